@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-import labapp.pixels  # noqa: F401 (OpenCV is told before anything loads it)
+import labapp.pixels  # noqa: F401 (sets OpenCV's limits before anything loads it)
 from labapp.version import VERSION
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ __version__ = VERSION
 
 
 def __getattr__(name: str) -> object:
-    # Loaded when asked for: `labapp --version` needs no numpy.
+    # Loaded on first use: `labapp --version` needs no numpy.
     if name == "Session":
         from labapp.session.session import Session
 

@@ -1,8 +1,10 @@
-"""What a user can put right: the one exception for bad input, with where, what and what instead."""
+"""The exception for wrong input: where it is, what it is, and what is expected instead."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 MAX_SHOWN = 80
 """Characters of a wrong value that a message repeats."""
@@ -57,3 +59,12 @@ class InputError(Exception):
         """One error that reports all of ``problems``; there is at least one."""
         first, *rest = problems
         return cls(first.source, first.field, first.value, first.expected, tuple(rest))
+
+
+@contextmanager
+def os_errors_as_input(path: str | os.PathLike[str], field: str, expected: str) -> Iterator[None]:
+    """Raise an `OSError` of the block as an `InputError` about ``path``."""
+    try:
+        yield
+    except OSError as error:
+        raise InputError(path, field, error.strerror or error, expected) from error

@@ -9,6 +9,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from labapp.errors import os_errors_as_input
+
 
 def as_bytes(text: str) -> bytes:
     r"""UTF-8; a file name that is no text keeps its odd bytes as ``\udcXX``, as in JSON."""
@@ -59,3 +61,16 @@ def write_atomically(path: Path, content: bytes) -> None:
             os.fsync(file.fileno())
         if path.exists():
             shutil.copymode(path, part)
+
+
+def write_file(path: Path, content: bytes) -> Path:
+    """Write a file by `write_atomically`; returns its path.
+
+    Raises
+    ------
+    InputError
+        If it cannot be written.
+    """
+    with os_errors_as_input(path, "file", "one that can be written"):
+        write_atomically(path, content)
+    return path

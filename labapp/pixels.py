@@ -1,4 +1,4 @@
-"""How large a picture may be, and OpenCV told of it; `labapp` imports it before all else."""
+"""How large a picture may be, set for OpenCV, too; `labapp` imports it before all else."""
 
 from __future__ import annotations
 
@@ -19,6 +19,6 @@ HELD_FRAMES, HELD_REORDERED = 2, 17
 
 
 def most_decoded(bits: int, reordered: bool) -> int:
-    """Pixels that a frame of a video may have, of so many bits each."""
+    """Pixels that a frame of a video may have, at the given bits of each."""
     held = HELD_REORDERED if reordered else HELD_FRAMES
     return min(MOST_PIXELS, 8 * MOST_BYTES // (max(bits, 1) * held))

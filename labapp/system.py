@@ -43,7 +43,7 @@ def sync_folder(path: Path) -> None:
 def interrupts_blocked() -> Iterator[None]:
     """Block Ctrl-C and SIGTERM while processes are started; this one receives them afterwards.
 
-    A process that is started half tells of the other half that it lacks. Those that are started
+    A process that is only half set up reports errors about what it lacks. Those that are started
     ignore Ctrl-C from then on, and heed SIGTERM when they call `ignore_interrupts`. Windows has no
     such mask: there that call does it.
     """

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import csv
+from collections.abc import Iterable, Sequence
 from datetime import datetime
 
 SIGMA_OF = "noise, level and set-up"
@@ -66,3 +68,17 @@ def as_cell(value: object) -> object:
     except ValueError:
         return f"'{value}"
     return value
+
+
+def csv_text(rows: Iterable[Sequence[object]]) -> str:
+    """CSV text of rows; text that a spreadsheet would evaluate is escaped (`as_cell`)."""
+    lines = _Lines()
+    csv.writer(lines).writerows([as_cell(cell) for cell in row] for row in rows)
+    return "".join(lines)
+
+
+class _Lines(list[str]):
+    """Lines ending with a line feed alone; with csv's own option carriage returns stay unquoted."""
+
+    def write(self, line: str) -> None:
+        self.append(line.removesuffix("\r\n") + "\n")

@@ -62,7 +62,7 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
 @pytest.fixture(scope="session")
 def opengl() -> None:
     """Let only what can draw in 3-D off-screen go on."""
-    from labapp.export.drawing import can_draw
+    from labapp.export.rendering.drawing import can_draw
 
     if not can_draw():
         lacks("nothing can be drawn in 3-D here")

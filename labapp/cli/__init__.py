@@ -55,7 +55,7 @@ if TYPE_CHECKING:
     from labapp.core.calibration.plane_calibration import PlaneCalibration
 
 IMPATIENT_S = 2.0
-"""Asked to stop again within this time, nothing more happens: the first is being obeyed."""
+"""A second request to stop within this time is ignored: the first is being carried out."""
 
 app = typer.Typer(
     name="labapp",
@@ -231,8 +231,8 @@ def detect(
     if doubt:
         typer.echo(f"{image}: {doubt}", err=True)
     placed = 0 if lattice is None else int((lattice.row > 0).sum())
-    told = placed or "none"
-    typer.echo(f"{len(dots)} dots, {told} with a row and a column, in {out.absolute()}")
+    message = placed or "none"
+    typer.echo(f"{len(dots)} dots, {message} with a row and a column, in {out.absolute()}")
     if not placed:
         raise typer.Exit(NOTHING_MEASURED)
 
@@ -344,12 +344,9 @@ def _calibrated(
     from labapp.core.calibration.imaging_plane import calibrate_imaging_plane
     from labapp.core.calibration.plane_calibration import PlaneCalibrationSettings
     from labapp.core.values import CannotMeasure
-    from labapp.media import open_source
+    from labapp.media import read_picture
 
-    pictures = []
-    for path in images:
-        with open_source(path) as source:
-            pictures.append(source.frame(0).image)
+    pictures = [read_picture(path) for path in images]
     try:
         named = None if board is None else parse_board(board)
     except ValueError as error:

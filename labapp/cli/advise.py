@@ -7,8 +7,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from labapp.cli.shared import NOTHING_MEASURED, progress_shown, writable_folder, write_file
+from labapp.cli.shared import NOTHING_MEASURED, progress_shown, writable_folder
 from labapp.errors import InputError
+from labapp.files import write_file
 
 if TYPE_CHECKING:
     from labapp.studies.adviser.bench_limits import BenchLimits
@@ -100,9 +101,9 @@ def _advised(
         if advice.possible:
             typer.echo("\n" + cost_table(advice).markdown())
         if check and advice.possible:
-            told = adviser_check.check_text(adviser_check.check(advice, progress=progress))
-            write_file(folder / "check.txt", told.encode() + b"\n")
-            typer.echo(told)
+            message = adviser_check.check_text(adviser_check.check(advice, progress=progress))
+            write_file(folder / "check.txt", message.encode() + b"\n")
+            typer.echo(message)
     typer.echo(f"Tables and picture are in {folder.absolute()}")
     return advice.possible
 

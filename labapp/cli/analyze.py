@@ -14,9 +14,9 @@ from labapp.cli.shared import (
     results_folder,
     writable_folder,
     write_figure,
-    write_file,
 )
 from labapp.errors import InputError
+from labapp.files import write_file
 from labapp.studies import SCHEMES
 from labapp.studies.analysis import (
     PARTS,
@@ -184,7 +184,7 @@ def budget(
 
 
 def _chosen(name: str, asked: list[str] | None, known: tuple[T, ...]) -> tuple[T, ...]:
-    """The names asked for, in their usual order; all of them if none was."""
+    """The requested names, in their usual order; all of them if none was given."""
     for one in asked or ():
         if one not in known:
             raise InputError(f"--{name}", name, one, f"one of {', '.join(known)}")
@@ -192,7 +192,7 @@ def _chosen(name: str, asked: list[str] | None, known: tuple[T, ...]) -> tuple[T
 
 
 def _keep(folder: Path | None, made: AnalysisPart) -> None:
-    """Write what a part gave, and print what is to be told of it."""
+    """Write the results of a part, and print its short tables."""
     if folder is not None:
         for name, content in made.files.items():
             write_file(folder / name, content)

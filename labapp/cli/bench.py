@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from labapp.cli.shared import NOTHING_MEASURED, write_file
+from labapp.cli.shared import NOTHING_MEASURED
 from labapp.errors import InputError
+from labapp.files import write_file
+from labapp.text import csv_text
 
 if TYPE_CHECKING:
     from labapp.config.setup import Setup
@@ -104,10 +104,9 @@ def mirror_picture(path: Path, mirror: Mirror) -> Picture:
     """The dots of a picture of a mirror."""
     from labapp.core.bench_check.labelling import Picture
     from labapp.core.images.find_dots import DotSettings, find_dots
-    from labapp.media import open_source
+    from labapp.media import read_picture
 
-    with open_source(path) as source:
-        image = source.frame(0).image
+    image = read_picture(path)
     height, width = image.shape
     return Picture(path.name, mirror, find_dots(image, DotSettings()), (height, width))
 
@@ -161,18 +160,16 @@ def _print_check(check: BenchCheck) -> None:
 
 def _residuals(check: BenchCheck) -> str:
     """Residual of every dot, CSV."""
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(
+    rows: list[list[object]] = [
         ["picture", "ray_row", "ray_column", "plane_x_mm", "plane_z_mm", "residual_x_mm",
          "residual_z_mm"]
-    )  # fmt: skip
+    ]  # fmt: skip
     for one in check.pictures:
         columns = one.ray.tolist(), one.plane_mm.tolist(), one.residual_mm.tolist()
         for ray, place, residual in zip(*columns, strict=True):
             cells = [f"{value:.6f}" for value in (*place, *residual)]
-            table.writerow([one.picture.name, *ray, *cells])
-    return text.getvalue()
+            rows.append([one.picture.name, *ray, *cells])
+    return csv_text(rows)
 
 
 def _write(setup: Path, before: str, check: BenchCheck) -> None:

@@ -163,8 +163,8 @@ def _edits_in_order(context: typer.Context) -> list[tuple[str, str]]:
 
 def _label(frames: list[int], edits: list[tuple[str, str]]) -> str:
     """Name a change for the history."""
-    told = ", ".join(f"{name.replace('_', '-')} {value}".rstrip() for name, value in edits)
-    label = f"{frames_text(frames)}: {told or 'carried on'}"
+    message = ", ".join(f"{name.replace('_', '-')} {value}".rstrip() for name, value in edits)
+    label = f"{frames_text(frames)}: {message or 'carried on'}"
     return label if len(label) <= LABEL_LENGTH else f"{label[: LABEL_LENGTH - 1]}…"
 
 
@@ -326,6 +326,6 @@ def _compared(before: Measures | None, after: Measures | None) -> str:
         values = [getattr(measures, name, math.nan) for measures in (before, after)]
         if name == "own_are_mm" and not any(map(math.isfinite, values)):
             continue  # the scheme has none
-        told = [f"{value:z8.4f}" if math.isfinite(value) else f"{'–':>8}" for value in values]
-        lines.append(f"  {label:7}{told[0]} → {told[1]} mm")
+        parts = [f"{value:z8.4f}" if math.isfinite(value) else f"{'–':>8}" for value in values]
+        lines.append(f"  {label:7}{parts[0]} → {parts[1]} mm")
     return "\n".join(lines)

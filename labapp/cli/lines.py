@@ -17,9 +17,10 @@ from labapp.cli.shared import (
     RECORDING_HELP,
     progress_shown,
     writable_folder,
-    write_file,
 )
-from labapp.errors import InputError
+from labapp.errors import os_errors_as_input
+from labapp.files import write_file
+from labapp.text import csv_text
 
 if TYPE_CHECKING:
     import numpy.typing as npt
@@ -55,13 +56,11 @@ def lines(
     with open_source(source) as recording:
         chosen = select_frames(frames, len(recording))
         folder = writable_folder(out)
-        try:
+        with os_errors_as_input(folder, "results", "room on its disk"):
             if follow or bench.rig.pattern.count == 1:
                 done = _follow(recording, chosen, folder)
             else:
                 done = _measure(recording, chosen, folder, bench)
-        except OSError as error:
-            raise InputError(folder, "results", error.strerror, "room on its disk") from error
     typer.echo(f"Results are in {folder.absolute()}")
     if not done:
         raise typer.Exit(NOTHING_MEASURED)
@@ -85,15 +84,13 @@ def _measure(source: FrameSource, frames: range, folder: Path, bench: LineSetup)
             times_s.append(frame.time_s)
             written.write(number, one)
             if one.status == "ok" and one.surface is not None:
-                rows = tables.surface_rows(one.surface)
-                text = tables.csv_text(tables.SURFACE_COLUMNS, rows)
+                text = csv_text([tables.SURFACE_COLUMNS, *tables.surface_rows(one.surface)])
                 write_file(folder / f"surface_{number:06d}.csv", text.encode())
             progress(source.name, k + 1, len(frames))
     series = LineSeries.of(found)
     states = line_states(series)
     rows = tables.feature_rows(frames, times_s, found, states)
-    text = tables.csv_text(tables.FEATURE_COLUMNS, rows)
-    write_file(folder / "features.csv", text.encode())
+    write_file(folder / "features.csv", csv_text([tables.FEATURE_COLUMNS, *rows]).encode())
     for name, counts in (("frames", [one.status for one in found]), ("states", states)):
         shown = ", ".join(f"{what} {n}" for what, n in Counter(counts).most_common())
         typer.echo(f"{name}: {shown}")
@@ -121,7 +118,7 @@ def _follow(source: FrameSource, frames: range, folder: Path) -> bool:
 
         film = track_line(images(), rate)
     rows = tables.track_rows(frames, times_s, film)
-    write_file(folder / "track.csv", tables.csv_text(tables.TRACK_COLUMNS, rows).encode())
+    write_file(folder / "track.csv", csv_text([tables.TRACK_COLUMNS, *rows]).encode())
     off = [one for one, pulse in zip(film.lines, film.pulses.on, strict=True) if not pulse]
     followed = sum(one is not None for one in off)
     typer.echo(f"{len(off)} of {len(frames)} frames are without a pulse; line in {followed}")

@@ -35,7 +35,6 @@ from labapp.errors import InputError
 
 if TYPE_CHECKING:
     from labapp.core.pipeline import Settings
-    from labapp.core.recording.residual_check import ResidualRecord
     from labapp.export.summary import Summary
     from labapp.run.runner import Measurer, Sink
     from labapp.run.streams import Stream
@@ -185,8 +184,3 @@ def _measure_recording(
     typer.echo(summary.text() + doubt)
     typer.echo(f"Results are in {out.absolute()}")
     return summary
-
-
-def _note_residuals(record: ResidualRecord) -> Sink:
-    """A sink that takes note of each frame's residuals."""
-    return lambda result: record.add(result.measurement)

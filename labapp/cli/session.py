@@ -270,9 +270,9 @@ def _set(session: Session, options: dict[str, str]) -> None:
         wanted = "--scheme irs, which alone has it"
         raise InputError("--algorithm", "algorithm", settings.algorithm, wanted)
     if settings != session.settings:
-        told = ", ".join(f"{name} {value}" for name, value in options.items())
-        session.set_settings(settings, told)
-        typer.echo(f"Settings: {told} (labapp session undo takes it back)")
+        message = ", ".join(f"{name} {value}" for name, value in options.items())
+        session.set_settings(settings, message)
+        typer.echo(f"Settings: {message} (labapp session undo takes it back)")
 
 
 app.command(cls=InOrder)(correct)
@@ -369,7 +369,7 @@ def _size(text: str) -> tuple[int, int]:
 
 
 def _words(text: str) -> frozenset[str]:
-    """Split ``a,b,c``; ``none`` stands for nothing."""
+    """Split ``a,b,c``; ``none`` means nothing."""
     return frozenset() if text == "none" else frozenset(map(str.strip, text.split(",")))
 
 
@@ -379,8 +379,8 @@ def _step(file: Path, way: Literal["undo", "redo"]) -> None:
     with Session.open(file) as session, report_stale_results(session):
         change = session.undo() if way == "undo" else session.redo()
         done = "Undone" if way == "undo" else "Done again"
-        told = f"{done}: {change.label} (of {change.made})" if change else f"Nothing to {way}"
-        typer.echo(told)
+        message = f"{done}: {change.label} (of {change.made})" if change else f"Nothing to {way}"
+        typer.echo(message)
 
 
 app.command()(info)
@@ -411,10 +411,10 @@ def verify(
             raise typer.Exit(NOTHING_MEASURED)
         results = sum(session.measured_by.values())
         parts = ((len(session.frames), "frame"), (results, "result"))
-        told = [
+        texts = [
             pluralize(count, thing) for count, thing in (*parts, (len(session.history), "change"))
         ]
-        typer.echo(f"whole: {', '.join(told)}")
+        typer.echo(f"whole: {', '.join(texts)}")
 
 
 @contextmanager

@@ -12,7 +12,8 @@ import typer
 import typer.core
 
 from labapp.core.schemes import SCHEMES, scheme_words
-from labapp.errors import InputError
+from labapp.errors import InputError, os_errors_as_input
+from labapp.files import write_file
 from labapp.system import quoted
 from labapp.text import pluralize
 
@@ -105,7 +106,7 @@ def note(console: Console, text: str) -> None:
 
 
 def progress_sink(progress: Progress, name: str, count: int) -> Sink:
-    """A sink that shows how many results of so many there are, and why a frame gave no surface."""
+    """A sink that shows the number of results so far, and why a frame gave no surface."""
     task = progress.add_task(name, total=count)
 
     def show(result: FrameResult) -> None:
@@ -215,7 +216,7 @@ def _results(results: Collection[tuple[int, str]]) -> str:
 
 
 def results_folder(out: Path | None, tables: bool = True) -> Path | None:
-    """The folder for tables and pictures, made if it is not there; None where none is asked for.
+    """The folder for tables and pictures, made if it is not there; None where none is requested.
 
     Raises
     ------
@@ -237,12 +238,10 @@ def writable_folder(folder: Path, option: str = "--out") -> Path:
     InputError
         If it cannot be written.
     """
-    try:
+    with os_errors_as_input(folder, option, "a folder that can be written"):
         folder.mkdir(parents=True, exist_ok=True)
         (folder / ".write").touch()
         (folder / ".write").unlink()
-    except OSError as error:
-        raise InputError(folder, option, error.strerror, "a folder that can be written") from error
     return folder
 
 
@@ -251,22 +250,6 @@ def write_figure(folder: Path, name: str, figure: Figure, kind: str) -> None:
     from labapp.studies.plotting import as_bytes
 
     write_file(folder / f"{name}.{kind}", as_bytes(figure, kind))
-
-
-def write_file(path: Path, content: bytes) -> None:
-    """Write a file whole, in place of what was there.
-
-    Raises
-    ------
-    InputError
-        If it cannot be written.
-    """
-    from labapp.files import write_atomically
-
-    try:
-        write_atomically(path, content)
-    except OSError as error:
-        raise InputError(path, "file", error.strerror, "one that can be written") from error
 
 
 @contextmanager

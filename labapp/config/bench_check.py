@@ -121,17 +121,7 @@ def changed_since_check(values: Mapping[str, Any]) -> list[str]:
 def check_values(
     check: BenchCheck, text_values: Mapping[str, Any], date: str
 ) -> dict[str, dict[str, object]]:
-    """Section → key → value that make a setup file that of a check (`setup.update_setup`).
-
-    Parameters
-    ----------
-    check
-        The check.
-    text_values
-        Sections of the file before the check.
-    date
-        When the pictures were taken, or looked at.
-    """
+    """Section → key → value that make a setup file that of a check (`setup.update_setup`)."""
     made: dict[str, dict[str, object]] = {}
     quantities, homography = [], "homography" in text_values["image_calibration"]
     for one in check.changes:

@@ -33,21 +33,14 @@ STAND_IN = {"rows": 3, "columns": 3, "inter_beam_angle_deg": 1e-3}
 
 @dataclass(frozen=True)
 class LineSetup:
-    """A valid setup with a line pattern.
-
-    Parameters
-    ----------
-    rig
-        Laser, line pattern, electrode, imaging plane.
-    calibration
-        Pixel ↔ imaging plane.
-    text
-        The file as it was read, for the record.
-    """
+    """A valid setup with a line pattern."""
 
     rig: LineRig
+    """Laser, line pattern, electrode, imaging plane."""
     calibration: ImageCalibration
+    """Pixel ↔ imaging plane."""
     text: str
+    """The file as it was read, for the record."""
 
 
 def read_line_setup(path: str | os.PathLike[str]) -> LineSetup:

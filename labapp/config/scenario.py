@@ -36,26 +36,19 @@ COURSE_HZ = (0.3, 3.0)
 """A pool's size wanders by swings between these frequencies."""
 
 SWINGS = 6
-"""So many of them make a course."""
+"""Least number of them for a course."""
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """A valid scenario.
-
-    Parameters
-    ----------
-    recording
-        What it describes, to be rendered.
-    setup
-        The setup file of its bench, as text.
-    text
-        The scenario as it was read.
-    """
+    """A valid scenario."""
 
     recording: Recording
+    """What it describes, to be rendered."""
     setup: str
+    """The setup file of its bench, as text."""
     text: str
+    """The scenario as it was read."""
 
     @property
     def title(self) -> str:
@@ -164,7 +157,7 @@ def _check_pool(path: Path, keys: Any) -> list[InputError]:
 
 
 def _several(terms: Any) -> list[Any]:
-    """Tables, of which one need not be in a list; what is neither was told of already."""
+    """Tables, of which one need not be in a list; what is neither was reported already."""
     if isinstance(terms, dict):
         return [terms]
     return terms if isinstance(terms, list) else []

@@ -31,7 +31,7 @@ from labapp.core.geometry.uncertainty import (
     RigUncertainty,
     covariance_of,
 )
-from labapp.errors import InputError
+from labapp.errors import InputError, os_errors_as_input
 from labapp.files import write_atomically
 
 A_SETUP = "a setup file (TOML, UTF-8)"
@@ -42,25 +42,18 @@ LEAST_ANGLE_DEG = 10.0
 
 @dataclass(frozen=True)
 class Setup:
-    """A valid setup.
-
-    Parameters
-    ----------
-    rig
-        Laser, dot pattern, electrode, imaging plane.
-    calibration
-        Pixel ↔ imaging plane.
-    text
-        The file as it was read, for the record.
-    checked
-        When the bench was checked against a known mirror, ISO 8601; empty where it was not, or was
-        changed since.
-    """
+    """A valid setup."""
 
     rig: Rig
+    """Laser, dot pattern, electrode, imaging plane."""
     calibration: ImageCalibration
+    """Pixel ↔ imaging plane."""
     text: str
+    """The file as it was read, for the record."""
     checked: str = ""
+    """When the bench was checked against a known mirror, ISO 8601; empty where it was not, or was
+    changed since.
+    """
 
     @functools.cached_property
     def bench(self) -> Bench:
@@ -113,7 +106,7 @@ def parse_setup(text: str, path: str | os.PathLike[str]) -> Setup:
             )
         ),
     ]
-    # How values fit each other can be asked once each is right by itself.
+    # Values are compared with each other once each is valid by itself.
     problems = problems or _contradictions(path, values)
     if problems:
         raise InputError.gather(problems)
@@ -143,12 +136,10 @@ def update_setup(path: str | os.PathLike[str], values: Mapping[str, Mapping[str,
     """
     path = Path(path)
     text = updated_setup(read_text(path, A_SETUP) if path.exists() else "", path, values)
-    try:
+    with os_errors_as_input(path, "file", "a file that can be written"):
         if path.exists() and not os.access(path, os.W_OK):
             raise PermissionError(13, "write-protected")
         write_atomically(path, text.encode())
-    except OSError as error:
-        raise InputError(path, "file", error.strerror, "a file that can be written") from error
 
 
 def updated_setup(

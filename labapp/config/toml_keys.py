@@ -51,21 +51,14 @@ def parse_toml(text: str, path: Path, wanted: str) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Rule:
-    """Rule for the value of a key.
-
-    Parameters
-    ----------
-    expected
-        That in words, completing "expected …".
-    accepts
-        Whether a value as TOML gives it is right.
-    required
-        Whether the key must be there.
-    """
+    """Rule for the value of a key."""
 
     expected: str
+    """What is right, in words, completing "expected …"."""
     accepts: Callable[[object], bool]
+    """Whether a value as TOML gives it is right."""
     required: bool = True
+    """Whether the key must be there."""
 
 
 def is_number(value: object) -> TypeGuard[float]:
@@ -74,7 +67,7 @@ def is_number(value: object) -> TypeGuard[float]:
 
 
 def are_numbers(value: object, count: int) -> TypeGuard[list[float]]:
-    """Whether this is a list of so many finite numbers."""
+    """Whether this is a list of finite numbers of the given length."""
     return isinstance(value, list) and len(value) == count and all(map(is_number, value))
 
 

@@ -22,14 +22,18 @@ from filelock import FileLock, Timeout
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.pipeline import Measurement
 from labapp.errors import InputError
-from labapp.export.drawing import VIEWS, Direction
-from labapp.export.film import TICKS_HZ, Extent, film_times, write_film
 from labapp.export.formats import RUN_FORMATS, SURFACE_FORMATS, RunFormat, mesh_formats
 from labapp.export.frame_result import FrameResult
 from labapp.export.meshes import SMALLEST_SPACING_MM, SPACING_MM, refuse_too_large
-from labapp.export.pictures import write_frame_picture, write_surface_picture, write_trend_picture
+from labapp.export.rendering.drawing import VIEWS, Direction
+from labapp.export.rendering.film import TICKS_HZ, Extent, film_times, write_film
+from labapp.export.rendering.pictures import (
+    write_frame_picture,
+    write_surface_picture,
+    write_trend_picture,
+)
+from labapp.export.rendering.studio import PICTURE_PX, drawing_errors, drawing_process
 from labapp.export.results import SURFACES, surface_files
-from labapp.export.studio import PICTURE_PX, drawing_errors, drawing_process
 from labapp.export.summary import Summary
 from labapp.export.tables import TABLES, csv_header, csv_rows, frame_tables
 from labapp.files import as_bytes, beside
@@ -63,33 +67,6 @@ OWN_FOLDER = "a new or empty folder, or an earlier export that was not changed (
 class ExportChoice:
     """Choice of what an export contains.
 
-    Parameters
-    ----------
-    tables
-        Which tables as CSV: some of ``measures``, ``dots``, ``points``, ``boundary``.
-    surfaces
-        How to write each surface: some of `SURFACE_FORMATS`.
-    solid
-        Whether to add each surface as a watertight body, in the mesh formats of `surfaces`.
-    hdf5
-        Short for ``hdf5`` in `together`.
-    pictures
-        Some of ``frames`` (dots over each frame), ``surfaces`` (each in 3-D), ``trends`` and
-        ``film`` (the surfaces, one after the other in one view and on one colour scale).
-    spacing_mm
-        Distance of the surfaces' nodes, mm.
-    view
-        Where surfaces are looked at from, in pictures and the film: ``free`` (obliquely), ``top``,
-        ``side`` or ``front``.
-    size_px
-        Width and height of these, even, px.
-    film_rate_hz
-        Frames of the film a second; None: as fast as they were recorded (`film.film_times`).
-    together
-        How to write everything into one file: some of `RUN_FORMATS`.
-    sigma_parts
-        Whether `measures.csv` has the parts of standard uncertainties, too.
-
     Raises
     ------
     InputError
@@ -97,16 +74,31 @@ class ExportChoice:
     """
 
     tables: frozenset[str] = frozenset(TABLES)
+    """Which tables as CSV: some of ``measures``, ``dots``, ``points``, ``boundary``."""
     surfaces: frozenset[str] = frozenset(SURFACES)
+    """How to write each surface: some of `SURFACE_FORMATS`."""
     solid: bool = False
+    """Whether to add each surface as a watertight body, in the mesh formats of `surfaces`."""
     hdf5: bool = False
+    """Short for ``hdf5`` in `together`."""
     pictures: frozenset[str] = frozenset()
+    """Some of ``frames`` (dots over each frame), ``surfaces`` (each in 3-D), ``trends`` and
+    ``film`` (the surfaces, one after the other in one view and on one colour scale).
+    """
     spacing_mm: float = SPACING_MM
+    """Distance of the surfaces' nodes, mm."""
     view: Direction = "free"
+    """Where surfaces are looked at from, in pictures and the film: ``free`` (obliquely), ``top``,
+    ``side`` or ``front``.
+    """
     size_px: tuple[int, int] = PICTURE_PX
+    """Width and height of these, even, px."""
     film_rate_hz: float | None = None
+    """Frames of the film a second; None: as fast as they were recorded (`film.film_times`)."""
     together: frozenset[str] = frozenset()
+    """How to write everything into one file: some of `RUN_FORMATS`."""
     sigma_parts: bool = False
+    """Whether `measures.csv` has the parts of standard uncertainties, too."""
 
     def __post_init__(self) -> None:
         allowed: dict[str, Collection[str]] = {
@@ -146,16 +138,8 @@ class ExportChoice:
 class ExportedFile:
     """A file of an export, as its manifest lists it.
 
-    Parameters
-    ----------
-    name
-        Its name in the folder.
-    size
-        In bytes.
-    sha256
-        Of its content, in hex.
-    rows
-        Of a CSV file, without its header; None of any other.
+    ``size`` is in bytes, ``sha256`` in hex; ``rows`` of a CSV file, its header not counted, else
+    None.
     """
 
     name: str
@@ -354,8 +338,7 @@ def _has_picture(measurement: Measurement, choice: ExportChoice) -> bool:
 
 
 def _made() -> dict[str, object]:
-    made = {"program": "labapp", "version": VERSION, "created": now()}
-    return {**made, "sigma_of": SIGMA_OF}
+    return {"program": "labapp", "version": VERSION, "created": now(), "sigma_of": SIGMA_OF}
 
 
 def _about(provenance: Mapping[str, object]) -> dict[str, object]:

@@ -20,26 +20,19 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SurfaceFormat:
-    """A format with a file for each frame that has a surface.
-
-    Parameters
-    ----------
-    end
-        How the names of its files end, after ``surface_NNNNNN``.
-    title, tip
-        What the Export page calls it, and what it is.
-    of
-        What is written: ``mesh`` for triangles (`meshes.Mesh`), which can be a watertight body
-        too; ``nodes`` for the points of a grid within the boundary, shape (n, 3), mm.
-    writer
-        ``module:function`` in this package: makes the file's bytes from the mesh or the nodes.
-    """
+    """A format with a file for each frame that has a surface."""
 
     end: str
+    """How the names of its files end, after ``surface_NNNNNN``."""
     title: str
     tip: str
+    """What the Export page calls it, and what it is."""
     of: Literal["mesh", "nodes"]
+    """What is written: ``mesh`` for triangles (`meshes.Mesh`), which can be a watertight body too;
+    ``nodes`` for the points of a grid within the boundary, shape (n, 3), mm.
+    """
     writer: str
+    """``module:function`` in this package: makes the file's bytes from the mesh or the nodes."""
 
     def content(self, shape: object) -> bytes:
         """Content of the file for a mesh, or for nodes."""
@@ -59,23 +52,16 @@ class RunWriter(Protocol):
 
 @dataclass(frozen=True)
 class RunFormat:
-    """A format with one file for all frames.
-
-    Parameters
-    ----------
-    file
-        Its name.
-    title, tip
-        What the Export page calls it, and what it is.
-    writer
-        ``module:Class`` in this package: a `RunWriter`, made from the file's path, what is to be
-        said of its source, and the distance of the surfaces' nodes in mm.
-    """
+    """A format with one file for all frames."""
 
     file: str
     title: str
     tip: str
+    """What the Export page calls it, and what it is."""
     writer: str
+    """``module:Class`` in this package: a `RunWriter`, made from the file's path, what is to be
+    said of its source, and the distance of the surfaces' nodes in mm.
+    """
 
     def open(
         self, path: str | os.PathLike[str], about: Mapping[str, object], spacing_mm: float

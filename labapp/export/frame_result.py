@@ -10,25 +10,16 @@ from labapp.core.pipeline import Measurement
 
 @dataclass(frozen=True)
 class FrameResult:
-    """The result of one frame.
-
-    Parameters
-    ----------
-    frame, time_s
-        Its number, and its time where it has one, s.
-    measurement
-        What was measured.
-    track_lost
-        Why it was not measured from the frame before; None if it was, or was not to be.
-    rows
-        Its rows of each table as CSV text (`tables.table_rows`); None: not made yet.
-    """
+    """The result of one frame."""
 
     frame: int
     time_s: float | None
+    """Its number, and its time where it has one, s."""
     measurement: Measurement
     track_lost: str | None = None
+    """Why it was not measured from the frame before; None if it was, or was not to be."""
     rows: Mapping[str, str] | None = None
+    """Its rows of each table as CSV text (`tables.table_rows`); None: not made yet."""
 
 
 def without_surface(measurement: Measurement) -> Measurement:

@@ -1,4 +1,4 @@
-"""A whole run in one HDF5 file, in full precision.
+"""A run in one HDF5 file, in full precision.
 
 ::
 
@@ -13,7 +13,7 @@ A table is one compound dataset: ``file["frames/000012/dots"]["u_px"]`` in Pytho
 ``h5read(file, '/frames/000012/dots').u_px`` in MATLAB. What a frame has not is not there. Numbers
 are float64, NaN where unknown, or int64 where they never are; text is UTF-8, of fixed length in
 tables. Every dataset has the attributes ``units`` and ``description``, tables one each per column;
-the root's tell where it all comes from. The format is that of HDF5 1.8, which every reader knows.
+the root's state the provenance. The format is that of HDF5 1.8, which every reader knows.
 """
 
 from __future__ import annotations

@@ -48,25 +48,17 @@ def difference_at(
 
 @dataclass(frozen=True)
 class Profile(ReadOnlyArrays):
-    """A vertical section through a pool; n points, NaN outside the boundary.
-
-    Parameters
-    ----------
-    along_mm
-        Way along the section line from the point of it nearest the origin, shape (n,), mm.
-    place_mm
-        (X, Y) of the points, shape (n, 2), mm.
-    height_mm, sigma_mm
-        Height of the surface and its standard uncertainty, shape (n,), mm.
-    edge_mm
-        (way, height) where the line crosses the boundary, shape (k, 2), mm.
-    """
+    """A vertical section through a pool; n points, NaN outside the boundary."""
 
     along_mm: FloatArray
+    """Way along the section line from the point of it nearest the origin, shape (n,), mm."""
     place_mm: FloatArray
+    """(X, Y) of the points, shape (n, 2), mm."""
     height_mm: FloatArray
     sigma_mm: FloatArray
+    """Height of the surface and its standard uncertainty, shape (n,), mm."""
     edge_mm: FloatArray
+    """(way, height) where the line crosses the boundary, shape (k, 2), mm."""
 
 
 def profile(

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +12,7 @@ from labapp.core.sequence.line_frame import LineFrame
 from labapp.core.sequence.line_states import State
 from labapp.core.sequence.line_track import LineFilm
 from labapp.core.surface.line_fit import LineSurface
+from labapp.text import csv_text
 
 LINE_COLUMNS = (
     "frame", "line", "number", "left_u_px", "left_v_px", "right_u_px", "right_v_px", "left_cut",
@@ -141,16 +140,6 @@ def _cell(value: float | None) -> str:
     return "" if value is None or not np.isfinite(value) else f"{value:.5f}"
 
 
-def csv_text(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    """A table as CSV, with a header row where columns are given."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    if columns:
-        writer.writerow(columns)
-    writer.writerows(rows)
-    return text.getvalue()
-
-
 class LineTables:
     """`lines.csv` and `line_points.csv` of a folder, written frame by frame."""
 
@@ -161,12 +150,12 @@ class LineTables:
             for name in ("lines.csv", "line_points.csv")
         ]
         for file, columns in zip(self._files, (LINE_COLUMNS, POINT_COLUMNS), strict=True):
-            file.write(csv_text(columns, []))
+            file.write(csv_text([columns]))
 
     def write(self, frame: int, found: LineFrame) -> None:
         """Write the lines of a frame."""
         for file, rows in zip(self._files, (line_rows, point_rows), strict=True):
-            file.write(csv_text((), rows(frame, found, self._calibration)))
+            file.write(csv_text(rows(frame, found, self._calibration)))
             file.flush()
 
     def close(self) -> None:

@@ -22,7 +22,7 @@ SPACING_MM = 0.1
 """Distance between the rings of a mesh, and between the nodes of a surface as CSV, mm."""
 
 SMALLEST_SPACING_MM = 0.05
-"""STL's 32-bit numbers cannot tell apart the vertices of smaller rings."""
+"""STL's 32-bit numbers cannot distinguish the vertices of smaller rings."""
 
 MOST_NODES = 10_000_000
 """A surface that is written has no more nodes: one in a stranger's session may be any size."""
@@ -40,18 +40,12 @@ PLY_FACE = np.dtype([("count", "u1"), ("corner", "<i4", 3)])
 
 @dataclass(frozen=True)
 class Mesh(ReadOnlyArrays):
-    """Triangles; n vertices, k triangles.
-
-    Parameters
-    ----------
-    vertices_mm
-        UCS, shape (n, 3), mm.
-    triangles
-        Indices of their corners, shape (k, 3).
-    """
+    """Triangles; n vertices, k triangles."""
 
     vertices_mm: FloatArray
+    """UCS, shape (n, 3), mm."""
     triangles: IntArray
+    """Indices of their corners, shape (k, 3)."""
 
 
 def refuse_too_large(reconstruction: Reconstruction, spacing_mm: float) -> None:

@@ -26,21 +26,14 @@ MEANS = {
 
 @dataclass
 class Summary:
-    """Accumulates measures and statuses of a run, frame by frame.
-
-    Attributes
-    ----------
-    frames
-        (frame, time in s, measures or None) of every frame, in order.
-    statuses
-        Number of frames by status.
-    example
-        The first frame with a surface.
-    """
+    """Accumulates measures and statuses of a run, frame by frame."""
 
     frames: list[tuple[int, float | None, Measures | None]] = field(default_factory=list)
+    """(frame, time in s, measures or None) of every frame, in order."""
     statuses: Counter[str] = field(default_factory=Counter)
+    """Number of frames by status."""
     example: FrameResult | None = None
+    """The first frame with a surface."""
 
     def add(self, result: FrameResult) -> None:
         """Add a frame."""

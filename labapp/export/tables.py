@@ -5,10 +5,9 @@ Values are exact; only CSV rounds them. An unknown value is NaN, and an empty ce
 
 from __future__ import annotations
 
-import csv
 import io
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from functools import cache
 from typing import Any
@@ -23,7 +22,7 @@ from labapp.core.surface.measures import Measures, sigma_name
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.values import FloatArray
 from labapp.export.frame_result import FrameResult
-from labapp.text import HEIGHT_SIGMA_OF, SIGMA_OF, as_cell
+from labapp.text import HEIGHT_SIGMA_OF, SIGMA_OF, csv_text
 
 PX_DIGITS, MM_DIGITS = 4, 6
 
@@ -36,24 +35,16 @@ Table = dict[str, npt.NDArray[Any]]
 
 @dataclass(frozen=True)
 class Column:
-    """A column of a table.
-
-    Parameters
-    ----------
-    name
-        Its name, which ends in the unit.
-    description
-        What it holds, in a few words.
-    digits
-        Decimals in CSV; 0 for whole numbers, None for text.
-    is_part
-        Whether it is a part of a standard uncertainty: in CSV files where these are asked for.
-    """
+    """A column of a table."""
 
     name: str
+    """Its name, which ends in the unit."""
     description: str
+    """What it holds, in a few words."""
     digits: int | None = MM_DIGITS
+    """Decimals in CSV; 0 for whole numbers, None for text."""
     is_part: bool = False
+    """Whether it is a part of a standard uncertainty: in CSV files where these are requested."""
 
     @property
     def unit(self) -> str:
@@ -269,7 +260,7 @@ def table_rows(
 
 def csv_header(name: str, sigma_parts: bool = False) -> str:
     """Header line of a table's CSV file."""
-    return as_csv([[column.name for column in columns_of(name, sigma_parts)]])
+    return csv_text([[column.name for column in columns_of(name, sigma_parts)]])
 
 
 def csv_rows(name: str, table: Table, sigma_parts: bool = False) -> str:
@@ -284,7 +275,7 @@ def csv_rows(name: str, table: Table, sigma_parts: bool = False) -> str:
         else [number(value, column.digits) for value in table[column.name].tolist()]
         for column in columns
     ]
-    return as_csv(zip(*cells, strict=True))
+    return csv_text(zip(*cells, strict=True))
 
 
 def _numeric_rows(columns: Sequence[Column], table: Table) -> str | None:
@@ -320,17 +311,3 @@ def nodes_csv(nodes: FloatArray) -> bytes:
 def number(value: float | None, digits: int = MM_DIGITS) -> str:
     """A number as a CSV cell; empty where unknown."""
     return f"{value:z.{digits}f}" if value is not None and math.isfinite(value) else ""
-
-
-def as_csv(rows: Iterable[Sequence[object]]) -> str:
-    """CSV text of rows; text that a spreadsheet would evaluate is escaped (`as_cell`)."""
-    lines = _Lines()
-    csv.writer(lines).writerows([as_cell(cell) for cell in row] for row in rows)
-    return "".join(lines)
-
-
-class _Lines(list[str]):
-    """Lines ending with a line feed alone; with csv's own option carriage returns stay unquoted."""
-
-    def write(self, line: str) -> None:
-        self.append(line.removesuffix("\r\n") + "\n")

@@ -58,11 +58,6 @@ HEARTBEAT_MS = 300
 def main(arguments: Sequence[str]) -> int:
     """Open the app, and a session or a recording in it; returns when its window was closed.
 
-    Parameters
-    ----------
-    arguments
-        Nothing, or one file or folder.
-
     Raises
     ------
     InputError
@@ -87,7 +82,7 @@ def main(arguments: Sequence[str]) -> int:
 
 @contextlib.contextmanager
 def open_window(app: QApplication, preferences: Preferences, file: Path) -> Iterator[MainWindow]:
-    """Show the window, with all that goes on beside it; ended, what was there before is back."""
+    """Show the window; signals, error reporting and garbage collection are restored after it."""
     from labapp.gui.shell.commands import make_window
 
     window = make_window(preferences, file)

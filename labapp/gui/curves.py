@@ -13,17 +13,10 @@ from labapp.gui.digits import rounded
 
 @dataclass(frozen=True)
 class Mark:
-    """How a point looks, and what that means.
-
-    Parameters
-    ----------
-    sign
-        ● or ○ (circles, filled and open), ■ or ▪ (squares, the small one red), × (a cross).
-    words
-        What it means.
-    """
+    """How a point looks, and what that means."""
 
     sign: str
+    """● or ○ (circles, filled and open), ■ or ▪ (squares, the small one red), × (a cross)."""
     words: str
 
 
@@ -36,49 +29,35 @@ def _none() -> IntArray:
 
 @dataclass(frozen=True)
 class Curve(ReadOnlyArrays):
-    """One plot's curve; n points.
-
-    Parameters
-    ----------
-    name, unit
-        Of what goes up.
-    x, y
-        Shape (n,); x ascends, a NaN in y is a gap.
-    sigma
-        ± of each y, shape (n,); NaN where there is none. Empty: no bars.
-    key
-        What each point stands for (a frame's number), ascending, shape (n,). Empty: points are not
-        drawn and cannot be chosen, only the line is.
-    mark
-        Index of each point's mark, shape (n,); empty as ``key`` is.
-    marks
-        What the marks are, the usual one first.
-    level
-        A dashed line at that height: the mean; NaN for none.
-    decimals
-        Of y where no σ says how many.
-    from_zero
-        Whether the axis begins at 0.
-    limits
-        Lines at the lowest and the highest that y is to be, which are always seen; None for none.
-    quick
-        Whether points have a mark only where it is not the usual one: the curve is redrawn many
-        times a second.
-    """
+    """One plot's curve; n points."""
 
     name: str
     unit: str
+    """Quantity and unit of the vertical axis."""
     x: FloatArray
     y: FloatArray
+    """Shape (n,); x ascends, a NaN in y is a gap."""
     sigma: FloatArray = field(default_factory=lambda: np.zeros(0))
+    """± of each y, shape (n,); NaN where there is none. Empty: no bars."""
     key: IntArray = field(default_factory=_none)
+    """What each point stands for (a frame's number), ascending, shape (n,). Empty: points are not
+    drawn and cannot be chosen, only the line is.
+    """
     mark: IntArray = field(default_factory=_none)
+    """Index of each point's mark, shape (n,); empty as ``key`` is."""
     marks: tuple[Mark, ...] = (PLAIN,)
+    """What the marks are, the usual one first."""
     level: float = float("nan")
+    """A dashed line at that height: the mean; NaN for none."""
     decimals: int = 3
+    """Decimals of y where no σ gives them."""
     from_zero: bool = False
     limits: tuple[float | None, float | None] = (None, None)
+    """Lines at the lower and the upper limit of y, always in view; None for none."""
     quick: bool = False
+    """Whether points have a mark only where it is not the usual one: the curve is redrawn many
+    times a second.
+    """
 
     @property
     def title(self) -> str:
@@ -88,25 +67,17 @@ class Curve(ReadOnlyArrays):
 
 @dataclass(frozen=True)
 class Axis:
-    """What goes to the right.
-
-    Parameters
-    ----------
-    name, unit
-        "Time", "s".
-    decimals
-        Of a place on it in words.
-    key_name
-        What a point's key is: "frame".
-    span
-        Both ends of what is to be seen in any case; None: the curves alone.
-    """
+    """The horizontal axis."""
 
     name: str
     unit: str
+    """"Time", "s"."""
     decimals: int = 4
+    """Decimals of a place on it, in text."""
     key_name: str = "frame"
+    """What a point's key is: "frame"."""
     span: tuple[float, float] | None = None
+    """Both ends of what is to be seen in any case; None: the curves alone."""
 
     @property
     def title(self) -> str:
@@ -118,14 +89,14 @@ def point_text(curve: Curve, index: int, axis: Axis) -> str:
     """A point for the read-out and the screen reader."""
     sigma = float(curve.sigma[index]) if len(curve.sigma) else None
     value, spread = rounded(float(curve.y[index]), sigma, curve.decimals)
-    told = f"{curve.name} {value}{f' ± {spread}' if spread else ''} {curve.unit}".strip()
+    message = f"{curve.name} {value}{f' ± {spread}' if spread else ''} {curve.unit}".strip()
     place, _ = rounded(float(curve.x[index]), None, axis.decimals)
     where = f"{axis.name.lower()} {place} {axis.unit}".strip()
     if len(curve.key):
         where = f"{axis.key_name} {curve.key[index]}" + (f", {place} s" * (axis.unit == "s"))
         mark = curve.mark[index]
         where += f", {curve.marks[mark].words}" if mark else ""
-    return f"{where[0].upper()}{where[1:]}: {told}"
+    return f"{where[0].upper()}{where[1:]}: {message}"
 
 
 def nearest(curve: Curve, x: float) -> int | None:
@@ -138,7 +109,7 @@ def nearest(curve: Curve, x: float) -> int | None:
 
 
 def next_key(curves: Sequence[Curve], current: int, step: int) -> int | None:
-    """The key so many points after the present one (before: negative); None without points."""
+    """The key a number of points after the present one (before: negative); None without points."""
     keyed = [curve.key for curve in curves if len(curve.key)]
     if not keyed:
         return None

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
 
 from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QFileDialog, QMessageBox, QWidget
 
-from labapp.errors import InputError
-from labapp.files import write_atomically
 from labapp.session.file.database import SUFFIX
 
 SESSIONS = f"Sessions (*{SUFFIX})"
@@ -118,26 +114,4 @@ def new_path(folder: Path, stem: str, suffix: str = SUFFIX) -> Path:
     while path.exists():
         number += 1
         path = folder / f"{stem} {number}{suffix}"
-    return path
-
-
-@contextmanager
-def refused_as_input(path: Path, field: str) -> Iterator[None]:
-    """Turn an `OSError` about a path into an `InputError` that says what is wrong with it."""
-    try:
-        yield
-    except OSError as error:
-        raise InputError(path, field, error.strerror, "one that can be written") from error
-
-
-def write_file(path: Path, content: bytes) -> Path:
-    """Write a file whole, in place of what was there; returns its path.
-
-    Raises
-    ------
-    InputError
-        If it cannot be written.
-    """
-    with refused_as_input(path, "file"):
-        write_atomically(path, content)
     return path

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+
+from labapp.text import csv_text
 
 MINUS = "−"
 """As wide as a digit's plus; a hyphen reads as a dash."""
@@ -17,35 +17,24 @@ NOTHING = "–"
 """Stands where there is no number."""
 
 EXTRA_DECIMALS = 3
-"""A number with this many decimals more than its field shows was typed so: it is shown whole."""
+"""A number with this many decimals more than its field shows was typed so: all are shown."""
 
 
 @dataclass(frozen=True)
 class ResultRow:
-    """One line of a result table.
-
-    Parameters
-    ----------
-    name
-        The quantity.
-    value
-        A number, or words; None or NaN where there is none.
-    sigma
-        Its standard uncertainty; None where there is none.
-    unit
-        "mm", "°", "px/mm" …
-    decimals
-        How many to show where no σ says it.
-    note
-        More about it, as a tooltip.
-    """
+    """One line of a result table."""
 
     name: str
     value: float | str | None
+    """A number, or words; None or NaN where there is none."""
     sigma: float | None = None
+    """Its standard uncertainty; None where there is none."""
     unit: str = ""
+    """"mm", "°", "px/mm" …"""
     decimals: int = 3
+    """How many to show where no σ says it."""
     note: str = ""
+    """More about it, as a tooltip."""
 
     @property
     def texts(self) -> tuple[str, str, str, str]:
@@ -76,7 +65,7 @@ def rounded(value: float | None, sigma: float | None, decimals: int = 3) -> tupl
 
 
 def plain(value: float, decimals: int) -> str:
-    """A number with so many decimals (negative: rounded to tens …), without a negative zero."""
+    """A number with the given decimals (negative: rounded to tens …), without a negative zero."""
     text = f"{round(value, decimals):.{max(decimals, 0)}f}"
     return text.lstrip("-") if float(text) == 0 else text.replace("-", MINUS)
 
@@ -104,11 +93,14 @@ def as_text(rows: Iterable[ResultRow]) -> str:
 
 def as_csv(rows: Iterable[ResultRow]) -> str:
     """Result rows for a program: comma-separated, numbers in full."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(("quantity", "value", "sigma", "unit"))
-    writer.writerows((row.name, row.value, row.sigma, row.unit) for row in rows)
-    return text.getvalue()
+    cells = ((row.name, row.value, row.sigma, row.unit) for row in rows)
+    return csv_text([("quantity", "value", "sigma", "unit"), *cells])
+
+
+def round_factor(most: float) -> float:
+    """1, 2 or 5 times a power of ten, the largest that is not above ``most`` (positive)."""
+    power: float = 10.0 ** math.floor(math.log10(most))
+    return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= most)
 
 
 UNITS = {"mm": "mm", "deg": "°", "px": "px", "pct": "%", "um per unit": "µm per mm or °"}

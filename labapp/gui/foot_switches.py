@@ -23,7 +23,7 @@ POLL_MS = 20
 """What is pressed is done within this."""
 
 DEAF_S = 0.5
-"""A press that was learned does nothing besides: so long nothing else is heard."""
+"""Time, s, in which presses are ignored after one that was learned."""
 
 DOES: dict[Action, str] = {
     "trigger": "record, or end it",
@@ -62,52 +62,34 @@ class InUse:
 
 @dataclass(frozen=True)
 class DevicesFound:
-    """What was found plugged in.
-
-    Parameters
-    ----------
-    usable
-        Names of the foot switches that are known and can be read.
-    closed
-        Devices that may not be read, those that are known first.
-    problem
-        Why nothing could be looked for; empty if it could.
-    """
+    """What was found plugged in."""
 
     usable: tuple[str, ...] = ()
+    """Names of the foot switches that are known and can be read."""
     closed: tuple[HidInfo, ...] = ()
+    """Devices that may not be read, those that are known first."""
     problem: str = ""
+    """Why nothing could be looked for; empty if it could."""
 
     @property
     def words(self) -> str:
         """What was found, a sentence or two."""
         if self.problem:
             return self.problem
-        told = [f"Found: {', '.join(self.usable)}."] if self.usable else []
+        parts = [f"Found: {', '.join(self.usable)}."] if self.usable else []
         known = [info.name for info in self.closed if info.is_pedal or info.is_3d]
         if known:
-            told.append(f"▲ May not be read: {', '.join(known)}.")
-        if not told:
-            told = ["No foot switch that is known is plugged in; any other can be learned."]
-        return "\n".join(told)
+            parts.append(f"▲ May not be read: {', '.join(known)}.")
+        if not parts:
+            parts = ["No foot switch that is known is plugged in; any other can be learned."]
+        return "\n".join(parts)
 
 
 class FootSwitches(QObject):
-    """Foot switches: what is pressed is asked of the window's menus.
+    """Foot switches: a pressed pedal runs an action of the window's menus.
 
     Nothing runs while none is in use. Devices are read in threads of their own; what they tell is
     taken from a queue.
-
-    Signals
-    -------
-    changed
-        Something that is shown of them is otherwise.
-    kept
-        Others are in use, or their pedals do something else: as plain values, to be remembered.
-    pressed
-        The name of the menus' action that a pedal was pressed for.
-    notified
-        Something for the operator to read: a sentence, and whether it is a problem.
 
     Attributes
     ----------
@@ -116,13 +98,17 @@ class FootSwitches(QObject):
     found
         What was plugged in at the last look; None before one.
     learned
-        The pedal that was pressed to be learned, until it is said what it does.
+        The pedal that was pressed to be learned, until its action is chosen.
     """
 
     changed = Signal()
+    """What is shown of them changed."""
     kept = Signal(object)
+    """The foot switches in use or their actions changed: as plain values, to be stored."""
     pressed = Signal(str)
+    """The name of the menus' action that a pedal was pressed for."""
     notified = Signal(str, bool)
+    """Something for the operator to read: a sentence, and whether it is a problem."""
 
     def __init__(self, tasks: Tasks, parent: QObject | None = None) -> None:
         super().__init__(parent)
@@ -143,7 +129,7 @@ class FootSwitches(QObject):
     # --- in use -------------------------------------------------------------------------------
 
     def use(self, kept: Iterable[Mapping[str, Any]]) -> None:
-        """Take up the foot switches that were remembered; one that is damaged is said."""
+        """Start the foot switches that were stored; a damaged entry is reported."""
         for values in kept:
             try:
                 pedals = PedalMap.from_dict(values)
@@ -312,7 +298,7 @@ def _found() -> DevicesFound:
 
 
 def _learned(control: Control) -> Learned | str | None:
-    """Wait for a pedal; why none can be heard, as words."""
+    """Wait for a pedal; why none can be read, in words."""
 
     def told(problems: list[str]) -> None:
         if not control.cancelled.is_set():

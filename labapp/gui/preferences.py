@@ -23,33 +23,23 @@ KEPT_RECENT = 12
 THEMES = ("system", "light", "dark")
 LARGEST_BYTES = 1_000_000
 LOCK_S = 2.0
-"""So long a window waits for another one's change."""
+"""Time, s, that a window waits for the change of another."""
 
 
 @dataclass(frozen=True)
 class Preferences:
-    """What is remembered.
-
-    Parameters
-    ----------
-    recent
-        Session files, the last opened first.
-    theme
-        One of `THEMES`.
-    geometry, layout
-        Of the window, as Qt tells them, base64; empty for the default.
-    last_folder
-        Where a file was chosen last; empty for the documents folder.
-    foot_switches
-        What their pedals do, each as `PedalMap.as_dict` has it.
-    """
+    """What is remembered."""
 
     recent: tuple[str, ...] = ()
+    """Session files, the last opened first."""
     theme: str = "system"
     geometry: str = ""
     layout: str = ""
+    """Geometry and state of the window as Qt gives them, base64; empty for the default."""
     last_folder: str = ""
+    """Where a file was chosen last; empty for the documents folder."""
     foot_switches: tuple[Mapping[str, Any], ...] = ()
+    """What their pedals do, each as `PedalMap.as_dict` has it."""
 
     def with_recent(self, path: Path) -> Preferences:
         """The same with a session as the last opened."""
@@ -84,17 +74,12 @@ class PreferencesStore(QObject):
     ----------
     current
         The preferences that hold now.
-
-    Signals
-    -------
-    changed
-        Something was remembered.
-    failed
-        It could not be written: why. It holds in this window all the same.
     """
 
     changed = Signal()
+    """A preference was stored."""
     failed = Signal(str)
+    """A preference could not be written, and why. It still applies to this window."""
 
     def __init__(self, preferences: Preferences, path: Path) -> None:
         super().__init__()
@@ -139,7 +124,7 @@ def read_preferences(path: Path) -> tuple[Preferences, str]:
     Returns
     -------
     preferences, problem
-        ``problem`` tells the operator what was wrong; empty if nothing was.
+        ``problem`` is the message for the operator; empty if nothing was wrong.
     """
     try:
         if path.stat().st_size > LARGEST_BYTES:

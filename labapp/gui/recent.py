@@ -22,27 +22,17 @@ THUMBNAIL_PX = (128, 96)
 
 @dataclass(frozen=True)
 class Recent:
-    """A session opened before.
-
-    Parameters
-    ----------
-    path
-        Its file.
-    title
-        Of the experiment, or the file's name.
-    about
-        Date, frames, what is measured; or why it cannot be opened.
-    thumbnail
-        Its first frame, small; None where it cannot be read.
-    there
-        Whether it can be opened.
-    """
+    """A session opened before."""
 
     path: Path
     title: str
+    """Of the experiment, or the file's name."""
     about: str
+    """Date, frames, what is measured; or why it cannot be opened."""
     thumbnail: GreyImage | None = None
+    """Its first frame, small; None where it cannot be read."""
     there: bool = True
+    """Whether it can be opened."""
 
 
 def look_at(path: Path) -> Recent:
@@ -68,8 +58,8 @@ def _counted(statuses: Sequence[str]) -> str:
     measured = sum(status == "ok" for status in statuses)
     without = sum(status not in ("", "ok") for status in statuses)
     some = "all" if measured == len(statuses) else measured or "none"
-    told = f"{pluralize(len(statuses), 'frame')}, {some} measured"
-    return f"{told}, {without} could not be" if without else told
+    message = f"{pluralize(len(statuses), 'frame')}, {some} measured"
+    return f"{message}, {without} could not be" if without else message
 
 
 def _thumbnail(session: Session, frames: np.ndarray) -> GreyImage | None:
@@ -79,7 +69,7 @@ def _thumbnail(session: Session, frames: np.ndarray) -> GreyImage | None:
         return None
     try:
         image = session.frame(int(frames[0])).image
-    except InputError:  # the recording is elsewhere; the session is whole all the same
+    except InputError:  # the recording is elsewhere; the session can be used without it
         return None
     rows, columns = image.shape
     scale = min(THUMBNAIL_PX[0] / columns, THUMBNAIL_PX[1] / rows)

@@ -26,7 +26,7 @@ PROGRESS_MS = 100
 """Progress is reported no more often."""
 
 STOP_S = 5.0
-"""A cancelled task is waited for so long."""
+"""Time, s, that a cancelled task is waited for."""
 
 
 class Cancelled(Exception):
@@ -35,21 +35,14 @@ class Cancelled(Exception):
 
 @dataclass
 class Control:
-    """What a task's work talks to.
-
-    Parameters
-    ----------
-    events
-        Where what happens goes.
-    reached
-        How far the work is: done, and in all.
-    stage
-        What of it is being done; empty where it has no parts.
-    """
+    """What a task's work talks to."""
 
     events: queue.SimpleQueue[tuple[str, Any]] = field(default_factory=queue.SimpleQueue)
+    """Receives its events."""
     reached: tuple[int, int] = (0, 0)
+    """How far the work is: done, and in all."""
     stage: str = ""
+    """What of it is being done; empty where it has no parts."""
     cancelled: threading.Event = field(default_factory=threading.Event)
 
     def progress(self, done: int, total: int, stage: str = "") -> None:
@@ -64,7 +57,7 @@ class Control:
         self.reached, self.stage = (done, total), stage
 
     def part(self, value: object) -> None:
-        """Hand over a part of the result: it reaches ``on_part`` on the GUI thread."""
+        """Pass a part of the result to ``on_part``, on the GUI thread."""
         self.check()
         self.events.put(("part", value))
 
@@ -79,29 +72,18 @@ Work = Callable[[Control], Any]
 
 @dataclass
 class Task:
-    """One piece of work under way.
-
-    Parameters
-    ----------
-    title
-        What it does, for the operator: "Measuring".
-    control
-        Its side of the talk.
-    thread
-        Where it runs.
-    on_part, on_done, beside
-        Called on the GUI thread with parts, with the result, and with why it failed.
-    kind
-        What work fails and goes well together: "Exporting", wherever to.
-    """
+    """One piece of work under way."""
 
     title: str
+    """What it does, for the operator: "Measuring"."""
     control: Control
     thread: threading.Thread
     on_part: Callable[[Any], None] | None
     on_done: Callable[[Any], None] | None
     beside: Callable[[str], object] | None
+    """Called on the GUI thread with parts, with the result, and with why it failed."""
     kind: str
+    """Tasks of one kind share a failure: "Exporting", whatever the folder."""
 
     @property
     def done(self) -> int:
@@ -119,24 +101,16 @@ class Task:
 
 
 class Tasks(QObject):
-    """The tasks of a window.
-
-    Signals
-    -------
-    changed
-        A task began or ended.
-    progressed
-        Tasks have gone on.
-    failed
-        A task failed: its title, what to tell the operator, and its kind.
-    settled
-        Work of a kind begins again: that it failed before no longer holds.
-    """
+    """The tasks of a window."""
 
     changed = Signal()
+    """A task began or ended."""
     progressed = Signal()
+    """The progress of a task changed."""
     failed = Signal(str, str, str)
+    """A task failed: its title, the message for the operator, and its kind."""
     settled = Signal(str)
+    """Work of a kind begins again: an earlier failure no longer counts."""
 
     def __init__(self, parent: QObject | None = None) -> None:
         super().__init__(parent)
@@ -163,7 +137,7 @@ class Tasks(QObject):
         work
             Called with its `Control`; touches no widget.
         on_done, on_part
-            Called on the GUI thread with what ``work`` returns, and with each part it hands over.
+            Called on the GUI thread with what ``work`` returns, and with each `Control.part`.
             Not called after a cancel or a failure.
         beside
             Shows why it failed beside what was pressed, too; called with nothing at the beginning.

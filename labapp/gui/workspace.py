@@ -35,41 +35,28 @@ class Workspace(QObject):
 
     Pages read the session through `session`, change it through `attempt`, and start long work
     through `tasks`. They show what the session holds whenever a signal says that it changed.
-
-    Signals
-    -------
-    closing
-        The session that is open will be closed: an edit under way can still be kept in it.
-    opened
-        Another session is open, or none.
-    changed
-        A document, the recording or a result changed; pages in view show the session again.
-    measured
-        Frames that are not in view were measured; told some times a second while more follow.
-    frame_changed
-        Another frame is in view.
-    notified
-        Something for the operator to read: a sentence, and whether it is a problem.
-    settled
-        What was said to be wrong no longer is: its words.
-    action_requested
-        An action of the window's menus is wanted, by its name.
-    next_session_requested
-        A session like this one is wanted for a recording: its file.
-    foot_switches_changed
-        What the pedals of foot switches do is to be remembered, as plain values.
     """
 
     closing = Signal()
+    """The session that is open will be closed: an edit under way can still be kept in it."""
     opened = Signal()
+    """Another session is open, or none."""
     changed = Signal()
+    """A document, the recording or a result changed; pages in view show the session again."""
     measured = Signal()
+    """Frames that are not in view were measured; sent some times a second while more follow."""
     frame_changed = Signal(int)
+    """Another frame is in view."""
     notified = Signal(str, bool)
+    """Something for the operator to read: a sentence, and whether it is a problem."""
     settled = Signal(str)
+    """A reported problem is solved: its words."""
     action_requested = Signal(str)
+    """Run an action of the window's menus, by its name."""
     next_session_requested = Signal(object)
+    """Begin a session like this one for a recording: its file."""
     foot_switches_changed = Signal(object)
+    """The actions of the pedals are to be stored, as plain values."""
 
     def __init__(self, parent: QObject | None = None) -> None:
         super().__init__(parent)
@@ -89,7 +76,7 @@ class Workspace(QObject):
 
     @cached_property
     def foot_switches(self) -> FootSwitches:
-        """The foot switches in use; what they need is loaded when they are first asked for."""
+        """The foot switches in use; what they need is loaded on first use."""
         from labapp.gui.foot_switches import FootSwitches
 
         made = FootSwitches(self.tasks, self)
@@ -252,17 +239,17 @@ class Workspace(QObject):
         pool = self._pool
 
         def work(control: Control) -> int:
-            done, told = 0, 0.0
+            done, emitted_s = 0, 0.0
             numbers = [int(k) for k in (session.stale_frames() if frames is None else frames)]
             try:
                 for done, (number, _) in enumerate(session.measure(numbers, pool), 1):
                     control.progress(done, len(numbers))
                     if number == self.frame:
                         control.part(None)
-                    elif time.monotonic() - told > MEASURED_S:
+                    elif time.monotonic() - emitted_s > MEASURED_S:
                         # Looked up here: the window would wait for results that are being saved.
                         control.part(session.overview())
-                        told = time.monotonic()
+                        emitted_s = time.monotonic()
             except (BrokenProcessPool, CancelledError) as error:
                 control.check()  # ended on purpose
                 self._pool = None

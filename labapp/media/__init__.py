@@ -7,7 +7,7 @@ from pathlib import Path
 
 import cv2
 
-from labapp.errors import InputError
+from labapp.errors import InputError, os_errors_as_input
 from labapp.media.base import Frame, FrameSource, GreyImage
 from labapp.media.formats.cine import CINE_MAGIC, CineSource
 from labapp.media.formats.images import IMAGE_SUFFIXES, ImageSequence, files_in, images_in
@@ -17,7 +17,7 @@ from labapp.media.formats.stored import regular_size
 from labapp.media.formats.tiff import TIFF_MAGICS, TIFF_SUFFIXES, TiffStack
 from labapp.media.quiet import quiet_opencv
 
-__all__ = ["Frame", "FrameSource", "GreyImage", "open_source"]
+__all__ = ["Frame", "FrameSource", "GreyImage", "open_source", "read_picture"]
 
 VIDEO_SUFFIXES = frozenset(
     ".avi .mkv .mp4 .m4v .mov .nut .mpg .mpeg .ts .wmv .asf .webm .ogv .flv .mxf .dv .gif".split()
@@ -26,7 +26,7 @@ RECORDING_SUFFIXES = VIDEO_SUFFIXES | {".cine", ".npy", ".npz"} | PHOTRON_SUFFIX
 
 
 def open_source(path: str | os.PathLike[str], index: bytes | None = None) -> FrameSource:
-    """Open a recording: what it is, its content tells before its name does.
+    """Open a recording; its type is recognised by its content first, then by its name.
 
     Parameters
     ----------
@@ -43,18 +43,21 @@ def open_source(path: str | os.PathLike[str], index: bytes | None = None) -> Fra
     """
     quiet_opencv()
     path = Path(path)
-    try:
+    with os_errors_as_input(path, "source", "an image, a folder of images or a video"):
         if path.is_dir():
             return _open_folder(path, index)
         size = regular_size(path)
         with path.open("rb") as file:
             head = file.read(12)
-    except OSError as error:
-        expected = "an image, a folder of images or a video"
-        raise InputError(path, "source", error.strerror, expected) from error
     if size == 0:
         raise InputError(path, "size", "0 bytes", "an image or a video with something in it")
     return _by_content(path, head, index) or _by_name(path, index)
+
+
+def read_picture(path: str | os.PathLike[str]) -> GreyImage:
+    """Grey levels of a picture, or of a recording's first frame; raises as `open_source` does."""
+    with open_source(path) as source:
+        return source.frame(0).image
 
 
 def _by_content(path: Path, head: bytes, index: bytes | None) -> FrameSource | None:
@@ -104,7 +107,7 @@ def _open_folder(path: Path, index: bytes | None) -> FrameSource:
         return ImageSequence(path, images)
     recordings = [entry for entry in files_in(path) if entry.suffix.lower() in RECORDING_SUFFIXES]
     headers = {entry.stem for entry in recordings if entry.suffix.lower() in (".cih", ".cihx")}
-    # A Photron recording is two files; its header stands for both.
+    # A Photron recording is two files; its header represents both.
     recordings = [
         entry
         for entry in recordings

@@ -19,21 +19,14 @@ GreyImage = npt.NDArray[Any]
 
 @dataclass(frozen=True)
 class Frame(ReadOnlyArrays):
-    """A frame of a source.
-
-    Parameters
-    ----------
-    index
-        Its place in the source, from 0.
-    time_s
-        Time since the source's first frame, s; None where the source has no time base.
-    image
-        Grey levels, shape (rows, columns), read-only.
-    """
+    """A frame of a source."""
 
     index: int
+    """Its place in the source, from 0."""
     time_s: float | None
+    """Time since the source's first frame, s; None where the source has no time base."""
     image: GreyImage
+    """Grey levels, shape (rows, columns), read-only."""
 
 
 class FrameSource(Protocol):

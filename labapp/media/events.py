@@ -19,23 +19,13 @@ Kind = Literal["note", "warning", "loss"]
 
 @dataclass(frozen=True)
 class Event:
-    """An event.
-
-    Parameters
-    ----------
-    source
-        A camera's id, a recording's file, a pedal's name.
-    kind
-        Severity.
-    words
-        One sentence for the operator.
-    at
-        When.
-    """
+    """An event."""
 
     source: str
+    """A camera's id, a recording's file, a pedal's name."""
     kind: Kind
     words: str
+    """One sentence for the operator."""
     at: datetime = field(default_factory=lambda: datetime.now().astimezone())
 
     def __str__(self) -> str:
@@ -60,23 +50,24 @@ def ignore_event(_: Event) -> None:
     """Discard an event."""
 
 
+EVERY_S = 1.0
+"""Least time between the reports of a `Tally`, s."""
+
+
 class Tally:
     """Counter of frequent events that reports at most once in an interval.
 
     Parameters
     ----------
     report
-        Called with the count since its last call.
-    every_s
-        Least time between calls, s.
+        Called with the count since its last call, `EVERY_S` after it at the earliest.
     """
 
-    def __init__(self, report: Callable[[int], None], every_s: float = 1.0) -> None:
+    def __init__(self, report: Callable[[int], None]) -> None:
         self.total = 0
         self._report = report
-        self._every_s = every_s
         self._unreported = 0
-        self._reported_s = -every_s
+        self._reported_s = -EVERY_S
         self._mutex = threading.Lock()
 
     def count(self, more: int = 1) -> None:
@@ -95,7 +86,7 @@ class Tally:
         at_s = time.monotonic()
         with self._mutex:
             count = self._unreported
-            if not count or not (now or at_s - self._reported_s >= self._every_s):
+            if not count or not (now or at_s - self._reported_s >= EVERY_S):
                 return
             self._unreported, self._reported_s = 0, at_s
         self._report(count)

@@ -9,5 +9,5 @@ import cv2
 
 @functools.cache
 def quiet_opencv() -> None:
-    """Silence OpenCV; what it cannot decode is reported by the reader that asked."""
+    """Silence OpenCV; what it cannot decode is reported by its reader."""
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)

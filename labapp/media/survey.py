@@ -1,4 +1,4 @@
-"""Read a recording through once at import, and check that any frame can be asked for."""
+"""Read a recording through once at import, and check that any frame can be read."""
 
 from __future__ import annotations
 
@@ -26,30 +26,20 @@ NAMED_FRAMES = 10
 
 @dataclass(frozen=True)
 class Survey(ReadOnlyArrays):
-    """Findings of reading a recording through.
-
-    Parameters
-    ----------
-    checksum
-        `frame_checksum` of each frame, shape (n,), uint32; 0 where a frame cannot be read.
-    readable
-        Whether a frame can be read, shape (n,).
-    time_s
-        Time of each frame since the first, shape (n,), s; NaN where unknown.
-    frame_exact
-        Whether the frames read again out of order were the same.
-    checked
-        How many were; 0 for a video that is decoded from its start in any case.
-    warnings
-        What the user should know beyond the source's own warnings, one sentence each.
-    """
+    """Findings of reading a recording through."""
 
     checksum: npt.NDArray[np.uint32]
+    """`frame_checksum` of each frame, shape (n,), uint32; 0 where a frame cannot be read."""
     readable: npt.NDArray[np.bool_]
+    """Whether a frame can be read, shape (n,)."""
     time_s: FloatArray
+    """Time of each frame since the first, shape (n,), s; NaN where unknown."""
     frame_exact: bool
+    """Whether the frames read again out of order were the same."""
     checked: int
+    """How many were; 0 for a video that is decoded from its start in any case."""
     warnings: tuple[str, ...]
+    """What the user should know beyond the source's own warnings, one sentence each."""
 
 
 def frame_checksum(image: GreyImage) -> int:

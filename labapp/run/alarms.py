@@ -17,7 +17,7 @@ from labapp.run.limits import NAMES, Limits, Size, Standing, sizes_of, standing
 from labapp.text import pluralize
 
 CALM_S = 1.0
-"""An alarm is over when its cause has been away for so long, by the camera's clock."""
+"""Time without its cause, s by the camera's clock, after which an alarm is over."""
 
 NOT_MEASURED, SILENT = "not-measured", "silent"
 """Codes of the alarms of frames that cannot be measured, and of none that is; others are as
@@ -26,31 +26,21 @@ NOT_MEASURED, SILENT = "not-measured", "silent"
 
 @dataclass(frozen=True)
 class Alarm:
-    """Something that the operator must see.
-
-    Parameters
-    ----------
-    code
-        ``width-low``, ``width-high`` … ``height-high``, ``not-measured`` or ``silent``.
-    words
-        What is wrong, a sentence without its full stop.
-    frame, time_s
-        The camera's number of the frame that raised it, and its time by the camera's clock, s.
-    holds
-        Whether it is so still.
-    acknowledged
-        Whether the operator has acknowledged it.
-    at
-        When it was raised.
-    """
+    """Something that the operator must see."""
 
     code: str
+    """``width-low``, ``width-high`` … ``height-high``, ``not-measured`` or ``silent``."""
     words: str
+    """What is wrong, a sentence without its full stop."""
     frame: int
     time_s: float
+    """The camera's number of the frame that raised it, and its time by the camera's clock, s."""
     holds: bool = True
+    """Whether its condition still holds."""
     acknowledged: bool = False
+    """Whether the operator has acknowledged it."""
     at: datetime = field(default_factory=lambda: datetime.now().astimezone())
+    """When it was raised."""
 
     @property
     def description(self) -> str:

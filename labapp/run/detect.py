@@ -12,10 +12,11 @@ from labapp.core.images.find_dots import DotSettings, find_dots
 from labapp.core.rows.find_lattice import LatticeSettings, find_lattice
 from labapp.core.rows.lattice import Lattice
 from labapp.core.values import CannotMeasure
-from labapp.errors import InputError
-from labapp.export.tables import PX_DIGITS, as_csv, number
+from labapp.errors import os_errors_as_input
+from labapp.export.tables import PX_DIGITS, number
 from labapp.files import write_atomically
-from labapp.media import open_source
+from labapp.media import read_picture
+from labapp.text import csv_text
 
 COLUMNS = "u_px v_px reflected_row reflected_column snr u_sigma_px v_sigma_px".split()
 
@@ -37,8 +38,7 @@ def detect_dots(
     InputError
         If the source cannot be read.
     """
-    with open_source(path) as source:
-        image = source.frame(0).image
+    image = read_picture(path)
     settings = DotSettings(band_pass=BandPassSettings(size_px=size_px))
     dots = Dots(*np.empty((7, 0)))
     try:
@@ -67,8 +67,6 @@ def write_detected(path: Path, dots: Dots, lattice: Lattice | None) -> None:
         ]
         for k in range(len(dots))
     ]
-    try:
+    with os_errors_as_input(path, "--out", "a file that can be written"):
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_atomically(path, as_csv([COLUMNS, *rows]).encode())
-    except OSError as error:
-        raise InputError(path, "--out", error.strerror, "a file that can be written") from error
+        write_atomically(path, csv_text([COLUMNS, *rows]).encode())

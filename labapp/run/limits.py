@@ -13,13 +13,13 @@ from labapp.core.values import BoolArray, FloatArray
 from labapp.errors import InputError
 
 CHANCE = 2.0
-"""Beyond a limit by no more than so many σ, a size may be there by chance: that is no alarm.
+"""Number of σ by which a size may be beyond a limit by chance: that is no alarm.
 
 σ covers noise, level and set-up.
 """
 
 UNMEASURED = 3
-"""So many frames in a row that cannot be measured are an alarm, by default."""
+"""Default number of frames in a row without a measurement that are an alarm."""
 
 LARGEST_MM = 1000.0
 
@@ -53,15 +53,6 @@ class Size(NamedTuple):
 class Limits:
     """Between what the sizes of a pool are to be; the ends are mm, None where there is none.
 
-    Parameters
-    ----------
-    width_mm, length_mm
-        Lowest and highest.
-    height_mm
-        The same of the height; of a hollow pool of the depth, which is negative.
-    unmeasured
-        So many frames in a row that cannot be measured are an alarm.
-
     Raises
     ------
     InputError
@@ -70,8 +61,11 @@ class Limits:
 
     width_mm: Ends = (None, None)
     length_mm: Ends = (None, None)
+    """Lowest and highest."""
     height_mm: Ends = (None, None)
+    """The same of the height; of a hollow pool of the depth, which is negative."""
     unmeasured: int = UNMEASURED
+    """Number of frames in a row without a measurement that are an alarm."""
 
     def __post_init__(self) -> None:
         problems = []

@@ -13,12 +13,12 @@ from labapp.config.setup import Setup
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.quality import Quality, judge_quality
 from labapp.export.frame_result import FrameResult, without_surface
-from labapp.export.scene import Scene, scene_of
+from labapp.export.rendering.scene import Scene, scene_of
 from labapp.media.cameras import CameraFrame
 from labapp.simulation.parallel import end_processes, start_worker
 
 JUDGED_S = 0.2
-"""How long the quality of a frame stands for those that follow, s."""
+"""How long the quality of a frame applies to those that follow, s."""
 
 SOUGHT_S = 1.0
 """For so long after a frame that was measured, s, frames that cannot be followed are left out: the
@@ -31,39 +31,22 @@ class LiveMeasuringEnded(Exception):
 
 @dataclass(frozen=True, kw_only=True)
 class LiveResult(FrameResult):
-    """What a live frame gave: status, reason and measures, without dots, rays and surface.
-
-    Parameters
-    ----------
-    time_s
-        By the camera's clock, s.
-    arrived_s
-        `time.monotonic` when it came, s: the sizes are as old.
-    quality
-        How fit the frame is to be measured; of a followed one, that of a frame at most `JUDGED_S`
-        before.
-    scene
-        Its surface to be drawn, if wanted; None where it could not be measured.
-    """
+    """What a live frame gave: status, reason and measures, without dots, rays and surface."""
 
     time_s: float
+    """By the camera's clock, s."""
     arrived_s: float
+    """`time.monotonic` when it came, s: the sizes are as old."""
     quality: Quality
+    """How fit the frame is to be measured; of a followed one, that of a frame at most `JUDGED_S`
+    before.
+    """
     scene: Scene | None = None
+    """Its surface to be drawn, if wanted; None where it could not be measured."""
 
 
 class LiveMeasuring:
-    """Measures frames in one process; each call waits for its frame.
-
-    Parameters
-    ----------
-    setup
-        Rig and image calibration.
-    settings
-        Of the measurement.
-    bit_depth
-        Significant bits of a grey level.
-    """
+    """Measures frames in one process; each call waits for its frame."""
 
     def __init__(self, setup: Setup, settings: Settings, bit_depth: int) -> None:
         spawn = multiprocessing.get_context("spawn")

@@ -44,13 +44,13 @@ class FrameQueue:
         self._given_s = 0.0
         """When the frame that is measured now arrived."""
         self._in_order = self._followed = 0
-        """How many of those that wait come next in any case, and how many followed of late."""
+        """How many of those that wait come next in any case, and how many followed recently."""
         self._is_behind = self._is_old = False
         """Whether a frame found no room, and whether the one measured now came in its order."""
 
     @property
     def every(self) -> int:
-        """Every so many-th frame is measured."""
+        """Step between frames that are measured."""
         return self._every
 
     def put(self, frame: CameraFrame) -> None:

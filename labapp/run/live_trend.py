@@ -16,7 +16,7 @@ from labapp.run.limits import NAMES, Limits, beyond, sizes_of
 from labapp.run.live_measuring import LiveResult
 
 RATE_S = 2.0
-"""Rates are those of so long."""
+"""Time over which rates are taken, s."""
 
 TREND_S = 120.0
 """The trend goes back so far."""
@@ -27,45 +27,30 @@ MOST_KEPT = 12_000
 
 @dataclass(frozen=True)
 class Trend(ReadOnlyArrays):
-    """Sizes of the last frames that were tried; n frames, the oldest first.
-
-    Parameters
-    ----------
-    names
-        What the three sizes are: the last is ``height``, or of a hollow pool ``depth``.
-    number
-        The camera's numbers of them, shape (n,).
-    since_s
-        When they came, from now on and so negative, shape (n,), s.
-    value_mm, sigma_mm
-        Of width, length and height, shape (3, n); NaN where they are not known.
-    beyond
-        Which of them are beyond a limit, shape (3, n).
-    """
+    """Sizes of the last frames that were tried; n frames, the oldest first."""
 
     names: tuple[str, ...]
+    """What the three sizes are: the last is ``height``, or of a hollow pool ``depth``."""
     number: IntArray
+    """The camera's numbers of them, shape (n,)."""
     since_s: FloatArray
+    """When they came, from now on and so negative, shape (n,), s."""
     value_mm: FloatArray
     sigma_mm: FloatArray
+    """Of width, length and height, shape (3, n); NaN where they are not known."""
     beyond: BoolArray
+    """Which of them are beyond a limit, shape (3, n)."""
 
 
 @dataclass(frozen=True)
 class Pace:
-    """How measuring keeps up, of late.
-
-    Parameters
-    ----------
-    measured_hz
-        Frames measured a second.
-    tried, failed
-        How many frames were tried, and of them could not be measured.
-    """
+    """How measuring keeps up at present."""
 
     measured_hz: float
+    """Frames measured a second."""
     tried: int
     failed: int
+    """How many frames were tried, and of them could not be measured."""
 
 
 class _Frame(NamedTuple):
@@ -111,7 +96,7 @@ class LiveTrend:
         return Pace((len(late) - failed) / RATE_S, len(late), failed)
 
     def over(self, last_s: float, limits: Limits) -> Trend:
-        """Sizes of the frames that came in the last so many seconds, compared with limits."""
+        """Sizes of the frames of the last seconds, compared with limits."""
         now_s = time.monotonic()
         with self._turn:
             late = [each for each in self._frames if each.arrived_s > now_s - last_s]

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from labapp.config.setup import Setup
 from labapp.core.pipeline import Measurement, Settings
 from labapp.export.frame_result import FrameResult
-from labapp.export.scene import Scene
+from labapp.export.rendering.scene import Scene
 from labapp.media.cameras import CameraFrame
 from labapp.media.events import Event
 from labapp.run.alarms import Alarm, Alarms
@@ -21,7 +21,7 @@ from labapp.run.live_trend import LiveTrend
 from labapp.run.streams import Stream, stream_values
 
 SILENT_S = 10.0
-"""No result for so long, s, is an alarm. A frame that is measured by itself takes seconds."""
+"""Time without a result, s, that is an alarm. A frame that is measured by itself takes seconds."""
 
 
 class LiveWatch:
@@ -156,7 +156,7 @@ class LiveWatch:
         self._is_drawn.set()
 
     def scene(self) -> Scene | None:
-        """The surface asked for; None before it is there, and if it was returned before."""
+        """The requested surface; None before it is there, and if it was returned before."""
         return self._scene.popleft() if self._scene else None
 
     def stream(self, kind: str) -> Stream | None:

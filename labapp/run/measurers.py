@@ -37,7 +37,7 @@ from labapp.simulation.parallel import NICE, start_worker
 T = TypeVar("T")
 
 AHEAD = 8
-"""So many frames are submitted to a pool of processes beyond the one whose result is awaited."""
+"""Number of frames submitted to a pool of processes beyond the one whose result is awaited."""
 
 VOTERS, WAITS = 3, 5
 """A frame is judged with two more that have a surface, so that of three that disagree two decide;
@@ -64,25 +64,16 @@ Corrected = Callable[[int], Correction | None]
 
 @dataclass(frozen=True)
 class ColdMeasurer:
-    """Measures each frame as if it were the first.
-
-    Parameters
-    ----------
-    read
-        Reads frames; one that cannot be read gets the status ``unreadable``.
-    setup, settings
-        What frames are measured with.
-    corrected
-        Gives the corrections by hand.
-    pool
-        Where to measure (`measuring_pool`), some frames ahead; None: here, one after the other.
-    """
+    """Measures each frame as if it were the first."""
 
     read: Read
+    """Reads frames; one that cannot be read gets the status ``unreadable``."""
     setup: Setup
     settings: Settings
     corrected: Corrected = lambda _: None
+    """Gives the corrections by hand."""
     pool: Executor | None = None
+    """Where to measure (`measuring_pool`), some frames ahead; None: here, one after the other."""
 
     def __call__(self, frames: Iterable[int]) -> Generator[FrameResult]:
         """Measure frames; see `runner.Measurer`."""
@@ -191,7 +182,7 @@ def measuring_pool(workers: int) -> ProcessPoolExecutor:
 
 
 def _results_in_order(begun: Iterable[Future[T]], ahead: int) -> Generator[T]:
-    """Results in their order, so many begun ahead, which are cancelled if it is closed early."""
+    """Results in their order, some begun ahead, which are cancelled if it is closed early."""
     waiting: deque[Future[T]] = deque()
     try:
         for future in begun:
@@ -216,17 +207,13 @@ class WarmMeasurer:
     """Measures each frame from the one before, here, in stretches (`WarmChain`).
 
     A frame that was corrected by hand is measured by itself, as it was corrected.
-
-    Parameters
-    ----------
-    read, setup, settings, corrected
-        As of `ColdMeasurer`.
     """
 
     read: Read
     setup: Setup
     settings: Settings
     corrected: Corrected = lambda _: None
+    """As of `ColdMeasurer`."""
 
     def __call__(self, frames: Iterable[int]) -> Generator[FrameResult]:
         """Measure frames; see `runner.Measurer`."""
@@ -258,20 +245,6 @@ class RecordingMeasurer:
 
     Each process opens the recording itself. Results have the rows of the tables (`FrameResult`).
 
-    Parameters
-    ----------
-    path, index
-        The recording, and what opening it found out (`FrameSource.index`), where it was.
-    setup, settings
-        What it is measured with.
-    with_surfaces
-        Whether results have dots, rays and surface, too: to pass them from process to process takes
-        a twentieth of the time that it took to measure them.
-    sigma_parts
-        Whether rows have the parts of standard uncertainties, too.
-    pools
-        Where to measure (`stretch_pools`); none: here.
-
     Raises
     ------
     InputError
@@ -280,11 +253,17 @@ class RecordingMeasurer:
 
     path: Path
     index: bytes | None
+    """The recording, and what opening it found out (`FrameSource.index`), where it was."""
     setup: Setup
     settings: Settings
     with_surfaces: bool = False
+    """Whether results have dots, rays and surface, too: to pass them from process to process takes
+    a twentieth of the time that it took to measure them.
+    """
     sigma_parts: bool = False
+    """Whether rows have the parts of standard uncertainties, too."""
     pools: Sequence[Executor] = ()
+    """Where to measure (`stretch_pools`); none: in this process."""
 
     def __call__(self, frames: Iterable[int]) -> Generator[FrameResult]:
         """Measure frames; see `runner.Measurer`."""

@@ -200,13 +200,6 @@ class OpcuaStream:
     They are ``Objects/Pool/NAME`` in the namespace ``urn:labapp:measures``; NaN where unknown.
     Needs asyncua, which the extra ``control`` installs.
 
-    Parameters
-    ----------
-    host, port
-        Where to listen.
-    anywhere
-        Whether other machines may connect.
-
     Raises
     ------
     InputError

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, get_args
 from urllib.parse import quote
 
-from labapp.errors import InputError
+from labapp.errors import InputError, os_errors_as_input
 from labapp.files import atomic_file
 from labapp.session.documents import Key, Kind
 from labapp.session.file.database import SUFFIX, new_session_path
@@ -31,13 +31,6 @@ def copy_session(source: Path, path: str | os.PathLike[str]) -> Path:
 
     The copy refers to the same recording, which is read through once to verify it, unless the copy
     is in the same folder.
-
-    Parameters
-    ----------
-    source
-        The session file.
-    path
-        The new one.
 
     Raises
     ------
@@ -69,13 +62,6 @@ def next_session(session: Session, path: str | os.PathLike[str]) -> Session:
 
     Record, set-up, calibrations with their pictures, settings and limits are copied; the safety
     list, the recording and what was measured from it are not.
-
-    Parameters
-    ----------
-    session
-        The template; it is not changed.
-    path
-        The new file.
 
     Raises
     ------
@@ -122,7 +108,7 @@ def copy_sample(name: str, folder: Path) -> Path:
     """
     sample = sample_folder(name)
     session = f"{name}{SUFFIX}"
-    try:
+    with os_errors_as_input(folder, "folder", "one that can be written"):
         folder.mkdir(parents=True, exist_ok=True)
         for each in (SAMPLES[name].recording, session):
             if (folder / each).exists():
@@ -132,6 +118,4 @@ def copy_sample(name: str, folder: Path) -> Path:
                 copy = shutil.copytree if (sample / each).is_dir() else shutil.copyfile
                 copy(sample / each, part)
                 part.rename(folder / each)
-    except OSError as error:
-        raise InputError(folder, "folder", error.strerror, "one that can be written") from error
     return folder / session

@@ -102,7 +102,7 @@ def read_correction(
     blocked = frozenset(row.row for row in rows if row.blocked)
     lattice = Lattice(site[:, 0], site[:, 1], blocked_rows=blocked)
     manual = changed | np.append(before.manual, True)[source]
-    # Left to be found: that also tells which sites it could be.
+    # Left to be found: that also determines which sites it could be.
     return set_reference(Correction(replace(dots, u_px=u, v_px=v), lattice, manual), None)
 
 

@@ -59,27 +59,17 @@ MAX_HISTORY_BYTES = 64_000_000
 
 @dataclass(frozen=True)
 class Change:
-    """One step of the history.
-
-    Parameters
-    ----------
-    number
-        Counts up over the session's life.
-    label
-        What was done.
-    made
-        When, ISO 8601.
-    undone
-        Whether it was undone, and can be redone.
-    keys
-        The documents that it set.
-    """
+    """One step of the history."""
 
     number: int
+    """Counts up over the session's life."""
     label: str
     made: str
+    """When, ISO 8601."""
     undone: bool
+    """Whether it was undone, and can be redone."""
     keys: tuple[Key, ...]
+    """The documents that it set."""
 
 
 class Documents:

@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from labapp.core.values import IntArray
-from labapp.errors import InputError
+from labapp.errors import InputError, os_errors_as_input
 from labapp.export.summary import format_ranges
 from labapp.media import Frame, FrameSource, GreyImage, open_source
 from labapp.media.formats.images import decoded
@@ -42,13 +42,7 @@ PAIRED = frozenset({".cih", ".cihx", ".mraw"})
 
 
 class Frames:
-    """The recording of a session and its frames; may be used from several threads.
-
-    Parameters
-    ----------
-    database
-        The session file.
-    """
+    """The recording of a session and its frames; may be used from several threads."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
@@ -426,7 +420,7 @@ def identify(path: Path) -> tuple[int, str]:
     InputError
         If it cannot be read.
     """
-    try:
+    with os_errors_as_input(path, "recording", "one that can be read"):
         files = _files(path)
         size = 0
         digests = []
@@ -437,8 +431,6 @@ def identify(path: Path) -> tuple[int, str]:
                 while part := stream.read(READ_BYTES):
                     digest.update(part)
             digests.append((file.name, digest.hexdigest()))
-    except OSError as error:
-        raise InputError(path, "recording", error.strerror, "one that can be read") from error
     if len(files) == 1 and files[0] == path:
         return size, digests[0][1]
     return size, hashlib.sha256(repr(digests).encode()).hexdigest()

@@ -32,18 +32,12 @@ MAX_STASHED_BYTES = 64_000_000
 
 @dataclass(frozen=True)
 class Basis:
-    """Inputs of a measurement besides the image.
-
-    Parameters
-    ----------
-    setup
-        Rig and image calibration.
-    settings
-        Of every step, the scheme included.
-    """
+    """Inputs of a measurement besides the image."""
 
     setup: Setup
+    """Rig and image calibration."""
     settings: Settings
+    """Of every step, the scheme included."""
 
     @property
     def scheme(self) -> str:
@@ -57,64 +51,40 @@ class Basis:
 
 @dataclass(frozen=True)
 class Result:
-    """Stored result of one frame by one scheme.
-
-    Parameters
-    ----------
-    frame
-        Its number in the recording.
-    measurement
-        Its measurement.
-    scheme
-        Name of the scheme, as in `Basis.scheme`.
-    version
-        Version of labapp that measured it.
-    measured
-        When, ISO 8601.
-    setup
-        The setup it was measured with, TOML.
-    settings
-        The settings it was measured with.
-    stale
-        Why it is stale, a clause each; empty if it is not.
-    """
+    """Stored result of one frame by one scheme."""
 
     frame: int
+    """Its number in the recording."""
     measurement: Measurement
     scheme: str
+    """Name of the scheme, as in `Basis.scheme`."""
     version: str
+    """Version of labapp that measured it."""
     measured: str
+    """When, ISO 8601."""
     setup: str
+    """The setup it was measured with, TOML."""
     settings: Settings
     stale: tuple[str, ...]
+    """Why it is stale, a clause each; empty if it is not."""
 
 
 @dataclass(frozen=True)
 class Overview(ReadOnlyArrays):
-    """Status, staleness and measures of all frames of a session; n frames.
-
-    Parameters
-    ----------
-    frame
-        Numbers in the recording, ascending, shape (n,).
-    time_s
-        Times, shape (n,), s; NaN where unknown.
-    status
-        Each frame's status; empty where it was not measured.
-    corrected
-        Which frames have a correction by hand, shape (n,).
-    stale
-        Which results are stale, shape (n,).
-    measures
-        Name → values, shape (n,), of `Measures`; NaN where there is none.
-    """
+    """Status, staleness and measures of all frames of a session; n frames."""
 
     frame: IntArray
+    """Numbers in the recording, ascending, shape (n,)."""
     time_s: FloatArray
+    """Times, shape (n,), s; NaN where unknown."""
     status: tuple[str, ...]
+    """Each frame's status; empty where it was not measured."""
     corrected: BoolArray
+    """Which frames have a correction by hand, shape (n,)."""
     stale: BoolArray
+    """Which results are stale, shape (n,)."""
     measures: dict[str, FloatArray]
+    """Name → values, shape (n,), of `Measures`; NaN where there is none."""
 
 
 class _Row(NamedTuple):
@@ -129,13 +99,7 @@ class _Row(NamedTuple):
 
 
 class Results:
-    """The results of a session.
-
-    Parameters
-    ----------
-    database
-        The session file.
-    """
+    """The results of a session."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
@@ -178,13 +142,7 @@ class Results:
             _replace(connection, frame, basis.scheme, row, measurement)
 
     def restore(self, changed: Collection[tuple[str, int]]) -> None:
-        """Restore the stashed results of frames whose correction was changed.
-
-        Parameters
-        ----------
-        changed
-            Kind and frame of the documents that were set.
-        """
+        """Restore stashed results where a ``("correction", frame)`` was changed."""
         for kind, frame in changed:
             if kind == "correction":
                 self._restore(frame)
@@ -253,7 +211,7 @@ class Results:
         frame, scheme
             Which result.
         basis, correction
-            Present inputs, to tell whether it is stale; basis None where the setup is incomplete.
+            Present inputs, to see whether it is stale; basis None where the setup is incomplete.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""From a session to an export: which results go out, and what is told of where they come from."""
+"""From a session to an export: which results go out, with their provenance."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ def _result(session: SessionContents, frame: int, scheme: str) -> Result:
 
 
 def _provenance(session: SessionContents, scheme: str, frames: Sequence[int]) -> dict[str, object]:
-    """What an export tells of source, setup, settings and versions; plain values."""
+    """Source, setup, settings and versions of an export; plain values."""
     recording, first = session.recording, _result(session, frames[0], scheme)
     source = {} if recording is None else asdict(recording)
     source.pop("index", None)

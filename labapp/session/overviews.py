@@ -40,41 +40,26 @@ QUERY = (
 
 @dataclass
 class _Table:
-    """Results of a scheme as last read, one row per frame.
-
-    Parameters
-    ----------
-    number, time_s, inputs
-        Of the frame; row of `inputs` that it was measured from, 0 where it was not; shape (n,).
-    used, held
-        SHA-256 of the correction it was measured with, and of the present one; None without.
-    status, sizes
-        Of the result: shape (n,) and (n, number of measures).
-    due
-        Frames that have changed since.
-    seen
-        The overview made from it last, and the outdated rows of `inputs` then.
-    """
+    """Results of a scheme as last read, one row per frame."""
 
     number: IntArray
     time_s: FloatArray
     inputs: IntArray
+    """Of the frame; row of `inputs` that it was measured from, 0 where it was not; shape (n,)."""
     used: np.ndarray[tuple[int], np.dtype[np.object_]]
     held: np.ndarray[tuple[int], np.dtype[np.object_]]
+    """SHA-256 of the correction it was measured with, and of the present one; None without."""
     status: np.ndarray[tuple[int], np.dtype[np.object_]]
     sizes: FloatArray
+    """Of the result: shape (n,) and (n, number of measures)."""
     due: set[int] = field(default_factory=set)
+    """Frames that have changed since."""
     seen: tuple[Collection[int], Overview] | None = None
+    """The overview made from it last, and the outdated rows of `inputs` then."""
 
 
 class Overviews:
-    """The overviews of a session, one per scheme; thread-safe.
-
-    Parameters
-    ----------
-    database, results
-        The session file, and its results.
-    """
+    """The overviews of a session, one per scheme; thread-safe."""
 
     def __init__(self, database: Database, results: Results) -> None:
         self._database = database

@@ -12,19 +12,7 @@ from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
 
 @dataclass(frozen=True)
 class Record:
-    """The experiment record; empty or None where nothing was noted.
-
-    Parameters
-    ----------
-    title, operator, material, gas, notes
-        In the operator's words.
-    thickness_mm, current_a, voltage_v, travel_speed_mm_s, gas_flow_l_min
-        The weld's parameters.
-    expected_width_mm, expected_length_mm, expected_height_mm
-        Size of the pool that is expected; a negative height is a concave one.
-    safety
-        Items of the safety list (Appendix II) that were ticked: (item, ISO 8601 time) pairs.
-    """
+    """The experiment record in the operator's words; empty or None where nothing was noted."""
 
     title: str = ""
     operator: str = ""
@@ -38,174 +26,120 @@ class Record:
     expected_width_mm: float | None = None
     expected_length_mm: float | None = None
     expected_height_mm: float | None = None
+    """Size of the pool that is expected; a negative height is a concave one."""
     notes: str = ""
     safety: tuple[tuple[str, str], ...] = ()
+    """Items of the safety list (Appendix II) that were ticked: (item, ISO 8601 time) pairs."""
 
 
 @dataclass(frozen=True)
 class LaserReadings:
-    """A laser calibration (Appendix I) and what it was found from.
-
-    Parameters
-    ----------
-    l1_mm, l2_mm, l3_mm
-        Lengths of the cross as read, mm; one or more of each.
-    fan_angle_deg
-        Fan angle of the cross-hair lens, degrees.
-    found
-        What follows from them.
-    picture_sha256
-        The picture of the cross-hair, kept in the session; None where lengths were typed.
-    fan_angle_sigma_deg
-        Standard uncertainty of the fan angle, degrees; None in files of before it was asked for.
-    resolution_mm
-        Smallest step of the callipers, mm; None likewise.
-    """
+    """A laser calibration (Appendix I) and what it was found from."""
 
     l1_mm: tuple[float, ...]
     l2_mm: tuple[float, ...]
     l3_mm: tuple[float, ...]
+    """Lengths of the cross as read, mm; one or more of each."""
     fan_angle_deg: float
+    """Fan angle of the cross-hair lens, degrees."""
     found: LaserCalibration
+    """What follows from them."""
     picture_sha256: str | None = None
+    """The picture of the cross-hair, kept in the session; None where lengths were typed."""
     fan_angle_sigma_deg: float | None = None
+    """Standard uncertainty of the fan angle, degrees; None in older files."""
     resolution_mm: float | None = None
+    """Smallest step of the callipers, mm; None likewise."""
 
 
 @dataclass(frozen=True)
 class PlanePicture:
-    """An imaging-plane calibration (§5.1) and what it was found from.
-
-    Parameters
-    ----------
-    unit_mm
-        Length of a unit of the target's axes, or edge of a board's squares, mm.
-    found
-        What was found in the picture.
-    picture_sha256
-        The picture, kept in the session.
-    """
+    """An imaging-plane calibration (§5.1) and what it was found from."""
 
     unit_mm: float
+    """Length of a unit of the target's axes, or edge of a board's squares, mm."""
     found: PlaneCalibration | BoardCalibration
+    """What was found in the picture."""
     picture_sha256: str
+    """The picture, kept in the session."""
 
 
 @dataclass(frozen=True)
 class MirrorPicture(ReadOnlyArrays):
-    """A picture of a known mirror (bench check), and what became of its n dots with a ray.
-
-    Parameters
-    ----------
-    name
-        Of the picture's file.
-    kind
-        Which mirror it shows.
-    height_mm
-        Height of the plate's surface, or of the top of a cap or ball, over the work piece.
-    diameter_mm
-        Of the cap's rim or of the ball; None for a plate.
-    picture_sha256
-        The picture, kept in the session.
-    ray
-        Ray (i, j) of each dot, counted from 1, shape (n, 2).
-    dot_px, computed_px
-        Where it is, and where the adjusted bench has it, (u, v), shape (n, 2), px.
-    residual_mm
-        Observed minus computed dot on the plane, shape (n, 2), mm.
-    measured
-        The mirror, measured with the adjusted bench as if its size were not known: (name, known,
-        measured, standard uncertainty by the noise of the dots), mm.
-    """
+    """A picture of a known mirror (bench check), and what became of its n dots with a ray."""
 
     name: str
+    """Of the picture's file."""
     kind: str
     height_mm: float
+    """Height of the plate's surface, or of the top of a cap or ball, over the work piece."""
     diameter_mm: float | None
+    """Of the cap's rim or of the ball; None for a plate."""
     picture_sha256: str
+    """The picture, kept in the session."""
     ray: IntArray
+    """Ray (i, j) of each dot, counted from 1, shape (n, 2)."""
     dot_px: FloatArray
     computed_px: FloatArray
+    """Where it is, and where the adjusted bench has it, (u, v), shape (n, 2), px."""
     residual_mm: FloatArray
+    """Observed minus computed dot on the plane, shape (n, 2), mm."""
     measured: tuple[tuple[str, float, float, float], ...] = ()
+    """The mirror, measured with the adjusted bench as if its size were not known: (name, known,
+    measured, standard uncertainty by the noise of the dots), mm.
+    """
 
 
 @dataclass(frozen=True)
 class BenchCheckRecord(ReadOnlyArrays):
-    """A bench check and what it was found from.
-
-    Parameters
-    ----------
-    date
-        When it was made, ISO 8601.
-    pictures
-        The mirrors and their dots.
-    quantities
-        Keys of the q quantities that were adjusted (`uncertainty.QUANTITIES`).
-    before, before_sigma, after, after_sigma
-        Their values and standard uncertainties before and after, shape (q,), in their units.
-    """
+    """A bench check and what it was found from."""
 
     date: str
+    """When it was made, ISO 8601."""
     pictures: tuple[MirrorPicture, ...]
     quantities: tuple[str, ...]
+    """Keys of the q quantities that were adjusted (`uncertainty.QUANTITIES`)."""
     before: FloatArray
     before_sigma: FloatArray
     after: FloatArray
     after_sigma: FloatArray
+    """Their values and standard uncertainties before and after, shape (q,), in their units."""
 
 
 @dataclass(frozen=True)
 class Recording:
-    """Where a session's frames come from, as it was found at import.
-
-    Parameters
-    ----------
-    path
-        Relative to the session's folder where that can be said, with ``/``; else absolute.
-    size
-        Of all its files together, bytes.
-    sha256
-        Of the file; of a recording of several files, of their names and SHA-256.
-    description
-        Codec, frame size, depth and rate, in words.
-    frames, rows, columns, bit_depth
-        Frames in the recording, of which a session may use a part; their size, px; significant
-        bits of a grey level.
-    frame_rate_hz
-        The rate that the session's times follow; None where there is no time base.
-    rate_is_given
-        Whether the rate was given at import; otherwise it is the recording's own.
-    frame_exact
-        Whether frames read at random were those read in order.
-    selected
-        Start, stop and step of the frames that the session uses.
-    embedded
-        Whether the session holds these frames itself.
-    warnings
-        What the user should know, one sentence each.
-    index
-        What opening it again needs to know (`FrameSource.index`).
-    imported
-        When, ISO 8601.
-    frames_sha256
-        Of the number, time and checksum of every frame that the session uses.
-    """
+    """Where a session's frames come from, as it was found at import."""
 
     path: str
+    """Relative to the session's folder where that can be said, with ``/``; else absolute."""
     size: int
+    """Of all its files together, bytes."""
     sha256: str
+    """Of the file; of a recording of several files, of their names and SHA-256."""
     description: str
+    """Codec, frame size, depth and rate, in words."""
     frames: int
     rows: int
     columns: int
     bit_depth: int
+    """Frames in the recording, of which a session may use a part; their size, px; significant bits
+    of a grey level.
+    """
     frame_rate_hz: float | None
+    """The rate that the session's times follow; None where there is no time base."""
     rate_is_given: bool
+    """Whether the rate was given at import; otherwise it is the recording's own."""
     frame_exact: bool
+    """Whether frames read at random were those read in order."""
     selected: tuple[int, int, int]
+    """Start, stop and step of the frames that the session uses."""
     embedded: bool
+    """Whether the session holds these frames itself."""
     warnings: tuple[str, ...]
+    """What the user should know, one sentence each."""
     index: bytes | None
+    """What opening it again needs to know (`FrameSource.index`)."""
     imported: str
+    """When, ISO 8601."""
     frames_sha256: str = ""
+    """Of the number, time and checksum of every frame that the session uses."""

@@ -1,19 +1,12 @@
-"""The sample runs, and the sessions made of them by the calls that a script would make.
-
-``python -m labapp.session.samples [NAME …]`` makes those in `sample_sessions` anew.
-"""
+"""The sample runs, and new sessions of them."""
 
 from __future__ import annotations
 
 import contextlib
-import sys
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from labapp.bundled import bundled
-from labapp.core.pipeline import start_correction
-from labapp.core.rows.correction import block_row, set_reference
 from labapp.errors import InputError
 from labapp.session.record import Record
 from labapp.session.session import Session
@@ -24,33 +17,11 @@ UNIT_MM = 6.35
 
 @dataclass(frozen=True)
 class SampleSession:
-    """What is known of a sample besides its folder.
-
-    Parameters
-    ----------
-    recording
-        The recording's name in the folder.
-    record
-        The experiment record.
-    finish
-        What somebody did after the first measuring.
-    """
+    """What is known of a sample besides its folder."""
 
     recording: str
+    """The recording's name in the folder."""
     record: Record
-    finish: Callable[[Session], None] = lambda _: None
-
-
-def correct_frame_2(session: Session) -> None:
-    """Name the reference and the blocked rows of frame 2; the frames after it are left to you."""
-    result = session.result(2)
-    assert result is not None
-    correction = set_reference(start_correction(result.measurement), (6, 8))
-    for row in (1, 2, 6, 7, 8):
-        correction = block_row(correction, row)
-    session.correct({2: correction}, "reference and blocked rows of frame 2")
-    for _ in session.measure([2]):
-        pass
 
 
 SIMULATED = "Simulated: labapp.simulation.samples."
@@ -87,7 +58,6 @@ SAMPLES = {
             operator="labapp",
             notes=f"{SIMULATED} Frame 2 was corrected by hand, frames 3 to 5 were not.",
         ),
-        correct_frame_2,
     ),
     "concave": SampleSession(
         "recording",
@@ -130,18 +100,3 @@ def begin_session(name: str, path: Path) -> Session:
         session.import_recording(folder / sample.recording)
         on_failure.pop_all()
     return session
-
-
-def main(names: Sequence[str]) -> None:
-    """Make the sessions named, or all; those that are there are replaced."""
-    for name in names or SAMPLES:
-        path = sample_folder(name) / f"{name}.labsession"
-        path.unlink(missing_ok=True)
-        with begin_session(name, path) as session:
-            for _ in session.measure():
-                pass
-            SAMPLES[name].finish(session)
-
-
-if __name__ == "__main__":
-    main(sys.argv[1:])

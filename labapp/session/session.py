@@ -100,7 +100,7 @@ class Session(SessionContents):
         Raises
         ------
         InputError
-            If a section is not one; whether values are possible is told by `setup`.
+            If a section is not one; whether values are possible is checked by `setup`.
         """
         self._documents.change(label, {("setup", NO_FRAME): self._updated_setup(values)})
 
@@ -163,10 +163,9 @@ class Session(SessionContents):
             PlaneCalibrationSettings,
             calibrate_plane,
         )
-        from labapp.media import open_source
+        from labapp.media import read_picture
 
-        with open_source(picture) as source:
-            image = source.frame(0).image
+        image = read_picture(picture)
         settings = PlaneCalibrationSettings(unit_mm=unit_mm)
         found = calibrate_plane(image, settings, lens_of(self.setup_text))
         self.use_plane(found, unit_mm, image, Path(picture).name)
@@ -192,12 +191,9 @@ class Session(SessionContents):
             If one cannot be read.
         """
         from labapp.core.calibration.board_calibration import calibrate_board
-        from labapp.media import open_source
+        from labapp.media import read_picture
 
-        images = []
-        for picture in pictures:
-            with open_source(picture) as source:
-                images.append(source.frame(0).image)
+        images = [read_picture(picture) for picture in pictures]
         found = calibrate_board(images, board)
         self.use_plane(found, found.board.square_mm, images[0], Path(pictures[0]).name)
         return found

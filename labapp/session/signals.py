@@ -29,7 +29,7 @@ A_TABLE = "a table (CSV, UTF-8) with a line of names: a time (s, ms, µs), a cur
 LARGEST_FILE = 1 << 28
 MOST_ROWS = 500_000
 LINES_ABOVE = 60
-"""Loggers tell of themselves in so many lines before the names at most."""
+"""Largest number of lines before the names, in which loggers describe themselves."""
 
 NAMES = {
     "time": "time|zeit|t|seconds",
@@ -46,25 +46,17 @@ UNITS = {
 
 @dataclass(frozen=True)
 class Signals(ReadOnlyArrays):
-    """Current and voltage of a weld; n samples.
-
-    Parameters
-    ----------
-    file
-        Name of the table they were read from.
-    time_s
-        Time of each sample by the logger's clock, ascending, shape (n,), s.
-    current_a, voltage_v
-        Shape (n,), A and V; NaN where there is none.
-    start_s
-        Added to the logger's time it gives the recording's, s.
-    """
+    """Current and voltage of a weld; n samples."""
 
     file: str
+    """Name of the table they were read from."""
     time_s: FloatArray
+    """Time of each sample by the logger's clock, ascending, shape (n,), s."""
     current_a: FloatArray
     voltage_v: FloatArray
+    """Shape (n,), A and V; NaN where there is none."""
     start_s: float = 0.0
+    """Added to the logger's time it gives the recording's, s."""
 
 
 @dataclass(frozen=True)

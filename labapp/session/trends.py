@@ -14,7 +14,7 @@ from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 from labapp.session.measured import Overview
 
 NEIGHBOURS = 15
-"""A frame is compared with the median of so many frames around it …"""
+"""Number of frames around a frame with whose median it is compared …"""
 
 FEWEST = 8
 """… and with none where there are fewer in all."""
@@ -32,24 +32,14 @@ EVEN = 0.05
 
 @dataclass(frozen=True)
 class Quantity:
-    """A measure whose course can be shown.
-
-    Parameters
-    ----------
-    key
-        Its name in `Measures`.
-    label
-        What it is called.
-    unit
-        Its unit.
-    sigma
-        Name of its σ in `Measures`; empty where there is none.
-    """
+    """A measure whose course can be shown."""
 
     key: str
+    """Its name in `Measures`."""
     label: str
     unit: str
     sigma: str = ""
+    """Name of its σ in `Measures`; empty where there is none."""
 
 
 QUANTITIES = (
@@ -70,99 +60,69 @@ BY_KEY = {quantity.key: quantity for quantity in QUANTITIES}
 
 @dataclass(frozen=True)
 class Trend(ReadOnlyArrays):
-    """One measure over the frames that have it; n frames.
-
-    Parameters
-    ----------
-    quantity
-        What it is.
-    frame
-        Numbers of the frames, ascending, shape (n,).
-    at
-        Their times, s, or where any is unknown, again their numbers, shape (n,).
-    timed
-        Whether ``at`` is in s.
-    place
-        Their places among the session's frames, ascending, shape (n,).
-    value, sigma
-        Shape (n,), in the quantity's unit; σ is NaN where there is none.
-    doubtful, stale, corrected
-        Which stand out (`doubtful_frames`), no longer stand, were corrected by hand, shape (n,).
-    counts
-        Which go into the statistics and the spectrum, shape (n,).
-    measures
-        All measures of these frames by their names, each of shape (n,).
-    """
+    """One measure over the frames that have it; n frames."""
 
     quantity: Quantity
     frame: IntArray
+    """Numbers of the frames, ascending, shape (n,)."""
     at: FloatArray
+    """Their times, s, or where any is unknown, again their numbers, shape (n,)."""
     timed: bool
+    """Whether ``at`` is in s."""
     place: IntArray
+    """Their places among the session's frames, ascending, shape (n,)."""
     value: FloatArray
     sigma: FloatArray
+    """Shape (n,), in the quantity's unit; σ is NaN where there is none."""
     doubtful: BoolArray
     stale: BoolArray
     corrected: BoolArray
+    """Which stand out (`doubtful_frames`), no longer stand, were corrected by hand, shape (n,)."""
     counts: BoolArray
+    """Which go into the statistics and the spectrum, shape (n,)."""
     measures: Mapping[str, FloatArray]
+    """All measures of these frames by their names, each of shape (n,)."""
 
 
 @dataclass(frozen=True)
 class Spread:
-    """Mean, standard deviation and range of a measure (Eq. 7-2 … 7-4).
-
-    Parameters
-    ----------
-    count
-        How many frames.
-    mean, deviation, lowest, highest
-        In the measure's unit; the deviation is the root of the mean square, divided by n as in the
-        text. NaN without a frame.
-    mean_sigma
-        Standard uncertainty of the mean (`sigma_of_mean`); NaN where the measure has none.
-    mean_setup_sigma
-        The set-up's part of that (`setup_sigma_of_mean`).
-    """
+    """Mean, standard deviation and range of a measure (Eq. 7-2 … 7-4)."""
 
     count: int
     mean: float
     deviation: float
     lowest: float
     highest: float
+    """In the measure's unit; the deviation is the root of the mean square, divided by n as in the
+    text. NaN without a frame.
+    """
     mean_sigma: float = math.nan
+    """Standard uncertainty of the mean (`sigma_of_mean`); NaN where the measure has none."""
     mean_setup_sigma: float = 0.0
+    """The set-up's part of that (`setup_sigma_of_mean`)."""
 
 
 @dataclass(frozen=True)
 class Spectrum(ReadOnlyArrays):
-    """Amplitudes of a measure's oscillation.
-
-    Parameters
-    ----------
-    frequency
-        From the lowest that the series tells to half the rate, shape (k,), Hz, or 1/frame where
-        times are not known.
-    amplitude
-        Of a sine of that frequency, shape (k,), in the measure's unit.
-    timed
-        Whether frequencies are in Hz.
-    first, last
-        The frames it was computed from: all between them that the session uses.
-    count
-        How many they are.
-    resolution
-        Sines nearer to each other than this cannot be told apart: two steps of the frequency, the
-        half width of the Hann window's main lobe.
-    """
+    """Amplitudes of a measure's oscillation."""
 
     frequency: FloatArray
+    """From the lowest that the series resolves to half the rate, shape (k,), Hz, or 1/frame where
+    times are not known.
+    """
     amplitude: FloatArray
+    """Of a sine of that frequency, shape (k,), in the measure's unit."""
     timed: bool
+    """Whether frequencies are in Hz."""
     first: int
     last: int
+    """The frames it was computed from: all between them that the session uses."""
     count: int
+    """How many they are."""
     resolution: float
+    """Sines nearer to each other than this cannot be resolved: two steps of the frequency, the half
+    width of the Hann window's main lobe.
+    """
 
     @property
     def peak(self) -> tuple[float, float]:

@@ -31,6 +31,7 @@ from labapp.simulated.simulated_pool import BENCH
 from labapp.simulation.parallel import Progress
 
 RATE_HZ, WAVE_HZ = 200.0, 37.3
+COLD = 3  # frames measured without a prior
 
 SCENARIO = f"""# A pool that swings, before a fast camera.
 
@@ -68,24 +69,15 @@ STEPS = ("dots", "match", "measures")
 
 @dataclass(frozen=True)
 class Video:
-    """A simulated video and its ground truth.
-
-    Parameters
-    ----------
-    path
-        Raw 8-bit grey frames in an AVI: decoding costs next to nothing, as with a camera.
-    setup
-        Its setup.
-    height_mm
-        True height of the pool in each frame, shape (frames,), mm.
-    dots
-        True dots of each frame that show: place, shape (n, 2), px, and ray (i, j), shape (n, 2).
-    """
+    """A simulated video and its ground truth."""
 
     path: Path
+    """Raw 8-bit grey frames in an AVI: decoding costs next to nothing, as with a camera."""
     setup: Setup
     height_mm: FloatArray
+    """True height of the pool in each frame, shape (frames,), mm."""
     dots: list[tuple[FloatArray, IntArray]]
+    """True dots of each frame that show: place, shape (n, 2), px, and ray (i, j), shape (n, 2)."""
 
 
 def make_video(
@@ -162,26 +154,19 @@ class Spread:
 
 @dataclass(frozen=True)
 class Latency:
-    """Time per frame on one core.
-
-    Parameters
-    ----------
-    frame, steps
-        Wall time of a followed frame, and of its steps.
-    processor
-        Processor time of a followed frame, which other programs hardly change.
-    cold_s
-        Processor time of a frame measured without a prior, s.
-    """
+    """Time per frame on one core."""
 
     frame: Spread
     steps: dict[str, Spread]
+    """Wall time of a followed frame, and of its steps."""
     processor: Spread
+    """Processor time of a followed frame, which other programs hardly change."""
     cold_s: float
+    """Processor time of a frame measured without a prior, s."""
 
 
-def time_frames(video: Video, frames: int, cold: int = 3) -> Latency:
-    """Time the first ``frames`` frames, each followed from the one before, and ``cold`` without."""
+def time_frames(video: Video, frames: int) -> Latency:
+    """Time the first ``frames`` frames, each followed from the one before, and `COLD` without."""
     cv2.setNumThreads(1)
     steps: dict[str, list[float]] = {name: [] for name in STEPS}
     last = [0.0]
@@ -207,45 +192,35 @@ def time_frames(video: Video, frames: int, cold: int = 3) -> Latency:
                 wall.append(time.perf_counter() - begun)
                 used.append(time.process_time() - start)
         begun = time.process_time()
-        for number in range(cold):
-            image = source.frame((number + 1) * frames // (cold + 1)).image
+        for number in range(COLD):
+            image = source.frame((number + 1) * frames // (COLD + 1)).image
             measure(image, bench, settings)
-        cold_s = (time.process_time() - begun) / cold
+        cold_s = (time.process_time() - begun) / COLD
     by_step = {name: Spread.of(times) for name, times in steps.items()}
     return Latency(Spread.of(wall), by_step, Spread.of(used), cold_s)
 
 
 @dataclass(frozen=True)
 class Run:
-    """Throughput and accuracy over the whole video, from its file to the CSV tables.
-
-    Parameters
-    ----------
-    frames, seconds, processor_s
-        Number of frames, wall time and processor time.
-    start_s
-        Time until the measuring processes had started and loaded their modules.
-    measured, cold
-        Frames with a surface; frames measured without a prior.
-    wrong, labelled
-        Dots with a wrong ray; share of the visible dots with the right one.
-    normalized_error
-        Root mean square of the height's error over its σ by noise and level.
-    frequency_hz, true_hz
-        Frequency of the height's largest oscillation, measured and true.
-    """
+    """Throughput and accuracy over the whole video, from its file to the CSV tables."""
 
     frames: int
     seconds: float
     processor_s: float
+    """Number of frames, wall time and processor time."""
     start_s: float
+    """Time until the measuring processes had started and loaded their modules."""
     measured: int
     cold: int
+    """Frames with a surface; frames measured without a prior."""
     wrong: int
     labelled: float
+    """Dots with a wrong ray; share of the visible dots with the right one."""
     normalized_error: float
+    """Root mean square of the height's error over its σ by noise and level."""
     frequency_hz: float
     true_hz: float = WAVE_HZ
+    """Frequency of the height's largest oscillation, measured and true."""
 
 
 def run_video(

@@ -6,8 +6,8 @@ from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 
 from labapp.core.surface.reconstruction import Reconstruction
-from labapp.errors import InputError
-from labapp.export.pictures import write_surface_picture
+from labapp.errors import os_errors_as_input
+from labapp.export.rendering.pictures import write_surface_picture
 from labapp.session.samples import begin_session
 from labapp.session.session import Session
 
@@ -25,10 +25,8 @@ def open_demo(folder: Path) -> Session:
     path = folder / "gtaw.labsession"
     if path.exists():
         return Session.open(path)
-    try:
+    with os_errors_as_input(folder, "folder", "one that can be written"):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(folder, "folder", error.strerror, "one that can be written") from error
     return begin_session("gtaw", path)
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from labapp.config.scenario import Scenario
 from labapp.config.scenario_keys import RECORDINGS
-from labapp.errors import InputError
+from labapp.errors import InputError, os_errors_as_input
 from labapp.session.record import Record
 from labapp.session.session import Session
 from labapp.simulation.parallel import Progress
@@ -33,7 +33,7 @@ def simulate(
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> None:
-    """Render a scenario's recording into a folder, which is whole or not there.
+    """Render a scenario's recording into a folder, which is complete or absent.
 
     A former simulation in it is replaced.
 
@@ -46,7 +46,7 @@ def simulate(
     workers
         How many processes render; None: one a core. The result is the same.
     progress
-        Told of each frame, and while one is waited for; what it raises leaves nothing.
+        Called for each frame, and while one is waited for; what it raises leaves nothing.
 
     Raises
     ------
@@ -58,7 +58,7 @@ def simulate(
     recording = scenario.recording
     if workers is None:
         workers = min(os.cpu_count() or 1, len(recording.pools))
-    try:
+    with os_errors_as_input(out, "--out", "a folder that can be written"):
         out.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=out.parent) as beside:
             part = Path(beside) / out.name
@@ -68,9 +68,6 @@ def simulate(
             if out.exists():
                 shutil.rmtree(out)
             part.rename(out)
-    except OSError as error:
-        expected = "a folder that can be written"
-        raise InputError(out, "--out", error.strerror or error, expected) from error
 
 
 def _check_replaceable(out: Path) -> None:
@@ -104,7 +101,7 @@ def begin_session(
     path
         The session file.
     progress
-        Told how much of the recording is imported; what it raises leaves no session.
+        Called with how much of the recording is imported; what it raises leaves no session.
 
     Raises
     ------

@@ -89,7 +89,7 @@ def pool_camera(text: str, progress: Callable[[int, int], None]) -> SimulatedDev
     text
         Of `simulated_pool`; the usual bench stands in for one that cannot be simulated.
     progress
-        Told how many frames are rendered, and of how many; what it raises ends it.
+        Called with the numbers of frames rendered and in all; what it raises ends it.
     """
     with tempfile.TemporaryDirectory(prefix="labapp-") as folder:
         path = Path(folder) / "pool.toml"

@@ -27,41 +27,9 @@ CUT_MM, TICK_MM = 0.1, 1.6
 
 @dataclass(frozen=True)
 class PrintedBoard:
-    """A board on white, IPCS about its O′.
-
-    Parameters
-    ----------
-    board
-        The board.
-    """
+    """A board on white, IPCS about its O′."""
 
     board: Board
-
-    def inked(self, plane_mm: FloatArray) -> BoolArray:
-        """Whether points (X′, Z′), shape (…, 2), mm, are black, shape (…)."""
-        board = self.board
-        place = np.asarray(plane_mm, float) / board.square_mm
-        column = np.floor(place[..., 0]).astype(int) + 1
-        row = board.rows - 2 - np.floor(place[..., 1]).astype(int)
-        on = (column >= 0) & (column < board.columns) & (row >= 0) & (row < board.rows)
-        ink = on & ((row + column) % 2 == 0)
-        if board.kind == "chessboard":
-            return np.asarray(ink)
-        # Where in its square a point is, from its upper left corner, in cells of the marker.
-        x, y = np.mod(place[..., 0], 1.0), 1.0 - np.mod(place[..., 1], 1.0)
-        rim = (1.0 - board.marker_mm / board.square_mm) / 2.0
-        cell = [
-            np.floor((along - rim) / (1.0 - 2.0 * rim) * MARKER_CELLS).astype(int)
-            for along in (x, y)
-        ]
-        in_marker = on & ~ink & (np.minimum(*cell) >= 0) & (np.maximum(*cell) < MARKER_CELLS)
-        number = self._numbers[
-            np.clip(row, 0, board.rows - 1), np.clip(column, 0, board.columns - 1)
-        ]
-        safe = (np.clip(part, 0, MARKER_CELLS - 1) for part in cell)
-        at_x, at_y = safe
-        black = self._markers[np.maximum(number, 0), at_y, at_x]
-        return np.asarray(ink | (in_marker & black))
 
     def rectangles_mm(self) -> FloatArray:
         """All that is black as (X′ from, Z′ from, X′ to, Z′ to), shape (m, 4), mm."""
@@ -200,7 +168,7 @@ def _sheet(printed: PrintedBoard) -> list[tuple[float, float, float, float]]:
 
 
 def _words(printed: PrintedBoard) -> list[tuple[float, float, float, str]]:
-    """Words on the plate: left and foot of each from its lower left, size, mm, and what is said."""
+    """Texts on the plate: left and foot of each from its lower left, size, mm, and the text."""
     (width, height), (x, z) = printed.plate_mm, printed.origin_mm
     edge = printed.board.square_mm
     size = 2.0 if width < 150 else 3.4

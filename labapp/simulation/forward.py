@@ -50,40 +50,30 @@ class PoolSurface(Protocol):
 
 @dataclass(frozen=True)
 class Reflections(ReadOnlyArrays):
-    """What becomes of every ray of the pattern; ray (i, j) is at ``[i - 1, j - 1]``.
-
-    Parameters
-    ----------
-    absent
-        The lens makes no such ray (the centre), shape (rows, columns).
-    hit
-        The ray meets the pool, shape (rows, columns). An absent ray is traced like any other.
-    incident_blocked, reflected_blocked
-        The torch is in the way of the incident or of the reflected ray, shape (rows, columns).
-    hits_again
-        The reflected ray meets the pool a second time, shape (rows, columns). It is not followed
-        any further: what else it does lights no dot where one is looked for.
-    on_plane
-        The reflected ray meets the imaging plane within its edges, shape (rows, columns).
-    point_mm
-        Reflection point, UCS, shape (rows, columns, 3), mm; NaN without one.
-    incident, reflected
-        Unit directions, shape (rows, columns, 3); the reflected one NaN without a hit.
-    plane_mm
-        Where the reflected ray meets the plane, its edges ignored, IPCS (X′, Z′), shape
-        (rows, columns, 2), mm; NaN where it never does.
-    """
+    """What becomes of every ray of the pattern; ray (i, j) is at ``[i - 1, j - 1]``."""
 
     absent: BoolArray
+    """The lens makes no such ray (the centre), shape (rows, columns)."""
     hit: BoolArray
+    """The ray meets the pool, shape (rows, columns). An absent ray is traced like any other."""
     incident_blocked: BoolArray
     reflected_blocked: BoolArray
+    """The torch is in the way of the incident or of the reflected ray, shape (rows, columns)."""
     hits_again: BoolArray
+    """The reflected ray meets the pool a second time, shape (rows, columns). It is not followed any
+    further: what else it does lights no dot where one is looked for.
+    """
     on_plane: BoolArray
+    """The reflected ray meets the imaging plane within its edges, shape (rows, columns)."""
     point_mm: FloatArray
+    """Reflection point, UCS, shape (rows, columns, 3), mm; NaN without one."""
     incident: FloatArray
     reflected: FloatArray
+    """Unit directions, shape (rows, columns, 3); the reflected one NaN without a hit."""
     plane_mm: FloatArray
+    """Where the reflected ray meets the plane, its edges ignored, IPCS (X′, Z′), shape (rows,
+    columns, 2), mm; NaN where it never does.
+    """
 
     @property
     def lit(self) -> BoolArray:
@@ -167,7 +157,7 @@ def exact_match(
     Raises
     ------
     ValueError
-        If noise is asked for without ``rng``.
+        If there is noise but no ``rng``.
     """
     visible = reflections.visible
     ray = np.argwhere(visible) + 1
@@ -192,7 +182,7 @@ def exact_match(
 
 
 def seen_orientation(reflections: Reflections) -> Orientation:
-    """Tell the correspondence from how most neighbouring dots lie to each other on the plane."""
+    """The correspondence by how most neighbouring dots lie to each other on the plane."""
     dots = np.where(reflections.visible[..., None], reflections.plane_mm, np.nan)
     across = np.sign(np.diff(dots[..., 0], axis=1))
     upward = np.sign(np.diff(dots[..., 1], axis=0))

@@ -15,7 +15,7 @@ from labapp.core.values import BoolArray, FloatArray, ReadOnlyArrays
 from labapp.simulation.pools import PoolSize, size_of
 
 STEP = 1e-4
-"""Step of the differences that stand for a gradient, over the pool's longer side."""
+"""Step of the differences that approximate a gradient, over the pool's longer side."""
 
 MARGIN = 3
 """Nodes beyond the known ones that continue the surface; the spline sees no farther."""
@@ -30,16 +30,6 @@ Function = Callable[[FloatArray, FloatArray], FloatArray]
 class OutlinedPool(ReadOnlyArrays):
     """A pool that is any function of (x, y) within any closed polygon.
 
-    Parameters
-    ----------
-    function
-        z at (x, y), arrays of one shape, mm; defined a little beyond the outline, too.
-    outline_mm
-        Corners of the boundary in their order, shape (n, 2), mm.
-    slope
-        (∂z/∂x, ∂z/∂y) at (x, y), shape (…, 2); None: central differences of the function, of the
-        fourth order.
-
     Raises
     ------
     ValueError
@@ -47,8 +37,13 @@ class OutlinedPool(ReadOnlyArrays):
     """
 
     function: Function
+    """z at (x, y), arrays of one shape, mm; defined a little beyond the outline, too."""
     outline_mm: FloatArray
+    """Corners of the boundary in their order, shape (n, 2), mm."""
     slope: Function | None = None
+    """(∂z/∂x, ∂z/∂y) at (x, y), shape (…, 2); None: central differences of the function, of the
+    fourth order.
+    """
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -87,13 +87,7 @@ def in_parallel(
 
 @contextmanager
 def shared_processes(workers: int | None = None) -> Iterator[None]:
-    """Reuse the same processes for every `in_parallel` within: each takes seconds to start.
-
-    Parameters
-    ----------
-    workers
-        See `in_parallel`.
-    """
+    """Reuse the same processes for every `in_parallel` within: each takes seconds to start."""
     workers = workers or os.cpu_count() or 1
     if workers <= 1:
         yield
@@ -117,15 +111,7 @@ def wait_for(future: Future[R], poll: Callable[[], None]) -> R:
 def processes(
     workers: int, become: Callable[..., None] | None = None, *given: object
 ) -> Iterator[ProcessPoolExecutor]:
-    """Pool of worker processes; an exception terminates them.
-
-    Parameters
-    ----------
-    workers
-        Number of processes.
-    become, given
-        Function that each calls first, and its arguments.
-    """
+    """Pool of worker processes that call ``become(*given)`` first; an exception ends them."""
     spawn = multiprocessing.get_context("spawn")
     begin = functools.partial(start_worker, NICE if _low.get() else 0, become, *given)
     pool = ProcessPoolExecutor(workers, spawn, initializer=begin)
@@ -138,15 +124,7 @@ def processes(
 
 
 def end_processes(pool: ProcessPoolExecutor, wait: bool = True) -> None:
-    """Terminate the processes of a pool, whatever they are doing.
-
-    Parameters
-    ----------
-    pool
-        The pool; it cannot be used afterwards.
-    wait
-        Whether to wait until they have ended.
-    """
+    """Terminate the processes of a pool, whatever they do; it cannot be used afterwards."""
     # A process may be half through sending its result: the reading thread must see the end of the
     # pipe. A pool that has ended reads no more.
     results = getattr(pool, "_result_queue", None)

@@ -20,24 +20,17 @@ from labapp.core.values import BoolArray, FloatArray
 
 @dataclass(frozen=True)
 class PoolSize:
-    """True size of a pool, mm.
-
-    Parameters
-    ----------
-    width_mm, length_mm
-        Extent of the boundary along X and along Y.
-    height_mm, depth_mm
-        Largest and smallest z, the boundary included.
-    peak_mm, bottom_mm
-        (x, y) of the largest and of the smallest z.
-    """
+    """True size of a pool, mm."""
 
     width_mm: float
     length_mm: float
+    """Extent of the boundary along X and along Y."""
     height_mm: float
     depth_mm: float
+    """Largest and smallest z, the boundary included."""
     peak_mm: tuple[float, float]
     bottom_mm: tuple[float, float]
+    """(x, y) of the largest and of the smallest z."""
 
 
 @dataclass(frozen=True)
@@ -47,21 +40,15 @@ class Footprint:
     Points are placed by ``p = x/(width/2)`` and ``q(y)``, the fractional linear map that takes
     the tail's end to −1, the widest place to 0 and the head's end to 1; the boundary is
     p² + q² = 1. The map is smooth, so that no line across the pool has a kink in its curvature.
-
-    Parameters
-    ----------
-    width_mm
-        Largest width, at the centre.
-    head_mm, tail_mm
-        Distance from the centre to the boundary along +Y and along −Y.
-    center_mm
-        Where the pool is widest, (x, y) in the UCS.
     """
 
     width_mm: float
+    """Largest width, at the centre."""
     head_mm: float
     tail_mm: float
+    """Distance from the centre to the boundary along +Y and along −Y."""
     center_mm: tuple[float, float] = (0.0, 0.0)
+    """Where the pool is widest, (x, y) in the UCS."""
 
     def place(self, x_mm: FloatArray, y_mm: FloatArray) -> Place:
         """Place points (x, y), arrays of one shape, in the footprint."""
@@ -114,19 +101,13 @@ class Term(Protocol):
 
 @dataclass(frozen=True)
 class Dent:
-    """A Gaussian dip, as under the torch; damped by 1 − ρ² so that the boundary stays at z = 0.
-
-    Parameters
-    ----------
-    depth_mm, radius_mm
-        Depth and standard deviation of the dip.
-    offset_mm
-        Its (x, y) from the pool's centre.
-    """
+    """A Gaussian dip, as under the torch; damped by 1 − ρ² so that the boundary stays at z = 0."""
 
     depth_mm: float
     radius_mm: float
+    """Depth and standard deviation of the dip."""
     offset_mm: tuple[float, float] = (0.0, 0.0)
+    """Its (x, y) from the pool's centre."""
 
     def _dip(self, place: Place) -> tuple[FloatArray, FloatArray, FloatArray]:
         x = (place.x_mm - self.offset_mm[0]) / self.radius_mm
@@ -173,18 +154,13 @@ class Oscillation:
     """A swinging pool: the surface slides to and fro along and across, vanishing at the boundary.
 
     ``amplitude · (1 − ρ²)² · (cos(ωt)·q + ½·sin(ωt)·p)`` has no net volume on an even pool.
-
-    Parameters
-    ----------
-    amplitude_mm
-        Largest factor of the mode.
-    frequency_hz, time_s
-        ω/2π, and the moment that is looked at.
     """
 
     amplitude_mm: float
+    """Largest factor of the mode."""
     frequency_hz: float
     time_s: float = 0.0
+    """ω/2π, and the moment that is looked at."""
 
     def _weights(self) -> tuple[float, float]:
         phase = 2 * np.pi * self.frequency_hz * self.time_s
@@ -210,22 +186,6 @@ class Wave:
     ``amplitude · J_m(j_mn·ρ) · cos(m(φ − φ₀)) · cos(ωt)`` stands, ``… cos(m(φ − φ₀) − ωt)`` travels
     round; ρ and φ are polar in (p, q), j_mn is the n-th zero of the Bessel function J_m.
 
-    Parameters
-    ----------
-    mode
-        (m, n): nodal diameters, nodal circles with the boundary's counted; (0, 1), (1, 1), (2, 1)
-        and (0, 2) are what weld pools show.
-    amplitude_mm
-        Largest height that it adds.
-    frequency_hz, time_s
-        ω/2π, and the moment that is looked at.
-    travelling
-        Whether it turns, counter-clockwise seen from above, rather than stands.
-    turned_deg
-        φ₀, from +X counter-clockwise.
-    phase_deg
-        Added to ωt.
-
     Raises
     ------
     ValueError
@@ -233,12 +193,20 @@ class Wave:
     """
 
     mode: tuple[int, int]
+    """(m, n): nodal diameters, nodal circles with the boundary's counted; (0, 1), (1, 1), (2, 1)
+    and (0, 2) are what weld pools show.
+    """
     amplitude_mm: float
+    """Largest height that it adds."""
     frequency_hz: float = 0.0
     time_s: float = 0.0
+    """ω/2π, and the moment that is looked at."""
     travelling: bool = False
+    """Whether it turns, counter-clockwise seen from above, rather than stands."""
     turned_deg: float = 0.0
+    """φ₀, from +X counter-clockwise."""
     phase_deg: float = 0.0
+    """Added to ωt."""
 
     def __post_init__(self) -> None:
         if self.mode[0] < 0 or self.mode[1] < 1:
@@ -299,17 +267,6 @@ class Pool:
     and tail are equal, of a sphere when the width equals them too. κ (`fullness`) is that of the
     sphere of the pool's width unless given; 0 is a paraboloid, 1 half an ellipsoid.
 
-    Parameters
-    ----------
-    footprint
-        The area inside the boundary.
-    peak_mm
-        z of the undisturbed cap at the centre, negative for a concave pool.
-    terms
-        Disturbances, added up.
-    fullness
-        κ above, 0 ≤ κ < 1.
-
     Raises
     ------
     ValueError
@@ -318,8 +275,11 @@ class Pool:
 
     footprint: Footprint
     peak_mm: float
+    """z of the undisturbed cap at the centre, negative for a concave pool."""
     terms: tuple[Term, ...] = ()
+    """Disturbances, added up."""
     fullness: float | None = None
+    """κ above, 0 ≤ κ < 1."""
 
     def __post_init__(self) -> None:
         foot = self.footprint

@@ -22,26 +22,22 @@ RUN_OUT_MM = 60.0
 
 @dataclass(frozen=True)
 class Clearance:
-    """What the torch leaves room for, in the plane through laser and electrode (§4.2.1.1).
-
-    Parameters
-    ----------
-    l1_mm
-        Longest tail, electrode to the pool's end at −Y, whose incident rays the torch lets pass
-        (Eq. 4-14); infinite for a laser that stands no higher than the tip.
-    l2_mm
-        Longest head, electrode to the pool's end at +Y, whose reflected rays the torch lets pass
-        (Eq. 4-15, 4-17, 4-18).
-    least_plane_mm, most_plane_mm
-        Distances from the electrode between which a vertical imaging plane with the rig's edges
-        catches the steepest of those rays, the one that grazes the tip (Eq. 4-16 with H the height
-        of the lower and of the upper edge).
-    """
+    """What the torch leaves room for, in the plane through laser and electrode (§4.2.1.1)."""
 
     l1_mm: float
+    """Longest tail, electrode to the pool's end at −Y, whose incident rays the torch lets pass (Eq.
+    4-14); infinite for a laser that stands no higher than the tip.
+    """
     l2_mm: float
+    """Longest head, electrode to the pool's end at +Y, whose reflected rays the torch lets pass
+    (Eq. 4-15, 4-17, 4-18).
+    """
     least_plane_mm: float
     most_plane_mm: float
+    """Distances from the electrode between which a vertical imaging plane with the rig's edges
+    catches the steepest of those rays, the one that grazes the tip (Eq. 4-16 with H the height of
+    the lower and of the upper edge).
+    """
 
 
 def clearance(rig: Rig, head_slope_deg: float = 0.0) -> Clearance:
@@ -88,49 +84,33 @@ class Fate(Enum):
 
 @dataclass(frozen=True)
 class SideRay:
-    """A ray of the central column, seen from the side.
-
-    Parameters
-    ----------
-    row
-        i of the ray, from 1.
-    fate
-        What becomes of it.
-    path_mm
-        (y, z) of the laser, of where it meets pool or work piece, and of its end, shape (2 or 3,
-        2), mm.
-    """
+    """A ray of the central column, seen from the side."""
 
     row: int
+    """i of the ray, from 1."""
     fate: Fate
     path_mm: FloatArray
+    """(y, z) of the laser, of where it meets pool or work piece, and of its end, shape (2 or 3, 2),
+    mm.
+    """
 
 
 @dataclass(frozen=True)
 class SideView:
-    """The bench from the side, looking along −X: what is drawn of it, (y, z), mm.
-
-    Parameters
-    ----------
-    rays
-        Of the central column.
-    pool_mm, plane_mm
-        The pool's profile at x = 0, shape (n, 2); the plane's lower and upper edge, shape (2, 2).
-    laser_mm, tip_mm
-        The diode; the electrode's tip, shape (2,).
-    clearance
-        L1, L2 and the plane distances.
-    tally
-        How many rays of the whole pattern have which fate.
-    """
+    """The bench from the side, looking along −X: what is drawn of it, (y, z), mm."""
 
     rays: tuple[SideRay, ...]
+    """Of the central column."""
     pool_mm: FloatArray
     plane_mm: FloatArray
+    """The pool's profile at x = 0, shape (n, 2); the plane's lower and upper edge, shape (2, 2)."""
     laser_mm: FloatArray
     tip_mm: FloatArray
+    """The diode; the electrode's tip, shape (2,)."""
     clearance: Clearance
+    """L1, L2 and the plane distances."""
     tally: dict[Fate, int]
+    """How many rays of the whole pattern have which fate."""
 
 
 def side_view(

@@ -63,66 +63,46 @@ class TruePool(PoolSurface, Protocol):
 
 @dataclass(frozen=True)
 class RecordedFrame(ReadOnlyArrays):
-    """A rendered frame and its ground truth.
-
-    Parameters
-    ----------
-    pool, reflections
-        The ground truth, in the middle of the exposure.
-    image
-        Grey levels, shape (height, width), 8 bit; 16 bit where exposures were added up or the
-        look has more bits.
-    dot_px
-        (u, v) of each ray's dot, shape (rows, columns, 2), px; NaN where the ray makes none.
-    shown
-        Rays whose dot is in the picture, shape (rows, columns).
-    """
+    """A rendered frame and its ground truth."""
 
     pool: TruePool
     reflections: Reflections
+    """The ground truth, in the middle of the exposure."""
     image: Picture
+    """Grey levels, shape (height, width), 8 bit; 16 bit where exposures were added up or the look
+    has more bits.
+    """
     dot_px: FloatArray
+    """(u, v) of each ray's dot, shape (rows, columns, 2), px; NaN where the ray makes none."""
     shown: BoolArray
+    """Rays whose dot is in the picture, shape (rows, columns)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recording:
-    """Description of a simulated recording; its random numbers follow from the seed.
-
-    Parameters
-    ----------
-    file
-        Its name: a video (``.avi``, ``.mkv``), a TIFF stack (``.tif``), or a folder of PNG files
-        (no suffix).
-    rig, view, look
-        The bench, where the camera sees the imaging plane, and what the frames look like.
-    pools
-        The pool of each frame, in the middle of its exposure.
-    seed
-        Source of the noise.
-    frame_rate_hz
-        None where the recording has no time base.
-    exposure_s
-        How long a frame takes; dots of a pool that moves are smeared over it.
-    torches
-        The torch in each frame; empty: all that passes above the rig's electrode is hidden.
-    exposures
-        How many exposures a frame is the sum of.
-    first_number
-        Number in the first PNG file's name.
-    """
+    """Description of a simulated recording; its random numbers follow from the seed."""
 
     file: str
+    """Its name: a video (``.avi``, ``.mkv``), a TIFF stack (``.tif``), or a folder of PNG files (no
+    suffix).
+    """
     rig: Rig
     view: CameraView
     look: Look
+    """The bench, where the camera sees the imaging plane, and what the frames look like."""
     pools: tuple[TruePool, ...]
+    """The pool of each frame, in the middle of its exposure."""
     seed: int
     frame_rate_hz: float | None = None
+    """None where the recording has no time base."""
     exposure_s: float = 0.0
+    """How long a frame takes; dots of a pool that moves are smeared over it."""
     torches: tuple[Torch, ...] = ()
+    """The torch in each frame; empty: all that passes above the rig's electrode is hidden."""
     exposures: int = 1
+    """How many exposures a frame is the sum of."""
     first_number: int = 0
+    """Number in the first PNG file's name."""
 
     truth_columns: ClassVar[tuple[str, ...]] = TRUTH_COLUMNS
     dot_columns: ClassVar[tuple[str, ...]] = DOT_COLUMNS

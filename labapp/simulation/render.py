@@ -24,75 +24,55 @@ Picture = npt.NDArray[np.uint8 | np.uint16]
 
 @dataclass(frozen=True)
 class Look:
-    """What a frame looks like.
-
-    Parameters
-    ----------
-    dot_peak
-        Grey levels of a dot of middling brightness over the background.
-    unevenness
-        Standard deviation of the logarithm of the rays' brightness.
-    beam_fraction
-        Standard deviation of a beam's light over the angle between beams: a dot is as much wider
-        as the pool spreads the pattern there.
-    dot_floor_mm, dot_ceiling_mm
-        Least and largest standard deviation of a dot on the plane, mm: what diffraction and
-        scattering in the plane add, and where a spread dot stops being one.
-    speckle
-        Contrast of the speckle inside dots, 0 … 1.
-    blur_px
-        Standard deviation of the camera's blur, px.
-    background, glow
-        Grey levels of the dark plane, and of the arc's glow on it where it is brightest.
-    read_noise, photon_noise
-        Standard deviation in the dark, grey levels; variance per grey level of light.
-    hot_pixels, false_dots
-        How many there are.
-    missing
-        Probability that a dot which should show does not.
-    full_scale
-        Light at which a pixel is full: what is brighter is cut off there.
-    bits
-        Depth of the picture: 255 becomes the largest number that it holds.
-    """
+    """What a frame looks like."""
 
     dot_peak: float = 55.0
+    """Grey levels of a dot of middling brightness over the background."""
     unevenness: float = 0.22
+    """Standard deviation of the logarithm of the rays' brightness."""
     beam_fraction: float = 0.045
+    """Standard deviation of a beam's light over the angle between beams: a dot is as much wider as
+    the pool spreads the pattern there.
+    """
     dot_floor_mm: float = 0.28
     dot_ceiling_mm: float = 0.55
+    """Least and largest standard deviation of a dot on the plane, mm: what diffraction and
+    scattering in the plane add, and where a spread dot stops being one.
+    """
     speckle: float = 0.35
+    """Contrast of the speckle inside dots, 0 … 1."""
     blur_px: float = 0.8
+    """Standard deviation of the camera's blur, px."""
     background: float = 18.0
     glow: float = 18.0
+    """Grey levels of the dark plane, and of the arc's glow on it where it is brightest."""
     read_noise: float = 1.2
     photon_noise: float = 0.08
+    """Standard deviation in the dark, grey levels; variance per grey level of light."""
     hot_pixels: int = 0
     false_dots: int = 0
     missing: float = 0.0
+    """Probability that a dot which should show does not."""
     full_scale: float = 255.0
+    """Light at which a pixel is full: what is brighter is cut off there."""
     bits: int = 8
+    """Depth of the picture: 255 becomes the largest number that it holds."""
 
 
 @dataclass(frozen=True)
 class Frame(ReadOnlyArrays):
-    """A rendered frame and what is in it.
-
-    Parameters
-    ----------
-    image
-        Shape (height, width), 8 bit, or 16 where the look has more bits than 8.
-    dot_px
-        (u, v) of each ray's dot, in the picture or not, shape (rows, columns, 2), px: the middle
-        of its light where it moves while it is exposed; NaN where the ray makes none.
-    shown
-        Rays whose dot was drawn with its centre in the picture for at least half of the exposure,
-        shape (rows, columns).
-    """
+    """A rendered frame and what is in it."""
 
     image: Picture
+    """Shape (height, width), 8 bit, or 16 where the look has more bits than 8."""
     dot_px: FloatArray
+    """(u, v) of each ray's dot, in the picture or not, shape (rows, columns, 2), px: the middle of
+    its light where it moves while it is exposed; NaN where the ray makes none.
+    """
     shown: BoolArray
+    """Rays whose dot was drawn with its centre in the picture for at least half of the exposure,
+    shape (rows, columns).
+    """
 
 
 def ray_brightness(

@@ -8,52 +8,35 @@ are at (5.5, 0) and (0, 2.5), the points of Eq. 5-6.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from labapp.core.values import BoolArray, FloatArray
-from labapp.simulation.camera import CameraView, PosedView
+from labapp.simulation.camera import CameraView
 from labapp.simulation.render import GreyImage
-
-
-class Print(Protocol):
-    """What is printed on the imaging plane, or on a board in its place."""
-
-    def inked(self, plane_mm: FloatArray) -> BoolArray:
-        """Whether points (X′, Z′), shape (…, 2), mm, are black, shape (…)."""
-        ...
 
 
 @dataclass(frozen=True)
 class Target:
-    """Marks on the imaging plane.
-
-    Parameters
-    ----------
-    unit_mm
-        Length of a unit. The default is a quarter of an inch: ten of them fit on the 4-inch plate
-        and into the picture of it.
-    x_units, z_units
-        Where the bars end; they begin at 1.
-    bar_mm, flag_mm, dot_mm
-        Thickness of the bars, thickness of the unit flags, diameter of the origin's dot.
-    flag_length_mm
-        How far a flag stands out on either side of its bar.
-    plate_mm, margin_mm
-        Edge of the square plate; distance of O′ from its left and its lower edge.
-    """
+    """Marks on the imaging plane."""
 
     unit_mm: float = 6.35
+    """Length of a unit. The default is a quarter of an inch: ten of them fit on the 4-inch plate
+    and into the picture of it.
+    """
     x_units: int = 10
     z_units: int = 4
+    """Where the bars end; they begin at 1."""
     bar_mm: float = 1.6
     flag_mm: float = 0.4
     dot_mm: float = 4.0
+    """Thickness of the bars, thickness of the unit flags, diameter of the origin's dot."""
     flag_length_mm: float = 1.2
+    """How far a flag stands out on either side of its bar."""
     plate_mm: float = 101.6
     margin_mm: float = 7.0
+    """Edge of the square plate; distance of O′ from its left and its lower edge."""
 
     @property
     def x_middle_mm(self) -> float:
@@ -88,33 +71,24 @@ class Target:
 
 @dataclass(frozen=True)
 class TargetLook:
-    """What the calibration picture looks like: dim and of low contrast, as in Fig. 5-2.
-
-    Parameters
-    ----------
-    light, dark
-        Grey levels of plane and marks in the middle of the picture.
-    vignetting
-        Fraction of the light that is lost at the corners.
-    slope
-        Fraction by which the light falls from one side of the picture to the other.
-    blur_px, noise
-        Standard deviation of the camera's blur, px, and of its noise, grey levels.
-    specks
-        How many dead and hot pixels there are (the impulse noise of Eq. 5-2).
-    """
+    """What the calibration picture looks like: dim and of low contrast, as in Fig. 5-2."""
 
     light: float = 32.0
     dark: float = 12.0
+    """Grey levels of plane and marks in the middle of the picture."""
     vignetting: float = 0.35
+    """Fraction of the light that is lost at the corners."""
     slope: float = 0.25
+    """Fraction by which the light falls from one side of the picture to the other."""
     blur_px: float = 0.9
     noise: float = 1.3
+    """Standard deviation of the camera's blur, px, and of its noise, grey levels."""
     specks: int = 60
+    """How many dead and hot pixels there are (the impulse noise of Eq. 5-2)."""
 
 
 def render_target(
-    target: Print, view: CameraView | PosedView, look: TargetLook, rng: np.random.Generator
+    target: Target, view: CameraView, look: TargetLook, rng: np.random.Generator
 ) -> GreyImage:
     """Render the calibration picture, shape (height, width), grey levels."""
     fine = 4

@@ -40,14 +40,10 @@ class YozTorch:
 
     However far to the side: the incident ray of points at y < 0, the reflected one of points at
     y > 0.
-
-    Parameters
-    ----------
-    height_mm
-        Of the tip.
     """
 
     height_mm: float
+    """Of the tip."""
 
     def hides(
         self, point_mm: FloatArray, incident: FloatArray, reflected: FloatArray
@@ -62,22 +58,15 @@ class YozTorch:
 
 @dataclass(frozen=True)
 class ConeTorch:
-    """An electrode with a conical tip, upright: it hides what it stands in the way of.
-
-    Parameters
-    ----------
-    tip_mm
-        Where the middle of the tip's flat end is, (x, y, z) in the UCS.
-    tip_radius_mm, radius_mm
-        Radius of the flat end and of the rod.
-    half_angle_deg
-        Of the cone.
-    """
+    """An electrode with a conical tip, upright: it hides what it stands in the way of."""
 
     tip_mm: tuple[float, float, float]
+    """Where the middle of the tip's flat end is, (x, y, z) in the UCS."""
     tip_radius_mm: float = 0.25
     radius_mm: float = 1.2
+    """Radius of the flat end and of the rod."""
     half_angle_deg: float = 12.0
+    """Of the cone."""
 
     def hides(
         self, point_mm: FloatArray, incident: FloatArray, reflected: FloatArray

@@ -31,49 +31,29 @@ FIGURES = {"CE": (6, 7), "LE": (8, 9), "ME": (10, 11)}
 
 @dataclass(frozen=True)
 class AnalysisOptions:
-    """Options of the error analysis of chapter 8.
-
-    Parameters
-    ----------
-    parts
-        Some of `PARTS`.
-    schemes
-        Reconstruction schemes.
-    step
-        Step between places of the laser, degrees and mm (LE, ME).
-    frames
-        Frames rendered of each surface (measurement, images).
-    draws
-        Monte Carlo draws of the calibration (parameters).
-    picture
-        ``png`` or ``svg``.
-    """
+    """Options of the error analysis of chapter 8."""
 
     parts: tuple[str, ...] = PARTS
+    """Some of `PARTS`."""
     schemes: tuple[str, ...] = SCHEMES
     step: float = 2.0
+    """Step between places of the laser, degrees and mm (LE, ME)."""
     frames: int = 3
+    """Frames rendered of each surface (measurement, images)."""
     draws: int = 400
+    """Monte Carlo draws of the calibration (parameters)."""
     picture: str = "png"
 
 
 @dataclass(frozen=True)
 class AnalysisPart:
-    """Result of a part of the analysis.
-
-    Parameters
-    ----------
-    tables
-        Its tables.
-    pictures
-        File name → content.
-    printed
-        Tables to print: those that are short and complete.
-    """
+    """Result of a part of the analysis."""
 
     tables: tuple[Table, ...]
     pictures: Mapping[str, bytes]
+    """File name → content."""
     printed: tuple[Table, ...]
+    """Tables to print: those that are short and complete."""
 
     @property
     def files(self) -> dict[str, bytes]:

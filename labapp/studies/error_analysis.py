@@ -104,28 +104,20 @@ def errors_of(match: Match, seen: Reflections, rig: Rig, cap: Pool, scheme: str)
 
 @dataclass(frozen=True)
 class ErrorSurvey(ReadOnlyArrays):
-    """Errors of the schemes on caps, with the laser at one or more places.
-
-    Parameters
-    ----------
-    kind
-        ``CE``, ``LE`` or ``ME``.
-    caps
-        The known surfaces, n of them.
-    schemes
-        The schemes, s of them.
-    errors
-        `ERRORS` of each cap by each scheme, shape (n, s, 4), as fractions and mm: the least over
-        the laser's places, each on its own; NaN where no place gives a surface.
-    lost
-        How often a scheme found no surface, shape (s,).
-    """
+    """Errors of the schemes on caps, with the laser at one or more places."""
 
     kind: str
+    """``CE``, ``LE`` or ``ME``."""
     caps: tuple[Pool, ...]
+    """The known surfaces, n of them."""
     schemes: tuple[str, ...]
+    """The schemes, s of them."""
     errors: FloatArray
+    """`ERRORS` of each cap by each scheme, shape (n, s, 4), as fractions and mm: the least over the
+    laser's places, each on its own; NaN where no place gives a surface.
+    """
     lost: FloatArray
+    """How often a scheme found no surface, shape (s,)."""
 
     def of(self, scheme: str, error: str, surface: str = "all") -> FloatArray:
         """One of `ERRORS` of the caps: ``convex``, ``concave`` or ``all``."""
@@ -171,7 +163,7 @@ def survey(
 
 
 def aside(caps: Sequence[Pool], centers: int) -> tuple[Pool, ...]:
-    """Each cap at so many centres near the origin (`ASIDE_MM`), the same ones each time."""
+    """Each cap at a number of centres near the origin (`ASIDE_MM`), the same ones each time."""
     rng = np.random.default_rng(83)
     at = rng.uniform(-ASIDE_MM, ASIDE_MM, (len(caps), centers, 2)).tolist()
     return tuple(
@@ -203,12 +195,12 @@ def error_table(surveys: Sequence[ErrorSurvey]) -> Table:
     for one in surveys:
         for letter, error in (("D", "depth"), ("B", "boundary")):
             for surface in ("convex", "concave", "all"):
-                told = TEXT.get((one.kind, letter, surface), (None, None))
+                published = TEXT.get((one.kind, letter, surface), (None, None))
                 row: list[Cell] = [f"{one.kind}-{letter}", surface]
                 for scheme in one.schemes:
                     values = 100 * one.of(scheme, error, surface)
                     row += [float(np.nanmean(values)), float(np.nanmax(values))]
-                rows.append((*row, *(None if v is None else 100 * v for v in told)))
+                rows.append((*row, *(None if v is None else 100 * v for v in published)))
     schemes = surveys[0].schemes
     columns = [f"{scheme}_{what}_pct" for scheme in schemes for what in ("mean", "worst")]
     return Table(

@@ -1,4 +1,4 @@
-"""How far a pool's size is off by what its set-up is not exactly known to be, for any scheme."""
+"""Uncertainty of a pool's sizes by the uncertainty of its set-up, for any scheme."""
 
 from __future__ import annotations
 
@@ -18,26 +18,17 @@ from labapp.studies.parameter_deviation import move
 
 @dataclass(frozen=True)
 class Contribution(ReadOnlyArrays):
-    """What one quantity's ± does to the sizes.
-
-    Parameters
-    ----------
-    name
-        The quantity.
-    sigma, unit
-        Its standard uncertainty.
-    assumed
-        Whether that is assumed, as nobody told it.
-    change
-        What each of `SIZES` changes by with the quantity, shape (6,); NaN where there is then no
-        surface.
-    """
+    """What one quantity's ± does to the sizes."""
 
     name: str
     sigma: float
     unit: str
     assumed: bool
+    """Whether it is assumed, because none was entered."""
     change: FloatArray
+    """What each of `SIZES` changes by with the quantity, shape (6,); NaN where there is then no
+    surface.
+    """
 
 
 def setup_budget(
@@ -47,13 +38,6 @@ def setup_budget(
 
     Which ray made which dot stays as it was found. Half the difference is what a size changes by,
     as in `core.surface.setup_uncertainty`, which the default scheme has in its own ±.
-
-    Parameters
-    ----------
-    measurement
-        A frame with a surface.
-    setup, settings
-        What it was measured with.
     """
     match, known = measurement.match, setup.rig.uncertainty
     if match is None or measurement.measures is None:

@@ -44,7 +44,7 @@ TACK_RIG = Rig(
     Electrode(5.0),
     ImagingPlane.vertical(40.69, 50.8, 0.0),
 )
-"""Its set-up. The text does not tell the electrode's height nor O′: here it is that of Table 4-1,
+"""Its set-up. The text gives neither the electrode's height nor O′: here it is that of Table 4-1,
 and the 4″ plane stands on the paper, its middle opposite the torch."""
 
 BENCH = Rig(
@@ -70,28 +70,19 @@ TACK_TEXT = {"irs": (0.1777, 0.014903, 0.220807), "ers": (0.0912, 0.014903, 0.18
 
 @dataclass(frozen=True)
 class FrameErrors(ReadOnlyArrays):
-    """What one rendered frame gave, by each scheme; s of them.
-
-    Parameters
-    ----------
-    status
-        Of the frame.
-    errors
-        Relative errors of height (or depth) and diameter, signed, and ARE in mm, shape (s, 3);
-        NaN without a surface.
-    exact
-        The same of exact reflections, shape (s, 3).
-    off_px
-        Distance of each matched dot to where it truly is, shape (n,).
-    missed
-        Dots that show and were given no ray.
-    """
+    """What one rendered frame gave, by each scheme; s of them."""
 
     status: str
     errors: FloatArray
+    """Relative errors of height (or depth) and diameter, signed, and ARE in mm, shape (s, 3); NaN
+    without a surface.
+    """
     exact: FloatArray
+    """The same of exact reflections, shape (s, 3)."""
     off_px: FloatArray
+    """Distance of each matched dot to where it truly is, shape (n,)."""
     missed: int
+    """Dots that show and were given no ray."""
 
     @property
     def wrong(self) -> int:
@@ -107,9 +98,9 @@ def axes_of(view: CameraView) -> AxisPoints:
     return AxisPoints(calibration, view.x_axis_mm, view.z_axis_mm)
 
 
-def exactly_seen(cap: Pool, rig: Rig, view: CameraView = VIEW) -> KnownPool:
+def exactly_seen(cap: Pool, rig: Rig) -> KnownPool:
     """A known pool with its dots where they truly are; those that miss the plane are lost."""
-    return KnownPool(cap, exact_match(trace_once(cap, rig), rig), rig, nominal(axes_of(view)))
+    return KnownPool(cap, exact_match(trace_once(cap, rig), rig), rig, nominal(axes_of(VIEW)))
 
 
 def frame_errors(
@@ -179,10 +170,10 @@ def thumb_tack_table(frames: Sequence[FrameErrors], schemes: Sequence[str] = SCH
     for k, scheme in enumerate(schemes):
         exact = np.abs(frames[0].exact[k])
         each = np.abs([frame.errors[k] for frame in frames])
-        told = TACK_TEXT.get(scheme, (None,) * 3)
+        published = TACK_TEXT.get(scheme, (None,) * 3)
         for name, n, unit in (("height", 0, 100), ("diameter", 1, 100), ("ARE", 2, 1)):
             known = each[np.isfinite(each[:, n]), n] * unit
-            text = told[n]
+            text = published[n]
             rows.append(
                 (
                     scheme,

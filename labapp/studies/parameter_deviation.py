@@ -69,23 +69,17 @@ def move(match: Match, rig: Rig, axes: AxisPoints, offset: FloatArray) -> tuple[
 
 @dataclass(frozen=True)
 class ParameterDeviation(ReadOnlyArrays):
-    """What a bench's uncertainties do to height (or depth) and diameter of a pool.
-
-    Parameters
-    ----------
-    uncertainty
-        Of the bench.
-    contribution
-        What each of `QUANTITIES` changes, over the true size, by its standard uncertainty: height,
-        diameter; shape (q, 2).
-    draws
-        Relative errors of height and diameter of every draw, less those of the undisturbed
-        bench, shape (m, 2); NaN where there was no surface.
-    """
+    """What a bench's uncertainties do to height (or depth) and diameter of a pool."""
 
     uncertainty: RigUncertainty
     contribution: FloatArray
+    """What each of `QUANTITIES` changes, over the true size, by its standard uncertainty: height,
+    diameter; shape (q, 2).
+    """
     draws: FloatArray
+    """Relative errors of height and diameter of every draw, less those of the undisturbed bench,
+    shape (m, 2); NaN where there was no surface.
+    """
 
     @property
     def linear(self) -> FloatArray:
@@ -106,20 +100,13 @@ class ParameterDeviation(ReadOnlyArrays):
 
 @dataclass(frozen=True)
 class KnownPool:
-    """A known pool, and what is measured of it with what.
-
-    Parameters
-    ----------
-    cap
-        The pool.
-    match, rig, uncertainty
-        Its dots, the bench, and how well that is known.
-    """
+    """A known pool, and what is measured of it with what."""
 
     cap: Pool
     match: Match
     rig: Rig
     uncertainty: RigUncertainty
+    """Its dots, the bench, and how well that is known."""
 
 
 def parameter_deviation(

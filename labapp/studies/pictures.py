@@ -38,6 +38,13 @@ FATES = {
 }
 
 
+PLATE_MM = 101.6
+"""Edge of the imaging plane of Fig. 4-11."""
+
+OPEN_PLANE_MM = 1e4
+"""s and h of the boundless plane of `correspondence_table.OPEN_BENCH`."""
+
+
 def positioning_picture(rig: Rig, width_mm: float, length_mm: float, height_mm: float) -> Figure:
     """Fig. 4-7 … 4-9: the central rays by way of a flat, a convex and a concave pool, L1 and L2."""
     with rc_context(STYLE):
@@ -80,17 +87,17 @@ def _draw_side(plot: Any, view: SideView) -> None:
     plot.set(xlim=(low - 3, view.laser_mm[0] + 4), ylim=(-5, 40), aspect="equal", ylabel="Z (mm)")
 
 
-def coverage_picture(placements: Sequence[Coverage], plane_mm: float = 101.6) -> Figure:
+def coverage_picture(placements: Sequence[Coverage]) -> Figure:
     """Fig. 4-11: the dots on the plane at several distances of it."""
     with rc_context(STYLE):
         figure = new_figure(INCHES, INCHES)
         for plot, one in zip(figure.subplots(2, 2).ravel(), placements, strict=True):
-            plot.add_patch(Rectangle((0, 0), plane_mm, plane_mm, fc="none", ec="k", lw=1))
+            plot.add_patch(Rectangle((0, 0), PLATE_MM, PLATE_MM, fc="none", ec="k", lw=1))
             plot.plot(*one.plane_mm[one.on_plane].T, "o", ms=2.5, color="#1b4f8a")
             plot.plot(*one.plane_mm[~one.on_plane].T, "x", ms=4, color="#b01030")
             off = int((~one.on_plane).sum())
             plot.set_title(f"plane at {one.distance_mm:g} mm: {off} of {len(one.on_plane)} off it")
-            plot.set(xlim=(-8, plane_mm + 8), ylim=(-8, 125), aspect="equal")
+            plot.set(xlim=(-8, PLATE_MM + 8), ylim=(-8, 125), aspect="equal")
             plot.set(xlabel="X′ (mm)", ylabel="Z′ (mm)")
         return figure
 
@@ -114,15 +121,10 @@ def correspondence_picture(seen: Reflections, title: str) -> Figure:
                     plot.plot(*places[column], marker, ms=3, color=colour, mew=0)
         plane.set(xlabel="X′ − s (mm)", ylabel="Z (mm)", title="dots on the imaging plane")
         pool.set(xlabel="X (mm)", ylabel="Y (mm)", title="rays on the pool", aspect="equal")
-        _on_work_piece(plane)
+        for axis in (plane.xaxis, plane.yaxis):  # from the torch's middle and the work piece
+            axis.set_major_formatter(lambda value, _: f"{value - OPEN_PLANE_MM:g}")
         figure.suptitle(title, fontsize=8)
         return figure
-
-
-def _on_work_piece(plot: Any, s_mm: float = 1e4) -> None:
-    """Label an open plane's axes from the torch's middle and the work piece."""
-    for axis in (plot.xaxis, plot.yaxis):
-        axis.set_major_formatter(lambda value, _: f"{value - s_mm:g}")
 
 
 def error_picture(survey: ErrorSurvey) -> Figure:

@@ -97,21 +97,14 @@ def clearance_table() -> Table:
 
 @dataclass(frozen=True)
 class Coverage(ReadOnlyArrays):
-    """Dots of one placement of the imaging plane (Fig. 4-11).
-
-    Parameters
-    ----------
-    distance_mm
-        Of the plane to the torch.
-    plane_mm
-        The dots, its edges ignored, IPCS, shape (n, 2), mm.
-    on_plane
-        Which lie within its edges, shape (n,).
-    """
+    """Dots of one placement of the imaging plane (Fig. 4-11)."""
 
     distance_mm: float
+    """Of the plane to the torch."""
     plane_mm: FloatArray
+    """The dots, its edges ignored, IPCS, shape (n, 2), mm."""
     on_plane: BoolArray
+    """Which lie within its edges, shape (n,)."""
 
 
 def coverage() -> tuple[Coverage, ...]:

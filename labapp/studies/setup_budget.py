@@ -33,44 +33,32 @@ SHIFT_MM, STRETCH = 0.3, 0.05
 
 @dataclass(frozen=True)
 class Bench:
-    """A set-up, and how well it is known.
-
-    Parameters
-    ----------
-    rig, uncertainty
-        The set-up, and how well it is known.
-    dot_sigma_mm
-        Standard uncertainty of a dot's place on the plane.
-    """
+    """A set-up, and how well it is known."""
 
     rig: Rig
     uncertainty: RigUncertainty
+    """The set-up, and how well it is known."""
     dot_sigma_mm: float = DOT_SIGMA_MM
+    """Standard uncertainty of a dot's place on the plane."""
 
 
 @dataclass(frozen=True)
 class SetupBudget(ReadOnlyArrays):
-    """Budget of the height of a kind of pool; m pools of it.
-
-    Parameters
-    ----------
-    pool, uncertainty
-        The pool that is expected, and how well the bench is known.
-    predicted
-        The error of each of the m pools, predicted.
-    random
-        Relative height error of each, simulated without calibration errors, shape (m,); NaN
-        where there was no surface.
-    parameters
-        Relative change of the height by the standard uncertainty of each of `QUANTITIES`,
-        simulated: of some of the pools, shape (k, q).
-    """
+    """Budget of the height of a kind of pool; m pools of it."""
 
     pool: Pool
     uncertainty: RigUncertainty
+    """The pool that is expected, and how well the bench is known."""
     predicted: tuple[PredictedError, ...]
+    """The error of each of the m pools, predicted."""
     random: FloatArray
+    """Relative height error of each, simulated without calibration errors, shape (m,); NaN where
+    there was no surface.
+    """
     parameters: FloatArray
+    """Relative change of the height by the standard uncertainty of each of `QUANTITIES`, simulated:
+    of some of the pools, shape (k, q).
+    """
 
 
 def setup_budget(

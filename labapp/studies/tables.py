@@ -2,42 +2,30 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from dataclasses import dataclass
+
+from labapp.text import csv_text
 
 Cell = str | int | float | None
 
 
 @dataclass(frozen=True)
 class Table:
-    """A table that a command prints and writes.
-
-    Parameters
-    ----------
-    name
-        Name of its file, without the ending.
-    caption
-        One line that says what it shows, and which table or figure of the text it stands beside.
-    columns
-        Names of the columns, units in them.
-    rows
-        Cells; None or NaN where a value is unknown.
-    """
+    """A table that a command prints and writes."""
 
     name: str
+    """Name of its file, without the ending."""
     caption: str
+    """One line that says what it shows, and which table or figure of the text it stands beside."""
     columns: tuple[str, ...]
+    """Names of the columns, units in them."""
     rows: tuple[tuple[Cell, ...], ...]
+    """Cells; None or NaN where a value is unknown."""
 
     def csv(self) -> str:
         """CSV with a header row; an unknown value is an empty cell."""
-        out = io.StringIO()
-        writer = csv.writer(out, lineterminator="\n")
-        writer.writerow(self.columns)
-        writer.writerows([_text(cell, 6) for cell in row] for row in self.rows)
-        return out.getvalue()
+        return csv_text([self.columns, *([_text(cell, 6) for cell in row] for row in self.rows)])
 
     def markdown(self) -> str:
         """The caption in bold, and the table with its columns in line."""

@@ -20,8 +20,8 @@ import pyvista
 from labapp.core.surface.boundary import Boundary
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.surface.spline import SplineBasis, SplineSurface
-from labapp.export.drawing import build_scene
-from labapp.export.scene import scene_of
+from labapp.export.rendering.drawing import build_scene
+from labapp.export.rendering.scene import scene_of
 
 SIZE = (900, 600)
 SECONDS = 3.0

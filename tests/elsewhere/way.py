@@ -42,7 +42,7 @@ def run(*arguments: object) -> None:
 
 def measure(folder: Path) -> Path:
     """Simulate, record, measure and export by commands; returns the session."""
-    from labapp.export.drawing import can_draw
+    from labapp.export.rendering.drawing import can_draw
 
     made, session = folder / "egg", folder / "egg.labsession"
     setup, recording = made / "setup.toml", made / "recording.avi"

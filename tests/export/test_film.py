@@ -18,11 +18,11 @@ import pytest
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.pipeline import Measurement
 from labapp.errors import InputError
-from labapp.export.film import Extent, film_scene, film_times, write_film, write_video
 from labapp.export.folder import ExportChoice, export, verify_export
 from labapp.export.frame_result import FrameResult
-from labapp.export.scene import Scene
-from labapp.export.studio import Picture, Studio
+from labapp.export.rendering.film import Extent, film_scene, film_times, write_film, write_video
+from labapp.export.rendering.scene import Scene
+from labapp.export.rendering.studio import Picture, Studio
 
 Frames = list[FrameResult]
 SIZE = (480, 320)
@@ -266,7 +266,7 @@ FULL_DISK = """
     import resource, sys
     import numpy as np
     from pathlib import Path
-    from labapp.export.film import write_video
+    from labapp.export.rendering.film import write_video
 
     path, generator = Path(sys.argv[1]), np.random.default_rng(0)
     path.write_bytes(b"earlier")

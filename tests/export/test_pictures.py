@@ -12,8 +12,8 @@ import pytest
 
 from labapp.core.pipeline import Measurement
 from labapp.errors import InputError
-from labapp.export import pictures
 from labapp.export.frame_result import FrameResult
+from labapp.export.rendering import pictures
 from labapp.export.summary import Summary
 from labapp.session.record import Record
 from labapp.session.session import Session

@@ -9,11 +9,11 @@ import pytest
 from labapp.core.pipeline import Measurement
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.surface.surface import FlatSurface
-from labapp.export import drawing as draws
-from labapp.export import scene as scenes
 from labapp.export.heights import difference_at, profile, sigma_at
-from labapp.export.scene import difference_scene, rays_of, scene_of
-from labapp.export.studio import Studio
+from labapp.export.rendering import drawing as draws
+from labapp.export.rendering import scene as scenes
+from labapp.export.rendering.scene import difference_scene, rays_of, scene_of
+from labapp.export.rendering.studio import Studio
 from tests.scenes import BENCH_RIG
 
 RADIUS_MM, HEIGHT_MM = 3.0, 0.3

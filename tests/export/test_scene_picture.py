@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from labapp.export.drawing import build_scene
-from labapp.export.scene import Scene
+from labapp.export.rendering.drawing import build_scene
+from labapp.export.rendering.scene import Scene
 from tests.pictures import RENEW, Away, away, check_picture
 
 KEPT_PICTURE = Path(__file__).parent / "pictures" / "pool.png"

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from labapp.core.pipeline import Measurement
-from labapp.export.drawing import Direction
-from labapp.export.scene import scene_of
-from labapp.export.studio import Studio
+from labapp.export.rendering.drawing import Direction
+from labapp.export.rendering.scene import scene_of
+from labapp.export.rendering.studio import Studio
 
 
 @pytest.mark.parametrize("size_px", [(367, 226), (285, 170)])

@@ -13,7 +13,7 @@ from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication
 from pytestqt.qtbot import QtBot
 
-from labapp.export.scene import Scene
+from labapp.export.rendering.scene import Scene
 from labapp.gui.views import view3d
 from labapp.gui.views.view3d import NOTHING_HERE, OffscreenView, View3d, make_view3d
 from tests.gui.conftest import KEPT

@@ -21,7 +21,7 @@ from labapp.core.images.dots import Dots
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.recording import chain as recording_chain
 from labapp.core.surface.measures import Measures
-from labapp.export.scene import Scene, empty_scene
+from labapp.export.rendering.scene import Scene, empty_scene
 from labapp.media import open_source
 from labapp.media.cameras import CameraFrame
 from labapp.media.events import Event

@@ -14,8 +14,9 @@ from labapp.core.pipeline import Settings, measure, start_correction
 from labapp.core.rows.correction import block_row, set_reference
 from labapp.media import open_source
 from labapp.simulation.recording import TARGET
-from labapp.simulation.samples.__main__ import main
-from labapp.simulation.samples.runs import (
+from labapp.simulation.torch import ConeTorch
+from tests.samples.__main__ import main
+from tests.samples.runs import (
     BENT_MM,
     blocked_rows,
     concave,
@@ -23,7 +24,6 @@ from labapp.simulation.samples.runs import (
     samples,
     thumb_tack,
 )
-from labapp.simulation.torch import ConeTorch
 
 FOLDER = Path(__file__).parents[2] / "sample_sessions"
 

@@ -68,7 +68,7 @@ def tour(out: Path, size_px: tuple[int, int], theme: str) -> str:
 
     from PySide6.QtCore import QSettings, Qt
 
-    from labapp.export.drawing import can_draw
+    from labapp.export.rendering.drawing import can_draw
 
     from .bench import lay_out
     from .hands import Hands, TourFailed

@@ -45,15 +45,10 @@ Apply = Callable[[CameraSettings], "Future[CameraSettings] | None"]
 
 
 class CameraFields(QObject):
-    """Exposure, gain, rate, trigger and region, where the camera lets them be set.
-
-    Signals
-    -------
-    reset
-        Rate, trigger or region is another: frames are no longer as those before.
-    """
+    """Exposure, gain, rate, trigger and region, where the camera lets them be set."""
 
     reset = Signal()
+    """Rate, trigger or region changed: frames differ from those before."""
 
     def __init__(self, form: FieldForm, apply: Apply) -> None:
         super().__init__(form)

@@ -29,7 +29,7 @@ OLD_S = 2.0
 """A figure that is older is not of the pool that is seen: it is not in order, whatever it is."""
 
 LARGE = 1.9
-"""A figure that is read from afar is so many times as large as others."""
+"""How much larger a figure is that is read from a distance."""
 
 ACKNOWLEDGE_PX = 40
 """Least height of a button that is pressed in gloves."""
@@ -42,23 +42,16 @@ NO_SETUP = "Sizes stand here, too, when the set-up is complete (steps 1 to 3)"
 
 @dataclass(frozen=True)
 class Figure:
-    """A size as it is shown.
-
-    Parameters
-    ----------
-    name, value, sigma
-        Texts; value and sigma in mm.
-    told
-        How it stands to its limits, in words after a sign; empty where it has none.
-    look
-        In red, or pale.
-    """
+    """A size as it is shown."""
 
     name: str
     value: str
     sigma: str
+    """Texts; value and sigma in mm."""
     told: str = ""
+    """How it stands to its limits, in words after a sign; empty where it has none."""
     look: Look = "plain"
+    """Red or pale."""
 
 
 def figures(
@@ -66,7 +59,7 @@ def figures(
 ) -> tuple[Figure, ...]:
     """Width, length and height, of a hollow pool the depth.
 
-    All with as many decimals, whatever the ±: nothing jumps as they change.
+    All with the same number of decimals, whatever the ±: nothing jumps as they change.
 
     Parameters
     ----------
@@ -114,21 +107,21 @@ def pace_text(result: LiveResult | None, pace: Pace, came_hz: float | None, age_
     """How measuring keeps up, and why there is no figure where there is none."""
     if result is None:
         return FIRST
-    told = []
+    parts = []
     found = result.measurement
     if found.measures is None:
-        told.append(f"▲ Not measured ({found.status}): {found.reason}.")
+        parts.append(f"▲ Not measured ({found.status}): {found.reason}.")
     elif pace.failed:
-        told.append(f"◆ {pace.failed} of the last {pace.tried} frames could not be measured.")
+        parts.append(f"◆ {pace.failed} of the last {pace.tried} frames could not be measured.")
     if age_s > OLD_S:
-        told.append(f"▲ The figures are {age_s:.0f} s old.")
+        parts.append(f"▲ The figures are {age_s:.0f} s old.")
     came = f" of {came_hz:.1f}" if came_hz is not None else ""
-    told.append(f"{pace.measured_hz:.1f}{came} frames/s measured")
+    parts.append(f"{pace.measured_hz:.1f}{came} frames/s measured")
     if age_s <= OLD_S:
-        told[-1] += f"; {age_s:.2f} s old"
+        parts[-1] += f"; {age_s:.2f} s old"
     if found.setup_status in SETUP_WORDS:
-        told[-1] += f". {SETUP_WORDS[found.setup_status]}"
-    return " ".join(told)
+        parts[-1] += f". {SETUP_WORDS[found.setup_status]}"
+    return " ".join(parts)
 
 
 class LiveFigures(FollowsTheme, QWidget):
@@ -219,9 +212,9 @@ class AlarmStrip(FollowsTheme, QFrame):
     def show_alarms(self, alarms: Sequence[Alarm]) -> None:
         """Show alarms, after those that are kept; none hides it."""
         alarms = (*self._kept, *alarms)
-        told = alarms_text(alarms)
-        if told != self.words.text():
-            self.words.setText(told)
+        message = alarms_text(alarms)
+        if message != self.words.text():
+            self.words.setText(message)
             # A screen reader says it at once.
             alert = QAccessibleEvent(self.words, QAccessible.Event.Alert)
             QAccessible.updateAccessibility(alert)

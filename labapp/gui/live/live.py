@@ -76,34 +76,21 @@ def choices(found: list[CameraInfo]) -> list[tuple[str, str]]:
 
 @dataclass(frozen=True)
 class JudgedFrame:
-    """What was found in a frame.
-
-    Parameters
-    ----------
-    dots_px
-        (u, v) of its dots, shape (n, 2); None where they come with the frames that are shown.
-    quality
-        Whether it is fit to be measured.
-    """
+    """What was found in a frame."""
 
     dots_px: FloatArray | None
+    """(u, v) of its dots, shape (n, 2); None where they come with the frames that are shown."""
     quality: Quality
+    """Whether it can be measured."""
 
 
 @dataclass(frozen=True)
 class LiveFrame:
-    """A frame to be shown.
-
-    Parameters
-    ----------
-    frame
-        As the camera gave it.
-    dots_px
-        (u, v) of its dots, shape (n, 2); None where it is not known how to find them quickly.
-    """
+    """A frame to be shown."""
 
     frame: CameraFrame
     dots_px: FloatArray | None
+    """(u, v) of its dots, shape (n, 2); None where it is not known how to find them quickly."""
 
 
 class Live:
@@ -333,7 +320,7 @@ class Live:
         return self._judged.popleft() if self._judged else None
 
     def events(self) -> list[Event]:
-        """What has happened since it was asked last."""
+        """Events since the last call."""
         return [self._events.get() for _ in range(self._events.qsize())]
 
     def ended_takes(self) -> list[Take]:
@@ -348,7 +335,7 @@ class Live:
         return self._recorders[-1].running if self._recorders else None
 
     def rate_hz(self) -> float | None:
-        """Frames a second that came of late; None while that is not known."""
+        """Present rate of frames, 1/s; None while it is unknown."""
         now_s, counted = time.monotonic(), self._counted
         counted.append((now_s, 0 if self.feed is None else self.feed.counts.frames))
         while len(counted) > 2 and counted[1][0] < now_s - RATE_S:
@@ -371,10 +358,10 @@ class Live:
         if self.feed is None:
             return ""
         counts = self.feed.counts
-        told = [pluralize(counts.frames, "frame")]
-        told += [f"{counts.dropped} dropped", f"{counts.broken} not whole"]
-        told += [f"lost {pluralize(counts.lost, 'time')}"] * (counts.lost > 0)
-        return ", ".join(told)
+        parts = [pluralize(counts.frames, "frame")]
+        parts += [f"{counts.dropped} dropped", f"{counts.broken} not whole"]
+        parts += [f"lost {pluralize(counts.lost, 'time')}"] * (counts.lost > 0)
+        return ", ".join(parts)
 
     def ring(self) -> tuple[float, str]:
         """How full the memory of what comes before a trigger is, 0 … 1, and that in words."""
@@ -387,19 +374,19 @@ class Live:
 
     def recording_text(self) -> str:
         """What is being recorded, or became of the last recording, and for how long is room."""
-        take, told = self.running, []
+        take, parts = self.running, []
         if take is not None:
-            told = [f"● Recording: {pluralize(take.frames, 'frame')} written, {take.lost} lost"]
-            told += [f"▲ {take.trouble}"] * bool(take.trouble)
+            parts = [f"● Recording: {pluralize(take.frames, 'frame')} written, {take.lost} lost"]
+            parts += [f"▲ {take.trouble}"] * bool(take.trouble)
         elif self.takes and not self.takes[-1].finished.is_set():
-            told = [f"Writing the rest of {self.takes[-1].path.name}"]
+            parts = [f"Writing the rest of {self.takes[-1].path.name}"]
         elif self.takes:
-            told = [f"{self.takes[-1].path.name}: {self.takes[-1].summary.words}"]
+            parts = [f"{self.takes[-1].path.name}: {self.takes[-1].summary.words}"]
         rate = self.rate_hz()
         if self.room_byte is not None and rate:
             room_s = self.room_byte / (self._frame_byte * rate / self.plan.every)
-            told.append(f"room for {_lasting(room_s)} ({format_bytes(self.room_byte)})")
-        return "; ".join(told)
+            parts.append(f"room for {_lasting(room_s)} ({format_bytes(self.room_byte)})")
+        return "; ".join(parts)
 
     # --- to do --------------------------------------------------------------------------------
 

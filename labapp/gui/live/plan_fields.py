@@ -22,15 +22,10 @@ SHARE = 0.5
 
 
 class PlanFields(QObject):
-    """Fields for a `Plan`.
-
-    Signals
-    -------
-    edited
-        Another plan was entered.
-    """
+    """Fields for a `Plan`."""
 
     edited = Signal()
+    """Another plan was entered."""
 
     def __init__(self, form: FieldForm) -> None:
         super().__init__(form)
@@ -98,11 +93,11 @@ def cost_text(plan: Plan, frame_byte: int, rate_hz: float) -> str:
     part, core_s = COSTS[plan.codec]
     byte_s = frame_byte * rate_hz / plan.every
     core = core_s * byte_s
-    told = (
+    message = (
         f"About {format_bytes(round(part * byte_s))} a second, {max(1, round(100 * core))} % of a "
         "core"
     )
     if plan.codec == "ffv1" and core > SHARE:
         lost = "frames will be lost" if core > 1 else "little is left to measure live"
-        return f"⚠ {told}: {lost}. Raw takes {max(1, round(100 * COSTS['raw'][1] * byte_s))} %"
-    return told
+        return f"⚠ {message}: {lost}. Raw takes {max(1, round(100 * COSTS['raw'][1] * byte_s))} %"
+    return message

@@ -53,10 +53,10 @@ class RecordBar(QWidget):
     def show_status(self, live: Live) -> None:
         """Show the state of a camera and its recording."""
         self.state.setText(live.state_text())
-        part, told = live.ring()
+        part, message = live.ring()
         self.ring.setValue(round(100 * part))
-        self.ring.setFormat(told)
-        self.ring.setAccessibleName(f"Kept from before the trigger: {told}")
+        self.ring.setFormat(message)
+        self.ring.setAccessibleName(f"Kept from before the trigger: {message}")
         self.recording.setText(live.recording_text())
 
     def show_recording(self, recording: bool) -> None:

@@ -89,7 +89,7 @@ class LiveStreams(QWidget):
                 self._bring_about(kind)
 
     def _wanted(self, kind: str) -> tuple[LiveWatch | None, str, bool]:
-        """What is to be: who tells, where (empty: nowhere), and whether others may listen."""
+        """What sends, its address (empty: none), and whether other machines may connect."""
         anywhere, port = self.anywhere.isChecked(), int(self.ports[kind].value() or 0)
         place = f"{ANY if anywhere else OWN}:{port}"
         return self._watch(), place if self.boxes[kind].isChecked() else "", anywhere
@@ -148,8 +148,8 @@ class LiveStreams(QWidget):
         watch = self._watch()
         for kind in KINDS:
             stream = None if watch is None else watch.stream(kind)
-            told = stream_text(stream, self._is_at_work(kind), self._problems.get(kind, ""))
-            self.words[kind].setText(told)
+            message = stream_text(stream, self._is_at_work(kind), self._problems.get(kind, ""))
+            self.words[kind].setText(message)
         show_words(self.warning, WARNING if self.anywhere.isChecked() else "")
 
 
@@ -160,9 +160,9 @@ def stream_text(stream: Stream | None, at_work: bool, problem: str) -> str:
     if stream is None:
         return "○ One moment …" if at_work else "○ Off"
     listen = "program listens" if stream.listeners == 1 else "programs listen"
-    told = pluralize(stream.sent, "frame")
+    message = pluralize(stream.sent, "frame")
     where = f"{stream.address} (every address of this machine)" * (ANY in stream.address)
-    return f"● {where or stream.address}: {stream.listeners} {listen}, {told} told"
+    return f"● {where or stream.address}: {stream.listeners} {listen}, {message} told"
 
 
 def problem_text(error: InputError) -> str:

@@ -8,7 +8,7 @@ from functools import partial
 
 from PySide6.QtWidgets import QWidget
 
-from labapp.export.scene import Scene
+from labapp.export.rendering.scene import Scene
 from labapp.gui.live.figures import OLD_S
 from labapp.gui.views.view3d import LOOKS, make_view3d
 from labapp.gui.widgets.buttons import button
@@ -82,7 +82,7 @@ class LiveSurface(QWidget):
 
     def _show(self, scene: Scene | None) -> None:
         self.view.show_scene(scene)
-        self.view.repaint()  # at once: how long it takes tells how soon the next may come
+        self.view.repaint()  # at once: its duration determines when the next may come
 
 
 def steady_limits(

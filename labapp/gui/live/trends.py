@@ -160,7 +160,7 @@ class LiveTrends(QWidget):
         self.unmeasured.setEnabled(not session.read_only)
 
     def show_trend(self, watch: LiveWatch) -> None:
-        """Show what was measured of late."""
+        """Show the last measurements."""
         last_s = self.last.value() or LAST_S
         limits = watch.alarms.limits
         trend = watch.trend.over(last_s, limits)

@@ -60,13 +60,6 @@ RING, RING_PX = "#2fd39b", 15
 class LiveView(QObject):
     """A camera that is watched in the page's picture and recorded from.
 
-    Signals
-    -------
-    changed
-        A camera was started or stopped.
-    recorded
-        A recording was written to its end: a `Take`.
-
     Attributes
     ----------
     group
@@ -82,7 +75,9 @@ class LiveView(QObject):
     """
 
     changed = Signal()
+    """A camera was started or stopped."""
     recorded = Signal(object)
+    """A recording was written to its end: a `Take`."""
 
     def __init__(self, workspace: Workspace, picture: PictureView, exposure: ExposureBars) -> None:
         super().__init__(picture)
@@ -121,8 +116,8 @@ class LiveView(QObject):
             found, problems = answer
             self._choices = choices(found)
             self.camera.set_choices(self._choices)
-            told = f"{pluralize(len(found), 'camera')} found"
-            self.workspace.notified.emit(". ".join([told, *problems]), False)
+            message = f"{pluralize(len(found), 'camera')} found"
+            self.workspace.notified.emit(". ".join([message, *problems]), False)
 
         if self._finding not in self.workspace.tasks.active:
             self._finding = self.workspace.tasks.start(
@@ -325,14 +320,14 @@ class LiveView(QObject):
             self._timer.setInterval(wanted)
 
     def _follow(self, watch: LiveWatch) -> None:
-        """Show what was measured since it was asked last."""
+        """Show what was measured since the last call."""
         result = watch.newest()
         if result is not None:
             former, was_old = self._result, self._age_s > OLD_S
             self._result, self.measured_s = result, time.monotonic()
             self._show_figures(watch)
             if was_old or former is None or former.measurement.status != result.measurement.status:
-                self._status_s = 0.0  # what is said of the figures goes with them
+                self._status_s = 0.0  # the text about the figures is cleared with them
             if self._age_s <= OLD_S:  # else it is not of what is in view
                 self._show_quality(result.quality)
         self.updates += self.canvas.follow(result, watch)

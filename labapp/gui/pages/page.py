@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from PySide6.QtGui import QKeyEvent, QPixmap
 from PySide6.QtWidgets import QVBoxLayout, QWidget
 
 from labapp.gui.shell.steps import State, read_only
+from labapp.gui.tasks import Task, Work
 from labapp.gui.widgets.fields import Field
 from labapp.gui.widgets.labels import Message
 from labapp.gui.widgets.layouts import vbox
@@ -66,6 +67,14 @@ class Page(QWidget):
     def locked(self) -> str:
         """Why nothing in the session can be changed; empty if it can."""
         return read_only(self.workspace.session)
+
+    def start_task(
+        self, title: str, work: Work, on_done: Callable[[Any], None], kind: str = ""
+    ) -> Task:
+        """Begin work in the background, see `Tasks.start`; `refused` says why it failed."""
+        return self.workspace.tasks.start(
+            title, work, on_done, beside=self.refused.setText, kind=kind
+        )
 
     def lock_with_session(self, *widgets: QWidget) -> None:
         """Have these, which change the session, be of no use while it is open read-only."""

@@ -35,21 +35,14 @@ WIDTH_PX = 760
 
 
 class Welcome(FollowsTheme, QWidget):
-    """Recent sessions with thumbnail, date and frames; New; Open; Try the sample.
-
-    Signals
-    -------
-    action_requested
-        A button was pressed: the name of its action.
-    chosen
-        A session of the list was chosen.
-    forgotten
-        A session is to be taken off the list.
-    """
+    """Recent sessions with thumbnail, date and frames; New; Open; Try the sample."""
 
     action_requested = Signal(str)
+    """A button was pressed: the name of its action."""
     chosen = Signal(Path)
+    """A session of the list was chosen."""
     forgotten = Signal(Path)
+    """A session is to be removed from the list."""
 
     def __init__(self, workspace: Workspace) -> None:
         super().__init__()

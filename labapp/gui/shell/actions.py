@@ -13,38 +13,22 @@ Needs = Literal["", "session", "frames", "measuring", "undo", "redo", "work", "l
 
 @dataclass(frozen=True)
 class Action:
-    """One thing the operator can do from anywhere in the window; `commands` does it.
-
-    Parameters
-    ----------
-    name
-        In code; unique.
-    text
-        Its words there; ``&`` before the letter that chooses it, … where it asks something first.
-    key
-        Its key. One without Ctrl, Alt or F is first the key of what has the focus.
-    tip
-        What it does, a sentence.
-    needs
-        What must be there.
-    checkable
-        Whether it can be on or off.
-    group
-        Of actions of which one is on.
-    begins
-        Whether a line divides it from the one before.
-    menu
-        Where it stands.
-    """
+    """One thing the operator can do from anywhere in the window; `commands` does it."""
 
     name: str
+    """In code; unique."""
     text: str
+    """Its words there; ``&`` before the letter that chooses it, … where it asks something first."""
     key: str
+    """Its key. One without Ctrl, Alt or F is first the key of what has the focus."""
     tip: str
+    """What it does, a sentence."""
     needs: Needs = ""
     checkable: bool = False
     group: str = ""
+    """Of actions of which one is on."""
     begins: bool = False
+    """Whether a line divides it from the one before."""
     menu: str = ""
 
 

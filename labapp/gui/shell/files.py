@@ -23,15 +23,10 @@ if TYPE_CHECKING:
 
 
 class Files(QObject):
-    """What the window opens and makes.
-
-    Signals
-    -------
-    recording_requested
-        The step Recording is to be shown, and to take this file or folder, unless it is None.
-    """
+    """What the window opens and makes."""
 
     recording_requested = Signal(object)
+    """The step Recording is to be shown, and to take this file or folder, unless it is None."""
 
     def __init__(
         self,
@@ -143,7 +138,7 @@ class Files(QObject):
             self.workspace.show(None)
 
     def may_close(self) -> bool:
-        """Ask what becomes of a recording that runs; False if it is to go on, nothing closed."""
+        """Ask what to do with a running recording; False if it continues and nothing is closed."""
         camera = self._camera()
         take = None if camera is None else camera.recording
         if camera is None or take is None:

@@ -61,8 +61,8 @@ def keys(page: QWidget | None = None) -> str:
         rows = [(key, text, tip.removesuffix(f" ({key})")) for key, text, tip in own if key]
         parts += [_table(f"This page: {page.accessibleName()}", rows)] if rows else []
     in_views = (("Pictures", picture.KEYS), ("3-D views", view3d.KEYS_TOLD), ("Plots", plots.KEYS))
-    told = "".join(f"<p><b>{name}</b>: {escape(words)}.</p>" for name, words in in_views)
-    parts.append(f"<h3>In what is drawn</h3>{told}")
+    message = "".join(f"<p><b>{name}</b>: {escape(words)}.</p>" for name, words in in_views)
+    parts.append(f"<h3>In what is drawn</h3>{message}")
     for menu in MENUS:
         rows = [(_shown(a.key), a.text, a.tip) for a in ACTIONS if a.menu == menu and a.key]
         parts.append(_table(menu.replace("&", ""), rows))

@@ -27,11 +27,11 @@ PROBLEM = "▲"
 """Before a problem, which is shown by shape as well as by colour."""
 
 TOLD = Qt.ItemDataRole.UserRole
-"""Of a line of the log: what it tells, since when, and how often it was said."""
+"""Of a line of the log: its text, since when, and how many times."""
 
 
 class LogPanel(QListWidget):
-    """Everything that was said, the last at the end."""
+    """All messages, the last at the end."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -48,17 +48,17 @@ class LogPanel(QListWidget):
         return QSize(400, self.fontMetrics().height() * 6)
 
     def add(self, text: str, problem: bool) -> None:
-        """Add what was said; the same again in the same line, with how often."""
+        """Add a message; a repeated one is counted in the same line."""
         now = datetime.datetime.now().strftime("%H:%M:%S")
-        told = f"{PROBLEM + ' ' if problem else ''}{text}"
+        message = f"{PROBLEM + ' ' if problem else ''}{text}"
         last = self.item(self.count() - 1) if self.count() else None
-        if last is not None and last.data(TOLD)[0] == told:
+        if last is not None and last.data(TOLD)[0] == message:
             _, first, times = last.data(TOLD)
-            last.setData(TOLD, (told, first, times + 1))
-            last.setText(f"{now}  {told} ({times + 1} times since {first})")
+            last.setData(TOLD, (message, first, times + 1))
+            last.setText(f"{now}  {message} ({times + 1} times since {first})")
             return
-        item = QListWidgetItem(f"{now}  {told}")
-        item.setData(TOLD, (told, now, 1))
+        item = QListWidgetItem(f"{now}  {message}")
+        item.setData(TOLD, (message, now, 1))
         font = item.font()
         font.setBold(problem)
         item.setFont(font)
@@ -83,15 +83,11 @@ class LogPanel(QListWidget):
 class StatusLine(QWidget):
     """The last message, and how far the work under way is.
 
-    A problem stays until it was read, or is over, whatever is said after it.
-
-    Signals
-    -------
-    read
-        The operator has read the problems, and wants to see them all.
+    A problem stays until it was read or is solved, whatever message follows.
     """
 
     read = Signal()
+    """The operator has read the problems, and wants to see them all."""
 
     def __init__(self, tasks: Tasks) -> None:
         super().__init__()

@@ -80,15 +80,10 @@ def _drawn(mark: Mark, colour: QColor, ground: QColor) -> QPixmap:
 
 
 class StepList(FollowsTheme, QListWidget):
-    """The steps that have a page.
-
-    Signals
-    -------
-    chosen
-        The operator chose a step: its key.
-    """
+    """The steps that have a page."""
 
     chosen = Signal(str)
+    """The operator chose a step: its key."""
 
     def __init__(self, steps: Sequence[Step]) -> None:
         super().__init__()
@@ -124,8 +119,8 @@ class StepList(FollowsTheme, QListWidget):
             state, item = states[step.key], self.item(row)
             item.setIcon(mark_icon(state.mark, dark, selected))
             item.setToolTip(plain_tip(f"{state.mark.value.capitalize()}: {state.why}"))
-            told = f"{row + 1} {step.title}: {state.mark.value}. {state.why}"
-            item.setData(Qt.ItemDataRole.AccessibleTextRole, told)
+            message = f"{row + 1} {step.title}: {state.mark.value}. {state.why}"
+            item.setData(Qt.ItemDataRole.AccessibleTextRole, message)
 
     def take_colours(self) -> None:
         """Draw the marks in the window's colours."""

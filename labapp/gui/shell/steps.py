@@ -56,8 +56,8 @@ def setup_to_do(problems: Iterable[InputError]) -> str:
         elif problem.value == "missing":
             enter.append(f"{PARTS[part]} ({key.replace('_', ' ')})" if key else PARTS[part])
         else:
-            told = f"{PARTS[part]}, {key.replace('_', ' ')}"
-            wrong.append(f"correct {told}: {problem.value} is not {problem.expected}")
+            message = f"{PARTS[part]}, {key.replace('_', ' ')}"
+            wrong.append(f"correct {message}: {problem.value} is not {problem.expected}")
     typed = [f"enter {', '.join(dict.fromkeys(enter))}"] if enter else []
     words = "; ".join([*wrong, *typed, *calibrate])
     return words[:1].upper() + words[1:]
@@ -118,24 +118,16 @@ def _entered(keys: Any, found: Mapping[str, Any]) -> bool:
 
 @dataclass(frozen=True)
 class Facts:
-    """What the steps' states are computed from.
-
-    Parameters
-    ----------
-    session
-        What is open.
-    problems
-        Of its set-up.
-    count, measured, without, stale
-        Frames; of these those that are measured, have no surface then, no longer stand.
-    """
+    """What the steps' states are computed from."""
 
     session: Session
     problems: tuple[InputError, ...] = ()
+    """Of its set-up."""
     count: int = 0
     measured: int = 0
     without: int = 0
     stale: int = 0
+    """Number of frames, and of those measured, without a surface, stale."""
 
     @property
     def checked(self) -> str:
@@ -257,30 +249,19 @@ def _export(facts: Facts) -> State:
 
 @dataclass(frozen=True)
 class Step:
-    """One step of the guided way.
-
-    Parameters
-    ----------
-    key
-        Its name in code: its page is in ``labapp.gui.pages.KEY``.
-    title
-        Its name for the operator.
-    hint
-        What to do there, in two or three sentences.
-    page
-        The page's class.
-    state
-        How far it is.
-    needs_frames
-        Whether it is of no use before there is a recording; ``state`` is not asked then.
-    """
+    """One step of the guided way."""
 
     key: str
+    """Its name in code: its page is in ``labapp.gui.pages.KEY``."""
     title: str
+    """Its name for the operator."""
     hint: str
+    """What to do there, in two or three sentences."""
     page: str
+    """The page's class."""
     state: Callable[[Facts], State] = results
     needs_frames: bool = True
+    """Whether it needs a recording; ``state`` is not called before there is one."""
 
 
 STEPS = (

@@ -44,7 +44,7 @@ Commands = Callable[["MainWindow"], Mapping[str, Callable[[], object]]]
 """What each action does in a window, by its name."""
 
 REST = 4
-"""After showing a change the window rests so many times as long as that took, for the hands."""
+"""After showing a change the window waits this multiple of its duration, to stay responsive."""
 
 LONGEST_REST_MS = 1000
 
@@ -287,7 +287,7 @@ class MainWindow(QMainWindow):
         """Show another session from the start, or the welcome page."""
         session = self.workspace.session
         self.timeline.set_playing(False)
-        self.status_line.say("", False)  # what was said of another session
+        self.status_line.say("", False)  # the message was about another session
         self._leave()
         self.side_panel.read_only.setVisible(session is not None and session.read_only)
         self._show_session()
@@ -427,7 +427,7 @@ class MainWindow(QMainWindow):
                 restore(QByteArray.fromBase64(text.encode("ascii", "replace")))
         if preferences.layout:
             self._wanted = {name: not dock.isHidden() for name, dock in self._docks.items()}
-            self._wanted["log"] = False  # what was said then is not said now
+            self._wanted["log"] = False  # its messages are from before
 
     # --- events -----------------------------------------------------------------------------
 

@@ -23,7 +23,7 @@ TOOLS = {
 
 
 def show_tool(key: str, sessions: Files, window: QWidget) -> ToolWindow:
-    """Bring a tool's window into view; it is made when it is first asked for."""
+    """Bring a tool's window into view; it is made on first use."""
     from PySide6.QtWidgets import QDialog
 
     tool: ToolWindow | None = window.findChild(QDialog, f"tool-{key}")  # type: ignore[assignment]

@@ -130,7 +130,7 @@ class AdviserWindow(ToolWindow):
             number.set_value(values[table][name])
 
     def values(self) -> advising.Values:
-        """What is asked now."""
+        """The request as the fields have it."""
         values = {table: dict(keys) for table, keys in self._asked.items()}
         values["pools"]["kind"] = self.kind.value()
         for key, field in self.ranges.items():

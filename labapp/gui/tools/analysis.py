@@ -183,7 +183,7 @@ class AnalysisWindow(ToolWindow):
         self.begin("Working out", work, lambda _: self.say("Done"), self.show_part)
 
     def _budget(self) -> tuple[Setup | None, Pool]:
-        """Set-up and pool of the budget, as they are asked for."""
+        """Set-up and pool of the budget, as chosen."""
         session = self.workspace.session
         pool = expected_pool(*(float(field.value() or 0) for field in self.sizes.values()))
         if self.setup.value() == USUAL:

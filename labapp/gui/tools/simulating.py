@@ -14,21 +14,14 @@ from labapp.simulation.recording import RecordedFrame
 
 @dataclass(frozen=True)
 class ScenarioPreview:
-    """A scenario with its first frame.
-
-    Parameters
-    ----------
-    scenario
-        As it was read, with one frame.
-    frames
-        How many it asks for itself.
-    frame
-        The first one, with its truth.
-    """
+    """A scenario with its first frame."""
 
     scenario: Scenario
+    """As it was read, with one frame."""
     frames: int
+    """Number of frames that it asks for."""
     frame: RecordedFrame
+    """The first one, with its truth."""
 
     @property
     def dots_px(self) -> FloatArray:
@@ -56,7 +49,7 @@ def choices(own: Path | None) -> list[tuple[str, str]]:
 
 
 def rows(shown: ScenarioPreview, frames: int) -> tuple[ResultRow, ...]:
-    """What is known of a scenario's first frame, and of a recording of so many."""
+    """What is known of a scenario's first frame, and of a recording of that many frames."""
     recording, frame = shown.scenario.recording, shown.frame
     size, seen = frame.pool.size, frame.reflections
     free = seen.lit & ~seen.blocked

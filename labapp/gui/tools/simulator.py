@@ -123,7 +123,7 @@ class SimulatorWindow(ToolWindow):
             self.show_scenario()
 
     def show_scenario(self) -> None:
-        """Draw the scenario that is chosen, with the seed and as many frames as it asks for."""
+        """Draw the scenario that is chosen, with its seed and number of frames."""
         if self.folder.value() == self._proposed:
             self._propose(Path(self._proposed).parent)
         self._draw(None)
@@ -155,7 +155,7 @@ class SimulatorWindow(ToolWindow):
     # --- its first frame -----------------------------------------------------------------------
 
     def _draw(self, seed: int | None) -> None:
-        """Draw the first frame in the background; what was asked for last is shown."""
+        """Draw the first frame in the background; the last request is shown."""
         path = self.scenario.value()
         for task in self.previews.active:
             task.cancel()
@@ -207,7 +207,7 @@ class SimulatorWindow(ToolWindow):
             self.open_button.setEnabled(not self.working and self.made is not None)
 
     def start(self) -> None:
-        """Write recording and truth, in the background; the folder is whole or not there."""
+        """Write recording and truth, in the background; the folder is complete or absent."""
         for field in (self.frames, self.seed, self.folder):
             field.flush()
         path, seed = Path(self.scenario.value()), int(self.seed.value() or 0)

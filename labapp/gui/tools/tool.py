@@ -12,7 +12,9 @@ from PySide6.QtCore import QSize, Qt
 from PySide6.QtGui import QCloseEvent
 from PySide6.QtWidgets import QDialog, QHBoxLayout, QProgressBar, QPushButton, QVBoxLayout, QWidget
 
-from labapp.gui.dialogs import ask_folder, refused_as_input, write_file
+from labapp.errors import os_errors_as_input
+from labapp.files import write_file
+from labapp.gui.dialogs import ask_folder
 from labapp.gui.shell.messages import PROBLEM
 from labapp.gui.tasks import Control, Task, Tasks
 from labapp.gui.widgets.buttons import button
@@ -116,7 +118,7 @@ class ToolWindow(QDialog):
     # --- what tools say for themselves ---------------------------------------------------------
 
     def prefill(self) -> None:
-        """Put what the session holds into the form, where that is another than last time."""
+        """Put what the session holds into the form, where it changed since last time."""
 
     def show_state(self) -> None:
         """Enable what is of use now."""
@@ -201,10 +203,10 @@ class ToolWindow(QDialog):
             self.save(folder)
 
     def save(self, folder: Path) -> None:
-        """Write what was found, as the command does; each file is whole."""
+        """Write the results, as the command does; each file atomically."""
 
         def write() -> Path:
-            with refused_as_input(folder, "folder"):
+            with os_errors_as_input(folder, "folder", "one that can be written"):
                 folder.mkdir(parents=True, exist_ok=True)
             for name, content in self.files.items():
                 write_file(folder / name, content)
@@ -218,7 +220,7 @@ class ToolWindow(QDialog):
         self.message.setText(f"{PROBLEM} {text}" if problem else text)
 
     def _repeat_message(self, text: str, problem: bool) -> None:
-        """What is said behind this window is said here too."""
+        """Show messages of the main window here, too."""
         if self.isVisible():
             self.say(text, problem)
 

@@ -59,8 +59,8 @@ class CrossHairView(Sketch):
         self.plot.plot(*diode[:, None], pen=None, symbol="s", symbolSize=13, symbolBrush=ink)
         self._text("laser", diode, (0.5, 1.4))
         words = f"beam {found.distance_mm:.1f} mm at {found.angle_deg:.2f}°"
-        for part, told in ((0.4, f"height {found.height_mm:.1f} mm"), (0.2, words)):
-            self._text(told, (diode[0], diode[1] * part), (1.05, 0.5))
+        for part, message in ((0.4, f"height {found.height_mm:.1f} mm"), (0.2, words)):
+            self._text(message, (diode[0], diode[1] * part), (1.05, 0.5))
         self.plot.setRange(xRange=(-l2 - 4, right), yRange=(2 * level, diode[1] * 1.15))
 
     def _line(self, points: object, pen: object, **symbol: object) -> None:

@@ -32,15 +32,10 @@ def arrow_step(event: QKeyEvent) -> tuple[float, float] | None:
 
 
 class DragPoint(pg.TargetItem):  # type: ignore[misc]
-    """A named point to drag, or to nudge with the arrow keys.
-
-    Signals
-    -------
-    moved
-        It was dragged or nudged, or is being dragged: u, v.
-    """
+    """A named point to drag, or to nudge with the arrow keys."""
 
     moved = Signal(float, float)
+    """It was dragged or nudged, or is being dragged: u, v."""
 
     def __init__(self, name: str, u: float, v: float, color: str = "#ffb000") -> None:
         self.name = name

@@ -38,7 +38,7 @@ DARKEST, BRIGHTEST = 1.0, 99.7
 """Percentiles of the levels that are drawn black and white."""
 
 CONTRAST_STEPS = 25
-"""So many steps of the contrast slider halve or double the range of levels."""
+"""Number of steps of the contrast slider that halve or double the range of levels."""
 
 KEYS = (
     "Zoom with the wheel, + and −; F fits; drag with the middle button, or Shift and arrow keys, "
@@ -60,7 +60,7 @@ class Tool:
         return False
 
     def drag(self, u: float, v: float) -> None:
-        """Go on with the drag."""
+        """Continue the drag."""
 
     def end(self, u: float, v: float) -> None:
         """End the drag."""
@@ -79,11 +79,6 @@ class Tool:
 class PictureView(Drawn):
     """A grey picture; overlays are pyqtgraph items that `add` puts over it, in px.
 
-    Signals
-    -------
-    pointed
-        Where the pointer is and the level there: u, v, level (None outside the picture).
-
     Attributes
     ----------
     tool
@@ -93,6 +88,7 @@ class PictureView(Drawn):
     """
 
     pointed = Signal(float, float, object)
+    """Where the pointer is and the level there: u, v, level (None outside the picture)."""
 
     def __init__(self, name: str = "Picture") -> None:
         super().__init__(name, KEYS)
@@ -191,7 +187,7 @@ class PictureView(Drawn):
     # --- zoom and contrast --------------------------------------------------------------------
 
     def fit(self) -> None:
-        """Show the whole picture, and go on to when the view gets larger or smaller."""
+        """Fit the picture into the view, also when the view is resized."""
         self._fits = True
         if self._image is not None:
             rows, columns = self._image.shape

@@ -34,7 +34,7 @@ from labapp.gui.widgets.layouts import fill, scrolled
 pg.setConfigOptions(imageAxisOrder="row-major", antialias=True)
 
 MOST_POINTS = 1500
-"""Where more are in view, a line stands for them, and only special ones keep their mark."""
+"""Where more are in view, they are drawn as a line, and only special ones keep their mark."""
 
 NEAR = 18.0
 """A click this near to a point, in screen pixels, means it."""
@@ -42,7 +42,7 @@ NEAR = 18.0
 AXIS_WIDTH = 60
 TITLE_HEIGHT = 18
 NUMBER_LINES = 1.3
-"""A number up an axis takes so many lines of its font."""
+"""Height of a number at an axis, in lines of its font."""
 
 LEAST_HEIGHT = 76
 """A plot is no lower than this; where they do not fit, they scroll."""
@@ -53,15 +53,10 @@ Role = QPalette.ColorRole
 
 
 class PlotStack(Plotted):
-    """Plots under each other.
-
-    Signals
-    -------
-    chosen
-        The operator chose a point, with the pointer or the keys: its key.
-    """
+    """Plots under each other."""
 
     chosen = Signal(int)
+    """The operator chose a point, with the pointer or the keys: its key."""
 
     def __init__(self, name: str = "Plots") -> None:
         super().__init__(name, KEYS)

@@ -1,7 +1,7 @@
 """The 3-D view: a scene that can be turned, in the window's own OpenGL or drawn off-screen.
 
 Where Qt has no OpenGL for VTK (no display, or Wayland) the scene is drawn off-screen and shown as
-a picture. So it is where the processor draws: a window with OpenGL in it is put together whole for
+a picture. So it is where the processor draws: a window with OpenGL in it is composed as a whole for
 every picture, which costs more than the scene does. Where nothing can be drawn, words say so.
 """
 
@@ -30,8 +30,8 @@ from PySide6.QtGui import (
 )
 from PySide6.QtWidgets import QVBoxLayout, QWidget
 
-from labapp.export.drawing import USUAL_DPI, Direction, Drawing, build_scene, can_draw
-from labapp.export.scene import Scene
+from labapp.export.rendering.drawing import USUAL_DPI, Direction, Drawing, build_scene, can_draw
+from labapp.export.rendering.scene import Scene
 from labapp.gui.views.canvas import Drawn
 
 LOOKS: dict[Direction, tuple[str, str]] = {
@@ -88,14 +88,10 @@ class View3d(Drawn):
 
     The mouse turns it, the wheel zooms, Shift or the middle button moves it. Arrow keys turn, + and
     − zoom, 1 to 4 look from the top, the side, the front and obliquely.
-
-    Signals
-    -------
-    camera_changed
-        The operator looks from elsewhere: its `Camera`.
     """
 
     camera_changed = Signal(object)
+    """The direction of view changed: its `Camera`."""
 
     def __init__(self, name: str = "3-D view") -> None:
         super().__init__(name, KEYS_TOLD)

@@ -1,6 +1,6 @@
 """Fields for numbers, words and choices, and the form that lays them out.
 
-A field tells of an edit only when it is finished: Enter, leaving the field, or a pause after steps.
+A field reports an edit only when it is finished: Enter, leaving the field, or a pause after steps.
 What is wrong stands in words below it: why the last entry was refused, until another one is taken;
 else what is wrong with the value that it holds.
 """
@@ -39,11 +39,6 @@ STEP_PAUSE_MS = 300
 class Field(QWidget):
     """An editor with its label, its unit and room for a problem in words.
 
-    Signals
-    -------
-    edited
-        The operator has entered another value: the value, None where it was emptied.
-
     Attributes
     ----------
     label
@@ -53,6 +48,7 @@ class Field(QWidget):
     """
 
     edited = Signal(object)
+    """The operator has entered another value: the value, None where it was emptied."""
 
     def __init__(self, label: str, editor: QWidget, tooltip: str, unit: str = "") -> None:
         super().__init__()
@@ -105,17 +101,17 @@ class Field(QWidget):
     def _show_problem_text(self) -> None:
         """Make or take its room; not while a button of the mouse is down, or a click is lost."""
         words = self._refusal or self._fault
-        told = f"⚠ {words}" if words else ""
-        if told != self.problem.text() and QGuiApplication.mouseButtons():
+        message = f"⚠ {words}" if words else ""
+        if message != self.problem.text() and QGuiApplication.mouseButtons():
             QTimer.singleShot(MOUSE_MS, self, self._show_problem_text)
             return
-        show_words(self.problem, told)
+        show_words(self.problem, message)
 
 
 class NumberField(Field):
     """A number with its unit, right-aligned; steps by arrow keys, buttons and wheel.
 
-    What is no number, or out of range, is said below the field, and the former value stays. While
+    What is no number, or out of range, is shown below the field, and the former value stays. While
     the operator types, `set_value` does not take the text from under the hand.
 
     Parameters

@@ -102,7 +102,7 @@ class Message(QLabel):
             self._update_tip()
 
     def resizeEvent(self, event: QResizeEvent) -> None:
-        """Update the tooltip, which has the whole text where it does not fit."""
+        """Update the tooltip, which has the full text where it does not fit."""
         super().resizeEvent(event)
         self._update_tip()
 

@@ -10,11 +10,11 @@ from labapp.gui.widgets.fields import TextField
 from labapp.gui.widgets.labels import plain_tip
 
 TEXT_MARGIN_PX = 2
-"""Between the frame's contents and the text: QLineEdit's own, which Qt does not tell."""
+"""Between the frame's contents and the text: QLineEdit's own, which Qt does not publish."""
 
 
 class PathField(TextField):
-    """A file's or folder's path; its tooltip has it whole."""
+    """A file's or folder's path; its tooltip has the full path."""
 
     def __init__(self, label: str, *, tooltip: str = "") -> None:
         line = PathLine()

@@ -22,7 +22,7 @@ class ResultTable(ReadTable):
         self.setVerticalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
         self.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
         self.horizontalHeader().setSectionResizeMode(0, QHeaderView.ResizeMode.Stretch)
-        # The header tells of a width before the cells have it.
+        # The header reports a width before the cells have it.
         self._narrowed = QTimer(self, singleShot=True, interval=0)
         self._narrowed.timeout.connect(self._fit_height)
         self.horizontalHeader().sectionResized.connect(lambda *_: self._narrowed.start())

@@ -37,25 +37,16 @@ Shape = Sequence[tuple[float, float]]
 
 @dataclass(frozen=True)
 class Tick:
-    """How ticks of one kind look.
-
-    Parameters
-    ----------
-    words
-        What it means.
-    short
-        The same in a word, where there is little room.
-    light, dark
-        Colour on a light and on a dark ground; empty for the palette's.
-    parts
-        (from, to) up the height, 0 at the foot and 1 at the top: shape tells as much as colour.
-    """
+    """How ticks of one kind look."""
 
     words: str
     short: str
+    """The same in a word, where there is little room."""
     light: str
     dark: str
+    """Colour on a light and on a dark ground; empty for the palette's."""
     parts: Shape
+    """(from, to) of the height, 0 at the foot and 1 at the top, so that colour is not needed."""
 
 
 def aggregated(kinds: npt.NDArray[np.int64], columns: int) -> npt.NDArray[np.int64]:
@@ -79,14 +70,10 @@ class Scrubber(QAbstractSlider):
     """The ticks, and the frame in view on them; it knows positions, not what a frame is.
 
     To a screen reader it is a slider, whose value is the position.
-
-    Signals
-    -------
-    moved
-        The operator went to a position, counted from 0.
     """
 
     moved = Signal(int)
+    """The operator went to a position, counted from 0."""
 
     def __init__(self, ticks: Sequence[Tick]) -> None:
         super().__init__()

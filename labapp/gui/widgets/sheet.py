@@ -12,7 +12,7 @@ from labapp.gui.theme import FollowsTheme, is_dark
 from labapp.gui.widgets.labels import plain_label
 
 MOST_SCALE = 1.25
-"""Larger than so many times as it was printed it is not shown."""
+"""Largest scale at which it is shown, of its printed size."""
 
 
 class Sheet(FollowsTheme, QScrollArea):

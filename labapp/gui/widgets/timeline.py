@@ -29,18 +29,14 @@ class Timeline(FollowsTheme, QWidget):
     """The scrubber with its buttons, the frame's number and time.
 
     It knows no session: numbers, times and kinds of frames are given to it.
-
-    Signals
-    -------
-    moved
-        The operator went to a frame: its number.
-    jumped
-        The operator asked for the next frame in doubt or corrected: ``doubtful`` or
-        ``corrected``, and whether forward.
     """
 
     moved = Signal(int)
+    """The operator went to a frame: its number."""
     jumped = Signal(str, bool)
+    """The operator asked for the next frame in doubt or corrected: ``doubtful`` or ``corrected``,
+    and whether forward.
+    """
 
     def __init__(self, ticks: Sequence[Tick]) -> None:
         super().__init__()
@@ -188,7 +184,7 @@ class Timeline(FollowsTheme, QWidget):
         found = np.bincount(kinds, minlength=len(self._ticks)) if len(kinds) else ()
         long: list[str] = []
         short: list[str] = []
-        told: list[str] = []
+        parts: list[str] = []
         for tick, count in zip(self._ticks, found, strict=False):
             if count:
                 square = (
@@ -196,9 +192,9 @@ class Timeline(FollowsTheme, QWidget):
                 )
                 for texts, words in ((long, tick.words.split(":")[0]), (short, tick.short)):
                     texts.append(f"{square}&nbsp;{count}&nbsp;{words.replace(' ', '&nbsp;')}")
-                told.append(f"{count} {tick.words}")
-        self.counts.setToolTip("\n".join(told))
-        self.counts.setAccessibleName(", ".join(told))
+                parts.append(f"{count} {tick.words}")
+        self.counts.setToolTip("\n".join(parts))
+        self.counts.setAccessibleName(", ".join(parts))
         self.counts.setText(" &nbsp; ".join(long))
         if self.counts.sizeHint().width() > self.counts.width():
             self.counts.setText(" &nbsp; ".join(short))

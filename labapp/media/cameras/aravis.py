@@ -78,11 +78,6 @@ def find_genicam() -> list[CameraInfo]:
 class GenicamCamera(Camera):
     """A GenICam camera that is open; see `Camera`.
 
-    Parameters
-    ----------
-    info
-        One of `find_genicam`.
-
     Raises
     ------
     CameraError
@@ -298,7 +293,7 @@ class GenicamCamera(Camera):
         self._aravis.release(stream.handle)
 
     def close(self) -> None:
-        """Let go of the camera."""
+        """Release the camera."""
         self.stop()
         camera, self._camera = self._camera, 0
         if camera:
@@ -320,7 +315,7 @@ class _Stream:
     last: int = -1
 
     def number(self, frame_id: int) -> int:
-        """Number of a frame that goes on where 16 bits begin anew."""
+        """Number of a frame, continued where its 16 bits overflow."""
         if frame_id < self.last <= LARGEST_SHORT_ID and self.last - frame_id > LARGEST_SHORT_ID / 2:
             self.turns += 1
         self.last = frame_id

@@ -14,7 +14,7 @@ from labapp.errors import InputError
 from labapp.media.base import GreyImage
 
 Trigger = Literal["free", "software", "line"]
-"""When a frame is taken: at the camera's own rate, when told to, at a signal on its input."""
+"""When a frame is taken: at the camera's own rate, by software, at a signal on its input."""
 
 Region = tuple[int, int, int, int]
 """(u, v, width, height) of the part of the sensor that is read out, px."""
@@ -23,11 +23,11 @@ NUMBERS = {"exposure_us": "µs", "gain_db": "dB", "rate_hz": "frames/s"}
 """What is set by a number, and its unit."""
 
 BUFFERED_S, BUFFERED_BYTE, LEAST_BUFFERED = 2.0, 128_000_000, 32
-"""Frames that wait for their reader: those of so long, as far as so much memory holds them."""
+"""Frames that wait for their reader: a duration, s, limited by an amount of memory, bytes."""
 
 
 class CameraError(Exception):
-    """A camera does not do what was asked; the message says what, and what to do about it."""
+    """A camera did not do what was requested; the message says what, and what to do about it."""
 
 
 class CameraLost(CameraError):
@@ -35,26 +35,19 @@ class CameraLost(CameraError):
 
 
 class BrokenFrame(CameraError):
-    """A frame arrived that is not whole; the next may be."""
+    """A frame arrived incomplete; the next may be complete."""
 
 
 @dataclass(frozen=True)
 class CameraInfo:
-    """A camera that was found.
-
-    Parameters
-    ----------
-    id
-        What it is opened by: "uvc:0", "aravis:Vendor-Serial", "simulated:cap.toml".
-    name
-        Maker and model, as it says itself.
-    kind
-        How it is connected: "USB video", "GigE Vision", "USB3 Vision", "simulated".
-    """
+    """A camera that was found."""
 
     id: str
+    """What it is opened by: "uvc:0", "aravis:Vendor-Serial", "simulated:cap.toml"."""
     name: str
+    """Maker and model, as it reports them."""
     kind: str
+    """How it is connected: "USB video", "GigE Vision", "USB3 Vision", "simulated"."""
 
 
 @dataclass(frozen=True)
@@ -67,51 +60,30 @@ class Range:
 
 @dataclass(frozen=True, kw_only=True)
 class Limits:
-    """What can be set on a camera; None for what cannot.
-
-    Parameters
-    ----------
-    exposure_us, gain_db, rate_hz
-        From where to where.
-    sensor
-        (width, height) of the whole picture, px.
-    least_region
-        (width, height) of the smallest region, px; None where no region can be set.
-    triggers
-        The triggers it knows, "free" among them.
-    gain_unit
-        Of the gain, for people; empty where it is in the driver's own steps.
-    """
+    """What can be set on a camera; None for what cannot."""
 
     exposure_us: Range | None = None
     gain_db: Range | None = None
     rate_hz: Range | None = None
+    """Lowest and highest value."""
     sensor: tuple[int, int]
+    """(width, height) of the whole picture, px."""
     least_region: tuple[int, int] | None = None
+    """(width, height) of the smallest region, px; None where no region can be set."""
     triggers: tuple[Trigger, ...] = ("free",)
+    """The triggers it knows, "free" among them."""
     gain_unit: str = "dB"
+    """Of the gain, for people; empty where it is in the driver's own steps."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CameraSettings:
-    """What a camera is set to, or is to be; None: unknown, or left as it is.
-
-    Parameters
-    ----------
-    exposure_us
-        How long light is gathered for a frame, µs.
-    gain_db
-        Amplification, dB (of USB video the driver's own number).
-    rate_hz
-        Frames a second.
-    region
-        See `Region`.
-    trigger
-        See `Trigger`.
-    """
+    """What a camera is set to, or is to be; None: unknown, or left as it is."""
 
     exposure_us: float | None = None
+    """How long light is gathered for a frame, µs."""
     gain_db: float | None = None
+    """Amplification, dB (of USB video the driver's own number)."""
     rate_hz: float | None = None
     region: Region | None = None
     trigger: Trigger | None = None
@@ -133,24 +105,16 @@ class CameraSettings:
 
 @dataclass(frozen=True)
 class CameraFrame(ReadOnlyArrays):
-    """A frame as a camera gave it.
-
-    Parameters
-    ----------
-    number
-        The camera's own count; a gap tells of frames that were lost on the way.
-    time_s
-        The camera's clock, s; by the computer's where the camera has none.
-    arrived_s
-        `time.monotonic` when it was here, s.
-    image
-        Grey levels, shape (rows, columns), uint8 or uint16, read-only.
-    """
+    """A frame as a camera gave it."""
 
     number: int
+    """The camera's own count; a gap means frames that were lost in transfer."""
     time_s: float
+    """The camera's clock, s; by the computer's where the camera has none."""
     arrived_s: float
+    """`time.monotonic` at its arrival, s."""
     image: GreyImage = field(repr=False)
+    """Grey levels, shape (rows, columns), uint8 or uint16, read-only."""
 
 
 class Camera(Protocol):
@@ -202,7 +166,7 @@ class Camera(Protocol):
         Raises
         ------
         BrokenFrame
-            If one came that is not whole.
+            If an incomplete one arrived.
         CameraLost
             If none will come any more.
         """
@@ -222,7 +186,7 @@ class Camera(Protocol):
         ...
 
     def close(self) -> None:
-        """Let go of the camera. Closing twice does no harm."""
+        """Release the camera. Closing twice does no harm."""
         ...
 
     def __enter__(self) -> Self:
@@ -234,23 +198,18 @@ class Camera(Protocol):
 
 @dataclass(frozen=True)
 class CameraKind:
-    """What cameras of a kind are found and opened by.
-
-    Parameters
-    ----------
-    form
-        How an id is written: what all ids of the kind begin with, to the colon, and a word for the
-        rest: "uvc:NUMBER".
-    find
-        Lists those that are connected; may raise `CameraError` where that is unknown.
-    open
-        Opens the camera of an id; may raise `InputError` for an id that no camera has, and
-        `CameraError` where the camera is not there or cannot be opened.
-    """
+    """What cameras of a kind are found and opened by."""
 
     form: str
+    """How an id is written: what all ids of the kind begin with, to the colon, and a word for the
+    rest: "uvc:NUMBER".
+    """
     find: Callable[[], list[CameraInfo]]
+    """Lists those that are connected; may raise `CameraError` where that is unknown."""
     open: Callable[[str], Camera]
+    """Opens the camera of an id; may raise `InputError` for an id that no camera has, and
+    `CameraError` where the camera is not there or cannot be opened.
+    """
 
     @property
     def prefix(self) -> str:

@@ -34,7 +34,7 @@ SOON_S = 0.01
 """… and with a software trigger, s."""
 
 SILENT_S = 2.0
-"""A free-running camera without a frame for so long, or for 20 frames, is stalled."""
+"""Time, s, without a frame after which a free-running camera is stalled; or that of 20 frames."""
 
 HOPELESS_S = 6.0
 """… and after so much longer it is opened again."""
@@ -47,24 +47,16 @@ State = Literal["opening", "running", "stalled", "lost", "ended"]
 
 @dataclass(frozen=True)
 class Counts:
-    """Counts of a feed so far.
-
-    Parameters
-    ----------
-    frames
-        Complete frames delivered.
-    broken
-        Incomplete frames, left out.
-    dropped
-        Frames that never arrived, by gaps in the camera's numbers and its driver's count.
-    lost
-        How often the camera was lost.
-    """
+    """Counts of a feed so far."""
 
     frames: int
+    """Complete frames delivered."""
     broken: int
+    """Incomplete frames, left out."""
     dropped: int
+    """Frames that never arrived, by gaps in the camera's numbers and its driver's count."""
     lost: int
+    """How often the camera was lost."""
 
 
 class Feed:
@@ -82,12 +74,12 @@ class Feed:
     on_frame
         Called with every frame, in the feed's thread: it must not wait. Frames are numbered from
         0 on; numbers of frames that did not arrive are left out, and of those there was no time for
-        while the camera was set, as far as its rate tells. `CameraFrame.time_s` is the time
-        since the first, by the camera's clock, and goes on when the camera is opened again.
+        while the camera was set, as far as its rate is known. `CameraFrame.time_s` is the time
+        since the first, by the camera's clock, continued when the camera is opened again.
     on_event
         Called with every event.
     settings
-        What the camera is set to whenever it was opened. Where no trigger is asked for it takes
+        What the camera is set to whenever it was opened. Where no trigger is set it takes
         frames by itself, whatever mode it was left in.
 
     Raises
@@ -310,7 +302,7 @@ class Feed:
         if self._first_s is None:
             self._first_s = frame.arrived_s
         if known.offset_s is None:
-            # Goes on where it was: by the computer's clock, but never back.
+            # Continued by the computer's clock, but never backwards.
             since_s = max(frame.arrived_s - self._first_s, self._last_s + 1e-6 * (self._next > 0))
             known.offset_s = since_s - frame.time_s
         time_s = frame.time_s + known.offset_s
@@ -364,7 +356,7 @@ class _Connection:
         self.shape = (rows, columns)
         self.dtype = np.uint8 if camera.bit_depth <= 8 else np.uint16
         self.spoiled = 0
-        """Frames that were left out since the last whole one."""
+        """Frames that were left out since the last complete one."""
         self.offset_s: float | None = None
         self.former_hz: float | None = None
         """The rate at which frames came before it was set."""

@@ -1,6 +1,6 @@
 """What is called of Aravis and GLib, which GenICam cameras are reached by, through ctypes.
 
-No PyGObject: it would have to be built for every Python (docs/adr/0014). Loaded when first asked
+No PyGObject: it would have to be built for every Python (docs/adr/0014). Loaded on first
 for; everything here may be called from any thread.
 """
 
@@ -140,7 +140,7 @@ class Aravis:
         function.restype, function.argtypes = result, arguments
 
     def open(self, device: str) -> int:
-        """Open a camera by its id; to be let go of by `release`."""
+        """Open a camera by its id; to be freed by `release`."""
         return int(self._asked("arv_camera_new", device.encode()))
 
     def ask(self, camera: int, name: str, *given: Any) -> Any:
@@ -154,7 +154,7 @@ class Aravis:
         return self._asked(f"arv_camera_{name}", camera, *given)
 
     def pair(self, camera: int, name: str) -> tuple[Any, Any]:
-        """Call arv_camera_NAME, which tells two numbers."""
+        """Call arv_camera_NAME, which returns two numbers."""
         kind = c_double if OF_CAMERA[name] is BOUNDS else c_int
         first, second = kind(), kind()
         self.ask(camera, name, byref(first), byref(second))
@@ -173,7 +173,7 @@ class Aravis:
         return names
 
     def release(self, thing: int) -> None:
-        """Let go of a camera, a stream or a buffer."""
+        """Release a camera, a stream or a buffer."""
         self._gobject.g_object_unref(thing)
 
     def when_lost(self, camera: int, call: Any) -> int:
@@ -200,5 +200,5 @@ class Aravis:
 
 @functools.cache
 def aravis() -> Aravis:
-    """The library, loaded when first asked for; see `Aravis`."""
+    """The library, loaded on first use; see `Aravis`."""
     return Aravis()

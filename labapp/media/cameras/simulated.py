@@ -1,6 +1,6 @@
 """A camera that is simulated: any pictures at any rate, and every fault that a real one has.
 
-What it is plugged into is a `SimulatedDevice`, which goes on while cameras are opened and closed.
+What it is plugged into is a `SimulatedDevice`, which runs while cameras are opened and closed.
 """
 
 from __future__ import annotations
@@ -43,28 +43,18 @@ def there_and_back(images: Sequence[GreyImage]) -> Callable[[int], GreyImage]:
 
 @dataclass(frozen=True)
 class Faults:
-    """What goes wrong by itself; everything random follows from the seed.
-
-    Parameters
-    ----------
-    garbage
-        Part of the frames that arrive cut off, of another size or of another type, 0 … 1.
-    dropped
-        Part of the frames that never arrive, 0 … 1.
-    unplug_every, unplugged_s
-        After so many frames the cable is out for so long, s; 0: never.
-    stall_every, stalled_s
-        After so many frames none come for so long, s; 0: never.
-    seed
-        Of what is random.
-    """
+    """What goes wrong by itself; everything random follows from the seed."""
 
     garbage: float = 0.0
+    """Part of the frames that arrive cut off, of another size or of another type, 0 … 1."""
     dropped: float = 0.0
+    """Part of the frames that never arrive, 0 … 1."""
     unplug_every: int = 0
     unplugged_s: float = 0.2
+    """Number of frames after which the cable is out, and for how long, s; 0: never."""
     stall_every: int = 0
     stalled_s: float = 0.5
+    """Number of frames after which none come, and for how long, s; 0: never."""
     seed: int = 0
 
 
@@ -103,7 +93,7 @@ class SimulatedDevice:
         self.sensor = (columns, rows)
         self.settings = CameraSettings(rate_hz=rate_hz, region=(0, 0, columns, rows))
         self.taken = 0
-        """Frames exposed since it was made; what is drawn from the seed is told by this number."""
+        """Frames exposed since it was made; random numbers follow from the seed and this number."""
         self.disconnects = 0
         self._unplugged_until_s = 0.0
         self._stalled_until_s = 0.0
@@ -131,7 +121,7 @@ class SimulatedDevice:
         return max(0.0, self._stalled_until_s - time.monotonic())
 
     def unplug(self, seconds: float = float("inf")) -> None:
-        """Pull its cable, for so long."""
+        """Pull its cable for a time."""
         self.disconnects += 1
         self._unplugged_until_s = time.monotonic() + seconds
 
@@ -140,7 +130,7 @@ class SimulatedDevice:
         self._unplugged_until_s = 0.0
 
     def stall(self, seconds: float) -> None:
-        """Let no frame come for so long."""
+        """Let no frame come for a time."""
         self._stalled_until_s = time.monotonic() + seconds
 
     def expose(self) -> tuple[GreyImage, Literal["", "lost", "cut off"]]:
@@ -241,7 +231,7 @@ class SimulatedCamera(Camera):
         self._begun_s = None
 
     def close(self) -> None:
-        """Let go of the device."""
+        """Release the device."""
         self.stop()
 
     def _await(self, until_s: float) -> int | None:

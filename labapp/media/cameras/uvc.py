@@ -108,13 +108,6 @@ class UvcCamera(Camera):
     Its driver numbers no frames: what is lost on the way does not show. OpenCV's own driver
     chooses the nearest size and rate that the camera has.
 
-    Parameters
-    ----------
-    info
-        One of `find_uvc`.
-    capture, query, present
-        OpenCV and the driver; in tests others.
-
     Raises
     ------
     CameraError
@@ -186,7 +179,7 @@ class UvcCamera(Camera):
     def read(self, timeout_s: float) -> CameraFrame | None:
         """Wait for the next frame; see `Camera.read`.
 
-        OpenCV cannot be told how long: of a camera that is silent it waits for ten seconds.
+        OpenCV's time limit cannot be set: it waits ten seconds for a camera that is silent.
         """
         if not self._running:
             raise CameraError(f"{self.info.name} was not started")
@@ -211,7 +204,7 @@ class UvcCamera(Camera):
 
     @property
     def dropped(self) -> int:
-        """None that its driver would tell of."""
+        """None that its driver would report."""
         return 0
 
     def stop(self) -> None:
@@ -219,7 +212,7 @@ class UvcCamera(Camera):
         self._running = False
 
     def close(self) -> None:
-        """Let go of the camera."""
+        """Release the camera."""
         self.stop()
         self._capture.release()
 

@@ -34,32 +34,23 @@ BOUNCE_S = 0.05
 """A pedal that is down again within this time of having been down was pressed once."""
 
 GLANCE_MS = 10
-"""So long each device is listened to in turn while one is learned."""
+"""Time, ms, that each device is read in turn while one is learned."""
 
 MODIFIERS = 0xE0
-"""The first of the keys that a keyboard tells by bits (Ctrl, Shift …)."""
+"""The first of the keys that a keyboard sends as bits (Ctrl, Shift …)."""
 
 
 @dataclass(frozen=True)
 class PedalMap:
-    """A foot switch and what its pedals do.
-
-    Parameters
-    ----------
-    device
-        Its `HidInfo.key`.
-    name
-        What to call it.
-    keyboard
-        Whether it tells of keys.
-    actions
-        Pedal's number → what it does.
-    """
+    """A foot switch and what its pedals do."""
 
     device: str
+    """Its `HidInfo.key`."""
     name: str
     keyboard: bool
+    """Whether it sends keys."""
     actions: Mapping[int, Action] = field(default_factory=dict)
+    """Pedal's number → what it does."""
 
     def with_action(self, pedal: int, action: Action | None) -> PedalMap:
         """Copy with another action of a pedal; None: no action."""
@@ -113,11 +104,6 @@ class Pedals:
 
     A keyboard's report lists its keys; of any other device every bit may be a pedal, and those
     that are set without one, as by a joystick's axes, count for nothing.
-
-    Parameters
-    ----------
-    keyboard
-        Whether the device is a keyboard.
     """
 
     def __init__(self, keyboard: bool) -> None:
@@ -151,7 +137,7 @@ class Pedals:
 def _keys(report: bytes) -> frozenset[int]:
     """Keys that are down: a byte of modifiers, one that is unused, then keys by their numbers."""
     modifiers = {MODIFIERS + bit for bit in range(8) if report[:1] and report[0] >> bit & 1}
-    # 1 to 3 tell of errors, such as too many keys.
+    # 1 to 3 mean errors, such as too many keys.
     return frozenset(modifiers | {key for key in report[2:] if key > 3})
 
 
@@ -198,7 +184,7 @@ class FootSwitch(HidReader):
         now_s, before = time.monotonic(), self._known.down
         new = self._known.pressed(number, report)
         first = [p for p in sorted(new) if now_s - self._down_s.get(p, -math.inf) >= BOUNCE_S]
-        # One that is let go now was down until now: contacts bounce then, too.
+        # One that is released now was down until now: contacts bounce then, too.
         self._down_s |= dict.fromkeys(before | new, now_s)
         if number < 0:
             self._down_s.clear()

@@ -20,7 +20,7 @@ LONGEST = 64
 """Bytes of a report, at most."""
 
 WAIT_MS = 30
-"""So long a report is waited for before it is seen whether reading is to end."""
+"""Time, ms, that a report is waited for before reading checks whether to end."""
 
 RETRY_S = 0.5
 """Pause between attempts to open a device that is gone."""
@@ -50,30 +50,22 @@ class HidError(Exception):
 
 @dataclass(frozen=True)
 class HidInfo:
-    """A device, or one of the several that it shows itself as.
-
-    Parameters
-    ----------
-    path
-        Where the system has it now: "/dev/hidraw3".
-    vendor, product, interface
-        USB's numbers.
-    usage
-        (page, usage) of HID: (1, 6) is a keyboard, (1, 8) a 3-D controller.
-    name
-        As it calls itself.
-    """
+    """A device, or one of the several that it shows itself as."""
 
     path: str
+    """Its device file: "/dev/hidraw3"."""
     vendor: int
     product: int
     interface: int
+    """USB's numbers."""
     usage: tuple[int, int]
+    """(page, usage) of HID: (1, 6) is a keyboard, (1, 8) a 3-D controller."""
     name: str
+    """Its own name."""
 
     @property
     def key(self) -> str:
-        """What tells it from others wherever it is plugged in: "0c45:7403:1"."""
+        """Identifies it wherever it is plugged in: "0c45:7403:1"."""
         return f"{self.vendor:04x}:{self.product:04x}:{self.interface}"
 
     @property
@@ -93,7 +85,7 @@ class HidInfo:
 
     @property
     def is_keyboard(self) -> bool:
-        """Whether it tells of keys, by their numbers, rather than of buttons, by bits."""
+        """Whether it sends key numbers rather than button bits."""
         return self.usage == (1, 6)
 
 
@@ -181,7 +173,7 @@ def why_closed(info: HidInfo) -> str:
 
 
 def may_be_read(info: HidInfo) -> bool:
-    """Whether the user may read a device; True except on Linux, where it can be told beforehand."""
+    """Whether the user may read a device; True except on Linux, which can say beforehand."""
     return not IS_LINUX or os.access(info.path, os.R_OK | os.W_OK)
 
 

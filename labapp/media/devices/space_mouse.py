@@ -30,30 +30,23 @@ TRANSLATION, ROTATION, BUTTONS = 1, 2, 3
 
 @dataclass(frozen=True)
 class SixAxes:
-    """How a controller is held; each axis −1 … 1.
-
-    Parameters
-    ----------
-    right, near, down
-        Pushed to the right, towards the operator, down.
-    pitch, roll, yaw
-        Turned about the first, the second, the third of these, right-handed.
-    buttons
-        Those that are down, by number from 0.
-    """
+    """How a controller is held; each axis −1 … 1."""
 
     right: float = 0.0
     near: float = 0.0
     down: float = 0.0
+    """Pushed to the right, towards the operator, down."""
     pitch: float = 0.0
     roll: float = 0.0
     yaw: float = 0.0
+    """Turned about the first, the second, the third of these, right-handed."""
     buttons: frozenset[int] = frozenset()
+    """Those that are down, by number from 0."""
 
     def after(self, number: int, report: bytes) -> SixAxes:
-        """How it is held after a report of this number; as before where it tells nothing.
+        """How it is held after a report of this number; unchanged by other reports.
 
-        Number −1, the device is gone: let go of.
+        Number −1, the device is gone: released.
         """
         if number < 0:
             return SixAxes()
@@ -100,7 +93,7 @@ class SpaceMouse(HidReader):
         return info.is_3d
 
     def on_report(self, number: int, report: bytes) -> None:
-        """Tell of a change."""
+        """Report a change."""
         held = self._held.after(number, report)
         if held != self._held:
             self._held = held

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import struct
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
+from labapp.bundled import bundled
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
 from labapp.media.base import GreyImage, to_grey
-from labapp.media.formats.cine_levels import LINEAR_12_BIT
 from labapp.media.formats.stored import (
     StoredFrames,
     ends_early,
@@ -87,15 +88,10 @@ class CineSource(StoredFrames):
     Levels are those of the sensor, in its bits (RealBPP); packed 10 bit levels are made linear
     with 12 bits by the published table. Times are the recorded time stamps (block 1002).
 
-    Parameters
-    ----------
-    path
-        The file.
-
     Raises
     ------
     InputError
-        If it is no such recording or there is not one whole frame in it.
+        If it is no such recording or there is no complete frame in it.
     """
 
     def __init__(self, path: Path) -> None:
@@ -167,12 +163,18 @@ class CineSource(StoredFrames):
         return InputError(self._path, f"frame {index}", value, expected)
 
 
+@cache
+def _linear_12_bit() -> npt.NDArray[np.uint16]:
+    """Published level with 12 bits, linear, for every level with 10 bits; shape (1024,)."""
+    return np.loadtxt(bundled("resources/formats/cine_10_to_12_bit.txt"), np.uint16)
+
+
 def _decode(content: bytes, form: _Format, stride: int) -> GreyImage:
     """Grey levels, shape (rows, columns), the first row at the top."""
     if form.packed_bits:
         levels = unpack_bits(content, form.packed_bits)[: form.rows * form.columns]
         image: npt.NDArray[np.uint16] = levels.reshape(form.rows, form.columns)
-        return LINEAR_12_BIT[image] if form.packed_bits == 10 else image
+        return _linear_12_bit()[image] if form.packed_bits == 10 else image
     kind = np.dtype("u1") if form.bit_count in (8, 24) else np.dtype("<u2")
     channels = 3 if form.bit_count in (24, 48) else 1
     used = form.row_bits // 8
@@ -235,7 +237,7 @@ def _read_setup(path: Path, at: int, size: int) -> _Setup:
         length=length,
         frame_rate_hz=plausible_rate(rate & 0xFFFFFFFF),
         real_bits=field(REAL_BPP),
-        # The high byte tells grey heads of cameras with several.
+        # The high byte distinguishes the heads of cameras with several.
         filtered=bool((field(CFA) or 0) & 0xFFFFFF),
         shown_turned=any(field(offset) for offset in (FLIP_H, FLIP_V, ROTATE)),
     )
@@ -244,7 +246,7 @@ def _read_setup(path: Path, at: int, size: int) -> _Setup:
 def _read_places(
     path: Path, at: int, claimed: int, size: int, form: _Format
 ) -> tuple[npt.NDArray[np.uint64], int]:
-    """Offset of every whole image, shape (n,), and the number of images there should be."""
+    """Offset of every complete image, shape (n,), and the number of images there should be."""
     if claimed == 0:
         raise InputError(path, "ImageCount", 0, "1 frame or more")
     possible = min(claimed, max(size - at, 0) // 8, size // (8 + form.image_bytes))

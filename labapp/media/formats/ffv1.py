@@ -15,7 +15,7 @@ def slices_whole(packet: bytes) -> bool:
     """Whether every slice of a packet of FFV1 version 3 or later has the checksum it says.
 
     False too where there is none, as before version 3 (RFC 9043, §4.9: CRC-32 with the polynomial
-    04C11DB7 from the highest bit on, over slice and footer; 0 where they are whole).
+    04C11DB7 from the highest bit on, over slice and footer; 0 where they are intact).
     """
     end = len(packet)
     while end >= FOOTER:

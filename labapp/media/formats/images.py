@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from labapp.errors import InputError
+from labapp.errors import InputError, os_errors_as_input
 from labapp.media.base import GreyImage, to_grey
 from labapp.media.formats.stored import StoredFrames, finite, regular_size
 from labapp.media.formats.tiff import TIFF_MAGICS, TIFF_SUFFIXES, TiffStack
@@ -26,13 +26,6 @@ AN_IMAGE = f"a whole image of at most {MOST_PIXELS} px: PNG, TIFF, BMP, JPEG, PG
 
 class ImageSequence(StoredFrames):
     """Pictures of one shape, read one at a time.
-
-    Parameters
-    ----------
-    path
-        The file or folder, for its name.
-    pictures
-        The files in order, at least one.
 
     Raises
     ------
@@ -83,10 +76,8 @@ def images_in(path: Path) -> list[Path]:
 
 def files_in(path: Path) -> list[Path]:
     """What is in a folder, in natural order, without hidden files."""
-    try:
+    with os_errors_as_input(path, "folder", "a folder that may be read"):
         entries = [entry for entry in path.iterdir() if not entry.name.startswith(".")]
-    except OSError as error:
-        raise InputError(path, "folder", error.strerror, "a folder that may be read") from error
     return sorted(entries, key=lambda entry: natural_key(entry.name))
 
 
@@ -96,14 +87,12 @@ def read_image(path: Path) -> GreyImage:
     Raises
     ------
     InputError
-        If it cannot be opened, is not a whole image, holds several, or NaN or infinity.
+        If it cannot be opened, is no complete image, holds several, or NaN or infinity.
     """
     # Read here rather than by OpenCV: it says why a file cannot be opened.
-    try:
+    with os_errors_as_input(path, "file", "a file that may be read"):
         regular_size(path)
         content = path.read_bytes()
-    except OSError as error:
-        raise InputError(path, "file", error.strerror, "a file that may be read") from error
     if not content:
         raise InputError(path, "size", "0 bytes", AN_IMAGE)
     if content[:4] in TIFF_MAGICS:

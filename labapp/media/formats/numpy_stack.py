@@ -45,7 +45,7 @@ EXPECTED = {
 """What an entry of the header is called in a message, and what it should be."""
 
 MOST_HELD = 2**30
-"""A compressed array is held in memory whole, unpacked: no more bytes than this."""
+"""A compressed array is held in memory, unpacked: no more bytes than this."""
 
 NOT_HELD = f"at most {MOST_HELD} bytes, or an array saved as it is (numpy.savez)"
 
@@ -57,7 +57,7 @@ AS_NUMPY_DOES = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """How arrays are kept. Of other kinds zipfile unpacks all it has read at once, without bounds."""
 
 DEFLATE_RATIO = 1032
-"""Deflate makes data at most so many times smaller."""
+"""Largest factor by which Deflate makes data smaller."""
 
 
 class NumpyStack(StoredFrames):
@@ -67,15 +67,10 @@ class NumpyStack(StoredFrames):
     file, mapped; a compressed one is held in memory. Booleans become 0 and 255; types other than
     uint8 and uint16 become float32. A .npz may give ``time_s`` or ``frame_rate_hz``.
 
-    Parameters
-    ----------
-    path
-        The file.
-
     Raises
     ------
     InputError
-        If it holds no such array, Python objects, or not one whole frame.
+        If it holds no such array, Python objects, or no complete frame.
     """
 
     def __init__(self, path: Path, *, archive: bool) -> None:
@@ -148,7 +143,7 @@ def _is_stack(path: Path, shape: tuple[int, ...]) -> None:
 
 
 def _map_array(path: Path, file: IO[bytes], start: int, end: int) -> tuple[npt.NDArray[Any], int]:
-    """The whole frames of the array at bytes ``start`` … ``end``, and how many it claims."""
+    """The complete frames of the array at bytes ``start`` … ``end``, and how many it claims."""
     file.seek(start)
     shape, columns_first, kind = _header(path, file)
     _is_stack(path, shape)

@@ -42,31 +42,21 @@ UNKNOWN = np.iinfo(np.int64).min
 
 @dataclass(frozen=True)
 class Packets:
-    """Packets of a video in file order; n packets.
-
-    Parameters
-    ----------
-    placed_by
-        What identifies a packet: its offset in the file ("pos") or a time stamp ("pts", "dts").
-    place
-        That identifier, shape (n,).
-    pts, dts
-        Presentation and decoding time stamps, shape (n,), ticks; `UNKNOWN` where there is none.
-    key
-        Whether it is a key frame, shape (n,).
-    shown
-        Whether it gives a frame, shape (n,): edited MP4s hold packets that are not shown.
-    holed
-        Whether there are gaps, by damaged packets. True if in doubt.
-    """
+    """Packets of a video in file order; n packets."""
 
     placed_by: str
+    """What identifies a packet: its offset in the file ("pos") or a time stamp ("pts", "dts")."""
     place: IntArray
+    """That identifier, shape (n,)."""
     pts: IntArray
     dts: IntArray
+    """Presentation and decoding time stamps, shape (n,), ticks; `UNKNOWN` where there is none."""
     key: BoolArray
+    """Whether it is a key frame, shape (n,)."""
     shown: BoolArray
+    """Whether it gives a frame, shape (n,): edited MP4s hold packets that are not shown."""
     holed: bool = True
+    """Whether there are gaps, by damaged packets. True if in doubt."""
 
     def __len__(self) -> int:
         return len(self.place)
@@ -195,64 +185,44 @@ def number_by_stamp(packets: Packets) -> IntArray:
 
 @dataclass(frozen=True)
 class Timing:
-    """Timing in a video's header.
-
-    Parameters
-    ----------
-    tick_s
-        Unit of the time stamps, s.
-    rate_hz
-        Average frame rate; None where unknown.
-    claimed
-        Number of frames; 0 where unknown.
-    stamped
-        Whether presentation time stamps are reliable.
-    from_0
-        Whether time begins at stamp 0, else at the first stamp.
-    """
+    """Timing in a video's header."""
 
     tick_s: float
+    """Unit of the time stamps, s."""
     rate_hz: float | None
+    """Average frame rate; None where unknown."""
     claimed: int
+    """Number of frames; 0 where unknown."""
     stamped: bool
+    """Whether presentation time stamps are reliable."""
     from_0: bool
+    """Whether time begins at stamp 0, else at the first stamp."""
 
 
 @dataclass(frozen=True)
 class PacketTable(ReadOnlyArrays):
-    """Index by which any frame of a video is found.
-
-    Parameters
-    ----------
-    placed_by, place, key
-        As in `Packets`.
-    seek
-        Time stamps to seek to for each key frame, shape (keys, 2), ticks.
-    number
-        Frame number of each packet, shape (n,); −1: none.
-    time_s
-        Time of each frame since the first, shape (frames,), s; NaN where there is no time base.
-    frame_rate_hz, shape, bit_depth, description, warnings
-        As of a `FrameSource`.
-    seekable
-        Whether seeking is reliable.
-    slice_crc
-        Whether packets carry checksums, as FFV1's may.
-    """
+    """Index by which any frame of a video is found."""
 
     placed_by: str
     place: IntArray
     key: BoolArray
+    """As in `Packets`."""
     seek: IntArray
+    """Time stamps to seek to for each key frame, shape (keys, 2), ticks."""
     number: IntArray
+    """Frame number of each packet, shape (n,); −1: none."""
     time_s: FloatArray
+    """Time of each frame since the first, shape (frames,), s; NaN where there is no time base."""
     frame_rate_hz: float | None
     shape: tuple[int, int] = (0, 0)
     bit_depth: int = 8
     description: str = ""
     warnings: tuple[str, ...] = ()
+    """As of a `FrameSource`."""
     seekable: bool = True
+    """Whether seeking is reliable."""
     slice_crc: bool = False
+    """Whether packets carry checksums, as FFV1's may."""
 
     @classmethod
     def build(cls, packets: Packets, number: IntArray, timing: Timing, name: str) -> Self:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from labapp.errors import InputError
+from labapp.errors import InputError, os_errors_as_input
 from labapp.media.base import GreyImage, to_grey
 from labapp.media.formats.stored import (
     StoredFrames,
@@ -88,7 +88,7 @@ class PhotronSource(StoredFrames):
     ------
     InputError
         If the other file is missing or one of two, the header does not say what is needed, or
-        there is not one whole frame.
+        there is no complete frame.
     """
 
     def __init__(self, path: Path) -> None:
@@ -159,14 +159,12 @@ def _pair(path: Path) -> tuple[Path, Path]:
     """The .mraw and its header, one of which is ``path``."""
     suffix = path.suffix.lower()
     looked_for = HEADER_SUFFIXES if suffix == ".mraw" else (".mraw",)
-    try:
+    with os_errors_as_input(path.parent, "folder", "a folder to read"):
         found = [
             entry
             for entry in sorted(path.parent.iterdir())
             if entry.stem == path.stem and entry.suffix.lower() in looked_for
         ]
-    except OSError as error:
-        raise InputError(path.parent, "folder", error.strerror, "a folder to read") from error
     names = " or ".join(path.stem + suffix for suffix in looked_for)
     if not found:
         raise InputError(path, "partner", "missing", f"{names} beside it")

@@ -74,11 +74,6 @@ class TiffStack(StoredFrames):
     tifffile cannot decode by itself goes to OpenCV. A frame interval comes from ImageJ's
     ``finterval`` or ``fps``, or from OME's ``TimeIncrement`` or ``DeltaT``.
 
-    Parameters
-    ----------
-    path
-        The file.
-
     Raises
     ------
     InputError

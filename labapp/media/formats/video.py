@@ -20,7 +20,7 @@ from av.packet import Packet
 from av.video.frame import VideoFrame
 from av.video.stream import VideoStream
 
-from labapp.errors import InputError
+from labapp.errors import InputError, os_errors_as_input
 from labapp.media.base import Frame, FrameSource, check_index, format_frame_rate
 from labapp.media.formats.boxes import mp4_formats
 from labapp.media.formats.ffv1 import slices_whole
@@ -89,7 +89,7 @@ class VideoSource(FrameSource):
     where the container keeps neither the order frames are shown in nor which are key frames (H.264
     in AVI; an AVI cut before its index) is everything decoded once to learn them.
 
-    A frame that cannot be decoded whole is refused, and so are those that build on it.
+    A frame that cannot be decoded completely is refused, and so are those that build on it.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ class VideoSource(FrameSource):
     Raises
     ------
     InputError
-        If there is not one whole frame in it.
+        If there is no complete frame in it.
     """
 
     _shown: tuple[int, VideoFrame] | None
@@ -212,7 +212,7 @@ class VideoSource(FrameSource):
         return found
 
     def _restart(self) -> None:
-        """Open the file again and go on before its first frame."""
+        """Open the file again, before its first frame."""
         self._open()
         self._continue_with(self._listed_packets())
 
@@ -259,7 +259,7 @@ class VideoSource(FrameSource):
         """Numbers and frames, in the decoder's order.
 
         After a packet that is missing or damaged nothing is decoded before the next key frame:
-        decoders would go on with what they have, and only some would say so.
+        decoders would continue with what they have, and only some would say so.
         """
         sound, begun = False, 0
         for ordinal, packet in packets:
@@ -413,16 +413,13 @@ class VideoSource(FrameSource):
 
 
 def _fingerprint(path: Path) -> tuple[int, int]:
-    """Size, bytes, and checksum of both ends of a file, to tell whether it is the same."""
+    """Size, bytes, and checksum of both ends of a file, to see whether it is the same."""
     part = 1 << 16
-    try:
-        with path.open("rb") as file:
-            ends = file.read(part)
-            size = file.seek(0, 2)
-            file.seek(max(0, size - part))
-            ends += file.read(part)
-    except OSError as error:
-        raise InputError(path, "file", error.strerror, "a file that may be read") from error
+    with os_errors_as_input(path, "file", "a file that may be read"), path.open("rb") as file:
+        ends = file.read(part)
+        size = file.seek(0, 2)
+        file.seek(max(0, size - part))
+        ends += file.read(part)
     return size, zlib.crc32(ends)
 
 
@@ -451,7 +448,7 @@ def _open(path: Path) -> tuple[InputContainer, VideoStream]:
         if context.width * context.height > most:
             size = f"{context.width}×{context.height} px"
             raise InputError(path, "frame size", size, f"at most {most} px in a frame of its kind")
-        # Frame threads would hold back each frame that is asked for until more are read.
+        # Frame threads would hold back each requested frame until more are read.
         context.thread_type = "SLICE"
         context.options = {"max_pixels": str(most), "err_detect": "explode"}
     except BaseException:

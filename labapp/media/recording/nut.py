@@ -15,7 +15,7 @@ import numpy as np
 from av.error import FFmpegError
 from av.video.stream import VideoStream
 
-from labapp.errors import InputError
+from labapp.errors import os_errors_as_input
 from labapp.media.base import GreyImage
 
 Codec = Literal["ffv1", "raw"]
@@ -134,7 +134,7 @@ class NutWriter:
         Raises
         ------
         OSError
-            If it cannot be written: frames before it are whole.
+            If it cannot be written: frames before it are intact.
         WrongFrame
             If it is of another shape or has levels of more bits.
         """
@@ -154,7 +154,7 @@ class NutWriter:
         Raises
         ------
         OSError
-            If what is left of it cannot be written: it is whole without.
+            If what is left of it cannot be written: the file is complete without it.
         """
         try:
             self._container.close()
@@ -170,7 +170,5 @@ def _levels(bit_depth: int, codec: Codec) -> int:
 
 
 def _create(path: Path) -> ByteFile:
-    try:
+    with os_errors_as_input(path, "recording", "a file that can be made"):
         return path.open("xb", buffering=0)
-    except OSError as error:
-        raise InputError(path, "recording", error.strerror, "a file that can be made") from error

@@ -32,7 +32,7 @@ SWITCH_S = 5e-4
 slower than 200 of them come a second, while a window draws."""
 
 STALL_S = 1.0
-"""A disk that takes longer for a frame is said to stall."""
+"""A disk that takes longer for a frame is reported as stalled."""
 
 RATE_HZ = 25.0
 """Frame rate in the video's header where the camera's is unknown."""
@@ -42,20 +42,6 @@ RATE_HZ = 25.0
 class Plan:
     """What of a camera's frames is recorded.
 
-    Parameters
-    ----------
-    before_s
-        So much from before the trigger, s.
-    after_s
-        So long from the first frame after it on, s; None: until it is stopped.
-    every
-        Every n-th frame.
-    codec
-        ``raw``, or ``ffv1``: less than half the size, for some 4 ms of a core a frame of 640×480.
-    memory_mb
-        What frames that wait may take, MB: those from before the trigger, and those that the disk
-        had no time for yet.
-
     Raises
     ------
     InputError
@@ -63,10 +49,17 @@ class Plan:
     """
 
     before_s: float = 0.0
+    """Time recorded from before the trigger, s."""
     after_s: float | None = None
+    """Duration from the first frame after it, s; None: until it is stopped."""
     every: int = 1
+    """Every n-th frame."""
     codec: Codec = "raw"
+    """``raw``, or ``ffv1``: less than half the size, for some 4 ms of a core a frame of 640×480."""
     memory_mb: float = 512.0
+    """What frames that wait may take, MB: those from before the trigger, and those that the disk
+    had no time for yet.
+    """
 
     def __post_init__(self) -> None:
         problems = [

@@ -20,7 +20,7 @@ NOTES = ("time_s", "frame", "source", "kind", "what")
 """Columns of the notes beside a recording; the frame is the one that was next at that time."""
 
 NOTED_LATE = 10_000
-"""A note may refer to a time so many frames ago: measuring a frame can take seconds."""
+"""Number of frames that a note may be late: measuring a frame can take seconds."""
 
 
 @dataclass(frozen=True)
@@ -38,35 +38,23 @@ def notes_of(path: Path) -> Path:
 
 @dataclass(eq=False)
 class Take:
-    """One recording, from its trigger on.
-
-    Parameters
-    ----------
-    path
-        The video. Notes are beside it, see `notes`.
-
-    Attributes
-    ----------
-    frames
-        Written so far.
-    lost
-        Left out for want of room in memory, or of a disk; or not as the others are.
-    trouble
-        Why writing ended early; empty if it did not.
-    finished
-        Set when nothing more is written.
-    triggered_s, ends_s
-        When it was triggered and when it ends by itself, by the camera's clock, s; None: not known
-        yet, or never.
-    """
+    """One recording, from its trigger on."""
 
     path: Path
+    """The video. Notes are beside it, see `notes`."""
     frames: int = 0
+    """Written so far."""
     lost: int = 0
+    """Left out for want of room in memory, or of a disk; or not as the others are."""
     trouble: str = ""
+    """Why writing ended early; empty if it did not."""
     finished: threading.Event = field(default_factory=threading.Event)
+    """Set when nothing more is written."""
     triggered_s: float = 0.0
     ends_s: float | None = None
+    """When it was triggered and when it ends by itself, by the camera's clock, s; None: not known
+    yet, or never.
+    """
 
     @property
     def summary(self) -> Event:
@@ -160,7 +148,7 @@ class TakeFiles:
             self._note(note)
 
     def _note(self, note: Note) -> None:
-        """Append a note; if that fails the video goes on, with one event."""
+        """Append a note; if that fails the video continues, with one event."""
         time_s = note.time_s - self._first_s
         event = note.event
         later = len(self._times_s) - bisect_right(self._times_s, note.time_s)

@@ -48,7 +48,7 @@ LARGEST_TREE = 8_000_000
 """Of these, bytes of JSON: every two of them may become a list of sixty bytes."""
 
 MOST_SURFACE_POINTS = 4000
-"""The surfaces of a value are made from so many: a thin plate's system grows with their square."""
+"""Most points of all surfaces of a value: a thin plate's system grows with their square."""
 
 UNREADABLE = (
     *(zlib.error, ValueError, TypeError, KeyError, IndexError, AttributeError, OverflowError),
@@ -82,14 +82,7 @@ def pack(value: object) -> bytes:
 
 
 def unpack(blob: object, kind: Any = Any) -> Any:
-    """Deserialise a value; numbers and arrays bit for bit, arrays read-only.
-
-    Parameters
-    ----------
-    blob
-        Output of `pack`.
-    kind
-        Its expected class or type hint.
+    """Deserialise what `pack` gave, of a class or type; numbers bit for bit, arrays read-only.
 
     Raises
     ------

@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 from filelock import FileLock, Timeout
 
-from labapp.errors import InputError
+from labapp.errors import InputError, os_errors_as_input
 from labapp.files import atomic_file
 from labapp.session.file.schema import APPLICATION_ID, MIGRATIONS, TABLES, VERSION
 
@@ -272,12 +272,10 @@ def _check_header(path: Path) -> int:
         regular_size,  # late: it loads what reads every recording
     )
 
-    try:
+    with os_errors_as_input(path, "file", A_SESSION):
         regular_size(path)
         with path.open("rb") as file:
             header = file.read(HEADER_BYTES)
-    except OSError as error:
-        raise InputError(path, "file", error.strerror, A_SESSION) from error
     if len(header) < HEADER_BYTES or not header.startswith(SQLITE_MAGIC):
         raise InputError(path, "content", "not a session" if header else "0 bytes", A_SESSION)
     if int.from_bytes(header[68:72], "big") != APPLICATION_ID:

@@ -45,27 +45,17 @@ from labapp.session.signals import Signals
 
 @dataclass(frozen=True)
 class Stored:
-    """How values of a class are kept.
-
-    Parameters
-    ----------
-    kind
-        The class, a dataclass.
-    renamed
-        Names of fields in files, and those of the class, where the two differ.
-    retired
-        Names of fields that files of earlier versions have: left out when they are read.
-    shapes
-        Shape of every array; equal letters are equal lengths.
-    fits
-        Whether the fields of a value fit each other.
-    """
+    """How values of a class are kept."""
 
     kind: Any
     renamed: Mapping[str, str] = field(default_factory=dict)
+    """Names of fields in files, and those of the class, where the two differ."""
     retired: Collection[str] = ()
+    """Names of fields that files of earlier versions have: left out when they are read."""
     shapes: Mapping[str, str] = field(default_factory=dict)
+    """Shape of every array; equal letters are equal lengths."""
     fits: Callable[[Any], bool] = lambda _: True
+    """Whether the fields of a value fit each other."""
 
     def names(self) -> dict[str, str]:
         """Names of the fields in files, and those of the class."""

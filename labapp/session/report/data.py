@@ -48,41 +48,26 @@ STATISTICS = {
 
 @dataclass(frozen=True)
 class FrameLine:
-    """One frame of a report.
-
-    Parameters
-    ----------
-    frame, time_s
-        Its number, and its time where it has one, else NaN.
-    status, reason
-        As in `Measurement`; empty where it was not measured.
-    stale
-        Why its result no longer stands, a clause each.
-    corrected
-        Whether it was measured from dots and rows corrected by hand.
-    doubtful
-        Whether another correspondence explains its dots nearly as well.
-    dots
-        Dots found.
-    orientation
-        Its correspondence.
-    version
-        The labapp that measured it.
-    measures
-        Its sizes; None without a surface.
-    """
+    """One frame of a report."""
 
     frame: int
     time_s: float
+    """Its number, and its time where it has one, else NaN."""
     status: str = ""
     reason: str = ""
+    """As in `Measurement`; empty where it was not measured."""
     stale: tuple[str, ...] = ()
+    """Why its result no longer stands, a clause each."""
     corrected: bool = False
+    """Whether it was measured from dots and rows corrected by hand."""
     doubtful: bool = False
+    """Whether another correspondence explains its dots nearly as well."""
     dots: int | None = None
     orientation: str = ""
     version: str = ""
+    """The labapp that measured it."""
     measures: Measures | None = None
+    """Its sizes; None without a surface."""
 
     @property
     def counts(self) -> bool:
@@ -107,27 +92,16 @@ class FrameLine:
 
 @dataclass(frozen=True)
 class ReportData:
-    """Session, scheme and frames of a report.
-
-    Parameters
-    ----------
-    session
-        The session.
-    scheme
-        Name of the scheme whose results are reported.
-    lines
-        The frames.
-    setup
-        The present setup; None if it is incomplete.
-    problems
-        What is missing or wrong in it.
-    """
+    """Session, scheme and frames of a report."""
 
     session: SessionContents
     scheme: str
+    """Name of the scheme whose results are reported."""
     lines: list[FrameLine]
     setup: Setup | None
+    """The present setup; None if it is incomplete."""
     problems: tuple[InputError, ...]
+    """What is missing or wrong in it."""
 
     @classmethod
     def of(

@@ -36,31 +36,16 @@ STATES = {
 
 @dataclass(frozen=True)
 class Series:
-    """A size over the frames; n of them.
-
-    Parameters
-    ----------
-    label
-        Its name and unit.
-    values, sigma
-        Shape (n,); NaN where there is none.
-    """
+    """A size over the frames; n of them."""
 
     label: str
     values: FloatArray
     sigma: FloatArray
+    """Shape (n,); NaN where there is none."""
 
 
 def side_view(rig: Rig, pool_mm: tuple[float, float]) -> bytes:
-    """The rig from the side, to scale: laser, torch, pool, plane, central ray and the fan.
-
-    Parameters
-    ----------
-    rig
-        The rig.
-    pool_mm
-        Length and height of the pool.
-    """
+    """The rig from the side, to scale, with a pool of (length, height), mm: laser, torch, rays."""
     laser, plane = rig.laser.position_mm, rig.imaging_plane
     top = plane.origin_mm + plane.height_mm * plane.z_axis
     middle = (rig.pattern.columns - 1) // 2

@@ -19,7 +19,7 @@ from labapp.studies.error_budget import setup_budget
 from labapp.text import SIGMA_OF, setup_words
 
 LATEST_CHANGES = 40
-"""So many of the newest changes are listed."""
+"""Number of the newest changes that are listed."""
 
 NOT_COVERED = (
     "Not in it: that the pool is taken for a mirror and the imaging plane for a perfectly "

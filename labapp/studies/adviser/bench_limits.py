@@ -52,50 +52,33 @@ class Place:
 
 @dataclass(frozen=True)
 class BenchLimits:
-    """What can be moved how far, and what is as it is.
-
-    Parameters
-    ----------
-    angle_deg, distance_mm
-        Laser: projection angle and distance, from the least to the most.
-    plane_mm
-        Distance of the imaging plane.
-    s_mm, h_mm
-        Where O′ can stand: to the left of the electrode, and above the work piece.
-    plate_mm
-        Width and height of the imaging plane.
-    edge_mm
-        Dots stay so far within its edges.
-    electrode_mm
-        Height of the tip.
-    pattern
-        The dots.
-    px_per_mm
-        Of the camera, on the imaging plane.
-    spacing_px
-        Neighbouring dots that lie closer cannot be told apart.
-    dot_sigma_px
-        Standard uncertainty of a dot's place.
-    sigma
-        Standard uncertainties of the bench's quantities, by `Quantity.sigma_key`.
-    angle_distance_correlation
-        Of the laser's projection angle and distance.
-    """
+    """What can be moved how far, and what is as it is."""
 
     angle_deg: Range = (25.0, 35.0)
     distance_mm: Range = (25.0, 35.0)
+    """Laser: projection angle and distance, from the least to the most."""
     plane_mm: Range = (30.0, 100.0)
+    """Distance of the imaging plane."""
     s_mm: Range = (0.0, 101.6)
     h_mm: Range = (0.0, 20.0)
+    """Where O′ can stand: to the left of the electrode, and above the work piece."""
     plate_mm: tuple[float, float] = (101.6, 101.6)
+    """Width and height of the imaging plane."""
     edge_mm: float = 1.0
+    """Least distance of dots from its edges."""
     electrode_mm: float = 5.0
+    """Height of the tip."""
     pattern: DotPattern = field(default_factory=DotPattern)
     px_per_mm: float = 4.7
+    """Of the camera, on the imaging plane."""
     spacing_px: float = 6.0
+    """Neighbouring dots that lie closer cannot be resolved."""
     dot_sigma_px: float = 0.3
+    """Standard uncertainty of a dot's place."""
     sigma: Mapping[str, float] = field(default_factory=lambda: dict(NOMINAL))
+    """Standard uncertainties of the bench's quantities, by `Quantity.sigma_key`."""
     angle_distance_correlation: float = 0.0
+    """Of the laser's projection angle and distance."""
 
     @property
     def dot_sigma_mm(self) -> float:

@@ -31,28 +31,22 @@ class Check(ReadOnlyArrays):
 
     Which rays come back hangs on where a pool lies under the torch, to a fraction of a row, and one
     place a pool leaves the mean over 50 of them swinging by a tenth.
-
-    Parameters
-    ----------
-    advice
-        What is checked.
-    chosen, text
-        Error of the height (mm), hidden rays and rays that miss the plane, of every pool at every
-        place with the recommended set-up and with that of §8.3.1, shape (n, k, 3); infinite
-        errors where there is no surface.
-    places, errors
-        The grid's possible set-ups and their mean errors on the same pools, shape (m,), mm.
-    rematch
-        Errors of the recommended set-up and of that of the grid that did best, on n pools more,
-        shape (2, n, k), mm: on the first pools it did best by luck, too.
     """
 
     advice: Advice
     chosen: FloatArray
     text: FloatArray
+    """Error of the height (mm), hidden rays and rays that miss the plane, of every pool at every
+    place with the recommended set-up and with that of §8.3.1, shape (n, k, 3); infinite errors
+    where there is no surface.
+    """
     places: tuple[Place, ...]
     errors: FloatArray
+    """The grid's possible set-ups and their mean errors on the same pools, shape (m,), mm."""
     rematch: FloatArray
+    """Errors of the recommended set-up and of that of the grid that did best, on n pools more,
+    shape (2, n, k), mm: on the first pools it did best by luck, too.
+    """
 
     @property
     def error_mm(self) -> float:
@@ -75,7 +69,7 @@ class Check(ReadOnlyArrays):
 
     @property
     def off_prediction(self) -> float:
-        """How far the error is off the predicted one, as a share of that."""
+        """Deviation of the error from the predicted one, as a share of that."""
         return self.error_mm / self.advice.error_mm - 1
 
 

@@ -25,17 +25,6 @@ SIZES, DRAWN = 3, 5
 class ExpectedPools:
     """Parts of ellipsoids, evenly spread over ranges of size and place.
 
-    Parameters
-    ----------
-    width_mm, length_mm
-        Smallest and largest, along X and along Y.
-    height_mm
-        Least and most, positive for either kind.
-    kind
-        ``convex`` stands above the work piece, ``concave`` lies below it.
-    shift_mm
-        How far a pool's middle lies off the electrode at most, along X and along Y.
-
     Raises
     ------
     ValueError
@@ -44,9 +33,13 @@ class ExpectedPools:
 
     width_mm: Range
     length_mm: Range
+    """Smallest and largest, along X and along Y."""
     height_mm: Range
+    """Least and most, positive for either kind."""
     kind: Kind = "convex"
+    """``convex`` stands above the work piece, ``concave`` lies below it."""
     shift_mm: float = 0.3
+    """How far a pool's middle lies off the electrode at most, along X and along Y."""
 
     def __post_init__(self) -> None:
         for name in ("width_mm", "length_mm", "height_mm"):
@@ -86,7 +79,7 @@ class ExpectedPools:
         return tuple(dict.fromkeys(self.at(np.array(share)) for share in shares))
 
     def sample(self, count: int, seed: int, even: bool = True, places: int = 1) -> Sample:
-        """Draw pools, each at so many places, and errors of the calibration with each of these.
+        """Draw pools, each at a number of places, and errors of the calibration with each of these.
 
         Evenly, by a scrambled Sobol row, or each independently of the others. The places of a
         pool follow each other.
@@ -105,18 +98,10 @@ class ExpectedPools:
 
 @dataclass(frozen=True)
 class Sample(ReadOnlyArrays):
-    """Pools that set-ups are compared on: the same ones, with the same errors.
-
-    Parameters
-    ----------
-    pools
-        n of them.
-    deviate
-        Errors of the calibration, in standard uncertainties, shape (n, q).
-    seed
-        Of the dots' noise.
-    """
+    """Pools that set-ups are compared on: the same ones, with the same errors."""
 
     pools: tuple[Pool, ...]
+    """n of them."""
     deviate: FloatArray
+    """Errors of the calibration, in standard uncertainties, shape (n, q)."""
     seed: int

@@ -23,24 +23,16 @@ MEAN_OF_SIGMA = float(np.sqrt(2 / np.pi))
 
 @dataclass(frozen=True)
 class Trial:
-    """A set-up, and which pools of a sample it is tried on.
-
-    Parameters
-    ----------
-    limits, place
-        The set-up.
-    sample, first, last
-        Pools ``first`` to before ``last`` of a sample.
-    calibrated
-        Whether the calibration is off, by the sample's errors.
-    """
+    """A set-up, and which pools of a sample it is tried on."""
 
     limits: BenchLimits
     place: Place
     sample: Sample
     first: int
     last: int
+    """Pools ``first`` to before ``last`` of a sample."""
     calibrated: bool = True
+    """Whether the calibration has the sample's errors."""
 
 
 def simulated_errors(trial: Trial) -> FloatArray:

@@ -36,40 +36,32 @@ LEAST_DOTS = 9
 RIM_POINTS = 72
 
 DECIDING = 4
-"""So many lit and dark rays nearest the boundary place the level."""
+"""Number of lit and dark rays nearest the boundary that determine the level."""
 
 
 @dataclass(frozen=True)
 class PredictedError(ReadOnlyArrays):
-    """Predicted standard uncertainties of a pool's height, mm.
-
-    Parameters
-    ----------
-    boundary_mm
-        Which rays came back leaves open where the pool ends, and so its level.
-    shape_mm
-        What the smooth surface misses between and beyond the dots: exact slopes, no noise.
-    dots_mm
-        The dots' uncertainty on the plane.
-    parameters_mm
-        What each of the bench's `QUANTITIES` changes by its standard uncertainty, shape (q,); zero
-        where not asked for.
-    setup_mm
-        These together, with their correlations.
-    dots, blocked, off_plane, lost
-        Dots that show; rays from the pool that the torch hides; whose reflection misses the
-        plane's edges; that meet the pool again.
-    """
+    """Predicted standard uncertainties of a pool's height, mm."""
 
     boundary_mm: float
+    """Uncertainty of the level: the rays that came back leave open where the pool ends."""
     shape_mm: float
+    """What the smooth surface misses between and beyond the dots: exact slopes, no noise."""
     dots_mm: float
+    """The dots' uncertainty on the plane."""
     parameters_mm: FloatArray
+    """What each of the bench's `QUANTITIES` changes by its standard uncertainty, shape (q,); zero
+    where not requested.
+    """
     setup_mm: float
+    """These together, with their correlations."""
     dots: int
     blocked: int
     off_plane: int
     lost: int
+    """Dots that show; rays from the pool that the torch hides; whose reflection misses the plane's
+    edges; that meet the pool again.
+    """
 
     @property
     def random_mm(self) -> float:

@@ -27,7 +27,7 @@ KEPT, BROKEN = "#1b7a3d", "#b01030"
 
 
 def advice_text(advice: Advice) -> str:
-    """Tell the recommended set-up, what to expect of it and what it keeps; Markdown."""
+    """The recommended set-up, its expected error and its margins, as Markdown."""
     best = advice.best
     if advice.possible:
         height = advice.expected.mean_height_mm
@@ -187,9 +187,9 @@ def _draw_bench(plot: Any, advice: Advice) -> None:
     plot.annotate("laser", laser[1:], (5, 3), textcoords="offset points")
     plot.annotate("imaging plane", (-place.plane_mm, top), (5, -8), textcoords="offset points")
     plot.set(aspect="equal", xlabel="Y (mm)", ylabel="Z (mm)", ylim=(-5, top + 5))
-    told = "recommended" if advice.possible else "nearest; not possible"
+    message = "recommended" if advice.possible else "nearest; not possible"
     plot.set_title(
-        f"{told}: laser {place.projection_angle_deg:.1f}°, {place.distance_mm:.1f} mm; "
+        f"{message}: laser {place.projection_angle_deg:.1f}°, {place.distance_mm:.1f} mm; "
         f"plane {place.plane_mm:.1f} mm, s {place.s_mm:.1f}, h {place.h_mm:.1f} mm",
         loc="left",
         fontsize=8,

@@ -47,27 +47,19 @@ SEED = 4
 
 @dataclass(frozen=True)
 class Effort:
-    """Effort of the search; the defaults take some minutes on two cores.
-
-    Parameters
-    ----------
-    grid
-        Numbers of angles, distances and plane distances of the grid.
-    pools
-        Numbers of pools on which all feasible places, the best ten, and the finalists are compared.
-    steps
-        Function evaluations of a refinement.
-    finalists
-        Number of set-ups that are simulated.
-    sweep
-        Points of each sensitivity curve.
-    """
+    """Effort of the search; the defaults take some minutes on two cores."""
 
     grid: tuple[int, int, int] = (6, 6, 4)
+    """Numbers of angles, distances and plane distances of the grid."""
     pools: tuple[int, int, int] = (8, 32, 128)
+    """Numbers of pools on which all feasible places, the best ten, and the finalists are compared.
+    """
     steps: int = 24
+    """Function evaluations of a refinement."""
     finalists: int = 6
+    """Number of set-ups that are simulated."""
     sweep: int = 9
+    """Points of each sensitivity curve."""
 
 
 QUICK = Effort(grid=(5, 4, 3), pools=(2, 4, 12), steps=6, finalists=2, sweep=3)
@@ -76,21 +68,13 @@ QUICK = Effort(grid=(5, 4, 3), pools=(2, 4, 12), steps=6, finalists=2, sweep=3)
 
 @dataclass(frozen=True)
 class Candidate:
-    """An evaluated set-up.
-
-    Parameters
-    ----------
-    place
-        Places of laser and plane.
-    margins
-        Margin of each of `CONSTRAINTS`; negative where it is violated.
-    error_mm
-        Predicted mean error of the height; infinite if a constraint is violated.
-    """
+    """An evaluated set-up."""
 
     place: Place
     margins: dict[Constraint, float]
+    """Margin of each of `CONSTRAINTS`; negative where it is violated."""
     error_mm: float = np.inf
+    """Predicted mean error of the height; infinite if a constraint is violated."""
 
     @property
     def possible(self) -> bool:
@@ -100,24 +84,16 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Sweep(ReadOnlyArrays):
-    """Sensitivity to one quantity, with the others as recommended; n places.
-
-    Parameters
-    ----------
-    name
-        Of the quantity in `Place`.
-    value
-        Its values, mm or degrees, shape (n,).
-    error_mm
-        Predicted mean error there, constraints ignored, shape (n,).
-    margins
-        Margins there, n of them.
-    """
+    """Sensitivity to one quantity, with the others as recommended; n places."""
 
     name: str
+    """Of the quantity in `Place`."""
     value: FloatArray
+    """Its values, mm or degrees, shape (n,)."""
     error_mm: FloatArray
+    """Predicted mean error there, constraints ignored, shape (n,)."""
     margins: tuple[dict[Constraint, float], ...]
+    """Margins there, n of them."""
 
     def breaks(self, number: int) -> tuple[Constraint, ...]:
         """Constraints that are violated there."""
@@ -126,33 +102,23 @@ class Sweep(ReadOnlyArrays):
 
 @dataclass(frozen=True)
 class Advice:
-    """The recommended set-up, its expected error, and the set-ups compared with it.
-
-    Parameters
-    ----------
-    expected, limits
-        The request.
-    best
-        The recommended set-up; where none is feasible, the one with the least violation.
-    error_mm, sigma_mm
-        Expected mean error of its height, and the standard uncertainty of that mean; NaN where no
-        set-up is feasible.
-    random_mm
-        The same mean with the calibration known exactly.
-    grid
-        The places of the grid, laser place by laser place.
-    sweeps
-        Sensitivity to each quantity.
-    """
+    """The recommended set-up, its expected error, and the set-ups compared with it."""
 
     expected: ExpectedPools
     limits: BenchLimits
     best: Candidate
+    """The recommended set-up; where none is feasible, the one with the least violation."""
     error_mm: float
     sigma_mm: float
+    """Expected mean error of its height, and the standard uncertainty of that mean; NaN where no
+    set-up is feasible.
+    """
     random_mm: float
+    """The same mean with the calibration known exactly."""
     grid: tuple[Candidate, ...]
+    """The places of the grid, laser place by laser place."""
     sweeps: tuple[Sweep, ...]
+    """Sensitivity to each quantity."""
 
     @property
     def possible(self) -> bool:

@@ -22,7 +22,7 @@ from labapp.core.images.exposure import Exposure
 from labapp.core.pipeline import Measurement
 from labapp.core.quality import Quality, Remark
 from labapp.core.surface.measures import Measures
-from labapp.export.scene import HEIGHT, Scene
+from labapp.export.rendering.scene import HEIGHT, Scene
 from labapp.gui.live import view as live_view
 from labapp.gui.live.figures import (
     FIRST,

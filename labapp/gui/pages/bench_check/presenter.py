@@ -1,4 +1,4 @@
-"""What the bench-check page shows: mirrors and their pictures, and what they tell of the bench."""
+"""What the bench-check page shows: mirrors and their pictures, and what follows for the bench."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.uncertainty import INDEX, QUANTITIES
 from labapp.core.images.find_dots import DotSettings, find_dots
 from labapp.core.values import FloatArray
-from labapp.gui.digits import ResultRow, rounded
+from labapp.gui.digits import ResultRow, round_factor, rounded
 from labapp.media import GreyImage
 from labapp.media.formats.images import IMAGE_SUFFIXES
 from labapp.session.record import BenchCheckRecord, MirrorPicture, Record
@@ -38,28 +38,24 @@ USUAL: Mapping[str, tuple[float, float | None]] = {
 }
 """Height and diameter that a mirror of a kind has at first, mm."""
 
+REACH_PX = 8.0
+"""How near to a dot the pointer must be."""
+
 Progress = Callable[[int, int, str], None]
 
 
 @dataclass(frozen=True, eq=False)
 class Chosen:
-    """A picture in the list.
-
-    Parameters
-    ----------
-    name
-        Of its file.
-    image
-        Grey levels, shape (rows, columns).
-    kind, height_mm, diameter_mm
-        The mirror in it, see `MirrorPicture`.
-    """
+    """A picture in the list."""
 
     name: str
+    """Of its file."""
     image: GreyImage
+    """Grey levels, shape (rows, columns)."""
     kind: str = "plate"
     height_mm: float = 0.0
     diameter_mm: float | None = None
+    """The mirror in it, see `MirrorPicture`."""
 
     @property
     def mirror(self) -> Mirror:
@@ -105,22 +101,14 @@ def kept(session: Session) -> tuple[Chosen, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Checked:
-    """A check that was made here.
-
-    Parameters
-    ----------
-    chosen, setup_text
-        The pictures and the set-up that it was made with.
-    check
-        Its result.
-    record
-        The same, as a session keeps it; its pictures are not kept yet.
-    """
+    """A check that was made here."""
 
     chosen: tuple[Chosen, ...]
     setup_text: str
+    """The pictures and the set-up that it was made with."""
     check: BenchCheck
     record: BenchCheckRecord
+    """The check as a session stores it; its pictures are not stored yet."""
 
     @property
     def words(self) -> str:
@@ -220,7 +208,7 @@ def _sentence(words: str, end: str = ".") -> str:
 
 
 def kept_words(session: Session) -> str:
-    """What is said of the check that the session keeps; empty without one."""
+    """The stored check in words; empty without one."""
     found = session.bench_check
     if found is None:
         return ""
@@ -232,17 +220,10 @@ def kept_words(session: Session) -> str:
 
 @dataclass(frozen=True)
 class QuantityRow:
-    """A line of the table of quantities.
-
-    Parameters
-    ----------
-    texts
-        Name, value and ± before, value and ± after, unit, and whether the pictures determine it.
-    determined
-        The same.
-    """
+    """A line of the table of quantities."""
 
     texts: tuple[str, str, str, str, str, str, str]
+    """Name, value and ± before, value and ± after, unit, and whether the pictures determine it."""
     determined: bool
 
 
@@ -260,13 +241,13 @@ def quantity_rows(record: BenchCheckRecord) -> tuple[QuantityRow, ...]:
             continue
         one = QUANTITIES[INDEX[key]]
         before, before_sigma, after, after_sigma = map(float, values)
-        told = after_sigma <= UNDETERMINED * before_sigma
+        determined = after_sigma <= UNDETERMINED * before_sigma
         texts = (
             *(_sentence(one.name, ""), *rounded(before, before_sigma)),
             *(*rounded(after, after_sigma), one.unit),
-            DETERMINED if told else NOT_DETERMINED,
+            DETERMINED if determined else NOT_DETERMINED,
         )
-        rows.append(QuantityRow(texts, told))
+        rows.append(QuantityRow(texts, determined))
     return tuple(rows)
 
 
@@ -288,35 +269,26 @@ def mirror_rows(record: BenchCheckRecord) -> tuple[ResultRow, ...]:
 
 @dataclass(frozen=True)
 class Overlay:
-    """What lies over a picture.
-
-    Parameters
-    ----------
-    dot_px
-        The dots with a ray, shape (n, 2).
-    arrows_px
-        From each dot towards where the adjusted bench has it, enlarged, shape (2n, 2): beginnings
-        and ends in turn.
-    numbers
-        Words at places: (text, u, v, whether it is a row's); each at its first dot.
-    words
-        What is drawn, and how much the arrows are enlarged.
-    """
+    """What is drawn over a picture."""
 
     dot_px: FloatArray
+    """The dots with a ray, shape (n, 2)."""
     arrows_px: FloatArray
+    """From each dot towards where the adjusted bench has it, enlarged, shape (2n, 2): beginnings
+    and ends in turn.
+    """
     numbers: tuple[tuple[str, float, float, bool], ...]
+    """Words at places: (text, u, v, whether it is a row's); each at its first dot."""
     words: str
+    """What is drawn, and how much the arrows are enlarged."""
 
 
 def overlay(picture: MirrorPicture, height_px: int) -> Overlay:
     """Dots, their rays' numbers, and residuals to be seen in a picture of such a height."""
     residual = picture.computed_px - picture.dot_px
     length = np.hypot(*residual.T)
-    # 1, 2 or 5 times a power of ten: nine in ten become a thirtieth of the picture at most.
-    room = height_px / 30 / max(float(np.quantile(length, 0.9)), 1e-6)
-    power = 10.0 ** np.floor(np.log10(room))
-    times = max(step for step in (1, 2, 5) if step * power <= room) * power
+    # Nine in ten become a thirtieth of the picture at most.
+    times = round_factor(height_px / 30 / max(float(np.quantile(length, 0.9)), 1e-6))
     ends = picture.dot_px + times * residual
     arrows = np.stack([picture.dot_px, ends], axis=1).reshape(-1, 2)
     longest_um = 1000 * float(np.hypot(*picture.residual_mm.T).max())
@@ -342,10 +314,10 @@ def _numbers(picture: MirrorPicture) -> tuple[tuple[str, float, float, bool], ..
     return tuple(made)
 
 
-def ray_words(picture: MirrorPicture, u: float, v: float, reach_px: float = 8.0) -> str:
+def ray_words(picture: MirrorPicture, u: float, v: float) -> str:
     """The ray of the dot at a place, and its residual; empty where there is none."""
     off = np.hypot(*(picture.dot_px - [u, v]).T)
-    if not len(off) or off.min() > reach_px:
+    if not len(off) or off.min() > REACH_PX:
         return ""
     k = int(np.argmin(off))
     (i, j), um = picture.ray[k].tolist(), 1000 * np.hypot(*picture.residual_mm[k])

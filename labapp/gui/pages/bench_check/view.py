@@ -15,7 +15,6 @@ from labapp.gui.dialogs import ask_file
 from labapp.gui.digits import ResultRow
 from labapp.gui.pages.bench_check import presenter
 from labapp.gui.pages.bench_check.presenter import COLUMNS, KINDS, Checked, Chosen
-from labapp.gui.pages.laser.presenter import read_picture
 from labapp.gui.pages.page import Page
 from labapp.gui.shell.steps import setup_to_do
 from labapp.gui.views.picture import PictureView
@@ -26,6 +25,7 @@ from labapp.gui.widgets.layouts import fill, hbox, vbox
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.widgets.tables import ReadTable
 from labapp.gui.workspace import Workspace
+from labapp.media import read_picture
 from labapp.session.record import BenchCheckRecord, MirrorPicture
 
 NO_PICTURE = (
@@ -100,11 +100,10 @@ class BenchCheckPage(Page):
         def loaded(pictures: Sequence[Chosen]) -> None:
             self._list([*self.chosen, *pictures], len(self.chosen))
 
-        self.workspace.tasks.start(
+        self.start_task(
             "Loading the picture",
             lambda _: [Chosen(path.name, read_picture(path)) for path in paths],
             loaded,
-            beside=self.refused.setText,
         )
 
     def takes_files(self, paths: Sequence[Path]) -> bool:
@@ -154,11 +153,10 @@ class BenchCheckPage(Page):
                 self.checked = made
                 self._follow()
 
-        self.workspace.tasks.start(
+        self.start_task(
             "Checking the bench",
             lambda control: presenter.check(chosen, (text, path), settings, control.progress, free),
             found,
-            beside=self.refused.setText,
         )
 
     def find_suspect(self) -> None:
@@ -182,11 +180,10 @@ class BenchCheckPage(Page):
         """Predict what pictures would do for the ± of the pool's height."""
         session = self.session
         setup, record = session.setup, session.record
-        self.workspace.tasks.start(
+        self.start_task(
             "Predicting what pictures tell",
             lambda _: presenter.predicted(setup, record),
             self._show_predicted,
-            beside=self.refused.setText,
         )
 
     def _show_predicted(self, rows: Sequence[ResultRow]) -> None:
@@ -402,7 +399,7 @@ class _QuantityTable(ReadTable):
         name = "Quantities of the set-up, before and after the check"
         super().__init__(name, f"{name}: Ctrl+C copies it", COLUMNS)
         self.horizontalHeader().setSectionResizeMode(0, QHeaderView.ResizeMode.Stretch)
-        # Long names take more lines; the header tells of a width before the cells have it.
+        # Long names take more lines; the header reports a width before the cells have it.
         self._narrowed = QTimer(self, singleShot=True, interval=0)
         self._narrowed.timeout.connect(self.resizeRowsToContents)
         self.horizontalHeader().sectionResized.connect(lambda *_: self._narrowed.start())

@@ -96,10 +96,10 @@ class FootSwitchPanel(Group):
     def refresh(self) -> None:
         """Show how the foot switches are now."""
         switches = self.switches
-        told = [each.words for each in switches.in_use.values()] or [NONE_YET]
+        parts = [each.words for each in switches.in_use.values()] or [NONE_YET]
         if switches.found is not None:
-            told.append(switches.found.words)
-        show_words(self.words, "\n".join(told))
+            parts.append(switches.found.words)
+        show_words(self.words, "\n".join(parts))
         self._show_rows()
         self.learn_button.setText("Stop waiting" if switches.learns else "Learn a pedal")
         self.look_button.setEnabled(not (switches.looks or switches.learns))
@@ -148,9 +148,9 @@ class FootSwitchPanel(Group):
     def _show_commands(self) -> None:
         closed = () if self.switches.found is None else self.switches.found.closed
         chosen = next((info for info in closed if info.key == self.closed.value()), None)
-        told = "" if chosen is None else commands(chosen)
-        if told != self.commands.toPlainText():
-            self.commands.setPlainText(told)
+        message = "" if chosen is None else commands(chosen)
+        if message != self.commands.toPlainText():
+            self.commands.setPlainText(message)
 
     # --- what is done -------------------------------------------------------------------------
 

@@ -28,15 +28,10 @@ NEXT_TIP = (
 
 
 class ImportChoice(Group):
-    """Which frames to import; seen while a recording is looked at.
-
-    Signals
-    -------
-    edited
-        Something else was chosen.
-    """
+    """Which frames to import; seen while a recording is looked at."""
 
     edited = Signal()
+    """Something else was chosen."""
 
     def __init__(
         self,
@@ -90,8 +85,8 @@ class ImportChoice(Group):
             field.highest = max(1, last)
             field.set_value(value)
         self.rate.set_value(None)
-        told = "\n".join([preview.description, *(f"⚠ {each}" for each in preview.warnings)])
-        self.source_words.setText(f"{preview.path.name}\n{told}")
+        message = "\n".join([preview.description, *(f"⚠ {each}" for each in preview.warnings)])
+        self.source_words.setText(f"{preview.path.name}\n{message}")
 
     def choice(self) -> Choice:
         """What is chosen."""

@@ -41,7 +41,7 @@ class KeptRecordings(Group):
         try:
             found = recordings_beside(folder, session.path.stem)
         except OSError:
-            found = []  # what is wrong with the folder is said where something is written in it
+            found = []  # problems of the folder are reported on writing to it
         kept = [path for path in reversed(found) if path not in others]
         self.choice.set_choices([(str(path), _choice_text(path)) for path in kept])
         if kept:

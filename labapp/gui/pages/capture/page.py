@@ -37,7 +37,7 @@ from labapp.session.session import Session
 from labapp.text import pluralize
 
 REST_MS = 120
-"""Exposure is judged where a frame stays in view so long: not while frames rush by."""
+"""Time, ms, that a frame stays in view before its exposure is judged."""
 
 NONE_YET = (
     "Choose a video, an image, a folder of images or a stack, or drop it on the window; or start a "
@@ -103,14 +103,16 @@ class CapturePage(Page):
         """How far the step is: a recording may be chosen that the session does not have yet."""
         session = self.workspace.session
         if self.live_view.live is not None:
-            told = "A camera is watched: Space here, Ctrl+R and the pedal begin and end a recording"
-            return State(Mark.READY, told)
+            message = (
+                "A camera is watched: Space here, Ctrl+R and the pedal begin and end a recording"
+            )
+            return State(Mark.READY, message)
         if self.preview is None or session is None or session.recording is not None:
             return found
         return State(Mark.READY, f"{self.preview.path.name} is not imported yet: press Import")
 
     def leave(self) -> None:
-        """Judge no frame that nobody sees; a camera goes on, and so does its recording."""
+        """Judge no frame that is not in view; a camera and its recording continue."""
         if self._rest.isActive():
             self._rest.stop()
             self._seen = None
@@ -204,13 +206,13 @@ class CapturePage(Page):
             return  # else the verdict on the frame before stays until this one is judged
         self.exposure.show()
         verdict = seen.exposure.verdict
-        told = f"{verdict.capitalize()}. {seen.exposure.advice}"
-        self.exposure.show_exposure(seen.exposure, told, verdict == "good")
+        message = f"{verdict.capitalize()}. {seen.exposure.advice}"
+        self.exposure.show_exposure(seen.exposure, message, verdict == "good")
 
     # --- frames to look at --------------------------------------------------------------------
 
     def _look(self) -> None:
-        """Read the frame to be seen in the background; of several asked for, the last."""
+        """Read the frame in view in the background; of several requests, the last."""
         if self.live_view.live is not None:
             return
         session, preview = self.workspace.session, self.preview
@@ -289,12 +291,8 @@ class CapturePage(Page):
             self._look()
             self.workspace.changed.emit()
 
-        self._opening = self.workspace.tasks.start(
-            f"Opening {path.name}",
-            lambda _: Preview(path),
-            opened,
-            beside=self.refused.setText,
-            kind="Opening a recording",
+        self._opening = self.start_task(
+            f"Opening {path.name}", lambda _: Preview(path), opened, kind="Opening a recording"
         )
 
     def choice(self) -> Choice | None:
@@ -335,13 +333,13 @@ class CapturePage(Page):
             if self.workspace.frame not in frames:
                 self.workspace.show_frame(frames[0])
             self._seen = None
-            told = f"{pluralize(len(frames), 'frame')} of {path.name} imported"
-            self.workspace.notified.emit(f"{told}. {' '.join(recording.warnings)}".strip(), False)
+            message = f"{pluralize(len(frames), 'frame')} of {path.name} imported"
+            self.workspace.notified.emit(
+                f"{message}. {' '.join(recording.warnings)}".strip(), False
+            )
             self.workspace.changed.emit()
 
-        self._importing = self.workspace.tasks.start(
-            f"Importing {path.name}", work, done, beside=self.refused.setText, kind="Importing"
-        )
+        self._importing = self.start_task(f"Importing {path.name}", work, done, kind="Importing")
         self._listed = None  # one of them may be the session's own then
         self._show_import()
 
@@ -386,12 +384,8 @@ class CapturePage(Page):
             self.workspace.notified.emit(f"The recording is found at {path}", False)
             self.workspace.changed.emit()
 
-        self.workspace.tasks.start(
-            f"Comparing {path.name}",
-            lambda _: session.relink(path),
-            done,
-            beside=self.refused.setText,
-            kind="Comparing",
+        self.start_task(
+            f"Comparing {path.name}", lambda _: session.relink(path), done, kind="Comparing"
         )
 
     # --- the panel ----------------------------------------------------------------------------

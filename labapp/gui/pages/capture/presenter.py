@@ -21,24 +21,15 @@ from labapp.text import format_bytes
 
 @dataclass(frozen=True)
 class Seen:
-    """A frame to look at.
-
-    Parameters
-    ----------
-    title
-        Which it is, in words.
-    image
-        Grey levels, shape (rows, columns); None where it cannot be read.
-    exposure
-        How it is exposed; None where it cannot be read, or was not judged yet.
-    words
-        Why it cannot be read; empty if it can.
-    """
+    """A frame to look at."""
 
     title: str
     image: GreyImage | None
+    """Grey levels, shape (rows, columns); None where it cannot be read."""
     exposure: Exposure | None
+    """How it is exposed; None where it cannot be read, or was not judged yet."""
     words: str = ""
+    """Why it cannot be read; empty if it can."""
 
 
 class Preview:
@@ -102,23 +93,16 @@ def _judged(
 
 @dataclass(frozen=True)
 class Choice:
-    """Which frames of a recording to import, and how.
-
-    Parameters
-    ----------
-    first, last, every
-        Frames ``first``, ``first + every`` … up to ``last``.
-    rate_hz
-        The rate it was filmed at; None: the recording's own.
-    embed
-        Whether the session keeps the frames itself.
-    """
+    """Which frames of a recording to import, and how."""
 
     first: int
     last: int
     every: int = 1
+    """Frames ``first``, ``first + every`` … up to ``last``."""
     rate_hz: float | None = None
+    """The rate it was filmed at; None: the recording's own."""
     embed: bool = False
+    """Whether the session keeps the frames itself."""
 
     @property
     def frames(self) -> str:
@@ -133,11 +117,11 @@ class Choice:
 
 def choice_text(preview: Preview, choice: Choice) -> str:
     """What would be imported."""
-    told = f"{choice.count} of {preview.frames} frames"
+    count = f"{choice.count} of {preview.frames} frames"
     rate = choice.rate_hz or preview.frame_rate_hz
     if rate is None:
-        return f"{told}; without a frame rate there are no times"
-    return f"{told}, {choice.count * choice.every / rate:.3f} s at {format_frame_rate(rate)}"
+        return f"{count}; without a frame rate there are no times"
+    return f"{count}, {choice.count * choice.every / rate:.3f} s at {format_frame_rate(rate)}"
 
 
 def refusal(session: Session | None, choice: Choice | None, working: bool) -> str:
@@ -189,13 +173,13 @@ def missing_text(session: Session) -> str:
     missing = session.missing_recording
     if missing is None:
         return ""
-    told = (
+    lost = (
         f"{missing.name} is not where it was ({missing.parent}). What was measured is still there, "
         "but no frame can be seen or measured. "
     )
     if session.read_only:
-        return f"{told}The session is open read-only: open it for changes to say where it is now."
+        return f"{lost}The session is open read-only: open it for changes to say where it is now."
     return (
-        f"{told}Say where it is now: only the same recording is taken, which its size and SHA-256 "
+        f"{lost}Say where it is now: only the same recording is taken, which its size and SHA-256 "
         "tell."
     )

@@ -13,18 +13,13 @@ from labapp.gui.workspace import Workspace
 from labapp.media import GreyImage
 
 REST_MS = 120
-"""Dots are looked for where the frame stays in view so long: not while frames rush by."""
+"""Time, ms, that a frame stays in view before its dots are searched."""
 
 
 class Looking(QObject):
     """Reads the frame in view, and looks for dots where the session knows none.
 
     One task at a time: when it ends, what is wanted by then comes next.
-
-    Signals
-    -------
-    ready
-        There is something new to show.
 
     Attributes
     ----------
@@ -39,6 +34,7 @@ class Looking(QObject):
     """
 
     ready = Signal()
+    """There is something new to show."""
 
     def __init__(self, workspace: Workspace) -> None:
         super().__init__()

@@ -22,7 +22,7 @@ WARM_MS = 1500
 """The page is shown first; its processes begin then."""
 
 AGAIN_MS = 50
-"""An edit that cannot take the place of the fit before it yet tries again after so long."""
+"""Time, ms, after which an edit that cannot replace the fit before it yet tries again."""
 
 
 class Processes:
@@ -35,7 +35,7 @@ class Processes:
         """Have both: the second is there at once when the first is ended."""
         while len(self._pools) < 2:
             pool = measuring_pool(1)
-            # To make settings it loads the whole measurement.
+            # Making settings loads all modules of the measurement.
             self._pools.append((pool, pool.submit(Settings)))
 
     @property
@@ -121,7 +121,7 @@ class Refit:
             self.want(self._seen)
 
     def _give_up(self, frame: int) -> bool:
-        """End the fit under way if it is of this frame, as it was; False if it goes on."""
+        """End the running fit if it is of this frame; False if it continues."""
         assert self._task is not None
         if self._begun is None or self._begun[0] != frame:
             return False

@@ -9,7 +9,7 @@ from labapp.core.rows.lattice import Site
 from labapp.core.values import FloatArray, IntArray
 
 NEIGHBOURS = 8
-"""A site is estimated from so many numbered dots around it."""
+"""Number of numbered dots that a site is estimated from."""
 
 FAR_OFF = 0.35
 """A dot farther than this share of a step from every site is not numbered."""
@@ -67,7 +67,7 @@ def row_ends(row: IntArray, dots_px: FloatArray) -> tuple[tuple[int, int], ...]:
 def site_at(correction: Correction, u: float, v: float) -> tuple[Site, float] | None:
     """Which site (k, t) is at a place, and how far its middle is, in steps; None without rows.
 
-    The numbered dots round the place tell it.
+    It follows from the numbered dots round the place.
     """
     sited = np.flatnonzero(correction.sited)
     places = correction.dots.image_px[sited]
@@ -118,7 +118,7 @@ def numbered_by_neighbours(correction: Correction, dots: IntArray) -> Correction
     Raises
     ------
     ValueError
-        If there are none to tell it, a dot lies between sites, or another dot has its site.
+        If there are no numbered dots, a dot lies between sites, or another dot has its site.
     """
     correction = clear_rows(correction, dots)
     for dot in dots.tolist():

@@ -35,76 +35,46 @@ Origin = Literal["corrected", "measured", "found", "looked for"]
 
 @dataclass(frozen=True)
 class DetectedDots:
-    """What a detector found in a frame.
-
-    Parameters
-    ----------
-    frame
-        Its number.
-    by
-        The settings that it was found with.
-    correction
-        Dots and rows, as a correction would begin.
-    why
-        What could not be found, a sentence; empty if all was.
-    """
+    """What a detector found in a frame."""
 
     frame: int
     by: tuple[DotSettings, LatticeSettings]
+    """The settings that it was found with."""
     correction: Correction
+    """Dots and rows, as a correction would begin."""
     why: str
+    """What could not be found, a sentence; empty if all was."""
 
 
 @dataclass(frozen=True)
 class DotsState:
-    """What the page shows of one frame.
-
-    Parameters
-    ----------
-    frame
-        Its number.
-    origin
-        Where dots and rows come from.
-    correction
-        The dots and rows, and what an edit begins with; None while they are looked for.
-    computed_px
-        Where the measured surface puts the dots, shape (m, 2), px.
-    result
-        What the frame gave last, which may no longer stand.
-    why
-        What could not be done, a sentence or two.
-    """
+    """What the page shows of one frame."""
 
     frame: int
     origin: Origin
     correction: Correction | None
+    """The dots and rows, and what an edit begins with; None while they are looked for."""
     computed_px: FloatArray
+    """Where the measured surface puts the dots, shape (m, 2), px."""
     result: Result | None
+    """What the frame gave last, which may no longer stand."""
     why: str
+    """What could not be done, a sentence or two."""
 
 
 @dataclass(frozen=True)
 class Figures:
-    """Figures that show whether an edit improved the fit; lengths in mm, NaN where there are none.
-
-    Parameters
-    ----------
-    status
-        Of the measurement.
-    matched
-        Number of dots whose ray is known.
-    are_mm, mre_mm
-        Reflection errors.
-    height_mm, height_sigma_mm
-        Largest height, or the depth of a pool that is deeper than high, and its σ.
-    """
+    """Figures that show whether an edit improved the fit; lengths in mm, NaN where unknown."""
 
     status: str
     matched: int
+    """Number of dots whose ray is known."""
     are_mm: float
     mre_mm: float
+    """Reflection errors."""
     height_mm: float
     height_sigma_mm: float
+    """Largest height, or the depth of a pool that is deeper than high, and its σ."""
 
 
 @dataclass(frozen=True)
@@ -219,13 +189,13 @@ def sentence(seen: DotsState) -> str:
     lattice, dots = seen.correction.lattice, seen.correction.dots
     doubtful = int((~seen.correction.sited).sum())
     rows = len(set(lattice.row[lattice.row > 0].tolist()))
-    told = {
+    message = {
         "corrected": "Corrected by hand",
         "measured": "As measured",
         "found": "As found, not measured",
         "looked for": "",
     }[seen.origin]
-    words = f"{told}: {pluralize(len(dots), 'dot')} in {pluralize(rows, 'row')}"
+    words = f"{message}: {pluralize(len(dots), 'dot')} in {pluralize(rows, 'row')}"
     words += f", {doubtful} in doubt" if doubtful else ", none in doubt"
     if lattice.reference is None:
         words += ". The reference is not known"
@@ -314,7 +284,7 @@ def figures(result: Result | None) -> Figures | None:
 
 
 def compared(before: Figures | None, after: Figures | None, pending: str = "") -> list[ResultRow]:
-    """The fit before the last edit and after it; ``pending`` stands for what is not known yet."""
+    """The fit before the last edit and after it; ``pending`` is shown for what is not known yet."""
 
     def pair(texts: Sequence[str]) -> str:
         first, last = texts
@@ -325,12 +295,12 @@ def compared(before: Figures | None, after: Figures | None, pending: str = "") -
         values = [math.nan if f is None else getattr(f, name) for f in (before, after)]
         return pair([plain(v, digits) if math.isfinite(v) else "–" for v in values])
 
-    told = [("–", "–") if f is None else (f.status, str(f.matched)) for f in (before, after)]
+    texts = [("–", "–") if f is None else (f.status, str(f.matched)) for f in (before, after)]
     sigma = math.nan if after is None or pending else after.height_sigma_mm
     height = length("height_mm") + (f" ± {plain(sigma, 3)}" if math.isfinite(sigma) else "")
     return [
-        ResultRow("Fit", pair([t[0] for t in told]), note="Status before the edit, and now"),
-        ResultRow("Dots matched", pair([t[1] for t in told])),
+        ResultRow("Fit", pair([t[0] for t in texts]), note="Status before the edit, and now"),
+        ResultRow("Dots matched", pair([t[1] for t in texts])),
         ResultRow("ARE", length("are_mm"), unit="mm", note="Average reflection error (Eq. 6-3)"),
         ResultRow("MRE", length("mre_mm"), unit="mm", note="Largest reflection error (Eq. 6-4)"),
         ResultRow(
@@ -347,18 +317,12 @@ def compared(before: Figures | None, after: Figures | None, pending: str = "") -
 
 @dataclass(frozen=True)
 class Carried:
-    """How far a correction could be carried on.
-
-    Parameters
-    ----------
-    corrections
-        Frame → correction, without the frame it began with.
-    words
-        Where it stopped and why, a sentence.
-    """
+    """How far a correction could be carried on."""
 
     corrections: dict[int, Correction]
+    """Frame → correction, without the frame it began with."""
     words: str
+    """Where it stopped and why, a sentence."""
 
 
 def carry(session: Session, seen: DotsState, most: int | None, control: Control) -> Carried:

@@ -186,10 +186,10 @@ class DotsPage(Page):
         self.draw()
 
     def leave(self) -> None:
-        """End a drag or nudge under way; a fit under way goes on."""
+        """End a drag or nudge under way; a running fit continues."""
         self._in_view = False
         self.hand.release()
-        self.hand.give_up()  # a click that is asked for is not to follow into another session
+        self.hand.give_up()  # a click that is awaited must not carry over to another session
         self.looking.stop()
 
     def picture(self) -> QPixmap:
@@ -402,7 +402,7 @@ class Hand(Tool):
 
     @property
     def busy(self) -> bool:
-        """Whether a drag is under way or a click is asked for."""
+        """Whether a drag is under way or a click is awaited."""
         return self._start is not None or self._next_click is not None
 
     def ask(self, do: Callable[[float, float], object], words: str) -> None:
@@ -417,7 +417,7 @@ class Hand(Tool):
         self._page.overlay.hide_box()
 
     def click(self, u: float, v: float, modifiers: Qt.KeyboardModifier) -> None:
-        """Choose a dot, Shift: in addition; or do what a button asked a click for."""
+        """Choose a dot, Shift: in addition; or do what a button awaits a click for."""
         if self._next_click is not None:
             do, self._next_click, self.asked = self._next_click, None, ""
             do(u, v)

@@ -11,8 +11,6 @@ from threadpoolctl import threadpool_limits
 
 from labapp.core.schemes import scheme_words
 from labapp.core.values import FloatArray, IntArray
-from labapp.export.drawing import Direction
-from labapp.export.film import UNTIMED_HZ, film_times
 from labapp.export.folder import (
     FILM_FILE,
     MANIFEST,
@@ -29,7 +27,9 @@ from labapp.export.formats import (
     mesh_formats,
 )
 from labapp.export.meshes import SPACING_MM
-from labapp.export.studio import PICTURE_PX
+from labapp.export.rendering.drawing import Direction
+from labapp.export.rendering.film import UNTIMED_HZ, film_times
+from labapp.export.rendering.studio import PICTURE_PX
 from labapp.session.frames import Progress
 from labapp.session.measured import SETUP_CHANGED, scheme_name
 from labapp.session.session import Session
@@ -53,19 +53,10 @@ SIZES = ((1280, 720), (1920, 1080), (2560, 1440), (800, 600))
 
 @dataclass(frozen=True)
 class Item:
-    """Something that can be ticked.
-
-    Parameters
-    ----------
-    key
-        ``tables:dots``, ``surfaces:stl``, ``solid``, ``together:hdf5``, ``report``.
-    name
-        Its words.
-    tip
-        What it is.
-    """
+    """Something that can be ticked."""
 
     key: str
+    """``tables:dots``, ``surfaces:stl``, ``solid``, ``together:hdf5``, ``report``."""
     name: str
     tip: str
 
@@ -131,34 +122,24 @@ USUAL = frozenset(
 
 @dataclass(frozen=True)
 class ExportRequest:
-    """What the operator wants to take along.
-
-    Parameters
-    ----------
-    ticked
-        Keys of the `Item` that are ticked.
-    which
-        ``all``, ``view`` (the frame in view) or ``part``.
-    first, last, every
-        The part: frames ``first``, ``first + every`` … up to ``last``.
-    scheme
-        Whose results; empty: that of the settings.
-    spacing_mm
-        Distance of the surfaces' nodes.
-    view, size_px, film_rate_hz
-        As in `ExportChoice`.
-    """
+    """What the operator wants to export."""
 
     ticked: frozenset[str] = USUAL
+    """Keys of the `Item` that are ticked."""
     which: str = "all"
+    """``all``, ``view`` (the frame in view) or ``part``."""
     first: int = 0
     last: int = 0
     every: int = 1
+    """The part: frames ``first``, ``first + every`` … up to ``last``."""
     scheme: str = ""
+    """Scheme whose results are written; empty: that of the settings."""
     spacing_mm: float = SPACING_MM
+    """Distance of the surfaces' nodes."""
     view: Direction = "free"
     size_px: tuple[int, int] = PICTURE_PX
     film_rate_hz: float | None = None
+    """As in `ExportChoice`."""
 
     def some(self, kind: str) -> frozenset[str]:
         """What is ticked of a kind."""
@@ -191,30 +172,20 @@ class ExportRequest:
 
 @dataclass(frozen=True)
 class ExportPlan:
-    """What would be written.
-
-    Parameters
-    ----------
-    scheme
-        Whose results.
-    frames
-        Numbers of the frames that are measured and chosen, shape (n,).
-    again
-        Frames to be measured for the choice to be whole: stale or unmeasured ones, shape (k,).
-    why_not
-        Why nothing can be written; empty if it can.
-    notes
-        What to know otherwise, a sentence each.
-    files
-        What would be in the folder, a line each.
-    """
+    """What would be written."""
 
     scheme: str
+    """Whose results."""
     frames: IntArray
+    """Numbers of the frames that are measured and chosen, shape (n,)."""
     again: IntArray
+    """Chosen frames that are stale or unmeasured, shape (k,)."""
     why_not: str
+    """Why nothing can be written; empty if it can."""
     notes: tuple[str, ...]
+    """What to know otherwise, a sentence each."""
     files: tuple[str, ...]
+    """What would be in the folder, a line each."""
 
 
 def plan(session: Session, request: ExportRequest, frame: int) -> ExportPlan:
@@ -256,12 +227,12 @@ def film_note(frames: IntArray, time_s: FloatArray, rate_hz: float | None) -> st
     """How long the film takes, and what to do where that is too short to see anything."""
     timed = [(int(k), t if np.isfinite(t) else None) for k, t in zip(frames, time_s, strict=True)]
     lasts_s = float(film_times(timed, rate_hz)[-1])
-    told = f"The film lasts {lasts_s:.3g} s."
+    message = f"The film lasts {lasts_s:.3g} s."
     if rate_hz is None and not np.isfinite(time_s).all():
-        return f"{told} The recording has no time base: {UNTIMED_HZ:g} frames/s."
+        return f"{message} The recording has no time base: {UNTIMED_HZ:g} frames/s."
     if rate_hz is None and len(frames) > 1 and lasts_s < BRIEF_S:
-        return f"{told} To see it slowed, enter its frames/s: 10, say."
-    return told
+        return f"{message} To see it slowed, enter its frames/s: 10, say."
+    return message
 
 
 def _chosen(
@@ -344,37 +315,28 @@ def folder_within(folder: Path, session: Session) -> Path:
     try:
         own = not any(folder.iterdir()) or (folder / MANIFEST).is_file()
     except OSError:
-        own = True  # the export tells what is wrong with it
+        own = True  # the export reports what is wrong with it
     return folder if own else folder / proposed_folder(session).name
 
 
 @dataclass(frozen=True)
 class Written:
-    """What came of an export.
-
-    Parameters
-    ----------
-    folder
-        Where it is.
-    files
-        What is in it.
-    problems
-        What in it differs from its manifest; empty if nothing does.
-    """
+    """What came of an export."""
 
     folder: Path
     files: tuple[ExportedFile, ...]
     problems: tuple[str, ...]
+    """What in it differs from its manifest; empty if nothing does."""
 
     @property
     def words(self) -> str:
         """For the operator."""
         size = format_bytes(sum(file.size for file in self.files))
-        told = f"{len(self.files)} files and the manifest, {size}, are in {self.folder}."
+        message = f"{len(self.files)} files and the manifest, {size}, are in {self.folder}."
         if not self.problems:
-            return f"✓ {told} Read again and compared with the manifest: all as written."
+            return f"✓ {message} Read again and compared with the manifest: all as written."
         shown = "; ".join(self.problems[:SHOWN_PROBLEMS])
-        return f"▲ {told} But not all is as it was written: {shown}."
+        return f"▲ {message} But not all is as it was written: {shown}."
 
 
 def write(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 
@@ -17,7 +16,6 @@ from labapp.core.values import FloatArray
 from labapp.gui.digits import ResultRow, parsed
 from labapp.gui.pages.setup.presenter import shown as setup_shown
 from labapp.gui.shell.steps import calibrations_in_use
-from labapp.media import GreyImage, open_source
 from labapp.session.session import Session
 
 NAMES = ("l₁", "l₂", "l₃")
@@ -40,43 +38,28 @@ SCALE = ("scale 1", "scale 2")
 
 @dataclass(frozen=True)
 class Readings:
-    """Lengths as they were typed.
-
-    Parameters
-    ----------
-    lengths_mm
-        Readings of l₁, l₂, l₃, mm; any number of each.
-    fan_angle_deg
-        Of the cross-hair lens.
-    settings
-        How well the fan angle and a reading are known.
-    wrong
-        What was typed and is no length, a sentence each.
-    """
+    """Lengths as they were typed."""
 
     lengths_mm: tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]] = ((), (), ())
+    """Readings of l₁, l₂, l₃, mm; any number of each."""
     fan_angle_deg: float = FAN_ANGLE_DEG
+    """Of the cross-hair lens."""
     settings: LaserCalibrationSettings = field(default_factory=LaserCalibrationSettings)
+    """How well the fan angle and a reading are known."""
     wrong: tuple[str, ...] = ()
+    """What was typed and is no length, a sentence each."""
 
 
 @dataclass(frozen=True)
 class LaserResult:
-    """What follows from readings.
-
-    Parameters
-    ----------
-    found
-        The laser; None where none follows.
-    why_not
-        Then why, in words.
-    rows
-        Means of the lengths, and the laser.
-    """
+    """What follows from readings."""
 
     found: LaserCalibration | None
+    """The laser; None where none follows."""
     why_not: str
+    """Why none follows, in words."""
     rows: tuple[ResultRow, ...]
+    """Means of the lengths, and the laser."""
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -166,12 +149,6 @@ def in_use(session: Session) -> tuple[ResultRow, ...]:
 
 
 # --- a picture of the cross -------------------------------------------------------------------
-
-
-def read_picture(path: Path) -> GreyImage:
-    """Read a picture, or the first frame of a recording; an `InputError` says why not."""
-    with open_source(path) as source:
-        return source.frame(0).image
 
 
 def first_places(shape: tuple[int, int]) -> dict[str, Place]:

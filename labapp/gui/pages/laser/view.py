@@ -23,7 +23,7 @@ from labapp.gui.widgets.layouts import fill
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.widgets.tables import RIGHT
 from labapp.gui.workspace import Workspace
-from labapp.media import GreyImage
+from labapp.media import GreyImage, read_picture
 
 WAYS = (("callipers", "by callipers"), ("picture", "from a picture"))
 
@@ -81,12 +81,7 @@ class LaserPage(Page):
 
     def load_picture(self, path: Path) -> None:
         """Show a picture of the cross, with the points to drag."""
-        self.workspace.tasks.start(
-            "Loading the picture",
-            lambda _: presenter.read_picture(path),
-            self._show_picture,
-            beside=self.refused.setText,
-        )
+        self.start_task("Loading the picture", lambda _: read_picture(path), self._show_picture)
 
     def add_reading(self) -> None:
         """Put the lengths from the picture into the table, as one more reading."""
@@ -297,8 +292,8 @@ class LaserPage(Page):
         except ValueError as error:
             self.lengths.setText(f"⚠ {error}")
             return None
-        told = (f"{name} {length:.2f} mm" for name, length in zip(NAMES, lengths, strict=True))
-        self.lengths.setText(",  ".join(told))
+        parts = (f"{name} {length:.2f} mm" for name, length in zip(NAMES, lengths, strict=True))
+        self.lengths.setText(",  ".join(parts))
         return lengths
 
     def _dragged(self) -> None:

@@ -15,7 +15,7 @@ from labapp.core.calibration.mark_fit import Model, root_mean_square
 from labapp.core.calibration.plane_calibration import PlaneCalibration, PlaneCalibrationSettings
 from labapp.core.geometry.coordinates import ImageCalibration, Lens
 from labapp.core.values import FloatArray
-from labapp.gui.digits import ResultRow
+from labapp.gui.digits import ResultRow, round_factor
 from labapp.gui.shell.steps import calibrations_in_use
 from labapp.media import GreyImage
 from labapp.session.session import Session
@@ -100,21 +100,14 @@ def places(found: Calibration) -> tuple[Place, Place, Place]:
 
 @dataclass(frozen=True)
 class PlaneResult:
-    """What follows from the points and the marks.
-
-    Parameters
-    ----------
-    rows
-        Scales and angle with ±, and the residuals.
-    why_not
-        Why they cannot be used; empty if they can.
-    warnings
-        What the operator should look at.
-    """
+    """What follows from the points and the marks."""
 
     rows: tuple[ResultRow, ...] = ()
+    """Scales and angle with ±, and the residuals."""
     why_not: str = ""
+    """Why they cannot be used; empty if they can."""
     warnings: tuple[str, ...] = ()
+    """What the operator should look at."""
 
 
 def result(found: Calibration | None) -> PlaneResult:
@@ -217,8 +210,8 @@ def choices(found: Calibration | None) -> tuple[tuple[Model, str], ...]:
     named: list[tuple[Model, str]] = [("affine", "Affine")]
     if found.fits.homography is not None:
         named.append(("homography", "Homography"))
-    told = [(model, f"{words} (proposed)" if model == best else words) for model, words in named]
-    return (*told, ("three points", "Three points"))
+    models = [(model, f"{words} (proposed)" if model == best else words) for model, words in named]
+    return (*models, ("three points", "Three points"))
 
 
 def why(found: Calibration | None) -> str:
@@ -238,22 +231,15 @@ def _capital(found: PlaneCalibration) -> list[str]:
 
 @dataclass(frozen=True)
 class ResidualMap:
-    """Where the model has the marks, against where they are, enlarged.
-
-    Parameters
-    ----------
-    begin_px, end_px
-        Arrows from the marks towards where the model has them, shape (n, 2), px.
-    share
-        Length of each over the longest, shape (n,), 0 … 1.
-    words
-        How much they are enlarged, and the longest.
-    """
+    """Residuals of the marks, enlarged."""
 
     begin_px: FloatArray
     end_px: FloatArray
+    """Arrows from the marks towards their modelled places, shape (n, 2), px."""
     share: FloatArray
+    """Length of each over the longest, shape (n,), 0 … 1."""
     words: str
+    """How much they are enlarged, and the longest."""
 
 
 def residual_map(found: Calibration | None, height_px: int) -> ResidualMap | None:
@@ -267,10 +253,7 @@ def residual_map(found: Calibration | None, height_px: int) -> ResidualMap | Non
         begin = np.array(found.marks)[:, 2:4]
     length = np.hypot(*residual.T)
     longest = max(float(length.max()), 1e-9)
-    # 1, 2 or 5 times a power of ten: the longest becomes a tenth of the picture at most.
-    room = 0.1 * height_px / longest
-    power = 10.0 ** np.floor(np.log10(room))
-    times = max(step for step in (1, 2, 5) if step * power <= room) * power
+    times = round_factor(0.1 * height_px / longest)  # the longest: at most a tenth of the picture
     words = f"Arrows: residuals × {times:g}, the longest {longest:.2f} px"
     return ResidualMap(begin, begin + times * residual, length / longest, words)
 

@@ -13,8 +13,8 @@ from labapp.core.calibration.boards import BOARDS
 from labapp.core.calibration.imaging_plane import Calibration
 from labapp.core.calibration.mark_fit import Model
 from labapp.core.calibration.plane_calibration import PlaneCalibration
-from labapp.gui.dialogs import ask_file, ask_save, write_file
-from labapp.gui.pages.laser.presenter import read_picture
+from labapp.files import write_file
+from labapp.gui.dialogs import ask_file, ask_save
 from labapp.gui.pages.page import Page
 from labapp.gui.pages.plane import presenter
 from labapp.gui.pages.plane.presenter import POINTS
@@ -26,7 +26,7 @@ from labapp.gui.widgets.labels import plain_label, plain_tip, show_words, wrappi
 from labapp.gui.widgets.layouts import fill
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
-from labapp.media import GreyImage
+from labapp.media import GreyImage, read_picture
 from labapp.simulation.board import board_pdf, board_svg
 from labapp.simulation.target import Target, target_svg
 
@@ -88,12 +88,7 @@ class PlanePage(Page):
             self._show(image, None)
             self.find_axes()
 
-        self.workspace.tasks.start(
-            "Loading the picture",
-            lambda _: read_picture(path),
-            loaded,
-            beside=self.refused.setText,
-        )
+        self.start_task("Loading the picture", lambda _: read_picture(path), loaded)
 
     def add_picture(self, path: Path) -> None:
         """Take a further picture of the board, held anyhow before the camera."""
@@ -102,12 +97,7 @@ class PlanePage(Page):
             self._tilted = (*self._tilted, image)
             self.find_axes()
 
-        self.workspace.tasks.start(
-            "Loading the picture",
-            lambda _: read_picture(path),
-            loaded,
-            beside=self.refused.setText,
-        )
+        self.start_task("Loading the picture", lambda _: read_picture(path), loaded)
 
     def take_kept(self) -> None:
         """Show the picture that the session keeps, and the points in use."""
@@ -141,11 +131,8 @@ class PlanePage(Page):
                     self.square.set_value(calibration.board.square_mm)
                 self._place(presenter.with_unit(calibration, self._unit()))
 
-        self.workspace.tasks.start(
-            "Looking for O′ and the axes",
-            lambda _: presenter.find(images, unit, lens),
-            found,
-            beside=self.refused.setText,
+        self.start_task(
+            "Looking for O′ and the axes", lambda _: presenter.find(images, unit, lens), found
         )
 
     def use(self) -> None:
@@ -378,8 +365,8 @@ class PlanePage(Page):
         self.result.set_rows(result.rows)
         self.result.setVisible(bool(result.rows))
         why_not = (result.why_not,) if result.why_not else ()
-        told = (f"⚠ {words}" for words in (*why_not, *result.warnings))
-        show_words(self.words, "\n".join(told))
+        parts = (f"⚠ {words}" for words in (*why_not, *result.warnings))
+        show_words(self.words, "\n".join(parts))
         unusable = result.why_not or self.locked
         self.use_button.setEnabled(not unusable)
         tip = "Measure with this; undo brings the former back"

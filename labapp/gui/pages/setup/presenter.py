@@ -22,29 +22,21 @@ from labapp.text import setup_words
 
 @dataclass(frozen=True)
 class Entry:
-    """A field of the page.
-
-    Parameters
-    ----------
-    key
-        ``section.key`` of the setup, or the name in `Record`.
-    label, unit, tooltip
-        What it is; its unit; more about it.
-    lowest, highest, step, decimals
-        Of its number; lowest = highest: it takes words.
-    usual
-        What the text has for it (Appendix II); None: nothing.
-    """
+    """A field of the page."""
 
     key: str
+    """``section.key`` of the setup, or the name in `Record`."""
     label: str
     unit: str = ""
     tooltip: str = ""
+    """What it is; its unit; more about it."""
     lowest: float = 0.0
     highest: float = 0.0
     step: float = 1.0
     decimals: int = 1
+    """Range and decimals of its number; lowest = highest: it takes text."""
     usual: float | None = None
+    """What the text has for it (Appendix II); None: nothing."""
 
 
 RIG: tuple[tuple[str, tuple[Entry, ...]], ...] = (
@@ -188,33 +180,22 @@ SAFETY: tuple[tuple[str, str], ...] = (
 
 @dataclass(frozen=True)
 class SetupState:
-    """What the page shows.
-
-    Parameters
-    ----------
-    values
-        By the keys of `RIG`; None where there is none.
-    sigmas
-        Standard uncertainties by the keys of `ASSUMED`; None where one is assumed.
-    kind, travel
-        The dot pattern's, of `KINDS`; which way the torch moves, of `TRAVELS`.
-    status
-        How far the set-up can be relied on, in words; empty while it is not complete.
-    problems
-        What is wrong, in words, by the same keys.
-    others
-        What is wrong elsewhere in the setup, a sentence each.
-    record
-        The experiment record.
-    """
+    """What the page shows."""
 
     values: dict[str, float | None]
+    """By the keys of `RIG`; None where there is none."""
     sigmas: dict[str, float | None]
+    """Standard uncertainties by the keys of `ASSUMED`; None where one is assumed."""
     kind: str
+    """Kind of the dot pattern, of `KINDS`."""
     travel: str
+    """Which way the torch moves, of `TRAVELS`."""
     status: str
+    """How far the set-up can be relied on, in words; empty while it is not complete."""
     problems: dict[str, str]
+    """What is wrong, in words, by the same keys."""
     others: tuple[str, ...]
+    """What is wrong elsewhere in the setup, a sentence each."""
     record: Record
 
 
@@ -275,20 +256,12 @@ def rig(session: Session) -> Rig | None:
 
 @dataclass(frozen=True)
 class BenchState:
-    """The bench from the side.
-
-    Parameters
-    ----------
-    view
-        What is drawn; None without a rig, or a pool that cannot be.
-    words
-        The same in words, or why it is not drawn.
-    rows
-        Its numbers.
-    """
+    """The bench from the side."""
 
     view: SideView | None
+    """What is drawn; None without a rig, or a pool that cannot be."""
     words: str
+    """The same in words, or why it is not drawn."""
     rows: tuple[ResultRow, ...] = ()
 
 

@@ -9,7 +9,8 @@ from pathlib import Path
 from PySide6.QtWidgets import QCheckBox, QLabel, QTabWidget, QVBoxLayout, QWidget
 
 from labapp.config.setup import read_setup
-from labapp.gui.dialogs import EVERYTHING, ask_file, ask_save, write_file
+from labapp.files import write_file
+from labapp.gui.dialogs import EVERYTHING, ask_file, ask_save
 from labapp.gui.pages.page import Page
 from labapp.gui.pages.setup import presenter
 from labapp.gui.pages.setup.presenter import (

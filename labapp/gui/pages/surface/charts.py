@@ -86,8 +86,8 @@ class DotsChart(Chart):
         self._computed.setData(pos=computed)
         ends = np.stack([captured, captured + scale * (computed - captured)], axis=1).reshape(-1, 2)
         self._errors.setData(ends[:, 0], ends[:, 1])
-        told = f"○ captured, + computed; lines: errors × {scale:g}"
-        self.say(told if dots is not None else "No reflected dots to compare")
+        message = f"○ captured, + computed; lines: errors × {scale:g}"
+        self.say(message if dots is not None else "No reflected dots to compare")
         self.plot.autoRange()
 
     def take_colours(self) -> None:
@@ -100,15 +100,10 @@ class DotsChart(Chart):
 
 
 class PlanChart(Chart):
-    """The pool from above; both ends of the section line can be dragged, or the whole line.
-
-    Signals
-    -------
-    dragged
-        The line runs elsewhere now: its angle, degrees, and offset, mm (see `profile`).
-    """
+    """The pool from above; both ends of the section line can be dragged, or the whole line."""
 
     dragged = Signal(float, float)
+    """The line was moved: its angle, degrees, and offset, mm (see `profile`)."""
 
     def __init__(self) -> None:
         super().__init__("Section line", "X (mm)", "Y (mm)", equal=True)

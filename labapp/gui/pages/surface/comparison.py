@@ -9,7 +9,7 @@ import numpy as np
 from labapp.core.pipeline import Measurement, reconstruct
 from labapp.core.surface.measures import Measures, measure_surface
 from labapp.core.values import CannotMeasure
-from labapp.export.scene import Scene, difference_scene
+from labapp.export.rendering.scene import Scene, difference_scene
 from labapp.gui.digits import rounded
 from labapp.gui.pages.surface.presenter import (
     ERRORS,
@@ -34,27 +34,18 @@ def other_scheme(scheme: str) -> str:
 
 @dataclass(frozen=True)
 class Comparison:
-    """A frame by two schemes.
-
-    Parameters
-    ----------
-    scenes
-        Of the first and the second; None where that finds no surface.
-    words
-        Why not; empty where it does.
-    difference
-        The first's surface coloured by how it differs; None where they do not overlap.
-    rows
-        Figures of both and their difference.
-    told
-        All of it in a sentence.
-    """
+    """A frame by two schemes."""
 
     scenes: tuple[Scene | None, Scene | None]
+    """Result of the first and the second; None where it has no surface."""
     words: tuple[str, str]
+    """Why it has none; empty where it has."""
     difference: Scene | None
+    """Surface of the first, coloured by the difference; None where they do not overlap."""
     rows: tuple[Row, ...]
+    """Figures of both and their difference."""
     told: str
+    """The comparison in a sentence."""
 
 
 def compared(
@@ -82,21 +73,21 @@ def compared(
         limits = min(each.depth_mm for each in measures), max(each.height_mm for each in measures)
     scenes = [None if each is None else scene(each, rig, options, limits, None) for each in found]
     rows: tuple[Row, ...] = ()
-    difference, told = None, "There are no two surfaces to compare."
+    difference, message = None, "There are no two surfaces to compare."
     if first and second and first.measures and second.measures:
         assert first.reconstruction is not None
         assert second.reconstruction is not None
         plain = difference_scene(first.reconstruction, second.reconstruction)
         rows = compared_rows(first.measures, second.measures)
         names = [SCHEMES[scheme].title for scheme in schemes]
-        told = f"{names[0]} minus {names[1]}, from the same dots: "
+        message = f"{names[0]} minus {names[1]}, from the same dots: "
         if len(plain.values):
             difference = replace(plain, exaggeration=options.exaggeration)
             largest = float(np.abs(plain.values).max())
-            told += f"the heights differ by {largest:.3f} mm at most."
+            message += f"the heights differ by {largest:.3f} mm at most."
         else:
-            told += "the two surfaces do not overlap."
-    return Comparison((scenes[0], scenes[1]), (words[0], words[1]), difference, rows, told)
+            message += "the two surfaces do not overlap."
+    return Comparison((scenes[0], scenes[1]), (words[0], words[1]), difference, rows, message)
 
 
 def by_scheme(session: Session, frame: int, scheme: str) -> Measurement:
@@ -140,9 +131,9 @@ def compared_rows(one: Measures, other: Measures) -> tuple[Row, ...]:
         sigmas = [getattr(each, of_sigma) for each in (one, other)]
         rows.append(_row(name, [getattr(each, value) for each in (one, other)], sigmas, unit))
     for name, value, _ in ERRORS:
-        told = [getattr(each, value) for each in (one, other)]
-        if value != "own_are_mm" or np.isfinite(told).any():
-            rows.append(_row(name, told, [], "mm"))
+        values = [getattr(each, value) for each in (one, other)]
+        if value != "own_are_mm" or np.isfinite(values).any():
+            rows.append(_row(name, values, [], "mm"))
     return tuple(rows)
 
 
@@ -152,10 +143,10 @@ def _row(name: str, values: list[float], sigmas: list[float], unit: str) -> Row:
     first, second, difference = (
         rounded(number, largest, decimals)[0] for number in (*values, values[0] - values[1])
     )
-    told = [
+    texts = [
         f"{text} ± {rounded(value, sigma)[1]}" if np.isfinite(sigma) and sigma > 0 else text
         for text, value, sigma in zip(
             (first, second), values, sigmas or [np.nan, np.nan], strict=True
         )
     ]
-    return name, told[0], told[1], difference, unit
+    return name, texts[0], texts[1], difference, unit

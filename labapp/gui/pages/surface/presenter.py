@@ -17,7 +17,7 @@ from labapp.core.surface.measures import Measures, sigma_name
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.values import FloatArray
 from labapp.export.heights import Profile
-from labapp.export.scene import Scene, rays_of, scene_of
+from labapp.export.rendering.scene import Scene, rays_of, scene_of
 from labapp.gui.digits import ResultRow
 from labapp.session.measured import Overview, Result, scheme_name
 from labapp.session.session import Session
@@ -71,21 +71,7 @@ def with_scheme(settings: Settings, name: str) -> Settings:
 
 @dataclass(frozen=True)
 class Options:
-    """What the 3-D view shows, as the operator ticked it.
-
-    Parameters
-    ----------
-    colour
-        By ``height``, or by its ``sigma``.
-    points, boundary, rays, electrode
-        Whether they are drawn.
-    same_colours
-        Whether all frames share one scale of colours.
-    exaggeration
-        Heights are drawn so many times as high.
-    section
-        Angle, degrees, and offset, mm, of the section line; None without one.
-    """
+    """What the 3-D view shows, as the operator ticked it."""
 
     colour: Literal["height", "sigma"] = "height"
     points: bool = True
@@ -93,40 +79,31 @@ class Options:
     rays: bool = False
     electrode: bool = True
     same_colours: bool = False
+    """Whether all frames share one scale of colours."""
     exaggeration: float = 3.0
+    """Factor by which heights are drawn larger."""
     section: tuple[float, float] | None = (90.0, 0.0)
+    """Angle, degrees, and offset, mm, of the section line; None without one."""
 
 
 @dataclass(frozen=True)
 class SurfaceState:
-    """What the page shows of one frame.
-
-    Parameters
-    ----------
-    result
-        What the session holds of it; None if it was not measured by the scheme.
-    state
-        ``measured``, ``stale``, ``failed`` or ``unmeasured``.
-    words
-        The same for the operator; why, where there is no surface or it no longer stands.
-    provenance
-        Frame, scheme, version, time, and whether dots were corrected by hand.
-    sizes, errors
-        Lines of the tables; empty without a surface.
-    trials
-        The correspondences that were tried, and their errors.
-    verdict
-        How clearly one of them was chosen.
-    """
+    """What the page shows of one frame."""
 
     result: Result | None
+    """Its stored result; None if it was not measured by the scheme."""
     state: Literal["measured", "stale", "failed", "unmeasured"]
     words: str
+    """The result in words; where there is no surface or it is stale, the reason."""
     provenance: str = ""
+    """Frame, scheme, version, time, and whether dots were corrected by hand."""
     sizes: tuple[ResultRow, ...] = ()
     errors: tuple[ResultRow, ...] = ()
+    """Lines of the tables; empty without a surface."""
     trials: tuple[ResultRow, ...] = ()
+    """The correspondences that were tried, and their errors."""
     verdict: str = ""
+    """How clearly one of them was chosen."""
 
     @property
     def reconstruction(self) -> Reconstruction | None:
@@ -151,7 +128,7 @@ def shown(session: Session, frame: int) -> SurfaceState:
         scheme = SCHEMES[scheme_name(session.settings)].title
         return SurfaceState(None, "unmeasured", f"Frame {frame} is not measured by {scheme} yet.")
     measurement = result.measurement
-    told = SurfaceState(
+    return SurfaceState(
         result,
         *_state(result),
         provenance=provenance(result),
@@ -160,7 +137,6 @@ def shown(session: Session, frame: int) -> SurfaceState:
         trials=trial_rows(measurement.match),
         verdict=verdict(measurement.match),
     )
-    return told
 
 
 def _state(result: Result) -> tuple[Literal["measured", "stale", "failed"], str]:
@@ -212,8 +188,8 @@ def _sigma_words(measures: Measures, value: str, unit: str) -> str:
         return f"±: one σ, {HEIGHT_SIGMA_OF}"
     noise = np.sqrt(max(total**2 - np.nan_to_num(level) ** 2 - setup**2, 0.0))
     parts = (("noise", noise), ("level", level), ("set-up", setup))
-    told = ", ".join(f"{name} {part:.2g}" for name, part in parts)
-    return f"±: one σ, {SIGMA_OF} ({told} {unit})"
+    sizes = ", ".join(f"{name} {part:.2g}" for name, part in parts)
+    return f"±: one σ, {SIGMA_OF} ({sizes} {unit})"
 
 
 def error_rows(measures: Measures | None) -> tuple[ResultRow, ...]:
@@ -250,8 +226,8 @@ def verdict(match: Match | None) -> str:
     if not np.isfinite(match.margin):
         return f"{match.orientation}: no other correspondence has a surface."
     times = match.margin
-    told = f"{times:.0f}" if times >= 10 else f"{times:.1f}"
-    return f"{match.orientation}: the next best is off {told} times as far."
+    factor = f"{times:.0f}" if times >= 10 else f"{times:.1f}"
+    return f"{match.orientation}: the next best is off {factor} times as far."
 
 
 def rig_of(result: Result) -> Rig:

@@ -31,8 +31,8 @@ from PySide6.QtWidgets import (
 )
 
 from labapp.errors import InputError
-from labapp.export.drawing import Direction
 from labapp.export.heights import profile
+from labapp.export.rendering.drawing import Direction
 from labapp.gui.dialogs import ask_save
 from labapp.gui.pages.page import Page
 from labapp.gui.pages.surface.charts import DotsChart, PlanChart, ProfileChart
@@ -226,7 +226,7 @@ class SurfacePage(Page):
             self._show_surface()
 
     def leave(self) -> None:
-        """Stop comparing, drawing and steering; the measurement goes on."""
+        """Stop comparing, drawing and steering; the measurement continues."""
         self._rest.stop()
         self.steering.stop()
         self.compare.leave()
@@ -248,7 +248,7 @@ class SurfacePage(Page):
             self.write_picture(path)
 
     def write_picture(self, path: Path) -> None:
-        """Write the picture as PNG; a refusal is said."""
+        """Write the picture as PNG; a failure is reported."""
         path = path if path.suffix.lower() == ".png" else path.with_name(path.name + ".png")
         written = self.picture().save(str(path), "PNG")
         words = f"{path.name} is written" if written else f"{path} cannot be written"

@@ -33,57 +33,38 @@ SIGNALS = {"current": ("Current", "A"), "voltage": ("Voltage", "V")}
 
 @dataclass(frozen=True)
 class TrendOptions:
-    """What the operator wants to see.
-
-    Parameters
-    ----------
-    shown
-        Measures, and ``current``, ``voltage``.
-    without_doubtful
-        Whether frames in doubt are left out of statistics and spectrum.
-    spectrum_of
-        A measure; empty for no spectrum.
-    """
+    """What the operator wants to see."""
 
     shown: tuple[str, ...] = (*FIRST_SHOWN, *SIGNALS)
+    """Measures, and ``current``, ``voltage``."""
     without_doubtful: bool = False
+    """Whether frames in doubt are left out of statistics and spectrum."""
     spectrum_of: str = ""
+    """A measure; empty for no spectrum."""
 
 
 @dataclass(frozen=True)
 class TrendsState:
-    """What the page shows.
-
-    Parameters
-    ----------
-    curves, axis
-        Of the course over time; the axis holds all frames.
-    places
-        Where every frame is on the axis, by its number.
-    rows
-        Mean ± standard deviation, range, and ± of the mean where it has one: rows of a measure.
-    words
-        How many frames count, and why others do not.
-    setup_words
-        How far the set-up can be relied on; empty where it is not complete.
-    spectrum, spectrum_axis
-        Of the measure asked for; no curve where there is none.
-    spectrum_words
-        The strongest oscillation, or why there is no spectrum.
-    signals_words
-        Of current and voltage.
-    """
+    """What the page shows."""
 
     curves: tuple[Curve, ...]
     axis: Axis
+    """Of the course over time; the axis holds all frames."""
     places: dict[int, float]
+    """Where every frame is on the axis, by its number."""
     rows: tuple[ResultRow, ...]
+    """Mean ± standard deviation, range, and ± of the mean where it has one: rows of a measure."""
     words: str
+    """How many frames count, and why others do not."""
     setup_words: str
+    """How far the set-up can be relied on; empty where it is not complete."""
     spectrum: tuple[Curve, ...]
     spectrum_axis: Axis
+    """Spectrum of the chosen measure; no curve where there is none."""
     spectrum_words: str
+    """The strongest oscillation, or why there is no spectrum."""
     signals_words: str
+    """Of current and voltage."""
 
 
 def show(session: Session, options: TrendOptions, seen: Overview | None = None) -> TrendsState:
@@ -103,7 +84,7 @@ def show(session: Session, options: TrendOptions, seen: Overview | None = None) 
     if signals is not None and timed:
         curves += _signal_curves(signals, seen, options.shown)
     of = course_of(options.spectrum_of) if options.spectrum_of in BY_KEY else None
-    found, spectrum_axis, told = _spectrum(of, timed)
+    found, spectrum_axis, message = _spectrum(of, timed)
     return TrendsState(
         curves=tuple(curves),
         axis=axis,
@@ -115,7 +96,7 @@ def show(session: Session, options: TrendOptions, seen: Overview | None = None) 
         else setup_words(setup_status(session.setup.rig), session.setup.checked),
         spectrum=found,
         spectrum_axis=spectrum_axis,
-        spectrum_words=told,
+        spectrum_words=message,
         signals_words=_told_signals(signals, seen, timed),
     )
 
@@ -163,7 +144,7 @@ def _rows(course: Trend) -> tuple[ResultRow, ...]:
 
 def _counted(seen: Overview, course: Trend) -> str:
     total, has = len(seen.frame), len(course.frame)
-    told = [f"{int(course.counts.sum())} of {total} frames count"]
+    parts = [f"{int(course.counts.sum())} of {total} frames count"]
     unmeasured = seen.status.count("")
     reasons = (
         (unmeasured, "not measured yet"),
@@ -171,8 +152,8 @@ def _counted(seen: Overview, course: Trend) -> str:
         (int(course.stale.sum()), "no longer stand"),
         (int(course.doubtful.sum()), "stand out"),
     )
-    told += [f"{count} {words}" for count, words in reasons if count]
-    return ", ".join(told)
+    parts += [f"{count} {words}" for count, words in reasons if count]
+    return ", ".join(parts)
 
 
 def _spectrum(course: Trend | None, timed: bool) -> tuple[tuple[Curve, ...], Axis, str]:
@@ -221,13 +202,13 @@ def _told_signals(signals: Signals | None, seen: Overview, timed: bool) -> str:
     if signals is None:
         return "None. A table (CSV) with a time and a current or voltage can be shown along."
     ends = signals.time_s[[0, -1]] + signals.start_s
-    told = f"{signals.file}: {len(signals.time_s)} samples, {ends[0]:.3f} … {ends[1]:.3f} s"
+    message = f"{signals.file}: {len(signals.time_s)} samples, {ends[0]:.3f} … {ends[1]:.3f} s"
     if not timed:
-        return f"{told}. Not shown: the recording has no time base; import it with a frame rate."
+        return f"{message}. Not shown: the recording has no time base; import it with a frame rate."
     low, high = float(seen.time_s.min()), float(seen.time_s.max())
     if ends[1] < low or ends[0] > high:
         return (
-            f"{told}. None of it falls into the recording's {low:.3f} … {high:.3f} s: "
+            f"{message}. None of it falls into the recording's {low:.3f} … {high:.3f} s: "
             "say below when it starts."
         )
-    return told
+    return message

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from labapp.core.values import FloatArray, IntArray
-from labapp.export.scene import EMPTY, Scene
+from labapp.export.rendering.scene import EMPTY, Scene
 from labapp.system import IS_LINUX
 
 VIEW_ANGLE_DEG = 30.0
@@ -46,7 +46,7 @@ BESIDE_PX, ASIDE_PX = 110, 62
 """What the scale takes of a picture's width, and how far that moves the pool's middle."""
 
 USUAL_DPI = 72
-"""At it VTK draws texts as large as they are told to be."""
+"""At this resolution VTK draws texts at their nominal size."""
 
 FLAT = 1 / 8
 """Axes less high than this part of their width have one number upwards: more would overlap."""
@@ -75,7 +75,7 @@ class Drawing:
         A `pyvista.Plotter`; nothing but scenes is drawn in it.
     steady
         Whether axes stay while the next scene fills them well: they do not jump from frame to
-        frame, and new ones take long to draw. Else a picture does not tell what was there before.
+        frame, and new ones take long to draw. Else a picture does not depend on the scene before.
     """
 
     def __init__(self, plotter: Any, steady: bool = False) -> None:
@@ -250,8 +250,8 @@ class Drawing:
         mark = _polydata(top if scene.electrode else EMPTY, "lines", 2)
         self._put("electrode", mark, scene.foreground, line_width=1)
         high = scene.exaggeration
-        told = [f"heights drawn {high:g} times as high"] if high != 1 else []
-        words = "\n".join(told + ["upright line: the electrode's axis"] * scene.electrode)
+        parts = [f"heights drawn {high:g} times as high"] if high != 1 else []
+        words = "\n".join(parts + ["upright line: the electrode's axis"] * scene.electrode)
         self._set_text("caption", words, scene.foreground, **self._in_corner("upper_left"))
 
     def _in_corner(self, position: str) -> dict[str, Any]:
@@ -290,7 +290,7 @@ def _holds(box: FloatArray, other: FloatArray) -> bool:
 
 
 def _polydata(points: FloatArray, kind: str, length: int) -> Any:
-    """Points, or lines of so many points each, for VTK; None without points."""
+    """Points, or lines of a number of points each, for VTK; None without points."""
     import pyvista
 
     if not len(points):

@@ -20,8 +20,8 @@ import numpy.typing as npt
 from labapp.core.pipeline import Measurement
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.values import FloatArray
-from labapp.export.scene import scene_of
-from labapp.export.studio import draw_there, drawing_process
+from labapp.export.rendering.scene import scene_of
+from labapp.export.rendering.studio import draw_there, drawing_process
 from labapp.files import write_atomically
 
 ENLARGED = 3

@@ -13,8 +13,8 @@ from labapp.simulation.camera import CameraView
 from labapp.simulation.pools import Footprint, Oscillation, Pool, egg, spherical_cap
 from labapp.simulation.recording import TARGET
 from labapp.simulation.render import Look
-from labapp.simulation.samples.recording import Sample
 from labapp.simulation.torch import ConeTorch
+from tests.samples.recording import Sample
 
 WIDTH_MM, WIDTH_SIGMA_MM = 6.66, 0.15
 LENGTH_MM, LENGTH_SIGMA_MM = 7.45, 0.46
@@ -56,7 +56,7 @@ def gtaw() -> Sample:
 # A recorded run, simulated
 
 GTAW at 75 A and 3 mm/s with the set-up of §7.3 of the dissertation, 30 frames at
-{RUN_HZ:g} frames a second. No camera saw it: `python -m labapp.simulation.samples DIR`
+{RUN_HZ:g} frames a second. No camera saw it: `python -m tests.samples DIR`
 makes it from exact rays on a known pool, so that every measured figure can be held to the truth.
 
 {{files}}
@@ -97,7 +97,7 @@ height {TACK_HEIGHT_MM:g} mm, part of a sphere. It stands still: the {count} fra
 their noise alone,
 and each is the sum of 16 exposures of 8 bit. A picture stack has no time base, so `time_s` is
 empty. What the section does not say is chosen here: electrode 5 mm above the paper, O′ 45 mm to
-the left and 3 mm up. Made by `python -m labapp.simulation.samples DIR`.
+the left and 3 mm up. Made by `python -m tests.samples DIR`.
 
 {{files}}
 
@@ -155,7 +155,7 @@ def concave() -> Sample:
 A pool that is pressed down to a hollow 0.6 mm deep, as at high current: its reflection is turned
 round both ways (correspondence I/I: rows and columns of the dots run against those of the rays,
 Table 4-4). Six pictures cut out of a longer run, hence their numbers; pictures have no time base,
-so `time_s` is empty. Made by `python -m labapp.simulation.samples DIR`.
+so `time_s` is empty. Made by `python -m tests.samples DIR`.
 
 {files}
 
@@ -184,7 +184,7 @@ of the origin and
 {-BENT_MM[1]:g} mm behind it. So it hides the middle of the front rows and of the rear ones, and \
 with them
 a dot next to the absent centre dot: no hole in the rows is surely the reference any more. Made by
-`python -m labapp.simulation.samples DIR`.
+`python -m tests.samples DIR`.
 
 {{files}}
 

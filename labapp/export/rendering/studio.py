@@ -17,8 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from labapp.errors import InputError
-from labapp.export.drawing import Direction, Drawing, draw_without_display
-from labapp.export.scene import Scene
+from labapp.export.rendering.drawing import Direction, Drawing, draw_without_display
+from labapp.export.rendering.scene import Scene
 
 PICTURE_PX = (1280, 720)
 """Width and height of a picture by default."""

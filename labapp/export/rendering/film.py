@@ -24,8 +24,8 @@ from labapp.core.pipeline import Measurement
 from labapp.core.values import FloatArray, IntArray
 from labapp.errors import InputError
 from labapp.export.frame_result import FrameResult
-from labapp.export.scene import Scene, empty_scene, scene_of
-from labapp.export.studio import Picture, draw_there
+from labapp.export.rendering.scene import Scene, empty_scene, scene_of
+from labapp.export.rendering.studio import Picture, draw_there
 from labapp.files import atomic_file
 
 CODEC = "mpeg4"
@@ -33,16 +33,16 @@ QUALITY = 2
 """Of 1, the best, to 31."""
 
 TICKS_HZ = 60_000
-"""Times in a film are whole numbers of so many to a second; MPEG-4 has no more than 65535."""
+"""Ticks per second that times in a film are multiples of; MPEG-4 has no more than 65535."""
 
 UNTIMED_HZ = 10.0
 """Frames a second where the recording has no time base and nobody said otherwise."""
 
 AHEAD = 3
-"""So many pictures are drawn while one is being written."""
+"""Number of pictures drawn while one is being written."""
 
 LINE = 60
-"""Letters in a line of the words that stand for a surface."""
+"""Letters in a line of the text shown in place of a surface."""
 
 
 class Extent:
@@ -188,13 +188,13 @@ def write_video(path: Path, pictures: Iterable[Picture], times_s: FloatArray) ->
         rate = 1 / np.diff(times_s).min()
         most = f"at most {TICKS_HZ} frames/s: a film that is slower than the recording"
         raise InputError("export", "film_rate_hz", f"{rate:.6g}", most)
-    # Written through Python's file, that a full disk is told as such.
+    # Written through Python's file, so that a full disk is reported as such.
     with atomic_file(path) as part, part.open("wb") as file:
         container = av.open(file, "w", format="mp4")
         try:
             _encode(container, pictures, ticks)
         except BaseException:
-            with contextlib.suppress(FFmpegError, OSError):  # what failed first is told
+            with contextlib.suppress(FFmpegError, OSError):  # the first failure is reported
                 container.close()
             raise
         container.close()

@@ -27,63 +27,45 @@ SPACING_MM = 0.15
 HEIGHT = "height (mm)"
 
 SPOKES = 120
-"""About so many vertices a ring: its sides are within a thousandth of a pool's radius."""
+"""Approximate number of vertices a ring: its sides are within a thousandth of a pool's radius."""
 
 EMPTY = np.empty((0, 3))
 
 
 @dataclass(frozen=True)
 class Scene(ReadOnlyArrays):
-    """Content of a 3-D picture, mm, UCS; n vertices.
-
-    Parameters
-    ----------
-    vertices_mm, triangles
-        The surface, shapes (n, 3) and (k, 3).
-    values
-        What colours it, shape (n,).
-    label
-        What the values are, with their unit.
-    limits
-        The values at both ends of the colour scale.
-    diverging
-        Whether the colours run both ways from the middle.
-    points_mm
-        Reflection points, shape (p, 3).
-    lines_mm
-        Closed or open lines by name, each of shape (q, 3): ``boundary``, ``section``.
-    rays_mm
-        Both ends of rays by name, each of shape (r, 2, 3): ``incident``, ``reflected``.
-    electrode
-        Whether to mark the electrode's axis, X = Y = 0.
-    exaggeration
-        Heights are drawn so many times as high; the axes tell true ones.
-    within_mm
-        Places that the axes hold in any case, shape (k, 3): pictures of a film share them.
-    stamp
-        Said in the upper right corner.
-    notice
-        Said in the middle: why there is no surface.
-    foreground, background
-        Colours of texts and axes, and behind everything.
-    """
+    """Content of a 3-D picture, mm, UCS; n vertices."""
 
     vertices_mm: FloatArray
     triangles: IntArray
+    """The surface, shapes (n, 3) and (k, 3)."""
     values: FloatArray
+    """What colours it, shape (n,)."""
     label: str
+    """What the values are, with their unit."""
     limits: tuple[float, float]
+    """The values at both ends of the colour scale."""
     diverging: bool = False
+    """Whether the colours run both ways from the middle."""
     points_mm: FloatArray = field(default_factory=lambda: EMPTY)
+    """Reflection points, shape (p, 3)."""
     lines_mm: dict[str, FloatArray] = field(default_factory=dict)
+    """Closed or open lines by name, each of shape (q, 3): ``boundary``, ``section``."""
     rays_mm: dict[str, FloatArray] = field(default_factory=dict)
+    """Both ends of rays by name, each of shape (r, 2, 3): ``incident``, ``reflected``."""
     electrode: bool = True
+    """Whether to mark the electrode's axis, X = Y = 0."""
     exaggeration: float = EXAGGERATION
+    """Factor by which heights are drawn larger; the axes show true heights."""
     within_mm: FloatArray = field(default_factory=lambda: EMPTY)
+    """Places that the axes hold in any case, shape (k, 3): pictures of a film share them."""
     stamp: str = ""
+    """Said in the upper right corner."""
     notice: str = ""
+    """Said in the middle: why there is no surface."""
     foreground: str = "#202020"
     background: str = "#ffffff"
+    """Colours of texts and axes, and behind everything."""
 
 
 def scene_of(
