@@ -13,9 +13,9 @@ from labapp.config.line_setup import read_line_setup
 from labapp.config.setup import read_setup
 from labapp.errors import InputError
 from labapp.simulation.camera import CameraView
+from labapp.simulation.line_frames import LineLook, render_lines
 from labapp.simulation.pools import spherical_cap
 from tests.conftest import Run
-from labapp.simulation.line_frames import LineLook, render_lines
 
 SETUP = """
 [laser]

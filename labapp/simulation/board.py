@@ -31,6 +31,32 @@ class PrintedBoard:
 
     board: Board
 
+    def inked(self, plane_mm: FloatArray) -> BoolArray:
+        """Whether points (X′, Z′), shape (…, 2), mm, are black, shape (…)."""
+        board = self.board
+        place = np.asarray(plane_mm, float) / board.square_mm
+        column = np.floor(place[..., 0]).astype(int) + 1
+        row = board.rows - 2 - np.floor(place[..., 1]).astype(int)
+        on = (column >= 0) & (column < board.columns) & (row >= 0) & (row < board.rows)
+        ink = on & ((row + column) % 2 == 0)
+        if board.kind == "chessboard":
+            return np.asarray(ink)
+        # Where in its square a point is, from its upper left corner, in cells of the marker.
+        x, y = np.mod(place[..., 0], 1.0), 1.0 - np.mod(place[..., 1], 1.0)
+        rim = (1.0 - board.marker_mm / board.square_mm) / 2.0
+        cell = [
+            np.floor((along - rim) / (1.0 - 2.0 * rim) * MARKER_CELLS).astype(int)
+            for along in (x, y)
+        ]
+        in_marker = on & ~ink & (np.minimum(*cell) >= 0) & (np.maximum(*cell) < MARKER_CELLS)
+        number = self._numbers[
+            np.clip(row, 0, board.rows - 1), np.clip(column, 0, board.columns - 1)
+        ]
+        safe = (np.clip(part, 0, MARKER_CELLS - 1) for part in cell)
+        at_x, at_y = safe
+        black = self._markers[np.maximum(number, 0), at_y, at_x]
+        return np.asarray(ink | (in_marker & black))
+
     def rectangles_mm(self) -> FloatArray:
         """All that is black as (X′ from, Z′ from, X′ to, Z′ to), shape (m, 4), mm."""
         board, edge = self.board, self.board.square_mm

@@ -8,13 +8,22 @@ are at (5.5, 0) and (0, 2.5), the points of Eq. 5-6.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from labapp.core.values import BoolArray, FloatArray
-from labapp.simulation.camera import CameraView
+from labapp.simulation.camera import CameraView, PosedView
 from labapp.simulation.render import GreyImage
+
+
+class Print(Protocol):
+    """What is printed on the imaging plane, or on a board in its place."""
+
+    def inked(self, plane_mm: FloatArray) -> BoolArray:
+        """Whether points (X′, Z′), shape (…, 2), mm, are black, shape (…)."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -88,7 +97,7 @@ class TargetLook:
 
 
 def render_target(
-    target: Target, view: CameraView, look: TargetLook, rng: np.random.Generator
+    target: Print, view: CameraView | PosedView, look: TargetLook, rng: np.random.Generator
 ) -> GreyImage:
     """Render the calibration picture, shape (height, width), grey levels."""
     fine = 4

@@ -23,10 +23,10 @@ from labapp.core.sequence.line_frame import LineFrame, LineMeasureSettings, meas
 from labapp.core.sequence.line_states import LineSeries, line_changes, line_states
 from labapp.core.sequence.line_track import track_line
 from labapp.simulation.camera import CameraView
-from labapp.simulation.pools import Pool, egg
 from labapp.simulation.line_frames import LineFrame as TrueFrame
 from labapp.simulation.line_frames import LineLook, render_lines
 from labapp.simulation.line_runs import GmawLook, gmaw_run, penetration_run
+from labapp.simulation.pools import Pool, egg
 
 RIG = LineRig(
     Laser(27.0, 90.0),

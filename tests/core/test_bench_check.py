@@ -22,12 +22,12 @@ from labapp.core.geometry.uncertainty import INDEX, QUANTITIES
 from labapp.core.matching.observation import Observation
 from labapp.core.values import CannotMeasure
 from labapp.errors import InputError
+from labapp.simulation.benches import BenchErrors, SimulatedBench, draw_bench
 from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import PoolSurface, trace
+from labapp.simulation.mirrors import BallMirror, FlatMirror
 from labapp.simulation.pools import spherical_cap
 from tests.scenes import as_dots
-from labapp.simulation.benches import BenchErrors, SimulatedBench, draw_bench
-from labapp.simulation.mirrors import BallMirror, FlatMirror
 
 SHAPE = (640, 480)
 VIEW = CameraView.rolled((0.74, 558.26), 4.7)

@@ -13,9 +13,9 @@ from labapp.core.calibration.imaging_plane import calibrate_imaging_plane
 from labapp.core.calibration.lens_fit import PlaneView, fit_lens, fit_terms
 from labapp.core.calibration.plane_calibration import PlaneCalibration, PlaneCalibrationSettings
 from labapp.core.values import CannotMeasure
-from labapp.simulation.camera import Lens
+from labapp.simulation.board import PrintedBoard
+from labapp.simulation.camera import Lens, PosedView
 from labapp.simulation.target import Target, TargetLook, render_target
-from labapp.simulation.posed_view import InkedBoard, PosedView
 
 pytestmark = pytest.mark.slow
 
@@ -39,7 +39,7 @@ def shot(
         tuple(middle), px_per_mm, turned_deg=turned, lens=lens(percent), axis_px=axis
     )
     look = TargetLook()
-    return view, render_target(InkedBoard(board), view, look, np.random.default_rng(seed))
+    return view, render_target(PrintedBoard(board), view, look, np.random.default_rng(seed))
 
 
 def off_mm(found: BoardCalibration, view: PosedView) -> np.ndarray:

@@ -16,8 +16,8 @@ from labapp.core.surface.line_model import LineData, LineModel
 from labapp.core.surface.spline import SplineBasis
 from labapp.core.values import CannotMeasure
 from labapp.simulation.camera import CameraView
-from labapp.simulation.pools import Pool, spherical_cap
 from labapp.simulation.line_frames import LineFrame, LineLook, render_lines
+from labapp.simulation.pools import Pool, spherical_cap
 
 RIG = LineRig(
     Laser(27.0, 90.0),

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from labapp.core.calibration.boards import BOARDS
-from labapp.simulation.board import board_pdf, board_svg
-from labapp.simulation.posed_view import InkedBoard
+from labapp.simulation.board import PrintedBoard, board_pdf, board_svg
 
 TARGETS = Path(__file__).parents[2] / "resources" / "targets"
 SVG = "{http://www.w3.org/2000/svg}"
@@ -20,7 +19,7 @@ every_board = pytest.mark.parametrize("board", BOARDS.values(), ids=BOARDS)
 
 @every_board
 def test_rectangles_are_what_is_inked(board):
-    printed = InkedBoard(board)
+    printed = PrintedBoard(board)
     rectangles = printed.rectangles_mm()
     rng = np.random.default_rng(4)
     places = rng.uniform(-20, 200, (4000, 2))
@@ -32,7 +31,7 @@ def test_rectangles_are_what_is_inked(board):
 @every_board
 def test_svg_has_the_board_at_true_size(board):
     root = ET.fromstring(board_svg(board))
-    width, height = InkedBoard(board).plate_mm
+    width, height = PrintedBoard(board).plate_mm
     assert (root.get("width"), root.get("height")) == (f"{width:g}mm", f"{height:g}mm")
     squares = [
         (float(rect.get("width")), float(rect.get("x")), float(rect.get("y")))
@@ -40,7 +39,7 @@ def test_svg_has_the_board_at_true_size(board):
         if float(rect.get("width")) == float(rect.get("height")) == board.square_mm
     ]
     assert len(squares) == -(-board.columns * board.rows // 2)
-    x, z = InkedBoard(board).origin_mm
+    x, z = PrintedBoard(board).origin_mm
     # The square to the lower left of O′: black where columns and rows are both even, or both odd.
     lower_left = (board.square_mm, x - board.square_mm, height - z)
     upper_left = (board.square_mm, x - board.square_mm, height - z - board.square_mm)
@@ -50,6 +49,6 @@ def test_svg_has_the_board_at_true_size(board):
 @every_board
 def test_committed_boards_are_these(board):
     assert (TARGETS / f"{board.name}.svg").read_text("utf-8") == board_svg(board)
-    pdf, width = (TARGETS / f"{board.name}.pdf").read_bytes(), InkedBoard(board).plate_mm[0]
+    pdf, width = (TARGETS / f"{board.name}.pdf").read_bytes(), PrintedBoard(board).plate_mm[0]
     assert f"/MediaBox [ 0 0 {width * 72 / 25.4:.6g}"[:20].encode() in pdf
     assert board_pdf(board)[:5] == pdf[:5] == b"%PDF-"

@@ -15,8 +15,8 @@ from labapp.session.copies import copy_sample
 from labapp.session.samples import sample_folder
 from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import trace
-from labapp.simulation.render import Look, render
 from labapp.simulation.mirrors import FlatMirror
+from labapp.simulation.render import Look, render
 
 CROSS_MM = (4.65, 6.23, 2.75)
 """l₁, l₂, l₃ that the laser of the sample draws with a fan angle of 10°."""

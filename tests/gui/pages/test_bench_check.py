@@ -32,9 +32,9 @@ from labapp.media import GreyImage
 from labapp.session.session import Session
 from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import trace
+from labapp.simulation.mirrors import FlatMirror
 from labapp.simulation.render import Look, render
 from tests.gui.conftest import KEPT
-from labapp.simulation.mirrors import FlatMirror
 
 SETUP = Path(__file__).parents[3] / "sample_sessions" / "gtaw" / "setup.toml"
 

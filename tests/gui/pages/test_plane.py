@@ -23,11 +23,10 @@ from labapp.gui.pages.plane import PlanePage, presenter
 from labapp.gui.shell.steps import calibrations_in_use, states
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
-from labapp.simulation.board import board_svg
-from labapp.simulation.camera import Lens
+from labapp.simulation.board import PrintedBoard, board_svg
+from labapp.simulation.camera import Lens, PosedView
 from labapp.simulation.target import Target, TargetLook, render_target, target_svg
 from tests.gui.conftest import KEPT
-from labapp.simulation.posed_view import InkedBoard, PosedView
 
 GTAW = Path(__file__).parents[3] / "sample_sessions" / "gtaw"
 
@@ -311,7 +310,7 @@ def test_every_button_says_what_it_does(page: PlanePage) -> None:
 def board_picture(path: Path) -> Path:
     """Picture of a board by a lens that distorts by 1 %."""
     view = PosedView.at((40.0, 36.0), 5.0, turned_deg=(1, -2, 1.3), lens=Lens(1000.0, k1=-0.06))
-    printed, rng = InkedBoard(BOARDS["charuco_4_inch"]), np.random.default_rng(1)
+    printed, rng = PrintedBoard(BOARDS["charuco_4_inch"]), np.random.default_rng(1)
     cv2.imwrite(str(path), render_target(printed, view, TargetLook(), rng))
     return path
 
