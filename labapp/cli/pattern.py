@@ -8,8 +8,9 @@ from typing import Annotated
 import typer
 
 from labapp.cli.bench import mirror_picture
-from labapp.cli.shared import NOTHING_MEASURED, write_file
+from labapp.cli.shared import NOTHING_MEASURED
 from labapp.errors import InputError
+from labapp.files import write_file
 
 CONTRADICTING = 3.0
 """Pictures that differ by so many times what the dots' noise allows contradict each other."""
