@@ -190,7 +190,7 @@ def decide(observed: Observation, found: list[Hypothesis], settings: MatchSettin
     best = _without(observed, best, doubtful, fit)
     for _ in range(MOST_LEFT_OUT):
         best = _settled(observed, best, fit)
-        wrong = unsupported(observed, _fitted_labels(observed, best, fit))
+        wrong = unsupported(observed, fitted_labels(observed, best, fit))
         if len(wrong) == 0:
             break
         best = _without(observed, best, wrong, fit)
@@ -217,7 +217,7 @@ def _settled(observed: Observation, best: Hypothesis, fit: FitSettings) -> Hypot
         return best
 
 
-def _fitted_labels(observed: Observation, best: Hypothesis, fit: FitSettings) -> FittedLabels:
+def fitted_labels(observed: Observation, best: Hypothesis, fit: FitSettings) -> FittedLabels:
     """The hypothesis's labels and surface, as `unsupported` takes them."""
     basis, paths = best.pool.surface.basis, paths_of(observed, best.pool)
     missed = np.ravel_multi_index(tuple(best.missed_rays.T), best.labels.shape)

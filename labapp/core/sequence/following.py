@@ -17,19 +17,11 @@ import numpy as np
 
 from labapp.core.images import dot_kernels
 from labapp.core.match import Trial, missing_share
-from labapp.core.matching import match_kernels
 from labapp.core.matching.correspondence import match_of_pairs
 from labapp.core.matching.decision import MatchSettings
 from labapp.core.matching.observation import UNLABELLED, Observation, amid, count_labels, widened
 from labapp.core.matching.outliers import MOST_LEFT_OUT, FittedLabels, unsupported
-from labapp.core.matching.prediction import (
-    GATE_SIGMA2,
-    MODEL_ERROR_MM,
-    RIVAL_MARGIN,
-    SIGMA_INFLATION,
-    RayPaths,
-    covariance_of_dots,
-)
+from labapp.core.matching.prediction import RayPaths, covariance_of_dots, sure_pairs
 from labapp.core.matching.ray_classes import RayClasses, certain_witness, classify_rays
 from labapp.core.schemes.fit import LEAST_DOTS, UNSETTLED_MM
 from labapp.core.sequence.prior import MOST_ROUNDS, SETTLED_MM, Followed, Prior, predictions
@@ -332,8 +324,7 @@ def _tracked(
 def _widened(fit: _Fit) -> IntArray:
     """Labels that the fitted surface supports, and new ones beside them that it makes sure of.
 
-    A new label stands where it is likelier by far than any other ray for the dot, and any other
-    dot for the ray (`label_growth`), with what the prediction is uncertain by.
+    A new label is one of `sure_pairs`, as where labels grow without a prior (`label_growth`).
     """
     observed, paths, lit = fit.observed, fit.paths(), fit.labels != UNLABELLED
     known = np.isfinite(paths.plane_mm[:, 0])
@@ -352,17 +343,11 @@ def _widened(fit: _Fit) -> IntArray:
         near = looked_for[np.unique(np.argsort(apart, axis=0)[:RIVALS])]
         apart = _apart_mm(paths.plane_mm[near], observed.plane_mm)
         dots = np.union1d(free, np.argsort(apart, axis=1)[:, : RIVALS + 1])
-        spread = SIGMA_INFLATION**2 * fit.covariance_of(paths, near) + MODEL_ERROR_MM**2 * np.eye(2)
-        seen = observed.plane_mm[dots], observed.covariance_mm2[dots]
-        distance, cost = match_kernels.pair_deviances(*seen, paths.plane_mm[near], spread)
-        for dot in np.searchsorted(dots, free).tolist():
-            best = int(np.argmin(cost[dot]))
-            ray = int(near[best])
-            rivals = np.delete(cost[dot], best), np.delete(cost[:, best], dot)
-            clear = all(len(r) == 0 or r.min() > cost[dot, best] + RIVAL_MARGIN for r in rivals)
-            may = beside.ravel()[ray] and next_mm[ray] > observed.resolution_mm
-            if clear and may and distance[dot, best] < GATE_SIGMA2:
-                labels[ray] = dots[dot]
+        covariance = fit.covariance_of(paths, near)
+        dot, ray = sure_pairs(observed, dots, paths.plane_mm[near], covariance)
+        ray = near[ray]
+        may = beside.ravel()[ray] & (next_mm[ray] > observed.resolution_mm) & is_free[dot]
+        labels[ray[may]] = dot[may]
     return labels.reshape(lit.shape)
 
 
