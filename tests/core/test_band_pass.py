@@ -149,6 +149,18 @@ def test_dots_close_together_do_not_pull_at_each_other() -> None:
     assert np.abs(offsets(dots.image_px, places)).max() < 0.15
 
 
+def test_a_faint_dot_beside_a_bright_one_does_not_end_on_that() -> None:
+    """Its window moved on from where it had come, 7 px in all."""
+    bright, faint = np.array([120.0, 120.0]), np.array([128.0, 117.6])
+    others = np.array([[60.0, 60.0], [250.0, 60.0], [60.0, 180.0], [250.0, 180.0], [200.0, 120.0]])
+    frame = draw(np.vstack([others, bright]), 2.6, 60.0) + draw(faint[None], 2.6, 26.0)
+    frame += np.random.default_rng(5).normal(30.0, 0.5, SHAPE)
+    dots = band_pass_dots(frame, BandPassSettings())
+    assert len(dots) == 7
+    away = np.linalg.norm(dots.image_px - bright, axis=-1)
+    assert np.sum(away < np.linalg.norm(bright - faint) / 2) == 1
+
+
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
 def test_the_type_of_the_frame_does_not_matter(dtype: type) -> None:
     frame = draw(grid(), 2.0, 60.0) + np.random.default_rng(6).normal(40.0, 2.0, SHAPE)

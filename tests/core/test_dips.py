@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from labapp.core.geometry.bench import Bench
-from labapp.core.matching.hypothesis import Hypothesis, contested, evaluate, shifted_labels
+from labapp.core.matching.hypothesis import Hypothesis, evaluate, shifted_labels
 from labapp.core.matching.observation import UNLABELLED, Observation
 from labapp.core.schemes import fit
 from labapp.core.schemes.fit import FitSettings
@@ -103,24 +103,6 @@ def test_a_marker_that_is_not_amid_labelled_rays_is_unknown() -> None:
     apart[: BENCH_RIG.pattern.marker[0]] = UNLABELLED
     apart[:, : BENCH_RIG.pattern.marker[1]] = UNLABELLED
     assert weighed(observed, apart).marker == "unknown"
-
-
-def test_labels_next_to_a_dot_without_a_ray_are_in_doubt() -> None:
-    _, seen = draw(SHIFTED)
-    observed, labels = observation_of(seen)
-    assert len(contested(observed, weighed(observed, labels))) == 0
-    # A false dot beside a true one may be the right one.
-    dot = int(labels[labels != UNLABELLED][20])
-    nearest = np.sort(np.linalg.norm(observed.plane_mm - observed.plane_mm[dot], axis=-1))[1]
-    beside = observed.plane_mm[dot] + [0.2 * nearest, 0.0]
-    crowded = Observation(
-        np.vstack([observed.plane_mm, beside]),
-        np.concatenate([observed.covariance_mm2, observed.covariance_mm2[dot][None]]),
-        np.append(observed.size_mm, observed.size_mm[dot]),
-        observed.bench,
-        observed.frame_shape,
-    )
-    assert contested(crowded, weighed(crowded, labels)).tolist() == [dot]
 
 
 OUT_OF_VIEW = 41110

@@ -296,7 +296,7 @@ class _BandPassed:
     ) -> tuple[FloatArray, FloatArray]:
         """Centroids, (u, v), and moments of the light over its surroundings.
 
-        A dot is in the middle of the square that is weighed, wherever its peak is.
+        Windows move for a few steps only: beside a brighter dot they would move on to that.
         """
         from labapp.core.images import centroid_kernels
 
@@ -309,17 +309,7 @@ class _BandPassed:
         (x, y), moment = centroid_kernels.centroids(
             picture, around, taps, u, v, margin, width, reach
         )
-        off = np.flatnonzero(np.maximum(np.abs(x), np.abs(y)) > 0.5)
-        place = np.stack([u + x, v + y])
-        if len(off):
-            height, wide = picture.shape
-            u = np.clip(np.rint(place[0, off]), 0, wide - 1).astype(np.int64)
-            v = np.clip(np.rint(place[1, off]), 0, height - 1).astype(np.int64)
-            (x, y), moment[off] = centroid_kernels.centroids(
-                picture, around, taps, u, v, margin, width[off], reach
-            )
-            place[:, off] = u + x, v + y
-        return place, moment
+        return np.stack([u + x, v + y]), moment
 
 
 def widen(image: Grey, into: Grey, variance_px2: float) -> None:

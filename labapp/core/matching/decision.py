@@ -18,9 +18,9 @@ from labapp.core.matching.hypothesis import (
     STRAY_COST,
     USUAL_KNOTS,
     Hypothesis,
-    contested,
     evaluate,
     grow_and_evaluate,
+    paths_of,
     reoriented_labels,
     rough_costs,
     shifted_labels,
@@ -28,8 +28,9 @@ from labapp.core.matching.hypothesis import (
     without_false_ends,
 )
 from labapp.core.matching.observation import QUICK, UNLABELLED, Observation, try_fit
-from labapp.core.matching.outliers import unsupported
+from labapp.core.matching.outliers import MOST_LEFT_OUT, FittedLabels, unsupported
 from labapp.core.matching.prediction import covariance_of_dots
+from labapp.core.matching.ray_classes import RayClasses
 from labapp.core.surface.pool_fit import FitSettings, FittedPool
 from labapp.core.values import CannotMeasure, IntArray, median
 
@@ -165,7 +166,7 @@ def decide(observed: Observation, found: list[Hypothesis], settings: MatchSettin
         raise CannotMeasure(
             "no-reference", "the absent centre dot is not amid dots that have their ray"
         )
-    doubtful: list[int] = [*contested(observed, best), *_unsupported(observed, best, fit)]
+    doubtful: list[int] = []
     others = (
         reoriented_labels(observed, best.labels, own, way)
         for way in settings.orientations
@@ -186,20 +187,48 @@ def decide(observed: Observation, found: list[Hypothesis], settings: MatchSettin
             raise CannotMeasure(
                 "ambiguous-rows", "several holes in the rows can be the absent centre dot"
             )
-    if doubtful:
-        certain = np.where(np.isin(best.labels, doubtful), UNLABELLED, best.labels)
-        witness = np.where(certain == best.labels, best.witness, 0)
-        best = replace(evaluate(observed, certain, fit, initial=best.pool) or best, witness=witness)
+    best = _without(observed, best, doubtful, fit)
+    for _ in range(MOST_LEFT_OUT):
+        best = _settled(observed, best, fit)
+        wrong = unsupported(observed, fitted_labels(observed, best, fit))
+        if len(wrong) == 0:
+            break
+        best = _without(observed, best, wrong, fit)
     return best
 
 
-def _unsupported(observed: Observation, best: Hypothesis, fit: FitSettings) -> IntArray:
-    """Labelled dots that the hypothesis's surface does not support (`outliers.unsupported`)."""
-    pool, dot = best.pool, best.labels[best.labels != UNLABELLED]
-    plane = observed.plane_mm[dot] + pool.residual_mm
-    at = observed.rig, pool.surface.basis, pool.factor, pool.points_mm, plane
-    made = pool.residual_mm, covariance_of_dots(*at), fit.floor_mm
-    return unsupported(observed, best.labels, *made)
+def _without(
+    observed: Observation, best: Hypothesis, dots: IntArray | list[int], fit: FitSettings
+) -> Hypothesis:
+    """The hypothesis without the labels of some dots, whose rays say nothing of the boundary."""
+    certain = np.where(np.isin(best.labels, dots), UNLABELLED, best.labels)
+    if (certain == best.labels).all():
+        return best
+    witness = np.where(certain == best.labels, best.witness, 0)
+    return replace(evaluate(observed, certain, fit, initial=best.pool) or best, witness=witness)
+
+
+def _settled(observed: Observation, best: Hypothesis, fit: FitSettings) -> Hypothesis:
+    """The hypothesis with its fit run on, as far as that of a reconstruction."""
+    fit = replace(fit, settled_mm=FitSettings().settled_mm)
+    try:
+        return replace(best, pool=observed.fit(best.labels, best.witness, fit, best.pool))
+    except CannotMeasure:
+        return best
+
+
+def fitted_labels(observed: Observation, best: Hypothesis, fit: FitSettings) -> FittedLabels:
+    """The hypothesis's labels and surface, as `unsupported` takes them."""
+    basis, paths = best.pool.surface.basis, paths_of(observed, best.pool)
+    missed = np.ravel_multi_index(tuple(best.missed_rays.T), best.labels.shape)
+    classes = RayClasses(best.witness, missed, best.stray_dots)
+    rays = np.union1d(np.flatnonzero(best.labels != UNLABELLED), missed)
+    rays = rays[np.isfinite(paths.plane_mm[rays, 0])]
+    at = best.pool.factor, paths.points_mm[rays], paths.plane_mm[rays]
+    covariance = np.full((best.labels.size, 2, 2), np.nan)
+    covariance[rays] = covariance_of_dots(observed.rig, basis, *at)
+    how = fit.floor_mm, best.pool.unsettled_mm
+    return FittedLabels(best.labels, basis, best.pool.level, paths, covariance, classes, *how)
 
 
 def _cheapest(

@@ -12,7 +12,6 @@ from itertools import product
 from typing import Literal
 
 import numpy as np
-import scipy
 
 from labapp.core.match import Orientation, ways
 from labapp.core.matching.label_growth import grow_labels
@@ -36,7 +35,7 @@ from labapp.core.matching.ray_classes import RayClasses, classify_rays
 from labapp.core.rows.lattice import Lattice, Site
 from labapp.core.surface.level import Level
 from labapp.core.surface.pool_fit import FitSettings, FittedPool
-from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, median
+from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray
 
 KNOT_ERROR_MM = 0.045
 """How far dots may be off the right surface, mm, because its knots cannot follow a dent."""
@@ -74,9 +73,6 @@ MARKER_SPACINGS = 1 / 3
 
 AGREED = 0.8
 """Such a share of a hypothesis's dots in the grid must agree with it on where its rays are."""
-
-CONTESTED_SPACINGS = 0.5
-"""A label is in doubt where a rival is nearer than this, in spacings of the dots."""
 
 
 @dataclass(frozen=True)
@@ -169,34 +165,10 @@ def _outside(observed: Observation, hypothesis: Hypothesis) -> IntArray:
     at = np.argwhere(hypothesis.labels != UNLABELLED)
     x, y = observed.landing_mm[at[:, 0], at[:, 1], :2].T
     height, slope = hypothesis.pool.surface.height_and_gradient(x, y)
-    far = landing_rises(height, slope, y, hypothesis.pool.level, observed.spacing_mm)[1]
-    return np.asarray(at[far])
-
-
-def landing_rises(
-    height: FloatArray, slope: FloatArray, y: FloatArray, level: Level, spacing_mm: FloatArray
-) -> tuple[FloatArray, BoolArray]:
-    """How far within the boundary rays land, and whether that is far beyond it.
-
-    Parameters
-    ----------
-    height, slope
-        Of the surface where n rays would land on z = 0: shape (n,), mm, and gradients, (n, 2).
-    y
-        Where they would land along Y, shape (n,), mm.
-    level
-        Where z = 0 lies.
-    spacing_mm
-        Distance between neighbouring landing points along X and along Y, shape (2,), mm.
-
-    Returns
-    -------
-    inward_mm, far
-        Height over the boundary's on the pool's side, shape (n,), mm; whether a ray lands by
-        `BEYOND_SPACINGS` outside, shape (n,).
-    """
+    level = hypothesis.pool.level
     inward = level.sign * (height - level.rear.height(y))
-    return inward, inward < -BEYOND_SPACINGS * np.linalg.norm(slope * spacing_mm, axis=-1)
+    far = inward < -BEYOND_SPACINGS * np.linalg.norm(slope * observed.spacing_mm, axis=-1)
+    return np.asarray(at[far])
 
 
 def evaluate(
@@ -278,26 +250,6 @@ def _marker_state(observed: Observation, lit: BoolArray, pool: FittedPool) -> Ma
     if np.linalg.norm(observed.plane_mm - place, axis=-1).min() < spacing * MARKER_SPACINGS:
         return "lit"
     return "dark" if amid(lit)[at] else "unknown"
-
-
-def contested(observed: Observation, hypothesis: Hypothesis) -> IntArray:
-    """Return the labelled dots next to a dot without a ray, or to where a ray lacks its dot.
-
-    Either may be the right pair there. Indices of dots.
-    """
-    labels = hypothesis.labels
-    dots = labels[labels != UNLABELLED]
-    rivals = np.concatenate([hypothesis.missed_mm, observed.plane_mm[hypothesis.stray_dots]])
-    if len(rivals) == 0 or len(dots) < 2:
-        return np.zeros(0, np.int64)
-    spacing = median(
-        scipy.spatial.cKDTree(observed.plane_mm[dots]).query(observed.plane_mm[dots], k=2)[0][:, 1]
-    )
-    near = (
-        scipy.spatial.cKDTree(rivals).query(observed.plane_mm[dots])[0]
-        < CONTESTED_SPACINGS * spacing
-    )
-    return np.asarray(dots[near])
 
 
 def without_false_ends(

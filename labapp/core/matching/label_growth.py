@@ -22,13 +22,7 @@ from labapp.core.matching.observation import (
     try_fit,
     within_rings,
 )
-from labapp.core.matching.prediction import (
-    GATE_SIGMA2,
-    RIVAL_MARGIN,
-    false_dot_deviance,
-    pair_deviances,
-    predict,
-)
+from labapp.core.matching.prediction import predict, sure_pairs
 from labapp.core.surface.pool_fit import FitSettings, FittedPool
 from labapp.core.values import IntArray, median
 
@@ -112,25 +106,18 @@ def _settled(observed: Observation, labels: IntArray, settings: FitSettings) -> 
 def _matched(observed: Observation, pool: FittedPool, labels: IntArray) -> IntArray:
     """Labels for dots that one ray alone can have made, and rays that made one dot alone.
 
-    Likelihoods are those of `pair_deviances`. Rays a ring farther out
-    than any that is given a dot stand as rivals: where the prediction is so uncertain that the
-    dots of the next row but one come into question, nobody gets them.
+    Likelihoods are those of `sure_pairs`. Rays a ring farther out than any that is given a dot
+    stand as rivals: where the prediction is so uncertain that the dots of the next row but one come
+    into question, nobody gets them.
     """
-    from labapp.core.matching import match_kernels
-
     matched = np.full(labels.shape, UNLABELLED, np.int64)
     far = predict(observed, pool, within_rings(labels, 2))
     if len(far.at) == 0:
         return matched
-    distance, deviance = pair_deviances(observed, pool, far, np.arange(len(observed.plane_mm)))
-    ray, next_ray, best_dot, next_dot = match_kernels.two_least(deviance)
-    dot = np.arange(len(ray))
-    least = deviance[dot, ray]
-    taken = (best_dot[ray] == dot) & (distance[dot, ray] < GATE_SIGMA2)
-    taken &= least + RIVAL_MARGIN < np.minimum(next_ray, next_dot[ray])
-    taken &= least + RIVAL_MARGIN < false_dot_deviance()
+    dots, covariance = np.arange(len(observed.plane_mm)), far.covariance_mm2(pool, observed.rig)
+    dot, ray = sure_pairs(observed, dots, far.plane_mm, covariance)
     at = far.at[ray]
-    taken &= within_rings(labels, 1)[at[:, 0], at[:, 1]] & ~observed.absent[at[:, 0], at[:, 1]]
+    taken = within_rings(labels, 1)[at[:, 0], at[:, 1]] & ~observed.absent[at[:, 0], at[:, 1]]
     # Dots that run into each other have no place of their own.
     taken &= far.spacing_mm[ray] > observed.resolution_mm
     matched[at[taken, 0], at[taken, 1]] = dot[taken]

@@ -39,6 +39,39 @@ def pair_deviances(
     return distance, deviance
 
 
+@compiled(_f2, _f3, _f3, types.float64, types.float64)
+def left_out(
+    residual: FloatArray, dot: FloatArray, computed: FloatArray, unsettled: float, most: float
+) -> tuple[FloatArray, FloatArray]:
+    """Residuals of n dots to fits without each of them, and the covariance of these predictions.
+
+    Residuals to the fit with all have shape (n, 2), covariances of dots and of what the fit
+    computes for them (n, 2, 2). Residuals are off by ``unsettled``, a standard deviation, where the
+    fit has not converged. A dot draws the fit to itself by no larger a share than ``most``.
+    """
+    off, spread = np.empty((len(residual), 2)), np.empty((len(residual), 2, 2))
+    for n in range(len(residual)):
+        a, b, c = dot[n, 0, 0], dot[n, 0, 1], dot[n, 1, 1]
+        share = most
+        for _ in range(100):  # what the fit computes may be of a round before
+            xx, xy = a - share * computed[n, 0, 0], b - share * computed[n, 0, 1]
+            yy = c - share * computed[n, 1, 1]
+            area = xx * yy - xy * xy
+            if xx > 0.0 and area > (1.0 - most) ** 2 * (a * c - b * b):
+                break
+            share *= 0.98
+        # What the dot's covariance is times the inverse of that of its residual.
+        p, q = (a * yy - b * xy) / area, (b * xx - a * xy) / area
+        r, s = (b * yy - c * xy) / area, (c * xx - b * xy) / area
+        x, y = residual[n, 0], residual[n, 1]
+        off[n, 0], off[n, 1] = p * x + q * y, r * x + s * y
+        rest = unsettled * unsettled
+        spread[n, 0, 0] = p * a + q * b - a + rest * (p * p + q * q)
+        spread[n, 1, 1] = r * b + s * c - c + rest * (r * r + s * s)
+        spread[n, 0, 1] = spread[n, 1, 0] = p * b + q * c - b + rest * (p * r + q * s)
+    return off, spread
+
+
 @compiled(_f2, _f2, _f2, _f2, _f2)
 def within_view(
     places: FloatArray,

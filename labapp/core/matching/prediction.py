@@ -159,6 +159,40 @@ def predict(observed: Observation, pool: FittedPool, where: BoolArray) -> Predic
     return Prediction(at, points, slopes, plane, dot_kernels.next_apart(plane))
 
 
+def sure_pairs(
+    observed: Observation, dots: IntArray, plane_mm: FloatArray, covariance_mm2: FloatArray
+) -> tuple[IntArray, IntArray]:
+    """Pairs of a dot that one ray alone can have made and the ray that can have made it alone.
+
+    The ray is likelier by `RIVAL_MARGIN` than any other for the dot, the dot than any other for
+    the ray, and both than a false dot.
+
+    Parameters
+    ----------
+    observed, dots
+        The frame's dots, and indices of the n among them that come into question.
+    plane_mm, covariance_mm2
+        Where a surface puts the dots of m > 0 rays, IPCS, shape (m, 2), mm, and their covariance,
+        as far as the surface is uncertain, shape (m, 2, 2).
+
+    Returns
+    -------
+    dot, ray
+        Index of the dot and position of the ray among the m, of each pair.
+    """
+    from labapp.core.matching import match_kernels
+
+    spread = SIGMA_INFLATION**2 * covariance_mm2 + MODEL_ERROR_MM**2 * np.eye(2)
+    seen = observed.plane_mm[dots], observed.covariance_mm2[dots]
+    distance, deviance = match_kernels.pair_deviances(*seen, plane_mm, spread)
+    ray, next_ray, best_dot, next_dot = match_kernels.two_least(deviance)
+    own = np.arange(len(ray))
+    rival = np.minimum(np.minimum(next_ray, next_dot[ray]), false_dot_deviance())
+    sure = (best_dot[ray] == own) & (distance[own, ray] < GATE_SIGMA2)
+    sure &= deviance[own, ray] + RIVAL_MARGIN < rival
+    return dots[sure], ray[sure]
+
+
 def pair_deviances(
     observed: Observation, pool: FittedPool, predicted: Prediction, dots: IntArray
 ) -> tuple[FloatArray, FloatArray]:

@@ -17,24 +17,14 @@ import numpy as np
 
 from labapp.core.images import dot_kernels
 from labapp.core.match import Trial, missing_share
-from labapp.core.matching import match_kernels
 from labapp.core.matching.correspondence import match_of_pairs
 from labapp.core.matching.decision import MatchSettings
-from labapp.core.matching.hypothesis import FEW_BEYOND, landing_rises
 from labapp.core.matching.observation import UNLABELLED, Observation, amid, count_labels, widened
-from labapp.core.matching.outliers import unsupported
-from labapp.core.matching.prediction import (
-    GATE_SIGMA2,
-    MODEL_ERROR_MM,
-    RIVAL_MARGIN,
-    SIGMA_INFLATION,
-    RayPaths,
-    covariance_of_dots,
-)
+from labapp.core.matching.outliers import MOST_LEFT_OUT, FittedLabels, unsupported
+from labapp.core.matching.prediction import RayPaths, covariance_of_dots, sure_pairs
 from labapp.core.matching.ray_classes import RayClasses, certain_witness, classify_rays
 from labapp.core.schemes.fit import LEAST_DOTS, UNSETTLED_MM
 from labapp.core.sequence.prior import MOST_ROUNDS, SETTLED_MM, Followed, Prior, predictions
-from labapp.core.surface import kernels
 from labapp.core.surface.level import Level, Witnesses
 from labapp.core.surface.pool_fit import (
     FitSettings,
@@ -119,19 +109,16 @@ def follow(
         if count_labels(labels) < count_labels(before) + MANY:
             break
         fit.run(ROUGHLY_MM)
-    fit.settle()
-    covariance = fit.covariance_around()
-    wrong = _unsupported(fit, covariance)
-    if len(wrong):
-        fit = fit.without_dots(wrong)
+    for _ in range(MOST_LEFT_OUT):
         fit.settle()
         covariance = fit.covariance_around()
-    classes, level = _with_level(prior, fit, covariance)
-    outside = _landed_outside(prior, fit, level)
-    if len(outside):
-        fit = fit.without_dots(outside)
-        fit.settle()
-        classes, level = _with_level(prior, fit, fit.covariance_around())
+        classes, level = _with_level(prior, fit, covariance)
+        wrong = _unsupported(fit, covariance, classes, level)
+        if len(wrong) == 0:
+            break
+        fit = fit.without_dots(wrong)
+    else:
+        raise TrackLost("too many dots are not where one surface has them")
     rays, dots = fit.rays, fit.labels.ravel()[fit.rays]
     _check_explained(classes, limits, len(observed.plane_mm), len(rays))
     pool = fitted_pool(fit.rounds, level, observed.rig, observed.plane_mm[dots])
@@ -337,8 +324,7 @@ def _tracked(
 def _widened(fit: _Fit) -> IntArray:
     """Labels that the fitted surface supports, and new ones beside them that it makes sure of.
 
-    A new label stands where it is likelier by far than any other ray for the dot, and any other
-    dot for the ray (`label_growth`), with what the prediction is uncertain by.
+    A new label is one of `sure_pairs`, as where labels grow without a prior (`label_growth`).
     """
     observed, paths, lit = fit.observed, fit.paths(), fit.labels != UNLABELLED
     known = np.isfinite(paths.plane_mm[:, 0])
@@ -357,17 +343,11 @@ def _widened(fit: _Fit) -> IntArray:
         near = looked_for[np.unique(np.argsort(apart, axis=0)[:RIVALS])]
         apart = _apart_mm(paths.plane_mm[near], observed.plane_mm)
         dots = np.union1d(free, np.argsort(apart, axis=1)[:, : RIVALS + 1])
-        spread = SIGMA_INFLATION**2 * fit.covariance_of(paths, near) + MODEL_ERROR_MM**2 * np.eye(2)
-        seen = observed.plane_mm[dots], observed.covariance_mm2[dots]
-        distance, cost = match_kernels.pair_deviances(*seen, paths.plane_mm[near], spread)
-        for dot in np.searchsorted(dots, free).tolist():
-            best = int(np.argmin(cost[dot]))
-            ray = int(near[best])
-            rivals = np.delete(cost[dot], best), np.delete(cost[:, best], dot)
-            clear = all(len(r) == 0 or r.min() > cost[dot, best] + RIVAL_MARGIN for r in rivals)
-            may = beside.ravel()[ray] and next_mm[ray] > observed.resolution_mm
-            if clear and may and distance[dot, best] < GATE_SIGMA2:
-                labels[ray] = dots[dot]
+        covariance = fit.covariance_of(paths, near)
+        dot, ray = sure_pairs(observed, dots, paths.plane_mm[near], covariance)
+        ray = near[ray]
+        may = beside.ravel()[ray] & (next_mm[ray] > observed.resolution_mm) & is_free[dot]
+        labels[ray[may]] = dot[may]
     return labels.reshape(lit.shape)
 
 
@@ -380,12 +360,10 @@ def _apart_mm(one: FloatArray, other: FloatArray) -> FloatArray:
 # --- what labels must stand ---------------------------------------------------------------------
 
 
-def _unsupported(fit: _Fit, covariance: FloatArray) -> IntArray:
+def _unsupported(fit: _Fit, covariance: FloatArray, classes: RayClasses, level: Level) -> IntArray:
     """Labelled dots that the surface does not support (`outliers.unsupported`)."""
-    plane = fit.paths().plane_mm[fit.rays]
-    residual = plane - fit.observed.plane_mm[fit.labels.ravel()[fit.rays]]
-    made = residual, covariance[fit.rays], fit.settings.floor_mm
-    return unsupported(fit.observed, fit.labels, *made)
+    seen = fit.paths(), covariance, classes, fit.settings.floor_mm, fit.rounds.moved_mm
+    return unsupported(fit.observed, FittedLabels(fit.labels, fit.prior.basis, level, *seen))
 
 
 def _with_level(prior: Prior, fit: _Fit, covariance: FloatArray) -> tuple[RayClasses, Level]:
@@ -404,23 +382,6 @@ def _with_level(prior: Prior, fit: _Fit, covariance: FloatArray) -> tuple[RayCla
     level = rounds_with_level(fit.rounds, witnesses, *how)
     fit.check_settled()
     return RayClasses(witness, found.missed, found.stray), level
-
-
-def _landed_outside(prior: Prior, fit: _Fit, level: Level) -> IntArray:
-    """Labelled dots that may be false ones, by where their rays landed.
-
-    Well beyond the boundary one or two (`landing_rises`); of rays that were not lit before, all
-    that are not within it.
-    """
-    basis, coefficients = prior.basis, fit.rounds.coefficients
-    landing = fit.observed.landing_mm.reshape(-1, 3)[fit.rays]
-    height, *slope = kernels.surface_at(basis.grid, coefficients, landing)
-    spacing = fit.observed.spacing_mm
-    inward, far = landing_rises(height, np.array(slope).T, landing[:, 1], level, spacing)
-    is_new = ~prior.lit.ravel()[fit.rays]
-    far &= ~is_new
-    outside = (is_new & (inward < 0)) | (far & (far.sum() <= FEW_BEYOND))
-    return np.asarray(fit.labels.ravel()[fit.rays[outside]])
 
 
 def _check_explained(classes: RayClasses, limits: MatchSettings, dots: int, rays: int) -> None:

@@ -157,6 +157,38 @@ class Witnesses(ReadOnlyArrays):
         seen = np.array(slope).T, self.landing_mm[:, 1], self.sign, self.spacing_mm
         return find_level(height, *seen, (self.head_sign, drop_mm), about, self.missing)
 
+    def negative_log_evidence(
+        self, basis: SplineBasis, coefficients: FloatArray, level: Level
+    ) -> float:
+        """−log of the probability of who came back, over all levels near one and all blurs, nats.
+
+        The surface lies at that level; how its rear lies is held. A constant is left out.
+        """
+        from labapp.core.surface import kernels, level_kernels
+
+        height, *slope = kernels.surface_at(basis.grid, coefficients, self.landing_mm)
+        rise, usual = _rises(np.array(slope).T, self.spacing_mm)
+        near = np.abs(height) < NEAR_RISES * rise
+        over = height[near] - level.rear.height(self.landing_mm[near, 1])
+        dark, side = self.sign[near] < 0, level.sign * self.sign[near] / rise[near]
+        grid = -usual, usual / STEPS_A_REACH, 2 * STEPS_A_REACH + 1, _BLURS
+        nats = level_kernels.level_negative_log_likelihood(
+            over[None], side, dark, self.missing, *grid
+        )
+        cost = nats[0] + _BLUR_COST[:, None]
+        return float(cost.min() - np.log(np.exp(cost.min() - cost).sum()))
+
+
+def _rises(slope: FloatArray, spacing_mm: FloatArray) -> tuple[FloatArray, float]:
+    """Heights by which a surface changes from one ray to the next, and their median, mm.
+
+    They are taken straight across the contour, from gradients, shape (m, 2), and as no less than a
+    quarter of the median.
+    """
+    rise = np.linalg.norm(slope * spacing_mm, axis=-1) + 1e-6
+    usual = median(rise)
+    return np.maximum(rise, usual / 4), usual
+
 
 def find_level(
     height: FloatArray,
@@ -197,10 +229,7 @@ def find_level(
     """
     from labapp.core.surface import level_kernels
 
-    # Height by which the surface changes from one ray to the next, straight across the contour.
-    rise = np.linalg.norm(slope * spacing_mm, axis=-1) + 1e-6
-    usual = median(rise)
-    rise = np.maximum(rise, usual / 4)
+    rise, usual = _rises(slope, spacing_mm)
     shift, sign, reach = about or (*_scan_levels(height, rise, witness), 1.0)
     near = np.abs(height + shift) < NEAR_RISES * rise
     count = round(STEPS_A_REACH * reach) + 1
