@@ -175,26 +175,29 @@ def test_the_two_least_are_those_of_the_sorted_values() -> None:
     assert np.isinf(match_kernels.two_least(values[:, :1])[1]).all()
 
 
-@pytest.mark.parametrize("banded", [True, False])
-def test_the_normal_equations_are_those_of_least_squares(banded: bool) -> None:
+def test_the_normal_equations_are_those_of_least_squares() -> None:
     rng = random()
     points = np.column_stack([rng.uniform(BASIS.low_mm, BASIS.high_mm, (60, 2)), np.zeros(60)])
     root = rng.normal(size=(60, 2, 2))
     weights = root @ np.swapaxes(root, 1, 2)
     by = np.stack([BASIS.matrix(*points[:, :2].T, 1, 0), BASIS.matrix(*points[:, :2].T, 0, 1)], 1)
-    normal = np.einsum("nap,nab,nbq->pq", by, weights, by)
-    if banded:
-        width = 3 * BASIS.shape[1] + 3
-        flat = np.zeros(COUNT * (width + 1))
-        kernels.accumulate_normal_matrix(BASIS.grid, points, weights, flat, width)
-        band = flat.reshape(COUNT, width + 1).T
-        for k in range(width + 1):
-            np.testing.assert_allclose(band[k, : COUNT - k], np.diagonal(normal, -k), atol=1e-9)
-        assert not np.diagonal(normal, -width - 1).any()
-    else:
-        flat = np.zeros(COUNT**2)
-        kernels.accumulate_normal_matrix(BASIS.grid, points, weights, flat, COUNT)
-        np.testing.assert_allclose(flat.reshape(COUNT, COUNT), np.triu(normal), atol=1e-9)
+    band = 0.1 * BASIS.roughness
+    rough = sum(np.diag(line[: COUNT - k], -k) for k, line in enumerate(band))
+    rough += np.tril(rough, -1).T
+    normal = np.einsum("nap,nab,nbq->pq", by, weights, by) + rough
+    factor = normal_factor(BASIS, band, points, weights)
+    lower = sum(np.diag(line[: COUNT - k], -k) for k, line in enumerate(factor))
+    held = lower @ lower.T - normal
+    middle = np.unravel_index(np.argmax(held), held.shape)
+    assert middle[0] == middle[1]
+    assert held[middle] == pytest.approx(np.trace(normal) / COUNT)
+    held[middle] = 0.0
+    np.testing.assert_allclose(held, 0.0, atol=1e-9 * normal.max())
+    right = rng.normal(size=(2, COUNT))
+    solved = np.linalg.solve(lower @ lower.T, right.T).T
+    np.testing.assert_allclose(kernels.solve(factor, right), solved, rtol=1e-6)
+    indefinite = kernels.normal_factor(BASIS.grid, -1e3 * BASIS.roughness, points, weights)
+    assert not indefinite[1]
     dots_mm = PLANE.to_universal(rng.uniform([10.0, 10.0], [80.0, 60.0], (60, 2)))
     asked = bisecting_gradient(points - LASER, dots_mm - points)
     off = asked - surface().gradient(*points[:, :2].T)

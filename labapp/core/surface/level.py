@@ -15,12 +15,6 @@ from labapp.core.geometry.optics import ProjectedRays
 from labapp.core.surface.spline import SplineBasis
 from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays, median
 
-STEPS_A_REACH = 120
-"""Steps of the grid of levels over a reach of 1 on either side."""
-
-NEAR_RISES = 3.0
-"""Witnesses whose rays land farther than so many spacings from the boundary do not count."""
-
 SCAN_LEVELS = 300
 """Levels that are tried where nothing is known of it."""
 
@@ -153,9 +147,9 @@ class Witnesses(ReadOnlyArrays):
         """Find the level of a surface of these splines (`find_level`)."""
         from labapp.core.surface import kernels
 
-        height, *slope = kernels.surface_at(basis.grid, coefficients, self.landing_mm)
-        seen = np.array(slope).T, self.landing_mm[:, 1], self.sign, self.spacing_mm
-        return find_level(height, *seen, (self.head_sign, drop_mm), about, self.missing)
+        there = kernels.surface_at(basis.grid, coefficients, self.landing_mm)
+        seen = there[1:].T, self.landing_mm[:, 1], self.sign, self.spacing_mm
+        return find_level(there[0], *seen, (self.head_sign, drop_mm), about, self.missing)
 
 
 def find_level(
@@ -197,49 +191,19 @@ def find_level(
     """
     from labapp.core.surface import level_kernels
 
-    # Height by which the surface changes from one ray to the next, straight across the contour.
-    rise = np.linalg.norm(slope * spacing_mm, axis=-1) + 1e-6
-    usual = median(rise)
-    rise = np.maximum(rise, usual / 4)
-    shift, sign, reach = about or (*_scan_levels(height, rise, witness), 1.0)
-    near = np.abs(height + shift) < NEAR_RISES * rise
-    count = round(STEPS_A_REACH * reach) + 1
-    first, step = shift - reach * usual, 2 * reach * usual / (count - 1)
     head_sign, drop_mm = rear
-    lit = head_sign * y[witness > 0]
-    start = (lit.max() + lit.min()) / 2
-    end = min(lit.min(), start - 1e-6)  # a single row has no rear
-    sunk = Rear(1.0, head_sign * start, head_sign * end)
+    seen = height, slope, y, witness, spacing_mm
+    shift, sign, reach = about or (*level_kernels.scan_levels(*seen, SCAN_LEVELS, _WIDEST_BLUR), 1.0)
     # Only a pool that stands above the work piece is seen to sink at its rear.
-    seen = sign > 0 and bool(np.any(near & (witness < 0) & (head_sign * y < end)))
-    drops = (_DROPS_MM if seen else _DROPS_MM[:1]) if drop_mm is None else np.array([drop_mm])
-    over = height[near] - drops[:, None] * sunk.height(y[near])
-    side = sign * witness[near] / rise[near]
-    nats = level_kernels.level_negative_log_likelihood(
-        over, side, witness[near] < 0, missing, first, step, count, _BLURS
-    )
-    costs = _BLUR_COST, _SUNK_COST, drops
-    drop, mean, sigma, at_ends = level_kernels.level_posterior(nats, *costs, first, step)
+    some = _DROPS_MM if drop_mm is None and sign > 0 else np.array([drop_mm or 0.0])
+    search = np.array([head_sign, shift, sign, reach, missing])
+    priors = some, _BLURS, _BLUR_COST, _SUNK_COST
+    found, rays = level_kernels.search_level(*seen, search, *priors)
+    mean, sigma, drop, start, end, at_ends, least, usual = found.tolist()
     if about is not None and at_ends > (MOST_AT_ENDS if reach < 1.0 else MOST_AT_FAR_ENDS):
         about = (shift, sign, 1.0) if reach < 1.0 else None
-        return find_level(height, slope, y, witness, spacing_mm, rear, about, missing)
-    least, rays = float(nats.min()), int(near.sum())
-    return Level(mean, sigma, sign, replace(sunk, drop_mm=drop), least, rays, usual)
-
-
-def _scan_levels(height: FloatArray, rise: FloatArray, witness: IntArray) -> tuple[float, int]:
-    """Shift, mm, and sign that the witnesses contradict least, with the widest blur."""
-    from labapp.core.surface import level_kernels
-
-    scan, side = np.linspace((-height).min(), (-height).max(), SCAN_LEVELS), witness / rise
-    grid = witness < 0, 0.0, scan[0], scan[1] - scan[0], len(scan), _WIDEST_BLUR
-    above, below = (
-        level_kernels.level_negative_log_likelihood(height[None], k * side, *grid)[0, 0]
-        for k in (1, -1)
-    )
-    if above.min() <= below.min():
-        return float(scan[np.argmin(above)]), 1
-    return float(scan[np.argmin(below)]), -1
+        return find_level(*seen, rear, about, missing)
+    return Level(mean, sigma, sign, Rear(drop, start, end), least, rays, usual)
 
 
 def guess_level(height: FloatArray, outer: BoolArray) -> Level:

@@ -26,7 +26,7 @@ from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match
 from labapp.core.surface.level import Witnesses
 from labapp.core.surface.pool_fit import FitSettings, FittedPool, normal_equations
-from labapp.core.surface.solver import NormalEquations, solve
+from labapp.core.surface.solver import NormalEquations
 from labapp.core.values import FloatArray
 
 ROUNDS = 3
@@ -137,6 +137,8 @@ class _Response:
 
         A bench is a rig, and where the dots are on its plane, shape (n, 2), mm.
         """
+        from labapp.core.surface import kernels
+
         own = self.equations
         base = self._right_side(own.laser_mm, own.plane, own.dots_mm, None)
         sides = [
@@ -151,7 +153,8 @@ class _Response:
         right = np.stack(sides, axis=-1) - base[:, None]
         change = np.zeros_like(right)
         for _ in range(ROUNDS):
-            change = solve(self.pool.factor, right + self.along @ (self.sinking @ change))
+            asked = right + self.along @ (self.sinking @ change)
+            change = kernels.solve(self.pool.factor, asked.T).T
             change -= (self.values @ change).mean(axis=0)  # slopes leave the level open
         return change
 
