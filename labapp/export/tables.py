@@ -215,8 +215,7 @@ def _sigma_parts(measured: Measures | None) -> list[float]:
 
 def _sigmas(measured: Measures | None, part: str) -> FloatArray:
     """Standard uncertainty of each of `measures.SIZES`, or a part of it; NaN where unknown."""
-    names = (sigma_name(size, part) for size in measures.SIZES)
-    return np.array([getattr(measured, name, math.nan) for name in names])
+    return np.array([getattr(measured, name, math.nan) for name in measures.sigma_names(part)])
 
 
 def _dots(measurement: Measurement, calibration: ImageCalibration) -> list[npt.NDArray[Any]]:
@@ -279,12 +278,12 @@ def csv_rows(name: str, table: Table, sigma_parts: bool = False) -> str:
     if text is not None:
         return text
     cells = [
-        table[column.name].tolist()
+        [as_cell(text) for text in table[column.name].tolist()]
         if column.digits is None
         else [number(value, column.digits) for value in table[column.name].tolist()]
         for column in columns
     ]
-    return as_csv(zip(*cells, strict=True))
+    return _as_lines(zip(*cells, strict=True))
 
 
 def _numeric_rows(columns: Sequence[Column], table: Table) -> str | None:
@@ -324,8 +323,12 @@ def number(value: float | None, digits: int = MM_DIGITS) -> str:
 
 def as_csv(rows: Iterable[Sequence[object]]) -> str:
     """CSV text of rows; text that a spreadsheet would evaluate is escaped (`as_cell`)."""
+    return _as_lines([as_cell(cell) for cell in row] for row in rows)
+
+
+def _as_lines(rows: Iterable[Sequence[object]]) -> str:
     lines = _Lines()
-    csv.writer(lines).writerows([as_cell(cell) for cell in row] for row in rows)
+    csv.writer(lines).writerows(rows)
     return "".join(lines)
 
 

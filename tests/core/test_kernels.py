@@ -25,7 +25,7 @@ from labapp.core.geometry.optics import (
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.images import centroid_kernels, dot_kernels, dot_size, dots
 from labapp.core.matching import match_kernels
-from labapp.core.sequence.prior import recurrence
+from labapp.core.sequence.prior import RIDGE, recurrence
 from labapp.core.surface import kernels, level_kernels
 from labapp.core.surface.level import Rear
 from labapp.core.surface.solver import normal_factor
@@ -228,9 +228,11 @@ def test_frames_follow_on_each_other_by_the_least_squares_recurrence() -> None:
     own = slopes[:, rays].reshape(30, -1)
     own = own - own.mean(axis=0)
     before = np.stack([own[order - 1 - k : 29 - k].ravel() for k in range(order)], axis=-1)
-    gram, right = recurrence(slopes, rays, order)
+    held = np.sqrt(RIDGE * np.sum(before**2)) * np.eye(order)
+    known = np.concatenate([own[order:].ravel(), np.zeros(order)])
     np.testing.assert_allclose(
-        np.linalg.solve(gram, right), np.linalg.lstsq(before, own[order:].ravel(), rcond=None)[0]
+        recurrence(slopes, rays, order),
+        np.linalg.lstsq(np.concatenate([before, held]), known, rcond=None)[0],
     )
 
 

@@ -31,6 +31,7 @@ _f, _i = types.float64, types.int64
 _f1, _f2, _f3, _f4 = (types.Array(_f, n, "A", readonly=True) for n in (1, 2, 3, 4))
 _mask = types.Array(types.boolean, 2, "A", readonly=True)
 _lower = types.Array(_f, 2, "F", readonly=True)
+_bands, _bench = types.UniTuple(_lower, 2), types.Tuple((_f1, _f2))  # type: ignore[no-untyped-call]
 
 
 LONGEST_STEP_MM, LEAST_DESCENT = 0.5, 0.05
@@ -39,6 +40,9 @@ where one grazes the surface a step would throw it off the pool."""
 
 LONGEST_QUADRIC_STEP_MM = 1.0
 """The same for quadrics, which go on beyond the pool."""
+
+ON_SURFACE_MM = 1e-9
+"""After a step as short no other is taken: the next would be far below rounding."""
 
 QUADRIC_STEPS = 3
 """Newton steps from the plane z = 0, or that of the cap's top, to a quadric."""
@@ -651,24 +655,31 @@ def gradient_rhs(
     return out
 
 
-@_compiled(_f2, _lower, _lower, _f1, _f1, _f2, _f3, _f1, _f2, _f2)
+@_compiled(_f2, _bands, _f1, _f1, _f2, _f3, _bench, _f2)
 def fit_step(
     grid: FloatArray,
-    stiffness: FloatArray,
-    factor: FloatArray,
+    bands: tuple[FloatArray, FloatArray],
     coefficients: FloatArray,
     rough: FloatArray,
     points: FloatArray,
     weights: FloatArray,
-    laser: FloatArray,
-    plane: FloatArray,
+    bench: tuple[FloatArray, FloatArray],
     dots: FloatArray,
 ) -> FloatArray:
     """Coefficients after one step of the fit (`NormalEquations.step`), shape (p,).
 
-    ``rough`` are the coefficients of the surface that is held smooth, shape (p,); the others are
-    those of `normal_factor` and `gradient_rhs`.
+    Parameters
+    ----------
+    grid, coefficients, points, weights, dots
+        See `gradient_rhs`.
+    bands
+        Stiffness and factor, see `normal_factor`.
+    rough
+        Coefficients of the surface that is held smooth, shape (p,).
+    bench
+        The laser and the plane.
     """
+    (stiffness, factor), (laser, plane) = bands, bench
     change = gradient_rhs(grid, coefficients, points, weights, laser, plane, dots)
     columns, (height, count) = stiffness.T, stiffness.shape
     for j in range(count):
@@ -697,7 +708,9 @@ def newton_along_rays(
     moved, most, work = points.copy(), 0.0, np.empty((4, 4))
     for k in range(len(points)):
         for _ in range(steps):
-            _newton_step(grid, coefficients, rays[k], moved[k], work)
+            step, _, _ = _newton_step(grid, coefficients, rays[k], moved[k], work)
+            if abs(step) < ON_SURFACE_MM:
+                break
         for axis in range(3):
             by = abs(moved[k, axis] - points[k, axis])
             if not by <= most:  # NaN, too

@@ -7,13 +7,13 @@ which may lie below it (§7.2).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from labapp.core.geometry.optics import ProjectedRays
 from labapp.core.surface.spline import SplineBasis
-from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays, median
+from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 
 SCAN_LEVELS = 300
 """Levels that are tried where nothing is known of it."""
@@ -25,8 +25,8 @@ of a narrow grid (reach below 1), the second of a wide one."""
 # Blurs: width of the step from inside to outside, in dot spacings, from a boundary that is known
 # as sharply as the surface is to one that half the neighbouring rays contradict.
 _BLURS = np.geomspace(1 / 200, 1 / 4, 9)
-_BLUR_COST = 1.2 * np.log(_BLURS)  # −log of the prior, blur^−1.2, nats: sharp ones are likelier
 _WIDEST_BLUR = _BLURS[-1:]
+_BLURS = np.array([_BLURS, 1.2 * np.log(_BLURS)])  # −log of the prior, nats: sharp is likelier
 
 # Drops: how deep a rear may lie, mm. One in five lies below the work piece, as deep as any other.
 _DROPS_MM = np.concatenate([[0.0], np.linspace(0.01, 0.15, 10)])
@@ -193,12 +193,14 @@ def find_level(
 
     head_sign, drop_mm = rear
     seen = height, slope, y, witness, spacing_mm
-    shift, sign, reach = about or (*level_kernels.scan_levels(*seen, SCAN_LEVELS, _WIDEST_BLUR), 1.0)
+    shift, sign, reach = about or (
+        *level_kernels.scan_levels(*seen, SCAN_LEVELS, _WIDEST_BLUR),
+        1.0,
+    )
     # Only a pool that stands above the work piece is seen to sink at its rear.
     some = _DROPS_MM if drop_mm is None and sign > 0 else np.array([drop_mm or 0.0])
-    search = np.array([head_sign, shift, sign, reach, missing])
-    priors = some, _BLURS, _BLUR_COST, _SUNK_COST
-    found, rays = level_kernels.search_level(*seen, search, *priors)
+    search = np.array([head_sign, shift, sign, reach, missing, _SUNK_COST])
+    found, rays = level_kernels.search_level(*seen, search, some, _BLURS)
     mean, sigma, drop, start, end, at_ends, least, usual = found.tolist()
     if about is not None and at_ends > (MOST_AT_ENDS if reach < 1.0 else MOST_AT_FAR_ENDS):
         about = (shift, sign, 1.0) if reach < 1.0 else None
@@ -216,6 +218,7 @@ def guess_level(height: FloatArray, outer: BoolArray) -> Level:
     outer
         Which of them lie far from their middle, shape (n,).
     """
-    shift = -float(np.mean(height[outer]))
-    sign = 1 if height[~outer].mean() + shift > 0 else -1
-    return Level(shift, float(np.std(height)), sign, Rear(), 0.0)
+    from labapp.core.surface import level_kernels
+
+    shift, sigma, inner = level_kernels.guess_level(height, outer)
+    return Level(shift, sigma, 1 if inner + shift > 0 else -1, Rear(), 0.0)

@@ -243,7 +243,7 @@ def scan_levels(
     return shift, sign
 
 
-@_compiled(_f1, _f2, _f1, _i1, _f1, _f1, _f1, _f1, _f1, _f)
+@_compiled(_f1, _f2, _f1, _i1, _f1, _f1, _f1, _f2)
 def search_level(
     height: FloatArray,
     slope: FloatArray,
@@ -253,8 +253,6 @@ def search_level(
     search: FloatArray,
     drops: FloatArray,
     blurs: FloatArray,
-    blur_cost: FloatArray,
-    sunk: float,
 ) -> tuple[FloatArray, int]:
     """Weigh levels near one, blurs and drops of the rear on a grid.
 
@@ -264,12 +262,13 @@ def search_level(
         See `level.find_level`.
     search
         Sign of the head's side, the level in the middle, mm, its sign, how far levels reach from
-        there, in rises, and the probability that a dot is missing.
+        there, in rises, the probability that a dot is missing, and −log of the prior of every drop
+        but the first, nats.
     drops
         Drops of the rear, mm. Of several only the first counts where no dark ray near the boundary
         is at the rear.
-    blurs, blur_cost, sunk
-        See `level_negative_log_likelihood` and `level_posterior`.
+    blurs
+        Blurs, in spacings of the rays, and −log of their priors, shape (2, b).
 
     Returns
     -------
@@ -278,7 +277,7 @@ def search_level(
         mm, probability at the ends of the grid, least −log likelihood, and the usual rise, mm; and
         how many witnesses count.
     """
-    head_sign, shift, sign, reach, missing = search
+    head_sign, shift, sign, reach, missing, sunk = search
     rises, usual = _rises(slope, spacing)
     low, high = np.inf, -np.inf
     for n in range(len(y)):
@@ -289,18 +288,30 @@ def search_level(
     near = np.flatnonzero(np.abs(height + shift) < NEAR_RISES * rises)
     side, dark = np.empty(len(near)), np.empty(len(near), np.bool_)
     is_seen = False
-    for m, n in enumerate(near):
-        side[m], dark[m] = sign * witness[n] / rises[n], witness[n] < 0
-        is_seen |= dark[m] and head_sign * y[n] < end
+    for m in range(len(near)):
+        at = near[m]
+        side[m], dark[m] = sign * witness[at] / rises[at], witness[at] < 0
+        is_seen |= dark[m] and head_sign * y[at] < end
     drops = drops if is_seen else drops[:1]
     over = np.empty((len(drops), len(near)))
-    for m, n in enumerate(near):
-        share = max((start - head_sign * y[n]) / (start - end), 0.0)
+    for m in range(len(near)):
+        share = max((start - head_sign * y[near[m]]) / (start - end), 0.0)
         for d in range(len(drops)):
-            over[d, m] = height[n] + drops[d] * share * share
+            over[d, m] = height[near[m]] + drops[d] * share * share
     count = int(np.rint(STEPS_A_REACH * reach)) + 1
     first, step = shift - reach * usual, 2.0 * reach * usual / (count - 1)
-    nats = level_negative_log_likelihood(over, side, dark, missing, first, step, count, blurs)
-    drop, mean, sigma, at_ends = level_posterior(nats, blur_cost, sunk, drops, first, step)
+    nats = level_negative_log_likelihood(over, side, dark, missing, first, step, count, blurs[0])
+    drop, mean, sigma, at_ends = level_posterior(nats, blurs[1], sunk, drops, first, step)
     rear = head_sign * start, head_sign * end
     return np.array([mean, sigma, drop, *rear, at_ends, nats.min(), usual]), len(near)
+
+
+@_compiled(_f1, types.Array(types.boolean, 1, "A", readonly=True))
+def guess_level(height: FloatArray, outer: BoolArray) -> tuple[float, float, float]:
+    """Shift that puts outer points at 0, standard deviation of heights, mean of the inner ones.
+
+    Heights up to their level, mm, and which are outer, shape (n,).
+    """
+    inner = ~outer
+    shift, mean = -np.sum(height * outer) / outer.sum(), np.sum(height * inner) / inner.sum()
+    return shift, float(np.std(height)), mean

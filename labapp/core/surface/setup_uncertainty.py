@@ -11,6 +11,7 @@ bench off either way, and half the difference is taken, over the very width that
 from __future__ import annotations
 
 from collections.abc import Sequence
+
 import numpy as np
 
 from labapp.core.geometry.optics import intersect_level, project_rays
@@ -99,7 +100,7 @@ def _response(
 
     base = right_side(points, own.laser_mm, own.plane, own.dots_mm)
     changes = np.zeros((len(benches), len(coefficients)))
-    for change, (bench, plane_mm) in zip(changes, benches, strict=True):
+    for k, (bench, plane_mm) in enumerate(benches):
         laser_mm, plane = bench.laser.position_mm, bench.imaging_plane
         rays = project_rays(bench.laser, bench.pattern).directions[at]
         start = intersect_level(laser_mm, rays, points[:, 2:])
@@ -108,11 +109,11 @@ def _response(
         _, *slopes = kernels.surface_at(grid, coefficients, there)
         rises = rays / (rays[:, 2] - np.vecdot(np.transpose(slopes), rays[:, :2]))[:, None]
         for _ in range(ROUNDS):
-            raised = kernels.surface_at(grid, change, there)[0][:, None]
+            raised = kernels.surface_at(grid, changes[k], there)[0][:, None]
             asked = right_side(there + raised * rises, *seen) - base
-            change[:] = kernels.solve(pool.factor, asked[None])[0]
+            changes[k] = kernels.solve(pool.factor, asked[None])[0]
             # Slopes leave the level open.
-            change -= kernels.surface_at(grid, change, there)[0].mean()
+            changes[k] -= kernels.surface_at(grid, changes[k], there)[0].mean()
     return changes.T
 
 

@@ -85,9 +85,16 @@ class NormalEquations:
 
         if self.factor is None or not moved_mm <= self.reuse_mm:
             self.factor = normal_factor(self.basis, self.stiffness, points_mm, self.weights)
-        surface = self.basis.grid, self.stiffness, self.factor, coefficients
-        seen = points_mm, self.weights, self.laser_mm, self.plane, self.dots_mm
-        return kernels.fit_step(*surface, coefficients - smooth_about, *seen)
+        return kernels.fit_step(
+            self.basis.grid,
+            (self.stiffness, self.factor),
+            coefficients,
+            coefficients - smooth_about,
+            points_mm,
+            self.weights,
+            (self.laser_mm, self.plane),
+            self.dots_mm,
+        )
 
 
 @dataclass
@@ -273,7 +280,7 @@ def fit_slopes(
 
     splines, (value, *slope) = kernels.splines_at(basis.grid, points_mm)
     weighted = np.einsum("nas,na->ns", weights @ np.stack(slope, axis=1), slopes)
-    target = np.bincount(splines.ravel(), weighted.ravel(), basis.count)
+    target = np.bincount(splines.ravel(), weighted.ravel(), basis.count).astype(float)
     factor = normal_factor(basis, stiffness * basis.roughness, points_mm, weights)
     coefficients = kernels.solve(factor, target[None])[0]
     mean_splines = np.bincount(splines.ravel(), value.ravel(), basis.count) / len(points_mm)
