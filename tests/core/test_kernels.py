@@ -210,6 +210,42 @@ def test_the_normal_equations_are_those_of_least_squares() -> None:
     )
 
 
+def test_a_step_solves_the_normal_equations_and_keeps_the_mean_height() -> None:
+    rng = random()
+    points = np.column_stack([rng.uniform(BASIS.low_mm, BASIS.high_mm, (60, 2)), np.zeros(60)])
+    weights = np.tile(np.diag([4e4, 1e4]), (60, 1, 1))
+    dots_mm = PLANE.to_universal(rng.uniform([10.0, 10.0], [80.0, 60.0], (60, 2)))
+    own, rough = surface().coefficients, rng.normal(0.0, 0.1, COUNT)
+    band = 10.0 * BASIS.roughness
+    factor = normal_factor(BASIS, band, points, weights)
+    half = sum(np.diag(line[: COUNT - k], -k) for k, line in enumerate(band))
+    right = kernels.gradient_rhs(BASIS.grid, own, points, weights, LASER, PLANE.pose_mm, dots_mm)
+    right -= (half + np.tril(half, -1).T) @ rough
+    change = kernels.solve(factor, right[None])[0]
+    change -= (BASIS.matrix(*points[:, :2].T) @ change).mean()
+    bench = LASER, PLANE.pose_mm
+    made = kernels.fit_step(BASIS.grid, (band, factor), own, rough, points, weights, bench, dots_mm)
+    np.testing.assert_allclose(made, own + change, atol=1e-9 * np.abs(change).max())
+
+
+def test_rays_are_amid_others_in_their_row_or_column() -> None:
+    lit = random().uniform(size=(9, 7)) < 0.2
+    lit[4] = False
+    expected = np.zeros_like(lit)
+    for i, j in np.ndindex(lit.shape):
+        row, column = lit[i], lit[:, j]
+        expected[i, j] |= row[: j + 1].any() and row[j:].any()
+        expected[i, j] |= column[: i + 1].any() and column[i:].any()
+    np.testing.assert_array_equal(match_kernels.amid(lit), expected)
+
+
+def test_a_guessed_level_has_the_outer_points_at_0() -> None:
+    height, outer = random().normal(1.0, 0.3, 12), np.arange(12) % 3 == 0
+    guessed = level_kernels.guess_level(height, outer)
+    expected = -height[outer].mean(), height.std(), height[~outer].mean()
+    np.testing.assert_allclose(guessed, expected)
+
+
 def test_rays_are_hidden_by_the_torch_as_when_they_are_reflected_one_by_one() -> None:
     rays, landing = landings()
     points = landing + random().normal(0.0, 0.2, landing.shape)
