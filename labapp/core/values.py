@@ -36,8 +36,8 @@ class ReadOnlyArrays:
         fields = vars(self)
         for name, item in fields.items():
             if isinstance(item, np.ndarray) and item.flags.writeable:
-                view = fields[name] = item.view()
-                view.flags.writeable = False
+                view = fields[name] = item[...]
+                view.setflags(write=False)
 
 
 def median(values: FloatArray) -> float:

@@ -206,8 +206,7 @@ def _sigma_parts(measured: Measures | None) -> list[float]:
 
 def _sigmas(measured: Measures | None, part: str) -> FloatArray:
     """Standard uncertainty of each of `measures.SIZES`, or a part of it; NaN where unknown."""
-    names = (sigma_name(size, part) for size in measures.SIZES)
-    return np.array([getattr(measured, name, math.nan) for name in names])
+    return np.array([getattr(measured, name, math.nan) for name in measures.sigma_names(part)])
 
 
 def _dots(measurement: Measurement, calibration: ImageCalibration) -> list[npt.NDArray[Any]]:

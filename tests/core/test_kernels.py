@@ -25,7 +25,7 @@ from labapp.core.geometry.optics import (
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.images import centroid_kernels, dot_kernels, dot_size, dots
 from labapp.core.matching import match_kernels
-from labapp.core.sequence.prior import recurrence
+from labapp.core.sequence.prior import RIDGE, recurrence
 from labapp.core.surface import kernels, level_kernels
 from labapp.core.surface.level import Rear
 from labapp.core.surface.solver import normal_factor
@@ -175,26 +175,29 @@ def test_the_two_least_are_those_of_the_sorted_values() -> None:
     assert np.isinf(match_kernels.two_least(values[:, :1])[1]).all()
 
 
-@pytest.mark.parametrize("banded", [True, False])
-def test_the_normal_equations_are_those_of_least_squares(banded: bool) -> None:
+def test_the_normal_equations_are_those_of_least_squares() -> None:
     rng = random()
     points = np.column_stack([rng.uniform(BASIS.low_mm, BASIS.high_mm, (60, 2)), np.zeros(60)])
     root = rng.normal(size=(60, 2, 2))
     weights = root @ np.swapaxes(root, 1, 2)
     by = np.stack([BASIS.matrix(*points[:, :2].T, 1, 0), BASIS.matrix(*points[:, :2].T, 0, 1)], 1)
-    normal = np.einsum("nap,nab,nbq->pq", by, weights, by)
-    if banded:
-        width = 3 * BASIS.shape[1] + 3
-        flat = np.zeros(COUNT * (width + 1))
-        kernels.accumulate_normal_matrix(BASIS.grid, points, weights, flat, width)
-        band = flat.reshape(COUNT, width + 1).T
-        for k in range(width + 1):
-            np.testing.assert_allclose(band[k, : COUNT - k], np.diagonal(normal, -k), atol=1e-9)
-        assert not np.diagonal(normal, -width - 1).any()
-    else:
-        flat = np.zeros(COUNT**2)
-        kernels.accumulate_normal_matrix(BASIS.grid, points, weights, flat, COUNT)
-        np.testing.assert_allclose(flat.reshape(COUNT, COUNT), np.triu(normal), atol=1e-9)
+    band = 0.1 * BASIS.roughness
+    rough = sum(np.diag(line[: COUNT - k], -k) for k, line in enumerate(band))
+    rough += np.tril(rough, -1).T
+    normal = np.einsum("nap,nab,nbq->pq", by, weights, by) + rough
+    factor = normal_factor(BASIS, band, points, weights)
+    lower = sum(np.diag(line[: COUNT - k], -k) for k, line in enumerate(factor))
+    held = lower @ lower.T - normal
+    middle = np.unravel_index(np.argmax(held), held.shape)
+    assert middle[0] == middle[1]
+    assert held[middle] == pytest.approx(np.trace(normal) / COUNT)
+    held[middle] = 0.0
+    np.testing.assert_allclose(held, 0.0, atol=1e-9 * normal.max())
+    right = rng.normal(size=(2, COUNT))
+    solved = np.linalg.solve(lower @ lower.T, right.T).T
+    np.testing.assert_allclose(kernels.solve(factor, right), solved, rtol=1e-6)
+    indefinite = kernels.normal_factor(BASIS.grid, -1e3 * BASIS.roughness, points, weights)
+    assert not indefinite[1]
     dots_mm = PLANE.to_universal(rng.uniform([10.0, 10.0], [80.0, 60.0], (60, 2)))
     asked = bisecting_gradient(points - LASER, dots_mm - points)
     off = asked - surface().gradient(*points[:, :2].T)
@@ -205,6 +208,42 @@ def test_the_normal_equations_are_those_of_least_squares(banded: bool) -> None:
         np.einsum("nap,nab,nb->p", by, weights, off),
         atol=1e-9,
     )
+
+
+def test_a_step_solves_the_normal_equations_and_keeps_the_mean_height() -> None:
+    rng = random()
+    points = np.column_stack([rng.uniform(BASIS.low_mm, BASIS.high_mm, (60, 2)), np.zeros(60)])
+    weights = np.tile(np.diag([4e4, 1e4]), (60, 1, 1))
+    dots_mm = PLANE.to_universal(rng.uniform([10.0, 10.0], [80.0, 60.0], (60, 2)))
+    own, rough = surface().coefficients, rng.normal(0.0, 0.1, COUNT)
+    band = 10.0 * BASIS.roughness
+    factor = normal_factor(BASIS, band, points, weights)
+    half = sum(np.diag(line[: COUNT - k], -k) for k, line in enumerate(band))
+    right = kernels.gradient_rhs(BASIS.grid, own, points, weights, LASER, PLANE.pose_mm, dots_mm)
+    right -= (half + np.tril(half, -1).T) @ rough
+    change = kernels.solve(factor, right[None])[0]
+    change -= (BASIS.matrix(*points[:, :2].T) @ change).mean()
+    bench = LASER, PLANE.pose_mm
+    made = kernels.fit_step(BASIS.grid, (band, factor), own, rough, points, weights, bench, dots_mm)
+    np.testing.assert_allclose(made, own + change, atol=1e-9 * np.abs(change).max())
+
+
+def test_rays_are_amid_others_in_their_row_or_column() -> None:
+    lit = random().uniform(size=(9, 7)) < 0.2
+    lit[4] = False
+    expected = np.zeros_like(lit)
+    for i, j in np.ndindex(lit.shape):
+        row, column = lit[i], lit[:, j]
+        expected[i, j] |= row[: j + 1].any() and row[j:].any()
+        expected[i, j] |= column[: i + 1].any() and column[i:].any()
+    np.testing.assert_array_equal(match_kernels.amid(lit), expected)
+
+
+def test_a_guessed_level_has_the_outer_points_at_0() -> None:
+    height, outer = random().normal(1.0, 0.3, 12), np.arange(12) % 3 == 0
+    guessed = level_kernels.guess_level(height, outer)
+    expected = -height[outer].mean(), height.std(), height[~outer].mean()
+    np.testing.assert_allclose(guessed, expected)
 
 
 def test_rays_are_hidden_by_the_torch_as_when_they_are_reflected_one_by_one() -> None:
@@ -225,9 +264,11 @@ def test_frames_follow_on_each_other_by_the_least_squares_recurrence() -> None:
     own = slopes[:, rays].reshape(30, -1)
     own = own - own.mean(axis=0)
     before = np.stack([own[order - 1 - k : 29 - k].ravel() for k in range(order)], axis=-1)
-    gram, right = recurrence(slopes, rays, order)
+    held = np.sqrt(RIDGE * np.sum(before**2)) * np.eye(order)
+    known = np.concatenate([own[order:].ravel(), np.zeros(order)])
     np.testing.assert_allclose(
-        np.linalg.solve(gram, right), np.linalg.lstsq(before, own[order:].ravel(), rcond=None)[0]
+        recurrence(slopes, rays, order),
+        np.linalg.lstsq(np.concatenate([before, held]), known, rcond=None)[0],
     )
 
 

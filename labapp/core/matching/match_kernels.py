@@ -99,6 +99,22 @@ def within_view(
     return made
 
 
+@compiled(types.Array(types.boolean, 2, "A", readonly=True))
+def amid(lit: BoolArray) -> BoolArray:
+    """Rays between lit ones in their row or in their column, shape (rows, columns)."""
+    rows, columns = lit.shape
+    made = np.zeros((rows, columns), np.bool_)
+    for i in range(rows):
+        some = np.flatnonzero(lit[i])
+        if len(some):
+            made[i, some[0] : some[-1] + 1] = True
+    for j in range(columns):
+        some = np.flatnonzero(lit[:, j])
+        if len(some):
+            made[some[0] : some[-1] + 1, j] = True
+    return made
+
+
 @compiled(_f2)
 def two_least(values: FloatArray) -> tuple[IntArray, FloatArray, IntArray, FloatArray]:
     """Where each row's least value is and its second least; the same of each column.

@@ -190,7 +190,7 @@ class Observation(ReadOnlyArrays):
         """
         from labapp.core.matching import match_kernels
 
-        margin = np.broadcast_to(np.asarray(margin_mm, float), plane_mm.shape)
+        margin = np.full(plane_mm.shape, margin_mm)
         at, view = (plane_mm.reshape(-1, 2), margin.reshape(-1, 2)), self._view
         made = match_kernels.within_view(*at, self.bench.calibration.from_plane, *view)
         return made.reshape(plane_mm.shape[:-1])
@@ -233,12 +233,9 @@ def count_labels(labels: IntArray) -> int:
 
 def amid(lit: BoolArray) -> BoolArray:
     """Rays between lit ones in their row or in their column, shape (rows, columns)."""
-    between = np.zeros_like(lit)
-    for rays, among in ((lit, between), (lit.T, between.T)):
-        before = np.logical_or.accumulate(rays)
-        after = np.logical_or.accumulate(rays[::-1])[::-1]
-        np.logical_or(among, before & after, out=among)
-    return between
+    from labapp.core.matching import match_kernels
+
+    return match_kernels.amid(lit)
 
 
 def neighbours_of(lit: BoolArray) -> IntArray:
@@ -255,4 +252,7 @@ def within_rings(labels: IntArray, rings: int) -> BoolArray:
 def widened(mask: BoolArray, rings: int) -> BoolArray:
     """A mask over rays, shape (rows, columns), and the neighbours, so many rings of them."""
     lit = np.ascontiguousarray(mask).view(np.uint8)
-    return cv2.dilate(lit, np.ones((3, 3), np.uint8), iterations=rings).view(bool)
+    return cv2.dilate(lit, _BESIDE, iterations=rings).view(bool)
+
+
+_BESIDE = np.ones((3, 3), np.uint8)

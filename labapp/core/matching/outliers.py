@@ -19,7 +19,7 @@ from labapp.core.matching.prediction import (
     false_dot_deviance,
 )
 from labapp.core.matching.ray_classes import RayClasses
-from labapp.core.surface.level import NEAR_RISES, Level, Witnesses
+from labapp.core.surface.level import Level, Witnesses
 from labapp.core.surface.spline import SplineBasis
 from labapp.core.values import BoolArray, FloatArray, IntArray, median
 
@@ -39,9 +39,6 @@ MOST_LEFT_OUT = 4
 LEVER = 10.0
 """How far a dot moves when its reflection point does: twice the way to the plane, some 55 mm, times
 the surface's curvature, some 0.1 a mm."""
-
-NATS_A_BLUR = np.pi**2 / 6 / NEAR_RISES
-"""Mean −log likelihood of rays that land up to `NEAR_RISES` from a boundary, over its blur."""
 
 
 @dataclass(frozen=True)

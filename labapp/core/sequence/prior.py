@@ -26,6 +26,9 @@ MEMORY, ORDER, TEACHERS = 32, 8, 3
 """Frames that predictions are learnt from, and from how many of them, at most, one is made; every
 so-many-th lit ray tells as much as all."""
 
+RIDGE = 1e-4
+"""Penalty on the recurrence's coefficients, a share of the trace of its normal matrix."""
+
 MOST_ROUNDS, SETTLED_MM = 8, 3e-4
 """Rounds of a fit from a surface nearby; no reflection point moves by more in the last."""
 
@@ -217,10 +220,7 @@ def predictions(prior: Prior) -> Iterator[FloatArray]:
     past, order = prior.past, min(ORDER, len(prior.past) // 2)
     if order > 2:
         teachers = np.flatnonzero(prior.lit)[::TEACHERS]
-        gram, right = recurrence(prior.slopes, teachers, order)
-        gram.flat[:: order + 1] += 1e-4 * np.trace(gram)
-        ratio = np.linalg.solve(gram, right)
-        mean = past.mean(axis=0)
+        ratio, mean = recurrence(prior.slopes, teachers, order), past.mean(axis=0)
         yield mean + ratio @ (past[: -order - 1 : -1] - mean)
     if len(past) > 1:
         yield 2 * past[-1] - past[-2]
@@ -232,11 +232,11 @@ def predictions(prior: Prior) -> Iterator[FloatArray]:
     types.Array(types.int64, 1, "A", readonly=True),
     types.int64,
 )
-def recurrence(slopes: FloatArray, rays: IntArray, order: int) -> tuple[FloatArray, FloatArray]:
-    """Normal equations of the linear recurrence by which frames follow on each other.
+def recurrence(slopes: FloatArray, rays: IntArray, order: int) -> FloatArray:
+    """Coefficients of the linear recurrence by which frames follow on each other, shape (order,).
 
-    Of the slopes of some rays in M frames, shape (M, R, 2), each over its mean: shapes
-    (order, order) and (order,), the newest of the frames that are followed first.
+    The newest frame's first: ridge regression over the slopes of some rays in M frames, shape
+    (M, R, 2), each over its mean.
     """
     gram, right = np.zeros((order, order)), np.zeros(order)
     own = np.empty(len(slopes))
@@ -262,4 +262,7 @@ def recurrence(slopes: FloatArray, rays: IntArray, order: int) -> tuple[FloatArr
     for k in range(order):
         for other in range(k):
             gram[other, k] = gram[k, other]
-    return gram, right
+    held = RIDGE * np.trace(gram)
+    for k in range(order):
+        gram[k, k] += held
+    return np.linalg.solve(gram, right).astype(np.float64)

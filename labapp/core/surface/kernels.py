@@ -4,7 +4,7 @@ A frame has a hundred dots: NumPy's overhead per call would take longer than the
 call each other are in one file because a compiled function is kept on disk as long as its own file
 does not change, whatever became of those it calls. Arrays may be read-only, and of any layout.
 
-Five arguments mean the same everywhere, all in the UCS and mm:
+Six arguments mean the same everywhere, all in the UCS and mm:
 
 * ``grid``: low end, high end, step and number of cells of the splines along x and along y, shape
   (2, 4) (`SplineBasis.grid`); with it ``coefficients`` of the splines, shape (p,).
@@ -13,6 +13,9 @@ Five arguments mean the same everywhere, all in the UCS and mm:
   and index of its glass, shape (5, 3) (`ImagingPlane.pose_mm`).
 * ``work``: memory to write on, which holds values and slopes of the four splines along x, then
   those along y, shape (4, 4).
+
+A lower band has the shape (width + 1, p), as LAPACK has it, and its columns follow on each other in
+memory; ``columns`` is the same transposed.
 """
 
 from __future__ import annotations
@@ -27,6 +30,8 @@ from labapp.core.values import BoolArray, FloatArray, IntArray
 _f, _i = types.float64, types.int64
 _f1, _f2, _f3, _f4 = (types.Array(_f, n, "A", readonly=True) for n in (1, 2, 3, 4))
 _mask = types.Array(types.boolean, 2, "A", readonly=True)
+_lower = types.Array(_f, 2, "F", readonly=True)
+_bands, _bench = types.UniTuple(_lower, 2), types.Tuple((_f1, _f2))  # type: ignore[no-untyped-call]
 
 
 LONGEST_STEP_MM, LEAST_DESCENT = 0.5, 0.05
@@ -35,6 +40,9 @@ where one grazes the surface a step would throw it off the pool."""
 
 LONGEST_QUADRIC_STEP_MM = 1.0
 """The same for quadrics, which go on beyond the pool."""
+
+ON_SURFACE_MM = 1e-9
+"""After a step as short no other is taken: the next would be far below rounding."""
 
 QUADRIC_STEPS = 3
 """Newton steps from the plane z = 0, or that of the cap's top, to a quadric."""
@@ -47,6 +55,9 @@ SNELL_STEPS = 4
 
 DOT_STEP_MM = 1e-3
 """Step of the finite differences by the place of a dot."""
+
+AT_ONCE = 8
+"""Columns of a matrix that are factorized at once."""
 
 MOST_BOUNDARY_STEPS = 20
 """Newton steps along a direction, if the boundary does not settle before."""
@@ -400,15 +411,11 @@ def roughness(along_x: FloatArray, along_y: FloatArray, step: FloatArray) -> Flo
     return columns.T
 
 
-@_compiled(_f2, _f2, _f3, types.Array(_f, 1, "C"), _i)
-def accumulate_normal_matrix(
-    grid: FloatArray, points: FloatArray, weights: FloatArray, normal: FloatArray, stride: int
+@_inner
+def _accumulate_normal_matrix(
+    grid: FloatArray, points: FloatArray, weights: FloatArray, columns: FloatArray
 ) -> None:
-    """Add what slopes at points weigh to a normal matrix, its coefficients i ≤ j at i·stride + j.
-
-    With a stride of p that is the upper triangle of a full matrix; with the width of a band, its
-    columns one after the other, as LAPACK has them.
-    """
+    """Add what slopes at points weigh to the columns of a normal matrix's lower band."""
     work, many = np.empty((4, 4)), int(grid[1, 3]) + 3
     by_x, by_y = np.empty(16), np.empty(16)
     for k in range(len(points)):
@@ -422,44 +429,134 @@ def accumulate_normal_matrix(
         for own in range(16):
             along_x = xx * by_x[own] + xy * by_y[own]
             along_y = xy * by_x[own] + yy * by_y[own]
-            row = ((first_x + own // 4) * many + first_y + own % 4) * stride
+            column = columns[(first_x + own // 4) * many + first_y + own % 4]
             for other in range(own, 16):
-                column = (first_x + other // 4) * many + first_y + other % 4
-                normal[row + column] += along_x * by_x[other] + along_y * by_y[other]
+                below = (other // 4 - own // 4) * many + other % 4 - own % 4
+                column[below] += along_x * by_x[other] + along_y * by_y[other]
 
 
 @_inner
-def _inverse_band(lower: FloatArray, start: int) -> FloatArray:
+def _factorize(columns: FloatArray, count: int, width: int) -> bool:
+    """Replace the lower band of a matrix by its Cholesky factor; whether it has one.
+
+    Columns are one a row, and there is room of `AT_ONCE` beyond the last and below the band. So
+    many columns at once are taken from those after them, each of which is read and written once.
+    """
+    for j in range(0, count, AT_ONCE):
+        for a in range(min(AT_ONCE, count - j)):
+            own = columns[j + a]
+            for b in range(a):
+                factor, other = columns[j + b, a - b], columns[j + b, a - b :]
+                for k in range(width + 1):
+                    own[k] -= factor * other[k]
+            if not own[0] > 0.0:
+                return False
+            scale = 1.0 / np.sqrt(own[0])
+            for k in range(width + 1):
+                own[k] *= scale
+        c0, c1, c2, c3 = columns[j], columns[j + 1], columns[j + 2], columns[j + 3]
+        c4, c5, c6, c7 = columns[j + 4], columns[j + 5], columns[j + 6], columns[j + 7]
+        for t in range(AT_ONCE, min(AT_ONCE + width, count - j)):
+            own = columns[j + t]
+            f0, f1, f2, f3 = c0[t], c1[t - 1], c2[t - 2], c3[t - 3]
+            f4, f5, f6, f7 = c4[t - 4], c5[t - 5], c6[t - 6], c7[t - 7]
+            s0, s1, s2, s3 = c0[t:], c1[t - 1 :], c2[t - 2 :], c3[t - 3 :]
+            s4, s5, s6, s7 = c4[t - 4 :], c5[t - 5 :], c6[t - 6 :], c7[t - 7 :]
+            for k in range(width + AT_ONCE - t):
+                own[k] -= (f0 * s0[k] + f1 * s1[k] + f2 * s2[k] + f3 * s3[k]) + (
+                    f4 * s4[k] + f5 * s5[k] + f6 * s6[k] + f7 * s7[k]
+                )
+    return True
+
+
+@_compiled(_f2, _lower, _f2, _f3)
+def normal_factor(
+    grid: FloatArray, stiffness: FloatArray, points: FloatArray, weights: FloatArray
+) -> tuple[FloatArray, bool]:
+    """Cholesky factor of the normal matrix (`solver.normal_factor`), and whether it has one."""
+    height, count = stiffness.shape
+    columns = np.zeros((count + AT_ONCE, height + AT_ONCE))
+    columns[:count, :height] = stiffness.T
+    _accumulate_normal_matrix(grid, points, weights, columns)
+    x, y, diagonal = 0.0, 0.0, 0.0
+    for k in range(len(points)):
+        x, y = x + points[k, 0] / len(points), y + points[k, 1] / len(points)
+    for k in range(count):
+        diagonal += columns[k, 0] / count
+    work = np.empty((4, 4))
+    first_x = _cubic_splines(grid[0], x, work[0], work[1])
+    first_y = _cubic_splines(grid[1], y, work[2], work[3])
+    columns[(first_x + 1) * (int(grid[1, 3]) + 3) + first_y + 1, 0] += diagonal
+    has_one = _factorize(columns, count, height - 1)
+    return columns[:count, :height].copy().T, has_one
+
+
+@_inner
+def _solve_lower(columns: FloatArray, right: FloatArray) -> None:
+    """Replace a right-hand side by the solution, with a lower band."""
+    count, height = columns.shape
+    for j in range(count):
+        if right[j] != 0.0:
+            column, rest = columns[j], right[j:]
+            value = rest[0] / column[0]
+            for k in range(1, min(height, count - j)):
+                rest[k] -= value * column[k]
+            rest[0] = value
+
+
+@_inner
+def _solve(columns: FloatArray, right: FloatArray) -> None:
+    """Replace a right-hand side by the solution, with a Cholesky factor."""
+    count, height = columns.shape
+    _solve_lower(columns, right)
+    for j in range(count - 1, -1, -1):
+        column, rest, total = columns[j], right[j:], 0.0
+        for k in range(1, min(height, count - j)):
+            total += column[k] * rest[k]
+        rest[0] = (rest[0] - total) / column[0]
+
+
+@_compiled(_lower, _f2)
+def solve(lower: FloatArray, right: FloatArray) -> FloatArray:
+    """Solve the normal equations of a factor for m right-hand sides, shape (m, p)."""
+    made = right.copy()
+    for m in range(len(made)):
+        _solve(lower.T, made[m])
+    return made
+
+
+@_inner
+def _inverse_band(columns: FloatArray, start: int) -> FloatArray:
     """Band of the inverse of LLᵀ from row ``start`` on, both triangles, shape (p, p).
 
     Entries farther from the diagonal than the band of L, and rows before ``start``, are not set.
     Takahashi's recurrence (Erisman and Tinney 1975, On computing certain elements of the inverse
     of a sparse matrix), from the last row to the first.
     """
-    width, count = lower.shape[0] - 1, lower.shape[1]
+    width, count = columns.shape[1] - 1, len(columns)
     inverse, column = np.empty((count, count)), np.empty(width)
     for j in range(count - 1, start - 1, -1):
         after = min(width, count - 1 - j)
         column[:] = 0.0
         for k in range(0, after - 3, 4):  # four at a time: the column is read and written once
-            a, b = lower[k + 1, j] / lower[0, j], lower[k + 2, j] / lower[0, j]
-            c, d = lower[k + 3, j] / lower[0, j], lower[k + 4, j] / lower[0, j]
+            a, b = columns[j, k + 1] / columns[j, 0], columns[j, k + 2] / columns[j, 0]
+            c, d = columns[j, k + 3] / columns[j, 0], columns[j, k + 4] / columns[j, 0]
             rows = inverse[j + 1 + k : j + 5 + k, j + 1 :]
             for i in range(after):
                 column[i] -= a * rows[0, i] + b * rows[1, i] + c * rows[2, i] + d * rows[3, i]
         for k in range(after - after % 4, after):
-            factor, row = lower[k + 1, j] / lower[0, j], inverse[j + 1 + k, j + 1 :]
+            factor, row = columns[j, k + 1] / columns[j, 0], inverse[j + 1 + k, j + 1 :]
             for i in range(after):
                 column[i] -= factor * row[i]
-        own = 1.0 / (lower[0, j] * lower[0, j])
+        own = 1.0 / (columns[j, 0] * columns[j, 0])
         for k in range(after):
             inverse[j, j + 1 + k] = inverse[j + 1 + k, j] = column[k]
-            own -= lower[k + 1, j] / lower[0, j] * column[k]
+            own -= columns[j, k + 1] / columns[j, 0] * column[k]
         inverse[j, j] = own
     return inverse
 
 
-@_compiled(_f2, _f2, _f1, _f2, _f2, _f2)
+@_compiled(_f2, _lower, _f1, _f2, _f2, _f2)
 def covariance_of_dots(
     grid: FloatArray,
     lower: FloatArray,
@@ -482,7 +579,7 @@ def covariance_of_dots(
     if pairs == 0:
         return out
     # The splines of a cell are all within the band.
-    inverse = _inverse_band(lower, first.min())
+    inverse = _inverse_band(lower.T, first.min())
     by_u, by_v = np.empty(16), np.empty(16)
     for k in range(pairs):
         (xu, xv), (yu, yv) = _slope_jacobian(laser, plane, points[k], dots[k])
@@ -509,25 +606,16 @@ def covariance_of_dots(
     return out
 
 
-@_compiled(_f2, _f2)
+@_compiled(_lower, _f2)
 def variances(lower: FloatArray, gradients: FloatArray) -> FloatArray:
     """Diagonal of G (LLᵀ)⁻¹ Gᵀ, shape (m,).
 
     L is the factor of the normal matrix, shape (width + 1, p); G has shape (m, p).
     """
-    (height, count), out = lower.shape, np.empty(len(gradients))
-    left, columns = np.empty(count), lower.T.copy()
-    for m in range(len(gradients)):
-        left[:count] = gradients[m]
-        total = 0.0
-        for j in range(count):
-            column, rest = columns[j], left[j:]
-            value = rest[0] / column[0]
-            total += value * value
-            if value != 0.0:
-                for k in range(min(height, count - j)):
-                    rest[k] -= value * column[k]
-        out[m] = total
+    left, columns, out = gradients.copy(), lower.T, np.empty(len(gradients))
+    for m in range(len(left)):
+        _solve_lower(columns, left[m])
+        out[m] = np.sum(left[m] * left[m])
     return out
 
 
@@ -567,6 +655,48 @@ def gradient_rhs(
     return out
 
 
+@_compiled(_f2, _bands, _f1, _f1, _f2, _f3, _bench, _f2)
+def fit_step(
+    grid: FloatArray,
+    bands: tuple[FloatArray, FloatArray],
+    coefficients: FloatArray,
+    rough: FloatArray,
+    points: FloatArray,
+    weights: FloatArray,
+    bench: tuple[FloatArray, FloatArray],
+    dots: FloatArray,
+) -> FloatArray:
+    """Coefficients after one step of the fit (`NormalEquations.step`), shape (p,).
+
+    Parameters
+    ----------
+    grid, coefficients, points, weights, dots
+        See `gradient_rhs`.
+    bands
+        Stiffness and factor, see `normal_factor`.
+    rough
+        Coefficients of the surface that is held smooth, shape (p,).
+    bench
+        The laser and the plane.
+    """
+    (stiffness, factor), (laser, plane) = bands, bench
+    change = gradient_rhs(grid, coefficients, points, weights, laser, plane, dots)
+    columns, (height, count) = stiffness.T, stiffness.shape
+    for j in range(count):
+        column, own, rest, total = columns[j], rough[j], change[j:], 0.0
+        rest[0] -= column[0] * own
+        for k in range(1, min(height, count - j)):
+            rest[k] -= column[k] * own
+            total += column[k] * rough[j + k]
+        rest[0] -= total
+    _solve(factor.T, change)
+    # Slopes leave the level open: the mean height of the points stays.
+    mean = 0.0
+    for height_there in surface_at(grid, change, points)[0]:
+        mean += height_there / len(points)
+    return coefficients + (change - mean)
+
+
 @_compiled(_f2, _f1, _f2, _f2, _i)
 def newton_along_rays(
     grid: FloatArray, coefficients: FloatArray, rays: FloatArray, points: FloatArray, steps: int
@@ -578,7 +708,9 @@ def newton_along_rays(
     moved, most, work = points.copy(), 0.0, np.empty((4, 4))
     for k in range(len(points)):
         for _ in range(steps):
-            _newton_step(grid, coefficients, rays[k], moved[k], work)
+            step, _, _ = _newton_step(grid, coefficients, rays[k], moved[k], work)
+            if abs(step) < ON_SURFACE_MM:
+                break
         for axis in range(3):
             by = abs(moved[k, axis] - points[k, axis])
             if not by <= most:  # NaN, too

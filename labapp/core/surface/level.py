@@ -7,19 +7,13 @@ which may lie below it (§7.2).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
 from labapp.core.geometry.optics import ProjectedRays
 from labapp.core.surface.spline import SplineBasis
-from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays, median
-
-STEPS_A_REACH = 120
-"""Steps of the grid of levels over a reach of 1 on either side."""
-
-NEAR_RISES = 3.0
-"""Witnesses whose rays land farther than so many spacings from the boundary do not count."""
+from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 
 SCAN_LEVELS = 300
 """Levels that are tried where nothing is known of it."""
@@ -31,8 +25,8 @@ of a narrow grid (reach below 1), the second of a wide one."""
 # Blurs: width of the step from inside to outside, in dot spacings, from a boundary that is known
 # as sharply as the surface is to one that half the neighbouring rays contradict.
 _BLURS = np.geomspace(1 / 200, 1 / 4, 9)
-_BLUR_COST = 1.2 * np.log(_BLURS)  # −log of the prior, blur^−1.2, nats: sharp ones are likelier
 _WIDEST_BLUR = _BLURS[-1:]
+_BLURS = np.array([_BLURS, 1.2 * np.log(_BLURS)])  # −log of the prior, nats: sharp is likelier
 
 # Drops: how deep a rear may lie, mm. One in five lies below the work piece, as deep as any other.
 _DROPS_MM = np.concatenate([[0.0], np.linspace(0.01, 0.15, 10)])
@@ -153,9 +147,9 @@ class Witnesses(ReadOnlyArrays):
         """Find the level of a surface of these splines (`find_level`)."""
         from labapp.core.surface import kernels
 
-        height, *slope = kernels.surface_at(basis.grid, coefficients, self.landing_mm)
-        seen = np.array(slope).T, self.landing_mm[:, 1], self.sign, self.spacing_mm
-        return find_level(height, *seen, (self.head_sign, drop_mm), about, self.missing)
+        there = kernels.surface_at(basis.grid, coefficients, self.landing_mm)
+        seen = there[1:].T, self.landing_mm[:, 1], self.sign, self.spacing_mm
+        return find_level(there[0], *seen, (self.head_sign, drop_mm), about, self.missing)
 
     def negative_log_evidence(
         self, basis: SplineBasis, coefficients: FloatArray, level: Level
@@ -166,28 +160,10 @@ class Witnesses(ReadOnlyArrays):
         """
         from labapp.core.surface import kernels, level_kernels
 
-        height, *slope = kernels.surface_at(basis.grid, coefficients, self.landing_mm)
-        rise, usual = _rises(np.array(slope).T, self.spacing_mm)
-        near = np.abs(height) < NEAR_RISES * rise
-        over = height[near] - level.rear.height(self.landing_mm[near, 1])
-        dark, side = self.sign[near] < 0, level.sign * self.sign[near] / rise[near]
-        grid = -usual, usual / STEPS_A_REACH, 2 * STEPS_A_REACH + 1, _BLURS
-        nats = level_kernels.level_negative_log_likelihood(
-            over[None], side, dark, self.missing, *grid
-        )
-        cost = nats[0] + _BLUR_COST[:, None]
-        return float(cost.min() - np.log(np.exp(cost.min() - cost).sum()))
-
-
-def _rises(slope: FloatArray, spacing_mm: FloatArray) -> tuple[FloatArray, float]:
-    """Heights by which a surface changes from one ray to the next, and their median, mm.
-
-    They are taken straight across the contour, from gradients, shape (m, 2), and as no less than a
-    quarter of the median.
-    """
-    rise = np.linalg.norm(slope * spacing_mm, axis=-1) + 1e-6
-    usual = median(rise)
-    return np.maximum(rise, usual / 4), usual
+        there = kernels.surface_at(basis.grid, coefficients, self.landing_mm)
+        seen = there[0], there[1:].T, self.sign, self.spacing_mm
+        rear = level.rear.height(self.landing_mm[:, 1])
+        return level_kernels.negative_log_evidence(*seen, rear, level.sign, self.missing, _BLURS)
 
 
 def find_level(
@@ -229,46 +205,21 @@ def find_level(
     """
     from labapp.core.surface import level_kernels
 
-    rise, usual = _rises(slope, spacing_mm)
-    shift, sign, reach = about or (*_scan_levels(height, rise, witness), 1.0)
-    near = np.abs(height + shift) < NEAR_RISES * rise
-    count = round(STEPS_A_REACH * reach) + 1
-    first, step = shift - reach * usual, 2 * reach * usual / (count - 1)
     head_sign, drop_mm = rear
-    lit = head_sign * y[witness > 0]
-    start = (lit.max() + lit.min()) / 2
-    end = min(lit.min(), start - 1e-6)  # a single row has no rear
-    sunk = Rear(1.0, head_sign * start, head_sign * end)
-    # Only a pool that stands above the work piece is seen to sink at its rear.
-    seen = sign > 0 and bool(np.any(near & (witness < 0) & (head_sign * y < end)))
-    drops = (_DROPS_MM if seen else _DROPS_MM[:1]) if drop_mm is None else np.array([drop_mm])
-    over = height[near] - drops[:, None] * sunk.height(y[near])
-    side = sign * witness[near] / rise[near]
-    nats = level_kernels.level_negative_log_likelihood(
-        over, side, witness[near] < 0, missing, first, step, count, _BLURS
+    seen = height, slope, y, witness, spacing_mm
+    shift, sign, reach = about or (
+        *level_kernels.scan_levels(*seen, SCAN_LEVELS, _WIDEST_BLUR),
+        1.0,
     )
-    costs = _BLUR_COST, _SUNK_COST, drops
-    drop, mean, sigma, at_ends = level_kernels.level_posterior(nats, *costs, first, step)
+    # Only a pool that stands above the work piece is seen to sink at its rear.
+    some = _DROPS_MM if drop_mm is None and sign > 0 else np.array([drop_mm or 0.0])
+    search = np.array([head_sign, shift, sign, reach, missing, _SUNK_COST])
+    found, rays = level_kernels.search_level(*seen, search, some, _BLURS)
+    mean, sigma, drop, start, end, at_ends, least, usual = found.tolist()
     if about is not None and at_ends > (MOST_AT_ENDS if reach < 1.0 else MOST_AT_FAR_ENDS):
         about = (shift, sign, 1.0) if reach < 1.0 else None
-        return find_level(height, slope, y, witness, spacing_mm, rear, about, missing)
-    least, rays = float(nats.min()), int(near.sum())
-    return Level(mean, sigma, sign, replace(sunk, drop_mm=drop), least, rays, usual)
-
-
-def _scan_levels(height: FloatArray, rise: FloatArray, witness: IntArray) -> tuple[float, int]:
-    """Shift, mm, and sign that the witnesses contradict least, with the widest blur."""
-    from labapp.core.surface import level_kernels
-
-    scan, side = np.linspace((-height).min(), (-height).max(), SCAN_LEVELS), witness / rise
-    grid = witness < 0, 0.0, scan[0], scan[1] - scan[0], len(scan), _WIDEST_BLUR
-    above, below = (
-        level_kernels.level_negative_log_likelihood(height[None], k * side, *grid)[0, 0]
-        for k in (1, -1)
-    )
-    if above.min() <= below.min():
-        return float(scan[np.argmin(above)]), 1
-    return float(scan[np.argmin(below)]), -1
+        return find_level(*seen, rear, about, missing)
+    return Level(mean, sigma, sign, Rear(drop, start, end), least, rays, usual)
 
 
 def guess_level(height: FloatArray, outer: BoolArray) -> Level:
@@ -281,6 +232,7 @@ def guess_level(height: FloatArray, outer: BoolArray) -> Level:
     outer
         Which of them lie far from their middle, shape (n,).
     """
-    shift = -float(np.mean(height[outer]))
-    sign = 1 if height[~outer].mean() + shift > 0 else -1
-    return Level(shift, float(np.std(height)), sign, Rear(), 0.0)
+    from labapp.core.surface import level_kernels
+
+    shift, sigma, inner = level_kernels.guess_level(height, outer)
+    return Level(shift, sigma, 1 if inner + shift > 0 else -1, Rear(), 0.0)

@@ -7,16 +7,23 @@ from numba import types
 
 from labapp.core.compiled import compiled as _compiled
 from labapp.core.compiled import inner as _inner
-from labapp.core.values import BoolArray, FloatArray
+from labapp.core.values import BoolArray, FloatArray, IntArray
 
 _f, _i = types.float64, types.int64
 _f1, _f2, _f3 = (types.Array(_f, n, "A", readonly=True) for n in (1, 2, 3))
+_i1 = types.Array(_i, 1, "A", readonly=True)
 
 EPS = 1e-12
 """1 plus less than this is taken for 1: a thousand such factors change no level."""
 
 FARTHEST = -np.log(EPS)
 """A factor whose logarithm is farther below 0 is such a one."""
+
+STEPS_A_REACH = 120
+"""Steps of the grid of levels over a reach of 1 on either side."""
+
+NEAR_RISES = 3.0
+"""Witnesses whose rays land farther than so many spacings from the boundary do not count."""
 
 FACTORS = 1000
 """So many factors of at most 2 have a product that does not overflow."""
@@ -192,3 +199,155 @@ def level_posterior(
         for k in range(count):
             spread += share[d, k] * (first + k * step - mean) ** 2
     return drop, mean, np.sqrt(spread), share[:, 0].sum() + share[:, -1].sum()
+
+
+@_inner
+def rises_of(slope: FloatArray, spacing: FloatArray) -> tuple[FloatArray, float]:
+    """Height by which a surface changes from one ray to the next, straight across the contour.
+
+    Where m rays land, shape (m,), mm, and not less than a quarter of the median, the second value.
+    """
+    rises = np.empty(len(slope))
+    for n in range(len(rises)):
+        rises[n] = np.hypot(slope[n, 0] * spacing[0], slope[n, 1] * spacing[1]) + 1e-6
+    usual = np.median(rises)
+    return np.maximum(rises, usual / 4.0), usual
+
+
+@_compiled(_f1, _f2, _f1, _i1, _f1, _i, _f1)
+def scan_levels(
+    height: FloatArray,
+    slope: FloatArray,
+    y: FloatArray,
+    witness: IntArray,
+    spacing: FloatArray,
+    count: int,
+    blur: FloatArray,
+) -> tuple[float, int]:
+    """Shift, mm, and sign that the witnesses contradict least, of so many shifts, with one blur.
+
+    The first five arguments are those of `level.find_level`.
+    """
+    rises, _ = rises_of(slope, spacing)
+    over, first = np.empty((1, len(height))), -height.max()
+    over[0] = height
+    least, shift, sign = np.inf, 0.0, 1
+    step = (height.max() - height.min()) / (count - 1)
+    for way in (1, -1):
+        nats = level_negative_log_likelihood(
+            over, way * witness / rises, witness < 0, 0.0, first, step, count, blur
+        )[0, 0]
+        at = np.argmin(nats)
+        if nats[at] < least:
+            least, shift, sign = nats[at], first + at * step, way
+    return shift, sign
+
+
+@_compiled(_f1, _f2, _f1, _i1, _f1, _f1, _f1, _f2)
+def search_level(
+    height: FloatArray,
+    slope: FloatArray,
+    y: FloatArray,
+    witness: IntArray,
+    spacing: FloatArray,
+    search: FloatArray,
+    drops: FloatArray,
+    blurs: FloatArray,
+) -> tuple[FloatArray, int]:
+    """Weigh levels near one, blurs and drops of the rear on a grid.
+
+    Parameters
+    ----------
+    height, slope, y, witness, spacing
+        See `level.find_level`.
+    search
+        Sign of the head's side, the level in the middle, mm, its sign, how far levels reach from
+        there, in rises, the probability that a dot is missing, and −log of the prior of every drop
+        but the first, nats.
+    drops
+        Drops of the rear, mm. Of several only the first counts where no dark ray near the boundary
+        is at the rear.
+    blurs
+        Blurs, in spacings of the rays, and −log of their priors, shape (2, b).
+
+    Returns
+    -------
+    found, rays
+        Mean and standard deviation of the level, drop, start and end of the rear (`level.Rear`),
+        mm, probability at the ends of the grid, least −log likelihood, and the usual rise, mm; and
+        how many witnesses count.
+    """
+    head_sign, shift, sign, reach, missing, sunk = search
+    rises, usual = rises_of(slope, spacing)
+    low, high = np.inf, -np.inf
+    for n in range(len(y)):
+        if witness[n] > 0:
+            low, high = min(low, head_sign * y[n]), max(high, head_sign * y[n])
+    start = (low + high) / 2.0
+    end = min(low, start - 1e-6)  # a single row has no rear
+    near = np.flatnonzero(np.abs(height + shift) < NEAR_RISES * rises)
+    side, dark = np.empty(len(near)), np.empty(len(near), np.bool_)
+    is_seen = False
+    for m in range(len(near)):
+        at = near[m]
+        side[m], dark[m] = sign * witness[at] / rises[at], witness[at] < 0
+        is_seen |= dark[m] and head_sign * y[at] < end
+    drops = drops if is_seen else drops[:1]
+    over = np.empty((len(drops), len(near)))
+    for m in range(len(near)):
+        share = max((start - head_sign * y[near[m]]) / (start - end), 0.0)
+        for d in range(len(drops)):
+            over[d, m] = height[near[m]] + drops[d] * share * share
+    count = int(np.rint(STEPS_A_REACH * reach)) + 1
+    first, step = shift - reach * usual, 2.0 * reach * usual / (count - 1)
+    nats = level_negative_log_likelihood(over, side, dark, missing, first, step, count, blurs[0])
+    drop, mean, sigma, at_ends = level_posterior(nats, blurs[1], sunk, drops, first, step)
+    rear = head_sign * start, head_sign * end
+    return np.array([mean, sigma, drop, *rear, at_ends, nats.min(), usual]), len(near)
+
+
+@_compiled(_f1, _f2, _i1, _f1, _f1, _f, _f, _f2)
+def negative_log_evidence(
+    height: FloatArray,
+    slope: FloatArray,
+    witness: IntArray,
+    spacing: FloatArray,
+    rear: FloatArray,
+    sign: float,
+    missing: float,
+    blurs: FloatArray,
+) -> float:
+    """−log of the probability of the witnesses over all levels near 0 and all blurs, nats.
+
+    Height of the boundary where the m rays land, ``rear``, shape (m,), mm. ``blurs`` are those of
+    `search_level`, the others those of `level.find_level`. A constant is left out.
+    """
+    rises, usual = rises_of(slope, spacing)
+    near = np.flatnonzero(np.abs(height) < NEAR_RISES * rises)
+    over, side = np.empty((1, len(near))), np.empty(len(near))
+    dark = np.empty(len(near), np.bool_)
+    for m in range(len(near)):
+        at = near[m]
+        over[0, m] = height[at] - rear[at]
+        side[m], dark[m] = sign * witness[at] / rises[at], witness[at] < 0
+    grid = -usual, usual / STEPS_A_REACH, 2 * STEPS_A_REACH + 1
+    nats = level_negative_log_likelihood(
+        over, side, dark, missing, grid[0], grid[1], grid[2], blurs[0]
+    )
+    least, total = np.inf, 0.0
+    for b in range(blurs.shape[1]):
+        least = min(least, nats[0, b].min() + blurs[1, b])
+    for b in range(blurs.shape[1]):
+        total += np.exp(least - blurs[1, b] - nats[0, b]).sum()
+    return float(least - np.log(total))
+
+
+@_compiled(_f1, types.Array(types.boolean, 1, "A", readonly=True))
+def guess_level(height: FloatArray, outer: BoolArray) -> tuple[float, float, float]:
+    """Shift that puts outer points at 0, standard deviation of heights, mean of the inner ones.
+
+    Heights up to their level, mm, and which are outer, shape (n,).
+    """
+    inner = ~outer
+    shift, mean = -np.sum(height * outer) / outer.sum(), np.sum(height * inner) / inner.sum()
+    return shift, float(np.std(height)), mean

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 
 import numpy as np
 
@@ -132,6 +133,12 @@ def sigma_name(name: str, part: str = "") -> str:
     return "_".join(filter(None, (size, "sigma", part, unit)))
 
 
+@cache
+def sigma_names(part: str = "") -> tuple[str, ...]:
+    """`sigma_name` of each of `SIZES`."""
+    return tuple(sigma_name(size, part) for size in SIZES)
+
+
 def measure_surface(reconstruction: Reconstruction, match: Match, rig: Rig) -> Measures:
     """Measure a reconstructed pool."""
     errors = reflection_errors(reconstruction, match, rig)
@@ -155,9 +162,9 @@ def assemble_measures(
         "setup": reconstruction.size_sigma_setup,
     }
     told = {
-        sigma_name(name, part): float(sigma[k])
+        name: value
         for part, sigma in sigmas.items()
-        for k, name in enumerate(SIZES)
+        for name, value in zip(sigma_names(part), sigma.tolist(), strict=True)
     }
     return Measures(
         are_mm=errors.are_mm,
@@ -170,7 +177,7 @@ def assemble_measures(
         peak_y_mm=float(peak_mm[1]),
         scale_x=float(errors.scale[0]),
         scale_z=float(errors.scale[1]),
-        **{name: float(size[k]) for k, name in enumerate(SIZES)},
+        **dict(zip(SIZES, size.tolist(), strict=True)),
         **told,
     )
 

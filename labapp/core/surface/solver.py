@@ -12,8 +12,6 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
-import scipy
 
 from labapp.core.surface.spline import SplineBasis, SplineSurface
 from labapp.core.values import CannotMeasure, FloatArray
@@ -87,16 +85,16 @@ class NormalEquations:
 
         if self.factor is None or not moved_mm <= self.reuse_mm:
             self.factor = normal_factor(self.basis, self.stiffness, points_mm, self.weights)
-        at = self.basis.grid, coefficients, points_mm, self.weights
-        target = kernels.gradient_rhs(*at, self.laser_mm, self.plane, self.dots_mm)
-        width = len(self.stiffness) - 1
-        target -= scipy.linalg.blas.dsbmv(
-            width, 1.0, self.stiffness, coefficients - smooth_about, lower=1
+        return kernels.fit_step(
+            self.basis.grid,
+            (self.stiffness, self.factor),
+            coefficients,
+            coefficients - smooth_about,
+            points_mm,
+            self.weights,
+            (self.laser_mm, self.plane),
+            self.dots_mm,
         )
-        change = solve(self.factor, target)
-        # Slopes leave the level open: the mean height of the points stays.
-        change -= kernels.surface_at(self.basis.grid, change, points_mm)[0].mean()
-        return np.asarray(coefficients + change)
 
 
 @dataclass
@@ -170,11 +168,6 @@ class Rounds:
                 break
 
 
-def solve(factor: FloatArray, right: npt.ArrayLike) -> FloatArray:
-    """Solve the normal equations of a factor for right sides, shape (p,) or (p, m)."""
-    return np.asarray(scipy.linalg.lapack.dpbtrs(factor, right, lower=1)[0])
-
-
 def normal_factor(
     basis: SplineBasis, stiffness: FloatArray, points_mm: FloatArray, weights: FloatArray
 ) -> FloatArray:
@@ -198,15 +191,10 @@ def normal_factor(
     """
     from labapp.core.surface import kernels
 
-    columns, (height, count) = stiffness.flatten(order="F"), stiffness.shape
-    kernels.accumulate_normal_matrix(basis.grid, points_mm, weights, columns, height - 1)
-    band = columns.reshape(count, height).T
-    middle = kernels.splines_at(basis.grid, points_mm.mean(axis=0)[None])[0]
-    band[0, middle[0, 5]] += band[0].mean()
-    lower, info = scipy.linalg.lapack.dpbtrf(band, lower=1, overwrite_ab=1)
-    if info:
+    lower, has_one = kernels.normal_factor(basis.grid, stiffness, points_mm, weights)
+    if not has_one:
         raise CannotMeasure("no-surface", "no surface has the slopes that the dots ask for")
-    return np.asarray(lower)
+    return lower
 
 
 def propagate_sigma(
@@ -292,9 +280,9 @@ def fit_slopes(
 
     splines, (value, *slope) = kernels.splines_at(basis.grid, points_mm)
     weighted = np.einsum("nas,na->ns", weights @ np.stack(slope, axis=1), slopes)
-    target = np.bincount(splines.ravel(), weighted.ravel(), basis.count)
+    target = np.bincount(splines.ravel(), weighted.ravel(), basis.count).astype(float)
     factor = normal_factor(basis, stiffness * basis.roughness, points_mm, weights)
-    coefficients = solve(factor, target)
+    coefficients = kernels.solve(factor, target[None])[0]
     mean_splines = np.bincount(splines.ravel(), value.ravel(), basis.count) / len(points_mm)
     surface = SplineSurface(basis, coefficients - mean_splines @ coefficients)
     return SlopeFit(surface, factor, mean_splines)

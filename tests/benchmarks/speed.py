@@ -1,0 +1,151 @@
+"""How fast frames are measured: followed and cold ones, their dots, and a video from file to CSV.
+
+Run as ``python -m tests.benchmarks.speed [--frames N] [--cache FOLDER] [--cases FOLDER …]``. The
+video is that of `labapp benchmark`. A folder of cases has a folder each with ``frame.png`` and
+``setup.toml``; each frame is measured by itself, after one that is not counted. Times are those of
+the processor, on one core, unless something else is named. Each ratio is of one run: where other
+programs share the cores, it tells more than the times do. The profile has what a followed frame
+costs by module, with the profiler's own time in it, and how often what costs most is called.
+"""
+
+from __future__ import annotations
+
+import argparse
+import cProfile
+import pstats
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable
+from itertools import islice
+from pathlib import Path
+
+import cv2
+import numpy as np
+import platformdirs
+from threadpoolctl import ThreadpoolController
+
+from labapp.config.setup import read_setup
+from labapp.core.images.band_pass import DetectorTuning
+from labapp.core.images.dots import Image
+from labapp.core.pipeline import Settings, measure
+from labapp.core.recording.chain import WarmChain
+from labapp.export.frame_result import FrameResult
+from labapp.export.tables import table_rows
+from labapp.media import open_source
+from labapp.simulated.benchmark import Video, make_video, run_video, time_frames
+from tests.benchmarks.detectors import detectors
+
+FOLLOWED, BEFORE, SEARCHED = 200, 20, 10
+"""Frames that are followed under the profiler, frames before them, and frames whose dots are
+sought."""
+
+COUNTED = {
+    "rounds of the fit": "step",
+    "factorisations": "normal_factor",
+    "searches for the level": "find_level",
+    "covariances of dots": "covariance_of_dots",
+}
+"""What is counted, and the function that does it."""
+
+
+def seconds(work: Callable[..., object], *given: object) -> float:
+    """Processor time of some work, s."""
+    began = time.process_time()
+    work(*given)
+    return time.process_time() - began
+
+
+def print_ratio(name: str, ratio: float, wanted: str) -> None:
+    """A line for a ratio, and what it is to be."""
+    print(f"{name:42}{ratio:8.2f}   wanted {wanted}")
+
+
+def compare_dots(images: list[Image]) -> None:
+    """Dots of frames without a prior beside OpenCV's SimpleBlobDetector."""
+    size_px = DetectorTuning.of(images[0], Settings().dots.band_pass).size_px
+    (_, own), (_, blobs) = islice(detectors(size_px), 2)
+    assert not isinstance(own, str)
+    assert not isinstance(blobs, str)
+    own(images[0])
+    times = np.array([[seconds(find, one) for one in images] for find in (own, blobs)])
+    ours, others = 1e3 * np.median(times, axis=1)
+    print(f"dots of a cold frame {ours:.1f} ms, SimpleBlobDetector {others:.1f} ms")
+    print_ratio("cold dots / SimpleBlobDetector", ours / others, "<= 1")
+
+
+def time_cases(folder: Path) -> None:
+    """Cold frames of a folder of cases: median and worst, ms."""
+    cases = []
+    for case in sorted(path.parent for path in folder.glob("*/frame.png")):
+        with open_source(case / "frame.png") as source:
+            cases.append((source.frame(0).image, read_setup(case / "setup.toml").bench))
+    measure(*cases[0], Settings())
+    times_ms = 1e3 * np.array([seconds(measure, *case, Settings()) for case in cases])
+    print(f"cold frames of {folder.name}: {len(cases)}")
+    print_ratio("  median, ms", float(np.median(times_ms)), "<= 100")
+    print_ratio("  worst, ms", float(times_ms.max()), "<= 1000")
+
+
+def profile_followed(video: Video) -> None:
+    """What a followed frame costs by module, from reading it to the text of its rows."""
+    chain, profile = WarmChain(video.setup.bench, Settings()), cProfile.Profile(time.process_time)
+    with open_source(video.path) as source:
+
+        def follow(number: int) -> None:
+            frame = source.frame(number)
+            result = FrameResult(number, frame.time_s, chain.measure(frame.image))
+            table_rows(result, video.setup.calibration)
+
+        for number in range(BEFORE):
+            follow(number)
+        for number in range(BEFORE, BEFORE + FOLLOWED):
+            profile.runcall(follow, number)
+    shares: Counter[str] = Counter()
+    calls: Counter[str] = Counter()
+    every = pstats.Stats(profile).stats  # type: ignore[attr-defined]
+    for (path, _, name), (_, count, own_s, _, _) in every.items():
+        module = path.rpartition("/labapp/")[2] if "/labapp/" in path else "NumPy, OpenCV, Python"
+        shares[module] += own_s
+        calls[name] += 0 if module.endswith("kernels.py") else count
+    print(f"\n{'profile of a followed frame':42}{'ms':>8}")
+    for module, own_s in shares.most_common(14):
+        print(f"  {module:40}{1e3 * own_s / FOLLOWED:8.2f}")
+    print(f"{'calls a followed frame':42}")
+    print(f"  {'of all functions':40}{sum(one[1] for one in every.values()) / FOLLOWED:8.0f}")
+    for name, function in COUNTED.items():
+        print(f"  {name:40}{calls[function] / FOLLOWED:8.1f}")
+
+
+def main() -> None:
+    """Print all."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--frames", type=int, default=2000)
+    parser.add_argument("--cache", type=Path)
+    parser.add_argument("--cases", type=Path, nargs="*", default=[])
+    chosen = parser.parse_args()
+    folder = chosen.cache or Path(platformdirs.user_cache_dir("labapp")) / "benchmark"
+    folder.mkdir(parents=True, exist_ok=True)
+    video = make_video(folder, chosen.frames)
+    with tempfile.TemporaryDirectory(dir=folder) as out:
+        run = run_video(video, Path(out) / "results", 2)
+    ms = 1e3 * run.processor_s / run.frames
+    print(f"from file to CSV, two processes, {run.frames} frames, {run.cold} of them cold")
+    print_ratio("  frames a second", run.frames / run.seconds, ">= 500")
+    print(f"  {ms:.2f} ms of all processors a frame, the start of the processes in it")
+    cv2.setNumThreads(1)
+    with ThreadpoolController().limit(limits=1, user_api="blas"):
+        latency = time_frames(video, min(chosen.frames, 400), cold=10)
+        followed, cold = latency.processor.median, 1e3 * latency.cold_s
+        print(f"a followed frame {followed:.2f} ms, a cold one {cold:.0f} ms")
+        print_ratio("cold / followed", cold / followed, "<= 25")
+        numbers = np.linspace(0, chosen.frames - 1, SEARCHED).astype(int).tolist()
+        with open_source(video.path) as source:
+            compare_dots([source.frame(number).image for number in numbers])
+        for cases in chosen.cases:
+            time_cases(cases)
+        profile_followed(video)
+
+
+if __name__ == "__main__":
+    main()
