@@ -324,6 +324,16 @@ def light_of(dots: FloatArray, shape: tuple[int, int], blur: float = 0.0) -> Flo
     return made
 
 
+def test_residual_light_of_bytes_is_that_of_numbers() -> None:
+    dots, light, rest = fitted_picture()
+    coarse, level = np.rint(light + rest).astype(np.uint8), np.full(light.shape, 12.0, np.float32)
+    number, begin = dot_fit_kernels.neighbours(dots[:, 0], dots[:, 1], 25.0)
+    given = level, 7.0, dots, 1.3 * dots[:, 3], number, begin, 6
+    for made in (dot_fit_kernels.residual_sums, dot_fit_kernels.residual_modes):
+        one, other = made(coarse, *given), made(coarse.astype(np.float32), *given)
+        np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-3)
+
+
 def test_dots_are_taken_off_a_blurred_picture() -> None:
     dots, light, rest = fitted_picture()
     blurred = light_of(dots, light.shape, 7.0)
@@ -347,9 +357,12 @@ def test_residual_light_is_what_dots_and_surroundings_leave() -> None:
         left, profile = window * (rest - 12.0)[near], np.exp(-square / (2 * size**2))
         made = left @ np.stack([0 * p + 1, p, q, profile, profile * square], -1)
         np.testing.assert_allclose(sums[k, :5], made, rtol=1e-3, atol=0.15)
-        middle = 4 / (1 / width[k] ** 2 + 1 / size**2)
-        mode = [p, q, p * q, (p**2 - q**2) / 2, p * (square - middle), q * (square - middle)]
-        np.testing.assert_allclose(modes[:, k, 0], mode @ left, rtol=1e-3, atol=1.5)
+        spread = 1 / (1 / width[k] ** 2 + 1 / size**2)
+        third = square - 4 * spread
+        fifth = square**2 - 12 * spread * square + 24 * spread**2
+        mode = np.stack([each for by in (1.0, third, fifth) for each in (by * p, by * q)])
+        large = np.sqrt(np.square(mode) @ window**2)
+        np.testing.assert_allclose(modes[:, k, 0] / large, mode @ left / large, atol=0.1)
         seen = np.square(mode) @ (window * light[near]) ** 2
         np.testing.assert_allclose(modes[:, k, 2], seen, rtol=0.03)
         if 8 < u_px < 70 and 8 < v_px < 54:  # the window is in the picture
@@ -473,13 +486,9 @@ def test_the_finer_band_is_that_of_the_whole_picture() -> None:
 def test_bytes_are_read_as_they_are() -> None:
     place, image = picture()
     u, v = np.rint(place).astype(np.int64).T
-    coarse, around = np.clip(image + 20, 0, 255).astype(np.uint8), np.full(image.shape, 20.0, "f4")
-    width, near = np.full(len(u), 2.0), dot_fit_kernels.neighbours(*place.T, 20.0)
-    dots = np.column_stack([place, np.full(len(u), 30.0), width])
+    coarse = np.clip(image + 20, 0, 255).astype(np.uint8)
     narrow, wide = np.float32(random().uniform(0, 1, (2, 3, 13)))
     for made in (
-        lambda own: dot_fit_kernels.residual_sums(own, around, 5.0, dots, width, *near, 6),
-        lambda own: dot_fit_kernels.residual_modes(own, around, 5.0, dots, width, *near, 6),
         lambda own: centroid_kernels.finest(own, u, v, narrow, wide),
         lambda own: dot_kernels.spikes(own, 3.0, 1.9, 1.2, 5),
         lambda own: dot_kernels.tile_noise(own, 2, 3),

@@ -11,13 +11,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
 
 from labapp.core.images.dots import Grey, Picture
 from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
 
 WINDOW, CLOSE_WINDOW = 1.54, 1.3
-"""Widths of the window of a dot, over its size: of one that stands alone, and of one among others.
+"""Widths of a dot's window, over the frame's dot size: of one that stands alone, and among others.
 The wider, the less speckle moves the place, and the more noise and neighbours do."""
 
 WINDOW_SHARE = 0.275
@@ -38,9 +37,6 @@ REACH_SIZES = 10.0
 ASTRAY = 2.0
 """A place that the fit moves by more dot sizes is not the dot's: it stays where it was."""
 
-NEIGHBOURS = 8
-"""So many nearest dots tell the shape that a dot would have without speckle."""
-
 BLUR_PX, BLUR_POWER = 0.8, 1.8
 """Standard deviation of a camera's blur, as a rule; from one order of modes to the next, speckle
 keeps (1 − blur²/size²) to this power of its power."""
@@ -48,13 +44,16 @@ keeps (1 − blur²/size²) to this power of its power."""
 USUAL_PX2 = 0.2
 """Strength of speckle, px², and its standard uncertainty, before a frame tells."""
 
-LEAST_RATIO, SEEN_WEIGHT, SHAPED = 0.1, 0.25, 0.5
-"""It keeps at least so much; weight of what the frame shows of it, beside the rule; share of the
-power in the second order that may be the dots' shape."""
+LEAST_RATIO, RULE_SIGMA = 0.05, 0.8
+"""Speckle keeps at least so much of its power two orders on; standard uncertainty of the rule's
+logarithm."""
 
 OVERLAP, OVERLAP_SIZES, MOST_TAKEN = 1.2, 2.35, 0.11
 """What the fit of a neighbour so many sizes away takes up of a dot's noise: a Gaussian of that, of
 this height and width, and no more than the last."""
+
+ALONE = 0.9
+"""A dot stands alone whose neighbours' fit leaves more of its noise."""
 
 OUTLIER = 9.0
 """Projections whose square exceeds its expectation by so much are cut off there."""
@@ -114,8 +113,8 @@ def fit_dots(
     next_px = next_apart(np.ascontiguousarray(dots[:, :2]))
 
     for last in range(ROUNDS + 1):
-        size = dots[:, 3]
-        width = np.clip(WINDOW_SHARE * next_px / size, CLOSE_WINDOW, WINDOW) * size
+        usual = float(np.median(dots[:, 3]))
+        width = np.clip(WINDOW_SHARE * next_px, CLOSE_WINDOW * usual, WINDOW * usual)
         margin = int(np.ceil(2.2 * width.max())) + 1
         rest = kernels.without_dots(around[0], by, blur, dots)
         where = picture, rest, blur, dots, width, number, begin, margin
@@ -128,7 +127,7 @@ def fit_dots(
     variance = noise**2 * modes[:2, :, 1] + speckle * modes[:2, :, 2]
     sigma = np.sqrt(variance / free) / _pull(dots, width)
     u, v = start[:, :2].T
-    astray = np.hypot(dots[:, 0] - u, dots[:, 1] - v) > ASTRAY * np.median(dots[:, 3])
+    astray = np.hypot(dots[:, 0] - u, dots[:, 1] - v) > ASTRAY * usual
     return FittedDots(
         u_px=np.where(astray, u, dots[:, 0]),
         v_px=np.where(astray, v, dots[:, 1]),
@@ -191,46 +190,34 @@ def _speckle(modes: FloatArray, dots: FloatArray, noise: FloatArray, free: Float
     """Strength of the speckle, px², as it is in modes of the first order.
 
     Grains that are not small beside a dot have less power in a higher order, by about the same
-    ratio from each to the next, which depends on the camera's blur. What is alike in neighbouring
-    dots is their shape, and is taken off.
+    ratio from each to the next. The camera's blur, as it is as a rule, tells the ratio roughly, and
+    the third and fifth order of dots that stand alone tell it, too. Half of what it may be
+    off by is added, as a strength of none would be trusted most.
     """
-    shapes = modes[2:4].copy()
-    light = np.sqrt(shapes[..., 2] + 1e-30)
-    shapes[..., 0] = _without_trend(shapes[..., 0] / light, dots[:, :2]) * light
-    second, third = _power(shapes, noise, free), _power(modes[4:], noise, free)
+    third, alone = _power(modes[2:4], noise, free), free > ALONE
     sharp = 1 - (BLUR_PX / max(float(np.median(dots[:, 3])), 1.2 * BLUR_PX)) ** 2
-    ratio = sharp**BLUR_POWER
-    if second[0] > second[1] and third[0] > third[1]:
-        seen = min(max(third[0] / second[0], LEAST_RATIO), 1.0)
-        ratio = ratio ** (1 - SEEN_WEIGHT) * seen**SEEN_WEIGHT
-    one, two = second[0] / ratio, third[0] / ratio**2
-    sigma = np.hypot(second[1] / ratio, SHAPED * max(one, 0.0)), third[1] / ratio**2, USUAL_PX2
-    known = np.average([one, two, USUAL_PX2], weights=1 / np.square(sigma))
-    return max(float(known), 0.0)
-
-
-def _without_trend(values: FloatArray, place_px: FloatArray) -> FloatArray:
-    """Values, shape (k, n), less the plane through those of the nearest places; scaled alike."""
-    if len(place_px) <= 2 * NEIGHBOURS:
-        return values
-    near = scipy.spatial.cKDTree(place_px).query(place_px, k=NEIGHBOURS + 1)[1][:, 1:]
-    away = place_px[near] - place_px[:, None]
-    away /= np.abs(away).max(axis=(1, 2), keepdims=True)
-    terms = np.concatenate([np.ones((*near.shape, 1)), away], axis=2)
-    normal = np.einsum("nki,nkj->nij", terms, terms) + 0.1 * np.diag([0.0, 1.0, 1.0])
-    inverse = np.linalg.inv(normal)[:, 0]
-    share = np.einsum("nj,nkj->nk", inverse, terms)
-    left = values - np.einsum("nk,mnk->mn", share, values[:, near])
-    return np.asarray(left / np.sqrt(1 + (share**2).sum(axis=1)))
+    log_ratio = 2 * BLUR_POWER * np.log(sharp)
+    if alone.any():
+        two = [_power(modes[k : k + 2, alone], noise[alone], free[alone]) for k in (2, 4)]
+        (low, low_sigma), (high, high_sigma) = two
+        if low > low_sigma and high > 0.5 * high_sigma:
+            sigma = np.hypot(low_sigma / low, high_sigma / high)
+            weight = RULE_SIGMA**2 / (RULE_SIGMA**2 + sigma**2)
+            log_ratio += weight * (np.log(high / low) - log_ratio)
+    ratio = np.exp(np.clip(log_ratio, np.log(LEAST_RATIO), 0.0))
+    sigma = third[1] / ratio
+    weight = USUAL_PX2**2 / (USUAL_PX2**2 + sigma**2)
+    known = USUAL_PX2 + weight * (third[0] / ratio - USUAL_PX2)
+    return float(max(known, 0.0) + 0.5 * np.sqrt(weight) * sigma)
 
 
 def _power(modes: FloatArray, noise: FloatArray, free: FloatArray) -> tuple[float, float]:
-    """Power of residuals over that of the light in modes, without the noise's, and its σ; px²."""
-    square, white, shone = (
-        modes[..., 0] ** 2 / free,
-        noise**2 * modes[..., 1],
-        modes[..., 2] + 1e-30,
-    )
+    """Power of residuals over that of the light in modes, without the noise's, and its σ; px².
+
+    Of speckle, whose grains are broader than pixels, neighbours' fit takes up its share once for each order on, about.
+    """
+    square, white = modes[..., 0] ** 2 / free, noise**2 * modes[..., 1]
+    shone = free**2 * modes[..., 2] + 1e-30
     power = 0.0
     for _ in range(6):
         expected = white + max(power, 0.0) * shone

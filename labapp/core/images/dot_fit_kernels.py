@@ -234,40 +234,35 @@ def residual_sums(
 
 @_inner
 def _add_modes(
-    sums: FloatArray,
-    weight: float,
-    q: float,
-    middle: float,
-    moments: tuple[float, float, float, float],
+    sums: FloatArray, weight: float, q: float, spread: float, moments: FloatArray
 ) -> None:
-    """Add a row's part of the projections on the modes, by its moments along u."""
-    p0, p1, p2, p3 = moments
-    sums[0] += weight * p1
-    sums[1] += weight * q * p0
-    sums[2] += weight * q * p1
-    sums[3] += weight * (p2 - q * q * p0) / 2
-    sums[4] += weight * (p3 + (q * q - middle) * p1)
-    sums[5] += weight * q * (p2 + (q * q - middle) * p0)
+    """Add a row's part of the projections on the modes, by its moments along u up to the fifth."""
+    p, less = moments, q * q - 4 * spread
+    b, c = 2 * q * q - 12 * spread, q**4 - 12 * spread * q * q + 24 * spread**2
+    sums[0] += weight * p[1]
+    sums[1] += weight * q * p[0]
+    sums[2] += weight * (p[3] + less * p[1])
+    sums[3] += weight * q * (p[2] + less * p[0])
+    sums[4] += weight * (p[5] + b * p[3] + c * p[1])
+    sums[5] += weight * q * (p[4] + b * p[2] + c * p[0])
 
 
 @_inner
 def _add_squares(
-    sums: FloatArray,
-    weight: float,
-    q: float,
-    middle: float,
-    moments: tuple[float, float, float, float],
+    sums: FloatArray, weight: float, q: float, spread: float, moments: FloatArray
 ) -> None:
-    """Add a row's part of the sums of the modes' squares, by its even moments along u."""
-    s0, s2, s4, s6 = moments
-    square = q * q
-    less = square - middle
-    sums[0] += weight * s2
-    sums[1] += weight * square * s0
-    sums[2] += weight * square * s2
-    sums[3] += weight * (s4 - 2 * square * s2 + square * square * s0) / 4
-    sums[4] += weight * (s6 + 2 * less * s4 + less * less * s2)
-    sums[5] += weight * square * (s4 + 2 * less * s2 + less * less * s0)
+    """Add a row's part of the sums of the modes' squares, by its even moments up to the tenth."""
+    s, square, less = moments, q * q, q * q - 4 * spread
+    b, c = 2 * q * q - 12 * spread, q**4 - 12 * spread * q * q + 24 * spread**2
+    sums[0] += weight * s[1]
+    sums[1] += weight * square * s[0]
+    sums[2] += weight * (s[3] + 2 * less * s[2] + less * less * s[1])
+    sums[3] += weight * square * (s[2] + 2 * less * s[1] + less * less * s[0])
+    twice = b * b + 2 * c
+    sums[4] += weight * (s[5] + 2 * b * s[4] + twice * s[3] + 2 * b * c * s[2] + c * c * s[1])
+    sums[5] += (
+        weight * square * (s[4] + 2 * b * s[3] + twice * s[2] + 2 * b * c * s[1] + c * c * s[0])
+    )
 
 
 @_compiled_for(*((own, _grey, _f, _f2, _f1, _ints, _ints, _i) for own in (_grey, _byte)))
@@ -283,18 +278,23 @@ def residual_modes(
 ) -> FloatArray:
     """Projections of the residual light on modes of each dot, shape (6, n, 3), see `residual_sums`.
 
-    The modes are polynomials of the place in the window: two of the first order, two of the second
-    and two of the third, which no shift of the dot has a share in. Of each: the projection, the
-    sum of the mode's square, and of the square of mode times light.
+    The modes are polynomials of the place in the window, two each of the first, third and fifth
+    order; of a round dot's shift the first alone have a share. Of each: the projection, the sum of
+    the mode's square, and of the square of mode times light.
     """
     side, made, by = (
         2 * margin + 1,
         np.zeros((6, len(dots), 3)),
         image.shape[1] / surroundings.shape[1],
     )
-    single, power = np.float32, np.empty((6, 2 * margin + 1), np.float32)
+    single, power = np.float32, np.empty((11, 2 * margin + 1), np.float32)
     patch, light = np.empty((side, side), single), np.empty((side, side), single)
-    lines = np.empty((2, side), single)
+    lines, moments, squares, white = (
+        np.empty((2, side), single),
+        np.empty(6),
+        np.empty(6),
+        np.empty(6),
+    )
     for k in range(len(dots)):
         others = number[begin[k] : begin[k + 1]]
         level = _level(surroundings, by, blur, dots[k])
@@ -303,40 +303,26 @@ def residual_modes(
         left, top = round(u) - margin, round(v) - margin
         _bell(left, u, width[k], lines[0])
         _bell(top, v, width[k], lines[1])
-        middle = 4.0 / (1.0 / width[k] ** 2 + 1.0 / size**2)
+        spread = 1.0 / (1.0 / width[k] ** 2 + 1.0 / size**2)
         for x in range(side):
-            away = single(left + x - u)
-            weighed = lines[0, x] * away
-            power[0, x], power[1, x], power[2, x] = weighed, weighed * away, weighed * away * away
-            weighed *= weighed
-            away *= away
-            power[3, x], power[4, x], power[5, x] = weighed, weighed * away, weighed * away * away
+            away, value = single(left + x - u), single(1.0)
+            for n in range(11):
+                power[n, x] = value
+                value *= away
+        for n in range(6):
+            white[n] = 0.0
+            for x in range(side):
+                white[n] += lines[0, x] * lines[0, x] * power[2 * n, x]
         for y in range(side):
-            p0, p1, p2, p3 = single(0.0), single(0.0), single(0.0), single(0.0)
-            s0, s2, s4, s6 = single(0.0), single(0.0), single(0.0), single(0.0)
-            for x in range(side):
-                value, shone = patch[y, x], light[y, x] * light[y, x]
-                plain = lines[0, x]
-                p0 += plain * value
-                p1 += power[0, x] * value
-                p2 += power[1, x] * value
-                p3 += power[2, x] * value
-                s0 += plain * plain * shone
-                s2 += power[3, x] * shone
-                s4 += power[4, x] * shone
-                s6 += power[5, x] * shone
+            for n in range(6):
+                moment, square = single(0.0), single(0.0)
+                for x in range(side):
+                    moment += lines[0, x] * patch[y, x] * power[n, x]
+                    weighed = lines[0, x] * light[y, x]
+                    square += weighed * weighed * power[2 * n, x]
+                moments[n], squares[n] = moment, square
             q, down = top + y - v, float(lines[1, y])
-            _add_modes(made[:, k, 0], down, q, middle, (float(p0), float(p1), float(p2), float(p3)))
-            _add_squares(
-                made[:, k, 2], down**2, q, middle, (float(s0), float(s2), float(s4), float(s6))
-            )
-            s0, s2, s4, s6 = single(0.0), single(0.0), single(0.0), single(0.0)
-            for x in range(side):
-                s0 += lines[0, x] * lines[0, x]
-                s2 += power[3, x]
-                s4 += power[4, x]
-                s6 += power[5, x]
-            _add_squares(
-                made[:, k, 1], down**2, q, middle, (float(s0), float(s2), float(s4), float(s6))
-            )
+            _add_modes(made[:, k, 0], down, q, spread, moments)
+            _add_squares(made[:, k, 1], down**2, q, spread, white)
+            _add_squares(made[:, k, 2], down**2, q, spread, squares)
     return made
