@@ -27,7 +27,7 @@ def setup(tmp_path: Path) -> Path:
 
 @pytest.mark.slow
 def test_a_rendered_plate_adjusts_the_setup_file(setup: Path, tmp_path: Path):
-    look = Look(glow=0.0, speckle=0.1, dot_floor_mm=0.2)
+    look = Look(glow=0.0)
     laser = replace(EXACT.rig.laser, aim_x_mm=0.6)
     made = trace(FlatMirror(), replace(EXACT.rig, laser=laser))
     image = render(made, VIEW, look, np.random.default_rng(1)).image

@@ -23,7 +23,7 @@ from labapp.core.geometry.optics import (
     surface_normal,
 )
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
-from labapp.core.images import centroid_kernels, dot_kernels, dot_size, dots
+from labapp.core.images import centroid_kernels, dot_fit_kernels, dot_kernels, dot_size, dots
 from labapp.core.matching import match_kernels
 from labapp.core.sequence.prior import RIDGE, recurrence
 from labapp.core.surface import kernels, level_kernels
@@ -342,36 +342,72 @@ def test_ridges_are_long_at_any_angle_and_at_the_edge() -> None:
         assert dot_kernels.ridges(band, np.array([at]), np.array([30]), 10.0) == [long]
 
 
-def centroids_by_hand(
-    light: FloatArray, u: int, v: int, margin: int, width: float
-) -> tuple[float, float, float]:
-    """A window moved on to the light until it stays, in NumPy: column, row, second moment."""
-    wide = np.pad(np.maximum(light, 0.0), margin)
-    patch = wide[v : v + 2 * margin + 1, u : u + 2 * margin + 1].astype(float)
-    y, x = np.mgrid[-margin : margin + 1, -margin : margin + 1]
-    at_u = at_v = 0.0
-    for _ in range(4):
-        weight = patch * np.exp(-((x - at_u) ** 2 + (y - at_v) ** 2) / (2 * width**2))
-        weight /= weight.sum() + 1e-12
-        mean_u, mean_v = (weight * x).sum(), (weight * y).sum()
-        square = (weight * (x**2 + y**2)).sum() - mean_u**2 - mean_v**2
-        at_u, at_v = at_u + 1.5 * (mean_u - at_u), at_v + 1.5 * (mean_v - at_v)
-        at_u, at_v = np.clip(at_u, -2, 2), np.clip(at_v, -2, 2)
-    return at_u, at_v, square
+def fitted_picture() -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Crowded dots, shape (n, 4), and some light over those and a slope, near edges, too."""
+    rng = random()
+    place = np.stack(np.meshgrid(np.arange(4.0, 76.0, 8.0), np.arange(6.0, 58.0, 9.0)), -1)
+    place = place.reshape(-1, 2) + rng.uniform(-1.5, 1.5, (54, 2))
+    dots = np.column_stack([place, rng.uniform(20, 60, 54), rng.uniform(1.2, 2.2, 54)])
+    v, u = np.mgrid[:64, :80]
+    return dots, light_of(dots, (64, 80)), 12.0 + 0.1 * u - 0.05 * v + rng.normal(0, 2, (64, 80))
 
 
-@pytest.mark.parametrize("sigma", [0.0, 1.1])
-def test_centroids_are_those_of_the_blurred_picture_over_what_is_around_it(sigma: float) -> None:
-    place, image = picture()
-    u, v = np.rint(place).astype(np.int64).T
-    width = random().uniform(1.0, 2.2, len(u))
-    around = dot_size.blur(image, 4.0) if sigma else np.zeros_like(image)
-    taps = dot_size.kernel(sigma)
-    light = cv2.sepFilter2D(image, -1, taps, taps, borderType=cv2.BORDER_REFLECT) - around
-    offset, moment = centroid_kernels.centroids(image, around, taps, u, v, 6, width, 2.0)
-    for k in range(len(u)):
-        wanted = centroids_by_hand(light, u[k], v[k], 6, width[k])
-        np.testing.assert_allclose([*offset[:, k], moment[k]], wanted, atol=1e-5)
+def light_of(dots: FloatArray, shape: tuple[int, int], blur: float = 0.0) -> FloatArray:
+    """Light of round dots, blurred, in a picture whose edges are mirrors if it is blurred."""
+    v, u = np.mgrid[: shape[0], : shape[1]]
+    made = np.zeros(shape)
+    for u_px, v_px, peak, size in dots:
+        wide = size**2 + blur**2
+        for at_u in (u_px, -1 - u_px, 2 * shape[1] - 1 - u_px) if blur else (u_px,):
+            for at_v in (v_px, -1 - v_px, 2 * shape[0] - 1 - v_px) if blur else (v_px,):
+                square = (u - at_u) ** 2 + (v - at_v) ** 2
+                made += peak * size**2 / wide * np.exp(-square / (2 * wide))
+    return made
+
+
+def test_residual_light_of_bytes_is_that_of_numbers() -> None:
+    dots, light, rest = fitted_picture()
+    coarse, level = np.rint(light + rest).astype(np.uint8), np.full(light.shape, 12.0, np.float32)
+    number, begin = dot_fit_kernels.neighbours(dots[:, 0], dots[:, 1], 25.0)
+    given = level, 7.0, dots, 1.3 * dots[:, 3], number, begin, 6
+    for made in (dot_fit_kernels.residual_sums, dot_fit_kernels.residual_modes):
+        one, other = made(coarse, *given), made(coarse.astype(np.float32), *given)
+        np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-3)
+
+
+def test_dots_are_taken_off_a_blurred_picture() -> None:
+    dots, light, rest = fitted_picture()
+    blurred = light_of(dots, light.shape, 7.0)
+    left = dot_fit_kernels.without_dots((blurred + rest).astype(np.float32), 1.0, 7.0, dots)
+    np.testing.assert_allclose(left, rest, atol=0.02)
+
+
+def test_residual_light_is_what_dots_and_surroundings_leave() -> None:
+    dots, light, rest = fitted_picture()
+    level = np.full(light.shape, 12.0, np.float32)
+    width, margin = 1.3 * dots[:, 3], 6
+    number, begin = dot_fit_kernels.neighbours(dots[:, 0], dots[:, 1], 25.0)
+    given = (light + rest).astype(np.float32), level, 7.0, dots, width, number, begin, margin
+    sums, modes = dot_fit_kernels.residual_sums(*given), dot_fit_kernels.residual_modes(*given)
+    v, u = np.mgrid[:64, :80]
+    for k, (u_px, v_px, _, size) in enumerate(dots):
+        near = (np.abs(u - round(u_px)) <= margin) & (np.abs(v - round(v_px)) <= margin)
+        p, q = (u - u_px)[near], (v - v_px)[near]
+        square = p**2 + q**2
+        window = np.exp(-square / (2 * width[k] ** 2))
+        left, profile = window * (rest - 12.0)[near], np.exp(-square / (2 * size**2))
+        made = left @ np.stack([0 * p + 1, p, q, profile, profile * square], -1)
+        np.testing.assert_allclose(sums[k, :5], made, rtol=1e-3, atol=0.15)
+        spread = 1 / (1 / width[k] ** 2 + 1 / size**2)
+        third = square - 4 * spread
+        fifth = square**2 - 12 * spread * square + 24 * spread**2
+        mode = np.stack([each for by in (1.0, third, fifth) for each in (by * p, by * q)])
+        large = np.sqrt(np.square(mode) @ window**2)
+        np.testing.assert_allclose(modes[:, k, 0] / large, mode @ left / large, atol=0.1)
+        seen = np.square(mode) @ (window * light[near]) ** 2
+        np.testing.assert_allclose(modes[:, k, 2], seen, rtol=0.03)
+        if 8 < u_px < 70 and 8 < v_px < 54:  # the window is in the picture
+            np.testing.assert_allclose(modes[:, k, 1], np.square(mode) @ window**2, rtol=1e-3)
 
 
 def test_an_enlarged_band_is_that_of_the_whole_picture_where_it_is_over_a_floor() -> None:
@@ -491,11 +527,9 @@ def test_the_finer_band_is_that_of_the_whole_picture() -> None:
 def test_bytes_are_read_as_they_are() -> None:
     place, image = picture()
     u, v = np.rint(place).astype(np.int64).T
-    coarse, around = np.clip(image + 20, 0, 255).astype(np.uint8), np.full(image.shape, 20.0, "f4")
-    taps, width = cv2.getGaussianKernel(9, 1.1, cv2.CV_32F).ravel(), np.full(len(u), 2.0)
+    coarse = np.clip(image + 20, 0, 255).astype(np.uint8)
     narrow, wide = np.float32(random().uniform(0, 1, (2, 3, 13)))
     for made in (
-        lambda own: centroid_kernels.centroids(own, around, taps, u, v, 6, width, 2.0),
         lambda own: centroid_kernels.finest(own, u, v, narrow, wide),
         lambda own: dot_kernels.spikes(own, 3.0, 1.9, 1.2, 5),
         lambda own: dot_kernels.tile_noise(own, 2, 3),

@@ -72,9 +72,7 @@ def plate(setup: Path) -> GreyImage:
     points = {key: tuple(x) if isinstance(x, list) else x for key, x in given.items()}
     reflections = trace(FlatMirror(), read_setup(setup).rig)
     rng = np.random.default_rng(5)
-    image = render(
-        reflections, CameraView(**points), Look(glow=0.0, speckle=0.1, dot_floor_mm=0.14), rng
-    ).image
+    image = render(reflections, CameraView(**points), Look(glow=0.0), rng).image
     return np.asarray(image, np.uint8)
 
 

@@ -216,9 +216,23 @@ class System:
         return np.asarray(observed - computed)
 
     def standardised(self, k: int, bench: FloatArray, pose: FloatArray) -> FloatArray:
-        """The same over their standard uncertainties, shape (2n,)."""
-        residual = np.einsum("nij,nj->ni", self.roots[k], self.residual_mm(k, bench, pose))
+        """The same over their standard uncertainties, shape (2n,).
+
+        The dots' noise is that of the picture: it does not shrink on a plane of another scale.
+        """
+        scale = np.linalg.inv(self._enlargement(k, bench))
+        residual = scale @ self.residual_mm(k, bench, pose)[..., None]
+        residual = (self.roots[k] @ residual)[..., 0]
         return np.where(np.isfinite(residual), residual, LOST).ravel()
+
+    def _enlargement(self, k: int, bench: FloatArray) -> FloatArray:
+        """Derivatives of observed dots by what they were before the check, shape (n, 2, 2)."""
+        known, seen = self.rig.uncertainty, self.sightings[k].plane_mm
+        assert known is not None
+        offset = self.factor @ bench
+        places = np.concatenate([seen, *(seen + step for step in np.eye(2))])
+        moved = moved_dots(places, self.rig, known.axes, offset).reshape(3, -1, 2)
+        return np.stack([moved[1] - moved[0], moved[2] - moved[0]], axis=-1)
 
     def residuals(self, unknown: FloatArray) -> FloatArray:
         """Standardised residuals of all sightings, shape (m,)."""

@@ -185,7 +185,11 @@ def _by_grid(observed: Observation, picture: Picture) -> list[IntArray]:
 
 
 def _by_places(observed: Observation, picture: Picture) -> list[IntArray]:
-    """Labels by where the expected bench has the dots of a ball or cap, at places all over."""
+    """Labels by where the expected bench has the dots of a ball or cap, at places all over.
+
+    A row or column on, with the mirror moved as much, they fit a bench that may be off as well: the
+    absent ray is put at each hole that the lit ones leave.
+    """
     mirror, rig = picture.mirror, observed.rig
     if "x_mm" not in mirror.parameters:
         return []
@@ -197,7 +201,25 @@ def _by_places(observed: Observation, picture: Picture) -> list[IntArray]:
         relabelled(observed, mirror, still, np.array([*place, *mirror.pose[2:]]), LOOSE)
         for place in product(x, y)
     ]
-    return sorted(made, key=lambda labels: -int((labels != UNLABELLED).sum()))[: 2 * MOST_STARTS]
+    made.sort(key=lambda labels: -int((labels != UNLABELLED).sum()))
+    i, j = rig.pattern.marker or rig.pattern.reference
+    found: dict[bytes, IntArray] = {}
+    for labels in made[: 4 * MOST_STARTS]:
+        holes = (labels == UNLABELLED) & (_lit_neighbours(labels) >= SURROUNDED)
+        for site in np.argwhere(holes):
+            moved = _moved(labels, np.array([i - 1, j - 1]) - site)
+            found.setdefault(moved.tobytes(), moved)
+    return list(found.values())
+
+
+def _moved(labels: IntArray, by: IntArray) -> IntArray:
+    """Labels so many rows and columns on; what leaves the pattern gets no ray."""
+    made = np.full_like(labels, UNLABELLED)
+    at = np.argwhere(labels != UNLABELLED)
+    to = at + by
+    inside = ((to >= 0) & (to < labels.shape)).all(axis=1)
+    made[tuple(to[inside].T)] = labels[tuple(at[inside].T)]
+    return made
 
 
 def _explains(observed: Observation, one: Labelled) -> bool:

@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 import scipy
 
+from labapp.core.images.dot_fit import fit_dots
 from labapp.core.images.dot_size import (
     SLENDER,
     as_picture,
@@ -52,12 +53,12 @@ ROUND_PX2 = 0.25
 LEAST_PX2 = 0.8
 """A blur of less, px² of the smaller picture, is not taken of it."""
 
-CENTROID_WIDENING = 1.4
-"""Centroids are taken over windows wider by this than a dot is found by: over more of its grains of
-speckle, which then move it less."""
+AROUND_SIZES = 4.2
+"""A dot's surroundings are blurred by so many of its sizes."""
 
-MOST_SURROUNDINGS = 0.3
-"""Where the dots' surroundings are a larger share of the picture, all of it is blurred at once."""
+AROUND_PX2 = 3.0
+"""Variance of that blur, px² of the smaller picture it is taken of, at least: it is followed by its
+values at pixels."""
 
 HALVED_PX, NEARLY = 1.5, 0.75
 """Dots of this size are sought at half the size: a peak over the floor has a pixel there that is
@@ -65,9 +66,6 @@ over so much of it."""
 
 PEAK_GAIN = 1 / 1.64 - 1 / 3.56
 """What a Gaussian dot of the band's own size keeps of its height: 1/(1 + 0.8²) − 1/(1 + 1.6²)."""
-
-WIDTH_KEPT = 0.8
-"""What is left of a Gaussian dot's width when its surroundings are taken off."""
 
 
 @dataclass(frozen=True)
@@ -291,25 +289,24 @@ class _BandPassed:
         ridges = dot_kernels.ridges(self.band, u // self.step, v // self.step, SLENDER)
         return np.asarray(~sharp & ~ridges)
 
-    def light(
-        self, u: IntArray, v: IntArray, width: FloatArray, reach: float
-    ) -> tuple[FloatArray, FloatArray]:
-        """Centroids, (u, v), and moments of the light over its surroundings.
-
-        Windows move for a few steps only: beside a brighter dot they would move on to that.
-        """
-        from labapp.core.images import centroid_kernels
-
-        variance = ((3.0 * CENTROID_WIDENING) ** 2 - 0.8**2) * (self.size / self.step) ** 2
-        around = smaller_blurred(self._narrow, variance)
-        margin, taps, picture = margin_of(reach), kernel(0.5 * self.size), self.picture
-        if len(u) * (2 * margin + 1) ** 2 > MOST_SURROUNDINGS * picture.size:
-            into = scratch("picture", picture.shape)
-            picture, taps = blur(picture, 0.5 * self.size, into), kernel(0.0)
-        (x, y), moment = centroid_kernels.centroids(
-            picture, around, taps, u, v, margin, width, reach
-        )
-        return np.stack([u + x, v + y]), moment
+    def around(self) -> tuple[Grey, float]:
+        """The picture, made smaller and blurred, and the blur's standard deviation, px."""
+        image, (height, width), scale = self._narrow, self._narrow.shape, 1
+        variance = (AROUND_SIZES**2 - 0.8**2) * (self.size / self.step) ** 2
+        while (
+            variance / (2 * scale) ** 2 > AROUND_PX2
+            and height % (2 * scale) == width % (2 * scale) == 0
+        ):
+            scale *= 2
+        shape = height // scale, width // scale
+        if scale > 1:
+            into = scratch(f"around {scale}", shape)
+            image = np.asarray(
+                cv2.resize(image, shape[::-1], into, 0, 0, cv2.INTER_AREA), np.float32
+            )
+        left = variance / scale**2 - (1 - scale**-2) / 12
+        made = blur(image, float(np.sqrt(left)), scratch(f"around {scale} blurred", shape))
+        return made, AROUND_SIZES * self.size
 
 
 def widen(image: Grey, into: Grey, variance_px2: float) -> None:
@@ -360,37 +357,19 @@ def _nine(sigma: float, widest: float) -> Grey:
     return np.asarray(nine)
 
 
-def window_widths(next_px: FloatArray, reach: float) -> FloatArray:
-    """Widths of the Gaussian windows of dots so far from the next one, shape (n,), px.
-
-    A window that ends half-way to the next dot keeps its light out.
-    """
-    return np.minimum(1.1 * reach, np.maximum(0.275 * next_px, 0.75))
-
-
-def margin_of(reach: float) -> int:
-    """So far from a peak, px, light is weighed."""
-    return int(np.ceil(2.2 * reach)) + 1
-
-
-def _described(seen: _BandPassed, peaks: Peaks, noise: Grey, speckle_px: float) -> Dots:
-    """Centroid, its uncertainty, size, peak and signal-to-noise of each peak."""
-    from labapp.core.images import dot_kernels
-
+def _described(seen: _BandPassed, peaks: Peaks, noise: Grey, least_px: float) -> Dots:
+    """Place, its uncertainty, size, peak and signal-to-noise of each peak."""
     (u, v, bright), size = peaks, seen.size
-    width = window_widths(dot_kernels.next_apart(pairs(u, v)), CENTROID_WIDENING * size)
-    (u_px, v_px), moment = seen.light(u, v, width, CENTROID_WIDENING * size)
-    moment = np.clip(moment / 2, 1e-3, 0.95 * width**2)
-    spread = (1 / (1 / moment - 1 / width**2) - (0.5 * size) ** 2) / WIDTH_KEPT**2
     peak = bright / PEAK_GAIN
-    snr = peak / np.maximum(noise[v, u], 1e-3 * np.max(peak))
-    sigma = np.hypot(0.8 / snr, speckle_px)
+    own = np.maximum(noise[v, u], 1e-3 * np.max(peak)).astype(np.float64)
+    start = np.stack([u, v, peak, np.full(len(u), size)], axis=1).astype(np.float64)
+    fitted = fit_dots(seen.picture, seen.around(), start, own)
     return Dots(
-        u_px=u_px,
-        v_px=v_px,
-        u_sigma_px=sigma,
-        v_sigma_px=sigma.copy(),
-        size_px=np.sqrt(np.clip(spread, (0.3 * size) ** 2, (3.0 * size) ** 2)),
+        u_px=fitted.u_px,
+        v_px=fitted.v_px,
+        u_sigma_px=np.hypot(fitted.u_sigma_px, least_px),
+        v_sigma_px=np.hypot(fitted.v_sigma_px, least_px),
+        size_px=np.clip(fitted.size_px, 0.3 * size, 3.0 * size),
         peak=peak,
-        snr=snr,
+        snr=peak / own,
     )

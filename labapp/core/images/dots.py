@@ -66,10 +66,11 @@ class BandPassSettings:
     contrast
         … and is at least this fraction of the frame's typical dot.
     speckle_px
-        Part of the position's uncertainty that no signal-to-noise removes.
+        Least standard uncertainty of a position, px, beside what noise and speckle of the frame
+        give it.
     """
 
     size_px: float | None = None
     threshold: float = 6.0
     contrast: float = 0.15
-    speckle_px: float = 0.12
+    speckle_px: float = 0.02

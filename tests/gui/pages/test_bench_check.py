@@ -50,7 +50,7 @@ def plate() -> GreyImage:
     rig = read_setup(SETUP).rig
     laser = replace(rig.laser, projection_angle_deg=TRUE_ANGLE_DEG)
     rig = replace(rig, laser=laser, pattern=replace(rig.pattern, rotation_deg=TRUE_ROTATION_DEG))
-    look, rng = Look(glow=0.0, speckle=0.1, dot_floor_mm=0.14), np.random.default_rng(3)
+    look, rng = Look(glow=0.0), np.random.default_rng(3)
     return np.asarray(render(trace(FlatMirror(), rig), view, look, rng).image, np.uint8)
 
 

@@ -1,0 +1,227 @@
+"""Joint fit of all dots to a picture: places that neighbours' light does not move, and their σ.
+
+Every dot is a round Gaussian; what neighbours and surroundings add to its window is taken off by
+the others' fit. Speckle, which is in proportion to the light, scatters the places more than the
+camera's noise does. How strong it is, the residual light tells: in modes that a shift of the dot
+has no share in.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from labapp.core.images.dots import Grey, Picture
+from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
+
+WINDOW, CLOSE_WINDOW = 1.54, 1.3
+"""Widths of a dot's window, over the frame's dot size: of one that stands alone, and among others.
+The wider, the less speckle moves the place, and the more noise and neighbours do."""
+
+WINDOW_SHARE = 0.275
+"""Of the way to the next dot, which a window is no wider than if it is wider than the least."""
+
+ROUNDS, SETTLED_PX = 12, 0.002
+"""Rounds of the fit at most; places have settled that move by less."""
+
+ALIKE = 1.0
+"""Weight of the frame's size in each dot's, over that of the dot's own light."""
+
+MOST_GROWTH, MOST_MOVE = 0.25, 1.0
+"""A size changes by no more than this share in a round, nor a place by more than this, px."""
+
+REACH_SIZES = 10.0
+"""Dots so many sizes apart have no light in each other's windows."""
+
+ASTRAY = 2.0
+"""A place that the fit moves by more dot sizes is not the dot's: it stays where it was."""
+
+BLUR_PX, BLUR_POWER = 0.8, 1.8
+"""Standard deviation of a camera's blur, as a rule; from one order of modes to the next, speckle
+keeps (1 − blur²/size²) to this power of its power."""
+
+USUAL_PX2 = 0.2
+"""Strength of speckle, px², and its standard uncertainty, before a frame tells."""
+
+LEAST_RATIO, RULE_SIGMA = 0.05, 0.8
+"""Speckle keeps at least so much of its power two orders on; standard uncertainty of the rule's
+logarithm."""
+
+OVERLAP, OVERLAP_SIZES, MOST_TAKEN = 1.2, 2.35, 0.11
+"""What the fit of a neighbour so many sizes away takes up of a dot's noise: a Gaussian of that, of
+this height and width, and no more than the last."""
+
+ALONE = 0.9
+"""A dot stands alone whose neighbours' fit leaves more of its noise."""
+
+OUTLIER = 9.0
+"""Projections whose square exceeds its expectation by so much are cut off there."""
+
+
+@dataclass(frozen=True)
+class FittedDots(ReadOnlyArrays):
+    """Dots by the fit; every array has shape (n,).
+
+    Parameters
+    ----------
+    u_px, v_px
+        Place.
+    u_sigma_px, v_sigma_px
+        Its standard uncertainty.
+    size_px
+        Standard deviation of the dot's light.
+    speckle_px2
+        Strength of the speckle in the frame: its contrast squared times the area of a grain.
+    """
+
+    u_px: FloatArray
+    v_px: FloatArray
+    u_sigma_px: FloatArray
+    v_sigma_px: FloatArray
+    size_px: FloatArray
+    speckle_px2: float
+
+
+def fit_dots(
+    picture: Picture,
+    around: tuple[Grey, float],
+    start: FloatArray,
+    noise: FloatArray,
+) -> FittedDots:
+    """Fit dots to a picture.
+
+    Parameters
+    ----------
+    picture
+        Shape (height, width).
+    around
+        The picture, made smaller and blurred by a Gaussian, and that Gaussian's standard deviation
+        in pixels of the picture.
+    start
+        Place u and v, peak and size of each dot to begin with, shape (n, 4).
+    noise
+        The camera's noise at each dot, shape (n,), grey levels.
+    """
+    from labapp.core.images import dot_fit_kernels as kernels
+    from labapp.core.images.dot_kernels import next_apart
+
+    dots, usual = np.array(start, np.float64), float(np.median(start[:, 3]))
+    by, blur = picture.shape[1] / around[0].shape[1], around[1]
+    number, begin = kernels.neighbours(dots[:, 0], dots[:, 1], REACH_SIZES * usual)
+    move = np.inf
+    next_px = next_apart(np.ascontiguousarray(dots[:, :2]))
+
+    for last in range(ROUNDS + 1):
+        usual = float(np.median(dots[:, 3]))
+        width = np.clip(WINDOW_SHARE * next_px, CLOSE_WINDOW * usual, WINDOW * usual)
+        margin = int(np.ceil(2.2 * width.max())) + 1
+        rest = kernels.without_dots(around[0], by, blur, dots)
+        where = picture, rest, blur, dots, width, number, begin, margin
+        if last == ROUNDS or move < SETTLED_PX:
+            break
+        move = _improve(dots, kernels.residual_sums(*where), width)
+    modes = kernels.residual_modes(*where)
+    free = _free_share(dots, number, begin)
+    speckle = _speckle(modes, dots, noise, free)
+    variance = noise**2 * modes[:2, :, 1] + speckle * modes[:2, :, 2]
+    sigma = np.sqrt(variance / free) / _pull(dots, width)
+    u, v = start[:, :2].T
+    astray = np.hypot(dots[:, 0] - u, dots[:, 1] - v) > ASTRAY * usual
+    return FittedDots(
+        u_px=np.where(astray, u, dots[:, 0]),
+        v_px=np.where(astray, v, dots[:, 1]),
+        u_sigma_px=np.where(astray, usual, sigma[0]),
+        v_sigma_px=np.where(astray, usual, sigma[1]),
+        size_px=dots[:, 3].copy(),
+        speckle_px2=speckle,
+    )
+
+
+def _pull(dots: FloatArray, width: FloatArray) -> FloatArray:
+    """What the first moment in the window changes by with a dot's place, shape (n,)."""
+    _, _, peak, size = dots.T
+    return np.asarray(peak / size**2 * 2 * np.pi / (1 / width**2 + 1 / size**2) ** 2)
+
+
+def _improve(dots: FloatArray, sums: FloatArray, width: FloatArray) -> float:
+    """Improve places, peaks and sizes by one round of least squares; returns the largest move.
+
+    Peak, size and dark level are solved for together, dot by dot; sizes are drawn to the frame's.
+    """
+    peak, size = dots[:, 2].copy(), dots[:, 3].copy()
+    plain, by_u, by_v, by_own, by_wide, window = sums.T
+    one, two = 1 / width**2 + 1 / size**2, 1 / width**2 + 2 / size**2
+    grown = peak / size**2  # times r² and the profile: the derivative by ln size
+    # Normal equations of peak (0), dark level (1) and ln size (2), by integrals over Gaussians.
+    n00, n01, n11 = 2 * np.pi / two, 2 * np.pi / one, window
+    n02, n12 = grown * 4 * np.pi / two**2, grown * 4 * np.pi / one**2
+    n22 = grown**2 * 16 * np.pi / two**3
+    g2 = grown * by_wide
+    det = n00 * n11 - n01**2
+    with np.errstate(divide="ignore", invalid="ignore"):
+        own = (n11 * n02 - n01 * n12) / det, (n00 * n12 - n01 * n02) / det
+        curvature = n22 - n02 * own[0] - n12 * own[1]
+        slope = g2 - by_own * own[0] - plain * own[1]
+    usual = float(np.median(size))
+    pooled = slope.sum() / curvature.sum()
+    hold = ALIKE * curvature.mean()
+    growth = (slope + hold * (pooled - np.log(size / usual))) / (curvature + hold)
+    growth = np.clip(growth, -MOST_GROWTH, MOST_GROWTH)
+    rest_own, rest_plain = by_own - n02 * growth, plain - n12 * growth
+    higher = (n11 * rest_own - n01 * rest_plain) / det
+    move = np.stack([by_u, by_v]) / _pull(dots, width)
+    move = np.clip(np.nan_to_num(move), -MOST_MOVE, MOST_MOVE)
+    dots[:, :2] += move.T
+    dots[:, 2] = np.maximum(peak + np.nan_to_num(higher), 0.1 * np.median(peak))
+    dots[:, 3] = size * np.exp(np.nan_to_num(growth))
+    return float(np.abs(move).max())
+
+
+def _free_share(dots: FloatArray, number: IntArray, begin: IntArray) -> FloatArray:
+    """Share of a dot's noise that its near neighbours' fit does not take up, shape (n,)."""
+    own = np.repeat(np.arange(len(dots)), np.diff(begin))
+    away = np.hypot(*(dots[number, :2] - dots[own, :2]).T) / dots[own, 3]
+    taken = np.minimum(MOST_TAKEN, OVERLAP * np.exp(-((away / OVERLAP_SIZES) ** 2)))
+    return np.exp(-np.bincount(own, taken, len(dots)))
+
+
+def _speckle(modes: FloatArray, dots: FloatArray, noise: FloatArray, free: FloatArray) -> float:
+    """Strength of the speckle, px², as it is in modes of the first order.
+
+    Grains that are not small beside a dot have less power in a higher order, by about the same
+    ratio from each to the next. The camera's blur, as it is as a rule, tells the ratio roughly, and
+    the third and fifth order of dots that stand alone tell it, too. Half of what it may be
+    off by is added, as a strength of none would be trusted most.
+    """
+    third, alone = _power(modes[2:4], noise, free), free > ALONE
+    sharp = 1 - (BLUR_PX / max(float(np.median(dots[:, 3])), 1.2 * BLUR_PX)) ** 2
+    log_ratio = 2 * BLUR_POWER * np.log(sharp)
+    if alone.any():
+        two = [_power(modes[k : k + 2, alone], noise[alone], free[alone]) for k in (2, 4)]
+        (low, low_sigma), (high, high_sigma) = two
+        if low > low_sigma and high > 0.5 * high_sigma:
+            sigma = np.hypot(low_sigma / low, high_sigma / high)
+            weight = RULE_SIGMA**2 / (RULE_SIGMA**2 + sigma**2)
+            log_ratio += weight * (np.log(high / low) - log_ratio)
+    ratio = np.exp(np.clip(log_ratio, np.log(LEAST_RATIO), 0.0))
+    sigma = third[1] / ratio
+    weight = USUAL_PX2**2 / (USUAL_PX2**2 + sigma**2)
+    known = USUAL_PX2 + weight * (third[0] / ratio - USUAL_PX2)
+    return float(max(known, 0.0) + 0.5 * np.sqrt(weight) * sigma)
+
+
+def _power(modes: FloatArray, noise: FloatArray, free: FloatArray) -> tuple[float, float]:
+    """Power of residuals over that of the light in modes, without the noise's, and its σ; px².
+
+    Of speckle, whose grains are broader than pixels, neighbours' fit takes up its share once for each order on, about.
+    """
+    square, white = modes[..., 0] ** 2 / free, noise**2 * modes[..., 1]
+    shone = free**2 * modes[..., 2] + 1e-30
+    power = 0.0
+    for _ in range(6):
+        expected = white + max(power, 0.0) * shone
+        capped = np.minimum(square, OUTLIER * expected)
+        weight = float(np.sum((shone / expected) ** 2))
+        power = float(np.sum((capped - white) * shone / expected**2)) / weight
+    return power, float(np.sqrt(2 / weight))

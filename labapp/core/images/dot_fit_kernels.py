@@ -1,0 +1,328 @@
+"""Inner loops of the joint fit of dots to a picture, compiled for the processor (docs/adr/0018)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import types
+
+from labapp.core.compiled import compiled as _compiled
+from labapp.core.compiled import compiled_for as _compiled_for
+from labapp.core.compiled import inner as _inner
+from labapp.core.images.dots import Grey, Picture
+from labapp.core.values import FloatArray, IntArray
+
+_f, _i = types.float64, types.int64
+_f1 = types.Array(_f, 1, "A", readonly=True)
+_f2 = types.Array(_f, 2, "C", readonly=True)
+_grey = types.Array(types.float32, 2, "C", readonly=True)
+_byte = types.Array(types.uint8, 2, "C", readonly=True)
+_ints = types.Array(_i, 1, "A", readonly=True)
+
+NEIGHBOUR_SIZES, AROUND_SIZES = 3.5, 4.0
+"""A dot's light is followed so many standard deviations far, and its blurred light."""
+
+
+@_inner
+def _bell(first: int, center: float, width: float, values: Grey) -> None:
+    """A Gaussian at whole numbers from the first on: each value is the last times a ratio."""
+    away = first - center
+    value = np.exp(-0.5 * (away / width) ** 2)
+    ratio, shrinks = np.exp(-(away + 0.5) / width**2), np.exp(-1.0 / width**2)
+    for k in range(len(values)):
+        values[k] = value
+        value *= ratio
+        ratio *= shrinks
+
+
+@_inner
+def _between(picture: Grey, u: float, v: float, by: float) -> float:
+    """Value of a picture, which is ``by`` times smaller, at a place in the large one."""
+    height, width = picture.shape
+    x = min(max((u + 0.5) / by - 0.5, 0.0), width - 1.0)
+    y = min(max((v + 0.5) / by - 0.5, 0.0), height - 1.0)
+    i, j = min(int(x), max(width - 2, 0)), min(int(y), max(height - 2, 0))
+    right, below = min(i + 1, width - 1), min(j + 1, height - 1)
+    x, y = x - i, y - j
+    high = (1 - x) * picture[j, i] + x * picture[j, right]
+    low = (1 - x) * picture[below, i] + x * picture[below, right]
+    return float((1 - y) * high + y * low)
+
+
+@_compiled(_f1, _f1, _f)
+def neighbours(u: FloatArray, v: FloatArray, reach: float) -> tuple[IntArray, IntArray]:
+    """Numbers of the other places within reach of each, and where each one's numbers begin."""
+    count, total = len(u), 0
+    begin = np.zeros(count + 1, np.int64)
+    number = np.empty(16 * count + 16, np.int64)
+    for k in range(count):
+        for other in range(count):
+            if other == k or (u[k] - u[other]) ** 2 + (v[k] - v[other]) ** 2 > reach * reach:
+                continue
+            if total == len(number):
+                number = np.append(number, np.empty(total, np.int64))
+            number[total] = other
+            total += 1
+        begin[k + 1] = total
+    return number[:total], begin
+
+
+@_inner
+def _patch(
+    image: Picture,
+    level: tuple[float, float, float],
+    dots: FloatArray,
+    others: IntArray,
+    k: int,
+    patch: Grey,
+    light: Grey,
+    lines: Grey,
+) -> None:
+    """Residual light round a dot, all dots and the surroundings taken off, and all dots' light.
+
+    Both are of shape (side, side); nothing is left outside the picture.
+    """
+    (u, v, peak, size), side = dots[k], len(patch)
+    left, top = round(u) - side // 2, round(v) - side // 2
+    across, down = lines[0, :side], lines[1, :side]
+    _bell(left, u, size, across)
+    _bell(top, v, size, down)
+    for y in range(side):
+        row, height = light[y], np.float32(peak) * down[y]
+        for x in range(side):
+            row[x] = height * across[x]
+    for other in others:
+        u_other, v_other, peak, size = dots[other]
+        far = side / 2 + NEIGHBOUR_SIZES * size
+        if abs(u_other - u) > far or abs(v_other - v) > far:
+            continue
+        _bell(left, u_other, size, across)
+        _bell(top, v_other, size, down)
+        for y in range(side):
+            row, height = light[y], np.float32(peak) * down[y]
+            for x in range(side):
+                row[x] += height * across[x]
+    first, last = max(-left, 0), min(side, image.shape[1] - left)
+    slope = np.float32(level[1])
+    for y in range(side):
+        row = patch[y]
+        if not 0 <= top + y < image.shape[0]:
+            row[:] = 0.0
+            continue
+        dark = np.float32(level[0] + level[1] * (left - u) + level[2] * (top + y - v))
+        row[:first] = 0.0
+        row[last:] = 0.0
+        seen, own = image[top + y, left + first : left + last], light[y, first:last]
+        made = row[first:last]
+        for x in range(len(made)):
+            made[x] = np.float32(seen[x]) - own[x] - (dark + slope * np.float32(first + x))
+
+
+@_inner
+def _level(
+    surroundings: Grey, by: float, blur: float, dot: FloatArray
+) -> tuple[float, float, float]:
+    """Dark level at a dot, and its slopes."""
+    u, v, far = dot[0], dot[1], blur / 2
+    right, left = _between(surroundings, u + far, v, by), _between(surroundings, u - far, v, by)
+    below, above = _between(surroundings, u, v + far, by), _between(surroundings, u, v - far, by)
+    slopes = (right - left) / (2 * far), (below - above) / (2 * far)
+    return _between(surroundings, u, v, by), slopes[0], slopes[1]
+
+
+@_inner
+def _folded_bell(center: float, by: float, width: float, values: Grey) -> tuple[int, int]:
+    """A Gaussian at the pixels of a smaller picture whose edges are mirrors; from where, to where.
+
+    It is that of a place in the large picture, and of a width there.
+    """
+    count, at, far = len(values), (center + 0.5) / by - 0.5, width / by
+    first, last = int(at - AROUND_SIZES * far), int(at + AROUND_SIZES * far) + 1
+    values[max(first, 0) : min(last + 1, count)] = 0.0
+    begin, end = count, 0
+    for k in range(first, last + 1):
+        own = -1 - k if k < 0 else (2 * count - 1 - k if k >= count else k)
+        if 0 <= own <= last and first <= own < count:
+            values[own] += np.exp(-0.5 * ((k - at) / far) ** 2)
+            begin, end = min(begin, own), max(end, own + 1)
+    return begin, end
+
+
+@_compiled(_grey, _f, _f, _f2)
+def without_dots(around: Grey, by: float, blur: float, dots: FloatArray) -> Grey:
+    """A picture, ``by`` times smaller and blurred, without the light of dots, shape (n, 4)."""
+    made = around.copy()
+    across, down = np.empty(around.shape[1], np.float32), np.empty(around.shape[0], np.float32)
+    for k in range(len(dots)):
+        u, v, peak, size = dots[k]
+        wide = size**2 + blur**2
+        left, right = _folded_bell(u, by, np.sqrt(wide), across)
+        top, bottom = _folded_bell(v, by, np.sqrt(wide), down)
+        for y in range(top, bottom):
+            row, height = made[y], np.float32(peak * size**2 / wide) * down[y]
+            for x in range(left, right):
+                row[x] -= height * across[x]
+    return made
+
+
+@_compiled_for(*((own, _grey, _f, _f2, _f1, _ints, _ints, _i) for own in (_grey, _byte)))
+def residual_sums(
+    image: Picture,
+    surroundings: Grey,
+    blur: float,
+    dots: FloatArray,
+    width: FloatArray,
+    number: IntArray,
+    begin: IntArray,
+    margin: int,
+) -> FloatArray:
+    """Sums over the residual light in each dot's window, shape (n, 6).
+
+    Of it alone, times u, times v, times the dot's profile, that times r², and of the window.
+
+    Parameters
+    ----------
+    image, surroundings, blur
+        The picture; what `without_dots` leaves of it; the blur's standard deviation, px.
+    dots
+        Place, peak and size of each dot, shape (n, 4).
+    width
+        Of each dot's Gaussian window, shape (n,), px.
+    number, begin
+        See `neighbours`.
+    margin
+        So far from a dot light is weighed, px.
+    """
+    side, made, by = (
+        2 * margin + 1,
+        np.zeros((len(dots), 6)),
+        image.shape[1] / surroundings.shape[1],
+    )
+    single, away = np.float32, np.empty((2, 2 * margin + 1), np.float32)
+    patch, light = np.empty((side, side), single), np.empty((side, side), single)
+    lines = np.empty((4, side), single)
+    for k in range(len(dots)):
+        others = number[begin[k] : begin[k + 1]]
+        level = _level(surroundings, by, blur, dots[k])
+        _patch(image, level, dots, others, k, patch, light, lines)
+        u, v, _, size = dots[k]
+        left, top = round(u) - margin, round(v) - margin
+        _bell(left, u, width[k], lines[0])
+        _bell(top, v, width[k], lines[1])
+        _bell(left, u, size, lines[2])
+        _bell(top, v, size, lines[3])
+        for x in range(side):
+            away[0, x], away[1, x] = left + x - u, (left + x - u) ** 2
+            lines[2, x] *= lines[0, x]
+        for y in range(side):
+            row, row_u, row_own, row_wide = single(0.0), single(0.0), single(0.0), single(0.0)
+            for x in range(side):
+                value = patch[y, x]
+                row += lines[0, x] * value
+                row_u += lines[0, x] * value * away[0, x]
+                row_own += lines[2, x] * value
+                row_wide += lines[2, x] * value * away[1, x]
+            away_v, down = top + y - v, lines[1, y]
+            made[k, 0] += down * row
+            made[k, 1] += down * row_u
+            made[k, 2] += down * row * away_v
+            down *= lines[3, y]
+            made[k, 3] += down * row_own
+            made[k, 4] += down * (row_wide + away_v**2 * row_own)
+        made[k, 5] = lines[0].sum() * lines[1].sum()
+    return made
+
+
+@_inner
+def _add_modes(
+    sums: FloatArray, weight: float, q: float, spread: float, moments: FloatArray
+) -> None:
+    """Add a row's part of the projections on the modes, by its moments along u up to the fifth."""
+    p, less = moments, q * q - 4 * spread
+    b, c = 2 * q * q - 12 * spread, q**4 - 12 * spread * q * q + 24 * spread**2
+    sums[0] += weight * p[1]
+    sums[1] += weight * q * p[0]
+    sums[2] += weight * (p[3] + less * p[1])
+    sums[3] += weight * q * (p[2] + less * p[0])
+    sums[4] += weight * (p[5] + b * p[3] + c * p[1])
+    sums[5] += weight * q * (p[4] + b * p[2] + c * p[0])
+
+
+@_inner
+def _add_squares(
+    sums: FloatArray, weight: float, q: float, spread: float, moments: FloatArray
+) -> None:
+    """Add a row's part of the sums of the modes' squares, by its even moments up to the tenth."""
+    s, square, less = moments, q * q, q * q - 4 * spread
+    b, c = 2 * q * q - 12 * spread, q**4 - 12 * spread * q * q + 24 * spread**2
+    sums[0] += weight * s[1]
+    sums[1] += weight * square * s[0]
+    sums[2] += weight * (s[3] + 2 * less * s[2] + less * less * s[1])
+    sums[3] += weight * square * (s[2] + 2 * less * s[1] + less * less * s[0])
+    twice = b * b + 2 * c
+    sums[4] += weight * (s[5] + 2 * b * s[4] + twice * s[3] + 2 * b * c * s[2] + c * c * s[1])
+    sums[5] += (
+        weight * square * (s[4] + 2 * b * s[3] + twice * s[2] + 2 * b * c * s[1] + c * c * s[0])
+    )
+
+
+@_compiled_for(*((own, _grey, _f, _f2, _f1, _ints, _ints, _i) for own in (_grey, _byte)))
+def residual_modes(
+    image: Picture,
+    surroundings: Grey,
+    blur: float,
+    dots: FloatArray,
+    width: FloatArray,
+    number: IntArray,
+    begin: IntArray,
+    margin: int,
+) -> FloatArray:
+    """Projections of the residual light on modes of each dot, shape (6, n, 3), see `residual_sums`.
+
+    The modes are polynomials of the place in the window, two each of the first, third and fifth
+    order; of a round dot's shift the first alone have a share. Of each: the projection, the sum of
+    the mode's square, and of the square of mode times light.
+    """
+    side, made, by = (
+        2 * margin + 1,
+        np.zeros((6, len(dots), 3)),
+        image.shape[1] / surroundings.shape[1],
+    )
+    single, power = np.float32, np.empty((11, 2 * margin + 1), np.float32)
+    patch, light = np.empty((side, side), single), np.empty((side, side), single)
+    lines, moments, squares, white = (
+        np.empty((2, side), single),
+        np.empty(6),
+        np.empty(6),
+        np.empty(6),
+    )
+    for k in range(len(dots)):
+        others = number[begin[k] : begin[k + 1]]
+        level = _level(surroundings, by, blur, dots[k])
+        _patch(image, level, dots, others, k, patch, light, lines)
+        u, v, _, size = dots[k]
+        left, top = round(u) - margin, round(v) - margin
+        _bell(left, u, width[k], lines[0])
+        _bell(top, v, width[k], lines[1])
+        spread = 1.0 / (1.0 / width[k] ** 2 + 1.0 / size**2)
+        for x in range(side):
+            away, value = single(left + x - u), single(1.0)
+            for n in range(11):
+                power[n, x] = value
+                value *= away
+        for n in range(6):
+            white[n] = 0.0
+            for x in range(side):
+                white[n] += lines[0, x] * lines[0, x] * power[2 * n, x]
+        for y in range(side):
+            for n in range(6):
+                moment, square = single(0.0), single(0.0)
+                for x in range(side):
+                    moment += lines[0, x] * patch[y, x] * power[n, x]
+                    weighed = lines[0, x] * light[y, x]
+                    square += weighed * weighed * power[2 * n, x]
+                moments[n], squares[n] = moment, square
+            q, down = top + y - v, float(lines[1, y])
+            _add_modes(made[:, k, 0], down, q, spread, moments)
+            _add_squares(made[:, k, 1], down**2, q, spread, white)
+            _add_squares(made[:, k, 2], down**2, q, spread, squares)
+    return made
