@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from labapp.core.pipeline import Measurement
+from labapp.core.recording.residual_check import Residuals
 
 
 @dataclass(frozen=True)
@@ -22,6 +23,10 @@ class FrameResult:
         Why it was not measured from the frame before; None if it was, or was not to be.
     rows
         Its rows of each table as CSV text (`tables.table_rows`); None: not made yet.
+    residuals
+        Its residuals, where the measurement no longer has them.
+    setup_doubt
+        Why the set-up is doubtful, as far as the frames so far show it; empty if it is not.
     """
 
     frame: int
@@ -29,6 +34,8 @@ class FrameResult:
     measurement: Measurement
     track_lost: str | None = None
     rows: Mapping[str, str] | None = None
+    residuals: Residuals | None = None
+    setup_doubt: str = ""
 
 
 def without_surface(measurement: Measurement) -> Measurement:

@@ -324,8 +324,13 @@ def number(value: float | None, digits: int = MM_DIGITS) -> str:
 
 def as_csv(rows: Iterable[Sequence[object]]) -> str:
     """CSV text of rows; text that a spreadsheet would evaluate is escaped (`as_cell`)."""
+    return csv_text([as_cell(cell) for cell in row] for row in rows)
+
+
+def csv_text(rows: Iterable[Sequence[object]]) -> str:
+    """CSV text of rows as they are."""
     lines = _Lines()
-    csv.writer(lines).writerows([as_cell(cell) for cell in row] for row in rows)
+    csv.writer(lines).writerows(rows)
     return "".join(lines)
 
 
