@@ -7,7 +7,7 @@ and is known without the surface being known. The fit's own stiffness is not in 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -41,54 +41,64 @@ and is not absorbed."""
 
 @dataclass(frozen=True)
 class DotResponse(ReadOnlyArrays):
-    """Response of m rays' dots on the imaging plane, X′ and Z′ in turn.
+    """Response of m rays' dots on the imaging plane, X′ and Z′ in turn, about one surface.
 
     Parameters
     ----------
-    known
-        Which of the rays that were given meet the surface and the plane; they are the m.
     absorbed
         Orthonormal basis of what surfaces move the dots by, shape (2m, a).
     by_quantity
-        Computed minus captured dots, not absorbed, for each of `QUANTITIES` off by one unit,
-        shape (2m, q), mm.
+        Computed minus captured dots, less what is absorbed, for each of `QUANTITIES` off by one
+        unit, shape (2m, q), mm.
     """
 
-    known: BoolArray
     absorbed: FloatArray
     by_quantity: FloatArray
 
-    @classmethod
-    def of(cls, rig: Rig, surface: SplineSurface, ray: IntArray) -> DotResponse:
-        """Work it out.
-
-        Parameters
-        ----------
-        rig
-            The bench, with its uncertainty.
-        surface
-            A surface that is near those of the recording's frames.
-        ray
-            Rays (i, j), counted from 1, shape (n, 2).
-        """
-        by_quantity, by_spline = _by_quantity(rig, surface, ray), _by_spline(rig, surface, ray)
-        known = np.isfinite(np.concatenate([by_quantity, by_spline], axis=-1)).all(axis=(1, 2))
-        rows = by_spline[known].reshape(-1, by_spline.shape[-1])
-        square, basis = np.linalg.eigh(rows @ rows.T)
-        absorbed = basis[:, square > CLOSED * square[-1:]]
-        moved = by_quantity[known].reshape(len(rows), -1)
-        return cls(np.asarray(known), absorbed, moved - absorbed @ (absorbed.T @ moved))
-
     def unabsorbed(self, dots: FloatArray) -> FloatArray:
         """What no surface could explain of changes of the dots, shape (m, 2): shape (2m,)."""
-        flat = dots.ravel()
-        return np.asarray(flat - self.absorbed @ (self.absorbed.T @ flat))
+        return _without(self.absorbed, dots.ravel())
 
     @property
     def freedom(self) -> int:
         """Degrees of freedom that are left."""
         count, absorbed = self.absorbed.shape
         return int(count - absorbed)
+
+
+def dot_responses(
+    rig: Rig, surfaces: Sequence[SplineSurface], ray: IntArray
+) -> tuple[BoolArray, list[DotResponse]]:
+    """Work out the response about each of some surfaces.
+
+    Parameters
+    ----------
+    rig
+        The bench, with its uncertainty.
+    surfaces
+        Surfaces of a recording's frames.
+    ray
+        Rays (i, j), counted from 1, shape (n, 2).
+
+    Returns
+    -------
+    known, responses
+        Which rays meet all surfaces and the plane, shape (n,); the responses of these m.
+    """
+    every = [(_by_spline(rig, one, ray), _by_quantity(rig, one, ray)) for one in surfaces]
+    known = np.isfinite(np.concatenate(sum(every, ()), axis=-1)).all(axis=(1, 2))
+    return np.asarray(known), [_response(by[known], moved[known]) for by, moved in every]
+
+
+def _response(by_spline: FloatArray, by_quantity: FloatArray) -> DotResponse:
+    rows, moved = (every.reshape(2 * len(every), -1) for every in (by_spline, by_quantity))
+    square, basis = np.linalg.eigh(rows @ rows.T)
+    absorbed = basis[:, square > CLOSED * np.max(square, initial=0.0)]
+    return DotResponse(absorbed, _without(absorbed, moved))
+
+
+def _without(absorbed: FloatArray, moved: FloatArray) -> FloatArray:
+    return np.asarray(moved - absorbed @ (absorbed.T @ moved))
 
 
 def _by_quantity(rig: Rig, surface: SplineSurface, ray: IntArray) -> FloatArray:

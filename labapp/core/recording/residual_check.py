@@ -24,12 +24,15 @@ from labapp.core.geometry.perturbation import Direction, directions
 from labapp.core.geometry.rig import Rig
 from labapp.core.geometry.uncertainty import INDEX, QUANTITIES
 from labapp.core.pipeline import Measurement, setup_status
-from labapp.core.recording.dot_response import DotResponse
+from labapp.core.recording.dot_response import dot_responses
 from labapp.core.surface.spline import SplineSurface
 from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
 
 MOST = 64
 """So many frames are kept, evenly over the recording …"""
+
+PARTS = 3
+"""The first and the last of so many parts of a recording tell what has changed."""
 
 FEWEST, FREEDOM = 6, 20
 """… and so many, with so many degrees of freedom that no surface absorbs, make a verdict."""
@@ -37,8 +40,8 @@ FEWEST, FREEDOM = 6, 20
 OFTEN = 0.5
 """A ray counts if it has a dot in this share of the frames."""
 
-LIMIT = 13.0
-"""A quantity is off where the cost falls by more with it free: 3.6 standard deviations."""
+LIMIT = 11.0
+"""A quantity is off where the cost falls by more with it free: 3.3 standard deviations."""
 
 ALIKE = 6.0
 """Quantities that the cost falls by nearly as much with explain the residuals alike."""
@@ -46,6 +49,9 @@ ALIKE = 6.0
 MODEL_MM = 1e-3
 """Standard uncertainty, root mean square over the dots on the plane, of what a set-up's pattern may
 have of spots that overlap and of shapes that no spline has."""
+
+NONLINEAR = 0.05
+"""And as a share of all that no surface absorbs: the response is linear to that share."""
 
 VISIBLE_MM = 1e-3
 """A quantity that leaves less for its assumed uncertainty cannot be seen."""
@@ -75,7 +81,7 @@ class Suspect:
         What it is called (`perturbation.directions`), and what it is measured in.
     off, sigma
         By how much the residuals have it off if it alone is, and the standard uncertainty of that,
-        the other quantities' ± included; of a drift, by how much it has changed.
+        the other quantities' ± included; of a drift, from the first to the last part.
     rms_mm
         What of the residuals it explains, root mean square, mm.
     is_drift
@@ -230,21 +236,31 @@ def judge_setup(
         few = f"{len(samples)} frames with a surface are too few: {FEWEST} are needed"
         return SetupVerdict(False, few)
     ray, residual = _by_ray(samples, (rig.pattern.rows, rig.pattern.columns))
-    response = DotResponse.of(rig, samples[len(samples) // 2].surface, ray)
-    residual = residual[:, response.known]
-    if response.freedom < FREEDOM:
-        return SetupVerdict(False, f"{len(ray)} dots are too few to contradict it")
-    time = np.linspace(-0.5, 0.5, len(samples))
-    change = np.tensordot(time, residual, 1) / np.sum(time**2)
+    parts = np.array_split(np.arange(len(samples)), PARTS)
+    surfaces = [samples[part[len(part) // 2]].surface for part in parts]
+    known, responses = dot_responses(rig, surfaces, ray)
+    if min(one.freedom for one in responses) < FREEDOM:
+        return SetupVerdict(False, f"{np.sum(known)} dots are too few to contradict it")
+    left = np.array(
+        [
+            one.unabsorbed(residual[part][:, known].mean(axis=0))
+            for one, part in zip(responses, parts, strict=True)
+        ]
+    )
+    patterns = np.array([one.by_quantity for one in responses])
+    freedom, root = responses[PARTS // 2].freedom, rig.uncertainty.root
+    pattern, change = patterns.mean(axis=0), patterns[-1] - patterns[0]
+    bent = NONLINEAR * _rms(left)
+    mean = _Left(left.mean(axis=0), pattern, pattern @ root, freedom, bent)
+    # A set-up that is off leaves something else where the pool has become another.
+    drift = _Left(left[-1] - left[0], pattern, change @ root, freedom, bent)
     every = directions(rig)
-    moving = [one for one in every if not one.key.startswith(FIXED)]
-    uncertain = response.by_quantity @ rig.uncertainty.root
-    drift = _suspects(response, change, moving, np.zeros_like(uncertain), is_drift=True)
-    static = _suspects(response, residual.mean(axis=0), every, uncertain, is_drift=False)
-    if not drift and not static:
+    moved = drift.suspects([one for one in every if not one.key.startswith(FIXED)], is_drift=True)
+    off = mean.suspects(every, is_drift=False)
+    if not moved and not off:
         said = f"the residuals of {len(samples)} frames do not contradict it"
         return SetupVerdict(False, said)
-    return SetupVerdict(True, _reason(drift or static, len(samples)), (*drift, *static))
+    return SetupVerdict(True, _reason(moved or off, len(samples)), (*moved, *off))
 
 
 def _by_ray(samples: Sequence[Residuals], shape: tuple[int, int]) -> tuple[IntArray, FloatArray]:
@@ -261,66 +277,73 @@ def _by_ray(samples: Sequence[Residuals], shape: tuple[int, int]) -> tuple[IntAr
     return np.argwhere(often) + 1, np.where(np.isfinite(residual), residual, mean)
 
 
-def _suspects(
-    response: DotResponse,
-    residual_mm: FloatArray,
-    tested: Sequence[Direction],
-    uncertain: FloatArray,
-    *,
-    is_drift: bool,
-) -> tuple[Suspect, ...]:
-    """What would explain residuals, the likeliest first; empty: they contradict nothing.
+@dataclass(frozen=True)
+class _Left(ReadOnlyArrays):
+    """What no surface could explain of m rays' residuals, X′ and Z′ in turn.
 
     Parameters
     ----------
-    response
-        Of the m dots.
     residual_mm
-        Mean residual of each, or its change over the recording, shape (m, 2), mm.
-    tested
-        What may be off.
+        Their mean, or how it has changed, shape (2m,), mm.
+    by_quantity
+        Response to each of `QUANTITIES`, shape (2m, q).
     uncertain
-        Root of the covariance that the set-up's uncertainty gives the residuals, shape (2m, q).
-    is_drift
-        Whether it is the change.
+        Root of the covariance that the set-up's uncertainty gives it, shape (2m, q).
+    freedom
+        Degrees of freedom.
+    bent_mm
+        Standard uncertainty of the response, as it is not quite linear, root mean square, mm.
     """
-    left, count = response.unabsorbed(residual_mm), response.by_quantity.shape[0]
-    assumed = np.array([one.assumed for one in QUANTITIES])
-    modes, size, _ = np.linalg.svd(response.by_quantity * assumed, full_matrices=False)
-    modes = modes[:, size > VISIBLE_MM * np.sqrt(count)]
-    unexplained = left - modes @ (modes.T @ left)
-    noise = float(np.sum(unexplained**2)) / (response.freedom - modes.shape[1])
-    floor = noise + count * MODEL_MM**2
-    weight = np.linalg.inv(uncertain @ uncertain.T + floor * np.eye(count))
-    found: list[tuple[float, Suspect]] = []
-    for one in tested:
-        pattern = response.by_quantity @ one.vector
-        usual = QUANTITIES[INDEX[one.key]].assumed if one.key in INDEX else 1.0
-        if usual * _rms(pattern) < VISIBLE_MM:
-            continue
-        weighed = weight @ pattern
-        known = float(pattern @ weighed)
-        # Computed with a set-up that is off by δ, residuals are as with the dots off by −δ.
-        off, sigma = -float(left @ weighed) / known, known**-0.5
-        explained = abs(off) * _rms(pattern)
-        suspect = Suspect(one.name, one.unit, off, sigma, explained, is_drift)
-        found.append(((off / sigma) ** 2, suspect))
-    most = max((drop for drop, _ in found), default=0.0)
-    if most < LIMIT:
-        return ()
-    found.sort(key=lambda pair: -pair[0])
-    return tuple(suspect for drop, suspect in found if drop > most - ALIKE)
+
+    residual_mm: FloatArray
+    by_quantity: FloatArray
+    uncertain: FloatArray
+    freedom: int
+    bent_mm: float
+
+    def suspects(self, tested: Sequence[Direction], *, is_drift: bool) -> tuple[Suspect, ...]:
+        """Which of the ways that a bench may be off contradict it, the likeliest first."""
+        left, weight = self.residual_mm, np.linalg.inv(self._covariance())
+        found: list[tuple[float, Suspect]] = []
+        for one in tested:
+            pattern = self.by_quantity @ one.vector
+            usual = QUANTITIES[INDEX[one.key]].assumed if one.key in INDEX else 1.0
+            if usual * _rms(pattern) < VISIBLE_MM:
+                continue
+            weighed = weight @ pattern
+            known = float(pattern @ weighed)
+            # Computed with a set-up that is off by δ, residuals are as with the dots off by −δ.
+            off, sigma = -float(left @ weighed) / known, known**-0.5
+            explained = abs(off) * _rms(pattern)
+            suspect = Suspect(one.name, one.unit, off, sigma, explained, is_drift)
+            found.append(((off / sigma) ** 2, suspect))
+        most = max((drop for drop, _ in found), default=0.0)
+        if most < LIMIT:
+            return ()
+        found.sort(key=lambda pair: -pair[0])
+        return tuple(suspect for drop, suspect in found if drop > most - ALIKE)
+
+    def _covariance(self) -> FloatArray:
+        """Covariance of the residuals where the set-up is as it says, shape (2m, 2m), mm²."""
+        left, count = self.residual_mm, len(self.residual_mm)
+        assumed = np.array([one.assumed for one in QUANTITIES])
+        modes, size, _ = np.linalg.svd(self.by_quantity * assumed, full_matrices=False)
+        modes = modes[:, size > VISIBLE_MM * np.sqrt(count)]
+        unexplained = left - modes @ (modes.T @ left)
+        noise = float(np.sum(unexplained**2)) / (self.freedom - modes.shape[1])
+        floor = count * (MODEL_MM**2 + self.bent_mm**2)
+        return np.asarray(self.uncertain @ self.uncertain.T + (noise + floor) * np.eye(count))
 
 
 def _reason(suspects: Sequence[Suspect], frames: int) -> str:
     """What the likeliest cause is, in a clause."""
     first = suspects[0]
     others = [one.name for one in suspects[1:] if one.is_drift == first.is_drift]
-    size = f"{1e3 * first.rms_mm:.0f} µm"
+    size = f"residuals of {1e3 * first.rms_mm:.0f} µm"
     if first.is_drift:
-        what = f"residuals change by {size} over the recording, as if {first.name} had moved"
+        what = f"{size} have come up during the recording, as if {first.name} had changed"
     else:
-        what = f"residuals of {size} are the same in {frames} frames, as if {first.name} were off"
+        what = f"{size} are the same in {frames} frames, as if {first.name} were off"
     by = f"{first.off:+.2g} ± {first.sigma:.1g} {first.unit}"
     return f"{what} by {by}{''.join(f'; or {name}' for name in others[:3])}"
 
