@@ -13,7 +13,7 @@ A set-up that is far off leaves few residuals to look at: hardly a frame is meas
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Self
@@ -59,8 +59,8 @@ VISIBLE_MM = 1e-3
 UNANSWERED, FEWEST_TRIED = 0.8, 10
 """A set-up is in doubt where a larger share of so many frames has rays that match no pool."""
 
-AGAIN = 1.25
-"""While frames come, they are judged again when there are so many times as many."""
+AGAIN, AT_LEAST = 1.25, 1000
+"""While frames come, they are judged again at so many times as many, or at so many more."""
 
 NO_MATCH = frozenset({"no-match", "no-reference", "ambiguous-rows", "no-rows", "no-surface"})
 
@@ -156,6 +156,7 @@ class ResidualRecord:
 
     rig: Rig
     _samples: list[Residuals] = field(default_factory=list)
+    _newest: deque[Residuals] = field(default_factory=lambda: deque(maxlen=MOST // PARTS))
     _statuses: Counter[str] = field(default_factory=Counter)
     _every: int = 1
     _seen: int = 0
@@ -175,6 +176,7 @@ class ResidualRecord:
         found = residuals or Residuals.of(measurement)
         if found is None:
             return
+        self._newest.append(found)
         if self._seen % self._every == 0:
             self._samples.append(found)
         self._seen += 1
@@ -183,11 +185,17 @@ class ResidualRecord:
             self._every *= 2
 
     def judged(self, measurement: Measurement, residuals: Residuals | None = None) -> Measurement:
-        """Add the next frame; returns it with what is known of the set-up by now."""
+        """Add the next frame; returns it with what is known of the set-up by now.
+
+        The newest frames weigh as much as all before: what has moved is soon seen.
+        """
         self.add(measurement, residuals)
-        count = sum(self._statuses.values())
-        if count >= max(FEWEST_TRIED, AGAIN * self._judged[0]):
-            self._judged = count, self.verdict()
+        count, last = sum(self._statuses.values()), self._judged[0]
+        if count >= max(FEWEST_TRIED, min(AGAIN * last, last + AT_LEAST)):
+            newest = {id(one): one for one in self._newest}
+            before = [one for one in self._samples if id(one) not in newest]
+            samples = [*before, *newest.values()]
+            self._judged = count, judge_setup(self.rig, self._statuses, samples)
         status = measurement.setup_status and judged_status(self.rig, self._judged[1])
         return replace(measurement, setup_status=status)
 

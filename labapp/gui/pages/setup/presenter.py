@@ -219,8 +219,7 @@ def shown(session: Session) -> SetupState:
     torch = sections.get("torch")
     travel = torch.get("travel", "+y") if isinstance(torch, dict) else "+y"
     found = rig(session)
-    checked = "" if session.setup_problems else session.setup.checked
-    status = "" if found is None else setup_words(setup_status(found), checked)
+    status = session.setup_words or ("" if found is None else setup_words(setup_status(found)))
     problems: dict[str, str] = {}
     others = []
     for problem in session.setup_problems:
