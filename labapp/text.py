@@ -16,15 +16,29 @@ SETUP_WORDS = {
     "entered": "The set-up was entered, not calibrated: usual uncertainties are assumed.",
     "calibrated": "Laser and imaging plane were calibrated, and no known mirror was measured.",
     "checked": "The set-up was checked against a known mirror.",
-    "doubtful": "The set-up is doubtful: dots lie off in the same way in frame after frame.",
+    "doubtful": "The set-up is doubtful: the recording contradicts it.",
 }
 """What `setup_status` means to the operator."""
 
 
-def setup_words(status: str, checked: str = "") -> str:
-    """What a `setup_status` means, with the day of the check (ISO 8601); empty without one."""
+def setup_words(status: str, checked: str = "", doubt: str = "") -> str:
+    """What a `setup_status` means; empty without one.
+
+    Parameters
+    ----------
+    status
+        The status.
+    checked
+        When a checked set-up was, ISO 8601.
+    doubt
+        Why a doubtful one is (`SetupVerdict.reason`).
+    """
     words = SETUP_WORDS.get(status, "")
-    return f"{words[:-1]} on {checked[:10]}." if status == "checked" and checked else words
+    if status == "checked" and checked:
+        return f"{words[:-1]} on {checked[:10]}."
+    if status == "doubtful" and doubt:
+        return f"The set-up is doubtful: {doubt}."
+    return words
 
 
 def now() -> str:
@@ -72,8 +86,13 @@ def as_cell(value: object) -> object:
 
 def csv_text(rows: Iterable[Sequence[object]]) -> str:
     """CSV text of rows; text that a spreadsheet would evaluate is escaped (`as_cell`)."""
+    return unescaped_csv_text([as_cell(cell) for cell in row] for row in rows)
+
+
+def unescaped_csv_text(rows: Iterable[Sequence[object]]) -> str:
+    """CSV text of rows as they are, such as those that were read from a CSV file."""
     lines = _Lines()
-    csv.writer(lines).writerows([as_cell(cell) for cell in row] for row in rows)
+    csv.writer(lines).writerows(rows)
     return "".join(lines)
 
 

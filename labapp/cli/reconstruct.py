@@ -7,7 +7,6 @@ folder (`export.results`), the summary, streams, progress.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
@@ -140,15 +139,15 @@ def _measure_recording(
     Parameters are the command's options (`reconstruct`), and sinks for the streams.
     """
     from labapp.config.setup import read_setup
-    from labapp.core.recording.residual_check import ResidualRecord
+    from labapp.core.recording.residual_check import ResidualRecord, judged_status
     from labapp.export.results import ResultsWriter
     from labapp.export.summary import Summary
     from labapp.media import open_source
     from labapp.run.measurers import ColdMeasurer, RecordingMeasurer, stretch_pools
-    from labapp.run.runner import provenance, run, select_frames
+    from labapp.run.runner import provenance, run, select_frames, with_setup_check
 
     setup = read_setup(setup_path)
-    summary, record = Summary(), ResidualRecord(setup.rig, settings.fit)
+    summary, record = Summary(), ResidualRecord(setup.rig)
     with open_source(source_path) as source, progress_bar() as progress:
         for warning in source.warnings:
             note(progress.console, f"warning: {warning}")
@@ -165,22 +164,15 @@ def _measure_recording(
                         *(source_path, source.index, setup, settings, surfaces, sigma_parts),
                         processes,
                     )
-                sinks = [
-                    results.write,
-                    summary.add,
-                    lambda result: record.add(result.measurement),
-                    *streams,
-                    shown,
-                ]
-                for _ in run(selected, measurer, sinks):
+                sinks = [results.write, summary.add, *streams, shown]
+                for _ in run(selected, with_setup_check(measurer, record), sinks):
                     pass  # the sinks have it
-                verdict = record.verdict()
-                results.note(setup_check=dataclasses.asdict(verdict))
+                summary.verdict = record.verdict()
+                results.set_setup_status(judged_status(setup.rig, summary.verdict), summary.verdict)
         except KeyboardInterrupt:
             done = f"stopped: {results.frames} of {len(selected)} frames are done, in {out}"
             note(progress.console, done)
             raise typer.Exit(INTERRUPTED) from None
-    doubt = f"\nset-up doubtful: {verdict.reason}" if verdict.is_doubtful else ""
-    typer.echo(summary.text() + doubt)
+    typer.echo(summary.text())
     typer.echo(f"Results are in {out.absolute()}")
     return summary

@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from labapp.core.pipeline import Measurement
+from labapp.core.recording.residual_check import Residuals
 
 
 @dataclass(frozen=True)
@@ -20,6 +21,10 @@ class FrameResult:
     """Why it was not measured from the frame before; None if it was, or was not to be."""
     rows: Mapping[str, str] | None = None
     """Its rows of each table as CSV text (`tables.table_rows`); None: not made yet."""
+    residuals: Residuals | None = None
+    """Its residuals, where the measurement no longer has them."""
+    setup_doubt: str = ""
+    """Why the set-up is doubtful, as far as the frames so far show it; empty if it is not."""
 
 
 def without_surface(measurement: Measurement) -> Measurement:

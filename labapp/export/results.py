@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import csv
 import io
 import json
 import os
 import re
 from collections.abc import Collection, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Self
 
 from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.recording.residual_check import DOUBTFUL, SetupVerdict
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.errors import InputError
 from labapp.export.formats import SURFACE_FORMATS
@@ -18,7 +21,7 @@ from labapp.export.frame_result import FrameResult
 from labapp.export.meshes import SPACING_MM, known_nodes, open_mesh, solid_mesh
 from labapp.export.tables import TABLES, csv_header, table_rows
 from labapp.files import as_bytes, write_atomically
-from labapp.text import SIGMA_OF, now
+from labapp.text import SIGMA_OF, now, unescaped_csv_text
 from labapp.version import VERSION
 
 RUN_FILE = "run.json"
@@ -106,6 +109,7 @@ class ResultsWriter:
     ) -> None:
         self.folder = folder
         self.frames = 0
+        self._statuses: set[str] = set()
         self._calibration = calibration
         self.surfaces = surfaces
         self._sigma_parts = sigma_parts
@@ -162,10 +166,37 @@ class ResultsWriter:
                 raise self._unwritable(error) from error
             raise
         self.frames += 1
+        self._statuses.add(result.measurement.setup_status)
 
-    def note(self, **facts: object) -> None:
-        """Have `run.json` say something more of the run, once it ends."""
-        self._run |= facts
+    def set_setup_status(self, status: str, verdict: SetupVerdict) -> None:
+        """Write what all frames say of their set-up: into `run.json`, and into every frame's row.
+
+        Parameters
+        ----------
+        status
+            How far the set-up can be relied on (`Measurement.setup_status`).
+        verdict
+            What the frames say of it.
+
+        Raises
+        ------
+        InputError
+            If it cannot be written.
+        """
+        self._run |= {"setup_status": status, "setup_check": asdict(verdict)}
+        if DOUBTFUL not in (status, *self._statuses):
+            return
+        path = self.folder / "measures.csv"
+        try:
+            with path.open(encoding="utf-8", newline="") as file:
+                names, *rows = csv.reader(file)
+            place = names.index("setup_status")
+            for row in rows:
+                row[place] = row[place] and status
+            self._files.pop("measures").close()
+            write_atomically(path, as_bytes(unescaped_csv_text([names, *rows])))
+        except OSError as error:
+            raise self._unwritable(error) from error
 
     def __enter__(self) -> Self:
         return self

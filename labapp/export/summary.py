@@ -8,11 +8,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from labapp.core.recording.residual_check import DOUBTFUL, SetupVerdict
 from labapp.core.sequence.mean import series_of, sigma_of_mean
 from labapp.core.surface.measures import Measures
 from labapp.core.values import FloatArray
 from labapp.export.frame_result import FrameResult
-from labapp.text import SETUP_WORDS
+from labapp.text import setup_words
 
 MEANS = {
     "width": "width_mm",
@@ -34,6 +35,8 @@ class Summary:
     """Number of frames by status."""
     example: FrameResult | None = None
     """The first frame with a surface."""
+    verdict: SetupVerdict | None = None
+    """What the run says of its set-up, once it is known."""
 
     def add(self, result: FrameResult) -> None:
         """Add a frame."""
@@ -65,9 +68,11 @@ class Summary:
             if len(values) > 1:
                 words += [f"(mean; standard deviation {np.std(values):.4f} mm)"]
             lines.append(f"{label:7}{np.mean(values):z8.4f} {' '.join(words)}")
-        if self.example is not None and self.example.measurement.setup_status:
-            lines.append(SETUP_WORDS[self.example.measurement.setup_status])
-        return "\n".join(lines)
+        if self.verdict is not None and self.verdict.is_doubtful:
+            lines.append(setup_words(DOUBTFUL, doubt=self.verdict.reason))
+        elif self.example is not None:
+            lines.append(setup_words(self.example.measurement.setup_status))
+        return "\n".join(line for line in lines if line)
 
 
 def format_ranges(frames: Iterable[int], to: str = "–", most: int = 12) -> str:

@@ -19,9 +19,9 @@ from labapp.text import pluralize
 CALM_S = 1.0
 """Time without its cause, s by the camera's clock, after which an alarm is over."""
 
-NOT_MEASURED, SILENT = "not-measured", "silent"
-"""Codes of the alarms of frames that cannot be measured, and of none that is; others are as
-``width-high``."""
+NOT_MEASURED, SILENT, DOUBTFUL = "not-measured", "silent", "setup-doubtful"
+"""Codes of the alarms of frames that cannot be measured, of none that is, and of a set-up that they
+contradict; others are as ``width-high``."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Alarm:
     """Something that the operator must see."""
 
     code: str
-    """``width-low``, ``width-high`` … ``height-high``, ``not-measured`` or ``silent``."""
+    """``width-low`` … ``height-high``, ``not-measured``, ``silent`` or ``setup-doubtful``."""
     words: str
     """What is wrong, a sentence without its full stop."""
     frame: int
@@ -54,7 +54,7 @@ class Alarms:
     Parameters
     ----------
     limits
-        What is watched; without any limit nothing is.
+        What is watched; without any limit nothing is but the set-up.
     """
 
     def __init__(self, limits: Limits) -> None:
@@ -89,7 +89,12 @@ class Alarms:
         return tuple(self._shown.values())
 
     def judge(
-        self, frame: int, time_s: float, measures: Measures | None, reason: str
+        self,
+        frame: int,
+        time_s: float,
+        measures: Measures | None,
+        reason: str,
+        setup_doubt: str = "",
     ) -> list[Alarm]:
         """Look at the next frame.
 
@@ -101,6 +106,8 @@ class Alarms:
             Sizes; None where it could not be measured.
         reason
             Why not.
+        setup_doubt
+            Why the set-up is doubtful; empty if it is not.
 
         Returns
         -------
@@ -108,13 +115,15 @@ class Alarms:
             Those that it raised, and those that are over (they hold no more).
         """
         with self._turn:
-            if not self._limits.are_set:
-                return []
             self._newest = (frame, time_s)
             if measures is not None and self._misses(measures):
                 measures, reason = None, "a size that is watched is not known"
-            self._unmeasured = self._unmeasured + 1 if measures is None else 0
-            causes = self._causes(measures, reason)
+            counted = measures is None and self._limits.are_set
+            self._unmeasured = self._unmeasured + 1 if counted else 0
+            causes = self._causes(measures, reason) if self._limits.are_set else {}
+            causes.pop(DOUBTFUL, None)
+            if setup_doubt:
+                causes[DOUBTFUL] = f"The set-up is doubtful: {setup_doubt}"
             for code, words in causes.items():
                 if words is not None or code in self._shown:
                     self._held_s[code] = time_s

@@ -85,8 +85,10 @@ class LiveChain:
 
     def __init__(self, setup: Setup, settings: Settings, bit_depth: int) -> None:
         from labapp.core.recording.chain import WarmChain
+        from labapp.core.recording.residual_check import ResidualRecord
 
         self._chain = WarmChain(setup.bench, settings)
+        self._record = ResidualRecord(setup.rig)
         self._rays = setup.rig.pattern.rows * setup.rig.pattern.columns
         self._bit_depth = bit_depth
         self._measured_s = -math.inf
@@ -106,7 +108,8 @@ class LiveChain:
             frame=frame.number,
             time_s=frame.time_s,
             arrived_s=frame.arrived_s,
-            measurement=without_surface(found),
+            measurement=without_surface(self._record.judged(found)),
+            setup_doubt=self._record.doubt,
             track_lost=self._chain.track_lost,
             quality=self._quality(frame, found),
             scene=scene_of(surface) if drawn and surface is not None else None,

@@ -118,7 +118,9 @@ class LiveWatch:
         """Raise alarms, or end them."""
         self._measured_s, self._last = time.monotonic(), (result.frame, result.time_s)
         found = result.measurement
-        for alarm in self.alarms.judge(*self._last, found.measures, found.reason):
+        for alarm in self.alarms.judge(
+            *self._last, found.measures, found.reason, result.setup_doubt
+        ):
             self._on_event(self._changed(alarm), result.time_s)
 
     def _show(self, result: LiveResult) -> None:

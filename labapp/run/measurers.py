@@ -27,6 +27,7 @@ from threadpoolctl import ThreadpoolController
 
 from labapp.config.setup import Setup
 from labapp.core.pipeline import Measurement, Settings, measure
+from labapp.core.recording.residual_check import Residuals
 from labapp.core.rows.correction import Correction
 from labapp.errors import InputError
 from labapp.export.frame_result import FrameResult, without_surface
@@ -276,6 +277,7 @@ class RecordingMeasurer:
                 yield replace(
                     result,
                     measurement=found if self.with_surfaces else without_surface(found),
+                    residuals=None if self.with_surfaces else Residuals.of(found),
                     rows=table_rows(result, self.setup.calibration, self.sigma_parts),
                 )
 

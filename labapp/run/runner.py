@@ -10,10 +10,12 @@ import dataclasses
 import os
 from collections.abc import Callable, Generator, Iterable, Sequence
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 from labapp.config.setup import Setup
 from labapp.core.pipeline import Settings
+from labapp.core.recording.residual_check import ResidualRecord
 from labapp.errors import InputError
 from labapp.export.frame_result import FrameResult
 from labapp.media import FrameSource
@@ -46,6 +48,18 @@ def run(frames: Iterable[int], measurer: Measurer, sinks: Sequence[Sink]) -> Gen
             for sink in sinks:
                 sink(result)
             yield result
+
+
+def with_setup_check(measurer: Measurer, record: ResidualRecord) -> Measurer:
+    """A measurer whose results have what the frames so far say of the set-up."""
+
+    def measure(frames: Iterable[int]) -> Generator[FrameResult]:
+        with closing(measurer(frames)) as results:
+            for result in results:
+                measurement = record.judged(result.measurement, result.residuals)
+                yield replace(result, measurement=measurement, setup_doubt=record.doubt)
+
+    return measure
 
 
 def select_frames(text: str, count: int) -> range:

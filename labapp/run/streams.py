@@ -38,6 +38,9 @@ OPCUA_S = 0.05
 ALARMS = ("alarm", "unacknowledged")
 """Names of the alarms' values, while a camera is live."""
 
+WORDS = ("status", "reason", "scheme", "sigma_of", "setup_status", "setup_doubt")
+"""Names of the other values that are words."""
+
 NAMESPACE = "urn:labapp:measures"
 
 STARTING_S = 20.0
@@ -68,6 +71,8 @@ def stream_values(result: FrameResult, alarms: Iterable[Alarm] | None = None) ->
         "scheme": measurement.scheme,
         **{name: number(name) for name in SIZES},
         "sigma_of": sigma_of(measurement),
+        "setup_status": measurement.setup_status,
+        "setup_doubt": result.setup_doubt,
     }
     if alarms is None:
         return values
@@ -259,7 +264,7 @@ class OpcuaStream:
         server.allow_remote_admin(False)  # or anybody could write, and take variables away
         space = await server.register_namespace(NAMESPACE)
         pool = await server.nodes.objects.add_object(space, "Pool")
-        words = dict.fromkeys(("status", "reason", "scheme", "sigma_of", *ALARMS), "")
+        words = dict.fromkeys((*WORDS, *ALARMS), "")
         sizes = dict.fromkeys(SIZES, math.nan)
         for name, empty in {"frame": -1, "time_s": math.nan, **words, **sizes}.items():
             self._variables[name] = await pool.add_variable(space, name, empty)

@@ -16,6 +16,7 @@ from labapp.errors import InputError
 if TYPE_CHECKING:
     from labapp.config.setup import Setup
     from labapp.core.pipeline import Settings
+    from labapp.core.recording.residual_check import SetupVerdict
     from labapp.core.rows.correction import Correction
     from labapp.core.values import IntArray
     from labapp.media import Frame, GreyImage
@@ -212,6 +213,30 @@ class SessionContents:
     def overview(self, scheme: str | None = None) -> Overview:
         """Status, correction, staleness and measures of every frame."""
         return self._overviews.get(scheme or self._scheme(), self._basis())
+
+    @property
+    def setup_verdict(self) -> SetupVerdict | None:
+        """What the frames that were measured with the present set-up say of it; None without."""
+        basis = self._basis()
+        return None if basis is None else self._results.verdict(basis)
+
+    @property
+    def setup_status(self) -> str:
+        """How far the present set-up can be relied on (`Measurement`); empty if incomplete."""
+        from labapp.core.recording.residual_check import judged_status
+
+        basis = self._basis()
+        return "" if basis is None else judged_status(basis.setup.rig, self.setup_verdict)
+
+    @property
+    def setup_words(self) -> str:
+        """The same in a sentence, with the cause of a doubt."""
+        from labapp.text import setup_words
+
+        status, verdict = self.setup_status, self.setup_verdict
+        return setup_words(
+            status, self.setup.checked if status else "", verdict.reason if verdict else ""
+        )
 
     def corrected_frames(self) -> IntArray:
         """Numbers of the frames with a correction by hand, ascending, shape (n,)."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import sqlite3
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Collection
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -13,6 +13,13 @@ import numpy as np
 
 from labapp.config.setup import Setup, parse_setup
 from labapp.core.pipeline import Measurement, Settings
+from labapp.core.recording.residual_check import (
+    DOUBTFUL,
+    MOST,
+    Residuals,
+    SetupVerdict,
+    judge_setup,
+)
 from labapp.core.schemes import SCHEMES
 from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 from labapp.errors import InputError
@@ -67,6 +74,8 @@ class Result:
     settings: Settings
     stale: tuple[str, ...]
     """Why it is stale, a clause each; empty if it is not."""
+    doubt: str = ""
+    """Why the setup it was measured with is doubtful; empty if it is not."""
 
 
 @dataclass(frozen=True)
@@ -227,6 +236,10 @@ class Results:
         except Damaged as error:
             raise InputError(path, named, error, "what was written there") from error
         inputs = self._inputs(row.setup, row.settings)
+        verdict = self._verdict(row.setup)
+        doubt = verdict.reason if verdict is not None and verdict.is_doubtful else ""
+        if doubt and measurement.setup_status:
+            measurement = replace(measurement, setup_status=DOUBTFUL)
         outdated = _differences(basis, inputs)
         return Result(
             frame=frame,
@@ -237,7 +250,69 @@ class Results:
             setup=inputs.setup.text,
             settings=inputs.settings,
             stale=(*outdated, *((CORRECTION_CHANGED,) if row.correction != correction else ())),
+            doubt=doubt,
         )
+
+    def judge_setup(self, basis: Basis) -> None:
+        """Judge a set-up by all results from it that stand, and store the verdict.
+
+        Parameters
+        ----------
+        basis
+            The inputs that results were measured from.
+
+        Raises
+        ------
+        InputError
+            If the verdict cannot be saved.
+        """
+        given = VERSION, pack(basis.setup.text), pack(basis.settings)
+        rows = self._database.rows(
+            "SELECT frame, status FROM result JOIN inputs ON inputs.id = inputs "
+            "WHERE version = ? AND setup = ? AND settings = ? AND correction IS (SELECT sha256 "
+            "FROM document WHERE kind = 'correction' AND document.frame = result.frame) "
+            "ORDER BY frame",
+            *given,
+        )
+        frames = np.array([frame for frame, status in rows if status == "ok"], np.int64)
+        places = np.unique(np.linspace(0, len(frames) - 1, MOST).round().astype(int))
+        samples = []
+        for frame in frames[places[places >= 0]].tolist():
+            row = self._row(frame, basis.scheme)
+            assert row is not None
+            residuals = _residuals(row.content, (frame, basis.scheme, *row[:-1]))
+            samples += [residuals] if residuals else []
+        statuses = Counter(status for _, status in rows)
+        found = judge_setup(basis.setup.rig, statuses, samples)
+        with self._database.transaction() as connection:
+            connection.execute(
+                "UPDATE inputs SET verdict = ? WHERE version = ? AND setup = ? AND settings = ?",
+                (pack(found), *given),
+            )
+
+    def verdict(self, basis: Basis) -> SetupVerdict | None:
+        """What results say of a set-up; None where none were measured with it.
+
+        Raises
+        ------
+        InputError
+            If it is damaged.
+        """
+        return self._verdict(pack(basis.setup.text))
+
+    def _verdict(self, setup: bytes) -> SetupVerdict | None:
+        """Verdict on a packed set-up; one that doubts it where schemes or settings differ."""
+        rows = self._database.rows(
+            "SELECT verdict FROM inputs WHERE setup = ? AND verdict IS NOT NULL ORDER BY id", setup
+        )
+        try:
+            found = [_unpacked_verdict(verdict) for (verdict,) in rows]
+        except Damaged as error:
+            raise InputError(
+                self._database.path, "set-up verdict", error, "what was written there"
+            ) from error
+        doubting = [one for one in found if one.is_doubtful]
+        return next(iter([*doubting, *reversed(found)]), None)
 
     def counts(self) -> dict[tuple[str, str], int]:
         """Number of results: (scheme, version of labapp) → count."""
@@ -250,10 +325,14 @@ class Results:
     def problems(self) -> list[str]:
         """Sentences on damaged results; empty if there are none."""
         found = []
-        for number, version, setup, settings in self._database.rows("SELECT * FROM inputs"):
+        for number, version, setup, settings, verdict in self._database.rows(
+            "SELECT id, version, setup, settings, verdict FROM inputs"
+        ):
             try:
                 parse_setup(unpack(setup, str), self._database.path)
                 unpack(settings, Settings)
+                if verdict is not None:
+                    unpack(verdict, SetupVerdict)
             except (Damaged, InputError) as error:
                 found.append(f"inputs {number} of version {version} are damaged: {error}")
         names = ", ".join(MEASURES)
@@ -341,6 +420,21 @@ def _verified(content: object, columns: tuple[object, ...]) -> Measurement:
     if seal != fingerprint(columns):
         raise Damaged("it is of another frame, or was measured from something else")
     return measurement
+
+
+@functools.lru_cache(maxsize=2 * MOST)
+def _residuals(content: bytes, columns: tuple[object, ...]) -> Residuals | None:
+    """Residuals of a detail (`_verified`); None where it has none, or is damaged."""
+    try:
+        return Residuals.of(_verified(content, columns))
+    except Damaged:
+        return None
+
+
+@functools.lru_cache(maxsize=64)
+def _unpacked_verdict(content: bytes) -> SetupVerdict:
+    found: SetupVerdict = unpack(content, SetupVerdict)
+    return found
 
 
 @functools.lru_cache(maxsize=64)

@@ -93,6 +93,7 @@ def _result(session: SessionContents, frame: int, scheme: str) -> Result:
 def _provenance(session: SessionContents, scheme: str, frames: Sequence[int]) -> dict[str, object]:
     """Source, setup, settings and versions of an export; plain values."""
     recording, first = session.recording, _result(session, frames[0], scheme)
+    verdict = session.setup_verdict
     source = {} if recording is None else asdict(recording)
     source.pop("index", None)
     return {
@@ -100,6 +101,8 @@ def _provenance(session: SessionContents, scheme: str, frames: Sequence[int]) ->
         "record": asdict(session.record),
         "source": source,
         "setup": {"toml": first.setup},
+        "setup_status": session.setup_status,
+        "setup_check": None if verdict is None else asdict(verdict),
         "settings": asdict(first.settings),
         "measured_by": sorted({version for name, version in session.measured_by if name == scheme}),
         "corrected_frames": sorted(set(session.corrected_frames().tolist()) & set(frames)),

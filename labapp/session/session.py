@@ -364,8 +364,11 @@ class Session(SessionContents):
         given = (self.frame, basis.setup, basis.settings, self.correction)
         measurer: Measurer = WarmMeasurer(*given) if warm else ColdMeasurer(*given, pool)
         numbers = (int(number) for number in chosen)
-        for result in run(numbers, measurer, [keep, *sinks]):
-            yield result.frame, result.measurement
+        try:
+            for result in run(numbers, measurer, [keep, *sinks]):
+                yield result.frame, result.measurement
+        finally:
+            self._results.judge_setup(basis)
         self._frames.refuse_lost(lost)
 
     def export(

@@ -54,7 +54,7 @@ def listener(stream: LineStream) -> Any:
 def test_a_measurement_is_told_with_the_names_of_the_table(measured: Measurement) -> None:
     told = stream_values(FrameResult(7, 0.1, measured))
     assert list(told)[:5] == ["frame", "time_s", "status", "reason", "scheme"]
-    assert list(told)[5:] == [*SIZES, "sigma_of"]
+    assert list(told)[5:] == [*SIZES, "sigma_of", "setup_status", "setup_doubt"]
     assert told["sigma_of"] == SIGMA_OF
     assert measured.measures is not None
     assert told["height_mm"] == measured.measures.height_mm

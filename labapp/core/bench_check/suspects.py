@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from labapp.core.bench_check.adjustment import Adjustment, Sighting, System
-from labapp.core.geometry.perturbation import quantity_values
+from labapp.core.geometry.perturbation import Direction, directions
 from labapp.core.geometry.rig import Rig
 from labapp.core.geometry.uncertainty import INDEX, QUANTITIES
 from labapp.core.values import FloatArray
@@ -20,8 +20,13 @@ from labapp.core.values import FloatArray
 FREE = {"°": 20.0, "mm": 30.0, "px": 60.0, "%": 20.0}
 """Standard uncertainty of a quantity that is freed, in its unit."""
 
-FREE_STEP, FREE_SHIFT_PX, FREE_SCALE = 0.4, 200.0, 0.5
-"""The same of the inter-beam angle, degrees, of the whole picture's place, and of its scale."""
+FREE_OWN = {
+    "pattern.inter_beam_angle_deg": 0.4,
+    "picture.u": 200.0,
+    "picture.v": 200.0,
+    "picture.scale": 50.0,
+}
+"""The same of those that have their own, by their keys."""
 
 LIMIT = 20.0
 """A quantity is off by more than its ± allows where the cost falls by more with it free: 4.5
@@ -63,8 +68,8 @@ def released(rig: Rig, keys: Sequence[str]) -> FloatArray:
     KeyError
         If a key is unknown.
     """
-    every = _directions(rig)
-    return np.array([every[key][1] for key in keys]).reshape(-1, len(QUANTITIES))
+    every = {one.key: _free(one) for one in directions(rig)}
+    return np.array([every[key] for key in keys]).reshape(-1, len(QUANTITIES))
 
 
 def suspect_keys() -> tuple[str, ...]:
@@ -88,11 +93,10 @@ def find_suspects(
     already
         What was free in it, see `released`.
     """
-    directions = _directions(rig)
+    every = {one.key: one for one in directions(rig)}
     system = System.of(rig, sightings, already)
     first = {
-        key: made.drop(system.by_bench(made, vector[:, None]))[0]
-        for key, (_, vector) in directions.items()
+        key: made.drop(system.by_bench(made, _free(one)[:, None]))[0] for key, one in every.items()
     }
     most = max(first.values())
     if most < LIMIT:
@@ -101,8 +105,8 @@ def find_suspects(
     likely = sorted(first, key=lambda key: -first[key])[:TRIED]
     found = []
     for key in likely:
-        system = System.of(rig, sightings, np.vstack([already, directions[key][1]]))
-        found.append(Suspect(key, directions[key][0], made.cost - system.solved(made).cost))
+        system = System.of(rig, sightings, np.vstack([already, _free(every[key])]))
+        found.append(Suspect(key, every[key].name, made.cost - system.solved(made).cost))
     found.sort(key=lambda one: -one.drop)
     if found[0].drop < LIMIT:
         return ()
@@ -111,20 +115,6 @@ def find_suspects(
     )
 
 
-def _directions(rig: Rig) -> dict[str, tuple[str, FloatArray]]:
-    """Key → name and direction of what can be freed."""
-    made = {}
-    for k, one in enumerate(QUANTITIES):
-        free = FREE_STEP if one.key.startswith("pattern.inter") else FREE[one.unit]
-        made[one.key] = (one.name, free * np.eye(len(QUANTITIES))[k])
-    points = [k for key, k in INDEX.items() if key.startswith("image_calibration.")]
-    seen = quantity_values(rig)[points].reshape(3, 2)
-    for name, key, shift in (
-        ("picture, shifted along u", "picture.u", FREE_SHIFT_PX * np.array([1.0, 0.0])),
-        ("picture, shifted along v", "picture.v", FREE_SHIFT_PX * np.array([0.0, 1.0])),
-        ("image calibration, scale", "picture.scale", FREE_SCALE * (seen - seen[0])),
-    ):
-        vector = np.zeros(len(QUANTITIES))
-        vector[points] = np.broadcast_to(shift, (3, 2)).ravel()
-        made[key] = (name, vector)
-    return made
+def _free(one: Direction) -> FloatArray:
+    """Offset of the quantities by the standard uncertainty of a direction that is freed."""
+    return FREE_OWN.get(one.key, FREE[one.unit]) * one.vector

@@ -5,14 +5,14 @@ An offset is a vector over the quantities, in their units. Which ray made which 
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.rig import ImagingPlane, Laser, Rig
-from labapp.core.geometry.uncertainty import INDEX, AxisPoints
-from labapp.core.values import FloatArray
+from labapp.core.geometry.uncertainty import INDEX, QUANTITIES, AxisPoints
+from labapp.core.values import FloatArray, ReadOnlyArrays
 
 _LASER, _PATTERN, _PLANE = (
     [(key.partition(".")[2], k) for key, k in INDEX.items() if key.startswith(f"{section}.")]
@@ -20,6 +20,46 @@ _LASER, _PATTERN, _PLANE = (
 )
 _POINTS = [k for key, k in INDEX.items() if key.startswith("image_calibration.")]
 _DISTORTION = INDEX["camera_lens.distortion_percent"]
+
+
+@dataclass(frozen=True)
+class Direction(ReadOnlyArrays):
+    """A way in which a bench may be off.
+
+    Parameters
+    ----------
+    key
+        Key of the quantity (`Quantity.key`), or ``picture.u``, ``picture.v``, ``picture.scale`` for
+        the whole of the image calibration.
+    name, unit
+        What it is called, and what it is measured in.
+    vector
+        Offset of the quantities for one unit of it, shape (q,).
+    """
+
+    key: str
+    name: str
+    unit: str
+    vector: FloatArray
+
+
+def directions(rig: Rig) -> tuple[Direction, ...]:
+    """Ways in which a bench may be off: by each quantity, and by its whole picture."""
+    single = [
+        Direction(one.key, one.name, one.unit, np.eye(len(QUANTITIES))[k])
+        for k, one in enumerate(QUANTITIES)
+    ]
+    points = quantity_values(rig)[_POINTS].reshape(3, 2)
+    whole = []
+    for key, name, unit, shift in (
+        ("picture.u", "picture, shifted along u", "px", np.array([1.0, 0.0])),
+        ("picture.v", "picture, shifted along v", "px", np.array([0.0, 1.0])),
+        ("picture.scale", "image calibration, scale", "%", (points - points[0]) / 100.0),
+    ):
+        vector = np.zeros(len(QUANTITIES))
+        vector[_POINTS] = np.broadcast_to(shift, (3, 2)).ravel()
+        whole.append(Direction(key, name, unit, vector))
+    return *single, *whole
 
 
 def moved_rig(rig: Rig, offset: FloatArray) -> Rig:

@@ -1,55 +1,74 @@
 """What the residuals of a recording say of its set-up.
 
-Most of what is wrong with a set-up goes into the surface: the residuals do not show it. What is
-left is the same in every frame, where noise is not. For each quantity of the set-up the fit is
-done anew with that quantity off, which gives the pattern of residuals that it would leave. The
-amplitude of each pattern in the residuals of each frame is a series, whose mean is tested with the
-correlation of its values in time allowed for.
+Most of what is wrong with a set-up goes into the surface: residuals do not show it. What no surface
+can absorb (`dot_response`) is the same in every frame, or changes over the recording where a part
+moves, while noise averages out. The mean residual of each ray, and its change over the recording,
+are compared with the response to each quantity (score test): one is off where the cost falls by
+more than `LIMIT` once it is free. The cost of the mean has the set-up's own covariance, so that
+what its ± covers is no contradiction; nothing should move during a recording. What fits no quantity
+(speckle, a surface finer than the fit's) is the noise that both are compared with.
 
-A set-up that is far off leaves few residuals to look at: hardly a frame is answered at all.
+A set-up that is far off leaves few residuals to look at: hardly a frame is measured at all.
 """
 
 from __future__ import annotations
 
-from collections import Counter
+from collections import Counter, deque
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Self
 
 import numpy as np
 
-from labapp.core.geometry.perturbation import moved_dots, moved_rig
+from labapp.core.geometry.perturbation import Direction, directions
 from labapp.core.geometry.rig import Rig
-from labapp.core.geometry.uncertainty import QUANTITIES
-from labapp.core.match import Match
-from labapp.core.pipeline import Measurement
-from labapp.core.surface.pool_fit import FitSettings, fit_pool
+from labapp.core.geometry.uncertainty import INDEX, QUANTITIES
+from labapp.core.pipeline import Measurement, setup_status
+from labapp.core.recording.dot_response import dot_responses
 from labapp.core.surface.spline import SplineSurface
-from labapp.core.values import BoolArray, CannotMeasure, FloatArray, ReadOnlyArrays
+from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
 
 MOST = 64
-"""So many frames are kept, evenly over the recording; so many at least make a verdict: …"""
+"""So many frames are kept, evenly over the recording …"""
 
-FEWEST = 6
+PARTS = 3
+"""The first and the last of so many parts of a recording tell what has changed."""
 
-LEAST_MM = 0.015
-"""A pattern is in doubt from this root mean square on the imaging plane on: spots that overlap and
-waves that the surface is too stiff for leave up to half as much, frame after frame, …"""
+FEWEST, FREEDOM = 6, 20
+"""… and so many, with so many degrees of freedom that no surface absorbs, make a verdict."""
 
-LEAST_T = 6.0
-"""… from so many standard uncertainties of its mean amplitude, …"""
+OFTEN = 0.5
+"""A ray counts if it has a dot in this share of the frames."""
 
-LEAST_SIGMAS = 1.5
-"""… and where the quantity is off by so many times what it is known to."""
+LIMIT = 11.0
+"""A quantity is off where the cost falls by more with it free: 3.3 standard deviations."""
+
+ALIKE = 6.0
+"""Quantities that the cost falls by nearly as much with explain the residuals alike."""
+
+MODEL_MM = 1e-3
+"""Standard uncertainty, root mean square over the dots on the plane, of what a set-up's pattern may
+have of spots that overlap and of shapes that no spline has."""
+
+NONLINEAR = 0.05
+"""And as a share of all that no surface absorbs: the response is linear to that share."""
 
 VISIBLE_MM = 1e-3
-"""A quantity that leaves less for its standard uncertainty cannot be seen."""
-
-ALIKE = 0.9
-"""Quantities that explain such a share of what the best does cannot be told apart by it."""
+"""A quantity that leaves less for its assumed uncertainty cannot be seen."""
 
 UNANSWERED, FEWEST_TRIED = 0.8, 10
 """A set-up is in doubt where a larger share of so many frames has rays that match no pool."""
 
+AGAIN, AT_LEAST = 1.25, 1000
+"""While frames come, they are judged again at so many times as many, or at so many more."""
+
 NO_MATCH = frozenset({"no-match", "no-reference", "ambiguous-rows", "no-rows", "no-surface"})
+
+DOUBTFUL = "doubtful"
+"""`Measurement.setup_status` of a set-up that its recording contradicts."""
+
+FIXED = ("image_calibration.", "pattern.inter_beam_angle_deg", "camera_lens.")
+"""Keys of what cannot change during a recording begin so."""
 
 
 @dataclass(frozen=True)
@@ -59,11 +78,14 @@ class Suspect:
     Parameters
     ----------
     name, unit
-        What it is called (`uncertainty.QUANTITIES`), and what it is measured in.
+        What it is called (`perturbation.directions`), and what it is measured in.
     off, sigma
-        By how much the residuals have it off if it alone is, and the standard uncertainty of that.
+        By how much the residuals have it off if it alone is, and the standard uncertainty of that,
+        the other quantities' ± included; of a drift, from the first to the last part.
     rms_mm
         What of the residuals it explains, root mean square, mm.
+    is_drift
+        Whether it has changed during the recording.
     """
 
     name: str
@@ -71,6 +93,7 @@ class Suspect:
     off: float
     sigma: float
     rms_mm: float
+    is_drift: bool = False
 
 
 @dataclass(frozen=True)
@@ -82,7 +105,7 @@ class SetupVerdict:
     is_doubtful
         Whether it contradicts the set-up.
     reason
-        Why, or why nothing can be said, in a sentence.
+        Why, or why nothing can be said, in a clause.
     suspects
         Quantities that would explain it, the likeliest first.
     """
@@ -93,10 +116,32 @@ class SetupVerdict:
 
 
 @dataclass(frozen=True)
-class _Sample(ReadOnlyArrays):
-    match: Match
-    surface: SplineSurface
+class Residuals(ReadOnlyArrays):
+    """Residuals of the n dots of a frame, and the surface that left them.
+
+    Parameters
+    ----------
+    ray
+        Ray (i, j) of each, counted from 1, shape (n, 2).
+    residual_mm
+        Computed minus captured dot, shape (n, 2), mm.
+    surface
+        The fit's surface.
+    """
+
+    ray: IntArray
     residual_mm: FloatArray
+    surface: SplineSurface
+
+    @classmethod
+    def of(cls, measurement: Measurement) -> Self | None:
+        """Those of a frame; None where the fit did not measure it."""
+        match, made = measurement.match, measurement.reconstruction
+        if match is None or made is None or not isinstance(made.unbounded, SplineSurface):
+            return None
+        if len(made.residual_mm) != len(match.ray):
+            return None
+        return cls(match.ray, made.residual_mm, made.unbounded)
 
 
 @dataclass
@@ -107,132 +152,208 @@ class ResidualRecord:
     ----------
     rig
         The bench that the frames are measured with.
-    settings
-        Of the fit.
     """
 
     rig: Rig
-    settings: FitSettings = field(default_factory=FitSettings)
-    _samples: list[_Sample] = field(default_factory=list)
+    _samples: list[Residuals] = field(default_factory=list)
+    _newest: deque[Residuals] = field(default_factory=lambda: deque(maxlen=MOST // PARTS))
     _statuses: Counter[str] = field(default_factory=Counter)
     _every: int = 1
     _seen: int = 0
+    _judged: tuple[int, SetupVerdict] = (0, SetupVerdict(False, "no frame was measured"))
 
-    def add(self, measured: Measurement) -> None:
-        """Take note of the next frame. Only what the fit measured has residuals that are used."""
-        self._statuses[measured.status] += 1
-        match, made = measured.match, measured.reconstruction
-        if match is None or made is None or not isinstance(made.unbounded, SplineSurface):
+    def add(self, measurement: Measurement, residuals: Residuals | None = None) -> None:
+        """Add the next frame, in their order.
+
+        Parameters
+        ----------
+        measurement
+            What was measured.
+        residuals
+            Its residuals, where the measurement no longer has them.
+        """
+        self._statuses[measurement.status] += 1
+        found = residuals or Residuals.of(measurement)
+        if found is None:
             return
-        if len(made.residual_mm) != len(match.ray):
-            return
+        self._newest.append(found)
         if self._seen % self._every == 0:
-            self._samples.append(_Sample(match, made.unbounded, made.residual_mm))
+            self._samples.append(found)
         self._seen += 1
         if len(self._samples) > MOST:
             self._samples = self._samples[::2]
             self._every *= 2
 
+    def judged(self, measurement: Measurement, residuals: Residuals | None = None) -> Measurement:
+        """Add the next frame; returns it with what is known of the set-up by now.
+
+        The newest frames weigh as much as all before: what has moved is soon seen.
+        """
+        self.add(measurement, residuals)
+        count, last = sum(self._statuses.values()), self._judged[0]
+        if count >= max(FEWEST_TRIED, min(AGAIN * last, last + AT_LEAST)):
+            newest = {id(one): one for one in self._newest}
+            before = [one for one in self._samples if id(one) not in newest]
+            samples = [*before, *newest.values()]
+            self._judged = count, judge_setup(self.rig, self._statuses, samples)
+        status = measurement.setup_status and judged_status(self.rig, self._judged[1])
+        return replace(measurement, setup_status=status)
+
+    @property
+    def doubt(self) -> str:
+        """Why the set-up is doubtful, as far as it is known by now; empty if it is not."""
+        last = self._judged[1]
+        return last.reason if last.is_doubtful else ""
+
     def verdict(self) -> SetupVerdict:
         """Whether the frames contradict the set-up, and which quantity would explain it."""
-        tried = sum(self._statuses[one] for one in (*NO_MATCH, "ok"))
-        lost = tried - self._statuses["ok"]
-        if tried >= FEWEST_TRIED and lost > UNANSWERED * tried:
-            return SetupVerdict(
-                True,
-                f"the dots of {lost} of {tried} frames match no pool on this set-up: look at the "
-                "pattern's rotation and inter-beam angle, the laser and the image calibration",
-            )
-        if self.rig.uncertainty is None or len(self._samples) < FEWEST:
-            few = f"{len(self._samples)} frames with a surface are too few: {FEWEST} are needed"
-            return SetupVerdict(False, few)
-        suspects = self._suspects()
-        if not suspects:
-            return SetupVerdict(
-                False, f"the residuals of {len(self._samples)} frames do not contradict it"
-            )
-        first = suspects[0]
-        off = f"{first.off:+.2g} ± {first.sigma:.1g} {first.unit}"
+        return judge_setup(self.rig, self._statuses, self._samples)
+
+
+def judged_status(rig: Rig, verdict: SetupVerdict | None) -> str:
+    """How far a rig can be relied on (`pipeline.setup_status`), with what its recording says."""
+    is_doubtful = verdict is not None and verdict.is_doubtful
+    return setup_status(rig) and (DOUBTFUL if is_doubtful else setup_status(rig))
+
+
+def judge_setup(
+    rig: Rig, statuses: Mapping[str, int], samples: Sequence[Residuals]
+) -> SetupVerdict:
+    """Judge whether a recording contradicts its set-up, and which quantity would explain it.
+
+    Parameters
+    ----------
+    rig
+        The bench that the frames were measured with.
+    statuses
+        How many frames have each status.
+    samples
+        Residuals of frames, evenly over the recording, in their order.
+    """
+    tried = sum(statuses.get(one, 0) for one in (*NO_MATCH, "ok"))
+    lost = tried - statuses.get("ok", 0)
+    if tried >= FEWEST_TRIED and lost > UNANSWERED * tried:
         return SetupVerdict(
             True,
-            f"residuals of {1e3 * first.rms_mm:.0f} µm are the same in {len(self._samples)} "
-            f"frames, as if {first.name} were off by {off}",
-            suspects,
+            f"the dots of {lost} of {tried} frames match no pool on this set-up: look at the "
+            "pattern's rotation and inter-beam angle, the laser and the image calibration",
         )
-
-    def _suspects(self) -> tuple[Suspect, ...]:
-        assert self.rig.uncertainty is not None
-        middle = self._samples[len(self._samples) // 2]
-        place = np.full(middle.match.witness.shape, -1)
-        place[tuple(middle.match.ray.T - 1)] = np.arange(len(middle.match.ray))
-        found = []
-        for k, (quantity, sigma) in enumerate(
-            zip(QUANTITIES, self.rig.uncertainty.sigma.tolist(), strict=True)
-        ):
-            pattern = self._pattern(middle, k, sigma) if sigma else None
-            if pattern is None or _rms(pattern) < VISIBLE_MM:
-                continue
-            amplitude = np.array([_amplitude(one, place, pattern) for one in self._samples])
-            mean, spread = float(np.mean(amplitude)), _sigma_of_mean(amplitude)
-            explained = abs(mean) * _rms(pattern)
-            certain = abs(mean) > LEAST_T * spread and abs(mean) > LEAST_SIGMAS
-            if certain and explained > LEAST_MM:
-                # Computed with a set-up that is off by δ, residuals are as with the dots off by −δ.
-                off = -mean * sigma
-                one = Suspect(quantity.name, quantity.unit, off, spread * sigma, explained)
-                found.append((abs(mean), one))
-        # Of those that explain about as much, the likeliest is off by the least it is known to.
-        most = max((one.rms_mm for _, one in found), default=0.0)
-        found.sort(key=lambda pair: (pair[1].rms_mm < ALIKE * most, pair[0]))
-        return tuple(one for _, one in found)
-
-    def _pattern(self, sample: _Sample, quantity: int, sigma: float) -> FloatArray | None:
-        """Residuals by a quantity off by its σ, once the surface has followed, shape (n, 2), mm."""
-        offset = np.zeros(len(QUANTITIES))
-        offset[quantity] = sigma
-        try:
-            return (self._refitted(sample, offset) - self._refitted(sample, -offset)) / 2.0
-        except CannotMeasure:
-            return None
-
-    def _refitted(self, sample: _Sample, offset: FloatArray) -> FloatArray:
-        match, known = sample.match, self.rig.uncertainty
-        assert known is not None
-        dots = moved_dots(match.plane_mm, self.rig, known.axes, offset)
-        bench = replace(moved_rig(self.rig, offset), uncertainty=None)
-        pool = fit_pool(
-            *(match.ray, dots, match.plane_covariance_mm2, match.witness, bench, self.settings),
-            *(sample.surface, match.missing),
-        )
-        return pool.residual_mm
+    if rig.uncertainty is None:
+        return SetupVerdict(False, "the set-up is taken as exact")
+    if len(samples) < FEWEST:
+        few = f"{len(samples)} frames with a surface are too few: {FEWEST} are needed"
+        return SetupVerdict(False, few)
+    ray, residual = _by_ray(samples, (rig.pattern.rows, rig.pattern.columns))
+    parts = np.array_split(np.arange(len(samples)), PARTS)
+    surfaces = [samples[part[len(part) // 2]].surface for part in parts]
+    known, responses = dot_responses(rig, surfaces, ray)
+    if min(one.freedom for one in responses) < FREEDOM:
+        return SetupVerdict(False, f"{np.sum(known)} dots are too few to contradict it")
+    left = np.array(
+        [
+            one.unabsorbed(residual[part][:, known].mean(axis=0))
+            for one, part in zip(responses, parts, strict=True)
+        ]
+    )
+    patterns = np.array([one.by_quantity for one in responses])
+    freedom, root = responses[PARTS // 2].freedom, rig.uncertainty.root
+    pattern, change = patterns.mean(axis=0), patterns[-1] - patterns[0]
+    bent = NONLINEAR * _rms(left)
+    mean = _Left(left.mean(axis=0), pattern, pattern @ root, freedom, bent)
+    # A set-up that is off leaves something else where the pool has become another.
+    drift = _Left(left[-1] - left[0], pattern, change @ root, freedom, bent)
+    every = directions(rig)
+    moved = drift.suspects([one for one in every if not one.key.startswith(FIXED)], is_drift=True)
+    off = mean.suspects(every, is_drift=False)
+    if not moved and not off:
+        said = f"the residuals of {len(samples)} frames do not contradict it"
+        return SetupVerdict(False, said)
+    return SetupVerdict(True, _reason(moved or off, len(samples)), (*moved, *off))
 
 
-def _amplitude(sample: _Sample, place: np.ndarray, pattern: FloatArray) -> float:
-    """Least-squares amplitude of a pattern in the residuals of the rays that have one."""
-    at = place[tuple(sample.match.ray.T - 1)]
-    known: BoolArray = at >= 0
-    expected, residual = pattern[at[known]], sample.residual_mm[known]
-    return float(np.sum(expected * residual) / max(float(np.sum(expected**2)), 1e-18))
+def _by_ray(samples: Sequence[Residuals], shape: tuple[int, int]) -> tuple[IntArray, FloatArray]:
+    """Rays (i, j) that often have a dot, shape (n, 2); their residuals, shape (frames, n, 2).
 
-
-def _sigma_of_mean(values: FloatArray) -> float:
-    """Standard uncertainty of the mean of values that follow on each other.
-
-    Neighbours that are alike are as good as fewer values: autocorrelations are summed up to the
-    first that is not above 0, and to a third of the series at most.
+    Where a frame lacks one, it is the mean of the others.
     """
-    count = len(values)
-    apart = values - values.mean()
-    variance = float(np.mean(apart**2))
-    if not variance:
-        return 0.0
-    alike = 0.0
-    for lag in range(1, count // 3 + 1):
-        correlation = float(np.mean(apart[lag:] * apart[:-lag])) / variance
-        if correlation <= 0.0:
-            break
-        alike += (1.0 - lag / count) * correlation
-    return float(np.sqrt(variance * (1.0 + 2.0 * alike) / (count - 1)))
+    every = np.full((len(samples), *shape, 2), np.nan)
+    for place, one in zip(every, samples, strict=True):
+        place[tuple(one.ray.T - 1)] = one.residual_mm
+    often = np.isfinite(every[..., 0]).mean(axis=0) >= OFTEN
+    residual = every[:, often]
+    mean = np.nanmean(residual, axis=0)
+    return np.argwhere(often) + 1, np.where(np.isfinite(residual), residual, mean)
+
+
+@dataclass(frozen=True)
+class _Left(ReadOnlyArrays):
+    """What no surface could explain of m rays' residuals, X′ and Z′ in turn.
+
+    Parameters
+    ----------
+    residual_mm
+        Their mean, or how it has changed, shape (2m,), mm.
+    by_quantity
+        Response to each of `QUANTITIES`, shape (2m, q).
+    uncertain
+        Root of the covariance that the set-up's uncertainty gives it, shape (2m, q).
+    freedom
+        Degrees of freedom.
+    bent_mm
+        Standard uncertainty of the response, as it is not quite linear, root mean square, mm.
+    """
+
+    residual_mm: FloatArray
+    by_quantity: FloatArray
+    uncertain: FloatArray
+    freedom: int
+    bent_mm: float
+
+    def suspects(self, tested: Sequence[Direction], *, is_drift: bool) -> tuple[Suspect, ...]:
+        """Which of the ways that a bench may be off contradict it, the likeliest first."""
+        left, weight = self.residual_mm, np.linalg.inv(self._covariance())
+        found: list[tuple[float, Suspect]] = []
+        for one in tested:
+            pattern = self.by_quantity @ one.vector
+            usual = QUANTITIES[INDEX[one.key]].assumed if one.key in INDEX else 1.0
+            if usual * _rms(pattern) < VISIBLE_MM:
+                continue
+            weighed = weight @ pattern
+            known = float(pattern @ weighed)
+            # Computed with a set-up that is off by δ, residuals are as with the dots off by −δ.
+            off, sigma = -float(left @ weighed) / known, known**-0.5
+            explained = abs(off) * _rms(pattern)
+            suspect = Suspect(one.name, one.unit, off, sigma, explained, is_drift)
+            found.append(((off / sigma) ** 2, suspect))
+        most = max((drop for drop, _ in found), default=0.0)
+        if most < LIMIT:
+            return ()
+        found.sort(key=lambda pair: -pair[0])
+        return tuple(suspect for drop, suspect in found if drop > most - ALIKE)
+
+    def _covariance(self) -> FloatArray:
+        """Covariance of the residuals where the set-up is as it says, shape (2m, 2m), mm²."""
+        left, count = self.residual_mm, len(self.residual_mm)
+        assumed = np.array([one.assumed for one in QUANTITIES])
+        modes, size, _ = np.linalg.svd(self.by_quantity * assumed, full_matrices=False)
+        modes = modes[:, size > VISIBLE_MM * np.sqrt(count)]
+        unexplained = left - modes @ (modes.T @ left)
+        noise = float(np.sum(unexplained**2)) / (self.freedom - modes.shape[1])
+        floor = count * (MODEL_MM**2 + self.bent_mm**2)
+        return np.asarray(self.uncertain @ self.uncertain.T + (noise + floor) * np.eye(count))
+
+
+def _reason(suspects: Sequence[Suspect], frames: int) -> str:
+    """What the likeliest cause is, in a clause."""
+    first = suspects[0]
+    others = [one.name for one in suspects[1:] if one.is_drift == first.is_drift]
+    size = f"residuals of {1e3 * first.rms_mm:.0f} µm"
+    if first.is_drift:
+        what = f"{size} have come up during the recording, as if {first.name} had changed"
+    else:
+        what = f"{size} are the same in {frames} frames, as if {first.name} were off"
+    by = f"{first.off:+.2g} ± {first.sigma:.1g} {first.unit}"
+    return f"{what} by {by}{''.join(f'; or {name}' for name in others[:3])}"
 
 
 def _rms(values: FloatArray) -> float:

@@ -20,7 +20,7 @@ from labapp.run.alarms import Alarm
 from labapp.run.limits import Limits, Size, Standing, sizes_of, standing
 from labapp.run.live_measuring import LiveResult
 from labapp.run.live_trend import Pace
-from labapp.text import SETUP_WORDS
+from labapp.text import setup_words
 
 DECIMALS = 3
 """Of live figures, mm."""
@@ -119,8 +119,8 @@ def pace_text(result: LiveResult | None, pace: Pace, came_hz: float | None, age_
     parts.append(f"{pace.measured_hz:.1f}{came} frames/s measured")
     if age_s <= OLD_S:
         parts[-1] += f"; {age_s:.2f} s old"
-    if found.setup_status in SETUP_WORDS:
-        parts[-1] += f". {SETUP_WORDS[found.setup_status]}"
+    if about := setup_words(found.setup_status, doubt=result.setup_doubt):
+        parts[-1] += f". {about}"
     return " ".join(parts)
 
 

@@ -2,7 +2,8 @@
 
 What the operator says is in `document`, one row per thing; every change of it is in `change` with
 the value before and after. What was filmed is in `recording` and `frame`, what was measured in
-`result`, with the `inputs` it was measured from. Nothing is stored that follows from these.
+`result`, with the `inputs` it was measured from and what all results from these say of the set-up.
+Nothing else is stored that follows from these.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 APPLICATION_ID = 0x4C414250
 """“LABP”, in SQLite's header: what makes a database a session."""
 
-VERSION = 3
+VERSION = 4
 """Of the tables below. A change to them adds 1, and a step to `MIGRATIONS`."""
 
 NO_FRAME = -1
@@ -71,7 +72,7 @@ TABLES = (
         id INTEGER PRIMARY KEY,
         version TEXT NOT NULL,
         setup BLOB NOT NULL,
-        settings BLOB NOT NULL,
+        settings BLOB NOT NULL, verdict BLOB,
         UNIQUE (version, setup, settings)
     )""",
     f"""CREATE TABLE result (
@@ -96,5 +97,6 @@ TABLES = (
 MIGRATIONS: dict[int, tuple[str, ...]] = {
     1: tuple(f"ALTER TABLE result ADD COLUMN {name} REAL" for name in MEASURES[20:26]),
     2: tuple(f"ALTER TABLE result ADD COLUMN {name} REAL" for name in MEASURES[26:32]),
+    3: ("ALTER TABLE inputs ADD COLUMN verdict BLOB",),
 }
 """From each earlier version, the statements that lead to the next."""

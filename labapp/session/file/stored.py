@@ -24,6 +24,7 @@ from labapp.core.images import dots, find_dots, threshold_dots
 from labapp.core.match import Match, Trial
 from labapp.core.matching.decision import MatchSettings
 from labapp.core.pipeline import Measurement, Settings
+from labapp.core.recording.residual_check import SetupVerdict, Suspect
 from labapp.core.rows import find_lattice, lattice, lattice_growth, row_search
 from labapp.core.rows.correction import Correction
 from labapp.core.schemes import SCHEMES
@@ -197,6 +198,8 @@ STORED = {
     ),
     "Measures": Stored(Measures),
     "Measurement": Stored(Measurement, fits=_measurement_fits),
+    "SetupVerdict": Stored(SetupVerdict),
+    "Suspect": Stored(Suspect),
 }
 """What a session may hold, by its name there."""
 

@@ -187,7 +187,7 @@ def _set_up(story: Story, report: ReportData) -> None:
     story.table(
         "The rig. UCS: origin on the work piece under the electrode's tip, Y along the welding "
         "direction, Z up.",
-        data.rig_cells(report.setup),
+        data.rig_cells(report.setup, report.session.setup_status),
         "llr",
         (0.22, 0.48, 0.3),
     )

@@ -13,7 +13,7 @@ import numpy as np
 
 from labapp.config.setup import Setup
 from labapp.core.geometry.rig import ImagingPlane, Rig
-from labapp.core.pipeline import Measurement, Settings, setup_status
+from labapp.core.pipeline import Measurement, Settings
 from labapp.core.sequence.mean import series_of, sigma_of_mean
 from labapp.core.surface.measures import SIZES, Measures, sigma_name
 from labapp.core.values import FloatArray
@@ -337,8 +337,8 @@ def _flat(settings: Any, prefix: str = "") -> Iterable[tuple[str, object]]:
             yield prefix + field.name, value
 
 
-def rig_cells(setup: Setup) -> Cells:
-    """The rig and the image calibration, with units."""
+def rig_cells(setup: Setup, status: str = "") -> Cells:
+    """The rig and the image calibration, with units; how far they can be relied on."""
     rig, plane = setup.rig, setup.rig.imaging_plane
     absent = ", ".join(f"({i}, {j})" for i, j in sorted(rig.pattern.absent_rays)[:8])
     x, y, z = plane.origin_mm
@@ -346,7 +346,7 @@ def rig_cells(setup: Setup) -> Cells:
     origin = setup.calibration.to_image(np.zeros(2))
     return [
         ["part", "quantity", "value"],
-        ["set-up", "status", setup_status(rig)],
+        ["set-up", "status", status],
         ["laser", "projection angle α", f"{rig.laser.projection_angle_deg:.6g} °"],
         ["", "distance to the origin", f"{rig.laser.distance_mm:.6g} mm"],
         ["dot pattern", "rows × columns", f"{rig.pattern.rows} × {rig.pattern.columns}"],

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from labapp.config.setup import parse_setup
-from labapp.core.pipeline import Measurement, setup_status
+from labapp.core.pipeline import Measurement
 from labapp.core.surface.measures import sigma_name
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
@@ -16,7 +16,7 @@ from labapp.session.report import data, figures
 from labapp.session.report.data import FrameLine, ReportData
 from labapp.session.report.layout import Story
 from labapp.studies.error_budget import setup_budget
-from labapp.text import SIGMA_OF, setup_words
+from labapp.text import SIGMA_OF
 
 LATEST_CHANGES = 40
 """Number of the newest changes that are listed."""
@@ -54,7 +54,7 @@ def add_results(story: Story, report: ReportData) -> None:
             (0.19, 0.09, *[0.102] * 7),
         )
         if report.setup is not None:
-            story.text(setup_words(setup_status(report.setup.rig), report.setup.checked))
+            story.text(report.session.setup_words)
         _trends(story, lines)
     elif any(line.status for line in lines):
         story.text("No frame has a surface that stands, so there is no mean.")

@@ -211,8 +211,7 @@ def shown(session: Session) -> SetupState:
         for section, key, usual in (("pattern", "kind", DotPattern.kind), ("torch", "travel", "+y"))
     )
     found = rig(session)
-    checked = "" if session.setup_problems else session.setup.checked
-    status = "" if found is None else setup_words(setup_status(found), checked)
+    status = session.setup_words or ("" if found is None else setup_words(setup_status(found)))
     problems: dict[str, str] = {}
     others = []
     for problem in session.setup_problems:

@@ -148,7 +148,8 @@ def _state(result: Result) -> tuple[Literal["measured", "stale", "failed"], str]
         return "stale", f"{was} Since then {' and '.join(result.stale)}."
     if failed:
         return "failed", words
-    about = setup_words(measurement.setup_status, parse_setup(result.setup, "setup").checked)
+    checked = parse_setup(result.setup, "setup").checked
+    about = setup_words(measurement.setup_status, checked, result.doubt)
     return "measured", f"{words} {about}".strip()
 
 

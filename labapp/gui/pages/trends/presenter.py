@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from labapp.core.pipeline import setup_status
 from labapp.core.values import IntArray
 from labapp.gui.curves import Axis, Curve, Mark
 from labapp.gui.digits import ResultRow, rounded
@@ -16,7 +15,7 @@ from labapp.session.measured import Overview
 from labapp.session.session import Session
 from labapp.session.signals import Signals
 from labapp.session.trends import BY_KEY, Trend, doubtful_frames, spectrum, spread, trend
-from labapp.text import SIGMA_OF, setup_words
+from labapp.text import SIGMA_OF
 
 MARKS = (
     Mark("●", "measured"),
@@ -91,9 +90,7 @@ def show(session: Session, options: TrendOptions, seen: Overview | None = None) 
         places=dict(zip(seen.frame.tolist(), at.tolist(), strict=True)),
         rows=tuple(row for course in courses for row in _rows(course)),
         words=_counted(seen, course_of("height_mm")),
-        setup_words=""
-        if session.setup_problems
-        else setup_words(setup_status(session.setup.rig), session.setup.checked),
+        setup_words=session.setup_words,
         spectrum=found,
         spectrum_axis=spectrum_axis,
         spectrum_words=message,

@@ -1,0 +1,158 @@
+"""Response of the dots to the quantities of a set-up, less what a pool's surface could absorb.
+
+Most of what a quantity moves the dots by looks like another surface. A dot has two coordinates and
+a surface one height for both: what is left does not fit the gradient of any surface (its curl),
+and is known without the surface being known. The fit's own stiffness is not in it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from labapp.core.geometry.optics import (
+    intersect_imaging_plane,
+    project_rays,
+    reflect,
+    surface_normal,
+)
+from labapp.core.geometry.perturbation import moved_dots, moved_rig
+from labapp.core.geometry.rig import Rig
+from labapp.core.geometry.uncertainty import QUANTITIES
+from labapp.core.surface.spline import SplineSurface
+from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
+
+SHARE = 0.1
+"""Share of a quantity's assumed uncertainty that it is off by for the differences …"""
+
+STEP = 1e-4
+"""… and step along rays, mm, and of slopes."""
+
+NEWTON_STEPS = 8
+"""From where a ray lands on the work piece to where it meets the surface."""
+
+CLOSED = 1e-6
+"""What surfaces move the dots by in weaker combinations, in squares of the strongest, is rounding,
+and is not absorbed."""
+
+
+@dataclass(frozen=True)
+class DotResponse(ReadOnlyArrays):
+    """Response of m rays' dots on the imaging plane, X′ and Z′ in turn, about one surface.
+
+    Parameters
+    ----------
+    absorbed
+        Orthonormal basis of what surfaces move the dots by, shape (2m, a).
+    by_quantity
+        Computed minus captured dots, less what is absorbed, for each of `QUANTITIES` off by one
+        unit, shape (2m, q), mm.
+    """
+
+    absorbed: FloatArray
+    by_quantity: FloatArray
+
+    def unabsorbed(self, dots: FloatArray) -> FloatArray:
+        """What no surface could explain of changes of the dots, shape (m, 2): shape (2m,)."""
+        return _without(self.absorbed, dots.ravel())
+
+    @property
+    def freedom(self) -> int:
+        """Degrees of freedom that are left."""
+        count, absorbed = self.absorbed.shape
+        return int(count - absorbed)
+
+
+def dot_responses(
+    rig: Rig, surfaces: Sequence[SplineSurface], ray: IntArray
+) -> tuple[BoolArray, list[DotResponse]]:
+    """Work out the response about each of some surfaces.
+
+    Parameters
+    ----------
+    rig
+        The bench, with its uncertainty.
+    surfaces
+        Surfaces of a recording's frames.
+    ray
+        Rays (i, j), counted from 1, shape (n, 2).
+
+    Returns
+    -------
+    known, responses
+        Which rays meet all surfaces and the plane, shape (n,); the responses of these m.
+    """
+    every = [(_by_spline(rig, one, ray), _by_quantity(rig, one, ray)) for one in surfaces]
+    known = np.isfinite(np.concatenate(sum(every, ()), axis=-1)).all(axis=(1, 2))
+    return np.asarray(known), [_response(by[known], moved[known]) for by, moved in every]
+
+
+def _response(by_spline: FloatArray, by_quantity: FloatArray) -> DotResponse:
+    rows, moved = (every.reshape(2 * len(every), -1) for every in (by_spline, by_quantity))
+    square, basis = np.linalg.eigh(rows @ rows.T)
+    absorbed = basis[:, square > CLOSED * np.max(square, initial=0.0)]
+    return DotResponse(absorbed, _without(absorbed, moved))
+
+
+def _without(absorbed: FloatArray, moved: FloatArray) -> FloatArray:
+    return np.asarray(moved - absorbed @ (absorbed.T @ moved))
+
+
+def _by_quantity(rig: Rig, surface: SplineSurface, ray: IntArray) -> FloatArray:
+    """Change of computed minus captured dots on one surface, shape (n, 2, q)."""
+    from labapp.core.surface import kernels
+
+    assert rig.uncertainty is not None
+    axes, at = rig.uncertainty.axes, tuple(ray.T - 1)
+
+    def computed(bench: Rig) -> FloatArray:
+        rays = project_rays(bench.laser, bench.pattern)
+        near = rays.directions[at], rays.landing_mm[at]
+        met = surface.basis.grid, surface.coefficients, *near, NEWTON_STEPS
+        return kernels.intersect_and_reflect(*met, bench.imaging_plane.pose_mm)[2]
+
+    dots, changes = computed(rig), []
+    for k, one in enumerate(QUANTITIES):
+        step = SHARE * one.assumed
+        more, less = (
+            computed(moved_rig(rig, offset)) - moved_dots(dots, rig, axes, offset)
+            for offset in (way * step * np.eye(len(QUANTITIES))[k] for way in (1.0, -1.0))
+        )
+        changes.append((more - less) / (2.0 * step))
+    return np.stack(changes, axis=-1)
+
+
+def _by_spline(rig: Rig, surface: SplineSurface, ray: IntArray) -> FloatArray:
+    """Change of the computed dots by each spline of a surface, shape (n, 2, p)."""
+    from labapp.core.surface import kernels
+
+    rays, at = project_rays(rig.laser, rig.pattern), tuple(ray.T - 1)
+    grid, direction = surface.basis.grid, rays.directions[at]
+    near = grid, surface.coefficients, direction, rays.landing_mm[at]
+    point, _ = kernels.newton_along_rays(*near, NEWTON_STEPS)
+    x, y = point[:, 0], point[:, 1]
+    slope = surface.gradient(x, y)
+
+    def dots(along: float, aside: tuple[float, float]) -> FloatArray:
+        """Dots from points moved along their rays, where slopes are changed."""
+        moved = point + along * direction
+        tilt = surface.gradient(moved[:, 0], moved[:, 1]) + np.array(aside)
+        to = reflect(direction, surface_normal(tilt))
+        return intersect_imaging_plane(moved, to, rig.imaging_plane)
+
+    def change(of: Callable[[float], FloatArray]) -> FloatArray:
+        return (of(STEP) - of(-STEP)) / (2.0 * STEP)
+
+    by_x = change(lambda step: dots(0.0, (step, 0.0)))
+    by_y = change(lambda step: dots(0.0, (0.0, step)))
+    by_way = change(partial(dots, aside=(0.0, 0.0)))
+    descent = np.vecdot(slope, direction[:, :2]) - direction[:, 2]
+    sinking = -surface.basis.matrix(x, y) / descent[:, None]
+    return np.asarray(
+        by_x[..., None] * surface.basis.matrix(x, y, 1)[:, None]
+        + by_y[..., None] * surface.basis.matrix(x, y, 0, 1)[:, None]
+        + by_way[..., None] * sinking[:, None]
+    )
