@@ -99,8 +99,6 @@ class Alarms:
             The camera's number of it, and its time, s.
         measures
             Sizes; None where it could not be measured.
-        reason
-            Why not.
 
         Returns
         -------

@@ -31,12 +31,8 @@ class LiveWatch:
 
     Parameters
     ----------
-    name
-        Of the camera, for events.
     setup, settings, bit_depth
         As of `LiveMeasuring`.
-    limits
-        Of the sizes.
     on_event
         Called when an alarm is raised, over, or acknowledged, and when limits change, with the
         event and the time of its frame by the camera's clock, s (None: now); from any thread.

@@ -191,8 +191,6 @@ class SessionContents:
 
         Parameters
         ----------
-        frame
-            Its number.
         scheme
             ``fit``, ``ers``, ``irs-opa`` …; None: the one that the settings choose.
         """

@@ -100,20 +100,10 @@ class Live:
 
     Parameters
     ----------
-    name
-        Of the camera.
     place
         Gives the file of a recording that begins.
-    plan
-        What is recorded.
-    wanted
-        What the camera is set to.
-    settings
-        Of the measurement.
     setup
         Rig and image calibration that frames are measured by; None: they are only looked at.
-    limits
-        Of the sizes that are measured.
     """
 
     def __init__(

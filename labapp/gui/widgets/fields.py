@@ -118,8 +118,6 @@ class NumberField(Field):
         Of the arrow keys and buttons; Page Up and Down go ten.
     decimals
         How many are shown; 0: whole numbers, and values are int.
-    optional
-        Whether the field may be emptied.
     """
 
     def __init__(

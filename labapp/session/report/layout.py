@@ -122,8 +122,6 @@ class Story:
 
         Parameters
         ----------
-        caption
-            What it shows.
         cells
             Its text, the header first.
         align
