@@ -25,8 +25,6 @@ def open_table(path: Path, wanted: str, largest: int) -> Iterator[TextIO]:
 
     Parameters
     ----------
-    path
-        Where it is.
     wanted
         What it should be, for the errors.
     largest

@@ -124,8 +124,6 @@ def update_setup(path: str | os.PathLike[str], values: Mapping[str, Mapping[str,
 
     Parameters
     ----------
-    path
-        The setup file.
     values
         Section → key → value; None takes the key out.
 

@@ -96,8 +96,6 @@ def check_keys(
 
     Parameters
     ----------
-    path
-        The file.
     table
         Its full name.
     keys

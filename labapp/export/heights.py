@@ -20,8 +20,6 @@ def sigma_at(reconstruction: Reconstruction, x_mm: FloatArray, y_mm: FloatArray)
 
     Parameters
     ----------
-    reconstruction
-        Whose.
     x_mm, y_mm
         Where, shape (n,), mm.
 
@@ -68,8 +66,6 @@ def profile(
 
     Parameters
     ----------
-    reconstruction
-        The pool.
     angle_deg
         Direction of the line, from +X towards +Y: 0 cuts across, 90 along the welding direction.
     offset_mm

@@ -89,8 +89,6 @@ def open_mesh(reconstruction: Reconstruction, spacing_mm: float) -> Mesh:
 
     Parameters
     ----------
-    reconstruction
-        What to mesh.
     spacing_mm
         Largest distance between rings of vertices, mm.
     """
@@ -122,8 +120,6 @@ def solid_mesh(reconstruction: Reconstruction, spacing_mm: float) -> Mesh:
 
     Parameters
     ----------
-    reconstruction
-        What to mesh.
     spacing_mm
         Largest distance between rings of vertices, mm.
     """

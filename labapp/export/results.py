@@ -42,10 +42,6 @@ def surface_files(
 
     Parameters
     ----------
-    frame
-        Its number.
-    reconstruction
-        What it gave.
     formats
         Some of `SURFACE_FORMATS`.
     spacing_mm
@@ -88,8 +84,6 @@ class ResultsWriter:
         Pixel ↔ imaging plane, for the dots' places on the plane.
     provenance
         What `run.json` is to say of the source, the setup and the options.
-    surfaces
-        Whether to write the surface files.
     sigma_parts
         Whether `measures.csv` has the parts of standard uncertainties, too.
 

@@ -90,15 +90,6 @@ class FootSwitches(QObject):
 
     Nothing runs while none is in use. Devices are read in threads of their own; what they tell is
     taken from a queue.
-
-    Attributes
-    ----------
-    in_use
-        By the device's key.
-    found
-        What was plugged in at the last look; None before one.
-    learned
-        The pedal that was pressed to be learned, until its action is chosen.
     """
 
     changed = Signal()
@@ -114,8 +105,11 @@ class FootSwitches(QObject):
         super().__init__(parent)
         self._tasks = tasks
         self.in_use: dict[str, InUse] = {}
+        """By the device's key."""
         self.found: DevicesFound | None = None
+        """What was plugged in at the last look; None before one."""
         self.learned: Learned | None = None
+        """The pedal that was pressed to be learned, until its action is chosen."""
         self.unavailable: tuple[str, ...] = ()
         """Why some devices cannot be listened to while a pedal is waited for."""
         self._deaf_until_s = 0.0

@@ -68,13 +68,7 @@ class Preferences:
 
 
 class PreferencesStore(QObject):
-    """The preferences of a window and their file, which other windows change, too.
-
-    Attributes
-    ----------
-    current
-        The preferences that hold now.
-    """
+    """The preferences of a window and their file, which other windows change, too."""
 
     changed = Signal()
     """A preference was stored."""
@@ -84,6 +78,7 @@ class PreferencesStore(QObject):
     def __init__(self, preferences: Preferences, path: Path) -> None:
         super().__init__()
         self.current = preferences
+        """The preferences that hold now."""
         self.path = path
 
     def remember(self, change: Callable[[Preferences], Preferences]) -> None:

@@ -132,8 +132,6 @@ class Tasks(QObject):
 
         Parameters
         ----------
-        title
-            What it does, for the operator.
         work
             Called with its `Control`; touches no widget.
         on_done, on_part

@@ -142,8 +142,6 @@ class Workspace(QObject):
 
         Parameters
         ----------
-        work
-            What is done.
         cause
             What a refusal lasts as long as, see `say_wrong`; empty: until it was read.
         beside

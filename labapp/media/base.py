@@ -30,35 +30,25 @@ class Frame(ReadOnlyArrays):
 
 
 class FrameSource(Protocol):
-    """Frames in a fixed order, each of the same shape: a video, an image, a folder of images.
-
-    Attributes
-    ----------
-    name
-        What to call it.
-    frame_rate_hz
-        Frames a second; None where there is no time base.
-    shape
-        (rows, columns) of every frame.
-    warnings
-        What the user should know about it, one sentence each.
-    description
-        What was read, in words: "AVI, FFV1, 640×480 px, 8 bit grey, 60 frames/s".
-    bit_depth
-        Significant bits of a grey level: 8, 10, 12, 16; 32 for float.
-    index
-        What opening had to find out in the file (time stamps, key frames …):
-        ``open_source(path, index)`` opens it again at once. None where opening is cheap. An index
-        that does not fit the file is ignored.
-    """
+    """Frames in a fixed order, each of the same shape: a video, an image, a folder of images."""
 
     name: str
+    """What to call it."""
     frame_rate_hz: float | None
+    """Frames a second; None where there is no time base."""
     shape: tuple[int, int]
+    """(rows, columns) of every frame."""
     warnings: tuple[str, ...]
+    """What the user should know about it, one sentence each."""
     description: str = ""
+    """What was read, in words: "AVI, FFV1, 640×480 px, 8 bit grey, 60 frames/s"."""
     bit_depth: int = 8
+    """Significant bits of a grey level: 8, 10, 12, 16; 32 for float."""
     index: bytes | None = None
+    """What opening had to find out in the file (time stamps, key frames …): ``open_source(path,
+    index)`` opens it again at once. None where opening is cheap. An index that does not fit the
+    file is ignored.
+    """
 
     def __len__(self) -> int: ...
 

@@ -104,8 +104,6 @@ class Alarms:
             The camera's number of it, and its time, s.
         measures
             Sizes; None where it could not be measured.
-        reason
-            Why not.
         setup_doubt
             Why the set-up is doubtful; empty if it is not.
 

@@ -60,8 +60,6 @@ class LiveMeasuring:
 
         Parameters
         ----------
-        frame
-            As the camera gave it.
         drawn
             Whether its surface is to be drawn: that takes a millisecond more.
 

@@ -31,22 +31,11 @@ class LiveWatch:
 
     Parameters
     ----------
-    name
-        Of the camera, for events.
     setup, settings, bit_depth
         As of `LiveMeasuring`.
-    limits
-        Of the sizes.
     on_event
         Called when an alarm is raised, over, or acknowledged, and when limits change, with the
         event and the time of its frame by the camera's clock, s (None: now); from any thread.
-
-    Attributes
-    ----------
-    alarms
-        What is watched, and what the operator must see.
-    trend
-        Sizes of the last frames, and how measuring keeps up.
     """
 
     def __init__(
@@ -59,6 +48,7 @@ class LiveWatch:
         on_event: Callable[[Event, float | None], None],
     ) -> None:
         self.alarms, self.trend = Alarms(limits), LiveTrend()
+        """What the operator must see; sizes of the last frames, and how measuring keeps up."""
         self._name, self._scheme, self._on_event = name, settings.scheme, on_event
         self._measuring = LiveMeasuring(setup, settings, bit_depth)
         self._queue = FrameQueue()

@@ -101,8 +101,6 @@ def _agreeing(
     ----------
     measured
         What was measured, in its order.
-    setup, settings
-        With what.
     warm
         Whether frames follow on those before, but for where the track was lost.
     """

@@ -38,8 +38,6 @@ def run(frames: Iterable[int], measurer: Measurer, sinks: Sequence[Sink]) -> Gen
     ----------
     frames
         Their numbers, in the order in which they are measured.
-    measurer
-        What measures them.
     sinks
         Where results go, in this order.
     """

@@ -36,15 +36,7 @@ if TYPE_CHECKING:
 
 
 class SessionContents:
-    """The contents of a session, read-only; `Session` adds the changes.
-
-    Attributes
-    ----------
-    path
-        The session file.
-    read_only
-        Whether it was opened so.
-    """
+    """The contents of a session, read-only; `Session` adds the changes."""
 
     def __init__(self, database: Database) -> None:
         from labapp.session.calibration_pictures import CalibrationPictures
@@ -54,7 +46,9 @@ class SessionContents:
         from labapp.session.overviews import Overviews
 
         self.path = database.path
+        """The session file."""
         self.read_only = database.read_only
+        """Whether it was opened so."""
         self._database = database
         self._frames = Frames(database)
         self._pictures = CalibrationPictures(database)
@@ -198,8 +192,6 @@ class SessionContents:
 
         Parameters
         ----------
-        frame
-            Its number.
         scheme
             ``fit``, ``ers``, ``irs-opa`` …; None: the one that the settings choose.
         """

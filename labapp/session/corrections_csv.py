@@ -72,8 +72,6 @@ def read_correction(
     path
         The table; with a column ``frame``, its rows of other frames are passed over. The separator
         is a comma, a semicolon or a tab; the decimals' a point, or, with the latter two, a comma.
-    frame
-        Which frame it is for.
     frame_shape
         Height and width of the frame, px.
     before

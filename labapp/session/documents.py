@@ -77,8 +77,6 @@ class Documents:
 
     Parameters
     ----------
-    database
-        The session file.
     on_change
         Called with the documents that a change, an undo or a redo has set, in the same transaction.
     """

@@ -126,8 +126,6 @@ class Results:
         ----------
         frame, measurement
             The frame's number and its measurement.
-        basis
-            Inputs of the measurement.
         correction
             SHA-256 of the correction it was measured with; None without.
 
@@ -217,8 +215,6 @@ class Results:
 
         Parameters
         ----------
-        frame, scheme
-            Which result.
         basis, correction
             Present inputs, to see whether it is stale; basis None where the setup is incomplete.
 

@@ -75,8 +75,6 @@ class Overviews:
 
         Parameters
         ----------
-        scheme
-            Name of the scheme.
         basis
             Present inputs; None where the setup is incomplete.
 

@@ -138,8 +138,6 @@ def trend(
 
     Parameters
     ----------
-    seen
-        All frames at a glance.
     key
         Name of the measure, one of `BY_KEY`.
     without_doubtful

@@ -53,8 +53,6 @@ def camera_opener(
         as if a camera filmed it, there and back without end.
     progress
         Called for each frame of a scenario that is rendered.
-    faults
-        Of a simulated camera.
 
     Raises
     ------

@@ -39,10 +39,6 @@ def simulate(
 
     Parameters
     ----------
-    scenario
-        What is rendered.
-    out
-        The folder.
     workers
         How many processes render; None: one a core. The result is the same.
     progress
@@ -94,12 +90,6 @@ def begin_session(
 
     Parameters
     ----------
-    scenario
-        What was simulated.
-    folder
-        Where to.
-    path
-        The session file.
     progress
         Called with how much of the recording is imported; what it raises leaves no session.
 

@@ -142,10 +142,6 @@ def exact_match(
 
     Parameters
     ----------
-    reflections
-        What `trace` gave.
-    rig
-        The rig that it was given.
     orientation
         The correspondence the match carries; None: the one the dots show.
     sigma_mm

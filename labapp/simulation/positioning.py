@@ -45,8 +45,6 @@ def clearance(rig: Rig, head_slope_deg: float = 0.0) -> Clearance:
 
     Parameters
     ----------
-    rig
-        The bench.
     head_slope_deg
         How steeply the pool falls towards its head's edge: 0 for a flat one, β of Eq. 4-17 for a
         convex one, −γ of Eq. 4-18 for a concave one, degrees.
@@ -123,8 +121,6 @@ def side_view(
 
     Parameters
     ----------
-    rig
-        The bench.
     width_mm, length_mm, height_mm
         Size of the pool, part of an ellipsoid; a negative height is a concave one.
 

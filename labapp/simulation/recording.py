@@ -143,10 +143,6 @@ class Recording:
         ----------
         folder
             Made if missing.
-        setup
-            Text of the setup file.
-        workers
-            Number of processes.
         progress
             Called for each frame, and while one is waited for; may raise to stop.
 

@@ -64,8 +64,6 @@ def read_pool(
 
     Parameters
     ----------
-    path
-        The file.
     spacing_mm
         Of a grid that does not say where its nodes are; not used for others.
     center_mm

@@ -141,14 +141,10 @@ def survey(
     kind
         ``CE``: the laser where it stood, 31.14°, 31.48 mm. ``LE``: the least error of all with the
         laser at 25° to 35° and 25 to 35 mm. ``ME``: the same with 39 × 39 rays, 0.385° apart.
-    schemes
-        Which schemes.
     step
         Of the laser's places, degrees and mm.
     caps
         The surfaces; None for the 28 of §8.3.1, each at its `CENTERS`.
-    progress, workers
-        See `in_parallel`.
     """
     caps, schemes = tuple(caps or aside(caps_8_3_1(), CENTERS[kind])), tuple(schemes)
     pattern = DENSE if kind == "ME" else DotPattern()

@@ -120,15 +120,9 @@ def parameter_deviation(
 
     Parameters
     ----------
-    known
-        The pool.
-    scheme
-        How it is reconstructed.
     draws
         How many Monte Carlo draws. The standard deviation of m draws is itself known to about
         1/√(2m): 400 give 3.5 %.
-    progress, workers
-        See `in_parallel`.
     """
     uncertainty, count = known.uncertainty, len(QUANTITIES)
     uncertain = np.flatnonzero(uncertainty.sigma)

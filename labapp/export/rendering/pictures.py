@@ -134,10 +134,6 @@ def write_surface_picture(
 
     Parameters
     ----------
-    path
-        Where to.
-    reconstruction
-        What to draw.
     process
         A `drawing_process` to draw several pictures in; None starts one for this, of the usual
         size and view.

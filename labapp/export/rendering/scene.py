@@ -77,8 +77,6 @@ def scene_of(
 
     Parameters
     ----------
-    reconstruction
-        The pool.
     colour
         By height, or by the height's standard uncertainty; by height where the scheme gives none.
     limits

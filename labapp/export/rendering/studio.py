@@ -35,8 +35,6 @@ class Studio:
     ----------
     size
         Width and height of the pictures, px.
-    direction
-        Where from.
 
     Raises
     ------

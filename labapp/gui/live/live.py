@@ -100,29 +100,10 @@ class Live:
 
     Parameters
     ----------
-    name
-        Of the camera.
     place
         Gives the file of a recording that begins.
-    plan
-        What is recorded.
-    wanted
-        What the camera is set to.
-    settings
-        Of the measurement.
     setup
         Rig and image calibration that frames are measured by; None: they are only looked at.
-    limits
-        Of the sizes that are measured.
-
-    Attributes
-    ----------
-    watch
-        Measures the frames; None where there is no set-up, and before the camera is open.
-    takes
-        The recordings made, in their order.
-    room_byte
-        Free on the disk; None where that is not known.
     """
 
     def __init__(
@@ -138,8 +119,10 @@ class Live:
         self.name = name
         self.plan = plan
         self.takes: list[Take] = []
+        """The recordings made, in their order."""
         self.feed: Feed | None = None
         self.watch: LiveWatch | None = None
+        """Measures the frames; None where there is no set-up, and before the camera is open."""
         self._place, self._folder, self._wanted = place, place().parent, wanted
         self._settings, self._setup, self._limits = settings, setup, limits or Limits()
         self._dots = settings.dots
@@ -154,6 +137,7 @@ class Live:
         self._counted: deque[tuple[float, int]] = deque()
         self._frame_byte = 0
         self.room_byte: int | None = None
+        """Free on the disk; None where that is not known."""
         self._is_stale = False
         self._closing = threading.Event()
         self._turn = threading.Lock()

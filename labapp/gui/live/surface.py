@@ -50,8 +50,6 @@ class LiveSurface(QWidget):
         ----------
         result
             What was measured since the last call; None: nothing.
-        watch
-            Which measures.
         """
         scene = watch.scene()
         watch.ask_for_scene()

@@ -26,33 +26,24 @@ class Page(QWidget):
 
     The window calls `refresh` when the page comes into view and whenever, while it is in view, the
     session, its results or the frame in view changed. A page keeps nothing that the session holds.
-
-    Attributes
-    ----------
-    key
-        Of its step in `steps.STEPS`.
-    shows_all_frames
-        Whether it shows what all frames gave, and not only the one in view.
-    workspace
-        What is open.
-    panel
-        Parameters and results; the window puts the step's hint above it.
-    refused
-        Says why what was pressed was refused; a page that refuses puts it beside that.
     """
 
     key = ""
+    """Key of its step in `steps.STEPS`."""
     shows_all_frames = False
+    """Whether it shows what all frames gave, and not only the one in view."""
 
     def __init__(self, workspace: Workspace) -> None:
         super().__init__()
         self.workspace = workspace
         self.panel = QWidget()
+        """Parameters and results; the window puts the step's hint above it."""
         self.canvas_layout = vbox(of=self)
         self.panel_layout = QVBoxLayout(self.panel)
         self.setObjectName(f"page-{self.key}")
         self.panel.setObjectName(f"panel-{self.key}")
         self.refused = Message(2)
+        """Says why what was pressed was refused; a page that refuses puts it beside that."""
         self._changing: list[QWidget] = []
         workspace.opened.connect(self._take_session)
 

@@ -18,13 +18,7 @@ if TYPE_CHECKING:
 
 
 class Menus:
-    """The window's menus, and which of their actions are of use now.
-
-    Attributes
-    ----------
-    actions
-        The Qt actions by their names.
-    """
+    """The window's menus, and which of their actions are of use now."""
 
     def __init__(
         self,
@@ -38,6 +32,7 @@ class Menus:
         self._do = do
         self._open_session = open_session
         self.actions: dict[str, QAction] = {}
+        """The Qt actions by their names."""
         self._plain: dict[QKeyCombination, str] = {}
         self._menus = {title: window.menuBar().addMenu(title) for title in MENUS}
         groups: dict[str, QActionGroup] = {}

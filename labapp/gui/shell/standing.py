@@ -78,8 +78,6 @@ def next_frame(
         Which of them are wanted, shape (n,), of bool.
     current
         A frame's number.
-    forward
-        Whether to look after it.
     """
     chosen = frames[wanted]
     chosen = chosen[chosen > current] if forward else chosen[chosen < current][::-1]

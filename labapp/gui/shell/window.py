@@ -59,19 +59,7 @@ PAGE_PX = 336
 
 
 class MainWindow(QMainWindow):
-    """The app's one window.
-
-    Attributes
-    ----------
-    workspace
-        What is open.
-    pages
-        Those made by now, by their keys.
-    standings
-        How each frame stands, shape (n,).
-    page
-        The page in view; None for the welcome page.
-    """
+    """The app's one window."""
 
     def __init__(self, preferences: PreferencesStore, commands: Commands) -> None:
         super().__init__()
@@ -80,9 +68,12 @@ class MainWindow(QMainWindow):
         preferences.setParent(self)
         self.workspace = Workspace(self)
         self.pages: dict[str, Page] = {}
+        """The pages made by now, by their keys."""
         self.files = Files(self, self.workspace, preferences, lambda: self.camera)
         self.standings: IntArray = np.zeros(0, np.int64)
+        """How each frame stands, shape (n,)."""
         self.page: Page | None = None
+        """The page in view; None for the welcome page."""
         self._steps = tuple(step for step in STEPS if step.key in PAGES)
         self._states = states(None)
         self._changes_due = False

@@ -38,13 +38,7 @@ SIZES = (
 
 
 class AnalysisWindow(ToolWindow):
-    """Works out parts of chapter 8 and the budget of a set-up, and shows each when it is done.
-
-    Attributes
-    ----------
-    tables, pictures
-        What the last run gave, by name.
-    """
+    """Works out parts of chapter 8 and the budget of a set-up, and shows each when it is done."""
 
     key = "analysis"
     title = "Error analysis"
@@ -52,6 +46,7 @@ class AnalysisWindow(ToolWindow):
     def __init__(self, sessions: Files, window: QWidget) -> None:
         self.tables: dict[str, Table] = {}
         self.pictures: dict[str, bytes] = {}
+        """What the last run gave, by name."""
         self._anew = False
         self._basis: object = None
         super().__init__(sessions, window)

@@ -33,22 +33,16 @@ RING, RING_PX = "#2fd39b", 15
 
 
 class SimulatorWindow(ToolWindow):
-    """Shows a scenario, writes its recording with the truth, and opens that as a session.
-
-    Attributes
-    ----------
-    preview
-        The scenario that is shown; None until its first frame is drawn.
-    made
-        The scenario that was written last, and where to.
-    """
+    """Shows a scenario, writes its recording with the truth, and opens that as a session."""
 
     key = "simulator"
     title = "Simulator"
 
     def __init__(self, sessions: Files, window: QWidget) -> None:
         self.preview: ScenarioPreview | None = None
+        """The scenario that is shown; None until its first frame is drawn."""
         self.made: tuple[Scenario, Path] | None = None
+        """The scenario that was written last, and where to."""
         self._own: Path | None = None
         self._proposed = ""
         self._turn = threading.Lock()

@@ -36,29 +36,19 @@ class ToolWindow(QDialog):
     """A window with a form at the left, results at the right and buttons below.
 
     Closing it stops its work, and keeps what it shows.
-
-    Attributes
-    ----------
-    key, title
-        In code; for the operator.
-    workspace
-        What is open.
-    tasks
-        The tool's own work.
-    form, results
-        Where the tool puts its fields, and what it found.
-    files
-        What it found as files: name → content.
     """
 
     key = ""
     title = ""
+    """Name in code, and name for the operator."""
 
     def __init__(self, sessions: Files, window: QWidget) -> None:
         super().__init__(window)
         self.workspace = sessions.workspace
         self.tasks = Tasks(self)
+        """The tool's own work."""
         self.files: dict[str, bytes] = {}
+        """What it found as files: name → content."""
         self._task: Task | None = None
         self._pressed: QWidget | None = None
         self.setObjectName(f"tool-{self.key}")
@@ -66,6 +56,7 @@ class ToolWindow(QDialog):
         self.setWindowFlag(Qt.WindowType.WindowMaximizeButtonHint)
         self.form = FieldForm()
         self.results = QVBoxLayout()
+        """Where the tool puts its results; its fields go into `form`."""
         self.message = Message(1)
         self.message.setAccessibleName("Last message")
         self.bar = QProgressBar()

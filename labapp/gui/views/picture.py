@@ -77,15 +77,7 @@ class Tool:
 
 
 class PictureView(Drawn):
-    """A grey picture; overlays are pyqtgraph items that `add` puts over it, in px.
-
-    Attributes
-    ----------
-    tool
-        What the left button does.
-    points
-        The points to drag.
-    """
+    """A grey picture; overlays are pyqtgraph items that `add` puts over it, in px."""
 
     pointed = Signal(float, float, object)
     """Where the pointer is and the level there: u, v, level (None outside the picture)."""
@@ -93,7 +85,9 @@ class PictureView(Drawn):
     def __init__(self, name: str = "Picture") -> None:
         super().__init__(name, KEYS)
         self.tool = Tool()
+        """What the left button does."""
         self.points: list[DragPoint] = []
+        """The points to drag."""
         self._image: GreyImage | None = None
         self._levels = (0.0, 1.0)
         self._fits = True

@@ -37,15 +37,7 @@ STEP_PAUSE_MS = 300
 
 
 class Field(QWidget):
-    """An editor with its label, its unit and room for a problem in words.
-
-    Attributes
-    ----------
-    label
-        Stands before it; a `FieldForm` places it.
-    editor
-        The widget that takes the keys.
-    """
+    """An editor with its label, its unit and room for a problem in words."""
 
     edited = Signal(object)
     """The operator has entered another value: the value, None where it was emptied."""
@@ -53,9 +45,11 @@ class Field(QWidget):
     def __init__(self, label: str, editor: QWidget, tooltip: str, unit: str = "") -> None:
         super().__init__()
         self.label = wrapping_label(label)
+        """Stands before it; a `FieldForm` places it."""
         self.label.setBuddy(editor)
         self.label.setToolTip(tooltip)
         self.editor = editor
+        """The widget that takes the keys."""
         editor.setToolTip(tooltip)
         editor.setAccessibleName(f"{label}, {unit}" if unit else label)
         self._tooltip = tooltip
@@ -124,8 +118,6 @@ class NumberField(Field):
         Of the arrow keys and buttons; Page Up and Down go ten.
     decimals
         How many are shown; 0: whole numbers, and values are int.
-    optional
-        Whether the field may be emptied.
     """
 
     def __init__(

@@ -56,8 +56,6 @@ def aggregated(kinds: npt.NDArray[np.int64], columns: int) -> npt.NDArray[np.int
     ----------
     kinds
         Of the frames, at least one, shape (n,).
-    columns
-        How many there are.
     """
     count = len(kinds)
     first = np.arange(columns, dtype=np.int64) * count // columns

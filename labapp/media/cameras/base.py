@@ -118,21 +118,14 @@ class CameraFrame(ReadOnlyArrays):
 
 
 class Camera(Protocol):
-    """A camera that is open. Used by one thread at a time.
-
-    Attributes
-    ----------
-    info
-        Which it is.
-    limits
-        What can be set.
-    bit_depth
-        Significant bits of a grey level.
-    """
+    """A camera that is open. Used by one thread at a time."""
 
     info: CameraInfo
+    """Which it is."""
     limits: Limits
+    """What can be set."""
     bit_depth: int
+    """Significant bits of a grey level."""
 
     @property
     def settings(self) -> CameraSettings:

@@ -67,8 +67,6 @@ class Feed:
 
     Parameters
     ----------
-    name
-        Of the camera, for events.
     opener
         Opens the camera: raises `CameraError` while it cannot.
     on_frame

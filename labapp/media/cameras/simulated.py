@@ -72,8 +72,6 @@ class SimulatedDevice:
         Significant bits of a grey level.
     rate_hz
         Frames a second at first.
-    faults
-        What goes wrong by itself.
     """
 
     def __init__(

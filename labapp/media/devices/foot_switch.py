@@ -157,8 +157,6 @@ class FootSwitch(HidReader):
         Called with an action when its pedal is pressed, in a thread of the foot switch.
     on_event
         Called with every event.
-    find, opener
-        Find and open devices; tests replace them.
     """
 
     def __init__(
@@ -206,8 +204,6 @@ def learn(
     ----------
     ending
         Set to stop waiting.
-    find, opener
-        Find and open devices; tests replace them.
     on_problems
         Called once with why some devices cannot be read.
 

@@ -219,12 +219,8 @@ class HidReader:
 
     Parameters
     ----------
-    name
-        Name of the device in events.
     on_event
         Called with every event.
-    find, opener
-        Find and open devices; tests replace them.
     retry_s
         Pause between searches for a missing device, s; None: `RETRY_S`.
     """

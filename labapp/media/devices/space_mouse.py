@@ -73,8 +73,6 @@ class SpaceMouse(HidReader):
         Called with its state whenever that changes, in the reader's thread.
     on_event
         Called with every event but that none is connected.
-    find, opener
-        Find and open devices; tests replace them.
     """
 
     def __init__(

@@ -22,8 +22,6 @@ class StoredFrames(FrameSource):
 
     Parameters
     ----------
-    path
-        The file or folder.
     kind
         Begin of the description: "Phantom cine".
     count
@@ -32,8 +30,6 @@ class StoredFrames(FrameSource):
         (rows, columns).
     bit_depth
         Significant bits of a grey level.
-    colour
-        Whether the recording is in colour.
     frame_rate_hz
         Frame rate, Hz; None where unknown.
     time_s

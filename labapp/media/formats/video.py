@@ -93,8 +93,6 @@ class VideoSource(FrameSource):
 
     Parameters
     ----------
-    path
-        The file.
     index
         `index` of an earlier source, to open the file without reading it through.
 

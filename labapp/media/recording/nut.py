@@ -65,8 +65,6 @@ class NutWriter:
 
     Parameters
     ----------
-    path
-        A new file.
     shape
         (rows, columns) of every frame.
     bit_depth
@@ -75,8 +73,6 @@ class NutWriter:
         Frame rate in the header, Hz; frames have time stamps of their own.
     codec
         ``ffv1``: about half the size; ``raw``: the levels as they are.
-    threads
-        That encode.
     file
         Written instead of a file at ``path``.
 

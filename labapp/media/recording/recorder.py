@@ -91,10 +91,6 @@ class Recorder:
     ----------
     new_path
         Returns the path of a new recording; it and its notes must not exist.
-    plan
-        What is recorded.
-    bit_depth, rate_hz
-        Of the camera.
     on_event
         Called with every event.
     writer

@@ -81,11 +81,6 @@ class TakeFiles:
         Opens its video, for frames of a shape.
     on_event
         Called with faults.
-
-    Attributes
-    ----------
-    wrong
-        Frames of another size or with more bits.
     """
 
     def __init__(
@@ -93,6 +88,7 @@ class TakeFiles:
     ) -> None:
         self.take = take
         self.wrong = Tally(self._emit_wrong)
+        """Frames of another size or with more bits."""
         self._opener = opener
         self._on_event = on_event
         self._has_notes = True

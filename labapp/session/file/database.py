@@ -59,18 +59,13 @@ class Database:
 
     Make it with `Database.create` or `Database.open`. It is thread-safe: a transaction excludes
     other threads.
-
-    Attributes
-    ----------
-    path
-        The file.
-    read_only
-        Whether it was opened so.
     """
 
     def __init__(self, path: Path, read_only: bool, lock: FileLock | None) -> None:
         self.path = path
+        """The file."""
         self.read_only = read_only
+        """Whether it was opened so."""
         self._lock = lock
         self._mutex = threading.RLock()
         self._temporary: Path | None = None

@@ -23,8 +23,6 @@ def check_fields(value: Any, shapes: Mapping[str, str]) -> None:
 
     Parameters
     ----------
-    value
-        The instance.
     shapes
         Shape of every array, as in ``"n 3"``; equal letters are equal lengths.
 

@@ -46,8 +46,6 @@ def report_pdf(
 
     Parameters
     ----------
-    session
-        The session.
     scheme
         Whose results; None: of the one that the settings choose.
     frames

@@ -154,8 +154,6 @@ def trends(axis: FloatArray, label: str, series: list[Series], states: list[str]
     ----------
     axis, label
         Time or number of each frame, shape (n,), and what it is.
-    series
-        The sizes.
     states
         Which of `STATES` each frame has; what is in none is not drawn.
     """

@@ -82,21 +82,15 @@ def plain(text: str) -> str:
 
 
 class Story:
-    """What a report says, from top to bottom; its tables and figures are counted.
-
-    Attributes
-    ----------
-    flowables
-        All of it, in order.
-    tables, captions
-        Each table's text, and each caption, for who wants to read them.
-    """
+    """What a report says, from top to bottom; its tables and figures are counted."""
 
     def __init__(self) -> None:
         _register_fonts()
         self.flowables: list[Flowable] = []
+        """All of it, in order."""
         self.tables: list[Cells] = []
         self.captions: list[str] = []
+        """Each table's text, and each caption, for who wants to read them."""
         self._figures = 0
         self._headings: list[Flowable] = []
 
@@ -128,8 +122,6 @@ class Story:
 
         Parameters
         ----------
-        caption
-            What it shows.
         cells
             Its text, the header first.
         align

@@ -121,8 +121,6 @@ class LaserPlace:
 
     Parameters
     ----------
-    expected, limits
-        The pools and the bench.
     angle_deg, distance_mm
         The laser's place.
     """

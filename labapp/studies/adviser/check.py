@@ -92,8 +92,6 @@ def check(
         drawn anew.
     grid
         Angles, distances and plane distances, evenly over the bench's limits.
-    progress, workers
-        See `in_parallel`.
     """
     expected, limits = advice.expected, advice.limits
     rivals = _possible(advice, grid)

@@ -87,8 +87,6 @@ def predict_error(
     ----------
     pool
         A pool of the kind that is expected, its boundary on the work piece.
-    rig
-        The set-up.
     dot_sigma_mm
         Standard uncertainty of a dot's place on the plane.
     uncertainty

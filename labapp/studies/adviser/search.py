@@ -140,8 +140,6 @@ def advise(
     ----------
     expected, limits
         The pools, and the bench's limits.
-    effort
-        How thoroughly.
     seed
         Of the pools and errors that set-ups are compared on: the same one gives the same advice.
     progress, workers

@@ -139,8 +139,6 @@ def check(
 
     Parameters
     ----------
-    chosen
-        The pictures.
     setup_file, settings
         Text and path of the set-up, and how dots are found. What an earlier check has told of the
         bench is left out, or its pictures would count twice.

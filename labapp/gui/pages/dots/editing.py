@@ -25,23 +25,16 @@ NOTHING: IntArray = np.zeros(0, np.int64)
 
 
 class Editor:
-    """The hand on one frame: a selection, a drag under way, and the edits.
-
-    Attributes
-    ----------
-    correction
-        The dots and rows that are shown; None without any.
-    selection
-        Indices of the chosen dots, ascending.
-    shift_px
-        How far a drag or a held key has brought the chosen dots so far, shape (2,).
-    """
+    """The hand on one frame: a selection, a drag under way, and the edits."""
 
     def __init__(self, commit: Commit) -> None:
         self._commit = commit
         self.correction: Correction | None = None
+        """The dots and rows that are shown; None without any."""
         self.selection = NOTHING
+        """Indices of the chosen dots, ascending."""
         self.shift_px: FloatArray = np.zeros(2)
+        """How far a drag or a held key has brought the chosen dots so far, shape (2,)."""
 
     def show(self, correction: Correction | None, same_frame: bool) -> None:
         """Work on what a frame shows now; the selection stays where its dots do."""

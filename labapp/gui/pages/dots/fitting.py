@@ -70,11 +70,6 @@ class Refit:
 
     One fit at a time, in a process of its own: a long measurement does not hold it up. An edit made
     meanwhile ends it at once and begins another, of what the frame has then.
-
-    Attributes
-    ----------
-    processes
-        Where it fits.
     """
 
     def __init__(self, workspace: Workspace) -> None:
@@ -83,6 +78,7 @@ class Refit:
         self._begun: tuple[int, object] | None = None
         self._seen: DotsState | None = None
         self.processes = Processes()
+        """The processes that fit."""
         self._warm, self._again = QTimer(workspace), QTimer(workspace)
         for timer, rest_ms, work in (
             (self._warm, WARM_MS, self.processes.begin),

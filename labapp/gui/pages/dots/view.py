@@ -385,13 +385,7 @@ class DotsPage(Page):
 
 
 class Hand(Tool):
-    """The pointer and the arrow keys on the dots.
-
-    Attributes
-    ----------
-    asked
-        What a button asks a click for; empty if none does.
-    """
+    """The pointer and the arrow keys on the dots."""
 
     def __init__(self, page: DotsPage) -> None:
         self._page = page
@@ -399,6 +393,7 @@ class Hand(Tool):
         self._boxing = self._adds = False
         self._next_click: Callable[[float, float], object] | None = None
         self.asked = ""
+        """What a button asks a click for; empty if none does."""
 
     @property
     def busy(self) -> bool:

@@ -261,12 +261,6 @@ def scene(
 
     Parameters
     ----------
-    measurement
-        Of the frame.
-    rig
-        What it was measured with.
-    options
-        What was ticked.
     limits
         Colour scale that all frames share, mm; None: that of this frame.
     cut
