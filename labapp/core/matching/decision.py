@@ -189,8 +189,8 @@ def decide(observed: Observation, found: list[Hypothesis], settings: MatchSettin
             )
     best = _without(observed, best, doubtful, fit)
     for _ in range(MOST_LEFT_OUT):
-        best = _settled(observed, best, fit)
-        wrong = unsupported(observed, fitted_labels(observed, best, fit))
+        settled = _settled(observed, best, fit)
+        wrong = unsupported(observed, fitted_labels(observed, settled, fit))
         if len(wrong) == 0:
             break
         best = _without(observed, best, wrong, fit)
