@@ -63,7 +63,6 @@ def _accumulate(
     slopes: FloatArray,
     start: float,
     slope: float,
-    shrinks: float,
 ) -> None:
     """Add log(1 + exp(−(start + k · slope))) to every level k.
 
@@ -71,11 +70,14 @@ def _accumulate(
     exponent is above 0 it is taken out of the logarithm, into ``starts`` and ``slopes``.
     """
     count = len(factors)
+    if min(start, start + (count - 1) * slope) > FARTHEST:
+        return  # nothing to add: most witnesses are far on the right side
     turn = -start / slope if slope != 0.0 else np.inf * start
     turn = int(min(max(np.ceil(turn), 0.0), count)) if not np.isnan(turn) else 0
     begins, ends = (0, turn) if slope > 0.0 else (turn, count)
     starts[begins], slopes[begins] = starts[begins] - start, slopes[begins] - slope
     starts[ends], slopes[ends] = starts[ends] + start, slopes[ends] + slope
+    shrinks = np.exp(-abs(slope))
     for at, way in ((turn, 1), (turn - 1, -1)):
         away = abs(start + at * slope)
         if 0 <= at < count and away < FARTHEST:
@@ -122,7 +124,6 @@ def level_negative_log_likelihood(
     """
     made = np.empty((len(over), len(blurs), count))
     factors, starts, slopes = np.empty(count), np.empty(count + 1), np.empty(count + 1)
-    shrinking = np.exp(-step * np.outer(1.0 / blurs, np.abs(side)))
     for d in range(len(over)):
         for b in range(len(blurs)):
             total = made[d, b]
@@ -133,9 +134,9 @@ def level_negative_log_likelihood(
                 shift = -np.log(missing) if part else 0.0
                 for n in range(len(side)):
                     if dark[n] or not part:
-                        start = side[n] * (over[d, n] + first) / blurs[b] + shift
-                        slope = side[n] * step / blurs[b]
-                        _accumulate(factors, starts, slopes, start, slope, shrinking[b, n])
+                        sharp = side[n] / blurs[b]
+                        start, slope = sharp * (over[d, n] + first) + shift, sharp * step
+                        _accumulate(factors, starts, slopes, start, slope)
                     if n % FACTORS == FACTORS - 1 or n == len(side) - 1:
                         total += sign * np.log(factors)
                         factors[:] = 1.0
