@@ -209,8 +209,10 @@ class SessionContents:
     @property
     def setup_verdict(self) -> SetupVerdict | None:
         """What the frames that were measured with the present set-up say of it; None without."""
+        from labapp.session.file.blobs import pack
+
         basis = self._basis()
-        return None if basis is None else self._results.verdict(basis)
+        return None if basis is None else self._results.verdicts.of(pack(basis.setup.text))
 
     @property
     def setup_status(self) -> str:

@@ -13,19 +13,14 @@ import numpy as np
 
 from labapp.config.setup import Setup, parse_setup
 from labapp.core.pipeline import Measurement, Settings
-from labapp.core.recording.residual_check import (
-    DOUBTFUL,
-    MOST,
-    Residuals,
-    SetupVerdict,
-    judge_setup,
-)
+from labapp.core.recording.residual_check import DOUBTFUL, MOST, Residuals, judge_setup
 from labapp.core.schemes import SCHEMES
 from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 from labapp.errors import InputError
 from labapp.session.file.blobs import Damaged, fingerprint, pack, unpack
 from labapp.session.file.database import Database
 from labapp.session.file.schema import MEASURES
+from labapp.session.setup_verdicts import SetupVerdicts, chosen_evenly
 from labapp.text import now
 from labapp.version import VERSION
 
@@ -112,6 +107,7 @@ class Results:
 
     def __init__(self, database: Database) -> None:
         self._database = database
+        self.verdicts = SetupVerdicts(database)
         self._stashed: OrderedDict[tuple[int, str, str | None], _Row] = OrderedDict()
 
     def put(
@@ -232,8 +228,7 @@ class Results:
         except Damaged as error:
             raise InputError(path, named, error, "what was written there") from error
         inputs = self._inputs(row.setup, row.settings)
-        verdict = self._verdict(row.setup)
-        doubt = verdict.reason if verdict is not None and verdict.is_doubtful else ""
+        doubt = self.verdicts.doubt_of(row.setup)
         if doubt and measurement.setup_status:
             measurement = replace(measurement, setup_status=DOUBTFUL)
         outdated = _differences(basis, inputs)
@@ -270,45 +265,14 @@ class Results:
             "ORDER BY frame",
             *given,
         )
-        frames = np.array([frame for frame, status in rows if status == "ok"], np.int64)
-        places = np.unique(np.linspace(0, len(frames) - 1, MOST).round().astype(int))
         samples = []
-        for frame in frames[places[places >= 0]].tolist():
+        for frame in chosen_evenly([frame for frame, status in rows if status == "ok"]):
             row = self._row(frame, basis.scheme)
             assert row is not None
             residuals = _residuals(row.content, (frame, basis.scheme, *row[:-1]))
             samples += [residuals] if residuals else []
         statuses = Counter(status for _, status in rows)
-        found = judge_setup(basis.setup.rig, statuses, samples)
-        with self._database.transaction() as connection:
-            connection.execute(
-                "UPDATE inputs SET verdict = ? WHERE version = ? AND setup = ? AND settings = ?",
-                (pack(found), *given),
-            )
-
-    def verdict(self, basis: Basis) -> SetupVerdict | None:
-        """What results say of a set-up; None where none were measured with it.
-
-        Raises
-        ------
-        InputError
-            If it is damaged.
-        """
-        return self._verdict(pack(basis.setup.text))
-
-    def _verdict(self, setup: bytes) -> SetupVerdict | None:
-        """Verdict on a packed set-up; one that doubts it where schemes or settings differ."""
-        rows = self._database.rows(
-            "SELECT verdict FROM inputs WHERE setup = ? AND verdict IS NOT NULL ORDER BY id", setup
-        )
-        try:
-            found = [_unpacked_verdict(verdict) for (verdict,) in rows]
-        except Damaged as error:
-            raise InputError(
-                self._database.path, "set-up verdict", error, "what was written there"
-            ) from error
-        doubting = [one for one in found if one.is_doubtful]
-        return next(iter([*doubting, *reversed(found)]), None)
+        self.verdicts.put(given, judge_setup(basis.setup.rig, statuses, samples))
 
     def counts(self) -> dict[tuple[str, str], int]:
         """Number of results: (scheme, version of labapp) → count."""
@@ -321,16 +285,15 @@ class Results:
     def problems(self) -> list[str]:
         """Sentences on damaged results; empty if there are none."""
         found = []
-        for number, version, setup, settings, verdict in self._database.rows(
-            "SELECT id, version, setup, settings, verdict FROM inputs"
+        for number, version, setup, settings in self._database.rows(
+            "SELECT id, version, setup, settings FROM inputs"
         ):
             try:
                 parse_setup(unpack(setup, str), self._database.path)
                 unpack(settings, Settings)
-                if verdict is not None:
-                    unpack(verdict, SetupVerdict)
             except (Damaged, InputError) as error:
                 found.append(f"inputs {number} of version {version} are damaged: {error}")
+        found += self.verdicts.problems()
         names = ", ".join(MEASURES)
         for result, frame, scheme, status, *sizes in self._database.rows(
             f"SELECT id, frame, scheme, status, {names} FROM result"
@@ -425,12 +388,6 @@ def _residuals(content: bytes, columns: tuple[object, ...]) -> Residuals | None:
         return Residuals.of(_verified(content, columns))
     except Damaged:
         return None
-
-
-@functools.lru_cache(maxsize=64)
-def _unpacked_verdict(content: bytes) -> SetupVerdict:
-    found: SetupVerdict = unpack(content, SetupVerdict)
-    return found
 
 
 @functools.lru_cache(maxsize=64)

@@ -23,11 +23,13 @@ RIG = replace(BENCH_RIG, uncertainty=KNOWN)
 EXACT = replace(BENCH_RIG, uncertainty=None)
 
 
-def frames(truth, count=8, seed=0, noise_mm=0.02):
+def frames(truth, count=8, seed=0, noise_mm=0.02, growth=0.0):
     """Frames of a pool that swings, seen on a bench, and fitted on what it is taken for."""
     rng = np.random.default_rng(seed)
     for n in range(count):
-        pool = egg(6.6, 3.0, 4.2, 0.29, (0.0, -0.6), (Oscillation(0.012, 22.0, n / 60.0),))
+        by = 1.0 + growth * n / count
+        swing = Oscillation(0.012, 22.0, n / 60.0)
+        pool = egg(6.6 * by, 3.0 * by, 4.2 * by, 0.29 * by, (0.0, -0.6), (swing,))
         seen = trace(pool, truth)
         ray = np.argwhere(seen.visible) + 1
         dots = seen.plane_mm[seen.visible] + rng.normal(0, noise_mm, (len(ray), 2))
@@ -88,3 +90,27 @@ def test_long_recordings_are_thinned_evenly():
     for _ in range(500):
         record.add(one)
     assert MOST / 2 <= len(record._samples) <= MOST
+
+
+def test_laser_that_slips_is_doubted_as_a_drift():
+    slipped = replace(BENCH_RIG, laser=replace(BENCH_RIG.laser, azimuth_deg=0.15))
+    found = verdict_of([*frames(BENCH_RIG), *frames(slipped, seed=1)])
+    assert found.is_doubtful
+    assert found.suspects[0].is_drift
+    azimuth = next(one for one in found.suspects if "azimuth" in one.name)
+    assert azimuth.off == pytest.approx(0.15, abs=0.04)
+
+
+def test_what_is_sent_has_the_doubt_once_it_is_known():
+    slipped = replace(BENCH_RIG, laser=replace(BENCH_RIG.laser, azimuth_deg=0.15))
+    record = ResidualRecord(RIG)
+    entered = [replace(one, setup_status="entered") for one in frames(BENCH_RIG)]
+    later = [replace(one, setup_status="entered") for one in frames(slipped, count=16, seed=1)]
+    assert {record.judged(one).setup_status for one in entered} == {"entered"}
+    assert record.doubt == ""
+    assert [record.judged(one).setup_status for one in later][-1] == "doubtful"
+    assert record.doubt
+
+
+def test_pool_that_grows_is_no_drift():
+    assert not verdict_of(frames(BENCH_RIG, count=12, growth=0.07)).is_doubtful

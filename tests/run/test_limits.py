@@ -190,3 +190,13 @@ def test_a_session_keeps_its_limits(tmp_path: Path):
     with Session.open(tmp_path / "a.labsession") as session:
         assert session.limits == wanted
         assert session.problems() == []
+
+
+def test_a_set_up_that_is_doubtful_is_an_alarm_without_limits_too():
+    alarms = Alarms(Limits())
+    assert alarms.judge(1, 1.0, measured(6.8), "") == []
+    raised = alarms.judge(2, 2.0, measured(6.8), "", "the laser slipped")
+    assert codes(raised) == [("setup-doubtful", True)]
+    assert "the laser slipped" in raised[0].words
+    assert alarms.judge(3, 3.0, None, "it is dark", "the laser slipped") == []
+    assert codes(alarms.judge(4, 5.0, measured(6.8), "")) == [("setup-doubtful", False)]

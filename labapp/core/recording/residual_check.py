@@ -347,13 +347,11 @@ def _reason(suspects: Sequence[Suspect], frames: int) -> str:
     """What the likeliest cause is, in a clause."""
     first = suspects[0]
     others = [one.name for one in suspects[1:] if one.is_drift == first.is_drift]
-    size = f"residuals of {1e3 * first.rms_mm:.0f} µm"
-    if first.is_drift:
-        what = f"{size} have come up during the recording, as if {first.name} had changed"
-    else:
-        what = f"{size} are the same in {frames} frames, as if {first.name} were off"
-    by = f"{first.off:+.2g} ± {first.sigma:.1g} {first.unit}"
-    return f"{what} by {by}{''.join(f'; or {name}' for name in others[:3])}"
+    when = "have come up during the recording" if first.is_drift else f"recur in {frames} frames"
+    by = f"by {first.off:+.2g} ± {first.sigma:.1g} {first.unit}"
+    alike = f" (or {'; '.join(others[:3])})" if others else ""
+    size = f"{1e3 * first.rms_mm:.0f} µm"
+    return f"residuals of {size} {when}; likeliest cause: {first.name}, {by}{alike}"
 
 
 def _rms(values: FloatArray) -> float:

@@ -161,7 +161,7 @@ class TrendsPage(Page):
         self.canvas_layout.addWidget(self.nothing, 1)
         self.table = ResultTable("Statistics of the measures")
         self.counted = Message(3)
-        self.setup_words = Message(2)
+        self.setup_words = Message(5)
         self.without = check_box(
             "Leave out frames that stand out",
             "Mean, deviation, range and spectrum are of the frames that do not stand out from "

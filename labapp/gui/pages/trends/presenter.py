@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from labapp.core.recording.residual_check import DOUBTFUL as IN_DOUBT
 from labapp.core.values import IntArray
 from labapp.gui.curves import Axis, Curve, Mark
 from labapp.gui.digits import ResultRow, rounded
@@ -74,6 +75,7 @@ def show(session: Session, options: TrendOptions, seen: Overview | None = None) 
     def course_of(key: str) -> Trend:
         return trend(seen, key, options.without_doubtful, doubtful)
 
+    words = session.setup_words
     courses = [course_of(key) for key in BY_KEY if key in options.shown]
     timed = bool(np.isfinite(seen.time_s).all()) and len(seen.time_s) > 0
     at = seen.time_s if timed else seen.frame.astype(float)
@@ -90,7 +92,7 @@ def show(session: Session, options: TrendOptions, seen: Overview | None = None) 
         places=dict(zip(seen.frame.tolist(), at.tolist(), strict=True)),
         rows=tuple(row for course in courses for row in _rows(course)),
         words=_counted(seen, course_of("height_mm")),
-        setup_words=session.setup_words,
+        setup_words=f"▲ {words}" if session.setup_status == IN_DOUBT else words,
         spectrum=found,
         spectrum_axis=spectrum_axis,
         spectrum_words=message,

@@ -1,0 +1,89 @@
+"""What the results of a session say of their set-ups, kept with the inputs of these results."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Sequence
+
+import numpy as np
+
+from labapp.core.recording.residual_check import MOST, SetupVerdict
+from labapp.errors import InputError
+from labapp.session.file.blobs import Damaged, pack, unpack
+from labapp.session.file.database import Database
+
+
+class SetupVerdicts:
+    """Verdicts on the set-ups of a session.
+
+    Parameters
+    ----------
+    database
+        The session file.
+    """
+
+    def __init__(self, database: Database) -> None:
+        self._database = database
+
+    def put(self, inputs: tuple[str, bytes, bytes], verdict: SetupVerdict) -> None:
+        """Store the verdict of results from these inputs: version, packed setup and settings.
+
+        Raises
+        ------
+        InputError
+            If it cannot be saved.
+        """
+        with self._database.transaction() as connection:
+            connection.execute(
+                "UPDATE inputs SET verdict = ? WHERE version = ? AND setup = ? AND settings = ?",
+                (pack(verdict), *inputs),
+            )
+
+    def of(self, setup: bytes) -> SetupVerdict | None:
+        """Verdict on a packed setup; None where nothing was measured with it.
+
+        Of several, by other settings, one that doubts it.
+
+        Raises
+        ------
+        InputError
+            If it is damaged.
+        """
+        rows = self._database.rows(
+            "SELECT verdict FROM inputs WHERE setup = ? AND verdict IS NOT NULL ORDER BY id", setup
+        )
+        try:
+            found = [_unpacked(verdict) for (verdict,) in rows]
+        except Damaged as error:
+            path = self._database.path
+            raise InputError(path, "verdict", error, "what was written there") from error
+        return max(reversed(found), key=lambda one: one.is_doubtful, default=None)
+
+    def doubt_of(self, setup: bytes) -> str:
+        """Why a packed setup is doubtful; empty if it is not."""
+        verdict = self.of(setup)
+        return verdict.reason if verdict is not None and verdict.is_doubtful else ""
+
+    def problems(self) -> list[str]:
+        """Sentences on damaged verdicts; empty if there are none."""
+        found = []
+        for number, verdict in self._database.rows(
+            "SELECT id, verdict FROM inputs WHERE verdict IS NOT NULL"
+        ):
+            try:
+                unpack(verdict, SetupVerdict)
+            except Damaged as error:
+                found.append(f"the verdict on inputs {number} is damaged: {error}")
+        return found
+
+
+def chosen_evenly(frames: Sequence[int]) -> list[int]:
+    """Choose as many frames as a verdict needs, evenly."""
+    places = np.linspace(0, len(frames) - 1, min(len(frames), MOST)).round().astype(int)
+    return [frames[place] for place in places.tolist()]
+
+
+@functools.lru_cache(maxsize=64)
+def _unpacked(content: bytes) -> SetupVerdict:
+    found: SetupVerdict = unpack(content, SetupVerdict)
+    return found
