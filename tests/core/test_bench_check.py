@@ -14,11 +14,13 @@ from labapp.config.setup import checked_setup, parse_setup, unchecked_setup
 from labapp.core.bench_check.adjustment import adjust
 from labapp.core.bench_check.check import BenchCheck, check_bench
 from labapp.core.bench_check.forecast import forecast
+from labapp.core.bench_check.known import measure_known
 from labapp.core.bench_check.labelling import Picture, label_picture, sighting_of
 from labapp.core.bench_check.mirrors import Ball, Cap, Mirror, Plate, landing_points
 from labapp.core.geometry.bench import Bench
-from labapp.core.geometry.rig import Rig
+from labapp.core.geometry.rig import DotPattern, Rig
 from labapp.core.geometry.uncertainty import INDEX, QUANTITIES
+from labapp.core.images.find_dots import DotSettings, find_dots
 from labapp.core.matching.observation import Observation
 from labapp.core.values import CannotMeasure
 from labapp.errors import InputError
@@ -27,6 +29,7 @@ from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import PoolSurface, trace
 from labapp.simulation.mirrors import BallMirror, FlatMirror
 from labapp.simulation.pools import spherical_cap
+from labapp.simulation.render import Look, render
 from tests.scenes import as_dots
 
 SHAPE = (640, 480)
@@ -82,7 +85,7 @@ def picture(
 
 def check_of(bench: SimulatedBench, free: tuple[str, ...] = ()) -> BenchCheck:
     """A check with a plate and a thumb tack."""
-    rng = np.random.default_rng(11)
+    rng = np.random.default_rng(9)
     tack = Cap(9.75, 0.91), spherical_cap(9.75, 0.91, (0.2, -0.1))
     pairs = [(Plate(), FlatMirror(0.01, 0.001, -0.001)), tack]
     return check_bench(
@@ -215,16 +218,69 @@ def test_a_quantity_far_off_is_named_and_put_right_when_let_go_of():
     assert again.rig.laser.distance_mm == pytest.approx(laser.distance_mm, abs=0.5)
 
 
+class BowedPattern(DotPattern):
+    """Another lens: its rows and columns are bowed, by 4 % at the edges."""
+
+    @property
+    def tangents(self) -> np.ndarray:
+        """Tangents of the rays to the beam axis."""
+        made = super().tangents
+        return made * (1 + 0.04 * (made**2).sum(axis=-1, keepdims=True) / np.abs(made).max() ** 2)
+
+
 @pytest.mark.slow
-def test_a_bent_plate_is_recognized():
+@pytest.mark.parametrize(
+    ("plate", "pattern", "verdict"),
+    [
+        (FlatMirror(bend_per_mm=(0.001, -0.0008)), RIG.pattern, "plate-not-flat"),
+        (FlatMirror(), BowedPattern(), "wrong-lens"),
+    ],
+    ids=["plate", "lens"],
+)
+def test_what_the_model_lacks_is_named(plate: FlatMirror, pattern: DotPattern, verdict: str):
     rng = np.random.default_rng(4)
-    bent = FlatMirror(bend_per_mm=(0.004, -0.003))
+    bench = replace(EXACT, rig=replace(EXACT.rig, pattern=pattern))
     pictures = [
-        picture(Plate(), bent, EXACT, rng)[0],
-        picture(Plate(2.0), FlatMirror(2.0), EXACT, rng)[0],
+        picture(Plate(), plate, bench, rng)[0],
+        picture(Plate(2.0), FlatMirror(2.0), bench, rng)[0],
     ]
     check = check_bench(pictures, RIG, CALIBRATION)
-    assert check.status != "ok"
+    assert check.status == check.verdict == verdict
+    known = check.rig.uncertainty
+    assert known is not None
+    assert known.status != "checked"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["ball", "sunk ball", "thumb tack"])
+@pytest.mark.parametrize("seed", range(2))
+def test_a_mirror_alone_in_the_usual_look_measures_itself(kind: str, seed: int):
+    rng = np.random.default_rng([33, seed])
+    bench = draw_bench(RIG, VIEW, BenchErrors(), rng)
+    x, y = rng.uniform(-0.6, 0.6, 2)
+    steep = np.tan(np.radians(RIG.laser.projection_angle_deg))
+    mirror, surface = {
+        "ball": (Ball(10.0), BallMirror(10.0, 10.0, (x, 10.0 / steep + y))),
+        "sunk ball": (Ball(10.0, 2.0), BallMirror(10.0, 2.0, (x, 2.0 / steep + y))),
+        "thumb tack": (Cap(9.75, 0.91), spherical_cap(9.75, 0.91, (x, y))),
+    }[kind]
+    image = render(trace(surface, bench.rig), bench.view, Look(glow=0.0), rng).image
+    dots = find_dots(image, DotSettings())
+    check = check_bench([Picture(kind, mirror, dots, image.shape)], RIG, CALIBRATION)
+    assert check.status == "ok"
+    for size in measure_known(check, check.pictures[0]):
+        assert size.measured_mm == pytest.approx(size.known_mm, rel=0.01)
+
+
+@pytest.mark.slow
+def test_noise_of_the_dots_is_not_taken_for_a_wrong_scale():
+    """On a plane of smaller scale residuals are smaller, which once counted for it."""
+    rng = np.random.default_rng(0)
+    made = trace(FlatMirror(), EXACT.rig)
+    place = VIEW.to_image(made.plane_mm)[made.visible]
+    dots = as_dots(place + rng.normal(0, 0.2, place.shape), 0.2)
+    check = check_bench([Picture("plate", Plate(), dots, SHAPE)], RIG, CALIBRATION)
+    assert (check.status, check.suspects) == ("ok", ())
 
 
 def test_pictures_are_forecast_to_help():

@@ -37,6 +37,9 @@ ROUNDS = 3
 WIDE = 10.0
 """So many times its standard uncertainty a quantity may be off for rays to be found still."""
 
+FAR_BETTER = 2.0
+"""So many times as much the cost falls with a cause that explains the dots far better."""
+
 UNDETERMINED = 0.8
 """A quantity is not determined whose ± after the check is more than this share of that before."""
 
@@ -83,7 +86,8 @@ class BenchCheck(ReadOnlyArrays):
     ----------
     status
         ``ok``; ``quantity-off`` where a quantity is off by far more than its ± allows; or the
-        verdict, where that is not ``noise-like``. Only with ``ok`` is the new set-up to be used.
+        verdict, where that is not ``noise-like``, or explains the dots far better than a quantity.
+        Only with ``ok`` is the new set-up to be used.
     reason
         The same in a sentence; empty with ``ok``.
     verdict, patterns
@@ -193,7 +197,7 @@ def check_bench(
     assert made is not None
     suspects = find_suspects(rig, sightings, made, free_directions)
     verdict, patterns = judge(rig, sightings, made, free_directions)
-    status, reason = _status(suspects, verdict)
+    status, reason = _status(suspects, verdict, patterns)
     after, calibrated = adjusted_bench(rig, made, status == "ok")
     checked = tuple(
         CheckedPicture(
@@ -289,8 +293,12 @@ REASONS: dict[Verdict, str] = {
 }
 
 
-def _status(suspects: Sequence[Suspect], verdict: Verdict) -> tuple[Status, str]:
-    if suspects:
+def _status(
+    suspects: Sequence[Suspect], verdict: Verdict, patterns: Sequence[Pattern]
+) -> tuple[Status, str]:
+    """A quantity that is off, unless a cause that the model lacks explains the dots far better."""
+    explained = max((one.drop for one in patterns if one.cause == verdict), default=0.0)
+    if suspects and explained < FAR_BETTER * suspects[0].drop:
         names = " or ".join(one.name for one in suspects)
         sure = np.sqrt(suspects[0].drop)
         return "quantity-off", (

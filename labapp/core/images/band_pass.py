@@ -174,7 +174,7 @@ def dot_at(
         its own is within two dots' sizes it is at (u_px, v_px), uncertain by a dot's size.
     """
     size = settings.size_px or (float(np.median(others.size_px)) if len(others) else None)
-    like = BandPassSettings(size, FAINT_SIGMA, 0.0, settings.speckle_px)
+    like = BandPassSettings(size, FAINT_SIGMA, 0.0, settings.least_sigma_px)
     tuning, seen = _tuned(as_picture(frame), like)
     size = tuning.size_px
     u, v, _ = seen.peaks(tuning)
@@ -196,7 +196,7 @@ def dot_at(
     known = np.clip(np.rint(others.image_px), 0, limit).astype(np.int64)
     u, v = np.append(known[:, 0], u[k]), np.append(known[:, 1], v[k])
     bright = seen.band[v // seen.step, u // seen.step].astype(float)
-    every = _described(seen, (u, v, bright), tuning.noise, settings.speckle_px)
+    every = _described(seen, (u, v, bright), tuning.noise, settings.least_sigma_px)
     return Dots(*(getattr(every, column.name)[-1:] for column in fields(every)))
 
 
@@ -342,7 +342,7 @@ def _found(tuning: DetectorTuning, seen: _BandPassed, settings: BandPassSettings
     keep = np.flatnonzero(bright >= settings.contrast * typical(bright))
     # The top of a dot may be flat.
     keep = keep[dot_kernels.first_of_each(u[keep], v[keep], max(1.5, seen.size))]
-    dots = _described(seen, (u[keep], v[keep], bright[keep]), tuning.noise, settings.speckle_px)
+    dots = _described(seen, (u[keep], v[keep], bright[keep]), tuning.noise, settings.least_sigma_px)
     order = np.argsort(dots.v_px)
     return Dots(*(values[order] for values in vars(dots).values()))
 

@@ -214,8 +214,8 @@ def _speckle(modes: FloatArray, dots: FloatArray, noise: FloatArray, free: Float
 def _power(modes: FloatArray, noise: FloatArray, free: FloatArray) -> tuple[float, float]:
     """Power of residuals over that of the light in modes, without the noise's, and its σ; px².
 
-    The grains of speckle are broader than pixels: the neighbours' fit takes up about as much of it
-    for each further order.
+    Of speckle, whose grains are broader than pixels, neighbours' fit takes up about three times as
+    much as of noise.
     """
     square, white = modes[..., 0] ** 2 / free, noise**2 * modes[..., 1]
     shone = free**2 * modes[..., 2] + 1e-30

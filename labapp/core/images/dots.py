@@ -65,7 +65,7 @@ class BandPassSettings:
         A dot's band-passed peak stands this many local noise σ above the background.
     contrast
         … and is at least this fraction of the frame's typical dot.
-    speckle_px
+    least_sigma_px
         Least standard uncertainty of a position, px, beside what noise and speckle of the frame
         give it.
     """
@@ -73,4 +73,4 @@ class BandPassSettings:
     size_px: float | None = None
     threshold: float = 6.0
     contrast: float = 0.15
-    speckle_px: float = 0.02
+    least_sigma_px: float = 0.02
