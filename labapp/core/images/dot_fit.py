@@ -127,7 +127,10 @@ def fit_dots(
     variance = noise**2 * modes[:2, :, 1] + speckle * modes[:2, :, 2]
     sigma = np.sqrt(variance / free) / _pull(dots, width)
     u, v = start[:, :2].T
-    astray = np.hypot(dots[:, 0] - u, dots[:, 1] - v) > ASTRAY * usual
+    most, (high, wide) = ASTRAY * usual, picture.shape
+    # The band-pass mirrors the picture at its rim, and a dot there has its peak nearer to it.
+    at_rim = np.minimum(np.minimum(u, wide - 1 - u), np.minimum(v, high - 1 - v)) < most
+    astray = np.hypot(dots[:, 0] - u, dots[:, 1] - v) > np.where(at_rim, 2 * most, most)
     return FittedDots(
         u_px=np.where(astray, u, dots[:, 0]),
         v_px=np.where(astray, v, dots[:, 1]),
