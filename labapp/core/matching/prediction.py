@@ -67,7 +67,7 @@ class RayPaths(ReadOnlyArrays):
         basis: SplineBasis,
         coefficients: FloatArray,
         near_mm: FloatArray | None = None,
-        steps: int = 4,
+        steps: int = 12,
     ) -> RayPaths:
         """Intersect and reflect the rays, from points nearby, shape (R, 3), or from z = 0."""
         from labapp.core.surface import kernels
