@@ -58,8 +58,8 @@ EXPLAINED = 0.85
 GRID_MM, LOOSE = 0.25, 0.45
 """Steps between places where a ball or cap is looked for; `NEAR` there, as the bench may be off."""
 
-ROUNDS = 3
-"""Of adjusting and labelling anew."""
+ROUNDS = 8
+"""Of adjusting and labelling anew, at most."""
 
 
 @dataclass(frozen=True)
