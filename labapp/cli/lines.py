@@ -91,7 +91,7 @@ def _measure(source: FrameSource, frames: range, folder: Path, bench: LineSetup)
             progress(source.name, k + 1, len(frames))
     series = LineSeries.of(found)
     states = line_states(series)
-    rows = tables.feature_rows(frames, times_s, found, states)
+    rows = tables.feature_rows(frames, times_s, found, states, bench.setup_status)
     text = tables.csv_text(tables.FEATURE_COLUMNS, rows)
     write_file(folder / "features.csv", text.encode())
     for name, counts in (("frames", [one.status for one in found]), ("states", states)):

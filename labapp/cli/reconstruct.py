@@ -185,8 +185,3 @@ def _measure_recording(
     typer.echo(summary.text() + doubt)
     typer.echo(f"Results are in {out.absolute()}")
     return summary
-
-
-def _note_residuals(record: ResidualRecord) -> Sink:
-    """A sink that takes note of each frame's residuals."""
-    return lambda result: record.add(result.measurement)
