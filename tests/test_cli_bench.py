@@ -12,6 +12,8 @@ from typer.testing import CliRunner
 
 from labapp.cli import app
 from labapp.config.setup import read_setup
+from labapp.core.images import find_dots
+from labapp.errors import InputError
 from labapp.simulation.forward import trace
 from labapp.simulation.mirrors import FlatMirror
 from labapp.simulation.render import Look, render
@@ -26,7 +28,9 @@ def setup(tmp_path: Path) -> Path:
 
 
 @pytest.mark.slow
-def test_a_rendered_plate_adjusts_the_setup_file(setup: Path, tmp_path: Path):
+def test_a_rendered_plate_adjusts_the_setup_file(
+    setup: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
     look = Look(glow=0.0)
     laser = replace(EXACT.rig.laser, aim_x_mm=0.6)
     made = trace(FlatMirror(), replace(EXACT.rig, laser=laser))
@@ -34,7 +38,17 @@ def test_a_rendered_plate_adjusts_the_setup_file(setup: Path, tmp_path: Path):
     cv2.imwrite(str(tmp_path / "plate.png"), image)
     given = ["calibrate", "bench", str(tmp_path / "plate.png"), "--mirror", "plate:0"]
     table = tmp_path / "residuals.csv"
-    done = CliRunner().invoke(app, [*given, "--setup", str(setup), "--use", "--out", str(table)])
+    given += ["--setup", str(setup), "--use"]
+    with monkeypatch.context() as meanwhile:
+        edited = TEXT.replace("# by protractor", "# by two protractors")
+        find = find_dots.find_dots
+        meanwhile.setattr(
+            find_dots, "find_dots", lambda *a: (setup.write_text(edited, "utf-8"), find(*a))[1]
+        )
+        refused = CliRunner().invoke(app, given)
+    assert isinstance(refused.exception, InputError)
+    assert setup.read_text("utf-8") == edited
+    done = CliRunner().invoke(app, [*given, "--out", str(table)])
     assert done.exit_code == 0, done.output
     known = read_setup(setup).rig.uncertainty
     assert known is not None

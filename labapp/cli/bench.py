@@ -74,7 +74,7 @@ def calibrate_bench(
     if check.status != "ok":
         raise typer.Exit(NOTHING_MEASURED)
     if use:
-        _write(setup, before, check)
+        _write(setup, text, before, check)
 
 
 def _checked(
@@ -172,9 +172,15 @@ def _residuals(check: BenchCheck) -> str:
     return csv_text(rows)
 
 
-def _write(setup: Path, before: str, check: BenchCheck) -> None:
-    from labapp.config.setup import checked_setup
+def _write(setup: Path, text: str, before: str, check: BenchCheck) -> None:
+    """Write the adjusted set-up, unless the file has another text by now."""
+    from labapp.config.setup import checked_setup, read_setup_text
     from labapp.text import now
 
+    if read_setup_text(setup) != text:
+        found = "changed while the pictures were checked"
+        raise InputError(
+            setup, "file", found, "the file as it was: check again, nothing is written"
+        )
     write_file(setup, checked_setup(before, setup, check, now()).encode())
     typer.echo(f"The adjusted set-up is in {setup.absolute()}")

@@ -89,7 +89,7 @@ def _measure(source: FrameSource, frames: range, folder: Path, bench: LineSetup)
             progress(source.name, k + 1, len(frames))
     series = LineSeries.of(found)
     states = line_states(series)
-    rows = tables.feature_rows(frames, times_s, found, states)
+    rows = tables.feature_rows(frames, times_s, found, states, bench.setup_status)
     write_file(folder / "features.csv", csv_text([tables.FEATURE_COLUMNS, *rows]).encode())
     for name, counts in (("frames", [one.status for one in found]), ("states", states)):
         shown = ", ".join(f"{what} {n}" for what, n in Counter(counts).most_common())

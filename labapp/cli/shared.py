@@ -63,7 +63,9 @@ Warm = Annotated[
 
 SigmaParts = Annotated[
     bool,
-    typer.Option("--sigma-parts", help="The parts of each ±, too, in measures.csv: noise, level."),
+    typer.Option(
+        "--sigma-parts", help="The parts of each ± in measures.csv, too: noise, level, set-up."
+    ),
 ]
 
 

@@ -7,23 +7,41 @@ As soon as the file has anything else than that, the set-up no longer counts as 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import fields, is_dataclass
+from datetime import datetime
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from labapp.config.toml_keys import Rule, are_numbers, is_number
+from labapp.config.toml_keys import Rule, are_numbers, is_matrix, is_number
 from labapp.core.bench_check.check import BenchCheck
+from labapp.core.geometry.rig import DotPattern, ImagingPlane, Rig
 from labapp.core.geometry.uncertainty import INDEX
 from labapp.core.values import FloatArray
+from labapp.errors import InputError
 
 SECTION = "bench_check"
 
 MATTERS = ("laser", "pattern", "imaging_plane", "image_calibration", "camera_lens")
 """Sections that a check is about."""
 
-_NEVER = ("angle_distance_correlation",)
+_DEFAULTS = {key: 0.0 for key in INDEX if not key.endswith("]")} | {
+    "pattern.kind": DotPattern.kind,
+    "imaging_plane.glass_mm": ImagingPlane.glass_mm,
+    "imaging_plane.glass_index": ImagingPlane.glass_index,
+}
+_UNCERTAINTIES = ("_sigma", "_correlation")
+_SETS = ("pattern.absent",)
 _SAME = 1e-9
 _MOST = 200
+
+
+def _is_date(value: object) -> bool:
+    try:
+        return isinstance(value, str) and bool(datetime.fromisoformat(value))
+    except ValueError:
+        return False
 
 
 def _texts(value: object) -> bool:
@@ -34,15 +52,19 @@ def _are_quantities(value: object) -> bool:
     return (
         isinstance(value, list)
         and len(value) <= _MOST
-        and all(
-            isinstance(one, dict)
-            and one.keys() == {"key", "before", "after", "sigma"}
-            and one["key"] in INDEX
-            and all(is_number(one[name]) for name in ("before", "after", "sigma"))
-            and one["sigma"] >= 0
-            for one in value
-        )
+        and all(map(_is_quantity, value))
         and len({one["key"] for one in value}) == len(value)
+    )
+
+
+def _is_quantity(value: object) -> bool:
+    return (
+        isinstance(value, dict)
+        and value.keys() == {"key", "before", "after", "sigma"}
+        and isinstance(value["key"], str)
+        and value["key"] in INDEX
+        and all(is_number(value[name]) for name in ("before", "after", "sigma"))
+        and (value["sigma"] > 0 or (value["sigma"] == 0 and _near(value["before"], value["after"])))
     )
 
 
@@ -60,23 +82,40 @@ def _is_correlation(value: object) -> bool:
 
 
 RULES = {
-    "date": Rule("a date and time, as text", lambda value: isinstance(value, str)),
+    "date": Rule("a date and time, as text (ISO 8601)", _is_date),
     "pictures": Rule("names of pictures", _texts),
     "mirrors": Rule("a mirror for each picture", _texts),
-    "quantities": Rule("a list of { key, before, after, sigma }, each key once", _are_quantities),
+    "quantities": Rule(
+        "a list of { key, before, after, sigma }, each key once, sigma above 0 unless the quantity "
+        "was known exactly and kept its value",
+        _are_quantities,
+    ),
     "correlation": Rule("a symmetric matrix of correlations", _is_correlation),
     "given": Rule("a table of keys and values", lambda value: isinstance(value, dict)),
+    "sigmas": Rule(
+        "a table of the uncertainties before the check",
+        lambda value: isinstance(value, dict),
+        required=False,
+    ),
     "homography": Rule(
-        "3 rows of 3 numbers, those before the check",
-        lambda value: (
-            isinstance(value, list)
-            and len(value) == 3
-            and all(are_numbers(row, 3) for row in value)
-        ),
+        "3 rows of 3 numbers (px to mm) that can be inverted, those before the check",
+        is_matrix,
         required=False,
     ),
 }
 """Rules of its keys."""
+
+
+def contradictions(path: Path, values: Mapping[str, Any]) -> list[InputError]:
+    """Problems of keys of the section that are valid by themselves and contradict each other."""
+    section = values.get(SECTION)
+    if section is None:
+        return []
+    count, rows = len(section["quantities"]), len(section["correlation"])
+    if rows == count:
+        return []
+    right = f"{count} x {count}, a row and a column for each of the quantities"
+    return [InputError(path, f"{SECTION}.correlation", f"{rows} x {rows}", right)]
 
 
 def checked_covariance(
@@ -90,32 +129,57 @@ def checked_covariance(
         Sections of a setup file.
     covariance
         That by the uncertainties in its sections: it holds where the set-up is not as it was
-        checked, and of quantities that the check did not know.
+        checked. A check that has not every quantity is no check of the set-up.
     """
     section = values.get(SECTION)
-    if section is None or changed_since_check(values):
+    if section is None or len(section["quantities"]) < len(INDEX) or changed_since_check(values):
         return covariance, False
     at = [INDEX[one["key"]] for one in section["quantities"]]
     sigma = np.array([one["sigma"] for one in section["quantities"]], float)
-    made = covariance.copy()
-    made[at, :] = 0.0
-    made[:, at] = 0.0
-    made[np.ix_(at, at)] = np.array(section["correlation"], float) * np.outer(sigma, sigma)
+    correlation = _semidefinite(np.array(section["correlation"], float))
+    made = np.zeros_like(covariance)
+    made[np.ix_(at, at)] = correlation * np.outer(sigma, sigma)
     return made, True
 
 
+def _semidefinite(correlation: FloatArray) -> FloatArray:
+    """A correlation matrix without the small negative eigenvalues that rounding gives it."""
+    eigenvalues, vectors = np.linalg.eigh((correlation + correlation.T) / 2)
+    if eigenvalues.min() >= 0.0:
+        return correlation
+    clipped = (vectors * np.maximum(eigenvalues, 0.0)) @ vectors.T
+    scale = np.sqrt(np.diag(clipped))
+    return np.asarray(clipped / np.outer(scale, scale))
+
+
 def changed_since_check(values: Mapping[str, Any]) -> list[str]:
-    """Keys of a setup file that are no longer what they were when it was checked."""
+    """Keys of a setup file that are no longer what they were when it was checked.
+
+    A key that is left out and one with its default value are the same. Files of checks that did
+    not keep the uncertainties before them have no ``sigmas``: there these are not compared.
+    """
     section = values[SECTION]
     after = {one["key"]: one["after"] for one in section["quantities"]}
     changed = [
         key
         for key, value in after.items()
-        if not np.isclose(found := _value(values, key), value, rtol=_SAME, atol=_SAME)
+        if not _near(found := _value(values, key), value)
         and not np.isnan(found)  # a point that the file has a homography for
     ]
-    given, now = section["given"], _given(values, after.keys())
-    return changed + sorted(key for key in given.keys() | now if given.get(key) != now.get(key))
+    pattern = values["pattern"]
+    defaults = _DEFAULTS | {
+        "pattern.absent": [[(pattern["rows"] + 1) // 2, (pattern["columns"] + 1) // 2]]
+    }
+    changed += _differing(section["given"], _given(values, after.keys()), defaults)
+    if "sigmas" in section:
+        changed += _differing(section["sigmas"], _uncertainties(values), {})
+    return changed
+
+
+def same_setup(one: Rig, other: Rig) -> bool:
+    """Whether two rigs are the same to a bench check, their image calibrations included."""
+    parts = ("laser", "pattern", "imaging_plane", "uncertainty")
+    return all(_equal(getattr(one, part), getattr(other, part)) for part in parts)
 
 
 def check_values(
@@ -152,6 +216,7 @@ def check_values(
         "quantities": quantities,
         "correlation": [[round(float(c), 9) for c in row] for row in correlation],
         "given": _given(merged, keys),
+        "sigmas": _uncertainties(text_values),
     }
     if homography:
         made[SECTION]["homography"] = text_values["image_calibration"]["homography"]
@@ -164,10 +229,11 @@ def unchecked_values(values: Mapping[str, Any]) -> dict[str, dict[str, object]]:
     if section is None:
         return {}
     made: dict[str, dict[str, object]] = {SECTION: {}}
-    if "homography" in section and "homography" in values["image_calibration"]:
+    written = section["given"].get("image_calibration.homography")
+    if "homography" in section and written == values["image_calibration"].get("homography"):
         made["image_calibration"] = {"homography": section["homography"]}
     for one in section["quantities"]:
-        if not np.isclose(_value(values, one["key"]), one["after"], rtol=_SAME, atol=_SAME):
+        if not _near(_value(values, one["key"]), one["after"]):
             continue
         part, _, key = one["key"].partition(".")
         name, _, axis = key.partition("[")
@@ -192,8 +258,47 @@ def _given(values: Mapping[str, Any], adjusted: Iterable[str]) -> dict[str, obje
     """What a check takes as given: all of the sections that matter but adjusted keys and ±."""
     names = {key.partition("[")[0] for key in adjusted}
     return {
-        f"{section}.{key}": value
+        key: value
+        for key, value in _keys(values)
+        if key not in names and not key.endswith(_UNCERTAINTIES)
+    }
+
+
+def _uncertainties(values: Mapping[str, Any]) -> dict[str, object]:
+    """The standard uncertainties and the correlation in the sections that matter."""
+    return {key: value for key, value in _keys(values) if key.endswith(_UNCERTAINTIES)}
+
+
+def _keys(values: Mapping[str, Any]) -> list[tuple[str, object]]:
+    return [
+        (f"{section}.{key}", value)
         for section in MATTERS
         for key, value in values.get(section, {}).items()
-        if f"{section}.{key}" not in names and not key.endswith("_sigma") and key not in _NEVER
-    }
+    ]
+
+
+def _differing(
+    one: Mapping[str, object], other: Mapping[str, object], defaults: Mapping[str, object]
+) -> list[str]:
+    """Keys whose values differ; the order of absent rays does not matter."""
+
+    def value(of: Mapping[str, object], key: str) -> object:
+        found = of.get(key, defaults.get(key))
+        return sorted(found, key=repr) if isinstance(found, list) and key in _SETS else found
+
+    return sorted(key for key in one.keys() | other if value(one, key) != value(other, key))
+
+
+def _near(one: float, other: float) -> bool:
+    return bool(np.isclose(one, other, rtol=_SAME, atol=_SAME))
+
+
+def _equal(one: object, other: object) -> bool:
+    if isinstance(one, np.ndarray):
+        return np.array_equal(one, other)  # type: ignore[arg-type]
+    if not is_dataclass(one):
+        return one == other
+    names = (field.name for field in fields(one))
+    return type(one) is type(other) and all(
+        _equal(getattr(one, name), getattr(other, name)) for name in names
+    )

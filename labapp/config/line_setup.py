@@ -12,6 +12,7 @@ from labapp.config.setup import A_SETUP, parse_setup
 from labapp.config.toml_keys import Rule, between, check_keys, parse_toml, read_text, shown
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.line_pattern import LinePattern, LineRig
+from labapp.core.pipeline import setup_status
 from labapp.errors import InputError
 
 KIND = "lines"
@@ -41,6 +42,8 @@ class LineSetup:
     """Pixel ↔ imaging plane."""
     text: str
     """The file as it was read, for the record."""
+    setup_status: str
+    """How far it can be relied on (`RigUncertainty.status`)."""
 
 
 def read_line_setup(path: str | os.PathLike[str]) -> LineSetup:
@@ -77,6 +80,5 @@ def read_line_setup(path: str | os.PathLike[str]) -> LineSetup:
         allowed = f"a number below {others.rig.laser.projection_angle_deg / half:.3g} times this"
         raise InputError(path, "pattern.interline_angle_deg", lines.interline_angle_deg, allowed)
     rig = others.rig
-    return LineSetup(
-        LineRig(rig.laser, lines, rig.electrode, rig.imaging_plane), others.calibration, text
-    )
+    line_rig = LineRig(rig.laser, lines, rig.electrode, rig.imaging_plane)
+    return LineSetup(line_rig, others.calibration, text, setup_status(rig))

@@ -16,6 +16,8 @@ from tomlkit.items import Table
 from labapp.config.bench_check import (
     check_values,
     checked_covariance,
+    contradictions,
+    same_setup,
     unchecked_values,
 )
 from labapp.config.ray_file import with_rays
@@ -192,7 +194,16 @@ def lens_of(text: str) -> Lens | None:
 
 
 def checked_setup(text: str, path: str | os.PathLike[str], check: BenchCheck, date: str) -> str:
-    """Text of a setup file with the outcome of a bench check in it; ``path`` is for errors."""
+    """Text of a setup file with the outcome of a bench check in it; ``path`` is for errors.
+
+    Raises
+    ------
+    InputError
+        If the text is no valid setup, or another one than the check was made with.
+    """
+    if not same_setup(check.before, parse_setup(text, Path(path)).rig):
+        changed = "changed since the pictures were checked with it"
+        raise InputError(path, "set-up", changed, "the set-up of the check: check it again")
     values = parse_toml(text, Path(path), A_SETUP)
     return updated_setup(text, path, _keeping_sigmas(check_values(check, values, date), values))
 
@@ -201,7 +212,13 @@ def unchecked_setup(text: str, path: str | os.PathLike[str]) -> str:
     """Text of a setup file as it was before its bench check; what was changed since then stays.
 
     A new check begins with it, or the former one's pictures would count twice.
+
+    Raises
+    ------
+    InputError
+        If the text is no valid setup.
     """
+    parse_setup(text, Path(path))
     now = parse_toml(text, Path(path), A_SETUP)
     values = unchecked_values(now)
     if not values:
@@ -264,9 +281,10 @@ def dot_pattern(keys: Mapping[str, Any]) -> DotPattern:
 def _contradictions(path: Path, values: dict[str, Any]) -> list[InputError]:
     """Problems of values that are valid by themselves and contradict each other."""
     pattern, angle = values["pattern"], values["laser"]["projection_angle_deg"]
+    problems = contradictions(path, values)
     rows, columns = pattern["rows"], pattern["columns"]
     step = pattern["inter_beam_angle_deg"]
-    problems = [
+    problems += [
         InputError(
             path,
             "pattern.absent",

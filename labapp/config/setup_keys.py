@@ -4,11 +4,17 @@ from __future__ import annotations
 
 from typing import get_args
 
-import numpy as np
-
 from labapp.config import bench_check
 from labapp.config.ray_file import FEWEST_RAYS
-from labapp.config.toml_keys import LARGEST_MM, Rule, are_numbers, between, is_number, within
+from labapp.config.toml_keys import (
+    LARGEST_MM,
+    Rule,
+    are_numbers,
+    between,
+    is_matrix,
+    is_number,
+    within,
+)
 from labapp.core.geometry.patterns import MEASURED, PATTERNS
 from labapp.core.geometry.rig import Travel
 from labapp.core.geometry.uncertainty import QUANTITIES
@@ -47,15 +53,6 @@ def _are_measured(value: object) -> bool:
     return whole and len({tuple(ray[:2]) for ray in value}) == len(value) >= FEWEST_RAYS
 
 
-def _is_matrix(value: object) -> bool:
-    return (
-        isinstance(value, list)
-        and len(value) == 3
-        and all(are_numbers(row, 3) for row in value)
-        and bool(np.linalg.cond(np.array(value, float)) < 1e12)
-    )
-
-
 _PIXEL = Rule("[u, v], two numbers (px)", lambda value: are_numbers(value, 2))
 _ON_AXIS = Rule(
     f"a number from -{LARGEST_MM:g} to {LARGEST_MM:g} (mm) that is not 0",
@@ -78,7 +75,7 @@ THREE_POINTS = {
     "z_axis_mm": _ON_AXIS,
 }
 HOMOGRAPHY = {
-    "homography": Rule("3 rows of 3 numbers (px to mm) that can be inverted", _is_matrix),
+    "homography": Rule("3 rows of 3 numbers (px to mm) that can be inverted", is_matrix),
 }
 RAYS = {
     "rays": Rule(

@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeGuard
 
+import numpy as np
+
 from labapp.errors import InputError
 
 LARGEST_MM = 10_000.0
@@ -69,6 +71,16 @@ def is_number(value: object) -> TypeGuard[float]:
 def are_numbers(value: object, count: int) -> TypeGuard[list[float]]:
     """Whether this is a list of finite numbers of the given length."""
     return isinstance(value, list) and len(value) == count and all(map(is_number, value))
+
+
+def is_matrix(value: object) -> bool:
+    """Whether this is a list of 3 rows of 3 numbers that can be inverted."""
+    return (
+        isinstance(value, list)
+        and len(value) == 3
+        and all(are_numbers(row, 3) for row in value)
+        and bool(np.linalg.cond(np.array(value, float)) < 1e12)
+    )
 
 
 def between(low: float, high: float, unit: str, required: bool = True) -> Rule:

@@ -24,12 +24,16 @@ FEATURE_COLUMNS = (
     "frame", "time_s", "status", "state", "lines", "left_out", "length_mm", "width_mm",
     "height_mm", "area_mm2", "spacing_mm", "curvature_per_mm", "asymmetry", "pool_height_mm",
     "pool_height_sigma_mm", "pool_width_mm", "pool_curvature_per_mm", "misfit", "margin",
+    "setup_status",
 )  # fmt: skip
+"""``pool_height_sigma_mm`` has no part by the set-up, unlike ``height_sigma_mm`` of dots;
+``setup_status`` says how far the set-up can be relied on."""
 TRACK_COLUMNS = (
     "frame", "time_s", "pulse", "pulse_probability", "followed", "shift_px", "tilt_px", "bend_px",
     "agreeing_share",
 )  # fmt: skip
 SURFACE_COLUMNS = ("x_mm", "y_mm", "z_mm", "z_sigma_mm")
+"""``z_sigma_mm`` has no part by the set-up either."""
 
 SPACING_MM = 0.1
 
@@ -79,6 +83,7 @@ def feature_rows(
     times_s: Sequence[float | None],
     found: Sequence[LineFrame],
     states: Sequence[State],
+    setup_status: str,
 ) -> list[list[str]]:
     """Rows of ``features.csv``: one a frame."""
     rows = []
@@ -98,6 +103,7 @@ def feature_rows(
                 *map(_cell, (seen.length_mm, seen.width_mm, seen.height_mm, seen.area_mm2)),
                 *map(_cell, (seen.spacing_mm, seen.curvature_per_mm, seen.asymmetry)),
                 *map(_cell, measured),
+                setup_status,
             ]
         )
     return rows

@@ -19,9 +19,9 @@ from labapp.errors import InputError
 from labapp.export.formats import SURFACE_FORMATS
 from labapp.export.frame_result import FrameResult
 from labapp.export.meshes import SPACING_MM, known_nodes, open_mesh, solid_mesh
-from labapp.export.tables import TABLES, csv_header, table_rows
+from labapp.export.tables import TABLES, csv_header, sigma_of, table_rows
 from labapp.files import as_bytes, write_atomically
-from labapp.text import SIGMA_OF, now, unescaped_csv_text
+from labapp.text import now, unescaped_csv_text
 from labapp.version import VERSION
 
 RUN_FILE = "run.json"
@@ -110,7 +110,7 @@ class ResultsWriter:
         self._run = {
             "program": "labapp",
             "version": VERSION,
-            "sigma_of": SIGMA_OF,
+            "sigma_of": "",  # until a frame has any standard uncertainty
             "state": "running",
             "started": now(),
             "ended": None,
@@ -151,6 +151,9 @@ class ResultsWriter:
                 write_atomically(path, content)
             for name, text in rows.items():
                 _append(self._files[name], text)
+            if not self._run["sigma_of"] and (covered := sigma_of(result.measurement)):
+                self._run["sigma_of"] = covered
+                self._write_run()
         except BaseException as error:
             for file, size in before.items():
                 file.truncate(size)

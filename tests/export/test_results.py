@@ -108,6 +108,14 @@ def test_points_carry_residual_and_sigma(written: Path) -> None:
     assert (second["residual_mm"], second["sigma_mm"]) == ("0.010000", "")
 
 
+def test_without_any_sigma_nothing_is_said_to_be_in_it(
+    out: Path, writer: Writer, unmeasured: Measurement
+) -> None:
+    with writer(out) as files:
+        files.write(FrameResult(7, None, unmeasured))
+    assert json.loads((out / "run.json").read_text("utf-8"))["sigma_of"] == ""
+
+
 def test_what_is_in_sigma_is_said_beside_the_tables(written: Path) -> None:
     assert json.loads((written / "run.json").read_text("utf-8"))["sigma_of"] == SIGMA_OF
     sigmas = [c for name in TABLES for c in TABLES[name] if "_sigma_" in f"_{c.name}_" and c.digits]

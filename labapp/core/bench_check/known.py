@@ -61,8 +61,7 @@ def measure_known(check: BenchCheck, picture: CheckedPicture) -> tuple[MeasuredS
         observed.plane_mm[picture.dot],
         observed.covariance_mm2[picture.dot],
     )
-    start = (picture.pose - mirror.pose) / mirror.sigma
-    made = adjust(exact, [sighting], start=start)
+    made = adjust(exact, [sighting])
     pose, covariance = made.poses[0], made.pose_covariances[0]
     at = mirror.parameters.index("height_mm")
     height = MeasuredSize(

@@ -243,7 +243,8 @@ def test_a_kept_check_is_shown_when_its_session_is_opened(
 ) -> None:
     workspace, path = page.workspace, page.session.path
     image = checked.chosen[0].image
-    page.session.use_bench_check(checked.check, checked.record, [image])
+    check = replace(checked.check, before=page.session.setup.rig)
+    page.session.use_bench_check(check, checked.record, [image])
     workspace.close()
     workspace.show(Session.open(path))
     page.refresh()
@@ -263,7 +264,8 @@ def test_every_button_says_what_it_does(page: BenchCheckPage) -> None:
 def test_what_was_known_before_holds_again_once_the_bench_is_unchecked(checked: Checked) -> None:
     known = {"projection_angle_deg_sigma": 0.3, "angle_distance_correlation": 0.9}
     text = updated_setup(SETUP.read_text("utf-8"), SETUP, {"laser": known})
-    after = checked_setup(text, SETUP, checked.check, "2026-01-31T12:00:00+00:00")
+    check = replace(checked.check, before=parse_setup(text, SETUP).rig)
+    after = checked_setup(text, SETUP, check, "2026-01-31T12:00:00+00:00")
     assert parse_setup(after, SETUP).checked.startswith("2026-01-31")
     back = unchecked_setup(after, SETUP)
     assert not parse_setup(back, SETUP).checked
