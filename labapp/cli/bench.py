@@ -43,7 +43,9 @@ def calibrate_bench(
     ] = None,
     predict: Annotated[
         bool,
-        typer.Option("--predict", help="Only tell what pictures would help most; none is needed."),
+        typer.Option(
+            "--predict", help="Only predict which pictures would help most; none is needed."
+        ),
     ] = False,
     use: Annotated[
         bool, typer.Option("--use", help="Write the adjusted set-up into the setup file.")

@@ -224,7 +224,7 @@ def check_values(
 
 
 def unchecked_values(values: Mapping[str, Any]) -> dict[str, dict[str, object]]:
-    """Section → key → value that take a check back: what still is as it left it."""
+    """Section → key → value that undo a check, except for what was changed since."""
     section = values.get(SECTION)
     if section is None:
         return {}

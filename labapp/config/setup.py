@@ -39,7 +39,7 @@ from labapp.files import write_atomically
 A_SETUP = "a setup file (TOML, UTF-8)"
 
 LEAST_ANGLE_DEG = 10.0
-"""Axes of the imaging plane that look closer together than this are a slip."""
+"""Axes of the imaging plane that look closer together than this are taken for an input error."""
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import numpy as np
 from labapp.errors import InputError
 
 LARGEST_MM = 10_000.0
-"""Lengths above this are a slip of the unit, not of a bench."""
+"""Lengths above this are taken for an input error of the unit."""
 
 LARGEST = 1e9
 """Numbers of any kind above this are no measurement."""

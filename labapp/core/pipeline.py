@@ -1,7 +1,7 @@
 """Frame → Measurement: the steps of the measurement, in order, and nothing else.
 
 1. `find_dots`: the reflected dots of the frame (§5.2.1).
-2. `find_lattice`: their rows and columns in the picture, as far as they can be told (§5.2.2).
+2. `find_lattice`: their rows and columns in the picture, as far as they can be determined (§5.2.2).
 3. `match_rays`: which ray made which dot (§4.2.2); then rows and columns are those of the rays.
 4. `reconstruct`: the pool's surface and boundary, by the scheme that is chosen (ch. 6, 7).
 5. `measure_surface`: its size and the reflection errors (Eq. 6-3 … 6-8).
@@ -84,10 +84,10 @@ class Measurement:
     reason
         The same in a sentence; empty if all went well.
     scheme
-        Which scheme was asked for.
+        Scheme requested.
     dots, lattice, match, reconstruction, measures
         Results of steps 1 to 5; None from the step on that could not be done. The lattice may be
-        None before that, too: rays can be told without.
+        None before that, too: rays can be identified without it.
     correction
         The operator's dots and rows; None if they are as they were found.
     setup_status
@@ -126,7 +126,7 @@ def measure(
     image
         Grey frame, shape (height, width), any real type.
     bench
-        What the frame was seen on.
+        Bench that the frame was recorded on.
     settings
         See `Settings`.
     prior
@@ -247,7 +247,7 @@ def reconstruct(match: Match, rig: Rig, settings: Settings) -> Reconstruction:
 def _lattice_or_why(
     dots: Dots, frame_shape: tuple[int, int], settings: LatticeSettings
 ) -> tuple[Lattice | None, CannotMeasure | None]:
-    """Rows and columns, or why there are none: the optics may still tell the rays."""
+    """Rows and columns, or why there are none: the optics may still identify the rays."""
     try:
         return find_lattice(dots, frame_shape, settings), None
     except CannotMeasure as why:

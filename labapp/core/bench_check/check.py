@@ -96,7 +96,7 @@ class BenchCheck(ReadOnlyArrays):
         Quantities that are off by far more than their ±, the likeliest first; those that explain
         the dots alike come together.
     free
-        Keys of suspects that the ± was widened of, as was asked for.
+        Keys of suspects whose prior was widened on request.
     before
         The set-up before the check.
     rig, calibration
@@ -252,8 +252,8 @@ def _first_label(
 ) -> Labelled:
     """Labels by the first bench that has any.
 
-    A mirror that is not what it is said to be, or a quantity that is far off, leads those astray
-    that come after.
+    A mirror that is not what it is said to be, or a quantity that is far off, misleads the
+    adjustments after it.
     """
     for bench in benches[:-1]:
         try:
@@ -264,7 +264,7 @@ def _first_label(
 
 
 def _wide(rig: Rig) -> Rig:
-    """The bench, known a good deal worse than it is said to be."""
+    """The bench with much larger uncertainties than it is given."""
     assert rig.uncertainty is not None
     covariance = WIDE**2 * rig.uncertainty.covariance
     return replace(rig, uncertainty=replace(rig.uncertainty, covariance=covariance))

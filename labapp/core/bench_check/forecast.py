@@ -29,7 +29,7 @@ CANDIDATES: Mapping[str, tuple[Mirror, ...]] = {
     "plate at 0 mm, thumb tack": (Plate(0.0), Cap(9.75, 0.91)),
     "plate at 0 and 2 mm, thumb tack": (Plate(0.0), Plate(2.0), Cap(9.75, 0.91)),
 }
-"""Pictures that are worth thinking of."""
+"""Candidate sets of pictures."""
 
 
 @dataclass(frozen=True)

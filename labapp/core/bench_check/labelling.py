@@ -228,7 +228,7 @@ def _explains(observed: Observation, one: Labelled) -> bool:
 
 
 def sighting_of(observed: Observation, mirror: Mirror, labels: IntArray) -> Sighting:
-    """The pairs of ray and dot that labels are."""
+    """Ray–dot pairs of a labelling."""
     at = np.argwhere((labels != UNLABELLED) & ~observed.absent)
     dot = labels[tuple(at.T)]
     return Sighting(mirror, at, observed.plane_mm[dot], observed.covariance_mm2[dot])

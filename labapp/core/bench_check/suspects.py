@@ -33,7 +33,7 @@ LIMIT = 20.0
 standard deviations."""
 
 TRIED = 8
-"""So many suspects are adjusted with."""
+"""Number of suspects tried."""
 
 ALIKE = 6.0
 """Suspects that the cost falls by nearly as much with explain the dots alike."""

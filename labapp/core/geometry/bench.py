@@ -34,7 +34,7 @@ class Bench:
         return project_rays(self.rig.laser, self.rig.pattern)
 
     def frame_px(self, frame_shape: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
-        """First and last pixel (u, v) of a frame, freed of the lens's distortion, shapes (2,).
+        """First and last pixel (u, v) of a frame, undistorted, shapes (2,).
 
         A distorting lens bends the frame's edges: the rectangle is the one within them.
         """

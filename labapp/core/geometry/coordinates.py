@@ -13,7 +13,7 @@ RADIAL_STEPS = 6
 """Of Newton's method, for the inverse of a radial distortion."""
 
 UNDISTORTED_PX = 1e-6
-"""To so much of a pixel a place is freed of a lens's distortion."""
+"""Tolerance of undistortion, px."""
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ class ImageCalibration(ReadOnlyArrays):
     Parameters
     ----------
     matrix
-        Shape (3, 3): homogeneous (u, v, 1) in px, freed of the lens's distortion, to (X′, Z′, 1)
+        Shape (3, 3): homogeneous (u, v, 1) in px, undistorted, to (X′, Z′, 1)
         in mm.
     lens
         The lens's distortion; None where there is none.
@@ -179,7 +179,7 @@ class ImageCalibration(ReadOnlyArrays):
         return cls(_inverse(to_image), lens)
 
     def with_distortion(self, percent: float, half_mm: FloatArray) -> ImageCalibration:
-        """Put a radial distortion in place of any that there is, see `RadialDistortion`."""
+        """Replace the radial distortion, see `RadialDistortion`."""
         lens = self.plain_lens
         bent = RadialDistortion(self.matrix, lens, half_mm, percent) if percent else lens
         return ImageCalibration(self.matrix, bent)
@@ -195,7 +195,7 @@ class ImageCalibration(ReadOnlyArrays):
         return self.lens.percent if isinstance(self.lens, RadialDistortion) else 0.0
 
     def ideal_px(self, image_px: FloatArray) -> FloatArray:
-        """(u, v), shape (…, 2), px, freed of the lens's distortion."""
+        """(u, v), shape (…, 2), px, undistorted."""
         return image_px if self.lens is None else self.lens.ideal(image_px)
 
     def to_plane(self, image_px: FloatArray) -> FloatArray:

@@ -113,7 +113,7 @@ _SNELL_STEPS = 4
 
 
 def _in_glass(index: float, tangent2: FloatArray) -> FloatArray:
-    """Tangent of rays' angles to the normal in glass, over those in air, of which the squares."""
+    """Tangent of the rays' angles to the normal in glass over that in air, given its square."""
     return np.asarray(1.0 / np.sqrt(index**2 + (index**2 - 1.0) * tangent2))
 
 

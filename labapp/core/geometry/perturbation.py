@@ -1,6 +1,7 @@
-"""A bench whose quantities (`uncertainty.QUANTITIES`) are off from what they are taken for.
+"""A bench whose quantities (`uncertainty.QUANTITIES`) differ from their nominal values.
 
-An offset is a vector over the quantities, in their units. Which ray made which dot stays.
+An offset is a vector over the quantities, in their units: the true value is the nominal one plus
+the offset. Which ray made which dot stays.
 """
 
 from __future__ import annotations

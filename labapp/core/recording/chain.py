@@ -44,7 +44,7 @@ class WarmChain:
     def follow(self, image: Image) -> Measurement | None:
         """Measure the next frame from those before; None where they do not lead to it.
 
-        That takes no longer, and a frame after it may be followed again.
+        No search is started, and a frame after it may be followed again.
         """
         if self._prior is None:
             self.track_lost = "no frame before it was measured"

@@ -26,7 +26,7 @@ ALIKE = 0.15
 """Surfaces that differ by less have the same rows, a share of their root mean square height."""
 
 NEARER = 2.0
-"""Rays have slipped if with others the surface is so many times nearer to the one before."""
+"""Rows have slipped if shifted labels bring the surface so many times nearer to the one before."""
 
 SLIPS = tuple(np.array(by) for by in product((0, 1, -1, 2, -2), repeat=2) if 0 in by and any(by))
 """Rows and columns by which they may have."""

@@ -72,9 +72,7 @@ def solve(
             "too-few-dots", f"{len(match.ray)} dots have a ray, a surface needs {LEAST_DOTS}"
         )
     if not (match.witness < 0).any():
-        raise CannotMeasure(
-            "open-boundary", "no ray that would show stayed away: where the pool ends is not seen"
-        )
+        raise CannotMeasure("open-boundary", "no visible ray is missing: the boundary is not seen")
     dots = match.ray, match.plane_mm, match.plane_covariance_mm2, match.witness
     pool = fit_pool(*dots, rig, settings, near, match.missing)
     if pool.unsettled_mm > UNSETTLED_MM:

@@ -1,6 +1,6 @@
 """Which ray made which dot, where the frames before predict where dots should be.
 
-A pool that swings is carried on as it swung (`prior.predictions`). Where that does not find the
+The surface is extrapolated from its oscillation (`prior.predictions`). Where that does not find the
 dots, as at the start, they are followed from the absent one outwards, ring by ring. The dots found
 have their rays; others beside them get theirs from the surface fitted to these. An answer is given
 only where the absent ray's place is dark amid lit ones, and where no more is left unexplained than
@@ -123,7 +123,7 @@ def follow(
     _check_explained(classes, limits, len(observed.plane_mm), len(rays))
     pool = fitted_pool(fit.rounds, level, observed.rig, observed.plane_mm[dots])
     if not pool.residual_rms_mm < WORSE * prior.residual_mm:
-        raise TrackLost("the surface no longer has the dots")
+        raise TrackLost("the surface no longer explains the dots")
     paths = fit.paths()
     is_seen = _datum_is_seen(observed, paths, off)
     if not is_seen and prior.unseen >= HELD:
@@ -357,7 +357,7 @@ def _apart_mm(one: FloatArray, other: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(x * x + y * y))
 
 
-# --- what labels must stand ---------------------------------------------------------------------
+# --- checks that labels must pass ----------------------------------------------------------------
 
 
 def _unsupported(fit: _Fit, covariance: FloatArray, classes: RayClasses, level: Level) -> IntArray:
@@ -372,7 +372,7 @@ def _with_level(prior: Prior, fit: _Fit, covariance: FloatArray) -> tuple[RayCla
     found = classify_rays(observed, fit.labels, paths)
     witness = certain_witness(observed, found.witness, paths, lambda some: covariance[some])
     if not (witness < 0).any():
-        raise TrackLost("no ray that would show stayed away")
+        raise TrackLost("no visible ray is missing: the boundary is not seen")
     missing = missing_share(len(found.missed), len(fit.rays))
     witnesses = Witnesses.of(
         observed.bench.rays, observed.rig.head_sign, witness, prior.basis, missing

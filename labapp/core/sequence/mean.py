@@ -23,7 +23,7 @@ DISTANCE = 0.6
 """ℓ: from recordings of the twin, pools that swing or whose boundary wanders by 0.2 to 2 %."""
 
 TINY_MM = 1e-9
-"""No outline is known better."""
+"""Lower bound of the uncertainty of an outline."""
 
 MOST = 1000
 """From so many frames at most, evenly spaced, the correlation is worked out."""

@@ -24,7 +24,7 @@ from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray
 
 MEMORY, ORDER, TEACHERS = 32, 8, 3
 """Frames that predictions are learnt from, and from how many of them, at most, one is made; every
-so-many-th lit ray tells as much as all."""
+third lit ray is sufficient."""
 
 RIDGE = 1e-4
 """Penalty on the recurrence's coefficients, a share of the trace of its normal matrix."""
@@ -34,7 +34,7 @@ MOST_ROUNDS, SETTLED_MM = 8, 3e-4
 
 POINTS_EVERY, SETUP_EVERY, SINKS_EVERY = 8, 64, 16
 """Every so many frames the uncertainty of the reflection points is worked out anew, that of the
-sizes by the set-up, and whether the rear sinks."""
+sizes by the set-up, and whether the rear lies below the work piece."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Followed:
 
 @dataclass(frozen=True)
 class Prior:
-    """What a frame leaves to the next.
+    """State passed from a frame to the next.
 
     Parameters
     ----------
@@ -214,8 +214,8 @@ class Prior:
 def predictions(prior: Prior) -> Iterator[FloatArray]:
     """Spline coefficients that the next frame may have, the likeliest first.
 
-    A pool that swings goes on as it did: a linear recurrence, learnt from the frames before on the
-    slopes at lit rays, carries any few oscillations on.
+    A linear recurrence, learnt from the slopes at lit rays in the frames before, extrapolates a sum of
+    a few oscillations.
     """
     past, order = prior.past, min(ORDER, len(prior.past) // 2)
     if order > 2:

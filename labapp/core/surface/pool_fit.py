@@ -51,7 +51,7 @@ NEWTON_STEPS = 4
 
 @dataclass(frozen=True)
 class FitSettings:
-    """How the fit decides.
+    """Settings of the fit.
 
     Parameters
     ----------
@@ -60,7 +60,7 @@ class FitSettings:
     knot_mm
         Spacing of the spline knots, mm.
     jerk
-        Third derivatives of the surface that are to be expected, mm⁻²: the smaller, the smoother.
+        Expected third derivatives of the surface, mm⁻²: the smaller, the smoother.
     floor_mm
         Added to the standard uncertainty of every dot on the imaging plane, in squares, mm.
     settled_mm
@@ -243,7 +243,7 @@ def rounds_with_level(
             height = kernels.surface_at(basis.grid, rounds.coefficients, rounds.points_mm)[0]
             level = guess_level(height, outer)
             return level.shift_mm
-        # The drop is held from half-way on, or the rounds might go to and fro.
+        # The drop is held from half-way on, or the iteration may oscillate.
         is_held = not drop_is_free or 2 * count > most
         reach = LEVEL_REACH if count else FIRST_REACH
         found = witnesses.level(

@@ -78,7 +78,7 @@ class Reconstruction(ReadOnlyArrays):
         The set-up's part, shape (6,): the same error in all frames of a recording.
     own_are_mm
         ARE of the points as the scheme has them, with the surface through nothing else (step 4 of
-        §6.3.1 and §7.1), mm: what the text tells. NaN for fit, whose points are the surface's.
+        §6.3.1 and §7.1), mm, as the dissertation defines it. NaN for fit, whose points lie on it.
     """
 
     scheme: str

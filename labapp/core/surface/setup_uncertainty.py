@@ -1,11 +1,11 @@
-"""What is not known of the bench, in the sizes of a pool: linear propagation (JCGM 100, 5.1.2).
+"""The set-up's part of the uncertainty of sizes, by linear propagation (JCGM 100, 5.1.2).
 
-The bench is off by each column of a root of its covariance, with the rays and the witnesses that
-the fit had. A column is a quantity's standard uncertainty or, where quantities are correlated, one
-of the independent causes of what they are off by. The surface answers linearly: its coefficients
+The bench is perturbed by each column of a square root of its covariance, with the rays and the
+witnesses that the fit had. A column is a quantity's standard uncertainty or, where quantities are
+correlated, one of the independent error components. The surface responds linearly: its coefficients
 solve the normal equations, so that their change follows from that of the right-hand side (implicit
-differentiation). Where z = 0 lies answers few rays in steps: that level is found anew with the
-bench off either way, and half the difference is taken, over the very width that matters.
+differentiation). The level responds to few rays, in steps: it is found anew with the bench perturbed
+either way, and half the difference is taken, over ± one standard uncertainty.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from labapp.core.surface.pool_fit import FitSettings, FittedPool, normal_equatio
 from labapp.core.values import FloatArray
 
 ROUNDS = 3
-"""Rounds in which the reflection points follow the surface: what they leave is a thousandth."""
+"""Rounds in which the reflection points follow the surface: the remaining error is 0.1 %."""
 
 SHARE = 1e-4
 """Share of a column by which the bench is off for the change of the right-hand side: where
@@ -39,7 +39,7 @@ REACH = 0.6
 def setup_changes(
     match: Match, rig: Rig, settings: FitSettings, pool: FittedPool, gradient: FloatArray
 ) -> FloatArray:
-    """Changes of sizes by each independent cause of what the bench is off by.
+    """Changes of sizes due to each independent error component of the bench.
 
     Parameters
     ----------

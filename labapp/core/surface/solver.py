@@ -1,8 +1,8 @@
-"""The normal equations of the fit: which change of a surface the dots ask for.
+"""The normal equations of the fit: the update of a surface that the dots require.
 
 The normal matrix of the spline coefficients is a band, so that its Cholesky factor costs little.
 With one factor several rounds of the fit are solved: each takes the slopes where the rays now meet
-the surface, and solves for what they still ask for. Rounds end at the same surface whatever factor
+the surface, and solves for the remaining residual. Rounds end at the same surface whatever factor
 they are solved with.
 """
 
@@ -40,8 +40,8 @@ class NormalEquations:
     factor
         Cholesky factor of the normal matrix (`normal_factor`); None: not known yet.
     reuse_mm
-        The factor is used again where no reflection point has moved by more. An old one lets
-        what the dots leave nearly open run away, the sooner the surer the dots are.
+        The factor is used again where no reflection point has moved by more. With an
+        outdated one weakly determined modes diverge, the sooner the smaller the σ of the dots.
     """
 
     basis: SplineBasis
