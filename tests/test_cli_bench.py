@@ -41,9 +41,11 @@ def test_a_rendered_plate_adjusts_the_setup_file(
     given += ["--setup", str(setup), "--use"]
     with monkeypatch.context() as meanwhile:
         edited = TEXT.replace("# by protractor", "# by two protractors")
-        find = find_dots.find_dots
+        find = find_dots.find_mirror_dots
         meanwhile.setattr(
-            find_dots, "find_dots", lambda *a: (setup.write_text(edited, "utf-8"), find(*a))[1]
+            find_dots,
+            "find_mirror_dots",
+            lambda *a: (setup.write_text(edited, "utf-8"), find(*a))[1],
         )
         refused = CliRunner().invoke(app, given)
     assert isinstance(refused.exception, InputError)

@@ -105,12 +105,12 @@ def _checked(
 def mirror_picture(path: Path, mirror: Mirror) -> Picture:
     """The dots of a picture of a mirror."""
     from labapp.core.bench_check.labelling import Picture
-    from labapp.core.images.find_dots import DotSettings, find_dots
+    from labapp.core.images.find_dots import DotSettings, find_mirror_dots
     from labapp.media import read_picture
 
     image = read_picture(path)
     height, width = image.shape
-    return Picture(path.name, mirror, find_dots(image, DotSettings()), (height, width))
+    return Picture(path.name, mirror, find_mirror_dots(image, DotSettings()), (height, width))
 
 
 def _print_forecast(rig: Rig, mirrors: list[Mirror]) -> None:

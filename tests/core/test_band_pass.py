@@ -52,7 +52,7 @@ def test_dots_of_any_size_are_found_and_measured(size: float) -> None:
 @pytest.mark.slow
 def test_places_are_as_good_as_white_noise_allows_and_said_to_be(snr: float) -> None:
     rng = np.random.default_rng(2)
-    settings = BandPassSettings(least_sigma_px=0.0)
+    settings = BandPassSettings(speckle_px=0.0)
     errors, sigmas = [], []
     for _ in range(6):
         frame = draw(grid(), 2.2, 10.0 * snr) + rng.normal(100.0, 10.0, SHAPE)

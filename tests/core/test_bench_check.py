@@ -20,7 +20,7 @@ from labapp.core.bench_check.mirrors import Ball, Cap, Mirror, Plate, landing_po
 from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.rig import DotPattern, Rig
 from labapp.core.geometry.uncertainty import INDEX, QUANTITIES
-from labapp.core.images.find_dots import DotSettings, find_dots
+from labapp.core.images.find_dots import DotSettings, find_mirror_dots
 from labapp.core.matching.observation import Observation
 from labapp.core.values import CannotMeasure
 from labapp.errors import InputError
@@ -265,7 +265,7 @@ def test_a_mirror_alone_in_the_usual_look_measures_itself(kind: str, seed: int):
         "thumb tack": (Cap(9.75, 0.91), spherical_cap(9.75, 0.91, (x, y))),
     }[kind]
     image = render(trace(surface, bench.rig), bench.view, Look(glow=0.0), rng).image
-    dots = find_dots(image, DotSettings())
+    dots = find_mirror_dots(image, DotSettings())
     check = check_bench([Picture(kind, mirror, dots, image.shape)], RIG, CALIBRATION)
     assert check.status == "ok"
     for size in measure_known(check, check.pictures[0]):

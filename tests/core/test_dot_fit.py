@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from labapp.core.images.band_pass import band_pass_dots
+from labapp.core.images.band_pass import crowded_dots
 from labapp.core.images.dots import BandPassSettings, Dots
 from labapp.core.values import FloatArray
 from labapp.simulation.forward import PoolSurface, trace
@@ -22,7 +22,7 @@ def seen(surface: PoolSurface, look: Look, seed: int) -> tuple[Dots, FloatArray,
     """Dots of a picture, and their places and errors, shapes (n, 2), px."""
     frame = render(trace(surface, EXACT.rig), VIEW, look, np.random.default_rng([7, seed]))
     true = frame.dot_px[frame.shown]
-    dots = band_pass_dots(frame.image, BandPassSettings())
+    dots = crowded_dots(frame.image, BandPassSettings())
     away, own = cKDTree(true).query(dots.image_px)
     assert len(dots) > 0.97 * len(true)
     assert (away < 1.5).all()

@@ -342,6 +342,38 @@ def test_ridges_are_long_at_any_angle_and_at_the_edge() -> None:
         assert dot_kernels.ridges(band, np.array([at]), np.array([30]), 10.0) == [long]
 
 
+def centroids_by_hand(
+    light: FloatArray, u: int, v: int, margin: int, width: float
+) -> tuple[float, float, float]:
+    """A window moved on to the light until it stays, in NumPy: column, row, second moment."""
+    wide = np.pad(np.maximum(light, 0.0), margin)
+    patch = wide[v : v + 2 * margin + 1, u : u + 2 * margin + 1].astype(float)
+    y, x = np.mgrid[-margin : margin + 1, -margin : margin + 1]
+    at_u = at_v = 0.0
+    for _ in range(4):
+        weight = patch * np.exp(-((x - at_u) ** 2 + (y - at_v) ** 2) / (2 * width**2))
+        weight /= weight.sum() + 1e-12
+        mean_u, mean_v = (weight * x).sum(), (weight * y).sum()
+        square = (weight * (x**2 + y**2)).sum() - mean_u**2 - mean_v**2
+        at_u, at_v = at_u + 1.5 * (mean_u - at_u), at_v + 1.5 * (mean_v - at_v)
+        at_u, at_v = np.clip(at_u, -2, 2), np.clip(at_v, -2, 2)
+    return at_u, at_v, square
+
+
+@pytest.mark.parametrize("sigma", [0.0, 1.1])
+def test_centroids_are_those_of_the_blurred_picture_over_what_is_around_it(sigma: float) -> None:
+    place, image = picture()
+    u, v = np.rint(place).astype(np.int64).T
+    width = random().uniform(1.0, 2.2, len(u))
+    around = dot_size.blur(image, 4.0) if sigma else np.zeros_like(image)
+    taps = dot_size.kernel(sigma)
+    light = cv2.sepFilter2D(image, -1, taps, taps, borderType=cv2.BORDER_REFLECT) - around
+    offset, moment = centroid_kernels.centroids(image, around, taps, u, v, 6, width, 2.0)
+    for k in range(len(u)):
+        wanted = centroids_by_hand(light, u[k], v[k], 6, width[k])
+        np.testing.assert_allclose([*offset[:, k], moment[k]], wanted, atol=1e-5)
+
+
 def fitted_picture() -> tuple[FloatArray, FloatArray, FloatArray]:
     """Crowded dots, shape (n, 4), and some light over those and a slope, near edges, too."""
     rng = random()
@@ -527,9 +559,11 @@ def test_the_finer_band_is_that_of_the_whole_picture() -> None:
 def test_bytes_are_read_as_they_are() -> None:
     place, image = picture()
     u, v = np.rint(place).astype(np.int64).T
-    coarse = np.clip(image + 20, 0, 255).astype(np.uint8)
+    coarse, around = np.clip(image + 20, 0, 255).astype(np.uint8), np.full(image.shape, 20.0, "f4")
+    taps, width = cv2.getGaussianKernel(9, 1.1, cv2.CV_32F).ravel(), np.full(len(u), 2.0)
     narrow, wide = np.float32(random().uniform(0, 1, (2, 3, 13)))
     for made in (
+        lambda own: centroid_kernels.centroids(own, around, taps, u, v, 6, width, 2.0),
         lambda own: centroid_kernels.finest(own, u, v, narrow, wide),
         lambda own: dot_kernels.spikes(own, 3.0, 1.9, 1.2, 5),
         lambda own: dot_kernels.tile_noise(own, 2, 3),

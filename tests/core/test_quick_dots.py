@@ -49,6 +49,20 @@ def test_the_dots_of_the_next_frame_are_those_of_the_default_detector(seed: int)
     assert np.sqrt(np.mean(off**2)) < np.sqrt(2) * 0.08
 
 
+def test_light_is_the_same_round_the_dots_alone_and_over_the_whole_picture(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rng = np.random.default_rng(5)
+    image = frame(places(rng), rng)
+    tuning = DetectorTuning.of(image, BandPassSettings())
+    made = []
+    for much in (np.inf, 0.0):
+        monkeypatch.setattr("labapp.core.images.band_pass.MOST_SURROUNDINGS", much)
+        made.append(quick_dots(image, tuning, BandPassSettings()))
+    np.testing.assert_allclose(made[0].image_px, made[1].image_px, atol=1e-4)
+    np.testing.assert_allclose(made[0].size_px, made[1].size_px, atol=1e-3)
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_dots_in_a_part_of_the_picture_are_those_of_the_whole_of_it(
     seed: int, monkeypatch: pytest.MonkeyPatch
@@ -68,7 +82,7 @@ def test_dots_in_a_part_of_the_picture_are_those_of_the_whole_of_it(
         made += [quick_dots(each, tuning, BandPassSettings()) for each in (first, image)]
     for part, whole in zip(made[:2], made[2:], strict=True):
         assert len(part) == len(whole)
-        assert (np.abs(part.image_px - whole.image_px) < 0.04 * whole.u_sigma_px[:, None]).all()
+        assert (np.abs(part.image_px - whole.image_px) < 0.01 * whole.u_sigma_px[:, None]).all()
         np.testing.assert_allclose(part.size_px, whole.size_px, rtol=1e-2)
     assert np.linalg.norm(made[1].image_px - faint, axis=-1).min() < 1.0
 

@@ -53,12 +53,12 @@ ROUND_PX2 = 0.25
 LEAST_PX2 = 0.8
 """A blur of less, px² of the smaller picture, is not taken of it."""
 
-AROUND_SIZES = 4.2
-"""A dot's surroundings are blurred by so many of its sizes."""
+CENTROID_WIDENING = 1.4
+"""Centroids are taken over windows wider by this than a dot is found by: over more of its grains of
+speckle, which then move it less."""
 
-AROUND_PX2 = 3.0
-"""Variance of that blur, px² of the smaller picture it is taken of, at least: it is followed by its
-values at pixels."""
+MOST_SURROUNDINGS = 0.3
+"""Where the dots' surroundings are a larger share of the picture, all of it is blurred at once."""
 
 HALVED_PX, NEARLY = 1.5, 0.75
 """Dots of this size are sought at half the size: a peak over the floor has a pixel there that is
@@ -66,6 +66,19 @@ over so much of it."""
 
 PEAK_GAIN = 1 / 1.64 - 1 / 3.56
 """What a Gaussian dot of the band's own size keeps of its height: 1/(1 + 0.8²) − 1/(1 + 1.6²)."""
+
+WIDTH_KEPT = 0.8
+"""What is left of a Gaussian dot's width when its surroundings are taken off."""
+
+AROUND_SIZES = 4.2
+"""The surroundings of dots that are fitted together are blurred by so many of their sizes."""
+
+AROUND_PX2 = 3.0
+"""Variance of that blur, px² of the smaller picture it is taken of, at least: it is followed by its
+values at pixels."""
+
+LEAST_SIGMA_PX = 0.02
+"""Added to the uncertainty of places of dots that are fitted together, in squares, px."""
 
 
 @dataclass(frozen=True)
@@ -151,6 +164,21 @@ def quick_dots(frame: Image, tuning: DetectorTuning, settings: BandPassSettings)
     return _found(tuning, _BandPassed(picture, tuning.size_px), settings)
 
 
+def crowded_dots(frame: Image, settings: BandPassSettings) -> Dots:
+    """Find dots that overlap, such as those of a plate, and fit them together.
+
+    Neighbours' light moves centroids of such dots by half a pixel. The joint fit takes several
+    times as long, so it is not for the frames of a recording.
+
+    Raises
+    ------
+    CannotMeasure
+        ``no-dots`` if nothing stands out of the noise.
+    """
+    tuning, seen = _tuned(as_picture(frame), settings)
+    return _downwards(_fitted(seen, _kept(tuning, seen, settings), tuning.noise))
+
+
 def dot_at(
     frame: Image, u_px: float, v_px: float, others: Dots, settings: BandPassSettings
 ) -> Dots:
@@ -174,7 +202,7 @@ def dot_at(
         its own is within two dots' sizes it is at (u_px, v_px), uncertain by a dot's size.
     """
     size = settings.size_px or (float(np.median(others.size_px)) if len(others) else None)
-    like = BandPassSettings(size, FAINT_SIGMA, 0.0, settings.least_sigma_px)
+    like = BandPassSettings(size, FAINT_SIGMA, 0.0, settings.speckle_px)
     tuning, seen = _tuned(as_picture(frame), like)
     size = tuning.size_px
     u, v, _ = seen.peaks(tuning)
@@ -196,7 +224,7 @@ def dot_at(
     known = np.clip(np.rint(others.image_px), 0, limit).astype(np.int64)
     u, v = np.append(known[:, 0], u[k]), np.append(known[:, 1], v[k])
     bright = seen.band[v // seen.step, u // seen.step].astype(float)
-    every = _described(seen, (u, v, bright), tuning.noise, settings.least_sigma_px)
+    every = _described(seen, (u, v, bright), tuning.noise, settings.speckle_px)
     return Dots(*(getattr(every, column.name)[-1:] for column in fields(every)))
 
 
@@ -289,6 +317,26 @@ class _BandPassed:
         ridges = dot_kernels.ridges(self.band, u // self.step, v // self.step, SLENDER)
         return np.asarray(~sharp & ~ridges)
 
+    def light(
+        self, u: IntArray, v: IntArray, width: FloatArray, reach: float
+    ) -> tuple[FloatArray, FloatArray]:
+        """Centroids, (u, v), and moments of the light over its surroundings.
+
+        Windows move for a few steps only: beside a brighter dot they would move on to that.
+        """
+        from labapp.core.images import centroid_kernels
+
+        variance = ((3.0 * CENTROID_WIDENING) ** 2 - 0.8**2) * (self.size / self.step) ** 2
+        around = smaller_blurred(self._narrow, variance)
+        margin, taps, picture = margin_of(reach), kernel(0.5 * self.size), self.picture
+        if len(u) * (2 * margin + 1) ** 2 > MOST_SURROUNDINGS * picture.size:
+            into = scratch("picture", picture.shape)
+            picture, taps = blur(picture, 0.5 * self.size, into), kernel(0.0)
+        (x, y), moment = centroid_kernels.centroids(
+            picture, around, taps, u, v, margin, width, reach
+        )
+        return np.stack([u + x, v + y]), moment
+
     def around(self) -> tuple[Grey, float]:
         """The picture, made smaller and blurred, and the blur's standard deviation, px."""
         image, (height, width), scale = self._narrow, self._narrow.shape, 1
@@ -334,6 +382,13 @@ def smaller_blurred(image: Grey, variance_px2: float) -> Grey:
 
 
 def _found(tuning: DetectorTuning, seen: _BandPassed, settings: BandPassSettings) -> Dots:
+    u, v, bright = _kept(tuning, seen, settings)
+    dots = _described(seen, (u, v, bright), tuning.noise, settings.speckle_px)
+    return _downwards(dots)
+
+
+def _kept(tuning: DetectorTuning, seen: _BandPassed, settings: BandPassSettings) -> Peaks:
+    """Peaks that are bright enough, each once."""
     from labapp.core.images import dot_kernels
 
     u, v, bright = seen.peaks(tuning)
@@ -342,7 +397,10 @@ def _found(tuning: DetectorTuning, seen: _BandPassed, settings: BandPassSettings
     keep = np.flatnonzero(bright >= settings.contrast * typical(bright))
     # The top of a dot may be flat.
     keep = keep[dot_kernels.first_of_each(u[keep], v[keep], max(1.5, seen.size))]
-    dots = _described(seen, (u[keep], v[keep], bright[keep]), tuning.noise, settings.least_sigma_px)
+    return u[keep], v[keep], bright[keep]
+
+
+def _downwards(dots: Dots) -> Dots:
     order = np.argsort(dots.v_px)
     return Dots(*(values[order] for values in vars(dots).values()))
 
@@ -357,8 +415,44 @@ def _nine(sigma: float, widest: float) -> Grey:
     return np.asarray(nine)
 
 
-def _described(seen: _BandPassed, peaks: Peaks, noise: Grey, least_px: float) -> Dots:
-    """Place, its uncertainty, size, peak and signal-to-noise of each peak."""
+def window_widths(next_px: FloatArray, reach: float) -> FloatArray:
+    """Widths of the Gaussian windows of dots so far from the next one, shape (n,), px.
+
+    A window that ends half-way to the next dot keeps its light out.
+    """
+    return np.minimum(1.1 * reach, np.maximum(0.275 * next_px, 0.75))
+
+
+def margin_of(reach: float) -> int:
+    """So far from a peak, px, light is weighed."""
+    return int(np.ceil(2.2 * reach)) + 1
+
+
+def _described(seen: _BandPassed, peaks: Peaks, noise: Grey, speckle_px: float) -> Dots:
+    """Centroid, its uncertainty, size, peak and signal-to-noise of each peak."""
+    from labapp.core.images import dot_kernels
+
+    (u, v, bright), size = peaks, seen.size
+    width = window_widths(dot_kernels.next_apart(pairs(u, v)), CENTROID_WIDENING * size)
+    (u_px, v_px), moment = seen.light(u, v, width, CENTROID_WIDENING * size)
+    moment = np.clip(moment / 2, 1e-3, 0.95 * width**2)
+    spread = (1 / (1 / moment - 1 / width**2) - (0.5 * size) ** 2) / WIDTH_KEPT**2
+    peak = bright / PEAK_GAIN
+    snr = peak / np.maximum(noise[v, u], 1e-3 * np.max(peak))
+    sigma = np.hypot(0.8 / snr, speckle_px)
+    return Dots(
+        u_px=u_px,
+        v_px=v_px,
+        u_sigma_px=sigma,
+        v_sigma_px=sigma.copy(),
+        size_px=np.sqrt(np.clip(spread, (0.3 * size) ** 2, (3.0 * size) ** 2)),
+        peak=peak,
+        snr=snr,
+    )
+
+
+def _fitted(seen: _BandPassed, peaks: Peaks, noise: Grey) -> Dots:
+    """The same of dots that overlap, from a joint fit (`fit_dots`)."""
     (u, v, bright), size = peaks, seen.size
     peak = bright / PEAK_GAIN
     own = np.maximum(noise[v, u], 1e-3 * np.max(peak)).astype(np.float64)
@@ -367,8 +461,8 @@ def _described(seen: _BandPassed, peaks: Peaks, noise: Grey, least_px: float) ->
     return Dots(
         u_px=fitted.u_px,
         v_px=fitted.v_px,
-        u_sigma_px=np.hypot(fitted.u_sigma_px, least_px),
-        v_sigma_px=np.hypot(fitted.v_sigma_px, least_px),
+        u_sigma_px=np.hypot(fitted.u_sigma_px, LEAST_SIGMA_PX),
+        v_sigma_px=np.hypot(fitted.v_sigma_px, LEAST_SIGMA_PX),
         size_px=np.clip(fitted.size_px, 0.3 * size, 3.0 * size),
         peak=peak,
         snr=peak / own,

@@ -13,9 +13,14 @@ from labapp.core.compiled import inner as _inner
 from labapp.core.images.dots import Grey, Picture
 from labapp.core.values import FloatArray, IntArray
 
-_grey = types.Array(types.float32, 2, "C", readonly=True)
+_f, _i = types.float64, types.int64
+_f1 = types.Array(_f, 1, "A", readonly=True)
+_taps, _grey = (types.Array(types.float32, n, "C", readonly=True) for n in (1, 2))
 _byte = types.Array(types.uint8, 2, "C", readonly=True)
-_ints = types.Array(types.int64, 1, "A", readonly=True)
+_ints = types.Array(_i, 1, "A", readonly=True)
+
+SETTLED_PX = 1e-4
+"""A centroid that moved by less stays."""
 
 
 @_inner
@@ -23,6 +28,171 @@ def _mirrored(at: int, count: int) -> int:
     """A pixel's number where a picture goes on beyond its edge as in a mirror."""
     at %= 2 * count
     return 2 * count - 1 - at if at >= count else at
+
+
+@_inner
+def _fold(line: Grey, taps: Grey, step: int, count: int, out: Grey) -> None:
+    """Filter a line by even taps that are so many numbers apart, into as many as are counted."""
+    rim = len(taps) // 2
+    middle, made = line[rim * step :], out[:count]
+    for x in range(count):
+        made[x] = taps[rim] * middle[x]
+    for k in range(rim):
+        weight, one, other = taps[k], line[k * step :], line[(2 * rim - k) * step :]
+        for x in range(count):
+            made[x] += weight * (one[x] + other[x])
+
+
+@_inner
+def _blurred(image: Picture, taps: Grey, u: int, v: int, lines: Grey, patch: Grey) -> None:
+    """Blur a square round a pixel, shape (side, any), by an even filter along rows and columns.
+
+    The two lines, as long as the square and what the filter reaches beyond it, are memory to write
+    on: rows follow each other there, and where one ends the filter reaches into the next.
+    """
+    side, rim = len(patch), len(taps) // 2
+    wide, reach = side + 2 * rim, side // 2 + rim
+    inside = reach <= v < image.shape[0] - reach and reach <= u < image.shape[1] - reach
+    for y in range(wide):
+        row = lines[0, y * wide : (y + 1) * wide]
+        if inside:
+            own = image[v + y - reach, u - reach : u + reach + 1]
+            for x in range(wide):
+                row[x] = own[x]
+        else:
+            at_y = _mirrored(v + y - reach, image.shape[0])
+            for x in range(wide):
+                row[x] = image[at_y, _mirrored(u + x - reach, image.shape[1])]
+    _fold(lines[0], taps, 1, wide * wide - 2 * rim, lines[1])
+    _fold(lines[1], taps, wide, wide * side, lines[0])
+    for y in range(side):
+        row, own = patch[y], lines[0, y * wide :]
+        for x in range(side):
+            row[x] = own[x]
+
+
+@_inner
+def _beneath(at: int, by: float, count: int) -> tuple[int, float]:
+    """Number of the pixel of a picture ``by`` times smaller before one, and how far on it is."""
+    place = min(max((at + 0.5) / by - 0.5, 0.0), count - 1.0)
+    before = min(int(place), max(count - 2, 0))
+    return before, place - before
+
+
+@_inner
+def _take_off(
+    patch: Grey, around: Grey, by: float, u: int, v: int, shape: tuple[int, int], across: Grey
+) -> None:
+    """Take what is around, a smaller picture, off a patch whose first pixel is (u, v).
+
+    Nothing is left outside the picture, and of what is darker.
+    """
+    (side, even), zero = patch.shape, np.float32(0.0)
+    top, _ = _beneath(v, by, around.shape[0])
+    last, _ = _beneath(v + side - 1, by, around.shape[0])
+    last = min(last + 1, around.shape[0] - 1)
+    for x in range(even):
+        column, on = _beneath(u + x, by, around.shape[1])
+        after = min(column + 1, around.shape[1] - 1)
+        for row in range(top, last + 1):
+            low, high = around[row, column], around[row, after]
+            across[row - top, x] = low + np.float32(on) * (high - low)
+    first_x, last_x = max(-u, 0), min(side, shape[1] - u)
+    for y in range(side):
+        if not 0 <= v + y < shape[0]:
+            patch[y] = zero
+            continue
+        row, part = _beneath(v + y, by, around.shape[0])
+        low, high = across[row - top], across[min(row + 1, last) - top]
+        share = np.float32(part)
+        for x in range(even):
+            light = patch[y, x] - (low[x] + share * (high[x] - low[x]))
+            patch[y, x] = light if light > zero else zero
+        patch[y, :first_x] = zero
+        patch[y, last_x:] = zero
+
+
+@_inner
+def _bell(center: float, width: float, values: Grey) -> None:
+    """A Gaussian at whole numbers round 0: each value is the last times what shrinks evenly."""
+    away = -(len(values) // 2) - center
+    value = np.exp(-0.5 * (away / width) ** 2)
+    ratio, shrinks = np.exp(-(away + 0.5) / width**2), np.exp(-1.0 / width**2)
+    for k in range(len(values)):
+        values[k] = value
+        value *= ratio
+        ratio *= shrinks
+
+
+@_inner
+def _centroid(patch: Grey, place: FloatArray, width: float, reach: float, lines: Grey) -> float:
+    """Move a place, shape (2,), from a patch's middle to the centroid; returns the second moment.
+
+    What is weighed is in a Gaussian window that moves along. The four lines, as long as a row, are
+    memory to write on.
+    """
+    (side, even), moment = patch.shape, 0.0
+    along_u, along_v, pull_u, pull_v = lines[0], lines[1], lines[2], lines[3]
+    pull_u[side:] = 0.0
+    for _ in range(4):
+        _bell(place[0], width, pull_u[:side])
+        _bell(place[1], width, pull_v[:side])
+        along_u[:] = 0.0
+        for y in range(side):
+            row = np.float32(0.0)
+            for x in range(even):
+                weighed = patch[y, x] * pull_u[x]
+                row += weighed
+                along_u[x] += pull_v[y] * weighed
+            along_v[y] = pull_v[y] * row
+        total, mean_u, mean_v, square = 1e-12, 0.0, 0.0, 0.0
+        for at in range(side):
+            away = at - side // 2
+            total += along_u[at]
+            mean_u += along_u[at] * away
+            mean_v += along_v[at] * away
+            square += (along_u[at] + along_v[at]) * away * away
+        mean_u, mean_v = mean_u / total, mean_v / total
+        moment = square / total - mean_u * mean_u - mean_v * mean_v
+        # The window holds the mean back; half as much again brings it home in a few steps.
+        change_u, change_v = 1.5 * (mean_u - place[0]), 1.5 * (mean_v - place[1])
+        place[0] = min(max(place[0] + change_u, -reach), reach)
+        place[1] = min(max(place[1] + change_v, -reach), reach)
+        if max(abs(change_u), abs(change_v)) < SETTLED_PX:
+            break
+    return moment
+
+
+@_compiled_for(*((own, _grey, _taps, _ints, _ints, _i, _f1, _f) for own in (_grey, _byte)))
+def centroids(
+    image: Picture,
+    around: Grey,
+    taps: Grey,
+    u: IntArray,
+    v: IntArray,
+    margin: int,
+    width: FloatArray,
+    reach: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Centroids and second moments of light round pixels: see `band_pass._described`.
+
+    Light is the image, blurred by an even filter, over what is around it, a picture that may be
+    smaller. Centroids are given as offsets from the pixels, shape (2, n).
+    """
+    count, side, rim = len(u), 2 * margin + 1, len(taps) // 2
+    even = (side + 7) // 8 * 8  # numbers are added eight at a time
+    by, single = image.shape[1] / around.shape[1], np.float32
+    offset, moment, patch = np.zeros((2, count)), np.empty(count), np.zeros((side, even), single)
+    squares, across = (
+        np.zeros((2, (side + 2 * rim) ** 2), single),
+        np.empty((side + 2, even), single),
+    )
+    lines = np.empty((4, even), single)
+    for k in range(count):
+        _blurred(image, taps, u[k], v[k], squares, patch)
+        _take_off(patch, around, by, u[k] - margin, v[k] - margin, image.shape, across)
+        moment[k] = _centroid(patch, offset[:, k], width[k], reach, lines)
+    return offset, moment
 
 
 @_compiled_for(*((own, _ints, _ints, _grey, _grey) for own in (_grey, _byte)))

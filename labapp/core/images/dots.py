@@ -65,12 +65,11 @@ class BandPassSettings:
         A dot's band-passed peak stands this many local noise σ above the background.
     contrast
         … and is at least this fraction of the frame's typical dot.
-    least_sigma_px
-        Least standard uncertainty of a position, px, beside what noise and speckle of the frame
-        give it.
+    speckle_px
+        Part of the position's uncertainty that no signal-to-noise removes.
     """
 
     size_px: float | None = None
     threshold: float = 6.0
     contrast: float = 0.15
-    least_sigma_px: float = 0.02
+    speckle_px: float = 0.12

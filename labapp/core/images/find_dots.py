@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
-from labapp.core.images.band_pass import band_pass_dots
+from labapp.core.images.band_pass import band_pass_dots, crowded_dots
 from labapp.core.images.dots import BandPassSettings, Dots, Image
 from labapp.core.images.threshold_dots import (
     BlockThresholdSettings,
@@ -51,3 +51,16 @@ def find_dots(frame: Image, settings: DotSettings) -> Dots:
     if len(dots) == 0:
         raise CannotMeasure("no-dots", "no dot stands out of the frame's background")
     return dots
+
+
+def find_mirror_dots(frame: Image, settings: DotSettings) -> Dots:
+    """Find the dots of a plate, ball or cap: those of the default detector are fitted together.
+
+    Raises
+    ------
+    CannotMeasure
+        ``no-dots`` if nothing stands out of the noise.
+    """
+    if settings.method != "band-pass":
+        return find_dots(frame, settings)
+    return crowded_dots(frame, settings.band_pass)

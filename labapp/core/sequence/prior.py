@@ -214,8 +214,8 @@ class Prior:
 def predictions(prior: Prior) -> Iterator[FloatArray]:
     """Spline coefficients that the next frame may have, the likeliest first.
 
-    A linear recurrence, learnt from the slopes at lit rays in the frames before, extrapolates a sum of
-    a few oscillations.
+    A linear recurrence, learnt from the slopes at lit rays in the frames before, extrapolates a
+    sum of a few oscillations.
     """
     past, order = prior.past, min(ORDER, len(prior.past) // 2)
     if order > 2:

@@ -4,8 +4,8 @@ The bench is perturbed by each column of a square root of its covariance, with t
 witnesses that the fit had. A column is a quantity's standard uncertainty or, where quantities are
 correlated, one of the independent error components. The surface responds linearly: its coefficients
 solve the normal equations, so that their change follows from that of the right-hand side (implicit
-differentiation). The level responds to few rays, in steps: it is found anew with the bench perturbed
-either way, and half the difference is taken, over ± one standard uncertainty.
+differentiation). The level responds to few rays, in steps: it is found anew with the bench
+perturbed either way, and half the difference is taken, over ± one standard uncertainty.
 """
 
 from __future__ import annotations

@@ -148,7 +148,7 @@ STORED = {
     # Settings
     "Settings": Stored(Settings, fits=_scheme_is_known),
     "DotSettings": Stored(find_dots.DotSettings),
-    "BandPassSettings": Stored(dots.BandPassSettings, retired=("speckle_px",)),
+    "BandPassSettings": Stored(dots.BandPassSettings),
     "BlockThresholdSettings": Stored(threshold_dots.BlockThresholdSettings),
     "WaveletSettings": Stored(threshold_dots.WaveletSettings),
     "LatticeSettings": Stored(find_lattice.LatticeSettings),

@@ -16,7 +16,7 @@ from labapp.core.bench_check.labelling import Picture
 from labapp.core.bench_check.mirrors import Ball, Cap, Mirror, Plate
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.uncertainty import INDEX, QUANTITIES
-from labapp.core.images.find_dots import DotSettings, find_dots
+from labapp.core.images.find_dots import DotSettings, find_mirror_dots
 from labapp.core.values import FloatArray
 from labapp.gui.digits import ResultRow, round_factor, rounded
 from labapp.media import GreyImage
@@ -152,7 +152,7 @@ def check(
     pictures, parts = [], 2 * len(chosen) + 1
     for n, one in enumerate(chosen):
         progress(n, parts, f"dots of {one.name}")
-        dots = find_dots(one.image, settings)
+        dots = find_mirror_dots(one.image, settings)
         rows, columns = one.image.shape
         pictures.append(Picture(one.name, one.mirror, dots, (rows, columns)))
     progress(len(chosen), parts, "adjusting the set-up")
