@@ -15,6 +15,9 @@ from labapp.files import write_file
 CONTRADICTING = 3.0
 """Pictures that differ by so many times what the dots' noise allows contradict each other."""
 
+HIGHEST_MM = 1000.0
+"""No mirror is higher over the work piece."""
+
 
 def calibrate_pattern(
     *,
@@ -44,19 +47,12 @@ def calibrate_pattern(
     from labapp.config.ray_file import ray_table
     from labapp.config.setup import read_setup, update_setup
     from labapp.core.bench_check.mirrors import Plate
-    from labapp.core.bench_check.pattern_calibration import LEAST_PICTURES
     from labapp.core.bench_check.pattern_calibration import calibrate_pattern as calibrated
     from labapp.core.geometry.patterns import MEASURED
     from labapp.core.values import CannotMeasure
 
     known = read_setup(setup)
-    if len(height) != len(pictures) or len(set(height)) < LEAST_PICTURES:
-        counts = f"{len(set(height))} for {len(pictures)} pictures"
-        raise InputError("--height", "heights", counts, "one for each picture, two that differ")
-    if not all(abs(one) <= 1000 for one in height):
-        raise InputError("--height", "height", height, "heights to 1000 mm")
-    if use and out.absolute().parent != setup.absolute().parent:
-        raise InputError("--out", "folder", out, f"that of {setup}, which is to name the table")
+    _check_options(setup, pictures, height, out, use)
     try:
         found = calibrated(
             [mirror_picture(path, Plate(z)) for path, z in zip(pictures, height, strict=True)],
@@ -83,3 +79,17 @@ def calibrate_pattern(
         values = {"kind": MEASURED, "file": out.name, **left}
         update_setup(setup, {"pattern": values})
         typer.echo(f"They are the pattern of {setup.absolute()}")
+
+
+def _check_options(
+    setup: Path, pictures: list[Path], height: list[float], out: Path, use: bool
+) -> None:
+    from labapp.core.bench_check.pattern_calibration import LEAST_PICTURES
+
+    if len(height) != len(pictures) or len(set(height)) < LEAST_PICTURES:
+        counts = f"{len(set(height))} for {len(pictures)} pictures"
+        raise InputError("--height", "heights", counts, "one for each picture, two that differ")
+    if not all(abs(one) <= HIGHEST_MM for one in height):
+        raise InputError("--height", "height", height, f"heights to {HIGHEST_MM:g} mm")
+    if use and out.absolute().parent != setup.absolute().parent:
+        raise InputError("--out", "folder", out, f"that of {setup}, which is to name the table")

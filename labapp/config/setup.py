@@ -284,21 +284,7 @@ def _contradictions(path: Path, values: dict[str, Any]) -> list[InputError]:
     problems = contradictions(path, values)
     rows, columns = pattern["rows"], pattern["columns"]
     step = pattern["inter_beam_angle_deg"]
-    problems += [
-        InputError(
-            path,
-            "pattern.absent",
-            [i, j],
-            f"rays [row, column] from [1, 1] to [{rows}, {columns}]",
-        )
-        for i, j in pattern.get("absent", [])
-        if not (1 <= i <= rows and 1 <= j <= columns)
-    ]
-    problems += [
-        InputError(path, "pattern.rays", [i, j], f"rows to {rows} and columns to {columns}")
-        for i, j, *_ in pattern.get("rays", [])
-        if not (1 <= i <= rows and 1 <= j <= columns)
-    ]
+    problems += _rays_beyond(path, pattern)
     plane = values["imaging_plane"]
     if plane.get("glass_mm", 0.0) >= plane["distance_mm"]:
         expected = f"a number below the plane's distance, {plane['distance_mm']:g} (mm)"
@@ -340,6 +326,19 @@ def _contradictions(path: Path, values: dict[str, Any]) -> list[InputError]:
     else:
         problems += _nearly_one_line(path, values["image_calibration"])
     return problems
+
+
+def _rays_beyond(path: Path, pattern: dict[str, Any]) -> list[InputError]:
+    """Find rays that are named and lie beyond the pattern's rows and columns."""
+    rows, columns = pattern["rows"], pattern["columns"]
+    return [
+        InputError(
+            path, f"pattern.{key}", [i, j], f"rays [row, column] from [1, 1] to [{rows}, {columns}]"
+        )
+        for key in ("absent", "rays")
+        for i, j, *_ in pattern.get(key, [])
+        if not (1 <= i <= rows and 1 <= j <= columns)
+    ]
 
 
 def _nearly_one_line(path: Path, keys: dict[str, Any]) -> list[InputError]:
