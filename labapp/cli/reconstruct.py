@@ -35,7 +35,6 @@ from labapp.errors import InputError
 
 if TYPE_CHECKING:
     from labapp.core.pipeline import Settings
-    from labapp.core.recording.residual_check import ResidualRecord
     from labapp.export.summary import Summary
     from labapp.run.runner import Measurer, Sink
     from labapp.run.streams import Stream
