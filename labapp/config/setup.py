@@ -116,7 +116,7 @@ def parse_setup(text: str, path: str | os.PathLike[str]) -> Setup:
         ),
     ]
     # How values fit each other can be asked once each is right by itself.
-    problems = problems or _contradictions(path, values)
+    problems = problems or [*_contradictions(path, values), *contradictions(path, values)]
     if problems:
         raise InputError.gather(problems)
     calibration = _calibration(values)
@@ -292,10 +292,9 @@ def dot_pattern(keys: Mapping[str, Any]) -> DotPattern:
 def _contradictions(path: Path, values: dict[str, Any]) -> list[InputError]:
     """Problems of values that are valid by themselves and contradict each other."""
     pattern, angle = values["pattern"], values["laser"]["projection_angle_deg"]
-    problems = contradictions(path, values)
     rows, columns = pattern["rows"], pattern["columns"]
     step = pattern["inter_beam_angle_deg"]
-    problems += [
+    problems = [
         InputError(
             path,
             "pattern.absent",
