@@ -64,6 +64,17 @@ def test_it_predicts_without_a_picture(setup: Path):
     assert "plate at 0 mm" in done.output
 
 
+@pytest.mark.parametrize(("mirror", "is_predicted"), [("ball:10", True), ("ball:60", False)])
+def test_a_mirror_that_shows_no_dot_is_not_predicted(
+    setup: Path, mirror: str, *, is_predicted: bool
+):
+    given = ["calibrate", "bench", "--setup", str(setup), "--predict", "--mirror", mirror]
+    done = CliRunner().invoke(app, given)
+    assert done.exit_code == 0, done.output
+    assert "ball" in done.output
+    assert ("not predicted" in done.output) is not is_predicted
+
+
 def test_every_picture_needs_its_mirror(setup: Path):
     done = CliRunner().invoke(app, ["calibrate", "bench", "a.png", "--setup", str(setup)])
     assert done.exit_code != 0

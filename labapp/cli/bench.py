@@ -122,8 +122,11 @@ def _print_forecast(rig: Rig, mirrors: list[Mirror]) -> None:
         every[", ".join(one.name for one in mirrors)] = tuple(mirrors)
     typer.echo(f"± of the height of a pool like a {EXPECTED.name} (mm)")
     typer.echo(f"{'pictures':40} {'set-up':>8} {'total':>8}")
-    for one in forecast(rig, every):
+    made = forecast(rig, every)
+    for one in made:
         typer.echo(f"{one.name:40} {one.setup_sigma_mm:8.4f} {one.total_sigma_mm:8.4f}")
+    for name in every.keys() - {one.name for one in made}:
+        typer.echo(f"not predicted: {name}: no dot of it, or of one of them, would be on the plane")
 
 
 def _print_check(check: BenchCheck) -> None:

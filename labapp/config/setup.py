@@ -109,7 +109,7 @@ def parse_setup(text: str, path: str | os.PathLike[str]) -> Setup:
         ),
     ]
     # Values are compared with each other once each is valid by itself.
-    problems = problems or _contradictions(path, values)
+    problems = problems or [*_contradictions(path, values), *contradictions(path, values)]
     if problems:
         raise InputError.gather(problems)
     calibration = _calibration(values)
@@ -281,10 +281,9 @@ def dot_pattern(keys: Mapping[str, Any]) -> DotPattern:
 def _contradictions(path: Path, values: dict[str, Any]) -> list[InputError]:
     """Problems of values that are valid by themselves and contradict each other."""
     pattern, angle = values["pattern"], values["laser"]["projection_angle_deg"]
-    problems = contradictions(path, values)
     rows, columns = pattern["rows"], pattern["columns"]
     step = pattern["inter_beam_angle_deg"]
-    problems += _rays_beyond(path, pattern)
+    problems = _rays_beyond(path, pattern)
     plane = values["imaging_plane"]
     if plane.get("glass_mm", 0.0) >= plane["distance_mm"]:
         expected = f"a number below the plane's distance, {plane['distance_mm']:g} (mm)"

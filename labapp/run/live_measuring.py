@@ -97,6 +97,7 @@ class LiveChain:
         found = self._chain.follow(frame.image)
         if found is None:
             if time.monotonic() < self._measured_s + SOUGHT_S:
+                self._chain.skip()
                 return None
             found = self._chain.search(frame.image)
         surface = None

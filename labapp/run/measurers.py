@@ -205,7 +205,8 @@ def _results_in_order(begun: Iterable[Future[T]], ahead: int) -> Generator[T]:
 class WarmMeasurer:
     """Measures each frame from the one before, here, in stretches (`WarmChain`).
 
-    A frame that was corrected by hand is measured by itself, as it was corrected.
+    A frame that was corrected by hand is measured by itself, as it was corrected. Such a frame, one
+    that cannot be read and a change of the step between frames are gaps (`WarmChain.skip`).
     """
 
     read: Read
@@ -224,13 +225,21 @@ class WarmMeasurer:
     def _stretch(self, frames: Iterable[int]) -> Generator[FrameResult]:
         from labapp.core.recording.chain import WarmChain
 
+        last: int | None = None
+        step: int | None = None
         for place, number in enumerate(frames):
             if place in BY_THEMSELVES:
                 warm = WarmChain(self.setup.bench, self.settings)
+            before = None if last is None else number - last
+            if step is not None and before != step:
+                warm.skip()
+            last, step = number, before
             frame = _read(self.read, number, self.settings)
             if isinstance(frame, FrameResult):
+                warm.skip()
                 yield frame
             elif (correction := self.corrected(number)) is not None:
+                warm.skip()
                 yield _cold(number, frame, self.setup, self.settings, correction)
             else:
                 with _one_thread():

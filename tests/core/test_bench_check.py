@@ -16,7 +16,7 @@ from labapp.core.bench_check.check import BenchCheck, check_bench
 from labapp.core.bench_check.forecast import forecast
 from labapp.core.bench_check.known import measure_known
 from labapp.core.bench_check.labelling import Picture, label_picture, sighting_of
-from labapp.core.bench_check.mirrors import Ball, Cap, Mirror, Plate, landing_points
+from labapp.core.bench_check.mirrors import Ball, Cap, Mirror, Plate, landing_points, placed
 from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.rig import DotPattern, Rig
 from labapp.core.geometry.uncertainty import INDEX, QUANTITIES
@@ -109,6 +109,17 @@ def test_mirrors_send_rays_where_the_simulation_has_them(mirror: Mirror, surface
     np.testing.assert_array_equal(hit & true.hit, true.hit & np.isfinite(true.plane_mm[..., 0]))
     both = hit & true.hit
     np.testing.assert_allclose(plane[both], true.plane_mm[both], atol=1e-5)
+
+
+@pytest.mark.parametrize("top_mm", [0.9, 10.0])
+def test_a_ball_is_expected_where_the_beam_axis_meets_its_top(top_mm: float):
+    laser = replace(RIG.laser, azimuth_deg=5.0, aim_x_mm=0.5)
+    rig = replace(RIG, laser=laser)
+    ball = placed(Ball(10.0, top_mm), rig)
+    way = ball.pose[:3] - laser.position_mm
+    np.testing.assert_allclose(way / np.linalg.norm(way), laser.axes[0], atol=1e-12)
+    assert placed(Plate(2.0), rig) == Plate(2.0)
+    assert len(forecast(rig, {"a ball": (ball,)})) == 2
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -319,6 +319,7 @@ class Chain:
         self.now_s, self.is_lost = 100.0, True
         self.searched: list[float] = []
         self.judged: list[float] = []
+        self.skipped: list[float] = []
         self.track_lost: str | None = None
         self.found = Measurement("ok", "", "fit", Dots(*np.ones((7, 2))), measures=MEASURES)
 
@@ -329,6 +330,9 @@ class Chain:
     def search(self, _: np.ndarray) -> Measurement:
         self.searched.append(self.now_s)
         return self.found
+
+    def skip(self) -> None:
+        self.skipped.append(self.now_s)
 
     def judge(self, *_: object) -> Any:
         self.judged.append(self.now_s)
@@ -360,6 +364,7 @@ def test_a_frame_is_searched_for_only_when_none_was_followed_for_long(setup: Set
     again = measure(one, False)
     assert again is not None
     assert again.track_lost == "it jumped"
+    assert chain.skipped == pytest.approx([100 + 0.9 * SOUGHT_S, 100 + 1.8 * SOUGHT_S])
     assert chain.searched == [100.0, chain.now_s]
 
 

@@ -8,7 +8,7 @@ import os
 import subprocess
 import sys
 import textwrap
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -23,15 +23,24 @@ from labapp.cli import app
 from labapp.config.scenario import read_scenario
 from labapp.config.setup import read_setup
 from labapp.core import pipeline
-from labapp.core.pipeline import Measurement, Settings, start_correction
+from labapp.core.pipeline import Measurement, Settings, measure, start_correction
+from labapp.core.rows.correction import Correction
 from labapp.core.schemes import fit
+from labapp.core.sequence import following
+from labapp.core.sequence.prior import Prior
 from labapp.core.surface.pool_fit import FitSettings
 from labapp.errors import InputError
 from labapp.export.frame_result import FrameResult
 from labapp.export.results import ResultsWriter
 from labapp.media import Frame, open_source
 from labapp.run import measurers
-from labapp.run.measurers import AHEAD, ColdMeasurer, RecordingMeasurer, stretch_pools
+from labapp.run.measurers import (
+    AHEAD,
+    ColdMeasurer,
+    RecordingMeasurer,
+    WarmMeasurer,
+    stretch_pools,
+)
 from labapp.session.record import Record
 from labapp.session.session import Session
 from labapp.simulated.benchmark import SCENARIO
@@ -177,6 +186,51 @@ def test_a_session_follows_frames_and_leaves_corrected_ones_as_they_are(
         again = dict(session.measure([0, 1, 2], warm=True))
         assert again[1].correction is not None
         assert again[2].status == "ok"
+
+
+@pytest.mark.parametrize(
+    ("frames", "gap", "remembered"),
+    [
+        (range(9), None, [1, 2, 3, 4, 5, 6]),
+        (range(9), "unreadable", [1, 2, 1, 1, 2]),
+        (range(9), "corrected", [1, 2, 1, 1, 2]),
+        ([0, 1, 2, 3, 4, 6, 7, 8], None, [1, 2, 1, 1, 1]),  # two changes of the step
+    ],
+)
+def test_frames_beside_a_gap_are_not_taken_for_equally_spaced(
+    recording: RecordingMeasurer,
+    monkeypatch: pytest.MonkeyPatch,
+    frames: Sequence[int],
+    gap: str | None,
+    remembered: list[int],
+) -> None:
+    """What a frame is extrapolated from; the first three are measured by themselves."""
+    found: list[int] = []
+    predict = following.predictions
+
+    def counted(prior: Prior) -> Iterator[np.ndarray]:
+        found.append(len(prior.past))
+        return predict(prior)
+
+    monkeypatch.setattr(following, "predictions", counted)
+    with open_source(recording.path) as source:
+
+        def read(number: int) -> Frame:
+            if gap == "unreadable" and number == 5:
+                raise InputError(recording.path, "frame", number, "a frame")
+            return source.frame(number)
+
+        def corrected(number: int) -> Correction | None:
+            if gap == "corrected" and number == 5:
+                cold, _ = measure(source.frame(5).image, recording.setup.bench, Settings())
+                return start_correction(cold)
+            return None
+
+        measurer = WarmMeasurer(read, recording.setup, Settings(), corrected)
+        results = list(measurer(frames))
+    wrong = [one.frame for one in results if one.measurement.status != "ok"]
+    assert wrong == ([5] if gap == "unreadable" else [])
+    assert found == remembered
 
 
 def told_here(recording: RecordingMeasurer) -> list[FrameResult]:

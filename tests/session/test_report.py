@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import labapp
-from labapp.config.setup import Setup, parse_setup
+from labapp.config.setup import Setup, parse_setup, updated_setup
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.rig import Rig
 from labapp.core.geometry.uncertainty import QUANTITIES, AxisPoints, RigUncertainty
@@ -236,7 +236,29 @@ def test_the_rig_is_told_with_units(setup: Setup):
     assert cells["scale along O′X′"] == f"{arm / 34.925:.4f} px/mm"
     tilted = SETUP.replace("\ns_mm", "\npitch_deg = 4.0\nyaw_deg = -3.0\ns_mm")
     cells = {row[1]: row[2] for row in data.rig_cells(parse_setup(tilted, "setup.toml"))}
-    assert cells["pitch, yaw"] == "4 °, -3 °"
+    assert cells["pitch, yaw, roll"].startswith("4 °, -3 °, ")
+
+
+def test_the_rig_has_what_is_not_ideal_of_it(setup: Setup):
+    values = {
+        "laser": {"azimuth_deg": 1.5, "aim_x_mm": 0.25, "aim_y_mm": -0.5},
+        "pattern": {"rotation_deg": 0.75},
+        "imaging_plane": {"glass_mm": 3.0, "roll_deg": 0.5},
+        "camera_lens": {"distortion_percent": -2.0},
+    }
+    text = updated_setup(SETUP, "setup.toml", values)
+    ideal = {row[1] for row in data.rig_cells(setup)}
+    cells = {row[1]: row[2] for row in data.rig_cells(parse_setup(text, "setup.toml"))}
+    assert cells["glass on the pool's side"].startswith("3 mm")
+    assert {name: cells[name] for name in cells.keys() - ideal} == {
+        "azimuth": "1.5 °",
+        "aim along X": "0.25 mm",
+        "aim along Y": "-0.5 mm",
+        "rotation about the beam axis": "0.75 °",
+        "pitch, yaw, roll": cells["pitch, yaw, roll"],
+        "distortion in the plane's corner": "-2 %",
+    }
+    assert cells["pitch, yaw, roll"].endswith("0.5 °")
 
 
 # --- error budget -----------------------------------------------------------------------------

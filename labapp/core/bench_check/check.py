@@ -18,7 +18,7 @@ from labapp.core.bench_check.labelling import (
     relabelled,
     sighting_of,
 )
-from labapp.core.bench_check.mirrors import Plate
+from labapp.core.bench_check.mirrors import Plate, placed
 from labapp.core.bench_check.suspects import Suspect, find_suspects, released
 from labapp.core.bench_check.verdict import Pattern, Verdict, judge
 from labapp.core.geometry.bench import Bench
@@ -173,6 +173,7 @@ def check_bench(
     CannotMeasure
         As `label_picture`.
     """
+    pictures = [replace(one, mirror=placed(one.mirror, rig)) for one in pictures]
     free_directions = released(rig, free)
     bench = Bench(rig, calibration)
     observed = [Observation.of(p.dots, bench, p.frame_shape) for p in pictures]

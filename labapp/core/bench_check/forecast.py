@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from labapp.core.bench_check.adjustment import Sighting, System
-from labapp.core.bench_check.mirrors import Cap, Mirror, Plate, landing_points
+from labapp.core.bench_check.mirrors import Cap, Mirror, Plate, landing_points, placed
 from labapp.core.geometry.optics import intersect_level, ray_directions
 from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match
@@ -55,7 +55,8 @@ def forecast(
 ) -> tuple[Forecast, ...]:
     """Predict the ± of a pool's height as the set-up is known, and after each set of pictures.
 
-    By linear propagation of the covariance; the first of the results is without pictures.
+    By linear propagation of the covariance; the first of the results is without pictures. Pictures
+    with a mirror none of whose dots would be on the imaging plane are left out.
 
     Raises
     ------
@@ -82,6 +83,7 @@ def height_sigma(rig: Rig, pool: Cap = EXPECTED) -> Forecast:
 
 def expected_sighting(mirror: Mirror, rig: Rig) -> Sighting | None:
     """The dots of a mirror in its expected pose that are expected on the plane; None: no dots."""
+    mirror = placed(mirror, rig)
     plane, shown = _shown(mirror, rig)
     if not shown.any():
         return None

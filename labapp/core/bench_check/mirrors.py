@@ -5,12 +5,17 @@ A mirror has a *pose*, a vector of what is not known of it exactly, held by stan
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
 
-from labapp.core.geometry.optics import intersect_imaging_plane, ray_directions, reflect
+from labapp.core.geometry.optics import (
+    intersect_imaging_plane,
+    intersect_level,
+    ray_directions,
+    reflect,
+)
 from labapp.core.geometry.rig import Rig
 from labapp.core.values import BoolArray, FloatArray, IntArray
 
@@ -185,7 +190,9 @@ class Ball:
     diameter_sigma_mm, top_sigma_mm
         How well these are known.
     place_sigma_mm
-        How near it is placed to where the beam axis meets its top, along X and along Y.
+        How near it is placed to `place_mm`, along X and along Y.
+    place_mm
+        X and Y where its top is expected, see `placed`.
     """
 
     diameter_mm: float
@@ -193,6 +200,7 @@ class Ball:
     diameter_sigma_mm: float = 0.002
     top_sigma_mm: float = 0.01
     place_sigma_mm: float = FREE_MM
+    place_mm: tuple[float, float] = (0.0, 0.0)
 
     @property
     def name(self) -> str:
@@ -208,7 +216,7 @@ class Ball:
     def pose(self) -> FloatArray:
         """The pose that is expected."""
         top = self.diameter_mm if self.top_mm is None else self.top_mm
-        return np.array([0.0, 0.0, top, self.diameter_mm])
+        return np.array([*self.place_mm, top, self.diameter_mm])
 
     @property
     def sigma(self) -> FloatArray:
@@ -229,6 +237,15 @@ class Ball:
         center = np.array([x, y, top - diameter / 2])
         point, normal, met = _meet_sphere(source_mm, direction, center, diameter / 2)
         return point, normal, np.asarray(met & (point[..., 2] > 0) & (normal[..., 2] > 0))
+
+
+def placed(mirror: Mirror, rig: Rig) -> Mirror:
+    """The mirror where it is expected on a bench: a ball's top lies on the beam axis."""
+    if not isinstance(mirror, Ball):
+        return mirror
+    laser = rig.laser
+    x, y, _ = intersect_level(laser.position_mm, laser.axes[0], float(mirror.pose[2])).tolist()
+    return replace(mirror, place_mm=(x, y))
 
 
 def sphere_radius(diameter_mm: float, height_mm: float) -> float:

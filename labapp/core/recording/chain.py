@@ -7,6 +7,7 @@ once.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 
 from labapp.core.geometry.bench import Bench
 from labapp.core.images.dots import Image
@@ -40,6 +41,15 @@ class WarmChain:
         self._passed = passed
         self.track_lost: str | None = None
         self._prior: Prior | None = None
+        self._after_gap = False
+
+    def skip(self) -> None:
+        """Leave out a frame: those before and after it are not equally spaced in time.
+
+        The next frame is sought around the last one, without extrapolation of how the pool swung.
+        """
+        if self._prior is not None:
+            self._prior, self._after_gap = self._prior.after_gap(), True
 
     def follow(self, image: Image) -> Measurement | None:
         """Measure the next frame from those before; None where they do not lead to it.
@@ -54,7 +64,8 @@ class WarmChain:
         if prior is None:
             self.track_lost = measurement.reason
             return None
-        self._prior, self.track_lost = prior, None
+        self._keep(prior)
+        self.track_lost = None
         return measurement
 
     def measure(self, image: Image) -> Measurement:
@@ -71,7 +82,14 @@ class WarmChain:
         former = self._prior
         if prior is not None and former is not None:
             prior = prior.with_past_of(former, self.bench, self.settings.fit)
-        elif prior is None and former is not None and measurement.status != "ok":
-            prior = former.after_gap() if former.unseen < HELD else None
-        self._prior = prior
+        elif measurement.status != "ok" and former is not None and former.unseen < HELD:
+            self.skip()
+            return measurement
+        self._keep(prior)
         return measurement
+
+    def _keep(self, prior: Prior | None) -> None:
+        """Keep a frame's prior; after a gap without the memory of the frames before that."""
+        if prior is not None and self._after_gap:
+            prior = replace(prior, past=prior.past[-1:], slopes=prior.slopes[-1:])
+        self._prior, self._after_gap = prior, False

@@ -349,9 +349,13 @@ def rig_cells(setup: Setup, status: str = "") -> Cells:
         ["set-up", "status", status],
         ["laser", "projection angle α", f"{rig.laser.projection_angle_deg:.6g} °"],
         ["", "distance to the origin", f"{rig.laser.distance_mm:.6g} mm"],
+        *_unless_zero("azimuth", rig.laser.azimuth_deg, "°"),
+        *_unless_zero("aim along X", rig.laser.aim_x_mm, "mm"),
+        *_unless_zero("aim along Y", rig.laser.aim_y_mm, "mm"),
         ["dot pattern", "rows × columns", f"{rig.pattern.rows} × {rig.pattern.columns}"],
         ["", "kind", rig.pattern.kind],
         ["", "inter-beam angle β", f"{rig.pattern.inter_beam_angle_deg:.6g} °"],
+        *_unless_zero("rotation about the beam axis", rig.pattern.rotation_deg, "°"),
         ["", "absent rays (i, j)", absent + (" …" if len(rig.pattern.absent_rays) > 8 else "")],
         ["electrode", "height of the tip", f"{rig.electrode.height_mm:.6g} mm"],
         ["torch", "moves towards", rig.travel.upper().replace("-", "−")],
@@ -365,7 +369,14 @@ def rig_cells(setup: Setup, status: str = "") -> Cells:
         ["", "scale along O′X′", f"{along_x:.4f} px/mm"],
         ["", "scale along O′Z′", f"{along_z:.4f} px/mm"],
         ["", "angle between the axes", f"{angle:.3f} °"],
+        *_unless_zero(
+            "distortion in the plane's corner", setup.calibration.distortion_percent, "%"
+        ),
     ]
+
+
+def _unless_zero(quantity: str, value: float, unit: str) -> Cells:
+    return [["", quantity, f"{value:.4g} {unit}"]] if value else []
 
 
 def _glass(plane: ImagingPlane) -> str:
@@ -375,12 +386,10 @@ def _glass(plane: ImagingPlane) -> str:
 
 
 def _tilt_rows(plane: ImagingPlane) -> Cells:
-    yaw = np.arctan2(plane.x_axis[1], plane.x_axis[0])
-    level = plane.z_axis[0] * np.sin(yaw) - plane.z_axis[1] * np.cos(yaw)
-    pitch = np.arctan2(level, plane.z_axis[2])
-    if abs(yaw) + abs(pitch) < 1e-9:
+    if np.abs(plane.angles_deg).max() < 1e-7:
         return [["", "pose", "vertical, square to Y"]]
-    return [["", "pitch, yaw", f"{np.degrees(pitch):.4g} °, {np.degrees(yaw):.4g} °"]]
+    angles = ", ".join(f"{angle:.4g} °" for angle in plane.angles_deg)
+    return [["", "pitch, yaw, roll", angles]]
 
 
 def _image_scale(setup: Setup) -> tuple[float, float, float]:
