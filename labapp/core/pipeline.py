@@ -191,12 +191,12 @@ def measure(
     passed("measures")
     result = replace(result, reconstruction=made, measures=size)
     if prior is not None and followed is not None:
-        return result, prior.followed_by(followed, made)
+        return result, prior.followed_by(followed, made, size)
     from labapp.core.sequence.prior import Prior
 
     if tuning is None or rig.pattern.marker is None:
         return result, None
-    return result, Prior.of(bench, tuning, match, pool, made)
+    return result, Prior.of(bench, tuning, match, pool, made, size)
 
 
 def _as_before(image: Image, prior: Prior) -> Image:

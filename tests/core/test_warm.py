@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import numpy as np
@@ -12,6 +12,7 @@ import pytest
 from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.geometry.uncertainty import AxisPoints, RigUncertainty, covariance_of
 from labapp.core.pipeline import Measurement, Settings, measure
 from labapp.core.recording.chain import WarmChain
 from labapp.core.values import FloatArray
@@ -294,3 +295,26 @@ def test_another_scheme_is_measured_by_the_cold_chain() -> None:
         result = follower.measure(frame.image)
         assert follower.track_lost is not None
         assert result.scheme == "ers"
+
+
+@pytest.mark.slow
+def test_the_part_of_the_set_up_follows_a_pool_that_grows():
+    axes = AxisPoints(CALIBRATION, VIEW.x_axis_mm, VIEW.z_axis_mm)
+    covariance, assumed = covariance_of({})
+    rig = replace(RIG, uncertainty=RigUncertainty(axes, covariance, assumed))
+    pools = tuple(egg(6.4, 2.9, 3.9, height, (0.0, -0.4)) for height in np.linspace(0.18, 0.34, 20))
+    made = Recording(
+        file="recording.avi", rig=rig, view=VIEW, look=Look(), pools=pools, seed=5,
+        frame_rate_hz=RATE_HZ,
+    )  # fmt: skip
+    chain, bench = WarmChain(Bench(rig, CALIBRATION), Settings()), Bench(rig, CALIBRATION)
+    last = None
+    for n in range(len(pools)):
+        last = chain.measure(made.frame(n).image)
+    assert last is not None
+    assert chain.track_lost is None
+    cold = measure(made.frame(len(pools) - 1).image, bench, Settings())[0]
+    assert last.measures is not None
+    assert cold.measures is not None
+    for name in ("height_sigma_setup_mm", "volume_sigma_setup_mm3"):
+        assert getattr(last.measures, name) == pytest.approx(getattr(cold.measures, name), rel=0.25)

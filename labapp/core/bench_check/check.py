@@ -190,7 +190,8 @@ def check_bench(
             for o, p, pose in zip(observed, pictures, made.poses, strict=True)
         ]
         again = [np.where(o.absent, UNLABELLED, a) for o, a in zip(observed, again, strict=True)]
-        if all((new == old).all() for new, old in zip(again, labels, strict=True)):
+        used = labels
+        if all((new == old).all() for new, old in zip(again, used, strict=True)):
             break
         if any((new != UNLABELLED).sum() < LEAST_DOTS for new in again):
             raise CannotMeasure("no-match", "no bench explains all pictures together")
@@ -210,9 +211,7 @@ def check_bench(
             pose=made.poses[k],
             pose_sigma=np.sqrt(np.diag(made.pose_covariances[k])),
         )
-        for k, (picture, sighting, found) in enumerate(
-            zip(pictures, sightings, labels, strict=True)
-        )
+        for k, (picture, sighting, found) in enumerate(zip(pictures, sightings, used, strict=True))
     )
     return BenchCheck(
         status=status,
@@ -240,28 +239,27 @@ def _labelled(
     labels: dict[int, IntArray] = {}
     near = rig, calibration
     for k in order:
-        found = _first_label(
-            pictures[k], [near, (rig, calibration), (_wide(rig), calibration)], free_directions
-        )
+        benches = [near, (rig, calibration), (_wide(rig), calibration)]
+        found, seen_by = _first_label(pictures[k], benches, free_directions)
         labels[k] = found.labels
-        near = adjusted_bench(near[0], found.adjustment)
+        near = adjusted_bench(seen_by, found.adjustment)
     return [labels[k] for k in range(len(pictures))]
 
 
 def _first_label(
     picture: Picture, benches: Sequence[tuple[Rig, ImageCalibration]], free_directions: FloatArray
-) -> Labelled:
-    """Labels by the first bench that has any.
+) -> tuple[Labelled, Rig]:
+    """Labels by the first bench that has any, and its rig, which their adjustment begins with.
 
     A mirror that is not what it is said to be, or a quantity that is far off, misleads the
     adjustments after it.
     """
     for bench in benches[:-1]:
         try:
-            return label_picture(picture, *bench, free_directions)
+            return label_picture(picture, *bench, free_directions), bench[0]
         except CannotMeasure:
             continue
-    return label_picture(picture, *benches[-1], free_directions)
+    return label_picture(picture, *benches[-1], free_directions), benches[-1][0]
 
 
 def _wide(rig: Rig) -> Rig:

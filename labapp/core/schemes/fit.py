@@ -16,13 +16,37 @@ from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.surface.setup_uncertainty import setup_changes, setup_sigma
 from labapp.core.surface.sizes import sizes_and_gradients
 from labapp.core.surface.spline import SplineSurface
-from labapp.core.values import CannotMeasure, FloatArray
+from labapp.core.values import CannotMeasure, FloatArray, ReadOnlyArrays
 
 LEAST_DOTS = 9
 """A surface from fewer reflections is a guess."""
 
 UNSETTLED_MM = 0.02
 """A reflection point that still moves as far in the last round has not been found."""
+
+
+CHANGED = 0.1
+"""The set-up's part of the uncertainty is worked out anew where a size changed by this share."""
+
+
+@dataclass(frozen=True)
+class SetupPart(ReadOnlyArrays):
+    """The set-up's part of the uncertainty of sizes, and the sizes that it was worked out for.
+
+    Parameters
+    ----------
+    sigma, sizes
+        In the order of `measures.SIZES`, shape (6,), mm, mm², mm³.
+    """
+
+    sigma: FloatArray
+    sizes: FloatArray
+
+    def holds_for(self, sizes: FloatArray) -> bool:
+        """Whether no size, shape (6,), has changed by more than `CHANGED`; depth as height."""
+        scale = np.abs(self.sizes)
+        scale[2:4] = scale[2:4].max()
+        return bool((np.abs(sizes - self.sizes) <= CHANGED * scale).all())
 
 
 @dataclass(frozen=True)
@@ -36,13 +60,13 @@ class Known:
     free_sigma_mm
         Uncertainty of the height of the n reflection points, their level apart, shape (n,), mm;
         None: to be worked out.
-    size_sigma_setup
-        See `Reconstruction`; None: to be worked out.
+    by_setup
+        The set-up's part of the uncertainty of sizes; None: to be worked out.
     """
 
     boundary: Boundary
     free_sigma_mm: FloatArray | None
-    size_sigma_setup: FloatArray | None
+    by_setup: SetupPart | None
 
 
 def reconstruct(match: Match, rig: Rig, settings: FitSettings) -> Reconstruction:
@@ -103,10 +127,10 @@ def complete(
         raise CannotMeasure(
             "open-boundary", "the surface comes down to the work piece within its boundary"
         )
-    by_setup = None if known is None else known.size_sigma_setup
-    if by_setup is None:
-        changes = setup_changes(match, rig, settings, pool, sizes.gradient)
-        by_setup = setup_sigma(changes)
+    if known is not None and known.by_setup and known.by_setup.holds_for(sizes.size):
+        by_setup = known.by_setup.sigma
+    else:
+        by_setup = setup_sigma(setup_changes(match, rig, settings, pool, sizes.gradient))
     free = None if known is None else known.free_sigma_mm
     if free is None:
         free = pool.free_sigma_of(basis.matrix(*points[:, :2].T))

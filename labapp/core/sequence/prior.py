@@ -13,9 +13,10 @@ from labapp.core.geometry.bench import Bench
 from labapp.core.images.band_pass import DetectorTuning
 from labapp.core.match import Match
 from labapp.core.matching.prediction import RayPaths
-from labapp.core.schemes.fit import UNSETTLED_MM, Known
+from labapp.core.schemes.fit import UNSETTLED_MM, Known, SetupPart
 from labapp.core.surface.boundary import Boundary
 from labapp.core.surface.level import Level
+from labapp.core.surface.measures import Measures
 from labapp.core.surface.pool_fit import NEWTON_STEPS, FitSettings, FittedPool, normal_equations
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.surface.solver import Rounds
@@ -83,8 +84,8 @@ class Prior:
     free_sigma_mm
         Uncertainty of the height where each ray meets the surface, its level apart, as it was last
         worked out, shape (R,), mm; NaN where it never was. It changes slowly.
-    size_sigma_setup
-        Uncertainty of the sizes by the set-up (`Reconstruction`), as it was last worked out.
+    by_setup
+        The set-up's part of the uncertainty of sizes, as it was last worked out.
     unseen
         Frames since the absent ray's place was last seen dark amid four lit ones.
     count
@@ -103,7 +104,7 @@ class Prior:
     slopes: FloatArray
     open_mm: float
     free_sigma_mm: FloatArray
-    size_sigma_setup: FloatArray
+    by_setup: SetupPart
     unseen: int = 0
     count: int = 0
 
@@ -115,6 +116,7 @@ class Prior:
         match: Match,
         pool: FittedPool,
         made: Reconstruction,
+        measures: Measures,
     ) -> Prior:
         """That of a frame that was matched without one."""
         basis, coefficients = pool.surface.basis, pool.surface.coefficients
@@ -132,11 +134,14 @@ class Prior:
             slopes=paths.slopes[None],
             open_mm=level.sigma_mm,
             free_sigma_mm=np.full(len(paths.slopes), np.nan),
-            size_sigma_setup=made.size_sigma_setup,
+            by_setup=SetupPart(made.size_sigma_setup, measures.sizes),
         )
 
-    def followed_by(self, followed: Followed, made: Reconstruction) -> Prior:
+    def followed_by(self, followed: Followed, made: Reconstruction, measures: Measures) -> Prior:
         """That of the next frame, which followed on this one."""
+        by_setup, known = made.size_sigma_setup, self.by_setup
+        if not np.array_equal(by_setup, known.sigma):
+            known = SetupPart(by_setup, measures.sizes)
         paths, lit, pool = followed.paths, followed.lit, followed.pool
         free = self.free_sigma_mm.copy()
         free[lit.ravel()] = np.sqrt(np.maximum(made.sigma_mm**2 - pool.level.sigma_mm**2, 0.0))
@@ -150,7 +155,7 @@ class Prior:
             slopes=np.concatenate([self.slopes[1 - MEMORY :], paths.slopes[None]]),
             open_mm=pool.level.sigma_mm if self.drop_is_free else self.open_mm,
             free_sigma_mm=free,
-            size_sigma_setup=made.size_sigma_setup,
+            by_setup=known,
             unseen=0 if followed.datum_is_seen else self.unseen + 1,
             count=self.count + 1,
         )
@@ -168,7 +173,7 @@ class Prior:
         free = self.free_sigma_mm[lit.ravel()]
         is_known = self.count % POINTS_EVERY != 0 and bool(np.isfinite(free).all())
         setup_is_due = self.count % SETUP_EVERY == SETUP_EVERY - 1
-        by_setup = None if setup_is_due else self.size_sigma_setup
+        by_setup = None if setup_is_due else self.by_setup
         return Known(self.boundary, free if is_known else None, by_setup)
 
     def after_gap(self) -> Prior:

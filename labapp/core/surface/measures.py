@@ -122,6 +122,11 @@ class Measures:
     area_sigma_setup_mm2: float = math.nan
     volume_sigma_setup_mm3: float = math.nan
 
+    @property
+    def sizes(self) -> FloatArray:
+        """The six of `SIZES`, shape (6,), mm, mm², mm³."""
+        return np.array([getattr(self, name) for name in SIZES])
+
 
 SIZES = ("width_mm", "length_mm", "height_mm", "depth_mm", "area_mm2", "volume_mm3")
 """The sizes that have a standard uncertainty, in the order of arrays."""
