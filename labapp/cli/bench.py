@@ -125,7 +125,7 @@ def _print_forecast(rig: Rig, mirrors: list[Mirror]) -> None:
     made = forecast(rig, every)
     for one in made:
         typer.echo(f"{one.name:40} {one.setup_sigma_mm:8.4f} {one.total_sigma_mm:8.4f}")
-    for name in every.keys() - {one.name for one in made}:
+    for name in sorted(every.keys() - {one.name for one in made}):
         typer.echo(f"not predicted: {name}: no dot of it, or of one of them, would be on the plane")
 
 

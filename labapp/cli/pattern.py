@@ -40,7 +40,7 @@ def calibrate_pattern(
     """Measure the direction of every ray from pictures of the dots on a flat mirror.
 
     Laser, imaging plane and camera are taken as the setup file has them: check the bench first.
-    Exit code 1: the rays cannot be told, or the heights contradict each other.
+    Exit code 1: the rays cannot be identified, or the heights contradict each other.
     """
     import numpy as np
 

@@ -15,8 +15,8 @@ import numpy as np
 import tomlkit
 
 from labapp.config.csv_tables import bounded_lines, open_table, parse_number
-from labapp.config.toml_keys import shown
-from labapp.core.geometry.patterns import MEASURED
+from labapp.config.toml_keys import is_number, shown
+from labapp.core.geometry.patterns import FEWEST_RAYS, MEASURED
 from labapp.core.geometry.rig import Laser
 from labapp.core.values import FloatArray, IntArray
 from labapp.errors import InputError
@@ -30,7 +30,6 @@ UNIVERSAL, BEAM = ("x", "y", "z"), ("aside", "up", "along")
 MOST_ROWS = 99
 """Labels above this are none: no pattern has more rows or columns."""
 
-FEWEST_RAYS = 9
 LARGEST_FILE = 4_000_000
 NORM_OFF = 0.01
 """A direction whose length differs by more from 1 is no unit vector."""
@@ -59,20 +58,22 @@ def with_rays(text: str, path: Path, values: Mapping[str, Any]) -> str:
         expected = "the name of a CSV file in the folder of the setup file"
         raise InputError(path, "pattern.file", shown(name), expected)
     ray, tangents = read_rays(path.parent / name, values)
-    step = _inter_beam_angle(path, pattern, ray, tangents)
-    rows, columns = (int(pattern.get(key, ray[:, k].max())) for k, key in enumerate(_SIZES))
-    made = np.round(tangents / np.tan(np.radians(step)), 9)
+    found: dict[str, float] = {"rows": int(ray[:, 0].max()), "columns": int(ray[:, 1].max())}
+    step = pattern.get("inter_beam_angle_deg")
+    if step is None:
+        step = found["inter_beam_angle_deg"] = _inter_beam_angle(path, ray, tangents)
+    # A value that is none is refused with the others of the file.
+    made = np.round(tangents / np.tan(np.radians(step if is_number(step) and step > 0 else 1.0)), 9)
     document = tomlkit.parse(text)
     table: Any = document["pattern"]
-    table.remove("file")
-    table.update({"rows": rows, "columns": columns, "inter_beam_angle_deg": step})
+    del table["file"]
+    for key, value in found.items():
+        if key not in pattern:
+            table[key] = value
     rays = tomlkit.array()
     rays.extend([i, j, *place] for (i, j), place in zip(ray.tolist(), made.tolist(), strict=True))
     table["rays"] = rays.multiline(True)
     return tomlkit.dumps(document)
-
-
-_SIZES = ("rows", "columns")
 
 
 def read_rays(path: Path, setup: Mapping[str, Any]) -> tuple[IntArray, FloatArray]:
@@ -164,13 +165,8 @@ def _beam_axes(path: Path, setup: Mapping[str, Any]) -> FloatArray:
 _NOT_OF_LASER = ("_sigma", "_correlation")
 
 
-def _inter_beam_angle(
-    path: Path, pattern: Mapping[str, Any], ray: IntArray, tangents: FloatArray
-) -> float:
-    """The angle that the file gives, or the median one between neighbours of a row, degrees."""
-    given = pattern.get("inter_beam_angle_deg")
-    if isinstance(given, int | float) and given > 0:
-        return float(given)
+def _inter_beam_angle(path: Path, ray: IntArray, tangents: FloatArray) -> float:
+    """The median angle between neighbours of a row, degrees."""
     beside = (np.diff(ray[:, 0]) == 0) & (np.diff(ray[:, 1]) == 1)
     if not beside.any():
         expected = "an angle in degrees: no two rays of the table are neighbours"

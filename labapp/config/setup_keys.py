@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import get_args
 
 from labapp.config import bench_check
-from labapp.config.ray_file import FEWEST_RAYS
 from labapp.config.toml_keys import (
     LARGEST_MM,
     Rule,
@@ -15,7 +14,7 @@ from labapp.config.toml_keys import (
     is_number,
     within,
 )
-from labapp.core.geometry.patterns import MEASURED, PATTERNS
+from labapp.core.geometry.patterns import FEWEST_RAYS, MEASURED, PATTERNS
 from labapp.core.geometry.rig import Travel
 from labapp.core.geometry.uncertainty import QUANTITIES
 

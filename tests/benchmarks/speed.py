@@ -103,7 +103,7 @@ def profile_followed(video: Video) -> None:
             profile.runcall(follow, number)
     shares: Counter[str] = Counter()
     calls: Counter[str] = Counter()
-    every = pstats.Stats(profile).stats  # type: ignore[attr-defined]
+    every = pstats.Stats(profile).stats  # type: ignore[attr-defined]  # not in typeshed
     for (path, _, name), (_, count, own_s, _, _) in every.items():
         module = path.rpartition("/labapp/")[2] if "/labapp/" in path else "NumPy, OpenCV, Python"
         shares[module] += own_s

@@ -57,9 +57,9 @@ def with_check(text: str = "", **changes: Any) -> str:
     document = tomlkit.parse(text or checked_text())
     for key, value in changes.items():
         if value is None:
-            del document["bench_check"][key]  # type: ignore[union-attr]
+            del document["bench_check"][key]  # type: ignore[union-attr]  # a table
         else:
-            document["bench_check"][key] = value  # type: ignore[index]
+            document["bench_check"][key] = value  # type: ignore[index]  # a table
     return tomlkit.dumps(document)
 
 

@@ -10,7 +10,6 @@ import pytest
 from labapp.core.bench_check.mirrors import Plate
 from labapp.core.bench_check.pattern_calibration import PatternCalibration, calibrate_pattern
 from labapp.core.geometry.bench import Bench
-from labapp.core.geometry.optics import ray_directions
 from labapp.core.geometry.patterns import PATTERNS, PatternKind
 from labapp.core.geometry.rig import DotPattern, Rig
 from labapp.core.values import CannotMeasure
@@ -45,11 +44,6 @@ def test_rays_are_found_within_their_uncertainty():
     assert 0.85 < np.sqrt(np.mean(pulls**2)) < 1.15
     assert 0.8 < found.disagreement < 1.2
     assert found.off_deg > 5 * np.degrees(np.sqrt(np.mean(off**2)))
-    # The pattern has these rays, to be measured with.
-    at = tuple(found.ray.T - 1)
-    made, aimed = (ray_directions(RIG.laser, one)[at] for one in (found.pattern, true))
-    assert np.abs(made - aimed).max() < 5 * found.sigma.max()
-    assert found.pattern.marker == true.marker
 
 
 @pytest.mark.slow

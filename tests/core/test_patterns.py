@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tomlkit
 
 from labapp.config.setup import (
     parse_setup,
@@ -174,6 +175,26 @@ def test_measured_rays_come_from_a_table_beside_the_setup_file(
 
 
 @pytest.mark.parametrize(
+    "head",
+    [
+        'pattern = { kind = "directions", file = "rays.csv" }\n',
+        'pattern.kind = "directions"\npattern.file = "rays.csv"\n',
+    ],
+    ids=["inline", "dotted"],
+)
+def test_the_pattern_may_be_written_in_any_way_of_toml(tmp_path: Path, head: str) -> None:
+    text = SETUP.read_text("utf-8")
+    rig = parse_setup(text, SETUP).rig
+    others = {
+        section: keys for section, keys in tomllib.loads(text).items() if section != "pattern"
+    }
+    (tmp_path / "rays.csv").write_text(ray_table(rig, True), "utf-8")
+    path = tmp_path / "setup.toml"
+    path.write_text(head + tomlkit.dumps(others), "utf-8")
+    assert len(read_setup(path).rig.pattern.measured) == 360
+
+
+@pytest.mark.parametrize(
     ("keys", "table", "field"),
     [
         ({"file": "../rays.csv"}, "", "pattern.file"),
@@ -188,6 +209,9 @@ def test_measured_rays_come_from_a_table_beside_the_setup_file(
         ({}, "ray_row,ray_column,x,y,z\n1,1,0,0,-1\n", "rays"),
         ({"rows": 17}, None, "pattern.rays"),
         ({"rows": 18}, None, "pattern.rows"),
+        ({"rows": "many"}, None, "pattern.rows"),
+        ({"inter_beam_angle_deg": -1.0}, None, "pattern.inter_beam_angle_deg"),
+        ({"inter_beam_angle_deg": float("nan")}, None, "pattern.inter_beam_angle_deg"),
         ({"file": None}, None, "pattern.rays"),
     ],
 )

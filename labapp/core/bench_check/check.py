@@ -251,7 +251,7 @@ def _first_label(
 ) -> tuple[Labelled, Rig]:
     """Labels by the first bench that has any, and its rig, which their adjustment begins with.
 
-    A mirror that is not what it is said to be, or a quantity that is far off, misleads the
+    A mirror of another kind or size than given, or a quantity that is far off, misleads the
     adjustments after it.
     """
     for bench in benches[:-1]:

@@ -9,7 +9,7 @@ the imaging plane leans. A laser that is elsewhere is hardly seen: its rays seem
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,15 +17,12 @@ from labapp.core.bench_check.labelling import Picture, label_picture, sighting_o
 from labapp.core.bench_check.mirrors import Plate
 from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.optics import direction_to_dots
-from labapp.core.geometry.patterns import MEASURED
-from labapp.core.geometry.rig import DotPattern
+from labapp.core.geometry.patterns import FEWEST_RAYS
 from labapp.core.matching.observation import Observation
 from labapp.core.values import CannotMeasure, FloatArray, IntArray, ReadOnlyArrays
 
 LEAST_PICTURES = 2
 """One height cannot tell a mirror that is not at its height from rays that go elsewhere."""
-
-FEWEST_RAYS = 9
 
 
 @dataclass(frozen=True)
@@ -45,8 +42,6 @@ class PatternCalibration(ReadOnlyArrays):
     disagreement
         Root mean square of how much the pictures differ, over what the dots' noise allows: about 1
         where the mirrors' heights and the imaging plane are right.
-    pattern
-        The pattern with these rays.
     """
 
     ray: IntArray
@@ -54,7 +49,6 @@ class PatternCalibration(ReadOnlyArrays):
     sigma: FloatArray
     off_deg: float
     disagreement: float
-    pattern: DotPattern
 
 
 def calibrate_pattern(pictures: Sequence[Picture], bench: Bench) -> PatternCalibration:
@@ -95,14 +89,12 @@ def calibrate_pattern(pictures: Sequence[Picture], bench: Bench) -> PatternCalib
     freedom = 2 * int((seen[twice] - 1).sum())
     chi2 = float((squares[twice] - weight[twice] * mean**2).sum())
     off = np.degrees(np.arctan(np.linalg.norm(mean - rig.pattern.tangents[twice], axis=-1)))
-    ray = np.argwhere(twice) + 1
     return PatternCalibration(
-        ray=ray,
+        ray=np.argwhere(twice) + 1,
         tangents=mean,
         sigma=1.0 / np.sqrt(weight[twice]),
         off_deg=float(np.sqrt(np.mean(off**2))),
         disagreement=float(np.sqrt(max(chi2, 0.0) / freedom)),
-        pattern=_pattern(rig.pattern, ray, mean),
     )
 
 
@@ -124,11 +116,3 @@ def _unfolded(
     by_dot = np.stack(slopes, axis=-1)
     variance = np.einsum("nij,njk,nik->ni", by_dot, covariance_mm2, by_dot)
     return made, np.sqrt(variance)
-
-
-def _pattern(pattern: DotPattern, ray: IntArray, tangents: FloatArray) -> DotPattern:
-    """The pattern with measured rays, the rotation that it had among them."""
-    steps = tangents / np.tan(np.radians(pattern.inter_beam_angle_deg))
-    places = (ray - pattern.reference).tolist()
-    measured = tuple((i, j, *to) for (i, j), to in zip(places, steps.tolist(), strict=True))
-    return replace(pattern, kind=MEASURED, measured=measured, absent=frozenset(), rotation_deg=0.0)

@@ -93,6 +93,9 @@ PATTERNS: dict[str, PatternKind] = {
 MEASURED = "directions"
 """The kind whose rays were measured one by one: `measured_steps` says where they go."""
 
+FEWEST_RAYS = 9
+"""Fewer measured rays are no pattern."""
+
 MeasuredRay = tuple[int, int, float, float]
 """Row and column of a ray from the centre ray; its tangents over that of the inter-beam angle."""
 

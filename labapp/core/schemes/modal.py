@@ -68,13 +68,12 @@ def heights(place: FloatArray, gradient: FloatArray, order: int) -> FloatArray:
     x, y = ((place - center) / radius).T
     degree = np.add.outer(np.arange(order + 1), np.arange(order + 1))
     kept = np.flatnonzero((degree <= order) & (degree > 0))
-    values, slopes = (_chebyshev(at, order) for at in (x, y)), (_slopes(at, order) for at in (x, y))
-    (value_x, value_y), (slope_x, slope_y) = values, slopes
-    products = (
+    value_x, value_y = (chebyshev.chebvander(at, order) for at in (x, y))
+    slope_x, slope_y = (_slopes(at, order) for at in (x, y))
+    basis, by_x, by_y = (
         np.einsum("na,nb->nab", *pair).reshape(len(place), -1)[:, kept]
         for pair in ((value_x, value_y), (slope_x, value_y), (value_x, slope_y))
     )
-    basis, by_x, by_y = products
     coefficients = np.linalg.lstsq(np.vstack([by_x, by_y]), radius * gradient.T.ravel())[0]
     return np.asarray(basis @ coefficients)
 
@@ -84,12 +83,7 @@ def _terms(order: int) -> int:
     return (order + 1) * (order + 2) // 2 - 1
 
 
-def _chebyshev(at: FloatArray, order: int) -> FloatArray:
-    """Chebyshev polynomials T₀ … at places, shape (n, order + 1)."""
-    return np.asarray(chebyshev.chebvander(at, order))
-
-
 def _slopes(at: FloatArray, order: int) -> FloatArray:
-    """Their derivatives, shape (n, order + 1)."""
+    """Derivatives of the Chebyshev polynomials T₀ … at places, shape (n, order + 1)."""
     derived = [chebyshev.chebval(at, chebyshev.chebder(one)) for one in np.eye(order + 1)]
     return np.stack(derived, axis=-1)

@@ -139,9 +139,9 @@ class Prior:
 
     def followed_by(self, followed: Followed, made: Reconstruction, measures: Measures) -> Prior:
         """That of the next frame, which followed on this one."""
-        by_setup, known = made.size_sigma_setup, self.by_setup
-        if not np.array_equal(by_setup, known.sigma):
-            known = SetupPart(by_setup, measures.sizes)
+        by_setup, sizes = self.by_setup, measures.sizes
+        if self.setup_is_due or not by_setup.holds_for(sizes):  # then it was worked out anew
+            by_setup = SetupPart(made.size_sigma_setup, sizes)
         paths, lit, pool = followed.paths, followed.lit, followed.pool
         free = self.free_sigma_mm.copy()
         free[lit.ravel()] = np.sqrt(np.maximum(made.sigma_mm**2 - pool.level.sigma_mm**2, 0.0))
@@ -155,7 +155,7 @@ class Prior:
             slopes=np.concatenate([self.slopes[1 - MEMORY :], paths.slopes[None]]),
             open_mm=pool.level.sigma_mm if self.drop_is_free else self.open_mm,
             free_sigma_mm=free,
-            by_setup=known,
+            by_setup=by_setup,
             unseen=0 if followed.datum_is_seen else self.unseen + 1,
             count=self.count + 1,
         )
@@ -165,6 +165,11 @@ class Prior:
         """Whether the next frame's level is found along with the drop of the rear."""
         return self.count % SINKS_EVERY == SINKS_EVERY - 1
 
+    @property
+    def setup_is_due(self) -> bool:
+        """Whether the set-up's part is worked out anew in the next frame, whatever its sizes."""
+        return self.count % SETUP_EVERY == SETUP_EVERY - 1
+
     def known(self, lit: BoolArray) -> Known:
         """What is known of the next frame's pool, which lights these rays, shape (rows, columns).
 
@@ -172,8 +177,7 @@ class Prior:
         """
         free = self.free_sigma_mm[lit.ravel()]
         is_known = self.count % POINTS_EVERY != 0 and bool(np.isfinite(free).all())
-        setup_is_due = self.count % SETUP_EVERY == SETUP_EVERY - 1
-        by_setup = None if setup_is_due else self.by_setup
+        by_setup = None if self.setup_is_due else self.by_setup
         return Known(self.boundary, free if is_known else None, by_setup)
 
     def after_gap(self) -> Prior:

@@ -27,9 +27,9 @@ ROUNDS = 3
 
 SHARE = 1e-4
 """Share of a column by which the bench is off for the change of the right-hand side: where
-reflection points go far from those of the factor, what the dots leave nearly open runs away."""
+reflection points go far from those of the factor, weakly determined modes diverge."""
 
-Bench = tuple[Rig, FloatArray]
+Perturbed = tuple[Rig, FloatArray]
 """A rig, and where the dots are on its plane, shape (n, 2), mm."""
 
 REACH = 0.6
@@ -81,9 +81,9 @@ def setup_changes(
 
 
 def _response(
-    match: Match, rig: Rig, settings: FitSettings, pool: FittedPool, benches: Sequence[Bench]
+    match: Match, rig: Rig, settings: FitSettings, pool: FittedPool, benches: Sequence[Perturbed]
 ) -> FloatArray:
-    """Changes of a fit's p coefficients on q benches that are hardly off, shape (p, q), mm."""
+    """Changes of a fit's p coefficients on q benches perturbed a little, shape (p, q), mm."""
     from labapp.core.surface import kernels
 
     points, surface = pool.points_mm, pool.surface
@@ -117,7 +117,7 @@ def _response(
     return changes.T
 
 
-def _bench_off(match: Match, rig: Rig, offset: FloatArray) -> Bench:
+def _bench_off(match: Match, rig: Rig, offset: FloatArray) -> Perturbed:
     """The rig with its quantities off by an offset, shape (q,); the dots on its plane, mm."""
     assert rig.uncertainty is not None
     dots = moved_dots(match.plane_mm, rig, rig.uncertainty.axes, offset)

@@ -162,7 +162,7 @@ def stream_text(stream: Stream | None, at_work: bool, problem: str) -> str:
     listen = "program listens" if stream.listeners == 1 else "programs listen"
     message = pluralize(stream.sent, "frame")
     where = f"{stream.address} (every address of this machine)" * (ANY in stream.address)
-    return f"● {where or stream.address}: {stream.listeners} {listen}, {message} told"
+    return f"● {where or stream.address}: {stream.listeners} {listen}, {message} sent"
 
 
 def problem_text(error: InputError) -> str:
