@@ -263,6 +263,17 @@ def test_what_the_model_lacks_is_named(plate: FlatMirror, pattern: DotPattern, v
 
 
 @pytest.mark.slow
+def test_a_plate_that_is_bent_much_is_no_check():
+    rng = np.random.default_rng(4)
+    bent = FlatMirror(bend_per_mm=(0.004, -0.003))
+    pictures = [
+        picture(Plate(), bent, EXACT, rng)[0],
+        picture(Plate(2.0), FlatMirror(2.0), EXACT, rng)[0],
+    ]
+    assert check_bench(pictures, RIG, CALIBRATION).status != "ok"
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["ball", "sunk ball", "thumb tack"])
 @pytest.mark.parametrize("seed", range(2))
 def test_a_mirror_alone_in_the_usual_look_measures_itself(kind: str, seed: int):
