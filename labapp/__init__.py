@@ -1,26 +1,39 @@
 """labapp measures the surface of a molten weld pool in 3-D from a reflected dot matrix.
 
-`labapp.Session` is the way in for scripts (docs/python.md).
+`labapp.measure` and `labapp.Session` are for scripts (docs/python.md).
 """
 
 from __future__ import annotations
 
+import importlib
 from typing import TYPE_CHECKING
 
 import labapp.pixels  # noqa: F401 (sets OpenCV's limits before anything loads it)
 from labapp.version import VERSION
 
 if TYPE_CHECKING:
+    from labapp.api import Results, measure
+    from labapp.errors import InputError
     from labapp.session.session import Session
 
-__all__ = ["Session", "__version__"]
+__all__ = ["InputError", "Results", "Session", "__version__", "measure"]
 __version__ = VERSION
+
+_HOMES = {
+    "InputError": "labapp.errors",
+    "Results": "labapp.api",
+    "Session": "labapp.session.session",
+    "measure": "labapp.api",
+}
 
 
 def __getattr__(name: str) -> object:
     # Loaded on first use: `labapp --version` needs no numpy.
-    if name == "Session":
-        from labapp.session.session import Session
+    if name not in _HOMES:
+        raise AttributeError(f"module 'labapp' has no attribute {name!r}")
+    found: object = getattr(importlib.import_module(_HOMES[name]), name)
+    return found
 
-        return Session
-    raise AttributeError(f"module 'labapp' has no attribute {name!r}")
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

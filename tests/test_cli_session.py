@@ -108,7 +108,7 @@ def measured_once(imported_once: Path, tmp_path_factory: pytest.TempPathFactory)
         Session.open(folder / "run.labsession") as session,
     ):
         patched.setattr(measurers, "measure", measure)
-        statuses = [measurement.status for _, measurement in session.measure()]
+        statuses = [measurement.status for _, measurement in session.measure_each()]
     assert statuses == ["ok"] * DARK + ["no-dots"]
     return folder
 

@@ -174,7 +174,7 @@ def measure_frames(session: Session, frames: Sequence[int], *, warm: bool = Fals
     with progress_bar() as progress:
         sinks = [summary.add, progress_sink(progress, session.path.name, len(frames))]
         try:
-            for _ in session.measure(frames, warm=warm, sinks=sinks):
+            for _ in session.measure_each(frames, warm=warm, sinks=sinks):
                 pass
         except KeyboardInterrupt:
             done = f"stopped: {len(summary.frames)} of {len(frames)} frames are done and kept"

@@ -240,7 +240,7 @@ class Workspace(QObject):
             done, emitted_s = 0, 0.0
             numbers = [int(k) for k in (session.stale_frames() if frames is None else frames)]
             try:
-                for done, (number, _) in enumerate(session.measure(numbers, pool), 1):
+                for done, (number, _) in enumerate(session.measure_each(numbers, pool), 1):
                     control.progress(done, len(numbers))
                     if number == self.frame:
                         control.part(None)

@@ -56,6 +56,9 @@ class SessionContents:
         self._documents = Documents(database, self._results.restore)
         self._overviews = Overviews(database, self._results)
 
+    def __repr__(self) -> str:
+        return f"<labapp session {self.path.name}>"
+
     def close(self) -> None:
         """Close the file. Closing twice does no harm."""
         self._frames.close()

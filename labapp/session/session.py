@@ -312,6 +312,22 @@ class Session(SessionContents):
     # --- what was measured ------------------------------------------------------------------
 
     def measure(
+        self, frames: Iterable[int] | None = None, *, warm: bool = False
+    ) -> list[tuple[int, Measurement]]:
+        """Measure frames and store the results (`measure_each`).
+
+        Returns
+        -------
+        list
+            Frame and measurement of each, in their order, with status and measures only:
+            `result` has dots, rays and surface, too.
+        """
+        from labapp.export.frame_result import without_surface
+
+        each = self.measure_each(frames, warm=warm)
+        return [(number, without_surface(measurement)) for number, measurement in each]
+
+    def measure_each(
         self,
         frames: Iterable[int] | None = None,
         pool: Executor | None = None,

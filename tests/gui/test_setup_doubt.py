@@ -22,7 +22,7 @@ def test_pages_say_that_a_set_up_is_doubtful_until_it_is_changed(
     with Session.create(path) as session:
         session.set_setup(closely_known(OFF))
         session.import_recording(GTAW / "recording.avi", "0:8")
-        list(session.measure())
+        list(session.measure_each())
 
     def saying(step: str) -> list[str]:
         window.show_step(step)

@@ -96,7 +96,7 @@ def test_it_writes_what_the_command_writes_and_opens_it(
     assert session.record.title == "The tail ends below the work piece (§7.2)"
     assert session.record.expected_width_mm == pytest.approx(6.66, rel=0.1)
     assert not simulator.isVisible()
-    for _, result in session.measure([0]):
+    for _, result in session.measure_each([0]):
         assert result.status == "ok"
 
 

@@ -177,13 +177,13 @@ def test_a_session_follows_frames_and_leaves_corrected_ones_as_they_are(
     with Session.create(tmp_path / "one.labsession", Record(title="a pool that swings")) as session:
         session.set_setup(recording.setup.text)
         session.import_recording(recording.path)
-        first = dict(session.measure([0, 1, 2], warm=True))
+        first = dict(session.measure_each([0, 1, 2], warm=True))
         assert [one.status for one in first.values()] == ["ok"] * 3
         bare = told_here(recording)[1].measurement
         assert_same(first[1].measures, bare.measures)
         assert (bare.dots, bare.lattice, bare.match, bare.reconstruction) == (None,) * 4
         session.correct({1: start_correction(first[1])}, "as it is")
-        again = dict(session.measure([0, 1, 2], warm=True))
+        again = dict(session.measure_each([0, 1, 2], warm=True))
         assert again[1].correction is not None
         assert again[2].status == "ok"
 

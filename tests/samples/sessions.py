@@ -19,7 +19,7 @@ def correct_frame_2(session: Session) -> None:
     for row in (1, 2, 6, 7, 8):
         correction = block_row(correction, row)
     session.correct({2: correction}, "reference and blocked rows of frame 2")
-    for _ in session.measure([2]):
+    for _ in session.measure_each([2]):
         pass
 
 
@@ -29,7 +29,7 @@ def main(names: Sequence[str]) -> None:
         path = sample_folder(name) / f"{name}.labsession"
         path.unlink(missing_ok=True)
         with begin_session(name, path) as session:
-            for _ in session.measure():
+            for _ in session.measure_each():
                 pass
             if name == "blocked_rows":
                 correct_frame_2(session)

@@ -40,7 +40,7 @@ def measured_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with Session.create(folder / "run.labsession", Record(operator="A. Weld")) as session:
         session.set_setup((SAMPLE / "setup.toml").read_text("utf-8"))
         session.import_recording(folder / "recording.avi", "0:8:2")
-        statuses = [measurement.status for _, measurement in session.measure([0, 2])]
+        statuses = [measurement.status for _, measurement in session.measure_each([0, 2])]
     assert statuses == ["ok", "ok"]
     return folder
 
@@ -127,7 +127,7 @@ def test_results_say_what_they_come_from(session: Session):
 
 
 def test_what_is_kept_is_what_was_measured(session: Session):
-    ((_, measured),) = session.measure([4])
+    ((_, measured),) = session.measure_each([4])
     kept = session.result(4)
     assert kept is not None
     assert measured.reconstruction is not None
@@ -169,7 +169,7 @@ def test_an_incomplete_setup_makes_everything_stale(session: Session):
     session.update_setup({"laser": {"distance_mm": None}})
     assert session.overview().stale.tolist() == [True, True, False, False]
     with pytest.raises(InputError, match=r"laser.distance_mm"):
-        next(session.measure())
+        next(session.measure_each())
 
 
 def test_a_correction_makes_its_frame_stale(session: Session):
@@ -184,7 +184,7 @@ def test_a_correction_makes_its_frame_stale(session: Session):
     result = session.result(2)
     assert result is not None
     assert result.stale == (CORRECTION_CHANGED,)
-    ((number, measurement),) = session.measure([2])
+    ((number, measurement),) = session.measure_each([2])
     assert (number, measurement.status) == (2, "ok")
     assert session.overview().stale.tolist() == [False, False, False, False]
 
@@ -194,7 +194,7 @@ def test_undo_and_redo_bring_back_what_was_measured(session: Session):
     assert found is not None
     correction = Correction.of(found.measurement.dots, found.measurement.lattice)
     session.correct({2: correction})
-    assert len(list(session.measure([2]))) == 1
+    assert len(list(session.measure_each([2]))) == 1
     by_hand = session.result(2)
     for step, expected in ((session.undo, found), (session.redo, by_hand), (session.undo, found)):
         step()
@@ -325,7 +325,7 @@ def test_a_recording_that_is_gone_is_asked_for_and_what_was_measured_shows(folde
         result = session.result(0)
         assert result is not None
         assert result.measurement.measures is not None
-        for attempt in (lambda: session.frame(0), lambda: next(session.measure())):
+        for attempt in (lambda: session.frame(0), lambda: next(session.measure_each())):
             with pytest.raises(InputError, match="is not there"):
                 attempt()
         assert session.overview().status == ("ok", "ok", "", "")
@@ -508,9 +508,9 @@ def test_an_export_needs_something_measured(session: Session, tmp_path: Path):
 
 
 def test_processes_measure_the_same(session: Session):
-    here = [kept for _, kept in session.measure([4])]
+    here = [kept for _, kept in session.measure_each([4])]
     with measuring_pool(1) as pool:
-        there = dict(session.measure([4, 6], pool))
+        there = dict(session.measure_each([4, 6], pool))
     assert list(there) == [4, 6]
     assert same(there[4], here[0])
 
@@ -518,18 +518,18 @@ def test_processes_measure_the_same(session: Session):
 def test_a_corrected_frame_that_processes_measure_stands_until_it_is_corrected_anew(
     session: Session,
 ):
-    ((_, found),) = session.measure([4])
+    ((_, found),) = session.measure_each([4])
     session.correct({4: start_correction(found)})
     assert stale(session) == [4]
     with measuring_pool(1) as pool:
-        ((_, again),) = session.measure([4], pool)
+        ((_, again),) = session.measure_each([4], pool)
     assert again.correction is not None
     assert stale(session) == []
     session.undo()
     session.redo()
     assert stale(session) == []
     session.undo()
-    ((_, meanwhile),) = session.measure([4], sinks=[lambda _: session.redo()])
+    ((_, meanwhile),) = session.measure_each([4], sinks=[lambda _: session.redo()])
     assert meanwhile.correction is None
     assert stale(session) == []
 
@@ -547,13 +547,13 @@ def test_results_go_on_to_sinks_when_they_are_kept(session: Session):
         is_kept = kept is not None and same(kept.measurement, result.measurement)
         told.append((result.frame, result.time_s, is_kept))
 
-    assert [frame for frame, _ in session.measure([4, 6], sinks=[tell])] == [4, 6]
+    assert [frame for frame, _ in session.measure_each([4, 6], sinks=[tell])] == [4, 6]
     assert told == [(4, session.frame(4).time_s, True), (6, session.frame(6).time_s, True)]
 
 
 def test_measuring_that_is_stopped_keeps_what_was_finished(session: Session):
     with measuring_pool(1) as pool:
-        measuring = session.measure([4, 6, 0], pool)
+        measuring = session.measure_each([4, 6, 0], pool)
         assert next(measuring)[0] == 4
         measuring.close()
     assert session.overview().status == ("ok", "ok", "ok", "")

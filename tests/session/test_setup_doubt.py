@@ -56,7 +56,7 @@ def test_a_session_keeps_the_doubt_with_the_set_up_it_is_of(
     with Session.create(path) as session:
         session.set_setup(closely_known(OFF))
         session.import_recording(GTAW / "recording.avi", FRAMES)
-        list(session.measure())
+        list(session.measure_each())
         assert session.setup_status == "doubtful"
     with Session.open(path) as session:
         assert session.problems() == []
@@ -86,7 +86,7 @@ def test_a_session_keeps_the_doubt_with_the_set_up_it_is_of(
         session.undo()
         assert session.setup_verdict == verdict
         session.redo()
-        list(session.measure())
+        list(session.measure_each())
         assert session.setup_status == "calibrated"
         found = session.setup_verdict
         assert found is not None

@@ -220,7 +220,7 @@ def test_undo_shows_the_measured_rows_at_once(
     assert before is not None
     page.editor.selection = np.array([12])
     assert page.editor.put_in_doubt()
-    assert len(list(session.measure([0]))) == 1
+    assert len(list(session.measure_each([0]))) == 1
     page.workspace.changed.emit()
     assert unfitted == [[0]]
     page.workspace.undo()
@@ -251,7 +251,7 @@ def test_what_the_detector_found_is_no_start_while_the_frame_is_measured(
         result = session.result(0)
         assert result is not None
         session.correct({0: start_correction(result.measurement)})
-        assert len(list(session.measure([0]))) == 1
+        assert len(list(session.measure_each([0]))) == 1
     session = show(page, qtbot, path, 0)
     session.undo()  # what was measured before is not known in a session opened anew
     page.workspace.changed.emit()

@@ -135,7 +135,7 @@ class Refit:
 
         def work(control: Control) -> None:
             try:
-                for _ in session.measure([frame], _Patient(pool, control)):
+                for _ in session.measure_each([frame], _Patient(pool, control)):
                     control.check()
             except BrokenProcessPool as error:
                 control.check()  # ended on purpose

@@ -1,0 +1,323 @@
+"""The Python API for scripts: measure an image or a recording, and get tables, grids and plots.
+
+`measure` is `labapp.measure`. Tables need pandas, grids xarray; both come with the extra ``data``.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Literal, overload
+
+import numpy as np
+import numpy.typing as npt
+
+from labapp.config.setup import Setup, read_setup
+from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.pipeline import Measurement, Settings
+from labapp.core.recording.residual_check import ResidualRecord, SetupVerdict, judged_status
+from labapp.core.values import FloatArray
+from labapp.errors import InputError
+from labapp.export.frame_result import FrameResult
+from labapp.export.tables import TABLES, frame_tables
+from labapp.media import Frame, open_source
+from labapp.run.measurers import ColdMeasurer, WarmMeasurer
+from labapp.run.runner import run, select_frames, with_setup_check
+
+if TYPE_CHECKING:
+    import matplotlib.axes
+    import pandas as pd
+    import xarray as xr
+
+    from labapp.session.session import Session
+
+TableName = Literal["measures", "dots", "points", "boundary"]
+
+MOST_NODES = 50_000_000
+"""Heights of a `Results.surfaces` grid at most: 400 MB."""
+
+LIMIT_PARTS = 40
+"""Contour levels of a plotted surface."""
+
+
+def measure(
+    source: str | os.PathLike[str] | npt.NDArray[Any],
+    setup: str | os.PathLike[str] | Setup,
+    *,
+    frames: str = ":",
+    settings: Settings | None = None,
+    follow: bool = False,
+    progress: Callable[[FrameResult], object] | None = None,
+) -> Results:
+    """Measure the pool in an image, a stack of images or a recording.
+
+    A frame that cannot be measured does not raise: its status and reason say why.
+
+    Parameters
+    ----------
+    source
+        Grey image, shape (height, width), or images, shape (n, height, width), any real type; or
+        the path of a recording or of an image.
+    setup
+        The setup file's path, or a set-up that was read from one (`labapp.config.setup`).
+    frames
+        Which frames, ``START:STOP:STEP`` as in a Python slice, or the number of one.
+    settings
+        What can be chosen, `labapp.core.pipeline.Settings`; None: the defaults.
+    follow
+        Whether to measure each frame from the one before, which is some twenty times faster.
+    progress
+        Called with the result of each frame.
+
+    Returns
+    -------
+    Results
+        The result of each frame.
+
+    Raises
+    ------
+    InputError
+        If the recording or the setup file cannot be read, or an array is no image.
+    """
+    bench = setup if isinstance(setup, Setup) else read_setup(setup)
+    chosen = Settings() if settings is None else settings
+    with ExitStack() as at_end:
+        if isinstance(source, np.ndarray):
+            count, read = len(_images(source)), _reader(_images(source))
+        else:
+            recording = at_end.enter_context(open_source(source))
+            count, read = len(recording), recording.frame
+        measurer = (WarmMeasurer if follow else ColdMeasurer)(read, bench, chosen)
+        record = ResidualRecord(bench.rig)
+        sinks = [] if progress is None else [progress]
+        selected = select_frames(frames, count)
+        found = list(run(selected, with_setup_check(measurer, record), sinks))
+    verdict = record.verdict()
+    status = judged_status(bench.rig, verdict)  # of the whole run, as `labapp reconstruct` has it
+    judged = (replace(r, measurement=replace(r.measurement, setup_status=status)) for r in found)
+    return Results(tuple(judged), bench.calibration, verdict)
+
+
+@dataclass(frozen=True, repr=False)
+class Results(Sequence[FrameResult]):
+    """The results of frames, in their order: a sequence of `FrameResult`."""
+
+    results: tuple[FrameResult, ...]
+    """Result of each frame."""
+    calibration: ImageCalibration
+    """Pixel ↔ imaging plane."""
+    setup_check: SetupVerdict | None = None
+    """What the frames together say of the set-up; None: it was not examined."""
+
+    @classmethod
+    def of_session(cls, session: Session) -> Results:
+        """Return the results that a session has; frames that were not measured are left out."""
+        times = session.overview().time_s.tolist()
+        each = zip(times, map(session.result, session.frames.tolist()), strict=True)
+        results = tuple(
+            FrameResult(r.frame, None if np.isnan(time_s) else time_s, r.measurement)
+            for time_s, r in each
+            if r is not None
+        )
+        return cls(results, session.setup.calibration, session.setup_verdict)
+
+    # --- a sequence ---------------------------------------------------------------------------
+
+    def __len__(self) -> int:
+        return len(self.results)
+
+    @overload
+    def __getitem__(self, index: int) -> FrameResult: ...
+    @overload
+    def __getitem__(self, index: slice) -> Results: ...
+    def __getitem__(self, index: int | slice) -> FrameResult | Results:
+        if isinstance(index, slice):
+            return Results(self.results[index], self.calibration, self.setup_check)
+        return self.results[index]
+
+    def __iter__(self) -> Iterator[FrameResult]:
+        return iter(self.results)
+
+    def __repr__(self) -> str:
+        measured = [r.measurement.measures for r in self.results if r.measurement.measures]
+        text = f"<labapp results: {len(self)} frames, {len(measured)} measured"
+        if measured:
+            heights = np.array([size.height_mm for size in measured])
+            text += f", mean height {heights.mean():.3f} mm"
+        return text + ">"
+
+    # --- as data ------------------------------------------------------------------------------
+
+    def dataframe(self, table: TableName = "measures") -> pd.DataFrame:
+        """Return a table of all frames, with the columns and units of the CSV files.
+
+        Parameters
+        ----------
+        table
+            ``measures`` has a row per frame, ``dots``, ``points`` and ``boundary`` have many.
+
+        Returns
+        -------
+        DataFrame
+            Unknown values are NaN. ``attrs["units"]`` has the unit of each column, and
+            ``attrs["descriptions"]`` what it holds.
+        """
+        import pandas as pd
+
+        columns = TABLES[table]
+        parts = [frame_tables(result, self.calibration)[table] for result in self.results]
+        values: dict[str, Any] = {
+            column.name: np.concatenate([part[column.name] for part in parts]) if parts else []
+            for column in columns
+        }
+        frame = pd.DataFrame(values)
+        frame.attrs["units"] = {column.name: column.unit for column in columns}
+        frame.attrs["descriptions"] = {column.name: column.description for column in columns}
+        return frame
+
+    def surfaces(self, spacing_mm: float = 0.1) -> xr.Dataset:
+        """Return the surfaces on one grid, NaN outside each frame's boundary.
+
+        Parameters
+        ----------
+        spacing_mm
+            Distance of the grid's nodes, mm.
+
+        Returns
+        -------
+        Dataset
+            ``height``, dimensions (frame, y, x), mm above the work piece, with coordinates
+            ``frame``, ``time``, ``y`` and ``x``. Frames without a surface are left out.
+
+        Raises
+        ------
+        InputError
+            If the spacing is not positive, or the grid would be very large.
+        """
+        import xarray as xr
+
+        there = [r for r in self.results if r.measurement.reconstruction is not None]
+        x_mm, y_mm = _axes([r.measurement for r in there], spacing_mm)
+        places = np.meshgrid(x_mm, y_mm)
+        height = np.full((len(there), len(y_mm), len(x_mm)), np.nan)
+        for grid, result in zip(height, there, strict=True):
+            made = result.measurement.reconstruction
+            assert made is not None
+            grid[...] = made.surface.height(*places)
+        times = [np.nan if r.time_s is None else r.time_s for r in there]
+        mm = {"units": "mm"}
+        return xr.Dataset(
+            {"height": (("frame", "y", "x"), height, mm | {"long_name": "height of the surface"})},
+            {
+                "frame": [r.frame for r in there],
+                "time": ("frame", times, {"units": "s"}),
+                "y": ("y", y_mm, mm | {"long_name": "Y, along the weld"}),
+                "x": ("x", x_mm, mm | {"long_name": "X, across the weld"}),
+            },
+        )
+
+    # --- as plots -----------------------------------------------------------------------------
+
+    def plot(
+        self, size: str = "height_mm", axes: matplotlib.axes.Axes | None = None
+    ) -> matplotlib.axes.Axes:
+        """Plot a size over time (over frames where these have no time), with ± as a band.
+
+        Parameters
+        ----------
+        size
+            A column of the measures, such as ``width_mm``.
+        axes
+            Where to plot; None: in a new figure.
+        """
+        axes = _new_axes() if axes is None else axes
+        table = self.dataframe()
+        timed = bool(np.isfinite(table["time_s"]).all())
+        at, value = table["time_s" if timed else "frame"].to_numpy(), table[size].to_numpy(float)
+        (line,) = axes.plot(at, value, marker="." if len(at) < LIMIT_PARTS else "")
+        name, _, unit = size.rpartition("_")
+        sigma = f"{name}_sigma_{unit}"
+        if sigma in table:
+            band = table[sigma].to_numpy(float)
+            axes.fill_between(at, value - band, value + band, alpha=0.3, color=line.get_color())
+        axes.set_xlabel("time (s)" if timed else "frame")
+        axes.set_ylabel(f"{name.replace('_', ' ')} ({unit})")
+        return axes
+
+    def plot_surface(
+        self, index: int = 0, axes: matplotlib.axes.Axes | None = None, spacing_mm: float = 0.05
+    ) -> matplotlib.axes.Axes:
+        """Plot a frame's surface as a map of heights, with its boundary and reflection points.
+
+        Parameters
+        ----------
+        index
+            Its place in these results.
+        axes
+            Where to plot; None: in a new figure.
+        spacing_mm
+            Distance of the grid's nodes, mm.
+
+        Raises
+        ------
+        InputError
+            If the frame has no surface.
+        """
+        result = self.results[index]
+        made = result.measurement.reconstruction
+        if made is None:
+            why = f"{result.measurement.status}: {result.measurement.reason}"
+            raise InputError(f"frame {result.frame}", "surface", why, "a frame with a surface")
+        axes = _new_axes() if axes is None else axes
+        height = self[index : index + 1].surfaces(spacing_mm)["height"][0]
+        shown = axes.contourf(height["x"], height["y"], height, LIMIT_PARTS)
+        axes.figure.colorbar(shown, ax=axes, label="height (mm)")
+        outline = np.vstack([made.boundary.points_mm, made.boundary.points_mm[:1]])
+        axes.plot(outline[:, 0], outline[:, 1], color="black", linewidth=1)
+        axes.plot(*made.points_mm[:, :2].T, ".", color="white", markersize=2)
+        axes.set_aspect("equal")
+        axes.set_xlabel("X (mm)")
+        axes.set_ylabel("Y, along the weld (mm)")
+        return axes
+
+
+# --- parts ------------------------------------------------------------------------------------
+
+
+def _images(source: npt.NDArray[Any]) -> npt.NDArray[Any]:
+    """Images as an array, shape (n, height, width)."""
+    right = "a grey image, shape (height, width), or images, shape (n, height, width)"
+    if source.ndim not in (2, 3) or not source.size:
+        raise InputError("source", "shape", str(source.shape), right)
+    if source.dtype.kind not in "uif":
+        raise InputError("source", "dtype", str(source.dtype), "integers or real numbers")
+    return source if source.ndim == 3 else source[None]
+
+
+def _reader(images: npt.NDArray[Any]) -> Callable[[int], Frame]:
+    return lambda number: Frame(number, None, images[number])
+
+
+def _axes(measured: Iterable[Measurement], spacing_mm: float) -> tuple[FloatArray, FloatArray]:
+    """X and Y of a grid through the origin that has all boundaries in it, mm."""
+    if not spacing_mm > 0:
+        raise InputError("surfaces", "spacing_mm", str(spacing_mm), "more than 0 mm")
+    found = [m.reconstruction.boundary.points_mm[:, :2] for m in measured if m.reconstruction]
+    if not found:
+        return np.empty(0), np.empty(0)
+    every = np.vstack(found)
+    low, high = np.floor(every.min(axis=0) / spacing_mm), np.ceil(every.max(axis=0) / spacing_mm)
+    if np.prod(high - low + 1) * len(found) > MOST_NODES:
+        right = f"a spacing with at most {MOST_NODES} nodes in all"
+        raise InputError("surfaces", "spacing_mm", str(spacing_mm), right)
+    x_mm, y_mm = (np.arange(a, b + 1) * spacing_mm for a, b in zip(low, high, strict=True))
+    return x_mm, y_mm
+
+
+def _new_axes() -> matplotlib.axes.Axes:
+    import matplotlib.pyplot as plt
+
+    axes: matplotlib.axes.Axes = plt.subplots(layout="constrained")[1]
+    return axes
