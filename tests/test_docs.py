@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import importlib.util
 import re
 import shlex
 import shutil
 from pathlib import Path
 
+import matplotlib as mpl
 import pytest
 import typer.core
 import typer.main
@@ -17,6 +19,27 @@ from labapp.session.session import Session
 from tests.conftest import Run
 
 ROOT = Path(__file__).resolve().parent.parent
+
+
+def test_the_tutorial_leads_to_a_figure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    mpl.use("Agg")
+    text = (ROOT / "docs/tutorial.md").read_text("utf-8")
+    names: dict[str, object] = {}
+    for example in re.findall(r"```python\n(.*?)```", text, re.S):
+        exec(example, names)
+    assert (tmp_path / "pool.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_the_commands_of_the_site_are_those_of_the_command_line() -> None:
+    spec = importlib.util.spec_from_file_location("site_hooks", ROOT / "docs" / "site_hooks.py")
+    assert spec is not None
+    assert spec.loader is not None
+    hooks = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(hooks)
+    page = hooks.commands_page()
+    for command in ("labapp reconstruct", "labapp session measure", "labapp calibrate bench"):
+        assert f"`{command}`" in page
 
 
 def test_the_examples_of_the_python_api_run(
