@@ -94,11 +94,12 @@ def test_links_in_the_texts_lead_somewhere():
 
 
 def test_decisions_are_numbered_without_gaps():
-    names = sorted(path.name for path in (ROOT / "docs" / "adr").glob("*.md"))
+    names = sorted(path.name for path in (ROOT / "docs" / "adr").glob("0*.md"))
     assert [int(name[:4]) for name in names] == list(range(1, len(names) + 1))
     for name in names:
         title = (ROOT / "docs" / "adr" / name).read_text("utf-8").splitlines()[0]
         assert title.startswith(f"# {int(name[:4])}. ")
+        assert f"]({name})" in (ROOT / "docs" / "adr" / "index.md").read_text("utf-8")
 
 
 def test_no_path_of_one_machine_is_written_down():
