@@ -22,6 +22,12 @@ def has_display(environment: Mapping[str, str]) -> bool:
     return IS_WINDOWS or IS_MACOS or any(environment.get(name) for name in names)
 
 
+def own_command() -> list[str]:
+    """Words of the command that starts labapp again, as this one was: frozen, or by Python."""
+    frozen = getattr(sys, "frozen", False)
+    return [sys.executable] if frozen else [sys.executable, "-m", "labapp"]
+
+
 def sync_folder(path: Path) -> None:
     """Have the disk hold the names that a folder has now; Windows sees to that by itself.
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import os
 import subprocess
-import sys
+
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
 import typer
 
 from labapp.errors import InputError
-from labapp.system import has_display, quoted
+from labapp.system import has_display, own_command, quoted
 
 
 def asks_for_app(arguments: Sequence[str], commands: Collection[str]) -> bool:
@@ -47,4 +47,4 @@ def show_in_app(session: Path) -> None:
         return
     typer.echo("The app opens with it; close its window to end.")
     # A process of its own: whatever comes over the window, the results are there.
-    subprocess.run([sys.executable, "-m", "labapp", os.fspath(session)], check=False)
+    subprocess.run([*own_command(), os.fspath(session)], check=False)

@@ -25,8 +25,10 @@ from PySide6.QtCore import (
     Signal,
     qInstallMessageHandler,
 )
+from PySide6.QtGui import QIcon
 from PySide6.QtWidgets import QApplication
 
+from labapp.bundled import bundled
 from labapp.errors import InputError
 from labapp.log import NAME, start_log
 from labapp.system import has_display
@@ -167,6 +169,7 @@ def start_app() -> QApplication:
     app.setApplicationDisplayName(NAME)
     app.setApplicationVersion(VERSION)
     app.setDesktopFileName(NAME)
+    app.setWindowIcon(QIcon(str(bundled("resources/icons/labapp.svg"))))
     return app
 
 

@@ -1,0 +1,9 @@
+"""The frozen program's start: the command ``labapp``."""
+
+import multiprocessing
+
+if __name__ == "__main__":
+    multiprocessing.freeze_support()  # a process that measures starts this program again
+    from labapp.cli import main
+
+    main()
