@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import subprocess
-
 from collections.abc import Collection, Sequence
 from pathlib import Path
 
