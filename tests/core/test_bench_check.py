@@ -18,13 +18,14 @@ from labapp.core.bench_check.known import measure_known
 from labapp.core.bench_check.labelling import Picture, label_picture, sighting_of
 from labapp.core.bench_check.mirrors import Ball, Cap, Mirror, Plate, landing_points, placed
 from labapp.core.geometry.bench import Bench
+from labapp.core.geometry.coordinates import ImageCalibration, Lens
 from labapp.core.geometry.rig import DotPattern, Rig
 from labapp.core.geometry.uncertainty import INDEX, QUANTITIES
 from labapp.core.images.find_dots import DotSettings, find_mirror_dots
 from labapp.core.matching.observation import Observation
 from labapp.core.values import CannotMeasure
 from labapp.errors import InputError
-from labapp.simulation.benches import BenchErrors, SimulatedBench, draw_bench
+from labapp.simulation.benches import FOCAL_PX, BenchErrors, SimulatedBench, draw_bench
 from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import PoolSurface, trace
 from labapp.simulation.mirrors import BallMirror, FlatMirror
@@ -213,6 +214,30 @@ def test_a_check_is_kept_in_the_setup_file_until_something_is_changed():
     back = parse_setup(unchecked_setup(text, "setup.toml"), "setup.toml")
     assert back.rig.laser == RIG.laser
     assert back.calibration.lens is None
+
+
+@pytest.mark.slow
+def test_the_set_up_that_is_written_is_the_adjusted_one():
+    """With a lens in it, too, and its picture shifted: nothing else was adjusted to the dots."""
+    middle = SHAPE[1] / 2, SHAPE[0] / 2
+    keys = {"focal_px": [FOCAL_PX] * 2, "center_px": list(middle), "distortion": [-0.5, 0, 0, 0, 0]}
+    written = "".join(f"{key} = {value}\n" for key, value in keys.items())
+    text = TEXT + "[camera_lens]\n" + written
+    lens_px = Lens((FOCAL_PX, FOCAL_PX), middle, (-0.5, 0.0, 0.0, 0.0, 0.0))
+    setup, rng = parse_setup(text, "setup.toml"), np.random.default_rng(3)
+    made = trace(FlatMirror(), EXACT.rig)
+    matrix = np.linalg.inv(np.array([[1, 0, 12], [0, 1, -7], [0, 0, 1]]) @ CALIBRATION.from_plane)
+    ideal = ImageCalibration(matrix, lens_px)
+    place = ideal.to_image(made.plane_mm[made.visible])
+    dots = as_dots(place + rng.normal(0, 0.12, place.shape), 0.12)
+    shot = Picture("plate", Plate(), dots, SHAPE)
+    check = check_bench([shot], setup.rig, setup.calibration, ["picture.u", "picture.v"])
+    assert check.status == "ok"
+    read = parse_setup(checked_setup(text, "setup.toml", check, "2026-11-24T12:00:00+00:00"), "")
+    (one,) = check.pictures
+    computed, _ = landing_points(Plate(), one.pose, read.rig, tuple(one.ray.T - 1))
+    again = read.calibration.to_plane(dots.image_px[one.dot]) - computed
+    np.testing.assert_allclose(again, one.residual_mm, atol=1e-4)
 
 
 @pytest.mark.slow
