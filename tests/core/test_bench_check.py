@@ -14,7 +14,6 @@ from labapp.config.setup import checked_setup, parse_setup, unchecked_setup
 from labapp.core.bench_check.adjustment import adjust
 from labapp.core.bench_check.check import BenchCheck, check_bench
 from labapp.core.bench_check.forecast import forecast
-from labapp.core.bench_check.known import measure_known
 from labapp.core.bench_check.labelling import Picture, label_picture, sighting_of
 from labapp.core.bench_check.mirrors import Ball, Cap, Mirror, Plate, landing_points, placed
 from labapp.core.geometry.bench import Bench
@@ -254,6 +253,21 @@ def test_a_quantity_far_off_is_named_and_put_right_when_let_go_of():
     assert again.rig.laser.distance_mm == pytest.approx(laser.distance_mm, abs=0.5)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("truth", [0.91, 1.0])
+def test_a_mirror_that_measures_otherwise_than_it_is_known_is_no_check(truth: float):
+    rng = np.random.default_rng(9)
+    pairs = [(Plate(), FlatMirror()), (Cap(9.75, 0.91), spherical_cap(9.75, truth, (0.2, -0.1)))]
+    check = check_bench([picture(*each, EXACT, rng)[0] for each in pairs], RIG, CALIBRATION)
+    radius, height = check.pictures[1].sizes
+    assert check.status == ("ok" if truth == 0.91 else "size-off")
+    assert radius.is_contradicted == (truth != 0.91)
+    assert height.independent_mm == pytest.approx(truth, abs=3 * height.independent_sigma_mm)
+    known = check.rig.uncertainty
+    assert known is not None
+    assert (known.status == "checked") == (truth == 0.91)
+
+
 class BowedPattern(DotPattern):
     """Another lens: its rows and columns are bowed, by 4 % at the edges."""
 
@@ -315,8 +329,10 @@ def test_a_mirror_alone_in_the_usual_look_measures_itself(kind: str, seed: int):
     dots = find_mirror_dots(image, DotSettings())
     check = check_bench([Picture(kind, mirror, dots, image.shape)], RIG, CALIBRATION)
     assert check.status == "ok"
-    for size in measure_known(check, check.pictures[0]):
+    for size in check.pictures[0].sizes:
         assert size.measured_mm == pytest.approx(size.known_mm, rel=0.01)
+        assert size.independent_sigma_mm > 3 * size.sigma_mm
+        assert not size.is_contradicted
 
 
 @pytest.mark.slow
