@@ -11,7 +11,6 @@ import numpy as np
 from labapp.config.setup import Setup, parse_setup, unchecked_setup
 from labapp.core.bench_check.check import UNDETERMINED, BenchCheck, CheckedPicture, check_bench
 from labapp.core.bench_check.forecast import EXPECTED, forecast
-from labapp.core.bench_check.known import measure_known
 from labapp.core.bench_check.labelling import Picture
 from labapp.core.bench_check.mirrors import Ball, Cap, Mirror, Plate
 from labapp.core.geometry.coordinates import ImageCalibration
@@ -174,7 +173,6 @@ def _kept(
 ) -> MirrorPicture:
     dots = checked.picture.dots
     dot_px = np.column_stack([dots.u_px, dots.v_px])[checked.dot]
-    measured = measure_known(found, checked)
     return MirrorPicture(
         one.name,
         one.kind,
@@ -185,7 +183,9 @@ def _kept(
         dot_px,
         before.to_image(checked.plane_mm - checked.residual_mm),
         checked.residual_mm,
-        tuple((size.name, size.known_mm, size.measured_mm, size.sigma_mm) for size in measured),
+        tuple(
+            (size.name, size.known_mm, size.measured_mm, size.sigma_mm) for size in checked.sizes
+        ),
     )
 
 
