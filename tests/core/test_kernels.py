@@ -447,14 +447,18 @@ def test_an_enlarged_band_is_that_of_the_whole_picture_where_it_is_over_a_floor(
     image = np.zeros((120, 160))
     for u_px, v_px in random().uniform(0.0, 120.0, (30, 2)):
         image += 40.0 * np.exp(-((u - u_px) ** 2 + (v - v_px) ** 2) / (2 * 3.2**2))
-    band, large = dot_kernels.halved(image.astype(np.float32)), np.empty((120, 160), np.float32)
-    low = np.full(band.shape, 10.0, np.float32)
-    dot_kernels.enlarge_above(band, low, large)
+    band, large = dot_kernels.halved(image.astype(np.float32)), np.full((120, 160), 9e9, "f4")
+    low, floor = np.full(band.shape, 10.0, "f4"), np.full(large.shape, 12.0, "f4")
+    disc = np.ones((5, 5), bool)
+    found, high = dot_kernels.enlarged_peaks(band, low, floor, disc, large)
     lit = np.kron(band > low, np.ones((2, 2), bool))
     blurred = cv2.blur(image, (3, 3)) * 0.375 + image * 0.625  # as far as a pixel's area blurs
     inner = np.s_[8:-8, 8:-8]
     assert np.abs(large - blurred)[inner][lit[inner]].max() < 0.02 * image.max()
-    assert not large[~lit].any()
+    np.testing.assert_array_equal(large[~lit], np.float32(9e9))  # where it does not count
+    np.testing.assert_array_equal(high, large[found[1], found[0]])
+    alone = np.where(lit, large, np.float32(0.0))
+    np.testing.assert_array_equal(found, dot_kernels.peaks(alone, floor, disc))
 
 
 def test_a_halved_picture_has_the_means_of_four_pixels() -> None:

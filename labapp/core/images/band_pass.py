@@ -300,11 +300,12 @@ class _BandPassed:
         """Peaks over the floor."""
         from labapp.core.images import dot_kernels
 
-        band = self.band
+        band, floor, disc = self.band, tuning.floor, peak_disc(self.size)
         if self.step == 2:
-            band = scratch("large band", self.picture.shape)
-            dot_kernels.enlarge_above(self.band, tuning.coarse, band)
-        u, v = dot_kernels.peaks(band, tuning.floor, peak_disc(self.size))
+            large = scratch("large band", self.picture.shape)
+            (u, v), bright = dot_kernels.enlarged_peaks(band, tuning.coarse, floor, disc, large)
+            return u, v, bright
+        u, v = dot_kernels.peaks(band, floor, disc)
         return u, v, band[v, u].astype(float)
 
     def _dot_like(self, u: IntArray, v: IntArray, bright: FloatArray) -> BoolArray:

@@ -163,39 +163,116 @@ def ridges(band: Grey, u: IntArray, v: IntArray, slender: float) -> BoolArray:
     return made
 
 
-@_compiled(_grey, _grey, types.Array(types.float32, 2, "C"))
-def enlarge_above(band: Grey, low: Grey, large: Grey) -> None:
-    """Write a band over ``low``, of the same shape, to a picture of twice its size; 0 elsewhere.
+@_inner
+def _lit_pixels(band: Grey, low: Grey) -> tuple[IntArray, IntArray]:
+    """Columns of the n pixels over ``low``, row by row, and where each row begins among them.
 
-    Between the band's pixels it is interpolated by polynomials through six of them (Lagrange).
+    Shapes (n,) and (height + 1,).
     """
-    (height, width), single = band.shape, np.float32
-    # A quarter of the way from the third of six pixels to the fourth.
-    taps = np.array([77, -693, 6930, 2310, -495, 63], single) / single(8192)
-    large[:] = single(0.0)
-    columns, rows = np.empty(7, np.int64), np.empty((7, 2), np.float32)
+    height, width = band.shape
+    column, begin, count = np.empty(width, np.int64), np.zeros(height + 1, np.int64), 0
     for v in range(height):
+        own, dark = band[v], low[v]
+        if len(column) < count + width:
+            more = np.empty(2 * (count + width), np.int64)
+            more[:count] = column[:count]
+            column = more
         for first in range(0, width, BLOCK):
             last = min(first + BLOCK, width)
-            if not _any_over(band[v, first:last], low[v, first:last]):
+            if not _any_over(own[first:last], dark[first:last]):
                 continue
             for u in range(first, last):
-                if not band[v, u] > low[v, u]:
+                column[count] = u
+                count += own[u] > dark[u]
+        begin[v + 1] = count
+    return column, begin
+
+
+@_inner
+def _enlarge(band: Grey, v: int, u: int, taps: Grey, patch: Grey, large: Grey) -> None:
+    """Write the four pixels that one of a band is made into to a picture of twice its size.
+
+    Between the band's pixels it is interpolated by polynomials through six of them, of which the
+    ``taps`` are the weights a quarter of the way from the third to the fourth. The patch, of shape
+    (7, 7), is memory to write on.
+    """
+    (height, width), single = band.shape, np.float32
+    inside = 3 <= v < height - 3 and 3 <= u < width - 3
+    for y in range(7):
+        row = band[v + y - 3 if inside else min(max(v + y - 3, 0), height - 1)]
+        for x in range(7):
+            patch[y, x] = row[u + x - 3 if inside else min(max(u + x - 3, 0), width - 1)]
+    for x in range(2):
+        above, below = single(0.0), single(0.0)
+        for y in range(7):
+            across = single(0.0)
+            for m in range(6):
+                across += taps[m if x else 5 - m] * patch[y, m + x]
+            above += taps[5 - y] * across if y < 6 else single(0.0)
+            below += taps[y - 1] * across if y else single(0.0)
+        large[2 * v, 2 * u + x], large[2 * v + 1, 2 * u + x] = above, below
+
+
+@_inner
+def _tops_enlarged(large: Grey, band: Grey, low: Grey, disc: BoolArray, v: int, u: int) -> bool:
+    """Whether no pixel of a disc round one is over it, of those where the band is over ``low``."""
+    (height, width), reach, own = large.shape, len(disc) // 2, large[v, u]
+    for y in range(max(v - reach, 0), min(v + reach + 1, height)):
+        for x in range(max(u - reach, 0), min(u + reach + 1, width)):
+            if (
+                disc[y - v + reach, x - u + reach]
+                and large[y, x] > own
+                and band[y >> 1, x >> 1] > low[y >> 1, x >> 1]
+            ):
+                return False
+    return True
+
+
+@_compiled(_grey, _grey, _grey, _mask, types.Array(types.float32, 2, "C"))
+def enlarged_peaks(
+    band: Grey, low: Grey, floor: Grey, disc: BoolArray, large: Grey
+) -> tuple[IntArray, FloatArray]:
+    """Peaks of a band made twice as large where it is over ``low``, of its shape (`peaks`).
+
+    Parameters
+    ----------
+    band, low
+        Shape (height, width); elsewhere there is no peak.
+    floor
+        What peaks are over, not below 0, of twice that shape.
+    disc
+        See `peaks`.
+    large
+        Of twice that shape: gets the larger band where it is over ``low``; what else is in it stays
+        and does not count.
+
+    Returns
+    -------
+    places, heights
+        Columns and rows, shape (2, n), and the larger band there, shape (n,).
+    """
+    column, begin = _lit_pixels(band, low)
+    # Lagrange's polynomials through six pixels.
+    taps = np.array([77, -693, 6930, 2310, -495, 63], np.float32) / np.float32(8192)
+    patch = np.empty((7, 7), np.float32)
+    for v in range(len(band)):
+        for k in range(begin[v], begin[v + 1]):
+            _enlarge(band, v, column[k], taps, patch, large)
+    found, high, count = np.empty((2, 4 * begin[-1]), np.int64), np.empty(4 * begin[-1]), 0
+    for v in range(2 * len(band)):
+        for k in range(begin[v // 2], begin[v // 2 + 1]):
+            left, top = 2 * column[k], v - v % 2
+            # Of the four pixels one is over the others: most are no peaks by that.
+            most = max(large[top, left], large[top, left + 1])
+            most = max(most, large[top + 1, left], large[top + 1, left + 1])
+            for u in range(left, left + 2):
+                own = large[v, u]
+                if own < most or not own > floor[v, u]:
                     continue
-                for k in range(7):
-                    columns[k] = min(max(u + k - 3, 0), width - 1)
-                for k in range(7):
-                    row = band[min(max(v + k - 3, 0), height - 1)]
-                    rows[k, 0] = rows[k, 1] = single(0.0)
-                    for m in range(6):
-                        rows[k, 0] += taps[5 - m] * row[columns[m]]
-                        rows[k, 1] += taps[m] * row[columns[m + 1]]
-                for x in range(2):
-                    above, below = single(0.0), single(0.0)
-                    for m in range(6):
-                        above += taps[5 - m] * rows[m, x]
-                        below += taps[m] * rows[m + 1, x]
-                    large[2 * v, 2 * u + x], large[2 * v + 1, 2 * u + x] = above, below
+                if _tops_enlarged(large, band, low, disc, v, u):
+                    found[0, count], found[1, count], high[count] = u, v, own
+                    count += 1
+    return found[:, :count].copy(), high[:count].copy()
 
 
 @_compiled_for(*((own,) for own in (_grey, _byte)))

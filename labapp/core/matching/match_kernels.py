@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 from numba import types
 
-from labapp.core.compiled import compiled
+from labapp.core.compiled import compiled, inner
 from labapp.core.values import BoolArray, FloatArray, IntArray
 
-_f2, _f3 = (types.Array(types.float64, n, "A", readonly=True) for n in (2, 3))
+_f1, _f2, _f3 = (types.Array(types.float64, n, "A", readonly=True) for n in (1, 2, 3))
+_uncertain = types.Tuple((_f2, _f3))  # type: ignore[no-untyped-call]
+_i1, _i2 = (types.Array(types.int64, n, "A", readonly=True) for n in (1, 2))
 
 
 @compiled(_f2, _f3, _f2, _f3)
@@ -115,6 +117,22 @@ def amid(lit: BoolArray) -> BoolArray:
     return made
 
 
+@compiled(types.Array(types.boolean, 2, "A", readonly=True))
+def between(lit: BoolArray) -> BoolArray:
+    """Rays with lit ones on either side, in their row or in their column, (rows, columns)."""
+    rows, columns = lit.shape
+    made = np.zeros((rows, columns), np.bool_)
+    for i in range(rows):
+        some = np.flatnonzero(lit[i])
+        if len(some) > 1:
+            made[i, some[0] + 1 : some[-1]] = True
+    for j in range(columns):
+        some = np.flatnonzero(lit[:, j])
+        if len(some) > 1:
+            made[some[0] + 1 : some[-1], j] = True
+    return made
+
+
 @compiled(_f2)
 def two_least(values: FloatArray) -> tuple[IntArray, FloatArray, IntArray, FloatArray]:
     """Where each row's least value is and its second least; the same of each column.
@@ -160,3 +178,134 @@ def medians_around(values: FloatArray) -> FloatArray:
             if count:
                 medians[i, j] = np.median(around[:count])
     return medians
+
+
+# --- labels that a surface does not support ----------------------------------------------------
+
+
+@inner
+def _deviances(
+    off: FloatArray, covariance: FloatArray, excess: float
+) -> tuple[FloatArray, FloatArray]:
+    """Squared lengths of residuals, shape (n, 2), in σ, and deviances, as of `pair_deviances`.
+
+    Covariances, shape (n, 2, 2), are so many times as large.
+    """
+    distance, deviance = np.empty(len(off)), np.empty(len(off))
+    for n in range(len(off)):
+        x, y, xy = off[n, 0], off[n, 1], excess * covariance[n, 0, 1]
+        xx, yy = excess * covariance[n, 0, 0], excess * covariance[n, 1, 1]
+        area = xx * yy - xy * xy
+        distance[n] = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / area
+        deviance[n] = distance[n] + np.log(area)
+    return distance, deviance
+
+
+@inner
+def _least_deviance(
+    place: FloatArray,
+    covariance: FloatArray,
+    others: FloatArray,
+    of_others: FloatArray,
+    excess: float,
+) -> float:
+    """Least deviance of a place from others, as of `pair_deviances`; infinite from none.
+
+    Covariances, shapes (2, 2) and (m, 2, 2), are so many times as large; others of which it is NaN
+    do not count.
+    """
+    least = np.inf
+    for m in range(len(others)):
+        x, y = place[0] - others[m, 0], place[1] - others[m, 1]
+        xx = excess * (covariance[0, 0] + of_others[m, 0, 0])
+        xy = excess * (covariance[0, 1] + of_others[m, 0, 1])
+        yy = excess * (covariance[1, 1] + of_others[m, 1, 1])
+        area = xx * yy - xy * xy
+        deviance = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / area + np.log(area)
+        least = deviance if deviance < least else least
+    return least
+
+
+@inner
+def _with_variance(covariance: FloatArray, variance: float) -> FloatArray:
+    """Covariances, shape (n, 2, 2), and a variance along both axes more."""
+    made = covariance.copy()
+    for n in range(len(made)):
+        made[n, 0, 0] += variance
+        made[n, 1, 1] += variance
+    return made
+
+
+@inner
+def _is_worst_around(worst: FloatArray, i: int, j: int) -> bool:
+    """Whether none of the eight values round one, of shape (rows, columns), is over it."""
+    rows, columns = worst.shape
+    for k in range(max(i - 1, 0), min(i + 2, rows)):
+        for m in range(max(j - 1, 0), min(j + 2, columns)):
+            if worst[k, m] > worst[i, j]:
+                return False
+    return True
+
+
+@compiled(_i2, _uncertain, _uncertain, _f1, _i1, _i1, _f1)
+def failing_labels(
+    labels: IntArray,
+    dots: tuple[FloatArray, FloatArray],
+    surface: tuple[FloatArray, FloatArray],
+    shows: FloatArray,
+    missed: IntArray,
+    stray: IntArray,
+    limits: FloatArray,
+) -> BoolArray:
+    """Labels that their ray alone does not explain, of neighbours the worst (`outliers`).
+
+    Parameters
+    ----------
+    labels
+        Index of each ray's dot, below 0 where it has none, shape (rows, columns).
+    dots
+        Places of dots and their covariances, shapes (d, 2), mm, and (d, 2, 2), mm².
+    surface
+        Dots that the surface makes of all R rays, row by row, and their covariances as far as the
+        surface is uncertain, shapes (R, 2), mm, and (R, 2, 2), mm²; NaN where unknown.
+    shows
+        Probability that a labelled ray came back and has a dot, row by row, shape (n,).
+    missed, stray
+        Numbers of rays without a dot amid the others, and of dots without a ray.
+    limits
+        Least variance of a dot in the fit, mm²; how far points still moved; largest leverage (both
+        `left_out`); inflation of the surface's variance; variance of its model, mm²; median of χ²;
+        deviance of a false dot; the largest squared distance; margin over rivals.
+
+    Returns
+    -------
+    BoolArray
+        Shape (rows, columns).
+    """
+    floor, unsettled, leverage, inflation, error, median, false, gate, margin = limits
+    (places, seen), (predicted, drawn) = dots, surface
+    rays = np.flatnonzero(labels.ravel() >= 0)
+    number = labels.ravel()[rays]
+    own, fitted = places[number], _with_variance(seen[number], floor)
+    off, computed = left_out(predicted[rays] - own, fitted, drawn[rays], unsettled, leverage)
+    spread = _with_variance(inflation * computed, error)
+    both = fitted + spread
+    distance, _ = _deviances(off, both, 1.0)
+    excess = np.median(distance) / median
+    excess = excess if excess > 1.0 else 1.0
+    distance, deviance = _deviances(off, both, excess)
+    around = _with_variance(inflation * drawn[missed], error)
+    worst = np.zeros(labels.shape)
+    for n in range(len(rays)):
+        by_ray = deviance[n] + 2.0 * np.log(1.0 - shows[n]) - 2.0 * np.log(max(shows[n], 1e-300))
+        rival = min(
+            _least_deviance(own[n] + off[n], spread[n], places[stray], seen[stray], excess),
+            _least_deviance(own[n], fitted[n], predicted[missed], around, excess),
+        )
+        if distance[n] > gate or by_ray + margin > false or deviance[n] + margin > rival:
+            worst[rays[n] // labels.shape[1], rays[n] % labels.shape[1]] = distance[n]
+    fails = np.zeros(labels.shape, np.bool_)
+    for i in range(len(labels)):
+        for j in range(labels.shape[1]):
+            fails[i, j] = worst[i, j] > 0.0 and _is_worst_around(worst, i, j)
+    return fails

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from labapp.core.match import missing_share
@@ -21,7 +20,7 @@ from labapp.core.matching.prediction import (
 from labapp.core.matching.ray_classes import RayClasses
 from labapp.core.surface.level import Level, Witnesses
 from labapp.core.surface.spline import SplineBasis
-from labapp.core.values import BoolArray, FloatArray, IntArray, median
+from labapp.core.values import FloatArray, IntArray
 
 WIDE = 1.45
 """A dot so many times as wide as the median of those around it is two in one. Of 15,000 dots of
@@ -101,73 +100,50 @@ def unsupported(observed: Observation, fitted: FittedLabels) -> IntArray:
     """
     from labapp.core.matching import match_kernels
 
-    labels, classes, paths = fitted.labels, fitted.classes, fitted.paths
-    lit = labels != UNLABELLED
-    dots, rays = labels[lit], np.flatnonzero(lit)
-    place, error = observed.plane_mm[dots], MODEL_ERROR_MM**2 * np.eye(2)
-    seen = observed.covariance_mm2[dots] + fitted.floor_mm**2 * np.eye(2)
-    residual, drawn = paths.plane_mm[rays] - place, fitted.covariance_mm2[rays]
-    how = LEVER * fitted.unsettled_mm, MOST_LEVERAGE
-    off, computed = match_kernels.left_out(residual, seen, drawn, *how)
-    spread = SIGMA_INFLATION**2 * computed + error
-    distance, deviance = _deviances(off, seen + spread)
-    excess = max(1.0, median(distance) / MEDIAN_CHI2)
-    distance, deviance = _deviances(off, excess * (seen + spread))
-
-    share = missing_share(len(classes.missed), len(rays))
-    shows = (1 - share) * np.where(_between(lit)[lit], 1.0, _inside(observed, fitted, share))
-    own = deviance + 2 * np.log(1 - shows) - 2 * np.log(np.maximum(shows, 1e-300))
-    false_per_mm2 = max(FALSE_DOTS_PER_MM2, (len(classes.stray) + 1) / observed.view_mm2)
-    fails = (distance > GATE_SIGMA2) | (own + RIVAL_MARGIN > false_dot_deviance(false_per_mm2))
-
-    rival = np.full(len(dots), np.inf)
-    if len(classes.stray):
-        other = observed.plane_mm[classes.stray], excess * observed.covariance_mm2[classes.stray]
-        made = match_kernels.pair_deviances(*other, place + off, excess * spread)[1]
-        rival = made.min(axis=0)
-    if len(classes.missed):
-        missed = classes.missed[np.isfinite(fitted.covariance_mm2[classes.missed, 0, 0])]
-        around = SIGMA_INFLATION**2 * fitted.covariance_mm2[missed] + error
-        made = match_kernels.pair_deviances(
-            place, excess * seen, paths.plane_mm[missed], excess * around
-        )[1]
-        rival = np.minimum(rival, made.min(axis=1, initial=np.inf))
-    fails |= deviance + RIVAL_MARGIN > rival
-
-    worst, size = np.zeros(lit.shape), np.full(lit.shape, np.nan)
-    worst[lit], size[lit] = np.where(fails, distance, 0.0), observed.size_mm[dots]
-    beside = cv2.dilate(worst, np.array([[1, 1, 1], [1, 0, 1], [1, 1, 1]], np.uint8))
-    wide = size > WIDE * match_kernels.medians_around(size)
-    return np.asarray(labels[lit & (wide | ((worst > 0.0) & (worst >= beside)))])
-
-
-def _deviances(off: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Squared lengths of residuals, shape (n, 2), in σ, and deviances, as of `pair_deviances`."""
-    (x, y), (xx, xy, yy) = off.T, covariance[:, [0, 0, 1], [0, 1, 1]].T
-    area = xx * yy - xy * xy
-    distance = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / area
-    return distance, distance + np.log(area)
-
-
-def _between(lit: BoolArray) -> BoolArray:
-    """Rays with lit ones on either side of them in their row or in their column."""
-    between = np.zeros_like(lit)
-    for axis in (0, 1):
-        upto = np.cumsum(lit, axis=axis)
-        between |= (upto > lit) & (upto < np.sum(lit, axis=axis, keepdims=True))
-    return between
+    labels, classes = fitted.labels, fitted.classes
+    lit, stray = labels != UNLABELLED, classes.stray
+    share = missing_share(len(classes.missed), int(lit.sum()))
+    false_per_mm2 = max(FALSE_DOTS_PER_MM2, (len(stray) + 1) / observed.view_mm2)
+    limits = np.array(
+        [
+            fitted.floor_mm**2,
+            LEVER * fitted.unsettled_mm,
+            MOST_LEVERAGE,
+            SIGMA_INFLATION**2,
+            MODEL_ERROR_MM**2,
+            MEDIAN_CHI2,
+            false_dot_deviance(false_per_mm2),
+            GATE_SIGMA2,
+            RIVAL_MARGIN,
+        ]
+    )
+    fails = match_kernels.failing_labels(
+        labels,
+        (observed.plane_mm, observed.covariance_mm2),
+        (fitted.paths.plane_mm, fitted.covariance_mm2),
+        (1 - share) * _inside(observed, fitted, share),
+        classes.missed,
+        stray,
+        limits,
+    )
+    size = np.full(lit.shape, np.nan)
+    size[lit] = observed.size_mm[labels[lit]]
+    return np.asarray(labels[fails | (size > WIDE * match_kernels.medians_around(size))])
 
 
 def _inside(observed: Observation, fitted: FittedLabels, missing: float) -> FloatArray:
-    """Probability of each of the n labelled rays to land inside the boundary, shape (n,), ≤ 1/2.
+    """Probability of each of the n labelled rays to land inside the boundary, shape (n,).
 
-    It is that of `level.find_level`, with the level's uncertainty, and as much blur as the rays
-    near the boundary contradict it. Where a ray seems to land outside, the level is that which the
-    others give.
+    That of rays between others is 1, that of others at most 1/2: that of `level.find_level`, with
+    the level's uncertainty, and as much blur as the rays near the boundary contradict it. Where a
+    ray seems to land outside, the level is that which the others give.
     """
+    from labapp.core.matching import match_kernels
     from labapp.core.surface import kernels
 
-    at, known, level = np.argwhere(fitted.labels != UNLABELLED), fitted.classes, fitted.level
+    lit, known, level = fitted.labels != UNLABELLED, fitted.classes, fitted.level
+    inside = np.ones(lit.shape)
+    at = np.argwhere(lit & ~match_kernels.between(lit))
     landing, coefficients = observed.landing_mm[tuple(at.T)], fitted.paths.coefficients
     height = kernels.surface_at(fitted.basis.grid, coefficients, landing)[0]
     outside = level.sign * (height - level.rear.height(landing[:, 1])) < 0.0
@@ -182,4 +158,5 @@ def _inside(observed: Observation, fitted: FittedLabels, missing: float) -> Floa
                 Witnesses.of(*rays).negative_log_evidence(fitted.basis, coefficients, level)
             )
         odds[k] = np.exp(min(nats[1] - nats[0], 0.0))
-    return odds / (1 + odds)
+    inside[tuple(at.T)] = odds / (1 + odds)
+    return np.asarray(inside[lit])

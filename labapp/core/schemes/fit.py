@@ -26,7 +26,8 @@ UNSETTLED_MM = 0.02
 
 
 CHANGED = 0.1
-"""The set-up's part of the uncertainty is worked out anew where a size changed by this share."""
+"""The set-up's part of the uncertainty is worked out anew where a size differs by this share from
+those that it was worked out for."""
 
 
 @dataclass(frozen=True)
@@ -42,11 +43,17 @@ class SetupPart(ReadOnlyArrays):
     sigma: FloatArray
     sizes: FloatArray
 
-    def holds_for(self, sizes: FloatArray) -> bool:
-        """Whether no size, shape (6,), has changed by more than `CHANGED`; depth as height."""
+    def change_to(self, sizes: FloatArray) -> float:
+        """Largest change of a size, shape (6,), as a share of it; depth as a share of height."""
         scale = np.abs(self.sizes)
         scale[2:4] = scale[2:4].max()
-        return bool((np.abs(sizes - self.sizes) <= CHANGED * scale).all())
+        return float(np.max(np.abs(sizes - self.sizes) / scale))
+
+
+def nearest_part(parts: tuple[SetupPart, ...], sizes: FloatArray) -> SetupPart | None:
+    """The part of the nearest sizes, shape (6,); None where all are farther than `CHANGED`."""
+    nearest = min(parts, key=lambda part: part.change_to(sizes), default=None)
+    return nearest if nearest and nearest.change_to(sizes) <= CHANGED else None
 
 
 @dataclass(frozen=True)
@@ -61,12 +68,12 @@ class Known:
         Uncertainty of the height of the n reflection points, their level apart, shape (n,), mm;
         None: to be worked out.
     by_setup
-        The set-up's part of the uncertainty of sizes; None: to be worked out.
+        The set-up's part of the uncertainty, as it was worked out for some sizes before.
     """
 
     boundary: Boundary
     free_sigma_mm: FloatArray | None
-    by_setup: SetupPart | None
+    by_setup: tuple[SetupPart, ...]
 
 
 def reconstruct(match: Match, rig: Rig, settings: FitSettings) -> Reconstruction:
@@ -127,8 +134,9 @@ def complete(
         raise CannotMeasure(
             "open-boundary", "the surface comes down to the work piece within its boundary"
         )
-    if known is not None and known.by_setup and known.by_setup.holds_for(sizes.size):
-        by_setup = known.by_setup.sigma
+    part = None if known is None else nearest_part(known.by_setup, sizes.size)
+    if part is not None:
+        by_setup = part.sigma
     else:
         by_setup = setup_sigma(setup_changes(match, rig, settings, pool, sizes.gradient))
     free = None if known is None else known.free_sigma_mm

@@ -13,7 +13,7 @@ from labapp.core.geometry.bench import Bench
 from labapp.core.images.band_pass import DetectorTuning
 from labapp.core.match import Match
 from labapp.core.matching.prediction import RayPaths
-from labapp.core.schemes.fit import UNSETTLED_MM, Known, SetupPart
+from labapp.core.schemes.fit import UNSETTLED_MM, Known, SetupPart, nearest_part
 from labapp.core.surface.boundary import Boundary
 from labapp.core.surface.level import Level
 from labapp.core.surface.measures import Measures
@@ -35,7 +35,7 @@ MOST_ROUNDS, SETTLED_MM = 8, 3e-4
 
 POINTS_EVERY, SETUP_EVERY, SINKS_EVERY = 8, 64, 16
 """Every so many frames the uncertainty of the reflection points is worked out anew, that of the
-sizes by the set-up, and whether the rear lies below the work piece."""
+sizes by the set-up for whatever sizes there are, and whether the rear lies below the work piece."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,8 @@ class Prior:
         Uncertainty of the height where each ray meets the surface, its level apart, as it was last
         worked out, shape (R,), mm; NaN where it never was. It changes slowly.
     by_setup
-        The set-up's part of the uncertainty of sizes, as it was last worked out.
+        The set-up's part of the uncertainty of sizes, for each of the sizes that it was worked out
+        for since it was last worked out anew for all: a pool that oscillates has them again.
     unseen
         Frames since the absent ray's place was last seen dark amid four lit ones.
     count
@@ -104,7 +105,7 @@ class Prior:
     slopes: FloatArray
     open_mm: float
     free_sigma_mm: FloatArray
-    by_setup: SetupPart
+    by_setup: tuple[SetupPart, ...]
     unseen: int = 0
     count: int = 0
 
@@ -134,14 +135,14 @@ class Prior:
             slopes=paths.slopes[None],
             open_mm=level.sigma_mm,
             free_sigma_mm=np.full(len(paths.slopes), np.nan),
-            by_setup=SetupPart(made.size_sigma_setup, measures.sizes),
+            by_setup=(SetupPart(made.size_sigma_setup, measures.sizes),),
         )
 
     def followed_by(self, followed: Followed, made: Reconstruction, measures: Measures) -> Prior:
         """That of the next frame, which followed on this one."""
-        by_setup, sizes = self.by_setup, measures.sizes
-        if self.setup_is_due or not by_setup.holds_for(sizes):  # then it was worked out anew
-            by_setup = SetupPart(made.size_sigma_setup, sizes)
+        by_setup, sizes = () if self.setup_is_due else self.by_setup, measures.sizes
+        if nearest_part(by_setup, sizes) is None:  # then it was worked out
+            by_setup = *by_setup, SetupPart(made.size_sigma_setup, sizes)
         paths, lit, pool = followed.paths, followed.lit, followed.pool
         free = self.free_sigma_mm.copy()
         free[lit.ravel()] = np.sqrt(np.maximum(made.sigma_mm**2 - pool.level.sigma_mm**2, 0.0))
@@ -177,7 +178,7 @@ class Prior:
         """
         free = self.free_sigma_mm[lit.ravel()]
         is_known = self.count % POINTS_EVERY != 0 and bool(np.isfinite(free).all())
-        by_setup = None if self.setup_is_due else self.by_setup
+        by_setup = () if self.setup_is_due else self.by_setup
         return Known(self.boundary, free if is_known else None, by_setup)
 
     def after_gap(self) -> Prior:
