@@ -35,8 +35,8 @@ from labapp.core.values import (
 )
 
 MARGIN_ROWS, LEAST_MARGIN_MM = 2.5, 2.0
-"""How far beyond the outermost reflection points the splines go on: in rows of rays, and at least so
-far, mm. Between them and the boundary the torch may hide some, or dots miss the imaging plane: of a
+"""How far beyond the outermost reflection points the splines go on: in rows of rays, and at least,
+mm. Before the boundary is reached the torch may hide some, or dots miss the imaging plane: of a
 dense pattern that is as wide a strip of the pool, and more rows."""
 
 CORRELATED_MM2 = 1.0
