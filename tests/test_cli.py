@@ -477,7 +477,7 @@ def test_detect_by_the_methods_of_the_text(
         assert labapp("detect", SAMPLE / "recording.avi", "--out", out, *chosen)[0] in {0, 1}
         found[name] = table(out)
     assert found["text"] != found["usual"]
-    assert len(found["text"]) > 60
+    assert len(found["text"]) > 40
 
 
 def test_detect_refuses_a_size_that_the_detector_has_not(labapp: Run, tmp_path: Path) -> None:
