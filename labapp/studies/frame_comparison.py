@@ -15,7 +15,7 @@ import numpy as np
 
 from labapp.core.geometry.rig import Rig
 from labapp.core.match import ORIENTATIONS, Match, Orientation, ways
-from labapp.core.rows.row_shape import ALLOWED, match_row_shapes
+from labapp.core.matching.row_shape import ALLOWED, match_row_shapes
 from labapp.core.schemes.irs import Algorithm, IrsSettings, estimates
 from labapp.core.schemes.slopes import Estimate, ReflectedRays, reflected_rays
 from labapp.core.surface.measures import inside_points, reflection_scale

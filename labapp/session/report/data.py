@@ -13,8 +13,8 @@ import numpy as np
 
 from labapp.config.setup import Setup
 from labapp.core.geometry.rig import ImagingPlane, Rig
+from labapp.core.matching.row_shape import match_row_shapes
 from labapp.core.pipeline import Measurement, Settings
-from labapp.core.rows.row_shape import match_row_shapes
 from labapp.core.sequence.mean import series_of, sigma_of_mean
 from labapp.core.surface.measures import SIZES, Measures, sigma_name
 from labapp.core.values import FloatArray
