@@ -466,6 +466,29 @@ def test_detect_writes_its_columns(labapp: Run, tmp_path: Path) -> None:
     assert said.startswith(f"{len(rows)} dots, ")
 
 
+@pytest.mark.parametrize("options", [("--detector", "block-threshold"), ("--rows", "rows")])
+def test_detect_by_the_methods_of_the_text(
+    labapp: Run, tmp_path: Path, options: tuple[str, str]
+) -> None:
+    found = {}
+    for name, chosen in (("usual", ()), ("text", options)):
+        out = tmp_path / f"{name}.csv"
+        # The text's detector finds dots here of which the default search makes no rows.
+        assert labapp("detect", SAMPLE / "recording.avi", "--out", out, *chosen)[0] in {0, 1}
+        found[name] = table(out)
+    assert found["text"] != found["usual"]
+    assert len(found["text"]) > 40
+
+
+def test_detect_refuses_a_size_that_the_detector_has_not(labapp: Run, tmp_path: Path) -> None:
+    options = ("--size", "2", "--detector", "wavelet")
+    code, _, complained = labapp(
+        "detect", SAMPLE / "recording.avi", "--out", tmp_path / "dots.csv", *options
+    )
+    assert code == 2
+    assert "--size" in complained
+
+
 def test_detect_does_not_write_over_its_image(labapp: Run, tmp_path: Path) -> None:
     image = tmp_path / "frame.png"
     cv2.imwrite(str(image), np.full((40, 40), 90, np.uint8))

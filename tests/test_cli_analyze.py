@@ -156,11 +156,23 @@ def test_what_cannot_be_is_refused(
 def test_a_frame_is_compared_by_algorithm(labapp: Run, tmp_path: Path) -> None:
     recording = SETUP.with_name("recording.avi")
     given = ["analyze", "frame", str(recording), "--setup", str(SETUP), "--frame", "3"]
-    code, _, err = labapp(*given, "--out", str(tmp_path))
+    code, _, err = labapp(*given, "--known-object", "7", "0.3", "--out", str(tmp_path))
     assert code == 0, err
+    (shape,) = table(tmp_path / "section_7_1_row_shape.csv")
+    assert (shape["by_residual"], shape["agree"]) == ("S/S", "yes")
+    known = table(tmp_path / "section_8_2_known_object.csv")
+    assert [row["status"] for row in known if row["scheme"] == "fit"] == ["ok"]
     assert len(table(tmp_path / "figure_6_10_edge_points.csv")) == 9
     rows = table(tmp_path / "figure_6_13_base_height.csv")
     assert len({row["base_height_mm"] for row in rows}) == 11
+
+
+def test_an_impossible_known_object_is_refused(labapp: Run) -> None:
+    recording = SETUP.with_name("recording.avi")
+    given = ["analyze", "frame", str(recording), "--setup", str(SETUP)]
+    code, _, err = labapp(*given, "--known-object", "9", "5", "--tables")
+    assert code == 2
+    assert "--known-object" in err
 
 
 def test_a_frame_that_is_not_there_is_refused(labapp: Run) -> None:

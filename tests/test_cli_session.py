@@ -383,6 +383,22 @@ def test_a_scheme_is_a_setting_that_can_be_undone(labapp: Run, measured: Path) -
         assert not session.overview().stale.any()
 
 
+def test_detector_and_row_search_are_settings(labapp: Run, measured: Path) -> None:
+    options = ("--detector", "block-threshold", "--rows", "masks")
+    code, said, _ = labapp("session", "measure", measured, "--frames", 2, *options)
+    assert code in {0, 1}
+    assert "detector block-threshold, rows masks" in said
+    with opened(measured) as session:
+        settings = session.settings
+        assert (settings.dots.method, settings.lattice.method) == ("block-threshold", "masks")
+        result = session.result(2)
+        assert result is not None
+        assert result.settings.dots.method == "block-threshold"
+    labapp("session", "undo", measured)
+    with opened(measured) as session:
+        assert session.settings == Settings()
+
+
 def test_a_run_without_a_surface_ends_with_1(labapp: Run, file: Path) -> None:
     code, said, complained = labapp(
         "session", "measure", file, "--frames", "0:2", "--scheme", "ers"

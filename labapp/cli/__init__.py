@@ -35,13 +35,17 @@ from labapp.cli import (
 )
 from labapp.cli.shared import (
     BAD_INPUT,
+    DETECTOR_HELP,
     FAULT,
     FRAMES_HELP,
     FRAMES_METAVAR,
     INTERRUPTED,
     NOTHING_MEASURED,
+    ROWS_HELP,
     TERMINATED,
     Commands,
+    DetectorName,
+    RowsName,
     choose_frames,
     measure_frames,
 )
@@ -212,9 +216,11 @@ def detect(
             max=20.0,
             metavar="PX",
             help="Standard deviation of a dot's light (px), about a quarter of what is seen "
-            "across; without it, it is estimated from the image.",
+            "across; without it, it is estimated from the image. Of band-pass alone.",
         ),
     ] = None,
+    detector: Annotated[DetectorName, typer.Option(help=DETECTOR_HELP)] = "band-pass",
+    rows: Annotated[RowsName, typer.Option(help=ROWS_HELP)] = "grow",
 ) -> None:
     """Find the dots of one image and their rows and columns, without a setup.
 
@@ -222,9 +228,15 @@ def detect(
 
     A dot in doubt has none: its cells are empty. Exit code 1: no dot has any.
     """
+    from labapp.core.images.dots import BandPassSettings
+    from labapp.core.images.find_dots import DotSettings
+    from labapp.core.rows.find_lattice import LatticeSettings
     from labapp.run.detect import detect_dots, write_detected
 
-    dots, lattice, doubt = detect_dots(image, size)
+    if size is not None and detector != "band-pass":
+        raise InputError("--size", "size", size, "--detector band-pass, which alone has it")
+    how = DotSettings(detector, BandPassSettings(size_px=size)), LatticeSettings(rows)
+    dots, lattice, doubt = detect_dots(image, *how)
     if out.exists() and out.samefile(image):
         raise InputError(out, "--out", "the image itself", "another file, for the dots (CSV)")
     write_detected(out, dots, lattice)

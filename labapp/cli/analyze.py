@@ -130,19 +130,31 @@ def frame(
     source: Annotated[Path, typer.Argument(help="A recording, or one image.")],
     setup: Annotated[Path, typer.Option(help="Setup file (TOML).")],
     number: Annotated[int, typer.Option("--frame", min=0, help="Which frame.")] = 0,
+    known_object: Annotated[
+        tuple[float, float] | None,
+        typer.Option(
+            metavar="DIAMETER HEIGHT",
+            help="The frame shows a cap of this size, such as a thumb tack (mm); the height of a "
+            "hollow is below 0. The error of every scheme, with a circle as boundary (§8.2).",
+        ),
+    ] = None,
     out: Out = None,
     tables: Tables = False,
 ) -> None:
     """Compare algorithms, correspondences and base heights of IRS on a frame (Fig. 6-10, 6-13).
+
+    The correspondence by the shape of the reflected rows (§7.1) stands beside the one that was
+    found.
 
     Exit code 1: the frame's dots have no rays.
     """
     from labapp.config.setup import read_setup
     from labapp.core.pipeline import Settings, measure
     from labapp.media import open_source
-    from labapp.studies.frame_comparison import comparison_tables
+    from labapp.studies.frame_comparison import comparison_tables, shape_table
+    from labapp.studies.known_object import known_cap, known_object_table
 
-    known = read_setup(setup)
+    known, cap = read_setup(setup), None if known_object is None else known_cap(*known_object)
     with open_source(source) as recording:
         if number >= len(recording):
             allowed = f"frames 0 to {len(recording) - 1} of {source}"
@@ -152,7 +164,9 @@ def frame(
     if found.match is None:
         typer.echo(f"{source}: {found.status}: {found.reason}", err=True)
         raise typer.Exit(NOTHING_MEASURED)
-    made = comparison_tables(found.match, known.rig)
+    made = (shape_table(found.match), *comparison_tables(found.match, known.rig))
+    if cap is not None:
+        made = (known_object_table(found.match, known.rig, cap), *made)
     _keep(results_folder(out, tables), AnalysisPart(made, {}, made if tables else ()))
 
 

@@ -16,18 +16,23 @@ import typer
 
 from labapp.cli.shared import (
     ABOUT_SCHEMES,
+    DETECTOR_HELP,
     FRAMES_HELP,
     FRAMES_METAVAR,
     INTERRUPTED,
     NOTHING_MEASURED,
     RECORDING_HELP,
+    ROWS_HELP,
     Algorithm,
+    DetectorName,
+    RowsName,
     SchemeName,
     SigmaParts,
     Warm,
     note,
     progress_bar,
     progress_sink,
+    with_methods,
 )
 from labapp.core.schemes import SCHEMES
 from labapp.errors import InputError
@@ -59,11 +64,13 @@ def reconstruct(
         Literal["auto", "S/S", "S/I", "I/I"],
         typer.Option(help="Order of columns/rows of dots to that of rays: same S, inverse I."),
     ] = "auto",
+    *,
+    detector: Annotated[DetectorName, typer.Option(help=DETECTOR_HELP)] = "band-pass",
+    rows: Annotated[RowsName, typer.Option(help=ROWS_HELP)] = "grow",
     frames: Annotated[str, typer.Option(metavar=FRAMES_METAVAR, help=FRAMES_HELP)] = ":",
     surfaces: Annotated[
         Literal["all", "none"], typer.Option(help="Write the surface of every frame, or of none.")
     ] = "all",
-    *,
     sigma_parts: SigmaParts = False,
     warm: Warm = False,
     lines: Annotated[
@@ -89,6 +96,7 @@ def reconstruct(
     if algorithm != "opa" and not SCHEMES[scheme].algorithms:
         raise InputError("--algorithm", "algorithm", algorithm, "--scheme irs, which alone has it")
     settings = Settings(scheme=scheme, algorithm=algorithm, correspondence=correspondence)
+    settings = with_methods(settings, detector, rows)
     places = {"lines": lines, "opcua": opcua}
     with ExitStack() as at_end:
         streams = _stream_sinks(at_end, places, anywhere)

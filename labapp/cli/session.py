@@ -15,13 +15,17 @@ from labapp.cli.correct import InOrder, correct
 from labapp.cli.info import info
 from labapp.cli.shared import (
     ABOUT_SCHEMES,
+    DETECTOR_HELP,
     FRAMES_HELP,
     FRAMES_METAVAR,
     NOTHING_MEASURED,
     RECORDING_HELP,
+    ROWS_HELP,
     Algorithm,
     Commands,
+    DetectorName,
     ResultsName,
+    RowsName,
     SchemeName,
     SigmaParts,
     Warm,
@@ -32,6 +36,7 @@ from labapp.cli.shared import (
     measure_frames,
     progress_shown,
     report_stale_results,
+    with_methods,
 )
 from labapp.core.schemes import SCHEMES, scheme_words
 from labapp.errors import InputError
@@ -235,11 +240,17 @@ def measure(
         Literal["auto", "S/S", "S/I", "I/I"] | None,
         typer.Option(help="From now on: order of columns/rows of dots to that of rays."),
     ] = None,
+    *,
+    detector: Annotated[
+        DetectorName | None, typer.Option(help=f"From now on. {DETECTOR_HELP}")
+    ] = None,
+    rows: Annotated[RowsName | None, typer.Option(help=f"From now on. {ROWS_HELP}")] = None,
     warm: Warm = False,
 ) -> None:
     """Measure frames: those that are not measured yet or whose measures no longer stand.
 
-    Scheme, algorithm and correspondence are kept as settings of the session; that can be undone.
+    Scheme, algorithm, correspondence, detector and search for rows are kept as settings of the
+    session; that can be undone.
 
     Ctrl-C or SIGTERM stops after whole frames: what was finished is kept.
     """
@@ -251,7 +262,8 @@ def measure(
         _ = session.setup  # what is missing in it is reported before anything is changed
         chosen = choose_frames(session, frames or ":")
         options = {"scheme": scheme, "algorithm": algorithm, "correspondence": correspondence}
-        _set(session, {name: value for name, value in options.items() if value is not None})
+        given = {name: value for name, value in options.items() if value is not None}
+        _set(session, given, detector, rows)
         if frames is None and not everything:
             chosen = session.stale_frames().tolist()
         if not chosen:
@@ -263,14 +275,22 @@ def measure(
         raise typer.Exit(NOTHING_MEASURED)
 
 
-def _set(session: Session, options: dict[str, str]) -> None:
+def _set(
+    session: Session,
+    options: dict[str, str],
+    detector: DetectorName | None,
+    rows: RowsName | None,
+) -> None:
     """Make options the session's settings, in one step of its history."""
     settings: Settings = replace(session.settings, **options)  # type: ignore[arg-type]
+    settings = with_methods(settings, detector, rows)
     if "algorithm" in options and not SCHEMES[settings.scheme].algorithms:
         wanted = "--scheme irs, which alone has it"
         raise InputError("--algorithm", "algorithm", settings.algorithm, wanted)
     if settings != session.settings:
-        message = ", ".join(f"{name} {value}" for name, value in options.items())
+        methods = (("detector", detector), ("rows", rows))
+        named = options | {name: value for name, value in methods if value is not None}
+        message = ", ".join(f"{name} {value}" for name, value in named.items())
         session.set_settings(settings, message)
         typer.echo(f"Settings: {message} (labapp session undo takes it back)")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeAlias
 
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress, TaskID
 
+    from labapp.core.pipeline import Settings
     from labapp.core.schemes import irs
     from labapp.export.frame_result import FrameResult
     from labapp.export.summary import Summary
@@ -61,6 +63,11 @@ Warm = Annotated[
     ),
 ]
 
+DetectorName: TypeAlias = Literal["band-pass", "block-threshold", "wavelet"]
+RowsName: TypeAlias = Literal["grow", "rows", "masks"]
+DETECTOR_HELP = "How dots are found: band-pass, block threshold (§5.2.1), wavelet chain (§5.3)."
+ROWS_HELP = "How rows are found: grown from dot to dot, row search (§5.2.2), masks (§5.3)."
+
 SigmaParts = Annotated[
     bool,
     typer.Option(
@@ -78,6 +85,18 @@ class Commands(typer.core.TyperGroup):
             formatter.write_dl(
                 [(name, one.get_short_help_str(limit=1000)) for name, one in self.commands.items()]
             )
+
+
+def with_methods(
+    settings: Settings, detector: DetectorName | None, rows: RowsName | None
+) -> Settings:
+    """Settings with another detector and another search for rows; None: that which they have."""
+    dots, lattice = settings.dots, settings.lattice
+    return replace(
+        settings,
+        dots=replace(dots, method=detector or dots.method),
+        lattice=replace(lattice, method=rows or lattice.method),
+    )
 
 
 def progress_bar() -> Progress:

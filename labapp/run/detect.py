@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from labapp.core.images.dots import BandPassSettings, Dots
+from labapp.core.images.dots import Dots
 from labapp.core.images.find_dots import DotSettings, find_dots
 from labapp.core.rows.find_lattice import LatticeSettings, find_lattice
 from labapp.core.rows.lattice import Lattice
@@ -22,11 +22,9 @@ COLUMNS = "u_px v_px reflected_row reflected_column snr u_sigma_px v_sigma_px".s
 
 
 def detect_dots(
-    path: str | os.PathLike[str], size_px: float | None = None
+    path: str | os.PathLike[str], dot_settings: DotSettings, lattice_settings: LatticeSettings
 ) -> tuple[Dots, Lattice | None, str]:
     """Find the dots of a source's first frame, their rows and columns, and what is in doubt.
-
-    ``size_px`` is the standard deviation of a dot's light; None: it is estimated.
 
     Returns
     -------
@@ -39,11 +37,10 @@ def detect_dots(
         If the source cannot be read.
     """
     image = read_picture(path)
-    settings = DotSettings(band_pass=BandPassSettings(size_px=size_px))
     dots = Dots(*np.empty((7, 0)))
     try:
-        dots = find_dots(image, settings)
-        return dots, find_lattice(dots, (image.shape[0], image.shape[1]), LatticeSettings()), ""
+        dots = find_dots(image, dot_settings)
+        return dots, find_lattice(dots, (image.shape[0], image.shape[1]), lattice_settings), ""
     except CannotMeasure as answer:
         return dots, None, str(answer)
 

@@ -1,5 +1,7 @@
 """IRS on one frame by algorithm, correspondence and base height (Fig. 6-10, 6-13, 6-16).
 
+Beside them the correspondence that the shape of the reflected rows allows (§7.1).
+
 The dots keep their rows and columns; each correspondence gives them other rays. Dots whose rays lie
 beyond the pattern are left out. Errors are those of the scheme's own points, step 4 of §6.3.1.
 """
@@ -13,6 +15,7 @@ import numpy as np
 
 from labapp.core.geometry.rig import Rig
 from labapp.core.match import ORIENTATIONS, Match, Orientation, ways
+from labapp.core.matching.row_shape import ALLOWED, match_row_shapes
 from labapp.core.schemes.irs import Algorithm, IrsSettings, estimates
 from labapp.core.schemes.slopes import Estimate, ReflectedRays, reflected_rays
 from labapp.core.surface.measures import inside_points, reflection_scale
@@ -39,6 +42,42 @@ def with_orientation(match: Match, rig: Rig, orientation: Orientation) -> Match:
         plane_mm=match.plane_mm[there],
         plane_covariance_mm2=match.plane_covariance_mm2[there],
         witness=np.zeros_like(match.witness),
+    )
+
+
+def shape_table(match: Match) -> Table:
+    """Correspondences that the picture's rows allow (§7.1), and the one of least residual.
+
+    Residuals are those of the surface fitted with each correspondence that was tried.
+    """
+    shapes = match_row_shapes(match)
+    allowed = ALLOWED[shapes.shape] if shapes.shape else ()
+    residual = {trial.orientation: trial.residual_mm for trial in match.trials}
+    words = {True: "yes", False: "no", None: ""}
+    rows: list[tuple[Cell, ...]] = [
+        (
+            shapes.shape or "neither",
+            shapes.convex,
+            shapes.concave,
+            " ".join(allowed),
+            match.orientation,
+            *(residual.get(way) for way in ORIENTATIONS),
+            words[shapes.allows(match.orientation)],
+        )
+    ]
+    return Table(
+        "section_7_1_row_shape",
+        "Correspondence by the shape of the reflected rows (§7.1) and by the residual",
+        (
+            "rows",
+            "convex",
+            "concave",
+            "allowed_by_rows",
+            "by_residual",
+            *(f"residual_{way.replace('/', '')}_mm" for way in ORIENTATIONS),
+            "agree",
+        ),
+        tuple(rows),
     )
 
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.linalg.lapack import dtbtrs
 
+from labapp.core.geometry.rig import DotPattern
 from labapp.core.match import Match
 from labapp.core.schemes import ers, fit
 from labapp.core.surface.boundary_trace import trace_boundary
@@ -27,6 +28,7 @@ from labapp.simulation.pools import (
     ellipsoidal_cap,
     spherical_cap,
 )
+from labapp.studies.image_error import BENCH
 from tests.scenes import OPEN_RIG
 
 NOISE_MM = 0.053
@@ -54,6 +56,19 @@ def inside(pool: Pool) -> FloatArray:
     center = np.array(pool.footprint.center_mm)
     spokes = pool.boundary_mm(180)[:, :2] - center
     return (center + np.linspace(0.02, 0.98, 25)[:, None, None] * spokes).reshape(-1, 2)
+
+
+@pytest.mark.parametrize(("width_mm", "depth_mm"), [(6.1, -0.72), (5.5, -0.6)])
+def test_head_and_rear_of_a_pool_may_miss_the_plane(width_mm: float, depth_mm: float) -> None:
+    # However dense the pattern: only the middle third of the pool is seen.
+    rig = replace(BENCH, pattern=DotPattern(37, 37, 0.385))
+    pool = spherical_cap(width_mm, depth_mm)
+    match = exact_match(trace(pool, rig), rig)
+    made = fit.reconstruct(match, rig, FitSettings())
+    sizes = measure_surface(made, match, rig)
+    assert np.ptp(made.points_mm[:, 1]) < 0.75 * width_mm
+    assert sizes.depth_mm == pytest.approx(depth_mm, rel=0.02)
+    assert sizes.length_mm == pytest.approx(width_mm, rel=0.02)
 
 
 def test_the_28_caps_of_8_3_1() -> None:

@@ -186,6 +186,14 @@ def test_a_frame_whose_correspondence_has_a_rival_is_doubtful(
     ]
 
 
+def test_rows_that_do_not_allow_a_correspondence_are_counted():
+    lines = [FrameLine(0, 0.0, rows_allow=True), FrameLine(1, 0.1), FrameLine(4, 0.4)]
+    assert "1 of 1 frame" in data.rows_sentence(lines)
+    lines[2] = replace(lines[2], rows_allow=False)
+    assert "1 of 2 frames, not in 4" in data.rows_sentence(lines)
+    assert not data.rows_sentence(lines[1:2])
+
+
 def test_of_many_frames_the_first_and_the_last_are_listed():
     lines = [FrameLine(k, k / 50) for k in range(100)]
     cells = data.frame_cells(lines)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.pools import egg
 from labapp.studies.correspondence_table import OPEN_BENCH
-from labapp.studies.frame_comparison import comparison_tables, with_orientation
+from labapp.studies.frame_comparison import comparison_tables, shape_table, with_orientation
 
 MATCH = exact_match(trace(egg(6.0, 2.7, 3.4, 0.3), OPEN_BENCH), OPEN_BENCH)
 
@@ -22,6 +24,17 @@ def test_rays_are_mirrored_about_the_marker() -> None:
     np.testing.assert_array_equal(back.ray, MATCH.ray)
     rows = with_orientation(MATCH, OPEN_BENCH, "S/I")
     np.testing.assert_array_equal(rows.ray, np.abs(MATCH.ray - [20, 0]))
+
+
+def test_rows_of_a_convex_pool_agree_with_its_correspondence() -> None:
+    (row,) = shape_table(MATCH).rows
+    named = dict(zip(shape_table(MATCH).columns, row, strict=True))
+    assert named["rows"] == "convex"
+    assert named["by_residual"] == "S/S"
+    assert named["agree"] == "yes"
+    # The same dots with rows that allow another: they are told to differ.
+    (row,) = shape_table(replace(MATCH, orientation="S/I")).rows
+    assert row[-1] == "no"
 
 
 @pytest.mark.slow

@@ -20,7 +20,7 @@ from functools import cached_property
 
 import numpy as np
 
-from labapp.core.geometry.optics import project_rays
+from labapp.core.geometry.optics import ProjectedRays, project_rays
 from labapp.core.geometry.rig import Rig
 from labapp.core.surface.level import Level, Rear, Witnesses, guess_level
 from labapp.core.surface.solver import NormalEquations, Rounds, propagate_sigma
@@ -34,9 +34,10 @@ from labapp.core.values import (
     median,
 )
 
-MARGIN_ROWS = 2.5
-"""How far beyond the outermost reflection points the splines go on, in rows of rays: the torch may
-hide some before the boundary is reached."""
+MARGIN_ROWS, LEAST_MARGIN_MM = 2.5, 2.0
+"""How far beyond the outermost reflection points the splines go on: in rows of rays, and at least,
+mm. Before the boundary is reached the torch may hide some, or dots miss the imaging plane: of a
+dense pattern that is as wide a strip of the pool, and more rows."""
 
 CORRELATED_MM2 = 1.0
 """Area over which a pool's third derivatives are correlated, mm²."""
@@ -158,8 +159,7 @@ def fit_pool(
 
     rays, at = project_rays(rig.laser, rig.pattern), tuple(ray.T - 1)
     points = rays.landing_mm[at]
-    margin = MARGIN_ROWS * rays.spacing_mm.max()
-    basis = _basis_around(points[:, :2], margin, settings.knot_mm)
+    basis = basis_around(points[:, :2], rays, settings.knot_mm)
     equations = normal_equations(basis, rig, points, plane_mm, plane_covariance_mm2, settings)
     equations.reuse_mm = settings.floor_mm / 50
     if initial is not None:
@@ -287,7 +287,18 @@ def fitted_pool(rounds: Rounds, level: Level, rig: Rig, plane_mm: FloatArray) ->
     return FittedPool(surface, rounds.equations.factor, level, points, residual, rounds.moved_mm)
 
 
-def _basis_around(places_mm: FloatArray, margin_mm: float, knot_mm: float) -> SplineBasis:
-    """Splines over places, shape (n, 2), mm, and a margin round them."""
-    low, high = places_mm.min(axis=0) - margin_mm, places_mm.max(axis=0) + margin_mm
+def basis_around(places_mm: FloatArray, rays: ProjectedRays, knot_mm: float) -> SplineBasis:
+    """Splines over places, shape (n, 2), mm, and as far beyond as a pool may go on.
+
+    Parameters
+    ----------
+    places_mm
+        Reflection points, and what else is to be covered.
+    rays
+        The rays, whose spacing the margin follows.
+    knot_mm
+        Spacing of the spline knots, mm.
+    """
+    margin = max(MARGIN_ROWS * rays.spacing_mm.max(), LEAST_MARGIN_MM)
+    low, high = places_mm.min(axis=0) - margin, places_mm.max(axis=0) + margin
     return SplineBasis.over(low, high, knot_mm)

@@ -13,6 +13,7 @@ import numpy as np
 
 from labapp.config.setup import Setup
 from labapp.core.geometry.rig import ImagingPlane, Rig
+from labapp.core.matching.row_shape import match_row_shapes
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.sequence.mean import series_of, sigma_of_mean
 from labapp.core.surface.measures import SIZES, Measures, sigma_name
@@ -23,6 +24,7 @@ from labapp.session.contents import SessionContents
 from labapp.session.measured import scheme_name
 from labapp.session.report.layout import Cells
 from labapp.studies.error_budget import Contribution, total
+from labapp.text import pluralize
 
 DOUBTFUL_MARGIN = 5.0
 """A frame is doubtful where another correspondence comes within this factor of the residual."""
@@ -64,6 +66,8 @@ class FrameLine:
     """Whether another correspondence explains its dots nearly as well."""
     dots: int | None = None
     orientation: str = ""
+    rows_allow: bool | None = None
+    """Whether the shape of the reflected rows allows its correspondence (§7.1); None: open."""
     version: str = ""
     """The labapp that measured it."""
     measures: Measures | None = None
@@ -174,9 +178,25 @@ def _frame_line(session: SessionContents, scheme: str, number: int, time_s: floa
         doubtful=is_doubtful(found),
         dots=None if found.dots is None else len(found.dots),
         orientation="" if found.match is None else found.match.orientation,
+        rows_allow=None
+        if found.match is None
+        else match_row_shapes(found.match).allows(found.match.orientation),
         version=result.version,
         measures=found.measures,
     )
+
+
+def rows_sentence(lines: Iterable[FrameLine]) -> str:
+    """In how many frames the shape of the rows allows the correspondence of least residual."""
+    told = [line for line in lines if line.rows_allow is not None]
+    if not told:
+        return ""
+    others = [line.frame for line in told if not line.rows_allow]
+    words = (
+        f"The shape of the reflected rows (§7.1) allows the correspondence of least residual in "
+        f"{len(told) - len(others)} of {pluralize(len(told), 'frame')}"
+    )
+    return f"{words}, not in {format_ranges(others, ' to ', 6)}." if others else f"{words}."
 
 
 def is_doubtful(measurement: Measurement) -> bool:

@@ -61,6 +61,8 @@ def add_results(story: Story, report: ReportData) -> None:
     else:
         story.text("Nothing was measured yet.")
         return
+    if by_rows := data.rows_sentence(lines):
+        story.text(by_rows)
     more = len(lines) > data.ALL_FRAMES
     story.table(
         "Frame by frame, mm and mm³"

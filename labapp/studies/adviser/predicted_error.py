@@ -20,9 +20,8 @@ from labapp.core.geometry.optics import (
 from labapp.core.geometry.perturbation import aimed_as, moved_dots, moved_rig
 from labapp.core.geometry.rig import Rig
 from labapp.core.geometry.uncertainty import QUANTITIES, AxisPoints, RigUncertainty
-from labapp.core.surface.pool_fit import CORRELATED_MM2, MARGIN_ROWS, FitSettings
+from labapp.core.surface.pool_fit import CORRELATED_MM2, FitSettings, basis_around
 from labapp.core.surface.solver import SlopeFit, fit_slopes
-from labapp.core.surface.spline import SplineBasis
 from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
 from labapp.simulation.forward import Reflections, trace
 from labapp.simulation.pools import Pool
@@ -141,11 +140,8 @@ class _Model:
         self.rim = pool.boundary_mm(RIM_POINTS)[:, :2]
         rays = project_rays(rig.laser, rig.pattern)
         self.ground = ground = rays.landing_mm[..., :2]
-        margin = MARGIN_ROWS * rays.spacing_mm.max()
         corners = np.vstack([self.points[:, :2], self.rim, self.peak_xy])
-        self.basis = SplineBasis.over(
-            corners.min(axis=0) - margin, corners.max(axis=0) + margin, settings.knot_mm
-        )
+        self.basis = basis_around(corners, rays, settings.knot_mm)
         self.stiffness = CORRELATED_MM2 / settings.jerk**2
         # The weights are those of the fit; the noise is what it will be.
         variance = dot_sigma_mm**2 + settings.floor_mm**2

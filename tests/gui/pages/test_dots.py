@@ -524,6 +524,21 @@ def test_carrying_on_keeps_what_was_done_when_it_is_cancelled(copy_sample: CopyS
         assert "stopped before frame 5: it was cancelled" in carried.words
 
 
+def test_the_search_for_rows_is_chosen_on_the_page(
+    page: DotsPage, qtbot: QtBot, copy_sample: CopySample
+) -> None:
+    session = Session.open(copy_sample("gtaw"))
+    page.workspace.show(session)
+    qtbot.waitUntil(lambda: page.editor.correction is not None)
+    page.refresh()
+    assert page.dots_panel.row_search.value() == "grow"
+    page.dots_panel.row_search.edited.emit("rows")
+    assert session.settings.lattice.method == "rows"
+    assert page.dots_panel.row_search.value() == "rows"
+    page.workspace.undo()
+    assert page.dots_panel.row_search.value() == "grow"
+
+
 def test_what_is_shown_without_a_window(copy_sample: CopySample) -> None:
     with Session.open(copy_sample("blocked_rows")) as session:
         seen = presenter.shown(session, 0, None)

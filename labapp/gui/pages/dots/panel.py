@@ -11,7 +11,13 @@ from PySide6.QtWidgets import QGridLayout, QHeaderView, QSizePolicy, QToolButton
 from labapp.core.pipeline import Settings
 from labapp.core.rows.lattice import Site
 from labapp.gui.digits import ResultRow
-from labapp.gui.pages.dots.presenter import METHODS, NUMBERS, RowLine, detector_value
+from labapp.gui.pages.dots.presenter import (
+    METHODS,
+    NUMBERS,
+    ROW_SEARCHES,
+    RowLine,
+    detector_value,
+)
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
 from labapp.gui.widgets.labels import Message, heading, plain_label, show_words, wrapping_label
 from labapp.gui.widgets.layouts import vbox
@@ -98,6 +104,7 @@ class DotsPanel(QWidget):
     def show_settings(self, settings: Settings) -> None:
         """Show how dots are found."""
         self.method.set_value(settings.dots.method)
+        self.row_search.set_value(settings.lattice.method)
         for number, field in zip(NUMBERS, self.numbers, strict=True):
             field.set_value(detector_value(settings, number))
             field.setVisible(number.method == settings.dots.method)
@@ -142,6 +149,10 @@ class DotsPanel(QWidget):
             "Method", METHODS, tooltip="How dots are found in frames not corrected by hand"
         )
         form.add(self.method)
+        self.row_search = ChoiceField(
+            "Rows", ROW_SEARCHES, tooltip="How rows are found in frames not corrected by hand"
+        )
+        form.add(self.row_search)
         self.numbers = []
         for number in NUMBERS:
             field = NumberField(

@@ -376,6 +376,13 @@ METHODS = (
 )
 
 
+ROW_SEARCHES = (
+    ("grow", "From dot to dot (default)"),
+    ("rows", "Row search (§5.2.2)"),
+    ("masks", "Masks (§5.3)"),
+)
+
+
 @dataclass(frozen=True)
 class DetectorNumber:
     """A number of a detector that can be set; see the settings class for what it is."""
@@ -434,3 +441,8 @@ def with_detector_value(
 def with_method(settings: Settings, method: Any) -> Settings:
     """The settings with another detector."""
     return replace(settings, dots=replace(settings.dots, method=method))
+
+
+def with_row_search(settings: Settings, method: Any) -> Settings:
+    """The settings with another search for rows."""
+    return replace(settings, lattice=replace(settings.lattice, method=method))

@@ -73,7 +73,8 @@ class DotsPage(Page):
         self.canvas_layout.addWidget(self.view)
         self.panel_layout.addWidget(self.dots_panel)
         self.setFocusProxy(self.view)
-        self.lock_with_session(self.dots_panel.method, *self.dots_panel.numbers)
+        panel = self.dots_panel
+        self.lock_with_session(panel.method, panel.row_search, *panel.numbers)
         self._connect()
 
     def _connect(self) -> None:
@@ -87,6 +88,9 @@ class DotsPage(Page):
             field.edited.connect(lambda _: self._refer(panel.reference))
         panel.method.edited.connect(
             lambda method: self._set(lambda now: presenter.with_method(now, method), "detector")
+        )
+        panel.row_search.edited.connect(
+            lambda method: self._set(lambda now: presenter.with_row_search(now, method), "rows")
         )
         for number, field in zip(presenter.NUMBERS, panel.numbers, strict=True):
             field.edited.connect(partial(self._set_number, number))

@@ -1,0 +1,88 @@
+"""Measurement error on an object of known size in place of the pool (§8.2).
+
+Its boundary is a circle, for the schemes that take a boundary model (§8.2.1).
+"""
+
+from __future__ import annotations
+
+from labapp.core.geometry.rig import Rig
+from labapp.core.match import Match
+from labapp.core.pipeline import reconstruct
+from labapp.core.surface.measures import measure_surface
+from labapp.core.values import CannotMeasure
+from labapp.errors import InputError
+from labapp.simulation.pools import Pool, spherical_cap
+from labapp.studies import SCHEMES
+from labapp.studies.error_analysis import circle_settings, computed_are, relative_errors
+from labapp.studies.tables import Cell, Table
+
+LARGEST_MM = 30.0
+
+
+def known_cap(diameter_mm: float, height_mm: float) -> Pool:
+    """Spherical cap of a diameter and a height, mm; the height of a hollow is negative.
+
+    Raises
+    ------
+    InputError
+        If there is no such cap.
+    """
+    if not 1.0 <= diameter_mm <= LARGEST_MM:
+        raise InputError("--known-object", "diameter", diameter_mm, f"1 to {LARGEST_MM:g} mm")
+    if not 0.01 <= abs(height_mm) <= diameter_mm / 4:
+        expected = f"0.01 to {diameter_mm / 4:g} mm, a quarter of the diameter; a hollow below 0"
+        raise InputError("--known-object", "height", height_mm, expected)
+    return spherical_cap(diameter_mm, height_mm)
+
+
+def known_object_table(match: Match, rig: Rig, cap: Pool) -> Table:
+    """Measurement error ME by every scheme (Eq. 8-1), as §8.2.2 has it for the thumb tack.
+
+    Parameters
+    ----------
+    match, rig
+        The object's dots with their rays, and the bench.
+    cap
+        The object as it is (`known_cap`).
+
+    Returns
+    -------
+    Table
+        A row each scheme; empty cells where it finds no surface.
+    """
+    rows: list[tuple[Cell, ...]] = []
+    diameter_mm, height_mm = cap.footprint.width_mm, cap.peak_mm
+    for scheme in SCHEMES:
+        try:
+            made = reconstruct(match, rig, circle_settings(scheme))
+        except CannotMeasure as why:
+            rows.append((scheme, why.status, *[None] * 5))
+            continue
+        measures = measure_surface(made, match, rig)
+        height, diameter = relative_errors(measures, cap)
+        rows.append(
+            (
+                scheme,
+                "ok",
+                diameter_mm * (1 + diameter),
+                100 * abs(diameter),
+                height_mm * (1 + height),
+                100 * abs(height),
+                computed_are(measures),
+            )
+        )
+    return Table(
+        "section_8_2_known_object",
+        f"Measurement error on an object of diameter {diameter_mm:g} and height {height_mm:g} mm "
+        "(§8.2, circle model)",
+        (
+            "scheme",
+            "status",
+            "diameter_mm",
+            "diameter_error_pct",
+            "height_mm",
+            "height_error_pct",
+            "are_mm",
+        ),
+        tuple(rows),
+    )
