@@ -128,7 +128,7 @@ class LightLine(ReadOnlyArrays):
 
     @property
     def folded(self) -> bool:
-        """Whether both halves lie on each other, or in a spot: the pool gathers them (a caustic)."""
+        """Whether its halves lie on each other or in a spot: the pool gathers them (a caustic)."""
         return is_upright(self.image_px) or self.length_px < SPOT_WIDTHS * self.width_px
 
 
