@@ -26,11 +26,18 @@ GAP_SHARE = 0.4
 """A line has a gap where its ridge falls below this share of its median strength."""
 
 
+STRIP_WIDTHS = 2.6
+"""The light beside a line is read so many standard deviations of it to either side; where the
+picture ends before, its middle is not known."""
+
 CENTER_ROUNDS = 4
 """Of the window that follows the middle of a line's light."""
 
 PATH_SMOOTHER = 1.8
 """The path that a line's light is averaged along is smoothed over so many times that length."""
+
+SPOT_WIDTHS = 6.0
+"""A line shorter than so many times its width is a spot: it has no direction of its own."""
 
 GLOW_ROUNDS = 5
 """Of the fit of the light under the lines."""
@@ -55,9 +62,10 @@ class LineSettings:
         Longest gap that is joined, px.
     turn_deg
         Largest turn at either side of a gap, degrees.
-    smooth_px, smooth_widths
-        Standard deviation of the weights by which a line is smoothed along itself: px, and at least
-        so many times its width.
+    smooth_px, smooth_widths, smooth_share
+        Standard deviation of the weights by which a line is smoothed along itself: px, at least,
+        and so many times its width; of a longer line, which bends less, so much of its length, up
+        to the second number of widths.
     edge_px
         A line that ends so near to the picture's edge is cut off there, px.
     """
@@ -69,7 +77,8 @@ class LineSettings:
     gap_px: float = 14.0
     turn_deg: float = 45.0
     smooth_px: float = 6.0
-    smooth_widths: float = 3.0
+    smooth_widths: tuple[float, float] = (3.0, 4.5)
+    smooth_share: float = 0.05
     edge_px: float = 6.0
 
 
@@ -119,8 +128,8 @@ class LightLine(ReadOnlyArrays):
 
     @property
     def folded(self) -> bool:
-        """Whether both halves lie on each other: the pool gathers the line (a caustic)."""
-        return is_upright(self.image_px)
+        """Whether its halves lie on each other or in a spot: the pool gathers them (a caustic)."""
+        return is_upright(self.image_px) or self.length_px < SPOT_WIDTHS * self.width_px
 
 
 def find_lines(frame: Image, settings: LineSettings) -> tuple[LightLine, ...]:
@@ -187,9 +196,15 @@ def _line(
     if first[1] > last[1] if is_upright(place) else first[0] > last[0]:
         points, place = points[::-1], place[::-1]
     width = float(np.sqrt(max(spread2 - scale**2, (0.75 * scale) ** 2)))
-    smooth_px = min(max(settings.smooth_widths * width, settings.smooth_px), len(place) / 8)
+    low, high = (each * width for each in settings.smooth_widths)
+    wanted = float(np.clip(settings.smooth_share * len(place), low, high))
+    smooth_px = min(max(wanted, settings.smooth_px), len(place) / 8)
     # What wavers in the path would stay in the line: it is smoother than the line.
     path = SmoothPath.through(place, PATH_SMOOTHER * smooth_px)
+    seen = path.seen & _within(path.place, STRIP_WIDTHS * width, picture)
+    if seen.sum() < least:
+        return None
+    path = replace(path, seen=seen)
     off, sigma = _centers(picture, path, width, smooth_px)
     # A bent line's light, blurred, has its ridge on the inner side: by σ²κ/2.
     off -= path.curvature * width**2 / 2
@@ -203,7 +218,6 @@ def _line(
     size = np.array(picture.shape[::-1])
     places = np.array(ends)
     cut = ((places < settings.edge_px) | (places > size - 1 - settings.edge_px)).any(axis=-1)
-    seen = path.seen
     return LightLine(
         image_px=path.place[seen],
         tangent=path.tangent[seen],
@@ -218,6 +232,12 @@ def _line(
     )
 
 
+def _within(place: FloatArray, room_px: float, picture: Grey) -> BoolArray:
+    """Which places, (u, v), shape (n, 2), are so far within a picture, shape (n,)."""
+    last = np.array(picture.shape[::-1]) - 1 - room_px
+    return np.asarray(((place >= room_px) & (place <= last)).all(axis=-1))
+
+
 def _centers(
     picture: Grey, path: SmoothPath, width: float, smooth_px: float
 ) -> tuple[FloatArray, float]:
@@ -226,7 +246,7 @@ def _centers(
     The light beside the path is taken as a straight strip, weighed by a Gaussian window that
     follows its middle, and averaged along the path.
     """
-    reach = 2.6 * width + 1.0
+    reach = STRIP_WIDTHS * width + 1.0
     side = np.arange(-reach, reach + 0.25, 0.5)
     at = (path.place[:, None] + side[:, None] * path.across[:, None]).astype(np.float32)
     strip = np.asarray(

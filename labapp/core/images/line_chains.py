@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from labapp.core.images.ridges import Ridges
-from labapp.core.values import FloatArray, IntArray
+from labapp.core.values import BoolArray, FloatArray, IntArray
 
 TANGENT_POINTS = 20
 """The direction in which a chain ends is that of so many of its points."""
@@ -30,6 +30,13 @@ SHORT_PX = 25
 
 ALIKE = 2.5
 """Parts of one line are not brighter one than the other by a larger factor."""
+
+GAP_SHARE = 0.1
+"""A gap is longer where the pool spreads the line: by so much of the length of what it parts."""
+
+WITHIN = 0.25
+"""An upright chain below another is not part of it where it is farther in than so much of its
+extent: that is the folded line beside an arch, not one of the arch's legs."""
 
 
 def join_chains(
@@ -121,12 +128,14 @@ def _join(ridges: Ridges, chains: list[IntArray], gap_px: float, turn_deg: float
     bright = np.repeat([np.median(ridges.strength[chain]) for chain in chains], 2)
     fits &= np.abs(np.log(bright[:, None] / bright)) < np.log(ALIKE)
     trimmed = np.repeat([END_WIDTHS * spread_of(ridges, chain) for chain in chains], 2)
-    fits &= length <= gap_px + trimmed[:, None] + trimmed
+    spread = GAP_SHARE * np.repeat([float(len(chain)) for chain in chains], 2)
+    fits &= length <= gap_px + trimmed[:, None] + trimmed + spread[:, None] + spread
     # Upright chains one above the other are lines that the pool has folded together (a caustic).
     folded = np.repeat([is_upright(ridges.image_px[chain]) for chain in chains], 2)
     short = np.repeat([len(chain) < SHORT_PX for chain in chains], 2)
     steep = np.abs(step[..., 0]) < np.abs(step[..., 1])
-    fits &= ~(folded[:, None] & folded | steep & short[:, None] & short)
+    inside = np.repeat(np.repeat(_inside(ridges, chains), 2, axis=0), 2, axis=1) & folded[:, None]
+    fits &= ~(folded[:, None] & folded | steep & short[:, None] & short | inside | inside.T)
     one, other = np.nonzero(np.triu(fits, 1))
     cost = length[one, other] * (3.0 - ahead[one, other] - behind[one, other])
     partner: dict[int, int] = {}
@@ -139,6 +148,15 @@ def _join(ridges: Ridges, chains: list[IntArray], gap_px: float, turn_deg: float
         old, new = root[b // 2], root[a // 2]
         root = [new if each == old else each for each in root]
     return _walk(chains, partner)
+
+
+def _inside(ridges: Ridges, chains: list[IntArray]) -> BoolArray:
+    """Whether the middle of each chain is well within the columns of each other, shape (k, k)."""
+    columns = [ridges.image_px[chain, 0] for chain in chains]
+    middle = np.array([each.mean() for each in columns])
+    low, high = np.array([[each.min(), each.max()] for each in columns]).T
+    room = WITHIN * (high - low)
+    return np.asarray((middle[:, None] > low + room) & (middle[:, None] < high - room))
 
 
 def _chain_ends(ridges: Ridges, chains: list[IntArray]) -> tuple[FloatArray, FloatArray]:
