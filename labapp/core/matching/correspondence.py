@@ -106,8 +106,8 @@ def match_rays(
     hopeless = bool(found) and not any(nearly_explains(observed, each) for each in found)
     try:
         best = None if hopeless else _decide_among(observed, found, lattice, settings)
-    except CannotMeasure as reason:
-        if reason.status != "no-match":
+    except CannotMeasure:
+        if any_explains(observed, found):
             raise
         best = None
     if best is None:

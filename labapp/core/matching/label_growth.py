@@ -94,7 +94,7 @@ def _settled(observed: Observation, labels: IntArray, settings: FitSettings) -> 
         pool = try_fit(observed, labels, settings, pool)
         if pool is None:
             return None
-        labels = _matched(observed, pool, labels)
+        labels = matched_labels(observed, pool, labels)
         state = labels.tobytes()
         if state in before:
             break
@@ -103,7 +103,7 @@ def _settled(observed: Observation, labels: IntArray, settings: FitSettings) -> 
     return labels if count_labels(labels) >= LEAST_LABELS else None
 
 
-def _matched(observed: Observation, pool: FittedPool, labels: IntArray) -> IntArray:
+def matched_labels(observed: Observation, pool: FittedPool, labels: IntArray) -> IntArray:
     """Labels for dots that one ray alone can have made, and rays that made one dot alone.
 
     Likelihoods are those of `sure_pairs`. Rays a ring farther out than any that is given a dot
