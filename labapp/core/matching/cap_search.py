@@ -44,7 +44,7 @@ many are looked at closer. With 29 of 30 rays right, a cap may find fewer dots t
 33: what tells them apart is how smooth a surface has their dots."""
 
 
-def search_caps(observed: Observation, most: int = 8) -> list[IntArray]:
+def search_caps(observed: Observation, most: int = 24) -> list[IntArray]:
     """Find the caps whose rays fall on the dots best.
 
     The best of them are sorted by what a surface through their dots explains.
