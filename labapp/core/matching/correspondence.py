@@ -214,7 +214,7 @@ def _by_caps(observed: Observation) -> list[Hypothesis]:
             found.append(hypothesis)
             if explains(observed, hypothesis):
                 return found
-    for start in sorted(found, key=lambda hypothesis: hypothesis.cost)[:MOST_REPAIRED]:
+    for start in sorted(found, key=lambda hypothesis: hypothesis.misfit)[:MOST_REPAIRED]:
         found += with_repaired(observed, [start])[1:]
         if any_explains(observed, found):
             break

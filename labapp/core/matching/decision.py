@@ -389,7 +389,7 @@ def _evaluate_twice(
     return replace(
         own,
         marker=marker,
-        misfit=(own.misfit + usual.misfit) / 2,
+        misfit_without_marker=(own.misfit_without_marker + usual.misfit_without_marker) / 2,
         roughness=(own.roughness + usual.roughness) / 2,
     )
 

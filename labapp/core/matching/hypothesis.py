@@ -98,7 +98,7 @@ class Hypothesis:
         Indices of the dots that have no ray, shape (s,).
     marker
         What shows at the marker's absent ray; None if the pattern has no marker.
-    misfit
+    misfit_without_marker
         χ² of the dots, `STRAY_COST` and `MISSED_COST` for each that is left over, and the cost of
         the boundary.
     roughness
@@ -112,18 +112,23 @@ class Hypothesis:
     missed_mm: FloatArray
     stray_dots: IntArray
     marker: Marker | None
-    misfit: float
+    misfit_without_marker: float
     roughness: float
 
     @property
-    def cost_without_marker(self) -> float:
-        """Misfit and roughness, in units of χ²."""
-        return self.misfit + self.roughness
+    def misfit(self) -> float:
+        """What is left unexplained, in units of χ²: a dot at the marker counts, too."""
+        return self.misfit_without_marker + LIT_MARKER_COST * (self.marker == "lit")
 
     @property
     def cost(self) -> float:
-        """The lower the likelier, in units of χ²: a dot at the marker counts, too."""
-        return self.cost_without_marker + LIT_MARKER_COST * (self.marker == "lit")
+        """−2 log likelihood of the hypothesis: misfit and roughness."""
+        return self.misfit + self.roughness
+
+    @property
+    def cost_without_marker(self) -> float:
+        """The same where it does not count that a dot, perhaps a false one, is at the marker."""
+        return self.misfit_without_marker + self.roughness
 
     @property
     def stray_count(self) -> int:
@@ -156,10 +161,13 @@ class Hypothesis:
 
 
 def grow_and_evaluate(
-    observed: Observation, labels: IntArray, settings: FitSettings = USUAL_KNOTS
+    observed: Observation,
+    labels: IntArray,
+    settings: FitSettings = USUAL_KNOTS,
+    knot_mm: float | None = None,
 ) -> Hypothesis | None:
     """Let labels grow (`grow_labels`) and evaluate what they lead to; None if that is nowhere."""
-    grown = grow_labels(observed, labels)
+    grown = grow_labels(observed, labels, knot_mm)
     hypothesis = None if grown is None else evaluate(observed, grown, settings)
     if hypothesis is None:
         return None

@@ -47,7 +47,9 @@ OUTLIER_TIMES, OUTLIER_SPACINGS = 6.0, 0.25
 share of the way to the next dot."""
 
 
-def grow_labels(observed: Observation, labels: IntArray) -> IntArray | None:
+def grow_labels(
+    observed: Observation, labels: IntArray, knot_mm: float | None = None
+) -> IntArray | None:
     """Follow the surface from the labels given until nothing changes.
 
     Parameters
@@ -56,6 +58,9 @@ def grow_labels(observed: Observation, labels: IntArray) -> IntArray | None:
         The dots and the rig.
     labels
         Index of each ray's dot or `UNLABELLED`, shape (rows, columns).
+    knot_mm
+        Spacing of the surface's knots, mm, where most dots are labelled already and a dip is left;
+        None: as far as labels lead farthest.
 
     Returns
     -------
@@ -66,6 +71,8 @@ def grow_labels(observed: Observation, labels: IntArray) -> IntArray | None:
     enough = (1 - FEW_UNLABELLED) * len(observed.plane_mm)
     few = count_labels(labels) < FEW_LABELS
     course = (_STIFF_WIDE, _SOFT_WIDE, _STIFF_WIDE) if few else (STIFF, SOFT, STIFF)
+    if knot_mm is not None:
+        course = (replace(SOFT, knot_mm=knot_mm),)
     for attempt in range(2):
         for settings in course:
             grown = _settled(observed, labels, settings)
