@@ -395,7 +395,7 @@ def _evaluate_twice(
 
 
 def _missed_lie_apart(hypothesis: Hypothesis) -> bool:
-    """Whether no more than `PAIR` rays without a dot are side by side, or one more round a corner."""
+    """Whether no more than `PAIR` rays without a dot are together, or one more round a corner."""
     seen = np.zeros(hypothesis.labels.shape, np.uint8)
     seen[tuple(hypothesis.missed_rays.T)] = 1
     found = cv2.connectedComponentsWithStats(seen, connectivity=4)[2][1:]
