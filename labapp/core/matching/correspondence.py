@@ -64,6 +64,10 @@ MOST_SITES = 8
 """So many sites of the marker in the grid lead to a hypothesis, of those that fit best."""
 
 
+MOST_REPAIRED = 4
+"""So many hypotheses from caps are repaired, where none explains the frame as it is."""
+
+
 def match_rays(
     dots: Dots,
     lattice: Lattice | None,
@@ -106,8 +110,8 @@ def match_rays(
     hopeless = bool(found) and not any(nearly_explains(observed, each) for each in found)
     try:
         best = None if hopeless else _decide_among(observed, found, lattice, settings)
-    except CannotMeasure as reason:
-        if reason.status != "no-match":
+    except CannotMeasure:
+        if any_explains(observed, found):
             raise
         best = None
     if best is None:
@@ -202,11 +206,16 @@ def _fitting(
 
 
 def _by_caps(observed: Observation) -> list[Hypothesis]:
-    """Hypotheses from the caps that the dots lie on best, each repaired."""
+    """Hypotheses from the caps that the dots lie on best, the cheapest of them repaired."""
     found: list[Hypothesis] = []
     for labels in search_caps(observed):
         hypothesis = grow_and_evaluate(observed, labels)
-        found += with_repaired(observed, [hypothesis]) if hypothesis is not None else []
+        if hypothesis is not None:
+            found.append(hypothesis)
+            if explains(observed, hypothesis):
+                return found
+    for start in sorted(found, key=lambda hypothesis: hypothesis.misfit)[:MOST_REPAIRED]:
+        found += with_repaired(observed, [start])[1:]
         if any_explains(observed, found):
             break
     return found

@@ -318,7 +318,7 @@ def _beyond_doubt(observed: Observation, best: Hypothesis, margin: float) -> boo
     if best.stray_count or best.missed_count or best.marker != "dark":
         return False
     fine = evaluate(observed, best.labels, FINE_KNOTS, initial=best.pool)
-    return fine is not None and fine.cost + margin < STRAY_COST + MISSED_COST
+    return fine is not None and fine.misfit + margin < STRAY_COST + MISSED_COST
 
 
 def _with_neighbours(
@@ -389,16 +389,18 @@ def _evaluate_twice(
     return replace(
         own,
         marker=marker,
-        cost_without_marker=(own.cost_without_marker + usual.cost_without_marker) / 2,
+        misfit_without_marker=(own.misfit_without_marker + usual.misfit_without_marker) / 2,
+        roughness=(own.roughness + usual.roughness) / 2,
     )
 
 
 def _missed_lie_apart(hypothesis: Hypothesis) -> bool:
-    """Whether no more than `PAIR` rays without a dot are side by side."""
+    """Whether no more than `PAIR` rays without a dot are together, or one more round a corner."""
     seen = np.zeros(hypothesis.labels.shape, np.uint8)
     seen[tuple(hypothesis.missed_rays.T)] = 1
-    sizes = cv2.connectedComponentsWithStats(seen, connectivity=4)[2][1:, cv2.CC_STAT_AREA]
-    return bool((sizes <= PAIR).all())
+    found = cv2.connectedComponentsWithStats(seen, connectivity=4)[2][1:]
+    count, sides = found[:, cv2.CC_STAT_AREA], found[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]]
+    return bool((count <= PAIR + (sides == PAIR).all(axis=1)).all())
 
 
 def _strays_lie_apart(observed: Observation, hypothesis: Hypothesis) -> bool:

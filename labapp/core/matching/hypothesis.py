@@ -34,7 +34,7 @@ from labapp.core.matching.prediction import (
 from labapp.core.matching.ray_classes import RayClasses, classify_rays
 from labapp.core.rows.lattice import Lattice, Site
 from labapp.core.surface.level import Level
-from labapp.core.surface.pool_fit import FitSettings, FittedPool
+from labapp.core.surface.pool_fit import CORRELATED_MM2, FitSettings, FittedPool
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray
 
 KNOT_ERROR_MM = 0.045
@@ -58,6 +58,10 @@ labels a row or a column off put one there nearly always."""
 SETUP_ERROR_MM, MOST_BOUNDARY_COST = 0.01, 60.0
 """How far the set-up may be off at the boundary, as height, mm; and the most that rays near the
 boundary may cost a hypothesis, in units of χ²."""
+
+ROUGHNESS_FREEDOM = 100.0
+"""Degrees of freedom of a surface's expected third derivatives: how large they are is known as well
+as from so many."""
 
 Marker = Literal["dark", "lit", "unknown"]
 """What shows where the marker's absent ray would make its dot: ``lit``, a dot; ``dark``, nothing,
@@ -94,9 +98,11 @@ class Hypothesis:
         Indices of the dots that have no ray, shape (s,).
     marker
         What shows at the marker's absent ray; None if the pattern has no marker.
-    cost_without_marker
+    misfit_without_marker
         χ² of the dots, `STRAY_COST` and `MISSED_COST` for each that is left over, and the cost of
         the boundary.
+    roughness
+        −2 log probability of the surface, for its third derivatives.
     """
 
     labels: IntArray
@@ -106,12 +112,23 @@ class Hypothesis:
     missed_mm: FloatArray
     stray_dots: IntArray
     marker: Marker | None
-    cost_without_marker: float
+    misfit_without_marker: float
+    roughness: float
+
+    @property
+    def misfit(self) -> float:
+        """What is left unexplained, in units of χ²: a dot at the marker counts, too."""
+        return self.misfit_without_marker + LIT_MARKER_COST * (self.marker == "lit")
 
     @property
     def cost(self) -> float:
-        """The lower the likelier, in units of χ²: a dot at the marker counts, too."""
-        return self.cost_without_marker + LIT_MARKER_COST * (self.marker == "lit")
+        """−2 log likelihood of the hypothesis: misfit and roughness."""
+        return self.misfit + self.roughness
+
+    @property
+    def cost_without_marker(self) -> float:
+        """The same where it does not count that a dot, perhaps a false one, is at the marker."""
+        return self.misfit_without_marker + self.roughness
 
     @property
     def stray_count(self) -> int:
@@ -144,10 +161,13 @@ class Hypothesis:
 
 
 def grow_and_evaluate(
-    observed: Observation, labels: IntArray, settings: FitSettings = USUAL_KNOTS
+    observed: Observation,
+    labels: IntArray,
+    settings: FitSettings = USUAL_KNOTS,
+    knot_mm: float | None = None,
 ) -> Hypothesis | None:
     """Let labels grow (`grow_labels`) and evaluate what they lead to; None if that is nowhere."""
-    grown = grow_labels(observed, labels)
+    grown = grow_labels(observed, labels, knot_mm)
     hypothesis = None if grown is None else evaluate(observed, grown, settings)
     if hypothesis is None:
         return None
@@ -191,10 +211,12 @@ def evaluate(
         return None
     paths = paths_of(observed, pool)
     classes, marker, cost = _misfit(observed, labels, pool, paths)
-    cost += _boundary_cost(pool.level)
+    misfit = cost + _boundary_cost(pool.level)
+    rough = _roughness_cost(pool, settings)
     missed = np.stack(np.divmod(classes.missed, labels.shape[1]), axis=-1)
     missed_mm = paths.plane_mm[classes.missed]
-    return Hypothesis(labels, pool, classes.witness, missed, missed_mm, classes.stray, marker, cost)
+    left = classes.witness, missed, missed_mm, classes.stray, marker
+    return Hypothesis(labels, pool, *left, misfit, rough)
 
 
 def paths_of(observed: Observation, pool: FittedPool) -> RayPaths:
@@ -232,6 +254,15 @@ def _boundary_cost(level: Level) -> float:
     """
     share = level.rise_mm**2 / (level.rise_mm**2 + SETUP_ERROR_MM**2)
     return min(2 * share * level.negative_log_likelihood, MOST_BOUNDARY_COST)
+
+
+def _roughness_cost(pool: FittedPool, settings: FitSettings) -> float:
+    """−2 log probability of a surface's third derivatives, whose size is known by about.
+
+    Wrong labels need a rougher surface than right ones nearly always.
+    """
+    ratio = CORRELATED_MM2 / settings.jerk**2 * pool.surface.roughness() / ROUGHNESS_FREEDOM
+    return ROUGHNESS_FREEDOM * float(np.log1p(ratio))
 
 
 def _marker_state(observed: Observation, lit: BoolArray, pool: FittedPool) -> Marker | None:

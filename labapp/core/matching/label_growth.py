@@ -47,7 +47,9 @@ OUTLIER_TIMES, OUTLIER_SPACINGS = 6.0, 0.25
 share of the way to the next dot."""
 
 
-def grow_labels(observed: Observation, labels: IntArray) -> IntArray | None:
+def grow_labels(
+    observed: Observation, labels: IntArray, knot_mm: float | None = None
+) -> IntArray | None:
     """Follow the surface from the labels given until nothing changes.
 
     Parameters
@@ -56,6 +58,9 @@ def grow_labels(observed: Observation, labels: IntArray) -> IntArray | None:
         The dots and the rig.
     labels
         Index of each ray's dot or `UNLABELLED`, shape (rows, columns).
+    knot_mm
+        Spacing of the surface's knots, mm, where most dots are labelled already and a dip is left;
+        None: as far as labels lead farthest.
 
     Returns
     -------
@@ -66,6 +71,8 @@ def grow_labels(observed: Observation, labels: IntArray) -> IntArray | None:
     enough = (1 - FEW_UNLABELLED) * len(observed.plane_mm)
     few = count_labels(labels) < FEW_LABELS
     course = (_STIFF_WIDE, _SOFT_WIDE, _STIFF_WIDE) if few else (STIFF, SOFT, STIFF)
+    if knot_mm is not None:
+        course = (replace(SOFT, knot_mm=knot_mm),)
     for attempt in range(2):
         for settings in course:
             grown = _settled(observed, labels, settings)
@@ -94,7 +101,7 @@ def _settled(observed: Observation, labels: IntArray, settings: FitSettings) -> 
         pool = try_fit(observed, labels, settings, pool)
         if pool is None:
             return None
-        labels = _matched(observed, pool, labels)
+        labels = matched_labels(observed, pool, labels)
         state = labels.tobytes()
         if state in before:
             break
@@ -103,7 +110,7 @@ def _settled(observed: Observation, labels: IntArray, settings: FitSettings) -> 
     return labels if count_labels(labels) >= LEAST_LABELS else None
 
 
-def _matched(observed: Observation, pool: FittedPool, labels: IntArray) -> IntArray:
+def matched_labels(observed: Observation, pool: FittedPool, labels: IntArray) -> IntArray:
     """Labels for dots that one ray alone can have made, and rays that made one dot alone.
 
     Likelihoods are those of `sure_pairs`. Rays a ring farther out than any that is given a dot

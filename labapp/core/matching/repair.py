@@ -7,7 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 import scipy
 
-from labapp.core.matching.hypothesis import Hypothesis, grow_and_evaluate
+from labapp.core.matching.decision import explains
+from labapp.core.matching.hypothesis import FINE_KNOTS, Hypothesis, grow_and_evaluate
 from labapp.core.matching.observation import UNLABELLED, Observation, widened, within_rings
 from labapp.core.matching.prediction import (
     GATE_SIGMA2,
@@ -34,19 +35,25 @@ LEAST_BETWEEN = 2
 def with_repaired(observed: Observation, found: list[Hypothesis]) -> list[Hypothesis]:
     """Add what the cheapest hypothesis leads to when it is repaired, as long as that is cheaper.
 
-    Labels round what is unexplained are discarded, jumped rows closed up, left out ones let in.
+    Labels round what is unexplained are discarded, jumped rows closed up, left out ones let in, and
+    a dip is followed with finer knots.
+
+    Labels that are still to be repaired bend the surface: its roughness does not count yet.
 
     Where rows cross in a dip, growth may swap them; the swapped labels then bend the surface and
     hold each other up. The surface through the labels round about knows better.
     """
-    best = min(found, key=lambda hypothesis: hypothesis.cost, default=None)
+    best = min(found, key=lambda hypothesis: hypothesis.misfit, default=None)
     while best is not None:
         labels = np.where(_about_unexplained(observed, best), UNLABELLED, best.labels)
         tried = [labels] if (labels != best.labels).any() else []
         tried += [*_closed_up(best), *_opened_up(observed, best)]
         led = [h for labels in tried if (h := grow_and_evaluate(observed, labels))]
-        cheapest = min(led, key=lambda hypothesis: hypothesis.cost, default=best)
-        best = cheapest if cheapest.cost < best.cost else None
+        if not explains(observed, best):
+            finer = grow_and_evaluate(observed, best.labels, knot_mm=FINE_KNOTS.knot_mm)
+            led += [finer] if finer is not None else []
+        cheapest = min(led, key=lambda hypothesis: hypothesis.misfit, default=best)
+        best = cheapest if cheapest.misfit < best.misfit else None
         found = found if best is None else [*found, best]
     return found
 
@@ -116,15 +123,15 @@ def with_rows_beyond(observed: Observation, found: list[Hypothesis]) -> list[Hyp
     """
     # The cheapest of all, and of those that have the marker dark: all it lacks may be a row.
     groups = (found, [hypothesis for hypothesis in found if hypothesis.marker == "dark"])
-    starts = [min(group, key=lambda hypothesis: hypothesis.cost) for group in groups if group]
+    starts = [min(group, key=lambda hypothesis: hypothesis.misfit) for group in groups if group]
     for start in starts[:1] + [start for start in starts[1:] if start is not starts[0]]:
         best: Hypothesis | None = start
         while best is not None:
             most = MOST_BEYOND * len(observed.plane_mm)
             wider = _rows_begun(observed, best) if LEAST_ROW <= best.stray_count <= most else []
             found = [*found, *wider]
-            cheapest = min(wider, key=lambda hypothesis: hypothesis.cost, default=best)
-            best = cheapest if cheapest.cost < best.cost else None
+            cheapest = min(wider, key=lambda hypothesis: hypothesis.misfit, default=best)
+            best = cheapest if cheapest.misfit < best.misfit else None
     return found
 
 

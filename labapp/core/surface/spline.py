@@ -11,6 +11,7 @@ from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
+import scipy
 
 from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 
@@ -243,6 +244,11 @@ class SplineSurface(ReadOnlyArrays):
     def gradient(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
         """(∂z/∂x, ∂z/∂y) at (x, y), shape (…, 2)."""
         return self.height_and_gradient(x_mm, y_mm)[1]
+
+    def roughness(self) -> float:
+        """∫∫ z_xxx² + 3 z_xxy² + 3 z_xyy² + z_yyy² over the rectangle, mm⁻²."""
+        band, own = self.basis.roughness, self.coefficients
+        return float(own @ scipy.linalg.blas.dsbmv(len(band) - 1, 1.0, band, own, lower=1))
 
     def raised(self, by_mm: float) -> SplineSurface:
         """Shift the whole surface up."""
