@@ -1,6 +1,6 @@
 """labapp measures the surface of a molten weld pool in 3-D from a reflected dot matrix.
 
-`labapp.Session` is the way in for scripts (docs/python.md).
+`labapp.Session` and `labapp.Study` are the ways in for scripts (docs/python.md, docs/studies.md).
 """
 
 from __future__ import annotations
@@ -11,9 +11,10 @@ import labapp.pixels  # noqa: F401 (sets OpenCV's limits before anything loads i
 from labapp.version import VERSION
 
 if TYPE_CHECKING:
+    from labapp.run.study.study import Study
     from labapp.session.session import Session
 
-__all__ = ["Session", "__version__"]
+__all__ = ["Session", "Study", "__version__"]
 __version__ = VERSION
 
 
@@ -23,4 +24,8 @@ def __getattr__(name: str) -> object:
         from labapp.session.session import Session
 
         return Session
+    if name == "Study":
+        from labapp.run.study.study import Study
+
+        return Study
     raise AttributeError(f"module 'labapp' has no attribute {name!r}")
