@@ -10,7 +10,7 @@ from typing import Any
 from matplotlib import rc_context
 
 from labapp.core.surface.measures import SIZES
-from labapp.run.study.plan import Condition
+from labapp.run.study.plan import Condition, shown_condition
 from labapp.run.study.summary import GroupSummary, Mean, StudySummary
 from labapp.studies.plotting import STYLE, as_bytes, new_figure
 from labapp.text import SIGMA_OF, pluralize
@@ -166,8 +166,8 @@ def _places(groups: Sequence[GroupSummary], condition: str) -> tuple[list[float]
     values = [group.conditions.get(condition) for group in groups]
     if condition and all(isinstance(value, int | float) for value in values):
         return [float(value) for value in values if not isinstance(value, str | None)], None
-    ticks = list(dict.fromkeys(_words(value) for value in values))
-    return [float(ticks.index(_words(value))) for value in values], ticks
+    ticks = list(dict.fromkeys(shown_condition(value) for value in values))
+    return [float(ticks.index(shown_condition(value))) for value in values], ticks
 
 
 def _colours(groups: Sequence[GroupSummary], others: Sequence[str]) -> list[str]:
@@ -177,12 +177,6 @@ def _colours(groups: Sequence[GroupSummary], others: Sequence[str]) -> list[str]
     if len(kinds) > MOST_COLOURS:
         return [COLOURS[0]] * len(groups)
     return [COLOURS[kinds.index(each)] for each in of]
-
-
-def _words(value: Condition | None) -> str:
-    if value is None:
-        return "–"
-    return value if isinstance(value, str) else f"{value:g}"
 
 
 # --- tables -------------------------------------------------------------------------------------
@@ -197,7 +191,7 @@ def _n(value: object) -> str:
 
 
 def _cell(value: Condition | None) -> str:
-    return _t(value) if isinstance(value, str) else _n(_words(value))
+    return _t(value) if isinstance(value, str) else _n(shown_condition(value))
 
 
 def _table(head: Iterable[str], rows: Iterable[Sequence[str]]) -> str:

@@ -53,7 +53,18 @@ NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 CONDITION = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,49}")
 FIELD = re.compile(r"\{([^{}]*)\}")
 
+PARTS_OF_NAME = (slice(-1, None), slice(-2, -1), slice(-2, None), slice(-3, None))
+"""Parts of a recording's path that become its name, the first that tell all recordings apart: the
+file's name, its folder's, both …"""
+
 Condition = float | str
+
+
+def shown_condition(value: Condition | None) -> str:
+    """A condition's value as text; a dash where it is not known."""
+    if value is None:
+        return "–"
+    return value if isinstance(value, str) else f"{value:g}"
 
 
 @dataclass(frozen=True)
@@ -231,7 +242,8 @@ def _relative(path: Path, folder: Path) -> str:
 
 def _toml(value: Condition) -> str:
     """A value as TOML writes it."""
-    return str(tomlkit.item(value).as_string())
+    whole = isinstance(value, float) and value.is_integer()
+    return str(tomlkit.item(int(value) if whole else value).as_string())
 
 
 def _recording(
@@ -366,8 +378,8 @@ def _files(path: Path, where: str, text: str) -> Iterator[tuple[Path, dict[str, 
 
 def _names(path: Path, found: Sequence[tuple[str, dict[str, Any], Path, Any]]) -> list[str]:
     """A name for each recording, no two alike even where case does not count."""
-    for parents in range(4):  # recording.avi in many folders: with the folder's name before it
-        names = [str(keys.get("name") or _plain(file, parents)) for _, keys, file, _ in found]
+    for parts in PARTS_OF_NAME:
+        names = [str(keys.get("name") or _plain(file, parts)) for _, keys, file, _ in found]
         counts = Counter(name.casefold() for name in names)
         if len(counts) == len(names):
             return names
@@ -376,7 +388,8 @@ def _names(path: Path, found: Sequence[tuple[str, dict[str, Any], Path, Any]]) -
     raise InputError(path, f"{where}.name", names[twice], "a name that no other recording has")
 
 
-def _plain(file: Path, parents: int) -> str:
-    """A name made of a path: its last part without suffix, and some folders before it."""
-    parts = [*file.parts[1:-1][-parents:], file.stem] if parents else [file.stem]
-    return re.sub(r"[^A-Za-z0-9.-]+", "_", "-".join(parts)).strip("._-")[-100:].lstrip("._-") or "x"
+def _plain(file: Path, parts: slice) -> str:
+    """A name made of parts of a path."""
+    chosen = [*file.parts[1:-1], file.stem][parts]
+    name = re.sub(r"[^A-Za-z0-9.-]+", "_", "-".join(chosen)).strip("._-")
+    return name[-100:].lstrip("._-") or "x"

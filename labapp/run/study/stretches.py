@@ -202,16 +202,18 @@ def stretches_of(
     length = measurers.STRETCH
     every = -(-len(frames) // KEPT_RESIDUALS)
     identity = f"{found.size} {found.sha256}"
-    kept = frames[::every]
-    return [
-        Stretch(
-            *(folder, recording, identity, setup, settings, warm),
-            frames[at : at + length],
-            kept,
-            surfaces,
+    tasks = []
+    for at in range(0, len(frames), length):
+        kept = frames[at + -at % every : at + length : every]
+        tasks.append(
+            Stretch(
+                *(folder, recording, identity, setup, settings, warm),
+                frames[at : at + length],
+                kept,
+                surfaces,
+            )
         )
-        for at in range(0, len(frames), length)
-    ]
+    return tasks
 
 
 def measure_stretch(stretch: Stretch) -> None:
