@@ -99,7 +99,7 @@ def write_results(
             file = dataset / f"{name}.parquet"
             if tasks is None or table is None:
                 file.unlink(missing_ok=True)
-                recordings.append(RecordingSummary(status, {}, "", "", {}))
+                recordings.append(RecordingSummary(_counted(status, 0), {}, "", "", {}))
                 continue
             status = _counted(status, len(table["frame"]))
             _write_parquet(file, table, plan.conditions, numbers, status)
@@ -133,7 +133,7 @@ def _counted(status: RecordingStatus, frames: int) -> RecordingStatus:
     """A status with the frames that could be read: damaged files count no longer."""
     if frames == status.frames_done:
         return status
-    return replace(status, state="part", frames_done=frames)
+    return replace(status, state="part" if frames else "waiting", frames_done=frames)
 
 
 def _assembled(tasks: Tasks) -> tuple[Table | None, SetupVerdict | None]:
@@ -280,7 +280,8 @@ def _put(
     group: Any, name: str, values: Any, dimensions: Sequence[str], unit: str, description: str
 ) -> None:
     about = _about(dimensions, unit, description)
-    group.create_array(name, data=values, attributes=about)
+    # No fill value: readers take it for unknown.
+    group.create_array(name, data=values, fill_value=None, attributes=about)
 
 
 def _about(dimensions: Sequence[str], unit: str, description: str) -> dict[str, object]:
