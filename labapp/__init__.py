@@ -1,6 +1,6 @@
 """labapp measures the surface of a molten weld pool in 3-D from a reflected dot matrix.
 
-`labapp.measure` and `labapp.Session` are for scripts (docs/python.md).
+`labapp.measure`, `labapp.Session` and `labapp.Study` are for scripts (docs/python.md).
 """
 
 from __future__ import annotations
@@ -14,15 +14,17 @@ from labapp.version import VERSION
 if TYPE_CHECKING:
     from labapp.api import Results, measure
     from labapp.errors import InputError
+    from labapp.run.study.study import Study
     from labapp.session.session import Session
 
-__all__ = ["InputError", "Results", "Session", "__version__", "measure"]
+__all__ = ["InputError", "Results", "Session", "Study", "__version__", "measure"]
 __version__ = VERSION
 
 _HOMES = {
     "InputError": "labapp.errors",
     "Results": "labapp.api",
     "Session": "labapp.session.session",
+    "Study": "labapp.run.study.study",
     "measure": "labapp.api",
 }
 

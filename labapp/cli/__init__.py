@@ -32,6 +32,7 @@ from labapp.cli import (
     reconstruct,
     session,
     simulate,
+    study,
 )
 from labapp.cli.shared import (
     BAD_INPUT,
@@ -87,6 +88,7 @@ calibrate.command("bench")(bench.calibrate_bench)
 calibrate.command("pattern")(pattern.calibrate_pattern)
 app.add_typer(analyze.app, name="analyze")
 app.add_typer(session.app, name="session")
+app.add_typer(study.app, name="study")
 app.command()(simulate.simulate)
 app.command()(advise.advise)
 app.command()(cameras.cameras)

@@ -19,11 +19,11 @@ import numpy as np
 import numpy.typing as npt
 
 from labapp.core.values import IntArray
-from labapp.errors import InputError, os_errors_as_input
+from labapp.errors import InputError
 from labapp.export.summary import format_ranges
 from labapp.media import Frame, FrameSource, GreyImage, open_source
 from labapp.media.formats.images import decoded
-from labapp.media.formats.stored import regular_size
+from labapp.media.identity import identify
 from labapp.media.survey import Survey, frame_checksum, survey
 from labapp.run.runner import select_frames
 from labapp.session.file.blobs import MAGIC, pack, unpack_from
@@ -36,9 +36,6 @@ Progress = Callable[[int, int], None]
 """Called with steps done and in all; may raise to stop."""
 
 THE_RECORDING = "the recording; `labapp session relink` says where it is now"
-
-READ_BYTES = 1 << 20
-PAIRED = frozenset({".cih", ".cihx", ".mraw"})
 
 
 class Frames:
@@ -410,40 +407,6 @@ class Frames:
         if image is None or image.ndim != 2:
             raise InputError(self._database.path, named, "damaged", "what was written there")
         return np.asarray(image)
-
-
-def identify(path: Path) -> tuple[int, str]:
-    """Size in bytes and SHA-256 of a recording; of a folder or a pair, over all its files.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read.
-    """
-    with os_errors_as_input(path, "recording", "one that can be read"):
-        files = _files(path)
-        size = 0
-        digests = []
-        for file in files:
-            size += regular_size(file)
-            digest = hashlib.sha256()
-            with file.open("rb") as stream:
-                while part := stream.read(READ_BYTES):
-                    digest.update(part)
-            digests.append((file.name, digest.hexdigest()))
-    if len(files) == 1 and files[0] == path:
-        return size, digests[0][1]
-    return size, hashlib.sha256(repr(digests).encode()).hexdigest()
-
-
-def _files(path: Path) -> list[Path]:
-    if path.is_dir():
-        return sorted(p for p in path.iterdir() if p.is_file() and not p.name.startswith("."))
-    if path.suffix.lower() in PAIRED:
-        return sorted(
-            p for p in path.parent.iterdir() if p.stem == path.stem and p.suffix.lower() in PAIRED
-        )
-    return [path]
 
 
 def _encoded(image: npt.NDArray[Any]) -> bytes:

@@ -56,16 +56,31 @@ def sigma_of_mean(name: str, series: Mapping[str, FloatArray]) -> float:
     """
     if sigma_name(name) not in series or not len(series[name]):
         return math.nan
-    sigma, level = _without_setup(series, name), series[sigma_name(name, "level")]
-    level = np.where(np.isfinite(level), level, sigma)
-    count = len(sigma)
-    variance = (np.sum(np.maximum(sigma**2 - level**2, 0.0)) + np.sum(level**2)) / count**2
+    parts = (
+        noise_sigma_of_mean(name, series),
+        level_sigma_of_mean(name, series),
+        setup_sigma_of_mean(name, series),
+    )
+    return float(np.linalg.norm(parts))
+
+
+def noise_sigma_of_mean(name: str, series: Mapping[str, FloatArray]) -> float:
+    """The noise's part of `sigma_of_mean`: frames are independent."""
+    sigma, level = _without_setup(series, name), _level(series, name)
+    return float(np.sqrt(np.sum(np.maximum(sigma**2 - level**2, 0.0))) / len(sigma))
+
+
+def level_sigma_of_mean(name: str, series: Mapping[str, FloatArray]) -> float:
+    """The level's part of `sigma_of_mean`: frames whose boundary is alike have the same error."""
+    level = _level(series, name)
+    count = len(level)
+    variance = np.sum(level**2) / count**2
     if count > 1:
         some = np.unique(np.linspace(0, count - 1, min(count, MOST)).round().astype(int))
         together = level[some] @ level_correlation(series, some) @ level[some]
         pairs = len(some) * (len(some) - 1)
         variance += (together - np.sum(level[some] ** 2)) / pairs * (count - 1) / count
-    return float(np.sqrt(variance + setup_sigma_of_mean(name, series) ** 2))
+    return float(np.sqrt(variance))
 
 
 def setup_sigma_of_mean(name: str, series: Mapping[str, FloatArray]) -> float:
@@ -76,6 +91,12 @@ def setup_sigma_of_mean(name: str, series: Mapping[str, FloatArray]) -> float:
 def _setup(series: Mapping[str, FloatArray], name: str) -> FloatArray:
     """The set-up's part of a size's uncertainty, shape (n,); 0 where it is unknown."""
     return np.nan_to_num(series.get(sigma_name(name, "setup"), np.zeros(len(series[name]))))
+
+
+def _level(series: Mapping[str, FloatArray], name: str) -> FloatArray:
+    """The level's part of a size's uncertainty, shape (n,); all but the set-up's if unknown."""
+    level = series[sigma_name(name, "level")]
+    return np.where(np.isfinite(level), level, _without_setup(series, name))
 
 
 def _without_setup(series: Mapping[str, FloatArray], name: str) -> FloatArray:

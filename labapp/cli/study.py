@@ -1,0 +1,184 @@
+"""`labapp study …`: many recordings measured alike and compared, by the calls of `run.study`."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from labapp.cli.shared import (
+    INTERRUPTED,
+    NOTHING_MEASURED,
+    Commands,
+    note,
+    progress_bar,
+)
+from labapp.system import quoted
+from labapp.text import pluralize
+
+if TYPE_CHECKING:
+    from labapp.run.study.status import Progress, RecordingStatus
+    from labapp.run.study.study import Study
+
+app = typer.Typer(
+    cls=Commands,
+    no_args_is_help=True,
+    help="Measure many recordings alike, on all cores or a cluster, and compare them.",
+)
+
+File = Annotated[Path, typer.Argument(metavar="STUDY", help="The study file (TOML or CSV).")]
+Out = Annotated[
+    Path | None,
+    typer.Option(help="Folder for the results; without it, STUDY_results beside the study file."),
+]
+
+SHOWN = 20
+"""Recordings that are listed one by one, at most."""
+
+
+@app.command()
+def new(
+    study: Annotated[
+        Path, typer.Argument(metavar="STUDY", help="The study file to write, .toml or .csv.")
+    ],
+    recordings: Annotated[
+        list[str],
+        typer.Argument(
+            help="Recordings; or in quotes a pattern, with {name} for a condition and * for "
+            'another part that varies: "runs/I{current_a}_*.avi".'
+        ),
+    ],
+    setup: Annotated[Path, typer.Option(help="Setup file of all recordings (TOML).")],
+) -> None:
+    """Write a study file that lists recordings, to be completed with conditions by hand."""
+    from labapp.run.study.plan import write_study
+
+    plan = write_study(study, recordings, setup)
+    names = f", conditions {', '.join(plan.conditions)}" if plan.conditions else ""
+    typer.echo(f"{pluralize(len(plan.recordings), 'recording')}{names}, in {study.absolute()}")
+    typer.echo(f"  labapp study run {quoted(str(study))}")
+
+
+@app.command()
+def run(
+    study: File,
+    out: Out = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(min=0, max=1024, help="How many processes; without it, one a core."),
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Dask scheduler to use instead: tcp://HOST:8786."),
+    ] = None,
+    surfaces: Annotated[
+        bool, typer.Option("--surfaces", help="Keep surfaces, too, and write surfaces.zarr.")
+    ] = False,
+) -> None:
+    """Measure what is not measured yet, and write tables and a summary.
+
+    Interrupted at any moment, it can be run again. A recording that cannot be measured does not
+    stop the others. Exit code 1: not everything is measured.
+    """
+    from labapp.run.study.results import require_extra
+    from labapp.run.study.study import Study
+
+    opened = Study(study, out)
+    require_extra()
+    with progress_bar() as bar:
+        task = bar.add_task(study.stem, total=None)
+
+        def show(now: Progress) -> None:
+            words = f"{study.stem}: {now.recordings_done} of {now.recordings} recordings, frames"
+            bar.update(task, description=words, completed=now.frames_done, total=now.frames or None)
+
+        try:
+            opened.run(
+                workers,
+                scheduler,
+                surfaces=surfaces,
+                progress=show,
+                note=lambda text: note(bar.console, text),
+            )
+        except KeyboardInterrupt:
+            states = Counter(one.state for one in opened.status(surfaces=surfaces))
+            done = f"stopped: {states['done']} of {pluralize(states.total(), 'recording')} done"
+            note(bar.console, f"{done}; what was measured is kept: run it again")
+            raise typer.Exit(INTERRUPTED) from None
+    _finish(opened, surfaces)
+
+
+@app.command()
+def status(study: File, out: Out = None) -> None:
+    """Say what is measured of each recording, and why others are not.
+
+    Exit code 1: not everything is measured.
+    """
+    from labapp.run.study.study import Study
+
+    opened = Study(study, out)
+    found = opened.status()
+    for one in found:
+        frames = f"{one.frames_done} of {one.frames} frames" if one.frames else ""
+        typer.echo("  ".join(filter(None, (f"{one.state:8}{one.recording.name}", frames))))
+        if one.problem:
+            typer.echo(f"        {one.problem}")
+    typer.echo(_counted(found))
+    if any(one.state != "done" for one in found):
+        raise typer.Exit(NOTHING_MEASURED)
+
+
+@app.command()
+def results(
+    study: File,
+    out: Out = None,
+    surfaces: Annotated[
+        bool,
+        typer.Option("--surfaces", help="Write surfaces.zarr, of what was run with --surfaces."),
+    ] = False,
+) -> None:
+    """Write tables and a summary of what is measured so far: after conditions were changed, too.
+
+    Exit code 1: not everything is measured.
+    """
+    from labapp.run.study.study import Study
+
+    _finish(Study(study, out), surfaces)
+
+
+def _finish(study: Study, surfaces: bool) -> None:
+    """Write the results, print the means, and exit with 1 unless all is measured."""
+    summary = study.results(surfaces=surfaces)
+    from labapp.run.study.page import rounded
+    from labapp.run.study.plan import shown_condition
+
+    states = [one.status for one in summary.recordings]
+    for one in states:
+        if one.state != "done" and one.problem:
+            typer.echo(f"{one.recording.name}: {one.problem}", err=True)
+    for group in summary.groups[:SHOWN]:
+        at = ", ".join(f"{name} {shown_condition(v)}" for name, v in group.conditions.items())
+        means = (
+            f"{size} {rounded(group.means[f'{size}_mm'].mean, group.means[f'{size}_mm'].sigma)} mm"
+            for size in ("width", "length", "height")
+        )
+        count = pluralize(len(group.recordings), "recording")
+        typer.echo(f"{at or 'all'} ({count}): {', '.join(means)}")
+    if len(summary.groups) > SHOWN:
+        typer.echo(f"… and {len(summary.groups) - SHOWN} more, in summary.csv")
+    if summary.outliers:
+        typer.echo(f"{pluralize(len(summary.outliers), 'value')} out of line: outliers.csv")
+    typer.echo(_counted(states))
+    typer.echo(f"Results are in {study.folder}: summary.html, measures.parquet")
+    if any(one.state != "done" for one in states):
+        raise typer.Exit(NOTHING_MEASURED)
+
+
+def _counted(found: Sequence[RecordingStatus]) -> str:
+    """How many recordings are in each state."""
+    states = Counter(one.state for one in found)
+    counts = [f"{states[s]} {s}" for s in ("done", "part", "waiting", "failed") if states[s]]
+    return f"{pluralize(len(found), 'recording')}: {', '.join(counts)}"

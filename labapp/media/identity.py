@@ -1,0 +1,62 @@
+"""Which recording a path leads to: its files, their digest, and a quick check for a change."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+from labapp.errors import os_errors_as_input
+from labapp.media.formats.stored import regular_size
+
+READ_BYTES = 1 << 20
+PAIRED = frozenset({".cih", ".cihx", ".mraw"})
+
+READABLE = "one that can be read"
+
+
+def identify(path: Path) -> tuple[int, str]:
+    """Size in bytes and SHA-256 of a recording; of a folder or a pair, over all its files.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read.
+    """
+    with os_errors_as_input(path, "recording", READABLE):
+        files = _files(path)
+        size = 0
+        digests = []
+        for file in files:
+            size += regular_size(file)
+            digest = hashlib.sha256()
+            with file.open("rb") as stream:
+                while part := stream.read(READ_BYTES):
+                    digest.update(part)
+            digests.append((file.name, digest.hexdigest()))
+    if len(files) == 1 and files[0] == path:
+        return size, digests[0][1]
+    return size, hashlib.sha256(repr(digests).encode()).hexdigest()
+
+
+def stamp(path: Path) -> str:
+    """Digest of the names, sizes and times of change of a recording's files, without reading them.
+
+    Raises
+    ------
+    InputError
+        If one of them is not there.
+    """
+    with os_errors_as_input(path, "recording", READABLE):
+        seen = [(file.name, file.stat()) for file in _files(path)]
+    facts = [(name, found.st_size, found.st_mtime_ns) for name, found in seen]
+    return hashlib.sha256(repr(facts).encode()).hexdigest()
+
+
+def _files(path: Path) -> list[Path]:
+    if path.is_dir():
+        return sorted(p for p in path.iterdir() if p.is_file() and not p.name.startswith("."))
+    if path.suffix.lower() in PAIRED:
+        return sorted(
+            p for p in path.parent.iterdir() if p.stem == path.stem and p.suffix.lower() in PAIRED
+        )
+    return [path]

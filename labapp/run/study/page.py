@@ -1,0 +1,261 @@
+"""The summary of a study as a page to look at: one HTML file, its plots inside."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from html import escape
+from typing import Any
+
+from matplotlib import rc_context
+
+from labapp.core.surface.measures import SIZES
+from labapp.run.study.plan import Condition, shown_condition
+from labapp.run.study.summary import GroupSummary, Mean, StudySummary
+from labapp.studies.plotting import STYLE, as_bytes, new_figure
+from labapp.text import SIGMA_OF, pluralize
+
+MOST_SHOWN = 60
+"""Rows of a table of problems or outliers, columns of plots' colours: the rest is in the files."""
+
+MOST_COLOURS = 8
+COLOURS = "#0072b2 #d55e00 #009e73 #cc79a7 #56b4e9 #e69f00 #333333 #999999".split()
+"""Colours that people with poor colour vision tell apart (Okabe and Ito)."""
+
+PANEL_INCHES = (2.5, 1.75)
+
+WORDS = {
+    "width_mm": ("width", "mm"),
+    "length_mm": ("length", "mm"),
+    "height_mm": ("height", "mm"),
+    "depth_mm": ("depth", "mm"),
+    "area_mm2": ("area", "mm²"),
+    "volume_mm3": ("volume", "mm³"),
+}
+
+CSS = """
+body { font: 15px/1.45 system-ui, sans-serif; color: #222; max-width: 75rem; margin: 2rem auto;
+  padding: 0 1rem; }
+h1 { font-size: 1.6rem; margin-bottom: .2rem; } h2 { font-size: 1.15rem; margin-top: 2.2rem; }
+p.note { color: #555; margin-top: .2rem; } .bad { color: #a40000; }
+.scroll { overflow-x: auto; } svg { max-width: 100%; height: auto; }
+table { border-collapse: collapse; font-size: 13px; } th, td { padding: .25rem .6rem; }
+th { text-align: left; border-bottom: 1px solid #888; } td { border-bottom: 1px solid #e4e4e4; }
+td.n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
+"""
+
+
+def summary_page(summary: StudySummary, made: str) -> str:
+    """The page, as HTML with SVG in it; nothing else is loaded.
+
+    Parameters
+    ----------
+    made
+        When, for its foot.
+    """
+    parts = [f"<h1>{escape(summary.title)}</h1>", _head(summary)]
+    parts += _problems(summary)
+    if summary.groups:
+        parts += ["<h2>Measures against conditions</h2>", _plots_note(summary), _plots(summary)]
+        parts += ["<h2>Means</h2>", _groups(summary)]
+    parts += ["<h2>Out of line</h2>", _outliers(summary)]
+    parts += ["<h2>Recordings</h2>", _recordings(summary)]
+    parts.append(f"<p class=note>Made by labapp, {escape(made)}.</p>")
+    body = "\n".join(parts)
+    return (
+        '<!doctype html>\n<html lang="en"><head><meta charset="utf-8">'
+        f"<title>{escape(summary.title)}</title><style>{CSS}</style></head>\n"
+        f"<body>\n{body}\n</body></html>\n"
+    )
+
+
+def _head(summary: StudySummary) -> str:
+    states = [one.status.state for one in summary.recordings]
+    measured = sum(one.statuses.get("ok", 0) for one in summary.recordings)
+    frames = sum(one.status.frames_done for one in summary.recordings)
+    words = [f"{pluralize(len(states), 'recording')}: {states.count('done')} done"]
+    words += [
+        f"{states.count(state)} {word}"
+        for state, word in (("part", "in part"), ("waiting", "waiting"), ("failed", "failed"))
+        if state in states
+    ]
+    surface = f"{frames} frames measured, {measured} of them with a surface"
+    return f"<p>{', '.join(words)}. {surface}.</p>"
+
+
+def _problems(summary: StudySummary) -> list[str]:
+    rows = [
+        (one.status.recording.name, one.status.problem or f"The set-up is doubtful: {one.doubt}.")
+        for one in summary.recordings
+        if one.status.problem or one.doubt
+    ]
+    if not rows:
+        return []
+    table = _table(["recording", "problem"], [[_t(name), _t(text)] for name, text in rows])
+    return ['<h2 class="bad">Problems</h2>', table]
+
+
+# --- plots --------------------------------------------------------------------------------------
+
+
+def _plots_note(summary: StudySummary) -> str:
+    varying = _varying(summary)
+    colours = " Colours tell the other conditions apart." if len(varying) > 1 else ""
+    return (
+        "<p class=note>Large: mean of the recordings under one condition, with its standard "
+        f"uncertainty ({SIGMA_OF}). Small: each recording's mean.{colours} The set-up's part of "
+        "± is common to all that was measured on one bench: differences are known better.</p>"
+    )
+
+
+def _varying(summary: StudySummary) -> list[str]:
+    """Conditions that have more than one value."""
+    values = {
+        name: {one.conditions.get(name) for one in summary.groups} for name in summary.conditions
+    }
+    return [name for name, each in values.items() if len(each) > 1]
+
+
+def _plots(summary: StudySummary) -> str:
+    """Small multiples: a row a size, a column a condition that varies."""
+    columns = _varying(summary)[:6] or [""]
+    width, height = PANEL_INCHES
+    by_name = {one.status.recording.name: one for one in summary.recordings}
+    with rc_context(STYLE):
+        figure = new_figure(width * max(len(columns), 2) + 0.6, height * len(SIZES) + 0.4)
+        axes = figure.subplots(len(SIZES), len(columns), squeeze=False, sharex="col", sharey="row")
+        for column, condition in enumerate(columns):
+            colours = _colours(summary.groups, [c for c in columns if c not in ("", condition)])
+            places, ticks = _places(summary.groups, condition)
+            for row, size in enumerate(SIZES):
+                axis = axes[row][column]
+                for group, place, colour in zip(summary.groups, places, colours, strict=True):
+                    each = [by_name[name].means[size].mean for name in group.recordings]
+                    mean = group.means[size]
+                    _draw(axis, place, mean, each, colour)
+                axis.grid(True, color="0.9", linewidth=0.5)
+                axis.set_axisbelow(True)
+                if column == 0:
+                    axis.set_ylabel("{} ({})".format(*WORDS[size]))
+                if ticks is not None:
+                    axis.set_xticks(range(len(ticks)), ticks)
+                    axis.margins(x=0.15)
+                if row == len(SIZES) - 1:
+                    axis.set_xlabel(condition.replace("_", " ") or "all recordings")
+        svg = as_bytes(figure, "svg").decode()
+    return f'<div class="scroll">{svg[svg.index("<svg") :]}</div>'
+
+
+def _draw(axis: Any, place: float, mean: Mean, each: Sequence[float], colour: str) -> None:
+    axis.plot([place] * len(each), each, ".", color=colour, markersize=2.5, alpha=0.45)
+    sigma = mean.sigma if math.isfinite(mean.sigma) else 0.0
+    axis.errorbar(
+        [place],
+        [mean.mean],
+        [sigma],
+        fmt="o",
+        color=colour,
+        markersize=3.5,
+        capsize=2,
+        elinewidth=0.9,
+    )
+
+
+def _places(groups: Sequence[GroupSummary], condition: str) -> tuple[list[float], list[str] | None]:
+    """Where each group stands along a condition; ticks where it is text."""
+    values = [group.conditions.get(condition) for group in groups]
+    if condition and all(isinstance(value, int | float) for value in values):
+        return [float(value) for value in values if not isinstance(value, str | None)], None
+    ticks = list(dict.fromkeys(shown_condition(value) for value in values))
+    return [float(ticks.index(shown_condition(value))) for value in values], ticks
+
+
+def _colours(groups: Sequence[GroupSummary], others: Sequence[str]) -> list[str]:
+    """A colour for each combination of the other conditions; one for all if there are many."""
+    of = [tuple(group.conditions.get(name) for name in others) for group in groups]
+    kinds = list(dict.fromkeys(of))
+    if len(kinds) > MOST_COLOURS:
+        return [COLOURS[0]] * len(groups)
+    return [COLOURS[kinds.index(each)] for each in of]
+
+
+# --- tables -------------------------------------------------------------------------------------
+
+
+def _t(value: object) -> str:
+    return f"<td>{escape(str(value))}</td>"
+
+
+def _n(value: object) -> str:
+    return f'<td class="n">{escape(str(value))}</td>'
+
+
+def _cell(value: Condition | None) -> str:
+    return _t(value) if isinstance(value, str) else _n(shown_condition(value))
+
+
+def _table(head: Iterable[str], rows: Iterable[Sequence[str]]) -> str:
+    names = "".join(f"<th>{escape(name)}</th>" for name in head)
+    body = "\n".join(f"<tr>{''.join(row)}</tr>" for row in rows)
+    return f'<div class="scroll"><table><tr>{names}</tr>\n{body}</table></div>'
+
+
+def rounded(value: float, sigma: float) -> str:
+    """Value and ±, as many decimals as two digits of ± have."""
+    if not math.isfinite(sigma) or sigma <= 0:
+        return f"{value:z.4g}"
+    decimals = min(max(1 - math.floor(math.log10(sigma)), 0), 6)
+    return f"{value:z.{decimals}f} ± {sigma:.{decimals}f}"
+
+
+def _mean_cells(means: Mapping[str, Mean]) -> list[str]:
+    return [_n(rounded(means[s].mean, means[s].sigma)) if s in means else _n("") for s in SIZES]
+
+
+def _groups(summary: StudySummary) -> str:
+    sizes = ["{} ({})".format(*WORDS[size]) for size in SIZES]
+    head = [*summary.conditions, "recordings", "frames", *sizes]
+    return _table(
+        head,
+        (
+            [
+                *(_cell(one.conditions.get(name)) for name in summary.conditions),
+                *(_n(len(one.recordings)), _n(one.frames), *_mean_cells(one.means)),
+            ]
+            for one in summary.groups
+        ),
+    )
+
+
+def _outliers(summary: StudySummary) -> str:
+    if not summary.outliers:
+        return "<p>No frame and no recording is far from the others.</p>"
+    rows = [
+        [
+            *(_t(one.recording), _n("all" if one.frame is None else one.frame)),
+            *(_t(WORDS[one.measure][0]), _n(f"{one.value:.4g}"), _n(f"{one.usual:.4g}")),
+            *(_n(f"{one.times:.1f}"), _t(one.file)),
+        ]
+        for one in summary.outliers[:MOST_SHOWN]
+    ]
+    left = len(summary.outliers) - len(rows)
+    more = f"<p>{left} more are in outliers.csv.</p>" if left else ""
+    head = ["recording", "frame", "measure", "value", "usual", "standard deviations off", "file"]
+    return _table(head, rows) + more
+
+
+def _recordings(summary: StudySummary) -> str:
+    sizes = ["{} ({})".format(*WORDS[size]) for size in SIZES]
+    head = ["recording", *summary.conditions, "state", "frames", "with a surface", *sizes]
+    return _table(
+        head,
+        (
+            [
+                _t(one.status.recording.name),
+                *(_cell(one.status.recording.conditions.get(c)) for c in summary.conditions),
+                *(_t(one.status.state), _n(one.status.frames_done)),
+                *(_n(one.statuses.get("ok", 0)), *_mean_cells(one.means)),
+            ]
+            for one in summary.recordings
+        ),
+    )

@@ -1,0 +1,395 @@
+"""The study file: many recordings, each with its set-up, its settings and its conditions.
+
+TOML, with defaults for all recordings at the top::
+
+    title = "Current and gas"
+    setup = "bench.toml"
+
+    [[recording]]
+    file = "runs/I100_1.avi"
+    conditions = { current_a = 100, gas = "Ar" }
+
+    [[recording]]
+    file = "runs/I{current_a}_{repeat}.avi"     # every file of that form
+
+or CSV with a column ``file``, columns named like the other keys, and a column for each condition.
+"""
+
+from __future__ import annotations
+
+import csv
+import glob
+import itertools
+import os
+import re
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import tomlkit
+
+from labapp.config.csv_tables import bounded_lines, open_table, parse_number
+from labapp.config.toml_keys import Rule, check_keys, is_number, parse_toml, shown, unknown_key
+from labapp.core.pipeline import Settings
+from labapp.core.schemes import SCHEMES
+from labapp.errors import InputError
+from labapp.export.tables import TABLES
+from labapp.files import as_bytes, write_file
+from labapp.text import unescaped_csv_text
+
+A_STUDY = "a study file (TOML or CSV, UTF-8)"
+
+LARGEST_FILE = 8_000_000
+MOST_RECORDINGS = 10_000
+MOST_CONDITIONS = 64
+LONGEST_TEXT = 200
+
+RESERVED = frozenset({"recording", *(column.name for column in TABLES["measures"])})
+"""Names that conditions cannot have: columns of the table that they are put into."""
+
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
+CONDITION = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,49}")
+FIELD = re.compile(r"\{([^{}]*)\}")
+
+PARTS_OF_NAME = (slice(-1, None), slice(-2, -1), slice(-2, None), slice(-3, None))
+"""Parts of a recording's path that become its name, the first that tell all recordings apart: the
+file's name, its folder's, both …"""
+
+Condition = float | str
+
+
+def shown_condition(value: Condition | None) -> str:
+    """A condition's value as text; a dash where it is not known."""
+    if value is None:
+        return "–"
+    return value if isinstance(value, str) else f"{value:g}"
+
+
+@dataclass(frozen=True)
+class StudyRecording:
+    """A recording of a study."""
+
+    name: str
+    """Its name in results; also the name of its files there."""
+    path: Path
+    """Where it is."""
+    setup: Path
+    """Its setup file."""
+    frames: str = ":"
+    """Its frames, ``A:B:STEP``."""
+    settings: Settings = field(default_factory=Settings)
+    """How it is measured."""
+    warm: bool = True
+    """Whether each frame is measured from the one before."""
+    conditions: Mapping[str, Condition] = field(default_factory=dict)
+    """Under which conditions it was made; a missing one is not known."""
+
+
+@dataclass(frozen=True)
+class StudyPlan:
+    """What a study file says."""
+
+    title: str
+    recordings: tuple[StudyRecording, ...]
+    conditions: tuple[str, ...]
+    """Names of all conditions, in the order in which they occur."""
+
+
+def _text(longest: int = LONGEST_TEXT) -> Rule:
+    return Rule(
+        f"text of 1 to {longest} characters",
+        lambda value: isinstance(value, str) and 0 < len(value) <= longest,
+        required=False,
+    )
+
+
+def _one_of(words: Sequence[str]) -> Rule:
+    return Rule(f"one of {', '.join(words)}", lambda value: value in words, required=False)
+
+
+DEFAULTS: dict[str, Rule] = {
+    "setup": _text(4096),
+    "frames": _text(),
+    "scheme": _one_of(tuple(SCHEMES)),
+    "algorithm": _one_of(tuple(name for one in SCHEMES.values() for name in one.algorithms)),
+    "correspondence": _one_of(("auto", "S/S", "S/I", "I/I")),
+    "warm": Rule("true or false", lambda value: isinstance(value, bool), required=False),
+}
+"""Keys that may stand at the top for all recordings, and in each."""
+
+OF_RECORDING: dict[str, Rule] = {
+    "file": Rule(
+        "the path of a recording, or of many: {condition} or * for a part that varies",
+        lambda value: isinstance(value, str) and 0 < len(value) <= 4096 and "\0" not in value,
+    ),
+    "name": Rule(
+        "letters, digits, ., - and _, a letter or digit first, at most 100",
+        lambda value: isinstance(value, str) and NAME.fullmatch(value) is not None,
+        required=False,
+    ),
+    "conditions": Rule("a table of conditions", lambda v: isinstance(v, dict), required=False),
+    **DEFAULTS,
+}
+
+
+def read_study(path: str | os.PathLike[str]) -> StudyPlan:
+    """Read a study file; its paths are relative to its folder.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read, or anything in it is unknown, missing or impossible; all that was
+        found is reported together. Recordings and setup files need not be there.
+    """
+    path = Path(path)
+    read = _read_csv if path.suffix.lower() == ".csv" else _read_toml
+    top, entries = read(path)
+    problems: list[InputError] = []
+    found: list[tuple[str, dict[str, Any], Path, dict[str, Condition]]] = []
+    for where, entry in entries:
+        wrong = [
+            *check_keys(path, where, entry, OF_RECORDING, where),
+            *_conditions(path, where, entry),
+        ]
+        problems += wrong
+        if wrong:
+            continue
+        keys = {**top, **entry}
+        if "setup" not in keys:
+            problems.append(InputError(path, f"{where}.setup", "missing", "its setup file"))
+            continue
+        try:
+            files = list(itertools.islice(_files(path, where, keys["file"]), MOST_RECORDINGS + 1))
+        except InputError as error:
+            problems.append(error)
+            continue
+        if len(files) > 1 and "name" in keys:
+            named = f"{shown(keys['name'])} for {len(files)} files"
+            problems.append(InputError(path, f"{where}.name", named, "no name beside a pattern"))
+        found += [(where, keys, file, varied) for file, varied in files]
+        if len(found) > MOST_RECORDINGS:
+            many = f"more than {MOST_RECORDINGS}"
+            raise InputError(path, "recording", many, f"at most {MOST_RECORDINGS} recordings")
+    if not problems and not found:
+        problems.append(InputError(path, "recording", "none", "one recording or more"))
+    if problems:
+        raise InputError.gather(problems[:10])
+    names = _names(path, found)
+    recordings = tuple(
+        _recording(path, name, keys, file, varied)
+        for name, (_, keys, file, varied) in zip(names, found, strict=True)
+    )
+    conditions = dict.fromkeys(name for one in recordings for name in one.conditions)
+    if len(conditions) > MOST_CONDITIONS:
+        few = f"at most {MOST_CONDITIONS}"
+        raise InputError(path, "conditions", f"{len(conditions)} different ones", few)
+    return StudyPlan(str(top.get("title", path.stem)), recordings, tuple(conditions))
+
+
+def write_study(
+    path: str | os.PathLike[str], recordings: Sequence[str], setup: str | os.PathLike[str]
+) -> StudyPlan:
+    """Write a new study file that lists recordings; paths in it are relative where they can be.
+
+    Parameters
+    ----------
+    path
+        Of the file, ``.toml`` or ``.csv``.
+    recordings
+        Paths of recordings, or patterns of them, from where the program runs.
+    setup
+        Setup file of them all.
+
+    Raises
+    ------
+    InputError
+        If the file is there already or cannot be written, or a pattern matches nothing.
+    """
+    path = Path(path)
+    if path.suffix.lower() not in (".toml", ".csv"):
+        raise InputError(path, "name", path.suffix or "no suffix", ".toml or .csv")
+    if path.exists():
+        raise InputError(path, "file", "is there already", "a new file")
+    here, folder = Path(), path.parent.absolute()
+    found = [each for text in recordings for each in _files(here / "study", "recording", text)]
+    names = list(dict.fromkeys(name for _, varied in found for name in varied))
+    entries = [
+        {"file": _relative(file, folder), "setup": _relative(Path(setup), folder), **varied}
+        for file, varied in found
+    ]
+    if path.suffix.lower() == ".csv":
+        head = ["file", "setup", *names]
+        text = unescaped_csv_text([head, *([one.get(n, "") for n in head] for one in entries)])
+    else:
+        text = f"title = {_toml(path.stem)}\nsetup = {_toml(_relative(Path(setup), folder))}\n"
+        for (_, varied), entry in zip(found, entries, strict=True):
+            text += f"\n[[recording]]\nfile = {_toml(entry['file'])}\n"
+            each = ", ".join(f"{name} = {_toml(value)}" for name, value in varied.items())
+            text += f"conditions = {{ {each} }}\n" if each else ""
+    write_file(path, as_bytes(text))
+    return read_study(path)
+
+
+def _relative(path: Path, folder: Path) -> str:
+    """A path from a folder, with ``/``; as it is where there is no way."""
+    try:
+        return Path(os.path.relpath(path, folder)).as_posix()
+    except ValueError:  # on another drive
+        return path.absolute().as_posix()
+
+
+def _toml(value: Condition) -> str:
+    """A value as TOML writes it."""
+    whole = isinstance(value, float) and value.is_integer()
+    return str(tomlkit.item(int(value) if whole else value).as_string())
+
+
+def _recording(
+    path: Path, name: str, keys: Mapping[str, Any], file: Path, varied: Mapping[str, Condition]
+) -> StudyRecording:
+    chosen = {key: keys[key] for key in ("scheme", "algorithm", "correspondence") if key in keys}
+    return StudyRecording(
+        name,
+        file,
+        path.parent.absolute() / keys["setup"],
+        keys.get("frames", ":"),
+        Settings(**chosen),
+        keys.get("warm", True),
+        {**keys.get("conditions", {}), **varied},
+    )
+
+
+def _read_toml(path: Path) -> tuple[dict[str, Any], list[tuple[str, Any]]]:
+    """Keys at the top, and each recording's with the name of its place."""
+    with open_table(path, A_STUDY, LARGEST_FILE) as file:
+        values = parse_toml(file.read(), path, A_STUDY)
+    entries = values.pop("recording", [])
+    if not isinstance(entries, list):
+        raise InputError(path, "recording", shown(entries), "tables [[recording]]")
+    rules = {"title": _text(), **DEFAULTS}
+    problems = [
+        unknown_key(path, key, {**rules, "recording": None})
+        if key not in rules
+        else InputError(path, key, shown(value), rules[key].expected)
+        for key, value in values.items()
+        if key not in rules or not rules[key].accepts(value)
+    ]
+    if problems:
+        raise InputError.gather(problems)
+    return values, [(f"recording[{place}]", each) for place, each in enumerate(entries, 1)]
+
+
+def _read_csv(path: Path) -> tuple[dict[str, Any], list[tuple[str, Any]]]:
+    """The same of a table: a row is a recording, a column that is no key a condition."""
+    entries: list[tuple[str, Any]] = []
+    with open_table(path, A_STUDY, LARGEST_FILE) as file:
+        lines = bounded_lines(path, file, A_STUDY)
+        head = next(lines, "")
+        separator = max(",;\t", key=head.count)
+        header = [cell.strip() for cell in next(csv.reader([head], delimiter=separator), [])]
+        twice = [name for name, count in Counter(header).items() if count > 1]
+        if "file" not in header or twice:
+            named = f"{shown(twice[0])} twice" if twice else head.strip() or "empty"
+            raise InputError(path, "line 1", named, "the names of the columns, file among them")
+        for number, cells in enumerate(csv.reader(lines, delimiter=separator), 2):
+            if not any(cells):
+                continue
+            if len(cells) > len(header):
+                more = f"{len(cells)} cells"
+                raise InputError(path, f"line {number}", more, f"at most {len(header)}")
+            given = {k: v.strip() for k, v in zip(header, cells, strict=False) if v.strip()}
+            entry: dict[str, Any] = {k: v for k, v in given.items() if k in OF_RECORDING}
+            if entry.get("warm", "").lower() in ("true", "false"):
+                entry["warm"] = entry["warm"].lower() == "true"
+            entry["conditions"] = {
+                name: _value(cell, separator)
+                for name, cell in given.items()
+                if name not in OF_RECORDING
+            }
+            entries.append((f"line {number}", entry))
+            if len(entries) > MOST_RECORDINGS:
+                raise InputError(path, "rows", "more", f"at most {MOST_RECORDINGS} recordings")
+    return {}, entries
+
+
+def _value(cell: str, separator: str = ",") -> Condition:
+    """A condition's value: a number if it reads like one."""
+    number = parse_number(cell, separator)
+    return cell if number is None else number
+
+
+def _conditions(path: Path, where: str, entry: object) -> Iterator[InputError]:
+    """Problems of a recording's conditions."""
+    given = entry.get("conditions") if isinstance(entry, dict) else None
+    if not isinstance(given, dict):
+        return
+    for name, value in given.items():
+        full = f"{where}.conditions.{name}"
+        problem = _wrong_condition(name)
+        if problem is not None:
+            yield InputError(path, full, shown(name), problem)
+        elif not (is_number(value) or (isinstance(value, str) and len(value) <= LONGEST_TEXT)):
+            expected = f"a number, or text of at most {LONGEST_TEXT} characters"
+            yield InputError(path, full, shown(value), expected)
+
+
+def _wrong_condition(name: str) -> str | None:
+    """What is right in place of a condition's name that is none; None if it is one."""
+    if not CONDITION.fullmatch(name):
+        return "a name of letters, digits and _, a letter first, at most 50"
+    if name.lower() in RESERVED:
+        return "another name: results have a column of this one"
+    return None
+
+
+def _files(path: Path, where: str, text: str) -> Iterator[tuple[Path, dict[str, Condition]]]:
+    """Recordings that a path leads to, sorted; with the conditions that are in their names."""
+    folder = path.parent.absolute()
+    if (folder / text).exists() or not set(text) & set("*{}"):
+        yield folder / text, {}
+        return
+    fields = FIELD.findall(text)
+    for name in fields:
+        expected = _wrong_condition(name)
+        if expected is not None:
+            raise InputError(path, f"{where}.file", f"{{{name}}}", expected)
+    twice = [name for name, count in Counter(fields).items() if count > 1]
+    if twice or "**" in text:
+        named = f"{{{twice[0]}}} twice" if twice else "**"
+        raise InputError(path, f"{where}.file", named, "* and each {condition} once")
+    whole = (folder / text).as_posix()
+    parts = re.split(r"(\{[^{}]*\}|\*)", whole)
+    pattern = "".join("*" if k % 2 else glob.escape(part) for k, part in enumerate(parts))
+    form = "".join(
+        re.escape(part) if k % 2 == 0 else "[^/]*" if part == "*" else f"(?P<{part[1:-1]}>[^/]+?)"
+        for k, part in enumerate(parts)
+    )
+    matched = 0
+    for found in sorted(itertools.islice(glob.iglob(pattern), MOST_RECORDINGS + 1)):
+        fits = re.fullmatch(form, Path(found).as_posix())
+        if fits is not None:
+            matched += 1
+            yield Path(found), {name: _value(cell) for name, cell in fits.groupdict().items()}
+    if not matched:
+        raise InputError(path, f"{where}.file", text, "a pattern that some files match")
+
+
+def _names(path: Path, found: Sequence[tuple[str, dict[str, Any], Path, Any]]) -> list[str]:
+    """A name for each recording, no two alike even where case does not count."""
+    for parts in PARTS_OF_NAME:
+        names = [str(keys.get("name") or _plain(file, parts)) for _, keys, file, _ in found]
+        counts = Counter(name.casefold() for name in names)
+        if len(counts) == len(names):
+            return names
+    twice = next(k for k, name in enumerate(names) if counts[name.casefold()] > 1)
+    where = found[twice][0]
+    raise InputError(path, f"{where}.name", names[twice], "a name that no other recording has")
+
+
+def _plain(file: Path, parts: slice) -> str:
+    """A name made of parts of a path."""
+    chosen = [*file.parts[1:-1], file.stem][parts]
+    name = re.sub(r"[^A-Za-z0-9.-]+", "_", "-".join(chosen)).strip("._-")
+    return name[-100:].lstrip("._-") or "x"

@@ -1,0 +1,244 @@
+"""What a study says: measures against conditions, with ±, and what is out of line."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from labapp.core.sequence.mean import (
+    level_sigma_of_mean,
+    noise_sigma_of_mean,
+    setup_sigma_of_mean,
+)
+from labapp.core.surface.measures import SIZES, sigma_name
+from labapp.core.values import FloatArray
+from labapp.export.tables import Table
+from labapp.run.study.plan import Condition
+from labapp.run.study.status import RecordingStatus
+
+FAR = 5.0
+"""An outlier is so many standard deviations from the median, and of its own uncertainty."""
+
+MAD = 1.4826
+"""Standard deviation of a normal distribution over its median absolute deviation."""
+
+FEWEST_FRAMES, FEWEST_RECORDINGS = 10, 4
+"""Among fewer, none is called an outlier."""
+
+MOST_OUTLIERS = 100
+"""Of a recording."""
+
+
+@dataclass(frozen=True)
+class Mean:
+    """Mean of a size, and how uncertain it is."""
+
+    mean: float
+    noise: float
+    level: float
+    setup: float
+    """Parts of its standard uncertainty; NaN where the scheme gives none."""
+    scatter: float
+    """Standard deviation: of frames in a recording, of recordings under one condition."""
+    count: int
+    """How many of them."""
+
+    @property
+    def sigma(self) -> float:
+        """Its standard uncertainty (`core.sequence.mean.sigma_of_mean`)."""
+        return float(np.linalg.norm([self.noise, self.level, self.setup]))
+
+
+@dataclass(frozen=True)
+class Outlier:
+    """A frame far from the others of its recording, or a recording from those like it."""
+
+    recording: str
+    file: str
+    frame: int | None
+    """None: it is the mean of the recording."""
+    measure: str
+    value: float
+    usual: float
+    """The median of the others."""
+    times: float
+    """Its distance in standard deviations."""
+
+
+@dataclass(frozen=True)
+class RecordingSummary:
+    """What was measured of a recording."""
+
+    status: RecordingStatus
+    statuses: Mapping[str, int]
+    """How many frames have each status."""
+    setup_status: str
+    """How far the set-up can be relied on (`Measurement.setup_status`)."""
+    doubt: str
+    """Why it is doubtful, if it is."""
+    means: Mapping[str, Mean]
+    """Mean of each of `SIZES` over its frames with a surface."""
+
+
+@dataclass(frozen=True)
+class GroupSummary:
+    """What was measured under one condition: of recordings with the same conditions."""
+
+    conditions: Mapping[str, Condition]
+    recordings: tuple[str, ...]
+    frames: int
+    """Frames with a surface."""
+    means: Mapping[str, Mean]
+    """Mean of each of `SIZES`; each recording counts alike."""
+
+
+@dataclass(frozen=True)
+class StudySummary:
+    """The results of a study."""
+
+    title: str
+    conditions: tuple[str, ...]
+    recordings: tuple[RecordingSummary, ...]
+    groups: tuple[GroupSummary, ...]
+    outliers: tuple[Outlier, ...]
+
+
+def recording_means(table: Table) -> dict[str, Mean]:
+    """Mean of each size over the frames with a surface; empty if there is none.
+
+    Parameters
+    ----------
+    table
+        The columns of `measures.csv`.
+    """
+    measured = table["status"] == "ok"
+    if not measured.any():
+        return {}
+    series = {name: values[measured] for name, values in table.items() if values.dtype.kind in "fi"}
+    means = {}
+    for size in SIZES:
+        values = series[size]
+        means[size] = Mean(
+            float(values.mean()),
+            noise_sigma_of_mean(size, series),
+            level_sigma_of_mean(size, series),
+            setup_sigma_of_mean(size, series),
+            _deviation(values),
+            len(values),
+        )
+    return means
+
+
+def group_recordings(
+    conditions: Sequence[str], recordings: Sequence[RecordingSummary]
+) -> tuple[GroupSummary, ...]:
+    """Means over the recordings that were made under the same conditions.
+
+    Noise is independent from recording to recording. What is wrong with the level and with the
+    set-up is taken to be the same in all of them: they do not average it out.
+    """
+    groups: dict[tuple[Condition | None, ...], list[RecordingSummary]] = {}
+    for one in recordings:
+        if one.means:
+            values = one.status.recording.conditions
+            groups.setdefault(tuple(map(values.get, conditions)), []).append(one)
+    found = []
+    for given, members in sorted(groups.items(), key=lambda item: _order(item[0])):
+        known = {k: v for k, v in zip(conditions, given, strict=True) if v is not None}
+        names = tuple(one.status.recording.name for one in members)
+        frames = sum(one.statuses.get("ok", 0) for one in members)
+        means = {size: _common([one.means[size] for one in members]) for size in SIZES}
+        found.append(GroupSummary(known, names, frames, means))
+    return tuple(found)
+
+
+def _order(values: Sequence[Condition | None]) -> list[tuple[int, float, str]]:
+    """Numbers before text before what is missing."""
+    return [
+        (2, 0.0, "") if v is None else (1, 0.0, v) if isinstance(v, str) else (0, float(v), "")
+        for v in values
+    ]
+
+
+def _common(means: Sequence[Mean]) -> Mean:
+    count = len(means)
+    values = np.array([one.mean for one in means])
+    noise = float(np.linalg.norm([one.noise for one in means])) / count
+    level, setup = (
+        float(np.mean([getattr(one, part) for one in means])) for part in ("level", "setup")
+    )
+    return Mean(float(values.mean()), noise, level, setup, _deviation(values), count)
+
+
+def _deviation(values: FloatArray) -> float:
+    """Standard deviation, estimated from n values; NaN of one."""
+    return float(np.std(values, ddof=1)) if len(values) > 1 else float("nan")
+
+
+def outlying_frames(status: RecordingStatus, table: Table) -> list[Outlier]:
+    """Frames whose size is far from the recording's median, the farthest first.
+
+    Far is more than `FAR` times the standard deviation of most frames, and `FAR` times the frame's
+    own standard uncertainty by noise and level.
+    """
+    measured = np.flatnonzero(table["status"] == "ok")
+    if len(measured) < FEWEST_FRAMES:
+        return []
+    found = []
+    for size in SIZES:
+        values = table[size][measured]
+        noise, level = (table[sigma_name(size, part)][measured] for part in ("noise", "level"))
+        times = _times(values, np.nan_to_num(np.hypot(noise, level)))
+        for place in np.flatnonzero(times > FAR):
+            frame = int(table["frame"][measured[place]])
+            found.append(
+                _outlier(status, frame, size, float(values[place]), values, float(times[place]))
+            )
+    return sorted(found, key=lambda one: -one.times)[:MOST_OUTLIERS]
+
+
+def outlying_recordings(
+    groups: Sequence[GroupSummary], recordings: Sequence[RecordingSummary]
+) -> list[Outlier]:
+    """Recordings whose mean is far from that of others under the same conditions."""
+    by_name = {one.status.recording.name: one for one in recordings}
+    found = []
+    for group in groups:
+        members = [by_name[name] for name in group.recordings]
+        if len(members) < FEWEST_RECORDINGS:
+            continue
+        for size in SIZES:
+            values = np.array([one.means[size].mean for one in members])
+            noise = np.array([one.means[size].noise for one in members])
+            times = _times(values, np.nan_to_num(noise))
+            for place in np.flatnonzero(times > FAR):
+                status, value = members[place].status, float(values[place])
+                found.append(_outlier(status, None, size, value, values, float(times[place])))
+    return found
+
+
+def _times(values: FloatArray, own: FloatArray) -> FloatArray:
+    """Distance of values from their median in standard deviations, shape (n,).
+
+    Of most values, or of its own if that is larger.
+    """
+    away = np.abs(values - np.median(values))
+    deviation = np.maximum(MAD * np.median(away), own)
+    return np.asarray(
+        np.divide(away, deviation, out=np.zeros_like(away), where=deviation > 0), np.float64
+    )
+
+
+def _outlier(
+    status: RecordingStatus,
+    frame: int | None,
+    size: str,
+    value: float,
+    values: FloatArray,
+    times: float,
+) -> Outlier:
+    recording = status.recording
+    usual = float(np.median(values))
+    return Outlier(recording.name, str(recording.path), frame, size, value, usual, times)

@@ -1,0 +1,246 @@
+"""Where a study's tasks are done: in processes of this machine, or by Dask's workers anywhere.
+
+Both are a `concurrent.futures.Executor`; `run_jobs` keeps either busy.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    wait,
+)
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from typing import Any
+
+from labapp.errors import InputError
+from labapp.run.measurers import measuring_pool
+from labapp.simulation.parallel import POLL_S, end_processes
+from labapp.system import interrupts_blocked
+
+ATTEMPTS = 4
+"""A task is begun so often, at most: the process that does it may die, or its machine."""
+
+TIMEOUT_S = 10
+"""A scheduler that does not answer for so long is not there."""
+
+A_SCHEDULER = "the address of a Dask scheduler that runs, such as tcp://127.0.0.1:8786"
+
+
+@dataclass(frozen=True)
+class Job:
+    """A task for one of the workers."""
+
+    about: int
+    """Which recording it is about."""
+    work: Callable[..., None]
+    given: tuple[Any, ...]
+    """A function of a module, and its arguments."""
+    attempt: int = 1
+
+
+@dataclass(frozen=True)
+class Workers:
+    """Who does tasks."""
+
+    executor: Executor
+    slots: Callable[[], int]
+    """How many tasks to give them at once."""
+    dashboard: str = ""
+    """Address of the page that shows what they do; empty if there is none."""
+    warning: str = ""
+    """What the user should know of them; empty if nothing."""
+
+
+def run_jobs(
+    jobs: Iterator[Job],
+    workers: Workers,
+    finished: Callable[[Job, Exception | None], Iterable[Job]],
+    poll: Callable[[], object],
+) -> None:
+    """Have jobs done, many at once, the newest first to be followed up.
+
+    Parameters
+    ----------
+    jobs
+        What is to be done; read as there is room.
+    finished
+        Called here with each job that is done, and the error if it failed for good; returns jobs
+        that follow from it, which go before others.
+    poll
+        Called now and then; may raise to stop.
+
+    Raises
+    ------
+    InputError
+        If the scheduler is lost.
+    """
+    ready: deque[Job] = deque()
+    pending: dict[Future[None], Job] = {}
+    try:
+        while True:
+            while len(pending) < workers.slots():
+                job = ready.popleft() if ready else next(jobs, None)
+                if job is None:
+                    break
+                pending[workers.executor.submit(job.work, *job.given)] = job
+            if not pending:
+                return
+            for future in wait(pending, POLL_S, FIRST_COMPLETED).done:
+                job = pending.pop(future)
+                error = _error_of(future)
+                if error is None or isinstance(error, InputError) or job.attempt == ATTEMPTS:
+                    ready.extend(finished(job, error))
+                else:
+                    ready.append(replace(job, attempt=job.attempt + 1))
+            poll()
+    finally:
+        for future in pending:
+            future.cancel()
+
+
+def _error_of(future: Future[None]) -> Exception | None:
+    """What a task raised; None if nothing."""
+    if future.cancelled():
+        raise InputError("--scheduler", "connection", "lost", f"{A_SCHEDULER}; then run again")
+    error = future.exception()
+    if error is not None and not isinstance(error, Exception):
+        raise error
+    return error
+
+
+# --- here ---------------------------------------------------------------------------------------
+
+
+class _Processes(Executor):
+    """Processes with a pool each: one that dies takes no other task with it."""
+
+    def __init__(self, count: int) -> None:
+        self._lock = threading.Lock()
+        self._idle: list[ProcessPoolExecutor | None] = [None] * count
+        self._pools: set[ProcessPoolExecutor] = set()
+
+    def submit(self, work: Callable[..., Any], /, *given: Any, **named: Any) -> Future[Any]:
+        """Begin a task in an idle process, of which there must be one."""
+        with self._lock:
+            pool = self._idle.pop() or measuring_pool(1)
+            self._pools.add(pool)
+        with interrupts_blocked():
+            future = pool.submit(work, *given, **named)
+        future.add_done_callback(lambda done: self._free(pool, done))
+        return future
+
+    def _free(self, pool: ProcessPoolExecutor, done: Future[Any]) -> None:
+        """Take back a process; if it has died, another takes its place."""
+        died = not done.cancelled() and isinstance(done.exception(), BrokenExecutor)
+        with self._lock:
+            if died:
+                self._pools.discard(pool)
+            self._idle.append(None if died else pool)
+        if died:
+            pool.shutdown(wait=False)
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
+        """End the processes, whatever they do: what a task has not written is not there."""
+        for pool in list(self._pools):
+            end_processes(pool, wait)
+
+
+class _Here(Executor):
+    """Does each task at once, in this process."""
+
+    def submit(self, work: Callable[..., Any], /, *given: Any, **named: Any) -> Future[Any]:
+        future: Future[Any] = Future()
+        try:
+            future.set_result(work(*given, **named))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+@contextmanager
+def local_workers(count: int | None) -> Iterator[Workers]:
+    """Processes of this machine.
+
+    Parameters
+    ----------
+    count
+        How many; None: one a core; 0: none, tasks are done in this process.
+    """
+    count = (os.cpu_count() or 1) if count is None else count
+    executor = _Processes(count) if count else _Here()
+    try:
+        yield Workers(executor, lambda: max(count, 1))
+    finally:
+        executor.shutdown()
+
+
+# --- a cluster ----------------------------------------------------------------------------------
+
+
+@contextmanager
+def dask_workers(address: str) -> Iterator[Workers]:
+    """Workers of a Dask scheduler. Needs dask[distributed], which the extra ``study`` installs.
+
+    Parameters
+    ----------
+    address
+        Of the scheduler: ``tcp://HOST:PORT``.
+
+    Raises
+    ------
+    InputError
+        If Dask is not installed, or the scheduler does not answer.
+    """
+    try:
+        from distributed import Client
+    except ImportError as error:
+        expected = "dask, which pip install 'labapp[study]' brings"
+        raise InputError("--scheduler", "dask", "is not installed", expected) from error
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)
+    try:
+        client = Client(address, timeout=TIMEOUT_S, set_as_default=False)
+    except (OSError, ValueError, TimeoutError) as error:
+        raise InputError("--scheduler", "scheduler", address, A_SCHEDULER) from error
+    try:
+        threads = client.nthreads()
+        several = sum(each > 1 for each in threads.values())
+        warning = (
+            f"{several} of {len(threads)} workers have several threads, of which one measures: "
+            "start them with --nthreads 1"
+        )
+        executor = client.get_executor(pure=False, retries=0)
+        try:
+            dashboard = str(client.dashboard_link or "")
+            yield Workers(executor, _Slots(client), dashboard, warning if several else "")
+        finally:
+            executor.shutdown(wait=False)
+    finally:
+        client.close(timeout=TIMEOUT_S)
+
+
+class _Slots:
+    """Twice as many tasks as there are threads, so that none waits; workers come and go."""
+
+    def __init__(self, client: Any) -> None:
+        self._client, self._at, self._count = client, -1.0, 1
+
+    def __call__(self) -> int:
+        now = time.monotonic()
+        if now - self._at > 1.0:
+            try:
+                self._count = 2 * max(1, sum(self._client.nthreads().values()))
+            except (OSError, TimeoutError) as error:
+                raise InputError("--scheduler", "connection", "lost", A_SCHEDULER) from error
+            self._at = now
+        return self._count

@@ -1,0 +1,51 @@
+"""A recording of a pool that swings, and a study of parts of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from labapp.config.scenario import read_scenario
+from labapp.simulated.benchmark import SCENARIO
+from labapp.simulated.simulate import simulate
+
+FRAMES = 9
+
+Write = Callable[..., Path]
+
+
+@pytest.fixture(scope="session")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of a simulated recording and its set-up."""
+    folder = tmp_path_factory.mktemp("simulated")
+    (folder / "scenario.toml").write_text(SCENARIO.format(frames=FRAMES), "utf-8")
+    simulate(read_scenario(folder / "scenario.toml"), folder / "made", workers=1)
+    return folder / "made"
+
+
+@pytest.fixture
+def study_file(simulated: Path, tmp_path: Path) -> Path:
+    """A study of two parts of the recording, and of three recordings that are none."""
+    (tmp_path / "empty.avi").touch()
+    (tmp_path / "corrupt.avi").write_bytes(b"RIFF no video at all" * 20)
+    setup, recording = simulated / "setup.toml", simulated / "recording.avi"
+    text = f"""
+setup = '{setup}'
+[[recording]]
+file = '{recording}'
+name = "first"
+frames = ":5"
+conditions = {{ current_a = 80, gas = "Ar" }}
+[[recording]]
+file = '{recording}'
+name = "second"
+frames = "5:"
+conditions = {{ current_a = 100, gas = "Ar" }}
+"""
+    for name in ("empty", "corrupt", "missing"):
+        text += f'[[recording]]\nfile = "{name}.avi"\nconditions = {{ current_a = 80 }}\n'
+    path = tmp_path / "study.toml"
+    path.write_text(text, "utf-8")
+    return path

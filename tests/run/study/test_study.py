@@ -1,0 +1,324 @@
+"""A study: run, interrupted, run again; what is not measured says why; the same for any workers."""
+
+from __future__ import annotations
+
+import csv
+import errno
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import polars as pl
+import pytest
+import xarray as xr
+from typer.testing import CliRunner
+
+from labapp import Study, files
+from labapp.cli import app
+from labapp.config.setup import read_setup
+from labapp.core.pipeline import Settings, measure
+from labapp.errors import InputError
+from labapp.media import open_source
+from labapp.run import measurers
+from labapp.run.study import stretches, workers
+from labapp.run.study import study as study_module
+
+STATES = ["done", "done", "failed", "failed", "failed"]
+
+
+@pytest.fixture(autouse=True)
+def _short(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stretches of three frames: a recording has some."""
+    monkeypatch.setattr(measurers, "STRETCH", 3)
+
+
+def bytes_of(folder: Path) -> dict[str, str]:
+    """Digest of each file that tasks wrote."""
+    return {
+        path.name: hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted((folder / "stretches").glob("*.npz"))
+    }
+
+
+def rows_of(folder: Path) -> pd.DataFrame:
+    table = pd.read_parquet(folder / "measures.parquet")
+    return table.sort_values(["recording", "frame"], ignore_index=True)
+
+
+def test_what_can_be_measured_is_and_the_others_say_why(study_file: Path) -> None:
+    study = Study(study_file)
+    assert {one.state for one in study.status()} == {"waiting", "failed"}  # one is missing
+    notes: list[str] = []
+    found = study.run(0, note=notes.append)
+    assert [one.state for one in found] == STATES
+    assert [(one.frames, one.frames_done) for one in found[:2]] == [(5, 5), (4, 4)]
+    assert all(one.problem for one in found[2:])
+    assert not any(one.problem for one in found[:2])
+    assert [note.partition(":")[0] for note in notes] == ["empty", "corrupt", "missing"]
+    assert [one.state for one in Study(study_file).status()] == STATES
+    summary = study.results()
+    rows = rows_of(study.folder)
+    assert rows["frame"].tolist() == [0, 1, 2, 3, 4, 5, 6, 7, 8]
+    assert rows["current_a"].tolist() == [80.0] * 5 + [100.0] * 4
+    assert set(rows["gas"]) == {"Ar"}
+    assert set(rows["status"]) == {"ok"}
+    assert [group.conditions for group in summary.groups] == [
+        {"current_a": 80, "gas": "Ar"},
+        {"current_a": 100, "gas": "Ar"},
+    ]
+
+
+def test_figures_are_those_of_reconstruct(
+    study_file: Path, simulated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    study = Study(study_file)
+    study.run(0)
+    study.results()
+    monkeypatch.undo()
+    monkeypatch.setattr(measurers, "STRETCH", 3)
+    given = ["reconstruct", simulated / "recording.avi", "--setup", simulated / "setup.toml"]
+    options = ["--out", tmp_path / "out", "--frames", ":5", "--surfaces", "none", "--warm"]
+    assert CliRunner().invoke(app, [*map(str, given), *map(str, options)]).exit_code == 0
+    with (tmp_path / "out" / "measures.csv").open(encoding="utf-8", newline="") as file:
+        expected = list(csv.DictReader(file))
+    rows = rows_of(study.folder)
+    rows = rows[rows["recording"] == "first"]
+    for name in ("width_mm", "height_mm", "height_sigma_mm", "time_s", "dots"):
+        assert rows[name].tolist() == pytest.approx([float(r[name]) for r in expected], abs=1e-6)
+    assert rows["setup_status"].tolist() == [row["setup_status"] for row in expected]
+
+
+def test_nothing_that_is_done_is_done_again(
+    study_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    study = Study(study_file)
+    study.run(0)
+    before = bytes_of(study.folder)
+    assert len(before) == 4
+    measured: list[object] = []
+    monkeypatch.setattr(stretches, "_measured", lambda *given: measured.append(given))
+    study.run(0)
+    assert not measured
+    assert bytes_of(study.folder) == before
+
+
+def test_another_setup_other_settings_and_another_recording_are_measured_anew(
+    study_file: Path, simulated: Path, tmp_path: Path
+) -> None:
+    study = Study(study_file)
+    study.run(0)
+    text = study_file.read_text("utf-8")
+    changed = text.replace('name = "first"', 'name = "first"\nscheme = "ers"')
+    study_file.write_text(changed, "utf-8")
+    assert [one.state for one in Study(study_file).status()[:2]] == ["waiting", "done"]
+    setup = (simulated / "setup.toml").read_text("utf-8")
+    (tmp_path / "other.toml").write_text(setup + "# other\n", "utf-8")
+    changed = text.replace('name = "second"', 'name = "second"\nsetup = "other.toml"')
+    study_file.write_text(changed, "utf-8")
+    assert [one.state for one in Study(study_file).status()[:2]] == ["done", "waiting"]
+    study_file.write_text(text.replace('frames = ":5"', 'frames = ":6"'), "utf-8")
+    first = Study(study_file).status()[0]
+    assert (first.state, first.frames_done) == ("part", 3)
+
+
+def test_conditions_change_without_measuring(study_file: Path) -> None:
+    Study(study_file).run(0)
+    text = study_file.read_text("utf-8").replace('gas = "Ar"', 'gas = "He", speed = 2')
+    study_file.write_text(text, "utf-8")
+    study = Study(study_file)
+    assert [one.state for one in study.status()] == STATES
+    study.results()
+    rows = rows_of(study.folder)
+    assert set(rows["gas"]) == {"He"}
+    assert set(rows["speed"]) == {2.0}
+
+
+@pytest.mark.slow
+def test_processes_and_this_one_give_the_same_bytes(study_file: Path, tmp_path: Path) -> None:
+    made = {}
+    for count in (0, 1, 2):
+        study = Study(study_file, tmp_path / f"out_{count}")
+        assert [one.state for one in study.run(count)] == STATES
+        made[count] = bytes_of(study.folder)
+    assert made[0] == made[1] == made[2]
+    assert len(made[0]) == 4
+
+
+def test_a_run_that_is_stopped_goes_on_where_it_was(study_file: Path) -> None:
+    study = Study(study_file)
+
+    def stop(now: study_module.Progress) -> None:
+        if now.frames_done >= 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        study.run(0, progress=stop)
+    before = bytes_of(study.folder)
+    assert len(before) == 1
+    assert study.status()[0].state == "part"
+    study.results()  # of what there is
+    assert len(rows_of(study.folder)) == 3
+    study.run(0)
+    assert [one.state for one in study.status()] == STATES
+    assert before.items() <= bytes_of(study.folder).items()
+
+
+def test_a_full_disk_stops_a_run_and_loses_nothing(
+    study_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    study = Study(study_file)
+    write = stretches.write_atomically
+    written: list[Path] = []
+
+    def full(path: Path, content: bytes) -> None:
+        written.append(path)
+        if len(written) == 3:
+            raise OSError(errno.ENOSPC, "no space left")
+        write(path, content)
+
+    monkeypatch.setattr(stretches, "write_atomically", full)
+    with pytest.raises(InputError) as error:
+        study.run(0)
+    assert "no space left" in str(error.value)
+    monkeypatch.undo()
+    monkeypatch.setattr(measurers, "STRETCH", 3)
+    assert not list(study.folder.glob("*/.*.part"))
+    assert len(bytes_of(study.folder)) == 1
+    assert [one.state for one in study.run(0)] == STATES
+
+
+def test_a_damaged_file_is_measured_again(study_file: Path) -> None:
+    study = Study(study_file)
+    study.run(0)
+    before = bytes_of(study.folder)
+    damaged = sorted((study.folder / "stretches").glob("*.npz"))
+    for path, content in zip(
+        damaged, (b"", b"PK none", damaged[2].read_bytes()[:-400]), strict=False
+    ):
+        path.write_bytes(content)
+    damaged[3].write_bytes(damaged[3].read_bytes().replace(b"ok", b"no"))
+    states = [one.status.state for one in study.results().recordings]
+    assert "done" not in states
+    study.run(0)
+    assert [one.status.state for one in study.results().recordings] == STATES
+    assert bytes_of(study.folder) == before
+
+
+def test_a_recording_that_was_changed_is_looked_at_again(
+    study_file: Path, simulated: Path, tmp_path: Path
+) -> None:
+    study = Study(study_file)
+    study.run(0)
+    (tmp_path / "missing.avi").write_bytes((simulated / "recording.avi").read_bytes())
+    assert Study(study_file).status()[4].problem
+    found = Study(study_file).run(0)[4]
+    assert (found.state, found.problem, found.frames) == ("done", "", 9)
+
+
+def test_only_one_run_at_a_time(study_file: Path) -> None:
+    study = Study(study_file)
+    with study._alone(), pytest.raises(InputError):
+        study.run(0)
+
+
+def test_a_folder_of_others_is_left_alone(study_file: Path, tmp_path: Path) -> None:
+    (tmp_path / "theirs").mkdir()
+    (tmp_path / "theirs" / "thesis.txt").touch()
+    with pytest.raises(InputError):
+        Study(study_file, tmp_path / "theirs")
+    with pytest.raises(InputError):
+        Study(study_file, study_file)
+
+
+@pytest.mark.parametrize("key", ["setup", "frames"])
+def test_a_recording_with_a_wrong_key_does_not_stop_the_others(study_file: Path, key: str) -> None:
+    text = study_file.read_text("utf-8")
+    wrong = {"setup": 'setup = "none.toml"', "frames": 'frames = "70:"'}[key]
+    changed = text.replace('frames = ":5"', wrong)
+    study_file.write_text(changed, "utf-8")
+    found = Study(study_file).run(0)
+    assert [one.state for one in found] == ["failed", *STATES[1:]]
+    assert key in found[0].problem
+
+
+def test_the_dataset_opens_lazily_and_says_its_units(study_file: Path) -> None:
+    study = Study(study_file)
+    study.run(0)
+    study.results()
+    scanned = pl.scan_parquet(study.folder / "measures.parquet" / "*.parquet")
+    mean = scanned.filter(pl.col("current_a") == 100).select(pl.col("height_mm").mean())
+    rows = rows_of(study.folder)
+    assert mean.collect().item() == rows[rows["current_a"] == 100]["height_mm"].mean()
+    from pyarrow import parquet
+
+    schema = parquet.read_schema(study.folder / "measures.parquet" / "first.parquet")
+    assert schema.field("height_sigma_mm").metadata[b"units"] == b"mm"
+    # A recording that is no longer in the study is no longer in its results.
+    text = study_file.read_text("utf-8").replace('name = "second"', 'name = "other"')
+    study_file.write_text(text, "utf-8")
+    Study(study_file).results()
+    assert set(rows_of(study.folder)["recording"]) == {"first", "other"}
+
+
+def test_surfaces_are_an_array_over_frames(study_file: Path, simulated: Path) -> None:
+    study = Study(study_file)
+    study.run(0)
+    study.results(surfaces=True)
+    assert not (study.folder / "surfaces.zarr").exists()  # none were kept
+    study.run(0, surfaces=True)
+    study.results(surfaces=True)
+    data = xr.open_zarr(study.folder / "surfaces.zarr", group="second", consolidated=False)
+    assert data["z_mm"].dims == ("frame", "y", "x")
+    assert data["frame"].values.tolist() == [5, 6, 7, 8]
+    assert {data[name].attrs["units"] for name in ("z_mm", "x", "y")} == {"mm"}
+    rows = rows_of(study.folder)
+    heights = rows[rows["recording"] == "second"]["height_mm"].to_numpy()
+    np.testing.assert_allclose(data["z_mm"].max(("x", "y")).values, heights, atol=2e-3)
+    setup = read_setup(simulated / "setup.toml")
+    with open_source(simulated / "recording.avi") as source:
+        alone, _ = measure(source.frame(5).image, setup.bench, Settings())
+    assert alone.reconstruction is not None
+    z_mm = data["z_mm"].sel(frame=5)
+    for x, y in ((0.0, 0.0), (1.0, -1.0)):
+        there = z_mm.sel(x=x, y=y, method="nearest")
+        own = alone.reconstruction.surface.height(np.array(there.x), np.array(there.y))
+        assert float(there) == pytest.approx(float(own), abs=1e-6)
+
+
+def test_tasks_that_raise_are_tried_again_and_then_reported(
+    study_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tried: list[object] = []
+    whole = stretches._measured
+
+    def flaky(stretch: stretches.Stretch, measurer: object) -> bytes:
+        tried.append(stretch.frames)
+        if stretch.frames == range(3) and len(tried) < workers.ATTEMPTS:
+            raise RuntimeError("a hiccup")
+        if stretch.frames == range(8, 9):
+            raise RuntimeError("always")
+        return whole(stretch, measurer)
+
+    monkeypatch.setattr(stretches, "_measured", flaky)
+    found = Study(study_file).run(0)
+    assert [one.state for one in found] == ["done", "failed", *STATES[2:]]
+    assert "always" in found[1].problem
+    assert tried.count(range(8, 9)) == workers.ATTEMPTS
+    monkeypatch.undo()
+    monkeypatch.setattr(measurers, "STRETCH", 3)
+    assert [one.state for one in Study(study_file).run(0)] == STATES
+
+
+def test_temporary_files_that_a_killed_run_left_are_deleted(
+    study_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    study = Study(study_file)
+    study.run(0)
+    left = files.beside(study.folder / "stretches" / "x.npz")
+    left.touch()
+    study.run(0)
+    assert left.exists()  # it may be being written
+    monkeypatch.setattr(study_module, "OLD_S", -1.0)
+    study.run(0)
+    assert not left.exists()
