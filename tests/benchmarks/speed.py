@@ -135,7 +135,7 @@ def main() -> None:
     print(f"  {ms:.2f} ms of all processors a frame, the start of the processes in it")
     cv2.setNumThreads(1)
     with ThreadpoolController().limit(limits=1, user_api="blas"):
-        latency = time_frames(video, min(chosen.frames, 400), cold=10)
+        latency = time_frames(video, min(chosen.frames, 400))
         followed, cold = latency.processor.median, 1e3 * latency.cold_s
         print(f"a followed frame {followed:.2f} ms, a cold one {cold:.0f} ms")
         print_ratio("cold / followed", cold / followed, "<= 25")

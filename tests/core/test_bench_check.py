@@ -268,6 +268,20 @@ def test_a_mirror_that_measures_otherwise_than_it_is_known_is_no_check(truth: fl
     assert (known.status == "checked") == (truth == 0.91)
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("absent", [[9, 10], [10, 11]])
+def test_rays_a_row_off_are_named(absent: list[int]):
+    """The bench adjusts itself to them, by half a degree here and half a millimetre there."""
+    angle = "inter_beam_angle_deg = 0.77\n"
+    setup = parse_setup(TEXT.replace(angle, f"{angle}absent = [{absent}]\n"), "setup.toml")
+    rng = np.random.default_rng(0)
+    pictures = [picture(Plate(height), FlatMirror(height), EXACT, rng)[0] for height in (0.0, 2.0)]
+    check = check_bench(pictures, setup.rig, setup.calibration)
+    assert check.status == "row-slipped"
+    off = [abs(one.after - one.before) / one.before_sigma for one in check.changes]
+    assert max(off) < 2.0
+
+
 class BowedPattern(DotPattern):
     """Another lens: its rows and columns are bowed, by 4 % at the edges."""
 

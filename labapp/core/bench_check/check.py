@@ -20,7 +20,8 @@ from labapp.core.bench_check.labelling import (
     sighting_of,
 )
 from labapp.core.bench_check.mirrors import Plate, placed
-from labapp.core.bench_check.suspects import Suspect, find_suspects, released
+from labapp.core.bench_check.slips import slip_drop
+from labapp.core.bench_check.suspects import ALIKE, Suspect, find_suspects, released
 from labapp.core.bench_check.verdict import Pattern, Verdict, judge
 from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.coordinates import ImageCalibration
@@ -40,6 +41,9 @@ WIDE = 10.0
 
 FAR_BETTER = 2.0
 """So many times as much the cost falls with a cause that explains the dots far better."""
+
+SLIPPED = 10.0
+"""Rays are those of the next row or column where the cost falls by more with these."""
 
 UNDETERMINED = 0.8
 """A quantity is not determined whose ± after the check is more than this share of that before."""
@@ -203,12 +207,15 @@ def check_bench(
         labels = again
     assert made is not None
     suspects = find_suspects(rig, sightings, made, free_directions)
+    seen = [(o, p.mirror, own) for o, p, own in zip(observed, pictures, used, strict=True)]
+    slip = slip_drop(rig, seen, made, free_directions)
     verdict, patterns = judge(rig, sightings, made, free_directions)
     sizes = measure_sizes(rig, sightings, free_directions, made)
     status, reason = _status(
         suspects,
         verdict,
         patterns,
+        slip,
         {
             f"{picture.name}, {picture.mirror.name}: {size.name}": size
             for picture, own in zip(pictures, sizes, strict=True)
@@ -312,6 +319,7 @@ def _status(
     suspects: Sequence[Suspect],
     verdict: Verdict,
     patterns: Sequence[Pattern],
+    slip: float,
     sizes: Mapping[str, MeasuredSize],
 ) -> tuple[Status, str]:
     """What is off: a quantity or a size, unless a cause that the model lacks explains far more."""
@@ -319,6 +327,8 @@ def _status(
     name, size = max(sizes.items(), key=lambda pair: abs(pair[1].deviation))
     suspected = suspects[0].drop if suspects else 0.0
     contradiction = size.deviation**2 if size.is_contradicted else 0.0
+    if slip > max(SLIPPED, suspected - ALIKE, contradiction - ALIKE):
+        return "row-slipped", REASONS["row-slipped"]
     if verdict != "noise-like" and explained >= FAR_BETTER * max(suspected, contradiction):
         return verdict, REASONS[verdict]
     if contradiction > suspected:

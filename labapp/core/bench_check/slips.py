@@ -37,9 +37,10 @@ def slip_drop(
     made: Adjustment,
     released: FloatArray,
 ) -> float:
-    """By how much the cost falls with the rays of the next row or column; at most 0: it does not.
+    """By how much the cost falls with the rays of the next row or column; −inf: it cannot.
 
-    Dots without a ray count as in `label_picture`.
+    Dots without a ray count as in `label_picture`: where all others fit, more of them than the
+    prior costs speak against it at once.
 
     Parameters
     ----------
@@ -50,20 +51,27 @@ def slip_drop(
     made
         The adjustment to these.
     """
-    cost = made.cost + STRAY * sum(_strays(observed, labels) for observed, _, labels in seen)
-    others = (_cost_of_slip(rig, seen, made.scale, released, np.array(by)) for by in SLIPS)
-    return cost - min(others)
+    strays = sum(_strays(observed, labels) for observed, _, labels in seen)
+    prior = float(made.unknown @ made.unknown)
+    excess = prior + max(made.cost - prior - len(made.standardised), 0.0)  # all that is not noise
+    drops = [-np.inf]
+    for by in np.array(SLIPS):
+        labels = [moved_labels(own, by) for _, _, own in seen]
+        more = sum(_strays(o, own) for (o, *_), own in zip(seen, labels, strict=True)) - strays
+        if STRAY * more < excess:
+            cost = _cost_of_slip(rig, seen, labels, made.scale, released)
+            drops.append(made.cost + STRAY * strays - cost)
+    return max(drops)
 
 
 def _cost_of_slip(
     rig: Rig,
     seen: Sequence[tuple[Observation, Mirror, IntArray]],
+    labels: list[IntArray],
     scale: float,
     released: FloatArray,
-    by: IntArray,
 ) -> float:
-    """Cost with all rays so many rows and columns on, the absent one among them."""
-    labels = [moved_labels(one, by) for _, _, one in seen]
+    """Cost with other labels to begin with; the absent ray may have a dot."""
     if any((one != UNLABELLED).sum() < LEAST_DOTS for one in labels):
         return np.inf
     unknown: FloatArray | None = None

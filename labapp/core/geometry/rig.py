@@ -238,7 +238,8 @@ class ImagingPlane(ReadOnlyArrays):
     @cached_property
     def normal(self) -> FloatArray:
         """Unit normal, shape (3,); for the vertical plane it points at the camera, −Y."""
-        return np.cross(self.x_axis, self.z_axis)
+        (a, b, c), (d, e, f) = self.x_axis.tolist(), self.z_axis.tolist()
+        return np.array([b * f - c * e, c * d - a * f, a * e - b * d])  # np.cross takes 20 µs
 
     @cached_property
     def pose_mm(self) -> FloatArray:

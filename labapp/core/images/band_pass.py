@@ -302,8 +302,7 @@ class _BandPassed:
 
         band, floor, disc = self.band, tuning.floor, peak_disc(self.size)
         if self.step == 2:
-            large = scratch("large band", self.picture.shape)
-            (u, v), bright = dot_kernels.enlarged_peaks(band, tuning.coarse, floor, disc, large)
+            (u, v), bright = dot_kernels.enlarged_peaks(band, tuning.coarse, floor, disc)
             return u, v, bright
         u, v = dot_kernels.peaks(band, floor, disc)
         return u, v, band[v, u].astype(float)

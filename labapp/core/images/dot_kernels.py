@@ -164,33 +164,29 @@ def ridges(band: Grey, u: IntArray, v: IntArray, slender: float) -> BoolArray:
 
 
 @_inner
-def _lit_pixels(band: Grey, low: Grey) -> tuple[IntArray, IntArray]:
-    """Columns of the n pixels over ``low``, row by row, and where each row begins among them.
-
-    Shapes (n,) and (height + 1,).
-    """
+def _lit_pixels(band: Grey, low: Grey) -> IntArray:
+    """Rows and columns, shape (n, 2), of the pixels over ``low``, row by row."""
     height, width = band.shape
-    column, begin, count = np.empty(width, np.int64), np.zeros(height + 1, np.int64), 0
+    lit, count = np.empty((width, 2), np.int64), 0
     for v in range(height):
         own, dark = band[v], low[v]
-        if len(column) < count + width:
-            more = np.empty(2 * (count + width), np.int64)
-            more[:count] = column[:count]
-            column = more
+        if len(lit) < count + width:
+            more = np.empty((2 * (count + width), 2), np.int64)
+            more[:count] = lit[:count]
+            lit = more
         for first in range(0, width, BLOCK):
             last = min(first + BLOCK, width)
             if not _any_over(own[first:last], dark[first:last]):
                 continue
             for u in range(first, last):
-                column[count] = u
+                lit[count, 0], lit[count, 1] = v, u
                 count += own[u] > dark[u]
-        begin[v + 1] = count
-    return column, begin
+    return lit[:count]
 
 
 @_inner
-def _enlarge(band: Grey, v: int, u: int, taps: Grey, patch: Grey, large: Grey) -> None:
-    """Write the four pixels that one of a band is made into to a picture of twice its size.
+def _enlarged(band: Grey, v: int, u: int, taps: Grey, patch: Grey, four: Grey) -> None:
+    """Put the values of the four pixels that one of a band is made into, row by row, into ``four``.
 
     Between the band's pixels it is interpolated by polynomials through six of them, of which the
     ``taps`` are the weights a quarter of the way from the third to the fourth. The patch, of shape
@@ -210,69 +206,70 @@ def _enlarge(band: Grey, v: int, u: int, taps: Grey, patch: Grey, large: Grey) -
                 across += taps[m if x else 5 - m] * patch[y, m + x]
             above += taps[5 - y] * across if y < 6 else single(0.0)
             below += taps[y - 1] * across if y else single(0.0)
-        large[2 * v, 2 * u + x], large[2 * v + 1, 2 * u + x] = above, below
+        four[x], four[2 + x] = above, below
 
 
 @_inner
-def _tops_enlarged(large: Grey, band: Grey, low: Grey, disc: BoolArray, v: int, u: int) -> bool:
-    """Whether no pixel of a disc round one is over it, of those where the band is over ``low``."""
-    (height, width), reach, own = large.shape, len(disc) // 2, large[v, u]
-    for y in range(max(v - reach, 0), min(v + reach + 1, height)):
-        for x in range(max(u - reach, 0), min(u + reach + 1, width)):
-            if (
-                disc[y - v + reach, x - u + reach]
-                and large[y, x] > own
-                and band[y >> 1, x >> 1] > low[y >> 1, x >> 1]
-            ):
+def _tops_enlarged(fours: Grey, number: IntArray, disc: BoolArray, v: int, u: int) -> bool:
+    """Whether none of the larger pixels of a disc round one is over it.
+
+    Those of each of n pixels of the band have shape (n, 4); what is not among the n, by their
+    numbers, shape (height, width), below 0, does not count.
+    """
+    (height, width), reach = number.shape, len(disc) // 2
+    own = fours[number[v >> 1, u >> 1], 2 * (v & 1) + (u & 1)]
+    for k in range(2 * reach + 1):  # from its own row outwards: what is over it is mostly near
+        y = v + (k + 1) // 2 * (1 if k & 1 else -1)
+        if not 0 <= y < 2 * height:
+            continue
+        numbers, part = number[y >> 1], disc[y - v + reach]
+        for x in range(max(u - reach, 0), min(u + reach + 1, 2 * width)):
+            at = numbers[x >> 1]
+            if at >= 0 and part[x - u + reach] and fours[at, 2 * (y & 1) + (x & 1)] > own:
                 return False
     return True
 
 
-@_compiled(_grey, _grey, _grey, _mask, types.Array(types.float32, 2, "C"))
+@_compiled(_grey, _grey, _grey, _mask)
 def enlarged_peaks(
-    band: Grey, low: Grey, floor: Grey, disc: BoolArray, large: Grey
+    band: Grey, low: Grey, floor: Grey, disc: BoolArray
 ) -> tuple[IntArray, FloatArray]:
     """Peaks of a band made twice as large where it is over ``low``, of its shape (`peaks`).
 
     Parameters
     ----------
     band, low
-        Shape (height, width); elsewhere there is no peak.
+        Shape (height, width); where the band is not over it, no peak is, and nothing over one.
     floor
-        What peaks are over, not below 0, of twice that shape.
+        What peaks are over, of twice that shape.
     disc
         See `peaks`.
-    large
-        Of twice that shape: gets the larger band where it is over ``low``; what else is in it stays
-        and does not count.
 
     Returns
     -------
     places, heights
         Columns and rows, shape (2, n), and the larger band there, shape (n,).
     """
-    column, begin = _lit_pixels(band, low)
+    lit = _lit_pixels(band, low)
+    number = np.full(band.shape, -1, np.int64)
+    fours, patch = np.empty((len(lit), 4), np.float32), np.empty((7, 7), np.float32)
     # Lagrange's polynomials through six pixels.
     taps = np.array([77, -693, 6930, 2310, -495, 63], np.float32) / np.float32(8192)
-    patch = np.empty((7, 7), np.float32)
-    for v in range(len(band)):
-        for k in range(begin[v], begin[v + 1]):
-            _enlarge(band, v, column[k], taps, patch, large)
-    found, high, count = np.empty((2, 4 * begin[-1]), np.int64), np.empty(4 * begin[-1]), 0
-    for v in range(2 * len(band)):
-        for k in range(begin[v // 2], begin[v // 2 + 1]):
-            left, top = 2 * column[k], v - v % 2
-            # Of the four pixels one is over the others: most are no peaks by that.
-            most = max(large[top, left], large[top, left + 1])
-            most = max(most, large[top + 1, left], large[top + 1, left + 1])
-            for u in range(left, left + 2):
-                own = large[v, u]
-                if own < most or not own > floor[v, u]:
-                    continue
-                if _tops_enlarged(large, band, low, disc, v, u):
-                    found[0, count], found[1, count], high[count] = u, v, own
-                    count += 1
-    return found[:, :count].copy(), high[:count].copy()
+    for k in range(len(lit)):
+        number[lit[k, 0], lit[k, 1]] = k
+        _enlarged(band, lit[k, 0], lit[k, 1], taps, patch, fours[k])
+    found, high, count = np.empty((2, 4 * len(lit)), np.int64), np.empty(4 * len(lit)), 0
+    for k in range(len(lit)):
+        most = fours[k].max()  # the others of the four are no peaks
+        for m in range(4):
+            v, u = 2 * lit[k, 0] + m // 2, 2 * lit[k, 1] + m % 2
+            if fours[k, m] < most or not _tops_enlarged(fours, number, disc, v, u):
+                continue
+            if most > floor[v, u]:
+                found[0, count], found[1, count], high[count] = u, v, most
+                count += 1
+    row = np.argsort(found[1, :count], kind="mergesort")
+    return found[:, :count][:, row], high[:count][row]
 
 
 @_compiled_for(*((own,) for own in (_grey, _byte)))

@@ -33,7 +33,7 @@ RIDGE = 1e-4
 MOST_ROUNDS, SETTLED_MM = 8, 3e-4
 """Rounds of a fit from a surface nearby; no reflection point moves by more in the last."""
 
-POINTS_EVERY, SETUP_EVERY, SINKS_EVERY = 8, 64, 16
+POINTS_EVERY, SETUP_EVERY, SINKS_EVERY = 8, 128, 16
 """Every so many frames the uncertainty of the reflection points is worked out anew, that of the
 sizes by the set-up for whatever sizes there are, and whether the rear lies below the work piece."""
 
