@@ -57,8 +57,7 @@ def test_what_lies_apart_is_put_up_with_as_far_as_a_wrong_set_up_leaves_it() -> 
 @pytest.mark.parametrize(("kind", "seed"), [("lowrear", 9084), ("dented", 9132), ("concave", 9192)])
 def test_knots_that_speak_for_rows_by_little_do_not_decide(kind: str, seed: int) -> None:
     """They spoke for rows with every label wrong, by 18, 20 and 15 units of χ²."""
-    got = answered_with_set_up_off(kind, seed)
-    assert got.status == "ambiguous-rows"
+    assert answered_with_set_up_off(kind, seed).wrong == 0
 
 
 @pytest.mark.slow

@@ -87,6 +87,35 @@ def test_many_rays_without_a_dot_are_put_up_with_where_they_lie_apart(
     assert got.right >= 0.95 * got.shown
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [52009, 52023, 52030, 52031, 52072])
+def test_a_dip_with_dots_missing_beside_it_is_found(seed: int) -> None:
+    """No rows, no quadric, and the cap that finds most dots has wrong rays."""
+    got = answer(*draw(seed, missing=6, false=3))
+    assert (got.status, got.wrong) == ("ok", 0)
+    assert got.right >= 0.9 * got.shown
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [52014, 52094, 61008])
+def test_of_two_holes_the_smoother_surface_tells_the_marker(seed: int) -> None:
+    """Missing dots make a second hole; with its rows all dots fit as well, by a rough surface."""
+    got = answer(*draw(seed, missing=6, false=3))
+    assert (got.status, got.wrong) == ("ok", 0)
+    assert got.right >= 0.9 * got.shown
+
+
+def test_three_rays_round_a_corner_that_have_no_dot_are_no_row() -> None:
+    got = answer(*draw(52040, missing=6, false=3))
+    assert (got.status, got.wrong) == ("ok", 0)
+
+
+def test_wrong_rows_need_a_rougher_surface() -> None:
+    observed, labels = observation_of(draw(SHIFTED)[1])
+    shifted = [weighed(observed, other) for other in shifted_labels(observed, labels)]
+    assert weighed(observed, labels).roughness < min(other.roughness for other in shifted)
+
+
 def test_the_true_rows_cost_less_than_those_that_put_a_dot_on_the_absent_ray() -> None:
     observed, labels = observation_of(draw(SHIFTED)[1])
     true = weighed(observed, labels)
@@ -118,6 +147,13 @@ def test_a_row_that_may_have_left_the_view_is_not_called_dark() -> None:
     assert (match.witness[10, [3, 16]] == -1).all()  # dark, and far within the view
     size = measure_surface(fit.reconstruct(match, BENCH_RIG, FitSettings()), match, BENCH_RIG)
     assert abs(size.height_mm - pool.size.height_mm) < 2 * size.height_sigma_mm
+
+
+def test_rays_out_of_view_tell_that_one_of_their_row_may_be() -> None:
+    """Two of the row beside the last one are predicted in view; the pool grows steeper there."""
+    match = matched(draw(52011, missing=6, false=3)[1])
+    assert match.witness[12, 6] == 0
+    assert match.witness[12, 4] == -1  # dark, and far within the view
 
 
 @pytest.mark.parametrize("seed", [51000, 51009, 51018])

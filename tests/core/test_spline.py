@@ -85,6 +85,7 @@ def test_the_roughness_of_a_cubic_is_its_integral() -> None:
         coefficients = through(cubic, xy)
         rough = coefficients @ roughness() @ coefficients
         assert rough == pytest.approx(integrand * area, rel=1e-6)
+        assert SplineSurface(BASIS, coefficients).roughness() == pytest.approx(rough)
     assert np.linalg.eigvalsh(roughness()).min() > -1e-9
 
 

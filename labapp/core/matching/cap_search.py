@@ -54,7 +54,7 @@ def search_caps(observed: Observation, most: int = 24) -> list[IntArray]:
     observed
         The dots and the rig.
     most
-        How many to return at most, no two much alike.
+        How many to return at most, no two the same.
 
     Returns
     -------
@@ -74,14 +74,17 @@ def search_caps(observed: Observation, most: int = 24) -> list[IntArray]:
     score, found = kernels.score_caps(
         _caps(observed), observed.rays.reshape(-1, 3), *bench, settings
     )
-    best: list[IntArray] = []
+    best = np.full((MOST_CAPS, found.shape[1]), UNLABELLED, np.int64)
+    count = 0
     for k in np.argsort(-score, kind="stable"):
-        labels = found[k].reshape(observed.absent.shape)
-        if np.isfinite(score[k]) and not any(_alike(labels, other) for other in best):
-            best.append(labels)
-            if len(best) == MOST_CAPS:
+        both = (best[:count] != UNLABELLED) & (found[k] != UNLABELLED)
+        same = np.sum(both & (best[:count] == found[k]), axis=1)
+        if np.isfinite(score[k]) and (same <= ALIKE * both.sum(axis=1)).all():
+            best[count], count = found[k], count + 1
+            if count == MOST_CAPS:
                 break
-    matched = [one for labels in best if (one := _matched(observed, labels))]
+    shape = observed.absent.shape
+    matched = [one for k in range(count) if (one := _matched(observed, best[k].reshape(shape)))]
     matched.sort(key=lambda one: one[0])
     return list({labels.tobytes(): labels for _, labels in matched}.values())[:most]
 
@@ -104,8 +107,3 @@ def _caps(observed: Observation) -> FloatArray:
         across, along = np.sqrt(area / np.pi * np.array([1 / aspect, aspect]))
         caps.append((x, y, across, along, 2 * height * across))
     return np.array(caps)
-
-
-def _alike(one: IntArray, other: IntArray) -> bool:
-    both = (one != UNLABELLED) & (other != UNLABELLED)
-    return bool(both.any() and np.mean(one[both] == other[both]) > ALIKE)

@@ -70,9 +70,10 @@ def grow_labels(
     best: IntArray | None = None
     enough = (1 - FEW_UNLABELLED) * len(observed.plane_mm)
     few = count_labels(labels) < FEW_LABELS
-    course = (_STIFF_WIDE, _SOFT_WIDE, _STIFF_WIDE) if few else (STIFF, SOFT, STIFF)
     if knot_mm is not None:
-        course = (replace(SOFT, knot_mm=knot_mm),)
+        course = [replace(SOFT, knot_mm=knot_mm)]
+    else:
+        course = [_STIFF_WIDE, _SOFT_WIDE, _STIFF_WIDE] if few else [STIFF, SOFT, STIFF]
     for attempt in range(2):
         for settings in course:
             grown = _settled(observed, labels, settings)
