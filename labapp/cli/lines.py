@@ -25,7 +25,8 @@ from labapp.text import csv_text
 if TYPE_CHECKING:
     import numpy.typing as npt
 
-    from labapp.config.line_setup import LineSetup
+    from labapp.config.setup import Setup
+    from labapp.core.sequence.line_frame import LineFrame
     from labapp.media import FrameSource
 
 
@@ -57,7 +58,7 @@ def lines(
         chosen = select_frames(frames, len(recording))
         folder = writable_folder(out)
         with os_errors_as_input(folder, "results", "room on its disk"):
-            if follow or bench.rig.pattern.count == 1:
+            if follow or bench.rig.pattern.rows == 1:
                 done = _follow(recording, chosen, folder)
             else:
                 done = _measure(recording, chosen, folder, bench)
@@ -66,20 +67,21 @@ def lines(
         raise typer.Exit(NOTHING_MEASURED)
 
 
-def _measure(source: FrameSource, frames: range, folder: Path, bench: LineSetup) -> bool:
+def _measure(source: FrameSource, frames: range, folder: Path, bench: Setup) -> bool:
     """Measure frames one by one; whether any has lines."""
-    from labapp.core.sequence.line_frame import LineMeasureSettings, measure_lines
+    from labapp.core.pipeline import Settings, measure
     from labapp.core.sequence.line_states import LineSeries, line_changes, line_states
     from labapp.export import line_results as tables
 
-    settings, found, times_s = LineMeasureSettings(), [], []
+    found, times_s = list[LineFrame](), list[float | None]()
     with (
         progress_shown("stopped: the lines of the frames that were finished are kept") as progress,
         closing(tables.LineTables(folder, bench.calibration)) as written,
     ):
         for k, number in enumerate(frames):
             frame = source.frame(number)
-            one = measure_lines(frame.image, bench.rig, bench.calibration, settings)
+            one = measure(frame.image, bench.bench, Settings())[0].lines
+            assert one is not None
             found.append(one)
             times_s.append(frame.time_s)
             written.write(number, one)

@@ -26,6 +26,8 @@ from labapp.config.toml_keys import check_keys, parse_toml, read_text, shown, un
 from labapp.core.bench_check.check import BenchCheck
 from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.coordinates import ImageCalibration, Lens
+from labapp.core.geometry.line_pattern import KIND as LINES
+from labapp.core.geometry.line_pattern import LinePattern, LineRays, LineRig, line_rig
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.geometry.uncertainty import (
     CALIBRATED,
@@ -47,7 +49,7 @@ class Setup:
     """A valid setup."""
 
     rig: Rig
-    """Laser, dot pattern, electrode, imaging plane."""
+    """Laser, pattern, electrode, imaging plane; a line pattern as `LineRays`."""
     calibration: ImageCalibration
     """Pixel ↔ imaging plane."""
     text: str
@@ -62,9 +64,14 @@ class Setup:
         """Rig and calibration as the measurement takes them."""
         return Bench(self.rig, self.calibration)
 
+    @property
+    def line_rig(self) -> LineRig | None:
+        """The rig of a line pattern; None where the pattern is one of dots."""
+        return line_rig(self.rig)
 
-def read_setup(path: str | os.PathLike[str]) -> Setup:
-    """Read and check a setup file.
+
+def read_setup(path: str | os.PathLike[str], lines: bool = False) -> Setup:
+    """Read and check a setup file; see `parse_setup`.
 
     Raises
     ------
@@ -72,7 +79,7 @@ def read_setup(path: str | os.PathLike[str]) -> Setup:
         If the file cannot be read or anything in it is unknown, missing or impossible; all that
         was found is reported together (`InputError.problems`).
     """
-    return parse_setup(read_setup_text(path), Path(path))
+    return parse_setup(read_setup_text(path), Path(path), lines)
 
 
 def read_setup_text(path: str | os.PathLike[str]) -> str:
@@ -89,12 +96,18 @@ def read_setup_text(path: str | os.PathLike[str]) -> str:
 
 
 @functools.lru_cache(maxsize=64)
-def parse_setup(text: str, path: str | os.PathLike[str]) -> Setup:
-    """Check a setup that was read from ``path``; see `read_setup`."""
+def parse_setup(text: str, path: str | os.PathLike[str], lines: bool = False) -> Setup:
+    """Check a setup that was read from ``path``; see `read_setup`.
+
+    Parameters
+    ----------
+    lines
+        Whether a line pattern is accepted, too: by what measures both, or neither.
+    """
     path = Path(path)
     values = parse_toml(text, path, A_SETUP)
     pattern = values.get("pattern")
-    if isinstance(pattern, dict) and pattern.get("kind") == "lines":
+    if isinstance(pattern, dict) and pattern.get("kind") == LINES and not lines:
         right = "a dot pattern; lines are measured by labapp lines"
         raise InputError(path, "pattern.kind", '"lines"', right)
     problems = [
@@ -176,6 +189,16 @@ def updated_setup(
 
 _CALIBRATED_KEYS = frozenset(key.partition("[")[0] for key in CALIBRATED)
 _SHARED = {"laser": ("angle_distance_correlation",)}
+
+
+def pattern_kind(text: str) -> str:
+    """Kind of pattern that the text of a setup has, which may lack anything else."""
+    try:
+        keys = tomlkit.parse(text).unwrap().get("pattern")
+    except (tomlkit.exceptions.TOMLKitError, ValueError, RecursionError):
+        return DotPattern.kind
+    kind = keys.get("kind") if isinstance(keys, dict) else None
+    return kind if isinstance(kind, str) else DotPattern.kind
 
 
 def lens_of(text: str) -> Lens | None:
@@ -278,17 +301,45 @@ def dot_pattern(keys: Mapping[str, Any]) -> DotPattern:
     )
 
 
+def _pattern(keys: Mapping[str, Any]) -> DotPattern:
+    if keys.get("kind") != LINES:
+        return dot_pattern(keys)
+    return LineRays.of(LinePattern(**{key: value for key, value in keys.items() if key != "kind"}))
+
+
 def _contradictions(path: Path, values: dict[str, Any]) -> list[InputError]:
     """Problems of values that are valid by themselves and contradict each other."""
     pattern, angle = values["pattern"], values["laser"]["projection_angle_deg"]
-    rows, columns = pattern["rows"], pattern["columns"]
-    step = pattern["inter_beam_angle_deg"]
-    problems = _rays_beyond(path, pattern)
+    of_pattern = _steep_lines if pattern.get("kind") == LINES else _steep_rays
+    problems = of_pattern(path, pattern, angle)
     plane = values["imaging_plane"]
     if plane.get("glass_mm", 0.0) >= plane["distance_mm"]:
         expected = f"a number below the plane's distance, {plane['distance_mm']:g} (mm)"
         glass = plane["glass_mm"]
         problems.append(InputError(path, "imaging_plane.glass_mm", glass, expected))
+    lens = {"focal_px", "center_px", "distortion"}
+    lacking = sorted(lens - values.get("camera_lens", {}).keys())
+    if 0 < len(lacking) < len(lens):
+        problems.append(
+            InputError(path, f"camera_lens.{lacking[0]}", "missing", "all of the lens, or none")
+        )
+        return problems
+    try:
+        _calibration(values)
+    except ValueError as error:
+        problems.append(
+            InputError(path, "image_calibration", error, "three points that span the plane")
+        )
+    else:
+        problems += _nearly_one_line(path, values["image_calibration"])
+    return problems
+
+
+def _steep_rays(path: Path, pattern: dict[str, Any], angle: float) -> list[InputError]:
+    """Find what is wrong with dots: rays that are no rays of theirs, and too large a fan."""
+    rows, columns = pattern["rows"], pattern["columns"]
+    step = pattern["inter_beam_angle_deg"]
+    problems = _rays_beyond(path, pattern)
     steps = max(rows, columns) - 1
     if steps * step >= 90:
         problems.append(
@@ -309,22 +360,17 @@ def _contradictions(path: Path, values: dict[str, Any]) -> list[InputError]:
                 "rays above that never reach the work piece",
             )
         )
-    lens = {"focal_px", "center_px", "distortion"}
-    lacking = sorted(lens - values.get("camera_lens", {}).keys())
-    if 0 < len(lacking) < len(lens):
-        problems.append(
-            InputError(path, f"camera_lens.{lacking[0]}", "missing", "all of the lens, or none")
-        )
-        return problems
-    try:
-        _calibration(values)
-    except ValueError as error:
-        problems.append(
-            InputError(path, "image_calibration", error, "three points that span the plane")
-        )
-    else:
-        problems += _nearly_one_line(path, values["image_calibration"])
     return problems
+
+
+def _steep_lines(path: Path, pattern: dict[str, Any], angle: float) -> list[InputError]:
+    """Find lines that never reach the work piece."""
+    step = pattern["interline_angle_deg"]
+    half = (pattern["count"] - 1) / 2 * step
+    if half < angle:
+        return []
+    allowed = f"a number below {angle / half:.3g} times this"
+    return [InputError(path, "pattern.interline_angle_deg", step, allowed)]
 
 
 def _rays_beyond(path: Path, pattern: dict[str, Any]) -> list[InputError]:
@@ -376,7 +422,7 @@ def _rig(values: dict[str, Any], calibration: ImageCalibration) -> Rig:
     covariance, checked = checked_covariance(values, covariance)
     return Rig(
         Laser(**laser),
-        dot_pattern(values["pattern"]),
+        _pattern(values["pattern"]),
         Electrode(**values["electrode"]),
         _imaging_plane(plane),
         RigUncertainty(axes, covariance, frozenset() if checked else assumed, checked),

@@ -14,6 +14,7 @@ from labapp.config.toml_keys import (
     is_number,
     within,
 )
+from labapp.core.geometry.line_pattern import KIND as LINES
 from labapp.core.geometry.patterns import FEWEST_RAYS, MEASURED, PATTERNS
 from labapp.core.geometry.rig import Travel
 from labapp.core.geometry.uncertainty import QUANTITIES
@@ -83,6 +84,17 @@ RAYS = {
         _are_measured,
     ),
 }
+LINE_PATTERN = {
+    "kind": Rule(f'"{LINES}"', lambda value: value == LINES),
+    "count": Rule(
+        "a whole number from 1 to 99", lambda value: type(value) is int and 1 <= value <= 99
+    ),
+    "interline_angle_deg": between(0, 45, "degrees"),
+    "fan_angle_deg": between(0, 90, "degrees"),
+    "rotation_deg": _TILT,
+}
+"""Keys of ``[pattern]`` of a line pattern."""
+
 SECTIONS = {
     "laser": {
         "projection_angle_deg": between(0, 90, "degrees"),
@@ -156,10 +168,13 @@ OPTIONAL = ("camera_lens", "torch", "bench_check")
 def rules_for(section: str, keys: object) -> dict[str, Rule]:
     """Rules of a section, given the keys it holds.
 
-    A homography replaces the three points; only a pattern of measured rays has these.
+    A homography replaces the three points; only a pattern of measured rays has these, and a line
+    pattern has keys of its own.
     """
     if section == "pattern" and isinstance(keys, dict) and keys.get("kind") == MEASURED:
         return SECTIONS[section] | RAYS
+    if section == "pattern" and isinstance(keys, dict) and keys.get("kind") == LINES:
+        return LINE_PATTERN
     if section != "image_calibration":
         return SECTIONS[section]
     form = HOMOGRAPHY if isinstance(keys, dict) and "homography" in keys else THREE_POINTS

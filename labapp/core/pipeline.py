@@ -9,6 +9,8 @@
 Of a frame that the operator has corrected, his dots and rows take the place of steps 1 and 2. With
 a prior, what the frame before left, dots have the rays of those that it predicts there (`follow`),
 and no rows are needed for it: the other steps are the same.
+
+A line pattern has steps of its own (`measure_lines`): its points do not say which ray made them.
 """
 
 from __future__ import annotations
@@ -18,6 +20,7 @@ from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 from labapp.core.geometry.bench import Bench
+from labapp.core.geometry.line_pattern import LineRig, line_rig
 from labapp.core.geometry.rig import Rig
 from labapp.core.images.band_pass import DetectorTuning, quick_dots, tuned_dots
 from labapp.core.images.dots import Dots, Image
@@ -31,6 +34,7 @@ from labapp.core.rows.correction import Correction
 from labapp.core.rows.find_lattice import LatticeSettings, find_lattice
 from labapp.core.rows.lattice import Lattice
 from labapp.core.schemes import SCHEMES, ers, fit, irs, modal, zonal
+from labapp.core.sequence.line_frame import LineFrame, LineMeasureSettings, measure_lines
 from labapp.core.surface import measures
 from labapp.core.surface.pool_fit import FitSettings
 from labapp.core.surface.reconstruction import Reconstruction
@@ -92,6 +96,9 @@ class Measurement:
         The operator's dots and rows; None if they are as they were found.
     setup_status
         How far the set-up can be relied on (`RigUncertainty.status`); empty where it is exact.
+    lines
+        What the lines of a line pattern gave; None where the pattern is one of dots, which have all
+        that is above.
     """
 
     status: str
@@ -104,6 +111,7 @@ class Measurement:
     measures: measures.Measures | None = None
     correction: Correction | None = None
     setup_status: str = ""
+    lines: LineFrame | None = None
 
 
 def setup_status(rig: Rig) -> str:
@@ -148,6 +156,8 @@ def measure(
     result = Measurement(
         "ok", "", settings.scheme, correction=correction, setup_status=setup_status(bench.rig)
     )
+    if (of_lines := line_rig(bench.rig)) is not None:
+        return _with_lines(result, image, of_lines, bench), None
     rig, limits = bench.rig, replace(settings.match, correspondence=settings.correspondence)
     shape, known = (image.shape[0], image.shape[1]), None
     followed, tuning, near = None, None, None
@@ -197,6 +207,12 @@ def measure(
     if tuning is None or rig.pattern.marker is None:
         return result, None
     return result, Prior.of(bench, tuning, match, pool, made, size)
+
+
+def _with_lines(result: Measurement, image: Image, rig: LineRig, bench: Bench) -> Measurement:
+    """The result of a frame of a line pattern."""
+    found = measure_lines(image, rig, bench.calibration, LineMeasureSettings())
+    return replace(result, status=found.status, reason=found.reason, lines=found)
 
 
 def _as_before(image: Image, prior: Prior) -> Image:

@@ -96,7 +96,7 @@ class SessionContents:
         """
         from labapp.config.setup import parse_setup
 
-        return parse_setup(self.setup_text, self.path)
+        return parse_setup(self.setup_text, self.path, lines=True)
 
     @property
     def setup_problems(self) -> tuple[InputError, ...]:
@@ -106,6 +106,13 @@ class SessionContents:
         except InputError as error:
             return error.problems
         return ()
+
+    @property
+    def has_lines(self) -> bool:
+        """Whether the pattern is one of lines rather than dots."""
+        from labapp.config.setup import pattern_kind
+
+        return pattern_kind(self.setup_text) == "lines"
 
     @property
     def laser_calibration(self) -> LaserReadings | None:

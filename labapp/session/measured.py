@@ -289,7 +289,7 @@ class Results:
             "SELECT id, version, setup, settings FROM inputs"
         ):
             try:
-                parse_setup(unpack(setup, str), self._database.path)
+                parse_setup(unpack(setup, str), self._database.path, lines=True)
                 unpack(settings, Settings)
             except (Damaged, InputError) as error:
                 found.append(f"inputs {number} of version {version} are damaged: {error}")
@@ -392,13 +392,13 @@ def _residuals(content: bytes, columns: tuple[object, ...]) -> Residuals | None:
 
 @functools.lru_cache(maxsize=64)
 def _read_inputs(setup: bytes, settings: bytes) -> Basis:
-    return Basis(parse_setup(unpack(setup, str), "setup"), unpack(settings, Settings))
+    return Basis(parse_setup(unpack(setup, str), "setup", lines=True), unpack(settings, Settings))
 
 
 @functools.lru_cache(maxsize=64)
 def _setup_fingerprint(text: str) -> str:
     """SHA-256 of a setup's values, comments aside."""
-    setup = parse_setup(text, "setup")
+    setup = parse_setup(text, "setup", lines=True)
     return fingerprint((setup.rig, setup.calibration))
 
 

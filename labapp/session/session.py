@@ -12,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from labapp.errors import InputError
 from labapp.session.contents import SessionContents
 from labapp.session.file.schema import NO_FRAME
 
@@ -89,7 +90,7 @@ class Session(SessionContents):
         """
         from labapp.config.setup import parse_setup
 
-        parse_setup(text, self.path)
+        parse_setup(text, self.path, lines=True)
         self._documents.change(label, {("setup", NO_FRAME): text})
 
     def update_setup(
@@ -263,6 +264,8 @@ class Session(SessionContents):
         InputError
             If the session has no such frame.
         """
+        if any(corrections.values()) and self.has_lines:
+            raise InputError(self.path, "correction", "dots", "a pattern of dots; this has lines")
         for frame in corrections:
             self._frames.time_s(frame)
         self._documents.change(
@@ -378,13 +381,16 @@ class Session(SessionContents):
             self._results.put(number, measurement, basis, made_with)
 
         given = (self.frame, basis.setup, basis.settings, self.correction)
-        measurer: Measurer = WarmMeasurer(*given) if warm else ColdMeasurer(*given, pool)
+        lines = basis.setup.line_rig is not None  # each frame by itself; nothing judges the set-up
+        by_itself = lines or not warm
+        measurer: Measurer = ColdMeasurer(*given, pool) if by_itself else WarmMeasurer(*given)
         numbers = (int(number) for number in chosen)
         try:
             for result in run(numbers, measurer, [keep, *sinks]):
                 yield result.frame, result.measurement
         finally:
-            self._results.judge_setup(basis)
+            if not lines:
+                self._results.judge_setup(basis)
         self._frames.refuse_lost(lost)
 
     def export(

@@ -6,11 +6,12 @@ known, and the place along the fan is open.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
-from labapp.core.geometry.rig import Electrode, ImagingPlane, Laser
+from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.values import FloatArray
 
 
@@ -61,6 +62,43 @@ class LinePattern:
         return np.asarray(tangents @ np.array([[cos, sin], [-sin, cos]]))
 
 
+KIND = "lines"
+"""Kind of a pattern of lines in setup files."""
+
+RAYS_A_LINE = 41
+"""So many rays stand for a line where single rays are followed."""
+
+
+@dataclass(frozen=True)
+class LineRays(DotPattern):
+    """A line pattern as rays, a row for each line: for drawings, and for what counts rays.
+
+    Parameters
+    ----------
+    lines
+        The pattern.
+    """
+
+    lines: LinePattern = field(default_factory=LinePattern)
+
+    @classmethod
+    def of(cls, lines: LinePattern) -> LineRays:
+        """Rays at equal angles along each line."""
+        step = lines.fan_angle_deg / (RAYS_A_LINE - 1)
+        none = frozenset[tuple[int, int]]()
+        return cls(lines.count, RAYS_A_LINE, step, none, KIND, lines.rotation_deg, lines=lines)
+
+    @property
+    def tangents(self) -> FloatArray:
+        """Tangents of the rays to the beam axis, shape (rows, columns, 2)."""
+        fan = np.linspace(-self.lines.half_fan, self.lines.half_fan, self.columns)
+        return self.lines.tangents(np.arange(1.0, self.rows + 1)[:, None], fan)
+
+    @cached_property
+    def _outside(self) -> frozenset[tuple[int, int]]:
+        return frozenset()
+
+
 @dataclass(frozen=True)
 class LineRig:
     """A bench with a line pattern: everything whose place must be known to measure.
@@ -75,6 +113,13 @@ class LineRig:
     pattern: LinePattern
     electrode: Electrode
     imaging_plane: ImagingPlane
+
+
+def line_rig(rig: Rig) -> LineRig | None:
+    """The rig of a line pattern; None where the rig has one of dots."""
+    if not isinstance(rig.pattern, LineRays):
+        return None
+    return LineRig(rig.laser, rig.pattern.lines, rig.electrode, rig.imaging_plane)
 
 
 def line_directions(

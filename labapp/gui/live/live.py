@@ -445,9 +445,9 @@ def rays_of(setup: Setup | None) -> int | None:
 
 
 def setup_of(session: Session) -> Setup | None:
-    """The set-up of a session; None where it is not complete."""
+    """The set-up of a session; None where it is not complete, or has lines in place of dots."""
     try:
-        return session.setup
+        return None if session.has_lines else session.setup
     except InputError:
         return None
 

@@ -37,7 +37,7 @@ class State:
 
 PARTS = {
     "laser": "the laser",
-    "pattern": "the dot pattern",
+    "pattern": "the pattern",
     "electrode": "the electrode",
     "imaging_plane": "the imaging plane",
 }

@@ -18,9 +18,12 @@ from labapp.core.calibration.boards import FEWEST_CORNERS, Board, BoardCorners
 from labapp.core.calibration.laser_calibration import LaserCalibration
 from labapp.core.calibration.plane_calibration import PlaneCalibration
 from labapp.core.geometry.coordinates import ImageCalibration, Lens, RadialDistortion
+from labapp.core.geometry.line_pattern import LinePattern, LineRays
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.geometry.uncertainty import AxisPoints, RigUncertainty
 from labapp.core.images import dots, find_dots, threshold_dots
+from labapp.core.images.light_lines import LightLine
+from labapp.core.images.line_numbers import LinesSeen
 from labapp.core.match import Match, Trial
 from labapp.core.matching.decision import MatchSettings
 from labapp.core.pipeline import Measurement, Settings
@@ -28,7 +31,9 @@ from labapp.core.recording.residual_check import SetupVerdict, Suspect
 from labapp.core.rows import find_lattice, lattice, lattice_growth, row_search
 from labapp.core.rows.correction import Correction
 from labapp.core.schemes import SCHEMES
+from labapp.core.sequence.line_frame import LineFeatures, LineFrame
 from labapp.core.surface.boundary import Boundary
+from labapp.core.surface.line_fit import LineSurface
 from labapp.core.surface.measures import Measures
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.surface.spline import SplineBasis, SplineSurface
@@ -105,6 +110,20 @@ def _boards_fit(value: Any) -> bool:
     )
 
 
+def _lines_fit(value: Any) -> bool:
+    """Whether each line has points, and a surface is of lines that are there and not folded."""
+    lines, surface = value.seen.lines, value.surface
+    count = sum(not one.folded for one in lines)
+    return all(len(one.image_px) > 1 for one in lines) and (
+        surface is None
+        or (
+            len(surface.numbers) == count
+            and len(surface.point_mm) > 0
+            and len(surface.covariance) == len(surface.surface.coefficients)
+        )
+    )
+
+
 def _all_within(numbers: Any, least: int, most: int) -> bool:
     return bool(((numbers >= least) & (numbers <= most)).all())
 
@@ -113,6 +132,8 @@ STORED = {
     # The bench and its calibrations
     "Laser": Stored(Laser),
     "DotPattern": Stored(DotPattern),
+    "LinePattern": Stored(LinePattern),
+    "LineRays": Stored(LineRays),
     "Electrode": Stored(Electrode),
     "ImagingPlane": Stored(ImagingPlane, shapes={"origin_mm": "3", "x_axis": "3", "z_axis": "3"}),
     "Rig": Stored(Rig),
@@ -198,6 +219,23 @@ STORED = {
     ),
     "Measures": Stored(Measures),
     "Measurement": Stored(Measurement, fits=_measurement_fits),
+    "LineFrame": Stored(LineFrame, fits=_lines_fit),
+    "LineFeatures": Stored(LineFeatures),
+    "LinesSeen": Stored(LinesSeen),
+    "LightLine": Stored(
+        LightLine,
+        shapes={
+            "image_px": "n 2",
+            "tangent": "n 2",
+            "sigma_px": "n",
+            "curvature": "n",
+            "ends_px": "2 2",
+            "cut": "2",
+        },
+    ),
+    "LineSurface": Stored(
+        LineSurface, shapes={"covariance": "p p", "numbers": "k", "point_mm": "n 3"}
+    ),
     "SetupVerdict": Stored(SetupVerdict),
     "Suspect": Stored(Suspect),
 }

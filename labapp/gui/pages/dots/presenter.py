@@ -169,7 +169,7 @@ def computed_px(result: Result | None) -> FloatArray:
     point, pair = np.array(points, int).reshape(-1, 2).T
     plane = match.plane_mm[pair] + surface.residual_mm[point]
     met = np.isfinite(plane).all(axis=1)
-    return parse_setup(result.setup, "setup").calibration.to_image(plane[met])
+    return parse_setup(result.setup, "setup", lines=True).calibration.to_image(plane[met])
 
 
 def needs_fit(seen: DotsState) -> bool:

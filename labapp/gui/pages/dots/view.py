@@ -1,4 +1,7 @@
-"""The dots page: the frame, its dots and rows, and the keys and buttons that correct them."""
+"""The page of the pattern: the frame, its dots and rows, the keys and buttons that correct them.
+
+Of a line pattern it shows the lines in their place.
+"""
 
 from __future__ import annotations
 
@@ -16,6 +19,8 @@ from labapp.gui.pages.dots import presenter
 from labapp.gui.pages.dots.background import Looking, carry_on
 from labapp.gui.pages.dots.editing import Editor
 from labapp.gui.pages.dots.fitting import Refit
+from labapp.gui.pages.dots.lines import show_lines
+from labapp.gui.pages.dots.lines_view import LinesOverlay, LinesPanel
 from labapp.gui.pages.dots.overlay import DotsOverlay
 from labapp.gui.pages.dots.panel import DotsPanel
 from labapp.gui.pages.dots.presenter import DetectorNumber, DotsState, Figures, Need
@@ -56,6 +61,7 @@ class DotsPage(Page):
         self.editor = Editor(self._commit)
         self.view = PictureView("Frame with its dots")
         self.overlay = DotsOverlay(self.view)
+        self.lines = LinesOverlay(self.view)
         self.view.tool = self.hand = Hand(self)
         self.looking = Looking(workspace)
         self.refit = Refit(workspace)
@@ -71,7 +77,10 @@ class DotsPage(Page):
             self._action(command)
         self.dots_panel = DotsPanel(edits, frames)
         self.canvas_layout.addWidget(self.view)
+        self.lines_panel = LinesPanel()
+        self.lines_panel.hide()
         self.panel_layout.addWidget(self.dots_panel)
+        self.panel_layout.addWidget(self.lines_panel)
         self.setFocusProxy(self.view)
         panel = self.dots_panel
         self.lock_with_session(panel.method, panel.row_search, *panel.numbers)
@@ -117,6 +126,12 @@ class DotsPage(Page):
         same = self.seen is not None and self.seen.frame == frame
         if self.looking.image is None or self.view.picture is not self.looking.image:
             self.view.show_picture(self.looking.image, self.looking.why)
+        self._show_pattern(session.has_lines)
+        if session.has_lines:
+            state = show_lines(session, frame)
+            self.lines.show(state.lines)
+            self.lines_panel.show_frame(state)
+            return
         self.seen = presenter.shown(session, frame, self.looking.found)
         if self.seen.correction is None:
             self.looking.look()
@@ -127,6 +142,22 @@ class DotsPage(Page):
         self.dots_panel.show_settings(session.settings)
         self._show_words()
         self.draw()
+
+    def _show_pattern(self, lines: bool) -> None:
+        """Show the marks and the panel of dots, or those of lines; lines have no edits."""
+        if lines == self.lines_panel.isVisibleTo(self.panel):
+            return
+        self.lines_panel.setVisible(lines)
+        self.dots_panel.setVisible(not lines)
+        for action in self.actions():
+            action.setEnabled(not lines)
+        self.view.tool = Tool() if lines else self.hand
+        if lines:
+            self.seen = None
+            self.editor.show(None, same_frame=False)
+            self.draw()
+        else:
+            self.lines.show(())
 
     def _show_words(self) -> None:
         session, seen = self.session, self.seen
@@ -217,6 +248,7 @@ class DotsPage(Page):
         self.seen = self._before = None
         self.editor.show(None, same_frame=False)
         self.view.show_picture(None)
+        self.lines.show(())
         self.draw()
 
     # --- what is changed ----------------------------------------------------------------------

@@ -7,7 +7,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from labapp.config.setup import parse_setup, updated_setup
-from labapp.config.setup_keys import SECTIONS, THREE_POINTS
+from labapp.config.setup_keys import LINE_PATTERN, RAYS, SECTIONS, THREE_POINTS, rules_for
+from labapp.core.geometry.line_pattern import KIND as LINES
+from labapp.core.geometry.line_pattern import LineRays
 from labapp.core.geometry.patterns import MEASURED, PATTERNS
 from labapp.core.geometry.rig import DotPattern, Rig
 from labapp.core.geometry.uncertainty import QUANTITIES
@@ -38,15 +40,28 @@ class Entry:
     usual: float | None = None
     """What the text has for it (Appendix II); None: nothing."""
 
+    @property
+    def kinds(self) -> tuple[str, ...]:
+        """Kinds of pattern that have it."""
+        section, _, name = self.key.partition(".")
+        if section != "pattern":
+            return tuple(kind for kind, _ in KINDS)
+        return tuple(kind for kind, _ in KINDS if name in rules_for(section, {"kind": kind}))
+
 
 RIG: tuple[tuple[str, tuple[Entry, ...]], ...] = (
-    ("Dot pattern", (
+    ("Pattern", (
         Entry("pattern.rows", "Rows", "", "Rows of the dot matrix, odd", 3, 99, 2, 0, 19),
         Entry("pattern.columns", "Columns", "", "Columns of it, odd", 3, 99, 2, 0, 19),
         Entry("pattern.inter_beam_angle_deg", "Inter-beam angle", "°",
               "Angle between neighbouring rays at the centre", 0, 45, 0.01, 2, 0.77),
+        Entry("pattern.count", "Lines", "", "How many lines the lens makes", 1, 99, 1, 0, 5),
+        Entry("pattern.interline_angle_deg", "Interline angle", "°",
+              "Angle between neighbouring lines at the centre", 0, 45, 0.01, 3, 0.23),
+        Entry("pattern.fan_angle_deg", "Fan angle", "°",
+              "Angle from one end of a line to the other", 0, 90, 0.5, 2, 5),
         Entry("pattern.rotation_deg", "Rotation", "°",
-              "How far the pattern is turned about the beam; empty: rows lie level",
+              "How far the pattern is turned about the beam; empty: rows and lines lie level",
               -90, 90, 0.5, 2),
     )),
     ("Laser", (
@@ -117,8 +132,9 @@ TRAVELS = (("+y", "towards +Y"), ("-y", "towards −Y"))
 KINDS = (
     *((name, kind.title) for name, kind in PATTERNS.items()),
     (MEASURED, "measured rays"),
+    (LINES, "lines"),
 )
-"""Kinds of dot pattern, and how they are called."""
+"""Kinds of pattern, and how they are called."""
 
 
 def sigma_entry(entry: Entry) -> Entry | None:
@@ -187,7 +203,7 @@ class SetupState:
     sigmas: dict[str, float | None]
     """Standard uncertainties by the keys of `ASSUMED`; None where one is assumed."""
     kind: str
-    """Kind of the dot pattern, of `KINDS`."""
+    """Kind of the pattern, of `KINDS`."""
     travel: str
     """Which way the torch moves, of `TRAVELS`."""
     status: str
@@ -221,7 +237,7 @@ def shown(session: Session) -> SetupState:
         if problem.field in values or problem.field in sigmas:
             problems[problem.field] = words
         elif problem.value == "missing" and f"{problem.field}." in " ".join(keys):
-            rules = SECTIONS[problem.field]
+            rules = rules_for(problem.field, sections.get(problem.field))
             problems |= {f"{problem.field}.{key}": words for key in rules if rules[key].required}
         elif problem.field.startswith("image_calibration") and problem.value == "missing":
             others.append("The imaging plane is not calibrated: that is step 3.")
@@ -248,7 +264,7 @@ def rig(session: Session) -> Rig | None:
         text = updated_setup(
             session.setup_text, session.path, {"image_calibration": points | anything}
         )
-        return parse_setup(text, session.path).rig
+        return parse_setup(text, session.path, lines=True).rig
     except InputError:
         return None
 
@@ -283,12 +299,16 @@ def bench(session: Session) -> BenchState:
     tally, room = view.tally, view.clearance
     width, length, height = size
     given = None not in (record.expected_width_mm, record.expected_length_mm)
+    drawn = "the central column of the pattern"
+    if isinstance(found.pattern, LineRays):
+        rays = f"{found.pattern.columns} rays"
+        drawn = f"the plane of light of each line, seen from its edge; a line counts as {rays}"
     words = (
         f"{tally[Fate.CAUGHT]} of {sum(tally.values())} rays come back to the imaging plane "
         f"(solid). {tally[Fate.BLOCKED]} are blocked by the torch (dashed red), "
         f"{tally[Fate.PAST]} miss the plane (dotted grey), {tally[Fate.UNUSED]} do not meet the "
         f"pool (thin grey). {'Expected' if given else 'Usual'} pool: {width:g} × {length:g} mm, "
-        f"{f'{height:g} mm high' if height else 'flat'}. Drawn: the central column of the pattern. "
+        f"{f'{height:g} mm high' if height else 'flat'}. Drawn: {drawn}. "
         f"The torch moves {'to the right' if found.head_sign > 0 else 'to the left'}."
     )
     ends = ("tail", "head")[:: found.head_sign]
@@ -326,9 +346,10 @@ def put(session: Session, key: str, value: float | None) -> None:
 
 
 def put_kind(session: Session, kind: str) -> None:
-    """Enter the kind of dot pattern; measured rays are those of a pattern that is left."""
-    rays = {} if kind == MEASURED else {"rays": None}
-    session.update_setup({"pattern": {"kind": kind, **rays}}, "set-up, dot pattern")
+    """Enter the kind of pattern, without the keys that only the kind before has."""
+    known = (*SECTIONS["pattern"], *RAYS, *LINE_PATTERN)
+    keys = {key: None for key in known if key not in rules_for("pattern", {"kind": kind})}
+    session.update_setup({"pattern": {**keys, "kind": kind}}, "set-up, pattern")
 
 
 def put_travel(session: Session, travel: str) -> None:
@@ -338,11 +359,13 @@ def put_travel(session: Session, travel: str) -> None:
 
 def put_usual(session: Session) -> None:
     """Put the usual values in where something is missing; what is there stays."""
-    values = shown(session).values
+    state = shown(session)
+    values = state.values
     missing: dict[str, dict[str, object]] = {}
     for _, entries in RIG:
         for entry in entries:
-            if values[entry.key] is None and entry.usual is not None:
+            wanted = entry.usual is not None and state.kind in entry.kinds
+            if values[entry.key] is None and wanted:
                 section, _, name = entry.key.partition(".")
                 missing.setdefault(section, {})[name] = entry.usual
     session.update_setup(missing, "usual values")

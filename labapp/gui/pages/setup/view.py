@@ -85,6 +85,7 @@ class SetupPage(Page):
             if shown.problems.get(key):
                 field.set_problem(shown.problems[key])
         self.kind.set_value(shown.kind)
+        self._show_kind(shown.kind)
         self.travel.set_value(shown.travel)
         self.status.setText(shown.status)
         for name, noted in self.record_fields.items():
@@ -104,6 +105,16 @@ class SetupPage(Page):
             self.table.set_rows(bench.rows)
             self.table.setVisible(bool(bench.rows))
 
+    def _show_kind(self, kind: str) -> None:
+        """Show the fields that a kind of pattern has."""
+        for _, entries in RIG:
+            for entry in entries:
+                field, sigma = self.rig_fields[entry.key], presenter.sigma_entry(entry)
+                field.setVisible(kind in entry.kinds)
+                field.label.setVisible(kind in entry.kinds)
+                if sigma is not None:  # whose label is nowhere
+                    self.sigma_fields[sigma.key].setVisible(kind in sigma.kinds)
+
     def leave(self) -> None:
         """Finish the edit under way."""
         numbers = (*self.rig_fields.values(), *self.sigma_fields.values())
@@ -113,7 +124,9 @@ class SetupPage(Page):
     def load(self, path: Path) -> None:
         """Take the setup from a file."""
         if self.workspace.attempt(
-            lambda session: session.set_setup(read_setup(path).text, f"set-up from {path.name}"),
+            lambda session: session.set_setup(
+                read_setup(path, lines=True).text, f"set-up from {path.name}"
+            ),
             "Loading",
             self.refused.setText,
         ):
@@ -191,12 +204,15 @@ class SetupPage(Page):
         form.add_wide(wrapping_label("Right: ±, one standard uncertainty. In grey: assumed."))
         for heading, entries in RIG:
             form.add_heading(heading)
+            if heading == "Pattern":
+                tip = (
+                    "Dots, and how they lie to each other, or lines. "
+                    "Measured rays come with a setup file: Load…"
+                )
+                self.kind = self._choice("Kind", KINDS, tip, presenter.put_kind)
+                form.add(self.kind)
             for entry in entries:
                 form.add(self._rig_field(entry), self._sigma_field(presenter.sigma_entry(entry)))
-            if heading == "Dot pattern":
-                tip = "How the dots lie to each other. Measured rays come with a setup file: Load…"
-                self.kind = self._choice("Grid", KINDS, tip, presenter.put_kind)
-                form.add(self.kind)
             if heading == "Torch":
                 tip = "Where the pool's head is: +Y is the laser's side. The rear may lie low"
                 self.travel = self._choice("Welding", TRAVELS, tip, presenter.put_travel)

@@ -148,7 +148,7 @@ def _state(result: Result) -> tuple[Literal["measured", "stale", "failed"], str]
         return "stale", f"{was} Since then {' and '.join(result.stale)}."
     if failed:
         return "failed", words
-    checked = parse_setup(result.setup, "setup").checked
+    checked = parse_setup(result.setup, "setup", lines=True).checked
     about = setup_words(measurement.setup_status, checked, result.doubt)
     return "measured", f"{words} {about}".strip()
 
@@ -238,7 +238,7 @@ def rig_of(result: Result) -> Rig:
 
 @functools.lru_cache(maxsize=8)
 def _rig(setup: str) -> Rig:
-    return parse_setup(setup, "setup").rig
+    return parse_setup(setup, "setup", lines=True).rig
 
 
 def height_limits(seen: Overview) -> tuple[float, float] | None:

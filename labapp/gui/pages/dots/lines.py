@@ -1,0 +1,134 @@
+"""What the page shows of a frame of a line pattern, without Qt."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from labapp.core.images.light_lines import LightLine
+from labapp.core.sequence.line_frame import LineFrame
+from labapp.core.values import BoolArray, FloatArray
+from labapp.errors import InputError
+from labapp.gui.digits import ResultRow
+from labapp.session.measured import Result
+from labapp.session.session import Session
+from labapp.text import pluralize
+
+STATUSES = {
+    "ok": "The lines determine the surface",
+    "profile": "The lines leave a direction of the surface open: a profile, no height",
+    "no-lines": "No line is seen",
+    "folded-lines": "The pool gathers the lines to points: they show how many they are, no shape",
+    "too-few-lines": "One line alone determines no surface",
+}
+
+
+@dataclass(frozen=True)
+class DrawnLine:
+    """A line as it is drawn."""
+
+    name: str
+    """Its number in the pattern; in brackets its place from the lowest up where no number is sure.
+    """
+    image_px: FloatArray
+    """(u, v) of its ridge, shape (n, 2), px."""
+    ends_px: FloatArray
+    """(u, v) of its ends, shape (2, 2), px."""
+    cut: BoolArray
+    """Whether each end is at the picture's edge, shape (2,)."""
+    folded: bool
+
+
+@dataclass(frozen=True)
+class LinesState:
+    """What the page shows of one frame."""
+
+    words: str
+    """What is seen, in a sentence or two."""
+    lines: tuple[DrawnLine, ...] = ()
+    """From the lowest in the picture up."""
+    listed: tuple[tuple[str, ...], ...] = ()
+    """A row of the list for each line, from the top of the picture down: see `COLUMNS`."""
+    rows: tuple[ResultRow, ...] = ()
+    """What the lines show, and what they say of the pool."""
+    why: str = ""
+    """Why there is no surface, or why the result is stale; empty if neither."""
+
+
+COLUMNS = ("Line", "Length, px", "Width, px", "Gap, px", "Ends")
+"""Of the list of lines."""
+
+
+def show_lines(session: Session, frame: int) -> LinesState:
+    """What a frame shows: its lines as they were measured."""
+    try:
+        result = session.result(frame)
+    except InputError as error:
+        return LinesState("This frame's result is damaged.", why=f"{error}; measure it again")
+    if result is None:
+        return LinesState("This frame is not measured yet: measure it to see its lines.")
+    found = result.measurement.lines
+    if found is None:  # a pattern of dots, or a frame that could not be read
+        why = result.measurement.reason or "; ".join(result.stale)
+        return LinesState("No lines were looked for in this frame: measure it.", why=why)
+    names = line_names(found)
+    lines = found.seen.lines
+    drawn = tuple(
+        DrawnLine(name, one.image_px, one.ends_px, one.cut, one.folded)
+        for name, one in zip(names, lines, strict=True)
+    )
+    listed = tuple(_listed(name, one) for name, one in zip(names, lines, strict=True))[::-1]
+    why = "; ".join(result.stale) or found.reason
+    return LinesState(_words(found), drawn, listed, _rows(found, result), why)
+
+
+def line_names(found: LineFrame) -> tuple[str, ...]:
+    """Number of each line in the pattern; its place, in brackets, where that is not settled."""
+    places = [f"({k + 1})" for k in range(len(found.seen.lines))]
+    if found.status != "ok" or found.surface is None:
+        return tuple(places)
+    numbers = iter(found.surface.numbers.tolist())
+    return tuple(
+        place if one.folded else str(next(numbers))
+        for place, one in zip(places, found.seen.lines, strict=True)
+    )
+
+
+def _words(found: LineFrame) -> str:
+    seen = found.seen
+    message = f"{pluralize(len(seen.lines), 'line')}" if seen.lines else "No line"
+    if seen.left_out:
+        message += f", {seen.left_out} fainter left out (fringes)"
+    if seen.lines and found.status != "ok":
+        message += ". Numbers are not settled: counted from the lowest up"
+    return f"{message}. {STATUSES.get(found.status, found.reason or found.status)}."
+
+
+def _listed(name: str, one: LightLine) -> tuple[str, ...]:
+    ends = ["cut off by the picture" if cut else "seen" for cut in one.cut.tolist()]
+    words = ends[0] if ends[0] == ends[1] else f"left {ends[0]}, right {ends[1]}"
+    shape = "folded" if one.folded else words
+    return name, f"{one.length_px:.0f}", f"{one.width_px:.1f}", f"{one.gap_px:.0f}", shape
+
+
+def _rows(found: LineFrame, result: Result) -> tuple[ResultRow, ...]:
+    seen, surface = found.features, found.surface
+    rows = [
+        ResultRow("Lines", str(seen.count), note="How many of the pattern's lines are seen"),
+        ResultRow("Extent, X′", seen.width_mm, unit="mm", note="Of the lines, on the plane"),
+        ResultRow("Extent, Z′", seen.height_mm, unit="mm", note="Of the lines, on the plane"),
+        ResultRow("Area", seen.area_mm2, unit="mm²", decimals=1, note="Between the outermost"),
+        ResultRow("Curvature", seen.curvature_per_mm, unit="1/mm",
+                  note="Of the lines on the plane, positive where they are arched upwards"),
+        ResultRow("Asymmetry", seen.asymmetry,
+                  note="Right extent less left one, about the highest points, over their sum"),
+    ]  # fmt: skip
+    if surface is not None and found.status == "ok":
+        rows += [
+            ResultRow("Pool height", surface.height_mm, surface.height_sigma_mm, "mm",
+                      note="Under the lines; negative for a hollow. ± without the set-up's part"),
+            ResultRow("Pool width", surface.width_mm, unit="mm",
+                      note="Between the ends of the lines"),
+            ResultRow("Misfit", surface.misfit, decimals=2,
+                      note="χ² of points and ends over its degrees of freedom"),
+        ]  # fmt: skip
+    return tuple(rows)

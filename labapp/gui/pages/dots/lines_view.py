@@ -1,0 +1,116 @@
+"""Reflected lines as they are drawn over a frame, and the panel beside it.
+
+Every line has its colour and its number. A ring is an end, a square one where the picture cuts the
+line off; a dashed line is folded: its halves lie on each other.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pyqtgraph as pg
+from PySide6.QtCore import Qt
+from PySide6.QtGui import QColor, QPen
+from PySide6.QtWidgets import QHeaderView, QWidget
+
+from labapp.gui.pages.dots.lines import COLUMNS, DrawnLine, LinesState
+from labapp.gui.pages.dots.overlay import row_color
+from labapp.gui.views.picture import PictureView
+from labapp.gui.widgets.labels import Message, heading, show_words, wrapping_label
+from labapp.gui.widgets.layouts import vbox
+from labapp.gui.widgets.result_table import ResultTable
+from labapp.gui.widgets.tables import ReadTable
+
+END = 11.0
+"""Diameter of the mark of an end, points of the screen."""
+
+BESIDE = 14.0
+"""How far beside a line's right end its number stands, points of the screen."""
+
+
+class LinesOverlay:
+    """The lines over a picture."""
+
+    def __init__(self, view: PictureView) -> None:
+        self._view = view
+        self._items: list[pg.GraphicsObject] = []
+        self._labels: list[tuple[pg.TextItem, DrawnLine]] = []
+        view.box.sigXRangeChanged.connect(lambda *_: self._place_labels())
+
+    def show(self, lines: tuple[DrawnLine, ...]) -> None:
+        """Draw lines in place of those drawn before."""
+        for item in (*self._items, *(label for label, _ in self._labels)):
+            self._view.box.removeItem(item)
+        self._items, self._labels = [], []
+        for k, line in enumerate(lines):
+            self._draw(line, row_color(k + 1))
+        self._place_labels()
+
+    def _draw(self, line: DrawnLine, color: str) -> None:
+        style = Qt.PenStyle.DashLine if line.folded else Qt.PenStyle.SolidLine
+        curve = pg.PlotCurveItem(*_with_gaps(line.image_px).T, pen=_pen(color, style))
+        ends = pg.ScatterPlotItem(
+            *line.ends_px.T,
+            symbol=["s" if cut else "o" for cut in line.cut.tolist()],
+            size=END,
+            pen=_pen(color),
+            brush=None,
+        )
+        label = pg.TextItem(line.name, color, anchor=(0, 0.5), fill=(0, 0, 0, 60))
+        for item in (curve, ends, label):
+            self._view.add(item)
+        self._items += [curve, ends]
+        self._labels.append((label, line))
+
+    def _place_labels(self) -> None:
+        for label, line in self._labels:
+            u, v = line.ends_px[1]
+            label.setPos(u + BESIDE * self._view.px_per_point, v)
+
+
+class LinesPanel(QWidget):
+    """What stands beside the frame of a line pattern."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.seen, self.why = Message(4), wrapping_label()
+        self.rows = ResultTable("What the lines show")
+        self.lines = _LineList()
+        vbox(
+            *(self.seen, self.why, heading("Lines, from the top down"), self.lines),
+            *(heading("What they show"), self.rows, 1),
+            of=self,
+        )
+
+    def show_frame(self, state: LinesState) -> None:
+        """Show what the session says of the frame in view."""
+        self.seen.setText(state.words)
+        show_words(self.why, f"⚠ {state.why[:1].upper()}{state.why[1:]}" if state.why else "")
+        self.lines.show_lines(state.listed)
+        self.rows.set_rows(state.rows)
+
+
+class _LineList(ReadTable):
+    def __init__(self) -> None:
+        super().__init__("Lines", "Lines of the frame, from the top down", list(COLUMNS))
+        header = self.horizontalHeader()
+        header.setSectionResizeMode(len(COLUMNS) - 1, QHeaderView.ResizeMode.Stretch)
+
+    def show_lines(self, listed: tuple[tuple[str, ...], ...]) -> None:
+        """List lines."""
+        self.setRowCount(len(listed))
+        for k, cells in enumerate(listed):
+            for column, text in enumerate(cells):
+                self.set_cell(k, column, text, number=column < len(cells) - 1, tip=text)
+        self.setFixedHeight(self.full_height)
+
+
+def _with_gaps(points: np.ndarray) -> np.ndarray:
+    """Points of a line, NaN where it has a gap: nothing is drawn there."""
+    gaps = np.flatnonzero(np.linalg.norm(np.diff(points, axis=0), axis=-1) > 3.0) + 1
+    return np.insert(points, gaps, np.nan, axis=0)
+
+
+def _pen(color: str, style: Qt.PenStyle = Qt.PenStyle.SolidLine) -> QPen:
+    pen = QPen(QColor(color), 2, style)
+    pen.setCosmetic(True)
+    return pen
