@@ -85,9 +85,9 @@ RIG: tuple[tuple[str, tuple[Entry, ...]], ...] = (
               "How far its upper edge leans away from the torch; empty: upright", -90, 90, 0.5, 2),
         Entry("imaging_plane.yaw_deg", "Yaw", "°",
               "How far it is turned about the upright; empty: square to the welding direction",
-              -90, 90, 0.5, 2),
+              -180, 180, 0.5, 2),
         Entry("imaging_plane.roll_deg", "Roll", "°",
-              "How far O′X′ rises; empty: it lies level", -90, 90, 0.5, 2),
+              "How far O′X′ rises; empty: it lies level", -180, 180, 0.5, 2),
         Entry("imaging_plane.glass_mm", "Glass", "mm",
               "Thickness of a glass before the paper, on the pool's side; empty: none. "
               "Distances are measured to the paper", 0, 100, 0.5, 2),
