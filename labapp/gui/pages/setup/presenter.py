@@ -163,20 +163,6 @@ EXPERIMENT = (
     Entry("notes", "Notes", tooltip="Anything else worth keeping; Ctrl+Enter keeps it"),
 )  # fmt: skip
 
-SAFETY: tuple[tuple[str, str], ...] = (
-    (
-        "Laser points at nobody's eyes",
-        "It is of class IIIb: never into the beam, nor into its reflection on metal.",
-    ),
-    ("Laser goggles are worn", "By everybody in the room, for 685 nm."),
-    ("Welding goggles are worn", "The arc is bright enough to hurt the eyes."),
-    ("Welding clothes are worn", "Metal splatters."),
-    ("Hands stay off the arc", "Arc, torch and work piece are very hot."),
-    ("Water cooling is on", "Before the welding machine is switched on."),
-    ("Shielding gas is on", "Before the welding machine is switched on."),
-)
-"""Title and what it means, from Appendix II."""
-
 
 @dataclass(frozen=True)
 class SetupState:
@@ -351,10 +337,3 @@ def put_usual(session: Session) -> None:
 def note(session: Session, name: str, value: str | float | None) -> None:
     """Note one item of the experiment record."""
     session.set_record(replace(session.record, **{name: value}))  # type: ignore[arg-type]
-
-
-def tick(session: Session, item: str, ticked: bool, now: str) -> None:
-    """Tick an item of the safety list at a time (ISO 8601), or take its tick away."""
-    kept = tuple(pair for pair in session.record.safety if pair[0] != item)
-    safety = (*kept, (item, now)) if ticked else kept
-    session.set_record(replace(session.record, safety=safety))
