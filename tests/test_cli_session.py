@@ -24,6 +24,7 @@ from labapp.core.surface.measures import Measures
 from labapp.core.values import CannotMeasure
 from labapp.errors import InputError
 from labapp.run import measurers
+from labapp.session.checklist import SAFETY, STEPS
 from labapp.session.frames import Frames
 from labapp.session.measured import Results
 from labapp.session.session import Session
@@ -139,6 +140,24 @@ def test_a_new_session_keeps_setup_and_record(labapp: Run, tmp_path: Path) -> No
         assert (record.thickness_mm, record.current_a, record.voltage_v) == (2, 120, 11.5)
         assert (record.travel_speed_mm_s, record.notes) == (3, "N")
         assert session.setup_text == SETUP.read_text("utf-8")
+
+
+def test_the_lists_of_appendix_ii_are_ticked(labapp: Run, tmp_path: Path) -> None:
+    file = tmp_path / "a.labsession"
+    labapp("session", "new", file)
+    code, said, _ = labapp("session", "checklist", file)
+    assert code == 0
+    assert said.count("[ ]") == 7 + 7 + 6
+    code, said, _ = labapp("session", "checklist", file, "--tick", 2, "--tick", 15)
+    assert code == 0
+    assert said.count("[x]") == 2
+    with opened(file) as session:
+        assert [item for item, _ in session.record.safety] == [SAFETY[1][0], STEPS[0][0]]
+    _, said, _ = labapp("session", "checklist", file, "--untick", 2)
+    assert said.count("[x]") == 1
+    code, _, complained = labapp("session", "checklist", file, "--tick", 21)
+    assert code == 2
+    assert "--tick" in complained
 
 
 def test_a_session_without_a_setup_says_how_to_go_on(labapp: Run, tmp_path: Path) -> None:

@@ -27,6 +27,7 @@ from labapp.cli import (
     bench,
     benchmark,
     cameras,
+    fold,
     lines,
     pattern,
     reconstruct,
@@ -86,6 +87,7 @@ calibrate = typer.Typer(
 app.add_typer(calibrate, name="calibrate")
 calibrate.command("bench")(bench.calibrate_bench)
 calibrate.command("pattern")(pattern.calibrate_pattern)
+calibrate.command("fold")(fold.calibrate_fold)
 app.add_typer(analyze.app, name="analyze")
 app.add_typer(session.app, name="session")
 app.add_typer(study.app, name="study")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 
 import typer
 
@@ -26,6 +26,9 @@ from labapp.studies.analysis import (
     analyze_errors,
     expected_pool,
 )
+
+if TYPE_CHECKING:
+    from labapp.studies.tables import Table
 
 T = TypeVar("T", bound=str)
 
@@ -164,7 +167,7 @@ def frame(
     if found.match is None:
         typer.echo(f"{source}: {found.status}: {found.reason}", err=True)
         raise typer.Exit(NOTHING_MEASURED)
-    made = (shape_table(found.match), *comparison_tables(found.match, known.rig))
+    made: tuple[Table, ...] = (shape_table(found.match), *comparison_tables(found.match, known.rig))
     if cap is not None:
         made = (known_object_table(found.match, known.rig, cap), *made)
     _keep(results_folder(out, tables), AnalysisPart(made, {}, made if tables else ()))

@@ -407,6 +407,45 @@ app.command()(info)
 
 
 @app.command()
+def checklist(
+    file: File,
+    tick: Annotated[
+        list[int] | None, typer.Option(min=1, help="Tick the item of this number; repeat for more.")
+    ] = None,
+    untick: Annotated[
+        list[int] | None, typer.Option(min=1, help="Take its tick away; repeat for more.")
+    ] = None,
+) -> None:
+    """Show the lists of Appendix II, safety, equipment and steps, and tick what is done.
+
+    The session keeps the time of each tick.
+    """
+    from datetime import datetime
+
+    from labapp.session import checklist as lists
+    from labapp.session.session import Session
+
+    items = [item for some in lists.LISTS.values() for item, _ in some]
+    for option, numbers in (("--tick", tick), ("--untick", untick)):
+        for number in numbers or ():
+            if number > len(items):
+                raise InputError(option, "item", number, f"1 to {len(items)}")
+    with Session.open(file, read_only=not (tick or untick)) as session:
+        now = datetime.now().astimezone().isoformat(timespec="seconds")
+        for ticked, numbers in ((True, tick), (False, untick)):
+            for number in numbers or ():
+                lists.tick(session, items[number - 1], ticked, now)
+        times, number = dict(session.record.safety), 0
+        for name, some in lists.LISTS.items():
+            typer.echo(f"{name}: {sum(item in times for item, _ in some)} of {len(some)}")
+            for item, meaning in some:
+                number += 1
+                mark = f"ticked {times[item][:16].replace('T', ' ')}" if item in times else ""
+                typer.echo(f"{number:3} {'[x]' if mark else '[ ]'} {item}  {mark}".rstrip())
+                typer.echo(f"        {meaning}")
+
+
+@app.command()
 def verify(
     file: File,
     recording: Annotated[

@@ -29,7 +29,7 @@ class Record:
     """Size of the pool that is expected; a negative height is a concave one."""
     notes: str = ""
     safety: tuple[tuple[str, str], ...] = ()
-    """Items of the safety list (Appendix II) that were ticked: (item, ISO 8601 time) pairs."""
+    """Items of the lists of Appendix II (`checklist`) that were ticked: (item, ISO 8601) pairs."""
 
 
 @dataclass(frozen=True)

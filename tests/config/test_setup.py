@@ -135,7 +135,7 @@ def test_a_homography_stands_for_the_three_points(path: Path) -> None:
             "angle_deg = 5",
             "inter_beam_angle_deg: 5; expected a number below 5 ",
         ),
-        ("h_mm = 3.0\n", "h_mm = 3.0\npitch_deg = 90\n", "imaging_plane.pitch_deg: 90; expected"),
+        ("h_mm = 3.0\n", "h_mm = 3.0\npitch_deg = 91\n", "imaging_plane.pitch_deg: 91; expected"),
         ("height_mm = 5.0", "height_mm = -1", "electrode.height_mm: -1; expected a number from 0"),
         ("[44.0, 590.0]", "[44.0]", r"image_calibration.origin_px: \[44.0\]; expected \[u, v\]"),
         ("[44.0, 590.0]", "[44.0, nan]", r"image_calibration.origin_px: \[44.0, nan\]"),

@@ -434,7 +434,7 @@ class RandomHand:
             self._press(edit[1], edit[0])
             return f"{key.name}, {edit[0].name} {edit[1].name}"
         if isinstance(page, SetupPage):
-            page.tabs.setCurrentIndex(rng.randrange(3))
+            page.tabs.setCurrentIndex(rng.randrange(4))
         if isinstance(page, CapturePage):
             parts = page.live_view.canvas.tabs
             parts.setCurrentIndex(rng.randrange(parts.count()) if parts.isVisible() else 0)

@@ -16,11 +16,11 @@ from PySide6.QtWidgets import (
 from pytestqt.qtbot import QtBot
 
 from labapp.gui.pages import PAGES
-from labapp.gui.pages.setup.presenter import SAFETY
 from labapp.gui.pages.setup.view import BENCH_TAB, SAFETY_TAB
 from labapp.gui.shell.window import MainWindow
 from labapp.gui.widgets.fields import Field
 from labapp.gui.widgets.labels import Message
+from labapp.session.checklist import SAFETY
 from labapp.session.session import Session
 from tests.gui.conftest import CopySample, let_draw
 

@@ -167,6 +167,10 @@ class Electrode:
     height_mm: float = 5.0
 
 
+_LEVEL = 1e-9
+"""A plane whose normal has no larger part along the work piece lies level."""
+
+
 @dataclass(frozen=True)
 class ImagingPlane(ReadOnlyArrays):
     """The imaging plane, of any pose: O′ and the directions of O′X′ and O′Z′ in the UCS.
@@ -231,8 +235,10 @@ class ImagingPlane(ReadOnlyArrays):
     def angles_deg(self) -> tuple[float, float, float]:
         """Pitch, yaw and roll (`of_angles`), degrees."""
         x, y, z = self.normal.tolist()
-        pitch, yaw = np.arcsin(np.clip(-z, -1.0, 1.0)), np.arctan2(x, -y)
+        pitch, yaw = np.arctan2(-z, np.hypot(x, y)), np.arctan2(x, -y)
         roll = np.arctan2(self.x_axis[2], self.z_axis[2])
+        if np.hypot(x, y) < _LEVEL:  # yaw and roll turn a level plane about the same axis
+            yaw, roll = np.arctan2(self.x_axis[1], self.x_axis[0]), 0.0
         return float(np.degrees(pitch)), float(np.degrees(yaw)), float(np.degrees(roll))
 
     @cached_property

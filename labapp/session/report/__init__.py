@@ -110,10 +110,10 @@ def _experiment(story: Story, report: ReportData, title: str) -> None:
     if len(story.flowables) == before:
         story.text("Nothing was noted about the experiment.")
     if record.safety:
-        story.part("Safety list")
+        story.part("Safety and preparation")
         story.listing([(time.replace("T", " "), item) for item, time in record.safety])
     else:
-        story.text("No item of the safety list was ticked.")
+        story.text("No item of the lists of safety and preparation was ticked.")
     story.part("Recording")
     _recording(story, session)
     story.part("Measured by")

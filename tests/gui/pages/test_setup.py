@@ -14,8 +14,9 @@ from labapp.config.setup import read_setup
 from labapp.config.setup_keys import SECTIONS
 from labapp.core.geometry.uncertainty import ANGLE, DISTANCE, INDEX, QUANTITIES
 from labapp.gui.pages.setup import SetupPage, presenter
-from labapp.gui.pages.setup.presenter import RIG, SAFETY
+from labapp.gui.pages.setup.presenter import RIG
 from labapp.gui.workspace import Workspace
+from labapp.session.checklist import SAFETY, STEPS, tick
 from labapp.session.session import Session
 from labapp.simulation.positioning import Fate
 from tests.gui.conftest import KEPT
@@ -123,9 +124,9 @@ def test_the_bench_counts_what_comes_back(empty: Session) -> None:
 
 def test_a_tick_is_kept_with_its_time(empty: Session) -> None:
     (first, _), (second, _), *_ = SAFETY
-    presenter.tick(empty, first, True, "2026-11-21T10:00:00+01:00")
-    presenter.tick(empty, second, True, "2026-11-21T10:01:00+01:00")
-    presenter.tick(empty, first, False, "2026-11-21T10:02:00+01:00")
+    tick(empty, first, True, "2026-11-21T10:00:00+01:00")
+    tick(empty, second, True, "2026-11-21T10:01:00+01:00")
+    tick(empty, first, False, "2026-11-21T10:02:00+01:00")
     assert empty.record.safety == ((second, "2026-11-21T10:01:00+01:00"),)
     empty.undo()
     assert dict(empty.record.safety)[first].startswith("2026-11-21T10:00")
@@ -260,6 +261,11 @@ def test_record_and_ticks_by_hand(qtbot: QtBot, page: SetupPage) -> None:
     assert "1/7" in page.tabs.tabText(1)
     page.ticks[item].click()
     assert item not in dict(session.record.safety)
+    step = STEPS[0][0]
+    page.preparation[step].click()
+    assert step in dict(session.record.safety)
+    assert "0/7" in page.tabs.tabText(1)
+    assert "1/13" in page.tabs.tabText(3)
 
 
 def test_a_wrong_file_is_refused_in_words(page: SetupPage, tmp_path: Path) -> None:

@@ -100,9 +100,9 @@ RIG: tuple[tuple[str, tuple[Entry, ...]], ...] = (
               "How far its upper edge leans away from the torch; empty: upright", -90, 90, 0.5, 2),
         Entry("imaging_plane.yaw_deg", "Yaw", "°",
               "How far it is turned about the upright; empty: square to the welding direction",
-              -90, 90, 0.5, 2),
+              -180, 180, 0.5, 2),
         Entry("imaging_plane.roll_deg", "Roll", "°",
-              "How far O′X′ rises; empty: it lies level", -90, 90, 0.5, 2),
+              "How far O′X′ rises; empty: it lies level", -180, 180, 0.5, 2),
         Entry("imaging_plane.glass_mm", "Glass", "mm",
               "Thickness of a glass before the paper, on the pool's side; empty: none. "
               "Distances are measured to the paper", 0, 100, 0.5, 2),
@@ -178,20 +178,6 @@ EXPERIMENT = (
     Entry("gas_flow_l_min", "Gas flow", "l/min", "Of the shielding gas", 0, 1000, 0.5, 1),
     Entry("notes", "Notes", tooltip="Anything else worth keeping; Ctrl+Enter keeps it"),
 )  # fmt: skip
-
-SAFETY: tuple[tuple[str, str], ...] = (
-    (
-        "Laser points at nobody's eyes",
-        "It is of class IIIb: never into the beam, nor into its reflection on metal.",
-    ),
-    ("Laser goggles are worn", "By everybody in the room, for 685 nm."),
-    ("Welding goggles are worn", "The arc is bright enough to hurt the eyes."),
-    ("Welding clothes are worn", "Metal splatters."),
-    ("Hands stay off the arc", "Arc, torch and work piece are very hot."),
-    ("Water cooling is on", "Before the welding machine is switched on."),
-    ("Shielding gas is on", "Before the welding machine is switched on."),
-)
-"""Title and what it means, from Appendix II."""
 
 
 @dataclass(frozen=True)
@@ -374,10 +360,3 @@ def put_usual(session: Session) -> None:
 def note(session: Session, name: str, value: str | float | None) -> None:
     """Note one item of the experiment record."""
     session.set_record(replace(session.record, **{name: value}))  # type: ignore[arg-type]
-
-
-def tick(session: Session, item: str, ticked: bool, now: str) -> None:
-    """Tick an item of the safety list at a time (ISO 8601), or take its tick away."""
-    kept = tuple(pair for pair in session.record.safety if pair[0] != item)
-    safety = (*kept, (item, now)) if ticked else kept
-    session.set_record(replace(session.record, safety=safety))

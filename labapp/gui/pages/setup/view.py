@@ -1,4 +1,4 @@
-"""The set-up page: three tabs beside the drawing of the bench."""
+"""The set-up page: four tabs beside the drawing of the bench."""
 
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from labapp.gui.pages.setup.presenter import (
     KINDS,
     POOL,
     RIG,
-    SAFETY,
     TRAVELS,
     UNCERTAIN_ONLY,
     Entry,
@@ -27,19 +26,20 @@ from labapp.gui.pages.setup.presenter import (
 from labapp.gui.views.bench import BenchView
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField, TextField
-from labapp.gui.widgets.labels import Message, show_words, wrapping_label
+from labapp.gui.widgets.labels import Message, heading, show_words, wrapping_label
 from labapp.gui.widgets.layouts import fill, hbox
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
+from labapp.session.checklist import EQUIPMENT, SAFETY, STEPS, Items, tick
 from labapp.session.session import Session
 
 SETUP_FILES = "Set-up files (*.toml)"
 
-EXPERIMENT_TAB, SAFETY_TAB, BENCH_TAB = range(3)
+EXPERIMENT_TAB, SAFETY_TAB, BENCH_TAB, PREPARATION_TAB = range(4)
 
 
 class SetupPage(Page):
-    """Experiment, safety list and bench; the bench is drawn as it is entered."""
+    """Experiment, lists of Appendix II and bench; the bench is drawn as it is entered."""
 
     key = "setup"
 
@@ -51,12 +51,20 @@ class SetupPage(Page):
         self.sigma_fields: dict[str, NumberField] = {}
         self.record_fields: dict[str, NumberField | TextField] = {}
         self.ticks: dict[str, QCheckBox] = {}
+        self.preparation: dict[str, QCheckBox] = {}
         self._times: dict[str, QLabel] = {}
         self._drawn: object = None
         self.tabs = QTabWidget()
         self.tabs.tabBar().setAccessibleName("Parts of the set-up")
-        contents = (self._experiment(), self._safety(), self._bench())
-        for content, title in zip(contents, ("Experiment", "Safety", "Bench"), strict=True):
+        safety, preparation = self._list(self.ticks, SAFETY), QWidget()
+        lists = (("Equipment", EQUIPMENT), ("Steps", STEPS))
+        layout = QVBoxLayout(preparation)
+        for title, items in lists:
+            layout.addWidget(heading(title))
+            layout.addWidget(self._list(self.preparation, items))
+        contents = (self._experiment(), safety, self._bench(), preparation)
+        titles = ("Experiment", "Safety", "Bench", "Preparation")
+        for content, title in zip(contents, titles, strict=True):
             self.tabs.addTab(_top(content), title)
 
         def show_tab(number: int) -> None:
@@ -69,7 +77,8 @@ class SetupPage(Page):
         self.panel_layout.addWidget(self.tabs)
         self.lock_with_session(
             *(*self.rig_fields.values(), *self.sigma_fields.values(), self.kind, self.travel),
-            *(*self.record_fields.values(), *self.ticks.values(), *self._filling),
+            *(*self.record_fields.values(), *self.ticks.values(), *self.preparation.values()),
+            *self._filling,
         )
         self.panel_layout.setContentsMargins(0, 0, 0, 0)
 
@@ -91,10 +100,14 @@ class SetupPage(Page):
         for name, noted in self.record_fields.items():
             noted.set_value(getattr(shown.record, name))
         ticked = dict(shown.record.safety)
-        for item, box in self.ticks.items():
+        for item, box in (self.ticks | self.preparation).items():
             box.setChecked(item in ticked)
             self._times[item].setText(f"ticked {_clock(ticked[item])}" if item in ticked else "")
-        self.tabs.setTabText(SAFETY_TAB, f"Safety {len(ticked.keys() & self.ticks)}/{len(SAFETY)}")
+        for tab, name, boxes in (
+            (SAFETY_TAB, "Safety", self.ticks),
+            (PREPARATION_TAB, "Preparation", self.preparation),
+        ):
+            self.tabs.setTabText(tab, f"{name} {len(ticked.keys() & boxes)}/{len(boxes)}")
         self.tabs.setTabText(BENCH_TAB, "Bench ⚠" if shown.problems else "Bench")
         show_words(self.others, "\n".join(shown.others))
         basis = (session.setup_text, shown.record)
@@ -163,10 +176,10 @@ class SetupPage(Page):
         self.record_fields[entry.key] = field
         form.add(field)
 
-    def _safety(self) -> QWidget:
+    def _list(self, boxes: dict[str, QCheckBox], items: Items) -> QWidget:
         page = QWidget()
         layout = QVBoxLayout(page)
-        for item, meaning in SAFETY:
+        for item, meaning in items:
             box = QCheckBox(item)
             box.setToolTip(f"{meaning} The time of the tick is kept.")
             box.setAccessibleDescription(meaning)
@@ -177,13 +190,13 @@ class SetupPage(Page):
                 label.setIndent(24)
                 layout.addWidget(label)
             layout.addSpacing(4)
-            self.ticks[item], self._times[item] = box, time
+            boxes[item], self._times[item] = box, time
         return page
 
     def _tick(self, item: str, ticked: bool) -> None:
         now = datetime.now().astimezone().isoformat(timespec="seconds")
-        if not self.workspace.attempt(lambda session: presenter.tick(session, item, ticked, now)):
-            self.ticks[item].setChecked(not ticked)
+        if not self.workspace.attempt(lambda session: tick(session, item, ticked, now)):
+            (self.ticks | self.preparation)[item].setChecked(not ticked)
 
     def _bench(self) -> QWidget:
         form = FieldForm()

@@ -1,0 +1,83 @@
+"""`labapp calibrate fold`: the imaging plane behind a flat folding mirror (§9.2)."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from labapp.cli.shared import finite
+from labapp.errors import InputError
+
+Vector = tuple[float, float, float]
+
+
+def calibrate_fold(
+    *,
+    setup: Annotated[
+        Path, typer.Option(help="Setup file (TOML), with the imaging plane where it stands.")
+    ],
+    point: Annotated[
+        Vector, typer.Option(metavar="X Y Z", help="A point of the mirror's face (mm).")
+    ],
+    normal: Annotated[
+        Vector, typer.Option(metavar="X Y Z", help="Its normal, of any length and either sign.")
+    ],
+    position_sigma: Annotated[
+        float,
+        typer.Option(min=0, max=100, callback=finite, help="± of its place along the normal (mm)."),
+    ] = 0.5,
+    tilt_sigma: Annotated[
+        float, typer.Option(min=0, max=45, callback=finite, help="± of its tilt (degrees).")
+    ] = 0.5,
+    use: Annotated[
+        bool, typer.Option("--use", help="Write the mirror image's pose into the setup file.")
+    ] = False,
+) -> None:
+    """Compute the pose of an imaging plane that a flat mirror between pool and plane folds away.
+
+    Rays meet the plane where they would meet its mirror image, which stands in the set-up for it.
+    The image of the image is the plane itself.
+    """
+    import numpy as np
+
+    from labapp.config.setup import read_setup, update_setup
+    from labapp.core.geometry.folding import FoldingMirror, image_sigma, pose_of
+    from labapp.core.geometry.uncertainty import INDEX
+
+    if not all(map(math.isfinite, point)):
+        raise InputError("--point", "point", point, "three numbers (mm)")
+    if not (all(map(math.isfinite, normal)) and any(normal)):
+        raise InputError("--normal", "normal", normal, "three numbers that are not all 0")
+    rig = read_setup(setup).rig
+    assert rig.uncertainty is not None
+    mirror = FoldingMirror(np.array(point), np.array(normal))
+    pose = pose_of(mirror.image_of(rig.imaging_plane))
+    if abs(pose[3]) > STEEPEST_DEG:
+        expected = f"an image that is not level: pitch below {STEEPEST_DEG:g} degrees"
+        raise InputError("--normal", "image's pitch", f"{pose[3]:.4g} degrees", expected)
+    if pose[0] <= 0:
+        expected = "a mirror whose image of O′ lies on the far side of the torch, at Y below 0"
+        raise InputError("--point", "image", f"O′ at Y = {-pose[0]:g} mm", expected)
+    keys = [f"imaging_plane.{name}" for name in POSE]
+    own = rig.uncertainty.sigma[[INDEX[key] for key in keys]]
+    by_mirror = np.array([position_sigma, tilt_sigma, tilt_sigma])
+    sigma = image_sigma(rig.imaging_plane, mirror, own, by_mirror)
+    for name, value, one in zip(POSE, pose, sigma, strict=True):
+        typer.echo(f"{name:12} {value:10.4f} ± {one:.4f}")
+    if use:
+        values = {name: round(float(value), 9) for name, value in zip(POSE, pose, strict=True)}
+        sigmas = {
+            f"{name}_sigma": round(float(one), 9) for name, one in zip(POSE, sigma, strict=True)
+        }
+        update_setup(setup, {"imaging_plane": values | sigmas})
+        typer.echo(f"They are the imaging plane of {setup.absolute()}")
+
+
+POSE = ("distance_mm", "s_mm", "h_mm", "pitch_deg", "yaw_deg", "roll_deg")
+"""Keys of the plane's pose, in the order of `folding.pose_of`."""
+
+STEEPEST_DEG = 85.0
+"""Yaw and roll of a plane that is nearly level turn it about nearly the same axis."""

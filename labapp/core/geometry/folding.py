@@ -1,0 +1,103 @@
+"""A flat folding mirror between pool and imaging plane (§9.2): the plane's mirror image.
+
+Rays that a flat mirror turns to a plane arrive where they would have met the plane's mirror image
+behind it: a rig has that image as its imaging plane, and no mirror. The picture may be of either
+side of the paper: the image calibration holds which.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from labapp.core.geometry.rig import ImagingPlane
+from labapp.core.values import FloatArray, ReadOnlyArrays
+
+STEP = 1e-4
+"""Step of finite differences, mm and degrees."""
+
+
+@dataclass(frozen=True)
+class FoldingMirror(ReadOnlyArrays):
+    """A flat mirror.
+
+    Parameters
+    ----------
+    point_mm
+        A point of its face, UCS, shape (3,), mm.
+    normal
+        Normal of its face, of any length and either sign, shape (3,).
+    """
+
+    point_mm: FloatArray
+    normal: FloatArray
+
+    def image_of(self, plane: ImagingPlane) -> ImagingPlane:
+        """Mirror image of a plane: where its rays seem to go, seen from the pool."""
+        unit = self.normal / np.linalg.norm(self.normal)
+        turn = np.eye(3) - 2.0 * np.outer(unit, unit)
+        origin = self.point_mm + turn @ (plane.origin_mm - self.point_mm)
+        return replace(
+            plane, origin_mm=origin, x_axis=turn @ plane.x_axis, z_axis=turn @ plane.z_axis
+        )
+
+    def moved(self, offset_mm: float, tilt_deg: tuple[float, float]) -> FoldingMirror:
+        """The mirror shifted along its normal, and tilted about two axes in its face."""
+        unit = self.normal / np.linalg.norm(self.normal)
+        first = np.cross(unit, np.eye(3)[np.argmin(np.abs(unit))])
+        first /= np.linalg.norm(first)
+        tilt = np.tan(np.radians(tilt_deg))
+        normal = unit + tilt[0] * first + tilt[1] * np.cross(unit, first)
+        return FoldingMirror(self.point_mm + offset_mm * unit, normal)
+
+
+def pose_of(plane: ImagingPlane) -> FloatArray:
+    """Distance, s, h (mm), pitch, yaw and roll (degrees) of a plane, shape (6,)."""
+    x, y, z = plane.origin_mm
+    return np.array([-y, -x, z, *plane.angles_deg])
+
+
+def plane_of(pose: FloatArray, like: ImagingPlane) -> ImagingPlane:
+    """Plane of a pose (`pose_of`), of another's size and glass."""
+    distance, s, h = pose[:3]
+    pitch, yaw, roll = pose[3:].tolist()
+    posed = ImagingPlane.of_angles(np.array([-s, -distance, h]), (pitch, yaw, roll))
+    axes = posed.x_axis, posed.z_axis
+    return replace(like, origin_mm=posed.origin_mm, x_axis=axes[0], z_axis=axes[1])
+
+
+def image_sigma(
+    plane: ImagingPlane, mirror: FoldingMirror, sigma: FloatArray, mirror_sigma: FloatArray
+) -> FloatArray:
+    """Standard uncertainty of the pose of a plane's mirror image, shape (6,), by linear response.
+
+    A tilt of the mirror turns the image by twice as much. What the six have in common is left out.
+
+    Parameters
+    ----------
+    plane, mirror
+        Where they are.
+    sigma
+        Standard uncertainty of the plane's own pose (`pose_of`), shape (6,).
+    mirror_sigma
+        Of the mirror's place along its normal, mm, and of its tilt either way, degrees, shape (3,).
+    """
+    pose = pose_of(plane)
+    image = pose_of(mirror.image_of(plane))
+    columns = []
+    for k, one in enumerate(sigma):
+        off = plane_of(pose + STEP * np.eye(6)[k], plane)
+        columns.append(one * _change(pose_of(mirror.image_of(off)), image))
+    for k, one in enumerate(mirror_sigma):
+        offset, *tilt = (STEP * np.eye(3)[k]).tolist()
+        moved = mirror.moved(offset, (tilt[0], tilt[1]))
+        columns.append(one * _change(pose_of(moved.image_of(plane)), image))
+    return np.asarray(np.linalg.norm(columns, axis=0))
+
+
+def _change(after: FloatArray, before: FloatArray) -> FloatArray:
+    """Change of a pose a unit step; angles may pass 180°."""
+    change = after - before
+    change[3:] = (change[3:] + 180.0) % 360.0 - 180.0
+    return change / STEP

@@ -1,0 +1,72 @@
+"""The lists of Appendix II: safety, equipment and the steps of an experiment, to be ticked.
+
+Items go into session files with the time of their tick: they stay as they are.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from labapp.session.session import Session
+
+Items = tuple[tuple[str, str], ...]
+
+SAFETY: Items = (
+    (
+        "Laser points at nobody's eyes",
+        "It is of class IIIb: never into the beam, nor into its reflection on metal.",
+    ),
+    ("Laser goggles are worn", "By everybody in the room, for 685 nm."),
+    ("Welding goggles are worn", "The arc is bright enough to hurt the eyes."),
+    ("Welding clothes are worn", "Metal splatters."),
+    ("Hands stay off the arc", "Arc, torch and work piece are very hot."),
+    ("Water cooling is on", "Before the welding machine is switched on."),
+    ("Shielding gas is on", "Before the welding machine is switched on."),
+)
+"""Title and what it means."""
+
+EQUIPMENT: Items = (
+    ("Welding machine", "GTAW, with water cooling and shielding gas."),
+    ("Welding platform", "It moves the work piece under the torch."),
+    (
+        "Laser with its lens",
+        "685 nm, 20 mW; 19 × 19 dots with 0.77° between rays, or five lines with 0.23°.",
+    ),
+    ("Imaging plane", "As simple as paper on a square glass."),
+    ("Camera with its filter", "A band-pass of 20 nm round the laser's wavelength."),
+    ("Goggles for the laser", "For 685 nm."),
+    ("Welding goggles and clothes", "For everybody near the arc."),
+)
+
+STEPS: Items = (
+    ("1 Plate on the platform", "Mild steel of 2 mm; one piece is enough to watch the pool."),
+    ("2 Torch upright", "Electrode tip 3 to 5 mm above the work piece."),
+    (
+        "3 Laser along the weld",
+        "At about 30°, about 35 mm from the electrode's tip (90 mm for five lines). The pattern "
+        "covers the pool's place; lines lie across the weld. Then step 2 measures where it stands.",
+    ),
+    (
+        "4 Imaging plane behind the torch",
+        "Across the weld, upright, about 50 mm from the electrode's axis. Step 3 calibrates it.",
+    ),
+    (
+        "5 Camera before the plane",
+        "About 2 m away, square to it; focus and aperture so that the plane is clearly seen; 60 "
+        "frames a second or more.",
+    ),
+    (
+        "6 Weld and record",
+        "Cooling and gas on, goggles on; 65 to 75 A; start the platform and the camera. At the end "
+        "switch the machine off.",
+    ),
+)
+
+LISTS = {"Safety": SAFETY, "Equipment": EQUIPMENT, "Steps": STEPS}
+
+
+def tick(session: Session, item: str, ticked: bool, now: str) -> None:
+    """Tick an item of a list at a time (ISO 8601), or take its tick away."""
+    kept = tuple(pair for pair in session.record.safety if pair[0] != item)
+    safety = (*kept, (item, now)) if ticked else kept
+    session.set_record(replace(session.record, safety=safety))

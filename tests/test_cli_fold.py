@@ -1,0 +1,67 @@
+"""`labapp calibrate fold`: the mirror image of an imaging plane in the setup file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from labapp.cli import app
+from labapp.config.setup import read_setup, update_setup
+
+SETUP = Path(__file__).parents[1] / "sample_sessions" / "gtaw" / "setup.toml"
+LEVEL = {"distance_mm": 52.0, "h_mm": 45.0, "pitch_deg": 90.0}
+GIVEN = ["--point", "0", "-30", "20", "--normal", "0", "1", "1"]
+
+
+@pytest.fixture
+def setup(tmp_path: Path) -> Path:
+    path = tmp_path / "setup.toml"
+    path.write_text(SETUP.read_text("utf-8"), "utf-8")
+    update_setup(path, {"imaging_plane": LEVEL})
+    return path
+
+
+def test_a_level_plane_above_a_mirror_stands_upright_in_the_setup(setup: Path) -> None:
+    before = read_setup(setup)
+    command = ["calibrate", "fold", "--setup", str(setup), *GIVEN]
+    assert CliRunner().invoke(app, command).exit_code == 0
+    assert read_setup(setup).text == before.text
+    done = CliRunner().invoke(app, [*command, "--use"])
+    assert done.exit_code == 0, done.output
+    after = read_setup(setup)
+    assert after.rig.imaging_plane.origin_mm[1:] == pytest.approx([-55, 42])
+    np.testing.assert_allclose(after.rig.imaging_plane.normal, [0, -1, 0], atol=1e-9)
+    assert after.rig.uncertainty is not None
+    assert "imaging_plane.pitch_deg" not in after.rig.uncertainty.assumed
+
+
+def test_the_image_of_the_image_is_the_plane(setup: Path) -> None:
+    update_setup(setup, {"imaging_plane": {"pitch_deg": 50.0, "yaw_deg": 20.0}})
+    before = read_setup(setup).rig.imaging_plane
+    given = ["--setup", str(setup), *GIVEN, "--use"]
+    for _ in range(2):
+        done = CliRunner().invoke(app, ["calibrate", "fold", *given])
+        assert done.exit_code == 0, done.output
+    back = read_setup(setup).rig.imaging_plane
+    np.testing.assert_allclose(back.pose_mm, before.pose_mm, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("given", "option"),
+    [
+        (["--point", "0", "-30", "20", "--normal", "0", "0", "0"], "--normal"),
+        (["--point", "nan", "-30", "20", "--normal", "0", "1", "0"], "--point"),
+        (["--point", "0", "60", "0", "--normal", "0", "1", "1"], "--point"),
+        (["--point", "0", "-30", "0", "--normal", "0", "1", "0.02"], "--normal"),
+        ([*GIVEN, "--tilt-sigma", "-1"], "--tilt-sigma"),
+    ],
+)
+def test_an_impossible_mirror_is_refused(setup: Path, given: list[str], option: str) -> None:
+    before = setup.read_text("utf-8")
+    done = CliRunner().invoke(app, ["calibrate", "fold", "--setup", str(setup), *given, "--use"])
+    assert done.exit_code != 0
+    assert option in (done.output + str(done.exception))
+    assert setup.read_text("utf-8") == before
