@@ -16,13 +16,15 @@ from labapp.studies.plotting import STYLE, as_bytes, new_figure
 from labapp.text import SIGMA_OF, pluralize
 
 MOST_SHOWN = 60
-"""Rows of a table of problems or outliers, columns of plots' colours: the rest is in the files."""
+"""Outliers that are listed: the others are in their file."""
 
-MOST_COLOURS = 8
+MOST_ROWS = 6
+"""Conditions that are drawn."""
+
 COLOURS = "#0072b2 #d55e00 #009e73 #cc79a7 #56b4e9 #e69f00 #333333 #999999".split()
 """Colours that people with poor colour vision tell apart (Okabe and Ito)."""
 
-PANEL_INCHES = (2.5, 1.75)
+PANEL_INCHES = (2.0, 1.8)
 
 WORDS = {
     "width_mm": ("width", "mm"),
@@ -41,6 +43,7 @@ p.note { color: #555; margin-top: .2rem; } .bad { color: #a40000; }
 .scroll { overflow-x: auto; } svg { max-width: 100%; height: auto; }
 table { border-collapse: collapse; font-size: 13px; } th, td { padding: .25rem .6rem; }
 th { text-align: left; border-bottom: 1px solid #888; } td { border-bottom: 1px solid #e4e4e4; }
+td:first-child { white-space: nowrap; }
 td.n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowrap; }
 """
 
@@ -117,33 +120,45 @@ def _varying(summary: StudySummary) -> list[str]:
 
 
 def _plots(summary: StudySummary) -> str:
-    """Small multiples: a row a size, a column a condition that varies."""
-    columns = _varying(summary)[:6] or [""]
+    """Small multiples: a row a condition that varies, a column a size."""
+    varying = _varying(summary)[:MOST_ROWS] or [""]
     width, height = PANEL_INCHES
-    by_name = {one.status.recording.name: one for one in summary.recordings}
     with rc_context(STYLE):
-        figure = new_figure(width * max(len(columns), 2) + 0.6, height * len(SIZES) + 0.4)
-        axes = figure.subplots(len(SIZES), len(columns), squeeze=False, sharex="col", sharey="row")
-        for column, condition in enumerate(columns):
-            colours = _colours(summary.groups, [c for c in columns if c not in ("", condition)])
-            places, ticks = _places(summary.groups, condition)
-            for row, size in enumerate(SIZES):
-                axis = axes[row][column]
-                for group, place, colour in zip(summary.groups, places, colours, strict=True):
-                    each = [by_name[name].means[size].mean for name in group.recordings]
-                    mean = group.means[size]
-                    _draw(axis, place, mean, each, colour)
-                axis.grid(True, color="0.9", linewidth=0.5)
-                axis.set_axisbelow(True)
-                if column == 0:
-                    axis.set_ylabel("{} ({})".format(*WORDS[size]))
-                if ticks is not None:
-                    axis.set_xticks(range(len(ticks)), ticks)
-                    axis.margins(x=0.15)
-                if row == len(SIZES) - 1:
-                    axis.set_xlabel(condition.replace("_", " ") or "all recordings")
+        figure = new_figure(width * len(SIZES) + 1.2, height * len(varying) + 0.3)
+        shape = len(varying), len(SIZES)
+        axes = figure.subplots(*shape, squeeze=False, sharex="row", sharey="col")
+        for row, condition in enumerate(varying):
+            others = [name for name in varying if name not in ("", condition)]
+            _draw_row(axes[row], summary, condition, others)
+        for axis, size in zip(axes[0], SIZES, strict=True):
+            axis.set_title("{} ({})".format(*WORDS[size]))
         svg = as_bytes(figure, "svg").decode()
     return f'<div class="scroll">{svg[svg.index("<svg") :]}</div>'
+
+
+def _draw_row(
+    axes: Sequence[Any], summary: StudySummary, condition: str, others: Sequence[str]
+) -> None:
+    """Draw every size against one condition; a colour for each combination of the others."""
+    by_name = {one.status.recording.name: one for one in summary.recordings}
+    places, ticks = _places(summary.groups, condition)
+    kinds = _kinds(summary.groups, others)
+    colours = dict(zip(dict.fromkeys(kinds), COLOURS, strict=False))
+    for axis, size in zip(axes, SIZES, strict=True):
+        for group, place, kind in zip(summary.groups, places, kinds, strict=True):
+            each = [by_name[name].means[size].mean for name in group.recordings]
+            _draw(axis, place, group.means[size], each, colours[kind])
+        axis.grid(True, color="0.9", linewidth=0.5)
+        axis.set_axisbelow(True)
+        if ticks is not None:
+            axis.set_xticks(range(len(ticks)), ticks)
+            axis.margins(x=0.15)
+        axis.set_xlabel(condition or "all recordings")
+        axis.tick_params(labelbottom=True)
+    if len(colours) > 1:
+        for kind, colour in colours.items():
+            axes[-1].plot([], [], "o", color=colour, markersize=3.5, label=kind)
+        axes[-1].legend(loc="center left", bbox_to_anchor=(1.02, 0.5), frameon=False)
 
 
 def _draw(axis: Any, place: float, mean: Mean, each: Sequence[float], colour: str) -> None:
@@ -170,13 +185,13 @@ def _places(groups: Sequence[GroupSummary], condition: str) -> tuple[list[float]
     return [float(ticks.index(shown_condition(value))) for value in values], ticks
 
 
-def _colours(groups: Sequence[GroupSummary], others: Sequence[str]) -> list[str]:
-    """A colour for each combination of the other conditions; one for all if there are many."""
-    of = [tuple(group.conditions.get(name) for name in others) for group in groups]
-    kinds = list(dict.fromkeys(of))
-    if len(kinds) > MOST_COLOURS:
-        return [COLOURS[0]] * len(groups)
-    return [COLOURS[kinds.index(each)] for each in of]
+def _kinds(groups: Sequence[GroupSummary], others: Sequence[str]) -> list[str]:
+    """The other conditions of each group in words; none of them if there are too many."""
+    kinds = [
+        "\n".join(f"{name} {shown_condition(one.conditions.get(name))}" for name in others)
+        for one in groups
+    ]
+    return kinds if len(set(kinds)) <= len(COLOURS) else [""] * len(kinds)
 
 
 # --- tables -------------------------------------------------------------------------------------

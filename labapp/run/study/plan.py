@@ -54,8 +54,8 @@ CONDITION = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,49}")
 FIELD = re.compile(r"\{([^{}]*)\}")
 
 PARTS_OF_NAME = (slice(-1, None), slice(-2, -1), slice(-2, None), slice(-3, None))
-"""Parts of a recording's path that become its name, the first that tell all recordings apart: the
-file's name, its folder's, both …"""
+"""Parts of a recording's path that become its name, the first that tell it from others: the file's
+name, its folder's, both …"""
 
 Condition = float | str
 
@@ -378,12 +378,20 @@ def _files(path: Path, where: str, text: str) -> Iterator[tuple[Path, dict[str, 
 
 def _names(path: Path, found: Sequence[tuple[str, dict[str, Any], Path, Any]]) -> list[str]:
     """A name for each recording, no two alike even where case does not count."""
-    for parts in PARTS_OF_NAME:
-        names = [str(keys.get("name") or _plain(file, parts)) for _, keys, file, _ in found]
+    level = [0] * len(found)
+    while True:
+        names = [
+            str(keys.get("name") or _plain(file, PARTS_OF_NAME[k]))
+            for (_, keys, file, _), k in zip(found, level, strict=True)
+        ]
         counts = Counter(name.casefold() for name in names)
-        if len(counts) == len(names):
+        alike = {k for k, name in enumerate(names) if counts[name.casefold()] > 1}
+        if not alike:
             return names
-    twice = next(k for k, name in enumerate(names) if counts[name.casefold()] > 1)
+        if any(level[k] + 1 == len(PARTS_OF_NAME) for k in alike):
+            break
+        level = [one + (k in alike) for k, one in enumerate(level)]
+    twice = min(alike)
     where = found[twice][0]
     raise InputError(path, f"{where}.name", names[twice], "a name that no other recording has")
 

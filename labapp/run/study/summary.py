@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import scipy.stats
 
 from labapp.core.sequence.mean import (
     level_sigma_of_mean,
@@ -19,7 +21,10 @@ from labapp.run.study.plan import Condition
 from labapp.run.study.status import RecordingStatus
 
 FAR = 5.0
-"""An outlier is so many standard deviations from the median, and of its own uncertainty."""
+"""A frame is an outlier so many standard deviations from the median, and of its own uncertainty."""
+
+SURE = 0.999
+"""A recording is one outside the interval that holds others with this probability."""
 
 MAD = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
@@ -202,20 +207,29 @@ def outlying_frames(status: RecordingStatus, table: Table) -> list[Outlier]:
 def outlying_recordings(
     groups: Sequence[GroupSummary], recordings: Sequence[RecordingSummary]
 ) -> list[Outlier]:
-    """Recordings whose mean is far from that of others under the same conditions."""
+    """Recordings whose mean is far from that of the others under the same conditions.
+
+    Far is outside the interval in which another recording would lie with probability `SURE`, by
+    Student's t: of the few that there are, some are near to each other by chance.
+    """
     by_name = {one.status.recording.name: one for one in recordings}
     found = []
     for group in groups:
         members = [by_name[name] for name in group.recordings]
+        count = len(members) - 1
         if len(members) < FEWEST_RECORDINGS:
             continue
+        limit = scipy.stats.t.ppf((1 + SURE) / 2, count - 1)
         for size in SIZES:
             values = np.array([one.means[size].mean for one in members])
-            noise = np.array([one.means[size].noise for one in members])
-            times = _times(values, np.nan_to_num(noise))
-            for place in np.flatnonzero(times > FAR):
-                status, value = members[place].status, float(values[place])
-                found.append(_outlier(status, None, size, value, values, float(times[place])))
+            for place, one in enumerate(members):
+                others = np.delete(values, place)
+                spread = max(_deviation(others), np.nan_to_num(one.means[size].noise))
+                spread *= math.sqrt(1 + 1 / count)
+                times = abs(values[place] - others.mean()) / spread if spread > 0 else 0.0
+                if times > limit:
+                    value = float(values[place])
+                    found.append(_outlier(one.status, None, size, value, others, float(times)))
     return found
 
 
