@@ -43,8 +43,9 @@ def setup_words(status: str, checked: str = "", doubt: str = "", was_checked: st
         return f"{words[:-1]} on {checked[:10]}."
     if status == "doubtful" and doubt:
         return f"The set-up is doubtful: {doubt}."
-    if words and was_checked and status != "checked":
-        return f"{words} It was changed after the bench check of {was_checked[:10]}."
+    if was_checked and status in ("entered", "calibrated"):
+        day = was_checked[:10]
+        return f"The set-up was changed after the bench check of {day}: it counts as {status} only."
     return words
 
 

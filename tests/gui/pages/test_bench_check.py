@@ -30,6 +30,7 @@ from labapp.core.values import CannotMeasure
 from labapp.gui.digits import with_sigma
 from labapp.gui.pages.bench_check import BenchCheckPage, presenter
 from labapp.gui.pages.bench_check.presenter import Checked, Chosen
+from labapp.gui.pages.setup import presenter as setup_presenter
 from labapp.gui.shell.steps import Mark, states
 from labapp.gui.workspace import Workspace
 from labapp.media import GreyImage
@@ -38,6 +39,7 @@ from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import trace
 from labapp.simulation.mirrors import FlatMirror
 from labapp.simulation.render import Look, render
+from labapp.text import SETUP_MARKS
 from tests.gui.conftest import KEPT
 
 SETUP = Path(__file__).parents[3] / "sample_sessions" / "gtaw" / "setup.toml"
@@ -270,6 +272,11 @@ def test_a_bench_is_checked_used_kept_and_undone(
 
     session.update_setup({"laser": {"aim_x_mm": 0.25}})
     assert states(session)["bench_check"].mark is Mark.ATTENTION
+    stated = setup_presenter.shown(session)
+    assert stated.usual_sigmas == setup_presenter.ASSUMED
+    assert stated.status.startswith(SETUP_MARKS["entered"])
+    assert kept.date[:10] in stated.status
+    assert kept.date[:10] in presenter.kept_words(session)
     session.undo()
     assert states(session)["bench_check"].mark is Mark.DONE
     page.workspace.undo()

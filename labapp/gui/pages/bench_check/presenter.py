@@ -120,8 +120,8 @@ class Checked:
             parts = [f"✓ {_fit_words(self.record)}", *self._freed()]
             if self.height_sigma_mm is not None:
                 before, after = self.height_sigma_mm
-                parts.append(f"Height of the expected pool: ± {before:.2g} mm → ± {after:.2g} mm.")
-            return " ".join((*parts, "Press Use to measure with the adjusted set-up."))
+                parts.append(f"Expected ± of the pool's height: {before:.2g} → {after:.2g} mm.")
+            return " ".join((*parts, "Press Use to adopt the adjusted set-up."))
         reason = f"▲ {_sentence(self.check.reason)}"
         if not self.suspects:
             return reason
@@ -255,8 +255,8 @@ def _fit_words(record: BenchCheckRecord) -> str:
     square = np.concatenate([np.sum(one.residual_mm**2, axis=-1) for one in record.pictures])
     rms_um = 1000 * float(np.sqrt(np.mean(square)))
     return (
-        f"{count} dots fit the known mirrors. Their residual, {rms_um:.0f} µm RMS on the imaging "
-        "plane, is noise-like."
+        f"{count} dots fit the known mirrors; their residual, {rms_um:.0f} µm RMS on the plane, is "
+        "noise-like."
     )
 
 

@@ -67,9 +67,13 @@ class BenchCheckPage(Page):
         vbox((self.quantities, 1), wrapping_label(presenter.KEY), of=self.found)
         self.splitter = QSplitter(Qt.Orientation.Horizontal)
         self.splitter.setChildrenCollapsible(False)
-        for n, (side, share) in enumerate(((left, 3), (self.found, 2))):
-            self.splitter.addWidget(side)
-            self.splitter.setStretchFactor(n, share)
+        self.splitter.addWidget(left)
+        self.splitter.addWidget(self.found)
+        self.splitter.setStretchFactor(0, 1)
+        self.splitter.setSizes([WIDE_PX - TABLE_PX, TABLE_PX])
+        # The splitter has its new size only after the page has it.
+        self._arranged = QTimer(self, singleShot=True, interval=0)
+        self._arranged.timeout.connect(self._arrange)
         self.canvas_layout.addWidget(self.splitter)
         self._make_panel()
 
@@ -80,7 +84,12 @@ class BenchCheckPage(Page):
         way = Qt.Orientation.Horizontal if wide else Qt.Orientation.Vertical
         if self.splitter.orientation() != way:
             self.splitter.setOrientation(way)
-            self.splitter.setSizes([self.width() - TABLE_PX, TABLE_PX] if wide else [1, 1])
+            self._arranged.start()
+
+    def _arrange(self) -> None:
+        wide = self.splitter.orientation() == Qt.Orientation.Horizontal
+        size, table = (self.width(), TABLE_PX) if wide else (self.height(), self.height() * 2 // 5)
+        self.splitter.setSizes([size - table, table])
 
     def refresh(self) -> None:
         """Show the check that the session keeps when it changed."""
@@ -255,9 +264,10 @@ class BenchCheckPage(Page):
         self.check_button = button("Check", "", self.check)
         self.use_button = button("Use", "", self.use)
         self.words = wrapping_label()
-        self.mirrors_words = heading("Known mirrors, measured with the adjusted set-up")
+        self.mirrors_words = heading("Known mirrors, measured")
         tip = (
-            "Each size measured as if it were not known; ± is the noise of the dots alone. "
+            "Each size measured with the adjusted set-up as if it were not known; ± is the noise "
+            "of the dots alone. "
             "Ctrl+C copies the table"
         )
         self.mirrors = FullTable("Known mirrors, measured", tip, presenter.MIRROR_COLUMNS)
