@@ -326,6 +326,8 @@ def test_a_refused_check_offers_what_is_off_and_no_measured_mirror(
     page.checked = replace(page.checked, check=off)
     page.refresh()
     assert page.suspect.value() == "imaging_plane.h_mm"
+    page.workspace.close()
+    assert page.state(states(None)["bench_check"]) == states(None)["bench_check"]
 
 
 def test_the_table_stands_below_the_picture_where_there_is_no_room_beside_it(

@@ -107,8 +107,10 @@ class BenchCheckPage(Page):
 
     def state(self, found: State) -> State:
         """How far the step is: a check may be made that is not in use yet."""
-        made = self.checked
-        if made is None or self._is_kept() or made.setup_text != self.session.setup_text:
+        made, session = self.checked, self.workspace.session
+        if made is None or session is None or self._is_kept():
+            return found
+        if made.setup_text != session.setup_text:
             return found
         if made.usable:
             return State(Mark.READY, "Checked; the adjusted set-up is not in use yet")
