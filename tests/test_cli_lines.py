@@ -105,6 +105,8 @@ def test_frames_become_tables(labapp: Run, setup: Path, tmp_path: Path):
     assert [row["status"] for row in features] == ["ok", "no-lines"]
     assert float(features[0]["pool_height_mm"]) == pytest.approx(0.25, rel=0.1)
     assert features[1]["pool_height_mm"] == ""
+    assert "width_mm" not in features[0]  # of the pool, in other tables
+    assert float(features[0]["plane_width_mm"]) > 10.0
     assert [row["setup_status"] for row in features] == ["entered", "entered"]
     lines = rows(out / "lines.csv")
     assert [row["number"] for row in lines] == ["1", "2", "3", "4", "5"]

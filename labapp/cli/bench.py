@@ -147,6 +147,13 @@ def _print_check(check: BenchCheck) -> None:
             f"{picture.picture.name}: {picture.picture.mirror.name}, {len(picture.ray)} dots of "
             f"{len(picture.picture.dots)} with a ray, residual {1000 * picture.rms_mm:.0f} µm RMS"
         )
+        for size in picture.sizes:
+            typer.echo(
+                f"  {size.name}: known {size.known_mm:.3f} ± {size.known_sigma_mm:.3f} mm; "
+                f"measured without that {size.independent_mm:.3f} ± "
+                f"{size.independent_sigma_mm:.3f} mm; with the new set-up, which has it in it, "
+                f"{size.measured_mm:.3f} mm"
+            )
     typer.echo(f"residuals: {check.verdict}")
     try:
         was, now = height_sigma(check.before), height_sigma(check.rig)

@@ -21,13 +21,15 @@ LINE_COLUMNS = (
 )  # fmt: skip
 POINT_COLUMNS = ("frame", "line", "u_px", "v_px", "sigma_px", "plane_x_mm", "plane_z_mm")
 FEATURE_COLUMNS = (
-    "frame", "time_s", "status", "state", "lines", "left_out", "length_mm", "width_mm",
-    "height_mm", "area_mm2", "spacing_mm", "curvature_per_mm", "asymmetry", "pool_height_mm",
+    "frame", "time_s", "status", "state", "lines", "left_out", "plane_length_mm",
+    "plane_width_mm", "plane_height_mm", "plane_area_mm2", "plane_spacing_mm",
+    "plane_curvature_per_mm", "plane_asymmetry", "pool_height_mm",
     "pool_height_sigma_mm", "pool_width_mm", "pool_curvature_per_mm", "misfit", "margin",
     "setup_status",
 )  # fmt: skip
-"""``pool_height_sigma_mm`` has no part by the set-up, unlike ``height_sigma_mm`` of dots;
-``setup_status`` says how far the set-up can be relied on."""
+"""``plane_…`` is of the lines on the imaging plane. ``pool_height_sigma_mm`` has no part by the
+set-up, unlike ``height_sigma_mm`` of dots; ``setup_status`` says how far the set-up can be relied
+on."""
 TRACK_COLUMNS = (
     "frame", "time_s", "pulse", "pulse_probability", "followed", "shift_px", "tilt_px", "bend_px",
     "agreeing_share",

@@ -81,8 +81,8 @@ TABLES: dict[str, tuple[Column, ...]] = {
         Column("z_mm", "height of the reflection point above the work piece"),
         Column("residual_mm", "distance of computed and captured dot on the imaging plane"),
         Column("sigma_mm", f"standard uncertainty of the height, {HEIGHT_SIGMA_OF}"),
-        Column("residual_x_mm", "computed minus captured dot on the imaging plane, along X′"),
-        Column("residual_z_mm", "computed minus captured dot on the imaging plane, along Z′"),
+        Column("residual_x_mm", "captured minus computed dot on the imaging plane, along X′"),
+        Column("residual_z_mm", "captured minus computed dot on the imaging plane, along Z′"),
         Column("error_x_mm", "reflection error on the work piece, along X"),
         Column("error_y_mm", "reflection error on the work piece, along Y"),
     ),
@@ -232,8 +232,8 @@ def _dots(measurement: Measurement, calibration: ImageCalibration) -> list[npt.N
 
 
 def _points(reconstruction: Reconstruction, measures: Measures | None) -> list[npt.NDArray[Any]]:
-    """Columns of the reflection points, with their residuals on either plane."""
-    residual = reconstruction.residual_mm
+    """Columns of the reflection points, with their residuals, captured minus computed."""
+    residual = -reconstruction.residual_mm
     scale = (math.nan, math.nan) if measures is None else (measures.scale_x, measures.scale_z)
     return [
         *reconstruction.ray.T,

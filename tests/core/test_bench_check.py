@@ -14,17 +14,17 @@ from labapp.config.setup import checked_setup, parse_setup, unchecked_setup
 from labapp.core.bench_check.adjustment import adjust
 from labapp.core.bench_check.check import BenchCheck, check_bench
 from labapp.core.bench_check.forecast import forecast
-from labapp.core.bench_check.known import measure_known
 from labapp.core.bench_check.labelling import Picture, label_picture, sighting_of
 from labapp.core.bench_check.mirrors import Ball, Cap, Mirror, Plate, landing_points, placed
 from labapp.core.geometry.bench import Bench
+from labapp.core.geometry.coordinates import ImageCalibration, Lens
 from labapp.core.geometry.rig import DotPattern, Rig
 from labapp.core.geometry.uncertainty import INDEX, QUANTITIES
 from labapp.core.images.find_dots import DotSettings, find_mirror_dots
 from labapp.core.matching.observation import Observation
 from labapp.core.values import CannotMeasure
 from labapp.errors import InputError
-from labapp.simulation.benches import BenchErrors, SimulatedBench, draw_bench
+from labapp.simulation.benches import FOCAL_PX, BenchErrors, SimulatedBench, draw_bench
 from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import PoolSurface, trace
 from labapp.simulation.mirrors import BallMirror, FlatMirror
@@ -216,6 +216,30 @@ def test_a_check_is_kept_in_the_setup_file_until_something_is_changed():
 
 
 @pytest.mark.slow
+def test_the_set_up_that_is_written_is_the_adjusted_one():
+    """With a lens in it, too, and its picture shifted: nothing else was adjusted to the dots."""
+    middle = SHAPE[1] / 2, SHAPE[0] / 2
+    keys = {"focal_px": [FOCAL_PX] * 2, "center_px": list(middle), "distortion": [-0.5, 0, 0, 0, 0]}
+    written = "".join(f"{key} = {value}\n" for key, value in keys.items())
+    text = TEXT + "[camera_lens]\n" + written
+    lens_px = Lens((FOCAL_PX, FOCAL_PX), middle, (-0.5, 0.0, 0.0, 0.0, 0.0))
+    setup, rng = parse_setup(text, "setup.toml"), np.random.default_rng(3)
+    made = trace(FlatMirror(), EXACT.rig)
+    matrix = np.linalg.inv(np.array([[1, 0, 12], [0, 1, -7], [0, 0, 1]]) @ CALIBRATION.from_plane)
+    ideal = ImageCalibration(matrix, lens_px)
+    place = ideal.to_image(made.plane_mm[made.visible])
+    dots = as_dots(place + rng.normal(0, 0.12, place.shape), 0.12)
+    shot = Picture("plate", Plate(), dots, SHAPE)
+    check = check_bench([shot], setup.rig, setup.calibration, ["picture.u", "picture.v"])
+    assert check.status == "ok"
+    read = parse_setup(checked_setup(text, "setup.toml", check, "2026-11-24T12:00:00+00:00"), "")
+    (one,) = check.pictures
+    computed, _ = landing_points(Plate(), one.pose, read.rig, tuple(one.ray.T - 1))
+    again = read.calibration.to_plane(dots.image_px[one.dot]) - computed
+    np.testing.assert_allclose(again, one.residual_mm, atol=1e-4)
+
+
+@pytest.mark.slow
 def test_a_quantity_far_off_is_named_and_put_right_when_let_go_of():
     laser = replace(RIG.laser, distance_mm=RIG.laser.distance_mm / 0.8)
     check = check_of(SimulatedBench(replace(EXACT.rig, laser=laser), VIEW))
@@ -227,6 +251,35 @@ def test_a_quantity_far_off_is_named_and_put_right_when_let_go_of():
     again = check_of(SimulatedBench(replace(EXACT.rig, laser=laser), VIEW), ("laser.distance_mm",))
     assert again.status == "ok"
     assert again.rig.laser.distance_mm == pytest.approx(laser.distance_mm, abs=0.5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("truth", [0.91, 1.0])
+def test_a_mirror_that_measures_otherwise_than_it_is_known_is_no_check(truth: float):
+    rng = np.random.default_rng(9)
+    pairs = [(Plate(), FlatMirror()), (Cap(9.75, 0.91), spherical_cap(9.75, truth, (0.2, -0.1)))]
+    check = check_bench([picture(*each, EXACT, rng)[0] for each in pairs], RIG, CALIBRATION)
+    radius, height = check.pictures[1].sizes
+    assert check.status == ("ok" if truth == 0.91 else "size-off")
+    assert radius.is_contradicted == (truth != 0.91)
+    assert height.independent_mm == pytest.approx(truth, abs=3 * height.independent_sigma_mm)
+    known = check.rig.uncertainty
+    assert known is not None
+    assert (known.status == "checked") == (truth == 0.91)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("absent", [[9, 10], [10, 11]])
+def test_rays_a_row_off_are_named(absent: list[int]):
+    """The bench adjusts itself to them, by half a degree here and half a millimetre there."""
+    angle = "inter_beam_angle_deg = 0.77\n"
+    setup = parse_setup(TEXT.replace(angle, f"{angle}absent = [{absent}]\n"), "setup.toml")
+    rng = np.random.default_rng(0)
+    pictures = [picture(Plate(height), FlatMirror(height), EXACT, rng)[0] for height in (0.0, 2.0)]
+    check = check_bench(pictures, setup.rig, setup.calibration)
+    assert check.status == "row-slipped"
+    off = [abs(one.after - one.before) / one.before_sigma for one in check.changes]
+    assert max(off) < 2.0
 
 
 class BowedPattern(DotPattern):
@@ -290,8 +343,10 @@ def test_a_mirror_alone_in_the_usual_look_measures_itself(kind: str, seed: int):
     dots = find_mirror_dots(image, DotSettings())
     check = check_bench([Picture(kind, mirror, dots, image.shape)], RIG, CALIBRATION)
     assert check.status == "ok"
-    for size in measure_known(check, check.pictures[0]):
+    for size in check.pictures[0].sizes:
         assert size.measured_mm == pytest.approx(size.known_mm, rel=0.01)
+        assert size.independent_sigma_mm > 3 * size.sigma_mm
+        assert not size.is_contradicted
 
 
 @pytest.mark.slow

@@ -2,18 +2,27 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from labapp.core.geometry.coordinates import ImageCalibration
-from labapp.core.geometry.perturbation import moved_calibration, moved_dots, moved_rig
+from labapp.core.geometry.coordinates import ImageCalibration, Lens
+from labapp.core.geometry.perturbation import moved_bench, moved_dots, moved_rig
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
-from labapp.core.geometry.uncertainty import INDEX, QUANTITIES, AxisPoints, covariance_of
+from labapp.core.geometry.uncertainty import (
+    INDEX,
+    QUANTITIES,
+    AxisPoints,
+    RigUncertainty,
+    covariance_of,
+)
 
 RIG = Rig(Laser(31.14, 31.48), DotPattern(), Electrode(5.0), ImagingPlane.vertical(50, 45, 3))
 AXES = AxisPoints(
     ImageCalibration.from_three_points((44, 590), (440, 590), 69.85, (44, 410), 31.75), 69.85, 31.75
 )
+LENS = Lens((700.0, 700.0), (240.0, 320.0), (-0.2, 0.03, 0.001, -0.001, 0.0))
 DOTS = np.random.default_rng(5).uniform(5.0, 95.0, (30, 2))
 
 
@@ -49,12 +58,20 @@ def test_every_quantity_of_the_bench_moves_what_it_names():
     assert moved_rig(RIG, offset()).imaging_plane is RIG.imaging_plane
 
 
-def test_dots_follow_the_points_of_the_image_calibration():
-    """A dot stays in the picture; a calibration with moved points has it elsewhere."""
-    by = offset(**{"image_calibration_x_axis_px[u]": 3.0, "image_calibration_origin_px[v]": -2.0})
-    moved = moved_dots(DOTS, RIG, AXES, by)
-    again = moved_calibration(AXES, by).to_plane(AXES.calibration.to_image(DOTS))
-    np.testing.assert_allclose(moved, again, atol=1e-9)
+@pytest.mark.parametrize("percent", [0.0, 0.8])
+@pytest.mark.parametrize("lens", [None, LENS])
+def test_dots_follow_the_image_calibration(lens: Lens | None, percent: float):
+    """A dot stays in the picture; the calibration of the moved bench has it elsewhere."""
+    before = replace(AXES.calibration, lens=lens).with_distortion(percent, np.array([50.8, 50.8]))
+    axes = replace(AXES, calibration=before)
+    rig = replace(RIG, uncertainty=RigUncertainty(axes, *covariance_of({})))
+    by = {key: 30.0 for key in INDEX if key.endswith("px[u]")}
+    by |= {"image_calibration.origin_px[v]": -2.0, "camera_lens.distortion_percent": 0.5}
+    vector = np.zeros(len(QUANTITIES))
+    vector[[INDEX[key] for key in by]] = list(by.values())
+    moved = moved_dots(DOTS, rig, axes, vector)
+    again = moved_bench(rig, vector)[1].to_plane(before.to_image(DOTS))
+    np.testing.assert_allclose(moved, again, atol=1e-6)
     assert np.abs(moved - DOTS).max() > 0.3
 
 

@@ -84,3 +84,5 @@ def test_a_rear_that_sinks_towards_the_laser_is_measured():
     assert off["-y"] < 0.35
     assert abs(found["-y"].height_mm - true.height_mm) < 0.02
     assert found["-y"].depth_mm < -0.02 < found["+y"].depth_mm
+    assert np.isnan(found["-y"].depth_sigma_mm)  # the shape of the rear is assumed
+    assert found["-y"].height_sigma_mm > 0.0

@@ -134,7 +134,8 @@ def test_are_is_reckoned_from_the_points(out: Path, writer: Writer, scheme: str)
         ImagingPlane.vertical(50.0, 1e4, -1e4, 2e4, 2e4),
     )
     rng = np.random.default_rng(5)
-    match = exact_match(trace(egg(6.6, 3.0, 4.0, 0.35), rig), rig, sigma_mm=0.05, rng=rng)
+    seen = trace(egg(6.6, 3.0, 4.0, 0.35), rig)
+    match = exact_match(seen, rig, sigma_mm=0.05, rng=rng)
     match = replace(match, dot=np.zeros(len(match.ray), int))
     made = reconstruct(match, rig, Settings(scheme=scheme))
     size = measure_surface(made, match, rig)
@@ -155,6 +156,10 @@ def test_are_is_reckoned_from_the_points(out: Path, writer: Writer, scheme: str)
     assert (column["residual_x_mm"] * column["error_x_mm"] >= 0).all()
     assert {np.sign(value) for value in column["error_y_mm"]} >= {-1.0, 1.0}
     assert bool(told["own_are_mm"]) == (scheme != "fit")
+    if scheme == "fit":  # captured minus computed: what noise has added to a dot
+        noise = match.plane_mm - exact_match(seen, rig).plane_mm
+        assert np.corrcoef(column["residual_x_mm"], noise[:, 0])[0, 1] > 0.5
+        assert np.corrcoef(column["residual_z_mm"], noise[:, 1])[0, 1] > 0.5
 
 
 def test_the_boundary_is_written(written: Path) -> None:

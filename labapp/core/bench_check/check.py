@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
@@ -10,6 +10,7 @@ from typing import Literal
 import numpy as np
 
 from labapp.core.bench_check.adjustment import Adjustment, adjust
+from labapp.core.bench_check.known import MeasuredSize, measure_sizes
 from labapp.core.bench_check.labelling import (
     LEAST_DOTS,
     Labelled,
@@ -19,7 +20,8 @@ from labapp.core.bench_check.labelling import (
     sighting_of,
 )
 from labapp.core.bench_check.mirrors import Plate, placed
-from labapp.core.bench_check.suspects import Suspect, find_suspects, released
+from labapp.core.bench_check.slips import slip_drop
+from labapp.core.bench_check.suspects import ALIKE, Suspect, find_suspects, released
 from labapp.core.bench_check.verdict import Pattern, Verdict, judge
 from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.coordinates import ImageCalibration
@@ -29,7 +31,7 @@ from labapp.core.geometry.uncertainty import QUANTITIES
 from labapp.core.matching.observation import UNLABELLED, Observation
 from labapp.core.values import CannotMeasure, FloatArray, IntArray, ReadOnlyArrays
 
-Status = Literal["ok", "quantity-off"] | Verdict
+Status = Literal["ok", "quantity-off", "size-off"] | Verdict
 
 ROUNDS = 3
 """Of adjusting to all pictures and labelling anew."""
@@ -39,6 +41,9 @@ WIDE = 10.0
 
 FAR_BETTER = 2.0
 """So many times as much the cost falls with a cause that explains the dots far better."""
+
+SLIPPED = 10.0
+"""Rays are those of the next row or column where the cost falls by more with these."""
 
 UNDETERMINED = 0.8
 """A quantity is not determined whose ± after the check is more than this share of that before."""
@@ -62,6 +67,8 @@ class CheckedPicture(ReadOnlyArrays):
         Observed minus computed dot, shape (n, 2), mm.
     pose, pose_sigma
         The mirror's pose (`Mirror.parameters`) and its standard uncertainties, shape (d,).
+    sizes
+        The mirror's sizes, known and measured.
     """
 
     picture: Picture
@@ -71,6 +78,7 @@ class CheckedPicture(ReadOnlyArrays):
     residual_mm: FloatArray
     pose: FloatArray
     pose_sigma: FloatArray
+    sizes: tuple[MeasuredSize, ...]
 
     @property
     def rms_mm(self) -> float:
@@ -85,9 +93,10 @@ class BenchCheck(ReadOnlyArrays):
     Parameters
     ----------
     status
-        ``ok``; ``quantity-off`` where a quantity is off by far more than its ± allows; or the
-        verdict, where that is not ``noise-like``, or explains the dots far better than a quantity.
-        Only with ``ok`` is the new set-up to be used.
+        ``ok``; ``quantity-off`` where a quantity is off by far more than its ± allows; ``size-off``
+        where a mirror's known size is contradicted; or the verdict, where that is not
+        ``noise-like``, or explains the dots far better than these. Only with ``ok`` is the new
+        set-up to be used.
     reason
         The same in a sentence; empty with ``ok``.
     verdict, patterns
@@ -198,8 +207,21 @@ def check_bench(
         labels = again
     assert made is not None
     suspects = find_suspects(rig, sightings, made, free_directions)
+    seen = [(o, p.mirror, own) for o, p, own in zip(observed, pictures, used, strict=True)]
+    slip = slip_drop(rig, seen, made, free_directions)
     verdict, patterns = judge(rig, sightings, made, free_directions)
-    status, reason = _status(suspects, verdict, patterns)
+    sizes = measure_sizes(rig, sightings, free_directions, made)
+    status, reason = _status(
+        suspects,
+        verdict,
+        patterns,
+        slip,
+        {
+            f"{picture.name}, {picture.mirror.name}: {size.name}": size
+            for picture, own in zip(pictures, sizes, strict=True)
+            for size in own
+        },
+    )
     after, calibrated = adjusted_bench(rig, made, status == "ok")
     checked = tuple(
         CheckedPicture(
@@ -210,6 +232,7 @@ def check_bench(
             residual_mm=made.residual_mm[k],
             pose=made.poses[k],
             pose_sigma=np.sqrt(np.diag(made.pose_covariances[k])),
+            sizes=sizes[k],
         )
         for k, (picture, sighting, found) in enumerate(zip(pictures, sightings, used, strict=True))
     )
@@ -293,14 +316,31 @@ REASONS: dict[Verdict, str] = {
 
 
 def _status(
-    suspects: Sequence[Suspect], verdict: Verdict, patterns: Sequence[Pattern]
+    suspects: Sequence[Suspect],
+    verdict: Verdict,
+    patterns: Sequence[Pattern],
+    slip: float,
+    sizes: Mapping[str, MeasuredSize],
 ) -> tuple[Status, str]:
-    """A quantity that is off, unless a cause that the model lacks explains the dots far better."""
+    """What is off: a quantity or a size, unless a cause that the model lacks explains far more."""
     explained = max((one.drop for one in patterns if one.cause == verdict), default=0.0)
-    if suspects and explained < FAR_BETTER * suspects[0].drop:
+    name, size = max(sizes.items(), key=lambda pair: abs(pair[1].deviation))
+    suspected = suspects[0].drop if suspects else 0.0
+    contradiction = size.deviation**2 if size.is_contradicted else 0.0
+    if slip > max(SLIPPED, suspected - ALIKE, contradiction - ALIKE):
+        return "row-slipped", REASONS["row-slipped"]
+    if verdict != "noise-like" and explained >= FAR_BETTER * max(suspected, contradiction):
+        return verdict, REASONS[verdict]
+    if contradiction > suspected:
+        return "size-off", (
+            f"{name}: known to be {size.known_mm:.3f} ± {size.known_sigma_mm:.3f} mm, and measured "
+            f"without that {size.independent_mm:.3f} ± {size.independent_sigma_mm:.3f} mm: is it "
+            "the mirror that was named?"
+        )
+    if suspects:
         names = " or ".join(one.name for one in suspects)
         sure = np.sqrt(suspects[0].drop)
         return "quantity-off", (
             f"{names}: off by far more than the ± in the set-up ({sure:.0f} standard deviations)"
         )
-    return ("ok" if verdict == "noise-like" else verdict), REASONS[verdict]
+    return "ok", ""

@@ -1,90 +1,152 @@
-"""A known mirror measured with the adjusted bench, as if its size were not known."""
+"""The sizes of known mirrors as the bench measures them: the proof of an adjusted set-up.
+
+Bench and mirrors are adjusted together, so a mirror's known size is in the new set-up: that this
+set-up measures it again shows that nothing is in its way, and proves little. So each mirror is also
+measured without its known size, by the set-up before the check, the other mirrors and its own dots
+together: where that differs from the known size by more than both are known to, one of them is
+wrong.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from labapp.core.bench_check.adjustment import Sighting, adjust
-from labapp.core.bench_check.check import BenchCheck, CheckedPicture
+from labapp.core.bench_check.adjustment import MOST_STEPS, Adjustment, Sighting, System, adjust
 from labapp.core.bench_check.mirrors import Ball, Cap, Mirror, Plate, sphere_radius
-from labapp.core.geometry.bench import Bench
-from labapp.core.matching.observation import Observation
+from labapp.core.geometry.perturbation import moved_dots, moved_rig
+from labapp.core.geometry.rig import Rig
 from labapp.core.values import FloatArray
 
 LOOSE = 0.5
 """Standard uncertainty of a size that is to be measured, over the size."""
 
-LOOSE_PLATE_MM, LOOSE_TILT_DEG = 5.0, 1.0
+LOOSE_PLATE_MM = 5.0
+"""The same of a plate's height."""
+
+STEP_MM = 1e-4
+"""Of the differences that propagate uncertainties to sizes."""
+
+CONTRADICTED = 3.0
+"""A known size is wrong, or the set-up is, where they differ by more standard uncertainties."""
 
 
 @dataclass(frozen=True)
 class MeasuredSize:
-    """A size of a mirror, known and measured, mm.
+    """A size of a mirror, known and measured, with standard uncertainties, mm.
 
     Parameters
     ----------
     name
         ``height`` or ``radius``.
-    known_mm, measured_mm
-        As it was given, and as the adjusted bench has it.
-    sigma_mm
-        Standard uncertainty of the latter by the noise of the dots.
+    known_mm, known_sigma_mm
+        As it was given.
+    measured_mm, sigma_mm
+        As the adjusted set-up measures it, and its uncertainty by the noise of the dots. The known
+        size had a part in the adjustment: not an independent measurement.
+    independent_mm, independent_sigma_mm
+        As it is measured without the known size; total uncertainty: noise and set-up.
     """
 
     name: str
     known_mm: float
+    known_sigma_mm: float
     measured_mm: float
     sigma_mm: float
+    independent_mm: float
+    independent_sigma_mm: float
+
+    @property
+    def deviation(self) -> float:
+        """Independently measured minus known size, in standard uncertainties of the difference."""
+        sigma = np.hypot(self.independent_sigma_mm, self.known_sigma_mm)
+        return float((self.independent_mm - self.known_mm) / sigma)
+
+    @property
+    def is_contradicted(self) -> bool:
+        """Whether the dots contradict the known size."""
+        return abs(self.deviation) > CONTRADICTED
 
 
-def measure_known(check: BenchCheck, picture: CheckedPicture) -> tuple[MeasuredSize, ...]:
-    """Sizes of a picture's mirror that the adjusted bench measures: its height, and its radius.
+def measure_sizes(
+    rig: Rig, sightings: Sequence[Sighting], released: FloatArray, made: Adjustment
+) -> tuple[tuple[MeasuredSize, ...], ...]:
+    """Measure the sizes of each mirror: the height, and of a ball or cap the radius before it.
 
     Parameters
     ----------
-    check, picture
-        The check, and one of its pictures.
+    rig, sightings, released
+        What was adjusted, see `adjust`.
+    made
+        The adjustment.
     """
-    knows, taken = check.rig.uncertainty, picture.picture
+    every = []
+    for k, sighting in enumerate(sightings):
+        mirror = sighting.mirror
+        known = mirror.pose, np.diag(mirror.sigma**2)
+        by_new = _by_adjusted_bench(rig, sighting, made)
+        independent = _without_size(rig, sightings, released, made, k)
+        sizes = []
+        for name, size in _sizes(mirror).items():
+            found = (_propagated(size, *pose) for pose in (known, by_new, independent))
+            sizes.append(MeasuredSize(name, *(value for pair in found for value in pair)))
+        every.append(tuple(sizes))
+    return tuple(every)
+
+
+def _by_adjusted_bench(
+    rig: Rig, sighting: Sighting, made: Adjustment
+) -> tuple[FloatArray, FloatArray]:
+    """Pose of a mirror by the adjusted bench, taken as exact, and its covariance."""
+    knows = rig.uncertainty
     assert knows is not None
-    bench = Bench(check.rig, check.calibration)
-    observed = Observation.of(taken.dots, bench, taken.frame_shape)
-    exact = replace(
-        check.rig, uncertainty=replace(knows, covariance=np.zeros_like(knows.covariance))
-    )
-    mirror = _loosened(taken.mirror)
-    sighting = Sighting(
-        mirror,
-        picture.ray - 1,
-        observed.plane_mm[picture.dot],
-        observed.covariance_mm2[picture.dot],
-    )
-    made = adjust(exact, [sighting])
-    pose, covariance = made.poses[0], made.pose_covariances[0]
+    exact = replace(knows, covariance=np.zeros_like(knows.covariance))
+    dots = moved_dots(sighting.plane_mm, rig, knows.axes, made.offset)
+    one = replace(sighting, mirror=_loosened(sighting.mirror), plane_mm=dots)
+    found = adjust(replace(moved_rig(rig, made.offset), uncertainty=exact), [one])
+    return found.poses[0], found.pose_covariances[0]
+
+
+def _without_size(
+    rig: Rig, sightings: Sequence[Sighting], released: FloatArray, made: Adjustment, k: int
+) -> tuple[FloatArray, FloatArray]:
+    """Pose of a mirror by an adjustment in which its size is free, and its covariance."""
+    own = sightings[k].mirror
+    loose = _loosened(own)
+    others = [replace(s, mirror=loose) if n == k else s for n, s in enumerate(sightings)]
+    system = System.of(rig, others, released)
+    unknown = made.unknown.copy()
+    unknown[system.parts[k + 1]] *= own.sigma / loose.sigma
+    found = system.adjustment(system.minimised(unknown, made.scale, MOST_STEPS), made.scale)
+    return found.poses[k], found.pose_covariances[k]
+
+
+def _propagated(
+    size: Callable[[FloatArray], float], pose: FloatArray, covariance: FloatArray
+) -> tuple[float, float]:
+    """A size of a pose, and its standard uncertainty."""
+    value = size(pose)
+    slope = np.array([size(pose + step) - value for step in STEP_MM * np.eye(len(pose))]) / STEP_MM
+    return value, float(np.sqrt(slope @ covariance @ slope))
+
+
+def _sizes(mirror: Mirror) -> dict[str, Callable[[FloatArray], float]]:
+    """Sizes of a mirror by their names, as functions of its pose."""
     at = mirror.parameters.index("height_mm")
-    height = MeasuredSize(
-        "height", float(taken.mirror.pose[at]), float(pose[at]), float(np.sqrt(covariance[at, at]))
-    )
+    height = {"height": lambda pose: float(pose[at])}
     if isinstance(mirror, Plate):
-        return (height,)
-    slope = np.array([_radius(mirror, pose + step) for step in 1e-4 * np.eye(len(pose))])
-    radius = _radius(mirror, pose)
-    slope = (slope - radius) / 1e-4
-    sigma = float(np.sqrt(slope @ covariance @ slope))
-    return MeasuredSize("radius", _radius(mirror, taken.mirror.pose), radius, sigma), height
-
-
-def _radius(mirror: Mirror, pose: FloatArray) -> float:
-    _, _, height, diameter = pose
-    return float(sphere_radius(diameter, height) if isinstance(mirror, Cap) else diameter / 2)
+        return height
+    if isinstance(mirror, Cap):
+        return {"radius": lambda pose: float(sphere_radius(pose[3], pose[2]))} | height
+    return {"radius": lambda pose: float(pose[3]) / 2} | height
 
 
 def _loosened(mirror: Mirror) -> Mirror:
     """The mirror, its sizes hardly known."""
     if isinstance(mirror, Plate):
-        return replace(mirror, height_sigma_mm=LOOSE_PLATE_MM, tilt_sigma_deg=LOOSE_TILT_DEG)
+        return replace(mirror, height_sigma_mm=LOOSE_PLATE_MM)
     if isinstance(mirror, Cap):
         return replace(
             mirror,

@@ -207,12 +207,12 @@ def _by_places(observed: Observation, picture: Picture) -> list[IntArray]:
     for labels in made[: 4 * MOST_STARTS]:
         holes = (labels == UNLABELLED) & (_lit_neighbours(labels) >= SURROUNDED)
         for site in np.argwhere(holes):
-            moved = _moved(labels, np.array([i - 1, j - 1]) - site)
+            moved = moved_labels(labels, np.array([i - 1, j - 1]) - site)
             found.setdefault(moved.tobytes(), moved)
     return list(found.values())
 
 
-def _moved(labels: IntArray, by: IntArray) -> IntArray:
+def moved_labels(labels: IntArray, by: IntArray) -> IntArray:
     """Labels so many rows and columns on; what leaves the pattern gets no ray."""
     made = np.full_like(labels, UNLABELLED)
     at = np.argwhere(labels != UNLABELLED)
@@ -227,9 +227,11 @@ def _explains(observed: Observation, one: Labelled) -> bool:
     return lit >= max(LEAST_DOTS, EXPLAINED * len(observed.plane_mm))
 
 
-def sighting_of(observed: Observation, mirror: Mirror, labels: IntArray) -> Sighting:
-    """Ray–dot pairs of a labelling."""
-    at = np.argwhere((labels != UNLABELLED) & ~observed.absent)
+def sighting_of(
+    observed: Observation, mirror: Mirror, labels: IntArray, *, with_absent: bool = False
+) -> Sighting:
+    """Ray–dot pairs of a labelling; on request with dots of rays that should be absent."""
+    at = np.argwhere((labels != UNLABELLED) & (with_absent | ~observed.absent))
     dot = labels[tuple(at.T)]
     return Sighting(mirror, at, observed.plane_mm[dot], observed.covariance_mm2[dot])
 

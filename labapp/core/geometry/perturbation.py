@@ -21,6 +21,7 @@ _LASER, _PATTERN, _PLANE = (
 )
 _POINTS = [k for key, k in INDEX.items() if key.startswith("image_calibration.")]
 _DISTORTION = INDEX["camera_lens.distortion_percent"]
+_PICTURE = [*_POINTS, _DISTORTION]
 
 
 @dataclass(frozen=True)
@@ -97,34 +98,36 @@ def aimed_as(laser: Laser, rig: Rig) -> Rig:
 def moved_dots(plane_mm: FloatArray, rig: Rig, axes: AxisPoints, offset: FloatArray) -> FloatArray:
     """Dots on the plane, shape (n, 2), mm, with its picture's quantities off by an offset, (q,).
 
-    The dots stay where they are in the picture: their places on the plane follow the axis points
-    and the lens. Its distortion grows with the cube of the distance from the plane's centre.
+    The dots stay where they are in the picture: `moved_calibration` has them elsewhere on the
+    plane. The lens that the camera is calibrated with is in both, and cancels.
     """
-    points = offset[_POINTS].reshape(3, 2)
-    if points.any():
-        # What was taken for the moved points is where the true ones are.
-        calibration = axes.calibration
-        true = calibration.to_image(_axis_points_mm(axes))
-        dots = _with_ones(calibration.to_image(plane_mm))
-        share = np.linalg.solve(_with_ones(true + points).T, dots.T)
-        plane_mm = calibration.to_plane(share.T @ true)
-    if offset[_DISTORTION]:
-        corner = np.array([rig.imaging_plane.width_mm, rig.imaging_plane.height_mm]) / 2
-        out = plane_mm - corner
-        share = np.sum(out**2, axis=-1, keepdims=True) / np.sum(corner**2)
-        plane_mm = plane_mm + offset[_DISTORTION] / 100 * share * out
-    return plane_mm
+    if not offset[_PICTURE].any():
+        return plane_mm
+    plane = rig.imaging_plane
+    before, after = (
+        ImageCalibration(one.matrix).with_distortion(one.distortion_percent, _half_mm(plane))
+        for one in (axes.calibration, moved_calibration(axes, plane, offset))
+    )
+    return after.to_plane(before.to_image(plane_mm))
 
 
-def moved_calibration(axes: AxisPoints, offset: FloatArray) -> ImageCalibration:
-    """Image calibration whose three points are off by an offset, shape (q,), lens as it is."""
+def moved_calibration(
+    axes: AxisPoints, plane: ImagingPlane, offset: FloatArray
+) -> ImageCalibration:
+    """Image calibration with its points and its distortion on the plane off by an offset, (q,).
+
+    What was taken for the moved points is where the true ones are. The camera's lens stays as it
+    is, its centre too.
+    """
     calibration = axes.calibration
     base = ImageCalibration(calibration.matrix, calibration.plain_lens)
+    percent = calibration.distortion_percent + float(offset[_DISTORTION])
     plane_mm = _axis_points_mm(axes)
     true = _with_ones(base.ideal_px(base.to_image(plane_mm)))
     moved = base.ideal_px(base.to_image(plane_mm) + offset[_POINTS].reshape(3, 2))
     back = np.linalg.solve(_with_ones(moved), true).T
-    return ImageCalibration(base.matrix @ back, base.lens)
+    made = ImageCalibration(base.matrix @ back, base.lens)
+    return made.with_distortion(percent, _half_mm(plane))
 
 
 def moved_bench(rig: Rig, offset: FloatArray) -> tuple[Rig, ImageCalibration]:
@@ -133,10 +136,8 @@ def moved_bench(rig: Rig, offset: FloatArray) -> tuple[Rig, ImageCalibration]:
     The rig's uncertainty has the new calibration and the covariance that there was.
     """
     assert rig.uncertainty is not None
-    axes, plane = rig.uncertainty.axes, rig.imaging_plane
-    percent = axes.calibration.distortion_percent + float(offset[_DISTORTION])
-    half = np.array([plane.width_mm, plane.height_mm]) / 2
-    calibration = moved_calibration(axes, offset).with_distortion(percent, half)
+    axes = rig.uncertainty.axes
+    calibration = moved_calibration(axes, rig.imaging_plane, offset)
     uncertainty = replace(rig.uncertainty, axes=replace(axes, calibration=calibration))
     return replace(moved_rig(rig, offset), uncertainty=uncertainty), calibration
 
@@ -162,6 +163,10 @@ def quantity_values(rig: Rig) -> FloatArray:
 
 def _axis_points_mm(axes: AxisPoints) -> FloatArray:
     return np.array([[0.0, 0.0], [axes.x_mm, 0.0], [0.0, axes.z_mm]])
+
+
+def _half_mm(plane: ImagingPlane) -> FloatArray:
+    return np.array([plane.width_mm, plane.height_mm]) / 2
 
 
 def _with_ones(points: FloatArray) -> FloatArray:

@@ -72,7 +72,8 @@ class Measures:
         Where the surface is farthest from the work piece: the highest point of a convex pool,
         the lowest of a concave one.
     width_sigma_mm, length_sigma_mm, height_sigma_mm, depth_sigma_mm
-        Standard uncertainties, by noise, level and set-up; NaN where the scheme gives none.
+        Standard uncertainties, by noise, level and set-up; NaN where the scheme gives none, and of
+        the depth where it is the boundary's.
     area_sigma_mm2, volume_sigma_mm3
         The same of area and volume.
     width_sigma_level_mm … volume_sigma_level_mm3
@@ -130,6 +131,8 @@ class Measures:
 
 SIZES = ("width_mm", "length_mm", "height_mm", "depth_mm", "area_mm2", "volume_mm3")
 """The sizes that have a standard uncertainty, in the order of arrays."""
+
+DEPTH = SIZES.index("depth_mm")
 
 
 def sigma_name(name: str, part: str = "") -> str:

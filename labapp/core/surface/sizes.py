@@ -32,7 +32,9 @@ class Sizes:
     peak_mm
         Where the surface is farthest from the work piece, shape (2,).
     gradient
-        Derivatives by the spline coefficients, shape (6, p).
+        Derivatives by the spline coefficients, shape (6, p). NaN of the depth of a pool that stands
+        above the work piece, where it is its boundary's: that is assumed to be a parabola at the
+        rear, and not measured.
     holds
         Whether the surface is on one side of the boundary's height from the centre to it.
     """
@@ -78,6 +80,8 @@ def sizes_and_gradients(
         if sign * within[2] >= sign * extreme[2]:
             extreme = measures.refined(height, boundary, within, sign)
             change[:] = kernels.gradient_of_sum(grid, len(change), extreme[None, :2], np.ones(1))
+        elif level.sign > 0:
+            change[:] = np.nan
         extremes.append(extreme)
     high, low = extremes
     by_boundary = kernels.size_gradients(

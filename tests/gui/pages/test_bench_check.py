@@ -105,14 +105,19 @@ def test_the_known_mirror_is_measured_with_the_adjusted_bench(checked: Checked) 
     assert (name, known) == ("height", 0.0)
     assert 0 < sigma < 0.05
     assert abs(measured) < 0.05
+    ((alone, alone_sigma),) = checked.record.pictures[0].independent
     assert presenter.mirror_rows(checked.record) == (
-        ("Plate, height", with_sigma(measured, sigma), "0.000", ""),
+        ("Plate, height 0.000", with_sigma(measured, sigma), with_sigma(alone, alone_sigma)),
     )
+    assert alone_sigma > sigma
     ball = replace(
-        checked.record.pictures[0], kind="ball", measured=(("radius", 5.0, 5.003, 0.01),)
+        checked.record.pictures[0],
+        kind="ball",
+        measured=(("radius", 5.0, 5.003, 0.01),),
+        independent=(),
     )
     (row,) = presenter.mirror_rows(replace(checked.record, pictures=(ball,)))
-    assert row == ("Ball, radius", "5.003 ± 0.010", "5.000", "0.06 %")
+    assert row == ("Ball, radius 5.000", "5.003 ± 0.010", "")
 
 
 @pytest.mark.slow

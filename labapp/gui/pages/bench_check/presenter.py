@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,6 @@ from scipy.spatial import cKDTree
 from labapp.config.setup import Setup, parse_setup, unchecked_setup
 from labapp.core.bench_check.check import UNDETERMINED, BenchCheck, CheckedPicture, check_bench
 from labapp.core.bench_check.forecast import CANDIDATES, EXPECTED, forecast, height_sigma
-from labapp.core.bench_check.known import measure_known
 from labapp.core.bench_check.labelling import Picture
 from labapp.core.bench_check.mirrors import Ball, Cap, Mirror, Plate
 from labapp.core.geometry.coordinates import ImageCalibration
@@ -235,7 +235,6 @@ def _kept(
 ) -> MirrorPicture:
     dots = checked.picture.dots
     dot_px = np.column_stack([dots.u_px, dots.v_px])[checked.dot]
-    measured = measure_known(found, checked)
     return MirrorPicture(
         one.name,
         one.kind,
@@ -246,7 +245,10 @@ def _kept(
         dot_px,
         before.to_image(checked.plane_mm - checked.residual_mm),
         checked.residual_mm,
-        tuple((size.name, size.known_mm, size.measured_mm, size.sigma_mm) for size in measured),
+        tuple(
+            (size.name, size.known_mm, size.measured_mm, size.sigma_mm) for size in checked.sizes
+        ),
+        tuple((size.independent_mm, size.independent_sigma_mm) for size in checked.sizes),
     )
 
 
@@ -325,18 +327,22 @@ def quantity_rows(record: BenchCheckRecord) -> tuple[QuantityRow, ...]:
     return tuple(rows)
 
 
-MIRROR_COLUMNS = ("Mirror", "Measured, mm", "True", "Error")
+MIRROR_COLUMNS = ("True size, mm", "Adjusted", "Without it")
 
 
-def mirror_rows(record: BenchCheckRecord) -> tuple[tuple[str, str, str, str], ...]:
-    """Every mirror's size as the adjusted bench measures it, beside its true one."""
+def mirror_rows(record: BenchCheckRecord) -> tuple[tuple[str, str, str], ...]:
+    """Every mirror's true size; as the adjusted set-up measures it; and as measured without it.
+
+    The last is empty for a check that a former version has stored.
+    """
     names = {"plate": "Plate", "cap": "Cap", "ball": "Ball"}
     rows = []
     for picture in record.pictures:
-        for name, known, measured, sigma in picture.measured:
-            off = f"{plain(100 * (measured / known - 1), 2)} %" if abs(known) > 0.05 else ""
-            words = f"{names[picture.kind]}, {name}"
-            rows.append((words, with_sigma(measured, sigma), plain(known, 3), off))
+        for one, independent in zip_longest(picture.measured, picture.independent):
+            name, known, measured, sigma = one
+            words = f"{names[picture.kind]}, {name} {plain(known, 3)}"
+            alone = "" if independent is None else with_sigma(*independent)
+            rows.append((words, with_sigma(measured, sigma), alone))
     return tuple(rows)
 
 

@@ -268,8 +268,8 @@ class BenchCheckPage(Page):
         self.words = wrapping_label()
         self.mirrors_words = heading("Known mirrors, measured")
         tip = (
-            "Each size measured with the adjusted set-up as if it were not known; ± is the noise "
-            "of the dots alone. "
+            "Each size as the adjusted set-up measures it (±: noise of the dots), and as it is "
+            "measured without its true value (±: noise and set-up). "
             "Ctrl+C copies the table"
         )
         self.mirrors = FullTable("Known mirrors, measured", tip, presenter.MIRROR_COLUMNS)
