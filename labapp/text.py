@@ -13,15 +13,18 @@ HEIGHT_SIGMA_OF = "noise and level only"
 """What the ± of single heights covers; so did those of sizes before the set-up was in them."""
 
 SETUP_WORDS = {
-    "entered": "The set-up was entered, not calibrated: usual uncertainties are assumed.",
-    "calibrated": "Laser and imaging plane were calibrated, and no known mirror was measured.",
+    "entered": "The set-up was entered by hand, not calibrated; usual uncertainties are assumed.",
+    "calibrated": "Laser and imaging plane were calibrated, not checked against a known mirror.",
     "checked": "The set-up was checked against a known mirror.",
     "doubtful": "The set-up is doubtful: the recording contradicts it.",
 }
 """What `setup_status` means to the operator."""
 
+SETUP_MARKS = {"entered": "○", "calibrated": "◐", "checked": "✓", "doubtful": "▲"}
+"""Stand before these words in windows."""
 
-def setup_words(status: str, checked: str = "", doubt: str = "") -> str:
+
+def setup_words(status: str, checked: str = "", doubt: str = "", was_checked: str = "") -> str:
     """What a `setup_status` means; empty without one.
 
     Parameters
@@ -32,13 +35,23 @@ def setup_words(status: str, checked: str = "", doubt: str = "") -> str:
         When a checked set-up was, ISO 8601.
     doubt
         Why a doubtful one is (`SetupVerdict.reason`).
+    was_checked
+        When one was that was changed since, ISO 8601.
     """
     words = SETUP_WORDS.get(status, "")
     if status == "checked" and checked:
         return f"{words[:-1]} on {checked[:10]}."
     if status == "doubtful" and doubt:
         return f"The set-up is doubtful: {doubt}."
+    if was_checked and status in ("entered", "calibrated"):
+        day = was_checked[:10]
+        return f"The set-up was changed after the bench check of {day}: it counts as {status} only."
     return words
+
+
+def marked_setup_words(status: str, words: str) -> str:
+    """The words of a `setup_status` after its mark; empty without one."""
+    return f"{SETUP_MARKS[status]} {words}" if words else ""
 
 
 def now() -> str:

@@ -64,6 +64,11 @@ def rounded(value: float | None, sigma: float | None, decimals: int = 3) -> tupl
     return plain(value, place), plain(sigma, place)
 
 
+def with_sigma(value: float | None, sigma: float | None) -> str:
+    """A value and its σ in one text: "5.003 ± 0.010", see `rounded`."""
+    return " ± ".join(filter(None, rounded(value, sigma)))
+
+
 def plain(value: float, decimals: int) -> str:
     """A number with the given decimals (negative: rounded to tens …), without a negative zero."""
     text = f"{round(value, decimals):.{max(decimals, 0)}f}"

@@ -237,10 +237,10 @@ class SessionContents:
         """The same in a sentence, with the cause of a doubt."""
         from labapp.text import setup_words
 
-        status, verdict = self.setup_status, self.setup_verdict
-        return setup_words(
-            status, self.setup.checked if status else "", verdict.reason if verdict else ""
-        )
+        status, verdict, check = self.setup_status, self.setup_verdict, self.bench_check
+        checked = self.setup.checked if status else ""
+        was_checked = check.date if check is not None and not checked else ""
+        return setup_words(status, checked, verdict.reason if verdict else "", was_checked)
 
     def corrected_frames(self) -> IntArray:
         """Numbers of the frames with a correction by hand, ascending, shape (n,)."""

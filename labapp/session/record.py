@@ -88,6 +88,10 @@ class MirrorPicture(ReadOnlyArrays):
     """The mirror, measured with the adjusted bench as if its size were not known: (name, known,
     measured, standard uncertainty by the noise of the dots), mm.
     """
+    independent: tuple[tuple[float, float], ...] = ()
+    """Each of these sizes measured without its known value (`MeasuredSize.independent_mm`), and its
+    standard uncertainty, mm; empty in older files.
+    """
 
 
 @dataclass(frozen=True)

@@ -123,7 +123,7 @@ def label_picture(
     Raises
     ------
     CannotMeasure
-        ``too-few-dots``; ``no-reference`` where no hole amid the dots can be the absent ray's;
+        ``too-few-dots``; ``no-reference`` where no gap among the dots can be the absent ray's;
         ``ambiguous-rows`` where several can; ``no-match`` where the mirror explains the dots
         with none.
     """
@@ -146,14 +146,14 @@ def label_picture(
     if not found:
         raise CannotMeasure(
             "no-reference",
-            f"{picture.name}: no hole amid the dots can be the absent ray's: move the mirror "
-            "or the plane until it is seen",
+            f"{picture.name}: no gap among the dots can be the absent ray's. Is it the mirror that "
+            "was named? Else move the mirror or the plane until it is seen",
         )
     best, *others = _different(found)
     if others and others[0].cost < best.cost + MARGIN:
         raise CannotMeasure(
             "ambiguous-rows",
-            f"{picture.name}: several holes can be the absent ray's, and explain the dots alike",
+            f"{picture.name}: several gaps among the dots can be the absent ray's",
         )
     if not _explains(observed, best):
         lit = int((best.labels != UNLABELLED).sum())

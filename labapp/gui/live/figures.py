@@ -20,7 +20,7 @@ from labapp.run.alarms import Alarm
 from labapp.run.limits import Limits, Size, Standing, sizes_of, standing
 from labapp.run.live_measuring import LiveResult
 from labapp.run.live_trend import Pace
-from labapp.text import setup_words
+from labapp.text import marked_setup_words, setup_words
 
 DECIMALS = 3
 """Of live figures, mm."""
@@ -119,9 +119,14 @@ def pace_text(result: LiveResult | None, pace: Pace, came_hz: float | None, age_
     parts.append(f"{pace.measured_hz:.1f}{came} frames/s measured")
     if age_s <= OLD_S:
         parts[-1] += f"; {age_s:.2f} s old"
-    if about := setup_words(found.setup_status, doubt=result.setup_doubt):
-        parts[-1] += f". {about}"
     return " ".join(parts)
+
+
+def live_setup_words(result: LiveResult | None, checked: str) -> str:
+    """How far the set-up can be relied on; ``checked``: when it was checked, ISO 8601."""
+    if result is None or not (status := result.measurement.setup_status):
+        return ""
+    return marked_setup_words(status, setup_words(status, checked, result.setup_doubt))
 
 
 class LiveFigures(FollowsTheme, QWidget):
@@ -131,8 +136,8 @@ class LiveFigures(FollowsTheme, QWidget):
         super().__init__()
         self._grid = QGridLayout()
         self._grid.setColumnStretch(1, 1)
-        self.words = Message(4)
-        vbox(self._grid, self.words, of=self)
+        self.words, self.setup_words = Message(3), Message(3)
+        vbox(self._grid, self.words, self.setup_words, of=self)
         self._labels: dict[tuple[int, int], QLabel] = {}
         self._looks: dict[QLabel, tuple[Look, bool]] = {}
         self.follow_theme()

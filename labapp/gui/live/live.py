@@ -124,7 +124,8 @@ class Live:
         self.watch: LiveWatch | None = None
         """Measures the frames; None where there is no set-up, and before the camera is open."""
         self._place, self._folder, self._wanted = place, place().parent, wanted
-        self._settings, self._setup, self._limits = settings, setup, limits or Limits()
+        self._settings, self._limits = settings, limits or Limits()
+        self.setup = setup
         self._dots = settings.dots
         self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
         self._to_show: deque[CameraFrame] = deque(maxlen=1)
@@ -160,8 +161,8 @@ class Live:
             if not self._closing.is_set():
                 self.feed = feed
                 self._recorders = [self._recorder(feed)]
-                if self._setup is not None:
-                    given = (self._setup, self._settings, feed.bit_depth, self._limits)
+                if self.setup is not None:
+                    given = (self.setup, self._settings, feed.bit_depth, self._limits)
                     self.watch = LiveWatch(self.name, *given, self._say)
                 self._begin_work()
                 return
@@ -284,7 +285,7 @@ class Live:
         dots = self._dots_in(frame.image, self._light)
         found = Measurement(UNMEASURED, "it is only looked at", "fit", dots=dots)
         depth = None if self.feed is None else self.feed.bit_depth
-        quality = judge_quality(frame.image, found, depth, rays_of(self._setup))
+        quality = judge_quality(frame.image, found, depth, rays_of(self.setup))
         self._frame_byte = frame.image.nbytes
         try:
             self.room_byte = shutil.disk_usage(self._folder).free

@@ -14,7 +14,14 @@ from labapp.core.quality import Quality
 from labapp.core.values import FloatArray
 from labapp.gui.live.camera_fields import CameraFields, calibrated_px
 from labapp.gui.live.canvas import LiveCanvas
-from labapp.gui.live.figures import NO_SETUP, OLD_S, LiveFigures, figures, pace_text
+from labapp.gui.live.figures import (
+    NO_SETUP,
+    OLD_S,
+    LiveFigures,
+    figures,
+    live_setup_words,
+    pace_text,
+)
 from labapp.gui.live.live import SIMULATED, Live, choices, setup_of
 from labapp.gui.live.plan_fields import PlanFields
 from labapp.gui.live.record_bar import RecordBar
@@ -184,6 +191,7 @@ class LiveView(QObject):
         self.measured_s, self._result = 0.0, None
         self.figures.show_figures(figures(None) if live.watch is not None else ())
         self.figures.words.setText(NO_SETUP if live.watch is None else "")
+        self.figures.setup_words.setText("")
         self.canvas.set_live(live.watch is not None)
         self._rings.show()
         self._timer.start(TICK_MS)
@@ -370,6 +378,8 @@ class LiveView(QObject):
             pace, came_hz = live.watch.trend.pace(), live.rate_hz()
             self._show_figures(live.watch)
             self.figures.words.setText(pace_text(self._result, pace, came_hz, self._age_s))
+            checked = "" if live.setup is None else live.setup.checked
+            self.figures.setup_words.setText(live_setup_words(self._result, checked))
             self.canvas.show_status(live.watch)
         picture = self._picture.picture
         if live.feed is not None and picture is not None:

@@ -186,7 +186,7 @@ def _bench_check(facts: Facts) -> State:
         return State(Mark.DONE, f"Checked against a known mirror on {facts.checked[:10]}")
     if kept is not None:
         return State(Mark.ATTENTION, "The set-up was changed after the check: check again")
-    return State(Mark.READY, "Not checked against a known mirror")
+    return State(Mark.READY, "Optional: not checked against a known mirror")
 
 
 def _calibrated(facts: Facts, kept: object, used: bool, needed: bool) -> State:
@@ -295,9 +295,9 @@ STEPS = (
     Step(
         "bench_check",
         "Bench check",
-        "Picture a mirror of known shape under the laser: a flat plate, a thumb tack, a bearing "
-        "ball. Its dots tell where laser and plane really stand, and a wrong set-up shows. A plate "
-        "and a cap tell most; the check may be left out.",
+        "Take a picture of a mirror of known shape under the laser: a flat plate, a thumb tack, a "
+        "bearing ball. Its dots show where laser and plane really stand. A plate and a cap "
+        "together tell most. This step is optional.",
         "BenchCheckPage",
         _bench_check,
         needs_frames=False,

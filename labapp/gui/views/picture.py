@@ -91,6 +91,7 @@ class PictureView(Drawn):
         self._image: GreyImage | None = None
         self._levels = (0.0, 1.0)
         self._fits = True
+        self._region: QRectF | None = None
         self._current: DragPoint | None = None
         self.canvas = pg.GraphicsView()
         self.canvas.setFocusPolicy(Qt.FocusPolicy.NoFocus)
@@ -182,16 +183,14 @@ class PictureView(Drawn):
 
     def fit(self) -> None:
         """Fit the picture into the view, also when the view is resized."""
-        self._fits = True
-        if self._image is not None:
-            rows, columns = self._image.shape
-            self.box.setRange(QRectF(-0.5, -0.5, columns, rows), padding=0.01)
+        self._fits, self._region = True, None
+        self._refit()
 
     def show_region(self, low: tuple[float, float], high: tuple[float, float]) -> None:
-        """Show what lies between two places (u, v), px, with a margin."""
-        self._stop_fitting()
+        """Fit what lies between two places (u, v), px, into the view, with a margin."""
         (u, v), (right, down) = low, high
-        self.box.setRange(QRectF(u, v, right - u, down - v), padding=0.12)
+        self._fits, self._region = True, QRectF(u, v, right - u, down - v)
+        self._refit()
 
     def zoom(self, factor: float) -> None:
         """Zoom about the middle; more than 1 makes it larger."""
@@ -209,8 +208,13 @@ class PictureView(Drawn):
         self._fits = False
 
     def _refit(self) -> None:
-        if self._fits:
-            self.fit()
+        if not self._fits or self._image is None:
+            return
+        rows, columns = self._image.shape
+        if self._region is None:
+            self.box.setRange(QRectF(-0.5, -0.5, columns, rows), padding=0.01)
+        else:
+            self.box.setRange(self._region, padding=0.12)
 
     @property
     def px_per_point(self) -> float:

@@ -4,28 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from PySide6.QtCore import Qt, QTimer
 from PySide6.QtGui import QGuiApplication
-from PySide6.QtWidgets import QHeaderView
 
 from labapp.gui.digits import ResultRow, as_csv, as_text
-from labapp.gui.widgets.tables import ReadTable
+from labapp.gui.widgets.tables import FullTable
 
 
-class ResultTable(ReadTable):
+class ResultTable(FullTable):
     """Results: name, value, ±, unit. Copied as text (Ctrl+C) or CSV (its menu)."""
 
     def __init__(self, name: str) -> None:
         tip = f"{name}: Ctrl+C copies it; right click to copy it as CSV"
         super().__init__(name, tip, ["", "Value", "±", "Unit"])
         self.rows: tuple[ResultRow, ...] = ()
-        self.setVerticalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
-        self.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
-        self.horizontalHeader().setSectionResizeMode(0, QHeaderView.ResizeMode.Stretch)
-        # The header reports a width before the cells have it.
-        self._narrowed = QTimer(self, singleShot=True, interval=0)
-        self._narrowed.timeout.connect(self._fit_height)
-        self.horizontalHeader().sectionResized.connect(lambda *_: self._narrowed.start())
         self.offer(("Copy table", self.copy_text), ("Copy table as CSV", self.copy_csv))
         self.set_rows(())
 
@@ -37,12 +28,7 @@ class ResultTable(ReadTable):
             for column, text in enumerate(row.texts):
                 tip = row.note or " ".join(row.texts)
                 self.set_cell(k, column, text, number=column in (1, 2), tip=tip)
-        self._fit_height()
-
-    def _fit_height(self) -> None:
-        """Give long names the lines that they take, and the table the height of all rows."""
-        self.resizeRowsToContents()
-        self.setFixedHeight(self.full_height)
+        self.fit_height()
 
     def copy_text(self) -> None:
         """Put the selected rows, or all, on the clipboard, in tabs."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-from PySide6.QtCore import Qt
+from PySide6.QtCore import Qt, QTimer
 from PySide6.QtGui import QAction, QGuiApplication, QKeySequence
 from PySide6.QtWidgets import (
     QAbstractItemView,
@@ -77,6 +77,33 @@ class ReadTable(QTableWidget):
         first = self.actions()[0]
         first.setShortcut(QKeySequence.StandardKey.Copy)
         first.setShortcutContext(Qt.ShortcutContext.WidgetShortcut)
+
+
+class FullTable(ReadTable):
+    """A table as high as all its rows; long names in its first column take more lines."""
+
+    def __init__(self, name: str, tip: str, columns: Sequence[str]) -> None:
+        super().__init__(name, tip, columns)
+        self.setVerticalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
+        self.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
+        self.horizontalHeader().setSectionResizeMode(0, QHeaderView.ResizeMode.Stretch)
+        # The header reports a width before the cells have it.
+        self._narrowed = QTimer(self, singleShot=True, interval=0)
+        self._narrowed.timeout.connect(self.fit_height)
+        self.horizontalHeader().sectionResized.connect(lambda *_: self._narrowed.start())
+
+    def fit_height(self) -> None:
+        """Give long names the lines that they take, and the table the height of all rows."""
+        self.resizeRowsToContents()
+        self.setFixedHeight(self.full_height)
+
+    def show_texts(self, rows: Sequence[Sequence[str]]) -> None:
+        """Show rows of texts: a name, then numbers."""
+        self.setRowCount(len(rows))
+        for row, texts in enumerate(rows):
+            for column, text in enumerate(texts):
+                self.set_cell(row, column, text, number=column > 0)
+        self.fit_height()
 
 
 class CellTable(ReadTable):

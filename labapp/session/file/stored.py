@@ -154,7 +154,10 @@ STORED = {
     "MirrorPicture": Stored(
         MirrorPicture,
         shapes=dict.fromkeys(("ray", "dot_px", "computed_px", "residual_mm"), "n 2"),
-        fits=lambda value: value.kind in ("plate", "cap", "ball"),
+        fits=lambda value: (
+            value.kind in ("plate", "cap", "ball")
+            and len(value.independent) in (0, len(value.measured))
+        ),
     ),
     "BenchCheckRecord": Stored(
         BenchCheckRecord,

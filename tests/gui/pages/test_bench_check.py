@@ -10,6 +10,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QPushButton
 from pytestqt.qtbot import QtBot
 
@@ -20,12 +21,16 @@ from labapp.config.setup import (
     unchecked_setup,
     updated_setup,
 )
+from labapp.core.bench_check.forecast import CANDIDATES
 from labapp.core.bench_check.mirrors import Ball, Cap, Plate
+from labapp.core.bench_check.suspects import Suspect
 from labapp.core.geometry.uncertainty import INDEX
 from labapp.core.images.find_dots import DotSettings
 from labapp.core.values import CannotMeasure
+from labapp.gui.digits import with_sigma
 from labapp.gui.pages.bench_check import BenchCheckPage, presenter
 from labapp.gui.pages.bench_check.presenter import Checked, Chosen
+from labapp.gui.pages.setup import presenter as setup_presenter
 from labapp.gui.shell.steps import Mark, states
 from labapp.gui.workspace import Workspace
 from labapp.media import GreyImage
@@ -34,6 +39,7 @@ from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import trace
 from labapp.simulation.mirrors import FlatMirror
 from labapp.simulation.render import Look, render
+from labapp.text import SETUP_MARKS
 from tests.gui.conftest import KEPT
 
 SETUP = Path(__file__).parents[3] / "sample_sessions" / "gtaw" / "setup.toml"
@@ -81,11 +87,13 @@ def test_the_check_finds_what_is_off_and_what_it_cannot_tell(checked: Checked) -
     record = checked.record
     k = INDEX["pattern.rotation_deg"]
     assert abs(record.after[k] - TRUE_ROTATION_DEG) < 3 * record.after_sigma[k]
-    rows = {row.texts[0]: row for row in presenter.quantity_rows(record)}
+    rows = {(row.group, row.texts[0]): row for row in presenter.quantity_rows(record)}
     assert len(rows) == len(INDEX)
-    rotation = rows["Pattern, rotation"]
+    assert ("Imaging plane", "s") in rows
+    rotation = rows["Pattern", "Rotation"]
     assert rotation.determined
     assert rotation.texts[-1] == presenter.DETERMINED
+    assert " ± " in rotation.texts[2]
     undetermined = {name for name, row in rows.items() if not row.determined}
     sigma = dict(zip(record.quantities, record.after_sigma / record.before_sigma, strict=True))
     assert len(undetermined) == sum(share > 0.8 for share in sigma.values()) > 0
@@ -97,8 +105,19 @@ def test_the_known_mirror_is_measured_with_the_adjusted_bench(checked: Checked) 
     assert (name, known) == ("height", 0.0)
     assert 0 < sigma < 0.05
     assert abs(measured) < 0.05
-    (row,) = presenter.mirror_rows(checked.record)
-    assert row.value == measured
+    ((alone, alone_sigma),) = checked.record.pictures[0].independent
+    assert presenter.mirror_rows(checked.record) == (
+        ("Plate, height 0.000", with_sigma(measured, sigma), with_sigma(alone, alone_sigma)),
+    )
+    assert alone_sigma > sigma
+    ball = replace(
+        checked.record.pictures[0],
+        kind="ball",
+        measured=(("radius", 5.0, 5.003, 0.01),),
+        independent=(),
+    )
+    (row,) = presenter.mirror_rows(replace(checked.record, pictures=(ball,)))
+    assert row == ("Ball, radius 5.000", "5.003 ± 0.010", "")
 
 
 @pytest.mark.slow
@@ -120,7 +139,7 @@ def test_dots_are_drawn_where_they_are_and_arrows_as_enlarged(checked: Checked) 
 def test_dark_pictures_are_refused_with_the_cause() -> None:
     dark = Chosen("dark.png", np.zeros((640, 480), np.uint8))
     text = SETUP.read_text("utf-8")
-    with pytest.raises(CannotMeasure):
+    with pytest.raises(CannotMeasure, match=r"dark\.png"):
         presenter.check([dark], (text, SETUP), DotSettings(), lambda *_: None)
 
 
@@ -128,10 +147,33 @@ def test_dark_pictures_are_refused_with_the_cause() -> None:
 def test_pictures_are_predicted_to_help(tmp_path: Path) -> None:
     with Session.create(tmp_path / "new.labsession") as session:
         record = session.record
-    rows = presenter.predicted(read_setup(SETUP), record)
-    values = [float(row.value) for row in rows if not isinstance(row.value, str | None)]
-    assert len(values) == len(rows) > 3
+    made = presenter.predicted(read_setup(SETUP), record)
+    values = [float(sigma) for _, sigma in made.rows]
+    assert len(values) == len(CANDIDATES) + 1
     assert all(value < values[0] for value in values[1:])
+
+
+@pytest.mark.slow
+def test_a_set_of_pictures_without_dots_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The imaging plane ends far below the dots of a plate at 90 mm."""
+    sets = {"high": (Plate(90.0),), "level": (Plate(0.0),)}
+    monkeypatch.setattr(presenter, "CANDIDATES", sets)
+    with Session.create(tmp_path / "new.labsession") as session:
+        made = presenter.predicted(read_setup(SETUP), session.record)
+    sigmas = dict(made.rows)
+    assert len(sigmas) == 3
+    assert sigmas["High"] == presenter.NO_DOTS
+    assert float(sigmas["Level"]) > 0
+
+
+def test_a_picture_of_another_size_is_refused(tmp_path: Path) -> None:
+    one, other = (Chosen(str(n), np.zeros((n, 48), np.uint8)) for n in (64, 32))
+    with Session.create(tmp_path / "new.labsession") as session:
+        presenter.check_sizes(session, [one, one])
+        with pytest.raises(CannotMeasure, match="48 × 32"):
+            presenter.check_sizes(session, [one, other])
 
 
 # --- the page -----------------------------------------------------------------------------------
@@ -213,8 +255,15 @@ def test_a_bench_is_checked_used_kept_and_undone(
     add(qtbot, page, tmp_path, plate)
     page.check_button.click()
     qtbot.waitUntil(lambda: page.checked is not None)
-    assert page.quantities.rowCount() == len(INDEX)
+    assert {row.texts[0] for row in presenter.quantity_rows(page.checked.record)} <= {
+        page.quantities.item(row, 0).text() for row in range(page.quantities.rowCount())
+    }
+    assert page.mirrors.rowCount() == 1
+    not_used = page.state(states(session)["bench_check"])
+    assert not_used.mark is Mark.READY
+    assert not_used != states(session)["bench_check"]
     page.use_button.click()
+    assert page.state(states(session)["bench_check"]).mark is Mark.DONE
     setup = session.setup
     assert setup.rig.uncertainty is not None
     assert setup.rig.uncertainty.status == "checked"
@@ -228,6 +277,11 @@ def test_a_bench_is_checked_used_kept_and_undone(
 
     session.update_setup({"laser": {"aim_x_mm": 0.25}})
     assert states(session)["bench_check"].mark is Mark.ATTENTION
+    stated = setup_presenter.shown(session)
+    assert stated.usual_sigmas == setup_presenter.ASSUMED
+    assert stated.status.startswith(SETUP_MARKS["entered"])
+    assert kept.date[:10] in stated.status
+    assert kept.date[:10] in presenter.kept_words(session)
     session.undo()
     assert states(session)["bench_check"].mark is Mark.DONE
     page.workspace.undo()
@@ -250,8 +304,51 @@ def test_a_kept_check_is_shown_when_its_session_is_opened(
     page.refresh()
     qtbot.waitUntil(lambda: len(page.chosen) == 1)
     assert page.view.picture is not None
-    assert page.quantities.rowCount() == len(INDEX)
+    assert page.quantities.rowCount() > len(INDEX)
+    assert page.mirrors.rowCount() == 1
     assert "In use" in page.words.text()
+
+
+@pytest.mark.slow
+def test_a_refused_check_offers_what_is_off_and_no_measured_mirror(
+    page: BenchCheckPage, checked: Checked
+) -> None:
+    """What a bench measures that is not to be used would look right."""
+    page.chosen = list(checked.chosen)
+    suspects = (
+        Suspect("laser.distance_mm", "laser, distance", 30.0),
+        Suspect("imaging_plane.h_mm", "imaging plane, h", 30.0),
+    )
+    off = replace(checked.check, status="quantity-off", reason="off", suspects=suspects)
+    page.checked = replace(checked, check=off, setup_text=page.session.setup_text)
+    page.refresh()
+    assert page.suspect.value() == "laser.distance_mm"
+    assert page.mirrors.rowCount() == 0
+    assert page.quantities.rowCount() > len(INDEX)
+    assert not page.use_button.isEnabled()
+    assert page.state(states(page.session)["bench_check"]).mark is Mark.ATTENTION
+    off = replace(off, suspects=suspects[1:])
+    page.checked = replace(page.checked, check=off)
+    page.refresh()
+    assert page.suspect.value() == "imaging_plane.h_mm"
+    page.workspace.close()
+    assert page.state(states(None)["bench_check"]) == states(None)["bench_check"]
+
+
+def test_the_table_stands_below_the_picture_where_there_is_no_room_beside_it(
+    page: BenchCheckPage,
+) -> None:
+    page.resize(900, 600)
+    assert page.splitter.orientation() == Qt.Orientation.Horizontal
+    page.resize(500, 600)
+    assert page.splitter.orientation() == Qt.Orientation.Vertical
+
+
+@pytest.mark.slow
+def test_a_quantity_found_from_the_pictures_alone_is_said_to_be(checked: Checked) -> None:
+    free = replace(checked, check=replace(checked.check, free=("laser.distance_mm",)))
+    assert "distance" not in checked.words
+    assert "distance" in free.words
 
 
 def test_every_button_says_what_it_does(page: BenchCheckPage) -> None:

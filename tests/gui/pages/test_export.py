@@ -27,6 +27,7 @@ from labapp.gui.pages.export.presenter import (
 )
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
+from labapp.text import SETUP_MARKS
 from tests.gui.conftest import KEPT
 
 
@@ -60,6 +61,7 @@ def test_what_would_be_written_of_which_frames(gtaw: Path) -> None:
             "surface_NNNNNN.csv, 30 of them",
         )
         assert every.files[-1].startswith("manifest.json")
+        assert every.notes == (f"{SETUP_MARKS['entered']} {session.setup_words}",)
         assert plan(session, ExportRequest(which="view"), 3).frames.tolist() == [3]
         part = plan(session, ExportRequest(which="part", first=4, last=11, every=3), 0)
         assert part.frames.tolist() == [4, 7, 10]
@@ -72,7 +74,7 @@ def test_frames_without_a_surface_are_told_and_the_recording_missed(copy_sample)
     path = copy_sample("blocked_rows")
     with Session.open(path) as session:
         made = plan(session, ExportRequest(), 0)
-        assert made.notes == ("3 frames without a surface: in the tables with the reason.",)
+        assert made.notes[1:] == ("3 frames without a surface: in the tables with the reason.",)
         assert "surface_NNNNNN.stl, 3 of them" in made.files
     (path.parent / "recording.mkv").unlink()
     with Session.open(path) as session:

@@ -30,6 +30,7 @@ from labapp.gui.live.figures import (
     OLD_S,
     alarms_text,
     figures,
+    live_setup_words,
     pace_text,
 )
 from labapp.gui.live.surface import steady_limits
@@ -44,6 +45,7 @@ from labapp.run.limits import Limits
 from labapp.run.live_measuring import LiveResult
 from labapp.run.live_trend import Pace, Trend
 from labapp.session.session import Session
+from labapp.text import SETUP_MARKS
 from tests.gui.conftest import SAMPLES
 from tests.gui.hand import Hand
 from tests.gui.test_accessibility import check_round
@@ -101,6 +103,15 @@ def test_it_is_said_why_a_frame_has_no_figures_and_how_measuring_keeps_up():
     )
     dark = pace_text(live_result(DARK), Pace(0.0, 3, 3), 60.0, 5.2)
     assert dark.startswith("▲ Not measured (no-dots): it is dark. ▲ The figures are 5 s old.")
+
+
+def test_live_figures_are_marked_with_the_status_of_the_set_up():
+    assert live_setup_words(None, "") == live_setup_words(live_result(), "") == ""
+    checked = live_result(replace(OK, setup_status="checked"))
+    assert live_setup_words(checked, "2026-01-31T12:00:00+00:00").startswith(SETUP_MARKS["checked"])
+    assert "2026-01-31" in live_setup_words(checked, "2026-01-31T12:00:00+00:00")
+    doubtful = replace(live_result(replace(OK, setup_status="doubtful")), setup_doubt="it moved")
+    assert "it moved" in live_setup_words(doubtful, "")
 
 
 def test_alarms_in_words():

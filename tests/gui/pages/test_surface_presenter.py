@@ -13,6 +13,7 @@ from labapp.gui.pages.surface.presenter import Options
 from labapp.gui.shell.steps import why_not_measurable
 from labapp.session.measured import scheme_name
 from labapp.session.session import Session
+from labapp.text import SETUP_MARKS
 from tests.gui.conftest import CopySample
 
 
@@ -37,6 +38,13 @@ def test_a_measured_frame_is_told_with_its_figures(session: Session) -> None:
     assert [row.value for row in told.errors] == [
         *(measures.are_mm, measures.mre_mm, measures.are_inner_mm, measures.mre_inner_mm)
     ]
+
+
+def test_it_is_marked_how_far_the_set_up_of_a_surface_can_be_relied_on(session: Session) -> None:
+    assert list(session.measure([3]))
+    assert presenter.shown(session, 3).setup_words.startswith(SETUP_MARKS["entered"])
+    session.update_setup({"laser": {"distance_mm": 31.0}})
+    assert presenter.shown(session, 3).setup_words == ""
 
 
 def test_it_says_where_the_figures_come_from(session: Session) -> None:

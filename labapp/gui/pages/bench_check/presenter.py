@@ -4,20 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from labapp.config.setup import Setup, parse_setup, unchecked_setup
 from labapp.core.bench_check.check import UNDETERMINED, BenchCheck, CheckedPicture, check_bench
-from labapp.core.bench_check.forecast import EXPECTED, forecast
+from labapp.core.bench_check.forecast import CANDIDATES, EXPECTED, forecast, height_sigma
 from labapp.core.bench_check.labelling import Picture
 from labapp.core.bench_check.mirrors import Ball, Cap, Mirror, Plate
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.uncertainty import INDEX, QUANTITIES
 from labapp.core.images.find_dots import DotSettings, find_mirror_dots
-from labapp.core.values import FloatArray
-from labapp.gui.digits import ResultRow, round_factor, rounded
+from labapp.core.values import CannotMeasure, FloatArray
+from labapp.gui.digits import plain, round_factor, with_sigma
 from labapp.media import GreyImage
 from labapp.media.formats.images import IMAGE_SUFFIXES
 from labapp.session.record import BenchCheckRecord, MirrorPicture, Record
@@ -108,13 +110,37 @@ class Checked:
     check: BenchCheck
     record: BenchCheckRecord
     """The check as a session stores it; its pictures are not stored yet."""
+    height_sigma_mm: tuple[float, float] | None = None
+    """± of the height of the expected pool before and after; None where it cannot be measured."""
 
     @property
     def words(self) -> str:
-        """The verdict in a sentence."""
+        """The verdict, and what to do next."""
+        if self.usable:
+            parts = [f"✓ {_fit_words(self.record)}", *self._freed()]
+            if self.height_sigma_mm is not None:
+                before, after = self.height_sigma_mm
+                parts.append(f"Expected ± of the pool's height: {before:.2g} → {after:.2g} mm.")
+            return " ".join((*parts, "Press Use to adopt the adjusted set-up."))
+        reason = f"▲ {_sentence(self.check.reason)}"
+        if not self.suspects:
+            return reason
         return (
-            f"✓ {_fit_words(self.record)}" if self.usable else f"▲ {_sentence(self.check.reason)}"
+            f"{reason} Are the mirror's kind, size and height right? Then measure the quantity "
+            "again and correct it, or have it found from the pictures."
         )
+
+    def _freed(self) -> list[str]:
+        """What quantities found from the pictures alone have become."""
+        found = []
+        for one in self.check.changes:
+            if one.key in self.check.free:
+                before, after = plain(one.before, 2), with_sigma(one.after, one.after_sigma)
+                found.append(
+                    f"{_sentence(one.name, '')}, found from the pictures: {before} → {after} "
+                    f"{one.unit}. Measure it again to be sure."
+                )
+        return found
 
     @property
     def usable(self) -> bool:
@@ -133,6 +159,7 @@ def check(
     settings: DotSettings,
     progress: Progress,
     free: Sequence[str] = (),
+    pool: Cap = EXPECTED,
 ) -> Checked:
     """Adjust the set-up to pictures of known mirrors; `CannotMeasure` says why not.
 
@@ -145,13 +172,18 @@ def check(
         Called with parts done, parts in all, and what is being done; may raise.
     free
         Quantities that are to be found from the pictures alone, see `check_bench`.
+    pool
+        The pool that is expected.
     """
     text, path = setup_file
     setup = parse_setup(unchecked_setup(text, path), path)
     pictures, parts = [], 2 * len(chosen) + 1
     for n, one in enumerate(chosen):
         progress(n, parts, f"dots of {one.name}")
-        dots = find_mirror_dots(one.image, settings)
+        try:
+            dots = find_mirror_dots(one.image, settings)
+        except CannotMeasure as answer:
+            raise CannotMeasure(answer.status, f"{one.name}: {answer.reason}") from answer
         rows, columns = one.image.shape
         pictures.append(Picture(one.name, one.mirror, dots, (rows, columns)))
     progress(len(chosen), parts, "adjusting the set-up")
@@ -165,7 +197,37 @@ def check(
     values = {name: np.array([getattr(one, name) for one in changes]) for name in columns}
     keys = tuple(one.key for one in changes)
     record = BenchCheckRecord(now(), tuple(kept), keys, **values)
-    return Checked(tuple(chosen), text, found, record)
+    return Checked(tuple(chosen), text, found, record, _height_sigmas(found, pool))
+
+
+def check_sizes(session: Session, chosen: Sequence[Chosen]) -> None:
+    """Raise `CannotMeasure` if a picture is not of the size of the camera's others.
+
+    These are the recording, the picture of the imaging plane, or the first in the list.
+    """
+    recording, plane = session.recording, session.plane_calibration
+    if recording is not None:
+        shape, of = (recording.rows, recording.columns), "the recording"
+    elif plane is not None:
+        shape, of = session.picture(plane.picture_sha256).shape, "the imaging plane's picture"
+    else:
+        shape, of = chosen[0].image.shape, chosen[0].name
+    for one in chosen:
+        if one.image.shape != shape:
+            (rows, columns), (usual_rows, usual_columns) = one.image.shape, shape
+            raise CannotMeasure(
+                "wrong-size",
+                f"{one.name} is {columns} × {rows} px, {of} {usual_columns} × {usual_rows} px: "
+                "take it with the same camera and settings",
+            )
+
+
+def _height_sigmas(found: BenchCheck, pool: Cap) -> tuple[float, float] | None:
+    try:
+        before, after = (height_sigma(rig, pool) for rig in (found.before, found.rig))
+    except CannotMeasure:
+        return None
+    return before.total_sigma_mm, after.total_sigma_mm
 
 
 def _kept(
@@ -186,6 +248,7 @@ def _kept(
         tuple(
             (size.name, size.known_mm, size.measured_mm, size.sigma_mm) for size in checked.sizes
         ),
+        tuple((size.independent_mm, size.independent_sigma_mm) for size in checked.sizes),
     )
 
 
@@ -194,7 +257,8 @@ def _fit_words(record: BenchCheckRecord) -> str:
     square = np.concatenate([np.sum(one.residual_mm**2, axis=-1) for one in record.pictures])
     rms_um = 1000 * float(np.sqrt(np.mean(square)))
     return (
-        f"{count} dots fit the known mirrors: what is left, {rms_um:.0f} µm on the plane, is noise."
+        f"{count} dots fit the known mirrors; their residual, {rms_um:.0f} µm RMS on the plane, is "
+        "noise-like."
     )
 
 
@@ -212,22 +276,33 @@ def kept_words(session: Session) -> str:
         return ""
     day = found.date[:10]
     if session.setup_problems or not session.setup.checked:
-        return f"▲ Checked on {day}, and the set-up was changed since: check again."
-    return f"✓ In use since {day}. {_fit_words(found)}"
+        return (
+            f"▲ The set-up was changed after this check of {day} and is no longer checked. Check "
+            "again, or undo the change."
+        )
+    return f"✓ In use: checked on {day}. {_fit_words(found)}"
 
 
 @dataclass(frozen=True)
 class QuantityRow:
     """A line of the table of quantities."""
 
-    texts: tuple[str, str, str, str, str, str, str]
-    """Name, value and ± before, value and ± after, unit, and whether the pictures determine it."""
+    group: str
+    """What it is a quantity of."""
+    texts: tuple[str, str, str, str, str]
+    """Name, value ± before, value ± after, unit, and whether the pictures determine it."""
     determined: bool
 
 
-COLUMNS = ("Quantity", "Before", "±", "After", "±", "Unit", "Determined")
+COLUMNS = ("Quantity", "Before", "After", "Unit", "")
 
-DETERMINED, NOT_DETERMINED = "● yes", "○ no"
+DETERMINED, NOT_DETERMINED = "●", "○"
+
+KEY = (
+    f"±: standard uncertainty. {DETERMINED} determined by the pictures; {NOT_DETERMINED} hardly: "
+    f"its ± is still more than {UNDETERMINED:.0%} of that before"
+).replace("%", " %")
+"""What the signs in the table mean."""
 
 
 def quantity_rows(record: BenchCheckRecord) -> tuple[QuantityRow, ...]:
@@ -240,28 +315,34 @@ def quantity_rows(record: BenchCheckRecord) -> tuple[QuantityRow, ...]:
         one = QUANTITIES[INDEX[key]]
         before, before_sigma, after, after_sigma = map(float, values)
         determined = after_sigma <= UNDETERMINED * before_sigma
+        group, _, name = one.name.partition(", ")
         texts = (
-            *(_sentence(one.name, ""), *rounded(before, before_sigma)),
-            *(*rounded(after, after_sigma), one.unit),
+            name if len(name) == 1 else _sentence(name, ""),  # s and h are symbols
+            with_sigma(before, before_sigma),
+            with_sigma(after, after_sigma),
+            one.unit,
             DETERMINED if determined else NOT_DETERMINED,
         )
-        rows.append(QuantityRow(texts, determined))
+        rows.append(QuantityRow(_sentence(group, ""), texts, determined))
     return tuple(rows)
 
 
-def mirror_rows(record: BenchCheckRecord) -> tuple[ResultRow, ...]:
-    """Every mirror's size as the adjusted bench measures it, beside what is known of it."""
+MIRROR_COLUMNS = ("True size, mm", "Adjusted", "Without it")
+
+
+def mirror_rows(record: BenchCheckRecord) -> tuple[tuple[str, str, str], ...]:
+    """Every mirror's true size; as the adjusted set-up measures it; and as measured without it.
+
+    The last is empty for a check that a former version has stored.
+    """
     names = {"plate": "Plate", "cap": "Cap", "ball": "Ball"}
     rows = []
     for picture in record.pictures:
-        for name, known, measured, sigma in picture.measured:
-            off = f" ({100 * (measured / known - 1):+.2f} %)" if abs(known) > 0.05 else ""
-            note = (
-                f"{picture.name}: known {known:.3f} mm, measured {measured:.3f} mm{off}; "
-                "±: noise of the dots alone"
-            )
-            words = f"{names[picture.kind]}, {name} (known {known:.3f})"
-            rows.append(ResultRow(words, measured, sigma, "mm", 3, note))
+        for one, independent in zip_longest(picture.measured, picture.independent):
+            name, known, measured, sigma = one
+            words = f"{names[picture.kind]}, {name} {plain(known, 3)}"
+            alone = "" if independent is None else with_sigma(*independent)
+            rows.append((words, with_sigma(measured, sigma), alone))
     return tuple(rows)
 
 
@@ -285,16 +366,23 @@ def overlay(picture: MirrorPicture, height_px: int) -> Overlay:
     """Dots, their rays' numbers, and residuals to be seen in a picture of such a height."""
     residual = picture.computed_px - picture.dot_px
     length = np.hypot(*residual.T)
-    # Nine in ten become a thirtieth of the picture at most.
-    times = round_factor(height_px / 30 / max(float(np.quantile(length, 0.9)), 1e-6))
+    # Nine in ten end before the next dot, so that dots stay in sight.
+    longest = min(height_px / 30, _spacing_px(picture.dot_px))
+    times = round_factor(longest / max(float(np.quantile(length, 0.9)), 1e-6))
     ends = picture.dot_px + times * residual
     arrows = np.stack([picture.dot_px, ends], axis=1).reshape(-1, 2)
     longest_um = 1000 * float(np.hypot(*picture.residual_mm.T).max())
     words = (
-        f"Arrows: residuals × {times:g}, the longest {longest_um:.0f} µm on the plane. "
-        "i: rows, j: columns of the rays"
+        f"Lines: residuals × {times:g}, from each dot to where the adjusted set-up has it; the "
+        f"longest is {longest_um:.0f} µm. i, j: row and column of the ray"
     )
     return Overlay(picture.dot_px, arrows, _numbers(picture), words)
+
+
+def _spacing_px(dot_px: FloatArray) -> float:
+    """Median distance of a dot to the nearest other."""
+    distance, _ = cKDTree(dot_px).query(dot_px, k=2)
+    return float(np.median(distance[:, 1]))
 
 
 def _numbers(picture: MirrorPicture) -> tuple[tuple[str, float, float, bool], ...]:
@@ -322,12 +410,45 @@ def ray_words(picture: MirrorPicture, u: float, v: float) -> str:
     return f"Ray ({i}, {j}): residual {um:.0f} µm"
 
 
-def predicted(setup: Setup, record: Record) -> tuple[ResultRow, ...]:
-    """± of the height of the pool that is expected, now and after each set of pictures."""
+def expected_pool(record: Record) -> Cap:
+    """The pool that the set-up expects, or a usual one."""
     width, height = record.expected_width_mm, record.expected_height_mm
-    pool = Cap(width, height) if width and height and height > 0 else EXPECTED
-    note = f"Standard uncertainty of the height of a pool {pool.name}"
-    return tuple(
-        ResultRow(_sentence(one.name, ""), one.total_sigma_mm, None, "mm", 4, note)
-        for one in forecast(setup.rig, pool=pool)
+    return Cap(width, height) if width and height and height > 0 else EXPECTED
+
+
+@dataclass(frozen=True)
+class Predicted:
+    """What pictures would do for the ± of the height of the expected pool."""
+
+    words: str
+    """Of which pool, and what is not predicted."""
+    rows: tuple[tuple[str, str], ...]
+    """Set of pictures, and ± after it in mm; the first line is without pictures."""
+
+
+def predicted(setup: Setup, record: Record) -> Predicted:
+    """Predict the ± of the height of the expected pool, now and after each set of pictures.
+
+    Raises
+    ------
+    CannotMeasure
+        If that pool cannot be measured with this set-up.
+    """
+    pool = expected_pool(record)
+    try:
+        made = forecast(setup.rig, CANDIDATES, pool)
+    except CannotMeasure as answer:
+        words = f"a pool like a {pool.name} cannot be measured with this set-up: {answer.reason}"
+        raise CannotMeasure(answer.status, words) from answer
+    rows = [(one.name, f"{one.total_sigma_mm:.4f}") for one in made]
+    rows += [(name, NO_DOTS) for name in CANDIDATES if name not in {one.name for one in made}]
+    rows[0] = "no picture: as it is now", rows[0][1]
+    words = (
+        f"Predicted ± of the height of a pool {pool.diameter_mm:g} mm wide and {pool.height_mm:g} "
+        "mm high:"
     )
+    return Predicted(words, tuple((_sentence(name, ""), sigma) for name, sigma in rows))
+
+
+NO_DOTS = "no dots"
+"""Of a set of pictures one of which would have no dots on the imaging plane."""

@@ -8,22 +8,27 @@ from pathlib import Path
 
 import pyqtgraph as pg
 from PySide6.QtCore import Qt, QTimer
-from PySide6.QtGui import QPalette
-from PySide6.QtWidgets import QAbstractItemView, QHeaderView, QSplitter, QWidget
+from PySide6.QtGui import QResizeEvent
+from PySide6.QtWidgets import (
+    QAbstractItemView,
+    QHeaderView,
+    QSplitter,
+    QTableWidgetItem,
+    QWidget,
+)
 
 from labapp.gui.dialogs import ask_file
-from labapp.gui.digits import ResultRow
 from labapp.gui.pages.bench_check import presenter
-from labapp.gui.pages.bench_check.presenter import COLUMNS, KINDS, Checked, Chosen
+from labapp.gui.pages.bench_check.presenter import COLUMNS, KINDS, Checked, Chosen, Predicted
 from labapp.gui.pages.page import Page
-from labapp.gui.shell.steps import setup_to_do
+from labapp.gui.shell.steps import Mark, State, setup_to_do
+from labapp.gui.tasks import Control
 from labapp.gui.views.picture import PictureView
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
-from labapp.gui.widgets.labels import Message, plain_label, plain_tip, show_words, wrapping_label
+from labapp.gui.widgets.labels import Message, heading, plain_tip, show_words, wrapping_label
 from labapp.gui.widgets.layouts import fill, hbox, vbox
-from labapp.gui.widgets.result_table import ResultTable
-from labapp.gui.widgets.tables import ReadTable
+from labapp.gui.widgets.tables import FullTable, ReadTable
 from labapp.gui.workspace import Workspace
 from labapp.media import read_picture
 from labapp.session.record import BenchCheckRecord, MirrorPicture
@@ -35,6 +40,8 @@ NO_PICTURE = (
 
 COLOR = "#ffb000"
 LIST_ROWS, ROW_PX = 3, 24
+TABLE_PX, WIDE_PX = 400, 720
+"""Width of the table of quantities, and of a page that has room for it beside the picture."""
 
 
 class BenchCheckPage(Page):
@@ -46,6 +53,7 @@ class BenchCheckPage(Page):
         super().__init__(workspace)
         self.chosen: list[Chosen] = []
         self.checked: Checked | None = None
+        self.refused = Message(4)
         self._path: Path | None = None
         self._kept: BenchCheckRecord | None = None
         self._found: MirrorPicture | None = None
@@ -54,21 +62,41 @@ class BenchCheckPage(Page):
         self._overlays: list[pg.GraphicsObject] = []
         self.legend, self.pointed = Message(2), Message(1)
         self.quantities = _QuantityTable()
-        left, splitter = QWidget(), QSplitter(Qt.Orientation.Horizontal)
+        left, self.found = QWidget(), QWidget()
         vbox((self.view, 1), self.legend, self.pointed, of=left)
-        splitter.setChildrenCollapsible(False)
-        splitter.addWidget(left)
-        splitter.addWidget(self.quantities)
-        splitter.setSizes([400, 500])
-        self.canvas_layout.addWidget(splitter)
+        vbox((self.quantities, 1), wrapping_label(presenter.KEY), of=self.found)
+        self.splitter = QSplitter(Qt.Orientation.Horizontal)
+        self.splitter.setChildrenCollapsible(False)
+        self.splitter.addWidget(left)
+        self.splitter.addWidget(self.found)
+        self.splitter.setStretchFactor(0, 1)
+        self.splitter.setSizes([WIDE_PX - TABLE_PX, TABLE_PX])
+        # The splitter has its new size only after the page has it.
+        self._arranged = QTimer(self, singleShot=True, interval=0)
+        self._arranged.timeout.connect(self._arrange)
+        self.canvas_layout.addWidget(self.splitter)
         self._make_panel()
+
+    def resizeEvent(self, event: QResizeEvent) -> None:
+        """Put the table below the picture where there is no room beside it."""
+        super().resizeEvent(event)
+        wide = self.width() >= WIDE_PX
+        way = Qt.Orientation.Horizontal if wide else Qt.Orientation.Vertical
+        if self.splitter.orientation() != way:
+            self.splitter.setOrientation(way)
+            self._arranged.start()
+
+    def _arrange(self) -> None:
+        wide = self.splitter.orientation() == Qt.Orientation.Horizontal
+        size, table = (self.width(), TABLE_PX) if wide else (self.height(), self.height() * 2 // 5)
+        self.splitter.setSizes([size - table, table])
 
     def refresh(self) -> None:
         """Show the check that the session keeps when it changed."""
         session, kept = self.session, self.session.bench_check
         if session.path != self._path:
             self._path, self._kept, self.checked = session.path, None, None
-            self.predicted.set_rows(())
+            self._show_predicted(None)
             self._list(())
         if kept is not self._kept:
             self._kept = kept
@@ -76,6 +104,17 @@ class BenchCheckPage(Page):
                 self.checked = None
                 self._take_kept()
         self._follow()
+
+    def state(self, found: State) -> State:
+        """How far the step is: a check may be made that is not in use yet."""
+        made, session = self.checked, self.workspace.session
+        if made is None or session is None or self._is_kept():
+            return found
+        if made.setup_text != session.setup_text:
+            return found
+        if made.usable:
+            return State(Mark.READY, "Checked; the adjusted set-up is not in use yet")
+        return State(Mark.ATTENTION, "The pictures contradict the set-up")
 
     def _is_kept(self) -> bool:
         """Whether what is shown is what the session keeps."""
@@ -131,7 +170,8 @@ class BenchCheckPage(Page):
     def _list(self, chosen: Sequence[Chosen], at: int = 0) -> None:
         """Show a list of pictures; what was found with another no longer counts."""
         self.chosen = list(chosen)
-        if self.checked is not None and self.checked.chosen != tuple(chosen):
+        dropped = self.checked is not None and self.checked.chosen != tuple(chosen)
+        if dropped:
             self.checked = None
         self.list.setRowCount(len(chosen))
         for row, one in enumerate(chosen):
@@ -139,7 +179,10 @@ class BenchCheckPage(Page):
                 self.list.set_cell(row, column, text, number=False)
         if chosen:
             self.list.selectRow(min(at, len(chosen) - 1))
-        self._follow()
+        if dropped:
+            self.workspace.changed.emit()
+        else:
+            self._follow()
 
     # --- the check ----------------------------------------------------------------------------
 
@@ -147,17 +190,19 @@ class BenchCheckPage(Page):
         """Adjust the set-up to the pictures."""
         session, chosen = self.session, tuple(self.chosen)
         text, path, settings = session.setup_text, session.path, session.settings.dots
+        pool = presenter.expected_pool(session.record)
+
+        def work(control: Control) -> Checked:
+            presenter.check_sizes(session, chosen)
+            return presenter.check(chosen, (text, path), settings, control.progress, free, pool)
 
         def found(made: Checked) -> None:
             if tuple(self.chosen) == chosen:
                 self.checked = made
-                self._follow()
+                self.workspace.changed.emit()
+                self.workspace.notified.emit("The pictures are checked", False)
 
-        self.start_task(
-            "Checking the bench",
-            lambda control: presenter.check(chosen, (text, path), settings, control.progress, free),
-            found,
-        )
+        self.start_task("Checking the bench", work, found)
 
     def find_suspect(self) -> None:
         """Check again, with a quantity found from the pictures alone."""
@@ -173,7 +218,7 @@ class BenchCheckPage(Page):
             lambda session: session.use_bench_check(made.check, made.record, images)
         ):
             self.workspace.notified.emit(
-                "The checked set-up is in use; undo brings the former back", False
+                "The adjusted set-up is in use; undo brings the former one back", False
             )
 
     def predict(self) -> None:
@@ -186,10 +231,10 @@ class BenchCheckPage(Page):
             self._show_predicted,
         )
 
-    def _show_predicted(self, rows: Sequence[ResultRow]) -> None:
-        self.predicted.set_rows(rows)
-        for shown in (self.predicted, self.predicted_words):
-            shown.setVisible(bool(rows))
+    def _show_predicted(self, made: Predicted | None) -> None:
+        show_words(self.predicted_words, "" if made is None else made.words)
+        self.predicted.show_texts(() if made is None else made.rows)
+        self.predicted.setVisible(made is not None)
 
     def leave(self) -> None:
         """Finish the edit under way."""
@@ -200,8 +245,12 @@ class BenchCheckPage(Page):
 
     def _make_panel(self) -> None:
         self.predict_button = button("Which pictures help most?", "", self.predict)
-        self.predicted = ResultTable("Predicted ± of the pool's height")
-        self.predicted_words = plain_label("Predicted ± of the pool's height after")
+        name = "Predicted ± of the pool's height"
+        self.predicted = FullTable(
+            name, f"{name}: Ctrl+C copies it", ("After a check with", "±, mm")
+        )
+        self.predicted.offer(("Copy table", self.predicted.copy_text))
+        self.predicted_words = wrapping_label()
         tip = "Add pictures of a mirror's dots, taken by the camera in its place"
         self.add_button = button("Add picture…", tip, self._choose)
         self.remove_button = button("Remove", "Take the picture off the list", self.remove)
@@ -217,15 +266,23 @@ class BenchCheckPage(Page):
         self.check_button = button("Check", "", self.check)
         self.use_button = button("Use", "", self.use)
         self.words = wrapping_label()
-        self.mirrors = ResultTable("Known mirrors, measured with the adjusted set-up")
+        self.mirrors_words = heading("Known mirrors, measured")
+        tip = (
+            "Each size as the adjusted set-up measures it (±: noise of the dots), and as it is "
+            "measured without its true value (±: noise and set-up). "
+            "Ctrl+C copies the table"
+        )
+        self.mirrors = FullTable("Known mirrors, measured", tip, presenter.MIRROR_COLUMNS)
+        self.mirrors.offer(("Copy table", self.mirrors.copy_text))
         fill(
             self.panel_layout,
             *(hbox((self.add_button, 1), self.remove_button), self.list, self._mirror_form()),
             *(hbox((self.check_button, 1), (self.use_button, 1)), self.predict_button),
-            *(self.refused, self.words, self._suspect_part(), self.mirrors),
+            *(self.words, self._suspect_part(), self.mirrors_words, self.mirrors, self.refused),
             *(self.predicted_words, self.predicted, 1),
         )
         self.lock_with_session(self.add_button)
+        self._show_predicted(None)
 
     def _mirror_form(self) -> QWidget:
         form = FieldForm()
@@ -261,12 +318,13 @@ class BenchCheckPage(Page):
         return form
 
     def _suspect_part(self) -> QWidget:
-        self.suspect_part = FieldForm()
-        tip = "What the dots say is off; those in the list explain them alike"
-        self.suspect = ChoiceField("Off", tooltip=tip)
-        tip = "Check again, without holding this quantity by its ±"
-        self.suspect_part.add(self.suspect)
-        self.suspect_part.add_wide(button("Find it from the pictures", tip, self.find_suspect))
+        tip = "Which quantity is off; those in the list explain the dots equally well"
+        self.suspect = ChoiceField("What is off", tooltip=tip)
+        tip = "Check again with this quantity free: its entered value is ignored"
+        self.suspect_part = QWidget()
+        find = button("Find it from the pictures", tip, self.find_suspect)
+        # Names are long: the label stands above them.
+        vbox(self.suspect.label, self.suspect, find, of=self.suspect_part)
         return self.suspect_part
 
     def _choose(self) -> None:
@@ -303,12 +361,19 @@ class BenchCheckPage(Page):
         self._show_mirror()
         self._show_picture(None if record is None else record.pictures[self._at()])
         self.quantities.show_rows(() if record is None else presenter.quantity_rows(record))
-        self.mirrors.set_rows(() if record is None else presenter.mirror_rows(record))
-        self.mirrors.setVisible(record is not None)
+        self.found.setVisible(record is not None)
+        # A refused bench measures nothing.
+        stands = record is not None and (made is None or made.usable)
+        self.mirrors.show_texts(presenter.mirror_rows(record) if record and stands else ())
+        for shown in (self.mirrors_words, self.mirrors):
+            shown.setVisible(stands)
         used = record is not None and (made is None or self._is_kept())
         words = presenter.kept_words(self.session) if used else made.words if made else ""
         show_words(self.words, words)
-        self.suspect.set_choices(made.suspects if made else ())
+        suspects = made.suspects if made else ()
+        self.suspect.set_choices(suspects)
+        if suspects and not self.suspect.value():  # the former one is not among them
+            self.suspect.set_value(suspects[0][0])
         self.suspect_part.setVisible(bool(made and made.suspects))
         self._enable(used)
 
@@ -325,12 +390,11 @@ class BenchCheckPage(Page):
         elif made is None:
             unusable = "Check the pictures first"
         else:
-            unusable = "" if made.usable else "What is off must be put right first"
-        tip = "Measure with the adjusted set-up; undo brings the former back"
+            unusable = "" if made.usable else "What is wrong must be corrected first"
+        tip = "Measure with the adjusted set-up; undo brings the former one back"
         self._let(self.use_button, self.locked or unusable, tip)
         tip = "Predicted ± of the height of the expected pool, after each set of pictures"
         self._let(self.predict_button, lacking, tip)
-        self._show_predicted(self.predicted.rows)
         self._let(
             self.remove_button,
             self.locked or ("" if self.chosen else "No picture"),
@@ -368,7 +432,7 @@ class BenchCheckPage(Page):
             return
         shown = presenter.overlay(found, image.shape[0])
         arrows = pg.PlotDataItem(
-            *shown.arrows_px.T, connect="pairs", pen=pg.mkPen(COLOR, width=2), symbol=None
+            *shown.arrows_px.T, connect="pairs", pen=pg.mkPen(COLOR, width=1), symbol=None
         )
         dots = pg.PlotDataItem(
             *shown.dot_px.T, pen=None, symbol="o", symbolSize=5, symbolBrush=None
@@ -393,7 +457,7 @@ class BenchCheckPage(Page):
 
 
 class _QuantityTable(ReadTable):
-    """Quantities before and after; those that the pictures do not determine are grey."""
+    """Quantities before and after, in groups."""
 
     def __init__(self) -> None:
         name = "Quantities of the set-up, before and after the check"
@@ -406,17 +470,26 @@ class _QuantityTable(ReadTable):
         self.offer(("Copy table", self.copy_text))
 
     def show_rows(self, rows: Sequence[presenter.QuantityRow]) -> None:
-        """Show quantities."""
-        self.setRowCount(len(rows))
-        usual, grey = (
-            self.palette().color(group, QPalette.ColorRole.Text)
-            for group in (QPalette.ColorGroup.Active, QPalette.ColorGroup.Disabled)
-        )
-        for k, row in enumerate(rows):
+        """Show quantities, each group of them below its heading."""
+        self.setRowCount(0)
+        group = ""
+        for row in rows:
+            if row.group != group:
+                group = row.group
+                self._add_heading(group)
+            at = self.rowCount()
+            self.setRowCount(at + 1)
             for column, text in enumerate(row.texts):
-                self.set_cell(k, column, text, number=1 <= column <= 4)
-                item = self.item(k, column)
-                assert item is not None
-                item.setForeground(usual if row.determined else grey)
+                tip = presenter.KEY if column == len(row.texts) - 1 else ""
+                self.set_cell(at, column, text, number=column in (1, 2), tip=tip)
         self.resizeRowsToContents()
-        self.setVisible(bool(rows))
+
+    def _add_heading(self, words: str) -> None:
+        item = QTableWidgetItem(words)
+        font = item.font()
+        font.setBold(True)
+        item.setFont(font)
+        at = self.rowCount()
+        self.setRowCount(at + 1)
+        self.setItem(at, 0, item)
+        self.setSpan(at, 0, 1, len(COLUMNS))

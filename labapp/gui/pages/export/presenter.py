@@ -33,7 +33,7 @@ from labapp.export.rendering.studio import PICTURE_PX
 from labapp.session.frames import Progress
 from labapp.session.measured import SETUP_CHANGED, scheme_name
 from labapp.session.session import Session
-from labapp.text import format_bytes, pluralize
+from labapp.text import format_bytes, marked_setup_words, pluralize
 
 REPORT_FILE = "report.pdf"
 
@@ -200,6 +200,8 @@ def plan(session: Session, request: ExportRequest, frame: int) -> ExportPlan:
     unmeasured = seen.frame[chosen & (status == "")]
     surfaces = int((measured & (status == "ok")).sum())
     notes = []
+    if len(seen.frame[measured]):
+        notes.append(marked_setup_words(session.setup_status, session.setup_words))
     if len(unmeasured):
         notes.append(
             f"{pluralize(len(unmeasured), 'frame')} not measured by {_named(scheme)}: left out."
@@ -218,7 +220,7 @@ def plan(session: Session, request: ExportRequest, frame: int) -> ExportPlan:
         frames=frames,
         again=np.asarray(again, np.int64),
         why_not=_why_not(session, request, scheme, frames, stale),
-        notes=tuple(notes),
+        notes=tuple(filter(None, notes)),
         files=_files(request, len(frames), surfaces),
     )
 

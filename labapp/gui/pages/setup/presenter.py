@@ -19,7 +19,7 @@ from labapp.gui.digits import ResultRow
 from labapp.session.record import Record
 from labapp.session.session import Session
 from labapp.simulation.positioning import USUAL_LENGTH_MM, USUAL_WIDTH_MM, Fate, SideView, side_view
-from labapp.text import setup_words
+from labapp.text import marked_setup_words, setup_words
 
 
 @dataclass(frozen=True)
@@ -187,7 +187,11 @@ class SetupState:
     values: dict[str, float | None]
     """By the keys of `RIG`; None where there is none."""
     sigmas: dict[str, float | None]
-    """Standard uncertainties by the keys of `ASSUMED`; None where one is assumed."""
+    """Standard uncertainties by the keys of `ASSUMED`; None where none is entered."""
+    usual_sigmas: dict[str, float]
+    """What holds where none is entered: what is assumed, or what the bench check gave."""
+    sigma_words: str
+    """What the standard uncertainties are."""
     kind: str
     """Kind of the pattern, of `KINDS`."""
     travel: str
@@ -213,7 +217,12 @@ def shown(session: Session) -> SetupState:
         for section, key, usual in (("pattern", "kind", DotPattern.kind), ("torch", "travel", "+y"))
     )
     found = rig(session)
-    status = session.setup_words or ("" if found is None else setup_words(setup_status(found)))
+    if words := session.setup_words:
+        status = marked_setup_words(session.setup_status, words)
+    else:  # the imaging plane may be missing still
+        usual = "" if found is None else setup_status(found)
+        status = marked_setup_words(usual, setup_words(usual))
+    usual_sigmas, sigma_words = _usual_sigmas(found)
     problems: dict[str, str] = {}
     others = []
     for problem in session.setup_problems:
@@ -230,7 +239,30 @@ def shown(session: Session) -> SetupState:
         else:
             others.append(f"{problem.field}: {words}")
     unique = tuple(dict.fromkeys(others))
-    return SetupState(values, sigmas, kind, travel, status, problems, unique, session.record)
+    return SetupState(
+        values=values,
+        sigmas=sigmas,
+        usual_sigmas=usual_sigmas,
+        sigma_words=sigma_words,
+        kind=kind,
+        travel=travel,
+        status=status,
+        problems=problems,
+        others=unique,
+        record=session.record,
+    )
+
+
+def _usual_sigmas(found: Rig | None) -> tuple[dict[str, float], str]:
+    """What holds of each standard uncertainty that is not entered, and a note on it."""
+    words = "Right: ±, one standard uncertainty. In grey: "
+    known = None if found is None else found.uncertainty
+    if known is None or not known.checked:
+        return ASSUMED, f"{words}assumed."
+    sigmas: dict[str, float] = {}
+    for one, sigma in zip(QUANTITIES, known.sigma.tolist(), strict=True):
+        sigmas[one.sigma_key] = max(sigma, sigmas.get(one.sigma_key, 0.0))  # along u and v
+    return sigmas, f"{words}as the bench check found it."
 
 
 def _number(sections: dict[str, Any], key: str) -> float | None:

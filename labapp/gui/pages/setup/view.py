@@ -14,7 +14,6 @@ from labapp.gui.dialogs import EVERYTHING, ask_file, ask_save
 from labapp.gui.pages.page import Page
 from labapp.gui.pages.setup import presenter
 from labapp.gui.pages.setup.presenter import (
-    ASSUMED,
     EXPERIMENT,
     KINDS,
     POOL,
@@ -91,12 +90,14 @@ class SetupPage(Page):
                 field.set_problem(shown.problems[key])
         for key, field in self.sigma_fields.items():
             field.set_value(shown.sigmas[key])
+            field.set_placeholder(f"{shown.usual_sigmas[key]:.2g}")
             if shown.problems.get(key):
                 field.set_problem(shown.problems[key])
         self.kind.set_value(shown.kind)
         self._show_kind(shown.kind)
         self.travel.set_value(shown.travel)
         self.status.setText(shown.status)
+        self.sigma_words.setText(shown.sigma_words)
         for name, noted in self.record_fields.items():
             noted.set_value(getattr(shown.record, name))
         ticked = dict(shown.record.safety)
@@ -212,9 +213,10 @@ class SetupPage(Page):
         hbox(load, save, usual, of=buttons)
         form.add_wide(buttons)
         form.add_wide(self.refused)
-        self.status = Message(2)
+        self.status = Message(3)
         form.add_wide(self.status)
-        form.add_wide(wrapping_label("Right: ±, one standard uncertainty. In grey: assumed."))
+        self.sigma_words = wrapping_label()
+        form.add_wide(self.sigma_words)
         for heading, entries in RIG:
             form.add_heading(heading)
             if heading == "Pattern":
@@ -274,7 +276,6 @@ class SetupPage(Page):
         if entry is None:
             return None
         field = self.sigma_fields[entry.key] = _number(entry)
-        field.set_placeholder(f"{ASSUMED[entry.key]:g}")
         self._put_when_edited(field, entry.key)
         return field
 

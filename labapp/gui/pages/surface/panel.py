@@ -44,7 +44,8 @@ class SurfacePanel:
         form = FieldForm()
         form.add(self.scheme)
         form.add(self.correspondence)
-        self.status, self.provenance, self.verdict = (wrapping_label() for _ in range(3))
+        self.status, self.setup_words = wrapping_label(), wrapping_label()
+        self.provenance, self.verdict = wrapping_label(), wrapping_label()
         self.status.setAccessibleName("How this frame stands")
         self.again = button(
             "Measure &again", "Measure this frame again: its figures are out of date", self.this_one
@@ -58,8 +59,8 @@ class SurfacePanel:
         keep_room(self.progress, self.cancel, self.again)
         fill(
             layout,
-            *(form, grid, self.again, self.status, self.sizes, self.errors, self.provenance),
-            *(self.verdict, self.trials, 1),
+            *(form, grid, self.again, self.status, self.setup_words, self.sizes, self.errors),
+            *(self.provenance, self.verdict, self.trials, 1),
         )
         workspace.tasks.changed.connect(self._show_progress)
         workspace.tasks.progressed.connect(self._show_progress)
@@ -95,9 +96,10 @@ class SurfacePanel:
         settings = session.settings
         self.scheme.set_value(scheme_name(settings))
         self.correspondence.set_value(settings.correspondence)
-        remedy = " Its dots can be corrected in step 5." if told.state == "failed" else ""
+        remedy = " Its dots can be corrected in step 6." if told.state == "failed" else ""
         self.status.setText(f"{SIGNS[told.state]} {told.words}{remedy}")
         self.again.setVisible(told.state == "stale")
+        show_words(self.setup_words, told.setup_words)
         show_words(self.provenance, told.provenance)
         show_words(self.verdict, told.verdict)
         for table, rows in (

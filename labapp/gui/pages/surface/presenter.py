@@ -21,7 +21,7 @@ from labapp.export.rendering.scene import Scene, rays_of, scene_of
 from labapp.gui.digits import ResultRow
 from labapp.session.measured import Overview, Result, scheme_name
 from labapp.session.session import Session
-from labapp.text import HEIGHT_SIGMA_OF, SIGMA_OF, setup_words
+from labapp.text import HEIGHT_SIGMA_OF, SIGMA_OF, marked_setup_words, setup_words
 
 SCHEMES = scheme_words()
 """Name that results are kept under → words for the operator."""
@@ -95,6 +95,8 @@ class SurfaceState:
     state: Literal["measured", "stale", "failed", "unmeasured"]
     words: str
     """The result in words; where there is no surface or it is stale, the reason."""
+    setup_words: str = ""
+    """How far the set-up of a surface can be relied on."""
     provenance: str = ""
     """Frame, scheme, version, time, and whether dots were corrected by hand."""
     sizes: tuple[ResultRow, ...] = ()
@@ -131,6 +133,7 @@ def shown(session: Session, frame: int) -> SurfaceState:
     return SurfaceState(
         result,
         *_state(result),
+        setup_words=_setup_words(result),
         provenance=provenance(result),
         sizes=size_rows(measurement.measures),
         errors=error_rows(measurement.measures),
@@ -148,9 +151,15 @@ def _state(result: Result) -> tuple[Literal["measured", "stale", "failed"], str]
         return "stale", f"{was} Since then {' and '.join(result.stale)}."
     if failed:
         return "failed", words
+    return "measured", words
+
+
+def _setup_words(result: Result) -> str:
+    status = result.measurement.setup_status
+    if result.stale or result.measurement.status != "ok" or not status:
+        return ""
     checked = parse_setup(result.setup, "setup", lines=True).checked
-    about = setup_words(measurement.setup_status, checked, result.doubt)
-    return "measured", f"{words} {about}".strip()
+    return marked_setup_words(status, setup_words(status, checked, result.doubt))
 
 
 def provenance(result: Result) -> str:

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from labapp.core.recording.residual_check import DOUBTFUL as IN_DOUBT
 from labapp.core.values import IntArray
 from labapp.gui.curves import Axis, Curve, Mark
 from labapp.gui.digits import ResultRow, rounded
@@ -16,7 +15,7 @@ from labapp.session.measured import Overview
 from labapp.session.session import Session
 from labapp.session.signals import Signals
 from labapp.session.trends import BY_KEY, Trend, doubtful_frames, spectrum, spread, trend
-from labapp.text import SIGMA_OF
+from labapp.text import SIGMA_OF, marked_setup_words
 
 MARKS = (
     Mark("●", "measured"),
@@ -75,7 +74,6 @@ def show(session: Session, options: TrendOptions, seen: Overview | None = None) 
     def course_of(key: str) -> Trend:
         return trend(seen, key, options.without_doubtful, doubtful)
 
-    words = session.setup_words
     courses = [course_of(key) for key in BY_KEY if key in options.shown]
     timed = bool(np.isfinite(seen.time_s).all()) and len(seen.time_s) > 0
     at = seen.time_s if timed else seen.frame.astype(float)
@@ -92,7 +90,7 @@ def show(session: Session, options: TrendOptions, seen: Overview | None = None) 
         places=dict(zip(seen.frame.tolist(), at.tolist(), strict=True)),
         rows=tuple(row for course in courses for row in _rows(course)),
         words=_counted(seen, course_of("height_mm")),
-        setup_words=f"▲ {words}" if session.setup_status == IN_DOUBT else words,
+        setup_words=marked_setup_words(session.setup_status, session.setup_words),
         spectrum=found,
         spectrum_axis=spectrum_axis,
         spectrum_words=message,
