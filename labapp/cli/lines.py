@@ -69,7 +69,7 @@ def lines(
 
 def _measure(source: FrameSource, frames: range, folder: Path, bench: Setup) -> bool:
     """Measure frames one by one; whether any has lines."""
-    from labapp.core.pipeline import Settings, measure
+    from labapp.core.pipeline import Settings, measure, setup_status
     from labapp.core.sequence.line_states import LineSeries, line_changes, line_states
     from labapp.export import line_results as tables
 
@@ -91,7 +91,7 @@ def _measure(source: FrameSource, frames: range, folder: Path, bench: Setup) -> 
             progress(source.name, k + 1, len(frames))
     series = LineSeries.of(found)
     states = line_states(series)
-    rows = tables.feature_rows(frames, times_s, found, states, bench.setup_status)
+    rows = tables.feature_rows(frames, times_s, found, states, setup_status(bench.rig))
     write_file(folder / "features.csv", csv_text([tables.FEATURE_COLUMNS, *rows]).encode())
     for name, counts in (("frames", [one.status for one in found]), ("states", states)):
         shown = ", ".join(f"{what} {n}" for what, n in Counter(counts).most_common())

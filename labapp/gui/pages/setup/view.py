@@ -217,9 +217,9 @@ class SetupPage(Page):
         form.add_wide(self.status)
         self.sigma_words = wrapping_label()
         form.add_wide(self.sigma_words)
-        for heading, entries in RIG:
-            form.add_heading(heading)
-            if heading == "Pattern":
+        for title, entries in RIG:
+            form.add_heading(title)
+            if title == "Pattern":
                 tip = (
                     "Dots, and how they lie to each other, or lines. "
                     "Measured rays come with a setup file: Load…"
@@ -228,12 +228,12 @@ class SetupPage(Page):
                 form.add(self.kind)
             for entry in entries:
                 form.add(self._rig_field(entry), self._sigma_field(presenter.sigma_entry(entry)))
-            if heading == "Torch":
+            if title == "Torch":
                 tip = "Where the pool's head is: +Y is the laser's side. The rear may lie low"
                 self.travel = self._choice("Welding", TRAVELS, tip, presenter.put_travel)
                 form.add(self.travel)
-        heading, entries = UNCERTAIN_ONLY
-        form.add_heading(f"{heading}, ±")
+        title, entries = UNCERTAIN_ONLY
+        form.add_heading(f"{title}, ±")
         for entry in entries:
             field = self._sigma_field(entry)
             assert field is not None
