@@ -149,13 +149,6 @@ def test_a_row_that_may_have_left_the_view_is_not_called_dark() -> None:
     assert abs(size.height_mm - pool.size.height_mm) < 2 * size.height_sigma_mm
 
 
-def test_rays_out_of_view_tell_that_one_of_their_row_may_be() -> None:
-    """Two of the row beside the last one are predicted in view; the pool grows steeper there."""
-    match = matched(draw(52011, missing=6, false=3)[1])
-    assert match.witness[12, 6] == 0
-    assert match.witness[12, 4] == -1  # dark, and far within the view
-
-
 @pytest.mark.parametrize("seed", [51000, 51009, 51018])
 def test_a_dot_that_is_missing_at_the_rim_does_not_lower_the_pool(seed: int) -> None:
     """A dark ray beside the boundary may have come back, as often as dots are missing elsewhere."""

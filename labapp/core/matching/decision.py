@@ -262,12 +262,8 @@ def _likeliest(found: list[Hypothesis]) -> Hypothesis:
     get no ray in the end.
     """
     cheapest = min(found, key=lambda hypothesis: hypothesis.cost)
-    alike = []
-    for each in found:
-        differing, shared = _differing(cheapest, each)
-        same = shared - len(differing)
-        if same >= (1 - MOST_DIFFERING) * cheapest.label_count:
-            alike.append(each)
+    lit, enough = cheapest.labels != UNLABELLED, (1 - MOST_DIFFERING) * cheapest.label_count
+    alike = [each for each in found if np.sum((each.labels == cheapest.labels)[lit]) >= enough]
     return min(alike, key=lambda hypothesis: hypothesis.misfit)
 
 

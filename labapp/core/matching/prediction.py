@@ -234,7 +234,7 @@ def lines_out_of_view(
     observed
         The dots and the rig.
     at, plane_mm
-        Rays without a dot beside the lit ones, as in `Prediction`, shapes (m, 2), mm.
+        Dark rays beside the lit ones, as in `Prediction`, shapes (m, 2), mm.
     covariance_of
         Covariance of the dots of some of them, by a mask of shape (m,), shape (…, 2, 2), mm².
     """

@@ -91,9 +91,7 @@ def certain_witness(
     covariance_of
         Covariance of the dots of some rays, by their numbers, shape (m,): shape (m, 2, 2), mm².
     """
-    # Rays that are predicted out of view tell, too, that their row may be.
-    seen = np.isfinite(paths.plane_mm[:, 0]).reshape(witness.shape)
-    rim = np.flatnonzero((witness <= 0) & widened(witness > 0, 1) & seen)
+    rim = np.flatnonzero((witness < 0) & widened(witness > 0, 1))
     at = np.stack(np.divmod(rim, witness.shape[1]), axis=-1)
     some = paths.plane_mm[rim]
     lost = lines_out_of_view(observed, at, some, lambda which: covariance_of(rim[which]))
