@@ -228,6 +228,17 @@ def test_a_step_solves_the_normal_equations_and_keeps_the_mean_height() -> None:
     np.testing.assert_allclose(made, own + change, atol=1e-9 * np.abs(change).max())
 
 
+def test_rays_are_between_others_that_are_lit_on_either_side() -> None:
+    lit = random().uniform(size=(9, 11)) < 0.2
+    wanted = np.zeros_like(lit)
+    for i, j in np.ndindex(lit.shape):
+        row, column = lit[i], lit[:, j]
+        wanted[i, j] = (row[:j].any() and row[j + 1 :].any()) or (
+            column[:i].any() and column[i + 1 :].any()
+        )
+    np.testing.assert_array_equal(match_kernels.between(lit), wanted)
+
+
 def test_rays_are_amid_others_in_their_row_or_column() -> None:
     lit = random().uniform(size=(9, 7)) < 0.2
     lit[4] = False
