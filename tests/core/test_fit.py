@@ -257,3 +257,17 @@ def test_every_size_has_its_uncertainty_where_the_pool_ends_near_what_is_fitted(
     size = measure_surface(made, match, OPEN_RIG)
     assert all(np.isfinite(value) for name, value in vars(size).items() if "_sigma_" in name)
     assert 0 < size.volume_sigma_mm3 < 0.2 * size.volume_mm3
+
+
+def test_the_set_up_s_part_is_that_of_the_nearest_sizes_within_a_tenth() -> None:
+    sizes = np.array([6.0, 7.0, 0.3, -0.01, 30.0, 5.0])
+    parts = tuple(fit.SetupPart(np.full(6, by), by * sizes) for by in (1.0, 1.08, 1.3))
+    assert fit.nearest_part((), sizes) is None
+    for by, wanted in ((1.0, 1.0), (1.05, 1.08), (1.25, 1.3)):
+        part = fit.nearest_part(parts, by * sizes)
+        assert part is not None
+        assert part.sigma[0] == wanted
+    assert fit.nearest_part(parts, 0.85 * sizes) is None
+    depth = np.eye(6)[3]  # its change is one of the height's
+    assert fit.nearest_part(parts[:1], sizes - 0.02 * depth) is parts[0]
+    assert fit.nearest_part(parts[:1], sizes - 0.04 * depth) is None

@@ -23,7 +23,14 @@ from labapp.core.geometry.optics import (
     surface_normal,
 )
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
-from labapp.core.images import centroid_kernels, dot_fit_kernels, dot_kernels, dot_size, dots
+from labapp.core.images import (
+    centroid_kernels,
+    dot_fit_kernels,
+    dot_kernels,
+    dot_size,
+    dots,
+    size_kernels,
+)
 from labapp.core.matching import match_kernels
 from labapp.core.sequence.prior import RIDGE, recurrence
 from labapp.core.surface import kernels, level_kernels
@@ -226,6 +233,17 @@ def test_a_step_solves_the_normal_equations_and_keeps_the_mean_height() -> None:
     bench = LASER, PLANE.pose_mm
     made = kernels.fit_step(BASIS.grid, (band, factor), own, rough, points, weights, bench, dots_mm)
     np.testing.assert_allclose(made, own + change, atol=1e-9 * np.abs(change).max())
+
+
+def test_rays_are_between_others_that_are_lit_on_either_side() -> None:
+    lit = random().uniform(size=(9, 11)) < 0.2
+    wanted = np.zeros_like(lit)
+    for i, j in np.ndindex(lit.shape):
+        row, column = lit[i], lit[:, j]
+        wanted[i, j] = (row[:j].any() and row[j + 1 :].any()) or (
+            column[:i].any() and column[i + 1 :].any()
+        )
+    np.testing.assert_array_equal(match_kernels.between(lit), wanted)
 
 
 def test_rays_are_amid_others_in_their_row_or_column() -> None:
@@ -503,11 +521,11 @@ def test_noise_is_that_of_each_tile() -> None:
     image = 50 + np.concatenate(
         [rng.normal(0, 1.0, (200, 240)), rng.normal(0, 3.0, (200, 240))], axis=1
     )
-    made = 1.4826 * dot_kernels.tile_noise(image.astype(np.float32), 2, 4)
+    made = 1.4826 * size_kernels.tile_noise(image.astype(np.float32), 2, 4)
     np.testing.assert_allclose(made, [[1, 1, 3, 3]] * 2, rtol=0.08)
     ramp = np.add.outer(np.arange(40.0), 3 * np.arange(50.0)).astype(np.float32)
-    np.testing.assert_allclose(dot_kernels.tile_noise(ramp, 2, 2), 0.0, atol=1e-4)
-    assert dot_kernels.tile_noise(ramp[:8, :8].copy(), 1, 1).shape == (1, 1)
+    np.testing.assert_allclose(size_kernels.tile_noise(ramp, 2, 2), 0.0, atol=1e-4)
+    assert size_kernels.tile_noise(ramp[:8, :8].copy(), 1, 1).shape == (1, 1)
 
 
 def test_pixels_that_hang_together_are_those_of_one_spot() -> None:
@@ -540,12 +558,14 @@ def test_answers_are_the_largest_about_the_same_place_in_smaller_pictures() -> N
         u, v = np.array([0, 33, 79]), np.array([0, 21, 59])
         most = cv2.dilate(small, np.ones((3, 3)))
         x, y = (np.rint((at + 0.5) / step - 0.5).astype(int) for at in (u, v))
-        np.testing.assert_array_equal(dot_kernels.answers(small, u, v, float(step)), most[y, x])
+        np.testing.assert_array_equal(size_kernels.answers(small, u, v, float(step)), most[y, x])
 
 
 def test_parts_have_a_whole_near_them() -> None:
     places, wholes = np.array([[0.0, 0], [3, 0], [9, 0], [0, 4]]), np.array([[1.0, 0], [9, 3]])
-    made = dot_kernels.parts(places, np.array([1.0, 2, 1, 1]), wholes, np.array([1.0, 0.5]), 3, 0.6)
+    made = size_kernels.parts(
+        places, np.array([1.0, 2, 1, 1]), wholes, np.array([1.0, 0.5]), 3, 0.6
+    )
     np.testing.assert_array_equal(made, [True, False, False, False])
 
 
@@ -575,7 +595,7 @@ def test_bytes_are_read_as_they_are() -> None:
         lambda own: centroid_kernels.centroids(own, around, taps, u, v, 6, width, 2.0),
         lambda own: centroid_kernels.finest(own, u, v, narrow, wide),
         lambda own: dot_kernels.spikes(own, 3.0, 1.9, 1.2, 5),
-        lambda own: dot_kernels.tile_noise(own, 2, 3),
+        lambda own: size_kernels.tile_noise(own, 2, 3),
     ):
         for one, other in zip(made(coarse), made(coarse.astype(np.float32)), strict=True):
             np.testing.assert_array_equal(one, other)

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.ndimage import maximum_filter
 
 from labapp.core.matching import match_kernels
 from labapp.core.matching.decision import fitted_labels
@@ -137,6 +138,56 @@ def test_a_fit_that_goes_through_a_dot_says_little_of_it() -> None:
     off, spread = match_kernels.left_out(np.zeros((1, 2)), dot, 1.1 * dot, 0.0, 0.998)
     assert np.isfinite(off).all()
     assert (np.linalg.eigvalsh(spread[0]) > 20 * 1e-4).all()
+
+
+def test_labels_fail_by_the_likelihoods_of_ray_rivals_and_false_dots() -> None:
+    rng, shape = np.random.default_rng(9), (6, 7)
+    labels = np.full(shape, UNLABELLED)
+    labels[rng.uniform(size=shape) < 0.7] = 0
+    lit = labels != UNLABELLED
+    count = int(lit.sum())
+    labels[lit] = rng.permutation(count)
+    predicted = np.stack(np.indices(shape)[::-1], axis=-1).reshape(-1, 2).astype(float)
+    places = rng.uniform(-1, 8, (count + 3, 2))  # the last three have no ray
+    places[labels[lit]] = predicted[lit.ravel()] + rng.normal(0.0, 0.1, (count, 2))
+    seen, drawn = (0.02 * covariances(rng, n) for n in (len(places), lit.size))
+    shows, missed = rng.uniform(0.2, 1.0, count), np.flatnonzero(~lit)[:5]
+    drawn[missed[0]] = np.nan
+    stray, false, gate, margin = np.arange(count, count + 3), 3.0, 20.0, 1.0
+    limits = np.array([1e-4, 0.02, 0.998, 1.4, 1e-3, 1.386, false, gate, margin])
+    found = match_kernels.failing_labels(
+        labels, (places, seen), (predicted, drawn), shows, missed, stray, limits
+    )
+
+    own, rays, fitted = labels[lit], np.flatnonzero(lit), seen + 1e-4 * np.eye(2)
+    off, spread = match_kernels.left_out(
+        predicted[rays] - places[own], fitted[own], drawn[rays], 0.02, 0.998
+    )
+    spread = 1.4 * spread + 1e-3 * np.eye(2)
+
+    def deviance(away: FloatArray, covariance: FloatArray) -> tuple[FloatArray, FloatArray]:
+        square = np.einsum("...i,...ij,...j->...", away, np.linalg.inv(covariance), away)
+        return square, square + np.log(np.linalg.det(covariance))
+
+    excess = max(1.0, np.median(deviance(off, fitted[own] + spread)[0]) / 1.386)
+    square, own_deviance = deviance(off, excess * (fitted[own] + spread))
+    to_stray = (places[own] + off)[:, None] - places[stray]
+    by_stray = deviance(to_stray, excess * (spread[:, None] + seen[stray]))[1].min(axis=1)
+    around = 1.4 * drawn[missed[1:]] + 1e-3 * np.eye(2)
+    to_missed = places[own][:, None] - predicted[missed[1:]]
+    by_missed = deviance(to_missed, excess * (fitted[own][:, None] + around))[1].min(axis=1)
+    fails = (square > gate) | (own_deviance + 2 * np.log((1 - shows) / shows) + margin > false)
+    fails |= own_deviance + margin > np.minimum(by_stray, by_missed)
+    worst = np.zeros(shape)
+    worst[lit] = np.where(fails, square, 0.0)
+    wanted = (worst > 0.0) & (worst >= maximum_filter(worst, 3, mode="constant"))
+    assert 0 < wanted.sum() < fails.sum() < count
+    np.testing.assert_array_equal(found, wanted)
+
+
+def covariances(rng: np.random.Generator, count: int) -> FloatArray:
+    half = rng.normal(0.0, 0.5, (count, 2, 2))
+    return half @ half.swapaxes(1, 2) + 0.3 * np.eye(2)
 
 
 def test_a_ray_far_outside_the_boundary_is_unlikely_to_have_come_back() -> None:

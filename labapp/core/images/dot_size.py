@@ -66,11 +66,11 @@ def local_noise(picture: Picture) -> Grey:
     Taken from a difference that smooth structure, dots included, does not pass (Immerkær 1996),
     by the scaled median over tiles.
     """
-    from labapp.core.images import dot_kernels
+    from labapp.core.images import size_kernels
 
     height, width = picture.shape
     rows, columns = (max(1, round(side / TILE_PX)) for side in picture.shape)
-    medians = dot_kernels.tile_noise(picture, rows, columns)
+    medians = size_kernels.tile_noise(picture, rows, columns)
     if min(medians.shape) >= 3:
         medians = np.asarray(cv2.medianBlur(medians, 3), np.float32)
     return np.asarray(cv2.resize(1.4826 * medians, (width, height)), np.float32)
@@ -134,13 +134,13 @@ def size_of(picture: Picture, noise: Grey) -> float:
 
 def _size_from(picture: Picture, level: float, finest: int) -> float | None:
     """Size of the dots by the scales from the finest on; None if it may be less, or is not seen."""
-    from labapp.core.images import dot_kernels
+    from labapp.core.images import size_kernels
 
     bands = dict(_bands(picture, finest))
     kinds = [_blobs(bands, scale, level) for scale in sorted(bands)[:-1]]
     for k, few in enumerate(kinds):
         for large in kinds[k + 1 :]:
-            few.votes &= ~dot_kernels.parts(
+            few.votes &= ~size_kernels.parts(
                 few.place_px,
                 few.own,
                 large.place_px[large.tops],
@@ -188,7 +188,7 @@ class _Blobs:
 
 
 def _blobs(bands: dict[int, tuple[int, Grey]], scale: int, noise: float) -> _Blobs:
-    from labapp.core.images import dot_kernels
+    from labapp.core.images import dot_kernels, size_kernels
 
     step, band = bands[scale]
     white = noise / noise_gain(SCALES_PX[scale])
@@ -203,7 +203,7 @@ def _blobs(bands: dict[int, tuple[int, Grey]], scale: int, noise: float) -> _Blo
         x, y = x[most], y[most]
     place = (pairs(x, y) + 0.5) * step - 0.5
     u, v = np.rint(place.T).astype(np.int64)
-    answer = {k: dot_kernels.answers(other, u, v, float(by)) for k, (by, other) in bands.items()}
+    answer = {k: size_kernels.answers(other, u, v, float(by)) for k, (by, other) in bands.items()}
     answer[scale] = band[y, x].astype(np.float64)
     less = answer.get(scale - 1, np.full(len(place), -np.inf))
     largest = np.stack(list(answer.values())).max(axis=0)

@@ -1,0 +1,84 @@
+"""Loops that tell a frame's noise and the size of its dots, compiled (`dot_size`).
+
+Arrays may be read-only, and of any layout but for pictures (docs/adr/0018).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import types
+
+from labapp.core.compiled import compiled as _compiled
+from labapp.core.compiled import compiled_for as _compiled_for
+from labapp.core.images.dots import Grey, Picture
+from labapp.core.values import BoolArray, FloatArray, IntArray
+
+_f, _i = types.float64, types.int64
+_f1, _f2 = (types.Array(_f, n, "A", readonly=True) for n in (1, 2))
+_grey = types.Array(types.float32, 2, "C", readonly=True)
+_byte = types.Array(types.uint8, 2, "C", readonly=True)
+_ints = types.Array(_i, 1, "A", readonly=True)
+
+
+@_compiled_for(*((own, _i, _i) for own in (_grey, _byte)))
+def tile_noise(image: Picture, rows: int, columns: int) -> Grey:
+    """Noise of a picture's tiles, shape (rows, columns): see `dot_size.local_noise`.
+
+    Every second pixel of every second row stands for the others.
+    """
+    height, width = image.shape
+    made = np.empty((rows, columns), np.float32)
+    for i in range(rows):
+        top, bottom = max(i * height // rows, 1), min((i + 1) * height // rows, height - 1)
+        for j in range(columns):
+            left, right = max(j * width // columns, 1), min((j + 1) * width // columns, width - 1)
+            some = np.empty(((bottom - top + 1) // 2) * ((right - left + 1) // 2), np.float32)
+            count = 0
+            for v in range(top, bottom, 2):
+                for u in range(left, right, 2):
+                    sides = float(image[v - 1, u]) + float(image[v + 1, u])
+                    sides += float(image[v, u - 1]) + float(image[v, u + 1])
+                    ends = float(image[v - 1, u - 1]) + float(image[v + 1, u + 1])
+                    ends += float(image[v - 1, u + 1]) + float(image[v + 1, u - 1])
+                    some[count] = abs(4.0 * float(image[v, u]) - 2.0 * sides + ends) / 6.0
+                    count += 1
+            made[i, j] = np.median(some)
+    return made
+
+
+@_compiled(_grey, _ints, _ints, _f)
+def answers(band: Grey, u: IntArray, v: IntArray, step: float) -> FloatArray:
+    """Largest value of a picture, made smaller ``step``-fold, about each pixel of the large one."""
+    height, width = band.shape
+    made = np.empty(len(u))
+    for k in range(len(u)):
+        x, y = round((u[k] + 0.5) / step - 0.5), round((v[k] + 0.5) / step - 0.5)
+        most = -np.inf
+        for at_y in range(max(y - 1, 0), min(y + 2, height)):
+            for at_x in range(max(x - 1, 0), min(x + 2, width)):
+                most = max(most, band[at_y, at_x])
+        made[k] = most
+    return made
+
+
+@_compiled(_f2, _f1, _f2, _f1, _f, _f)
+def parts(
+    places: FloatArray,
+    strength: FloatArray,
+    wholes: FloatArray,
+    of_whole: FloatArray,
+    within: float,
+    share: float,
+) -> BoolArray:
+    """Whether a whole lies within some distance of each place that has this share of its strength.
+
+    Places and wholes have shapes (n, 2) and (m, 2).
+    """
+    made = np.zeros(len(places), np.bool_)
+    for k in range(len(places)):
+        for m in range(len(wholes)):
+            x, y = places[k, 0] - wholes[m, 0], places[k, 1] - wholes[m, 1]
+            if x * x + y * y <= within * within and of_whole[m] >= share * strength[k]:
+                made[k] = True
+                break
+    return made
