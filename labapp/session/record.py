@@ -88,6 +88,10 @@ class MirrorPicture(ReadOnlyArrays):
     """The mirror, measured with the adjusted bench as if its size were not known: (name, known,
     measured, standard uncertainty by the noise of the dots), mm.
     """
+    pose_sigma: tuple[tuple[str, float], ...] = ()
+    """Standard uncertainty of each parameter of the mirror's pose (`Mirror.parameters`), by its
+    name, as it was given; empty in older files.
+    """
 
 
 @dataclass(frozen=True)
@@ -104,6 +108,8 @@ class BenchCheckRecord(ReadOnlyArrays):
     after: FloatArray
     after_sigma: FloatArray
     """Their values and standard uncertainties before and after, shape (q,), in their units."""
+    free: tuple[str, ...] = ()
+    """Keys of what was not held by its uncertainty; in older files not kept."""
 
 
 @dataclass(frozen=True)

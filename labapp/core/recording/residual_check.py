@@ -67,7 +67,12 @@ NO_MATCH = frozenset({"no-match", "no-reference", "ambiguous-rows", "no-rows", "
 DOUBTFUL = "doubtful"
 """`Measurement.setup_status` of a set-up that its recording contradicts."""
 
-FIXED = ("image_calibration.", "pattern.inter_beam_angle_deg", "camera_lens.")
+FIXED = (
+    "image_calibration.",
+    "imaging_plane.glass_",
+    "pattern.inter_beam_angle_deg",
+    "camera_lens.",
+)
 """Keys of what cannot change during a recording begin so."""
 
 
