@@ -135,8 +135,9 @@ def _print_check(check: BenchCheck) -> None:
 
     typer.echo(f"{'quantity':40} {'before':>10} {'±':>8} {'after':>10} {'±':>8}")
     for one in check.changes:
+        name = ", ".join(filter(None, (one.name, one.unit)))
         typer.echo(
-            f"{one.name + ', ' + one.unit:40} {one.before:10.4f} {one.before_sigma:8.4f} "
+            f"{name:40} {one.before:10.4f} {one.before_sigma:8.4f} "
             f"{one.after:10.4f} {one.after_sigma:8.4f}"
         )
     if check.undetermined:

@@ -14,10 +14,11 @@ from typing import Any
 
 import numpy as np
 
+from labapp.config.mirror_text import mirror_text
 from labapp.config.toml_keys import Rule, are_numbers, is_matrix, is_number
 from labapp.core.bench_check.check import BenchCheck
 from labapp.core.geometry.rig import DotPattern, ImagingPlane, Rig
-from labapp.core.geometry.uncertainty import INDEX
+from labapp.core.geometry.uncertainty import FIRST, INDEX, QUANTITIES
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
 
@@ -26,7 +27,7 @@ SECTION = "bench_check"
 MATTERS = ("laser", "pattern", "imaging_plane", "image_calibration", "camera_lens")
 """Sections that a check is about."""
 
-_DEFAULTS = {key: 0.0 for key in INDEX if not key.endswith("]")} | {
+_DEFAULTS = {key: 0.0 for key in INDEX if not key.startswith("image_calibration.")} | {
     "pattern.kind": DotPattern.kind,
     "imaging_plane.glass_mm": ImagingPlane.glass_mm,
     "imaging_plane.glass_index": ImagingPlane.glass_index,
@@ -85,6 +86,7 @@ RULES = {
     "date": Rule("a date and time, as text (ISO 8601)", _is_date),
     "pictures": Rule("names of pictures", _texts),
     "mirrors": Rule("a mirror for each picture", _texts),
+    "free": Rule("keys of quantities", _texts, required=False),
     "quantities": Rule(
         "a list of { key, before, after, sigma }, each key once, sigma above 0 unless the quantity "
         "was known exactly and kept its value",
@@ -129,10 +131,13 @@ def checked_covariance(
         Sections of a setup file.
     covariance
         That by the uncertainties in its sections: it holds where the set-up is not as it was
-        checked. A check that has not every quantity is no check of the set-up.
+        checked. A check that has not every one of the `FIRST` quantities is no check of the set-up;
+        of those that came later it took as exact what it has not.
     """
     section = values.get(SECTION)
-    if section is None or len(section["quantities"]) < len(INDEX) or changed_since_check(values):
+    if section is None or changed_since_check(values):
+        return covariance, False
+    if {one.key for one in QUANTITIES[:FIRST]} - {one["key"] for one in section["quantities"]}:
         return covariance, False
     at = [INDEX[one["key"]] for one in section["quantities"]]
     sigma = np.array([one["sigma"] for one in section["quantities"]], float)
@@ -212,7 +217,8 @@ def check_values(
     made[SECTION] = {
         "date": date,
         "pictures": [one.picture.name for one in check.pictures],
-        "mirrors": [one.picture.mirror.name for one in check.pictures],
+        "mirrors": [mirror_text(one.picture.mirror) for one in check.pictures],
+        "free": list(check.free),
         "quantities": quantities,
         "correlation": [[round(float(c), 9) for c in row] for row in correlation],
         "given": _given(merged, keys),
@@ -247,10 +253,11 @@ def unchecked_values(values: Mapping[str, Any]) -> dict[str, dict[str, object]]:
 
 
 def _value(values: Mapping[str, Any], key: str) -> float:
-    """A quantity's value in a file; NaN where it has none, 0 where its key may be left out."""
+    """A quantity's value in a file; NaN where it has none, the default one for a key left out."""
     section, _, name = key.partition(".")
     name, _, axis = name.partition("[")
-    found = values.get(section, {}).get(name, [np.nan, np.nan] if axis else 0.0)
+    lacking = [np.nan, np.nan] if axis else _DEFAULTS.get(key, np.nan)
+    found = values.get(section, {}).get(name, lacking)
     return float(found["uv".index(axis[0])] if axis else found)
 
 

@@ -12,6 +12,7 @@ FORMS = "plate:HEIGHT, cap:DIAMETER:HEIGHT, ball:DIAMETER or ball:DIAMETER:TOP (
 """How mirrors are written."""
 
 _LARGEST_MM = 1000.0
+_SIZES = ("height_mm", "diameter_mm")
 
 
 def parse_mirror(text: str) -> Mirror:
@@ -39,6 +40,15 @@ def parse_mirror(text: str) -> Mirror:
         return maker(*(_number(one) for one in numbers))
     except ValueError:
         raise InputError("--mirror", "mirror", text, f"one of {FORMS}") from None
+
+
+def mirror_text(mirror: Mirror) -> str:
+    """Write a mirror with the standard uncertainties of its sizes: inverse of `parse_mirror`."""
+    known = dict(zip(mirror.parameters, zip(mirror.pose, mirror.sigma, strict=True), strict=True))
+    sizes = [
+        f"{value:.9g}+-{sigma:.9g}" for name, (value, sigma) in known.items() if name in _SIZES
+    ]
+    return ":".join([type(mirror).__name__.lower(), *reversed(sizes)])
 
 
 def _number(text: str) -> tuple[float, float | None]:

@@ -222,13 +222,16 @@ def checked_setup(text: str, path: str | os.PathLike[str], check: BenchCheck, da
     Raises
     ------
     InputError
-        If the text is no valid setup, or another one than the check was made with.
+        If the text is no valid setup, or another one than the check was made with; or if a quantity
+        has become impossible.
     """
     if not same_setup(check.before, parse_setup(text, Path(path)).rig):
         changed = "changed since the pictures were checked with it"
         raise InputError(path, "set-up", changed, "the set-up of the check: check it again")
     values = parse_toml(text, Path(path), A_SETUP)
-    return updated_setup(text, path, _keeping_sigmas(check_values(check, values, date), values))
+    made = updated_setup(text, path, _keeping_sigmas(check_values(check, values, date), values))
+    parse_setup(made, Path(path))
+    return made
 
 
 def unchecked_setup(text: str, path: str | os.PathLike[str]) -> str:
@@ -418,7 +421,8 @@ def _rig(values: dict[str, Any], calibration: ImageCalibration) -> Rig:
     given = {
         f"{section}.{key}": sigma for section in values for key, sigma in values[section].items()
     }
-    covariance, assumed = covariance_of(given, correlation)
+    has_glass = plane.get("glass_mm", 0.0) > 0.0
+    covariance, assumed = covariance_of(given, correlation, has_glass=has_glass)
     covariance, checked = checked_covariance(values, covariance)
     return Rig(
         Laser(**laser),

@@ -27,7 +27,7 @@ _COUNT = Rule(
 )
 _TILT = between(-90, 90, "degrees", required=False)
 _AIM = within(-LARGEST_MM, LARGEST_MM, "mm", required=False)
-_LARGEST_SIGMA = {"mm": LARGEST_MM, "°": 90.0, "px": 1e4, "%": 100.0}
+_LARGEST_SIGMA = {"mm": LARGEST_MM, "°": 90.0, "px": 1e4, "%": 100.0, "": 4.0}
 
 
 def _sigmas(section: str) -> dict[str, Rule]:

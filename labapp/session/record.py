@@ -92,6 +92,10 @@ class MirrorPicture(ReadOnlyArrays):
     """Each of these sizes measured without its known value (`MeasuredSize.independent_mm`), and its
     standard uncertainty, mm; empty in older files.
     """
+    pose_sigma: tuple[tuple[str, float], ...] = ()
+    """Standard uncertainty of each parameter of the mirror's pose (`Mirror.parameters`), by its
+    name, as it was given; empty in older files.
+    """
 
 
 @dataclass(frozen=True)
@@ -108,6 +112,8 @@ class BenchCheckRecord(ReadOnlyArrays):
     after: FloatArray
     after_sigma: FloatArray
     """Their values and standard uncertainties before and after, shape (q,), in their units."""
+    free: tuple[str, ...] = ()
+    """Keys of what was not held by its uncertainty; in older files not kept."""
 
 
 @dataclass(frozen=True)

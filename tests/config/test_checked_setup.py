@@ -17,13 +17,13 @@ from labapp.config.setup import (
 )
 from labapp.core.bench_check.adjustment import Adjustment
 from labapp.core.bench_check.check import BenchCheck, adjusted_bench
-from labapp.core.geometry.uncertainty import INDEX, QUANTITIES
+from labapp.core.geometry.uncertainty import FIRST, INDEX, QUANTITIES, covariance_of
 from labapp.errors import InputError
 from tests.config.test_setup import HOMOGRAPHY, SETUP
 
 PATH = "setup.toml"
 DATE = "2026-11-24T12:00:00+00:00"
-SIGMA = np.array([one.assumed for one in QUANTITIES]) / 10
+SIGMA = np.sqrt(np.diag(covariance_of({})[0])) / 10
 OFFSET = SIGMA * np.where(np.arange(len(SIGMA)) % 2, 1, -1)
 
 
@@ -102,18 +102,38 @@ def test_a_correlation_that_rounding_made_indefinite_is_taken() -> None:
     rig = parse_setup(with_check(correlation=correlation.tolist()), PATH).rig
     assert rig.uncertainty is not None
     assert rig.uncertainty.status == "checked"
-    np.testing.assert_allclose(rig.uncertainty.correlation, correlation, atol=1e-5)
+    some = np.s_[:FIRST, :FIRST]  # there is no glass
+    np.testing.assert_allclose(rig.uncertainty.correlation[some], correlation[some], atol=1e-5)
     root = rig.uncertainty.root
     np.testing.assert_allclose(root @ root.T, rig.uncertainty.covariance, atol=1e-8)
 
 
-@pytest.mark.parametrize("count", [0, 1, len(QUANTITIES) - 1])
+@pytest.mark.parametrize("count", [0, 1, FIRST - 1])
 def test_a_check_of_some_quantities_is_no_check(count: int) -> None:
     some = quantities(count)
     text = with_check(quantities=some, correlation=np.eye(count).tolist())
     setup = parse_setup(text, PATH)
     assert status(text) == "entered"
     assert not setup.checked
+
+
+def test_a_check_of_before_there_were_more_quantities_still_counts() -> None:
+    """It took the later ones as they were, and had them in `given`."""
+    text = checked_text()
+    later = {one.key for one in QUANTITIES[FIRST:]}
+    values = tomlkit.parse(text).unwrap()
+    given = values["bench_check"]["given"]
+    for key in later:
+        section, _, name = key.partition(".")
+        given[key] = values[section][name]
+    old = with_check(
+        text, quantities=quantities(FIRST), correlation=np.eye(FIRST).tolist(), given=given
+    )
+    known = parse_setup(old, PATH).rig.uncertainty
+    assert known is not None
+    assert known.status == "checked"
+    np.testing.assert_allclose(known.sigma, np.where(np.arange(len(SIGMA)) < FIRST, SIGMA, 0.0))
+    assert status(changed(old, "image_calibration", x_axis_mm=70.0)) == "entered"
 
 
 def test_a_quantity_that_is_known_exactly_stays_so_in_a_check() -> None:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from labapp.config.setup import read_setup, update_setup
 from labapp.core.geometry.rig import Laser
-from labapp.core.geometry.uncertainty import ANGLE, DISTANCE, INDEX, QUANTITIES
+from labapp.core.geometry.uncertainty import ANGLE, DISTANCE, GLASS, INDEX, QUANTITIES
 from labapp.errors import InputError
 
 SETUP = """\
@@ -351,8 +351,9 @@ def test_a_setup_of_before_is_the_ideal_bench_with_usual_uncertainties(path: Pat
     assert setup.rig.laser == Laser(31.14, 31.48)
     assert setup.calibration.lens is None
     assert known is not None
-    assert known.assumed == {one.key for one in QUANTITIES}
-    np.testing.assert_allclose(known.sigma, [one.assumed for one in QUANTITIES])
+    assert known.assumed == {one.key for one in QUANTITIES} - GLASS
+    usual = [0.0 if one.key in GLASS else one.assumed for one in QUANTITIES]
+    np.testing.assert_allclose(known.sigma, usual)
 
 
 @pytest.mark.parametrize(
@@ -379,7 +380,21 @@ def test_a_lens_may_be_known_by_its_uncertainty_alone(path: Path) -> None:
     )
     assert setup.calibration.lens is None
     assert setup.rig.uncertainty is not None
-    assert setup.rig.uncertainty.sigma[-1] == 0.0
+    assert setup.rig.uncertainty.sigma[INDEX["camera_lens.distortion_percent"]] == 0.0
+
+
+def test_glass_and_places_on_the_axes_have_uncertainties(path: Path) -> None:
+    given = {
+        "imaging_plane": {"glass_mm": 3.0, "glass_index_sigma": 0.005},
+        "image_calibration": {"x_axis_mm_sigma": 0.02},
+    }
+    update_setup(path, given)
+    known = read_setup(path).rig.uncertainty
+    assert known is not None
+    keys = [f"imaging_plane.glass_{one}" for one in ("mm", "index")]
+    keys += [f"image_calibration.{axis}_axis_mm" for axis in "xz"]
+    np.testing.assert_allclose(known.sigma[[INDEX[key] for key in keys]], [0.1, 0.005, 0.02, 0.1])
+    assert known.assumed & set(keys) == {keys[0], keys[3]}
 
 
 def test_glass_and_welding_direction_are_read(path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from dataclasses import replace
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 from labapp.config.bench_check import changed_since_check
-from labapp.config.mirror_text import parse_mirror
+from labapp.config.mirror_text import mirror_text, parse_mirror
 from labapp.config.setup import checked_setup, parse_setup, unchecked_setup
 from labapp.core.bench_check.adjustment import adjust
 from labapp.core.bench_check.check import BenchCheck, check_bench
@@ -192,6 +193,9 @@ def test_a_check_is_kept_in_the_setup_file_until_something_is_changed():
     assert check.status == "ok"
     assert check.verdict == "noise-like"
     text = checked_setup(TEXT, "setup.toml", check, "2026-11-24T12:00:00+00:00")
+    section = tomllib.loads(text)["bench_check"]
+    assert section["free"] == []
+    assert section["mirrors"] == ["plate:0+-0.02", "cap:9.75+-0.02:0.91+-0.005"]
     checked = parse_setup(text, "setup.toml")
     known = checked.rig.uncertainty
     assert known is not None
@@ -205,7 +209,8 @@ def test_a_check_is_kept_in_the_setup_file_until_something_is_changed():
         checked.calibration.to_image(checked.calibration.to_plane(places)), places, atol=1e-6
     )
     moved = text.replace("width_mm = 101.6", "width_mm = 101.7", 1)
-    for changed in (moved, text.replace("x_axis_mm = 69.85", "x_axis_mm = 69.9")):
+    farther = re.sub("(?m)^x_axis_mm = .*$", "x_axis_mm = 69.95", text)
+    for changed in (moved, farther):
         again = parse_setup(changed, "setup.toml").rig.uncertainty
         assert again is not None
         assert again.status == "entered"
@@ -380,6 +385,10 @@ def test_pictures_are_forecast_to_help():
 )
 def test_mirrors_are_read(text: str, mirror: Mirror):
     assert parse_mirror(text) == mirror
+    written = parse_mirror(mirror_text(mirror))
+    np.testing.assert_allclose(written.pose, mirror.pose)
+    np.testing.assert_allclose(written.sigma, mirror.sigma)
+    assert type(written) is type(mirror)
 
 
 @pytest.mark.parametrize(

@@ -8,9 +8,15 @@ import numpy as np
 import pytest
 
 from labapp.core.geometry.coordinates import ImageCalibration, Lens
-from labapp.core.geometry.perturbation import moved_bench, moved_dots, moved_rig
+from labapp.core.geometry.perturbation import (
+    moved_bench,
+    moved_dots,
+    moved_rig,
+    quantity_values,
+)
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.geometry.uncertainty import (
+    FIRST,
     INDEX,
     QUANTITIES,
     AxisPoints,
@@ -48,8 +54,12 @@ def test_every_quantity_of_the_bench_moves_what_it_names():
             imaging_plane_h_mm=0.1,
             imaging_plane_roll_deg=0.6,
             imaging_plane_pitch_deg=-0.4,
+            imaging_plane_glass_mm=0.3,
+            imaging_plane_glass_index=0.02,
         ),
     )
+    assert rig.imaging_plane.glass_mm == pytest.approx(0.3)
+    assert rig.imaging_plane.glass_index == pytest.approx(1.52)
     assert rig.laser == Laser(31.14, 31.98, 1.0, 0.0, -0.3)
     assert rig.pattern.rotation_deg == 2.0
     assert rig.pattern.inter_beam_angle_deg == pytest.approx(0.78)
@@ -75,6 +85,29 @@ def test_dots_follow_the_image_calibration(lens: Lens | None, percent: float):
     assert np.abs(moved - DOTS).max() > 0.3
 
 
+def test_dots_lie_farther_out_where_the_axis_points_do():
+    by = offset(image_calibration_x_axis_mm=0.6985, image_calibration_z_axis_mm=-0.3175)
+    np.testing.assert_allclose(moved_dots(DOTS, RIG, AXES, by), DOTS * [1.01, 0.99], rtol=1e-9)
+    rig = replace(RIG, uncertainty=RigUncertainty(AXES, *covariance_of({})))
+    np.testing.assert_allclose(quantity_values(moved_bench(rig, by)[0]) - quantity_values(rig), by)
+
+
+def test_a_glass_is_uncertain_where_there_is_one():
+    given = {"imaging_plane.glass_mm_sigma": 0.3}
+    at = [INDEX["imaging_plane.glass_mm"], INDEX["imaging_plane.glass_index"]]
+    for has_glass, sigma in ((False, (0.3, 0.0)), (True, (0.3, 0.02))):
+        covariance, assumed = covariance_of(given, has_glass=has_glass)
+        np.testing.assert_allclose(np.sqrt(np.diag(covariance)[at]), sigma)
+        assert ("imaging_plane.glass_index" in assumed) == has_glass
+
+
+def test_a_covariance_of_the_first_quantities_has_the_others_exact():
+    before = RigUncertainty(AXES, covariance_of({})[0][:FIRST, :FIRST])
+    assert before.covariance.shape == (len(QUANTITIES), len(QUANTITIES))
+    assert not before.sigma[FIRST:].any()
+    assert before.sigma[:FIRST].all()
+
+
 def test_distortion_moves_the_corner_by_its_share_and_the_centre_not_at_all():
     by = offset(camera_lens_distortion_percent=1.0)
     corner, center = np.array([101.6, 101.6]), np.array([50.8, 50.8])
@@ -87,4 +120,4 @@ def test_angle_and_distance_of_the_laser_may_be_correlated():
     covariance, assumed = covariance_of(told, 0.5)
     assert covariance[0, 1] == covariance[1, 0] == pytest.approx(0.04)
     assert np.count_nonzero(covariance - np.diag(np.diag(covariance))) == 2
-    assert len(assumed) == len(QUANTITIES) - 2
+    assert len(assumed) == len(QUANTITIES) - 4  # these two, and no glass

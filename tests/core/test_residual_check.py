@@ -8,7 +8,12 @@ import numpy as np
 import pytest
 
 from labapp.core.geometry.rig import ImagingPlane
-from labapp.core.geometry.uncertainty import AxisPoints, RigUncertainty, covariance_of
+from labapp.core.geometry.uncertainty import (
+    QUANTITIES,
+    AxisPoints,
+    RigUncertainty,
+    covariance_of,
+)
 from labapp.core.match import Match
 from labapp.core.pipeline import Measurement
 from labapp.core.recording.residual_check import MOST, ResidualRecord
@@ -23,7 +28,17 @@ RIG = replace(BENCH_RIG, uncertainty=KNOWN)
 EXACT = replace(BENCH_RIG, uncertainty=None)
 
 
-def frames(truth, count=8, seed=0, noise_mm=0.02, growth=0.0):
+CENTER_MM = np.array([50.8, 50.8])
+
+
+def bent(plane_mm, by_percent, center_mm):
+    """Dots seen through a lens whose distortion has a centre."""
+    out = plane_mm - center_mm
+    square = np.sum(out**2, axis=-1, keepdims=True) / np.sum(CENTER_MM**2)
+    return plane_mm + by_percent / 100.0 * square * out
+
+
+def frames(truth, count=8, seed=0, noise_mm=0.02, growth=0.0, lens=lambda plane_mm: plane_mm):
     """Frames of a pool that swings, seen on a bench, and fitted on what it is taken for."""
     rng = np.random.default_rng(seed)
     for n in range(count):
@@ -32,7 +47,7 @@ def frames(truth, count=8, seed=0, noise_mm=0.02, growth=0.0):
         pool = egg(6.6 * by, 3.0 * by, 4.2 * by, 0.29 * by, (0.0, -0.6), (swing,))
         seen = trace(pool, truth)
         ray = np.argwhere(seen.visible) + 1
-        dots = seen.plane_mm[seen.visible] + rng.normal(0, noise_mm, (len(ray), 2))
+        dots = lens(seen.plane_mm[seen.visible]) + rng.normal(0, noise_mm, (len(ray), 2))
         witness = np.where(seen.visible, 1, np.where(seen.lit | seen.absent, 0, -1))
         covariance = np.broadcast_to(noise_mm**2 * np.eye(2), (len(ray), 2, 2))
         index = np.arange(len(ray))
@@ -41,8 +56,8 @@ def frames(truth, count=8, seed=0, noise_mm=0.02, growth=0.0):
         yield Measurement("ok", "", "fit", match=match, reconstruction=made)
 
 
-def verdict_of(measured):
-    record = ResidualRecord(RIG)
+def verdict_of(measured, rig=RIG):
+    record = ResidualRecord(rig)
     for one in measured:
         record.add(one)
     return record.verdict()
@@ -55,17 +70,33 @@ def test_right_set_up_is_not_doubted(seed):
 
 def test_rolled_plane_is_doubted_and_named():
     plane = BENCH_RIG.imaging_plane
-    rolled = ImagingPlane.of_angles(plane.origin_mm, (0, 0, 3.0), plane.width_mm, plane.height_mm)
+    rolled = ImagingPlane.of_angles(plane.origin_mm, (0, 0, 3.5), plane.width_mm, plane.height_mm)
     found = verdict_of(frames(replace(BENCH_RIG, imaging_plane=rolled)))
     assert found.is_doubtful
     roll = next(one for one in found.suspects if "roll" in one.name)
-    assert roll.off == pytest.approx(3.0, abs=0.8)
+    assert roll.off == pytest.approx(3.5, abs=0.8)
 
 
 def test_error_that_is_not_off_by_more_than_known_is_not_doubted():
     plane = BENCH_RIG.imaging_plane
     rolled = ImagingPlane.of_angles(plane.origin_mm, (0, 0, 0.4), plane.width_mm, plane.height_mm)
     assert not verdict_of(frames(replace(BENCH_RIG, imaging_plane=rolled))).is_doubtful
+
+
+def test_lens_that_looks_beside_the_plane_s_middle_is_no_doubt():
+    """A checked bench knows how much its picture is distorted, and not about which centre."""
+    calibration = BENCH_VIEW.with_distortion(1.0, CENTER_MM)
+    sigma = {one.sigma_key: 0.02 * one.assumed for one in QUANTITIES}
+    known = RigUncertainty(AxisPoints(calibration, 69.85, 31.75), *covariance_of(sigma))
+
+    def left(plane_mm):
+        """What is left of the distortion, the check has moved the image calibration's points."""
+        off = bent(plane_mm, 1.0, CENTER_MM) - bent(plane_mm, 1.0, CENTER_MM - [22.0, 5.0])
+        ones = np.column_stack([plane_mm, np.ones(len(plane_mm))])
+        return plane_mm + off - ones @ np.linalg.lstsq(ones, off, rcond=None)[0]
+
+    found = verdict_of(frames(BENCH_RIG, lens=left), replace(BENCH_RIG, uncertainty=known))
+    assert not found.is_doubtful
 
 
 def test_few_frames_say_nothing():

@@ -22,6 +22,10 @@ FREE = {"°": 20.0, "mm": 30.0, "px": 60.0, "%": 20.0}
 
 FREE_OWN = {
     "pattern.inter_beam_angle_deg": 0.4,
+    "imaging_plane.glass_mm": 5.0,
+    "imaging_plane.glass_index": 0.5,
+    "image_calibration.x_axis_mm": 10.0,
+    "image_calibration.z_axis_mm": 10.0,
     "picture.u": 200.0,
     "picture.v": 200.0,
     "picture.scale": 50.0,
@@ -117,4 +121,5 @@ def find_suspects(
 
 def _free(one: Direction) -> FloatArray:
     """Offset of the quantities by the standard uncertainty of a direction that is freed."""
-    return FREE_OWN.get(one.key, FREE[one.unit]) * one.vector
+    free = FREE_OWN[one.key] if one.key in FREE_OWN else FREE[one.unit]
+    return free * one.vector

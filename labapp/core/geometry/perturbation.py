@@ -19,9 +19,10 @@ _LASER, _PATTERN, _PLANE = (
     [(key.partition(".")[2], k) for key, k in INDEX.items() if key.startswith(f"{section}.")]
     for section in ("laser", "pattern", "imaging_plane")
 )
-_POINTS = [k for key, k in INDEX.items() if key.startswith("image_calibration.")]
+_POINTS = [k for key, k in INDEX.items() if key.startswith("image_calibration.") and key[-1] == "]"]
+_AXES = [INDEX[f"image_calibration.{axis}_axis_mm"] for axis in "xz"]
 _DISTORTION = INDEX["camera_lens.distortion_percent"]
-_PICTURE = [*_POINTS, _DISTORTION]
+_PICTURE = [*_POINTS, *_AXES, _DISTORTION]
 
 
 @dataclass(frozen=True)
@@ -75,7 +76,9 @@ def moved_rig(rig: Rig, offset: FloatArray) -> Rig:
         pitch, yaw, roll = np.add(plane.angles_deg, turned).tolist()
         posed = ImagingPlane.of_angles(origin, (pitch, yaw, roll))
         axes = posed.x_axis, posed.z_axis
+        glass = plane.glass_mm + by["glass_mm"], plane.glass_index + by["glass_index"]
         plane = replace(plane, origin_mm=origin, x_axis=axes[0], z_axis=axes[1])
+        plane = replace(plane, glass_mm=glass[0], glass_index=glass[1])
     return replace(
         rig,
         laser=replace(rig.laser, **laser),
@@ -116,8 +119,8 @@ def moved_calibration(
 ) -> ImageCalibration:
     """Image calibration with its points and its distortion on the plane off by an offset, (q,).
 
-    What was taken for the moved points is where the true ones are. The camera's lens stays as it
-    is, its centre too.
+    What was taken for the moved points is where the true ones are; how far along the axes these lie
+    may be off, too. The camera's lens stays as it is, its centre too.
     """
     calibration = axes.calibration
     base = ImageCalibration(calibration.matrix, calibration.plain_lens)
@@ -126,7 +129,8 @@ def moved_calibration(
     true = _with_ones(base.ideal_px(base.to_image(plane_mm)))
     moved = base.ideal_px(base.to_image(plane_mm) + offset[_POINTS].reshape(3, 2))
     back = np.linalg.solve(_with_ones(moved), true).T
-    made = ImageCalibration(base.matrix @ back, base.lens)
+    stretch = np.diag([*(1.0 + offset[_AXES] / [axes.x_mm, axes.z_mm]), 1.0])
+    made = ImageCalibration(stretch @ base.matrix @ back, base.lens)
     return made.with_distortion(percent, _half_mm(plane))
 
 
@@ -138,7 +142,8 @@ def moved_bench(rig: Rig, offset: FloatArray) -> tuple[Rig, ImageCalibration]:
     assert rig.uncertainty is not None
     axes = rig.uncertainty.axes
     calibration = moved_calibration(axes, rig.imaging_plane, offset)
-    uncertainty = replace(rig.uncertainty, axes=replace(axes, calibration=calibration))
+    x_mm, z_mm = np.add([axes.x_mm, axes.z_mm], offset[_AXES]).tolist()
+    uncertainty = replace(rig.uncertainty, axes=AxisPoints(calibration, x_mm, z_mm))
     return replace(moved_rig(rig, offset), uncertainty=uncertainty), calibration
 
 
@@ -149,6 +154,7 @@ def quantity_values(rig: Rig) -> FloatArray:
     x_mm, y_mm, z_mm = plane.origin_mm.tolist()
     at = {"distance_mm": -y_mm, "s_mm": -x_mm, "h_mm": z_mm}
     at |= dict(zip(("pitch_deg", "yaw_deg", "roll_deg"), plane.angles_deg, strict=True))
+    at |= {"glass_mm": plane.glass_mm, "glass_index": plane.glass_index}
     values = np.zeros(len(INDEX))
     for part, names in ((rig.laser, _LASER), (rig.pattern, _PATTERN)):
         for name, k in names:
@@ -157,6 +163,7 @@ def quantity_values(rig: Rig) -> FloatArray:
         values[k] = at[name]
     base = ImageCalibration(axes.calibration.matrix, axes.calibration.plain_lens)
     values[_POINTS] = base.to_image(_axis_points_mm(axes)).ravel()
+    values[_AXES] = axes.x_mm, axes.z_mm
     values[_DISTORTION] = axes.calibration.distortion_percent
     return values
 

@@ -64,15 +64,29 @@ QUANTITIES = (
     *_point("x_axis_px", "image calibration, point on O′X′"),
     *_point("z_axis_px", "image calibration, point on O′Z′"),
     Quantity("camera_lens.distortion_percent", "lens, distortion in the plane's corner", "%", 0.5),
+    Quantity("imaging_plane.glass_mm", "glass, thickness", "mm", 0.1),
+    Quantity("imaging_plane.glass_index", "glass, refractive index", "", 0.02),
+    Quantity(
+        "image_calibration.x_axis_mm", "image calibration, X′ of the point on O′X′", "mm", 0.1
+    ),
+    Quantity(
+        "image_calibration.z_axis_mm", "image calibration, Z′ of the point on O′Z′", "mm", 0.1
+    ),
 )
-"""All of them, in the order of vectors and matrices."""
+"""All of them, in the order of vectors and matrices: those that came later at the end."""
 
 INDEX = {quantity.key: k for k, quantity in enumerate(QUANTITIES)}
+
+FIRST = 20
+"""So many were there at first; what knows of these only takes the others as exact."""
+
+GLASS = frozenset({"imaging_plane.glass_mm", "imaging_plane.glass_index"})
+"""Keys of what is known exactly of a plane without glass."""
 
 CALIBRATED = frozenset(
     one.key
     for one in QUANTITIES
-    if one.key.startswith("image_calibration.")
+    if (one.key.startswith("image_calibration.") and one.key.endswith("]"))
     or one.key in ("laser.projection_angle_deg", "laser.distance_mm")
 )
 """Keys of what steps 2 and 3 calibrate (Appendix I, §5.1)."""
@@ -106,7 +120,8 @@ class RigUncertainty(ReadOnlyArrays):
     axes
         The image calibration and its points.
     covariance
-        Of `QUANTITIES`, shape (q, q), in the squares of their units.
+        Of `QUANTITIES`, shape (q, q), in the squares of their units. One of the first of them only
+        has the others known exactly.
     assumed
         Keys of the quantities whose uncertainty was not given.
     checked
@@ -117,6 +132,12 @@ class RigUncertainty(ReadOnlyArrays):
     covariance: FloatArray
     assumed: frozenset[str] = frozenset()
     checked: bool = False
+
+    def __post_init__(self) -> None:
+        later = len(QUANTITIES) - len(self.covariance)
+        if later:
+            object.__setattr__(self, "covariance", np.pad(self.covariance, (0, later)))
+        super().__post_init__()
 
     @property
     def sigma(self) -> FloatArray:
@@ -158,7 +179,7 @@ class RigUncertainty(ReadOnlyArrays):
 
 
 def covariance_of(
-    given: Mapping[str, float], laser_correlation: float = 0.0
+    given: Mapping[str, float], laser_correlation: float = 0.0, *, has_glass: bool = False
 ) -> tuple[FloatArray, frozenset[str]]:
     """Covariance of `QUANTITIES`, shape (q, q), and the keys of those that are assumed.
 
@@ -168,9 +189,14 @@ def covariance_of(
         Standard uncertainties by `Quantity.sigma_key`, in their units.
     laser_correlation
         Of projection angle and distance, which Appendix I takes from the same lengths.
+    has_glass
+        Whether there is a glass on the imaging plane, which is known exactly where there is none.
     """
-    sigma = np.array([given.get(one.sigma_key, one.assumed) for one in QUANTITIES], float)
+    exact = frozenset() if has_glass else GLASS
+    usual = [0.0 if one.key in exact else one.assumed for one in QUANTITIES]
+    sigma = np.array([given.get(o.sigma_key, s) for o, s in zip(QUANTITIES, usual, strict=True)])
     covariance = np.diag(sigma**2)
     shared = laser_correlation * sigma[ANGLE] * sigma[DISTANCE]
     covariance[ANGLE, DISTANCE] = covariance[DISTANCE, ANGLE] = shared
-    return covariance, frozenset(one.key for one in QUANTITIES if one.sigma_key not in given)
+    lacking = frozenset(one.key for one in QUANTITIES if one.sigma_key not in given)
+    return covariance, lacking - exact

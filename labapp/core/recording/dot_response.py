@@ -20,7 +20,7 @@ from labapp.core.geometry.optics import (
     surface_normal,
 )
 from labapp.core.geometry.perturbation import moved_dots, moved_rig
-from labapp.core.geometry.rig import Rig
+from labapp.core.geometry.rig import ImagingPlane, Rig
 from labapp.core.geometry.uncertainty import QUANTITIES
 from labapp.core.surface.spline import SplineSurface
 from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
@@ -50,10 +50,14 @@ class DotResponse(ReadOnlyArrays):
     by_quantity
         Computed minus captured dots, less what is absorbed, for each of `QUANTITIES` off by one
         unit, shape (2m, q), mm.
+    by_lens_center
+        The same, but for its sign, of a distortion of 1 % in the plane's corner whose centre lies 1
+        mm off the plane's middle, along X′ and Z′, shape (2m, 2), mm.
     """
 
     absorbed: FloatArray
     by_quantity: FloatArray
+    by_lens_center: FloatArray
 
     def unabsorbed(self, dots: FloatArray) -> FloatArray:
         """What no surface could explain of changes of the dots, shape (m, 2): shape (2m,)."""
@@ -85,24 +89,28 @@ def dot_responses(
     known, responses
         Which rays meet all surfaces and the plane, shape (n,); the responses of these m.
     """
-    every = [(_by_spline(rig, one, ray), _by_quantity(rig, one, ray)) for one in surfaces]
+    every = [(_by_spline(rig, one, ray), *_by_bench(rig, one, ray)) for one in surfaces]
     known = np.isfinite(np.concatenate(sum(every, ()), axis=-1)).all(axis=(1, 2))
-    return np.asarray(known), [_response(by[known], moved[known]) for by, moved in every]
+    return np.asarray(known), [_response(*(by[known] for by in one)) for one in every]
 
 
-def _response(by_spline: FloatArray, by_quantity: FloatArray) -> DotResponse:
-    rows, moved = (every.reshape(2 * len(every), -1) for every in (by_spline, by_quantity))
+def _response(
+    by_spline: FloatArray, by_quantity: FloatArray, by_lens_center: FloatArray
+) -> DotResponse:
+    count = 2 * len(by_spline)
+    rows = by_spline.reshape(count, -1)
     square, basis = np.linalg.eigh(rows @ rows.T)
     absorbed = basis[:, square > CLOSED * np.max(square, initial=0.0)]
-    return DotResponse(absorbed, _without(absorbed, moved))
+    moved = (_without(absorbed, by.reshape(count, -1)) for by in (by_quantity, by_lens_center))
+    return DotResponse(absorbed, *moved)
 
 
 def _without(absorbed: FloatArray, moved: FloatArray) -> FloatArray:
     return np.asarray(moved - absorbed @ (absorbed.T @ moved))
 
 
-def _by_quantity(rig: Rig, surface: SplineSurface, ray: IntArray) -> FloatArray:
-    """Change of computed minus captured dots on one surface, shape (n, 2, q)."""
+def _by_bench(rig: Rig, surface: SplineSurface, ray: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Changes of the dots of one surface: by each quantity, (n, 2, q); by the lens's centre."""
     from labapp.core.surface import kernels
 
     assert rig.uncertainty is not None
@@ -122,7 +130,16 @@ def _by_quantity(rig: Rig, surface: SplineSurface, ray: IntArray) -> FloatArray:
             for offset in (way * step * np.eye(len(QUANTITIES))[k] for way in (1.0, -1.0))
         )
         changes.append((more - less) / (2.0 * step))
-    return np.stack(changes, axis=-1)
+    return np.stack(changes, axis=-1), _by_lens_center(dots, rig.imaging_plane)
+
+
+def _by_lens_center(plane_mm: FloatArray, plane: ImagingPlane) -> FloatArray:
+    """Change of dots, shape (n, 2, 2), see `DotResponse.by_lens_center`."""
+    half = np.array([plane.width_mm, plane.height_mm]) / 2
+    out = plane_mm - half
+    square = np.sum(out**2, axis=-1)[:, None, None]
+    outer = out[:, :, None] * out[:, None]
+    return np.asarray((square * np.eye(2) + 2.0 * outer) / 100.0 / np.sum(half**2))
 
 
 def _by_spline(rig: Rig, surface: SplineSurface, ray: IntArray) -> FloatArray:

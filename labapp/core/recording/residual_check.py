@@ -53,6 +53,10 @@ have of spots that overlap and of shapes that no spline has."""
 NONLINEAR = 0.05
 """And as a share of all that no surface absorbs: the response is linear to that share."""
 
+LENS_CENTER = 0.25
+"""Standard uncertainty of the centre of the distortion on the plane, which is taken for the plane's
+middle, along either axis, over half of the plane's shorter side."""
+
 VISIBLE_MM = 1e-3
 """A quantity that leaves less for its assumed uncertainty cannot be seen."""
 
@@ -67,7 +71,12 @@ NO_MATCH = frozenset({"no-match", "no-reference", "ambiguous-rows", "no-rows", "
 DOUBTFUL = "doubtful"
 """`Measurement.setup_status` of a set-up that its recording contradicts."""
 
-FIXED = ("image_calibration.", "pattern.inter_beam_angle_deg", "camera_lens.")
+FIXED = (
+    "image_calibration.",
+    "imaging_plane.glass_",
+    "pattern.inter_beam_angle_deg",
+    "camera_lens.",
+)
 """Keys of what cannot change during a recording begin so."""
 
 
@@ -256,12 +265,13 @@ def judge_setup(
         ]
     )
     patterns = np.array([one.by_quantity for one in responses])
+    centers = _lens_center_sigma(rig) * np.array([one.by_lens_center for one in responses])
     freedom, root = responses[PARTS // 2].freedom, rig.uncertainty.root
-    pattern, change = patterns.mean(axis=0), patterns[-1] - patterns[0]
+    pattern, uncertain = patterns.mean(axis=0), np.concatenate([patterns @ root, centers], axis=-1)
     bent = NONLINEAR * _rms(left)
-    mean = _Left(left.mean(axis=0), pattern, pattern @ root, freedom, bent)
+    mean = _Left(left.mean(axis=0), pattern, uncertain.mean(axis=0), freedom, bent)
     # A set-up that is off leaves something else where the pool has become another.
-    drift = _Left(left[-1] - left[0], pattern, change @ root, freedom, bent)
+    drift = _Left(left[-1] - left[0], pattern, uncertain[-1] - uncertain[0], freedom, bent)
     every = directions(rig)
     moved = drift.suspects([one for one in every if not one.key.startswith(FIXED)], is_drift=True)
     off = mean.suspects(every, is_drift=False)
@@ -269,6 +279,15 @@ def judge_setup(
         said = f"the residuals of {len(samples)} frames do not contradict it"
         return SetupVerdict(False, said)
     return SetupVerdict(True, _reason(moved or off, len(samples)), (*moved, *off))
+
+
+def _lens_center_sigma(rig: Rig) -> float:
+    """Standard uncertainty of the distortion's centre times the distortion, mm·percent."""
+    known, plane = rig.uncertainty, rig.imaging_plane
+    assert known is not None
+    sigma = float(known.sigma[INDEX["camera_lens.distortion_percent"]])
+    reach = min(plane.width_mm, plane.height_mm) / 2
+    return LENS_CENTER * reach * float(np.hypot(known.axes.calibration.distortion_percent, sigma))
 
 
 def _by_ray(samples: Sequence[Residuals], shape: tuple[int, int]) -> tuple[IntArray, FloatArray]:
@@ -296,7 +315,8 @@ class _Left(ReadOnlyArrays):
     by_quantity
         Response to each of `QUANTITIES`, shape (2m, q).
     uncertain
-        Root of the covariance that the set-up's uncertainty gives it, shape (2m, q).
+        Root of the covariance that the uncertainties of the set-up and of the centre of the lens's
+        distortion give it, shape (2m, q + 2).
     freedom
         Degrees of freedom.
     bent_mm
@@ -335,7 +355,8 @@ class _Left(ReadOnlyArrays):
         """Covariance of the residuals where the set-up is as it says, shape (2m, 2m), mm²."""
         left, count = self.residual_mm, len(self.residual_mm)
         assumed = np.array([one.assumed for one in QUANTITIES])
-        modes, size, _ = np.linalg.svd(self.by_quantity * assumed, full_matrices=False)
+        explained = np.column_stack([self.by_quantity * assumed, self.uncertain[:, -2:]])
+        modes, size, _ = np.linalg.svd(explained, full_matrices=False)
         modes = modes[:, size > VISIBLE_MM * np.sqrt(count)]
         unexplained = left - modes @ (modes.T @ left)
         noise = float(np.sum(unexplained**2)) / (self.freedom - modes.shape[1])

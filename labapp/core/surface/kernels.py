@@ -227,7 +227,7 @@ def _reflected_dot(
         at = point[axis] + distance * away[axis] - plane[0, axis]
         x += at * plane[1, axis]
         z += at * plane[2, axis]
-    if plane[4, 0] > 0.0:
+    if plane[4, 0] != 0.0:
         return _through_glass(x, z, away, along, plane)
     return x, z
 
@@ -322,7 +322,7 @@ def _slope_jacobian(
     by = plane[2]
     up = dot[0] + step * by[0], dot[1] + step * by[1], dot[2] + step * by[2]
     own = dot[0], dot[1], dot[2]
-    if plane[4, 0] > 0.0:
+    if plane[4, 0] != 0.0:
         own, across = _without_glass(point, own, plane), _without_glass(point, across, plane)
         up = _without_glass(point, up, plane)
     base_x, base_y = _bisecting_slopes(laser, point, own[0], own[1], own[2])
@@ -635,7 +635,7 @@ def gradient_rhs(
     are the inverse covariances of these slopes, shape (n, 2, 2).
     """
     out, work = np.zeros(len(coefficients)), np.empty((4, 4))
-    many, glass = int(grid[1, 3]) + 3, plane[4, 0] > 0.0
+    many, glass = int(grid[1, 3]) + 3, plane[4, 0] != 0.0
     for k in range(len(points)):
         x, y = points[k, 0], points[k, 1]
         _, slope_x, slope_y = _height_and_slopes(grid, coefficients, x, y, work)
@@ -1174,7 +1174,7 @@ def fit_quadrics(
                         dot[axis] = plane[0, axis] + place[0] * plane[1, axis]
                         dot[axis] += place[1] * plane[2, axis]
                     at = dot[0], dot[1], dot[2]
-                    if plane[4, 0] > 0.0:
+                    if plane[4, 0] != 0.0:
                         at = _without_glass(point, at, plane)
                     asked = _bisecting_slopes(laser, point, at[0], at[1], at[2])
                     x, y = point[0] - center[0], point[1] - center[1]

@@ -196,7 +196,7 @@ def check(
     columns = ("before", "before_sigma", "after", "after_sigma")
     values = {name: np.array([getattr(one, name) for one in changes]) for name in columns}
     keys = tuple(one.key for one in changes)
-    record = BenchCheckRecord(now(), tuple(kept), keys, **values)
+    record = BenchCheckRecord(now(), tuple(kept), keys, **values, free=tuple(free))
     return Checked(tuple(chosen), text, found, record, _height_sigmas(found, pool))
 
 

@@ -119,6 +119,10 @@ UNCERTAIN_ONLY = ("Image calibration", (
           "That point in the picture, along u and along v", 0, 10_000, 0.1, 2),
     Entry("image_calibration.z_axis_px_sigma", "Point on O′Z′", "px",
           "That point in the picture, along u and along v", 0, 10_000, 0.1, 2),
+    Entry("image_calibration.x_axis_mm_sigma", "Its X′", "mm",
+          "X′ of the point on O′X′", 0, 10_000, 0.1, 2),
+    Entry("image_calibration.z_axis_mm_sigma", "Its Z′", "mm",
+          "Z′ of the point on O′Z′", 0, 10_000, 0.1, 2),
     Entry("camera_lens.distortion_percent_sigma", "Lens distortion", "%",
           "Of the picture in the plane's corner, of its distance from the middle", 0, 100, 0.1, 2),
 ))  # fmt: skip
