@@ -327,7 +327,7 @@ def quantity_rows(record: BenchCheckRecord) -> tuple[QuantityRow, ...]:
     return tuple(rows)
 
 
-MIRROR_COLUMNS = ("True size, mm", "Adjusted", "Without it")
+MIRROR_COLUMNS = ("True, mm", "Adjusted", "Without it")
 
 
 def mirror_rows(record: BenchCheckRecord) -> tuple[tuple[str, str, str], ...]:

@@ -215,7 +215,7 @@ class SetupPage(Page):
         form.add_wide(self.refused)
         self.status = Message(3)
         form.add_wide(self.status)
-        self.sigma_words = wrapping_label()
+        self.sigma_words = Message(2)
         form.add_wide(self.sigma_words)
         for title, entries in RIG:
             form.add_heading(title)
