@@ -17,6 +17,8 @@ from labapp.errors import InputError
 from labapp.gui.pages.dots.lines import show_lines
 from labapp.gui.pages.setup import presenter as setup_page
 from labapp.gui.pages.surface import presenter as surface_page
+from labapp.gui.pages.trends import presenter as trends_page
+from labapp.session.line_trends import line_trend
 from labapp.session.session import Session
 from labapp.simulation.line_frames import LineLook, render_lines
 from labapp.simulation.pools import Pool, egg
@@ -69,7 +71,7 @@ def test_lines_are_exported_as_the_command_writes_them(session: Session, tmp_pat
     with (tmp_path / "out" / "features.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
     assert [row["lines"] for row in rows] == ["0", "5"]
-    assert [row["state"] for row in rows][0] == "no-pool"
+    assert rows[0]["state"] == "no-pool"
 
 
 @pytest.mark.slow
@@ -131,3 +133,15 @@ def test_the_drawing_shows_a_plane_of_light_for_each_line(tmp_path: Path):
         view = setup_page.bench(session).view
     assert view is not None
     assert [ray.row for ray in view.rays] == [1, 2, 3, 4, 5]
+
+
+@pytest.mark.slow
+def test_trends_show_lines_and_states(session: Session):
+    shown = trends_page.show(session, trends_page.TrendOptions())
+    curves = {curve.name: curve for curve in shown.curves}
+    assert curves["Lines"].y.tolist() == [0.0, 5.0]
+    assert curves["Pool height"].key is not None
+    assert curves["Pool height"].key.tolist() == [1]
+    found = line_trend(session)
+    assert found.states[0] == "no-pool"
+    assert [first for _, first, _ in found.stretches()] == [0, 1]

@@ -195,6 +195,8 @@ def provenance(result: Result) -> str:
     by_hand = result.measurement.correction is not None
     when = result.measured[:16].replace("T", " ")
     dots = "dots corrected by hand" if by_hand else "dots found automatically"
+    if result.measurement.lines is not None:
+        dots = "lines found automatically"
     scheme = SCHEMES[result.scheme].title if result.scheme in SCHEMES else result.scheme
     return f"Frame {result.frame} · {scheme} · {dots} · labapp {result.version} · {when}"
 

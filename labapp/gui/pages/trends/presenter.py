@@ -12,6 +12,7 @@ from labapp.core.recording.residual_check import DOUBTFUL as IN_DOUBT
 from labapp.core.values import IntArray
 from labapp.gui.curves import Axis, Curve, Mark
 from labapp.gui.digits import ResultRow, rounded
+from labapp.session.line_trends import LINE_QUANTITIES, line_trend
 from labapp.session.measured import Overview
 from labapp.session.session import Session
 from labapp.session.signals import Signals
@@ -70,6 +71,8 @@ class TrendsState:
 def show(session: Session, options: TrendOptions, seen: Overview | None = None) -> TrendsState:
     """What to show of a session; ``seen`` is its overview, if it is at hand."""
     seen, signals = seen or session.overview(), session.signals
+    if session.has_lines:
+        return _show_lines(session, options, seen)
     doubtful = doubtful_frames(seen)
 
     def course_of(key: str) -> Trend:
@@ -97,6 +100,50 @@ def show(session: Session, options: TrendOptions, seen: Overview | None = None) 
         spectrum_axis=spectrum_axis,
         spectrum_words=message,
         signals_words=_told_signals(signals, seen, timed),
+    )
+
+
+def _show_lines(session: Session, options: TrendOptions, seen: Overview) -> TrendsState:
+    """What lines show over the recording; they have no choice of measures and no spectrum."""
+    found = line_trend(session)
+    timed = bool(np.isfinite(seen.time_s).all()) and len(seen.time_s) > 0
+    at = seen.time_s if timed else seen.frame.astype(float)
+    span = (float(at.min()), float(at.max())) if len(at) else None
+    places = dict(zip(seen.frame.tolist(), at.tolist(), strict=True))
+    x = np.array([places[frame] for frame in found.frame.tolist()], float)
+    mark = np.where(found.stale, STALE, MEASURED).astype(np.int64)
+    none = np.full(len(x), np.nan)
+    curves = [
+        Curve(
+            name=words,
+            unit=unit,
+            x=x[known],
+            y=values[known],
+            sigma=(found.height_sigma_mm if name == "pool_height_mm" else none)[known],
+            key=found.frame[known],
+            mark=mark[known],
+            marks=MARKS,
+        )
+        for name, words, unit in LINE_QUANTITIES
+        if (known := np.isfinite(values := found.values[name])).any()
+    ]
+    if session.signals is not None and timed:
+        curves += _signal_curves(session.signals, seen, options.shown)
+    states = ", ".join(
+        f"{state} {first}–{last}" if last > first else f"{state} {first}"
+        for state, first, last in found.stretches()
+    )
+    return TrendsState(
+        curves=tuple(curves),
+        axis=Axis("Time", "s", span=span) if timed else Axis("Frame", "", 0, span=span),
+        places=places,
+        rows=(),
+        words=f"States by frame: {states}." if states else "No frame is measured yet.",
+        setup_words=session.setup_words,
+        spectrum=(),
+        spectrum_axis=Axis("Frequency", "Hz" if timed else "1/frame", 2 if timed else 4),
+        spectrum_words="",
+        signals_words=_told_signals(session.signals, seen, timed),
     )
 
 
