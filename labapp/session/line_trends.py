@@ -21,6 +21,10 @@ LINE_QUANTITIES = (
 """Name, words and unit of what is followed; the height only where lines determine it."""
 
 
+FEWEST = 60
+"""States are read from changes over some tens of frames: from so many that follow on each other."""
+
+
 @dataclass(frozen=True)
 class LineTrend(ReadOnlyArrays):
     """What the measured frames of a line pattern show; n frames."""
@@ -34,7 +38,9 @@ class LineTrend(ReadOnlyArrays):
     height_sigma_mm: FloatArray
     """Of the pool's height, without the set-up's part, shape (n,)."""
     states: tuple[State, ...]
-    """Of the pool in each frame (`line_states`)."""
+    """Of the pool in each frame (`line_states`); none where fewer than `FEWEST` frames, or not all
+    that follow on each other, were measured.
+    """
 
     def stretches(self) -> list[tuple[State, int, int]]:
         """Each state in turn, with its first and its last frame."""
@@ -60,6 +66,9 @@ def line_trend(session: SessionContents) -> LineTrend:
             numbers.append(number)
             stale.append(old)
             found.append(result.measurement.lines)
+    enough = len(found) >= FEWEST and bool(
+        (np.diff(np.searchsorted(seen.frame, numbers)) == 1).all()
+    )
     sure = [one.surface if one.status == "ok" else None for one in found]
     values = {
         name: np.array([getattr(one.features, name) for one in found], float)
@@ -73,5 +82,5 @@ def line_trend(session: SessionContents) -> LineTrend:
         stale=np.array(stale, bool),
         values=values | {"pool_height_mm": np.array(height, float)},
         height_sigma_mm=np.array(sigma, float),
-        states=line_states(LineSeries.of(found)) if found else (),
+        states=line_states(LineSeries.of(found)) if enough else (),
     )

@@ -13,12 +13,13 @@ import pytest
 from labapp.config.setup import parse_setup
 from labapp.core.geometry.line_pattern import LineRays
 from labapp.core.rows.correction import Correction
+from labapp.core.sequence.line_states import State
 from labapp.errors import InputError
 from labapp.gui.pages.dots.lines import show_lines
 from labapp.gui.pages.setup import presenter as setup_page
 from labapp.gui.pages.surface import presenter as surface_page
 from labapp.gui.pages.trends import presenter as trends_page
-from labapp.session.line_trends import line_trend
+from labapp.session.line_trends import LineTrend, line_trend
 from labapp.session.session import Session
 from labapp.simulation.line_frames import LineLook, render_lines
 from labapp.simulation.pools import Pool, egg
@@ -136,12 +137,17 @@ def test_the_drawing_shows_a_plane_of_light_for_each_line(tmp_path: Path):
 
 
 @pytest.mark.slow
-def test_trends_show_lines_and_states(session: Session):
+def test_trends_show_lines_and_no_states_of_few_frames(session: Session):
     shown = trends_page.show(session, trends_page.TrendOptions())
     curves = {curve.name: curve for curve in shown.curves}
     assert curves["Lines"].y.tolist() == [0.0, 5.0]
     assert curves["Pool height"].key is not None
     assert curves["Pool height"].key.tolist() == [1]
-    found = line_trend(session)
-    assert found.states[0] == "no-pool"
-    assert [first for _, first, _ in found.stretches()] == [0, 1]
+    assert line_trend(session).states == ()
+
+
+def test_states_in_turn():
+    frame, none = np.arange(5), np.zeros(5)
+    states: tuple[State, ...] = ("no-pool", "no-pool", "growing", "convex", "convex")
+    trend = LineTrend(frame, none > 0, {}, none, states)
+    assert trend.stretches() == [("no-pool", 0, 1), ("growing", 2, 2), ("convex", 3, 4)]

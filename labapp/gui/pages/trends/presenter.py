@@ -12,7 +12,7 @@ from labapp.core.recording.residual_check import DOUBTFUL as IN_DOUBT
 from labapp.core.values import IntArray
 from labapp.gui.curves import Axis, Curve, Mark
 from labapp.gui.digits import ResultRow, rounded
-from labapp.session.line_trends import LINE_QUANTITIES, line_trend
+from labapp.session.line_trends import FEWEST, LINE_QUANTITIES, line_trend
 from labapp.session.measured import Overview
 from labapp.session.session import Session
 from labapp.session.signals import Signals
@@ -28,6 +28,8 @@ MARKS = (
 MEASURED, CORRECTED, DOUBTFUL, STALE = range(4)
 
 FIRST_SHOWN = ("width_mm", "length_mm", "height_mm", "are_mm")
+
+NO_STATES = f"The pool's states are read from {FEWEST} frames or more, measured without a gap."
 
 SIGNALS = {"current": ("Current", "A"), "voltage": ("Voltage", "V")}
 
@@ -123,6 +125,7 @@ def _show_lines(session: Session, options: TrendOptions, seen: Overview) -> Tren
             key=found.frame[known],
             mark=mark[known],
             marks=MARKS,
+            decimals=0 if name == "count" else 3,
         )
         for name, words, unit in LINE_QUANTITIES
         if (known := np.isfinite(values := found.values[name])).any()
@@ -138,7 +141,7 @@ def _show_lines(session: Session, options: TrendOptions, seen: Overview) -> Tren
         axis=Axis("Time", "s", span=span) if timed else Axis("Frame", "", 0, span=span),
         places=places,
         rows=(),
-        words=f"States by frame: {states}." if states else "No frame is measured yet.",
+        words=f"States by frame: {states}." if states else NO_STATES,
         setup_words=session.setup_words,
         spectrum=(),
         spectrum_axis=Axis("Frequency", "Hz" if timed else "1/frame", 2 if timed else 4),
