@@ -60,7 +60,8 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 def test_a_setup_of_lines(setup: Path):
     bench = read_line_setup(setup)
-    pattern = bench.rig.pattern
+    assert bench.line_rig is not None
+    pattern = bench.line_rig.pattern
     assert (pattern.count, pattern.interline_angle_deg, pattern.fan_angle_deg) == (5, 0.23, 5.0)
     assert bench.rig.laser.projection_angle_deg == 27.0
 
@@ -94,7 +95,7 @@ def test_frames_become_tables(labapp: Run, setup: Path, tmp_path: Path):
     pools = (spherical_cap(6.0, 0.25), None)
     (tmp_path / "frames").mkdir()
     for k, pool in enumerate(pools):
-        image = render_lines(pool, read_line_setup(setup).rig, VIEW, LineLook(),
+        image = render_lines(pool, read_line_setup(setup).line_rig, VIEW, LineLook(),
                              np.random.default_rng(k)).image  # fmt: skip
         cv2.imwrite(str(tmp_path / "frames" / f"frame_{k}.png"), image)
     out = tmp_path / "out"

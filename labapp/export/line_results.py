@@ -9,7 +9,7 @@ import numpy as np
 
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.sequence.line_frame import LineFrame
-from labapp.core.sequence.line_states import State
+from labapp.core.sequence.line_states import LineSeries, State, line_states
 from labapp.core.sequence.line_track import LineFilm
 from labapp.core.surface.line_fit import LineSurface
 from labapp.text import csv_text
@@ -146,6 +146,31 @@ def surface_rows(surface: LineSurface) -> list[list[str]]:
 
 def _cell(value: float | None) -> str:
     return "" if value is None or not np.isfinite(value) else f"{value:.5f}"
+
+
+def line_tables(
+    frames: Sequence[int],
+    times_s: Sequence[float | None],
+    found: Sequence[LineFrame],
+    calibration: ImageCalibration,
+    setup_status: str,
+) -> dict[str, str]:
+    """All tables of the frames of a recording as CSV text, by the names of their files."""
+    states = line_states(LineSeries.of(found))
+    numbered = list(zip(frames, found, strict=True))
+    features = feature_rows(frames, times_s, found, states, setup_status)
+    lines = [row for k, one in numbered for row in line_rows(k, one, calibration)]
+    points = [row for k, one in numbered for row in point_rows(k, one, calibration)]
+    tables = {
+        "features.csv": csv_text([FEATURE_COLUMNS, *features]),
+        "lines.csv": csv_text([LINE_COLUMNS, *lines]),
+        "line_points.csv": csv_text([POINT_COLUMNS, *points]),
+    }
+    for k, one in numbered:
+        if one.status == "ok" and one.surface is not None:
+            text = csv_text([SURFACE_COLUMNS, *surface_rows(one.surface)])
+            tables[f"surface_{k:06d}.csv"] = text
+    return tables
 
 
 class LineTables:

@@ -6,12 +6,14 @@ import math
 import os
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
+from functools import partial
 
 import numpy as np
 
 from labapp.errors import InputError
 from labapp.export.folder import ExportChoice, ExportedFile, export
 from labapp.export.frame_result import FrameResult
+from labapp.export.line_results import line_tables
 from labapp.session.contents import SessionContents
 from labapp.session.frames import Progress
 from labapp.session.measured import Result, scheme_name
@@ -30,6 +32,8 @@ def export_session(
     """Write a session's results into a folder; see `Session.export`."""
     scheme = scheme or scheme_name(session.settings)
     numbers = _standing(session, scheme, frames)
+    if session.has_lines:
+        return _export_lines(session, folder, scheme, numbers)
     before = len(numbers) * report
     total = before + len(numbers) * (2 if "film" in choice.pictures else 1)
     told = progress or (lambda done, total: None)
@@ -46,6 +50,30 @@ def export_session(
         image_of=lambda number: session.frame(number).image,
         extras={"report.pdf": made} if report else None,
         progress=lambda done: told(before + done, total),
+    )
+
+
+def _export_lines(
+    session: SessionContents, folder: str | os.PathLike[str], scheme: str, numbers: Sequence[int]
+) -> tuple[ExportedFile, ...]:
+    """Write the tables of a line pattern, as `labapp lines` does; there are no others."""
+    measured = list(_Measured(session, scheme, numbers))
+    pairs = [(one, one.measurement.lines) for one in measured]
+    known = [(one, lines) for one, lines in pairs if lines is not None]  # not unreadable
+    texts = line_tables(
+        [one.frame for one, _ in known],
+        [one.time_s for one, _ in known],
+        [lines for _, lines in known],
+        session.setup.calibration,
+        session.setup_status,
+    )
+    return export(
+        folder,
+        (),
+        session.setup.calibration,
+        _provenance(session, scheme, numbers),
+        ExportChoice(tables=frozenset(), surfaces=frozenset()),
+        extras={name: partial(str.encode, text) for name, text in texts.items()},
     )
 
 

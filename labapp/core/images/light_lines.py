@@ -39,6 +39,10 @@ PATH_SMOOTHER = 1.8
 SPOT_WIDTHS = 6.0
 """A line shorter than so many times its width is a spot: it has no direction of its own."""
 
+SPECK_WIDTHS, SPECK_LIGHT = 2.0, 0.15
+"""What comes so many of its widths near to a line, and has no more than this share of its light in
+all, is part of that line's side."""
+
 GLOW_ROUNDS = 5
 """Of the fit of the light under the lines."""
 
@@ -149,7 +153,19 @@ def find_lines(frame: Image, settings: LineSettings) -> tuple[LightLine, ...]:
     picture = np.ascontiguousarray(frame, np.float32)
     picture = picture - glow(picture)
     lines = (_line(picture, ridges, one, scale, settings) for one in joined)
-    return tuple(one for one in lines if one is not None)
+    return _without_specks(tuple(one for one in lines if one is not None))
+
+
+def _without_specks(lines: tuple[LightLine, ...]) -> tuple[LightLine, ...]:
+    """Lines without the specks of light on the side of one, which have some of its light, too."""
+
+    def is_speck(one: LightLine, other: LightLine) -> bool:
+        if one.length_px * one.light > SPECK_LIGHT * other.length_px * other.light:
+            return False
+        away = np.linalg.norm(one.image_px[:, None] - other.image_px, axis=-1)
+        return bool(away.min() < SPECK_WIDTHS * one.width_px)
+
+    return tuple(one for one in lines if not any(is_speck(one, other) for other in lines))
 
 
 def glow(picture: Grey) -> Grey:

@@ -76,8 +76,12 @@ class DotsChart(Chart):
             self.plot.addItem(item)
         self.follow_theme()
 
-    def show_dots(self, dots: tuple[FloatArray, FloatArray] | None) -> None:
-        """Show captured and computed dots, each of shape (n, 2), mm; None shows nothing."""
+    def show_dots(
+        self,
+        dots: tuple[FloatArray, FloatArray] | None,
+        without: str = "No reflected dots to compare",
+    ) -> None:
+        """Show captured and computed dots, each of shape (n, 2), mm; None shows why not."""
         captured, computed = dots if dots is not None else (np.empty((0, 2)), np.empty((0, 2)))
         scale = error_scale(captured, computed)
         self._captured.setData(pos=captured)
@@ -87,7 +91,7 @@ class DotsChart(Chart):
         ends = np.stack([captured, captured + scale * (computed - captured)], axis=1).reshape(-1, 2)
         self._errors.setData(ends[:, 0], ends[:, 1])
         message = f"○ captured, + computed; lines: errors × {scale:g}"
-        self.say(message if dots is not None else "No reflected dots to compare")
+        self.say(message if dots is not None else without)
         self.plot.autoRange()
 
     def take_colours(self) -> None:
@@ -179,8 +183,8 @@ class ProfileChart(Chart):
             self.plot.addItem(item)
         self.follow_theme()
 
-    def show_profile(self, cut: Profile | None) -> None:
-        """Show a profile; None shows nothing."""
+    def show_profile(self, cut: Profile | None, edge: str = "boundary") -> None:
+        """Show a profile, which ends at an edge; None shows nothing."""
         if cut is None or not len(cut.edge_mm):
             for curve in (self._low, self._high, self._height):
                 curve.setData([], [])
@@ -195,7 +199,7 @@ class ProfileChart(Chart):
         self._high.setData(along, height + sigma)
         self._edge.setData(pos=cut.edge_mm)
         band = f"; band: ±, {HEIGHT_SIGMA_OF}" if sigma.any() else "; this scheme gives no ±"
-        self.say(f"Height along the section; ◆ boundary{band}")
+        self.say(f"Height along the section; ◆ {edge}{band}")
         self.plot.autoRange()
 
     def take_colours(self) -> None:

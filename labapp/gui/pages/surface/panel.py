@@ -96,7 +96,8 @@ class SurfacePanel:
         settings = session.settings
         self.scheme.set_value(scheme_name(settings))
         self.correspondence.set_value(settings.correspondence)
-        remedy = " Its dots can be corrected in step 6." if told.state == "failed" else ""
+        dots = told.state == "failed" and not session.has_lines
+        remedy = " Its dots can be corrected in step 6." if dots else ""
         self.status.setText(f"{SIGNS[told.state]} {told.words}{remedy}")
         self.again.setVisible(told.state == "stale")
         show_words(self.setup_words, told.setup_words)

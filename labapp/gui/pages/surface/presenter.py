@@ -13,6 +13,8 @@ from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.schemes import scheme_words
+from labapp.core.sequence.line_frame import LineFrame
+from labapp.core.surface.line_region import between_lines
 from labapp.core.surface.measures import Measures, sigma_name
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.values import FloatArray
@@ -110,7 +112,29 @@ class SurfaceState:
     @property
     def reconstruction(self) -> Reconstruction | None:
         """The surface; None without."""
-        return None if self.result is None else self.result.measurement.reconstruction
+        return None if self.result is None else pool_of(self.result.measurement)
+
+
+def pool_of(measurement: Measurement) -> Reconstruction | None:
+    """The surface of a measurement; of lines that between them, where they determine it."""
+    if measurement.lines is None:
+        return measurement.reconstruction
+    surface = measurement.lines.surface
+    return between_lines(surface) if surface is not None and surface.status == "ok" else None
+
+
+def line_size_rows(found: LineFrame) -> tuple[ResultRow, ...]:
+    """Height and width under lines that determine them; empty otherwise."""
+    surface = found.surface
+    if surface is None or found.status != "ok":
+        return ()
+    x, y, z = surface.peak_mm.tolist()
+    under = f"At X {x:.2f}, Y {y:.2f} mm, under the lines; ± has no part by the set-up"
+    name = "Height" if z >= 0 else "Depth"
+    return (
+        ResultRow(name, z, surface.height_sigma_mm, "mm", note=under),
+        ResultRow("Width", surface.width_mm, unit="mm", note="Between the ends of the lines"),
+    )
 
 
 def shown(session: Session, frame: int) -> SurfaceState:
@@ -130,6 +154,10 @@ def shown(session: Session, frame: int) -> SurfaceState:
         scheme = SCHEMES[scheme_name(session.settings)].title
         return SurfaceState(None, "unmeasured", f"Frame {frame} is not measured by {scheme} yet.")
     measurement = result.measurement
+    if measurement.lines is not None:
+        state, words = _state(result)
+        sizes = line_size_rows(measurement.lines)
+        return SurfaceState(result, state, words, provenance(result), sizes)
     return SurfaceState(
         result,
         *_state(result),
@@ -145,7 +173,16 @@ def shown(session: Session, frame: int) -> SurfaceState:
 def _state(result: Result) -> tuple[Literal["measured", "stale", "failed"], str]:
     measurement = result.measurement
     failed = measurement.status != "ok"
-    words = f"No surface ({measurement.status}): {measurement.reason}." if failed else "Measured."
+    words = "Measured."
+    if measurement.status == "profile":
+        words = (
+            "A profile only: the lines leave a direction of the surface open, so that no height "
+            "is given. What the lines show is in step Dots."
+        )
+    elif measurement.lines is not None and not failed:
+        words = "Measured between the lines; nothing is known of the pool beyond them."
+    elif failed:
+        words = f"No surface ({measurement.status}): {measurement.reason}."
     if result.stale:
         was = words if failed else "These figures no longer stand."
         return "stale", f"{was} Since then {' and '.join(result.stale)}."
@@ -167,6 +204,8 @@ def provenance(result: Result) -> str:
     by_hand = result.measurement.correction is not None
     when = result.measured[:16].replace("T", " ")
     dots = "dots corrected by hand" if by_hand else "dots found automatically"
+    if result.measurement.lines is not None:
+        dots = "lines found automatically"
     scheme = SCHEMES[result.scheme].title if result.scheme in SCHEMES else result.scheme
     return f"Frame {result.frame} · {scheme} · {dots} · labapp {result.version} · {when}"
 
@@ -275,8 +314,8 @@ def scene(
     cut
         The section to mark on the surface; None for none.
     """
-    reconstruction, match = measurement.reconstruction, measurement.match
-    if reconstruction is None or match is None:
+    reconstruction, match = pool_of(measurement), measurement.match
+    if reconstruction is None:
         return None
     made = scene_of(reconstruction, options.colour, limits if options.colour == "height" else None)
     lines = dict(made.lines_mm) if options.boundary else {}
@@ -286,7 +325,7 @@ def scene(
         made,
         points_mm=made.points_mm if options.points else made.points_mm[:0],
         lines_mm=lines,
-        rays_mm=rays_of(reconstruction, match, rig) if options.rays else {},
+        rays_mm=rays_of(reconstruction, match, rig) if options.rays and match else {},
         electrode=options.electrode,
         exaggeration=options.exaggeration,
     )

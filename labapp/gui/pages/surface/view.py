@@ -268,11 +268,14 @@ class SurfacePage(Page):
         self.view.set_words(self.told.words)
         self.view.show_scene(drawn)
         boundary = None if reconstruction is None else reconstruction.boundary
+        lines = result is not None and result.measurement.lines is not None
+        edge = "edge of what the lines show" if lines else "boundary"
+        without = "Reflected lines are in step Dots" if lines else "No reflected dots to compare"
 
         def show_charts() -> None:
-            self.dots.show_dots(dots)
+            self.dots.show_dots(dots, without)
             self.plan.show_pool(boundary, self.options.section)
-            self.profile.show_profile(cut)
+            self.profile.show_profile(cut, edge)
 
         self._charts_due = show_charts
         if not self._rest.isActive():

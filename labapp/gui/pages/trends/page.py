@@ -80,6 +80,10 @@ class TrendsPage(Page):
         self.spectrum_words.setText(shown.spectrum_words)
         self.signals_words.setText(shown.signals_words)
         self._show_signals(session.signals, session.read_only)
+        for key, box in self._boxes.items():
+            box.setEnabled(key in SIGNALS or not session.has_lines)
+        for widget in (self.of, self.without):
+            widget.setEnabled(not session.has_lines)
 
     def _mark(self, frame: int) -> None:
         self.plots.set_current(frame, None if self.shown is None else self.shown.places.get(frame))

@@ -11,6 +11,7 @@ import numpy as np
 from labapp.core.values import IntArray
 from labapp.gui.curves import Axis, Curve, Mark
 from labapp.gui.digits import ResultRow, rounded
+from labapp.session.line_trends import FEWEST, LINE_QUANTITIES, line_trend
 from labapp.session.measured import Overview
 from labapp.session.session import Session
 from labapp.session.signals import Signals
@@ -26,6 +27,8 @@ MARKS = (
 MEASURED, CORRECTED, DOUBTFUL, STALE = range(4)
 
 FIRST_SHOWN = ("width_mm", "length_mm", "height_mm", "are_mm")
+
+NO_STATES = f"The pool's states are read from {FEWEST} frames or more, measured without a gap."
 
 SIGNALS = {"current": ("Current", "A"), "voltage": ("Voltage", "V")}
 
@@ -69,6 +72,8 @@ class TrendsState:
 def show(session: Session, options: TrendOptions, seen: Overview | None = None) -> TrendsState:
     """What to show of a session; ``seen`` is its overview, if it is at hand."""
     seen, signals = seen or session.overview(), session.signals
+    if session.has_lines:
+        return _show_lines(session, options, seen)
     doubtful = doubtful_frames(seen)
 
     def course_of(key: str) -> Trend:
@@ -95,6 +100,51 @@ def show(session: Session, options: TrendOptions, seen: Overview | None = None) 
         spectrum_axis=spectrum_axis,
         spectrum_words=message,
         signals_words=_told_signals(signals, seen, timed),
+    )
+
+
+def _show_lines(session: Session, options: TrendOptions, seen: Overview) -> TrendsState:
+    """What lines show over the recording; they have no choice of measures and no spectrum."""
+    found = line_trend(session)
+    timed = bool(np.isfinite(seen.time_s).all()) and len(seen.time_s) > 0
+    at = seen.time_s if timed else seen.frame.astype(float)
+    span = (float(at.min()), float(at.max())) if len(at) else None
+    places = dict(zip(seen.frame.tolist(), at.tolist(), strict=True))
+    x = np.array([places[frame] for frame in found.frame.tolist()], float)
+    mark = np.where(found.stale, STALE, MEASURED).astype(np.int64)
+    none = np.full(len(x), np.nan)
+    curves = [
+        Curve(
+            name=words,
+            unit=unit,
+            x=x[known],
+            y=values[known],
+            sigma=(found.height_sigma_mm if name == "pool_height_mm" else none)[known],
+            key=found.frame[known],
+            mark=mark[known],
+            marks=MARKS,
+            decimals=0 if name == "count" else 3,
+        )
+        for name, words, unit in LINE_QUANTITIES
+        if (known := np.isfinite(values := found.values[name])).any()
+    ]
+    if session.signals is not None and timed:
+        curves += _signal_curves(session.signals, seen, options.shown)
+    states = ", ".join(
+        f"{state} {first}–{last}" if last > first else f"{state} {first}"
+        for state, first, last in found.stretches()
+    )
+    return TrendsState(
+        curves=tuple(curves),
+        axis=Axis("Time", "s", span=span) if timed else Axis("Frame", "", 0, span=span),
+        places=places,
+        rows=(),
+        words=f"States by frame: {states}." if states else NO_STATES,
+        setup_words=session.setup_words,
+        spectrum=(),
+        spectrum_axis=Axis("Frequency", "Hz" if timed else "1/frame", 2 if timed else 4),
+        spectrum_words="",
+        signals_words=_told_signals(session.signals, seen, timed),
     )
 
 

@@ -1,0 +1,86 @@
+"""How the lines of a session change over its recording, and the states that they show."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from labapp.core.sequence.line_states import LineSeries, State, line_states
+from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
+from labapp.errors import InputError
+from labapp.session.contents import SessionContents
+
+LINE_QUANTITIES = (
+    ("count", "Lines", ""),
+    ("area_mm2", "Area of the lines", "mm²"),
+    ("curvature_per_mm", "Curvature of the lines", "1/mm"),
+    ("asymmetry", "Asymmetry of the lines", ""),
+    ("pool_height_mm", "Pool height", "mm"),
+)
+"""Name, words and unit of what is followed; the height only where lines determine it."""
+
+
+FEWEST = 60
+"""States are read from changes over some tens of frames: from so many that follow on each other."""
+
+
+@dataclass(frozen=True)
+class LineTrend(ReadOnlyArrays):
+    """What the measured frames of a line pattern show; n frames."""
+
+    frame: IntArray
+    """Numbers of the frames, ascending, shape (n,)."""
+    stale: BoolArray
+    """Which results no longer stand, shape (n,)."""
+    values: dict[str, FloatArray]
+    """By the names of `LINE_QUANTITIES`, shape (n,); NaN where unknown."""
+    height_sigma_mm: FloatArray
+    """Of the pool's height, without the set-up's part, shape (n,)."""
+    states: tuple[State, ...]
+    """Of the pool in each frame (`line_states`); none where fewer than `FEWEST` frames, or not all
+    that follow on each other, were measured.
+    """
+
+    def stretches(self) -> list[tuple[State, int, int]]:
+        """Each state in turn, with its first and its last frame."""
+        found: list[tuple[State, int, int]] = []
+        for state, frame in zip(self.states, self.frame.tolist(), strict=True):
+            if found and found[-1][0] == state:
+                found[-1] = (state, found[-1][1], frame)
+            else:
+                found.append((state, frame, frame))
+        return found
+
+
+def line_trend(session: SessionContents) -> LineTrend:
+    """Collect what the lines of all measured frames show; damaged results are left out."""
+    seen = session.overview()
+    numbers, stale, found = list[int](), list[bool](), []
+    for number, old in zip(seen.frame.tolist(), seen.stale.tolist(), strict=True):
+        try:
+            result = session.result(number)
+        except InputError:
+            continue
+        if result is not None and result.measurement.lines is not None:
+            numbers.append(number)
+            stale.append(old)
+            found.append(result.measurement.lines)
+    enough = len(found) >= FEWEST and bool(
+        (np.diff(np.searchsorted(seen.frame, numbers)) == 1).all()
+    )
+    sure = [one.surface if one.status == "ok" else None for one in found]
+    values = {
+        name: np.array([getattr(one.features, name) for one in found], float)
+        for name, *_ in LINE_QUANTITIES
+        if name != "pool_height_mm"
+    }
+    height = [np.nan if one is None else one.height_mm for one in sure]
+    sigma = [np.nan if one is None else one.height_sigma_mm for one in sure]
+    return LineTrend(
+        frame=np.array(numbers, np.int64),
+        stale=np.array(stale, bool),
+        values=values | {"pool_height_mm": np.array(height, float)},
+        height_sigma_mm=np.array(sigma, float),
+        states=line_states(LineSeries.of(found)) if enough else (),
+    )

@@ -1,0 +1,153 @@
+"""A session of a line pattern: measured, kept, exported; shown by the pages without Qt."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from labapp.config.setup import parse_setup
+from labapp.core.geometry.line_pattern import LineRays
+from labapp.core.rows.correction import Correction
+from labapp.core.sequence.line_states import State
+from labapp.errors import InputError
+from labapp.gui.pages.dots.lines import show_lines
+from labapp.gui.pages.setup import presenter as setup_page
+from labapp.gui.pages.surface import presenter as surface_page
+from labapp.gui.pages.trends import presenter as trends_page
+from labapp.session.line_trends import LineTrend, line_trend
+from labapp.session.session import Session
+from labapp.simulation.line_frames import LineLook, render_lines
+from labapp.simulation.pools import Pool, egg
+from tests.test_cli_lines import SETUP, VIEW
+
+POOL = egg(6.0, 2.8, 3.2, 0.3)
+
+
+def measured_session(folder: Path, pools: list[Pool | None]) -> Session:
+    rig = parse_setup(SETUP, "setup", lines=True).line_rig
+    assert rig is not None
+    frames = folder / "frames"
+    frames.mkdir()
+    for k, pool in enumerate(pools):
+        image = render_lines(pool, rig, VIEW, LineLook(), np.random.default_rng(k)).image
+        cv2.imwrite(str(frames / f"{k}.png"), image)
+    session = Session.create(folder / "lines.labsession")
+    session.set_setup(SETUP)
+    session.import_recording(frames, frame_rate_hz=10.0)
+    for _ in session.measure(warm=True):
+        pass
+    return session
+
+
+@pytest.fixture(scope="module")
+def session(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
+    with measured_session(tmp_path_factory.mktemp("lines"), [None, POOL]) as made:
+        yield made
+
+
+@pytest.mark.slow
+def test_lines_are_measured_and_kept(session: Session):
+    kept = session.result(1)
+    assert kept is not None
+    found = kept.measurement.lines
+    assert found is not None
+    assert kept.stale == ()
+    assert (kept.measurement.status, found.features.count) == ("ok", 5)
+    assert found.surface is not None
+    assert found.surface.height_mm == pytest.approx(0.3, rel=0.08)
+    assert session.overview().status == ("no-lines", "ok")
+    assert session.problems() == []
+    assert not len(session.stale_frames())
+
+
+@pytest.mark.slow
+def test_lines_are_exported_as_the_command_writes_them(session: Session, tmp_path: Path):
+    written = {one.name for one in session.export(tmp_path / "out")}
+    assert written == {"features.csv", "lines.csv", "line_points.csv", "surface_000001.csv"}
+    with (tmp_path / "out" / "features.csv").open(newline="", encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    assert [row["lines"] for row in rows] == ["0", "5"]
+    assert rows[0]["state"] == "no-pool"
+
+
+@pytest.mark.slow
+def test_dots_are_no_correction_of_lines(session: Session):
+    with pytest.raises(InputError):
+        session.correct({1: Correction.of(None, None)})
+
+
+@pytest.mark.slow
+def test_a_change_of_the_pattern_makes_lines_stale(session: Session):
+    session.update_setup({"pattern": {"interline_angle_deg": 0.25}})
+    assert session.stale_frames().tolist() == [0, 1]
+    session.undo()
+    assert session.stale_frames().tolist() == []
+
+
+@pytest.mark.slow
+def test_the_page_shows_lines_by_their_numbers(session: Session):
+    shown = show_lines(session, 1)
+    assert [line.name for line in shown.lines] == ["1", "2", "3", "4", "5"]
+    assert len(shown.listed) == 5
+    assert show_lines(session, 0).lines == ()
+
+
+@pytest.mark.slow
+def test_the_surface_ends_at_the_lines(session: Session):
+    shown = surface_page.shown(session, 1)
+    pool = shown.reconstruction
+    assert pool is not None
+    assert surface_page.shown(session, 0).reconstruction is None
+    x, y = pool.points_mm[:, :2].T
+    assert np.isfinite(pool.surface.height(0.99 * x, 0.99 * y + 0.01 * y.mean())).mean() > 0.95
+    # The head, beyond the uppermost line, is part of the pool and not of what is shown.
+    assert np.isfinite(POOL.height(np.zeros(1), np.array([2.5]))).all()
+    assert np.isnan(pool.surface.height(np.zeros(1), np.array([2.5]))).all()
+    assert [row.name for row in shown.sizes] == ["Height", "Width"]
+
+
+def test_another_kind_of_pattern_takes_the_keys_of_the_former_out(tmp_path: Path):
+    with Session.create(tmp_path / "kind.labsession") as session:
+        session.set_setup(SETUP)
+        assert session.has_lines
+        setup_page.put_kind(session, "square")
+        state = setup_page.shown(session)
+        assert state.kind == "square"
+        assert state.values["pattern.count"] is None
+        assert "pattern.rows" in state.problems
+        setup_page.put_kind(session, "lines")
+        setup_page.put_usual(session)
+        assert session.setup_problems == ()
+        pattern = session.setup.rig.pattern
+        assert isinstance(pattern, LineRays)
+        assert (pattern.lines.count, pattern.lines.interline_angle_deg) == (5, 0.23)
+
+
+def test_the_drawing_shows_a_plane_of_light_for_each_line(tmp_path: Path):
+    with Session.create(tmp_path / "bench.labsession") as session:
+        session.set_setup(SETUP)
+        view = setup_page.bench(session).view
+    assert view is not None
+    assert [ray.row for ray in view.rays] == [1, 2, 3, 4, 5]
+
+
+@pytest.mark.slow
+def test_trends_show_lines_and_no_states_of_few_frames(session: Session):
+    shown = trends_page.show(session, trends_page.TrendOptions())
+    curves = {curve.name: curve for curve in shown.curves}
+    assert curves["Lines"].y.tolist() == [0.0, 5.0]
+    assert curves["Pool height"].key is not None
+    assert curves["Pool height"].key.tolist() == [1]
+    assert line_trend(session).states == ()
+
+
+def test_states_in_turn():
+    frame, none = np.arange(5), np.zeros(5)
+    states: tuple[State, ...] = ("no-pool", "no-pool", "growing", "convex", "convex")
+    trend = LineTrend(frame, none > 0, {}, none, states)
+    assert trend.stretches() == [("no-pool", 0, 1), ("growing", 2, 2), ("convex", 3, 4)]
