@@ -206,11 +206,11 @@ class SetupPage(Page):
             form.add_heading(title)
             for entry in entries:
                 form.add(self._rig_field(entry), self._sigma_field(presenter.sigma_entry(entry)))
-            if heading == "Dot pattern":
+            if title == "Dot pattern":
                 tip = "How the dots lie to each other. Measured rays come with a setup file: Load…"
                 self.kind = self._choice("Grid", KINDS, tip, presenter.put_kind)
                 form.add(self.kind)
-            if heading == "Torch":
+            if title == "Torch":
                 tip = "Where the pool's head is: +Y is the laser's side. The rear may lie low"
                 self.travel = self._choice("Welding", TRAVELS, tip, presenter.put_travel)
                 form.add(self.travel)
