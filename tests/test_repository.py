@@ -31,6 +31,11 @@ LONG_FILES: dict[str, str] = {
 LONG_FUNCTIONS: dict[str, str] = {}
 
 
+REPOSITORY_FOLDERS = (
+    *(".ci", ".github", "docs", "labapp", "packaging", "resources", "sample_sessions", "tests"),
+)
+
+
 def relative(path: Path) -> str:
     return path.relative_to(ROOT).as_posix()
 
@@ -40,7 +45,7 @@ def repository_files() -> Iterator[Path]:
     for top in ROOT.iterdir():
         if top.is_file() and top.name != ".git":  # a work tree has a file of that name
             yield top
-    for folder in (".ci", "docs", "labapp", "resources", "sample_sessions", "tests"):
+    for folder in REPOSITORY_FOLDERS:
         for path in (ROOT / folder).rglob("*"):
             if path.is_file() and "__pycache__" not in path.parts:
                 yield path

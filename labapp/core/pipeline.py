@@ -190,9 +190,7 @@ def measure(
             lattice = lattice_of_match(match, rig, len(dots))
         result = replace(result, match=match, lattice=lattice)
         if settings.scheme != "fit":
-            made = reconstruct(match, rig, settings)
-            size = measures.measure_surface(made, match, rig)
-            return replace(result, reconstruction=made, measures=size), None
+            return _by_scheme(result, match, rig, settings), None
         pool = followed.pool if followed else fit.solve(match, rig, settings.fit, near)
         passed("match")
         made, size = fit.complete(match, pool, rig, settings.fit, known)
@@ -207,6 +205,13 @@ def measure(
     if tuning is None or rig.pattern.marker is None:
         return result, None
     return result, Prior.of(bench, tuning, match, pool, made, size)
+
+
+def _by_scheme(result: Measurement, match: Match, rig: Rig, settings: Settings) -> Measurement:
+    """The result with the surface of a scheme that needs no more than the match."""
+    made = reconstruct(match, rig, settings)
+    size = measures.measure_surface(made, match, rig)
+    return replace(result, reconstruction=made, measures=size)
 
 
 def _with_lines(result: Measurement, image: Image, rig: LineRig, bench: Bench) -> Measurement:

@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from labapp.core.bench_check.adjustment import Adjustment, adjust
+from labapp.core.bench_check.adjustment import Adjustment, Sighting, adjust
 from labapp.core.bench_check.known import MeasuredSize, measure_sizes
 from labapp.core.bench_check.labelling import (
     LEAST_DOTS,
@@ -186,42 +186,18 @@ def check_bench(
     free_directions = released(rig, free)
     bench = Bench(rig, calibration)
     observed = [Observation.of(p.dots, bench, p.frame_shape) for p in pictures]
-    labels = _labelled(pictures, rig, calibration, free_directions)
-    made: Adjustment | None = None
-    for _ in range(ROUNDS):
-        sightings = [
-            sighting_of(o, p.mirror, found)
-            for o, p, found in zip(observed, pictures, labels, strict=True)
-        ]
-        made = adjust(rig, sightings, free_directions, None if made is None else made.unknown)
-        again = [
-            relabelled(o, p.mirror, made.offset, pose)
-            for o, p, pose in zip(observed, pictures, made.poses, strict=True)
-        ]
-        again = [np.where(o.absent, UNLABELLED, a) for o, a in zip(observed, again, strict=True)]
-        used = labels
-        if all((new == old).all() for new, old in zip(again, used, strict=True)):
-            break
-        if any((new != UNLABELLED).sum() < LEAST_DOTS for new in again):
-            raise CannotMeasure("no-match", "no bench explains all pictures together")
-        labels = again
-    assert made is not None
+    made, sightings, used = _adjusted(pictures, observed, rig, calibration, free_directions)
     suspects = find_suspects(rig, sightings, made, free_directions)
     seen = [(o, p.mirror, own) for o, p, own in zip(observed, pictures, used, strict=True)]
     slip = slip_drop(rig, seen, made, free_directions)
     verdict, patterns = judge(rig, sightings, made, free_directions)
     sizes = measure_sizes(rig, sightings, free_directions, made)
-    status, reason = _status(
-        suspects,
-        verdict,
-        patterns,
-        slip,
-        {
-            f"{picture.name}, {picture.mirror.name}: {size.name}": size
-            for picture, own in zip(pictures, sizes, strict=True)
-            for size in own
-        },
-    )
+    named = {
+        f"{picture.name}, {picture.mirror.name}: {size.name}": size
+        for picture, own in zip(pictures, sizes, strict=True)
+        for size in own
+    }
+    status, reason = _status(suspects, verdict, patterns, slip, named)
     after, calibrated = adjusted_bench(rig, made, status == "ok")
     checked = tuple(
         CheckedPicture(
@@ -249,6 +225,43 @@ def check_bench(
         pictures=checked,
         adjustment=made,
     )
+
+
+def _adjusted(
+    pictures: Sequence[Picture],
+    observed: Sequence[Observation],
+    rig: Rig,
+    calibration: ImageCalibration,
+    free_directions: FloatArray,
+) -> tuple[Adjustment, list[Sighting], list[IntArray]]:
+    """Adjust and label again in turn until no label changes.
+
+    Returns
+    -------
+    adjustment, sightings, labels
+        The adjusted set-up; the dots of each picture that it was adjusted to; and their labels.
+    """
+    labels = _labelled(pictures, rig, calibration, free_directions)
+    made: Adjustment | None = None
+    for _ in range(ROUNDS):
+        sightings = [
+            sighting_of(o, p.mirror, found)
+            for o, p, found in zip(observed, pictures, labels, strict=True)
+        ]
+        made = adjust(rig, sightings, free_directions, None if made is None else made.unknown)
+        again = [
+            relabelled(o, p.mirror, made.offset, pose)
+            for o, p, pose in zip(observed, pictures, made.poses, strict=True)
+        ]
+        again = [np.where(o.absent, UNLABELLED, a) for o, a in zip(observed, again, strict=True)]
+        used = labels
+        if all((new == old).all() for new, old in zip(again, used, strict=True)):
+            break
+        if any((new != UNLABELLED).sum() < LEAST_DOTS for new in again):
+            raise CannotMeasure("no-match", "no bench explains all pictures together")
+        labels = again
+    assert made is not None
+    return made, sightings, used
 
 
 def _labelled(

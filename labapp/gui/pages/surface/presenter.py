@@ -157,7 +157,8 @@ def shown(session: Session, frame: int) -> SurfaceState:
     if measurement.lines is not None:
         state, words = _state(result)
         sizes = line_size_rows(measurement.lines)
-        return SurfaceState(result, state, words, provenance(result), sizes)
+        about = _setup_words(result)
+        return SurfaceState(result, state, words, about, provenance(result), sizes)
     return SurfaceState(
         result,
         *_state(result),
