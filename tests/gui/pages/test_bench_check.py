@@ -21,9 +21,11 @@ from labapp.config.setup import (
     unchecked_setup,
     updated_setup,
 )
+from labapp.core.bench_check.check import REASONS
 from labapp.core.bench_check.forecast import CANDIDATES
 from labapp.core.bench_check.mirrors import Ball, Cap, Plate
 from labapp.core.bench_check.suspects import Suspect
+from labapp.core.bench_check.verdict import Pattern
 from labapp.core.geometry.uncertainty import INDEX
 from labapp.core.images.find_dots import DotSettings
 from labapp.core.values import CannotMeasure
@@ -342,6 +344,22 @@ def test_the_table_stands_below_the_picture_where_there_is_no_room_beside_it(
     assert page.splitter.orientation() == Qt.Orientation.Horizontal
     page.resize(500, 600)
     assert page.splitter.orientation() == Qt.Orientation.Vertical
+
+
+@pytest.mark.slow
+def test_a_cause_that_explains_more_than_the_suspect_is_named_beside_it(checked: Checked) -> None:
+    suspects = (Suspect("laser.distance_mm", "laser, distance", 784.0),)
+    for drop, named in ((1476.0, True), (700.0, False)):
+        patterns = (Pattern("plate-not-flat", drop, 0.05),)
+        off = replace(
+            checked.check,
+            status="quantity-off",
+            reason="off",
+            suspects=suspects,
+            patterns=patterns,
+        )
+        words = replace(checked, check=off).words
+        assert (REASONS["plate-not-flat"] in words) == named
 
 
 @pytest.mark.slow

@@ -11,7 +11,13 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from labapp.config.setup import Setup, parse_setup, unchecked_setup
-from labapp.core.bench_check.check import UNDETERMINED, BenchCheck, CheckedPicture, check_bench
+from labapp.core.bench_check.check import (
+    REASONS,
+    UNDETERMINED,
+    BenchCheck,
+    CheckedPicture,
+    check_bench,
+)
 from labapp.core.bench_check.forecast import CANDIDATES, EXPECTED, forecast, height_sigma
 from labapp.core.bench_check.labelling import Picture
 from labapp.core.bench_check.mirrors import Ball, Cap, Mirror, Plate
@@ -123,8 +129,11 @@ class Checked:
                 parts.append(f"Expected ± of the pool's height: {before:.2g} → {after:.2g} mm.")
             return " ".join((*parts, "Press Use to adopt the adjusted set-up."))
         reason = f"▲ {_sentence(self.check.reason)}"
-        if not self.suspects:
+        if not self.check.suspects:
             return reason
+        likeliest = max(self.check.patterns, key=lambda one: one.drop, default=None)
+        if likeliest is not None and likeliest.drop > self.check.suspects[0].drop:
+            reason += f" Or {REASONS[likeliest.cause]}."
         return (
             f"{reason} Are the mirror's kind, size and height right? Then measure the quantity "
             "again and correct it, or have it found from the pictures."
