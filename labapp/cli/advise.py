@@ -19,7 +19,10 @@ if TYPE_CHECKING:
 def advise(
     *,
     out: Annotated[
-        Path, typer.Option(help="Folder for advice.md, .csv, .png, setup.toml; they are replaced.")
+        Path,
+        typer.Option(
+            help="Folder for advice.md, .csv, .png, patterns.csv, setup.toml; they are replaced."
+        ),
     ],
     question: Annotated[
         Path | None,
@@ -88,7 +91,7 @@ def _advised(
     """Search, print and write; whether any set-up is possible."""
     from labapp.studies.adviser import check as adviser_check
     from labapp.studies.adviser import search as adviser
-    from labapp.studies.adviser.files import advice_files
+    from labapp.studies.adviser.files import advice_files, patterns_of
     from labapp.studies.adviser.report import advice_text, cost_table
 
     folder = writable_folder(out)
@@ -100,6 +103,7 @@ def _advised(
             write_file(folder / name, content)
         if advice.possible:
             typer.echo("\n" + cost_table(advice).markdown())
+            typer.echo(patterns_of(advice).markdown())
         if check and advice.possible:
             message = adviser_check.check_text(adviser_check.check(advice, progress=progress))
             write_file(folder / "check.txt", message.encode() + b"\n")

@@ -86,7 +86,7 @@ def test_it_gives_what_the_command_gives_and_undo_takes_it_back(
     code, _, err = labapp("advise", question, "--quick", "--out", tmp_path / "command")
     assert code == 0, err
     names = sorted(path.name for path in (tmp_path / "command").iterdir())
-    assert names == ["advice.csv", "advice.md", "advice.png", "setup.toml"]
+    assert names == ["advice.csv", "advice.md", "advice.png", "patterns.csv", "setup.toml"]
     for name in names:
         made = (tmp_path / "window" / name).read_bytes()
         assert made == (tmp_path / "command" / name).read_bytes(), name

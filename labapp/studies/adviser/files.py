@@ -5,9 +5,11 @@ from __future__ import annotations
 from typing import Any
 
 from labapp.config.setup import pattern_values, updated_setup
+from labapp.studies.adviser.dense_patterns import compare_patterns, pattern_table
 from labapp.studies.adviser.report import advice_picture, advice_table, advice_text, cost_table
 from labapp.studies.adviser.search import Advice
 from labapp.studies.plotting import as_bytes
+from labapp.studies.tables import Table
 
 SETUP = "setup.toml"
 
@@ -21,16 +23,23 @@ HEAD = """\
 
 def advice_files(advice: Advice) -> dict[str, bytes]:
     """Words, tables, picture, and the set-up where there is one: file name → content."""
-    tables = [cost_table(advice)] if advice.possible else []
+    patterns = patterns_of(advice) if advice.possible else None
+    tables = [] if patterns is None else [cost_table(advice), patterns]
     words = "\n\n".join([advice_text(advice), *(table.markdown() for table in tables)])
     files = {
         "advice.md": words.encode() + b"\n",
         "advice.csv": advice_table(advice).csv().encode(),
         "advice.png": as_bytes(advice_picture(advice), "png"),
     }
-    if advice.possible:
+    if patterns is not None:
+        files["patterns.csv"] = patterns.csv().encode()
         files[SETUP] = updated_setup(HEAD, SETUP, advised_setup(advice)).encode()
     return files
+
+
+def patterns_of(advice: Advice) -> Table:
+    """Dot patterns of the same fan at the recommended place (`dense_patterns`)."""
+    return pattern_table(compare_patterns(advice.expected, advice.limits, advice.best.place))
 
 
 def advised_setup(advice: Advice) -> dict[str, dict[str, Any]]:

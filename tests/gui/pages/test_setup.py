@@ -262,10 +262,9 @@ def test_record_and_ticks_by_hand(qtbot: QtBot, page: SetupPage) -> None:
     page.ticks[item].click()
     assert item not in dict(session.record.safety)
     step = STEPS[0][0]
-    page.preparation[step].click()
+    page.steps[step].click()
     assert step in dict(session.record.safety)
     assert "0/7" in page.tabs.tabText(1)
-    assert "1/13" in page.tabs.tabText(3)
 
 
 def test_a_wrong_file_is_refused_in_words(page: SetupPage, tmp_path: Path) -> None:

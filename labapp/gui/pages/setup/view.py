@@ -34,7 +34,7 @@ from labapp.session.session import Session
 
 SETUP_FILES = "Set-up files (*.toml)"
 
-EXPERIMENT_TAB, SAFETY_TAB, BENCH_TAB, PREPARATION_TAB = range(4)
+EXPERIMENT_TAB, SAFETY_TAB, BENCH_TAB, STEPS_TAB = range(4)
 
 
 class SetupPage(Page):
@@ -50,7 +50,7 @@ class SetupPage(Page):
         self.sigma_fields: dict[str, NumberField] = {}
         self.record_fields: dict[str, NumberField | TextField] = {}
         self.ticks: dict[str, QCheckBox] = {}
-        self.preparation: dict[str, QCheckBox] = {}
+        self.steps: dict[str, QCheckBox] = {}
         self._times: dict[str, QLabel] = {}
         self._drawn: object = None
         self.tabs = QTabWidget()
@@ -60,9 +60,9 @@ class SetupPage(Page):
         layout = QVBoxLayout(preparation)
         for title, items in lists:
             layout.addWidget(heading(title))
-            layout.addWidget(self._list(self.preparation, items))
+            layout.addWidget(self._list(self.steps, items))
         contents = (self._experiment(), safety, self._bench(), preparation)
-        titles = ("Experiment", "Safety", "Bench", "Preparation")
+        titles = ("Experiment", "Safety", "Bench", "Steps")
         for content, title in zip(contents, titles, strict=True):
             self.tabs.addTab(_top(content), title)
 
@@ -76,7 +76,7 @@ class SetupPage(Page):
         self.panel_layout.addWidget(self.tabs)
         self.lock_with_session(
             *(*self.rig_fields.values(), *self.sigma_fields.values(), self.kind, self.travel),
-            *(*self.record_fields.values(), *self.ticks.values(), *self.preparation.values()),
+            *(*self.record_fields.values(), *self.ticks.values(), *self.steps.values()),
             *self._filling,
         )
         self.panel_layout.setContentsMargins(0, 0, 0, 0)
@@ -101,14 +101,10 @@ class SetupPage(Page):
         for name, noted in self.record_fields.items():
             noted.set_value(getattr(shown.record, name))
         ticked = dict(shown.record.safety)
-        for item, box in (self.ticks | self.preparation).items():
+        for item, box in (self.ticks | self.steps).items():
             box.setChecked(item in ticked)
             self._times[item].setText(f"ticked {_clock(ticked[item])}" if item in ticked else "")
-        for tab, name, boxes in (
-            (SAFETY_TAB, "Safety", self.ticks),
-            (PREPARATION_TAB, "Preparation", self.preparation),
-        ):
-            self.tabs.setTabText(tab, f"{name} {len(ticked.keys() & boxes)}/{len(boxes)}")
+        self.tabs.setTabText(SAFETY_TAB, f"Safety {len(ticked.keys() & self.ticks)}/{len(SAFETY)}")
         self.tabs.setTabText(BENCH_TAB, "Bench ⚠" if shown.problems else "Bench")
         show_words(self.others, "\n".join(shown.others))
         basis = (session.setup_text, shown.record)
@@ -197,7 +193,7 @@ class SetupPage(Page):
     def _tick(self, item: str, ticked: bool) -> None:
         now = datetime.now().astimezone().isoformat(timespec="seconds")
         if not self.workspace.attempt(lambda session: tick(session, item, ticked, now)):
-            (self.ticks | self.preparation)[item].setChecked(not ticked)
+            (self.ticks | self.steps)[item].setChecked(not ticked)
 
     def _bench(self) -> QWidget:
         form = FieldForm()
