@@ -45,7 +45,8 @@ class LineTrend(ReadOnlyArrays):
     def stretches(self) -> list[tuple[State, int, int]]:
         """Each state in turn, with its first and its last frame."""
         found: list[tuple[State, int, int]] = []
-        for state, frame in zip(self.states, self.frame.tolist(), strict=True):
+        frames = self.frame.tolist() if self.states else []
+        for state, frame in zip(self.states, frames, strict=True):
             if found and found[-1][0] == state:
                 found[-1] = (state, found[-1][1], frame)
             else:
@@ -66,9 +67,8 @@ def line_trend(session: SessionContents) -> LineTrend:
             numbers.append(number)
             stale.append(old)
             found.append(result.measurement.lines)
-    enough = len(found) >= FEWEST and bool(
-        (np.diff(np.searchsorted(seen.frame, numbers)) == 1).all()
-    )
+    place = np.searchsorted(seen.frame, np.array(numbers, np.int64))
+    enough = len(found) >= FEWEST and bool((np.diff(place) == 1).all())
     sure = [one.surface if one.status == "ok" else None for one in found]
     values = {
         name: np.array([getattr(one.features, name) for one in found], float)

@@ -71,7 +71,7 @@ class LineSettings:
         and so many times its width; of a longer line, which bends less, so much of its length, up
         to the second number of widths.
     edge_px
-        A line that ends so near to the picture's edge is cut off there, px.
+        A line that ends so near to the picture's edge is cut off there, px; a wide one farther.
     """
 
     ridges: RidgeSettings = field(default_factory=RidgeSettings)
@@ -233,7 +233,8 @@ def _line(
     ]
     size = np.array(picture.shape[::-1])
     places = np.array(ends)
-    cut = ((places < settings.edge_px) | (places > size - 1 - settings.edge_px)).any(axis=-1)
+    edge = max(settings.edge_px, STRIP_WIDTHS * width)
+    cut = ((places < edge) | (places > size - 1 - edge)).any(axis=-1)
     return LightLine(
         image_px=path.place[seen],
         tangent=path.tangent[seen],
