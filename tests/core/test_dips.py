@@ -105,6 +105,13 @@ def test_of_two_holes_the_smoother_surface_tells_the_marker(seed: int) -> None:
     assert got.right >= 0.9 * got.shown
 
 
+def test_a_false_dot_near_a_rays_prediction_at_the_rim_gets_no_ray() -> None:
+    """It lay 0.5 mm from where a ray that did not come back was predicted."""
+    got = answer(*draw(71011, missing=6, false=3))
+    assert (got.status, got.wrong) == ("ok", 0)
+    assert got.right >= 0.95 * got.shown
+
+
 def test_three_rays_round_a_corner_that_have_no_dot_are_no_row() -> None:
     got = answer(*draw(52040, missing=6, false=3))
     assert (got.status, got.wrong) == ("ok", 0)

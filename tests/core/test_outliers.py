@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.ndimage import maximum_filter
+from scipy.ndimage import convolve, maximum_filter
 
 from labapp.core.matching import match_kernels
 from labapp.core.matching.decision import fitted_labels
@@ -154,7 +154,9 @@ def test_labels_fail_by_the_likelihoods_of_ray_rivals_and_false_dots() -> None:
     shows, missed = rng.uniform(0.2, 1.0, count), np.flatnonzero(~lit)[:5]
     drawn[missed[0]] = np.nan
     stray, false, gate, margin = np.arange(count, count + 3), 3.0, 20.0, 1.0
+    rim_neighbours, rim_sigma2, rim_times = 4, 4.0, 2.0
     limits = np.array([1e-4, 0.02, 0.998, 1.4, 1e-3, 1.386, false, gate, margin])
+    limits = np.append(limits, [rim_neighbours, rim_sigma2, rim_times])
     found = match_kernels.failing_labels(
         labels, (places, seen), (predicted, drawn), shows, missed, stray, limits
     )
@@ -176,7 +178,11 @@ def test_labels_fail_by_the_likelihoods_of_ray_rivals_and_false_dots() -> None:
     around = 1.4 * drawn[missed[1:]] + 1e-3 * np.eye(2)
     to_missed = places[own][:, None] - predicted[missed[1:]]
     by_missed = deviance(to_missed, excess * (fitted[own][:, None] + around))[1].min(axis=1)
-    fails = (square > gate) | (own_deviance + 2 * np.log((1 - shows) / shows) + margin > false)
+    neighbours = (convolve(lit.astype(int), np.ones((3, 3)), mode="constant") - 1)[lit]
+    rim_gate = min(max(rim_sigma2, rim_times * np.median(square)), gate)
+    gates = np.where(neighbours <= rim_neighbours, rim_gate, gate)
+    assert (square > gates).sum() > (square > gate).sum()
+    fails = (square > gates) | (own_deviance + 2 * np.log((1 - shows) / shows) + margin > false)
     fails |= own_deviance + margin > np.minimum(by_stray, by_missed)
     worst = np.zeros(shape)
     worst[lit] = np.where(fails, square, 0.0)

@@ -275,14 +275,16 @@ def failing_labels(
     limits
         Least variance of a dot in the fit, mm²; how far points still moved; largest leverage (both
         `left_out`); inflation of the surface's variance; variance of its model, mm²; median of χ²;
-        deviance of a false dot; the largest squared distance; margin over rivals.
+        deviance of a false dot; the largest squared distance; margin over rivals. At the rim: the
+        most labelled neighbours; the largest squared distance, or so many times the median one.
 
     Returns
     -------
     BoolArray
         Shape (rows, columns).
     """
-    floor, unsettled, leverage, inflation, error, median, false, gate, margin = limits
+    floor, unsettled, leverage, inflation, error, median, false, gate, margin = limits[:9]
+    rim_neighbours, rim_sigma2, rim_times = limits[9:]
     (places, seen), (predicted, drawn) = dots, surface
     rays = np.flatnonzero(labels.ravel() >= 0)
     number = labels.ravel()[rays]
@@ -294,16 +296,21 @@ def failing_labels(
     excess = np.median(distance) / median
     excess = excess if excess > 1.0 else 1.0
     distance, deviance = _deviances(off, both, excess)
+    rim_gate = min(max(rim_sigma2, rim_times * np.median(distance)), gate)
     around = _with_variance(inflation * drawn[missed], error)
     worst = np.zeros(labels.shape)
     for n in range(len(rays)):
+        i, j = rays[n] // labels.shape[1], rays[n] % labels.shape[1]
+        beside = labels[max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2]
+        at_rim = np.sum(beside >= 0) - 1 <= rim_neighbours
         by_ray = deviance[n] + 2.0 * np.log(1.0 - shows[n]) - 2.0 * np.log(max(shows[n], 1e-300))
         rival = min(
             _least_deviance(own[n] + off[n], spread[n], places[stray], seen[stray], excess),
             _least_deviance(own[n], fitted[n], predicted[missed], around, excess),
         )
-        if distance[n] > gate or by_ray + margin > false or deviance[n] + margin > rival:
-            worst[rays[n] // labels.shape[1], rays[n] % labels.shape[1]] = distance[n]
+        is_far = distance[n] > (rim_gate if at_rim else gate)
+        if is_far or by_ray + margin > false or deviance[n] + margin > rival:
+            worst[i, j] = distance[n]
     fails = np.zeros(labels.shape, np.bool_)
     for i in range(len(labels)):
         for j in range(labels.shape[1]):
