@@ -235,7 +235,7 @@ def _cheapest(
     observed: Observation, found: list[Hypothesis], margin: float
 ) -> tuple[Hypothesis, list[Hypothesis], list[Hypothesis], FitSettings]:
     """The cheapest hypothesis, those found, its neighbours a row or two on, and the fit of all."""
-    best = _likeliest(found)
+    best = min(found, key=lambda hypothesis: hypothesis.cost)
     fit = USUAL_KNOTS
     neighbours: list[Hypothesis] = []
     if best.stray_count or best.missed_count:
@@ -247,24 +247,12 @@ def _cheapest(
         found = [
             h for each in found if (h := _evaluate_twice(observed, each.labels, fit, each.pool))
         ]
-        best = _likeliest(found) if found else best
+        best = min(found, key=lambda hypothesis: hypothesis.cost, default=best)
     if not neighbours and not _beyond_doubt(observed, best, margin):
         best, neighbours = _with_neighbours(observed, best, fit)
     if fit is FINE_KNOTS:  # what takes labels away compares costs of these knots alone
         best = evaluate(observed, best.labels, fit, initial=best.pool) or best
     return best, found, neighbours, fit
-
-
-def _likeliest(found: list[Hypothesis]) -> Hypothesis:
-    """The cheapest hypothesis, or one with nearly the same labels that leaves less unexplained.
-
-    Of two that differ by few dots the smoother one may just lack some. Dots on which they disagree
-    get no ray in the end.
-    """
-    cheapest = min(found, key=lambda hypothesis: hypothesis.cost)
-    lit, enough = cheapest.labels != UNLABELLED, (1 - MOST_DIFFERING) * cheapest.label_count
-    alike = [each for each in found if np.sum((each.labels == cheapest.labels)[lit]) >= enough]
-    return min(alike, key=lambda hypothesis: hypothesis.misfit)
 
 
 def _refuse_unexplained(observed: Observation, best: Hypothesis, settings: MatchSettings) -> None:
