@@ -27,13 +27,16 @@ from labapp.core.values import FloatArray, IntArray
 SLIPS = ((1, 0), (-1, 0), (0, 1), (0, -1))
 """Rows and columns by which rays may have slipped."""
 
-STEPS = 15
-"""Of the adjustment to other rays."""
+FEW_STEPS, STEPS = 4, 15
+"""Of the adjustment to each of these, and to the likeliest."""
+
+Seen = tuple[Observation, Mirror, IntArray]
+"""A picture's dots, its mirror, and the index of each ray's dot."""
 
 
 def slip_drop(
     rig: Rig,
-    seen: Sequence[tuple[Observation, Mirror, IntArray]],
+    seen: Sequence[Seen],
     made: Adjustment,
     released: FloatArray,
 ) -> float:
@@ -51,48 +54,46 @@ def slip_drop(
     made
         The adjustment to these.
     """
-    strays = sum(_strays(observed, labels) for observed, _, labels in seen)
+    strays = _strays(seen)
     prior = float(made.unknown @ made.unknown)
     excess = prior + max(made.cost - prior - len(made.standardised), 0.0)  # all that is not noise
-    drops = [-np.inf]
-    for by in np.array(SLIPS):
-        labels = [moved_labels(own, by) for _, _, own in seen]
-        more = sum(_strays(o, own) for (o, *_), own in zip(seen, labels, strict=True)) - strays
-        if STRAY * more < excess:
-            cost = _cost_of_slip(rig, seen, labels, made.scale, released)
-            drops.append(made.cost + STRAY * strays - cost)
-    return max(drops)
+    slipped = (
+        [(observed, mirror, moved_labels(labels, by)) for observed, mirror, labels in seen]
+        for by in np.array(SLIPS)
+    )
+    possible = [one for one in slipped if STRAY * (_strays(one) - strays) < excess]
+    possible = [one for one in possible if min(map(_lit, one)) >= LEAST_DOTS]
+    if not possible:
+        return -np.inf
+    tried = [(_adjusted(rig, one, made.scale, released), one) for one in possible]
+    near, best = min(tried, key=lambda pair: pair[0].cost + STRAY * _strays(pair[1]))
+    again = [
+        (observed, mirror, relabelled(observed, mirror, near.offset, pose))
+        for (observed, mirror, _), pose in zip(best, near.poses, strict=True)
+    ]
+    best = again if min(map(_lit, again)) >= LEAST_DOTS else best
+    found = _adjusted(rig, best, made.scale, released, near)
+    return made.cost + STRAY * strays - found.cost - STRAY * _strays(best)
 
 
-def _cost_of_slip(
+def _adjusted(
     rig: Rig,
-    seen: Sequence[tuple[Observation, Mirror, IntArray]],
-    labels: list[IntArray],
+    seen: Sequence[Seen],
     scale: float,
     released: FloatArray,
-) -> float:
-    """Cost with other labels to begin with; the absent ray may have a dot."""
-    if any((one != UNLABELLED).sum() < LEAST_DOTS for one in labels):
-        return np.inf
-    unknown: FloatArray | None = None
-    for _ in range(2):
-        sightings = [
-            sighting_of(observed, mirror, one, with_absent=True)
-            for (observed, mirror, _), one in zip(seen, labels, strict=True)
-        ]
-        system = System.of(rig, sightings, released)
-        unknown = system.minimised(system.start() if unknown is None else unknown, scale, STEPS)
-        found = system.adjustment(unknown, scale)
-        used = labels
-        labels = [
-            relabelled(observed, mirror, found.offset, pose)
-            for (observed, mirror, _), pose in zip(seen, found.poses, strict=True)
-        ]
-        if all((one == other).all() for one, other in zip(used, labels, strict=True)):
-            break
-    strays = sum(_strays(one[0], own) for one, own in zip(seen, used, strict=True))
-    return found.cost + STRAY * strays
+    near: Adjustment | None = None,
+) -> Adjustment:
+    """Adjustment to labels, roughly or from one nearby; the absent ray may have a dot."""
+    sightings = [sighting_of(*one, with_absent=True) for one in seen]
+    system = System.of(rig, sightings, released)
+    start, steps = (system.start(), FEW_STEPS) if near is None else (near.unknown, STEPS)
+    return system.adjustment(system.minimised(start, scale, steps), scale)
 
 
-def _strays(observed: Observation, labels: IntArray) -> int:
-    return len(observed.plane_mm) - int((labels != UNLABELLED).sum())
+def _lit(one: Seen) -> int:
+    return int((one[2] != UNLABELLED).sum())
+
+
+def _strays(seen: Sequence[Seen]) -> int:
+    """How many dots have no ray."""
+    return sum(len(one[0].plane_mm) - _lit(one) for one in seen)

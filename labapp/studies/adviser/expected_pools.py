@@ -10,7 +10,7 @@ import numpy as np
 from scipy import special
 from scipy.stats import qmc
 
-from labapp.core.geometry.uncertainty import QUANTITIES
+from labapp.core.geometry.uncertainty import FIRST, QUANTITIES
 from labapp.core.values import FloatArray, ReadOnlyArrays
 from labapp.simulation.pools import Pool, ellipsoidal_cap
 
@@ -85,10 +85,12 @@ class ExpectedPools:
         pool follow each other.
         """
         rng, total = np.random.default_rng(seed), count * places
-        share = rng.random((total, DRAWN + len(QUANTITIES)))
+        share = rng.random((total, DRAWN + FIRST))
         if even:
-            row = qmc.Sobol(DRAWN + len(QUANTITIES), rng=rng)
+            row = qmc.Sobol(DRAWN + FIRST, rng=rng)
             share = row.random_base2(max(total - 1, 0).bit_length())[:total]
+        # Drawn last, so that with these known exactly the same advice comes of a seed as ever.
+        share = np.hstack([share, rng.random((total, len(QUANTITIES) - FIRST))])
         share[:, :SIZES] = np.repeat(share[:count, :SIZES], places, axis=0)
         pools = tuple(self.at(one) for one in share[:, :DRAWN])
         # It may hold a 0, to which no normal deviate belongs.
