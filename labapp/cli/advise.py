@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -69,7 +69,8 @@ def advise(
 
     values = read_request(question) if question else {}
     kind = None if convex is None else "convex" if convex else "concave"
-    for table, key, value in (
+    _replace(
+        values,
         ("pools", "kind", kind),
         ("pools", "width_mm", _span("--width", width)),
         ("pools", "length_mm", _span("--length", length)),
@@ -77,12 +78,17 @@ def advise(
         ("bench", "projection_angle_deg", _span("--angle", angle)),
         ("bench", "distance_mm", _span("--distance", distance)),
         ("bench", "plane_distance_mm", _span("--plane", plane)),
-    ):
-        if value is not None and isinstance(values.setdefault(table, {}), dict):
-            values[table][key] = value
+    )
     expected, limits = parse_request(values, question or "labapp advise")
     if not _advised(expected, limits, out, quick, check, seed):
         raise typer.Exit(NOTHING_MEASURED)
+
+
+def _replace(values: dict[str, Any], *options: tuple[str, str, object]) -> None:
+    """Put the options that were given, (table, key, value), in place of what a file says."""
+    for table, key, value in options:
+        if value is not None and isinstance(values.setdefault(table, {}), dict):
+            values[table][key] = value
 
 
 def _advised(
