@@ -19,10 +19,7 @@ if TYPE_CHECKING:
 def advise(
     *,
     out: Annotated[
-        Path,
-        typer.Option(
-            help="Folder for advice.md, .csv, .png, patterns.csv, setup.toml; they are replaced."
-        ),
+        Path, typer.Option(help="Folder for the files of the advice, which are replaced.")
     ],
     question: Annotated[
         Path | None,
