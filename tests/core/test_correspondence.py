@@ -155,8 +155,9 @@ def test_a_row_that_growth_does_not_reach_is_begun(monkeypatch: pytest.MonkeyPat
     assert match is not None
     np.testing.assert_array_equal(seen.ray[match.dot], match.ray)
     assert len(match.dot) == len(seen.dots)
-    for way in ("with_rows_beyond", "with_repaired"):  # either tells them
+    for way in ("with_rows_beyond", "with_repaired"):  # either finds them, and so do caps
         monkeypatch.setattr(correspondence, way, lambda _scene, found: found)
+    monkeypatch.setattr(correspondence, "_by_caps", lambda _scene: [])
     assert matched(seen.dots) == (None, "no-match")
 
 

@@ -154,7 +154,7 @@ def test_the_uncertainty_of_sizes_is_their_spread_over_surfaces_as_likely() -> N
         sizes.append(surface_sizes(surface, boundary)[0])
     np.testing.assert_allclose(np.std(sizes, axis=0)[:3], made.size_sigma[:3], rtol=0.2)
     np.testing.assert_allclose(np.std(sizes, axis=0)[4:], made.size_sigma[4:], rtol=0.2)
-    assert made.size_sigma[3] == 0.0  # the lowest point is on the rim, which is at 0
+    assert np.isnan(made.size_sigma[3])  # the lowest point is on the rim
 
 
 def random_pool(rng: np.random.Generator, kind: int) -> Pool:
@@ -255,7 +255,9 @@ def test_every_size_has_its_uncertainty_where_the_pool_ends_near_what_is_fitted(
     )
     made = fit.reconstruct(match, OPEN_RIG, FitSettings())
     size = measure_surface(made, match, OPEN_RIG)
-    assert all(np.isfinite(value) for name, value in vars(size).items() if "_sigma_" in name)
+    sigmas = {name: value for name, value in vars(size).items() if "_sigma_" in name}
+    # The lowest point is on the boundary.
+    assert all(np.isfinite(sigmas[name]) for name in sigmas if not name.startswith("depth"))
     assert 0 < size.volume_sigma_mm3 < 0.2 * size.volume_mm3
 
 

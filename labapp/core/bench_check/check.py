@@ -342,7 +342,8 @@ def _status(
     contradiction = size.deviation**2 if size.is_contradicted else 0.0
     if slip > max(SLIPPED, suspected - ALIKE, contradiction - ALIKE):
         return "row-slipped", REASONS["row-slipped"]
-    if verdict != "noise-like" and explained >= FAR_BETTER * max(suspected, contradiction):
+    # What the model lacks pulls the sizes along.
+    if verdict != "noise-like" and explained >= max(FAR_BETTER * suspected, contradiction):
         return verdict, REASONS[verdict]
     if contradiction > suspected:
         return "size-off", (

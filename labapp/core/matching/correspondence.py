@@ -91,14 +91,16 @@ def match_rays(
     Raises
     ------
     CannotMeasure
-        ``too-few-dots`` if there are fewer than `LEAST_LABELS`; ``no-reference`` if no hole can be
-        the absent centre dot, ``ambiguous-rows`` if several can; ``ambiguous-orientation``;
+        ``too-few-dots`` if there are fewer than `LEAST_LABELS`; ``no-reference`` if the pattern has
+        no absent ray or no hole can be the absent dot, ``ambiguous-rows`` if several can; ``ambiguous-orientation``;
         ``no-match`` if no surface explains the dots.
     """
     if len(dots) < LEAST_LABELS:
         raise CannotMeasure(
             "too-few-dots", f"{len(dots)} dots were found, telling rays needs {LEAST_LABELS}"
         )
+    if bench.rig.pattern.marker is None:
+        raise CannotMeasure("no-reference", "the pattern has no absent ray, which tells rows apart")
     observed = Observation.of(dots, bench, frame_shape)
     orientations = settings.orientations
     found: list[Hypothesis] = []
@@ -128,7 +130,7 @@ def _decide_among(
     asked = settings.orientations
     found = [hypothesis for hypothesis in found if hypothesis.orientation(observed) in asked]
     if not found:
-        if observed.rig.pattern.marker is None or (lattice is not None and not lattice.candidates):
+        if lattice is not None and not lattice.candidates:
             raise CannotMeasure("no-reference", "no hole in the rows can be the absent dot")
         raise CannotMeasure("no-match", NOTHING_EXPLAINS)
     return decide(observed, found, settings)
@@ -181,8 +183,7 @@ def _by_sites(
     Few grow: those whose surface fits best, first a quick one, then that with which labels grow.
     """
     pattern = observed.rig.pattern
-    if pattern.marker is None:
-        return []
+    assert pattern.marker is not None
     shape = (pattern.rows, pattern.columns)
     labelled = [
         labels_from_lattice(lattice, site, pattern.marker, orientation, shape)
