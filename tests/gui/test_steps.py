@@ -20,8 +20,8 @@ CALIBRATE = "calibrate the picture (step Imaging plane)"
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("", f"Enter the laser, the dot pattern, {TYPED}; {CALIBRATE}"),
-        (LASER, f"Enter the dot pattern, {TYPED}; {CALIBRATE}"),
+        ("", f"Enter the laser, the pattern, {TYPED}; {CALIBRATE}"),
+        (LASER, f"Enter the pattern, {TYPED}; {CALIBRATE}"),
         (
             LASER.replace("distance_mm = 31.48\n", "") + PATTERN,
             f"Enter the laser (distance mm), {TYPED}; {CALIBRATE}",

@@ -92,8 +92,8 @@ def match_rays(
     ------
     CannotMeasure
         ``too-few-dots`` if there are fewer than `LEAST_LABELS`; ``no-reference`` if the pattern has
-        no absent ray or no hole can be the absent dot, ``ambiguous-rows`` if several can; ``ambiguous-orientation``;
-        ``no-match`` if no surface explains the dots.
+        no absent ray or no hole can be the absent dot, ``ambiguous-rows`` if several can;
+        ``ambiguous-orientation``; ``no-match`` if no surface explains the dots.
     """
     if len(dots) < LEAST_LABELS:
         raise CannotMeasure(

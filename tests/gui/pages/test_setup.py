@@ -39,7 +39,7 @@ def test_everything_is_missing_in_a_new_session(empty: Session) -> None:
     rules = {
         f"{section}.{key}": rule for section in SECTIONS for key, rule in SECTIONS[section].items()
     }
-    needed = [key for key in KEYS if rules[key].required]
+    needed = [key for key in KEYS if key in rules and rules[key].required]  # not those of lines
     assert shown.problems == dict.fromkeys(needed, "missing")
     assert set(shown.values.values()) == {None}
     assert shown.others == ("The imaging plane is not calibrated: that is step 3.",)

@@ -315,7 +315,10 @@ KEY = (
 
 
 def quantity_rows(record: BenchCheckRecord) -> tuple[QuantityRow, ...]:
-    """Quantities before and after a check; one that is known hardly better is not determined."""
+    """Quantities before and after a check; one that is known hardly better is not determined.
+
+    Those that are known exactly, such as the glass where there is none, are left out.
+    """
     rows = []
     arrays = (record.before, record.before_sigma, record.after, record.after_sigma)
     for key, *values in zip(record.quantities, *arrays, strict=True):
@@ -323,6 +326,8 @@ def quantity_rows(record: BenchCheckRecord) -> tuple[QuantityRow, ...]:
             continue
         one = QUANTITIES[INDEX[key]]
         before, before_sigma, after, after_sigma = map(float, values)
+        if before_sigma == 0.0:
+            continue
         determined = after_sigma <= UNDETERMINED * before_sigma
         group, _, name = one.name.partition(", ")
         texts = (
