@@ -26,7 +26,6 @@ if TYPE_CHECKING:
     import numpy.typing as npt
 
     from labapp.config.setup import Setup
-    from labapp.core.sequence.line_frame import LineFrame
     from labapp.media import FrameSource
 
 
@@ -70,6 +69,7 @@ def lines(
 def _measure(source: FrameSource, frames: range, folder: Path, bench: Setup) -> bool:
     """Measure frames one by one; whether any has lines."""
     from labapp.core.pipeline import Settings, measure, setup_status
+    from labapp.core.sequence.line_frame import LineFrame
     from labapp.core.sequence.line_states import LineSeries, line_changes, line_states
     from labapp.export import line_results as tables
 
