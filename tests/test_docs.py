@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import re
 import shlex
 import shutil
 from pathlib import Path
+from typing import Any
 
 import matplotlib as mpl
 import pytest
@@ -29,6 +31,21 @@ def test_the_tutorial_leads_to_a_figure(tmp_path: Path, monkeypatch: pytest.Monk
     for example in re.findall(r"```python\n(.*?)```", text, re.S):
         exec(example, names)
     assert (tmp_path / "pool.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    mpl.use("Agg")
+    notebook = json.loads((ROOT / "docs/notebooks/measured_and_true.ipynb").read_text("utf-8"))
+    names: dict[str, Any] = {}
+    for cell in notebook["cells"]:
+        if cell["cell_type"] == "code":
+            assert not cell["outputs"]  # results belong to who runs it
+            exec("".join(cell["source"]), names)
+    comparison = names["comparison"]
+    assert (comparison["median error, %"] < 2).all()
+    assert (comparison["error / ±, RMS"] < 2).all()
+    assert (tmp_path / "measured_and_true.png").exists()
 
 
 def test_the_commands_of_the_site_are_those_of_the_command_line() -> None:
