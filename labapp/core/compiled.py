@@ -6,10 +6,12 @@ a measurement and not to the app's start.
 
 from __future__ import annotations
 
+import logging
 import shutil
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext, suppress
+from functools import cache
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, TypeVar
@@ -31,6 +33,9 @@ HOW: dict[str, Any] = {
     "fastmath": {"reassoc", "contract", "nsz"},
 }
 """Sums may be taken in any order and division by zero gives infinity or NaN, as in NumPy."""
+
+NOTICES = "labapp.notices"
+"""Logger of what whoever waits is to read."""
 
 OLD_S = 60 * 86400.0
 """What was compiled for a source that nobody has is deleted after so long, s."""
@@ -77,6 +82,7 @@ class BySource(_CacheLocator):
         except OSError:
             return None
         if is_new:
+            _announce()
             _delete_old(_folder())
         return place
 
@@ -96,6 +102,15 @@ class BySource(_CacheLocator):
 def _folder() -> Path:
     own = _config.CACHE_DIR or platformdirs.user_cache_dir("labapp", appauthor=False)
     return Path(own) / "loops"
+
+
+@cache
+def _announce() -> None:
+    # Once in a process; in its workers too, but they find what it compiled.
+    logging.getLogger(NOTICES).warning(
+        "First use on this computer: labapp is compiled for its processor. This takes some minutes "
+        "at most, and happens once."
+    )
 
 
 def _delete_old(folder: Path) -> None:

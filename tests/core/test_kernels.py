@@ -769,6 +769,29 @@ def test_what_cannot_be_kept_on_disk_is_compiled_all_the_same(tmp_path: Path) ->
     assert (told.returncode, told.stdout) == (0, "2\n"), told.stderr
 
 
+def test_the_first_use_is_announced_once(tmp_path: Path) -> None:
+    source = """from numba import types
+from labapp.core.compiled import compiled
+@compiled(types.float64)
+def twice(x): return 2.0 * x
+@compiled(types.float64)
+def thrice(x): return 3.0 * x
+"""
+    (tmp_path / "loops.py").write_text(source, "utf-8")
+    said = []
+    for _ in range(2):
+        done = subprocess.run(
+            [sys.executable, "-c", "import loops"], capture_output=True, text=True, check=True,
+            cwd=tmp_path,
+            env={
+                **os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache"),
+                "PYTHONPATH": str(Path(__file__).parents[2]),
+            },
+        )  # fmt: skip
+        said.append(done.stderr.splitlines())
+    assert [len(lines) for lines in said] == [1, 0]
+
+
 @pytest.mark.parametrize("height_mm", [0.3, -0.5])
 def test_caps_are_scored_by_the_places_that_lie_where_they_have_dots(height_mm: float) -> None:
     rng = np.random.default_rng(7)
