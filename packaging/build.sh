@@ -33,7 +33,7 @@ Maintainer: labapp contributors <labapp@localhost>
 Section: science
 Priority: optional
 Installed-Size: $(du -sk "$tree" | cut -f1)
-Depends: libegl1, libgl1, libglib2.0-0 | libglib2.0-0t64, libxkbcommon0, libfontconfig1, libdbus-1-3, libxcb-cursor0, libxcb-icccm4, libxcb-keysyms1, libxcb-shape0, libxkbcommon-x11-0, libxcursor1
+Depends: libstdc++6, libegl1, libgl1, libglib2.0-0 | libglib2.0-0t64, libxkbcommon0, libfontconfig1, libdbus-1-3, libxcb-cursor0, libxcb-icccm4, libxcb-keysyms1, libxcb-shape0, libxkbcommon-x11-0, libxcursor1
 Recommends: libaravis-0.8-0
 Description: surface of a molten weld pool, measured from reflected laser dots
  A desktop application and a command line: calibration, recording,
