@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -71,28 +70,24 @@ def _measure(source: FrameSource, frames: range, folder: Path, bench: Setup) -> 
     from labapp.core.pipeline import Settings, measure, setup_status
     from labapp.core.sequence.line_frame import LineFrame
     from labapp.core.sequence.line_states import LineSeries, line_changes, line_states
-    from labapp.export import line_results as tables
+    from labapp.export.line_results import line_tables
 
     found, times_s = list[LineFrame](), list[float | None]()
-    with (
-        progress_shown("stopped: the lines of the frames that were finished are kept") as progress,
-        closing(tables.LineTables(folder, bench.calibration)) as written,
-    ):
-        for k, number in enumerate(frames):
-            frame = source.frame(number)
-            one = measure(frame.image, bench.bench, Settings())[0].lines
-            assert one is not None
-            found.append(one)
-            times_s.append(frame.time_s)
-            written.write(number, one)
-            if one.status == "ok" and one.surface is not None:
-                text = csv_text([tables.SURFACE_COLUMNS, *tables.surface_rows(one.surface)])
-                write_file(folder / f"surface_{number:06d}.csv", text.encode())
-            progress(source.name, k + 1, len(frames))
+    try:
+        with progress_shown("stopped: the frames that were finished are kept") as progress:
+            for k, number in enumerate(frames):
+                frame = source.frame(number)
+                one = measure(frame.image, bench.bench, Settings())[0].lines
+                assert one is not None
+                found.append(one)
+                times_s.append(frame.time_s)
+                progress(source.name, k + 1, len(frames))
+    finally:
+        done, status = frames[: len(found)], setup_status(bench.rig)
+        for name, text in line_tables(done, times_s, found, bench.calibration, status).items():
+            write_file(folder / name, text.encode())
     series = LineSeries.of(found)
     states = line_states(series)
-    rows = tables.feature_rows(frames, times_s, found, states, setup_status(bench.rig))
-    write_file(folder / "features.csv", csv_text([tables.FEATURE_COLUMNS, *rows]).encode())
     for name, counts in (("frames", [one.status for one in found]), ("states", states)):
         shown = ", ".join(f"{what} {n}" for what, n in Counter(counts).most_common())
         typer.echo(f"{name}: {shown}")

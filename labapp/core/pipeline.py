@@ -25,6 +25,7 @@ from labapp.core.geometry.rig import Rig
 from labapp.core.images.band_pass import DetectorTuning, quick_dots, tuned_dots
 from labapp.core.images.dots import Dots, Image
 from labapp.core.images.find_dots import DotSettings, find_dots
+from labapp.core.images.line_correction import LineCorrection
 from labapp.core.match import Match
 from labapp.core.matching.corrected_rows import lattice_of_corrected, match_corrected
 from labapp.core.matching.correspondence import lattice_of_match, match_rays
@@ -44,6 +45,9 @@ if TYPE_CHECKING:  # the module compiles: it is loaded where a frame is measured
     from labapp.core.sequence.prior import Prior
 
 Passed = Callable[[str], None]
+
+ByHand = Correction | LineCorrection
+"""A frame as the operator has it: dots and rows, or the lines of a line pattern."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +97,7 @@ class Measurement:
         Results of steps 1 to 5; None from the step on that could not be done. The lattice may be
         None before that, too: rays can be identified without it.
     correction
-        The operator's dots and rows; None if they are as they were found.
+        The operator's dots and rows, or lines; None if they are as they were found.
     setup_status
         How far the set-up can be relied on (`RigUncertainty.status`); empty where it is exact.
     lines
@@ -109,7 +113,7 @@ class Measurement:
     match: Match | None = None
     reconstruction: Reconstruction | None = None
     measures: measures.Measures | None = None
-    correction: Correction | None = None
+    correction: ByHand | None = None
     setup_status: str = ""
     lines: LineFrame | None = None
 
@@ -124,7 +128,7 @@ def measure(
     bench: Bench,
     settings: Settings,
     prior: Prior | None = None,
-    correction: Correction | None = None,
+    correction: ByHand | None = None,
     passed: Passed = lambda _: None,
 ) -> tuple[Measurement, Prior | None]:
     """Measure the pool that a frame shows. Never raises for a bad frame: the status says why.
@@ -142,8 +146,9 @@ def measure(
         the status is ``track-lost``, or another that is not ``ok``, where it does not lead here.
         None: the frame is measured by itself.
     correction
-        The frame's dots and rows as the operator has them; they are measured in place of what would
-        be found, and of the image only the shape counts.
+        The frame's dots and rows, or lines, as the operator has them; they are measured in place of
+        what would be found, and of the image only the shape counts. One of the other kind of
+        pattern is not used.
     passed
         Called with the name of each step when it is done: dots, match, measures.
 
@@ -162,7 +167,7 @@ def measure(
     shape, known = (image.shape[0], image.shape[1]), None
     followed, tuning, near = None, None, None
     try:
-        if correction is not None:
+        if isinstance(correction, Correction):
             dots, lattice = correction.dots, correction.lattice
             result = replace(result, dots=dots, lattice=lattice)
             match, near = match_corrected(dots, lattice, bench, shape, limits)
@@ -216,7 +221,8 @@ def _by_scheme(result: Measurement, match: Match, rig: Rig, settings: Settings) 
 
 def _with_lines(result: Measurement, image: Image, rig: LineRig, bench: Bench) -> Measurement:
     """The result of a frame of a line pattern."""
-    found = measure_lines(image, rig, bench.calibration, LineMeasureSettings())
+    by_hand = result.correction if isinstance(result.correction, LineCorrection) else None
+    found = measure_lines(image, rig, bench.calibration, LineMeasureSettings(), by_hand)
     return replace(result, status=found.status, reason=found.reason, lines=found)
 
 
@@ -242,7 +248,7 @@ def start_correction(measurement: Measurement) -> Correction:
     The latter has a reference only where the frame was matched: a hole that stands out among the
     rows is no more than a candidate until the rays agree.
     """
-    if measurement.correction is not None:
+    if isinstance(measurement.correction, Correction):
         return measurement.correction
     lattice = measurement.lattice
     if lattice is not None and measurement.match is None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
@@ -171,27 +170,3 @@ def line_tables(
             text = csv_text([SURFACE_COLUMNS, *surface_rows(one.surface)])
             tables[f"surface_{k:06d}.csv"] = text
     return tables
-
-
-class LineTables:
-    """`lines.csv` and `line_points.csv` of a folder, written frame by frame."""
-
-    def __init__(self, folder: Path, calibration: ImageCalibration) -> None:
-        self._calibration = calibration
-        self._files = [
-            (folder / name).open("w", encoding="utf-8", newline="")
-            for name in ("lines.csv", "line_points.csv")
-        ]
-        for file, columns in zip(self._files, (LINE_COLUMNS, POINT_COLUMNS), strict=True):
-            file.write(csv_text([columns]))
-
-    def write(self, frame: int, found: LineFrame) -> None:
-        """Write the lines of a frame."""
-        for file, rows in zip(self._files, (line_rows, point_rows), strict=True):
-            file.write(csv_text(rows(frame, found, self._calibration)))
-            file.flush()
-
-    def close(self) -> None:
-        """Close both files."""
-        for file in self._files:
-            file.close()

@@ -17,6 +17,7 @@ import numpy.typing as npt
 
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.pipeline import Measurement
+from labapp.core.rows.correction import Correction
 from labapp.core.surface import measures
 from labapp.core.surface.measures import Measures, sigma_name
 from labapp.core.surface.reconstruction import Reconstruction
@@ -225,7 +226,7 @@ def _dots(measurement: Measurement, calibration: ImageCalibration) -> list[npt.N
         hidden = np.isin(lattice.row, list(lattice.blocked_rows)) if lattice.blocked_rows else 0
         blocked = np.where(lattice.row > 0, hidden, np.nan)
     source = np.full(len(dots), "auto", object)
-    if measurement.correction is not None:
+    if isinstance(measurement.correction, Correction):
         source[measurement.correction.manual] = "manual"
     plane = calibration.to_plane(dots.image_px)
     return [*dots.image_px.T, *plane.T, *site.T, *ray.T, blocked, source]

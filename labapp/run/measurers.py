@@ -26,9 +26,8 @@ import cv2
 from threadpoolctl import ThreadpoolController
 
 from labapp.config.setup import Setup
-from labapp.core.pipeline import Measurement, Settings, measure
+from labapp.core.pipeline import ByHand, Measurement, Settings, measure
 from labapp.core.recording.residual_check import Residuals
-from labapp.core.rows.correction import Correction
 from labapp.errors import InputError
 from labapp.export.frame_result import FrameResult, without_surface
 from labapp.export.tables import table_rows
@@ -56,8 +55,8 @@ BATCH = 20
 Read = Callable[[int], Frame]
 """Reads a frame by its number; raises `InputError` if it cannot."""
 
-Corrected = Callable[[int], Correction | None]
-"""The dots and rows of a frame as they were corrected by hand; None: they were not."""
+Corrected = Callable[[int], ByHand | None]
+"""The dots and rows, or lines, of a frame as they were corrected by hand; None: they were not."""
 
 
 # --- each frame by itself -----------------------------------------------------------------------
@@ -152,7 +151,7 @@ def _read(read: Read, number: int, settings: Settings) -> Frame | FrameResult:
 
 
 def _cold(
-    number: int, frame: Frame, setup: Setup, settings: Settings, correction: Correction | None
+    number: int, frame: Frame, setup: Setup, settings: Settings, correction: ByHand | None
 ) -> FrameResult:
     """Measure a frame by itself, with its dots and rows as they were corrected."""
     with _one_thread():

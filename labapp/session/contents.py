@@ -15,7 +15,8 @@ from labapp.errors import InputError
 
 if TYPE_CHECKING:
     from labapp.config.setup import Setup
-    from labapp.core.pipeline import Settings
+    from labapp.core.images.line_correction import LineCorrection
+    from labapp.core.pipeline import ByHand, Settings
     from labapp.core.recording.residual_check import SetupVerdict
     from labapp.core.rows.correction import Correction
     from labapp.core.values import IntArray
@@ -151,8 +152,21 @@ class SessionContents:
         return Settings() if found is None else found
 
     def correction(self, frame: int) -> Correction | None:
-        """Correction of a frame by hand; None where there is none."""
-        found: Correction | None = self._documents.get("correction", frame)
+        """Dots and rows of a frame as they were corrected by hand; None where there are none."""
+        from labapp.core.rows.correction import Correction
+
+        found = self._by_hand(frame)
+        return found if isinstance(found, Correction) else None
+
+    def line_correction(self, frame: int) -> LineCorrection | None:
+        """Lines of a frame as they were corrected by hand; None where there are none."""
+        from labapp.core.images.line_correction import LineCorrection
+
+        found = self._by_hand(frame)
+        return found if isinstance(found, LineCorrection) else None
+
+    def _by_hand(self, frame: int) -> ByHand | None:
+        found: ByHand | None = self._documents.get("correction", frame)
         return found
 
     @property

@@ -12,8 +12,7 @@ from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal, Never
 
-from labapp.core.pipeline import Settings
-from labapp.core.rows.correction import Correction
+from labapp.core.pipeline import ByHand, Settings
 from labapp.run.limits import Limits
 from labapp.session.file.blobs import Damaged, fingerprint_of, pack, unpack, unpack_from
 from labapp.session.file.database import Database
@@ -37,14 +36,14 @@ Kind = Literal[
 Key = tuple[Kind, int]
 """Kind, and the frame of a correction; `NO_FRAME` for what belongs to no frame."""
 
-CLASSES: dict[str, type] = {
+CLASSES: dict[str, Any] = {
     "record": Record,
     "setup": str,
     "settings": Settings,
     "laser-calibration": LaserReadings,
     "plane-calibration": PlanePicture,
     "bench-check": BenchCheckRecord,
-    "correction": Correction,
+    "correction": ByHand,
     "signals": Signals,
     "limits": Limits,
 }

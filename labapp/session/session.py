@@ -27,8 +27,7 @@ if TYPE_CHECKING:
         LaserCalibrationSettings,
     )
     from labapp.core.calibration.plane_calibration import PlaneCalibration
-    from labapp.core.pipeline import Measurement, Settings
-    from labapp.core.rows.correction import Correction
+    from labapp.core.pipeline import ByHand, Measurement, Settings
     from labapp.export.folder import ExportChoice, ExportedFile
     from labapp.export.frame_result import FrameResult
     from labapp.media import GreyImage
@@ -254,18 +253,20 @@ class Session(SessionContents):
         """Set how frames are measured: the scheme, and the settings of every step."""
         self._documents.change(label, {("settings", NO_FRAME): settings})
 
-    def correct(
-        self, corrections: Mapping[int, Correction | None], label: str = "correction"
-    ) -> None:
+    def correct(self, corrections: Mapping[int, ByHand | None], label: str = "correction") -> None:
         """Set the corrections of frames in one step; None returns a frame to automatic.
 
         Raises
         ------
         InputError
-            If the session has no such frame.
+            If the session has no such frame, or another kind of pattern.
         """
-        if any(corrections.values()) and self.has_lines:
-            raise InputError(self.path, "correction", "dots", "a pattern of dots; this has lines")
+        from labapp.core.images.line_correction import LineCorrection
+
+        other, own = ("dots", "lines") if self.has_lines else ("lines", "dots")
+        for value in corrections.values():
+            if value is not None and isinstance(value, LineCorrection) != self.has_lines:
+                raise InputError(self.path, "correction", other, f"{own}, as the pattern has")
         for frame in corrections:
             self._frames.time_s(frame)
         self._documents.change(
@@ -380,7 +381,7 @@ class Session(SessionContents):
             made_with = None if used is None else fingerprint(used)
             self._results.put(number, measurement, basis, made_with)
 
-        given = (self.frame, basis.setup, basis.settings, self.correction)
+        given = (self.frame, basis.setup, basis.settings, self._by_hand)
         lines = basis.setup.line_rig is not None  # each frame by itself; nothing judges the set-up
         by_itself = lines or not warm
         measurer: Measurer = ColdMeasurer(*given, pool) if by_itself else WarmMeasurer(*given)

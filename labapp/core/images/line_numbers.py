@@ -7,6 +7,7 @@ pool that shrinks loses outer lines first (Fig. 3-14).
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -76,15 +77,15 @@ def number_lines(lines: tuple[LightLine, ...], count: int) -> LinesSeen:
     light = np.array([one.light for one in ordered])
     brightest = int(np.argmax(total))
     real = _pattern_lines(light, total, brightest)
-    heights = _heights(ordered)
+    height = heights(ordered)
     if len(real) > count:
         runs = np.convolve(total[real], np.ones(count), "valid")
         start = int(np.argmax(runs))
         real = real[start : start + count]
     return LinesSeen(
         tuple(ordered[k] for k in real),
-        _is_fringe(heights, real, -1),
-        _is_fringe(heights, real, 1),
+        _is_fringe(height, real, -1),
+        _is_fringe(height, real, 1),
         len(lines) - len(real),
     )
 
@@ -100,7 +101,7 @@ def _are_legs(one: LightLine, other: LightLine) -> bool:
     return shared > min(high - low, top - bottom) / 2
 
 
-def _heights(lines: list[LightLine]) -> FloatArray:
+def heights(lines: Sequence[LightLine]) -> FloatArray:
     """−v of each line where it is nearest to the column that most of them cross, px."""
     middle = np.median([np.mean(one.ends_px[:, 0]) for one in lines])
     nearest = [int(np.argmin(np.abs(one.image_px[:, 0] - middle))) for one in lines]
@@ -108,7 +109,7 @@ def _heights(lines: list[LightLine]) -> FloatArray:
 
 
 def _from_below(lines: list[LightLine]) -> list[LightLine]:
-    return [lines[k] for k in np.argsort(_heights(lines))]
+    return [lines[k] for k in np.argsort(heights(lines))]
 
 
 def _pattern_lines(light: FloatArray, total: FloatArray, brightest: int) -> list[int]:
@@ -124,13 +125,13 @@ def _pattern_lines(light: FloatArray, total: FloatArray, brightest: int) -> list
     return sorted(real)
 
 
-def _is_fringe(heights: FloatArray, real: list[int], side: int) -> bool:
+def _is_fringe(height: FloatArray, real: list[int], side: int) -> bool:
     """Whether what is beside the outermost line has a fringe's distance from it."""
     outer, inner = (real[0], real[1:2]) if side < 0 else (real[-1], real[-2:-1])
     beside = outer + side
-    if not 0 <= beside < len(heights):
+    if not 0 <= beside < len(height):
         return False
     if not inner:
         return True
-    spacing = abs(heights[outer] - heights[inner[0]])
-    return bool(NEAREST * spacing < abs(heights[beside] - heights[outer]) < FARTHEST * spacing)
+    spacing = abs(height[outer] - height[inner[0]])
+    return bool(NEAREST * spacing < abs(height[beside] - height[outer]) < FARTHEST * spacing)

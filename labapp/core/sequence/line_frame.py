@@ -10,12 +10,15 @@ from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.line_pattern import LineRig
 from labapp.core.images.dots import Image
 from labapp.core.images.light_lines import LightLine, LineSettings, find_lines
+from labapp.core.images.line_correction import LineCorrection
 from labapp.core.images.line_numbers import LinesSeen, number_lines
 from labapp.core.surface.line_data import line_data
 from labapp.core.surface.line_fit import LineFitSettings, LineSurface, fit_lines
-from labapp.core.values import CannotMeasure, FloatArray
+from labapp.core.values import CannotMeasure, FloatArray, IntArray
 
 FOLDED = "the pool gathers the lines to points: they show how many they are, and no shape"
+
+UNNUMBERED = "the lines, or the numbers given by hand, are not those of neighbours in the pattern"
 
 
 @dataclass(frozen=True)
@@ -68,7 +71,7 @@ class LineFrame:
     ----------
     status
         ``ok``; ``profile`` where the lines leave a direction of the surface open; ``no-lines``,
-        ``folded-lines``, ``too-few-lines``, ``no-surface``.
+        ``folded-lines``, ``too-few-lines``, ``line-numbers``, ``no-surface``.
     reason
         One sentence where there is no surface; empty otherwise.
     seen, features
@@ -85,10 +88,17 @@ class LineFrame:
 
 
 def measure_lines(
-    image: Image, rig: LineRig, calibration: ImageCalibration, settings: LineMeasureSettings
+    image: Image,
+    rig: LineRig,
+    calibration: ImageCalibration,
+    settings: LineMeasureSettings,
+    correction: LineCorrection | None = None,
 ) -> LineFrame:
-    """Measure one grey frame, shape (height, width), of a line pattern."""
-    seen = number_lines(find_lines(image, settings.lines), rig.pattern.count)
+    """Measure one grey frame, shape (height, width), of a line pattern, as it was corrected."""
+    count = rig.pattern.count
+    if correction is None:
+        correction = LineCorrection.of(number_lines(find_lines(image, settings.lines), count))
+    seen = correction.seen
     features = line_features(seen.lines, calibration)
     if not seen.lines:
         return LineFrame("no-lines", "no line stands out of the noise", seen, features, None)
@@ -96,7 +106,9 @@ def measure_lines(
     if len(open_lines) < len(seen.lines) / 2:
         return LineFrame("folded-lines", FOLDED, seen, features, None)
     data = line_data(tuple(seen.lines[k] for k in open_lines), calibration)
-    numberings = [each[open_lines] for each in _numberings(seen, rig.pattern.count)]
+    numberings = [each[open_lines] for each in _numberings(seen, correction.number, count)]
+    if not numberings:
+        return LineFrame("line-numbers", UNNUMBERED, seen, features, None)
     try:
         surface = fit_lines(data, numberings, rig, settings.fit)
     except CannotMeasure as problem:
@@ -105,13 +117,24 @@ def measure_lines(
     return LineFrame(surface.status, open_, seen, features, surface)
 
 
-def _numberings(seen: LinesSeen, count: int) -> list[FloatArray]:
+def _numberings(seen: LinesSeen, by_hand: IntArray, count: int) -> list[FloatArray]:
     """Numbers that the lines may have, from the lowest up, growing either way."""
-    steps = np.arange(len(seen.lines), dtype=float)
-    return [
+    if by_hand.all():
+        return [by_hand.astype(float)]
+    given = by_hand > 0
+    same = given[1:] & (np.diff(by_hand) == 0)  # pieces of one line
+    steps = np.concatenate([[0.0], np.cumsum(~same)])
+    runs = [
         first + sign * steps
         for sign in (1, -1)
-        for first in seen.first_numbers(count, same_order=sign > 0)
+        for first in (
+            range(1, count + 1) if given.any() else seen.first_numbers(count, same_order=sign > 0)
+        )
+    ]
+    return [
+        run
+        for run in runs
+        if run.min() >= 1 and run.max() <= count and (run == by_hand)[given].all()
     ]
 
 

@@ -4,11 +4,13 @@
 | --- | --- | --- |
 | ``no-pool`` | "a blurred plane without any lines" at point A (Fig. 3-11) | no line is seen |
 | ``growing`` | from A to B "the weld pool grows" (Fig. 3-11) | the pool's width rises, or lines have appeared and do not yet give one |
-| ``concave`` | full penetration, steady (Fig. 3-12) | curvature below zero, not changing |
-| ``flattening`` | "from being concave towards being convex", the size falls (Fig. 3-13) | curvature rises |
-| ``convex`` | partial penetration, images larger, lines fewer (Fig. 3-14) | curvature above zero, not changing |
+| ``concave`` | full penetration, steady (Fig. 3-12) | turn below zero, not changing |
+| ``flattening`` | "from being concave towards being convex", the size falls (Fig. 3-13) | turn rises |
+| ``convex`` | partial penetration, images larger, lines fewer (Fig. 3-14) | turn above zero, not changing |
 
-The text reads shapes by eye; here curvature and width are those of the surface that was fitted.
+The text reads shapes by eye; here width and turn are those of the surface that was fitted. The turn
+is its curvature times its width, the angle between its normals at both ends of the lines: lines
+determine it better than either, as a wider and flatter surface reflects them nearly alike.
 """  # noqa: E501
 
 from __future__ import annotations
@@ -35,6 +37,15 @@ STEADY_FRAMES, SLOPING_FRAMES, CORNER_REACH = 25, 12, 8
 """A corner is sought so near to where a change seems to begin, from so many frames before it and in
 it."""
 
+RAMP_REACH = 16
+"""A ramp begins and ends so near to where a change seems to."""
+
+LEAST_KNOWN, MOST_OFF = 5, 6.0
+"""A ramp needs so many frames on both sides; no frame costs more, −log likelihood."""
+
+UNEVEN = 0.05
+"""Standard deviation of frames from a straight ramp, over its height."""
+
 APPEARING_FRAMES = 15
 """Growth that shows so soon after the first lines began with them."""
 
@@ -58,15 +69,15 @@ class StateSettings:
         half, as a local fit to a corner has half the rate beyond it.
     sigmas
         And above so many standard uncertainties.
-    least_growth_mm, least_change_per_mm
-        What width and curvature must change by over a window to count at all, mm and 1/mm.
+    least_growth_mm, least_turn
+        What width and turn must change by over a window to count at all, mm and rad.
     """
 
     window: float = 5.0
     share: float = 0.55
     sigmas: float = 4.0
     least_growth_mm: float = 0.1
-    least_change_per_mm: float = 0.006
+    least_turn: float = 0.03
 
 
 @dataclass(frozen=True)
@@ -87,6 +98,11 @@ class LineSeries(ReadOnlyArrays):
     width_mm: FloatArray
     curvature_per_mm: FloatArray
 
+    @property
+    def turn(self) -> FloatArray:
+        """Angle between the surface's normals across the pool, rad, positive when convex."""
+        return self.curvature_per_mm * self.width_mm
+
     @classmethod
     def of(cls, frames: Sequence[LineFrame]) -> LineSeries:
         """Collect the series from frames in order."""
@@ -106,12 +122,12 @@ def line_states(series: LineSeries, settings: StateSettings | None = None) -> tu
     window = settings.window
     lit = _steady(series.count > 0)
     width, growth, growth_sigma = local_line(series.width_mm, lit, window)
-    curvature, bending, bending_sigma = local_line(series.curvature_per_mm, lit, window)
+    turn, turning, turning_sigma = local_line(series.turn, lit, window)
     grows = _changes(growth, growth_sigma, settings.least_growth_mm, settings)
     grows = lit & _with_corners(grows, series.width_mm, lit)
     grows |= _just_appeared(lit, grows)
-    flattens = _changes(bending, bending_sigma, settings.least_change_per_mm, settings)
-    flattens = lit & ~grows & _with_corners(flattens, series.curvature_per_mm, lit)
+    flattens = _changes(turning, turning_sigma, settings.least_turn, settings)
+    flattens = lit & ~grows & _ramps(flattens, series.turn, lit & ~grows)
     # Lines that have just appeared may be too few for a surface.
     unknown = lit & ~np.isfinite(width)
     states: list[State] = []
@@ -123,7 +139,7 @@ def line_states(series: LineSeries, settings: StateSettings | None = None) -> tu
         elif flattens[k]:
             states.append("flattening")
         else:
-            states.append("convex" if curvature[k] > 0 else "concave")
+            states.append("convex" if turn[k] > 0 else "concave")
     return tuple(states)
 
 
@@ -208,6 +224,42 @@ def _with_corners(change: BoolArray, values: FloatArray, on: BoolArray) -> BoolA
         end = _corner(values[::-1], on[::-1], len(values) - 1 - int(last))
         result[begin : len(values) - end] = True
     return result
+
+
+def _ramps(change: BoolArray, values: FloatArray, on: BoolArray) -> BoolArray:
+    """Changes as ramps between two levels."""
+    parts, count = label(change)
+    result = np.zeros(len(change), bool)
+    for part in range(1, count + 1):
+        first, last = np.flatnonzero(parts == part)[[0, -1]]
+        begin, end = _ramp(values, on, int(first), int(last) + 1)
+        result[begin:end] = True
+    return result
+
+
+def _ramp(values: FloatArray, on: BoolArray, begin: int, end: int) -> tuple[int, int]:
+    """First frame of a change near ``begin``, and the first after it: a line between two levels."""
+    known = on & np.isfinite(values)
+    known[: max(begin - STEADY_FRAMES, 0)] = known[end + STEADY_FRAMES :] = False
+    frames = np.flatnonzero(known)
+    seen = values[frames]
+    sides = [seen[frames < begin - RAMP_REACH // 2], seen[frames >= end + RAMP_REACH // 2]]
+    if min(map(len, sides)) < LEAST_KNOWN:
+        return begin, end
+    low, high = (float(np.median(side)) for side in sides)
+    scatter = [1.4826 * float(np.median(np.abs(side - np.median(side)))) for side in sides]
+    best, least = (begin, end), np.inf
+    for first in range(max(begin - RAMP_REACH, 0), begin + RAMP_REACH + 1):
+        for last in range(max(end - RAMP_REACH, first + LEAST_FRAMES), end + RAMP_REACH + 1):
+            share = np.clip((frames - first + 0.5) / (last - first), 0.0, 1.0)
+            off = np.abs(seen - low - share * (high - low))
+            typical = scatter[0] + share * (scatter[1] - scatter[0]) + 1e-9
+            inside = (share > 0) & (share < 1)
+            typical = np.hypot(typical, inside * UNEVEN * abs(high - low))
+            cost = float(np.sum(np.minimum((off / typical) ** 2 / 2, MOST_OFF) + np.log(typical)))
+            if cost < least:
+                best, least = (first, last), cost
+    return best
 
 
 def _corner(values: FloatArray, on: BoolArray, near: int) -> int:

@@ -206,7 +206,7 @@ def fit_lines(
 def _status(one: LineSurface, margin: float, settings: LineFitSettings) -> str:
     sure = one.height_sigma_mm <= settings.most_relative_sigma * abs(one.height_mm)
     fits = one.misfit <= settings.most_misfit
-    enough = len(one.numbers) >= LEAST_LINES
+    enough = len(np.unique(one.numbers)) >= LEAST_LINES
     return "ok" if enough and sure and fits and margin >= settings.margin else "profile"
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
-from PySide6.QtCore import Qt, QTimer
+from PySide6.QtCore import QItemSelectionModel, QSignalBlocker, Qt, QTimer
 from PySide6.QtGui import QAction, QGuiApplication, QKeySequence
 from PySide6.QtWidgets import (
     QAbstractItemView,
@@ -57,6 +57,17 @@ class ReadTable(QTableWidget):
         if item.text() != text:
             item.setText(text)
         item.setToolTip(plain_tip(tip or text))
+
+    def select_rows(self, rows: Sequence[int]) -> None:
+        """Select rows alone; emits no signal."""
+        if {index.row() for index in self.selectedIndexes()} == set(rows):
+            return
+        with QSignalBlocker(self):
+            self.clearSelection()
+            ways = QItemSelectionModel.SelectionFlag
+            for row in rows:
+                self.selectionModel().select(self.model().index(row, 0), ways.Select | ways.Rows)
+        self.viewport().update()
 
     @property
     def full_height(self) -> int:

@@ -23,6 +23,7 @@ from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser,
 from labapp.core.geometry.uncertainty import AxisPoints, RigUncertainty
 from labapp.core.images import dots, find_dots, threshold_dots
 from labapp.core.images.light_lines import LightLine
+from labapp.core.images.line_correction import LineCorrection
 from labapp.core.images.line_numbers import LinesSeen
 from labapp.core.match import Match, Trial
 from labapp.core.matching.decision import MatchSettings
@@ -124,6 +125,11 @@ def _lines_fit(value: Any) -> bool:
     )
 
 
+def _line_correction_fits(value: Any) -> bool:
+    lines = value.seen.lines
+    return len(value.number) == len(lines) and all(len(one.image_px) > 1 for one in lines)
+
+
 def _all_within(numbers: Any, least: int, most: int) -> bool:
     return bool(((numbers >= least) & (numbers <= most)).all())
 
@@ -223,6 +229,7 @@ STORED = {
     "Measures": Stored(Measures),
     "Measurement": Stored(Measurement, fits=_measurement_fits),
     "LineFrame": Stored(LineFrame, fits=_lines_fit),
+    "LineCorrection": Stored(LineCorrection, shapes={"number": "k"}, fits=_line_correction_fits),
     "LineFeatures": Stored(LineFeatures),
     "LinesSeen": Stored(LinesSeen),
     "LightLine": Stored(

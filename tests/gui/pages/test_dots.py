@@ -442,7 +442,7 @@ def test_split_merge_and_reference(
     assert before is not None
     assert before.lattice.reference is None
     # The README of the sample says where it is on the picture, and which site that is.
-    page._pointer = (278.0, 281.0)
+    page.pointer = (278.0, 281.0)
     key(page, Qt.Key.Key_R)
     assert editor.correction is not None
     assert editor.correction.lattice.reference == (6, 8)

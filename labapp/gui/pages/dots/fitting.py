@@ -10,8 +10,6 @@ from typing import Any
 from PySide6.QtCore import QTimer
 
 from labapp.core.pipeline import Settings
-from labapp.gui.pages.dots import presenter
-from labapp.gui.pages.dots.presenter import DotsState
 from labapp.gui.shell.steps import why_not_measurable
 from labapp.gui.tasks import Cancelled, Control, Task
 from labapp.gui.workspace import Workspace
@@ -76,7 +74,7 @@ class Refit:
         self._space = workspace
         self._task: Task | None = None
         self._begun: tuple[int, object] | None = None
-        self._seen: DotsState | None = None
+        self._seen: tuple[int, bool] | None = None
         self.processes = Processes()
         """The processes that fit."""
         self._warm, self._again = QTimer(workspace), QTimer(workspace)
@@ -94,27 +92,27 @@ class Refit:
         """Whether a fit is under way."""
         return self._task is not None and self._task in self._space.tasks.active
 
-    def want(self, seen: DotsState) -> None:
-        """Fit a frame if what it was measured from has been changed."""
+    def want(self, frame: int, due: bool) -> None:
+        """Fit a frame if it is due: what it was measured from has been changed by hand."""
         session = self._space.session
         if session is None or why_not_measurable(session):
             return
-        self._seen = seen
+        self._seen = frame, due
         if not self.processes.begun and not self._warm.isActive():
             self._warm.start()
         # A fit that was refused or cancelled is not begun again until something else is tried.
-        state = (seen.frame, session.history)
+        state = (frame, session.history)
         if state == self._begun:
             return
-        if self.pending and not self._give_up(seen.frame):
+        if self.pending and not self._give_up(frame):
             return
-        if presenter.needs_fit(seen):
+        if due:
             self._begun = state
-            self._fit(seen.frame)
+            self._fit(frame)
 
     def _once_more(self) -> None:
         if self._seen is not None:
-            self.want(self._seen)
+            self.want(*self._seen)
 
     def _give_up(self, frame: int) -> bool:
         """End the running fit if it is of this frame; False if it continues."""

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
 
 from labapp.core.images.light_lines import LightLine
+from labapp.core.images.line_correction import LineCorrection
+from labapp.core.images.line_numbers import LinesSeen
 from labapp.core.sequence.line_frame import LineFrame
-from labapp.core.values import BoolArray, FloatArray
+from labapp.core.values import BoolArray, FloatArray, IntArray
 from labapp.errors import InputError
 from labapp.gui.digits import ResultRow
-from labapp.session.measured import Result
+from labapp.session.measured import CORRECTION_CHANGED, Result
 from labapp.session.session import Session
 from labapp.text import pluralize
 
@@ -19,6 +24,7 @@ STATUSES = {
     "no-lines": "No line is seen",
     "folded-lines": "The pool gathers the lines to points: they show how many they are, no shape",
     "too-few-lines": "One line alone determines no surface",
+    "line-numbers": "More lines than the pattern has, or their numbers are not those of neighbours",
 }
 
 
@@ -52,6 +58,12 @@ class LinesState:
     """What the lines show, and what they say of the pool."""
     why: str = ""
     """Why there is no surface, or why the result is stale; empty if neither."""
+    correction: LineCorrection | None = None
+    """What an edit begins with; None where no lines are known."""
+    by_hand: bool = False
+    """Whether the lines were corrected by hand."""
+    due: bool = False
+    """Whether they are to be measured again, as they were corrected."""
 
 
 COLUMNS = ("Line", "Length, px", "Width, px", "Gap, px", "Ends")
@@ -59,31 +71,48 @@ COLUMNS = ("Line", "Length, px", "Width, px", "Gap, px", "Ends")
 
 
 def show_lines(session: Session, frame: int) -> LinesState:
-    """What a frame shows: its lines as they were measured."""
+    """What a frame shows: its lines as they were corrected or measured."""
+    correction = session.line_correction(frame)
     try:
         result = session.result(frame)
     except InputError as error:
         return LinesState("This frame's result is damaged.", why=f"{error}; measure it again")
+    due = result is None or CORRECTION_CHANGED in result.stale
+    if correction is not None and due:
+        words = f"Corrected by hand: {_count(correction.seen)}. Not measured yet."
+        names = _places(correction.number)
+        return _with_lines(LinesState(words, correction=correction), names, by_hand=True, due=True)
     if result is None:
         return LinesState("This frame is not measured yet: measure it to see its lines.")
     found = result.measurement.lines
     if found is None:  # a pattern of dots, or a frame that could not be read
         why = result.measurement.reason or "; ".join(result.stale)
         return LinesState("No lines were looked for in this frame: measure it.", why=why)
-    names = line_names(found)
-    lines = found.seen.lines
-    drawn = tuple(
-        DrawnLine(name, one.image_px, one.ends_px, one.cut, one.folded)
-        for name, one in zip(names, lines, strict=True)
-    )
-    listed = tuple(_listed(name, one) for name, one in zip(names, lines, strict=True))[::-1]
+    by_hand = correction is not None
+    correction = correction or LineCorrection.of(found.seen)
+    words = ("Corrected by hand: " if by_hand else "") + _words(found)
     why = "; ".join(result.stale) or found.reason
-    return LinesState(_words(found), drawn, listed, _rows(found, result), why)
+    state = LinesState(words, rows=_rows(found, result), why=why, correction=correction)
+    return _with_lines(state, line_names(found, correction.number), by_hand, due)
 
 
-def line_names(found: LineFrame) -> tuple[str, ...]:
+def _with_lines(state: LinesState, names: Sequence[str], by_hand: bool, due: bool) -> LinesState:
+    """The state with its lines to be drawn and listed."""
+    assert state.correction is not None
+    named = tuple(zip(names, state.correction.seen.lines, strict=True))
+    drawn = (DrawnLine(name, one.image_px, one.ends_px, one.cut, one.folded) for name, one in named)
+    listed = tuple(_listed(name, one) for name, one in named)[::-1]
+    return replace(state, lines=tuple(drawn), listed=listed, by_hand=by_hand, due=due)
+
+
+def _places(number: IntArray) -> list[str]:
+    """Numbers by hand; the place of a line, in brackets, where it has none."""
+    return [str(n) if n else f"({k + 1})" for k, n in enumerate(number.tolist())]
+
+
+def line_names(found: LineFrame, by_hand: IntArray | None = None) -> tuple[str, ...]:
     """Number of each line in the pattern; its place, in brackets, where that is not settled."""
-    places = [f"({k + 1})" for k in range(len(found.seen.lines))]
+    places = _places(np.zeros(len(found.seen.lines), np.int64) if by_hand is None else by_hand)
     if found.status != "ok" or found.surface is None:
         return tuple(places)
     numbers = iter(found.surface.numbers.tolist())
@@ -95,16 +124,19 @@ def line_names(found: LineFrame) -> tuple[str, ...]:
 
 def _words(found: LineFrame) -> str:
     seen = found.seen
-    message = f"{pluralize(len(seen.lines), 'line')}" if seen.lines else "No line"
-    if seen.left_out:
-        message += f", {seen.left_out} fainter left out (fringes)"
+    message = _count(seen)
     if seen.lines and found.status != "ok":
         message += ". Numbers are not settled: counted from the lowest up"
     return f"{message}. {STATUSES.get(found.status, found.reason or found.status)}."
 
 
+def _count(seen: LinesSeen) -> str:
+    message = pluralize(len(seen.lines), "line") if seen.lines else "No line"
+    return f"{message}, {seen.left_out} left out (fringes)" if seen.left_out else message
+
+
 def _listed(name: str, one: LightLine) -> tuple[str, ...]:
-    ends = ["cut off by the picture" if cut else "seen" for cut in one.cut.tolist()]
+    ends = ["cut off" if cut else "seen" for cut in one.cut.tolist()]
     words = ends[0] if ends[0] == ends[1] else f"left {ends[0]}, right {ends[1]}"
     shape = "folded" if one.folded else words
     return name, f"{one.length_px:.0f}", f"{one.width_px:.1f}", f"{one.gap_px:.0f}", shape

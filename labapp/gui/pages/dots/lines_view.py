@@ -1,20 +1,25 @@
 """Reflected lines as they are drawn over a frame, and the panel beside it.
 
 Every line has its colour and its number. A ring is an end, a square one where the picture cuts the
-line off; a dashed line is folded: its halves lie on each other.
+line off or a hand cut it; a dashed line is folded: its halves lie on each other. A chosen line is
+drawn wider.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pyqtgraph as pg
 from PySide6.QtCore import Qt
-from PySide6.QtGui import QColor, QPen
-from PySide6.QtWidgets import QHeaderView, QWidget
+from PySide6.QtGui import QAction, QColor, QPen
+from PySide6.QtWidgets import QHeaderView, QToolButton, QWidget
 
 from labapp.gui.pages.dots.lines import COLUMNS, DrawnLine, LinesState
 from labapp.gui.pages.dots.overlay import row_color
+from labapp.gui.pages.dots.panel import button_grid
 from labapp.gui.views.picture import PictureView
+from labapp.gui.widgets.fields import FieldForm, NumberField
 from labapp.gui.widgets.labels import Message, heading, show_words, wrapping_label
 from labapp.gui.widgets.layouts import vbox
 from labapp.gui.widgets.result_table import ResultTable
@@ -36,18 +41,20 @@ class LinesOverlay:
         self._labels: list[tuple[pg.TextItem, DrawnLine]] = []
         view.box.sigXRangeChanged.connect(lambda *_: self._place_labels())
 
-    def show(self, lines: tuple[DrawnLine, ...]) -> None:
+    def show(self, lines: tuple[DrawnLine, ...], chosen: Sequence[int] = ()) -> None:
         """Draw lines in place of those drawn before."""
         for item in (*self._items, *(label for label, _ in self._labels)):
             self._view.box.removeItem(item)
         self._items, self._labels = [], []
         for k, line in enumerate(lines):
-            self._draw(line, row_color(k + 1))
+            self._draw(line, row_color(k + 1), k in chosen)
         self._place_labels()
 
-    def _draw(self, line: DrawnLine, color: str) -> None:
+    def _draw(self, line: DrawnLine, color: str, chosen: bool) -> None:
         style = Qt.PenStyle.DashLine if line.folded else Qt.PenStyle.SolidLine
-        curve = pg.PlotCurveItem(*_with_gaps(line.image_px).T, pen=_pen(color, style))
+        curve = pg.PlotCurveItem(
+            *_with_gaps(line.image_px).T, pen=_pen(color, style, 5 if chosen else 2)
+        )
         ends = pg.ScatterPlotItem(
             *line.ends_px.T,
             symbol=["s" if cut else "o" for cut in line.cut.tolist()],
@@ -70,16 +77,35 @@ class LinesOverlay:
 class LinesPanel(QWidget):
     """What stands beside the frame of a line pattern."""
 
-    def __init__(self) -> None:
+    def __init__(self, edits: Sequence[QAction]) -> None:
         super().__init__()
-        self.seen, self.why = Message(4), wrapping_label()
+        self.seen, self.why, self.chosen = Message(4), wrapping_label(), Message(2)
         self.rows = ResultTable("What the lines show")
-        self.lines = _LineList()
+        self.lines = LineList()
+        self.buttons: dict[str, QToolButton] = {}
+        self.number = NumberField(
+            "Number of the chosen line", lowest=0, highest=999, decimals=0, optional=True,
+            tooltip="Its number in the pattern, growing towards the head; empty: found by the "
+            "fit. Pieces of one line have the same",
+        )  # fmt: skip
+        form = FieldForm()
+        form.add(self.number)
         vbox(
-            *(self.seen, self.why, heading("Lines, from the top down"), self.lines),
+            *(self.seen, self.why, heading("Correct"), self.chosen, form),
+            button_grid(edits, self.buttons),
+            *(heading("Lines, from the top down"), self.lines),
             *(heading("What they show"), self.rows, 1),
             of=self,
         )
+
+    def show_chosen(self, lines: Sequence[int], asked: str, number: int, why: str) -> None:
+        """Show the chosen lines, from the lowest up: what is asked for, and a number by hand."""
+        count = len(lines)
+        words = f"{count} chosen" if count else "Click a line to choose it, Shift adds one"
+        self.chosen.setText(asked or words)
+        self.number.set_value(number or None)
+        self.number.lock(why)
+        self.lines.select_rows([self.lines.rowCount() - 1 - k for k in lines])
 
     def show_frame(self, state: LinesState) -> None:
         """Show what the session says of the frame in view."""
@@ -89,7 +115,9 @@ class LinesPanel(QWidget):
         self.rows.set_rows(state.rows)
 
 
-class _LineList(ReadTable):
+class LineList(ReadTable):
+    """The lines of a frame from the top down; choosing a row chooses its line."""
+
     def __init__(self) -> None:
         super().__init__("Lines", "Lines of the frame, from the top down", list(COLUMNS))
         header = self.horizontalHeader()
@@ -103,6 +131,12 @@ class _LineList(ReadTable):
                 self.set_cell(k, column, text, number=column < len(cells) - 1, tip=text)
         self.setFixedHeight(self.full_height)
 
+    @property
+    def places(self) -> list[int]:
+        """Places of the chosen lines, from the lowest up, ascending."""
+        rows = {index.row() for index in self.selectedIndexes()}
+        return sorted(self.rowCount() - 1 - row for row in rows)
+
 
 def _with_gaps(points: np.ndarray) -> np.ndarray:
     """Points of a line, NaN where it has a gap: nothing is drawn there."""
@@ -110,7 +144,7 @@ def _with_gaps(points: np.ndarray) -> np.ndarray:
     return np.insert(points, gaps, np.nan, axis=0)
 
 
-def _pen(color: str, style: Qt.PenStyle = Qt.PenStyle.SolidLine) -> QPen:
-    pen = QPen(QColor(color), 2, style)
+def _pen(color: str, style: Qt.PenStyle = Qt.PenStyle.SolidLine, width: int = 2) -> QPen:
+    pen = QPen(QColor(color), width, style)
     pen.setCosmetic(True)
     return pen

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from PySide6.QtCore import QItemSelectionModel, QSignalBlocker, Qt
+from PySide6.QtCore import QSignalBlocker, Qt
 from PySide6.QtGui import QAction
 from PySide6.QtWidgets import QGridLayout, QHeaderView, QSizePolicy, QToolButton, QWidget
 
@@ -165,16 +165,21 @@ class DotsPanel(QWidget):
         return form
 
     def _buttons(self, actions: Sequence[QAction]) -> QGridLayout:
-        grid = QGridLayout()
-        grid.setSpacing(3)
-        for k, action in enumerate(actions):
-            button = self.buttons[action.text()] = QToolButton()
-            button.setDefaultAction(action)
-            button.setAccessibleName(action.text())
-            button.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
-            button.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Fixed)
-            grid.addWidget(button, k // COLUMNS_OF_BUTTONS, k % COLUMNS_OF_BUTTONS)
-        return grid
+        return button_grid(actions, self.buttons)
+
+
+def button_grid(actions: Sequence[QAction], buttons: dict[str, QToolButton]) -> QGridLayout:
+    """Lay out a button for each action; ``buttons`` gets them by their words."""
+    grid = QGridLayout()
+    grid.setSpacing(3)
+    for k, action in enumerate(actions):
+        button = buttons[action.text()] = QToolButton()
+        button.setDefaultAction(action)
+        button.setAccessibleName(action.text())
+        button.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
+        button.setSizePolicy(QSizePolicy.Policy.Expanding, QSizePolicy.Policy.Fixed)
+        grid.addWidget(button, k // COLUMNS_OF_BUTTONS, k % COLUMNS_OF_BUTTONS)
+    return grid
 
 
 class _RowList(ReadTable):
@@ -215,13 +220,4 @@ class _RowList(ReadTable):
 
     def choose(self, rows: Sequence[int]) -> None:
         """Select the lines of rows; emits no signal."""
-        if sorted(self.chosen()) == sorted(rows):
-            return
-        with QSignalBlocker(self):
-            self.clearSelection()
-            model = self.selectionModel()
-            ways = QItemSelectionModel.SelectionFlag
-            for k, row in enumerate(self._numbers):
-                if row in rows:
-                    model.select(self.model().index(k, 0), ways.Select | ways.Rows)
-        self.viewport().update()
+        self.select_rows([k for k, row in enumerate(self._numbers) if row in rows])

@@ -1,6 +1,6 @@
 """The page of the pattern: the frame, its dots and rows, the keys and buttons that correct them.
 
-Of a line pattern it shows the lines in their place.
+Of a line pattern it shows the lines in their place (`lines_hand`).
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from labapp.gui.pages.dots.background import Looking, carry_on
 from labapp.gui.pages.dots.editing import Editor
 from labapp.gui.pages.dots.fitting import Refit
 from labapp.gui.pages.dots.lines import show_lines
+from labapp.gui.pages.dots.lines_hand import LinesHand
 from labapp.gui.pages.dots.lines_view import LinesOverlay, LinesPanel
 from labapp.gui.pages.dots.overlay import DotsOverlay
 from labapp.gui.pages.dots.panel import DotsPanel
@@ -67,17 +68,21 @@ class DotsPage(Page):
         self.refit = Refit(workspace)
         self.seen: DotsState | None = None
         self._before: tuple[int, Figures | None] | None = None
-        self._pointer: tuple[float, float] | None = None
+        self.pointer: tuple[float, float] | None = None
+        """Where the pointer is in the frame."""
+        self._lines_frame = -1
         self._in_view = False
         self._unmet: dict[str, str] = {}
         self._needs = {c.text: c.needs for c in (*self._edits(), *self._frame_commands())}
-        edits = [self._action(command) for command in self._edits()]
-        frames = [self._action(command) for command in self._frame_commands()]
-        for command in self._keys():
-            self._action(command)
+        edits, frames, keys = (
+            [self.action(*command[:4]) for command in commands]
+            for commands in (self._edits(), self._frame_commands(), self._keys())
+        )
+        self._dot_actions = [*edits, *frames, *keys]
+        self.lines_hand = LinesHand(self)
         self.dots_panel = DotsPanel(edits, frames)
         self.canvas_layout.addWidget(self.view)
-        self.lines_panel = LinesPanel()
+        self.lines_panel = LinesPanel(self.lines_hand.actions)
         self.lines_panel.hide()
         self.panel_layout.addWidget(self.dots_panel)
         self.panel_layout.addWidget(self.lines_panel)
@@ -91,6 +96,9 @@ class DotsPage(Page):
         panel.rows.itemSelectionChanged.connect(
             lambda: self.choose(self.editor.choose_rows, panel.rows.chosen())
         )
+        line_list = self.lines_panel.lines
+        line_list.itemSelectionChanged.connect(lambda: self.lines_hand.choose(line_list.places))
+        self.lines_panel.number.edited.connect(self.lines_hand.number)
         for name in ("row", "column"):
             getattr(panel, name).edited.connect(partial(self._assign, name))
         for field in (panel.reference_row, panel.reference_column):
@@ -129,13 +137,15 @@ class DotsPage(Page):
         self._show_pattern(session.has_lines)
         if session.has_lines:
             state = show_lines(session, frame)
-            self.lines.show(state.lines)
             self.lines_panel.show_frame(state)
+            self.lines_hand.show(state, self._lines_frame == frame)
+            self._lines_frame = frame
+            self.refit.want(frame, state.due)
             return
         self.seen = presenter.shown(session, frame, self.looking.found)
         if self.seen.correction is None:
             self.looking.look()
-        self.refit.want(self.seen)
+        self.refit.want(frame, presenter.needs_fit(self.seen))
         self.editor.show(self.seen.correction, same)
         correction = self.seen.correction
         self.dots_panel.show_reference(None if correction is None else correction.lattice.reference)
@@ -144,14 +154,16 @@ class DotsPage(Page):
         self.draw()
 
     def _show_pattern(self, lines: bool) -> None:
-        """Show the marks and the panel of dots, or those of lines; lines have no edits."""
+        """Show the marks, the panel and the hand of dots, or those of lines."""
         if lines == self.lines_panel.isVisibleTo(self.panel):
             return
         self.lines_panel.setVisible(lines)
         self.dots_panel.setVisible(not lines)
-        for action in self.actions():
+        for action in self._dot_actions:
             action.setEnabled(not lines)
-        self.view.tool = Tool() if lines else self.hand
+        for action in self.lines_hand.actions:
+            action.setEnabled(lines)
+        self.view.tool = self.lines_hand if lines else self.hand
         if lines:
             self.seen = None
             self.editor.show(None, same_frame=False)
@@ -234,11 +246,11 @@ class DotsPage(Page):
     def eventFilter(self, watched: QObject, event: QEvent) -> bool:
         """Note when the pointer leaves the picture."""
         if event.type() == QEvent.Type.Leave:
-            self._pointer = None
+            self.pointer = None
         return super().eventFilter(watched, event)
 
     def _point(self, u: float, v: float, level: object) -> None:
-        self._pointer = (u, v) if level is not None else None
+        self.pointer = (u, v) if level is not None else None
 
     def _again(self) -> None:
         if self._in_view and self.workspace.session is not None:
@@ -301,8 +313,8 @@ class DotsPage(Page):
 
     def _at_pointer(self, do: Callable[[float, float], object], ask: str) -> None:
         """Do something where the pointer is; a button asks for a click first."""
-        if self._pointer is not None:
-            do(*self._pointer)
+        if self.pointer is not None:
+            do(*self.pointer)
         else:
             self.hand.ask(do, f"{ask} (Esc: leave it)")
             self.view.setFocus()
@@ -339,15 +351,16 @@ class DotsPage(Page):
 
     # --- keys and buttons ---------------------------------------------------------------------
 
-    def _action(self, command: Command) -> QAction:
-        action = QAction(command.text, self)
-        tip = f"{command.tip} ({command.key})" if command.key else command.tip
+    def action(self, text: str, key: str, tip: str, do: Callable[[], object]) -> QAction:
+        """Make an action of the page and its panel: its words, its key, what it does."""
+        action = QAction(text, self)
+        tip = f"{tip} ({key})" if key else tip
         action.setToolTip(tip)
         action.setStatusTip(tip)
-        if command.key:
-            action.setShortcut(QKeySequence(command.key))
+        if key:
+            action.setShortcut(QKeySequence(key))
         action.setShortcutContext(Qt.ShortcutContext.WidgetWithChildrenShortcut)
-        action.triggered.connect(lambda *_: command.do())
+        action.triggered.connect(lambda *_: do())
         for widget in (self, self.panel):
             widget.addAction(action)
         return action

@@ -1,0 +1,146 @@
+"""Lines corrected by hand: what each edit makes of them, and what is then measured."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.images.light_lines import LightLine, LineSettings, find_lines
+from labapp.core.images.line_correction import (
+    LineCorrection,
+    cut_line,
+    delete_line,
+    join_lines,
+    nearest_line,
+    number_line,
+)
+from labapp.core.images.line_numbers import LinesSeen, number_lines
+from labapp.core.sequence.line_frame import LineMeasureSettings, measure_lines
+from labapp.simulation.line_frames import LineLook, render_lines
+from labapp.simulation.pools import egg
+from tests.benchmarks.lines import CALIBRATION, RIG, VIEW
+
+SETTINGS = LineMeasureSettings()
+
+
+def straight(v_px: float, u_px: tuple[int, int] = (100, 300)) -> LightLine:
+    """A line along u."""
+    u = np.arange(*u_px, dtype=float)
+    place = np.stack([u, np.full_like(u, v_px)], axis=-1)
+    return LightLine(
+        image_px=place,
+        tangent=np.tile([1.0, 0.0], (len(u), 1)),
+        sigma_px=np.full(len(u), 0.1),
+        curvature=np.zeros(len(u)),
+        ends_px=place[[0, -1]],
+        cut=np.zeros(2, bool),
+        width_px=3.0,
+        light=100.0,
+        gap_px=0.0,
+        smoothed_px=9.0,
+    )
+
+
+def five() -> LineCorrection:
+    """Five lines, 40 px apart, from the lowest up."""
+    lines = tuple(straight(500.0 - 40.0 * k) for k in range(5))
+    return LineCorrection.of(LinesSeen(lines, True, True, 2))
+
+
+def same(one: LightLine, other: LightLine) -> bool:
+    return bool(np.array_equal(one.image_px, other.image_px) and (one.cut == other.cut).all())
+
+
+def test_a_line_that_is_cut_and_joined_is_what_it_was():
+    cut = cut_line(five(), 2, 80)
+    assert len(cut.seen.lines) == 6
+    left, right = sorted(cut.seen.lines[2:4], key=lambda one: one.ends_px[0, 0])
+    assert [left.cut.tolist(), right.cut.tolist()] == [[False, True], [True, False]]
+    assert left.ends_px[1].tolist() == right.ends_px[0].tolist() == [180.0, 420.0]
+    joined = join_lines(cut, 3, 2)
+    assert len(joined.seen.lines) == 5
+    assert same(joined.seen.lines[2], five().seen.lines[2])
+
+
+def test_pieces_are_joined_at_their_nearest_ends_whichever_way_they_run():
+    one, other = straight(420.0, (100, 180)), straight(420.0, (220, 300))
+    turned = LineCorrection.of(LinesSeen((other, one), False, False, 0))
+    joined = join_lines(turned, 0, 1).seen.lines[0]
+    assert joined.image_px[0, 0] == 100
+    assert (np.diff(joined.image_px[:, 0]) > 0).all()
+    assert joined.gap_px == pytest.approx(40.0, abs=1.0)
+    assert joined.ends_px[:, 0].tolist() == [100.0, 299.0]
+
+
+def test_a_line_is_not_cut_at_its_end():
+    with pytest.raises(ValueError, match="end"):
+        cut_line(five(), 0, 3)
+
+
+def test_what_is_deleted_at_the_edge_leaves_no_fringe_beside_the_next():
+    assert delete_line(five(), 2).seen.fringe_below
+    changed = delete_line(five(), 0).seen
+    assert (changed.fringe_below, changed.fringe_above) == (False, True)
+    assert changed.left_out == 3
+    assert [one.image_px[0, 1] for one in changed.lines] == [460.0, 420.0, 380.0, 340.0]
+
+
+def test_numbers_that_no_pattern_has_are_refused():
+    with pytest.raises(ValueError, match="1 to 5"):
+        number_line(five(), 0, 6, 5)
+    two = number_line(number_line(five(), 0, 2, 5), 1, 3, 5)
+    with pytest.raises(ValueError, match="different numbers"):
+        join_lines(two, 0, 1)
+
+
+def test_the_line_at_a_place():
+    line, point, away = nearest_line(five().seen.lines, 150.0, 463.0)
+    assert (line, point, away) == (1, 50, 3.0)
+
+
+@pytest.fixture(scope="module")
+def picture() -> np.ndarray:
+    pool = egg(6.0, 2.8, 3.2, 0.3)
+    return render_lines(pool, RIG, VIEW, LineLook(), np.random.default_rng(3)).image
+
+
+@pytest.fixture(scope="module")
+def found(picture: np.ndarray) -> LineCorrection:
+    seen = number_lines(find_lines(picture, LineSettings()), 5)
+    assert len(seen.lines) == 5
+    return LineCorrection.of(seen)
+
+
+def measured(picture: np.ndarray, correction: LineCorrection):
+    assert isinstance(CALIBRATION, ImageCalibration)
+    return measure_lines(picture, RIG, CALIBRATION, SETTINGS, correction)
+
+
+@pytest.mark.slow
+def test_two_pieces_of_one_number_give_the_surface_of_the_line(
+    picture: np.ndarray, found: LineCorrection
+):
+    whole = measured(picture, found).surface
+    cut = cut_line(found, 2, len(found.seen.lines[2].image_px) // 2)
+    assert measured(picture, cut).status == "line-numbers"  # six lines of five
+    for k in (2, 3):
+        cut = number_line(cut, k, 3, 5)
+    result = measured(picture, cut)
+    assert result.status == "ok"
+    assert result.surface is not None
+    assert whole is not None
+    assert result.surface.numbers.tolist() == [1, 2, 3, 3, 4, 5]
+    assert result.surface.height_mm == pytest.approx(whole.height_mm, rel=0.03)
+
+
+@pytest.mark.slow
+def test_numbers_by_hand_go_before_those_that_fringes_settle(
+    picture: np.ndarray, found: LineCorrection
+):
+    three = delete_line(delete_line(found, 4), 3)
+    three = number_line(number_line(three, 0, 1, 5), 1, 2, 5)
+    surface = measured(picture, three).surface
+    assert surface is not None
+    assert surface.numbers.tolist() == [1, 2, 3]
+    assert measured(picture, number_line(three, 1, 4, 5)).status == "line-numbers"

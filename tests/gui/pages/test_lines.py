@@ -1,0 +1,161 @@
+"""A hand that corrects the lines of a frame on the page of the pattern."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from PySide6.QtCore import QEvent, QPoint, QPointF, Qt
+from PySide6.QtTest import QTest
+from PySide6.QtWidgets import QApplication, QHBoxLayout, QWidget
+from pytestqt.qtbot import QtBot
+
+from labapp.gui.pages.dots import DotsPage
+from labapp.gui.pages.dots.fitting import Processes, Refit
+from labapp.gui.workspace import Workspace
+from labapp.session.session import Session
+from tests.gui.conftest import KEPT, let_draw
+
+SETUP = """
+[laser]
+projection_angle_deg = 27.0
+distance_mm = 90.0
+[pattern]
+kind = "lines"
+count = 5
+interline_angle_deg = 0.23
+fan_angle_deg = 5.0
+[electrode]
+height_mm = 5.0
+[imaging_plane]
+distance_mm = 53.6
+s_mm = 32.0
+h_mm = -5.0
+width_mm = 64.0
+height_mm = 84.0
+[image_calibration]
+origin_px = [2.0, 638.0]
+x_axis_px = [452.0, 638.0]
+x_axis_mm = 60.0
+z_axis_px = [2.0, 188.0]
+z_axis_mm = 60.0
+"""
+SHIFT, NONE = Qt.KeyboardModifier.ShiftModifier, Qt.KeyboardModifier.NoModifier
+
+
+def arcs() -> np.ndarray:
+    """Three arched lines, 60 px apart, the lowest at v = 400 where it is highest."""
+    v, u = np.mgrid[:640, :480].astype(float)
+    light = 20 + np.random.default_rng(1).normal(size=v.shape)
+    for k in range(3):
+        off = v - (400 - 60 * k) - (u - 240) ** 2 / 900
+        light += 70 * np.exp(-(off**2) / 18) * (abs(u - 240) < 150)
+    return np.clip(light, 0, 255).astype(np.uint8)
+
+
+@pytest.fixture
+def page(qtbot: QtBot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[DotsPage]:
+    monkeypatch.setattr(Processes, "begin", lambda self: None)
+    monkeypatch.setattr(Refit, "_fit", lambda self, frame: None)
+    (tmp_path / "frames").mkdir()
+    cv2.imwrite(str(tmp_path / "frames" / "0.png"), arcs())
+    with Session.create(tmp_path / "lines.labsession") as session:
+        session.set_setup(SETUP)
+        session.import_recording(tmp_path / "frames")
+        for _ in session.measure():
+            pass
+    space = Workspace()
+    page = DotsPage(space)
+    space.changed.connect(lambda: page.refresh() if space.session else None)
+    beside = QWidget()
+    layout = QHBoxLayout(beside)
+    layout.addWidget(page, 1)
+    layout.addWidget(page.panel)
+    KEPT.append(beside)
+    beside.resize(1300, 900)
+    beside.show()
+    beside.activateWindow()
+    qtbot.waitExposed(beside)
+    space.show(Session.open(tmp_path / "lines.labsession"))
+    page.refresh()
+    qtbot.waitUntil(lambda: len(page.lines_hand.state.lines) == 3)
+    let_draw()
+    page.view.setFocus()
+    yield page
+    page.leave()
+    space.close()
+
+
+def click(page: DotsPage, u: float, v: float, modifier: Qt.KeyboardModifier = NONE) -> None:
+    port: QPoint = page.view.canvas.mapFromScene(page.view.box.mapViewToScene(QPointF(u, v)))
+    QTest.mouseClick(page.view.canvas.viewport(), Qt.MouseButton.LeftButton, modifier, port)
+    let_draw()
+
+
+def press(page: DotsPage, key: Qt.Key, modifier: Qt.KeyboardModifier = NONE) -> None:
+    QApplication.sendEvent(page.view.canvas, QEvent(QEvent.Type.Leave))
+    QTest.keyClick(page.view, key, modifier)
+    let_draw()
+
+
+def lines(page: DotsPage) -> list[str]:
+    return [line.name for line in page.lines_hand.state.lines]
+
+
+def test_cut_join_number_and_delete_are_each_a_step_of_undo(page: DotsPage) -> None:
+    session, space = page.session, page.workspace
+    assert session.corrected_frames().tolist() == []
+    press(page, Qt.Key.Key_C)
+    click(page, 240, 340)
+    assert lines(page) == ["(1)", "(2)", "(3)", "(4)"]
+    click(page, 170, 345)
+    click(page, 310, 345, SHIFT)
+    assert len(page.lines_hand.chosen) == 2
+    press(page, Qt.Key.Key_J)
+    assert len(lines(page)) == 3
+    click(page, 240, 400)
+    page.lines_hand.number(2)
+    assert lines(page)[0] == "2"
+    click(page, 240, 280)
+    press(page, Qt.Key.Key_Delete)
+    assert len(lines(page)) == 2
+    assert session.corrected_frames().tolist() == [0]
+    assert page.lines_hand.state.due
+    assert [change.label.split(",")[0] for change in session.history][-4:] == [
+        *("cut a line", "join two lines", "number a line", "delete lines")
+    ]
+    for count in (3, 3, 4, 3):
+        space.undo()
+        assert len(lines(page)) == count
+    assert session.corrected_frames().tolist() == []
+
+
+def test_what_is_not_chosen_greys_out_what_needs_it(page: DotsPage) -> None:
+    buttons = page.lines_panel.buttons
+    assert buttons["Cut"].isEnabled()
+    assert not buttons["Join"].isEnabled()
+    assert not buttons["Back to automatic"].isEnabled()
+    page.lines_panel.lines.selectAll()
+    assert page.lines_hand.chosen == [0, 1, 2]
+    assert buttons["Delete"].isEnabled()
+    assert not buttons["Join"].isEnabled()
+
+
+def test_a_corrected_frame_is_measured_as_it_was_corrected(page: DotsPage) -> None:
+    session = page.session
+    click(page, 240, 280)
+    press(page, Qt.Key.Key_Delete)
+    correction = session.line_correction(0)
+    assert correction is not None
+    for _ in session.measure():
+        pass
+    page.refresh()
+    assert not page.lines_hand.state.due
+    assert page.lines_hand.state.by_hand
+    assert len(lines(page)) == 2
+    press(page, Qt.Key.Key_Backspace, Qt.KeyboardModifier.ControlModifier)
+    assert len(lines(page)) == 3
+    assert session.corrected_frames().tolist() == []
