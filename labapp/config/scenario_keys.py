@@ -95,6 +95,7 @@ TERMS: dict[str, dict[str, Rule]] = {
         "kind": _one_of("standing", "travelling"),
         "turned_deg": _ANGLE,
         "phase_deg": _ANGLE,
+        "damping_per_s": within(0, 1e4, "1/s"),
     },
 }
 """What is laid on a cap, each a table [pool.NAME] or several [[pool.NAME]]: name → keys."""

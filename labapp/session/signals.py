@@ -1,4 +1,4 @@
-"""Weld current and voltage on the recording's time axis, from a table that a logger wrote."""
+"""Current, voltage and wire feed of a weld, from a file of a logger: CSV, TDMS or WAV."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ import itertools
 import math
 import os
 import re
+import warnings
 from array import array
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TextIO
 
@@ -24,7 +26,12 @@ from labapp.config.csv_tables import (
 from labapp.core.values import FloatArray, ReadOnlyArrays
 from labapp.errors import InputError
 
-A_TABLE = "a table (CSV, UTF-8) with a line of names: a time (s, ms, µs), a current, a voltage"
+A_TABLE = (
+    "a table (CSV, UTF-8) with a line of names: a time (s, ms, µs), and a current, a voltage or a "
+    "wire feed"
+)
+A_TDMS = "TDMS with channels for current, voltage or wire feed, and a time or an increment"
+A_WAV = "WAV (PCM of 8, 16 or 32 bits, or floats): current, voltage, wire feed, a channel each"
 
 LARGEST_FILE = 1 << 28
 MOST_ROWS = 500_000
@@ -35,21 +42,25 @@ NAMES = {
     "time": "time|zeit|t|seconds",
     "current": "current|weld_?current|welding_?current|strom|i|amps?|amperes?",
     "voltage": "voltage|weld_?voltage|welding_?voltage|arc_?voltage|spannung|u|v|volts?",
+    "wire": "wire|wire_?feed|wire_?feed_?(speed|rate)|wfs|drahtvorschub",
 }
 UNITS = {
     "time": {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6},
     "current": {"a": 1.0, "ma": 1e-3, "ka": 1e3},
     "voltage": {"v": 1.0, "mv": 1e-3, "kv": 1e3},
+    "wire": {"m/min": 1.0, "mm/s": 0.06, "cm/s": 0.6, "m/s": 60.0, "in/min": 0.0254, "ipm": 0.0254},
 }
-"""Units of each column, and what one of them is in s, A, V. Without a unit it is these."""
+"""Units of each column, and what one of them is in s, A, V, m/min. Without a unit it is these."""
+
+CHANNELS = ("current", "voltage", "wire")
 
 
 @dataclass(frozen=True)
 class Signals(ReadOnlyArrays):
-    """Current and voltage of a weld; n samples."""
+    """Current, voltage and wire feed of a weld; n samples."""
 
     file: str
-    """Name of the table they were read from."""
+    """Name of the file they were read from."""
     time_s: FloatArray
     """Time of each sample by the logger's clock, ascending, shape (n,), s."""
     current_a: FloatArray
@@ -57,6 +68,19 @@ class Signals(ReadOnlyArrays):
     """Shape (n,), A and V; NaN where there is none."""
     start_s: float = 0.0
     """Added to the logger's time it gives the recording's, s."""
+    wire_m_min: FloatArray = field(default_factory=lambda: np.empty(0))
+    """Shape (n,), m/min; NaN where there is none, as in files of versions without it."""
+
+    def __post_init__(self) -> None:
+        if not len(self.wire_m_min):
+            object.__setattr__(self, "wire_m_min", np.full(len(self.time_s), np.nan))
+        super().__post_init__()
+
+    @property
+    def channels(self) -> dict[str, FloatArray]:
+        """Those of `CHANNELS` that have samples: name → values, shape (n,)."""
+        every = zip(CHANNELS, (self.current_a, self.voltage_v, self.wire_m_min), strict=True)
+        return {name: value for name, value in every if np.isfinite(value).any()}
 
 
 @dataclass(frozen=True)
@@ -69,23 +93,127 @@ class _Column:
     factor: float
 
 
-def read_signals(path: str | os.PathLike[str]) -> Signals:
-    """Read current and voltage from a table.
+def read_signals(
+    path: str | os.PathLike[str], full_scale: Sequence[float] = (1.0, 1.0, 1.0)
+) -> Signals:
+    """Read current, voltage and wire feed from CSV, TDMS (``.tdms``) or WAV (``.wav``).
 
-    The line of names may have others above it. A name is that of the quantity, with its unit in
-    brackets or behind an underscore: ``time_s``, ``Current (A)``, ``U [V]``. The separator is a
-    comma, a semicolon or a tab; the decimals' a point, or, with the latter two, a comma. An empty
-    cell is a sample that is not there. Columns of other names are passed over.
+    A CSV's line of names may have others above it. A name is that of the quantity, with its unit in
+    brackets or behind an underscore: ``time_s``, ``Current (A)``, ``U [V]``, ``WFS [m/min]``. The
+    separator is a comma, a semicolon or a tab; the decimals' a point, or, with the latter two, a
+    comma. An empty cell is a sample that is not there. Columns of other names are passed over.
+    Channels of TDMS are named alike, or have their unit as the property ``unit_string``. Of TDMS
+    and WAV more than `MOST_ROWS` samples are averaged to fewer.
+
+    Parameters
+    ----------
+    path
+        The file.
+    full_scale
+        Of WAV: what full scale of its first, second and third channel is, A, V and m/min.
 
     Raises
     ------
     InputError
-        If the file cannot be read, or anything in it is missing or impossible; the first ten
-        problems are reported together, each with its line and column.
+        If the file cannot be read, or anything in it is missing or impossible; of a table, the
+        first ten problems are reported together, each with its line and column.
     """
     path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix in (".tdms", ".wav"):
+        wanted = A_TDMS if suffix == ".tdms" else A_WAV
+        with _hostile(path, wanted):
+            return _read_tdms(path) if suffix == ".tdms" else _read_wav(path, full_scale)
     with open_table(path, A_TABLE, LARGEST_FILE) as file:
         return _read(path, file)
+
+
+@contextmanager
+def _hostile(path: Path, wanted: str) -> Iterator[None]:
+    """Errors of a binary file, whatever they are, as `InputError`; its size is checked first."""
+    try:
+        size = path.stat().st_size
+        if size > LARGEST_FILE:
+            raise InputError(path, "size", f"{size} bytes", f"at most {LARGEST_FILE} bytes")
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # chunks that nobody needs
+            yield
+    except InputError:
+        raise
+    except OSError as error:
+        raise InputError(path, "file", error.strerror or error, wanted) from error
+    except Exception as error:  # a reader that a stranger's bytes lead anywhere
+        raise InputError(path, "content", str(error) or type(error).__name__, wanted) from error
+
+
+def _read_tdms(path: Path) -> Signals:
+    try:
+        from nptdms import TdmsFile
+    except ImportError as error:
+        wanted = "the package nptdms: pip install 'labapp[tdms]'"
+        raise InputError(path, "format", "TDMS", wanted) from error
+    found: dict[str, FloatArray] = {}
+    time_s: FloatArray | None = None
+    with path.open("rb") as raw, TdmsFile.open(raw) as file:
+        for channel in (channel for group in file.groups() for channel in group.channels()):
+            unit = channel.properties.get("unit_string")
+            name = f"{channel.name} [{unit}]" if unit else channel.name
+            named = _named(name, 0) or _named(channel.name, 0)
+            if not named or named[0].quantity in found:
+                continue
+            bytes_held = len(channel) * max(getattr(channel.dtype, "itemsize", 8), 1)
+            if bytes_held > path.stat().st_size or channel.dtype.kind not in "iuf":
+                shown = f"{len(channel)} samples of {channel.dtype}"
+                raise InputError(path, channel.name, shown, "numbers that the file holds")
+            found[named[0].quantity] = np.asarray(channel[:], float) * named[0].factor
+            if time_s is None and channel.properties.get("wf_increment"):
+                start = float(channel.properties.get("wf_start_offset", 0.0))
+                step = float(channel.properties["wf_increment"])
+                time_s = np.asarray(start + step * np.arange(len(channel)), float)
+    return _signals(path, found.pop("time", time_s), found, A_TDMS)
+
+
+def _read_wav(path: Path, full_scale: Sequence[float]) -> Signals:
+    from scipy.io import wavfile
+
+    rate, data = wavfile.read(path, mmap=True)
+    data = data.reshape(len(data), -1)[:, : len(CHANNELS)]
+    if data.dtype.kind == "f":
+        offset, scale = 0.0, 1.0
+    else:  # WAV has bytes without a sign
+        scale = 2.0 ** (8 * data.itemsize - 1)
+        offset = scale if data.dtype.kind == "u" else 0.0
+    found = {
+        name: (values.astype(float) - offset) / scale * factor
+        for name, values, factor in zip(CHANNELS, data.T, full_scale, strict=False)
+    }
+    return _signals(path, np.arange(len(data)) / rate, found, A_WAV)
+
+
+def _signals(
+    path: Path, time_s: FloatArray | None, found: dict[str, FloatArray], wanted: str
+) -> Signals:
+    """Signals of equally many samples, averaged to `MOST_ROWS` at most."""
+    if time_s is None or not found:
+        raise InputError(path, "channels", ", ".join(found) or "none of these", wanted)
+    count = len(time_s)
+    if not count or any(len(values) != count for values in found.values()):
+        shown = ", ".join(f"{name} {len(values)}" for name, values in found.items())
+        raise InputError(path, "samples", f"time {count}, {shown}", "as many of each, and some")
+    if not np.isfinite(time_s).all() or (np.diff(time_s) <= 0).any():
+        raise InputError(path, "time", "not ascending", "times that ascend")
+    block = -(-count // MOST_ROWS)
+    begins = np.arange(0, count, block)
+    share = np.diff(np.append(begins, count))
+
+    def mean(values: FloatArray) -> FloatArray:
+        return np.asarray(np.add.reduceat(values, begins) / share)
+
+    of = {
+        name: mean(found[name]) if name in found else np.full(len(begins), np.nan)
+        for name in CHANNELS
+    }
+    return Signals(path.name, mean(time_s), of["current"], of["voltage"], wire_m_min=of["wire"])
 
 
 def _read(path: Path, file: TextIO) -> Signals:
@@ -120,10 +248,10 @@ def _read(path: Path, file: TextIO) -> Signals:
     if not len(held["time"]):
         raise InputError(path, "rows", "none", "a row for each sample")
     missing = np.full(len(held["time"]), np.nan)
-    current, voltage = (
-        np.array(held[name]) if name in held else missing for name in ("current", "voltage")
+    current, voltage, wire = (
+        np.array(held[name]) if name in held else missing for name in CHANNELS
     )
-    return Signals(path.name, np.array(held["time"]), current, voltage)
+    return Signals(path.name, np.array(held["time"]), current, voltage, wire_m_min=wire)
 
 
 def _find_names(path: Path, lines: Iterator[str]) -> tuple[int, str, list[_Column], int]:

@@ -207,6 +207,8 @@ class Wave:
     """φ₀, from +X counter-clockwise."""
     phase_deg: float = 0.0
     """Added to ωt."""
+    damping_per_s: float = 0.0
+    """γ: the amplitude falls as exp(−γt)."""
 
     def __post_init__(self) -> None:
         if self.mode[0] < 0 or self.mode[1] < 1:
@@ -238,7 +240,8 @@ class Wave:
         swing = 2 * np.pi * self.frequency_hz * self.time_s + np.radians(self.phase_deg)
         run = np.exp(-1j * swing) if self.travelling else np.cos(swing)
         turn = np.exp(-1j * m * np.radians(self.turned_deg))
-        return complex(self.amplitude_mm / largest * turn * run)
+        size = self.amplitude_mm * np.exp(-self.damping_per_s * self.time_s)
+        return complex(size / largest * turn * run)
 
     def height(self, place: Place) -> FloatArray:
         """Height that it adds, mm."""

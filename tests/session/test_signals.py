@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
 import numpy as np
@@ -102,3 +103,76 @@ def test_a_session_keeps_them_and_can_undo_that(tmp_path: Path) -> None:
         assert session.problems() == []
         session.undo()
         assert session.signals is None
+
+
+def write_tdms(path: Path, channels) -> Path:
+    from nptdms import ChannelObject, TdmsWriter
+
+    with TdmsWriter(path) as writer:
+        writer.write_segment([ChannelObject("weld", *channel) for channel in channels])
+    return path
+
+
+def test_tdms_with_an_increment_and_units(tmp_path: Path) -> None:
+    wave = {"wf_increment": 0.001, "wf_start_offset": 0.5, "unit_string": "mV"}
+    channels = [
+        ("Arc Voltage", np.array([11e3, 12e3, 13e3]), wave),
+        ("Current", np.array([70, 80, 90], np.int16), {}),
+        ("WFS", np.array([10.0, 20.0, 30.0]), {"unit_string": "mm/s"}),
+        ("gas", np.array([1.0]), {}),
+    ]
+    found = read_signals(write_tdms(tmp_path / "a.tdms", channels))
+    np.testing.assert_allclose(found.time_s, [0.5, 0.501, 0.502])
+    np.testing.assert_allclose(found.voltage_v, [11, 12, 13])
+    np.testing.assert_allclose(found.current_a, [70, 80, 90])
+    np.testing.assert_allclose(found.wire_m_min, [0.6, 1.2, 1.8])
+    assert list(found.channels) == ["current", "voltage", "wire"]
+
+
+def test_wav_is_scaled_and_averaged_to_what_a_session_holds(tmp_path: Path, monkeypatch) -> None:
+    from scipy.io import wavfile
+
+    path, samples = tmp_path / "a.wav", np.array([[0, 16384], [16384, 0]] * 8, np.int16)
+    wavfile.write(path, 1000, samples)
+    found = read_signals(path, (200.0, 50.0, 1.0))
+    np.testing.assert_allclose(found.time_s, np.arange(16) / 1000)
+    np.testing.assert_allclose(found.current_a[:2], [0, 100])
+    np.testing.assert_allclose(found.voltage_v[:2], [25, 0])
+    assert np.isnan(found.wire_m_min).all()
+    monkeypatch.setattr("labapp.session.signals.MOST_ROWS", 4)
+    found = read_signals(path, (200.0, 50.0, 1.0))
+    np.testing.assert_allclose(found.current_a, 50)
+    np.testing.assert_allclose(found.time_s, [0.0015, 0.0055, 0.0095, 0.0135])
+
+
+@pytest.mark.parametrize("name", ["a.tdms", "a.wav"])
+def test_bytes_of_a_stranger_are_refused(tmp_path: Path, monkeypatch, name: str) -> None:
+    from scipy.io import wavfile
+
+    path = tmp_path / name
+    with pytest.raises(InputError, match="file"):
+        read_signals(path)
+    if name == "a.wav":
+        wavfile.write(path, 1000, np.zeros((64, 2), np.int16))
+    else:
+        wave = {"wf_increment": 0.001}
+        write_tdms(path, [("current", np.arange(64.0), wave)])
+    good = path.read_bytes()
+    rng = np.random.default_rng(4)
+    for _ in range(60):
+        bad = bytearray(good)
+        for place in rng.integers(0, min(len(bad), 200), 4):
+            bad[place] = int(rng.integers(256))
+        path.write_bytes(bytes(bad[: rng.integers(1, len(bad) + 1)]))
+        with contextlib.suppress(InputError):
+            assert len(read_signals(path).time_s) < 1000
+    path.write_bytes(good)
+    monkeypatch.setattr("labapp.session.signals.LARGEST_FILE", 100)
+    with pytest.raises(InputError, match="at most 100"):
+        read_signals(path)
+
+
+def test_wire_feed_of_a_table(table) -> None:
+    found = read_signals(table("time,WFS [in/min]\n0,100\n1,200\n"))
+    np.testing.assert_allclose(found.wire_m_min, [2.54, 5.08])
+    assert list(found.channels) == ["wire"]

@@ -174,7 +174,9 @@ STORED = {
     "Record": Stored(Record),
     "Recording": Stored(Recording),
     "Limits": Stored(Limits),
-    "Signals": Stored(Signals, shapes=dict.fromkeys(("time_s", "current_a", "voltage_v"), "n")),
+    "Signals": Stored(
+        Signals, shapes=dict.fromkeys(("time_s", "current_a", "voltage_v", "wire_m_min"), "n")
+    ),
     # Settings
     "Settings": Stored(Settings, fits=_scheme_is_known),
     "DotSettings": Stored(find_dots.DotSettings),

@@ -1,0 +1,267 @@
+"""Modes of an oscillating pool: Bessel modes on its own outline, and POD of its surfaces.
+
+Every surface is sampled at the nodes of a unit disk: ρ = 1 is its own boundary, ρ and φ are polar
+in (x/half width, y/half length) about the middle of the boundary, ρ scaled by the boundary's
+distance in the direction φ. On an ellipse that is affine, and a mode of a round membrane, which a
+pool held at its rim has nearly, J_m(j_mn·ρ)·cos m(φ − φ₀), stays one. Modes (0, 1), (1, 1), (2, 1)
+and (0, 2) are those that dot patterns of GTA weld pools show ("Oscillation Modes of Weld Pool in
+Stationary GTA Welding Using Structure Laser Method", Chin. J. Mech. Eng. 34 (2021); K. Zhang et
+al., Weld. J. 96 (2017) 143-s).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import special
+
+from labapp.core.dynamics.oscillation import Oscillation, fit_oscillations
+from labapp.core.surface.boundary import Boundary
+from labapp.core.surface.surface import Surface
+from labapp.core.values import ComplexArray, FloatArray, IntArray, ReadOnlyArrays
+
+MODES = ((0, 1), (1, 1), (2, 1), (0, 2))
+"""(m, n): nodal diameters, nodal circles with the boundary's counted."""
+
+RINGS, SPOKES = 12, 32
+
+_NODE, _WEIGHT = np.polynomial.legendre.leggauss(RINGS)
+RHO = np.repeat((_NODE + 1) / 2, SPOKES)
+PHI = np.tile(2 * np.pi * np.arange(SPOKES) / SPOKES, RINGS)
+"""The nodes of the unit disk, shape (k,): rings outwards, counter-clockwise from +X."""
+
+DISK_WEIGHT = RHO * np.repeat(_WEIGHT / 2, SPOKES) * 2 * np.pi / SPOKES
+"""Area that each node stands for on the unit disk, shape (k,); the sum is π."""
+
+POD_MODES = 4
+
+
+@dataclass(frozen=True)
+class SurfaceSeries(ReadOnlyArrays):
+    """Surfaces of n frames at the same k nodes of the unit disk.
+
+    Parameters
+    ----------
+    frame, time_s
+        Shape (n,), ascending; s.
+    height_mm
+        Shape (n, k).
+    nodes_mm
+        Where the nodes are on the mean outline, (x, y), shape (k, 2).
+    area_mm2
+        Area that each stands for there, shape (k,).
+    """
+
+    frame: IntArray
+    time_s: FloatArray
+    height_mm: FloatArray
+    nodes_mm: FloatArray
+    area_mm2: FloatArray
+
+    @classmethod
+    def of(cls, surfaces: Iterable[tuple[int, float, Surface, Boundary]]) -> SurfaceSeries:
+        """Sample surfaces.
+
+        Parameters
+        ----------
+        surfaces
+            Number, time (s), surface and boundary of each frame. The surface has a height at all
+            places within the boundary.
+        """
+        frames, times, heights, places = [], [], [], []
+        for frame, time_s, surface, boundary in surfaces:
+            place = disk_nodes(boundary)
+            frames.append(frame)
+            times.append(time_s)
+            heights.append(surface.height(place[:, 0], place[:, 1]))
+            places.append(place)
+        nodes = np.mean(places, axis=0) if places else np.zeros((len(RHO), 2))
+        return cls(
+            np.array(frames, np.int64),
+            np.array(times, float),
+            np.array(heights).reshape(-1, len(RHO)),
+            nodes,
+            _areas(nodes),
+        )
+
+    @property
+    def mean_mm(self) -> FloatArray:
+        """Mean height at each node, shape (k,)."""
+        return np.asarray(self.height_mm.mean(axis=0))
+
+
+@dataclass(frozen=True)
+class ModeCourse(ReadOnlyArrays):
+    """One mode over a recording; n frames, c shapes (two of a mode with nodal diameters).
+
+    Parameters
+    ----------
+    name
+        ``(m, n)``, or ``POD 1`` …
+    shape
+        Height at the nodes per mm of coefficient, shape (c, k); largest absolute value 1.
+    coefficient_mm
+        Shape (n, c).
+    share
+        Share of the surfaces' variance, weighted by area.
+    oscillations
+        Damped sinusoids in the coefficients, the strongest first; empty: none stands out.
+    nodal_diameters
+        m; 0 of a POD mode.
+    scale_sigma
+        Relative standard uncertainty of all heights, by the set-up.
+    """
+
+    name: str
+    shape: FloatArray
+    coefficient_mm: FloatArray
+    share: float
+    oscillations: tuple[Oscillation, ...]
+    nodal_diameters: int = 0
+    scale_sigma: float = 0.0
+
+    @property
+    def figures(self) -> dict[str, tuple[float, float]]:
+        """Quantities of the strongest oscillation by name, each with its standard uncertainty.
+
+        ``amplitude_mm`` is the largest height at the first frame; ``phase_deg`` that of its cosine
+        there; ``damping_per_s`` its decay rate γ; ``direction_deg`` where the crest lies, from +X
+        counter-clockwise; ``turning`` from −1 (travels clockwise) over 0 (stands) to 1.
+        """
+        if not self.oscillations:
+            return {}
+        one = self.oscillations[0]
+        value, sigma = one.quantities(_swing)
+        sigma[0] = np.hypot(sigma[0], value[0] * self.scale_sigma)
+        # The opposite direction half a period later is the same oscillation.
+        halves = np.floor(value[2] / 180)
+        value[1] = (value[1] + 180 * halves + 180) % 360 - 180
+        value[2] -= 180 * halves
+        value[2], sigma[2] = (x / max(self.nodal_diameters, 1) for x in (value[2], sigma[2]))
+        names = ("amplitude_mm", "phase_deg", "direction_deg", "turning")
+        swing = dict(zip(names, zip(value.tolist(), sigma.tolist(), strict=True), strict=True))
+        if len(one.amplitude) < 2:
+            del swing["direction_deg"], swing["turning"]
+        return {
+            "frequency_hz": (one.frequency_hz, one.frequency_sigma_hz),
+            "damping_per_s": (one.damping_per_s, one.damping_sigma_per_s),
+            **swing,
+        }
+
+
+def disk_nodes(boundary: Boundary) -> FloatArray:
+    """Where the nodes of the unit disk are within a boundary, (x, y), shape (k, 2), mm."""
+    outline = boundary.points_mm[:, :2]
+    middle = (outline.min(axis=0) + outline.max(axis=0)) / 2
+    half = np.ptp(outline, axis=0) / 2
+    p, q = ((outline - middle) / half).T
+    angle, radius = np.arctan2(q, p), np.hypot(p, q)
+    order = np.argsort(angle)
+    reach = np.interp(PHI, angle[order], radius[order], period=2 * np.pi)
+    along = RHO * reach * (1 - 1e-9)
+    return np.asarray(middle + half * np.column_stack([along * np.cos(PHI), along * np.sin(PHI)]))
+
+
+def bessel_shapes(mode: tuple[int, int]) -> FloatArray:
+    """Shapes of a mode at the nodes, largest value 1: one if m = 0, else cos and sin, (c, k)."""
+    m, n = mode
+    radial = special.jv(m, special.jn_zeros(m, n)[-1] * RHO)
+    largest = special.jv(m, special.jnp_zeros(m, 1)[0]) if m else 1.0
+    around = [np.cos(m * PHI), np.sin(m * PHI)] if m else [np.ones_like(PHI)]
+    return np.stack([radial * one / largest for one in around])
+
+
+def bessel_modes(
+    series: SurfaceSeries,
+    modes: tuple[tuple[int, int], ...] = MODES,
+    scale_sigma: float = 0.0,
+    band_hz: tuple[float, float] | None = None,
+) -> tuple[ModeCourse, ...]:
+    """Bessel modes of a pool on its own outline, by least squares with the disk's area as weight.
+
+    Parameters
+    ----------
+    series
+        The surfaces of a recording.
+    modes
+        Modes (m, n), fitted together.
+    scale_sigma
+        Relative standard uncertainty of heights by the set-up: the same in all frames, it is added
+        to the noise in the ± of amplitudes.
+    band_hz
+        See `fit_oscillations`.
+    """
+    shapes = [bessel_shapes(mode) for mode in modes]
+    stacked = np.vstack(shapes)
+    gram = (stacked * DISK_WEIGHT) @ stacked.T
+    moving = series.height_mm - series.mean_mm
+    weights = np.asarray(np.linalg.solve(gram, (stacked * DISK_WEIGHT) @ moving.T).T, float)
+    total = max(float(np.sum(moving**2 @ series.area_mm2)), 1e-30)
+    found, begin = [], 0
+    for mode, shape in zip(modes, shapes, strict=True):
+        own = weights[:, begin : begin + len(shape)]
+        begin += len(shape)
+        share = float(np.sum((own @ shape) ** 2 @ series.area_mm2)) / total
+        swings = fit_oscillations(series.time_s, own, band_hz=band_hz)
+        name = f"({mode[0]}, {mode[1]})"
+        found.append(ModeCourse(name, shape, own, share, swings, mode[0], scale_sigma))
+    return tuple(found)
+
+
+def pod_modes(
+    series: SurfaceSeries,
+    count: int = POD_MODES,
+    scale_sigma: float = 0.0,
+    band_hz: tuple[float, float] | None = None,
+) -> tuple[ModeCourse, ...]:
+    """Proper orthogonal decomposition: the shapes that hold most of the surfaces' variance.
+
+    Singular vectors of the heights less their mean, weighted by the area on the mean outline
+    (Sirovich 1987). Parameters as of `bessel_modes`; ``count`` modes are returned, fewer of fewer
+    frames.
+    """
+    root = np.sqrt(series.area_mm2)
+    moving: FloatArray = (series.height_mm - series.mean_mm) * root
+    energy, vectors = np.linalg.eigh(moving.T @ moving)
+    found = []
+    for k in range(1, min(count, len(moving) - 1) + 1):
+        shape = vectors[:, -k] / root
+        largest = shape[np.argmax(np.abs(shape))]
+        course: FloatArray = (moving @ vectors[:, -k:][:, :1]) * largest
+        swings = fit_oscillations(series.time_s, course, band_hz=band_hz)
+        share = float(energy[-k] / max(energy.sum(), 1e-30))
+        one = np.atleast_2d(shape / largest), course, share, swings
+        found.append(ModeCourse(f"POD {k}", *one, scale_sigma=scale_sigma))
+    return tuple(found)
+
+
+def _swing(amplitude: ComplexArray) -> FloatArray:
+    """Amplitude, phase (deg), m times direction (deg), turning of one or two channels, shape (4,).
+
+    The two are parts of Z = cos part + i·sin part = L·exp(iωτ) + R·exp(−iωτ), which turn left and
+    right; the crest is largest, |L| + |R|, where both have one direction.
+    """
+    if len(amplitude) == 1:
+        return np.array([abs(amplitude[0]), np.degrees(np.angle(amplitude[0])), 0.0, 0.0])
+    left = (amplitude[0] + 1j * amplitude[1]) / 2
+    right = (amplitude[0].conj() + 1j * amplitude[1].conj()) / 2
+    largest = abs(left) + abs(right)
+    phase = (np.angle(left) - np.angle(right)) / 2
+    direction = (np.angle(left) + np.angle(right)) / 2
+    turning = (abs(left) - abs(right)) / max(largest, 1e-30)
+    return np.array([largest, np.degrees(phase), np.degrees(direction), turning])
+
+
+def _areas(nodes_mm: FloatArray) -> FloatArray:
+    """Area of each node on the outline that nodes lie on, shape (k,), mm².
+
+    The map of the disk is linear along a spoke, so that the area is the disk's times the spoke's
+    cross product with its change round the pool.
+    """
+    grid = nodes_mm.reshape(RINGS, SPOKES, 2)
+    spoke = (grid[-1] - grid[0]) / (RHO[-1] - RHO[0])
+    turned = (np.roll(spoke, -1, axis=0) - np.roll(spoke, 1, axis=0)) / (4 * np.pi / SPOKES)
+    cross = spoke[:, 0] * turned[:, 1] - spoke[:, 1] * turned[:, 0]
+    return np.asarray(DISK_WEIGHT * np.tile(cross, RINGS))

@@ -1,0 +1,229 @@
+"""Damped sinusoids in a series, with their uncertainty: nonlinear least squares on the samples.
+
+The samples need not be even: frames that are missing are left out, nothing is filled in. Of a given
+frequency and damping the model is linear (variable projection, Golub & Pereyra 1973). Noise need
+not be white: its variance is that of the residual's periodogram beside the frequency.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import stdtrit
+
+from labapp.core.values import ComplexArray, FloatArray, ReadOnlyArrays
+
+FALSE_ALARM = 1e-3
+"""Probability of an oscillation where there is only noise."""
+
+TREND = 2
+"""Degree of the polynomial that is the series without its oscillations."""
+
+FEWEST = 16
+"""Samples that an oscillation is looked for in."""
+
+BESIDE = np.concatenate([np.arange(-12, -1), np.arange(2, 13)])
+"""Where the noise is taken, in 1/duration from the frequency: the fit has removed that between."""
+
+DAMPING_STARTS = (0.5, 6.0)
+"""In 1/duration."""
+
+
+@dataclass(frozen=True)
+class Oscillation(ReadOnlyArrays):
+    """A damped sinusoid common to c channels: Re(A · exp((iω − γ)·τ)), τ from the first sample.
+
+    Parameters
+    ----------
+    frequency_hz, damping_per_s
+        ω/2π, and the decay rate γ of the amplitude; negative where it grows.
+    amplitude
+        A of each channel, shape (c,), in the unit of the series.
+    covariance
+        Of frequency, damping, then real and imaginary part of each A, shape (2 + 2c, 2 + 2c).
+    """
+
+    frequency_hz: float
+    damping_per_s: float
+    amplitude: ComplexArray
+    covariance: FloatArray
+
+    @property
+    def frequency_sigma_hz(self) -> float:
+        """Standard uncertainty of the frequency, Hz."""
+        return float(np.sqrt(self.covariance[0, 0]))
+
+    @property
+    def damping_sigma_per_s(self) -> float:
+        """Standard uncertainty of the damping, 1/s."""
+        return float(np.sqrt(self.covariance[1, 1]))
+
+    def quantities(self, of: Callable[[ComplexArray], FloatArray]) -> tuple[FloatArray, FloatArray]:
+        """Quantities of the amplitudes and their standard uncertainties, to first order.
+
+        Parameters
+        ----------
+        of
+            Gives k quantities, shape (k,), of complex amplitudes, shape (c,).
+        """
+        step = 1e-6 * max(float(np.abs(self.amplitude).max()), 1e-12)
+        slopes = [
+            (of(self.amplitude + d) - of(self.amplitude - d)) / (2 * step)
+            for unit in np.eye(len(self.amplitude))
+            for d in (step * unit, 1j * step * unit)
+        ]
+        slope = np.stack(slopes)
+        variance = np.einsum("ik,ij,jk->k", slope, self.covariance[2:, 2:], slope)
+        return of(self.amplitude), np.sqrt(variance)
+
+    def at(self, time_s: FloatArray) -> FloatArray:
+        """Value of each channel at times from the first sample, shape (n, c)."""
+        rate = 2j * np.pi * self.frequency_hz - self.damping_per_s
+        return np.asarray((np.exp(rate * time_s)[:, None] * self.amplitude).real)
+
+
+def fit_oscillations(
+    time_s: FloatArray,
+    values: FloatArray,
+    most: int = 3,
+    band_hz: tuple[float, float] | None = None,
+) -> tuple[Oscillation, ...]:
+    """Damped sinusoids in a series, the strongest first.
+
+    One after the other is added where the residual's periodogram is largest, and all are fitted
+    together, as long as noise would make as much with a probability of less than `FALSE_ALARM`.
+
+    Parameters
+    ----------
+    time_s
+        Times of n samples, ascending, shape (n,), s; they need not be even.
+    values
+        Shape (n,), or (n, c) of c channels that swing with one frequency.
+    most
+        Largest number of oscillations.
+    band_hz
+        Lowest and highest frequency. None: from two periods in the series to half the frame rate.
+    """
+    time = np.asarray(time_s, float) - time_s[0]
+    value = np.asarray(values, float).reshape(len(time), -1)
+    if len(time) < FEWEST:
+        return ()
+    step = float(np.median(np.diff(time)))
+    band = band_hz or (2 / (time[-1] + step), 0.5 / step)
+    fitted = _Fit(time, value, np.empty((0, 2)))
+    found: list[Oscillation] = []
+    while len(found) < most:
+        start = 2 * np.pi * _strongest(time, fitted.residual, step, band)
+        starts = (np.vstack([fitted.rates, (start, k / time[-1])]) for k in DAMPING_STARTS)
+        wider = min((_refine(time, value, s, band) for s in starts), key=lambda f: f.cost)
+        if not _stands_out(fitted, wider, step):
+            break
+        fitted = wider
+        found.append(fitted.oscillation(0, step))
+    every = [fitted.oscillation(k, step) for k in range(len(found))]
+    return tuple(sorted(every, key=lambda one: -_energy(one, time)))
+
+
+class _Fit:
+    """The model's linear part of given rates (ω, γ), shape (k, 2), by least squares."""
+
+    def __init__(self, time: FloatArray, value: FloatArray, rates: FloatArray) -> None:
+        self.time, self.value, self.rates = time, value, rates
+        span = max(float(time[-1]), 1e-12)
+        self._trend = np.polynomial.legendre.legvander(2 * time / span - 1, TREND)
+        waves = [np.exp((1j * w - g) * time) for w, g in rates]
+        parts = [part for wave in waves for part in (wave.real, -wave.imag)]
+        self.columns = np.column_stack([*parts, self._trend])
+        self.weights = np.linalg.lstsq(self.columns, value, rcond=None)[0]
+        self.residual = value - self.columns @ self.weights
+        self.cost = float(np.sum(self.residual**2))
+
+    def amplitude(self, k: int) -> ComplexArray:
+        """A of component k, shape (c,)."""
+        return np.asarray(self.weights[2 * k] + 1j * self.weights[2 * k + 1])
+
+    def noise(self, k: int, step: float) -> FloatArray:
+        """Variance of white noise as strong as that beside component k, shape (c,)."""
+        span = float(self.time[-1]) + step
+        near = self.rates[k, 0] / (2 * np.pi) + BESIDE / span
+        near = near[(near > 1 / span) & (near < 0.5 / step)]
+        turned = np.exp(-2j * np.pi * near[:, None] * self.time)
+        power = np.mean(np.abs(turned @ self.residual) ** 2, axis=0) / len(self.time)
+        # As of few samples (JCGM 100, G.3): two degrees of freedom a frequency.
+        student = stdtrit(2 * len(near), 0.975) / stdtrit(np.inf, 0.975)
+        return np.asarray(np.maximum(power * student**2, 1e-30))
+
+    def oscillation(self, k: int, step: float) -> Oscillation:
+        """Component k with its covariance."""
+        channels, count = self.value.shape[1], len(self.rates)
+        linear = self.columns.shape[1]
+        size = 2 * count + linear * channels
+        normal = np.zeros((size, size))
+        for c, variance in enumerate(self.noise(k, step)):
+            jacobian = np.zeros((len(self.time), size))
+            for j, (w, g) in enumerate(self.rates):
+                moved = self.time * np.exp((1j * w - g) * self.time) * self.amplitude(j)[c]
+                jacobian[:, 2 * j], jacobian[:, 2 * j + 1] = -moved.imag, -moved.real
+            begin = 2 * count + c * linear
+            jacobian[:, begin : begin + linear] = self.columns
+            normal += jacobian.T @ jacobian / variance
+        scale = 1 / np.sqrt(np.maximum(normal.diagonal(), 1e-300))
+        covariance = np.linalg.pinv(normal * scale * scale[:, None], hermitian=True)
+        covariance *= scale * scale[:, None]
+        own = [2 * k, 2 * k + 1]
+        for c in range(channels):
+            begin = 2 * count + c * linear + 2 * k
+            own += [begin, begin + 1]
+        block = covariance[np.ix_(own, own)]
+        block[0] /= 2 * np.pi
+        block[:, 0] /= 2 * np.pi
+        frequency, damping = self.rates[k, 0] / (2 * np.pi), self.rates[k, 1]
+        return Oscillation(float(frequency), float(damping), self.amplitude(k), np.asarray(block))
+
+
+def _strongest(
+    time: FloatArray, residual: FloatArray, step: float, band: tuple[float, float]
+) -> float:
+    """Frequency of the largest power of all channels together, Hz."""
+    place = np.round(time / step).astype(int)
+    even = np.zeros((place[-1] + 1, residual.shape[1]))
+    even[place] = residual
+    size = 4 * len(even)
+    power = np.sum(np.abs(np.fft.rfft(even, size, axis=0)) ** 2, axis=1)
+    frequency = np.fft.rfftfreq(size, step)
+    power[(frequency < band[0]) | (frequency > band[1])] = 0
+    return float(frequency[np.argmax(power)])
+
+
+def _refine(
+    time: FloatArray, value: FloatArray, rates: FloatArray, band: tuple[float, float]
+) -> _Fit:
+    """The fit whose rates are optimal, near those given."""
+    from scipy.optimize import least_squares
+
+    span, scale = float(time[-1]), np.tile([1.0, 1.0], len(rates)) / float(time[-1])
+    low = np.tile([2 * np.pi * band[0], -3 / span], len(rates))
+    high = np.tile([2 * np.pi * band[1], 2 * np.pi * band[1]], len(rates))
+
+    def residual(flat: FloatArray) -> FloatArray:
+        return np.ravel(_Fit(time, value, flat.reshape(-1, 2)).residual)
+
+    start = np.clip(rates.ravel(), low + 1e-9 * high, high * (1 - 1e-9))
+    best = least_squares(residual, start, bounds=(low, high), x_scale=scale, xtol=1e-10)
+    return _Fit(time, value, best.x.reshape(-1, 2))
+
+
+def _stands_out(without: _Fit, with_it: _Fit, step: float) -> bool:
+    """Whether the last component explains more than noise at any of the frequencies would."""
+    from scipy.stats import chi2
+
+    last, channels = len(with_it.rates) - 1, with_it.value.shape[1]
+    gain = np.sum(without.residual**2 - with_it.residual**2, axis=0)
+    chance = chi2.sf(np.sum(gain / with_it.noise(last, step)), 2 * channels + 2)
+    return bool(chance * 2 * len(without.time) < FALSE_ALARM)
+
+
+def _energy(one: Oscillation, time: FloatArray) -> float:
+    return float(np.sum(one.at(time) ** 2))

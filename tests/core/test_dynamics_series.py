@@ -1,0 +1,161 @@
+"""Spectra, peaks, events, responses, shape and offset of series against known truth."""
+
+import numpy as np
+import pytest
+from scipy import signal
+
+from labapp.core.dynamics.alignment import find_offset
+from labapp.core.dynamics.shape import shape_of
+from labapp.core.dynamics.spectra import spectrogram, track_peak
+from labapp.core.dynamics.steps import find_events, step_response
+from labapp.simulation.pools import Footprint, Pool, Wave
+from tests.core.dynamics_truth import boundary_of
+
+
+def test_even_frames_have_welchs_spectrum_and_chi_square_intervals():
+    rng, held = np.random.default_rng(5), []
+    for _ in range(40):
+        value = rng.normal(0, 1, 2000)
+        found = spectrogram(np.arange(2000) / 1000, value, 0.25)
+        mean = found.mean()
+        held.append((mean.low <= 2e-3) & (mean.high >= 2e-3))
+    _, density = signal.welch(value, 1000, "hann", 250, 125, detrend="linear")
+    assert found.method == "Welch"
+    np.testing.assert_allclose(mean.density, density[1:])
+    assert 0.92 < np.mean(np.array(held)[:, 3:-3]) < 0.98
+
+
+def test_a_spectrum_with_missing_frames_has_the_same_density():
+    rng = np.random.default_rng(6)
+    time = np.arange(4000) / 1000
+    value = rng.normal(0, 1, 4000) + np.cos(2 * np.pi * 100 * time)
+    kept = rng.random(4000) > 0.1
+    found = spectrogram(time[kept], value[kept], 0.25)
+    mean = found.mean()
+    assert found.method == "Lomb-Scargle"
+    assert mean.frequency_hz[np.argmax(mean.density)] == pytest.approx(100, abs=4)
+    beside = mean.frequency_hz > 150
+    assert mean.density[beside].mean() == pytest.approx(2e-3, rel=0.1)
+
+
+def test_the_peak_of_a_chirp_is_tracked():
+    rng = np.random.default_rng(8)
+    time = np.arange(4000) / 1000
+    kept = rng.random(4000) > 0.05
+    value = np.cos(2 * np.pi * (60 * time + 5 * time**2)) + rng.normal(0, 0.3, 4000)
+    found = track_peak(time[kept], value[kept], 0.25)
+    truth = 60 + 10 * found.time_s  # the phase's derivative
+    error = found.frequency_hz - truth
+    assert np.abs(error).max() < 0.5
+    assert np.sqrt(np.mean((error / found.frequency_sigma_hz) ** 2)) < 1.5
+
+
+def test_too_short_a_segment_is_refused():
+    with pytest.raises(ValueError, match="fewer"):
+        spectrogram(np.arange(100) / 100, np.zeros(100), 0.05)
+
+
+def second_order(time, zeta, omega):
+    """Step response in the textbook's form of two complex poles."""
+    poles = omega * (-zeta + 1j * np.sqrt(1 - zeta**2) * np.array([1, -1]))
+    late = np.maximum(time, 0)[:, None]
+    parts = np.exp(poles * late) * poles[::-1] / (poles - poles[::-1])
+    return 1 + parts.sum(axis=1).real
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_a_step_response_against_truth(order):
+    rng, time = np.random.default_rng(order), np.arange(1000) / 200
+    late = time - 1.6  # the step at 1.5 s, 0.1 s of delay
+    fine = np.linspace(0, 5, 100_001)
+    if order == 1:
+        clean = -np.expm1(-np.maximum(late, 0) / 0.4)
+        tau, over, course = 0.4, 0.0, -np.expm1(-fine / 0.4)
+    else:
+        clean, course = second_order(late, 0.4, 8.0), second_order(fine, 0.4, 8.0)
+        tau, over = 1 / (0.4 * 8), course.max() - 1
+    rise = fine[np.argmax(course > 0.9)] - fine[np.argmax(course > 0.1)]
+    truth = {"change": 0.5, "delay_s": 0.1, "time_constant_s": tau}
+    truth |= {"rise_time_s": rise, "overshoot": over}
+    scores = []
+    for _ in range(20):
+        found = step_response(time, 5 + 0.5 * clean + rng.normal(0, 0.02, 1000), 1.5)
+        assert found.order == order
+        assert found.before == pytest.approx(5, abs=0.01)
+        for name, value in truth.items():
+            error = found.value[name] - value
+            scores.append(error / found.sigma[name] if found.sigma[name] else 0)
+            assert abs(error) < 5 * found.sigma[name] + 1e-12
+    assert 0.88 < np.mean(np.abs(scores) < 1.96) <= 1
+
+
+def test_noise_does_not_respond():
+    rng, time = np.random.default_rng(9), np.arange(1000) / 200
+    found = [step_response(time, rng.normal(5, 0.02, 1000), 1.5) for _ in range(10)]
+    assert sum(one is not None for one in found) <= 1
+
+
+def test_an_event_is_found_in_an_oscillating_series_and_none_where_there_is_none():
+    rng, time = np.random.default_rng(10), np.arange(1000) / 200
+    errors = []
+    for _ in range(20):
+        still = rng.normal(0, 0.02, 1000) + 0.05 * np.cos(2 * np.pi * 31 * time)
+        assert not find_events(time, still, 1 / 31)
+        (one, *more) = find_events(time, still + 0.08 * (time > 2.33), 1 / 31)
+        assert len(more) <= 1
+        errors.append((one.time_s - 2.33) / one.sigma_s)
+    assert np.mean(np.abs(errors) < 1.96) >= 0.8
+
+
+def test_a_ramp_begins_at_an_event():
+    rng, time = np.random.default_rng(12), np.arange(2000) / 200
+    (one,) = find_events(time, rng.normal(0, 0.01, 2000) + 0.1 * np.maximum(time - 4, 0))
+    assert abs(one.time_s - 4) < 3 * one.sigma_s + 0.1
+    assert one.slope_change_per_s == pytest.approx(0.1, rel=0.1)
+
+
+def test_shape_of_a_paraboloid():
+    pool = Pool(Footprint(6.0, 3.5, 3.5), 0.3, fullness=0.0)
+    found = shape_of(pool, boundary_of(pool))
+    assert found.convexity_mm == pytest.approx(0.2, rel=1e-3)  # ∫(1 − q²) over the length
+    assert found.asymmetry == pytest.approx(0, abs=1e-6)
+    # |∇z| = 2·0.3/a on both axes, between these elsewhere.
+    assert np.degrees(np.arctan(0.6 / 3.5)) < found.wetting_slope_deg
+    assert found.wetting_slope_deg < np.degrees(np.arctan(0.6 / 3.0))
+    hollow = Pool(Footprint(6.0, 3.5, 3.5), -0.3, fullness=0.0)
+    assert shape_of(hollow, boundary_of(hollow)).convexity_mm == pytest.approx(-0.2, rel=1e-3)
+
+
+def test_asymmetry_of_a_pool_that_leans_right():
+    pool = Pool(Footprint(6.0, 3.0, 3.0), 0.3, (Wave((1, 1), 0.03),), fullness=0.0)
+    x, y = np.meshgrid(np.linspace(-3, 3, 1201), np.linspace(-3, 3, 1201))
+    height = np.abs(np.nan_to_num(pool.height(x, y)))
+    truth = (height[x > 0].sum() - height[x < 0].sum()) / height.sum()
+    found = shape_of(pool, boundary_of(pool))
+    assert truth > 0.05
+    assert found.asymmetry == pytest.approx(truth, abs=0.005)
+
+
+def test_the_offset_of_a_logger_by_the_light():
+    rng, scores = np.random.default_rng(13), []
+    for _ in range(20):
+        true_s = rng.uniform(-2, 3)
+        logged_s = np.arange(0, 12, 1 / 2000)
+        swing = (logged_s * 1.3 + 0.15 * np.sin(logged_s * 2.1)) % 1 < 0.4
+        current = 80 + 40 * swing + 20 * (logged_s > 5)
+        frame_s = np.flatnonzero(rng.random(1000) > 0.05) / 200
+        exposure = frame_s[:, None] - true_s + np.arange(20) / 20 / 200
+        light = 10 + 0.5 * np.interp(exposure, logged_s, current).mean(axis=1)
+        found = find_offset(logged_s, current, frame_s, light + rng.normal(0, 4, len(light)))
+        assert abs(found.start_s - true_s) < 0.0025
+        scores.append((found.start_s - true_s) / found.sigma_s)
+    assert np.mean(np.abs(scores) < 1.96) >= 0.9
+
+
+def test_an_offset_among_regular_pulses_has_a_rival_and_noise_has_none():
+    logged_s, frame_s = np.arange(0, 12, 1 / 2000), np.arange(600) / 200
+    pulses = np.where(logged_s % 0.5 < 0.2, 120.0, 60.0)
+    light = np.interp(frame_s + 2, logged_s, pulses)
+    assert find_offset(logged_s, pulses, frame_s, light).rival_s is not None
+    noise = np.random.default_rng(14).normal(size=600)
+    assert find_offset(logged_s, pulses, frame_s, noise) is None
