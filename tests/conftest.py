@@ -88,8 +88,9 @@ def little_search(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """Keep the log out of the home folder; start and end each test without its handler."""
+    """Keep log and drafts out of the home folder; start and end each test without its handler."""
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    monkeypatch.setenv("XDG_DATA_HOME", str(tmp_path / "data"))
     _end_log()
     yield tmp_path / "state"
     _end_log()

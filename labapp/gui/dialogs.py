@@ -11,6 +11,7 @@ from PySide6.QtWidgets import QFileDialog, QMessageBox, QWidget
 from labapp.session.file.database import SUFFIX
 
 SESSIONS = f"Sessions (*{SUFFIX})"
+SETUP_FILES = "Set-up files (*.toml)"
 EVERYTHING = "All files (*)"
 
 
@@ -57,9 +58,14 @@ def ask_new_session(parent: QWidget, proposed: Path, title: str = "New session")
     return path if path.suffix.lower() == SUFFIX else path.with_name(path.name + SUFFIX)
 
 
-def ask_recording(parent: QWidget, folder: Path) -> Path | None:
-    """Ask which recording to import."""
-    return ask_file(parent, "Import a recording", folder, f"{recordings()};;{EVERYTHING}")
+def ask_recording(parent: QWidget, folder: Path, title: str = "Import recording") -> Path | None:
+    """Ask for a recording that is a file."""
+    return ask_file(parent, title, folder, f"{recordings()};;{EVERYTHING}")
+
+
+def ask_setup(parent: QWidget, folder: Path) -> Path | None:
+    """Ask which setup file to load."""
+    return ask_file(parent, "Load set-up", folder, f"{SETUP_FILES};;{EVERYTHING}")
 
 
 def ask_read_only(parent: QWidget, path: Path) -> bool:
@@ -81,6 +87,27 @@ def ask_read_only(parent: QWidget, path: Path) -> bool:
     box.setDefaultButton(look)
     box.exec()
     return box.clickedButton() is look
+
+
+def ask_delete_draft(parent: QWidget, path: Path) -> bool:
+    """Ask whether a draft is to be deleted."""
+    box = QMessageBox(parent)
+    box.setObjectName("delete-draft")
+    box.setIcon(QMessageBox.Icon.Question)
+    box.setWindowTitle("Delete draft")
+    box.setTextFormat(Qt.TextFormat.PlainText)
+    box.setText(f"Delete the draft “{path.stem}”?")
+    box.setInformativeText(
+        "Its set-up, corrections and results are lost. The recording stays where it is."
+    )
+    delete = box.addButton("&Delete", QMessageBox.ButtonRole.DestructiveRole)
+    delete.setToolTip("Delete the draft for good")
+    keep = box.addButton("&Keep", QMessageBox.ButtonRole.RejectRole)
+    keep.setToolTip("Delete nothing (Esc)")
+    box.setDefaultButton(keep)
+    box.setEscapeButton(keep)
+    box.exec()
+    return box.clickedButton() is delete
 
 
 def ask_recording_end(parent: QWidget, name: str) -> Literal["keep", "discard", "go on"]:

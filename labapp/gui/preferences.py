@@ -41,11 +41,12 @@ class Preferences:
     foot_switches: tuple[Mapping[str, Any], ...] = ()
     """What their pedals do, each as `PedalMap.as_dict` has it."""
 
-    def with_recent(self, path: Path) -> Preferences:
-        """The same with a session as the last opened."""
+    def with_recent(self, path: Path, folder: Path | None = None) -> Preferences:
+        """The same with a session as the last opened, and its folder, or another, as the last."""
         name = str(path.absolute())
         others = (other for other in self.recent if other != name)
-        return replace(self, recent=(name, *others)[:KEPT_RECENT], last_folder=str(path.parent))
+        last = str(folder or path.parent)
+        return replace(self, recent=(name, *others)[:KEPT_RECENT], last_folder=last)
 
     def without_recent(self, path: Path) -> Preferences:
         """The same with a session forgotten."""

@@ -1,4 +1,4 @@
-"""What the welcome page shows of a session. Without Qt."""
+"""What the welcome page shows of a session."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from labapp.errors import InputError
+from labapp.gui.drafts import is_draft
 from labapp.text import pluralize
 
 if TYPE_CHECKING:
@@ -44,7 +45,8 @@ def look_at(path: Path) -> Recent:
         with Session.open(path, read_only=True) as session:
             title = session.record.title or path.stem
             frames = session.frames
-            about = f"{changed:%Y-%m-%d %H:%M} · {_counted(session.overview().status)}"
+            draft = "draft · " if is_draft(path) else ""
+            about = f"{draft}{changed:%Y-%m-%d %H:%M} · {_counted(session.overview().status)}"
             return Recent(path, title, about, _thumbnail(session, frames))
     except InputError as error:
         return Recent(path, path.stem, f"{error.field}: {error.value}", there=False)

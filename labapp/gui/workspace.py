@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from PySide6.QtCore import QObject, Signal
 
+from labapp.gui.drafts import folder_of
 from labapp.gui.tasks import Control, Task, Tasks, error_text
 from labapp.simulation import parallel
 
@@ -87,8 +88,8 @@ class Workspace(QObject):
 
     @property
     def folder(self) -> Path:
-        """Where a file dialog begins: the session's folder; without a session the home folder."""
-        return Path.home() if self.session is None else self.session.path.parent
+        """Where a file dialog begins (`drafts.folder_of`); without a session the home folder."""
+        return Path.home() if self.session is None else folder_of(self.session)
 
     def show(self, session: Session | None) -> None:
         """Show a session in place of the present one, which is closed."""

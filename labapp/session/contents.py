@@ -196,6 +196,11 @@ class SessionContents:
         return self._frames.recording
 
     @property
+    def recording_place(self) -> Path | None:
+        """Path of the recording; None before one was imported."""
+        return self._frames.place
+
+    @property
     def missing_recording(self) -> Path | None:
         """Path at which the recording is missing; None if its frames can be read."""
         return self._frames.missing

@@ -25,6 +25,9 @@ BUSY_S = 30.0
 OF_A_RECORDING = ("correction", "signals")
 """Kinds of documents that belong to the recording."""
 
+OF_A_BENCH: tuple[Kind, ...] = ("setup", "laser-calibration", "plane-calibration", "bench-check")
+"""Kinds of documents that belong to the bench."""
+
 
 def copy_session(source: Path, path: str | os.PathLike[str]) -> Path:
     """Copy a session as it is now, even while it is open and written to.
@@ -55,6 +58,42 @@ def copy_session(source: Path, path: str | os.PathLike[str]) -> Path:
             if place.exists():
                 copy.relink(place)
     return path
+
+
+def move_session(source: Path, path: str | os.PathLike[str]) -> Path:
+    """Move a session that is not open to another name or folder; its recording stays in its place.
+
+    Raises
+    ------
+    InputError
+        If there is a file of that name, or it cannot be written; the session is where it was then.
+    """
+    path = new_session_path(path)
+    with Session.open(source, read_only=True) as session:
+        place = session.recording_place
+    with os_errors_as_input(path, "file", "a folder to write in"), atomic_file(path) as part:
+        shutil.copyfile(source, part)
+    with Session.open(path) as moved:
+        if place is not None and moved.missing_recording is not None:
+            moved.relink(place, verify=False)
+    source.unlink()
+    return path
+
+
+def use_setup_of(session: Session, path: Path) -> None:
+    """Take set-up, calibrations and bench check of another session, with their pictures.
+
+    Raises
+    ------
+    InputError
+        If the other session cannot be read, or its set-up is not complete.
+    """
+    with Session.open(path, read_only=True) as other:
+        if other.setup_problems:
+            raise InputError(path, "set-up", "not complete", "a session with a complete set-up")
+        held: dict[Key, Any] = {(kind, NO_FRAME): other._documents.get(kind) for kind in OF_A_BENCH}
+        session._pictures.copy_from(other._pictures)
+    session._documents.change(f"set-up of {path.stem}", held)
 
 
 def next_session(session: Session, path: str | os.PathLike[str]) -> Session:

@@ -284,8 +284,15 @@ class Frames:
         if (missing := self.missing) is not None:
             raise InputError(missing, "recording", "is not there", THE_RECORDING)
 
-    def relink(self, path: str | os.PathLike[str]) -> None:
+    def relink(self, path: str | os.PathLike[str], verify: bool = True) -> None:
         """Set the path of the recording.
+
+        Parameters
+        ----------
+        path
+            Where it is.
+        verify
+            Read it through and compare it; else each frame is compared when it is read.
 
         Raises
         ------
@@ -294,12 +301,11 @@ class Frames:
         """
         path = Path(path).absolute()
         recording = self._imported()
-        size, sha256 = identify(path)
-        if (size, sha256) != (recording.size, recording.sha256):
+        if verify and (found := identify(path)) != (recording.size, recording.sha256):
             raise InputError(
                 path,
                 "content",
-                f"another recording ({size} bytes)",
+                f"another recording ({found[0]} bytes)",
                 f"{Path(recording.path).name} as it was imported ({recording.size} bytes)",
             )
         values = {**vars(recording), "path": self._relative(path)}
@@ -378,6 +384,11 @@ class Frames:
         if recording is None:
             raise InputError(self._database.path, "recording", "none", "one to be imported first")
         return recording
+
+    @property
+    def place(self) -> Path | None:
+        """Path of the recording; None before one was imported."""
+        return None if self.recording is None else self._place()
 
     def _place(self) -> Path:
         """Path of the recording: as imported, else in the session's folder."""

@@ -309,9 +309,9 @@ class Session(SessionContents):
         """Refuse any recording but the present one; see `Frames.refuse_another`."""
         self._frames.refuse_another()
 
-    def relink(self, path: str | os.PathLike[str]) -> None:
+    def relink(self, path: str | os.PathLike[str], verify: bool = True) -> None:
         """Set where the recording is now; see `Frames.relink`."""
-        self._frames.relink(path)
+        self._frames.relink(path, verify)
 
     # --- what was measured ------------------------------------------------------------------
 

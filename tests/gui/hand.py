@@ -94,6 +94,8 @@ class Hand:
             for button in self.window.findChildren(QAbstractButton)
             if button.text().replace("&", "") == words and button.isVisible()
         ]
+        if len(found) > 1:  # what leads on from an empty page is in its panel, too
+            found = [each for each in found if not self.window.empty.isAncestorOf(each)]
         assert len(found) == 1, f"{len(found)} buttons “{words}” are in view"
         return found[0]
 

@@ -64,7 +64,7 @@ def test_every_action_is_in_the_menu_with_its_tip(window: MainWindow):
 
 def test_without_a_session_only_what_is_of_use_is_enabled(window: MainWindow):
     enabled = {name for name, made in window.menus.actions.items() if made.isEnabled()}
-    assert {"new", "open", "sample", "import", "quit", "guide"} <= enabled
+    assert {"open_recording", "new", "open", "sample", "quit", "guide"} <= enabled
     assert not {"undo", "redo", "copy", "close", "measure", "next", "cancel"} & enabled
 
 

@@ -16,6 +16,7 @@ from pytestqt.qtbot import QtBot
 
 from labapp.errors import InputError
 from labapp.gui import app, dialogs
+from labapp.gui.drafts import drafts, drafts_folder
 from labapp.gui.pages.dots.presenter import NUMBERS, detector_value
 from labapp.gui.pages.page import Page
 from labapp.gui.preferences import Preferences, read_preferences
@@ -42,7 +43,7 @@ class Plain(Page):
     def __init__(self, workspace: Workspace) -> None:
         super().__init__(workspace)
         self.refreshed, self.left = 0, 0
-        self.taken: list[Path] = []
+        self.taken: list[tuple[Path, bool]] = []
 
     def refresh(self) -> None:
         assert self.workspace.session is not None
@@ -51,8 +52,8 @@ class Plain(Page):
     def leave(self) -> None:
         self.left += 1
 
-    def take(self, path: Path) -> None:
-        self.taken.append(path)
+    def take(self, path: Path, at_once: bool = False) -> None:
+        self.taken.append((path, at_once))
 
 
 class Broken(Plain):
@@ -346,22 +347,17 @@ def test_what_is_dropped_is_opened_or_imported(
     monkeypatch: pytest.MonkeyPatch,
 ):
     path = copy_sample("gtaw")
-    asked: list[Path] = []
-
-    def answer(_: object, proposed: Path, *__: object) -> Path:
-        asked.append(proposed)
-        return tmp_path / "made.labsession"
-
-    monkeypatch.setattr(dialogs, "ask_new_session", answer)
+    monkeypatch.setattr(dialogs, "ask_new_session", lambda *_: pytest.fail("a name is asked for"))
     recording = path.parent / "recording.avi"
     drop(plain, qtbot, recording)
-    assert asked == [path.parent / "recording.labsession"]
-    assert plain.workspace.session is not None
-    assert plain.workspace.session.path == tmp_path / "made.labsession"
+    settle(plain, qtbot)
+    session = plain.workspace.session
+    assert session is not None
+    assert session.path == drafts_folder() / "recording.labsession"
     assert plain_page(plain).key == "capture"
-    assert plain_page(plain).taken == [recording]
+    assert plain_page(plain).taken == [(recording, True)]
     drop(plain, qtbot, path.parent)
-    assert plain_page(plain).taken == [recording, path.parent]
+    assert plain_page(plain).taken[1:] == [(path.parent, False)]
     drop(plain, qtbot, path)
     assert plain.workspace.session.path == path
     drop(plain, qtbot, path, recording)
@@ -370,13 +366,13 @@ def test_what_is_dropped_is_opened_or_imported(
     assert "is not there" in problems(plain)[1]
 
 
-def test_saying_no_to_a_new_session_imports_nothing(
-    plain: MainWindow, copy_sample: CopySample, monkeypatch: pytest.MonkeyPatch
-):
-    monkeypatch.setattr(dialogs, "ask_new_session", lambda *_: None)
-    plain.files.take(copy_sample("gtaw").parent / "recording.avi")
+def test_what_is_no_recording_makes_no_draft(plain: MainWindow, tmp_path: Path, qtbot: QtBot):
+    (tmp_path / "notes.txt").write_text("no recording")
+    plain.files.take(tmp_path / "notes.txt")
+    settle(plain, qtbot)
     assert plain.workspace.session is None
-    assert plain.page is None
+    assert drafts() == []
+    assert "notes.txt" in plain.welcome.refused.text()
 
 
 def test_a_copy_stands_elsewhere_and_finds_its_recording(

@@ -138,7 +138,7 @@ class LiveView(QObject):
             return
         chosen = self.camera.value()
         name = dict(self._choices)[chosen]
-        folder, stem = session.path.parent, session.path.stem
+        folder, stem = self.workspace.folder, session.path.stem
         live = Live(
             name,
             lambda: recording_path(folder, stem),

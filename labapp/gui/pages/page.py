@@ -6,10 +6,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from PySide6.QtCore import Signal
 from PySide6.QtGui import QKeyEvent, QPixmap
 from PySide6.QtWidgets import QVBoxLayout, QWidget
 
-from labapp.gui.shell.steps import State, read_only
+from labapp.gui.shell.steps import Lead, State, read_only
 from labapp.gui.tasks import Task, Work
 from labapp.gui.widgets.fields import Field
 from labapp.gui.widgets.labels import Message
@@ -30,6 +31,8 @@ class Page(QWidget):
 
     key = ""
     """Key of its step in `steps.STEPS`."""
+    lead_changed = Signal()
+    """What is shown in place of the page changed: see `lead`."""
     shows_all_frames = False
     """Whether it shows what all frames gave, and not only the one in view."""
 
@@ -99,13 +102,17 @@ class Page(QWidget):
         """How far the step is, as the session has it or as only the page knows."""
         return found
 
+    def lead(self, found: Lead | None) -> Lead | None:
+        """What is shown in place of the page, as the session has it or as only the page knows."""
+        return found
+
     def leave(self) -> None:
         """The page goes out of view, or the window closes: stop what only it needs."""
 
-    def take(self, path: Path) -> None:
+    def take(self, path: Path, at_once: bool = False) -> None:
         """Take a recording that was dropped on the window or chosen in its menu; for ``capture``.
 
-        The page is in view.
+        The page is in view. ``at_once``: import all of it, and go on to its dots.
         """
 
     def takes_files(self, paths: Sequence[Path]) -> bool:

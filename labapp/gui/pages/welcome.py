@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 
 from PySide6.QtCore import QSize, Qt, Signal
@@ -18,18 +17,15 @@ from PySide6.QtWidgets import (
 )
 
 from labapp.gui.recent import THUMBNAIL_PX, Recent, look_at
+from labapp.gui.shell.lead import action_button
 from labapp.gui.tasks import Control
 from labapp.gui.theme import FollowsTheme
-from labapp.gui.widgets.buttons import button
-from labapp.gui.widgets.labels import plain_label, plain_tip, wrapping_label
+from labapp.gui.widgets.labels import Message, plain_label, plain_tip, wrapping_label
 from labapp.gui.widgets.layouts import fill, hbox
 from labapp.gui.workspace import Workspace
 
-BUTTONS = (
-    ("new", "&New session …", "Make a file for a new experiment (Ctrl+N)"),
-    ("open", "&Open a session …", "Open a session that is not in the list (Ctrl+O)"),
-    ("sample", "&Try the sample", "Open a copy of a recorded run that is measured already"),
-)
+BUTTONS = ("open_recording", "open", "new", "sample")
+"""Actions of the window; the first leads to a surface soonest."""
 
 WIDTH_PX = 760
 
@@ -61,14 +57,17 @@ class Welcome(FollowsTheme, QWidget):
             "The surface of a molten weld pool, measured from the reflections of a laser dot "
             "matrix. An experiment is one session file; everything you do is saved in it at once."
         )
-        for name, text, tip in BUTTONS:
-            made = self.buttons[name] = button(text, tip, partial(self.action_requested.emit, name))
+        for name in BUTTONS:
+            made = self.buttons[name] = action_button(name, self.action_requested.emit)
             made.setMinimumHeight(made.fontMetrics().height() * 2)
+        self.buttons[BUTTONS[0]].setDefault(True)
+        self.refused = Message(2)
         self.label = plain_label("&Recent sessions")
         self.list = QListWidget()
         self.list.setAccessibleName("Recent sessions")
         self.list.setToolTip(
-            "Enter or a double click opens a session, Delete takes it off the list"
+            "Enter or a double click opens a session; Delete takes it off the list, or deletes the "
+            "draft that it is"
         )
         self.list.setIconSize(QSize(*THUMBNAIL_PX))
         self.list.setFrameShape(QFrame.Shape.StyledPanel)
@@ -77,13 +76,13 @@ class Welcome(FollowsTheme, QWidget):
         self.list.itemActivated.connect(self._open)
         self.label.setBuddy(self.list)
         self.nothing = wrapping_label(
-            "No session was opened yet. Drop a video, an image, a folder of images or a session "
-            "anywhere on this window to begin, or try the sample."
+            "No session was opened yet. Open a recording, or drop a video, an image, a folder of "
+            "images or a session anywhere on this window; or try the sample."
         )
         buttons = hbox(*self.buttons.values())
         column = fill(
             QVBoxLayout(inner),
-            *(title, about, buttons, self.label, (self.list, 1), self.nothing, 0),
+            *(title, about, buttons, self.refused, self.label, (self.list, 1), self.nothing, 0),
         )
         column.setSpacing(12)
         hbox(1, (inner, 100), 1, of=self).setContentsMargins(24, 20, 24, 12)

@@ -7,7 +7,9 @@ from typing import Literal
 
 from labapp.gui.shell.steps import STEPS
 
-Needs = Literal["", "session", "frames", "measuring", "undo", "redo", "work", "live"]
+Needs = Literal[
+    "", "session", "draft", "changing", "frames", "measuring", "undo", "redo", "work", "live"
+]
 """What must be there for an action to be of use; it is greyed out without."""
 
 
@@ -33,28 +35,71 @@ class Action:
 
 
 FILE = (
-    Action("new", "&New session …", "Ctrl+N", "Make a file for a new experiment"),
-    Action("open", "&Open …", "Ctrl+O", "Open a session"),
+    Action(
+        "open_recording",
+        "Open &recording…",
+        "Ctrl+Shift+O",
+        "See a video, an image or a stack at once, in a session that needs no name yet",
+    ),
+    Action("new", "&New session…", "Ctrl+N", "Make a file for a new experiment"),
+    Action("open", "&Open session…", "Ctrl+O", "Open a session"),
     Action(
         "sample", "Try the &sample", "", "Open a copy of a recorded run that is measured already"
     ),
     Action(
-        "copy",
-        "Save a &copy …",
-        "Ctrl+Shift+S",
-        "Save the session as it is now under another name; you go on in this one",
-        needs="session",
+        "name_draft",
+        "N&ame this session…",
+        "Ctrl+S",
+        "Move the draft to a folder of yours, under a name; all of it is saved already",
+        needs="draft",
         begins=True,
     ),
     Action(
+        "copy",
+        "Save a &copy…",
+        "Ctrl+Shift+S",
+        "Save the session as it is now under another name; this one stays open",
+        needs="session",
+    ),
+    Action(
         "import",
-        "&Import a recording …",
+        "&Import recording…",
         "Ctrl+I",
         "Take frames from a video, an image or a stack into the session",
+        needs="session",
+    ),
+    Action(
+        "load_setup",
+        "Load set-&up…",
+        "",
+        "Take the set-up from a setup file (TOML); frames that are there are measured",
+        needs="changing",
+        begins=True,
+    ),
+    Action(
+        "last_setup",
+        "Use last set-up",
+        "",
+        "Take the set-up of the session opened last that has a complete one, and measure",
+        needs="changing",
+    ),
+    Action(
+        "other_setup",
+        "Set-up of a session…",
+        "",
+        "Take set-up and calibrations of another session, and measure",
+        needs="changing",
+    ),
+    Action(
+        "enter_setup",
+        "Enter set-up",
+        "",
+        "Go to the drawing of the bench and enter its dimensions",
+        needs="session",
     ),
     Action(
         "export",
-        "&Export …",
+        "&Export…",
         "Ctrl+E",
         "Go to the step that writes tables, surfaces, pictures and the report",
         needs="session",
@@ -303,19 +348,19 @@ VIEW = (
 TOOLS = (
     Action(
         "simulator",
-        "&Simulator …",
+        "&Simulator…",
         "Ctrl+Shift+M",
         "Render a recording of a pool that is known, with the truth about every dot",
     ),
     Action(
         "adviser",
-        "Configuration &adviser …",
+        "Configuration &adviser…",
         "Ctrl+Shift+A",
         "Where laser and imaging plane should stand for the pools that are expected",
     ),
     Action(
         "analysis",
-        "&Error analysis …",
+        "&Error analysis…",
         "Ctrl+Shift+E",
         "How large the error is, and what makes it: the budget of a set-up, and chapter 8",
     ),

@@ -42,11 +42,17 @@ def commands(window: MainWindow) -> dict[str, Callable[[], object]]:
         window.status_line,
     )
     return {
+        "open_recording": files.open_recording,
         "new": files.new,
         "open": files.choose,
         "sample": files.try_sample,
         "copy": files.save_copy,
+        "name_draft": lambda: name_draft(window),
         "import": files.choose_recording,
+        "load_setup": window.setups.load,
+        "last_setup": window.setups.use_last,
+        "other_setup": window.setups.use_other,
+        "enter_setup": lambda: enter_setup(window),
         "export": lambda: window.show_step("export"),
         "close": files.close,
         "quit": lambda: files.may_close() and window.close(),
@@ -84,6 +90,24 @@ def commands(window: MainWindow) -> dict[str, Callable[[], object]]:
         **{kind: partial(show_help, window, kind) for kind in TITLES},
         "log_folder": lambda: show_log_folder(window),
     }
+
+
+def name_draft(window: MainWindow) -> None:
+    """Name the draft; the step and the frame in view stay."""
+    key, frame = window.page.key if window.page else "", window.workspace.frame
+    window.files.name_draft()
+    window.show_step(key)
+    if window.workspace.session is not None and frame in window.workspace.session.frames:
+        window.workspace.show_frame(frame)
+
+
+def enter_setup(window: MainWindow) -> None:
+    """Show the drawing of the bench."""
+    from labapp.gui.pages.setup.view import BENCH_TAB, SetupPage
+
+    window.show_step("setup")
+    if isinstance(window.page, SetupPage):
+        window.page.tabs.setCurrentIndex(BENCH_TAB)
 
 
 def record(window: MainWindow) -> None:

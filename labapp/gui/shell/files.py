@@ -1,4 +1,4 @@
-"""Sessions and recordings of the window: new, open, import, copy, the sample, those of before."""
+"""Sessions and recordings of the window: new, drafts, open, import, copy, the sample."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from PySide6.QtCore import QObject, Signal
 
 from labapp.gui import dialogs
+from labapp.gui.drafts import folder_of, is_draft, new_draft
 from labapp.gui.workspace import MISSING
 from labapp.session.file.database import SUFFIX, SessionInUse
 
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
 
     from labapp.gui.live.view import LiveView
     from labapp.gui.preferences import PreferencesStore
+    from labapp.gui.tasks import Control
     from labapp.gui.workspace import Workspace
     from labapp.session.session import Session
 
@@ -25,8 +27,13 @@ if TYPE_CHECKING:
 class Files(QObject):
     """What the window opens and makes."""
 
-    recording_requested = Signal(object)
-    """The step Recording is to be shown, and to take this file or folder, unless it is None."""
+    recording_requested = Signal(object, bool)
+    """The step Recording is to be shown, and to take this file or folder, unless it is None.
+
+    The second says whether it is to be imported at once.
+    """
+    refused = Signal(str)
+    """Why what was pressed on the welcome page was refused; empty: it was not."""
 
     def __init__(
         self,
@@ -43,7 +50,17 @@ class Files(QObject):
 
     def new(self) -> bool:
         """Ask for a file and make a session in it."""
-        return self._create(dialogs.new_path(self.preferences.current.folder, "experiment"))
+        from labapp.session.session import Session
+
+        proposed = dialogs.new_path(self.preferences.current.folder, "experiment")
+        path = dialogs.ask_new_session(self._window, proposed)
+        if path is None or not self.may_close():
+            return False
+        session = self.workspace.run_or_report(lambda: Session.create(path))
+        if session is None:
+            return False
+        self._show(session)
+        return True
 
     def choose(self) -> None:
         """Ask for a session and open it."""
@@ -51,8 +68,74 @@ class Files(QObject):
         if path is not None:
             self.open(path)
 
+    def open_recording(self) -> None:
+        """Ask for a recording and show it at once, in a draft."""
+        folder = self.preferences.current.folder
+        path = dialogs.ask_recording(self._window, folder, "Open recording")
+        if path is not None:
+            self.begin_draft(path)
+
+    def begin_draft(self, recording: Path) -> None:
+        """Show a recording at once, in a session that needs no name yet."""
+        if not self.may_close():
+            return
+
+        def check(_: Control) -> None:
+            from labapp.media import open_source
+
+            open_source(recording).close()
+
+        def opened(_: None) -> None:
+            session = self.workspace.run_or_report(
+                lambda: new_draft(recording), beside=self.refused.emit
+            )
+            if session is not None:
+                self._show(session, recording.parent)
+                self.recording_requested.emit(recording, True)
+
+        title = f"Opening {recording.name}"
+        self.workspace.tasks.start(
+            title, check, opened, beside=self.refused.emit, kind="Opening a recording"
+        )
+
+    def name_draft(self) -> bool:
+        """Ask for a file and keep the draft under that name; False if it stays a draft."""
+        session = self.workspace.session
+        if session is None:
+            return False
+        draft, folder = session.path, folder_of(session)
+        proposed = dialogs.new_path(folder, draft.stem)
+        path = dialogs.ask_new_session(self._window, proposed, "Name this session")
+        if path is None or not self.may_close():
+            return False
+        self.workspace.show(None)
+
+        from labapp.session.copies import move_session
+
+        moved = self.workspace.run_or_report(lambda: move_session(draft, path))
+        if moved is not None:
+            self.preferences.remember(lambda before: before.without_recent(draft))
+            self.workspace.notified.emit(f"The session is {path}", False)
+        return self.open(moved or draft) and moved is not None
+
+    def forget(self, path: Path) -> None:
+        """Take a session off the list of recent ones; delete a draft if the operator agrees."""
+        if is_draft(path) and path.exists():
+            if not dialogs.ask_delete_draft(self._window, path):
+                return
+            from labapp.session.session import Session
+
+            def delete() -> bool:
+                Session.open(path).close()  # refused while another window has it open
+                path.unlink()
+                return True
+
+            if self.workspace.run_or_report(delete, beside=self.refused.emit) is None:
+                return
+        self.preferences.remember(lambda before: before.without_recent(path))
+
     def choose_recording(self) -> None:
-        """Ask for a recording and import it."""
+        """Ask for a recording and import it into the session."""
         path = dialogs.ask_recording(self._window, self.preferences.current.folder)
         if path is not None:
             self.take(path)
@@ -78,22 +161,22 @@ class Files(QObject):
         return True
 
     def take(self, path: Path) -> None:
-        """Take a recording to the capture page, in a new session where none is open."""
+        """Take a recording into the session; in a draft where none is open."""
         if not path.exists():
             self.workspace.notified.emit(f"{path} is not there", True)
-        elif self.workspace.session is not None or self._create(
-            dialogs.new_path(path.parent, path.stem)
-        ):
+        elif self.workspace.session is None:
+            self.begin_draft(path)
+        else:
             folder = str(path.parent)
             self.preferences.remember(lambda before: replace(before, last_folder=folder))
-            self.recording_requested.emit(path)
+            self.recording_requested.emit(path, False)
 
     def save_copy(self) -> None:
         """Ask for a file and save the session in it as it is now."""
         session = self.workspace.session
         if session is None:
             return
-        proposed = dialogs.new_path(session.path.parent, f"{session.path.stem} copy")
+        proposed = dialogs.new_path(folder_of(session), f"{session.path.stem} copy")
         path = dialogs.ask_new_session(self._window, proposed, "Save a copy")
         if path is not None:
             from labapp.session.copies import copy_session
@@ -113,14 +196,14 @@ class Files(QObject):
         from labapp.session.copies import next_session
 
         title = "New session from this recording"
-        proposed = dialogs.new_path(present.path.parent, recording.stem)
+        proposed = dialogs.new_path(folder_of(present), recording.stem)
         path = dialogs.ask_new_session(self._window, proposed, title)
         if path is None or not self.may_close():
             return
         session = self.workspace.run_or_report(lambda: next_session(present, path))
         if session is not None:
             self._show(session)
-            self.recording_requested.emit(None)
+            self.recording_requested.emit(None, False)
 
     def try_sample(self) -> None:
         """Open a copy of the sample run, in a folder of the user's."""
@@ -148,18 +231,6 @@ class Files(QObject):
             camera.discard(take)
         return answer != "go on"
 
-    def _create(self, proposed: Path) -> bool:
-        from labapp.session.session import Session
-
-        path = dialogs.ask_new_session(self._window, proposed)
-        if path is None or not self.may_close():
-            return False
-        session = self.workspace.run_or_report(lambda: Session.create(path))
-        if session is None:
-            return False
-        self._show(session)
-        return True
-
     def _opened(self, path: Path) -> Session | None:
         from labapp.session.session import Session
 
@@ -170,8 +241,9 @@ class Files(QObject):
                 return None
             return Session.open(path, read_only=True)
 
-    def _show(self, session: Session) -> None:
-        self.preferences.remember(lambda before: before.with_recent(session.path))
+    def _show(self, session: Session, folder: Path | None = None) -> None:
+        folder = folder or self.workspace.run_or_report(lambda: folder_of(session))
+        self.preferences.remember(lambda before: before.with_recent(session.path, folder))
         self.workspace.show(session)
         missing = self.workspace.run_or_report(lambda: session.missing_recording)
         if missing is not None:
@@ -183,4 +255,5 @@ def title(session: Session | None) -> str:
     """Title of a window with a session, or with none."""
     if session is None:
         return "labapp"
-    return f"{session.path.stem}{' (read-only)' if session.read_only else ''} — labapp"
+    notes = (" (draft)" if is_draft(session.path) else "") + " (read-only)" * session.read_only
+    return f"{session.path.stem}{notes} — labapp"

@@ -35,6 +35,27 @@ class State:
     why: str
 
 
+@dataclass(frozen=True)
+class Offer:
+    """A button of a page that is no action of the window."""
+
+    text: str
+    tip: str
+    do: Callable[[], object]
+
+
+@dataclass(frozen=True)
+class Lead:
+    """What a page with nothing to show says: what it will show, and what leads there."""
+
+    words: str
+    actions: tuple[str | Offer, ...]
+    """Names of the window's actions, or buttons of the page's own; the first leads on best."""
+
+
+SETUP_ACTIONS = ("load_setup", "last_setup", "other_setup", "enter_setup")
+MEASURE_ACTIONS = ("measure", "measure_frame")
+
 PARTS = {
     "laser": "the laser",
     "pattern": "the pattern",
@@ -262,6 +283,10 @@ class Step:
     state: Callable[[Facts], State] = results
     needs_frames: bool = True
     """Whether it needs a recording; ``state`` is not called before there is one."""
+    shows: str = ""
+    """What it shows as soon as it has something to show, a sentence."""
+    needs_results: bool = False
+    """Whether it shows nothing before a frame is measured."""
 
 
 STEPS = (
@@ -318,6 +343,7 @@ STEPS = (
         "is wrong, and go on to the next frame.",
         "DotsPage",
         _dots,
+        shows="The dots of each frame, numbered by row and column.",
     ),
     Step(
         "surface",
@@ -325,12 +351,16 @@ STEPS = (
         "Measure the frames and look at the surface. The residuals tell whether to trust it.",
         "SurfacePage",
         _surface,
+        shows="The surface of the pool in 3-D, its width, length and height with their ±.",
+        needs_results=True,
     ),
     Step(
         "trends",
         "Trends",
         "See how the pool changes over the recording. Click a point to go to its frame.",
         "TrendsPage",
+        shows="Width, length and height of the pool over the recording.",
+        needs_results=True,
     ),
     Step(
         "export",
@@ -338,6 +368,8 @@ STEPS = (
         "Tick what you want to take along, and choose a folder.",
         "ExportPage",
         _export,
+        shows="Tables, surfaces, pictures and the report, to be written into a folder.",
+        needs_results=True,
     ),
 )
 """The registry of the app's pages: list, menu, keys, guide and window are made from it."""
@@ -350,6 +382,30 @@ def states(session: Session | None, seen: Overview | None = None) -> dict[str, S
     facts, bare = _facts(session, seen), session.recording is None
     first = State(Mark.TODO, "Import a recording first")
     return {step.key: first if bare and step.needs_frames else step.state(facts) for step in STEPS}
+
+
+def lead(
+    step: Step, session: Session, seen: Overview | None = None, measuring: bool = False
+) -> Lead | None:
+    """What a step shows in place of its page; None if there is something on the page.
+
+    Parameters
+    ----------
+    seen
+        The session's overview, if it is at hand.
+    measuring
+        Whether frames are being measured.
+    """
+    facts = _facts(session, seen)
+    if session.recording is None:
+        return Lead(step.shows, ("import",)) if step.needs_frames else None
+    if facts.measured or not step.needs_results:
+        return None
+    if measuring:
+        return Lead(f"{step.shows} It appears with the first frame measured.", ("cancel",))
+    if facts.problems:
+        return Lead(f"{step.shows} What is missing is the set-up.", SETUP_ACTIONS)
+    return Lead(step.shows, MEASURE_ACTIONS)
 
 
 def first_step(session: Session) -> str:

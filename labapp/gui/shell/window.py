@@ -21,6 +21,7 @@ from PySide6.QtWidgets import (
 )
 
 from labapp.core.values import IntArray
+from labapp.gui.drafts import drafts, is_draft
 from labapp.gui.pages import PAGES
 from labapp.gui.pages.page import Page
 from labapp.gui.pages.welcome import Welcome
@@ -28,11 +29,21 @@ from labapp.gui.preferences import THEMES, PreferencesStore
 from labapp.gui.shell.actions import ACTIONS, Needs
 from labapp.gui.shell.files import Files, title
 from labapp.gui.shell.focus import finish_edit
+from labapp.gui.shell.lead import EmptyState
 from labapp.gui.shell.menus import Menus, steps_of
 from labapp.gui.shell.messages import LogPanel, StatusLine
+from labapp.gui.shell.setups import Setups
 from labapp.gui.shell.standing import DOUBTFUL, TICKS, next_frame, standings
 from labapp.gui.shell.step_list import SidePanel, StepList
-from labapp.gui.shell.steps import STEPS, first_step, read_only, states, why_not_measurable
+from labapp.gui.shell.steps import (
+    STEPS,
+    Lead,
+    first_step,
+    lead,
+    read_only,
+    states,
+    why_not_measurable,
+)
 from labapp.gui.theme import apply_theme
 from labapp.gui.widgets.timeline import Timeline
 from labapp.gui.workspace import MEASURING, Workspace
@@ -70,6 +81,7 @@ class MainWindow(QMainWindow):
         self.pages: dict[str, Page] = {}
         """The pages made by now, by their keys."""
         self.files = Files(self, self.workspace, preferences, lambda: self.camera)
+        self.setups = Setups(self, self.workspace, preferences)
         self.standings: IntArray = np.zeros(0, np.int64)
         """How each frame stands, shape (n,)."""
         self.page: Page | None = None
@@ -96,7 +108,9 @@ class MainWindow(QMainWindow):
         self.welcome = Welcome(self.workspace)
         self.stack = QStackedWidget()
         self.stack.setMinimumHeight(PAGE_PX)  # else hidden pages could make the window grow
-        self.stack.addWidget(self.welcome)
+        self.empty = EmptyState()
+        for each in (self.welcome, self.empty):
+            self.stack.addWidget(each)
         self.setCentralWidget(self.stack)
         self.step_list = StepList(self._steps)
         self.side_panel = SidePanel()
@@ -130,6 +144,8 @@ class MainWindow(QMainWindow):
         preferences.changed.connect(lambda: self.menus.show_recent(preferences.current.recent))
         preferences.failed.connect(self.say)
         self.files.recording_requested.connect(self._show_recording)
+        self.files.refused.connect(self.welcome.refused.setText)
+        self.setups.refused.connect(self._show_refused)
         space.closing.connect(self._leave)
         space.opened.connect(self._session_opened)
         space.changed.connect(self._changed)
@@ -143,11 +159,13 @@ class MainWindow(QMainWindow):
             lambda held: preferences.remember(lambda before: replace(before, foot_switches=held))
         )
         space.tasks.changed.connect(self._show_actions)
+        space.tasks.changed.connect(self._show_lead)
         self.step_list.chosen.connect(self.show_step)
         self.timeline.moved.connect(space.show_frame)
         self.timeline.jumped.connect(self.jump)
         self.status_line.read.connect(self.read_messages)
         self.welcome.action_requested.connect(self.do)
+        self.empty.action_requested.connect(self.do)
         self.welcome.chosen.connect(self.files.open)
         self.welcome.forgotten.connect(self._forget)
 
@@ -165,6 +183,8 @@ class MainWindow(QMainWindow):
         there: dict[Needs, bool] = {
             "": True,
             "session": session is not None,
+            "draft": session is not None and is_draft(session.path),
+            "changing": session is not None and not read_only(session),
             "frames": frames,
             "measuring": frames and not read_only(session),
             "undo": bool(undo),
@@ -205,18 +225,21 @@ class MainWindow(QMainWindow):
             if made is None:
                 return
             self.pages[key] = made
+            made.lead_changed.connect(self._show_lead)
             self.stack.addWidget(made)
         page = self.pages[key]
         if page is not self.page:
             self._leave()
             self.page = page
             listed = self.step_list.hasFocus()
-            self.stack.setCurrentWidget(page)
             step = next(step for step in STEPS if step.key == key)
             page.setAccessibleName(step.title)
             self.side_panel.show_panel(page.panel, step)
+            self._show_refused("")
+            self._show_lead()
             if not listed:
-                page.setFocus()  # or they stay with what is hidden now
+                seen = page if self.stack.currentWidget() is page else self.empty
+                seen.setFocus()  # or they stay with what is hidden now
         self.step_list.show_step(key)
         self._show_page()
         self._show_actions()
@@ -249,11 +272,17 @@ class MainWindow(QMainWindow):
         else:
             self.workspace.show_frame(found)
 
-    def _show_recording(self, path: Path | None) -> None:
+    def _show_recording(self, path: Path | None, at_once: bool) -> None:
         """Show the step Recording, and have it take a recording."""
         self.show_step("capture")
         if path is not None and self.page is not None:
-            self.page.take(path)
+            self.page.take(path, at_once)
+
+    def _show_refused(self, words: str) -> None:
+        """Say beside what was pressed why it was refused."""
+        self.empty.refused.setText(words)
+        if self.page is not None:
+            self.page.refused.setText(words)
 
     def _list_recent(self) -> None:
         """List the sessions opened before, in other windows too."""
@@ -261,11 +290,12 @@ class MainWindow(QMainWindow):
         recent = self.preferences.current.recent
         self.menus.show_recent(recent)
         if self.workspace.session is None:
-            self.welcome.show_recent([Path(name) for name in recent])
+            paths = [Path(name) for name in recent]
+            self.welcome.show_recent([*paths, *(path for path in drafts() if path not in paths)])
 
     def _forget(self, path: Path) -> None:
-        """Take a session off the list of recent ones; the file stays."""
-        self.preferences.remember(lambda before: before.without_recent(path))
+        """Take a session off the list of recent ones, see `Files.forget`."""
+        self.files.forget(path)
         self._list_recent()
 
     def _leave(self) -> None:
@@ -342,6 +372,23 @@ class MainWindow(QMainWindow):
         if self.page is not None and self.workspace.session is not None:
             self.side_panel.show_state(self.page.state(self._states[self.page.key]))
             self.workspace.run_or_report(self.page.refresh)
+            self._show_lead()
+
+    def _show_lead(self) -> None:
+        """Show the page in view, or what leads on while there is nothing on it."""
+        page, session = self.page, self.workspace.session
+        if page is None or session is None:
+            return
+        step = next(step for step in STEPS if step.key == page.key)
+        measuring = self.workspace.measuring is not None
+
+        def find() -> Lead | None:
+            return page.lead(lead(step, session, self.workspace.overview(), measuring))
+
+        found = self.workspace.run_or_report(find)
+        if found is not None:
+            self.empty.show_lead(page.key, found)
+        self.stack.setCurrentWidget(page if found is None else self.empty)
 
     def _frame_changed(self, frame: int) -> None:
         self.timeline.set_frame(frame)

@@ -21,7 +21,7 @@ from labapp.gui.dialogs import ask_file
 from labapp.gui.pages.bench_check import presenter
 from labapp.gui.pages.bench_check.presenter import COLUMNS, KINDS, Checked, Chosen, Predicted
 from labapp.gui.pages.page import Page
-from labapp.gui.shell.steps import Mark, State, setup_to_do
+from labapp.gui.shell.steps import Lead, Mark, Offer, State, setup_to_do
 from labapp.gui.tasks import Control
 from labapp.gui.views.picture import PictureView
 from labapp.gui.widgets.buttons import button
@@ -116,6 +116,11 @@ class BenchCheckPage(Page):
             return State(Mark.READY, "Checked; the adjusted set-up is not in use yet")
         return State(Mark.ATTENTION, "The pictures contradict the set-up")
 
+    def lead(self, found: Lead | None) -> Lead | None:
+        """Where a picture can come from, while there is none."""
+        add = Offer("&Add picture…", "Of a mirror of known shape", self._choose)
+        return found if self.chosen else Lead(NO_PICTURE, () if self.locked else (add,))
+
     def _is_kept(self) -> bool:
         """Whether what is shown is what the session keeps."""
         kept = self._kept
@@ -183,6 +188,7 @@ class BenchCheckPage(Page):
             self.workspace.changed.emit()
         else:
             self._follow()
+            self.lead_changed.emit()
 
     # --- the check ----------------------------------------------------------------------------
 
@@ -422,7 +428,7 @@ class BenchCheckPage(Page):
     def _show_picture(self, found: MirrorPicture | None) -> None:
         image = self._selected().image if self.chosen else None
         if image is not self.view.picture or image is None:
-            self.view.show_picture(image, NO_PICTURE)
+            self.view.show_picture(image)
         for item in self._overlays:
             self.view.remove(item)
         former, self._found, self._overlays = self._found, found, []

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
+from labapp.gui.drafts import folder_of
 from labapp.gui.pages.capture.import_choice import NEXT, NEXT_TIP
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, FieldForm
@@ -35,8 +36,8 @@ class KeptRecordings(Group):
 
     def list_beside(self, session: Session, running: Take | None) -> None:
         """List those of a session, the newest first, without the one that runs."""
-        folder = session.path.parent
-        others = [] if session.recording is None else [folder / session.recording.path]
+        folder = folder_of(session)
+        others = [session.recording_place]
         others += [] if running is None else [running.path]
         try:
             found = recordings_beside(folder, session.path.stem)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 from PySide6.QtCore import Qt, QTimer
@@ -23,7 +24,7 @@ from labapp.gui.pages.capture.presenter import (
     recording_facts,
 )
 from labapp.gui.pages.page import Page
-from labapp.gui.shell.steps import Mark, State
+from labapp.gui.shell.steps import Lead, Mark, Offer, State
 from labapp.gui.tasks import Control, Task
 from labapp.gui.views.picture import PictureView
 from labapp.gui.widgets.buttons import button
@@ -39,10 +40,7 @@ from labapp.text import pluralize
 REST_MS = 120
 """Time, ms, that a frame stays in view before its exposure is judged."""
 
-NONE_YET = (
-    "Choose a video, an image, a folder of images or a stack, or drop it on the window; or start a "
-    "camera."
-)
+CAPTURE_SHOWS = "The frames of a video, of images or a stack, or what a camera sees."
 
 KEYPAD = Qt.KeyboardModifier.KeypadModifier
 
@@ -110,6 +108,17 @@ class CapturePage(Page):
         if self.preview is None or session is None or session.recording is not None:
             return found
         return State(Mark.READY, f"{self.preview.path.name} is not imported yet: press Import")
+
+    def lead(self, found: Lead | None) -> Lead | None:
+        """Where a recording can come from, while there is none to be seen."""
+        session = self.workspace.session
+        if session is None or session.recording or self.preview or self.live_view.live:
+            return found
+        file = Offer("Choose &file…", "A video, an image or a stack", self.choose_file)
+        folder = Offer("Choose f&older…", "A folder of images in order", self.choose_folder)
+        camera = Offer("&Start camera", "See what the camera chosen at the right sees",
+                       self.live_view.start)  # fmt: skip
+        return Lead(CAPTURE_SHOWS, (file, folder, camera))
 
     def leave(self) -> None:
         """Judge no frame that is not in view; a camera and its recording continue."""
@@ -222,7 +231,7 @@ class CapturePage(Page):
             self._wanted = (None, self.workspace.frame)
         else:
             self._wanted = self._seen = None
-            self._show_seen(Seen("", None, None, NONE_YET))
+            self._show_seen(Seen("", None, None))
             return
         if self._wanted != self._seen and self._reading not in self.workspace.tasks.active:
             self._read()
@@ -271,8 +280,8 @@ class CapturePage(Page):
     def _folder(self) -> Path:
         return self._last_folder if self._last_folder.name else self.workspace.folder
 
-    def take(self, path: Path) -> None:
-        """Look at a recording, to import it."""
+    def take(self, path: Path, at_once: bool = False) -> None:
+        """Look at a recording, to import it; or import all of it at once, see `Page.take`."""
         self._last_folder = path.parent
         self.live_view.stop()
         if self._opening in self.workspace.tasks.active and self._opening is not None:
@@ -287,8 +296,10 @@ class CapturePage(Page):
             self.slider.setValue(0)
             self.slider.blockSignals(False)
             self.chosen.begin(preview)
-            self._show_import()
             self._look()
+            if at_once:
+                self._import(path, ":", None, False, self._go_to_dots)
+            self._show_import()
             self.workspace.changed.emit()
 
         self._opening = self.start_task(
@@ -317,7 +328,14 @@ class CapturePage(Page):
         if self.workspace.session is not former:  # the dialog was not cancelled
             self._import(path, frames, rate_hz, embed)
 
-    def _import(self, path: Path, frames: str, rate_hz: float | None, embed: bool) -> None:
+    def _import(
+        self,
+        path: Path,
+        frames: str,
+        rate_hz: float | None,
+        embed: bool,
+        then: Callable[[], None] = lambda: None,
+    ) -> None:
         session = self.session
 
         def work(control: Control) -> Recording:
@@ -338,10 +356,16 @@ class CapturePage(Page):
                 f"{message}. {' '.join(recording.warnings)}".strip(), False
             )
             self.workspace.changed.emit()
+            then()
 
         self._importing = self.start_task(f"Importing {path.name}", work, done, kind="Importing")
         self._listed = None  # one of them may be the session's own then
         self._show_import()
+
+    def _go_to_dots(self) -> None:
+        """Go on to the dots, unless the operator has gone elsewhere."""
+        if self.isVisible():
+            self.workspace.action_requested.emit("step_dots")
 
     def _drop_preview(self) -> None:
         preview, self.preview = self.preview, None
@@ -392,8 +416,8 @@ class CapturePage(Page):
 
     def _make_panel(self) -> None:
         choose = hbox(
-            button("Choose a file …", "A video, an image or a stack", self.choose_file),
-            button("Choose a folder …", "A folder of images in order", self.choose_folder),
+            button("Choose file…", "A video, an image or a stack", self.choose_file),
+            button("Choose folder…", "A folder of images in order", self.choose_folder),
         )
         self.missing = selectable_label()
         self.find_button = button(

@@ -2,11 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from PySide6.QtCore import QSignalBlocker, Qt
 from PySide6.QtGui import QAction
-from PySide6.QtWidgets import QGridLayout, QHeaderView, QSizePolicy, QToolButton, QWidget
+from PySide6.QtWidgets import (
+    QGridLayout,
+    QHeaderView,
+    QSizePolicy,
+    QStackedWidget,
+    QToolButton,
+    QWidget,
+)
 
 from labapp.core.pipeline import Settings
 from labapp.core.rows.lattice import Site
@@ -18,11 +25,22 @@ from labapp.gui.pages.dots.presenter import (
     RowLine,
     detector_value,
 )
+from labapp.gui.shell.lead import action_grid
+from labapp.gui.shell.steps import MEASURE_ACTIONS, SETUP_ACTIONS
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
-from labapp.gui.widgets.labels import Message, heading, plain_label, show_words, wrapping_label
-from labapp.gui.widgets.layouts import vbox
+from labapp.gui.widgets.labels import (
+    Message,
+    heading,
+    plain_label,
+    plain_tip,
+    show_words,
+    wrapping_label,
+)
+from labapp.gui.widgets.layouts import Group, vbox
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.widgets.tables import ReadTable
+
+LEADS = (("Measure", MEASURE_ACTIONS), ("To measure, the set-up is missing", SETUP_ACTIONS))
 
 MOST_ROWS = 60
 COLUMNS_OF_BUTTONS = 3
@@ -31,8 +49,19 @@ COLUMNS_OF_BUTTONS = 3
 class DotsPanel(QWidget):
     """What stands beside the frame; the page listens to its fields and its list of rows."""
 
-    def __init__(self, edits: Sequence[QAction], frames: Sequence[QAction]) -> None:
+    def __init__(
+        self,
+        edits: Sequence[QAction],
+        frames: Sequence[QAction],
+        do: Callable[[str], object],
+        refused: QWidget,
+    ) -> None:
         super().__init__()
+        # Of one height: what is below does not move when the set-up is there.
+        self.lead = QStackedWidget()
+        for words, names in LEADS:
+            self.lead.addWidget(Group(words, action_grid(names, do)))
+        self.lead.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Fixed)
         # The buttons stay under the hand, whatever there is to say.
         self.seen, self.chosen, self.why = Message(3), Message(2), wrapping_label()
         self.fit = ResultTable("Fit before the last edit and after it")
@@ -45,7 +74,8 @@ class DotsPanel(QWidget):
         form.add(self.most)
         self.rows = _RowList()
         vbox(
-            *(self.seen, heading("Correct"), self.chosen, self._sites(), self._buttons(edits)),
+            *(self.seen, self.lead, refused, heading("Correct"), self.chosen, self._sites()),
+            self._buttons(edits),
             *(heading("Following frames"), form, self._buttons(frames)),
             *(heading("Fit"), self.why, self.fit, heading("Rows"), self.rows),
             *(heading("Detector"), self._detector(), 1),
@@ -61,6 +91,12 @@ class DotsPanel(QWidget):
         self.fit.set_rows(fit)
         if rows is not None:
             self.rows.show_lines(rows)
+
+    def show_lead(self, without_setup: bool, why_not: str) -> None:
+        """Offer to measure, or where a set-up can come from; greyed out where neither can be."""
+        self.lead.setCurrentIndex(int(without_setup))
+        self.lead.setEnabled(not why_not)
+        self.lead.setToolTip(plain_tip(why_not))
 
     def show_chosen(self, words: str, rows: Sequence[int], site: tuple[int, int]) -> None:
         """Show what is chosen: in words, its rows, and the site of a single dot (0: none)."""

@@ -26,7 +26,7 @@ from labapp.gui.pages.dots.overlay import DotsOverlay
 from labapp.gui.pages.dots.panel import DotsPanel
 from labapp.gui.pages.dots.presenter import DetectorNumber, DotsState, Figures, Need
 from labapp.gui.pages.page import Page
-from labapp.gui.shell.steps import why_not_measurable
+from labapp.gui.shell.steps import recording_gone
 from labapp.gui.views.drag_point import SHIFT, arrow_step
 from labapp.gui.views.picture import PictureView, Tool
 from labapp.gui.workspace import Workspace
@@ -80,7 +80,7 @@ class DotsPage(Page):
         )
         self._dot_actions = [*edits, *frames, *keys]
         self.lines_hand = LinesHand(self)
-        self.dots_panel = DotsPanel(edits, frames)
+        self.dots_panel = DotsPanel(edits, frames, workspace.action_requested.emit, self.refused)
         self.canvas_layout.addWidget(self.view)
         self.lines_panel = LinesPanel(self.lines_hand.actions)
         self.lines_panel.hide()
@@ -116,6 +116,7 @@ class DotsPage(Page):
         self.looking.ready.connect(self._again)
         # The window may show a change a little later; the next edit must begin with it.
         self.workspace.changed.connect(self._again)
+        self.workspace.tasks.changed.connect(self._show_lead)
         self.workspace.opened.connect(self._forget)
 
     # --- what is shown ------------------------------------------------------------------------
@@ -180,10 +181,11 @@ class DotsPage(Page):
         figures = presenter.figures(seen.result)
         stands = seen.result is not None and not seen.result.stale
         pending = "fitting …" if self.refit.pending else "" if stands else "–"
-        why = seen.why or (why_not_measurable(session) if not stands else "")
+        why = seen.why or recording_gone(session)
         dots = seen.correction
         if seen.why and dots is not None and dots.lattice.reference is None:
             why = f"{why}. {NO_REFERENCE}"
+        self._show_lead()
         self.dots_panel.show_frame(
             sentence,
             why,
@@ -195,6 +197,12 @@ class DotsPage(Page):
             # The list keeps its size while dots are looked for: nothing jumps.
             None if seen.correction is None else presenter.row_lines(seen.correction),
         )
+
+    def _show_lead(self) -> None:
+        session = self.workspace.session
+        if session is not None:
+            measuring = "Frames are being measured" if self.workspace.measuring is not None else ""
+            self.dots_panel.show_lead(bool(session.setup_problems), self.locked or measuring)
 
     def draw(self) -> None:
         """Draw the marks, a drag under way included."""

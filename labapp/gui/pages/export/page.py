@@ -12,6 +12,7 @@ from PySide6.QtWidgets import QCheckBox, QGridLayout, QWidget
 
 from labapp.export.meshes import SMALLEST_SPACING_MM
 from labapp.gui.dialogs import ask_folder
+from labapp.gui.drafts import folder_of
 from labapp.gui.pages.export.presenter import (
     SIZES,
     USUAL,
@@ -167,7 +168,7 @@ class ExportPage(Page):
             return
         folder = Path(self.folder.value() or proposed_folder(session)).expanduser()
         if not folder.is_absolute():
-            folder = session.path.parent / folder
+            folder = folder_of(session) / folder
         frames = made.frames.tolist()
 
         def work(control: Control) -> Written:

@@ -30,6 +30,7 @@ from labapp.export.meshes import SPACING_MM
 from labapp.export.rendering.drawing import Direction
 from labapp.export.rendering.film import UNTIMED_HZ, film_times
 from labapp.export.rendering.studio import PICTURE_PX
+from labapp.gui.drafts import folder_of
 from labapp.session.frames import Progress
 from labapp.session.measured import SETUP_CHANGED, scheme_name
 from labapp.session.session import Session
@@ -309,7 +310,7 @@ def schemes(session: Session) -> tuple[tuple[str, str], ...]:
 
 def proposed_folder(session: Session) -> Path:
     """Where to write if nobody says otherwise."""
-    return session.path.parent / f"{session.path.stem}-results"
+    return folder_of(session) / f"{session.path.stem}-results"
 
 
 def folder_within(folder: Path, session: Session) -> Path:

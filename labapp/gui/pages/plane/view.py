@@ -18,6 +18,7 @@ from labapp.gui.dialogs import ask_file, ask_save
 from labapp.gui.pages.page import Page
 from labapp.gui.pages.plane import presenter
 from labapp.gui.pages.plane.presenter import POINTS
+from labapp.gui.shell.steps import Lead, Offer
 from labapp.gui.views.drag_point import DragPoint
 from labapp.gui.views.picture import PictureView
 from labapp.gui.widgets.buttons import button
@@ -51,7 +52,7 @@ class PlanePage(Page):
     def __init__(self, workspace: Workspace) -> None:
         super().__init__(workspace)
         self.view = PictureView("Picture of the target")
-        self.view.show_picture(None, NO_PICTURE)
+        self.view.show_picture(None)
         self.canvas_layout.addWidget(self.view)
         self.found: Calibration | None = None
         self._tilted: tuple[GreyImage, ...] = ()
@@ -148,6 +149,14 @@ class PlanePage(Page):
             self.workspace.notified.emit(
                 "The imaging plane is in use; undo brings the former back", False
             )
+
+    def lead(self, found: Lead | None) -> Lead | None:
+        """Where a picture can come from, while there is none."""
+        if self.view.picture is not None:
+            return found
+        load = Offer("&Load picture…", "Of the target, or of a board", self._choose)
+        tip = "The target that is chosen at the right"
+        return Lead(NO_PICTURE, (load, Offer("&Save for printing…", tip, self._choose_target)))
 
     def leave(self) -> None:
         """Finish the edit under way."""
@@ -289,11 +298,13 @@ class PlanePage(Page):
             self._place(self.found.with_square(square))
 
     def _clear(self) -> None:
-        self.view.show_picture(None, NO_PICTURE)
+        self.view.show_picture(None)
+        self.lead_changed.emit()
         self._place(None)
 
     def _show(self, image: GreyImage, found: Calibration | None) -> None:
         self.view.show_picture(image)
+        self.lead_changed.emit()
         rows, columns = image.shape
         self._place(found or presenter.first_points((rows, columns), self._unit()))
 

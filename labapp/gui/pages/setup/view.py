@@ -10,7 +10,7 @@ from PySide6.QtWidgets import QCheckBox, QLabel, QTabWidget, QVBoxLayout, QWidge
 
 from labapp.config.setup import read_setup
 from labapp.files import write_file
-from labapp.gui.dialogs import EVERYTHING, ask_file, ask_save
+from labapp.gui.dialogs import SETUP_FILES, ask_save, ask_setup
 from labapp.gui.pages.page import Page
 from labapp.gui.pages.setup import presenter
 from labapp.gui.pages.setup.presenter import (
@@ -31,8 +31,6 @@ from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
 from labapp.session.checklist import EQUIPMENT, SAFETY, STEPS, Items, tick
 from labapp.session.session import Session
-
-SETUP_FILES = "Set-up files (*.toml)"
 
 EXPERIMENT_TAB, SAFETY_TAB, BENCH_TAB, STEPS_TAB = range(4)
 
@@ -281,8 +279,7 @@ class SetupPage(Page):
         )
 
     def _choose_load(self) -> None:
-        kinds = f"{SETUP_FILES};;{EVERYTHING}"
-        if path := ask_file(self, "Load set-up", self.workspace.folder, kinds):
+        if path := ask_setup(self, self.workspace.folder):
             self.load(path)
 
     def _choose_save(self) -> None:

@@ -1,0 +1,123 @@
+"""Where a session's set-up comes from: a setup file, another session, the one used last."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from PySide6.QtCore import QObject, Signal
+
+from labapp.errors import InputError
+from labapp.gui import dialogs
+
+if TYPE_CHECKING:
+    from PySide6.QtWidgets import QWidget
+
+    from labapp.gui.preferences import PreferencesStore
+    from labapp.gui.tasks import Control
+    from labapp.gui.workspace import Workspace
+    from labapp.session.session import Session
+
+CAUSE = "Set-up"
+"""Of refusals, see `Workspace.say_wrong`."""
+
+NO_LAST = "No session among the recent ones has a complete set-up: load a setup file, or enter it"
+
+
+class Setups(QObject):
+    """Takes a whole set-up into the session; frames that are there are measured with it at once."""
+
+    refused = Signal(str)
+    """Why a set-up was not taken, for beside what was pressed; empty: it was."""
+
+    def __init__(
+        self, window: QWidget, workspace: Workspace, preferences: PreferencesStore
+    ) -> None:
+        super().__init__(window)
+        self._window = window
+        self.workspace = workspace
+        self.preferences = preferences
+
+    def load(self) -> None:
+        """Ask for a setup file and take it."""
+        path = dialogs.ask_setup(self._window, self.workspace.folder)
+        if path is not None:
+            self._use(lambda session: load_setup(session, path), path.name)
+
+    def use_other(self) -> None:
+        """Ask for another session and take its set-up."""
+        path = dialogs.ask_session(self._window, self.workspace.folder)
+        if path is not None:
+            self._use_session(path)
+
+    def use_last(self) -> None:
+        """Take the set-up of the session opened last that has a complete one."""
+        session = self.workspace.session
+        if session is None:
+            return
+        paths = [Path(name) for name in self.preferences.current.recent]
+        others = [path for path in paths if path != session.path]
+
+        def look(_: Control) -> Path:
+            found = next(filter(_is_complete, others), None)
+            if found is None:
+                raise ValueError(NO_LAST)
+            return found
+
+        self.workspace.tasks.start(
+            "Looking for the last set-up",
+            look,
+            self._use_session,
+            beside=self.refused.emit,
+            kind=CAUSE,
+        )
+
+    def _use_session(self, path: Path) -> None:
+        from labapp.session.copies import use_setup_of
+
+        self._use(lambda session: use_setup_of(session, path), path.stem)
+
+    def _use(self, take: Callable[[Session], None], name: str) -> None:
+        """Take a set-up, and measure with it unless its calibration is of another size of frame."""
+        from labapp.gui.live.camera_fields import calibrated_px, other_size
+
+        workspace = self.workspace
+        if not workspace.attempt(take, CAUSE, self.refused.emit):
+            return
+        session = workspace.session
+        assert session is not None
+        workspace.notified.emit(f"Set-up of {name} applied; undo brings the former back", False)
+        recording = session.recording
+        if recording is None or session.missing_recording is not None:
+            return
+        if unlike := other_size(calibrated_px(session), (recording.rows, recording.columns)):
+            workspace.say_wrong(CAUSE, unlike)
+            self.refused.emit(f"▲ {unlike}")
+            return
+        workspace.measure()
+        workspace.action_requested.emit("step_surface")
+
+
+def load_setup(session: Session, path: Path) -> None:
+    """Take the set-up from a setup file.
+
+    Raises
+    ------
+    InputError
+        If anything in it is unknown, missing or impossible.
+    """
+    from labapp.config.setup import read_setup
+
+    session.set_setup(read_setup(path, lines=True).text, f"set-up from {path.name}")
+
+
+def _is_complete(path: Path) -> bool:
+    """Whether a session can be opened and its set-up is complete."""
+    from labapp.session.session import Session
+
+    try:
+        with Session.open(path, read_only=True) as session:
+            return not session.setup_problems
+    except (InputError, OSError):
+        return False

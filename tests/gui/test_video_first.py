@@ -1,0 +1,266 @@
+"""A video first: its frames at once, then the set-up, then the surface; actions counted."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import cv2
+import pytest
+from PySide6.QtCore import QMimeData, QPointF, Qt, QUrl
+from PySide6.QtGui import QDropEvent
+from pytestqt.qtbot import QtBot
+
+from labapp.errors import InputError
+from labapp.gui import dialogs
+from labapp.gui.drafts import drafts, is_draft
+from labapp.gui.shell.window import MainWindow
+from labapp.media import open_source
+from labapp.session.copies import move_session, use_setup_of
+from labapp.session.record import Record
+from labapp.session.session import Session
+from tests.gui.conftest import SAMPLES, CopySample, let_draw
+from tests.gui.hand import Hand
+
+FRAMES = 2
+
+
+class CountingHand(Hand):
+    """A hand that counts its actions: clicks, answers to a dialog, drops."""
+
+    def __init__(self, window: MainWindow, qtbot: QtBot) -> None:
+        super().__init__(window)
+        self.qtbot = qtbot
+        self.actions = 0
+
+    def press_button(self, words: str) -> None:
+        """Click a button in view."""
+        self.actions += 1
+        self.button(words)
+        self.settle()
+
+    def choose_file(self, words: str, path: Path) -> None:
+        """Click a button, write a path into the dialog that opens, and press Enter."""
+        self.actions += 1
+        self.answer(path)
+        self.press_button(words)
+
+    def drop(self, path: Path) -> None:
+        """Drop a file or a folder on the window."""
+        self.actions += 1
+        data = QMimeData()
+        data.setUrls([QUrl.fromLocalFile(str(path))])
+        event = QDropEvent(
+            *(QPointF(60, 60), Qt.DropAction.CopyAction, data),
+            *(Qt.MouseButton.LeftButton, Qt.KeyboardModifier.NoModifier),
+        )
+        self.window.dropEvent(event)
+        let_draw()
+        self.settle()
+
+    def settle(self) -> None:
+        """Wait until no work is under way."""
+        tasks = self.window.workspace.tasks
+        for _ in range(3):  # work may begin other work when it ends
+            self.qtbot.waitUntil(lambda: not tasks.active)
+            let_draw()
+
+
+@pytest.fixture
+def hand(window: MainWindow, qtbot: QtBot) -> CountingHand:
+    window.activateWindow()
+    qtbot.waitUntil(window.isActiveWindow)
+    return CountingHand(window, qtbot)
+
+
+@pytest.fixture
+def bench(tmp_path: Path) -> Path:
+    """A folder with a short recording, a folder of images and an image, and their setup file."""
+    folder = tmp_path / "bench"
+    images = folder / "recording"
+    images.mkdir(parents=True)
+    with open_source(SAMPLES / "gtaw" / "recording.avi") as source:
+        for k in range(FRAMES):
+            cv2.imwrite(str(images / f"{k}.png"), source.frame(k).image)
+    shutil.copyfile(SAMPLES / "gtaw" / "setup.toml", folder / "setup.toml")
+    return folder
+
+
+def surface_is_shown(window: MainWindow) -> bool:
+    """Whether the surface of the frame in view is on the page in view."""
+    page, session = window.page, window.workspace.session
+    assert session is not None
+    result = session.result(window.workspace.frame)
+    is_ok = result is not None and result.measurement.status == "ok"
+    seen = window.stack.currentWidget()
+    return is_ok and page is not None and page is seen and page.key == "surface"
+
+
+@pytest.mark.slow
+def test_four_actions_from_a_video_to_a_surface_and_two_with_the_last_set_up(
+    window: MainWindow, hand: CountingHand, bench: Path
+):
+    hand.choose_file("Open recording…", bench / "recording" / "0.png")
+    assert window.page is not None
+    assert window.page.key == "dots"
+    hand.choose_file("Load set-up…", bench / "setup.toml")
+    assert surface_is_shown(window)
+    assert hand.actions == 4
+    window.do("close")
+    hand.settle()
+    hand.actions = 0
+    hand.drop(bench / "recording")
+    hand.press_button("Use last set-up")
+    assert surface_is_shown(window)
+    assert hand.actions == 2
+    assert [path.stem for path in drafts()] == ["recording", "0"]
+
+
+def test_frames_are_seen_before_any_set_up_and_are_a_draft_that_can_be_named(
+    window: MainWindow,
+    hand: CountingHand,
+    bench: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+):
+    hand.drop(bench / "recording")
+    session = window.workspace.session
+    assert session is not None
+    assert is_draft(session.path)
+    assert len(session.frames) == FRAMES
+    assert window.workspace.folder == bench
+    assert window.page is not None
+    seen = window.page
+    hand.qtbot.waitUntil(lambda: seen.seen is not None and seen.seen.correction is not None)
+    assert not window.page.dots_panel.why.text().startswith("⚠")
+    window.workspace.attempt(lambda own: own.set_record(Record(title="Mine")))
+    window.workspace.show_frame(1)
+    named = tmp_path / "named.labsession"
+    monkeypatch.setattr(dialogs, "ask_new_session", lambda *_: named)
+    window.do("name_draft")
+    hand.settle()
+    session = window.workspace.session
+    assert session is not None
+    assert session.path == named
+    assert drafts() == []
+    assert session.record.title == "Mine"
+    assert session.missing_recording is None
+    assert session.frame(0).image.shape == (640, 480)
+    assert (window.page.key, window.workspace.frame) == ("dots", 1)
+    assert str(named) in window.preferences.current.recent
+    assert not window.menus.actions["name_draft"].isEnabled()
+
+
+def test_a_draft_that_cannot_be_moved_stays_a_draft(
+    window: MainWindow,
+    hand: CountingHand,
+    bench: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+):
+    hand.drop(bench / "recording")
+    monkeypatch.setattr(dialogs, "ask_new_session", lambda *_: tmp_path / "no" / "a.labsession")
+    window.do("name_draft")
+    hand.settle()
+    session = window.workspace.session
+    assert session is not None
+    assert drafts() == [session.path]
+
+
+def test_drafts_are_listed_and_deleted_only_after_a_question(
+    window: MainWindow, hand: CountingHand, bench: Path, monkeypatch: pytest.MonkeyPatch
+):
+    hand.drop(bench / "recording")
+    window.do("close")
+    hand.settle()
+    (draft,) = drafts()
+    window.preferences.remember(lambda before: before.without_recent(draft))
+    window._list_recent()
+    hand.settle()
+    assert "draft" in window.welcome.list.item(0).text()
+    answers = [False, True]
+    monkeypatch.setattr(dialogs, "ask_delete_draft", lambda *_: answers.pop(0))
+    window._forget(draft)
+    assert drafts() == [draft]
+    window._forget(draft)
+    hand.settle()
+    assert drafts() == []
+    assert window.welcome.list.count() == 0
+
+
+def test_without_a_complete_set_up_among_the_recent_ones_it_says_so_beside_the_button(
+    window: MainWindow, hand: CountingHand, bench: Path
+):
+    hand.drop(bench / "recording")
+    hand.press_button("Use last set-up")
+    assert window.page is not None
+    assert window.page.key == "dots"
+    assert window.page.refused.isVisible()
+    assert "complete set-up" in window.page.refused.text()
+
+
+def test_a_set_up_of_another_size_of_frame_is_taken_and_nothing_measured(
+    window: MainWindow,
+    hand: CountingHand,
+    bench: Path,
+    copy_sample: CopySample,
+    monkeypatch: pytest.MonkeyPatch,
+):
+    other = copy_sample("gtaw")
+    with Session.open(other) as session:
+        session.calibrate_plane(other.parent / "calibration.png", 6.35)
+    small = bench / "small.png"
+    cv2.imwrite(str(small), cv2.imread(str(bench / "recording" / "0.png"))[:, :400])
+    hand.drop(small)
+    monkeypatch.setattr(dialogs, "ask_session", lambda *_: other)
+    window.do("other_setup")
+    hand.settle()
+    session = window.workspace.session
+    assert session is not None
+    assert session.setup_problems == ()
+    assert session.plane_calibration is not None
+    assert session.result(0) is None
+    assert window.page is not None
+    assert "400×640 px" in window.page.refused.text()
+
+
+def test_another_session_s_set_up_comes_with_its_calibrations_in_one_step(
+    copy_sample: CopySample, tmp_path: Path
+):
+    other = copy_sample("gtaw")
+    with Session.open(other) as session:
+        session.calibrate_plane(other.parent / "calibration.png", 6.35)
+        text, kept = session.setup_text, session.plane_calibration
+    assert kept is not None
+    with Session.create(tmp_path / "new.labsession") as session:
+        use_setup_of(session, other)
+        assert (session.setup_text, session.plane_calibration) == (text, kept)
+        assert session.picture(kept.picture_sha256).ndim == 2
+        session.undo()
+        assert (session.setup_text, session.plane_calibration) == ("", None)
+    with Session.create(tmp_path / "bare.labsession") as bare, pytest.raises(InputError):
+        use_setup_of(bare, tmp_path / "new.labsession")
+
+
+def test_a_session_is_not_moved_onto_another(copy_sample: CopySample, tmp_path: Path):
+    path, other = copy_sample("gtaw"), tmp_path / "other.labsession"
+    Session.create(other).close()
+    with pytest.raises(InputError):
+        move_session(path, other)
+    assert path.exists()
+
+
+@pytest.mark.parametrize("key", ["dots", "surface", "trends", "export", "capture", "plane"])
+def test_a_page_with_nothing_to_show_leads_on(
+    window: MainWindow, hand: CountingHand, tmp_path: Path, key: str
+):
+    window.workspace.show(Session.create(tmp_path / "new.labsession"))
+    window.show_step(key)
+    hand.settle()
+    assert window.stack.currentWidget() is window.empty
+    first = window.empty.buttons[0]
+    assert first.isVisible()
+    assert first.isEnabled()
+    assert window.empty.words.height() >= window.empty.words.heightForWidth(
+        window.empty.words.width()
+    )
