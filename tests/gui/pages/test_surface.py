@@ -22,6 +22,7 @@ from PySide6.QtWidgets import (
 from pytestqt.qtbot import QtBot
 
 from labapp.export.heights import profile
+from labapp.export.rendering.scene import DIFFERENCE_MAP
 from labapp.gui.pages.surface import SurfacePage
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
@@ -228,7 +229,7 @@ def test_two_schemes_stand_side_by_side(page: SurfacePage, qtbot: QtBot) -> None
     qtbot.waitUntil(lambda: compare.table.rowCount() == 11)  # ers tells its own ARE besides
     page.grab()
     first, second, difference = compare.views
-    assert difference.scene.diverging
+    assert difference.scene.colour_map == DIFFERENCE_MAP
     assert first.scene.limits == second.scene.limits
     first.turn(40, 10)
     assert second.camera == first.camera == difference.camera
