@@ -15,7 +15,7 @@ from labapp.errors import InputError, os_errors_as_input
 from labapp.export.folder import ExportChoice, ExportedFile, export
 from labapp.export.frame_result import FrameResult
 from labapp.export.line_results import line_tables
-from labapp.export.rendering.drawing import Camera
+from labapp.export.rendering.drawing import Camera, Direction
 from labapp.export.rendering.film import Extent, film_times, write_film
 from labapp.export.rendering.studio import drawing_errors, drawing_process
 from labapp.session.contents import SessionContents
@@ -58,7 +58,11 @@ def export_session(
 
 
 def write_view_film(
-    session: SessionContents, path: Path, camera: Camera, size_px: tuple[int, int], told: Progress
+    session: SessionContents,
+    path: Path,
+    camera: Direction | Camera,
+    size_px: tuple[int, int],
+    told: Progress,
 ) -> None:
     """Write a film (MP4) of all frames of the settings' scheme, seen from a camera.
 
