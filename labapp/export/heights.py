@@ -13,28 +13,37 @@ from labapp.core.values import FloatArray, ReadOnlyArrays
 PROFILE_POINTS = 241
 
 
-def sigma_at(reconstruction: Reconstruction, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
-    """Standard uncertainty of the height at (x, y), from that of the reflection points.
+def between_points(
+    reconstruction: Reconstruction, values: FloatArray, x_mm: FloatArray, y_mm: FloatArray
+) -> FloatArray:
+    """Values of the reflection points, interpolated at (x, y).
 
     Linear between the points; outside them that of the nearest.
 
     Parameters
     ----------
+    values
+        One a reflection point, shape (p,); NaN where unknown.
     x_mm, y_mm
         Where, shape (n,), mm.
 
     Returns
     -------
     FloatArray
-        Shape (n,), mm; NaN where the scheme gives none.
+        Shape (n,); NaN where fewer than four are known.
     """
-    known = np.isfinite(reconstruction.sigma_mm)
-    places, sigma = reconstruction.points_mm[known, :2], reconstruction.sigma_mm[known]
+    known = np.isfinite(values)
+    places, values = reconstruction.points_mm[known, :2], values[known]
     if len(places) < 4:
         return np.full(len(x_mm), np.nan)
-    inside = scipy.interpolate.LinearNDInterpolator(places, sigma)(x_mm, y_mm)
-    nearest = scipy.interpolate.NearestNDInterpolator(places, sigma)(x_mm, y_mm)
+    inside = scipy.interpolate.LinearNDInterpolator(places, values)(x_mm, y_mm)
+    nearest = scipy.interpolate.NearestNDInterpolator(places, values)(x_mm, y_mm)
     return np.asarray(np.where(np.isfinite(inside), inside, nearest))
+
+
+def sigma_at(reconstruction: Reconstruction, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
+    """Standard uncertainty of the height at (x, y), shape (n,), mm, as `between_points` has it."""
+    return between_points(reconstruction, reconstruction.sigma_mm, x_mm, y_mm)
 
 
 def difference_at(

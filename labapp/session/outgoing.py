@@ -7,13 +7,17 @@ import os
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 
-from labapp.errors import InputError
+from labapp.errors import InputError, os_errors_as_input
 from labapp.export.folder import ExportChoice, ExportedFile, export
 from labapp.export.frame_result import FrameResult
 from labapp.export.line_results import line_tables
+from labapp.export.rendering.drawing import Camera, Direction
+from labapp.export.rendering.film import Extent, film_times, write_film
+from labapp.export.rendering.studio import drawing_errors, drawing_process
 from labapp.session.contents import SessionContents
 from labapp.session.frames import Progress
 from labapp.session.measured import Result, scheme_name
@@ -51,6 +55,38 @@ def export_session(
         extras={"report.pdf": made} if report else None,
         progress=lambda done: told(before + done, total),
     )
+
+
+def write_view_film(
+    session: SessionContents,
+    path: Path,
+    camera: Direction | Camera,
+    size_px: tuple[int, int],
+    told: Progress,
+) -> None:
+    """Write a film (MP4) of all frames of the settings' scheme, seen from a camera.
+
+    Raises
+    ------
+    InputError
+        If a result no longer stands, nothing was measured, or it cannot be drawn or written.
+    """
+    scheme = scheme_name(session.settings)
+    numbers = _standing(session, scheme, None)
+    measured, extent = _Measured(session, scheme, numbers), Extent()
+    frames = []
+    for result in measured:
+        extent.add(result.measurement)
+        frames.append((result.frame, result.time_s))
+    if not extent.known:
+        raise InputError(session.path, "results", "no frame has a surface", "one that has")
+    with (
+        drawing_errors("film"),
+        os_errors_as_input(path, "film", "a file that can be written"),
+        drawing_process(size_px, camera) as process,
+    ):
+        times_s, count = film_times(frames), len(numbers)
+        write_film(path, measured, times_s, extent, process, lambda done: told(done, count))
 
 
 def _export_lines(

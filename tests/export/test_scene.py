@@ -9,9 +9,10 @@ import pytest
 from labapp.core.pipeline import Measurement
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.surface.surface import FlatSurface
-from labapp.export.heights import difference_at, profile, sigma_at
+from labapp.export.heights import between_points, difference_at, profile, sigma_at
 from labapp.export.rendering import drawing as draws
 from labapp.export.rendering import scene as scenes
+from labapp.export.rendering.axes import round_ticks
 from labapp.export.rendering.scene import difference_scene, rays_of, scene_of
 from labapp.export.rendering.studio import Studio
 from tests.scenes import BENCH_RIG
@@ -29,7 +30,7 @@ def pool(measured: Measurement) -> Reconstruction:
         measured.reconstruction,
         ray=np.column_stack([np.repeat(np.arange(5), 5) + 8, np.tile(np.arange(5), 5) + 8]),
         points_mm=np.column_stack([x, y, z]),
-        residual_mm=np.zeros((25, 2)),
+        residual_mm=np.column_stack([0.01 * x, 0.02 * y]),
         sigma_mm=0.002 + 0.0005 * x,
     )
 
@@ -109,7 +110,7 @@ def test_rays_come_from_the_laser_and_go_to_the_computed_dots(pool: Reconstructi
 def test_a_difference_is_coloured_both_ways_alike(pool: Reconstruction) -> None:
     other = replace(pool, surface=FlatSurface(0.05))
     made = difference_scene(pool, other)
-    assert made.diverging
+    assert made.colour_map == scenes.DIFFERENCE_MAP
     assert made.limits == pytest.approx((-0.25, 0.25))
     np.testing.assert_allclose(made.values, made.vertices_mm[:, 2] - 0.05, atol=1e-9)
     assert made.values.min() == pytest.approx(-0.05, abs=1e-6)
@@ -137,14 +138,6 @@ def test_what_is_not_known_of_a_surface_is_not_drawn(pool: Reconstruction) -> No
     assert np.isfinite(made.vertices_mm).all()
     centres = made.vertices_mm[made.triangles].mean(axis=1)
     assert np.hypot(centres[:, 0] - 1, centres[:, 1]).min() > 0.35
-
-
-@pytest.mark.parametrize(
-    ("limits", "form"),
-    [((0, 0.28), "%.2f"), ((0, 0.0028), "%.4f"), ((-5, 5), "%.1f"), ((-0.025, 0.025), "%.3f")],
-)
-def test_the_labels_of_a_colour_scale_are_true(limits: tuple[float, float], form: str) -> None:
-    assert draws._label_format(limits) == form
 
 
 def test_normals_point_up_and_stand_upright_on_the_surface(pool: Reconstruction) -> None:
@@ -231,7 +224,8 @@ def test_the_scale_says_what_the_colours_are(plotter: Any, pool: Reconstruction)
     drawing = draws.build_scene(plotter, scene_of(pool))
     for label in ("± (mm)", "height (mm)", "± (mm)"):
         drawing.update(replace(scene_of(pool), label=label))
-        assert list(plotter.scalar_bars.keys()) == [label.replace(" (", "\n(")]
+        seen(plotter)
+        assert label.replace(" (", "\n(") in drawing.overlay.words
 
 
 def test_a_surface_that_failed_is_made_another_time(
@@ -247,9 +241,8 @@ def test_a_surface_that_failed_is_made_another_time(
     with monkeypatch.context() as patched:
         patched.setattr(plotter, "add_mesh", refused)
         with pytest.raises(ValueError, match="refused"):
-            drawing.update(replace(heights, label="± (mm)"))
+            drawing.update(replace(heights, colour_map=scenes.ERROR_MAP))
     drawing.update(heights)
-    assert list(plotter.scalar_bars.keys()) == ["height\n(mm)"]
     np.testing.assert_allclose(seen(plotter), wanted, atol=2)
 
 
@@ -273,14 +266,82 @@ def test_a_surface_may_come_after_a_scene_without_one(plotter: Any, pool: Recons
         np.testing.assert_allclose(after, coloured(), atol=45)
 
 
-@pytest.mark.parametrize(("exaggeration", "labels"), [(1.0, ["", "0.3"]), (3.0, ["0.0", "0.3"])])
-def test_numbers_upwards_do_not_overlap(
-    plotter: Any, pool: Reconstruction, exaggeration: float, labels: list[str]
+@pytest.mark.parametrize("exaggeration", [1.0, 3.0, 12.0])
+@pytest.mark.parametrize("azimuth_deg", range(0, 360, 45))
+def test_names_and_numbers_are_seen_from_every_side_and_do_not_overlap(
+    plotter: Any, pool: Reconstruction, exaggeration: float, azimuth_deg: float
 ) -> None:
-    drawing = draws.build_scene(plotter, replace(scene_of(pool), exaggeration=4.0 - exaggeration))
-    drawing.update(replace(scene_of(pool), exaggeration=exaggeration))
+    drawing = draws.build_scene(plotter, replace(scene_of(pool), exaggeration=exaggeration))
+    plotter.camera.Azimuth(azimuth_deg + 10)
     seen(plotter)
-    assert plotter.renderer.cube_axes_actor.z_labels == labels
+    overlay, size = drawing.overlay, np.array(plotter.window_size)
+    assert {"X (mm)", "Y, along the weld (mm)"} <= set(overlay.words)
+    assert ("Z (mm)" in overlay.words) == (exaggeration > 1)  # too low to be numbered
+    texts = [text for text in overlay._texts if text.GetVisibility()]
+    boxes = []
+    for text in texts:
+        box = np.zeros(4)
+        text.GetBoundingBox(plotter.renderer, box)
+        at = np.array(text.GetPosition())
+        boxes.append(np.stack([at + box[[0, 2]], at + box[[1, 3]]]))
+    assert all((low >= 0).all() and (high <= size).all() for low, high in boxes)
+    for k, (low, high) in enumerate(boxes):
+        for other in boxes[k + 1 :]:
+            assert not ((low < other[1]).all() and (other[0] < high).all())
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "most", "wanted"),
+    [
+        (0.0, 0.28, 6, ["0.00", "0.05", "0.10", "0.15", "0.20", "0.25"]),
+        (-3.0, 4.0, 4, ["−2", "0", "2", "4"]),
+        (-0.02, 0.02, 3, ["−0.02", "0.00", "0.02"]),
+        (150.0, 1000.0, 5, ["200", "400", "600", "800", "1000"]),
+    ],
+)
+def test_ticks_are_round_numbers(low: float, high: float, most: int, wanted: list[str]) -> None:
+    ticks, texts = round_ticks(low, high, most)
+    assert texts == wanted
+    assert ticks == pytest.approx([float(text.replace("−", "-")) for text in wanted])
+
+
+def test_lines_of_equal_height_are_on_the_surface_at_round_heights(
+    plotter: Any, pool: Reconstruction
+) -> None:
+    drawing = draws.build_scene(plotter, replace(scene_of(pool), contours=True))
+    lines, actor = drawing._parts["contours"]
+    heights = np.unique(np.round(lines.points[:, 2] / scenes.EXAGGERATION, 6))
+    assert len(heights) >= 3
+    assert np.diff(heights) == pytest.approx(0.05)
+    drawing.update(scene_of(pool))
+    assert not actor.GetVisibility()
+
+
+def test_the_work_piece_is_drawn_round_the_pool(plotter: Any, pool: Reconstruction) -> None:
+    drawing = draws.build_scene(plotter, scene_of(pool))
+    drawing.look("top")
+    plate, actor = drawing._parts["plate"]
+    assert actor.GetVisibility()
+    area = plate.triangulate().compute_cell_sizes()["Area"].sum()
+    box, edge = drawing.overlay.box_mm, scene_of(pool).plate_mm
+    x, y = edge[:, 0], edge[:, 1]
+    hole = 0.5 * abs(float(x @ np.roll(y, 1) - y @ np.roll(x, 1)))
+    # But for the corners, which are cut between two points of the edge.
+    assert area == pytest.approx(np.prod(np.ptp(box, axis=0)[:2]) - hole, rel=0.02)
+
+
+@pytest.mark.parametrize("colour", ["sigma", "residual"])
+def test_errors_have_one_map_from_zero(pool: Reconstruction, colour: scenes.Colour) -> None:
+    made = scene_of(pool, colour)
+    assert made.colour_map == scenes.ERROR_MAP
+    assert made.limits == (0.0, pytest.approx(made.values.max()))
+
+
+def test_residuals_are_those_of_the_points(pool: Reconstruction) -> None:
+    lengths = np.linalg.norm(pool.residual_mm, axis=1)
+    at = pool.points_mm[np.isfinite(lengths)]
+    found = between_points(pool, lengths, *at[:, :2].T)
+    assert found == pytest.approx(lengths[np.isfinite(lengths)], abs=1e-9)
 
 
 def test_axes_stay_while_pools_fill_them(plotter: Any, pool: Reconstruction) -> None:
@@ -290,7 +351,7 @@ def test_axes_stay_while_pools_fill_them(plotter: Any, pool: Reconstruction) -> 
 
     def bounds(drawing: draws.Drawing, factor: float) -> tuple[float, ...]:
         drawing.update(scaled(factor))
-        return tuple(plotter.renderer.cube_axes_actor.bounds)
+        return tuple(drawing.overlay.box_mm.ravel())
 
     steady = draws.build_scene(plotter, scaled(1.0), steady=True)
     of_all = bounds(steady, 1.0)
@@ -299,7 +360,6 @@ def test_axes_stay_while_pools_fill_them(plotter: Any, pool: Reconstruction) -> 
     assert larger != of_all
     assert bounds(steady, 1.0) != larger  # too small a pool in them
     plotter.clear()
-    plotter.remove_bounds_axes()
     alone = draws.build_scene(plotter, scaled(1.0))
     assert bounds(alone, 1.0) == of_all
     assert bounds(alone, 0.6) != of_all
@@ -320,9 +380,9 @@ def test_heights_are_drawn_as_told_and_the_axes_stay_true(
     def extent(exaggeration: float) -> float:
         plotter.clear()
         drawn = replace(scene_of(pool), exaggeration=exaggeration, electrode=False)
-        draws.build_scene(plotter, drawn).look("front")
-        axes = plotter.renderer.cube_axes_actor
-        assert axes.GetZAxisRange() == pytest.approx((0.0, 0.3))
+        drawing = draws.build_scene(plotter, drawn)
+        drawing.look("front")
+        assert drawing.overlay.box_mm[:, 2] == pytest.approx((0.0, 0.3))
         top, bottom = np.nonzero(amount_rows(seen(plotter)))[0][[0, -1]]
         return float(bottom - top)
 

@@ -79,7 +79,7 @@ def test_what_is_drawn_otherwise_is_noticed(picture: np.ndarray, what: str) -> N
     other = {
         "mirrored": pool(mirrored=True),
         "hollow": pool(hollow=True),
-        "colour map": replace(pool(), diverging=True),
+        "colour map": replace(pool(), colour_map="coolwarm"),
         "limits": replace(pool(), limits=(0.0, 0.9)),
         "points": replace(pool(), points_mm=np.empty((0, 3))),
         "height": replace(pool(), exaggeration=pool().exaggeration * 1.5),

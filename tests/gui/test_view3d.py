@@ -10,7 +10,7 @@ import pytest
 from PySide6.QtCore import QEvent, QPoint, QPointF, Qt
 from PySide6.QtGui import QColor, QMouseEvent, QPalette, QWheelEvent
 from PySide6.QtTest import QTest
-from PySide6.QtWidgets import QApplication
+from PySide6.QtWidgets import QApplication, QMenu
 from pytestqt.qtbot import QtBot
 
 from labapp.export.rendering.scene import Scene
@@ -105,6 +105,82 @@ def drag(
     ):
         event = QMouseEvent(kind, QPointF(at), QPointF(at), button, buttons, keys)
         QApplication.sendEvent(view, event)
+
+
+def test_the_right_button_zooms(view: View3d, qtbot: QtBot) -> None:
+    before = view.camera
+    right, none = Qt.MouseButton.RightButton, Qt.MouseButton.NoButton
+    at, end = QPointF(160, 120), QPointF(160, 60)
+    for kind, place, button, buttons in (
+        (QEvent.Type.MouseButtonPress, at, right, right),
+        (QEvent.Type.MouseMove, end, none, right),
+        (QEvent.Type.MouseButtonRelease, end, right, none),
+    ):
+        event = QMouseEvent(kind, place, place, button, buttons, Qt.KeyboardModifier.NoModifier)
+        QApplication.sendEvent(view, event)
+    assert view.camera[3] < before[3]  # a narrower angle of view
+    assert not view.findChildren(QMenu)  # a click opens it
+
+
+def click(view: View3d, at: QPoint, button: Qt.MouseButton = Qt.MouseButton.LeftButton) -> None:
+    QTest.mouseClick(view, button, pos=at)
+
+
+def test_a_click_reads_a_point_off(view: View3d, qtbot: QtBot) -> None:
+    view.sigma_at = lambda x, y: 0.0021
+    view.look("top")
+    view.grab()
+    at = view._drawing.overlay.project(np.array([[1.0, -0.5, 0.0]]))[0]
+    centre = view._drawing.overlay.project(np.zeros((1, 3)))[0]
+    assert np.hypot(*(at - centre)) > 10
+    click(view, QPoint(round(at[0]), round(view.height() - at[1])))
+    (x, y, z), words = view.scene.mark_mm[0], view.read_off
+    assert (x, y) == (pytest.approx(1.0, abs=0.05), pytest.approx(-0.5, abs=0.05))
+    assert z == pytest.approx(0.3 * (1 - (x**2 + y**2) / 18), abs=0.02)  # of flat triangles
+    assert words == f"X {x:.3f}, Y {y:.3f}, Z {z:.4f} ± 0.0021 mm".replace("-", "−")
+    QTest.keyClick(view, Qt.Key.Key_P)
+    assert QApplication.clipboard().text() == words
+    view.grab()
+    assert words.replace(", Z", ",\nZ") in view._drawing.overlay.words
+    view.show_scene(hill(0.15))  # another frame, at the same place
+    assert view.scene.mark_mm[0] == pytest.approx([x, y, z / 2], abs=1e-6)
+    QTest.keyClick(view, Qt.Key.Key_Escape)
+    assert view.read_off == ""
+    assert len(view.scene.mark_mm) == 0
+
+
+def test_the_pointer_says_what_it_is_on(view: View3d, qtbot: QtBot) -> None:
+    told: list[str] = []
+    view.pointed.connect(told.append)
+    view.look("top")
+    view.grab()
+    on = view._drawing.overlay.project(np.zeros((1, 3)))[0]
+    QTest.mouseMove(view, QPoint(round(on[0]), round(view.height() - on[1])))
+    QTest.mouseMove(view, QPoint(2, 2))
+    assert told[-2].endswith("mm")
+    assert float(told[-2].split("Z ")[1].split()[0]) == pytest.approx(0.3, abs=0.01)
+    assert told[-1] == ""
+
+
+def test_a_click_with_the_right_button_opens_the_menu(view: View3d, qtbot: QtBot) -> None:
+    click(view, QPoint(160, 120), Qt.MouseButton.RightButton)
+    (menu,) = view.findChildren(QMenu)
+    by = {action.text(): action for action in menu.actions() if action.text()}
+    assert {"Copy picture", "Copy point", "Look at all of it", "Top", "Oblique"} <= set(by)
+    assert not by["Copy point"].isEnabled()  # none was read off
+    by["Top"].trigger()
+    assert view.camera[5]
+    menu.close()
+
+
+def test_f_shows_all_from_the_side_chosen_last(view: View3d) -> None:
+    QTest.keyClick(view, Qt.Key.Key_2)
+    side = view.camera
+    view.turn(20, 10)
+    view.zoom(2)
+    QTest.keyClick(view, Qt.Key.Key_F)
+    for now, wanted in zip(view.camera, side, strict=True):
+        assert now == pytest.approx(wanted)
 
 
 @pytest.mark.parametrize(

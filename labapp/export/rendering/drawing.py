@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from labapp.core.values import FloatArray, IntArray
+from labapp.export.rendering.axes import Overlay, round_step, round_ticks
 from labapp.export.rendering.scene import EMPTY, Scene
 from labapp.system import IS_LINUX
 
@@ -21,6 +22,11 @@ VIEW_ANGLE_DEG = 30.0
 
 Direction = Literal["top", "side", "front", "free"]
 """Where a scene is looked at from; ``free`` is obliquely from the camera's side."""
+
+Triple = tuple[float, ...]
+Camera = tuple[Triple, Triple, Triple, float, float, bool, tuple[float, float]]
+"""Position, focal point, up; view angle, parallel scale, whether it is without perspective; centre
+of the window."""
 
 VIEWS: dict[Direction, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
     "top": ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0)),
@@ -38,18 +44,13 @@ COLOURS = {
     "section": "#ff5fd2",
 }
 
-BAR_WIDTH = 0.04
-BAR_NUMBERS_PX = 56
-"""Width of the colour scale, a part of the picture's, and what its numbers take beside it."""
-
 BESIDE_PX, ASIDE_PX = 110, 62
 """What the scale takes of a picture's width, and how far that moves the pool's middle."""
 
-USUAL_DPI = 72
-"""At this resolution VTK draws texts at their nominal size."""
+CONTOURS = 8
+"""At most so many contour lines, at round heights."""
 
-FLAT = 1 / 8
-"""Axes less high than this part of their width have one number upwards: more would overlap."""
+PLATE_OPACITY = 0.3
 
 ROOMY = 1.5
 """Axes that stay are no more times as long as the scene needs."""
@@ -82,12 +83,12 @@ class Drawing:
         self.plotter = plotter
         self._steady = steady
         self.plotter.theme.allow_empty_mesh = True  # a frame may have no surface
-        self._box, self._steps = np.zeros((2, 3)), np.ones(3, int)
+        self._box, self._step_mm = np.zeros((2, 3)), 1.0
         self._stretch = np.ones(3)
-        self._axes_actor: Any = None
-        self._bar: Any = None
-        # Before every picture: its size may have changed.
-        plotter.renderer.AddObserver("StartEvent", lambda *_: self._place_bar())
+        self.overlay = Overlay(plotter, "black")
+        """Axes, colour scale and captions."""
+        # Before every picture: its size or the camera may have changed.
+        plotter.renderer.AddObserver("StartEvent", lambda *_: self._place())
         self._parts: dict[str, tuple[Any, Any]] = {}
         self._made_for: dict[str, object] = {}
 
@@ -97,9 +98,8 @@ class Drawing:
         if self._is_new("colours", colours):
             self.plotter.clear()
             self._parts.clear()
-            self.plotter.remove_bounds_axes()
-            self._axes_actor = None
             self._made_for = {"colours": colours}
+            self.overlay = Overlay(self.plotter, scene.foreground)
             self.plotter.set_background(scene.background)
             self.plotter.enable_lightkit()
         self._stretch = np.array([1.0, 1.0, scene.exaggeration])
@@ -107,6 +107,9 @@ class Drawing:
         points = _polydata(scene.points_mm * self._stretch, "verts", 1)
         style = {"point_size": 6, "render_points_as_spheres": True}
         self._put("points", points, COLOURS["points"], **style)
+        mark = _polydata(scene.mark_mm * self._stretch, "verts", 1)
+        style["point_size"] = 11
+        self._put("mark", mark, COLOURS["section"], **style)
         for name in ("boundary", "section"):
             line = scene.lines_mm.get(name, EMPTY) * self._stretch
             colour = COLOURS.get(name, scene.foreground)
@@ -115,13 +118,13 @@ class Drawing:
             ends = scene.rays_mm.get(name, EMPTY).reshape(-1, 3) * self._stretch
             self._put(name, _polydata(ends, "lines", 2), COLOURS[name], line_width=1)
         self._axes(scene)
-        self._set_text("stamp", scene.stamp, scene.foreground, **self._in_corner("upper_right"))
-        size = max(5, int(self.plotter.window_size[0] / self._scale) // 90)
-        middle = {"position": (0.12, 0.75), "viewport": True, "font_size": size}
-        self._set_text("notice", scene.notice, scene.foreground, **middle)
+        self.overlay.mark = (scene.mark_mm[0], scene.mark_words) if len(scene.mark_mm) else None
 
-    def look(self, direction: Direction) -> None:
-        """Look from one of the `VIEWS`; from the top, side and front without perspective."""
+    def look(self, direction: Direction | Camera) -> None:
+        """Look from one of the `VIEWS`, or as a camera does; sides without perspective."""
+        if not isinstance(direction, str):
+            self.camera = direction
+            return
         way, up = VIEWS[direction]
         self.plotter.camera.view_angle = VIEW_ANGLE_DEG  # zooming has made it narrower
         self.plotter.camera.parallel_projection = direction != "free"
@@ -129,7 +132,7 @@ class Drawing:
         bounds = (self._box * self._stretch).T.ravel().tolist()
         self.plotter.reset_camera(render=False, bounds=bounds)
         # The numbers along the axes, and the colour scale, are as large in a small picture.
-        width, height = np.array(self.plotter.window_size) / self._scale
+        width, height = np.array(self.plotter.window_size) / self.overlay.point_px
         fill, below = (1.3, 78) if direction == "free" else (1.15, 85)
         room = min(fill * (height - below), 0.95 * (width - BESIDE_PX)) / min(width, height)
         self.plotter.camera.zoom(max(min(room, fill), 0.5))
@@ -137,9 +140,22 @@ class Drawing:
         self.plotter.camera.SetWindowCenter(max(0.12, min(ASIDE_PX / width, 0.25)), -34 / height)
 
     @property
-    def _scale(self) -> float:
-        """Pixels of the picture per pixel of a usual screen; text scales by itself."""
-        return float(self.plotter.render_window.GetDPI()) / USUAL_DPI
+    def camera(self) -> Camera:
+        """Where it is looked at from."""
+        held = self.plotter.camera
+        return (
+            *(tuple(held.position), tuple(held.focal_point), tuple(held.up)),
+            *(float(held.view_angle), float(held.parallel_scale)),
+            *(bool(held.parallel_projection), tuple(held.GetWindowCenter())),
+        )
+
+    @camera.setter
+    def camera(self, camera: Camera) -> None:
+        held = self.plotter.camera
+        held.position, held.focal_point, held.up = camera[:3]
+        held.view_angle, held.parallel_scale, held.parallel_projection = camera[3:6]
+        held.SetWindowCenter(*camera[6])
+        self.plotter.renderer.ResetCameraClippingRange()
 
     def _is_new(self, part: str, made_for: object) -> bool:
         """Whether a part was made for something else and must be created again."""
@@ -171,116 +187,135 @@ class Drawing:
         mesh.point_data["values"] = scene.values
         mesh.point_data.active_normals = _normals(np.asarray(mesh.points), scene.triangles)
         mesh.set_active_scalars("values")
-        title = scene.label.replace(" (", "\n(")  # narrow, to stay within the picture
-        made_for = (scene.label, scene.diverging)
+        made_for = scene.colour_map
         if self._made_for.get("surface") != made_for:
             self._made_for.pop("surface", None)  # what fails below is made another time
-            for former in list(self.plotter.scalar_bars.keys()):
-                self.plotter.remove_scalar_bar(former, render=False)
             actor = self.plotter.add_mesh(
                 mesh,
                 scalars="values",
                 name="surface",
-                cmap="coolwarm" if scene.diverging else "viridis",
+                cmap=scene.colour_map,
                 clim=scene.limits,  # the values may all be unknown
                 interpolate_before_map=True,
                 ambient=0.35,
                 diffuse=0.75,
                 reset_camera=False,
                 render=False,
-                scalar_bar_args={
-                    "title": title,
-                    "color": scene.foreground,
-                    "vertical": True,
-                    "height": 0.6,
-                    "title_font_size": 14,
-                    "label_font_size": 13,
-                    "unconstrained_font_size": True,
-                    "width": BAR_WIDTH,
-                },
+                show_scalar_bar=False,
             )
             actor.prop.interpolation = "Phong"
             # Lines that lie on the surface are seen whole.
             actor.mapper.SetResolveCoincidentTopologyToPolygonOffset()
             actor.mapper.SetRelativeCoincidentTopologyPolygonOffsetParameters(2.0, 2.0)
             self._parts["surface"] = (mesh, actor)
-            self._bar = self.plotter.scalar_bars[title]
-            self._place_bar()
             self._made_for["surface"] = made_for
         held, actor = self._parts["surface"]
         if held is not mesh:
             held.ShallowCopy(mesh)
         actor.mapper.lookup_table.scalar_range = scene.limits
         actor.mapper.scalar_range = scene.limits
-        self._bar.SetLabelFormat(_label_format(scene.limits))
+        self.overlay.scale = scene.label, scene.limits, actor.mapper.lookup_table
+        self._contours(scene, mesh)
 
-    def _place_bar(self) -> None:
-        """Put the colour scale where its numbers, as tall in any picture, stay within."""
-        if self._bar is not None:
-            numbers = BAR_NUMBERS_PX * self._scale / self.plotter.window_size[0]
-            left = 1 - BAR_WIDTH - numbers
-            self._bar.SetPosition(min(left, 0.85), 0.2)
+    def show_pointed(self, words: str) -> bool:
+        """Say what the pointer is on, in the lower left corner; returns whether that changed."""
+        changed = self.overlay.captions.get("lower left", "") != words
+        self.overlay.captions["lower left"] = words
+        return changed
+
+    def _contours(self, scene: Scene, mesh: Any) -> None:
+        """Draw lines of equal height on the surface."""
+        lines, heights = None, scene.vertices_mm[:, 2]
+        self._contour_step_mm = 0.0
+        if scene.contours and len(heights) and np.ptp(heights) > 0:
+            low, high = float(heights.min()), float(heights.max())
+            levels, _ = round_ticks(low, high, CONTOURS)
+            self._contour_step_mm = round_step(high - low, CONTOURS)
+            found = mesh.contour(levels.tolist(), scalars=np.array(heights))
+            lines = found if found.n_points else None
+        self._put("contours", lines, "#000000", line_width=1, opacity=0.55)
+
+    def _place(self) -> None:
+        """Put texts, and the line along which Z is numbered, where the camera sees them."""
+        self.overlay.place()
+        if "upright" in self._parts:
+            line = _polydata(self.overlay.upright_mm * self._stretch, "lines", 2)
+            self._parts["upright"][0].ShallowCopy(line)
 
     def _axes(self, scene: Scene) -> None:
-        box, steps = _box(scene)
+        box, step_mm = _box(scene)
         if self._steady and _holds(self._box, box):
-            box, steps = self._box, self._steps
-        self._box, self._steps = box, steps
-        if not self._is_new("axes", (box.tobytes(), scene.exaggeration, scene.electrode)):
-            return
-        axes = self._axes_actor = self._axes_actor or self.plotter.show_bounds(
-            xtitle="X (mm)",
-            ytitle="Y, along the weld (mm)",
-            ztitle="Z (mm)",
-            n_zlabels=2,
-            fmt="%.1f",
-            color=scene.foreground,
-            location="outer",
-            font_size=round(11 * self._scale),
-            use_3d_text=False,
-            bounds=(box * self._stretch).T.ravel().tolist(),
-            render=False,
-        )
-        axes.bounds = (box * self._stretch).T.ravel().tolist()
-        axes.n_xlabels, axes.n_ylabels = int(steps[0]) + 1, int(steps[1]) + 1
-        axes.x_axis_range, axes.y_axis_range, axes.z_axis_range = map(tuple, box.T.tolist())
-        if np.ptp(box[:, 2]) * scene.exaggeration < FLAT * np.ptp(box[:, :2], axis=0).max():
-            axes.GetAxisLabels(2).SetValue(0, "")
+            box, step_mm = self._box, self._step_mm
+        self._box, self._step_mm = box, step_mm
+        self.overlay.box_mm, self.overlay.stretch = box, self._stretch
+        faint = _between(scene.background, scene.foreground, 0.35)
+        if self._is_new("grid", (box.tobytes(), scene.exaggeration)):
+            self._put("grid", _polydata(_grid(box, step_mm) * self._stretch, "lines", 2), faint)
+            upright = _polydata(np.zeros((2, 3)), "lines", 2)
+            self._put("upright", upright, scene.foreground, line_width=1)
+        self._put("plate", _plate(scene.plate_mm, box, self._stretch), faint, opacity=PLATE_OPACITY)
         top = np.array([[0, 0, box[0, 2]], [0, 0, box[1, 2] + 0.5]]) * self._stretch
         mark = _polydata(top if scene.electrode else EMPTY, "lines", 2)
         self._put("electrode", mark, scene.foreground, line_width=1)
-        high = scene.exaggeration
-        parts = [f"heights drawn {high:g} times as high"] if high != 1 else []
-        words = "\n".join(parts + ["upright line: the electrode's axis"] * scene.electrode)
-        self._set_text("caption", words, scene.foreground, **self._in_corner("upper_left"))
-
-    def _in_corner(self, position: str) -> dict[str, Any]:
-        """Style of text in a corner, whose size VTK does not scale."""
-        return {"position": position, "font_size": round(6 * self._scale)}
-
-    def _set_text(self, name: str, words: str, colour: str, **style: Any) -> None:
-        """Set a text over the picture; an empty one removes it."""
-        if not self._is_new(name, words):
-            return
-        if words:
-            self.plotter.add_text(words, name=name, color=colour, render=False, **style)
-        else:
-            self.plotter.remove_actor(name, render=False)
+        high, contour = scene.exaggeration, self._contour_step_mm
+        captions = [f"heights drawn {high:g} times as high"] * (high != 1)
+        captions += ["upright line: the electrode's axis"] * scene.electrode
+        captions += [f"contour lines every {contour:g} mm of height"] * (contour > 0)
+        places = ("upper left", "upper right", "middle")
+        texts = ("\n".join(captions), scene.stamp, scene.notice)
+        self.overlay.captions = dict(zip(places, texts, strict=True))
 
 
-def _box(scene: Scene) -> tuple[FloatArray, IntArray]:
-    """Lowest and highest corner of the axes, shape (2, 3), mm, and steps along each, shape (3,).
+def _box(scene: Scene) -> tuple[FloatArray, float]:
+    """Lowest and highest corner of the axes, shape (2, 3), and step of the floor's grid, mm.
 
-    Whole millimetres, so that the numbers along the axes are; tenths upwards.
+    Whole steps of the grid; tenths upwards.
     """
     held = np.vstack([scene.vertices_mm, scene.within_mm])
     low, high = held.min(axis=0), held.max(axis=0)
-    extent = float(np.max((high - low)[:2]))
-    along = next((step for step in (1.0, 2.0, 5.0) if extent <= 6 * step), 10.0)
+    along = round_step(float(np.max((high - low)[:2])), 10)
     step = np.array([along, along, 0.1])
     first, last = np.floor(low / step + 1e-6), np.ceil(high / step - 1e-6)
     last = np.maximum(last, first + 1)
-    return np.stack([first, last]) * step, (last - first).astype(int)
+    return np.stack([first, last]) * step, along
+
+
+def _grid(box: FloatArray, step_mm: float) -> FloatArray:
+    """Ends of the lines of the floor's grid, two rows a line, mm."""
+    ends = []
+    for axis in (0, 1):
+        for at in np.arange(box[0, axis], box[1, axis] + step_mm / 2, step_mm):
+            line = box * [1, 1, 0] + [0, 0, box[0, 2]]
+            line[:, axis] = at
+            ends.append(line)
+    return np.concatenate(ends)
+
+
+def _plate(edge_mm: FloatArray, box: FloatArray, stretch: FloatArray) -> Any:
+    """Return the work piece's top round a pool, from its edge, shape (n, 3), to the box's sides."""
+    import pyvista
+
+    if len(edge_mm) < 3:
+        return None
+    middle = edge_mm[:, :2].mean(axis=0)
+    way = edge_mm[:, :2] - middle
+    sides = np.where(way >= 0, box[1, :2] - middle, box[0, :2] - middle)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        reach = np.nanmin(np.where(way == 0, np.inf, sides / way), axis=1)
+    outer = np.column_stack([middle + np.maximum(reach, 1.0)[:, None] * way, np.zeros(len(way))])
+    n, k = len(edge_mm), np.arange(len(edge_mm))
+    after = (k + 1) % n
+    quads = np.column_stack([k, after, after + n, k + n]).astype(int)
+    made: Any = pyvista.PolyData.from_regular_faces(np.vstack([edge_mm, outer]) * stretch, quads)
+    return made
+
+
+def _between(one: str, other: str, share: float) -> str:
+    """Return a colour between two."""
+    import pyvista
+
+    ends = np.array([pyvista.Color(each).float_rgb for each in (one, other)])
+    return str(pyvista.Color((1 - share) * ends[0] + share * ends[1]).hex_rgb)
 
 
 def _holds(box: FloatArray, other: FloatArray) -> bool:
@@ -311,12 +346,6 @@ def _normals(vertices: FloatArray, triangles: IntArray) -> npt.NDArray[np.float3
     )
     length = np.linalg.norm(summed, axis=1, keepdims=True)
     return np.asarray(summed / np.maximum(length, 1e-12), np.float32)
-
-
-def _label_format(limits: tuple[float, float]) -> str:
-    """Number format that resolves the labels of a colour scale to a tenth of their distance."""
-    step = max((limits[1] - limits[0]) / 4, 1e-9)
-    return f"%.{max(0, int(np.ceil(-np.log10(0.2 * step))))}f"
 
 
 def draw_without_display() -> None:

@@ -12,7 +12,7 @@ from labapp.core.match import Match
 from labapp.core.surface.mesh import surface_mesh
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
-from labapp.export.heights import difference_at, sigma_at
+from labapp.export.heights import between_points, difference_at
 from labapp.export.meshes import drawn_spacing, known_part
 
 EXAGGERATION = 3.0
@@ -25,6 +25,12 @@ SPACING_MM = 0.15
 """Largest distance between rings of the mesh that is drawn, mm."""
 
 HEIGHT = "height (mm)"
+
+HEIGHT_MAP, ERROR_MAP, DIFFERENCE_MAP = "viridis", "cividis", "coolwarm"
+"""Colours of heights; of ± and residuals, from 0; of differences, 0 in the middle."""
+
+Colour = Literal["height", "sigma", "residual"]
+"""What a surface is coloured by."""
 
 SPOKES = 120
 """Approximate number of vertices a ring: its sides are within a thousandth of a pool's radius."""
@@ -45,8 +51,12 @@ class Scene(ReadOnlyArrays):
     """What the values are, with their unit."""
     limits: tuple[float, float]
     """The values at both ends of the colour scale."""
-    diverging: bool = False
-    """Whether the colours run both ways from the middle."""
+    colour_map: str = HEIGHT_MAP
+    """matplotlib's name: one for heights, one for ± and residuals, one for differences."""
+    contours: bool = False
+    """Whether to draw lines of equal height."""
+    plate_mm: FloatArray = field(default_factory=lambda: EMPTY)
+    """Edge of the pool, shape (m, 3), round which the work piece is drawn; empty: it is not."""
     points_mm: FloatArray = field(default_factory=lambda: EMPTY)
     """Reflection points, shape (p, 3)."""
     lines_mm: dict[str, FloatArray] = field(default_factory=dict)
@@ -59,6 +69,10 @@ class Scene(ReadOnlyArrays):
     """Factor by which heights are drawn larger; the axes show true heights."""
     within_mm: FloatArray = field(default_factory=lambda: EMPTY)
     """Places that the axes hold in any case, shape (k, 3): pictures of a film share them."""
+    mark_mm: FloatArray = field(default_factory=lambda: EMPTY)
+    """A point of the surface that was read off, shape (1, 3); empty without one."""
+    mark_words: str = ""
+    """Said of it."""
     stamp: str = ""
     """Said in the upper right corner."""
     notice: str = ""
@@ -70,7 +84,7 @@ class Scene(ReadOnlyArrays):
 
 def scene_of(
     reconstruction: Reconstruction,
-    colour: Literal["height", "sigma"] = "height",
+    colour: Colour = "height",
     limits: tuple[float, float] | None = None,
 ) -> Scene:
     """Scene of a pool's surface, boundary and reflection points.
@@ -78,27 +92,35 @@ def scene_of(
     Parameters
     ----------
     colour
-        By height, or by the height's standard uncertainty; by height where the scheme gives none.
+        By height, by its standard uncertainty, or by the residual on the imaging plane (its length,
+        interpolated between the reflection points); by height where the scheme gives none.
     limits
         Ends of the colour scale, mm; None: those of this surface.
     """
     vertices, triangles = _mesh(reconstruction)
     used, triangles = known_part(triangles, vertices[:, 2])
     vertices = vertices[used]
-    values, label = vertices[:, 2], HEIGHT
-    if colour == "sigma":
-        sigma = sigma_at(reconstruction, vertices[:, 0], vertices[:, 1])
-        if np.isfinite(sigma).all():
-            values, label = sigma, "± height (mm)"
-            limits = (0.0, float(sigma.max())) if limits is None else limits
+    values, label, colours = vertices[:, 2], HEIGHT, HEIGHT_MAP
+    if colour != "height":
+        by = {
+            "sigma": ("± height (mm)", reconstruction.sigma_mm),
+            "residual": ("residual (mm)", np.linalg.norm(reconstruction.residual_mm, axis=1)),
+        }
+        found = between_points(reconstruction, by[colour][1], *vertices[:, :2].T)
+        if np.isfinite(found).all() and len(found):
+            values, label, colours = found, by[colour][0], ERROR_MAP
+            limits = (0.0, max(float(found.max()), 1e-9)) if limits is None else limits
+    edge = _closed(reconstruction.boundary.points_mm)
     return Scene(
         vertices,
         triangles,
         values,
         label,
         _limits(values) if limits is None else limits,
+        colour_map=colours,
         points_mm=reconstruction.points_mm,
-        lines_mm={"boundary": _closed(reconstruction.boundary.points_mm)},
+        lines_mm={"boundary": edge},
+        plate_mm=edge[:-1],
     )
 
 
@@ -117,7 +139,7 @@ def difference_scene(one: Reconstruction, other: Reconstruction) -> Scene:
         values,
         "difference (mm)",
         (-reach, reach),
-        diverging=True,
+        colour_map=DIFFERENCE_MAP,
         lines_mm={"boundary": _closed(one.boundary.points_mm)},
         within_mm=one.boundary.points_mm,  # there are no vertices where the two do not overlap
     )

@@ -17,7 +17,8 @@ import numpy as np
 import numpy.typing as npt
 
 from labapp.errors import InputError
-from labapp.export.rendering.drawing import Direction, Drawing, draw_without_display
+from labapp.export.rendering.axes import USUAL_DPI
+from labapp.export.rendering.drawing import Camera, Direction, Drawing, draw_without_display
 from labapp.export.rendering.scene import Scene
 
 PICTURE_PX = (1280, 720)
@@ -35,6 +36,10 @@ class Studio:
     ----------
     size
         Width and height of the pictures, px.
+    direction
+        Where scenes are looked at from.
+    dpi
+        Resolution, which makes texts as many pixels high.
 
     Raises
     ------
@@ -42,11 +47,15 @@ class Studio:
         Without pyvista.
     """
 
-    def __init__(self, size: tuple[int, int], direction: Direction) -> None:
+    def __init__(
+        self, size: tuple[int, int], direction: Direction | Camera, dpi: float = USUAL_DPI
+    ) -> None:
         import pyvista
 
         draw_without_display()
-        self.plotter: Any = pyvista.Plotter(off_screen=True, window_size=list(size))
+        plotter: Any = pyvista.Plotter(off_screen=True, window_size=list(size))
+        self.plotter = plotter
+        plotter.render_window.SetDPI(round(dpi))
         self._drawing = Drawing(self.plotter)
         self._direction = direction
 
@@ -58,9 +67,13 @@ class Studio:
         picture = self.plotter.screenshot(return_img=True)
         return np.ascontiguousarray(picture[..., ::-1])
 
+    def close(self) -> None:
+        """Release OpenGL."""
+        self.plotter.close()
+
 
 def drawing_process(
-    size: tuple[int, int] = PICTURE_PX, direction: Direction = "free"
+    size: tuple[int, int] = PICTURE_PX, direction: Direction | Camera = "free"
 ) -> ProcessPoolExecutor:
     """A process to draw in, by `draw_there`; parameters as of `Studio`."""
     context = multiprocessing.get_context("spawn")

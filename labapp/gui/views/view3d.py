@@ -8,16 +8,21 @@ every picture, which costs more than the scene does. Where nothing can be drawn,
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from PySide6.QtCore import QEvent, QObject, QPointF, Qt, QTimer, Signal
+from PySide6.QtCore import QEvent, QObject, QPoint, QPointF, Qt, QTimer, Signal
 from PySide6.QtGui import (
+    QAction,
+    QContextMenuEvent,
     QGuiApplication,
     QImage,
     QKeyEvent,
+    QKeySequence,
     QMouseEvent,
     QOffscreenSurface,
     QOpenGLContext,
@@ -28,9 +33,12 @@ from PySide6.QtGui import (
     QShowEvent,
     QWheelEvent,
 )
-from PySide6.QtWidgets import QVBoxLayout, QWidget
+from PySide6.QtWidgets import QMenu, QVBoxLayout, QWidget
 
-from labapp.export.rendering.drawing import USUAL_DPI, Direction, Drawing, build_scene, can_draw
+from labapp.core.values import FloatArray
+from labapp.export.rendering.axes import USUAL_DPI, view_matrix
+from labapp.export.rendering.drawing import Camera, Direction, Drawing, build_scene, can_draw
+from labapp.export.rendering.pick import first_hit
 from labapp.export.rendering.scene import Scene
 from labapp.gui.views.canvas import Drawn
 
@@ -50,6 +58,9 @@ ZOOM = 1.15
 
 DEGREES_A_PIXEL = 0.4
 
+ZOOM_PX = 12.0
+"""The right button zooms by `ZOOM` for so much of a way."""
+
 KEYS: dict[Qt.Key, Direction] = {
     Qt.Key.Key_1: "top",
     Qt.Key.Key_2: "side",
@@ -64,7 +75,11 @@ TURNS = {
     Qt.Key.Key_Down: (0.0, TURN_DEG),
 }
 
-KEYS_TOLD = "arrow keys turn, + and − zoom, 1 to 4 look from the top, side, front and obliquely"
+KEYS_TOLD = (
+    "arrow keys turn, + and − zoom, 1 to 4 look from the top, side, front and obliquely, F shows "
+    "all, P copies the point read off; drag to turn, with the middle button or Shift to move, with "
+    "the right one or the wheel to zoom; click to read a point off"
+)
 
 GL_RENDERER = 0x1F01
 
@@ -79,29 +94,50 @@ ON_THE_PROCESSOR = (
 
 NOTHING_HERE = "The 3-D view needs OpenGL, which cannot be used here. All figures are measured."
 
-Camera = tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...], float, float, bool]
-"""Position, focal point, up, view angle, parallel scale, whether it is without perspective."""
-
 
 class View3d(Drawn):
     """A scene to look at from all sides; make it with `make_view3d`.
 
-    The mouse turns it, the wheel zooms, Shift or the middle button moves it. Arrow keys turn, + and
-    − zoom, 1 to 4 look from the top, the side, the front and obliquely.
+    The left button turns it, the middle one, or Shift, moves it, the right one and the wheel zoom.
+    A click reads a point off, a click with the right button opens the menu, which has actions of
+    the page, too.
     """
 
     camera_changed = Signal(object)
     """The direction of view changed: its `Camera`."""
+    pointed = Signal(str)
+    """The point of the surface that the pointer is on, in words; empty where it is on none."""
 
     def __init__(self, name: str = "3-D view") -> None:
         super().__init__(name, KEYS_TOLD)
-        self.setToolTip(f"{name}: drag to turn, wheel to zoom, Shift and drag to move; {KEYS_TOLD}")
         self.setMinimumSize(160, 120)
         self._words = ""
         self._scene: Scene | None = None
         self._drawing: Drawing | None = None
         self._wanted: Camera | Direction | None = None
+        self._side: Direction = "free"
+        self._at = self._pressed = QPointF()
+        self._point_mm: tuple[float, float] | None = None
+        self.sigma_at: Callable[[float, float], float] | None = None
+        """Standard uncertainty of the height at (x, y), mm; None where there is none."""
+        self.setMouseTracking(True)
+        self._add_actions()
         self.follow_theme()
+
+    def _add_actions(self) -> None:
+        works: tuple[tuple[str, str, str, Callable[[], object]], ...] = (
+            ("Copy picture", "Ctrl+C", "Copy the 3-D picture to the clipboard", self.copy_picture),
+            ("Copy point", "P", "Copy X, Y, Z ± of the point that was read off", self.copy_point),
+            ("Forget point", "Esc", "Take the mark of the point away", self.forget_point),
+            ("Look at all of it", "F", "Bring all into view from the side chosen last", self.fit),
+        )
+        for words, key, tip, work in works:
+            action = QAction(words, self)
+            action.setToolTip(f"{tip} ({key})")
+            action.setShortcut(QKeySequence(key))
+            action.setShortcutContext(Qt.ShortcutContext.WidgetShortcut)
+            action.triggered.connect(lambda *_, do=work: do())
+            self.addAction(action)
 
     # --- what is shown -----------------------------------------------------------------------
 
@@ -120,6 +156,7 @@ class View3d(Drawn):
                 background=palette.color(QPalette.ColorRole.Base).name(),
             )
         self._scene = scene
+        self._mark()
         self._refresh()
 
     def set_words(self, words: str) -> None:
@@ -130,29 +167,26 @@ class View3d(Drawn):
 
     def look(self, direction: Direction) -> None:
         """Look from the top, the side, the front, or obliquely (``free``)."""
-        self._wanted = direction
+        self._wanted = self._side = direction
         if self._drawing is not None:
             self._drawing.look(direction)
             self._turned()
 
+    def fit(self) -> None:
+        """Look at all of it from the side that was chosen last."""
+        self.look(self._side)
+
     @property
     def camera(self) -> Camera | None:
         """Where it is looked at from; None before anything was drawn."""
-        if self._drawing is None:
-            return None
-        camera = self._drawing.plotter.camera
-        return (
-            *(tuple(camera.position), tuple(camera.focal_point), tuple(camera.up)),
-            *(float(camera.view_angle), float(camera.parallel_scale)),
-            bool(camera.parallel_projection),
-        )
+        return None if self._drawing is None else self._drawing.camera
 
     def set_camera(self, camera: Camera) -> None:
         """Take over another view's camera; emits no signal."""
         if self._drawing is None:
             self._wanted = camera
         elif camera != self.camera:
-            self._place(camera)
+            self._drawing.camera = camera
             self._refresh()
 
     def picture(self) -> npt.NDArray[np.uint8] | None:
@@ -167,11 +201,76 @@ class View3d(Drawn):
         picture = self.picture()
         return None if picture is None else as_image(picture)
 
+    def copy_picture(self) -> None:
+        """Put what is seen on the clipboard."""
+        image = self.image()
+        if image is not None:
+            QGuiApplication.clipboard().setImage(image)
+
     def eventFilter(self, watched: QObject, event: QEvent) -> bool:
         """Release OpenGL before the window is destroyed."""
         if event.type() == QEvent.Type.Close:
             self.close_view()
         return super().eventFilter(watched, event)
+
+    # --- points that are read off --------------------------------------------------------------
+
+    def surface_point(self, at: QPointF) -> FloatArray | None:
+        """Return the point of the surface that is seen at a place of the view, shape (3,), mm."""
+        scene = self._scene
+        if scene is None or self._drawing is None:
+            return None
+        stretch = np.array([1.0, 1.0, scene.exaggeration])
+        across, up = 2 * at.x() / max(self.width(), 1) - 1, 1 - 2 * at.y() / max(self.height(), 1)
+        ends = np.array([[across, up, -1.0, 1.0], [across, up, 1.0, 1.0]])
+        near, far = ends @ np.linalg.inv(view_matrix(self._drawing.plotter.renderer)).T
+        start, end = near[:3] / near[3], far[:3] / far[3]
+        hit = first_hit(scene.vertices_mm * stretch, scene.triangles, start, end - start)
+        return None if hit is None else hit / stretch
+
+    def point_words(self, point_mm: FloatArray) -> str:
+        """Return a point of the surface in words, with the ± of its height where that is known."""
+        x, y, z = point_mm.tolist()
+        sigma = np.nan if self.sigma_at is None else self.sigma_at(x, y)
+        more = f" ± {sigma:.4f}" if np.isfinite(sigma) else ""
+        return f"X {x:.3f}, Y {y:.3f}, Z {z:.4f}{more} mm".replace("-", "−")
+
+    @property
+    def read_off(self) -> str:
+        """The point that was read off, in words; empty without one."""
+        return "" if self._scene is None else self._scene.mark_words.replace("\n", " ")
+
+    def read_point(self, at: QPointF) -> None:
+        """Read off the point at a place of the view; beside the surface the mark is taken away."""
+        point = self.surface_point(at)
+        self._point_mm = None if point is None else (float(point[0]), float(point[1]))
+        self._mark()
+        self._refresh()
+
+    def forget_point(self) -> None:
+        """Take the mark of the point away."""
+        self._point_mm = None
+        self._mark()
+        self._refresh()
+
+    def copy_point(self) -> None:
+        """Put the point that was read off on the clipboard."""
+        if self.read_off:
+            QGuiApplication.clipboard().setText(self.read_off)
+
+    def _mark(self) -> None:
+        """Mark the point that was read off; at the same X and Y on another frame's surface."""
+        scene, words, mark = self._scene, "", np.empty((0, 3))
+        if scene is None:
+            return
+        if self._point_mm is not None:
+            above = np.array([*self._point_mm, 1e3])
+            down = np.array([0.0, 0.0, -1.0])
+            hit = first_hit(scene.vertices_mm, scene.triangles, above, down)
+            if hit is not None:
+                mark, words = hit[None], self.point_words(hit).replace(", Z", ",\nZ")
+        self._scene = replace(scene, mark_mm=mark, mark_words=words)
+        self.describe(self.read_off or self._words)
 
     def close_view(self) -> None:
         """Release OpenGL until the view is next shown."""
@@ -197,20 +296,11 @@ class View3d(Drawn):
         if self._drawing is None:
             self.window().installEventFilter(self)
             self._drawing = build_scene(self._new_plotter(), self._scene, steady=True)
-            if isinstance(self._wanted, str):
+            if self._wanted is not None:
                 self._drawing.look(self._wanted)
-            elif self._wanted is not None:
-                self._place(self._wanted)
         else:
             self._drawing.update(self._scene)
         return True
-
-    def _place(self, camera: Camera) -> None:
-        assert self._drawing is not None
-        held = self._drawing.plotter.camera
-        held.position, held.focal_point, held.up = camera[:3]
-        held.view_angle, held.parallel_scale, held.parallel_projection = camera[3:]
-        self._drawing.plotter.renderer.ResetCameraClippingRange()
 
     def _pixels(self) -> tuple[int, int]:
         ratio = self.devicePixelRatioF()
@@ -263,6 +353,64 @@ class View3d(Drawn):
                 event.accept()
         return super().event(event)
 
+    def mousePressEvent(self, event: QMouseEvent) -> None:
+        """Begin to turn, to move or to zoom."""
+        self._at = self._pressed = event.position()
+
+    def mouseMoveEvent(self, event: QMouseEvent) -> None:
+        """Turn, move or zoom; without a button show what the pointer is on."""
+        way, self._at = event.position() - self._at, event.position()
+        buttons, shift = event.buttons(), event.modifiers() & Qt.KeyboardModifier.ShiftModifier
+        if not buttons:
+            point = self.surface_point(event.position())
+            self._show_pointed("" if point is None else self.point_words(point))
+        elif shift or buttons & Qt.MouseButton.MiddleButton:
+            self.move_scene(way)
+        elif buttons & Qt.MouseButton.LeftButton:
+            self.turn(way.x() * DEGREES_A_PIXEL, way.y() * DEGREES_A_PIXEL)
+        elif buttons & Qt.MouseButton.RightButton:
+            self.zoom(ZOOM ** (-way.y() / ZOOM_PX))
+
+    def mouseReleaseEvent(self, event: QMouseEvent) -> None:
+        """Read a point off, or open the menu, where the mouse was not moved."""
+        if not self._is_click(event):
+            return
+        if event.button() == Qt.MouseButton.LeftButton:
+            self.read_point(event.position())
+        elif event.button() == Qt.MouseButton.RightButton:
+            self.open_menu(event.globalPosition().toPoint())
+
+    def _is_click(self, event: QMouseEvent) -> bool:
+        way = event.position() - self._pressed
+        return way.manhattanLength() < QGuiApplication.styleHints().startDragDistance()
+
+    def contextMenuEvent(self, event: QContextMenuEvent) -> None:
+        """Open the menu by its key; the mouse opens it when its button is released."""
+        if event.reason() == QContextMenuEvent.Reason.Keyboard:
+            self.open_menu(self.mapToGlobal(self.rect().center()))
+
+    def open_menu(self, at: QPoint) -> None:
+        """Open the menu of all that can be done with the view."""
+        menu = QMenu(self)
+        menu.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
+        menu.setToolTipsVisible(True)
+        for action in self.actions():
+            if action.text() in ("Copy point", "Forget point"):
+                action.setEnabled(bool(self.read_off))
+        menu.addActions(self.actions())
+        menu.addSeparator()
+        for direction, (text, tip) in LOOKS.items():
+            menu.addAction(text, partial(self.look, direction)).setToolTip(tip)
+        menu.popup(at)
+
+    def _show_pointed(self, words: str) -> None:
+        self.pointed.emit(words)
+
+    def leaveEvent(self, event: QEvent) -> None:
+        """Show no point any more."""
+        self._show_pointed("")
+        super().leaveEvent(event)
+
     def keyPressEvent(self, event: QKeyEvent) -> None:
         """Turn, zoom, or look from one of four sides."""
         key = Qt.Key(event.key())
@@ -294,7 +442,7 @@ class OffscreenView(View3d):
     def __init__(self, name: str = "3-D view") -> None:
         super().__init__(name)
         self._picture: QImage | None = None
-        self._at = QPointF()
+        self._pointed_at = ""
 
     def _new_plotter(self) -> Any:
         # Not `pyvista.Plotter`: it is not waited for while another thread loads it.
@@ -334,27 +482,27 @@ class OffscreenView(View3d):
             painter.fillRect(self.rect(), self.palette().color(QPalette.ColorRole.Base))
             if self._picture is not None:
                 painter.drawImage(0, 0, self._picture)
+                self._paint_pointed(painter)
             else:
                 self._paint_words(painter, self._words if self._scene is None else NOTHING_HERE)
             if self.hasFocus():
                 self.paint_frame(painter)
 
-    def mousePressEvent(self, event: QMouseEvent) -> None:
-        """Begin to turn or to move."""
-        self._at = event.position()
-
-    def mouseMoveEvent(self, event: QMouseEvent) -> None:
-        """Turn with the left button; move with Shift or the middle one."""
-        way, self._at = event.position() - self._at, event.position()
-        shift = event.modifiers() & Qt.KeyboardModifier.ShiftModifier
-        if shift or event.buttons() & Qt.MouseButton.MiddleButton:
-            self.move_scene(way)
-        elif event.buttons() & Qt.MouseButton.LeftButton:
-            self.turn(way.x() * DEGREES_A_PIXEL, way.y() * DEGREES_A_PIXEL)
-
     def wheelEvent(self, event: QWheelEvent) -> None:
         """Zoom."""
         self.zoom(ZOOM ** (event.angleDelta().y() / 120))
+
+    def _show_pointed(self, words: str) -> None:
+        super()._show_pointed(words)
+        if words != self._pointed_at:
+            self._pointed_at = words
+            self.update()
+
+    def _paint_pointed(self, painter: QPainter) -> None:
+        painter.setPen(self.palette().color(QPalette.ColorRole.Text))
+        area = self.rect().adjusted(6, 6, -6, -6)
+        corner = Qt.AlignmentFlag.AlignBottom | Qt.AlignmentFlag.AlignLeft
+        painter.drawText(area, corner, self._pointed_at)
 
 
 class InteractiveView(View3d):
@@ -381,8 +529,27 @@ class InteractiveView(View3d):
             plotter.iren.add_observer(event, self._interacted)
         plotter.iren.add_observer("MouseWheelBackwardEvent", self._interacted)
         self._layout.addWidget(plotter)
+        plotter.setMouseTracking(True)
+        plotter.installEventFilter(self)
         plotter.show()
         return plotter
+
+    def eventFilter(self, watched: QObject, event: QEvent) -> bool:
+        """Read points off and open the menu; VTK turns, moves and zooms by itself."""
+        if isinstance(event, QMouseEvent) and self._drawing is not None:
+            if event.type() == QEvent.Type.MouseButtonPress:
+                self._pressed = event.position()
+                self.setFocus(Qt.FocusReason.MouseFocusReason)
+            elif event.type() == QEvent.Type.MouseButtonRelease:
+                self.mouseReleaseEvent(event)
+            elif event.type() == QEvent.Type.MouseMove and not event.buttons():
+                self.mouseMoveEvent(event)
+        return super().eventFilter(watched, event)
+
+    def _show_pointed(self, words: str) -> None:
+        super()._show_pointed(words)
+        if self._drawing is not None and self._drawing.show_pointed(words):
+            QWidget.update(self._drawing.plotter)
 
     def _interacted(self, *_: object) -> None:
         self.camera_changed.emit(self.camera)

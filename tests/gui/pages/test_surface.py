@@ -6,6 +6,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import ClassVar
 
+import av
 import numpy as np
 import pytest
 from PySide6.QtCore import QPointF, Qt
@@ -21,8 +22,13 @@ from PySide6.QtWidgets import (
 )
 from pytestqt.qtbot import QtBot
 
-from labapp.export.heights import profile
+from labapp.export.heights import profile, sigma_at
+from labapp.export.rendering.paper import Paper
+from labapp.export.rendering.scene import DIFFERENCE_MAP
+from labapp.export.rendering.studio import Studio
 from labapp.gui.pages.surface import SurfacePage
+from labapp.gui.pages.surface.view import FILM_PX
+from labapp.gui.views.picture_files import PaperDialog
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
 from tests.gui.conftest import KEPT, CopySample
@@ -197,13 +203,63 @@ def test_the_picture_is_copied_and_written(page: SurfacePage, tmp_path: Path) ->
     said = told(page)
     page.grab()
     button(page, "Top").click()
-    button(page, "Copy").click()
+    page.copy_picture()
     copied = QGuiApplication.clipboard().image()
     assert copied.size() == page.view.size()
     page.write_picture(tmp_path / "pool")
-    assert QImage(str(tmp_path / "pool.png")).size() == page.view.size()
+    page.write_picture(tmp_path / "pool.tif", Paper(60, 150))
+    page.write_picture(tmp_path / "pool.jpg", Paper(60, 150))
+    assert QImage(str(tmp_path / "pool.png")).width() == Paper().width_px
+    for name in ("pool.tif", "pool.jpg"):
+        written = QImage(str(tmp_path / name))
+        assert written.width() == round(60 / 25.4 * 150)
+        assert written.dotsPerMeterX() == pytest.approx(150 / 0.0254, rel=0.01)
     page.write_picture(tmp_path / "nowhere" / "pool.png")
-    assert [bad for _, bad in said] == [False, False, True]
+    assert [bad for _, bad in said] == [False, False, False, False, True]
+
+
+@pytest.mark.usefixtures("opengl")
+def test_a_film_is_seen_as_the_view_is(page: SurfacePage, tmp_path: Path, qtbot: QtBot) -> None:
+    page.grab()
+    page.view.turn(40, 10)
+    page.write_film(tmp_path / "pool")
+    qtbot.waitUntil(lambda: not page.workspace.tasks.active, timeout=round(1000 * PATIENCE_S))
+    with av.open(tmp_path / "pool.mp4") as film:
+        frames = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
+    assert len(frames) == len(page.session.frames)
+    turned = Studio(FILM_PX, page.view.camera).draw(page.view.scene)
+    usual = Studio(FILM_PX, "free").draw(page.view.scene)
+    first = frames[0][..., ::-1].astype(int)
+    ground = [(picture.astype(int) != picture[0, -1]).any(axis=2) for picture in (turned, usual)]
+    drawn = (np.abs(first - 255) > 60).any(axis=2)
+    agree = [(drawn & one).sum() / (drawn | one).sum() for one in ground]
+    assert agree[0] > agree[1]
+
+
+def test_heights_are_drawn_true_or_as_high_as_before(page: SurfacePage) -> None:
+    page.high.set_value(5.0)
+    page.high.edited.emit(5.0)
+    page.true_scale.click()
+    assert page.view.scene.exaggeration == 1.0
+    {each.text(): each for each in page.view.actions()}["True scale, or exaggerated"].trigger()
+    assert page.view.scene.exaggeration == 5.0
+    assert not page.true_scale.isChecked()
+
+
+@pytest.mark.usefixtures("opengl")
+def test_a_point_read_off_has_the_height_and_its_sigma(page: SurfacePage) -> None:
+    page.grab()
+    page.view.look("top")
+    page.grab()
+    at = page.view._drawing.overlay.project(np.zeros((1, 3)))[0]
+    page.view.read_point(QPointF(at[0], page.view.height() - at[1]))
+    x, y, z = page.view.scene.mark_mm[0]
+    pool = page.told.reconstruction
+    assert z == pytest.approx(
+        float(pool.surface.height(np.array([x]), np.array([y]))[0]), abs=0.002
+    )
+    sigma = float(sigma_at(pool, np.array([x]), np.array([y]))[0])
+    assert f"± {sigma:.4f} mm" in page.view.read_off
 
 
 @pytest.mark.usefixtures("opengl")
@@ -212,12 +268,13 @@ def test_a_key_saves_the_picture(
 ) -> None:
     chosen = str(tmp_path / "pool.png")
     monkeypatch.setattr(QFileDialog, "getSaveFileName", lambda *given: (chosen, "PNG"))
+    monkeypatch.setattr(PaperDialog, "exec", lambda _: PaperDialog.DialogCode.Accepted)
     page.activateWindow()
     qtbot.waitUntil(page.isActiveWindow)
     keys = Qt.KeyboardModifier.ControlModifier | Qt.KeyboardModifier.ShiftModifier
     QTest.keyClick(page, Qt.Key.Key_P, keys)
     qtbot.waitUntil(Path(chosen).exists)
-    assert QImage(chosen).size() == page.view.size()
+    assert QImage(chosen).width() == PaperDialog.paper.width_px
 
 
 @pytest.mark.usefixtures("opengl")
@@ -228,7 +285,7 @@ def test_two_schemes_stand_side_by_side(page: SurfacePage, qtbot: QtBot) -> None
     qtbot.waitUntil(lambda: compare.table.rowCount() == 11)  # ers tells its own ARE besides
     page.grab()
     first, second, difference = compare.views
-    assert difference.scene.diverging
+    assert difference.scene.colour_map == DIFFERENCE_MAP
     assert first.scene.limits == second.scene.limits
     first.turn(40, 10)
     assert second.camera == first.camera == difference.camera

@@ -8,6 +8,7 @@ import pytest
 
 from labapp.core.values import CannotMeasure
 from labapp.export.heights import profile
+from labapp.export.rendering.scene import DIFFERENCE_MAP
 from labapp.gui.pages.surface import comparison, presenter
 from labapp.gui.pages.surface.presenter import Options
 from labapp.gui.shell.steps import why_not_measurable
@@ -164,7 +165,7 @@ def test_two_schemes_are_compared_on_the_same_dots(session: Session) -> None:
     ers = comparison.by_scheme(session, 3, "ers")
     fit = session.result(3).measurement
     assert made.scenes[0].limits == made.scenes[1].limits
-    assert made.difference.diverging
+    assert made.difference.colour_map == DIFFERENCE_MAP
     name, one, other, difference, unit = made.rows[0]
     assert (name, unit) == ("Width", "mm")
     assert one.split(" ± ")[1]

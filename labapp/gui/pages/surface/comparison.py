@@ -53,7 +53,7 @@ def compared(
 ) -> Comparison:
     """Reconstruct a frame by two schemes and hold them against each other.
 
-    Both surfaces are coloured on one scale.
+    Both surfaces are coloured on one scale, if by the same quantity.
     """
     found: list[Measurement | None] = []
     words = []
@@ -72,6 +72,7 @@ def compared(
     if measures:
         limits = min(each.depth_mm for each in measures), max(each.height_mm for each in measures)
     scenes = [None if each is None else scene(each, rig, options, limits, None) for each in found]
+    scenes = _with_one_range(scenes)
     rows: tuple[Row, ...] = ()
     difference, message = None, "There are no two surfaces to compare."
     if first and second and first.measures and second.measures:
@@ -82,12 +83,23 @@ def compared(
         names = [SCHEMES[scheme].title for scheme in schemes]
         message = f"{names[0]} minus {names[1]}, from the same dots: "
         if len(plain.values):
-            difference = replace(plain, exaggeration=options.exaggeration)
+            difference = replace(
+                plain, exaggeration=options.exaggeration, contours=options.contours
+            )
             largest = float(np.abs(plain.values).max())
             message += f"the heights differ by {largest:.3f} mm at most."
         else:
             message += "the two surfaces do not overlap."
     return Comparison((scenes[0], scenes[1]), (words[0], words[1]), difference, rows, message)
+
+
+def _with_one_range(scenes: list[Scene | None]) -> list[Scene | None]:
+    """Give scenes that show the same quantity one range of colours."""
+    drawn = [each for each in scenes if each is not None]
+    if len({each.label for each in drawn}) != 1:
+        return scenes
+    limits = min(each.limits[0] for each in drawn), max(each.limits[1] for each in drawn)
+    return [None if each is None else replace(each, limits=limits) for each in scenes]
 
 
 def by_scheme(session: Session, frame: int, scheme: str) -> Measurement:

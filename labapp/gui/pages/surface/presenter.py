@@ -19,7 +19,7 @@ from labapp.core.surface.measures import Measures, sigma_name
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.values import FloatArray
 from labapp.export.heights import Profile
-from labapp.export.rendering.scene import Scene, rays_of, scene_of
+from labapp.export.rendering.scene import Colour, Scene, rays_of, scene_of
 from labapp.gui.digits import ResultRow
 from labapp.session.measured import Overview, Result, scheme_name
 from labapp.session.session import Session
@@ -75,9 +75,11 @@ def with_scheme(settings: Settings, name: str) -> Settings:
 class Options:
     """What the 3-D view shows, as the operator ticked it."""
 
-    colour: Literal["height", "sigma"] = "height"
+    colour: Colour = "height"
     points: bool = True
     boundary: bool = True
+    contours: bool = False
+    work_piece: bool = True
     rays: bool = False
     electrode: bool = True
     same_colours: bool = False
@@ -328,6 +330,8 @@ def scene(
         lines_mm=lines,
         rays_mm=rays_of(reconstruction, match, rig) if options.rays and match else {},
         electrode=options.electrode,
+        contours=options.contours,
+        plate_mm=made.plate_mm if options.work_piece else made.plate_mm[:0],
         exaggeration=options.exaggeration,
     )
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 from PySide6.QtCore import QSize, Qt, QTimer
 from PySide6.QtGui import (
     QAction,
@@ -30,9 +31,11 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
+from labapp.core.surface.reconstruction import Reconstruction
 from labapp.errors import InputError
-from labapp.export.heights import profile
-from labapp.export.rendering.drawing import Direction
+from labapp.export.heights import profile, sigma_at
+from labapp.export.rendering.drawing import Camera, Direction
+from labapp.export.rendering.paper import Paper, paper_picture
 from labapp.gui.dialogs import ask_save
 from labapp.gui.pages.page import Page
 from labapp.gui.pages.surface.charts import DotsChart, PlanChart, ProfileChart
@@ -47,13 +50,17 @@ from labapp.gui.pages.surface.presenter import (
     scene,
     shown,
 )
+from labapp.gui.tasks import Control
+from labapp.gui.views.picture_files import RASTERS, ask_paper, with_suffix, write_image
 from labapp.gui.views.steering import Steering
-from labapp.gui.views.view3d import LOOKS, View3d, make_view3d
+from labapp.gui.views.view3d import LOOKS, View3d, as_image, make_view3d
 from labapp.gui.widgets.fields import ChoiceField, NumberField
 from labapp.gui.widgets.layouts import fill, hbox, vbox
 from labapp.gui.widgets.parts import PartsBar
 from labapp.gui.workspace import Workspace
 from labapp.session.measured import scheme_name
+from labapp.session.outgoing import write_view_film
+from labapp.text import HEIGHT_SIGMA_OF
 
 LEAST_PLAN_WIDTH = 100
 """In a narrow window the section's fields would leave it less, too little to drag the line."""
@@ -64,9 +71,17 @@ CHARTS_SOON_MS = 20
 CHARTS_REST_MS = 250
 """Charts are drawn no more often: they cost more than the 3-D view does."""
 
+COLOURED = [("height", "by height"), ("sigma", "by ±"), ("residual", "by residual")]
+
+FILM_PX = (1280, 720)
+
+SCREEN_DPI = 96.0
+
 SHOWN_PARTS = {
     "points": ("Reflection &points", "White dots: where the rays meet the surface"),
     "boundary": ("&Boundary", "The line where the pool meets unmelted metal"),
+    "contours": ("&Contour lines", "Lines of equal height, at round heights"),
+    "work_piece": ("&Work piece", "The work piece's top round the pool"),
     "rays": ("&Rays", "The last 3 mm of the incident rays, the first of the reflected ones"),
     "electrode": ("&Electrode's axis", "The upright line X = Y = 0"),
     "same_colours": ("Same colours in &all frames", "One scale of heights for the recording"),
@@ -89,6 +104,7 @@ class SurfacePage(Page):
         self.compare = CompareView(workspace)
         self.side = SurfacePanel(workspace, self.panel_layout)
         self.lock_with_session(self.side.scheme, self.side.correspondence)
+        self._exaggerated = self.options.exaggeration
         self._charts_due: Callable[[], None] | None = None
         self._rest = QTimer(self, singleShot=True)
         self._rest.timeout.connect(self._show_charts)
@@ -165,8 +181,9 @@ class SurfacePage(Page):
     def _tools(self) -> QWidget:
         self.colour = ChoiceField(
             "Colour",
-            [("height", "by height"), ("sigma", "by ±")],
-            tooltip="What the surface is coloured by",
+            COLOURED,
+            tooltip="What the surface is coloured by; ± is one standard uncertainty, "
+            f"{HEIGHT_SIGMA_OF}; residuals are interpolated between the points",
         )
         self.colour.edited.connect(lambda key: self._set(colour=key))
         self.high = NumberField(
@@ -184,16 +201,41 @@ class SurfacePage(Page):
             _tool(words, what, partial(self._look, direction))
             for direction, (words, what) in LOOKS.items()
         ]
-        self.copy = _tool("Copy", "Copy the 3-D picture to the clipboard", self.copy_picture)
-        self.save = _tool("Save …", "Save the 3-D picture as PNG (Ctrl+Shift+P)", self.save_picture)
+        what = "Draw heights as they are, or as many times as high as before (E)"
+        self.true_scale = _tool("1:1", what, self.toggle_scale, _Toggle())
+        self.true_scale.setCheckable(True)
+        self.true_scale.setAccessibleName("True scale")
+        self.save = _tool(
+            "Save …",
+            "Save the 3-D picture at its size on paper: PNG, TIFF or JPEG (Ctrl+Shift+P)",
+            self.save_picture,
+        )
         self.save.setShortcut(QKeySequence("Ctrl+Shift+P"))
+        what = "Write a film (MP4) of all frames, seen as the 3-D view is now"
+        self.film = _tool("Film …", what, self.save_film)
         what = "Put two schemes side by side, or show one again"
         self.comparing = _tool("Compare", what, self._toggle_compare, _Toggle())
         self.comparing.setCheckable(True)
+        self._view_actions()
+        coloured = self.colour.label, self.colour
         return _Tools(
-            hbox(self.colour.label, self.colour, self.high.label, self.high, self._parts_button()),
-            hbox(*looks, 1, self.copy, self.save, self.comparing),
+            hbox(*coloured, self.high.label, self.high, self.true_scale, self._parts_button()),
+            hbox(*looks, 1, self.save, self.film, self.comparing),
         )
+
+    def _view_actions(self) -> None:
+        """Add what this page does with the 3-D view to the view's own menu."""
+        for words, key, work in (
+            ("Save picture …", "", self.save_picture),
+            ("Film of the recording …", "", self.save_film),
+            ("True scale, or exaggerated", "E", self.toggle_scale),
+            ("Contour lines", "C", lambda: self._set(contours=not self.options.contours)),
+        ):
+            action = QAction(words, self.view)
+            action.setShortcut(QKeySequence(key))
+            action.setShortcutContext(Qt.ShortcutContext.WidgetShortcut)
+            action.triggered.connect(lambda *_, do=work: do())
+            self.view.addAction(action)
 
     def _parts_button(self) -> QToolButton:
         menu = QMenu(self)
@@ -244,15 +286,49 @@ class SurfacePage(Page):
     def save_picture(self) -> None:
         """Ask for a file and write the picture to it."""
         proposed = self.workspace.folder / f"surface_{self.workspace.frame:06d}.png"
-        if path := ask_save(self, "Save picture", proposed, "PNG (*.png)"):
-            self.write_picture(path)
+        if asked := ask_paper(self, proposed, RASTERS):
+            self.write_picture(*asked)
 
-    def write_picture(self, path: Path) -> None:
-        """Write the picture as PNG; a failure is reported."""
-        path = path if path.suffix.lower() == ".png" else path.with_name(path.name + ".png")
-        written = self.picture().save(str(path), "PNG")
+    def write_picture(self, path: Path, paper: Paper | None = None) -> None:
+        """Write the picture at its size on paper; comparing, as it is seen. A failure is reported.
+
+        Without ``paper`` it is one column wide.
+        """
+        path, paper = with_suffix(path), paper or Paper()
+        view = self.view
+        if self.stack.currentWidget() is self.compare or view.camera is None or view.scene is None:
+            written = write_image(path, self.picture().toImage(), SCREEN_DPI)
+        else:
+            shape = view.height() / max(view.width(), 1)
+            drawn = paper_picture(view.scene, view.camera, paper, shape)
+            written = write_image(path, as_image(drawn[..., ::-1]), paper.dpi)
         words = f"{path.name} is written" if written else f"{path} cannot be written"
         self.workspace.notified.emit(words, not written)
+
+    def save_film(self) -> None:
+        """Ask for a file and write a film of all frames to it, seen as the 3-D view is now."""
+        proposed = self.workspace.folder / f"{self.session.path.stem}.mp4"
+        if path := ask_save(self, "Save film", proposed, "Film (*.mp4)"):
+            self.write_film(path)
+
+    def write_film(self, path: Path) -> None:
+        """Write a film in the background."""
+        session = self.session
+        camera: Direction | Camera = self.view.camera or "free"
+        path = path if path.suffix.lower() == ".mp4" else path.with_name(path.name + ".mp4")
+
+        def work(control: Control) -> None:
+            write_view_film(session, path, camera, FILM_PX, control.progress)
+
+        def done(_: object) -> None:
+            self.workspace.notified.emit(f"{path.name} is written", False)
+
+        self.start_task(f"Writing {path.name}", work, done, kind="Film")
+
+    def toggle_scale(self) -> None:
+        """Draw heights as they are, or exaggerated as before."""
+        now = self.options.exaggeration
+        self._set(exaggeration=1.0 if now != 1.0 else self._exaggerated)
 
     def _show_surface(self) -> None:
         result, seen = self.told.result, self.workspace.overview()
@@ -266,6 +342,7 @@ class SurfacePage(Page):
             drawn = scene(measurement, rig_of(result), self.options, limits, cut)
             dots = reflected_dots(measurement)
         self.view.set_words(self.told.words)
+        self.view.sigma_at = None if reconstruction is None else partial(_sigma, reconstruction)
         self.view.show_scene(drawn)
         boundary = None if reconstruction is None else reconstruction.boundary
         lines = result is not None and result.measurement.lines is not None
@@ -290,7 +367,10 @@ class SurfacePage(Page):
 
     def _show_options(self) -> None:
         self.colour.set_value(self.options.colour)
-        self.high.set_value(self.options.exaggeration)
+        high = self.options.exaggeration
+        self._exaggerated = high if high != 1.0 else self._exaggerated
+        self.high.set_value(high)
+        self.true_scale.setChecked(high == 1.0)
         for name, action in self.parts.items():
             action.blockSignals(True)
             action.setChecked(getattr(self.options, name))
@@ -379,6 +459,11 @@ class _Toggle(QToolButton):
             text = colours.color(QPalette.ColorRole.HighlightedText)
             colours.setColor(QPalette.ColorRole.ButtonText, text)
             option.palette = colours
+
+
+def _sigma(reconstruction: Reconstruction, x_mm: float, y_mm: float) -> float:
+    """Standard uncertainty of the height at a place, mm; NaN where the scheme gives none."""
+    return float(sigma_at(reconstruction, np.array([x_mm]), np.array([y_mm]))[0])
 
 
 def _tool(

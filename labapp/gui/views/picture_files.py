@@ -1,0 +1,144 @@
+"""Pictures written to files at the size they have on paper: 3-D views, plots and frames."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from PySide6.QtCore import QRectF, QSize
+from PySide6.QtGui import QImage, QPainter, QPalette
+from PySide6.QtWidgets import QDialog, QGraphicsView, QWidget
+
+from labapp.export.rendering.paper import MM_AN_INCH, Paper
+from labapp.gui.dialogs import ask_save
+from labapp.gui.theme import palette
+from labapp.gui.widgets.buttons import button
+from labapp.gui.widgets.fields import FieldForm, NumberField
+from labapp.gui.widgets.labels import wrapping_label
+from labapp.gui.widgets.layouts import hbox, vbox
+
+RASTERS = "PNG (*.png);;TIFF (*.tif *.tiff);;JPEG (*.jpg *.jpeg)"
+VECTORS = f"{RASTERS};;SVG (*.svg)"
+SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
+SVG = ".svg"
+SVG_DPI = 96
+"""What programs take a pixel of an SVG for."""
+
+
+class PaperDialog(QDialog):
+    """Asks how wide a picture is on paper and how fine; the next time it begins with that."""
+
+    paper = Paper()
+
+    def __init__(self, parent: QWidget) -> None:
+        super().__init__(parent)
+        self.setObjectName("save-picture")
+        self.setWindowTitle("Save picture")
+        self.width_mm = NumberField(
+            *("Width on paper", "mm"), lowest=20, highest=300, step=5, decimals=0,
+            tooltip="90 mm is one column of a journal, 180 mm two; margins are cropped",
+        )  # fmt: skip
+        self.dpi = NumberField(
+            *("Resolution", "dpi"), lowest=72, highest=600, step=50, decimals=0,
+            tooltip="Pixels an inch; journals want 300 or 600. An SVG of a plot has none",
+        )  # fmt: skip
+        self.size_words = wrapping_label()
+        form = FieldForm()
+        for field, value in ((self.width_mm, self.paper.width_mm), (self.dpi, self.paper.dpi)):
+            field.set_value(value)
+            field.edited.connect(lambda _: self._take())
+            form.add(field)
+        save = button("Save as …", "Choose the file; its ending says the format", self.accept)
+        save.setDefault(True)
+        cancel = button("Cancel", "Save nothing (Esc)", self.reject)
+        vbox(form, self.size_words, hbox(1, cancel, save), of=self)
+        self._take()
+
+    def _take(self) -> None:
+        width_mm, dpi = self.width_mm.value(), self.dpi.value()
+        if width_mm is not None and dpi is not None:
+            PaperDialog.paper = Paper(float(width_mm), int(dpi))
+        self.size_words.setText(f"{self.paper.width_px} px wide, black on white")
+
+
+def ask_paper(parent: QWidget, proposed: Path, kinds: str) -> tuple[Path, Paper] | None:
+    """Ask for size and file of a picture; None if nothing is to be saved."""
+    dialog = PaperDialog(parent)
+    wanted = dialog.exec() == QDialog.DialogCode.Accepted
+    dialog.deleteLater()
+    path = ask_save(parent, "Save picture", proposed, kinds) if wanted else None
+    return None if path is None else (path, PaperDialog.paper)
+
+
+def with_suffix(path: Path, *more: str) -> Path:
+    """Return the path, with .png where it has no ending of a picture."""
+    known = path.suffix.lower() in (*SUFFIXES, *more)
+    return path if known else path.with_name(f"{path.name}.png")
+
+
+def write_image(path: Path, image: QImage, dpi: float) -> bool:
+    """Write an image that says how large it is on paper; returns whether that worked."""
+    per_m = round(dpi / MM_AN_INCH * 1000)
+    image.setDotsPerMeterX(per_m)
+    image.setDotsPerMeterY(per_m)
+    # Of PNG this is how small, of JPEG how good.
+    return image.save(str(path), quality=95 if path.suffix.lower().startswith(".jp") else 0)
+
+
+def write_plot(path: Path, drawn: QWidget, canvas: QGraphicsView, paper: Paper) -> bool:
+    """Write what a plot shows, dark on light: SVG, or pixels; returns whether that worked."""
+    with _light(drawn):
+        if path.suffix.lower() == SVG:
+            return _write_svg(path, canvas, paper)
+        size = QSize(paper.width_px, round(paper.width_px * canvas.height() / canvas.width()))
+        image = QImage(size, QImage.Format.Format_RGB32)
+        image.fill(canvas.backgroundBrush().color())
+        _paint(image, canvas)
+        return write_image(path, image, paper.dpi)
+
+
+def _paint(device: Any, canvas: QGraphicsView) -> None:
+    with QPainter(device) as painter:
+        painter.setRenderHint(QPainter.RenderHint.Antialiasing)
+        whole = QRectF(canvas.viewport().rect())
+        canvas.render(painter, QRectF(painter.viewport()), whole.toRect())
+
+
+def _write_svg(path: Path, canvas: QGraphicsView, paper: Paper) -> bool:
+    from PySide6.QtSvg import QSvgGenerator
+
+    wide = round(paper.width_mm / MM_AN_INCH * SVG_DPI)
+    size = QSize(wide, round(wide * canvas.height() / canvas.width()))
+    generator = QSvgGenerator()
+    generator.setFileName(str(path))
+    generator.setResolution(SVG_DPI)
+    generator.setSize(size)
+    generator.setViewBox(QRectF(0, 0, size.width(), size.height()))
+    _paint(generator, canvas)
+    return path.is_file()
+
+
+@contextmanager
+def _light(drawn: QWidget) -> Iterator[None]:
+    """Give a widget the light colours."""
+    drawn.setPalette(palette(False))
+    try:
+        yield
+    finally:
+        drawn.setPalette(QPalette())
+
+
+def save_plot(drawn: QWidget, canvas: QGraphicsView, name: str) -> Callable[[], None]:
+    """Return what asks for a file and writes a plot to it."""
+
+    def save() -> None:
+        if asked := ask_paper(drawn, Path.home() / f"{name}.png", VECTORS):
+            path = with_suffix(asked[0], SVG)
+            if not write_plot(path, drawn, canvas, asked[1]):
+                from PySide6.QtWidgets import QMessageBox
+
+                QMessageBox.warning(drawn, "Save picture", f"{path} cannot be written.")
+
+    return save
