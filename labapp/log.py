@@ -26,6 +26,8 @@ def start_log() -> logging.Logger:
         handler = _handler()
         handler.set_name(NAME)
         logger.addHandler(handler)
+    if logging.lastResort is not None:  # what `core.compiled` announces is for stderr, too
+        logger.getChild("notices").addHandler(logging.lastResort)
     return logger
 
 

@@ -9,7 +9,6 @@ it loads is handled like any other.
 from __future__ import annotations
 
 import errno
-import logging
 import signal
 import sys
 import time
@@ -107,7 +106,6 @@ SetupToChange = Annotated[
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
     """Run the command line and exit: bad input in a line or two, never a traceback."""
     log = start_log()
-    log.getChild("notices").addHandler(logging.StreamHandler())
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
             stream.reconfigure(errors="replace")  # a terminal without "±" is no reason to stop

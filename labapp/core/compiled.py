@@ -35,7 +35,7 @@ HOW: dict[str, Any] = {
 """Sums may be taken in any order and division by zero gives infinity or NaN, as in NumPy."""
 
 NOTICES = "labapp.notices"
-"""Logger of what whoever waits is to read."""
+"""Logger of what the user should read while waiting; `labapp.log` shows it on stderr."""
 
 OLD_S = 60 * 86400.0
 """What was compiled for a source that nobody has is deleted after so long, s."""
@@ -106,10 +106,10 @@ def _folder() -> Path:
 
 @cache
 def _announce() -> None:
-    # Once in a process; in its workers too, but they find what it compiled.
+    # Once in a process, however many files it compiles.
     logging.getLogger(NOTICES).warning(
-        "First use on this computer: labapp is compiled for its processor. This takes some minutes "
-        "at most, and happens once."
+        "First use of this version: labapp is being compiled for this computer's processor. "
+        "This takes one to two minutes and is done once."
     )
 
 
