@@ -98,6 +98,7 @@ def _measure(source: FrameSource, frames: range, folder: Path, bench: Setup) -> 
 
 def _follow(source: FrameSource, frames: range, folder: Path) -> bool:
     """Follow one line; whether it was followed in any frame."""
+    from labapp.core.sequence.line_frame import LineFrame
     from labapp.core.sequence.line_track import track_line
     from labapp.export import line_results as tables
 
@@ -114,10 +115,12 @@ def _follow(source: FrameSource, frames: range, folder: Path) -> bool:
                 yield frame.image
 
         film = track_line(images(), rate)
-    rows = tables.track_rows(frames, times_s, film)
+    pulses = zip(film.lines, film.pulses.on.tolist(), film.pulses.probability.tolist(), strict=True)
+    found = [LineFrame.of_track(*one) for one in pulses]
+    rows = tables.track_rows(frames, times_s, found)
     write_file(folder / "track.csv", csv_text([tables.TRACK_COLUMNS, *rows]).encode())
-    off = [one for one, pulse in zip(film.lines, film.pulses.on, strict=True) if not pulse]
-    followed = sum(one is not None for one in off)
+    off = [one for one in found if one.status != "pulse"]
+    followed = sum(one.track is not None for one in off)
     typer.echo(f"{len(off)} of {len(frames)} frames are without a pulse; line in {followed}")
     if film.pulses.on.any():
         typer.echo(f"pulses: {film.pulses.frequency_hz:.2f} Hz")

@@ -271,7 +271,7 @@ def measure(
             return
         summary = measure_frames(session, chosen, warm=warm)
     typer.echo(summary.text())
-    if not summary.statuses["ok"]:
+    if not summary.statuses["ok"] + summary.statuses["followed"]:
         raise typer.Exit(NOTHING_MEASURED)
 
 

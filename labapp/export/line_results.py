@@ -9,7 +9,6 @@ import numpy as np
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.sequence.line_frame import LineFrame
 from labapp.core.sequence.line_states import LineSeries, State, line_states
-from labapp.core.sequence.line_track import LineFilm
 from labapp.core.surface.line_fit import LineSurface
 from labapp.text import csv_text
 
@@ -111,20 +110,20 @@ def feature_rows(
 
 
 def track_rows(
-    frames: Sequence[int], times_s: Sequence[float | None], film: LineFilm
+    frames: Sequence[int], times_s: Sequence[float | None], found: Sequence[LineFrame]
 ) -> list[list[str]]:
     """Rows of ``track.csv``: one a frame of one line that is followed."""
     rows = []
-    for k, (frame, time_s, line) in enumerate(zip(frames, times_s, film.lines, strict=True)):
+    for frame, time_s, one in zip(frames, times_s, found, strict=True):
+        line = one.track
         shape = (
             [""] * 4
             if line is None
             else [_cell(x) for x in (line.shift_px, line.tilt_px, line.bend_px, line.share)]
         )
-        on, chance = bool(film.pulses.on[k]), float(film.pulses.probability[k])
-        state = "on" if on else "off"
+        state = "on" if one.status == "pulse" else "off"
         followed = str(int(line is not None))
-        rows.append([str(frame), _cell(time_s), state, f"{chance:.4f}", followed, *shape])
+        rows.append([str(frame), _cell(time_s), state, f"{one.pulse:.4f}", followed, *shape])
     return rows
 
 
@@ -165,6 +164,9 @@ def line_tables(
         "lines.csv": csv_text([LINE_COLUMNS, *lines]),
         "line_points.csv": csv_text([POINT_COLUMNS, *points]),
     }
+    if any(np.isfinite(one.pulse) for one in found):
+        rows = track_rows(frames, times_s, found)
+        tables["track.csv"] = csv_text([TRACK_COLUMNS, *rows])
     for k, one in numbered:
         if one.status == "ok" and one.surface is not None:
             text = csv_text([SURFACE_COLUMNS, *surface_rows(one.surface)])

@@ -23,10 +23,11 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import cv2
+import numpy as np
 from threadpoolctl import ThreadpoolController
 
 from labapp.config.setup import Setup
-from labapp.core.pipeline import ByHand, Measurement, Settings, measure
+from labapp.core.pipeline import ByHand, Measurement, Settings, measure, setup_status
 from labapp.core.recording.residual_check import Residuals
 from labapp.errors import InputError
 from labapp.export.frame_result import FrameResult, without_surface
@@ -42,6 +43,9 @@ AHEAD = 8
 VOTERS, WAITS = 3, 5
 """A frame is judged with two more that have a surface, so that of three that disagree two decide;
 so many wait at most."""
+
+FOLLOWED_AT_ONCE = 400
+"""Frames whose pulses are told apart together: some tens of their periods."""
 
 STRETCH = 1000
 """Frames of a stretch: a cold frame takes as long as some two hundred that follow."""
@@ -195,6 +199,43 @@ def _results_in_order(begun: Iterable[Future[T]], ahead: int) -> Generator[T]:
     finally:
         for future in waiting:
             future.cancel()
+
+
+# --- one line, over all frames ------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class LineFollower:
+    """Follows the line of a pattern of one (§3.3) through frames in order, sorted by pulse."""
+
+    read: Read
+    setup: Setup
+    settings: Settings
+    """As of `ColdMeasurer`."""
+
+    def __call__(self, frames: Iterable[int]) -> Generator[FrameResult]:
+        """Measure frames; see `runner.Measurer`. Results come a stretch at a time."""
+        from labapp.core.sequence.line_frame import LineFrame
+        from labapp.core.sequence.line_track import LineTracker, track_line
+
+        tracker, numbers = LineTracker(), iter(frames)
+        while chosen := list(islice(numbers, FOLLOWED_AT_ONCE)):
+            begun = [(number, _read(self.read, number, self.settings)) for number in chosen]
+            seen = [frame for _, frame in begun if isinstance(frame, Frame)]
+            steps = np.diff([np.nan if one.time_s is None else one.time_s for one in seen])
+            step = float(np.median(steps)) if len(steps) else 0.0
+            film = track_line((one.image for one in seen), 1 / step if step > 0 else None,
+                              tracker=tracker)  # fmt: skip
+            pulses = film.pulses
+            followed = zip(film.lines, pulses.on.tolist(), pulses.probability.tolist(), strict=True)
+            for number, frame in begun:
+                if isinstance(frame, FrameResult):
+                    yield frame
+                    continue
+                lines = LineFrame.of_track(*next(followed))
+                found = Measurement(lines.status, lines.reason, self.settings.scheme, lines=lines)
+                status = setup_status(self.setup.rig)
+                yield FrameResult(number, frame.time_s, replace(found, setup_status=status))
 
 
 # --- each frame from the one before -------------------------------------------------------------

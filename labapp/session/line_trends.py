@@ -21,6 +21,13 @@ LINE_QUANTITIES = (
 """Name, words and unit of what is followed; the height only where lines determine it."""
 
 
+TRACK_QUANTITIES = (
+    ("shift_px", "Shift of the line", "px"),
+    ("tilt_px", "Tilt of the line", "px"),
+    ("bend_px", "Bend of the line", "px"),
+)
+"""The same of one line that is followed (`TrackedLine`)."""
+
 FEWEST = 60
 """States are read from changes over some tens of frames: from so many that follow on each other."""
 
@@ -34,7 +41,9 @@ class LineTrend(ReadOnlyArrays):
     stale: BoolArray
     """Which results no longer stand, shape (n,)."""
     values: dict[str, FloatArray]
-    """By the names of `LINE_QUANTITIES`, shape (n,); NaN where unknown."""
+    """By the names of `LINE_QUANTITIES`, or of `TRACK_QUANTITIES` where a line is followed, shape
+    (n,); NaN where unknown.
+    """
     height_sigma_mm: FloatArray
     """Of the pool's height, without the set-up's part, shape (n,)."""
     states: tuple[State, ...]
@@ -68,6 +77,17 @@ def line_trend(session: SessionContents) -> LineTrend:
             stale.append(old)
             found.append(result.measurement.lines)
     place = np.searchsorted(seen.frame, np.array(numbers, np.int64))
+    if any(one.track is not None for one in found):
+        return LineTrend(
+            frame=np.array(numbers, np.int64),
+            stale=np.array(stale, bool),
+            values={
+                name: np.array([getattr(one.track, name, np.nan) for one in found], float)
+                for name, *_ in TRACK_QUANTITIES
+            },
+            height_sigma_mm=np.full(len(found), np.nan),
+            states=(),
+        )
     enough = len(found) >= FEWEST and bool((np.diff(place) == 1).all())
     sure = [one.surface if one.status == "ok" else None for one in found]
     values = {

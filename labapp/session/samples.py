@@ -22,6 +22,8 @@ class SampleSession:
     recording: str
     """The recording's name in the folder."""
     record: Record
+    frame_rate_hz: float | None = None
+    """Of a recording without a time base that says it."""
 
 
 SIMULATED = "Simulated: labapp.simulation.samples."
@@ -63,6 +65,15 @@ SAMPLES = {
         "recording",
         Record(title="A concave pool", operator="labapp", notes=SIMULATED),
     ),
+    "five_lines": SampleSession(
+        "recording.avi",
+        Record(title="Five lines, §3.2.1", operator="labapp", notes=SIMULATED),
+    ),
+    "gmaw": SampleSession(
+        "recording.tif",
+        Record(title="One line on a GMAW pool, §3.3", operator="labapp", notes=SIMULATED),
+        frame_rate_hz=1500.0,
+    ),
 }
 
 
@@ -96,7 +107,8 @@ def begin_session(name: str, path: Path) -> Session:
         on_failure.callback(path.unlink)
         on_failure.callback(session.close)
         session.set_setup((folder / "setup.toml").read_text("utf-8"))
-        session.calibrate_plane(folder / "calibration.png", UNIT_MM)
-        session.import_recording(folder / sample.recording)
+        if (folder / "calibration.png").exists():
+            session.calibrate_plane(folder / "calibration.png", UNIT_MM)
+        session.import_recording(folder / sample.recording, frame_rate_hz=sample.frame_rate_hz)
         on_failure.pop_all()
     return session

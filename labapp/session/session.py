@@ -361,7 +361,7 @@ class Session(SessionContents):
             If the setup is incomplete, or a result cannot be saved; at the end, if frames are no
             longer those that were imported.
         """
-        from labapp.run.measurers import ColdMeasurer, WarmMeasurer
+        from labapp.run.measurers import ColdMeasurer, LineFollower, WarmMeasurer
         from labapp.run.runner import run
         from labapp.session.file.blobs import fingerprint
         from labapp.session.measured import Basis
@@ -382,9 +382,12 @@ class Session(SessionContents):
             self._results.put(number, measurement, basis, made_with)
 
         given = (self.frame, basis.setup, basis.settings, self._by_hand)
-        lines = basis.setup.line_rig is not None  # each frame by itself; nothing judges the set-up
+        rig = basis.setup.line_rig
+        lines = rig is not None  # each frame by itself; nothing judges the set-up
         by_itself = lines or not warm
         measurer: Measurer = ColdMeasurer(*given, pool) if by_itself else WarmMeasurer(*given)
+        if rig is not None and rig.pattern.count == 1:
+            measurer = LineFollower(*given[:3])
         numbers = (int(number) for number in chosen)
         try:
             for result in run(numbers, measurer, [keep, *sinks]):

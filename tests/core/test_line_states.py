@@ -29,7 +29,7 @@ def run_series(seed: int, noise: float = 0.004) -> tuple[LineSeries, list[str]]:
     unknown = rng.random(200) < 0.15
     bend[unknown], width[unknown] = np.nan, np.nan
     bend[::37] = 0.2  # a wrong surface now and then
-    return LineSeries(np.where(lit, count, 0), width, bend), truth
+    return LineSeries(np.where(lit, count, 0), width, bend * width), truth
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -42,9 +42,15 @@ def test_states_of_a_run(seed: int):
 
 def test_a_steady_pool_neither_grows_nor_flattens():
     rng = np.random.default_rng(4)
-    bend = -0.06 + 0.004 * rng.normal(size=120)
-    series = LineSeries(np.full(120, 5), 6.0 + 0.05 * rng.normal(size=120), bend)
+    turn = -0.36 + 0.024 * rng.normal(size=120)
+    series = LineSeries(np.full(120, 5), 6.0 + 0.05 * rng.normal(size=120), turn)
     assert set(line_states(series)) == {"concave"}
+
+
+def test_frames_without_a_surface_keep_the_state_before_them():
+    turn = np.concatenate([np.full(100, -0.3), np.full(40, np.nan)])
+    width = np.where(np.isfinite(turn), 6.0, np.nan)
+    assert set(line_states(LineSeries(np.full(140, 5), width, turn))) == {"concave"}
 
 
 def test_lasting_changes_of_the_number_of_lines():

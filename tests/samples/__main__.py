@@ -8,12 +8,13 @@ from pathlib import Path
 
 from labapp.simulation.recording import TARGET
 from labapp.simulation.target import target_svg
+from tests.samples.lines import line_samples
 from tests.samples.runs import samples
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Write each sample into a folder of its own."""
-    every = {sample.name: sample for sample in samples()}
+    every = {sample.name: sample for sample in (*samples(), *line_samples())}
     parser = argparse.ArgumentParser(prog="python -m tests.samples", description=__doc__)
     parser.add_argument("folder", type=Path, help="where the folders of the samples go")
     parser.add_argument("--only", choices=every, metavar="NAME", help="write this sample alone")

@@ -12,6 +12,7 @@ import pytest
 from labapp.errors import InputError
 from labapp.session import samples
 from labapp.session.copies import copy_sample
+from labapp.session.line_trends import line_trend
 from labapp.session.samples import SAMPLES, sample_folder
 from labapp.session.session import Session
 
@@ -23,9 +24,16 @@ EXPECTED = {
 }
 
 
-def truth(name: str, column: str) -> np.ndarray:
+def texts(name: str, column: str) -> list[str]:
     with (sample_folder(name) / "truth.csv").open(encoding="utf-8") as file:
-        return np.array([float(row[column]) for row in csv.DictReader(file)])
+        return [row[column] for row in csv.DictReader(file)]
+
+
+def truth(name: str, column: str) -> np.ndarray:
+    return np.array([float(text) for text in texts(name, column)])
+
+
+LINES = ("five_lines", "gmaw")
 
 
 @pytest.fixture(params=SAMPLES)
@@ -33,6 +41,7 @@ def name(request: pytest.FixtureRequest) -> str:
     return str(request.param)
 
 
+@pytest.mark.parametrize("name", EXPECTED)
 def test_a_sample_session_is_whole_and_near_the_truth(name: str):
     path = sample_folder(name) / f"{name}.labsession"
     before = path.read_bytes()
@@ -49,6 +58,32 @@ def test_a_sample_session_is_whole_and_near_the_truth(name: str):
         assert np.abs(error).max() < 0.03
         assert session.frame(int(session.frames[-1])).image.any()
     assert path.read_bytes() == before
+
+
+@pytest.mark.parametrize("name", LINES)
+def test_a_session_of_lines_is_whole_and_near_the_truth(name: str):
+    with Session.open(sample_folder(name) / f"{name}.labsession", read_only=True) as session:
+        assert session.problems() == []
+        assert session.record == SAMPLES[name].record
+        seen = session.overview()
+        assert not seen.stale.any()
+        if name == "gmaw":
+            on = [state == "on" for state in texts(name, "pulse")]
+            assert [status == "pulse" for status in seen.status] == on
+            assert set(seen.status) == {"followed", "pulse"}
+            v, measured = truth(name, "line_v_px"), line_trend(session).values["shift_px"]
+            known = np.isfinite(measured)
+            assert np.corrcoef(measured[known], v[known])[0, 1] > 0.9
+            return
+        found = line_trend(session)
+        height = found.values["pool_height_mm"]
+        known = np.isfinite(height)
+        assert known.mean() > 0.6
+        error = height / (truth(name, "height_mm") + truth(name, "depth_mm")) - 1
+        assert np.median(np.abs(error[known])) < 0.08
+        assert np.abs(error[known]).max() < 0.25
+        right = [a == b for a, b in zip(found.states, texts(name, "state"), strict=True)]
+        assert np.mean(right) > 0.9
 
 
 def test_links_beside_the_copy_of_a_sample_are_not_followed(name: str, tmp_path: Path):

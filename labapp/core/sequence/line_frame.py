@@ -12,11 +12,18 @@ from labapp.core.images.dots import Image
 from labapp.core.images.light_lines import LightLine, LineSettings, find_lines
 from labapp.core.images.line_correction import LineCorrection
 from labapp.core.images.line_numbers import LinesSeen, number_lines
+from labapp.core.sequence.line_track import TrackedLine
 from labapp.core.surface.line_data import line_data
 from labapp.core.surface.line_fit import LineFitSettings, LineSurface, fit_lines
 from labapp.core.values import CannotMeasure, FloatArray, IntArray
 
 FOLDED = "the pool gathers the lines to points: they show how many they are, and no shape"
+
+FOLLOWED = {
+    "pulse": "a pulse of the current outshines the line",
+    "line-lost": "the line is not where it is expected",
+}
+"""Why there is no line of a pattern of one in a frame."""
 
 UNNUMBERED = "the lines, or the numbers given by hand, are not those of neighbours in the pattern"
 
@@ -71,13 +78,17 @@ class LineFrame:
     ----------
     status
         ``ok``; ``profile`` where the lines leave a direction of the surface open; ``no-lines``,
-        ``folded-lines``, ``too-few-lines``, ``line-numbers``, ``no-surface``.
+        ``folded-lines``, ``too-few-lines``, ``line-numbers``, ``no-surface``. Of one line that is
+        followed: ``followed``, ``pulse``, ``line-lost``.
     reason
         One sentence where there is no surface; empty otherwise.
     seen, features
         The lines, and what they show.
     surface
         The surface nearest to them; a measurement only where the status is ``ok``.
+    track, pulse
+        Of a pattern of one line: where it was followed to, None where it was not; the probability
+        that a pulse of the current is on, NaN in other patterns.
     """
 
     status: str
@@ -85,6 +96,17 @@ class LineFrame:
     seen: LinesSeen
     features: LineFeatures
     surface: LineSurface | None
+    track: TrackedLine | None = None
+    pulse: float = float("nan")
+
+    @classmethod
+    def of_track(cls, track: TrackedLine | None, on: bool, pulse: float) -> LineFrame:
+        """A frame of one line that is followed; ``on``: a pulse outshines it."""
+        status = "pulse" if on else "line-lost" if track is None else "followed"
+        reason = FOLLOWED.get(status, "")
+        nothing = LinesSeen((), False, False, 0)
+        features = LineFeatures(0 if track is None else 1)
+        return cls(status, reason, nothing, features, None, track, pulse)
 
 
 def measure_lines(

@@ -23,6 +23,7 @@ import numpy as np
 from scipy.ndimage import label
 
 from labapp.core.sequence.line_frame import LineFrame
+from labapp.core.surface.line_fit import LEAST_LINES
 from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 
 State = Literal["no-pool", "growing", "concave", "flattening", "convex"]
@@ -90,30 +91,28 @@ class LineSeries(ReadOnlyArrays):
         Lines seen.
     width_mm
         Of the pool along X, between the lines' ends; NaN where unknown.
-    curvature_per_mm
-        Of the pool, positive when convex; NaN where unknown or where its sign is in doubt.
+    turn
+        Angle between the surface's normals across the pool, rad, positive when convex; NaN where
+        unknown or where its sign is in doubt.
     """
 
     count: IntArray
     width_mm: FloatArray
-    curvature_per_mm: FloatArray
-
-    @property
-    def turn(self) -> FloatArray:
-        """Angle between the surface's normals across the pool, rad, positive when convex."""
-        return self.curvature_per_mm * self.width_mm
+    turn: FloatArray
 
     @classmethod
     def of(cls, frames: Sequence[LineFrame]) -> LineSeries:
         """Collect the series from frames in order."""
         count = np.array([one.features.count for one in frames], np.int64)
-        width, curvature = np.full(len(frames), np.nan), np.full(len(frames), np.nan)
+        width, turn = np.full(len(frames), np.nan), np.full(len(frames), np.nan)
         for k, one in enumerate(frames):
             surface = one.surface
-            if surface is not None and surface.margin >= SURE_MARGIN and len(surface.numbers) > 2:
-                width[k] = surface.width_mm
-                curvature[k] = surface.curvature_per_mm
-        return cls(count, width, curvature)
+            if surface is None or len(surface.numbers) < LEAST_LINES:
+                continue
+            if surface.margin >= SURE_MARGIN:
+                width[k] = surface.width_mm if surface.bulges else np.nan
+                turn[k] = surface.curvature_per_mm * surface.width_mm
+        return cls(count, width, turn)
 
 
 def line_states(series: LineSeries, settings: StateSettings | None = None) -> tuple[State, ...]:
@@ -121,15 +120,18 @@ def line_states(series: LineSeries, settings: StateSettings | None = None) -> tu
     settings = settings or StateSettings()
     window = settings.window
     lit = _steady(series.count > 0)
-    width, growth, growth_sigma = local_line(series.width_mm, lit, window)
+    _, growth, growth_sigma = local_line(series.width_mm, lit, window)
     turn, turning, turning_sigma = local_line(series.turn, lit, window)
     grows = _changes(growth, growth_sigma, settings.least_growth_mm, settings)
+    grows = _well_known(grows, series.width_mm)
     grows = lit & _with_corners(grows, series.width_mm, lit)
     grows |= _just_appeared(lit, grows)
     flattens = _changes(turning, turning_sigma, settings.least_turn, settings)
     flattens = lit & ~grows & _ramps(flattens, series.turn, lit & ~grows)
-    # Lines that have just appeared may be too few for a surface.
-    unknown = lit & ~np.isfinite(width)
+    known = np.flatnonzero(np.isfinite(turn))
+    # Lines that have just appeared may be too few for a surface; later, the last state lasts.
+    unknown = np.arange(len(lit)) < known.min(initial=len(lit))
+    turn = np.interp(np.arange(len(lit)), known, turn[known]) if len(known) else turn
     states: list[State] = []
     for k in range(len(lit)):
         if not lit[k]:
@@ -191,7 +193,7 @@ def local_line(
         weights = base * np.maximum(1 - (off / (2 * noise[:, None])) ** 2, 0.0) ** 2 + 1e-9 * base
     typical = np.median(noise[on & np.isfinite(noise)])
     sigma = typical / TUKEY * np.sqrt(np.sum(weights**2 * step**2, axis=1)) / np.maximum(s2, 1e-9)
-    enough = on & (s0 > 0.5) & (determinant > 1e-3)
+    enough = on & (s0 > 3) & (determinant > 1e-3)
     result[:, enough] = np.stack([value, rate, sigma])[:, enough]
     return result[0], result[1], result[2]
 
@@ -212,6 +214,14 @@ def _changes(
     parts, _ = label(known & (fast | _closed(fast)))
     sure = [part for part in np.unique(parts[real]) if np.sum(parts == part) >= LEAST_FRAMES]
     return np.asarray(np.isin(parts, sure) & (parts > 0))
+
+
+def _well_known(change: BoolArray, values: FloatArray) -> BoolArray:
+    """Changes in which at least half of the frames have a value."""
+    parts, count = label(change)
+    known = np.isfinite(values)
+    kept = [part for part in range(1, count + 1) if known[parts == part].mean() >= 0.5]
+    return np.asarray(np.isin(parts, kept) & change)
 
 
 def _with_corners(change: BoolArray, values: FloatArray, on: BoolArray) -> BoolArray:

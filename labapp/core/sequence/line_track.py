@@ -17,7 +17,7 @@ from scipy import signal
 from labapp.core.images.dots import Grey, Image
 from labapp.core.images.light_lines import LineSettings, find_lines
 from labapp.core.images.pulse_light import Pulses, classify_pulses, frame_brightness
-from labapp.core.values import BoolArray, FloatArray
+from labapp.core.values import BoolArray, FloatArray, ReadOnlyArrays
 
 OVERSAMPLE = 8
 """Frequencies tried in the inverse of a recording's length."""
@@ -55,7 +55,7 @@ class TrackSettings:
 
 
 @dataclass(frozen=True)
-class TrackedLine:
+class TrackedLine(ReadOnlyArrays):
     """A line in a frame.
 
     Parameters
@@ -200,13 +200,15 @@ def track_line(
     frames: Iterable[Image],
     frame_rate_hz: float | None,
     settings: TrackSettings | None = None,
+    tracker: LineTracker | None = None,
 ) -> LineFilm:
     """Sort the frames of a recording by pulse, and follow its line in those without one.
 
     The line is read in every frame that is not blinded; what was read in frames that turn out, with
-    the others known, to have a pulse is dropped.
+    the others known, to have a pulse is dropped. ``tracker`` is that of the frames before.
     """
-    tracker, bright, lines = LineTracker(settings), list[float](), list[TrackedLine | None]()
+    tracker = tracker or LineTracker(settings)
+    bright, lines = list[float](), list[TrackedLine | None]()
     for frame in frames:
         bright.append(frame_brightness(frame))
         recent = bright[-RECENT:]

@@ -137,6 +137,11 @@ class LineSurface(ReadOnlyArrays):
         return np.asarray(np.sqrt(np.maximum(np.vecdot(rows @ self.covariance, rows), 0.0)))
 
     @property
+    def bulges(self) -> bool:
+        """Whether height and curvature agree: convex above the work piece, concave below it."""
+        return self.height_mm * self.curvature_per_mm > 0
+
+    @property
     def width_mm(self) -> float:
         """Width of the pool along X, between the ends of the lines, mm."""
         return float(np.ptp(self.point_mm[:, 0]))
@@ -207,7 +212,9 @@ def _status(one: LineSurface, margin: float, settings: LineFitSettings) -> str:
     sure = one.height_sigma_mm <= settings.most_relative_sigma * abs(one.height_mm)
     fits = one.misfit <= settings.most_misfit
     enough = len(np.unique(one.numbers)) >= LEAST_LINES
-    return "ok" if enough and sure and fits and margin >= settings.margin else "profile"
+    return (
+        "ok" if enough and sure and fits and one.bulges and margin >= settings.margin else "profile"
+    )
 
 
 def _differ(one: LineSurface, other: LineSurface) -> bool:

@@ -18,10 +18,11 @@ class FrameStatus(IntEnum):
     """How a frame stands; where several share a pixel, the greatest shows."""
 
     NOT_MEASURED = 0
-    MEASURED = 1
-    CORRECTED = 2
-    DOUBTFUL = 3
-    NOT_MEASURABLE = 4
+    PULSE = 1
+    MEASURED = 2
+    CORRECTED = 3
+    DOUBTFUL = 4
+    NOT_MEASURABLE = 5
 
     @property
     def words(self) -> str:
@@ -31,6 +32,7 @@ class FrameStatus(IntEnum):
 
 WORDS = {
     FrameStatus.NOT_MEASURED: "not measured",
+    FrameStatus.PULSE: "outshone by a pulse of the current",
     FrameStatus.MEASURED: "measured",
     FrameStatus.CORRECTED: "corrected by hand",
     FrameStatus.DOUBTFUL: "in doubt: stands out, or changed since it was measured",
@@ -39,6 +41,7 @@ WORDS = {
 
 TICKS = (
     Tick(FrameStatus.NOT_MEASURED.words, "to do", "", "", ((0.0, 0.12),)),
+    Tick(FrameStatus.PULSE.words, "pulse", "#7a4fb5", "#b08ae6", ((0.0, 0.3),)),
     Tick(FrameStatus.MEASURED.words, "done", "#1d7f45", "#3fae6b", ((0.0, 0.62),)),
     Tick(FrameStatus.CORRECTED.words, "by hand", "#0a6fc2", "#59aef0", ((0.0, 1.0),)),
     Tick(FrameStatus.DOUBTFUL.words, "doubtful", "#c77700", "#e8a23a", ((0.0, 0.3), (0.5, 0.8))),
@@ -57,10 +60,11 @@ def standings(seen: Overview) -> IntArray:
     from labapp.session.trends import doubtful_frames
 
     status = np.array(seen.status, dtype=object)
-    measured, fine = status != "", status == "ok"
+    measured, fine = status != "", np.isin(status, ("ok", "followed"))
     found = np.where(measured, FrameStatus.MEASURED, FrameStatus.NOT_MEASURED)
     found = np.where(seen.corrected & (fine | ~measured), FrameStatus.CORRECTED, found)
     found = np.where(measured & ~fine, FrameStatus.NOT_MEASURABLE, found)
+    found = np.where(status == "pulse", FrameStatus.PULSE, found)
     doubtful = (measured & seen.stale) | (fine & doubtful_frames(seen))
     return np.asarray(np.where(doubtful, FrameStatus.DOUBTFUL, found), np.int64)
 

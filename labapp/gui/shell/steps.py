@@ -177,7 +177,7 @@ def _facts(session: Session, seen: Overview | None) -> Facts:
         problems,
         count=len(seen.frame),
         measured=int(measured.sum()),
-        without=int((measured & (status != "ok")).sum()),
+        without=int((measured & ~np.isin(status, ("ok", "followed", "pulse"))).sum()),
         stale=int(seen.stale.sum()),
     )
 

@@ -33,6 +33,7 @@ from labapp.core.rows import find_lattice, lattice, lattice_growth, row_search
 from labapp.core.rows.correction import Correction
 from labapp.core.schemes import SCHEMES
 from labapp.core.sequence.line_frame import LineFeatures, LineFrame
+from labapp.core.sequence.line_track import TrackedLine
 from labapp.core.surface.boundary import Boundary
 from labapp.core.surface.line_fit import LineSurface
 from labapp.core.surface.measures import Measures
@@ -232,6 +233,7 @@ STORED = {
     "Measurement": Stored(Measurement, fits=_measurement_fits),
     "LineFrame": Stored(LineFrame, fits=_lines_fit),
     "LineCorrection": Stored(LineCorrection, shapes={"number": "k"}, fits=_line_correction_fits),
+    "TrackedLine": Stored(TrackedLine, shapes={"u_px": "n", "v_px": "n"}),
     "LineFeatures": Stored(LineFeatures),
     "LinesSeen": Stored(LinesSeen),
     "LightLine": Stored(

@@ -24,6 +24,9 @@ STATUSES = {
     "no-lines": "No line is seen",
     "folded-lines": "The pool gathers the lines to points: they show how many they are, no shape",
     "too-few-lines": "One line alone determines no surface",
+    "followed": "The line is followed",
+    "pulse": "A pulse of the current outshines the line",
+    "line-lost": "The line is not where it is expected",
     "line-numbers": "More lines than the pattern has, or their numbers are not those of neighbours",
 }
 
@@ -88,12 +91,32 @@ def show_lines(session: Session, frame: int) -> LinesState:
     if found is None:  # a pattern of dots, or a frame that could not be read
         why = result.measurement.reason or "; ".join(result.stale)
         return LinesState("No lines were looked for in this frame: measure it.", why=why)
+    if np.isfinite(found.pulse):
+        return _followed(found, "; ".join(result.stale))
     by_hand = correction is not None
     correction = correction or LineCorrection.of(found.seen)
     words = ("Corrected by hand: " if by_hand else "") + _words(found)
     why = "; ".join(result.stale) or found.reason
     state = LinesState(words, rows=_rows(found, result), why=why, correction=correction)
     return _with_lines(state, line_names(found, correction.number), by_hand, due)
+
+
+def _followed(found: LineFrame, why: str) -> LinesState:
+    """What a frame shows of one line that is followed; it has no edits."""
+    rows = [ResultRow("Pulse", found.pulse, decimals=2, note="Probability that a pulse is on")]
+    track = found.track
+    if track is None:
+        return LinesState(f"{STATUSES[found.status]}.", rows=tuple(rows), why=why)
+    u = np.arange(track.u_px[0], track.u_px[-1] + 1)
+    place = np.stack([u, np.interp(u, track.u_px, track.v_px)], axis=-1)
+    lines = (DrawnLine("1", place, place[[0, -1]], np.zeros(2, bool), folded=False),)
+    rows += [
+        ResultRow("Shift", track.shift_px, unit="px", note="Downwards, from the first frame"),
+        ResultRow("Tilt", track.tilt_px, unit="px", note="Rise over half of its length"),
+        ResultRow("Bend", track.bend_px, unit="px", note="Rise of its ends over its middle"),
+        ResultRow("Agreeing", track.share, decimals=2, note="Share of columns that agree"),
+    ]
+    return LinesState(f"{STATUSES[found.status]}.", lines, rows=tuple(rows), why=why)
 
 
 def _with_lines(state: LinesState, names: Sequence[str], by_hand: bool, due: bool) -> LinesState:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 from PySide6.QtCore import Qt
 from PySide6.QtGui import QAction
@@ -17,11 +16,13 @@ from labapp.core.images.line_correction import (
     number_line,
 )
 from labapp.gui.pages.dots.lines import LinesState
+from labapp.gui.pages.dots.lines_view import LinesOverlay, LinesPanel
+from labapp.gui.pages.page import Page
 from labapp.gui.views.drag_point import SHIFT
 from labapp.gui.views.picture import Tool
 
-if TYPE_CHECKING:
-    from labapp.gui.pages.dots.view import DotsPage
+MakeAction = Callable[[str, str, str, Callable[[], object]], QAction]
+"""Makes an action of the page: its words, its key, what it does in a sentence, and it."""
 
 REACH = 12.0
 """A line is meant by a pointer this near, in points of the screen."""
@@ -29,7 +30,7 @@ REACH = 12.0
 CUT_WHERE = "Click where the line is to be cut (Esc: leave it)"
 
 UNMET = {
-    "lines": "There are no lines to correct: measure the frame",
+    "lines": "There are no lines that can be corrected in this frame",
     "line": "Choose a line first",
     "two": "Choose two lines first",
     "corrected": "This frame is as it was found: nothing was corrected",
@@ -41,12 +42,21 @@ class LinesHand(Tool):
 
     Parameters
     ----------
-    page
-        Whose frame it works on.
+    page, overlay
+        Whose frame it works on, and the lines over its picture.
+    make_action, pointer
+        Makes an action of the page; says where the pointer is in the frame.
     """
 
-    def __init__(self, page: DotsPage) -> None:
-        self._page = page
+    def __init__(
+        self,
+        page: Page,
+        overlay: LinesOverlay,
+        make_action: MakeAction,
+        pointer: Callable[[], tuple[float, float] | None],
+    ) -> None:
+        self._page, self._overlay = page, overlay
+        self._make_action, self._pointer = make_action, pointer
         self.state = LinesState("")
         """What is shown."""
         self.chosen: list[int] = []
@@ -61,11 +71,16 @@ class LinesHand(Tool):
             self._action("Back to automatic", "Ctrl+Backspace",
                          "Forget the corrections of this frame", self.automatic, "corrected"),
         ]  # fmt: skip
+        self.panel = LinesPanel(self.actions)
+        """What stands beside the frame."""
+        listed = self.panel.lines
+        listed.itemSelectionChanged.connect(lambda: self.choose(listed.places))
+        self.panel.number.edited.connect(self.number)
 
     def _action(
         self, text: str, key: str, tip: str, do: Callable[[], object], need: str
     ) -> QAction:
-        action = self._page.action(text, key, tip, do)
+        action = self._make_action(text, key, tip, do)
         self._needs.append((action, action.toolTip(), need))
         action.setEnabled(False)
         return action
@@ -86,15 +101,15 @@ class LinesHand(Tool):
 
     def _draw(self) -> None:
         page, state = self._page, self.state
-        page.lines.show(state.lines, self.chosen)
+        self._overlay.show(state.lines, self.chosen)
         number = 0
         if len(self.chosen) == 1 and state.correction is not None:
             number = int(state.correction.number[self.chosen[0]])
         why = page.locked or ("" if len(self.chosen) == 1 else UNMET["line"])
-        page.lines_panel.show_chosen(self.chosen, CUT_WHERE if self._cuts else "", number, why)
+        self.panel.show_chosen(self.chosen, CUT_WHERE if self._cuts else "", number, why)
         there = {
             "": True,
-            "lines": bool(state.lines),
+            "lines": state.correction is not None and bool(state.lines),
             "line": bool(self.chosen),
             "two": len(self.chosen) == 2,
             "corrected": state.by_hand,
@@ -123,7 +138,7 @@ class LinesHand(Tool):
         if self.state.correction is None or not self.state.lines:
             return None
         line, point, away = nearest_line(self.state.correction.seen.lines, u, v)
-        return (line, point) if away <= REACH * self._page.view.px_per_point else None
+        return (line, point) if away <= REACH * self._overlay.px_per_point else None
 
     def escape(self) -> None:
         """Choose no line; no cut is awaited any more."""
@@ -134,7 +149,7 @@ class LinesHand(Tool):
 
     def cut(self) -> None:
         """Cut the line under the pointer; without one there, where the next click is."""
-        place = self._page.pointer
+        place = self._pointer()
         if place is not None and self._at(*place) is not None:
             self.cut_at(*place)
         else:

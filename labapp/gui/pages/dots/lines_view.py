@@ -68,6 +68,11 @@ class LinesOverlay:
         self._items += [curve, ends]
         self._labels.append((label, line))
 
+    @property
+    def px_per_point(self) -> float:
+        """Pixels of the picture in a point of the screen."""
+        return self._view.px_per_point
+
     def _place_labels(self) -> None:
         for label, line in self._labels:
             u, v = line.ends_px[1]

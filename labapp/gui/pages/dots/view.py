@@ -21,7 +21,7 @@ from labapp.gui.pages.dots.editing import Editor
 from labapp.gui.pages.dots.fitting import Refit
 from labapp.gui.pages.dots.lines import show_lines
 from labapp.gui.pages.dots.lines_hand import LinesHand
-from labapp.gui.pages.dots.lines_view import LinesOverlay, LinesPanel
+from labapp.gui.pages.dots.lines_view import LinesOverlay
 from labapp.gui.pages.dots.overlay import DotsOverlay
 from labapp.gui.pages.dots.panel import DotsPanel
 from labapp.gui.pages.dots.presenter import DetectorNumber, DotsState, Figures, Need
@@ -79,10 +79,10 @@ class DotsPage(Page):
             for commands in (self._edits(), self._frame_commands(), self._keys())
         )
         self._dot_actions = [*edits, *frames, *keys]
-        self.lines_hand = LinesHand(self)
+        self.lines_hand = LinesHand(self, self.lines, self.action, lambda: self.pointer)
         self.dots_panel = DotsPanel(edits, frames, workspace.action_requested.emit, self.refused)
         self.canvas_layout.addWidget(self.view)
-        self.lines_panel = LinesPanel(self.lines_hand.actions)
+        self.lines_panel = self.lines_hand.panel
         self.lines_panel.hide()
         self.panel_layout.addWidget(self.dots_panel)
         self.panel_layout.addWidget(self.lines_panel)
@@ -96,9 +96,6 @@ class DotsPage(Page):
         panel.rows.itemSelectionChanged.connect(
             lambda: self.choose(self.editor.choose_rows, panel.rows.chosen())
         )
-        line_list = self.lines_panel.lines
-        line_list.itemSelectionChanged.connect(lambda: self.lines_hand.choose(line_list.places))
-        self.lines_panel.number.edited.connect(self.lines_hand.number)
         for name in ("row", "column"):
             getattr(panel, name).edited.connect(partial(self._assign, name))
         for field in (panel.reference_row, panel.reference_column):

@@ -8,10 +8,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from labapp.core.values import IntArray
+from labapp.core.sequence.line_track import oscillation_frequency
+from labapp.core.values import FloatArray, IntArray
 from labapp.gui.curves import Axis, Curve, Mark
 from labapp.gui.digits import ResultRow, rounded
-from labapp.session.line_trends import FEWEST, LINE_QUANTITIES, line_trend
+from labapp.session.line_trends import (
+    FEWEST,
+    LINE_QUANTITIES,
+    TRACK_QUANTITIES,
+    line_trend,
+)
 from labapp.session.measured import Overview
 from labapp.session.session import Session
 from labapp.session.signals import Signals
@@ -125,8 +131,8 @@ def _show_lines(session: Session, options: TrendOptions, seen: Overview) -> Tren
             marks=MARKS,
             decimals=0 if name == "count" else 3,
         )
-        for name, words, unit in LINE_QUANTITIES
-        if (known := np.isfinite(values := found.values[name])).any()
+        for name, words, unit in LINE_QUANTITIES + TRACK_QUANTITIES
+        if name in found.values and (known := np.isfinite(values := found.values[name])).any()
     ]
     if session.signals is not None and timed:
         curves += _signal_curves(session.signals, seen, options.shown)
@@ -134,18 +140,31 @@ def _show_lines(session: Session, options: TrendOptions, seen: Overview) -> Tren
         f"{state} {first}–{last}" if last > first else f"{state} {first}"
         for state, first, last in found.stretches()
     )
+    words = f"States by frame: {states}." if states else NO_STATES
+    if "shift_px" in found.values:
+        words = _followed(x, found.values["shift_px"], timed)
     return TrendsState(
         curves=tuple(curves),
         axis=Axis("Time", "s", span=span) if timed else Axis("Frame", "", 0, span=span),
         places=places,
         rows=(),
-        words=f"States by frame: {states}." if states else NO_STATES,
+        words=words,
         setup_words=session.setup_words,
         spectrum=(),
         spectrum_axis=Axis("Frequency", "Hz" if timed else "1/frame", 2 if timed else 4),
         spectrum_words="",
         signals_words=_told_signals(session.signals, seen, timed),
     )
+
+
+def _followed(x: FloatArray, shift_px: FloatArray, timed: bool) -> str:
+    """How often a line was followed, and its strongest oscillation."""
+    known = np.isfinite(shift_px)
+    words = f"The line is followed in {known.sum()} of {len(x)} frames."
+    hertz, strength = oscillation_frequency(x[known], shift_px[known]) if timed else (np.nan, 0.0)
+    if np.isfinite(hertz):
+        words += f" Strongest oscillation of its shift: {hertz:.1f} Hz, {strength:.0%} of it."
+    return words
 
 
 def _curve(course: Trend) -> Curve:
