@@ -388,6 +388,7 @@ class MainWindow(QMainWindow):
         found = self.workspace.run_or_report(find)
         if found is not None:
             self.empty.show_lead(page.key, found)
+            self.empty.setAccessibleName(step.title)
         self.stack.setCurrentWidget(page if found is None else self.empty)
 
     def _frame_changed(self, frame: int) -> None:
