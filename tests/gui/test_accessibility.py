@@ -248,7 +248,7 @@ def test_f6_goes_through_the_parts_of_the_window(opened: MainWindow, qtbot: QtBo
     opened.say("The recording is gone", True)
     parts.append(opened.status_line)
     QTest.keyClick(opened, Qt.Key.Key_F6, Qt.KeyboardModifier.ShiftModifier)
-    assert QApplication.focusWidget() is opened.status_line.read_button
+    assert QApplication.focusWidget() is opened.status_line.dismiss_button
 
 
 def test_f6_comes_back_to_where_the_keys_were(opened: MainWindow):

@@ -158,9 +158,8 @@ class Hands:
         return page
 
     def read(self) -> None:
-        """Read the problem that is told, and hide the messages again."""
-        self.press("Read")
-        self.do("log")
+        """Take the problem off the status line."""
+        self.press("Dismiss")
 
     def do(self, name: str) -> None:
         """Do an action of the menus."""

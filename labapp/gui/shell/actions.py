@@ -373,7 +373,7 @@ HELP = (
         "log_folder",
         "Show the &log folder",
         "",
-        "Open the folder with the log, which tells what went wrong in full",
+        "Open the folder with the log, which has every error in full",
     ),
     Action("about", "&About labapp", "", "Version, licence and what it is built on", begins=True),
 )

@@ -134,9 +134,9 @@ def test_the_bench_counts_what_comes_back(empty: Session) -> None:
 
 def test_a_tick_is_kept_with_its_time(empty: Session) -> None:
     (first, _), (second, _), *_ = SAFETY
-    tick(empty, first, True, "2026-11-21T10:00:00+01:00")
-    tick(empty, second, True, "2026-11-21T10:01:00+01:00")
-    tick(empty, first, False, "2026-11-21T10:02:00+01:00")
+    empty.set_record(tick(empty.record, first, True, "2026-11-21T10:00:00+01:00"))
+    empty.set_record(tick(empty.record, second, True, "2026-11-21T10:01:00+01:00"))
+    empty.set_record(tick(empty.record, first, False, "2026-11-21T10:02:00+01:00"))
     assert empty.record.safety == ((second, "2026-11-21T10:01:00+01:00"),)
     empty.undo()
     assert dict(empty.record.safety)[first].startswith("2026-11-21T10:00")

@@ -156,7 +156,7 @@ class LaserPage(Page):
         self.table = _ReadingsTable()
         self.table.itemChanged.connect(self._cell_changed)
         readings = wrapping_label("Readings, mm: three lines or more")
-        self.use_button = button("Use these", "", self.use)
+        self.use_button = button("Apply", "", self.use)
         self.words = wrapping_label()
         self.result = ResultTable("The laser that follows")
         self.in_use = ResultTable("Laser in use")

@@ -30,7 +30,7 @@ from labapp.gui.widgets.labels import Message, heading, show_words, wrapping_lab
 from labapp.gui.widgets.layouts import fill, hbox
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
-from labapp.session.checklist import EQUIPMENT, SAFETY, STEPS, Items, tick
+from labapp.session.checklist import EQUIPMENT, SAFETY, STEPS, Items, tick, ticked
 from labapp.session.session import Session
 
 ENTRIES = {entry.key: entry for _, entries in RIG for entry in entries}
@@ -106,11 +106,11 @@ class SetupPage(Page):
         self.sigma_words.setText(shown.sigma_words)
         for name, noted in self.record_fields.items():
             noted.set_value(getattr(shown.record, name))
-        ticked = dict(shown.record.safety)
+        times = dict(ticked(shown.record))
         for item, box in (self.ticks | self.steps).items():
-            box.setChecked(item in ticked)
-            self._times[item].setText(f"ticked {_clock(ticked[item])}" if item in ticked else "")
-        self.tabs.setTabText(SAFETY_TAB, f"Safety {len(ticked.keys() & self.ticks)}/{len(SAFETY)}")
+            box.setChecked(item in times)
+            self._times[item].setText(f"ticked {_clock(times[item])}" if item in times else "")
+        self.tabs.setTabText(SAFETY_TAB, f"Safety {len(times.keys() & self.ticks)}/{len(SAFETY)}")
         self.tabs.setTabText(BENCH_TAB, "Bench ⚠" if shown.problems or shown.missing else "Bench")
         show_words(self.others, "\n".join(shown.others))
         basis = (session.setup_text, shown.record)
@@ -199,14 +199,16 @@ class SetupPage(Page):
             boxes[item], self._times[item] = box, time
         return page
 
-    def _tick(self, item: str, ticked: bool) -> None:
+    def _tick(self, item: str, on: bool) -> None:
         now = datetime.now().astimezone().isoformat(timespec="seconds")
-        if not self.workspace.attempt(lambda session: tick(session, item, ticked, now)):
-            (self.ticks | self.steps)[item].setChecked(not ticked)
+        if not self.workspace.attempt(
+            lambda session: session.set_record(tick(session.record, item, on, now))
+        ):
+            (self.ticks | self.steps)[item].setChecked(not on)
 
     def _bench(self) -> QWidget:
         form = FieldForm()
-        load = button("Load…", "Take the whole set-up from a setup file (TOML)", self._choose_load)
+        load = button("Load…", "Take all of the set-up from a setup file (TOML)", self._choose_load)
         save = button("Save…", "Write the set-up to a file, for another session", self._choose_save)
         usual = button(
             "Use defaults",
