@@ -175,6 +175,8 @@ class Hands:
             for widget in self.window.findChildren(kind)
             if widget.isVisible() and words_of(widget).replace("&", "") == words
         ]
+        if len(there) > 1:  # what leads on from an empty page is in its panel, too
+            there = [each for each in there if not self.window.empty.isAncestorOf(each)]
         if len(there) != 1:
             raise self.fail(f"{len(there)} of “{words}” are in view, not one")
         return self.reveal(there[0])
