@@ -324,6 +324,7 @@ def test_what_is_no_session_is_refused_in_words(plain: MainWindow, tmp_path: Pat
     assert not plain.files.open(tmp_path / "gone.labsession")
     assert len(problems(plain)) == 2
     assert plain.stack.currentWidget() is plain.welcome
+    assert "gone.labsession" in plain.welcome.refused.text()
 
 
 def drop(window: MainWindow, qtbot: QtBot, *paths: Path) -> None:
