@@ -434,8 +434,9 @@ def checklist(
         now = datetime.now().astimezone().isoformat(timespec="seconds")
         for ticked, numbers in ((True, tick), (False, untick)):
             for number in numbers or ():
-                lists.tick(session, items[number - 1], ticked, now)
-        times, number = dict(session.record.safety), 0
+                item = items[number - 1]
+                session.set_record(lists.tick(session.record, item, ticked, now))
+        times, number = dict(lists.ticked(session.record)), 0
         for name, some in lists.LISTS.items():
             typer.echo(f"{name}: {sum(item in times for item, _ in some)} of {len(some)}")
             for item, meaning in some:

@@ -1,23 +1,23 @@
 """The lists of Appendix II: safety, equipment and the steps of an experiment, to be ticked.
 
-Items go into session files with the time of their tick: they stay as they are.
+Items go into session files with the time of their tick: one that is renamed is in `FORMER`.
 """
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-from labapp.session.session import Session
+from labapp.session.record import Record
 
 Items = tuple[tuple[str, str], ...]
 
 SAFETY: Items = (
     (
         "Laser points at nobody's eyes",
-        "It is of class IIIb: never into the beam, nor into its reflection on metal.",
+        "It is of class 3B: never into the beam, nor into its reflection on metal.",
     ),
     ("Laser goggles are worn", "By everybody in the room, for 685 nm."),
-    ("Welding goggles are worn", "The arc is bright enough to hurt the eyes."),
+    ("Welding helmet is worn", "The arc is bright enough to hurt the eyes."),
     ("Welding clothes are worn", "Metal splatters."),
     ("Hands stay off the arc", "Arc, torch and work piece are very hot."),
     ("Water cooling is on", "Before the welding machine is switched on."),
@@ -35,7 +35,7 @@ EQUIPMENT: Items = (
     ("Imaging plane", "As simple as paper on a square glass."),
     ("Camera with its filter", "A band-pass of 20 nm round the laser's wavelength."),
     ("Goggles for the laser", "For 685 nm."),
-    ("Welding goggles and clothes", "For everybody near the arc."),
+    ("Welding helmet and clothes", "For everybody near the arc."),
 )
 
 STEPS: Items = (
@@ -57,16 +57,27 @@ STEPS: Items = (
     ),
     (
         "6 Weld and record",
-        "Cooling and gas on, goggles on; 65 to 75 A; start the platform and the camera. At the end "
-        "switch the machine off.",
+        "Cooling and gas on, goggles and helmet on; 65 to 75 A; start the platform and the camera. "
+        "At the end switch the machine off.",
     ),
 )
 
 LISTS = {"Safety": SAFETY, "Equipment": EQUIPMENT, "Steps": STEPS}
 
 
-def tick(session: Session, item: str, ticked: bool, now: str) -> None:
-    """Tick an item of a list at a time (ISO 8601), or take its tick away."""
-    kept = tuple(pair for pair in session.record.safety if pair[0] != item)
-    safety = (*kept, (item, now)) if ticked else kept
-    session.set_record(replace(session.record, safety=safety))
+FORMER = {
+    "Welding goggles are worn": "Welding helmet is worn",
+    "Welding goggles and clothes": "Welding helmet and clothes",
+}
+"""Names of items in older sessions, and their names now."""
+
+
+def ticked(record: Record) -> tuple[tuple[str, str], ...]:
+    """The items that are ticked, by their names now, and when (ISO 8601)."""
+    return tuple((FORMER.get(item, item), time) for item, time in record.safety)
+
+
+def tick(record: Record, item: str, on: bool, now: str) -> Record:
+    """The record with an item of a list ticked at a time (ISO 8601), or its tick taken away."""
+    kept = tuple(pair for pair in ticked(record) if pair[0] != item)
+    return replace(record, safety=(*kept, (item, now)) if on else kept)

@@ -91,7 +91,7 @@ def show(session: Path, folder: Path) -> tuple[str, ...]:
             assert window.page.key == key
         window.workspace.foot_switches.look()
         until("foot switches", lambda: window.workspace.foot_switches.found is not None)
-        window.measure_all()
+        window.do("measure")
         until("measured", lambda: not window.workspace.tasks.active)
         for key in TOOLS:  # some begin to calculate for minutes
             until(key, show_tool(key, window.files, window).isVisible)

@@ -76,7 +76,7 @@ def work(path: Path, recording: Path, pipe: int) -> None:
             page.import_chosen()  # type: ignore[attr-defined]
 
     if len(session.frames):
-        window.measure_all()
+        window.do("measure")
     else:
         window.files.take(recording)
         begin()

@@ -57,11 +57,11 @@ EDITING = (
 
 PURPOSES = {
     "setup": ("Usual values", "Load…", "Laser goggles are worn", "Water cooling is on"),
-    "laser": ("Use these",),
-    "plane": ("Load picture…", "Find O′ and the axes", "Use"),
-    "bench_check": ("Add picture…", "Which pictures help most?", "Check", "Use", "Remove"),
+    "laser": ("Apply",),
+    "plane": ("Load picture…", "Find O′ and the axes", "Apply"),
+    "bench_check": ("Add picture…", "Which pictures help most?", "Check", "Apply", "Remove"),
     "capture": (
-        *("Choose a file …", "New session from this recording …", "Import"),
+        *("Choose file…", "New session from this recording …", "Import"),
         *("Start", "● Record", "Mark", "Take a frame", "Learn a pedal"),
         *("Lines of JSON over TCP", "Other machines may connect", "Acknowledge"),
         "Stop the camera",

@@ -113,13 +113,13 @@ def test_a_pedal_is_learned_by_pressing_it_and_kept(
     assert panel.learned_words.text() == "VEC Infinity foot pedal: pedal 2 was pressed."
     assert panel.action.value() == "trigger"  # what none does yet
     hand.choose(panel.action, DOES["next"])
-    hand.button("Use it")
+    hand.button("Apply")
     assert panel.learned.isHidden()
     qtbot.waitUntil(connected(window))
     qtbot.waitUntil(lambda: panel.words.text() == "● VEC Infinity foot pedal: connected")
     learn(window, bench, PCSENSOR, "0000050000000000", "0000000000000000", qtbot=qtbot)
     assert panel.learned_words.text() == "PCsensor FootSwitch: key B was pressed."
-    hand.button("Use it")
+    hand.button("Apply")
     qtbot.waitUntil(connected(window, PCSENSOR))
     assert [field.value() for field in panel.pedals.values()] == ["next", "trigger"]
     kept = read_preferences(window.preferences.path)[0].foot_switches
@@ -149,7 +149,7 @@ def test_a_press_that_is_learned_does_nothing_else(
     assert panel.action.value() == "next"  # what it does already
     qtbot.wait(150)
     assert window.page.key == "capture"
-    Hand(window).button("Not this one")
+    Hand(window).button("Discard")
     bench.press(INFINITY, *RIGHT)
     qtbot.waitUntil(lambda: window.page.key == "dots")
     qtbot.waitUntil(lambda: not window.workspace.tasks.active)
@@ -262,7 +262,7 @@ def test_unplugged_is_said_and_it_comes_back_by_itself(start, bench: Bench, copy
         assert window.status_line.unread == ["VEC Infinity foot pedal: it was unplugged"]
         bench.devices[INFINITY].plugged = True
         qtbot.waitUntil(lambda: panel.words.text().startswith("● VEC"))
-        window.read_messages()
+        window.status_line.mark_read()
         window.show_step("capture")
         bench.press(INFINITY, *RIGHT)
         qtbot.waitUntil(lambda: window.page.key == "dots")

@@ -112,7 +112,7 @@ def test_measuring_is_watched_cancelled_and_gone_on_with(
 
     monkeypatch.setattr(session, "frame", slow)
     window.show_step("trends")
-    window.measure_all()
+    window.do("measure")
     line, kinds = window.status_line, window.timeline.scrubber
     qtbot.waitUntil(lambda: line.bar.value() > 0)
     qtbot.waitUntil(lambda: bool((kinds.kinds == FrameStatus.NOT_MEASURABLE).any()))
@@ -129,7 +129,7 @@ def test_measuring_is_watched_cancelled_and_gone_on_with(
     # What was kept is shown, though nothing follows it.
     qtbot.waitUntil(lambda: int((kinds.kinds != FrameStatus.NOT_MEASURED).sum()) == len(kept))
     read.clear()
-    window.measure_all()
+    window.do("measure")
     idle(window, qtbot)
     assert read == list(range(len(kept), FRAMES))  # nothing is measured twice
     assert set(session.overview().status) == {"no-dots"}

@@ -111,10 +111,10 @@ def test_an_incomplete_set_up_is_forgotten_when_frames_are_measured(
     whole, recording = sample.setup_text, sample.path.parent / "recording.tif"
     opened.workspace.show(Session.create(tmp_path / "new.labsession"))
     assert opened.workspace.attempt(lambda session: session.import_recording(recording))
-    opened.measure_frame()
+    opened.do("measure_frame")
     assert "not complete" in opened.status_line.message.text()
     assert opened.workspace.attempt(lambda session: session.set_setup(whole))
-    opened.measure_frame()
+    opened.do("measure_frame")
     assert opened.status_line.unread == []
     opened.files.close()  # it is not what this is about how long measuring takes
 
@@ -138,7 +138,7 @@ def test_refused_files_are_told_beside_their_buttons(
     page = opened.page
     page.take(wrong)
     qtbot.waitUntil(lambda: "wrong.toml" in page.refused.text())
-    assert stands_beside(page.refused, hand.find("Choose a file …"))
+    assert stands_beside(page.refused, hand.find("Choose file…"))
     opened.show_step("plane")
     page = opened.page
     page.load(wrong)

@@ -14,13 +14,17 @@ from pytestqt.qtbot import QtBot
 from labapp.errors import InputError
 from labapp.gui import dialogs
 from labapp.gui.drafts import drafts, is_draft
+from labapp.gui.pages.dots import DotsPage
+from labapp.gui.pages.export import ExportPage
+from labapp.gui.pages.laser import LaserPage
 from labapp.gui.shell.window import MainWindow
 from labapp.media import open_source
 from labapp.session.copies import move_session, use_setup_of
 from labapp.session.record import Record
 from labapp.session.session import Session
 from tests.gui.conftest import SAMPLES, CopySample, let_draw
-from tests.gui.hand import Hand
+from tests.gui.hand import CONTROL, Hand
+from tests.tour.bench import lay_out, places
 
 FRAMES = 2
 
@@ -264,3 +268,68 @@ def test_a_page_with_nothing_to_show_leads_on(
     assert window.empty.words.height() >= window.empty.words.heightForWidth(
         window.empty.words.width()
     )
+
+
+@pytest.mark.slow
+def test_a_wrong_row_and_the_default_export_take_two_actions_each(
+    window: MainWindow, hand: CountingHand, copy_sample: CopySample
+):
+    assert window.files.open(copy_sample("gtaw"))
+    window.show_step("dots")
+    hand.settle()
+    page, session = window.page, window.workspace.session
+    assert isinstance(page, DotsPage)
+    assert session is not None
+    assert page.seen is not None
+    assert page.seen.correction is not None
+    lattice, row = page.seen.correction.lattice, 5
+    before = lattice.column[lattice.row == row]
+    u, v = page.seen.correction.dots.image_px[lattice.row == row][0]
+    hand.click(page.view.canvas, hand.point(page.view, u, v))
+    hand.actions += 1
+    hand.press_button("Row right")
+    kept = session.correction(window.workspace.frame)
+    assert kept is not None
+    assert kept.lattice.column[kept.lattice.row == row].tolist() == (before + 1).tolist()
+    assert hand.actions == 2
+    session.undo()
+    window.workspace.changed.emit()
+    hand.settle()
+    hand.actions = 0
+    bar = window.step_list
+    hand.click(bar.viewport(), bar.visualItemRect(bar.item(bar.count() - 1)).center())
+    hand.actions += 1
+    hand.press_button("Export")
+    export = window.page
+    assert isinstance(export, ExportPage)
+    assert export.written is not None
+    assert hand.actions == 2
+
+
+def test_laser_and_plane_are_calibrated_from_pictures_in_25_actions(
+    window: MainWindow, hand: CountingHand, tmp_path: Path
+):
+    lay_out(tmp_path / "files")
+    pictures = tmp_path / "files" / "measurements"
+    window.workspace.show(Session.create(tmp_path / "new.labsession"))
+    session = window.workspace.session
+    assert session is not None
+    window.show_step("laser")
+    laser = window.page
+    assert isinstance(laser, LaserPage)
+    hand.choose(laser.way, "from a picture")
+    hand.actions += 2  # open the list, choose
+    hand.choose_file("Load picture…", pictures / "cross_hair.png")
+    for name, place in places().items():
+        laser._points[name].set_place(*place)  # as a drag does
+        hand.actions += 1
+    laser._dragged()
+    hand.press_button("Add as a reading")
+    hand.press_button("Apply")
+    assert session.laser_calibration is not None
+    hand.press(Qt.Key.Key_3, CONTROL)
+    hand.actions += 1
+    hand.choose_file("Load picture…", pictures / "calibration.png")
+    hand.press_button("Apply")
+    assert session.plane_calibration is not None
+    assert hand.actions <= 25

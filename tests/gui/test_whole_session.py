@@ -115,7 +115,7 @@ def calibrate(hand: Hand, qtbot: QtBot) -> None:
     for column, readings in enumerate(CROSS):
         for row, text in enumerate(readings):
             hand.cell(laser.table, row, column, text)
-    hand.button("Use these")
+    hand.button("Apply")
     hand.press(Qt.Key.Key_PageDown, CONTROL)
     plane = page(hand, PlanePage)
     hand.enter(plane.unit, UNIT_MM)
@@ -123,14 +123,14 @@ def calibrate(hand: Hand, qtbot: QtBot) -> None:
     hand.button("Load picture…")
     qtbot.waitUntil(plane.use_button.isEnabled)
     settle(hand, qtbot)
-    hand.button("Use")
+    hand.button("Apply")
 
 
 def take_frames(hand: Hand, qtbot: QtBot, recording: Path) -> None:
     hand.press(Qt.Key.Key_5, CONTROL)
     capture = page(hand, CapturePage)
     hand.answer(recording)
-    hand.button("Choose a file …")
+    hand.button("Choose file…")
     chosen = capture.chosen
     qtbot.waitUntil(chosen.isVisible)
     for field, number in zip((chosen.first, chosen.last, chosen.every), FRAMES, strict=True):

@@ -259,7 +259,7 @@ def test_the_same_again_is_one_line_with_how_often(plain: MainWindow):
 def test_the_status_line_is_as_high_with_a_problem(plain: MainWindow):
     height = plain.status_line.minimumHeight()
     plain.say("The disk is full:\nnothing\ncan be\nwritten", True)
-    assert plain.status_line.read_button.isVisible()
+    assert plain.status_line.dismiss_button.isVisible()
     assert plain.status_line.sizeHint().height() <= height
     assert plain.status_line.message.minimumSizeHint().height() <= height
 
@@ -272,7 +272,7 @@ def test_no_page_in_view_or_hidden_makes_the_window_grow(
     for key in ("setup", "surface"):
         plain.show_step(key)
         plain_page(plain).setMinimumHeight(2000)
-    plain.read_messages()
+    plain.do("log")
     settle(plain, qtbot)
     assert plain.log_panel.isVisible()
     assert plain.minimumSizeHint().height() <= 512
@@ -288,9 +288,11 @@ def test_a_page_that_fails_is_said_and_the_window_stays(
     assert "no export today" in plain.status_line.message.text()
     plain.show_step("surface")
     assert plain_page(plain).key == "surface"
-    plain.status_line.read_button.click()
+    plain.status_line.show_button.click()
     assert plain.log_panel.isVisible()
     assert plain.status_line.unread == []
+    plain.status_line.show_button.click()
+    assert not plain.log_panel.isVisible()
 
 
 def test_a_session_that_is_in_use_is_offered_read_only(
@@ -322,6 +324,7 @@ def test_what_is_no_session_is_refused_in_words(plain: MainWindow, tmp_path: Pat
     assert not plain.files.open(tmp_path / "gone.labsession")
     assert len(problems(plain)) == 2
     assert plain.stack.currentWidget() is plain.welcome
+    assert "gone.labsession" in plain.welcome.refused.text()
 
 
 def drop(window: MainWindow, qtbot: QtBot, *paths: Path) -> None:

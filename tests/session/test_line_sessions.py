@@ -119,7 +119,7 @@ def test_another_kind_of_pattern_takes_the_keys_of_the_former_out(tmp_path: Path
         state = setup_page.shown(session)
         assert state.kind == "square"
         assert state.values["pattern.count"] is None
-        assert "pattern.rows" in state.problems
+        assert "pattern.rows" in state.missing
         setup_page.put_kind(session, "lines")
         setup_page.put_usual(session)
         assert session.setup_problems == ()

@@ -158,9 +158,8 @@ class Hands:
         return page
 
     def read(self) -> None:
-        """Read the problem that is told, and hide the messages again."""
-        self.press("Read")
-        self.do("log")
+        """Take the problem off the status line."""
+        self.press("Dismiss")
 
     def do(self, name: str) -> None:
         """Do an action of the menus."""
@@ -176,6 +175,8 @@ class Hands:
             for widget in self.window.findChildren(kind)
             if widget.isVisible() and words_of(widget).replace("&", "") == words
         ]
+        if len(there) > 1:  # what leads on from an empty page is in its panel, too
+            there = [each for each in there if not self.window.empty.isAncestorOf(each)]
         if len(there) != 1:
             raise self.fail(f"{len(there)} of “{words}” are in view, not one")
         return self.reveal(there[0])

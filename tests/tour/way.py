@@ -121,7 +121,7 @@ def _laser(hands: Hands, files: Path) -> None:
         for column, length in enumerate(CROSS_MM):
             hands.enter_cell(page.table, row, column, f"{length + off_mm:.2f}")
     hands.picture("callipers")
-    hands.press("Use these")
+    hands.press("Apply")
     hands.picture("used")
 
 
@@ -136,7 +136,7 @@ def _plane(hands: Hands, files: Path) -> None:
     known = files / "calibration.png"
     hands.asked("", lambda: hands.press("Load picture…"), give(known))
     hands.picture("found")
-    hands.press("Use")
+    hands.press("Apply")
     hands.picture("used")
     hands.asked("print-target", lambda: hands.press("Save for printing…"))
 
@@ -153,7 +153,7 @@ def _bench_check(hands: Hands, files: Path) -> None:
     hands.press("Check")
     hands.wait(lambda: page.checked, "the bench to be checked")
     hands.picture("checked")
-    hands.press("Use")
+    hands.press("Apply")
     hands.picture("used")
     hands.do("undo")
 
@@ -161,8 +161,8 @@ def _bench_check(hands: Hands, files: Path) -> None:
 def _record(hands: Hands, files: Path) -> None:
     hands.do("next_step")
     hands.picture("none")
-    hands.asked("folder", lambda: hands.press("Choose a folder …"))
-    hands.asked("file", lambda: hands.press("Choose a file …"), give(files / "recording.avi"))
+    hands.asked("folder", lambda: hands.press("Choose folder…"))
+    hands.asked("file", lambda: hands.press("Choose file…"), give(files / "recording.avi"))
     hands.settle()
     hands.enter("Last frame", str(FRAMES - 1))
     hands.picture("chosen")
@@ -202,11 +202,11 @@ def _look_on(hands: Hands, page: CapturePage) -> None:
     hands.wait(lambda: canvas.surface.view.scene, "a live surface")
     hands.picture("live-surface")
     canvas.tabs.setCurrentIndex(list(PARTS).index("trends"))
-    hands.enter("Width, highest", "6")
+    hands.enter("Width, max.", "6")
     hands.wait(canvas.alarms.isVisible, "an alarm")
     hands.picture("live-alarm", trouble=True)
     hands.press("Acknowledge")
-    hands.enter("Width, highest", "9")
+    hands.enter("Width, max.", "9")
     hands.wait(lambda: not canvas.alarms.isVisible(), "the alarm to go")
     hands.read()
     canvas.tabs.setCurrentIndex(streams)
@@ -329,7 +329,7 @@ def _analysis(hands: Hands) -> None:
     for key in ("budget", "measurement"):
         hands.press(tool.parts[key].text())
     hands.enter("Frames of each", "1")
-    hands.press("Work out")
+    hands.press("Run")
     hands.wait(lambda: tool.files and not tool.working, "the thumb tack to be worked out")
     hands.picture("dialog-analysis")
     hands.asked("save-results", lambda: hands.press("Save the results …"))
@@ -387,7 +387,7 @@ def _moved(hands: Hands, folder: Path) -> None:
     hands.picture("missing", trouble=True)
     hands.read()
     found = give(elsewhere / there.name)
-    hands.asked("where-is", lambda: hands.press("Say where it is …"), found)
+    hands.asked("where-is", lambda: hands.press("Locate…"), found)
     hands.picture("found-again")
     hands.do("close")
 
@@ -401,7 +401,7 @@ def _troubles(hands: Hands, files: Path) -> None:
     hands.settle()
     hands.window.files.open_path(files / "damaged.labsession")
     hands.picture("problem", trouble=True)
-    hands.press("Read")
+    hands.press("Messages")
     hands.picture("messages")
     hands.do("log")
 

@@ -28,9 +28,9 @@ NUMBERS = {
 """Label, unit, decimals, step and tip of what is set by a number."""
 
 TRIGGERS = {
-    "free": "by itself, at its rate",
-    "software": "when told: Take a frame",
-    "line": "at a signal on its input",
+    "free": "free run",
+    "software": "by the button Take a frame",
+    "line": "external signal",
 }
 
 APPART = 1e-3
@@ -62,7 +62,7 @@ class CameraFields(QObject):
                 label, unit, lowest=0, highest=1e9, decimals=decimals, step=step, tooltip=tip
             )
         self.trigger = self.fields["trigger"] = ChoiceField(
-            "Frames are taken", tooltip="What the camera waits for before it takes a frame"
+            "Trigger", tooltip="What the camera waits for before it takes a frame"
         )
         self.region = self.fields["region"] = TextField(
             "Region, px",
@@ -75,9 +75,7 @@ class CameraFields(QObject):
         self._make_buttons(form)
 
     def _make_buttons(self, form: FieldForm) -> None:
-        self.whole_button = button(
-            "All of the sensor", "Read the whole sensor again", self._set_whole
-        )
+        self.whole_button = button("Full sensor", "Read all of the sensor again", self._set_whole)
         self.shoot_button = button(
             "Take a frame", "Have the camera take a frame now", self._take_frame
         )

@@ -92,7 +92,7 @@ class LiveTrends(QWidget):
         self.unmeasured.edited.connect(lambda value: self._keep(unmeasured=int(value)))
         self.fields = {
             (name, end): NumberField(
-                f"{name.capitalize()}, {'lowest' if end == 0 else 'highest'}",
+                f"{name.capitalize()}, {'min.' if end == 0 else 'max.'}",
                 lowest=-LARGEST_MM,
                 highest=LARGEST_MM,
                 decimals=3,
@@ -116,7 +116,7 @@ class LiveTrends(QWidget):
 
     def _limits(self) -> QGridLayout:
         grid = QGridLayout()
-        for column, words in enumerate(("Limits (mm)", "lowest", "highest")):
+        for column, words in enumerate(("Limits (mm)", "Min.", "Max.")):
             label = plain_label(words)
             label.setToolTip(RULE)
             grid.addWidget(label, 0, column)

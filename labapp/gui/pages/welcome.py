@@ -59,7 +59,7 @@ class Welcome(FollowsTheme, QWidget):
         )
         for name in BUTTONS:
             made = self.buttons[name] = action_button(name, self.action_requested.emit)
-            made.setMinimumHeight(made.fontMetrics().height() * 2)
+            made.setMinimumSize(1, made.fontMetrics().height() * 2)  # no wider than other pages
         self.buttons[BUTTONS[0]].setDefault(True)
         self.refused = Message(2)
         self.label = plain_label("&Recent sessions")

@@ -37,7 +37,7 @@ class Action:
 FILE = (
     Action(
         "open_recording",
-        "Open &recording…",
+        "Open recor&ding…",
         "Ctrl+Shift+O",
         "See a video, an image or a stack at once, in a session that needs no name yet",
     ),
@@ -78,21 +78,21 @@ FILE = (
     ),
     Action(
         "last_setup",
-        "Use last set-up",
+        "Use las&t set-up",
         "",
         "Take the set-up of the session opened last that has a complete one, and measure",
         needs="changing",
     ),
     Action(
         "other_setup",
-        "Set-up of a session…",
+        "Set-up o&f a session…",
         "",
         "Take set-up and calibrations of another session, and measure",
         needs="changing",
     ),
     Action(
         "enter_setup",
-        "Enter set-up",
+        "Enter set-u&p",
         "",
         "Go to the drawing of the bench and enter its dimensions",
         needs="session",
@@ -150,7 +150,7 @@ EDIT = (
 FRAMES = (
     Action(
         "measure",
-        "&Measure what is not measured",
+        "&Measure all frames",
         "F5",
         "Measure every frame that is not measured, or whose measures no longer stand",
         needs="measuring",
@@ -373,7 +373,7 @@ HELP = (
         "log_folder",
         "Show the &log folder",
         "",
-        "Open the folder with the log, which tells what went wrong in full",
+        "Open the folder with the log, which has every error in full",
     ),
     Action("about", "&About labapp", "", "Version, licence and what it is built on", begins=True),
 )

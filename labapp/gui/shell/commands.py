@@ -13,10 +13,11 @@ from PySide6.QtWidgets import QApplication, QTableView
 from labapp.gui.preferences import THEMES, Preferences, PreferencesStore
 from labapp.gui.shell.focus import go_to_part
 from labapp.gui.shell.help import TITLES, HelpDialog
-from labapp.gui.shell.steps import STEPS
+from labapp.gui.shell.steps import STEPS, why_not_measurable
 from labapp.gui.shell.window import MainWindow
 from labapp.gui.tools import TOOLS, show_tool
 from labapp.gui.widgets.tables import table_text
+from labapp.gui.workspace import MEASURING
 from labapp.log import log_file
 
 FAR = 10**9
@@ -63,8 +64,8 @@ def commands(window: MainWindow) -> dict[str, Callable[[], object]]:
         **{f"step_{step.key}": partial(window.show_step, step.key) for step in STEPS},
         "next_step": lambda: window.go_step(1),
         "previous_step": lambda: window.go_step(-1),
-        "measure": window.measure_all,
-        "measure_frame": window.measure_frame,
+        "measure": lambda: measure(window, None),
+        "measure_frame": lambda: measure(window, [workspace.frame]),
         "cancel": window.status_line.cancel,
         "previous": lambda: timeline.step(-1),
         "next": lambda: timeline.step(1),
@@ -99,6 +100,21 @@ def name_draft(window: MainWindow) -> None:
     window.show_step(key)
     if window.workspace.session is not None and frame in window.workspace.session.frames:
         window.workspace.show_frame(frame)
+
+
+def measure(window: MainWindow, frames: list[int] | None) -> None:
+    """Measure frames; None: those that are not measured, or whose measures no longer stand."""
+    workspace, session = window.workspace, window.workspace.session
+    if session is None:
+        return
+    if frames is None and not len(session.stale_frames()):
+        window.say("Every frame is measured, and its measures stand")
+    elif workspace.measuring is not None:
+        window.say("Frames are being measured already")
+    elif why := why_not_measurable(session):
+        workspace.say_wrong(MEASURING, why)
+    else:
+        workspace.measure(frames)
 
 
 def enter_setup(window: MainWindow) -> None:

@@ -154,7 +154,7 @@ class Files(QObject):
             return True
         if not self.may_close():
             return False
-        session = self.workspace.run_or_report(lambda: self._opened(path))
+        session = self.workspace.run_or_report(lambda: self._opened(path), beside=self.refused.emit)
         if session is None:
             return False
         self._show(session)

@@ -7,15 +7,16 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from PySide6.QtCore import QPointF, QRectF, Qt, Signal
 from PySide6.QtGui import QColor, QPainter, QPaintEvent, QPalette, QPen, QPolygonF
-from PySide6.QtWidgets import QGridLayout, QPushButton, QVBoxLayout, QWidget
+from PySide6.QtWidgets import QGridLayout, QPushButton, QWidget
 
 from labapp.core.values import FloatArray
 from labapp.gui.shell.actions import ACTIONS
 from labapp.gui.shell.steps import Lead, Offer
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.labels import Message, wrapping_label
+from labapp.gui.widgets.layouts import hbox, vbox
 
-WORDS_PX = 460
+WORDS_PX = 340
 PICTURE_PX = (240, 144)
 """Width of the words; size of the picture."""
 
@@ -33,7 +34,9 @@ def action_grid(names: Sequence[str], do: Callable[[str], object]) -> QWidget:
     grid = QGridLayout(made)
     grid.setContentsMargins(0, 0, 0, 0)
     for k, name in enumerate(names):
-        grid.addWidget(action_button(name, do), k // 2, k % 2)
+        pressed = action_button(name, do)
+        pressed.setMinimumWidth(1)  # a narrow panel holds it, too
+        grid.addWidget(pressed, k // 2, k % 2)
     return made
 
 
@@ -49,20 +52,14 @@ class EmptyState(QWidget):
         self.picture = _Picture()
         self.words = wrapping_label()
         self.words.setAlignment(Qt.AlignmentFlag.AlignCenter)
-        self.words.setFixedWidth(WORDS_PX)
         self.refused = Message(2)
-        self.refused.setFixedWidth(WORDS_PX)
         self.buttons: list[QPushButton] = []
-        self._column = QVBoxLayout()
-        outer = QVBoxLayout(self)
-        center = Qt.AlignmentFlag.AlignHCenter
-        outer.addStretch(2)
-        for each in (self.picture, self.words):
-            outer.addWidget(each, 0, center)
-        outer.addSpacing(8)
-        outer.addLayout(self._column)
-        outer.addWidget(self.refused, 0, center)
-        outer.addStretch(3)
+        self._column = vbox()
+        inner = QWidget()
+        inner.setMaximumWidth(WORDS_PX)
+        picture = hbox(1, self.picture, 1)
+        vbox(2, picture, self.words, self._column, self.refused, 3, of=inner).setSpacing(8)
+        hbox(1, (inner, 100), 1, of=self)
 
     def show_lead(self, key: str, lead: Lead) -> None:
         """Show what a step will show, and the buttons that lead there, the first one bold."""
@@ -71,7 +68,6 @@ class EmptyState(QWidget):
         self._shown = key, lead
         self.picture.show_step(key)
         self.words.setText(lead.words)
-        self.words.setFixedHeight(self.words.heightForWidth(WORDS_PX))
         for each in self.buttons:
             each.hide()  # it is deleted only later
             each.deleteLater()
@@ -81,9 +77,8 @@ class EmptyState(QWidget):
             font.setBold(k == 0)
             made.setFont(font)
             made.setDefault(k == 0)
-            made.setFixedWidth(WORDS_PX * 2 // 3)
-            made.setMinimumHeight(made.fontMetrics().height() * (2 if k == 0 else 1) + 10)
-            self._column.addWidget(made, 0, Qt.AlignmentFlag.AlignHCenter)
+            made.setMinimumHeight(made.fontMetrics().height() * (2 if k == 0 else 1) + 8)
+            self._column.addWidget(made)
 
     def _button(self, offer: str | Offer) -> QPushButton:
         if isinstance(offer, Offer):

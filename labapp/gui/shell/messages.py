@@ -83,11 +83,11 @@ class LogPanel(QListWidget):
 class StatusLine(QWidget):
     """The last message, and how far the work under way is.
 
-    A problem stays until it was read or is solved, whatever message follows.
+    A problem stays until it is dismissed or solved, whatever message follows.
     """
 
-    read = Signal()
-    """The operator has read the problems, and wants to see them all."""
+    messages_requested = Signal()
+    """All messages are to be shown, or hidden again."""
 
     def __init__(self, tasks: Tasks) -> None:
         super().__init__()
@@ -95,9 +95,12 @@ class StatusLine(QWidget):
         self.unread: list[str] = []
         self.message = Message(1)
         self.message.setAccessibleName("Last message")
-        tip = "Show all messages, and take the problem off this line (F4)"
-        self.read_button = button("Read", tip, self.read.emit)
-        self.read_button.setAccessibleName("Read the problem")
+        tip = "Take the problem off this line; the messages (F4) still have it"
+        self.dismiss_button = button("Dismiss", tip, self.mark_read)
+        self.dismiss_button.setAccessibleName("Dismiss the problem")
+        tip = "Show or hide all messages (F4)"
+        self.show_button = button("Messages", tip, self.messages_requested.emit)
+        self.show_button.setFocusPolicy(Qt.FocusPolicy.NoFocus)  # it has its key
         self.title = plain_label()
         self.bar = QProgressBar()
         self.bar.setFixedWidth(180)
@@ -108,8 +111,8 @@ class StatusLine(QWidget):
         self.cancel_button.setAccessibleName("Cancel the work under way")
         layout = QHBoxLayout(self)
         layout.setContentsMargins(6, 0, 6, 0)
-        right = (self.title, self.bar, self.cancel_button)
-        fill(layout, self.read_button, (self.message, 1), *right)
+        right = (self.title, self.bar, self.cancel_button, self.show_button)
+        fill(layout, self.dismiss_button, (self.message, 1), *right)
         # What comes and goes must not move the window's other parts.
         self.setMinimumHeight(layout.sizeHint().height())
         tasks.changed.connect(self.show_progress)
@@ -164,4 +167,4 @@ class StatusLine(QWidget):
         font = self.message.font()
         font.setBold(count > 0)
         self.message.setFont(font)
-        self.read_button.setVisible(count > 0)
+        self.dismiss_button.setVisible(count > 0)

@@ -95,7 +95,9 @@ def read_only(session: Session | None) -> str:
 def recording_gone(session: Session) -> str:
     """That the recording is not where it was, and what to do; empty if it is."""
     missing = session.missing_recording
-    return "" if missing is None else f"{missing.name} is not where it was: say where it is now"
+    return (
+        "" if missing is None else f"{missing.name} is not where it was: locate it (step Recording)"
+    )
 
 
 def why_not_measurable(session: Session) -> str:

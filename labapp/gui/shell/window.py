@@ -42,11 +42,10 @@ from labapp.gui.shell.steps import (
     lead,
     read_only,
     states,
-    why_not_measurable,
 )
 from labapp.gui.theme import apply_theme
 from labapp.gui.widgets.timeline import Timeline
-from labapp.gui.workspace import MEASURING, Workspace
+from labapp.gui.workspace import Workspace
 
 if TYPE_CHECKING:
     from labapp.gui.live.view import LiveView
@@ -163,7 +162,7 @@ class MainWindow(QMainWindow):
         self.step_list.chosen.connect(self.show_step)
         self.timeline.moved.connect(space.show_frame)
         self.timeline.jumped.connect(self.jump)
-        self.status_line.read.connect(self.read_messages)
+        self.status_line.messages_requested.connect(lambda: self.do("log"))
         self.welcome.action_requested.connect(self.do)
         self.empty.action_requested.connect(self.do)
         self.welcome.chosen.connect(self.files.open)
@@ -208,13 +207,6 @@ class MainWindow(QMainWindow):
         self.status_line.say(text, problem)
         if problem:
             self.timeline.set_playing(False)
-
-    def read_messages(self) -> None:
-        """Show the messages; the problems count as read."""
-        self._wanted["log"] = True
-        self.status_line.mark_read()
-        self._show_docks()
-        self._show_actions()
 
     def show_step(self, key: str) -> None:
         """Bring a step's page into view; it is made when it is first shown."""
@@ -388,37 +380,12 @@ class MainWindow(QMainWindow):
         found = self.workspace.run_or_report(find)
         if found is not None:
             self.empty.show_lead(page.key, found)
+            self.empty.setAccessibleName(step.title)
         self.stack.setCurrentWidget(page if found is None else self.empty)
 
     def _frame_changed(self, frame: int) -> None:
         self.timeline.set_frame(frame)
         self._show_page()
-
-    # --- measuring --------------------------------------------------------------------------
-
-    def measure_all(self) -> None:
-        """Measure the frames that are not measured, or no longer stand."""
-        session = self.workspace.session
-        if session is not None and not len(session.stale_frames()):
-            self.say("Every frame is measured, and its measures stand")
-        elif session is not None:
-            self._measure(None)
-
-    def measure_frame(self) -> None:
-        """Measure the frame in view."""
-        self._measure([self.workspace.frame])
-
-    def _measure(self, frames: list[int] | None) -> None:
-        session = self.workspace.session
-        if session is None:
-            return
-        if self.workspace.measuring is not None:
-            self.say("Frames are being measured already")
-            return
-        if why := why_not_measurable(session):
-            self.workspace.say_wrong(MEASURING, why)
-            return
-        self.workspace.measure(frames)
 
     # --- look -------------------------------------------------------------------------------
 

@@ -63,7 +63,7 @@ class AdviserWindow(ToolWindow):
             "Save the advice …", "Write words, tables, picture and set-up file to a folder"
         )
         self.use_button = self.add_button(
-            "Use these",
+            "Apply",
             "Put this set-up into the session's; undo brings the old one back",
             self.use,
         )

@@ -56,12 +56,12 @@ class AnalysisWindow(ToolWindow):
             "Save the results …", "Write all tables (CSV, Markdown) and pictures to a folder"
         )
         self.start_button = self.add_button(
-            "Work out", "Work out what is ticked; each part is shown when it is done", self.start
+            "Run", "Compute what is ticked; each part is shown when it is done", self.start
         )
         self.show_state()
 
     def _make_form(self) -> None:
-        self.form.add_heading("What is worked out")
+        self.form.add_heading("What is computed")
         self.parts: dict[str, QCheckBox] = {}
         for key, words, tip in PARTS:
             box = QCheckBox(words)
@@ -118,7 +118,7 @@ class AnalysisWindow(ToolWindow):
         line = FieldForm()
         line.add(self.which)
         self.words = wrapping_label(
-            "Tick what is to be worked out, then press Work out. All of it is simulated; the "
+            "Tick what is to be computed, then press Run. All of it is simulated; the "
             "calibration is taken to be known to 0.1 mm, 0.1° and 0.1 px, a dot to 0.3 px."
         )
         self.words.setAlignment(Qt.AlignmentFlag.AlignTop)
@@ -152,7 +152,7 @@ class AnalysisWindow(ToolWindow):
             field.set_value(value)
 
     def start(self) -> None:
-        """Work out what is ticked, in the background, one part after the other."""
+        """Compute what is ticked, in the background, one part after the other."""
         for field in (*self.sizes.values(), self.step, self.frames, self.draws):
             field.flush()
         ticked = tuple(key for key, box in self.parts.items() if box.isChecked())

@@ -7,6 +7,7 @@ from typing import Any
 import pyqtgraph as pg
 from PySide6.QtCore import Qt
 from PySide6.QtGui import QColor
+from PySide6.QtWidgets import QLayout, QWidget
 
 from labapp.core.values import FloatArray
 from labapp.gui.views.canvas import Drawn
@@ -54,9 +55,9 @@ def paint_axes(plot: pg.PlotWidget | pg.PlotItem, lines: QColor, text: QColor) -
 class Sketch(Drawn):
     """A drawing to scale with words below it; they stand in the middle where nothing is drawn."""
 
-    def __init__(self, name: str, *plots: tuple[pg.PlotWidget, int]) -> None:
+    def __init__(self, name: str, *plots: tuple[pg.PlotWidget | QLayout, int]) -> None:
         super().__init__(name)
-        self._plots = [plot for plot, _ in plots]
+        self._plots = [plot for plot, _ in plots if isinstance(plot, QWidget)]
         self.words = wrapping_label()
         self.words.setMargin(6)
         self._column = vbox(hbox(*plots), self.words, of=self)

@@ -1,14 +1,20 @@
-"""The bench from the side, to scale: laser, torch, pool, imaging plane and the central rays."""
+"""The bench from the side and from above, to scale; its dimensions are fields."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 import pyqtgraph as pg
-from PySide6.QtCore import Qt
-from PySide6.QtGui import QColor, QPalette
+from PySide6.QtCore import QRect, Qt
+from PySide6.QtGui import QColor, QPalette, QResizeEvent
 
+from labapp.core.geometry.rig import Rig
 from labapp.core.values import FloatArray
 from labapp.gui.views.axes import Sketch, draw_line, draw_text, make_plot, paint_axes
+from labapp.gui.views.dimension import DimensionBox
+from labapp.gui.widgets.fields import NumberField
+from labapp.gui.widgets.layouts import vbox
 from labapp.simulation.positioning import Fate, SideView
 
 RED, BLUE = {True: "#ff6b5e", False: "#c62828"}, {True: "#6cb6ff", False: "#1565c0"}
@@ -18,34 +24,91 @@ TORCH_MM, SHOULDER_MM = 14.0, 3.5
 """How far up the torch is drawn, and the radius of its electrode."""
 
 
+DRAWN = {
+    "laser.projection_angle_deg": "α",
+    "laser.distance_mm": "d",
+    "electrode.height_mm": "tip",
+    "imaging_plane.distance_mm": "D",
+    "imaging_plane.h_mm": "h",
+    "imaging_plane.height_mm": "height",
+    "imaging_plane.s_mm": "s",
+    "imaging_plane.width_mm": "width",
+}
+"""Dimensions that are fields of the drawing, and what stands before the number."""
+
+IN_TOP_VIEW = ("imaging_plane.s_mm", "imaging_plane.width_mm")
+
+NARROW_PX = 760
+"""On a narrower canvas the enlarged view has no room."""
+
+
 class BenchView(Sketch):
-    """Side view of the bench along −X: Y to the right, Z up, mm.
+    """Views of the bench along −X (Y to the right, Z up) and from above (X downwards), mm.
 
     The fates of the rays differ by line as well as by colour: solid, dashed, dotted.
+
+    Parameters
+    ----------
+    fields
+        The fields of the dimensions, by the keys of `DRAWN`.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, fields: Mapping[str, NumberField]) -> None:
         self._view: SideView | None = None
+        self._rig: Rig | None = None
         self.whole = make_plot("Y, along the weld, mm", "Z, mm")
+        self.top = make_plot("from above: Y, mm", "X, mm")
+        self.top.invertY(True)
         self.near = make_plot("enlarged, mm")
-        super().__init__("Side view of the bench", (self.whole, 3), (self.near, 2))
+        views = vbox((self.whole, 3), (self.top, 2))
+        super().__init__(
+            "Drawing of the bench from the side and from above", (views, 3), (self.near, 2)
+        )
+        self._plots = [self.whole, self.top, self.near]  # shown and hidden with what is drawn
+        self.boxes = {
+            key: DimensionBox(DRAWN[key], field, self.top if key in IN_TOP_VIEW else self.whole)
+            for key, field in fields.items()
+        }
+        for plot in (self.whole, self.top):
+            plot.getViewBox().sigTransformChanged.connect(lambda _: self._place_fields())
         self.follow_theme()
 
-    def show_bench(self, view: SideView | None, words: str) -> None:
+    def show_bench(self, rig: Rig | None, view: SideView | None, words: str) -> None:
         """Draw a bench, or none; the words stand below and are what a screen reader says."""
-        former, self._view = self._view, view
+        former, self._view, self._rig = self._view, view, rig
         self.say(words, view is not None)
         self._draw()
         if view is not None and (former is None or _extent(view) != _extent(former)):
             self.fit()
+        self._arrange()
+        self._place_fields()
 
     def fit(self) -> None:
         """Show the whole bench."""
-        if self._view is not None:
+        if self._view is not None and self._rig is not None:
             left, right, top = _extent(self._view)
-            self.whole.setRange(xRange=(left, right), yRange=(-2.0, top), padding=0.04)
+            self.whole.setRange(xRange=(left, right), yRange=(-12.0, top), padding=0.02)
+            first, last = _across(self._rig)
+            self.top.setRange(xRange=(left, right), yRange=(first, last), padding=0.08)
             left, right = _near(self._view)
             self.near.setRange(xRange=(-left, right), yRange=(-0.4 * right, right), padding=0)
+
+    def resizeEvent(self, event: QResizeEvent) -> None:
+        """Leave the enlarged view out where there is no room for it."""
+        super().resizeEvent(event)
+        self._arrange()
+
+    def _arrange(self) -> None:
+        self.near.setVisible(self._view is not None and self.width() >= NARROW_PX)
+
+    def _place_fields(self) -> None:
+        """Put the fields at their dimensions, none over another."""
+        if self._rig is None or self._view is None:
+            return
+        taken: dict[pg.PlotWidget, list[QRect]] = {}
+        for key, (_, place) in _dimensions(self._rig, self._view).items():
+            box = self.boxes[key]
+            box.put_at(place, taken.setdefault(box.plot, []))
 
     def take_colours(self) -> None:
         """Draw in the window's colours."""
@@ -53,7 +116,7 @@ class BenchView(Sketch):
         self._ground = palette.color(QPalette.ColorRole.Base)
         self._ink = palette.color(QPalette.ColorRole.Text)
         self._dark = self._ground.lightness() < 128
-        for plot in (self.whole, self.near):
+        for plot in (self.whole, self.top, self.near):
             plot.setBackground(self._ground)
             paint_axes(plot, self._faint(0.5), self._ink)
         self._draw()
@@ -80,12 +143,39 @@ class BenchView(Sketch):
         }
 
     def _draw(self) -> None:
-        for plot in (self.whole, self.near):
+        for plot in (self.whole, self.top, self.near):
             plot.clear()
-            if self._view is not None:
-                self._draw_bench(plot, self._view)
-        if self._view is not None:
-            self._draw_labels(self._view)
+        if self._view is None or self._rig is None:
+            return
+        for plot in (self.whole, self.near):
+            self._draw_bench(plot, self._view)
+        self._draw_from_above(self._rig, self._view)
+        self._draw_labels(self._view)
+        pen = pg.mkPen(self._faint(0.75), width=1.2)
+        for key, (line, _) in _dimensions(self._rig, self._view).items():
+            mark = {"symbol": "o", "symbolSize": 4, "symbolPen": pen, "symbolBrush": None}
+            draw_line(self.boxes[key].plot, line, pen, **({} if len(line) > 2 else mark))
+
+    def _draw_from_above(self, rig: Rig, view: SideView) -> None:
+        """Plane, pool, torch and the edges of the fan, (y, x)."""
+        plane, half = rig.imaging_plane, float(view.pool_mm[-1, 0])
+        ends = np.array([[0.0, 0.0], [plane.width_mm, 0.0]])
+        draw_line(self.top, plane.to_universal(ends)[:, [1, 0]], pg.mkPen(self._ink, width=4))
+        left, right, _ = _extent(view)
+        axis = np.array([[left, 0.0], [right, 0.0]])
+        draw_line(self.top, axis, pg.mkPen(self._faint(0.4), style=Qt.PenStyle.DashDotLine))
+        turn = np.linspace(0, 2 * np.pi, 49)
+        round_ = np.stack([half * np.cos(turn), 0.8 * half * np.sin(turn)], axis=-1)
+        draw_line(self.top, round_, pg.mkPen(RED[self._dark], width=2))
+        laser = rig.laser.position_mm[[1, 0]]
+        fan_deg = _fan_deg(rig)
+        reach = rig.laser.distance_mm * np.tan(np.radians(fan_deg / 2))
+        fan = np.array([[0.0, -reach], laser, [0.0, reach]])
+        draw_line(self.top, fan, pg.mkPen(BLUE[self._dark], width=1.4))
+        self.top.plot(*laser[:, None], pen=None, symbol="s", symbolSize=13, symbolBrush=self._ink)
+        draw_text(self.top, f"full fan {fan_deg:.1f}°", laser, self._ink, (0.5, -0.4))
+        origin = plane.to_universal(ends)[0, [1, 0]]
+        draw_text(self.top, "O′", origin, self._ink, (-0.3, 0.5))
 
     def _draw_bench(self, plot: pg.PlotWidget, view: SideView) -> None:
         pens = self._pens()
@@ -118,6 +208,7 @@ class BenchView(Sketch):
         draw_text(self.whole, "laser", view.laser_mm, self._ink, (0.5, 1.5))
         top = np.minimum(view.plane_mm[1], [np.inf, _extent(view)[2]])
         draw_text(self.whole, "imaging plane", top, self._ink, (-0.1, 0.0))
+        draw_text(self.whole, "O′", view.plane_mm[0], self._ink, (-0.3, 0.8))
         left, right = _near(view)
         lengths = (
             ("L1", -view.clearance.l1_mm, -left / 2),
@@ -139,6 +230,49 @@ def _near(view: SideView) -> tuple[float, float]:
     right = 1.3 * float(max(view.pool_mm[-1, 0], view.clearance.l2_mm, 3.0))
     l1_mm = view.clearance.l1_mm
     return max(right, min(1.1 * l1_mm, 3 * right) if np.isfinite(l1_mm) else 0.0), right
+
+
+def _across(rig: Rig) -> tuple[float, float]:
+    """Lowest and highest X that the view from above shows, mm."""
+    x = rig.imaging_plane.to_universal(np.array([[0.0, 0.0], [rig.imaging_plane.width_mm, 0.0]]))
+    return float(min(x[:, 0].min(), -10.0)), float(max(x[:, 0].max(), 10.0))
+
+
+def _fan_deg(rig: Rig) -> float:
+    """Angle between the outermost columns of the pattern, or the ends of a line, degrees."""
+    tangents = rig.pattern.tangents[..., 0]
+    lowest, highest = np.arctan([np.nanmin(tangents), np.nanmax(tangents)])
+    return float(np.degrees(highest - lowest))
+
+
+def _dimensions(rig: Rig, view: SideView) -> dict[str, tuple[FloatArray, FloatArray]]:
+    """The line of each dimension, shape (n, 2), and the middle of its field, shape (2,), mm."""
+    laser, alpha = view.laser_mm, np.radians(rig.laser.projection_angle_deg)
+    lower, upper = view.plane_mm
+    outside = lower[0] - 3
+    _, _, highest = _extent(view)
+    turn = np.linspace(0, alpha, 20)
+    arc = 0.62 * np.hypot(*laser) * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+    tip = view.tip_mm[1]
+    top_mm = min(upper[1], highest)
+    corners = rig.imaging_plane.to_universal(
+        np.array([[0.0, 0.0], [rig.imaging_plane.width_mm, 0.0]])
+    )[:, [1, 0]]
+    start, end = corners
+    lines = {
+        "laser.projection_angle_deg": (arc, arc[8] + [6.0, 0.0]),
+        "laser.distance_mm": ([[0.0, 0.0], laser], 0.6 * laser + [-2.0, 8.0]),
+        "electrode.height_mm": ([[8.0, 0.0], [8.0, tip]], [12.0, -6.0]),
+        "imaging_plane.distance_mm": ([[lower[0], -5.0], [0.0, -5.0]], [lower[0] / 2, -6.0]),
+        "imaging_plane.h_mm": ([[outside, 0.0], [outside, lower[1]]], [outside, -4.0]),
+        "imaging_plane.height_mm": (
+            [[outside, lower[1]], [outside, top_mm]],
+            [lower[0] + 8, lower[1] + 0.7 * (top_mm - lower[1])],
+        ),
+        "imaging_plane.s_mm": ([[outside, 0.0], start - [3, 0]], [start[0] + 10, start[1] / 2]),
+        "imaging_plane.width_mm": (corners + np.array([2.0, 0.0]), [end[0] + 10, end[1] * 0.7]),
+    }
+    return {key: (np.array(line), np.array(place)) for key, (line, place) in lines.items()}
 
 
 def _broken(paths: list[FloatArray]) -> FloatArray:

@@ -1,71 +1,114 @@
-"""The laser over its cross hair from the side, to scale (Fig. A-1)."""
+"""The laser over its cross hair from the side and from above, to scale (Fig. A-1)."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 import pyqtgraph as pg
-from PySide6.QtCore import Qt
+from PySide6.QtCore import QRect, Qt
 from PySide6.QtGui import QPalette
 
 from labapp.core.calibration.laser_calibration import LaserCalibration
 from labapp.gui.views.axes import Sketch, draw_line, draw_text, make_plot, paint_axes
+from labapp.gui.views.dimension import DimensionBox
+from labapp.gui.widgets.fields import NumberField
+from labapp.gui.widgets.layouts import vbox
+
+Lengths = tuple[float, float, float]
 
 
 class CrossHairView(Sketch):
-    """Diode, beam, the fan's two edges, and l₁ and l₂ on the work piece; mm."""
+    """Diode, beam and the fan's edges; the cross on the work piece with l₁, l₂, l₃ as fields; mm.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    names, fields
+        Of l₁, l₂, l₃.
+    """
+
+    def __init__(self, names: Sequence[str], fields: Sequence[NumberField]) -> None:
         self.plot = make_plot("Y, mm", "Z, mm")
-        super().__init__("Drawing of the laser and its cross hair", (self.plot, 1))
-        self._shown: tuple[LaserCalibration | None, float, float] = (None, 0.0, 0.0)
+        self.top = make_plot("from above: Y, mm", "X, mm")
+        views = vbox((self.plot, 3), (self.top, 2))
+        super().__init__("Drawing of the laser and its cross hair", (views, 1))
+        self._plots = [self.plot, self.top]
+        self.boxes = [
+            DimensionBox(name, field, self.top) for name, field in zip(names, fields, strict=True)
+        ]
+        self._shown: tuple[LaserCalibration, Lengths, float] | None = None
+        self.top.getViewBox().sigTransformChanged.connect(lambda _: self._place_fields())
         self.say("", False)
         self.follow_theme()
 
     def show_laser(
-        self, found: LaserCalibration | None, l1_mm: float, l2_mm: float, words: str
+        self, found: LaserCalibration, lengths_mm: Lengths, fan_angle_deg: float, words: str
     ) -> None:
-        """Draw a laser and the lengths that were read, or say in words why there is none."""
-        self._shown = (found, l1_mm, l2_mm)
-        self.say(words, found is not None)
+        """Draw a laser and its cross; the words stand below."""
+        self._shown = found, lengths_mm, fan_angle_deg
+        self.say(words, True)
         self.take_colours()
+        self._place_fields()
 
     def take_colours(self) -> None:
         """Draw in the window's colours."""
         ground = self.palette().color(QPalette.ColorRole.Base)
         ink = self.palette().color(QPalette.ColorRole.Text)
-        beam = "#ff6b5e" if ground.lightness() < 128 else "#c62828"
-        self.plot.setBackground(ground)
-        paint_axes(self.plot, ink, ink)
-        self.plot.clear()
-        found, l1, l2 = self._shown
-        if found is None:
+        for plot in (self.plot, self.top):
+            plot.setBackground(ground)
+            paint_axes(plot, ink, ink)
+            plot.clear()
+        if self._shown is None:
             return
+        found, (l1, l2, l3), fan_deg = self._shown
+        beam = "#ff6b5e" if ground.lightness() < 128 else "#c62828"
+        solid, edge = (
+            pg.mkPen(beam, width=1.6, style=style)
+            for style in (Qt.PenStyle.SolidLine, Qt.PenStyle.DashLine)
+        )
         diode = np.array([found.horizontal_mm, found.height_mm])
         right = max(diode[0], l1) * 1.1 + 2
-        self._line([[-l2 - 4, 0], [right, 0]], pg.mkPen(ink, width=2.5))
-        for end, style in (
-            (0.0, Qt.PenStyle.SolidLine),
-            (l1, Qt.PenStyle.DashLine),
-            (-l2, Qt.PenStyle.DashLine),
-        ):
-            self._line([diode, [end, 0.0]], pg.mkPen(beam, width=1.6, style=style))
-        self._line([diode, [diode[0], 0.0]], pg.mkPen(ink, width=1, style=Qt.PenStyle.DotLine))
-        level = -0.06 * max(right + l2, diode[1])
-        # Away from each other: a small window brings their middles together.
-        for name, end, anchor in (("l₁", l1, (-0.05, 0.0)), ("l₂", -l2, (1.05, 0.0))):
-            pen = pg.mkPen(ink, width=1.2)
-            self._line([[0.0, level], [end, level]], pen, symbol="|", symbolPen=pen)
-            self._text(f"{name} {abs(end):.2f} mm", (0.0, level), anchor)
+        self._line(self.plot, [[-l2 - 4, 0], [right, 0]], pg.mkPen(ink, width=2.5))
+        for end, pen in ((0.0, solid), (l1, edge), (-l2, edge)):
+            self._line(self.plot, [diode, [end, 0.0]], pen)
+        upright = pg.mkPen(ink, width=1, style=Qt.PenStyle.DotLine)
+        self._line(self.plot, [diode, [diode[0], 0.0]], upright)
+        ends = np.arctan2(-diode[1], np.array([-l2, l1]) - diode[0])
+        turn = np.linspace(ends[0], ends[1], 20)
+        arc = diode + 0.5 * found.distance_mm * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+        self._line(self.plot, arc, pg.mkPen(ink, width=1.2))
+        self._text(f"full fan angle {fan_deg:g}°", arc[0], (1.05, 1.0))
         self.plot.plot(*diode[:, None], pen=None, symbol="s", symbolSize=13, symbolBrush=ink)
         self._text("laser", diode, (0.5, 1.4))
         words = f"beam {found.distance_mm:.1f} mm at {found.angle_deg:.2f}°"
         for part, message in ((0.4, f"height {found.height_mm:.1f} mm"), (0.2, words)):
             self._text(message, (diode[0], diode[1] * part), (1.05, 0.5))
-        self.plot.setRange(xRange=(-l2 - 4, right), yRange=(2 * level, diode[1] * 1.15))
+        self.plot.setRange(xRange=(-l2 - 4, right), yRange=(-1, diode[1] * 1.15))
+        for line in ([[-l2, 0], [l1, 0]], [[0, -l3], [0, l3]]):
+            self._line(self.top, line, pg.mkPen(beam, width=3))
+        measure = pg.mkPen(ink, width=1.2)
+        for line in _dimension_lines(l1, l2, l3):
+            self._line(self.top, line, measure, symbol="o", symbolSize=4, symbolPen=measure)
+        self.top.setRange(xRange=(-l2 - 4, right), yRange=(-2 * l3, 2 * l3))
 
-    def _line(self, points: object, pen: object, **symbol: object) -> None:
-        draw_line(self.plot, np.array(points, float), pen, **symbol)
+    def _place_fields(self) -> None:
+        """Put the fields at the lengths that they are of."""
+        if self._shown is not None:
+            l1, l2, l3 = self._shown[1]
+            taken: list[QRect] = []
+            places = ((0.9 * l1, -1.5 * l3), (-0.9 * l2, -1.5 * l3), (4.5, 0.7 * l3))
+            for box, place in zip(self.boxes, places, strict=True):
+                box.put_at(np.array(place), taken)
+
+    def _line(self, plot: pg.PlotWidget, points: object, pen: object, **symbol: object) -> None:
+        draw_line(plot, np.array(points, float), pen, **symbol)
 
     def _text(self, words: str, place: object, anchor: tuple[float, float]) -> None:
         color = self.palette().color(QPalette.ColorRole.Text)
         draw_text(self.plot, words, np.asarray(place, float), color, anchor)
+
+
+def _dimension_lines(l1: float, l2: float, l3: float) -> list[list[list[float]]]:
+    """The lines of l₁, l₂ and l₃ beside the cross, seen from above."""
+    level, beside = -0.8 * l3, 0.6
+    return [[[0, level], [l1, level]], [[-l2, level], [0, level]], [[beside, 0], [beside, l3]]]

@@ -248,7 +248,7 @@ class PictureView(Drawn):
             one.clicked.connect(lambda _: do())
             bar.addWidget(one)
 
-        button("Fit", "Fit picture", "Show the whole picture (F)", self.fit)
+        button("Fit", "Fit picture", "Fit the picture (F)", self.fit)
         button("−", "Zoom out", "Zoom out (−)", lambda: self.zoom(1 / ZOOM_STEP))
         button("+", "Zoom in", "Zoom in (+)", lambda: self.zoom(ZOOM_STEP))
         bar.addSpacing(8)

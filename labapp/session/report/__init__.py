@@ -19,6 +19,7 @@ from labapp.core.geometry.rig import Rig
 from labapp.core.geometry.uncertainty import INDEX, QUANTITIES
 from labapp.errors import InputError
 from labapp.media.base import format_frame_rate
+from labapp.session.checklist import ticked
 from labapp.session.contents import SessionContents
 from labapp.session.report import data, figures
 from labapp.session.report.data import ReportData, number, with_unit
@@ -111,7 +112,7 @@ def _experiment(story: Story, report: ReportData, title: str) -> None:
         story.text("Nothing was noted about the experiment.")
     if record.safety:
         story.part("Safety and preparation")
-        story.listing([(time.replace("T", " "), item) for item, time in record.safety])
+        story.listing([(time.replace("T", " "), item) for item, time in ticked(record)])
     else:
         story.text("No item of the lists of safety and preparation was ticked.")
     story.part("Recording")

@@ -188,7 +188,7 @@ def test_a_region_is_what_is_seen_and_recorded(page: CapturePage, fields, device
 def test_frames_are_taken_when_they_are_asked_for(page: CapturePage, fields, device, qtbot: QtBot):
     view, hand = page.live_view, Hand(page.window())
     assert fields.shoot_button.isHidden()
-    hand.choose(fields.trigger, "when told: Take a frame")
+    hand.choose(fields.trigger, "by the button Take a frame")
     qtbot.waitUntil(lambda: device.settings.trigger == "software" and not fields.waiting)
     qtbot.waitUntil(fields.shoot_button.isVisible)
     qtbot.waitUntil(lambda: view.bar.state.text().startswith(f"● {WAITS['software']}"))
@@ -198,7 +198,7 @@ def test_frames_are_taken_when_they_are_asked_for(page: CapturePage, fields, dev
         qtbot.waitUntil(lambda count=count: device.taken == taken + count)
     qtbot.wait(50)
     assert device.taken == taken + 3
-    hand.choose(fields.trigger, "by itself, at its rate")
+    hand.choose(fields.trigger, "free run")
     qtbot.waitUntil(lambda: device.settings.trigger == "free" and not fields.waiting)
     updates = view.updates
     qtbot.waitUntil(lambda: view.updates > updates + 2)

@@ -114,7 +114,7 @@ def test_a_missing_recording_is_told_and_frames_say_why(copy_sample) -> None:
         assert missing_text(session).startswith("recording.avi is not where it was")
         seen = look(session, 0)
         assert seen.image is None
-        assert seen.words == "recording.avi is not where it was: say where it is now"
+        assert seen.words == "recording.avi is not where it was: locate it (step Recording)"
 
 
 def made(workspace: Workspace) -> CapturePage:

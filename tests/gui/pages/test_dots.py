@@ -463,7 +463,7 @@ def test_a_button_asks_for_the_click_it_needs(
 ) -> None:
     session = show(page, qtbot, copy_sample("blocked_rows"), 3)
     panel = page.dots_panel
-    assert "Press Reference" in panel.why.text()
+    assert "press Reference" in panel.why.text()
     button = next(b for b in panel.findChildren(QToolButton) if b.text() == "Reference")
     place, left = np.array([278.0, 281.0]), button.mapTo(page.panel, QPoint())
     button.click()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -15,11 +16,12 @@ from labapp.config.setup_keys import SECTIONS
 from labapp.core.geometry.uncertainty import ANGLE, DISTANCE, INDEX, QUANTITIES
 from labapp.gui.pages.setup import SetupPage, presenter
 from labapp.gui.pages.setup.presenter import RIG
+from labapp.gui.views.bench import DRAWN
 from labapp.gui.workspace import Workspace
 from labapp.session.checklist import SAFETY, STEPS, tick
 from labapp.session.session import Session
 from labapp.simulation.positioning import Fate
-from tests.gui.conftest import KEPT
+from tests.gui.conftest import KEPT, let_draw
 
 SAMPLES = Path(__file__).parents[3] / "sample_sessions"
 
@@ -34,18 +36,26 @@ def empty(tmp_path: Path) -> Iterator[Session]:
         yield session
 
 
-def test_everything_is_missing_in_a_new_session(empty: Session) -> None:
+def test_a_new_session_lacks_what_is_needed_and_is_drawn_with_the_dissertation_s_bench(
+    empty: Session,
+) -> None:
     shown = presenter.shown(empty)
     rules = {
         f"{section}.{key}": rule for section in SECTIONS for key, rule in SECTIONS[section].items()
     }
     needed = [key for key in KEYS if key in rules and rules[key].required]  # not those of lines
-    assert shown.problems == dict.fromkeys(needed, "missing")
+    assert shown.missing == set(needed)
+    assert shown.problems == {}
     assert set(shown.values.values()) == {None}
     assert shown.others == ("The imaging plane is not calibrated: that is step 3.",)
     bench = presenter.bench(empty)
-    assert bench.view is None
-    assert "appears when" in bench.words
+    assert bench.rig is not None
+    assert bench.rig.laser.distance_mm == presenter.DEFAULTS["laser.distance_mm"]
+    assert bench.words.startswith(presenter.NOT_ENTERED)
+    assert bench.rows == ()  # nothing is counted of a bench that is not the operator's
+    assert presenter.rig(empty) is None
+    presenter.put(empty, "laser.projection_angle_deg", 90)
+    assert presenter.bench(empty).view is None
 
 
 def test_usual_values_fill_only_what_is_missing(empty: Session) -> None:
@@ -54,8 +64,8 @@ def test_usual_values_fill_only_what_is_missing(empty: Session) -> None:
     shown = presenter.shown(empty)
     assert shown.values["laser.distance_mm"] == 42.0
     assert shown.values["pattern.rows"] == 19
-    assert set(shown.problems) == {"imaging_plane.s_mm", "imaging_plane.h_mm"}
-    for key in shown.problems:
+    assert shown.missing == {"imaging_plane.s_mm", "imaging_plane.h_mm"}
+    for key in shown.missing:
         presenter.put(empty, key, 3.0)
     rig = presenter.rig(empty)
     assert rig is not None
@@ -124,9 +134,9 @@ def test_the_bench_counts_what_comes_back(empty: Session) -> None:
 
 def test_a_tick_is_kept_with_its_time(empty: Session) -> None:
     (first, _), (second, _), *_ = SAFETY
-    tick(empty, first, True, "2026-11-21T10:00:00+01:00")
-    tick(empty, second, True, "2026-11-21T10:01:00+01:00")
-    tick(empty, first, False, "2026-11-21T10:02:00+01:00")
+    empty.set_record(tick(empty.record, first, True, "2026-11-21T10:00:00+01:00"))
+    empty.set_record(tick(empty.record, second, True, "2026-11-21T10:01:00+01:00"))
+    empty.set_record(tick(empty.record, first, False, "2026-11-21T10:02:00+01:00"))
     assert empty.record.safety == ((second, "2026-11-21T10:01:00+01:00"),)
     empty.undo()
     assert dict(empty.record.safety)[first].startswith("2026-11-21T10:00")
@@ -241,12 +251,49 @@ def test_an_emptied_field_is_marked(qtbot: QtBot, page: SetupPage) -> None:
     field = page.rig_fields["laser.distance_mm"]
     field.editor.clear()
     field.flush()
-    assert field.problem.text() == "⚠ missing"
-    assert "⚠" in page.tabs.tabText(2)
-    assert page.bench.whole.isHidden()
-    page.workspace.undo()
     assert field.problem.isHidden()
-    assert not page.bench.whole.isHidden()
+    assert field.editor.text() == ""
+    assert field.editor.lineEdit().placeholderText() == "35"
+    assert "⚠" in page.tabs.tabText(2)
+    assert page.bench.words.text().startswith(presenter.NOT_ENTERED)
+    page.workspace.undo()
+    assert field.value() == 31.48
+    assert not page.bench.words.text().startswith(presenter.NOT_ENTERED)
+
+
+@pytest.mark.parametrize("key", list(DRAWN))
+def test_a_dimension_is_entered_in_the_drawing_which_follows(
+    qtbot: QtBot, page: SetupPage, key: str
+) -> None:
+    session = page.workspace.session
+    assert session is not None
+    box = page.bench.boxes[key]
+    plotted = box.plot.listDataItems()
+    before = [item.getData() for item in plotted]
+    value = page.rig_fields[key].value()
+    assert value is not None
+    assert box.field.value() == value
+    retype(qtbot, box.field, f"{value + 1:g}")
+    assert page.rig_fields[key].value() == pytest.approx(value + 1)
+    after = [item.getData() for item in box.plot.listDataItems()]
+    assert not all(
+        np.array_equal(one, other, equal_nan=True)
+        for old, new in zip(before, after, strict=True)
+        for one, other in zip(old, new, strict=True)
+    )
+    page.workspace.undo()
+    assert box.field.value() == value
+
+
+def test_no_field_of_the_drawing_lies_on_another(page: SetupPage) -> None:
+    for size in ((560, 400), (900, 640)):
+        page.bench.resize(*size)
+        let_draw()
+        for plot in (page.bench.whole, page.bench.top):
+            boxes = [each for each in page.bench.boxes.values() if each.plot is plot]
+            assert all(plot.rect().contains(each.geometry()) for each in boxes)
+            pairs = itertools.combinations(boxes, 2)
+            assert not any(a.geometry().intersects(b.geometry()) for a, b in pairs)
 
 
 def test_record_and_ticks_by_hand(qtbot: QtBot, page: SetupPage) -> None:

@@ -33,10 +33,7 @@ from labapp.gui.workspace import Workspace
 from labapp.media import read_picture
 from labapp.session.record import BenchCheckRecord, MirrorPicture
 
-NO_PICTURE = (
-    "Lay a known mirror where the pool will be, take a picture of its dots, and add it here or "
-    "drop it on the window."
-)
+NO_PICTURE = "Put a known mirror where the pool will be; add a picture of its dots, or drop it."
 
 COLOR = "#ffb000"
 LIST_ROWS, ROW_PX = 3, 24
@@ -119,7 +116,7 @@ class BenchCheckPage(Page):
     def lead(self, found: Lead | None) -> Lead | None:
         """Where a picture can come from, while there is none."""
         add = Offer("&Add picture…", "Of a mirror of known shape", self._choose)
-        return found if self.chosen else Lead(NO_PICTURE, () if self.locked else (add,))
+        return found if self.chosen else Lead(NO_PICTURE, (add,))
 
     def _is_kept(self) -> bool:
         """Whether what is shown is what the session keeps."""
@@ -270,7 +267,7 @@ class BenchCheckPage(Page):
         self.list.setFixedHeight(ROW_PX * (LIST_ROWS + 1) + 8)
         self.list.offer(("Copy table", self.list.copy_text))
         self.check_button = button("Check", "", self.check)
-        self.use_button = button("Use", "", self.use)
+        self.use_button = button("Apply", "", self.use)
         self.words = wrapping_label()
         self.mirrors_words = heading("Known mirrors, measured")
         tip = (

@@ -54,8 +54,8 @@ class FootSwitchPanel(Group):
             "It is to", list(DOES.items()), tooltip="What stepping on this pedal does from now on"
         )
         form.add(self.action)
-        self.use_button = button("Use it", "Use the pedal so, now and after each start", self._use)
-        leave = button("Not this one", "Leave this pedal as it is", self.switches.give_up)
+        self.use_button = button("Apply", "Use the pedal so, now and after each start", self._use)
+        leave = button("Discard", "Leave this pedal as it is", self.switches.give_up)
         self.learned = QWidget()
         vbox(form, hbox(self.use_button, leave), of=self.learned)
         # The buttons stand above the words, which need more or less room.

@@ -22,9 +22,7 @@ MEASURED = (
 )
 
 NEXT = "New session from this recording …"
-NEXT_TIP = (
-    "Make a session with the same set-up and calibration, and import it there; this one stays whole"
-)
+NEXT_TIP = "Make a session with the same set-up and calibration, and import it there"
 
 
 class ImportChoice(Group):
@@ -50,7 +48,7 @@ class ImportChoice(Group):
         self.choice_words = Message(2)
         self.import_button = button("Import", "", do_import)
         self.import_button.setDefault(True)
-        stop = button("Not this one", "Leave it, and see the session's frames", leave)
+        stop = button("Discard", "Leave it, and see the session's frames", leave)
         self.next_button = button(NEXT, NEXT_TIP, begin_next)
         fill(
             self.column,
@@ -117,7 +115,9 @@ class ImportChoice(Group):
         self.import_button.setEnabled(not (why_not or wants_own))
         self.import_button.setDefault(not wants_own)
         self.next_button.setDefault(wants_own)
-        tip = why_not or (MEASURED if wants_own else "Read it through once, and take its frames in")
+        tip = why_not or (
+            MEASURED if wants_own else "Read it once from end to end, and add its frames"
+        )
         self.import_button.setToolTip(plain_tip(tip))
         if preview is not None and choice is not None:
             words = choice_text(preview, choice)

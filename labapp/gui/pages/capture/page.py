@@ -421,7 +421,7 @@ class CapturePage(Page):
         )
         self.missing = selectable_label()
         self.find_button = button(
-            "Say where it is …", "Find the recording in its new place", self.find_recording
+            "Locate…", "Choose the recording where it is now", self.find_recording
         )
         self.chosen = ImportChoice(self.import_chosen, self.begin_next, self.cancel_choice)
         self.chosen.edited.connect(self._show_import)

@@ -178,8 +178,5 @@ def missing_text(session: Session) -> str:
         "but no frame can be seen or measured. "
     )
     if session.read_only:
-        return f"{lost}The session is open read-only: open it for changes to say where it is now."
-    return (
-        f"{lost}Say where it is now: only the same recording is taken, which its size and SHA-256 "
-        "tell."
-    )
+        return f"{lost}The session is open read-only: open it for changes to locate it."
+    return f"{lost}Locate it: only the same recording is accepted, by its size and SHA-256."

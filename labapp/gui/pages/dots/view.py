@@ -31,7 +31,7 @@ from labapp.gui.views.drag_point import SHIFT, arrow_step
 from labapp.gui.views.picture import PictureView, Tool
 from labapp.gui.workspace import Workspace
 
-NO_REFERENCE = "The reference is not known: can you tell it from other frames? Press Reference"
+NO_REFERENCE = "The reference is not known: if you know it from other frames, press Reference"
 
 NOT_YET = "The frame is being measured as it was found: edit it when its rows are there"
 
@@ -379,7 +379,7 @@ class DotsPage(Page):
                     lambda: self._at_pointer(self.add_at, "Click where the dot is")),
             Command("Delete", "Del", "Take the chosen dots out", lambda: self._then(editor.delete),
                     "dots"),
-            Command("Number", "N", "Give the chosen dots the row and column their neighbours tell",
+            Command("Number", "N", "Give the chosen dots row and column by their neighbours",
                     editor.number, "dots"),
             Command("Row left", "Ctrl+Left", "Shift the chosen rows left by a column",
                     lambda: editor.shift(-1), "row"),

@@ -117,7 +117,9 @@ class ExportPage(Page):
         why_not = "It is being written." if writing else made.why_not
         self.export_button.setEnabled(not why_not)
         self.export_button.setToolTip(
-            plain_tip(why_not or "Write all of it: the folder is whole or not there")
+            plain_tip(
+                why_not or "Write everything that is ticked; nothing half-written stays behind"
+            )
         )
         count = len(made.frames)
         ready = f"{count} frame{'s' * (count != 1)} will be written."

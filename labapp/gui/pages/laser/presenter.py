@@ -28,6 +28,9 @@ MEANINGS = (
 
 FAN_ANGLE_DEG = 10.0
 
+EXAMPLE_MM = (4.65, 6.23, 2.75)
+"""l₁, l₂, l₃ that are drawn before there are readings: a laser 31.5 mm away at 31°."""
+
 Place = tuple[float, float]
 
 ENDS = ("laser's side", "far side", "left", "right")
@@ -129,6 +132,27 @@ def result(readings: Readings) -> LaserResult:
         ResultRow("Correlation", found.correlation, decimals=2, note="Of angle and distance"),
     )
     return LaserResult(found, "", (*spread, check, *rows))
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """A laser to be drawn."""
+
+    found: LaserCalibration
+    lengths_mm: tuple[float, float, float]
+    fan_angle_deg: float
+    is_example: bool
+    """Whether it is that of `EXAMPLE_MM`, as none follows from the readings."""
+
+
+def drawn(readings: Readings, found: LaserCalibration | None) -> Drawn:
+    """The laser that follows from readings, or an example."""
+    if found is not None:
+        l1, l2, l3 = (float(np.mean(lengths)) for lengths in readings.lengths_mm)
+        return Drawn(found, (l1, l2, l3), readings.fan_angle_deg, False)
+    l1, l2, l3 = EXAMPLE_MM
+    example = calibrate_laser([l1], [l2], [l3], FAN_ANGLE_DEG)
+    return Drawn(example, EXAMPLE_MM, FAN_ANGLE_DEG, True)
 
 
 def in_use(session: Session) -> tuple[ResultRow, ...]:

@@ -27,7 +27,9 @@ from labapp.media import GreyImage, read_picture
 
 WAYS = (("callipers", "by callipers"), ("picture", "from a picture"))
 
-EXPLAINED = "\n".join(f"{name}: {meaning}" for name, meaning in zip(NAMES, MEANINGS, strict=True))
+DRAWN_WORDS = "To scale: the beam, the edges of the fan, and the cross on the work piece."
+
+SEVERAL = "The mean of several readings: change them in the table"
 
 NO_PICTURE = "Take a picture of the cross beside a scale, square from above, and load it here."
 
@@ -41,7 +43,10 @@ class LaserPage(Page):
 
     def __init__(self, workspace: Workspace) -> None:
         super().__init__(workspace)
-        self.drawing = CrossHairView()
+        self.length_fields = [_length_field(k) for k in range(3)]
+        for k, field in enumerate(self.length_fields):
+            field.edited.connect(lambda value, k=k: self._enter_length(k, value))
+        self.drawing = CrossHairView(NAMES, self.length_fields)
         self.picture_view = PictureView("Picture of the cross hair")
         self.picture_view.show_picture(None, NO_PICTURE)
         self.canvas = QStackedWidget()
@@ -118,13 +123,13 @@ class LaserPage(Page):
         self.way.edited.connect(self._show_way)
         form.add(self.way)
         self.fan = NumberField(
-            "Fan angle",
+            "Fan angle, full",
             "°",
             lowest=0.1,
             highest=89.9,
             step=0.5,
             decimals=2,
-            tooltip="Fan angle of the cross-hair lens, as its maker says",
+            tooltip="Full angle from one edge of the fan to the other, as the lens' maker gives it",
         )
         self.fan_sigma = NumberField(
             "Fan angle ±",
@@ -151,7 +156,7 @@ class LaserPage(Page):
         self.table = _ReadingsTable()
         self.table.itemChanged.connect(self._cell_changed)
         readings = wrapping_label("Readings, mm: three lines or more")
-        self.use_button = button("Use these", "", self.use)
+        self.use_button = button("Apply", "", self.use)
         self.words = wrapping_label()
         self.result = ResultTable("The laser that follows")
         self.in_use = ResultTable("Laser in use")
@@ -246,15 +251,21 @@ class LaserPage(Page):
         self.use_button.setEnabled(not why_not)
         tip = "Put angle and distance into the rig; undo brings the former back"
         self.use_button.setToolTip(plain_tip(why_not or tip))
-        means = [row.value for row in result.rows[:2]]
-        l1, l2 = (value if isinstance(value, float) else 0.0 for value in means)
-        explained = f"{EXPLAINED}\n\n{result.why_not}"
-        words = (
-            explained
-            if result.why_not
-            else "From the side, to scale: the beam, and the edges of the fan."
-        )
-        self.drawing.show_laser(result.found, l1, l2, words)
+        drawn = presenter.drawn(readings, result.found)
+        words = f"{result.why_not}. Drawn is an example" if drawn.is_example else DRAWN_WORDS
+        self.drawing.show_laser(drawn.found, drawn.lengths_mm, drawn.fan_angle_deg, words)
+        self._show_lengths(readings)
+
+    def _show_lengths(self, readings: Readings) -> None:
+        """Show the lengths in the drawing: the only reading, or the mean of several."""
+        several = max(map(len, readings.lengths_mm)) > 1
+        for field, lengths in zip(self.length_fields, readings.lengths_mm, strict=True):
+            field.set_value(sum(lengths) / len(lengths) if lengths else None)
+            field.lock(self.locked or (SEVERAL if several else ""))
+
+    def _enter_length(self, column: int, value: float | None) -> None:
+        """Put the length that was entered in the drawing into the table."""
+        self.table.setItem(0, column, _cell("" if value is None else f"{value:g}"))
 
     # --- the picture ------------------------------------------------------------------------
 
@@ -298,6 +309,19 @@ class LaserPage(Page):
 
     def _dragged(self) -> None:
         self.add_button.setEnabled(self._cross() is not None and not self.locked)
+
+
+def _length_field(column: int) -> NumberField:
+    field = NumberField(
+        *(NAMES[column], "mm"),
+        lowest=0.01,
+        highest=1000,
+        step=0.1,
+        tooltip=MEANINGS[column],
+        optional=True,
+    )
+    field.set_placeholder(f"{presenter.EXAMPLE_MM[column]:g}")
+    return field
 
 
 class _ReadingsTable(QTableWidget):

@@ -247,7 +247,7 @@ class PlanePage(Page):
         )
         self.model.edited.connect(self.choose_model)
         model.add(self.model)
-        self.use_button = button("Use", "", self.use)
+        self.use_button = button("Apply", "", self.use)
         self.words, self.why = wrapping_label(), wrapping_label()
         self.result = ResultTable("What follows from the points and marks")
         self.in_use = ResultTable("Image calibration in use")

@@ -112,6 +112,18 @@ RIG: tuple[tuple[str, tuple[Entry, ...]], ...] = (
 )  # fmt: skip
 """Of the rig, by headings."""
 
+DEFAULTS = {entry.key: entry.usual or 0.0 for _, entries in RIG for entry in entries} | {
+    "imaging_plane.s_mm": 45.0,
+    "imaging_plane.h_mm": 3.0,
+    "imaging_plane.glass_index": 1.5,
+}
+"""What is seen of the bench, in grey, where nothing is entered.
+
+Of what must be entered it is only drawn, never measured with.
+"""
+
+NOT_ENTERED = "Grey numbers are the dissertation's bench, not yours: click one and type."
+
 UNCERTAIN_ONLY = ("Image calibration", (
     Entry("image_calibration.origin_px_sigma", "O′", "px",
           "O′ in the picture, along u and along v", 0, 10_000, 0.1, 2),
@@ -204,6 +216,8 @@ class SetupState:
     """How far the set-up can be relied on, in words; empty while it is not complete."""
     problems: dict[str, str]
     """What is wrong, in words, by the same keys."""
+    missing: frozenset[str]
+    """Keys of the values that have to be entered still."""
     others: tuple[str, ...]
     """What is wrong elsewhere in the setup, a sentence each."""
     record: Record
@@ -228,17 +242,19 @@ def shown(session: Session) -> SetupState:
         status = marked_setup_words(usual, setup_words(usual))
     usual_sigmas, sigma_words = _usual_sigmas(found)
     problems: dict[str, str] = {}
+    missing: set[str] = set()
     others = []
     for problem in session.setup_problems:
-        words = "missing"
-        if problem.value != words:
-            words = f"{problem.value}; expected {problem.expected}"
-        if problem.field in values or problem.field in sigmas:
+        is_missing = problem.value == "missing"
+        words = "missing" if is_missing else f"{problem.value}; expected {problem.expected}"
+        if is_missing and problem.field in values:
+            missing.add(problem.field)
+        elif problem.field in values or problem.field in sigmas:
             problems[problem.field] = words
-        elif problem.value == "missing" and f"{problem.field}." in " ".join(keys):
+        elif is_missing and f"{problem.field}." in " ".join(keys):
             rules = rules_for(problem.field, sections.get(problem.field))
-            problems |= {f"{problem.field}.{key}": words for key in rules if rules[key].required}
-        elif problem.field.startswith("image_calibration") and problem.value == "missing":
+            missing |= {f"{problem.field}.{key}" for key in rules if rules[key].required}
+        elif problem.field.startswith("image_calibration") and is_missing:
             others.append("The imaging plane is not calibrated: that is step 3.")
         else:
             others.append(f"{problem.field}: {words}")
@@ -252,6 +268,7 @@ def shown(session: Session) -> SetupState:
         travel=travel,
         status=status,
         problems=problems,
+        missing=frozenset(missing & values.keys()),
         others=unique,
         record=session.record,
     )
@@ -291,12 +308,31 @@ def rig(session: Session) -> Rig | None:
         return None
 
 
+def default_rig(session: Session) -> Rig | None:
+    """The rig with the dissertation's dimensions where none are entered; None: a value is wrong."""
+    state = shown(session)
+    anything = {"homography": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]}
+    values: dict[str, dict[str, object]] = {
+        "image_calibration": dict.fromkeys(THREE_POINTS) | anything
+    }
+    for key in state.missing:
+        section, _, name = key.partition(".")
+        values.setdefault(section, {})[name] = DEFAULTS[key]
+    try:
+        text = updated_setup(session.setup_text, session.path, values)
+        return parse_setup(text, session.path, lines=True).rig
+    except InputError:
+        return None
+
+
 @dataclass(frozen=True)
 class BenchState:
-    """The bench from the side."""
+    """The bench as it is drawn."""
 
+    rig: Rig | None
+    """What is drawn; None where a value is wrong."""
     view: SideView | None
-    """What is drawn; None without a rig, or a pool that cannot be."""
+    """Its rays; None without a rig, or with a pool that cannot be."""
     words: str
     """The same in words, or why it is not drawn."""
     rows: tuple[ResultRow, ...] = ()
@@ -304,11 +340,9 @@ class BenchState:
 
 def bench(session: Session) -> BenchState:
     """The bench as it is set up, with the pool that is expected."""
-    found, record = rig(session), session.record
+    found, record, entered = default_rig(session), session.record, rig(session) is not None
     if found is None:
-        return BenchState(
-            None, "The drawing appears when laser, pattern, torch and plane are entered."
-        )
+        return BenchState(None, None, "The drawing appears when every number is possible.")
     size = (
         record.expected_width_mm or USUAL_WIDTH_MM,
         record.expected_length_mm or USUAL_LENGTH_MM,
@@ -317,7 +351,7 @@ def bench(session: Session) -> BenchState:
     try:
         view = side_view(found, *size)
     except ValueError as error:
-        return BenchState(None, f"There is no such pool: {error}.")
+        return BenchState(found, None, f"There is no such pool: {error}.")
     tally, room = view.tally, view.clearance
     width, length, height = size
     given = None not in (record.expected_width_mm, record.expected_length_mm)
@@ -325,7 +359,8 @@ def bench(session: Session) -> BenchState:
     if isinstance(found.pattern, LineRays):
         rays = f"{found.pattern.columns} rays"
         drawn = f"the plane of light of each line, seen from its edge; a line counts as {rays}"
-    words = (
+    words = "" if entered else f"{NOT_ENTERED} "
+    words += (
         f"{tally[Fate.CAUGHT]} of {sum(tally.values())} rays come back to the imaging plane "
         f"(solid). {tally[Fate.BLOCKED]} are blocked by the torch (dashed red), "
         f"{tally[Fate.PAST]} miss the plane (dotted grey), {tally[Fate.UNUSED]} do not meet the "
@@ -345,7 +380,7 @@ def bench(session: Session) -> BenchState:
         ResultRow("Least plane distance", room.least_plane_mm, unit="mm", decimals=1, note=REACH),
         ResultRow("Most plane distance", room.most_plane_mm, unit="mm", decimals=1, note=REACH),
     )
-    return BenchState(view, words, rows)
+    return BenchState(found, view, words, rows if entered else ())
 
 
 REACH = "The plane catches the steepest ray that passes the torch between these two (Eq. 4-16)"

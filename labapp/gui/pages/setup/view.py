@@ -14,6 +14,7 @@ from labapp.gui.dialogs import SETUP_FILES, ask_save, ask_setup
 from labapp.gui.pages.page import Page
 from labapp.gui.pages.setup import presenter
 from labapp.gui.pages.setup.presenter import (
+    DEFAULTS,
     EXPERIMENT,
     KINDS,
     POOL,
@@ -22,15 +23,17 @@ from labapp.gui.pages.setup.presenter import (
     UNCERTAIN_ONLY,
     Entry,
 )
-from labapp.gui.views.bench import BenchView
+from labapp.gui.views.bench import DRAWN, BenchView
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField, TextField
 from labapp.gui.widgets.labels import Message, heading, show_words, wrapping_label
 from labapp.gui.widgets.layouts import fill, hbox
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
-from labapp.session.checklist import EQUIPMENT, SAFETY, STEPS, Items, tick
+from labapp.session.checklist import EQUIPMENT, SAFETY, STEPS, Items, tick, ticked
 from labapp.session.session import Session
+
+ENTRIES = {entry.key: entry for _, entries in RIG for entry in entries}
 
 EXPERIMENT_TAB, SAFETY_TAB, BENCH_TAB, STEPS_TAB = range(4)
 
@@ -42,7 +45,10 @@ class SetupPage(Page):
 
     def __init__(self, workspace: Workspace) -> None:
         super().__init__(workspace)
-        self.bench = BenchView()
+        self.drawn_fields = {key: _number(ENTRIES[key]) for key in DRAWN}
+        for key, field in self.drawn_fields.items():
+            self._put_when_edited(field, key)
+        self.bench = BenchView(self.drawn_fields)
         self.canvas_layout.addWidget(self.bench)
         self.rig_fields: dict[str, NumberField] = {}
         self.sigma_fields: dict[str, NumberField] = {}
@@ -74,6 +80,7 @@ class SetupPage(Page):
         self.panel_layout.addWidget(self.tabs)
         self.lock_with_session(
             *(*self.rig_fields.values(), *self.sigma_fields.values(), self.kind, self.travel),
+            *self.drawn_fields.values(),
             *(*self.record_fields.values(), *self.ticks.values(), *self.steps.values()),
             *self._filling,
         )
@@ -82,8 +89,9 @@ class SetupPage(Page):
     def refresh(self) -> None:
         """Show record, safety list and setup as the session holds them."""
         session, shown = self.session, presenter.shown(self.session)
-        for key, field in self.rig_fields.items():
+        for key, field in (*self.rig_fields.items(), *self.drawn_fields.items()):
             field.set_value(shown.values[key])
+            field.set_placeholder(f"{DEFAULTS[key]:g}")
             if shown.problems.get(key):
                 field.set_problem(shown.problems[key])
         for key, field in self.sigma_fields.items():
@@ -98,18 +106,18 @@ class SetupPage(Page):
         self.sigma_words.setText(shown.sigma_words)
         for name, noted in self.record_fields.items():
             noted.set_value(getattr(shown.record, name))
-        ticked = dict(shown.record.safety)
+        times = dict(ticked(shown.record))
         for item, box in (self.ticks | self.steps).items():
-            box.setChecked(item in ticked)
-            self._times[item].setText(f"ticked {_clock(ticked[item])}" if item in ticked else "")
-        self.tabs.setTabText(SAFETY_TAB, f"Safety {len(ticked.keys() & self.ticks)}/{len(SAFETY)}")
-        self.tabs.setTabText(BENCH_TAB, "Bench ⚠" if shown.problems else "Bench")
+            box.setChecked(item in times)
+            self._times[item].setText(f"ticked {_clock(times[item])}" if item in times else "")
+        self.tabs.setTabText(SAFETY_TAB, f"Safety {len(times.keys() & self.ticks)}/{len(SAFETY)}")
+        self.tabs.setTabText(BENCH_TAB, "Bench ⚠" if shown.problems or shown.missing else "Bench")
         show_words(self.others, "\n".join(shown.others))
         basis = (session.setup_text, shown.record)
         if basis != self._drawn:
             self._drawn = basis
             bench = presenter.bench(session)
-            self.bench.show_bench(bench.view, bench.words)
+            self.bench.show_bench(bench.rig, bench.view, bench.words)
             self.table.set_rows(bench.rows)
             self.table.setVisible(bool(bench.rows))
 
@@ -125,7 +133,10 @@ class SetupPage(Page):
 
     def leave(self) -> None:
         """Finish the edit under way."""
-        numbers = (*self.rig_fields.values(), *self.sigma_fields.values())
+        numbers = (
+            *(*self.rig_fields.values(), *self.sigma_fields.values()),
+            *self.drawn_fields.values(),
+        )
         for field in (*numbers, *self.record_fields.values()):
             field.flush()
 
@@ -188,18 +199,20 @@ class SetupPage(Page):
             boxes[item], self._times[item] = box, time
         return page
 
-    def _tick(self, item: str, ticked: bool) -> None:
+    def _tick(self, item: str, on: bool) -> None:
         now = datetime.now().astimezone().isoformat(timespec="seconds")
-        if not self.workspace.attempt(lambda session: tick(session, item, ticked, now)):
-            (self.ticks | self.steps)[item].setChecked(not ticked)
+        if not self.workspace.attempt(
+            lambda session: session.set_record(tick(session.record, item, on, now))
+        ):
+            (self.ticks | self.steps)[item].setChecked(not on)
 
     def _bench(self) -> QWidget:
         form = FieldForm()
-        load = button("Load…", "Take the whole set-up from a setup file (TOML)", self._choose_load)
+        load = button("Load…", "Take all of the set-up from a setup file (TOML)", self._choose_load)
         save = button("Save…", "Write the set-up to a file, for another session", self._choose_save)
         usual = button(
-            "Usual values",
-            "Put the usual values in where something is missing; check each of them",
+            "Use defaults",
+            "Enter the dissertation's bench where nothing is entered; check each number",
             lambda: self.workspace.attempt(presenter.put_usual),
         )
         self._filling = load, usual

@@ -1,0 +1,59 @@
+"""A field on a drawing, at the dimension that it is of."""
+
+from __future__ import annotations
+
+import pyqtgraph as pg
+from PySide6.QtCore import QPoint, QPointF, QRect
+from PySide6.QtWidgets import QAbstractSpinBox, QLayout, QWidget
+
+from labapp.core.values import FloatArray
+from labapp.gui.widgets.fields import NumberField
+from labapp.gui.widgets.labels import plain_label
+from labapp.gui.widgets.layouts import hbox
+
+STEPS = sorted(
+    ((dx, dy) for dx in range(-240, 241, 20) for dy in range(-160, 161, 4)),
+    key=lambda step: (abs(step[1]) + 2 * abs(step[0]), step),
+)
+"""How far, px, a box gives way to others, the nearest places first."""
+
+
+class DimensionBox(QWidget):
+    """A name and a field on a plot."""
+
+    def __init__(self, name: str, field: NumberField, plot: pg.PlotWidget) -> None:
+        super().__init__(plot)
+        self.plot = plot
+        self.field = field
+        self.setAutoFillBackground(True)
+        editor = field.editor
+        assert isinstance(editor, QAbstractSpinBox)
+        editor.setButtonSymbols(QAbstractSpinBox.ButtonSymbols.NoButtons)
+        editor.setFixedWidth(editor.fontMetrics().horizontalAdvance("−000.00") + 10)
+        row = hbox(plain_label(name), field, of=self)
+        row.setContentsMargins(3, 1, 3, 1)
+        row.setSizeConstraint(QLayout.SizeConstraint.SetFixedSize)
+
+    def put_at(self, place: FloatArray, others: list[QRect]) -> None:
+        """Put its middle at a place of the plot, shape (2,), or beside what lies there already.
+
+        Parameters
+        ----------
+        others
+            What lies on the plot; this box is added.
+        """
+        scene = self.plot.getViewBox().mapViewToScene(QPointF(*place.tolist()))
+        rect = QRect(QPoint(), self.sizeHint())
+        rect.moveCenter(self.plot.mapFromScene(scene))
+        room = self.plot.rect().adjusted(2, 2, -2, -2)
+        rect.moveLeft(max(room.left(), min(rect.left(), room.right() - rect.width())))
+        rect.moveTop(max(room.top(), min(rect.top(), room.bottom() - rect.height())))
+        places = (rect.translated(dx, dy) for dx, dy in STEPS)
+        free = (
+            place
+            for place in places
+            if room.contains(place) and not any(place.intersects(other) for other in others)
+        )
+        rect = next(free, rect)
+        self.move(rect.topLeft())
+        others.append(rect)

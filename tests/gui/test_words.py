@@ -1,0 +1,46 @@
+"""None of the old words is left in what the window shows."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from labapp.session.checklist import FORMER, SAFETY, tick, ticked
+from labapp.session.record import Record
+from tests.gui.words import sentences
+
+BANNED = {
+    r"III[ab]": "class 3B",
+    r"[Ww]elding goggles": "welding helmet",
+    r"^Use (these|it)$": "Apply",
+    r"^Not this one$": "Discard",
+    r"^(lowest|highest)$": "Min., Max.",
+    r"^Work out$": "Run",
+    r"by itself, at its rate|when told": "Trigger: free run",
+    r"^Read$": "Dismiss",
+    r"[Ss]ay where": "Locate…",
+    r"^Usual values$": "Use defaults",
+    r"\bput right\b|\bbears\b|\blets go\b|\bhanded over\b": "a plain verb",
+}
+"""Patterns of old words, and what stands in their place."""
+
+
+@pytest.mark.parametrize("pattern", BANNED)
+def test_no_old_word_is_left(pattern: str):
+    found = [(place, words) for place, words in sentences() if re.search(pattern, words)]
+    former = set(FORMER)
+    assert not [each for each in found if each[1] not in former], BANNED[pattern]
+
+
+def test_the_list_of_sentences_has_those_of_buttons_and_messages():
+    words = {words for _, words in sentences()}
+    assert {"Load set-&up…", "Laser points at nobody's eyes", "Frames are being measured"} <= words
+
+
+def test_ticks_of_items_that_were_renamed_count():
+    (old, new), *_ = FORMER.items()
+    assert new in dict(SAFETY)
+    record = Record(safety=((old, "then"),))
+    assert ticked(record) == ((new, "then"),)
+    assert tick(record, new, False, "now").safety == ()
