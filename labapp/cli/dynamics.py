@@ -13,8 +13,7 @@ from labapp.errors import InputError, os_errors_as_input
 from labapp.files import write_file
 
 if TYPE_CHECKING:
-    from labapp.core.dynamics.analysis import Dynamics
-    from labapp.session.session import Session
+    from labapp.core.dynamics.analysis import Dynamics, DynamicsSettings
     from labapp.session.signals import Signals
 
 
@@ -59,31 +58,14 @@ def dynamics(
     standard uncertainties; dynamics.png, modes.png; with --film mode.mp4.
     """
     from labapp.core.dynamics.analysis import DynamicsSettings
-    from labapp.export.dynamics import (
-        dynamics_of,
-        dynamics_pictures,
-        dynamics_tables,
-        measured_of,
-        write_mode_film,
-    )
-    from labapp.export.result_folder import measured_in
-    from labapp.session.session import Session
+    from labapp.export.dynamics import dynamics_pictures, dynamics_tables, write_mode_film
     from labapp.session.signals import read_signals
 
     folder = writable_folder(out)
     settings = DynamicsSettings(of, _band(band), segment)
-    with ExitStack() as at_end, progress_shown():
-        session: Session | None = None
-        if source.is_dir():
-            measured = measured_in(source)
-        else:
-            session = at_end.enter_context(Session.open(source, read_only=True))
-            measured = measured_of(session.frame_results(stale=False))
-        known = session.signals if session else None
-        known = read_signals(signals, full_scale) if signals else known
-        if start is not None or align is not None:
-            known = _aligned(known, start, align)
-        found = dynamics_of(measured, known.timed() if known else {}, settings)
+    own = read_signals(signals, full_scale) if signals else None
+    with progress_shown():
+        found = _analysed(source, own, start, align, settings)
     with os_errors_as_input(folder, "results", "room on its disk"):
         for name, text in dynamics_tables(found).items():
             write_file(folder / name, text.encode())
@@ -93,6 +75,32 @@ def dynamics(
             write_mode_film(folder / "mode.mp4", found, film)
     _tell(found)
     typer.echo(f"Results are in {folder.absolute()}")
+
+
+def _analysed(
+    source: Path,
+    own: Signals | None,
+    start: float | None,
+    align: Path | None,
+    settings: DynamicsSettings,
+) -> Dynamics:
+    """Analyse a session or a folder, with its signals or those that are given."""
+    from labapp.export.dynamics import dynamics_of, measured_of
+    from labapp.export.result_folder import measured_in
+    from labapp.session.session import Session
+
+    with ExitStack() as at_end:
+        if source.is_dir():
+            known, measured = own, measured_in(source)
+        else:
+            session = at_end.enter_context(Session.open(source, read_only=True))
+            known, measured = (
+                own or session.signals,
+                measured_of(session.frame_results(stale=False)),
+            )
+        if start is not None or align is not None:
+            known = _aligned(known, start, align)
+        return dynamics_of(measured, known.timed() if known else {}, settings)
 
 
 def _band(text: str | None) -> tuple[float, float] | None:

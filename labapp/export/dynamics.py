@@ -155,33 +155,26 @@ def dynamics_tables(found: Dynamics) -> dict[str, str]:
             }
         ),
         "peak.csv": _columns(vars(found.peak)),
-        "events.csv": csv_text(
-            [
-                ["series", "time_s", "time_sigma_s", "change", "slope_change_per_s"],
-                *(
-                    [name, *map(_cell, (e.time_s, e.sigma_s, e.change, e.slope_change_per_s))]
-                    for name, events in found.events.items()
-                    for e in events
-                ),
-            ]
-        ),
-        "responses.csv": csv_text(
-            [
-                ["signal", "series", "step_s", "signal_change", "order", "before"]
-                + [f"{name}{s}" for name in QUANTITIES for s in pairs],
-                *(
-                    [one.signal, one.series, _cell(one.step.time_s), _cell(one.step.change)]
-                    + [str(one.response.order), _cell(one.response.before)]
-                    + [_cell(of[n]) for n in QUANTITIES for of in _both(one.response)]
-                    for one in found.responses
-                ),
-            ]
-        ),
+        "events.csv": csv_text(_event_rows(found)),
+        "responses.csv": csv_text(_response_rows(found)),
     }
 
 
-def _both(response: Any) -> tuple[Mapping[str, float], Mapping[str, float]]:
-    return response.value, response.sigma
+def _event_rows(found: Dynamics) -> Iterator[list[str]]:
+    yield ["series", "time_s", "time_sigma_s", "change", "slope_change_per_s"]
+    for name, events in found.events.items():
+        for one in events:
+            yield [name, *map(_cell, (one.time_s, one.sigma_s, one.change, one.slope_change_per_s))]
+
+
+def _response_rows(found: Dynamics) -> Iterator[list[str]]:
+    names = [f"{name}{part}" for name in QUANTITIES for part in ("", "_sigma")]
+    yield ["signal", "series", "step_s", "signal_change", "order", "before", *names]
+    for one in found.responses:
+        step, made = one.step, one.response
+        pairs = [_cell(of[name]) for name in QUANTITIES for of in (made.value, made.sigma)]
+        where = [one.signal, one.series, _cell(step.time_s), _cell(step.change)]
+        yield [*where, str(made.order), _cell(made.before), *pairs]
 
 
 def _mode_row(one: ModeCourse) -> list[str]:
