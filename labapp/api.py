@@ -31,7 +31,9 @@ if TYPE_CHECKING:
     import pandas as pd
     import xarray as xr
 
+    from labapp.core.dynamics.analysis import Dynamics
     from labapp.session.session import Session
+    from labapp.session.signals import Signals
 
 TableName = Literal["measures", "dots", "points", "boundary"]
 
@@ -114,13 +116,7 @@ class Results(Sequence[FrameResult]):
     @classmethod
     def of_session(cls, session: Session) -> Results:
         """Return the results that a session has; frames that were not measured are left out."""
-        times = session.overview().time_s.tolist()
-        each = zip(times, map(session.result, session.frames.tolist()), strict=True)
-        results = tuple(
-            FrameResult(r.frame, None if np.isnan(time_s) else time_s, r.measurement)
-            for time_s, r in each
-            if r is not None
-        )
+        results = tuple(session.frame_results())
         return cls(results, session.setup.calibration, session.setup_verdict)
 
     # --- a sequence ---------------------------------------------------------------------------
@@ -217,6 +213,39 @@ class Results(Sequence[FrameResult]):
                 "x": ("x", x_mm, mm | {"long_name": "X, across the weld"}),
             },
         )
+
+    def dynamics(
+        self,
+        signals: Signals | None = None,
+        of: str = "height_mm",
+        band_hz: tuple[float, float] | None = None,
+        segment_s: float | None = None,
+    ) -> Dynamics:
+        """Return modes, spectra, events and step responses of the pool over these frames.
+
+        Parameters
+        ----------
+        signals
+            Current, voltage and wire feed (`labapp.session.signals.read_signals`), whose steps the
+            pool responds to.
+        of
+            Series for the spectra: a column of sizes, or ``convexity_mm``, ``asymmetry``,
+            ``wetting_slope_deg``.
+        band_hz
+            Lowest and highest frequency of oscillations; None: all that the frames resolve.
+        segment_s
+            Duration of a segment of the spectrogram; None: an eighth of the recording.
+
+        Raises
+        ------
+        InputError
+            If frames have no time, or fewer than 16 have a surface.
+        """
+        from labapp.core.dynamics.analysis import DynamicsSettings
+        from labapp.export.dynamics import dynamics_of, measured_of
+
+        timed = signals.timed() if signals else {}
+        return dynamics_of(measured_of(self), timed, DynamicsSettings(of, band_hz, segment_s))
 
     # --- as plots -----------------------------------------------------------------------------
 

@@ -27,6 +27,7 @@ from labapp.cli import (
     bench,
     benchmark,
     cameras,
+    dynamics,
     fold,
     lines,
     pattern,
@@ -203,6 +204,7 @@ def program(
 
 app.command()(reconstruct.reconstruct)
 app.command()(lines.lines)
+app.command()(dynamics.dynamics)
 
 
 @app.command()

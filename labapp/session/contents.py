@@ -14,12 +14,15 @@ import numpy as np
 from labapp.errors import InputError
 
 if TYPE_CHECKING:
+    from collections.abc import Iterator
+
     from labapp.config.setup import Setup
     from labapp.core.images.line_correction import LineCorrection
     from labapp.core.pipeline import ByHand, Settings
     from labapp.core.recording.residual_check import SetupVerdict
     from labapp.core.rows.correction import Correction
     from labapp.core.values import IntArray
+    from labapp.export.frame_result import FrameResult
     from labapp.media import Frame, GreyImage
     from labapp.run.limits import Limits
     from labapp.session.documents import Change
@@ -230,6 +233,17 @@ class SessionContents:
             self._basis(),
             self._documents.fingerprint("correction", frame),
         )
+
+    def frame_results(self, stale: bool = True) -> Iterator[FrameResult]:
+        """Results of the frames that were measured, read one by one; ``stale``: stale ones, too."""
+        from labapp.export.frame_result import FrameResult
+
+        times = self.overview().time_s.tolist()
+        for frame, time_s in zip(self.frames.tolist(), times, strict=True):
+            found = self.result(frame)
+            if found is not None and (stale or not found.stale):
+                time = None if np.isnan(time_s) else time_s
+                yield FrameResult(frame, time, found.measurement)
 
     def overview(self, scheme: str | None = None) -> Overview:
         """Status, correction, staleness and measures of every frame."""

@@ -9,11 +9,11 @@ import os
 import re
 import warnings
 from array import array
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TextIO
+from typing import TYPE_CHECKING, TextIO
 
 import numpy as np
 
@@ -25,6 +25,10 @@ from labapp.config.csv_tables import (
 )
 from labapp.core.values import FloatArray, ReadOnlyArrays
 from labapp.errors import InputError
+
+if TYPE_CHECKING:
+    from labapp.core.dynamics.alignment import Offset
+    from labapp.media import Frame
 
 A_TABLE = (
     "a table (CSV, UTF-8) with a line of names: a time (s, ms, µs), and a current, a voltage or a "
@@ -81,6 +85,39 @@ class Signals(ReadOnlyArrays):
         """Those of `CHANNELS` that have samples: name → values, shape (n,)."""
         every = zip(CHANNELS, (self.current_a, self.voltage_v, self.wire_m_min), strict=True)
         return {name: value for name, value in every if np.isfinite(value).any()}
+
+    def timed(self) -> dict[str, tuple[FloatArray, FloatArray]]:
+        """The same with their times on the recording's clock, s."""
+        return {name: (self.time_s + self.start_s, of) for name, of in self.channels.items()}
+
+
+def align_signals(signals: Signals, frames: Iterable[Frame]) -> tuple[Signals, Offset]:
+    """Signals whose start was found by correlation with the mean brightness of frames.
+
+    The channel is taken that correlates best: current, as a rule.
+
+    Raises
+    ------
+    InputError
+        If none correlates, or frames have no time.
+    """
+    from labapp.core.dynamics.alignment import find_offset
+
+    seen = [(frame.time_s, float(frame.image.mean())) for frame in frames]
+    times = [time_s for time_s, _ in seen if time_s is not None]
+    if len(times) < len(seen):
+        raise InputError("signals", "start", "unknown", "a recording that has a time base")
+    light = np.array([bright for _, bright in seen])
+    found = [
+        offset
+        for of in signals.channels.values()
+        if (offset := find_offset(signals.time_s, of, np.array(times), light)) is not None
+    ]
+    if not found:
+        right = "signals that the frames' brightness follows; or enter when they start"
+        raise InputError(signals.file, "start", "not found: light and signals differ", right)
+    best = max(found, key=lambda one: abs(one.correlation))
+    return replace(signals, start_s=best.start_s), best
 
 
 @dataclass(frozen=True)

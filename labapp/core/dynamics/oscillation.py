@@ -93,7 +93,8 @@ def fit_oscillations(
     """Damped sinusoids in a series, the strongest first.
 
     One after the other is added where the residual's periodogram is largest, and all are fitted
-    together, as long as noise would make as much with a probability of less than `FALSE_ALARM`.
+    together, as long as noise would make as much with a probability of less than `FALSE_ALARM` and
+    none lies at an end of the band.
 
     Parameters
     ----------
@@ -102,7 +103,7 @@ def fit_oscillations(
     values
         Shape (n,), or (n, c) of c channels that swing with one frequency.
     most
-        Largest number of oscillations.
+        Largest number of oscillations; one for every `FEWEST` samples at most.
     band_hz
         Lowest and highest frequency. None: from two periods in the series to half the frame rate.
     """
@@ -112,17 +113,19 @@ def fit_oscillations(
         return ()
     step = float(np.median(np.diff(time)))
     band = band_hz or (2 / (time[-1] + step), 0.5 / step)
+    edge = 0.05 / (time[-1] + step)  # what is at an end of the band lies beyond it
     fitted = _Fit(time, value, np.empty((0, 2)))
-    found: list[Oscillation] = []
-    while len(found) < most:
+    while len(fitted.rates) < min(most, len(time) // FEWEST):
         start = 2 * np.pi * _strongest(time, fitted.residual, step, band)
         starts = (np.vstack([fitted.rates, (start, k / time[-1])]) for k in DAMPING_STARTS)
         wider = min((_refine(time, value, s, band) for s in starts), key=lambda f: f.cost)
+        hertz = wider.rates[:, 0] / (2 * np.pi)
+        if hertz.min() < band[0] + edge or hertz.max() > band[1] - edge:
+            break
         if not _stands_out(fitted, wider, step):
             break
         fitted = wider
-        found.append(fitted.oscillation(0, step))
-    every = [fitted.oscillation(k, step) for k in range(len(found))]
+    every = [fitted.oscillation(k, step) for k in range(len(fitted.rates))]
     return tuple(sorted(every, key=lambda one: -_energy(one, time)))
 
 

@@ -16,7 +16,7 @@ from labapp.core.surface.boundary import Boundary
 from labapp.core.surface.surface import Surface
 from labapp.core.values import FloatArray
 
-RIM = 1 - 1e-3
+RIM = 0.99
 """Share of the way from the centre to the boundary where its slope is taken."""
 
 

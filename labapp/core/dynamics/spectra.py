@@ -64,12 +64,15 @@ class Spectrogram(ReadOnlyArrays):
         Shape (s, f), unit²/Hz; each has two degrees of freedom.
     method
         How they were made.
+    segment_s
+        Duration of a segment, s.
     """
 
     time_s: FloatArray
     frequency_hz: FloatArray
     density: FloatArray
     method: Literal["Welch", "Lomb-Scargle"]
+    segment_s: float
 
     def mean(self, confidence: float = 0.95) -> Spectrum:
         """The mean density of all segments, with its confidence interval."""
@@ -119,7 +122,9 @@ def spectrogram(
         frequency, middle, density = signal.spectrogram(
             values, 1 / step, "hann", length, length // 2, detrend="linear"
         )
-        return Spectrogram(time_s[0] + middle, frequency[1:], density.T[:, 1:], "Welch")
+        return Spectrogram(
+            time_s[0] + middle, frequency[1:], density.T[:, 1:], "Welch", length * step
+        )
     frequency = np.asarray(np.fft.rfftfreq(length, step)[1:], float)
     begins = _begins(time_s, step, length)
     density = np.full((len(begins), len(frequency)), np.nan)
@@ -127,7 +132,9 @@ def spectrogram(
         within = _within(time_s, begin, step, length)
         if within.sum() >= LEAST_FILLED * length:
             row[:] = _lomb_scargle(time_s[within] - begin, values[within], frequency, step, length)
-    return Spectrogram(begins + length * step / 2, frequency, density, "Lomb-Scargle")
+    return Spectrogram(
+        begins + length * step / 2, frequency, density, "Lomb-Scargle", length * step
+    )
 
 
 def track_peak(

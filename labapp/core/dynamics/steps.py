@@ -175,18 +175,22 @@ def _noise(level: FloatArray) -> float:
     """Variance of the noise of samples, from their second differences (robust to changes)."""
     second = np.diff(level, 2)
     spread = 1.4826 * float(np.median(np.abs(second))) / np.sqrt(6)
-    return float(max(spread**2, 1e-30))
+    # Without noise, a thousandth of the range stands for it.
+    return float(max(spread**2, (1e-3 * float(np.ptp(level))) ** 2, 1e-30))
 
 
 def _partition(at: FloatArray, level: FloatArray, penalty: float) -> list[int]:
-    """Ends of the optimal pieces, beginning with 0 and ending with n."""
+    """Ends of the optimal pieces, beginning with 0 and ending with n.
+
+    The last sample of a piece counts in none: the change may lie amid what it is the mean of.
+    """
     count = len(at)
     best, previous = np.full(count + 1, np.inf), np.zeros(count + 1, int)
     best[0] = -penalty
     cost = _line_costs(at, level)
     for end in range(LEAST_BLOCKS, count + 1):
         begins = np.arange(0, end - LEAST_BLOCKS + 1)
-        total = best[begins] + cost(begins, end) + penalty
+        total = best[begins] + cost(begins, end - 1) + penalty
         previous[end] = begins[np.argmin(total)]
         best[end] = total.min()
     ends = [count]
@@ -214,17 +218,21 @@ def _event(
 ) -> Event:
     """The change between two pieces, and how well its place is known (profile likelihood)."""
     cost = _line_costs(at, level)
-    middles = np.arange(before[0] + 2, after[1] - 1)
-    total = [
-        float(cost(np.array([before[0]]), m)[0] + cost(np.array([m]), after[1])[0]) for m in middles
-    ]
-    weight = np.exp(-(np.array(total) - min(total)) / (2 * noise))
+    middles = np.arange(before[0] + 3, after[1] - 2)
+    total = np.array(
+        [
+            float(cost(np.array(before[:1]), m - 1)[0] + cost(np.array([m]), after[1] - 1)[0])
+            for m in middles
+        ]
+    )
+    weight = np.exp(-(total - total.min()) / (2 * noise))
     weight /= weight.sum()
-    edge = (at[middles - 1] + at[middles]) / 2
+    edge = at[middles - 1]
     time = float(weight @ edge)
     width = float(np.median(np.diff(at)))
     sigma = float(np.sqrt(weight @ (edge - time) ** 2 + width**2 / 12))
-    lines = [np.polyfit(at[a:b] - time, level[a:b], 1) for a, b in (before, after)]
+    ends = (before[0], before[1] - 1), (after[0], after[1] - 1)
+    lines = [np.polyfit(at[a:b] - time, level[a:b], 1) for a, b in ends]
     slope, change = lines[1] - lines[0]
     return Event(time, sigma, float(change), float(slope))
 

@@ -1,0 +1,157 @@
+"""`labapp dynamics`: what a pool does over a recording."""
+
+from __future__ import annotations
+
+from contextlib import ExitStack
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from labapp.cli.shared import finite, progress_shown, writable_folder, write_figure
+from labapp.errors import InputError, os_errors_as_input
+from labapp.files import write_file
+
+if TYPE_CHECKING:
+    from labapp.core.dynamics.analysis import Dynamics, DynamicsSettings
+    from labapp.session.signals import Signals
+
+
+def dynamics(
+    source: Annotated[
+        Path, typer.Argument(help="A session, or a folder that `labapp reconstruct` wrote.")
+    ],
+    out: Annotated[Path, typer.Option(help="Folder for tables and pictures; made if missing.")],
+    *,
+    of: Annotated[
+        str, typer.Option(help="Series for the spectra: width_mm, height_mm, convexity_mm …")
+    ] = "height_mm",
+    band: Annotated[
+        str | None, typer.Option(metavar="LOW:HIGH", help="Frequencies to look at (Hz).")
+    ] = None,
+    segment: Annotated[
+        float | None, typer.Option(min=1e-6, help="Duration of a segment of the spectrogram (s).")
+    ] = None,
+    signals: Annotated[
+        Path | None,
+        typer.Option(help="Current, voltage, wire feed: CSV, TDMS or WAV; else the session's."),
+    ] = None,
+    full_scale: Annotated[
+        tuple[float, float, float],
+        typer.Option(metavar="A V M/MIN", help="Full scale of a WAV's channels."),
+    ] = (1.0, 1.0, 1.0),
+    start: Annotated[
+        float | None,
+        typer.Option(callback=finite, help="Added to the signals' times it gives the recording's."),
+    ] = None,
+    align: Annotated[
+        Path | None,
+        typer.Option(metavar="RECORDING", help="Find --start from the light of these frames."),
+    ] = None,
+    film: Annotated[
+        str | None, typer.Option(metavar="MODE", help='Film of one mode: "(0,1)", "POD1" …')
+    ] = None,
+) -> None:
+    """Find oscillations, modes, events and step responses in what was measured.
+
+    series.csv, modes.csv, spectrum.csv, spectrogram.csv, peak.csv, events.csv, responses.csv, with
+    standard uncertainties; dynamics.png, modes.png; with --film mode.mp4.
+    """
+    from labapp.core.dynamics.analysis import DynamicsSettings
+    from labapp.export.dynamics import dynamics_pictures, dynamics_tables, write_mode_film
+    from labapp.session.signals import read_signals
+
+    folder = writable_folder(out)
+    settings = DynamicsSettings(of, _band(band), segment)
+    own = read_signals(signals, full_scale) if signals else None
+    with progress_shown():
+        found = _analysed(source, own, start, align, settings)
+    with os_errors_as_input(folder, "results", "room on its disk"):
+        for name, text in dynamics_tables(found).items():
+            write_file(folder / name, text.encode())
+        for name, figure in dynamics_pictures(found).items():
+            write_figure(folder, name, figure, "png")
+        if film is not None:
+            write_mode_film(folder / "mode.mp4", found, film)
+    _tell(found)
+    typer.echo(f"Results are in {folder.absolute()}")
+
+
+def _analysed(
+    source: Path,
+    own: Signals | None,
+    start: float | None,
+    align: Path | None,
+    settings: DynamicsSettings,
+) -> Dynamics:
+    """Analyse a session or a folder, with its signals or those that are given."""
+    from labapp.export.dynamics import dynamics_of, measured_of
+    from labapp.export.result_folder import measured_in
+    from labapp.session.session import Session
+
+    with ExitStack() as at_end:
+        if source.is_dir():
+            known, measured = own, measured_in(source)
+        else:
+            session = at_end.enter_context(Session.open(source, read_only=True))
+            known, measured = (
+                own or session.signals,
+                measured_of(session.frame_results(stale=False)),
+            )
+        if start is not None or align is not None:
+            known = _aligned(known, start, align)
+        return dynamics_of(measured, known.timed() if known else {}, settings)
+
+
+def _band(text: str | None) -> tuple[float, float] | None:
+    if text is None:
+        return None
+    try:
+        low, high = map(float, text.split(":"))
+    except ValueError:
+        low = high = 0.0
+    if not 0 < low < high:
+        raise InputError("--band", "band", text, "LOW:HIGH, two frequencies above 0 (Hz)")
+    return low, high
+
+
+def _aligned(known: Signals | None, start: float | None, align: Path | None) -> Signals:
+    """Signals with the start that is given, or that the light of a recording gives."""
+    from dataclasses import replace
+
+    from labapp.media import open_source
+    from labapp.session.signals import align_signals
+
+    if known is None:
+        raise InputError("--signals", "file", "none", "one, or a session that has signals")
+    if align is None:
+        assert start is not None
+        return replace(known, start_s=start)
+    with open_source(align) as recording:
+        frames = (recording.frame(number) for number in range(len(recording)))
+        aligned, offset = align_signals(known, frames)
+    sure = f"{offset.start_s:.4f} ± {offset.sigma_s:.4f} s, correlation {offset.correlation:.2f}"
+    typer.echo(f"signals start at {sure}")
+    if offset.rival_s is not None:
+        typer.echo(f"warning: {offset.rival_s:.4f} s fits about as well: give --start", err=True)
+    return aligned
+
+
+def _tell(found: Dynamics) -> None:
+    """Print frequencies, events and responses."""
+    for one in found.modes:
+        if figures := one.figures:
+            hertz, mm, rate = (
+                figures[n] for n in ("frequency_hz", "amplitude_mm", "damping_per_s")
+            )
+            typer.echo(
+                f"mode {one.name}: {hertz[0]:.3f} ± {hertz[1]:.3f} Hz, {1e3 * mm[0]:.2f} ± "
+                f"{1e3 * mm[1]:.2f} µm, damping {rate[0]:.2f} ± {rate[1]:.2f} /s, {one.share:.0%}"
+            )
+    for name, events in found.events.items():
+        for event in events:
+            typer.echo(f"{name} changes at {event.time_s:.4f} ± {event.sigma_s:.4f} s")
+    for step in found.responses:
+        value, sigma = step.response.value, step.response.sigma
+        told = ", ".join(f"{n} {value[n]:.4g} ± {sigma[n]:.2g}" for n in value)
+        typer.echo(f"{step.series} after {step.signal} at {step.step.time_s:.4f} s: {told}")

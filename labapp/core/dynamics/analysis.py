@@ -1,0 +1,162 @@
+"""Everything that a recording's surfaces and sizes say of the pool over time, in one value."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from labapp.core.dynamics.modes import ModeCourse, SurfaceSeries, bessel_modes, pod_modes
+from labapp.core.dynamics.oscillation import FEWEST
+from labapp.core.dynamics.spectra import PeakTrack, Spectrogram, spectrogram, track_peak
+from labapp.core.dynamics.steps import Event, StepResponse, find_events, step_response
+from labapp.core.values import FloatArray
+
+RESPONDING = ("width_mm", "length_mm", "height_mm", "convexity_mm")
+"""Series whose events and responses are looked for."""
+
+MOST_STEPS = 8
+"""A signal with more changes is pulsed: responses to single ones are not looked for."""
+
+
+@dataclass(frozen=True)
+class DynamicsSettings:
+    """What can be chosen.
+
+    Parameters
+    ----------
+    of
+        Series whose spectra and peak are made.
+    band_hz, segment_s
+        See `fit_oscillations` and `spectrogram`.
+    """
+
+    of: str = "height_mm"
+    band_hz: tuple[float, float] | None = None
+    segment_s: float | None = None
+
+
+@dataclass(frozen=True)
+class Response:
+    """Response of one series to a step of one signal."""
+
+    signal: str
+    series: str
+    step: Event
+    response: StepResponse
+
+
+@dataclass(frozen=True)
+class Dynamics:
+    """What the pool does over a recording; n frames.
+
+    Parameters
+    ----------
+    surfaces
+        The surfaces it is worked out from.
+    series
+        Sizes and shape of each, name → values, shape (n,).
+    settings
+        What was chosen.
+    modes, pod
+        Bessel modes and POD.
+    spectrogram, peak
+        Of ``settings.of``.
+    events
+        Change points by series, and by signal.
+    responses
+        Responses to the steps of signals.
+    """
+
+    surfaces: SurfaceSeries
+    series: Mapping[str, FloatArray]
+    settings: DynamicsSettings
+    modes: tuple[ModeCourse, ...]
+    pod: tuple[ModeCourse, ...]
+    spectrogram: Spectrogram
+    peak: PeakTrack
+    events: Mapping[str, tuple[Event, ...]]
+    responses: tuple[Response, ...]
+
+
+def analyse(
+    surfaces: SurfaceSeries,
+    series: Mapping[str, FloatArray],
+    signals: Mapping[str, tuple[FloatArray, FloatArray]],
+    settings: DynamicsSettings,
+    scale_sigma: float = 0.0,
+) -> Dynamics:
+    """Analyse how the pool changes over a recording.
+
+    Parameters
+    ----------
+    surfaces, series
+        See `Dynamics`.
+    signals
+        Name → times on the recording's clock, s, and values, of current, voltage, wire feed.
+    settings
+        See `DynamicsSettings`.
+    scale_sigma
+        See `bessel_modes`.
+
+    Raises
+    ------
+    ValueError
+        If there are fewer than `FEWEST` frames, or a segment has fewer.
+    """
+    time = surfaces.time_s
+    if len(time) < FEWEST:
+        raise ValueError(f"{len(time)} frames have a surface; {FEWEST} are needed")
+    modes = bessel_modes(surfaces, scale_sigma=scale_sigma, band_hz=settings.band_hz)
+    slowest = [one.oscillations[0].frequency_hz for one in modes if one.oscillations]
+    period = 1 / min(slowest) if slowest else 0.0
+    events = {name: find_events(time, series[name], period) for name in RESPONDING}
+    steps = {}
+    for name, (at, value) in signals.items():
+        within = (at >= time[0]) & (at <= time[-1]) & np.isfinite(value)
+        found = find_events(at[within], value[within])
+        steps[name] = tuple(_sharpened(one, at[within], value[within]) for one in found)
+    chosen = time, series[settings.of], settings.segment_s
+    return Dynamics(
+        surfaces,
+        series,
+        settings,
+        modes,
+        pod_modes(surfaces, scale_sigma=scale_sigma, band_hz=settings.band_hz),
+        spectrogram(*chosen),
+        track_peak(*chosen, settings.band_hz),
+        events | steps,
+        _responses(time, series, steps),
+    )
+
+
+def _responses(
+    time: FloatArray, series: Mapping[str, FloatArray], steps: Mapping[str, tuple[Event, ...]]
+) -> tuple[Response, ...]:
+    """Responses of every series to every step of signals that have few; each until the next."""
+    found = []
+    for signal, events in steps.items():
+        if len(events) > MOST_STEPS:
+            continue
+        ends = [*(one.time_s for one in events), np.inf]
+        for k, event in enumerate(events):
+            begin = -np.inf if k == 0 else ends[k - 1]
+            used = (time > begin) & (time < ends[k + 1])
+            for name in RESPONDING:
+                one = step_response(time[used], series[name][used], event.time_s)
+                found += [Response(signal, name, event, one)] if one else []
+    return tuple(found)
+
+
+def _sharpened(event: Event, at: FloatArray, value: FloatArray) -> Event:
+    """An event of a signal to the sample: the best split in two levels within 4 σ of it."""
+    near = np.flatnonzero(np.abs(at - event.time_s) <= 4 * event.sigma_s)
+    if len(near) < 4:
+        return event
+    x = value[near]
+    n = np.arange(1, len(x))
+    below, total = np.cumsum(x)[:-1], x.sum()
+    split = near[int(np.argmax(below**2 / n + (total - below) ** 2 / (len(x) - n)))]
+    step = float(at[split + 1] - at[split])
+    return replace(event, time_s=float(at[split] + step / 2), sigma_s=step / np.sqrt(12))

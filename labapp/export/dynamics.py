@@ -1,0 +1,336 @@
+"""The pool over time: from results to `Dynamics`, tables, pictures, a film of one mode."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from labapp.core.dynamics.analysis import Dynamics, DynamicsSettings, analyse
+from labapp.core.dynamics.modes import RHO, RINGS, SPOKES, ModeCourse, SurfaceSeries
+from labapp.core.dynamics.shape import shape_of
+from labapp.core.dynamics.steps import QUANTITIES
+from labapp.core.surface.boundary import Boundary
+from labapp.core.surface.interpolation import CloughTocherSurface
+from labapp.core.surface.measures import SIZES
+from labapp.core.surface.reconstruction import Reconstruction
+from labapp.core.surface.surface import Surface
+from labapp.core.values import FloatArray
+from labapp.errors import InputError
+from labapp.export.frame_result import FrameResult
+from labapp.text import csv_text
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from labapp.export.rendering.scene import Scene
+
+SHAPES = ("convexity_mm", "asymmetry", "wetting_slope_deg")
+SERIES = (*SIZES, *SHAPES)
+"""Series whose spectra can be made, and that are written."""
+
+FIGURES = (
+    *("frequency_hz", "damping_per_s", "amplitude_mm", "phase_deg"),
+    *("direction_deg", "turning"),
+)
+
+FILM_FRAMES, FILM_HZ, FILM_PERIODS = 48, 24.0, 3
+"""Pictures of a period in a film of one mode, pictures a second, periods."""
+
+FILM_SWING = 0.3
+"""Amplitude in it, as a share of the pool's largest height."""
+
+Measured = tuple[int, float, Surface, Boundary, Mapping[str, float]]
+"""Frame, time (s), surface, boundary, and sizes by name."""
+
+
+def measured_of(results: Iterable[FrameResult]) -> Iterator[Measured]:
+    """Frames that have a surface.
+
+    Raises
+    ------
+    InputError
+        If one has no time.
+    """
+    for one in results:
+        made, sizes = one.measurement.reconstruction, one.measurement.measures
+        if made is not None and sizes is not None:
+            if one.time_s is None:
+                raise no_time_base()
+            yield one.frame, one.time_s, made.unbounded, made.boundary, vars(sizes)
+
+
+def no_time_base() -> InputError:
+    """Why frames without times have no frequencies."""
+    right = "a recording that has a time base: import it with a frame rate"
+    return InputError("dynamics", "time", "unknown", right)
+
+
+def dynamics_of(
+    measured: Iterable[Measured],
+    signals: Mapping[str, tuple[FloatArray, FloatArray]] | None = None,
+    settings: DynamicsSettings | None = None,
+) -> Dynamics:
+    """Analyse how the pool changes over a recording.
+
+    Parameters
+    ----------
+    measured
+        Frames with a surface, in their order (`measured_of`); they are taken one by one.
+    signals
+        Name → times on the recording's clock, s, and values.
+    settings
+        None: the defaults.
+
+    Raises
+    ------
+    InputError
+        If there are too few frames, or a name or segment is none.
+    """
+    chosen = settings or DynamicsSettings()
+    if chosen.of not in SERIES:
+        raise InputError("dynamics", "of", chosen.of, f"one of {', '.join(SERIES)}")
+    rows: list[list[float]] = []
+    setup: list[float] = []
+
+    def noted() -> Iterator[tuple[int, float, Surface, Boundary]]:
+        for frame, time_s, surface, boundary, sizes in measured:
+            shape = shape_of(surface, boundary)
+            rows.append([*(sizes[name] for name in SIZES), *(getattr(shape, n) for n in SHAPES)])
+            setup.append(sizes.get("height_sigma_setup_mm", np.nan))
+            yield frame, time_s, surface, boundary
+
+    surfaces = SurfaceSeries.of(noted())
+    series = dict(zip(SERIES, np.array(rows).reshape(-1, len(SERIES)).T, strict=True))
+    highest = max(np.max(np.abs([series["height_mm"], series["depth_mm"]]), initial=0), 1e-9)
+    scale = float(np.nanmean(setup)) / highest if np.isfinite(setup).any() else 0.0
+    try:
+        return analyse(surfaces, series, signals or {}, chosen, scale)
+    except ValueError as error:
+        raise InputError("dynamics", "frames", str(error), "a longer recording or part") from error
+
+
+# --- tables -----------------------------------------------------------------------------------
+
+
+def dynamics_tables(found: Dynamics) -> dict[str, str]:
+    """Tables by file name, CSV."""
+    courses = [
+        (f"{one.name} {k}".replace(" 0", ""), one.coefficient_mm[:, k])
+        for one in (*found.modes, *found.pod)
+        for k in range(len(one.shape))
+    ]
+    series = {
+        "frame": found.surfaces.frame,
+        "time_s": found.surfaces.time_s,
+        **found.series,
+        **{f"mode {name} mm": values for name, values in courses},
+    }
+    mean, gram = found.spectrogram.mean(), found.spectrogram
+    pairs = ("", "_sigma")
+    return {
+        "series.csv": _columns(series),
+        "modes.csv": csv_text(
+            [
+                ["mode", "share", *(f"{n}{s}" for n in FIGURES for s in pairs), "others_hz"],
+                *(_mode_row(one) for one in (*found.modes, *found.pod)),
+            ]
+        ),
+        "spectrum.csv": _columns(
+            {
+                "frequency_hz": mean.frequency_hz,
+                "density_per_hz": mean.density,
+                "low_95_per_hz": mean.low,
+                "high_95_per_hz": mean.high,
+            }
+        ),
+        "spectrogram.csv": _columns(
+            {"time_s": gram.time_s}
+            | {
+                f"{hz:.6g} Hz": row
+                for hz, row in zip(gram.frequency_hz, gram.density.T, strict=True)
+            }
+        ),
+        "peak.csv": _columns(vars(found.peak)),
+        "events.csv": csv_text(_event_rows(found)),
+        "responses.csv": csv_text(_response_rows(found)),
+    }
+
+
+def _event_rows(found: Dynamics) -> Iterator[list[str]]:
+    yield ["series", "time_s", "time_sigma_s", "change", "slope_change_per_s"]
+    for name, events in found.events.items():
+        for one in events:
+            yield [name, *map(_cell, (one.time_s, one.sigma_s, one.change, one.slope_change_per_s))]
+
+
+def _response_rows(found: Dynamics) -> Iterator[list[str]]:
+    names = [f"{name}{part}" for name in QUANTITIES for part in ("", "_sigma")]
+    yield ["signal", "series", "step_s", "signal_change", "order", "before", *names]
+    for one in found.responses:
+        step, made = one.step, one.response
+        pairs = [_cell(of[name]) for name in QUANTITIES for of in (made.value, made.sigma)]
+        where = [one.signal, one.series, _cell(step.time_s), _cell(step.change)]
+        yield [*where, str(made.order), _cell(made.before), *pairs]
+
+
+def _mode_row(one: ModeCourse) -> list[str]:
+    figures = one.figures
+    cells = [_cell(x) for n in FIGURES for x in figures.get(n, (np.nan, np.nan))]
+    others = " ".join(f"{o.frequency_hz:.4g}" for o in one.oscillations[1:])
+    return [one.name, _cell(one.share), *cells, others]
+
+
+def _columns(columns: Mapping[str, Any]) -> str:
+    rows = zip(*columns.values(), strict=True)
+    return csv_text([list(columns), *(list(map(_cell, row)) for row in rows)])
+
+
+def _cell(value: float) -> str:
+    return f"{value:.7g}" if np.isfinite(value) else ""
+
+
+# --- pictures ---------------------------------------------------------------------------------
+
+
+def draw_spectrogram(plot: Any, found: Dynamics) -> None:
+    """Spectrogram in dB with the tracked peak, on a plot of matplotlib."""
+    gram = found.spectrogram
+    db = 10 * np.log10(np.maximum(gram.density.T, 1e-30))
+    low, high = np.nanpercentile(db, [20, 100])
+    # Segments overlap by half, so that each shows the middle of its own.
+    width = gram.segment_s / (2 if len(gram.time_s) > 1 else 1)
+    times = np.append(gram.time_s, gram.time_s[-1] + width) - width / 2
+    step = gram.frequency_hz[0]
+    hertz = np.append(gram.frequency_hz, gram.frequency_hz[-1] + step) - step / 2
+    image = plot.pcolormesh(times, hertz, db, vmin=low, vmax=high, rasterized=True)
+    peak = found.peak
+    bars = {"fmt": "w.-", "linewidth": 0.8, "markersize": 3}
+    plot.errorbar(peak.time_s, peak.frequency_hz, peak.frequency_sigma_hz, **bars)
+    plot.set(xlabel="time (s)", ylabel="frequency (Hz)")
+    plot.figure.colorbar(image, ax=plot, label=f"{found.settings.of}²/Hz (dB)")
+
+
+def draw_spectrum(plot: Any, found: Dynamics) -> None:
+    """Mean spectrum with its 95 % interval."""
+    mean = found.spectrogram.mean()
+    plot.fill_between(mean.frequency_hz, mean.low, mean.high, alpha=0.3, linewidth=0)
+    plot.semilogy(mean.frequency_hz, mean.density)
+    plot.set(xlabel="frequency (Hz)", ylabel=f"{found.settings.of}²/Hz")
+    plot.set_title(f"{found.spectrogram.method}, 95 %", fontsize="small", loc="right")
+
+
+def draw_series(plot: Any, found: Dynamics, name: str) -> None:
+    """One series with its events, the steps of signals and the fitted responses."""
+    plot.plot(found.surfaces.time_s, found.series[name], ".", markersize=2, color="0.5")
+    for event in found.events.get(name, ()):
+        plot.axvline(event.time_s, color="C1", linewidth=0.8)
+    for one in found.responses:
+        if one.series == name:
+            plot.plot(*one.response.fitted, color="C0")
+            plot.axvline(one.step.time_s, color="C2", linestyle="--", linewidth=0.8)
+    plot.set(xlabel="time (s)", ylabel=name)
+
+
+def draw_mode(plot: Any, found: Dynamics, one: ModeCourse) -> None:
+    """Height of a mode's crest from above."""
+    shape = mode_heights(one, 0.0)
+    closed = _closed(found.surfaces.nodes_mm), _closed(shape[:, None])
+    (x, y), z = np.moveaxis(closed[0], -1, 0), closed[1][..., 0]
+    plot.contourf(x, y, z, np.linspace(-1.05, 1.05, 22), cmap="RdBu_r")
+    plot.set(aspect="equal", xlabel="X (mm)")
+    figures = one.figures
+    told = "no oscillation stands out"
+    if figures:
+        hertz, mm = figures["frequency_hz"], figures["amplitude_mm"]
+        told = f"{hertz[0]:.2f} ± {hertz[1]:.2g} Hz\n{1e3 * mm[0]:.1f} ± {1e3 * mm[1]:.1f} µm"
+    plot.set_title(f"{one.name}, {one.share:.0%}\n{told}", fontsize="small")
+
+
+def dynamics_pictures(found: Dynamics) -> dict[str, Figure]:
+    """Pictures by name: ``dynamics`` and ``modes``."""
+    from matplotlib import rc_context
+
+    from labapp.studies.plotting import INCHES, STYLE, new_figure
+
+    with rc_context(STYLE):
+        whole = new_figure(INCHES, 7.5)
+        gram, spectrum, *series = whole.subplots(5, 1)
+        draw_spectrogram(gram, found)
+        draw_spectrum(spectrum, found)
+        for plot, name in zip(series, ("width_mm", "length_mm", "height_mm"), strict=True):
+            draw_series(plot, found, name)
+        modes = new_figure(INCHES, 4.2)
+        every = (*found.modes, *found.pod)
+        for plot, one in zip(modes.subplots(2, 4).flat, every, strict=False):
+            draw_mode(plot, found, one)
+    return {"dynamics": whole, "modes": modes}
+
+
+def mode_heights(one: ModeCourse, turn: float) -> FloatArray:
+    """Heights of a mode at the nodes at a part of its period, of amplitude 1, shape (k,)."""
+    if not one.oscillations:
+        return np.asarray(one.shape[0] * np.cos(2 * np.pi * turn))
+    amplitude = one.oscillations[0].amplitude / one.figures["amplitude_mm"][0]
+    crest = np.exp(-1j * np.radians(one.figures["phase_deg"][0]))
+    return np.asarray((amplitude * crest * np.exp(2j * np.pi * turn)).real @ one.shape)
+
+
+def mode_scenes(found: Dynamics, one: ModeCourse) -> Iterator[Scene]:
+    """Scenes of one period of a mode on the mean surface, its amplitude enlarged."""
+    from labapp.export.rendering.scene import scene_of
+
+    mean, figures = found.surfaces.mean_mm, one.figures
+    swing = FILM_SWING * float(np.abs(mean).max())
+    stamp = f"mode {one.name}"
+    if figures:
+        size = figures["amplitude_mm"][0]
+        stamp += f", {figures['frequency_hz'][0]:.2f} Hz, {1e3 * size:.1f} µm ×{swing / size:.3g}"
+    nodes = found.surfaces.nodes_mm.reshape(RINGS, SPOKES, 2)
+    spoke = (nodes[-1] - nodes[0]) / (RHO[-1] - RHO[0])
+    center = (nodes[0] - RHO[0] * spoke).mean(axis=0)
+    theta = np.degrees(np.arctan2(spoke[:, 1], spoke[:, 0]))
+    order = np.argsort(theta)
+    rim = np.column_stack([center + spoke, np.zeros(SPOKES)])
+    boundary = Boundary(center, theta[order], rim[order])
+    limits = float(mean.min() - swing), float(mean.max() + swing)
+    box = np.column_stack([rim[:, :2].min(0), rim[:, :2].max(0)]).T
+    within = np.column_stack([box, limits])
+    none = np.empty((0, 3))
+    for k in range(FILM_FRAMES):
+        height = mean + swing * mode_heights(one, k / FILM_FRAMES)
+        points = np.vstack([np.column_stack([found.surfaces.nodes_mm, height]), rim])
+        surface = CloughTocherSurface(points)
+        empty = np.empty((0, 2), np.int64), none, none[:, :2], none[:, 0]
+        scene = scene_of(Reconstruction("fit", surface, boundary, *empty), limits=limits)
+        yield replace(scene, within_mm=within, stamp=stamp)
+
+
+def write_mode_film(path: Path, found: Dynamics, name: str) -> None:
+    """Write a film (MP4) of one mode.
+
+    Raises
+    ------
+    InputError
+        If there is no such mode, or pictures in 3-D cannot be drawn.
+    """
+    from labapp.export.rendering.film import write_video
+    from labapp.export.rendering.studio import draw_there, drawing_errors, drawing_process
+
+    every = {one.name.replace(" ", ""): one for one in (*found.modes, *found.pod)}
+    wanted = name.replace(" ", "").upper()
+    if wanted not in every:
+        raise InputError("--film", "mode", name, f"one of {', '.join(every)}")
+    with drawing_errors("film"), drawing_process() as process:
+        pictures = list(process.map(draw_there, mode_scenes(found, every[wanted])))
+    count = FILM_PERIODS * FILM_FRAMES
+    write_video(path, pictures * FILM_PERIODS, np.arange(count + 1) / FILM_HZ)
+
+
+def _closed(values: FloatArray) -> FloatArray:
+    """Values at the nodes on rings that close, shape (RINGS, SPOKES + 1, …)."""
+    rings = values.reshape(RINGS, SPOKES, -1)
+    return np.concatenate([rings, rings[:, :1]], axis=1)

@@ -1,0 +1,107 @@
+"""Surfaces and sizes read back from a folder of results (CSV)."""
+
+from __future__ import annotations
+
+import csv
+import itertools
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from labapp.config.csv_tables import bounded_lines, open_table
+from labapp.core.surface.boundary import Boundary
+from labapp.core.surface.interpolation import CloughTocherSurface
+from labapp.core.values import FloatArray
+from labapp.errors import InputError
+from labapp.export.dynamics import Measured, no_time_base
+
+LARGEST = 1 << 31
+"""Largest table, bytes; boundary.csv of 100,000 frames has 1.5 GB, and is read row by row."""
+
+MOST_NODES = 200_000
+"""Most nodes of a surface."""
+
+KEPT_NODES = 800
+"""Of more nodes of a surface only some are used: pools are smooth."""
+
+WANTED = "as `labapp reconstruct` writes it"
+
+
+def measured_in(folder: Path) -> Iterator[Measured]:
+    """Frames with a surface in a folder that `labapp reconstruct` or an export wrote.
+
+    Raises
+    ------
+    InputError
+        If a table is missing or damaged, or frames have no time.
+    """
+    outlines = itertools.groupby(_rows(folder / "boundary.csv"), lambda row: row["frame"])
+    outline = next(outlines, None)
+    path = folder / "measures.csv"
+    for row in _rows(path):
+        if row.get("status") != "ok":
+            continue
+        if not row.get("time_s"):
+            raise no_time_base()
+        while outline is not None and outline[0] != row["frame"]:
+            outline = next(outlines, None)
+        if outline is None:
+            raise InputError(
+                folder / "boundary.csv", "frame", "missing", f"{row['frame']} in order"
+            )
+        sizes = {
+            name: _number(path, row, name) for name in row if name.endswith(("_mm", "mm2", "mm3"))
+        }
+        boundary = _boundary(folder / "boundary.csv", list(outline[1]))
+        frame, time_s = int(_number(path, row, "frame")), _number(path, row, "time_s")
+        yield (
+            frame,
+            time_s,
+            _surface(folder / f"surface_{frame:06d}.csv", boundary),
+            boundary,
+            sizes,
+        )
+
+
+def _rows(path: Path) -> Iterator[dict[str, str]]:
+    """Rows of a table, by column."""
+    with open_table(path, WANTED, LARGEST) as file:
+        for row in csv.DictReader(bounded_lines(path, file, WANTED)):
+            if None in row or None in row.values():
+                raise InputError(path, "row", "too many or too few cells", WANTED)
+            yield row
+
+
+def _number(path: Path, row: dict[str, str], name: str) -> float:
+    try:
+        return float(row[name]) if row[name] else np.nan
+    except (KeyError, ValueError) as error:
+        raise InputError(path, name, row.get(name, "missing"), "a number") from error
+
+
+def _points(path: Path, rows: list[dict[str, str]]) -> FloatArray:
+    points = np.array([[_number(path, row, f"{n}_mm") for n in "xyz"] for row in rows])
+    if len(rows) < 8 or not np.isfinite(points).all():
+        raise InputError(path, "points", f"{len(rows)}, or not numbers", WANTED)
+    return points
+
+
+def _boundary(path: Path, rows: list[dict[str, str]]) -> Boundary:
+    points = _points(path, rows)
+    theta = np.array([_number(path, row, "theta_deg") for row in rows])
+    if not (np.diff(theta) > 0).all():
+        raise InputError(path, "theta_deg", "not ascending", WANTED)
+    # The centre that the angles are about, by least squares: (y − y_c)·cos θ = (x − x_c)·sin θ.
+    sin, cos = np.sin(np.radians(theta)), np.cos(np.radians(theta))
+    right = points[:, 0] * sin - points[:, 1] * cos
+    center = np.linalg.lstsq(np.column_stack([sin, -cos]), right, rcond=None)[0]
+    return Boundary(np.asarray(center, float), theta, points)
+
+
+def _surface(path: Path, boundary: Boundary) -> CloughTocherSurface:
+    rows = list(itertools.islice(_rows(path), MOST_NODES + 1))
+    if len(rows) > MOST_NODES:
+        raise InputError(path, "rows", f"more than {MOST_NODES}", WANTED)
+    nodes = _points(path, rows[:: max(1, -(-len(rows) // KEPT_NODES))])
+    return CloughTocherSurface(np.vstack([nodes, boundary.points_mm]))

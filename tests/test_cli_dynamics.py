@@ -1,0 +1,123 @@
+"""`labapp dynamics` and `Results.dynamics`: tables, pictures, signals."""
+
+from __future__ import annotations
+
+import csv
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import labapp as package
+from labapp.errors import InputError
+from labapp.export.folder import ExportChoice
+from labapp.session.session import Session
+from tests.conftest import Run
+
+SAMPLE = Path(package.__file__).parents[1] / "sample_sessions" / "gtaw"
+
+
+@pytest.fixture
+def gtaw(tmp_path: Path) -> Path:
+    shutil.copytree(SAMPLE, tmp_path / "gtaw")
+    return tmp_path / "gtaw" / "gtaw.labsession"
+
+
+def rows(path: Path) -> list[dict[str, str]]:
+    with path.open(encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def same_step(folder: Path) -> Path:
+    """A logger's table with a step of the current at 0.25 s."""
+    table = folder / "log.csv"
+    times = np.arange(-0.2, 0.9, 0.001)
+    lines = [f"{t:.3f},{70 + 20 * (t >= 0.25):g}" for t in times]
+    table.write_text("\n".join(["time_s,current_a", *lines]))
+    return table
+
+
+def test_a_session_gives_tables_and_pictures(labapp: Run, gtaw: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    code, said, _ = labapp("dynamics", gtaw, "--out", out, "--signals", same_step(tmp_path))
+    assert code == 0
+    assert "current changes at 0.2" in said
+    series = rows(out / "series.csv")
+    assert len(series) == 30
+    with Session.open(gtaw, read_only=True) as session:
+        heights = session.overview().measures["height_mm"]
+    assert [float(row["height_mm"]) for row in series] == pytest.approx(heights, abs=1e-6)
+    assert {"convexity_mm", "asymmetry", "wetting_slope_deg", "mode (0, 1) mm"} <= set(series[0])
+    assert [row["mode"] for row in rows(out / "modes.csv")][:4] == [
+        *("(0, 1)", "(1, 1)", "(2, 1)", "(0, 2)"),
+    ]
+    (step,) = [row for row in rows(out / "events.csv") if row["series"] == "current"]
+    assert float(step["time_s"]) == pytest.approx(0.25, abs=0.001)
+    spectrum = rows(out / "spectrum.csv")
+    assert all(float(r["low_95_per_hz"]) < float(r["density_per_hz"]) for r in spectrum)
+    for name in ("dynamics.png", "modes.png"):
+        assert (out / name).read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.slow
+def test_a_folder_of_results_gives_what_its_session_gives(gtaw: Path, tmp_path: Path) -> None:
+    from labapp.export.dynamics import dynamics_of
+    from labapp.export.result_folder import measured_in
+
+    with Session.open(gtaw) as session:
+        session.export(tmp_path / "results", ExportChoice(surfaces=frozenset({"csv"})))
+        of_session = package.Results.of_session(session).dynamics()
+    of_folder = dynamics_of(measured_in(tmp_path / "results"))
+    for one, other in zip(of_session.modes, of_folder.modes, strict=True):
+        np.testing.assert_allclose(one.coefficient_mm, other.coefficient_mm, atol=5e-4)
+    for name, values in of_session.series.items():
+        np.testing.assert_allclose(values, of_folder.series[name], rtol=0.05, atol=0.02)
+    (tmp_path / "results" / "boundary.csv").write_text(
+        "frame,theta_deg,x_mm,y_mm,z_mm\n0,0,a,0,0\n"
+    )
+    with pytest.raises(InputError):
+        dynamics_of(measured_in(tmp_path / "results"))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ("--of", "shade_mm"),
+        ("--band", "9:3"),
+        ("--segment", "0.01"),
+        ("--start", "1"),
+        ("--film", "(9,9)"),
+    ],
+)
+def test_what_is_wrong_is_named(labapp: Run, gtaw: Path, tmp_path: Path, options) -> None:
+    code, _, error = labapp("dynamics", gtaw, "--out", tmp_path / "out", *options)
+    assert code == 2
+    assert options[1].split(":")[0] in error or options[0] in error or "signals" in error
+
+
+def test_frames_without_times_have_no_dynamics(labapp: Run, tmp_path: Path) -> None:
+    sample = SAMPLE.parent / "concave" / "concave.labsession"
+    shutil.copy(sample, tmp_path)
+    code, _, error = labapp("dynamics", tmp_path / sample.name, "--out", tmp_path / "out")
+    assert code == 2
+    assert "time" in error
+
+
+def test_signals_are_aligned_by_the_light_of_frames(tmp_path: Path) -> None:
+    from labapp.media import Frame
+    from labapp.session.signals import Signals, align_signals
+
+    time_s = np.arange(0, 5, 0.001)
+    current = np.where((time_s > 1) & (time_s < 1.7), 120.0, 60.0)
+    signals = Signals("a.csv", time_s, current, np.full(len(time_s), np.nan))
+    at = np.arange(300) / 100
+    level = np.interp(at + 0.5, time_s, current)
+    frames = [
+        Frame(k, t, np.full((4, 4), g)) for k, (t, g) in enumerate(zip(at, level, strict=True))
+    ]
+    aligned, offset = align_signals(signals, frames)
+    assert aligned.start_s == pytest.approx(-0.5, abs=0.01)
+    assert offset.correlation > 0.9
+    with pytest.raises(InputError):
+        align_signals(signals, [Frame(k, t, np.full((4, 4), k % 2)) for k, t in enumerate(at)])
