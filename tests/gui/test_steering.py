@@ -13,7 +13,8 @@ from pytestqt.qtbot import QtBot
 from labapp.gui.shell.window import MainWindow
 from labapp.gui.views import steering
 from labapp.gui.views.steering import steer
-from labapp.gui.views.view3d import View3d, make_view3d
+from labapp.gui.views.view3d import View3d
+from labapp.gui.views.view3d_kinds import make_view3d
 from labapp.media.devices import hid
 from labapp.media.devices.space_mouse import SixAxes, SpaceMouse
 from tests.gui.conftest import KEPT, CopySample
