@@ -41,7 +41,7 @@ def view(qtbot: QtBot) -> Iterator[View3d]:
 
 def place_px(view: View3d, point_mm: tuple[float, float, float]) -> np.ndarray:
     """Where a point of the scene is seen, (right, down) of the middle, heights of the view."""
-    position, focus, up, angle_deg, scale, parallel = view.camera
+    position, focus, up, angle_deg, scale, parallel, _ = view.camera
     ahead = np.subtract(focus, position)
     ahead = ahead / np.linalg.norm(ahead)
     right = np.cross(ahead, up)
