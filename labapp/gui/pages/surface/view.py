@@ -60,7 +60,6 @@ from labapp.gui.widgets.layouts import fill, hbox, vbox
 from labapp.gui.widgets.parts import PartsBar
 from labapp.gui.workspace import Workspace
 from labapp.session.measured import scheme_name
-from labapp.session.outgoing import write_view_film
 from labapp.text import HEIGHT_SIGMA_OF
 
 LEAST_PLAN_WIDTH = 100
@@ -323,6 +322,8 @@ class SurfacePage(Page):
         path = path if path.suffix.lower() == ".mp4" else path.with_name(path.name + ".mp4")
 
         def work(control: Control) -> None:
+            from labapp.session.outgoing import write_view_film
+
             write_view_film(session, path, camera, FILM_PX, control.progress)
 
         def done(_: object) -> None:
