@@ -334,6 +334,9 @@ def export(
     view: View = "free",
     size: Size = "1280x720",
     film_rate: FilmRate = None,
+    picture_format: Annotated[
+        str, typer.Option(help="Format of pictures of frames: png, jpg or tif.")
+    ] = "png",
     report: Annotated[bool, typer.Option("--report", help="A PDF report.")] = False,
 ) -> None:
     """Write results into a folder, which is whole or not there, with a manifest.
@@ -357,18 +360,14 @@ def export(
         view=view,
         size_px=_size(size),
         film_rate_hz=film_rate,
+        picture_format=picture_format,
     )
     with Session.open(file, read_only=True) as session, _counted(f"writing {out.name}") as progress:
         chosen = None if frames is None else choose_frames(session, frames)
         wanted = set(session.frames.tolist() if chosen is None else chosen)
         missing = wanted & _not_measured(session, scheme)
         files = session.export(
-            out,
-            choice,
-            frames=chosen,
-            scheme=scheme,
-            report=report,
-            progress=progress,
+            out, choice, frames=chosen, scheme=scheme, report=report, progress=progress
         )
     if missing:
         typer.echo(f"Not measured, so not in it: {frames_text(missing)}")

@@ -28,6 +28,7 @@ from labapp.export.meshes import SMALLEST_SPACING_MM, SPACING_MM, refuse_too_lar
 from labapp.export.rendering.drawing import VIEWS, Direction
 from labapp.export.rendering.film import TICKS_HZ, Extent, film_times, write_film
 from labapp.export.rendering.pictures import (
+    SMALL,
     write_frame_picture,
     write_surface_picture,
     write_trend_picture,
@@ -97,6 +98,8 @@ class ExportChoice:
     """Frames of the film a second; None: as fast as they were recorded (`film.film_times`)."""
     together: frozenset[str] = frozenset()
     """How to write everything into one file: some of `RUN_FORMATS`."""
+    picture_format: str = "png"
+    """Of pictures of frames: ``png``, ``jpg`` or ``tif``."""
     sigma_parts: bool = False
     """Whether `measures.csv` has the parts of standard uncertainties, too."""
 
@@ -123,6 +126,9 @@ class ExportChoice:
             size = "{}x{}".format(*self.size_px)
             wanted = f"even numbers from {SIZES_PX[0]} to {SIZES_PX[-1]}"
             raise InputError("export", "size_px", size, wanted)
+        if (suffix := f".{self.picture_format}") not in SMALL:
+            wanted = f"one of {', '.join(each[1:] for each in SMALL)}"
+            raise InputError("export", "picture_format", suffix[1:], wanted)
         rate = self.film_rate_hz
         if rate is not None and not 0 < rate <= TICKS_HZ:
             raise InputError("export", "film_rate_hz", rate, f"above 0, at most {TICKS_HZ}")
@@ -319,7 +325,7 @@ def _write_results(
             for writer in together:
                 writer.write(frame, tables, reconstruction)
             if image_of is not None and _has_picture(measurement, choice):
-                path = files.new(f"frame_{frame:06d}.png")
+                path = files.new(f"frame_{frame:06d}.{choice.picture_format}")
                 write_frame_picture(path, image_of(frame), measurement)
             if process is not None and reconstruction is not None:
                 with drawing_errors("surfaces"):

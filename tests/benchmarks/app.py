@@ -37,7 +37,7 @@ from labapp.gui.pages import PAGES
 from labapp.gui.preferences import Preferences
 from labapp.gui.shell.commands import make_window
 from labapp.gui.shell.window import MainWindow
-from labapp.gui.views.view3d import OffscreenView
+from labapp.gui.views.view3d_kinds import OffscreenView
 from labapp.session.session import Session
 
 STARTS = 5

@@ -13,7 +13,8 @@ from pytestqt.qtbot import QtBot
 from labapp.gui.shell.window import MainWindow
 from labapp.gui.views import steering
 from labapp.gui.views.steering import steer
-from labapp.gui.views.view3d import View3d, make_view3d
+from labapp.gui.views.view3d import View3d
+from labapp.gui.views.view3d_kinds import make_view3d
 from labapp.media.devices import hid
 from labapp.media.devices.space_mouse import SixAxes, SpaceMouse
 from tests.gui.conftest import KEPT, CopySample
@@ -40,7 +41,7 @@ def view(qtbot: QtBot) -> Iterator[View3d]:
 
 def place_px(view: View3d, point_mm: tuple[float, float, float]) -> np.ndarray:
     """Where a point of the scene is seen, (right, down) of the middle, heights of the view."""
-    position, focus, up, angle_deg, scale, parallel = view.camera
+    position, focus, up, angle_deg, scale, parallel, _ = view.camera
     ahead = np.subtract(focus, position)
     ahead = ahead / np.linalg.norm(ahead)
     right = np.cross(ahead, up)

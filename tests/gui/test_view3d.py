@@ -14,8 +14,9 @@ from PySide6.QtWidgets import QApplication, QMenu
 from pytestqt.qtbot import QtBot
 
 from labapp.export.rendering.scene import Scene
-from labapp.gui.views import view3d
-from labapp.gui.views.view3d import NOTHING_HERE, OffscreenView, View3d, make_view3d
+from labapp.gui.views import view3d, view3d_kinds
+from labapp.gui.views.view3d import NOTHING_HERE, View3d
+from labapp.gui.views.view3d_kinds import OffscreenView, make_view3d
 from tests.gui.conftest import KEPT
 from tests.screen import screen
 from tests.waiting import PATIENCE_S
@@ -305,7 +306,7 @@ def test_a_closed_view_is_taken_up_again(view: View3d) -> None:
     ],
 )
 def test_only_a_card_draws_in_the_window(renderer: str, card: bool) -> None:
-    assert view3d.has_card(renderer) is card
+    assert view3d_kinds.has_card(renderer) is card
 
 
 def test_a_scene_is_drawn_once_however_often_it_changes_and_is_painted(view: View3d) -> None:
@@ -326,7 +327,7 @@ import numpy as np
 from PySide6.QtCore import QDeadlineTimer, Qt
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication
-from labapp.gui.views.view3d import InteractiveView, OffscreenView, make_view3d
+from labapp.gui.views.view3d_kinds import InteractiveView, OffscreenView, make_view3d
 from tests.gui.conftest import let_draw
 from tests.gui.test_view3d import hill
 from tests.waiting import PATIENCE_S

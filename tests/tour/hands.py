@@ -41,7 +41,8 @@ from PySide6.QtWidgets import (
 from labapp.gui.pages.page import Page
 from labapp.gui.shell.window import MainWindow
 from labapp.gui.views.picture import PictureView
-from labapp.gui.views.view3d import InteractiveView, View3d
+from labapp.gui.views.view3d import View3d
+from labapp.gui.views.view3d_kinds import InteractiveView
 from labapp.gui.widgets.fields import ChoiceField, Field
 
 LONGEST_MS = 300_000

@@ -27,7 +27,7 @@ GAP_PT = 5.0
 SHORT_PT = 24.0
 """An edge that is seen shorter than this has no numbers."""
 
-STEEP = 0.95
+STEEP = 0.8
 """The name of an edge that is steeper, by the sine of its angle, is written along it."""
 
 BAR_PT, BAR_SHARE, STRIPS = 13.0, 0.55, 128
@@ -204,6 +204,8 @@ class Overlay:
         room = (3.6 * LETTER * abs(way[0]) + LINE * abs(way[1]) + 0.4) * NUMBER_PT * point
         low, high = ends_mm[:, axis].tolist()
         ticks, texts = round_ticks(low, high, max(int(length / room), 1))
+        if len(ticks) < 2:  # a single number says how long the edge is
+            ticks, texts = np.array([high]), [f"{high:g}"]
         share = (ticks - low) / (high - low)
         places_mm = ends_mm[0] + share[:, None] * (ends_mm[1] - ends_mm[0])
         places = self.project(places_mm * self.stretch) + GAP_PT * point * aside

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from labapp.core.values import FloatArray, IntArray
+from labapp.export.rendering.scene import Scene
 
 EPS = 1e-9
 
@@ -41,3 +42,29 @@ def first_hit(
     if not inside.any():
         return None
     return np.asarray(start + along[inside].min() * way)
+
+
+def point_over(scene: Scene, x_mm: float, y_mm: float) -> FloatArray | None:
+    """Return the point of a scene's surface at (x, y), shape (3,), mm; None beside the surface."""
+    above, down = np.array([x_mm, y_mm, 1e3]), np.array([0.0, 0.0, -1.0])
+    return first_hit(scene.vertices_mm, scene.triangles, above, down)
+
+
+def seen_point(
+    scene: Scene, view_matrix: FloatArray, across: float, up: float
+) -> FloatArray | None:
+    """Return the point of a scene's surface that is seen at a place of its picture, mm.
+
+    Parameters
+    ----------
+    view_matrix
+        From the scene as it is drawn to the picture, shape (4, 4).
+    across, up
+        The place: −1 at the left and at the bottom, 1 at the right and at the top.
+    """
+    stretch = np.array([1.0, 1.0, scene.exaggeration])
+    ends = np.array([[across, up, -1.0, 1.0], [across, up, 1.0, 1.0]])
+    near, far = ends @ np.linalg.inv(view_matrix).T
+    start, end = near[:3] / near[3], far[:3] / far[3]
+    hit = first_hit(scene.vertices_mm * stretch, scene.triangles, start, end - start)
+    return None if hit is None else hit / stretch

@@ -10,7 +10,8 @@ from PySide6.QtWidgets import QWidget
 
 from labapp.export.rendering.scene import Scene
 from labapp.gui.live.figures import OLD_S
-from labapp.gui.views.view3d import LOOKS, make_view3d
+from labapp.gui.views.view3d import LOOKS
+from labapp.gui.views.view3d_kinds import make_view3d
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.layouts import hbox, vbox
 from labapp.run.live_measuring import LiveResult

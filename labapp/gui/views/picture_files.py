@@ -9,7 +9,7 @@ from typing import Any
 
 from PySide6.QtCore import QRectF, QSize
 from PySide6.QtGui import QImage, QPainter, QPalette
-from PySide6.QtWidgets import QDialog, QGraphicsView, QWidget
+from PySide6.QtWidgets import QDialog, QGraphicsView, QMessageBox, QWidget
 
 from labapp.export.rendering.paper import MM_AN_INCH, Paper
 from labapp.gui.dialogs import ask_save
@@ -53,7 +53,9 @@ class PaperDialog(QDialog):
         save = button("Save as …", "Choose the file; its ending says the format", self.accept)
         save.setDefault(True)
         cancel = button("Cancel", "Save nothing (Esc)", self.reject)
-        vbox(form, self.size_words, hbox(1, cancel, save), of=self)
+        vbox(form, self.size_words, hbox(1, cancel, save), of=self).setContentsMargins(
+            12, 12, 12, 12
+        )
         self._take()
 
     def _take(self) -> None:
@@ -102,8 +104,14 @@ def write_plot(path: Path, drawn: QWidget, canvas: QGraphicsView, paper: Paper) 
 def _paint(device: Any, canvas: QGraphicsView) -> None:
     with QPainter(device) as painter:
         painter.setRenderHint(QPainter.RenderHint.Antialiasing)
-        whole = QRectF(canvas.viewport().rect())
-        canvas.render(painter, QRectF(painter.viewport()), whole.toRect())
+        marks = [item for item in canvas.scene().items() if hasattr(item, "setExportMode")]
+        for item in marks:  # or marks would be small pictures, as on the screen
+            item.setExportMode(True, {"painter": painter, "resolutionScale": 1.0})
+        try:
+            canvas.render(painter, QRectF(painter.viewport()), canvas.viewport().rect())
+        finally:
+            for item in marks:
+                item.setExportMode(False)
 
 
 def _write_svg(path: Path, canvas: QGraphicsView, paper: Paper) -> bool:
@@ -137,8 +145,6 @@ def save_plot(drawn: QWidget, canvas: QGraphicsView, name: str) -> Callable[[], 
         if asked := ask_paper(drawn, Path.home() / f"{name}.png", VECTORS):
             path = with_suffix(asked[0], SVG)
             if not write_plot(path, drawn, canvas, asked[1]):
-                from PySide6.QtWidgets import QMessageBox
-
                 QMessageBox.warning(drawn, "Save picture", f"{path} cannot be written.")
 
     return save

@@ -28,6 +28,7 @@ from labapp.gui.curves import Axis, Curve, as_table, nearest, next_key, point_te
 from labapp.gui.theme import RED, is_dark
 from labapp.gui.views.axes import paint_axes, plain_axes
 from labapp.gui.views.canvas import Plotted
+from labapp.gui.views.picture_files import save_plot
 from labapp.gui.widgets.labels import plain_tip, wrapping_label
 from labapp.gui.widgets.layouts import fill, scrolled
 
@@ -154,6 +155,7 @@ class PlotStack(Plotted):
         self.setContextMenuPolicy(Qt.ContextMenuPolicy.ActionsContextMenu)
         works: tuple[tuple[str, Callable[[], None]], ...] = (
             ("Copy picture", self.copy_picture),
+            ("Save picture …", save_plot(self, self.canvas, "trends")),
             ("Copy values as table", self.copy_table),
             ("Show all", self.fit),
         )

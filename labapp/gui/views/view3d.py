@@ -1,13 +1,7 @@
-"""The 3-D view: a scene that can be turned, in the window's own OpenGL or drawn off-screen.
-
-Where Qt has no OpenGL for VTK (no display, or Wayland) the scene is drawn off-screen and shown as
-a picture. So it is where the processor draws: a window with OpenGL in it is composed as a whole for
-every picture, which costs more than the scene does. Where nothing can be drawn, words say so.
-"""
+"""The 3-D view: a scene that can be turned, and read off."""
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -15,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from PySide6.QtCore import QEvent, QObject, QPoint, QPointF, Qt, QTimer, Signal
+from PySide6.QtCore import QEvent, QObject, QPoint, QPointF, Qt, Signal
 from PySide6.QtGui import (
     QAction,
     QContextMenuEvent,
@@ -24,21 +18,15 @@ from PySide6.QtGui import (
     QKeyEvent,
     QKeySequence,
     QMouseEvent,
-    QOffscreenSurface,
-    QOpenGLContext,
     QPainter,
-    QPaintEvent,
     QPalette,
-    QResizeEvent,
-    QShowEvent,
-    QWheelEvent,
 )
-from PySide6.QtWidgets import QMenu, QVBoxLayout, QWidget
+from PySide6.QtWidgets import QMenu
 
 from labapp.core.values import FloatArray
-from labapp.export.rendering.axes import USUAL_DPI, view_matrix
+from labapp.export.rendering.axes import view_matrix
 from labapp.export.rendering.drawing import Camera, Direction, Drawing, build_scene, can_draw
-from labapp.export.rendering.pick import first_hit
+from labapp.export.rendering.pick import point_over, seen_point
 from labapp.export.rendering.scene import Scene
 from labapp.gui.views.canvas import Drawn
 
@@ -81,22 +69,11 @@ KEYS_TOLD = (
     "the right one or the wheel to zoom; click to read a point off"
 )
 
-GL_RENDERER = 0x1F01
-
-SHARED = ("xcb", "windows", "cocoa")
-"""Qt's desktops whose OpenGL it shares with VTK."""
-
-ON_THE_PROCESSOR = (
-    *("llvmpipe", "softpipe", "software", "swiftshader", "swrast"),
-    *("gdi generic", "basic render"),
-)
-"""Parts of the names of what draws OpenGL without a graphics card."""
-
 NOTHING_HERE = "The 3-D view needs OpenGL, which cannot be used here. All figures are measured."
 
 
 class View3d(Drawn):
-    """A scene to look at from all sides; make it with `make_view3d`.
+    """A scene to look at from all sides; make it with `view3d_kinds.make_view3d`.
 
     The left button turns it, the middle one, or Shift, moves it, the right one and the wheel zoom.
     A click reads a point off, a click with the right button opens the menu, which has actions of
@@ -217,16 +194,10 @@ class View3d(Drawn):
 
     def surface_point(self, at: QPointF) -> FloatArray | None:
         """Return the point of the surface that is seen at a place of the view, shape (3,), mm."""
-        scene = self._scene
-        if scene is None or self._drawing is None:
+        if self._scene is None or self._drawing is None:
             return None
-        stretch = np.array([1.0, 1.0, scene.exaggeration])
         across, up = 2 * at.x() / max(self.width(), 1) - 1, 1 - 2 * at.y() / max(self.height(), 1)
-        ends = np.array([[across, up, -1.0, 1.0], [across, up, 1.0, 1.0]])
-        near, far = ends @ np.linalg.inv(view_matrix(self._drawing.plotter.renderer)).T
-        start, end = near[:3] / near[3], far[:3] / far[3]
-        hit = first_hit(scene.vertices_mm * stretch, scene.triangles, start, end - start)
-        return None if hit is None else hit / stretch
+        return seen_point(self._scene, view_matrix(self._drawing.plotter.renderer), across, up)
 
     def point_words(self, point_mm: FloatArray) -> str:
         """Return a point of the surface in words, with the ± of its height where that is known."""
@@ -264,9 +235,7 @@ class View3d(Drawn):
         if scene is None:
             return
         if self._point_mm is not None:
-            above = np.array([*self._point_mm, 1e3])
-            down = np.array([0.0, 0.0, -1.0])
-            hit = first_hit(scene.vertices_mm, scene.triangles, above, down)
+            hit = point_over(scene, *self._point_mm)
             if hit is not None:
                 mark, words = hit[None], self.point_words(hit).replace(", Z", ",\nZ")
         self._scene = replace(scene, mark_mm=mark, mark_words=words)
@@ -434,184 +403,6 @@ class View3d(Drawn):
         painter.setPen(self.palette().color(QPalette.ColorRole.Text))
         area = self.rect().adjusted(24, 24, -24, -24)
         painter.drawText(area, Qt.AlignmentFlag.AlignCenter | Qt.TextFlag.TextWordWrap, words)
-
-
-class OffscreenView(View3d):
-    """Draws off-screen when it is painted, and shows the picture."""
-
-    def __init__(self, name: str = "3-D view") -> None:
-        super().__init__(name)
-        self._picture: QImage | None = None
-        self._pointed_at = ""
-
-    def _new_plotter(self) -> Any:
-        # Not `pyvista.Plotter`: it is not waited for while another thread loads it.
-        from pyvista.plotting import Plotter
-
-        plotter: Any = Plotter(off_screen=True, window_size=list(self._pixels()))
-        plotter.render_window.SetDPI(round(USUAL_DPI * self.devicePixelRatioF()))
-        plotter.disable_anti_aliasing()
-        plotter.render_window.SetMultiSamples(0)
-        return plotter
-
-    def _refresh(self) -> None:
-        self._picture = None
-        self.update()
-
-    def _render(self) -> None:
-        picture = None
-        if self._draw():
-            assert self._drawing is not None
-            if tuple(self._drawing.plotter.window_size) != self._pixels():
-                self._drawing.plotter.window_size = list(self._pixels())
-            picture = self.picture()
-        self._picture = None if picture is None else as_image(picture)
-        if self._picture is not None:
-            self._picture.setDevicePixelRatio(self.devicePixelRatioF())
-
-    def resizeEvent(self, event: QResizeEvent) -> None:
-        """Redraw at the new size."""
-        super().resizeEvent(event)
-        self._refresh()
-
-    def paintEvent(self, event: QPaintEvent) -> None:
-        """Show the scene, or say why there is none."""
-        if self._picture is None and self._scene is not None:
-            self._render()
-        with QPainter(self) as painter:
-            painter.fillRect(self.rect(), self.palette().color(QPalette.ColorRole.Base))
-            if self._picture is not None:
-                painter.drawImage(0, 0, self._picture)
-                self._paint_pointed(painter)
-            else:
-                self._paint_words(painter, self._words if self._scene is None else NOTHING_HERE)
-            if self.hasFocus():
-                self.paint_frame(painter)
-
-    def wheelEvent(self, event: QWheelEvent) -> None:
-        """Zoom."""
-        self.zoom(ZOOM ** (event.angleDelta().y() / 120))
-
-    def _show_pointed(self, words: str) -> None:
-        super()._show_pointed(words)
-        if words != self._pointed_at:
-            self._pointed_at = words
-            self.update()
-
-    def _paint_pointed(self, painter: QPainter) -> None:
-        painter.setPen(self.palette().color(QPalette.ColorRole.Text))
-        area = self.rect().adjusted(6, 6, -6, -6)
-        corner = Qt.AlignmentFlag.AlignBottom | Qt.AlignmentFlag.AlignLeft
-        painter.drawText(area, corner, self._pointed_at)
-
-
-class InteractiveView(View3d):
-    """Holds a `pyvistaqt.QtInteractor`, made when the view is first shown."""
-
-    def __init__(self, name: str = "3-D view") -> None:
-        super().__init__(name)
-        self._layout = QVBoxLayout(self)
-        self._layout.setContentsMargins(1, 1, 1, 1)
-        self._late = QTimer(self, singleShot=True, interval=0)
-        self._late.timeout.connect(self._render)
-
-    def _new_plotter(self) -> Any:
-        from pyvistaqt import QtInteractor
-
-        plotter: Any = QtInteractor(
-            self, auto_update=False, multi_samples=1, line_smoothing=False, point_smoothing=False
-        )
-        # Keys are this view's: VTK's own would end the program with q.
-        plotter.setFocusPolicy(Qt.FocusPolicy.NoFocus)
-        plotter.render_window.SetDPI(round(USUAL_DPI * self.devicePixelRatioF()))
-        plotter.disable_anti_aliasing()
-        for event in ("InteractionEvent", "EndInteractionEvent", "MouseWheelForwardEvent"):
-            plotter.iren.add_observer(event, self._interacted)
-        plotter.iren.add_observer("MouseWheelBackwardEvent", self._interacted)
-        self._layout.addWidget(plotter)
-        plotter.setMouseTracking(True)
-        plotter.installEventFilter(self)
-        plotter.show()
-        return plotter
-
-    def eventFilter(self, watched: QObject, event: QEvent) -> bool:
-        """Read points off and open the menu; VTK turns, moves and zooms by itself."""
-        if isinstance(event, QMouseEvent) and self._drawing is not None:
-            if event.type() == QEvent.Type.MouseButtonPress:
-                self._pressed = event.position()
-                self.setFocus(Qt.FocusReason.MouseFocusReason)
-            elif event.type() == QEvent.Type.MouseButtonRelease:
-                self.mouseReleaseEvent(event)
-            elif event.type() == QEvent.Type.MouseMove and not event.buttons():
-                self.mouseMoveEvent(event)
-        return super().eventFilter(watched, event)
-
-    def _show_pointed(self, words: str) -> None:
-        super()._show_pointed(words)
-        if self._drawing is not None and self._drawing.show_pointed(words):
-            QWidget.update(self._drawing.plotter)
-
-    def _interacted(self, *_: object) -> None:
-        self.camera_changed.emit(self.camera)
-
-    def _refresh(self) -> None:
-        # Several changes of one event are one picture.
-        self._late.start()
-
-    def _render(self) -> None:
-        if not self.isVisible():
-            return
-        if self._draw():
-            assert self._drawing is not None
-            self._drawing.plotter.setVisible(True)
-            QWidget.update(self._drawing.plotter)  # which renders, once
-        elif self._drawing is not None:
-            self._drawing.plotter.setVisible(False)
-
-    def showEvent(self, event: QShowEvent) -> None:
-        """Draw what there is by now."""
-        super().showEvent(event)
-        self._refresh()
-
-    def paintEvent(self, event: QPaintEvent) -> None:
-        """Show the scene, or say why there is none."""
-        with QPainter(self) as painter:
-            painter.fillRect(self.rect(), self.palette().color(QPalette.ColorRole.Base))
-            if self._scene is None:
-                self._paint_words(painter, self._words)
-            elif not can_draw():
-                self._paint_words(painter, NOTHING_HERE)
-            if self.hasFocus():
-                self.paint_frame(painter)
-
-    def close_view(self) -> None:
-        """Release OpenGL until the view is next shown."""
-        self._late.stop()
-        super().close_view()
-
-
-def make_view3d(name: str = "3-D view") -> View3d:
-    """A view in the window's own OpenGL where a card draws it for Qt and VTK, else of pictures."""
-    if QGuiApplication.platformName() in SHARED and has_card(_renderer()):
-        return InteractiveView(name)
-    return OffscreenView(name)
-
-
-def has_card(renderer: str) -> bool:
-    """Whether a graphics card draws, by OpenGL's name of what does; empty for nothing."""
-    return bool(renderer) and not any(part in renderer.lower() for part in ON_THE_PROCESSOR)
-
-
-@functools.cache
-def _renderer() -> str:
-    """What draws OpenGL for Qt; empty without."""
-    context, surface = QOpenGLContext(), QOffscreenSurface()
-    surface.create()
-    if not (context.create() and context.makeCurrent(surface)):
-        return ""
-    name = context.functions().glGetString(GL_RENDERER)
-    context.doneCurrent()
-    return str(name or "")
 
 
 def as_image(picture: npt.NDArray[np.uint8]) -> QImage:

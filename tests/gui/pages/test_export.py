@@ -7,10 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
+import cv2
 import pytest
 from PySide6.QtWidgets import QAbstractButton
 from pytestqt.qtbot import QtBot
 
+from labapp.errors import InputError
 from labapp.export.folder import ExportChoice, verify_export
 from labapp.export.formats import RUN_FORMATS, SURFACE_FORMATS, RunFormat, SurfaceFormat
 from labapp.gui.pages.export.page import ExportPage
@@ -46,6 +48,27 @@ def test_the_usual_ticks_are_the_usual_export() -> None:
     assert everything.pictures == {"frames", "surfaces", "trends", "film"}
     assert keys > USUAL
     assert not ExportRequest(ticked=frozenset({"solid", "surfaces:csv"})).choice().solid
+
+
+@pytest.mark.parametrize("suffix", ["png", "jpg", "tif"])
+def test_pictures_of_frames_have_the_format_that_is_chosen(
+    gtaw: Path, tmp_path: Path, suffix: str
+) -> None:
+    request = ExportRequest(ticked=frozenset({"pictures:frames"}), picture_format=suffix)
+    with Session.open(gtaw) as session:
+        assert f"frame_NNNNNN.{suffix}, 30 of them" in plan(session, request, 0).files
+        written = write(session, request, [0], tmp_path / "out", lambda *_: None)
+        rows, columns = session.frame(0).image.shape
+    (picture,) = written.files
+    assert picture.name == f"frame_000000.{suffix}"
+    image = cv2.imread(str(tmp_path / "out" / picture.name))
+    assert image.shape == (3 * rows, 3 * columns, 3)
+    assert picture.size < 1_000_000 or suffix == "tif"
+
+
+def test_an_unknown_format_of_pictures_is_refused() -> None:
+    with pytest.raises(InputError, match="picture_format"):
+        ExportChoice(picture_format="bmp")
 
 
 def test_what_would_be_written_of_which_frames(gtaw: Path) -> None:
@@ -156,6 +179,16 @@ def test_the_button_writes_what_a_script_would(
         if name != "manifest.json":
             assert (tmp_path / "out" / name).read_bytes() == (script / name).read_bytes()
     assert verify_export(tmp_path / "out") == []
+
+
+def test_all_are_selected_or_none(page: ExportPage) -> None:
+    (every,) = [b for b in page.findChildren(QAbstractButton) if b.text() == "Select all"]
+    (none,) = [b for b in page.findChildren(QAbstractButton) if b.text() == "Select none"]
+    every.click()
+    assert page.request.ticked == frozenset(page._boxes)
+    none.click()
+    assert not page.request.ticked
+    assert not page.export_button.isEnabled()
 
 
 def test_a_cancelled_export_leaves_nothing(

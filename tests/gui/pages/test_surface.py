@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import re
 import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -28,7 +29,7 @@ from labapp.export.rendering.scene import DIFFERENCE_MAP
 from labapp.export.rendering.studio import Studio
 from labapp.gui.pages.surface import SurfacePage
 from labapp.gui.pages.surface.view import FILM_PX
-from labapp.gui.views.picture_files import PaperDialog
+from labapp.gui.views.picture_files import PaperDialog, write_plot
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
 from tests.gui.conftest import KEPT, CopySample
@@ -342,3 +343,26 @@ def test_every_control_can_be_named_and_reached(page: SurfacePage) -> None:
 def test_the_panel_fits_its_place(page: SurfacePage) -> None:
     page.side.again.show()
     assert page.panel.minimumSizeHint().width() <= 300
+
+
+def test_a_chart_shows_the_values_under_the_pointer_and_is_saved(
+    page: SurfacePage, qtbot: QtBot, tmp_path: Path
+) -> None:
+    chart = page.profile
+    qtbot.waitUntil(lambda: len(chart._height.getData()[0]) > 0)
+    box = chart.plot.getViewBox()
+    chart.plot.scene().sigMouseMoved.emit(box.mapViewToScene(QPointF(-1.5, 0.1)))
+    assert chart._at.text() == "−1.5, 0.1 mm"
+    assert {"Copy picture", "Save picture …", "Show all"} <= {a.text() for a in chart.actions()}
+    dark = chart.palette()
+    for name in ("chart.svg", "chart.png", "chart.tif"):
+        assert write_plot(tmp_path / name, chart, chart.plot, Paper(80, 150))
+    assert chart.palette() == dark
+    svg = (tmp_path / "chart.svg").read_text("utf-8")
+    wide = re.search(r'<svg width="([\d.]+)mm"', svg)
+    assert wide is not None
+    assert float(wide[1]) == pytest.approx(80, abs=0.3)  # a pixel
+    assert "<path" in svg
+    assert "<image" not in svg
+    assert QImage(str(tmp_path / "chart.png")).width() == Paper(80, 150).width_px
+    assert not write_plot(tmp_path / "nowhere" / "chart.png", chart, chart.plot, Paper())

@@ -14,6 +14,7 @@ from labapp.export.meshes import SMALLEST_SPACING_MM
 from labapp.gui.dialogs import ask_folder
 from labapp.gui.drafts import folder_of
 from labapp.gui.pages.export.presenter import (
+    FORMATS,
     SIZES,
     USUAL,
     VIEWS,
@@ -101,6 +102,7 @@ class ExportPage(Page):
             ((self.first, self.last, self.every), part),
             ((self.view, self.picture_size), drawn),
             ((self.rate,), film),
+            ((self.picture_format,), "frames" in self.request.some("pictures")),
         ):
             for one in fields:
                 one.setEnabled(used)
@@ -151,6 +153,14 @@ class ExportPage(Page):
         self._change_request(
             ticked=frozenset(key for key, box in self._boxes.items() if box.isChecked())
         )
+
+    def _tick(self, on: bool) -> None:
+        """Tick everything, or nothing."""
+        for box in self._boxes.values():
+            box.blockSignals(True)
+            box.setChecked(on)
+            box.blockSignals(False)
+        self._ticked()
 
     def choose_folder(self) -> None:
         """Ask for a folder; where it holds something else, a new one in it is taken."""
@@ -220,9 +230,16 @@ class ExportPage(Page):
         see = button("Open the folder", "Show it in the file manager", self.open_folder)
         self.result_group = Group("Written", self.result, hbox(see, 1))
         self.result_group.hide()
-        grid.addLayout(will, 2, 0, 1, 2)
-        grid.addWidget(self.result_group, 3, 0, 1, 2)
-        grid.setRowStretch(4, 1)
+        choose = hbox(
+            button("Select all", "Tick all that can be written", lambda: self._tick(True)),
+            button("Select none", "Tick nothing", lambda: self._tick(False)),
+            1,
+        )
+        choose.setSpacing(6)
+        grid.addLayout(choose, 2, 0, 1, 2)
+        grid.addLayout(will, 3, 0, 1, 2)
+        grid.addWidget(self.result_group, 4, 0, 1, 2)
+        grid.setRowStretch(5, 1)
         grid.setColumnStretch(0, 1)
         grid.setColumnStretch(1, 1)
         self.canvas_layout.addWidget(scrolled(inner, "What is exported"))
@@ -259,7 +276,7 @@ class ExportPage(Page):
         self._make_view_fields()
         for field in (
             *(self.which, self.first, self.last, self.every, self.scheme, self.spacing),
-            *(self.view, self.picture_size, self.rate),
+            *(self.view, self.picture_size, self.picture_format, self.rate),
         ):
             form.add(field)
         self.folder = PathField(
@@ -294,6 +311,10 @@ class ExportPage(Page):
         self.picture_size.edited.connect(
             lambda key: self._change_request(size_px=tuple(int(side) for side in key.split("x")))
         )
+        self.picture_format = ChoiceField(
+            "Frames as", FORMATS, tooltip="Format of the pictures of frames"
+        )
+        self.picture_format.edited.connect(lambda key: self._change_request(picture_format=key))
         self.rate = NumberField(
             "Film",
             "frames/s",

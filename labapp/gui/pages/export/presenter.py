@@ -49,6 +49,7 @@ VIEWS = (
     ("side", "from the side"),
     ("front", "from the front, as the camera"),
 )
+FORMATS = (("png", "PNG: exact"), ("jpg", "JPEG: small"), ("tif", "TIFF: exact, large"))
 SIZES = ((1280, 720), (1920, 1080), (2560, 1440), (800, 600))
 
 
@@ -86,7 +87,7 @@ def groups() -> tuple[tuple[str, tuple[Item, ...]], ...]:
             ),
         ),
         (
-            "Pictures (PNG), film (MP4)",
+            "Pictures, film (MP4)",
             (
                 Item("pictures:frames", "Frames", "Each frame with its dots, rows and columns"),
                 Item(
@@ -139,6 +140,7 @@ class ExportRequest:
     """Distance of the surfaces' nodes."""
     view: Direction = "free"
     size_px: tuple[int, int] = PICTURE_PX
+    picture_format: str = "png"
     film_rate_hz: float | None = None
     """As in `ExportChoice`."""
 
@@ -168,6 +170,7 @@ class ExportRequest:
             view=self.view,
             size_px=self.size_px,
             film_rate_hz=self.film_rate_hz,
+            picture_format=self.picture_format,
         )
 
 
@@ -282,7 +285,7 @@ def _files(request: ExportRequest, count: int, surfaces: int) -> tuple[str, ...]
     if request.choice().solid and surfaces:
         lines.append(f"the same as solids, {surfaces} of each format")
     if "frames" in request.some("pictures"):
-        lines.append(f"frame_NNNNNN.png, {count} of them")
+        lines.append(f"frame_NNNNNN.{request.picture_format}, {count} of them")
     if "trends" in request.some("pictures"):
         lines.append(TREND_FILE)
     if "film" in request.some("pictures") and surfaces:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pyqtgraph as pg
-from PySide6.QtCore import QPointF, Qt, Signal
-from PySide6.QtGui import QKeyEvent, QPalette
-from PySide6.QtWidgets import QVBoxLayout
+from PySide6.QtCore import QEvent, QPointF, Qt, Signal
+from PySide6.QtGui import QAction, QGuiApplication, QKeyEvent, QKeySequence, QPalette
+from PySide6.QtWidgets import QLabel, QVBoxLayout
 
 from labapp.core.surface.boundary import Boundary
 from labapp.core.values import FloatArray
@@ -14,6 +16,7 @@ from labapp.export.heights import Profile
 from labapp.gui.pages.surface.presenter import error_scale
 from labapp.gui.views.axes import make_plot, paint_axes
 from labapp.gui.views.canvas import Plotted
+from labapp.gui.views.picture_files import save_plot
 from labapp.gui.widgets.labels import wrapping_label
 from labapp.text import HEIGHT_SIGMA_OF
 
@@ -37,6 +40,45 @@ class Chart(Plotted):
         layout.setSpacing(0)
         layout.addWidget(self.title)
         layout.addWidget(self.plot)
+        self._at = QLabel(self.plot)
+        self._at.setAttribute(Qt.WidgetAttribute.WA_TransparentForMouseEvents)
+        self._at.hide()
+        self.plot.scene().sigMouseMoved.connect(self._moved_to)
+        self._add_actions()
+
+    def _add_actions(self) -> None:
+        self.setContextMenuPolicy(Qt.ContextMenuPolicy.ActionsContextMenu)
+        works: tuple[tuple[str, Callable[[], object]], ...] = (
+            ("Copy picture", self.copy_picture),
+            ("Save picture …", save_plot(self, self.plot, "chart")),
+            ("Show all", self.plot.autoRange),
+        )
+        for words, work in works:
+            action = QAction(words, self)
+            action.triggered.connect(lambda *_, do=work: do())
+            self.addAction(action)
+        copy = self.actions()[0]
+        copy.setShortcut(QKeySequence.StandardKey.Copy)
+        copy.setShortcutContext(Qt.ShortcutContext.WidgetShortcut)
+
+    def copy_picture(self) -> None:
+        """Put what is seen on the clipboard."""
+        QGuiApplication.clipboard().setPixmap(self.plot.grab())
+
+    def _moved_to(self, at: QPointF) -> None:
+        """Show the values under the pointer."""
+        box = self.plot.getViewBox()
+        inside = box.sceneBoundingRect().contains(at)
+        place = box.mapSceneToView(at)
+        self._at.setText(f"{place.x():.3g}, {place.y():.3g} mm".replace("-", "−"))
+        self._at.adjustSize()
+        self._at.move(self.plot.width() - self._at.width() - 4, 2)
+        self._at.setVisible(inside)
+
+    def leaveEvent(self, event: QEvent) -> None:
+        """Show no values any more."""
+        self._at.hide()
+        super().leaveEvent(event)
 
     def say(self, words: str) -> None:
         """Put words above the plot."""

@@ -10,7 +10,8 @@ from threadpoolctl import threadpool_limits
 from labapp.gui.pages.surface.comparison import Comparison, compared, other_scheme
 from labapp.gui.pages.surface.presenter import SCHEME_CHOICES, Options
 from labapp.gui.tasks import Control, Task
-from labapp.gui.views.view3d import View3d, make_view3d
+from labapp.gui.views.view3d import View3d
+from labapp.gui.views.view3d_kinds import make_view3d
 from labapp.gui.widgets.fields import ChoiceField
 from labapp.gui.widgets.labels import wrapping_label
 from labapp.gui.widgets.layouts import hbox, vbox

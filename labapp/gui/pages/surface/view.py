@@ -53,13 +53,13 @@ from labapp.gui.pages.surface.presenter import (
 from labapp.gui.tasks import Control
 from labapp.gui.views.picture_files import RASTERS, ask_paper, with_suffix, write_image
 from labapp.gui.views.steering import Steering
-from labapp.gui.views.view3d import LOOKS, View3d, as_image, make_view3d
+from labapp.gui.views.view3d import LOOKS, View3d, as_image
+from labapp.gui.views.view3d_kinds import make_view3d
 from labapp.gui.widgets.fields import ChoiceField, NumberField
 from labapp.gui.widgets.layouts import fill, hbox, vbox
 from labapp.gui.widgets.parts import PartsBar
 from labapp.gui.workspace import Workspace
 from labapp.session.measured import scheme_name
-from labapp.session.outgoing import write_view_film
 from labapp.text import HEIGHT_SIGMA_OF
 
 LEAST_PLAN_WIDTH = 100
@@ -76,6 +76,9 @@ COLOURED = [("height", "by height"), ("sigma", "by ±"), ("residual", "by residu
 FILM_PX = (1280, 720)
 
 SCREEN_DPI = 96.0
+
+NARROW_FIELD = 84
+"""Width of a field of two digits: all tools are in one line of a small screen."""
 
 SHOWN_PARTS = {
     "points": ("Reflection &points", "White dots: where the rays meet the surface"),
@@ -195,6 +198,7 @@ class SurfacePage(Page):
             tooltip="Heights are drawn so many times as high; the axes tell true ones",
         )
         self.high.edited.connect(lambda value: self._set(exaggeration=value))
+        self.high.setMaximumWidth(NARROW_FIELD)
         for field in (self.colour, self.high):
             field.label.setWordWrap(False)
         looks = [
@@ -318,6 +322,8 @@ class SurfacePage(Page):
         path = path if path.suffix.lower() == ".mp4" else path.with_name(path.name + ".mp4")
 
         def work(control: Control) -> None:
+            from labapp.session.outgoing import write_view_film
+
             write_view_film(session, path, camera, FILM_PX, control.progress)
 
         def done(_: object) -> None:
