@@ -28,6 +28,11 @@ from labapp.gui.workspace import Workspace
 BUTTONS = (
     ("new", "&New session …", "Make a file for a new experiment (Ctrl+N)"),
     ("open", "&Open a session …", "Open a session that is not in the list (Ctrl+O)"),
+    (
+        "study",
+        "&Many recordings …",
+        "Measure the recordings of a study alike, and compare them (Ctrl+Shift+R)",
+    ),
     ("sample", "&Try the sample", "Open a copy of a recorded run that is measured already"),
 )
 
