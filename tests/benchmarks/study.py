@@ -16,7 +16,7 @@ law
 kills
     Kills workers and programs at random moments.
 long
-    Measures 20,000 frames that are generated as they are read.
+    Measures 20,000 frames (``--long``) that are generated as they are read.
 
 Times are the processor's, which other programs hardly change, unless they are called wall.
 """
@@ -32,21 +32,24 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
-import psutil
+import psutil  # type: ignore[import-untyped]
+from pyarrow import parquet
 
 from labapp import Study
 from labapp.config.scenario import read_scenario
 from labapp.config.setup import read_setup
 from labapp.core.pipeline import Settings
-from labapp.core.values import FloatArray
 from labapp.export.tables import frame_tables
-from labapp.media import open_source
+from labapp.media import Frame, GreyImage, open_source
 from labapp.run.measurers import WarmMeasurer
+from labapp.run.study import stretches
+from labapp.run.study import study as study_module
 from labapp.run.study.summary import StudySummary
 from labapp.simulated.benchmark import SCENARIO
 from labapp.simulated.simulate import simulate
@@ -271,7 +274,7 @@ def law(folder: Path) -> None:
             f"{int((off < 2).sum())} within 2 ±"
         )
     for size in ("width_mm", "height_mm"):
-        print(f"{size}: {_slope(summary, size)}")
+        print(f"{size}: {_slope(summary, truth, size)}")
     for one in summary.outliers[:10]:
         print("outlier", one.recording, one.frame, one.measure, one.value, one.usual, one.times)
     print(f"{len(summary.outliers)} outliers; look at {folder / 'by 2 processes/summary.html'}")
@@ -283,20 +286,118 @@ def _truth(folder: Path, name: str) -> dict[str, float]:
     return {key: float(np.mean([float(row[key]) for row in rows])) for key in rows[0]}
 
 
-def _slope(summary: StudySummary, size: str) -> str:
-    """Slope against the current by least squares, as simulated and as measured."""
+def _slope(summary: StudySummary, truth: Mapping[str, Mapping[str, float]], size: str) -> str:
+    """Slope against the current by least squares: simulated, true in these pools, measured."""
+    by_name = {one.status.recording.name: one for one in summary.recordings}
     found = []
     for gas in GASES:
         groups = [one for one in summary.groups if one.conditions["gas"] == gas]
-        at = np.array([float(one.conditions["current_a"]) for one in groups])
-        value = np.array([one.means[size].mean for one in groups])
-        scatter = np.array([one.means[size].scatter / np.sqrt(REPEATS) for one in groups])
-        basis = np.stack([np.ones_like(at), at], axis=1) / scatter[:, None]
-        covariance: FloatArray = np.linalg.inv(basis.T @ basis)
-        slope = (covariance @ basis.T @ (value / scatter))[1]
-        true = (law_mm(125, gas)[size] - law_mm(80, gas)[size]) / 45
-        found.append(f"{gas} {slope:.6f} ± {np.sqrt(covariance[1, 1]):.6f} mm/A, put in {true:.6f}")
+        names = [name for one in groups for name in one.recordings]
+        at = np.array([float(str(one.conditions["current_a"])) for one in groups])
+        at = np.repeat(at, [len(one.recordings) for one in groups])
+        basis = np.stack([np.ones_like(at), at], axis=1)
+        slopes, errors = [], []
+        for values in (
+            [truth[name][size] for name in names],
+            [by_name[name].means[size].mean for name in names],
+        ):
+            fit, residual, *_ = np.linalg.lstsq(basis, np.array(values), rcond=None)
+            scatter = residual[0] / (len(names) - 2)
+            slopes.append(fit[1])
+            errors.append(np.sqrt(scatter * np.linalg.inv(basis.T @ basis)[1, 1]))
+        put_in = (law_mm(125, gas)[size] - law_mm(80, gas)[size]) / 45
+        found.append(
+            f"{gas} measured {slopes[1]:.6f} ± {errors[1]:.6f} mm/A, true of these pools "
+            f"{slopes[0]:.6f}, put in {put_in:.6f}"
+        )
     return "; ".join(found)
+
+
+# --- a long recording ---------------------------------------------------------------------------
+
+
+class Stream:
+    """Frames of a swinging pool, generated as they are read: rendered ones with fresh noise."""
+
+    name, frame_rate_hz, shape, warnings = "stream", 200.0, (640, 480), ()
+    description, bit_depth, index = "generated frames", 8, None
+
+    def __init__(self, rendered: list[GreyImage], frames: int) -> None:
+        self._rendered, self._frames = rendered, frames
+        noise = np.random.default_rng(3).normal(0, 1.5, (2 * 640, 480))
+        self._noise = np.round(noise).astype(np.int16)
+        self.made_s = 0.0
+        """Processor time that generating them took, s."""
+
+    def __len__(self) -> int:
+        return self._frames
+
+    def frame(self, number: int) -> Frame:
+        """Generate a frame."""
+        begun = time.process_time()
+        # To and fro: no jump where it begins anew.
+        place = number % (2 * len(self._rendered) - 2)
+        image = self._rendered[min(place, 2 * len(self._rendered) - 2 - place)]
+        noise = self._noise[number % 640 :][:640]
+        made = np.clip(image + noise, 0, 255).astype(np.uint8)
+        self.made_s += time.process_time() - begun
+        return Frame(number, number / self.frame_rate_hz, made)
+
+    def __enter__(self) -> Stream:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        return
+
+
+def long(folder: Path, frames: int) -> None:
+    """Measure a long recording in this process; time and memory of each stretch."""
+    draft = folder / "long.scenario.toml"
+    draft.write_text(SCENARIO.format(frames=200), "utf-8")
+    scenario = read_scenario(draft)
+    rendered = [scenario.recording.frame(k).image for k in range(200)]
+    stream = Stream(rendered, frames)
+    (folder / "long.avi").write_bytes(b"generated")
+    (folder / "long.setup.toml").write_text(scenario.setup, "utf-8")
+    text = 'setup = "long.setup.toml"\n[[recording]]\nfile = "long.avi"\n'
+    (folder / "long.toml").write_text(text, "utf-8")
+    out = folder / "long results"
+    shutil.rmtree(out, ignore_errors=True)
+    took_ms: list[float] = []
+    memory_mb: list[float] = []
+
+    def measure(stretch: stretches.Stretch) -> None:
+        begun, made_s = time.process_time(), stream.made_s
+        stretches.measure_stretch(stretch)
+        own_s = time.process_time() - begun - (stream.made_s - made_s)
+        took_ms.append(1e3 * own_s / len(stretch.frames))
+        memory_mb.append(psutil.Process().memory_info().rss / 1e6)
+        print(f"{len(took_ms)}: {took_ms[-1]:.2f} ms, {memory_mb[-1]:.0f} MB", flush=True)
+
+    with (
+        mock.patch.object(stretches, "open_source", return_value=stream),
+        mock.patch.object(study_module, "measure_stretch", measure),
+    ):
+        study = Study(folder / "long.toml", out)
+        study.run(0)
+    begun = time.process_time()
+    summary = study.results()
+    print(f"results {time.process_time() - begun:.1f} s; {summary.recordings[0].statuses}")
+    steady = np.array(took_ms[1:])
+    print(
+        f"{frames} frames: {np.median(steady):.2f} ms a frame, stretches {steady.min():.2f} to "
+        f"{steady.max():.2f} ms; memory after the second {memory_mb[1]:.0f}, at the end "
+        f"{memory_mb[-1]:.0f}, with results {psutil.Process().memory_info().rss / 1e6:.0f} MB"
+    )
+    path, before = out / "measures.parquet" / "long.parquet", psutil.Process().memory_info().rss
+    begun = time.process_time()
+    file = parquet.ParquetFile(path)
+    some = file.read_row_group(file.num_row_groups - 1, columns=["frame", "height_mm"])
+    more_mb = (psutil.Process().memory_info().rss - before) / 1e6
+    print(
+        f"Parquet {path.stat().st_size / 1e6:.1f} MB, {file.num_row_groups} row groups: the last "
+        f"{len(some)} rows of two columns in {time.process_time() - begun:.3f} s, {more_mb:.1f} MB"
+    )
 
 
 # --- kills --------------------------------------------------------------------------------------
@@ -322,6 +423,7 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("parts", nargs="*", metavar="PART")
     parser.add_argument("--frames", type=int, default=200)
+    parser.add_argument("--long", type=int, default=20_000)
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--seed", type=int, default=1)
     given = parser.parse_args()
@@ -331,6 +433,7 @@ def main() -> None:
         "workers": lambda: workers(folder),
         "overhead": lambda: overhead(folder),
         "law": lambda: law(folder),
+        "long": lambda: long(folder, given.long),
         "kills": lambda: kills(folder, given.kills, given.seed),
     }
     for part in given.parts or PARTS:
