@@ -348,9 +348,9 @@ class Session(SessionContents):
         frames
             Which ones; None: those not measured yet, or measured from what was changed since.
         pool
-            Processes to measure in (`run.measurers.measuring_pool`); None: here.
+            Processes to measure in (`run.measurers.measuring_pool`), one if ``warm``; None: here.
         warm
-            Whether to measure each frame from the one before (`WarmChain`), here.
+            Whether to measure each frame from the one before (`WarmChain`).
         sinks
             Where else results go once they are kept (`run.runner.run`).
 
@@ -383,7 +383,7 @@ class Session(SessionContents):
         given = (self.frame, basis.setup, basis.settings, self.correction)
         lines = basis.setup.line_rig is not None  # each frame by itself; nothing judges the set-up
         by_itself = lines or not warm
-        measurer: Measurer = ColdMeasurer(*given, pool) if by_itself else WarmMeasurer(*given)
+        measurer: Measurer = (ColdMeasurer if by_itself else WarmMeasurer)(*given, pool)
         numbers = (int(number) for number in chosen)
         try:
             for result in run(numbers, measurer, [keep, *sinks]):

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from PySide6.QtCore import QUrl
-from PySide6.QtGui import QDesktopServices
+from PySide6.QtGui import QCloseEvent, QDesktopServices
 from PySide6.QtWidgets import QAbstractItemView, QCheckBox, QTabWidget, QWidget
 
 from labapp.gui.dialogs import ask_file, ask_folder, ask_save
@@ -21,12 +21,14 @@ from labapp.gui.widgets.layouts import vbox
 from labapp.gui.widgets.path_field import PathField
 from labapp.gui.widgets.sheet import Sheet
 from labapp.gui.widgets.tables import CellTable
+from labapp.run.measurers import measuring_pool
 from labapp.run.study.page import condition_picture, varying_conditions
 from labapp.run.study.plan import StudyRecording, folder_pattern, write_study
 from labapp.run.study.results import require_extra
 from labapp.run.study.status import Progress, RecordingStatus
 from labapp.run.study.study import Study
 from labapp.run.study.summary import StudySummary
+from labapp.simulation.parallel import end_processes, wait_for
 
 if TYPE_CHECKING:
     from labapp.gui.shell.files import Files
@@ -59,6 +61,7 @@ class StudyWindow(ToolWindow):
         self._sessions = sessions
         self.looks = Tasks(self)
         self.looks.failed.connect(lambda _, why: self.say(why, True))
+        self.looks.changed.connect(self._show)
         self.tasks.changed.connect(self._look_at_end)
         self._make_form()
         self._make_results()
@@ -206,7 +209,7 @@ class StudyWindow(ToolWindow):
     def _look(self) -> None:
         """Read in the background what is done, and put its results together."""
         self.looks.cancel_all()
-        study = self.study
+        study, surfaces = self.study, self.surfaces.isChecked()
         if study is None:
             return
 
@@ -215,7 +218,13 @@ class StudyWindow(ToolWindow):
             control.part(found)
             if not any(one.frames_done for one in found):
                 return None
-            return study.results()
+            # In a process: the window would be slow meanwhile, and so would this.
+            pool = measuring_pool(1)
+            try:
+                begun = pool.submit(_results, study.path, study.folder, surfaces)
+                return wait_for(begun, control.check)
+            finally:
+                end_processes(pool)
 
         self.looks.start("Reading the study", work, self._show_summary, self._show_part)
 
@@ -243,7 +252,8 @@ class StudyWindow(ToolWindow):
     def _show(self) -> None:
         if self.study is not None:
             plan = self.study.plan
-            self.words.setText(studying.state_text(plan, self.found))
+            reading = ": reading the results …" * bool(self.looks.active)
+            self.words.setText(f"{studying.state_text(plan, self.found)}{reading}")
             self.list.show_table(studying.recordings_table(plan, self.found))
         if self.summary is not None:
             self.means.show_table(studying.means_table(self.summary))
@@ -293,8 +303,6 @@ class StudyWindow(ToolWindow):
                     took_s = looked_s - begun_s
 
             study.run(workers, scheduler, surfaces=surfaces, progress=progress, note=control.part)
-            control.progress(1, 1, "putting the results together")
-            study.results(surfaces=surfaces)
 
         self.begin(
             f"Measuring {study.plan.title}", work, lambda _: self.say("Done"), self._show_part
@@ -339,9 +347,19 @@ class StudyWindow(ToolWindow):
 
         self.begin(f"Opening {recording.name}", work, opened)
 
+    def closeEvent(self, event: QCloseEvent) -> None:
+        """Stop reading, too."""
+        self.looks.cancel_all()
+        super().closeEvent(event)
+
     def show_state(self) -> None:
         """Enable what is of use now."""
         if hasattr(self, "start_button"):
             self.start_button.setEnabled(self.study is not None and not self.working)
             self.open_button.setEnabled(self.selected() is not None and not self.working)
             self.page_button.setEnabled(self.summary is not None)
+
+
+def _results(path: Path, folder: Path, surfaces: bool) -> StudySummary:
+    """Put the results of a study together and write them, in another process."""
+    return Study(path, folder).results(surfaces=surfaces)

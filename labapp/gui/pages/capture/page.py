@@ -23,7 +23,7 @@ from labapp.gui.pages.capture.presenter import (
     recording_facts,
 )
 from labapp.gui.pages.page import Page
-from labapp.gui.shell.steps import Mark, State
+from labapp.gui.shell.steps import Mark, State, why_not_measurable
 from labapp.gui.tasks import Control, Task
 from labapp.gui.views.picture import PictureView
 from labapp.gui.widgets.buttons import button
@@ -159,7 +159,9 @@ class CapturePage(Page):
             self._show_import()
             self.workspace.notified.emit(kept_text(take, why_kept), False)
         else:
-            self._import(take.path, ":", None, False)
+            self._import(
+                take.path, ":", None, False, self.live_view.plan_fields.measured.isChecked()
+            )
 
     def _show_recording(self, recording: Recording | None) -> None:
         self.told_group.setVisible(recording is not None and self.live_view.live is None)
@@ -317,7 +319,9 @@ class CapturePage(Page):
         if self.workspace.session is not former:  # the dialog was not cancelled
             self._import(path, frames, rate_hz, embed)
 
-    def _import(self, path: Path, frames: str, rate_hz: float | None, embed: bool) -> None:
+    def _import(
+        self, path: Path, frames: str, rate_hz: float | None, embed: bool, measured: bool = False
+    ) -> None:
         session = self.session
 
         def work(control: Control) -> Recording:
@@ -338,6 +342,8 @@ class CapturePage(Page):
                 f"{message}. {' '.join(recording.warnings)}".strip(), False
             )
             self.workspace.changed.emit()
+            if measured and not why_not_measurable(session):
+                self.workspace.measure(warm=True)
 
         self._importing = self.start_task(f"Importing {path.name}", work, done, kind="Importing")
         self._listed = None  # one of them may be the session's own then
