@@ -22,7 +22,7 @@ from labapp.gui.tasks import Control
 from labapp.gui.theme import FollowsTheme
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.labels import plain_label, plain_tip, wrapping_label
-from labapp.gui.widgets.layouts import fill, hbox
+from labapp.gui.widgets.layouts import fill, hbox, vbox
 from labapp.gui.workspace import Workspace
 
 BUTTONS = (
@@ -85,7 +85,8 @@ class Welcome(FollowsTheme, QWidget):
             "No session was opened yet. Drop a video, an image, a folder of images or a session "
             "anywhere on this window to begin, or try the sample."
         )
-        buttons = hbox(*self.buttons.values())
+        made = list(self.buttons.values())
+        buttons = vbox(hbox(*made[:2]), hbox(*made[2:]))
         column = fill(
             QVBoxLayout(inner),
             *(title, about, buttons, self.label, (self.list, 1), self.nothing, 0),
