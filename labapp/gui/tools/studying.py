@@ -56,8 +56,7 @@ def means_table(summary: StudySummary) -> Table:
         )
         for one in summary.groups
     )
-    sizes = ("{}, {}".format(*WORDS[size]) for size in SIZES)
-    columns = (*summary.conditions, "Recordings", "Frames", *sizes)
+    columns = (*summary.conditions, "Recordings", "Frames", *SIZES)
     return Table("summary", "Means of each condition, with ±", columns, rows)
 
 

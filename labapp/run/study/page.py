@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
+from pathlib import Path
 from typing import Any
 
 from matplotlib import rc_context
@@ -223,6 +224,11 @@ def _n(value: object) -> str:
     return f'<td class="n">{escape(str(value))}</td>'
 
 
+def _link(path: str) -> str:
+    """A cell that opens a file."""
+    return f'<td><a href="{escape(Path(path).as_uri())}">{escape(path)}</a></td>'
+
+
 def _cell(value: Condition | None) -> str:
     return _t(value) if isinstance(value, str) else _n(shown_condition(value))
 
@@ -267,7 +273,7 @@ def _outliers(summary: StudySummary) -> str:
         [
             *(_t(one.recording), _n("all" if one.frame is None else one.frame)),
             *(_t(WORDS[one.measure][0]), _n(f"{one.value:.4g}"), _n(f"{one.usual:.4g}")),
-            *(_n(f"{one.times:.1f}"), _t(one.file)),
+            *(_n(f"{one.times:.1f}"), _link(one.file)),
         ]
         for one in summary.outliers[:MOST_SHOWN]
     ]
