@@ -64,6 +64,7 @@ class Workspace(QObject):
         self.session: Session | None = None
         self.frame = 0
         self._pool: ProcessPoolExecutor | None = None
+        self._warm_pool: ProcessPoolExecutor | None = None
         self._overview: Overview | None = None
         self._measuring: list[Task] = []
         # Connected first: the slots connected later see the frames as they are.
@@ -120,8 +121,8 @@ class Workspace(QObject):
         """End the processes: a frame that is half measured is not kept, and could take seconds."""
         for task in self.tasks.active:
             task.cancel()  # or it would take the end of its processes for a fault
-        pool, self._pool = self._pool, None
-        if pool is not None:
+        pools, self._pool, self._warm_pool = (self._pool, self._warm_pool), None, None
+        for pool in filter(None, pools):
             parallel.end_processes(pool)
 
     def say_wrong(self, cause: str, words: str) -> None:
@@ -223,25 +224,28 @@ class Workspace(QObject):
         """The measuring under way; None if there is none."""
         return next((task for task in self.tasks.active if task.title == MEASURING), None)
 
-    def measure(self, frames: Sequence[int] | None = None) -> None:
+    def measure(self, frames: Sequence[int] | None = None, *, warm: bool = False) -> None:
         """Measure frames in the background; None: those not measured, or stale.
 
         Frames that are kept make `measured` go out; that in view, and the last, `changed`.
+
+        Parameters
+        ----------
+        warm
+            Whether each frame is measured from the one before, as fits a fast recording.
         """
         session = self.session
         if session is None:
             return
-        if self._pool is None:
-            from labapp.run.measurers import measuring_pool
-
-            self._pool = measuring_pool(max(1, (os.cpu_count() or 2) - 1))
-        pool = self._pool
+        pool = self._measuring_pool(warm)
 
         def work(control: Control) -> int:
             done, emitted_s = 0, 0.0
             numbers = [int(k) for k in (session.stale_frames() if frames is None else frames)]
             try:
-                for done, (number, _) in enumerate(session.measure_each(numbers, pool), 1):
+                for done, (number, _) in enumerate(
+                    session.measure_each(numbers, pool, warm=warm), 1
+                ):
                     control.progress(done, len(numbers))
                     if number == self.frame:
                         control.part(None)
@@ -251,7 +255,7 @@ class Workspace(QObject):
                         emitted_s = time.monotonic()
             except (BrokenProcessPool, CancelledError) as error:
                 control.check()  # ended on purpose
-                self._pool = None
+                self._pool = self._warm_pool = None
                 raise ValueError(
                     "a process that measures has ended; what was measured is kept: measure again"
                 ) from error
@@ -268,6 +272,15 @@ class Workspace(QObject):
                 self.measured.emit()
 
         self._measuring.append(self.tasks.start(MEASURING, work, finished, kept))
+
+    def _measuring_pool(self, warm: bool) -> ProcessPoolExecutor:
+        from labapp.run.measurers import measuring_pool
+
+        if warm:
+            self._warm_pool = self._warm_pool or measuring_pool(1)
+            return self._warm_pool
+        self._pool = self._pool or measuring_pool(max(1, (os.cpu_count() or 2) - 1))
+        return self._pool
 
     def _show_end(self) -> None:
         """Have everything shown that was kept, however the measuring has ended."""

@@ -20,7 +20,7 @@ from contextlib import AbstractContextManager, ExitStack, closing, contextmanage
 from dataclasses import dataclass, replace
 from itertools import chain, islice
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import cv2
 import numpy as np
@@ -32,8 +32,11 @@ from labapp.core.recording.residual_check import Residuals
 from labapp.errors import InputError
 from labapp.export.frame_result import FrameResult, without_surface
 from labapp.export.tables import table_rows
-from labapp.media import Frame, open_source
+from labapp.media import Frame, GreyImage, open_source
 from labapp.simulation.parallel import NICE, start_worker
+
+if TYPE_CHECKING:
+    from labapp.core.recording.chain import WarmChain
 
 T = TypeVar("T")
 
@@ -243,7 +246,7 @@ class LineFollower:
 
 @dataclass(frozen=True)
 class WarmMeasurer:
-    """Measures each frame from the one before, here, in stretches (`WarmChain`).
+    """Measures each frame from the one before, in stretches (`WarmChain`).
 
     A frame that was corrected by hand is measured by itself, as it was corrected. Such a frame, one
     that cannot be read and a change of the step between frames are gaps (`WarmChain.skip`).
@@ -254,6 +257,8 @@ class WarmMeasurer:
     settings: Settings
     corrected: Corrected = lambda _: None
     """As of `ColdMeasurer`."""
+    pool: Executor | None = None
+    """One process to measure in (`measuring_pool`); None: here."""
 
     def __call__(self, frames: Iterable[int]) -> Generator[FrameResult]:
         """Measure frames; see `runner.Measurer`."""
@@ -263,13 +268,11 @@ class WarmMeasurer:
             yield from _agreeing(stretch, self.setup, self.settings, warm=True)
 
     def _stretch(self, frames: Iterable[int]) -> Generator[FrameResult]:
-        from labapp.core.recording.chain import WarmChain
-
         last: int | None = None
         step: int | None = None
         for place, number in enumerate(frames):
             if place in BY_THEMSELVES:
-                warm = WarmChain(self.setup.bench, self.settings)
+                warm = self._chain()
             before = None if last is None else number - last
             if step is not None and before != step:
                 warm.skip()
@@ -285,6 +288,55 @@ class WarmMeasurer:
                 with _one_thread():
                     found = warm.measure(frame.image)
                 yield FrameResult(number, frame.time_s, found, warm.track_lost)
+
+    def _chain(self) -> WarmChain | _ChainElsewhere:
+        from labapp.core.recording.chain import WarmChain
+
+        if self.pool is None:
+            return WarmChain(self.setup.bench, self.settings)
+        return _ChainElsewhere(self.pool, self.setup, self.settings)
+
+
+class _ChainElsewhere:
+    """A `WarmChain` in another process."""
+
+    def __init__(self, pool: Executor, setup: Setup, settings: Settings) -> None:
+        self.track_lost: str | None = None
+        self._pool = pool
+        pool.submit(_begin_chain, setup, settings)
+
+    def skip(self) -> None:
+        """Leave out a frame."""
+        self._pool.submit(_skip_in_chain)
+
+    def measure(self, image: GreyImage) -> Measurement:
+        """Measure the next frame."""
+        found, self.track_lost = self._pool.submit(_measure_in_chain, image).result()
+        return found
+
+
+_chain: WarmChain | None = None
+"""The chain of this process, for `_ChainElsewhere`."""
+
+
+def _begin_chain(setup: Setup, settings: Settings) -> None:
+    global _chain  # noqa: PLW0603 - one chain at a time
+    from labapp.core.recording.chain import WarmChain
+
+    cv2.setNumThreads(1)
+    _chain = WarmChain(setup.bench, settings)
+
+
+def _skip_in_chain() -> None:
+    assert _chain is not None
+    _chain.skip()
+
+
+def _measure_in_chain(image: GreyImage) -> tuple[Measurement, str | None]:
+    assert _chain is not None
+    with _one_thread():
+        found = _chain.measure(image)
+    return found, _chain.track_lost
 
 
 @dataclass(frozen=True)

@@ -349,9 +349,9 @@ class Session(SessionContents):
         frames
             Which ones; None: those not measured yet, or measured from what was changed since.
         pool
-            Processes to measure in (`run.measurers.measuring_pool`); None: here.
+            Processes to measure in (`run.measurers.measuring_pool`), one if ``warm``; None: here.
         warm
-            Whether to measure each frame from the one before (`WarmChain`), here.
+            Whether to measure each frame from the one before (`WarmChain`).
         sinks
             Where else results go once they are kept (`run.runner.run`).
 
@@ -385,7 +385,7 @@ class Session(SessionContents):
         rig = basis.setup.line_rig
         lines = rig is not None  # each frame by itself; nothing judges the set-up
         by_itself = lines or not warm
-        measurer: Measurer = ColdMeasurer(*given, pool) if by_itself else WarmMeasurer(*given)
+        measurer: Measurer = (ColdMeasurer if by_itself else WarmMeasurer)(*given, pool)
         if rig is not None and rig.pattern.count == 1:
             measurer = LineFollower(*given[:3])
         numbers = (int(number) for number in chosen)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -41,6 +42,9 @@ from labapp.gui.shell.window import MainWindow
 from labapp.gui.tools import TOOLS
 from labapp.gui.tools.tool import ToolWindow
 from labapp.gui.views.canvas import Drawn, Plotted
+from labapp.run.study.plan import StudyPlan, StudyRecording
+from labapp.run.study.status import RecordingStatus
+from labapp.run.study.summary import StudySummary
 from labapp.studies.analysis import AnalysisPart
 from labapp.studies.tables import Table
 from tests.gui.conftest import CopySample, let_draw
@@ -361,7 +365,23 @@ def fill_analysis(tool: Any, qtbot: QtBot) -> None:
     tool.show_part(AnalysisPart((table,), {}, (table,)))
 
 
-FILL = {"simulator": fill_simulator, "adviser": fill_adviser, "analysis": fill_analysis}
+def fill_study(tool: Any, qtbot: QtBot) -> None:
+    """It has a recording, and results."""
+    recording = StudyRecording("first", Path("first.avi"), Path("setup.toml"))
+    status = RecordingStatus(recording, "done", "", 3, 3)
+    plan = StudyPlan("study", (recording,), ())
+    tool.study = SimpleNamespace(plan=plan, folder=Path("results"))
+    tool.found = [status]
+    tool._show_summary(StudySummary("study", (), (), (), ()))
+    tool.list.selectRow(0)
+
+
+FILL = {
+    "study": fill_study,
+    "simulator": fill_simulator,
+    "adviser": fill_adviser,
+    "analysis": fill_analysis,
+}
 
 
 def test_the_question_whether_to_open_read_only(window: MainWindow, copy_sample: CopySample):

@@ -39,6 +39,7 @@ from labapp.run.measurers import (
     ColdMeasurer,
     RecordingMeasurer,
     WarmMeasurer,
+    measuring_pool,
     stretch_pools,
 )
 from labapp.session.record import Record
@@ -231,6 +232,18 @@ def test_frames_beside_a_gap_are_not_taken_for_equally_spaced(
     wrong = [one.frame for one in results if one.measurement.status != "ok"]
     assert wrong == ([5] if gap == "unreadable" else [])
     assert found == remembered
+
+
+@pytest.mark.slow
+def test_a_chain_in_another_process_gives_the_same(recording: RecordingMeasurer) -> None:
+    frames = [0, 1, 2, 3, 4, 7, 8]  # with a gap
+    with open_source(recording.path) as source, measuring_pool(1) as pool:
+        given = source.frame, recording.setup, Settings()
+        here, there = (list(WarmMeasurer(*given, pool=each)(frames)) for each in (None, pool))
+    assert [one.frame for one in there] == frames
+    for one, other in zip(here, there, strict=True):
+        assert one.track_lost == other.track_lost
+        assert_same(one.measurement.measures, other.measurement.measures)
 
 
 def told_here(recording: RecordingMeasurer) -> list[FrameResult]:

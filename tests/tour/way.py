@@ -21,6 +21,7 @@ from labapp.gui.shell.steps import STEPS
 from labapp.gui.tools.adviser import AdviserWindow
 from labapp.gui.tools.analysis import AnalysisWindow
 from labapp.gui.tools.simulator import SimulatorWindow
+from labapp.gui.tools.study import StudyWindow
 from labapp.gui.tools.tool import ToolWindow
 from labapp.session.session import Session
 
@@ -67,6 +68,7 @@ def go_through(hands: Hands, folder: Path) -> None:
     _menus(hands)
     _other_pages(hands)
     _simulator(hands)
+    _study(hands)
     _adviser(hands)
     _analysis(hands)
     _misnumber(hands)
@@ -312,6 +314,24 @@ def _simulator(hands: Hands) -> None:
     hands.press("Simulate")
     hands.wait(lambda: tool.made, "the simulation to be written")
     hands.picture("dialog-simulator")
+    tool.close()
+
+
+def _study(hands: Hands) -> None:
+    """A study of the recording that was simulated, made and measured."""
+    hands.do("step_setup")
+    made = hands.window.findChild(SimulatorWindow).made
+    tool = _tool(hands, "study", StudyWindow)
+    hands.asked("study", lambda: hands.press("Open a study …"))
+    hands.asked("study-recordings", lambda: hands.press("Choose a folder …"))
+    hands.asked("study-setup", lambda: hands.press("Choose a set-up …"))
+    tool.take_folder(made[1])
+    hands.asked("new-study", lambda: hands.press("Make the study …"))
+    tool.make(made[1].parent / "study.toml")
+    hands.wait(lambda: tool.found and not tool.looks.active, "the study to be read")
+    hands.press("Run")
+    hands.wait(lambda: tool.summary and not tool.looks.active, "the study to be measured")
+    hands.picture("dialog-study")
     tool.close()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from PySide6.QtCore import QObject, Signal
+from PySide6.QtWidgets import QCheckBox
 
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
 from labapp.gui.widgets.labels import selectable_label
@@ -65,6 +66,13 @@ class PlanFields(QObject):
         for field in (self.before, self.after, self.every, self.codec):
             field.edited.connect(lambda _: self.edited.emit())
             form.add(field)
+        self.measured = QCheckBox("Measure it afterwards")
+        self.measured.setToolTip(
+            "When a recording has ended and the set-up is complete, all its frames are measured in "
+            "the background, each from the one before; the bar below shows how far that is"
+        )
+        self.measured.setChecked(True)
+        form.add_wide(self.measured)
         self.cost = selectable_label()
         form.add_wide(self.cost)
 

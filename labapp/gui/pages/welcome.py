@@ -21,10 +21,10 @@ from labapp.gui.shell.lead import action_button
 from labapp.gui.tasks import Control
 from labapp.gui.theme import FollowsTheme
 from labapp.gui.widgets.labels import Message, plain_label, plain_tip, wrapping_label
-from labapp.gui.widgets.layouts import fill, hbox
+from labapp.gui.widgets.layouts import fill, hbox, vbox
 from labapp.gui.workspace import Workspace
 
-BUTTONS = ("open_recording", "open", "new", "sample")
+BUTTONS = ("open_recording", "open", "new", "study", "sample")
 """Actions of the window; the first leads to a surface soonest."""
 
 WIDTH_PX = 760
@@ -79,7 +79,8 @@ class Welcome(FollowsTheme, QWidget):
             "No session was opened yet. Open a recording, or drop a video, an image, a folder of "
             "images or a session anywhere on this window; or try the sample."
         )
-        buttons = hbox(*self.buttons.values())
+        made = list(self.buttons.values())
+        buttons = vbox(hbox(*made[:3]), hbox(*made[3:]))
         column = fill(
             QVBoxLayout(inner),
             *(title, about, buttons, self.refused, self.label, (self.list, 1), self.nothing, 0),

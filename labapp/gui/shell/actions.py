@@ -347,6 +347,12 @@ VIEW = (
 
 TOOLS = (
     Action(
+        "study",
+        "St&udy of many recordings…",
+        "Ctrl+Shift+R",
+        "Measure many recordings alike, and compare them under their conditions",
+    ),
+    Action(
         "simulator",
         "&Simulator…",
         "Ctrl+Shift+M",

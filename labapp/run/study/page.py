@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from html import escape
+from pathlib import Path
 from typing import Any
 
 from matplotlib import rc_context
@@ -12,7 +13,7 @@ from matplotlib import rc_context
 from labapp.core.surface.measures import SIZES
 from labapp.run.study.plan import Condition, shown_condition
 from labapp.run.study.summary import GroupSummary, Mean, StudySummary
-from labapp.studies.plotting import STYLE, as_bytes, new_figure
+from labapp.studies.plotting import INCHES, STYLE, as_bytes, new_figure
 from labapp.text import SIGMA_OF, pluralize
 
 MOST_SHOWN = 60
@@ -102,7 +103,7 @@ def _problems(summary: StudySummary) -> list[str]:
 
 
 def _plots_note(summary: StudySummary) -> str:
-    varying = _varying(summary)
+    varying = varying_conditions(summary)
     colours = " Colours tell the other conditions apart." if len(varying) > 1 else ""
     return (
         "<p class=note>Large: mean of the recordings under one condition, with its standard "
@@ -111,7 +112,7 @@ def _plots_note(summary: StudySummary) -> str:
     )
 
 
-def _varying(summary: StudySummary) -> list[str]:
+def varying_conditions(summary: StudySummary) -> list[str]:
     """Conditions that have more than one value."""
     values = {
         name: {one.conditions.get(name) for one in summary.groups} for name in summary.conditions
@@ -119,9 +120,27 @@ def _varying(summary: StudySummary) -> list[str]:
     return [name for name, each in values.items() if len(each) > 1]
 
 
+def condition_picture(summary: StudySummary, condition: str) -> bytes:
+    """Each size against one condition, in two rows, as PNG; the other conditions by colour.
+
+    Parameters
+    ----------
+    condition
+        One of `varying_conditions`; empty: none, all recordings at one place.
+    """
+    others = [name for name in varying_conditions(summary) if name != condition]
+    with rc_context(STYLE):
+        figure = new_figure(INCHES, 3.8)
+        axes = figure.subplots(2, 3, sharex=True).flatten()
+        _draw_row(axes, summary, condition, others)
+        for axis, size in zip(axes, SIZES, strict=True):
+            axis.set_title("{} ({})".format(*WORDS[size]))
+        return as_bytes(figure, dpi=150)
+
+
 def _plots(summary: StudySummary) -> str:
     """Small multiples: a row a condition that varies, a column a size."""
-    varying = _varying(summary)[:MOST_ROWS] or [""]
+    varying = varying_conditions(summary)[:MOST_ROWS] or [""]
     width, height = PANEL_INCHES
     with rc_context(STYLE):
         figure = new_figure(width * len(SIZES) + 1.2, height * len(varying) + 0.3)
@@ -205,6 +224,11 @@ def _n(value: object) -> str:
     return f'<td class="n">{escape(str(value))}</td>'
 
 
+def _link(path: str) -> str:
+    """A cell that opens a file."""
+    return f'<td><a href="{escape(Path(path).as_uri())}">{escape(path)}</a></td>'
+
+
 def _cell(value: Condition | None) -> str:
     return _t(value) if isinstance(value, str) else _n(shown_condition(value))
 
@@ -249,7 +273,7 @@ def _outliers(summary: StudySummary) -> str:
         [
             *(_t(one.recording), _n("all" if one.frame is None else one.frame)),
             *(_t(WORDS[one.measure][0]), _n(f"{one.value:.4g}"), _n(f"{one.usual:.4g}")),
-            *(_n(f"{one.times:.1f}"), _t(one.file)),
+            *(_n(f"{one.times:.1f}"), _link(one.file)),
         ]
         for one in summary.outliers[:MOST_SHOWN]
     ]

@@ -34,9 +34,10 @@ from labapp.config.csv_tables import bounded_lines, open_table, parse_number
 from labapp.config.toml_keys import Rule, check_keys, is_number, parse_toml, shown, unknown_key
 from labapp.core.pipeline import Settings
 from labapp.core.schemes import SCHEMES
-from labapp.errors import InputError
+from labapp.errors import InputError, os_errors_as_input
 from labapp.export.tables import TABLES
 from labapp.files import as_bytes, write_file
+from labapp.media import RECORDING_SUFFIXES
 from labapp.text import unescaped_csv_text
 
 A_STUDY = "a study file (TOML or CSV, UTF-8)"
@@ -212,8 +213,8 @@ def write_study(
         raise InputError(path, "name", path.suffix or "no suffix", ".toml or .csv")
     if path.exists():
         raise InputError(path, "file", "is there already", "a new file")
-    here, folder = Path(), path.parent.absolute()
-    found = [each for text in recordings for each in _files(here / "study", "recording", text)]
+    folder = path.parent.absolute()
+    found = [each for text in recordings for each in matching_recordings(text)]
     names = list(dict.fromkeys(name for _, varied in found for name in varied))
     entries = [
         {"file": _relative(file, folder), "setup": _relative(Path(setup), folder), **varied}
@@ -230,6 +231,39 @@ def write_study(
             text += f"conditions = {{ {each} }}\n" if each else ""
     write_file(path, as_bytes(text))
     return read_study(path)
+
+
+def matching_recordings(text: str) -> list[tuple[Path, dict[str, Condition]]]:
+    """Recordings that a path or a pattern leads to, with the conditions that are in their paths.
+
+    Raises
+    ------
+    InputError
+        If the pattern is wrong or matches nothing.
+    """
+    return list(itertools.islice(_files(Path("study"), "recording", text), MOST_RECORDINGS))
+
+
+def folder_pattern(folder: Path) -> Path:
+    """A pattern of the recordings in a folder; where there is none, of those in its folders.
+
+    Of several kinds, that of which there are most.
+
+    Raises
+    ------
+    InputError
+        If there is none.
+    """
+    with os_errors_as_input(folder, "folder", "a folder that can be read"):
+        for depth in ("*", "*/*"):
+            names = Counter(
+                f"*{path.suffix}" if depth == "*" else f"*/{path.name}"
+                for path in itertools.islice(folder.glob(depth), MOST_RECORDINGS)
+                if path.suffix.lower() in RECORDING_SUFFIXES
+            )
+            if names:
+                return folder / names.most_common(1)[0][0]
+    raise InputError(folder, "folder", "no recording in it", "a folder with recordings")
 
 
 def _relative(path: Path, folder: Path) -> str:

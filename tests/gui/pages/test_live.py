@@ -382,6 +382,35 @@ def test_large_figures_where_the_set_up_is_complete(
     assert {"Width", "Length", "Height", "mm"} <= {each.text() for each in shown}
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("wanted", [True, False])
+def test_what_was_recorded_is_measured_afterwards(
+    window: MainWindow,
+    page: CapturePage,
+    qtbot: QtBot,
+    monkeypatch: pytest.MonkeyPatch,
+    wanted: bool,
+):
+    with open_source(SAMPLES / "gtaw" / "recording.avi") as video:
+        image = video.frame(0).image
+    window.workspace.attempt(
+        lambda session: session.set_setup((SAMPLES / "gtaw" / "setup.toml").read_text("utf-8"))
+    )
+    film = SimulatedDevice("pool", lambda _: image, rate_hz=100)
+    monkeypatch.setattr(live_view, "pool_camera", lambda *_: film)
+    page.live_view.plan_fields.measured.setChecked(wanted)
+    start(page, qtbot)
+    hand, view, session = Hand(window), page.live_view, window.workspace.session
+    page.setFocus()
+    hand.press(Qt.Key.Key_Space)
+    qtbot.waitUntil(lambda: view.live.running.frames > 10)
+    hand.press(Qt.Key.Key_Space)
+    qtbot.waitUntil(lambda: session.recording is not None)
+    qtbot.waitUntil(lambda: not window.workspace.tasks.active)
+    assert view.is_live
+    assert set(session.overview().status) == ({"ok"} if wanted else {""})
+
+
 def test_space_plays_where_no_camera_is_live(window: MainWindow, copy_sample, qtbot: QtBot):
     window.files.open(copy_sample("gtaw"))
     window.show_step("capture")

@@ -1,9 +1,9 @@
 """Kill a study's workers and the program that runs it, at random moments; nothing may be lost.
 
-``kill.py STUDY KILLS SEED`` runs a study with two processes into a folder beside it. At each of
-the random moments the program (SIGKILL or Ctrl-C) or one of its processes (SIGKILL) is ended. Then
-it is run to its end, and the files of the tasks are held against those of a run that nobody
-disturbed.
+``kill.py STUDY KILLS SEED`` runs a study with two processes into a folder beside it; called with a
+scheduler, on Dask's workers. At each of the random moments the program (SIGKILL or Ctrl-C) or one
+of the processes that measure (SIGKILL) is ended. Then it is run to its end, and the files of the
+tasks are held against those of a run that nobody disturbed.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import subprocess
 import sys
 import time
 from collections import Counter
+from collections.abc import Sequence
 from pathlib import Path
 
 import pandas as pd
@@ -32,9 +33,10 @@ def bytes_of(folder: Path) -> dict[str, str]:
     }
 
 
-def start(study: Path, out: Path) -> subprocess.Popen[bytes]:
+def start(study: Path, out: Path, scheduler: str) -> subprocess.Popen[bytes]:
     """The command, heeding Ctrl-C."""
     given = ["study", "run", str(study), "--out", str(out), "--workers", "2"]
+    given += ["--scheduler", scheduler] if scheduler else []
     return subprocess.Popen(
         [sys.executable, "-c", HEEDING, *given],
         stdout=subprocess.DEVNULL,
@@ -43,8 +45,16 @@ def start(study: Path, out: Path) -> subprocess.Popen[bytes]:
     )
 
 
-def kill_at_random(study: Path, kills: int, seed: int) -> Counter[str]:
+def kill_at_random(
+    study: Path, kills: int, seed: int, scheduler: str = "", nannies: Sequence[int] = ()
+) -> Counter[str]:
     """Run a study, killed so many times; returns how many of which kind.
+
+    Parameters
+    ----------
+    scheduler, nannies
+        Address of a Dask scheduler, and the processes whose children are its workers; without, the
+        program's own processes measure.
 
     Raises
     ------
@@ -56,7 +66,7 @@ def kill_at_random(study: Path, kills: int, seed: int) -> Counter[str]:
     expected = [one.state for one in Study(study, alone).run(2)]
     kinds: Counter[str] = Counter()
     kept: dict[str, str] = {}
-    program = start(study, out)
+    program = start(study, out, scheduler)
     for _ in range(kills):
         count, more = len(bytes_of(out)), draw.choice([0, 0, 1, 1, 2])
         while program.poll() is None and len(bytes_of(out)) < count + more:
@@ -69,7 +79,11 @@ def kill_at_random(study: Path, kills: int, seed: int) -> Counter[str]:
             elif kind == "Ctrl-C":
                 program.send_signal(signal.SIGINT)
             else:
-                workers = psutil.Process(program.pid).children(recursive=True)
+                workers = [
+                    child
+                    for parent in nannies or [program.pid]
+                    for child in psutil.Process(parent).children(recursive=True)
+                ]
                 if workers:
                     workers[draw.randrange(len(workers))].kill()
             kinds[kind] += 1
@@ -79,7 +93,7 @@ def kill_at_random(study: Path, kills: int, seed: int) -> Counter[str]:
         assert kept.items() <= now.items(), "what was done is no longer there"
         kept = now
         if program.poll() is not None:
-            program = start(study, out)
+            program = start(study, out, scheduler)
     program.wait()
     assert [one.state for one in Study(study, out).run(2)] == expected
     assert bytes_of(out) == bytes_of(alone), "results differ from those of an undisturbed run"

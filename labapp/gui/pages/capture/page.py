@@ -24,7 +24,7 @@ from labapp.gui.pages.capture.presenter import (
     recording_facts,
 )
 from labapp.gui.pages.page import Page
-from labapp.gui.shell.steps import Lead, Mark, Offer, State
+from labapp.gui.shell.steps import Lead, Mark, Offer, State, why_not_measurable
 from labapp.gui.tasks import Control, Task
 from labapp.gui.views.picture import PictureView
 from labapp.gui.widgets.buttons import button
@@ -43,6 +43,10 @@ REST_MS = 120
 CAPTURE_SHOWS = "The frames of a video, of images or a stack, or what a camera sees."
 
 KEYPAD = Qt.KeyboardModifier.KeypadModifier
+
+
+def _nothing() -> None:
+    pass
 
 
 class CapturePage(Page):
@@ -168,7 +172,8 @@ class CapturePage(Page):
             self._show_import()
             self.workspace.notified.emit(kept_text(take, why_kept), False)
         else:
-            self._import(take.path, ":", None, False)
+            measured = self.live_view.plan_fields.measured.isChecked()
+            self._import(take.path, ":", None, False, self._measure if measured else _nothing)
 
     def _show_recording(self, recording: Recording | None) -> None:
         self.told_group.setVisible(recording is not None and self.live_view.live is None)
@@ -334,7 +339,7 @@ class CapturePage(Page):
         frames: str,
         rate_hz: float | None,
         embed: bool,
-        then: Callable[[], None] = lambda: None,
+        then: Callable[[], None] = _nothing,
     ) -> None:
         session = self.session
 
@@ -361,6 +366,11 @@ class CapturePage(Page):
         self._importing = self.start_task(f"Importing {path.name}", work, done, kind="Importing")
         self._listed = None  # one of them may be the session's own then
         self._show_import()
+
+    def _measure(self) -> None:
+        """Measure the recording, each frame from the one before, where that can be."""
+        if not why_not_measurable(self.session):
+            self.workspace.measure(warm=True)
 
     def _go_to_dots(self) -> None:
         """Go on to the dots, unless the operator has gone elsewhere."""

@@ -1,0 +1,365 @@
+"""The window of studies: which recordings at the left; progress and results at the right."""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from PySide6.QtCore import QUrl
+from PySide6.QtGui import QCloseEvent, QDesktopServices
+from PySide6.QtWidgets import QAbstractItemView, QCheckBox, QTabWidget, QWidget
+
+from labapp.gui.dialogs import ask_file, ask_folder, ask_save
+from labapp.gui.tasks import Control, Tasks
+from labapp.gui.tools import studying
+from labapp.gui.tools.tool import ToolWindow, progress_of
+from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField, TextField
+from labapp.gui.widgets.labels import show_words, wrapping_label
+from labapp.gui.widgets.layouts import vbox
+from labapp.gui.widgets.path_field import PathField
+from labapp.gui.widgets.sheet import Sheet
+from labapp.gui.widgets.tables import CellTable
+from labapp.run.measurers import measuring_pool
+from labapp.run.study.page import condition_picture, varying_conditions
+from labapp.run.study.plan import StudyRecording, folder_pattern, write_study
+from labapp.run.study.results import require_extra
+from labapp.run.study.status import Progress, RecordingStatus
+from labapp.run.study.study import Study
+from labapp.run.study.summary import StudySummary
+from labapp.simulation.parallel import end_processes, wait_for
+
+if TYPE_CHECKING:
+    from labapp.gui.shell.files import Files
+
+STUDIES = "Studies (*.toml *.csv)"
+
+LOOK_S = 1.0
+"""The list is renewed no more often while the study is run."""
+
+NONE_YET = (
+    "A study is a file that names recordings, each with its set-up and the conditions it was made "
+    "under. Open one, or choose a folder with recordings and press Make the study."
+)
+
+
+class StudyWindow(ToolWindow):
+    """Opens or makes a study, runs it, and shows what came out."""
+
+    key = "study"
+    title = "Study of many recordings"
+
+    def __init__(self, sessions: Files, window: QWidget) -> None:
+        self.study: Study | None = None
+        """The study that is shown; None before one was opened."""
+        self.found: list[RecordingStatus] = []
+        """What is done of each recording."""
+        self.summary: StudySummary | None = None
+        """Its results; None before there are any."""
+        super().__init__(sessions, window)
+        self._sessions = sessions
+        self.looks = Tasks(self)
+        self.looks.failed.connect(lambda _, why: self.say(why, True))
+        self.looks.changed.connect(self._show)
+        self.tasks.changed.connect(self._look_at_end)
+        self._make_form()
+        self._make_results()
+        self.page_button = self.add_button(
+            "Show the summary",
+            "Show tables and plots in the browser (summary.html)",
+            self.show_page,
+        )
+        self.open_button = self.add_button(
+            "Open in a session",
+            "Show the frames and surfaces of the selected recording in the main window",
+            self.open_selected,
+        )
+        self.start_button = self.add_button(
+            "Run", "Measure what is not measured yet; it can be stopped at any moment", self.start
+        )
+        self._show()
+
+    def _make_form(self) -> None:
+        self.form.add_heading("Study")
+        self.add_to_form("Open a study …", "Choose a study file (TOML or CSV)", self.choose)
+        self.form.add_heading("New study")
+        self.recordings = PathField(
+            "Recordings",
+            tooltip="A pattern that their paths fit: {current_a} is a condition, * any other part "
+            "that varies, such as the number of a repetition",
+        )
+        self.setup = PathField("Set-up", tooltip="The setup file of them all (TOML)")
+        self.recordings.edited.connect(lambda _: self._show_matches())
+        self.matches = wrapping_label()
+        self.form.add(self.recordings)
+        self.form.add_wide(self.matches)
+        self.add_to_form("Choose a folder …", "Take all recordings in a folder", self.choose_folder)
+        self.form.add(self.setup)
+        self.add_to_form("Choose a set-up …", "Choose a setup file", self.choose_setup)
+        self.add_to_form(
+            "Make the study …", "Write a study file that lists these recordings", self.choose_new
+        )
+        self.form.add_heading("Run")
+        self.workers = NumberField(
+            "Processes", lowest=1, highest=1024, decimals=0, tooltip="How many recordings at once"
+        )
+        self.workers.set_value(os.cpu_count() or 1)
+        self.scheduler = TextField(
+            "Dask scheduler",
+            tooltip="Address of a Dask scheduler, tcp://HOST:8786, whose workers measure instead; "
+            "empty: this machine",
+        )
+        self.surfaces = QCheckBox("Keep surfaces (Zarr)")
+        self.surfaces.setToolTip(
+            "Write surfaces.zarr, too: what was measured without is measured again"
+        )
+        self.form.add(self.workers)
+        self.form.add(self.scheduler)
+        self.form.add_wide(self.surfaces)
+
+    def _make_results(self) -> None:
+        self.words = wrapping_label(NONE_YET)
+        self.list = CellTable("Recordings of the study")
+        self.means = CellTable("Means of the study")
+        self.outliers = CellTable("Values out of line")
+        self.against = ChoiceField("Against", tooltip="The condition along the plots")
+        self.against.edited.connect(lambda _: self._draw())
+        self.sheet = Sheet("Plots of the study")
+        line = FieldForm()
+        line.add(self.against)
+        plots = QWidget()
+        vbox(line, (self.sheet, 1), of=plots)
+        self.tabs = QTabWidget()
+        for widget, words in (
+            (self.list, "Recordings"),
+            (plots, "Plots"),
+            (self.means, "Means"),
+            (self.outliers, "Out of line"),
+        ):
+            self.tabs.addTab(widget, words)
+        for table in (self.list, self.outliers):
+            table.setSelectionMode(QAbstractItemView.SelectionMode.SingleSelection)
+            table.itemSelectionChanged.connect(self.show_state)
+            table.cellDoubleClicked.connect(lambda *_: self.open_selected())
+        self.tabs.currentChanged.connect(lambda _: self.show_state())
+        self.results.addWidget(self.words)
+        self.results.addWidget(self.tabs, 1)
+
+    # --- which study ---------------------------------------------------------------------------
+
+    def choose(self) -> None:
+        """Ask for a study file."""
+        folder = self._sessions.preferences.current.folder
+        if path := ask_file(self, "Open a study", folder, STUDIES):
+            self.show_study(path)
+
+    def choose_folder(self) -> None:
+        """Ask for a folder with recordings."""
+        if folder := ask_folder(self, "Recordings in", self._sessions.preferences.current.folder):
+            self.take_folder(folder)
+
+    def take_folder(self, folder: Path) -> None:
+        """Propose the recordings in a folder, and a setup file that is beside one of them."""
+        pattern = self.workspace.run_or_report(lambda: folder_pattern(folder))
+        if pattern is None:
+            return
+        self.recordings.set_value(str(pattern))
+        self._show_matches()
+        beside = sorted(pattern.parent.parent.glob(f"{pattern.parent.name}/setup.toml"))
+        if not self.setup.value() and beside:
+            self.setup.set_value(str(beside[0]))
+
+    def _show_matches(self) -> None:
+        show_words(self.matches, studying.matches_text(self.recordings.value().strip()))
+
+    def choose_setup(self) -> None:
+        """Ask for a setup file."""
+        folder = self._sessions.preferences.current.folder
+        if path := ask_file(self, "Choose a set-up", folder, "Setup files (*.toml)"):
+            self.setup.set_value(str(path))
+
+    def choose_new(self) -> None:
+        """Ask where the new study goes, and make it."""
+        for field in (self.recordings, self.setup):
+            field.flush()
+        if not self.recordings.value().strip() or not self.setup.value().strip():
+            self.say("Enter the recordings and their set-up first, or choose them", True)
+            return
+        proposed = Path(self.recordings.value().split("{")[0].split("*")[0]).parent / "study.toml"
+        if path := ask_save(self, "New study", proposed, STUDIES):
+            self.make(path)
+
+    def make(self, path: Path) -> None:
+        """Make the study that the form describes, and open it."""
+        given = [self.recordings.value().strip()], self.setup.value().strip()
+        if self.workspace.run_or_report(lambda: write_study(path, *given)):
+            self.show_study(path)
+
+    def show_study(self, path: Path) -> None:
+        """Open a study."""
+        study = self.workspace.run_or_report(lambda: Study(path))
+        if study is not None:
+            self.study, self.found, self.summary = study, [], None
+            self.say(f"{path}")
+            self._look()
+
+    # --- what is done of it --------------------------------------------------------------------
+
+    def _look(self) -> None:
+        """Read in the background what is done, and put its results together."""
+        self.looks.cancel_all()
+        study, surfaces = self.study, self.surfaces.isChecked()
+        if study is None:
+            return
+
+        def work(control: Control) -> StudySummary | None:
+            found = study.status()
+            control.part(found)
+            if not any(one.frames_done for one in found):
+                return None
+            # In a process: the window would be slow meanwhile, and so would this.
+            pool = measuring_pool(1)
+            try:
+                begun = pool.submit(_results, study.path, study.folder, surfaces)
+                return wait_for(begun, control.check)
+            finally:
+                end_processes(pool)
+
+        self.looks.start("Reading the study", work, self._show_summary, self._show_part)
+
+    def _look_at_end(self) -> None:
+        """Show what is done when a run has ended, however."""
+        if not self.working:
+            self._look()
+
+    def _show_part(self, part: list[RecordingStatus] | str) -> None:
+        """Show what is done, or a sentence."""
+        if isinstance(part, str):
+            self.workspace.notified.emit(part, False)
+            return
+        self.found = part
+        self._show()
+
+    def _show_summary(self, summary: StudySummary | None) -> None:
+        self.summary = summary
+        self._show()
+        if summary is not None:
+            names = varying_conditions(summary)
+            self.against.set_choices([(name, name) for name in names] or [("", "none varies")])
+            self._draw()
+
+    def _show(self) -> None:
+        if self.study is not None:
+            plan = self.study.plan
+            reading = ": reading the results …" * bool(self.looks.active)
+            self.words.setText(f"{studying.state_text(plan, self.found)}{reading}")
+            self.list.show_table(studying.recordings_table(plan, self.found))
+        if self.summary is not None:
+            self.means.show_table(studying.means_table(self.summary))
+            self.outliers.show_table(studying.outliers_table(self.summary))
+        for place in range(1, self.tabs.count()):
+            self.tabs.setTabEnabled(place, self.summary is not None)
+        self.show_state()
+
+    def _draw(self) -> None:
+        summary, condition = self.summary, self.against.value()
+        if summary is not None and summary.groups:
+            self.sheet.show_png(condition_picture(summary, condition), f"Sizes against {condition}")
+
+    def show_page(self) -> None:
+        """Show the summary in the browser."""
+        if self.study is not None:
+            page = self.study.folder / "summary.html"
+            if not QDesktopServices.openUrl(QUrl.fromLocalFile(str(page))):
+                self.say(f"The summary is {page}")
+
+    # --- running -------------------------------------------------------------------------------
+
+    def start(self) -> None:
+        """Run the study in the background."""
+        for field in (self.workers, self.scheduler):
+            field.flush()
+        study = self.study and self.workspace.run_or_report(self._reread)
+        if study is None:
+            return
+        self.study = study
+        self.looks.cancel_all()
+        workers, scheduler = int(self.workers.value() or 1), self.scheduler.value().strip() or None
+        surfaces = self.surfaces.isChecked()
+
+        def work(control: Control) -> None:
+            require_extra()
+            looked_s = took_s = 0.0
+
+            def progress(now: Progress) -> None:
+                nonlocal looked_s, took_s
+                words = f"{now.recordings_done} of {now.recordings} recordings"
+                control.progress(now.frames_done, now.frames, words)
+                begun_s = time.monotonic()
+                if begun_s - looked_s > max(LOOK_S, 20 * took_s):
+                    control.part(study.status(surfaces=surfaces))
+                    looked_s = time.monotonic()
+                    took_s = looked_s - begun_s
+
+            study.run(workers, scheduler, surfaces=surfaces, progress=progress, note=control.part)
+
+        self.begin(
+            f"Measuring {study.plan.title}", work, lambda _: self.say("Done"), self._show_part
+        )
+
+    def _reread(self) -> Study:
+        """The study as its file is now."""
+        assert self.study is not None
+        return Study(self.study.path)
+
+    # --- one recording -------------------------------------------------------------------------
+
+    def selected(self) -> tuple[StudyRecording, int | None] | None:
+        """The recording that is selected, and the frame, in the table in view; None without one."""
+        table = self.outliers if self.tabs.currentWidget() is self.outliers else self.list
+        row = table.currentRow()
+        if not table.isVisible() or not table.selectedItems() or table.table is None:
+            return None
+        cells = table.table.rows[row]
+        name, frame = str(cells[0]), str(cells[1]) if table is self.outliers else ""
+        for one in self.found:
+            if one.recording.name == name and one.frames:
+                return one.recording, int(frame) if frame.isdecimal() else None
+        return None
+
+    def open_selected(self) -> None:
+        """Make a session of the selected recording, measured as here, and open it at the frame."""
+        chosen, study = self.selected(), self.study
+        if chosen is None or study is None or self.working:
+            return
+        recording, frame = chosen
+
+        def work(control: Control) -> Path:
+            return studying.begin_session(study.folder, recording, progress_of(control))
+
+        def opened(path: Path) -> None:
+            if self._sessions.open(path):
+                if frame is not None:
+                    self.workspace.show_frame(frame)
+                self.workspace.action_requested.emit("step_surface")
+                self.say(f"{recording.name} is open in the main window")
+
+        self.begin(f"Opening {recording.name}", work, opened)
+
+    def closeEvent(self, event: QCloseEvent) -> None:
+        """Stop reading, too."""
+        self.looks.cancel_all()
+        super().closeEvent(event)
+
+    def show_state(self) -> None:
+        """Enable what is of use now."""
+        if hasattr(self, "start_button"):
+            self.start_button.setEnabled(self.study is not None and not self.working)
+            self.open_button.setEnabled(self.selected() is not None and not self.working)
+            self.page_button.setEnabled(self.summary is not None)
+
+
+def _results(path: Path, folder: Path, surfaces: bool) -> StudySummary:
+    """Put the results of a study together and write them, in another process."""
+    return Study(path, folder).results(surfaces=surfaces)

@@ -1,0 +1,163 @@
+"""What the window of studies shows of one, and the session of one of its recordings: without Qt."""
+
+from __future__ import annotations
+
+import contextlib
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import fields
+from pathlib import Path
+
+from labapp.core.surface.measures import SIZES
+from labapp.errors import InputError
+from labapp.run.study.page import WORDS, rounded
+from labapp.run.study.plan import StudyPlan, StudyRecording, matching_recordings, shown_condition
+from labapp.run.study.status import RecordingStatus, State
+from labapp.run.study.summary import StudySummary
+from labapp.session.file.database import SUFFIX
+from labapp.session.record import Record
+from labapp.session.session import Session
+from labapp.simulation.parallel import Progress
+from labapp.studies.tables import Table
+from labapp.text import pluralize
+
+SIGNS: dict[State, str] = {
+    "done": "✓ done",
+    "part": "◐ in part",
+    "waiting": "○ waiting",
+    "failed": "▲ failed",
+}
+
+
+def recordings_table(plan: StudyPlan, found: Sequence[RecordingStatus]) -> Table:
+    """A row a recording: conditions, state, progress, and why it failed."""
+    rows = tuple(
+        (
+            one.recording.name,
+            *(shown_condition(one.recording.conditions.get(name)) for name in plan.conditions),
+            SIGNS[one.state],
+            f"{one.frames_done} of {one.frames}" if one.frames else "",
+            one.problem,
+        )
+        for one in found
+    )
+    columns = ("Recording", *plan.conditions, "State", "Frames", "Why not")
+    return Table("recordings", "Recordings of the study", columns, rows)
+
+
+def means_table(summary: StudySummary) -> Table:
+    """A row a group of recordings with the same conditions: mean of each size and its ±."""
+    rows = tuple(
+        (
+            *(shown_condition(one.conditions.get(name)) for name in summary.conditions),
+            str(len(one.recordings)),
+            str(one.frames),
+            *(rounded(one.means[size].mean, one.means[size].sigma) for size in SIZES),
+        )
+        for one in summary.groups
+    )
+    columns = (*summary.conditions, "Recordings", "Frames", *SIZES)
+    return Table("summary", "Means of each condition, with ±", columns, rows)
+
+
+def outliers_table(summary: StudySummary) -> Table:
+    """A row a frame, or a recording, that is far from the others."""
+    rows = tuple(
+        (
+            one.recording,
+            "all" if one.frame is None else str(one.frame),
+            "{}, {}".format(*WORDS[one.measure]),
+            f"{one.value:.4g}",
+            f"{one.usual:.4g}",
+            f"{one.times:.1f}",
+        )
+        for one in summary.outliers
+    )
+    columns = ("Recording", "Frame", "Measure", "Value", "Usual", "Standard deviations off")
+    return Table("outliers", "Frames and recordings far from the others", columns, rows)
+
+
+def state_text(plan: StudyPlan, found: Sequence[RecordingStatus]) -> str:
+    """Title of a study and how many of its recordings are in each state."""
+    states = Counter(one.state for one in found)
+    counts = ", ".join(
+        f"{states[state]} {words.split(' ', 1)[1]}"
+        for state, words in SIGNS.items()
+        if states[state]
+    )
+    return f"{plan.title}: {pluralize(len(found), 'recording')}, {counts}"
+
+
+def matches_text(pattern: str) -> str:
+    """How many recordings a pattern fits, and which conditions are in their paths."""
+    if not pattern:
+        return ""
+    try:
+        found = matching_recordings(pattern)
+    except InputError as error:
+        return f"⚠ {error.expected}"
+    count = pluralize(len(found), "recording")
+    names = ", ".join(dict.fromkeys(name for _, varied in found for name in varied))
+    if names:
+        return f"{count}; conditions: {names}"
+    return f"{count} without conditions: write {{name}} for the part of the path that tells one"
+
+
+def session_path(folder: Path, recording: StudyRecording) -> Path:
+    """The session of one of a study's recordings, in the folder of the results."""
+    return folder / "sessions" / f"{recording.name}{SUFFIX}"
+
+
+def begin_session(folder: Path, recording: StudyRecording, progress: Progress) -> Path:
+    """Make a session of a recording of a study, measured as in the study, unless it is there.
+
+    Parameters
+    ----------
+    folder
+        Of the study's results.
+    progress
+        Called with what is done, and frames done and in all; may raise to stop. No session is left
+        then while the recording is imported; later, what was measured is.
+
+    Raises
+    ------
+    InputError
+        If the recording or its setup file cannot be read, or the session cannot be written.
+    """
+    from labapp.config.setup import read_setup
+
+    path = session_path(folder, recording)
+    if path.exists():
+        return path
+    text = read_setup(recording.setup, lines=True).text
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with contextlib.ExitStack() as on_failure:
+        session = Session.create(path, _record(recording))
+        on_failure.callback(path.unlink)
+        on_failure.callback(session.close)
+        session.set_setup(text)
+        session.set_settings(recording.settings)
+        session.import_recording(
+            recording.path,
+            recording.frames,
+            progress=lambda done, total: progress("importing", done, total),
+        )
+        on_failure.pop_all()
+    with session:
+        total = len(session.frames)
+        for done, _ in enumerate(session.measure_each(warm=recording.warm), 1):
+            progress("measuring", done, total)
+    return path
+
+
+def _record(recording: StudyRecording) -> Record:
+    """What a session notes of a recording: conditions that it has a field for, others in words."""
+    kinds = {each.name: str(each.type) for each in fields(Record)}
+    known, others = {}, []
+    for name, value in recording.conditions.items():
+        wanted = "str" if isinstance(value, str) else "float | None"
+        if kinds.get(name) == wanted and name not in ("title", "notes"):
+            known[name] = value
+        else:
+            others.append(f"{name} = {shown_condition(value)}")
+    return Record(title=recording.name, notes="\n".join(others), **known)  # type: ignore[arg-type]

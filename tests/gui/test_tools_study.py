@@ -1,0 +1,126 @@
+"""The window of studies: made from a folder, run, stopped, looked at, a recording opened."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+from PySide6.QtCore import Qt
+from PySide6.QtTest import QTest
+from PySide6.QtWidgets import QPushButton
+from pytestqt.qtbot import QtBot
+
+from labapp.config.scenario import read_scenario
+from labapp.gui.shell.window import MainWindow
+from labapp.gui.tools.study import StudyWindow
+from labapp.simulated.benchmark import SCENARIO
+from labapp.simulated.simulate import simulate
+from tests.waiting import PATIENCE_S
+
+pytestmark = pytest.mark.slow
+
+PATIENCE_MS = round(1000 * PATIENCE_S)
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("simulated")
+    (folder / "scenario.toml").write_text(SCENARIO.format(frames=3), "utf-8")
+    simulate(read_scenario(folder / "scenario.toml"), folder / "made", workers=1)
+    return folder / "made"
+
+
+@pytest.fixture
+def recordings(simulated: Path, tmp_path: Path) -> Path:
+    """Two recordings under different currents, and one that is none."""
+    folder = tmp_path / "runs"
+    for current in (80, 100):
+        shutil.copytree(simulated, folder / f"I{current}_1")
+    (folder / "I120_1").mkdir()
+    (folder / "I120_1" / "recording.avi").write_bytes(b"RIFF no video at all" * 20)
+    return folder
+
+
+@pytest.fixture
+def study(window: MainWindow, qtbot: QtBot) -> StudyWindow:
+    window.do("study")
+    tool = window.findChild(StudyWindow)
+    assert tool is not None
+    qtbot.waitUntil(tool.isVisible)
+    return tool
+
+
+def click(button: QPushButton) -> None:
+    QTest.mouseClick(button, Qt.MouseButton.LeftButton)
+
+
+def is_idle(tool: StudyWindow) -> bool:
+    return not tool.working and not tool.looks.active
+
+
+def make(tool: StudyWindow, recordings: Path, qtbot: QtBot) -> None:
+    tool.take_folder(recordings)
+    assert Path(tool.setup.value()).name == "setup.toml"
+    tool.recordings.set_value(str(recordings / "I{current_a}_*" / "recording.avi"))
+    tool.make(recordings / "study.toml")
+    qtbot.waitUntil(lambda: len(tool.found) == 3 and is_idle(tool), timeout=PATIENCE_MS)
+
+
+def states(tool: StudyWindow) -> dict[str, str]:
+    return {one.recording.name: one.state for one in tool.found}
+
+
+def test_a_study_is_made_run_and_a_recording_of_it_opened(
+    study: StudyWindow, recordings: Path, qtbot: QtBot
+):
+    assert not study.start_button.isEnabled()
+    make(study, recordings, qtbot)
+    assert set(states(study).values()) == {"waiting"}
+    assert not study.tabs.isTabEnabled(1)
+    study.workers.set_value(1)
+    click(study.start_button)
+    assert study.working
+    qtbot.waitUntil(lambda: is_idle(study) and study.summary is not None, timeout=4 * PATIENCE_MS)
+    assert states(study) == {"I80_1": "done", "I100_1": "done", "I120_1": "failed"}
+    assert [study.means.table.rows[k][0] for k in range(2)] == ["80", "100"]
+    assert (study.study.folder / "measures.parquet" / "I80_1.parquet").exists()
+    row = next(k for k, cells in enumerate(study.list.table.rows) if cells[0] == "I120_1")
+    assert study.list.table.rows[row][-1]
+    study.list.selectRow(row)
+    assert not study.open_button.isEnabled()
+    study.list.selectRow(next(k for k in range(3) if study.list.table.rows[k][0] == "I100_1"))
+    click(study.open_button)
+    workspace = study.workspace
+    qtbot.waitUntil(
+        lambda: workspace.session is not None and is_idle(study), timeout=4 * PATIENCE_MS
+    )
+    assert workspace.session.record.current_a == 100
+    seen = workspace.session.overview()
+    assert list(seen.status) == ["ok"] * 3
+
+
+def test_a_stopped_run_keeps_what_is_done(study: StudyWindow, recordings: Path, qtbot: QtBot):
+    make(study, recordings, qtbot)
+    study.workers.set_value(1)
+    click(study.start_button)
+    folder = study.study.folder / "recordings"
+    qtbot.waitUntil(lambda: any(folder.glob("*.json")), timeout=PATIENCE_MS)
+    click(study.cancel_button)
+    qtbot.waitUntil(lambda: is_idle(study), timeout=PATIENCE_MS)
+    assert study.message.text() == "Stopped"
+    assert study.start_button.isEnabled()
+    assert any(folder.glob("*.json"))
+    assert "failed" not in [states(study)[name] for name in ("I80_1", "I100_1")]
+
+
+def test_what_is_no_study_is_refused(study: StudyWindow, tmp_path: Path):
+    (tmp_path / "wrong.toml").write_text("recordings = 1\n", "utf-8")
+    study.show_study(tmp_path / "wrong.toml")
+    assert study.study is None
+    assert "recordings" in study.message.text()
+    study.take_folder(tmp_path)
+    assert not study.recordings.value()
+    study.recordings.set_value(str(tmp_path / "none_*.avi"))
+    study._show_matches()
+    assert study.matches.text().startswith("⚠")
