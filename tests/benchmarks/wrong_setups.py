@@ -1,24 +1,26 @@
-"""Seven wrong set-ups, before and after a check against a plate and a thumb tack.
+"""Seven wrong set-ups, before and after a check against known mirrors.
 
-Run as ``python -m tests.benchmarks.wrong_setups [--seeds N] [NAME …]``. The bench stands as the
-set-up of `bench_check` has it but for one thing, and a pool of the usual size is measured on it:
-with the set-up as entered, and with the adjusted one. Where the check names quantities, the
-likeliest is freed and the check repeated, as an operator would.
+Run as ``python -m tests.benchmarks.wrong_setups [--seeds N] [--pictures N] [NAME …]``. The bench
+stands as the set-up of `bench_check` has it but for one thing. Pools are measured on it with the
+set-up as entered, with the adjusted one and with the true one, which shows what is no error of the
+set-up. Where the check names quantities, the likeliest is freed and the check repeated, as an
+operator would.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
 from labapp.core.bench_check.check import BenchCheck, check_bench
 from labapp.core.bench_check.labelling import Picture
-from labapp.core.bench_check.mirrors import Cap, Plate
+from labapp.core.bench_check.mirrors import Cap, Mirror, Plate
+from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.rig import ImagingPlane, Rig
-from labapp.core.values import CannotMeasure
+from labapp.core.values import CannotMeasure, FloatArray
 from labapp.simulation.benches import SimulatedBench
 from labapp.simulation.camera import CameraView
 from labapp.simulation.pools import spherical_cap
@@ -33,8 +35,8 @@ from tests.benchmarks.bench_check import (
     surface_like,
 )
 
-POOL = spherical_cap(6.7, 0.3)
-MIRRORS = (Plate(), Cap(9.75, 0.91))
+POOLS = tuple(spherical_cap(*size) for size in ((6.7, 0.3), (6.2, 0.2), (7.1, 0.3), (6.5, 0.25)))
+MIRRORS = (Plate(), Cap(9.75, 0.91), Plate(2.0))
 
 
 def _laser(**off: float) -> SimulatedBench:
@@ -77,24 +79,37 @@ WRONG: Mapping[str, Callable[[], SimulatedBench]] = {
 """How the bench truly stands; the set-up is `RIG` and `CALIBRATION` in all."""
 
 
-def height(bench: SimulatedBench, check: BenchCheck | None, seed: int) -> str:
-    """Error of the pool's height and its ±, in % of the height, and the status of the set-up."""
-    rig: Rig = RIG if check is None else check.rig
-    calibration = CALIBRATION if check is None else check.calibration
-    true, known = POOL.peak_mm, rig.uncertainty
-    assert known is not None
-    found, sigma = measured(POOL, bench, rig, calibration, [seed, 1])
-    if not np.isfinite(found):
-        return f"{'no surface':>15} {known.status:10}"
-    return f"{100 * (found / true - 1):+6.1f} ± {100 * sigma / true:4.1f} % {known.status:10}"
+def true_setup(bench: SimulatedBench) -> tuple[Rig, ImageCalibration]:
+    """The set-up that is right."""
+    view = bench.view
+    points = view.origin_px, view.x_axis_px, view.x_axis_mm, view.z_axis_px, view.z_axis_mm
+    return bench.rig, ImageCalibration.from_three_points(*points)
 
 
-def checked(bench: SimulatedBench, seed: int) -> tuple[BenchCheck | None, str]:
+def errors(bench: SimulatedBench, rig: Rig, calibration: ImageCalibration, seed: int) -> FloatArray:
+    """Error of each pool's height, and its ±, in % of the height, shape (pools, 2)."""
+    found = [measured(one, bench, rig, calibration, [seed, 1]) for one in POOLS]
+    true = np.array([one.peak_mm for one in POOLS])
+    return 100 * (np.array(found) - np.outer(true, [1.0, 0.0])) / true[:, None]
+
+
+def told(made: FloatArray) -> str:
+    """Mean of the errors, the largest, and the ± of one."""
+    made = made[np.isfinite(made[:, 0])]
+    if not len(made):
+        return f"{'no surface':>19}"
+    (mean, sigma), worst = made.mean(axis=0), max(made[:, 0].tolist(), key=abs)
+    return f"{mean:+6.2f} {worst:+6.1f} ± {sigma:4.1f}"
+
+
+def checked(
+    bench: SimulatedBench, mirrors: Sequence[Mirror], seed: int
+) -> tuple[BenchCheck | None, str]:
     """The check that the operator ends with, if any, and what was named on the way."""
     rng = np.random.default_rng([18, seed])
     pictures = [
         Picture(m.name, m, dots_at(seen(surface_like(m, rng), bench, rng)[0]), SHAPE)
-        for m in MIRRORS
+        for m in mirrors
     ]
     try:
         check = check_bench(pictures, RIG, CALIBRATION)
@@ -112,17 +127,23 @@ def main() -> None:
     """Run it and print a line for each set-up and seed."""
     ask = argparse.ArgumentParser()
     ask.add_argument("--seeds", type=int, default=2)
+    ask.add_argument("--pictures", type=int, default=len(MIRRORS))
     ask.add_argument("names", nargs="*", default=list(WRONG))
     given = ask.parse_args()
-    print(f"{'wrong in the set-up':24} seed {'before':26} {'after':26} check")
+    mirrors = MIRRORS[: given.pictures]
+    print(f"{len(POOLS)} pools, height %: mean and largest error, ± of one; mirrors:")
+    print(", ".join(one.name for one in mirrors))
+    print(f"{'wrong in the set-up':23} seed {'entered':19}  {'checked':19}  {'true':19}  check")
     for name in given.names:
         for seed in range(given.seeds):
             bench = WRONG[name]()
-            check, said = checked(bench, seed)
-            after = "refused" if check is None else height(bench, check, seed)
-            print(
-                f"{name:24} {seed:4} {height(bench, None, seed):26} {after:26} {said}", flush=True
-            )
+            check, said = checked(bench, mirrors, seed)
+            before = told(errors(bench, RIG, CALIBRATION, seed))
+            after = f"{'refused':>19}"
+            if check is not None:
+                after = told(errors(bench, check.rig, check.calibration, seed))
+            true = told(errors(bench, *true_setup(bench), seed))
+            print(f"{name:23} {seed:4} {before}  {after}  {true}  {said}", flush=True)
 
 
 if __name__ == "__main__":

@@ -9,17 +9,17 @@ variance 1, and a quantity that is known exactly has none.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
-import scipy
 
 from labapp.core.bench_check.mirrors import Mirror, landing_points
 from labapp.core.geometry.optics import intersect_level, ray_directions
-from labapp.core.geometry.perturbation import moved_dots, moved_rig
+from labapp.core.geometry.perturbation import OF_PICTURE, moved_dots, moved_rig
 from labapp.core.geometry.rig import Rig
-from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
+from labapp.core.geometry.uncertainty import QUANTITIES
+from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 
 FLOOR_MM = 0.02
 """Added to the standard uncertainty of every dot on the plane, in squares: what rays depart from
@@ -28,14 +28,17 @@ the lens's ideal pattern, and the mirror from its ideal shape."""
 ROBUST = 3.0
 """Residuals beyond this many standard uncertainties count less than by their squares (soft L1)."""
 
-STEP = 1e-3
-"""Of the central differences, in prior standard uncertainties: their error is of its square."""
+STEP = 1e-4
+"""Of the differences that derivatives are taken by, in usual standard uncertainties."""
 
 ROUNDS, FEW_STEPS, MOST_STEPS = 12, 3, 40
 """Of tightening the robust loss; steps in each of them, and in the last."""
 
 SETTLED = 0.95
 """A scale of the residuals has settled that shrinks by no more than to this share."""
+
+DAMPING, MOST_DAMPED, CONVERGED = 1e-4, 1e6, 1e-5
+"""Of the steps: damping at first and at most; converged where the cost falls by a smaller share."""
 
 PLACES = 9
 """Along X and Y, where a mirror whose place is free may be at first."""
@@ -205,50 +208,80 @@ class System:
         mirror = self.sightings[k].mirror
         return np.asarray(mirror.pose + mirror.sigma * unknown)
 
-    def residual_mm(self, k: int, bench: FloatArray, pose: FloatArray) -> FloatArray:
-        """Observed minus computed dots of a sighting, shape (n, 2), mm."""
-        known, one = self.rig.uncertainty, self.sightings[k]
-        assert known is not None
-        offset = self.factor @ bench
-        rig, shape = moved_rig(self.rig, offset), self.pose(k, pose)
-        computed, _ = landing_points(one.mirror, shape, rig, tuple(one.ray.T))
-        observed = moved_dots(one.plane_mm, self.rig, known.axes, offset)
-        return np.asarray(observed - computed)
-
-    def standardised(self, k: int, bench: FloatArray, pose: FloatArray) -> FloatArray:
-        """The same over their standard uncertainties, shape (2n,).
+    def pictured(self, k: int, offset: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """A sighting's dots on a plane whose picture is off, and what standardises residuals there.
 
         The dots' noise is that of the picture: it does not shrink on a plane of another scale.
-        """
-        scale = np.linalg.inv(self._enlargement(k, bench))
-        residual = scale @ self.residual_mm(k, bench, pose)[..., None]
-        residual = (self.roots[k] @ residual)[..., 0]
-        return np.where(np.isfinite(residual), residual, LOST).ravel()
 
-    def _enlargement(self, k: int, bench: FloatArray) -> FloatArray:
-        """Derivatives of observed dots by what they were before the check, shape (n, 2, 2)."""
+        Returns
+        -------
+        plane_mm, root
+            Shape (n, 2), mm; matrices that make residuals of unit variance, shape (n, 2, 2).
+        """
         known, seen = self.rig.uncertainty, self.sightings[k].plane_mm
         assert known is not None
-        offset = self.factor @ bench
         places = np.concatenate([seen, *(seen + step for step in np.eye(2))])
         moved = moved_dots(places, self.rig, known.axes, offset).reshape(3, -1, 2)
-        return np.stack([moved[1] - moved[0], moved[2] - moved[0]], axis=-1)
+        enlargement = np.stack([moved[1] - moved[0], moved[2] - moved[0]], axis=-1)
+        return moved[0], self.roots[k] @ np.linalg.inv(enlargement)
+
+    def computed(self, k: int, offset: FloatArray, pose: FloatArray) -> FloatArray:
+        """Where a bench that is off has the dots of a sighting, shape (n, 2), mm."""
+        one = self.sightings[k]
+        rig = moved_rig(self.rig, offset)
+        return landing_points(one.mirror, self.pose(k, pose), rig, tuple(one.ray.T))[0]
+
+    def residual_mm(self, k: int, bench: FloatArray, pose: FloatArray) -> FloatArray:
+        """Observed minus computed dots of a sighting, shape (n, 2), mm."""
+        offset = self.factor @ bench
+        return np.asarray(self.pictured(k, offset)[0] - self.computed(k, offset, pose))
 
     def residuals(self, unknown: FloatArray) -> FloatArray:
         """Standardised residuals of all sightings, shape (m,)."""
         bench, *poses = (unknown[part] for part in self.parts)
         return np.concatenate([self.standardised(k, bench, pose) for k, pose in enumerate(poses)])
 
+    def standardised(self, k: int, bench: FloatArray, pose: FloatArray) -> FloatArray:
+        """Residuals of a sighting over their standard uncertainties, shape (2n,)."""
+        offset = self.factor @ bench
+        return _standardised(*self.pictured(k, offset), self.computed(k, offset, pose))
+
     def jacobian(self, unknown: FloatArray) -> FloatArray:
         """Their derivatives, shape (m, p): a pose moves the dots of its own mirror alone."""
         bench, *poses = (unknown[part] for part in self.parts)
-        made, row = np.zeros((2 * sum(len(s.ray) for s in self.sightings), self.size)), 0
+        offset, used = self.factor @ bench, self.factor.any(axis=1)
+        made = np.zeros((2 * sum(len(s.ray) for s in self.sightings), self.size))
         for k, (pose, part) in enumerate(zip(poses, self.parts[1:], strict=True)):
-            rows = slice(row, row := row + 2 * len(self.sightings[k].ray))
-            both = partial(self.standardised, k)
-            made[rows, self.parts[0]] = _slopes(partial(_first, both, pose), bench)
-            made[rows, part] = _slopes(partial(both, bench), pose)
+            rows = self._rows(k)
+            made[rows, self.parts[0]] = self.by_quantities(k, offset, pose, used) @ self.factor
+            pictured = self.pictured(k, offset)
+            made[rows, part] = _slopes(
+                lambda x, k=k, at=pictured: _standardised(*at, self.computed(k, offset, x)), pose
+            )
         return made
+
+    def by_quantities(
+        self, k: int, offset: FloatArray, pose: FloatArray, used: BoolArray
+    ) -> FloatArray:
+        """Derivatives of a sighting's residuals by some quantities, shape (2n, q), the others' 0.
+
+        Quantities of the picture move the observed dots, all others the computed ones.
+        """
+        pictured, computed = self.pictured(k, offset), self.computed(k, offset, pose)
+        still = _standardised(*pictured, computed)
+        made = np.zeros((len(still), len(QUANTITIES)))
+        for q in np.flatnonzero(used):
+            moved = offset.copy()
+            moved[q] += (step := STEP * QUANTITIES[q].assumed)
+            dots = self.pictured(k, moved) if OF_PICTURE[q] else pictured
+            landed = computed if OF_PICTURE[q] else self.computed(k, moved, pose)
+            made[:, q] = (_standardised(*dots, landed) - still) / step
+        return made
+
+    def _rows(self, k: int) -> slice:
+        """Of all residuals: those of a sighting."""
+        first = 2 * sum(len(s.ray) for s in self.sightings[:k])
+        return slice(first, first + 2 * len(self.sightings[k].ray))
 
     def solved_from(self, unknown: FloatArray) -> Adjustment:
         """The adjustment that unknowns lead to."""
@@ -277,49 +310,47 @@ class System:
         unknown = np.insert(made.unknown, self.parts[0].stop - extra, np.zeros(extra))
         return self.adjustment(self.minimised(unknown, made.scale, MOST_STEPS), made.scale)
 
-    def by_bench(self, made: Adjustment, directions: FloatArray) -> FloatArray:
-        """Derivatives of the residuals by directions of the bench's quantities, shape (m, k)."""
-        wide = replace(self, factor=np.eye(len(made.offset)))
-        rows = []
-        for k, pose in enumerate(made.poses):
-            mirror = self.sightings[k].mirror
-            still = k, (pose - mirror.pose) / mirror.sigma
-
-            def along(x: FloatArray, at: tuple[int, FloatArray] = still) -> FloatArray:
-                return wide.standardised(at[0], made.offset + directions @ x, at[1])
-
-            rows.append(_slopes(along, np.zeros(directions.shape[1])))
-        return np.concatenate(rows)
+    def by_bench(self, made: Adjustment) -> FloatArray:
+        """Derivatives of the residuals by all quantities of the bench, shape (m, q)."""
+        every = np.ones(len(made.offset), bool)
+        unknown = (made.unknown[part] for part in self.parts[1:])
+        return np.concatenate(
+            [self.by_quantities(k, made.offset, pose, every) for k, pose in enumerate(unknown)]
+        )
 
     def by_dots(self, k: int, change_mm: FloatArray) -> FloatArray:
         """What changes of a sighting's residuals, shape (n, 2, c), mm, are to all, shape (m, c)."""
         made = np.zeros((2 * sum(len(s.ray) for s in self.sightings), change_mm.shape[2]))
-        first = 2 * sum(len(s.ray) for s in self.sightings[:k])
         own = np.einsum("nij,njc->nic", self.roots[k], change_mm)
-        own = np.where(np.isfinite(own), own, 0.0).reshape(-1, change_mm.shape[2])
-        made[first : first + len(own)] = own
+        made[self._rows(k)] = np.where(np.isfinite(own), own, 0.0).reshape(-1, change_mm.shape[2])
         return made
 
     def minimised(self, unknown: FloatArray, scale: float, steps: int) -> FloatArray:
-        """Unknowns of least cost, with the dots' standard uncertainties times a scale."""
-        data = 2 * sum(len(s.ray) for s in self.sightings)
-        eye = np.eye(self.size)
+        """Unknowns of least cost, with the dots' standard uncertainties times a scale.
 
-        def loss(square: FloatArray) -> FloatArray:
-            made = np.stack([square, np.ones_like(square), np.zeros_like(square)])
-            made[:, :data] = soft_l1(square[:data])
-            return made
-
-        found = scipy.optimize.least_squares(
-            lambda x: np.append(self.residuals(x) / scale, x),
-            unknown,
-            jac=lambda x: np.vstack([self.jacobian(x) / scale, eye]),
-            loss=loss,
-            xtol=1e-4,
-            ftol=1e-5,
-            max_nfev=steps,
-        )
-        return np.asarray(found.x)
+        By Levenberg and Marquardt's method, on the normal equations: the prior keeps them regular.
+        """
+        residual = self.residuals(unknown) / scale
+        cost, damping = _cost(residual, unknown), DAMPING
+        for _ in range(steps):
+            jacobian = self.jacobian(unknown) / scale
+            weight = soft_l1(residual**2)[1]
+            slope = jacobian.T @ (weight * residual) + unknown
+            # Second derivatives of the loss, not its weights alone: ρ′ + 2ρ″r² = ρ′³.
+            normal = jacobian.T @ (weight[:, None] ** 3 * jacobian) + np.eye(self.size)
+            while True:
+                step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), slope)
+                tried = self.residuals(unknown + step) / scale
+                fall = cost - _cost(tried, unknown + step)
+                if fall > 0 or damping > MOST_DAMPED:
+                    break
+                damping *= 10
+            if fall <= 0:
+                break
+            unknown, residual, cost, damping = unknown + step, tried, cost - fall, damping / 10
+            if fall < CONVERGED * cost:
+                break
+        return unknown
 
     def adjustment(self, unknown: FloatArray, scale: float) -> Adjustment:
         """The result, with the covariances that follow from the normal equations."""
@@ -348,10 +379,14 @@ class System:
         )
 
 
-def _first(
-    function: Callable[[FloatArray, FloatArray], FloatArray], second: FloatArray, first: FloatArray
-) -> FloatArray:
-    return function(first, second)
+def _standardised(plane_mm: FloatArray, root: FloatArray, computed_mm: FloatArray) -> FloatArray:
+    """Residuals over their standard uncertainties, shape (2n,)."""
+    made = (root @ (plane_mm - computed_mm)[..., None])[..., 0]
+    return np.where(np.isfinite(made), made, LOST).ravel()
+
+
+def _cost(residual: FloatArray, unknown: FloatArray) -> float:
+    return float(soft_l1(residual**2)[0].sum() + unknown @ unknown)
 
 
 def soft_l1(square: FloatArray) -> FloatArray:
@@ -366,10 +401,10 @@ def _spread(standardised: FloatArray) -> float:
 
 
 def _slopes(function: Callable[[FloatArray], FloatArray], at: FloatArray) -> FloatArray:
-    """Derivatives, shape (m, p), by central differences."""
-    steps = STEP * np.eye(len(at))
-    columns = [(function(at + step) - function(at - step)) / (2 * STEP) for step in steps]
-    return np.stack(columns, axis=1) if columns else np.zeros((len(function(at)), 0))
+    """Derivatives, shape (m, p)."""
+    still = function(at)
+    columns = [(function(at + step) - still) / STEP for step in STEP * np.eye(len(at))]
+    return np.stack(columns, axis=1)
 
 
 def _places(sighting: Sighting, rig: Rig) -> list[FloatArray]:

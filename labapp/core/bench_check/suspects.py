@@ -99,9 +99,8 @@ def find_suspects(
     """
     every = {one.key: one for one in directions(rig)}
     system = System.of(rig, sightings, already)
-    first = {
-        key: made.drop(system.by_bench(made, _free(one)[:, None]))[0] for key, one in every.items()
-    }
+    by_bench = system.by_bench(made)
+    first = {key: made.drop(by_bench @ _free(one)[:, None])[0] for key, one in every.items()}
     most = max(first.values())
     if most < LIMIT:
         return ()

@@ -24,6 +24,10 @@ _AXES = [INDEX[f"image_calibration.{axis}_axis_mm"] for axis in "xz"]
 _DISTORTION = INDEX["camera_lens.distortion_percent"]
 _PICTURE = [*_POINTS, *_AXES, _DISTORTION]
 
+OF_PICTURE = np.isin(np.arange(len(INDEX)), _PICTURE)
+"""Which quantities are the picture's: they move the dots that are seen, see `moved_dots`; the
+others, the rig's, move those that are computed."""
+
 
 @dataclass(frozen=True)
 class Direction(ReadOnlyArrays):
