@@ -15,7 +15,7 @@ from labapp.core.schemes import fit
 from labapp.core.surface.boundary_trace import trace_boundary
 from labapp.core.surface.measures import SIZES, measure_surface
 from labapp.core.surface.pool_fit import FitSettings
-from labapp.core.surface.setup_uncertainty import setup_changes
+from labapp.core.surface.setup_uncertainty import residual_changes, setup_changes
 from labapp.core.surface.sizes import sizes_and_gradients
 from labapp.core.values import FloatArray
 from labapp.simulation.forward import exact_match, trace
@@ -76,3 +76,23 @@ def test_a_bench_that_is_known_exactly_changes_nothing() -> None:
     rig, pool = replace(RIG, uncertainty=None), fit.solve(MATCH, RIG, SETTINGS)
     gradient = np.ones((6, len(pool.surface.coefficients)))
     assert setup_changes(MATCH, rig, SETTINGS, pool, gradient).shape == (6, 0)
+
+
+@pytest.mark.parametrize("key", ["laser.azimuth_deg", "pattern.rotation_deg", "imaging_plane.s_mm"])
+def test_residuals_change_as_those_of_fits_on_benches_that_are_off(key: str) -> None:
+    """These quantities leave most of what no surface absorbs."""
+    assert RIG.uncertainty is not None
+    offset = 0.1 * RIG.uncertainty.root[:, INDEX[key]]
+    dots = MATCH.plane_mm, MATCH.plane_covariance_mm2
+    pool = fit.solve(MATCH, RIG, SETTINGS)
+    change = residual_changes(MATCH.ray, *dots, RIG, SETTINGS, pool)[..., INDEX[key]]
+    more, less = (
+        fit.solve(
+            replace(MATCH, plane_mm=moved_dots(dots[0], RIG, RIG.uncertainty.axes, off)),
+            moved_rig(RIG, off),
+            SETTINGS,
+        )
+        for off in (offset, -offset)
+    )
+    wanted = (more.residual_mm - less.residual_mm) / 0.2
+    assert np.linalg.norm(change - wanted) <= 0.1 * np.linalg.norm(wanted)

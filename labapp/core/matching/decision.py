@@ -11,6 +11,7 @@ import numpy as np
 import scipy
 
 from labapp.core.match import ORIENTATIONS, Orientation
+from labapp.core.matching.free_setup import Adjusted, adjusted, labels_by_other_holes
 from labapp.core.matching.hypothesis import (
     FINE_KNOTS,
     KNOT_ERROR_MM,
@@ -19,6 +20,7 @@ from labapp.core.matching.hypothesis import (
     USUAL_KNOTS,
     Hypothesis,
     evaluate,
+    evaluate_twice,
     grow_and_evaluate,
     paths_of,
     reoriented_labels,
@@ -31,7 +33,7 @@ from labapp.core.matching.observation import QUICK, UNLABELLED, Observation, try
 from labapp.core.matching.outliers import MOST_LEFT_OUT, FittedLabels, unsupported
 from labapp.core.matching.prediction import covariance_of_dots
 from labapp.core.matching.ray_classes import RayClasses
-from labapp.core.surface.pool_fit import FitSettings, FittedPool
+from labapp.core.surface.pool_fit import FitSettings
 from labapp.core.values import CannotMeasure, IntArray, median
 
 MISFIT_MM, MISFIT_TIMES = 0.15, 3.0
@@ -150,10 +152,10 @@ def decide(observed: Observation, found: list[Hypothesis], settings: MatchSettin
     best, found, neighbours, fit = _cheapest(observed, found, settings.margin)
     cheapest = best  # compared with others before what is doubtful in it, as in them, is taken away
     if fit is FINE_KNOTS:
-        cheapest = _evaluate_twice(observed, best.labels, fit, best.pool) or best
+        cheapest = evaluate_twice(observed, best.labels, fit, best.pool) or best
     best = without_doubtful_outermost(observed, without_false_ends(observed, best, fit), fit)
     if fit is FINE_KNOTS:
-        best = _evaluate_twice(observed, best.labels, fit, best.pool) or best
+        best = evaluate_twice(observed, best.labels, fit, best.pool) or best
     _refuse_unexplained(observed, best, settings)
     own = best.orientation(observed)
     if best.marker == "lit":
@@ -188,6 +190,21 @@ def decide(observed: Observation, found: list[Hypothesis], settings: MatchSettin
                 "ambiguous-rows", "several holes in the rows can be the absent centre dot"
             )
     best = _without(observed, best, doubtful, fit)
+    best = _supported(observed, best, fit)
+    if observed.rig.uncertainty is None:
+        return best
+    free = _with_setup_free(observed, best, fit, settings)
+    if free is None:
+        return best
+    best, there = without_false_ends(free.observed, free.hypothesis, fit), free.observed
+    best = without_doubtful_outermost(there, best, fit)
+    _refuse_unexplained(there, best, settings)
+    best = _supported(there, best, fit)
+    return evaluate(observed, best.labels, fit, initial=best.pool) or best
+
+
+def _supported(observed: Observation, best: Hypothesis, fit: FitSettings) -> Hypothesis:
+    """The hypothesis without the labels that the surface through the others does not support."""
     for _ in range(MOST_LEFT_OUT):
         settled = _settled(observed, best, fit)
         wrong = unsupported(observed, fitted_labels(observed, settled, fit))
@@ -195,6 +212,34 @@ def decide(observed: Observation, found: list[Hypothesis], settings: MatchSettin
             break
         best = _without(observed, best, wrong, fit)
     return best
+
+
+def _with_setup_free(
+    observed: Observation, best: Hypothesis, fit: FitSettings, settings: MatchSettings
+) -> Adjusted | None:
+    """What costs less with the set-up free, the marker in another hole; None if nothing does.
+
+    Raises
+    ------
+    CannotMeasure
+        ``ambiguous-rows`` where two holes cost about as much.
+    """
+    holes = labels_by_other_holes(observed, best.labels)
+    own = free = adjusted(observed, best, fit) if holes else None
+    while free is not None:  # each round is cheaper than the one before
+        tried = (adjusted(observed, h, fit) for to in holes if (h := evaluate(observed, to)))
+        near = [one.grown(fit) for one in tried if one and one.cost < free.cost + settings.margin]
+        least = min(near, key=lambda one: one.cost, default=None)
+        ahead = 0.0 if least is None else least.cost - free.grown(fit).cost
+        if least is None or ahead >= settings.margin:
+            break
+        if ahead > -settings.margin or least.hypothesis.marker != "dark":
+            raise CannotMeasure(
+                "ambiguous-rows",
+                "where the set-up may be a little off, several holes can be the absent centre dot",
+            )
+        free, holes = least, labels_by_other_holes(observed, least.hypothesis.labels)
+    return None if free is own else free
 
 
 def _without(
@@ -245,7 +290,7 @@ def _cheapest(
     if near or best.residual_mm > KNOT_ERROR_MM:
         fit, neighbours = FINE_KNOTS, []
         found = [
-            h for each in found if (h := _evaluate_twice(observed, each.labels, fit, each.pool))
+            h for each in found if (h := evaluate_twice(observed, each.labels, fit, each.pool))
         ]
         best = min(found, key=lambda hypothesis: hypothesis.cost, default=best)
     if not neighbours and not _beyond_doubt(observed, best, margin):
@@ -333,7 +378,7 @@ def _with_neighbours(
         near = [each.labels for each in neighbours if each.cost < best.cost + CLOSE_COST]
         grown = [h for labels in near if (h := grow_and_evaluate(observed, labels, fit))]
         grown = [
-            h for each in grown if (h := _evaluate_twice(observed, each.labels, fit, each.pool))
+            h for each in grown if (h := evaluate_twice(observed, each.labels, fit, each.pool))
         ]
         better = min(grown, key=lambda h: h.cost, default=best)
         if better.cost >= best.cost:
@@ -366,32 +411,9 @@ def _rivals(
             unlit, cost = rough_costs(observed, labels, pool)
             if unlit > own[0] + FAR_COST and cost > own[1] + FAR_COST + CLOSE_COST:
                 continue
-        hypothesis = _evaluate_twice(observed, labels, fit, pool)
+        hypothesis = evaluate_twice(observed, labels, fit, pool)
         rivals += [] if hypothesis is None else [hypothesis]
     return rivals
-
-
-def _evaluate_twice(
-    observed: Observation, labels: IntArray, fit: FitSettings, initial: FittedPool
-) -> Hypothesis | None:
-    """Evaluate labels; with fine knots the cost is the mean of theirs and of the usual knots' cost.
-
-    The usual knots leave much of a dip, fine ones let wrong labels have the rough surface they
-    need. A marker that is lit with either is lit.
-    """
-    own = evaluate(observed, labels, fit, initial=initial)
-    if own is None or fit is not FINE_KNOTS:
-        return own
-    usual = evaluate(observed, labels, USUAL_KNOTS, initial=initial)
-    if usual is None:
-        return None
-    marker = "lit" if usual.marker == "lit" else own.marker
-    return replace(
-        own,
-        marker=marker,
-        misfit_without_marker=(own.misfit_without_marker + usual.misfit_without_marker) / 2,
-        roughness=(own.roughness + usual.roughness) / 2,
-    )
 
 
 def _missed_lie_apart(hypothesis: Hypothesis) -> bool:

@@ -75,6 +75,9 @@ rays are dark."""
 MARKER_SPACINGS = 1 / 3
 """A dot shows at the marker where it is nearer than this share of the way to the next dot."""
 
+STEPS = tuple(way for way in product(range(-2, 3), repeat=2) if 0 < abs(way[0]) + abs(way[1]) < 3)
+"""Rows and columns that labels are shifted by."""
+
 AGREED = 0.8
 """Such a share of a hypothesis's dots in the grid must agree with it on where its rays are."""
 
@@ -219,6 +222,29 @@ def evaluate(
     return Hypothesis(labels, pool, *left, misfit, rough)
 
 
+def evaluate_twice(
+    observed: Observation, labels: IntArray, fit: FitSettings, initial: FittedPool
+) -> Hypothesis | None:
+    """Evaluate labels; with fine knots the cost is the mean of theirs and of the usual knots' cost.
+
+    The usual knots leave much of a dip, fine ones let wrong labels have the rough surface they
+    need. A marker that is lit with either is lit.
+    """
+    own = evaluate(observed, labels, fit, initial=initial)
+    if own is None or fit is not FINE_KNOTS:
+        return own
+    usual = evaluate(observed, labels, USUAL_KNOTS, initial=initial)
+    if usual is None:
+        return None
+    marker = "lit" if usual.marker == "lit" else own.marker
+    return replace(
+        own,
+        marker=marker,
+        misfit_without_marker=(own.misfit_without_marker + usual.misfit_without_marker) / 2,
+        roughness=(own.roughness + usual.roughness) / 2,
+    )
+
+
 def paths_of(observed: Observation, pool: FittedPool) -> RayPaths:
     """What a fitted surface makes of all rays."""
     return RayPaths.of(observed.bench, pool.surface.basis, pool.surface.coefficients)
@@ -240,10 +266,16 @@ def _misfit(
     lit = labels != UNLABELLED
     classes = classify_rays(observed, labels, paths)
     marker = _marker_state(observed, lit, pool)
-    variance = observed.covariance_mm2[labels[lit]].trace(axis1=-2, axis2=-1) / 2 + KNOT_ERROR_MM**2
-    chi2 = np.minimum(np.sum(pool.residual_mm**2, axis=-1) / variance, STRAY_COST)
+    square = np.sum(pool.residual_mm**2, axis=-1) / variance_mm2(observed, labels[lit])
+    chi2 = np.minimum(square, STRAY_COST)
     cost = float(chi2.sum()) + STRAY_COST * len(classes.stray)
     return classes, marker, cost + MISSED_COST * len(classes.missed)
+
+
+def variance_mm2(observed: Observation, dots: IntArray) -> FloatArray:
+    """Variance of dots, shape (n,), along either axis of the plane, with the knots' error, mm²."""
+    covariance = observed.covariance_mm2[dots]
+    return np.asarray(covariance.trace(axis1=-2, axis2=-1) / 2 + KNOT_ERROR_MM**2)
 
 
 def _boundary_cost(level: Level) -> float:
@@ -384,14 +416,16 @@ def shifted_labels(observed: Observation, labels: IntArray) -> Iterator[IntArray
     A shift bends the surface a little and leaves the residuals nearly as they were: what a single
     frame tells worst.
     """
+    for step in STEPS:
+        yield shifted_by(observed, labels, step)
+
+
+def shifted_by(observed: Observation, labels: IntArray, step: tuple[int, ...]) -> IntArray:
+    """The same labels some rows and columns on."""
     at = np.argwhere(labels != UNLABELLED)
-    dot = labels[at[:, 0], at[:, 1]]
-    for step in (
-        way for way in product(range(-2, 3), repeat=2) if 0 < abs(way[0]) + abs(way[1]) < 3
-    ):
-        shifted = _labels_of_pairs(at + 1 + step, dot, labels.shape)
-        shifted[observed.absent] = UNLABELLED
-        yield shifted
+    shifted = _labels_of_pairs(at + 1 + step, labels[tuple(at.T)], labels.shape)
+    shifted[observed.absent] = UNLABELLED
+    return shifted
 
 
 def reoriented_labels(

@@ -20,7 +20,7 @@ from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match
 from labapp.core.surface.level import Witnesses
 from labapp.core.surface.pool_fit import FitSettings, FittedPool, normal_equations
-from labapp.core.values import FloatArray
+from labapp.core.values import FloatArray, IntArray
 
 ROUNDS = 3
 """Rounds in which the reflection points follow the surface: the remaining error is 0.1 %."""
@@ -28,6 +28,9 @@ ROUNDS = 3
 SHARE = 1e-4
 """Share of a column by which the bench is off for the change of the right-hand side: where
 reflection points go far from those of the factor, weakly determined modes diverge."""
+
+NEWTON_STEPS = 8
+"""From where a ray lands on the work piece to where it meets the surface."""
 
 Perturbed = tuple[Rig, FloatArray]
 """A rig, and where the dots are on its plane, shape (n, 2), mm."""
@@ -61,8 +64,9 @@ def setup_changes(
         return np.zeros((len(gradient), 0))
     changes = np.zeros((len(gradient), len(known.root)))
     off = np.flatnonzero(known.root.any(axis=0)).tolist()
-    benches = [_bench_off(match, rig, SHARE * known.root[:, k]) for k in off]
-    change = _response(match, rig, settings, pool, benches) / SHARE
+    dots = match.plane_mm, match.plane_covariance_mm2
+    benches = [bench_off(rig, SHARE * known.root[:, k], match.plane_mm) for k in off]
+    change = _response(match.ray, *dots, rig, settings, pool, benches) / SHARE
     basis, about = pool.surface.basis, (0.0, pool.level.sign, REACH)
     own = project_rays(rig.laser, rig.pattern)
     x, y = own.landing_mm[..., 0], own.landing_mm[..., 1]
@@ -80,15 +84,56 @@ def setup_changes(
     return changes
 
 
+def residual_changes(
+    ray: IntArray,
+    plane_mm: FloatArray,
+    plane_covariance_mm2: FloatArray,
+    rig: Rig,
+    settings: FitSettings,
+    pool: FittedPool,
+) -> FloatArray:
+    """Changes of a fit's residuals due to each independent error component of the bench.
+
+    The surface is fitted anew. Rays, dots and covariance are those of n pairs, see `Match`; the rig
+    has its uncertainty.
+
+    Returns
+    -------
+    FloatArray
+        Shape (n, 2, q), mm; the causes are the columns of `RigUncertainty.root`.
+    """
+    from labapp.core.surface import kernels
+
+    assert rig.uncertainty is not None
+    root, at, surface = rig.uncertainty.root, tuple(ray.T - 1), pool.surface
+    off = np.flatnonzero(root.any(axis=0)).tolist()
+    benches = [bench_off(rig, SHARE * root[:, k], plane_mm) for k in off]
+    change = _response(ray, plane_mm, plane_covariance_mm2, rig, settings, pool, benches)
+    changes = np.zeros((*plane_mm.shape, len(root)))
+    for k, by, (bench, dots_mm) in zip(off, change.T, benches, strict=True):
+        rays, plane = project_rays(bench.laser, bench.pattern), bench.imaging_plane.pose_mm
+        met = rays.directions[at], rays.landing_mm[at], NEWTON_STEPS, plane
+        coefficients = surface.coefficients + by
+        computed = kernels.intersect_and_reflect(surface.basis.grid, coefficients, *met)[2]
+        changes[..., k] = (computed - dots_mm - pool.residual_mm) / SHARE
+    return changes
+
+
 def _response(
-    match: Match, rig: Rig, settings: FitSettings, pool: FittedPool, benches: Sequence[Perturbed]
+    ray: IntArray,
+    plane_mm: FloatArray,
+    plane_covariance_mm2: FloatArray,
+    rig: Rig,
+    settings: FitSettings,
+    pool: FittedPool,
+    benches: Sequence[Perturbed],
 ) -> FloatArray:
     """Changes of a fit's p coefficients on q benches perturbed a little, shape (p, q), mm."""
     from labapp.core.surface import kernels
 
     points, surface = pool.points_mm, pool.surface
-    grid, coefficients, at = surface.basis.grid, surface.coefficients, tuple(match.ray.T - 1)
-    dots = match.plane_mm, match.plane_covariance_mm2
+    grid, coefficients, at = surface.basis.grid, surface.coefficients, tuple(ray.T - 1)
+    dots = plane_mm, plane_covariance_mm2
     own = normal_equations(surface.basis, rig, points, *dots, settings)
 
     def right_side(
@@ -100,12 +145,12 @@ def _response(
 
     base = right_side(points, own.laser_mm, own.plane, own.dots_mm)
     changes = np.zeros((len(benches), len(coefficients)))
-    for k, (bench, plane_mm) in enumerate(benches):
+    for k, (bench, dots_mm) in enumerate(benches):
         laser_mm, plane = bench.laser.position_mm, bench.imaging_plane
         rays = project_rays(bench.laser, bench.pattern).directions[at]
         start = intersect_level(laser_mm, rays, points[:, 2:])
         there, _ = kernels.newton_along_rays(grid, coefficients, rays, start, 2)
-        seen = laser_mm, plane.pose_mm, plane.to_universal(plane_mm)
+        seen = laser_mm, plane.pose_mm, plane.to_universal(dots_mm)
         _, *slopes = kernels.surface_at(grid, coefficients, there)
         rises = rays / (rays[:, 2] - np.vecdot(np.transpose(slopes), rays[:, :2]))[:, None]
         for _ in range(ROUNDS):
@@ -117,10 +162,10 @@ def _response(
     return changes.T
 
 
-def _bench_off(match: Match, rig: Rig, offset: FloatArray) -> Perturbed:
+def bench_off(rig: Rig, offset: FloatArray, plane_mm: FloatArray) -> Perturbed:
     """The rig with its quantities off by an offset, shape (q,); the dots on its plane, mm."""
     assert rig.uncertainty is not None
-    dots = moved_dots(match.plane_mm, rig, rig.uncertainty.axes, offset)
+    dots = moved_dots(plane_mm, rig, rig.uncertainty.axes, offset)
     return aimed_as(rig.laser, moved_rig(rig, offset)), dots
 
 
