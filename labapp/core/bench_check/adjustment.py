@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -249,16 +249,20 @@ class System:
     def jacobian(self, unknown: FloatArray) -> FloatArray:
         """Their derivatives, shape (m, p): a pose moves the dots of its own mirror alone."""
         bench, *poses = (unknown[part] for part in self.parts)
-        offset, used = self.factor @ bench, self.factor.any(axis=1)
+        offset, used = self.factor @ bench, np.asarray(self.factor.any(axis=1))
         made = np.zeros((2 * sum(len(s.ray) for s in self.sightings), self.size))
         for k, (pose, part) in enumerate(zip(poses, self.parts[1:], strict=True)):
             rows = self._rows(k)
             made[rows, self.parts[0]] = self.by_quantities(k, offset, pose, used) @ self.factor
             pictured = self.pictured(k, offset)
-            made[rows, part] = _slopes(
-                lambda x, k=k, at=pictured: _standardised(*at, self.computed(k, offset, x)), pose
-            )
+            made[rows, part] = _slopes(partial(self._posed, k, offset, *pictured), pose)
         return made
+
+    def _posed(
+        self, k: int, offset: FloatArray, seen_mm: FloatArray, root: FloatArray, pose: FloatArray
+    ) -> FloatArray:
+        """Residuals of a sighting over their standard uncertainties, at a pose, shape (2n,)."""
+        return _standardised(seen_mm, root, self.computed(k, offset, pose))
 
     def by_quantities(
         self, k: int, offset: FloatArray, pose: FloatArray, used: BoolArray
