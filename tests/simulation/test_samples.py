@@ -16,6 +16,7 @@ from labapp.media import open_source
 from labapp.simulation.recording import TARGET
 from labapp.simulation.torch import ConeTorch
 from tests.samples.__main__ import main
+from tests.samples.lines import line_samples
 from tests.samples.runs import (
     BENT_MM,
     blocked_rows,
@@ -151,7 +152,7 @@ def test_command_writes_a_folder_for_each(tmp_path):
     assert [path.name for path in (tmp_path / "all").iterdir()] == ["concave"]
     assert target.read_text(encoding="utf-8").startswith("<svg")
     kept = {path.name for path in FOLDER.iterdir() if path.is_dir()}
-    assert kept == {sample.name for sample in samples()}
+    assert kept == {sample.name for sample in (*samples(), *line_samples())}
 
 
 @every_sample

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
-from scipy import signal
+import scipy
 
 from labapp.core.images.dots import Grey, Image
 from labapp.core.images.light_lines import LineSettings, find_lines
@@ -248,7 +248,7 @@ def oscillation_frequency(
     kept = np.abs(swing) < limit
     step = 1.0 / (OVERSAMPLE * max(float(np.ptp(time_s)), 1e-9))
     rates = np.arange(lowest_hz, highest_hz, step)
-    power = signal.lombscargle(
+    power = scipy.signal.lombscargle(
         time_s[kept], swing[kept], 2 * np.pi * rates, normalize=True, floating_mean=True
     )
     best = int(np.argmax(power))

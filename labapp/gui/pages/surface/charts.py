@@ -8,7 +8,7 @@ import numpy as np
 import pyqtgraph as pg
 from PySide6.QtCore import QEvent, QPointF, Qt, Signal
 from PySide6.QtGui import QAction, QGuiApplication, QKeyEvent, QKeySequence, QPalette
-from PySide6.QtWidgets import QLabel, QVBoxLayout
+from PySide6.QtWidgets import QVBoxLayout
 
 from labapp.core.surface.boundary import Boundary
 from labapp.core.values import FloatArray
@@ -17,7 +17,7 @@ from labapp.gui.pages.surface.presenter import error_scale
 from labapp.gui.views.axes import make_plot, paint_axes
 from labapp.gui.views.canvas import Plotted
 from labapp.gui.views.picture_files import save_plot
-from labapp.gui.widgets.labels import wrapping_label
+from labapp.gui.widgets.labels import plain_label, wrapping_label
 from labapp.text import HEIGHT_SIGMA_OF
 
 BAND_ALPHA = 70
@@ -40,7 +40,7 @@ class Chart(Plotted):
         layout.setSpacing(0)
         layout.addWidget(self.title)
         layout.addWidget(self.plot)
-        self._at = QLabel(self.plot)
+        self._at = plain_label(parent=self.plot)
         self._at.setAttribute(Qt.WidgetAttribute.WA_TransparentForMouseEvents)
         self._at.hide()
         self.plot.scene().sigMouseMoved.connect(self._moved_to)
