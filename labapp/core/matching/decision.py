@@ -11,7 +11,7 @@ import numpy as np
 import scipy
 
 from labapp.core.match import ORIENTATIONS, Orientation
-from labapp.core.matching.free_setup import Adjusted, adjusted, labels_by_other_holes
+from labapp.core.matching.free_setup import another_hole_explains
 from labapp.core.matching.hypothesis import (
     FINE_KNOTS,
     KNOT_ERROR_MM,
@@ -191,16 +191,12 @@ def decide(observed: Observation, found: list[Hypothesis], settings: MatchSettin
             )
     best = _without(observed, best, doubtful, fit)
     best = _supported(observed, best, fit)
-    if observed.rig.uncertainty is None:
-        return best
-    free = _with_setup_free(observed, best, fit, settings)
-    if free is None:
-        return best
-    best, there = without_false_ends(free.observed, free.hypothesis, fit), free.observed
-    best = without_doubtful_outermost(there, best, fit)
-    _refuse_unexplained(there, best, settings)
-    best = _supported(there, best, fit)
-    return evaluate(observed, best.labels, fit, initial=best.pool) or best
+    if another_hole_explains(observed, best, fit, settings.margin):
+        raise CannotMeasure(
+            "ambiguous-rows",
+            "where the set-up may be a little off, several holes can be the absent centre dot",
+        )
+    return best
 
 
 def _supported(observed: Observation, best: Hypothesis, fit: FitSettings) -> Hypothesis:
@@ -212,34 +208,6 @@ def _supported(observed: Observation, best: Hypothesis, fit: FitSettings) -> Hyp
             break
         best = _without(observed, best, wrong, fit)
     return best
-
-
-def _with_setup_free(
-    observed: Observation, best: Hypothesis, fit: FitSettings, settings: MatchSettings
-) -> Adjusted | None:
-    """What costs less with the set-up free, the marker in another hole; None if nothing does.
-
-    Raises
-    ------
-    CannotMeasure
-        ``ambiguous-rows`` where two holes cost about as much.
-    """
-    holes = labels_by_other_holes(observed, best.labels)
-    own = free = adjusted(observed, best, fit) if holes else None
-    while free is not None:  # each round is cheaper than the one before
-        tried = (adjusted(observed, h, fit) for to in holes if (h := evaluate(observed, to)))
-        near = [one.grown(fit) for one in tried if one and one.cost < free.cost + settings.margin]
-        least = min(near, key=lambda one: one.cost, default=None)
-        ahead = 0.0 if least is None else least.cost - free.grown(fit).cost
-        if least is None or ahead >= settings.margin:
-            break
-        if ahead > -settings.margin or least.hypothesis.marker != "dark":
-            raise CannotMeasure(
-                "ambiguous-rows",
-                "where the set-up may be a little off, several holes can be the absent centre dot",
-            )
-        free, holes = least, labels_by_other_holes(observed, least.hypothesis.labels)
-    return None if free is own else free
 
 
 def _without(
