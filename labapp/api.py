@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import os
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -84,6 +85,8 @@ def measure(
         If the recording or the setup file cannot be read, or an array is no image.
     """
     bench = setup if isinstance(setup, Setup) else read_setup(setup)
+    for unusual in bench.warnings:
+        warnings.warn(f"set-up: {unusual}", stacklevel=2)
     chosen = Settings() if settings is None else settings
     with ExitStack() as at_end:
         if isinstance(source, np.ndarray):

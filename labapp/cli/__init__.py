@@ -51,6 +51,7 @@ from labapp.cli.shared import (
     RowsName,
     choose_frames,
     measure_frames,
+    warned,
 )
 from labapp.cli.window import asks_for_app, open_app, show_in_app
 from labapp.errors import InputError
@@ -405,7 +406,7 @@ def _write_values(setup: Path | None, values: Mapping[str, Mapping[str, object]]
     update_setup(setup, values)
     typer.echo(f"Written to [{'], ['.join(values)}] of {setup.absolute()}")
     try:
-        read_setup(setup)
+        warned(read_setup(setup))
     except InputError as lacking:
         typer.echo(f"It is not complete yet:\n{lacking}", err=True)
 

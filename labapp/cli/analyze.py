@@ -12,6 +12,7 @@ from labapp.cli.shared import (
     Commands,
     progress_shown,
     results_folder,
+    warned,
     writable_folder,
     write_figure,
 )
@@ -157,7 +158,8 @@ def frame(
     from labapp.studies.frame_comparison import comparison_tables, shape_table
     from labapp.studies.known_object import known_cap, known_object_table
 
-    known, cap = read_setup(setup), None if known_object is None else known_cap(*known_object)
+    known = warned(read_setup(setup))
+    cap = None if known_object is None else known_cap(*known_object)
     with open_source(source) as recording:
         if number >= len(recording):
             allowed = f"frames 0 to {len(recording) - 1} of {source}"
@@ -193,7 +195,7 @@ def budget(
     """
     from labapp.config.setup import read_setup
 
-    read = None if setup is None else read_setup(setup)
+    read = None if setup is None else warned(read_setup(setup))
     pool = expected_pool(width, length, height)
     folder = results_folder(out)
     with progress_shown() as progress:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from labapp.cli.shared import NOTHING_MEASURED
+from labapp.cli.shared import NOTHING_MEASURED, warned
 from labapp.errors import InputError
 from labapp.files import write_file
 from labapp.text import csv_text
@@ -64,7 +64,7 @@ def calibrate_bench(
     text = read_setup_text(setup)
     parse_setup(text, setup)
     before = unchecked_setup(text, setup)
-    known = parse_setup(before, setup)
+    known = warned(parse_setup(before, setup))
     mirrors = [parse_mirror(one) for one in mirror or []]
     if predict:
         _print_forecast(known.rig, mirrors)

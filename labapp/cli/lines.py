@@ -15,6 +15,7 @@ from labapp.cli.shared import (
     NOTHING_MEASURED,
     RECORDING_HELP,
     progress_shown,
+    warned,
     writable_folder,
 )
 from labapp.errors import os_errors_as_input
@@ -51,7 +52,7 @@ def lines(
     from labapp.media import open_source
     from labapp.run.runner import select_frames
 
-    bench = read_line_setup(setup)
+    bench = warned(read_line_setup(setup))
     with open_source(source) as recording:
         chosen = select_frames(frames, len(recording))
         folder = writable_folder(out)
@@ -67,7 +68,8 @@ def lines(
 
 def _measure(source: FrameSource, frames: range, folder: Path, bench: Setup) -> bool:
     """Measure frames one by one; whether any has lines."""
-    from labapp.core.pipeline import Settings, measure, setup_status
+    from labapp.core.pipeline import Settings, measure
+    from labapp.core.recording.residual_check import doubt_of_values, judged_status
     from labapp.core.sequence.line_frame import LineFrame
     from labapp.core.sequence.line_states import LineSeries, line_changes, line_states
     from labapp.export.line_results import line_tables
@@ -83,7 +85,7 @@ def _measure(source: FrameSource, frames: range, folder: Path, bench: Setup) -> 
                 times_s.append(frame.time_s)
                 progress(source.name, k + 1, len(frames))
     finally:
-        done, status = frames[: len(found)], setup_status(bench.rig)
+        done, status = frames[: len(found)], judged_status(bench.rig, doubt_of_values(bench.rig))
         for name, text in line_tables(done, times_s, found, bench.calibration, status).items():
             write_file(folder / name, text.encode())
     series = LineSeries.of(found)

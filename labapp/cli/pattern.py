@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from labapp.cli.bench import mirror_picture
-from labapp.cli.shared import NOTHING_MEASURED
+from labapp.cli.shared import NOTHING_MEASURED, warned
 from labapp.errors import InputError
 from labapp.files import write_file
 
@@ -51,7 +51,7 @@ def calibrate_pattern(
     from labapp.core.geometry.patterns import MEASURED
     from labapp.core.values import CannotMeasure
 
-    known = read_setup(setup)
+    known = warned(read_setup(setup))
     _check_options(setup, pictures, height, out, use)
     try:
         found = calibrated(

@@ -32,6 +32,7 @@ from labapp.cli.shared import (
     note,
     progress_bar,
     progress_sink,
+    warned,
     with_methods,
 )
 from labapp.core.schemes import SCHEMES
@@ -154,7 +155,7 @@ def _measure_recording(
     from labapp.run.measurers import ColdMeasurer, RecordingMeasurer, stretch_pools
     from labapp.run.runner import provenance, run, select_frames, with_setup_check
 
-    setup = read_setup(setup_path)
+    setup = warned(read_setup(setup_path))
     summary, record = Summary(), ResidualRecord(setup.rig)
     with open_source(source_path) as source, progress_bar() as progress:
         for warning in source.warnings:

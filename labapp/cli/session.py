@@ -36,6 +36,7 @@ from labapp.cli.shared import (
     measure_frames,
     progress_shown,
     report_stale_results,
+    warned,
     with_methods,
 )
 from labapp.core.schemes import SCHEMES, scheme_words
@@ -116,7 +117,7 @@ def new(
     from labapp.session.record import Record
     from labapp.session.session import Session
 
-    text = None if setup is None else read_setup(setup, lines=True).text
+    text = None if setup is None else warned(read_setup(setup, lines=True)).text
     record = Record(
         title=title,
         operator=operator,
@@ -146,7 +147,7 @@ def set_setup(
     from labapp.config.setup import read_setup
     from labapp.session.session import Session
 
-    text = read_setup(setup, lines=True).text
+    text = warned(read_setup(setup, lines=True)).text
     with Session.open(file) as session, report_stale_results(session):
         same = session.setup_text == text
         session.set_setup(text)

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.progress import Progress, TaskID
 
+    from labapp.config.setup import Setup
     from labapp.core.pipeline import Settings
     from labapp.core.schemes import irs
     from labapp.export.frame_result import FrameResult
@@ -124,6 +125,13 @@ def progress_bar() -> Progress:
 def note(console: Console, text: str) -> None:
     """Print a line on stderr, above the progress bar."""
     console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+
+def warned(setup: Setup) -> Setup:
+    """The set-up, once a warning is on stderr for each value that no usual bench has."""
+    for warning in setup.warnings:
+        typer.echo(f"warning: {warning}", err=True)
+    return setup
 
 
 def progress_sink(progress: Progress, name: str, count: int) -> Sink:

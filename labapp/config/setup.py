@@ -28,6 +28,7 @@ from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.coordinates import ImageCalibration, Lens
 from labapp.core.geometry.line_pattern import KIND as LINES
 from labapp.core.geometry.line_pattern import LinePattern, LineRays, LineRig, line_rig
+from labapp.core.geometry.plausibility import implausible_values
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.geometry.uncertainty import (
     CALIBRATED,
@@ -63,6 +64,11 @@ class Setup:
     def bench(self) -> Bench:
         """Rig and calibration as the measurement takes them."""
         return Bench(self.rig, self.calibration)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Values that no usual bench has, a clause each (`implausible_values`)."""
+        return implausible_values(self.rig)
 
     @property
     def line_rig(self) -> LineRig | None:

@@ -251,11 +251,18 @@ class SessionContents:
 
     @property
     def setup_verdict(self) -> SetupVerdict | None:
-        """What the frames that were measured with the present set-up say of it; None without."""
+        """What the frames that were measured with the present set-up say of it.
+
+        Without any, what its values alone say; None where they are usual.
+        """
+        from labapp.core.recording.residual_check import doubt_of_values
         from labapp.session.file.blobs import pack
 
         basis = self._basis()
-        return None if basis is None else self._results.verdicts.of(pack(basis.setup.text))
+        if basis is None:
+            return None
+        verdict = self._results.verdicts.of(pack(basis.setup.text))
+        return verdict or doubt_of_values(basis.setup.rig)
 
     @property
     def setup_status(self) -> str:

@@ -8,13 +8,14 @@ import numpy as np
 import pytest
 from scipy.ndimage import convolve, maximum_filter
 
-from labapp.core.matching import match_kernels
+from labapp.core.matching import match_kernels, observation
 from labapp.core.matching.decision import fitted_labels
 from labapp.core.matching.hypothesis import USUAL_KNOTS, evaluate
-from labapp.core.matching.observation import UNLABELLED, Observation
+from labapp.core.matching.observation import UNLABELLED, Observation, try_fit
 from labapp.core.matching.outliers import unsupported
 from labapp.core.matching.prediction import sure_pairs
 from labapp.core.surface.level import Witnesses
+from labapp.core.surface.pool_fit import FittedPool
 from labapp.core.values import FloatArray, IntArray
 from labapp.simulation.pools import egg
 from tests.core.test_dips import observation_of
@@ -215,3 +216,24 @@ def test_a_ray_far_outside_the_boundary_is_unlikely_to_have_come_back() -> None:
         return Witnesses.of(*rays).negative_log_evidence(surface.basis, surface.coefficients, level)
 
     assert evidence(1) - evidence(-1) > 3.0
+
+
+def test_only_the_newest_fits_of_a_frame_are_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    observed, labels = scene()
+    monkeypatch.setattr(observation, "COUNTED_EVERY", 1)
+
+    def fitted(row: int) -> FittedPool:
+        some = labels.copy()
+        some[row] = UNLABELLED
+        found = try_fit(observed, some)
+        assert found is not None
+        return found
+
+    first, newest = fitted(8), fitted(10)
+    assert fitted(8) is first
+    monkeypatch.setattr(observation, "KEPT_BYTES", newest.factor.nbytes)
+    fitted(11)
+    assert fitted(10) is newest
+    again = fitted(8)
+    assert again is not first
+    assert again.points_mm == pytest.approx(first.points_mm, abs=1e-9)

@@ -278,3 +278,14 @@ def test_a_single_row_of_rays_that_came_back_has_a_level() -> None:
     level = find_level(height, slope, y, witness, np.array([0.4, 0.8]))
     assert np.isfinite([level.shift_mm, level.sigma_mm]).all()
     assert level.rear.drop_mm == 0.0
+
+
+def test_rays_of_a_laser_ten_times_too_far_away_light_no_pool() -> None:
+    """Their splines would take gigabytes."""
+    match = exact_match(trace(POOL, OPEN_RIG), OPEN_RIG)
+    far = replace(OPEN_RIG.laser, distance_mm=10 * OPEN_RIG.laser.distance_mm)
+    dots = match.ray, match.plane_mm, match.plane_covariance_mm2, match.witness
+    with pytest.raises(CannotMeasure) as caught:
+        fit_pool(*dots, replace(OPEN_RIG, laser=far), FitSettings())
+    assert caught.value.status == "no-surface"
+    assert " mm" in caught.value.reason

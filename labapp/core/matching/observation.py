@@ -36,6 +36,10 @@ RESOLVED_SIZES = 2.2
 """Dots nearer to each other than this many of their standard deviations are taken for one: two
 equal Gaussians have a single peak up to 2, and pixels and noise blur them further."""
 
+KEPT_BYTES, COUNTED_EVERY = 100_000_000, 32
+"""Factors of the fits that are kept of a frame take about so many bytes at most, splines and
+stiffness twice as many: over a thousand fits of a usual pool. They are counted now and then."""
+
 EDGE_MM, EDGE_PX = 0.5, 4.0
 """A dot nearer to the edge of the plane or of the frame may be cut off, and is not in view: about
 the radius of a dot."""
@@ -168,13 +172,25 @@ class Observation(ReadOnlyArrays):
             surface = None if initial is None else initial.surface
             try:
                 made = fit_pool(at + 1, *dots, witness, self.rig, settings, surface)
+                if len(self._fitted) % COUNTED_EVERY == 0:
+                    self._forget_oldest()
                 self._fitted[key] = made
-            except CannotMeasure as reason:
-                self._fitted[key] = reason
+            except CannotMeasure as failure:  # its traceback holds the fit's arrays
+                self._fitted[key] = CannotMeasure(failure.status, failure.reason)
         found = self._fitted[key]
         if isinstance(found, CannotMeasure):
-            raise found
+            raise CannotMeasure(found.status, found.reason)
         return found
+
+    def _forget_oldest(self) -> None:
+        """Forget the oldest fits where their factors take more than `KEPT_BYTES` together."""
+        sizes = {k: p.factor.nbytes for k, p in self._fitted.items() if isinstance(p, FittedPool)}
+        over = sum(sizes.values()) - KEPT_BYTES
+        for key, size in sizes.items():
+            if over <= 0:
+                break
+            del self._fitted[key]
+            over -= size
 
     @cached_property
     def _fitted(self) -> dict[tuple[bytes, bytes, FitSettings], FittedPool | CannotMeasure]:

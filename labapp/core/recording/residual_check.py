@@ -21,6 +21,7 @@ from typing import Self
 import numpy as np
 
 from labapp.core.geometry.perturbation import Direction, directions
+from labapp.core.geometry.plausibility import implausible_values
 from labapp.core.geometry.rig import Rig
 from labapp.core.geometry.uncertainty import INDEX, QUANTITIES
 from labapp.core.pipeline import Measurement, setup_status
@@ -171,6 +172,10 @@ class ResidualRecord:
     _seen: int = 0
     _judged: tuple[int, SetupVerdict] = (0, SetupVerdict(False, "no frame was measured"))
 
+    def __post_init__(self) -> None:
+        if doubt := doubt_of_values(self.rig):
+            self._judged = 0, doubt
+
     def add(self, measurement: Measurement, residuals: Residuals | None = None) -> None:
         """Add the next frame, in their order.
 
@@ -219,6 +224,12 @@ class ResidualRecord:
         return judge_setup(self.rig, self._statuses, self._samples)
 
 
+def doubt_of_values(rig: Rig) -> SetupVerdict | None:
+    """Doubt of a set-up with values that no usual bench has (`implausible_values`); or None."""
+    unusual = implausible_values(rig)
+    return SetupVerdict(True, "; ".join(unusual)) if unusual else None
+
+
 def judged_status(rig: Rig, verdict: SetupVerdict | None) -> str:
     """How far a rig can be relied on (`pipeline.setup_status`), with what its recording says."""
     is_doubtful = verdict is not None and verdict.is_doubtful
@@ -230,6 +241,8 @@ def judge_setup(
 ) -> SetupVerdict:
     """Judge whether a recording contradicts its set-up, and which quantity would explain it.
 
+    Values that no usual bench has are a doubt whatever the recording says.
+
     Parameters
     ----------
     rig
@@ -239,6 +252,8 @@ def judge_setup(
     samples
         Residuals of frames, evenly over the recording, in their order.
     """
+    if doubt := doubt_of_values(rig):
+        return doubt
     tried = sum(statuses.get(one, 0) for one in (*NO_MATCH, "ok"))
     lost = tried - statuses.get("ok", 0)
     if tried >= FEWEST_TRIED and lost > UNANSWERED * tried:

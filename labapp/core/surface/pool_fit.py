@@ -39,6 +39,10 @@ MARGIN_ROWS, LEAST_MARGIN_MM = 2.5, 2.0
 mm. Before the boundary is reached the torch may hide some, or dots miss the imaging plane: of a
 dense pattern that is as wide a strip of the pool, and more rows."""
 
+MOST_SPLINES = 3000
+"""Rays that spread over more than these, 24 × 28 mm with knots 0.5 mm apart, are of no pool, but of
+a laser set up ten times too far away. Time grows with the square, and hypotheses are many."""
+
 CORRELATED_MM2 = 1.0
 """Area over which a pool's third derivatives are correlated, mm²."""
 
@@ -160,6 +164,9 @@ def fit_pool(
     rays, at = project_rays(rig.laser, rig.pattern), tuple(ray.T - 1)
     points = rays.landing_mm[at]
     basis = basis_around(points[:, :2], rays, settings.knot_mm)
+    if basis.count > MOST_SPLINES:
+        width, length = basis.high_mm - basis.low_mm
+        raise CannotMeasure("no-surface", f"lit rays spread over {width:.0f} × {length:.0f} mm")
     equations = normal_equations(basis, rig, points, plane_mm, plane_covariance_mm2, settings)
     equations.reuse_mm = settings.floor_mm / 50
     if initial is not None:

@@ -20,6 +20,7 @@ from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match
 from labapp.core.surface.level import Witnesses
 from labapp.core.surface.pool_fit import FitSettings, FittedPool, normal_equations
+from labapp.core.surface.solver import normal_factor
 from labapp.core.values import FloatArray, IntArray
 
 ROUNDS = 3
@@ -27,7 +28,8 @@ ROUNDS = 3
 
 SHARE = 1e-4
 """Share of a column by which the bench is off for the change of the right-hand side: where
-reflection points go far from those of the factor, weakly determined modes diverge."""
+reflection points go far from those of the factor, weakly determined modes diverge. For the same
+reason the factor is not the fit's, which followed frames reuse while points hardly move."""
 
 NEWTON_STEPS = 8
 """From where a ray lands on the work piece to where it meets the surface."""
@@ -135,6 +137,7 @@ def _response(
     grid, coefficients, at = surface.basis.grid, surface.coefficients, tuple(ray.T - 1)
     dots = plane_mm, plane_covariance_mm2
     own = normal_equations(surface.basis, rig, points, *dots, settings)
+    factor = normal_factor(surface.basis, own.stiffness, points, own.weights)
 
     def right_side(
         points_mm: FloatArray, laser_mm: FloatArray, plane: FloatArray, dots_mm: FloatArray
@@ -156,7 +159,7 @@ def _response(
         for _ in range(ROUNDS):
             raised = kernels.surface_at(grid, changes[k], there)[0][:, None]
             asked = right_side(there + raised * rises, *seen) - base
-            changes[k] = kernels.solve(pool.factor, asked[None])[0]
+            changes[k] = kernels.solve(factor, asked[None])[0]
             # Slopes leave the level open.
             changes[k] -= kernels.surface_at(grid, changes[k], there)[0].mean()
     return changes.T

@@ -13,7 +13,7 @@ from labapp.core.geometry.line_pattern import LineRays
 from labapp.core.geometry.patterns import MEASURED, PATTERNS
 from labapp.core.geometry.rig import DotPattern, Rig
 from labapp.core.geometry.uncertainty import QUANTITIES
-from labapp.core.pipeline import setup_status
+from labapp.core.recording.residual_check import doubt_of_values, judged_status
 from labapp.errors import InputError
 from labapp.gui.digits import ResultRow
 from labapp.session.record import Record
@@ -238,8 +238,10 @@ def shown(session: Session) -> SetupState:
     if words := session.setup_words:
         status = marked_setup_words(session.setup_status, words)
     else:  # the imaging plane may be missing still
-        usual = "" if found is None else setup_status(found)
-        status = marked_setup_words(usual, setup_words(usual))
+        doubt = None if found is None else doubt_of_values(found)
+        usual = "" if found is None else judged_status(found, doubt)
+        reason = doubt.reason if doubt else ""
+        status = marked_setup_words(usual, setup_words(usual, doubt=reason))
     usual_sigmas, sigma_words = _usual_sigmas(found)
     problems: dict[str, str] = {}
     missing: set[str] = set()
