@@ -62,7 +62,7 @@ def test_derivatives_are_those_by_central_differences() -> None:
     central = np.array([(of.residuals(at + s) - of.residuals(at - s)) / 2e-3 for s in steps]).T
     scale = np.abs(central).max(axis=0)
     np.testing.assert_allclose(of.jacobian(at) / scale, central / scale, atol=5e-5)
-    assert (scale[of.factor.any(axis=0).nonzero()] > 0.1).all()
+    assert (scale[np.flatnonzero(of.factor.any(axis=0))] > 0.1).all()
 
 
 @pytest.mark.slow
