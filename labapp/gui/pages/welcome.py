@@ -79,8 +79,8 @@ class Welcome(FollowsTheme, QWidget):
             "No session was opened yet. Open a recording, or drop a video, an image, a folder of "
             "images or a session anywhere on this window; or try the sample."
         )
-        made = list(self.buttons.values())
-        buttons = vbox(hbox(*made[:3]), hbox(*made[3:]))
+        shown = list(self.buttons.values())
+        buttons = vbox(hbox(*shown[:3]), hbox(*shown[3:]))
         column = fill(
             QVBoxLayout(inner),
             *(title, about, buttons, self.refused, self.label, (self.list, 1), self.nothing, 0),
