@@ -93,7 +93,7 @@ def errors(bench: SimulatedBench, rig: Rig, calibration: ImageCalibration, seed:
     return 100 * (np.array(found) - np.outer(true, [1.0, 0.0])) / true[:, None]
 
 
-def told(made: FloatArray) -> str:
+def summary(made: FloatArray) -> str:
     """Mean of the errors, the largest, and the ± of one."""
     made = made[np.isfinite(made[:, 0])]
     if not len(made):
@@ -138,11 +138,11 @@ def main() -> None:
         for seed in range(given.seeds):
             bench = WRONG[name]()
             check, said = checked(bench, mirrors, seed)
-            before = told(errors(bench, RIG, CALIBRATION, seed))
+            before = summary(errors(bench, RIG, CALIBRATION, seed))
             after = f"{'refused':>19}"
             if check is not None:
-                after = told(errors(bench, check.rig, check.calibration, seed))
-            true = told(errors(bench, *true_setup(bench), seed))
+                after = summary(errors(bench, check.rig, check.calibration, seed))
+            true = summary(errors(bench, *true_setup(bench), seed))
             print(f"{name:23} {seed:4} {before}  {after}  {true}  {said}", flush=True)
 
 

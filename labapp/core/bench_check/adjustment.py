@@ -8,7 +8,7 @@ variance 1, and a quantity that is known exactly has none.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 
@@ -28,8 +28,8 @@ the lens's ideal pattern, and the mirror from its ideal shape."""
 ROBUST = 3.0
 """Residuals beyond this many standard uncertainties count less than by their squares (soft L1)."""
 
-STEP = 1e-4
-"""Of the differences that derivatives are taken by, in usual standard uncertainties."""
+STEP = 1e-5
+"""Of the forward differences, in usual standard uncertainties."""
 
 ROUNDS, FEW_STEPS, MOST_STEPS = 12, 3, 40
 """Of tightening the robust loss; steps in each of them, and in the last."""
@@ -37,8 +37,12 @@ ROUNDS, FEW_STEPS, MOST_STEPS = 12, 3, 40
 SETTLED = 0.95
 """A scale of the residuals has settled that shrinks by no more than to this share."""
 
-DAMPING, MOST_DAMPED, CONVERGED = 1e-4, 1e6, 1e-5
-"""Of the steps: damping at first and at most; converged where the cost falls by a smaller share."""
+DAMPING, MOST_DAMPED = 1e-4, 1e6
+"""Of the steps: at first, and at most."""
+
+CONVERGED = 1e-3
+"""A step that the cost falls by less with is the last: unknowns move by 0.03 of their standard
+uncertainties."""
 
 PLACES = 9
 """Along X and Y, where a mirror whose place is free may be at first."""
@@ -208,14 +212,14 @@ class System:
         mirror = self.sightings[k].mirror
         return np.asarray(mirror.pose + mirror.sigma * unknown)
 
-    def pictured(self, k: int, offset: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """A sighting's dots on a plane whose picture is off, and what standardises residuals there.
+    def observed(self, k: int, offset: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """A sighting's dots on the plane with its picture off, and what whitens residuals there.
 
         The dots' noise is that of the picture: it does not shrink on a plane of another scale.
 
         Returns
         -------
-        plane_mm, root
+        plane_mm, whitening
             Shape (n, 2), mm; matrices that make residuals of unit variance, shape (n, 2, 2).
         """
         known, seen = self.rig.uncertainty, self.sightings[k].plane_mm
@@ -234,7 +238,7 @@ class System:
     def residual_mm(self, k: int, bench: FloatArray, pose: FloatArray) -> FloatArray:
         """Observed minus computed dots of a sighting, shape (n, 2), mm."""
         offset = self.factor @ bench
-        return np.asarray(self.pictured(k, offset)[0] - self.computed(k, offset, pose))
+        return np.asarray(self.observed(k, offset)[0] - self.computed(k, offset, pose))
 
     def residuals(self, unknown: FloatArray) -> FloatArray:
         """Standardised residuals of all sightings, shape (m,)."""
@@ -244,7 +248,7 @@ class System:
     def standardised(self, k: int, bench: FloatArray, pose: FloatArray) -> FloatArray:
         """Residuals of a sighting over their standard uncertainties, shape (2n,)."""
         offset = self.factor @ bench
-        return _standardised(*self.pictured(k, offset), self.computed(k, offset, pose))
+        return _standardised(*self.observed(k, offset), self.computed(k, offset, pose))
 
     def jacobian(self, unknown: FloatArray) -> FloatArray:
         """Their derivatives, shape (m, p): a pose moves the dots of its own mirror alone."""
@@ -252,34 +256,32 @@ class System:
         offset, used = self.factor @ bench, np.asarray(self.factor.any(axis=1))
         made = np.zeros((2 * sum(len(s.ray) for s in self.sightings), self.size))
         for k, (pose, part) in enumerate(zip(poses, self.parts[1:], strict=True)):
-            rows = self._rows(k)
+            rows, dots = self._rows(k), self.observed(k, offset)
             made[rows, self.parts[0]] = self.by_quantities(k, offset, pose, used) @ self.factor
-            pictured = self.pictured(k, offset)
-            made[rows, part] = _slopes(partial(self._posed, k, offset, *pictured), pose)
+            computed = partial(self.computed, k, offset)
+            still = _standardised(*dots, computed(pose))
+            for p, step in zip(range(part.start, part.stop), STEP * np.eye(len(pose)), strict=True):
+                made[rows, p] = (_standardised(*dots, computed(pose + step)) - still) / STEP
         return made
-
-    def _posed(
-        self, k: int, offset: FloatArray, seen_mm: FloatArray, root: FloatArray, pose: FloatArray
-    ) -> FloatArray:
-        """Residuals of a sighting over their standard uncertainties, at a pose, shape (2n,)."""
-        return _standardised(seen_mm, root, self.computed(k, offset, pose))
 
     def by_quantities(
         self, k: int, offset: FloatArray, pose: FloatArray, used: BoolArray
     ) -> FloatArray:
-        """Derivatives of a sighting's residuals by some quantities, shape (2n, q), the others' 0.
+        """Derivatives of a sighting's residuals by some quantities, shape (2n, q); 0 by the others.
 
         Quantities of the picture move the observed dots, all others the computed ones.
         """
-        pictured, computed = self.pictured(k, offset), self.computed(k, offset, pose)
-        still = _standardised(*pictured, computed)
+        dots, landed = self.observed(k, offset), self.computed(k, offset, pose)
+        still = _standardised(*dots, landed)
         made = np.zeros((len(still), len(QUANTITIES)))
         for q in np.flatnonzero(used):
             moved = offset.copy()
             moved[q] += (step := STEP * QUANTITIES[q].assumed)
-            dots = self.pictured(k, moved) if OF_PICTURE[q] else pictured
-            landed = computed if OF_PICTURE[q] else self.computed(k, moved, pose)
-            made[:, q] = (_standardised(*dots, landed) - still) / step
+            if OF_PICTURE[q]:
+                changed = _standardised(*self.observed(k, moved), landed)
+            else:
+                changed = _standardised(*dots, self.computed(k, moved, pose))
+            made[:, q] = (changed - still) / step
         return made
 
     def _rows(self, k: int) -> slice:
@@ -332,18 +334,19 @@ class System:
     def minimised(self, unknown: FloatArray, scale: float, steps: int) -> FloatArray:
         """Unknowns of least cost, with the dots' standard uncertainties times a scale.
 
-        By Levenberg and Marquardt's method, on the normal equations: the prior keeps them regular.
+        By Levenberg and Marquardt's method on the normal equations, which the prior keeps regular.
+        The Hessian of the robust loss ρ is approximated by Jᵀ(ρ′ + 2ρ″r²)J (Triggs et al. 2000,
+        Bundle adjustment – a modern synthesis, section 4.3); for soft L1 that is Jᵀρ′³J.
         """
         residual = self.residuals(unknown) / scale
         cost, damping = _cost(residual, unknown), DAMPING
         for _ in range(steps):
             jacobian = self.jacobian(unknown) / scale
             weight = soft_l1(residual**2)[1]
-            slope = jacobian.T @ (weight * residual) + unknown
-            # Second derivatives of the loss, not its weights alone: ρ′ + 2ρ″r² = ρ′³.
+            gradient = jacobian.T @ (weight * residual) + unknown
             normal = jacobian.T @ (weight[:, None] ** 3 * jacobian) + np.eye(self.size)
             while True:
-                step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), slope)
+                step = -np.linalg.solve(normal + damping * np.diag(np.diag(normal)), gradient)
                 tried = self.residuals(unknown + step) / scale
                 fall = cost - _cost(tried, unknown + step)
                 if fall > 0 or damping > MOST_DAMPED:
@@ -352,7 +355,7 @@ class System:
             if fall <= 0:
                 break
             unknown, residual, cost, damping = unknown + step, tried, cost - fall, damping / 10
-            if fall < CONVERGED * cost:
+            if fall < CONVERGED:
                 break
         return unknown
 
@@ -360,7 +363,7 @@ class System:
         """The result, with the covariances that follow from the normal equations."""
         standardised, jacobian = self.residuals(unknown), self.jacobian(unknown)
         square = (standardised / scale) ** 2
-        loss, weight, _ = soft_l1(square)
+        loss, weight = soft_l1(square)
         normal = np.eye(self.size) + jacobian.T @ (weight[:, None] * jacobian) / scale**2
         spread = np.linalg.inv(normal)
         bench, *poses = self.parts
@@ -383,32 +386,28 @@ class System:
         )
 
 
-def _standardised(plane_mm: FloatArray, root: FloatArray, computed_mm: FloatArray) -> FloatArray:
+def _standardised(
+    plane_mm: FloatArray, whitening: FloatArray, computed_mm: FloatArray
+) -> FloatArray:
     """Residuals over their standard uncertainties, shape (2n,)."""
-    made = (root @ (plane_mm - computed_mm)[..., None])[..., 0]
+    made = (whitening @ (plane_mm - computed_mm)[..., None])[..., 0]
     return np.where(np.isfinite(made), made, LOST).ravel()
 
 
 def _cost(residual: FloatArray, unknown: FloatArray) -> float:
+    """Sum of squares of residuals, robust, and of the unknowns."""
     return float(soft_l1(residual**2)[0].sum() + unknown @ unknown)
 
 
 def soft_l1(square: FloatArray) -> FloatArray:
-    """Robust loss of squared residuals and its first two derivatives, shape (3, m)."""
+    """Robust loss of squared residuals and its derivative, shape (2, m)."""
     root = np.sqrt(1 + square / ROBUST**2)
-    return np.stack([2 * ROBUST**2 * (root - 1), 1 / root, -1 / (2 * ROBUST**2 * root**3)])
+    return np.stack([2 * ROBUST**2 * (root - 1), 1 / root])
 
 
 def _spread(standardised: FloatArray) -> float:
     """Robust standard deviation of residuals about 0."""
     return float(1.4826 * np.median(np.abs(standardised)))
-
-
-def _slopes(function: Callable[[FloatArray], FloatArray], at: FloatArray) -> FloatArray:
-    """Derivatives, shape (m, p)."""
-    still = function(at)
-    columns = [(function(at + step) - still) / STEP for step in STEP * np.eye(len(at))]
-    return np.stack(columns, axis=1)
 
 
 def _places(sighting: Sighting, rig: Rig) -> list[FloatArray]:

@@ -1,0 +1,82 @@
+"""Derivatives and minimum of the bench check's adjustment, held against other methods."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import scipy
+
+from labapp.core.bench_check.adjustment import ROBUST, Sighting, System
+from labapp.core.bench_check.mirrors import Cap, Mirror, Plate
+from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
+from labapp.core.geometry.uncertainty import AxisPoints, RigUncertainty, covariance_of
+from labapp.core.values import FloatArray
+from labapp.simulation.benches import BenchErrors, draw_bench
+from labapp.simulation.camera import CameraView
+from labapp.simulation.forward import PoolSurface, trace
+from labapp.simulation.mirrors import FlatMirror
+from labapp.simulation.pools import spherical_cap
+
+VIEW = CameraView.rolled((0.74, 558.26), 4.7)
+CALIBRATION = ImageCalibration.from_three_points(
+    VIEW.origin_px, VIEW.x_axis_px, VIEW.x_axis_mm, VIEW.z_axis_px, VIEW.z_axis_mm
+)
+COVARIANCE, ASSUMED = covariance_of({}, has_glass=True)
+RIG = Rig(
+    Laser(31.14, 31.48),
+    DotPattern(),
+    Electrode(500.0),
+    replace(ImagingPlane.vertical(50.0, 45.0, 3.0), glass_mm=3.0),
+    RigUncertainty(AxisPoints(CALIBRATION, VIEW.x_axis_mm, VIEW.z_axis_mm), COVARIANCE, ASSUMED),
+)
+MIRRORS: tuple[tuple[Mirror, PoolSurface], ...] = (
+    (Plate(), FlatMirror(0.01, 0.001, -0.001)),
+    (Cap(9.75, 0.91), spherical_cap(9.75, 0.91, (0.2, -0.1))),
+)
+
+
+def system(gross_mm: float = 0.0) -> System:
+    """Equations of a bench that is off, some of its dots by a gross error."""
+    rng = np.random.default_rng(18)
+    bench = draw_bench(RIG, VIEW, BenchErrors(), rng)
+    sightings = []
+    for mirror, surface in MIRRORS:
+        made = trace(surface, bench.rig)
+        ray = np.argwhere(made.visible)
+        place = bench.view.to_image(made.plane_mm[made.visible])
+        dots = CALIBRATION.to_plane(place + rng.normal(0, 0.12, place.shape))
+        dots[::17] += gross_mm
+        covariance = np.tile(0.026**2 * np.eye(2), (len(ray), 1, 1))
+        sightings.append(Sighting(mirror, ray, dots, covariance))
+    return System.of(RIG, sightings, None)
+
+
+def test_derivatives_are_those_by_central_differences() -> None:
+    of = system()
+    at = np.random.default_rng(1).normal(0, 0.5, of.size)
+    at[-4:] *= 0.02  # the cap stays where rays meet it
+    steps = 1e-3 * np.eye(of.size)
+    central = np.array([(of.residuals(at + s) - of.residuals(at - s)) / 2e-3 for s in steps]).T
+    scale = np.abs(central).max(axis=0)
+    np.testing.assert_allclose(of.jacobian(at) / scale, central / scale, atol=5e-5)
+    assert (scale[np.flatnonzero(of.factor.any(axis=0))] > 0.1).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("gross_mm", [0.0, 0.5])
+def test_another_method_finds_no_lower_cost(gross_mm: float) -> None:
+    of = system(gross_mm)
+
+    def roots(x: FloatArray) -> FloatArray:
+        """Square roots of the terms of the cost, with the residuals' signs."""
+        residual = of.residuals(x)
+        loss = 2 * ROBUST**2 * (np.sqrt(1 + residual**2 / ROBUST**2) - 1)
+        return np.append(np.copysign(np.sqrt(loss), residual), x)
+
+    made = of.minimised(of.start(), 1.0, 40)
+    found = scipy.optimize.least_squares(roots, made, max_nfev=10)
+    assert roots(made) @ roots(made) == pytest.approx(2 * found.cost, abs=0.01)
+    np.testing.assert_allclose(made, found.x, atol=0.05)
