@@ -14,7 +14,7 @@ from scipy import signal
 from labapp.core.dynamics.weld_series import WeldSeries
 from labapp.core.values import FloatArray
 
-FEATURES = ("width_mm", "length_mm", "convexity_mm")
+FEATURES, TARGET = ("width_mm", "length_mm", "convexity_mm"), "back_width_mm"
 
 RATE_HZ, DURATION_S, CURRENT_S = 30.0, 20.0, 2.5
 """Frames a second, length of a weld, and how long a current lasts."""

@@ -11,7 +11,7 @@ Noise" (NIPS 2011): Σ (∂g/∂x_d · σ_d)² is added to the variance.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
@@ -87,6 +87,16 @@ class Prediction(ReadOnlyArrays):
     sigma: FloatArray
     is_outside: BoolArray
 
+    @property
+    def low_95(self) -> FloatArray:
+        """Lower end of the 95 % interval, never below 0, mm."""
+        return np.asarray(np.maximum(self.value - SURE_95 * self.sigma, 0.0))
+
+    @property
+    def high_95(self) -> FloatArray:
+        """Upper end of the 95 % interval, mm."""
+        return np.asarray(self.value + SURE_95 * self.sigma)
+
 
 @dataclass(frozen=True)
 class PenetrationModel(ReadOnlyArrays):
@@ -110,6 +120,8 @@ class PenetrationModel(ReadOnlyArrays):
         Standard deviation of what features do not explain.
     factor
         What ± is multiplied by, from the errors of welds that were left out.
+    rmse_mm
+        Root mean square of those errors; NaN where there are none.
     """
 
     kind: Kind
@@ -123,6 +135,7 @@ class PenetrationModel(ReadOnlyArrays):
     static: LinearMap | GaussianMap
     scatter_mm: float
     factor: float = 1.0
+    rmse_mm: float = float("nan")
 
     @cached_property
     def response(self) -> FloatArray:
@@ -301,12 +314,22 @@ class LeftOut(ReadOnlyArrays):
 
 
 def validated_model(
-    welds: Sequence[WeldSeries], kind: Kind, settings: ModelSettings
+    welds: Sequence[WeldSeries],
+    kind: Kind,
+    settings: ModelSettings,
+    progress: Callable[[int, int], object] = lambda _done, _of: None,
 ) -> tuple[PenetrationModel, LeftOut]:
     """Fit a model, and predict each weld by one of the others.
 
     Its ± is multiplied so that the mean square of those errors is explained, if it is more than
     the ± says: sections of one weld are not independent.
+
+    Parameters
+    ----------
+    welds, kind, settings
+        As of `fit_model`.
+    progress
+        Called with how many fits are done, and of how many; may raise to stop.
 
     Raises
     ------
@@ -322,7 +345,8 @@ def validated_model(
     model = fit_model(used, kind, settings)
     names: list[str] = []
     parts = []
-    for one in used:
+    for done, one in enumerate(used, 1):
+        progress(done, len(used) + 1)
         others = [each for each in used if each is not one]
         found = fit_model(others, kind, settings, like=model).predict(one)
         cut = np.isfinite(one.target) & np.isfinite(found.value)
@@ -336,4 +360,5 @@ def validated_model(
     )
     square = (left.predicted - left.measured) ** 2 - left.measured_sigma**2
     factor = float(np.sqrt(max(square.sum() / (left.sigma**2).sum(), 1.0)))
-    return replace(model, factor=factor), replace(left, sigma=factor * left.sigma)
+    model = replace(model, factor=factor, rmse_mm=left.rmse_mm)
+    return model, replace(left, sigma=factor * left.sigma)

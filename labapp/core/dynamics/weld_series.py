@@ -16,6 +16,9 @@ MOST_HELD = 5
 MOST_STEPS = 1_000_000
 """Steps of a weld at most."""
 
+LONGEST_MEMORY = 10_000
+"""Steps that a prediction depends on at most."""
+
 HOLD_S = 0.3
 """For so long a state lasts at least: what is shorter is noise about the limit."""
 
@@ -52,6 +55,8 @@ class WeldSeries(ReadOnlyArrays):
 def in_steps(weld: WeldSeries, step_s: float) -> WeldSeries:
     """Mean over each even step; one without frames has the features before it, for `MOST_HELD`.
 
+    From the first frame with all features to the last of all frames.
+
     Raises
     ------
     ValueError
@@ -61,7 +66,7 @@ def in_steps(weld: WeldSeries, step_s: float) -> WeldSeries:
     if not there.any():
         raise ValueError(f"{weld.name} has no frame with all features")
     time_s, value = weld.time_s[there], weld.value[there]
-    low, high = np.floor(time_s[[0, -1]] / step_s + 1e-9)
+    low, high = np.floor(np.array([time_s[0], weld.time_s[-1]]) / step_s + 1e-9)
     if high - low >= MOST_STEPS:
         raise ValueError(f"{weld.name} has more than {MOST_STEPS} steps of {step_s:g} s")
     count = int(high - low) + 1
