@@ -31,6 +31,7 @@ from labapp.cli import (
     fold,
     lines,
     pattern,
+    penetration,
     reconstruct,
     session,
     simulate,
@@ -93,6 +94,7 @@ calibrate.command("fold")(fold.calibrate_fold)
 app.add_typer(analyze.app, name="analyze")
 app.add_typer(session.app, name="session")
 app.add_typer(study.app, name="study")
+app.add_typer(penetration.app, name="penetration")
 app.command()(simulate.simulate)
 app.command()(advise.advise)
 app.command()(cameras.cameras)

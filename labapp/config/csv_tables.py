@@ -5,11 +5,15 @@ from __future__ import annotations
 import csv
 import itertools
 import math
-from collections.abc import Iterator
+from array import array
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TextIO
 
+import numpy as np
+
+from labapp.core.values import FloatArray
 from labapp.errors import InputError
 
 LONGEST_LINE = 1 << 14
@@ -73,3 +77,45 @@ def parse_number(cell: str, separator: str) -> float | None:
     except ValueError:
         return None
     return value if math.isfinite(value) else None
+
+
+def read_columns(
+    path: Path, wanted: str, largest: int, words: Collection[str] = ()
+) -> dict[str, list[str] | FloatArray]:
+    """Columns of a table by name; the separator is a comma, a semicolon or a tabulator.
+
+    Parameters
+    ----------
+    path, wanted, largest
+        As of `open_table`.
+    words
+        Names of columns of text; all others are numbers, NaN where a cell is empty.
+
+    Raises
+    ------
+    InputError
+        If it cannot be read, names are missing or twice, or a cell is no number.
+    """
+    with open_table(path, wanted, largest) as file:
+        lines = bounded_lines(path, file, wanted)
+        head = next(lines, "")
+        separator = max(",;\t", key=head.count)
+        names = [cell.strip() for cell in next(csv.reader([head], delimiter=separator), [])]
+        if not all(names) or len(set(names)) < len(names) or not names:
+            raise InputError(path, "line 1", head.strip() or "empty", f"a name a column: {wanted}")
+        texts: dict[str, list[str]] = {name: [] for name in names if name in words}
+        numbers = {name: array("d") for name in names if name not in words}
+        for line, cells in enumerate(csv.reader(lines, delimiter=separator), 2):
+            if not any(cells):
+                continue
+            if len(cells) != len(names):
+                raise InputError(path, f"line {line}", f"{len(cells)} cells", f"{len(names)}")
+            for name, cell in zip(names, map(str.strip, cells), strict=True):
+                if name in texts:
+                    texts[name].append(cell)
+                    continue
+                value = parse_number(cell, separator) if cell else math.nan
+                if value is None:
+                    raise InputError(path, f"line {line}, {name}", cell, "a number")
+                numbers[name].append(value)
+    return {name: texts[name] if name in texts else np.array(numbers[name]) for name in names}

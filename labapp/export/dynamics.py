@@ -21,6 +21,7 @@ from labapp.core.surface.surface import Surface
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
 from labapp.export.frame_result import FrameResult
+from labapp.export.tables import SHAPE_COLUMNS, Table
 from labapp.text import csv_text
 
 if TYPE_CHECKING:
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 
     from labapp.export.rendering.scene import Scene
 
-SHAPES = ("convexity_mm", "asymmetry", "wetting_slope_deg")
+SHAPES = tuple(column.name for column in SHAPE_COLUMNS)
 SERIES = (*SIZES, *SHAPES)
 """Series whose spectra can be made, and that are written."""
 
@@ -61,6 +62,12 @@ def measured_of(results: Iterable[FrameResult]) -> Iterator[Measured]:
             if one.time_s is None:
                 raise no_time_base()
             yield one.frame, one.time_s, made.unbounded, made.boundary, vars(sizes)
+
+
+def shape_row(made: Reconstruction | None) -> Table:
+    """The columns `SHAPE_COLUMNS` of one frame; NaN without a surface."""
+    shape = None if made is None else shape_of(made.unbounded, made.boundary)
+    return {name: np.array([getattr(shape, name, np.nan)]) for name in SHAPES}
 
 
 def no_time_base() -> InputError:

@@ -135,6 +135,13 @@ TABLES: dict[str, tuple[Column, ...]] = {
 }
 """The tables and their columns, in the order in which a frame is written to them."""
 
+SHAPE_COLUMNS = (
+    Column("convexity_mm", "mean height of the longitudinal section through the middle"),
+    Column("asymmetry", "volume right of that section minus that left of it, over both"),
+    Column("wetting_slope_deg", "angle of the surface at the boundary, rising inwards"),
+)
+"""The shape of the surface (`core.dynamics.shape.Shape`)."""
+
 _NAMES = {name: [column.name for column in columns] for name, columns in TABLES.items()}
 _MEASURED = {field.name for field in fields(Measures)}
 SIZES = [c.name for c in TABLES["measures"] if c.name in _MEASURED and not c.is_part]

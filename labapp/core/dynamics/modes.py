@@ -28,11 +28,14 @@ MODES = ((0, 1), (1, 1), (2, 1), (0, 2))
 RINGS, SPOKES = 12, 32
 
 _NODE, _WEIGHT = np.polynomial.legendre.leggauss(RINGS)
+RING_WEIGHT = _WEIGHT / 2
+"""Weight of each ring in a mean along a radius, shape (RINGS,)."""
+
 RHO = np.repeat((_NODE + 1) / 2, SPOKES)
 PHI = np.tile(2 * np.pi * np.arange(SPOKES) / SPOKES, RINGS)
 """The nodes of the unit disk, shape (k,): rings outwards, counter-clockwise from +X."""
 
-DISK_WEIGHT = RHO * np.repeat(_WEIGHT / 2, SPOKES) * 2 * np.pi / SPOKES
+DISK_WEIGHT = RHO * np.repeat(RING_WEIGHT, SPOKES) * 2 * np.pi / SPOKES
 """Area that each node stands for on the unit disk, shape (k,); the sum is π."""
 
 POD_MODES = 4

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from labapp.core.dynamics.modes import DISK_WEIGHT, PHI, RINGS, SPOKES, disk_nodes
+from labapp.core.dynamics.modes import DISK_WEIGHT, PHI, RING_WEIGHT, RINGS, SPOKES, disk_nodes
 from labapp.core.surface.boundary import Boundary
 from labapp.core.surface.surface import Surface
 from labapp.core.values import FloatArray
@@ -50,8 +50,7 @@ def shape_of(surface: Surface, boundary: Boundary) -> Shape:
     volume = np.abs(height) * DISK_WEIGHT * np.tile(_reach(nodes) ** 2, RINGS)
     right = np.cos(PHI)
     sides = np.sum(volume[right > 1e-9]), np.sum(volume[right < -1e-9])
-    rings = np.polynomial.legendre.leggauss(RINGS)[1] / 2
-    along = height.reshape(RINGS, SPOKES)[:, [SPOKES // 4, 3 * SPOKES // 4]].T @ rings
+    along = height.reshape(RINGS, SPOKES)[:, [SPOKES // 4, 3 * SPOKES // 4]].T @ RING_WEIGHT
     reach = _reach(nodes)[[SPOKES // 4, 3 * SPOKES // 4]]
     outline = boundary.points_mm[:, :2]
     tangent = (np.roll(outline, -1, axis=0) - np.roll(outline, 1, axis=0)) / 2

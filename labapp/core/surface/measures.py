@@ -138,7 +138,7 @@ DEPTH = SIZES.index("depth_mm")
 def sigma_name(name: str, part: str = "") -> str:
     """Name of a size's standard uncertainty, or of a part of it: ``width_sigma_level_mm``."""
     size, _, unit = name.rpartition("_")
-    return "_".join(filter(None, (size, "sigma", part, unit)))
+    return "_".join(filter(None, (size, "sigma", part, unit) if size else (unit, "sigma", part)))
 
 
 @cache

@@ -2,7 +2,7 @@
 
 ::
 
-    measures.parquet/NAME.parquet    a row a frame: recording, conditions, columns of measures.csv
+    measures.parquet/NAME.parquet    a row a frame: recording, conditions, `plan.COLUMNS`
     surfaces.zarr/NAME               z_mm(frame, y, x), where surfaces were kept
     recordings.csv                   a row a recording: state, problem, frames, means and ±
     summary.csv                      a row a condition: means, ±, scatter between recordings
@@ -33,10 +33,10 @@ from labapp.core.recording.residual_check import (
 from labapp.core.surface.measures import SIZES, sigma_name
 from labapp.errors import InputError, os_errors_as_input
 from labapp.export.meshes import SPACING_MM
-from labapp.export.tables import MM_DIGITS, TABLES, Table, number
+from labapp.export.tables import MM_DIGITS, Table, number
 from labapp.files import as_bytes, atomic_file, write_file
 from labapp.run.study.page import summary_page
-from labapp.run.study.plan import Condition, StudyPlan
+from labapp.run.study.plan import COLUMNS, Condition, StudyPlan
 from labapp.run.study.status import RecordingStatus, Tasks
 from labapp.run.study.stretches import ROOM, StretchFile
 from labapp.run.study.summary import (
@@ -95,7 +95,7 @@ def write_results(
         dataset.mkdir(exist_ok=True)
         for known, tasks in parts:
             status, name = known, known.recording.name
-            table, verdict = (None, None) if tasks is None else _assembled(tasks)
+            table, verdict = (None, None) if tasks is None else assembled(tasks)
             file = dataset / f"{name}.parquet"
             if tasks is None or table is None:
                 file.unlink(missing_ok=True)
@@ -136,7 +136,7 @@ def _counted(status: RecordingStatus, frames: int) -> RecordingStatus:
     return replace(status, state="part" if frames else "waiting", frames_done=frames)
 
 
-def _assembled(tasks: Tasks) -> tuple[Table | None, SetupVerdict | None]:
+def assembled(tasks: Tasks) -> tuple[Table | None, SetupVerdict | None]:
     """All rows of a recording as far as it is measured, and what they say of the set-up.
 
     A damaged file is deleted, so that its stretch is measured again.
@@ -206,7 +206,7 @@ def _write_parquet(
         cell = None if value is None else float(value) if condition in numbers else str(value)
         columns.append(pa.array([cell] * count, kind))
         fields.append(_field(condition, kind, "", "condition"))
-    for column in TABLES["measures"]:
+    for column in COLUMNS:
         values = table[column.name]
         kind = {"i": pa.int64(), "f": pa.float64()}.get(values.dtype.kind, pa.string())
         columns.append(

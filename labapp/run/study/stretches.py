@@ -31,18 +31,20 @@ from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.surface.spline import SplineBasis, SplineSurface
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
+from labapp.export.dynamics import shape_row
 from labapp.export.meshes import SPACING_MM, refuse_too_large
-from labapp.export.tables import TABLES, Table, frame_tables
+from labapp.export.tables import Table, frame_tables
 from labapp.files import as_bytes, write_atomically
 from labapp.media import open_source
 from labapp.media.identity import identify, stamp
 from labapp.run import measurers
 from labapp.run.measurers import ColdMeasurer, WarmMeasurer
 from labapp.run.runner import Measurer
+from labapp.run.study.plan import COLUMNS
 from labapp.system import sync_folder
 from labapp.version import VERSION
 
-FORMAT = 1
+FORMAT = 2
 """Of the files; raised when a new program cannot use old ones."""
 
 KEPT_RESIDUALS = 2 * MOST
@@ -251,7 +253,8 @@ def _measured(stretch: Stretch, measurer: Measurer) -> bytes:
     residuals: list[tuple[int, Residuals]] = []
     surfaces: list[tuple[int, FloatArray, tuple[int, int]]] = []
     for result in measurer(stretch.frames):
-        rows.append(frame_tables(result, stretch.setup.calibration)["measures"])
+        measures = frame_tables(result, stretch.setup.calibration)["measures"]
+        rows.append(measures | shape_row(result.measurement.reconstruction))
         kept = Residuals.of(result.measurement) if result.frame in stretch.kept else None
         if kept is not None:
             residuals.append((result.frame, kept))
@@ -259,7 +262,7 @@ def _measured(stretch: Stretch, measurer: Measurer) -> bytes:
         if stretch.surfaces and surface is not None:
             surfaces.append((result.frame, *_grid(surface)))
     arrays: dict[str, npt.NDArray[Any]] = {"key": np.array(stretch.key)}
-    for column in TABLES["measures"]:
+    for column in COLUMNS:
         values = np.concatenate([row[column.name] for row in rows])
         arrays[f"measures/{column.name}"] = values.astype(str) if values.dtype == object else values
     for frame, one in residuals:
@@ -322,8 +325,8 @@ class StretchFile:
         return found
 
     def measures(self) -> Table:
-        """The columns of `measures.csv`, a row a frame."""
-        table = {c.name: self._array(f"measures/{c.name}") for c in TABLES["measures"]}
+        """The columns `plan.COLUMNS`, a row a frame."""
+        table = {c.name: self._array(f"measures/{c.name}") for c in COLUMNS}
         frames = table["frame"].tolist()
         if frames != list(self._frames) or any(len(v) != len(frames) for v in table.values()):
             raise ValueError("rows are missing")

@@ -28,6 +28,7 @@ from labapp.run.study.workers import Job, Workers, dask_workers, local_workers, 
 from labapp.version import VERSION
 
 if TYPE_CHECKING:
+    from labapp.export.tables import Table
     from labapp.run.study.summary import StudySummary
 
 MARKER = "study.json"
@@ -219,6 +220,26 @@ class Study:
                 path.unlink(missing_ok=True)
 
     # --- results --------------------------------------------------------------------------------
+
+    def tables(self) -> dict[str, Table]:
+        """Sizes and shape of all frames, ``plan.COLUMNS``, of each recording that has results.
+
+        Raises
+        ------
+        InputError
+            If the study is being run.
+        """
+        from labapp.run.study.results import assembled
+
+        found = {}
+        with self._alone():
+            for one in self.plan.recordings:
+                with suppress(InputError):  # the status says so
+                    tasks = self.tasks(one)
+                    table = None if tasks is None else assembled(tasks)[0]
+                    if table is not None:
+                        found[one.name] = table
+        return found
 
     def results(self, *, surfaces: bool = False) -> StudySummary:
         """Put together what is measured, and write it: tables, a summary, surfaces.

@@ -1,0 +1,348 @@
+"""Penetration models in files, their predictions as tables, and their ONNX graph.
+
+A model's file is JSON with numbers and a few words; nothing in it is ever executed.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Collection, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from labapp.core.dynamics.penetration import ModelSettings, PenetrationModel, Prediction
+from labapp.core.dynamics.static_maps import MOST_POINTS, GaussianMap, LinearMap
+from labapp.core.dynamics.weld_series import LONGEST_MEMORY, MOST_HELD, Orders, WeldSeries
+from labapp.core.surface.measures import SIZES, sigma_name
+from labapp.core.values import FloatArray
+from labapp.errors import InputError, os_errors_as_input
+from labapp.export.dynamics import SERIES, SHAPES, shape_row
+from labapp.export.features import as_cell, needs_extra, weld_series
+from labapp.export.frame_result import FrameResult
+from labapp.files import as_bytes, write_file
+from labapp.text import csv_text
+from labapp.version import VERSION
+
+FORMAT = 1
+
+LARGEST = 1 << 25
+"""Bytes of a model's file at most."""
+
+WANTED = "a penetration model, as `labapp penetration fit` writes it"
+
+OPSET, IR_VERSION = 17, 8
+"""Of ONNX graphs: old enough for runtimes of 2022."""
+
+
+# --- files --------------------------------------------------------------------------------------
+
+
+def write_model(path: Path, model: PenetrationModel) -> None:
+    """Write a model as JSON.
+
+    Raises
+    ------
+    InputError
+        If it cannot be written.
+    """
+    settings, static = model.settings, model.static
+    content = {
+        "program": "labapp",
+        "version": VERSION,
+        "format": FORMAT,
+        "kind": model.kind,
+        **vars(settings),
+        "orders": vars(settings.orders),
+        **{key: getattr(model, key) for key in ("time_constants_s", *ARRAYS, *NUMBERS)},
+        "static": vars(static) if isinstance(static, LinearMap) else _fields(static),
+    }
+    write_file(path, as_bytes(json.dumps(content, default=_listed, indent=1) + "\n"))
+
+
+ARRAYS = ("center", "scale", "low", "high")
+NUMBERS = ("mean_mm", "scatter_mm", "factor", "rmse_mm")
+
+
+def _fields(static: GaussianMap) -> dict[str, Any]:
+    """Its fields, without what is kept of earlier calls."""
+    return {name: getattr(static, name) for name in GaussianMap.__dataclass_fields__}
+
+
+def _listed(value: Any) -> Any:
+    return value.tolist()
+
+
+def read_model(path: Path) -> PenetrationModel:
+    """Read a model that `write_model` wrote.
+
+    Raises
+    ------
+    InputError
+        If it is none, or anything in it is impossible.
+    """
+    with os_errors_as_input(path, "file", WANTED):
+        size = path.stat().st_size
+        if size > LARGEST:
+            raise InputError(path, "size", f"{size} bytes", f"at most {LARGEST} bytes")
+        content = path.read_bytes()
+    try:
+        read = json.loads(content)
+        if read["program"] != "labapp" or read["format"] != FORMAT:
+            raise InputError(path, "format", read["format"], f"{FORMAT}, of this labapp")
+        return _model(read)
+    except InputError:
+        raise
+    except (ValueError, TypeError, LookupError, ArithmeticError, RecursionError) as error:
+        raise InputError(path, "content", f"{type(error).__name__}: {error}", WANTED) from error
+
+
+def _model(read: Mapping[str, Any]) -> PenetrationModel:
+    """The model that a file's content describes; raises `ValueError` and others if it is none."""
+    orders = Orders(*(_whole(read["orders"], name) for name in ("poles", "lags", "delay")))
+    features = tuple(map(str, read["features"]))
+    constants = tuple(map(float, read["time_constants_s"]))
+    full = read["full_mm"]
+    step_s = float(read["step_s"])
+    _check(0 < len(set(features)) == len(features) and set(features) <= set(SERIES), "features")
+    _check(1e-4 <= step_s <= 100 and len(constants) == orders.poles <= 2, "step or poles")
+    _check(all(0 < one <= 1000 for one in constants), "time constants")
+    memory = 8 * sum(constants) / step_s + orders.delay + orders.lags
+    _check(orders.lags >= 1 and memory <= LONGEST_MEMORY, "orders")
+    _check(full is None or 0 < float(full) < 1e6, "full_mm")
+    target = str(read["target"])
+    _check(target.replace("_", "").isalnum() and len(target) <= 50, "target")
+    width = orders.lags * len(features)
+    given = read["static"]
+    static: LinearMap | GaussianMap
+    if read["kind"] == "arx":
+        static = LinearMap(
+            _array(given["weights"], width + 1), _array(given["covariance"], width + 1, width + 1)
+        )
+    else:
+        _check(read["kind"] == "gp", "kind")
+        count = len(given["values"])
+        _check(0 < count <= MOST_POINTS, "points")
+        values, variances = (_array(given[key], count) for key in ("values", "variances"))
+        lengths, signal = _array(given["lengths"], width), float(given["signal"])
+        static = GaussianMap(
+            _array(given["points"], count, width), values, variances, lengths, signal
+        )
+        _check(bool((variances > 0).all() and (lengths > 0).all() and 0 < signal < 1e12), "kernel")
+        _check(bool(np.isfinite(static.weights).all()), "kernel")
+    center, scale, low, high = (_array(read[key], width) for key in ARRAYS)
+    mean, *others = (float(read[key]) for key in NUMBERS)
+    _check(bool((scale > 0).all()), "scale")
+    _check(all(0 <= one < 1e12 for one in (mean, *others)), "numbers")
+    settings = ModelSettings(
+        features, target, step_s, orders, None if full is None else float(full)
+    )
+    return PenetrationModel(
+        read["kind"], settings, constants, center, scale, low, high, mean, static, *others
+    )
+
+
+def _check(is_right: bool, what: str) -> None:
+    if not is_right:
+        raise ValueError(f"impossible {what}")
+
+
+def _whole(of: Mapping[str, Any], name: str) -> int:
+    value = of[name]
+    _check(type(value) is int and 0 <= value <= LONGEST_MEMORY, name)
+    return int(value)
+
+
+def _array(values: Any, *shape: int) -> FloatArray:
+    found = np.array(values, float)
+    _check(found.shape == shape and bool((np.abs(found) < 1e12).all()), "shape or number")
+    return found
+
+
+# --- predictions --------------------------------------------------------------------------------
+
+
+def prediction_csv(name: str, model: PenetrationModel, found: Mapping[str, Prediction]) -> str:
+    """Predictions of recordings as CSV; every column of the model's is marked as such.
+
+    Parameters
+    ----------
+    name
+        Of the model.
+    found
+        By the recording's name.
+    """
+    target = f"model_{model.settings.target}"
+    ends = (f"model_low_95_{_unit(target)}", f"model_high_95_{_unit(target)}")
+    rows: list[list[str]] = [
+        ["recording", "time_s", target, sigma_name(target), *ends, "model_status", "model"]
+    ]
+    for recording, one in found.items():
+        columns = one.time_s, one.value, one.sigma, one.low_95, one.high_95
+        for values, outside in zip(np.column_stack(columns), one.is_outside, strict=True):
+            status = "extrapolated" if outside else "ok" if np.isfinite(values[1]) else "unknown"
+            rows.append([recording, *map(as_cell, values.tolist()), status, name])
+    return csv_text(rows)
+
+
+def _unit(name: str) -> str:
+    return name.rpartition("_")[2]
+
+
+class Predictor:
+    """Predicts while frames come, step by step, what `PenetrationModel.predict` gives for them all.
+
+    Parameters
+    ----------
+    name
+        Of the model.
+    model
+        The model.
+    """
+
+    def __init__(self, name: str, model: PenetrationModel) -> None:
+        self.name, self.model = name, model
+        self.newest = (math.nan, math.nan, False)
+        """Penetration and ± at the last step that has ended, mm; whether it is extrapolated."""
+        self._frames: list[WeldSeries] = []
+        self._step = -(1 << 62)
+
+    def add(self, result: FrameResult) -> None:
+        """Take the next frame.
+
+        Raises
+        ------
+        InputError
+            If it has no time.
+        """
+        if result.time_s is None:
+            right = "a recording that has a time base"
+            raise InputError("--model", "time", "unknown", right)
+        step_s = self.model.settings.step_s
+        step = math.floor(result.time_s / step_s + 1e-9)
+        if step != self._step:
+            self._end_step(step)
+        self._frames.append(frame_features(result, self.model.settings.features))
+
+    def _end_step(self, step: int) -> None:
+        """Predict the step that ends, and forget frames that no prediction needs any more."""
+        settings = self.model.settings
+        self.newest = (math.nan, math.nan, False)
+        if any(np.isfinite(one.value).all() for one in self._frames):
+            # Steps without a frame at the end are held, too.
+            until = self._empty((step - 0.5) * settings.step_s)
+            found = self.model.predict(joined([*self._frames, until]))
+            last = float(found.value[-1]), float(found.sigma[-1]), bool(found.is_outside[-1])
+            self.newest = last
+        first = (step - self.model.memory - MOST_HELD - 1) * settings.step_s
+        self._frames = [one for one in self._frames if one.time_s[0] >= first]
+        self._step = step
+
+    def _empty(self, time_s: float) -> WeldSeries:
+        none = np.full((1, len(self.model.settings.features)), np.nan)
+        return WeldSeries("", np.array([time_s]), none, none, none, none[:, 0], none[:, 0])
+
+    def values(self) -> dict[str, float | str | None]:
+        """The newest prediction as values of a stream (`streams.PENETRATION`)."""
+        value, sigma = (each if math.isfinite(each) else None for each in self.newest[:2])
+        words = f"{self.name} {self.model.settings.target}" + " extrapolated" * self.newest[2]
+        return {"penetration_mm": value, "penetration_sigma_mm": sigma, "penetration_model": words}
+
+
+def frame_features(result: FrameResult, features: Collection[str]) -> WeldSeries:
+    """Features of one frame, a series of length 1; NaN without a surface."""
+    found = result.measurement
+    sizes = vars(found.measures) if found.measures else dict.fromkeys(SIZES, math.nan)
+    columns = {name: np.array([value]) for name, value in sizes.items()}
+    if not set(SHAPES).isdisjoint(features):
+        columns |= shape_row(found.reconstruction)
+    time_s = np.array([math.nan if result.time_s is None else result.time_s])
+    return weld_series("", time_s, columns, tuple(features))
+
+
+def joined(parts: Iterable[WeldSeries], name: str = "") -> WeldSeries:
+    """Series that follow on each other as one."""
+    columns = zip(*(list(vars(one).values())[1:] for one in parts), strict=True)
+    return WeldSeries(name, *(np.concatenate(column) for column in columns))
+
+
+# --- ONNX ---------------------------------------------------------------------------------------
+
+
+def write_onnx(path: Path, model: PenetrationModel) -> None:
+    """Write a model's value as an ONNX graph of plain operators (float64).
+
+    Input ``features``, shape (memory, k): mean of each step up to the present, oldest first, in the
+    order of the metadata ``features``. Output ``value``, shape (1,), mm. The ± is not in it.
+
+    Raises
+    ------
+    InputError
+        If it cannot be written, or the package onnx is missing.
+    """
+    try:
+        import onnx
+        from onnx import TensorProto, helper, numpy_helper
+    except ImportError as error:
+        raise needs_extra("onnx") from error
+    settings, static = model.settings, model.static
+    orders, width = settings.orders, len(settings.features)
+    kernel = np.zeros((orders.lags, model.memory))
+    for lag in range(orders.lags):
+        end = model.memory - orders.delay - lag
+        kernel[lag, end - len(model.response) : end] = model.response[::-1]
+    constants: dict[str, Any] = {
+        "kernel": kernel,
+        "row": np.array([1, orders.lags * width]),
+        "center": model.center,
+        "scale": model.scale,
+        "mean": np.array([model.mean_mm]),
+    }
+    nodes = [
+        ("MatMul", "kernel features", "filtered"),
+        ("Reshape", "filtered row", "regressors"),
+        ("Sub", "regressors center", "centred"),
+        ("Div", "centred scale", "x"),
+    ]
+    if isinstance(static, LinearMap):
+        constants |= {"weights": static.weights[:-1, None], "constant": static.weights[-1:]}
+        nodes += [("MatMul", "x weights", "product"), ("Add", "product constant", "sum")]
+    else:
+        constants |= {
+            "points": static.points,
+            "lengths": static.lengths,
+            "one": np.ones((static.points.shape[1], 1)),
+            "half": np.array([-0.5]),
+            "weights": static.signal * static.weights[None, :],
+        }
+        nodes += [
+            ("Sub", "x points", "difference"),
+            ("Div", "difference lengths", "distance"),
+            ("Mul", "distance distance", "square"),
+            ("MatMul", "square one", "squares"),
+            ("Mul", "squares half", "exponent"),
+            ("Exp", "exponent", "covariance"),
+            ("MatMul", "weights covariance", "sum"),
+        ]
+    constants["flat"] = np.array([1])
+    nodes += [
+        ("Reshape", "sum flat", "deviation"),
+        ("Add", "deviation mean", "signed"),
+        ("Relu", "signed", "value"),
+    ]
+    real = TensorProto.DOUBLE
+    graph = helper.make_graph(
+        [helper.make_node(kind, given.split(), [out]) for kind, given, out in nodes],
+        "penetration",
+        [helper.make_tensor_value_info("features", real, [model.memory, width])],
+        [helper.make_tensor_value_info("value", real, [1])],
+        [numpy_helper.from_array(np.asarray(of), name) for name, of in constants.items()],
+    )
+    made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)])
+    made.ir_version = IR_VERSION
+    facts = {"features": " ".join(settings.features), "step_s": f"{settings.step_s:g}"}
+    helper.set_model_props(made, {**facts, "target": settings.target, "program": "labapp"})
+    onnx.checker.check_model(made)
+    write_file(path, made.SerializeToString())

@@ -1,0 +1,108 @@
+"""Welds with a known law of penetration: what the current does to pool and back side.
+
+The pool follows the current as a first-order lag. Above a limit it melts through: a back-side bead
+appears, the pool sinks, and width, length and convexity tell of it, as in GTA welds of thin plates.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import signal
+
+from labapp.core.dynamics.weld_series import WeldSeries
+from labapp.core.values import FloatArray
+
+FEATURES, TARGET = ("width_mm", "length_mm", "convexity_mm"), "back_width_mm"
+
+RATE_HZ, DURATION_S, CURRENT_S = 30.0, 20.0, 2.5
+"""Frames a second, length of a weld, and how long a current lasts."""
+
+POOL_S, BACK_S = 0.6, 0.25
+"""Time constants of the pool, and of the back side after it."""
+
+FULL_MM = 0.5
+"""Back-side width from which penetration is called full."""
+
+NOISE = np.array([0.03, 0.05, 0.008])
+LEVEL = np.array([0.02, 0.03, 0.004])
+"""Standard uncertainties of the features: of each frame, and the same in all of a weld, mm."""
+
+SCAN_MM, SCAN_SIGMA_MM, NO_BEAD_SIGMA_MM = 0.25, 0.08, 0.02
+"""Distance of the points of a scan, and its standard uncertainty on a bead and without one."""
+
+SCATTER_MM, SCATTER_S = 0.04, 1.0
+"""What the pool does not tell of the back side: standard deviation and correlation time."""
+
+
+@dataclass(frozen=True)
+class SimulatedWeld:
+    """A weld, and the truth about it.
+
+    Parameters
+    ----------
+    series
+        Features as they would be measured, and the scan of the back side.
+    speed_mm_s
+        Travel speed.
+    back_width_mm
+        True width of the back-side bead at each frame, shape (n,).
+    """
+
+    series: WeldSeries
+    speed_mm_s: float
+    back_width_mm: FloatArray
+
+
+def back_width_mm(drive: FloatArray) -> FloatArray:
+    """The law: width of the back-side bead against the drive, 1 where it melts through."""
+    above = np.maximum(drive - 1.0, 0.0)
+    return np.asarray(5.0 * above / (0.25 + above))
+
+
+def simulate_welds(count: int, seed: int) -> list[SimulatedWeld]:
+    """Simulate welds whose current changes at random times between random values.
+
+    Parameters
+    ----------
+    count
+        How many.
+    seed
+        Of the random numbers.
+    """
+    rng = np.random.default_rng(seed)
+    return [_weld(f"weld_{k:02d}", rng) for k in range(1, count + 1)]
+
+
+def _weld(name: str, rng: np.random.Generator) -> SimulatedWeld:
+    time_s = np.arange(round(RATE_HZ * DURATION_S)) / RATE_HZ
+    speed = float(rng.uniform(2.0, 3.0))
+    edges = np.arange(CURRENT_S, DURATION_S, CURRENT_S) + rng.uniform(-0.5, 0.5)
+    levels = rng.uniform(0.75, 1.45, len(edges) + 1)
+    drive = _lag(levels[np.searchsorted(edges, time_s)], POOL_S)
+    bead = back_width_mm(drive)
+    truth = np.column_stack(
+        [5.5 + 2.5 * (drive - 1), 7.0 + 4.5 * (drive - 1), 0.22 - 0.06 * (drive - 1) - 0.06 * bead]
+    )
+    share = np.exp(-1 / (SCATTER_S * RATE_HZ))
+    white = rng.normal(0, SCATTER_MM * np.sqrt(1 - share**2), len(time_s))
+    scatter = signal.lfilter([1.0], [1.0, -share], white)
+    back = _lag(bead, BACK_S)
+    back = np.where(back > 0.05, np.maximum(back + scatter, 0.0), 0.0)
+    measured = truth + rng.normal(0, NOISE, truth.shape) + rng.normal(0, LEVEL)
+    place = np.arange(0.0, speed * time_s[-1], SCAN_MM)
+    frame = np.unique(np.round(place / speed * RATE_HZ).astype(int))
+    target, sigma = np.full((2, len(time_s)), np.nan)
+    sigma[frame] = np.where(back[frame] > 0, SCAN_SIGMA_MM, NO_BEAD_SIGMA_MM)
+    noise = np.where(back[frame] > 0, rng.normal(0, SCAN_SIGMA_MM, len(frame)), 0.0)
+    target[frame] = np.maximum(back[frame] + noise, 0.0)
+    parts = np.tile(NOISE, (len(time_s), 1)), np.tile(LEVEL, (len(time_s), 1))
+    return SimulatedWeld(WeldSeries(name, time_s, measured, *parts, target, sigma), speed, back)
+
+
+def _lag(values: FloatArray, time_constant_s: float) -> FloatArray:
+    """A first-order lag that begins at rest."""
+    pole = np.exp(-1 / (time_constant_s * RATE_HZ))
+    start = [pole * values[0]]
+    return np.asarray(signal.lfilter([1 - pole], [1.0, -pole], values, zi=start)[0])
