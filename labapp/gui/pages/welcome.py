@@ -66,8 +66,8 @@ class Welcome(FollowsTheme, QWidget):
         self.list = QListWidget()
         self.list.setAccessibleName("Recent sessions")
         self.list.setToolTip(
-            "Enter or a double click opens a session; Delete takes it off the list, or deletes the "
-            "draft that it is"
+            "Enter or a double click opens a session; Delete takes it off the list, or deletes it "
+            "if it is a draft"
         )
         self.list.setIconSize(QSize(*THUMBNAIL_PX))
         self.list.setFrameShape(QFrame.Shape.StyledPanel)
@@ -79,8 +79,8 @@ class Welcome(FollowsTheme, QWidget):
             "No session was opened yet. Open a recording, or drop a video, an image, a folder of "
             "images or a session anywhere on this window; or try the sample."
         )
-        made = list(self.buttons.values())
-        buttons = vbox(hbox(*made[:3]), hbox(*made[3:]))
+        each = list(self.buttons.values())
+        buttons = vbox(hbox(*each[:3]), hbox(*each[3:]))
         column = fill(
             QVBoxLayout(inner),
             *(title, about, buttons, self.refused, self.label, (self.list, 1), self.nothing, 0),
@@ -110,7 +110,7 @@ class Welcome(FollowsTheme, QWidget):
                 for path in paths:
                     control.part(look_at(path))
 
-            self._workspace.tasks.start("Looking at recent sessions", look, on_part=self._show)
+            self._workspace.tasks.start("Reading the recent sessions", look, on_part=self._show)
 
     def keyPressEvent(self, event: QKeyEvent) -> None:
         """Take a session off the list."""
