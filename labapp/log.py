@@ -8,7 +8,9 @@ from pathlib import Path
 
 import platformdirs
 
-NAME = "labapp"
+NAME, NOTICES = "labapp", "notices"
+"""The program's logger, and its child for what the user should read while waiting."""
+
 MAX_BYTES, KEPT = 1_000_000, 3
 
 
@@ -27,7 +29,7 @@ def start_log() -> logging.Logger:
         handler.set_name(NAME)
         logger.addHandler(handler)
     if logging.lastResort is not None:  # what `core.compiled` announces is for stderr, too
-        logger.getChild("notices").addHandler(logging.lastResort)
+        logger.getChild(NOTICES).addHandler(logging.lastResort)
     return logger
 
 

@@ -856,7 +856,7 @@ def test_stale_results_are_not_exported(labapp: Run, measured: Path, tmp_path: P
     export = ("session", "export", measured, "--out", tmp_path / "out")
     code, _, complained = labapp(*export)
     assert code == 2
-    assert "1 of 6 frames no longer stand: the dots or rows were corrected" in complained
+    assert "1 of 6 frames are out of date: the dots or rows were corrected" in complained
     assert labapp(*export, "--frames", "2:")[0] == 0
 
 

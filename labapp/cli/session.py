@@ -248,7 +248,7 @@ def measure(
     rows: Annotated[RowsName | None, typer.Option(help=f"From now on. {ROWS_HELP}")] = None,
     warm: Warm = False,
 ) -> None:
-    """Measure frames: those that are not measured yet or whose measures no longer stand.
+    """Measure frames: those that are not measured yet or whose measures are out of date.
 
     Scheme, algorithm, correspondence, detector and search for rows are kept as settings of the
     session; that can be undone.
@@ -342,7 +342,7 @@ def export(
 ) -> None:
     """Write results into a folder, which is whole or not there, with a manifest.
 
-    Results that no longer stand are refused: measure again first.
+    Results that are out of date are refused: measure again first.
     """
     from labapp.export.folder import ExportChoice
     from labapp.export.tables import TABLES

@@ -67,9 +67,7 @@ class BySource(_CacheLocator):
     """
 
     def __init__(self, function: Any, file: str) -> None:
-        # What is kept names its module, too.
-        source = function.__module__.encode() + b"\0" + Path(file).read_bytes()
-        self._source = sha256(source).hexdigest()[:24]
+        self._source = _digest(function.__module__, Path(file))
         self._line: int = function.__code__.co_firstlineno
 
     @classmethod
@@ -97,6 +95,23 @@ class BySource(_CacheLocator):
     def get_disambiguator(self) -> str:
         """Return what tells functions of one name apart."""
         return str(self._line)
+
+
+def announce_new() -> None:
+    """Announce that functions will be compiled, where none of a file of them is kept.
+
+    Processes that measure announce what they compile on stderr, which a window does not show.
+    """
+    core = Path(__file__).parent
+    for file in core.rglob("*kernels.py"):
+        module = ".".join((__package__, *file.relative_to(core).with_suffix("").parts))
+        if not (_folder() / _digest(module, file)).exists():
+            _announce()
+
+
+def _digest(module: str, file: Path) -> str:
+    # What is kept names its module, too.
+    return sha256(module.encode() + b"\0" + file.read_bytes()).hexdigest()[:24]
 
 
 def _folder() -> Path:

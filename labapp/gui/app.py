@@ -23,6 +23,7 @@ from PySide6.QtCore import (
     QTimer,
     QtMsgType,
     Signal,
+    SignalInstance,
     qInstallMessageHandler,
 )
 from PySide6.QtGui import QIcon
@@ -30,7 +31,7 @@ from PySide6.QtWidgets import QApplication
 
 from labapp.bundled import bundled
 from labapp.errors import InputError
-from labapp.log import NAME, start_log
+from labapp.log import NAME, NOTICES, start_log
 from labapp.system import has_display
 from labapp.version import VERSION
 
@@ -174,7 +175,10 @@ def start_app() -> QApplication:
 
 
 class ErrorReporter(QObject):
-    """Uncaught errors: all of them to the log, and in words to the operator; the window stays."""
+    """Uncaught errors: all of them to the log, and in words to the operator; the window stays.
+
+    What the program announces while the operator waits (`labapp.log`) is shown, too.
+    """
 
     _happened = Signal(str, bool)
 
@@ -182,16 +186,19 @@ class ErrorReporter(QObject):
         super().__init__(parent)
         self._happened.connect(say)
         self._former = sys.excepthook, threading.excepthook
+        self._notices = _Notices(self._happened)
 
     def install(self) -> None:
         """Take the errors from now on."""
         self._former = sys.excepthook, threading.excepthook
         sys.excepthook = self.take
         threading.excepthook = self._take_in_thread
+        start_log().getChild(NOTICES).addHandler(self._notices)
 
     def uninstall(self) -> None:
         """Leave them to who had them before."""
         sys.excepthook, threading.excepthook = self._former
+        start_log().getChild(NOTICES).removeHandler(self._notices)
 
     def take(
         self, kind: type[BaseException], error: BaseException, trace: TracebackType | None
@@ -204,6 +211,17 @@ class ErrorReporter(QObject):
     def _take_in_thread(self, told: threading.ExceptHookArgs) -> None:
         if told.exc_value is not None:
             self.take(told.exc_type, told.exc_value, told.exc_traceback)
+
+
+class _Notices(logging.Handler):
+    """Emits what is announced, in whatever thread, by a signal."""
+
+    def __init__(self, signal: SignalInstance) -> None:
+        super().__init__()
+        self._signal = signal
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self._signal.emit(record.getMessage(), False)
 
 
 def _take_message(kind: QtMsgType, _context: QMessageLogContext, message: str) -> None:

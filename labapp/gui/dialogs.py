@@ -126,7 +126,7 @@ def ask_recording_end(parent: QWidget, name: str) -> Literal["keep", "discard", 
     discard = box.addButton("&Discard", QMessageBox.ButtonRole.DestructiveRole)
     discard.setToolTip("End the recording, delete its file, and close")
     go_on = box.addButton("&Go on recording", QMessageBox.ButtonRole.RejectRole)
-    go_on.setToolTip("Close nothing (Esc)")
+    go_on.setToolTip("Keep everything open (Esc)")
     box.setDefaultButton(keep)
     box.setEscapeButton(go_on)
     box.exec()

@@ -56,7 +56,7 @@ class InUse:
         if self.told is None:
             return f"○ {name}: being looked for"
         if self.told.words in (AWAY, UNPLUGGED):
-            return f"▲ {name}: not connected. It goes on when it is plugged in"
+            return f"▲ {name}: not connected. It works again once it is plugged in"
         return f"▲ {self.told.words}"
 
 
@@ -81,7 +81,7 @@ class DevicesFound:
         if known:
             parts.append(f"▲ May not be read: {', '.join(known)}.")
         if not parts:
-            parts = ["No foot switch that is known is plugged in; any other can be learned."]
+            parts = ["No known foot switch is plugged in; any other can be learned."]
         return "\n".join(parts)
 
 

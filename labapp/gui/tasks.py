@@ -22,6 +22,9 @@ from labapp.log import NAME
 
 POLL_MS = 10
 
+DONE, PROBLEM = "✓", "▲"
+"""Before what came of work, beside what was pressed: shape says it as well as colour."""
+
 PROGRESS_MS = 100
 """Progress is reported no more often."""
 
@@ -189,7 +192,7 @@ class Tasks(QObject):
         if kind == "failed":
             self.failed.emit(task.title, value, task.kind)
             if task.beside is not None:
-                task.beside(f"▲ {value}")
+                task.beside(f"{PROBLEM} {value}")
         elif kind == "done" and task.on_done is not None:
             task.on_done(value)
         self.changed.emit()

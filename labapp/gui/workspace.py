@@ -14,8 +14,9 @@ from typing import TYPE_CHECKING, TypeVar
 from PySide6.QtCore import QObject, Signal
 
 from labapp.gui.drafts import folder_of
-from labapp.gui.tasks import Control, Task, Tasks, error_text
+from labapp.gui.tasks import DONE, PROBLEM, Control, Task, Tasks, error_text
 from labapp.simulation import parallel
+from labapp.text import pluralize
 
 if TYPE_CHECKING:
     from labapp.gui.foot_switches import FootSwitches
@@ -158,7 +159,7 @@ class Workspace(QObject):
             else:
                 self.notified.emit(words, True)
             if beside is not None:
-                beside(f"▲ {words}")
+                beside(f"{PROBLEM} {words}")
             return None
         self.settle(cause)
         if beside is not None:
@@ -184,7 +185,7 @@ class Workspace(QObject):
 
     def redo(self) -> None:
         """Make the last change again that was taken back."""
-        self._step("redo", "Done again", "Nothing to redo")
+        self._step("redo", "Redone", "Nothing to redo")
 
     def _step(self, name: str, done: str, nothing: str) -> None:
         session = self.session
@@ -224,7 +225,13 @@ class Workspace(QObject):
         """The measuring under way; None if there is none."""
         return next((task for task in self.tasks.active if task.title == MEASURING), None)
 
-    def measure(self, frames: Sequence[int] | None = None, *, warm: bool = False) -> None:
+    def measure(
+        self,
+        frames: Sequence[int] | None = None,
+        *,
+        warm: bool = False,
+        beside: Callable[[str], object] | None = None,
+    ) -> None:
         """Measure frames in the background; None: those not measured, or stale.
 
         Frames that are kept make `measured` go out; that in view, and the last, `changed`.
@@ -233,19 +240,25 @@ class Workspace(QObject):
         ----------
         warm
             Whether each frame is measured from the one before, as fits a fast recording.
+        beside
+            Says beside what was pressed what came of it, too.
         """
         session = self.session
         if session is None:
             return
         pool = self._measuring_pool(warm)
 
-        def work(control: Control) -> int:
-            done, emitted_s = 0, 0.0
+        def work(control: Control) -> tuple[int, int]:
+            from labapp.core.compiled import announce_new
+
+            announce_new()
+            done, failed, emitted_s = 0, 0, 0.0
             numbers = [int(k) for k in (session.stale_frames() if frames is None else frames)]
             try:
-                for done, (number, _) in enumerate(
+                for done, (number, made) in enumerate(
                     session.measure_each(numbers, pool, warm=warm), 1
                 ):
+                    failed += made.status != "ok"
                     control.progress(done, len(numbers))
                     if number == self.frame:
                         control.part(None)
@@ -259,10 +272,15 @@ class Workspace(QObject):
                 raise ValueError(
                     "a process that measures has ended; what was measured is kept: measure again"
                 ) from error
-            return done
+            return done, failed
 
-        def finished(count: int) -> None:
-            self.notified.emit(f"{count} frame{'s' * (count != 1)} measured", False)
+        def finished(counts: tuple[int, int]) -> None:
+            done, failed = counts
+            words = f"{pluralize(done, 'frame')} measured"
+            words += f", {failed} without a surface" if failed else ""
+            self.notified.emit(words, False)
+            if beside is not None:
+                beside(f"{DONE} {words}")
 
         def kept(seen: Overview | None) -> None:
             if seen is None:
@@ -271,7 +289,7 @@ class Workspace(QObject):
                 self._overview = seen
                 self.measured.emit()
 
-        self._measuring.append(self.tasks.start(MEASURING, work, finished, kept))
+        self._measuring.append(self.tasks.start(MEASURING, work, finished, kept, beside))
 
     def _measuring_pool(self, warm: bool) -> ProcessPoolExecutor:
         from labapp.run.measurers import measuring_pool

@@ -32,7 +32,7 @@ EQUIPMENT: Items = (
         "Laser with its lens",
         "685 nm, 20 mW; 19 × 19 dots with 0.77° between rays, or five lines with 0.23°.",
     ),
-    ("Imaging plane", "As simple as paper on a square glass."),
+    ("Imaging plane", "Paper on a square glass is enough."),
     ("Camera with its filter", "A band-pass of 20 nm round the laser's wavelength."),
     ("Goggles for the laser", "For 685 nm."),
     ("Welding helmet and clothes", "For everybody near the arc."),

@@ -140,7 +140,7 @@ def _standing(session: SessionContents, scheme: str, frames: Sequence[int] | Non
         raise InputError(
             session.path,
             "results",
-            f"{len(stale)} of {chosen.sum()} frames no longer stand: {why}",
+            f"{len(stale)} of {chosen.sum()} frames are out of date: {why}",
             "them to be measured again, or the change undone",
         )
     if not chosen.any():

@@ -37,7 +37,7 @@ def stands_beside(label: QLabel, button: QAbstractButton) -> bool:
     one, other = (
         QRect(each.mapTo(each.window(), QPoint()), each.size()) for each in (label, button)
     )
-    return other.adjusted(0, -BESIDE_PX, 0, BESIDE_PX).intersects(one)
+    return other.adjusted(-BESIDE_PX, -BESIDE_PX, BESIDE_PX, BESIDE_PX).intersects(one)
 
 
 def test_a_full_disk_is_forgotten_when_the_export_goes_well(
@@ -56,16 +56,20 @@ def test_a_full_disk_is_forgotten_when_the_export_goes_well(
     monkeypatch.setattr(export_page, "write", full)
     page.export()
     qtbot.waitUntil(lambda: "No space left" in opened.status_line.message.text())
-    assert "No space left" in page.why_not.text()
-    assert stands_beside(page.why_not, page.export_button)
+    assert "No space left" in page.answer.text()
+    assert stands_beside(page.answer, page.export_button)
     assert page.export_button.isEnabled()
     monkeypatch.setattr(export_page, "write", write)
     page.folder.set_value(str(tmp_path / "second"))
     page.export()
+    assert not page.open_button.isEnabled()
     qtbot.waitUntil(lambda: page.written is not None)
+    assert str(tmp_path / "second") in page.answer.text()
+    assert page.answer.text().startswith("✓")
+    assert page.open_button.isEnabled()
     assert opened.status_line.unread == []
     assert "No space left" not in opened.status_line.message.text()
-    assert "No space left" not in page.why_not.text()
+    assert "No space left" not in page.answer.text()
     assert any("No space left" in line for line in opened.log_panel.texts())
 
 
@@ -77,13 +81,13 @@ def test_what_was_wrong_with_one_session_is_not_said_of_the_next(
     path = opened.workspace.session.path
     opened.files.close()
     opened.files.open(path)
-    assert "not where it was" in opened.status_line.message.text()
+    assert "recording is missing" in opened.status_line.message.text()
     opened.files.open(copy_sample("gtaw"))
     assert opened.status_line.unread == []
     # Where it is found again it is not missed any more.
     opened.files.open(path)
     opened.show_step("capture")
-    assert "not where it was" in opened.status_line.message.text()
+    assert "recording is missing" in opened.status_line.message.text()
     opened.page.relink(moved)
     qtbot.waitUntil(lambda: opened.workspace.session.missing_recording is None)
     qtbot.waitUntil(lambda: opened.status_line.unread == [])
@@ -128,19 +132,48 @@ def test_refused_files_are_told_beside_their_buttons(
     page = opened.page
     page.tabs.setCurrentIndex(BENCH_TAB)
     page.load(wrong)
-    assert "wrong.toml" in page.refused.text()
-    assert stands_beside(page.refused, hand.find("Load…"))
+    assert "wrong.toml" in page.answer.text()
+    assert stands_beside(page.answer, hand.find("Load…"))
     page.save(tmp_path / "right.toml")
-    assert page.refused.text() == ""
+    assert page.answer.text() == f"✓ Set-up saved in {tmp_path / 'right.toml'}"
+    assert stands_beside(page.answer, hand.find("Save…"))
     page.load(tmp_path / "right.toml")
     assert opened.status_line.unread == []
     opened.show_step("capture")
     page = opened.page
     page.take(wrong)
-    qtbot.waitUntil(lambda: "wrong.toml" in page.refused.text())
-    assert stands_beside(page.refused, hand.find("Choose file…"))
+    qtbot.waitUntil(lambda: "wrong.toml" in page.answer.text())
+    assert stands_beside(page.answer, hand.find("Choose file…"))
     opened.show_step("plane")
     page = opened.page
     page.load(wrong)
-    qtbot.waitUntil(lambda: bool(page.refused.text()))
-    assert stands_beside(page.refused, hand.find("Find O′ and the axes"))
+    qtbot.waitUntil(lambda: bool(page.answer.text()))
+    assert stands_beside(page.answer, hand.find("Find O′ and the axes"))
+
+
+def test_what_was_measured_is_said_beside_the_button_of_every_page_that_measures(
+    opened: MainWindow, qtbot: QtBot
+):
+    hand = Hand(opened)
+    for key, words in (("surface", "This frame"), ("dots", "Measure this frame")):
+        opened.show_step(key)
+        page, pressed = opened.page, hand.find(words)
+        assert page.answer.text() == ""
+        pressed.click()
+        qtbot.waitUntil(
+            lambda page=page: page.answer.text().startswith("✓ 1 frame"), timeout=60_000
+        )
+        assert stands_beside(page.answer, pressed)
+
+
+def test_a_picture_that_was_saved_or_not_is_said_beside_its_button(
+    opened: MainWindow, tmp_path: Path
+):
+    opened.show_step("surface")
+    page = opened.page
+    page.write_picture(tmp_path / "pool.png")
+    assert page.saved.text() == f"✓ Saved in {tmp_path / 'pool.png'}"
+    assert stands_beside(page.saved, page.save)
+    page.write_picture(tmp_path / "nowhere" / "pool.png")
+    assert page.saved.text().startswith("▲")
+    assert opened.status_line.unread

@@ -199,8 +199,8 @@ def test_without_a_complete_set_up_among_the_recent_ones_it_says_so_beside_the_b
     hand.press_button("Use last set-up")
     assert window.page is not None
     assert window.page.key == "dots"
-    assert window.page.refused.isVisible()
-    assert "complete set-up" in window.page.refused.text()
+    assert window.page.answer.isVisible()
+    assert "complete set-up" in window.page.answer.text()
 
 
 def test_a_set_up_of_another_size_of_frame_is_taken_and_nothing_measured(
@@ -225,7 +225,7 @@ def test_a_set_up_of_another_size_of_frame_is_taken_and_nothing_measured(
     assert session.plane_calibration is not None
     assert session.result(0) is None
     assert window.page is not None
-    assert "400×640 px" in window.page.refused.text()
+    assert "400×640 px" in window.page.answer.text()
 
 
 def test_another_session_s_set_up_comes_with_its_calibrations_in_one_step(

@@ -491,7 +491,7 @@ def test_hdf5_holds_every_number_of_the_session_exactly(session: Session, tmp_pa
 
 def test_what_no_longer_stands_is_not_exported(session: Session, tmp_path: Path):
     session.update_setup({"laser": {"distance_mm": 30.0}})
-    with pytest.raises(InputError, match="2 of 2 frames no longer stand: the rig"):
+    with pytest.raises(InputError, match="2 of 2 frames are out of date: the rig"):
         session.export(tmp_path / "out")
     assert not (tmp_path / "out").exists()
     session.undo()

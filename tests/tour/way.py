@@ -308,7 +308,7 @@ def _simulator(hands: Hands) -> None:
     hands.do("step_setup")
     tool = _tool(hands, "simulator", SimulatorWindow)
     hands.wait(lambda: tool.preview, "the first frame of a scenario")
-    hands.asked("scenario", lambda: hands.press("Own scenario …"))
+    hands.asked("scenario", lambda: hands.press("Load scenario …"))
     hands.asked("simulation-folder", lambda: hands.press("Choose a folder …"))
     hands.enter("Frames", "2")
     hands.press("Simulate")

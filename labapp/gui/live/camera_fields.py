@@ -21,7 +21,7 @@ from labapp.media.cameras import CameraError, CameraSettings, Feed, Limits, Regi
 from labapp.session.session import Session
 
 NUMBERS = {
-    "exposure_us": ("Exposure", "µs", 1, 100.0, "How long light is gathered for a frame"),
+    "exposure_us": ("Exposure", "µs", 1, 100.0, "How long each frame is exposed"),
     "gain_db": ("Gain", "dB", 1, 1.0, "Amplification: it brightens the noise, too"),
     "rate_hz": ("Rate", "frames/s", 2, 10.0, "Frames a second"),
 }
@@ -202,7 +202,7 @@ class CameraFields(QObject):
             self.fields[name].refuse(str(error))
             return
         for problem in error.problems:
-            words = f"{setting_text(problem.value)} is refused; right is {problem.expected}"
+            words = f"{setting_text(problem.value)} is refused; it must be {problem.expected}"
             self.fields.get(problem.field, self.fields[name]).refuse(words)
 
 

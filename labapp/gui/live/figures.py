@@ -36,8 +36,8 @@ ACKNOWLEDGE_PX = 40
 
 Look = Literal["plain", "alarm", "old"]
 
-FIRST = "Measuring the first frame: that takes some seconds …"
-NO_SETUP = "Sizes stand here, too, when the set-up is complete (steps 1 to 3)"
+FIRST = "Measuring the first frame: this takes some seconds …"
+NO_SETUP = "Sizes are shown here, too, once the set-up is complete (steps 1 to 3)"
 
 
 @dataclass(frozen=True)
@@ -198,7 +198,7 @@ class AlarmStrip(FollowsTheme, QFrame):
         font.setBold(True)
         self.words.setFont(font)
         self.button = button(
-            "Acknowledge", "Say that the alarms were seen (A); those that hold stay", acknowledge
+            "Acknowledge", "Confirm that the alarms were seen (A); active ones stay", acknowledge
         )
         self.button.setMinimumHeight(ACKNOWLEDGE_PX)
         hbox((self.words, 1), self.button, of=self).setContentsMargins(6, 2, 6, 2)

@@ -52,7 +52,7 @@ IDLE_S = 0.005
 STATES = {
     "opening": ("○", "Opening the camera …"),
     "running": ("●", "Live"),
-    "stalled": ("▲", "No frame comes, though it is connected: what is missing is not recorded"),
+    "stalled": ("▲", "No frames arrive, though it is connected: missing frames are not recorded"),
     "lost": ("▲", "Not connected: it is tried again and again. What was recorded is kept"),
     "ended": ("▲", "It has ended: start it again"),
 }

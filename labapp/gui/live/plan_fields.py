@@ -37,7 +37,7 @@ class PlanFields(QObject):
             lowest=0,
             highest=600,
             decimals=1,
-            tooltip="So much from before the trigger is recorded, too: it is kept in memory",
+            tooltip="How much from before the trigger is recorded, too: it is kept in memory",
         )
         self.before.set_value(BEFORE_S)
         self.after = NumberField(
@@ -47,7 +47,7 @@ class PlanFields(QObject):
             highest=86_400,
             decimals=1,
             optional=True,
-            tooltip="The recording ends so long after the trigger; empty: when you end it",
+            tooltip="How long after the trigger the recording ends; empty: when you end it",
         )
         self.every = NumberField(
             "Every n-th frame",
@@ -60,8 +60,8 @@ class PlanFields(QObject):
         self.codec = ChoiceField(
             "Written as",
             list(CODECS.items()),
-            tooltip="Both are without loss. Raw takes what the disk takes; FFV1 is less than half "
-            "the size, for six times the work",
+            tooltip="Both are lossless. Raw is as fast as the disk; FFV1 is less than half "
+            "the size, for six times the processor time",
         )
         for field in (self.before, self.after, self.every, self.codec):
             field.edited.connect(lambda _: self.edited.emit())

@@ -35,8 +35,8 @@ KINDS = {
 OWN, ANY = "127.0.0.1", "0.0.0.0"
 
 WARNING = (
-    "⚠ Any machine that reaches this one can read the measures then: nobody is asked who they are, "
-    "and nothing is hidden. Keep a firewall round it."
+    "⚠ Any machine that reaches this one can then read the measures: there is no password and no "
+    "encryption. Protect it by a firewall."
 )
 
 PORT_PX = 140

@@ -24,7 +24,7 @@ are measured: it is not of the pool that is seen."""
 ROOMY = 1.5
 """A colour scale stays while a surface fills this part of it: colours do not change at once."""
 
-WAITING = "The surface stands here as soon as the next frame is measured"
+WAITING = "The surface appears here once the next frame is measured"
 
 
 class LiveSurface(QWidget):

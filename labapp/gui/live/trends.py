@@ -77,7 +77,7 @@ class LiveTrends(QWidget):
             highest=TREND_S,
             decimals=0,
             step=10,
-            tooltip="So much of the trend is seen",
+            tooltip="How much of the trend is shown",
         )
         self.last.set_value(LAST_S)
         self.unmeasured = NumberField(
@@ -86,8 +86,8 @@ class LiveTrends(QWidget):
             lowest=1,
             highest=10_000,
             decimals=0,
-            tooltip="So many frames in a row that cannot be measured are an alarm, where there is "
-            "any limit",
+            tooltip="How many frames in a row that cannot be measured raise an alarm, where there "
+            "is any limit",
         )
         self.unmeasured.edited.connect(lambda value: self._keep(unmeasured=int(value)))
         self.fields = {
@@ -187,6 +187,6 @@ class LiveTrends(QWidget):
         except InputError as error:
             if field is not None:
                 self.fields[field].set_value(session.limits.of(field[0])[field[1]])
-                self.fields[field].refuse(f"It is to be {error.expected}")
+                self.fields[field].refuse(f"It must be {error.expected}")
             return
         self._workspace.attempt(lambda session: session.set_limits(limits))

@@ -25,7 +25,7 @@ from labapp.gui.live.figures import (
 from labapp.gui.live.live import SIMULATED, Live, choices, setup_of
 from labapp.gui.live.plan_fields import PlanFields
 from labapp.gui.live.record_bar import RecordBar
-from labapp.gui.tasks import Control, Task
+from labapp.gui.tasks import DONE, Control, Task
 from labapp.gui.views.picture import PictureView
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.exposure import ExposureBars
@@ -124,11 +124,16 @@ class LiveView(QObject):
             self._choices = choices(found)
             self.camera.set_choices(self._choices)
             message = f"{pluralize(len(found), 'camera')} found"
-            self.workspace.notified.emit(". ".join([message, *problems]), False)
+            words = ". ".join([message, *problems])
+            self.workspace.notified.emit(words, False)
+            self.answer.setText(f"{DONE} {words}")
 
         if self._finding not in self.workspace.tasks.active:
             self._finding = self.workspace.tasks.start(
-                "Looking for cameras", lambda _: find_cameras(), done
+                "Looking for cameras",
+                lambda _: find_cameras(),
+                done,
+                beside=self.answer.setText,
             )
 
     def start(self) -> None:
@@ -160,7 +165,7 @@ class LiveView(QObject):
             f"Opening {name}",
             work,
             lambda _: self._opened(live),
-            beside=self.refused.setText,
+            beside=self.answer.setText,
             kind="Opening the camera",
         )
         self.live = live
@@ -231,7 +236,7 @@ class LiveView(QObject):
                     f"Recorded beside the session: {take.path.name}", False
                 )
         self._ending.clear()
-        self.refused.setText("")
+        self.answer.setText("")
         self.live = None
         self.canvas.set_live(False)
         self.canvas.alarms.clear()
@@ -423,7 +428,7 @@ class LiveView(QObject):
         self.find_button = button(
             "Look for cameras", "Find the cameras that are connected", self.find
         )
-        self.refused, self.counts = Message(2), Message(2)
+        self.answer, self.counts = Message(2), Message(2)
         self.figures = LiveFigures()
         fields = FieldForm()
         self.camera_fields = CameraFields(
@@ -435,7 +440,7 @@ class LiveView(QObject):
         self.settings = QWidget()
         vbox(self.figures, self.counts, fields, of=self.settings)
         buttons = hbox(self.start_button, self.find_button)
-        self.group = Group("Capture", form, buttons, self.refused, self.settings)
+        self.group = Group("Capture", form, buttons, self.answer, self.settings)
 
     def take_key(self, key: Qt.Key) -> bool:
         """Do what a plain key means while live; whether it means anything."""

@@ -11,7 +11,7 @@ from PySide6.QtGui import QKeyEvent, QPixmap
 from PySide6.QtWidgets import QVBoxLayout, QWidget
 
 from labapp.gui.shell.steps import Lead, State, read_only
-from labapp.gui.tasks import Task, Work
+from labapp.gui.tasks import DONE, Task, Work
 from labapp.gui.widgets.fields import Field
 from labapp.gui.widgets.labels import Message
 from labapp.gui.widgets.layouts import vbox
@@ -45,8 +45,8 @@ class Page(QWidget):
         self.panel_layout = QVBoxLayout(self.panel)
         self.setObjectName(f"page-{self.key}")
         self.panel.setObjectName(f"panel-{self.key}")
-        self.refused = Message(2)
-        """Says why what was pressed was refused; a page that refuses puts it beside that."""
+        self.answer = Message(2)
+        """Says what came of what was pressed: what was done, or why not; stands beside that."""
         self._changing: list[QWidget] = []
         workspace.opened.connect(self._take_session)
 
@@ -62,13 +62,22 @@ class Page(QWidget):
         """Why nothing in the session can be changed; empty if it can."""
         return read_only(self.workspace.session)
 
+    def confirm(self, words: str, beside: Message | None = None) -> None:
+        """Say that what was pressed is done: in `answer`, or another message beside that."""
+        (beside or self.answer).setText(f"{DONE} {words}")
+        self.workspace.notified.emit(words, False)
+
     def start_task(
-        self, title: str, work: Work, on_done: Callable[[Any], None], kind: str = ""
+        self,
+        title: str,
+        work: Work,
+        on_done: Callable[[Any], None],
+        kind: str = "",
+        beside: Message | None = None,
     ) -> Task:
-        """Begin work in the background, see `Tasks.start`; `refused` says why it failed."""
-        return self.workspace.tasks.start(
-            title, work, on_done, beside=self.refused.setText, kind=kind
-        )
+        """Begin work in the background, see `Tasks.start`; `answer` says why it failed."""
+        answer = beside or self.answer
+        return self.workspace.tasks.start(title, work, on_done, beside=answer.setText, kind=kind)
 
     def lock_with_session(self, *widgets: QWidget) -> None:
         """Have these, which change the session, be of no use while it is open read-only."""
@@ -88,8 +97,8 @@ class Page(QWidget):
                 widget.setToolTip(why or widget.property("usual tip"))
 
     def _take_session(self) -> None:
-        """What was refused in the former session is of no interest in another."""
-        self.refused.setText("")
+        """What was said of the former session is of no interest in another."""
+        self.answer.setText("")
         for side in (self, self.panel):
             for field in side.findChildren(Field):
                 field.refuse("")

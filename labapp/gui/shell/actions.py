@@ -120,14 +120,14 @@ EDIT = (
         "undo",
         "&Undo",
         "Ctrl+Z",
-        "Take back the last change of set-up, calibration, settings, dots or rows",
+        "Undo the last change of set-up, calibration, settings, dots or rows",
         needs="undo",
     ),
     Action(
         "redo",
         "&Redo",
         "Ctrl+Shift+Z",
-        "Make the change again that was taken back last",
+        "Redo the change that was undone last",
         needs="redo",
     ),
     Action(
@@ -152,7 +152,7 @@ FRAMES = (
         "measure",
         "&Measure all frames",
         "F5",
-        "Measure every frame that is not measured, or whose measures no longer stand",
+        "Measure every frame that is not measured, or whose measures are out of date",
         needs="measuring",
     ),
     Action(
@@ -292,21 +292,21 @@ VIEW = (
         "log",
         "&Messages",
         "F4",
-        "Show or hide what the app has said since it was started",
+        "Show or hide all messages since the app was started",
         checkable=True,
     ),
     Action(
         "next_part",
         "&Next part of the window",
         "F6",
-        "Give the keys to the next of steps, page, parameters and timeline",
+        "Move the keyboard focus to the next of steps, page, parameters and timeline",
         begins=True,
     ),
     Action(
         "previous_part",
         "Part of the window &before",
         "Shift+F6",
-        "Give the keys to the part of the window before this one",
+        "Move the keyboard focus to the part of the window before this one",
     ),
     Action(
         "theme_system",
@@ -318,13 +318,13 @@ VIEW = (
         begins=True,
     ),
     Action(
-        "theme_light", "&Light", "", "Dark words on a light ground", checkable=True, group="theme"
+        "theme_light", "&Light", "", "Dark text on a light ground", checkable=True, group="theme"
     ),
     Action(
         "theme_dark",
         "Dar&k",
         "",
-        "Light words on a dark ground, for a dark lab",
+        "Light text on a dark ground, for a dark lab",
         checkable=True,
         group="theme",
     ),
@@ -350,13 +350,13 @@ TOOLS = (
         "study",
         "St&udy of many recordings…",
         "Ctrl+Shift+R",
-        "Measure many recordings alike, and compare them under their conditions",
+        "Measure many recordings with the same settings, and compare them by condition",
     ),
     Action(
         "simulator",
         "&Simulator…",
         "Ctrl+Shift+M",
-        "Render a recording of a pool that is known, with the truth about every dot",
+        "Render a recording of a known pool, with the true place of every dot",
     ),
     Action(
         "adviser",

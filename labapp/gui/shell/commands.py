@@ -15,6 +15,7 @@ from labapp.gui.shell.focus import go_to_part
 from labapp.gui.shell.help import TITLES, HelpDialog
 from labapp.gui.shell.steps import STEPS, why_not_measurable
 from labapp.gui.shell.window import MainWindow
+from labapp.gui.tasks import PROBLEM
 from labapp.gui.tools import TOOLS, show_tool
 from labapp.gui.widgets.tables import table_text
 from labapp.gui.workspace import MEASURING
@@ -103,18 +104,23 @@ def name_draft(window: MainWindow) -> None:
 
 
 def measure(window: MainWindow, frames: list[int] | None) -> None:
-    """Measure frames; None: those that are not measured, or whose measures no longer stand."""
+    """Measure frames; None: those that are not measured, or whose measures are out of date."""
     workspace, session = window.workspace, window.workspace.session
     if session is None:
         return
+    why_not = ""
     if frames is None and not len(session.stale_frames()):
-        window.say("Every frame is measured, and its measures stand")
+        why_not = "Every frame is measured and up to date"
     elif workspace.measuring is not None:
-        window.say("Frames are being measured already")
+        why_not = "Frames are being measured already"
+    if why_not:
+        window.say(why_not)
+        window.show_answer(why_not)
     elif why := why_not_measurable(session):
         workspace.say_wrong(MEASURING, why)
+        window.show_answer(f"{PROBLEM} {why}")
     else:
-        workspace.measure(frames)
+        workspace.measure(frames, beside=window.show_answer)
 
 
 def enter_setup(window: MainWindow) -> None:

@@ -247,7 +247,7 @@ class Files(QObject):
         self.workspace.show(session)
         missing = self.workspace.run_or_report(lambda: session.missing_recording)
         if missing is not None:
-            words = f"The recording is not where it was: {missing}"
+            words = f"The recording is missing: {missing}"
             self.workspace.say_wrong(MISSING, words)
 
 

@@ -52,13 +52,13 @@ class EmptyState(QWidget):
         self.picture = _Picture()
         self.words = wrapping_label()
         self.words.setAlignment(Qt.AlignmentFlag.AlignCenter)
-        self.refused = Message(2)
+        self.answer = Message(2)
         self.buttons: list[QPushButton] = []
         self._column = vbox()
         inner = QWidget()
         inner.setMaximumWidth(WORDS_PX)
         picture = hbox(1, self.picture, 1)
-        vbox(2, picture, self.words, self._column, self.refused, 3, of=inner).setSpacing(8)
+        vbox(2, picture, self.words, self._column, self.answer, 3, of=inner).setSpacing(8)
         hbox(1, (inner, 100), 1, of=self)
 
     def show_lead(self, key: str, lead: Lead) -> None:

@@ -16,15 +16,12 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
-from labapp.gui.tasks import Tasks
+from labapp.gui.tasks import PROBLEM, Tasks
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.labels import Message, plain_label
 from labapp.gui.widgets.layouts import fill
 
 KEPT_MESSAGES = 1000
-
-PROBLEM = "▲"
-"""Before a problem, which is shown by shape as well as by colour."""
 
 TOLD = Qt.ItemDataRole.UserRole
 """Of a line of the log: its text, since when, and how many times."""
@@ -36,7 +33,7 @@ class LogPanel(QListWidget):
     def __init__(self) -> None:
         super().__init__()
         self.setAccessibleName("Messages")
-        self.setToolTip("What the app has said since it was started; Ctrl+C copies")
+        self.setToolTip("All messages since the app was started; Ctrl+C copies those chosen")
         self.setSelectionMode(QAbstractItemView.SelectionMode.ExtendedSelection)
         self.setWordWrap(True)
         self.setTextElideMode(Qt.TextElideMode.ElideNone)
@@ -95,7 +92,7 @@ class StatusLine(QWidget):
         self.unread: list[str] = []
         self.message = Message(1)
         self.message.setAccessibleName("Last message")
-        tip = "Take the problem off this line; the messages (F4) still have it"
+        tip = "Remove the problem from this line; it stays among the messages (F4)"
         self.dismiss_button = button("Dismiss", tip, self.mark_read)
         self.dismiss_button.setAccessibleName("Dismiss the problem")
         tip = "Show or hide all messages (F4)"

@@ -10,6 +10,7 @@ from PySide6.QtCore import QObject, Signal
 
 from labapp.errors import InputError
 from labapp.gui import dialogs
+from labapp.gui.tasks import DONE, PROBLEM
 
 if TYPE_CHECKING:
     from PySide6.QtWidgets import QWidget
@@ -28,8 +29,8 @@ NO_LAST = "No session among the recent ones has a complete set-up: load a setup 
 class Setups(QObject):
     """Takes a whole set-up into the session; frames that are there are measured with it at once."""
 
-    refused = Signal(str)
-    """Why a set-up was not taken, for beside what was pressed; empty: it was."""
+    answered = Signal(str)
+    """What came of it, for beside what was pressed: why a set-up was not taken; empty at first."""
 
     def __init__(
         self, window: QWidget, workspace: Workspace, preferences: PreferencesStore
@@ -69,7 +70,7 @@ class Setups(QObject):
             "Looking for the last set-up",
             look,
             self._use_session,
-            beside=self.refused.emit,
+            beside=self.answered.emit,
             kind=CAUSE,
         )
 
@@ -83,19 +84,21 @@ class Setups(QObject):
         from labapp.gui.live.camera_fields import calibrated_px, other_size
 
         workspace = self.workspace
-        if not workspace.attempt(take, CAUSE, self.refused.emit):
+        if not workspace.attempt(take, CAUSE, self.answered.emit):
             return
         session = workspace.session
         assert session is not None
-        workspace.notified.emit(f"Set-up of {name} applied; undo brings the former back", False)
+        words = f"Set-up of {name} applied; undo restores the former one"
+        workspace.notified.emit(words, False)
+        self.answered.emit(f"{DONE} {words}")
         recording = session.recording
         if recording is None or session.missing_recording is not None:
             return
         if unlike := other_size(calibrated_px(session), (recording.rows, recording.columns)):
             workspace.say_wrong(CAUSE, unlike)
-            self.refused.emit(f"▲ {unlike}")
+            self.answered.emit(f"{PROBLEM} {unlike}")
             return
-        workspace.measure()
+        workspace.measure(beside=self.answered.emit)
         workspace.action_requested.emit("step_surface")
 
 

@@ -95,9 +95,7 @@ def read_only(session: Session | None) -> str:
 def recording_gone(session: Session) -> str:
     """That the recording is not where it was, and what to do; empty if it is."""
     missing = session.missing_recording
-    return (
-        "" if missing is None else f"{missing.name} is not where it was: locate it (step Recording)"
-    )
+    return "" if missing is None else f"{missing.name} is missing: locate it (step Recording)"
 
 
 def why_not_measurable(session: Session) -> str:
@@ -249,7 +247,7 @@ def _surface(facts: Facts) -> State:
     if facts.to_do and not facts.measured:
         return State(Mark.TODO, f"Set-up: {facts.to_do}")
     if facts.stale:
-        return State(Mark.ATTENTION, f"{facts.stale} of {frames} no longer stand: measure again")
+        return State(Mark.ATTENTION, f"{facts.stale} of {frames} out of date: measure again")
     if facts.measured < facts.count:
         return State(Mark.READY, f"{facts.count - facts.measured} of {frames} not measured yet")
     if facts.without:
@@ -367,7 +365,7 @@ STEPS = (
     Step(
         "export",
         "Export",
-        "Tick what you want to take along, and choose a folder.",
+        "Tick what is to be exported, and choose a folder.",
         "ExportPage",
         _export,
         shows="Tables, surfaces, pictures and the report, to be written into a folder.",

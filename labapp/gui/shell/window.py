@@ -144,7 +144,7 @@ class MainWindow(QMainWindow):
         preferences.failed.connect(self.say)
         self.files.recording_requested.connect(self._show_recording)
         self.files.refused.connect(self.welcome.refused.setText)
-        self.setups.refused.connect(self._show_refused)
+        self.setups.answered.connect(self.show_answer)
         space.closing.connect(self._leave)
         space.opened.connect(self._session_opened)
         space.changed.connect(self._changed)
@@ -227,7 +227,7 @@ class MainWindow(QMainWindow):
             step = next(step for step in STEPS if step.key == key)
             page.setAccessibleName(step.title)
             self.side_panel.show_panel(page.panel, step)
-            self._show_refused("")
+            self.show_answer("")
             self._show_lead()
             if not listed:
                 seen = page if self.stack.currentWidget() is page else self.empty
@@ -270,11 +270,11 @@ class MainWindow(QMainWindow):
         if path is not None and self.page is not None:
             self.page.take(path, at_once)
 
-    def _show_refused(self, words: str) -> None:
-        """Say beside what was pressed why it was refused."""
-        self.empty.refused.setText(words)
+    def show_answer(self, words: str) -> None:
+        """Say beside what was pressed what came of it."""
+        self.empty.answer.setText(words)
         if self.page is not None:
-            self.page.refused.setText(words)
+            self.page.answer.setText(words)
 
     def _list_recent(self) -> None:
         """List the sessions opened before, in other windows too."""

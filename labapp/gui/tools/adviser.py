@@ -39,7 +39,7 @@ NUMBERS = (
     ("pools.shift_mm", "Off the electrode", 0, 5, 0.1, "How far a pool's middle is off it at most"),
     ("bench.width_mm", "Plane's width", 10, 1000, 1, "Along O′X′"),
     ("bench.height_mm", "Plane's height", 10, 1000, 1, "Along O′Z′"),
-    ("bench.edge_mm", "Edge", 0, 50, 0.5, "Dots stay so far within the plane's edges"),
+    ("bench.edge_mm", "Edge", 0, 50, 0.5, "How far dots stay within the plane's edges"),
     ("bench.electrode_height_mm", "Electrode height", 0, 50, 0.5, "Work piece to the tip"),
 )
 
@@ -64,7 +64,7 @@ class AdviserWindow(ToolWindow):
         )
         self.use_button = self.add_button(
             "Apply",
-            "Put this set-up into the session's; undo brings the old one back",
+            "Put this set-up into the session's; undo restores the former one",
             self.use,
         )
         self.start_button = self.add_button(
@@ -76,12 +76,12 @@ class AdviserWindow(ToolWindow):
         kinds = (("convex", "convex"), ("concave", "concave"))
         self.kind = ChoiceField("Kind", kinds, tooltip="Above the work piece, or below it")
         efforts = (("thorough", "thorough: minutes"), ("quick", "quick: a tenth of the time"))
-        self.effort = ChoiceField("Search", efforts, tooltip="Quick: the error is known to a fifth")
-        self.form.add_heading("Expected pools: least, most")
+        self.effort = ChoiceField("Search", efforts, tooltip="Quick: the error is known to 20 %")
+        self.form.add_heading("Expected pools: min., max.")
         self.form.add(self.kind)
         for key, label, unit, lowest, highest, step, tip in RANGES:
             if key == "bench.projection_angle_deg":
-                self.form.add_heading("The bench's limits: least, most")
+                self.form.add_heading("Limits of the bench: min., max.")
             self.ranges[key] = RangeField(
                 label, unit, lowest=lowest, highest=highest, step=step, tooltip=tip
             )
@@ -97,7 +97,7 @@ class AdviserWindow(ToolWindow):
     def _make_results(self) -> None:
         self.headline = wrapping_label("Enter pools and limits, then press Advise.")
         self.place = ResultTable("Recommended set-up")
-        self.kept = ResultTable("What it must keep, and by how much it does")
+        self.kept = ResultTable("Constraints, and their margins")
         self.costs = CellTable("What each mm and degree away costs")
         self.sheet = Sheet("Bench, places of the laser, and cost curves")
         self.words = QWidget()

@@ -106,7 +106,7 @@ def kept_rows(advice: Advice) -> tuple[ResultRow, ...]:
             margin,
             unit=CONSTRAINTS[name][1],
             decimals=1 if CONSTRAINTS[name][1] in ("mm", "px") else 0,
-            note="By how much it is kept; below 0 it is not",
+            note="How far it is from its limit; below 0 it is violated",
         )
         for name, margin in advice.best.margins.items()
     )

@@ -175,7 +175,7 @@ class AnalysisWindow(ToolWindow):
                 control.part(made)
 
         self._anew = True
-        self.begin("Working out", work, lambda _: self.say("Done"), self.show_part)
+        self.begin("Computing", work, lambda _: self.say("Done"), self.show_part)
 
     def _budget(self) -> tuple[Setup | None, Pool]:
         """Set-up and pool of the budget, as chosen."""

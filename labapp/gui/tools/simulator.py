@@ -78,18 +78,18 @@ class SimulatorWindow(ToolWindow):
             lowest=0,
             highest=2**31 - 1,
             decimals=0,
-            tooltip="Source of noise and chance: the same gives the same frames",
+            tooltip="Seed of the random numbers: the same seed gives the same frames",
         )
         self.seed.edited.connect(lambda seed: self._draw(int(seed)))
         self.folder = PathField(
             "Folder",
             tooltip="Where to: a new or empty folder, or a former simulation, which is replaced",
         )
-        self.table = ResultTable("What is known of the first frame")
+        self.table = ResultTable("True values of the first frame")
         self.form.add(self.scenario)
         self.form.add_wide(self.words)
         self.add_to_form(
-            "Own scenario …", "Take a scenario of your own (TOML)", self.choose_scenario
+            "Load scenario …", "Load a scenario of your own (TOML)", self.choose_scenario
         )
         for field in (self.frames, self.seed, self.folder):
             self.form.add(field)
@@ -177,7 +177,7 @@ class SimulatorWindow(ToolWindow):
         self.picture.show_picture(found.frame.image)
         self._rings.setData(*found.dots_px.T)
         dots = len(found.dots_px)
-        self.picture.describe(f"{found.scenario.title}: {dots} dots, each ringed where it truly is")
+        self.picture.describe(f"{found.scenario.title}: {dots} dots, each ringed at its true place")
         self._show_rows()
         self.show_state()
 

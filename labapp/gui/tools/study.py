@@ -122,7 +122,7 @@ class StudyWindow(ToolWindow):
         self.words = wrapping_label(NONE_YET)
         self.list = CellTable("Recordings of the study")
         self.means = CellTable("Means of the study")
-        self.outliers = CellTable("Values out of line")
+        self.outliers = CellTable("Outliers")
         self.against = ChoiceField("Against", tooltip="The condition along the plots")
         self.against.edited.connect(lambda _: self._draw())
         self.sheet = Sheet("Plots of the study")
@@ -135,7 +135,7 @@ class StudyWindow(ToolWindow):
             (self.list, "Recordings"),
             (plots, "Plots"),
             (self.means, "Means"),
-            (self.outliers, "Out of line"),
+            (self.outliers, "Outliers"),
         ):
             self.tabs.addTab(widget, words)
         for table in (self.list, self.outliers):

@@ -41,7 +41,7 @@ def recordings_table(plan: StudyPlan, found: Sequence[RecordingStatus]) -> Table
         )
         for one in found
     )
-    columns = ("Recording", *plan.conditions, "State", "Frames", "Why not")
+    columns = ("Recording", *plan.conditions, "State", "Frames", "Reason")
     return Table("recordings", "Recordings of the study", columns, rows)
 
 
@@ -73,7 +73,7 @@ def outliers_table(summary: StudySummary) -> Table:
         )
         for one in summary.outliers
     )
-    columns = ("Recording", "Frame", "Measure", "Value", "Usual", "Standard deviations off")
+    columns = ("Recording", "Frame", "Measure", "Value", "Typical", "Standard deviations off")
     return Table("outliers", "Frames and recordings far from the others", columns, rows)
 
 
@@ -100,7 +100,7 @@ def matches_text(pattern: str) -> str:
     names = ", ".join(dict.fromkeys(name for _, varied in found for name in varied))
     if names:
         return f"{count}; conditions: {names}"
-    return f"{count} without conditions: write {{name}} for the part of the path that tells one"
+    return f"{count} without conditions: write {{name}} for the part of the path that gives one"
 
 
 def session_path(folder: Path, recording: StudyRecording) -> Path:

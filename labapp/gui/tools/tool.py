@@ -15,8 +15,7 @@ from PySide6.QtWidgets import QDialog, QHBoxLayout, QProgressBar, QPushButton, Q
 from labapp.errors import os_errors_as_input
 from labapp.files import write_file
 from labapp.gui.dialogs import ask_folder
-from labapp.gui.shell.messages import PROBLEM
-from labapp.gui.tasks import Control, Task, Tasks
+from labapp.gui.tasks import PROBLEM, Control, Task, Tasks
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import FieldForm
 from labapp.gui.widgets.labels import Message

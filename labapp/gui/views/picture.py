@@ -258,7 +258,7 @@ class PictureView(Drawn):
         self._contrast.setRange(-3 * CONTRAST_STEPS, 5 * CONTRAST_STEPS)
         self._contrast.setFixedWidth(80)
         self._contrast.setAccessibleName("Contrast")
-        self._contrast.setToolTip("Brings out faint dots, or calms bright ones ([ and ])")
+        self._contrast.setToolTip("Makes faint dots brighter, or bright ones darker ([ and ])")
         self._contrast.valueChanged.connect(lambda _: self._item.setLevels(self._shown_levels()))
         label.setBuddy(self._contrast)
         bar.addWidget(self._contrast)

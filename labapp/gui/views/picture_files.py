@@ -8,15 +8,16 @@ from pathlib import Path
 from typing import Any
 
 from PySide6.QtCore import QRectF, QSize
-from PySide6.QtGui import QImage, QPainter, QPalette
-from PySide6.QtWidgets import QDialog, QGraphicsView, QMessageBox, QWidget
+from PySide6.QtGui import QCursor, QImage, QPainter, QPalette
+from PySide6.QtWidgets import QDialog, QGraphicsView, QMessageBox, QToolTip, QWidget
 
 from labapp.export.rendering.paper import MM_AN_INCH, Paper
 from labapp.gui.dialogs import ask_save
+from labapp.gui.tasks import DONE
 from labapp.gui.theme import palette
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import FieldForm, NumberField
-from labapp.gui.widgets.labels import wrapping_label
+from labapp.gui.widgets.labels import plain_tip, wrapping_label
 from labapp.gui.widgets.layouts import hbox, vbox
 
 RASTERS = "PNG (*.png);;TIFF (*.tif *.tiff);;JPEG (*.jpg *.jpeg)"
@@ -31,6 +32,8 @@ class PaperDialog(QDialog):
     """Asks how wide a picture is on paper and how fine; the next time it begins with that."""
 
     paper = Paper()
+    folder = Path.home()
+    """Where the last picture was saved."""
 
     def __init__(self, parent: QWidget) -> None:
         super().__init__(parent)
@@ -42,7 +45,7 @@ class PaperDialog(QDialog):
         )  # fmt: skip
         self.dpi = NumberField(
             *("Resolution", "dpi"), lowest=72, highest=600, step=50, decimals=0,
-            tooltip="Pixels an inch; journals want 300 or 600. An SVG of a plot has none",
+            tooltip="Pixels per inch; journals ask for 300 or 600. An SVG of a plot has none",
         )  # fmt: skip
         self.size_words = wrapping_label()
         form = FieldForm()
@@ -50,7 +53,7 @@ class PaperDialog(QDialog):
             field.set_value(value)
             field.edited.connect(lambda _: self._take())
             form.add(field)
-        save = button("Save as …", "Choose the file; its ending says the format", self.accept)
+        save = button("Save as …", "Choose the file; its extension sets the format", self.accept)
         save.setDefault(True)
         cancel = button("Cancel", "Save nothing (Esc)", self.reject)
         vbox(form, self.size_words, hbox(1, cancel, save), of=self).setContentsMargins(
@@ -71,7 +74,10 @@ def ask_paper(parent: QWidget, proposed: Path, kinds: str) -> tuple[Path, Paper]
     wanted = dialog.exec() == QDialog.DialogCode.Accepted
     dialog.deleteLater()
     path = ask_save(parent, "Save picture", proposed, kinds) if wanted else None
-    return None if path is None else (path, PaperDialog.paper)
+    if path is None:
+        return None
+    PaperDialog.folder = path.parent
+    return path, PaperDialog.paper
 
 
 def with_suffix(path: Path, *more: str) -> Path:
@@ -142,9 +148,11 @@ def save_plot(drawn: QWidget, canvas: QGraphicsView, name: str) -> Callable[[], 
     """Return what asks for a file and writes a plot to it."""
 
     def save() -> None:
-        if asked := ask_paper(drawn, Path.home() / f"{name}.png", VECTORS):
+        if asked := ask_paper(drawn, PaperDialog.folder / f"{name}.png", VECTORS):
             path = with_suffix(asked[0], SVG)
-            if not write_plot(path, drawn, canvas, asked[1]):
+            if write_plot(path, drawn, canvas, asked[1]):
+                QToolTip.showText(QCursor.pos(), plain_tip(f"{DONE} Saved in {path}"), drawn)
+            else:
                 QMessageBox.warning(drawn, "Save picture", f"{path} cannot be written.")
 
     return save

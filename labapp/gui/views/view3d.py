@@ -69,7 +69,7 @@ KEYS_TOLD = (
     "the right one or the wheel to zoom; click to read a point off"
 )
 
-NOTHING_HERE = "The 3-D view needs OpenGL, which cannot be used here. All figures are measured."
+NOTHING_HERE = "The 3-D view needs OpenGL, which is missing here. All figures are there."
 
 
 class View3d(Drawn):

@@ -9,7 +9,7 @@ from labapp.gui.widgets.labels import Message, plain_tip
 from labapp.gui.widgets.layouts import Group
 
 BARS = (
-    ("Exposure", "Level of the bright {} as a part of the camera's full scale"),
+    ("Exposure", "Level of the bright {} as a fraction of the camera's full scale"),
     ("Saturation", "Part of the {} at the top of the scale: their centres are inaccurate"),
     ("Contrast", "How far the dots rise above their background, as a part of their level"),
 )

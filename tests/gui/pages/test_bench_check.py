@@ -243,7 +243,7 @@ def test_a_refusal_stands_beside_the_button(
     add(qtbot, page, tmp_path, np.zeros((640, 480), np.uint8))
     page.check_button.click()
     qtbot.waitUntil(lambda: not page.workspace.tasks.active)
-    assert page.refused.text()
+    assert page.answer.text()
     assert page.checked is None
     assert not page.use_button.isEnabled()
 

@@ -111,10 +111,10 @@ def test_a_missing_recording_is_told_and_frames_say_why(copy_sample) -> None:
     path = copy_sample("gtaw")
     (path.parent / "recording.avi").rename(path.parent / "moved.avi")
     with Session.open(path) as session:
-        assert missing_text(session).startswith("recording.avi is not where it was")
+        assert missing_text(session).startswith("recording.avi is missing")
         seen = look(session, 0)
         assert seen.image is None
-        assert seen.words == "recording.avi is not where it was: locate it (step Recording)"
+        assert seen.words == "recording.avi is missing: locate it (step Recording)"
 
 
 def made(workspace: Workspace) -> CapturePage:

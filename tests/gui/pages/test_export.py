@@ -103,7 +103,7 @@ def test_frames_without_a_surface_are_told_and_the_recording_missed(copy_sample)
     with Session.open(path) as session:
         assert plan(session, ExportRequest(), 0).why_not == ""
         pictures = ExportRequest(ticked=frozenset({"pictures:frames"}))
-        assert "recording.mkv is not where it was" in plan(session, pictures, 0).why_not
+        assert "recording.mkv is missing" in plan(session, pictures, 0).why_not
 
 
 def test_what_no_longer_stands_is_explained_and_can_be_measured(gtaw: Path) -> None:
@@ -111,7 +111,7 @@ def test_what_no_longer_stands_is_explained_and_can_be_measured(gtaw: Path) -> N
         session.update_setup({"laser": {"distance_mm": 32.0}})
         made = plan(session, ExportRequest(which="part", first=0, last=4), 0)
         assert made.why_not == (
-            "5 frames no longer stand, because the rig or a calibration was changed. "
+            "5 frames out of date, because the rig or a calibration was changed. "
             "Measure again, or undo the change."
         )
         assert made.again.tolist() == [0, 1, 2, 3, 4]
@@ -169,7 +169,7 @@ def test_the_button_writes_what_a_script_would(
     page.export_button.click()
     assert not page.export_button.isEnabled()
     qtbot.waitUntil(lambda: page.written is not None)
-    assert page.result.text().startswith("✓ 6 files and the manifest")
+    assert page.answer.text().startswith("✓ 6 files and the manifest")
     assert page.export_button.isEnabled()
     script = tmp_path / "script"
     session_of(page).export(script, frames=[6])
@@ -233,7 +233,7 @@ def test_a_folder_of_somebody_s_is_refused_in_words(
 def test_the_button_is_greyed_out_with_the_reason(page: ExportPage) -> None:
     page.workspace.attempt(lambda session: session.update_setup({"laser": {"distance_mm": 32.0}}))
     assert not page.export_button.isEnabled()
-    assert "no longer stand" in page.why_not.text()
+    assert "out of date" in page.answer.text()
     assert page.again_button.isVisibleTo(page.panel)
     assert page.again_button.text() == "Measure 30 now"
     page.workspace.undo()
@@ -241,7 +241,7 @@ def test_the_button_is_greyed_out_with_the_reason(page: ExportPage) -> None:
     assert not page.again_button.isVisibleTo(page.panel)
     for box in page._boxes.values():
         box.setChecked(False)
-    assert "Tick what" in page.why_not.text()
+    assert "Tick what" in page.answer.text()
     assert not page._boxes["solid"].isEnabled()
 
 

@@ -101,7 +101,7 @@ def test_choosing_a_scheme_is_a_step_that_can_be_undone(page: SurfacePage) -> No
 def test_what_is_stale_can_be_measured_again(page: SurfacePage, qtbot: QtBot) -> None:
     assert page.side.again.isHidden()
     page.side.correspondence.edited.emit("S/S")
-    assert page.side.status.text().startswith("⟳ These figures no longer stand")
+    assert page.side.status.text().startswith("⟳ These figures are out of date")
     assert not page.side.again.isHidden()
     page.side.again.click()
     assert not page.side.one.isEnabled()

@@ -65,9 +65,9 @@ def test_the_correspondences_that_were_tried_are_told(session: Session) -> None:
     match = told.result.measurement.match
     assert [row.name for row in told.trials] == ["S/S ✓", "S/I", "I/I"]
     assert [row.value for row in told.trials] == [trial.residual_mm for trial in match.trials]
-    assert told.verdict == f"S/S: the next best is off {match.margin:.0f} times as far."
+    assert told.verdict == f"S/S: the next best is {match.margin:.0f} times as far off."
     one = replace(match, trials=match.trials[:1])
-    assert presenter.verdict(one) == "S/S: no other correspondence has a surface."
+    assert presenter.verdict(one) == "S/S: no other correspondence gives a surface."
     none = replace(match.trials[1], residual_mm=np.inf)
     rows = presenter.trial_rows(replace(match, trials=(match.trials[0], none)))
     assert rows[1].texts == ("S/I", "no surface", "", "")
@@ -94,7 +94,7 @@ def test_what_changed_since_makes_figures_stale(session: Session) -> None:
     session.set_settings(replace(session.settings, correspondence="S/S"))
     told = presenter.shown(session, 3)
     assert told.state == "stale"
-    assert told.words == "These figures no longer stand. Since then the settings were changed."
+    assert told.words == "These figures are out of date. Since then the settings were changed."
     assert told.sizes  # they are still to be seen
     session.undo()
     assert presenter.shown(session, 3).state == "measured"
@@ -195,7 +195,7 @@ def test_why_nothing_can_be_measured(session: Session, copy_sample: CopySample) 
     path = copy_sample("concave")
     (path.parent / "recording").rename(path.parent / "elsewhere")
     with Session.open(path) as lost:
-        assert "is not where it was" in why_not_measurable(lost)
+        assert "is missing" in why_not_measurable(lost)
 
 
 def test_surfaces_that_do_not_overlap_are_said_to(

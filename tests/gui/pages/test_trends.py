@@ -56,7 +56,7 @@ def test_marks_say_how_frames_stand(copy_sample) -> None:
         shown = show(session, TrendOptions())
         assert (shown.curves[0].mark == STALE).all()
         assert shown.rows[0].texts[1:3] == ("–", "")
-        assert "3 no longer stand" in shown.words
+        assert "3 out of date" in shown.words
 
 
 def test_the_spectrum_is_told_or_why_there_is_none(gtaw: Path, copy_sample) -> None:

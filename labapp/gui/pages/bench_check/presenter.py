@@ -127,7 +127,7 @@ class Checked:
             if self.height_sigma_mm is not None:
                 before, after = self.height_sigma_mm
                 parts.append(f"Expected ± of the pool's height: {before:.2g} → {after:.2g} mm.")
-            return " ".join((*parts, "Press Use to adopt the adjusted set-up."))
+            return " ".join((*parts, "Press Apply to use the adjusted set-up."))
         reason = f"▲ {_sentence(self.check.reason)}"
         if not self.check.suspects:
             return reason

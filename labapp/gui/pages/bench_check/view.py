@@ -50,7 +50,7 @@ class BenchCheckPage(Page):
         super().__init__(workspace)
         self.chosen: list[Chosen] = []
         self.checked: Checked | None = None
-        self.refused = Message(4)
+        self.answer = Message(4)
         self._path: Path | None = None
         self._kept: BenchCheckRecord | None = None
         self._found: MirrorPicture | None = None
@@ -203,7 +203,7 @@ class BenchCheckPage(Page):
             if tuple(self.chosen) == chosen:
                 self.checked = made
                 self.workspace.changed.emit()
-                self.workspace.notified.emit("The pictures are checked", False)
+                self.confirm("The pictures are checked")
 
         self.start_task("Checking the bench", work, found)
 
@@ -220,9 +220,7 @@ class BenchCheckPage(Page):
         if self.workspace.attempt(
             lambda session: session.use_bench_check(made.check, made.record, images)
         ):
-            self.workspace.notified.emit(
-                "The adjusted set-up is in use; undo brings the former one back", False
-            )
+            self.confirm("The adjusted set-up is in use; undo restores the former one")
 
     def predict(self) -> None:
         """Predict what pictures would do for the ± of the pool's height."""
@@ -280,8 +278,8 @@ class BenchCheckPage(Page):
         fill(
             self.panel_layout,
             *(hbox((self.add_button, 1), self.remove_button), self.list, self._mirror_form()),
-            *(hbox((self.check_button, 1), (self.use_button, 1)), self.predict_button),
-            *(self.words, self._suspect_part(), self.mirrors_words, self.mirrors, self.refused),
+            *(hbox((self.check_button, 1), (self.use_button, 1)), self.answer, self.predict_button),
+            *(self.words, self._suspect_part(), self.mirrors_words, self.mirrors),
             *(self.predicted_words, self.predicted, 1),
         )
         self.lock_with_session(self.add_button)
@@ -394,7 +392,7 @@ class BenchCheckPage(Page):
             unusable = "Check the pictures first"
         else:
             unusable = "" if made.usable else "What is wrong must be corrected first"
-        tip = "Measure with the adjusted set-up; undo brings the former one back"
+        tip = "Measure with the adjusted set-up; undo restores the former one"
         self._let(self.use_button, self.locked or unusable, tip)
         tip = "Predicted ± of the height of the expected pool, after each set of pictures"
         self._let(self.predict_button, lacking, tip)

@@ -44,17 +44,17 @@ class FootSwitchPanel(Group):
 
     def _make_learning(self) -> None:
         self.learn_button = button(
-            "Learn a pedal", "Wait until a pedal is stepped on, of whatever device", self._learn
+            "Learn a pedal", "Wait until a pedal of any device is pressed", self._learn
         )
         self.look_button = button(
             "Look for devices", "See which foot switches are plugged in", self.switches.look
         )
         form = FieldForm()
         self.action = ChoiceField(
-            "It is to", list(DOES.items()), tooltip="What stepping on this pedal does from now on"
+            "Action", list(DOES.items()), tooltip="What stepping on this pedal does from now on"
         )
         form.add(self.action)
-        self.use_button = button("Apply", "Use the pedal so, now and after each start", self._use)
+        self.use_button = button("Apply", "Use this pedal, now and after every start", self._use)
         leave = button("Discard", "Leave this pedal as it is", self.switches.give_up)
         self.learned = QWidget()
         vbox(form, hbox(self.use_button, leave), of=self.learned)
@@ -82,7 +82,7 @@ class FootSwitchPanel(Group):
         )
         self.copy_button = button(
             "Copy the commands",
-            "Copy what installs the rule that lets you read it, for a terminal",
+            "Copy the commands that let you read it, for a terminal",
             self._copy,
         )
         self.closed.edited.connect(lambda _: self._show_commands())

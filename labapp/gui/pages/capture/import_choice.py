@@ -17,8 +17,8 @@ MOST_HZ = 1e7
 
 REPLACED = "The session has a recording already: Import puts this one in its place."
 MEASURED = (
-    "Frames of the session's recording are measured or corrected: another one wants a session of "
-    "its own."
+    "Frames of the session's recording are measured or corrected: another "
+    "recording needs its own session."
 )
 
 NEXT = "New session from this recording …"

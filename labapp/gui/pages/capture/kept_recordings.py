@@ -61,4 +61,4 @@ def kept_text(take: Take, why_kept: str) -> str:
 def _choice_text(path: Path) -> str:
     """Name of a recording beside the session, and whether a session was begun with it."""
     used = path.with_suffix(SUFFIX).exists()
-    return f"{path.name}, has a session of its own" if used else path.name
+    return f"{path.name}, has its own session" if used else path.name

@@ -357,9 +357,7 @@ class CapturePage(Page):
                 self.workspace.show_frame(frames[0])
             self._seen = None
             message = f"{pluralize(len(frames), 'frame')} of {path.name} imported"
-            self.workspace.notified.emit(
-                f"{message}. {' '.join(recording.warnings)}".strip(), False
-            )
+            self.confirm(f"{message}. {' '.join(recording.warnings)}".strip())
             self.workspace.changed.emit()
             then()
 
@@ -415,7 +413,7 @@ class CapturePage(Page):
         def done(_: object) -> None:
             self._seen = None
             self.workspace.settle(MISSING)
-            self.workspace.notified.emit(f"The recording is found at {path}", False)
+            self.confirm(f"The recording is found at {path}")
             self.workspace.changed.emit()
 
         self.start_task(
@@ -447,6 +445,6 @@ class CapturePage(Page):
         self.told_group = Group("What was read", self.told)
         fill(
             self.panel_layout,
-            *(choose, self.refused, self.live_view.group, self.missing, self.find_button),
+            *(choose, self.answer, self.live_view.group, self.missing, self.find_button),
             *(self.chosen, self.exposure, self.foot_switch, self.kept, self.told_group, 1),
         )

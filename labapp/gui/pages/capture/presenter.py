@@ -174,7 +174,7 @@ def missing_text(session: Session) -> str:
     if missing is None:
         return ""
     lost = (
-        f"{missing.name} is not where it was ({missing.parent}). What was measured is still there, "
+        f"{missing.name} is missing in {missing.parent}. What was measured is still there, "
         "but no frame can be seen or measured. "
     )
     if session.read_only:

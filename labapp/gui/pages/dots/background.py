@@ -7,8 +7,10 @@ from PySide6.QtCore import QObject, QTimer, Signal
 from labapp.errors import InputError
 from labapp.gui.pages.dots import presenter
 from labapp.gui.pages.dots.presenter import Carried, DetectedDots, DotsState
+from labapp.gui.pages.page import Page
 from labapp.gui.shell.steps import recording_gone, why_not_measurable
-from labapp.gui.tasks import Control, Task
+from labapp.gui.tasks import PROBLEM, Control, Task
+from labapp.gui.widgets.labels import Message
 from labapp.gui.workspace import Workspace
 from labapp.media import GreyImage
 
@@ -103,10 +105,9 @@ class Looking(QObject):
         )
 
 
-def carry_on(workspace: Workspace, seen: DotsState, most: int | None) -> None:
+def carry_on(page: Page, seen: DotsState, most: int | None, answer: Message) -> None:
     """Carry the correction of a frame on, one step that can be undone; then measure."""
-    session = workspace.session
-    assert session is not None
+    workspace, session = page.workspace, page.session
 
     def finished(carried: Carried) -> None:
         if carried.corrections and not workspace.attempt(
@@ -115,10 +116,17 @@ def carry_on(workspace: Workspace, seen: DotsState, most: int | None) -> None:
             )
         ):
             return
-        workspace.notified.emit(carried.words, not carried.corrections)
-        if carried.corrections and not why_not_measurable(session):
-            workspace.measure(list(carried.corrections))
+        if not carried.corrections:
+            workspace.notified.emit(carried.words, True)
+            answer.setText(f"{PROBLEM} {carried.words}")
+            return
+        page.confirm(carried.words, answer)
+        if not why_not_measurable(session):
+            workspace.measure(list(carried.corrections), beside=page.answer.setText)
 
-    workspace.tasks.start(
-        "Carrying on", lambda control: presenter.carry(session, seen, most, control), finished
+    page.start_task(
+        "Carrying on",
+        lambda control: presenter.carry(session, seen, most, control),
+        finished,
+        beside=answer,
     )

@@ -199,7 +199,7 @@ class Editor:
 
         def edit(correction: Correction) -> Correction:
             if len(rows) != 2:
-                raise ValueError("choose dots of the two rows that are one")
+                raise ValueError("choose dots of the two rows to merge")
             return core.merge_rows(correction, rows[1], into=rows[0])
 
         return self._edit(f"merge {_named(rows)}", edit)
@@ -226,7 +226,7 @@ class Editor:
         def edit(correction: Correction) -> Correction:
             found = picking.site_at(correction, u, v)
             if found is None:
-                raise ValueError("there are no rows yet to tell the reference's row and column by")
+                raise ValueError("without rows the reference's row and column are not known")
             return core.set_reference(correction, found[0])
 
         return self._edit("reference", edit)

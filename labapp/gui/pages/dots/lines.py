@@ -22,12 +22,12 @@ STATUSES = {
     "ok": "The lines determine the surface",
     "profile": "The lines leave a direction of the surface open: a profile, no height",
     "no-lines": "No line is seen",
-    "folded-lines": "The pool gathers the lines to points: they show how many they are, no shape",
+    "folded-lines": "The pool focuses the lines to points: they can be counted, but show no shape",
     "too-few-lines": "One line alone determines no surface",
     "followed": "The line is followed",
     "pulse": "A pulse of the current outshines the line",
     "line-lost": "The line is not where it is expected",
-    "line-numbers": "More lines than the pattern has, or their numbers are not those of neighbours",
+    "line-numbers": "More lines than the pattern has, or their numbers do not follow each other",
 }
 
 
@@ -149,7 +149,7 @@ def _words(found: LineFrame) -> str:
     seen = found.seen
     message = _count(seen)
     if seen.lines and found.status != "ok":
-        message += ". Numbers are not settled: counted from the lowest up"
+        message += ". The lines' numbers are uncertain: counted from the lowest up"
     return f"{message}. {STATUSES.get(found.status, found.reason or found.status)}."
 
 

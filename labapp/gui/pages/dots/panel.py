@@ -46,6 +46,22 @@ MOST_ROWS = 60
 COLUMNS_OF_BUTTONS = 3
 
 
+class MeasureLead(QStackedWidget):
+    """Offers to measure, or where a set-up can come from; of one height: nothing below it moves."""
+
+    def __init__(self, do: Callable[[str], object]) -> None:
+        super().__init__()
+        for words, names in LEADS:
+            self.addWidget(Group(words, action_grid(names, do)))
+        self.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Fixed)
+
+    def offer(self, without_setup: bool, why_not: str) -> None:
+        """Offer one of the two; greyed out where neither can be."""
+        self.setCurrentIndex(int(without_setup))
+        self.setEnabled(not why_not)
+        self.setToolTip(plain_tip(why_not))
+
+
 class DotsPanel(QWidget):
     """What stands beside the frame; the page listens to its fields and its list of rows."""
 
@@ -53,17 +69,11 @@ class DotsPanel(QWidget):
         self,
         edits: Sequence[QAction],
         frames: Sequence[QAction],
-        do: Callable[[str], object],
-        refused: QWidget,
     ) -> None:
         super().__init__()
-        # Of one height: what is below does not move when the set-up is there.
-        self.lead = QStackedWidget()
-        for words, names in LEADS:
-            self.lead.addWidget(Group(words, action_grid(names, do)))
-        self.lead.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Fixed)
         # The buttons stay under the hand, whatever there is to say.
         self.seen, self.chosen, self.why = Message(3), Message(2), wrapping_label()
+        self.carried = Message(2)
         self.fit = ResultTable("Fit before the last edit and after it")
         self.buttons: dict[str, QToolButton] = {}
         self.most = NumberField(
@@ -74,9 +84,9 @@ class DotsPanel(QWidget):
         form.add(self.most)
         self.rows = _RowList()
         vbox(
-            *(self.seen, self.lead, refused, heading("Correct"), self.chosen, self._sites()),
+            *(self.seen, heading("Correct"), self.chosen, self._sites()),
             self._buttons(edits),
-            *(heading("Following frames"), form, self._buttons(frames)),
+            *(heading("Following frames"), form, self._buttons(frames), self.carried),
             *(heading("Fit"), self.why, self.fit, heading("Rows"), self.rows),
             *(heading("Detector"), self._detector(), 1),
             of=self,
@@ -91,12 +101,6 @@ class DotsPanel(QWidget):
         self.fit.set_rows(fit)
         if rows is not None:
             self.rows.show_lines(rows)
-
-    def show_lead(self, without_setup: bool, why_not: str) -> None:
-        """Offer to measure, or where a set-up can come from; greyed out where neither can be."""
-        self.lead.setCurrentIndex(int(without_setup))
-        self.lead.setEnabled(not why_not)
-        self.lead.setToolTip(plain_tip(why_not))
 
     def show_chosen(self, words: str, rows: Sequence[int], site: tuple[int, int]) -> None:
         """Show what is chosen: in words, its rows, and the site of a single dot (0: none)."""

@@ -126,7 +126,7 @@ def numbered_by_neighbours(correction: Correction, dots: IntArray) -> Correction
         found = site_at(correction, u, v)
         if found is None or found[1] > FAR_OFF:
             raise ValueError(
-                f"the dots round ({u:.1f}, {v:.1f}) px do not tell its row and column; type them"
+                f"the dots near ({u:.1f}, {v:.1f}) px do not fix its row and column; type them"
             )
         correction = assign(correction, [dot], *found[0])
     return correction

@@ -408,19 +408,19 @@ NUMBERS = (
     DetectorNumber("band-pass", "size_px", "Dot size σ", "px", 0.5, 20, 0.1, 1,
                    "Standard deviation of a dot's light; empty: estimated from the frame", True),
     DetectorNumber("band-pass", "threshold", "Threshold", "σ", 1, 50, 0.5, 1,
-                   "A dot stands so many times the noise above the background"),
+                   "How many times the noise a dot is above the background"),
     DetectorNumber("band-pass", "contrast", "Contrast", "", 0, 1, 0.05, 2,
                    "… and is at least this fraction of a typical dot"),
     DetectorNumber("block-threshold", "block_px", "Block size", "px", 8, 200, 1, 0,
                    "Side of a block: each has its own threshold"),
     DetectorNumber("block-threshold", "delta_grey", "Threshold ΔI", "levels", 0, 100, 1, 1,
-                   "So far above its block's mean a dot's light is (Eq. 5-9)"),
+                   "How far a dot's light is above its block's mean (Eq. 5-9)"),
     DetectorNumber("block-threshold", "size_divisor", "Size divisor", "", 1, 50, 0.5, 1,
                    "A dot smaller than the average size over this is noise (Eq. 5-11)"),
     DetectorNumber("wavelet", "offset_sigma", "Threshold", "σ", 0, 50, 0.5, 1,
-                   "So many times the noise above the mean of its window a dot's light is"),
+                   "How many times the noise a dot's light is above the mean of its window"),
     DetectorNumber("wavelet", "soft_threshold", "Denoising", "σ", 0, 10, 0.1, 1,
-                   "Details are shrunk by so many times the noise"),
+                   "How many times the noise details are shrunk by"),
 )  # fmt: skip
 
 

@@ -23,12 +23,13 @@ from labapp.gui.pages.dots.lines import show_lines
 from labapp.gui.pages.dots.lines_hand import LinesHand
 from labapp.gui.pages.dots.lines_view import LinesOverlay
 from labapp.gui.pages.dots.overlay import DotsOverlay
-from labapp.gui.pages.dots.panel import DotsPanel
+from labapp.gui.pages.dots.panel import DotsPanel, MeasureLead
 from labapp.gui.pages.dots.presenter import DetectorNumber, DotsState, Figures, Need
 from labapp.gui.pages.page import Page
 from labapp.gui.shell.steps import recording_gone
 from labapp.gui.views.drag_point import SHIFT, arrow_step
 from labapp.gui.views.picture import PictureView, Tool
+from labapp.gui.widgets.layouts import fill
 from labapp.gui.workspace import Workspace
 
 NO_REFERENCE = "The reference is not known: if you know it from other frames, press Reference"
@@ -80,12 +81,15 @@ class DotsPage(Page):
         )
         self._dot_actions = [*edits, *frames, *keys]
         self.lines_hand = LinesHand(self, self.lines, self.action, lambda: self.pointer)
-        self.dots_panel = DotsPanel(edits, frames, workspace.action_requested.emit, self.refused)
+        self.dots_panel = DotsPanel(edits, frames)
         self.canvas_layout.addWidget(self.view)
         self.lines_panel = self.lines_hand.panel
         self.lines_panel.hide()
-        self.panel_layout.addWidget(self.dots_panel)
-        self.panel_layout.addWidget(self.lines_panel)
+        self.measure_lead = MeasureLead(workspace.action_requested.emit)
+        fill(
+            self.panel_layout,
+            *(self.measure_lead, self.answer, self.dots_panel, self.lines_panel),
+        )
         self.setFocusProxy(self.view)
         panel = self.dots_panel
         self.lock_with_session(panel.method, panel.row_search, *panel.numbers)
@@ -136,6 +140,7 @@ class DotsPage(Page):
         if session.has_lines:
             state = show_lines(session, frame)
             self.lines_panel.show_frame(state)
+            self._show_lead()
             self.lines_hand.show(state, self._lines_frame == frame)
             self._lines_frame = frame
             self.refit.want(frame, state.due)
@@ -199,7 +204,7 @@ class DotsPage(Page):
         session = self.workspace.session
         if session is not None:
             measuring = "Frames are being measured" if self.workspace.measuring is not None else ""
-            self.dots_panel.show_lead(bool(session.setup_problems), self.locked or measuring)
+            self.measure_lead.offer(bool(session.setup_problems), self.locked or measuring)
 
     def draw(self) -> None:
         """Draw the marks, a drag under way included."""
@@ -331,7 +336,7 @@ class DotsPage(Page):
             self.workspace.notified.emit("There are no dots yet to carry on", True)
             return
         most = self.dots_panel.most.value()
-        carry_on(self.workspace, seen, None if most is None else int(most))
+        carry_on(self, seen, None if most is None else int(most), self.dots_panel.carried)
 
     def _automatic(self) -> None:
         if self.seen is not None and self.seen.origin != "corrected":
@@ -419,14 +424,14 @@ class DotsPage(Page):
         return (
             Command("Choose all", "Ctrl+A", "Choose every dot",
                     lambda: self.choose(editor.choose_all)),
-            Command("Choose none", "Esc", "Let the dots go, or give up a drag", self._escape),
+            Command("Choose none", "Esc", "Choose no dot, or give up a drag", self._escape),
             Command("Choose in doubt", "D", "Choose the dots in doubt",
                     lambda: self.choose(editor.choose_doubtful)),
             Command("Next dot", ".", "Choose the next dot along the row",
                     lambda: self.choose(editor.choose_next, 1)),
             Command("Dot before", ",", "Choose the dot before it",
                     lambda: self.choose(editor.choose_next, -1)),
-            Command("Whole row", "W", "Choose the whole rows of the chosen dots",
+            Command("Whole row", "W", "Choose all dots in the rows of the chosen ones",
                     lambda: self.choose(editor.choose_rows, editor.rows)),
             Command("Type a row", "T", "Type the row of the chosen dots", self._type_row),
             Command("Hide marks", "H", "Hide the marks, or show them again",

@@ -29,11 +29,11 @@ from labapp.gui.pages.export.presenter import (
     write,
 )
 from labapp.gui.pages.page import Page
-from labapp.gui.tasks import Control, Task
+from labapp.gui.tasks import DONE, PROBLEM, Control, Task
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField, whole
-from labapp.gui.widgets.labels import heading, keep_room, plain_tip, wrapping_label
-from labapp.gui.widgets.layouts import Group, fill, hbox, scrolled, vbox
+from labapp.gui.widgets.labels import Message, heading, keep_room, plain_tip, wrapping_label
+from labapp.gui.widgets.layouts import fill, hbox, scrolled, vbox
 from labapp.gui.widgets.path_field import PathField
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
@@ -56,7 +56,8 @@ class ExportPage(Page):
         self.plan: ExportPlan | None = None
         self.written: Written | None = None
         self._writing: Task | None = None
-        self._failed = ""
+        self.answer = Message(5)
+        self._said = ""
         self._in_view: int | None = None
         self._boxes: dict[str, QCheckBox] = {}
         self._make_canvas()
@@ -120,25 +121,24 @@ class ExportPage(Page):
         self.export_button.setEnabled(not why_not)
         self.export_button.setToolTip(
             plain_tip(
-                why_not or "Write everything that is ticked; nothing half-written stays behind"
+                why_not or "Write all that is ticked; a cancelled export leaves nothing behind"
             )
         )
         count = len(made.frames)
         ready = f"{count} frame{'s' * (count != 1)} will be written."
-        wrong = f"▲ {why_not}" if why_not and not writing else why_not or self._failed
-        self.why_not.setText(wrong or ready)
+        wrong = f"{PROBLEM} {why_not}" if why_not and not writing else why_not or self._said
+        self.answer.setText(wrong or ready)
         again = len(made.again) > 0 and not self.workspace.session.read_only
         self.again_button.setVisible(again)
         self.again_button.setEnabled(again and not measuring)
         self.again_button.setText(
             "Being measured …" if measuring else f"Measure {len(made.again)} now"
         )
-        self.result.setText("" if self.written is None else self.written.words)
-        self.result_group.setVisible(self.written is not None)
+        self.open_button.setEnabled(self.written is not None)
 
     def _session_opened(self) -> None:
         self.written = self.plan = self._in_view = None
-        self._failed = ""
+        self._said = ""
         self.folder.set_value("")
         self.request = replace(self.request, scheme="", first=0, last=0)
 
@@ -146,6 +146,7 @@ class ExportPage(Page):
 
     def _change_request(self, **values: object) -> None:
         self.request = replace(self.request, **values)  # type: ignore[arg-type]
+        self._said = ""
         if self.workspace.session is not None:
             self._show_plan(self.workspace.session)
 
@@ -171,7 +172,7 @@ class ExportPage(Page):
     def measure_again(self) -> None:
         """Measure what is missing or no longer stands of the frames chosen."""
         if self.plan is not None:
-            self.workspace.measure(self.plan.again.tolist())
+            self.workspace.measure(self.plan.again.tolist(), beside=self._say)
 
     def export(self) -> None:
         """Write what is ticked, in the background."""
@@ -189,16 +190,17 @@ class ExportPage(Page):
         def done(written: Written) -> None:
             self.written = written
             self.workspace.notified.emit(written.words, bool(written.problems))
-            self._show_state()
-
-        def failed(words: str) -> None:
-            self._failed = words
-            self._show_state()
+            self._say(f"{PROBLEM if written.problems else DONE} {written.words}")
 
         self.written = None
         self._writing = self.workspace.tasks.start(
-            f"Exporting to {folder.name}", work, done, beside=failed, kind="Exporting"
+            f"Exporting to {folder.name}", work, done, beside=self._say, kind="Exporting"
         )
+        self._show_state()
+
+    def _say(self, words: str) -> None:
+        """Say beside the buttons what came of them, until something else is to be written."""
+        self._said = words
         self._show_state()
 
     def open_folder(self) -> None:
@@ -225,11 +227,8 @@ class ExportPage(Page):
                 box.toggled.connect(lambda _: self._ticked())
             self._boxes |= boxes
             grid.addLayout(vbox(heading(title), *boxes.values(), 1), number // 2, number % 2)
-        self.files, self.result = wrapping_label(), wrapping_label()
-        will = vbox(heading("In the folder there will be"), self.files)
-        see = button("Open the folder", "Show it in the file manager", self.open_folder)
-        self.result_group = Group("Written", self.result, hbox(see, 1))
-        self.result_group.hide()
+        self.files = wrapping_label()
+        will = vbox(heading("The folder will contain"), self.files)
         choose = hbox(
             button("Select all", "Tick all that can be written", lambda: self._tick(True)),
             button("Select none", "Tick nothing", lambda: self._tick(False)),
@@ -238,8 +237,7 @@ class ExportPage(Page):
         choose.setSpacing(6)
         grid.addLayout(choose, 2, 0, 1, 2)
         grid.addLayout(will, 3, 0, 1, 2)
-        grid.addWidget(self.result_group, 4, 0, 1, 2)
-        grid.setRowStretch(5, 1)
+        grid.setRowStretch(4, 1)
         grid.setColumnStretch(0, 1)
         grid.setColumnStretch(1, 1)
         self.canvas_layout.addWidget(scrolled(inner, "What is exported"))
@@ -284,19 +282,22 @@ class ExportPage(Page):
             tooltip="Where to: a new or empty folder, or an earlier export, which is replaced",
         )
         choose = button("Choose a folder …", "Choose where to write", self.choose_folder)
-        self.notes, self.why_not = wrapping_label(), wrapping_label()
+        self.notes = wrapping_label()
         self.again_button = button(
             "Measure now",
-            "Measure the chosen frames that are not measured, or no longer stand",
+            "Measure the chosen frames that are not measured or are out of date",
             self.measure_again,
         )
         keep_room(self.again_button)
         self.export_button = button("Export", "", self.export)
+        tip = "Show what was exported in the file manager"
+        self.open_button = button("Open the folder", tip, self.open_folder)
         # The buttons stand above the words, which need more or less room.
         fill(
             self.panel_layout,
-            *(form, self.folder.label, self.folder, choose, self.export_button),
-            *(self.again_button, self.why_not, self.notes, 1),
+            *(form, self.folder.label, self.folder, choose),
+            *(hbox((self.export_button, 1), self.open_button), self.again_button),
+            *(self.answer, self.notes, 1),
         )
 
     def _make_view_fields(self) -> None:

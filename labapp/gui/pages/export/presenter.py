@@ -261,14 +261,14 @@ def _why_not(
         result = session.result(int(stale[0]), scheme)
         why = " and ".join(result.stale) if result is not None else SETUP_CHANGED
         return (
-            f"{pluralize(len(stale), 'frame')} no longer stand{'s' * (len(stale) == 1)}, "
-            f"because {why}. Measure again, or undo the change."
+            f"{pluralize(len(stale), 'frame')} out of date, because {why}. "
+            "Measure again, or undo the change."
         )
     if not request.ticked - {"solid"}:
-        return "Tick what you want to take along."
+        return "Tick what is to be exported."
     missing = session.missing_recording
     if "frames" in request.some("pictures") and missing is not None:
-        return f"Pictures of frames need the recording, and {missing.name} is not where it was."
+        return f"Pictures of frames need the recording, and {missing.name} is missing."
     return ""
 
 
@@ -340,9 +340,9 @@ class Written:
         size = format_bytes(sum(file.size for file in self.files))
         message = f"{len(self.files)} files and the manifest, {size}, are in {self.folder}."
         if not self.problems:
-            return f"✓ {message} Read again and compared with the manifest: all as written."
+            return f"{message} Verified against the manifest."
         shown = "; ".join(self.problems[:SHOWN_PROBLEMS])
-        return f"▲ {message} But not all is as it was written: {shown}."
+        return f"{message} But not all agrees with the manifest: {shown}."
 
 
 def write(

@@ -107,7 +107,7 @@ def kept(session: Session) -> Readings | None:
 
 
 def result(readings: Readings) -> LaserResult:
-    """The laser that follows from readings, or why none does."""
+    """The laser computed from the lengths from readings, or why none does."""
     spread = tuple(
         _mean_row(name, meaning, np.array(lengths, float))
         for name, meaning, lengths in zip(NAMES, MEANINGS, readings.lengths_mm, strict=True)
@@ -122,7 +122,7 @@ def result(readings: Readings) -> LaserResult:
     except ValueError as error:
         return LaserResult(None, _spoken(str(error)), spread)
     check = ResultRow(
-        "l₁ that follows", found.expected_l1_mm, unit="mm", note="From l₂, l₃ and the fan angle"
+        "l₁ computed", found.expected_l1_mm, unit="mm", note="From l₂, l₃ and the fan angle"
     )
     rows = (
         ResultRow("Projection angle", found.angle_deg, found.angle_sigma_deg, "°"),
@@ -146,7 +146,7 @@ class Drawn:
 
 
 def drawn(readings: Readings, found: LaserCalibration | None) -> Drawn:
-    """The laser that follows from readings, or an example."""
+    """The laser computed from the lengths from readings, or an example."""
     if found is not None:
         l1, l2, l3 = (float(np.mean(lengths)) for lengths in readings.lengths_mm)
         return Drawn(found, (l1, l2, l3), readings.fan_angle_deg, False)

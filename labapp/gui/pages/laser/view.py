@@ -111,9 +111,7 @@ class LaserPage(Page):
         if self.workspace.attempt(
             lambda session: session.calibrate_laser(*lengths_mm, fan_deg, picture, settings)
         ):
-            self.workspace.notified.emit(
-                "The laser is in the rig; undo brings the former back", False
-            )
+            self.confirm("The set-up has this laser; undo restores the former one", self.applied)
 
     # --- the panel --------------------------------------------------------------------------
 
@@ -156,14 +154,14 @@ class LaserPage(Page):
         self.table = _ReadingsTable()
         self.table.itemChanged.connect(self._cell_changed)
         readings = wrapping_label("Readings, mm: three lines or more")
-        self.use_button = button("Apply", "", self.use)
+        self.use_button, self.applied = button("Apply", "", self.use), Message(2)
         self.words = wrapping_label()
-        self.result = ResultTable("The laser that follows")
+        self.result = ResultTable("The laser computed from the lengths")
         self.in_use = ResultTable("Laser in use")
         fill(
             self.panel_layout,
-            *(form, self._picture_part(), readings, self.table, self.use_button),
-            *(self.words, self.result, plain_label("In the rig now"), self.in_use, 1),
+            *(form, self._picture_part(), readings, self.table, self.use_button, self.applied),
+            *(self.words, self.result, plain_label("In the set-up now"), self.in_use, 1),
         )
         self.lock_with_session(self.fan, self.fan_sigma, self.resolution, self.table)
 
@@ -171,7 +169,7 @@ class LaserPage(Page):
         self.picture_part = FieldForm()
         tip = "A picture of the cross hair beside a scale"
         self.picture_part.add_wide(button("Load picture…", tip, self._choose_picture))
-        self.picture_part.add_wide(self.refused)
+        self.picture_part.add_wide(self.answer)
         self.scale = NumberField(
             "Scale length",
             "mm",
@@ -249,7 +247,7 @@ class LaserPage(Page):
         self.words.setText("\n".join(refused or warnings or ["✓ The three lengths agree."]))
         why_not = result.why_not or self.locked
         self.use_button.setEnabled(not why_not)
-        tip = "Put angle and distance into the rig; undo brings the former back"
+        tip = "Put angle and distance into the set-up; undo restores the former ones"
         self.use_button.setToolTip(plain_tip(why_not or tip))
         drawn = presenter.drawn(readings, result.found)
         words = f"{result.why_not}. Drawn is an example" if drawn.is_example else DRAWN_WORDS

@@ -134,7 +134,7 @@ def result(found: Calibration | None) -> PlaneResult:
     (along_x, along_z), angle = found.px_per_mm, found.angle_deg
     warnings = []
     if abs(along_x / along_z - 1) > DESIGN.scale_tolerance:
-        warnings.append("The two scales differ by more than a camera in front of the plane sees")
+        warnings.append("The scales differ more than is plausible for a camera facing the plane")
     if abs(angle - 90) > DESIGN.angle_tolerance_deg:
         warnings.append(f"The axes are {angle:.0f}° apart, which should be about 90°")
     return PlaneResult(tuple(rows), "", tuple(warnings))

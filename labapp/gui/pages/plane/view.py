@@ -23,7 +23,7 @@ from labapp.gui.views.drag_point import DragPoint
 from labapp.gui.views.picture import PictureView
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
-from labapp.gui.widgets.labels import plain_label, plain_tip, show_words, wrapping_label
+from labapp.gui.widgets.labels import Message, plain_label, plain_tip, show_words, wrapping_label
 from labapp.gui.widgets.layouts import fill
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
@@ -76,7 +76,7 @@ class PlanePage(Page):
             if kept is not None:
                 self.take_kept()
         self.kept_button.setEnabled(kept is not None)
-        none = "The session keeps no picture yet: Use keeps it"
+        none = "The session keeps no picture yet: Apply keeps it"
         self.kept_button.setToolTip("Show what is in use again" if kept else none)
         self.in_use.set_rows(presenter.in_use(self.session))
         self._follow()
@@ -146,9 +146,7 @@ class PlanePage(Page):
         if self.workspace.attempt(
             lambda session: session.use_plane(found, unit, image, self._name)
         ):
-            self.workspace.notified.emit(
-                "The imaging plane is in use; undo brings the former back", False
-            )
+            self.confirm("The calibration is in use; undo restores the former one", self.applied)
 
     def lead(self, found: Lead | None) -> Lead | None:
         """Where a picture can come from, while there is none."""
@@ -194,7 +192,7 @@ class PlanePage(Page):
             self.find_axes,
         )
         form.add_wide(self.find_button)
-        form.add_wide(self.refused)
+        form.add_wide(self.answer)
         self._add_print_fields(form)
         help_text = wrapping_label(
             "Drag a point that is not right: O′ to the middle of the dot, the others to the "
@@ -227,7 +225,7 @@ class PlanePage(Page):
         self.print = ChoiceField(
             "To print",
             tuple((name, name.replace("_", " ")) for name in PRINTS),
-            tooltip="The text's target, or a board: ChArUco boards may be seen in part",
+            tooltip="The dissertation's target, or a board: ChArUco boards may be seen in part",
         )
         form.add(self.print)
         form.add_wide(
@@ -237,23 +235,25 @@ class PlanePage(Page):
                 self._choose_target,
             )
         )
+        self.saved = Message(2)
+        form.add_wide(self.saved)
 
     def _make_results(self) -> None:
         model = FieldForm()
         self.model = ChoiceField(
             "Use",
             presenter.choices(None),
-            tooltip="What takes pixels to the plane: a fit to the tick marks, or the three points",
+            tooltip="How pixels map to the plane: a fit to the tick marks, or the three points",
         )
         self.model.edited.connect(self.choose_model)
         model.add(self.model)
-        self.use_button = button("Apply", "", self.use)
+        self.use_button, self.applied = button("Apply", "", self.use), Message(2)
         self.words, self.why = wrapping_label(), wrapping_label()
-        self.result = ResultTable("What follows from the points and marks")
+        self.result = ResultTable("The calibration computed from points and marks")
         self.in_use = ResultTable("Image calibration in use")
         fill(
             self.panel_layout,
-            *(model, self.use_button, self.words, self.result, self.why),
+            *(model, self.use_button, self.applied, self.words, self.result, self.why),
             *(plain_label("In use now"), self.in_use, 1),
         )
 
@@ -280,8 +280,10 @@ class PlanePage(Page):
             is_pdf = path.suffix.lower() == ".pdf"
             return board_pdf(BOARDS[name]) if is_pdf else board_svg(BOARDS[name]).encode()
 
-        if self.workspace.run_or_report(lambda: write_file(path, content())):
-            self.workspace.notified.emit(f"Saved as {path.name}: print it at 100 %", False)
+        if self.workspace.run_or_report(
+            lambda: write_file(path, content()), beside=self.saved.setText
+        ):
+            self.confirm(f"Saved in {path}: print it at 100 %", self.saved)
 
     # --- the picture ------------------------------------------------------------------------
 
@@ -380,7 +382,7 @@ class PlanePage(Page):
         show_words(self.words, "\n".join(parts))
         unusable = result.why_not or self.locked
         self.use_button.setEnabled(not unusable)
-        tip = "Measure with this; undo brings the former back"
+        tip = "Measure with this calibration; undo restores the former one"
         self.use_button.setToolTip(plain_tip(unusable or tip))
         self.find_button.setEnabled(self.view.picture is not None and not self.locked)
         for point in self.points:

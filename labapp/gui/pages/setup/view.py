@@ -147,17 +147,17 @@ class SetupPage(Page):
                 read_setup(path, lines=True).text, f"set-up from {path.name}"
             ),
             "Loading",
-            self.refused.setText,
+            self.answer.setText,
         ):
-            self.workspace.notified.emit(f"Set-up loaded from {path.name}", False)
+            self.confirm(f"Set-up loaded from {path.name}")
 
     def save(self, path: Path) -> None:
         """Write the setup to a file."""
         content = self.session.setup_text.encode()
         if self.workspace.run_or_report(
-            lambda: write_file(path, content), "Saving", self.refused.setText
+            lambda: write_file(path, content), "Saving", self.answer.setText
         ):
-            self.workspace.notified.emit(f"Set-up saved as {path.name}", False)
+            self.confirm(f"Set-up saved in {path}")
 
     # --- within -----------------------------------------------------------------------------
 
@@ -219,7 +219,7 @@ class SetupPage(Page):
         buttons = QWidget()
         hbox(load, save, usual, of=buttons)
         form.add_wide(buttons)
-        form.add_wide(self.refused)
+        form.add_wide(self.answer)
         self.status = Message(3)
         form.add_wide(self.status)
         self.sigma_words = Message(2)
@@ -236,7 +236,7 @@ class SetupPage(Page):
             for entry in entries:
                 form.add(self._rig_field(entry), self._sigma_field(presenter.sigma_entry(entry)))
             if title == "Torch":
-                tip = "Where the pool's head is: +Y is the laser's side. The rear may lie low"
+                tip = "Where the pool's head is: +Y is the laser's side. The rear may lie lower"
                 self.travel = self._choice("Welding", TRAVELS, tip, presenter.put_travel)
                 form.add(self.travel)
         title, entries = UNCERTAIN_ONLY
@@ -255,7 +255,7 @@ class SetupPage(Page):
                 lambda: self.workspace.action_requested.emit("adviser"),
             )
         )
-        self.table = ResultTable("What the bench lets through")
+        self.table = ResultTable("Rays that reach the imaging plane")
         form.add_wide(self.table)
         self.others = wrapping_label()
         form.add_wide(self.others)

@@ -16,7 +16,14 @@ from labapp.gui.pages.surface.presenter import (
 from labapp.gui.shell.steps import why_not_measurable
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, FieldForm
-from labapp.gui.widgets.labels import heading, keep_room, plain_tip, show_words, wrapping_label
+from labapp.gui.widgets.labels import (
+    Message,
+    heading,
+    keep_room,
+    plain_tip,
+    show_words,
+    wrapping_label,
+)
 from labapp.gui.widgets.layouts import fill
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
@@ -29,15 +36,15 @@ SIGNS = {"measured": "✓", "stale": "⟳", "failed": "✗", "unmeasured": "○"
 class SurfacePanel:
     """Fills a page's panel."""
 
-    def __init__(self, workspace: Workspace, layout: QVBoxLayout) -> None:
-        self.workspace = workspace
+    def __init__(self, workspace: Workspace, layout: QVBoxLayout, answer: Message) -> None:
+        self.workspace, self._answer = workspace, answer
         self.scheme = ChoiceField(
             "Scheme", SCHEME_CHOICES, tooltip="How the surface is found from the dots"
         )
         self.correspondence = ChoiceField(
             "Correspondence",
             list(CORRESPONDENCES.items()),
-            tooltip="Which way columns and rows of the dots run: tried out, or as you say",
+            tooltip="Order of the dots' columns and rows: found by trial, or fixed",
         )
         self.scheme.edited.connect(self._choose_scheme)
         self.correspondence.edited.connect(self._choose_correspondence)
@@ -46,6 +53,7 @@ class SurfacePanel:
         form.add(self.correspondence)
         self.status, self.setup_words = wrapping_label(), wrapping_label()
         self.provenance, self.verdict = wrapping_label(), wrapping_label()
+        self._stale = False
         self.status.setAccessibleName("How this frame stands")
         self.again = button(
             "Measure &again", "Measure this frame again: its figures are out of date", self.this_one
@@ -59,8 +67,8 @@ class SurfacePanel:
         keep_room(self.progress, self.cancel, self.again)
         fill(
             layout,
-            *(form, grid, self.again, self.status, self.setup_words, self.sizes, self.errors),
-            *(self.provenance, self.verdict, self.trials, 1),
+            *(form, grid, answer, self.status, self.setup_words),
+            *(self.sizes, self.errors, self.provenance, self.verdict, self.trials, 1),
         )
         workspace.tasks.changed.connect(self._show_progress)
         workspace.tasks.progressed.connect(self._show_progress)
@@ -69,7 +77,7 @@ class SurfacePanel:
         self.one = button("&This frame", "Measure the frame in view (Shift+F5)", self.this_one)
         self.missing = button(
             "&Not measured",
-            "Measure every frame that is not measured, or no longer stands (F5)",
+            "Measure every frame that is not measured or is out of date (F5)",
             self.not_measured,
         )
         self.all = button("A&ll frames", "Measure every frame again", self.all_frames)
@@ -83,6 +91,7 @@ class SurfacePanel:
         grid.addWidget(self.missing, 1, 0)
         grid.addWidget(self.all, 1, 1)
         grid.addWidget(self.progress, 2, 0)
+        grid.addWidget(self.again, 2, 0)  # in the same place: it is of use when nothing is measured
         grid.addWidget(self.cancel, 2, 1)
         return grid
 
@@ -99,7 +108,7 @@ class SurfacePanel:
         dots = told.state == "failed" and not session.has_lines
         remedy = " Its dots can be corrected in step 6." if dots else ""
         self.status.setText(f"{SIGNS[told.state]} {told.words}{remedy}")
-        self.again.setVisible(told.state == "stale")
+        self._stale = told.state == "stale"
         show_words(self.setup_words, told.setup_words)
         show_words(self.provenance, told.provenance)
         show_words(self.verdict, told.verdict)
@@ -124,6 +133,7 @@ class SurfacePanel:
             each.setToolTip(plain_tip(f"{tip}. {why}" if why else tip))
         self.progress.setVisible(task is not None)
         self.cancel.setVisible(task is not None)
+        self.again.setVisible(self._stale and task is None)
         if task is not None:
             self.progress.setRange(0, task.total)
             self.progress.setValue(task.done)
@@ -133,16 +143,19 @@ class SurfacePanel:
 
     def this_one(self) -> None:
         """Measure the frame in view."""
-        self.workspace.measure([self.workspace.frame])
+        self._measure([self.workspace.frame])
 
     def not_measured(self) -> None:
-        """Measure the frames that are not measured, or whose measures no longer stand."""
-        self.workspace.measure()
+        """Measure the frames that are not measured, or whose measures are out of date."""
+        self._measure(None)
 
     def all_frames(self) -> None:
         """Measure every frame again."""
         if self.workspace.session is not None:
-            self.workspace.measure(self.workspace.session.frames.tolist())
+            self._measure(self.workspace.session.frames.tolist())
+
+    def _measure(self, frames: list[int] | None) -> None:
+        self.workspace.measure(frames, beside=self._answer.setText)
 
     def stop(self) -> None:
         """Stop measuring."""

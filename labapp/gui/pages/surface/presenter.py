@@ -187,7 +187,7 @@ def _state(result: Result) -> tuple[Literal["measured", "stale", "failed"], str]
     elif failed:
         words = f"No surface ({measurement.status}): {measurement.reason}."
     if result.stale:
-        was = words if failed else "These figures no longer stand."
+        was = words if failed else "These figures are out of date."
         return "stale", f"{was} Since then {' and '.join(result.stale)}."
     if failed:
         return "failed", words
@@ -276,10 +276,10 @@ def verdict(match: Match | None) -> str:
     if match is None:
         return ""
     if not np.isfinite(match.margin):
-        return f"{match.orientation}: no other correspondence has a surface."
+        return f"{match.orientation}: no other correspondence gives a surface."
     times = match.margin
     factor = f"{times:.0f}" if times >= 10 else f"{times:.1f}"
-    return f"{match.orientation}: the next best is off {factor} times as far."
+    return f"{match.orientation}: the next best is {factor} times as far off."
 
 
 def rig_of(result: Result) -> Rig:

@@ -50,12 +50,13 @@ from labapp.gui.pages.surface.presenter import (
     scene,
     shown,
 )
-from labapp.gui.tasks import Control
+from labapp.gui.tasks import PROBLEM, Control
 from labapp.gui.views.picture_files import RASTERS, ask_paper, with_suffix, write_image
 from labapp.gui.views.steering import Steering
 from labapp.gui.views.view3d import LOOKS, View3d, as_image
 from labapp.gui.views.view3d_kinds import make_view3d
 from labapp.gui.widgets.fields import ChoiceField, NumberField
+from labapp.gui.widgets.labels import Message
 from labapp.gui.widgets.layouts import fill, hbox, vbox
 from labapp.gui.widgets.parts import PartsBar
 from labapp.gui.workspace import Workspace
@@ -77,6 +78,9 @@ FILM_PX = (1280, 720)
 
 SCREEN_DPI = 96.0
 
+ANSWER_PX = 150
+"""Least room beside the buttons that save, to say where."""
+
 NARROW_FIELD = 84
 """Width of a field of two digits: all tools are in one line of a small screen."""
 
@@ -87,7 +91,7 @@ SHOWN_PARTS = {
     "work_piece": ("&Work piece", "The work piece's top round the pool"),
     "rays": ("&Rays", "The last 3 mm of the incident rays, the first of the reflected ones"),
     "electrode": ("&Electrode's axis", "The upright line X = Y = 0"),
-    "same_colours": ("Same colours in &all frames", "One scale of heights for the recording"),
+    "same_colours": ("Same colours in &all frames", "One colour scale for the whole recording"),
 }
 
 
@@ -105,7 +109,7 @@ class SurfacePage(Page):
         self.plan.setMinimumWidth(LEAST_PLAN_WIDTH)
         self.plan.dragged.connect(self._set_section)
         self.compare = CompareView(workspace)
-        self.side = SurfacePanel(workspace, self.panel_layout)
+        self.side = SurfacePanel(workspace, self.panel_layout, self.answer)
         self.lock_with_session(self.side.scheme, self.side.correspondence)
         self._exaggerated = self.options.exaggeration
         self._charts_due: Callable[[], None] | None = None
@@ -195,7 +199,7 @@ class SurfacePage(Page):
             highest=20,
             step=1,
             decimals=1,
-            tooltip="Heights are drawn so many times as high; the axes tell true ones",
+            tooltip="How many times as high heights are drawn; the axis shows true heights",
         )
         self.high.edited.connect(lambda value: self._set(exaggeration=value))
         self.high.setMaximumWidth(NARROW_FIELD)
@@ -220,11 +224,13 @@ class SurfacePage(Page):
         what = "Put two schemes side by side, or show one again"
         self.comparing = _tool("Compare", what, self._toggle_compare, _Toggle())
         self.comparing.setCheckable(True)
+        self.saved = Message(1)
+        self.saved.setMinimumWidth(ANSWER_PX)
         self._view_actions()
         coloured = self.colour.label, self.colour
         return _Tools(
             hbox(*coloured, self.high.label, self.high, self.true_scale, self._parts_button()),
-            hbox(*looks, 1, self.save, self.film, self.comparing),
+            hbox(*looks, (self.saved, 1), self.save, self.film, self.comparing),
         )
 
     def _view_actions(self) -> None:
@@ -285,7 +291,7 @@ class SurfacePage(Page):
     def copy_picture(self) -> None:
         """Put the picture on the clipboard."""
         QGuiApplication.clipboard().setPixmap(self.picture())
-        self.workspace.notified.emit("The picture is on the clipboard", False)
+        self.confirm("The picture is on the clipboard", self.saved)
 
     def save_picture(self) -> None:
         """Ask for a file and write the picture to it."""
@@ -306,8 +312,11 @@ class SurfacePage(Page):
             shape = view.height() / max(view.width(), 1)
             drawn = paper_picture(view.scene, view.camera, paper, shape)
             written = write_image(path, as_image(drawn[..., ::-1]), paper.dpi)
-        words = f"{path.name} is written" if written else f"{path} cannot be written"
-        self.workspace.notified.emit(words, not written)
+        if written:
+            self.confirm(f"Saved in {path}", self.saved)
+        else:
+            self.workspace.notified.emit(f"{path} cannot be written", True)
+            self.saved.setText(f"{PROBLEM} {path} cannot be written")
 
     def save_film(self) -> None:
         """Ask for a file and write a film of all frames to it, seen as the 3-D view is now."""
@@ -327,9 +336,9 @@ class SurfacePage(Page):
             write_view_film(session, path, camera, FILM_PX, control.progress)
 
         def done(_: object) -> None:
-            self.workspace.notified.emit(f"{path.name} is written", False)
+            self.confirm(f"Saved in {path}", self.saved)
 
-        self.start_task(f"Writing {path.name}", work, done, kind="Film")
+        self.start_task(f"Writing {path.name}", work, done, kind="Film", beside=self.saved)
 
     def toggle_scale(self) -> None:
         """Draw heights as they are, or exaggerated as before."""

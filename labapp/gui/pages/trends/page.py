@@ -117,6 +117,10 @@ class TrendsPage(Page):
     def _chosen(self) -> None:
         self._set_options(shown=tuple(key for key, box in self._boxes.items() if box.isChecked()))
 
+    def _copied(self, copy: Callable[[], None], words: str) -> None:
+        copy()
+        self.confirm(words, self.copied)
+
     def choose_signals(self) -> None:
         """Ask for a table with current and voltage."""
         folder = self._last_folder if self._last_folder.name else self.workspace.folder
@@ -144,16 +148,10 @@ class TrendsPage(Page):
             return found
 
         def done(kept: Signals) -> None:
-            self.workspace.notified.emit(f"{kept.file}: {len(kept.time_s)} samples", False)
+            self.confirm(f"{kept.file}: {len(kept.time_s)} samples")
             self.workspace.changed.emit()
 
-        self.workspace.tasks.start(
-            title,
-            work,
-            done,
-            beside=lambda words: self.signals_words.setText(words or self.signals_words.text()),
-            kind="Reading current and voltage",
-        )
+        self.start_task(title, work, done, kind="Reading current and voltage")
 
     # --- the panel ----------------------------------------------------------------------------
 
@@ -175,13 +173,19 @@ class TrendsPage(Page):
         values = button(
             "Copy values",
             "Copy the values of all frames shown, for a spreadsheet",
-            self.plots.copy_table,
+            lambda: self._copied(self.plots.copy_table, "The values are on the clipboard"),
         )
-        picture = button("Copy picture", "Copy the plots as a picture", self.plots.copy_picture)
+        picture = button(
+            "Copy picture",
+            "Copy the plots as a picture",
+            lambda: self._copied(self.plots.copy_picture, "The picture is on the clipboard"),
+        )
+        self.copied = Message(1)
         fill(
             self.panel_layout,
             *(heading("Shown"), self._make_choice(), heading("Mean ± standard deviation, range")),
             *(self.table, self.counted, self.setup_words, self.without, hbox(values, picture)),
+            self.copied,
         )
         self._make_spectrum()
         self._make_signals()
@@ -217,7 +221,7 @@ class TrendsPage(Page):
             highest=FAR_S,
             step=0.01,
             decimals=3,
-            tooltip="Added to the table's times: when its zero is on the recording's clock",
+            tooltip="Added to the table's times: where its time 0 lies in the recording",
         )
         self.start.edited.connect(self._start_at)
         self.read_button = button(
@@ -227,12 +231,12 @@ class TrendsPage(Page):
         )
         self.forget_button = button(
             "Remove",
-            "Take current and voltage out of the session; undo brings them back",
+            "Take current and voltage out of the session; undo restores them",
             lambda: self.workspace.attempt(lambda session: session.set_signals(None)),
         )
         keep_room(self.start, self.start.label, self.forget_button)
         fill(
             self.panel_layout,
             *(heading("Current and voltage"), hbox(self.start.label, (self.start, 1))),
-            *(hbox(self.read_button, self.forget_button), self.signals_words, 1),
+            *(hbox(self.read_button, self.forget_button), self.answer, self.signals_words, 1),
         )

@@ -28,7 +28,7 @@ MARKS = (
     Mark("●", "measured"),
     Mark("■", "corrected by hand"),
     Mark("○", "stands out, in doubt"),
-    Mark("×", "no longer stands"),
+    Mark("×", "out of date"),
 )
 MEASURED, CORRECTED, DOUBTFUL, STALE = range(4)
 
@@ -193,13 +193,13 @@ def _rows(course: Trend) -> tuple[ResultRow, ...]:
     frames = f"{found.count} frame{'s' * (found.count != 1)}"
     note = f"Mean and standard deviation (divided by n, Eq. 7-2 … 7-4) of {frames}"
     sure = (
-        f"± of the mean, {SIGMA_OF}: levels of frames whose outline is the same err together, "
-        f"and the set-up ({found.mean_setup_sigma:.2g} {quantity.unit}) errs alike in all frames"
+        f"± of the mean, {SIGMA_OF}: frames with the same outline share the error of the level, "
+        f"all frames that of the set-up ({found.mean_setup_sigma:.2g} {quantity.unit})"
     )
     unknown = None if not found.count else " … ".join(ends).replace("-", "−")
     return (
         ResultRow(quantity.label, found.mean, found.deviation, quantity.unit, note=note),
-        ResultRow("range", unknown, unit=quantity.unit, note=f"Least and greatest of {frames}"),
+        ResultRow("range", unknown, unit=quantity.unit, note=f"Smallest and largest of {frames}"),
         *(
             [ResultRow("mean ±", found.mean_sigma, unit=quantity.unit, decimals=4, note=sure)]
             if math.isfinite(found.mean_sigma)
@@ -215,7 +215,7 @@ def _counted(seen: Overview, course: Trend) -> str:
     reasons = (
         (unmeasured, "not measured yet"),
         (total - has - unmeasured, "without a surface"),
-        (int(course.stale.sum()), "no longer stand"),
+        (int(course.stale.sum()), "out of date"),
         (int(course.doubtful.sum()), "stand out"),
     )
     parts += [f"{count} {words}" for count, words in reasons if count]
@@ -266,7 +266,7 @@ def _signal_curves(signals: Signals, seen: Overview, shown: Sequence[str]) -> li
 
 def _told_signals(signals: Signals | None, seen: Overview, timed: bool) -> str:
     if signals is None:
-        return "None. A table (CSV) with a time and a current or voltage can be shown along."
+        return "None. A table (CSV) of current or voltage over time can be shown with the measures."
     ends = signals.time_s[[0, -1]] + signals.start_s
     message = f"{signals.file}: {len(signals.time_s)} samples, {ends[0]:.3f} … {ends[1]:.3f} s"
     if not timed:
@@ -275,6 +275,6 @@ def _told_signals(signals: Signals | None, seen: Overview, timed: bool) -> str:
     if ends[1] < low or ends[0] > high:
         return (
             f"{message}. None of it falls into the recording's {low:.3f} … {high:.3f} s: "
-            "say below when it starts."
+            "enter when it starts."
         )
     return message
