@@ -34,7 +34,7 @@ def on_files(files: Any, config: Any) -> Any:
     from mkdocs.structure.files import File
 
     pages = {
-        page: (ROOT / name).read_text("utf-8")
+        page: (ROOT / name).read_text("utf-8").replace("](docs/", "](")
         for name, page in ELSEWHERE.items()
         if page != "index.md"
     }

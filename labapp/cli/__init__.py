@@ -414,6 +414,26 @@ def _write_values(setup: Path | None, values: Mapping[str, Mapping[str, object]]
 
 
 @app.command()
+def samples(
+    folder: Annotated[Path, typer.Argument(help="Where to copy them; made if it is missing.")],
+) -> None:
+    """Copy the sample runs, the scenarios to simulate and the targets to print into a folder.
+
+    The examples of the documents can be typed as they are in that folder. Nothing is replaced.
+    """
+    import shutil
+
+    from labapp.bundled import bundled
+
+    for name in ("sample_sessions", "resources"):
+        if (folder / name).exists():
+            raise InputError(f"{folder / name} exists: expected a folder without it")
+    for name in ("sample_sessions", "resources"):
+        shutil.copytree(bundled(name), folder / name, ignore=shutil.ignore_patterns(".*"))
+    typer.echo(f"sample_sessions and resources are in {folder}")
+
+
+@app.command()
 def demo(
     out: Annotated[Path, typer.Option(help="Folder for the results.")] = Path("demo_results"),
     frames: Annotated[str, typer.Option(metavar=FRAMES_METAVAR, help=FRAMES_HELP)] = ":",
