@@ -432,6 +432,15 @@ def test_a_log_that_cannot_be_written_stops_nothing(
     assert complained.count("\n") == 1
 
 
+def test_the_samples_are_copied_and_nothing_is_replaced(labapp: Run, tmp_path: Path) -> None:
+    folder = tmp_path / "new"
+    assert labapp("samples", folder)[0] == 0
+    assert (folder / "sample_sessions/gtaw/recording.avi").stat().st_size > 10_000
+    assert (folder / "resources/simulations/egg.toml").exists()
+    assert not list(folder.rglob(".*"))
+    assert labapp("samples", folder)[0] == 2
+
+
 def test_the_demo_measures_the_sample_run(
     labapp: Run,
     tmp_path: Path,

@@ -427,7 +427,7 @@ def samples(
 
     for name in ("sample_sessions", "resources"):
         if (folder / name).exists():
-            raise InputError(f"{folder / name} exists: expected a folder without it")
+            raise InputError(folder, "folder", f"it has {name}", "a folder without it")
     for name in ("sample_sessions", "resources"):
         shutil.copytree(bundled(name), folder / name, ignore=shutil.ignore_patterns(".*"))
     typer.echo(f"sample_sessions and resources are in {folder}")
