@@ -169,15 +169,17 @@ class Observation(ReadOnlyArrays):
             try:
                 made = fit_pool(at + 1, *dots, witness, self.rig, settings, surface)
                 self._fitted[key] = made
-            except CannotMeasure as reason:
-                self._fitted[key] = reason
+            except CannotMeasure as why:
+                self._fitted[key] = (why.status, why.reason)
         found = self._fitted[key]
-        if isinstance(found, CannotMeasure):
-            raise found
+        if isinstance(
+            found, tuple
+        ):  # an exception that is kept would keep its frames, and these it
+            raise CannotMeasure(*found)
         return found
 
     @cached_property
-    def _fitted(self) -> dict[tuple[bytes, bytes, FitSettings], FittedPool | CannotMeasure]:
+    def _fitted(self) -> dict[tuple[bytes, bytes, FitSettings], FittedPool | tuple[str, str]]:
         return {}
 
     def in_view(self, plane_mm: FloatArray, margin_mm: FloatArray | float = 0.0) -> BoolArray:
