@@ -78,7 +78,7 @@ def test_a_dot_keeps_its_ray_where_the_surface_tells_it_from_one_beside_it() -> 
 def test_a_wide_dot_beside_the_place_of_one_that_is_not_seen_may_be_both() -> None:
     observed, labels = scene()
     dot, size = inner_dot(labels), np.full(len(observed.plane_mm), 2.0)
-    size[dot] *= 1.3
+    size[dot] *= 1.4
     wide, fewer = replace(observed, size_mm=size), labels.copy()
     fewer[9, 12] = UNLABELLED
     assert left_out(wide, labels) == []

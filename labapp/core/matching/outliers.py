@@ -27,7 +27,7 @@ WIDE = 1.45
 rendered frames 17 were as wide: 13 of them were more than 1 px, four at most 0.8 px, off. Of a
 stricter rule, 1.35, known frames lost right labels at the rim and a tenth of their accuracy."""
 
-WIDE_BESIDE, BESIDE_RESOLUTIONS = 1.2, 1.5
+WIDE_BESIDE, BESIDE_RESOLUTIONS = 1.3, 1.5
 """Where a ray that has no dot would make one nearer than the second, times
 `Observation.resolution_mm`, a dot so many times as wide as the first may be both, and lie between.
 """
