@@ -18,6 +18,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.rig import ImagingPlane, Laser, Rig
 from labapp.core.geometry.uncertainty import AxisPoints, RigUncertainty, covariance_of
 from labapp.simulation.pools import Dent, LowRear, Pool, Wave, egg, ellipsoidal_cap, spherical_cap
@@ -25,9 +26,6 @@ from tests.benchmarks.dips import Answer, answer, report
 from tests.scenes import BENCH_RIG, BENCH_VIEW, SeenDots, see
 
 MODES = ((1, 1), (2, 1), (0, 2), (3, 1))
-
-ASSUMED = RigUncertainty(AxisPoints(BENCH_VIEW, 69.85, 31.75), *covariance_of({}))
-"""Of a set-up that is entered without any, with the bench's picture."""
 
 Draw = Callable[[np.random.Generator, float, tuple[float, float]], Pool]
 
@@ -101,12 +99,18 @@ def set_up_off(rig: Rig, seed: int, times: float) -> Rig:
     rng = np.random.default_rng([seed, 78])
     angle, distance = times * rng.normal(0.0, [0.2, 0.3])
     laser, plane = rig.laser, rig.imaging_plane
-    return replace(
+    off = replace(
         rig,
         laser=Laser(laser.projection_angle_deg + angle, laser.distance_mm + distance),
         imaging_plane=replace(plane, origin_mm=plane.origin_mm + times * rng.normal(0, 0.3, 3)),
-        uncertainty=ASSUMED,
     )
+    return as_entered(off, BENCH_VIEW)
+
+
+def as_entered(rig: Rig, calibration: ImageCalibration) -> Rig:
+    """The rig with the uncertainties that a setup file without any has."""
+    axes = AxisPoints(calibration, 60.0, 60.0)
+    return replace(rig, uncertainty=RigUncertainty(axes, *covariance_of({})))
 
 
 def main() -> int:

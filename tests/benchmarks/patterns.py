@@ -28,7 +28,7 @@ from labapp.simulation.pools import caps_8_3_1
 from labapp.simulation.render import Look, render
 from labapp.studies.correspondence_table import OPEN_BENCH
 from labapp.studies.error_analysis import aside, errors_of, trace_once
-from tests.benchmarks.clutter import draw_pool
+from tests.benchmarks.clutter import as_entered, draw_pool
 from tests.benchmarks.dips import height_error
 from tests.benchmarks.rendered import ON_ITS_DOT_PX, PX_PER_MM, draw_view
 
@@ -70,7 +70,8 @@ def measured(name: str, kind: str, seed: int) -> Outcome:
     rig, look, view = replace(rig, pattern=PATTERNS[name]), Look(), draw_view(rng)
     frame = render(trace(pool, rig), view, look, rng)
     axes = (view.origin_px, view.x_axis_px, view.x_axis_mm, view.z_axis_px, view.z_axis_mm)
-    bench = Bench(rig, ImageCalibration.from_three_points(*axes))
+    calibration = ImageCalibration.from_three_points(*axes)
+    bench = Bench(as_entered(rig, calibration), calibration)
     found, apart = (
         measure(frame.image, bench, Settings())[0],
         resolvable(frame.dot_px[frame.shown], look),

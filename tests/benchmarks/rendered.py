@@ -23,7 +23,7 @@ from labapp.core.pipeline import Settings, measure
 from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import trace
 from labapp.simulation.render import Look, render
-from tests.benchmarks.clutter import KINDS, draw_pool
+from tests.benchmarks.clutter import KINDS, as_entered, draw_pool
 from tests.benchmarks.dips import Answer, height_error, report
 from tests.scenes import FRAME_SHAPE
 
@@ -69,7 +69,8 @@ def measured(kind: str, seed: int) -> tuple[Answer, float]:
     frame = render(trace(pool, rig), view, draw_look(rng), rng)
     shown = int(frame.shown.sum())
     axes = (view.origin_px, view.x_axis_px, view.x_axis_mm, view.z_axis_px, view.z_axis_mm)
-    bench = Bench(rig, ImageCalibration.from_three_points(*axes))
+    calibration = ImageCalibration.from_three_points(*axes)
+    bench = Bench(as_entered(rig, calibration), calibration)
     began = time.process_time()
     found = measure(frame.image, bench, Settings())[0]
     took_s = time.process_time() - began

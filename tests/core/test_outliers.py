@@ -76,6 +76,16 @@ def test_a_dot_keeps_its_ray_where_the_surface_tells_it_from_one_beside_it() -> 
     assert left_out(beside, labels) == []
 
 
+def test_a_wide_dot_beside_the_place_of_one_that_is_not_seen_may_be_both() -> None:
+    observed, labels = scene()
+    dot, size = inner_dot(labels), np.full(len(observed.plane_mm), 2.0)
+    size[dot] *= 1.4
+    wide, fewer = replace(observed, size_mm=size), labels.copy()
+    fewer[9, 12] = UNLABELLED
+    assert left_out(wide, labels) == []
+    assert left_out(wide, fewer) == [dot]
+
+
 def test_a_false_dot_where_a_ray_outside_the_boundary_is_predicted_gets_no_ray() -> None:
     observed, labels = scene()
     hypothesis = evaluate(observed, labels, FIT)

@@ -175,11 +175,13 @@ class Observation(ReadOnlyArrays):
                 if len(self._fitted) % COUNTED_EVERY == 0:
                     self._forget_oldest()
                 self._fitted[key] = made
-            except CannotMeasure as failure:  # its traceback holds the fit's arrays
-                self._fitted[key] = CannotMeasure(failure.status, failure.reason)
+            except (
+                CannotMeasure
+            ) as failure:  # kept as it is, it would keep its frames and their arrays
+                self._fitted[key] = (failure.status, failure.reason)
         found = self._fitted[key]
-        if isinstance(found, CannotMeasure):
-            raise CannotMeasure(found.status, found.reason)
+        if isinstance(found, tuple):
+            raise CannotMeasure(*found)
         return found
 
     def _forget_oldest(self) -> None:
@@ -193,7 +195,7 @@ class Observation(ReadOnlyArrays):
             over -= size
 
     @cached_property
-    def _fitted(self) -> dict[tuple[bytes, bytes, FitSettings], FittedPool | CannotMeasure]:
+    def _fitted(self) -> dict[tuple[bytes, bytes, FitSettings], FittedPool | tuple[str, str]]:
         return {}
 
     def in_view(self, plane_mm: FloatArray, margin_mm: FloatArray | float = 0.0) -> BoolArray:

@@ -20,12 +20,17 @@ from labapp.core.matching.prediction import (
 from labapp.core.matching.ray_classes import RayClasses
 from labapp.core.surface.level import Level, Witnesses
 from labapp.core.surface.spline import SplineBasis
-from labapp.core.values import FloatArray, IntArray
+from labapp.core.values import BoolArray, FloatArray, IntArray
 
 WIDE = 1.45
 """A dot so many times as wide as the median of those around it is two in one. Of 15,000 dots of
 rendered frames 17 were as wide: 13 of them were more than 1 px, four at most 0.8 px, off. Of a
 stricter rule, 1.35, known frames lost right labels at the rim and a tenth of their accuracy."""
+
+WIDE_BESIDE, BESIDE_RESOLUTIONS = 1.3, 1.5
+"""Where a ray that has no dot would make one nearer than the second, times
+`Observation.resolution_mm`, a dot so many times as wide as the first may be both, and lie between.
+"""
 
 MEDIAN_CHI2 = 2 * np.log(2)
 """Median of χ² with two degrees of freedom."""
@@ -86,7 +91,8 @@ def unsupported(observed: Observation, fitted: FittedLabels) -> IntArray:
     `RIVAL_MARGIN` to have made it than a false dot to lie there, than its ray to have made another
     dot that has no ray, and than another ray amid the others, that has no dot, to have made it. A
     ray that lands outside the boundary of the others is unlikely to have come back at all. Dots
-    much wider than those around them are two in one. With few neighbours, at the rim, a label must
+    much wider than those around them are two in one, also less wide ones where a ray
+    without a dot would make its own beside them. With few neighbours, at the rim, a label must
     be nearer to its prediction than elsewhere. Where all are farther off than what is known
     of dots and surface explains, these are as much more uncertain.
 
@@ -136,9 +142,23 @@ def unsupported(observed: Observation, fitted: FittedLabels) -> IntArray:
         stray,
         limits,
     )
+    return np.asarray(labels[fails | _wide(observed, fitted)])
+
+
+def _wide(observed: Observation, fitted: FittedLabels) -> BoolArray:
+    """Labels whose dots may be two in one, for their width, shape (rows, columns)."""
+    from labapp.core.matching import match_kernels
+
+    lit, plane_mm = fitted.labels != UNLABELLED, fitted.paths.plane_mm
+    dark_mm = plane_mm[np.flatnonzero(~lit & ~observed.absent)]
     size = np.full(lit.shape, np.nan)
-    size[lit] = observed.size_mm[labels[lit]]
-    return np.asarray(labels[fails | (size > WIDE * match_kernels.medians_around(size))])
+    size[lit] = observed.size_mm[fitted.labels[lit]]
+    times = size / match_kernels.medians_around(size)
+    wide = times > WIDE
+    for ray in np.flatnonzero(~wide & (times > WIDE_BESIDE)):
+        apart_mm = np.linalg.norm(dark_mm - plane_mm[ray], axis=-1)
+        wide.flat[ray] = (apart_mm < BESIDE_RESOLUTIONS * observed.resolution_mm).any()
+    return wide
 
 
 def _inside(observed: Observation, fitted: FittedLabels, missing: float) -> FloatArray:

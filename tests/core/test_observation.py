@@ -1,0 +1,35 @@
+"""The dots of a frame, and the fits to them that are kept."""
+
+from __future__ import annotations
+
+import gc
+import weakref
+
+import numpy as np
+import pytest
+
+from labapp.core.matching import observation
+from labapp.core.matching.observation import try_fit
+from labapp.core.values import CannotMeasure
+from labapp.simulation.pools import egg
+from tests.core.test_dips import observation_of
+from tests.scenes import see
+
+
+def test_a_frame_whose_fits_fail_leaves_memory_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hundreds of megabytes waited for the garbage collector where many frames were refused."""
+
+    def fails(*_: object) -> None:
+        raise CannotMeasure("no-surface", "it diverges")
+
+    monkeypatch.setattr(observation, "fit_pool", fails)
+    observed, labels = observation_of(see(egg(5.8, 2.6, 3.2, 0.28), np.random.default_rng(1)))
+    assert try_fit(observed, labels) is None
+    assert try_fit(observed, labels) is None
+    left = weakref.ref(observed)
+    gc.disable()
+    try:
+        del observed
+        assert left() is None
+    finally:
+        gc.enable()
