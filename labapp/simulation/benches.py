@@ -24,6 +24,9 @@ class BenchErrors:
         rotation and inter-beam angle, and of the image calibration's points along u and v.
     distortion
         Largest radial distortion in the plane's corner, either way, as a fraction.
+    axis_mm, glass_mm, glass_index
+        Standard deviation of where the image calibration's points lie on the axes, and of thickness
+        and index of the glass on the plane.
     """
 
     angle_deg: float = 0.5
@@ -32,6 +35,9 @@ class BenchErrors:
     inter_beam_angle_deg: float = 0.004
     point_px: float = 0.3
     distortion: float = 0.01
+    axis_mm: float = 0.0
+    glass_mm: float = 0.0
+    glass_index: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -68,8 +74,16 @@ def draw_bench(
         aim_y_mm=laser.aim_y_mm + by_length[2],
     )
     pitch, yaw, roll = np.add(plane.angles_deg, by_angle[2:]).tolist()
-    true_plane = ImagingPlane.of_angles(
+    # From a generator of their own: the others' draws do not depend on these.
+    by_axis, by_glass = np.split(rng.spawn(1)[0].normal(size=4), 2)
+    by_glass = by_glass * [errors.glass_mm, errors.glass_index]
+    posed = ImagingPlane.of_angles(
         plane.origin_mm + length[3:], (pitch, yaw, roll), plane.width_mm, plane.height_mm
+    )
+    true_plane = replace(
+        posed,
+        glass_mm=plane.glass_mm + float(by_glass[0]),
+        glass_index=plane.glass_index + float(by_glass[1]),
     )
     step = rng.normal(0, errors.inter_beam_angle_deg)
     true_pattern = replace(
@@ -86,11 +100,14 @@ def draw_bench(
     )
     seen = np.array([view.origin_px, view.x_axis_px, view.z_axis_px])
     origin, on_x, on_z = (seen + rng.normal(0, errors.point_px, (3, 2))).tolist()
+    x_mm, z_mm = ([view.x_axis_mm, view.z_axis_mm] + errors.axis_mm * by_axis).tolist()
     true_view = replace(
         view,
         origin_px=tuple(origin),
         x_axis_px=tuple(on_x),
+        x_axis_mm=x_mm,
         z_axis_px=tuple(on_z),
+        z_axis_mm=z_mm,
         lens=Lens(FOCAL_PX, float(k1)),
     )
     return SimulatedBench(true_rig, true_view)
