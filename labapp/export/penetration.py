@@ -204,9 +204,8 @@ class Predictor:
 
     def __init__(self, name: str, model: PenetrationModel) -> None:
         self.name, self.model = name, model
-        self.newest = (math.nan, math.nan, False)
-        """Penetration and ± at the last step that has ended, mm; whether it is extrapolated."""
         self._frames: list[WeldSeries] = []
+        self._ended: list[Prediction] = []
         self._step = -(1 << 62)
 
     def add(self, result: FrameResult) -> None:
@@ -218,36 +217,49 @@ class Predictor:
             If it has no time.
         """
         if result.time_s is None:
-            right = "a recording that has a time base"
-            raise InputError("--model", "time", "unknown", right)
-        step_s = self.model.settings.step_s
-        step = math.floor(result.time_s / step_s + 1e-9)
+            raise InputError("--model", "time", "unknown", "a recording that has a time base")
+        step = math.floor(result.time_s / self.model.settings.step_s + 1e-9)
         if step != self._step:
             self._end_step(step)
         self._frames.append(frame_features(result, self.model.settings.features))
 
     def _end_step(self, step: int) -> None:
-        """Predict the step that ends, and forget frames that no prediction needs any more."""
-        settings = self.model.settings
-        self.newest = (math.nan, math.nan, False)
+        """Predict the steps before this one, and forget frames that are needed no more."""
+        step_s, last = self.model.settings.step_s, self._step
         if any(np.isfinite(one.value).all() for one in self._frames):
-            # Steps without a frame at the end are held, too.
-            until = self._empty((step - 0.5) * settings.step_s)
-            found = self.model.predict(joined([*self._frames, until]))
-            last = float(found.value[-1]), float(found.sigma[-1]), bool(found.is_outside[-1])
-            self.newest = last
-        first = (step - self.model.memory - MOST_HELD - 1) * settings.step_s
+            none = np.full((1, len(self.model.settings.features)), np.nan)
+            until = np.array([(step - 0.5) * step_s])  # steps without a frame are held, too
+            end = WeldSeries("", until, none, none, none, none[:, 0], none[:, 0])
+            found = self.model.predict(joined([*self._frames, end]))
+            new = found.time_s > last * step_s
+            self._ended.append(Prediction(*(of[new] for of in vars(found).values())))
+        elif self._ended:
+            unknown = np.full(1, np.nan)
+            time_s = np.array([(last + 0.5) * step_s])
+            self._ended.append(Prediction(time_s, unknown, unknown, np.zeros(1, bool)))
+        first = (step - self.model.memory - MOST_HELD - 1) * step_s
         self._frames = [one for one in self._frames if one.time_s[0] >= first]
         self._step = step
 
-    def _empty(self, time_s: float) -> WeldSeries:
-        none = np.full((1, len(self.model.settings.features)), np.nan)
-        return WeldSeries("", np.array([time_s]), none, none, none, none[:, 0], none[:, 0])
+    def predictions(self) -> Prediction | None:
+        """All predictions, the step that has not ended with them; None if there are none."""
+        self._end_step(self._step + 1)
+        if not self._ended:
+            return None
+        columns = zip(*(vars(one).values() for one in self._ended), strict=True)
+        return Prediction(*map(np.concatenate, columns))
 
     def values(self) -> dict[str, float | str | None]:
-        """The newest prediction as values of a stream (`streams.PENETRATION`)."""
-        value, sigma = (each if math.isfinite(each) else None for each in self.newest[:2])
-        words = f"{self.name} {self.model.settings.target}" + " extrapolated" * self.newest[2]
+        """The prediction of the last step that ended, as values of a stream.
+
+        Names are those of `streams.PENETRATION`.
+        """
+        value = sigma = None
+        words = f"{self.name} {self.model.settings.target}"
+        if self._ended and math.isfinite(self._ended[-1].value[-1]):
+            newest = self._ended[-1]
+            value, sigma = float(newest.value[-1]), float(newest.sigma[-1])
+            words += " extrapolated" * bool(newest.is_outside[-1])
         return {"penetration_mm": value, "penetration_sigma_mm": sigma, "penetration_model": words}
 
 
@@ -257,7 +269,11 @@ def frame_features(result: FrameResult, features: Collection[str]) -> WeldSeries
     sizes = vars(found.measures) if found.measures else dict.fromkeys(SIZES, math.nan)
     columns = {name: np.array([value]) for name, value in sizes.items()}
     if not set(SHAPES).isdisjoint(features):
-        columns |= shape_row(found.reconstruction)
+        columns |= (
+            shape_row(found.reconstruction)
+            if result.shape is None
+            else {name: np.array([value]) for name, value in vars(result.shape).items()}
+        )
     time_s = np.array([math.nan if result.time_s is None else result.time_s])
     return weld_series("", time_s, columns, tuple(features))
 
