@@ -46,6 +46,16 @@ if TYPE_CHECKING:
     from labapp.run.streams import Stream
 
 
+ModelFile = Annotated[
+    Path | None,
+    typer.Option(help="Penetration model; its predictions go to penetration.csv and streams."),
+]
+
+Anywhere = Annotated[
+    bool, typer.Option("--anywhere", help="Let other machines connect, unauthenticated.")
+]
+
+
 def reconstruct(
     source: Annotated[Path, typer.Argument(help=RECORDING_HELP)],
     setup: Annotated[Path, typer.Option(help="Setup file (TOML; mm, degrees, px).")],
@@ -75,10 +85,7 @@ def reconstruct(
     ] = "all",
     sigma_parts: SigmaParts = False,
     warm: Warm = False,
-    model: Annotated[
-        Path | None,
-        typer.Option(help="Penetration model; its predictions go to penetration.csv and streams."),
-    ] = None,
+    model: ModelFile = None,
     lines: Annotated[
         str | None,
         typer.Option(metavar="[HOST:]PORT", help="Send measures as lines of JSON over TCP."),
@@ -87,9 +94,7 @@ def reconstruct(
         str | None,
         typer.Option(metavar="[HOST:]PORT", help="Publish measures as variables of OPC UA."),
     ] = None,
-    anywhere: Annotated[
-        bool, typer.Option("--anywhere", help="Let other machines connect, unauthenticated.")
-    ] = False,
+    anywhere: Anywhere = False,
 ) -> None:
     """Measure frames and write measures, dots, points, boundaries and surfaces.
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -40,7 +41,7 @@ OPSET, IR_VERSION = 17, 8
 # --- files --------------------------------------------------------------------------------------
 
 
-def write_model(path: Path, model: PenetrationModel) -> None:
+def write_model(path: str | os.PathLike[str], model: PenetrationModel) -> None:
     """Write a model as JSON.
 
     Raises
@@ -59,7 +60,7 @@ def write_model(path: Path, model: PenetrationModel) -> None:
         **{key: getattr(model, key) for key in ("time_constants_s", *ARRAYS, *NUMBERS)},
         "static": vars(static) if isinstance(static, LinearMap) else _fields(static),
     }
-    write_file(path, as_bytes(json.dumps(content, default=_listed, indent=1) + "\n"))
+    write_file(Path(path), as_bytes(json.dumps(content, default=_listed, indent=1) + "\n"))
 
 
 ARRAYS = ("center", "scale", "low", "high")
@@ -75,7 +76,7 @@ def _listed(value: Any) -> Any:
     return value.tolist()
 
 
-def read_model(path: Path) -> PenetrationModel:
+def read_model(path: str | os.PathLike[str]) -> PenetrationModel:
     """Read a model that `write_model` wrote.
 
     Raises
@@ -83,6 +84,7 @@ def read_model(path: Path) -> PenetrationModel:
     InputError
         If it is none, or anything in it is impossible.
     """
+    path = Path(path)
     with os_errors_as_input(path, "file", WANTED):
         size = path.stat().st_size
         if size > LARGEST:
@@ -303,7 +305,7 @@ def write_onnx(path: Path, model: PenetrationModel) -> None:
         from onnx import TensorProto, helper, numpy_helper
     except ImportError as error:
         raise needs_extra("onnx") from error
-    settings, static = model.settings, model.static
+    settings = model.settings
     orders, width = settings.orders, len(settings.features)
     kernel = np.zeros((orders.lags, model.memory))
     for lag in range(orders.lags):
@@ -322,26 +324,9 @@ def write_onnx(path: Path, model: PenetrationModel) -> None:
         ("Sub", "regressors center", "centred"),
         ("Div", "centred scale", "x"),
     ]
-    if isinstance(static, LinearMap):
-        constants |= {"weights": static.weights[:-1, None], "constant": static.weights[-1:]}
-        nodes += [("MatMul", "x weights", "product"), ("Add", "product constant", "sum")]
-    else:
-        constants |= {
-            "points": static.points,
-            "lengths": static.lengths,
-            "one": np.ones((static.points.shape[1], 1)),
-            "half": np.array([-0.5]),
-            "weights": static.signal * static.weights[None, :],
-        }
-        nodes += [
-            ("Sub", "x points", "difference"),
-            ("Div", "difference lengths", "distance"),
-            ("Mul", "distance distance", "square"),
-            ("MatMul", "square one", "squares"),
-            ("Mul", "squares half", "exponent"),
-            ("Exp", "exponent", "covariance"),
-            ("MatMul", "weights covariance", "sum"),
-        ]
+    more, operators = _static_graph(model.static)
+    constants |= more
+    nodes += operators
     constants["flat"] = np.array([1])
     nodes += [
         ("Reshape", "sum flat", "deviation"),
@@ -362,3 +347,28 @@ def write_onnx(path: Path, model: PenetrationModel) -> None:
     helper.set_model_props(made, {**facts, "target": settings.target, "program": "labapp"})
     onnx.checker.check_model(made)
     write_file(path, made.SerializeToString())
+
+
+def _static_graph(
+    static: LinearMap | GaussianMap,
+) -> tuple[dict[str, FloatArray], list[tuple[str, str, str]]]:
+    """Constants and operators (kind, inputs, output) from ``x``, shape (1, d), to ``sum``."""
+    if isinstance(static, LinearMap):
+        constants = {"weights": static.weights[:-1, None], "constant": static.weights[-1:]}
+        return constants, [("MatMul", "x weights", "product"), ("Add", "product constant", "sum")]
+    constants = {
+        "points": static.points,
+        "lengths": static.lengths,
+        "one": np.ones((static.points.shape[1], 1)),
+        "half": np.array([-0.5]),
+        "weights": static.signal * static.weights[None, :],
+    }
+    return constants, [
+        ("Sub", "x points", "difference"),
+        ("Div", "difference lengths", "distance"),
+        ("Mul", "distance distance", "square"),
+        ("MatMul", "square one", "squares"),
+        ("Mul", "squares half", "exponent"),
+        ("Exp", "exponent", "covariance"),
+        ("MatMul", "weights covariance", "sum"),
+    ]
