@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import math
 import os
+from collections import deque
 from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -202,12 +203,14 @@ class Predictor:
         Of the model.
     model
         The model.
+    keeps
+        Whether all predictions are kept for `predictions`.
     """
 
-    def __init__(self, name: str, model: PenetrationModel) -> None:
+    def __init__(self, name: str, model: PenetrationModel, *, keeps: bool = True) -> None:
         self.name, self.model = name, model
         self._frames: list[WeldSeries] = []
-        self._ended: list[Prediction] = []
+        self._ended: deque[Prediction] = deque(maxlen=None if keeps else 1)
         self._step = -(1 << 62)
 
     def add(self, result: FrameResult) -> None:
@@ -221,7 +224,9 @@ class Predictor:
         if result.time_s is None:
             raise InputError("--model", "time", "unknown", "a recording that has a time base")
         step = math.floor(result.time_s / self.model.settings.step_s + 1e-9)
-        if step != self._step:
+        if not 0 <= step - self._step <= LONGEST_MEMORY:  # it begins, or the clock was set
+            self._frames, self._step = [], step
+        elif step > self._step:
             self._end_step(step)
         self._frames.append(frame_features(result, self.model.settings.features))
 
@@ -251,18 +256,27 @@ class Predictor:
         columns = zip(*(vars(one).values() for one in self._ended), strict=True)
         return Prediction(*map(np.concatenate, columns))
 
-    def values(self) -> dict[str, float | str | None]:
-        """The prediction of the last step that ended, as values of a stream.
+    @property
+    def newest(self) -> tuple[float, float, bool]:
+        """Penetration and ± at the last step that ended, mm; whether they are extrapolated.
 
-        Names are those of `streams.PENETRATION`.
+        NaN where nothing is known.
         """
-        value = sigma = None
-        words = f"{self.name} {self.model.settings.target}"
-        if self._ended and math.isfinite(self._ended[-1].value[-1]):
-            newest = self._ended[-1]
-            value, sigma = float(newest.value[-1]), float(newest.sigma[-1])
-            words += " extrapolated" * bool(newest.is_outside[-1])
-        return {"penetration_mm": value, "penetration_sigma_mm": sigma, "penetration_model": words}
+        if not self._ended:
+            return math.nan, math.nan, False
+        last = self._ended[-1]
+        return float(last.value[-1]), float(last.sigma[-1]), bool(last.is_outside[-1])
+
+    def values(self) -> dict[str, float | str | None]:
+        """The newest prediction as values of a stream, with the names `streams.PENETRATION`."""
+        value, sigma, is_outside = self.newest
+        known = math.isfinite(value)
+        return {
+            "penetration_mm": value if known else None,
+            "penetration_sigma_mm": sigma if known else None,
+            "penetration_model": f"{self.name} {self.model.settings.target}"
+            + " extrapolated" * is_outside,
+        }
 
 
 def frame_features(result: FrameResult, features: Collection[str]) -> WeldSeries:
