@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from labapp.core.dynamics.analysis import Dynamics
+    from labapp.core.dynamics.penetration import PenetrationModel, Prediction
     from labapp.session.session import Session
     from labapp.session.signals import Signals
 
@@ -249,6 +250,24 @@ class Results(Sequence[FrameResult]):
 
         timed = signals.timed() if signals else {}
         return dynamics_of(measured_of(self), timed, DynamicsSettings(of, band_hz, segment_s))
+
+    def penetration(self, model: PenetrationModel) -> Prediction:
+        """Return what a model says of the penetration over these frames.
+
+        Parameters
+        ----------
+        model
+            One that was fitted, or read by `labapp.export.penetration.read_model`.
+
+        Raises
+        ------
+        InputError
+            If frames have no time, or none has a surface.
+        """
+        from labapp.export.dynamics import measured_of
+        from labapp.export.features import measured_series
+
+        return model.predict(measured_series("results", measured_of(self), model.settings.features))
 
     # --- as plots -----------------------------------------------------------------------------
 

@@ -7,8 +7,8 @@ folder (`export.results`), the summary, streams, progress.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -37,12 +37,24 @@ from labapp.cli.shared import (
 )
 from labapp.core.schemes import SCHEMES
 from labapp.errors import InputError
+from labapp.files import as_bytes, write_file
 
 if TYPE_CHECKING:
     from labapp.core.pipeline import Settings
+    from labapp.export.penetration import Predictor
     from labapp.export.summary import Summary
     from labapp.run.runner import Measurer, Sink
     from labapp.run.streams import Stream
+
+
+ModelFile = Annotated[
+    Path | None,
+    typer.Option(help="Penetration model; its predictions go to penetration.csv and streams."),
+]
+
+Anywhere = Annotated[
+    bool, typer.Option("--anywhere", help="Let other machines connect, unauthenticated.")
+]
 
 
 def reconstruct(
@@ -74,6 +86,7 @@ def reconstruct(
     ] = "all",
     sigma_parts: SigmaParts = False,
     warm: Warm = False,
+    model: ModelFile = None,
     lines: Annotated[
         str | None,
         typer.Option(metavar="[HOST:]PORT", help="Send measures as lines of JSON over TCP."),
@@ -82,9 +95,7 @@ def reconstruct(
         str | None,
         typer.Option(metavar="[HOST:]PORT", help="Publish measures as variables of OPC UA."),
     ] = None,
-    anywhere: Annotated[
-        bool, typer.Option("--anywhere", help="Let other machines connect, unauthenticated.")
-    ] = False,
+    anywhere: Anywhere = False,
 ) -> None:
     """Measure frames and write measures, dots, points, boundaries and surfaces.
 
@@ -100,10 +111,12 @@ def reconstruct(
     settings = with_methods(settings, detector, rows)
     places = {"lines": lines, "opcua": opcua}
     with ExitStack() as at_end:
-        streams = _stream_sinks(at_end, places, anywhere)
+        predictor = at_end.enter_context(_predicting(model, out)) if model is not None else None
+        streams = _stream_sinks(at_end, places, anywhere, predictor)
         summary = _measure_recording(
             *(source, setup, out, settings, frames),
             surfaces=surfaces == "all",
+            with_surfaces=surfaces == "all" or model is not None,
             sigma_parts=sigma_parts,
             warm=warm,
             streams=streams,
@@ -112,17 +125,38 @@ def reconstruct(
         raise typer.Exit(NOTHING_MEASURED)
 
 
-def _stream_sinks(at_end: ExitStack, places: dict[str, str | None], anywhere: bool) -> list[Sink]:
-    """A sink for each stream that has a place (`open_stream`), which is closed at the end."""
+@contextmanager
+def _predicting(model: Path, out: Path) -> Iterator[Predictor]:
+    """A predictor for all frames; at the end its predictions are written beside their results."""
+    from labapp.export.penetration import Predictor, prediction_csv, read_model
+
+    predictor = Predictor(model.stem, read_model(model))
+    try:
+        yield predictor
+    finally:
+        found = predictor.predictions()
+        if found is not None:
+            text = prediction_csv(predictor.name, predictor.model, {out.name: found})
+            write_file(out / "penetration.csv", as_bytes(text))
+
+
+def _stream_sinks(
+    at_end: ExitStack, places: dict[str, str | None], anywhere: bool, predictor: Predictor | None
+) -> list[Sink]:
+    """A sink for the predictor, and for each stream that has a place (`open_stream`).
+
+    Streams are closed at the end.
+    """
+    sinks: list[Sink] = [] if predictor is None else [predictor.add]
     asked = {kind: place for kind, place in places.items() if place is not None}
     if not asked:
-        return []
+        return sinks
     from labapp.run.streams import open_stream, stream_values
 
     def sink(stream: Stream) -> Sink:
-        return lambda result: stream.publish(stream_values(result))
+        more = predictor.values if predictor is not None else dict
+        return lambda result: stream.publish({**stream_values(result), **more()})
 
-    sinks = []
     for kind, place in asked.items():
         stream = open_stream(kind, place, anywhere)
         at_end.callback(stream.close)
@@ -139,13 +173,15 @@ def _measure_recording(
     frames: str,
     *,
     surfaces: bool,
+    with_surfaces: bool,
     sigma_parts: bool,
     warm: bool,
     streams: Sequence[Sink],
 ) -> Summary:
     """Measure, showing progress and failures on stderr and the summary on stdout.
 
-    Parameters are the command's options (`reconstruct`), and sinks for the streams.
+    Parameters are the command's options (`reconstruct`), sinks for the streams, and whether they
+    need surfaces.
     """
     from labapp.config.setup import read_setup
     from labapp.core.recording.residual_check import ResidualRecord, judged_status
@@ -170,7 +206,7 @@ def _measure_recording(
                 if warm:
                     processes = at_end.enter_context(stretch_pools(len(selected)))
                     measurer = RecordingMeasurer(
-                        *(source_path, source.index, setup, settings, surfaces, sigma_parts),
+                        *(source_path, source.index, setup, settings, with_surfaces, sigma_parts),
                         processes,
                     )
                 sinks = [results.write, summary.add, *streams, shown]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -161,7 +162,7 @@ class FeatureTable:
 
     # --- files --------------------------------------------------------------------------------
 
-    def write(self, path: Path) -> None:
+    def write(self, path: str | os.PathLike[str]) -> None:
         """Write the table: ``.csv``, or ``.mat`` for MATLAB (``struct2table(features)``).
 
         Raises
@@ -169,6 +170,7 @@ class FeatureTable:
         InputError
             If it cannot be written, or the suffix is another.
         """
+        path = Path(path)
         suffix = path.suffix.lower()
         if suffix not in (".csv", ".mat"):
             raise InputError(path, "name", suffix or "no suffix", ".csv or .mat")
@@ -205,7 +207,7 @@ class FeatureTable:
         return columns
 
     @classmethod
-    def read(cls, path: Path) -> Self:
+    def read(cls, path: str | os.PathLike[str]) -> Self:
         """Read a table that `write` wrote as CSV, or one with the same columns.
 
         Raises
@@ -213,6 +215,7 @@ class FeatureTable:
         InputError
             If it is none.
         """
+        path = Path(path)
         read = read_columns(path, WANTED, LARGEST, ("recording",))
         names = read.pop("recording", None)
         columns = {name: of for name, of in read.items() if isinstance(of, np.ndarray)}

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import json
 import math
+import os
+from collections import deque
 from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -40,7 +42,7 @@ OPSET, IR_VERSION = 17, 8
 # --- files --------------------------------------------------------------------------------------
 
 
-def write_model(path: Path, model: PenetrationModel) -> None:
+def write_model(path: str | os.PathLike[str], model: PenetrationModel) -> None:
     """Write a model as JSON.
 
     Raises
@@ -59,7 +61,7 @@ def write_model(path: Path, model: PenetrationModel) -> None:
         **{key: getattr(model, key) for key in ("time_constants_s", *ARRAYS, *NUMBERS)},
         "static": vars(static) if isinstance(static, LinearMap) else _fields(static),
     }
-    write_file(path, as_bytes(json.dumps(content, default=_listed, indent=1) + "\n"))
+    write_file(Path(path), as_bytes(json.dumps(content, default=_listed, indent=1) + "\n"))
 
 
 ARRAYS = ("center", "scale", "low", "high")
@@ -75,7 +77,7 @@ def _listed(value: Any) -> Any:
     return value.tolist()
 
 
-def read_model(path: Path) -> PenetrationModel:
+def read_model(path: str | os.PathLike[str]) -> PenetrationModel:
     """Read a model that `write_model` wrote.
 
     Raises
@@ -83,6 +85,7 @@ def read_model(path: Path) -> PenetrationModel:
     InputError
         If it is none, or anything in it is impossible.
     """
+    path = Path(path)
     with os_errors_as_input(path, "file", WANTED):
         size = path.stat().st_size
         if size > LARGEST:
@@ -200,13 +203,14 @@ class Predictor:
         Of the model.
     model
         The model.
+    keeps
+        Whether all predictions are kept for `predictions`.
     """
 
-    def __init__(self, name: str, model: PenetrationModel) -> None:
+    def __init__(self, name: str, model: PenetrationModel, *, keeps: bool = True) -> None:
         self.name, self.model = name, model
-        self.newest = (math.nan, math.nan, False)
-        """Penetration and ± at the last step that has ended, mm; whether it is extrapolated."""
         self._frames: list[WeldSeries] = []
+        self._ended: deque[Prediction] = deque(maxlen=None if keeps else 1)
         self._step = -(1 << 62)
 
     def add(self, result: FrameResult) -> None:
@@ -218,37 +222,61 @@ class Predictor:
             If it has no time.
         """
         if result.time_s is None:
-            right = "a recording that has a time base"
-            raise InputError("--model", "time", "unknown", right)
-        step_s = self.model.settings.step_s
-        step = math.floor(result.time_s / step_s + 1e-9)
-        if step != self._step:
+            raise InputError("--model", "time", "unknown", "a recording that has a time base")
+        step = math.floor(result.time_s / self.model.settings.step_s + 1e-9)
+        if not 0 <= step - self._step <= LONGEST_MEMORY:  # it begins, or the clock was set
+            self._frames, self._step = [], step
+        elif step > self._step:
             self._end_step(step)
         self._frames.append(frame_features(result, self.model.settings.features))
 
     def _end_step(self, step: int) -> None:
-        """Predict the step that ends, and forget frames that no prediction needs any more."""
-        settings = self.model.settings
-        self.newest = (math.nan, math.nan, False)
+        """Predict the steps before this one, and forget frames that are needed no more."""
+        step_s, last = self.model.settings.step_s, self._step
         if any(np.isfinite(one.value).all() for one in self._frames):
-            # Steps without a frame at the end are held, too.
-            until = self._empty((step - 0.5) * settings.step_s)
-            found = self.model.predict(joined([*self._frames, until]))
-            last = float(found.value[-1]), float(found.sigma[-1]), bool(found.is_outside[-1])
-            self.newest = last
-        first = (step - self.model.memory - MOST_HELD - 1) * settings.step_s
+            none = np.full((1, len(self.model.settings.features)), np.nan)
+            until = np.array([(step - 0.5) * step_s])  # steps without a frame are held, too
+            end = WeldSeries("", until, none, none, none, none[:, 0], none[:, 0])
+            found = self.model.predict(joined([*self._frames, end]))
+            new = found.time_s > last * step_s
+            self._ended.append(Prediction(*(of[new] for of in vars(found).values())))
+        elif self._ended:
+            unknown = np.full(1, np.nan)
+            time_s = np.array([(last + 0.5) * step_s])
+            self._ended.append(Prediction(time_s, unknown, unknown, np.zeros(1, bool)))
+        first = (step - self.model.memory - MOST_HELD - 1) * step_s
         self._frames = [one for one in self._frames if one.time_s[0] >= first]
         self._step = step
 
-    def _empty(self, time_s: float) -> WeldSeries:
-        none = np.full((1, len(self.model.settings.features)), np.nan)
-        return WeldSeries("", np.array([time_s]), none, none, none, none[:, 0], none[:, 0])
+    def predictions(self) -> Prediction | None:
+        """All predictions, the step that has not ended with them; None if there are none."""
+        self._end_step(self._step + 1)
+        if not self._ended:
+            return None
+        columns = zip(*(vars(one).values() for one in self._ended), strict=True)
+        return Prediction(*map(np.concatenate, columns))
+
+    @property
+    def newest(self) -> tuple[float, float, bool]:
+        """Penetration and ± at the last step that ended, mm; whether they are extrapolated.
+
+        NaN where nothing is known.
+        """
+        if not self._ended:
+            return math.nan, math.nan, False
+        last = self._ended[-1]
+        return float(last.value[-1]), float(last.sigma[-1]), bool(last.is_outside[-1])
 
     def values(self) -> dict[str, float | str | None]:
-        """The newest prediction as values of a stream (`streams.PENETRATION`)."""
-        value, sigma = (each if math.isfinite(each) else None for each in self.newest[:2])
-        words = f"{self.name} {self.model.settings.target}" + " extrapolated" * self.newest[2]
-        return {"penetration_mm": value, "penetration_sigma_mm": sigma, "penetration_model": words}
+        """The newest prediction as values of a stream, with the names `streams.PENETRATION`."""
+        value, sigma, is_outside = self.newest
+        known = math.isfinite(value)
+        return {
+            "penetration_mm": value if known else None,
+            "penetration_sigma_mm": sigma if known else None,
+            "penetration_model": f"{self.name} {self.model.settings.target}"
+            + " extrapolated" * is_outside,
+        }
 
 
 def frame_features(result: FrameResult, features: Collection[str]) -> WeldSeries:
@@ -257,7 +285,11 @@ def frame_features(result: FrameResult, features: Collection[str]) -> WeldSeries
     sizes = vars(found.measures) if found.measures else dict.fromkeys(SIZES, math.nan)
     columns = {name: np.array([value]) for name, value in sizes.items()}
     if not set(SHAPES).isdisjoint(features):
-        columns |= shape_row(found.reconstruction)
+        columns |= (
+            shape_row(found.reconstruction)
+            if result.shape is None
+            else {name: np.array([value]) for name, value in vars(result.shape).items()}
+        )
     time_s = np.array([math.nan if result.time_s is None else result.time_s])
     return weld_series("", time_s, columns, tuple(features))
 
@@ -287,7 +319,7 @@ def write_onnx(path: Path, model: PenetrationModel) -> None:
         from onnx import TensorProto, helper, numpy_helper
     except ImportError as error:
         raise needs_extra("onnx") from error
-    settings, static = model.settings, model.static
+    settings = model.settings
     orders, width = settings.orders, len(settings.features)
     kernel = np.zeros((orders.lags, model.memory))
     for lag in range(orders.lags):
@@ -306,26 +338,9 @@ def write_onnx(path: Path, model: PenetrationModel) -> None:
         ("Sub", "regressors center", "centred"),
         ("Div", "centred scale", "x"),
     ]
-    if isinstance(static, LinearMap):
-        constants |= {"weights": static.weights[:-1, None], "constant": static.weights[-1:]}
-        nodes += [("MatMul", "x weights", "product"), ("Add", "product constant", "sum")]
-    else:
-        constants |= {
-            "points": static.points,
-            "lengths": static.lengths,
-            "one": np.ones((static.points.shape[1], 1)),
-            "half": np.array([-0.5]),
-            "weights": static.signal * static.weights[None, :],
-        }
-        nodes += [
-            ("Sub", "x points", "difference"),
-            ("Div", "difference lengths", "distance"),
-            ("Mul", "distance distance", "square"),
-            ("MatMul", "square one", "squares"),
-            ("Mul", "squares half", "exponent"),
-            ("Exp", "exponent", "covariance"),
-            ("MatMul", "weights covariance", "sum"),
-        ]
+    more, operators = _static_graph(model.static)
+    constants |= more
+    nodes += operators
     constants["flat"] = np.array([1])
     nodes += [
         ("Reshape", "sum flat", "deviation"),
@@ -346,3 +361,28 @@ def write_onnx(path: Path, model: PenetrationModel) -> None:
     helper.set_model_props(made, {**facts, "target": settings.target, "program": "labapp"})
     onnx.checker.check_model(made)
     write_file(path, made.SerializeToString())
+
+
+def _static_graph(
+    static: LinearMap | GaussianMap,
+) -> tuple[dict[str, FloatArray], list[tuple[str, str, str]]]:
+    """Constants and operators (kind, inputs, output) from ``x``, shape (1, d), to ``sum``."""
+    if isinstance(static, LinearMap):
+        constants = {"weights": static.weights[:-1, None], "constant": static.weights[-1:]}
+        return constants, [("MatMul", "x weights", "product"), ("Add", "product constant", "sum")]
+    constants = {
+        "points": static.points,
+        "lengths": static.lengths,
+        "one": np.ones((static.points.shape[1], 1)),
+        "half": np.array([-0.5]),
+        "weights": static.signal * static.weights[None, :],
+    }
+    return constants, [
+        ("Sub", "x points", "difference"),
+        ("Div", "difference lengths", "distance"),
+        ("Mul", "distance distance", "square"),
+        ("MatMul", "square one", "squares"),
+        ("Mul", "squares half", "exponent"),
+        ("Exp", "exponent", "covariance"),
+        ("MatMul", "weights covariance", "sum"),
+    ]

@@ -25,7 +25,9 @@ from labapp.text import now, unescaped_csv_text
 from labapp.version import VERSION
 
 RUN_FILE = "run.json"
-OURS = re.compile(r"(measures|dots|points|boundary|surface_\d{6,})\.csv|surface_\d{6,}\.stl")
+OURS = re.compile(
+    r"(measures|dots|points|boundary|penetration|surface_\d{6,})\.csv|surface_\d{6,}\.stl"
+)
 SURFACES = ("csv", "stl")
 """What a run writes of each surface."""
 

@@ -10,6 +10,7 @@ from collections.abc import Callable
 from labapp.config.setup import Setup
 from labapp.core.pipeline import Measurement, Settings
 from labapp.export.frame_result import FrameResult
+from labapp.export.penetration import Predictor
 from labapp.export.rendering.scene import Scene
 from labapp.media.cameras import CameraFrame
 from labapp.media.events import Event
@@ -59,7 +60,9 @@ class LiveWatch:
         self._is_closed = False
         self._measured_s, self._last = time.monotonic(), (0, 0.0)
         self._is_drawn = threading.Event()
-        self._sinks = (self._judge, self.trend.add, self._show, self._publish)
+        self.predictor: Predictor | None = None
+        """What predicts penetration from the results; may be replaced at any time."""
+        self._sinks = (self._judge, self.trend.add, self._predict, self._show, self._publish)
 
     def take(self, frame: CameraFrame) -> None:
         """Take a frame of the camera; never waits."""
@@ -113,6 +116,11 @@ class LiveWatch:
         ):
             self._on_event(self._changed(alarm), result.time_s)
 
+    def _predict(self, result: LiveResult) -> None:
+        predictor = self.predictor
+        if predictor is not None:
+            predictor.add(result)
+
     def _show(self, result: LiveResult) -> None:
         """Hold the result and its surface for `newest` and `scene`."""
         if result.scene is not None:
@@ -133,6 +141,9 @@ class LiveWatch:
 
     def _publish(self, result: FrameResult) -> None:
         values = stream_values(result, self.alarms.shown)
+        predictor = self.predictor
+        if predictor is not None and isinstance(result, LiveResult):  # not while all is silent
+            values = {**values, **predictor.values()}
         with self._turn:  # no stream may be closed meanwhile
             for stream in self._streams.values():
                 stream.publish(values)

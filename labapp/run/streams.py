@@ -41,6 +41,9 @@ ALARMS = ("alarm", "unacknowledged")
 WORDS = ("status", "reason", "scheme", "sigma_of", "setup_status", "setup_doubt")
 """Names of the other values that are words."""
 
+PENETRATION = ("penetration_mm", "penetration_sigma_mm", "penetration_model")
+"""Names of a model's prediction, where there is a model: value, ±, which model and of what."""
+
 NAMESPACE = "urn:labapp:measures"
 
 STARTING_S = 20.0
@@ -264,8 +267,8 @@ class OpcuaStream:
         server.allow_remote_admin(False)  # or anybody could write, and take variables away
         space = await server.register_namespace(NAMESPACE)
         pool = await server.nodes.objects.add_object(space, "Pool")
-        words = dict.fromkeys((*WORDS, *ALARMS), "")
-        sizes = dict.fromkeys(SIZES, math.nan)
+        words = dict.fromkeys((*WORDS, *ALARMS, PENETRATION[2]), "")
+        sizes = dict.fromkeys((*SIZES, *PENETRATION[:2]), math.nan)
         for name, empty in {"frame": -1, "time_s": math.nan, **words, **sizes}.items():
             self._variables[name] = await pool.add_variable(space, name, empty)
         await server.start()

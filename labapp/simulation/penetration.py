@@ -36,6 +36,19 @@ SCATTER_MM, SCATTER_S = 0.04, 1.0
 """What the pool does not tell of the back side: standard deviation and correlation time."""
 
 
+def back_width_mm(drive: FloatArray) -> FloatArray:
+    """The law: width of the back-side bead against the drive, 1 where it melts through."""
+    above = np.maximum(drive - 1.0, 0.0)
+    return np.asarray(5.0 * above / (0.25 + above))
+
+
+def pool_features(drive: FloatArray) -> FloatArray:
+    """`FEATURES` of the pool at a drive, shape (n, 3), mm."""
+    bead = back_width_mm(drive)
+    convexity = 0.22 - 0.06 * (drive - 1) - 0.06 * bead
+    return np.column_stack([5.5 + 2.5 * (drive - 1), 7.0 + 4.5 * (drive - 1), convexity])
+
+
 @dataclass(frozen=True)
 class SimulatedWeld:
     """A weld, and the truth about it.
@@ -53,12 +66,6 @@ class SimulatedWeld:
     series: WeldSeries
     speed_mm_s: float
     back_width_mm: FloatArray
-
-
-def back_width_mm(drive: FloatArray) -> FloatArray:
-    """The law: width of the back-side bead against the drive, 1 where it melts through."""
-    above = np.maximum(drive - 1.0, 0.0)
-    return np.asarray(5.0 * above / (0.25 + above))
 
 
 def simulate_welds(count: int, seed: int) -> list[SimulatedWeld]:
@@ -80,15 +87,12 @@ def _weld(name: str, rng: np.random.Generator) -> SimulatedWeld:
     speed = float(rng.uniform(2.0, 3.0))
     edges = np.arange(CURRENT_S, DURATION_S, CURRENT_S) + rng.uniform(-0.5, 0.5)
     levels = rng.uniform(0.75, 1.45, len(edges) + 1)
-    drive = _lag(levels[np.searchsorted(edges, time_s)], POOL_S)
-    bead = back_width_mm(drive)
-    truth = np.column_stack(
-        [5.5 + 2.5 * (drive - 1), 7.0 + 4.5 * (drive - 1), 0.22 - 0.06 * (drive - 1) - 0.06 * bead]
-    )
+    drive = first_order_lag(levels[np.searchsorted(edges, time_s)], POOL_S)
+    truth, bead = pool_features(drive), back_width_mm(drive)
     share = np.exp(-1 / (SCATTER_S * RATE_HZ))
     white = rng.normal(0, SCATTER_MM * np.sqrt(1 - share**2), len(time_s))
     scatter = signal.lfilter([1.0], [1.0, -share], white)
-    back = _lag(bead, BACK_S)
+    back = first_order_lag(bead, BACK_S)
     back = np.where(back > 0.05, np.maximum(back + scatter, 0.0), 0.0)
     measured = truth + rng.normal(0, NOISE, truth.shape) + rng.normal(0, LEVEL)
     place = np.arange(0.0, speed * time_s[-1], SCAN_MM)
@@ -101,8 +105,10 @@ def _weld(name: str, rng: np.random.Generator) -> SimulatedWeld:
     return SimulatedWeld(WeldSeries(name, time_s, measured, *parts, target, sigma), speed, back)
 
 
-def _lag(values: FloatArray, time_constant_s: float) -> FloatArray:
+def first_order_lag(
+    values: FloatArray, time_constant_s: float, rate_hz: float = RATE_HZ
+) -> FloatArray:
     """A first-order lag that begins at rest."""
-    pole = np.exp(-1 / (time_constant_s * RATE_HZ))
+    pole = np.exp(-1 / (time_constant_s * rate_hz))
     start = [pole * values[0]]
     return np.asarray(signal.lfilter([1 - pole], [1.0, -pole], values, zi=start)[0])

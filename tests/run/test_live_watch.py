@@ -17,10 +17,14 @@ import numpy as np
 import pytest
 
 from labapp.config.setup import Setup, read_setup
+from labapp.core.dynamics.penetration import ModelSettings, PenetrationModel
+from labapp.core.dynamics.static_maps import LinearMap
+from labapp.core.dynamics.weld_series import Orders
 from labapp.core.images.dots import Dots
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.recording import chain as recording_chain
 from labapp.core.surface.measures import Measures
+from labapp.export.penetration import Predictor
 from labapp.export.rendering.scene import Scene, empty_scene
 from labapp.media import open_source
 from labapp.media.cameras import CameraFrame
@@ -387,3 +391,27 @@ def test_frames_are_judged_some_times_a_second_while_they_are_followed(setup: Se
         measure(one, False)
         chain.now_s += 1.1 * SOUGHT_S
     assert len(chain.judged) == len(wanted) + 2
+
+
+def test_a_model_predicts_from_what_is_measured_and_not_while_all_is_silent(watch: LiveWatch):
+    """Half the width, a step a frame: the step that ended is that of the frame before."""
+    settings = ModelSettings(("width_mm",), "back_width_mm", 1.0, Orders(0, 1, 0))
+    one, half = np.ones(1), LinearMap(np.array([0.5, 0.0]), np.zeros((2, 2)))
+    model = PenetrationModel("arx", settings, (), 0 * one, one, 0 * one, 9 * one, 0.0, half, 0.1)
+    watch.predictor = Predictor("bench", model, keeps=False)
+    prepare(watch, {1: 7.0, 2: 5.0, **dict.fromkeys(range(4, 12))})
+    stream = LineStream()
+    watch.set_stream("lines", stream)
+    with connect(stream.port) as connected:
+        file = connected.makefile("rb")
+        file.readline()
+        for number in range(12):
+            watch.measure(frame(number))
+        lines = [json.loads(file.readline()) for _ in range(12)]
+        found = [line["penetration_mm"] for line in lines]
+        assert found[:5] == [None, *map(pytest.approx, (3.35, 3.5, 2.5, 3.35))]
+        assert found[-1] is None
+        assert {line["penetration_model"] for line in lines} == {"bench back_width_mm"}
+        assert lines[2]["penetration_sigma_mm"] == pytest.approx(np.hypot(0.1, 0.5 * 0.03))
+        watch._raise_silence("nothing came")
+        assert "penetration_mm" not in json.loads(file.readline())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy import signal
@@ -163,8 +164,7 @@ def find_transitions(time_s: FloatArray, value: FloatArray, full_mm: float) -> F
     is_full = value >= full_mm
     for state in (False, True):  # short partial ones first
         edges = np.flatnonzero(np.diff(is_full)) + 1
-        ends = [*edges[1:], len(value)]
-        for begin, end in zip(edges, ends, strict=True):
+        for begin, end in pairwise([*edges, len(value)]):
             lasts_s = time_s[min(end, len(value) - 1)] - time_s[begin]
             if is_full[begin] == state and lasts_s < HOLD_S:
                 is_full[begin:end] = not state

@@ -175,9 +175,7 @@ class Observation(ReadOnlyArrays):
                 if len(self._fitted) % COUNTED_EVERY == 0:
                     self._forget_oldest()
                 self._fitted[key] = made
-            except (
-                CannotMeasure
-            ) as failure:  # kept as it is, it would keep its frames and their arrays
+            except CannotMeasure as failure:  # its traceback would keep the fit's arrays
                 self._fitted[key] = (failure.status, failure.reason)
         found = self._fitted[key]
         if isinstance(found, tuple):

@@ -23,6 +23,7 @@ from labapp.gui.live.figures import (
     pace_text,
 )
 from labapp.gui.live.live import SIMULATED, Live, choices, setup_of
+from labapp.gui.live.penetration import LivePenetration
 from labapp.gui.live.plan_fields import PlanFields
 from labapp.gui.live.record_bar import RecordBar
 from labapp.gui.tasks import DONE, Control, Task
@@ -192,6 +193,8 @@ class LiveView(QObject):
         self.camera_fields.show_camera(
             live.feed, None if session is None else calibrated_px(session)
         )
+        self.penetration.begin()
+        self.penetration.setVisible(live.watch is not None)
         self._rings.setData([])
         self.measured_s, self._result = 0.0, None
         self.figures.show_figures(figures(None) if live.watch is not None else ())
@@ -346,7 +349,8 @@ class LiveView(QObject):
         self.updates += self.canvas.follow(result, watch)
 
     def _show_figures(self, watch: LiveWatch) -> None:
-        self.figures.show_figures(figures(self._result, watch.alarms.limits, self._age_s))
+        sizes = figures(self._result, watch.alarms.limits, self._age_s)
+        self.figures.show_figures((*sizes, *self.penetration.figures(self._age_s > OLD_S)))
 
     @property
     def _age_s(self) -> float:
@@ -429,7 +433,7 @@ class LiveView(QObject):
             "Look for cameras", "Find the cameras that are connected", self.find
         )
         self.answer, self.counts = Message(2), Message(2)
-        self.figures = LiveFigures()
+        self.figures, self.penetration = LiveFigures(), LivePenetration(self.workspace, self._watch)
         fields = FieldForm()
         self.camera_fields = CameraFields(
             fields, lambda wanted: None if self.live is None else self.live.apply(wanted)
@@ -438,7 +442,7 @@ class LiveView(QObject):
         self.plan_fields = PlanFields(fields)
         self.plan_fields.edited.connect(self._replan)
         self.settings = QWidget()
-        vbox(self.figures, self.counts, fields, of=self.settings)
+        vbox(self.figures, self.penetration, self.counts, fields, of=self.settings)
         buttons = hbox(self.start_button, self.find_button)
         self.group = Group("Capture", form, buttons, self.answer, self.settings)
 

@@ -28,6 +28,7 @@ from labapp.run.study.workers import Job, Workers, dask_workers, local_workers, 
 from labapp.version import VERSION
 
 if TYPE_CHECKING:
+    from labapp.export.features import FeatureTable
     from labapp.export.tables import Table
     from labapp.run.study.summary import StudySummary
 
@@ -240,6 +241,25 @@ class Study:
                     if table is not None:
                         found[one.name] = table
         return found
+
+    def features(self, sections: Path | None = None) -> FeatureTable:
+        """Features of all frames beside the penetration that sections tell (`FeatureTable.fit`).
+
+        Parameters
+        ----------
+        sections
+            Table of sections (docs/penetration.md); None: none is known.
+
+        Raises
+        ------
+        InputError
+            If nothing is measured yet, or the table is wrong.
+        """
+        from labapp.run.study.sections import study_features
+
+        return study_features(
+            self.plan, self.tables(), None if sections is None else Path(sections)
+        )[0]
 
     def results(self, *, surfaces: bool = False) -> StudySummary:
         """Put together what is measured, and write it: tables, a summary, surfaces.

@@ -18,11 +18,16 @@ from PySide6.QtGui import QPalette
 from PySide6.QtWidgets import QAbstractButton, QLabel
 from pytestqt.qtbot import QtBot
 
+from labapp.core.dynamics.penetration import ModelSettings, PenetrationModel
+from labapp.core.dynamics.static_maps import LinearMap
+from labapp.core.dynamics.weld_series import Orders
 from labapp.core.images.exposure import Exposure
 from labapp.core.pipeline import Measurement
 from labapp.core.quality import Quality, Remark
 from labapp.core.surface.measures import Measures
+from labapp.export.penetration import write_model
 from labapp.export.rendering.scene import HEIGHT, Scene
+from labapp.gui.live import penetration as live_penetration
 from labapp.gui.live import view as live_view
 from labapp.gui.live.figures import (
     FIRST,
@@ -438,6 +443,31 @@ def test_control_software_is_told_while_a_camera_is_watched(
     qtbot.waitUntil(lambda: not window.workspace.tasks.active)
     with pytest.raises(OSError, match="refused"):
         connect(port)
+
+
+def test_a_penetration_model_stands_beside_the_sizes_and_is_marked(
+    page: CapturePage, qtbot: QtBot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+):
+    settings = ModelSettings(("width_mm",), "back_width_mm", orders=Orders(0, 1, 0))
+    one, half = np.ones(1), LinearMap(np.array([0.5, 0.0]), np.zeros((2, 2)))
+    given = 0 * one, one, 0 * one, 9 * one, 0.0, half, 0.1
+    path = tmp_path / "bench.json"
+    write_model(path, PenetrationModel("arx", settings, (), *given, rmse_mm=0.12))
+    monkeypatch.setattr(live_penetration, "ask_file", lambda *_: path)
+    view = page.live_view
+    start(page, qtbot)
+    assert not view.penetration.none_button.isVisible()
+    view.penetration.choose_button.click()
+    qtbot.waitUntil(lambda: figure(page, 3, 1).text() == "3.350")
+    assert figure(page, 3, 0).text() == "Back width\nmodel"
+    assert "bench" in view.penetration.words.text()
+    # What cannot be read is said, and changes nothing.
+    path.write_text("{}")
+    view.penetration.choose_button.click()
+    qtbot.waitUntil(lambda: "bench.json" in view.penetration.words.text())
+    assert figure(page, 3, 1).isVisible()
+    view.penetration.none_button.click()
+    qtbot.waitUntil(lambda: not figure(page, 3, 1).isVisible())
 
 
 def test_a_port_that_is_taken_is_said_with_what_to_do(

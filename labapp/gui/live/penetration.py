@@ -1,0 +1,88 @@
+"""A penetration model beside the live sizes: chosen by the operator, marked as a model's."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from PySide6.QtWidgets import QWidget
+
+from labapp.core.dynamics.penetration import PenetrationModel
+from labapp.export.penetration import Predictor, read_model
+from labapp.gui.dialogs import ask_file
+from labapp.gui.digits import NOTHING
+from labapp.gui.live.figures import DECIMALS, Figure
+from labapp.gui.widgets.buttons import button
+from labapp.gui.widgets.labels import Message
+from labapp.gui.widgets.layouts import hbox, vbox
+from labapp.gui.workspace import Workspace
+from labapp.run.live_watch import LiveWatch
+
+MODELS = "Penetration models (*.json)"
+
+
+class LivePenetration(QWidget):
+    """Chooses a model, or none, which it is at every start."""
+
+    def __init__(self, workspace: Workspace, watch: Callable[[], LiveWatch | None]) -> None:
+        super().__init__()
+        self._workspace, self._watch = workspace, watch
+        self._model: tuple[str, PenetrationModel] | None = None
+        self.choose_button = button(
+            "Penetration &model…",
+            "Choose a model that labapp penetration fit wrote; it predicts from the live pool",
+            self.choose,
+        )
+        self.none_button = button("No model", "Predict no more", lambda: self.set_model(None))
+        self.words = Message(2)
+        vbox(hbox(self.choose_button, self.none_button), self.words, of=self)
+        self.set_model(None)
+
+    def choose(self) -> None:
+        """Ask for a model, and predict with it from the next frame on."""
+        path = ask_file(self, "Choose a penetration model", self._workspace.folder, MODELS)
+        if path is None:
+            return
+
+        def done(model: PenetrationModel) -> None:
+            self.set_model((path.stem, model))
+
+        self._workspace.tasks.start(
+            "Reading the model", lambda _: read_model(path), done, beside=self.words.setText
+        )
+
+    def set_model(self, named: tuple[str, PenetrationModel] | None) -> None:
+        """Predict with another model; None: with none."""
+        self._model = named
+        self.none_button.setVisible(named is not None)
+        words = ""
+        if named is not None:
+            name, model = named
+            words = f"Model {name} ({model.kind}), error {model.rmse_mm:.3f} mm of welds left out"
+        self.words.setText(words)
+        self.begin()
+
+    def begin(self) -> None:
+        """Predict with the chosen model: a camera has been started, or the model was chosen."""
+        watch = self._watch()
+        if watch is not None:
+            watch.predictor = None if self._model is None else Predictor(*self._model, keeps=False)
+
+    def figures(self, is_old: bool) -> tuple[Figure, ...]:
+        """What the model says, as a figure; none without one."""
+        watch = self._watch()
+        predictor = None if watch is None else watch.predictor
+        if predictor is None:
+            return ()
+        value, sigma, is_outside = predictor.newest
+        words = predictor.model.settings.target.rpartition("_")[0].replace("_", " ").capitalize()
+        known = math.isfinite(value)
+        return (
+            Figure(
+                words,
+                f"{value:.{DECIMALS}f}" if known else NOTHING,
+                f"± {sigma:.{DECIMALS}f}" if known else "",
+                "◆ model, extrapolated" if is_outside else "model",
+                "old" if is_old else "plain",
+            ),
+        )

@@ -1,0 +1,304 @@
+"""Tables of features, files of models, predictions while frames come, ONNX."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.io import loadmat
+
+from labapp.core.dynamics.penetration import ModelSettings, PenetrationModel, fit_model
+from labapp.core.dynamics.shape import Shape
+from labapp.core.dynamics.weld_series import Orders, WeldSeries
+from labapp.core.pipeline import Measurement
+from labapp.core.surface.measures import Measures
+from labapp.errors import InputError
+from labapp.export.features import FeatureTable, feature_sigmas
+from labapp.export.frame_result import FrameResult
+from labapp.export.penetration import (
+    Predictor,
+    prediction_csv,
+    read_model,
+    write_model,
+    write_onnx,
+)
+from labapp.simulation.penetration import FEATURES, TARGET, simulate_welds
+
+WELDS = tuple(one.series for one in simulate_welds(4, 2))
+
+
+@cache
+def fitted(kind: str) -> PenetrationModel:
+    settings = ModelSettings(FEATURES, TARGET, orders=Orders(1, 2, 1), full_mm=0.5)
+    model = fit_model(WELDS[:3], kind, settings)  # type: ignore[arg-type]
+    return replace(model, factor=1.2, rmse_mm=0.1)
+
+
+@pytest.fixture(scope="module", params=["arx", "gp"])
+def model(request: pytest.FixtureRequest) -> PenetrationModel:
+    return fitted(request.param)
+
+
+# --- tables -------------------------------------------------------------------------------------
+
+
+def test_a_table_comes_back_as_it_was(tmp_path: Path) -> None:
+    written = FeatureTable(FEATURES, TARGET, WELDS)
+    written.write(tmp_path / "features.csv")
+    read = FeatureTable.read(tmp_path / "features.csv")
+    assert (read.features, read.target) == (FEATURES, TARGET)
+    for one, other in zip(read.welds, WELDS, strict=True):
+        assert one.name == other.name
+        for name in ("time_s", "value", "noise", "level", "target", "target_sigma"):
+            there = getattr(other, name)
+            np.testing.assert_allclose(getattr(one, name), there, rtol=1e-6, equal_nan=True)
+
+
+def test_matlab_reads_the_table(tmp_path: Path) -> None:
+    FeatureTable(FEATURES, TARGET, WELDS).write(tmp_path / "features.mat")
+    read = loadmat(tmp_path / "features.mat")["features"][0, 0]
+    count = sum(len(one.time_s) for one in WELDS)
+    assert read["convexity_sigma_noise_mm"].shape == (count, 1)
+    assert read["width_mm"][:, 0] == pytest.approx(np.concatenate([w.value[:, 0] for w in WELDS]))
+    assert [str(cell[0]) for cell in read["recording"][[0, -1], 0]] == ["weld_01", "weld_04"]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "",
+        "recording,time_s\nweld,0\n",
+        "recording,width_mm\nweld,6\n",
+        "time_s,width_mm\n0,6\n",
+        "recording,time_s,width_mm\nweld,0,six\n",
+        "recording,time_s,width_mm\nweld,1,6\nweld,1,6\n",
+        "recording,time_s,width_mm\nweld,,6\n",
+        "recording,time_s,width_mm,a_mm,b_mm\nweld,0,6,1,2\n",
+        "recording,time_s,width_mm,width_mm\nweld,0,6,6\n",
+        "recording,time_s,width_mm\n",
+        "recording,time_s,width_mm\nweld,0,6,7\n",
+    ],
+)
+def test_a_table_that_is_none_is_refused(text: str, tmp_path: Path) -> None:
+    (tmp_path / "features.csv").write_text(text, "utf-8")
+    with pytest.raises(InputError):
+        FeatureTable.read(tmp_path / "features.csv")
+
+
+def test_what_cannot_be_chosen_or_fitted_is_refused(tmp_path: Path) -> None:
+    table = FeatureTable(FEATURES, TARGET, WELDS)
+    with pytest.raises(InputError):
+        table.chosen(("area_mm2",))
+    with pytest.raises(InputError):
+        replace(table, welds=WELDS[:2]).fit("arx", ModelSettings(FEATURES, TARGET))
+    with pytest.raises(InputError):
+        table.write(tmp_path / "features.xlsx")
+
+
+def test_the_set_up_is_no_part_of_the_uncertainty_of_features() -> None:
+    columns = {
+        name: np.array([value])
+        for name, value in {
+            "width_mm": 6.0,
+            "width_sigma_mm": 0.13,
+            "width_sigma_level_mm": 0.04,
+            "width_sigma_setup_mm": 0.12,
+            "volume_mm3": 4.0,
+            "volume_sigma_mm3": 0.5,
+            "volume_sigma_level_mm3": 0.4,
+            "area_mm2": 40.0,
+        }.items()
+    }
+    noise, level = feature_sigmas("width_mm", columns)
+    assert (noise[0], level[0]) == pytest.approx((0.03, 0.04))
+    noise, level = feature_sigmas("convexity_mm", columns)
+    assert (noise[0], level[0]) == pytest.approx((4 / 3 * 0.3 / 40, 4 / 3 * 0.4 / 40))
+    noise, level = feature_sigmas("asymmetry", columns)
+    assert (noise[0], level[0]) == pytest.approx((0.3 / 4, 0))
+
+
+# --- files of models ----------------------------------------------------------------------------
+
+
+def test_a_model_from_its_file_predicts_the_same(model: PenetrationModel, tmp_path: Path) -> None:
+    write_model(tmp_path / "model.json", model)
+    read = read_model(tmp_path / "model.json")
+    assert read.settings == model.settings
+    assert (read.kind, read.factor, read.rmse_mm) == (model.kind, 1.2, 0.1)
+    ours, theirs = model.predict(WELDS[3]), read.predict(WELDS[3])
+    np.testing.assert_array_equal(theirs.value, ours.value)
+    np.testing.assert_array_equal(theirs.sigma, ours.sigma)
+    np.testing.assert_array_equal(theirs.is_outside, ours.is_outside)
+
+
+def changed(key: str, value: Any) -> Callable[[dict[str, Any]], object]:
+    *folders, last = key.split("/")
+
+    def change(content: dict[str, Any]) -> None:
+        for folder in folders:
+            content = content[folder]
+        assert last in content
+        content[last] = value
+
+    return change
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        changed("program", "other"),
+        changed("format", 2),
+        changed("kind", "svm"),
+        changed("kind", ["gp"]),
+        changed("features", []),
+        changed("features", ["width_mm", "width_mm", "length_mm"]),
+        changed("features", ["width_mm", "length_mm", "os.system"]),
+        changed("step_s", 0.0),
+        changed("step_s", 1e-9),
+        changed("step_s", float("nan")),
+        changed("time_constants_s", []),
+        changed("time_constants_s", [-1.0]),
+        changed("time_constants_s", [1e300]),
+        changed("orders/lags", 0),
+        changed("orders/lags", 10**9),
+        changed("orders/delay", 10**9),
+        changed("orders/delay", -1),
+        changed("orders/poles", True),
+        changed("full_mm", -1),
+        changed("target", "=cmd()"),
+        changed("center", [1.0]),
+        changed("scale", [0.0] * 6),
+        changed("low", [float("nan")] * 6),
+        changed("mean_mm", 10**400),
+        changed("factor", float("inf")),
+        changed("static", None),
+        changed("static/values", [0.0] * 100_000),
+        changed("static/values", []),
+        changed("static/points", [[1.0]]),
+        changed("static/variances", [-1.0] * 3),
+        changed("static/lengths", [0.0] * 6),
+        changed("static/signal", -1.0),
+        changed("static/signal", "much"),
+    ],
+)
+def test_a_damaged_model_is_refused(damage: Callable[[Any], object], tmp_path: Path) -> None:
+    path = tmp_path / "model.json"
+    write_model(path, fitted("gp"))
+    content = json.loads(path.read_text("utf-8"))
+    damage(content)
+    path.write_text(json.dumps(content), "utf-8")
+    with pytest.raises(InputError):
+        read_model(path)
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"[]", b"{}", b"null", b"[" * 100_000, b"\xff\xfe", pickle.dumps([1])]
+)
+def test_what_is_no_model_is_refused(content: bytes, tmp_path: Path) -> None:
+    (tmp_path / "model.json").write_bytes(content)
+    with pytest.raises(InputError):
+        read_model(tmp_path / "model.json")
+
+
+def test_a_linear_model_with_wrong_weights_is_refused(tmp_path: Path) -> None:
+    write_model(tmp_path / "model.json", fitted("arx"))
+    content = json.loads((tmp_path / "model.json").read_text("utf-8"))
+    content["static"]["weights"] = [1.0]
+    (tmp_path / "model.json").write_text(json.dumps(content), "utf-8")
+    with pytest.raises(InputError):
+        read_model(tmp_path / "model.json")
+
+
+# --- predictions --------------------------------------------------------------------------------
+
+
+def frames(weld: WeldSeries) -> list[FrameResult]:
+    """Frames that give the features of a weld; NaN: not measured."""
+    names = [*Measures.__dataclass_fields__]
+    found = []
+    for k, time_s in enumerate(weld.time_s.tolist()):
+        width, length, convexity = weld.value[k].tolist()
+        sizes: dict[str, Any] = dict.fromkeys(names, np.nan)
+        for name, column in (("width", 0), ("length", 1)):
+            noise, level = weld.noise[k, column], weld.level[k, column]
+            sizes[f"{name}_sigma_mm"] = np.hypot(noise, level)
+            sizes[f"{name}_sigma_level_mm"] = level
+        volume = {part: getattr(weld, part)[k, 2] * 3 / 4 * 40 for part in ("noise", "level")}
+        sizes |= {
+            "width_mm": width,
+            "length_mm": length,
+            "area_mm2": 40.0,
+            "volume_sigma_mm3": np.hypot(*volume.values()),
+            "volume_sigma_level_mm3": volume["level"],
+        }
+        measured = np.isfinite(width)
+        status = Measurement("ok" if measured else "no-dots", "", "fit",
+                             measures=Measures(**sizes) if measured else None)  # fmt: skip
+        shape = Shape(convexity, 0.0, 0.0) if measured else None
+        found.append(FrameResult(k, time_s, status, shape=shape))
+    return found
+
+
+def test_frame_by_frame_it_predicts_the_same(model: PenetrationModel) -> None:
+    value = WELDS[3].value.copy()
+    value[100:130], value[300:450] = np.nan, np.nan  # one is short, one longer than is held
+    weld = replace(WELDS[3], value=value)
+    predictor = Predictor("bench", model)
+    seen = []
+    for result in frames(weld):
+        predictor.add(result)
+        seen.append(predictor.values()["penetration_mm"])
+    every, found = model.predict(weld), predictor.predictions()
+    assert found is not None
+    assert np.isnan(every.value).any()
+    np.testing.assert_allclose(found.time_s, every.time_s)
+    np.testing.assert_allclose(found.value, every.value, rtol=1e-9)
+    np.testing.assert_allclose(found.sigma, every.sigma, rtol=1e-6)
+    # What is shown is the step that ended last, and nothing where nothing is known.
+    assert seen[0] is None
+    assert seen[250] == pytest.approx(every.value[int(250 / 3) - 1])
+    assert seen[440] is None
+
+
+def test_a_recording_without_times_is_refused() -> None:
+    predictor = Predictor("bench", fitted("arx"))
+    with pytest.raises(InputError):
+        predictor.add(FrameResult(0, None, Measurement("no-dots", "", "fit")))
+
+
+def test_predictions_are_marked_as_a_model_s(model: PenetrationModel) -> None:
+    far = replace(WELDS[3], value=WELDS[3].value + 5)
+    found = {"a": model.predict(WELDS[3]), "b": model.predict(far)}
+    head, *rows = prediction_csv("bench", model, found).splitlines()
+    assert head.split(",")[2:4] == ["model_back_width_mm", "model_back_width_sigma_mm"]
+    assert all(row.endswith(",bench") for row in rows)
+    assert {row.split(",")[-2] for row in rows if row.startswith("b")} == {"extrapolated"}
+
+
+# --- ONNX ---------------------------------------------------------------------------------------
+
+
+def test_onnx_gives_the_same_value(model: PenetrationModel, tmp_path: Path) -> None:
+    import onnx
+    from onnx.reference import ReferenceEvaluator
+
+    from labapp.core.dynamics.weld_series import in_steps
+
+    write_onnx(tmp_path / "model.onnx", model)
+    graph = onnx.load(tmp_path / "model.onnx")
+    run = ReferenceEvaluator(graph)
+    steps, found = in_steps(WELDS[3], 0.1), model.predict(WELDS[3])
+    for last in (60, 111, 199):
+        window = steps.value[last + 1 - model.memory : last + 1]
+        (value,) = run.run(None, {"features": window})
+        assert value == pytest.approx(found.value[last], rel=1e-9)
+    facts = {one.key: one.value for one in graph.metadata_props}
+    assert SimpleNamespace(**facts).features == "width_mm length_mm convexity_mm"
