@@ -79,6 +79,11 @@ class Dynamics:
     events: Mapping[str, tuple[Event, ...]]
     responses: tuple[Response, ...]
 
+    @property
+    def all_modes(self) -> tuple[ModeCourse, ...]:
+        """Bessel modes, then those of the POD."""
+        return (*self.modes, *self.pod)
+
 
 def analyse(
     surfaces: SurfaceSeries,
