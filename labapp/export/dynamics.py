@@ -14,7 +14,7 @@ from labapp.core.dynamics.modes import RHO, RINGS, SPOKES, ModeCourse, SurfaceSe
 from labapp.core.dynamics.steps import QUANTITIES
 from labapp.core.surface.boundary import Boundary
 from labapp.core.surface.interpolation import CloughTocherSurface
-from labapp.core.surface.measures import SHAPES, SIZES, WITH_SIGMA
+from labapp.core.surface.measures import SHAPES, SIZES, WITH_SIGMA, sigma_names
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.surface.shape import shape_of
 from labapp.core.surface.surface import Surface
@@ -90,7 +90,8 @@ def dynamics_of(
     if chosen.of not in WITH_SIGMA:
         raise InputError("dynamics", "of", chosen.of, f"one of {', '.join(WITH_SIGMA)}")
     rows: list[list[float]] = []
-    setup: list[float] = []
+    sigmas: list[list[float]] = []
+    parts = "height_sigma_setup_mm", *sigma_names("level")
 
     def noted() -> Iterator[tuple[int, float, Surface, Boundary]]:
         for frame, time_s, surface, boundary, sizes in measured:
@@ -98,15 +99,19 @@ def dynamics_of(
             if not np.isfinite(shape).all():  # of a version without them
                 shape = shape_of(surface, boundary).tolist()
             rows.append([*(sizes[name] for name in SIZES), *shape])
-            setup.append(sizes.get("height_sigma_setup_mm", np.nan))
+            sigmas.append([sizes.get(name, np.nan) for name in parts])
             yield frame, time_s, surface, boundary
 
     surfaces = SurfaceSeries.of(noted())
     series = dict(zip(WITH_SIGMA, np.array(rows).reshape(-1, len(WITH_SIGMA)).T, strict=True))
     highest = max(np.max(np.abs([series["height_mm"], series["depth_mm"]]), initial=0), 1e-9)
-    scale = float(np.nanmean(setup)) / highest if np.isfinite(setup).any() else 0.0
+    setup, *level = (
+        float(np.mean(of[np.isfinite(of)])) if np.isfinite(of).any() else 0.0
+        for of in np.array(sigmas).reshape(-1, len(parts)).T
+    )
+    levels = dict(zip(WITH_SIGMA, level, strict=True))
     try:
-        return analyse(surfaces, series, signals or {}, chosen, scale)
+        return analyse(surfaces, series, signals or {}, chosen, setup / highest, levels)
     except ValueError as error:
         raise InputError("dynamics", "frames", str(error), "a longer recording or part") from error
 
@@ -204,9 +209,10 @@ def draw_spectrogram(plot: Any, found: Dynamics) -> None:
     times = np.append(gram.time_s, gram.time_s[-1] + width) - width / 2
     step = gram.frequency_hz[0]
     hertz = np.append(gram.frequency_hz, gram.frequency_hz[-1] + step) - step / 2
-    image = plot.pcolormesh(times, hertz, db, vmin=low, vmax=high, rasterized=True)
+    colours = {"vmin": low, "vmax": high, "cmap": "Blues", "rasterized": True}
+    image = plot.pcolormesh(times, hertz, db, **colours)
     peak = found.peak
-    bars = {"fmt": "w.-", "linewidth": 0.8, "markersize": 3}
+    bars = {"fmt": "C3.-", "linewidth": 0.8, "markersize": 3}
     plot.errorbar(peak.time_s, peak.frequency_hz, peak.frequency_sigma_hz, **bars)
     plot.set(xlabel="time (s)", ylabel="frequency (Hz)")
     plot.figure.colorbar(image, ax=plot, label=f"{density_label(found.settings.of)}, dB")

@@ -1,15 +1,23 @@
 """Spectra, peaks, events, responses, shape and offset of series against known truth."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy import signal
 
 from labapp.core.dynamics.alignment import find_offset
+from labapp.core.dynamics.analysis import RESPONDING
 from labapp.core.dynamics.spectra import spectrogram, track_peak
 from labapp.core.dynamics.steps import find_events, step_response
+from labapp.core.schemes import fit
+from labapp.core.surface.pool_fit import FitSettings
 from labapp.core.surface.shape import shape_of
+from labapp.export.dynamics import dynamics_of
+from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.pools import Footprint, Pool, Wave
 from tests.core.dynamics_truth import boundary_of
+from tests.scenes import OPEN_RIG
 
 
 def test_even_frames_have_welchs_spectrum_and_chi_square_intervals():
@@ -105,6 +113,51 @@ def test_an_event_is_found_in_an_oscillating_series_and_none_where_there_is_none
         assert len(more) <= 1
         errors.append((one.time_s - 2.33) / one.sigma_s)
     assert np.mean(np.abs(errors) < 1.96) >= 0.8
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("memory", [0.0, 0.5, 0.8])
+def test_noise_has_less_than_one_event_in_1000_frames(memory):
+    # Noise of one frame is in the next by so much: a boundary that stands still.
+    rng, time = np.random.default_rng(20), np.arange(1000) / 200
+    still = signal.lfilter([0.01], [1, -memory], rng.normal(size=(60, 1000)))
+    assert sum(len(find_events(time, one)) for one in still) < 60 / 4
+    step = 4 * still.std() * (time > 2.33)
+    assert np.mean([len(find_events(time, one + step)) >= 1 for one in still]) > 0.9
+
+
+@pytest.mark.slow
+def test_a_still_pool_has_no_events():
+    # Dots with noise, some lost in each frame; the boundary stands still, the surface does or not.
+    rng = np.random.default_rng(21)
+    for waves in ((), (Wave((0, 1), 0.02, 31.0, damping_per_s=1.0),)):
+        pool = Pool(Footprint(6.66, 3.0, 4.4, (0.0, -0.6)), 0.29, waves)
+        found = dynamics_of(fitted_frames(pool, 100, 200, rng))
+        assert found.events == dict.fromkeys(RESPONDING, ())
+
+
+def fitted_frames(pool, count, rate_hz, rng):
+    """Frames of a pool of the twin, fitted to dots with noise of which 1 in 100 is lost."""
+    near = None
+    for k in range(count):
+        match = exact_match(trace(pool.after(k / rate_hz), OPEN_RIG), OPEN_RIG, None, 0.03, rng)
+        there, witness = rng.random(len(match.ray)) > 0.01, match.witness.copy()
+        witness[tuple(match.ray[~there].T - 1)] = 0
+        per_dot = ("ray", "dot", "reflected", "plane_mm", "plane_covariance_mm2")
+        kept = {name: getattr(match, name)[there] for name in per_dot}
+        match = replace(match, witness=witness, **kept)
+        fitted = fit.solve(match, OPEN_RIG, FitSettings(), near)
+        made, sizes = fit.complete(match, fitted, OPEN_RIG, FitSettings())
+        near = fitted.surface
+        yield k, k / rate_hz, made.unbounded, made.boundary, vars(sizes)
+
+
+def test_a_change_within_the_ambiguity_of_the_level_is_no_event():
+    rng, time = np.random.default_rng(22), np.arange(400) / 200
+    series = rng.normal(0, 0.002, 400) + 0.02 * (time > 1)
+    assert len(find_events(time, series)) == 1
+    assert len(find_events(time, series, least=0.015)) == 1
+    assert not find_events(time, series, least=0.04)
 
 
 def test_a_ramp_begins_at_an_event():

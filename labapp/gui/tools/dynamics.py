@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from PySide6.QtCore import QTimer
+from PySide6.QtCore import Qt, QTimer
 from PySide6.QtGui import QCloseEvent
 from PySide6.QtWidgets import QAbstractItemView, QTabWidget, QWidget
 
@@ -109,11 +109,13 @@ class DynamicsWindow(ToolWindow):
                 "Events",
                 (self.event_words, (self.series, 3), (self.events, 2), hbox(self.frame_button, 1)),
             ),
-            ("Responses", (self.response_words, (self.responses, 1))),
+            ("Responses", ((self.response_words, 1), (self.responses, 1))),
         ):
             page = QWidget()
-            vbox(*parts, of=page).setContentsMargins(0, 6, 0, 0)
+            vbox(*parts, of=page).setContentsMargins(6, 6, 6, 6)
             self.tabs.addTab(page, words)
+        for label in (self.peak_words, self.event_words, self.response_words):
+            label.setAlignment(Qt.AlignmentFlag.AlignTop)
         self.tabs.currentChanged.connect(lambda _: self._turn.stop())
         self.results.addWidget(self.words)
         self.results.addWidget(self.tabs, 1)
@@ -158,7 +160,7 @@ class DynamicsWindow(ToolWindow):
             from labapp.export.dynamics import dynamics_of
 
             found = dynamics_of(counted(control), signals, settings)
-            return shown.drawn(found, control.check)
+            return shown.draw(found, control.check)
 
         self._of = seen
         self.begin("Analysing", work, self.show_found)
@@ -185,6 +187,7 @@ class DynamicsWindow(ToolWindow):
         self.response_words.setText(
             "" if responses.rows else shown.no_responses(found, has_signals)
         )
+        self.response_words.setVisible(not responses.rows)
         self.responses.setVisible(bool(responses.rows))
         self.tabs.show()
         self.show_state()

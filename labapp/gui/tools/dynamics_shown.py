@@ -40,6 +40,14 @@ WIDE, HIGH, DPI = 4.9, 3.9, 120
 FILM_TURNS = 16
 """Pictures of a mode in one period."""
 
+RESPONSE = {
+    "change": "Change",
+    "delay_s": "Delay (s)",
+    "time_constant_s": "Time constant (s)",
+    "rise_time_s": "Rise from 10 to 90 % (s)",
+    "overshoot": "Overshoot (share of the change)",
+}
+
 NO_STEPS = (
     "No response: {} The page Trends reads them from a table (Current and voltage), and a response "
     "is fitted to each of their steps, if there are at most eight."
@@ -117,9 +125,8 @@ def modes_table(found: Dynamics) -> Table:
             with_sigma(*(scale * x for x in figures[name])) if figures else "–"
             for name, scale in zip(names, scales, strict=True)
         ]
-        others = ", ".join(f"{each.frequency_hz:.1f}" for each in one.oscillations[1:])
-        rows.append((one.name, f"{one.share:.0%}", *cells, others))
-    columns = ("Mode", "Share", "Hz", "Amplitude (µm)", "Phase (°)", "Damping (1/s)", "Also (Hz)")
+        rows.append((one.name, f"{one.share:.0%}", *cells))
+    columns = ("Mode", "Share", "Hz", "Amplitude (µm)", "Phase (°)", "Damping (1/s)")
     return Table("modes", "Modes and their strongest oscillation, with ±", columns, tuple(rows))
 
 
@@ -133,8 +140,10 @@ def events_table(found: Dynamics) -> tuple[Table, tuple[int, ...]]:
         (
             with_sigma(one.time_s, one.sigma_s),
             series_label(name),
-            f"{one.change:+.3g}".replace("-", "−"),
-            f"{one.slope_change_per_s:+.3g}".replace("-", "−"),
+            *(
+                f"{x:+.3g}".replace("-", "−") if abs(x) > 1e-6 else "0"
+                for x in (one.change, one.slope_change_per_s)
+            ),
         )
         for one, name in every
     )
@@ -145,23 +154,17 @@ def events_table(found: Dynamics) -> tuple[Table, tuple[int, ...]]:
 
 
 def responses_table(found: Dynamics) -> Table:
-    """A row a response to a step of a signal."""
-    names = ("change", "delay_s", "time_constant_s", "rise_time_s", "overshoot")
+    """A row a quantity of a response to a step of a signal."""
     rows = []
     for one in found.responses:
         value, sigma = one.response.value, one.response.sigma
-        cells = [
-            "–" if name == "overshoot" and one.response.order == 1
-            else with_sigma(value[name], sigma[name])
-            for name in names
-        ]  # fmt: skip
         step = f"{one.signal} at {one.step.time_s:.3f} s"
-        rows.append((step, series_label(one.series), str(one.response.order), *cells))
-    columns = (
-        *("Step", "Series", "Order", "Change", "Delay (s)"),
-        *("Time constant (s)", "Rise 10–90 % (s)", "Overshoot"),
-    )
-    return Table("responses", "Responses to steps", columns, tuple(rows))
+        for name, words in RESPONSE.items():
+            if name != "overshoot" or one.response.order == 2:
+                known = with_sigma(value[name], sigma[name])
+                rows.append((step, series_label(one.series), words, known))
+    columns = ("Step", "Series", "Quantity", "Value")
+    return Table("responses", "Responses to steps, with ±", columns, tuple(rows))
 
 
 def no_responses(found: Dynamics, signals: bool) -> str:
@@ -185,7 +188,7 @@ def series_label(name: str) -> str:
 # --- pictures ---------------------------------------------------------------------------------
 
 
-def drawn(found: Dynamics, check: Callable[[], None]) -> Drawn:
+def draw(found: Dynamics, check: Callable[[], None]) -> Drawn:
     """Draw an analysis; ``check`` is called in between and may raise to stop."""
     modes = []
     for one in found.all_modes:
