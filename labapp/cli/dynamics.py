@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from labapp.cli.shared import finite, progress_shown, writable_folder, write_figure
+from labapp.cli.shared import finite, progress_shown, writable_folder
 from labapp.errors import InputError, os_errors_as_input
 from labapp.files import write_file
 
@@ -58,7 +58,7 @@ def dynamics(
     standard uncertainties; dynamics.png, modes.png; with --film mode.mp4.
     """
     from labapp.core.dynamics.analysis import DynamicsSettings
-    from labapp.export.dynamics import dynamics_pictures, dynamics_tables, write_mode_film
+    from labapp.export.dynamics import dynamics_files, write_mode_film
     from labapp.session.signals import read_signals
 
     folder = writable_folder(out)
@@ -67,10 +67,8 @@ def dynamics(
     with progress_shown():
         found = _analysed(source, own, start, align, settings)
     with os_errors_as_input(folder, "results", "room on its disk"):
-        for name, text in dynamics_tables(found).items():
-            write_file(folder / name, text.encode())
-        for name, figure in dynamics_pictures(found).items():
-            write_figure(folder, name, figure, "png")
+        for name, content in dynamics_files(found).items():
+            write_file(folder / name, content)
         if film is not None:
             write_mode_film(folder / "mode.mp4", found, film)
     _tell(found)

@@ -11,27 +11,22 @@ import numpy as np
 
 from labapp.core.dynamics.analysis import Dynamics, DynamicsSettings, analyse
 from labapp.core.dynamics.modes import RHO, RINGS, SPOKES, ModeCourse, SurfaceSeries
-from labapp.core.dynamics.shape import shape_of
 from labapp.core.dynamics.steps import QUANTITIES
 from labapp.core.surface.boundary import Boundary
 from labapp.core.surface.interpolation import CloughTocherSurface
-from labapp.core.surface.measures import SIZES
+from labapp.core.surface.measures import SHAPES, SIZES, WITH_SIGMA, sigma_names
 from labapp.core.surface.reconstruction import Reconstruction
+from labapp.core.surface.shape import shape_of
 from labapp.core.surface.surface import Surface
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
 from labapp.export.frame_result import FrameResult
-from labapp.export.tables import SHAPE_COLUMNS, Table
 from labapp.text import csv_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from labapp.export.rendering.scene import Scene
-
-SHAPES = tuple(column.name for column in SHAPE_COLUMNS)
-SERIES = (*SIZES, *SHAPES)
-"""Series whose spectra can be made, and that are written."""
 
 FIGURES = (
     *("frequency_hz", "damping_per_s", "amplitude_mm", "phase_deg"),
@@ -64,12 +59,6 @@ def measured_of(results: Iterable[FrameResult]) -> Iterator[Measured]:
             yield one.frame, one.time_s, made.unbounded, made.boundary, vars(sizes)
 
 
-def shape_row(made: Reconstruction | None) -> Table:
-    """The columns `SHAPE_COLUMNS` of one frame; NaN without a surface."""
-    shape = None if made is None else shape_of(made.unbounded, made.boundary)
-    return {name: np.array([getattr(shape, name, np.nan)]) for name in SHAPES}
-
-
 def no_time_base() -> InputError:
     """Why frames without times have no frequencies."""
     right = "a recording that has a time base: import it with a frame rate"
@@ -98,24 +87,31 @@ def dynamics_of(
         If there are too few frames, or a name or segment is none.
     """
     chosen = settings or DynamicsSettings()
-    if chosen.of not in SERIES:
-        raise InputError("dynamics", "of", chosen.of, f"one of {', '.join(SERIES)}")
+    if chosen.of not in WITH_SIGMA:
+        raise InputError("dynamics", "of", chosen.of, f"one of {', '.join(WITH_SIGMA)}")
     rows: list[list[float]] = []
-    setup: list[float] = []
+    sigmas: list[list[float]] = []
+    parts = "height_sigma_setup_mm", *sigma_names("level")
 
     def noted() -> Iterator[tuple[int, float, Surface, Boundary]]:
         for frame, time_s, surface, boundary, sizes in measured:
-            shape = shape_of(surface, boundary)
-            rows.append([*(sizes[name] for name in SIZES), *(getattr(shape, n) for n in SHAPES)])
-            setup.append(sizes.get("height_sigma_setup_mm", np.nan))
+            shape = [sizes.get(name, np.nan) for name in SHAPES]
+            if not np.isfinite(shape).all():  # of a version without them
+                shape = shape_of(surface, boundary).tolist()
+            rows.append([*(sizes[name] for name in SIZES), *shape])
+            sigmas.append([sizes.get(name, np.nan) for name in parts])
             yield frame, time_s, surface, boundary
 
     surfaces = SurfaceSeries.of(noted())
-    series = dict(zip(SERIES, np.array(rows).reshape(-1, len(SERIES)).T, strict=True))
+    series = dict(zip(WITH_SIGMA, np.array(rows).reshape(-1, len(WITH_SIGMA)).T, strict=True))
     highest = max(np.max(np.abs([series["height_mm"], series["depth_mm"]]), initial=0), 1e-9)
-    scale = float(np.nanmean(setup)) / highest if np.isfinite(setup).any() else 0.0
+    setup, *level = (
+        float(np.mean(of[np.isfinite(of)])) if np.isfinite(of).any() else 0.0
+        for of in np.array(sigmas).reshape(-1, len(parts)).T
+    )
+    levels = dict(zip(WITH_SIGMA, level, strict=True))
     try:
-        return analyse(surfaces, series, signals or {}, chosen, scale)
+        return analyse(surfaces, series, signals or {}, chosen, setup / highest, levels)
     except ValueError as error:
         raise InputError("dynamics", "frames", str(error), "a longer recording or part") from error
 
@@ -127,7 +123,7 @@ def dynamics_tables(found: Dynamics) -> dict[str, str]:
     """Tables by file name, CSV."""
     courses = [
         (f"{one.name} {k}".replace(" 0", ""), one.coefficient_mm[:, k])
-        for one in (*found.modes, *found.pod)
+        for one in found.all_modes
         for k in range(len(one.shape))
     ]
     series = {
@@ -143,7 +139,7 @@ def dynamics_tables(found: Dynamics) -> dict[str, str]:
         "modes.csv": csv_text(
             [
                 ["mode", "share", *(f"{n}{s}" for n in FIGURES for s in pairs), "others_hz"],
-                *(_mode_row(one) for one in (*found.modes, *found.pod)),
+                *(_mode_row(one) for one in found.all_modes),
             ]
         ),
         "spectrum.csv": _columns(
@@ -213,12 +209,22 @@ def draw_spectrogram(plot: Any, found: Dynamics) -> None:
     times = np.append(gram.time_s, gram.time_s[-1] + width) - width / 2
     step = gram.frequency_hz[0]
     hertz = np.append(gram.frequency_hz, gram.frequency_hz[-1] + step) - step / 2
-    image = plot.pcolormesh(times, hertz, db, vmin=low, vmax=high, rasterized=True)
+    colours = {"vmin": low, "vmax": high, "cmap": "Blues", "rasterized": True}
+    image = plot.pcolormesh(times, hertz, db, **colours)
     peak = found.peak
-    bars = {"fmt": "w.-", "linewidth": 0.8, "markersize": 3}
+    bars = {"fmt": "C3.-", "linewidth": 0.8, "markersize": 3}
     plot.errorbar(peak.time_s, peak.frequency_hz, peak.frequency_sigma_hz, **bars)
     plot.set(xlabel="time (s)", ylabel="frequency (Hz)")
-    plot.figure.colorbar(image, ax=plot, label=f"{found.settings.of}²/Hz (dB)")
+    plot.figure.colorbar(image, ax=plot, label=f"{density_label(found.settings.of)}, dB")
+
+
+def density_label(name: str) -> str:
+    """Name and unit of a series' power spectral density."""
+    size, _, unit = name.rpartition("_") if "_" in name else (name, "", "")
+    per_hz = {"": "1/Hz", "deg": "°²/Hz"}.get(
+        unit, f"({unit})²/Hz" if unit[-1:].isdigit() else f"{unit}²/Hz"
+    )
+    return f"{size.replace('_', ' ')} ({per_hz})"
 
 
 def draw_spectrum(plot: Any, found: Dynamics) -> None:
@@ -226,7 +232,7 @@ def draw_spectrum(plot: Any, found: Dynamics) -> None:
     mean = found.spectrogram.mean()
     plot.fill_between(mean.frequency_hz, mean.low, mean.high, alpha=0.3, linewidth=0)
     plot.semilogy(mean.frequency_hz, mean.density)
-    plot.set(xlabel="frequency (Hz)", ylabel=f"{found.settings.of}²/Hz")
+    plot.set(xlabel="frequency (Hz)", ylabel=density_label(found.settings.of))
     plot.set_title(f"{found.spectrogram.method}, 95 %", fontsize="small", loc="right")
 
 
@@ -242,9 +248,9 @@ def draw_series(plot: Any, found: Dynamics, name: str) -> None:
     plot.set(xlabel="time (s)", ylabel=name)
 
 
-def draw_mode(plot: Any, found: Dynamics, one: ModeCourse) -> None:
-    """Height of a mode's crest from above."""
-    shape = mode_heights(one, 0.0)
+def draw_mode(plot: Any, found: Dynamics, one: ModeCourse, turn: float = 0.0) -> None:
+    """Height of a mode from above at a part of its period: 0, the crest."""
+    shape = mode_heights(one, turn)
     closed = _closed(found.surfaces.nodes_mm), _closed(shape[:, None])
     (x, y), z = np.moveaxis(closed[0], -1, 0), closed[1][..., 0]
     plot.contourf(x, y, z, np.linspace(-1.05, 1.05, 22), cmap="RdBu_r")
@@ -271,10 +277,18 @@ def dynamics_pictures(found: Dynamics) -> dict[str, Figure]:
         for plot, name in zip(series, ("width_mm", "length_mm", "height_mm"), strict=True):
             draw_series(plot, found, name)
         modes = new_figure(INCHES, 4.2)
-        every = (*found.modes, *found.pod)
-        for plot, one in zip(modes.subplots(2, 4).flat, every, strict=False):
+        for plot, one in zip(modes.subplots(2, 4).flat, found.all_modes, strict=False):
             draw_mode(plot, found, one)
     return {"dynamics": whole, "modes": modes}
+
+
+def dynamics_files(found: Dynamics) -> dict[str, bytes]:
+    """Tables (CSV) and pictures (PNG) by file name."""
+    from labapp.studies.plotting import as_bytes
+
+    tables = {name: text.encode() for name, text in dynamics_tables(found).items()}
+    pictures = dynamics_pictures(found).items()
+    return tables | {f"{name}.png": as_bytes(figure) for name, figure in pictures}
 
 
 def mode_heights(one: ModeCourse, turn: float) -> FloatArray:
@@ -327,7 +341,7 @@ def write_mode_film(path: Path, found: Dynamics, name: str) -> None:
     from labapp.export.rendering.film import write_video
     from labapp.export.rendering.studio import draw_there, drawing_errors, drawing_process
 
-    every = {one.name.replace(" ", ""): one for one in (*found.modes, *found.pod)}
+    every = {one.name.replace(" ", ""): one for one in found.all_modes}
     wanted = name.replace(" ", "").upper()
     if wanted not in every:
         raise InputError("--film", "mode", name, f"one of {', '.join(every)}")

@@ -19,12 +19,11 @@ from labapp.core.dynamics.penetration import (
     PenetrationModel,
     validated_model,
 )
-from labapp.core.dynamics.shape import shape_of
 from labapp.core.dynamics.weld_series import WeldSeries
-from labapp.core.surface.measures import SIZES, sigma_name
+from labapp.core.surface.measures import WITH_SIGMA, sigma_name
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
-from labapp.export.dynamics import SERIES, SHAPES, Measured
+from labapp.export.dynamics import Measured
 from labapp.files import as_bytes, write_file
 from labapp.text import csv_text
 
@@ -32,9 +31,6 @@ LARGEST = 1 << 29
 """Bytes of a table at most."""
 
 WANTED = "a table of features, as `labapp penetration table` writes it"
-
-SECTION_OF_VOLUME = 4 / 3
-"""Mean height of the middle section over that of the pool, where it is a paraboloid."""
 
 PARTS = ("noise", "level")
 
@@ -45,27 +41,18 @@ def feature_sigmas(name: str, columns: Mapping[str, FloatArray]) -> tuple[FloatA
     Parameters
     ----------
     name
-        One of `SERIES`. Convexity has the ± of the mean height, volume over area, enlarged as the
-        height of the section is; asymmetry that of the volume by noise, over the volume.
+        One of `WITH_SIGMA`.
     columns
         Columns of `measures.csv`. Where parts of a ± are missing, all of it is taken for noise.
     """
-    count = len(columns["width_mm"])
 
-    def part(of: str, which: str) -> FloatArray:
-        return np.asarray(columns.get(sigma_name(of, which), np.full(count, np.nan)), float)
+    def part(which: str) -> FloatArray:
+        missing = np.full(len(columns[name]), np.nan)
+        return np.asarray(columns.get(sigma_name(name, which), missing), float)
 
-    if name in SIZES:
-        level, setup = (np.nan_to_num(part(name, which)) for which in ("level", "setup"))
-        total = part(name, "")
-        return np.sqrt(np.maximum(total**2 - level**2 - setup**2, 0.0)), level + 0 * total
-    noise, level = feature_sigmas("volume_mm3", columns)
-    if name == "convexity_mm":
-        share = SECTION_OF_VOLUME / np.maximum(columns["area_mm2"], 1e-9)
-        return share * noise, share * level
-    if name == "asymmetry":
-        return noise / np.maximum(np.abs(columns["volume_mm3"]), 1e-9), np.zeros(count)
-    return np.full(count, np.nan), np.full(count, np.nan)
+    level, setup = (np.nan_to_num(part(which)) for which in ("level", "setup"))
+    total = part("")
+    return np.sqrt(np.maximum(total**2 - level**2 - setup**2, 0.0)), level + 0 * total
 
 
 def weld_series(
@@ -80,15 +67,14 @@ def weld_series(
 
 
 def measured_series(
-    name: str, measured: Iterable[Measured], features: Sequence[str] = SERIES
+    name: str, measured: Iterable[Measured], features: Sequence[str] = WITH_SIGMA
 ) -> WeldSeries:
     """Features of a session or a folder of results (`export.dynamics.Measured`)."""
     times: list[float] = []
     rows: list[dict[str, float]] = []
-    shaped = not set(features).isdisjoint(SHAPES)
-    for _, time_s, surface, boundary, sizes in measured:
+    for _, time_s, _, _, sizes in measured:
         times.append(time_s)
-        rows.append({**sizes, **(vars(shape_of(surface, boundary)) if shaped else {})})
+        rows.append(dict(sizes))
     if not rows:
         raise InputError(name, "frames", "none with a surface", "some that were measured")
     columns = {key: np.array([row.get(key, np.nan) for row in rows], float) for key in rows[0]}
@@ -100,7 +86,7 @@ class FeatureTable:
     """Features of welds, and their penetration where sections or scans tell it."""
 
     features: tuple[str, ...]
-    """Some of `SERIES`."""
+    """Some of `WITH_SIGMA`."""
     target: str
     """Name of the penetration, such as ``back_width_mm``; empty if no section is known."""
     welds: tuple[WeldSeries, ...]
@@ -219,9 +205,9 @@ class FeatureTable:
         read = read_columns(path, WANTED, LARGEST, ("recording",))
         names = read.pop("recording", None)
         columns = {name: of for name, of in read.items() if isinstance(of, np.ndarray)}
-        features = tuple(name for name in columns if name in SERIES)
+        features = tuple(name for name in columns if name in WITH_SIGMA)
         if not isinstance(names, list) or "time_s" not in columns or not features or not names:
-            right = f"rows with recording, time_s and some of {', '.join(SERIES)}"
+            right = f"rows with recording, time_s and some of {', '.join(WITH_SIGMA)}"
             raise InputError(path, "columns", ", ".join(read) or "none", right)
         known = {"time_s", *features, *(sigma_name(f, part) for f in features for part in PARTS)}
         others = [name for name in columns if name not in known]

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
-from labapp.core.dynamics.shape import Shape
 from labapp.core.pipeline import Measurement
 from labapp.core.recording.residual_check import Residuals
 
@@ -26,8 +25,6 @@ class FrameResult:
     """Its residuals, where the measurement no longer has them."""
     setup_doubt: str = ""
     """Why the set-up is doubtful, as far as the frames so far show it; empty if it is not."""
-    shape: Shape | None = None
-    """Its shape, where that is known though the measurement no longer has the surface."""
 
 
 def without_surface(measurement: Measurement) -> Measurement:

@@ -18,10 +18,9 @@ import numpy as np
 from labapp.core.dynamics.penetration import ModelSettings, PenetrationModel, Prediction
 from labapp.core.dynamics.static_maps import MOST_POINTS, GaussianMap, LinearMap
 from labapp.core.dynamics.weld_series import LONGEST_MEMORY, MOST_HELD, Orders, WeldSeries
-from labapp.core.surface.measures import SIZES, sigma_name
+from labapp.core.surface.measures import WITH_SIGMA, sigma_name
 from labapp.core.values import FloatArray
 from labapp.errors import InputError, os_errors_as_input
-from labapp.export.dynamics import SERIES, SHAPES, shape_row
 from labapp.export.features import as_cell, needs_extra, weld_series
 from labapp.export.frame_result import FrameResult
 from labapp.files import as_bytes, write_file
@@ -109,7 +108,7 @@ def _model(read: Mapping[str, Any]) -> PenetrationModel:
     constants = tuple(map(float, read["time_constants_s"]))
     full = read["full_mm"]
     step_s = float(read["step_s"])
-    _check(0 < len(set(features)) == len(features) and set(features) <= set(SERIES), "features")
+    _check(0 < len(set(features)) == len(features) and set(features) <= set(WITH_SIGMA), "features")
     _check(1e-4 <= step_s <= 100 and len(constants) == orders.poles <= 2, "step or poles")
     _check(all(0 < one <= 1000 for one in constants), "time constants")
     memory = 8 * sum(constants) / step_s + orders.delay + orders.lags
@@ -282,14 +281,8 @@ class Predictor:
 def frame_features(result: FrameResult, features: Collection[str]) -> WeldSeries:
     """Features of one frame, a series of length 1; NaN without a surface."""
     found = result.measurement
-    sizes = vars(found.measures) if found.measures else dict.fromkeys(SIZES, math.nan)
+    sizes = vars(found.measures) if found.measures else dict.fromkeys(WITH_SIGMA, math.nan)
     columns = {name: np.array([value]) for name, value in sizes.items()}
-    if not set(SHAPES).isdisjoint(features):
-        columns |= (
-            shape_row(found.reconstruction)
-            if result.shape is None
-            else {name: np.array([value]) for name, value in vars(result.shape).items()}
-        )
     time_s = np.array([math.nan if result.time_s is None else result.time_s])
     return weld_series("", time_s, columns, tuple(features))
 

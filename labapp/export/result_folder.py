@@ -12,6 +12,7 @@ import numpy as np
 from labapp.config.csv_tables import bounded_lines, open_table
 from labapp.core.surface.boundary import Boundary
 from labapp.core.surface.interpolation import CloughTocherSurface
+from labapp.core.surface.measures import SHAPES
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
 from labapp.export.dynamics import Measured, no_time_base
@@ -51,7 +52,9 @@ def measured_in(folder: Path) -> Iterator[Measured]:
                 folder / "boundary.csv", "frame", "missing", f"{row['frame']} in order"
             )
         sizes = {
-            name: _number(path, row, name) for name in row if name.endswith(("_mm", "mm2", "mm3"))
+            name: _number(path, row, name)
+            for name in row
+            if name.endswith(("_mm", "mm2", "mm3")) or name in SHAPES
         }
         boundary = _boundary(folder / "boundary.csv", list(outline[1]))
         frame, time_s = int(_number(path, row, "frame")), _number(path, row, "time_s")

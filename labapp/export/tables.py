@@ -123,24 +123,23 @@ TABLES: dict[str, tuple[Column, ...]] = {
         Column("are_inner_mm", "average reflection error of inside points"),
         Column("mre_inner_mm", "maximum reflection error of inside points"),
         Column("own_are_mm", "irs, ers: average reflection error of the scheme's own points"),
+        Column("convexity_mm", "mean height of the longitudinal section through the middle"),
+        Column("asymmetry", "volume right of that section less that left of it, over both"),
+        Column("wetting_slope_deg", "mean angle of the surface at the boundary"),
+        Column("convexity_sigma_mm", f"standard uncertainty of the convexity, {SIGMA_OF}"),
+        Column("asymmetry_sigma", f"standard uncertainty of the asymmetry, {SIGMA_OF}"),
+        Column("wetting_slope_sigma_deg", f"standard uncertainty of that angle, {SIGMA_OF}"),
         Column("sigma_of", "what is in the standard uncertainties, where there are any", None),
         Column("reason", "why there is no surface, in a sentence", None),
         Column("setup_status", "entered, calibrated, checked against a mirror, or doubtful", None),
         *(
             Column(sigma_name(size, part), f"part of {sigma_name(size)}: {part}", is_part=True)
             for part in PARTS
-            for size in measures.SIZES
+            for size in measures.WITH_SIGMA
         ),
     ),
 }
 """The tables and their columns, in the order in which a frame is written to them."""
-
-SHAPE_COLUMNS = (
-    Column("convexity_mm", "mean height of the longitudinal section through the middle"),
-    Column("asymmetry", "volume right of that section minus that left of it, over both"),
-    Column("wetting_slope_deg", "angle of the surface at the boundary, rising inwards"),
-)
-"""The shape of the surface (`core.dynamics.shape.Shape`)."""
 
 _NAMES = {name: [column.name for column in columns] for name, columns in TABLES.items()}
 _MEASURED = {field.name for field in fields(Measures)}
@@ -213,7 +212,7 @@ def _sigma_parts(measured: Measures | None) -> list[float]:
 
 
 def _sigmas(measured: Measures | None, part: str) -> FloatArray:
-    """Standard uncertainty of each of `measures.SIZES`, or a part of it; NaN where unknown."""
+    """Standard uncertainty of each of `measures.WITH_SIGMA`, or a part of it; NaN where unknown."""
     return np.array([getattr(measured, name, math.nan) for name in measures.sigma_names(part)])
 
 

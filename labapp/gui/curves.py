@@ -54,6 +54,8 @@ class Curve(ReadOnlyArrays):
     from_zero: bool = False
     limits: tuple[float | None, float | None] = (None, None)
     """Lines at the lower and the upper limit of y, always in view; None for none."""
+    events: FloatArray = field(default_factory=lambda: np.zeros(0))
+    """Places on the axis where the curve changes, each a dotted line."""
     quick: bool = False
     """Whether points have a mark only where it is not the usual one: the curve is redrawn many
     times a second.

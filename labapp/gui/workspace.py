@@ -57,6 +57,8 @@ class Workspace(QObject):
     """Run an action of the window's menus, by its name."""
     next_session_requested = Signal(object)
     """Begin a session like this one for a recording: its file."""
+    analysed = Signal(object)
+    """How the pool changes over time was analysed: a `Dynamics`."""
     foot_switches_changed = Signal(object)
     """The actions of the pedals are to be stored, as plain values."""
 

@@ -10,10 +10,8 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 
 from labapp.config.setup import Setup
-from labapp.core.dynamics.shape import Shape, shape_of
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.quality import Quality, judge_quality
-from labapp.core.surface.reconstruction import Reconstruction
 from labapp.export.frame_result import FrameResult, without_surface
 from labapp.export.rendering.scene import Scene, scene_of
 from labapp.media.cameras import CameraFrame
@@ -21,9 +19,6 @@ from labapp.simulation.parallel import end_processes, start_worker
 
 JUDGED_S = 0.2
 """How long the quality of a frame applies to those that follow, s."""
-
-SHAPED_S = 0.02
-"""The shape of a surface takes a millisecond: it is measured no more often than this, s."""
 
 SOUGHT_S = 1.0
 """For so long after a frame that was measured, s, frames that cannot be followed are left out: the
@@ -94,7 +89,7 @@ class LiveChain:
         self._record = ResidualRecord(setup.rig)
         self._rays = setup.rig.pattern.rows * setup.rig.pattern.columns
         self._bit_depth = bit_depth
-        self._measured_s = self._shaped_s = -math.inf
+        self._measured_s = -math.inf
         self._judged: tuple[float, Quality] | None = None
 
     def measure(self, frame: CameraFrame, drawn: bool) -> LiveResult | None:
@@ -114,19 +109,10 @@ class LiveChain:
             arrived_s=frame.arrived_s,
             measurement=without_surface(self._record.judged(found)),
             setup_doubt=self._record.doubt,
-            shape=self._shape(surface),
             track_lost=self._chain.track_lost,
             quality=self._quality(frame, found),
             scene=scene_of(surface) if drawn and surface is not None else None,
         )
-
-    def _shape(self, surface: Reconstruction | None) -> Shape | None:
-        """Shape of the surface, if it is due."""
-        now_s = time.monotonic()
-        if surface is None or now_s < self._shaped_s + SHAPED_S:
-            return None
-        self._shaped_s = now_s
-        return shape_of(surface.unbounded, surface.boundary)
 
     def _quality(self, frame: CameraFrame, found: Measurement) -> Quality:
         """Quality of the frame, or of one just before: that takes half as long as measuring."""

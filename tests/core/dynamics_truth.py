@@ -4,9 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from labapp.core.dynamics.analysis import DynamicsSettings, analyse
 from labapp.core.dynamics.modes import RHO, SurfaceSeries, bessel_shapes
 from labapp.core.surface.boundary import Boundary
-from labapp.simulation.pools import Pool
+from labapp.core.surface.measures import WITH_SIGMA
+from labapp.simulation.pools import Footprint, Pool, Wave
 
 ROUGH = [(0, 1), (1, 1), (2, 1), (0, 2), (3, 1), (1, 2)]
 
@@ -30,6 +32,19 @@ def series_of(pool, rate_hz, seconds=1.0, rng=None, noise_mm=0.0, lost=0.0):
     shapes = np.vstack([*map(bessel_shapes, ROUGH), np.ones((1, len(RHO)))])
     noise = noise_mm * rng.normal(size=(len(frames), len(shapes))) @ shapes
     return replace(series, height_mm=series.height_mm + noise)
+
+
+def analysed_step():
+    """Analysis of two modes at once, whose width grows after a step of the current at 0.5 s."""
+    foot, rng = Footprint(6.6, 3.7, 3.7), np.random.default_rng(1)
+    waves = Wave((0, 1), 0.02, 31.0), Wave((1, 1), 0.01, 47.0)
+    surfaces = series_of(pool_with(foot, *waves), 200)
+    time_s = surfaces.time_s
+    series = dict.fromkeys(WITH_SIGMA, surfaces.height_mm[:, 0])
+    grown = 0.5 * -np.expm1(-np.maximum(time_s - 0.5, 0) / 0.05)
+    series["width_mm"] = 6.6 + grown + rng.normal(0, 0.01, len(time_s))
+    current = np.where(time_s < 0.5, 70.0, 90.0)
+    return analyse(surfaces, series, {"current": (time_s, current)}, DynamicsSettings())
 
 
 def pool_with(foot, *waves):

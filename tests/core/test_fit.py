@@ -15,6 +15,7 @@ from labapp.core.surface.boundary_trace import trace_boundary
 from labapp.core.surface.measures import Measures, measure_surface, reflection_errors, surface_sizes
 from labapp.core.surface.pool_fit import FitSettings, fit_pool
 from labapp.core.surface.reconstruction import Reconstruction
+from labapp.core.surface.shape import shape_of
 from labapp.core.surface.spline import SplineSurface
 from labapp.core.values import FloatArray
 from labapp.simulation.forward import exact_match, trace
@@ -135,10 +136,11 @@ def test_points_residuals_and_boundary_belong_to_the_surface() -> None:
 
 
 @pytest.mark.slow
-def test_the_uncertainty_of_sizes_is_their_spread_over_surfaces_as_likely() -> None:
+@pytest.mark.parametrize("seen", [spherical_cap(6.0, 0.35), egg(6.6, 3.2, 4.2, 0.3)])
+def test_the_uncertainty_of_sizes_is_their_spread_over_surfaces_as_likely(seen: Pool) -> None:
     # Surfaces drawn from the covariance of the fit, each measured as a whole.
     rng = np.random.default_rng(0)
-    pool_seen = trace(spherical_cap(6.0, 0.35), OPEN_RIG)
+    pool_seen = trace(seen, OPEN_RIG)
     match = exact_match(pool_seen, OPEN_RIG, sigma_mm=NOISE_MM, rng=rng)
     made = fit.reconstruct(match, OPEN_RIG, FitSettings())
     dots = match.plane_mm, match.plane_covariance_mm2
@@ -151,7 +153,7 @@ def test_the_uncertainty_of_sizes_is_their_spread_over_surfaces_as_likely() -> N
         surface = SplineSurface(pool.surface.basis, pool.surface.coefficients + change)
         center = made.boundary.center_mm
         boundary, _ = trace_boundary(surface.basis, surface.coefficients, pool.level, center)
-        sizes.append(surface_sizes(surface, boundary)[0])
+        sizes.append(np.append(surface_sizes(surface, boundary)[0], shape_of(surface, boundary)))
     np.testing.assert_allclose(np.std(sizes, axis=0)[:3], made.size_sigma[:3], rtol=0.2)
     np.testing.assert_allclose(np.std(sizes, axis=0)[4:], made.size_sigma[4:], rtol=0.2)
     assert np.isnan(made.size_sigma[3])  # the lowest point is on the rim

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.pipeline import Measurement
-from labapp.core.surface.measures import SIZES, Measures, sigma_name
+from labapp.core.surface.measures import Measures, sigma_names
 from labapp.export.fixed_point import format_fixed
 from labapp.export.frame_result import FrameResult
 from labapp.export.tables import TABLES, Table, csv_header, csv_rows, number, table_rows
@@ -70,12 +71,9 @@ def test_a_number_of_many_digits_is_written_the_slow_way() -> None:
 
 
 def test_parts_of_an_uncertainty_are_written_where_they_are_asked_for() -> None:
-    measures = Measures(
-        *[1.0] * 14,
-        *[0.13] * 6,
-        **{sigma_name(size, "level"): 0.04 for size in SIZES},
-        **{sigma_name(size, "setup"): 0.12 for size in SIZES},
-    )
+    parts = {"": 0.13, "level": 0.04, "setup": 0.12}
+    sigmas = {name: value for part, value in parts.items() for name in sigma_names(part)}
+    measures = replace(Measures(*[1.0] * 20), **sigmas)
     found = Measurement("ok", "", "fit", measures=measures)
     made = FrameResult(0, 0.0, found)
     rows = [
@@ -87,7 +85,7 @@ def test_parts_of_an_uncertainty_are_written_where_they_are_asked_for() -> None:
     )
     assert plain.items() <= whole.items()
     more = {name: float(whole[name]) for name in whole.keys() - plain.keys()}
-    assert len(more) == 18
+    assert len(more) == 27
     for name, value in more.items():
-        expected = 0.04 if "_level_" in name else 0.12 if "_setup_" in name else 0.03
+        expected = 0.04 if "_level" in name else 0.12 if "_setup" in name else 0.03
         assert value == expected, name

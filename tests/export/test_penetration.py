@@ -16,7 +16,6 @@ import pytest
 from scipy.io import loadmat
 
 from labapp.core.dynamics.penetration import ModelSettings, PenetrationModel, fit_model
-from labapp.core.dynamics.shape import Shape
 from labapp.core.dynamics.weld_series import Orders, WeldSeries
 from labapp.core.pipeline import Measurement
 from labapp.core.surface.measures import Measures
@@ -111,18 +110,14 @@ def test_the_set_up_is_no_part_of_the_uncertainty_of_features() -> None:
             "width_sigma_mm": 0.13,
             "width_sigma_level_mm": 0.04,
             "width_sigma_setup_mm": 0.12,
-            "volume_mm3": 4.0,
-            "volume_sigma_mm3": 0.5,
-            "volume_sigma_level_mm3": 0.4,
-            "area_mm2": 40.0,
+            "asymmetry": 0.1,
+            "asymmetry_sigma": 0.05,
         }.items()
     }
     noise, level = feature_sigmas("width_mm", columns)
     assert (noise[0], level[0]) == pytest.approx((0.03, 0.04))
-    noise, level = feature_sigmas("convexity_mm", columns)
-    assert (noise[0], level[0]) == pytest.approx((4 / 3 * 0.3 / 40, 4 / 3 * 0.4 / 40))
-    noise, level = feature_sigmas("asymmetry", columns)
-    assert (noise[0], level[0]) == pytest.approx((0.3 / 4, 0))
+    noise, level = feature_sigmas("asymmetry", columns)  # no parts are known
+    assert (noise[0], level[0]) == pytest.approx((0.05, 0))
 
 
 # --- files of models ----------------------------------------------------------------------------
@@ -227,23 +222,15 @@ def frames(weld: WeldSeries) -> list[FrameResult]:
     for k, time_s in enumerate(weld.time_s.tolist()):
         width, length, convexity = weld.value[k].tolist()
         sizes: dict[str, Any] = dict.fromkeys(names, np.nan)
-        for name, column in (("width", 0), ("length", 1)):
+        for name, column in (("width", 0), ("length", 1), ("convexity", 2)):
             noise, level = weld.noise[k, column], weld.level[k, column]
             sizes[f"{name}_sigma_mm"] = np.hypot(noise, level)
             sizes[f"{name}_sigma_level_mm"] = level
-        volume = {part: getattr(weld, part)[k, 2] * 3 / 4 * 40 for part in ("noise", "level")}
-        sizes |= {
-            "width_mm": width,
-            "length_mm": length,
-            "area_mm2": 40.0,
-            "volume_sigma_mm3": np.hypot(*volume.values()),
-            "volume_sigma_level_mm3": volume["level"],
-        }
+        sizes |= {"width_mm": width, "length_mm": length, "convexity_mm": convexity}
         measured = np.isfinite(width)
         status = Measurement("ok" if measured else "no-dots", "", "fit",
                              measures=Measures(**sizes) if measured else None)  # fmt: skip
-        shape = Shape(convexity, 0.0, 0.0) if measured else None
-        found.append(FrameResult(k, time_s, status, shape=shape))
+        found.append(FrameResult(k, time_s, status))
     return found
 
 

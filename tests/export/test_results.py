@@ -119,7 +119,7 @@ def test_without_any_sigma_nothing_is_said_to_be_in_it(
 def test_what_is_in_sigma_is_said_beside_the_tables(written: Path) -> None:
     assert json.loads((written / "run.json").read_text("utf-8"))["sigma_of"] == SIGMA_OF
     sigmas = [c for name in TABLES for c in TABLES[name] if "_sigma_" in f"_{c.name}_" and c.digits]
-    assert len(sigmas) == 7 + 18
+    assert len(sigmas) == 10 + 27
     for column in sigmas:  # the total says what is in it, a part of which total it is one
         whole = HEIGHT_SIGMA_OF if column.name == "sigma_mm" else SIGMA_OF
         assert ("part of" if column.is_part else whole) in column.description

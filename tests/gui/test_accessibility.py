@@ -40,6 +40,7 @@ from labapp.gui.shell.help import HelpDialog
 from labapp.gui.shell.steps import STEPS
 from labapp.gui.shell.window import MainWindow
 from labapp.gui.tools import TOOLS
+from labapp.gui.tools.dynamics_shown import draw
 from labapp.gui.tools.tool import ToolWindow
 from labapp.gui.views.canvas import Drawn, Plotted
 from labapp.run.study.plan import StudyPlan, StudyRecording
@@ -47,6 +48,7 @@ from labapp.run.study.status import RecordingStatus
 from labapp.run.study.summary import StudySummary
 from labapp.studies.analysis import AnalysisPart
 from labapp.studies.tables import Table
+from tests.core.dynamics_truth import analysed_step
 from tests.gui.conftest import CopySample, let_draw
 
 Role = QAccessible.Role
@@ -365,6 +367,13 @@ def fill_analysis(tool: Any, qtbot: QtBot) -> None:
     tool.show_part(AnalysisPart((table,), {}, (table,)))
 
 
+def fill_dynamics(tool: Any, qtbot: QtBot) -> None:
+    """It has modes, an event and a response."""
+    qtbot.waitUntil(lambda: not tool.working)
+    tool.show_found(draw(analysed_step(), lambda: None))
+    tool.events.selectRow(0)
+
+
 def fill_study(tool: Any, qtbot: QtBot) -> None:
     """It has a recording, and results."""
     recording = StudyRecording("first", Path("first.avi"), Path("setup.toml"))
@@ -377,6 +386,7 @@ def fill_study(tool: Any, qtbot: QtBot) -> None:
 
 
 FILL = {
+    "dynamics": fill_dynamics,
     "study": fill_study,
     "simulator": fill_simulator,
     "adviser": fill_adviser,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 
@@ -15,6 +16,10 @@ from labapp.core.values import FloatArray
 
 RESPONDING = ("width_mm", "length_mm", "height_mm", "convexity_mm")
 """Series whose events and responses are looked for."""
+
+LEVEL_SIGMAS = 2.0
+"""Least change of an event. The errors of two frames' levels are the same while the boundary stays,
+and independent where it has moved (`core.sequence.mean`): their difference is σ√2 at most."""
 
 MOST_STEPS = 8
 """A signal with more changes is pulsed: responses to single ones are not looked for."""
@@ -79,6 +84,11 @@ class Dynamics:
     events: Mapping[str, tuple[Event, ...]]
     responses: tuple[Response, ...]
 
+    @property
+    def all_modes(self) -> tuple[ModeCourse, ...]:
+        """Bessel modes, then those of the POD."""
+        return (*self.modes, *self.pod)
+
 
 def analyse(
     surfaces: SurfaceSeries,
@@ -86,6 +96,7 @@ def analyse(
     signals: Mapping[str, tuple[FloatArray, FloatArray]],
     settings: DynamicsSettings,
     scale_sigma: float = 0.0,
+    level_sigma: Mapping[str, float] = MappingProxyType({}),
 ) -> Dynamics:
     """Analyse how the pool changes over a recording.
 
@@ -99,6 +110,9 @@ def analyse(
         See `DynamicsSettings`.
     scale_sigma
         See `bessel_modes`.
+    level_sigma
+        The level's part of the standard uncertainty of series, by name: a change by less than
+        `LEVEL_SIGMAS` of it may be one of the level's error, and is no event.
 
     Raises
     ------
@@ -111,11 +125,14 @@ def analyse(
     modes = bessel_modes(surfaces, scale_sigma=scale_sigma, band_hz=settings.band_hz)
     slowest = [one.oscillations[0].frequency_hz for one in modes if one.oscillations]
     period = 1 / min(slowest) if slowest else 0.0
-    events = {name: find_events(time, series[name], period) for name in RESPONDING}
+    events = {
+        name: find_events(time, series[name], period, LEVEL_SIGMAS * level_sigma.get(name, 0.0))
+        for name in RESPONDING
+    }
     steps = {}
     for name, (at, value) in signals.items():
         within = (at >= time[0]) & (at <= time[-1]) & np.isfinite(value)
-        found = find_events(at[within], value[within])
+        found = find_events(at[within], value[within], lags=(1,))
         steps[name] = tuple(_sharpened(one, at[within], value[within]) for one in found)
     chosen = time, series[settings.of], settings.segment_s
     return Dynamics(

@@ -26,6 +26,10 @@ PENALTY = 6.0
 """Cost of an event, in variances of the noise times ln(samples): it has three
 parameters, and noise alone has an event in 2 of 100 series."""
 
+LAGS = (1, 2, 4, 8)
+"""Lags of the second differences that the noise of a pool's series is taken from, in blocks: that
+of correlated noise grows with the lag."""
+
 SECOND_ORDER_GAIN = 10.0
 """Least fall of the cost, in variances, where a response overshoots rather than not (BIC)."""
 
@@ -83,9 +87,15 @@ class StepResponse(ReadOnlyArrays):
 
 
 def find_events(
-    time_s: FloatArray, values: FloatArray, resolution_s: float = 0.0
+    time_s: FloatArray,
+    values: FloatArray,
+    resolution_s: float = 0.0,
+    least: float = 0.0,
+    lags: tuple[int, ...] = LAGS,
 ) -> tuple[Event, ...]:
     """Change points of a series, in their order.
+
+    Noise alone has less than one in 1000 frames, also where it is correlated over some 5 of them.
 
     Parameters
     ----------
@@ -94,6 +104,11 @@ def find_events(
     resolution_s
         Changes within less are not looked for: at least the period of the pool's oscillation, which
         is averaged out. Never less than the `BLOCKS`-th part of the series.
+    least
+        Least range of the series on both sides of an event, by its lines; what changes by less is
+        none.
+    lags
+        See `LAGS`; (1,) of a series whose noise is white and that may have many events.
     """
     if len(time_s) < 4 * LEAST_BLOCKS:
         return ()
@@ -104,10 +119,14 @@ def find_events(
     if len(number) < 4 * LEAST_BLOCKS:
         return ()
     at, level = (np.bincount(place, of) / np.bincount(place) for of in (time_s, values))
-    noise = _noise(level)
+    noise = _noise(level, lags)
     ends = _partition(at, level, PENALTY * noise * np.log(len(at)))
     pieces = [*pairwise(ends)]
-    return tuple(_event(at, level, first, last, noise) for first, last in pairwise(pieces))
+    return tuple(
+        _event(at, level, first, last, noise)
+        for first, last in pairwise(pieces)
+        if _range(at, level, first, last) >= least
+    )
 
 
 def step_response(
@@ -171,12 +190,26 @@ def step_response(
     return StepResponse(step_s, float(best.x[0]), found, known, order, course)
 
 
-def _noise(level: FloatArray) -> float:
+def _noise(level: FloatArray, lags: tuple[int, ...]) -> float:
     """Variance of the noise of samples, from their second differences (robust to changes)."""
-    second = np.diff(level, 2)
-    spread = 1.4826 * float(np.median(np.abs(second))) / np.sqrt(6)
+    seconds = [
+        level[2 * lag :] - 2 * level[lag:-lag] + level[: -2 * lag]
+        for lag in lags
+        if 4 * lag < len(level)
+    ]
+    spread = 1.4826 * max(float(np.median(np.abs(one))) for one in seconds) / np.sqrt(6)
     # Without noise, a thousandth of the range stands for it.
     return float(max(spread**2, (1e-3 * float(np.ptp(level))) ** 2, 1e-30))
+
+
+def _range(
+    at: FloatArray, level: FloatArray, before: tuple[int, int], after: tuple[int, int]
+) -> float:
+    """Range of the lines through two pieces."""
+    lines = [
+        np.polyval(np.polyfit(at[a:b], level[a:b], 1), at[[a, b - 1]]) for a, b in (before, after)
+    ]
+    return float(np.ptp(lines))
 
 
 def _partition(at: FloatArray, level: FloatArray, penalty: float) -> list[int]:

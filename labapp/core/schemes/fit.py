@@ -14,6 +14,7 @@ from labapp.core.surface.boundary_trace import retrace_boundary, trace_boundary
 from labapp.core.surface.pool_fit import FitSettings, FittedPool, fit_pool
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.surface.setup_uncertainty import setup_changes, setup_sigma
+from labapp.core.surface.shape import shape_and_gradients
 from labapp.core.surface.sizes import sizes_and_gradients
 from labapp.core.surface.spline import SplineSurface
 from labapp.core.values import CannotMeasure, FloatArray, ReadOnlyArrays
@@ -36,8 +37,10 @@ class SetupPart(ReadOnlyArrays):
 
     Parameters
     ----------
-    sigma, sizes
-        In the order of `measures.SIZES`, shape (6,), mm, mm², mm³.
+    sigma
+        Of each of `measures.WITH_SIGMA`, shape (9,).
+    sizes
+        Shape (6,), mm, mm², mm³.
     """
 
     sigma: FloatArray
@@ -134,11 +137,13 @@ def complete(
         raise CannotMeasure(
             "open-boundary", "the surface comes down to the work piece within its boundary"
         )
+    shape, by_shape = shape_and_gradients(basis, coefficients, boundary, slope)
+    gradient = np.concatenate([sizes.gradient, by_shape])
     part = None if known is None else nearest_part(known.by_setup, sizes.size)
     if part is not None:
         by_setup = part.sigma
     else:
-        by_setup = setup_sigma(setup_changes(match, rig, settings, pool, sizes.gradient))
+        by_setup = setup_sigma(setup_changes(match, rig, settings, pool, gradient))
     free = None if known is None else known.free_sigma_mm
     if free is None:
         free = pool.free_sigma_of(basis.matrix(*points[:, :2].T))
@@ -150,9 +155,10 @@ def complete(
         points_mm=points,
         residual_mm=pool.residual_mm,
         sigma_mm=np.hypot(free, level.sigma_mm),
-        size_sigma=np.hypot(pool.sigma_of(sizes.gradient), by_setup),
-        size_sigma_level=np.abs(sizes.by_level) * level.sigma_mm,
+        size_sigma=np.hypot(pool.sigma_of(gradient), by_setup),
+        size_sigma_level=np.abs(gradient.sum(axis=1)) * level.sigma_mm,
         size_sigma_setup=by_setup,
     )
     errors = measures.reflection_errors(made, match, rig)
-    return made, measures.assemble_measures(errors, sizes.size, sizes.peak_mm, center, made)
+    every = np.append(sizes.size, shape)
+    return made, measures.assemble_measures(errors, every, sizes.peak_mm, center, made)

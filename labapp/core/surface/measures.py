@@ -14,6 +14,7 @@ from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match
 from labapp.core.surface.boundary import Boundary
 from labapp.core.surface.reconstruction import Reconstruction
+from labapp.core.surface.shape import shape_of
 from labapp.core.surface.surface import Surface
 from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 
@@ -80,6 +81,10 @@ class Measures:
         The level's part of these six; NaN also in results of versions that did not keep it.
     width_sigma_setup_mm … volume_sigma_setup_mm3
         The set-up's part; NaN in results of versions whose ± were those of noise and level only.
+    convexity_mm, asymmetry, wetting_slope_deg
+        See `shape_of`; NaN, as all that follows, in results of versions without them.
+    convexity_sigma_mm … wetting_slope_sigma_setup_deg
+        Their standard uncertainties, and the level's and the set-up's part.
     own_are_mm
         See `Reconstruction`; NaN where the scheme gives none.
     scale_x, scale_z
@@ -122,6 +127,18 @@ class Measures:
     depth_sigma_setup_mm: float = math.nan
     area_sigma_setup_mm2: float = math.nan
     volume_sigma_setup_mm3: float = math.nan
+    convexity_mm: float = math.nan
+    asymmetry: float = math.nan
+    wetting_slope_deg: float = math.nan
+    convexity_sigma_mm: float = math.nan
+    asymmetry_sigma: float = math.nan
+    wetting_slope_sigma_deg: float = math.nan
+    convexity_sigma_level_mm: float = math.nan
+    asymmetry_sigma_level: float = math.nan
+    wetting_slope_sigma_level_deg: float = math.nan
+    convexity_sigma_setup_mm: float = math.nan
+    asymmetry_sigma_setup: float = math.nan
+    wetting_slope_sigma_setup_deg: float = math.nan
 
     @property
     def sizes(self) -> FloatArray:
@@ -130,21 +147,27 @@ class Measures:
 
 
 SIZES = ("width_mm", "length_mm", "height_mm", "depth_mm", "area_mm2", "volume_mm3")
-"""The sizes that have a standard uncertainty, in the order of arrays."""
+"""The sizes, in the order of arrays."""
+
+SHAPES = ("convexity_mm", "asymmetry", "wetting_slope_deg")
+"""What `shape_of` gives, in its order."""
+
+WITH_SIGMA = (*SIZES, *SHAPES)
+"""What has a standard uncertainty, in the order of arrays."""
 
 DEPTH = SIZES.index("depth_mm")
 
 
 def sigma_name(name: str, part: str = "") -> str:
-    """Name of a size's standard uncertainty, or of a part of it: ``width_sigma_level_mm``."""
-    size, _, unit = name.rpartition("_")
-    return "_".join(filter(None, (size, "sigma", part, unit) if size else (unit, "sigma", part)))
+    """Name of a standard uncertainty, or of a part of it: ``width_sigma_level_mm``."""
+    size, _, unit = name.rpartition("_") if "_" in name else (name, "", "")
+    return "_".join(filter(None, (size, "sigma", part, unit)))
 
 
 @cache
 def sigma_names(part: str = "") -> tuple[str, ...]:
-    """`sigma_name` of each of `SIZES`."""
-    return tuple(sigma_name(size, part) for size in SIZES)
+    """`sigma_name` of each of `WITH_SIGMA`."""
+    return tuple(sigma_name(name, part) for name in WITH_SIGMA)
 
 
 def measure_surface(reconstruction: Reconstruction, match: Match, rig: Rig) -> Measures:
@@ -152,6 +175,7 @@ def measure_surface(reconstruction: Reconstruction, match: Match, rig: Rig) -> M
     errors = reflection_errors(reconstruction, match, rig)
     boundary = reconstruction.boundary
     size, peak = surface_sizes(reconstruction.unbounded, boundary)
+    size = np.append(size, shape_of(reconstruction.unbounded, boundary))
     made = assemble_measures(errors, size, peak, boundary.center_mm, reconstruction)
     return replace(made, own_are_mm=reconstruction.own_are_mm)
 
@@ -163,7 +187,7 @@ def assemble_measures(
     center_mm: FloatArray,
     reconstruction: Reconstruction,
 ) -> Measures:
-    """Put errors, the result of `surface_sizes`, the centre and the sizes' σ together."""
+    """Put errors, sizes and shape, shape (9,), peak, centre and the reconstruction's σ together."""
     sigmas = {
         "": reconstruction.size_sigma,
         "level": reconstruction.size_sigma_level,
@@ -185,7 +209,7 @@ def assemble_measures(
         peak_y_mm=float(peak_mm[1]),
         scale_x=float(errors.scale[0]),
         scale_z=float(errors.scale[1]),
-        **dict(zip(SIZES, size.tolist(), strict=True)),
+        **dict(zip(WITH_SIGMA, size.tolist(), strict=True)),
         **told,
     )
 

@@ -69,13 +69,13 @@ class Reconstruction(ReadOnlyArrays):
         Standard uncertainty of each reflection point's height, noise and level only, shape (n,),
         mm; NaN where the scheme gives none.
     size_sigma
-        Standard uncertainty of width, length, height, depth, area and volume, shape (6,), mm, mm²,
-        mm³; NaN where the scheme gives none.
+        Standard uncertainty of each of `measures.WITH_SIGMA`, shape (9,); NaN where the scheme
+        gives none. Of shape (6,), as in files of versions without the last three, it is extended.
     size_sigma_level
-        The level's part of that, shape (6,). In frames that follow on each other it is much the
+        The level's part of that, shape (9,). In frames that follow on each other it is much the
         same error (`core.sequence.mean`).
     size_sigma_setup
-        The set-up's part, shape (6,): the same error in all frames of a recording.
+        The set-up's part, shape (9,): the same error in all frames of a recording.
     own_are_mm
         ARE of the points as the scheme has them, with the surface through nothing else (step 4 of
         §6.3.1 and §7.1), mm, as the dissertation defines it. NaN for fit, whose points lie on it.
@@ -88,12 +88,15 @@ class Reconstruction(ReadOnlyArrays):
     points_mm: FloatArray
     residual_mm: FloatArray
     sigma_mm: FloatArray
-    size_sigma: FloatArray = field(default_factory=lambda: np.full(6, np.nan))
-    size_sigma_level: FloatArray = field(default_factory=lambda: np.full(6, np.nan))
-    size_sigma_setup: FloatArray = field(default_factory=lambda: np.full(6, np.nan))
+    size_sigma: FloatArray = field(default_factory=lambda: np.full(9, np.nan))
+    size_sigma_level: FloatArray = field(default_factory=lambda: np.full(9, np.nan))
+    size_sigma_setup: FloatArray = field(default_factory=lambda: np.full(9, np.nan))
     own_are_mm: float = math.nan
 
     def __post_init__(self) -> None:
+        for name in ("size_sigma", "size_sigma_level", "size_sigma_setup"):
+            if np.shape(sigma := getattr(self, name)) == (6,):
+                object.__setattr__(self, name, np.append(sigma, np.full(3, np.nan)))
         super().__post_init__()
         object.__setattr__(self, "surface", BoundedSurface(self.unbounded, self.boundary))
 

@@ -44,11 +44,6 @@ class Sizes:
     gradient: FloatArray
     holds: bool
 
-    @property
-    def by_level(self) -> FloatArray:
-        """How they change with the level, shape (6,): the splines add up to 1."""
-        return np.asarray(self.gradient.sum(axis=1))
-
 
 def sizes_and_gradients(
     basis: SplineBasis,

@@ -347,6 +347,12 @@ VIEW = (
 
 TOOLS = (
     Action(
+        "dynamics",
+        "Pool &over time…",
+        "Ctrl+Shift+D",
+        "Oscillations, modes, events and step responses of the session's pool",
+    ),
+    Action(
         "study",
         "St&udy of many recordings…",
         "Ctrl+Shift+R",

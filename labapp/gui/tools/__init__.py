@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from labapp.gui.tools.tool import ToolWindow
 
 TOOLS = {
+    "dynamics": "DynamicsWindow",
     "study": "StudyWindow",
     "simulator": "SimulatorWindow",
     "adviser": "AdviserWindow",

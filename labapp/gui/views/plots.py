@@ -196,8 +196,10 @@ class PlotStack(Plotted):
         marks = {
             curve.marks[number]: None for curve in self.curves for number in np.unique(curve.mark)
         }
-        self.legend.setText("    ".join(f"{m.sign} {m.words}" for m in marks if m.words))
-        self.legend.setVisible(len(marks) > 1)
+        words = [f"{m.sign} {m.words}" for m in marks if m.words]
+        has_events = any(len(curve.events) for curve in self.curves)
+        self.legend.setText("    ".join(words + ["┊ change"] * has_events))
+        self.legend.setVisible(len(marks) > 1 or has_events)
 
     def _show_read_out(self, words: str) -> None:
         self.read_out.setText(words or " ")
@@ -295,6 +297,7 @@ class _Plot(pg.PlotItem):  # type: ignore[misc]
         self.limits = pg.InfiniteLine(angle=0), pg.InfiniteLine(angle=0)
         self.current = pg.InfiniteLine(angle=90)
         self.cross = pg.InfiniteLine(angle=90)
+        self.events: list[pg.InfiniteLine] = []
         for item in (self.bars, self.line, self.points):
             self.addItem(item)
         for item in (self.level, self.current, self.cross):
@@ -342,7 +345,16 @@ class _Plot(pg.PlotItem):  # type: ignore[misc]
             item.setVisible(limit is not None)
             if limit is not None:
                 item.setValue(limit)
+        self._show_events(curve)
         self._show_points()
+
+    def _show_events(self, curve: Curve) -> None:
+        for line in self.events:
+            self.removeItem(line)
+        pen = pg.mkPen(self._look.color(Role.Text), width=1.5, style=Qt.PenStyle.DotLine)
+        self.events = [pg.InfiniteLine(x, angle=90, pen=pen) for x in curve.events.tolist()]
+        for line in self.events:
+            self.addItem(line, ignoreBounds=True)
 
     def mark_place(self, x: float | None) -> None:
         """Draw an upright line at a place, or none."""

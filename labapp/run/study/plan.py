@@ -35,7 +35,7 @@ from labapp.config.toml_keys import Rule, check_keys, is_number, parse_toml, sho
 from labapp.core.pipeline import Settings
 from labapp.core.schemes import SCHEMES
 from labapp.errors import InputError, os_errors_as_input
-from labapp.export.tables import SHAPE_COLUMNS, TABLES
+from labapp.export.tables import TABLES
 from labapp.files import as_bytes, write_file
 from labapp.media import RECORDING_SUFFIXES
 from labapp.text import unescaped_csv_text
@@ -47,7 +47,7 @@ MOST_RECORDINGS = 10_000
 MOST_CONDITIONS = 64
 LONGEST_TEXT = 200
 
-COLUMNS = (*TABLES["measures"], *SHAPE_COLUMNS)
+COLUMNS = TABLES["measures"]
 """Columns of the table of all frames, after the recording's name and conditions."""
 
 RESERVED = frozenset({"recording", *(column.name for column in COLUMNS)})

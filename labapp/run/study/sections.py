@@ -10,10 +10,9 @@ import numpy as np
 
 from labapp.config.csv_tables import read_columns
 from labapp.core.dynamics.weld_series import WeldSeries
-from labapp.core.surface.measures import sigma_name
+from labapp.core.surface.measures import WITH_SIGMA, sigma_name
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
-from labapp.export.dynamics import SERIES
 from labapp.export.features import FeatureTable, weld_series
 from labapp.export.tables import Table
 from labapp.run.study.plan import RESERVED, StudyPlan
@@ -57,7 +56,7 @@ def study_features(
     if not series:
         raise InputError("study", "results", "none", "labapp study run first")
     if sections is None:
-        return FeatureTable(SERIES, "", tuple(series.values())), 0
+        return FeatureTable(WITH_SIGMA, "", tuple(series.values())), 0
     target, names, time_s, value, sigma = _read(plan, sections)
     found, unused = [], 0
     for name, one in series.items():
@@ -69,13 +68,13 @@ def study_features(
     if not any(np.isfinite(one.target).any() for one in found):
         right = f"sections within {NEAR_S:g} s of frames that have a surface and a time"
         raise InputError(sections, "sections", "none near a frame", right)
-    return FeatureTable(SERIES, target, tuple(found)), unused
+    return FeatureTable(WITH_SIGMA, target, tuple(found)), unused
 
 
 def _series(name: str, table: Table) -> WeldSeries:
     there = (table["status"] == "ok") & np.isfinite(table["time_s"])
     columns = {key: of[there] for key, of in table.items() if of.dtype.kind in "fi"}
-    return weld_series(name, columns["time_s"], columns, SERIES)
+    return weld_series(name, columns["time_s"], columns, WITH_SIGMA)
 
 
 def _read(

@@ -31,7 +31,6 @@ from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.surface.spline import SplineBasis, SplineSurface
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
-from labapp.export.dynamics import shape_row
 from labapp.export.meshes import SPACING_MM, refuse_too_large
 from labapp.export.tables import Table, frame_tables
 from labapp.files import as_bytes, write_atomically
@@ -253,8 +252,7 @@ def _measured(stretch: Stretch, measurer: Measurer) -> bytes:
     residuals: list[tuple[int, Residuals]] = []
     surfaces: list[tuple[int, FloatArray, tuple[int, int]]] = []
     for result in measurer(stretch.frames):
-        measures = frame_tables(result, stretch.setup.calibration)["measures"]
-        rows.append(measures | shape_row(result.measurement.reconstruction))
+        rows.append(frame_tables(result, stretch.setup.calibration)["measures"])
         kept = Residuals.of(result.measurement) if result.frame in stretch.kept else None
         if kept is not None:
             residuals.append((result.frame, kept))

@@ -11,7 +11,7 @@ from __future__ import annotations
 APPLICATION_ID = 0x4C414250
 """“LABP”, in SQLite's header: what makes a database a session."""
 
-VERSION = 4
+VERSION = 5
 """Of the tables below. A change to them adds 1, and a step to `MIGRATIONS`."""
 
 NO_FRAME = -1
@@ -24,7 +24,11 @@ MEASURES = (
     "width_sigma_level_mm length_sigma_level_mm height_sigma_level_mm depth_sigma_level_mm "
     "area_sigma_level_mm2 volume_sigma_level_mm3 "
     "width_sigma_setup_mm length_sigma_setup_mm height_sigma_setup_mm depth_sigma_setup_mm "
-    "area_sigma_setup_mm2 volume_sigma_setup_mm3"
+    "area_sigma_setup_mm2 volume_sigma_setup_mm3 "
+    "convexity_mm asymmetry wetting_slope_deg "
+    "convexity_sigma_mm asymmetry_sigma wetting_slope_sigma_deg "
+    "convexity_sigma_level_mm asymmetry_sigma_level wetting_slope_sigma_level_deg "
+    "convexity_sigma_setup_mm asymmetry_sigma_setup wetting_slope_sigma_setup_deg"
 ).split()
 """Columns of `result` that repeat `Measures`, so that trends need not unpack every frame."""
 
@@ -98,5 +102,6 @@ MIGRATIONS: dict[int, tuple[str, ...]] = {
     1: tuple(f"ALTER TABLE result ADD COLUMN {name} REAL" for name in MEASURES[20:26]),
     2: tuple(f"ALTER TABLE result ADD COLUMN {name} REAL" for name in MEASURES[26:32]),
     3: ("ALTER TABLE inputs ADD COLUMN verdict BLOB",),
+    4: tuple(f"ALTER TABLE result ADD COLUMN {name} REAL" for name in MEASURES[32:44]),
 }
 """From each earlier version, the statements that lead to the next."""

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from PySide6.QtCore import Qt
 from PySide6.QtGui import QPixmap
@@ -24,9 +25,12 @@ from labapp.gui.workspace import Workspace
 from labapp.session.signals import Signals, read_signals
 from labapp.session.trends import QUANTITIES
 
+if TYPE_CHECKING:
+    from labapp.core.dynamics.steps import Event
+
 FAR_S = 1e6
 
-TABLES = f"Tables (*.csv *.txt *.tsv);;{EVERYTHING}"
+TABLES = f"Tables (*.csv *.txt *.tsv *.tdms);;{EVERYTHING}"
 
 
 class TrendsPage(Page):
@@ -41,10 +45,12 @@ class TrendsPage(Page):
         self.shown: TrendsState | None = None
         self._boxes: dict[str, QCheckBox] = {}
         self._in_view: int | None = None
+        self._events: Mapping[str, tuple[Event, ...]] = {}
         self._last_folder = Path()
         self.plots = PlotStack("Trends over the recording")
         self.plots.chosen.connect(workspace.show_frame)
-        workspace.opened.connect(self.leave)
+        workspace.opened.connect(self._forget)
+        workspace.analysed.connect(lambda found: self._show_events(found.events))
         self.spectrum = PlotStack("Spectrum")
         self.spectrum.hide()
         splitter = QSplitter(Qt.Orientation.Vertical)
@@ -67,7 +73,8 @@ class TrendsPage(Page):
             self._mark(frame)
             return
         self._in_view = frame
-        self.shown = shown = show(session, self.options, self.workspace.overview())
+        seen = self.workspace.overview()
+        self.shown = shown = show(session, self.options, seen, self._events)
         self.plots.show_curves(shown.curves, shown.axis)
         self._mark(frame)
         self.plots.setVisible(bool(shown.curves))
@@ -87,6 +94,18 @@ class TrendsPage(Page):
 
     def _mark(self, frame: int) -> None:
         self.plots.set_current(frame, None if self.shown is None else self.shown.places.get(frame))
+
+    def _show_events(self, events: Mapping[str, tuple[Event, ...]]) -> None:
+        """Mark events in the curves."""
+        self._events = events
+        self.leave()
+        if self.isVisible():
+            self.refresh()
+
+    def _forget(self) -> None:
+        """Show no events of another session."""
+        self._events = {}
+        self.leave()
 
     def leave(self) -> None:
         """Refresh everything when the page comes back into view."""
@@ -210,7 +229,12 @@ class TrendsPage(Page):
         self.of.edited.connect(lambda key: self._set_options(spectrum_of=key))
         self.spectrum_words = Message(2)
         of = hbox(self.of.label, (self.of, 1))
-        fill(self.panel_layout, heading("Spectrum"), of, self.spectrum_words)
+        more = button(
+            "Pool over time …",
+            "Spectrogram, modes, changes and step responses, in a window of their own",
+            lambda: self.workspace.action_requested.emit("dynamics"),
+        )
+        fill(self.panel_layout, heading("Spectrum"), of, self.spectrum_words, more)
 
     def _make_signals(self) -> None:
         self.signals_words = wrapping_label()
@@ -226,7 +250,7 @@ class TrendsPage(Page):
         self.start.edited.connect(self._start_at)
         self.read_button = button(
             "Read a table …",
-            "Read current and voltage from a CSV table and keep them in the session",
+            "Read current, voltage, wire feed from a table (CSV, TDMS); keep them in the session",
             self.choose_signals,
         )
         self.forget_button = button(

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,6 +26,9 @@ from labapp.session.signals import Signals
 from labapp.session.trends import BY_KEY, Trend, doubtful_frames, spectrum, spread, trend
 from labapp.text import SIGMA_OF, marked_setup_words
 
+if TYPE_CHECKING:
+    from labapp.core.dynamics.steps import Event
+
 MARKS = (
     Mark("●", "measured"),
     Mark("■", "corrected by hand"),
@@ -36,7 +41,12 @@ FIRST_SHOWN = ("width_mm", "length_mm", "height_mm", "are_mm")
 
 NO_STATES = f"The pool's states are read from {FEWEST} frames or more, measured without a gap."
 
-SIGNALS = {"current": ("Current", "A"), "voltage": ("Voltage", "V")}
+SIGNALS = {
+    "current": ("Current", "A"),
+    "voltage": ("Voltage", "V"),
+    "wire": ("Wire feed", "m/min"),
+}
+"""Channels of `Signals`: name and unit."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +54,7 @@ class TrendOptions:
     """What the operator wants to see."""
 
     shown: tuple[str, ...] = (*FIRST_SHOWN, *SIGNALS)
-    """Measures, and ``current``, ``voltage``."""
+    """Measures, and channels of `SIGNALS`."""
     without_doubtful: bool = False
     """Whether frames in doubt are left out of statistics and spectrum."""
     spectrum_of: str = ""
@@ -75,8 +85,21 @@ class TrendsState:
     """Of current and voltage."""
 
 
-def show(session: Session, options: TrendOptions, seen: Overview | None = None) -> TrendsState:
-    """What to show of a session; ``seen`` is its overview, if it is at hand."""
+def show(
+    session: Session,
+    options: TrendOptions,
+    seen: Overview | None = None,
+    events: Mapping[str, tuple[Event, ...]] = MappingProxyType({}),
+) -> TrendsState:
+    """What to show of a session.
+
+    Parameters
+    ----------
+    seen
+        Its overview, if it is at hand.
+    events
+        Events by measure and signal, s, as they were last worked out.
+    """
     seen, signals = seen or session.overview(), session.signals
     if session.has_lines:
         return _show_lines(session, options, seen)
@@ -90,9 +113,13 @@ def show(session: Session, options: TrendOptions, seen: Overview | None = None) 
     at = seen.time_s if timed else seen.frame.astype(float)
     span = (float(at.min()), float(at.max())) if len(at) else None
     axis = Axis("Time", "s", span=span) if timed else Axis("Frame", "", 0, span=span)
-    curves = [_curve(course) for course in courses if len(course.frame)]
+    curves = [
+        _curve(course, events.get(course.quantity.key, ()))
+        for course in courses
+        if len(course.frame)
+    ]
     if signals is not None and timed:
-        curves += _signal_curves(signals, seen, options.shown)
+        curves += _signal_curves(signals, seen, options.shown, events)
     of = course_of(options.spectrum_of) if options.spectrum_of in BY_KEY else None
     found, spectrum_axis, message = _spectrum(of, timed)
     return TrendsState(
@@ -100,7 +127,7 @@ def show(session: Session, options: TrendOptions, seen: Overview | None = None) 
         axis=axis,
         places=dict(zip(seen.frame.tolist(), at.tolist(), strict=True)),
         rows=tuple(row for course in courses for row in _rows(course)),
-        words=_counted(seen, course_of("height_mm")),
+        words=_counted(seen, course_of("height_mm")) + _without_shape(courses),
         setup_words=marked_setup_words(session.setup_status, session.setup_words),
         spectrum=found,
         spectrum_axis=spectrum_axis,
@@ -135,7 +162,7 @@ def _show_lines(session: Session, options: TrendOptions, seen: Overview) -> Tren
         if name in found.values and (known := np.isfinite(values := found.values[name])).any()
     ]
     if session.signals is not None and timed:
-        curves += _signal_curves(session.signals, seen, options.shown)
+        curves += _signal_curves(session.signals, seen, options.shown, {})
     states = ", ".join(
         f"{state} {first}–{last}" if last > first else f"{state} {first}"
         for state, first, last in found.stretches()
@@ -167,7 +194,7 @@ def _followed(x: FloatArray, shift_px: FloatArray, timed: bool) -> str:
     return words
 
 
-def _curve(course: Trend) -> Curve:
+def _curve(course: Trend, events: Sequence[Event]) -> Curve:
     mark = np.full(len(course.frame), MEASURED)
     mark[course.corrected] = CORRECTED
     mark[course.doubtful] = DOUBTFUL
@@ -182,6 +209,7 @@ def _curve(course: Trend) -> Curve:
         mark=np.asarray(mark, np.int64),
         marks=MARKS,
         level=spread(course).mean,
+        events=np.array([one.time_s for one in events if course.timed]),
         decimals=4 if course.quantity.key == "are_mm" else 3,
     )
 
@@ -222,6 +250,14 @@ def _counted(seen: Overview, course: Trend) -> str:
     return ", ".join(parts)
 
 
+def _without_shape(courses: Sequence[Trend]) -> str:
+    """Which measures are shown that results of versions before did not have."""
+    names = [one.quantity.label for one in courses if not len(one.frame)]
+    if not names or all(not len(one.frame) for one in courses):
+        return ""
+    return f". {', '.join(names)}: not in results of an earlier version"
+
+
 def _spectrum(course: Trend | None, timed: bool) -> tuple[tuple[Curve, ...], Axis, str]:
     axis = Axis("Frequency", "Hz" if timed else "1/frame", 2 if timed else 4)
     if course is None:
@@ -250,23 +286,31 @@ def _spectrum(course: Trend | None, timed: bool) -> tuple[tuple[Curve, ...], Axi
     )
 
 
-def _signal_curves(signals: Signals, seen: Overview, shown: Sequence[str]) -> list[Curve]:
-    """Current and voltage while the recording runs, and a little before and after."""
+def _signal_curves(
+    signals: Signals,
+    seen: Overview,
+    shown: Sequence[str],
+    events: Mapping[str, tuple[Event, ...]],
+) -> list[Curve]:
+    """Signals while the recording runs, and a little before and after."""
     time_s = signals.time_s + signals.start_s
     low, high = float(seen.time_s.min()), float(seen.time_s.max())
     room = 0.05 * (high - low) or 0.5
     within: IntArray = np.flatnonzero((time_s >= low - room) & (time_s <= high + room))
     curves = []
-    for key, (name, unit) in SIGNALS.items():
-        values = getattr(signals, f"{key}_{unit.lower()}")[within]
-        if key in shown and np.isfinite(values).any():
-            curves.append(Curve(name, unit, time_s[within], values))
+    for key, values in signals.channels.items():
+        if key in shown and np.isfinite(values[within]).any():
+            found = np.array([one.time_s for one in events.get(key, ())])
+            curves.append(Curve(*SIGNALS[key], time_s[within], values[within], events=found))
     return curves
 
 
 def _told_signals(signals: Signals | None, seen: Overview, timed: bool) -> str:
     if signals is None:
-        return "None. A table (CSV) of current or voltage over time can be shown with the measures."
+        return (
+            "None. A table (CSV, TDMS) with a time and a current, a voltage or a wire feed can be "
+            "shown along."
+        )
     ends = signals.time_s[[0, -1]] + signals.start_s
     message = f"{signals.file}: {len(signals.time_s)} samples, {ends[0]:.3f} … {ends[1]:.3f} s"
     if not timed:

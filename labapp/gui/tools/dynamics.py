@@ -1,0 +1,294 @@
+"""The window of the pool over time: what to analyse at the left; spectra, modes, events."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from PySide6.QtCore import Qt, QTimer
+from PySide6.QtGui import QCloseEvent
+from PySide6.QtWidgets import QAbstractItemView, QTabWidget, QWidget
+
+from labapp.gui.tasks import Control
+from labapp.gui.tools import dynamics_shown as shown
+from labapp.gui.tools.tool import ToolWindow
+from labapp.gui.widgets.buttons import button
+from labapp.gui.widgets.fields import ChoiceField, NumberField
+from labapp.gui.widgets.labels import wrapping_label
+from labapp.gui.widgets.layouts import hbox, vbox
+from labapp.gui.widgets.sheet import Sheet
+from labapp.gui.widgets.tables import CellTable
+
+if TYPE_CHECKING:
+    from labapp.core.dynamics.analysis import Dynamics
+    from labapp.export.dynamics import Measured
+    from labapp.gui.shell.files import Files
+    from labapp.session.measured import Overview
+
+FILM_MS = 80
+"""From a picture of a mode's film to the next."""
+
+CHANGED = "Results have changed since: press Analyse again."
+
+
+class DynamicsWindow(ToolWindow):
+    """Analyses how the pool of the session changes over its recording, and shows it."""
+
+    key = "dynamics"
+    title = "Pool over time"
+
+    def __init__(self, sessions: Files, window: QWidget) -> None:
+        self.drawn: shown.Drawn | None = None
+        """What is shown; None before the first analysis."""
+        self._of: Overview | None = None
+        self._event_frames: tuple[int, ...] = ()
+        self._film: list[bytes] = []
+        super().__init__(sessions, window)
+        self._turn = QTimer(self, interval=FILM_MS)
+        self._turn.timeout.connect(self._next_picture)
+        self.workspace.opened.connect(self._forget)
+        self._make_form()
+        self._make_results()
+        self.add_save_button(
+            "Save the results …", "Write all tables (CSV) and pictures to a folder"
+        )
+        self.start_button = self.add_button(
+            "Analyse", "Find oscillations, modes, events and responses", self.start
+        )
+        self.show_state()
+
+    def _make_form(self) -> None:
+        self.form.add_heading("Spectrum")
+        self.of = ChoiceField("Measure", shown.SERIES, tooltip="Whose spectra and peak are shown")
+        self.of.set_value("height_mm")
+        self.segment = NumberField(
+            "Segment", "s", lowest=0.001, highest=1e4, step=0.05, decimals=3, optional=True,
+            tooltip="Duration of a segment of the spectrogram; empty: an eighth of the recording",
+        )  # fmt: skip
+        self.form.add(self.of)
+        self.form.add(self.segment)
+        self.form.add_heading("Oscillations looked for")
+        ends = ("From", 0.01, "Lowest"), ("To", 0.01, "Highest")
+        self.band = [
+            NumberField(
+                name, "Hz", lowest=lowest, highest=1e5, decimals=2, optional=True,
+                tooltip=f"{end} frequency; both empty: all that the frames resolve",
+            )
+            for name, lowest, end in ends
+        ]  # fmt: skip
+        for field in self.band:
+            self.form.add(field)
+
+    def _make_results(self) -> None:
+        self.words = wrapping_label()
+        self.peak_words, self.response_words = wrapping_label(), wrapping_label()
+        self.spectrum, self.series = Sheet("Spectrogram and spectrum"), Sheet("Series and events")
+        self.event_words = wrapping_label("No change stands out of the noise.")
+        self.shape = Sheet("Shape and course of the mode")
+        self.modes, self.events = CellTable("Modes"), CellTable("Events")
+        self.responses = CellTable("Responses")
+        self.play_button = button(
+            "Play", "Show one period of this mode as a film; press again to stop", self.play
+        )
+        self.frame_button = button(
+            "Show the frame", "Show the frame of this event in the main window", self.show_frame
+        )
+        for table, changed in (
+            (self.modes, self._show_mode),
+            (self.events, self.show_state),
+        ):
+            table.setSelectionMode(QAbstractItemView.SelectionMode.SingleSelection)
+            table.itemSelectionChanged.connect(changed)
+        self.events.cellActivated.connect(lambda *_: self.show_frame())
+        self.tabs = QTabWidget()
+        for words, parts in (
+            ("Spectrum", (self.peak_words, (self.spectrum, 1))),
+            ("Modes", ((self.modes, 3), (self.shape, 4), hbox(self.play_button, 1))),
+            (
+                "Events",
+                (self.event_words, (self.series, 3), (self.events, 2), hbox(self.frame_button, 1)),
+            ),
+            ("Responses", ((self.response_words, 1), (self.responses, 1))),
+        ):
+            page = QWidget()
+            vbox(*parts, of=page).setContentsMargins(6, 6, 6, 6)
+            self.tabs.addTab(page, words)
+        for label in (self.peak_words, self.event_words, self.response_words):
+            label.setAlignment(Qt.AlignmentFlag.AlignTop)
+        self.tabs.currentChanged.connect(lambda _: self._turn.stop())
+        self.results.addWidget(self.words)
+        self.results.addWidget(self.tabs, 1)
+        self.results.addStretch()
+        self.tabs.hide()
+
+    # --- analysing -----------------------------------------------------------------------------
+
+    def prefill(self) -> None:
+        """Analyse what the session holds, where it is not what is shown."""
+        if not shown.same_results(self.workspace.overview(), self._of):
+            self.start()
+
+    def start(self) -> None:
+        """Analyse the session's results in the background."""
+        for field in (self.segment, *self.band):
+            field.flush()
+        session, seen = self.workspace.session, self.workspace.overview()
+        why = shown.impossible(session, seen)
+        if why or session is None or seen is None or self.working:
+            self.show_state()
+            return
+        ends = [value for field in self.band if (value := field.value()) is not None]
+        if len(ends) == 1 or ends != sorted(set(ends)):
+            self.say("Enter both ends of the frequencies, the lower one first, or neither", True)
+            return
+        from labapp.core.dynamics.analysis import DynamicsSettings
+
+        band = (ends[0], ends[1]) if ends else None
+        settings = DynamicsSettings(self.of.value(), band, self.segment.value())
+        signals = session.signals.timed() if session.signals else {}
+
+        def counted(control: Control) -> Iterator[Measured]:
+            from labapp.export.dynamics import measured_of
+
+            for done, one in enumerate(measured_of(session.frame_results(stale=False))):
+                control.progress(done, len(seen.frame), "reading surfaces")
+                yield one
+            control.progress(len(seen.frame), len(seen.frame), "analysing")
+
+        def work(control: Control) -> shown.Drawn:
+            from labapp.export.dynamics import dynamics_of
+
+            found = dynamics_of(counted(control), signals, settings)
+            return shown.draw(found, control.check)
+
+        self._of = seen
+        self.begin("Analysing", work, self.show_found)
+
+    def show_found(self, drawn: shown.Drawn) -> None:
+        """Show an analysis."""
+        found = drawn.found
+        self.drawn = drawn
+        self.say("Done")
+        self.peak_words.setText(shown.peak_text(found))
+        self.spectrum.show_png(drawn.spectrum, self.peak_words.text())
+        self.series.show_png(drawn.series, "Series with their events as lines")
+        self.modes.show_table(shown.modes_table(found))
+        self.modes.selectRow(self._strongest(found))
+        table, self._event_frames = shown.events_table(found)
+        self.events.show_table(table)
+        self.event_words.setVisible(not table.rows)
+        for widget in (self.events, self.frame_button):
+            widget.setVisible(bool(table.rows))
+        responses = shown.responses_table(found)
+        self.responses.show_table(responses)
+        session = self.workspace.session
+        has_signals = session is not None and session.signals is not None
+        self.response_words.setText(
+            "" if responses.rows else shown.no_responses(found, has_signals)
+        )
+        self.response_words.setVisible(not responses.rows)
+        self.responses.setVisible(bool(responses.rows))
+        self.tabs.show()
+        self.show_state()
+        self.workspace.analysed.emit(found)
+
+    @staticmethod
+    def _strongest(found: Dynamics) -> int:
+        """Row of the Bessel mode with the largest share that oscillates, or of the first."""
+        return max(
+            range(len(found.modes)),
+            key=lambda k: (bool(found.modes[k].oscillations), found.modes[k].share),
+        )
+
+    def _forget(self) -> None:
+        """Show nothing of a session that is closed."""
+        self.tasks.cancel_all()
+        self._turn.stop()
+        self.drawn, self._of = None, None
+        self.tabs.hide()
+
+    def save(self, folder: Path) -> None:
+        """Write the results, as the command does; the pictures for paper are drawn first."""
+        from labapp.export.dynamics import dynamics_files
+
+        assert self.drawn is not None
+        found = self.drawn.found
+
+        def write(files: dict[str, bytes]) -> None:
+            self.files = files
+            super(DynamicsWindow, self).save(folder)
+
+        self.begin("Drawing", lambda _: dynamics_files(found), write)
+
+    # --- one mode, one event -------------------------------------------------------------------
+
+    def _show_mode(self) -> None:
+        """Show the mode that is selected."""
+        self._turn.stop()
+        self._film = []
+        row = self.modes.currentRow()
+        if self.drawn is not None and row >= 0:
+            name = self.drawn.found.all_modes[row].name
+            self.shape.show_png(self.drawn.modes[row], f"Mode {name}")
+        self.show_state()
+
+    def play(self) -> None:
+        """Play one period of the selected mode over and over, or stop."""
+        drawn, row = self.drawn, self.modes.currentRow()
+        if self._turn.isActive():
+            self._turn.stop()
+        elif self._film:
+            self._turn.start()
+        elif drawn is not None:
+            mode = drawn.found.all_modes[row]
+            turns = shown.FILM_TURNS
+
+            def work(control: Control) -> list[bytes]:
+                pictures = []
+                for k in range(turns):
+                    control.progress(k, turns, "drawing")
+                    pictures.append(shown.mode_picture(drawn.found, mode, k / turns))
+                return pictures
+
+            def done(pictures: list[bytes]) -> None:
+                if drawn is self.drawn and row == self.modes.currentRow():
+                    self.say(f"One period of mode {mode.name}, slowed down")
+                    self._film = pictures
+                    self._turn.start()
+
+            self.begin(f"Film of mode {mode.name}", work, done)
+
+    def _next_picture(self) -> None:
+        """Show the next picture of the film."""
+        self._film = [*self._film[1:], *self._film[:1]]
+        self.shape.show_png(self._film[0], "Film of the mode")
+
+    def show_frame(self) -> None:
+        """Show the frame of the selected event in the main window."""
+        row = self.events.currentRow()
+        if self.events.selectedItems() and row < len(self._event_frames):
+            self.workspace.show_frame(self._event_frames[row])
+            self.say(f"Frame {self._event_frames[row]} is in view in the main window")
+
+    def closeEvent(self, event: QCloseEvent) -> None:
+        """Stop the film, too."""
+        self._turn.stop()
+        super().closeEvent(event)
+
+    def show_state(self) -> None:
+        """Enable what is of use now, and say what can be determined."""
+        if not hasattr(self, "start_button"):
+            return
+        session = self.workspace.session
+        seen = self.workspace.overview() if session is not None else None
+        why = shown.impossible(session, seen)
+        told = why or (shown.range_text(seen) if seen is not None else "")
+        if self.drawn is not None and not shown.same_results(seen, self._of):
+            told = f"{CHANGED} {told}"
+        self.words.setText(told)
+        idle = not self.working
+        self.start_button.setEnabled(idle and not why)
+        self.save_button.setEnabled(idle and self.drawn is not None)
+        self.play_button.setEnabled(idle and self.modes.currentRow() >= 0)
+        self.frame_button.setEnabled(bool(self.events.selectedItems()))

@@ -1,0 +1,254 @@
+"""What the window of the pool over time shows, and why there is nothing to show: without Qt."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from labapp.core.dynamics.oscillation import FEWEST
+from labapp.core.surface.measures import WITH_SIGMA
+from labapp.gui.digits import with_sigma
+from labapp.session.trends import BY_KEY
+from labapp.studies.tables import Table
+from labapp.text import pluralize
+
+if TYPE_CHECKING:
+    from labapp.core.dynamics.analysis import Dynamics
+    from labapp.core.dynamics.modes import ModeCourse
+    from labapp.session.measured import Overview
+    from labapp.session.session import Session
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """An analysis with its pictures (PNG)."""
+
+    found: Dynamics
+    spectrum: bytes
+    series: bytes
+    modes: tuple[bytes, ...]
+
+
+SERIES = [(name, BY_KEY[name].label) for name in WITH_SIGMA]
+
+WIDE, HIGH, DPI = 4.9, 3.9, 120
+"""Size of a picture, inches, and its dots an inch: readable in a narrow window."""
+
+FILM_TURNS = 16
+"""Pictures of a mode in one period."""
+
+RESPONSE = {
+    "change": "Change",
+    "delay_s": "Delay (s)",
+    "time_constant_s": "Time constant (s)",
+    "rise_time_s": "Rise from 10 to 90 % (s)",
+    "overshoot": "Overshoot (share of the change)",
+}
+
+NO_STEPS = (
+    "No response: {} The page Trends reads them from a table (Current and voltage), and a response "
+    "is fitted to each of their steps, if there are at most eight."
+)
+
+
+def impossible(session: Session | None, seen: Overview | None) -> str:
+    """Why oscillations and events of a session cannot be determined; empty where they can."""
+    if session is None or seen is None:
+        return "No session is open."
+    if session.has_lines:
+        return "The session is of a line pattern, which has no surface to analyse over time."
+    if not np.isfinite(seen.time_s).all():
+        return (
+            "The frame rate is unknown, so there are no frequencies: import the recording with "
+            "its frame rate (step Recording)."
+        )
+    count = int((np.isfinite(seen.measures["height_mm"]) & ~seen.stale).sum())
+    if count < FEWEST:
+        return (
+            f"Too few frames: {count} of {len(seen.frame)} have a surface that stands, and "
+            f"{FEWEST} are needed. Measure more of them (F5)."
+        )
+    return ""
+
+
+def same_results(one: Overview | None, other: Overview | None) -> bool:
+    """Whether the same frames have the same sizes, and these still stand."""
+    if one is None or other is None:
+        return one is other
+    pairs = (
+        (one.time_s, other.time_s),
+        (one.stale, other.stale),
+        (one.measures["height_mm"], other.measures["height_mm"]),
+    )
+    return all(np.array_equal(a.astype(float), b.astype(float), equal_nan=True) for a, b in pairs)
+
+
+def range_text(seen: Overview) -> str:
+    """Which oscillations the frames can show."""
+    there = np.isfinite(seen.measures["height_mm"]) & ~seen.stale
+    time_s = seen.time_s[there]
+    step = float(np.median(np.diff(time_s)))
+    span = float(time_s[-1] - time_s[0]) + step
+    missing = round(span / step) - len(time_s)
+    gaps = f" {pluralize(missing, 'frame')} between them without one." * (missing > 0)
+    return (
+        f"{len(time_s)} frames with a surface in {span:.4g} s, {1 / step:.4g} frames/s: "
+        f"oscillations from {2 / span:.2g} to {0.5 / step:.4g} Hz. Faster ones show as slower "
+        f"ones.{gaps}"
+    )
+
+
+def peak_text(found: Dynamics) -> str:
+    """The strongest oscillation over time in a sentence."""
+    peak, gram = found.peak, found.spectrogram
+    there = np.isfinite(peak.frequency_hz)
+    segments = f"{pluralize(len(there), 'segment')} of {gram.segment_s:.3g} s ({gram.method})"
+    if not there.any():
+        return f"No oscillation stands out of the noise in {segments}."
+    hertz, sigma = peak.frequency_hz[there], peak.frequency_sigma_hz[there]
+    low, high = int(np.argmin(hertz)), int(np.argmax(hertz))
+    ends = [f"{with_sigma(hertz[k], sigma[k])} Hz" for k in dict.fromkeys((low, high))]
+    return f"Strongest oscillation {' to '.join(ends)} in {there.sum()} of {segments}."
+
+
+def modes_table(found: Dynamics) -> Table:
+    """A row a mode: its strongest oscillation with ±."""
+    names = ("frequency_hz", "amplitude_mm", "phase_deg", "damping_per_s")
+    scales = (1.0, 1e3, 1.0, 1.0)
+    rows = []
+    for one in found.all_modes:
+        figures = one.figures
+        cells = [
+            with_sigma(*(scale * x for x in figures[name])) if figures else "–"
+            for name, scale in zip(names, scales, strict=True)
+        ]
+        rows.append((one.name, f"{one.share:.0%}", *cells))
+    columns = ("Mode", "Share", "Hz", "Amplitude (µm)", "Phase (°)", "Damping (1/s)")
+    return Table("modes", "Modes and their strongest oscillation, with ±", columns, tuple(rows))
+
+
+def events_table(found: Dynamics) -> tuple[Table, tuple[int, ...]]:
+    """A row an event in the order of time, and the frame nearest to each."""
+    every = sorted(
+        ((one, name) for name, events in found.events.items() for one in events),
+        key=lambda pair: pair[0].time_s,
+    )
+    rows = tuple(
+        (
+            with_sigma(one.time_s, one.sigma_s),
+            series_label(name),
+            *(
+                f"{x:+.3g}".replace("-", "−") if abs(x) > 1e-6 else "0"
+                for x in (one.change, one.slope_change_per_s)
+            ),
+        )
+        for one, name in every
+    )
+    time_s = found.surfaces.time_s
+    frames = [found.surfaces.frame[np.argmin(np.abs(time_s - one.time_s))] for one, _ in every]
+    columns = ("Time (s)", "Series", "Change", "Change of slope (1/s)")
+    return Table("events", "Events", columns, rows), tuple(map(int, frames))
+
+
+def responses_table(found: Dynamics) -> Table:
+    """A row a quantity of a response to a step of a signal."""
+    rows = []
+    for one in found.responses:
+        value, sigma = one.response.value, one.response.sigma
+        step = f"{one.signal} at {one.step.time_s:.3f} s"
+        for name, words in RESPONSE.items():
+            if name != "overshoot" or one.response.order == 2:
+                known = with_sigma(value[name], sigma[name])
+                rows.append((step, series_label(one.series), words, known))
+    columns = ("Step", "Series", "Quantity", "Value")
+    return Table("responses", "Responses to steps, with ±", columns, tuple(rows))
+
+
+def no_responses(found: Dynamics, signals: bool) -> str:
+    """Why there is no response."""
+    steps = any(found.events.get(name) for name in ("current", "voltage", "wire"))
+    if not signals:
+        return NO_STEPS.format("no current, voltage or wire feed was imported.")
+    if not steps:
+        return NO_STEPS.format("the signals have no step while frames have a surface.")
+    return NO_STEPS.format("no size changes beyond its noise after a step.")
+
+
+def series_label(name: str) -> str:
+    """A series or a signal in words, with its unit."""
+    if name in BY_KEY:
+        quantity = BY_KEY[name]
+        return f"{quantity.label} ({quantity.unit})" if quantity.unit else quantity.label
+    return {"current": "Current (A)", "voltage": "Voltage (V)", "wire": "Wire feed (m/min)"}[name]
+
+
+# --- pictures ---------------------------------------------------------------------------------
+
+
+def draw(found: Dynamics, check: Callable[[], None]) -> Drawn:
+    """Draw an analysis; ``check`` is called in between and may raise to stop."""
+    modes = []
+    for one in found.all_modes:
+        check()
+        modes.append(mode_picture(found, one))
+    check()
+    return Drawn(found, spectrum_picture(found), series_picture(found), tuple(modes))
+
+
+def spectrum_picture(found: Dynamics) -> bytes:
+    """Spectrogram with the tracked peak, and the mean spectrum."""
+    from matplotlib import rc_context
+
+    from labapp.export.dynamics import draw_spectrogram, draw_spectrum
+    from labapp.studies.plotting import STYLE, as_bytes, new_figure
+
+    with rc_context(STYLE):
+        figure = new_figure(WIDE, HIGH)
+        above, below = figure.subplots(2, 1)
+        draw_spectrogram(above, found)
+        draw_spectrum(below, found)
+    return as_bytes(figure, dpi=DPI)
+
+
+def series_picture(found: Dynamics) -> bytes:
+    """Series with their events, steps of signals and responses."""
+    from matplotlib import rc_context
+
+    from labapp.core.dynamics.analysis import RESPONDING
+    from labapp.export.dynamics import draw_series
+    from labapp.studies.plotting import STYLE, as_bytes, new_figure
+
+    with rc_context(STYLE):
+        figure = new_figure(WIDE, HIGH)
+        plots = figure.subplots(len(RESPONDING), 1, sharex=True)
+        for plot, name in zip(plots, RESPONDING, strict=True):
+            draw_series(plot, found, name)
+            plot.set(ylabel=series_label(name).replace(" (", "\n("))
+            plot.label_outer()
+    return as_bytes(figure, dpi=DPI)
+
+
+def mode_picture(found: Dynamics, one: ModeCourse, turn: float = 0.0) -> bytes:
+    """A mode from above at a part of its period, and its coefficients over time."""
+    from matplotlib import rc_context
+
+    from labapp.export.dynamics import draw_mode
+    from labapp.studies.plotting import STYLE, as_bytes, new_figure
+
+    with rc_context(STYLE):
+        figure = new_figure(WIDE, 2.2)
+        shape, course = figure.subplots(1, 2, width_ratios=(2, 3))
+        draw_mode(shape, found, one, turn)
+        labels = ("cos", "sin") if len(one.shape) > 1 else (None,)
+        for values, label in zip(one.coefficient_mm.T, labels, strict=True):
+            course.plot(found.surfaces.time_s, 1e3 * values, ".-", markersize=2, label=label)
+        if len(one.shape) > 1:
+            course.legend(loc="upper right", ncols=2)
+        if one.oscillations:
+            period_s = 1 / one.oscillations[0].frequency_hz
+            course.axvline(found.surfaces.time_s[0] + turn * period_s, color="C3", linewidth=0.8)
+        course.set(xlabel="time (s)", ylabel="coefficient (µm)")
+    return as_bytes(figure, dpi=DPI)

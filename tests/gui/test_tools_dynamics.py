@@ -1,0 +1,144 @@
+"""The window of the pool over time: the command's tables, its events, and what it cannot tell."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PySide6.QtCore import Qt
+from PySide6.QtTest import QTest
+from pytestqt.qtbot import QtBot
+
+from labapp.gui.pages.trends import TrendsPage
+from labapp.gui.shell.window import MainWindow
+from labapp.gui.tools import dynamics_shown
+from labapp.gui.tools.dynamics import DynamicsWindow
+from tests.conftest import Run
+from tests.core.dynamics_truth import analysed_step
+from tests.gui.conftest import CopySample
+
+
+def opened(window: MainWindow, path: Path) -> DynamicsWindow:
+    assert window.files.open(path)
+    window.do("dynamics")
+    tool = window.findChild(DynamicsWindow)
+    assert tool is not None
+    return tool
+
+
+@pytest.fixture
+def tool(window: MainWindow, copy_sample: CopySample, qtbot: QtBot) -> DynamicsWindow:
+    """The window beside a session of 30 frames, analysed on opening."""
+    made = opened(window, copy_sample("gtaw"))
+    qtbot.waitUntil(lambda: not made.working)
+    assert made.drawn is not None
+    return made
+
+
+@pytest.mark.slow
+def test_its_files_are_the_commands(
+    tool: DynamicsWindow, labapp: Run, tmp_path: Path, qtbot: QtBot
+) -> None:
+    tool.save(tmp_path / "window")
+    qtbot.waitUntil(lambda: not tool.working)
+    session = tool.workspace.session
+    assert session is not None
+    assert labapp("dynamics", session.path, "--out", tmp_path / "command")[0] == 0
+    names = sorted(path.name for path in (tmp_path / "command").iterdir())
+    assert sorted(path.name for path in (tmp_path / "window").iterdir()) == names
+    for name in (name for name in names if name.endswith(".csv")):
+        one, other = ((tmp_path / of / name).read_bytes() for of in ("window", "command"))
+        assert one == other, name
+
+
+@pytest.mark.slow
+def test_what_was_chosen_is_analysed_and_half_a_band_is_refused(
+    tool: DynamicsWindow, qtbot: QtBot
+) -> None:
+    before = tool.drawn
+    tool.band[0].set_value(5.0)
+    tool.start()
+    assert not tool.working
+    tool.band[1].set_value(25.0)
+    tool.of.set_value("asymmetry")
+    tool.start()
+    qtbot.waitUntil(lambda: not tool.working)
+    assert tool.drawn is not None
+    assert tool.drawn is not before
+    assert tool.drawn.found.settings.of == "asymmetry"
+    assert tool.drawn.found.settings.band_hz == (5.0, 25.0)
+    tool.close()
+    tool.open_beside()
+    assert not tool.working  # nothing has changed
+
+
+@pytest.mark.slow
+def test_events_are_marked_on_the_trends_and_lead_to_their_frame(
+    tool: DynamicsWindow, window: MainWindow, qtbot: QtBot
+) -> None:
+    window.do("step_trends")
+    (page,) = window.findChildren(TrendsPage)
+    found = analysed_step()
+    tool.show_found(dynamics_shown.draw(found, lambda: None))
+    (width,) = [curve for curve in page.plots.curves if curve.name == "Width"]
+    assert width.events.tolist() == [one.time_s for one in found.events["width_mm"]]
+    assert width.events[0] == pytest.approx(0.5, abs=0.05)
+    row = [tool.events.item(k, 1).text() for k in range(tool.events.rowCount())].index("Width (mm)")
+    tool.events.selectRow(row)
+    with qtbot.waitSignal(window.workspace.frame_changed):
+        tool._event_frames = (*[20] * (row + 1),)
+        tool.frame_button.setFocus()
+        QTest.keyClick(tool.frame_button, Qt.Key.Key_Space)
+    assert window.workspace.frame == 20
+    window.workspace.show(None)
+    assert tool.drawn is None
+    assert not tool.tabs.isVisible()
+
+
+@pytest.mark.slow
+def test_a_mode_is_played_until_it_is_stopped(tool: DynamicsWindow, qtbot: QtBot) -> None:
+    tool.tabs.setCurrentIndex(1)
+    tool.play()
+    qtbot.waitUntil(lambda: not tool.working)
+    assert tool._turn.isActive()
+    tool.play()
+    assert not tool._turn.isActive()
+    tool.play()
+    tool.modes.selectRow(3)
+    assert not tool._turn.isActive()
+
+
+def test_without_a_frame_rate_nothing_is_analysed(
+    window: MainWindow, copy_sample: CopySample
+) -> None:
+    tool = opened(window, copy_sample("concave"))
+    assert not tool.working
+    assert "frame rate" in tool.words.text()
+    assert not tool.start_button.isEnabled()
+
+
+def test_too_few_frames_are_said_to_be(window: MainWindow, copy_sample: CopySample) -> None:
+    assert window.files.open(copy_sample("gtaw"))
+    seen = window.workspace.overview()
+    assert seen is not None
+    session = window.workspace.session
+    assert dynamics_shown.impossible(session, seen) == ""
+    few = {**seen.measures, "height_mm": np.where(seen.frame < 15, 0.3, np.nan)}
+    object.__setattr__(seen, "measures", few)
+    assert "15 of 30" in dynamics_shown.impossible(session, seen)
+
+
+def test_the_tables_say_what_was_put_in() -> None:
+    found = analysed_step()
+    rows = {str(row[0]): row for row in dynamics_shown.modes_table(found).rows}
+    assert str(rows["(0, 1)"][2]).startswith("31.0")
+    assert str(rows["(1, 1)"][2]).startswith("47.0")
+    response = dynamics_shown.responses_table(found).rows
+    assert {row[1] for row in response} == {"Width (mm)"}
+    assert len(response) == 4  # the first order does not overshoot
+    change = float(str(response[0][3]).partition(" ")[0])
+    assert change == pytest.approx(0.5, abs=0.01)
+    table, frames = dynamics_shown.events_table(found)
+    assert len(frames) == len(table.rows) >= 2
+    assert abs(frames[0] - 100) <= 4
