@@ -19,7 +19,7 @@ from labapp.core.surface.measures import SIZES
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.surface.surface import Surface
 from labapp.core.values import FloatArray
-from labapp.errors import InputError
+from labapp.errors import InputError, unknown_name
 from labapp.export.frame_result import FrameResult
 from labapp.text import csv_text
 
@@ -92,7 +92,7 @@ def dynamics_of(
     """
     chosen = settings or DynamicsSettings()
     if chosen.of not in SERIES:
-        raise InputError("dynamics", "of", chosen.of, f"one of {', '.join(SERIES)}")
+        raise unknown_name("dynamics", "of", chosen.of, SERIES)
     rows: list[list[float]] = []
     setup: list[float] = []
 
