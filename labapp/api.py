@@ -15,12 +15,13 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 import numpy as np
 import numpy.typing as npt
 
+from labapp.config.settings import check_settings
 from labapp.config.setup import Setup, read_setup
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.recording.residual_check import ResidualRecord, SetupVerdict, judged_status
 from labapp.core.values import FloatArray
-from labapp.errors import InputError
+from labapp.errors import PATH, InputError, check_positive, require, unknown_name
 from labapp.export.frame_result import FrameResult
 from labapp.export.tables import TABLES, frame_tables
 from labapp.media import Frame, open_source
@@ -83,12 +84,25 @@ def measure(
     Raises
     ------
     InputError
-        If the recording or the setup file cannot be read, or an array is no image.
+        If the recording or the setup file cannot be read, an array is no image, or an argument
+        cannot be what it says.
+
+    Warns
+    -----
+    UserWarning
+        If the set-up has a value that no usual bench has.
     """
+    require(source, (*PATH, np.ndarray), "measure", "source", "a path or an array of grey levels")
+    require(setup, (*PATH, Setup), "measure", "setup", "a setup file's path or a Setup")
+    if isinstance(setup, str) and "\n" in setup:
+        raise InputError("measure", "setup", "text of several lines", "a setup file's path")
     bench = setup if isinstance(setup, Setup) else read_setup(setup)
     for unusual in bench.warnings:
         warnings.warn(f"set-up: {unusual}", stacklevel=2)
     chosen = Settings() if settings is None else settings
+    check_settings(chosen, "measure")
+    if not (progress is None or callable(progress)):
+        raise InputError("measure", "progress", repr(progress), "a function of a FrameResult")
     with ExitStack() as at_end:
         if isinstance(source, np.ndarray):
             count, read = len(_images(source)), _reader(_images(source))
@@ -98,7 +112,7 @@ def measure(
         measurer = (WarmMeasurer if follow else ColdMeasurer)(read, bench, chosen)
         record = ResidualRecord(bench.rig)
         sinks = [] if progress is None else [progress]
-        selected = select_frames(frames, count)
+        selected = select_frames(frames, count, "measure")
         found = list(run(selected, with_setup_check(measurer, record), sinks))
     verdict = record.verdict()
     status = judged_status(bench.rig, verdict)  # of the whole run, as `labapp reconstruct` has it
@@ -120,6 +134,9 @@ class Results(Sequence[FrameResult]):
     @classmethod
     def of_session(cls, session: Session) -> Results:
         """Return the results that a session has; frames that were not measured are left out."""
+        from labapp.session.session import Session
+
+        require(session, Session, "Results.of_session", "session", "a Session")
         results = tuple(session.frame_results())
         return cls(results, session.setup.calibration, session.setup_verdict)
 
@@ -163,9 +180,16 @@ class Results(Sequence[FrameResult]):
         DataFrame
             Unknown values are NaN. ``attrs["units"]`` has the unit of each column, and
             ``attrs["descriptions"]`` what it holds.
+
+        Raises
+        ------
+        InputError
+            If there is no such table.
         """
         import pandas as pd
 
+        if table not in tuple(TABLES):
+            raise unknown_name("dataframe", "table", table, TABLES)
         columns = TABLES[table]
         parts = [frame_tables(result, self.calibration)[table] for result in self.results]
         values: dict[str, Any] = {
@@ -243,12 +267,24 @@ class Results(Sequence[FrameResult]):
         Raises
         ------
         InputError
-            If frames have no time, or fewer than 16 have a surface.
+            If frames have no time, fewer than 16 have a surface, or an argument is none.
         """
         from labapp.core.dynamics.analysis import DynamicsSettings
         from labapp.export.dynamics import dynamics_of, measured_of
+        from labapp.session.signals import Signals
 
-        timed = signals.timed() if signals else {}
+        timed = {}
+        if signals is not None:
+            require(signals, Signals, "dynamics", "signals", "those of read_signals, or None")
+            timed = signals.timed()
+        if segment_s is not None:
+            check_positive(segment_s, "dynamics", "segment_s", "s")
+        if band_hz is not None:
+            right = "two frequencies, the lower one first (Hz)"
+            require(band_hz, (tuple, list), "dynamics", "band_hz", right)
+            low, high, *more = (*band_hz, None, None)
+            if more[:-2] or not (_is_real(low) and _is_real(high) and low < high):
+                raise InputError("dynamics", "band_hz", band_hz, right)
         return dynamics_of(measured_of(self), timed, DynamicsSettings(of, band_hz, segment_s))
 
     def penetration(self, model: PenetrationModel) -> Prediction:
@@ -282,9 +318,18 @@ class Results(Sequence[FrameResult]):
             A column of the measures, such as ``width_mm``.
         axes
             Where to plot; None: in a new figure.
+
+        Raises
+        ------
+        InputError
+            If there is no such column, or it has no numbers.
         """
-        axes = _new_axes() if axes is None else axes
         table = self.dataframe()
+        numbers = map(str, table.select_dtypes("number"))
+        sizes = [name for name in numbers if name not in ("frame", "time_s")]
+        if size not in sizes:
+            raise unknown_name("plot", "size", size, sizes)
+        axes = _checked_axes("plot", axes)
         timed = bool(np.isfinite(table["time_s"]).all())
         at, value = table["time_s" if timed else "frame"].to_numpy(), table[size].to_numpy(float)
         (line,) = axes.plot(at, value, marker="." if len(at) < LIMIT_PARTS else "")
@@ -314,14 +359,19 @@ class Results(Sequence[FrameResult]):
         Raises
         ------
         InputError
-            If the frame has no surface.
+            If there is no such place, or the frame there has no surface.
         """
+        places = f"a place from 0 to {len(self) - 1}" if self.results else "results of some frames"
+        require(index, (int, np.integer), "plot_surface", "index", places)
+        if not -len(self) <= index < len(self):
+            raise InputError("plot_surface", "index", index, places)
+        index %= len(self)
         result = self.results[index]
         made = result.measurement.reconstruction
         if made is None:
             why = f"{result.measurement.status}: {result.measurement.reason}"
             raise InputError(f"frame {result.frame}", "surface", why, "a frame with a surface")
-        axes = _new_axes() if axes is None else axes
+        axes = _checked_axes("plot_surface", axes)
         height = self[index : index + 1].surfaces(spacing_mm)["height"][0]
         shown = axes.contourf(height["x"], height["y"], height, LIMIT_PARTS)
         axes.figure.colorbar(shown, ax=axes, label="height (mm)")
@@ -353,8 +403,7 @@ def _reader(images: npt.NDArray[Any]) -> Callable[[int], Frame]:
 
 def _axes(measured: Iterable[Measurement], spacing_mm: float) -> tuple[FloatArray, FloatArray]:
     """X and Y of a grid through the origin that has all boundaries in it, mm."""
-    if not spacing_mm > 0:
-        raise InputError("surfaces", "spacing_mm", str(spacing_mm), "more than 0 mm")
+    check_positive(spacing_mm, "surfaces", "spacing_mm", "mm")
     found = [m.reconstruction.boundary.points_mm[:, :2] for m in measured if m.reconstruction]
     if not found:
         return np.empty(0), np.empty(0)
@@ -367,8 +416,19 @@ def _axes(measured: Iterable[Measurement], spacing_mm: float) -> tuple[FloatArra
     return x_mm, y_mm
 
 
-def _new_axes() -> matplotlib.axes.Axes:
-    import matplotlib.pyplot as plt
+def _is_real(value: object) -> bool:
+    """Whether a value is a finite number."""
+    return isinstance(value, int | float | np.number) and bool(np.isfinite(value))
 
-    axes: matplotlib.axes.Axes = plt.subplots(layout="constrained")[1]
+
+def _checked_axes(source: str, axes: matplotlib.axes.Axes | None) -> matplotlib.axes.Axes:
+    """The axes to plot in; those of a new figure where there are none."""
+    from matplotlib.axes import Axes
+
+    if axes is None:
+        import matplotlib.pyplot as plt
+
+        made: matplotlib.axes.Axes = plt.subplots(layout="constrained")[1]
+        return made
+    require(axes, Axes, source, "axes", "matplotlib axes, or None")
     return axes

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import difflib
+import math
+import numbers
 import os
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
 MAX_SHOWN = 80
@@ -59,6 +62,43 @@ class InputError(Exception):
         """One error that reports all of ``problems``; there is at least one."""
         first, *rest = problems
         return cls(first.source, first.field, first.value, first.expected, tuple(rest))
+
+
+def unknown_name(
+    source: str | os.PathLike[str], field: str, value: object, known: Iterable[str]
+) -> InputError:
+    """Error for a value that is none of the known names, with the most similar of them first."""
+    names = list(known)
+    near = difflib.get_close_matches(str(value), names, 1)
+    every = f"one of {', '.join(names)}"
+    expected = f"{near[0]} (the most similar name), or {every}" if near else every
+    return InputError(source, field, repr(value), expected)
+
+
+def require(
+    value: object, kinds: type | tuple[type, ...], source: str, field: str, expected: str
+) -> None:
+    """Raise `InputError` unless a value is of one of some types.
+
+    A bool counts as no number, text as no sequence.
+    """
+    named = kinds if isinstance(kinds, tuple) else (kinds,)
+    is_other = any(isinstance(value, kind) and kind not in named for kind in (bool, str))
+    if is_other or not isinstance(value, kinds):
+        given = f"{value!r} ({type(value).__name__})"
+        raise InputError(source, field, given, expected)
+
+
+def check_positive(value: object, source: str, field: str, unit: str) -> None:
+    """Raise `InputError` unless a value is a finite number above 0."""
+    right = f"a number above 0 ({unit})"
+    require(value, (numbers.Real,), source, field, right)
+    if not (isinstance(value, numbers.Real) and 0 < float(value) < math.inf):
+        raise InputError(source, field, value, right)
+
+
+PATH = (str, os.PathLike)
+"""Types of a path."""
 
 
 @contextmanager

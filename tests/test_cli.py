@@ -637,6 +637,22 @@ def test_calibrate_plane_puts_its_values_into_a_setup(labapp: Run, tmp_path: Pat
     assert setup.read_text().startswith(SETUP.read_text().split("[image_calibration]")[0])
 
 
+def test_calibrate_plane_takes_labapp_s_own_target_and_prints_what_it_writes(
+    labapp: Run, tmp_path: Path
+) -> None:
+    setup = tmp_path / "setup.toml"
+    setup.write_text(SETUP.read_text())
+    code, said, _ = labapp("calibrate", "plane", SAMPLE / "calibration.png", "--setup", setup)
+    assert code == 0
+    assert "6.35 mm between flags" in said
+    written = tomllib.loads(setup.read_text())["image_calibration"]
+    for name in ("origin_px", "x_axis_px", "z_axis_px"):
+        (line,) = (line for line in said.splitlines() if line.startswith(name))
+        u, v = written[name]
+        assert f"{u:.3f}, {v:.3f} ± {written[f'{name}_sigma']:.3f} px" in line
+    assert f"x_axis_mm  {written['x_axis_mm']:.4f} mm" in said
+
+
 @pytest.mark.parametrize("unit", ["0", "-1", "nan", "inf"])
 def test_a_unit_that_cannot_be_is_refused(labapp: Run, unit: str) -> None:
     code, _, complained = labapp(

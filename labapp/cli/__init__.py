@@ -320,7 +320,7 @@ def calibrate_plane(
             help="Length of a unit of the target's axes, from one flag of a bar to the next (mm): "
             "measure it on the target. labapp's printed target and its sample run have 6.35.",
         ),
-    ] = 12.7,
+    ] = 6.35,
     board: Annotated[
         str | None,
         typer.Option(
@@ -385,14 +385,10 @@ def _calibrated(
 
 
 def _show_target(found: PlaneCalibration, unit_mm: float) -> None:
-    """Print where the target's three points are."""
-    points = {
-        "origin_px": found.origin_px,
-        "x_axis_px": found.x_axis_px,
-        "z_axis_px": found.z_axis_px,
-    }
+    """Print where the target's three points are, as they go into a set-up."""
+    points = dict(zip(("origin_px", "x_axis_px", "z_axis_px"), found.points_px, strict=True))
     lengths = {"x_axis_mm": found.x_axis_mm, "z_axis_mm": found.z_axis_mm}
-    for (name, (u, v)), sigma in zip(points.items(), found.sigma_px, strict=True):
+    for (name, (u, v)), sigma in zip(points.items(), found.points_sigma_px, strict=True):
         typer.echo(f"{name}  {u:.3f}, {v:.3f} ± {sigma:.3f} px")
     for name, length in lengths.items():
         typer.echo(f"{name}  {length:.4f} mm")

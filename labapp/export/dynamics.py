@@ -19,7 +19,7 @@ from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.surface.shape import shape_of
 from labapp.core.surface.surface import Surface
 from labapp.core.values import FloatArray
-from labapp.errors import InputError
+from labapp.errors import InputError, unknown_name
 from labapp.export.frame_result import FrameResult
 from labapp.text import csv_text
 
@@ -88,7 +88,7 @@ def dynamics_of(
     """
     chosen = settings or DynamicsSettings()
     if chosen.of not in WITH_SIGMA:
-        raise InputError("dynamics", "of", chosen.of, f"one of {', '.join(WITH_SIGMA)}")
+        raise unknown_name("dynamics", "of", chosen.of, WITH_SIGMA)
     rows: list[list[float]] = []
     sigmas: list[list[float]] = []
     parts = "height_sigma_setup_mm", *sigma_names("level")

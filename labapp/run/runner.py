@@ -16,7 +16,7 @@ from pathlib import Path
 from labapp.config.setup import Setup
 from labapp.core.pipeline import Settings
 from labapp.core.recording.residual_check import ResidualRecord
-from labapp.errors import InputError
+from labapp.errors import InputError, require
 from labapp.export.frame_result import FrameResult
 from labapp.media import FrameSource
 
@@ -60,25 +60,33 @@ def with_setup_check(measurer: Measurer, record: ResidualRecord) -> Measurer:
     return measure
 
 
-def select_frames(text: str, count: int) -> range:
+def select_frames(text: str, count: int, source: str = "--frames") -> range:
     """Frames that ``A:B:STEP`` selects from ``count``, as a Python slice does; ``A`` is one frame.
+
+    Parameters
+    ----------
+    text, count
+        What is selected, and from how many frames.
+    source
+        Where the text comes from, for the error.
 
     Raises
     ------
     InputError
         If it is not of that form, or selects nothing.
     """
+    require(text, str, source, "frames", f'text such as "0:100:5": {SOME_FRAMES}')
     try:
         first, *others = (int(part) if part.strip() else None for part in text.split(":"))
         if first is not None and not others:
             others = [first + 1 or None]
         selected = range(count)[slice(first, *others)]
     except (TypeError, ValueError) as error:  # TypeError: no number at all, or four
-        raise InputError("--frames", "frames", text, SOME_FRAMES) from error
+        raise InputError(source, "frames", text, SOME_FRAMES) from error
     if selected.step < 0:
-        raise InputError("--frames", "frames", text, SOME_FRAMES)
+        raise InputError(source, "frames", text, SOME_FRAMES)
     if not selected:
-        raise InputError("--frames", "frames", text, f"some of the frames 0 to {count - 1}")
+        raise InputError(source, "frames", text, f"some of the frames 0 to {count - 1}")
     return selected
 
 

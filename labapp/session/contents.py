@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from labapp.errors import InputError
+from labapp.errors import InputError, require, unknown_name
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -226,10 +226,16 @@ class SessionContents:
         ----------
         scheme
             ``fit``, ``ers``, ``irs-opa`` …; None: the one that the settings choose.
+
+        Raises
+        ------
+        InputError
+            If there is no such scheme, or the result is damaged.
         """
+        require(frame, (int, np.integer), "result", "frame", "the number of a frame")
         return self._results.get(
             frame,
-            scheme or self._scheme(),
+            self._known_scheme(scheme),
             self._basis(),
             self._documents.fingerprint("correction", frame),
         )
@@ -247,7 +253,7 @@ class SessionContents:
 
     def overview(self, scheme: str | None = None) -> Overview:
         """Status, correction, staleness and measures of every frame."""
-        return self._overviews.get(scheme or self._scheme(), self._basis())
+        return self._overviews.get(self._known_scheme(scheme), self._basis())
 
     @property
     def setup_verdict(self) -> SetupVerdict | None:
@@ -313,6 +319,17 @@ class SessionContents:
             *(self._frames.problems(progress) if recording else ()),
             *self._results.problems(),
         ]
+
+    def _known_scheme(self, scheme: str | None) -> str:
+        """Name of a scheme that results may have; None: that of the settings."""
+        from labapp.core.schemes import scheme_words
+
+        if scheme is None:
+            return self._scheme()
+        known = scheme_words()
+        if scheme not in known and scheme not in {name for name, _ in self.measured_by}:
+            raise unknown_name(self.path, "scheme", scheme, known)
+        return scheme
 
     def _scheme(self) -> str:
         from labapp.session.measured import scheme_name

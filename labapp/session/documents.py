@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, Never
 
 from labapp.core.pipeline import ByHand, Settings
+from labapp.errors import InputError
 from labapp.run.limits import Limits
 from labapp.session.file.blobs import Damaged, fingerprint_of, pack, unpack, unpack_from
 from labapp.session.file.database import Database
@@ -141,6 +142,9 @@ class Documents:
         with self._database.transaction() as connection:
             parts = []
             for (kind, frame), value in values.items():
+                if not isinstance(value, CLASSES[kind] | None):
+                    right = getattr(CLASSES[kind], "__name__", "a correction of dots or of lines")
+                    raise InputError(self._database.path, kind, repr(value), right)
                 before = _content(connection, kind, frame)
                 after = None if value is None else pack(value)
                 if before != after:

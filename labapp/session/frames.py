@@ -19,7 +19,7 @@ import numpy as np
 import numpy.typing as npt
 
 from labapp.core.values import IntArray
-from labapp.errors import InputError
+from labapp.errors import PATH, InputError, check_positive, require
 from labapp.export.summary import format_ranges
 from labapp.media import Frame, FrameSource, GreyImage, open_source
 from labapp.media.formats.images import decoded
@@ -115,11 +115,14 @@ class Frames:
         InputError
             If it cannot be read, or frames measured or corrected in this session are not in it.
         """
+        require(path, PATH, "recording", "path", "the path of a recording")
         path = Path(path).absolute()
+        if frame_rate_hz is not None:
+            check_positive(frame_rate_hz, str(path), "frame rate", "frames a second")
         if frame_rate_hz is not None and not 0 < frame_rate_hz < 1e8:
             raise InputError(path, "frame rate", frame_rate_hz, "frames a second above 0")
         with open_source(path) as source:
-            selected = select_frames(frames, len(source))
+            selected = select_frames(frames, len(source), str(path))
             found = survey(source, progress)
             size, sha256 = identify(path)
             recording = Recording(
@@ -299,6 +302,7 @@ class Frames:
         InputError
             If the file there is another recording.
         """
+        require(path, PATH, "recording", "path", "the path of the recording")
         path = Path(path).absolute()
         recording = self._imported()
         if verify and (found := identify(path)) != (recording.size, recording.sha256):

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from labapp.errors import InputError, os_errors_as_input
+from labapp.errors import PATH, InputError, os_errors_as_input, require
 from labapp.export.folder import ExportChoice, ExportedFile, export
 from labapp.export.frame_result import FrameResult
 from labapp.export.line_results import line_tables
@@ -34,6 +34,8 @@ def export_session(
     progress: Progress | None,
 ) -> tuple[ExportedFile, ...]:
     """Write a session's results into a folder; see `Session.export`."""
+    require(folder, PATH, "export", "folder", "the path of a folder")
+    require(choice, ExportChoice, "export", "choice", "labapp.export.folder.ExportChoice")
     scheme = scheme or scheme_name(session.settings)
     numbers = _standing(session, scheme, frames)
     if session.has_lines:

@@ -12,7 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from labapp.errors import InputError
+from labapp.errors import PATH, InputError, check_positive, require, unknown_name
 from labapp.session.contents import SessionContents
 from labapp.session.file.schema import NO_FRAME
 
@@ -43,19 +43,40 @@ class Session(SessionContents):
     """An open session; make it with `Session.create` or `Session.open`, use it in a ``with``."""
 
     @classmethod
-    def create(cls, path: str | os.PathLike[str], record: Record | None = None) -> Session:
+    def create(
+        cls,
+        path: str | os.PathLike[str],
+        record: Record | None = None,
+        *,
+        exist_ok: bool = False,
+    ) -> Session:
         """Make a new session file, ``….labsession``.
+
+        Parameters
+        ----------
+        path
+            Of the file.
+        record
+            The experiment record; None: an empty one, or that of the session that is there.
+        exist_ok
+            Whether to open a session that is there, with all that is in it: a script that failed
+            half-way can be run again, and measures only what is missing.
 
         Raises
         ------
         InputError
-            If there is a file of that name, or it cannot be written.
+            If there is a file of that name (with ``exist_ok``: one that is no session), or it
+            cannot be written.
         """
         from labapp.session.file.database import Database
 
-        session = cls(Database.create(path))
+        session = cls.open(path) if exist_ok and Path(path).exists() else cls(Database.create(path))
         if record is not None:
-            session.set_record(record)
+            try:
+                session.set_record(record)
+            except InputError:
+                session.close()
+                raise
         return session
 
     @classmethod
@@ -89,6 +110,10 @@ class Session(SessionContents):
         """
         from labapp.config.setup import parse_setup
 
+        expected = "the text of a setup file: Path(…).read_text()"
+        require(text, str, "set_setup", "text", expected)
+        if "\n" not in text and text.endswith(".toml"):
+            raise InputError("set_setup", "text", repr(text), expected)
         parse_setup(text, self.path, lines=True)
         self._documents.change(label, {("setup", NO_FRAME): text})
 
@@ -102,6 +127,14 @@ class Session(SessionContents):
         InputError
             If a section is not one; whether values are possible is checked by `setup`.
         """
+        from labapp.config.setup_keys import SECTIONS
+
+        right = 'values by section and key: {"laser": {"distance_mm": 36.0}}'
+        require(values, Mapping, "update_setup", "values", right)
+        for section, keys in values.items():
+            if section not in SECTIONS:
+                raise unknown_name("update_setup", "section", section, SECTIONS)
+            require(keys, Mapping, "update_setup", section, right)
         self._documents.change(label, {("setup", NO_FRAME): self._updated_setup(values)})
 
     def calibrate_laser(
@@ -119,7 +152,7 @@ class Session(SessionContents):
 
         Raises
         ------
-        ValueError
+        InputError
             If no laser can have drawn such a cross.
         """
         from labapp.core.calibration.laser_calibration import (
@@ -129,7 +162,11 @@ class Session(SessionContents):
         from labapp.session.record import LaserReadings
 
         settings = settings or LaserCalibrationSettings()
-        found = calibrate_laser(l1_mm, l2_mm, l3_mm, fan_angle_deg, settings)
+        try:
+            found = calibrate_laser(l1_mm, l2_mm, l3_mm, fan_angle_deg, settings)
+        except (TypeError, ValueError) as error:
+            expected = "readings in mm that a laser cross can have, and a fan angle in degrees"
+            raise InputError("calibrate_laser", "readings", error, expected) from error
         kept = None if picture is None else self._pictures.add("cross-hair", picture)
         lengths = tuple(l1_mm), tuple(l2_mm), tuple(l3_mm)
         known = settings.fan_angle_sigma_deg, settings.resolution_mm
@@ -165,6 +202,8 @@ class Session(SessionContents):
         )
         from labapp.media import read_picture
 
+        require(picture, PATH, "calibrate_plane", "picture", "the path of a picture")
+        check_positive(unit_mm, "calibrate_plane", "unit_mm", "mm")
         image = read_picture(picture)
         settings = PlaneCalibrationSettings(unit_mm=unit_mm)
         found = calibrate_plane(image, settings, lens_of(self.setup_text))
@@ -193,8 +232,13 @@ class Session(SessionContents):
         from labapp.core.calibration.board_calibration import calibrate_board
         from labapp.media import read_picture
 
+        right = "paths of 1 to 100 pictures, that of the imaging plane first"
+        require(pictures, (list, tuple), "calibrate_camera", "pictures", right)
         images = [read_picture(picture) for picture in pictures]
-        found = calibrate_board(images, board)
+        try:
+            found = calibrate_board(images, board)
+        except ValueError as error:
+            raise InputError("calibrate_camera", "pictures", error, right) from error
         self.use_plane(found, found.board.square_mm, images[0], Path(pictures[0]).name)
         return found
 
@@ -250,7 +294,16 @@ class Session(SessionContents):
         self._documents.change("bench check", changed)
 
     def set_settings(self, settings: Settings, label: str = "settings") -> None:
-        """Set how frames are measured: the scheme, and the settings of every step."""
+        """Set how frames are measured: the scheme, and the settings of every step.
+
+        Raises
+        ------
+        InputError
+            If they name what is not there.
+        """
+        from labapp.config.settings import check_settings
+
+        check_settings(settings, "set_settings")
         self._documents.change(label, {("settings", NO_FRAME): settings})
 
     def correct(self, corrections: Mapping[int, ByHand | None], label: str = "correction") -> None:
@@ -263,6 +316,8 @@ class Session(SessionContents):
         """
         from labapp.core.images.line_correction import LineCorrection
 
+        right = "corrections by frame: {5: correction}, or {5: None}"
+        require(corrections, Mapping, "correct", "corrections", right)
         other, own = ("dots", "lines") if self.has_lines else ("lines", "dots")
         for value in corrections.values():
             if value is not None and isinstance(value, LineCorrection) != self.has_lines:
@@ -366,6 +421,8 @@ class Session(SessionContents):
         from labapp.session.file.blobs import fingerprint
         from labapp.session.measured import Basis
 
+        if frames is not None:
+            require(frames, Iterable, "measure", "frames", "frame numbers: [0, 1, 2]")
         chosen = self.stale_frames() if frames is None else frames
         basis = Basis(self.setup, self.settings)
         self._frames.refuse_missing()
@@ -433,10 +490,17 @@ class Session(SessionContents):
         from labapp.session.outgoing import export_session
 
         what = choice or ExportChoice()
-        return export_session(self, folder, what, frames, scheme, report, progress)
+        chosen = self._known_scheme(scheme)
+        return export_session(self, folder, what, frames, chosen, report, progress)
 
     def _updated_setup(self, values: Mapping[str, Mapping[str, object]]) -> str:
         """Text of the setup with keys set or deleted; see `update_setup`."""
+        from tomlkit.exceptions import ConvertError
+
         from labapp.config.setup import updated_setup
 
-        return updated_setup(self.setup_text, self.path, values)
+        try:
+            return updated_setup(self.setup_text, self.path, values)
+        except ConvertError as error:
+            right = "numbers, text, or lists of them"
+            raise InputError("update_setup", "values", error, right) from error

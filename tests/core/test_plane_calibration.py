@@ -109,14 +109,14 @@ def test_the_points_of_eq_5_6_in_a_dim_picture() -> None:
     scene = Scene()
     found = calibrate_plane(scene.render())
     assert np.abs(points(found) - scene.truth).max() < 0.3
-    assert found.x_axis_mm == pytest.approx(69.85)
-    assert found.z_axis_mm == pytest.approx(31.75)
-    assert found.px_per_mm == pytest.approx((34 / 12.7, 34 / 12.7), rel=5e-3)
+    assert found.x_axis_mm == pytest.approx(34.925)
+    assert found.z_axis_mm == pytest.approx(15.875)
+    assert found.px_per_mm == pytest.approx((34 / 6.35, 34 / 6.35), rel=5e-3)
     assert found.angle_deg == pytest.approx(90.0, abs=0.3)
     assert 12 < found.threshold < 32
     assert (len(found.marks), found.model) == (15, "affine")
     plane = found.image_calibration.to_plane(scene.truth)
-    assert plane == pytest.approx(np.array([[0, 0], [69.85, 0], [0, 31.75]]), abs=0.15)
+    assert plane == pytest.approx(np.array([[0, 0], [34.925, 0], [0, 15.875]]), abs=0.075)
 
 
 @pytest.mark.slow
@@ -171,7 +171,7 @@ def test_a_flag_that_is_hidden_is_no_mark() -> None:
         cv2.line(image, *places, float(np.median(image)), 5)
     found = calibrate_plane(image)
     assert len(found.marks) == 14
-    assert 6 * 12.7 not in [mark[0] for mark in found.marks]
+    assert 6 * 6.35 not in [mark[0] for mark in found.marks]
     assert np.abs(points(found) - scene.truth).max() < 0.3
 
 

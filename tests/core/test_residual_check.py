@@ -112,6 +112,16 @@ def test_frames_that_match_nothing_are_a_doubt(lost, doubtful):
     assert verdict_of([none] * lost + [some] * (20 - lost)).is_doubtful == doubtful
 
 
+@pytest.mark.parametrize("status", ["no-reference", "ambiguous-rows", "no-rows"])
+def test_frames_that_lack_the_absent_dot_are_no_doubt(status):
+    """The right set-up gives these, too: the pool lies beside the absent ray, say."""
+    some = next(iter(frames(BENCH_RIG, count=1)))
+    assert not verdict_of([Measurement(status, "", "fit")] * 30).is_doubtful
+    assert not verdict_of([Measurement(status, "", "fit")] * 29 + [some]).is_doubtful
+    none = [Measurement("no-match", "", "fit")] * 12
+    assert verdict_of([Measurement(status, "", "fit")] * 30 + none).is_doubtful
+
+
 def test_dark_frames_are_no_doubt_of_the_set_up():
     assert not verdict_of([Measurement("no-dots", "", "fit")] * 30).is_doubtful
 

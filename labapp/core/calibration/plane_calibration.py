@@ -69,7 +69,7 @@ class PlaneCalibrationSettings(MarkSettings):
         A mark may be this many units from where the others have it, perspective allowed for.
     """
 
-    unit_mm: float = 12.7
+    unit_mm: float = 6.35
     x_units: tuple[float, float] = (1.0, 10.0)
     z_units: tuple[float, float] = (1.0, 4.0)
     subpixel: bool = True

@@ -67,7 +67,10 @@ UNANSWERED, FEWEST_TRIED = 0.8, 10
 AGAIN, AT_LEAST = 1.25, 1000
 """While frames come, they are judged again at so many times as many, or at so many more."""
 
-NO_MATCH = frozenset({"no-match", "no-reference", "ambiguous-rows", "no-rows", "no-surface"})
+NO_MATCH = frozenset({"no-match", "no-surface"})
+"""Statuses of frames that contradict a set-up. ``no-reference`` and ``ambiguous-rows`` do not: the
+right one gives them, too, where the pool lies beside the absent ray or a dot next to it is missing.
+"""
 
 DOUBTFUL = "doubtful"
 """`Measurement.setup_status` of a set-up that its recording contradicts."""

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from filelock import FileLock, Timeout
 
 from labapp.config.setup import read_setup
-from labapp.errors import InputError, os_errors_as_input
+from labapp.errors import PATH, InputError, os_errors_as_input, require
 from labapp.files import as_bytes, write_file
 from labapp.run.runner import select_frames
 from labapp.run.study.plan import StudyPlan, StudyRecording, read_study
@@ -55,6 +55,7 @@ class Study:
     """
 
     def __init__(self, path: Path, out: Path | None = None) -> None:
+        require(path, PATH, "Study", "path", "the path of a study file")
         self.path = Path(path).absolute()
         self.plan: StudyPlan = read_study(self.path)
         folder = out or self.path.with_name(f"{self.path.stem}_results")

@@ -22,7 +22,7 @@ import numpy as np
 import numpy.typing as npt
 from filelock import FileLock, Timeout
 
-from labapp.errors import InputError, os_errors_as_input
+from labapp.errors import PATH, InputError, os_errors_as_input, require
 from labapp.files import atomic_file
 from labapp.session.file.schema import APPLICATION_ID, MIGRATIONS, TABLES, VERSION
 
@@ -116,6 +116,7 @@ class Database:
         InputError
             If it cannot be read, is no session, or is one of a newer version.
         """
+        require(path, PATH, "session", "path", "the path of a .labsession")
         path = Path(path).absolute()
         _check_header(path)
         _check_journal(path)
@@ -253,6 +254,7 @@ def new_session_path(path: str | os.PathLike[str]) -> Path:
     InputError
         If that is no name of a session, or there is a file of that name.
     """
+    require(path, PATH, "session", "path", "the path of a .labsession")
     path = Path(path).absolute()
     if path.suffix.lower() != SUFFIX:
         raise InputError(path, "name", path.name, f"a name that ends in {SUFFIX}")

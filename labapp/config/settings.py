@@ -1,0 +1,38 @@
+"""Whether the settings of a measurement, as a script makes them, name what there is."""
+
+from __future__ import annotations
+
+from typing import get_args, get_type_hints
+
+from labapp.core.images.find_dots import DotSettings
+from labapp.core.pipeline import Settings
+from labapp.core.rows.find_lattice import LatticeSettings
+from labapp.core.schemes import SCHEMES
+from labapp.errors import require, unknown_name
+
+
+def check_settings(settings: Settings, source: str) -> None:
+    """Check the names in settings; ``source`` is what they were given to.
+
+    Raises
+    ------
+    InputError
+        If they are no `Settings`, or name a scheme, an algorithm, a correspondence or a method that
+        is none.
+    """
+    require(settings, Settings, source, "settings", "labapp.core.pipeline.Settings")
+    named = (
+        ("scheme", settings.scheme, tuple(SCHEMES)),
+        ("algorithm", settings.algorithm, SCHEMES["irs"].algorithms),
+        ("correspondence", settings.correspondence, _choices(Settings, "correspondence")),
+        ("dots.method", settings.dots.method, _choices(DotSettings, "method")),
+        ("lattice.method", settings.lattice.method, _choices(LatticeSettings, "method")),
+    )
+    for field, value, known in named:
+        if value not in known:
+            raise unknown_name(source, f"settings.{field}", value, known)
+
+
+def _choices(owner: type, field: str) -> tuple[str, ...]:
+    """Values that a field may have, by its type."""
+    return get_args(get_type_hints(owner)[field])
