@@ -8,16 +8,19 @@ import time
 from concurrent.futures import CancelledError, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 from labapp.config.setup import Setup
-from labapp.core.dynamics.shape import Shape, shape_of
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.quality import Quality, judge_quality
-from labapp.core.surface.reconstruction import Reconstruction
 from labapp.export.frame_result import FrameResult, without_surface
 from labapp.export.rendering.scene import Scene, scene_of
 from labapp.media.cameras import CameraFrame
 from labapp.simulation.parallel import end_processes, start_worker
+
+if TYPE_CHECKING:
+    from labapp.core.dynamics.shape import Shape
+    from labapp.core.surface.reconstruction import Reconstruction
 
 JUDGED_S = 0.2
 """How long the quality of a frame applies to those that follow, s."""
@@ -125,6 +128,8 @@ class LiveChain:
         now_s = time.monotonic()
         if surface is None or now_s < self._shaped_s + SHAPED_S:
             return None
+        from labapp.core.dynamics.shape import shape_of  # loads much of SciPy
+
         self._shaped_s = now_s
         return shape_of(surface.unbounded, surface.boundary)
 

@@ -31,7 +31,6 @@ from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.surface.spline import SplineBasis, SplineSurface
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
-from labapp.export.dynamics import shape_row
 from labapp.export.meshes import SPACING_MM, refuse_too_large
 from labapp.export.tables import Table, frame_tables
 from labapp.files import as_bytes, write_atomically
@@ -249,6 +248,8 @@ def measure_stretch(stretch: Stretch) -> None:
 
 def _measured(stretch: Stretch, measurer: Measurer) -> bytes:
     """The results of a stretch as one file."""
+    from labapp.export.dynamics import shape_row  # with what only a worker has a use for
+
     rows: list[Table] = []
     residuals: list[tuple[int, Residuals]] = []
     surfaces: list[tuple[int, FloatArray, tuple[int, int]]] = []
