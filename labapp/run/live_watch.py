@@ -6,11 +6,11 @@ import threading
 import time
 from collections import deque
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from labapp.config.setup import Setup
 from labapp.core.pipeline import Measurement, Settings
 from labapp.export.frame_result import FrameResult
-from labapp.export.penetration import Predictor
 from labapp.export.rendering.scene import Scene
 from labapp.media.cameras import CameraFrame
 from labapp.media.events import Event
@@ -20,6 +20,9 @@ from labapp.run.live_measuring import LiveMeasuring, LiveResult
 from labapp.run.live_queue import FrameQueue
 from labapp.run.live_trend import LiveTrend
 from labapp.run.streams import Stream, stream_values
+
+if TYPE_CHECKING:
+    from labapp.export.penetration import Predictor
 
 SILENT_S = 10.0
 """Time without a result, s, that is an alarm. A frame that is measured by itself takes seconds."""

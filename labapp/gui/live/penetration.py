@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import TYPE_CHECKING
 
 from PySide6.QtWidgets import QWidget
 
-from labapp.core.dynamics.penetration import PenetrationModel
-from labapp.export.penetration import Predictor, read_model
 from labapp.gui.dialogs import ask_file
 from labapp.gui.digits import NOTHING
 from labapp.gui.live.figures import DECIMALS, Figure
@@ -17,6 +16,10 @@ from labapp.gui.widgets.labels import Message
 from labapp.gui.widgets.layouts import hbox, vbox
 from labapp.gui.workspace import Workspace
 from labapp.run.live_watch import LiveWatch
+
+if TYPE_CHECKING:
+    from labapp.core.dynamics.penetration import PenetrationModel
+    from labapp.gui.tasks import Control
 
 MODELS = "Penetration models (*.json)"
 
@@ -29,7 +32,7 @@ class LivePenetration(QWidget):
         self._workspace, self._watch = workspace, watch
         self._model: tuple[str, PenetrationModel] | None = None
         self.choose_button = button(
-            "Penetration &model…",
+            "Penetration model…",
             "Choose a model that labapp penetration fit wrote; it predicts from the live pool",
             self.choose,
         )
@@ -44,12 +47,15 @@ class LivePenetration(QWidget):
         if path is None:
             return
 
+        def work(_: Control) -> PenetrationModel:
+            from labapp.export.penetration import read_model  # loads much of SciPy
+
+            return read_model(path)
+
         def done(model: PenetrationModel) -> None:
             self.set_model((path.stem, model))
 
-        self._workspace.tasks.start(
-            "Reading the model", lambda _: read_model(path), done, beside=self.words.setText
-        )
+        self._workspace.tasks.start("Reading the model", work, done, beside=self.words.setText)
 
     def set_model(self, named: tuple[str, PenetrationModel] | None) -> None:
         """Predict with another model; None: with none."""
@@ -65,8 +71,13 @@ class LivePenetration(QWidget):
     def begin(self) -> None:
         """Predict with the chosen model: a camera has been started, or the model was chosen."""
         watch = self._watch()
-        if watch is not None:
-            watch.predictor = None if self._model is None else Predictor(*self._model, keeps=False)
+        if watch is None:
+            return
+        watch.predictor = None
+        if self._model is not None:
+            from labapp.export.penetration import Predictor
+
+            watch.predictor = Predictor(*self._model, keeps=False)
 
     def figures(self, is_old: bool) -> tuple[Figure, ...]:
         """What the model says, as a figure; none without one."""
