@@ -20,6 +20,7 @@ from labapp.gui.pages.surface import SurfacePage
 from labapp.gui.shell.steps import STEPS
 from labapp.gui.tools.adviser import AdviserWindow
 from labapp.gui.tools.analysis import AnalysisWindow
+from labapp.gui.tools.dynamics import DynamicsWindow
 from labapp.gui.tools.simulator import SimulatorWindow
 from labapp.gui.tools.study import StudyWindow
 from labapp.gui.tools.tool import ToolWindow
@@ -280,6 +281,12 @@ def _trends(hands: Hands, files: Path) -> None:
     table = files / "current.csv"
     hands.asked("signals", lambda: hands.press("Read a table …"), give(table))
     hands.picture("signals")
+    tool = _tool(hands, "dynamics", DynamicsWindow)
+    hands.wait(lambda: tool.drawn and not tool.working, "the pool over time to be analysed")
+    tool.tabs.setCurrentIndex(1)
+    hands.picture("dialog-dynamics")
+    hands.asked("save-dynamics", lambda: hands.press("Save the results …"))
+    tool.close()
 
 
 def _export(hands: Hands, files: Path) -> None:
