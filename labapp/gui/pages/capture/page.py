@@ -111,7 +111,10 @@ class CapturePage(Page):
             return State(Mark.READY, message)
         if self.preview is None or session is None or session.recording is not None:
             return found
-        return State(Mark.READY, f"{self.preview.path.name} is not imported yet: press Import")
+        name = self.preview.path.name
+        if self._importing in self.workspace.tasks.active:
+            return State(Mark.READY, f"{name} is being imported")
+        return State(Mark.READY, f"{name} is not imported yet: press Import")
 
     def lead(self, found: Lead | None) -> Lead | None:
         """Where a recording can come from, while there is none to be seen."""
