@@ -203,6 +203,7 @@ class SurfacePage(Page):
         )
         self.high.edited.connect(lambda value: self._set(exaggeration=value))
         self.high.setMaximumWidth(NARROW_FIELD)
+        self.colour.setMaximumWidth(2 * NARROW_FIELD)
         for field in (self.colour, self.high):
             field.label.setWordWrap(False)
         looks = [
@@ -229,7 +230,7 @@ class SurfacePage(Page):
         self._view_actions()
         coloured = self.colour.label, self.colour
         return _Tools(
-            hbox(*coloured, self.high.label, self.high, self.true_scale, self._parts_button()),
+            hbox(*coloured, self.high.label, self.high, self.true_scale, self._parts_button(), 1),
             hbox(*looks, (self.saved, 1), self.save, self.film, self.comparing),
         )
 
