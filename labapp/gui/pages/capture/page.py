@@ -173,7 +173,7 @@ class CapturePage(Page):
         if why_kept:
             self._listed = None
             self._show_import()
-            self.workspace.notified.emit(kept_text(take, why_kept), False)
+            self.confirm(kept_text(take, why_kept))
         else:
             measured = self.live_view.plan_fields.measured.isChecked()
             self._import(take.path, ":", None, False, self._measure if measured else _nothing)
