@@ -1,4 +1,4 @@
-"""Files that come with labapp and are not code: samples, scenarios, the target, udev's rule."""
+"""Files that come with labapp and are not code: samples, scenarios, the target, the guide."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 def bundled(name: str) -> Path:
     """Place of a file or folder that comes with labapp, whether it is there or not.
 
-    The top-level folders ``resources`` and ``sample_sessions`` are beside the package in a
+    The folders ``resources``, ``sample_sessions`` and ``docs/guide`` are beside the package in a
     checkout; a wheel has them inside it (``pyproject.toml``).
 
     Parameters

@@ -8,9 +8,7 @@ from pathlib import Path
 
 import platformdirs
 
-NAME, NOTICES = "labapp", "notices"
-"""The program's logger, and its child for what the user should read while waiting."""
-
+NAME = "labapp"
 MAX_BYTES, KEPT = 1_000_000, 3
 
 
@@ -29,7 +27,7 @@ def start_log() -> logging.Logger:
         handler.set_name(NAME)
         logger.addHandler(handler)
     if logging.lastResort is not None:  # what `core.compiled` announces is for stderr, too
-        logger.getChild(NOTICES).addHandler(logging.lastResort)
+        logger.getChild("notices").addHandler(logging.lastResort)
     return logger
 
 

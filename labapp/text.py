@@ -67,7 +67,7 @@ def pluralize(count: int, noun: str) -> str:
 UNITS = ("bytes", "kB", "MB", "GB", "TB")
 
 
-def format_bytes(size: int) -> str:
+def format_bytes(size: float) -> str:
     """File size with a decimal unit: "512 bytes", "1.5 MB"."""
     value, unit = float(size), 0
     while value >= 1000 and unit < len(UNITS) - 1:

@@ -14,6 +14,7 @@ from contextlib import AbstractContextManager, nullcontext, suppress
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
+from threading import Event
 from typing import Any, TypeVar
 
 import numba
@@ -36,6 +37,11 @@ HOW: dict[str, Any] = {
 
 NOTICES = "labapp.notices"
 """Logger of what the user should read while waiting; `labapp.log` shows it on stderr."""
+
+MAY_COMPILE = Event()
+"""Cleared while another process compiles: meanwhile it would stop all threads of this one."""
+
+MAY_COMPILE.set()
 
 OLD_S = 60 * 86400.0
 """What was compiled for a source that nobody has is deleted after so long, s."""
@@ -97,16 +103,9 @@ class BySource(_CacheLocator):
         return str(self._line)
 
 
-def announce_new() -> None:
-    """Announce that functions will be compiled, where none of a file of them is kept.
-
-    Processes that measure announce what they compile on stderr, which a window does not show.
-    """
-    core = Path(__file__).parent
-    for file in core.rglob("*kernels.py"):
-        module = ".".join((__package__, *file.relative_to(core).with_suffix("").parts))
-        if not (_folder() / _digest(module, file)).exists():
-            _announce()
+def is_kept(module: str, file: Path) -> bool:
+    """Whether anything that a module's file compiles is kept on the disk."""
+    return (_folder() / _digest(module, file)).exists()
 
 
 def _digest(module: str, file: Path) -> str:
@@ -146,6 +145,7 @@ def _one_at_a_time(function: Any) -> AbstractContextManager[object]:
 
 
 def _kept(function: F, *signature: Any) -> F:
+    MAY_COMPILE.wait()
     # A numba that does not know the setting keeps what it compiles where it always does.
     usual = getattr(_config, "CACHE_LOCATOR_CLASSES", "")
     _config.CACHE_LOCATOR_CLASSES = f"{__name__}.{BySource.__name__}"

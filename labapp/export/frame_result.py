@@ -4,13 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 from labapp.core.pipeline import Measurement
 from labapp.core.recording.residual_check import Residuals
-
-if TYPE_CHECKING:
-    pass
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING
@@ -23,7 +24,6 @@ from PySide6.QtCore import (
     QTimer,
     QtMsgType,
     Signal,
-    SignalInstance,
     qInstallMessageHandler,
 )
 from PySide6.QtGui import QIcon
@@ -31,13 +31,15 @@ from PySide6.QtWidgets import QApplication
 
 from labapp.bundled import bundled
 from labapp.errors import InputError
-from labapp.log import NAME, NOTICES, start_log
+from labapp.gui import compiling
+from labapp.log import NAME, start_log
 from labapp.system import has_display
 from labapp.version import VERSION
 
 if TYPE_CHECKING:
     from labapp.gui.preferences import Preferences
     from labapp.gui.shell.window import MainWindow
+    from labapp.gui.tasks import Tasks
 
 WITHOUT = "labapp --help tells what can be done on the command line"
 
@@ -101,7 +103,9 @@ def open_window(app: QApplication, preferences: Preferences, file: Path) -> Iter
     stops = (signal.SIGINT, signal.SIGTERM)
     former = {number: signal.signal(number, lambda *_: window.close()) for number in stops}
     window.show()
-    loading = threading.Thread(target=_load_what_is_needed, name="loading", daemon=True)
+    first_use = FirstUse(window.workspace.tasks, window)
+    target = partial(_load_what_is_needed, first_use.found.emit)
+    loading = threading.Thread(target=target, name="loading", daemon=True)
     load = QTimer(window, singleShot=True)
     load.timeout.connect(loading.start)
     load.start(LOAD_AFTER_MS)
@@ -137,8 +141,25 @@ def collect_garbage(count: int) -> None:
         gc.collect(1 if count % 10 == 0 else 0)
 
 
-def _load_what_is_needed() -> None:
+class FirstUse(QObject):
+    """Has what is not compiled yet compiled beside the window, which shows that while it lasts."""
+
+    found = Signal(list)
+    """Modules are not compiled: their names."""
+
+    def __init__(self, tasks: Tasks, parent: QObject) -> None:
+        super().__init__(parent)
+        self.found.connect(
+            lambda modules: tasks.start(
+                compiling.TITLE, partial(compiling.compile_aside, modules), is_lasting=True
+            )
+        )
+
+
+def _load_what_is_needed(not_compiled: Callable[[list[str]], object]) -> None:
     """Load it while the operator looks at the first page."""
+    if modules := compiling.not_compiled():
+        not_compiled(modules)
     with contextlib.suppress(ImportError):  # there may be nothing to draw with in 3-D
         for name in NEEDED_LATER:
             importlib.import_module(name)
@@ -175,10 +196,7 @@ def start_app() -> QApplication:
 
 
 class ErrorReporter(QObject):
-    """Uncaught errors: all of them to the log, and in words to the operator; the window stays.
-
-    What the program announces while the operator waits (`labapp.log`) is shown, too.
-    """
+    """Uncaught errors: all of them to the log, and in words to the operator; the window stays."""
 
     _happened = Signal(str, bool)
 
@@ -186,19 +204,16 @@ class ErrorReporter(QObject):
         super().__init__(parent)
         self._happened.connect(say)
         self._former = sys.excepthook, threading.excepthook
-        self._notices = _Notices(self._happened)
 
     def install(self) -> None:
         """Take the errors from now on."""
         self._former = sys.excepthook, threading.excepthook
         sys.excepthook = self.take
         threading.excepthook = self._take_in_thread
-        start_log().getChild(NOTICES).addHandler(self._notices)
 
     def uninstall(self) -> None:
         """Leave them to who had them before."""
         sys.excepthook, threading.excepthook = self._former
-        start_log().getChild(NOTICES).removeHandler(self._notices)
 
     def take(
         self, kind: type[BaseException], error: BaseException, trace: TracebackType | None
@@ -211,17 +226,6 @@ class ErrorReporter(QObject):
     def _take_in_thread(self, told: threading.ExceptHookArgs) -> None:
         if told.exc_value is not None:
             self.take(told.exc_type, told.exc_value, told.exc_traceback)
-
-
-class _Notices(logging.Handler):
-    """Emits what is announced, in whatever thread, by a signal."""
-
-    def __init__(self, signal: SignalInstance) -> None:
-        super().__init__()
-        self._signal = signal
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self._signal.emit(record.getMessage(), False)
 
 
 def _take_message(kind: QtMsgType, _context: QMessageLogContext, message: str) -> None:

@@ -87,6 +87,8 @@ class Task:
     """Called on the GUI thread with parts, with the result, and with why it failed."""
     kind: str
     """Tasks of one kind share a failure: "Exporting", whatever the folder."""
+    is_lasting: bool
+    """Whether it continues when another session is opened."""
 
     @property
     def done(self) -> int:
@@ -130,6 +132,7 @@ class Tasks(QObject):
         on_part: Callable[[Any], None] | None = None,
         beside: Callable[[str], object] | None = None,
         kind: str = "",
+        is_lasting: bool = False,
     ) -> Task:
         """Begin work in a thread of its own.
 
@@ -144,12 +147,14 @@ class Tasks(QObject):
             Shows why it failed beside what was pressed, too; called with nothing at the beginning.
         kind
             A failure is forgotten when work of its kind begins again; empty: its title.
+        is_lasting
+            Whether it continues when another session is opened.
         """
         if beside is not None:
             beside("")
         control = Control()
         thread = threading.Thread(target=_run, args=(work, control), name=title, daemon=True)
-        task = Task(title, control, thread, on_part, on_done, beside, kind or title)
+        task = Task(title, control, thread, on_part, on_done, beside, kind or title, is_lasting)
         self.active.append(task)
         self.settled.emit(task.kind)
         thread.start()
@@ -157,14 +162,22 @@ class Tasks(QObject):
         self.changed.emit()
         return task
 
-    def cancel_all(self) -> None:
-        """Cancel everything and wait until it has stopped; nothing is called afterwards."""
-        for task in self.active:
+    def cancel_all(self, lasting: bool = True) -> None:
+        """Cancel everything and wait until it has stopped; nothing is called afterwards.
+
+        Parameters
+        ----------
+        lasting
+            Whether tasks that are lasting are cancelled, too.
+        """
+        ended = [task for task in self.active if lasting or not task.is_lasting]
+        for task in ended:
             task.cancel()
-        for task in self.active:
+        for task in ended:
             task.thread.join(STOP_S)
-        self.active.clear()
-        self._timer.stop()
+            self.active.remove(task)
+        if not self.active:
+            self._timer.stop()
         self.changed.emit()
 
     def _poll(self) -> None:

@@ -104,7 +104,7 @@ class Workspace(QObject):
         if self.tasks.active:
             self._stop_measuring()
         self._measuring.clear()
-        self.tasks.cancel_all()
+        self.tasks.cancel_all(lasting=False)
         if self.session is not None:
             self.session.close()
         self.session = session
@@ -119,11 +119,13 @@ class Workspace(QObject):
             self.foot_switches.stop()
         self._stop_measuring()
         self.show(None)
+        self.tasks.cancel_all()
 
     def _stop_measuring(self) -> None:
         """End the processes: a frame that is half measured is not kept, and could take seconds."""
         for task in self.tasks.active:
-            task.cancel()  # or it would take the end of its processes for a fault
+            if not task.is_lasting:
+                task.cancel()  # or it would take the end of its processes for a fault
         pools, self._pool, self._warm_pool = (self._pool, self._warm_pool), None, None
         for pool in filter(None, pools):
             parallel.end_processes(pool)
@@ -251,9 +253,6 @@ class Workspace(QObject):
         pool = self._measuring_pool(warm)
 
         def work(control: Control) -> tuple[int, int]:
-            from labapp.core.compiled import announce_new
-
-            announce_new()
             done, failed, emitted_s = 0, 0, 0.0
             numbers = [int(k) for k in (session.stale_frames() if frames is None else frames)]
             try:

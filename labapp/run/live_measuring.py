@@ -8,7 +8,6 @@ import time
 from concurrent.futures import CancelledError, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 from labapp.config.setup import Setup
 from labapp.core.pipeline import Measurement, Settings
@@ -17,9 +16,6 @@ from labapp.export.frame_result import FrameResult, without_surface
 from labapp.export.rendering.scene import Scene, scene_of
 from labapp.media.cameras import CameraFrame
 from labapp.simulation.parallel import end_processes, start_worker
-
-if TYPE_CHECKING:
-    pass
 
 JUDGED_S = 0.2
 """How long the quality of a frame applies to those that follow, s."""

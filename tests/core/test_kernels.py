@@ -791,27 +791,6 @@ def twice(x): return 2.0 * x
     assert [len(lines) for lines in said] == [1, 0]
 
 
-@pytest.mark.parametrize("is_kept", [False, True])
-def test_kernels_that_are_not_kept_are_announced_beforehand(tmp_path: Path, is_kept: bool) -> None:
-    script = """import sys
-from pathlib import Path
-from labapp.core import compiled
-for file in Path(compiled.__file__).parent.rglob("*kernels.py"):
-    module = ".".join(("labapp.core", file.parent.name, file.stem))
-    place = compiled._folder() / compiled._digest(module, file)
-    if sys.argv[1] == "True":
-        place.mkdir(parents=True)
-compiled.announce_new()
-compiled.announce_new()
-"""
-    done = subprocess.run(
-        [sys.executable, "-c", script, str(is_kept)],
-        capture_output=True, text=True, check=True, cwd=Path(__file__).parents[2],
-        env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)},
-    )  # fmt: skip
-    assert len(done.stderr.splitlines()) == (0 if is_kept else 1)
-
-
 @pytest.mark.parametrize("height_mm", [0.3, -0.5])
 def test_caps_are_scored_by_the_places_that_lie_where_they_have_dots(height_mm: float) -> None:
     rng = np.random.default_rng(7)

@@ -1,15 +1,17 @@
 from __future__ import annotations
 
-from PySide6.QtGui import QAction, QKeySequence
+from PySide6.QtCore import QUrl
+from PySide6.QtGui import QAction, QKeySequence, QTextDocument
 from PySide6.QtWidgets import QApplication, QWidget
 from pytestqt.qtbot import QtBot
 
 from labapp.gui.shell.actions import ACTIONS, MENUS
 from labapp.gui.shell.commands import commands
-from labapp.gui.shell.help import TEXTS, keys
+from labapp.gui.shell.help import TEXTS, HelpDialog, keys
 from labapp.gui.shell.steps import STEPS
 from labapp.gui.shell.window import MainWindow
 from labapp.gui.views import picture, plots, view3d
+from tests.gui.conftest import CopySample
 
 
 def test_every_action_is_whole():
@@ -90,3 +92,24 @@ def test_the_keys_of_the_page_in_view_and_of_drawings_are_told(qtbot: QtBot) -> 
     assert "<b>Row left</b></td><td>Shift the row</td>" in told
     for words in (picture.KEYS, view3d.KEYS_TOLD, plots.KEYS):
         assert words in keys()
+
+
+def test_the_guide_opens_at_the_page_in_view_with_its_pictures(
+    window: MainWindow, copy_sample: CopySample
+):
+    assert window.files.open(copy_sample("gtaw"))
+    window.show_step("trends")
+    window.do("guide")
+    (dialog,) = window.findChildren(HelpDialog)
+    browser = dialog.browser
+    assert browser.source().fileName() == "trends.md"
+    assert "Trends" in browser.toPlainText()
+    picture = browser.loadResource(
+        QTextDocument.ResourceType.ImageResource.value, QUrl("pictures/trends-spectrum.png")
+    )
+    assert 0 < picture.width() <= browser.viewport().width()
+    browser.anchorClicked.emit(QUrl("surface.md"))
+    assert browser.source().fileName() == "surface.md"
+    browser.anchorClicked.emit(QUrl("nowhere.md"))
+    assert browser.source().fileName() == "surface.md"
+    dialog.close()

@@ -6,11 +6,14 @@ import numpy as np
 import pyqtgraph as pg
 import pytest
 from PySide6.QtCore import QPoint, QPointF, QRectF, Qt
+from PySide6.QtGui import QAction
 from PySide6.QtTest import QTest
+from PySide6.QtWidgets import QApplication, QMenu
 from pytestqt.qtbot import QtBot
 
 from labapp.gui.views.drag_point import DragPoint
 from labapp.gui.views.picture import PictureView, Tool, auto_levels, level_at
+from labapp.gui.views.picture_levels import LevelsDialog, profile
 from tests.gui.conftest import KEPT, let_draw
 
 GREY = (np.add.outer(np.arange(120), np.arange(160)) % 251).astype(np.uint8)
@@ -207,3 +210,36 @@ def test_the_pointers_place_does_not_make_the_view_wider(view: PictureView) -> N
     view.box.scene().sigMouseMoved.emit(view.box.mapViewToScene(QPointF(100.0, 50.0)))
     assert "level" in view._place.text()
     assert view.minimumSizeHint().width() == before
+
+
+def test_the_right_button_opens_a_menu_with_the_page_s_actions_for_what_is_there(
+    view: PictureView, monkeypatch: pytest.MonkeyPatch
+):
+    pointed: list[tuple[float, float]] = []
+    monkeypatch.setattr(view.tool, "point_out", lambda u, v: pointed.append((round(u), round(v))))
+    own = QAction("Delete", view)
+    view.menu_actions = [own]
+    QTest.mouseClick(view.canvas.viewport(), Qt.MouseButton.RightButton, pos=at(view, 40, 30))
+    let_draw()
+    menu = QApplication.activePopupWidget()
+    assert isinstance(menu, QMenu)
+    assert menu.actions()[0] is own
+    assert pointed == [(40, 30)]
+    levels = next(each for each in menu.actions() if each.text().startswith("Histogram"))
+    levels.trigger()
+    menu.close()
+    (dialog,) = view.findChildren(LevelsDialog)
+    before = dialog.profile.plot.listDataItems()[0].yData.copy()
+    view.show_picture(GREY // 2)
+    assert dialog.profile.plot.listDataItems()[0].yData.max() < before.max()
+    dialog.close()
+
+
+def test_a_profile_has_the_levels_along_its_line_and_none_outside():
+    along, levels = profile(GREY, np.array([[10.0, 5.0], [20.0, 5.0]]))
+    np.testing.assert_allclose(along, np.arange(11))
+    np.testing.assert_allclose(levels, GREY[5, 10:21])
+    slanted = profile(GREY, np.array([[3.0, 4.0], [6.0, 8.0]]))
+    np.testing.assert_allclose(slanted[0], np.arange(6))
+    np.testing.assert_allclose(slanted[1], 7 + 1.4 * np.arange(6))
+    assert np.isnan(profile(GREY, np.array([[-5.0, 5.0], [-2.0, 5.0]]))[1]).all()

@@ -162,8 +162,8 @@ def test_every_dialog_class_has_a_picture(taken: tuple[Path, str, Path]):
         if isinstance(node, ast.ClassDef)
         and any(isinstance(base, ast.Name) and base.id == "QDialog" for base in node.bases)
     }
-    assert own == {"HelpDialog", "ToolWindow"}
-    for kind in (*TITLES, *TOOLS):
+    assert own == {"HelpDialog", "ToolWindow", "PaperDialog", "LevelsDialog"}
+    for kind in (*TITLES, *TOOLS, "save-picture", "levels"):
         assert named(taken, f"dialog-{kind}")
 
 

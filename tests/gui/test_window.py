@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import logging
 import shutil
 import threading
 import time
@@ -180,7 +179,7 @@ def test_undo_and_redo_say_what_they_do(plain: MainWindow, copy_sample: CopySamp
     assert actions["redo"].text() == "&Redo experiment record"
     actions["redo"].trigger()
     assert plain.workspace.session.record.title == "Another"
-    assert "Done again: experiment record" in plain.status_line.message.text()
+    assert "Redone: experiment record" in plain.status_line.message.text()
 
 
 def test_keys_go_through_the_frames_and_the_steps(
@@ -630,23 +629,6 @@ def test_a_fault_goes_to_the_log_and_is_said(plain: MainWindow, qtbot: QtBot):
     assert "Traceback" in log
     assert "in a thread" in log
     assert plain.isVisible()
-
-
-def test_what_the_program_announces_is_seen_whatever_thread_says_it(
-    plain: MainWindow, qtbot: QtBot
-):
-    faults = app.ErrorReporter(plain.say, plain)
-    notices = logging.getLogger("labapp.notices")
-    faults.install()
-    try:
-        thread = threading.Thread(target=lambda: notices.warning("it takes a while"))
-        thread.start()
-        thread.join()
-        qtbot.waitUntil(lambda: plain.status_line.message.text() == "it takes a while")
-    finally:
-        faults.uninstall()
-    notices.warning("nobody listens")
-    assert "nobody listens" not in plain.log_panel.texts()[-1]
 
 
 def test_without_a_display_or_a_file_it_says_so(

@@ -255,10 +255,15 @@ def _compare(hands: Hands) -> None:
 
 
 def _dots(hands: Hands) -> None:
-    """Take a dot out, add it again, and carry that on."""
+    """Look at levels; take a dot out, add it again, and carry that on."""
     hands.do("step_dots")
     page = hands.on(DotsPage)
     hands.picture("automatic")
+    page.view.show_levels()
+    hands.picture("dialog-levels")
+    levels = hands.window.findChild(QDialog, "picture-levels")
+    assert isinstance(levels, QDialog)
+    levels.close()
     hands.do("next")
     hands.settle()
     hands.key(Qt.Key.Key_Period)

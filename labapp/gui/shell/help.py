@@ -5,21 +5,29 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable
 from html import escape
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy
 import PySide6
-from PySide6.QtCore import QSize, Qt
-from PySide6.QtGui import QAction, QKeySequence
+from PySide6.QtCore import QSize, Qt, QUrl
+from PySide6.QtGui import QAction, QDesktopServices, QImage, QKeySequence, QTextDocument
 from PySide6.QtWidgets import QDialog, QDialogButtonBox, QTextBrowser, QVBoxLayout, QWidget
 
+from labapp.bundled import bundled
 from labapp.gui.shell.actions import ACTIONS, MENUS
 from labapp.gui.shell.standing import FrameStatus
 from labapp.gui.shell.steps import STEPS
 from labapp.log import log_file
 from labapp.version import VERSION
 
+if TYPE_CHECKING:
+    from labapp.gui.pages.page import Page
+
 PART_OF_SCREEN = 0.85
 """No text takes more of the screen; the rest is for the frame around it."""
+
+SIZES_PX = {"guide": (900, 700), "keys": (720, 600), "about": (520, 300)}
 
 TITLES = {"guide": "Guide", "keys": "Keys", "about": "About labapp"}
 
@@ -51,7 +59,7 @@ def guide() -> str:
     return f"<h2>Guide</h2>{INTRODUCTION}{steps}{frames}{CLOSING}"
 
 
-def keys(page: QWidget | None = None) -> str:
+def keys(page: Page | None = None) -> str:
     """Every action that has a key, those of the page in view first; HTML."""
     from labapp.gui.views import picture, plots, view3d
 
@@ -97,28 +105,63 @@ def about() -> str:
 TEXTS: dict[str, Callable[[], str]] = {"guide": guide, "keys": keys, "about": about}
 
 
+class GuidePages(QTextBrowser):
+    """Shows pages of the guide; their pictures are made to fit its width."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.setOpenLinks(False)
+        self.setVerticalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOn)  # the width stays
+        self.anchorClicked.connect(self._follow)
+
+    def show_page(self, name: str) -> bool:
+        """Show a page; False where the guide did not come with the program."""
+        file = bundled("docs/guide") / f"{name}.md"
+        if file.is_file():
+            self.setSource(QUrl.fromLocalFile(str(file)))
+        return file.is_file()
+
+    def _follow(self, link: QUrl) -> None:
+        url = self.source().resolved(link)
+        if not url.isLocalFile():
+            QDesktopServices.openUrl(url)
+        elif Path(url.toLocalFile()).is_file():
+            self.setSource(url)
+
+    def loadResource(self, kind: int, name: QUrl | str) -> object:
+        """Load a page, or a picture as wide as there is room."""
+        loaded = super().loadResource(kind, name)
+        if kind != QTextDocument.ResourceType.ImageResource.value:
+            return loaded
+        image = QImage(self.source().resolved(QUrl(name)).toLocalFile())
+        room = self.viewport().width() - 2 * round(self.document().documentMargin())
+        smooth = Qt.TransformationMode.SmoothTransformation
+        return image.scaledToWidth(room, smooth) if image.width() > room else image
+
+
 class HelpDialog(QDialog):
     """One of the help texts, beside the window."""
 
-    def __init__(
-        self, kind: str, parent: QWidget | None = None, page: QWidget | None = None
-    ) -> None:
+    def __init__(self, kind: str, parent: QWidget | None = None, page: Page | None = None) -> None:
         super().__init__(parent)
         self.setObjectName(f"help-{kind}")
         self.setWindowTitle(TITLES[kind])
         self.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
-        self.browser = QTextBrowser()
+        self.browser = GuidePages()
         self.browser.setAccessibleName(TITLES[kind])
         self.browser.setAccessibleDescription("Arrow keys and Page Up and Down scroll the text")
-        self.browser.setHtml(keys(page) if kind == "keys" else TEXTS[kind]())
         buttons = QDialogButtonBox(QDialogButtonBox.StandardButton.Close)
         buttons.button(QDialogButtonBox.StandardButton.Close).setToolTip("Close this window (Esc)")
         buttons.rejected.connect(self.reject)
         layout = QVBoxLayout(self)
         layout.addWidget(self.browser)
         layout.addWidget(buttons)
-        wanted = QSize(520, 300) if kind == "about" else QSize(720, 600)
+        wanted = QSize(*SIZES_PX[kind])
         self.resize(wanted.boundedTo(self.screen().availableSize() * PART_OF_SCREEN))
+        layout.activate()  # pictures are made to fit
+        name = "welcome" if page is None else page.key
+        if kind != "guide" or not self.browser.show_page(name):
+            self.browser.setHtml(keys(page) if kind == "keys" else TEXTS[kind]())
 
 
 def _key(action: QAction) -> str:

@@ -64,6 +64,12 @@ SIZE_PX = (1600, 1000)
 PART_OF_SCREEN = 0.92
 """Size at the first start, and the most of the screen that it takes."""
 
+OF_A_FRAME = (
+    *("measure_frame", "next_doubtful", "previous_doubtful", "next_corrected"),
+    *("previous_corrected", "first", "last", "play"),
+)
+"""Actions in the timeline's own menu."""
+
 PAGE_PX = 336
 """Least height of a page: with all panels 492, of the 512 that 768 are at 150 %."""
 
@@ -94,6 +100,7 @@ class MainWindow(QMainWindow):
         without = {f"step_{step.key}" for step in STEPS if step not in self._steps}
         actions = [action for action in ACTIONS if action.name not in without]
         self.menus = Menus(self, actions, self.do, self.files.open)
+        self.timeline.addActions([self.menus.actions[name] for name in OF_A_FRAME])
         self._commands = commands(self)
         self._connect()
         self.setAcceptDrops(True)

@@ -5,17 +5,26 @@ Places are (u, v) in px as everywhere: u right, v down, the first pixel's centre
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 import pyqtgraph as pg
-from PySide6.QtCore import QEvent, QPointF, QRectF, Qt, Signal
-from PySide6.QtGui import QFocusEvent, QImage, QKeyEvent, QPalette
+from PySide6.QtCore import QEvent, QPoint, QPointF, QRectF, Qt, Signal
+from PySide6.QtGui import (
+    QAction,
+    QContextMenuEvent,
+    QFocusEvent,
+    QGuiApplication,
+    QImage,
+    QKeyEvent,
+    QPalette,
+)
 from PySide6.QtWidgets import (
     QGraphicsItem,
     QGridLayout,
     QHBoxLayout,
+    QMenu,
     QSizePolicy,
     QSlider,
     QToolButton,
@@ -25,6 +34,7 @@ from PySide6.QtWidgets import (
 from labapp.core.values import BoolArray
 from labapp.gui.views.canvas import Drawn
 from labapp.gui.views.drag_point import ALT, CONTROL, SHIFT, DragPoint, arrow_step
+from labapp.gui.views.picture_files import save_picture
 from labapp.gui.widgets.labels import plain_label, wrapping_label
 from labapp.media import GreyImage
 
@@ -51,6 +61,9 @@ class Tool:
 
     def click(self, u: float, v: float, modifiers: Qt.KeyboardModifier) -> None:
         """The left button was pressed and released at a place."""
+
+    def point_out(self, u: float, v: float) -> None:
+        """The right button was clicked: choose what is there, for the menu."""
 
     def double_click(self, u: float, v: float) -> None:
         """It was pressed twice."""
@@ -81,6 +94,8 @@ class PictureView(Drawn):
 
     pointed = Signal(float, float, object)
     """Where the pointer is and the level there: u, v, level (None outside the picture)."""
+    changed = Signal()
+    """Another picture is shown, or none."""
 
     def __init__(self, name: str = "Picture") -> None:
         super().__init__(name, KEYS)
@@ -88,6 +103,8 @@ class PictureView(Drawn):
         """What the left button does."""
         self.points: list[DragPoint] = []
         """The points to drag."""
+        self.menu_actions: Sequence[QAction] = ()
+        """What the page does with what is right-clicked, above the view's own actions."""
         self._image: GreyImage | None = None
         self._levels = (0.0, 1.0)
         self._fits = True
@@ -129,6 +146,7 @@ class PictureView(Drawn):
         Zoom and contrast stay where the picture is of the same size and about as bright.
         """
         former, self._image = self._image, grey
+        self.changed.emit()
         self._empty.setText(why_not if grey is None else "")
         self._item.setVisible(grey is not None)
         if grey is None:
@@ -178,6 +196,32 @@ class PictureView(Drawn):
         """Return what is seen, overlays and all."""
         picture: QImage = self.canvas.grab().toImage()
         return picture
+
+    def show_levels(self) -> None:
+        """Show histogram and line profile beside the picture."""
+        from labapp.gui.views.picture_levels import LevelsDialog
+
+        LevelsDialog(self, self).show()
+
+    def open_menu(self, at: QPoint) -> None:
+        """Open the menu at a place of the screen."""
+        menu = QMenu(self)
+        menu.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
+        menu.addActions(self.menu_actions)
+        menu.addSeparator()
+        for words, work in (
+            ("Copy picture", lambda: QGuiApplication.clipboard().setImage(self.grab_picture())),
+            ("Save picture …", lambda: save_picture(self, self.grab_picture())),
+            ("Histogram and line profile …", self.show_levels),
+            ("Fit", self.fit),
+        ):
+            menu.addAction(words).triggered.connect(lambda *_, do=work: do())
+        menu.popup(at)
+
+    def contextMenuEvent(self, event: QContextMenuEvent) -> None:
+        """Open the menu by its key; of the mouse the canvas tells clicks from drags."""
+        if event.reason() == QContextMenuEvent.Reason.Keyboard:
+            self.open_menu(self.mapToGlobal(self.rect().center()))
 
     # --- zoom and contrast --------------------------------------------------------------------
 
@@ -343,12 +387,17 @@ class _Box(pg.ViewBox):  # type: ignore[misc]
         self._tool_drags = False
 
     def mouseClickEvent(self, event: Any) -> None:
-        if event.button() != Qt.MouseButton.LeftButton:
+        right = event.button() == Qt.MouseButton.RightButton
+        if not right and event.button() != Qt.MouseButton.LeftButton:
             return
         event.accept()
         self._view.setFocus(Qt.FocusReason.MouseFocusReason)
         place = self.mapSceneToView(event.scenePos())
-        if event.double():
+        if right:
+            if self._view.menu_actions:
+                self._view.tool.point_out(place.x(), place.y())
+            self._view.open_menu(event.screenPos().toPoint())
+        elif event.double():
             self._view.tool.double_click(place.x(), place.y())
         else:
             self._view.tool.click(place.x(), place.y(), event.modifiers())

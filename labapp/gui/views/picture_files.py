@@ -144,15 +144,27 @@ def _light(drawn: QWidget) -> Iterator[None]:
         drawn.setPalette(QPalette())
 
 
+def save_picture(drawn: QWidget, image: QImage) -> None:
+    """Ask for a file and write a picture to it as it is seen."""
+    proposed = PaperDialog.folder / "picture.png"
+    if path := ask_save(drawn, "Save picture", proposed, RASTERS):
+        PaperDialog.folder, path = path.parent, with_suffix(path)
+        _report(path, write_image(path, image, SVG_DPI), drawn)
+
+
+def _report(path: Path, written: bool, drawn: QWidget) -> None:
+    if written:
+        QToolTip.showText(QCursor.pos(), plain_tip(f"{DONE} Saved in {path}"), drawn)
+    else:
+        QMessageBox.warning(drawn, "Save picture", f"{path} cannot be written.")
+
+
 def save_plot(drawn: QWidget, canvas: QGraphicsView, name: str) -> Callable[[], None]:
     """Return what asks for a file and writes a plot to it."""
 
     def save() -> None:
         if asked := ask_paper(drawn, PaperDialog.folder / f"{name}.png", VECTORS):
             path = with_suffix(asked[0], SVG)
-            if write_plot(path, drawn, canvas, asked[1]):
-                QToolTip.showText(QCursor.pos(), plain_tip(f"{DONE} Saved in {path}"), drawn)
-            else:
-                QMessageBox.warning(drawn, "Save picture", f"{path} cannot be written.")
+            _report(path, write_plot(path, drawn, canvas, asked[1]), drawn)
 
     return save

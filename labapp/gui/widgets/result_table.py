@@ -4,20 +4,37 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from PySide6.QtGui import QGuiApplication
+from PySide6.QtCore import Qt
+from PySide6.QtGui import QCursor, QGuiApplication
+from PySide6.QtWidgets import QWhatsThis
 
 from labapp.gui.digits import ResultRow, as_csv, as_text
 from labapp.gui.widgets.tables import FullTable
+from labapp.text import HEIGHT_SIGMA_OF, SIGMA_OF
+
+PLUS_MINUS = (
+    "± is one standard uncertainty, 1σ: the true value lies within ± of the one given with a "
+    "probability of about 68 %, within 2 ± with 95 %.\n\n"
+    f"The ± of a pool's sizes is of {SIGMA_OF}, that of heights in the 3-D view of "
+    f"{HEIGHT_SIGMA_OF}. Reflection errors have none."
+)
 
 
 class ResultTable(FullTable):
     """Results: name, value, ±, unit. Copied as text (Ctrl+C) or CSV (its menu)."""
 
     def __init__(self, name: str) -> None:
-        tip = f"{name}: Ctrl+C copies it; right click to copy it as CSV"
+        tip = f"{name}: Ctrl+C copies it; right click for CSV, and for what ± is"
         super().__init__(name, tip, ["", "Value", "±", "Unit"])
         self.rows: tuple[ResultRow, ...] = ()
-        self.offer(("Copy table", self.copy_text), ("Copy table as CSV", self.copy_csv))
+        self.offer(
+            ("Copy table", self.copy_text),
+            ("Copy table as CSV", self.copy_csv),
+            ("What is ±?", lambda: QWhatsThis.showText(QCursor.pos(), PLUS_MINUS, self)),
+        )
+        way, role = Qt.Orientation.Horizontal, Qt.ItemDataRole.ToolTipRole
+        self.model().setHeaderData(2, way, PLUS_MINUS, role)
+        self.setWhatsThis(PLUS_MINUS)
         self.set_rows(())
 
     def set_rows(self, rows: Iterable[ResultRow]) -> None:

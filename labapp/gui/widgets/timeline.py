@@ -40,6 +40,7 @@ class Timeline(FollowsTheme, QWidget):
 
     def __init__(self, ticks: Sequence[Tick]) -> None:
         super().__init__()
+        self.setContextMenuPolicy(Qt.ContextMenuPolicy.ActionsContextMenu)
         self._ticks = tuple(ticks)
         self._icons: dict[QToolButton, QStyle.StandardPixmap] = {}
         self._frames: npt.NDArray[np.int64] = np.zeros(0, np.int64)

@@ -140,7 +140,10 @@ def test_a_value_that_the_camera_rounds_is_told(page: CapturePage, fields, devic
         ("8 8 16", "“8 8 16” is not four whole numbers"),
         ("-1, 0, 20, 20", "“-1, 0, 20, 20” is not four whole numbers"),
         ("0, 0, 20, 20, 20", "is not four whole numbers"),
-        ("60, 0, 20, 20", "60, 0, 20, 20 is refused; right is (u, v, width, height) within 64×48"),
+        (
+            "60, 0, 20, 20",
+            "60, 0, 20, 20 is refused; it must be (u, v, width, height) within 64×48",
+        ),
         ("0, 0, 20, 3", "at least 16×16 px"),
     ],
 )

@@ -262,7 +262,7 @@ def test_a_second_recording_goes_into_a_session_of_its_own(
     assert not page.chosen.isVisible()
     page.take(first.parent / "recording.tif")
     qtbot.waitUntil(lambda: page.preview is not None)
-    assert "wants a session of its own" in page.chosen.replace_words.text()
+    assert "needs its own session" in page.chosen.replace_words.text()
     assert page.chosen.replace_words.isVisible()
     assert not page.chosen.import_button.isEnabled()
     second = tmp_path / "second.labsession"

@@ -55,7 +55,9 @@ def page(qtbot: QtBot) -> Iterator[DotsPage]:
 def unfitted(monkeypatch: pytest.MonkeyPatch) -> list[list[int]]:
     """Frames that would have been measured."""
     asked: list[list[int]] = []
-    monkeypatch.setattr(Workspace, "measure", lambda self, frames=None: asked.append(list(frames)))
+    monkeypatch.setattr(
+        Workspace, "measure", lambda self, frames=None, **_: asked.append(list(frames))
+    )
     monkeypatch.setattr(Refit, "_fit", lambda self, frame: asked.append([frame]))
     monkeypatch.setattr(Processes, "begin", lambda self: None)
     return asked

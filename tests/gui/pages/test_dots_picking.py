@@ -104,5 +104,5 @@ def test_a_dot_between_sites_is_not_numbered() -> None:
         Dots(u, *(getattr(correction.dots, name) for name in list(correction.dots.__dict__)[1:])),
         correction.lattice,
     )
-    with pytest.raises(ValueError, match="do not tell"):
+    with pytest.raises(ValueError, match="do not fix"):
         picking.numbered_by_neighbours(between, np.array([8]))

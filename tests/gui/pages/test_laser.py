@@ -49,7 +49,7 @@ def test_means_spreads_and_the_laser_are_shown() -> None:
     assert rows["l₁, 2 readings"].sigma == pytest.approx(np.std([13.6, 13.8], ddof=1))
     assert rows["Projection angle"].value == found.angle_deg
     assert rows["Distance"].sigma == found.distance_sigma_mm
-    assert rows["l₁ that follows"].value == found.expected_l1_mm
+    assert rows["l₁ computed"].value == found.expected_l1_mm
 
 
 def test_lengths_that_contradict_each_other_are_said_in_the_pages_words() -> None:

@@ -31,7 +31,7 @@ class KeptRecordings(Group):
             lambda: look(Path(self.choice.value())),
         )
         begin = button(NEXT, NEXT_TIP, lambda: begin_next(Path(self.choice.value())))
-        super().__init__("Recorded besides", form, see, begin)
+        super().__init__("Other recordings", form, see, begin)
         self.hide()
 
     def list_beside(self, session: Session, running: Take | None) -> None:
@@ -52,10 +52,7 @@ class KeptRecordings(Group):
 
 def kept_text(take: Take, why_kept: str) -> str:
     """What became of a recording that is not imported."""
-    return (
-        f"{take.path.name} is kept beside the session: {why_kept}. To measure it, press New "
-        "session from this recording"
-    )
+    return f"{take.path.name} is kept beside the session: {why_kept}. See Other recordings"
 
 
 def _choice_text(path: Path) -> str:

@@ -111,7 +111,10 @@ class CapturePage(Page):
             return State(Mark.READY, message)
         if self.preview is None or session is None or session.recording is not None:
             return found
-        return State(Mark.READY, f"{self.preview.path.name} is not imported yet: press Import")
+        name = self.preview.path.name
+        if self._importing in self.workspace.tasks.active:
+            return State(Mark.READY, f"{name} is being imported")
+        return State(Mark.READY, f"{name} is not imported yet: press Import")
 
     def lead(self, found: Lead | None) -> Lead | None:
         """Where a recording can come from, while there is none to be seen."""
@@ -170,7 +173,7 @@ class CapturePage(Page):
         if why_kept:
             self._listed = None
             self._show_import()
-            self.workspace.notified.emit(kept_text(take, why_kept), False)
+            self.confirm(kept_text(take, why_kept))
         else:
             measured = self.live_view.plan_fields.measured.isChecked()
             self._import(take.path, ":", None, False, self._measure if measured else _nothing)

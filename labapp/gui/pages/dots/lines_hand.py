@@ -133,6 +133,12 @@ class LinesHand(Tool):
         else:
             self.choose([line[0]])
 
+    def point_out(self, u: float, v: float) -> None:
+        """Choose the line for the menu, unless it is among the chosen ones."""
+        line = self._at(u, v)
+        if line is None or line[0] not in self.chosen:
+            self.choose([] if line is None else [line[0]])
+
     def _at(self, u: float, v: float) -> tuple[int, int] | None:
         """Line at a place and its point there; None without one."""
         if self.state.correction is None or not self.state.lines:

@@ -83,6 +83,7 @@ class DotsPanel(QWidget):
         form = FieldForm()
         form.add(self.most)
         self.rows = _RowList()
+        self.rows.addActions(edits)
         vbox(
             *(self.seen, heading("Correct"), self.chosen, self._sites()),
             self._buttons(edits),

@@ -80,6 +80,7 @@ class DotsPage(Page):
             for commands in (self._edits(), self._frame_commands(), self._keys())
         )
         self._dot_actions = [*edits, *frames, *keys]
+        self.view.menu_actions = self._menu_actions = [*edits, *frames]
         self.lines_hand = LinesHand(self, self.lines, self.action, lambda: self.pointer)
         self.dots_panel = DotsPanel(edits, frames)
         self.canvas_layout.addWidget(self.view)
@@ -167,6 +168,7 @@ class DotsPage(Page):
         for action in self.lines_hand.actions:
             action.setEnabled(lines)
         self.view.tool = self.lines_hand if lines else self.hand
+        self.view.menu_actions = self.lines_hand.actions if lines else self._menu_actions
         if lines:
             self.seen = None
             self.editor.show(None, same_frame=False)
@@ -478,6 +480,12 @@ class Hand(Tool):
             self._page.draw()
             return
         self._page.choose(self._page.editor.click, u, v, self._reach(), bool(modifiers & SHIFT))
+
+    def point_out(self, u: float, v: float) -> None:
+        """Choose the dot for the menu, unless it is among the chosen ones."""
+        if self._page.editor.at(u, v, self._reach()) not in self._page.editor.selection.tolist():
+            self.give_up()
+            self.click(u, v, Qt.KeyboardModifier.NoModifier)
 
     def double_click(self, u: float, v: float) -> None:
         """Add a dot."""

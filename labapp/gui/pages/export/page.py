@@ -28,6 +28,7 @@ from labapp.gui.pages.export.presenter import (
     schemes,
     write,
 )
+from labapp.gui.pages.export.sizes import estimated_bytes
 from labapp.gui.pages.page import Page
 from labapp.gui.tasks import DONE, PROBLEM, Control, Task
 from labapp.gui.widgets.buttons import button
@@ -37,6 +38,7 @@ from labapp.gui.widgets.layouts import fill, hbox, scrolled, vbox
 from labapp.gui.widgets.path_field import PathField
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
+from labapp.text import format_bytes, pluralize
 
 WHICH = (
     ("all", "all that are measured"),
@@ -124,8 +126,16 @@ class ExportPage(Page):
                 why_not or "Write all that is ticked; a cancelled export leaves nothing behind"
             )
         )
-        count = len(made.frames)
-        ready = f"{count} frame{'s' * (count != 1)} will be written."
+        recording = self.workspace.session.recording
+        size = estimated_bytes(
+            self.request,
+            len(made.frames),
+            made.surfaces,
+            made.area_mm2,
+            0 if recording is None else recording.rows * recording.columns,
+        )
+        about = format_bytes(float(f"{size:.2g}")).replace(".0 ", " ")
+        ready = f"{pluralize(len(made.frames), 'frame')} will be written, about {about}."
         wrong = f"{PROBLEM} {why_not}" if why_not and not writing else why_not or self._said
         self.answer.setText(wrong or ready)
         again = len(made.again) > 0 and not self.workspace.session.read_only

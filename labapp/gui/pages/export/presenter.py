@@ -190,6 +190,10 @@ class ExportPlan:
     """What to know otherwise, a sentence each."""
     files: tuple[str, ...]
     """What would be in the folder, a line each."""
+    surfaces: int
+    """How many of the frames have a surface."""
+    area_mm2: float
+    """Mean area of the surfaces; 0 without any."""
 
 
 def plan(session: Session, request: ExportRequest, frame: int) -> ExportPlan:
@@ -226,6 +230,8 @@ def plan(session: Session, request: ExportRequest, frame: int) -> ExportPlan:
         why_not=_why_not(session, request, scheme, frames, stale),
         notes=tuple(filter(None, notes)),
         files=_files(request, len(frames), surfaces),
+        surfaces=surfaces,
+        area_mm2=float(np.nanmean(seen.measures["area_mm2"][measured])) if surfaces else 0.0,
     )
 
 

@@ -213,7 +213,7 @@ class SetupPage(Page):
         usual = button(
             "Use defaults",
             "Enter the dissertation's bench where nothing is entered; check each number",
-            lambda: self.workspace.attempt(presenter.put_usual),
+            self._use_defaults,
         )
         self._filling = load, usual
         buttons = QWidget()
@@ -290,6 +290,10 @@ class SetupPage(Page):
         field.edited.connect(
             lambda value: self.workspace.attempt(lambda session: presenter.put(session, key, value))
         )
+
+    def _use_defaults(self) -> None:
+        if self.workspace.attempt(presenter.put_usual, beside=self.answer.setText):
+            self.confirm("Defaults entered where nothing was; measure what is still grey")
 
     def _choose_load(self) -> None:
         if path := ask_setup(self, self.workspace.folder):

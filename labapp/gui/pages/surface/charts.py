@@ -2,108 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 import pyqtgraph as pg
-from PySide6.QtCore import QEvent, QPointF, Qt, Signal
-from PySide6.QtGui import QAction, QGuiApplication, QKeyEvent, QKeySequence, QPalette
-from PySide6.QtWidgets import QVBoxLayout
+from PySide6.QtCore import QPointF, Qt, Signal
 
 from labapp.core.surface.boundary import Boundary
 from labapp.core.values import FloatArray
 from labapp.export.heights import Profile
 from labapp.gui.pages.surface.presenter import error_scale
-from labapp.gui.views.axes import make_plot, paint_axes
-from labapp.gui.views.canvas import Plotted
-from labapp.gui.views.picture_files import save_plot
-from labapp.gui.widgets.labels import plain_label, wrapping_label
+from labapp.gui.views.chart import Chart
 from labapp.text import HEIGHT_SIGMA_OF
 
 BAND_ALPHA = 70
-
-KEYS = "+ − zoom, F shows all"
-ZOOM = 1.25
-
-
-class Chart(Plotted):
-    """One plot with a line of words above it, in the colours of the window."""
-
-    def __init__(self, name: str, x_label: str, y_label: str, equal: bool) -> None:
-        super().__init__(name, KEYS)
-        self.setToolTip(f"{name}: wheel to zoom, drag to move; {KEYS}")
-        self.title = wrapping_label(name)
-        self.plot = make_plot(x_label, y_label, equal)
-        self.plot.setMinimumSize(88, 80)
-        layout = QVBoxLayout(self)
-        layout.setContentsMargins(1, 1, 1, 1)
-        layout.setSpacing(0)
-        layout.addWidget(self.title)
-        layout.addWidget(self.plot)
-        self._at = plain_label(parent=self.plot)
-        self._at.setAttribute(Qt.WidgetAttribute.WA_TransparentForMouseEvents)
-        self._at.hide()
-        self.plot.scene().sigMouseMoved.connect(self._moved_to)
-        self._add_actions()
-
-    def _add_actions(self) -> None:
-        self.setContextMenuPolicy(Qt.ContextMenuPolicy.ActionsContextMenu)
-        works: tuple[tuple[str, Callable[[], object]], ...] = (
-            ("Copy picture", self.copy_picture),
-            ("Save picture …", save_plot(self, self.plot, "chart")),
-            ("Show all", self.plot.autoRange),
-        )
-        for words, work in works:
-            action = QAction(words, self)
-            action.triggered.connect(lambda *_, do=work: do())
-            self.addAction(action)
-        copy = self.actions()[0]
-        copy.setShortcut(QKeySequence.StandardKey.Copy)
-        copy.setShortcutContext(Qt.ShortcutContext.WidgetShortcut)
-
-    def copy_picture(self) -> None:
-        """Put what is seen on the clipboard."""
-        QGuiApplication.clipboard().setPixmap(self.plot.grab())
-
-    def _moved_to(self, at: QPointF) -> None:
-        """Show the values under the pointer."""
-        box = self.plot.getViewBox()
-        inside = box.sceneBoundingRect().contains(at)
-        place = box.mapSceneToView(at)
-        self._at.setText(f"{place.x():.3g}, {place.y():.3g} mm".replace("-", "−"))
-        self._at.adjustSize()
-        self._at.move(self.plot.width() - self._at.width() - 4, 2)
-        self._at.setVisible(inside)
-
-    def leaveEvent(self, event: QEvent) -> None:
-        """Show no values any more."""
-        self._at.hide()
-        super().leaveEvent(event)
-
-    def say(self, words: str) -> None:
-        """Put words above the plot."""
-        self.title.setText(words)
-        self.describe(words)
-
-    def take_colours(self) -> None:
-        """Take the window's colours."""
-        palette = self.palette()
-        self.text = palette.color(QPalette.ColorRole.Text)
-        self.accent = palette.color(QPalette.ColorRole.Highlight)
-        self.plot.setBackground(palette.color(QPalette.ColorRole.Base))
-        paint_axes(self.plot, self.text, self.text)
-
-    def keyPressEvent(self, event: QKeyEvent) -> None:
-        """Zoom, or show all."""
-        box = self.plot.getViewBox()
-        if event.key() in (Qt.Key.Key_Plus, Qt.Key.Key_Equal):
-            box.scaleBy((1 / ZOOM, 1 / ZOOM))
-        elif event.key() == Qt.Key.Key_Minus:
-            box.scaleBy((ZOOM, ZOOM))
-        elif event.key() == Qt.Key.Key_F:
-            self.plot.autoRange()
-        else:
-            super().keyPressEvent(event)
 
 
 class DotsChart(Chart):

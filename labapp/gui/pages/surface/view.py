@@ -203,6 +203,7 @@ class SurfacePage(Page):
         )
         self.high.edited.connect(lambda value: self._set(exaggeration=value))
         self.high.setMaximumWidth(NARROW_FIELD)
+        self.colour.setMaximumWidth(2 * NARROW_FIELD)
         for field in (self.colour, self.high):
             field.label.setWordWrap(False)
         looks = [
@@ -225,12 +226,13 @@ class SurfacePage(Page):
         self.comparing = _tool("Compare", what, self._toggle_compare, _Toggle())
         self.comparing.setCheckable(True)
         self.saved = Message(1)
-        self.saved.setMinimumWidth(ANSWER_PX)
+        self.saved.setMinimumWidth(1)  # a small screen has no more room
         self._view_actions()
         coloured = self.colour.label, self.colour
         return _Tools(
-            hbox(*coloured, self.high.label, self.high, self.true_scale, self._parts_button()),
+            hbox(*coloured, self.high.label, self.high, self.true_scale, self._parts_button(), 1),
             hbox(*looks, (self.saved, 1), self.save, self.film, self.comparing),
+            room_px=ANSWER_PX,
         )
 
     def _view_actions(self) -> None:
@@ -442,8 +444,9 @@ class SurfacePage(Page):
 class _Tools(QWidget):
     """Two lines of tools: side by side where there is room, else under each other."""
 
-    def __init__(self, *lines: QHBoxLayout) -> None:
+    def __init__(self, *lines: QHBoxLayout, room_px: int = 12) -> None:
         super().__init__()
+        self._room_px = room_px
         self._lines = lines
         self._box = QBoxLayout(QBoxLayout.Direction.LeftToRight, self)
         self._box.setContentsMargins(0, 0, 0, 0)
@@ -453,7 +456,7 @@ class _Tools(QWidget):
 
     def resizeEvent(self, event: QResizeEvent) -> None:
         super().resizeEvent(event)
-        wanted = sum(line.sizeHint().width() for line in self._lines) + 12
+        wanted = sum(line.sizeHint().width() for line in self._lines) + self._room_px
         way = QBoxLayout.Direction
         self._box.setDirection(way.LeftToRight if self.width() >= wanted else way.TopToBottom)
         self.setFixedHeight(self._box.sizeHint().height())

@@ -1,0 +1,59 @@
+"""The first use of a version: its loops are compiled in a process beside the window's."""
+
+from __future__ import annotations
+
+import importlib
+import multiprocessing
+from importlib.util import find_spec
+from pathlib import Path
+
+from labapp.gui.tasks import Control
+
+TITLE = "First use: compiling for this computer, one to two minutes"
+
+POLL_S = 0.2
+
+COMPILED = (
+    *(f"labapp.core.images.{name}_kernels" for name in ("centroid", "dot", "dot_fit", "ridge")),
+    "labapp.core.images.size_kernels",
+    "labapp.core.rows.lattice_kernels",
+    "labapp.core.surface.kernels",
+    "labapp.core.surface.level_kernels",
+    "labapp.core.matching.match_kernels",
+    "labapp.core.sequence.prior",
+    "labapp.export.fixed_point",
+)
+"""Modules that compile (docs/adr/0018), those of a frame's dots first."""
+
+
+def not_compiled() -> list[str]:
+    """Names of the modules whose compiled code is not on the disk."""
+    from labapp.core.compiled import is_kept
+
+    specs = [(name, find_spec(name)) for name in COMPILED]
+    files = [(name, Path(spec.origin)) for name, spec in specs if spec and spec.origin]
+    return [name for name, file in files if file.is_file() and not is_kept(name, file)]
+
+
+def compile_aside(modules: list[str], control: Control) -> None:
+    """Compile modules in another process; what needs them here waits, and the window does not."""
+    import cv2  # noqa: F401 - changes sys.path meanwhile, which the process would get
+
+    from labapp.core.compiled import MAY_COMPILE
+
+    MAY_COMPILE.clear()
+    spawn = multiprocessing.get_context("spawn")
+    process = spawn.Process(target=_import, args=(modules,), daemon=True)
+    process.start()
+    try:
+        while process.is_alive():
+            process.join(POLL_S)
+            control.check()
+    finally:
+        process.kill()
+        MAY_COMPILE.set()
+
+
+def _import(modules: list[str]) -> None:
+    for name in modules:
+        importlib.import_module(name)

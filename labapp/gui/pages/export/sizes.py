@@ -1,0 +1,57 @@
+"""About how large an export will be, by what exports of the samples were."""
+
+from __future__ import annotations
+
+from labapp.gui.pages.export.presenter import ExportRequest
+
+ROWS = {"measures": 400.0, "dots": 5_500.0, "points": 7_000.0, "boundary": 14_000.0}
+"""Bytes a frame of each table."""
+
+NODE = {"csv": 28.0}
+"""Bytes a node of a surface that is a grid of points."""
+
+TRIANGLE = {"stl": 50.0, "stl-ascii": 247.0, "ply": 29.0, "vtp": 64.0}
+"""Bytes a triangle of each mesh."""
+
+EDGE_TRIANGLES = 22_000
+"""Triangles along the boundary, whatever the grid; inside there are two a node."""
+
+PIXEL = {"png": 1.5, "jpg": 0.3, "tif": 3.0}
+"""Bytes a pixel of a picture of a frame."""
+
+SURFACE_PIXEL, FILM_PIXEL = 0.16, 0.03
+"""Bytes a pixel of a picture of a surface, and of a frame of a film."""
+
+TREND_PICTURE, REPORT, HDF5_FRAME, HDF5_NODE = 80_000.0, 2_000_000.0, 80_000.0, 6.5
+
+
+def estimated_bytes(
+    request: ExportRequest, frames: int, surfaces: int, area_mm2: float, frame_px: int
+) -> float:
+    """Return about how many bytes will be written.
+
+    Parameters
+    ----------
+    frames, surfaces
+        How many frames are written, and how many of them have a surface.
+    area_mm2
+        Mean area of the surfaces.
+    frame_px
+        Number of pixels of a frame.
+    """
+    nodes = area_mm2 / request.spacing_mm**2
+    triangles = 2 * nodes + EDGE_TRIANGLES
+    choice = request.choice()
+    a_frame = sum(ROWS[name] for name in choice.tables)
+    meshes = sum(TRIANGLE.get(name, 0.0) for name in choice.surfaces) * triangles
+    a_surface = meshes * (1 + choice.solid) + nodes * sum(NODE.get(n, 0) for n in choice.surfaces)
+    if choice.together:
+        a_frame += HDF5_FRAME
+        a_surface += HDF5_NODE * nodes
+    view_px = request.size_px[0] * request.size_px[1]
+    if "frames" in choice.pictures:
+        a_frame += PIXEL[request.picture_format] * frame_px
+    a_surface += SURFACE_PIXEL * view_px * ("surfaces" in choice.pictures)
+    a_surface += FILM_PIXEL * view_px * ("film" in choice.pictures)
+    once = TREND_PICTURE * ("trends" in choice.pictures) + REPORT * ("report" in request.ticked)
+    return once + frames * a_frame + surfaces * a_surface
