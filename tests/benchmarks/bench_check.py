@@ -1,23 +1,24 @@
 """How well bench checks do on simulated benches: coverage of the height's ±, and its errors.
 
-Run as ``python tests/benchmarks/bench_check.py [--benches N] [--full M] [--seed S]``. Benches are
-drawn about one set-up, with all quantities off that have a ±, those of a glass on the plane too;
-pools of two kinds are measured on each before and after the check. Of the
-first M benches dots are matched as in the app; of the others each dot's ray is given, which is some
-ten times as quick.
+Run as ``python -m tests.benchmarks.bench_check [--benches N] [--full M] [--seed S]``. Benches are
+drawn about one set-up, with all quantities off that have a ±, those of a glass on the plane too.
+Pools of two kinds are measured on each before and after the check, and with the true set-up, whose
+errors are those of noise and level alone. Of the first M benches dots are matched as in the app; of
+the others each dot's ray is given, which is some ten times as quick.
 """
 
 from __future__ import annotations
 
 import argparse
 from collections import defaultdict
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
 from labapp.core.bench_check.adjustment import Sighting, adjust
 from labapp.core.bench_check.check import adjusted_bench, check_bench
-from labapp.core.bench_check.forecast import forecast
+from labapp.core.bench_check.forecast import forecast, height_sigma
 from labapp.core.bench_check.labelling import Picture
 from labapp.core.bench_check.mirrors import Cap, Mirror, Plate
 from labapp.core.geometry.coordinates import ImageCalibration
@@ -102,8 +103,12 @@ def sighting(mirror: Mirror, place: FloatArray, ray: FloatArray) -> Sighting:
     return Sighting(mirror, ray, CALIBRATION.to_plane(place), covariance)
 
 
+ToPlane = Callable[[FloatArray], FloatArray]
+"""From places in the picture, px, to the imaging plane, mm."""
+
+
 def measured(
-    pool: Pool, bench: SimulatedBench, rig: Rig, calibration: ImageCalibration, seed: list[int]
+    pool: Pool, bench: SimulatedBench, rig: Rig, to_plane: ToPlane, seed: list[int]
 ) -> tuple[float, float]:
     """A pool's height by a set-up, and its ±, mm; NaN without a surface."""
     rng = np.random.default_rng(seed)
@@ -113,7 +118,7 @@ def measured(
     covariance = np.tile((SIGMA_PX / PX_PER_MM) ** 2 * np.eye(2), (len(place), 1, 1))
     match = replace(
         match, dot=match.dot[: keep.sum()], ray=ray + 1, reflected=match.reflected[keep],
-        plane_mm=calibration.to_plane(place), plane_covariance_mm2=covariance,
+        plane_mm=to_plane(place), plane_covariance_mm2=covariance,
     )  # fmt: skip
     try:
         made = measure_surface(reconstruct(match, rig, Settings()), match, rig)
@@ -141,7 +146,12 @@ def main() -> None:
             for one in forecast(BEHIND_GLASS, CANDIDATES, Cap(width, height))
         }
         seed = [given.seed, n, 1]
-        results = {"as it is": (BEHIND_GLASS, CALIBRATION)}
+        exact = replace(BEHIND_GLASS, uncertainty=None)
+        predicted["true"] = height_sigma(exact, Cap(width, height)).total_sigma_mm
+        results: dict[str, tuple[Rig, ToPlane]] = {
+            "true": (bench.rig, bench.view.to_plane),
+            "as it is": (BEHIND_GLASS, CALIBRATION.to_plane),
+        }
         for name, mirrors in CANDIDATES.items():
             shots = [(m, *seen(surface_like(m, rng), bench, rng)) for m in mirrors]
             if n < given.full:
@@ -152,27 +162,33 @@ def main() -> None:
                     statuses[name][why.status] += 1
                     continue
                 statuses[name][check.status] += 1
-                results[name] = check.rig, check.calibration
+                results[name] = check.rig, check.calibration.to_plane
             else:
                 made = adjust(BEHIND_GLASS, [sighting(*one) for one in shots])
-                results[name] = adjusted_bench(BEHIND_GLASS, made, checked=True)
-        for name, (rig, calibration) in results.items():
-            found, sigma = measured(pool, bench, rig, calibration, seed)
-            errors[name].append((found - height, sigma, predicted[name], height))
+                rig, calibration = adjusted_bench(BEHIND_GLASS, made, checked=True)
+                results[name] = rig, calibration.to_plane
+        by_truth = np.nan
+        for name, (rig, to_plane) in results.items():
+            found, sigma = measured(pool, bench, rig, to_plane, seed)
+            by_truth = found if name == "true" else by_truth
+            row = found - height, sigma, predicted[name], found - by_truth, height
+            errors[name].append(row)
         if n % 10 == 9 or n == given.benches - 1:
             report(errors, statuses)
 
 
 def report(errors: dict[str, list[tuple[float, ...]]], statuses: dict[str, dict[str, int]]) -> None:
     """Print what has come out so far."""
-    print(f"{'':20} {'n':>4} lost covered  RMS error  RMS ±  predicted  (of the height, %)")
+    print(
+        f"{'':20} {'n':>4} lost covered  RMS error  RMS ±  predicted  by set-up  (of the height, %)"
+    )
     for name, rows in errors.items():
-        error, sigma, predicted, height = np.array(rows).T
+        error, sigma, predicted, by_setup, height = np.array(rows).T
         known = np.isfinite(error)
         covered = np.mean(np.abs(error[known]) < 1.96 * sigma[known])
         percent = [
-            100 * float(np.sqrt(np.mean((part[known] / height[known]) ** 2)))
-            for part in (error, sigma, predicted)
+            100 * float(np.sqrt(np.nanmean((part[known] / height[known]) ** 2)))
+            for part in (error, sigma, predicted, by_setup)
         ]
         lost = int((~known).sum())
         line = " ".join(f"{value:9.2f}" for value in percent)

@@ -2,9 +2,9 @@
 
 Run as ``python -m tests.benchmarks.wrong_setups [--seeds N] [--pictures N] [NAME …]``. The bench
 stands as the set-up of `bench_check` has it but for one thing. Pools are measured on it with the
-set-up as entered, with the adjusted one and with the true one, which shows what is no error of the
-set-up. Where the check names quantities, the likeliest is freed and the check repeated, as an
-operator would.
+set-up as entered, with the adjusted one and with the true one, whose errors are those of noise and
+level alone: the mean difference of the last two is what the check has left of the set-up's. Where
+the check names quantities, the likeliest is freed and the check repeated, as an operator would.
 """
 
 from __future__ import annotations
@@ -18,7 +18,6 @@ import numpy as np
 from labapp.core.bench_check.check import BenchCheck, check_bench
 from labapp.core.bench_check.labelling import Picture
 from labapp.core.bench_check.mirrors import Cap, Mirror, Plate
-from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.rig import ImagingPlane, Rig
 from labapp.core.values import CannotMeasure, FloatArray
 from labapp.simulation.benches import SimulatedBench
@@ -29,6 +28,7 @@ from tests.benchmarks.bench_check import (
     RIG,
     SHAPE,
     VIEW,
+    ToPlane,
     dots_at,
     measured,
     seen,
@@ -79,16 +79,9 @@ WRONG: Mapping[str, Callable[[], SimulatedBench]] = {
 """How the bench truly stands; the set-up is `RIG` and `CALIBRATION` in all."""
 
 
-def true_setup(bench: SimulatedBench) -> tuple[Rig, ImageCalibration]:
-    """The set-up that is right."""
-    view = bench.view
-    points = view.origin_px, view.x_axis_px, view.x_axis_mm, view.z_axis_px, view.z_axis_mm
-    return bench.rig, ImageCalibration.from_three_points(*points)
-
-
-def errors(bench: SimulatedBench, rig: Rig, calibration: ImageCalibration, seed: int) -> FloatArray:
+def errors(bench: SimulatedBench, rig: Rig, to_plane: ToPlane, seed: int) -> FloatArray:
     """Error of each pool's height, and its ±, in % of the height, shape (pools, 2)."""
-    found = [measured(one, bench, rig, calibration, [seed, 1]) for one in POOLS]
+    found = [measured(one, bench, rig, to_plane, [seed, 1]) for one in POOLS]
     true = np.array([one.peak_mm for one in POOLS])
     return 100 * (np.array(found) - np.outer(true, [1.0, 0.0])) / true[:, None]
 
@@ -133,17 +126,20 @@ def main() -> None:
     mirrors = MIRRORS[: given.pictures]
     print(f"{len(POOLS)} pools, height %: mean and largest error, ± of one; mirrors:")
     print(", ".join(one.name for one in mirrors))
-    print(f"{'wrong in the set-up':23} seed {'entered':19}  {'checked':19}  {'true':19}  check")
+    columns = "".join(f"{name:21}" for name in ("entered", "checked", "true"))
+    print(f"{'wrong in the set-up':23} seed {columns}set-up  check")
     for name in given.names:
         for seed in range(given.seeds):
             bench = WRONG[name]()
             check, said = checked(bench, mirrors, seed)
-            before = summary(errors(bench, RIG, CALIBRATION, seed))
-            after = f"{'refused':>19}"
+            before = summary(errors(bench, RIG, CALIBRATION.to_plane, seed))
+            true = errors(bench, bench.rig, bench.view.to_plane, seed)
+            after, left = f"{'refused':>19}", np.nan
             if check is not None:
-                after = summary(errors(bench, check.rig, check.calibration, seed))
-            true = summary(errors(bench, *true_setup(bench), seed))
-            print(f"{name:23} {seed:4} {before}  {after}  {true}  {said}", flush=True)
+                found = errors(bench, check.rig, check.calibration.to_plane, seed)
+                after, left = summary(found), float(np.nanmean(found[:, 0] - true[:, 0]))
+            line = f"{name:23} {seed:4} {before}  {after}  {summary(true)}  {left:+6.2f}  {said}"
+            print(line, flush=True)
 
 
 if __name__ == "__main__":

@@ -13,7 +13,7 @@ from labapp.config.bench_check import changed_since_check
 from labapp.config.mirror_text import mirror_text, parse_mirror
 from labapp.config.setup import checked_setup, parse_setup, unchecked_setup
 from labapp.core.bench_check.adjustment import adjust
-from labapp.core.bench_check.check import BenchCheck, check_bench
+from labapp.core.bench_check.check import REASONS, BenchCheck, check_bench
 from labapp.core.bench_check.forecast import forecast
 from labapp.core.bench_check.labelling import Picture, label_picture, sighting_of
 from labapp.core.bench_check.mirrors import Ball, Cap, Mirror, Plate, landing_points, placed
@@ -317,6 +317,30 @@ def test_what_the_model_lacks_is_named(plate: FlatMirror, pattern: DotPattern, v
     known = check.rig.uncertainty
     assert known is not None
     assert known.status != "checked"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("bend_per_mm", [(0.00044, 0.0), (0.00044, -0.00044)])
+def test_a_plate_0_05_mm_from_flat_is_named(bend_per_mm: tuple[float, float]):
+    """Over 30 mm. It pulls the thumb tack's height along, which may be named first."""
+    rng = np.random.default_rng(4)
+    tack = Cap(9.75, 0.91), spherical_cap(9.75, 0.91, (0.2, -0.1))
+    pairs = [(Plate(), FlatMirror(bend_per_mm=bend_per_mm)), tack]
+    check = check_bench([picture(*each, EXACT, rng)[0] for each in pairs], RIG, CALIBRATION)
+    assert check.status in ("plate-not-flat", "size-off")
+    assert REASONS["plate-not-flat"] in check.reason
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("height_mm", [1.5, 2.3])
+def test_a_wrong_height_of_a_plate_is_named(height_mm: float):
+    rng = np.random.default_rng(4)
+    pairs = [(Plate(), FlatMirror()), (Plate(2.0), FlatMirror(height_mm))]
+    check = check_bench([picture(*each, EXACT, rng)[0] for each in pairs], RIG, CALIBRATION)
+    assert check.status == "size-off"
+    assert "plate at 2 mm: height" in check.reason
+    size = check.pictures[1].sizes[0]
+    assert size.independent_mm == pytest.approx(height_mm, abs=3 * size.independent_sigma_mm)
 
 
 @pytest.mark.slow

@@ -42,6 +42,9 @@ WIDE = 10.0
 FAR_BETTER = 2.0
 """So many times as much the cost falls with a cause that explains the dots far better."""
 
+NEARLY = 0.6
+"""Another cause is named as well that explains more than this share of what the likeliest does."""
+
 SLIPPED = 10.0
 """Rays are those of the next row or column where the cost falls by more with these."""
 
@@ -335,26 +338,50 @@ def _status(
     slip: float,
     sizes: Mapping[str, MeasuredSize],
 ) -> tuple[Status, str]:
-    """What is off: a quantity or a size, unless a cause that the model lacks explains far more."""
-    explained = max((one.drop for one in patterns if one.cause == verdict), default=0.0)
-    name, size = max(sizes.items(), key=lambda pair: abs(pair[1].deviation))
+    """What is off: a quantity or a size, unless a cause that the model lacks explains far more.
+
+    The reason also names other causes that explain nearly as much.
+    """
+    lacks = verdict if verdict != "noise-like" else patterns[0].cause
+    explained = max((one.drop for one in patterns if one.cause == lacks), default=0.0)
     suspected = suspects[0].drop if suspects else 0.0
-    contradiction = size.deviation**2 if size.is_contradicted else 0.0
+    contradiction, sizes_off = _sizes_off(sizes)
     if slip > max(SLIPPED, suspected - ALIKE, contradiction - ALIKE):
         return "row-slipped", REASONS["row-slipped"]
+    causes: dict[Status, tuple[float, str]] = {
+        "size-off": (contradiction, sizes_off),
+        "quantity-off": (suspected, _suspected(suspects)),
+        lacks: (explained, REASONS[lacks]),
+    }
     # What the model lacks pulls the sizes along.
     if verdict != "noise-like" and explained >= max(FAR_BETTER * suspected, contradiction):
-        return verdict, REASONS[verdict]
-    if contradiction > suspected:
-        return "size-off", (
-            f"{name}: known to be {size.known_mm:.3f} ± {size.known_sigma_mm:.3f} mm, and measured "
-            f"without that {size.independent_mm:.3f} ± {size.independent_sigma_mm:.3f} mm: is it "
-            "the mirror that was named?"
-        )
-    if suspects:
-        names = " or ".join(one.name for one in suspects)
-        sure = np.sqrt(suspects[0].drop)
-        return "quantity-off", (
-            f"{names}: off by far more than the ± in the set-up ({sure:.0f} standard deviations)"
-        )
-    return "ok", ""
+        status: Status = verdict
+    elif contradiction > suspected:
+        status = "size-off"
+    elif suspects:
+        status = "quantity-off"
+    else:
+        return "ok", ""
+    best, reason = causes.pop(status)
+    likely = [text for drop, text in causes.values() if drop > max(NEARLY * best, 0.0)]
+    return status, "; or ".join([reason, *likely])
+
+
+def _sizes_off(sizes: Mapping[str, MeasuredSize]) -> tuple[float, str]:
+    """By how much the dots contradict the sizes of mirrors, in units of χ², and which sizes."""
+    off = {name: one for name, one in sizes.items() if one.is_contradicted}
+    square = max((one.deviation**2 for one in off.values()), default=0.0)
+    named = (
+        f"{name}: known to be {one.known_mm:.3f} ± {one.known_sigma_mm:.3f} mm, and measured "
+        f"without that {one.independent_mm:.3f} ± {one.independent_sigma_mm:.3f} mm"
+        for name, one in sorted(off.items(), key=lambda pair: -abs(pair[1].deviation))
+        if one.deviation**2 > NEARLY * square
+    )
+    return square, "; or ".join(named) + ": is it the mirror that was named?"
+
+
+def _suspected(suspects: Sequence[Suspect]) -> str:
+    """The suspects in words."""
+    names = " or ".join(one.name for one in suspects)
+    sure = np.sqrt(suspects[0].drop) if suspects else 0.0
+    return f"{names}: off by far more than the ± in the set-up ({sure:.0f} standard deviations)"
