@@ -158,14 +158,13 @@ def _over_caps(survey: ErrorSurvey, rows: Sequence[tuple[str, str, float]]) -> F
                         chosen &= np.isfinite(values)
                         diameter, cap = np.unique(size[chosen, 0], return_inverse=True)
                         each = [values[chosen][cap == n] for n in range(len(diameter))]
-                        mean = np.array([own.mean() for own in each])
+                        least, mean, largest = (
+                            np.array([of(own) for own in each]) for of in (np.min, np.mean, np.max)
+                        )
                         plot.errorbar(
                             diameter,
                             mean,
-                            [
-                                mean - [own.min() for own in each],
-                                [own.max() for own in each] - mean,
-                            ],
+                            np.array([mean - least, largest - mean]),
                             fmt=style,
                             elinewidth=0.5,
                             marker=STYLE_OF[scheme][1],
