@@ -404,7 +404,10 @@ def lead(
     if measuring:
         return Lead(f"{step.shows} It appears with the first frame measured.", ("cancel",))
     if facts.problems:
-        return Lead(f"{step.shows} What is missing is the set-up.", SETUP_ACTIONS)
+        begun = all("." in problem.field for problem in facts.problems)
+        names = (SETUP_ACTIONS[-1], *SETUP_ACTIONS[:-1]) if begun else SETUP_ACTIONS
+        missing = setup_to_do(facts.problems) if begun else "What is missing is the set-up"
+        return Lead(f"{step.shows} {missing}.", names)
     return Lead(step.shows, MEASURE_ACTIONS)
 
 

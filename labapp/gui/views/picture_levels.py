@@ -16,7 +16,7 @@ from labapp.gui.widgets.layouts import vbox
 from labapp.media import GreyImage
 
 LINE = "#ffb000"
-SIZE_PX = (420, 460)
+SIZE_PX = (360, 400)
 BINS = 128
 
 

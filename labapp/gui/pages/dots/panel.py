@@ -52,7 +52,7 @@ class MeasureLead(QStackedWidget):
     def __init__(self, do: Callable[[str], object]) -> None:
         super().__init__()
         for words, names in LEADS:
-            self.addWidget(Group(words, action_grid(names, do)))
+            self.addWidget(Group(words, action_grid(names, do), 1))
         self.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Fixed)
 
     def offer(self, without_setup: bool, why_not: str) -> None:
