@@ -19,7 +19,7 @@ from labapp.session.session import Session
 EXPECTED = {
     "gtaw": ["ok"] * 30,
     "thumb_tack": ["ok"] * 3,
-    "blocked_rows": ["ok", "ok", "ok", "no-match", "no-match", "no-match"],
+    "blocked_rows": ["ok", "ok", "ok", "ambiguous-rows", "no-match", "ambiguous-rows"],
     "concave": ["ok"] * 6,
 }
 
