@@ -193,7 +193,8 @@ class StudyWindow(ToolWindow):
     def make(self, path: Path) -> None:
         """Make the study that the form describes, and open it."""
         given = [self.recordings.value().strip()], self.setup.value().strip()
-        if self.workspace.run_or_report(lambda: write_study(path, *given)):
+        # Whether one that is there is replaced, the dialog has asked.
+        if self.workspace.run_or_report(lambda: write_study(path, *given, replace=True)):
             self.show_study(path)
 
     def show_study(self, path: Path) -> None:

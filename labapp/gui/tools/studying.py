@@ -100,7 +100,11 @@ def matches_text(pattern: str) -> str:
     names = ", ".join(dict.fromkeys(name for _, varied in found for name in varied))
     if names:
         return f"{count}; conditions: {names}"
-    return f"{count} without conditions: write {{name}} for the part of the path that gives one"
+    first = "/".join(found[0][0].parts[-2:])
+    return (
+        f"{count} without conditions, the first {first}. Write a name in braces for each part of "
+        "the path that is one: {current_a}"
+    )
 
 
 def session_path(folder: Path, recording: StudyRecording) -> Path:

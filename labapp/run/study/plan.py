@@ -193,7 +193,10 @@ def read_study(path: str | os.PathLike[str]) -> StudyPlan:
 
 
 def write_study(
-    path: str | os.PathLike[str], recordings: Sequence[str], setup: str | os.PathLike[str]
+    path: str | os.PathLike[str],
+    recordings: Sequence[str],
+    setup: str | os.PathLike[str],
+    replace: bool = False,
 ) -> StudyPlan:
     """Write a new study file that lists recordings; paths in it are relative where they can be.
 
@@ -205,6 +208,8 @@ def write_study(
         Paths of recordings, or patterns of them, from where the program runs.
     setup
         Setup file of them all.
+    replace
+        Whether a study that is there may be replaced; nothing else is.
 
     Raises
     ------
@@ -214,7 +219,9 @@ def write_study(
     path = Path(path)
     if path.suffix.lower() not in (".toml", ".csv"):
         raise InputError(path, "name", path.suffix or "no suffix", ".toml or .csv")
-    if path.exists():
+    if path.exists() and replace:
+        read_study(path)  # refuses what is none
+    elif path.exists():
         raise InputError(path, "file", "is there already", "a new file")
     folder = path.parent.absolute()
     found = [each for text in recordings for each in matching_recordings(text)]

@@ -162,3 +162,10 @@ def test_a_new_file_says_what_it_was_made_from(
     assert [one.conditions.get("current_a") for one in plan.recordings] == [80, 90, None]
     with pytest.raises(InputError):
         write_study(tmp_path / "sub" / name, ["=odd.avi"], "bench.toml")
+    plan = write_study(tmp_path / "sub" / name, ["=odd.avi"], "bench.toml", replace=True)
+    assert len(plan.recordings) == 1
+    other = tmp_path / f"other{Path(name).suffix}"
+    other.write_text("a = 1\n")
+    with pytest.raises(InputError):
+        write_study(other, ["=odd.avi"], "bench.toml", replace=True)
+    assert other.read_text() == "a = 1\n"
