@@ -6,12 +6,12 @@ from collections.abc import Callable
 
 from PySide6.QtCore import QEvent, QPointF, Qt
 from PySide6.QtGui import QAction, QGuiApplication, QKeyEvent, QKeySequence, QPalette
-from PySide6.QtWidgets import QLabel, QVBoxLayout
+from PySide6.QtWidgets import QVBoxLayout
 
 from labapp.gui.views.axes import make_plot, paint_axes
 from labapp.gui.views.canvas import Plotted
 from labapp.gui.views.picture_files import save_plot
-from labapp.gui.widgets.labels import wrapping_label
+from labapp.gui.widgets.labels import plain_label, wrapping_label
 
 KEYS = "+ − zoom, F shows all"
 ZOOM = 1.25
@@ -40,7 +40,7 @@ class Chart(Plotted):
         layout.setSpacing(0)
         layout.addWidget(self.title)
         layout.addWidget(self.plot)
-        self._at = QLabel(self.plot)
+        self._at = plain_label(parent=self.plot)
         self._at.setAttribute(Qt.WidgetAttribute.WA_TransparentForMouseEvents)
         self._at.hide()
         self.plot.scene().sigMouseMoved.connect(self._moved_to)
