@@ -15,8 +15,10 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from unittest import mock
 
 from labapp.errors import InputError
+from labapp.gui import drafts
 from labapp.gui.app import open_window, start_app
 from labapp.gui.preferences import Preferences
 
@@ -85,7 +87,8 @@ def tour(out: Path, size_px: tuple[int, int], theme: str) -> str:
         preferences = BorrowedPreferences(
             theme=theme, last_folder=str(folder / "measurements"), tour_folder=name
         )
-        with open_window(app, preferences, folder / "preferences.json") as window:
+        own = mock.patch.object(drafts, "drafts_folder", return_value=folder / "drafts")
+        with own, open_window(app, preferences, folder / "preferences.json") as window:
             try:
                 go_through(Hands(window, out, size_px), folder)
             except TourFailed as failure:
