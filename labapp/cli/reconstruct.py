@@ -116,7 +116,6 @@ def reconstruct(
         summary = _measure_recording(
             *(source, setup, out, settings, frames),
             surfaces=surfaces == "all",
-            with_surfaces=surfaces == "all" or model is not None,
             sigma_parts=sigma_parts,
             warm=warm,
             streams=streams,
@@ -173,15 +172,13 @@ def _measure_recording(
     frames: str,
     *,
     surfaces: bool,
-    with_surfaces: bool,
     sigma_parts: bool,
     warm: bool,
     streams: Sequence[Sink],
 ) -> Summary:
     """Measure, showing progress and failures on stderr and the summary on stdout.
 
-    Parameters are the command's options (`reconstruct`), sinks for the streams, and whether they
-    need surfaces.
+    Parameters are the command's options (`reconstruct`), and sinks for the streams.
     """
     from labapp.config.setup import read_setup
     from labapp.core.recording.residual_check import ResidualRecord, judged_status
@@ -206,7 +203,7 @@ def _measure_recording(
                 if warm:
                     processes = at_end.enter_context(stretch_pools(len(selected)))
                     measurer = RecordingMeasurer(
-                        *(source_path, source.index, setup, settings, with_surfaces, sigma_parts),
+                        *(source_path, source.index, setup, settings, surfaces, sigma_parts),
                         processes,
                     )
                 sinks = [results.write, summary.add, *streams, shown]
