@@ -14,9 +14,7 @@ import numpy as np
 
 from labapp.core.geometry.bench import Bench
 from labapp.core.matching.hypothesis import (
-    MISSED_COST,
     STEPS,
-    STRAY_COST,
     USUAL_KNOTS,
     Hypothesis,
     evaluate,
@@ -53,11 +51,10 @@ def another_hole_explains(
     others = [] if observed.rig.uncertainty is None else _labels_by_other_holes(observed, best)
     if not others:
         return False
-    own = _cost_with_setup_free(observed, best, fit, np.inf)
+    own, own_grown = _costs_with_setup_free(observed, best, fit)
     rivals = (rival for labels in others if (rival := evaluate(observed, labels)))
-    return any(
-        _cost_with_setup_free(observed, rival, fit, own + margin) < own + margin for rival in rivals
-    )
+    costs = (_costs_with_setup_free(observed, rival, fit, own + margin) for rival in rivals)
+    return any(grown < own_grown + margin for _, grown in costs)
 
 
 def _labels_by_other_holes(observed: Observation, best: Hypothesis) -> list[IntArray]:
@@ -72,19 +69,19 @@ def _labels_by_other_holes(observed: Observation, best: Hypothesis) -> list[IntA
     ]
 
 
-def _cost_with_setup_free(
-    observed: Observation, hypothesis: Hypothesis, fit: FitSettings, most: float
-) -> float:
-    """Cost of labels and of the set-up that they are likeliest with; infinite without a surface.
+def _costs_with_setup_free(
+    observed: Observation, hypothesis: Hypothesis, fit: FitSettings, most: float = np.inf
+) -> tuple[float, float]:
+    """Cost of labels and of the set-up that they are likeliest with; of what they grow to there.
 
     That set-up is found in one Gauss–Newton step, which takes the squares of the residuals and of
-    the set-up's deviations, in σ, to their least sum, the surface fitted anew. Labels grow from
-    there, unless the cost would be above ``most`` even without what they leave over.
+    the set-up's deviations, in σ, to their least sum, the surface fitted anew. Costs are infinite
+    without a surface, and where that of the labels as they are is not below ``most``.
     """
     labels, known = hypothesis.labels, observed.rig.uncertainty
     pool = try_fit(observed, labels, USUAL_KNOTS, hypothesis.pool)
     if pool is None or known is None:
-        return np.inf
+        return np.inf, np.inf
     at = np.argwhere(labels != UNLABELLED)
     dot = labels[tuple(at.T)]
     pairs = at + 1, observed.plane_mm[dot], observed.covariance_mm2[dot]
@@ -97,10 +94,9 @@ def _cost_with_setup_free(
     rig, plane_mm = bench_off(observed.rig, known.root @ deviates, observed.plane_mm)
     moved = replace(observed, bench=Bench(rig, observed.bench.calibration), plane_mm=plane_mm)
     found, setup_cost = evaluate_twice(moved, labels, fit, pool), float(deviates @ deviates)
-    if found is None:
-        return np.inf
-    left = STRAY_COST * found.stray_count + MISSED_COST * found.missed_count
-    if found.cost - left + setup_cost < most and (more := grow_and_evaluate(moved, labels)):
-        grown = evaluate_twice(moved, more.labels, fit, more.pool)
-        found = min(found, grown or found, key=lambda one: one.cost)
-    return found.cost + setup_cost
+    if found is None or found.cost + setup_cost >= most:
+        return np.inf, np.inf
+    more = grow_and_evaluate(moved, labels)
+    grown = more and evaluate_twice(moved, more.labels, fit, more.pool)
+    least = min(found.cost, grown.cost if grown else np.inf)
+    return found.cost + setup_cost, least + setup_cost
