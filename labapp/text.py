@@ -16,7 +16,7 @@ SETUP_WORDS = {
     "entered": "The set-up was entered by hand, not calibrated; usual uncertainties are assumed.",
     "calibrated": "Laser and imaging plane were calibrated, not checked against a known mirror.",
     "checked": "The set-up was checked against a known mirror.",
-    "doubtful": "The set-up is doubtful: the recording contradicts it.",
+    "doubtful": "The set-up is doubtful: a value is unusual, or the recording contradicts it.",
 }
 """What `setup_status` means to the operator."""
 

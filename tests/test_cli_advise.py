@@ -71,7 +71,7 @@ def test_options_replace_the_file_and_the_impossible_is_told(labapp: Run, tmp_pa
     ("text", "options", "told"),
     [
         ("", (), "pools"),
-        (POOLS + "[bnch]\n", (), "bench, perhaps"),
+        (POOLS + "[bnch]\n", (), "bench, the most similar"),
         (POOLS.replace("convex", "flat"), (), "pools.kind"),
         (POOLS + "[camera]\npx_per_mm = -1\n", (), "camera.px_per_mm"),
         (POOLS + "[bench]\nprojection_angle_deg = [6, 30]\n", (), "above half the fan"),

@@ -114,7 +114,7 @@ def test_what_cannot_be_is_refused_in_words(tmp_path: Path, labapp: Run) -> None
         (("uvc:77", "--out", out), "uvc:77: camera: uvc:77 is not connected; expected a camera"),
         ((CAMERA,), "either --out or --session"),
         ((CAMERA, "--out", out, "--session", out), "either --out or --session"),
-        ((CAMERA, "--session", tmp_path / "no.labsession"), "is not there"),
+        ((CAMERA, "--session", tmp_path / "no.labsession"), "does not exist"),
         ((CAMERA, "--out", out.with_suffix(".avi")), "; expected a file that ends in .nut"),
         ((CAMERA, "--out", out, "--rate", "0"), "rate_hz: 0.0; expected from 0.1 to 10000"),
         ((CAMERA, "--out", out, "--exposure", "5"), "exposure_us: 5.0; expected nothing"),

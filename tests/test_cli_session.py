@@ -357,7 +357,7 @@ def test_a_recording_that_was_moved_is_found_again(labapp: Run, measured: Path) 
     moved = (measured.parent / "stack.npy").rename(measured.parent / "moved.npy")
     code, _, complained = labapp("session", "measure", measured, "--all")
     assert code == 2
-    assert "stack.npy: recording: is not there" in complained
+    assert "stack.npy: recording: does not exist" in complained
     _, said, _ = labapp("session", "info", measured)
     assert "stack.npy is missing; labapp session relink says where it is now" in said
     code, _, complained = labapp("session", "relink", measured, SAMPLE / "recording.avi")

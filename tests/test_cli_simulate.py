@@ -283,8 +283,8 @@ CAP = 'shape = "cap"\ndiameter_mm = 7.0\nheight_mm = 0.3\n'
 @pytest.mark.parametrize(
     ("pool", "more", "changed", "words"),
     [
-        ("", "[lock]\nx = 1\n", {}, "lock: unknown key; expected look, perhaps"),
-        ("", "[torches]\n", {}, "torches: unknown key; expected torch, perhaps"),
+        ("", "[lock]\nx = 1\n", {}, "lock: unknown key; expected look, the most"),
+        ("", "[torches]\n", {}, "torches: unknown key; expected torch, the most"),
         ("", "[torch]\nradius_mm = 1.0\n", {}, "torch.tip_mm: missing; expected [x, y, z]"),
         ("", "", {"hot_pixels": "1.5"}, "look.hot_pixels: 1.5; expected a whole number from 0"),
         ("", "", {"frames": "0"}, "recording.frames: 0; expected a whole number from 1"),
@@ -301,7 +301,7 @@ CAP = 'shape = "cap"\ndiameter_mm = 7.0\nheight_mm = 0.3\n'
         ("", "", {"kind": '"running"'}, 'expected "standing" or "travelling"'),
         ("", "", {"shape": '"eg"'}, 'pool.shape: "eg"; expected "cap" or "ellipsoid" or "egg"'),
         ("width_mm = 6.0\n", "", {}, 'pool.shape: missing; expected "cap"'),
-        (CAP + "head_mm = 3.0\n", "", {}, "pool.head_mm: unknown key; expected height_mm, perhaps"),
+        (CAP + "head_mm = 3.0\n", "", {}, "pool.head_mm: unknown key; expected height_mm"),
         (CAP + "dent = 3\n", "", {}, "pool.dent: 3; expected a table, or a list of them"),
         (CAP + "dent = [3]\n", "", {}, "pool.dent[0]: 3; expected a table [[pool.dent]] with dep"),
         (CAP + "[pool.low_rear]\n", "", {}, "pool.low_rear.drop_mm: missing"),
@@ -348,6 +348,19 @@ def test_what_is_no_scenario_is_refused(
     code, _, err = labapp("simulate", path, "--out", tmp_path / "out")
     assert code == 2
     assert words in err
+
+
+def test_an_unknown_name_is_answered_with_those_that_there_are(labapp: Run, tmp_path: Path) -> None:
+    names = {path.stem for path in EXAMPLES.glob("*.toml")}
+    code, _, err = labapp("simulate", "eg", "--out", tmp_path / "out")
+    assert code == 2
+    assert "egg (the most similar name)" in err
+    page = (EXAMPLES.parents[1] / "docs" / "simulation.md").read_text("utf-8")
+    said = " ".join(labapp("simulate", "--help")[1].replace("│", " ").split())
+    for name in names:
+        assert name in err
+        assert f"`{name}`" in page
+        assert name in said
 
 
 def test_a_missing_scenario_and_a_homography_are_refused(tmp_path: Path, labapp: Run) -> None:

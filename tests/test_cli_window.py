@@ -50,7 +50,7 @@ def test_a_file_that_is_not_there_is_named(labapp: Run, tmp_path: Path):
     code, _, err = labapp(tmp_path / "gone.labsession")
     assert code == 2
     assert "gone.labsession" in err
-    assert "is not there" in err
+    assert "does not exist" in err
 
 
 def test_without_what_windows_need_it_says_what_to_install(

@@ -183,7 +183,7 @@ def _opened(path: Path | None) -> Iterator[Session | None]:
         yield None
         return
     if not path.is_file():
-        raise InputError(path, "--session", "is not there", "one: labapp session new")
+        raise InputError(path, "--session", "does not exist", "one: labapp session new")
     with Session.open(path) as session:
         session.refuse_another_recording()
         yield session

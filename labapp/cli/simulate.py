@@ -7,8 +7,11 @@ from typing import Annotated
 
 import typer
 
+from labapp.bundled import bundled
 from labapp.cli.shared import progress_shown
 from labapp.text import pluralize
+
+SHIPPED = sorted(path.stem for path in bundled("resources/simulations").glob("*.toml"))
 
 
 def simulate(
@@ -16,7 +19,7 @@ def simulate(
         Path,
         typer.Argument(
             help="Pool, bench and camera (TOML; mm, degrees, px): docs/simulation.md. Or the name "
-            "of a scenario that comes with labapp: egg."
+            f"of a scenario that comes with labapp: {', '.join(SHIPPED)}."
         ),
     ],
     out: Annotated[

@@ -20,7 +20,7 @@ from labapp.config.setup_keys import SECTIONS
 from labapp.config.toml_keys import check_keys, parse_toml, read_text, unknown_key
 from labapp.core.geometry.rig import Rig
 from labapp.core.values import FloatArray
-from labapp.errors import InputError
+from labapp.errors import InputError, unknown_name
 from labapp.simulation.camera import CameraView, Lens
 from labapp.simulation.pools import Dent, Footprint, LowRear, Pool, Term, Wave
 from labapp.simulation.recording import Recording, TruePool
@@ -63,9 +63,19 @@ def shipped_scenarios() -> list[Path]:
 
 
 def find_scenario(name: Path) -> Path:
-    """Scenario of a command line: a file, or the name of one that comes with labapp, "egg"."""
+    """Scenario of a command line: a file, or the name of one that comes with labapp, "egg".
+
+    Raises
+    ------
+    InputError
+        If there is neither.
+    """
     shipped = {path.stem: path for path in shipped_scenarios()}
-    return name if name.is_file() else shipped.get(str(name), name)
+    if name.is_file() or name.suffix or name.parent != Path():
+        return name
+    if str(name) not in shipped:
+        raise unknown_name("SCENARIO", "scenario", str(name), [*shipped, "a scenario file"])
+    return shipped[str(name)]
 
 
 def read_scenario(

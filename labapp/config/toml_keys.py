@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import json
+import re
 import tomllib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -48,7 +49,32 @@ def parse_toml(text: str, path: Path, wanted: str) -> dict[str, Any]:
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # ValueError: too many digits, too
-        raise InputError(path, "syntax", error, wanted) from error
+        raise InputError(path, "syntax", *_syntax(text, error, wanted)) from error
+
+
+def _syntax(text: str, error: Exception, wanted: str) -> tuple[str, str]:
+    """What stands on the line of a syntax error, and what would be right."""
+    place = _PLACE.search(str(error))
+    lines = text.splitlines()
+    if place is None or not 0 < int(place[1]) <= len(lines):
+        return str(error), wanted
+    line = lines[int(place[1]) - 1].strip()
+    shown_line = f"line {place[1]} is “{line}”" if line else f"line {place[1]} is empty"
+    if number := _DECIMAL_COMMA.search(line):
+        return shown_line, f"a decimal point: {number[1]}.{number[2]}"
+    key, equals, value = (part.strip() for part in line.partition("="))
+    if equals and key and not value:
+        return shown_line, f"a value after {key} ="
+    if equals and value[0].isalpha() and value not in ("true", "false", "nan", "inf"):
+        return shown_line, f'a number, or text in quotation marks: {key} = "{value}"'
+    if equals and (unit := _WITH_UNIT.fullmatch(value)):
+        return shown_line, f"the number without its unit: {key} = {unit[1]}"
+    return f"{shown_line} ({_PLACE.sub('', str(error)).strip()})", wanted
+
+
+_PLACE = re.compile(r"\(at line (\d+), column \d+\)")
+_DECIMAL_COMMA = re.compile(r"=\s*([+-]?\d+),(\d+)\s*(?:#.*)?$")
+_WITH_UNIT = re.compile(r"([+-]?\d+(?:\.\d+)?)\s*(?:mm|cm|m|in|px|deg|°|\")\s*(?:#.*)?")
 
 
 @dataclass(frozen=True)
@@ -140,7 +166,7 @@ def check_keys(
 def unknown_key(path: Path, full: str, known: Mapping[str, object]) -> InputError:
     """Error for an unknown key or table, with the most similar known one."""
     near = difflib.get_close_matches(full.rpartition(".")[2], known, 1)
-    expected = f"{near[0]}, perhaps" if near else f"one of {', '.join(known)}"
+    expected = f"{near[0]}, the most similar key" if near else f"one of {', '.join(known)}"
     return InputError(path, full, "unknown key", expected)
 
 

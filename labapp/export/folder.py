@@ -451,7 +451,7 @@ def _manifest(folder: Path) -> tuple[ExportedFile, ...]:
     path = folder / MANIFEST
     try:
         if not path.is_file() or path.stat().st_size > LARGEST_MANIFEST:
-            raise InputError(folder, MANIFEST, "is not there", AN_EXPORT)
+            raise InputError(folder, MANIFEST, "does not exist", AN_EXPORT)
         content = json.loads(path.read_bytes())
         if content["program"] != "labapp":
             raise ValueError

@@ -70,7 +70,7 @@ def main(arguments: Sequence[str]) -> int:
     """
     path = Path(arguments[0]).absolute() if arguments else None
     if path is not None and not path.exists():
-        raise InputError(path, "file", "is not there", "a session, or a recording to import")
+        raise InputError(path, "file", "does not exist", "a session, or a recording to import")
     app = start_app()
 
     from labapp.gui.preferences import preferences_file, read_preferences

@@ -285,7 +285,7 @@ class Frames:
             If it is not where it should be.
         """
         if (missing := self.missing) is not None:
-            raise InputError(missing, "recording", "is not there", THE_RECORDING)
+            raise InputError(missing, "recording", "does not exist", THE_RECORDING)
 
     def relink(self, path: str | os.PathLike[str], verify: bool = True) -> None:
         """Set the path of the recording.
@@ -365,7 +365,7 @@ class Frames:
         if self._source is None:
             recording, place = self._imported(), self._place()
             if not place.exists():
-                raise InputError(place, "recording", "is not there", THE_RECORDING)
+                raise InputError(place, "recording", "does not exist", THE_RECORDING)
             source = open_source(place, recording.index)
             if (len(source), source.shape) != (
                 recording.frames,

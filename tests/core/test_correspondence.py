@@ -522,7 +522,7 @@ def test_too_few_rows_or_an_orientation_that_is_wrong_have_no_answer() -> None:
     seen = exact(CONVEX)
     correction, reference = by_hand(seen)
     good = set_reference(correction, reference)
-    with pytest.raises(CannotMeasure, match="too-few-dots: 5 dots have a row"):
+    with pytest.raises(CannotMeasure, match="too-few-dots: only 5 dots have a row"):
         corrected(clear_rows(good, np.arange(5, len(seen.ray))))
     with pytest.raises(CannotMeasure, match="no-match: the correction"):
         corrected(good, MatchSettings(correspondence="I/I"))

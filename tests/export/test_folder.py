@@ -595,5 +595,5 @@ def test_a_manifest_that_is_none_is_told(tmp_path: Path, text: str) -> None:
 
 def test_a_folder_without_a_manifest_is_told(tmp_path: Path) -> None:
     for folder in (tmp_path, tmp_path / "nowhere"):
-        with pytest.raises(InputError, match=r"manifest\.json: is not there"):
+        with pytest.raises(InputError, match=r"manifest\.json: does not exist"):
             verify_export(folder)

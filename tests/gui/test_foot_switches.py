@@ -167,7 +167,7 @@ def test_what_a_pedal_does_is_changed_and_taken_away(start, bench: Bench, copy_s
     qtbot.waitUntil(lambda: window.page.key == "dots")
     window.show_step("capture")
     for pedal in (0, 1, 2):
-        hand.choose(panel.pedals[key, pedal], "nothing any more")
+        hand.choose(panel.pedals[key, pedal], "no action")
         qtbot.waitUntil(lambda pedal=pedal: (key, pedal) not in panel.pedals)
     assert window.workspace.foot_switches.in_use == {}
     assert read_preferences(window.preferences.path)[0].foot_switches == ()

@@ -366,7 +366,7 @@ def test_what_is_dropped_is_opened_or_imported(
     drop(plain, qtbot, path, recording)
     assert "Drop one file" in problems(plain)[0]
     drop(plain, qtbot, tmp_path / "gone.avi")
-    assert "is not there" in problems(plain)[1]
+    assert "does not exist" in problems(plain)[1]
 
 
 def test_what_is_no_recording_makes_no_draft(plain: MainWindow, tmp_path: Path, qtbot: QtBot):
@@ -634,7 +634,7 @@ def test_a_fault_goes_to_the_log_and_is_said(plain: MainWindow, qtbot: QtBot):
 def test_without_a_display_or_a_file_it_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, state: Path
 ):
-    with pytest.raises(InputError, match="is not there"):
+    with pytest.raises(InputError, match="does not exist"):
         app.main([str(tmp_path / "gone.avi")])
     for name in ("DISPLAY", "WAYLAND_DISPLAY", "QT_QPA_PLATFORM"):
         monkeypatch.delenv(name, raising=False)

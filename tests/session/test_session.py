@@ -326,7 +326,7 @@ def test_a_recording_that_is_gone_is_asked_for_and_what_was_measured_shows(folde
         assert result is not None
         assert result.measurement.measures is not None
         for attempt in (lambda: session.frame(0), lambda: next(session.measure_each())):
-            with pytest.raises(InputError, match="is not there"):
+            with pytest.raises(InputError, match="does not exist"):
                 attempt()
         assert session.overview().status == ("ok", "ok", "", "")
         session.relink(folder / "moved.avi")

@@ -78,7 +78,7 @@ def match_corrected(
     elif count < LEAST_LABELS:
         raise CannotMeasure(
             "too-few-dots",
-            f"{count} dots have a row and a column, telling rays needs {LEAST_LABELS}",
+            f"only {count} dots have a row and a column; at least {LEAST_LABELS} are needed",
         )
     observed = Observation.of(dots, bench, frame_shape)
     tried = (_bound(observed, lattice, reference, orientation) for orientation in orientations)

@@ -97,7 +97,7 @@ def match_rays(
     """
     if len(dots) < LEAST_LABELS:
         raise CannotMeasure(
-            "too-few-dots", f"{len(dots)} dots were found, telling rays needs {LEAST_LABELS}"
+            "too-few-dots", f"only {len(dots)} dots found; at least {LEAST_LABELS} are needed"
         )
     if bench.rig.pattern.marker is None:
         raise CannotMeasure("no-reference", "the pattern has no absent ray, which tells rows apart")

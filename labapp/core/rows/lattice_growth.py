@@ -64,7 +64,7 @@ def grow_lattice(dots: Dots, settings: GrowSettings) -> Lattice:
 
     if len(dots) < settings.least:
         raise CannotMeasure(
-            "too-few-dots", f"{len(dots)} dots were found, a grid needs {settings.least}"
+            "too-few-dots", f"only {len(dots)} dots found; a grid needs {settings.least}"
         )
     plane = dots.u_px - 1j * dots.v_px
     order = np.argsort(plane.real)

@@ -103,7 +103,7 @@ def solve(
     """
     if len(match.ray) < LEAST_DOTS:
         raise CannotMeasure(
-            "too-few-dots", f"{len(match.ray)} dots have a ray, a surface needs {LEAST_DOTS}"
+            "too-few-dots", f"only {len(match.ray)} dots have a ray; a surface needs {LEAST_DOTS}"
         )
     if not (match.witness < 0).any():
         raise CannotMeasure("open-boundary", "no visible ray is missing: the boundary is not seen")

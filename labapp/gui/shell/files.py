@@ -163,7 +163,7 @@ class Files(QObject):
     def take(self, path: Path) -> None:
         """Take a recording into the session; in a draft where none is open."""
         if not path.exists():
-            self.workspace.notified.emit(f"{path} is not there", True)
+            self.workspace.notified.emit(f"{path} does not exist", True)
         elif self.workspace.session is None:
             self.begin_draft(path)
         else:

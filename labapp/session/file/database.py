@@ -406,7 +406,7 @@ def _lock(path: Path) -> FileLock:
     lock = FileLock(path.with_name(f".{path.name}.lock"))
     try:
         if not path.parent.is_dir():
-            raise NotADirectoryError(20, "is not there")
+            raise NotADirectoryError(20, "does not exist")
         lock.acquire(blocking=False)
     except Timeout as error:
         raise SessionInUse(

@@ -18,7 +18,7 @@ from labapp.media.devices.hid import commands
 
 NOTHING = "nothing"
 
-CHOICES = [*((action, words) for action, words in DOES.items()), (NOTHING, "nothing any more")]
+CHOICES = [*((action, words) for action, words in DOES.items()), (NOTHING, "no action")]
 
 NONE_YET = "No foot switch is in use. Plug one in, press Learn a pedal, and step on it."
 
