@@ -24,7 +24,7 @@ from labapp.session.file.database import SUFFIX
 
 SAMPLES = Path(__file__).parents[2] / "sample_sessions"
 
-HOMES = ("XDG_STATE_HOME", "XDG_CONFIG_HOME", "XDG_DOCUMENTS_DIR")
+HOMES = ("XDG_STATE_HOME", "XDG_CONFIG_HOME", "XDG_DATA_HOME", "XDG_DOCUMENTS_DIR")
 """Where the app looks for its own; not all of the home, where others keep what is slow to make."""
 
 WITHOUT_DESKTOP = ("This plugin does not support",)

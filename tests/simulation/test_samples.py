@@ -273,24 +273,19 @@ def test_torch_out_of_the_way_is_no_matter():
 
 @pytest.mark.parametrize("index", [2, 4, 5])
 @pytest.mark.slow
-def test_blocked_frame_is_measured_while_its_rows_can_be_told(index):
-    frame = blocked_rows().frame(index)
-    result = measured(blocked_rows(), index)
-    assert result.status == advised(index)[0] == "ok"
-    assert result.measures.height_mm == pytest.approx(frame.pool.size.height_mm, rel=0.05)
-    true = frame.reflections.plane_mm[tuple(result.match.ray.T - 1)]
-    np.testing.assert_allclose(result.match.plane_mm, true, atol=0.3)
-
-
-@pytest.mark.slow
-def test_marked_rows_bring_a_blocked_frame_closer():
-    sample, frame = blocked_rows(), blocked_rows().frame(5)
-    correction = start_correction(measured(sample, 5))
-    for row in advised(5)[3]:
+def test_a_blocked_frame_is_measured_with_its_reference_given(index):
+    sample, frame = blocked_rows(), blocked_rows().frame(index)
+    result = measured(sample, index)
+    status, reference, _, blocked = advised(index)
+    assert result.status == status == "ambiguous-rows"
+    correction = set_reference(start_correction(result), reference)
+    for row in blocked:
         correction = block_row(correction, row)
-    result = measured(sample, 5, correction)
+    result = measured(sample, index, correction)
     assert result.status == "ok"
     assert result.measures.height_mm == pytest.approx(frame.pool.size.height_mm, rel=0.02)
+    true = frame.reflections.plane_mm[tuple(result.match.ray.T - 1)]
+    np.testing.assert_allclose(result.match.plane_mm, true, atol=0.3)
 
 
 @pytest.mark.parametrize("mark", [True, False])

@@ -42,10 +42,10 @@ def test_a_measured_frame_is_told_with_its_figures(session: Session) -> None:
 
 
 def test_it_is_marked_how_far_the_set_up_of_a_surface_can_be_relied_on(session: Session) -> None:
-    assert list(session.measure([3]))
-    assert presenter.shown(session, 3).setup_words.startswith(SETUP_MARKS["entered"])
+    assert list(session.measure([4]))
+    assert presenter.shown(session, 4).setup_words.startswith(SETUP_MARKS["entered"])
     session.update_setup({"laser": {"distance_mm": 31.0}})
-    assert presenter.shown(session, 3).setup_words == ""
+    assert presenter.shown(session, 4).setup_words == ""
 
 
 def test_it_says_where_the_figures_come_from(session: Session) -> None:
