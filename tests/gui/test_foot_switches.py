@@ -255,7 +255,7 @@ def test_unplugged_is_said_and_it_comes_back_by_itself(start, bench: Bench, copy
     window.files.open(copy_sample("thumb_tack"))
     panel = panel_of(window)
     qtbot.waitUntil(connected(window))
-    unplugged = "▲ VEC Infinity foot pedal: not connected. It goes on when it is plugged in"
+    unplugged = "▲ VEC Infinity foot pedal: not connected. It works again once it is plugged in"
     for count in (1, 2):
         bench.devices[INFINITY].plugged = False
         qtbot.waitUntil(lambda: panel.words.text() == unplugged)
@@ -317,7 +317,7 @@ def test_where_there_is_no_foot_switch_it_is_said(start, bench: Bench, copy_samp
     window.files.open(copy_sample("thumb_tack"))
     panel, hand = panel_of(window), Hand(window)
     hand.button("Look for devices")
-    qtbot.waitUntil(lambda: "No foot switch that is known" in panel.words.text())
+    qtbot.waitUntil(lambda: "No known foot switch" in panel.words.text())
     hand.button("Learn a pedal")
     told = "no foot switch is connected: plug it in"
     qtbot.waitUntil(lambda: window.status_line.unread == [told])
