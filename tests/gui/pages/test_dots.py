@@ -478,7 +478,7 @@ def test_a_button_asks_for_the_click_it_needs(
     assert kept is not None
     assert kept.lattice.reference == (6, 8)  # as blocked_rows/README.md has it
     assert panel.chosen.text().startswith("Nothing chosen")
-    assert "Press Reference" not in panel.why.text()
+    assert "press Reference" not in panel.why.text()
     assert button.mapTo(page.panel, QPoint()) == left
     assert unfitted == [[3]]
 
