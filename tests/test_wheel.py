@@ -93,7 +93,7 @@ def test_without_windows_it_measures_and_simulates(uv: Path, away: Path) -> None
 @pytest.mark.xvfb
 @pytest.mark.usefixtures("opengl")
 def test_with_windows_it_opens_and_goes_through_every_page(uv: Path, away: Path) -> None:
-    labapp = install(uv, away, "[gui]")
+    labapp = install(uv, away, "[gui,study]")
     labapp("demo", "--frames", "0:1", "--no-window", "--out", "demo in 3-D")
     assert list((away / "demo in 3-D").glob("surface_*.png"))
     shutil.copytree(ROOT / "tests" / "tour", away / "tour")  # away from the checkout's labapp
