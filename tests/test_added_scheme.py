@@ -69,6 +69,7 @@ app = QApplication([])
 from labapp.gui.pages.export import presenter as export
 from labapp.gui.pages.surface import compare, comparison, panel, presenter
 from labapp.gui.tools import analysing
+from labapp.gui.widgets.labels import Message
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
 from labapp.studies import analysis, error_analysis, pictures
@@ -80,7 +81,7 @@ def offered(field):
 
 
 holder = QWidget()
-side = panel.SurfacePanel(Workspace(), QVBoxLayout(holder))
+side = panel.SurfacePanel(Workspace(), QVBoxLayout(holder), Message(1))
 box = compare._SchemeBox("First")
 found = {
     "surface page": offered(side.scheme),

@@ -155,7 +155,7 @@ def test_what_cannot_be_is_refused(
 @pytest.mark.slow
 def test_a_frame_is_compared_by_algorithm(labapp: Run, tmp_path: Path) -> None:
     recording = SETUP.with_name("recording.avi")
-    given = ["analyze", "frame", str(recording), "--setup", str(SETUP), "--frame", "3"]
+    given = ["analyze", "frame", str(recording), "--setup", str(SETUP), "--frame", "4"]
     code, _, err = labapp(*given, "--known-object", "7", "0.3", "--out", str(tmp_path))
     assert code == 0, err
     (shape,) = table(tmp_path / "section_7_1_row_shape.csv")

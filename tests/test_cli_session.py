@@ -328,9 +328,9 @@ def test_warnings_of_a_recording_are_told(labapp: Run, tmp_path: Path) -> None:
     ("options", "said"),
     [
         (["none.avi"], "none.avi: source: No such file or directory"),
-        (["stack.npy", "--frames", "9:"], "--frames: frames: 9:; expected some of the frames 0"),
+        (["stack.npy", "--frames", "9:"], "stack.npy: frames: 9:"),
         (["stack.npy", "--frame-rate", "nan"], "--frame-rate"),
-        (["stack.npy", "--frame-rate", "0"], "frame rate: 0.0; expected frames a second above 0"),
+        (["stack.npy", "--frame-rate", "0"], "stack.npy: frame rate: 0.0"),
     ],
 )
 def test_an_import_that_fails_changes_nothing(
