@@ -16,31 +16,8 @@ from labapp.simulation.camera import CameraView
 from labapp.simulation.line_frames import LineLook, render_lines
 from labapp.simulation.pools import spherical_cap
 from tests.conftest import Run
+from tests.setups import FIVE_LINES as SETUP
 
-SETUP = """
-[laser]
-projection_angle_deg = 27.0
-distance_mm = 90.0
-[pattern]
-kind = "lines"
-count = 5
-interline_angle_deg = 0.23
-fan_angle_deg = 5.0
-[electrode]
-height_mm = 5.0
-[imaging_plane]
-distance_mm = 53.6
-s_mm = 32.0
-h_mm = -5.0
-width_mm = 64.0
-height_mm = 84.0
-[image_calibration]
-origin_px = [2.0, 638.0]
-x_axis_px = [452.0, 638.0]
-x_axis_mm = 60.0
-z_axis_px = [2.0, 188.0]
-z_axis_mm = 60.0
-"""
 VIEW = CameraView((2.0, 638.0), (452.0, 638.0), 60.0, (2.0, 188.0), 60.0)
 
 pytestmark = pytest.mark.usefixtures("state")

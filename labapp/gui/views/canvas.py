@@ -2,8 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from PySide6.QtCore import QObject, Qt
-from PySide6.QtGui import QAccessible, QAccessibleInterface, QPainter, QPaintEvent, QPalette
+from PySide6.QtGui import (
+    QAccessible,
+    QAccessibleInterface,
+    QAction,
+    QKeySequence,
+    QPainter,
+    QPaintEvent,
+    QPalette,
+)
 from PySide6.QtWidgets import QAccessibleWidget, QWidget
 
 from labapp.gui.theme import FollowsTheme
@@ -51,6 +61,17 @@ class Plotted(Drawn):
     """A drawing that has axes."""
 
     ROLE = QAccessible.Role.Chart
+
+    def add_menu(self, *works: tuple[str, Callable[[], object]]) -> None:
+        """Add a menu for the right button, of words and what they do; Ctrl+C does the first."""
+        self.setContextMenuPolicy(Qt.ContextMenuPolicy.ActionsContextMenu)
+        for words, work in works:
+            action = QAction(words, self)
+            action.triggered.connect(lambda *_, do=work: do())
+            self.addAction(action)
+        copy = self.actions()[0]
+        copy.setShortcut(QKeySequence.StandardKey.Copy)
+        copy.setShortcutContext(Qt.ShortcutContext.WidgetShortcut)
 
 
 def _accessible(_class_name: str, thing: QObject) -> QAccessibleInterface | None:

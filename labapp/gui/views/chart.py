@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from PySide6.QtCore import QEvent, QPointF, Qt
-from PySide6.QtGui import QAction, QGuiApplication, QKeyEvent, QKeySequence, QPalette
+from PySide6.QtGui import QGuiApplication, QKeyEvent, QPalette
 from PySide6.QtWidgets import QVBoxLayout
 
 from labapp.gui.views.axes import make_plot, paint_axes
@@ -44,22 +42,11 @@ class Chart(Plotted):
         self._at.setAttribute(Qt.WidgetAttribute.WA_TransparentForMouseEvents)
         self._at.hide()
         self.plot.scene().sigMouseMoved.connect(self._moved_to)
-        self._add_actions()
-
-    def _add_actions(self) -> None:
-        self.setContextMenuPolicy(Qt.ContextMenuPolicy.ActionsContextMenu)
-        works: tuple[tuple[str, Callable[[], object]], ...] = (
+        self.add_menu(
             ("Copy picture", self.copy_picture),
             ("Save picture …", save_plot(self, self.plot, "chart")),
             ("Show all", self.plot.autoRange),
         )
-        for words, work in works:
-            action = QAction(words, self)
-            action.triggered.connect(lambda *_, do=work: do())
-            self.addAction(action)
-        copy = self.actions()[0]
-        copy.setShortcut(QKeySequence.StandardKey.Copy)
-        copy.setShortcutContext(Qt.ShortcutContext.WidgetShortcut)
 
     def copy_picture(self) -> None:
         """Put what is seen on the clipboard."""

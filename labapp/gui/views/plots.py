@@ -6,19 +6,17 @@ The wheel and dragging work along the common axis; what goes up always fits what
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import pyqtgraph as pg
 from PySide6.QtCore import QPointF, Qt, Signal
 from PySide6.QtGui import (
-    QAction,
     QColor,
     QFontMetricsF,
     QGuiApplication,
     QImage,
     QKeyEvent,
-    QKeySequence,
     QPalette,
 )
 from PySide6.QtWidgets import QGraphicsItem, QSizePolicy, QVBoxLayout
@@ -85,7 +83,12 @@ class PlotStack(Plotted):
         scene = self.canvas.scene()
         scene.sigMouseClicked.connect(self._clicked)
         scene.sigMouseMoved.connect(self._moved)
-        self._add_actions()
+        self.add_menu(
+            ("Copy picture", self.copy_picture),
+            ("Save picture …", save_plot(self, self.canvas, "trends")),
+            ("Copy values as table", self.copy_table),
+            ("Show all", self.fit),
+        )
         self.follow_theme()
 
     # --- what it shows ------------------------------------------------------------------------
@@ -150,22 +153,6 @@ class PlotStack(Plotted):
         QGuiApplication.clipboard().setText(as_table(self.curves, self.axis))
 
     # --- within -------------------------------------------------------------------------------
-
-    def _add_actions(self) -> None:
-        self.setContextMenuPolicy(Qt.ContextMenuPolicy.ActionsContextMenu)
-        works: tuple[tuple[str, Callable[[], None]], ...] = (
-            ("Copy picture", self.copy_picture),
-            ("Save picture …", save_plot(self, self.canvas, "trends")),
-            ("Copy values as table", self.copy_table),
-            ("Show all", self.fit),
-        )
-        for words, work in works:
-            action = QAction(words, self)
-            action.triggered.connect(lambda *_, do=work: do())
-            self.addAction(action)
-        copy = self.actions()[0]
-        copy.setShortcut(QKeySequence.StandardKey.Copy)
-        copy.setShortcutContext(Qt.ShortcutContext.WidgetShortcut)
 
     def _lay_out(self) -> None:
         for plot in self._plots:
