@@ -672,9 +672,9 @@ def test_a_picture_without_a_target_is_answered(labapp: Run, tmp_path: Path) -> 
 def board_picture(path: Path, name: str) -> Path:
     """Picture of a board by a lens that distorts by 1 %."""
     from labapp.core.calibration.boards import BOARDS
-    from labapp.simulation.board import PrintedBoard
+    from labapp.simulation.calibration.board import PrintedBoard
+    from labapp.simulation.calibration.target import TargetLook, render_target
     from labapp.simulation.camera import Lens, PosedView
-    from labapp.simulation.target import TargetLook, render_target
 
     lens = Lens(1000.0, k1=-0.06)
     view = PosedView.at((40.0, 36.0), 5.0, turned_deg=(1.0, -2.0, 1.3), lens=lens)

@@ -13,7 +13,7 @@ from labapp.config.line_setup import read_line_setup
 from labapp.config.setup import read_setup
 from labapp.errors import InputError
 from labapp.simulation.camera import CameraView
-from labapp.simulation.line_frames import LineLook, render_lines
+from labapp.simulation.lines.frames import LineLook, render_lines
 from labapp.simulation.pools import spherical_cap
 from tests.conftest import Run
 from tests.setups import FIVE_LINES as SETUP

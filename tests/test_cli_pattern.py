@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 
 from labapp.cli import app
 from labapp.config.setup import read_setup
+from labapp.simulation.calibration.mirrors import FlatMirror
 from labapp.simulation.forward import trace
-from labapp.simulation.mirrors import FlatMirror
 from labapp.simulation.render import Look, render
 from tests.core.test_bench_check import EXACT, TEXT, VIEW
 

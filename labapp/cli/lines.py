@@ -68,10 +68,10 @@ def lines(
 
 def _measure(source: FrameSource, frames: range, folder: Path, bench: Setup) -> bool:
     """Measure frames one by one; whether any has lines."""
+    from labapp.core.lines.frame import LineFrame
+    from labapp.core.lines.states import LineSeries, line_changes, line_states
     from labapp.core.pipeline import Settings, measure
     from labapp.core.recording.residual_check import doubt_of_values, judged_status
-    from labapp.core.sequence.line_frame import LineFrame
-    from labapp.core.sequence.line_states import LineSeries, line_changes, line_states
     from labapp.export.line_results import line_tables
 
     found, times_s = list[LineFrame](), list[float | None]()
@@ -100,8 +100,8 @@ def _measure(source: FrameSource, frames: range, folder: Path, bench: Setup) -> 
 
 def _follow(source: FrameSource, frames: range, folder: Path) -> bool:
     """Follow one line; whether it was followed in any frame."""
-    from labapp.core.sequence.line_frame import LineFrame
-    from labapp.core.sequence.line_track import track_line
+    from labapp.core.lines.frame import LineFrame
+    from labapp.core.lines.track import track_line
     from labapp.export import line_results as tables
 
     rate = source.frame_rate_hz

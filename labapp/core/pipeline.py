@@ -25,7 +25,8 @@ from labapp.core.geometry.rig import Rig
 from labapp.core.images.band_pass import DetectorTuning, quick_dots, tuned_dots
 from labapp.core.images.dots import Dots, Image
 from labapp.core.images.find_dots import DotSettings, find_dots
-from labapp.core.images.line_correction import LineCorrection
+from labapp.core.lines.correction import LineCorrection
+from labapp.core.lines.frame import LineFrame, LineMeasureSettings, measure_lines
 from labapp.core.match import Match
 from labapp.core.matching.corrected_rows import lattice_of_corrected, match_corrected
 from labapp.core.matching.correspondence import lattice_of_match, match_rays
@@ -35,7 +36,6 @@ from labapp.core.rows.correction import Correction
 from labapp.core.rows.find_lattice import LatticeSettings, find_lattice
 from labapp.core.rows.lattice import Lattice
 from labapp.core.schemes import SCHEMES, ers, fit, irs, modal, zonal
-from labapp.core.sequence.line_frame import LineFrame, LineMeasureSettings, measure_lines
 from labapp.core.surface import measures
 from labapp.core.surface.pool_fit import FitSettings
 from labapp.core.surface.reconstruction import Reconstruction

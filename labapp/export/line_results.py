@@ -7,9 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 
 from labapp.core.geometry.coordinates import ImageCalibration
-from labapp.core.sequence.line_frame import LineFrame
-from labapp.core.sequence.line_states import LineSeries, State, line_states
-from labapp.core.surface.line_fit import LineSurface
+from labapp.core.lines.fit import LineSurface
+from labapp.core.lines.frame import LineFrame
+from labapp.core.lines.states import LineSeries, State, line_states
 from labapp.text import csv_text
 
 LINE_COLUMNS = (

@@ -218,8 +218,8 @@ class LineFollower:
 
     def __call__(self, frames: Iterable[int]) -> Generator[FrameResult]:
         """Measure frames; see `runner.Measurer`. Results come a stretch at a time."""
-        from labapp.core.sequence.line_frame import LineFrame
-        from labapp.core.sequence.line_track import LineTracker, track_line
+        from labapp.core.lines.frame import LineFrame
+        from labapp.core.lines.track import LineTracker, track_line
 
         tracker, numbers = LineTracker(), iter(frames)
         while chosen := list(islice(numbers, FOLLOWED_AT_ONCE)):

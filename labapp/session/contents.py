@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from labapp.config.setup import Setup
-    from labapp.core.images.line_correction import LineCorrection
+    from labapp.core.lines.correction import LineCorrection
     from labapp.core.pipeline import ByHand, Settings
     from labapp.core.recording.residual_check import SetupVerdict
     from labapp.core.rows.correction import Correction
@@ -163,7 +163,7 @@ class SessionContents:
 
     def line_correction(self, frame: int) -> LineCorrection | None:
         """Lines of a frame as they were corrected by hand; None where there are none."""
-        from labapp.core.images.line_correction import LineCorrection
+        from labapp.core.lines.correction import LineCorrection
 
         found = self._by_hand(frame)
         return found if isinstance(found, LineCorrection) else None

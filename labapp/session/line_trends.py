@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from labapp.core.sequence.line_states import LineSeries, State, line_states
+from labapp.core.lines.states import LineSeries, State, line_states
 from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 from labapp.errors import InputError
 from labapp.session.contents import SessionContents

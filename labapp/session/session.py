@@ -314,7 +314,7 @@ class Session(SessionContents):
         InputError
             If the session has no such frame, or another kind of pattern.
         """
-        from labapp.core.images.line_correction import LineCorrection
+        from labapp.core.lines.correction import LineCorrection
 
         right = "corrections by frame: {5: correction}, or {5: None}"
         require(corrections, Mapping, "correct", "corrections", right)

@@ -19,11 +19,11 @@ import tifffile
 
 from labapp.core.geometry.rig import Rig
 from labapp.core.values import BoolArray, FloatArray, ReadOnlyArrays
+from labapp.simulation.calibration.target import Target, TargetLook, render_target
 from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import PoolSurface, Reflections, trace
 from labapp.simulation.parallel import Progress, processes, wait_for
 from labapp.simulation.render import GreyImage, Look, Picture, ray_brightness, render
-from labapp.simulation.target import Target, TargetLook, render_target
 from labapp.simulation.torch import Torch
 from labapp.system import interrupts_blocked
 

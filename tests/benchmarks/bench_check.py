@@ -29,9 +29,9 @@ from labapp.core.pipeline import Settings, reconstruct
 from labapp.core.surface.measures import measure_surface
 from labapp.core.values import CannotMeasure, FloatArray
 from labapp.simulation.benches import BenchErrors, SimulatedBench, draw_bench
+from labapp.simulation.calibration.mirrors import FlatMirror
 from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import PoolSurface, exact_match, trace
-from labapp.simulation.mirrors import FlatMirror
 from labapp.simulation.pools import Pool, egg, spherical_cap
 
 PX_PER_MM, SIGMA_PX, SHAPE = 4.7, 0.12, (640, 480)

@@ -19,13 +19,13 @@ from scipy.spatial import cKDTree
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.line_pattern import LinePattern, LineRig
 from labapp.core.geometry.rig import Electrode, ImagingPlane, Laser
-from labapp.core.sequence.line_frame import LineFrame, LineMeasureSettings, measure_lines
-from labapp.core.sequence.line_states import LineSeries, line_changes, line_states
-from labapp.core.sequence.line_track import track_line
+from labapp.core.lines.frame import LineFrame, LineMeasureSettings, measure_lines
+from labapp.core.lines.states import LineSeries, line_changes, line_states
+from labapp.core.lines.track import track_line
 from labapp.simulation.camera import CameraView
-from labapp.simulation.line_frames import LineFrame as TrueFrame
-from labapp.simulation.line_frames import LineLook, render_lines
-from labapp.simulation.line_runs import GmawLook, gmaw_run, penetration_run
+from labapp.simulation.lines.frames import LineFrame as TrueFrame
+from labapp.simulation.lines.frames import LineLook, render_lines
+from labapp.simulation.lines.runs import GmawLook, gmaw_run, penetration_run
 from labapp.simulation.pools import Pool, egg
 
 RIG = LineRig(

@@ -15,9 +15,9 @@ from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser,
 from labapp.core.geometry.uncertainty import AxisPoints, RigUncertainty, covariance_of
 from labapp.core.values import FloatArray
 from labapp.simulation.benches import BenchErrors, draw_bench
+from labapp.simulation.calibration.mirrors import FlatMirror
 from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import PoolSurface, trace
-from labapp.simulation.mirrors import FlatMirror
 from labapp.simulation.pools import spherical_cap
 
 VIEW = CameraView.rolled((0.74, 558.26), 4.7)

@@ -26,9 +26,9 @@ from labapp.core.matching.observation import Observation
 from labapp.core.values import CannotMeasure
 from labapp.errors import InputError
 from labapp.simulation.benches import FOCAL_PX, BenchErrors, SimulatedBench, draw_bench
+from labapp.simulation.calibration.mirrors import BallMirror, FlatMirror
 from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import PoolSurface, trace
-from labapp.simulation.mirrors import BallMirror, FlatMirror
 from labapp.simulation.pools import spherical_cap
 from labapp.simulation.render import Look, render
 from tests.scenes import as_dots

@@ -13,9 +13,9 @@ from labapp.core.calibration.imaging_plane import calibrate_imaging_plane
 from labapp.core.calibration.lens_fit import PlaneView, fit_lens, fit_terms
 from labapp.core.calibration.plane_calibration import PlaneCalibration, PlaneCalibrationSettings
 from labapp.core.values import CannotMeasure
-from labapp.simulation.board import PrintedBoard
+from labapp.simulation.calibration.board import PrintedBoard
+from labapp.simulation.calibration.target import Target, TargetLook, render_target
 from labapp.simulation.camera import Lens, PosedView
-from labapp.simulation.target import Target, TargetLook, render_target
 
 pytestmark = pytest.mark.slow
 

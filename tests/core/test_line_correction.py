@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from labapp.core.geometry.coordinates import ImageCalibration
-from labapp.core.images.light_lines import LightLine, LineSettings, find_lines
-from labapp.core.images.line_correction import (
+from labapp.core.lines.correction import (
     LineCorrection,
     cut_line,
     delete_line,
@@ -15,9 +14,10 @@ from labapp.core.images.line_correction import (
     nearest_line,
     number_line,
 )
-from labapp.core.images.line_numbers import LinesSeen, number_lines
-from labapp.core.sequence.line_frame import LineMeasureSettings, measure_lines
-from labapp.simulation.line_frames import LineLook, render_lines
+from labapp.core.lines.find_lines import LightLine, LineSettings, find_lines
+from labapp.core.lines.frame import LineMeasureSettings, measure_lines
+from labapp.core.lines.numbering import LinesSeen, number_lines
+from labapp.simulation.lines.frames import LineLook, render_lines
 from labapp.simulation.pools import egg
 from tests.benchmarks.lines import CALIBRATION, RIG, VIEW
 

@@ -7,11 +7,11 @@ import pytest
 
 from labapp.core.geometry.line_pattern import LinePattern, LineRig
 from labapp.core.geometry.rig import Electrode, ImagingPlane, Laser
-from labapp.core.images.pulse_light import classify_pulses
-from labapp.core.sequence.line_states import LineSeries, line_changes, line_states
-from labapp.core.sequence.line_track import oscillation_frequency, track_line
+from labapp.core.lines.pulses import classify_pulses
+from labapp.core.lines.states import LineSeries, line_changes, line_states
+from labapp.core.lines.track import oscillation_frequency, track_line
 from labapp.simulation.camera import CameraView
-from labapp.simulation.line_runs import PHASES, GmawLook, gmaw_run
+from labapp.simulation.lines.runs import PHASES, GmawLook, gmaw_run
 
 
 def run_series(seed: int, noise: float = 0.004) -> tuple[LineSeries, list[str]]:

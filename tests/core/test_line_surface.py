@@ -10,13 +10,13 @@ import pytest
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.line_pattern import LinePattern, LineRig, line_directions
 from labapp.core.geometry.rig import Electrode, ImagingPlane, Laser
-from labapp.core.sequence.line_frame import LineMeasureSettings, measure_lines
-from labapp.core.surface.line_fit import fit_lines
-from labapp.core.surface.line_model import LineData, LineModel
+from labapp.core.lines.fit import fit_lines
+from labapp.core.lines.frame import LineMeasureSettings, measure_lines
+from labapp.core.lines.model import LineData, LineModel
 from labapp.core.surface.spline import SplineBasis
 from labapp.core.values import CannotMeasure
 from labapp.simulation.camera import CameraView
-from labapp.simulation.line_frames import LineFrame, LineLook, render_lines
+from labapp.simulation.lines.frames import LineFrame, LineLook, render_lines
 from labapp.simulation.pools import Pool, spherical_cap
 
 RIG = LineRig(

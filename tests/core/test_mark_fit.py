@@ -14,8 +14,8 @@ from labapp.core.calibration.plane_calibration import (
     calibrate_plane,
 )
 from labapp.core.values import FloatArray
+from labapp.simulation.calibration.target import Target, TargetLook, render_target
 from labapp.simulation.render import CameraView
-from labapp.simulation.target import Target, TargetLook, render_target
 
 MARKS_MM = 6.35 * np.array(
     [(0, 0), *((n, 0) for n in range(1, 11)), *((0, n) for n in range(1, 5))], float

@@ -14,7 +14,7 @@ from labapp.core.geometry.patterns import PATTERNS, PatternKind
 from labapp.core.geometry.rig import DotPattern, Rig
 from labapp.core.values import CannotMeasure
 from labapp.simulation.benches import SimulatedBench
-from labapp.simulation.mirrors import FlatMirror
+from labapp.simulation.calibration.mirrors import FlatMirror
 from tests.core.test_bench_check import CALIBRATION, RIG, VIEW, picture
 from tests.core.test_patterns import bent
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from labapp.core.images.light_lines import LineSettings, find_lines
-from labapp.core.images.line_numbers import number_lines
-from labapp.core.images.ridges import RidgeSettings, find_ridges
+from labapp.core.lines.find_lines import LineSettings, find_lines
+from labapp.core.lines.numbering import number_lines
+from labapp.core.lines.ridges import RidgeSettings, find_ridges
 from labapp.core.values import FloatArray
 
 SHAPE = (200, 260)

@@ -6,8 +6,8 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
+from labapp.simulation.calibration.target import target_svg
 from labapp.simulation.recording import TARGET
-from labapp.simulation.target import target_svg
 from tests.samples.lines import line_samples
 from tests.samples.runs import samples
 

@@ -12,8 +12,8 @@ import pytest
 
 from labapp.config.setup import parse_setup
 from labapp.core.geometry.line_pattern import LineRays
+from labapp.core.lines.states import State
 from labapp.core.rows.correction import Correction
-from labapp.core.sequence.line_states import State
 from labapp.errors import InputError
 from labapp.gui.pages.dots.lines import show_lines
 from labapp.gui.pages.setup import presenter as setup_page
@@ -21,7 +21,7 @@ from labapp.gui.pages.surface import presenter as surface_page
 from labapp.gui.pages.trends import presenter as trends_page
 from labapp.session.line_trends import LineTrend, line_trend
 from labapp.session.session import Session
-from labapp.simulation.line_frames import LineLook, render_lines
+from labapp.simulation.lines.frames import LineLook, render_lines
 from labapp.simulation.pools import Pool, egg
 from tests.test_cli_lines import SETUP, VIEW
 

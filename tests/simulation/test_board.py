@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from labapp.core.calibration.boards import BOARDS
-from labapp.simulation.board import PrintedBoard, board_pdf, board_svg
+from labapp.simulation.calibration.board import PrintedBoard, board_pdf, board_svg
 
 TARGETS = Path(__file__).parents[2] / "resources" / "targets"
 SVG = "{http://www.w3.org/2000/svg}"

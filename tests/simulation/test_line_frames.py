@@ -7,8 +7,8 @@ import numpy as np
 from labapp.core.geometry.line_pattern import LinePattern, LineRig
 from labapp.core.geometry.rig import Electrode, ImagingPlane, Laser
 from labapp.simulation.camera import CameraView
-from labapp.simulation.line_frames import LineLook, render_lines
-from labapp.simulation.line_runs import PHASES, penetration_run
+from labapp.simulation.lines.frames import LineLook, render_lines
+from labapp.simulation.lines.runs import PHASES, penetration_run
 from labapp.simulation.pools import spherical_cap
 
 RIG = LineRig(

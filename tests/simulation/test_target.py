@@ -7,8 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
+from labapp.simulation.calibration.target import Target, TargetLook, render_target, target_svg
 from labapp.simulation.render import CameraView
-from labapp.simulation.target import Target, TargetLook, render_target, target_svg
 
 ROOT = Path(__file__).parents[2]
 

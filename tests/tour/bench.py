@@ -13,9 +13,9 @@ from labapp.config.setup import read_setup
 from labapp.media import GreyImage
 from labapp.session.copies import copy_sample
 from labapp.session.samples import sample_folder
+from labapp.simulation.calibration.mirrors import FlatMirror
 from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import trace
-from labapp.simulation.mirrors import FlatMirror
 from labapp.simulation.render import Look, render
 
 CROSS_MM = (4.65, 6.23, 2.75)

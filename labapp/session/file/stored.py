@@ -22,9 +22,12 @@ from labapp.core.geometry.line_pattern import LinePattern, LineRays
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.geometry.uncertainty import AxisPoints, RigUncertainty
 from labapp.core.images import dots, find_dots, threshold_dots
-from labapp.core.images.light_lines import LightLine
-from labapp.core.images.line_correction import LineCorrection
-from labapp.core.images.line_numbers import LinesSeen
+from labapp.core.lines.correction import LineCorrection
+from labapp.core.lines.find_lines import LightLine
+from labapp.core.lines.fit import LineSurface
+from labapp.core.lines.frame import LineFeatures, LineFrame
+from labapp.core.lines.numbering import LinesSeen
+from labapp.core.lines.track import TrackedLine
 from labapp.core.match import Match, Trial
 from labapp.core.matching.decision import MatchSettings
 from labapp.core.pipeline import Measurement, Settings
@@ -32,10 +35,7 @@ from labapp.core.recording.residual_check import SetupVerdict, Suspect
 from labapp.core.rows import find_lattice, lattice, lattice_growth, row_search
 from labapp.core.rows.correction import Correction
 from labapp.core.schemes import SCHEMES
-from labapp.core.sequence.line_frame import LineFeatures, LineFrame
-from labapp.core.sequence.line_track import TrackedLine
 from labapp.core.surface.boundary import Boundary
-from labapp.core.surface.line_fit import LineSurface
 from labapp.core.surface.measures import Measures
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.surface.spline import SplineBasis, SplineSurface

@@ -23,9 +23,9 @@ from labapp.gui.pages.plane import PlanePage, presenter
 from labapp.gui.shell.steps import calibrations_in_use, states
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
-from labapp.simulation.board import PrintedBoard, board_svg
+from labapp.simulation.calibration.board import PrintedBoard, board_svg
+from labapp.simulation.calibration.target import Target, TargetLook, render_target, target_svg
 from labapp.simulation.camera import Lens, PosedView
-from labapp.simulation.target import Target, TargetLook, render_target, target_svg
 from tests.gui.conftest import KEPT
 
 GTAW = Path(__file__).parents[3] / "sample_sessions" / "gtaw"

@@ -7,10 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from labapp.core.images.light_lines import LightLine
-from labapp.core.images.line_correction import LineCorrection
-from labapp.core.images.line_numbers import LinesSeen
-from labapp.core.sequence.line_frame import LineFrame
+from labapp.core.lines.correction import LineCorrection
+from labapp.core.lines.find_lines import LightLine
+from labapp.core.lines.frame import LineFrame
+from labapp.core.lines.numbering import LinesSeen
 from labapp.core.values import BoolArray, FloatArray, IntArray
 from labapp.errors import InputError
 from labapp.gui.digits import ResultRow

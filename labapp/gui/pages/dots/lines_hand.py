@@ -7,7 +7,7 @@ from collections.abc import Callable
 from PySide6.QtCore import Qt
 from PySide6.QtGui import QAction
 
-from labapp.core.images.line_correction import (
+from labapp.core.lines.correction import (
     LineCorrection,
     cut_line,
     delete_line,

@@ -19,7 +19,7 @@ from labapp.gui.digits import ResultRow, round_factor
 from labapp.gui.shell.steps import calibrations_in_use
 from labapp.media import GreyImage
 from labapp.session.session import Session
-from labapp.simulation.target import Target
+from labapp.simulation.calibration.target import Target
 
 POINTS = ("O′", "O′X′", "O′Z′")
 """Names of the three points: the origin, and the middles of the two bars."""

@@ -28,8 +28,8 @@ from labapp.gui.widgets.layouts import fill
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
 from labapp.media import GreyImage, read_picture
-from labapp.simulation.board import board_pdf, board_svg
-from labapp.simulation.target import Target, target_svg
+from labapp.simulation.calibration.board import board_pdf, board_svg
+from labapp.simulation.calibration.target import Target, target_svg
 
 NO_PICTURE = (
     "Load a picture of the target, or of a board, in the imaging plane, taken by the camera in its "

@@ -10,11 +10,11 @@ import numpy as np
 
 from labapp.config.setup import parse_setup
 from labapp.core.geometry.rig import Rig
+from labapp.core.lines.frame import LineFrame
+from labapp.core.lines.region import between_lines
 from labapp.core.match import Match
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.schemes import scheme_words
-from labapp.core.sequence.line_frame import LineFrame
-from labapp.core.surface.line_region import between_lines
 from labapp.core.surface.measures import Measures, sigma_name
 from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.values import FloatArray

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from labapp.core.sequence.line_track import oscillation_frequency
+from labapp.core.lines.track import oscillation_frequency
 from labapp.core.values import FloatArray, IntArray
 from labapp.gui.curves import Axis, Curve, Mark
 from labapp.gui.digits import ResultRow, rounded

@@ -22,8 +22,8 @@ from typing import Literal
 import numpy as np
 from scipy.ndimage import label
 
-from labapp.core.sequence.line_frame import LineFrame
-from labapp.core.surface.line_fit import LEAST_LINES
+from labapp.core.lines.fit import LEAST_LINES
+from labapp.core.lines.frame import LineFrame
 from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 
 State = Literal["no-pool", "growing", "concave", "flattening", "convex"]

@@ -9,12 +9,12 @@ import numpy as np
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.line_pattern import LineRig
 from labapp.core.images.dots import Image
-from labapp.core.images.light_lines import LightLine, LineSettings, find_lines
-from labapp.core.images.line_correction import LineCorrection
-from labapp.core.images.line_numbers import LinesSeen, number_lines
-from labapp.core.sequence.line_track import TrackedLine
-from labapp.core.surface.line_data import line_data
-from labapp.core.surface.line_fit import LineFitSettings, LineSurface, fit_lines
+from labapp.core.lines.correction import LineCorrection
+from labapp.core.lines.data import line_data
+from labapp.core.lines.find_lines import LightLine, LineSettings, find_lines
+from labapp.core.lines.fit import LineFitSettings, LineSurface, fit_lines
+from labapp.core.lines.numbering import LinesSeen, number_lines
+from labapp.core.lines.track import TrackedLine
 from labapp.core.values import CannotMeasure, FloatArray, IntArray
 
 FOLDED = "the pool gathers the lines to points: they show how many they are, and no shape"

@@ -12,9 +12,9 @@ import cv2
 import numpy as np
 
 from labapp.core.images.dots import Grey, Image
-from labapp.core.images.line_chains import LEAST_FOLDED, is_upright, join_chains, spread_of
-from labapp.core.images.ridges import Ridges, RidgeSettings, find_ridges
-from labapp.core.images.smooth_path import SmoothPath
+from labapp.core.lines.chains import LEAST_FOLDED, is_upright, join_chains, spread_of
+from labapp.core.lines.ridges import Ridges, RidgeSettings, find_ridges
+from labapp.core.lines.smooth_path import SmoothPath
 from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 
 END_PX, END_REACH_PX = 10.0, 30.0

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from labapp.core.images.light_lines import LightLine
+from labapp.core.lines.find_lines import LightLine
 from labapp.core.values import FloatArray
 
 FRINGE_LIGHT, FRINGE_TOTAL = 0.45, 0.4

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from labapp.core.geometry.coordinates import ImageCalibration
-from labapp.core.images.light_lines import LightLine
-from labapp.core.surface.line_model import LineData
+from labapp.core.lines.find_lines import LightLine
+from labapp.core.lines.model import LineData
 from labapp.core.values import FloatArray
 
 POINT_STEP_PX = 10.0

@@ -15,8 +15,8 @@ import numpy as np
 import scipy
 
 from labapp.core.images.dots import Grey, Image
-from labapp.core.images.light_lines import LineSettings, find_lines
-from labapp.core.images.pulse_light import Pulses, classify_pulses, frame_brightness
+from labapp.core.lines.find_lines import LineSettings, find_lines
+from labapp.core.lines.pulses import Pulses, classify_pulses, frame_brightness
 from labapp.core.values import BoolArray, FloatArray, ReadOnlyArrays
 
 OVERSAMPLE = 8

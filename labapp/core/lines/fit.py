@@ -16,7 +16,7 @@ import scipy
 
 from labapp.core.geometry.line_pattern import LineRig, line_directions
 from labapp.core.geometry.optics import intersect_level
-from labapp.core.surface.line_model import Linearized, LineData, LineModel
+from labapp.core.lines.model import Linearized, LineData, LineModel
 from labapp.core.surface.pool_fit import CORRELATED_MM2
 from labapp.core.surface.spline import SplineBasis, SplineSurface
 from labapp.core.values import CannotMeasure, FloatArray, IntArray, ReadOnlyArrays

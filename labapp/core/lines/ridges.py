@@ -92,7 +92,7 @@ def _derivative_kernels(scale_px: float) -> tuple[FloatArray, FloatArray, FloatA
 
 def find_ridges(frame: Image, settings: RidgeSettings) -> Ridges:
     """Find the bright ridges of a grey frame, shape (height, width), and link them to chains."""
-    from labapp.core.images import ridge_kernels
+    from labapp.core.lines import ridge_kernels
 
     picture = np.ascontiguousarray(frame, np.float32)
     bell, slope, bend = _derivative_kernels(settings.scale_px)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from labapp.cli.bench import mirror_picture
+from labapp.cli.calibrate.bench import mirror_picture
 from labapp.cli.shared import NOTHING_MEASURED, warned
 from labapp.errors import InputError
 from labapp.files import write_file

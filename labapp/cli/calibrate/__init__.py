@@ -1,0 +1,15 @@
+"""`labapp calibrate`: laser and imaging plane, and a check of both against a known mirror."""
+
+import typer
+
+from labapp.cli.calibrate import bench, fold, laser, pattern, plane
+from labapp.cli.shared import Commands
+
+app = typer.Typer(
+    no_args_is_help=True, cls=Commands, help="Calibrate laser or imaging plane, or check both."
+)
+app.command("laser")(laser.calibrate_laser)
+app.command("plane")(plane.calibrate_plane)
+app.command("bench")(bench.calibrate_bench)
+app.command("pattern")(pattern.calibrate_pattern)
+app.command("fold")(fold.calibrate_fold)

@@ -1,0 +1,108 @@
+"""`labapp calibrate plane`: the imaging plane from a picture of a target or a board (§5.1)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from labapp.cli.calibrate.setup_file import SetupToChange, write_values
+from labapp.cli.shared import NOTHING_MEASURED
+from labapp.errors import InputError
+
+if TYPE_CHECKING:
+    from labapp.core.calibration.imaging_plane import Calibration
+    from labapp.core.calibration.plane_calibration import PlaneCalibration
+
+
+def calibrate_plane(
+    images: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Picture of the target or a board in the imaging plane; of a board, more pictures "
+            "of it held anyhow may follow."
+        ),
+    ],
+    unit_mm: Annotated[
+        float,
+        typer.Option(
+            min=0.001,
+            max=1000,
+            help="Length of a unit of the target's axes, from one flag of a bar to the next (mm): "
+            "measure it on the target. labapp's printed target and its sample run have 6.35.",
+        ),
+    ] = 6.35,
+    board: Annotated[
+        str | None,
+        typer.Option(
+            help="The board: a name (charuco_4_inch, …) or KIND:COLUMNSxROWS:SQUARE_MM. Default: "
+            "what is printed by labapp is recognised."
+        ),
+    ] = None,
+    square_mm: Annotated[
+        float | None,
+        typer.Option(
+            min=0.1, max=1000, help="Edge of the board's squares as measured on the print (mm)."
+        ),
+    ] = None,
+    setup: SetupToChange = None,
+) -> None:
+    """Find the imaging plane, and with a board the lens, in a picture of the target (§5.1)."""
+    from labapp.core.calibration.plane_calibration import PlaneCalibration
+
+    found = _calibrated(images, unit_mm, board, setup)
+    if isinstance(found, PlaneCalibration):
+        _show_target(found, unit_mm)
+    elif square_mm is not None:
+        found = found.with_square(square_mm)
+    (x_scale, z_scale), angle = found.px_per_mm, found.angle_deg
+    x_sigma, z_sigma, angle_sigma = found.scales_and_angle_sigma
+    typer.echo(
+        f"scale      {x_scale:.4f} ± {x_sigma:.4f} px/mm along X′, "
+        f"{z_scale:.4f} ± {z_sigma:.4f} px/mm along Z′, "
+        f"{angle:.2f} ± {angle_sigma:.2f} degrees between them"
+    )
+    for line in found.fit_lines():
+        typer.echo(line)
+    write_values(setup, found.setup_keys)
+
+
+def _calibrated(
+    images: Sequence[Path], unit_mm: float, board: str | None, setup: Path | None
+) -> Calibration:
+    """Calibrate by pictures; with the lens that the setup has, where they show the target."""
+    from labapp.config.setup import lens_of
+    from labapp.core.calibration.boards import A_BOARD, parse_board
+    from labapp.core.calibration.imaging_plane import calibrate_imaging_plane
+    from labapp.core.calibration.plane_calibration import PlaneCalibrationSettings
+    from labapp.core.values import CannotMeasure
+    from labapp.media import read_picture
+
+    pictures = [read_picture(path) for path in images]
+    try:
+        named = None if board is None else parse_board(board)
+    except ValueError as error:
+        raise InputError("--board", "board", f"{board} ({error})", A_BOARD) from error
+    lens = lens_of(setup.read_text("utf-8")) if setup is not None and setup.is_file() else None
+    settings = PlaneCalibrationSettings(unit_mm=unit_mm)
+    try:
+        return calibrate_imaging_plane(pictures, settings, named, lens)
+    except CannotMeasure as answer:
+        if answer.status != "no-target":
+            shown = "a picture in which the board is seen, flat and sharp"
+            raise InputError(images[0], "board", answer.reason, shown) from answer
+        typer.echo(f"{images[0]}: {answer}", err=True)
+        raise typer.Exit(NOTHING_MEASURED) from answer
+
+
+def _show_target(found: PlaneCalibration, unit_mm: float) -> None:
+    """Print where the target's three points are, as they go into a set-up."""
+    points = dict(zip(("origin_px", "x_axis_px", "z_axis_px"), found.points_px, strict=True))
+    lengths = {"x_axis_mm": found.x_axis_mm, "z_axis_mm": found.z_axis_mm}
+    for (name, (u, v)), sigma in zip(points.items(), found.points_sigma_px, strict=True):
+        typer.echo(f"{name}  {u:.3f}, {v:.3f} ± {sigma:.3f} px")
+    for name, length in lengths.items():
+        typer.echo(f"{name}  {length:.4f} mm")
+    typer.echo(f"unit       {unit_mm:g} mm between flags (--unit-mm)")

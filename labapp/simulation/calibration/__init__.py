@@ -1,0 +1,1 @@
+"""Pictures of targets, boards and known mirrors."""
