@@ -151,5 +151,5 @@ def _tell(found: Dynamics) -> None:
             typer.echo(f"{name} changes at {event.time_s:.4f} ± {event.sigma_s:.4f} s")
     for step in found.responses:
         value, sigma = step.response.value, step.response.sigma
-        told = ", ".join(f"{n} {value[n]:.4g} ± {sigma[n]:.2g}" for n in value)
-        typer.echo(f"{step.series} after {step.signal} at {step.step.time_s:.4f} s: {told}")
+        values = ", ".join(f"{n} {value[n]:.4g} ± {sigma[n]:.2g}" for n in value)
+        typer.echo(f"{step.series} after {step.signal} at {step.step.time_s:.4f} s: {values}")

@@ -248,11 +248,11 @@ def _of_measurement(
     found = [Remark("measurement", "good", "The frame can be measured.")]
     if not np.isfinite(sigma_mm):
         return found
-    told = f"The height will be known to ± {sigma_mm:.3f} mm"
+    known = f"The height will be known to ± {sigma_mm:.3f} mm"
     if most_mm is not None and sigma_mm > most_mm:
-        words = f"{told}, not to ± {most_mm:g} mm: sharper or brighter dots, or more of them."
+        words = f"{known}, not to ± {most_mm:g} mm: sharper or brighter dots, or more of them."
         return [*found, Remark("height ±", "doubtful", words)]
-    return [*found, Remark("height ±", "good", f"{told}.")]
+    return [*found, Remark("height ±", "good", f"{known}.")]
 
 
 def _peak_sigma(sizes: Measures) -> float:

@@ -256,11 +256,11 @@ def draw_mode(plot: Any, found: Dynamics, one: ModeCourse, turn: float = 0.0) ->
     plot.contourf(x, y, z, np.linspace(-1.05, 1.05, 22), cmap="RdBu_r")
     plot.set(aspect="equal", xlabel="X (mm)")
     figures = one.figures
-    told = "no oscillation stands out"
+    text = "no oscillation stands out"
     if figures:
         hertz, mm = figures["frequency_hz"], figures["amplitude_mm"]
-        told = f"{hertz[0]:.2f} ± {hertz[1]:.2g} Hz\n{1e3 * mm[0]:.1f} ± {1e3 * mm[1]:.1f} µm"
-    plot.set_title(f"{one.name}, {one.share:.0%}\n{told}", fontsize="small")
+        text = f"{hertz[0]:.2f} ± {hertz[1]:.2g} Hz\n{1e3 * mm[0]:.1f} ± {1e3 * mm[1]:.1f} µm"
+    plot.set_title(f"{one.name}, {one.share:.0%}\n{text}", fontsize="small")
 
 
 def dynamics_pictures(found: Dynamics) -> dict[str, Figure]:

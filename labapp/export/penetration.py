@@ -10,6 +10,7 @@ import math
 import os
 from collections import deque
 from collections.abc import Collection, Iterable, Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -55,10 +56,9 @@ def write_model(path: str | os.PathLike[str], model: PenetrationModel) -> None:
         "version": VERSION,
         "format": FORMAT,
         "kind": model.kind,
-        **vars(settings),
-        "orders": vars(settings.orders),
+        **asdict(settings),
         **{key: getattr(model, key) for key in ("time_constants_s", *ARRAYS, *NUMBERS)},
-        "static": vars(static) if isinstance(static, LinearMap) else _fields(static),
+        "static": asdict(static) if isinstance(static, LinearMap) else _fields(static),
     }
     write_file(Path(path), as_bytes(json.dumps(content, default=_listed, indent=1) + "\n"))
 

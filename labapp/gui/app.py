@@ -223,9 +223,9 @@ class ErrorReporter(QObject):
         words = f"A fault in the program: {kind.__name__}: {error}. Your session is saved; "
         self._happened.emit(f"{words}details are in the log (Help, Show the log folder)", True)
 
-    def _take_in_thread(self, told: threading.ExceptHookArgs) -> None:
-        if told.exc_value is not None:
-            self.take(told.exc_type, told.exc_value, told.exc_traceback)
+    def _take_in_thread(self, details: threading.ExceptHookArgs) -> None:
+        if details.exc_value is not None:
+            self.take(details.exc_type, details.exc_value, details.exc_traceback)
 
 
 def _take_message(kind: QtMsgType, _context: QMessageLogContext, message: str) -> None:

@@ -116,6 +116,7 @@ def ask_recording_end(parent: QWidget, name: str) -> Literal["keep", "discard", 
     box.setObjectName("recording-runs")
     box.setIcon(QMessageBox.Icon.Question)
     box.setWindowTitle("A recording is running")
+    box.setTextFormat(Qt.TextFormat.PlainText)
     box.setText(f"{name} is still being recorded.")
     box.setInformativeText(
         "To close, the recording is ended. A finished one is kept beside the session and listed "

@@ -40,7 +40,7 @@ class InUse:
     """A foot switch in use, and its last event."""
 
     switch: FootSwitch
-    told: Event | None = None
+    event: Event | None = None
 
     @property
     def pedals(self) -> PedalMap:
@@ -53,11 +53,11 @@ class InUse:
         name = self.pedals.name
         if self.switch.connected:
             return f"● {name}: connected"
-        if self.told is None:
+        if self.event is None:
             return f"○ {name}: being looked for"
-        if self.told.words in (AWAY, UNPLUGGED):
+        if self.event.words in (AWAY, UNPLUGGED):
             return f"▲ {name}: not connected. It works again once it is plugged in"
-        return f"▲ {self.told.words}"
+        return f"▲ {self.event.words}"
 
 
 @dataclass(frozen=True)
@@ -169,18 +169,18 @@ class FootSwitches(QObject):
         """Do the actions of pedals that were pressed, and report events."""
         deaf = self.learns or time.monotonic() < self._deaf_until_s
         for _ in range(self._received.qsize()):
-            key, heard = self._received.get_nowait()
+            key, received = self._received.get_nowait()
             if key not in self.in_use:
                 continue
-            if isinstance(heard, Event):
-                self.in_use[key].told = heard
-                warned = heard.kind == "warning" and heard.words != AWAY
-                self.notified.emit(str(heard), warned)
-                if warned and heard.words != UNPLUGGED:
+            if isinstance(received, Event):
+                self.in_use[key].event = received
+                warned = received.kind == "warning" and received.words != AWAY
+                self.notified.emit(str(received), warned)
+                if warned and received.words != UNPLUGGED:
                     self.look()  # what it may not be read for
                 self.changed.emit()
             elif not deaf:
-                self._do(heard)
+                self._do(received)
 
     def _do(self, action: Action) -> None:
         if action == "next" and QApplication.activeModalWidget() is not None:
@@ -228,11 +228,11 @@ class FootSwitches(QObject):
                 self.learned = answer
             self.changed.emit()
 
-        def told(problems: list[str]) -> None:
+        def report_problems(problems: list[str]) -> None:
             self.unavailable = tuple(problems)
             self.changed.emit()
 
-        self._learning = self._tasks.start("Waiting for a pedal", _learned, done, told)
+        self._learning = self._tasks.start("Waiting for a pedal", _learned, done, report_problems)
         self.changed.emit()
 
     def give_up(self) -> None:
@@ -276,8 +276,8 @@ def pedal_name(number: int, keyboard: bool) -> str:
     return f"key {keys.get(number, f'number {number}')}"
 
 
-def _put(heard: queue.SimpleQueue[tuple[str, Any]], key: str, what: object) -> None:
-    heard.put((key, what))
+def _put(received: queue.SimpleQueue[tuple[str, Any]], key: str, what: object) -> None:
+    received.put((key, what))
 
 
 def _found() -> DevicesFound:
@@ -294,11 +294,11 @@ def _found() -> DevicesFound:
 def _learned(control: Control) -> Learned | str | None:
     """Wait for a pedal; why none can be read, in words."""
 
-    def told(problems: list[str]) -> None:
+    def report_problems(problems: list[str]) -> None:
         if not control.cancelled.is_set():
             control.part(problems)
 
     try:
-        return learn(control.cancelled, hid.find_hid, hid.open_hid, told)
+        return learn(control.cancelled, hid.find_hid, hid.open_hid, report_problems)
     except HidError as error:
         return str(error)

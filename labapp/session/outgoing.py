@@ -42,10 +42,12 @@ def export_session(
         return _export_lines(session, folder, scheme, numbers)
     before = len(numbers) * report
     total = before + len(numbers) * (2 if "film" in choice.pictures else 1)
-    told = progress or (lambda done, total: None)
+    report_progress = progress or (lambda done, total: None)
 
     def made() -> bytes:
-        return report_pdf(session, scheme, numbers, progress=lambda done: told(done, total))
+        return report_pdf(
+            session, scheme, numbers, progress=lambda done: report_progress(done, total)
+        )
 
     return export(
         folder,
@@ -55,7 +57,7 @@ def export_session(
         choice,
         image_of=lambda number: session.frame(number).image,
         extras={"report.pdf": made} if report else None,
-        progress=lambda done: told(before + done, total),
+        progress=lambda done: report_progress(before + done, total),
     )
 
 
@@ -64,7 +66,7 @@ def write_view_film(
     path: Path,
     camera: Direction | Camera,
     size_px: tuple[int, int],
-    told: Progress,
+    report_progress: Progress,
 ) -> None:
     """Write a film (MP4) of all frames of the settings' scheme, seen from a camera.
 
@@ -88,7 +90,9 @@ def write_view_film(
         drawing_process(size_px, camera) as process,
     ):
         times_s, count = film_times(frames), len(numbers)
-        write_film(path, measured, times_s, extent, process, lambda done: told(done, count))
+        write_film(
+            path, measured, times_s, extent, process, lambda done: report_progress(done, count)
+        )
 
 
 def _export_lines(

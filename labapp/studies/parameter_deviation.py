@@ -158,8 +158,8 @@ def deviation_table(found: dict[tuple[str, str], ParameterDeviation]) -> Table:
         ):
             if not sigma:
                 continue
-            told = (quantity.name, float(sigma), quantity.unit)
-            rows.append((surface, scheme, *told, float(height), float(diameter), None, None))
+            which = (quantity.name, float(sigma), quantity.unit)
+            rows.append((surface, scheme, *which, float(height), float(diameter), None, None))
         drawn = f"all, Monte Carlo ({len(one.draws)} draws)"
         for name, sizes, limits in (
             ("all, linear", one.linear, (None, None)),

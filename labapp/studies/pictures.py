@@ -68,10 +68,10 @@ def positioning_picture(rig: Rig, width_mm: float, length_mm: float, height_mm: 
 
 
 def _draw_side(plot: Any, view: SideView) -> None:
-    told: set[Fate] = set()
+    labelled: set[Fate] = set()
     for ray in view.rays:
-        label = None if ray.fate in told else ray.fate.value
-        told.add(ray.fate)
+        label = None if ray.fate in labelled else ray.fate.value
+        labelled.add(ray.fate)
         plot.plot(*ray.path_mm.T, color=FATES[ray.fate], lw=0.6, label=label)
     plot.axhline(0, color="0.3", lw=0.6)
     plot.plot(*view.pool_mm.T, color="#c05a00", lw=1.6)

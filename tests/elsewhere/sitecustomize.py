@@ -151,7 +151,9 @@ def _replace(source: Any, target: Any) -> None:
 
 
 def _unlink(path: Any) -> None:
-    _refuse_if_open(path)
+    # filelock knows the true system and removes its open lock, as it may there and not on Windows.
+    if sys._getframe(1).f_globals.get("__name__", "").partition(".")[0] != "filelock":
+        _refuse_if_open(path)
     TRUE["unlink"](path)
 
 

@@ -58,8 +58,8 @@ def number(qtbot):
     qtbot.addWidget(field)
     field.set_value(27.0)
     field.show()
-    field.told = []
-    field.edited.connect(field.told.append)
+    field.received = []
+    field.edited.connect(field.received.append)
     return field
 
 
@@ -72,19 +72,19 @@ def retype(qtbot, field, text):
 
 def test_a_number_is_told_when_it_is_finished(qtbot, number):
     retype(qtbot, number, "30,5")
-    assert number.told == []
+    assert number.received == []
     qtbot.keyClick(number.editor, Qt.Key.Key_Return)
-    assert number.told == [30.5]
+    assert number.received == [30.5]
     assert number.editor.text() == "30.50"
     qtbot.keyClick(number.editor, Qt.Key.Key_Return)
-    assert number.told == [30.5]
+    assert number.received == [30.5]
 
 
 def test_leaving_a_rounded_number_does_not_change_it(qtbot, number):
     number.set_value(27.123456789)
     number.editor.setFocus()
     qtbot.keyClick(number.editor, Qt.Key.Key_Return)
-    assert number.told == []
+    assert number.received == []
     assert number.value() == 27.123456789
 
 
@@ -97,7 +97,7 @@ def test_what_is_wrong_is_said_and_the_former_value_stays(qtbot, number, text, w
     if not text:
         number.editor.clear()
     qtbot.keyClick(number.editor, Qt.Key.Key_Return)
-    assert number.told == []
+    assert number.received == []
     assert number.value() == 27.0
     assert number.editor.text() == "27.00"
     assert words in number.problem.text()
@@ -138,13 +138,13 @@ def test_steps_that_follow_each_other_are_one_edit(qtbot, number):
     for _ in range(3):
         qtbot.keyClick(number.editor, Qt.Key.Key_Up)
     assert number.editor.text() == "30.00"
-    assert number.told == []
+    assert number.received == []
     number.set_value(27.0)  # a refresh meanwhile
-    qtbot.waitUntil(lambda: number.told == [30.0])
+    qtbot.waitUntil(lambda: number.received == [30.0])
     for _ in range(8):
         qtbot.keyClick(number.editor, Qt.Key.Key_PageUp)
     number.flush()
-    assert number.told == [30.0, 90.0]
+    assert number.received == [30.0, 90.0]
 
 
 def test_a_refresh_leaves_alone_what_is_being_typed(qtbot, number):
@@ -154,7 +154,7 @@ def test_a_refresh_leaves_alone_what_is_being_typed(qtbot, number):
     number.set_value(27.0)
     assert number.editor.text() == "30"
     qtbot.keyClick(number.editor, Qt.Key.Key_Return)
-    assert number.told == [30.0]
+    assert number.received == [30.0]
 
 
 def test_whole_numbers_and_empty_ones(qtbot):

@@ -160,9 +160,7 @@ def test_what_was_measured_is_said_beside_the_button_of_every_page_that_measures
         page, pressed = opened.page, hand.find(words)
         assert page.answer.text() == ""
         pressed.click()
-        qtbot.waitUntil(
-            lambda page=page: page.answer.text().startswith("✓ 1 frame"), timeout=60_000
-        )
+        qtbot.waitUntil(lambda page=page: page.answer.text().startswith("✓ 1 frame"))
         assert stands_beside(page.answer, pressed)
 
 

@@ -109,7 +109,7 @@ def test_clicking_typing_and_keys_go_to_frames(qtbot: QtBot):
     assert went[-1] == 109
     timeline.number.setValue(12)
     assert went[-1] == 12
-    assert timeline.told.text().startswith("3 of 100 · 0.0333 s")
+    assert timeline.position_text.text().startswith("3 of 100 · 0.0333 s")
     assert scrubber.accessibleDescription().startswith("Frame 12, 0.0333 s: ")
 
 

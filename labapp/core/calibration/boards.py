@@ -327,7 +327,7 @@ def _chessboard(grey: npt.NDArray[np.uint8], board: Board) -> BoardCorners:
             "chessboard must be whole and have a white rim; of a ChArUco board a part is enough.",
         )
     grid = np.asarray(corners, np.float64).reshape(board.rows - 1, board.columns - 1, 2)
-    # Which way the rows run is not told: upright is how a board stands.
+    # Which way the rows run is unknown: upright is how a board stands.
     if grid[:, -1, 0].mean() < grid[:, 0, 0].mean():
         grid = grid[:, ::-1]
     if grid[-1, :, 1].mean() < grid[0, :, 1].mean():

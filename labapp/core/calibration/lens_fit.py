@@ -2,7 +2,7 @@
 
 Each picture has a homography of its own, all have one lens: Brown and Conrady's k₁, k₂, p₁, p₂
 about the middle of the picture. So one picture is enough, square or askew, and any others add to
-it. Of the camera itself nothing more is assumed, and nothing can be told: pictures of planes
+it. Of the camera itself nothing more is assumed, and nothing can be found: pictures of planes
 square to it leave the focal length open, which only scales the coefficients. It is taken as the
 longer side of the picture. That the lens's axis passes beside the middle is, to first order,
 tangential distortion and perspective, which are free.

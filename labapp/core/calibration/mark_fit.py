@@ -171,13 +171,13 @@ class MarkFits:
         if whole is None:
             return (f"nothing tells how far the camera looks askew: {HELP}",)
         corner = f"{self.corner_mm:.0f}, {self.corner_mm:.0f} mm"
-        told = f"± {bound:.2g} mm at the plate's far corner (X′, Z′ = {corner}; 95 %)"
+        bound_text = f"± {bound:.2g} mm at the plate's far corner (X′, Z′ = {corner}; 95 %)"
         if bound <= WHAT_MATTERS_MM:
-            return (told,)
+            return (bound_text,)
         if self.best == "homography" and bound > 1.5 * self.bound_mm(
             self.of("homography").calibration
         ):
-            return told, "the homography would leave less: the marks show perspective"
+            return bound_text, "the homography would leave less: the marks show perspective"
         on_x, on_z = np.diag(whole.covariance)[list(PERSPECTIVE[-1])]
         axis, way = ("O′Z′", "up or down") if on_z > on_x else ("O′X′", "from the side")
         return (

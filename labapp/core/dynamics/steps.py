@@ -55,9 +55,9 @@ class Event:
 
 
 QUANTITIES = ("change", "delay_s", "time_constant_s", "rise_time_s", "overshoot")
-"""What a response is told by: how much the series changes in the end, in its unit; from the step to
-the response's beginning; τ of the first order, of the second 1/(ζω₀), with which it settles; from
-10 to 90 % of the change; largest excess as a share of the change, 0 of the first order."""
+"""Quantities of a step response: how much the series changes in the end, in its unit; from the step
+to the response's beginning; τ of the first order, of the second 1/(ζω₀), with which it settles;
+from 10 to 90 % of the change; largest excess as a share of the change, 0 of the first order."""
 
 
 @dataclass(frozen=True)

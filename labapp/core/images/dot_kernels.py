@@ -99,7 +99,7 @@ def _tops(band: Grey, disc: BoolArray, v: int, u: int) -> bool:
     """Whether no pixel of a disc round one is over it."""
     (height, width), reach, own = band.shape, len(disc) // 2, band[v, u]
     if (u > 0 and band[v, u - 1] > own) or (u < width - 1 and band[v, u + 1] > own):
-        return False  # most are told by their neighbours
+        return False  # most are refused by their neighbours
     for y in range(max(v - reach, 0), min(v + reach + 1, height)):
         for x in range(max(u - reach, 0), min(u + reach + 1, width)):
             if disc[y - v + reach, x - u + reach] and band[y, x] > own:
@@ -370,7 +370,7 @@ def spikes(
     beside it, grey levels.
     """
     height, width = image.shape
-    found, told, count = np.empty((2, 64), np.int64), np.empty((2, 64)), 0
+    found, values, count = np.empty((2, 64), np.int64), np.empty((2, 64)), 0
     near, far = np.exp(0.5 / size**2), np.exp(2.0 / size**2)
     far = far if far < 4.0 else np.inf  # dots so small have no light so far off
     # Of bytes these are integers of two bytes.
@@ -405,12 +405,12 @@ def spikes(
                     fit = min(one, ground + far / near * lower) if far < np.inf else one
                 if count == found.shape[1]:
                     more, further = np.empty((2, 2 * count), np.int64), np.empty((2, 2 * count))
-                    more[:, :count], further[:, :count] = found, told
-                    found, told = more, further
+                    more[:, :count], further[:, :count] = found, values
+                    found, values = more, further
                 found[0, count], found[1, count] = u, v
-                told[0, count], told[1, count] = times, fit
+                values[0, count], values[1, count] = times, fit
                 count += 1
-    return found[:, :count].copy(), told[:, :count].copy()
+    return found[:, :count].copy(), values[:, :count].copy()
 
 
 @_compiled(_ints, _ints, types.Array(types.boolean, 1, "A", readonly=True))

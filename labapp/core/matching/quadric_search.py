@@ -1,6 +1,6 @@
 """Hypotheses from the optics: quadrics whose rays round the absent centre fall on dots.
 
-Where rows bow so far that no grid grows on the picture, the surface can still be told from the
+Where rows bow so far that no grid grows on the picture, the surface can still be found from the
 few dots round the hole: near its middle a pool is a quadric. The hole fixes its slope, the two
 dots beside it the curvature across, and the curvature along is tried out. What then falls near
 the dots round the hole is fitted to them and held against more of them.
@@ -79,7 +79,7 @@ def search_quadrics(observed: Observation, most: int = 8) -> list[QuadricGuess]:
     """
     marker = observed.rig.pattern.marker
     if marker is None or min(marker) < 2 or np.any(np.array(marker) >= observed.rays.shape[:2]):
-        return []  # without rays all round it, a hole cannot be told
+        return []  # without rays all round it, a hole cannot be recognised
     window = _Window(observed, marker)
     found: dict[bytes, QuadricGuess] = {}
     quadrics = [_quadrics(window, *hole) for hole in _holes(observed, window.tree)]

@@ -35,7 +35,7 @@ def find_lattice(dots: Dots, frame_shape: tuple[int, int], settings: LatticeSett
     Raises
     ------
     CannotMeasure
-        ``too-few-dots`` or ``no-rows`` if there are none to be told.
+        ``too-few-dots`` or ``no-rows`` if none can be found.
     """
     if settings.method == "rows":
         return search_rows(dots, settings.rows)

@@ -53,7 +53,7 @@ class ReflectionErrors(ReadOnlyArrays):
 
 @dataclass(frozen=True)
 class Measures:
-    """What is told of one pool. Lengths in mm, z over the work piece.
+    """Measures of one pool. Lengths in mm, z over the work piece.
 
     Parameters
     ----------
@@ -193,7 +193,7 @@ def assemble_measures(
         "level": reconstruction.size_sigma_level,
         "setup": reconstruction.size_sigma_setup,
     }
-    told = {
+    size_sigmas = {
         name: value
         for part, sigma in sigmas.items()
         for name, value in zip(sigma_names(part), sigma.tolist(), strict=True)
@@ -210,7 +210,7 @@ def assemble_measures(
         scale_x=float(errors.scale[0]),
         scale_z=float(errors.scale[1]),
         **dict(zip(WITH_SIGMA, size.tolist(), strict=True)),
-        **told,
+        **size_sigmas,
     )
 
 

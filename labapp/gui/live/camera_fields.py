@@ -34,7 +34,7 @@ TRIGGERS = {
 }
 
 APPART = 1e-3
-"""What the camera takes is said where it is so far, as a part, from what was asked for."""
+"""What the camera takes is said where it is so far, as a part, from what was requested."""
 
 PART_WORDS = (
     "Sizes are right only where the imaging plane was calibrated with a picture of this very "

@@ -48,7 +48,7 @@ class Figure:
     value: str
     sigma: str
     """Texts; value and sigma in mm."""
-    told: str = ""
+    verdict: str = ""
     """How it stands to its limits, in words after a sign; empty where it has none."""
     look: Look = "plain"
     """Red or pale."""
@@ -147,7 +147,7 @@ class LiveFigures(FollowsTheme, QWidget):
         for (row, _), label in self._labels.items():
             label.setVisible(row < len(shown))
         for row, figure in enumerate(shown):
-            name = f"{figure.name}\n{figure.told}" if figure.told else figure.name
+            name = f"{figure.name}\n{figure.verdict}" if figure.verdict else figure.name
             texts = (name, figure.value, figure.sigma, "mm")
             for column, text in enumerate(texts):
                 label = self._label(row, column)

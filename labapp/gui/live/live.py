@@ -133,7 +133,7 @@ class Live:
         self._newest: deque[LiveFrame] = deque(maxlen=1)
         self._judged: deque[JudgedFrame] = deque(maxlen=1)
         self._recorders: list[Recorder] = []
-        self._told: set[Path] = set()
+        self._reported: set[Path] = set()
         self._discarded: list[Take] = []
         self._counted: deque[tuple[float, int]] = deque()
         self._frame_byte = 0
@@ -310,8 +310,8 @@ class Live:
 
     def ended_takes(self) -> list[Take]:
         """Recordings that are written to their end, each given once."""
-        ended = [t for t in self.takes if t.finished.is_set() and t.path not in self._told]
-        self._told |= {take.path for take in ended}
+        ended = [t for t in self.takes if t.finished.is_set() and t.path not in self._reported]
+        self._reported |= {take.path for take in ended}
         return ended
 
     @property
@@ -401,7 +401,7 @@ class Live:
             if self.running is not take:
                 return False
             self._recorders[-1].stop()
-        self._told.add(take.path)
+        self._reported.add(take.path)
         self._discarded.append(take)
         return True
 

@@ -145,13 +145,13 @@ class AdviserWindow(ToolWindow):
 
     def start(self) -> None:
         """Search, in the background."""
-        asked = self.workspace.run_or_report(lambda: parse_request(self.values(), "the adviser"))
-        if asked is None:
+        request = self.workspace.run_or_report(lambda: parse_request(self.values(), "the adviser"))
+        if request is None:
             return
         effort = adviser.QUICK if self.effort.value() == "quick" else Effort()
 
         def work(control: Control) -> tuple[Advice, dict[str, bytes]]:
-            advice = advise(*asked, effort, progress=progress_of(control))
+            advice = advise(*request, effort, progress=progress_of(control))
             return advice, advice_files(advice)
 
         self.begin("Advising", work, lambda found: self.show_advice(*found))

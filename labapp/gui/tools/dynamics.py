@@ -283,10 +283,10 @@ class DynamicsWindow(ToolWindow):
         session = self.workspace.session
         seen = self.workspace.overview() if session is not None else None
         why = shown.impossible(session, seen)
-        told = why or (shown.range_text(seen) if seen is not None else "")
+        text = why or (shown.range_text(seen) if seen is not None else "")
         if self.drawn is not None and not shown.same_results(seen, self._of):
-            told = f"{CHANGED} {told}"
-        self.words.setText(told)
+            text = f"{CHANGED} {text}"
+        self.words.setText(text)
         idle = not self.working
         self.start_button.setEnabled(idle and not why)
         self.save_button.setEnabled(idle and self.drawn is not None)

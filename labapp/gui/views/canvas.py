@@ -42,8 +42,8 @@ class Drawn(FollowsTheme, QWidget):
 
     def describe(self, words: str) -> None:
         """Set the description for screen readers; the keys follow it."""
-        told = (words.strip().rstrip("."), self._keys)
-        self.setAccessibleDescription(". ".join(part for part in told if part))
+        parts = (words.strip().rstrip("."), self._keys)
+        self.setAccessibleDescription(". ".join(part for part in parts if part))
 
     def paintEvent(self, _event: QPaintEvent) -> None:
         """Draw the focus frame; what lies on the widget leaves a px at the edge."""

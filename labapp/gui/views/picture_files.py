@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from PySide6.QtCore import QRectF, QSize
+from PySide6.QtCore import QRectF, QSize, Qt
 from PySide6.QtGui import QCursor, QImage, QPainter, QPalette
 from PySide6.QtWidgets import QDialog, QGraphicsView, QMessageBox, QToolTip, QWidget
 
@@ -156,15 +156,18 @@ def _report(path: Path, written: bool, drawn: QWidget) -> None:
     if written:
         QToolTip.showText(QCursor.pos(), plain_tip(f"{DONE} Saved in {path}"), drawn)
     else:
-        QMessageBox.warning(drawn, "Save picture", f"{path} cannot be written.")
+        box = QMessageBox(QMessageBox.Icon.Warning, "Save picture", "", parent=drawn)
+        box.setTextFormat(Qt.TextFormat.PlainText)
+        box.setText(f"{path} cannot be written.")
+        box.exec()
 
 
 def save_plot(drawn: QWidget, canvas: QGraphicsView, name: str) -> Callable[[], None]:
     """Return what asks for a file and writes a plot to it."""
 
     def save() -> None:
-        if asked := ask_paper(drawn, PaperDialog.folder / f"{name}.png", VECTORS):
-            path = with_suffix(asked[0], SVG)
-            _report(path, write_plot(path, drawn, canvas, asked[1]), drawn)
+        if answer := ask_paper(drawn, PaperDialog.folder / f"{name}.png", VECTORS):
+            path = with_suffix(answer[0], SVG)
+            _report(path, write_plot(path, drawn, canvas, answer[1]), drawn)
 
     return save

@@ -416,9 +416,9 @@ def _index_of(curve: Curve, key: int | None) -> int | None:
     return index if index < len(curve.key) and curve.key[index] == key else None
 
 
-def _joined(told: Sequence[str]) -> str:
+def _joined(texts: Sequence[str]) -> str:
     """Points of one frame in one sentence: where it is only once."""
-    if not told:
+    if not texts:
         return ""
-    where = told[0].partition(": ")[0]
-    return f"{where}: " + ";  ".join(words.partition(": ")[2] for words in told)
+    where = texts[0].partition(": ")[0]
+    return f"{where}: " + ";  ".join(words.partition(": ")[2] for words in texts)

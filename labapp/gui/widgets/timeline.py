@@ -57,8 +57,10 @@ class Timeline(FollowsTheme, QWidget):
         self.number.setKeyboardTracking(False)
         self.number.setAlignment(Qt.AlignmentFlag.AlignRight)
         self.number.valueChanged.connect(self._typed)
-        self.told = plain_label()
-        self.told.setMinimumWidth(self.fontMetrics().horizontalAdvance("of 10000 · 0000.0000 s  "))
+        self.position_text = plain_label()
+        self.position_text.setMinimumWidth(
+            self.fontMetrics().horizontalAdvance("of 10000 · 0000.0000 s  ")
+        )
         self.counts = plain_label()
         self.counts.setTextFormat(Qt.TextFormat.RichText)
         self.counts.setAlignment(Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter)
@@ -93,7 +95,7 @@ class Timeline(FollowsTheme, QWidget):
             button = self._button(name, tip, icon)
             button.clicked.connect(lambda *_, by=go: self.step(by))
             row.addWidget(button)
-        fill(row, self.number, self.told)
+        fill(row, self.number, self.position_text)
         for kind, words, key in (("doubtful", "in doubt", "F8"), ("corrected", "corrected", "F7")):
             row.addSpacing(8)
             row.addWidget(self._jump(kind, f"previous frame {words}", "◂", f"Shift+{key}", False))
@@ -161,7 +163,7 @@ class Timeline(FollowsTheme, QWidget):
     def set_frame(self, frame: int) -> None:
         """Mark the frame in view."""
         if not len(self._frames):
-            self.told.setText("")
+            self.position_text.setText("")
             return
         position = int(np.searchsorted(self._frames, frame).clip(0, len(self._frames) - 1))
         self.scrubber.set_position(position)
@@ -170,7 +172,7 @@ class Timeline(FollowsTheme, QWidget):
         self.number.blockSignals(False)
         time_s = self._times_s[position]
         when = "" if np.isnan(time_s) else f" · {time_s:.4f} s"
-        self.told.setText(f"{position + 1} of {len(self._frames)}{when}")
+        self.position_text.setText(f"{position + 1} of {len(self._frames)}{when}")
 
     def described(self, position: int) -> str:
         """A frame in words."""

@@ -188,13 +188,13 @@ def _frame_line(session: SessionContents, scheme: str, number: int, time_s: floa
 
 def rows_sentence(lines: Iterable[FrameLine]) -> str:
     """In how many frames the shape of the rows allows the correspondence of least residual."""
-    told = [line for line in lines if line.rows_allow is not None]
-    if not told:
+    checked = [line for line in lines if line.rows_allow is not None]
+    if not checked:
         return ""
-    others = [line.frame for line in told if not line.rows_allow]
+    others = [line.frame for line in checked if not line.rows_allow]
     words = (
         f"The shape of the reflected rows (§7.1) allows the correspondence of least residual in "
-        f"{len(told) - len(others)} of {pluralize(len(told), 'frame')}"
+        f"{len(checked) - len(others)} of {pluralize(len(checked), 'frame')}"
     )
     return f"{words}, not in {format_ranges(others, ' to ', 6)}." if others else f"{words}."
 

@@ -51,7 +51,7 @@ def simulated_errors(trial: Trial) -> FloatArray:
     for number in range(trial.first, trial.last):
         pool = sample.pools[number]
         seen = trace(pool, rig)
-        told = (int((seen.lit & seen.blocked).sum()), int((seen.lit & ~seen.on_plane).sum()))
+        counts = (int((seen.lit & seen.blocked).sum()), int((seen.lit & ~seen.on_plane).sum()))
         rng = np.random.default_rng([sample.seed, number])
         try:
             match = exact_match(seen, rig, sigma_mm=limits.dot_sigma_mm, rng=rng)
@@ -62,7 +62,7 @@ def simulated_errors(trial: Trial) -> FloatArray:
             error = abs(relative_errors(measures, pool)[0] * pool.peak_mm)
         except CannotMeasure:
             error = np.inf
-        rows.append((error, *told))
+        rows.append((error, *counts))
     return np.array(rows)
 
 

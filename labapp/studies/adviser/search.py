@@ -161,8 +161,8 @@ def _found(search: _Search) -> Advice:
             return Advice(expected, limits, nearest, unknown, unknown, unknown, grid, ())
         possible = [nearest]
     scored = search.scored(possible, 0)
-    told = {one.place: one for one in scored}
-    grid = tuple(told.get(one.place, one) for one in grid)
+    by_place = {one.place: one for one in scored}
+    grid = tuple(by_place.get(one.place, one) for one in grid)
     finalists = search.refined(search.scored(_best(scored, 10), 1))
     best, error, sigma, random = search.decided(finalists)
     scale = error / best.error_mm

@@ -175,7 +175,7 @@ def check(
     Parameters
     ----------
     setup_file, settings
-        Text and path of the set-up, and how dots are found. What an earlier check has told of the
+        Text and path of the set-up, and how dots are found. What an earlier check has found of the
         bench is left out, or its pictures would count twice.
     progress
         Called with parts done, parts in all, and what is being done; may raise.

@@ -179,7 +179,7 @@ class CapturePage(Page):
             self._import(take.path, ":", None, False, self._measure if measured else _nothing)
 
     def _show_recording(self, recording: Recording | None) -> None:
-        self.told_group.setVisible(recording is not None and self.live_view.live is None)
+        self.facts_group.setVisible(recording is not None and self.live_view.live is None)
         session = self.workspace.session
         if recording is None or session is None:
             return
@@ -187,20 +187,20 @@ class CapturePage(Page):
         if shown == self._told:
             return
         self._told = shown
-        while self.told.count():
-            item = self.told.takeAt(0)
+        while self.facts.count():
+            item = self.facts.takeAt(0)
             widget = None if item is None else item.widget()
             if widget is not None:
                 widget.hide()  # it is deleted only later
                 widget.deleteLater()
         rows = recording_facts(recording)
         for row, (name, words) in enumerate(rows):
-            self.told.addWidget(plain_label(f"{name}:"), row, 0)
-            self.told.addWidget(selectable_label(words), row, 1)
+            self.facts.addWidget(plain_label(f"{name}:"), row, 0)
+            self.facts.addWidget(selectable_label(words), row, 1)
         unlike = other_size(calibrated_px(session), (recording.rows, recording.columns))
         warnings = (*recording.warnings, *[unlike] * bool(unlike))
         for row, sentence in enumerate(warnings, len(rows)):
-            self.told.addWidget(selectable_label(f"⚠ {sentence}"), row, 0, 1, 2)
+            self.facts.addWidget(selectable_label(f"⚠ {sentence}"), row, 0, 1, 2)
 
     def _show_import(self) -> None:
         working = self._importing in self.workspace.tasks.active
@@ -443,11 +443,11 @@ class CapturePage(Page):
         self.kept = KeptRecordings(
             self.take, lambda path: self._import_next(path, ":", None, False)
         )
-        self.told = QGridLayout()  # a form keeps heights of the width before: lines are cut off
-        self.told.setColumnStretch(1, 1)
-        self.told_group = Group("What was read", self.told)
+        self.facts = QGridLayout()  # a form keeps heights of the width before: lines are cut off
+        self.facts.setColumnStretch(1, 1)
+        self.facts_group = Group("What was read", self.facts)
         fill(
             self.panel_layout,
             *(choose, self.answer, self.live_view.group, self.missing, self.find_button),
-            *(self.chosen, self.exposure, self.foot_switch, self.kept, self.told_group, 1),
+            *(self.chosen, self.exposure, self.foot_switch, self.kept, self.facts_group, 1),
         )

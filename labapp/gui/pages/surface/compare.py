@@ -108,7 +108,7 @@ class CompareView(QWidget):
             box.view.show_scene(scene)
         self.difference.set_words("Nothing to compare")
         self.difference.show_scene(comparison.difference)
-        self.words.setText(comparison.told)
+        self.words.setText(comparison.text)
         self.table.setRowCount(len(comparison.rows))
         for k, row in enumerate(comparison.rows):
             for column, text in enumerate(row):

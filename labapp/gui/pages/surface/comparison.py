@@ -44,7 +44,7 @@ class Comparison:
     """Surface of the first, coloured by the difference; None where they do not overlap."""
     rows: tuple[Row, ...]
     """Figures of both and their difference."""
-    told: str
+    text: str
     """The comparison in a sentence."""
 
 

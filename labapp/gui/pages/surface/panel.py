@@ -97,7 +97,7 @@ class SurfacePanel:
 
     # --- what is shown -----------------------------------------------------------------------
 
-    def show(self, told: SurfaceState) -> None:
+    def show(self, surface_state: SurfaceState) -> None:
         """Show the state of the frame in view and the session's settings."""
         session = self.workspace.session
         if session is None:
@@ -105,17 +105,17 @@ class SurfacePanel:
         settings = session.settings
         self.scheme.set_value(scheme_name(settings))
         self.correspondence.set_value(settings.correspondence)
-        dots = told.state == "failed" and not session.has_lines
+        dots = surface_state.state == "failed" and not session.has_lines
         remedy = " Its dots can be corrected in step 6." if dots else ""
-        self.status.setText(f"{SIGNS[told.state]} {told.words}{remedy}")
-        self._stale = told.state == "stale"
-        show_words(self.setup_words, told.setup_words)
-        show_words(self.provenance, told.provenance)
-        show_words(self.verdict, told.verdict)
+        self.status.setText(f"{SIGNS[surface_state.state]} {surface_state.words}{remedy}")
+        self._stale = surface_state.state == "stale"
+        show_words(self.setup_words, surface_state.setup_words)
+        show_words(self.provenance, surface_state.provenance)
+        show_words(self.verdict, surface_state.verdict)
         for table, rows in (
-            (self.sizes, told.sizes),
-            (self.errors, told.errors),
-            (self.trials, told.trials),
+            (self.sizes, surface_state.sizes),
+            (self.errors, surface_state.errors),
+            (self.trials, surface_state.trials),
         ):
             table.set_rows(rows)
             table.setVisible(bool(rows))

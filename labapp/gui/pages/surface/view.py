@@ -103,7 +103,7 @@ class SurfacePage(Page):
     def __init__(self, workspace: Workspace) -> None:
         super().__init__(workspace)
         self.options = Options()
-        self.told = SurfaceState(None, "unmeasured", "")
+        self.surface_state = SurfaceState(None, "unmeasured", "")
         self.view = make_view3d("The pool in 3-D")
         self.dots, self.plan, self.profile = DotsChart(), PlanChart(), ProfileChart()
         self.plan.setMinimumWidth(LEAST_PLAN_WIDTH)
@@ -119,7 +119,7 @@ class SurfacePage(Page):
         self.stack.addWidget(self._single())
         self.stack.addWidget(self.compare)
         self.steering = Steering(
-            self._steered, lambda told: workspace.notified.emit(told, False), self
+            self._steered, lambda text: workspace.notified.emit(text, False), self
         )
         fill(self.canvas_layout, self._tools(), (self.stack, 1))
 
@@ -269,10 +269,10 @@ class SurfacePage(Page):
     def refresh(self) -> None:
         """Show the frame in view by the scheme that the session's settings choose."""
         try:
-            self.told = shown(self.session, self.workspace.frame)
+            self.surface_state = shown(self.session, self.workspace.frame)
         except InputError as error:
-            self.told = SurfaceState(None, "failed", str(error))
-        self.side.show(self.told)
+            self.surface_state = SurfaceState(None, "failed", str(error))
+        self.side.show(self.surface_state)
         self._show_options()
         if self.stack.currentWidget() is self.compare:
             self.compare.refresh(self.options)
@@ -348,8 +348,8 @@ class SurfacePage(Page):
         self._set(exaggeration=1.0 if now != 1.0 else self._exaggerated)
 
     def _show_surface(self) -> None:
-        result, seen = self.told.result, self.workspace.overview()
-        reconstruction = self.told.reconstruction
+        result, seen = self.surface_state.result, self.workspace.overview()
+        reconstruction = self.surface_state.reconstruction
         drawn, cut, dots = None, None, None
         if reconstruction is not None and self.options.section is not None:
             cut = profile(reconstruction, *self.options.section)
@@ -358,7 +358,7 @@ class SurfacePage(Page):
             limits = height_limits(seen) if self.options.same_colours else None
             drawn = scene(measurement, rig_of(result), self.options, limits, cut)
             dots = reflected_dots(measurement)
-        self.view.set_words(self.told.words)
+        self.view.set_words(self.surface_state.words)
         self.view.sigma_at = None if reconstruction is None else partial(_sigma, reconstruction)
         self.view.show_scene(drawn)
         boundary = None if reconstruction is None else reconstruction.boundary
