@@ -1,9 +1,9 @@
 ; Inno Setup: the installer for Windows, made of what PyInstaller froze there:
 ;   uv sync --locked --all-extras --no-default-groups --group build --no-editable
 ;   uv run --no-sync pyinstaller --distpath build\frozen --workpath build\pyinstaller packaging\labapp.spec
-;   iscc /DVersion=0.1.0 packaging\labapp.iss
+;   iscc /DVersion=1.0.0 packaging\labapp.iss
 #ifndef Version
-  #error Give the version: iscc /DVersion=0.1.0
+  #error Give the version: iscc /DVersion=1.0.0
 #endif
 [Setup]
 AppName=labapp

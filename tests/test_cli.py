@@ -745,7 +745,7 @@ def test_every_status_is_explained() -> None:
 
 def test_the_version_is_told(labapp: Run) -> None:
     code, said, _ = labapp("--version")
-    assert (code, said) == (0, "labapp 0.1.0\n")
+    assert (code, said) == (0, "labapp 1.0.0\n")
 
 
 @pytest.mark.parametrize(

@@ -110,7 +110,7 @@ class Stream(Protocol):
 class LineStream:
     """A line of JSON per frame, to every TCP client.
 
-    The first line names the program: ``{"labapp": "0.1.0"}``. A line has ``missed`` where lines
+    The first line names the program: ``{"labapp": "1.0.0"}``. A line has ``missed`` where lines
     before it were dropped because the client did not read. Beyond `MOST_LISTENERS` the first line
     has ``refused``, and is the last.
 
