@@ -20,7 +20,6 @@ from typing import Any, TypeVar
 import numba
 import platformdirs
 from filelock import FileLock
-from llvmlite.binding import Linkage
 from numba import types
 from numba.core.caching import _CacheLocator
 from numba.core.codegen import JITCodeLibrary
@@ -123,8 +122,8 @@ class OwnCopies(JITCodeLibrary):
 
     def _optimize_final_module(self) -> None:
         for function in self._final_module.functions:
-            if function.linkage == Linkage.linkonce_odr:
-                function.linkage = Linkage.internal
+            if function.linkage.name == "linkonce_odr":
+                function.linkage = "internal"
         super()._optimize_final_module()  # type: ignore[no-untyped-call]
 
 
