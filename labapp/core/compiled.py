@@ -14,7 +14,7 @@ from contextlib import AbstractContextManager, nullcontext, suppress
 from functools import cache
 from hashlib import sha256
 from pathlib import Path
-from threading import Event
+from threading import Event, Lock
 from typing import Any, TypeVar
 
 import numba
@@ -22,6 +22,8 @@ import platformdirs
 from filelock import FileLock
 from numba import types
 from numba.core.caching import _CacheLocator
+from numba.core.codegen import JITCodeLibrary
+from numba.core.registry import cpu_target
 
 F = TypeVar("F", bound=Callable[..., object])
 
@@ -42,6 +44,12 @@ MAY_COMPILE = Event()
 """Cleared while another process compiles: meanwhile it would stop all threads of this one."""
 
 MAY_COMPILE.set()
+
+_numba_is_set = Lock()
+"""Held while numba is set to compile as it is done here: its settings are the process's."""
+
+FORMAT = 2
+"""Of what is kept on the disk; raised when it is compiled in another way than before."""
 
 OLD_S = 60 * 86400.0
 """What was compiled for a source that nobody has is deleted after so long, s."""
@@ -103,6 +111,22 @@ class BySource(_CacheLocator):
         return str(self._line)
 
 
+class OwnCopies(JITCodeLibrary):
+    """Compiled code that calls its own copies of other functions, and nobody else's.
+
+    The machine code of a function has a copy of each function that it calls. numba lets the linker
+    take one copy for all of a process: the first one, which is the function's own where it was
+    compiled, and that of the caller loaded first where all came from the disk. Copies are
+    optimised among other code each, so that their sums differ in the last digits.
+    """
+
+    def _optimize_final_module(self) -> None:
+        for function in self._final_module.functions:
+            if function.linkage.name == "linkonce_odr":
+                function.linkage = "internal"
+        super()._optimize_final_module()  # type: ignore[no-untyped-call]
+
+
 def is_kept(module: str, file: Path) -> bool:
     """Whether anything that a module's file compiles is kept on the disk."""
     return (_folder() / _digest(module, file)).exists()
@@ -110,7 +134,7 @@ def is_kept(module: str, file: Path) -> bool:
 
 def _digest(module: str, file: Path) -> str:
     # What is kept names its module, too.
-    return sha256(module.encode() + b"\0" + file.read_bytes()).hexdigest()[:24]
+    return sha256(f"{FORMAT} {module}\0".encode() + file.read_bytes()).hexdigest()[:24]
 
 
 def _folder() -> Path:
@@ -135,11 +159,7 @@ def _delete_old(folder: Path) -> None:
 
 
 def _one_at_a_time(function: Any) -> AbstractContextManager[object]:
-    """Have one process at a time compile the functions of a file.
-
-    What is compiled differs by whether the functions that it calls were compiled before, in their
-    last digits: the processes of a run must all have what one of them compiled.
-    """
+    """Have one process at a time compile a function, which the others then load."""
     place = BySource.from_function(function, function.__code__.co_filename)
     return nullcontext() if place is None else FileLock(Path(place.get_cache_path()) / "lock")
 
@@ -148,12 +168,16 @@ def _kept(function: F, *signature: Any) -> F:
     MAY_COMPILE.wait()
     # A numba that does not know the setting keeps what it compiles where it always does.
     usual = getattr(_config, "CACHE_LOCATOR_CLASSES", "")
-    _config.CACHE_LOCATOR_CLASSES = f"{__name__}.{BySource.__name__}"
-    try:
-        with _one_at_a_time(function) if signature else nullcontext():
-            made: F = _njit(*signature, cache=True, **HOW)(function)
-    except RuntimeError:  # nowhere to keep it
-        made = _njit(*signature, **HOW)(function)
-    finally:
-        _config.CACHE_LOCATOR_CLASSES = usual
+    codegen: Any = cpu_target.target_context.codegen()
+    with _numba_is_set:
+        _config.CACHE_LOCATOR_CLASSES = f"{__name__}.{BySource.__name__}"
+        codegen._library_class = OwnCopies
+        try:
+            with _one_at_a_time(function) if signature else nullcontext():
+                made: F = _njit(*signature, cache=True, **HOW)(function)
+        except RuntimeError:  # nowhere to keep it
+            made = _njit(*signature, **HOW)(function)
+        finally:
+            _config.CACHE_LOCATOR_CLASSES = usual
+            del codegen._library_class
     return made
