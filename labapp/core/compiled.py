@@ -7,9 +7,10 @@ a measurement and not to the app's start.
 from __future__ import annotations
 
 import logging
+import re
 import shutil
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext, suppress
 from functools import cache
 from hashlib import sha256
@@ -58,8 +59,8 @@ OLD_S = 60 * 86400.0
 def compiled(*signature: types.Type) -> Callable[[F], F]:
     """Compile for arguments of these types, or take what was compiled before from the disk.
 
-    What is kept there is compiled anew when the function's own file changes, and only then: it must
-    not call compiled functions of other files.
+    What is kept there is compiled anew when the function's file changes, or one that compiles and
+    that it imports at its top: it may call the compiled functions of these.
     """
     return lambda function: _kept(function, signature)
 
@@ -70,12 +71,12 @@ def compiled_for(*signatures: tuple[types.Type, ...]) -> Callable[[F], F]:
 
 
 def inner(function: F) -> F:
-    """Compile a function that compiled functions of its own file call, and nothing else does."""
+    """Compile a function that only compiled functions call."""
     return _kept(function)
 
 
 class BySource(_CacheLocator):
-    """Keeps what is compiled by its module's name and what that says, wherever its file is.
+    """Keeps what is compiled by its module's name and its sources, wherever its file is.
 
     A second checkout or environment of a user finds what the first one compiled.
     """
@@ -103,7 +104,7 @@ class BySource(_CacheLocator):
         return str(_folder() / self._source)
 
     def get_source_stamp(self) -> str:
-        """Return what the file says, as a digest."""
+        """Return the digest of the sources."""
         return self._source
 
     def get_disambiguator(self) -> str:
@@ -134,7 +135,21 @@ def is_kept(module: str, file: Path) -> bool:
 
 def _digest(module: str, file: Path) -> str:
     # What is kept names its module, too.
-    return sha256(f"{FORMAT} {module}\0".encode() + file.read_bytes()).hexdigest()[:24]
+    whole = sha256(f"{FORMAT} {module}\0".encode())
+    for source in sorted(set(_sources(module, file))):
+        whole.update(source)
+    return whole.hexdigest()[:24]
+
+
+def _sources(module: str, file: Path) -> Iterator[bytes]:
+    """Yield what a file says, and what those say that compile and that it imports at its top."""
+    source = file.read_bytes()
+    yield source
+    package, depth = module.partition(".")[0], module.count(".")
+    root = file.parents[depth - 1] if depth else file.parent
+    for name in re.findall(rf"^from {package}\.(\S+_kernels) import ", source.decode(), re.M):
+        path = name.split(".")
+        yield from _sources(f"{package}.{name}", root.joinpath(*path[:-1], f"{path[-1]}.py"))
 
 
 def _folder() -> Path:

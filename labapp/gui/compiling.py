@@ -14,12 +14,14 @@ TITLE = "First use: compiling for this computer, one to two minutes"
 POLL_S = 0.2
 
 COMPILED = (
-    *(f"labapp.core.images.{name}_kernels" for name in ("centroid", "dot", "dot_fit", "ridge")),
-    "labapp.core.images.size_kernels",
+    *(f"labapp.core.images.{name}_kernels" for name in ("centroid", "dot", "dot_fit", "size")),
     "labapp.core.rows.lattice_kernels",
-    "labapp.core.surface.kernels",
-    "labapp.core.surface.level_kernels",
-    "labapp.core.matching.match_kernels",
+    *(
+        f"labapp.core.surface.kernels.{name}_kernels"
+        for name in ("spline", "ray", "solver", "outline", "level")
+    ),
+    *(f"labapp.core.matching.{name}_kernels" for name in ("match", "quadric")),
+    "labapp.core.lines.ridge_kernels",
     "labapp.core.sequence.prior",
     "labapp.export.fixed_point",
 )

@@ -6,6 +6,8 @@ import sys
 
 import pytest
 
+from labapp.core import compiled
+
 LOOPS = """
 import numpy as np
 from numba import types
@@ -68,3 +70,23 @@ def test_a_process_that_compiles_computes_what_one_that_loads_does(tmp_path):
     assert kept[0]
     assert kept[0] == kept[1], "the second one is to load what the first one compiled"
     assert printed[0] == printed[1]
+
+
+def test_what_is_kept_depends_on_the_compiled_functions_that_are_imported(tmp_path):
+    package = tmp_path / "package"
+    (package / "far").mkdir(parents=True)
+    files = {
+        "own_kernels.py": "from package.far.near_kernels import near\n",
+        "far/near_kernels.py": "from package.last_kernels import last\n",
+        "last_kernels.py": "LAST = 1\n",
+        "other.py": "OTHER = 1\n",
+    }
+    for name, source in files.items():
+        (package / name).write_text(source, "utf-8")
+    own = ("package.own_kernels", package / "own_kernels.py")
+    found = [compiled._digest(*own)]
+    for name, source in files.items():
+        (package / name).write_text(source + "MORE = 2\n", "utf-8")
+        found.append(compiled._digest(*own))
+    assert len(set(found)) == 4, "all but the one that is not imported"
+    assert found[-1] == found[-2]

@@ -10,7 +10,7 @@ import pytest
 from labapp.core.geometry.optics import direction_to_dots, intersect_imaging_plane
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.pipeline import Settings, reconstruct
-from labapp.core.surface import kernels
+from labapp.core.surface.kernels import solver_kernels, spline_kernels
 from labapp.core.surface.measures import measure_surface
 from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.pools import egg
@@ -73,10 +73,10 @@ def test_the_loops_agree_with_the_vectors():
     grid = np.array([[-6.0, 6.0, 1.0, 12.0], [-6.0, 6.0, 1.0, 12.0]])
     asked = (plane.to_universal(seen.plane_mm[seen.visible]),)
     # The slopes that the dots ask for are the pool's own: nothing is left to ask for.
-    right = kernels.gradient_rhs(
+    right = solver_kernels.gradient_rhs(
         grid, np.zeros(225), points, weights, RIG.laser.position_mm, plane.pose_mm, *asked
     )
-    flat = kernels.splines_at(grid, points)
+    flat = spline_kernels.splines_at(grid, points)
     expected = np.zeros(225)
     for own, by_x, by_y, (x, y) in zip(flat[0], flat[1][1], flat[1][2], slopes, strict=True):
         np.add.at(expected, own, by_x * x + by_y * y)

@@ -31,9 +31,15 @@ from labapp.core.images import (
     dots,
     size_kernels,
 )
-from labapp.core.matching import match_kernels
+from labapp.core.matching import match_kernels, quadric_kernels
 from labapp.core.sequence.prior import RIDGE, recurrence
-from labapp.core.surface import kernels, level_kernels
+from labapp.core.surface.kernels import (
+    level_kernels,
+    outline_kernels,
+    ray_kernels,
+    solver_kernels,
+    spline_kernels,
+)
 from labapp.core.surface.level import Rear
 from labapp.core.surface.solver import normal_factor
 from labapp.core.surface.spline import SplineBasis, SplineSurface
@@ -66,22 +72,22 @@ def test_splines_and_surfaces_are_those_of_the_basis() -> None:
     # Some places lie beyond the rectangle, whose edge they are held to.
     place = random().uniform(BASIS.low_mm - 0.5, BASIS.high_mm + 0.5, (200, 2))
     held = np.clip(place, BASIS.low_mm, BASIS.high_mm)
-    splines, values = kernels.splines_at(BASIS.grid, place)
+    splines, values = spline_kernels.splines_at(BASIS.grid, place)
     for of, (dx, dy) in zip(values, ((0, 0), (1, 0), (0, 1)), strict=True):
         matrix = np.zeros((len(place), COUNT))
         np.put_along_axis(matrix, splines, of, axis=1)
         np.testing.assert_allclose(matrix, BASIS.matrix(*held.T, dx, dy), atol=1e-12)
-    made = kernels.surface_at(BASIS.grid, surface().coefficients, place)
+    made = spline_kernels.surface_at(BASIS.grid, surface().coefficients, place)
     height, gradient = surface().height_and_gradient(*held.T)
     np.testing.assert_allclose(made, [height, *gradient.T], atol=1e-12)
     share = random().normal(size=len(place))
-    summed = kernels.gradient_of_sum(BASIS.grid, COUNT, place, share)
+    summed = spline_kernels.gradient_of_sum(BASIS.grid, COUNT, place, share)
     np.testing.assert_allclose(summed, share @ BASIS.matrix(*held.T), atol=1e-12)
 
 
 def test_rays_meet_the_surface_and_their_dots_lie_where_the_optics_put_them() -> None:
     rays, landing = landings()
-    points, slopes, plane = kernels.intersect_and_reflect(
+    points, slopes, plane = ray_kernels.intersect_and_reflect(
         BASIS.grid, surface().coefficients, rays, landing, 6, PLANE.pose_mm
     )
     known = np.isfinite(plane[:, 0])
@@ -95,7 +101,7 @@ def test_rays_meet_the_surface_and_their_dots_lie_where_the_optics_put_them() ->
         plane[known], intersect_imaging_plane(points[known], way, PLANE), atol=1e-9
     )
     own = rays[known], landing[known]
-    moved, most = kernels.newton_along_rays(BASIS.grid, surface().coefficients, *own, 6)
+    moved, most = solver_kernels.newton_along_rays(BASIS.grid, surface().coefficients, *own, 6)
     np.testing.assert_allclose(moved, points[known], atol=1e-12)
     assert most == np.abs(moved - landing[known]).max()
 
@@ -103,7 +109,7 @@ def test_rays_meet_the_surface_and_their_dots_lie_where_the_optics_put_them() ->
 def test_a_ray_that_runs_away_from_the_plane_has_no_dot() -> None:
     rays, landing = landings()
     steep = SplineSurface(BASIS, surface().coefficients + 8.0 * BASIS_Y)
-    plane = kernels.intersect_and_reflect(
+    plane = ray_kernels.intersect_and_reflect(
         BASIS.grid, steep.coefficients, rays, landing, 1, PLANE.pose_mm
     )[2]
     assert np.isnan(plane).all()
@@ -131,7 +137,7 @@ def test_slopes_weigh_as_the_covariance_of_their_dots_has_it() -> None:
     seen = rng.uniform([10.0, 10.0], [80.0, 60.0], (len(landing), 2))
     half = rng.normal(0.0, 0.05, (len(landing), 2, 2))
     covariance, floor = half @ half.swapaxes(1, 2), 0.02
-    made = kernels.slope_weights(
+    made = ray_kernels.slope_weights(
         LASER, PLANE.pose_mm, landing, PLANE.to_universal(seen), covariance, floor
     )
     jacobian = slopes_of_dots(landing, seen)
@@ -146,7 +152,7 @@ def test_dots_are_uncertain_by_what_the_coefficients_are() -> None:
     factor = normal_factor(BASIS, 10.0 * BASIS.roughness, points, weights)
     lower = sum(np.diag(line[: COUNT - k], -k) for k, line in enumerate(factor))
     at, seen = points[:7], rng.uniform([10.0, 10.0], [80.0, 60.0], (7, 2))
-    made = kernels.covariance_of_dots(
+    made = solver_kernels.covariance_of_dots(
         BASIS.grid, factor, LASER, PLANE.pose_mm, at, PLANE.to_universal(seen)
     )
     slopes = np.stack([BASIS.matrix(*at[:, :2].T, 1, 0), BASIS.matrix(*at[:, :2].T, 0, 1)], axis=1)
@@ -202,14 +208,14 @@ def test_the_normal_equations_are_those_of_least_squares() -> None:
     np.testing.assert_allclose(held, 0.0, atol=1e-9 * normal.max())
     right = rng.normal(size=(2, COUNT))
     solved = np.linalg.solve(lower @ lower.T, right.T).T
-    np.testing.assert_allclose(kernels.solve(factor, right), solved, rtol=1e-6)
-    indefinite = kernels.normal_factor(BASIS.grid, -1e3 * BASIS.roughness, points, weights)
+    np.testing.assert_allclose(solver_kernels.solve(factor, right), solved, rtol=1e-6)
+    indefinite = solver_kernels.normal_factor(BASIS.grid, -1e3 * BASIS.roughness, points, weights)
     assert not indefinite[1]
     dots_mm = PLANE.to_universal(rng.uniform([10.0, 10.0], [80.0, 60.0], (60, 2)))
     asked = bisecting_gradient(points - LASER, dots_mm - points)
     off = asked - surface().gradient(*points[:, :2].T)
     np.testing.assert_allclose(
-        kernels.gradient_rhs(
+        solver_kernels.gradient_rhs(
             BASIS.grid, surface().coefficients, points, weights, LASER, PLANE.pose_mm, dots_mm
         ),
         np.einsum("nap,nab,nb->p", by, weights, off),
@@ -226,12 +232,16 @@ def test_a_step_solves_the_normal_equations_and_keeps_the_mean_height() -> None:
     band = 10.0 * BASIS.roughness
     factor = normal_factor(BASIS, band, points, weights)
     half = sum(np.diag(line[: COUNT - k], -k) for k, line in enumerate(band))
-    right = kernels.gradient_rhs(BASIS.grid, own, points, weights, LASER, PLANE.pose_mm, dots_mm)
+    right = solver_kernels.gradient_rhs(
+        BASIS.grid, own, points, weights, LASER, PLANE.pose_mm, dots_mm
+    )
     right -= (half + np.tril(half, -1).T) @ rough
-    change = kernels.solve(factor, right[None])[0]
+    change = solver_kernels.solve(factor, right[None])[0]
     change -= (BASIS.matrix(*points[:, :2].T) @ change).mean()
     bench = LASER, PLANE.pose_mm
-    made = kernels.fit_step(BASIS.grid, (band, factor), own, rough, points, weights, bench, dots_mm)
+    made = solver_kernels.fit_step(
+        BASIS.grid, (band, factor), own, rough, points, weights, bench, dots_mm
+    )
     np.testing.assert_allclose(made, own + change, atol=1e-9 * np.abs(change).max())
 
 
@@ -274,7 +284,7 @@ def test_rays_are_hidden_by_the_torch_as_when_they_are_reflected_one_by_one() ->
     height = points[:, 2] - points[:, 1] * towards[:, 2] / towards[:, 1]
     hidden = height > 2.4 - 0.3
     assert 10 < hidden.sum() < len(rays) - 10
-    np.testing.assert_array_equal(kernels.behind_torch(points, rays, slopes, 2.4), hidden)
+    np.testing.assert_array_equal(ray_kernels.behind_torch(points, rays, slopes, 2.4), hidden)
 
 
 def test_frames_follow_on_each_other_by_the_least_squares_recurrence() -> None:
@@ -617,9 +627,9 @@ def test_pictures_lower_than_the_filters_are_mirrored_again_and_again(rows: int)
 def test_what_is_not_a_number_is_not_settled() -> None:
     rays, landing = landings()
     nothing = np.full(COUNT, np.nan)
-    assert np.isnan(kernels.newton_along_rays(BASIS.grid, nothing, rays, landing, 1)[1])
+    assert np.isnan(solver_kernels.newton_along_rays(BASIS.grid, nothing, rays, landing, 1)[1])
     assert np.isnan(
-        kernels.intersect_and_reflect(BASIS.grid, nothing, rays, landing, 1, PLANE.pose_mm)[2]
+        ray_kernels.intersect_and_reflect(BASIS.grid, nothing, rays, landing, 1, PLANE.pose_mm)[2]
     ).all()
 
 
@@ -633,7 +643,7 @@ def test_the_rim_is_where_the_surface_comes_down_to_it(drop_mm: float) -> None:
     theta = np.linspace(-np.pi, np.pi, 48, endpoint=False)
     way = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
     center, rear = np.array([0.1, -0.4]), Rear(drop_mm, -1.0, -4.5)
-    radius, boundary_slope, over = kernels.newton_to_boundary(
+    radius, boundary_slope, over = outline_kernels.newton_to_boundary(
         BASIS.grid, surface().coefficients, np.array([drop_mm, -1.0, -4.5]), center, way,
         np.full(48, 3.0), np.full(48, 0.3), 1e-10,
     )  # fmt: skip
@@ -652,7 +662,9 @@ def test_rays_meet_quadrics() -> None:
     rays = ray_directions(RIG.laser, RIG.pattern)[7:12, 7:12].reshape(-1, 3)
     center = np.array([0.2, -0.3])
     quadrics = np.array([[0.02, -0.03, -0.05, 0.01, -0.04], [0.0, 0.01, 0.03, 0.0, 0.02]])
-    points, plane = kernels.reflect_off_quadrics(center, quadrics, rays, LASER, PLANE.pose_mm)
+    points, plane = quadric_kernels.reflect_off_quadrics(
+        center, quadrics, rays, LASER, PLANE.pose_mm
+    )
     for (g_x, g_y, k_x, k_xy, k_y), met, seen in zip(quadrics, points, plane, strict=True):
         x, y = (met[:, :2] - center).T
         z = g_x * x + g_y * y + (k_x * x**2 + 2 * k_xy * x * y + k_y * y**2) / 2
@@ -671,7 +683,7 @@ def test_a_predicted_dot_hits_within_its_share_of_the_way_to_the_next() -> None:
     absent[1, 1] = True
     places = np.array([[0.9, 0.0], [2.0, 3.0], [6.0, 1.1], [4.0, 5.0]])
     hit, dot, off = (
-        part[0] for part in kernels.match_predicted_dots(pattern[None], places, absent, 0.5)
+        part[0] for part in quadric_kernels.match_predicted_dots(pattern[None], places, absent, 0.5)
     )
     np.testing.assert_allclose(off[0, 0], 0.9)  # of half the 2 mm to the next in its row
     assert hit[0, 0]
@@ -690,13 +702,15 @@ def test_quadrics_are_fitted_by_least_squares_of_slopes(lit: list[int]) -> None:
     true = np.array([[0.02, -0.03, -0.05, 0.01, -0.04]])
     near, absent = true + 0.003 * random().normal(size=(1, 5)), np.zeros((5, 5), bool)
     bench = LASER, PLANE.pose_mm
-    places = kernels.reflect_off_quadrics(center, true, rays.reshape(-1, 3), *bench)[1]
+    places = quadric_kernels.reflect_off_quadrics(center, true, rays.reshape(-1, 3), *bench)[1]
     places = places.reshape(5, 5, 2)[1:4, 1:4].reshape(-1, 2)[list(lit)]
-    fitted = kernels.fit_quadrics(center, near, rays, *bench, places, absent, 0.5)
+    fitted = quadric_kernels.fit_quadrics(center, near, rays, *bench, places, absent, 0.5)
     if len(lit) < 4:
         np.testing.assert_array_equal(fitted, near)
         return
-    pattern = kernels.reflect_off_quadrics(center, fitted, rays.reshape(-1, 3), *bench)[1][0]
+    pattern = quadric_kernels.reflect_off_quadrics(center, fitted, rays.reshape(-1, 3), *bench)[1][
+        0
+    ]
     off = np.linalg.norm(places[:, None] - pattern, axis=-1).min(axis=1)
     assert off.max() < 0.02
     if len(lit) > 4:
@@ -806,7 +820,8 @@ def test_caps_are_scored_by_the_places_that_lie_where_they_have_dots(height_mm: 
         [[0.0, 0.0, -2 * height_mm / axes[0] ** 2, 0.0, -2 * height_mm / axes[1] ** 2]]
     )
     points, dots = (
-        part[0] for part in kernels.reflect_off_quadrics(middle, quadric, rays, LASER - down, plane)
+        part[0]
+        for part in quadric_kernels.reflect_off_quadrics(middle, quadric, rays, LASER - down, plane)
     )
     there = (((points[:, :2] - middle) / axes) ** 2).sum(axis=1) < 1
     there &= np.isfinite(dots).all(axis=1)
@@ -824,7 +839,9 @@ def test_caps_are_scored_by_the_places_that_lie_where_they_have_dots(height_mm: 
     settings = np.array([10, 0.45, 0.5, 0.3, 5.0])
     far = cap + np.array([9.0, 0.0, 0.0, 0.0, 0.0])
     caps = np.array([cap, far])
-    score, made = kernels.score_caps(caps, rays, LASER, PLANE.pose_mm, places, absent, settings)
+    score, made = quadric_kernels.score_caps(
+        caps, rays, LASER, PLANE.pose_mm, places, absent, settings
+    )
     assert len(own) > 30
     assert 0 < near.sum() < len(own)
     np.testing.assert_allclose(score, [wanted, -np.inf], rtol=1e-9)

@@ -61,7 +61,7 @@ def search_caps(observed: Observation, most: int = 24) -> list[IntArray]:
     list of IntArray
         Index of the dot of each ray or `UNLABELLED`, shape (rows, columns); the best first.
     """
-    from labapp.core.surface import kernels
+    from labapp.core.matching import quadric_kernels
 
     rig = observed.rig
     bench = (
@@ -71,7 +71,7 @@ def search_caps(observed: Observation, most: int = 24) -> list[IntArray]:
         observed.absent.ravel(),
     )
     settings = np.array([LEAST_RAYS, GATE, DARK_PENALTY, LIT_GATE, LIT_MARKER_PENALTY])
-    score, found = kernels.score_caps(
+    score, found = quadric_kernels.score_caps(
         _caps(observed), observed.rays.reshape(-1, 3), *bench, settings
     )
     best = np.full((MOST_CAPS, found.shape[1]), UNLABELLED, np.int64)
@@ -100,7 +100,7 @@ def _matched(observed: Observation, labels: IntArray) -> tuple[float, IntArray] 
 
 
 def _caps(observed: Observation) -> FloatArray:
-    """Caps to be tried, each as large as there are dots for: see `kernels.score_caps`."""
+    """Caps to be tried, each as large as there are dots for: see `quadric_kernels.score_caps`."""
     area = len(observed.plane_mm) * observed.spacing_mm.prod()
     caps = []
     for aspect, height, x, y in product(_ASPECTS, _HEIGHTS, _ASIDE, _ALONG):

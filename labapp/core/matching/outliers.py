@@ -169,13 +169,13 @@ def _inside(observed: Observation, fitted: FittedLabels, missing: float) -> Floa
     ray seems to land outside, the level is that which the others give.
     """
     from labapp.core.matching import match_kernels
-    from labapp.core.surface import kernels
+    from labapp.core.surface.kernels import spline_kernels
 
     lit, known, level = fitted.labels != UNLABELLED, fitted.classes, fitted.level
     inside = np.ones(lit.shape)
     at = np.argwhere(lit & ~match_kernels.between(lit))
     landing, coefficients = observed.landing_mm[tuple(at.T)], fitted.paths.coefficients
-    height = kernels.surface_at(fitted.basis.grid, coefficients, landing)[0]
+    height = spline_kernels.surface_at(fitted.basis.grid, coefficients, landing)[0]
     outside = level.sign * (height - level.rear.height(landing[:, 1])) < 0.0
     odds = np.ones(len(at))  # the surface may go up there for the dot alone
     for k in np.flatnonzero(outside):

@@ -70,11 +70,11 @@ class RayPaths(ReadOnlyArrays):
         steps: int = 12,
     ) -> RayPaths:
         """Intersect and reflect the rays, from points nearby, shape (R, 3), or from z = 0."""
-        from labapp.core.surface import kernels
+        from labapp.core.surface.kernels import ray_kernels
 
         start = bench.rays.landing_mm.reshape(-1, 3) if near_mm is None else near_mm
         rays, plane = bench.rays.directions.reshape(-1, 3), bench.rig.imaging_plane.pose_mm
-        met = kernels.intersect_and_reflect(basis.grid, coefficients, rays, start, steps, plane)
+        met = ray_kernels.intersect_and_reflect(basis.grid, coefficients, rays, start, steps, plane)
         return cls(coefficients, *met)
 
 
@@ -132,21 +132,21 @@ def covariance_of_dots(
         Reflection points, shape (n, 3), and the dots that the surface makes there, IPCS, shape
         (n, 2), mm.
     """
-    from labapp.core.surface import kernels
+    from labapp.core.surface.kernels import solver_kernels
 
     laser, plane = rig.laser.position_mm, rig.imaging_plane.pose_mm
     dots_mm = rig.imaging_plane.to_universal(plane_mm)
-    return kernels.covariance_of_dots(basis.grid, factor, laser, plane, points_mm, dots_mm)
+    return solver_kernels.covariance_of_dots(basis.grid, factor, laser, plane, points_mm, dots_mm)
 
 
 def predict(observed: Observation, pool: FittedPool, where: BoolArray) -> Prediction:
     """Predict the dots of the rays in a mask, shape (rows, columns), that reach the plane."""
     from labapp.core.images import dot_kernels
-    from labapp.core.surface import kernels
+    from labapp.core.surface.kernels import ray_kernels
 
     at = np.argwhere(where)
     index, surface, pose = tuple(at.T), pool.surface, observed.rig.imaging_plane.pose_mm
-    points, slopes, plane = kernels.intersect_and_reflect(
+    points, slopes, plane = ray_kernels.intersect_and_reflect(
         surface.basis.grid,
         surface.coefficients,
         observed.rays[index],

@@ -164,12 +164,14 @@ class _Window:
     def intersect(self, quadrics: FloatArray, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Reflection points of rays, shape (n, 3), on quadrics, shape (m, 5), and their dots.
 
-        Shapes (m, n, 3), mm, and IPCS, (m, n, 2), mm (`kernels.reflect_off_quadrics`).
+        Shapes (m, n, 3), mm, and IPCS, (m, n, 2), mm (`quadric_kernels.reflect_off_quadrics`).
         """
-        from labapp.core.surface import kernels
+        from labapp.core.matching import quadric_kernels
 
         laser = self.observed.rig.laser.position_mm
-        return kernels.reflect_off_quadrics(self.landing_mm[:2], quadrics, rays, laser, self.plane)
+        return quadric_kernels.reflect_off_quadrics(
+            self.landing_mm[:2], quadrics, rays, laser, self.plane
+        )
 
     def hits(
         self, pattern: FloatArray, gate: float, absent: BoolArray
@@ -179,18 +181,18 @@ class _Window:
         The last is in units of the gate: a share of the way to the next predicted dot in the row
         or the column.
         """
-        from labapp.core.surface import kernels
+        from labapp.core.matching import quadric_kernels
 
-        return kernels.match_predicted_dots(pattern, self.observed.plane_mm, absent, gate)
+        return quadric_kernels.match_predicted_dots(pattern, self.observed.plane_mm, absent, gate)
 
     def fitted(self, quadrics: FloatArray) -> FloatArray:
         """Fit quadrics to the dots that their rays next to the reference fall near."""
-        from labapp.core.surface import kernels
+        from labapp.core.matching import quadric_kernels
 
         laser, places = self.observed.rig.laser.position_mm, self.observed.plane_mm
         center, plane = self.landing_mm[:2], self.plane
         bench = self.rays, laser, plane, places, self.absent
-        return kernels.fit_quadrics(center, quadrics, *bench, LOOSE_GATE)
+        return quadric_kernels.fit_quadrics(center, quadrics, *bench, LOOSE_GATE)
 
     def scored(self, quadrics: FloatArray) -> Iterator[QuadricGuess]:
         """Hold quadrics against the dots; yield those that explain the dots round the hole."""

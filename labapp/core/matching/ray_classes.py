@@ -37,13 +37,13 @@ def classify_rays(observed: Observation, labels: IntArray, paths: RayPaths) -> R
     Neither a dot nor a ray is left over where the surface lets dots run into each other.
     """
     from labapp.core.images import dot_kernels
-    from labapp.core.surface import kernels
+    from labapp.core.surface.kernels import ray_kernels
 
     lit, plane = labels != UNLABELLED, paths.plane_mm
     known = np.flatnonzero(np.isfinite(plane[:, 0]))
     tip = observed.rig.electrode.height_mm
     rays = observed.rays.reshape(-1, 3)[known]
-    blocked = kernels.behind_torch(paths.points_mm[known], rays, paths.slopes[known], tip)
+    blocked = ray_kernels.behind_torch(paths.points_mm[known], rays, paths.slopes[known], tip)
     in_view = observed.in_view(plane[known]) & ~blocked
 
     hushed = observed.absent | observed.hidden

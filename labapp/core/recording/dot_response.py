@@ -111,7 +111,7 @@ def _without(absorbed: FloatArray, moved: FloatArray) -> FloatArray:
 
 def _by_bench(rig: Rig, surface: SplineSurface, ray: IntArray) -> tuple[FloatArray, FloatArray]:
     """Changes of the dots of one surface: by each quantity, (n, 2, q); by the lens's centre."""
-    from labapp.core.surface import kernels
+    from labapp.core.surface.kernels import ray_kernels
 
     assert rig.uncertainty is not None
     axes, at = rig.uncertainty.axes, tuple(ray.T - 1)
@@ -120,7 +120,7 @@ def _by_bench(rig: Rig, surface: SplineSurface, ray: IntArray) -> tuple[FloatArr
         rays = project_rays(bench.laser, bench.pattern)
         near = rays.directions[at], rays.landing_mm[at]
         met = surface.basis.grid, surface.coefficients, *near, NEWTON_STEPS
-        return kernels.intersect_and_reflect(*met, bench.imaging_plane.pose_mm)[2]
+        return ray_kernels.intersect_and_reflect(*met, bench.imaging_plane.pose_mm)[2]
 
     dots, changes = computed(rig), []
     for k, one in enumerate(QUANTITIES):
@@ -144,12 +144,12 @@ def _by_lens_center(plane_mm: FloatArray, plane: ImagingPlane) -> FloatArray:
 
 def _by_spline(rig: Rig, surface: SplineSurface, ray: IntArray) -> FloatArray:
     """Change of the computed dots by each spline of a surface, shape (n, 2, p)."""
-    from labapp.core.surface import kernels
+    from labapp.core.surface.kernels import solver_kernels
 
     rays, at = project_rays(rig.laser, rig.pattern), tuple(ray.T - 1)
     grid, direction = surface.basis.grid, rays.directions[at]
     near = grid, surface.coefficients, direction, rays.landing_mm[at]
-    point, _ = kernels.newton_along_rays(*near, NEWTON_STEPS)
+    point, _ = solver_kernels.newton_along_rays(*near, NEWTON_STEPS)
     x, y = point[:, 0], point[:, 1]
     slope = surface.gradient(x, y)
 

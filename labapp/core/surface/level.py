@@ -145,9 +145,9 @@ class Witnesses(ReadOnlyArrays):
         about: tuple[float, int, float] | None = None,
     ) -> Level:
         """Find the level of a surface of these splines (`find_level`)."""
-        from labapp.core.surface import kernels
+        from labapp.core.surface.kernels import spline_kernels
 
-        there = kernels.surface_at(basis.grid, coefficients, self.landing_mm)
+        there = spline_kernels.surface_at(basis.grid, coefficients, self.landing_mm)
         seen = there[1:].T, self.landing_mm[:, 1], self.sign, self.spacing_mm
         return find_level(there[0], *seen, (self.head_sign, drop_mm), about, self.missing)
 
@@ -158,9 +158,9 @@ class Witnesses(ReadOnlyArrays):
 
         The surface lies at that level; how its rear lies is held. A constant is left out.
         """
-        from labapp.core.surface import kernels, level_kernels
+        from labapp.core.surface.kernels import level_kernels, spline_kernels
 
-        there = kernels.surface_at(basis.grid, coefficients, self.landing_mm)
+        there = spline_kernels.surface_at(basis.grid, coefficients, self.landing_mm)
         seen = there[0], there[1:].T, self.sign, self.spacing_mm
         rear = level.rear.height(self.landing_mm[:, 1])
         return level_kernels.negative_log_evidence(*seen, rear, level.sign, self.missing, _BLURS)
@@ -203,7 +203,7 @@ def find_level(
     missing
         Probability that a ray that came back has no dot (`Match.missing`).
     """
-    from labapp.core.surface import level_kernels
+    from labapp.core.surface.kernels import level_kernels
 
     head_sign, drop_mm = rear
     seen = height, slope, y, witness, spacing_mm
@@ -232,7 +232,7 @@ def guess_level(height: FloatArray, outer: BoolArray) -> Level:
     outer
         Which of them lie far from their middle, shape (n,).
     """
-    from labapp.core.surface import level_kernels
+    from labapp.core.surface.kernels import level_kernels
 
     shift, sigma, inner = level_kernels.guess_level(height, outer)
     return Level(shift, sigma, 1 if inner + shift > 0 else -1, Rear(), 0.0)

@@ -114,11 +114,11 @@ class FittedPool(ReadOnlyArrays):
     @cached_property
     def mean_splines(self) -> FloatArray:
         """Mean value of each spline over the reflection points, shape (splines,)."""
-        from labapp.core.surface import kernels
+        from labapp.core.surface.kernels import spline_kernels
 
         share = np.full(len(self.points_mm), 1 / len(self.points_mm))
         grid, count = self.surface.basis.grid, self.factor.shape[1]
-        return kernels.gradient_of_sum(grid, count, self.points_mm, share)
+        return spline_kernels.gradient_of_sum(grid, count, self.points_mm, share)
 
     def sigma_of(self, gradients: FloatArray) -> FloatArray:
         """Standard uncertainty of quantities, shape (m,), from their derivatives, shape (m, p)."""
@@ -159,7 +159,7 @@ def fit_pool(
     CannotMeasure
         ``no-surface`` if no surface can be fitted or it sends rays away from the plane.
     """
-    from labapp.core.surface import kernels
+    from labapp.core.surface.kernels import solver_kernels
 
     rays, at = project_rays(rig.laser, rig.pattern), tuple(ray.T - 1)
     points = rays.landing_mm[at]
@@ -171,7 +171,7 @@ def fit_pool(
     equations.reuse_mm = settings.floor_mm / 50
     if initial is not None:
         near = initial.basis.grid, initial.coefficients, rays.directions[at], points
-        points, _ = kernels.newton_along_rays(*near, NEWTON_STEPS)
+        points, _ = solver_kernels.newton_along_rays(*near, NEWTON_STEPS)
     rounds = Rounds(equations, rays.directions[at], np.zeros(basis.count), points, np.inf)
     witnesses = Witnesses.of(rays, rig.head_sign, witness, basis, missing)
     outer = None if (witnesses.sign < 0).any() else _outer(rays.landing_mm[at][:, :2])
@@ -192,12 +192,12 @@ def normal_equations(
 
     Points nearby have shape (n, 3); the others are as in `fit_pool`.
     """
-    from labapp.core.surface import kernels
+    from labapp.core.surface.kernels import ray_kernels
 
     laser, plane = rig.laser.position_mm, rig.imaging_plane.pose_mm
     dots = rig.imaging_plane.to_universal(plane_mm)
     near = laser, plane, points_mm, dots
-    weights = kernels.slope_weights(*near, plane_covariance_mm2, settings.floor_mm)
+    weights = ray_kernels.slope_weights(*near, plane_covariance_mm2, settings.floor_mm)
     stiffness = basis.stiffness(CORRELATED_MM2 / settings.jerk**2)
     return NormalEquations(basis, stiffness, laser, plane, dots, weights)
 
@@ -238,7 +238,7 @@ def rounds_with_level(
     CannotMeasure
         ``no-surface`` if no surface has the slopes.
     """
-    from labapp.core.surface import kernels
+    from labapp.core.surface.kernels import spline_kernels
 
     basis, level = rounds.equations.basis, near or Level(0.0, np.inf, 1, Rear(), 0.0)
 
@@ -247,7 +247,7 @@ def rounds_with_level(
         if count and abs(level.shift_mm) < raised_mm:
             return 0.0
         if outer is not None:
-            height = kernels.surface_at(basis.grid, rounds.coefficients, rounds.points_mm)[0]
+            height = spline_kernels.surface_at(basis.grid, rounds.coefficients, rounds.points_mm)[0]
             level = guess_level(height, outer)
             return level.shift_mm
         # The drop is held from half-way on, or the iteration may oscillate.
@@ -281,11 +281,11 @@ def fitted_pool(rounds: Rounds, level: Level, rig: Rig, plane_mm: FloatArray) ->
     CannotMeasure
         ``no-surface`` if the surface sends rays away from the plane.
     """
-    from labapp.core.surface import kernels
+    from labapp.core.surface.kernels import ray_kernels
 
     basis, plane = rounds.equations.basis, rig.imaging_plane.pose_mm
     at = basis.grid, rounds.coefficients, rounds.rays, rounds.points_mm
-    points, _, computed = kernels.intersect_and_reflect(*at, 1, plane)
+    points, _, computed = ray_kernels.intersect_and_reflect(*at, 1, plane)
     residual = computed - plane_mm
     if not np.isfinite(residual).all():
         raise CannotMeasure("no-surface", "the fitted surface sends rays away from the plane")

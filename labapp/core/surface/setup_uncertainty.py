@@ -104,7 +104,7 @@ def residual_changes(
     FloatArray
         Shape (n, 2, q), mm; the causes are the columns of `RigUncertainty.root`.
     """
-    from labapp.core.surface import kernels
+    from labapp.core.surface.kernels import ray_kernels
 
     assert rig.uncertainty is not None
     root, at, surface = rig.uncertainty.root, tuple(ray.T - 1), pool.surface
@@ -116,7 +116,7 @@ def residual_changes(
         rays, plane = project_rays(bench.laser, bench.pattern), bench.imaging_plane.pose_mm
         met = rays.directions[at], rays.landing_mm[at], NEWTON_STEPS, plane
         coefficients = surface.coefficients + by
-        computed = kernels.intersect_and_reflect(surface.basis.grid, coefficients, *met)[2]
+        computed = ray_kernels.intersect_and_reflect(surface.basis.grid, coefficients, *met)[2]
         changes[..., k] = (computed - dots_mm - pool.residual_mm) / SHARE
     return changes
 
@@ -131,7 +131,7 @@ def _response(
     benches: Sequence[Perturbed],
 ) -> FloatArray:
     """Changes of a fit's p coefficients on q benches perturbed a little, shape (p, q), mm."""
-    from labapp.core.surface import kernels
+    from labapp.core.surface.kernels import solver_kernels, spline_kernels
 
     points, surface = pool.points_mm, pool.surface
     grid, coefficients, at = surface.basis.grid, surface.coefficients, tuple(ray.T - 1)
@@ -144,7 +144,7 @@ def _response(
     ) -> FloatArray:
         """Right-hand side of the equations with the surface as it is, shape (p,)."""
         at = grid, coefficients, points_mm, own.weights
-        return kernels.gradient_rhs(*at, laser_mm, plane, dots_mm)
+        return solver_kernels.gradient_rhs(*at, laser_mm, plane, dots_mm)
 
     base = right_side(points, own.laser_mm, own.plane, own.dots_mm)
     changes = np.zeros((len(benches), len(coefficients)))
@@ -152,16 +152,16 @@ def _response(
         laser_mm, plane = bench.laser.position_mm, bench.imaging_plane
         rays = project_rays(bench.laser, bench.pattern).directions[at]
         start = intersect_level(laser_mm, rays, points[:, 2:])
-        there, _ = kernels.newton_along_rays(grid, coefficients, rays, start, 2)
+        there, _ = solver_kernels.newton_along_rays(grid, coefficients, rays, start, 2)
         seen = laser_mm, plane.pose_mm, plane.to_universal(dots_mm)
-        _, *slopes = kernels.surface_at(grid, coefficients, there)
+        _, *slopes = spline_kernels.surface_at(grid, coefficients, there)
         rises = rays / (rays[:, 2] - np.vecdot(np.transpose(slopes), rays[:, :2]))[:, None]
         for _ in range(ROUNDS):
-            raised = kernels.surface_at(grid, changes[k], there)[0][:, None]
+            raised = spline_kernels.surface_at(grid, changes[k], there)[0][:, None]
             asked = right_side(there + raised * rises, *seen) - base
-            changes[k] = kernels.solve(factor, asked[None])[0]
+            changes[k] = solver_kernels.solve(factor, asked[None])[0]
             # Slopes leave the level open.
-            changes[k] -= kernels.surface_at(grid, changes[k], there)[0].mean()
+            changes[k] -= spline_kernels.surface_at(grid, changes[k], there)[0].mean()
     return changes.T
 
 

@@ -71,7 +71,7 @@ def shape_and_gradients(
     boundary, boundary_slope
         See `trace_boundary`.
     """
-    from labapp.core.surface import kernels
+    from labapp.core.surface.kernels import spline_kernels
 
     surface = _Evaluated(basis, coefficients)
     samples = _Samples.of(surface, boundary)
@@ -88,7 +88,9 @@ def shape_and_gradients(
         # The middle of the boundary moves by half of what each side of it does.
         every = np.concatenate([*places, outline[extremes, :2]])
         share = np.concatenate([*shares, by_middle * half])
-        gradients.append(kernels.gradient_of_sum(basis.grid, len(coefficients), every, share))
+        gradients.append(
+            spline_kernels.gradient_of_sum(basis.grid, len(coefficients), every, share)
+        )
     return samples.shape, np.stack(gradients)
 
 
@@ -106,10 +108,10 @@ class _Evaluated:
         return np.asarray(self._at(x_mm, y_mm)[1:].T.reshape(*x_mm.shape, 2))
 
     def _at(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
-        from labapp.core.surface import kernels
+        from labapp.core.surface.kernels import spline_kernels
 
         places = np.column_stack([x_mm.ravel(), y_mm.ravel()])
-        return kernels.surface_at(self.basis.grid, self.coefficients, places)
+        return spline_kernels.surface_at(self.basis.grid, self.coefficients, places)
 
 
 _Terms = tuple[list[FloatArray], list[FloatArray], float]

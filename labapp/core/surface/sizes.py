@@ -56,16 +56,16 @@ def sizes_and_gradients(
 
     ``boundary_slope`` is that of `boundary_trace`, shape (m, 2).
     """
-    from labapp.core.surface import kernels
+    from labapp.core.surface.kernels import outline_kernels, spline_kernels
 
     grid, outline, center = basis.grid, boundary.points_mm, boundary.center_mm
 
     def height(x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
         place_mm = np.stack([x_mm, y_mm], axis=-1).reshape(-1, 2)
-        z = kernels.surface_at(grid, coefficients, place_mm)[0]
+        z = spline_kernels.surface_at(grid, coefficients, place_mm)[0]
         return np.asarray(z.reshape(np.shape(x_mm)))
 
-    samples, over, share = kernels.spokes(
+    samples, over, share = outline_kernels.spokes(
         grid, coefficients, outline, center, FRACTION, WEIGHT, level.rear.as_array, STRIDE
     )
     extremes, changes = [], np.zeros((2, len(coefficients)))
@@ -74,12 +74,14 @@ def sizes_and_gradients(
         # On the boundary an extreme stays where it is; within it may lie between samples.
         if sign * within[2] >= sign * extreme[2]:
             extreme = measures.refined(height, boundary, within, sign)
-            change[:] = kernels.gradient_of_sum(grid, len(change), extreme[None, :2], np.ones(1))
+            change[:] = spline_kernels.gradient_of_sum(
+                grid, len(change), extreme[None, :2], np.ones(1)
+            )
         elif level.sign > 0:
             change[:] = np.nan
         extremes.append(extreme)
     high, low = extremes
-    by_boundary = kernels.size_gradients(
+    by_boundary = outline_kernels.size_gradients(
         grid, len(coefficients), samples, share, outline, boundary_slope, center
     )
     width, length = np.ptp(outline[:, :2], axis=0)

@@ -81,11 +81,11 @@ class NormalEquations:
         CannotMeasure
             ``no-surface`` if the slopes do not settle the surface.
         """
-        from labapp.core.surface import kernels
+        from labapp.core.surface.kernels import solver_kernels
 
         if self.factor is None or not moved_mm <= self.reuse_mm:
             self.factor = normal_factor(self.basis, self.stiffness, points_mm, self.weights)
-        return kernels.fit_step(
+        return solver_kernels.fit_step(
             self.basis.grid,
             (self.stiffness, self.factor),
             coefficients,
@@ -152,14 +152,14 @@ class Rounds:
         CannotMeasure
             ``no-surface`` if the slopes do not settle the surface.
         """
-        from labapp.core.surface import kernels
+        from labapp.core.surface.kernels import solver_kernels
 
         grid = self.equations.basis.grid
         for count in range(most):
             at = self.coefficients, self.points_mm, self.moved_mm
             self.coefficients = self.equations.step(*at, smooth_about)
             self.coefficients += shift(count)  # the splines add up to 1
-            self.points_mm, self.moved_mm = kernels.newton_along_rays(
+            self.points_mm, self.moved_mm = solver_kernels.newton_along_rays(
                 grid, self.coefficients, self.rays, self.points_mm, newton_steps
             )
             if np.isnan(self.moved_mm):
@@ -189,9 +189,9 @@ def normal_factor(
     CannotMeasure
         ``no-surface`` if there is none.
     """
-    from labapp.core.surface import kernels
+    from labapp.core.surface.kernels import solver_kernels
 
-    lower, has_one = kernels.normal_factor(basis.grid, stiffness, points_mm, weights)
+    lower, has_one = solver_kernels.normal_factor(basis.grid, stiffness, points_mm, weights)
     if not has_one:
         raise CannotMeasure("no-surface", "no surface has the slopes that the dots ask for")
     return lower
@@ -217,11 +217,13 @@ def propagate_sigma(
     level_sigma_mm
         Standard uncertainty of the level, mm.
     """
-    from labapp.core.surface import kernels
+    from labapp.core.surface.kernels import solver_kernels
 
     by_level = gradients.sum(axis=1)
     free = gradients - by_level[:, None] * mean_splines
-    return np.asarray(np.sqrt(kernels.variances(factor, free) + (level_sigma_mm * by_level) ** 2))
+    return np.asarray(
+        np.sqrt(solver_kernels.variances(factor, free) + (level_sigma_mm * by_level) ** 2)
+    )
 
 
 @dataclass(frozen=True)
@@ -276,13 +278,13 @@ def fit_slopes(
     CannotMeasure
         ``no-surface`` if the slopes do not settle the surface.
     """
-    from labapp.core.surface import kernels
+    from labapp.core.surface.kernels import solver_kernels, spline_kernels
 
-    splines, (value, *slope) = kernels.splines_at(basis.grid, points_mm)
+    splines, (value, *slope) = spline_kernels.splines_at(basis.grid, points_mm)
     weighted = np.einsum("nas,na->ns", weights @ np.stack(slope, axis=1), slopes)
     target = np.bincount(splines.ravel(), weighted.ravel(), basis.count).astype(float)
     factor = normal_factor(basis, stiffness * basis.roughness, points_mm, weights)
-    coefficients = kernels.solve(factor, target[None])[0]
+    coefficients = solver_kernels.solve(factor, target[None])[0]
     mean_splines = np.bincount(splines.ravel(), value.ravel(), basis.count) / len(points_mm)
     surface = SplineSurface(basis, coefficients - mean_splines @ coefficients)
     return SlopeFit(surface, factor, mean_splines)

@@ -190,10 +190,10 @@ class SplineBasis(ReadOnlyArrays):
 
         Its lower band, shape (width + 1, splines), as LAPACK has it.
         """
-        from labapp.core.surface import kernels
+        from labapp.core.surface.kernels import solver_kernels
 
         nx, ny = self.shape
-        return kernels.roughness(_products(nx), _products(ny), self.step_mm)
+        return solver_kernels.roughness(_products(nx), _products(ny), self.step_mm)
 
     def stiffness(self, weight: float) -> FloatArray:
         """`roughness` times a weight, kept for the next time."""

@@ -126,7 +126,7 @@ class _Model:
     """Smooth surface through the true slopes, and its response to changes of them."""
 
     def __init__(self, pool: Pool, rig: Rig, seen: Reflections, dot_sigma_mm: float) -> None:
-        from labapp.core.surface import kernels
+        from labapp.core.surface.kernels import ray_kernels
 
         settings = FitSettings()
         self.pool, self.rig, self.seen = pool, rig, seen
@@ -148,7 +148,7 @@ class _Model:
         covariance = np.broadcast_to(variance * np.eye(2), (len(self.points), 2, 2))
         laser, pose = rig.laser.position_mm, rig.imaging_plane.pose_mm
         dots = rig.imaging_plane.to_universal(self.plane)
-        self.weights = kernels.slope_weights(laser, pose, self.points, dots, covariance, 0.0)
+        self.weights = ray_kernels.slope_weights(laser, pose, self.points, dots, covariance, 0.0)
         self.fitted = self.fit(self.points, pool.gradient(*self.points[:, :2].T))
         self.inward = self._inward(ground)
         self.dark = ~seen.hit & ~seen.absent & self.basis.contains(ground[..., 0], ground[..., 1])

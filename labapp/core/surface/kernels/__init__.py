@@ -1,0 +1,1 @@
+"""Inner loops of the surface's steps, compiled for the processor (docs/adr/0018)."""

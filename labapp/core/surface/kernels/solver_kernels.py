@@ -1,0 +1,376 @@
+"""The steps of the fit and its covariance, compiled (docs/adr/0018).
+
+Arguments mean the same in all of these modules, all in the UCS and mm:
+
+* ``grid``: low end, high end, step and number of cells of the splines along x and along y, shape
+  (2, 4) (`SplineBasis.grid`); with it ``coefficients`` of the splines, shape (p,).
+* ``rays``: unit directions from the laser, shape (n, 3); ``points``: where they meet the surface.
+* ``plane``: O′, the directions of O′X′ and O′Z′ and the normal of the imaging plane, and thickness
+  and index of its glass, shape (5, 3) (`ImagingPlane.pose_mm`).
+* ``work``: memory to write on, which holds values and slopes of the four splines along x, then
+  those along y, shape (4, 4).
+
+A lower band has the shape (width + 1, p), as LAPACK has it, and its columns follow on each other in
+memory; ``columns`` is the same transposed.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import types
+
+from labapp.core.compiled import compiled as _compiled
+from labapp.core.compiled import inner as _inner
+from labapp.core.surface.kernels.ray_kernels import (
+    bisecting_slopes,
+    newton_step,
+    slope_jacobian,
+    without_glass,
+)
+from labapp.core.surface.kernels.spline_kernels import cubic_splines, height_and_slopes, surface_at
+from labapp.core.values import FloatArray
+
+_f, _i = types.float64, types.int64
+_f1, _f2, _f3, _f4 = (types.Array(_f, n, "A", readonly=True) for n in (1, 2, 3, 4))
+_lower = types.Array(_f, 2, "F", readonly=True)
+_bands, _bench = types.UniTuple(_lower, 2), types.Tuple((_f1, _f2))  # type: ignore[no-untyped-call]
+
+ON_SURFACE_MM = 1e-9
+"""After a step as short no other is taken: the next would be far below rounding."""
+
+AT_ONCE = 8
+"""Columns of a matrix that are factorized at once."""
+
+
+@_compiled(_f3, _f3, _f1)
+def roughness(along_x: FloatArray, along_y: FloatArray, step: FloatArray) -> FloatArray:
+    """Band of `SplineBasis.roughness` from the products along x and along y in cells of size 1.
+
+    Those of each spline with itself and the next three, for orders 0 … 3, shapes (4, nx, 4) and
+    (4, ny, 4) (`spline._products`); the size of a cell has shape (2,), mm.
+    """
+    nx, ny = along_x.shape[1], along_y.shape[1]
+    columns = np.zeros((nx * ny, 3 * (ny + 1) + 1))
+    scale = np.empty(4)
+    for order in range(4):
+        scale[order] = 3.0 if 0 < order < 3 else 1.0
+        scale[order] *= step[0] ** (2 * order - 5) * step[1] ** (1 - 2 * order)
+    for i in range(nx):
+        for j in range(ny):
+            for a in range(min(4, nx - i)):
+                for b in range(-min(3, j) if a else 0, min(4, ny - j)):
+                    first, on = (j, b) if b >= 0 else (j + b, -b)
+                    total = 0.0
+                    for order in range(4):
+                        total += scale[order] * along_x[3 - order, i, a] * along_y[order, first, on]
+                    columns[i * ny + j, a * ny + b] = total
+    return columns.T
+
+
+@_inner
+def _accumulate_normal_matrix(
+    grid: FloatArray, points: FloatArray, weights: FloatArray, columns: FloatArray
+) -> None:
+    """Add what slopes at points weigh to the columns of a normal matrix's lower band."""
+    work, many = np.empty((4, 4)), int(grid[1, 3]) + 3
+    by_x, by_y = np.empty(16), np.empty(16)
+    for k in range(len(points)):
+        first_x = cubic_splines(grid[0], points[k, 0], work[0], work[1])
+        first_y = cubic_splines(grid[1], points[k, 1], work[2], work[3])
+        for a in range(4):
+            for b in range(4):
+                by_x[4 * a + b] = work[1, a] * work[2, b]
+                by_y[4 * a + b] = work[0, a] * work[3, b]
+        xx, xy, yy = weights[k, 0, 0], weights[k, 0, 1], weights[k, 1, 1]
+        for own in range(16):
+            along_x = xx * by_x[own] + xy * by_y[own]
+            along_y = xy * by_x[own] + yy * by_y[own]
+            column = columns[(first_x + own // 4) * many + first_y + own % 4]
+            for other in range(own, 16):
+                below = (other // 4 - own // 4) * many + other % 4 - own % 4
+                column[below] += along_x * by_x[other] + along_y * by_y[other]
+
+
+@_inner
+def _factorize(columns: FloatArray, count: int, width: int) -> bool:
+    """Replace the lower band of a matrix by its Cholesky factor; whether it has one.
+
+    Columns are one a row, and there is room of `AT_ONCE` beyond the last and below the band. So
+    many columns at once are taken from those after them, each of which is read and written once.
+    """
+    for j in range(0, count, AT_ONCE):
+        for a in range(min(AT_ONCE, count - j)):
+            own = columns[j + a]
+            for b in range(a):
+                factor, other = columns[j + b, a - b], columns[j + b, a - b :]
+                for k in range(width + 1):
+                    own[k] -= factor * other[k]
+            if not own[0] > 0.0:
+                return False
+            scale = 1.0 / np.sqrt(own[0])
+            for k in range(width + 1):
+                own[k] *= scale
+        c0, c1, c2, c3 = columns[j], columns[j + 1], columns[j + 2], columns[j + 3]
+        c4, c5, c6, c7 = columns[j + 4], columns[j + 5], columns[j + 6], columns[j + 7]
+        for t in range(AT_ONCE, min(AT_ONCE + width, count - j)):
+            own = columns[j + t]
+            f0, f1, f2, f3 = c0[t], c1[t - 1], c2[t - 2], c3[t - 3]
+            f4, f5, f6, f7 = c4[t - 4], c5[t - 5], c6[t - 6], c7[t - 7]
+            s0, s1, s2, s3 = c0[t:], c1[t - 1 :], c2[t - 2 :], c3[t - 3 :]
+            s4, s5, s6, s7 = c4[t - 4 :], c5[t - 5 :], c6[t - 6 :], c7[t - 7 :]
+            for k in range(width + AT_ONCE - t):
+                own[k] -= (f0 * s0[k] + f1 * s1[k] + f2 * s2[k] + f3 * s3[k]) + (
+                    f4 * s4[k] + f5 * s5[k] + f6 * s6[k] + f7 * s7[k]
+                )
+    return True
+
+
+@_compiled(_f2, _lower, _f2, _f3)
+def normal_factor(
+    grid: FloatArray, stiffness: FloatArray, points: FloatArray, weights: FloatArray
+) -> tuple[FloatArray, bool]:
+    """Cholesky factor of the normal matrix (`solver.normal_factor`), and whether it has one."""
+    height, count = stiffness.shape
+    columns = np.zeros((count + AT_ONCE, height + AT_ONCE))
+    columns[:count, :height] = stiffness.T
+    _accumulate_normal_matrix(grid, points, weights, columns)
+    x, y, diagonal = 0.0, 0.0, 0.0
+    for k in range(len(points)):
+        x, y = x + points[k, 0] / len(points), y + points[k, 1] / len(points)
+    for k in range(count):
+        diagonal += columns[k, 0] / count
+    work = np.empty((4, 4))
+    first_x = cubic_splines(grid[0], x, work[0], work[1])
+    first_y = cubic_splines(grid[1], y, work[2], work[3])
+    columns[(first_x + 1) * (int(grid[1, 3]) + 3) + first_y + 1, 0] += diagonal
+    has_one = _factorize(columns, count, height - 1)
+    return columns[:count, :height].copy().T, has_one
+
+
+@_inner
+def _solve_lower(columns: FloatArray, right: FloatArray) -> None:
+    """Replace a right-hand side by the solution, with a lower band."""
+    count, height = columns.shape
+    for j in range(count):
+        if right[j] != 0.0:
+            column, rest = columns[j], right[j:]
+            value = rest[0] / column[0]
+            for k in range(1, min(height, count - j)):
+                rest[k] -= value * column[k]
+            rest[0] = value
+
+
+@_inner
+def _solve(columns: FloatArray, right: FloatArray) -> None:
+    """Replace a right-hand side by the solution, with a Cholesky factor."""
+    count, height = columns.shape
+    _solve_lower(columns, right)
+    for j in range(count - 1, -1, -1):
+        column, rest, total = columns[j], right[j:], 0.0
+        for k in range(1, min(height, count - j)):
+            total += column[k] * rest[k]
+        rest[0] = (rest[0] - total) / column[0]
+
+
+@_compiled(_lower, _f2)
+def solve(lower: FloatArray, right: FloatArray) -> FloatArray:
+    """Solve the normal equations of a factor for m right-hand sides, shape (m, p)."""
+    made = right.copy()
+    for m in range(len(made)):
+        _solve(lower.T, made[m])
+    return made
+
+
+@_inner
+def _inverse_band(columns: FloatArray, start: int) -> FloatArray:
+    """Band of the inverse of LLᵀ from row ``start`` on, both triangles, shape (p, p).
+
+    Entries farther from the diagonal than the band of L, and rows before ``start``, are not set.
+    Takahashi's recurrence (Erisman and Tinney 1975, On computing certain elements of the inverse
+    of a sparse matrix), from the last row to the first.
+    """
+    width, count = columns.shape[1] - 1, len(columns)
+    inverse, column = np.empty((count, count)), np.empty(width)
+    for j in range(count - 1, start - 1, -1):
+        after = min(width, count - 1 - j)
+        column[:] = 0.0
+        for k in range(0, after - 3, 4):  # four at a time: the column is read and written once
+            a, b = columns[j, k + 1] / columns[j, 0], columns[j, k + 2] / columns[j, 0]
+            c, d = columns[j, k + 3] / columns[j, 0], columns[j, k + 4] / columns[j, 0]
+            rows = inverse[j + 1 + k : j + 5 + k, j + 1 :]
+            for i in range(after):
+                column[i] -= a * rows[0, i] + b * rows[1, i] + c * rows[2, i] + d * rows[3, i]
+        for k in range(after - after % 4, after):
+            factor, row = columns[j, k + 1] / columns[j, 0], inverse[j + 1 + k, j + 1 :]
+            for i in range(after):
+                column[i] -= factor * row[i]
+        own = 1.0 / (columns[j, 0] * columns[j, 0])
+        for k in range(after):
+            inverse[j, j + 1 + k] = inverse[j + 1 + k, j] = column[k]
+            own -= columns[j, k + 1] / columns[j, 0] * column[k]
+        inverse[j, j] = own
+    return inverse
+
+
+@_compiled(_f2, _lower, _f1, _f2, _f2, _f2)
+def covariance_of_dots(
+    grid: FloatArray,
+    lower: FloatArray,
+    laser: FloatArray,
+    plane: FloatArray,
+    points: FloatArray,
+    dots: FloatArray,
+) -> FloatArray:
+    """Covariance of the dots that a fitted surface makes of rays, shape (n, 2, 2), mm².
+
+    With L the factor of the normal matrix, shape (width + 1, p), and R what each coefficient moves
+    either coordinate of a dot by, Rᵀ (LLᵀ)⁻¹ R. Points and dots are in the UCS, shape (n, 3), mm.
+    """
+    pairs, work, many = len(points), np.empty((4, 4)), int(grid[1, 3]) + 3
+    first = np.empty(pairs, np.int64)
+    for k in range(pairs):
+        first_x = cubic_splines(grid[0], points[k, 0], work[0], work[1])
+        first[k] = first_x * many + cubic_splines(grid[1], points[k, 1], work[2], work[3])
+    out = np.zeros((pairs, 2, 2))
+    if pairs == 0:
+        return out
+    # The splines of a cell are all within the band.
+    inverse = _inverse_band(lower.T, first.min())
+    by_u, by_v = np.empty(16), np.empty(16)
+    for k in range(pairs):
+        (xu, xv), (yu, yv) = slope_jacobian(laser, plane, points[k], dots[k])
+        area = xu * yv - xv * yu
+        cubic_splines(grid[0], points[k, 0], work[0], work[1])
+        cubic_splines(grid[1], points[k, 1], work[2], work[3])
+        for own in range(16):
+            by_x = work[1, own // 4] * work[2, own % 4]
+            by_y = work[0, own // 4] * work[3, own % 4]
+            by_u[own] = (yv * by_x - xv * by_y) / area
+            by_v[own] = (xu * by_y - yu * by_x) / area
+        for own in range(16):
+            row = inverse[first[k] + own // 4 * many + own % 4, first[k] :]
+            along_u, along_v = 0.0, 0.0
+            for a in range(4):
+                for b in range(4):
+                    entry = row[a * many + b]
+                    along_u += entry * by_u[4 * a + b]
+                    along_v += entry * by_v[4 * a + b]
+            out[k, 0, 0] += by_u[own] * along_u
+            out[k, 0, 1] += by_u[own] * along_v
+            out[k, 1, 1] += by_v[own] * along_v
+        out[k, 1, 0] = out[k, 0, 1]
+    return out
+
+
+@_compiled(_lower, _f2)
+def variances(lower: FloatArray, gradients: FloatArray) -> FloatArray:
+    """Diagonal of G (LLᵀ)⁻¹ Gᵀ, shape (m,).
+
+    L is the factor of the normal matrix, shape (width + 1, p); G has shape (m, p).
+    """
+    left, columns, out = gradients.copy(), lower.T, np.empty(len(gradients))
+    for m in range(len(left)):
+        _solve_lower(columns, left[m])
+        out[m] = np.sum(left[m] * left[m])
+    return out
+
+
+@_compiled(_f2, _f1, _f2, _f3, _f1, _f2, _f2)
+def gradient_rhs(
+    grid: FloatArray,
+    coefficients: FloatArray,
+    points: FloatArray,
+    weights: FloatArray,
+    laser: FloatArray,
+    plane: FloatArray,
+    dots: FloatArray,
+) -> FloatArray:
+    """Right-hand side of the normal equations, shape (p,): Σ Jᵀ W (slopes asked for − slopes).
+
+    Asked for at each point are the slopes that turn its ray to its dot, shape (n, 3), UCS; weights
+    are the inverse covariances of these slopes, shape (n, 2, 2).
+    """
+    out, work = np.zeros(len(coefficients)), np.empty((4, 4))
+    many, glass = int(grid[1, 3]) + 3, plane[4, 0] != 0.0
+    for k in range(len(points)):
+        x, y = points[k, 0], points[k, 1]
+        _, slope_x, slope_y = height_and_slopes(grid, coefficients, x, y, work)
+        first_x = cubic_splines(grid[0], x, work[0], work[1])
+        first_y = cubic_splines(grid[1], y, work[2], work[3])
+        at = dots[k, 0], dots[k, 1], dots[k, 2]
+        if glass:
+            at = without_glass(points[k], at, plane)
+        asked_x, asked_y = bisecting_slopes(laser, points[k], at[0], at[1], at[2])
+        off_x, off_y = asked_x - slope_x, asked_y - slope_y
+        pull_x = weights[k, 0, 0] * off_x + weights[k, 0, 1] * off_y
+        pull_y = weights[k, 1, 0] * off_x + weights[k, 1, 1] * off_y
+        for a in range(4):
+            for b in range(4):
+                by_x, by_y = work[1, a] * work[2, b], work[0, a] * work[3, b]
+                out[(first_x + a) * many + first_y + b] += pull_x * by_x + pull_y * by_y
+    return out
+
+
+@_compiled(_f2, _bands, _f1, _f1, _f2, _f3, _bench, _f2)
+def fit_step(
+    grid: FloatArray,
+    bands: tuple[FloatArray, FloatArray],
+    coefficients: FloatArray,
+    rough: FloatArray,
+    points: FloatArray,
+    weights: FloatArray,
+    bench: tuple[FloatArray, FloatArray],
+    dots: FloatArray,
+) -> FloatArray:
+    """Coefficients after one step of the fit (`NormalEquations.step`), shape (p,).
+
+    Parameters
+    ----------
+    grid, coefficients, points, weights, dots
+        See `gradient_rhs`.
+    bands
+        Stiffness and factor, see `normal_factor`.
+    rough
+        Coefficients of the surface that is held smooth, shape (p,).
+    bench
+        The laser and the plane.
+    """
+    (stiffness, factor), (laser, plane) = bands, bench
+    change = gradient_rhs(grid, coefficients, points, weights, laser, plane, dots)
+    columns, (height, count) = stiffness.T, stiffness.shape
+    for j in range(count):
+        column, own, rest, total = columns[j], rough[j], change[j:], 0.0
+        rest[0] -= column[0] * own
+        for k in range(1, min(height, count - j)):
+            rest[k] -= column[k] * own
+            total += column[k] * rough[j + k]
+        rest[0] -= total
+    _solve(factor.T, change)
+    # Slopes leave the level open: the mean height of the points stays.
+    mean = 0.0
+    for height_there in surface_at(grid, change, points)[0]:
+        mean += height_there / len(points)
+    return coefficients + (change - mean)
+
+
+@_compiled(_f2, _f1, _f2, _f2, _i)
+def newton_along_rays(
+    grid: FloatArray, coefficients: FloatArray, rays: FloatArray, points: FloatArray, steps: int
+) -> tuple[FloatArray, float]:
+    """Points moved along their rays to a surface by so many Newton steps, shape (n, 3), mm.
+
+    The second value is how far the farthest moved along X, Y or Z, mm; NaN where one is.
+    """
+    moved, most, work = points.copy(), 0.0, np.empty((4, 4))
+    for k in range(len(points)):
+        for _ in range(steps):
+            step, _, _ = newton_step(grid, coefficients, rays[k], moved[k], work)
+            if abs(step) < ON_SURFACE_MM:
+                break
+        for axis in range(3):
+            by = abs(moved[k, axis] - points[k, axis])
+            if not by <= most:  # NaN, too
+                most = by
+        if np.isnan(most):
+            break
+    return moved, most
