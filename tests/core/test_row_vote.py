@@ -8,16 +8,15 @@ import numpy as np
 import pytest
 
 from labapp.core.images.dots import Dots
-from labapp.core.pipeline import Measurement
+from labapp.core.pipeline import Measurement, Settings
 from labapp.core.recording.row_vote import RowVote
 from labapp.core.rows.correction import Correction
 from labapp.core.schemes import fit
-from labapp.core.surface.pool_fit import FitSettings
 from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.pools import Wave, egg
 from tests.scenes import BENCH_RIG
 
-SETTINGS = FitSettings()
+SETTINGS = Settings()
 
 
 def frames(count: int, seed: int = 0) -> list[Measurement]:
@@ -29,7 +28,7 @@ def frames(count: int, seed: int = 0) -> list[Measurement]:
         width = 6.0 * rng.normal(1.0, 0.01)
         pool = egg(width, 2.9, 3.7, 0.3, (0.1, -0.2), (replace(wave, time_s=k / 200),))
         match = exact_match(trace(pool, BENCH_RIG), BENCH_RIG, sigma_mm=0.02, rng=rng)
-        surface = fit.reconstruct(match, BENCH_RIG, SETTINGS)
+        surface = fit.reconstruct(match, BENCH_RIG, SETTINGS.fit)
         made.append(Measurement("ok", "", "fit", match=match, reconstruction=surface))
     return made
 
@@ -39,13 +38,14 @@ def slipped(right: Measurement, by: tuple[int, int]) -> Measurement:
     assert right.match is not None
     witness = np.roll(right.match.witness, by, (0, 1))
     match = replace(right.match, ray=right.match.ray + by, witness=witness)
-    return replace(right, match=match, reconstruction=fit.reconstruct(match, BENCH_RIG, SETTINGS))
+    surface = fit.reconstruct(match, BENCH_RIG, SETTINGS.fit)
+    return replace(right, match=match, reconstruction=surface)
 
 
 def statuses(measured: list[Measurement]) -> list[str]:
     vote = RowVote(BENCH_RIG, SETTINGS)
-    at = [vote.add(each) for each in measured]
-    return [vote.judged(*each).status for each in zip(measured, at, strict=True)]
+    ballots = [vote.add(each) for each in measured]
+    return [vote.judged(each).status for each in ballots]
 
 
 def test_frames_that_agree_are_told() -> None:
@@ -66,8 +66,8 @@ def test_nothing_wrong_is_left_of_a_frame_that_is_not_told() -> None:
     first, second, third = frames(3)
     vote = RowVote(BENCH_RIG, SETTINGS)
     measured = [first, slipped(second, (1, 0)), third]
-    at = [vote.add(each) for each in measured]
-    told = vote.judged(measured[1], at[1])
+    ballots = [vote.add(each) for each in measured]
+    told = vote.judged(ballots[1])
     assert told.match is told.reconstruction is told.measures is None
     assert "1 of 3" not in told.reason
     assert "2 of 3" in told.reason
@@ -90,9 +90,9 @@ def test_what_follows_a_frame_has_its_rows() -> None:
     right = frames(8)
     measured = [slipped(each, (1, 0)) if 3 <= k < 7 else each for k, each in enumerate(right)]
     vote = RowVote(BENCH_RIG, SETTINGS)
-    at = [vote.add(each, followed=k in {4, 5, 6}) for k, each in enumerate(measured)]
-    assert at == [*[(0, 0)] * 3, *[(1, 0)] * 4, (0, 0)]
-    told = [vote.judged(*each).status for each in zip(measured, at, strict=True)]
+    ballots = [vote.add(each, followed=k in {4, 5, 6}) for k, each in enumerate(measured)]
+    assert [each.at for each in ballots] == [*[(0, 0)] * 3, *[(1, 0)] * 4, (0, 0)]
+    told = [vote.judged(each).status for each in ballots]
     assert told == [*["ok"] * 3, *["ambiguous-rows"] * 4, "ok"]
 
 
@@ -103,6 +103,6 @@ def test_what_follows_a_corrected_frame_was_not_followed_from_it() -> None:
     )
     measured = [*right[:3], corrected, *right[4:]]
     vote = RowVote(BENCH_RIG, SETTINGS)
-    at = [vote.add(each, followed=k > 3) for k, each in enumerate(measured)]
-    assert at == [*[(0, 0)] * 3, (1, 0), *[(0, 0)] * 2]
-    assert [vote.judged(*each).status for each in zip(measured, at, strict=True)] == ["ok"] * 6
+    ballots = [vote.add(each, followed=k > 3) for k, each in enumerate(measured)]
+    assert [each.at for each in ballots] == [*[(0, 0)] * 3, (1, 0), *[(0, 0)] * 2]
+    assert [vote.judged(each).status for each in ballots] == ["ok"] * 6
