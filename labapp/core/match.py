@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
+from labapp.core.values import CannotMeasure, FloatArray, IntArray, ReadOnlyArrays
 
 Orientation = Literal["S/S", "S/I", "I/I"]
 """Column/row correspondence: S grows the same way as the rays, I the other way."""
@@ -90,3 +90,39 @@ class Match(ReadOnlyArrays):
         others = [t.residual_mm for t in self.trials if t.orientation != self.orientation]
         own = [t.residual_mm for t in self.trials if t.orientation == self.orientation]
         return min(others) / max(own[0], 1e-9) if own and others else float("inf")
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """One of the matches of a frame whose rows are open: the marker in one of several holes.
+
+    Parameters
+    ----------
+    match
+        The match; None where no surface has its rays with the set-up as it is entered.
+    step
+        Rows and columns by which its rays are on from those of the first candidate.
+    cost
+        −2 log likelihood of it with the set-up that it is likeliest with, within its uncertainty,
+        less that of the first candidate.
+    """
+
+    match: Match | None
+    step: tuple[int, int]
+    cost: float
+
+
+class RowsOpen(CannotMeasure):
+    """``ambiguous-rows``, with the matches that one frame leaves open.
+
+    Parameters
+    ----------
+    reason
+        One sentence for the operator.
+    candidates
+        First the one that is likeliest with the set-up as it is entered.
+    """
+
+    def __init__(self, reason: str, candidates: tuple[Candidate, ...]) -> None:
+        super().__init__("ambiguous-rows", reason)
+        self.candidates = candidates

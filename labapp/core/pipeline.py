@@ -16,7 +16,7 @@ A line pattern has steps of its own (`measure_lines`): its points do not say whi
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 from labapp.core.geometry.bench import Bench
@@ -27,7 +27,7 @@ from labapp.core.images.dots import Dots, Image
 from labapp.core.images.find_dots import DotSettings, find_dots
 from labapp.core.lines.correction import LineCorrection
 from labapp.core.lines.frame import LineFrame, LineMeasureSettings, measure_lines
-from labapp.core.match import Match
+from labapp.core.match import Candidate, Match, RowsOpen
 from labapp.core.matching.corrected_rows import lattice_of_corrected, match_corrected
 from labapp.core.matching.correspondence import lattice_of_match, match_rays
 from labapp.core.matching.decision import NOTHING_EXPLAINS, MatchSettings
@@ -118,6 +118,40 @@ class Measurement:
     lines: LineFrame | None = None
 
 
+@dataclass(frozen=True, kw_only=True)
+class OpenMeasurement(Measurement):
+    """An ``ambiguous-rows`` frame, of which other frames of the recording may decide the rows.
+
+    Parameters
+    ----------
+    candidates
+        The matches that are open.
+    """
+
+    candidates: tuple[Candidate, ...]
+
+    @property
+    def refused(self) -> Measurement:
+        """The measurement by itself."""
+        return Measurement(**{each.name: getattr(self, each.name) for each in fields(Measurement)})
+
+    def decided(self, match: Match, rig: Rig, settings: Settings) -> Measurement:
+        """The measurement with the match of one of the candidates, by the scheme of the settings.
+
+        Parameters
+        ----------
+        match, rig, settings
+            That match, the bench, and how the frame is measured.
+        """
+        assert self.dots is not None
+        lattice = lattice_of_match(match, rig, len(self.dots))
+        result = replace(self.refused, status="ok", reason="", lattice=lattice, match=match)
+        try:
+            return _by_scheme(result, match, rig, settings)
+        except CannotMeasure as why:
+            return replace(result, status=why.status, reason=why.reason)
+
+
 def setup_status(rig: Rig) -> str:
     """How far a rig can be relied on (`Measurement`)."""
     return "" if rig.uncertainty is None else rig.uncertainty.status
@@ -189,6 +223,9 @@ def measure(
             result = replace(result, dots=dots, lattice=rows)
             try:
                 match, near = match_rays(dots, rows, bench, shape, limits)
+            except RowsOpen as why:
+                own = {**vars(result), "status": why.status, "reason": why.reason}
+                return OpenMeasurement(**own, candidates=why.candidates), None
             except CannotMeasure as why:
                 nothing = why.reason == NOTHING_EXPLAINS
                 raise (no_rows if no_rows and nothing else why) from None

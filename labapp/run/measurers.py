@@ -47,6 +47,9 @@ VOTERS, WAITS = 3, 5
 """A frame is judged with two more that have a surface, so that of three that disagree two decide;
 so many wait at most."""
 
+OPEN_WAITS = 20
+"""So many wait at most for a frame whose rows are open."""
+
 FOLLOWED_AT_ONCE = 400
 """Frames whose pulses are told apart together: some tens of their periods."""
 
@@ -99,7 +102,7 @@ class ColdMeasurer:
 def _agreeing(
     measured: Generator[FrameResult], setup: Setup, settings: Settings, warm: bool = False
 ) -> Generator[FrameResult]:
-    """Results in their order, but for those whose rows are a row off the others' (`RowVote`).
+    """Results in their order, their rows decided together with those of the others (`RowVote`).
 
     A frame is judged when two more with a surface are there, or after the next few.
 
@@ -110,28 +113,27 @@ def _agreeing(
     warm
         Whether frames follow on those before, but for where the track was lost.
     """
-    from labapp.core.recording.row_vote import RowVote
+    from labapp.core.recording.row_vote import Ballot, RowVote
 
-    vote = RowVote(setup.rig, settings.fit)
-    waiting: deque[tuple[FrameResult, tuple[int, int] | None]] = deque()
+    vote = RowVote(setup.rig, settings)
+    waiting: deque[tuple[FrameResult, Ballot]] = deque()
 
     def is_due() -> bool:
-        voters = sum(at is not None for _, at in waiting)
-        return waiting[0][1] is None or voters >= VOTERS or len(waiting) > WAITS
+        first, voters = waiting[0][1], sum(ballot.at is not None for _, ballot in waiting)
+        if first.at is None and not first.is_open:
+            return True
+        return voters >= VOTERS or len(waiting) > (OPEN_WAITS if first.is_open else WAITS)
 
     def judged() -> FrameResult:
-        result, at = waiting.popleft()
-        if at is None:
-            return result
-        return replace(result, measurement=vote.judged(result.measurement, at))
+        result, ballot = waiting.popleft()
+        return replace(result, measurement=vote.judged(ballot))
 
     with closing(measured):
         try:
             for result in measured:
                 found = result.measurement
                 followed = warm and result.track_lost is None and found.correction is None
-                at = None if found.reconstruction is None else vote.add(found, followed)
-                waiting.append((result, at))
+                waiting.append((result, vote.add(found, followed)))
                 while waiting and is_due():
                     yield judged()
         except (Exception, KeyboardInterrupt):

@@ -188,13 +188,13 @@ a dot next to the absent centre dot: no hole in the rows is surely the reference
 
 {{files}}
 
-`labapp reconstruct recording.mkv --setup setup.toml --out DIR` measures frames 0 and 1 (height
-within 3 %). From frame 2 on either hole can be the reference for a bench that may be half a
-millimetre off. Who sees the whole run knows which one, for the rows stay where they are on the
-picture. Rows are counted from the bottom up, columns from left to right, both from 1, as the
-program finds them here.
+`labapp reconstruct recording.mkv --setup setup.toml --out DIR` measures all frames (height
+within 3 %). From frame 2 on either hole of a frame can be the reference for a bench that may be
+half a millimetre off. Frames 0 and 1 show which one, for the surface hardly changes; without them
+the others are refused: the table has the status of each by itself. Rows are counted from the
+bottom up, columns from left to right, both from 1, as the program finds them here.
 
-| frame | status | reference (row, column) | on the picture (u, v) | rows to mark as blocked |
+| frame | by itself | reference (row, column) | on the picture (u, v) | rows to mark as blocked |
 | --- | --- | --- | --- | --- |
 | 0 | `ok` | (6, 8) is found | (278, 282) px | none |
 | 1 | `ok` | (6, 8) is found | (278, 281) px | none |

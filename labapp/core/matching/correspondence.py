@@ -14,7 +14,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from itertools import product
 
 import numpy as np
@@ -22,7 +22,16 @@ import numpy as np
 from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.rig import Rig
 from labapp.core.images.dots import Dots
-from labapp.core.match import ORIENTATIONS, Match, Orientation, Trial, missing_share, ways
+from labapp.core.match import (
+    ORIENTATIONS,
+    Candidate,
+    Match,
+    Orientation,
+    RowsOpen,
+    Trial,
+    missing_share,
+    ways,
+)
 from labapp.core.matching.cap_search import search_caps
 from labapp.core.matching.decision import (
     MISFIT_MM,
@@ -34,9 +43,13 @@ from labapp.core.matching.decision import (
     decide,
     explains,
     nearly_explains,
+    supported,
 )
+from labapp.core.matching.free_setup import FreeHypothesis
 from labapp.core.matching.hypothesis import (
+    USUAL_KNOTS,
     Hypothesis,
+    evaluate,
     extended_over_grid,
     grow_and_evaluate,
     labels_from_lattice,
@@ -94,6 +107,9 @@ def match_rays(
         ``too-few-dots`` if there are fewer than `LEAST_LABELS`; ``no-reference`` if the pattern has
         no absent ray or no hole can be the absent dot, ``ambiguous-rows`` if several can;
         ``ambiguous-orientation``; ``no-match`` if no surface explains the dots.
+    RowsOpen
+        ``ambiguous-rows`` if several can for a set-up that is off within its uncertainty: other
+        frames of the recording may tell which.
     """
     if len(dots) < LEAST_LABELS:
         raise CannotMeasure(
@@ -111,19 +127,40 @@ def match_rays(
     # Where nothing explains most dots, what is found is not decided on, but caps are tried at once.
     hopeless = bool(found) and not any(nearly_explains(observed, each) for each in found)
     try:
-        best = None if hopeless else _decide_among(observed, found, lattice, settings)
+        decided = None if hopeless else _decide_among(observed, found, lattice, settings)
     except CannotMeasure:
         if any_explains(observed, found):
             raise
-        best = None
-    if best is None:
-        best = _decide_among(observed, found + _by_caps(observed), lattice, settings)
-    return match_of_hypothesis(observed, best, best.orientation(observed)), best.pool.surface
+        decided = None
+    if decided is None or (decided[1] and not any_explains(observed, found)):
+        decided = _decide_among(observed, found + _by_caps(observed), lattice, settings)
+    best, open_holes = decided
+    match = match_of_hypothesis(observed, best, best.orientation(observed))
+    if open_holes:
+        raise RowsOpen(
+            "where the set-up may be a little off, several holes can be the absent centre dot",
+            tuple(_candidates(observed, match, open_holes)),
+        )
+    return match, best.pool.surface
+
+
+def _candidates(
+    observed: Observation, own: Match, open_holes: list[FreeHypothesis]
+) -> Iterator[Candidate]:
+    """Matches of the hypotheses that are left open, the likeliest one's own first."""
+    least = open_holes[0]
+    yield Candidate(own, (0, 0), 0.0)
+    for each in open_holes[1:]:
+        rival, match = evaluate(observed, each.labels), None
+        if rival is not None:
+            rival = supported(observed, rival, USUAL_KNOTS)
+            match = match_of_hypothesis(observed, rival, own.orientation)
+        yield Candidate(match, each.step, each.cost - least.cost)
 
 
 def _decide_among(
     observed: Observation, found: list[Hypothesis], lattice: Lattice | None, settings: MatchSettings
-) -> Hypothesis:
+) -> tuple[Hypothesis, list[FreeHypothesis]]:
     """Decide on one of the hypotheses, or on what one leads to; `CannotMeasure` as `match_rays`."""
     found = with_rows_beyond(observed, found)
     # Labels may have grown into an orientation that is not asked for.

@@ -11,7 +11,7 @@ import numpy as np
 import scipy
 
 from labapp.core.match import ORIENTATIONS, Orientation
-from labapp.core.matching.free_setup import another_hole_explains
+from labapp.core.matching.free_setup import FreeHypothesis, holes_left_open
 from labapp.core.matching.hypothesis import (
     FINE_KNOTS,
     KNOT_ERROR_MM,
@@ -137,12 +137,20 @@ def any_explains(observed: Observation, found: list[Hypothesis]) -> bool:
     return any(explains(observed, hypothesis) for hypothesis in found)
 
 
-def decide(observed: Observation, found: list[Hypothesis], settings: MatchSettings) -> Hypothesis:
+def decide(
+    observed: Observation, found: list[Hypothesis], settings: MatchSettings
+) -> tuple[Hypothesis, list[FreeHypothesis]]:
     """Take the cheapest hypothesis, if nothing else comes near it and it leaves little open.
 
     It is held against the others, against itself up to two rows or columns further on (labels that
     grew from the wrong hole may come to almost the right place), and against itself with the other
     orientations. Dots on which near-equals disagree lose their ray.
+
+    Returns
+    -------
+    best, open_holes
+        The hypothesis; and where a set-up within its uncertainty leaves open which hole is the
+        marker's, that hypothesis and its rivals (`holes_left_open`).
 
     Raises
     ------
@@ -190,16 +198,11 @@ def decide(observed: Observation, found: list[Hypothesis], settings: MatchSettin
                 "ambiguous-rows", "several holes in the rows can be the absent centre dot"
             )
     best = _without(observed, best, doubtful, fit)
-    best = _supported(observed, best, fit)
-    if another_hole_explains(observed, best, fit, settings.margin):
-        raise CannotMeasure(
-            "ambiguous-rows",
-            "where the set-up may be a little off, several holes can be the absent centre dot",
-        )
-    return best
+    best = supported(observed, best, fit)
+    return best, holes_left_open(observed, best, fit, settings.margin)
 
 
-def _supported(observed: Observation, best: Hypothesis, fit: FitSettings) -> Hypothesis:
+def supported(observed: Observation, best: Hypothesis, fit: FitSettings) -> Hypothesis:
     """The hypothesis without the labels that the surface through the others does not support."""
     for _ in range(MOST_LEFT_OUT):
         settled = _settled(observed, best, fit)

@@ -8,7 +8,7 @@ costs more the unlikelier that is.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -29,13 +29,36 @@ from labapp.core.surface.setup_uncertainty import bench_off, residual_changes
 from labapp.core.values import IntArray
 
 
-def another_hole_explains(
-    observed: Observation, best: Hypothesis, fit: FitSettings, margin: float
-) -> bool:
-    """Whether the marker in another hole costs less than a margin more, with the set-up free.
+@dataclass(frozen=True)
+class FreeHypothesis:
+    """Labels with the set-up that they are likeliest with, within its uncertainty.
 
-    Its labels are those of the hypothesis up to two rows or columns on. Other shifts put a dot on
-    the marker's ray, which no set-up explains. A rig that is known exactly leaves nothing open.
+    Parameters
+    ----------
+    labels
+        They, or what they grow to there where that costs less.
+    step
+        Rows and columns by which the labels are on from those of the best hypothesis.
+    given_cost
+        Cost of the labels as they were given, in units of χ².
+    cost
+        That of `labels`; infinite, as the one before, without a surface.
+    """
+
+    labels: IntArray
+    step: tuple[int, int] = (0, 0)
+    given_cost: float = np.inf
+    cost: float = np.inf
+
+
+def holes_left_open(
+    observed: Observation, best: Hypothesis, fit: FitSettings, margin: float
+) -> list[FreeHypothesis]:
+    """Hypotheses with the marker in each hole that it may be in, with the set-up free.
+
+    Labels are those of the hypothesis, and the same up to two rows or columns on which cost less
+    than a margin more. Other shifts put a dot on the marker's ray, which no set-up explains. A rig
+    that is known exactly leaves nothing open.
 
     Parameters
     ----------
@@ -47,32 +70,38 @@ def another_hole_explains(
         How it is evaluated (`evaluate_twice`).
     margin
         In units of χ².
+
+    Returns
+    -------
+    list
+        The hypothesis itself first, then its rivals; empty where it has none.
     """
-    others = [] if observed.rig.uncertainty is None else _labels_by_other_holes(observed, best)
-    if not others:
-        return False
-    own, own_grown = _costs_with_setup_free(observed, best, fit)
-    rivals = (rival for labels in others if (rival := evaluate(observed, labels)))
-    costs = (_costs_with_setup_free(observed, rival, fit, own + margin) for rival in rivals)
-    return any(grown < own_grown + margin for _, grown in costs)
+    steps = [] if observed.rig.uncertainty is None else _steps_to_other_holes(observed, best)
+    if not steps:
+        return []
+    own = _with_setup_free(observed, best, fit)
+    rivals = []
+    for step in steps:
+        shifted = evaluate(observed, shifted_by(observed, best.labels, step))
+        if shifted is not None:
+            rival = _with_setup_free(observed, shifted, fit, own.given_cost + margin)
+            if rival.cost < own.cost + margin:
+                rivals.append(replace(rival, step=step))
+    return [own, *rivals] if rivals else []
 
 
-def _labels_by_other_holes(observed: Observation, best: Hypothesis) -> list[IntArray]:
-    """The same labels up to two rows or columns on, where the marker is in another hole."""
+def _steps_to_other_holes(observed: Observation, best: Hypothesis) -> list[tuple[int, int]]:
+    """Rows and columns by which labels are shifted for the marker to be in another hole."""
     marker = observed.rig.pattern.marker
     assert marker is not None
     holes = np.pad(best.labels == UNLABELLED, 2)  # beyond the pattern is no hole
-    return [
-        shifted_by(observed, best.labels, step)
-        for step in STEPS
-        if holes[marker[0] + 1 - step[0], marker[1] + 1 - step[1]]
-    ]
+    return [step for step in STEPS if holes[marker[0] + 1 - step[0], marker[1] + 1 - step[1]]]
 
 
-def _costs_with_setup_free(
+def _with_setup_free(
     observed: Observation, hypothesis: Hypothesis, fit: FitSettings, most: float = np.inf
-) -> tuple[float, float]:
-    """Cost of labels and of the set-up that they are likeliest with; of what they grow to there.
+) -> FreeHypothesis:
+    """Labels with the set-up that they are likeliest with.
 
     That set-up is found in one Gauss–Newton step, which takes the squares of the residuals and of
     the set-up's deviations, in σ, to their least sum, the surface fitted anew. Costs are infinite
@@ -81,7 +110,7 @@ def _costs_with_setup_free(
     labels, known = hypothesis.labels, observed.rig.uncertainty
     pool = try_fit(observed, labels, USUAL_KNOTS, hypothesis.pool)
     if pool is None or known is None:
-        return np.inf, np.inf
+        return FreeHypothesis(labels)
     at = np.argwhere(labels != UNLABELLED)
     dot = labels[tuple(at.T)]
     pairs = at + 1, observed.plane_mm[dot], observed.covariance_mm2[dot]
@@ -95,8 +124,10 @@ def _costs_with_setup_free(
     moved = replace(observed, bench=Bench(rig, observed.bench.calibration), plane_mm=plane_mm)
     found, setup_cost = evaluate_twice(moved, labels, fit, pool), float(deviates @ deviates)
     if found is None or found.cost + setup_cost >= most:
-        return np.inf, np.inf
+        return FreeHypothesis(labels)
     more = grow_and_evaluate(moved, labels)
     grown = more and evaluate_twice(moved, more.labels, fit, more.pool)
-    least = min(found.cost, grown.cost if grown else np.inf)
-    return found.cost + setup_cost, least + setup_cost
+    least = grown if grown and grown.cost < found.cost else found
+    return FreeHypothesis(
+        least.labels, given_cost=found.cost + setup_cost, cost=least.cost + setup_cost
+    )

@@ -75,7 +75,7 @@ rays are dark."""
 MARKER_SPACINGS = 1 / 3
 """A dot shows at the marker where it is nearer than this share of the way to the next dot."""
 
-STEPS = tuple(way for way in product(range(-2, 3), repeat=2) if 0 < abs(way[0]) + abs(way[1]) < 3)
+STEPS = tuple((i, j) for i, j in product(range(-2, 3), repeat=2) if 0 < abs(i) + abs(j) < 3)
 """Rows and columns that labels are shifted by."""
 
 AGREED = 0.8
