@@ -18,7 +18,7 @@ from labapp.config.mirror_text import mirror_text
 from labapp.config.toml_keys import Rule, are_numbers, is_matrix, is_number
 from labapp.core.bench_check.check import BenchCheck
 from labapp.core.geometry.rig import DotPattern, ImagingPlane, Rig
-from labapp.core.geometry.uncertainty import FIRST, INDEX, QUANTITIES
+from labapp.core.geometry.uncertainty import ENDINGS, FIRST, INDEX, QUANTITIES
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
 
@@ -32,7 +32,6 @@ _DEFAULTS = {key: 0.0 for key in INDEX if not key.startswith("image_calibration.
     "imaging_plane.glass_mm": ImagingPlane.glass_mm,
     "imaging_plane.glass_index": ImagingPlane.glass_index,
 }
-_UNCERTAINTIES = ("_sigma", "_correlation")
 _SETS = ("pattern.absent",)
 _SAME = 1e-9
 _MOST = 200
@@ -69,7 +68,8 @@ def _is_quantity(value: object) -> bool:
     )
 
 
-def _is_correlation(value: object) -> bool:
+def is_correlation(value: object) -> bool:
+    """Whether this is a list of rows that are a correlation matrix, but for rounding."""
     if not (isinstance(value, list) and len(value) <= _MOST):
         return False
     if not all(are_numbers(row, len(value)) for row in value):
@@ -92,7 +92,7 @@ RULES = {
         "was known exactly and kept its value",
         _are_quantities,
     ),
-    "correlation": Rule("a symmetric matrix of correlations", _is_correlation),
+    "correlation": Rule("a symmetric matrix of correlations", is_correlation),
     "given": Rule("a table of keys and values", lambda value: isinstance(value, dict)),
     "sigmas": Rule(
         "a table of the uncertainties before the check",
@@ -141,20 +141,21 @@ def checked_covariance(
         return covariance, False
     at = [INDEX[one["key"]] for one in section["quantities"]]
     sigma = np.array([one["sigma"] for one in section["quantities"]], float)
-    correlation = _semidefinite(np.array(section["correlation"], float))
+    correlation = semidefinite(np.array(section["correlation"], float))
     made = np.zeros_like(covariance)
     made[np.ix_(at, at)] = correlation * np.outer(sigma, sigma)
     return made, True
 
 
-def _semidefinite(correlation: FloatArray) -> FloatArray:
-    """A correlation matrix without the small negative eigenvalues that rounding gives it."""
-    eigenvalues, vectors = np.linalg.eigh((correlation + correlation.T) / 2)
-    if eigenvalues.min() >= 0.0:
-        return correlation
-    clipped = (vectors * np.maximum(eigenvalues, 0.0)) @ vectors.T
-    scale = np.sqrt(np.diag(clipped))
-    return np.asarray(clipped / np.outer(scale, scale))
+def semidefinite(covariance: FloatArray) -> FloatArray:
+    """A covariance or correlation matrix without the small negative eigenvalues of rounding."""
+    sigma = np.sqrt(np.diag(covariance))
+    correlation = (covariance + covariance.T) / 2 / np.outer(sigma, sigma)
+    eigenvalues, vectors = np.linalg.eigh(correlation)
+    if eigenvalues.min() < 0.0:
+        correlation = (vectors * np.maximum(eigenvalues, 0.0)) @ vectors.T
+    sigma /= np.sqrt(np.diag(correlation))
+    return np.asarray(correlation * np.outer(sigma, sigma))
 
 
 def changed_since_check(values: Mapping[str, Any]) -> list[str]:
@@ -265,15 +266,13 @@ def _given(values: Mapping[str, Any], adjusted: Iterable[str]) -> dict[str, obje
     """What a check takes as given: all of the sections that matter but adjusted keys and ±."""
     names = {key.partition("[")[0] for key in adjusted}
     return {
-        key: value
-        for key, value in _keys(values)
-        if key not in names and not key.endswith(_UNCERTAINTIES)
+        key: value for key, value in _keys(values) if key not in names and not key.endswith(ENDINGS)
     }
 
 
 def _uncertainties(values: Mapping[str, Any]) -> dict[str, object]:
     """The standard uncertainties and the correlation in the sections that matter."""
-    return {key: value for key, value in _keys(values) if key.endswith(_UNCERTAINTIES)}
+    return {key: value for key, value in _keys(values) if key.endswith(ENDINGS)}
 
 
 def _keys(values: Mapping[str, Any]) -> list[tuple[str, object]]:

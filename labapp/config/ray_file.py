@@ -18,6 +18,7 @@ from labapp.config.csv_tables import bounded_lines, open_table, parse_number
 from labapp.config.toml_keys import is_number, shown
 from labapp.core.geometry.patterns import FEWEST_RAYS, MEASURED
 from labapp.core.geometry.rig import Laser
+from labapp.core.geometry.uncertainty import ENDINGS
 from labapp.core.values import FloatArray, IntArray
 from labapp.errors import InputError
 
@@ -152,7 +153,7 @@ def _numbers(path: Path, line: int, cells: list[str], at: list[int]) -> tuple[An
 def _beam_axes(path: Path, setup: Mapping[str, Any]) -> FloatArray:
     """Directions to the side, upwards and along the beam axis in the UCS, shape (3, 3)."""
     try:
-        keys = {k: float(v) for k, v in setup["laser"].items() if not k.endswith(_NOT_OF_LASER)}
+        keys = {k: float(v) for k, v in setup["laser"].items() if not k.endswith(ENDINGS)}
         axis, aside, up = Laser(**keys).axes
         turn = np.radians(float(setup["pattern"].get("rotation_deg", 0.0)))
     except (AttributeError, KeyError, TypeError, ValueError) as error:
@@ -160,9 +161,6 @@ def _beam_axes(path: Path, setup: Mapping[str, Any]) -> FloatArray:
         raise InputError(path, "laser", "missing or wrong", expected) from error
     sin, cos = np.sin(turn), np.cos(turn)
     return np.array([cos * aside + sin * up, cos * up - sin * aside, axis])
-
-
-_NOT_OF_LASER = ("_sigma", "_correlation")
 
 
 def _inter_beam_angle(path: Path, ray: IntArray, tangents: FloatArray) -> float:

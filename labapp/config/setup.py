@@ -18,6 +18,7 @@ from labapp.config.bench_check import (
     checked_covariance,
     contradictions,
     same_setup,
+    semidefinite,
     unchecked_values,
 )
 from labapp.config.ray_file import with_rays
@@ -32,6 +33,7 @@ from labapp.core.geometry.plausibility import implausible_values
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.geometry.uncertainty import (
     CALIBRATED,
+    ENDINGS,
     AxisPoints,
     RigUncertainty,
     covariance_of,
@@ -194,7 +196,10 @@ def updated_setup(
 
 
 _CALIBRATED_KEYS = frozenset(key.partition("[")[0] for key in CALIBRATED)
-_SHARED = {"laser": ("angle_distance_correlation",)}
+_SHARED = {
+    "laser": ("angle_distance_correlation",),
+    "image_calibration": ("points_covariance_px2",),
+}
 
 
 def pattern_kind(text: str) -> str:
@@ -264,9 +269,8 @@ def _keeping_sigmas(
     values: Mapping[str, Mapping[str, object]], now: Mapping[str, Any]
 ) -> dict[str, dict[str, object]]:
     """Values to set, with the uncertainties that a file has: they hold again without the check."""
-    ends = ("_sigma", "_correlation")
     return {
-        section: {k: v for k, v in now.get(section, {}).items() if k.endswith(ends)} | dict(keys)
+        section: {k: v for k, v in now.get(section, {}).items() if k.endswith(ENDINGS)} | dict(keys)
         for section, keys in values.items()
     }
 
@@ -416,22 +420,23 @@ def _nearly_one_line(path: Path, keys: dict[str, Any]) -> list[InputError]:
 
 
 def _rig(values: dict[str, Any], calibration: ImageCalibration) -> Rig:
-    laser = _without_sigmas(values["laser"])
-    correlation = laser.pop("angle_distance_correlation", 0.0)
     plane, points = values["imaging_plane"], values["image_calibration"]
-    axes = AxisPoints(
-        calibration,
-        points.get("x_axis_mm", plane["width_mm"] / 2),
-        points.get("z_axis_mm", plane["height_mm"] / 2),
-    )
+    x_mm, z_mm = points.get("points_mm", [plane["width_mm"] / 2, plane["height_mm"] / 2])
+    axes = AxisPoints(calibration, points.get("x_axis_mm", x_mm), points.get("z_axis_mm", z_mm))
     given = {
         f"{section}.{key}": sigma for section in values for key, sigma in values[section].items()
     }
     has_glass = plane.get("glass_mm", 0.0) > 0.0
-    covariance, assumed = covariance_of(given, correlation, has_glass=has_glass)
+    of_points = points.get("points_covariance_px2")
+    covariance, assumed = covariance_of(
+        given,
+        values["laser"].get("angle_distance_correlation", 0.0),
+        None if of_points is None else semidefinite(np.array(of_points, float)),
+        has_glass=has_glass,
+    )
     covariance, checked = checked_covariance(values, covariance)
     return Rig(
-        Laser(**laser),
+        Laser(**_without_sigmas(values["laser"])),
         _pattern(values["pattern"]),
         Electrode(**values["electrode"]),
         _imaging_plane(plane),
@@ -441,7 +446,7 @@ def _rig(values: dict[str, Any], calibration: ImageCalibration) -> Rig:
 
 
 def _without_sigmas(keys: Mapping[str, Any]) -> dict[str, Any]:
-    return {key: value for key, value in keys.items() if not key.endswith("_sigma")}
+    return {key: value for key, value in keys.items() if not key.endswith(ENDINGS)}
 
 
 def _imaging_plane(keys: Mapping[str, Any]) -> ImagingPlane:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import get_args
 
+import numpy as np
+
 from labapp.config import bench_check
 from labapp.config.toml_keys import (
     LARGEST_MM,
@@ -76,6 +78,32 @@ THREE_POINTS = {
 }
 HOMOGRAPHY = {
     "homography": Rule("3 rows of 3 numbers (px to mm) that can be inverted", is_matrix),
+    "points_mm": Rule(
+        "[X′, Z′], two numbers that are not 0 (mm): where on the axes the points lie whose ± are "
+        "given",
+        lambda value: are_numbers(value, 2) and all(map(_ON_AXIS.accepts, value)),
+        required=False,
+    ),
+}
+
+
+def _is_points_covariance(value: object) -> bool:
+    if not (isinstance(value, list) and len(value) == 6):
+        return False
+    if not all(are_numbers(row, 6) for row in value) or min(np.diag(value)) <= 0:
+        return False
+    covariance = np.array(value, float)
+    sigma = np.sqrt(np.diag(covariance))
+    return bench_check.is_correlation((covariance / np.outer(sigma, sigma)).tolist())
+
+
+_OF_PICTURE = {
+    **_sigmas("image_calibration"),
+    "points_covariance_px2": Rule(
+        "a covariance matrix, 6 x 6 (px²): u and v of O′, of the point on O′X′, of that on O′Z′",
+        _is_points_covariance,
+        required=False,
+    ),
 }
 RAYS = {
     "rays": Rule(
@@ -138,7 +166,7 @@ SECTIONS = {
         "glass_index": within(1, 4, "refractive index"),
         **_sigmas("imaging_plane"),
     },
-    "image_calibration": {**THREE_POINTS, **HOMOGRAPHY, **_sigmas("image_calibration")},
+    "image_calibration": {**THREE_POINTS, **HOMOGRAPHY, **_OF_PICTURE},
     "camera_lens": {
         "focal_px": _two_numbers("[fu, fv], two numbers above 0 (px)", above_zero=True),
         "center_px": _two_numbers("[u, v], two numbers (px)"),
@@ -178,4 +206,4 @@ def rules_for(section: str, keys: object) -> dict[str, Rule]:
     if section != "image_calibration":
         return SECTIONS[section]
     form = HOMOGRAPHY if isinstance(keys, dict) and "homography" in keys else THREE_POINTS
-    return form | _sigmas(section)
+    return form | _OF_PICTURE

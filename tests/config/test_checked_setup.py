@@ -192,6 +192,7 @@ def test_a_check_of_another_set_up_is_refused(section: str, keys: dict[str, Any]
         ("laser", {"distance_mm_sigma": 0.02}),
         ("laser", {"angle_distance_correlation": 0.5}),
         ("image_calibration", {"origin_px_sigma": 0.1}),
+        ("image_calibration", {"points_covariance_px2": np.diag([0.09] * 6).tolist()}),
         ("imaging_plane", {"glass_mm": 3.0}),
         ("pattern", {"kind": "hexagonal"}),
     ],

@@ -11,7 +11,15 @@ from hypothesis import strategies as st
 
 from labapp.config.setup import read_setup, update_setup
 from labapp.core.geometry.rig import Laser
-from labapp.core.geometry.uncertainty import ANGLE, DISTANCE, GLASS, INDEX, QUANTITIES
+from labapp.core.geometry.uncertainty import (
+    ANGLE,
+    DISTANCE,
+    GLASS,
+    INDEX,
+    POINTS,
+    QUANTITIES,
+    RigUncertainty,
+)
 from labapp.errors import InputError
 
 SETUP = """\
@@ -456,3 +464,64 @@ def test_a_calibrated_value_that_is_changed_loses_its_uncertainty(path: Path) ->
     assert known.sigma[[ANGLE, DISTANCE]].tolist() == [0.2, 0.5]
     assert known.correlation[ANGLE, DISTANCE] == 0.0
     assert known.sigma[INDEX["laser.azimuth_deg"]] == 0.1
+
+
+COVARIANCE = np.diag([0.01, 0.04, 0.0025, 0.0025, 0.09, 0.09])
+COVARIANCE[0, 2] = COVARIANCE[2, 0] = 0.003
+"""Of the points of a calibration, px²: u of O′ and of the point on O′X′ go together."""
+
+
+def test_points_in_the_picture_have_a_whole_covariance(path: Path) -> None:
+    sigma = np.sqrt([0.025, 0.0025, 0.09])
+    names = ("origin_px", "x_axis_px", "z_axis_px")
+    given = {f"{name}_sigma": float(one) for name, one in zip(names, sigma, strict=True)}
+    points = np.ix_(POINTS, POINTS)
+
+    def known(**keys: object) -> RigUncertainty:
+        update_setup(path, {"image_calibration": keys})
+        found = read_setup(path).rig.uncertainty
+        assert found is not None
+        return found
+
+    whole = known(**given, points_covariance_px2=COVARIANCE.tolist())
+    np.testing.assert_allclose(whole.covariance[points], COVARIANCE)
+    np.testing.assert_allclose(whole.root @ whole.root.T, whole.covariance, atol=1e-9)
+    wider = known(origin_px_sigma=2 * given["origin_px_sigma"])
+    np.testing.assert_allclose(wider.covariance[points][:2, :2], 4 * COVARIANCE[:2, :2])
+    np.testing.assert_allclose(wider.correlation, whole.correlation)
+    # Another point is not what was calibrated: nothing is known of its errors and others'.
+    changed = known(origin_px=[45.0, 590.0])
+    alone = np.diag([0.09, 0.09, 0.0025, 0.0025, 0.09, 0.09])
+    np.testing.assert_allclose(changed.covariance[points], alone)
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [
+        ("origin_px_sigma", [0.1, 0.2]),
+        ("points_covariance_px2", 0.5),
+        ("points_covariance_px2", [[1.0, 0.0], [0.0, 1.0]]),
+        ("points_covariance_px2", (COVARIANCE - 0.0025 * np.eye(6)).tolist()),
+        ("points_covariance_px2", (COVARIANCE + np.eye(6, k=1)).tolist()),
+        ("points_mm", [30.0, 30.0]),
+    ],
+)
+def test_wrong_covariances_of_points_are_refused(path: Path, key: str, value: object) -> None:
+    update_setup(path, {"image_calibration": {key: value}})
+    with pytest.raises(InputError) as refused:
+        read_setup(path)
+    assert refused.value.field == f"image_calibration.{key}"
+
+
+def test_points_of_a_homography_lie_where_their_uncertainties_are_of(path: Path) -> None:
+    setup = read_setup(path)
+    points = ("origin_px", "x_axis_px", "x_axis_mm", "z_axis_px", "z_axis_mm")
+    rows = {"homography": setup.calibration.matrix.tolist()}
+    update_setup(path, {"image_calibration": dict.fromkeys(points) | rows})
+    half = read_setup(path).rig
+    assert half.uncertainty is not None
+    assert half.uncertainty.axes.x_mm == half.imaging_plane.width_mm / 2
+    update_setup(path, {"image_calibration": {"points_mm": [30.0, 20.0]}})
+    known = read_setup(path).rig.uncertainty
+    assert known is not None
+    assert (known.axes.x_mm, known.axes.z_mm) == (30.0, 20.0)

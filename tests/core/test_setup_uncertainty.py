@@ -8,9 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from labapp.config.setup import read_setup
+from labapp.config.setup import parse_setup, read_setup, updated_setup
+from labapp.core.calibration.plane_calibration import calibrate_plane
 from labapp.core.geometry.perturbation import moved_dots, moved_rig
-from labapp.core.geometry.uncertainty import INDEX
+from labapp.core.geometry.uncertainty import INDEX, QUANTITIES
 from labapp.core.schemes import fit
 from labapp.core.surface.boundary_trace import trace_boundary
 from labapp.core.surface.measures import SIZES, measure_surface
@@ -19,8 +20,10 @@ from labapp.core.surface.setup_uncertainty import residual_changes, setup_change
 from labapp.core.surface.sizes import sizes_and_gradients
 from labapp.core.surface.solver import REUSE_MM, normal_factor
 from labapp.core.values import FloatArray
+from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.pools import egg
+from labapp.simulation.target import Target, TargetLook, render_target
 
 SIZED = [0, 1, 2, 4, 5]
 """All sizes of a convex pool but its depth."""
@@ -110,3 +113,44 @@ def test_residuals_change_as_those_of_fits_on_benches_that_are_off(key: str) -> 
     )
     wanted = (more.residual_mm - less.residual_mm) / 0.2
     assert np.linalg.norm(change - wanted) <= 0.1 * np.linalg.norm(wanted)
+
+
+@pytest.mark.slow
+def test_the_height_is_covered_with_a_plane_that_a_noisy_picture_calibrated() -> None:
+    """Nothing else is uncertain: the ± is that of the calibration's whole covariance."""
+    view, pool, draws = CameraView.rolled(roll_deg=1.5), egg(6.6, 3.0, 3.9, 0.33), 50
+    sections = {one.sigma_key.partition(".")[::2]: 0.0 for one in QUANTITIES}
+    exact: dict[str, dict[str, object]] = {}
+    for (section, key), sigma in sections.items():
+        exact.setdefault(section, {})[key] = sigma
+    exact = {name: keys for name, keys in exact.items() if name != "image_calibration"}
+    axes = {"x_axis_mm_sigma": 0.0, "z_axis_mm_sigma": 0.0}
+    clean = render_target(
+        Target(), view, TargetLook(noise=0.0, specks=0), np.random.default_rng(0)
+    ).astype(float)
+    seen_px = view.to_image(MATCH.plane_mm)
+
+    def height(text: str) -> FloatArray:
+        """The height by a set-up, and the set-up's part of its ±."""
+        setup = parse_setup(text, "setup.toml")
+        match = exact_match(trace(pool, setup.rig), setup.rig)
+        match = replace(match, plane_mm=setup.calibration.to_plane(seen_px))
+        made = fit.reconstruct(match, setup.rig, SETTINGS)
+        size = measure_surface(made, match, setup.rig)
+        return np.array([size.height_mm, made.size_sigma_setup[2]])
+
+    text = updated_setup(SETUP.text, "setup.toml", exact)
+    truth = {
+        name: getattr(view, name)
+        for name in ("origin_px", "x_axis_px", "x_axis_mm", "z_axis_px", "z_axis_mm")
+    }
+    true, _ = height(updated_setup(text, "setup.toml", {"image_calibration": truth}))
+    errors = []
+    for n in range(draws):
+        noise = np.random.default_rng([18, n]).normal(0.0, 2.5, clean.shape)
+        found = calibrate_plane(np.clip(np.rint(clean + noise), 0, 255).astype(np.uint8))
+        calibrated = found.setup_keys["image_calibration"] | axes
+        made, sigma = height(updated_setup(text, "setup.toml", {"image_calibration": calibrated}))
+        errors.append((made - true) / sigma)
+    covered = np.mean(np.abs(errors) < 1.96)
+    assert 0.92 <= covered <= 0.98

@@ -15,7 +15,7 @@ import numpy as np
 
 from labapp.core.calibration.boards import Board, BoardCorners, find_board
 from labapp.core.calibration.lens_fit import LensFit, PlaneView, covered, fit_lens, fit_terms
-from labapp.core.calibration.seen_axes import SeenAxes
+from labapp.core.calibration.seen_axes import POINTS, SeenAxes
 from labapp.core.calibration.target_marks import Image
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.values import CannotMeasure, FloatArray
@@ -33,8 +33,6 @@ MOST_PICTURES = 100
 
 FEW_COVERED = 0.5
 """Where corners span less of the picture, how it is distorted beyond them is a guess."""
-
-SETUP_SIGMAS = ("origin_px", "x_axis_px", "z_axis_px")
 
 
 @dataclass(frozen=True)
@@ -103,6 +101,12 @@ class BoardCalibration(SeenAxes):
         return self.fit.covariance_px2(self._points_mm)
 
     @property
+    def affine_covariance_px2(self) -> FloatArray:
+        """Covariance of these points for an affine change of the picture, shape (6, 6), px²."""
+        corners = self.board.corners_mm
+        return self._affine_covariance_px2(corners, self.fit.covariance_px2(corners))
+
+    @property
     def residual_px(self) -> FloatArray:
         """Computed minus found place of each corner of the first picture, shape (n, 2), px."""
         return self.fit.residuals_px[: len(self.seen[0].index)]
@@ -126,12 +130,11 @@ class BoardCalibration(SeenAxes):
     def setup_keys(self) -> dict[str, dict[str, object]]:
         """The same as keys of a setup file by section; None for one that must not be there."""
         calibration, lens = self.image_calibration, self.fit.lens
-        gone = (*SETUP_SIGMAS, "x_axis_mm", "z_axis_mm")
-        sigmas = zip(SETUP_SIGMAS, self.points_sigma_px, strict=True)
         image: dict[str, object] = {
-            **dict.fromkeys(gone),
+            **dict.fromkeys((*POINTS, "x_axis_mm", "z_axis_mm")),
             "homography": calibration.matrix.tolist(),
-            **{f"{name}_sigma": sigma for name, sigma in sigmas},
+            "points_mm": [self.x_axis_mm, self.z_axis_mm],
+            **self.setup_uncertainty,
         }
         camera: dict[str, object] = dict.fromkeys(("focal_px", "center_px", "distortion"))
         if lens is not None:

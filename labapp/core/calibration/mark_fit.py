@@ -143,6 +143,11 @@ class MarkFits:
             raise ValueError(f"these marks give no {model}")
         return fit
 
+    @property
+    def field_mm(self) -> FloatArray:
+        """(X′, Z′) of places all over where dots land, shape (n, 2), mm."""
+        return _field(self.corner_mm)
+
     def bound_mm(self, used: ImageCalibration) -> float:
         """How far a map may err at the far corner: 95 % bound, mm; NaN if nothing tells.
 
@@ -285,8 +290,7 @@ def _gains(smaller: MarkFit, larger: MarkFit, axis_mm: float) -> bool:
 
 def _expected_errors_mm(smaller: MarkFit, larger: MarkFit, axis_mm: float) -> tuple[float, float]:
     """Root mean square error of two fits where dots land, if the larger is right but for noise."""
-    across = np.linspace(0.0, FIELD * axis_mm, 6)
-    field = np.stack(np.meshgrid(across, across), axis=-1).reshape(-1, 2)
+    field = _field(FIELD * axis_mm)
     seen = larger.calibration.to_image(field)
     mm2_per_px2 = np.abs(np.linalg.det(larger.calibration.jacobian(seen)))
 
@@ -345,6 +349,11 @@ def _fit(
         spare=np.diagonal(kept, axis1=1, axis2=2),
         variance=variance,
     )
+
+
+def _field(corner_mm: float) -> FloatArray:
+    across = np.linspace(0.0, corner_mm, 6)
+    return np.stack(np.meshgrid(across, across), axis=-1).reshape(-1, 2)
 
 
 def _calibration(matrix: FloatArray) -> ImageCalibration:

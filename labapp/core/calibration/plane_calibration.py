@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 
 from labapp.core.calibration.mark_fit import MarkFits, Model, fit_marks, root_mean_square
-from labapp.core.calibration.seen_axes import SeenAxes
+from labapp.core.calibration.seen_axes import POINTS, SeenAxes
 from labapp.core.calibration.target_bars import (
     Bar,
     bar_marks,
@@ -141,6 +141,14 @@ class PlaneCalibration(SeenAxes):
         return self.fits.of(self.model).covariance_px2(self._points_mm)
 
     @property
+    def affine_covariance_px2(self) -> FloatArray:
+        """Covariance of these points for an affine change of the picture, shape (6, 6), px²."""
+        if self.fits is None or self.model != "homography":
+            return self.points_covariance_px2
+        field = self.fits.field_mm
+        return self._affine_covariance_px2(field, self.fits.of(self.model).covariance_px2(field))
+
+    @property
     def image_calibration(self) -> ImageCalibration:
         """The calibration that the measurement uses.
 
@@ -167,17 +175,15 @@ class PlaneCalibration(SeenAxes):
 
         None for a key that must not be there.
         """
-        names = ("origin_px", "x_axis_px", "z_axis_px")
         lengths = {"x_axis_mm": self.x_axis_mm, "z_axis_mm": self.z_axis_mm}
-        sigmas = {
-            f"{name}_sigma": own for name, own in zip(names, self.points_sigma_px, strict=True)
-        }
+        known = self.setup_uncertainty
         if self.model == "homography":
-            rows = self.image_calibration.matrix.tolist()
-            keys = {**dict.fromkeys((*names, *lengths)), "homography": rows, **sigmas}
-            return {"image_calibration": keys}
-        points = dict(zip(names, self.points_px.tolist(), strict=True))
-        return {"image_calibration": {**points, **lengths, "homography": None, **sigmas}}
+            rows, places = self.image_calibration.matrix.tolist(), list(lengths.values())
+            keys = {**dict.fromkeys((*POINTS, *lengths)), "homography": rows, "points_mm": places}
+            return {"image_calibration": keys | known}
+        points = dict(zip(POINTS, self.points_px.tolist(), strict=True))
+        gone = {"homography": None, "points_mm": None}
+        return {"image_calibration": {**points, **lengths, **gone, **known}}
 
     def fit_lines(self) -> list[str]:
         """What the fits to the marks leave over, which is used and why, in words."""

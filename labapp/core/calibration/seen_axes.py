@@ -6,7 +6,11 @@ from abc import abstractmethod
 
 import numpy as np
 
+from labapp.core.geometry.uncertainty import point_sigma_px
 from labapp.core.values import FloatArray
+
+POINTS = ("origin_px", "x_axis_px", "z_axis_px")
+"""Keys of the points in a setup file."""
 
 
 class SeenAxes:
@@ -28,9 +32,36 @@ class SeenAxes:
     @property
     def points_sigma_px(self) -> tuple[float, float, float]:
         """Standard uncertainty of each of these points along either direction, px."""
-        variance = np.diag(self.points_covariance_px2).reshape(3, 2).mean(axis=1)
-        origin, on_x, on_z = np.sqrt(variance).tolist()
+        origin, on_x, on_z = point_sigma_px(self.points_covariance_px2).tolist()
         return origin, on_x, on_z
+
+    @property
+    def affine_covariance_px2(self) -> FloatArray:
+        """Covariance of these points for an affine change of the picture, shape (6, 6), px².
+
+        A set-up perturbs its image calibration by these three points alone. Where the map has more
+        than six parameters, this is the change nearest to its own over where dots land.
+        """
+        return self.points_covariance_px2
+
+    def _affine_covariance_px2(
+        self, plane_mm: FloatArray, covariance_px2: FloatArray
+    ) -> FloatArray:
+        """The same, from the covariance of where points (X′, Z′), shape (n, 2), mm, are seen."""
+        x, z = (plane_mm / [self.x_axis_mm, self.z_axis_mm]).T
+        shares = np.stack([1.0 - x - z, x, z], axis=-1)  # barycentric coordinates
+        nearest = np.kron(np.linalg.pinv(shares), np.eye(2))
+        return np.asarray(nearest @ covariance_px2 @ nearest.T)
+
+    @property
+    def setup_uncertainty(self) -> dict[str, object]:
+        """Keys of ``[image_calibration]``: ± of each point, and the covariance of them all."""
+        covariance = self.affine_covariance_px2
+        keys = {
+            f"{name}_sigma": sigma
+            for name, sigma in zip(POINTS, point_sigma_px(covariance).tolist(), strict=True)
+        }
+        return {**keys, "points_covariance_px2": covariance.tolist()}
 
     @property
     def px_per_mm(self) -> tuple[float, float]:

@@ -12,17 +12,16 @@ import numpy as np
 
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.rig import ImagingPlane, Laser, Rig
-from labapp.core.geometry.uncertainty import INDEX, QUANTITIES, AxisPoints
+from labapp.core.geometry.uncertainty import INDEX, POINTS, QUANTITIES, AxisPoints
 from labapp.core.values import FloatArray, ReadOnlyArrays
 
 _LASER, _PATTERN, _PLANE = (
     [(key.partition(".")[2], k) for key, k in INDEX.items() if key.startswith(f"{section}.")]
     for section in ("laser", "pattern", "imaging_plane")
 )
-_POINTS = [k for key, k in INDEX.items() if key.startswith("image_calibration.") and key[-1] == "]"]
 _AXES = [INDEX[f"image_calibration.{axis}_axis_mm"] for axis in "xz"]
 _DISTORTION = INDEX["camera_lens.distortion_percent"]
-_PICTURE = [*_POINTS, *_AXES, _DISTORTION]
+_PICTURE = [*POINTS, *_AXES, _DISTORTION]
 
 OF_PICTURE = np.isin(np.arange(len(INDEX)), _PICTURE)
 """Which quantities are the picture's: they move the dots that are seen, see `moved_dots`; the
@@ -56,7 +55,7 @@ def directions(rig: Rig) -> tuple[Direction, ...]:
         Direction(one.key, one.name, one.unit, np.eye(len(QUANTITIES))[k])
         for k, one in enumerate(QUANTITIES)
     ]
-    points = quantity_values(rig)[_POINTS].reshape(3, 2)
+    points = quantity_values(rig)[POINTS].reshape(3, 2)
     whole = []
     for key, name, unit, shift in (
         ("picture.u", "picture, shifted along u", "px", np.array([1.0, 0.0])),
@@ -64,7 +63,7 @@ def directions(rig: Rig) -> tuple[Direction, ...]:
         ("picture.scale", "image calibration, scale", "%", (points - points[0]) / 100.0),
     ):
         vector = np.zeros(len(QUANTITIES))
-        vector[_POINTS] = np.broadcast_to(shift, (3, 2)).ravel()
+        vector[POINTS] = np.broadcast_to(shift, (3, 2)).ravel()
         whole.append(Direction(key, name, unit, vector))
     return *single, *whole
 
@@ -131,7 +130,7 @@ def moved_calibration(
     percent = calibration.distortion_percent + float(offset[_DISTORTION])
     plane_mm = _axis_points_mm(axes)
     true = _with_ones(base.ideal_px(base.to_image(plane_mm)))
-    moved = base.ideal_px(base.to_image(plane_mm) + offset[_POINTS].reshape(3, 2))
+    moved = base.ideal_px(base.to_image(plane_mm) + offset[POINTS].reshape(3, 2))
     back = np.linalg.solve(_with_ones(moved), true).T
     stretch = np.diag([*(1.0 + offset[_AXES] / [axes.x_mm, axes.z_mm]), 1.0])
     made = ImageCalibration(stretch @ base.matrix @ back, base.lens)
@@ -166,7 +165,7 @@ def quantity_values(rig: Rig) -> FloatArray:
     for name, k in _PLANE:
         values[k] = at[name]
     base = ImageCalibration(axes.calibration.matrix, axes.calibration.plain_lens)
-    values[_POINTS] = base.to_image(_axis_points_mm(axes)).ravel()
+    values[POINTS] = base.to_image(_axis_points_mm(axes)).ravel()
     values[_AXES] = axes.x_mm, axes.z_mm
     values[_DISTORTION] = axes.calibration.distortion_percent
     return values

@@ -46,6 +46,9 @@ def _point(key: str, name: str) -> tuple[Quantity, Quantity]:
     return u, v
 
 
+ENDINGS = ("_sigma", "_correlation", "_covariance_px2")
+"""Of keys of a setup file that say how well others are known."""
+
 QUANTITIES = (
     Quantity("laser.projection_angle_deg", "laser, projection angle", "°", 0.5),
     Quantity("laser.distance_mm", "laser, distance", "mm", 0.5),
@@ -90,6 +93,9 @@ CALIBRATED = frozenset(
     or one.key in ("laser.projection_angle_deg", "laser.distance_mm")
 )
 """Keys of what steps 2 and 3 calibrate (Appendix I, §5.1)."""
+
+POINTS = [k for key, k in INDEX.items() if key.endswith("]")]
+"""Of the quantities: u and v of O′ and of the points on O′X′ and O′Z′."""
 
 ANGLE, DISTANCE = INDEX["laser.projection_angle_deg"], INDEX["laser.distance_mm"]
 
@@ -145,6 +151,14 @@ class RigUncertainty(ReadOnlyArrays):
         return np.asarray(np.sqrt(np.diag(self.covariance)))
 
     @property
+    def sigma_by_key(self) -> dict[str, float]:
+        """The same by `Quantity.sigma_key`; of a point in the picture the larger of u and v."""
+        found: dict[str, float] = {}
+        for one, sigma in zip(QUANTITIES, self.sigma.tolist(), strict=True):
+            found[one.sigma_key] = max(sigma, found.get(one.sigma_key, 0.0))
+        return found
+
+    @property
     def status(self) -> str:
         """How far the set-up can be relied on.
 
@@ -179,7 +193,11 @@ class RigUncertainty(ReadOnlyArrays):
 
 
 def covariance_of(
-    given: Mapping[str, float], laser_correlation: float = 0.0, *, has_glass: bool = False
+    given: Mapping[str, float],
+    laser_correlation: float = 0.0,
+    points_covariance_px2: FloatArray | None = None,
+    *,
+    has_glass: bool = False,
 ) -> tuple[FloatArray, frozenset[str]]:
     """Covariance of `QUANTITIES`, shape (q, q), and the keys of those that are assumed.
 
@@ -189,6 +207,10 @@ def covariance_of(
         Standard uncertainties by `Quantity.sigma_key`, in their units.
     laser_correlation
         Of projection angle and distance, which Appendix I takes from the same lengths.
+    points_covariance_px2
+        Of u and v of O′ and of the points on O′X′ and O′Z′, which are found in the same picture,
+        shape (6, 6). Each point's part is scaled to its own standard uncertainty, which is along
+        u and v the same without it. None: there is no correlation.
     has_glass
         Whether there is a glass on the imaging plane, which is known exactly where there is none.
     """
@@ -196,7 +218,15 @@ def covariance_of(
     usual = [0.0 if one.key in exact else one.assumed for one in QUANTITIES]
     sigma = np.array([given.get(o.sigma_key, s) for o, s in zip(QUANTITIES, usual, strict=True)])
     covariance = np.diag(sigma**2)
+    if points_covariance_px2 is not None:
+        scale = sigma[POINTS] / np.repeat(point_sigma_px(points_covariance_px2), 2)
+        covariance[np.ix_(POINTS, POINTS)] = points_covariance_px2 * np.outer(scale, scale)
     shared = laser_correlation * sigma[ANGLE] * sigma[DISTANCE]
     covariance[ANGLE, DISTANCE] = covariance[DISTANCE, ANGLE] = shared
     lacking = frozenset(one.key for one in QUANTITIES if one.sigma_key not in given)
     return covariance, lacking - exact
+
+
+def point_sigma_px(covariance_px2: FloatArray) -> FloatArray:
+    """Standard uncertainty of n points along either direction, of their covariance, (2n, 2n)."""
+    return np.asarray(np.sqrt(np.diag(covariance_px2).reshape(-1, 2).mean(axis=1)))

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from labapp.core.geometry.uncertainty import ENDINGS
 from labapp.errors import InputError
 from labapp.text import pluralize
 
@@ -130,7 +131,7 @@ def _entered(keys: Any, found: Mapping[str, Any]) -> bool:
         pairs = [
             (keys[name], value)
             for name, value in found.items()
-            if value is not None and not name.endswith(("_sigma", "_correlation"))
+            if value is not None and not name.endswith(ENDINGS)
         ]
         return all(np.allclose(one, other, rtol=1e-6) for one, other in pairs)
     except (KeyError, TypeError, ValueError):

@@ -38,7 +38,7 @@ LARGEST_SIGMA = 10.0
 
 def calibration_values(known: RigUncertainty) -> dict[str, float]:
     """How well a bench is known, as the keys of ``[calibration]``: key → value."""
-    sigma = {one.sigma_key: float(own) for one, own in zip(QUANTITIES, known.sigma, strict=True)}
+    sigma = known.sigma_by_key
     values = {name: min(sigma[key], LARGEST_SIGMA) for name, key in CALIBRATION.items()}
     shared = float(known.correlation[ANGLE, DISTANCE])
     return {**values, "angle_distance_correlation": shared}

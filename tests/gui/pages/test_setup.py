@@ -13,7 +13,7 @@ from pytestqt.qtbot import QtBot
 
 from labapp.config.setup import read_setup
 from labapp.config.setup_keys import SECTIONS
-from labapp.core.geometry.uncertainty import ANGLE, DISTANCE, INDEX, QUANTITIES
+from labapp.core.geometry.uncertainty import ANGLE, DISTANCE, INDEX, POINTS, QUANTITIES
 from labapp.gui.pages.setup import SetupPage, presenter
 from labapp.gui.pages.setup.presenter import RIG
 from labapp.gui.views.bench import DRAWN
@@ -90,7 +90,8 @@ def test_calibrations_make_a_setup_calibrated_and_edits_undo_that(empty: Session
     assert "calibrated" in presenter.shown(empty).status
     assert known.sigma[INDEX["laser.distance_mm"]] == found.distance_sigma_mm
     assert known.correlation[ANGLE, DISTANCE] == pytest.approx(found.correlation)
-    assert known.sigma[INDEX["image_calibration.z_axis_px[v]"]] == plane.points_sigma_px[2]
+    covariance = known.covariance[np.ix_(POINTS, POINTS)]
+    np.testing.assert_allclose(covariance, plane.points_covariance_px2, rtol=1e-6, atol=1e-9)
     # Another value is not what was calibrated.
     presenter.put(empty, "laser.distance_mm", 31.0)
     changed = empty.setup.rig.uncertainty

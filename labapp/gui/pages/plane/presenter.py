@@ -14,6 +14,7 @@ from labapp.core.calibration.imaging_plane import Calibration, calibrate_imaging
 from labapp.core.calibration.mark_fit import Model, root_mean_square
 from labapp.core.calibration.plane_calibration import PlaneCalibration, PlaneCalibrationSettings
 from labapp.core.geometry.coordinates import ImageCalibration, Lens
+from labapp.core.geometry.uncertainty import ENDINGS
 from labapp.core.values import FloatArray
 from labapp.gui.digits import ResultRow, round_factor
 from labapp.gui.shell.steps import calibrations_in_use
@@ -264,7 +265,7 @@ def in_use(session: Session) -> tuple[ResultRow, ...]:
     values, sigmas = [np.nan] * 3, [None] * 3
     kept = session.plane_calibration if calibrations_in_use(session)[1] else None
     keys = tomllib.loads(session.setup_text).get("image_calibration", {})
-    keys = {name: value for name, value in keys.items() if not name.endswith("_sigma")}
+    keys = {name: value for name, value in keys.items() if not name.endswith(ENDINGS)}
     lens = lens_of(session.setup_text)
     try:
         calibration = (

@@ -282,10 +282,7 @@ def _usual_sigmas(found: Rig | None) -> tuple[dict[str, float], str]:
     known = None if found is None else found.uncertainty
     if known is None or not known.checked:
         return ASSUMED, f"{words}assumed."
-    sigmas: dict[str, float] = {}
-    for one, sigma in zip(QUANTITIES, known.sigma.tolist(), strict=True):
-        sigmas[one.sigma_key] = max(sigma, sigmas.get(one.sigma_key, 0.0))  # along u and v
-    return sigmas, f"{words}as the bench check found it."
+    return known.sigma_by_key, f"{words}as the bench check found it."
 
 
 def _number(sections: dict[str, Any], key: str) -> float | None:
