@@ -6,7 +6,7 @@ import contextlib
 from dataclasses import dataclass
 from pathlib import Path
 
-from labapp.bundled import bundled
+from labapp.bundled import SAMPLE_TEXTS, bundled
 from labapp.errors import InputError
 from labapp.session.record import Record
 from labapp.session.session import Session
@@ -32,7 +32,7 @@ SAMPLES = {
     "gtaw": SampleSession(
         "recording.avi",
         Record(
-            title="GTAW run of §7.3",
+            title=SAMPLE_TEXTS["gtaw"].title,
             operator="labapp",
             current_a=75.0,
             travel_speed_mm_s=3.0,
@@ -45,7 +45,7 @@ SAMPLES = {
     "thumb_tack": SampleSession(
         "recording.tif",
         Record(
-            title="Thumb tack of §8.2",
+            title=SAMPLE_TEXTS["thumb_tack"].title,
             operator="labapp",
             expected_width_mm=9.75,
             expected_length_mm=9.75,
@@ -56,22 +56,22 @@ SAMPLES = {
     "blocked_rows": SampleSession(
         "recording.mkv",
         Record(
-            title="Rows blocked by the torch",
+            title=SAMPLE_TEXTS["blocked_rows"].title,
             operator="labapp",
             notes=f"{SIMULATED} Frame 2 was corrected by hand, frames 3 to 5 were not.",
         ),
     ),
     "concave": SampleSession(
         "recording",
-        Record(title="A concave pool", operator="labapp", notes=SIMULATED),
+        Record(title=SAMPLE_TEXTS["concave"].title, operator="labapp", notes=SIMULATED),
     ),
     "five_lines": SampleSession(
         "recording.avi",
-        Record(title="Five lines, §3.2.1", operator="labapp", notes=SIMULATED),
+        Record(title=SAMPLE_TEXTS["five_lines"].title, operator="labapp", notes=SIMULATED),
     ),
     "gmaw": SampleSession(
         "recording.tif",
-        Record(title="One line on a GMAW pool, §3.3", operator="labapp", notes=SIMULATED),
+        Record(title=SAMPLE_TEXTS["gmaw"].title, operator="labapp", notes=SIMULATED),
         frame_rate_hz=1500.0,
     ),
 }

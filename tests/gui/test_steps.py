@@ -24,11 +24,16 @@ CALIBRATE = "calibrate the picture (step Imaging plane)"
         (LASER, f"Enter the pattern, {TYPED}; {CALIBRATE}"),
         (
             LASER.replace("distance_mm = 31.48\n", "") + PATTERN,
-            f"Enter the laser (distance mm), {TYPED}; {CALIBRATE}",
+            f"Enter distance of the laser, {TYPED}; {CALIBRATE}",
+        ),
+        (
+            LASER + PATTERN + "[electrode]\nheight_mm = 5\n"
+            "[imaging_plane]\ndistance_mm = 50\nwidth_mm = 101.6\nheight_mm = 101.6\n",
+            f"Enter s and h of the imaging plane; {CALIBRATE}",
         ),
         (
             LASER.replace("31.48", "-3") + PATTERN,
-            "Correct the laser, distance mm: -3 is not a number above 0 and below 10000 (mm); "
+            "Correct distance of the laser: -3 is not a number above 0 and below 10000 (mm); "
             f"enter {TYPED}; {CALIBRATE}",
         ),
     ],

@@ -14,6 +14,7 @@ from PySide6.QtGui import QDropEvent
 from PySide6.QtWidgets import QApplication, QMessageBox
 from pytestqt.qtbot import QtBot
 
+from labapp.bundled import SAMPLE_TEXTS
 from labapp.errors import InputError
 from labapp.gui import app, dialogs
 from labapp.gui.drafts import drafts, drafts_folder
@@ -424,13 +425,16 @@ def test_the_sample_is_copied_once_and_then_the_users_own(tmp_path: Path):
             assert session.problems() == []
 
 
-def test_trying_the_sample_opens_it(
-    plain: MainWindow, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("name", sorted(SAMPLE_TEXTS))
+def test_trying_a_sample_opens_a_copy(
+    plain: MainWindow, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ):
     monkeypatch.setattr(Preferences, "samples_folder", tmp_path / "documents")
-    plain.welcome.buttons["sample"].click()
-    assert plain.workspace.session is not None
-    assert plain.workspace.session.path == tmp_path / "documents" / "gtaw" / "gtaw.labsession"
+    plain.welcome.samples[name].click()
+    session = plain.workspace.session
+    assert session is not None
+    assert session.path == tmp_path / "documents" / name / f"{name}.labsession"
+    assert session.record.title == SAMPLE_TEXTS[name].title
     assert "copy of the sample" in plain.status_line.message.text()
 
 
@@ -523,7 +527,7 @@ def test_a_set_up_that_is_not_complete_is_said_before_measuring(
     plain.files.open(copy_sample("thumb_tack"))
     plain.workspace.attempt(lambda s: s.update_setup({"laser": {"distance_mm": None}}))
     plain.do("measure_frame")
-    assert "the laser (distance mm)" in problems(plain)[0]
+    assert "distance of the laser" in problems(plain)[0]
     assert plain.workspace.tasks.active == []
 
 

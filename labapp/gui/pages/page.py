@@ -47,6 +47,7 @@ class Page(QWidget):
         self.panel.setObjectName(f"panel-{self.key}")
         self.answer = Message(2)
         """Says what came of what was pressed: what was done, or why not; stands beside that."""
+        self._answers = {self.answer}
         self._changing: list[QWidget] = []
         workspace.opened.connect(self._take_session)
 
@@ -64,7 +65,7 @@ class Page(QWidget):
 
     def confirm(self, words: str, beside: Message | None = None) -> None:
         """Say that what was pressed is done: in `answer`, or another message beside that."""
-        (beside or self.answer).setText(f"{DONE} {words}")
+        self._answer_in(beside).setText(f"{DONE} {words}")
         self.workspace.notified.emit(words, False)
 
     def start_task(
@@ -76,8 +77,14 @@ class Page(QWidget):
         beside: Message | None = None,
     ) -> Task:
         """Begin work in the background, see `Tasks.start`; `answer` says why it failed."""
-        answer = beside or self.answer
-        return self.workspace.tasks.start(title, work, on_done, beside=answer.setText, kind=kind)
+        say = self._answer_in(beside).setText
+        return self.workspace.tasks.start(title, work, on_done, beside=say, kind=kind)
+
+    def _answer_in(self, beside: Message | None) -> Message:
+        """The message that says what came of it; it is emptied with the session."""
+        message = beside or self.answer
+        self._answers.add(message)
+        return message
 
     def lock_with_session(self, *widgets: QWidget) -> None:
         """Have these, which change the session, be of no use while it is open read-only."""
@@ -98,7 +105,8 @@ class Page(QWidget):
 
     def _take_session(self) -> None:
         """What was said of the former session is of no interest in another."""
-        self.answer.setText("")
+        for message in self._answers:
+            message.setText("")
         for side in (self, self.panel):
             for field in side.findChildren(Field):
                 field.refuse("")

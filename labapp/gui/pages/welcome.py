@@ -1,4 +1,4 @@
-"""The first page: sessions opened before, a new one, and a sample to try."""
+"""The first page: sessions opened before, a new one, and samples to try."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from pathlib import Path
 from PySide6.QtCore import QSize, Qt, Signal
 from PySide6.QtGui import QColor, QIcon, QImage, QKeyEvent, QPixmap
 from PySide6.QtWidgets import (
+    QCommandLinkButton,
     QFrame,
     QListWidget,
     QListWidgetItem,
@@ -16,27 +17,30 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
+from labapp.bundled import SAMPLE_TEXTS
 from labapp.gui.recent import THUMBNAIL_PX, Recent, look_at
 from labapp.gui.shell.lead import action_button
 from labapp.gui.tasks import Control
 from labapp.gui.theme import FollowsTheme
 from labapp.gui.widgets.labels import Message, plain_label, plain_tip, wrapping_label
-from labapp.gui.widgets.layouts import fill, hbox, vbox
+from labapp.gui.widgets.layouts import fill, hbox, scrolled, vbox
 from labapp.gui.workspace import Workspace
 
-BUTTONS = ("open_recording", "open", "new", "study", "sample")
+BUTTONS = ("open_recording", "open", "new", "study")
 """Actions of the window; the first leads to a surface soonest."""
 
-WIDTH_PX = 760
+WIDTH_PX = 960
 
 
 class Welcome(FollowsTheme, QWidget):
-    """Recent sessions with thumbnail, date and frames; New; Open; Try the sample."""
+    """Buttons that begin; recent sessions with thumbnail, date and frames; samples."""
 
     action_requested = Signal(str)
     """A button was pressed: the name of its action."""
     chosen = Signal(Path)
     """A session of the list was chosen."""
+    sample_chosen = Signal(str)
+    """A sample was chosen: its name."""
     forgotten = Signal(Path)
     """A session is to be removed from the list."""
 
@@ -47,6 +51,7 @@ class Welcome(FollowsTheme, QWidget):
         self._shown: tuple[Path, ...] = ()
         self._gone: list[Path] = []
         self.buttons: dict[str, QPushButton] = {}
+        self.samples: dict[str, QCommandLinkButton] = {}
         inner = QWidget()
         inner.setMaximumWidth(WIDTH_PX)
         title = plain_label("labapp")
@@ -54,8 +59,8 @@ class Welcome(FollowsTheme, QWidget):
         font.setPointSizeF(font.pointSizeF() * 2.2)
         title.setFont(font)
         about = wrapping_label(
-            "The surface of a molten weld pool, measured from the reflections of a laser dot "
-            "matrix. An experiment is one session file; everything you do is saved in it at once."
+            "The surface of a molten weld pool, measured from the reflections of a laser "
+            "pattern. An experiment is one session file; everything you do is saved in it at once."
         )
         for name in BUTTONS:
             made = self.buttons[name] = action_button(name, self.action_requested.emit)
@@ -70,21 +75,29 @@ class Welcome(FollowsTheme, QWidget):
             "draft that it is"
         )
         self.list.setIconSize(QSize(*THUMBNAIL_PX))
-        self.list.setFrameShape(QFrame.Shape.StyledPanel)
         self.list.setTextElideMode(Qt.TextElideMode.ElideMiddle)
-        self.list.setAlternatingRowColors(True)
         self.list.itemActivated.connect(self._open)
+        self.list.setFrameShape(QFrame.Shape.StyledPanel)
+        self.list.setAlternatingRowColors(True)
+        samples = QWidget()
+        for name, text in SAMPLE_TEXTS.items():
+            offer = self.samples[name] = QCommandLinkButton(text.title, text.shows)
+            offer.setIcon(QIcon())  # the style's arrow is black on a dark ground, too
+            offer.setToolTip("Open a copy of this sample, in a folder of yours")
+            offer.setMinimumWidth(1)
+            offer.clicked.connect(lambda *_, name=name: self.sample_chosen.emit(name))
+        vbox(*self.samples.values(), 1, of=samples).setSpacing(0)
         self.label.setBuddy(self.list)
         self.nothing = wrapping_label(
             "No session was opened yet. Open a recording, or drop a video, an image, a folder of "
-            "images or a session anywhere on this window; or try the sample."
+            "images or a session anywhere on this window; or try a sample."
         )
-        shown = list(self.buttons.values())
-        buttons = vbox(hbox(*shown[:3]), hbox(*shown[3:]))
-        column = fill(
-            QVBoxLayout(inner),
-            *(title, about, buttons, self.refused, self.label, (self.list, 1), self.nothing, 0),
-        )
+        recent = vbox(self.label, (self.list, 1), self.nothing, 0)
+        offered = vbox(plain_label("Samples"), (scrolled(samples), 1))
+        lists = hbox((recent, 3), (offered, 2))
+        lists.setSpacing(16)
+        buttons = hbox(*self.buttons.values())
+        column = fill(QVBoxLayout(inner), title, about, buttons, self.refused, (lists, 1))
         column.setSpacing(12)
         hbox(1, (inner, 100), 1, of=self).setContentsMargins(24, 20, 24, 12)
         self.follow_theme()

@@ -205,12 +205,12 @@ class Files(QObject):
             self._show(session)
             self.recording_requested.emit(None, False)
 
-    def try_sample(self) -> None:
-        """Open a copy of the sample run, in a folder of the user's."""
+    def try_sample(self, name: str = "gtaw") -> None:
+        """Open a copy of a sample session, in a folder of the user's."""
         from labapp.session.copies import copy_sample
 
-        folder = self.preferences.current.samples_folder / "gtaw"
-        path = self.workspace.run_or_report(lambda: copy_sample("gtaw", folder))
+        folder = self.preferences.current.samples_folder / name
+        path = self.workspace.run_or_report(lambda: copy_sample(name, folder))
         if path is not None and self.open(path):
             words = f"This is a copy of the sample, in {path.parent}: change what you like"
             self.workspace.notified.emit(words, False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -68,7 +69,8 @@ PARTS = {
 
 def setup_to_do(problems: Iterable[InputError]) -> str:
     """What to do for the set-up to be complete, in words; empty if nothing."""
-    enter, wrong, calibrate = [], [], []
+    missing: dict[str, list[str]] = {}
+    wrong, calibrate = [], []
     for problem in problems:
         part, _, key = problem.field.partition(".")
         if part == "image_calibration":
@@ -76,13 +78,24 @@ def setup_to_do(problems: Iterable[InputError]) -> str:
         elif part not in PARTS:
             wrong.append(f"take out {problem.field}: {problem.expected}")
         elif problem.value == "missing":
-            enter.append(f"{PARTS[part]} ({key.replace('_', ' ')})" if key else PARTS[part])
+            missing.setdefault(PARTS[part], []).extend([_name(key)] if key else [])
         else:
-            message = f"{PARTS[part]}, {key.replace('_', ' ')}"
-            wrong.append(f"correct {message}: {problem.value} is not {problem.expected}")
-    typed = [f"enter {', '.join(dict.fromkeys(enter))}"] if enter else []
+            of = f"{_name(key)} of {PARTS[part]}"
+            wrong.append(f"correct {of}: {problem.value} is not {problem.expected}")
+    enter = [
+        f"{', '.join(names[:-1])} and {names[-1]} of {part}".removeprefix(" and ")
+        if names
+        else part
+        for part, names in missing.items()
+    ]
+    typed = [f"enter {', '.join(enter)}"] if enter else []
     words = "; ".join([*wrong, *typed, *calibrate])
     return words[:1].upper() + words[1:]
+
+
+def _name(key: str) -> str:
+    """What a value of the set-up is called: its key without the unit."""
+    return re.sub("_(mm|deg)$", "", key).replace("_", " ")
 
 
 READ_ONLY = "The session is open read-only: nothing can be changed"

@@ -173,6 +173,7 @@ class MainWindow(QMainWindow):
         self.welcome.action_requested.connect(self.do)
         self.empty.action_requested.connect(self.do)
         self.welcome.chosen.connect(self.files.open)
+        self.welcome.sample_chosen.connect(self.files.try_sample)
         self.welcome.forgotten.connect(self._forget)
 
     # --- actions ----------------------------------------------------------------------------

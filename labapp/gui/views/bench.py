@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping
+from functools import partial
 
 import numpy as np
 import pyqtgraph as pg
-from PySide6.QtCore import QRect, Qt
+from PySide6.QtCore import QPointF, QRect, QRectF, Qt
 from PySide6.QtGui import QColor, QPalette, QResizeEvent
+from PySide6.QtWidgets import QBoxLayout, QWidget
 
 from labapp.core.geometry.rig import Rig
 from labapp.core.values import FloatArray
 from labapp.gui.views.axes import Sketch, draw_line, draw_text, make_plot, paint_axes
 from labapp.gui.views.dimension import DimensionBox
 from labapp.gui.widgets.fields import NumberField
-from labapp.gui.widgets.layouts import vbox
+from labapp.gui.widgets.labels import plain_tip
+from labapp.gui.widgets.layouts import hbox, vbox
 from labapp.simulation.positioning import Fate, SideView
 
 RED, BLUE = {True: "#ff6b5e", False: "#c62828"}, {True: "#6cb6ff", False: "#1565c0"}
@@ -38,8 +42,17 @@ DRAWN = {
 
 IN_TOP_VIEW = ("imaging_plane.s_mm", "imaging_plane.width_mm")
 
+ROWS = (3, 3, 2)
+"""How many of the fields stand beside each other where they are not on the drawing."""
+
 NARROW_PX = 760
 """On a narrower canvas the enlarged view has no room."""
+
+SMALL_PX = (480, 400)
+"""On a canvas narrower or lower than this the fields would hide the drawing."""
+
+CLICK_PX = 22
+"""A click this near to the letter of a dimension means it."""
 
 
 class BenchView(Sketch):
@@ -60,27 +73,34 @@ class BenchView(Sketch):
         self.top = make_plot("from above: Y, mm", "X, mm")
         self.top.invertY(True)
         self.near = make_plot("enlarged, mm")
-        views = vbox((self.whole, 3), (self.top, 2))
+        self._views = vbox((self.whole, 3), (self.top, 2))
         super().__init__(
-            "Drawing of the bench from the side and from above", (views, 3), (self.near, 2)
+            "Drawing of the bench from the side and from above", (self._views, 3), (self.near, 2)
         )
         self._plots = [self.whole, self.top, self.near]  # shown and hidden with what is drawn
+        self._said = ""
+        self._is_small = False
         self.boxes = {
             key: DimensionBox(DRAWN[key], field, self.top if key in IN_TOP_VIEW else self.whole)
             for key, field in fields.items()
         }
+        self._rows = [hbox() for _ in ROWS]
+        self._strip = QWidget()
+        vbox(*self._rows, of=self._strip).setContentsMargins(4, 2, 4, 0)
+        self._column.insertWidget(1, self._strip)
         for plot in (self.whole, self.top):
             plot.getViewBox().sigTransformChanged.connect(lambda _: self._place_fields())
+            plot.scene().sigMouseClicked.connect(partial(self._choose, plot))
+        self._arrange()
         self.follow_theme()
 
     def show_bench(self, rig: Rig | None, view: SideView | None, words: str) -> None:
         """Draw a bench, or none; the words stand below and are what a screen reader says."""
-        former, self._view, self._rig = self._view, view, rig
-        self.say(words, view is not None)
+        former, self._view, self._rig, self._said = self._view, view, rig, words
+        self._arrange()
         self._draw()
         if view is not None and (former is None or _extent(view) != _extent(former)):
             self.fit()
-        self._arrange()
         self._place_fields()
 
     def fit(self) -> None:
@@ -89,26 +109,84 @@ class BenchView(Sketch):
             left, right, top = _extent(self._view)
             self.whole.setRange(xRange=(left, right), yRange=(-12.0, top), padding=0.02)
             first, last = _across(self._rig)
-            self.top.setRange(xRange=(left, right), yRange=(first, last), padding=0.08)
+            beyond = 15.0 * self._is_small  # for the words below the laser
+            across = {"xRange": (left, right + beyond), "yRange": (first, last)}
+            self.top.setRange(**across, padding=0.08)
             left, right = _near(self._view)
             self.near.setRange(xRange=(-left, right), yRange=(-0.4 * right, right), padding=0)
 
     def resizeEvent(self, event: QResizeEvent) -> None:
-        """Leave the enlarged view out where there is no room for it."""
+        """Leave out what there is no room for."""
         super().resizeEvent(event)
         self._arrange()
 
     def _arrange(self) -> None:
-        self.near.setVisible(self._view is not None and self.width() >= NARROW_PX)
+        """On a small canvas put the views side by side, the fields below them."""
+        is_drawn = self._view is not None
+        width, height = SMALL_PX
+        is_small = self.width() < width or self.height() < height
+        first, dot, _ = self._said.partition(". ")
+        self.say(first + dot.strip() if is_small and is_drawn else self._said, is_drawn)
+        self.words.setToolTip(plain_tip(self._said))
+        self.describe(self._said)
+        self.near.setVisible(is_drawn and not is_small and self.width() >= NARROW_PX)
+        self._strip.setVisible(is_drawn and is_small)
+        if is_small != self._is_small:
+            self._is_small = is_small
+            way = QBoxLayout.Direction
+            self._views.setDirection(way.LeftToRight if is_small else way.TopToBottom)
+            for plot in (self.whole, self.top):
+                for side in ("left", "bottom"):
+                    plot.showAxis(side, not is_small)
+            self._move_fields()
+            self._draw()
+            self.fit()
+
+    def _move_fields(self) -> None:
+        """Put the fields into the rows below the drawing, or on it."""
+        boxes = iter(self.boxes.values())
+        for count, row in zip(ROWS, self._rows, strict=True):
+            while row.count():
+                row.takeAt(0)
+            for box in itertools.islice(boxes, count):
+                if self._is_small:
+                    row.addWidget(box)
+                else:
+                    box.setParent(box.plot)
+                    box.show()
+            row.addStretch(1)
 
     def _place_fields(self) -> None:
-        """Put the fields at their dimensions, none over another."""
-        if self._rig is None or self._view is None:
+        """Put the fields at their dimensions, none over another, nor over what is drawn there."""
+        if self._rig is None or self._view is None or self._is_small:
             return
-        taken: dict[pg.PlotWidget, list[QRect]] = {}
+        taken = {plot: self.obstacles(plot) for plot in (self.whole, self.top)}
         for key, (_, place) in _dimensions(self._rig, self._view).items():
             box = self.boxes[key]
-            box.put_at(place, taken.setdefault(box.plot, []))
+            box.put_at(place, taken[box.plot])
+
+    def obstacles(self, plot: pg.PlotWidget) -> list[QRect]:
+        """Names on a plot, the torch and the laser: what no field is to lie on, in its pixels."""
+        items = [each for each in plot.items() if isinstance(each, pg.TextItem)]
+        found = [plot.mapFromScene(each.sceneBoundingRect()).boundingRect() for each in items]
+        if plot is self.whole and self._view is not None:
+            box = plot.getViewBox()
+            low = self._view.tip_mm - np.array([SHOULDER_MM, 0.0])
+            high = self._view.tip_mm + np.array([SHOULDER_MM, TORCH_MM])
+            corners = [box.mapViewToScene(QPointF(*each.tolist())) for each in (low, high)]
+            found.append(plot.mapFromScene(QRectF(*corners).normalized()).boundingRect())
+        return found
+
+    def _choose(self, plot: pg.PlotWidget, event: object) -> None:
+        """A click on the letter of a dimension leads to its field."""
+        if self._rig is None or self._view is None or not self._is_small:
+            return
+        box, at = plot.getViewBox(), event.scenePos()  # type: ignore[attr-defined]
+        for key, (_, place) in _dimensions(self._rig, self._view).items():
+            there = box.mapViewToScene(QPointF(*place.tolist()))
+            if self.boxes[key].plot is plot and (there - at).manhattanLength() < CLICK_PX:
+                self.boxes[key].field.editor.setFocus()
+                self.boxes[key].field.editor.selectAll()  # type: ignore[attr-defined]
 
     def take_colours(self) -> None:
         """Draw in the window's colours."""
@@ -152,9 +230,13 @@ class BenchView(Sketch):
         self._draw_from_above(self._rig, self._view)
         self._draw_labels(self._view)
         pen = pg.mkPen(self._faint(0.75), width=1.2)
-        for key, (line, _) in _dimensions(self._rig, self._view).items():
+        for key, (line, place) in _dimensions(self._rig, self._view).items():
             mark = {"symbol": "o", "symbolSize": 4, "symbolPen": pen, "symbolBrush": None}
             draw_line(self.boxes[key].plot, line, pen, **({} if len(line) > 2 else mark))
+            if self._is_small:
+                beside = place[0] > line[:, 0].max()
+                anchor = (0.0 if beside else 0.5, 0.5)
+                draw_text(self.boxes[key].plot, DRAWN[key], place, self._ink, anchor)
 
     def _draw_from_above(self, rig: Rig, view: SideView) -> None:
         """Plane, pool, torch and the edges of the fan, (y, x)."""
@@ -267,7 +349,7 @@ def _dimensions(rig: Rig, view: SideView) -> dict[str, tuple[FloatArray, FloatAr
         "imaging_plane.h_mm": ([[outside, 0.0], [outside, lower[1]]], [outside, -4.0]),
         "imaging_plane.height_mm": (
             [[outside, lower[1]], [outside, top_mm]],
-            [lower[0] + 8, lower[1] + 0.7 * (top_mm - lower[1])],
+            [lower[0] + 8, lower[1] + 0.3 * (top_mm - lower[1])],
         ),
         "imaging_plane.s_mm": ([[outside, 0.0], start - [3, 0]], [start[0] + 10, start[1] / 2]),
         "imaging_plane.width_mm": (corners + np.array([2.0, 0.0]), [end[0] + 10, end[1] * 0.7]),

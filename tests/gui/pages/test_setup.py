@@ -7,8 +7,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import numpy as np
+import pyqtgraph as pg
 import pytest
-from PySide6.QtCore import Qt
+from PySide6.QtCore import QPoint, QRect, Qt
+from PySide6.QtTest import QTest
 from pytestqt.qtbot import QtBot
 
 from labapp.config.setup import read_setup
@@ -286,15 +288,44 @@ def test_a_dimension_is_entered_in_the_drawing_which_follows(
     assert box.field.value() == value
 
 
-def test_no_field_of_the_drawing_lies_on_another(page: SetupPage) -> None:
+def test_no_field_of_the_drawing_lies_on_another_or_on_the_torch(page: SetupPage) -> None:
     for size in ((560, 400), (900, 640)):
         page.bench.resize(*size)
         let_draw()
         for plot in (page.bench.whole, page.bench.top):
             boxes = [each for each in page.bench.boxes.values() if each.plot is plot]
             assert all(plot.rect().contains(each.geometry()) for each in boxes)
-            pairs = itertools.combinations(boxes, 2)
-            assert not any(a.geometry().intersects(b.geometry()) for a, b in pairs)
+            lying = [*(each.geometry() for each in boxes), *page.bench.obstacles(plot)]
+            pairs = itertools.combinations(lying, 2)
+            drawn = set(map(id, lying[len(boxes) :]))
+            assert not any(
+                a.intersects(b) for a, b in pairs if not (id(a) in drawn and id(b) in drawn)
+            )
+
+
+def test_on_a_small_canvas_the_fields_are_below_the_drawing(qtbot: QtBot, page: SetupPage) -> None:
+    bench = page.bench
+    bench.resize(390, 300)
+    let_draw()
+    below = max(plot.geometry().bottom() for plot in (bench.whole, bench.top))
+    for box in bench.boxes.values():
+        place = QRect(box.mapTo(bench, QPoint()), box.size())
+        assert bench.rect().contains(place)
+        assert place.top() > below
+    letter = next(
+        each
+        for each in bench.top.items()
+        if isinstance(each, pg.TextItem) and each.toPlainText() == "s"
+    )
+    at = bench.top.mapFromScene(letter.sceneBoundingRect().center())
+    QTest.mouseClick(bench.top.viewport(), Qt.MouseButton.LeftButton, pos=at)
+    field = bench.boxes["imaging_plane.s_mm"].field
+    qtbot.waitUntil(lambda: page.window().focusWidget() is field.editor, timeout=20_000)
+    retype(qtbot, field, "44")
+    assert page.rig_fields["imaging_plane.s_mm"].value() == 44
+    bench.resize(900, 640)
+    let_draw()
+    assert all(box.parent() is box.plot and box.isVisible() for box in bench.boxes.values())
 
 
 def test_record_and_ticks_by_hand(qtbot: QtBot, page: SetupPage) -> None:
