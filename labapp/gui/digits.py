@@ -108,7 +108,15 @@ def round_factor(most: float) -> float:
     return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= most)
 
 
-UNITS = {"mm": "mm", "deg": "°", "px": "px", "pct": "%", "um per unit": "µm per mm or °"}
+UNITS = {
+    "mm": "mm",
+    "mm2": "mm²",
+    "mm3": "mm³",
+    "deg": "°",
+    "px": "px",
+    "pct": "%",
+    "um per unit": "µm per mm or °",
+}
 """How the name of a table's column ends, and the unit that it means."""
 
 

@@ -78,6 +78,29 @@ def test_two_modes_at_once_with_noise_and_lost_frames(rate_hz):
     assert not found[3].oscillations
 
 
+def test_no_mode_leaks_into_another_and_lost_frames_do_no_harm():
+    amplitude, pool = two_modes(np.random.default_rng(7))
+    series = series_of(pool, 200, rng=np.random.default_rng(8), lost=0.05)
+    for one, size, gamma in zip(bessel_modes(series), amplitude, (3.0, 4.0), strict=False):
+        at_first = size * math.exp(-gamma * series.time_s[0])
+        assert one.figures["amplitude_mm"][0] == pytest.approx(at_first, rel=1e-6)
+
+
+def test_an_amplitude_scatters_no_more_than_noise_makes_it():
+    """Its standard deviation is the Cramér-Rao bound, for white noise known to be so."""
+    rng, time, noise = np.random.default_rng(5), np.arange(200) / 200, 0.05
+    wave = np.exp((2j * np.pi * 61.8 - 4) * time)
+    found = [
+        abs(fit_oscillations(time, wave.real + noise * rng.normal(size=200), 1)[0].amplitude[0])
+        for _ in range(60)
+    ]
+    # Of amplitude, phase, frequency and decay, all at once; the trend costs next to nothing.
+    turned = np.column_stack([wave, 1j * wave, 1j * time * wave, time * wave]).real
+    bound = noise * np.sqrt(np.linalg.inv(turned.T @ turned)[0, 0])
+    assert np.std(found) == pytest.approx(bound, rel=0.3)  # 9 % standard deviation of 60
+    assert np.mean(found) == pytest.approx(1, abs=4 * bound / np.sqrt(60))
+
+
 @pytest.mark.slow
 def test_standard_uncertainties_cover_the_truth():
     rng, scores = np.random.default_rng(11), []

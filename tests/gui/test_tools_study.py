@@ -16,6 +16,7 @@ from labapp.gui.shell.window import MainWindow
 from labapp.gui.tools.study import StudyWindow
 from labapp.simulated.benchmark import SCENARIO
 from labapp.simulated.simulate import simulate
+from labapp.studies.tables import Table
 from tests.waiting import PATIENCE_S
 
 pytestmark = pytest.mark.slow
@@ -112,6 +113,21 @@ def test_a_stopped_run_keeps_what_is_done(study: StudyWindow, recordings: Path, 
     assert study.start_button.isEnabled()
     assert any(folder.glob("*.json"))
     assert "failed" not in [states(study)[name] for name in ("I80_1", "I100_1")]
+
+
+def test_means_fit_into_the_window(study: StudyWindow, qtbot: QtBot):
+    sizes = [f"{size}_mm" for size in ("width", "length", "height", "depth", "reach", "rise")]
+    columns = ("current_a", "gas", "Recordings", "Frames", *sizes)
+    row = ("80", "Ar", "5", "1000", *["6.12345 ± 0.00012"] * len(sizes))
+    study.resize(1120, 700)
+    study.tabs.setTabEnabled(2, True)
+    study.tabs.setCurrentWidget(study.means)
+    study.means.show_table(Table("summary", "Means", columns, (row,) * 8))
+    header = study.means.horizontalHeader()
+    qtbot.waitUntil(lambda: header.length() == study.means.viewport().width())
+    needed = study.means.fontMetrics().horizontalAdvance("± 0.00012")
+    assert min(map(header.sectionSize, range(len(columns)))) > needed
+    assert study.means.rowHeight(0) >= 2 * study.means.fontMetrics().height()
 
 
 def test_what_is_no_study_is_refused(study: StudyWindow, tmp_path: Path):

@@ -20,7 +20,7 @@ from labapp.gui.widgets.labels import show_words, wrapping_label
 from labapp.gui.widgets.layouts import vbox
 from labapp.gui.widgets.path_field import PathField
 from labapp.gui.widgets.sheet import Sheet
-from labapp.gui.widgets.tables import CellTable
+from labapp.gui.widgets.tables import CellTable, FittingTable
 from labapp.run.measurers import measuring_pool
 from labapp.run.study.page import condition_picture, varying_conditions
 from labapp.run.study.plan import StudyRecording, folder_pattern, write_study
@@ -121,7 +121,7 @@ class StudyWindow(ToolWindow):
     def _make_results(self) -> None:
         self.words = wrapping_label(NONE_YET)
         self.list = CellTable("Recordings of the study")
-        self.means = CellTable("Means of the study")
+        self.means = FittingTable("Means of the study")
         self.outliers = CellTable("Outliers")
         self.against = ChoiceField("Against", tooltip="The condition along the plots")
         self.against.edited.connect(lambda _: self._draw())

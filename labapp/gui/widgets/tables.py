@@ -22,6 +22,9 @@ if TYPE_CHECKING:
     from labapp.studies.tables import Table
 
 
+HEADER_MARGIN_PX = 8
+"""Above and below the two lines of a header, together."""
+
 RIGHT = Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter
 
 
@@ -153,6 +156,23 @@ class CellTable(ReadTable):
         """Put all of it on the clipboard as Markdown."""
         if self.table is not None:
             QGuiApplication.clipboard().setText(self.table.markdown())
+
+
+class FittingTable(CellTable):
+    """A table as wide as its place: where that is narrow, the ± of a value stands beneath it."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(name)
+        header = self.horizontalHeader()
+        header.setSectionResizeMode(QHeaderView.ResizeMode.Stretch)
+        header.setDefaultAlignment(Qt.AlignmentFlag.AlignCenter | Qt.TextFlag.TextWordWrap)
+        header.setMinimumSectionSize(header.fontMetrics().horizontalAdvance("± 0.00000"))
+        header.setFixedHeight(2 * header.fontMetrics().lineSpacing() + HEADER_MARGIN_PX)
+        self.verticalHeader().setSectionResizeMode(QHeaderView.ResizeMode.ResizeToContents)
+
+    def set_cell(self, row: int, column: int, text: str, *, number: bool, tip: str = "") -> None:
+        """Show a text in a cell; no line ends behind its ±."""
+        super().set_cell(row, column, text.replace("± ", "±\N{NO-BREAK SPACE}"), number=number)
 
 
 def table_text(table: QTableView) -> str:

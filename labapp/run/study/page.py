@@ -164,6 +164,10 @@ def _draw_row(
     kinds = _kinds(summary.groups, others)
     colours = dict(zip(dict.fromkeys(kinds), COLOURS, strict=False))
     for axis, size in zip(axes, SIZES, strict=True):
+        if all(group.means[size].mean == 0 for group in summary.groups):  # no course to be seen
+            axis.set_axis_off()
+            axis.text(0.5, 0.5, "0 everywhere", ha="center", transform=axis.transAxes)
+            continue
         for group, place, kind in zip(summary.groups, places, kinds, strict=True):
             each = [by_name[name].means[size].mean for name in group.recordings]
             _draw(axis, place, group.means[size], each, colours[kind])

@@ -111,6 +111,20 @@ def test_the_page_shows_text_as_text() -> None:
     assert "&lt;script&gt;" in page
 
 
+def test_a_size_that_is_0_everywhere_has_no_plot() -> None:
+    tables = [table(k) for k in range(2)]
+    pages = []
+    for depth_mm in (0.1, 0.0):
+        for one in tables:
+            one["depth_mm"] = np.full(len(one["frame"]), depth_mm)
+        both = [summary(f"r{k}", one, current=80.0 + k) for k, one in enumerate(tables)]
+        found = StudySummary(
+            "t", ("current",), tuple(both), group_recordings(["current"], both), ()
+        )
+        pages.append(summary_page(found, "today"))
+    assert ["0 everywhere" in page for page in pages] == [False, True]
+
+
 @pytest.mark.parametrize(
     ("value", "sigma", "expected"),
     [
