@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from labapp.simulation.target import Target, TargetLook, render_target
 
 from labapp.config.setup import parse_setup, read_setup, updated_setup
 from labapp.core.calibration.plane_calibration import calibrate_plane
@@ -23,7 +24,6 @@ from labapp.core.values import FloatArray
 from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.pools import egg
-from labapp.simulation.target import Target, TargetLook, render_target
 
 SIZED = [0, 1, 2, 4, 5]
 """All sizes of a convex pool but its depth."""
