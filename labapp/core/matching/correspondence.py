@@ -108,8 +108,8 @@ def match_rays(
         no absent ray or no hole can be the absent dot, ``ambiguous-rows`` if several can;
         ``ambiguous-orientation``; ``no-match`` if no surface explains the dots.
     RowsOpen
-        ``ambiguous-rows`` if several can for a set-up that is off within its uncertainty: other
-        frames of the recording may tell which.
+        ``ambiguous-rows`` if several can, perhaps with a set-up that is off within its uncertainty:
+        other frames of the recording may tell which.
     """
     if len(dots) < LEAST_LABELS:
         raise CannotMeasure(
@@ -138,7 +138,8 @@ def match_rays(
     match = match_of_hypothesis(observed, best, best.orientation(observed))
     if open_holes:
         raise RowsOpen(
-            "where the set-up may be a little off, several holes can be the absent centre dot",
+            "several holes in the rows can be the absent centre dot, perhaps with the set-up a "
+            "little off",
             tuple(_candidates(observed, match, open_holes)),
         )
     return match, best.pool.surface

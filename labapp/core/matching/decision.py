@@ -149,13 +149,14 @@ def decide(
     Returns
     -------
     best, open_holes
-        The hypothesis; and where a set-up within its uncertainty leaves open which hole is the
-        marker's, that hypothesis and its rivals (`holes_left_open`).
+        The hypothesis; and where several holes can be the marker's, perhaps with a set-up within
+        its uncertainty, that hypothesis and its rivals (`holes_left_open`).
 
     Raises
     ------
     CannotMeasure
-        ``no-match``, ``no-reference``, ``ambiguous-rows`` or ``ambiguous-orientation``.
+        ``no-match``, ``no-reference`` or ``ambiguous-orientation``; ``ambiguous-rows`` where there
+        is a dot in the only hole, or a part of the rows is open.
     """
     best, found, neighbours, fit = _cheapest(observed, found, settings.margin)
     cheapest = best  # compared with others before what is doubtful in it, as in them, is taken away
@@ -177,6 +178,7 @@ def decide(
             "no-reference", "the absent centre dot is not amid dots that have their ray"
         )
     doubtful: list[int] = []
+    rivals: list[Hypothesis] = []
     others = (
         reoriented_labels(observed, best.labels, own, way)
         for way in settings.orientations
@@ -194,12 +196,49 @@ def decide(
                 f"{own} and {other.orientation(observed)} explain the dots alike",
             )
         else:
-            raise CannotMeasure(
-                "ambiguous-rows", "several holes in the rows can be the absent centre dot"
-            )
+            rivals.append(other)
     best = _without(observed, best, doubtful, fit)
     best = supported(observed, best, fit)
-    return best, holes_left_open(observed, best, fit, settings.margin)
+    open_holes = holes_left_open(observed, best, fit, settings.margin)
+    return best, _with_rivals(open_holes, best, cheapest, rivals)
+
+
+def _with_rivals(
+    open_holes: list[FreeHypothesis],
+    best: Hypothesis,
+    cheapest: Hypothesis,
+    rivals: list[Hypothesis],
+) -> list[FreeHypothesis]:
+    """The holes left open, with those of rivals that are near with the set-up as it is entered.
+
+    Rivals cost so much more than the cheapest, which is the best before doubtful labels were taken
+    away. ``ambiguous-rows`` where one differs in a part of the rows alone.
+    """
+    if rivals and not open_holes:
+        open_holes = [FreeHypothesis(best.labels, cost=best.cost)]
+    for rival in rivals:
+        step = _step(best, rival)
+        if not any(step):
+            raise CannotMeasure("ambiguous-rows", "parts of the rows can be one on or not")
+        if step not in {each.step for each in open_holes}:
+            with_marker = rival.cost - cheapest.cost
+            without = rival.cost_without_marker - cheapest.cost_without_marker
+            cost = open_holes[0].cost + min(with_marker, without)
+            open_holes = [*open_holes, FreeHypothesis(rival.labels, step, cost, cost)]
+    return open_holes
+
+
+def _step(one: Hypothesis, other: Hypothesis) -> tuple[int, int]:
+    """Rows and columns by which most dots have their rays on in another hypothesis."""
+    count = max(one.labels.max(), other.labels.max()) + 1
+    at = np.full((2, count, 2), np.nan)
+    for place, labels in zip(at, (one.labels, other.labels), strict=True):
+        rays = np.argwhere(labels != UNLABELLED)
+        place[labels[tuple(rays.T)]] = rays
+    shared = np.isfinite(at).all(axis=(0, 2))
+    steps, many = np.unique((at[1] - at[0])[shared], axis=0, return_counts=True)
+    row, column = steps[np.argmax(many)]
+    return int(row), int(column)
 
 
 def supported(observed: Observation, best: Hypothesis, fit: FitSettings) -> Hypothesis:
