@@ -8,18 +8,22 @@ from collections.abc import Callable
 from labapp.core.bench_check.mirrors import FREE_MM, Ball, Cap, Mirror, Plate
 from labapp.errors import InputError
 
-FORMS = "plate:HEIGHT, cap:DIAMETER:HEIGHT, ball:DIAMETER or ball:DIAMETER:TOP (mm)"
+FORMS = (
+    "plate:HEIGHT or plate:HEIGHT:LEVEL (mm, degrees), cap:DIAMETER:HEIGHT, ball:DIAMETER or "
+    "ball:DIAMETER:TOP (mm)"
+)
 """How mirrors are written."""
 
 _LARGEST_MM = 1000.0
+_LARGEST_TILT_DEG = 10.0
 _SIZES = ("height_mm", "diameter_mm")
 
 
 def parse_mirror(text: str) -> Mirror:
     """Read a mirror.
 
-    Each number may have its standard uncertainty after ``+-`` or ``±``. The height of a plate may
-    be ``free``.
+    Each size may have its standard uncertainty after ``+-`` or ``±``. The height of a plate may
+    be ``free``; how level it lies is a standard uncertainty itself.
 
     Raises
     ------
@@ -29,6 +33,7 @@ def parse_mirror(text: str) -> Mirror:
     kind, *numbers = text.strip().split(":")
     makers: dict[tuple[str, int], Callable[..., Mirror]] = {
         ("plate", 1): _plate,
+        ("plate", 2): _plate,
         ("cap", 2): _cap,
         ("ball", 1): _ball,
         ("ball", 2): _ball,
@@ -48,6 +53,8 @@ def mirror_text(mirror: Mirror) -> str:
     sizes = [
         f"{value:.9g}+-{sigma:.9g}" for name, (value, sigma) in known.items() if name in _SIZES
     ]
+    if isinstance(mirror, Plate) and mirror.tilt_sigma_deg != Plate.tilt_sigma_deg:
+        sizes.insert(0, f"{mirror.tilt_sigma_deg:.9g}")
     return ":".join([type(mirror).__name__.lower(), *reversed(sizes)])
 
 
@@ -64,9 +71,14 @@ def _number(text: str) -> tuple[float, float | None]:
     return made
 
 
-def _plate(height: tuple[float, float | None]) -> Plate:
+def _plate(
+    height: tuple[float, float | None],
+    level: tuple[float, float | None] = (Plate.tilt_sigma_deg, None),
+) -> Plate:
+    if not 0 < level[0] <= _LARGEST_TILT_DEG or level[1] is not None:
+        raise ValueError
     value, sigma = height
-    return Plate(value) if sigma is None else Plate(value, sigma)
+    return Plate(value, Plate.height_sigma_mm if sigma is None else sigma, level[0])
 
 
 def _cap(diameter: tuple[float, float | None], height: tuple[float, float | None]) -> Cap:

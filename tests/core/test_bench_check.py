@@ -14,7 +14,7 @@ from labapp.config.mirror_text import mirror_text, parse_mirror
 from labapp.config.setup import checked_setup, parse_setup, unchecked_setup
 from labapp.core.bench_check.adjustment import adjust
 from labapp.core.bench_check.check import REASONS, BenchCheck, check_bench
-from labapp.core.bench_check.forecast import forecast
+from labapp.core.bench_check.forecast import blind_spots, forecast
 from labapp.core.bench_check.labelling import Picture, label_picture, sighting_of
 from labapp.core.bench_check.mirrors import Ball, Cap, Mirror, Plate, landing_points, placed
 from labapp.core.geometry.bench import Bench
@@ -23,12 +23,15 @@ from labapp.core.geometry.rig import DotPattern, Rig
 from labapp.core.geometry.uncertainty import INDEX, QUANTITIES
 from labapp.core.images.find_dots import DotSettings, find_mirror_dots
 from labapp.core.matching.observation import Observation
+from labapp.core.schemes import fit
+from labapp.core.surface.measures import measure_surface
+from labapp.core.surface.pool_fit import FitSettings
 from labapp.core.values import CannotMeasure
 from labapp.errors import InputError
 from labapp.simulation.benches import FOCAL_PX, BenchErrors, SimulatedBench, draw_bench
 from labapp.simulation.calibration.mirrors import BallMirror, FlatMirror
 from labapp.simulation.camera import CameraView
-from labapp.simulation.forward import PoolSurface, trace
+from labapp.simulation.forward import PoolSurface, exact_match, trace
 from labapp.simulation.pools import spherical_cap
 from labapp.simulation.render import Look, render
 from tests.scenes import as_dots
@@ -401,6 +404,8 @@ def test_pictures_are_forecast_to_help():
     [
         ("plate:0", Plate(0.0)),
         ("plate:2+-0.01", Plate(2.0, 0.01)),
+        ("plate:2:0.03", Plate(2.0, tilt_sigma_deg=0.03)),
+        ("plate:0+-0.01:0.05", Plate(0.0, 0.01, 0.05)),
         ("cap:9.75±0.05:0.91", Cap(9.75, 0.91, 0.05)),
         ("ball:10:1.2", Ball(10.0, 1.2)),
         ("ball:10", Ball(10.0)),
@@ -415,8 +420,45 @@ def test_mirrors_are_read(text: str, mirror: Mirror):
 
 
 @pytest.mark.parametrize(
-    "text", ["", "plate", "plate:nan", "cap:5:4", "ball:-1", "ball:10:30", "tack:1:2", "plate:1+-0"]
+    "text",
+    [
+        "",
+        "plate",
+        "plate:nan",
+        "cap:5:4",
+        "ball:-1",
+        "ball:10:30",
+        "tack:1:2",
+        "plate:1+-0",
+        "plate:0:0",
+        "plate:0:0.1+-0.1",
+        "plate:0:free",
+        "plate:0:20",
+    ],
 )
 def test_impossible_mirrors_are_refused(text: str):
     with pytest.raises(InputError):
         parse_mirror(text)
+
+
+@pytest.mark.slow
+def test_heights_whose_error_one_plate_cannot_notice_are_named():
+    """A plate half a millimetre too high is taken for a bench that is off; two plates are not."""
+    rng = np.random.default_rng(4)
+    right, high = (picture(Plate(), FlatMirror(z), EXACT, rng)[0] for z in (0.0, 0.5))
+    second = picture(Plate(2.0), FlatMirror(2.0), EXACT, rng)[0]
+    misled = check_bench([high], RIG, CALIBRATION)
+    assert misled.status == "ok"
+    pool = spherical_cap(6.7, 0.3)
+    match = exact_match(trace(pool, EXACT.rig), misled.rig)
+    seen = misled.calibration.to_plane(EXACT.view.to_image(match.plane_mm))
+    match = replace(match, plane_mm=seen)
+    found = measure_surface(fit.reconstruct(match, misled.rig, FitSettings()), match, misled.rig)
+    error = abs(found.height_mm - pool.peak_mm)
+    assert error > found.height_sigma_mm
+    (of_misled,), (of_right,) = map(blind_spots, (misled, check_bench([right], RIG, CALIBRATION)))
+    assert of_misled.picture == of_right.picture == right.name
+    assert 0.5 < of_misled.noticed_mm < 2.0
+    assert error < of_right.pool_mm < 3 * error
+    assert check_bench([high, second], RIG, CALIBRATION).status == "size-off"
+    assert blind_spots(check_bench([right, second], RIG, CALIBRATION)) == ()

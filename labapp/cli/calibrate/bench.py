@@ -30,8 +30,9 @@ def calibrate_bench(
         list[str] | None,
         typer.Option(
             help="What the picture at the same place shows: plate:HEIGHT, cap:DIAMETER:HEIGHT, "
-            "ball:DIAMETER:TOP (mm, above the work piece); each number may have its standard "
-            "uncertainty, as 2+-0.01. Repeat for more pictures."
+            "ball:DIAMETER:TOP (mm, above the work piece); each may have its standard uncertainty, "
+            "as 2+-0.01; plate:HEIGHT:LEVEL says how level it lies, ± degrees. Repeat for more "
+            "pictures."
         ),
     ] = None,
     free: Annotated[
@@ -130,7 +131,7 @@ def _print_forecast(rig: Rig, mirrors: list[Mirror]) -> None:
 
 
 def _print_check(check: BenchCheck) -> None:
-    from labapp.core.bench_check.forecast import EXPECTED, height_sigma
+    from labapp.core.bench_check.forecast import EXPECTED, blind_spots, height_sigma
     from labapp.core.values import CannotMeasure
 
     typer.echo(f"{'quantity':40} {'before':>10} {'±':>8} {'after':>10} {'±':>8}")
@@ -165,6 +166,12 @@ def _print_check(check: BenchCheck) -> None:
             f"± of the height of a pool like a {EXPECTED.name}: "
             f"{was.total_sigma_mm:.4f} → {now.total_sigma_mm:.4f} mm"
         )
+        for spot in blind_spots(check):
+            typer.echo(
+                f"not noticed: an error of the height in {spot.picture} below "
+                f"{spot.noticed_mm:.2g} mm; it puts that pool's height off by up to "
+                f"{spot.pool_mm:.2g} mm. Measure it, or add another mirror"
+            )
     if check.status != "ok":
         typer.echo(f"{check.status}: {check.reason}", err=True)
         for suspect in check.suspects:

@@ -115,8 +115,8 @@ class BenchCheck(ReadOnlyArrays):
         The set-up after it, with its uncertainty, which is marked as checked with ``ok``.
     pictures
         What became of each picture, in the order given.
-    adjustment
-        The adjustment itself.
+    sightings, adjustment
+        What was adjusted to, and the adjustment itself.
     """
 
     status: Status
@@ -129,6 +129,7 @@ class BenchCheck(ReadOnlyArrays):
     rig: Rig
     calibration: ImageCalibration
     pictures: tuple[CheckedPicture, ...]
+    sightings: tuple[Sighting, ...]
     adjustment: Adjustment
 
     @cached_property
@@ -226,6 +227,7 @@ def check_bench(
         rig=after,
         calibration=calibrated,
         pictures=checked,
+        sightings=tuple(sightings),
         adjustment=made,
     )
 

@@ -7,12 +7,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from labapp.core.bench_check.adjustment import Sighting, System
-from labapp.core.bench_check.mirrors import Cap, Mirror, Plate, landing_points, placed
+from labapp.core.bench_check.adjustment import MOST_STEPS, Sighting, System
+from labapp.core.bench_check.check import BenchCheck, adjusted_bench
+from labapp.core.bench_check.mirrors import Ball, Cap, Mirror, Plate, landing_points, placed
+from labapp.core.bench_check.suspects import released
 from labapp.core.geometry.optics import intersect_level, ray_directions
 from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match
 from labapp.core.schemes import fit
+from labapp.core.surface.measures import measure_surface
 from labapp.core.surface.pool_fit import FitSettings
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray
 
@@ -28,6 +31,10 @@ CANDIDATES: Mapping[str, tuple[Mirror, ...]] = {
     "thumb tack": (Cap(9.75, 0.91),),
     "plate at 0 mm, thumb tack": (Plate(0.0), Cap(9.75, 0.91)),
     "plate at 0 and 2 mm, thumb tack": (Plate(0.0), Plate(2.0), Cap(9.75, 0.91)),
+    "plate at 0 mm, level to ± 0.03°, thumb tack": (
+        Plate(0.0, tilt_sigma_deg=0.03),
+        Cap(9.75, 0.91),
+    ),
 }
 """Candidate sets of pictures."""
 
@@ -81,6 +88,74 @@ def height_sigma(rig: Rig, pool: Cap = EXPECTED) -> Forecast:
     return _of_height("as it is", rig, pool)
 
 
+@dataclass(frozen=True)
+class BlindSpot:
+    """A mirror's height whose error the pictures hardly contradict, mm.
+
+    Parameters
+    ----------
+    picture
+        Name of its picture.
+    noticed_mm
+        A smaller error of it is not noticed (`MeasuredSize.noticed_mm`).
+    pool_mm
+        By how much such an error puts the expected pool's height off.
+    """
+
+    picture: str
+    noticed_mm: float
+    pool_mm: float
+
+
+def blind_spots(check: BenchCheck, pool: Cap = EXPECTED) -> tuple[BlindSpot, ...]:
+    """Heights of mirrors whose unnoticed error exceeds the ± of the expected pool's height.
+
+    A height that is wrong beyond its own ± is in no result's. The check is repeated with it
+    (external reliability: Baarda 1968, A testing procedure for use in geodetic networks).
+
+    Raises
+    ------
+    CannotMeasure
+        If the pool cannot be measured with the adjusted set-up.
+    """
+    total, found = height_sigma(check.rig, pool).total_sigma_mm, []
+    for k, picture in enumerate(check.pictures):
+        noticed = next(one.noticed_mm for one in picture.sizes if one.name == "height")
+        off = max(abs(_misled(check, k, error, pool)) for error in (-noticed, noticed))
+        if off > total:
+            found.append(BlindSpot(picture.picture.name, noticed, off))
+    return tuple(found)
+
+
+def _misled(check: BenchCheck, k: int, error_mm: float, pool: Cap) -> float:
+    """By how much a wrong height of a mirror would put a pool's height off, mm."""
+    wrong = replace(check.sightings[k], mirror=_raised(check.sightings[k].mirror, error_mm))
+    sightings = [wrong if n == k else one for n, one in enumerate(check.sightings)]
+    system = System.of(check.before, sightings, released(check.before, check.free))
+    made, unknown = check.adjustment, check.adjustment.unknown.copy()
+    # The pose stays where it was found, and is that far from what is expected now.
+    at = system.parts[k + 1].start + wrong.mirror.parameters.index("height_mm")
+    unknown[at] -= error_mm / wrong.mirror.sigma[at - system.parts[k + 1].start]
+    again = system.adjustment(system.minimised(unknown, made.scale, MOST_STEPS), made.scale)
+    rig, calibration = adjusted_bench(check.before, again)
+    match = _expected_match(check.rig, pool)
+    seen = calibration.to_plane(check.calibration.to_image(match.plane_mm))
+    exact = [replace(one, uncertainty=None) for one in (check.rig, rig)]
+    right, found = (
+        measure_surface(fit.reconstruct(each, bench, FitSettings()), each, bench).height_mm
+        for each, bench in zip((match, replace(match, plane_mm=seen)), exact, strict=True)
+    )
+    return found - right
+
+
+def _raised(mirror: Mirror, by_mm: float) -> Mirror:
+    """The mirror, taken to be higher."""
+    if isinstance(mirror, Ball):
+        return replace(mirror, top_mm=float(mirror.pose[2]) + by_mm)
+    assert isinstance(mirror, Plate | Cap)
+    return replace(mirror, height_mm=mirror.height_mm + by_mm)
+
+
 def expected_sighting(mirror: Mirror, rig: Rig) -> Sighting | None:
     """The dots of a mirror in its expected pose that are expected on the plane; None: no dots."""
     mirror = placed(mirror, rig)
@@ -101,7 +176,8 @@ def _shown(mirror: Mirror, rig: Rig) -> tuple[FloatArray, BoolArray]:
     return plane, shown
 
 
-def _of_height(name: str, rig: Rig, pool: Cap) -> Forecast:
+def _expected_match(rig: Rig, pool: Cap) -> Match:
+    """The dots of a pool that are expected on the plane, with their rays."""
     plane, shown = _shown(pool, rig)
     ray = np.argwhere(shown) + 1
     ground = intersect_level(rig.laser.position_mm, ray_directions(rig.laser, rig.pattern))
@@ -109,7 +185,7 @@ def _of_height(name: str, rig: Rig, pool: Cap) -> Forecast:
     witness = np.where(shown, 1, np.where(outside, -1, 0))
     for i, j in rig.pattern.absent_rays:
         witness[i - 1, j - 1] = 0
-    match = Match(
+    return Match(
         orientation="S/S",
         dot=np.arange(len(ray)),
         ray=ray,
@@ -118,7 +194,10 @@ def _of_height(name: str, rig: Rig, pool: Cap) -> Forecast:
         plane_covariance_mm2=np.tile(DOT_MM**2 * np.eye(2), (len(ray), 1, 1)),
         witness=witness,
     )
-    made = fit.reconstruct(match, rig, FitSettings())
+
+
+def _of_height(name: str, rig: Rig, pool: Cap) -> Forecast:
+    made = fit.reconstruct(_expected_match(rig, pool), rig, FitSettings())
     height = 2
     setup, total = float(made.size_sigma_setup[height]), float(made.size_sigma[height])
     if not np.isfinite(total):

@@ -65,6 +65,11 @@ class MeasuredSize:
         return float((self.independent_mm - self.known_mm) / sigma)
 
     @property
+    def noticed_mm(self) -> float:
+        """Error of the known size from which on the dots contradict it, as a rule."""
+        return CONTRADICTED * float(np.hypot(self.independent_sigma_mm, self.known_sigma_mm))
+
+    @property
     def is_contradicted(self) -> bool:
         """Whether the dots contradict the known size."""
         return abs(self.deviation) > CONTRADICTED

@@ -83,6 +83,36 @@ def test_a_picture_shows_the_mirror_that_is_entered() -> None:
     assert not one.problem
 
 
+def test_how_well_a_mirror_is_known_is_entered() -> None:
+    one = Chosen("a", np.zeros((2, 2), np.uint8))
+    assert one.usual_height_sigma_mm == Plate.height_sigma_mm
+    known = replace(one, height_sigma_mm=0.005, level_sigma_deg=0.03)
+    assert known.mirror == Plate(0.0, 0.005, 0.03)
+    ball = replace(one.of_kind("ball"), height_sigma_mm=0.005)
+    assert ball.mirror == Ball(10.0, 10.0, top_sigma_mm=0.005)
+    assert known.of_kind("cap").mirror == Cap(9.75, 0.91)
+
+
+@pytest.mark.slow
+def test_how_well_a_mirror_is_known_is_kept(checked: Checked) -> None:
+    (picture,), (chosen,) = checked.record.pictures, checked.chosen
+    assert Chosen.of_kept(picture, chosen.image).mirror == chosen.mirror
+    assert chosen.is_of(picture)
+    assert chosen.is_of(replace(picture, pose_sigma=()))  # of a former version
+    level = replace(chosen, level_sigma_deg=0.03)
+    assert not level.is_of(picture)
+    sigma = tuple(zip(level.mirror.parameters, level.mirror.sigma.tolist(), strict=True))
+    assert Chosen.of_kept(replace(picture, pose_sigma=sigma), chosen.image).mirror == level.mirror
+
+
+@pytest.mark.slow
+def test_a_height_that_may_be_wrong_unnoticed_is_said_to_be(checked: Checked) -> None:
+    (spot,) = checked.blind
+    assert spot.picture == "plate.png"
+    assert f"{spot.noticed_mm:.2g} mm" in checked.words
+    assert spot.picture not in replace(checked, blind=()).words
+
+
 @pytest.mark.slow
 def test_the_check_finds_what_is_off_and_what_it_cannot_tell(checked: Checked) -> None:
     assert checked.usable

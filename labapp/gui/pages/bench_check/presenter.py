@@ -18,7 +18,14 @@ from labapp.core.bench_check.check import (
     CheckedPicture,
     check_bench,
 )
-from labapp.core.bench_check.forecast import CANDIDATES, EXPECTED, forecast, height_sigma
+from labapp.core.bench_check.forecast import (
+    CANDIDATES,
+    EXPECTED,
+    BlindSpot,
+    blind_spots,
+    forecast,
+    height_sigma,
+)
 from labapp.core.bench_check.labelling import Picture
 from labapp.core.bench_check.mirrors import Ball, Cap, Mirror, Plate
 from labapp.core.geometry.coordinates import ImageCalibration
@@ -63,15 +70,36 @@ class Chosen:
     height_mm: float = 0.0
     diameter_mm: float | None = None
     """The mirror in it, see `MirrorPicture`."""
+    height_sigma_mm: float | None = None
+    """Standard uncertainty of the height; None: the usual one."""
+    level_sigma_deg: float | None = None
+    """How level a plate lies; None: the usual one."""
 
     @property
-    def mirror(self) -> Mirror:
-        """The mirror."""
+    def usual_mirror(self) -> Plate | Cap | Ball:
+        """The mirror with usual uncertainties."""
         if self.kind == "plate" or self.diameter_mm is None:
             return Plate(self.height_mm)
         if self.kind == "cap":
             return Cap(self.diameter_mm, self.height_mm)
         return Ball(self.diameter_mm, self.height_mm)
+
+    @property
+    def usual_height_sigma_mm(self) -> float:
+        """Standard uncertainty of the height where none is entered, mm."""
+        usual = self.usual_mirror
+        return float(usual.sigma[usual.parameters.index("height_mm")])
+
+    @property
+    def mirror(self) -> Mirror:
+        """The mirror."""
+        usual, sigma, level = self.usual_mirror, self.height_sigma_mm, self.level_sigma_deg
+        if isinstance(usual, Ball):
+            return usual if sigma is None else replace(usual, top_sigma_mm=sigma)
+        known = usual if sigma is None else replace(usual, height_sigma_mm=sigma)
+        if isinstance(known, Plate) and level is not None:
+            return replace(known, tilt_sigma_deg=level)
+        return known
 
     @property
     def mirror_words(self) -> str:
@@ -89,16 +117,32 @@ class Chosen:
     def of_kind(self, kind: str) -> Chosen:
         """The same picture with the usual mirror of another kind."""
         height, diameter = USUAL[kind]
-        return replace(self, kind=kind, height_mm=height, diameter_mm=diameter)
+        return Chosen(self.name, self.image, kind, height, diameter)
+
+    @classmethod
+    def of_kept(cls, one: MirrorPicture, image: GreyImage) -> Chosen:
+        """A picture of a stored check."""
+        made = cls(one.name, image, one.kind, one.height_mm, one.diameter_mm)
+        usual = dict(zip(made.mirror.parameters, made.mirror.sigma.tolist(), strict=True))
+        own = {name: sigma for name, sigma in one.pose_sigma if sigma != usual.get(name)}
+        sigmas = own.get("height_mm"), own.get("tilt_x_deg")
+        return replace(made, height_sigma_mm=sigmas[0], level_sigma_deg=sigmas[1])
+
+    def is_of(self, one: MirrorPicture) -> bool:
+        """Whether a stored check has this picture with this mirror."""
+        return Chosen.of_kept(one, self.image)._key == self._key
+
+    @property
+    def _key(self) -> tuple[object, ...]:
+        sizes = self.height_mm, self.diameter_mm, self.height_sigma_mm, self.level_sigma_deg
+        return self.name, self.kind, *sizes
 
 
 def kept(session: Session) -> tuple[Chosen, ...]:
     """The pictures of the check that the session keeps."""
     found = session.bench_check
     return tuple(
-        Chosen(
-            one.name, session.picture(one.picture_sha256), one.kind, one.height_mm, one.diameter_mm
-        )
+        Chosen.of_kept(one, session.picture(one.picture_sha256))
         for one in (found.pictures if found else ())
     )
 
@@ -118,6 +162,8 @@ class Checked:
     """The check as a session stores it; its pictures are not stored yet."""
     height_sigma_mm: tuple[float, float] | None = None
     """± of the height of the expected pool before and after; None where it cannot be measured."""
+    blind: tuple[BlindSpot, ...] = ()
+    """Heights of mirrors whose error the pictures hardly contradict."""
 
     @property
     def words(self) -> str:
@@ -127,6 +173,12 @@ class Checked:
             if self.height_sigma_mm is not None:
                 before, after = self.height_sigma_mm
                 parts.append(f"Expected ± of the pool's height: {before:.2g} → {after:.2g} mm.")
+            parts += [
+                f"An error of the height in {one.picture} below {one.noticed_mm:.2g} mm is not "
+                f"noticed, and puts the pool's height off by up to {one.pool_mm:.2g} mm: add a "
+                "picture of another mirror, or make sure of it."
+                for one in self.blind
+            ]
             return " ".join((*parts, "Press Apply to use the adjusted set-up."))
         reason = f"▲ {_sentence(self.check.reason)}"
         if not self.check.suspects:
@@ -206,7 +258,7 @@ def check(
     values = {name: np.array([getattr(one, name) for one in changes]) for name in columns}
     keys = tuple(one.key for one in changes)
     record = BenchCheckRecord(now(), tuple(kept), keys, **values, free=tuple(free))
-    return Checked(tuple(chosen), text, found, record, _height_sigmas(found, pool))
+    return Checked(tuple(chosen), text, found, record, *_of_pool(found, pool))
 
 
 def check_sizes(session: Session, chosen: Sequence[Chosen]) -> None:
@@ -231,12 +283,16 @@ def check_sizes(session: Session, chosen: Sequence[Chosen]) -> None:
             )
 
 
-def _height_sigmas(found: BenchCheck, pool: Cap) -> tuple[float, float] | None:
+def _of_pool(
+    found: BenchCheck, pool: Cap
+) -> tuple[tuple[float, float] | None, tuple[BlindSpot, ...]]:
+    """± of the pool's height before and after, and what would not be noticed."""
     try:
         before, after = (height_sigma(rig, pool) for rig in (found.before, found.rig))
+        blind = blind_spots(found, pool) if found.status == "ok" else ()
     except CannotMeasure:
-        return None
-    return before.total_sigma_mm, after.total_sigma_mm
+        return None, ()
+    return (before.total_sigma_mm, after.total_sigma_mm), blind
 
 
 def _kept(
@@ -258,6 +314,7 @@ def _kept(
             (size.name, size.known_mm, size.measured_mm, size.sigma_mm) for size in checked.sizes
         ),
         tuple((size.independent_mm, size.independent_sigma_mm) for size in checked.sizes),
+        tuple(zip(one.mirror.parameters, one.mirror.sigma.tolist(), strict=True)),
     )
 
 

@@ -17,6 +17,7 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
+from labapp.core.bench_check.mirrors import Plate
 from labapp.gui.dialogs import ask_file
 from labapp.gui.pages.bench_check import presenter
 from labapp.gui.pages.bench_check.presenter import COLUMNS, KINDS, Checked, Chosen, Predicted
@@ -239,8 +240,8 @@ class BenchCheckPage(Page):
 
     def leave(self) -> None:
         """Finish the edit under way."""
-        self.height_field.flush()
-        self.diameter.flush()
+        for field in (self.height_field, self.diameter, self.height_sigma, self.level):
+            field.flush()
 
     # --- the panel ----------------------------------------------------------------------------
 
@@ -314,9 +315,38 @@ class BenchCheckPage(Page):
         self.height_field.edited.connect(
             lambda value: self.change(replace(self._selected(), height_mm=value))
         )
-        for field in (self.kind, self.diameter, self.height_field):
+        self.height_sigma = NumberField(
+            "Height ±",
+            "mm",
+            lowest=0.0001,
+            highest=100,
+            step=0.005,
+            decimals=4,
+            tooltip="Standard uncertainty of the height; empty: the usual one, in grey",
+        )
+        self.height_sigma.edited.connect(
+            lambda value: self.change(replace(self._selected(), height_sigma_mm=value))
+        )
+        self.level = NumberField(
+            "Level ±",
+            "°",
+            lowest=0.001,
+            highest=10,
+            step=0.01,
+            decimals=3,
+            tooltip="How level the plate lies on the work piece, either way, one standard "
+            "uncertainty; empty: the usual one, in grey. It limits what a check can do",
+        )
+        self.level.edited.connect(
+            lambda value: self.change(replace(self._selected(), level_sigma_deg=value))
+        )
+        for field in self._fields:
             form.add(field)
         return form
+
+    @property
+    def _fields(self) -> tuple[ChoiceField | NumberField, ...]:
+        return self.kind, self.diameter, self.height_field, self.height_sigma, self.level
 
     def _suspect_part(self) -> QWidget:
         tip = "Which quantity is off; those in the list explain the dots equally well"
@@ -344,11 +374,7 @@ class BenchCheckPage(Page):
         kept = self._kept
         if kept is None or len(kept.pictures) != len(self.chosen):
             return None
-        same = all(
-            (one.name, one.kind, one.height_mm, one.diameter_mm)
-            == (other.name, other.kind, other.height_mm, other.diameter_mm)
-            for one, other in zip(kept.pictures, self.chosen, strict=True)
-        )
+        same = all(other.is_of(one) for one, other in zip(kept.pictures, self.chosen, strict=True))
         return kept if same else None
 
     def _follow(self) -> None:
@@ -409,7 +435,7 @@ class BenchCheckPage(Page):
 
     def _show_mirror(self) -> None:
         one = self._selected() if self.chosen else None
-        for field in (self.kind, self.diameter, self.height_field):
+        for field in self._fields:
             field.lock(self.locked or ("" if one else "Add a picture first"))
         if one is None:
             return
@@ -417,8 +443,14 @@ class BenchCheckPage(Page):
         self.height_field.set_value(one.height_mm)
         self.height_field.set_problem(one.problem)
         self.diameter.set_value(one.diameter_mm)
+        self.height_sigma.set_value(one.height_sigma_mm)
+        self.height_sigma.set_placeholder(f"{one.usual_height_sigma_mm:g}")
+        self.level.set_value(one.level_sigma_deg)
+        self.level.set_placeholder(f"{Plate.tilt_sigma_deg:g}" if one.kind == "plate" else "")
         if one.kind == "plate":
             self.diameter.lock("A plate has no diameter")
+        else:
+            self.level.lock("A cap or ball has no level")
 
     def _show_picture(self, found: MirrorPicture | None) -> None:
         image = self._selected().image if self.chosen else None
