@@ -21,7 +21,7 @@ def go_to_part(parts: Sequence[QWidget], by: int) -> None:
 
 def give_keys(part: QWidget) -> bool:
     """Focus a part where it had the focus last, or its first widget; False if none can have it."""
-    # Not by nextInFocusChain: PySide takes its result for a child of the widget it is called on. The
+    # Not by nextInFocusChain: PySide takes its result for a child of the widget before it. The
     # window is last in the chain, and would be invalid once the label before it is deleted.
     inside = part.findChildren(QWidget)
     last: QWidget | None = part.focusWidget()  # None for a part that never had them
