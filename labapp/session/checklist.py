@@ -18,7 +18,7 @@ SAFETY: Items = (
     ),
     ("Laser goggles are worn", "By everybody in the room, for 685 nm."),
     ("Welding helmet is worn", "The arc is bright enough to hurt the eyes."),
-    ("Welding clothes are worn", "Metal splatters."),
+    ("Welding clothes are worn", "Against metal spatter."),
     ("Hands stay off the arc", "Arc, torch and work piece are very hot."),
     ("Water cooling is on", "Before the welding machine is switched on."),
     ("Shielding gas is on", "Before the welding machine is switched on."),

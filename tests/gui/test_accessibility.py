@@ -8,7 +8,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from PySide6.QtCore import Qt, QTimer
+from PySide6.QtCore import QCoreApplication, QEvent, Qt, QTimer
 from PySide6.QtGui import QAccessible
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import (
@@ -27,12 +27,14 @@ from PySide6.QtWidgets import (
     QMessageBox,
     QPlainTextEdit,
     QScrollArea,
+    QSpinBox,
     QTabBar,
     QTableWidget,
     QTextBrowser,
     QWidget,
 )
 from pytestqt.qtbot import QtBot
+from shiboken6 import isValid
 
 from labapp.gui import dialogs
 from labapp.gui.shell.actions import ACTIONS
@@ -392,6 +394,17 @@ FILL = {
     "adviser": fill_adviser,
     "analysis": fill_analysis,
 }
+
+
+def test_a_label_that_goes_takes_nothing_along_after_a_walk_through_the_parts(opened: MainWindow):
+    box, label = QSpinBox(opened), QLabel(opened)
+    line = box.lineEdit()
+    for _ in range(4):
+        opened.do("next_part")
+    label.deleteLater()
+    QCoreApplication.sendPostedEvents(None, QEvent.Type.DeferredDelete)
+    assert isValid(line)
+    assert isValid(opened.windowHandle())
 
 
 def test_the_question_whether_to_open_read_only(window: MainWindow, copy_sample: CopySample):

@@ -8,7 +8,7 @@ import pytest
 
 from labapp.config.setup import parse_setup
 from labapp.errors import InputError
-from labapp.gui.shell.steps import Mark, setup_to_do, states
+from labapp.gui.shell.steps import STEPS, Mark, setup_to_do, states
 from labapp.session.session import Session
 
 LASER = "[laser]\nprojection_angle_deg = 31.14\ndistance_mm = 31.48\n"
@@ -55,3 +55,15 @@ def test_a_new_session_has_nothing_entered(tmp_path: Path) -> None:
         == ("Not calibrated yet, and no values were entered")
     )
     assert setup_to_do(()) == ""
+
+
+def test_a_pattern_of_lines_gives_its_step_another_name(tmp_path: Path) -> None:
+    (dots,) = (step for step in STEPS if step.key == "dots")
+    assert dots.of(None).title == "Dots"
+    with Session.create(tmp_path / "new.labsession") as session:
+        assert dots.of(session) == dots
+        session.update_setup({"pattern": {"kind": "lines"}})
+        named = dots.of(session)
+        assert named.title == "Pattern"
+        assert "lines" in named.hint
+        assert all(step.of(session) == step for step in STEPS if step is not dots)

@@ -140,7 +140,7 @@ def test_the_set_up_page_leads_to_it(window: MainWindow, copy_sample: CopySample
     page = window.page
     assert isinstance(page, SetupPage)
     page.tabs.setCurrentIndex(2)
-    button = next(b for b in window.findChildren(QPushButton) if b.text() == "Advise …")
+    button = next(b for b in window.findChildren(QPushButton) if b.text() == "Advise…")
     click(button)
     tool = window.findChild(AdviserWindow)
     assert tool is not None

@@ -194,7 +194,7 @@ def _film(hands: Hands) -> None:
     hands.press("Stop the camera")
     hands.settle()
     hands.picture("second")
-    hands.asked("next-session", lambda: hands.press("New session from this recording …"))
+    hands.asked("next-session", lambda: hands.press("New session from this recording…"))
 
 
 def _look_on(hands: Hands, page: CapturePage) -> None:
@@ -244,7 +244,7 @@ def _surface(hands: Hands) -> None:
     page.parts["rays"].trigger()
     hands.picture("rays")
     page.parts["rays"].trigger()
-    hands.asked("save-picture", lambda: hands.press("Save …"))
+    hands.asked("save-picture", lambda: hands.press("Save…"))
     hands.asked("save-copy", lambda: hands.do("copy"))
 
 
@@ -284,20 +284,20 @@ def _trends(hands: Hands, files: Path) -> None:
     hands.picture("spectrum")
     hands.choose("Spectrum of", "none")
     table = files / "current.csv"
-    hands.asked("signals", lambda: hands.press("Read a table …"), give(table))
+    hands.asked("signals", lambda: hands.press("Read a table…"), give(table))
     hands.picture("signals")
     tool = _tool(hands, "dynamics", DynamicsWindow)
     hands.wait(lambda: tool.drawn and not tool.working, "the pool over time to be analysed")
     tool.tabs.setCurrentIndex(1)
     hands.picture("dialog-dynamics")
-    hands.asked("save-dynamics", lambda: hands.press("Save the results …"))
+    hands.asked("save-dynamics", lambda: hands.press("Save the results…"))
     tool.close()
 
 
 def _export(hands: Hands, files: Path) -> None:
     hands.do("step_export")
     hands.picture("before")
-    hands.asked("where-to", lambda: hands.press("Choose a folder …"), give(files))
+    hands.asked("where-to", lambda: hands.press("Choose folder…"), give(files))
     hands.choose("Frames", "the frame in view")
     hands.press("Export")
     hands.picture("after")
@@ -320,8 +320,8 @@ def _simulator(hands: Hands) -> None:
     hands.do("step_setup")
     tool = _tool(hands, "simulator", SimulatorWindow)
     hands.wait(lambda: tool.preview, "the first frame of a scenario")
-    hands.asked("scenario", lambda: hands.press("Load scenario …"))
-    hands.asked("simulation-folder", lambda: hands.press("Choose a folder …"))
+    hands.asked("scenario", lambda: hands.press("Load scenario…"))
+    hands.asked("simulation-folder", lambda: hands.press("Choose folder…"))
     hands.enter("Frames", "2")
     hands.press("Simulate")
     hands.wait(lambda: tool.made, "the simulation to be written")
@@ -364,7 +364,7 @@ def _analysis(hands: Hands) -> None:
     hands.press("Run")
     hands.wait(lambda: tool.files and not tool.working, "the thumb tack to be worked out")
     hands.picture("dialog-analysis")
-    hands.asked("save-results", lambda: hands.press("Save the results …"))
+    hands.asked("save-results", lambda: hands.press("Save the results…"))
     tool.close()
 
 

@@ -36,7 +36,7 @@ ACKNOWLEDGE_PX = 40
 
 Look = Literal["plain", "alarm", "old"]
 
-FIRST = "Measuring the first frame: this takes some seconds …"
+FIRST = "Measuring the first frame: this takes some seconds…"
 NO_SETUP = "Sizes are shown here, too, once the set-up is complete (steps 1 to 3)"
 
 
@@ -98,7 +98,7 @@ def standing_text(stands: Standing, limits: Limits, name: str) -> str:
     return {
         "": "",
         "unknown": "? not known",
-        "in order": "✓ in order",
+        "in order": "✓ within limits",
         "in doubt": "◆ at its limit",
     }[stands]
 

@@ -50,7 +50,7 @@ LIGHT_S = 1.0
 IDLE_S = 0.005
 
 STATES = {
-    "opening": ("○", "Opening the camera …"),
+    "opening": ("○", "Opening the camera…"),
     "running": ("●", "Live"),
     "stalled": ("▲", "No frames arrive, though it is connected: missing frames are not recorded"),
     "lost": ("▲", "Not connected: it is tried again and again. What was recorded is kept"),

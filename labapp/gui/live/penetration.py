@@ -36,7 +36,7 @@ class LivePenetration(QWidget):
             "Choose a model that labapp penetration fit wrote; it predicts from the live pool",
             self.choose,
         )
-        self.none_button = button("No model", "Predict no more", lambda: self.set_model(None))
+        self.none_button = button("No model", "Stop predicting", lambda: self.set_model(None))
         self.words = Message(2)
         vbox(hbox(self.choose_button, self.none_button), self.words, of=self)
         self.set_model(None)

@@ -54,7 +54,7 @@ class PlanFields(QObject):
             lowest=1,
             highest=10_000,
             decimals=0,
-            tooltip="1: every frame is recorded; 2: every second one …",
+            tooltip="1: every frame is recorded; 2: every second one…",
         )
         self.every.set_value(1)
         self.codec = ChoiceField(

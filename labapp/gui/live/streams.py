@@ -158,7 +158,7 @@ def stream_text(stream: Stream | None, at_work: bool, problem: str) -> str:
     if problem:
         return f"⚠ {problem}"
     if stream is None:
-        return "○ One moment …" if at_work else "○ Off"
+        return "○ One moment…" if at_work else "○ Off"
     listen = "program listens" if stream.listeners == 1 else "programs listen"
     message = pluralize(stream.sent, "frame")
     where = f"{stream.address} (every address of this machine)" * (ANY in stream.address)

@@ -35,7 +35,7 @@ ROOM_PX = 40
 
 RULE = (
     f"An alarm is raised when a size is beyond its limit by more than 2 σ, twice its ± "
-    f"({SIGMA_OF}), or when so many frames in a row cannot be measured. For a hollow pool, height "
+    f"({SIGMA_OF}), or when so many frames in a row cannot be measured. For a concave pool, height "
     "is its depth, which is negative."
 )
 
@@ -98,8 +98,8 @@ class LiveTrends(QWidget):
                 decimals=3,
                 step=0.1,
                 optional=True,
-                tooltip=f"{'Lowest' if end == 0 else 'Highest'} {name} that is in order; empty: "
-                f"there is no limit. {RULE}",
+                tooltip=f"{'Lowest' if end == 0 else 'Highest'} {name} allowed; empty: no limit. "
+                f"{RULE}",
             )
             for name in NAMES
             for end in (0, 1)

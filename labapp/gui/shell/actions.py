@@ -171,7 +171,7 @@ FRAMES = (
     ),
     Action(
         "previous",
-        "Frame &before",
+        "Previo&us frame",
         "Left",
         "Go to the frame before this one",
         needs="frames",
@@ -304,7 +304,7 @@ VIEW = (
     ),
     Action(
         "previous_part",
-        "Part of the window &before",
+        "Previo&us part of the window",
         "Shift+F6",
         "Move the keyboard focus to the part of the window before this one",
     ),

@@ -21,11 +21,12 @@ def go_to_part(parts: Sequence[QWidget], by: int) -> None:
 
 def give_keys(part: QWidget) -> bool:
     """Focus a part where it had the focus last, or its first widget; False if none can have it."""
-    chain = [part]
-    while (following := chain[-1].nextInFocusChain()) not in (None, part):
-        chain.append(following)
+    # Not by nextInFocusChain: PySide takes its result for a child of the widget before it. The
+    # window is last in the chain, and would be invalid once the label before it is deleted.
+    inside = part.findChildren(QWidget)
     last: QWidget | None = part.focusWidget()  # None for a part that never had them
-    found = next((each for each in (last, *chain) if each and takes_keys(each, part)), None)
+    candidates = (last, part, *inside)
+    found = next((each for each in candidates if each and takes_keys(each, part)), None)
     if found is not None:
         found.setFocus(Qt.FocusReason.TabFocusReason)
     return found is not None

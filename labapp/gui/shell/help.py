@@ -32,8 +32,8 @@ SIZES_PX = {"guide": (900, 700), "keys": (720, 600), "about": (520, 300)}
 TITLES = {"guide": "Guide", "keys": "Keys", "about": "About labapp"}
 
 INTRODUCTION = """
-<p>The steps at the left lead from the bench to the results. Take them from the top; a mark shows
-how far each is, and the pointer on it why: ○ to do, ▶ ready, ✓ done, ▲ needs attention. You may go
+<p>The steps at the left lead from the bench to the results. Begin at the top. A mark shows how far
+each step is; point at it to see why: ○ to do, ▶ ready, ✓ done, ▲ needs attention. You may go
 back at any time.</p>
 <p>Everything is saved as you do it: there is no Save. Every change of set-up, calibration,
 settings, dots and rows can be undone (Ctrl+Z), also after the session was closed.</p>

@@ -152,7 +152,7 @@ class StatusLine(QWidget):
         task = active[0]
         stopping = task.control.cancelled.is_set()
         others = f" (and {len(active) - 1} more)" if len(active) > 1 else ""
-        self.title.setText(f"{task.title}{', stopping …' if stopping else ''}{others}")
+        self.title.setText(f"{task.title}{', stopping…' if stopping else ''}{others}")
         self.bar.setRange(0, task.total)
         self.bar.setValue(task.done)
         self.cancel_button.setEnabled(not all(each.control.cancelled.is_set() for each in active))

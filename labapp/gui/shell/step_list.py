@@ -88,7 +88,7 @@ class StepList(FollowsTheme, QListWidget):
     def __init__(self, steps: Sequence[Step]) -> None:
         super().__init__()
         self._states: Mapping[str, State] = {}
-        self._steps = tuple(steps)
+        self._steps: tuple[Step, ...] = ()
         self.setAccessibleName("Steps")
         self.setToolTip("The steps from the bench to the results: ↑ and ↓ choose one")
         self.setFrameShape(QFrame.Shape.NoFrame)
@@ -96,10 +96,11 @@ class StepList(FollowsTheme, QListWidget):
         self.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
         self.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Expanding)
         self.setSpacing(1)
-        for number, step in enumerate(self._steps, 1):
-            item = QListWidgetItem(f"{number}  {step.title}")
+        for _ in steps:
+            item = QListWidgetItem()
             item.setSizeHint(QSize(0, self.fontMetrics().height() + 14))
             self.addItem(item)
+        self.show_titles(steps)
         self.setMinimumWidth(self.sizeHint().width())
         self.currentRowChanged.connect(self._told)
         self.follow_theme()
@@ -109,6 +110,12 @@ class StepList(FollowsTheme, QListWidget):
         metrics = self.fontMetrics()
         texts = [metrics.horizontalAdvance(self.item(row).text()) for row in range(self.count())]
         return QSize(max([60, *texts]) + ICON_PX + 36, 200)
+
+    def show_titles(self, steps: Sequence[Step]) -> None:
+        """Show the same steps, as they are called in the session."""
+        self._steps = tuple(steps)
+        for row, step in enumerate(self._steps):
+            self.item(row).setText(f"{row + 1}  {step.title}")
 
     def show_states(self, states: Mapping[str, State]) -> None:
         """Show how far every step is."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import Enum
 from typing import TYPE_CHECKING, Any
 
@@ -301,13 +301,22 @@ class Step:
     """What it shows as soon as it has something to show, a sentence."""
     needs_results: bool = False
     """Whether it shows nothing before a frame is measured."""
+    lines: tuple[str, str, str] = ("", "", "")
+    """Title, hint and what it shows where the pattern is one of lines; empty: no others."""
+
+    def of(self, session: Session | None) -> Step:
+        """The step as it is called in a session."""
+        if session is None or not self.lines[0] or not session.has_lines:
+            return self
+        title, hint, shows = self.lines
+        return replace(self, title=title, hint=hint, shows=shows)
 
 
 STEPS = (
     Step(
         "setup",
         "Set-up",
-        "Note the experiment, go through the safety list, and enter what is bolted to the bench. "
+        "Note the experiment, go through the safety list, and enter the dimensions of the bench. "
         "The drawing shows which rays come back.",
         "SetupPage",
         _setup,
@@ -353,16 +362,22 @@ STEPS = (
     Step(
         "dots",
         "Dots",
-        "Check the dots and their rows. Where the program is in doubt it says so: correct what "
-        "is wrong, and go on to the next frame.",
+        "Check the dots and their rows. Dots in doubt are marked: correct what is wrong, and go on "
+        "to the next frame.",
         "DotsPage",
         _dots,
         shows="The dots of each frame, numbered by row and column.",
+        lines=(
+            "Pattern",
+            "Check the lines and their numbers. Cut, join, number or delete what is wrong, and go "
+            "on to the next frame.",
+            "The lines of each frame, numbered from the lowest up.",
+        ),
     ),
     Step(
         "surface",
         "Surface",
-        "Measure the frames and look at the surface. The residuals tell whether to trust it.",
+        "Measure the frames and look at the surface. The residuals show whether to trust it.",
         "SurfacePage",
         _surface,
         shows="The surface of the pool in 3-D, its width, length and height with their ±.",

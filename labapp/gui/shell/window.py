@@ -232,7 +232,7 @@ class MainWindow(QMainWindow):
             self._leave()
             self.page = page
             listed = self.step_list.hasFocus()
-            step = next(step for step in STEPS if step.key == key)
+            step = next(step for step in STEPS if step.key == key).of(self.workspace.session)
             page.setAccessibleName(step.title)
             self.side_panel.show_panel(page.panel, step)
             self.show_answer("")
@@ -356,6 +356,10 @@ class MainWindow(QMainWindow):
         self.timeline.set_frame(self.workspace.frame)
         self._states = self.workspace.run_or_report(lambda: states(session, seen)) or states(None)
         own = {key: page.state(self._states[key]) for key, page in self.pages.items()}
+        steps = [step.of(session) for step in self._steps]
+        self.step_list.show_titles(steps)
+        for step in steps:
+            self.menus.actions[f"step_{step.key}"].setText(step.title)
         self.step_list.show_states(self._states | own)
 
     def _show_measured(self) -> None:
@@ -379,7 +383,7 @@ class MainWindow(QMainWindow):
         page, session = self.page, self.workspace.session
         if page is None or session is None:
             return
-        step = next(step for step in STEPS if step.key == page.key)
+        step = next(step for step in STEPS if step.key == page.key).of(session)
         measuring = self.workspace.measuring is not None
 
         def find() -> Lead | None:

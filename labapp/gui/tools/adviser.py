@@ -36,7 +36,14 @@ RANGES = (
     ("bench.h_mm", "Plane, h", "mm", -500, 500, 1, "How high O′ can be"),
 )
 NUMBERS = (
-    ("pools.shift_mm", "Off the electrode", 0, 5, 0.1, "How far a pool's middle is off it at most"),
+    (
+        "pools.shift_mm",
+        "Offset from electrode",
+        0,
+        5,
+        0.1,
+        "How far a pool's middle is off it at most",
+    ),
     ("bench.width_mm", "Plane's width", 10, 1000, 1, "Along O′X′"),
     ("bench.height_mm", "Plane's height", 10, 1000, 1, "Along O′Z′"),
     ("bench.edge_mm", "Edge", 0, 50, 0.5, "How far dots stay within the plane's edges"),
@@ -60,7 +67,7 @@ class AdviserWindow(ToolWindow):
         self._make_form()
         self._make_results()
         self.add_save_button(
-            "Save the advice …", "Write words, tables, picture and set-up file to a folder"
+            "Save the advice…", "Write words, tables, picture and set-up file to a folder"
         )
         self.use_button = self.add_button(
             "Apply",

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 SIZES = (
     ("width", "Width", 1.0, 30.0, 0.1, "Of the expected pool, along X"),
     ("length", "Length", 1.0, 30.0, 0.1, "Of the expected pool, along Y"),
-    ("height", "Height", -30.0, 30.0, 0.01, "Of the expected pool; below 0 for a hollow"),
+    ("height", "Height", -30.0, 30.0, 0.01, "Of the expected pool; negative for a concave one"),
 )
 
 
@@ -53,7 +53,7 @@ class AnalysisWindow(ToolWindow):
         self._make_form()
         self._make_results()
         self.add_save_button(
-            "Save the results …", "Write all tables (CSV, Markdown) and pictures to a folder"
+            "Save the results…", "Write all tables (CSV, Markdown) and pictures to a folder"
         )
         self.start_button = self.add_button(
             "Run", "Compute what is ticked; each part is shown when it is done", self.start

@@ -50,9 +50,7 @@ class DynamicsWindow(ToolWindow):
         self.workspace.opened.connect(self._forget)
         self._make_form()
         self._make_results()
-        self.add_save_button(
-            "Save the results …", "Write all tables (CSV) and pictures to a folder"
-        )
+        self.add_save_button("Save the results…", "Write all tables (CSV) and pictures to a folder")
         self.start_button = self.add_button(
             "Analyse", "Find oscillations, modes, events and responses", self.start
         )

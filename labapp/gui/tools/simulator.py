@@ -89,12 +89,12 @@ class SimulatorWindow(ToolWindow):
         self.form.add(self.scenario)
         self.form.add_wide(self.words)
         self.add_to_form(
-            "Load scenario …", "Load a scenario of your own (TOML)", self.choose_scenario
+            "Load scenario…", "Load a scenario of your own (TOML)", self.choose_scenario
         )
         for field in (self.frames, self.seed, self.folder):
             self.form.add(field)
         self.add_to_form(
-            "Choose a folder …", "The simulation goes into a new one in it", self.choose_folder
+            "Choose folder…", "The simulation goes into a new one in it", self.choose_folder
         )
         self.form.add_heading("First frame")
         self.form.add_wide(self.table)
@@ -138,7 +138,7 @@ class SimulatorWindow(ToolWindow):
     def choose_folder(self) -> None:
         """Ask where the simulation goes."""
         start = Path(self.folder.value()).parent
-        if folder := ask_folder(self, "Put the simulation in", start):
+        if folder := ask_folder(self, "Folder for the simulation", start):
             self._propose(folder)
 
     def _propose(self, parent: Path) -> None:

@@ -174,7 +174,7 @@ class ToolWindow(QDialog):
 
         if self.working:
             return
-        self.say(f"{title} …")
+        self.say(f"{title}…")
         self._pressed = self.focusWidget()
         self._task = self.tasks.start(title, behind, done, part)
         if self.focusWidget() is not self._pressed:
@@ -188,7 +188,7 @@ class ToolWindow(QDialog):
 
     def choose_folder(self) -> None:
         """Ask where to write what was found."""
-        title = f"{self.save_button.text().removesuffix(' …')} in"
+        title = f"{self.save_button.text().removesuffix('…')} in"
         if folder := ask_folder(self, title, self.workspace.folder):
             self.save(folder)
 
@@ -227,7 +227,7 @@ class ToolWindow(QDialog):
         stopping = task.control.cancelled.is_set()
         if active:
             stage = "stopping" if stopping else task.control.stage
-            self.say(f"{task.title}: {stage} …" if stage else f"{task.title} …")
+            self.say(f"{task.title}: {stage}…" if stage else f"{task.title}…")
             self.bar.setRange(0, task.total)
             self.bar.setValue(task.done)
         else:

@@ -44,7 +44,7 @@ class Chart(Plotted):
         self.plot.scene().sigMouseMoved.connect(self._moved_to)
         self.add_menu(
             ("Copy picture", self.copy_picture),
-            ("Save picture …", save_plot(self, self.plot, "chart")),
+            ("Save picture…", save_plot(self, self.plot, "chart")),
             ("Show all", self.plot.autoRange),
         )
 

@@ -211,8 +211,8 @@ class PictureView(Drawn):
         menu.addSeparator()
         for words, work in (
             ("Copy picture", lambda: QGuiApplication.clipboard().setImage(self.grab_picture())),
-            ("Save picture …", lambda: save_picture(self, self.grab_picture())),
-            ("Histogram and line profile …", self.show_levels),
+            ("Save picture…", lambda: save_picture(self, self.grab_picture())),
+            ("Histogram and line profile…", self.show_levels),
             ("Fit", self.fit),
         ):
             menu.addAction(words).triggered.connect(lambda *_, do=work: do())

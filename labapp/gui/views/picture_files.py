@@ -53,7 +53,7 @@ class PaperDialog(QDialog):
             field.set_value(value)
             field.edited.connect(lambda _: self._take())
             form.add(field)
-        save = button("Save as …", "Choose the file; its extension sets the format", self.accept)
+        save = button("Save as…", "Choose the file; its extension sets the format", self.accept)
         save.setDefault(True)
         cancel = button("Cancel", "Save nothing (Esc)", self.reject)
         vbox(form, self.size_words, hbox(1, cancel, save), of=self).setContentsMargins(

@@ -85,7 +85,7 @@ class PlotStack(Plotted):
         scene.sigMouseMoved.connect(self._moved)
         self.add_menu(
             ("Copy picture", self.copy_picture),
-            ("Save picture …", save_plot(self, self.canvas, "trends")),
+            ("Save picture…", save_plot(self, self.canvas, "trends")),
             ("Copy values as table", self.copy_table),
             ("Show all", self.fit),
         )

@@ -105,8 +105,8 @@ class View3d(Drawn):
         works: tuple[tuple[str, str, str, Callable[[], object]], ...] = (
             ("Copy picture", "Ctrl+C", "Copy the 3-D picture to the clipboard", self.copy_picture),
             ("Copy point", "P", "Copy X, Y, Z ± of the point that was read off", self.copy_point),
-            ("Forget point", "Esc", "Take the mark of the point away", self.forget_point),
-            ("Look at all of it", "F", "Bring all into view from the side chosen last", self.fit),
+            ("Clear point", "Esc", "Remove the mark of the point", self.forget_point),
+            ("Show all", "F", "Bring all into view from the side chosen last", self.fit),
         )
         for words, key, tip, work in works:
             action = QAction(words, self)
@@ -219,7 +219,7 @@ class View3d(Drawn):
         self._refresh()
 
     def forget_point(self) -> None:
-        """Take the mark of the point away."""
+        """Remove the mark of the point."""
         self._point_mm = None
         self._mark()
         self._refresh()
@@ -364,7 +364,7 @@ class View3d(Drawn):
         menu.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
         menu.setToolTipsVisible(True)
         for action in self.actions():
-            if action.text() in ("Copy point", "Forget point"):
+            if action.text() in ("Copy point", "Clear point"):
                 action.setEnabled(bool(self.read_off))
         menu.addActions(self.actions())
         menu.addSeparator()

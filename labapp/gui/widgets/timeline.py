@@ -84,7 +84,7 @@ class Timeline(FollowsTheme, QWidget):
         row = hbox()
         for name, tip, icon, go in (
             ("First frame", "Go to the first frame (Home)", style.SP_MediaSkipBackward, -(10**9)),
-            ("Frame before", "Go to the frame before (←)", style.SP_MediaSeekBackward, -1),
+            ("Previous frame", "Go to the frame before (←)", style.SP_MediaSeekBackward, -1),
             (None, None, None, 0),
             ("Next frame", "Go to the next frame (→)", style.SP_MediaSeekForward, 1),
             ("Last frame", "Go to the last frame (End)", style.SP_MediaSkipForward, 10**9),

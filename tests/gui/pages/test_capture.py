@@ -267,7 +267,7 @@ def test_a_second_recording_goes_into_a_session_of_its_own(
     assert not page.chosen.import_button.isEnabled()
     second = tmp_path / "second.labsession"
     hand.answer(second)
-    hand.button("New session from this recording …")
+    hand.button("New session from this recording…")
     qtbot.waitUntil(lambda: window.workspace.session is not former)
     session = window.workspace.session
     assert session.path == second

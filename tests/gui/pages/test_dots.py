@@ -578,8 +578,8 @@ def test_figures_before_and_after() -> None:
         "MRE": "– → 0.500",
         "Height": "– → 0.250 ± 0.006",
     }
-    waiting = {row.name: row.value for row in presenter.compared(after, after, "fitting …")}
-    assert waiting["ARE"] == "0.123 → fitting …"
+    waiting = {row.name: row.value for row in presenter.compared(after, after, "fitting…")}
+    assert waiting["ARE"] == "0.123 → fitting…"
     assert presenter.compared(None, after)[0].value == "ok"
 
 

@@ -353,7 +353,7 @@ def test_start_record_and_import_by_mouse_and_keys(
     # It goes into a session of its own, with this one's set-up.
     second = session.path.with_name("second.labsession")
     hand.answer(second)
-    hand.button("New session from this recording …")
+    hand.button("New session from this recording…")
     qtbot.waitUntil(lambda: window.workspace.session.path == second)
     qtbot.waitUntil(lambda: window.workspace.session.recording is not None)
     assert len(window.workspace.session.frames) > 5
@@ -575,7 +575,7 @@ def test_recordings_made_besides_are_listed_when_the_session_is_opened_again(
     assert page.kept.isVisible()
     assert page.kept.choice.editor.count() == 1
     assert page.kept.choice.value() == str(live.takes[0].path)
-    hand.button("Look at it")
+    hand.button("Preview")
     qtbot.waitUntil(lambda: page.preview is not None)
     hand.button("Import")
     session = window.workspace.session

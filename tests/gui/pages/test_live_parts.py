@@ -83,7 +83,7 @@ def test_figures_tell_how_they_stand_and_never_in_order_where_that_is_not_known(
     shown = figures(live_result(), limits)
     assert [(f.value, f.sigma, f.told, f.look) for f in shown] == [
         ("6.700", "± 0.030", "▲ above 6.6", "alarm"),
-        ("7.500", "± 0.040", "✓ in order", "plain"),
+        ("7.500", "± 0.040", "✓ within limits", "plain"),
         ("0.300", "± 0.003", "◆ at its limit", "plain"),
     ]
     for unknown in (
@@ -274,7 +274,7 @@ def test_a_limit_that_is_passed_is_seen_said_recorded_and_acknowledged(
     session = window.workspace.session
     hand.enter(view.canvas.trends.fields["width", 1], "6.9")
     assert session.limits == Limits(width_mm=(None, 6.9))
-    qtbot.waitUntil(lambda: figure(page, 0, 0).text() == "Width\n✓ in order")
+    qtbot.waitUntil(lambda: figure(page, 0, 0).text() == "Width\n✓ within limits")
     assert not view.canvas.alarms.isVisible()
     Prepared.found = replace(OK, measures=replace(MEASURES, width_mm=7.1))
     qtbot.waitUntil(view.canvas.alarms.isVisible)
@@ -390,7 +390,7 @@ def test_what_is_old_does_not_look_as_if_it_were_seen_now(
     start(page, qtbot)
     choose(page, "Surface")
     qtbot.waitUntil(lambda: shown.view.scene is not None)
-    qtbot.waitUntil(lambda: figure(page, 0, 0).text() == "Width\n✓ in order")
+    qtbot.waitUntil(lambda: figure(page, 0, 0).text() == "Width\n✓ within limits")
     Prepared.gate.clear()  # a frame that takes long
     try:
         qtbot.waitUntil(lambda: figure(page, 0, 0).text() == "Width\n? not known")
@@ -399,7 +399,7 @@ def test_what_is_old_does_not_look_as_if_it_were_seen_now(
     finally:
         Prepared.gate.set()
     qtbot.waitUntil(lambda: shown.view.scene is not None)
-    qtbot.waitUntil(lambda: figure(page, 0, 0).text() == "Width\n✓ in order")
+    qtbot.waitUntil(lambda: figure(page, 0, 0).text() == "Width\n✓ within limits")
 
 
 def test_control_software_is_told_while_a_camera_is_watched(

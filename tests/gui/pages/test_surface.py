@@ -353,7 +353,7 @@ def test_a_chart_shows_the_values_under_the_pointer_and_is_saved(
     box = chart.plot.getViewBox()
     chart.plot.scene().sigMouseMoved.emit(box.mapViewToScene(QPointF(-1.5, 0.1)))
     assert chart._at.text() == "−1.5, 0.1 mm"
-    assert {"Copy picture", "Save picture …", "Show all"} <= {a.text() for a in chart.actions()}
+    assert {"Copy picture", "Save picture…", "Show all"} <= {a.text() for a in chart.actions()}
     dark = chart.palette()
     for name in ("chart.svg", "chart.png", "chart.tif"):
         assert write_plot(tmp_path / name, chart, chart.plot, Paper(80, 150))

@@ -25,7 +25,7 @@ NONE_YET = "No foot switch is in use. Plug one in, press Learn a pedal, and step
 LINES = 5
 """Of the commands."""
 
-LISTENING = "Step on the pedal that is to be used …"
+LISTENING = "Step on the pedal that is to be used…"
 
 
 class FootSwitchPanel(Group):

@@ -21,7 +21,7 @@ MEASURED = (
     "recording needs its own session."
 )
 
-NEXT = "New session from this recording …"
+NEXT = "New session from this recording…"
 NEXT_TIP = "Make a session with the same set-up and calibration, and import it there"
 
 
@@ -61,7 +61,7 @@ class ImportChoice(Group):
         form = FieldForm()
         self.first = whole("First frame", 0, "The first frame to use, counted from 0")
         self.last = whole("Last frame", 0, "The last frame to use")
-        self.every = whole("Every n-th", 1, "1: every frame; 2: every second one …")
+        self.every = whole("Every n-th", 1, "1: every frame; 2: every second one…")
         self.rate = NumberField(
             "Frame rate",
             "frames/s",

@@ -26,7 +26,7 @@ class KeptRecordings(Group):
         self.choice = ChoiceField("Beside the session", tooltip="Recordings not in the session")
         form.add(self.choice)
         see = button(
-            "Look at it",
+            "Preview",
             "Show its frames, and choose which of them to import",
             lambda: look(Path(self.choice.value())),
         )

@@ -156,7 +156,7 @@ class CapturePage(Page):
             self.exposure.hide()
         else:
             self._drop_preview()
-            self._show_seen(Seen(f"Live: {live.name}", None, None, "Opening the camera …"))
+            self._show_seen(Seen(f"Live: {live.name}", None, None, "Opening the camera…"))
         self.refresh()
         self.workspace.changed.emit()
 

@@ -185,7 +185,7 @@ def needs_fit(seen: DotsState) -> bool:
 def sentence(seen: DotsState) -> str:
     """What is seen, in a sentence or two."""
     if seen.correction is None:
-        return "Looking for the dots …"
+        return "Looking for the dots…"
     lattice, dots = seen.correction.lattice, seen.correction.dots
     doubtful = int((~seen.correction.sited).sum())
     rows = len(set(lattice.row[lattice.row > 0].tolist()))

@@ -184,7 +184,7 @@ class DotsPage(Page):
         self.view.describe(sentence)
         figures = presenter.figures(seen.result)
         stands = seen.result is not None and not seen.result.stale
-        pending = "fitting …" if self.refit.pending else "" if stands else "–"
+        pending = "fitting…" if self.refit.pending else "" if stands else "–"
         why = seen.why or recording_gone(session)
         dots = seen.correction
         if seen.why and dots is not None and dots.lattice.reference is None:
@@ -417,7 +417,7 @@ class DotsPage(Page):
         return (
             Command("Carry on", "Ctrl+Return", "Apply these dots and rows to the following frames "
                     "by tracking, until they no longer fit", self._carry_on, "rows"),
-            Command("Back to automatic", "Ctrl+Backspace", "Forget the corrections of this frame",
+            Command("Back to automatic", "Ctrl+Backspace", "Discard the corrections of this frame",
                     self._automatic, "corrected"),
         )  # fmt: skip
 
@@ -426,12 +426,12 @@ class DotsPage(Page):
         return (
             Command("Choose all", "Ctrl+A", "Choose every dot",
                     lambda: self.choose(editor.choose_all)),
-            Command("Choose none", "Esc", "Choose no dot, or give up a drag", self._escape),
+            Command("Choose none", "Esc", "Choose no dot, or cancel a drag", self._escape),
             Command("Choose in doubt", "D", "Choose the dots in doubt",
                     lambda: self.choose(editor.choose_doubtful)),
             Command("Next dot", ".", "Choose the next dot along the row",
                     lambda: self.choose(editor.choose_next, 1)),
-            Command("Dot before", ",", "Choose the dot before it",
+            Command("Previous dot", ",", "Choose the dot before it",
                     lambda: self.choose(editor.choose_next, -1)),
             Command("Whole row", "W", "Choose all dots in the rows of the chosen ones",
                     lambda: self.choose(editor.choose_rows, editor.rows)),

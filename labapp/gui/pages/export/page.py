@@ -141,9 +141,7 @@ class ExportPage(Page):
         again = len(made.again) > 0 and not self.workspace.session.read_only
         self.again_button.setVisible(again)
         self.again_button.setEnabled(again and not measuring)
-        self.again_button.setText(
-            "Being measured …" if measuring else f"Measure {len(made.again)} now"
-        )
+        self.again_button.setText("Measuring…" if measuring else f"Measure {len(made.again)} now")
         self.open_button.setEnabled(self.written is not None)
 
     def _session_opened(self) -> None:
@@ -176,7 +174,7 @@ class ExportPage(Page):
     def choose_folder(self) -> None:
         """Ask for a folder; where it holds something else, a new one in it is taken."""
         here = Path(self.folder.value() or proposed_folder(self.session))
-        if folder := ask_folder(self, "Where to", here.parent):
+        if folder := ask_folder(self, "Export folder", here.parent):
             self.folder.set_value(str(folder_within(folder, self.session)))
 
     def measure_again(self) -> None:
@@ -291,7 +289,7 @@ class ExportPage(Page):
             "Folder",
             tooltip="Where to: a new or empty folder, or an earlier export, which is replaced",
         )
-        choose = button("Choose a folder …", "Choose where to write", self.choose_folder)
+        choose = button("Choose folder…", "Choose where to write", self.choose_folder)
         self.notes = wrapping_label()
         self.again_button = button(
             "Measure now",

@@ -69,7 +69,7 @@ def groups() -> tuple[tuple[str, tuple[Item, ...]], ...]:
         (
             "Tables (CSV)",
             (
-                Item("tables:measures", "Measures", "A row a frame: width, length, height, ARE …"),
+                Item("tables:measures", "Measures", "A row a frame: width, length, height, ARE…"),
                 Item("tables:dots", "Dots", "A row a dot: its place, row, column and ray"),
                 Item("tables:points", "Points", "A row a reflection point, with its residual"),
                 Item("tables:boundary", "Boundary", "The pool's boundary, point by point"),
@@ -81,7 +81,7 @@ def groups() -> tuple[tuple[str, tuple[Item, ...]], ...]:
                 *_formats("surfaces", SURFACE_FORMATS),
                 Item(
                     "solid",
-                    "also as solids",
+                    "Also as solids",
                     "Each surface as a watertight body, mesh formats only",
                 ),
             ),

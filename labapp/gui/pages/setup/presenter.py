@@ -192,7 +192,7 @@ EXPERIMENT = (
     Entry("travel_speed_mm_s", "Travel speed", "mm/s", "Of the torch", 0, 1000, 0.1, 2),
     Entry("gas", "Shielding gas", tooltip="Which gas"),
     Entry("gas_flow_l_min", "Gas flow", "l/min", "Of the shielding gas", 0, 1000, 0.5, 1),
-    Entry("notes", "Notes", tooltip="Anything else worth keeping; Ctrl+Enter keeps it"),
+    Entry("notes", "Notes", tooltip="Anything else worth noting; Ctrl+Enter saves it"),
 )  # fmt: skip
 
 
@@ -424,7 +424,7 @@ def put_usual(session: Session) -> None:
             if values[entry.key] is None and wanted:
                 section, _, name = entry.key.partition(".")
                 missing.setdefault(section, {})[name] = entry.usual
-    session.update_setup(missing, "usual values")
+    session.update_setup(missing, "defaults")
 
 
 def note(session: Session, name: str, value: str | float | None) -> None:

@@ -250,7 +250,7 @@ class SetupPage(Page):
             self._add_noted(form, entry)
         form.add_wide(
             button(
-                "Advise …",
+                "Advise…",
                 "Where laser and plane should stand for such pools (Ctrl+Shift+A)",
                 lambda: self.workspace.action_requested.emit("adviser"),
             )

@@ -78,7 +78,7 @@ class CompareView(QWidget):
         if wanted == self._shown_for:
             return
         self._shown_for, self._options = wanted, options
-        self.words.setText("Computing …")
+        self.words.setText("Computing…")
         if self._task is not None:
             self._task.cancel()
 

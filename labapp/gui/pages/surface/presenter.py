@@ -180,7 +180,7 @@ def _state(result: Result) -> tuple[Literal["measured", "stale", "failed"], str]
     if measurement.status == "profile":
         words = (
             "A profile only: the lines leave a direction of the surface open, so that no height "
-            "is given. What the lines show is in step Dots."
+            "is given. What the lines show is in step Pattern."
         )
     elif measurement.lines is not None and not failed:
         words = "Measured between the lines; nothing is known of the pool beyond them."

@@ -215,13 +215,13 @@ class SurfacePage(Page):
         self.true_scale.setCheckable(True)
         self.true_scale.setAccessibleName("True scale")
         self.save = _tool(
-            "Save …",
+            "Save…",
             "Save the 3-D picture at its size on paper: PNG, TIFF or JPEG (Ctrl+Shift+P)",
             self.save_picture,
         )
         self.save.setShortcut(QKeySequence("Ctrl+Shift+P"))
         what = "Write a film (MP4) of all frames, seen as the 3-D view is now"
-        self.film = _tool("Film …", what, self.save_film)
+        self.film = _tool("Film…", what, self.save_film)
         what = "Put two schemes side by side, or show one again"
         self.comparing = _tool("Compare", what, self._toggle_compare, _Toggle())
         self.comparing.setCheckable(True)
@@ -238,8 +238,8 @@ class SurfacePage(Page):
     def _view_actions(self) -> None:
         """Add what this page does with the 3-D view to the view's own menu."""
         for words, key, work in (
-            ("Save picture …", "", self.save_picture),
-            ("Film of the recording …", "", self.save_film),
+            ("Save picture…", "", self.save_picture),
+            ("Film of the recording…", "", self.save_film),
             ("True scale, or exaggerated", "E", self.toggle_scale),
             ("Contour lines", "C", lambda: self._set(contours=not self.options.contours)),
         ):
@@ -364,7 +364,7 @@ class SurfacePage(Page):
         boundary = None if reconstruction is None else reconstruction.boundary
         lines = result is not None and result.measurement.lines is not None
         edge = "edge of what the lines show" if lines else "boundary"
-        without = "Reflected lines are in step Dots" if lines else "No reflected dots to compare"
+        without = "Reflected lines are in step Pattern" if lines else "No reflected dots to compare"
 
         def show_charts() -> None:
             self.dots.show_dots(dots, without)

@@ -230,7 +230,7 @@ class TrendsPage(Page):
         self.spectrum_words = Message(2)
         of = hbox(self.of.label, (self.of, 1))
         more = button(
-            "Pool over time …",
+            "Pool over time…",
             "Spectrogram, modes, changes and step responses, in a window of their own",
             lambda: self.workspace.action_requested.emit("dynamics"),
         )
@@ -249,7 +249,7 @@ class TrendsPage(Page):
         )
         self.start.edited.connect(self._start_at)
         self.read_button = button(
-            "Read a table …",
+            "Read a table…",
             "Read current, voltage, wire feed from a table (CSV, TDMS); keep them in the session",
             self.choose_signals,
         )
