@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from labapp.config.setup import parse_setup
-from tests.benchmarks import rendered
+from tests.benchmarks import clutter_recordings, rendered
 from tests.benchmarks.clutter import draw, set_up_off
 from tests.benchmarks.dips import Answer, answer
 
@@ -59,6 +59,24 @@ def test_holes_that_a_set_up_within_its_uncertainty_leaves_open_are_not_answered
 ) -> None:
     """With the set-up taken for exact, every label was a row or a column off."""
     assert answered_with_set_up_off(kind, seed).status == "ambiguous-rows"
+
+
+@pytest.mark.slow
+def test_frames_of_a_recording_decide_rows_that_one_leaves_open() -> None:
+    """With the set-up off by chance, the same in all frames; a dot beside the marker is missing."""
+    clutter = clutter_recordings.Clutter(beside=0.6)
+    alone, together = clutter_recordings.outcomes("concave", 50000, 6, clutter, 1.0)
+    assert "ambiguous-rows" in alone
+    assert "wrong-rows" not in together
+    assert together.count("ok") > alone.count("ok")
+
+
+@pytest.mark.slow
+def test_a_pool_that_jumps_by_a_rays_spacing_carries_no_wrong_rows_on() -> None:
+    clutter = clutter_recordings.Clutter(beside=0.8, jump=3)
+    alone, together = clutter_recordings.outcomes("concave", 50001, 6, clutter, 0.0)
+    assert "ambiguous-rows" in alone[3:]
+    assert "wrong-rows" not in together
 
 
 @pytest.mark.slow
