@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from labapp.simulation.target import Target, TargetLook, render_target
 
 from labapp.config.setup import parse_setup, read_setup, updated_setup
 from labapp.core.calibration.plane_calibration import calibrate_plane
@@ -21,6 +20,7 @@ from labapp.core.surface.setup_uncertainty import residual_changes, setup_change
 from labapp.core.surface.sizes import sizes_and_gradients
 from labapp.core.surface.solver import REUSE_MM, normal_factor
 from labapp.core.values import FloatArray
+from labapp.simulation.calibration.target import Target, TargetLook, render_target
 from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.pools import egg
