@@ -63,6 +63,7 @@ CANDIDATES: dict[str, tuple[Mirror, ...]] = {
     "plate": (Plate(0.0),),
     "plate, two heights": (Plate(0.0), Plate(2.0)),
     "plate and cap": (Plate(0.0), Cap(9.75, 0.91)),
+    "level plate, cap": (Plate(0.0, tilt_sigma_deg=0.03), Cap(9.75, 0.91)),
 }
 
 

@@ -7,6 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from labapp.core.bench_check.adjustment import System
+from labapp.core.bench_check.forecast import expected_sighting
+from labapp.core.bench_check.mirrors import Cap, Plate
+from labapp.core.geometry.perturbation import directions, moved_calibration, moved_rig
 from labapp.core.geometry.rig import ImagingPlane
 from labapp.core.geometry.uncertainty import (
     QUANTITIES,
@@ -81,6 +85,54 @@ def test_error_that_is_not_off_by_more_than_known_is_not_doubted():
     plane = BENCH_RIG.imaging_plane
     rolled = ImagingPlane.of_angles(plane.origin_mm, (0, 0, 0.4), plane.width_mm, plane.height_mm)
     assert not verdict_of(frames(replace(BENCH_RIG, imaging_plane=rolled))).is_doubtful
+
+
+@pytest.fixture(scope="module")
+def checked():
+    """The bench as it is known after a check with a plate and a thumb tack."""
+    sightings = [expected_sighting(mirror, RIG) for mirror in (Plate(0.0), Cap(9.75, 0.91))]
+    system = System.of(RIG, sightings, None)
+    covariance = system.adjustment(np.zeros(system.size), 1.0).covariance
+    return replace(RIG, uncertainty=replace(KNOWN, covariance=covariance))
+
+
+WRONG = {
+    "laser.projection_angle_deg": 0.7,
+    "laser.distance_mm": 1.0,
+    "laser.azimuth_deg": 0.05,
+    "laser.aim_x_mm": 0.05,
+    "laser.aim_y_mm": 0.5,
+    "pattern.inter_beam_angle_deg": 0.01,
+    "pattern.rotation_deg": 0.1,
+    "imaging_plane.distance_mm": 0.5,
+    "imaging_plane.s_mm": 0.05,
+    "imaging_plane.h_mm": 0.5,
+    "imaging_plane.yaw_deg": 0.4,
+    "imaging_plane.roll_deg": 0.5,
+    "camera_lens.distortion_percent": 1.3,
+    "picture.u": 0.25,
+    "picture.v": 2.5,
+    "picture.scale": 0.1,
+}
+"""How far quantities are off that are found on a checked bench, twice what the table of
+`docs/method.md` has or a little more, in their units."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("key", WRONG)
+def test_every_quantity_that_is_off_is_named_on_a_checked_bench(key, checked):
+    one = next(one for one in directions(RIG) if one.key == key)
+    offset = WRONG[key] * one.vector
+    camera = moved_calibration(KNOWN.axes, RIG.imaging_plane, offset)
+
+    def seen(plane_mm):
+        return BENCH_VIEW.to_plane(camera.to_image(plane_mm))
+
+    found = verdict_of(frames(moved_rig(BENCH_RIG, offset), lens=seen), checked)
+    assert found.is_doubtful
+    own = next(suspect for suspect in found.suspects if suspect.name == one.name)
+    assert not own.is_drift
+    assert abs(own.off - WRONG[key]) < 4 * own.sigma
 
 
 def test_lens_that_looks_beside_the_plane_s_middle_is_no_doubt():

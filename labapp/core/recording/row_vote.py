@@ -90,7 +90,7 @@ class RowVote:
         self._before: Placed | None = None
         """The last frame that was answered."""
         self._undecided: list[Ballot] = []
-        """Open frames since the last one with a surface."""
+        """Open frames since the last one with a surface that are not judged yet."""
         self._decided: Counter[tuple[int, int]] = Counter()
         """How many open frames have candidates with rows so far off the first."""
         self._lost: dict[tuple[int, int], dict[tuple[int, int], float]] = {}
@@ -130,6 +130,7 @@ class RowVote:
         """
         measured, at = ballot.measured, ballot.at
         if isinstance(measured, OpenMeasurement):
+            self._undecided = [each for each in self._undecided if each is not ballot]
             return self._decide(measured, ballot.after)
         if at is None:
             return measured
@@ -154,8 +155,10 @@ class RowVote:
         """
         beside = [one for one in (self._before, after) if one is not None]
         places = {at for _, at in beside}
+        if len(places) != 1:
+            return measured.refused
         index = self._alike(measured.candidates, [surface for surface, _ in beside])
-        if len(places) != 1 or index is None:
+        if index is None:
             return measured.refused
         (at,) = places
         chosen, margin = measured.candidates[index], self._settings.match.margin

@@ -395,7 +395,10 @@ def quantity_rows(record: BenchCheckRecord) -> tuple[QuantityRow, ...]:
             DETERMINED if determined else NOT_DETERMINED,
         )
         rows.append(QuantityRow(_sentence(group, ""), texts, determined))
-    return tuple(rows)
+    groups = list(
+        dict.fromkeys(row.group for row in rows)
+    )  # quantities that came later join theirs
+    return tuple(sorted(rows, key=lambda row: groups.index(row.group)))
 
 
 MIRROR_COLUMNS = ("True, mm", "Adjusted", "Without it")

@@ -279,9 +279,9 @@ class BenchCheckPage(Page):
         fill(
             self.panel_layout,
             *(hbox((self.add_button, 1), self.remove_button), self.list, self._mirror_form()),
-            *(hbox((self.check_button, 1), (self.use_button, 1)), self.answer, self.predict_button),
+            *(hbox((self.check_button, 1), (self.use_button, 1)), self.answer),
             *(self.words, self._suspect_part(), self.mirrors_words, self.mirrors),
-            *(self.predicted_words, self.predicted, 1),
+            *(self.predict_button, self.predicted_words, self.predicted, 1),
         )
         self.lock_with_session(self.add_button)
         self._show_predicted(None)
