@@ -34,9 +34,12 @@ ALIKE = 2.5
 GAP_SHARE = 0.1
 """A gap is longer where the pool spreads the line: by so much of the length of what it parts."""
 
-WITHIN = 0.25
-"""An upright chain below another is not part of it where it is farther in than so much of its
-extent: that is the folded line beside an arch, not one of the arch's legs."""
+WITHIN, INSET_PX = 0.25, 2.0
+"""An upright or short chain below another is not part of it where its middle is farther in than so
+much of its extent, or all of it so many pixels: that is a folded line below an arch, and no leg."""
+
+BRIEF = 0.3
+"""Cosine of the largest turn at a short chain's end where it follows on a longer one."""
 
 
 def join_chains(
@@ -124,7 +127,10 @@ def _join(ridges: Ridges, chains: list[IntArray], gap_px: float, turn_deg: float
         behind = np.vecdot(-step, out[None]) / length
     least = np.cos(np.radians(turn_deg))
     near = length < 3.0
-    fits = ((ahead > least) & (behind > least)) | near & (np.vecdot(out[:, None], out[None]) < 0)
+    # A short chain has no direction of its own to rely on: that of a longer one decides.
+    brief = np.repeat([len(chain) < WHISKER_PX for chain in chains], 2)
+    fine_ahead = (ahead > least) | (brief[:, None] & ~brief & (ahead > BRIEF))
+    fits = fine_ahead & fine_ahead.T | near & (np.vecdot(out[:, None], out[None]) < 0)
     bright = np.repeat([np.median(ridges.strength[chain]) for chain in chains], 2)
     fits &= np.abs(np.log(bright[:, None] / bright)) < np.log(ALIKE)
     trimmed = np.repeat([END_WIDTHS * spread_of(ridges, chain) for chain in chains], 2)
@@ -134,7 +140,8 @@ def _join(ridges: Ridges, chains: list[IntArray], gap_px: float, turn_deg: float
     folded = np.repeat([is_upright(ridges.image_px[chain]) for chain in chains], 2)
     short = np.repeat([len(chain) < SHORT_PX for chain in chains], 2)
     steep = np.abs(step[..., 0]) < np.abs(step[..., 1])
-    inside = np.repeat(np.repeat(_inside(ridges, chains), 2, axis=0), 2, axis=1) & folded[:, None]
+    inside = np.repeat(np.repeat(_inside(ridges, chains), 2, axis=0), 2, axis=1)
+    inside &= (folded | short)[:, None]
     fits &= ~(folded[:, None] & folded | steep & short[:, None] & short | inside | inside.T)
     one, other = np.nonzero(np.triu(fits, 1))
     cost = length[one, other] * (3.0 - ahead[one, other] - behind[one, other])
@@ -151,12 +158,14 @@ def _join(ridges: Ridges, chains: list[IntArray], gap_px: float, turn_deg: float
 
 
 def _inside(ridges: Ridges, chains: list[IntArray]) -> BoolArray:
-    """Whether the middle of each chain is well within the columns of each other, shape (k, k)."""
+    """Whether each chain, or its middle, is well within the columns of each other, shape (k, k)."""
     columns = [ridges.image_px[chain, 0] for chain in chains]
     middle = np.array([each.mean() for each in columns])
     low, high = np.array([[each.min(), each.max()] for each in columns]).T
     room = WITHIN * (high - low)
-    return np.asarray((middle[:, None] > low + room) & (middle[:, None] < high - room))
+    amid = (middle[:, None] > low + room) & (middle[:, None] < high - room)
+    within = (low[:, None] > low + INSET_PX) & (high[:, None] < high - INSET_PX)
+    return np.asarray(amid | within)
 
 
 def _chain_ends(ridges: Ridges, chains: list[IntArray]) -> tuple[FloatArray, FloatArray]:

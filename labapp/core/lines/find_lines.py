@@ -13,6 +13,7 @@ import numpy as np
 
 from labapp.core.images.dots import Grey, Image
 from labapp.core.lines.chains import LEAST_FOLDED, is_upright, join_chains, spread_of
+from labapp.core.lines.gathered import gathered_spots
 from labapp.core.lines.ridges import Ridges, RidgeSettings, find_ridges
 from labapp.core.lines.smooth_path import SmoothPath
 from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
@@ -42,6 +43,10 @@ SPOT_WIDTHS = 6.0
 SPECK_WIDTHS, SPECK_LIGHT = 2.0, 0.15
 """What comes so many of its widths near to a line, and has no more than this share of its light in
 all, is part of that line's side."""
+
+GATHERED_WIDTHS, GATHERED_LIGHT = 8.0, 0.15
+"""All lines with this share of the brightest one's light lie within so many of their widths across:
+the pool gathers them to spots."""
 
 GLOW_ROUNDS = 5
 """Of the fit of the light under the lines."""
@@ -152,8 +157,51 @@ def find_lines(frame: Image, settings: LineSettings) -> tuple[LightLine, ...]:
     joined = join_chains(ridges, long, scale, settings.gap_px, settings.turn_deg)
     picture = np.ascontiguousarray(frame, np.float32)
     picture = picture - glow(picture)
-    lines = (_line(picture, ridges, one, scale, settings) for one in joined)
-    return _without_specks(tuple(one for one in lines if one is not None))
+    found = (_line(picture, ridges, one, scale, settings) for one in joined)
+    lines = tuple(one for one in found if one is not None)
+    if _is_gathered(lines):
+        return _spots(picture, lines)
+    return _without_specks(lines)
+
+
+def _bright(lines: tuple[LightLine, ...]) -> list[LightLine]:
+    """Those with a good share of the most light that one has."""
+    total = np.array([one.light * one.length_px for one in lines])
+    return [
+        one for one, light in zip(lines, total, strict=True) if light > GATHERED_LIGHT * max(total)
+    ]
+
+
+def _is_gathered(lines: tuple[LightLine, ...]) -> bool:
+    """Whether all bright lines are in a narrow column."""
+    if not lines:
+        return False
+    bright = _bright(lines)
+    across = np.ptp(np.concatenate([one.image_px[:, 0] for one in bright]))
+    return bool(across < GATHERED_WIDTHS * np.median([one.width_px for one in bright]))
+
+
+def _spots(picture: Grey, lines: tuple[LightLine, ...]) -> tuple[LightLine, ...]:
+    """Folded lines at the spots of a column of light."""
+    bright = _bright(lines)
+    width = float(np.median([one.width_px for one in bright]))
+    column = np.concatenate([one.image_px for one in bright])
+    side = np.array([[-1.0, 0.0], [0.0, 0.0], [1.0, 0.0]])
+    return tuple(
+        LightLine(
+            image_px=place + side,
+            tangent=np.tile([1.0, 0.0], (3, 1)),
+            sigma_px=np.full(3, width),
+            curvature=np.zeros(3),
+            ends_px=place + width * side[[0, 2]],
+            cut=np.zeros(2, bool),
+            width_px=width,
+            light=light / 2.0,
+            gap_px=0.0,
+            smoothed_px=0.0,
+        )
+        for place, light in gathered_spots(picture, column, width)
+    )
 
 
 def _without_specks(lines: tuple[LightLine, ...]) -> tuple[LightLine, ...]:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from labapp.core.lines.chains import is_upright
 from labapp.core.lines.find_lines import LightLine
 from labapp.core.values import FloatArray
 
@@ -21,8 +22,12 @@ FRINGE_LIGHT, FRINGE_TOTAL = 0.45, 0.4
 FAINTEST_TOTAL = 0.02
 """What has less light in all than this share of the brightest line is no line."""
 
-LEG_PX = 30.0
-"""Longest leg of a line that is nearly folded, px."""
+LEG_PX, PART_WIDTHS = 30.0, 2.5
+"""Longest leg of a line that is nearly folded, px; longer ones are upright. Short parts that are
+nearer than so many of their widths are of one such line."""
+
+LEAST_TOTAL = 0.06
+"""What has less light in all than this share of its neighbour further in is not of the pattern."""
 
 NEAREST, FARTHEST = 0.3, 2.5
 """A fringe is so many times as far from the line beside it as that from the next one."""
@@ -91,14 +96,16 @@ def number_lines(lines: tuple[LightLine, ...], count: int) -> LinesSeen:
 
 
 def _are_legs(one: LightLine, other: LightLine) -> bool:
-    """Whether two short lines are at one height: both legs of a line that is nearly folded."""
-    if max(one.length_px, other.length_px) > LEG_PX:
+    """Whether two lines are parts of one that is nearly folded: its legs, or what is at its top."""
+    if not all(each.length_px < LEG_PX or is_upright(each.image_px) for each in (one, other)):
         return False
     (low, high), (bottom, top) = (
         (float(v.min()), float(v.max())) for v in (one.image_px[:, 1], other.image_px[:, 1])
     )
     shared = min(high, top) - max(low, bottom)
-    return shared > min(high - low, top - bottom) / 2
+    away = np.linalg.norm(one.image_px[:, None] - other.image_px, axis=-1).min()
+    near = away < PART_WIDTHS * max(one.width_px, other.width_px)
+    return bool(shared > min(high - low, top - bottom) / 2 or near)
 
 
 def heights(lines: Sequence[LightLine]) -> FloatArray:
@@ -119,7 +126,7 @@ def _pattern_lines(light: FloatArray, total: FloatArray, brightest: int) -> list
         inner = brightest
         for k in way:
             alike = light[k] > FRINGE_LIGHT * light[inner]
-            if alike or total[k] > FRINGE_TOTAL * total[inner]:
+            if total[k] > (LEAST_TOTAL if alike else FRINGE_TOTAL) * total[inner]:
                 real.append(k)
                 inner = k
     return sorted(real)

@@ -20,6 +20,9 @@ from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
 WITHIN_PX = 0.6
 """A ridge point lies so near its pixel's centre along u and along v: a little over half."""
 
+REMAP_LIMIT = 32766
+"""Most places of a row that `cv2.remap` takes."""
+
 FLANKS = 2.5
 """The background of a ridge is seen so many standard deviations of the smoothed line beside it."""
 
@@ -130,16 +133,22 @@ def find_ridges(frame: Image, settings: RidgeSettings) -> Ridges:
     return Ridges(place, along, strength, height, starts, noise, smooth)
 
 
+def sampled(picture: Grey, place: FloatArray) -> Grey:
+    """Grey levels at places (u, v), shape (n, 2); outside, those of the edge; shape (n,)."""
+    rows = -(-len(place) // REMAP_LIMIT)  # cv2.remap takes no more columns
+    at = np.resize(place, (rows, -(-len(place) // max(rows, 1)), 2)).astype(np.float32)
+    light = cv2.remap(
+        picture, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
+    return np.asarray(light).ravel()[: len(place)]
+
+
 def _height(smooth: Grey, place: FloatArray, along: FloatArray, scale_px: float) -> FloatArray:
     """Height of a smoothed frame's ridges over the mean of both flanks, shape (n,)."""
     reach = FLANKS * np.sqrt(2.0) * scale_px
     across = np.stack([-along[:, 1], along[:, 0]], axis=-1)
-    sample = [place + side * reach * across for side in (-1.0, 0.0, 1.0)]
-    at = np.asarray(sample, np.float32)
-    if not at.size:
+    if not len(place):
         return np.zeros(0)
-    left, top, right = cv2.remap(
-        smooth, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    )
+    left, top, right = (sampled(smooth, place + side * reach * across) for side in (-1.0, 0.0, 1.0))
     # A neighbouring line may be on one flank.
     return np.asarray(top - np.minimum(left, right), float)

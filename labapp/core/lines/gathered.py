@@ -1,0 +1,75 @@
+"""Lines that the pool gathers to points, one above the other (a caustic).
+
+A hollow of about the focal length's depth reflects each line to a spot of a few pixels. Ridges lead
+from spot to spot, as the column that they make is longer than a spot is wide: the spots are found
+as peaks of the light down that column.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+
+from labapp.core.images.dots import Grey
+from labapp.core.lines.ridges import sampled
+from labapp.core.values import FloatArray
+
+REACH_WIDTHS = 3.0
+"""Light is added up so many widths of a line to either side of the column, and looked for so far
+beyond its ends; twice as far where the spots are, fringes lie."""
+
+SHARPENED = 0.7
+"""Peaks are those of the second derivative at this share of a line's width: it tells spots apart
+that the sum of their light does not."""
+
+LEAST_PEAK, LEAST_NOISE = 0.05, 5.0
+"""A spot has at least this share of the brightest one's peak, and so many times the noise."""
+
+
+def gathered_spots(
+    picture: Grey, column_px: FloatArray, width_px: float
+) -> list[tuple[FloatArray, float]]:
+    """Spots of a column: (u, v), px, and the light of each, grey levels·px².
+
+    Parameters
+    ----------
+    picture
+        Grey levels over the background, shape (height, width).
+    column_px
+        Points of the lines' ridges, shape (n, 2).
+    width_px
+        Standard deviation of a line's light across it.
+    """
+    reach = REACH_WIDTHS * width_px
+    u, v = column_px.T
+    lean, foot = np.polyfit(v, u, 1) if np.ptp(v) > reach else (0.0, float(u.mean()))
+    down = np.arange(
+        max(v.min() - 4 * reach, 0.0), min(v.max() + 4 * reach, picture.shape[0] - 1.0), 0.5
+    )
+    sharp, light = _down(picture, foot + lean * down, down, width_px)
+    # Most of the column is light: the noise is that of two strips beside it.
+    dark = [
+        _down(picture, foot + lean * down + side * reach, down, width_px)[0] for side in (-3.0, 3.0)
+    ]
+    noise = 1.4826 * float(np.median(np.abs(dark)))
+    least = max(LEAST_PEAK * float(sharp.max()), LEAST_NOISE * noise)
+    inner = sharp[1:-1]
+    tops = 1 + np.flatnonzero((inner > sharp[:-2]) & (inner >= sharp[2:]) & (inner > least))
+    half = round(2 * width_px)
+    return [
+        (
+            np.array([foot + lean * down[k], down[k]]),
+            0.5 * float(light[max(k - half, 0) : k + half + 1].sum()),
+        )
+        for k in tops
+    ]
+
+
+def _down(
+    picture: Grey, u: FloatArray, v: FloatArray, width_px: float
+) -> tuple[FloatArray, FloatArray]:
+    """Light across a column at places each half pixel down it, sharpened and as it is."""
+    beside = np.arange(-REACH_WIDTHS * width_px, REACH_WIDTHS * width_px + 0.5)
+    at = np.stack(np.broadcast_arrays(u[:, None] + beside, v[:, None]), axis=-1)
+    light = sampled(picture, at.reshape(-1, 2)).reshape(len(v), -1).sum(axis=1).astype(float)
+    return -gaussian_filter1d(light, 2 * SHARPENED * width_px, order=2), light
