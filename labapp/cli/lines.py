@@ -3,18 +3,19 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from labapp.cli.shared import (
     FRAMES_HELP,
     FRAMES_METAVAR,
+    INTERRUPTED,
     NOTHING_MEASURED,
     RECORDING_HELP,
-    progress_shown,
+    note,
+    progress_bar,
     warned,
     writable_folder,
 )
@@ -23,9 +24,9 @@ from labapp.files import write_file
 from labapp.text import csv_text
 
 if TYPE_CHECKING:
-    import numpy.typing as npt
-
     from labapp.config.setup import Setup
+    from labapp.core.lines.frame import LineFrame
+    from labapp.export.frame_result import FrameResult
     from labapp.media import FrameSource
 
 
@@ -57,40 +58,56 @@ def lines(
         chosen = select_frames(frames, len(recording))
         folder = writable_folder(out)
         with os_errors_as_input(folder, "results", "room on its disk"):
-            if follow or bench.rig.pattern.rows == 1:
-                done = _follow(recording, chosen, folder)
-            else:
-                done = _measure(recording, chosen, folder, bench)
+            follow = follow or bench.rig.pattern.rows == 1
+            done = _measured(recording, chosen, bench, follow)
+            any_line = (
+                _write_followed(done, folder) if follow else _write_measured(done, folder, bench)
+            )
     typer.echo(f"Results are in {folder.absolute()}")
-    if not done:
+    if len(done) < len(chosen):
+        raise typer.Exit(INTERRUPTED)
+    if not any_line:
         raise typer.Exit(NOTHING_MEASURED)
 
 
-def _measure(source: FrameSource, frames: range, folder: Path, bench: Setup) -> bool:
-    """Measure frames one by one; whether any has lines."""
-    from labapp.core.lines.frame import LineFrame
+def _measured(source: FrameSource, frames: range, bench: Setup, follow: bool) -> list[FrameResult]:
+    """Results of the frames that were finished, with progress on stderr."""
+    from labapp.core.pipeline import Settings
+    from labapp.export.frame_result import FrameResult
+    from labapp.run.measurers import ColdMeasurer, LineFollower
+    from labapp.run.runner import run
+
+    measurer = (LineFollower if follow else ColdMeasurer)(source.frame, bench, Settings())
+    done = list[FrameResult]()
+    with progress_bar() as progress:
+        task = progress.add_task(source.name, total=len(frames))
+
+        def shown(result: FrameResult) -> None:
+            progress.advance(task)
+            if result.measurement.lines is None:
+                note(progress.console, f"frame {result.frame}: {result.measurement.reason}")
+
+        try:
+            for _ in run(frames, measurer, [done.append, shown]):
+                pass  # the sinks have it
+        except KeyboardInterrupt:
+            note(progress.console, f"stopped: {len(done)} of {len(frames)} frames are finished")
+    return done
+
+
+def _write_measured(done: list[FrameResult], folder: Path, bench: Setup) -> bool:
+    """Write the tables of frames measured one by one; whether any has lines."""
     from labapp.core.lines.states import LineSeries, line_changes, line_states
-    from labapp.core.pipeline import Settings, measure
     from labapp.core.recording.residual_check import doubt_of_values, judged_status
     from labapp.export.line_results import line_tables
 
-    found, times_s = list[LineFrame](), list[float | None]()
-    try:
-        with progress_shown("stopped: the frames that were finished are kept") as progress:
-            for k, number in enumerate(frames):
-                frame = source.frame(number)
-                one = measure(frame.image, bench.bench, Settings())[0].lines
-                assert one is not None
-                found.append(one)
-                times_s.append(frame.time_s)
-                progress(source.name, k + 1, len(frames))
-    finally:
-        done, status = frames[: len(found)], judged_status(bench.rig, doubt_of_values(bench.rig))
-        for name, text in line_tables(done, times_s, found, bench.calibration, status).items():
-            write_file(folder / name, text.encode())
+    frames, times_s, found = _of_lines(done)
+    status = judged_status(bench.rig, doubt_of_values(bench.rig))
+    for name, text in line_tables(frames, times_s, found, bench.calibration, status).items():
+        write_file(folder / name, text.encode())
     series = LineSeries.of(found)
     states = line_states(series)
-    for name, counts in (("frames", [one.status for one in found]), ("states", states)):
+    for name, counts in (("frames", [one.measurement.status for one in done]), ("states", states)):
         shown = ", ".join(f"{what} {n}" for what, n in Counter(counts).most_common())
         typer.echo(f"{name}: {shown}")
     for k, before, after in line_changes(series):
@@ -98,37 +115,41 @@ def _measure(source: FrameSource, frames: range, folder: Path, bench: Setup) -> 
     return any(one.seen.lines for one in found)
 
 
-def _follow(source: FrameSource, frames: range, folder: Path) -> bool:
-    """Follow one line; whether it was followed in any frame."""
-    from labapp.core.lines.frame import LineFrame
-    from labapp.core.lines.track import track_line
+def _write_followed(done: list[FrameResult], folder: Path) -> bool:
+    """Write the table of one line that was followed; whether it was followed in any frame."""
+    import numpy as np
+
+    from labapp.core.lines.pulses import pulse_frequency
+    from labapp.core.lines.track import oscillation_frequency
     from labapp.export import line_results as tables
 
-    rate = source.frame_rate_hz
-    rate = None if rate is None else rate / frames.step
-    times_s: list[float | None] = []
-    with progress_shown("stopped: nothing is kept of a line that is not followed to the end") as on:
-
-        def images() -> Iterator[npt.NDArray[Any]]:
-            for k, number in enumerate(frames):
-                frame = source.frame(number)
-                times_s.append(frame.time_s)
-                on(source.name, k + 1, len(frames))
-                yield frame.image
-
-        film = track_line(images(), rate)
-    pulses = zip(film.lines, film.pulses.on.tolist(), film.pulses.probability.tolist(), strict=True)
-    found = [LineFrame.of_track(*one) for one in pulses]
+    frames, times_s, found = _of_lines(done)
     rows = tables.track_rows(frames, times_s, found)
     write_file(folder / "track.csv", csv_text([tables.TRACK_COLUMNS, *rows]).encode())
-    off = [one for one in found if one.status != "pulse"]
-    followed = sum(one.track is not None for one in off)
-    typer.echo(f"{len(off)} of {len(frames)} frames are without a pulse; line in {followed}")
-    if film.pulses.on.any():
-        typer.echo(f"pulses: {film.pulses.frequency_hz:.2f} Hz")
-    if followed:
-        typer.echo(
-            f"strongest oscillation: {film.frequency_hz:.2f} Hz,"
-            f" {film.strength:.0%} of the line's motion"
-        )
-    return bool(followed)
+    on = np.array([one.status == "pulse" for one in found], bool)
+    shift = np.array([np.nan if one.track is None else one.track.shift_px for one in found])
+    known = np.isfinite(shift)
+    typer.echo(f"{(~on).sum()} of {len(done)} frames are without a pulse; line in {known.sum()}")
+    time_s = np.array([np.nan if one is None else one for one in times_s])
+    step_s = float(np.median(np.diff(time_s))) if len(time_s) > 1 else float("nan")
+    hertz = pulse_frequency(on, 1 / step_s) if step_s > 0 else float("nan")
+    if np.isfinite(hertz):
+        typer.echo(f"pulses: {hertz:.2f} Hz")
+    known_time = known & np.isfinite(time_s)
+    hertz, strength = oscillation_frequency(time_s[known_time], shift[known_time])
+    if np.isfinite(hertz):
+        typer.echo(f"strongest oscillation: {hertz:.2f} Hz, {strength:.0%} of the line's motion")
+    return bool(known.any())
+
+
+def _of_lines(
+    done: list[FrameResult],
+) -> tuple[list[int], list[float | None], list[LineFrame]]:
+    """Numbers, times and lines of the frames that could be read."""
+    seen = [(one, one.measurement.lines) for one in done]
+    read = [(one, lines) for one, lines in seen if lines is not None]
+    return (
+        [one.frame for one, _ in read],
+        [one.time_s for one, _ in read],
+        [lines for _, lines in read],
+    )

@@ -64,7 +64,7 @@ def classify_pulses(brightness: FloatArray, frame_rate_hz: float | None = None) 
     if contrast < LEAST_CONTRAST:
         return Pulses(off_all, np.zeros(len(light)), float("nan"))
     odds = _log_odds(light, light > threshold)
-    frequency = float("nan") if frame_rate_hz is None else _frequency(odds > 0, frame_rate_hz)
+    frequency = float("nan") if frame_rate_hz is None else pulse_frequency(odds > 0, frame_rate_hz)
     if np.isfinite(frequency):
         assert frame_rate_hz is not None
         odds = odds + _prior_odds(odds > 0, frequency / frame_rate_hz)
@@ -101,8 +101,16 @@ def _log_odds(light: FloatArray, on: BoolArray) -> FloatArray:
     return np.asarray(20.0 * ((level - off_level) / step - 0.5))
 
 
-def _frequency(on: BoolArray, frame_rate_hz: float) -> float:
-    """Frequency of the pulses, Hz; NaN where they do not repeat."""
+def pulse_frequency(on: BoolArray, frame_rate_hz: float) -> float:
+    """Frequency of the pulses, Hz; NaN where they do not repeat.
+
+    Parameters
+    ----------
+    on
+        Whether the pulse is on in each frame, shape (n,).
+    frame_rate_hz
+        Frames a second.
+    """
     count = len(on)
     if count < 16:
         return float("nan")
