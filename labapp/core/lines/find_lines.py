@@ -44,9 +44,9 @@ SPECK_WIDTHS, SPECK_LIGHT = 2.0, 0.15
 """What comes so many of its widths near to a line, and has no more than this share of its light in
 all, is part of that line's side."""
 
-GATHERED_WIDTHS, GATHERED_LIGHT = 8.0, 0.15
-"""All lines with this share of the brightest one's light lie within so many of their widths across:
-the pool gathers them to spots."""
+GATHERED_WIDTHS, GATHERED_LIGHT = (14.0, 30.0), 0.15
+"""All lines with this share of the brightest one's light lie within so many of their widths across
+and up: the pool gathers them to spots, too near each other for ridges."""
 
 GLOW_ROUNDS = 5
 """Of the fit of the light under the lines."""
@@ -173,12 +173,13 @@ def _bright(lines: tuple[LightLine, ...]) -> list[LightLine]:
 
 
 def _is_gathered(lines: tuple[LightLine, ...]) -> bool:
-    """Whether all bright lines are in a narrow column."""
+    """Whether all bright lines are in a small column."""
     if not lines:
         return False
     bright = _bright(lines)
-    across = np.ptp(np.concatenate([one.image_px[:, 0] for one in bright]))
-    return bool(across < GATHERED_WIDTHS * np.median([one.width_px for one in bright]))
+    extent = np.ptp(np.concatenate([one.image_px for one in bright]), axis=0)
+    width = float(np.median([one.width_px for one in bright]))
+    return bool((extent < np.array(GATHERED_WIDTHS) * width).all())
 
 
 def _spots(picture: Grey, lines: tuple[LightLine, ...]) -> tuple[LightLine, ...]:
