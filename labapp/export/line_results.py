@@ -9,6 +9,7 @@ import numpy as np
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.lines.fit import LineSurface
 from labapp.core.lines.frame import LineFrame
+from labapp.core.lines.metal import PoolEdges
 from labapp.core.lines.states import LineSeries, State, line_states
 from labapp.text import csv_text
 
@@ -32,6 +33,7 @@ TRACK_COLUMNS = (
     "frame", "time_s", "pulse", "pulse_probability", "followed", "shift_px", "tilt_px", "bend_px",
     "agreeing_share",
 )  # fmt: skip
+EDGE_COLUMNS = ("frame", "line", "side", "x_mm", "y_mm", "sigma_mm")
 SURFACE_COLUMNS = ("x_mm", "y_mm", "z_mm", "z_sigma_mm")
 """``z_sigma_mm`` has no part by the set-up either."""
 
@@ -127,6 +129,15 @@ def track_rows(
     return rows
 
 
+def edge_rows(frame: int, edges: PoolEdges) -> list[list[str]]:
+    """Rows of ``edges.csv``: one an end of a line on the solid metal."""
+    ends = zip(edges.line, edges.side, edges.point_mm, edges.sigma_mm, strict=True)
+    return [
+        [str(frame), str(line), str(side), *(f"{value:.4f}" for value in (*place, sigma))]
+        for line, side, place, sigma in ends
+    ]
+
+
 def surface_rows(surface: LineSurface) -> list[list[str]]:
     """Rows of ``surface_NNNNNN.csv``: nodes between the lines, on the pool's side of z = 0."""
     low, high = surface.point_mm[:, :2].min(axis=0), surface.point_mm[:, :2].max(axis=0)
@@ -167,6 +178,9 @@ def line_tables(
     if any(np.isfinite(one.pulse) for one in found):
         rows = track_rows(frames, times_s, found)
         tables["track.csv"] = csv_text([TRACK_COLUMNS, *rows])
+    edges = [row for k, one in numbered if one.edges for row in edge_rows(k, one.edges)]
+    if edges:
+        tables["edges.csv"] = csv_text([EDGE_COLUMNS, *edges])
     for k, one in numbered:
         if one.status == "ok" and one.surface is not None:
             text = csv_text([SURFACE_COLUMNS, *surface_rows(one.surface)])

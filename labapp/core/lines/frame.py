@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -13,6 +13,7 @@ from labapp.core.lines.correction import LineCorrection
 from labapp.core.lines.data import line_data
 from labapp.core.lines.find_lines import LightLine, LineSettings, find_lines
 from labapp.core.lines.fit import LineFitSettings, LineSurface, fit_lines
+from labapp.core.lines.metal import PoolEdges, pool_edges, without_metal
 from labapp.core.lines.numbering import LinesSeen, number_lines
 from labapp.core.lines.track import TrackedLine
 from labapp.core.values import CannotMeasure, FloatArray, IntArray
@@ -89,6 +90,8 @@ class LineFrame:
     track, pulse
         Of a pattern of one line: where it was followed to, None where it was not; the probability
         that a pulse of the current is on, NaN in other patterns.
+    edges
+        Points of the pool's edge, where the solid metal reflects the lines beside it; or None.
     """
 
     status: str
@@ -98,6 +101,7 @@ class LineFrame:
     surface: LineSurface | None
     track: TrackedLine | None = None
     pulse: float = float("nan")
+    edges: PoolEdges | None = None
 
     @classmethod
     def of_track(cls, track: TrackedLine | None, on: bool, pulse: float) -> LineFrame:
@@ -118,9 +122,24 @@ def measure_lines(
 ) -> LineFrame:
     """Measure one grey frame, shape (height, width), of a line pattern, as it was corrected."""
     count = rig.pattern.count
+    edges = pool_edges(image, rig, calibration)
     if correction is None:
-        correction = LineCorrection.of(number_lines(find_lines(image, settings.lines), count))
-    seen = correction.seen
+        lines = find_lines(image, settings.lines)
+        if edges is not None:
+            lines = without_metal(lines, edges, rig, calibration)
+        correction = LineCorrection.of(number_lines(lines, count))
+    found = _measured(correction, rig, calibration, settings)
+    return replace(found, edges=edges)
+
+
+def _measured(
+    correction: LineCorrection,
+    rig: LineRig,
+    calibration: ImageCalibration,
+    settings: LineMeasureSettings,
+) -> LineFrame:
+    """What lines show, and the surface under them."""
+    count, seen = rig.pattern.count, correction.seen
     features = line_features(seen.lines, calibration)
     if not seen.lines:
         return LineFrame("no-lines", "no line stands out of the noise", seen, features, None)

@@ -26,6 +26,7 @@ from labapp.core.lines.correction import LineCorrection
 from labapp.core.lines.find_lines import LightLine
 from labapp.core.lines.fit import LineSurface
 from labapp.core.lines.frame import LineFeatures, LineFrame
+from labapp.core.lines.metal import PoolEdges
 from labapp.core.lines.numbering import LinesSeen
 from labapp.core.lines.track import TrackedLine
 from labapp.core.match import Match, Trial
@@ -232,6 +233,9 @@ STORED = {
     "Measures": Stored(Measures),
     "Measurement": Stored(Measurement, fits=_measurement_fits),
     "LineFrame": Stored(LineFrame, fits=_lines_fit),
+    "PoolEdges": Stored(
+        PoolEdges, shapes={"line": "n", "side": "n", "point_mm": "n 2", "sigma_mm": "n"}
+    ),
     "LineCorrection": Stored(LineCorrection, shapes={"number": "k"}, fits=_line_correction_fits),
     "TrackedLine": Stored(TrackedLine, shapes={"u_px": "n", "v_px": "n"}),
     "LineFeatures": Stored(LineFeatures),

@@ -17,6 +17,7 @@ from labapp.core.geometry.rig import DotPattern, Rig
 from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import PoolSurface, trace
+from labapp.simulation.pools import egg
 from labapp.simulation.render import Look, Picture, arc_glow, expose, speckle_field
 from labapp.simulation.torch import Torch
 
@@ -27,6 +28,9 @@ FINER = 20
 EDGE = 2.0
 """Rays are followed in the middle of a line and so many standard deviations beside it; its light is
 added up at places between them."""
+
+PLATE_MM = 60.0, 30.0, 30.0, 0.0
+"""Width, head, rear and height of the solid metal about the pool, mm."""
 
 ACROSS = np.linspace(-2.5, 2.5, 11)
 """These places, standard deviations."""
@@ -65,6 +69,9 @@ class LineLook:
         Number of gaps in the lines: oxides on the pool hide the light (§3.2.2).
     gap_mm
         Largest width of what hides it, on the pool, mm.
+    metal
+        Light of the solid metal's reflection over that of a flat pool: 0 on mild steel (Fig. 3-10
+        a), while stainless steel reflects straight lines beside the pool (Fig. 3-10 b).
     """
 
     light: Look = field(default_factory=Look)
@@ -74,6 +81,7 @@ class LineLook:
     fringes: tuple[float, ...] = (0.18, 0.08)
     gaps: int = 0
     gap_mm: float = 0.3
+    metal: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -174,6 +182,10 @@ def _line_light(
     dense = _DenseLines(len(tangents), RAYS_A_LINE, 1.0, absent=frozenset(), line_tangents=tangents)
     seen = trace(pool, Rig(rig.laser, dense, rig.electrode, rig.imaging_plane), torch)
     form = len(number), len(nodes), RAYS_A_LINE
+    if look.metal:
+        flat = trace(egg(*PLATE_MM), Rig(rig.laser, dense, rig.electrode, rig.imaging_plane), torch)
+        on_metal = view.to_image(flat.plane_mm).reshape(*form, 2)
+        plate = (flat.visible & ~seen.hit).reshape(form)
     image = view.to_image(seen.plane_mm).reshape(*form, 2)
     points = seen.point_mm.reshape(*form, 3)[:, 1]
     middle, size = image[:, 1], np.array([view.width_px, view.height_px])
@@ -186,6 +198,11 @@ def _line_light(
             # The parabola through the three rays across the line.
             off = place * (place - 1) / 2 * left + place * (place + 1) / 2 * right
             _add_light(light, middle[n] + off, shows[n], bright[n] * weight)
+        if look.metal:
+            shift = (on_metal[n, 2] - on_metal[n, 0]) / 2
+            for place, weight in zip(ACROSS / EDGE, weights / weights.sum(), strict=True):
+                share = bright[n] * weight * look.metal
+                _add_light(light, on_metal[n, 1] + place * shift, plate[n, 1], share)
     sigma_px = look.sigma_mm * float(np.sqrt(abs(np.linalg.det(view.px_per_mm))))
     light = gaussian_filter(light, sigma_px)
     visible: BoolArray = shows & ((middle >= 0) & (middle <= size - 1)).all(axis=-1)

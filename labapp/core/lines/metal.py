@@ -1,0 +1,207 @@
+"""Edges of the pool from the solid metal beside it (§3.2.1, Fig. 3-10 b).
+
+Stainless steel reflects the lines beside the pool, too: as a flat mirror at z = 0, so that where
+each ray of each line lands is known. The straight lines overlap on the imaging plane; their
+brightness along the fan is solved for together. Where a line's light ends, from outside inwards,
+its ray meets the boundary: a point (x, y) of the pool's edge.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import gaussian_filter1d
+
+from labapp.core.geometry.coordinates import ImageCalibration
+from labapp.core.geometry.line_pattern import LineRig, line_directions
+from labapp.core.geometry.optics import intersect_imaging_plane, intersect_level, reflect
+from labapp.core.images.dots import Image
+from labapp.core.lines.find_lines import LightLine
+from labapp.core.lines.ridges import sampled
+from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
+
+FAN_STEPS = 241
+"""Places along the fan at which the lines' light is solved for."""
+
+OUTER_STEPS = 12
+"""A line on the metal is lit within so many steps of the end of its fan; at these steps, the width
+of the lines is chosen."""
+
+WIDTHS_PX = (0.8, 1.2, 1.6, 2.0, 2.5, 3.0)
+"""Standard deviations of a line's light across it that are tried; the one that fits is taken."""
+
+BESIDE_PX = 6.0
+"""How far beyond the outermost straight lines light is read."""
+
+SMOOTHED_STEPS = 1.5
+"""Standard deviation of the smoothing along the fan, steps."""
+
+LEAST_LIGHT = 5.0
+"""Light of a line on the metal, over its noise."""
+
+FRINGES = 2
+"""Diffraction fringes to either side of the pattern (Fig. 3-9) that have light of their own."""
+
+METAL_WIDTHS, METAL_SHARE = 2.5, 0.7
+"""A line of which so much is within so many widths of the straight lines is one of these."""
+
+MOST_OFF_MM, FLOOR_MM = 0.15, 0.1
+"""The ends on one side are on a smooth boundary to so many mm RMS: lines of the pool that cross the
+straight ones end elsewhere. And what an end is not better known than, mm: blur spreads it."""
+
+
+@dataclass(frozen=True)
+class PoolEdges(ReadOnlyArrays):
+    """Where lines on the solid metal end at the pool: n points of its edge.
+
+    Parameters
+    ----------
+    line
+        Number of the line in the pattern, shape (n,).
+    side
+        −1: the end towards −X; 1: the other, shape (n,).
+    point_mm
+        (x, y) on the work piece, shape (n, 2), mm.
+    sigma_mm
+        Standard uncertainty along the line, by the noise of its light, shape (n,), mm.
+    width_px
+        Standard deviation of a straight line's light across it, px.
+    """
+
+    line: IntArray
+    side: IntArray
+    point_mm: FloatArray
+    sigma_mm: FloatArray
+    width_px: float
+
+
+def pool_edges(image: Image, rig: LineRig, calibration: ImageCalibration) -> PoolEdges | None:
+    """Edges of the pool in a frame, shape (height, width); None where the metal reflects no lines.
+
+    Parameters
+    ----------
+    image
+        A grey frame of a line pattern.
+    rig, calibration
+        The bench; the work piece is at z = 0.
+    """
+    fan = np.linspace(-rig.pattern.half_fan, rig.pattern.half_fan, FAN_STEPS)
+    number = np.arange(1.0 - FRINGES, rig.pattern.count + 1 + FRINGES)
+    point, path = _straight_lines(rig, calibration, number, fan)
+    if not np.isfinite(path).all():
+        return None
+    picture = np.ascontiguousarray(image, np.float32)
+    light, noise, width = _light_along(picture, path)
+    own = slice(FRINGES, -FRINGES)
+    point, light = point[own], light[own]
+    smooth = gaussian_filter1d(light, SMOOTHED_STEPS, axis=1, mode="nearest")
+    found = [
+        (k, side, *end)
+        for k in range(rig.pattern.count)
+        for side in (-1, 1)
+        if (end := _end(smooth[k][::-side], noise)) is not None
+    ]
+    if len(found) < 2 * rig.pattern.count:
+        return None
+    line, side = (np.array(column) for column in list(zip(*found, strict=True))[:2])
+    step = np.array([one[2] for one in found])
+    at = np.where(side < 0, step, FAN_STEPS - 1 - step)
+    places = np.stack(
+        [
+            [np.interp(each, np.arange(FAN_STEPS), point[k, :, axis]) for axis in (0, 1)]
+            for k, each in zip(line.tolist(), at.tolist(), strict=True)
+        ]
+    )
+    a_step = np.linalg.norm(np.diff(point[line, :, :2], axis=1), axis=-1).mean(axis=1)
+    slope = np.array([one[4] for one in found])
+    if any(_bends(places[side == one]) > MOST_OFF_MM for one in (-1, 1)):
+        return None
+    sigma = np.hypot(a_step * noise / slope, FLOOR_MM)
+    return PoolEdges(line + 1, side, places, sigma, width)
+
+
+def without_metal(
+    lines: tuple[LightLine, ...], edges: PoolEdges, rig: LineRig, calibration: ImageCalibration
+) -> tuple[LightLine, ...]:
+    """Lines but for those that are light of the metal: most of each is where that lands."""
+    half = rig.pattern.half_fan
+    number = np.arange(1.0, rig.pattern.count + 1)
+    path = _straight_lines(rig, calibration, number, np.linspace(-half, half, FAN_STEPS))[1]
+    near = METAL_WIDTHS * edges.width_px
+    return tuple(
+        one
+        for one in lines
+        if np.mean(_away(one.image_px, path.reshape(-1, 2)) < near) < METAL_SHARE
+    )
+
+
+def _away(place: FloatArray, others: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.norm(place[:, None] - others, axis=-1).min(axis=1))
+
+
+def _bends(place_mm: FloatArray) -> float:
+    """RMS distance along X of points (x, y) from a parabola through them, mm."""
+    x, y = place_mm.T
+    return float(np.std(x - np.polyval(np.polyfit(y, x, 2), y)) * np.sqrt(len(x) / (len(x) - 3)))
+
+
+def _straight_lines(
+    rig: LineRig, calibration: ImageCalibration, number: FloatArray, fan: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Where rays meet the work piece, shape (k, f, 3), mm, and their light, shape (k, f, 2), px."""
+    direction = line_directions(rig.laser, rig.pattern, number[:, None], fan)
+    point = intersect_level(rig.laser.position_mm, direction)
+    away = reflect(direction, np.array([0.0, 0.0, 1.0]))
+    return point, calibration.to_image(intersect_imaging_plane(point, away, rig.imaging_plane))
+
+
+def _light_along(picture: FloatArray, path: FloatArray) -> tuple[FloatArray, float, float]:
+    """Light of each line along the fan, shape (k, f), its noise, and the lines' width, px.
+
+    At each step of the fan, the light across all lines is the sum of their profiles and of a
+    straight background.
+    """
+    count, steps, _ = path.shape
+    middle = path.mean(axis=0)
+    along = np.gradient(middle, axis=0)
+    across = np.stack([-along[:, 1], along[:, 0]], axis=-1)
+    across /= np.linalg.norm(across, axis=-1, keepdims=True)
+    place = np.vecdot(path - middle, across)
+    reach = float(np.abs(place).max()) + BESIDE_PX
+    side = np.arange(-reach, reach + 0.5)
+    at = middle[:, None] + side[:, None] * across[:, None]
+    seen = np.asarray(sampled(picture, at.reshape(-1, 2)), float).reshape(steps, -1)
+    outer = np.r_[:OUTER_STEPS, steps - OUTER_STEPS : steps]
+    best: tuple[float, FloatArray, float] | None = None
+    for width in WIDTHS_PX:
+        bells = np.exp(-(((side[:, None] - place.T[:, None]) / width) ** 2) / 2)
+        straight = np.broadcast_to(
+            np.stack([np.ones_like(side), side / reach], axis=-1), (steps, len(side), 2)
+        )
+        design = np.concatenate([bells, straight], axis=-1)
+        inverse = np.linalg.pinv(design)
+        solved = (inverse @ seen[..., None])[..., 0]
+        rest = seen - (design @ solved[..., None])[..., 0]
+        misfit = float(np.sum(rest[outer] ** 2))
+        if best is None or misfit < best[0]:
+            grain = float(np.sqrt(misfit / (len(outer) * (len(side) - count - 2))))
+            gain = float(np.sqrt((inverse[:, :count] ** 2).sum(axis=-1).mean()))
+            best = misfit, solved[:, :count].T, width
+            noise = grain * gain
+    assert best is not None
+    return best[1], noise, best[2]
+
+
+def _end(light: FloatArray, noise: float) -> tuple[float, float, float] | None:
+    """Where a line's light ends, from its outer end inwards: the step, its level, its slope there.
+
+    None where there is none, or where it does not end.
+    """
+    top = np.maximum.accumulate(light)
+    ends = np.flatnonzero((top > LEAST_LIGHT * noise) & (light < top / 2))
+    if not len(ends) or not np.any(light[:OUTER_STEPS] > LEAST_LIGHT * noise / 2):
+        return None
+    k, level = int(ends[0]), float(top[ends[0]])
+    slope = float(light[k - 1] - light[k])
+    return k - 1 + float((light[k - 1] - level / 2) / slope), level, slope
