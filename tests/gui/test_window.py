@@ -26,7 +26,7 @@ from labapp.gui.shell import window as window_module
 from labapp.gui.shell.commands import make_window
 from labapp.gui.shell.files import title
 from labapp.gui.shell.step_list import StepList, mark_icon
-from labapp.gui.shell.steps import STEPS, Mark, first_step, states
+from labapp.gui.shell.steps import STEPS, Mark, first_frame, first_step, states
 from labapp.gui.shell.window import MainWindow
 from labapp.gui.widgets.tables import table_text
 from labapp.gui.workspace import Workspace
@@ -568,6 +568,20 @@ def test_where_to_begin(copy_sample: CopySample, tmp_path: Path):
         with Session.create(tmp_path / "other.labsession") as other:
             other.set_setup(session.setup_text)
             assert first_step(other) == "capture"
+            assert first_frame(other) is None
+        assert first_frame(session) == 0
+
+
+def test_a_session_opens_where_there_is_something_to_see(
+    plain: MainWindow, copy_sample: CopySample
+):
+    plain.files.open(copy_sample("five_lines"))
+    session = plain.workspace.session
+    assert session.result(0).measurement.status != "ok"
+    assert plain.page.key == "surface"
+    assert session.result(plain.workspace.frame).measurement.status == "ok"
+    plain.files.open(copy_sample("gmaw"))
+    assert first_step(plain.workspace.session) == "trends"  # one line gives no surface
 
 
 def test_every_step_tells_its_mark_in_words_and_in_a_shape(

@@ -247,13 +247,17 @@ def _capture(facts: Facts) -> State:
 
 def _dots(facts: Facts) -> State:
     if facts.without:
-        missing = pluralize(facts.without, "frame")
-        return State(Mark.ATTENTION, f"{missing} could not be measured: look at their dots")
+        missing, seen = pluralize(facts.without, "frame"), _seen(facts.session)
+        return State(Mark.ATTENTION, f"{missing} could not be measured: look at their {seen}")
     if facts.stale:
         return State(Mark.READY, f"{pluralize(facts.stale, 'frame')} to be measured again")
     if facts.measured == facts.count:
-        return State(Mark.DONE, "The dots of all frames make a surface")
+        return State(Mark.DONE, f"The {_seen(facts.session)} of all frames are measured")
     return State(Mark.READY, f"{pluralize(facts.count - facts.measured, 'frame')} to be measured")
+
+
+def _seen(session: Session) -> str:
+    return "lines" if session.has_lines else "dots"
 
 
 def _surface(facts: Facts) -> State:
@@ -443,6 +447,17 @@ def lead(
 def first_step(session: Session) -> str:
     """Key of the step to begin with: results if there are some, else what is to be done next."""
     if session.recording is not None:
-        measured = any(status != "" for status in session.overview().status)
+        measured = {status for status in session.overview().status if status != ""}
+        if "followed" in measured and "ok" not in measured:
+            return "trends"  # one line: it is followed, and gives no surface
         return "surface" if measured else "dots"
     return "capture" if states(session)["setup"].why == "Complete" else "setup"
+
+
+def first_frame(session: Session) -> int | None:
+    """The first frame with a surface; None if there is none."""
+    if session.recording is None:
+        return None
+    seen = session.overview()
+    found = (frame for frame, status in zip(seen.frame, seen.status, strict=True) if status == "ok")
+    return next((int(frame) for frame in found), None)

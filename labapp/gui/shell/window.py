@@ -38,6 +38,7 @@ from labapp.gui.shell.step_list import SidePanel, StepList
 from labapp.gui.shell.steps import (
     STEPS,
     Lead,
+    first_frame,
     first_step,
     lead,
     read_only,
@@ -319,6 +320,9 @@ class MainWindow(QMainWindow):
         elif self._steps:
             keys = [step.key for step in self._steps]
             first = self.workspace.run_or_report(lambda: first_step(session)) or "setup"
+            frame = self.workspace.run_or_report(lambda: first_frame(session))
+            if frame is not None:
+                self.workspace.show_frame(frame)
             self.show_step(first if first in keys else keys[0])
         self._show_docks()
 

@@ -143,7 +143,7 @@ def test_measuring_can_be_watched_and_cancelled(
 def test_buttons_say_why_they_are_off(page: SurfacePage) -> None:
     page.workspace.attempt(lambda session: session.update_setup({"laser": {"distance_mm": None}}))
     assert not page.side.one.isEnabled()
-    assert "The set-up is not complete. Enter the laser" in page.side.one.toolTip()
+    assert "The set-up is not complete. Enter distance of the laser" in page.side.one.toolTip()
     page.workspace.undo()
     assert page.side.one.isEnabled()
 

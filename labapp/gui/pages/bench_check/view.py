@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import pyqtgraph as pg
@@ -17,16 +16,17 @@ from PySide6.QtWidgets import (
     QWidget,
 )
 
-from labapp.core.bench_check.mirrors import Plate
 from labapp.gui.dialogs import ask_file
 from labapp.gui.pages.bench_check import presenter
-from labapp.gui.pages.bench_check.presenter import COLUMNS, KINDS, Checked, Chosen, Predicted
+from labapp.gui.pages.bench_check.chosen import Chosen, kept_pictures
+from labapp.gui.pages.bench_check.mirror_form import MirrorForm
+from labapp.gui.pages.bench_check.presenter import COLUMNS, Checked, Predicted
 from labapp.gui.pages.page import Page
 from labapp.gui.shell.steps import Lead, Mark, Offer, State, setup_to_do
 from labapp.gui.tasks import Control
 from labapp.gui.views.picture import PictureView
 from labapp.gui.widgets.buttons import button
-from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
+from labapp.gui.widgets.fields import ChoiceField
 from labapp.gui.widgets.labels import Message, heading, plain_tip, show_words, wrapping_label
 from labapp.gui.widgets.layouts import fill, hbox, vbox
 from labapp.gui.widgets.tables import FullTable, ReadTable
@@ -132,7 +132,7 @@ class BenchCheckPage(Page):
                 self._list(chosen)
 
         title = "Showing the pictures of the check"
-        self.workspace.tasks.start(title, lambda _: presenter.kept(session), shown)
+        self.workspace.tasks.start(title, lambda _: kept_pictures(session), shown)
 
     # --- the list -----------------------------------------------------------------------------
 
@@ -240,8 +240,7 @@ class BenchCheckPage(Page):
 
     def leave(self) -> None:
         """Finish the edit under way."""
-        for field in (self.height_field, self.diameter, self.height_sigma, self.level):
-            field.flush()
+        self.mirror_form.flush()
 
     # --- the panel ----------------------------------------------------------------------------
 
@@ -265,6 +264,9 @@ class BenchCheckPage(Page):
         self.list.verticalHeader().setDefaultSectionSize(ROW_PX)
         self.list.setFixedHeight(ROW_PX * (LIST_ROWS + 1) + 8)
         self.list.offer(("Copy table", self.list.copy_text))
+        self.mirror_form = MirrorForm(self._selected, self.change)
+        self.kind, self.diameter = self.mirror_form.kind, self.mirror_form.diameter
+        self.height_field = self.mirror_form.height_field
         self.check_button = button("Check", "", self.check)
         self.use_button = button("Apply", "", self.use)
         self.words = wrapping_label()
@@ -278,75 +280,13 @@ class BenchCheckPage(Page):
         self.mirrors.offer(("Copy table", self.mirrors.copy_text))
         fill(
             self.panel_layout,
-            *(hbox((self.add_button, 1), self.remove_button), self.list, self._mirror_form()),
+            *(hbox((self.add_button, 1), self.remove_button), self.list, self.mirror_form),
             *(hbox((self.check_button, 1), (self.use_button, 1)), self.answer),
             *(self.words, self._suspect_part(), self.mirrors_words, self.mirrors),
             *(self.predict_button, self.predicted_words, self.predicted, 1),
         )
         self.lock_with_session(self.add_button)
         self._show_predicted(None)
-
-    def _mirror_form(self) -> QWidget:
-        form = FieldForm()
-        tip = "Which mirror the selected picture shows"
-        self.kind = ChoiceField("Mirror", KINDS, tooltip=tip)
-        self.kind.edited.connect(lambda kind: self.change(self._selected().of_kind(kind)))
-        self.diameter = NumberField(
-            "Diameter",
-            "mm",
-            lowest=0.1,
-            highest=1000,
-            step=0.01,
-            decimals=3,
-            tooltip="Of the ball, or of the cap's rim: measure it with a micrometer",
-        )
-        self.diameter.edited.connect(
-            lambda value: self.change(replace(self._selected(), diameter_mm=value))
-        )
-        self.height_field = NumberField(
-            "Height",
-            "mm",
-            lowest=-100,
-            highest=1000,
-            step=0.01,
-            decimals=3,
-            tooltip="Of the plate's surface, or of the top of cap or ball, over the work piece",
-        )
-        self.height_field.edited.connect(
-            lambda value: self.change(replace(self._selected(), height_mm=value))
-        )
-        self.height_sigma = NumberField(
-            "Height ±",
-            "mm",
-            lowest=0.0001,
-            highest=100,
-            step=0.005,
-            decimals=4,
-            tooltip="Standard uncertainty of the height; empty: the usual one, in grey",
-        )
-        self.height_sigma.edited.connect(
-            lambda value: self.change(replace(self._selected(), height_sigma_mm=value))
-        )
-        self.level = NumberField(
-            "Level ±",
-            "°",
-            lowest=0.001,
-            highest=10,
-            step=0.01,
-            decimals=3,
-            tooltip="How level the plate lies on the work piece, either way, one standard "
-            "uncertainty; empty: the usual one, in grey. It limits what a check can do",
-        )
-        self.level.edited.connect(
-            lambda value: self.change(replace(self._selected(), level_sigma_deg=value))
-        )
-        for field in self._fields:
-            form.add(field)
-        return form
-
-    @property
-    def _fields(self) -> tuple[ChoiceField | NumberField, ...]:
-        return self.kind, self.diameter, self.height_field, self.height_sigma, self.level
 
     def _suspect_part(self) -> QWidget:
         tip = "Which quantity is off; those in the list explain the dots equally well"
@@ -385,7 +325,7 @@ class BenchCheckPage(Page):
             same = self.checked.setup_text == self.session.setup_text
             self.checked = self.checked if same else None
         record, made = self._record(), self.checked
-        self._show_mirror()
+        self.mirror_form.show_mirror(self._selected() if self.chosen else None, self.locked)
         self._show_picture(None if record is None else record.pictures[self._at()])
         self.quantities.show_rows(() if record is None else presenter.quantity_rows(record))
         self.found.setVisible(record is not None)
@@ -432,25 +372,6 @@ class BenchCheckPage(Page):
     def _let(pressed: QWidget, why_not: str, tip: str) -> None:
         pressed.setEnabled(not why_not)
         pressed.setToolTip(plain_tip(why_not or tip))
-
-    def _show_mirror(self) -> None:
-        one = self._selected() if self.chosen else None
-        for field in self._fields:
-            field.lock(self.locked or ("" if one else "Add a picture first"))
-        if one is None:
-            return
-        self.kind.set_value(one.kind)
-        self.height_field.set_value(one.height_mm)
-        self.height_field.set_problem(one.problem)
-        self.diameter.set_value(one.diameter_mm)
-        self.height_sigma.set_value(one.height_sigma_mm)
-        self.height_sigma.set_placeholder(f"{one.usual_height_sigma_mm:g}")
-        self.level.set_value(one.level_sigma_deg)
-        self.level.set_placeholder(f"{Plate.tilt_sigma_deg:g}" if one.kind == "plate" else "")
-        if one.kind == "plate":
-            self.diameter.lock("A plate has no diameter")
-        else:
-            self.level.lock("A cap or ball has no level")
 
     def _show_picture(self, found: MirrorPicture | None) -> None:
         image = self._selected().image if self.chosen else None

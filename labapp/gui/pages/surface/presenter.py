@@ -184,8 +184,11 @@ def _state(result: Result) -> tuple[Literal["measured", "stale", "failed"], str]
         )
     elif measurement.lines is not None and not failed:
         words = "Measured between the lines; nothing is known of the pool beyond them."
+    elif measurement.status == "followed":
+        words = "The line is followed, but one line gives no surface. Its motion is in step Trends."
     elif failed:
-        words = f"No surface ({measurement.status}): {measurement.reason}."
+        reason = f": {measurement.reason}" if measurement.reason else ""
+        words = f"No surface ({measurement.status}){reason}."
     if result.stale:
         was = words if failed else "These figures are out of date."
         return "stale", f"{was} Since then {' and '.join(result.stale)}."

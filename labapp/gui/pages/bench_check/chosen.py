@@ -1,0 +1,110 @@
+"""The pictures in the bench check's list, and the mirrors that they show."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+
+from labapp.core.bench_check.mirrors import Ball, Cap, Mirror, Plate
+from labapp.media import GreyImage
+from labapp.session.record import MirrorPicture
+from labapp.session.session import Session
+
+KINDS = (("plate", "Flat plate"), ("cap", "Cap or thumb tack"), ("ball", "Bearing ball"))
+"""Kinds of mirror, and how they are named."""
+
+USUAL: Mapping[str, tuple[float, float | None]] = {
+    "plate": (0.0, None),
+    "cap": (0.91, 9.75),
+    "ball": (10.0, 10.0),
+}
+"""Height and diameter that a mirror of a kind has at first, mm."""
+
+
+@dataclass(frozen=True, eq=False)
+class Chosen:
+    """A picture in the list."""
+
+    name: str
+    """Of its file."""
+    image: GreyImage
+    """Grey levels, shape (rows, columns)."""
+    kind: str = "plate"
+    height_mm: float = 0.0
+    diameter_mm: float | None = None
+    """The mirror in it, see `MirrorPicture`."""
+    height_sigma_mm: float | None = None
+    """Standard uncertainty of the height; None: the usual one."""
+    level_sigma_deg: float | None = None
+    """How level a plate lies; None: the usual one."""
+
+    @property
+    def usual_mirror(self) -> Plate | Cap | Ball:
+        """The mirror with usual uncertainties."""
+        if self.kind == "plate" or self.diameter_mm is None:
+            return Plate(self.height_mm)
+        if self.kind == "cap":
+            return Cap(self.diameter_mm, self.height_mm)
+        return Ball(self.diameter_mm, self.height_mm)
+
+    @property
+    def usual_height_sigma_mm(self) -> float:
+        """Standard uncertainty of the height where none is entered, mm."""
+        usual = self.usual_mirror
+        return float(usual.sigma[usual.parameters.index("height_mm")])
+
+    @property
+    def mirror(self) -> Mirror:
+        """The mirror."""
+        usual, sigma, level = self.usual_mirror, self.height_sigma_mm, self.level_sigma_deg
+        if isinstance(usual, Ball):
+            return usual if sigma is None else replace(usual, top_sigma_mm=sigma)
+        known = usual if sigma is None else replace(usual, height_sigma_mm=sigma)
+        if isinstance(known, Plate) and level is not None:
+            return replace(known, tilt_sigma_deg=level)
+        return known
+
+    @property
+    def mirror_words(self) -> str:
+        """The mirror in words."""
+        name = self.mirror.name
+        return name[:1].upper() + name[1:]
+
+    @property
+    def problem(self) -> str:
+        """Why there is no such mirror; empty if there can be."""
+        if self.kind == "cap" and not self.height_mm > 0:
+            return "A cap is higher than 0 mm"
+        return ""
+
+    def of_kind(self, kind: str) -> Chosen:
+        """The same picture with the usual mirror of another kind."""
+        height, diameter = USUAL[kind]
+        return Chosen(self.name, self.image, kind, height, diameter)
+
+    @classmethod
+    def of_kept(cls, one: MirrorPicture, image: GreyImage) -> Chosen:
+        """A picture of a stored check."""
+        made = cls(one.name, image, one.kind, one.height_mm, one.diameter_mm)
+        usual = dict(zip(made.mirror.parameters, made.mirror.sigma.tolist(), strict=True))
+        own = {name: sigma for name, sigma in one.pose_sigma if sigma != usual.get(name)}
+        sigmas = own.get("height_mm"), own.get("tilt_x_deg")
+        return replace(made, height_sigma_mm=sigmas[0], level_sigma_deg=sigmas[1])
+
+    def is_of(self, one: MirrorPicture) -> bool:
+        """Whether a stored check has this picture with this mirror."""
+        return Chosen.of_kept(one, self.image)._key == self._key
+
+    @property
+    def _key(self) -> tuple[object, ...]:
+        sizes = self.height_mm, self.diameter_mm, self.height_sigma_mm, self.level_sigma_deg
+        return self.name, self.kind, *sizes
+
+
+def kept_pictures(session: Session) -> tuple[Chosen, ...]:
+    """The pictures of the check that the session keeps."""
+    found = session.bench_check
+    return tuple(
+        Chosen.of_kept(one, session.picture(one.picture_sha256))
+        for one in (found.pictures if found else ())
+    )
