@@ -39,6 +39,7 @@ from labapp.core.schemes import SCHEMES, ers, fit, irs, modal, zonal
 from labapp.core.surface import measures
 from labapp.core.surface.pool_fit import FitSettings
 from labapp.core.surface.reconstruction import Reconstruction
+from labapp.core.surface.spline import SplineSurface
 from labapp.core.values import CannotMeasure
 
 if TYPE_CHECKING:  # the module compiles: it is loaded where a frame is measured
@@ -221,14 +222,7 @@ def measure(
             passed("dots")
             rows, no_rows = _lattice_or_why(dots, shape, settings.lattice)
             result = replace(result, dots=dots, lattice=rows)
-            try:
-                match, near = match_rays(dots, rows, bench, shape, limits)
-            except RowsOpen as why:
-                own = {**vars(result), "status": why.status, "reason": why.reason}
-                return OpenMeasurement(**own, candidates=why.candidates), None
-            except CannotMeasure as why:
-                nothing = why.reason == NOTHING_EXPLAINS
-                raise (no_rows if no_rows and nothing else why) from None
+            match, near = _match_or_why(dots, rows, no_rows, bench, shape, limits)
             lattice = lattice_of_match(match, rig, len(dots))
         result = replace(result, match=match, lattice=lattice)
         if settings.scheme != "fit":
@@ -237,7 +231,7 @@ def measure(
         passed("match")
         made, size = fit.complete(match, pool, rig, settings.fit, known)
     except CannotMeasure as why:
-        return replace(result, status=why.status, reason=why.reason), None
+        return _refused(result, why), None
     passed("measures")
     result = replace(result, reconstruction=made, measures=size)
     if prior is not None and followed is not None:
@@ -306,6 +300,30 @@ def reconstruct(match: Match, rig: Rig, settings: Settings) -> Reconstruction:
     if scheme.algorithms:
         own = replace(own, algorithm=settings.algorithm)
     return scheme.reconstruct(match, rig, own)
+
+
+def _refused(result: Measurement, why: CannotMeasure) -> Measurement:
+    """The measurement of a frame without an answer; rows that an operator gave stay refused."""
+    result = replace(result, status=why.status, reason=why.reason)
+    if isinstance(why, RowsOpen) and result.correction is None:
+        return OpenMeasurement(**vars(result), candidates=why.candidates)
+    return result
+
+
+def _match_or_why(
+    dots: Dots,
+    rows: Lattice | None,
+    no_rows: CannotMeasure | None,
+    bench: Bench,
+    frame_shape: tuple[int, int],
+    settings: MatchSettings,
+) -> tuple[Match, SplineSurface]:
+    """The match (`match_rays`); where nothing explains the dots, why there are no rows."""
+    try:
+        return match_rays(dots, rows, bench, frame_shape, settings)
+    except CannotMeasure as why:
+        nothing = why.reason == NOTHING_EXPLAINS
+        raise (no_rows if no_rows and nothing else why) from None
 
 
 def _lattice_or_why(

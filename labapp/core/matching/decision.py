@@ -167,16 +167,7 @@ def decide(
         best = evaluate_twice(observed, best.labels, fit, best.pool) or best
     _refuse_unexplained(observed, best, settings)
     own = best.orientation(observed)
-    if best.marker == "lit":
-        others_explain = any_explains(observed, [h for h in found if h.marker == "dark"])
-        raise CannotMeasure(
-            "ambiguous-rows" if others_explain else "no-reference",
-            "where the best rows have the absent centre dot, there is a dot",
-        )
-    if best.marker == "unknown":
-        raise CannotMeasure(
-            "no-reference", "the absent centre dot is not amid dots that have their ray"
-        )
+    _refuse_marker(observed, best, found)
     doubtful: list[int] = []
     rivals: list[Hypothesis] = []
     others = (
@@ -201,6 +192,20 @@ def decide(
     best = supported(observed, best, fit)
     open_holes = holes_left_open(observed, best, fit, settings.margin)
     return best, _with_rivals(open_holes, best, cheapest, rivals)
+
+
+def _refuse_marker(observed: Observation, best: Hypothesis, found: list[Hypothesis]) -> None:
+    """Raise ``no-reference`` or ``ambiguous-rows`` where the marker is not dark amid lit rays."""
+    if best.marker == "lit":
+        others_explain = any_explains(observed, [h for h in found if h.marker == "dark"])
+        raise CannotMeasure(
+            "ambiguous-rows" if others_explain else "no-reference",
+            "where the best rows have the absent centre dot, there is a dot",
+        )
+    if best.marker == "unknown":
+        raise CannotMeasure(
+            "no-reference", "the absent centre dot is not amid dots that have their ray"
+        )
 
 
 def _with_rivals(
