@@ -187,7 +187,7 @@ def test_a_scheme_compared_with_itself_does_not_differ(session: Session) -> None
 def test_why_nothing_can_be_measured(session: Session, copy_sample: CopySample) -> None:
     assert why_not_measurable(session) == ""
     session.update_setup({"laser": {"distance_mm": None}})
-    assert "Enter the laser" in why_not_measurable(session)
+    assert "Enter distance of the laser" in why_not_measurable(session)
     session.undo()
     with Session.create(session.path.with_name("empty.labsession")) as empty:
         assert why_not_measurable(empty) == "Import a recording first"
