@@ -44,7 +44,7 @@ SPECK_WIDTHS, SPECK_LIGHT = 2.0, 0.15
 """What comes so many of its widths near to a line, and has no more than this share of its light in
 all, is part of that line's side."""
 
-GATHERED_WIDTHS, GATHERED_LIGHT = (14.0, 30.0), 0.15
+GATHERED_WIDTHS, GATHERED_LIGHT = (14.0, 36.0), 0.15
 """All lines with this share of the brightest one's light lie within so many of their widths across
 and up: the pool gathers them to spots, too near each other for ridges."""
 

@@ -46,10 +46,6 @@ AGREES = 3.0
 LEAST_LINES = 3
 """Two lines and their ends are met by surfaces of both curvatures: they determine none."""
 
-UNMODELLED = 1.25
-"""Standard uncertainties are larger by this factor than points, ends and roughness give: ends have
-errors in common, and so have points of a bent line. So measured on the twin."""
-
 
 @dataclass(frozen=True)
 class LineFitSettings:
@@ -76,7 +72,7 @@ class LineFitSettings:
     jerk: float = 0.03
     settled: float = 0.05
     margin: float = 6.0
-    most_relative_sigma: float = 0.12
+    most_relative_sigma: float = 0.1
     most_misfit: float = 0.85
 
 
@@ -359,7 +355,7 @@ def _refined(
     agrees = np.abs(linear.residual) <= AGREES
     surface = LineSurface(
         SplineSurface(basis, coefficients),
-        UNMODELLED**2 * covariance,
+        covariance,
         np.rint(start.numbers).astype(np.int64),
         linear.point_mm[agrees] if agrees.sum() > 3 else linear.point_mm,
         float(np.sum(_cauchy(linear.residual))) / max(len(linear.residual) - 8, 1),
