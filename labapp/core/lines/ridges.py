@@ -140,7 +140,7 @@ def sampled(picture: Grey, place: FloatArray) -> Grey:
     light = cv2.remap(
         picture, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
     )
-    return np.asarray(light).ravel()[: len(place)]
+    return np.asarray(light, np.float32).ravel()[: len(place)]
 
 
 def _height(smooth: Grey, place: FloatArray, along: FloatArray, scale_px: float) -> FloatArray:
