@@ -5,12 +5,13 @@ from __future__ import annotations
 import itertools
 from collections.abc import Mapping
 from functools import partial
+from typing import Any
 
 import numpy as np
 import pyqtgraph as pg
 from PySide6.QtCore import QPointF, QRect, QRectF, Qt
 from PySide6.QtGui import QColor, QPalette, QResizeEvent
-from PySide6.QtWidgets import QBoxLayout, QWidget
+from PySide6.QtWidgets import QAbstractSpinBox, QBoxLayout, QWidget
 
 from labapp.core.geometry.rig import Rig
 from labapp.core.values import FloatArray
@@ -177,16 +178,18 @@ class BenchView(Sketch):
             found.append(plot.mapFromScene(QRectF(*corners).normalized()).boundingRect())
         return found
 
-    def _choose(self, plot: pg.PlotWidget, event: object) -> None:
+    def _choose(self, plot: pg.PlotWidget, event: Any) -> None:
         """A click on the letter of a dimension leads to its field."""
         if self._rig is None or self._view is None or not self._is_small:
             return
-        box, at = plot.getViewBox(), event.scenePos()  # type: ignore[attr-defined]
+        box, at = plot.getViewBox(), event.scenePos()
         for key, (_, place) in _dimensions(self._rig, self._view).items():
             there = box.mapViewToScene(QPointF(*place.tolist()))
             if self.boxes[key].plot is plot and (there - at).manhattanLength() < CLICK_PX:
-                self.boxes[key].field.editor.setFocus()
-                self.boxes[key].field.editor.selectAll()  # type: ignore[attr-defined]
+                editor = self.boxes[key].field.editor
+                assert isinstance(editor, QAbstractSpinBox)
+                editor.setFocus()
+                editor.selectAll()
 
     def take_colours(self) -> None:
         """Draw in the window's colours."""
