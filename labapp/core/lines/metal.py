@@ -16,7 +16,7 @@ from scipy.ndimage import gaussian_filter1d
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.line_pattern import LineRig, line_directions
 from labapp.core.geometry.optics import intersect_imaging_plane, intersect_level, reflect
-from labapp.core.images.dots import Image
+from labapp.core.images.dots import Grey, Image
 from labapp.core.lines.find_lines import LightLine
 from labapp.core.lines.ridges import sampled
 from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
@@ -156,7 +156,7 @@ def _straight_lines(
     return point, calibration.to_image(intersect_imaging_plane(point, away, rig.imaging_plane))
 
 
-def _light_along(picture: FloatArray, path: FloatArray) -> tuple[FloatArray, float, float]:
+def _light_along(picture: Grey, path: FloatArray) -> tuple[FloatArray, float, float]:
     """Light of each line along the fan, shape (k, f), its noise, and the lines' width, px.
 
     At each step of the fan, the light across all lines is the sum of their profiles and of a
@@ -171,7 +171,7 @@ def _light_along(picture: FloatArray, path: FloatArray) -> tuple[FloatArray, flo
     reach = float(np.abs(place).max()) + BESIDE_PX
     side = np.arange(-reach, reach + 0.5)
     at = middle[:, None] + side[:, None] * across[:, None]
-    seen = np.asarray(sampled(picture, at.reshape(-1, 2)), float).reshape(steps, -1)
+    seen = sampled(picture, at.reshape(-1, 2)).astype(np.float64).reshape(steps, -1)
     outer = np.r_[:OUTER_STEPS, steps - OUTER_STEPS : steps]
     best: tuple[float, FloatArray, float] | None = None
     for width in WIDTHS_PX:

@@ -82,7 +82,7 @@ class StudyWindow(ToolWindow):
 
     def _make_form(self) -> None:
         self.form.add_heading("Study")
-        self.add_to_form("Open a study …", "Choose a study file (TOML or CSV)", self.choose)
+        self.add_to_form("Open study…", "Choose a study file (TOML or CSV)", self.choose)
         self.form.add_heading("New study")
         self.recordings = PathField(
             "Recordings",
@@ -94,11 +94,11 @@ class StudyWindow(ToolWindow):
         self.matches = wrapping_label()
         self.form.add(self.recordings)
         self.form.add_wide(self.matches)
-        self.add_to_form("Choose a folder …", "Take all recordings in a folder", self.choose_folder)
+        self.add_to_form("Choose folder…", "Take all recordings in a folder", self.choose_folder)
         self.form.add(self.setup)
-        self.add_to_form("Choose a set-up …", "Choose a setup file", self.choose_setup)
+        self.add_to_form("Choose set-up…", "Choose a setup file", self.choose_setup)
         self.add_to_form(
-            "Make the study …", "Write a study file that lists these recordings", self.choose_new
+            "Make study…", "Write a study file that lists these recordings", self.choose_new
         )
         self.form.add_heading("Run")
         self.workers = NumberField(
@@ -253,7 +253,7 @@ class StudyWindow(ToolWindow):
     def _show(self) -> None:
         if self.study is not None:
             plan = self.study.plan
-            reading = ": reading the results …" * bool(self.looks.active)
+            reading = ": reading the results…" * bool(self.looks.active)
             self.words.setText(f"{studying.state_text(plan, self.found)}{reading}")
             self.list.show_table(studying.recordings_table(plan, self.found))
         if self.summary is not None:
