@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -65,3 +67,10 @@ def test_lines_of_a_convex_pool_that_cross_are_no_edges(bench):
     rng = np.random.default_rng(0)
     image = render_lines(pool, bench.line_rig, VIEW, LineLook(metal=0.4), rng).image
     assert pool_edges(image, bench.line_rig, bench.calibration) is None
+
+
+def test_too_few_lines_show_no_smooth_boundary(bench):
+    rig = replace(bench.line_rig, pattern=replace(bench.line_rig.pattern, count=3))
+    look, rng = LineLook(metal=0.4), np.random.default_rng(3)
+    image = render_lines(HOLLOW, rig, VIEW, look, rng).image
+    assert pool_edges(image, rig, bench.calibration) is None

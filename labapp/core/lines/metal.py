@@ -46,6 +46,9 @@ FRINGES = 2
 METAL_WIDTHS, METAL_SHARE = 2.5, 0.7
 """A line of which so much is within so many widths of the straight lines is one of these."""
 
+LEAST_LINES = 4
+"""Fewer cannot show that they end on a smooth boundary: a parabola passes through three ends."""
+
 MOST_OFF_MM, FLOOR_MM = 0.15, 0.1
 """The ends on one side are on a smooth boundary to so many mm RMS: lines of the pool that cross the
 straight ones end elsewhere. And what an end is not better known than, mm: blur spreads it."""
@@ -79,6 +82,8 @@ class PoolEdges(ReadOnlyArrays):
 def pool_edges(image: Image, rig: LineRig, calibration: ImageCalibration) -> PoolEdges | None:
     """Edges of the pool in a frame, shape (height, width); None where the metal reflects no lines.
 
+    None, too, for a pattern of fewer than `LEAST_LINES`.
+
     Parameters
     ----------
     image
@@ -86,6 +91,8 @@ def pool_edges(image: Image, rig: LineRig, calibration: ImageCalibration) -> Poo
     rig, calibration
         The bench; the work piece is at z = 0.
     """
+    if rig.pattern.count < LEAST_LINES:
+        return None
     fan = np.linspace(-rig.pattern.half_fan, rig.pattern.half_fan, FAN_STEPS)
     number = np.arange(1.0 - FRINGES, rig.pattern.count + 1 + FRINGES)
     point, path = _straight_lines(rig, calibration, number, fan)
@@ -173,24 +180,45 @@ def _light_along(picture: Grey, path: FloatArray) -> tuple[FloatArray, float, fl
     at = middle[:, None] + side[:, None] * across[:, None]
     seen = sampled(picture, at.reshape(-1, 2)).astype(np.float64).reshape(steps, -1)
     outer = np.r_[:OUTER_STEPS, steps - OUTER_STEPS : steps]
-    best: tuple[float, FloatArray, float] | None = None
-    for width in WIDTHS_PX:
-        bells = np.exp(-(((side[:, None] - place.T[:, None]) / width) ** 2) / 2)
-        straight = np.broadcast_to(
-            np.stack([np.ones_like(side), side / reach], axis=-1), (steps, len(side), 2)
-        )
-        design = np.concatenate([bells, straight], axis=-1)
-        inverse = np.linalg.pinv(design)
-        solved = (inverse @ seen[..., None])[..., 0]
-        rest = seen - (design @ solved[..., None])[..., 0]
-        misfit = float(np.sum(rest[outer] ** 2))
-        if best is None or misfit < best[0]:
-            grain = float(np.sqrt(misfit / (len(outer) * (len(side) - count - 2))))
-            gain = float(np.sqrt((inverse[:, :count] ** 2).sum(axis=-1).mean()))
-            best = misfit, solved[:, :count].T, width
-            noise = grain * gain
-    assert best is not None
-    return best[1], noise, best[2]
+    misfits = [_fitted(seen[outer], side, place.T[outer], width)[1] for width in WIDTHS_PX]
+    width = WIDTHS_PX[int(np.argmin(misfits))]
+    grain = np.sqrt(min(misfits) / (len(outer) * (len(side) - count - 2)))
+    light, _, gain = _fitted(seen, side, place.T, width)
+    return light.T, float(grain * gain), width
+
+
+def _fitted(
+    seen: FloatArray, side: FloatArray, place: FloatArray, width: float
+) -> tuple[FloatArray, float, float]:
+    """Least-squares fit of profiles on a straight background at each step of the fan.
+
+    Parameters
+    ----------
+    seen
+        Grey levels across the lines, shape (f, s).
+    side
+        Where they are, shape (s,), px.
+    place
+        Where the lines are, shape (f, k), px.
+    width
+        Standard deviation of the profiles, px.
+
+    Returns
+    -------
+    light, misfit, gain
+        Amplitudes of the profiles, shape (f, k); the sum of all squared residuals; and the root
+        mean square of an amplitude's noise, per noise of a pixel.
+    """
+    count = place.shape[1]
+    bells = np.exp(-(((side[:, None] - place[:, None]) / width) ** 2) / 2)
+    background = np.stack([np.ones_like(side), side / np.abs(side).max()], axis=-1)
+    background = np.broadcast_to(background, (len(seen), *background.shape))
+    design = np.concatenate([bells, background], axis=-1)
+    inverse = np.linalg.pinv(design)
+    solved = (inverse @ seen[..., None])[..., 0]
+    rest = seen - (design @ solved[..., None])[..., 0]
+    gain = np.sqrt((inverse[:, :count] ** 2).sum(axis=-1).mean())
+    return solved[:, :count], float(np.sum(rest**2)), float(gain)
 
 
 def _end(light: FloatArray, noise: float) -> tuple[float, float, float] | None:
