@@ -94,7 +94,7 @@ found = {
 with Session.open(sys.argv[1], read_only=True) as session:
     found["export page"] = dict(export.schemes(session))
     first = presenter.provenance(session.result(0, "toy"))
-    compared = comparison.compared(session, 0, ("toy", "fit"), presenter.Options()).told
+    compared = comparison.compared(session, 0, ("toy", "fit"), presenter.Options()).text
 found["other"] = comparison.other_scheme("toy")
 found["provenance"], found["compared"] = first, compared
 print(json.dumps(found))

@@ -161,7 +161,7 @@ def shown_by(window: MainWindow) -> Callable[[], bool]:
     if page.key == "capture":
         return lambda: page._seen == (None, space.frame)
     if page.key == "surface":
-        return lambda: page.told.result.frame == space.frame and is_drawn(page.view)
+        return lambda: page.surface_state.result.frame == space.frame and is_drawn(page.view)
     return lambda: True
 
 

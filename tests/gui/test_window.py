@@ -123,7 +123,7 @@ def test_opening_shows_the_results_and_closing_the_welcome_page(
     assert plain.windowTitle() == "gtaw — labapp"
     assert plain.side_panel.title.text() == "Surface"
     assert "All 30 frames are measured" in plain.side_panel.state.text()
-    assert plain.timeline.told.text().startswith("1 of 30")
+    assert plain.timeline.position_text.text().startswith("1 of 30")
     assert plain.preferences.current.recent == (str(path),)
     assert all(plain._docks[name].isVisible() for name in ("steps", "panel", "timeline"))
     plain.do("close")

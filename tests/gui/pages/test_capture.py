@@ -168,7 +168,7 @@ def test_choose_look_and_import(page: CapturePage, stack: Path, qtbot: QtBot) ->
     qtbot.waitUntil(lambda: "of the session" in page.title.text())
     assert session_of(page).frames.tolist() == [2, 4, 6, 8, 10]
     assert page.workspace.frame == 2
-    assert page.told_group.isVisibleTo(page.panel)
+    assert page.facts_group.isVisibleTo(page.panel)
     assert not page.chosen.isVisibleTo(page.panel)
     assert page.state(NOTHING) is NOTHING
 
@@ -317,7 +317,7 @@ def test_frames_of_another_size_than_the_calibration_picture_are_told(
     window.workspace.changed.emit()
 
     def told() -> str:
-        return " ".join(label.text() for label in page.told_group.findChildren(QLabel))
+        return " ".join(label.text() for label in page.facts_group.findChildren(QLabel))
 
     qtbot.waitUntil(lambda: "recording.tif" in told())
     assert "calibrated with" not in told()

@@ -81,7 +81,7 @@ def live_result(found: Measurement = OK) -> LiveResult:
 def test_figures_tell_how_they_stand_and_never_in_order_where_that_is_not_known():
     limits = Limits(width_mm=(6.0, 6.6), length_mm=(7.0, 8.0), height_mm=(0.301, None))
     shown = figures(live_result(), limits)
-    assert [(f.value, f.sigma, f.told, f.look) for f in shown] == [
+    assert [(f.value, f.sigma, f.verdict, f.look) for f in shown] == [
         ("6.700", "± 0.030", "▲ above 6.6", "alarm"),
         ("7.500", "± 0.040", "✓ within limits", "plain"),
         ("0.300", "± 0.003", "◆ at its limit", "plain"),
@@ -91,10 +91,10 @@ def test_figures_tell_how_they_stand_and_never_in_order_where_that_is_not_known(
         figures(live_result(DARK), limits),
         figures(live_result(), limits, age_s=OLD_S + 0.1),
     ):
-        assert [figure.told for figure in unknown] == ["? not known"] * 3
+        assert [figure.verdict for figure in unknown] == ["? not known"] * 3
         assert "alarm" not in [figure.look for figure in unknown]
     assert [figure.value for figure in figures(live_result(DARK), limits)] == ["–"] * 3
-    assert [figure.told for figure in figures(live_result())] == [""] * 3
+    assert [figure.verdict for figure in figures(live_result())] == [""] * 3
 
 
 def test_it_is_said_why_a_frame_has_no_figures_and_how_measuring_keeps_up():

@@ -155,7 +155,7 @@ def test_the_section_line_is_dragged(page: SurfacePage) -> None:
     line.movePoint(b, QPointF(3.0, 1.0), coords="parent")
     assert page.options.section == (0.0, 1.0)
     assert (page.angle.value(), page.offset.value()) == (0.0, 1.0)
-    cut = profile(page.told.reconstruction, 0.0, 1.0)
+    cut = profile(page.surface_state.reconstruction, 0.0, 1.0)
     along, height = page.profile._height.getData()
     known = np.isfinite(cut.height_mm)
     np.testing.assert_array_equal(along, cut.along_mm[known])
@@ -255,7 +255,7 @@ def test_a_point_read_off_has_the_height_and_its_sigma(page: SurfacePage) -> Non
     at = page.view._drawing.overlay.project(np.zeros((1, 3)))[0]
     page.view.read_point(QPointF(at[0], page.view.height() - at[1]))
     x, y, z = page.view.scene.mark_mm[0]
-    pool = page.told.reconstruction
+    pool = page.surface_state.reconstruction
     assert z == pytest.approx(
         float(pool.surface.height(np.array([x]), np.array([y]))[0]), abs=0.002
     )

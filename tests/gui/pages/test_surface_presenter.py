@@ -173,7 +173,7 @@ def test_two_schemes_are_compared_on_the_same_dots(session: Session) -> None:
     wanted = fit.measures.width_mm - ers.measures.width_mm
     assert float(difference.replace("−", "-")) == pytest.approx(wanted, abs=0.001)
     assert [row[0] for row in made.rows[-5:]] == ["ARE", "MRE", "ARE-I", "MRE-I", "Own ARE"]
-    assert made.told.startswith("Fit minus ERS, from the same dots")
+    assert made.text.startswith("Fit minus ERS, from the same dots")
 
 
 def test_a_scheme_compared_with_itself_does_not_differ(session: Session) -> None:
@@ -209,5 +209,5 @@ def test_surfaces_that_do_not_overlap_are_said_to(
     monkeypatch.setattr(comparison, "by_scheme", lambda _session, _frame, scheme: one[scheme])
     made = comparison.compared(session, 3, ("fit", "ers"), Options())
     assert made.difference is None
-    assert made.told == "Fit minus ERS, from the same dots: the two surfaces do not overlap."
+    assert made.text == "Fit minus ERS, from the same dots: the two surfaces do not overlap."
     assert made.rows
