@@ -167,7 +167,7 @@ def test_a_click_with_the_right_button_opens_the_menu(view: View3d, qtbot: QtBot
     click(view, QPoint(160, 120), Qt.MouseButton.RightButton)
     (menu,) = view.findChildren(QMenu)
     by = {action.text(): action for action in menu.actions() if action.text()}
-    assert {"Copy picture", "Copy point", "Look at all of it", "Top", "Oblique"} <= set(by)
+    assert {"Copy picture", "Copy point", "Show all", "Top", "Oblique"} <= set(by)
     assert not by["Copy point"].isEnabled()  # none was read off
     by["Top"].trigger()
     assert view.camera[5]

@@ -280,10 +280,11 @@ class BenchCheckPage(Page):
         self.mirrors.offer(("Copy table", self.mirrors.copy_text))
         fill(
             self.panel_layout,
-            *(hbox((self.add_button, 1), self.remove_button), self.list, self.mirror_form),
+            *(self.predict_button, hbox((self.add_button, 1), self.remove_button)),
+            *(self.list, self.mirror_form),
             *(hbox((self.check_button, 1), (self.use_button, 1)), self.answer),
             *(self.words, self._suspect_part(), self.mirrors_words, self.mirrors),
-            *(self.predict_button, self.predicted_words, self.predicted, 1),
+            *(self.predicted_words, self.predicted, 1),
         )
         self.lock_with_session(self.add_button)
         self._show_predicted(None)
