@@ -38,7 +38,7 @@ def check_of(text: str, covariance: np.ndarray | None = None) -> BenchCheck:
     })  # fmt: skip
     rig, calibration = adjusted_bench(before, made, checked=True)
     return BenchCheck(
-        "ok", "", "noise-like", (), (), (), before, rig, calibration, (), made
+        "ok", "", "noise-like", (), (), (), before, rig, calibration, (), (), made
     )  # fmt: skip
 
 

@@ -71,3 +71,14 @@ def test_a_full_disk_is_said_and_leaves_nothing(
     with pytest.raises(InputError, match="No space left on device"):
         simulate(scenario, tmp_path / "out", workers=1)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_calibrated_bench_can_be_simulated(tmp_path: Path) -> None:
+    """What a calibration says of its points is no property of the camera."""
+    path = next(path for path in shipped_scenarios() if path.stem == "concave")
+    covariance = [[0.01 * (row == column) for column in range(6)] for row in range(6)]
+    calibrated = f"[image_calibration]\npoints_covariance_px2 = {covariance}\n"
+    text = path.read_text("utf-8").replace("[image_calibration]\n", calibrated)
+    assert calibrated in text
+    (tmp_path / "own.toml").write_text(text, "utf-8")
+    assert read_scenario(tmp_path / "own.toml").recording.view == read_scenario(path).recording.view
