@@ -8,7 +8,7 @@ as peaks of the light down that column.
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
+import scipy
 
 from labapp.core.images.dots import Grey
 from labapp.core.lines.ridges import sampled
@@ -72,4 +72,4 @@ def _down(
     beside = np.arange(-REACH_WIDTHS * width_px, REACH_WIDTHS * width_px + 0.5)
     at = np.stack(np.broadcast_arrays(u[:, None] + beside, v[:, None]), axis=-1)
     light = sampled(picture, at.reshape(-1, 2)).reshape(len(v), -1).sum(axis=1).astype(float)
-    return -gaussian_filter1d(light, 2 * SHARPENED * width_px, order=2), light
+    return -scipy.ndimage.gaussian_filter1d(light, 2 * SHARPENED * width_px, order=2), light

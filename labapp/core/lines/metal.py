@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import gaussian_filter1d
+import scipy
 
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.line_pattern import LineRig, line_directions
@@ -102,7 +102,7 @@ def pool_edges(image: Image, rig: LineRig, calibration: ImageCalibration) -> Poo
     light, noise, width = _light_along(picture, path)
     own = slice(FRINGES, -FRINGES)
     point, light = point[own], light[own]
-    smooth = gaussian_filter1d(light, SMOOTHED_STEPS, axis=1, mode="nearest")
+    smooth = scipy.ndimage.gaussian_filter1d(light, SMOOTHED_STEPS, axis=1, mode="nearest")
     found = [
         (k, side, *end)
         for k in range(rig.pattern.count)
