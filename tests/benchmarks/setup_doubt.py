@@ -14,7 +14,7 @@ from __future__ import annotations
 import argparse
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from unittest import mock
 
 import numpy as np
@@ -23,7 +23,6 @@ from labapp.core.bench_check.adjustment import System, adjust
 from labapp.core.bench_check.check import adjusted_bench
 from labapp.core.bench_check.forecast import expected_sighting
 from labapp.core.bench_check.mirrors import Cap, Plate
-from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.perturbation import (
     Direction,
     directions,
@@ -72,7 +71,8 @@ def grown(pool: Pool, by: float, aside: FloatArray) -> Pool:
 def recorded(
     pools: Sequence[Pool],
     rig: Rig,
-    bench: SimulatedBench,
+    true: Rig,
+    to_image: Callable[[FloatArray], FloatArray],
     sigma_px: float,
     rng: np.random.Generator,
 ) -> tuple[Counter[str], list[Residuals]]:
@@ -83,8 +83,8 @@ def recorded(
     exact, known = replace(rig, uncertainty=None), rig.uncertainty
     assert known is not None
     for pool in pools:
-        made_dots = trace(pool, bench.rig)
-        place = bench.view.to_image(made_dots.plane_mm)
+        made_dots = trace(pool, true)
+        place = to_image(made_dots.plane_mm)
         inside = ((place > 3) & (place < np.array(SHAPE[::-1]) - 4)).all(axis=-1)
         shown = made_dots.visible & inside & (rng.random(inside.shape) > MISSING)
         ray, noise = np.argwhere(shown) + 1, rng.normal(0, sigma_px, (int(shown.sum()), 2))
@@ -136,7 +136,9 @@ def false_alarms(
             grown(pool.after(k / RATE_HZ), growth * s, way * s)
             for k, s in enumerate(share.tolist())
         ]
-        verdict = judge_setup(rig, *recorded(pools, rig, bench, sigma_px, rng))
+        verdict = judge_setup(
+            rig, *recorded(pools, rig, bench.rig, bench.view.to_image, sigma_px, rng)
+        )
         judged += "too few" not in verdict.reason
         doubted += verdict.is_doubtful
         if verdict.is_doubtful:
@@ -183,25 +185,14 @@ def smallest(
     return high
 
 
-@dataclass(frozen=True)
-class _View:
-    """What a camera with another image calibration sees."""
-
-    calibration: ImageCalibration
-
-    def to_image(self, plane_mm: FloatArray) -> FloatArray:
-        return self.calibration.to_image(plane_mm)
-
-
 def simulated(rig: Rig, one: Direction, size: float, pools: Sequence[Pool]) -> str:
     """What a recording says on a bench that is truly off: not by its linear response."""
     exact, offset = replace(rig, uncertainty=None), size * one.vector
     try:
         true = moved_rig(exact, offset)
-        camera = _View(moved_calibration(ASSUMED.axes, rig.imaging_plane, offset))
+        camera = moved_calibration(ASSUMED.axes, rig.imaging_plane, offset)
         rng = np.random.default_rng([SEED, 1])
-        bench = SimulatedBench(true, camera)  # type: ignore[arg-type]
-        verdict = judge_setup(rig, *recorded(pools, rig, bench, 0.16, rng))
+        verdict = judge_setup(rig, *recorded(pools, rig, true, camera.to_image, 0.16, rng))
     except ValueError as why:
         return f"impossible: {why}"
     if not verdict.is_doubtful:
@@ -222,7 +213,7 @@ def sizes(frames: int) -> None:
         egg(6.66, 3.0, 4.4, 0.29, (0.0, -0.6), (Oscillation(0.012, 22.0, k / RATE_HZ),))
         for k in range(frames)
     ]
-    _, samples = recorded(pools, rig, SimulatedBench(rig, VIEW), 0.16, rng)
+    _, samples = recorded(pools, rig, rig, VIEW.to_image, 0.16, rng)
     samples = samples[:: -(-len(samples) // MOST)] if frames > MOST else samples
     sightings = [expected_sighting(mirror, rig) for mirror in MIRRORS]
     system = System.of(rig, [one for one in sightings if one], None)

@@ -461,4 +461,5 @@ def test_heights_whose_error_one_plate_cannot_notice_are_named():
     assert 0.5 < of_misled.noticed_mm < 2.0
     assert error < of_right.pool_mm < 3 * error
     assert check_bench([high, second], RIG, CALIBRATION).status == "size-off"
+    assert blind_spots(replace(misled, status="size-off")) == ()
     assert blind_spots(check_bench([right, second], RIG, CALIBRATION)) == ()

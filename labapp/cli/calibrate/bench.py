@@ -159,6 +159,7 @@ def _print_check(check: BenchCheck) -> None:
     typer.echo(f"residuals: {check.verdict}")
     try:
         was, now = height_sigma(check.before), height_sigma(check.rig)
+        blind = blind_spots(check)
     except CannotMeasure:
         pass
     else:
@@ -166,7 +167,7 @@ def _print_check(check: BenchCheck) -> None:
             f"± of the height of a pool like a {EXPECTED.name}: "
             f"{was.total_sigma_mm:.4f} → {now.total_sigma_mm:.4f} mm"
         )
-        for spot in blind_spots(check):
+        for spot in blind:
             typer.echo(
                 f"not noticed: an error of the height in {spot.picture} below "
                 f"{spot.noticed_mm:.2g} mm; it puts that pool's height off by up to "

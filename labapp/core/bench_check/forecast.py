@@ -110,7 +110,8 @@ class BlindSpot:
 def blind_spots(check: BenchCheck, pool: Cap = EXPECTED) -> tuple[BlindSpot, ...]:
     """Heights of mirrors whose unnoticed error exceeds the ± of the expected pool's height.
 
-    A height that is wrong beyond its own ± is in no result's. The check is repeated with it
+    None unless the check's status is ``ok``: its set-up is not to be used otherwise. A height that
+    is wrong beyond its own ± is in no result's. The check is repeated with it
     (external reliability: Baarda 1968, A testing procedure for use in geodetic networks).
 
     Raises
@@ -118,6 +119,8 @@ def blind_spots(check: BenchCheck, pool: Cap = EXPECTED) -> tuple[BlindSpot, ...
     CannotMeasure
         If the pool cannot be measured with the adjusted set-up.
     """
+    if check.status != "ok":
+        return ()
     total, found = height_sigma(check.rig, pool).total_sigma_mm, []
     for k, picture in enumerate(check.pictures):
         noticed = next(one.noticed_mm for one in picture.sizes if one.name == "height")
@@ -128,7 +131,10 @@ def blind_spots(check: BenchCheck, pool: Cap = EXPECTED) -> tuple[BlindSpot, ...
 
 
 def _misled(check: BenchCheck, k: int, error_mm: float, pool: Cap) -> float:
-    """By how much a wrong height of a mirror would put a pool's height off, mm."""
+    """By how much a wrong height of a mirror would put a pool's height off, mm.
+
+    0 where the pool could not be measured then: no wrong height comes out.
+    """
     wrong = replace(check.sightings[k], mirror=_raised(check.sightings[k].mirror, error_mm))
     sightings = [wrong if n == k else one for n, one in enumerate(check.sightings)]
     system = System.of(check.before, sightings, released(check.before, check.free))
@@ -141,10 +147,13 @@ def _misled(check: BenchCheck, k: int, error_mm: float, pool: Cap) -> float:
     match = _expected_match(check.rig, pool)
     seen = calibration.to_plane(check.calibration.to_image(match.plane_mm))
     exact = [replace(one, uncertainty=None) for one in (check.rig, rig)]
-    right, found = (
-        measure_surface(fit.reconstruct(each, bench, FitSettings()), each, bench).height_mm
-        for each, bench in zip((match, replace(match, plane_mm=seen)), exact, strict=True)
-    )
+    try:
+        right, found = (
+            measure_surface(fit.reconstruct(each, bench, FitSettings()), each, bench).height_mm
+            for each, bench in zip((match, replace(match, plane_mm=seen)), exact, strict=True)
+        )
+    except CannotMeasure:
+        return 0.0
     return found - right
 
 

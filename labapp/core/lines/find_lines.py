@@ -1,7 +1,7 @@
 """Reflected lines of a frame: ridges joined through gaps and crossings, smoothed, with their ends.
 
 The pattern's own lines and the diffraction fringes beside them (§3.2.1, Fig. 3-9) are told apart by
-`line_numbers`.
+`numbering`.
 """
 
 from __future__ import annotations

@@ -33,8 +33,8 @@ TRIGGERS = {
     "line": "external signal",
 }
 
-APPART = 1e-3
-"""What the camera takes is said where it is so far, as a part, from what was requested."""
+DIFFERS = 1e-3
+"""Relative difference from which on a value that the camera takes is not the requested one."""
 
 PART_WORDS = (
     "Sizes are right only where the imaging plane was calibrated with a picture of this very "
@@ -187,7 +187,7 @@ class CameraFields(QObject):
         self._show(settings, feed.camera.limits)
         now = getattr(settings, name)
         if isinstance(wanted, float | int) and now is not None:
-            differs = abs(now - wanted) > APPART * abs(wanted)
+            differs = abs(now - wanted) > DIFFERS * abs(wanted)
         else:
             differs = now != wanted
         if differs and now is not None:

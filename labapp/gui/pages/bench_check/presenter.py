@@ -190,7 +190,7 @@ def _of_pool(
     """± of the pool's height before and after, and what would not be noticed."""
     try:
         before, after = (height_sigma(rig, pool) for rig in (found.before, found.rig))
-        blind = blind_spots(found, pool) if found.status == "ok" else ()
+        blind = blind_spots(found, pool)
     except CannotMeasure:
         return None, ()
     return (before.total_sigma_mm, after.total_sigma_mm), blind
