@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from PySide6.QtCore import QObject, Signal
+from PySide6.QtCore import QObject, QTimer, Signal
 
 from labapp.gui import dialogs
 from labapp.gui.drafts import folder_of, is_draft, new_draft
@@ -146,6 +146,14 @@ class Files(QObject):
             self.open(path)
         else:
             self.take(path)
+
+    def open_dropped(self, paths: Sequence[Path]) -> None:
+        """Open a file or folder that was dropped, once the other program has its pointer back."""
+        if len(paths) > 1:
+            words = "Drop one file, or the folder that holds the images"
+            self.workspace.notified.emit(words, True)
+        elif paths:
+            QTimer.singleShot(0, self, lambda: self.open_path(paths[0]))
 
     def open(self, path: Path) -> bool:
         """Open a session file, read-only if it is in use elsewhere and the operator agrees."""

@@ -14,6 +14,7 @@ from labapp.gui.shell.actions import MENUS, Action, Needs
 from labapp.gui.widgets.labels import plain_tip
 
 if TYPE_CHECKING:
+    from labapp.gui.shell.steps import Step
     from labapp.session.session import Session
 
 
@@ -85,6 +86,11 @@ class Menus:
             self.actions[name].setChecked(is_on)
         self.actions["undo"].setText(f"&Undo {undo}".rstrip())
         self.actions["redo"].setText(f"&Redo {redo}".rstrip())
+
+    def show_titles(self, steps: Sequence[Step]) -> None:
+        """Show steps as they are called in the session."""
+        for step in steps:
+            self.actions[f"step_{step.key}"].setText(step.title)
 
     def show_recent(self, paths: tuple[str, ...]) -> None:
         """List the sessions opened before."""

@@ -35,15 +35,7 @@ from labapp.gui.shell.messages import LogPanel, StatusLine
 from labapp.gui.shell.setups import Setups
 from labapp.gui.shell.standing import DOUBTFUL, TICKS, next_frame, standings
 from labapp.gui.shell.step_list import SidePanel, StepList
-from labapp.gui.shell.steps import (
-    STEPS,
-    Lead,
-    first_frame,
-    first_step,
-    lead,
-    read_only,
-    states,
-)
+from labapp.gui.shell.steps import STEPS, Lead, first_frame, first_step, lead, read_only, states
 from labapp.gui.theme import apply_theme
 from labapp.gui.widgets.timeline import Timeline
 from labapp.gui.workspace import Workspace
@@ -362,8 +354,7 @@ class MainWindow(QMainWindow):
         own = {key: page.state(self._states[key]) for key, page in self.pages.items()}
         steps = [step.of(session) for step in self._steps]
         self.step_list.show_titles(steps)
-        for step in steps:
-            self.menus.actions[f"step_{step.key}"].setText(step.title)
+        self.menus.show_titles(steps)
         self.step_list.show_states(self._states | own)
 
     def _show_measured(self) -> None:
@@ -475,15 +466,11 @@ class MainWindow(QMainWindow):
             event.acceptProposedAction()
 
     def dropEvent(self, event: QDropEvent) -> None:
-        """Open what was dropped, once the other program has its pointer back."""
+        """Give what was dropped to the page in view, or open it."""
         paths = [Path(url.toLocalFile()) for url in event.mimeData().urls() if url.isLocalFile()]
         event.acceptProposedAction()
-        if paths and self.page is not None and self.page.takes_files(paths):
-            return
-        if len(paths) > 1:
-            self.say("Drop one file, or the folder that holds the images", True)
-        elif paths:
-            QTimer.singleShot(0, self, lambda: self.files.open_path(paths[0]))
+        if self.page is None or not self.page.takes_files(paths):
+            self.files.open_dropped(paths)
 
     def closeEvent(self, event: QCloseEvent) -> None:
         """Stop all work, remember the layout and close the session.
@@ -497,13 +484,10 @@ class MainWindow(QMainWindow):
             beside.close()
         self.timeline.set_playing(False)
         self._show_docks(everywhere=True)
-        geometry, layout = _text(self.saveGeometry()), _text(self.saveState(LAYOUT_VERSION))
+        held = self.saveGeometry(), self.saveState(LAYOUT_VERSION)
+        geometry, layout = (bytes(one.toBase64().data()).decode("ascii") for one in held)
         self.preferences.remember(lambda before: replace(before, geometry=geometry, layout=layout))
         self.workspace.opened.disconnect(self._session_opened)
         self.workspace.close()
         self._rest.stop()
         event.accept()
-
-
-def _text(held: QByteArray) -> str:
-    return bytes(held.toBase64().data()).decode("ascii")
