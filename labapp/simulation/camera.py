@@ -9,7 +9,10 @@ import numpy as np
 from labapp.core.values import FloatArray, ReadOnlyArrays
 
 ROUNDS = 200
-"""Of the fixed point that takes a distortion back; it ends before, once nothing moves."""
+"""At most, of the fixed-point iteration that removes a distortion."""
+
+BLOCK = 1 << 14
+"""Points of one iteration: few enough to stay in the processor's cache."""
 
 
 @dataclass(frozen=True)
@@ -60,18 +63,25 @@ class Lens:
         return np.asarray(np.where((r2 < self._reach2)[..., None], seen * self.focal_px, np.nan))
 
     def straighten(self, seen_px: FloatArray) -> FloatArray:
-        """Take the distortion back: inverse of `distort`."""
-        seen = seen_px / self.focal_px
-        xy = seen
+        """Remove the distortion: the inverse of `distort`, shape (…, 2), px."""
+        seen = np.reshape(seen_px, (-1, 2)) / self.focal_px
+        xy = np.empty_like(seen)
+        for start in range(0, len(seen), BLOCK):
+            xy[start : start + BLOCK] = self._straightened(seen[start : start + BLOCK])
+        return np.asarray(xy.reshape(np.shape(seen_px)) * self.focal_px)
+
+    def _straightened(self, seen: FloatArray) -> FloatArray:
+        xy, bent = seen, self.p1 != 0 or self.p2 != 0
         with np.errstate(all="ignore"):
             for _ in range(ROUNDS):
                 x, y = xy[..., 0], xy[..., 1]
                 r2 = x**2 + y**2
                 former = xy
-                xy = (seen - self._tangential(x, y, r2)) / self._radial(r2)[..., None]
+                shifted = seen - self._tangential(x, y, r2) if bent else seen
+                xy = shifted / self._radial(r2)[..., None]
                 if not np.nanmax(np.abs(xy - former), initial=0.0) > 1e-13:
                     break
-        return np.asarray(xy * self.focal_px)
+        return xy
 
 
 @dataclass(frozen=True)

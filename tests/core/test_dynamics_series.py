@@ -139,8 +139,10 @@ def test_a_still_pool_has_no_events():
 def fitted_frames(pool, count, rate_hz, rng):
     """Frames of a pool of the twin, fitted to dots with noise of which 1 in 100 is lost."""
     near = None
+    still = None if pool.waves else trace(pool, OPEN_RIG)
     for k in range(count):
-        match = exact_match(trace(pool.after(k / rate_hz), OPEN_RIG), OPEN_RIG, None, 0.03, rng)
+        traced = still or trace(pool.after(k / rate_hz), OPEN_RIG)
+        match = exact_match(traced, OPEN_RIG, None, 0.03, rng)
         there, witness = rng.random(len(match.ray)) > 0.01, match.witness.copy()
         witness[tuple(match.ray[~there].T - 1)] = 0
         per_dot = ("ray", "dot", "reflected", "plane_mm", "plane_covariance_mm2")
