@@ -139,7 +139,7 @@ def test_a_still_pool_has_no_events():
 def fitted_frames(pool, count, rate_hz, rng):
     """Frames of a pool of the twin, fitted to dots with noise of which 1 in 100 is lost."""
     near = None
-    still = None if pool.waves else trace(pool, OPEN_RIG)
+    still = None if pool.terms else trace(pool, OPEN_RIG)
     for k in range(count):
         traced = still or trace(pool.after(k / rate_hz), OPEN_RIG)
         match = exact_match(traced, OPEN_RIG, None, 0.03, rng)
