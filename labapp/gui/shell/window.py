@@ -63,8 +63,8 @@ OF_A_FRAME = (
 )
 """Actions in the timeline's own menu."""
 
-PAGE_PX = 336
-"""Least height of a page: with all panels 492, of the 512 that 768 are at 150 %."""
+PAGE_PX = QSize(320, 336)
+"""Least size of a page: with all panels 680 × 492; 1024 × 768 at 150 % are 682 × 512."""
 
 
 class MainWindow(QMainWindow):
@@ -106,7 +106,7 @@ class MainWindow(QMainWindow):
     def _make_views(self) -> None:
         self.welcome = Welcome(self.workspace)
         self.stack = QStackedWidget()
-        self.stack.setMinimumHeight(PAGE_PX)  # else hidden pages could make the window grow
+        self.stack.setMinimumSize(PAGE_PX)  # else hidden pages could make the window grow
         self.empty = EmptyState()
         for each in (self.welcome, self.empty):
             self.stack.addWidget(each)

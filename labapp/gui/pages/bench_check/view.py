@@ -418,6 +418,7 @@ class _QuantityTable(ReadTable):
         name = "Quantities of the set-up, before and after the check"
         super().__init__(name, f"{name}: Ctrl+C copies it", COLUMNS)
         self.horizontalHeader().setSectionResizeMode(0, QHeaderView.ResizeMode.Stretch)
+        self.horizontalHeader().setMinimumSectionSize(self.fontMetrics().averageCharWidth() * 14)
         # Long names take more lines; the header reports a width before the cells have it.
         self._narrowed = QTimer(self, singleShot=True, interval=0)
         self._narrowed.timeout.connect(self.resizeRowsToContents)
