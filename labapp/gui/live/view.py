@@ -429,9 +429,7 @@ class LiveView(QObject):
         )
         form.add(self.camera)
         self.start_button = button("Start", "Show live what the camera sees", self.start)
-        self.find_button = button(
-            "Look for cameras", "Find the cameras that are connected", self.find
-        )
+        self.find_button = button("Find cameras", "List the cameras that are connected", self.find)
         self.answer, self.counts = Message(2), Message(2)
         self.figures, self.penetration = LiveFigures(), LivePenetration(self.workspace, self._watch)
         fields = FieldForm()

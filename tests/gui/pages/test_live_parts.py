@@ -412,14 +412,16 @@ def test_control_software_is_told_while_a_camera_is_watched(
     assert streams.words["lines"].text() == "○ Off"
     hand.enter(streams.ports["lines"], str(port))
     streams.boxes["lines"].click()
-    qtbot.waitUntil(lambda: streams.words["lines"].text().startswith(f"● 127.0.0.1:{port}: 0 pro"))
+    qtbot.waitUntil(
+        lambda: streams.words["lines"].text().startswith(f"● 127.0.0.1:{port}: 0 clients")
+    )
     connected = connect(port)
     file = connected.makefile("rb")
     connected.close()
     assert "labapp" in json.loads(file.readline())
     told = json.loads(file.readline())
     assert (told["width_mm"], told["alarm"], told["status"]) == (6.7, "", "ok")
-    qtbot.waitUntil(lambda: "1 program listens" in streams.words["lines"].text())
+    qtbot.waitUntil(lambda: "1 client connected" in streams.words["lines"].text())
     # Others are let in only where that is ticked, and then it is said what that means.
     assert not streams.warning.isVisible()
     streams.anywhere.click()

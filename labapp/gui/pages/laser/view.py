@@ -184,7 +184,7 @@ class LaserPage(Page):
         self.picture_part.add(self.scale)
         self.lengths = Message(2)
         self.picture_part.add_wide(self.lengths)
-        tip = "Put these lengths into the table, as one more reading"
+        tip = "Add these lengths to the table as a further reading"
         self.add_button = button("Add as a reading", tip, self.add_reading)
         self.picture_part.add_wide(self.add_button)
         return self.picture_part
