@@ -117,7 +117,7 @@ class LiveTrends(QWidget):
         self._below.addLayout(limits, 3)
         self._below.addWidget(others, 2, Qt.AlignmentFlag.AlignTop)
         self._fields = scrolled(below)
-        self._fields.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Maximum)
+        self._fields.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Preferred)
         name = "What is seen of the trends"
         self.canvas_parts = PartsBar(name, {"Plots": (self.plots,), "Limits": (self._fields,)})
         vbox(self.canvas_parts, (self.plots, 1), self._fields, of=self)
@@ -140,6 +140,7 @@ class LiveTrends(QWidget):
         form = FieldForm()
         for field in (self.last, self.unmeasured):
             form.add(field)
+        form.setMinimumWidth(form.minimumSizeHint().width())
         return form
 
     def resizeEvent(self, event: QResizeEvent) -> None:

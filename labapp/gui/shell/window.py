@@ -28,7 +28,7 @@ from labapp.gui.pages.welcome import Welcome
 from labapp.gui.preferences import THEMES, PreferencesStore
 from labapp.gui.shell.actions import ACTIONS, Needs
 from labapp.gui.shell.files import Files, title
-from labapp.gui.shell.focus import finish_edit
+from labapp.gui.shell.focus import finish_edit, show_in
 from labapp.gui.shell.lead import EmptyState
 from labapp.gui.shell.menus import Menus, steps_of
 from labapp.gui.shell.messages import LogPanel, StatusLine
@@ -388,7 +388,7 @@ class MainWindow(QMainWindow):
         if found is not None:
             self.empty.show_lead(page.key, found)
             self.empty.setAccessibleName(step.title)
-        self.stack.setCurrentWidget(page if found is None else self.empty)
+        show_in(self.stack, page if found is None else self.empty)
 
     def _frame_changed(self, frame: int) -> None:
         self.timeline.set_frame(frame)
