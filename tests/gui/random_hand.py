@@ -64,7 +64,7 @@ PURPOSES = {
         *("Choose file…", "New session from this recording…", "Import"),
         *("Start", "● Record", "Mark", "Take a frame", "Learn a pedal"),
         *("Lines of JSON over TCP", "Other machines may connect", "Acknowledge"),
-        "Stop the camera",
+        "Stop camera",
     ),
     "surface": ("Along X", "Compare", "&This frame", "Copy"),
     "trends": ("Load table…", "Width", "Height"),

@@ -39,7 +39,7 @@ WARNING = (
     "encryption. Protect it by a firewall."
 )
 
-PORT_PX = 140
+PORT_PX = 90
 
 IN_USE = "Choose another port, or end the program that has this one."
 
@@ -75,7 +75,7 @@ class LiveStreams(QWidget):
             lambda _: self._open_to_all(),
         )
         self.warning = selectable_label()
-        words = "Send every measured frame to control software"
+        words = "Send measures to control software"
         group = Group(words, grid, self.anywhere, self.warning)
         vbox(group, 1, of=self).setContentsMargins(8, 8, 8, 8)
         self.show_state()

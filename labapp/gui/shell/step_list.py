@@ -36,7 +36,7 @@ ICON_PX = 18
 NUMBER_PX = 14
 """Room around icon and number of a step."""
 
-LEAST_PX = 300
+LEAST_PX = 320
 """Least width of the panel: 683 are all that 1024 px are at 150 %."""
 
 STATE_LINES = 2

@@ -63,7 +63,7 @@ OF_A_FRAME = (
 )
 """Actions in the timeline's own menu."""
 
-PAGE_PX = QSize(320, 336)
+PAGE_PX = QSize(300, 336)
 """Least size of a page: with all panels 680 × 492; 1024 × 768 at 150 % are 682 × 512."""
 
 

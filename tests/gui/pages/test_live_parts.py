@@ -328,7 +328,7 @@ def test_an_alarm_that_nobody_saw_stays_in_view_when_the_camera_is_stopped(
     choose(page, "Trends and limits")
     hand.enter(view.canvas.trends.fields["width", 1], "6.6")
     qtbot.waitUntil(view.canvas.alarms.isVisible)
-    hand.button("Stop the camera")
+    hand.button("Stop camera")
     qtbot.waitUntil(lambda: view.live is None)
     assert view.canvas.alarms.words.text().startswith("△ over: Width")
     # … and when the next one is started, beside what that one raises.
@@ -436,7 +436,7 @@ def test_control_software_is_told_while_a_camera_is_watched(
     file.close()
     # It ends with the camera, and begins again with it.
     watch = view.live.watch
-    hand.button("Stop the camera")
+    hand.button("Stop camera")
     qtbot.waitUntil(lambda: not window.workspace.tasks.active)
     assert watch.stream("lines") is None
     start(page, qtbot)

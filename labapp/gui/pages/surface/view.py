@@ -80,7 +80,7 @@ SCREEN_DPI = 96.0
 GAP_PX = 6
 """Between groups of tools, and between their lines."""
 
-ANSWER_PX = 100
+ANSWER_PX = 80
 """Least room beside the buttons that save, to say where."""
 
 NARROW_FIELD = 84
