@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from labapp.gui.shell.window import MainWindow
     from labapp.gui.tasks import Tasks
 
-WITHOUT = "labapp --help tells what can be done on the command line"
+WITHOUT = "labapp --help lists the commands"
 
 BAD_INPUT = 2
 

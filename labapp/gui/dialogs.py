@@ -11,7 +11,7 @@ from PySide6.QtWidgets import QFileDialog, QMessageBox, QWidget
 from labapp.session.file.database import SUFFIX
 
 SESSIONS = f"Sessions (*{SUFFIX})"
-SETUP_FILES = "Set-up files (*.toml)"
+SETUP_FILES = "Setup files (*.toml)"
 EVERYTHING = "All files (*)"
 
 

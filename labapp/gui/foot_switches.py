@@ -79,7 +79,7 @@ class DevicesFound:
         parts = [f"Found: {', '.join(self.usable)}."] if self.usable else []
         known = [info.name for info in self.closed if info.is_pedal or info.is_3d]
         if known:
-            parts.append(f"▲ May not be read: {', '.join(known)}.")
+            parts.append(f"▲ No permission to read: {', '.join(known)}.")
         if not parts:
             parts = ["No known foot switch is plugged in; any other can be learned."]
         return "\n".join(parts)

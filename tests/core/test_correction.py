@@ -187,7 +187,7 @@ def test_the_reference_is_set_and_cleared() -> None:
 IMAGE = np.random.default_rng(0).normal(10.0, 1.0, (220, 340))
 
 REFUSED: list[tuple[Callable[[Correction], Correction], str]] = [
-    (lambda c: delete_dots(c, []), "no dot is chosen"),
+    (lambda c: delete_dots(c, []), "no dot is selected"),
     (lambda c: delete_dots(c, [LAST + 1]), f"no dot {LAST + 1}; there are {LAST + 1}"),
     (lambda c: move_dots(c, [-1], 0.0, 0.0), "no dot -1"),
     (lambda c: move_dots(c, [0], float("nan"), 0.0), "cannot be moved"),

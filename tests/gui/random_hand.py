@@ -59,15 +59,15 @@ PURPOSES = {
     "setup": ("Use defaults", "Load…", "Laser goggles are worn", "Water cooling is on"),
     "laser": ("Apply",),
     "plane": ("Load picture…", "Find O′ and the axes", "Apply"),
-    "bench_check": ("Add picture…", "Which pictures help most?", "Check", "Apply", "Remove"),
+    "bench_check": ("Add picture…", "Predict ± by pictures", "Check", "Apply", "Remove"),
     "capture": (
         *("Choose file…", "New session from this recording…", "Import"),
         *("Start", "● Record", "Mark", "Take a frame", "Learn a pedal"),
         *("Lines of JSON over TCP", "Other machines may connect", "Acknowledge"),
-        "Stop the camera",
+        "Stop camera",
     ),
     "surface": ("Along X", "Compare", "&This frame", "Copy"),
-    "trends": ("Read a table…", "Width", "Height"),
+    "trends": ("Load table…", "Width", "Height"),
     "export": ("Measures", "PLY", "Export"),
 }
 """Words of buttons, in the order in which they are pressed."""

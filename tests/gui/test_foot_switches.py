@@ -294,7 +294,7 @@ def test_without_the_right_to_read_it_the_rule_is_told_and_copied(
     # That it may not be read is a problem, and what to do is there without being asked for.
     qtbot.waitUntil(lambda: bool(window.status_line.unread))
     qtbot.waitUntil(panel.rights.isVisible)
-    assert "▲ May not be read: VEC Infinity foot pedal." in panel.words.text()
+    assert "▲ No permission to read: VEC Infinity foot pedal." in panel.words.text()
     assert "Found: PCsensor FootSwitch." in panel.words.text()
     hand.button("Copy the commands")
     copied = QApplication.clipboard().text()
@@ -307,7 +307,7 @@ def test_without_the_right_to_read_it_the_rule_is_told_and_copied(
     assert 'ATTRS{idVendor}=="1234", ATTRS{idProduct}=="00ab"' in QApplication.clipboard().text()
     bench.closed.clear()  # the rule is installed, and it was plugged in anew
     qtbot.waitUntil(connected(window))
-    hand.button("Look for devices")
+    hand.button("Find devices")
     qtbot.waitUntil(panel.rights.isHidden)
 
 
@@ -316,7 +316,7 @@ def test_where_there_is_no_foot_switch_it_is_said(start, bench: Bench, copy_samp
     window = start()
     window.files.open(copy_sample("thumb_tack"))
     panel, hand = panel_of(window), Hand(window)
-    hand.button("Look for devices")
+    hand.button("Find devices")
     qtbot.waitUntil(lambda: "No known foot switch" in panel.words.text())
     hand.button("Learn a pedal")
     told = "no foot switch is connected: plug it in"
@@ -333,7 +333,7 @@ def test_without_hidapi_it_is_said(start, copy_sample: CopySample, qtbot: QtBot,
     window = start()
     window.files.open(copy_sample("thumb_tack"))
     panel = panel_of(window)
-    Hand(window).button("Look for devices")
+    Hand(window).button("Find devices")
     qtbot.waitUntil(lambda: "hidapi is needed" in panel.words.text())
 
 

@@ -235,6 +235,21 @@ def test_another_frame_leaves_the_camera(view: View3d) -> None:
     assert view.camera == camera
 
 
+def test_a_view_of_another_size_shows_all_again_unless_it_was_moved(view: View3d) -> None:
+    small = view.camera
+    view.resize(800, 600)
+    view.grab()
+    assert view.camera[3] < small[3]  # a smaller angle: nearer
+    view.zoom(1.5)
+    moved = view.camera
+    view.resize(320, 240)
+    view.grab()
+    assert view.camera == moved
+    view.fit()
+    view.grab()
+    assert view.camera[3] == pytest.approx(small[3])
+
+
 def test_it_follows_the_window_to_dark(view: View3d) -> None:
     dark = QPalette()
     dark.setColor(QPalette.ColorRole.Base, QColor("#101418"))

@@ -18,6 +18,7 @@ from labapp.bundled import SAMPLE_TEXTS
 from labapp.errors import InputError
 from labapp.gui import app, dialogs
 from labapp.gui.drafts import drafts, drafts_folder
+from labapp.gui.pages import PAGES
 from labapp.gui.pages.dots.presenter import NUMBERS, detector_value
 from labapp.gui.pages.page import Page
 from labapp.gui.preferences import Preferences, read_preferences
@@ -717,3 +718,36 @@ def test_a_number_that_is_being_typed_is_kept_when_the_session_is_closed(
         assert held[key == "dots"] == float(number)
         if way == "quit":
             return
+
+
+def test_a_page_that_takes_the_place_of_an_empty_one_has_the_focus(
+    window: MainWindow, copy_sample: CopySample, qtbot: QtBot
+):
+    """Else the next key, such as Space to play, would go to whatever field Qt finds."""
+    assert window.files.open(copy_sample("thumb_tack"))
+    window.activateWindow()
+    qtbot.waitUntil(window.isActiveWindow)
+    window.show_step("surface")
+    page = window.page
+    assert page is not None
+    window.stack.setCurrentWidget(window.empty)
+    window.empty.setFocus()
+    window._show_lead()
+    assert window.stack.currentWidget() is page
+    assert QApplication.focusWidget() is page
+
+
+def test_the_window_fits_1024_px_at_150_percent(window: MainWindow, copy_sample: CopySample):
+    assert window.files.open(copy_sample("thumb_tack"))
+    for key in PAGES:
+        window.show_step(key)
+        least = window.minimumSizeHint()
+        assert least.width() <= 1024 / 1.5
+        assert least.height() <= 700 / 1.5
+    window.resize(window.minimumSizeHint())
+    let_draw()
+    assert window.step_list.item(0).text() == "1"
+    assert "Set-up" in window.step_list.item(0).toolTip()
+    window.resize(1280, 800)
+    let_draw()
+    assert window.step_list.item(0).text() == "1  Set-up"

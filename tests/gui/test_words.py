@@ -21,6 +21,9 @@ BANNED = {
     r"^Read$": "Dismiss",
     r"[Ss]ay where": "Locate…",
     r"^Usual values$": "Use defaults",
+    r"[Cc]hosen (dot|line|row)|^Choose (all|none|in doubt|a dot|a line|a row)": "select",
+    r"keeps from you|let you read|[Oo]ne moment|told apart|out of the noise": "plain words",
+    r"^Set-up files": "Setup files",
     r"\bput right\b|\bbears\b|\blets go\b|\bhanded over\b": "a plain verb",
 }
 """Patterns of old words, and what stands in their place."""

@@ -148,7 +148,7 @@ def _bench_check(hands: Hands, files: Path) -> None:
     hands.do("next_step")
     page = hands.on(BenchCheckPage)
     hands.picture("before")
-    hands.press("Which pictures help most?")
+    hands.press("Predict ± by pictures")
     hands.settle()
     picture = files / "plate.png"
     hands.asked("mirror", lambda: hands.press("Add picture…"), give(picture))
@@ -172,7 +172,7 @@ def _record(hands: Hands, files: Path) -> None:
     hands.press("Import")
     hands.picture("imported")
     hands.asked("import", lambda: hands.do("import"))
-    hands.press("Look for devices")
+    hands.press("Find devices")
     hands.picture("foot-switch")
 
 
@@ -190,8 +190,8 @@ def _film(hands: Hands) -> None:
     hands.wait(lambda: view.live and view.live.takes[0].frames > 150, "frames to be recorded")
     hands.picture("recording")
     hands.asked("recording-runs", lambda: hands.do("close"))
-    hands.press("■ End the recording")
-    hands.press("Stop the camera")
+    hands.press("■ End recording")
+    hands.press("Stop camera")
     hands.settle()
     hands.picture("second")
     hands.asked("next-session", lambda: hands.press("New session from this recording…"))
@@ -205,9 +205,14 @@ def _look_on(hands: Hands, page: CapturePage) -> None:
     hands.wait(lambda: canvas.surface.view.scene, "a live surface")
     hands.picture("live-surface")
     canvas.tabs.setCurrentIndex(list(PARTS).index("trends"))
+    canvas.trends.canvas_parts.setCurrentIndex(1)  # seen on a small screen only
     hands.enter("Width, max.", "6")
     hands.wait(canvas.alarms.isVisible, "an alarm")
+    if canvas.trends.canvas_parts.isVisible():
+        hands.picture("live-limits", trouble=True)
+    canvas.trends.canvas_parts.setCurrentIndex(0)
     hands.picture("live-alarm", trouble=True)
+    canvas.trends.canvas_parts.setCurrentIndex(1)
     hands.press("Acknowledge")
     hands.enter("Width, max.", "9")
     hands.wait(lambda: not canvas.alarms.isVisible(), "the alarm to go")
@@ -284,7 +289,7 @@ def _trends(hands: Hands, files: Path) -> None:
     hands.picture("spectrum")
     hands.choose("Spectrum of", "none")
     table = files / "current.csv"
-    hands.asked("signals", lambda: hands.press("Read a table…"), give(table))
+    hands.asked("signals", lambda: hands.press("Load table…"), give(table))
     hands.picture("signals")
     tool = _tool(hands, "dynamics", DynamicsWindow)
     hands.wait(lambda: tool.drawn and not tool.working, "the pool over time to be analysed")

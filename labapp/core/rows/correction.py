@@ -347,7 +347,7 @@ def _each(function: Callable[..., FloatArray], *dots: Dots) -> Dots:
 def _chosen(correction: Correction, dots: Indices) -> IntArray:
     chosen = np.asarray(dots)
     if chosen.ndim != 1 or len(chosen) == 0:
-        raise ValueError("no dot is chosen")
+        raise ValueError("no dot is selected")
     if chosen.dtype.kind not in "iu":
         raise ValueError("dots are chosen by their numbers")
     wrong = chosen[(chosen < 0) | (chosen >= len(correction.dots))]

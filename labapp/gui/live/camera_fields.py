@@ -23,7 +23,7 @@ from labapp.session.session import Session
 NUMBERS = {
     "exposure_us": ("Exposure", "µs", 1, 100.0, "How long each frame is exposed"),
     "gain_db": ("Gain", "dB", 1, 1.0, "Amplification: it brightens the noise, too"),
-    "rate_hz": ("Rate", "frames/s", 2, 10.0, "Frames a second"),
+    "rate_hz": ("Rate", "frames/s", 2, 10.0, "Frames per second"),
 }
 """Label, unit, decimals, step and tip of what is set by a number."""
 
@@ -76,9 +76,7 @@ class CameraFields(QObject):
 
     def _make_buttons(self, form: FieldForm) -> None:
         self.whole_button = button("Full sensor", "Read all of the sensor again", self._set_whole)
-        self.shoot_button = button(
-            "Take a frame", "Have the camera take a frame now", self._take_frame
-        )
+        self.shoot_button = button("Take a frame", "Take one frame now", self._take_frame)
         buttons = QWidget()
         hbox(self.shoot_button, self.whole_button, of=buttons)
         form.add_wide(buttons)

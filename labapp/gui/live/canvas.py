@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from PySide6.QtWidgets import QScrollArea, QStackedWidget, QTabBar, QWidget
+from PySide6.QtWidgets import QStackedWidget, QTabBar, QWidget
 
 from labapp.gui.live.figures import AlarmStrip
 from labapp.gui.live.streams import LiveStreams
@@ -47,7 +47,7 @@ class LiveCanvas(QWidget):
             self.tabs.addTab(words)
             self.tabs.setTabToolTip(k, tip)
         self.stack = QStackedWidget()
-        for part in (picture, self.surface, _scrolled(self.trends), _scrolled(self.streams)):
+        for part in (picture, self.surface, self.trends, scrolled(self.streams)):
             self.stack.addWidget(part)
         self.tabs.currentChanged.connect(self._choose)
         # Alarms below: what is above stays under the hand.
@@ -90,10 +90,3 @@ class LiveCanvas(QWidget):
         watch = self._watch()
         if watch is not None:
             self.show_status(watch)
-
-
-def _scrolled(part: QWidget) -> QScrollArea:
-    """A part that scrolls where the screen is small."""
-    area = scrolled(part)
-    area.setMinimumWidth(part.minimumSizeHint().width())
-    return area

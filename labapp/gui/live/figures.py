@@ -37,7 +37,7 @@ ACKNOWLEDGE_PX = 40
 Look = Literal["plain", "alarm", "old"]
 
 FIRST = "Measuring the first frame: this takes some seconds…"
-NO_SETUP = "Sizes are shown here, too, once the set-up is complete (steps 1 to 3)"
+NO_SETUP = "Sizes are shown here once the set-up is complete"
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,8 @@ from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.labels import Message, plain_label
 from labapp.gui.widgets.layouts import hbox, vbox
 
+BEGIN, END = "● Record", "■ End recording"
+
 BUTTON_PX, RING_BAR_PX = 44, 130
 """Least height of the buttons that are pressed in gloves; width of the bar beside them."""
 
@@ -35,7 +37,7 @@ class RecordBar(QWidget):
         line = hbox((self.state, 1), plain_label("Before the trigger:"), self.ring)
         self.recording = Message(2)
         self.record_button = button(
-            "● Record",
+            BEGIN,
             "Record from some seconds before now on, or end the recording (Space, Ctrl+R)",
             trigger,
         )
@@ -43,11 +45,18 @@ class RecordBar(QWidget):
             "Mark", "Note this moment beside the recording that runs (M)", mark
         )
         stop_button = button(
-            "Stop the camera", "Release the camera; a recording is finished first", stop
+            "Stop camera", "Release the camera; a recording is finished first", stop
         )
         buttons = ((self.record_button, 3), (self.mark_button, 1), (stop_button, 2))
         for each, _ in buttons:
             each.setMinimumHeight(BUTTON_PX)
+        font = self.record_button.font()
+        font.setBold(True)
+        self.record_button.setFont(font)
+        self.record_button.setText(END)
+        self.record_button.setMinimumWidth(self.record_button.sizeHint().width())
+        self.record_button.setText(BEGIN)
+        self.mark_button.setMinimumWidth(1)  # a style gives a short text more than it needs
         vbox(line, self.recording, hbox(*buttons), of=self).setContentsMargins(8, 2, 8, 4)
 
     def show_status(self, live: Live) -> None:
@@ -63,10 +72,8 @@ class RecordBar(QWidget):
         """Let the button that records say whether it does: by its words, its sign, and in red."""
         self.mark_button.setEnabled(recording)
         pressed = self.record_button
-        pressed.setText("■ End the recording" if recording else "● Record")
-        palette, font = QPalette(), pressed.font()
+        pressed.setText(END if recording else BEGIN)
+        palette = QPalette()
         if recording:
             palette.setColor(QPalette.ColorRole.ButtonText, RED[is_dark(palette)])
-        font.setBold(True)
         pressed.setPalette(palette)
-        pressed.setFont(font)

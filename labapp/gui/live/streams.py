@@ -39,7 +39,7 @@ WARNING = (
     "encryption. Protect it by a firewall."
 )
 
-PORT_PX = 140
+PORT_PX = 90
 
 IN_USE = "Choose another port, or end the program that has this one."
 
@@ -75,7 +75,7 @@ class LiveStreams(QWidget):
             lambda _: self._open_to_all(),
         )
         self.warning = selectable_label()
-        words = "Send every measured frame to control software"
+        words = "Send measures to control software"
         group = Group(words, grid, self.anywhere, self.warning)
         vbox(group, 1, of=self).setContentsMargins(8, 8, 8, 8)
         self.show_state()
@@ -144,7 +144,7 @@ class LiveStreams(QWidget):
     # --- what it shows ------------------------------------------------------------------------
 
     def show_state(self) -> None:
-        """Show how many programs listen, and how many frames were sent."""
+        """Show how many clients are connected, and how many frames were sent."""
         watch = self._watch()
         for kind in KINDS:
             stream = None if watch is None else watch.stream(kind)
@@ -158,11 +158,10 @@ def stream_text(stream: Stream | None, at_work: bool, problem: str) -> str:
     if problem:
         return f"⚠ {problem}"
     if stream is None:
-        return "○ One moment…" if at_work else "○ Off"
-    listen = "program listens" if stream.listeners == 1 else "programs listen"
-    message = pluralize(stream.sent, "frame")
+        return "○ Opening or closing…" if at_work else "○ Off"
+    clients, frames = pluralize(stream.listeners, "client"), pluralize(stream.sent, "frame")
     where = f"{stream.address} (every address of this machine)" * (ANY in stream.address)
-    return f"● {where or stream.address}: {stream.listeners} {listen}, {message} sent"
+    return f"● {where or stream.address}: {clients} connected, {frames} sent"
 
 
 def problem_text(error: InputError) -> str:

@@ -12,7 +12,7 @@ from labapp.export.rendering.scene import Scene
 from labapp.gui.live.figures import OLD_S
 from labapp.gui.views.view3d import LOOKS
 from labapp.gui.views.view3d_kinds import make_view3d
-from labapp.gui.widgets.buttons import button
+from labapp.gui.widgets.buttons import tool_button
 from labapp.gui.widgets.layouts import hbox, vbox
 from labapp.run.live_measuring import LiveResult
 from labapp.run.live_watch import LiveWatch
@@ -37,7 +37,7 @@ class LiveSurface(QWidget):
         self._shown_s = 0.0
         self._limits: tuple[float, float] | None = None
         looks = [
-            button(words, tip, partial(self.view.look, direction))
+            tool_button(words, tip, partial(self.view.look, direction))
             for direction, (words, tip) in LOOKS.items()
         ]
         row = hbox(*looks, 1)

@@ -8,14 +8,15 @@ from functools import partial
 import numpy as np
 from PySide6.QtCore import Qt
 from PySide6.QtGui import QResizeEvent
-from PySide6.QtWidgets import QBoxLayout, QGridLayout, QWidget
+from PySide6.QtWidgets import QBoxLayout, QGridLayout, QSizePolicy, QWidget
 
 from labapp.errors import InputError
 from labapp.gui.curves import PLAIN, Axis, Curve, Mark
 from labapp.gui.views.plots import PlotStack
 from labapp.gui.widgets.fields import FieldForm, NumberField
 from labapp.gui.widgets.labels import plain_label
-from labapp.gui.widgets.layouts import vbox
+from labapp.gui.widgets.layouts import scrolled, vbox
+from labapp.gui.widgets.parts import PartsBar
 from labapp.gui.workspace import Workspace
 from labapp.run.limits import LARGEST_MM, NAMES, Ends, Limits
 from labapp.run.live_trend import TREND_S, Trend
@@ -29,6 +30,9 @@ GAP_S = 0.5
 """Over a longer time without a frame no line is drawn."""
 
 MARKS = PLAIN, Mark("▪", "beyond its limit")
+
+LOW_PX = 460
+"""On a canvas lower than this plots and fields would leave each other no room."""
 
 ROOM_PX = 40
 """All fields stand beside each other where so much is left beside them."""
@@ -106,12 +110,17 @@ class LiveTrends(QWidget):
         }
         for (name, end), field in self.fields.items():
             field.edited.connect(partial(self._enter, name, end))
-        self._below = QBoxLayout(QBoxLayout.Direction.TopToBottom)
+        below = QWidget()
+        self._below = QBoxLayout(QBoxLayout.Direction.TopToBottom, below)
         self._below.setContentsMargins(8, 0, 8, 0)
         self._parts = limits, others = self._limits(), self._others()
         self._below.addLayout(limits, 3)
         self._below.addWidget(others, 2, Qt.AlignmentFlag.AlignTop)
-        vbox((self.plots, 1), self._below, of=self)
+        self._fields = scrolled(below)
+        self._fields.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Preferred)
+        name = "What is seen of the trends"
+        self.canvas_parts = PartsBar(name, {"Plots": (self.plots,), "Limits": (self._fields,)})
+        vbox(self.canvas_parts, (self.plots, 1), self._fields, of=self)
         workspace.changed.connect(self.refresh)
 
     def _limits(self) -> QGridLayout:
@@ -135,15 +144,12 @@ class LiveTrends(QWidget):
         return form
 
     def resizeEvent(self, event: QResizeEvent) -> None:
-        """Put all fields beside each other where there is room."""
+        """Put all fields beside each other where there is room; show plots or fields where not."""
         super().resizeEvent(event)
+        self.canvas_parts.fit(self, LOW_PX)
         way = QBoxLayout.Direction
         is_wide = self.width() >= sum(part.minimumSize().width() for part in self._parts) + ROOM_PX
         self._below.setDirection(way.LeftToRight if is_wide else way.TopToBottom)
-
-    def heightForWidth(self, _width: int) -> int:
-        """Be as low as there is room for: the plots scroll in themselves."""
-        return self.minimumSizeHint().height()
 
     # --- what it shows ------------------------------------------------------------------------
 

@@ -26,6 +26,7 @@ from labapp.gui.live.live import SIMULATED, Live, choices, setup_of
 from labapp.gui.live.penetration import LivePenetration
 from labapp.gui.live.plan_fields import PlanFields
 from labapp.gui.live.record_bar import RecordBar
+from labapp.gui.shell.steps import setup_to_do
 from labapp.gui.tasks import DONE, Control, Task
 from labapp.gui.views.picture import PictureView
 from labapp.gui.widgets.buttons import button
@@ -198,7 +199,8 @@ class LiveView(QObject):
         self._rings.setData([])
         self.measured_s, self._result = 0.0, None
         self.figures.show_figures(figures(None) if live.watch is not None else ())
-        self.figures.words.setText(NO_SETUP if live.watch is None else "")
+        to_do = "" if session is None else setup_to_do(session.setup_problems)
+        self.figures.words.setText("" if live.watch else f"{NO_SETUP}. {to_do}")
         self.figures.setup_words.setText("")
         self.canvas.set_live(live.watch is not None)
         self._rings.show()
@@ -429,9 +431,7 @@ class LiveView(QObject):
         )
         form.add(self.camera)
         self.start_button = button("Start", "Show live what the camera sees", self.start)
-        self.find_button = button(
-            "Look for cameras", "Find the cameras that are connected", self.find
-        )
+        self.find_button = button("Find cameras", "List the cameras that are connected", self.find)
         self.answer, self.counts = Message(2), Message(2)
         self.figures, self.penetration = LiveFigures(), LivePenetration(self.workspace, self._watch)
         fields = FieldForm()

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from PySide6.QtCore import Qt
-from PySide6.QtWidgets import QApplication, QWidget
+from PySide6.QtWidgets import QApplication, QStackedWidget, QWidget
 
 
 def go_to_part(parts: Sequence[QWidget], by: int) -> None:
@@ -43,6 +43,20 @@ def finish_edit(*parts: QWidget) -> None:
     focus = QApplication.focusWidget()
     if focus is not None and any(_holds(part, focus) for part in parts):
         focus.clearFocus()
+
+
+def show_in(stack: QStackedWidget, seen: QWidget) -> None:
+    """Show another widget of a stack, and give it the focus if it was in the former one.
+
+    Qt would give it to a field beside, which takes the keys of the window: Space plays no frames.
+    """
+    former, focus = stack.currentWidget(), QApplication.focusWidget()
+    if former is seen:
+        return
+    had_focus = former is not None and focus is not None and _holds(former, focus)
+    stack.setCurrentWidget(seen)
+    if had_focus:
+        seen.setFocus()
 
 
 def _holds(part: QWidget, widget: QWidget) -> bool:

@@ -33,7 +33,7 @@ class LogPanel(QListWidget):
     def __init__(self) -> None:
         super().__init__()
         self.setAccessibleName("Messages")
-        self.setToolTip("All messages since the app was started; Ctrl+C copies those chosen")
+        self.setToolTip("All messages since the app was started; Ctrl+C copies those selected")
         self.setSelectionMode(QAbstractItemView.SelectionMode.ExtendedSelection)
         self.setWordWrap(True)
         self.setTextElideMode(Qt.TextElideMode.ElideNone)

@@ -32,7 +32,7 @@ class FrameStatus(IntEnum):
 
 WORDS = {
     FrameStatus.NOT_MEASURED: "not measured",
-    FrameStatus.PULSE: "outshone by a pulse of the current",
+    FrameStatus.PULSE: "dimmer than a current pulse",
     FrameStatus.MEASURED: "measured",
     FrameStatus.CORRECTED: "corrected by hand",
     FrameStatus.DOUBTFUL: "in doubt: stands out, or changed since it was measured",

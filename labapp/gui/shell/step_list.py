@@ -5,7 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from PySide6.QtCore import QPointF, QRectF, QSize, Qt, Signal
-from PySide6.QtGui import QColor, QIcon, QPainter, QPalette, QPen, QPixmap, QPolygonF
+from PySide6.QtGui import (
+    QColor,
+    QIcon,
+    QPainter,
+    QPalette,
+    QPen,
+    QPixmap,
+    QPolygonF,
+    QResizeEvent,
+)
 from PySide6.QtWidgets import (
     QFrame,
     QListWidget,
@@ -23,6 +32,12 @@ from labapp.gui.widgets.labels import Message, plain_label, plain_tip, wrapping_
 from labapp.gui.widgets.layouts import fill, scrolled
 
 ICON_PX = 18
+
+NUMBER_PX = 14
+"""Room around icon and number of a step."""
+
+LEAST_PX = 320
+"""Least width of the panel: 683 are all that 1024 px are at 150 %."""
 
 STATE_LINES = 2
 """Room for how far a step is: the panel below stays where it is, whatever there is to say."""
@@ -101,21 +116,31 @@ class StepList(FollowsTheme, QListWidget):
             item.setSizeHint(QSize(0, self.fontMetrics().height() + 14))
             self.addItem(item)
         self.show_titles(steps)
-        self.setMinimumWidth(self.sizeHint().width())
+        # On a small screen the numbers and marks are left, with the titles in their tooltips.
+        self.setMinimumWidth(self.fontMetrics().horizontalAdvance("10") + ICON_PX + NUMBER_PX)
         self.currentRowChanged.connect(self._told)
         self.follow_theme()
 
     def sizeHint(self) -> QSize:
         """As wide as the longest title needs."""
         metrics = self.fontMetrics()
-        texts = [metrics.horizontalAdvance(self.item(row).text()) for row in range(self.count())]
+        texts = [metrics.horizontalAdvance(text) for text in self._texts()]
         return QSize(max([60, *texts]) + ICON_PX + 36, 200)
 
     def show_titles(self, steps: Sequence[Step]) -> None:
         """Show the same steps, as they are called in the session."""
         self._steps = tuple(steps)
-        for row, step in enumerate(self._steps):
-            self.item(row).setText(f"{row + 1}  {step.title}")
+        is_narrow = self.isVisible() and self.width() < self.sizeHint().width()
+        for row, text in enumerate(self._texts()):
+            self.item(row).setText(str(row + 1) if is_narrow else text)
+
+    def _texts(self) -> list[str]:
+        return [f"{row}  {step.title}" for row, step in enumerate(self._steps, 1)]
+
+    def resizeEvent(self, event: QResizeEvent) -> None:
+        """Show numbers alone where the titles have no room."""
+        super().resizeEvent(event)
+        self.show_titles(self._steps)
 
     def show_states(self, states: Mapping[str, State]) -> None:
         """Show how far every step is."""
@@ -125,8 +150,8 @@ class StepList(FollowsTheme, QListWidget):
         for row, step in enumerate(self._steps):
             state, item = states[step.key], self.item(row)
             item.setIcon(mark_icon(state.mark, dark, selected))
-            item.setToolTip(plain_tip(f"{state.mark.value.capitalize()}: {state.why}"))
             message = f"{row + 1} {step.title}: {state.mark.value}. {state.why}"
+            item.setToolTip(plain_tip(message))
             item.setData(Qt.ItemDataRole.AccessibleTextRole, message)
 
     def take_colours(self) -> None:
@@ -171,7 +196,7 @@ class SidePanel(FollowsTheme, QWidget):
         line.setFrameShape(QFrame.Shape.HLine)
         line.setForegroundRole(QPalette.ColorRole.Mid)
         fill(layout, self.title, self.hint, self.state, self.read_only, line, (self.stack, 1))
-        self.setMinimumWidth(320)
+        self.setMinimumWidth(LEAST_PX)
         self.follow_theme()
 
     def sizeHint(self) -> QSize:

@@ -248,7 +248,7 @@ def _capture(facts: Facts) -> State:
 def _dots(facts: Facts) -> State:
     if facts.without:
         missing, seen = pluralize(facts.without, "frame"), _seen(facts.session)
-        return State(Mark.ATTENTION, f"{missing} could not be measured: look at their {seen}")
+        return State(Mark.ATTENTION, f"{missing} could not be measured: check the {seen}")
     if facts.stale:
         return State(Mark.READY, f"{pluralize(facts.stale, 'frame')} to be measured again")
     if facts.measured == facts.count:

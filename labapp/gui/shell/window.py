@@ -28,7 +28,7 @@ from labapp.gui.pages.welcome import Welcome
 from labapp.gui.preferences import THEMES, PreferencesStore
 from labapp.gui.shell.actions import ACTIONS, Needs
 from labapp.gui.shell.files import Files, title
-from labapp.gui.shell.focus import finish_edit
+from labapp.gui.shell.focus import finish_edit, show_in
 from labapp.gui.shell.lead import EmptyState
 from labapp.gui.shell.menus import Menus, steps_of
 from labapp.gui.shell.messages import LogPanel, StatusLine
@@ -63,8 +63,8 @@ OF_A_FRAME = (
 )
 """Actions in the timeline's own menu."""
 
-PAGE_PX = 336
-"""Least height of a page: with all panels 492, of the 512 that 768 are at 150 %."""
+PAGE_PX = QSize(300, 336)
+"""Least size of a page: with all panels 680 × 492; 1024 × 768 at 150 % are 682 × 512."""
 
 
 class MainWindow(QMainWindow):
@@ -106,7 +106,7 @@ class MainWindow(QMainWindow):
     def _make_views(self) -> None:
         self.welcome = Welcome(self.workspace)
         self.stack = QStackedWidget()
-        self.stack.setMinimumHeight(PAGE_PX)  # else hidden pages could make the window grow
+        self.stack.setMinimumSize(PAGE_PX)  # else hidden pages could make the window grow
         self.empty = EmptyState()
         for each in (self.welcome, self.empty):
             self.stack.addWidget(each)
@@ -388,7 +388,7 @@ class MainWindow(QMainWindow):
         if found is not None:
             self.empty.show_lead(page.key, found)
             self.empty.setAccessibleName(step.title)
-        self.stack.setCurrentWidget(page if found is None else self.empty)
+        show_in(self.stack, page if found is None else self.empty)
 
     def _frame_changed(self, frame: int) -> None:
         self.timeline.set_frame(frame)

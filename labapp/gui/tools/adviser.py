@@ -71,7 +71,7 @@ class AdviserWindow(ToolWindow):
         )
         self.use_button = self.add_button(
             "Apply",
-            "Put this set-up into the session's; undo restores the former one",
+            "Apply this set-up to the session; undo restores the former one",
             self.use,
         )
         self.start_button = self.add_button(
@@ -105,7 +105,7 @@ class AdviserWindow(ToolWindow):
         self.headline = wrapping_label("Enter pools and limits, then press Advise.")
         self.place = ResultTable("Recommended set-up")
         self.kept = ResultTable("Constraints, and their margins")
-        self.costs = CellTable("What each mm and degree away costs")
+        self.costs = CellTable("Added error per mm and degree")
         self.sheet = Sheet("Bench, places of the laser, and cost curves")
         self.words = QWidget()
         tables = (self.place, self.kept, self.costs)

@@ -82,7 +82,7 @@ class DynamicsWindow(ToolWindow):
         self.words = wrapping_label()
         self.peak_words, self.response_words = wrapping_label(), wrapping_label()
         self.spectrum, self.series = Sheet("Spectrogram and spectrum"), Sheet("Series and events")
-        self.event_words = wrapping_label("No change stands out of the noise.")
+        self.event_words = wrapping_label("No change exceeds the noise.")
         self.shape = Sheet("Shape and course of the mode")
         self.modes, self.events = CellTable("Modes"), CellTable("Events")
         self.responses = CellTable("Responses")

@@ -107,7 +107,7 @@ def peak_text(found: Dynamics) -> str:
     there = np.isfinite(peak.frequency_hz)
     segments = f"{pluralize(len(there), 'segment')} of {gram.segment_s:.3g} s ({gram.method})"
     if not there.any():
-        return f"No oscillation stands out of the noise in {segments}."
+        return f"No oscillation exceeds the noise in {segments}."
     hertz, sigma = peak.frequency_hz[there], peak.frequency_sigma_hz[there]
     low, high = int(np.argmin(hertz)), int(np.argmax(hertz))
     ends = [f"{with_sigma(hertz[k], sigma[k])} Hz" for k in dict.fromkeys((low, high))]

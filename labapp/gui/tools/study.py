@@ -40,7 +40,7 @@ LOOK_S = 1.0
 
 NONE_YET = (
     "A study is a file that names recordings, each with its set-up and the conditions it was made "
-    "under. Open one, or choose a folder with recordings and press Make the study."
+    "under. Open one, or choose a folder with recordings and press Make study."
 )
 
 
@@ -98,7 +98,9 @@ class StudyWindow(ToolWindow):
         self.form.add(self.setup)
         self.add_to_form("Choose set-up…", "Choose a setup file", self.choose_setup)
         self.add_to_form(
-            "Make study…", "Write a study file that lists these recordings", self.choose_new
+            "Make study…",
+            "Write a study file that lists these recordings, and open it",
+            self.choose_new,
         )
         self.form.add_heading("Run")
         self.workers = NumberField(

@@ -54,7 +54,8 @@ class ToolWindow(QDialog):
         self.setWindowTitle(self.title)
         self.setWindowFlag(Qt.WindowType.WindowMaximizeButtonHint)
         self.form = FieldForm()
-        self.results = QVBoxLayout()
+        found = QWidget()
+        self.results = vbox(of=found)
         """Where the tool puts its results; its fields go into `form`."""
         self.message = Message(1)
         self.message.setAccessibleName("Last message")
@@ -69,7 +70,7 @@ class ToolWindow(QDialog):
         self.close_button = self.add_button(
             "Close", "Close this window and stop its work; what it found is kept", self.close
         )
-        self._lay_out()
+        self._lay_out(scrolled(found))  # on a small screen
         for signal in (self.tasks.changed, self.tasks.progressed):
             signal.connect(self._show_progress)
         self.tasks.failed.connect(lambda _, why: self.say(why, True))
@@ -80,14 +81,14 @@ class ToolWindow(QDialog):
         room = self.screen().availableSize() * PART_OF_SCREEN
         self.resize(QSize(*SIZE_PX).boundedTo(room))
 
-    def _lay_out(self) -> None:
+    def _lay_out(self, found: QWidget) -> None:
         column = QWidget()
         vbox(self.form, 1, of=column).setContentsMargins(0, 0, 8, 0)
         side = scrolled(column)
         side.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
         side.setFocusPolicy(Qt.FocusPolicy.NoFocus)
         side.setFixedWidth(FORM_PX + side.verticalScrollBar().sizeHint().width())
-        middle = hbox(side, (self.results, 1))
+        middle = hbox(side, (found, 1))
         fill(QVBoxLayout(self), (middle, 1), hbox((self.message, 1), self.bar), self.buttons)
         self.buttons.insertStretch(0, 1)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import pyqtgraph as pg
@@ -42,6 +43,13 @@ def make_plot(x_label: str, y_label: str = "", equal: bool = True) -> pg.PlotWid
     plot.setLabel("bottom", x_label)
     plot.setLabel("left", y_label)
     return plot
+
+
+def show_axes(plots: Sequence[pg.PlotWidget], shown: bool) -> None:
+    """Show the axes of drawings to scale, or leave their room to what is drawn."""
+    for plot in plots:
+        for side in ("left", "bottom"):
+            plot.showAxis(side, shown)
 
 
 def paint_axes(plot: pg.PlotWidget | pg.PlotItem, lines: QColor, text: QColor) -> None:

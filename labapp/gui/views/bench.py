@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping
 from functools import partial
 from typing import Any
@@ -11,15 +10,15 @@ import numpy as np
 import pyqtgraph as pg
 from PySide6.QtCore import QPointF, QRect, QRectF, Qt
 from PySide6.QtGui import QColor, QPalette, QResizeEvent
-from PySide6.QtWidgets import QAbstractSpinBox, QBoxLayout, QWidget
+from PySide6.QtWidgets import QAbstractSpinBox, QBoxLayout, QGridLayout, QWidget
 
 from labapp.core.geometry.rig import Rig
 from labapp.core.values import FloatArray
-from labapp.gui.views.axes import Sketch, draw_line, draw_text, make_plot, paint_axes
+from labapp.gui.views.axes import Sketch, draw_line, draw_text, make_plot, paint_axes, show_axes
 from labapp.gui.views.dimension import DimensionBox
 from labapp.gui.widgets.fields import NumberField
 from labapp.gui.widgets.labels import plain_tip
-from labapp.gui.widgets.layouts import hbox, vbox
+from labapp.gui.widgets.layouts import vbox
 from labapp.simulation.positioning import Fate, SideView
 
 RED, BLUE = {True: "#ff6b5e", False: "#c62828"}, {True: "#6cb6ff", False: "#1565c0"}
@@ -43,8 +42,8 @@ DRAWN = {
 
 IN_TOP_VIEW = ("imaging_plane.s_mm", "imaging_plane.width_mm")
 
-ROWS = (3, 3, 2)
-"""How many of the fields stand beside each other where they are not on the drawing."""
+BESIDE, BESIDE_PX = 3, 400
+"""So many fields stand beside each other below the drawing, one less on a narrower canvas."""
 
 NARROW_PX = 760
 """On a narrower canvas the enlarged view has no room."""
@@ -85,9 +84,10 @@ class BenchView(Sketch):
             key: DimensionBox(DRAWN[key], field, self.top if key in IN_TOP_VIEW else self.whole)
             for key, field in fields.items()
         }
-        self._rows = [hbox() for _ in ROWS]
+        self._beside = 0
         self._strip = QWidget()
-        vbox(*self._rows, of=self._strip).setContentsMargins(4, 2, 4, 0)
+        self._grid = QGridLayout(self._strip)
+        self._grid.setContentsMargins(4, 2, 4, 0)
         self._column.insertWidget(1, self._strip)
         for plot in (self.whole, self.top):
             plot.getViewBox().sigTransformChanged.connect(lambda _: self._place_fields())
@@ -110,9 +110,7 @@ class BenchView(Sketch):
             left, right, top = _extent(self._view)
             self.whole.setRange(xRange=(left, right), yRange=(-12.0, top), padding=0.02)
             first, last = _across(self._rig)
-            beyond = 15.0 * self._is_small  # for the words below the laser
-            across = {"xRange": (left, right + beyond), "yRange": (first, last)}
-            self.top.setRange(**across, padding=0.08)
+            self.top.setRange(xRange=(left, right), yRange=(first, last), padding=0.08)
             left, right = _near(self._view)
             self.near.setRange(xRange=(-left, right), yRange=(-0.4 * right, right), padding=0)
 
@@ -132,30 +130,27 @@ class BenchView(Sketch):
         self.describe(self._said)
         self.near.setVisible(is_drawn and not is_small and self.width() >= NARROW_PX)
         self._strip.setVisible(is_drawn and is_small)
+        beside = (BESIDE if self.width() >= BESIDE_PX else BESIDE - 1) if is_small else 0
+        if beside != self._beside:
+            self._beside = beside
+            self._move_fields()
         if is_small != self._is_small:
             self._is_small = is_small
             way = QBoxLayout.Direction
             self._views.setDirection(way.LeftToRight if is_small else way.TopToBottom)
-            for plot in (self.whole, self.top):
-                for side in ("left", "bottom"):
-                    plot.showAxis(side, not is_small)
-            self._move_fields()
+            show_axes((self.whole, self.top), not is_small)
             self._draw()
             self.fit()
 
     def _move_fields(self) -> None:
-        """Put the fields into the rows below the drawing, or on it."""
-        boxes = iter(self.boxes.values())
-        for count, row in zip(ROWS, self._rows, strict=True):
-            while row.count():
-                row.takeAt(0)
-            for box in itertools.islice(boxes, count):
-                if self._is_small:
-                    row.addWidget(box)
-                else:
-                    box.setParent(box.plot)
-                    box.show()
-            row.addStretch(1)
+        """Put the fields below the drawing, so many beside each other; or on it."""
+        for k, box in enumerate(self.boxes.values()):
+            self._grid.removeWidget(box)
+            if self._beside:
+                self._grid.addWidget(box, k // self._beside, k % self._beside)
+            else:
+                box.setParent(box.plot)
+                box.show()
 
     def _place_fields(self) -> None:
         """Put the fields at their dimensions, none over another, nor over what is drawn there."""
@@ -258,7 +253,8 @@ class BenchView(Sketch):
         fan = np.array([[0.0, -reach], laser, [0.0, reach]])
         draw_line(self.top, fan, pg.mkPen(BLUE[self._dark], width=1.4))
         self.top.plot(*laser[:, None], pen=None, symbol="s", symbolSize=13, symbolBrush=self._ink)
-        draw_text(self.top, f"full fan {fan_deg:.1f}°", laser, self._ink, (0.5, -0.4))
+        anchor = (1.0 if self._is_small else 0.5, -0.4)
+        draw_text(self.top, f"full fan {fan_deg:.1f}°", laser, self._ink, anchor)
         origin = plane.to_universal(ends)[0, [1, 0]]
         draw_text(self.top, "O′", origin, self._ink, (-0.3, 0.5))
 

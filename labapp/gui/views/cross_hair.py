@@ -7,15 +7,18 @@ from collections.abc import Sequence
 import numpy as np
 import pyqtgraph as pg
 from PySide6.QtCore import QRect, Qt
-from PySide6.QtGui import QPalette
+from PySide6.QtGui import QPalette, QResizeEvent
 
 from labapp.core.calibration.laser_calibration import LaserCalibration
-from labapp.gui.views.axes import Sketch, draw_line, draw_text, make_plot, paint_axes
+from labapp.gui.views.axes import Sketch, draw_line, draw_text, make_plot, paint_axes, show_axes
 from labapp.gui.views.dimension import DimensionBox
 from labapp.gui.widgets.fields import NumberField
 from labapp.gui.widgets.layouts import vbox
 
 Lengths = tuple[float, float, float]
+
+LOW_PX = 420
+"""On a canvas lower than this the axes would leave the cross no room."""
 
 
 class CrossHairView(Sketch):
@@ -40,6 +43,11 @@ class CrossHairView(Sketch):
         self.top.getViewBox().sigTransformChanged.connect(lambda _: self._place_fields())
         self.say("", False)
         self.follow_theme()
+
+    def resizeEvent(self, event: QResizeEvent) -> None:
+        """Leave out the axes on a low canvas: the lengths are the fields."""
+        super().resizeEvent(event)
+        show_axes((self.plot, self.top), self.height() >= LOW_PX)
 
     def show_laser(
         self, found: LaserCalibration, lengths_mm: Lengths, fan_angle_deg: float, words: str

@@ -300,7 +300,7 @@ class PictureView(Drawn):
         bar.addWidget(label)
         self._contrast = QSlider(Qt.Orientation.Horizontal)
         self._contrast.setRange(-3 * CONTRAST_STEPS, 5 * CONTRAST_STEPS)
-        self._contrast.setFixedWidth(80)
+        self._contrast.setFixedWidth(72)
         self._contrast.setAccessibleName("Contrast")
         self._contrast.setToolTip("Makes faint dots brighter, or bright ones darker ([ and ])")
         self._contrast.valueChanged.connect(lambda _: self._item.setLevels(self._shown_levels()))

@@ -92,6 +92,9 @@ class View3d(Drawn):
         self._scene: Scene | None = None
         self._drawing: Drawing | None = None
         self._wanted: Camera | Direction | None = None
+        self._fits = True
+        self._fitted_px: tuple[int, ...] = ()
+        """Whether all is in view, not turned or zoomed by hand; and the size for which it was."""
         self._side: Direction = "free"
         self._at = self._pressed = QPointF()
         self._point_mm: tuple[float, float] | None = None
@@ -148,6 +151,15 @@ class View3d(Drawn):
         if self._drawing is not None:
             self._drawing.look(direction)
             self._turned()
+        self._fits = True
+
+    def _refit(self) -> None:
+        """Bring all into view again in a window of another size, unless it was moved by hand."""
+        assert self._drawing is not None
+        size = tuple(self._drawing.plotter.window_size)
+        if self._fits and size != self._fitted_px:
+            self._drawing.look(self._side)
+        self._fitted_px = size
 
     def fit(self) -> None:
         """Look at all of it from the side that was chosen last."""
@@ -160,6 +172,7 @@ class View3d(Drawn):
 
     def set_camera(self, camera: Camera) -> None:
         """Take over another view's camera; emits no signal."""
+        self._fits = False
         if self._drawing is None:
             self._wanted = camera
         elif camera != self.camera:
@@ -278,6 +291,7 @@ class View3d(Drawn):
     # --- turning -----------------------------------------------------------------------------
 
     def _turned(self) -> None:
+        self._fits = False
         self._refresh()
         self.camera_changed.emit(self.camera)
 

@@ -70,6 +70,7 @@ class OffscreenView(View3d):
             assert self._drawing is not None
             if tuple(self._drawing.plotter.window_size) != self._pixels():
                 self._drawing.plotter.window_size = list(self._pixels())
+            self._refit()
             picture = self.picture()
         self._picture = None if picture is None else as_image(picture)
         if self._picture is not None:
@@ -142,6 +143,8 @@ class InteractiveView(View3d):
 
     def eventFilter(self, watched: QObject, event: QEvent) -> bool:
         """Read points off and open the menu; VTK turns, moves and zooms by itself."""
+        if event.type() == QEvent.Type.Resize:
+            self._refresh()  # when it has its new size
         if isinstance(event, QMouseEvent) and self._drawing is not None:
             if event.type() == QEvent.Type.MouseButtonPress:
                 self._pressed = event.position()
@@ -158,6 +161,7 @@ class InteractiveView(View3d):
             QWidget.update(self._drawing.plotter)
 
     def _interacted(self, *_: object) -> None:
+        self._fits = False
         self.camera_changed.emit(self.camera)
 
     def _refresh(self) -> None:
@@ -170,6 +174,7 @@ class InteractiveView(View3d):
         if self._draw():
             assert self._drawing is not None
             self._drawing.plotter.setVisible(True)
+            self._refit()
             QWidget.update(self._drawing.plotter)  # which renders, once
         elif self._drawing is not None:
             self._drawing.plotter.setVisible(False)

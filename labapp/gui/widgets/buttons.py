@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from PySide6.QtWidgets import QCheckBox, QPushButton
+from PySide6.QtCore import Qt
+from PySide6.QtWidgets import QCheckBox, QPushButton, QToolButton
 
 
 def button(text: str, tip: str, work: Callable[[], object]) -> QPushButton:
@@ -12,6 +13,18 @@ def button(text: str, tip: str, work: Callable[[], object]) -> QPushButton:
     button = QPushButton(text)
     button.setToolTip(tip)
     button.setAutoDefault(False)  # in a dialog Enter would press it, and it finishes a field
+    button.clicked.connect(lambda _: work())
+    return button
+
+
+def tool_button(
+    text: str, tip: str, work: Callable[[], object], button: QToolButton | None = None
+) -> QToolButton:
+    """A small button of a bar, which the keyboard reaches; ``button`` is one made before."""
+    button = button or QToolButton()
+    button.setText(text)
+    button.setToolTip(tip)
+    button.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
     button.clicked.connect(lambda _: work())
     return button
 

@@ -32,9 +32,10 @@ class PartsBar(QTabBar):
         self.currentChanged.connect(lambda _: self._show())
         self.hide()
 
-    def fit(self, canvas: QWidget) -> None:
-        """Follow a canvas that has become narrow or wide."""
+    def fit(self, canvas: QWidget, least_px: int = 0) -> None:
+        """Follow a canvas that has become narrow or wide, or lower or higher than all needs."""
         is_narrow = canvas.width() < NARROW * self.fontMetrics().averageCharWidth()
+        is_narrow = is_narrow or canvas.height() < least_px
         if is_narrow != self._is_narrow:
             self._is_narrow = is_narrow
             self.setVisible(is_narrow)

@@ -65,7 +65,6 @@ class Timeline(FollowsTheme, QWidget):
         self.counts.setTextFormat(Qt.TextFormat.RichText)
         self.counts.setAlignment(Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter)
         self.counts.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Preferred)
-        self.counts.setMinimumWidth(self.fontMetrics().horizontalAdvance("■ 0000   ") * 3)
         self.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Fixed)
         self._lay_out()
         self.follow_theme()
@@ -181,7 +180,10 @@ class Timeline(FollowsTheme, QWidget):
         return f"Frame {self._frames[position]}{when}"
 
     def _show_counts(self) -> None:
-        """A legend that counts the kinds that occur, in a word each where there is little room."""
+        """A legend that counts the kinds that occur: in a word each where there is little room.
+
+        It is empty on a small screen, where the tooltip of the scrubber has it.
+        """
         dark = is_dark(self.palette())
         kinds = self.scrubber.kinds
         found = np.bincount(kinds, minlength=len(self._ticks)) if len(kinds) else ()
@@ -198,9 +200,10 @@ class Timeline(FollowsTheme, QWidget):
                 parts.append(f"{count} {tick.words}")
         self.counts.setToolTip("\n".join(parts))
         self.counts.setAccessibleName(", ".join(parts))
-        self.counts.setText(" &nbsp; ".join(long))
-        if self.counts.sizeHint().width() > self.counts.width():
-            self.counts.setText(" &nbsp; ".join(short))
+        for texts in (long, short, []):
+            self.counts.setText(" &nbsp; ".join(texts))
+            if self.counts.sizeHint().width() <= self.counts.width():
+                break
 
     def resizeEvent(self, event: QResizeEvent) -> None:
         """Give the legend its words where there is room for them."""

@@ -324,11 +324,11 @@ def test_start_record_and_import_by_mouse_and_keys(
     page.setFocus()
     hand.press(Qt.Key.Key_Space)
     assert view.live.running is not None
-    assert view.bar.record_button.text() == "■ End the recording"
+    assert view.bar.record_button.text() == "■ End recording"
     assert not view.plan_fields.before.isEnabled()
     hand.press(Qt.Key.Key_M)
     qtbot.waitUntil(lambda: view.live.running.frames > 20)
-    hand.button("■ End the recording")
+    hand.button("■ End recording")
     session = window.workspace.session
     qtbot.waitUntil(lambda: session.recording is not None)
     take = view.live.takes[0]
@@ -345,7 +345,7 @@ def test_start_record_and_import_by_mouse_and_keys(
     hand.press(Qt.Key.Key_R, Qt.KeyboardModifier.ControlModifier)
     qtbot.waitUntil(lambda: "is kept beside the session" in said_in(window))
     assert len(session.frames) == take.frames
-    hand.button("Stop the camera")
+    hand.button("Stop camera")
     qtbot.waitUntil(lambda: not window.workspace.tasks.active)
     qtbot.waitUntil(lambda: "of the session" in page.title.text())
     assert not view.bar.isVisible()

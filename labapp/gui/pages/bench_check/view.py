@@ -36,6 +36,9 @@ from labapp.session.record import BenchCheckRecord, MirrorPicture
 
 NO_PICTURE = "Put a known mirror where the pool will be; add a picture of its dots, or drop it."
 
+NAME_LETTERS = 14
+"""Least width of a quantity's name in the table: the longest takes two lines."""
+
 COLOR = "#ffb000"
 LIST_ROWS, ROW_PX = 3, 24
 TABLE_PX, WIDE_PX = 400, 720
@@ -228,7 +231,7 @@ class BenchCheckPage(Page):
         session = self.session
         setup, record = session.setup, session.record
         self.start_task(
-            "Predicting what pictures tell",
+            "Predicting the effect of pictures",
             lambda _: presenter.predicted(setup, record),
             self._show_predicted,
         )
@@ -245,7 +248,7 @@ class BenchCheckPage(Page):
     # --- the panel ----------------------------------------------------------------------------
 
     def _make_panel(self) -> None:
-        self.predict_button = button("Which pictures help most?", "", self.predict)
+        self.predict_button = button("Predict ± by pictures", "", self.predict)
         name = "Predicted ± of the pool's height"
         self.predicted = FullTable(
             name, f"{name}: Ctrl+C copies it", ("After a check with", "±, mm")
@@ -254,7 +257,7 @@ class BenchCheckPage(Page):
         self.predicted_words = wrapping_label()
         tip = "Add pictures of a mirror's dots, taken by the camera in its place"
         self.add_button = button("Add picture…", tip, self._choose)
-        self.remove_button = button("Remove", "Take the picture off the list", self.remove)
+        self.remove_button = button("Remove", "Remove the picture from the list", self.remove)
         self.list = ReadTable("Pictures of mirrors", "Pictures and the mirrors that they show")
         self.list.setColumnCount(2)
         self.list.setHorizontalHeaderLabels(["Picture", "Mirror"])
@@ -366,7 +369,7 @@ class BenchCheckPage(Page):
         self._let(
             self.remove_button,
             self.locked or ("" if self.chosen else "No picture"),
-            "Take it off the list",
+            "Remove it from the list",
         )
 
     @staticmethod
@@ -417,12 +420,23 @@ class _QuantityTable(ReadTable):
     def __init__(self) -> None:
         name = "Quantities of the set-up, before and after the check"
         super().__init__(name, f"{name}: Ctrl+C copies it", COLUMNS)
-        self.horizontalHeader().setSectionResizeMode(0, QHeaderView.ResizeMode.Stretch)
+        self.horizontalHeader().setSectionResizeMode(0, QHeaderView.ResizeMode.Fixed)
         # Long names take more lines; the header reports a width before the cells have it.
         self._narrowed = QTimer(self, singleShot=True, interval=0)
-        self._narrowed.timeout.connect(self.resizeRowsToContents)
+        self._narrowed.timeout.connect(self._fit_names)
         self.horizontalHeader().sectionResized.connect(lambda *_: self._narrowed.start())
         self.offer(("Copy table", self.copy_text))
+
+    def resizeEvent(self, event: QResizeEvent) -> None:
+        """Give the names the room that is left, but never less than they need in two lines."""
+        super().resizeEvent(event)
+        self._narrowed.start()
+
+    def _fit_names(self) -> None:
+        taken = sum(self.columnWidth(column) for column in range(1, self.columnCount()))
+        least = NAME_LETTERS * self.fontMetrics().averageCharWidth()
+        self.setColumnWidth(0, max(least, self.viewport().width() - taken))
+        self.resizeRowsToContents()
 
     def show_rows(self, rows: Sequence[presenter.QuantityRow]) -> None:
         """Show quantities, each group of them below its heading."""

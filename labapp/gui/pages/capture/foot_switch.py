@@ -47,7 +47,7 @@ class FootSwitchPanel(Group):
             "Learn a pedal", "Wait until a pedal of any device is pressed", self._learn
         )
         self.look_button = button(
-            "Look for devices", "See which foot switches are plugged in", self.switches.look
+            "Find devices", "List the foot switches that are plugged in", self.switches.look
         )
         form = FieldForm()
         self.action = ChoiceField(
@@ -68,7 +68,7 @@ class FootSwitchPanel(Group):
     def _make_rights(self) -> None:
         form = FieldForm()
         self.closed = ChoiceField(
-            "May not be read", tooltip="Devices that the system keeps from you: choose yours"
+            "No permission", tooltip="Devices that you have no permission to read: choose yours"
         )
         form.add(self.closed)
         self.commands = QPlainTextEdit()
@@ -76,13 +76,13 @@ class FootSwitchPanel(Group):
         self.commands.setTabChangesFocus(True)
         self.commands.setWordWrapMode(QTextOption.WrapMode.WrapAtWordBoundaryOrAnywhere)
         self.commands.setFixedHeight(LINES * self.commands.fontMetrics().lineSpacing() + 14)
-        self.commands.setAccessibleName("Commands that let you read it")
+        self.commands.setAccessibleName("Commands that give permission")
         self.commands.setToolTip(
             "Type them in a terminal, then unplug the device and plug it in again"
         )
         self.copy_button = button(
             "Copy the commands",
-            "Copy the commands that let you read it, for a terminal",
+            "Copy the commands that give permission, for a terminal",
             self._copy,
         )
         self.closed.edited.connect(lambda _: self._show_commands())

@@ -406,7 +406,7 @@ class CapturePage(Page):
             return
         # A folder of images has no ending; files are chosen otherwise.
         ask = ask_file if missing.suffix else ask_folder
-        if found := ask(self, f"Where is {missing.name}?", self._folder()):
+        if found := ask(self, f"Locate {missing.name}", self._folder()):
             self.relink(found)
 
     def relink(self, path: Path) -> None:

@@ -84,7 +84,7 @@ class Editor:
             self.selection = np.flatnonzero(np.isin(self.correction.lattice.row, rows))
 
     def choose_all(self) -> None:
-        """Choose every dot."""
+        """Select every dot."""
         self.selection = np.arange(len(self.dots_px))
 
     def choose_doubtful(self) -> None:
@@ -134,7 +134,7 @@ class Editor:
         return True
 
     def delete(self) -> bool:
-        """Take the chosen dots out."""
+        """Delete the selected dots."""
         chosen = self.selection
         done = self._edit(_of("delete", chosen), lambda c: core.delete_dots(c, chosen))
         self.selection = NOTHING if done else self.selection
@@ -161,7 +161,7 @@ class Editor:
         return self._edit(label, lambda c: picking.numbered_by_neighbours(c, _some(chosen)))
 
     def put_in_doubt(self) -> bool:
-        """Take row and column from the chosen dots."""
+        """Put the selected dots in doubt: without row and column."""
         chosen = self.selection
         return self._edit(_of("put in doubt", chosen), lambda c: core.clear_rows(c, chosen))
 
@@ -184,7 +184,7 @@ class Editor:
 
         def edit(correction: Correction) -> Correction:
             if len(chosen) != 1 or not correction.sited[chosen[0]]:
-                raise ValueError("choose one dot that has a row: the row is split at it")
+                raise ValueError("select one dot that has a row: the row is split at it")
             dot = int(chosen[0])
             lattice = correction.lattice
             return core.split_row(
@@ -194,12 +194,12 @@ class Editor:
         return self._edit(f"split {_named(self.rows)}", edit)
 
     def merge(self) -> bool:
-        """Make one row of the two that the chosen dots are in."""
+        """Merge the two rows of the selected dots."""
         rows = self.rows
 
         def edit(correction: Correction) -> Correction:
             if len(rows) != 2:
-                raise ValueError("choose dots of the two rows to merge")
+                raise ValueError("select dots of the two rows to merge")
             return core.merge_rows(correction, rows[1], into=rows[0])
 
         return self._edit(f"merge {_named(rows)}", edit)
@@ -248,13 +248,13 @@ class Editor:
 
 def _some(dots: IntArray) -> IntArray:
     if not len(dots):
-        raise ValueError("no dot is chosen")
+        raise ValueError("no dot is selected")
     return dots
 
 
 def _wanted(rows: list[int]) -> list[int]:
     if not rows:
-        raise ValueError("choose a row, or a dot that has one")
+        raise ValueError("select a row, or a dot that has one")
     return rows
 
 

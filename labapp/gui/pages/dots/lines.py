@@ -25,7 +25,7 @@ STATUSES = {
     "folded-lines": "The pool focuses the lines to points: they can be counted, but show no shape",
     "too-few-lines": "One line alone determines no surface",
     "followed": "The line is followed",
-    "pulse": "A pulse of the current outshines the line",
+    "pulse": "A current pulse is brighter than the line",
     "line-lost": "The line is not where it is expected",
     "line-numbers": "More lines than the pattern has, or their numbers do not follow each other",
 }

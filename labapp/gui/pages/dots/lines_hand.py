@@ -31,8 +31,8 @@ CUT_WHERE = "Click where the line is to be cut (Esc: leave it)"
 
 UNMET = {
     "lines": "There are no lines that can be corrected in this frame",
-    "line": "Choose a line first",
-    "two": "Choose two lines first",
+    "line": "Select a line first",
+    "two": "Select two lines first",
     "corrected": "This frame is as it was found: nothing was corrected",
 }
 
@@ -65,9 +65,9 @@ class LinesHand(Tool):
         self._needs: list[tuple[QAction, str, str]] = []
         self.actions = [
             self._action("Cut", "C", "Cut a line in two: click where", self.cut, "lines"),
-            self._action("Join", "J", "Make one line of the two that are chosen", self.join, "two"),
-            self._action("Delete", "Del", "Take the chosen lines out", self.delete, "line"),
-            self._action("Choose none", "Esc", "Choose no line, and leave a cut", self.escape, ""),
+            self._action("Join", "J", "Join the two selected lines", self.join, "two"),
+            self._action("Delete", "Del", "Delete the selected lines", self.delete, "line"),
+            self._action("Select none", "Esc", "Select no line, or cancel a cut", self.escape, ""),
             self._action("Back to automatic", "Ctrl+Backspace",
                          "Forget the corrections of this frame", self.automatic, "corrected"),
         ]  # fmt: skip
@@ -179,7 +179,7 @@ class LinesHand(Tool):
         self._edit("join two lines", lambda now: join_lines(now, one, other))
 
     def delete(self) -> None:
-        """Take the chosen lines out."""
+        """Delete the selected lines."""
         chosen = sorted(self.chosen, reverse=True)
 
         def edit(now: LineCorrection) -> LineCorrection:

@@ -89,7 +89,7 @@ class LinesPanel(QWidget):
         self.lines = LineList()
         self.buttons: dict[str, QToolButton] = {}
         self.number = NumberField(
-            "Number of the chosen line", lowest=0, highest=999, decimals=0, optional=True,
+            "Number of the selected line", lowest=0, highest=999, decimals=0, optional=True,
             tooltip="Its number in the pattern, growing towards the head; empty: found by the "
             "fit. Pieces of one line have the same",
         )  # fmt: skip
@@ -106,7 +106,7 @@ class LinesPanel(QWidget):
     def show_chosen(self, lines: Sequence[int], asked: str, number: int, why: str) -> None:
         """Show the chosen lines, from the lowest up: what is asked for, and a number by hand."""
         count = len(lines)
-        words = f"{count} chosen" if count else "Click a line to choose it, Shift adds one"
+        words = f"{count} selected" if count else "Click a line to select it, Shift adds one"
         self.chosen.setText(asked or words)
         self.number.set_value(number or None)
         self.number.lock(why)

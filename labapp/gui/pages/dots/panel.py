@@ -161,15 +161,15 @@ class DotsPanel(QWidget):
             made.editor.setMinimumWidth(made.fontMetrics().horizontalAdvance("0000") + 34)
             return made
 
-        self.row = field("Row of the chosen dots", "Their row, counted from the bottom up (T)")
-        self.column = field("Column of the chosen dots", "Their column, counted from the left")
+        self.row = field("Row of the selected dots", "Their row, counted from the bottom up (T)")
+        self.column = field("Column of the selected dots", "Their column, counted from the left")
         self.reference_row = field("Row of the reference", "Row of the pattern's dark centre")
         self.reference_column = field("Column of the reference", "Column of that dark centre")
         grid = QGridLayout()
         for k, words in enumerate(("", "Row", "Column")):
             grid.addWidget(plain_label(words), 0, k)
         lines = (
-            ("Chosen dots", self.row, self.column),
+            ("Selected dots", self.row, self.column),
             ("Reference", self.reference_row, self.reference_column),
         )
         for line, (words, *pair) in enumerate(lines, 1):
@@ -228,7 +228,7 @@ class _RowList(ReadTable):
 
     def __init__(self) -> None:
         tip = (
-            "The rows as they lie in the frame: ↑ and ↓ choose one, Shift adds; then shift it "
+            "The rows as they lie in the frame: ↑ and ↓ select one, Shift adds; then shift it "
             "(Ctrl+← →), block it (B), merge two (M)"
         )
         super().__init__("Rows", tip, ("Row", "Dots", "Columns", ""))

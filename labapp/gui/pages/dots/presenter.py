@@ -225,9 +225,9 @@ def row_lines(correction: Correction) -> tuple[RowLine, ...]:
 def chosen_words(correction: Correction | None, selection: Sequence[int]) -> str:
     """What is chosen, in a few words."""
     if correction is None or not len(selection):
-        return "Nothing chosen: click a dot, or draw a box"
+        return "Nothing selected: click a dot, or draw a box"
     if len(selection) > 1:
-        return f"{len(selection)} dots chosen"
+        return f"{len(selection)} dots selected"
     n = int(selection[0])
     row, column = int(correction.lattice.row[n]), int(correction.lattice.column[n])
     u, v = correction.dots.image_px[n]
@@ -261,10 +261,10 @@ def unmet_need(need: Need, seen: DotsState | None, selection: IntArray, rows: Se
 UNMET: dict[Need, str] = {
     "rows": "There are no rows yet",
     "reference": "No reference is known",
-    "dots": "Choose a dot first",
-    "site": "Choose one dot that has a row first",
-    "row": "Choose a row first, or a dot that has one",
-    "two rows": "Choose dots of two rows first",
+    "dots": "Select a dot first",
+    "site": "Select one dot that has a row first",
+    "row": "Select a row first, or a dot that has one",
+    "two rows": "Select dots of two rows first",
     "corrected": "This frame is as it was found: nothing was corrected",
 }
 

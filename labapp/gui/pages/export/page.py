@@ -95,7 +95,7 @@ class ExportPage(Page):
 
     def _show_plan(self, session: Session) -> None:
         self.plan = made = plan(session, self.request, self.workspace.frame)
-        self.files.setText("\n".join(made.files) or "Nothing.")
+        self.files.setText("\n".join(made.files) or "Nothing is selected.")
         self.notes.setText("\n".join(made.notes))
         self._boxes["solid"].setEnabled(self.request.has_mesh)
         part, drawn = self.request.which == "part", self.request.has_view
@@ -293,7 +293,7 @@ class ExportPage(Page):
         self.notes = wrapping_label()
         self.again_button = button(
             "Measure now",
-            "Measure the chosen frames that are not measured or are out of date",
+            "Measure the selected frames that are not measured or are out of date",
             self.measure_again,
         )
         keep_room(self.again_button)

@@ -184,7 +184,7 @@ class LaserPage(Page):
         self.picture_part.add(self.scale)
         self.lengths = Message(2)
         self.picture_part.add_wide(self.lengths)
-        tip = "Put these lengths into the table, as one more reading"
+        tip = "Add these lengths to the table as a further reading"
         self.add_button = button("Add as a reading", tip, self.add_reading)
         self.picture_part.add_wide(self.add_button)
         return self.picture_part
@@ -204,7 +204,7 @@ class LaserPage(Page):
         self.table.setRowCount(max(LEAST_ROWS, count + 1))
         for column, lengths in enumerate(readings.lengths_mm):
             for row, length in enumerate(lengths):
-                self.table.setItem(row, column, _cell(f"{length:g}"))
+                self.table.setItem(row, column, _cell(_length(length)))
         self.table.blockSignals(False)
         self.table.fit()
         self.fan.set_value(readings.fan_angle_deg)
@@ -263,7 +263,7 @@ class LaserPage(Page):
 
     def _enter_length(self, column: int, value: float | None) -> None:
         """Put the length that was entered in the drawing into the table."""
-        self.table.setItem(0, column, _cell("" if value is None else f"{value:g}"))
+        self.table.setItem(0, column, _cell("" if value is None else _length(value)))
 
     # --- the picture ------------------------------------------------------------------------
 
@@ -356,3 +356,8 @@ def _cell(text: str) -> QTableWidgetItem:
     item = QTableWidgetItem(text)
     item.setTextAlignment(RIGHT)
     return item
+
+
+def _length(value_mm: float) -> str:
+    """A length to 0.01 mm, as callipers show it; more digits where they were typed."""
+    return max(f"{value_mm:.2f}", f"{value_mm:g}", key=len)

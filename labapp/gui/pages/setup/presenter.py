@@ -183,14 +183,14 @@ POOL = (
 )  # fmt: skip
 
 EXPERIMENT = (
-    Entry("title", "Title", tooltip="What this experiment is called"),
-    Entry("operator", "Operator", tooltip="Who does it"),
+    Entry("title", "Title", tooltip="Title of the experiment"),
+    Entry("operator", "Operator", tooltip="Name of the operator"),
     Entry("material", "Material", tooltip="Of the work piece"),
     Entry("thickness_mm", "Thickness", "mm", "Of the work piece", 0, 1000, 0.5, 2),
     Entry("current_a", "Current", "A", "Weld current", 0, 2000, 1, 1),
     Entry("voltage_v", "Voltage", "V", "Arc voltage", 0, 1000, 0.5, 1),
     Entry("travel_speed_mm_s", "Travel speed", "mm/s", "Of the torch", 0, 1000, 0.1, 2),
-    Entry("gas", "Shielding gas", tooltip="Which gas"),
+    Entry("gas", "Shielding gas", tooltip="Shielding gas, such as argon"),
     Entry("gas_flow_l_min", "Gas flow", "l/min", "Of the shielding gas", 0, 1000, 0.5, 1),
     Entry("notes", "Notes", tooltip="Anything else worth noting; Ctrl+Enter saves it"),
 )  # fmt: skip

@@ -27,7 +27,7 @@ from labapp.gui.views.bench import DRAWN, BenchView
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField, TextField
 from labapp.gui.widgets.labels import Message, heading, show_words, wrapping_label
-from labapp.gui.widgets.layouts import fill, hbox
+from labapp.gui.widgets.layouts import fill, hbox, vbox
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
 from labapp.session.checklist import EQUIPMENT, SAFETY, STEPS, Items, tick, ticked
@@ -217,7 +217,7 @@ class SetupPage(Page):
         )
         self._filling = load, usual
         buttons = QWidget()
-        hbox(load, save, usual, of=buttons)
+        vbox(hbox(load, save), usual, of=buttons)
         form.add_wide(buttons)
         form.add_wide(self.answer)
         self.status = Message(3)

@@ -20,9 +20,7 @@ from PySide6.QtGui import (
     QShowEvent,
 )
 from PySide6.QtWidgets import (
-    QBoxLayout,
     QHBoxLayout,
-    QLayout,
     QMenu,
     QSplitter,
     QStackedWidget,
@@ -55,6 +53,7 @@ from labapp.gui.views.picture_files import RASTERS, ask_paper, with_suffix, writ
 from labapp.gui.views.steering import Steering
 from labapp.gui.views.view3d import LOOKS, View3d, as_image
 from labapp.gui.views.view3d_kinds import make_view3d
+from labapp.gui.widgets.buttons import tool_button
 from labapp.gui.widgets.fields import ChoiceField, NumberField
 from labapp.gui.widgets.labels import Message
 from labapp.gui.widgets.layouts import fill, hbox, vbox
@@ -78,7 +77,10 @@ FILM_PX = (1280, 720)
 
 SCREEN_DPI = 96.0
 
-ANSWER_PX = 150
+GAP_PX = 6
+"""Between groups of tools, and between their lines."""
+
+ANSWER_PX = 80
 """Least room beside the buttons that save, to say where."""
 
 NARROW_FIELD = 84
@@ -179,11 +181,12 @@ class SurfacePage(Page):
             field.edited.connect(self._enter_section)
         direction = hbox(self.angle.label, (self.angle, 1))
         place = hbox(self.offset.label, (self.offset, 1))
+        along = hbox()
         for words, angle in (("Along X", 0.0), ("Along Y", 90.0)):
             cut = partial(self._set_section, angle, 0.0)
             what = f"Cut {words.lower()}, through the electrode's axis"
-            direction.addWidget(_tool(words, what, cut))
-        return _Tools(direction, place)
+            along.addWidget(tool_button(words, what, cut))
+        return _Tools(direction, along, place)
 
     def _tools(self) -> QWidget:
         self.colour = ChoiceField(
@@ -207,32 +210,33 @@ class SurfacePage(Page):
         for field in (self.colour, self.high):
             field.label.setWordWrap(False)
         looks = [
-            _tool(words, what, partial(self._look, direction))
+            tool_button(words, what, partial(self._look, direction))
             for direction, (words, what) in LOOKS.items()
         ]
         what = "Draw heights as they are, or as many times as high as before (E)"
-        self.true_scale = _tool("1:1", what, self.toggle_scale, _Toggle())
+        self.true_scale = tool_button("1:1", what, self.toggle_scale, _Toggle())
         self.true_scale.setCheckable(True)
         self.true_scale.setAccessibleName("True scale")
-        self.save = _tool(
+        self.save = tool_button(
             "Save…",
             "Save the 3-D picture at its size on paper: PNG, TIFF or JPEG (Ctrl+Shift+P)",
             self.save_picture,
         )
         self.save.setShortcut(QKeySequence("Ctrl+Shift+P"))
         what = "Write a film (MP4) of all frames, seen as the 3-D view is now"
-        self.film = _tool("Film…", what, self.save_film)
+        self.film = tool_button("Film…", what, self.save_film)
         what = "Put two schemes side by side, or show one again"
-        self.comparing = _tool("Compare", what, self._toggle_compare, _Toggle())
+        self.comparing = tool_button("Compare", what, self._toggle_compare, _Toggle())
         self.comparing.setCheckable(True)
         self.saved = Message(1)
-        self.saved.setMinimumWidth(1)  # a small screen has no more room
+        self.saved.setMinimumWidth(ANSWER_PX)
         self._view_actions()
         coloured = self.colour.label, self.colour
         return _Tools(
-            hbox(*coloured, self.high.label, self.high, self.true_scale, self._parts_button(), 1),
-            hbox(*looks, (self.saved, 1), self.save, self.film, self.comparing),
-            room_px=ANSWER_PX,
+            hbox(*coloured, 1),
+            hbox(self.high.label, self.high, self.true_scale, self._parts_button(), 1),
+            hbox(*looks, 1),
+            hbox((self.saved, 1), self.save, self.film, self.comparing),
         )
 
     def _view_actions(self) -> None:
@@ -259,7 +263,7 @@ class SurfacePage(Page):
             action.setToolTip(what)
             action.toggled.connect(lambda ticked, name=name: self._set(**{name: ticked}))
             self.parts[name] = action
-        button = _tool("Show", "Choose what the 3-D view shows", lambda: None)
+        button = tool_button("Show", "Choose what the 3-D view shows", lambda: None)
         button.setMenu(menu)
         button.setPopupMode(QToolButton.ToolButtonPopupMode.InstantPopup)
         return button
@@ -442,28 +446,38 @@ class SurfacePage(Page):
 
 
 class _Tools(QWidget):
-    """Two lines of tools: side by side where there is room, else under each other."""
+    """Groups of tools: as many beside each other as there is room for."""
 
-    def __init__(self, *lines: QHBoxLayout, room_px: int = 12) -> None:
+    def __init__(self, *groups: QHBoxLayout) -> None:
         super().__init__()
-        self._room_px = room_px
-        self._lines = lines
-        self._box = QBoxLayout(QBoxLayout.Direction.LeftToRight, self)
-        self._box.setContentsMargins(0, 0, 0, 0)
-        self._box.setSizeConstraint(QLayout.SizeConstraint.SetNoConstraint)
-        for line in lines:
-            self._box.addLayout(line)
+        self._groups = [QWidget(self) for _ in groups]
+        for widget, group in zip(self._groups, groups, strict=True):
+            widget.setLayout(group)
 
     def resizeEvent(self, event: QResizeEvent) -> None:
         super().resizeEvent(event)
-        wanted = sum(line.sizeHint().width() for line in self._lines) + self._room_px
-        way = QBoxLayout.Direction
-        self._box.setDirection(way.LeftToRight if self.width() >= wanted else way.TopToBottom)
-        self.setFixedHeight(self._box.sizeHint().height())
+        rows: list[list[QWidget]] = []
+        left = 0
+        for group in self._groups:
+            wanted = group.sizeHint().width() + GAP_PX
+            if not rows or wanted > left:
+                rows.append([])
+                left = self.width() + GAP_PX
+            rows[-1].append(group)
+            left -= wanted
+        height = max(group.sizeHint().height() for group in self._groups)
+        for k, row in enumerate(rows):
+            x = 0
+            for group in row:
+                wanted = group.sizeHint().width()
+                width = self.width() - x if group is row[-1] else wanted
+                group.setGeometry(x, k * (height + GAP_PX), width, height)
+                x += wanted + GAP_PX
+        self.setFixedHeight(len(rows) * (height + GAP_PX) - GAP_PX)
 
     def minimumSizeHint(self) -> QSize:
-        widest = max(line.minimumSize().width() for line in self._lines)
-        return QSize(widest, self._box.sizeHint().height())
+        widest = max(group.minimumSizeHint().width() for group in self._groups)
+        return QSize(widest, self.height())
 
 
 class _Toggle(QToolButton):
@@ -482,14 +496,3 @@ class _Toggle(QToolButton):
 def _sigma(reconstruction: Reconstruction, x_mm: float, y_mm: float) -> float:
     """Standard uncertainty of the height at a place, mm; NaN where the scheme gives none."""
     return float(sigma_at(reconstruction, np.array([x_mm]), np.array([y_mm]))[0])
-
-
-def _tool(
-    words: str, what: str, work: Callable[[], None], button: QToolButton | None = None
-) -> QToolButton:
-    button = button or QToolButton()
-    button.setText(words)
-    button.setToolTip(what)
-    button.setFocusPolicy(Qt.FocusPolicy.StrongFocus)
-    button.clicked.connect(lambda _: work())
-    return button

@@ -249,13 +249,13 @@ class TrendsPage(Page):
         )
         self.start.edited.connect(self._start_at)
         self.read_button = button(
-            "Read a table…",
+            "Load table…",
             "Read current, voltage, wire feed from a table (CSV, TDMS); keep them in the session",
             self.choose_signals,
         )
         self.forget_button = button(
             "Remove",
-            "Take current and voltage out of the session; undo restores them",
+            "Remove current and voltage from the session; undo restores them",
             lambda: self.workspace.attempt(lambda session: session.set_signals(None)),
         )
         keep_room(self.start, self.start.label, self.forget_button)

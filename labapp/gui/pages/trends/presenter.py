@@ -282,7 +282,7 @@ def _spectrum(course: Trend | None, timed: bool) -> tuple[tuple[Curve, ...], Axi
         axis,
         f"Strongest at {frequency:.{place}f} {axis.unit}: {amplitude:.2g} {quantity.unit}. "
         f"Frames {found.first} to {found.last} ({found.count}), Hann window; oscillations nearer "
-        f"than {found.resolution:.2g} {axis.unit} are not told apart.",
+        f"than {found.resolution:.2g} {axis.unit} are not resolved.",
     )
 
 
