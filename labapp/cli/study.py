@@ -153,14 +153,14 @@ def _finish(study: Study, surfaces: bool) -> None:
     """Write the results, print the means, and exit with 1 unless all is measured."""
     summary = study.results(surfaces=surfaces)
     from labapp.run.study.page import rounded
-    from labapp.run.study.plan import shown_condition
+    from labapp.run.study.plan import named_condition
 
     states = [one.status for one in summary.recordings]
     for one in states:
         if one.state != "done" and one.problem:
             typer.echo(f"{one.recording.name}: {one.problem}", err=True)
     for group in summary.groups[:SHOWN]:
-        at = ", ".join(f"{name} {shown_condition(v)}" for name, v in group.conditions.items())
+        at = ", ".join(named_condition(name, v) for name, v in group.conditions.items())
         means = (
             f"{size} {rounded(group.means[f'{size}_mm'].mean, group.means[f'{size}_mm'].sigma)} mm"
             for size in ("width", "length", "height")

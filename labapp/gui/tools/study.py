@@ -29,6 +29,7 @@ from labapp.run.study.status import Progress, RecordingStatus
 from labapp.run.study.study import Study
 from labapp.run.study.summary import StudySummary
 from labapp.simulation.parallel import end_processes, wait_for
+from labapp.text import heading
 
 if TYPE_CHECKING:
     from labapp.gui.shell.files import Files
@@ -247,7 +248,9 @@ class StudyWindow(ToolWindow):
         self._show()
         if summary is not None:
             names = varying_conditions(summary)
-            self.against.set_choices([(name, name) for name in names] or [("", "none varies")])
+            self.against.set_choices(
+                [(name, heading(name)) for name in names] or [("", "none varies")]
+            )
             self._draw()
 
     def _show(self) -> None:
@@ -266,7 +269,9 @@ class StudyWindow(ToolWindow):
     def _draw(self) -> None:
         summary, condition = self.summary, self.against.value()
         if summary is not None and summary.groups:
-            self.sheet.show_png(condition_picture(summary, condition), f"Sizes against {condition}")
+            self.sheet.show_png(
+                condition_picture(summary, condition), f"Sizes against {heading(condition)}"
+            )
 
     def show_page(self) -> None:
         """Show the summary in the browser."""

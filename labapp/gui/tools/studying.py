@@ -10,7 +10,7 @@ from pathlib import Path
 
 from labapp.core.surface.measures import SIZES
 from labapp.errors import InputError
-from labapp.run.study.page import WORDS, rounded
+from labapp.run.study.page import rounded
 from labapp.run.study.plan import StudyPlan, StudyRecording, matching_recordings, shown_condition
 from labapp.run.study.status import RecordingStatus, State
 from labapp.run.study.summary import StudySummary
@@ -19,7 +19,7 @@ from labapp.session.record import Record
 from labapp.session.session import Session
 from labapp.simulation.parallel import Progress
 from labapp.studies.tables import Table
-from labapp.text import pluralize
+from labapp.text import heading, pluralize
 
 SIGNS: dict[State, str] = {
     "done": "✓ done",
@@ -66,7 +66,7 @@ def outliers_table(summary: StudySummary) -> Table:
         (
             one.recording,
             "all" if one.frame is None else str(one.frame),
-            "{}, {}".format(*WORDS[one.measure]),
+            heading(one.measure),
             f"{one.value:.4g}",
             f"{one.usual:.4g}",
             f"{one.times:.1f}",
@@ -97,7 +97,7 @@ def matches_text(pattern: str) -> str:
     except InputError as error:
         return f"⚠ {error.expected}"
     count = pluralize(len(found), "recording")
-    names = ", ".join(dict.fromkeys(name for _, varied in found for name in varied))
+    names = "; ".join(dict.fromkeys(heading(name) for _, varied in found for name in varied))
     if names:
         return f"{count}; conditions: {names}"
     first = "/".join(found[0][0].parts[-2:])

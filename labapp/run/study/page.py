@@ -11,10 +11,10 @@ from typing import Any
 from matplotlib import rc_context
 
 from labapp.core.surface.measures import SIZES
-from labapp.run.study.plan import Condition, shown_condition
+from labapp.run.study.plan import Condition, named_condition, shown_condition
 from labapp.run.study.summary import GroupSummary, Mean, StudySummary
 from labapp.studies.plotting import INCHES, STYLE, as_bytes, new_figure
-from labapp.text import SIGMA_OF, pluralize
+from labapp.text import SIGMA_OF, axis_label, heading, pluralize
 
 MOST_SHOWN = 60
 """Outliers that are listed: the others are in their file."""
@@ -26,15 +26,6 @@ COLOURS = "#0072b2 #d55e00 #009e73 #cc79a7 #56b4e9 #e69f00 #333333 #999999".spli
 """Colours that people with poor colour vision tell apart (Okabe and Ito)."""
 
 PANEL_INCHES = (2.0, 1.8)
-
-WORDS = {
-    "width_mm": ("width", "mm"),
-    "length_mm": ("length", "mm"),
-    "height_mm": ("height", "mm"),
-    "depth_mm": ("depth", "mm"),
-    "area_mm2": ("area", "mm²"),
-    "volume_mm3": ("volume", "mm³"),
-}
 
 CSS = """
 body { font: 15px/1.45 system-ui, sans-serif; color: #222; max-width: 75rem; margin: 2rem auto;
@@ -134,7 +125,7 @@ def condition_picture(summary: StudySummary, condition: str) -> bytes:
         axes = figure.subplots(2, 3, sharex=True).flatten()
         _draw_row(axes, summary, condition, others)
         for axis, size in zip(axes, SIZES, strict=True):
-            axis.set_title("{} ({})".format(*WORDS[size]))
+            axis.set_title(axis_label(size))
         return as_bytes(figure, dpi=150)
 
 
@@ -150,7 +141,7 @@ def _plots(summary: StudySummary) -> str:
             others = [name for name in varying if name not in ("", condition)]
             _draw_row(axes[row], summary, condition, others)
         for axis, size in zip(axes[0], SIZES, strict=True):
-            axis.set_title("{} ({})".format(*WORDS[size]))
+            axis.set_title(axis_label(size))
         svg = as_bytes(figure, "svg").decode()
     return f'<div class="scroll">{svg[svg.index("<svg") :]}</div>'
 
@@ -176,7 +167,7 @@ def _draw_row(
         if ticks is not None:
             axis.set_xticks(range(len(ticks)), ticks)
             axis.margins(x=0.15)
-        axis.set_xlabel(condition or "all recordings")
+        axis.set_xlabel(axis_label(condition) or "all recordings")
         axis.tick_params(labelbottom=True)
     if len(colours) > 1:
         for kind, colour in colours.items():
@@ -211,7 +202,7 @@ def _places(groups: Sequence[GroupSummary], condition: str) -> tuple[list[float]
 def _kinds(groups: Sequence[GroupSummary], others: Sequence[str]) -> list[str]:
     """The other conditions of each group in words; none of them if there are too many."""
     kinds = [
-        "\n".join(f"{name} {shown_condition(one.conditions.get(name))}" for name in others)
+        "\n".join(named_condition(name, one.conditions.get(name)) for name in others)
         for one in groups
     ]
     return kinds if len(set(kinds)) <= len(COLOURS) else [""] * len(kinds)
@@ -256,10 +247,8 @@ def _mean_cells(means: Mapping[str, Mean]) -> list[str]:
 
 
 def _groups(summary: StudySummary) -> str:
-    sizes = ["{} ({})".format(*WORDS[size]) for size in SIZES]
-    head = [*summary.conditions, "recordings", "frames", *sizes]
     return _table(
-        head,
+        map(heading, (*summary.conditions, "recordings", "frames", *SIZES)),
         (
             [
                 *(_cell(one.conditions.get(name)) for name in summary.conditions),
@@ -276,7 +265,7 @@ def _outliers(summary: StudySummary) -> str:
     rows = [
         [
             *(_t(one.recording), _n("all" if one.frame is None else one.frame)),
-            *(_t(WORDS[one.measure][0]), _n(f"{one.value:.4g}"), _n(f"{one.usual:.4g}")),
+            *(_t(heading(one.measure)), _n(f"{one.value:.4g}"), _n(f"{one.usual:.4g}")),
             *(_n(f"{one.times:.1f}"), _link(one.file)),
         ]
         for one in summary.outliers[:MOST_SHOWN]
@@ -288,10 +277,9 @@ def _outliers(summary: StudySummary) -> str:
 
 
 def _recordings(summary: StudySummary) -> str:
-    sizes = ["{} ({})".format(*WORDS[size]) for size in SIZES]
-    head = ["recording", *summary.conditions, "state", "frames", "with a surface", *sizes]
+    conditions = map(heading, summary.conditions)
     return _table(
-        head,
+        ["recording", *conditions, "state", "frames", "with a surface", *map(heading, SIZES)],
         (
             [
                 _t(one.status.recording.name),
