@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from PySide6.QtCore import QUrl
 from PySide6.QtGui import QCloseEvent, QDesktopServices
-from PySide6.QtWidgets import QAbstractItemView, QCheckBox, QTabWidget, QWidget
+from PySide6.QtWidgets import QAbstractItemView, QCheckBox, QHeaderView, QTabWidget, QWidget
 
 from labapp.gui.dialogs import ask_file, ask_folder, ask_save
 from labapp.gui.tasks import Control, Tasks
@@ -41,7 +41,7 @@ LOOK_S = 1.0
 
 NONE_YET = (
     "A study is a file that names recordings, each with its set-up and the conditions it was made "
-    "under. Open one, or choose a folder with recordings and press Make the study."
+    "under. Open one, or choose a folder with recordings and press Make study."
 )
 
 
@@ -93,7 +93,8 @@ class StudyWindow(ToolWindow):
         self.setup = PathField("Set-up", tooltip="The setup file of them all (TOML)")
         self.recordings.edited.connect(lambda _: self._show_matches())
         self.matches = wrapping_label()
-        self.form.add(self.recordings)
+        self.form.add_wide(self.recordings.label)
+        self.form.add_wide(self.recordings)
         self.form.add_wide(self.matches)
         self.add_to_form("Choose folder…", "Take all recordings in a folder", self.choose_folder)
         self.form.add(self.setup)
@@ -122,6 +123,8 @@ class StudyWindow(ToolWindow):
     def _make_results(self) -> None:
         self.words = wrapping_label(NONE_YET)
         self.list = CellTable("Recordings of the study")
+        by_content = QHeaderView.ResizeMode.ResizeToContents
+        self.list.verticalHeader().setSectionResizeMode(by_content)
         self.means = FittingTable("Means of the study")
         self.outliers = CellTable("Outliers")
         self.against = ChoiceField("Against", tooltip="The condition along the plots")
@@ -259,6 +262,10 @@ class StudyWindow(ToolWindow):
             reading = ": reading the results…" * bool(self.looks.active)
             self.words.setText(f"{studying.state_text(plan, self.found)}{reading}")
             self.list.show_table(studying.recordings_table(plan, self.found))
+            header = self.list.horizontalHeader()
+            header.setSectionResizeMode(QHeaderView.ResizeMode.ResizeToContents)
+            # Why one failed, in as many lines as that takes.
+            header.setSectionResizeMode(header.count() - 1, QHeaderView.ResizeMode.Stretch)
         if self.summary is not None:
             self.means.show_table(studying.means_table(self.summary))
             self.outliers.show_table(studying.outliers_table(self.summary))

@@ -19,7 +19,7 @@ from labapp.session.record import Record
 from labapp.session.session import Session
 from labapp.simulation.parallel import Progress
 from labapp.studies.tables import Table
-from labapp.text import heading, pluralize
+from labapp.text import axis_label, heading, pluralize
 
 SIGNS: dict[State, str] = {
     "done": "✓ done",
@@ -37,11 +37,11 @@ def recordings_table(plan: StudyPlan, found: Sequence[RecordingStatus]) -> Table
             *(shown_condition(one.recording.conditions.get(name)) for name in plan.conditions),
             SIGNS[one.state],
             f"{one.frames_done} of {one.frames}" if one.frames else "",
-            one.problem,
+            one.problem.removeprefix(f"{one.recording.path}: "),
         )
         for one in found
     )
-    columns = ("Recording", *plan.conditions, "State", "Frames", "Reason")
+    columns = ("recording", *plan.conditions, "state", "frames", "reason")
     return Table("recordings", "Recordings of the study", columns, rows)
 
 
@@ -56,7 +56,7 @@ def means_table(summary: StudySummary) -> Table:
         )
         for one in summary.groups
     )
-    columns = (*summary.conditions, "Recordings", "Frames", *SIZES)
+    columns = (*summary.conditions, "recordings", "frames", *SIZES)
     return Table("summary", "Means of each condition, with ±", columns, rows)
 
 
@@ -73,7 +73,7 @@ def outliers_table(summary: StudySummary) -> Table:
         )
         for one in summary.outliers
     )
-    columns = ("Recording", "Frame", "Measure", "Value", "Typical", "Standard deviations off")
+    columns = ("recording", "frame", "measure", "value", "typical", "standard deviations off")
     return Table("outliers", "Frames and recordings far from the others", columns, rows)
 
 
@@ -97,7 +97,7 @@ def matches_text(pattern: str) -> str:
     except InputError as error:
         return f"⚠ {error.expected}"
     count = pluralize(len(found), "recording")
-    names = "; ".join(dict.fromkeys(heading(name) for _, varied in found for name in varied))
+    names = ", ".join(dict.fromkeys(axis_label(name) for _, varied in found for name in varied))
     if names:
         return f"{count}; conditions: {names}"
     first = "/".join(found[0][0].parts[-2:])
