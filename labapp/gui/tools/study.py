@@ -301,7 +301,7 @@ class StudyWindow(ToolWindow):
         workers, scheduler = int(self.workers.value() or 1), self.scheduler.value().strip() or None
         surfaces = self.surfaces.isChecked()
 
-        def work(control: Control) -> None:
+        def work(control: Control) -> list[RecordingStatus]:
             require_extra()
             looked_s = took_s = 0.0
 
@@ -315,11 +315,14 @@ class StudyWindow(ToolWindow):
                     looked_s = time.monotonic()
                     took_s = looked_s - begun_s
 
-            study.run(workers, scheduler, surfaces=surfaces, progress=progress, note=control.part)
+            return study.run(
+                workers, scheduler, surfaces=surfaces, progress=progress, note=control.part
+            )
 
-        self.begin(
-            f"Measuring {study.plan.title}", work, lambda _: self.say("Done"), self._show_part
-        )
+        def done(found: list[RecordingStatus]) -> None:
+            self.say(studying.state_text(study.plan, found))
+
+        self.begin(f"Measuring {study.plan.title}", work, done, self._show_part)
 
     def _reread(self) -> Study:
         """The study as its file is now."""
