@@ -25,7 +25,7 @@ from labapp.run.measurers import measuring_pool
 from labapp.run.study.page import condition_picture, varying_conditions
 from labapp.run.study.plan import StudyRecording, folder_pattern, write_study
 from labapp.run.study.results import require_extra
-from labapp.run.study.status import Progress, RecordingStatus
+from labapp.run.study.status import Progress, RecordingStatus, count_states
 from labapp.run.study.study import Study
 from labapp.run.study.summary import StudySummary
 from labapp.simulation.parallel import end_processes, wait_for
@@ -259,8 +259,8 @@ class StudyWindow(ToolWindow):
     def _show(self) -> None:
         if self.study is not None:
             plan = self.study.plan
-            reading = ": reading the results…" * bool(self.looks.active)
-            self.words.setText(f"{studying.state_text(plan, self.found)}{reading}")
+            reading = ". Reading the results…" * bool(self.looks.active)
+            self.words.setText(f"{plan.title}: {count_states(self.found)}{reading}")
             self.list.show_table(studying.recordings_table(plan, self.found))
             header = self.list.horizontalHeader()
             header.setSectionResizeMode(QHeaderView.ResizeMode.ResizeToContents)
@@ -320,7 +320,7 @@ class StudyWindow(ToolWindow):
             )
 
         def done(found: list[RecordingStatus]) -> None:
-            self.say(studying.state_text(study.plan, found))
+            self.say(count_states(found))
 
         self.begin(f"Measuring {study.plan.title}", work, done, self._show_part)
 

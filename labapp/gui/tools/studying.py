@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
@@ -12,7 +11,7 @@ from labapp.core.surface.measures import SIZES
 from labapp.errors import InputError
 from labapp.run.study.page import rounded
 from labapp.run.study.plan import StudyPlan, StudyRecording, matching_recordings, shown_condition
-from labapp.run.study.status import RecordingStatus, State
+from labapp.run.study.status import STATE_WORDS, RecordingStatus, State
 from labapp.run.study.summary import StudySummary
 from labapp.session.file.database import SUFFIX
 from labapp.session.record import Record
@@ -21,12 +20,7 @@ from labapp.simulation.parallel import Progress
 from labapp.studies.tables import Table
 from labapp.text import axis_label, heading, pluralize
 
-SIGNS: dict[State, str] = {
-    "done": "✓ done",
-    "part": "◐ in part",
-    "waiting": "○ waiting",
-    "failed": "▲ failed",
-}
+SIGNS: dict[State, str] = {"done": "✓", "part": "◐", "waiting": "○", "failed": "▲"}
 
 
 def recordings_table(plan: StudyPlan, found: Sequence[RecordingStatus]) -> Table:
@@ -35,7 +29,7 @@ def recordings_table(plan: StudyPlan, found: Sequence[RecordingStatus]) -> Table
         (
             one.recording.name,
             *(shown_condition(one.recording.conditions.get(name)) for name in plan.conditions),
-            SIGNS[one.state],
+            f"{SIGNS[one.state]} {STATE_WORDS[one.state]}",
             f"{one.frames_done} of {one.frames}" if one.frames else "",
             one.problem.removeprefix(f"{one.recording.path}: "),
         )
@@ -75,17 +69,6 @@ def outliers_table(summary: StudySummary) -> Table:
     )
     columns = ("recording", "frame", "measure", "value", "typical", "standard deviations off")
     return Table("outliers", "Frames and recordings far from the others", columns, rows)
-
-
-def state_text(plan: StudyPlan, found: Sequence[RecordingStatus]) -> str:
-    """Title of a study and how many of its recordings are in each state."""
-    states = Counter(one.state for one in found)
-    counts = ", ".join(
-        f"{states[state]} {words.split(' ', 1)[1]}"
-        for state, words in SIGNS.items()
-        if states[state]
-    )
-    return f"{plan.title}: {pluralize(len(found), 'recording')}, {counts}"
 
 
 def matches_text(pattern: str) -> str:

@@ -1,4 +1,4 @@
-"""The summary of a study as a page to look at: one HTML file, its plots inside."""
+"""The summary of a study as one HTML file with its plots."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from matplotlib import rc_context
 
 from labapp.core.surface.measures import SIZES
 from labapp.run.study.plan import Condition, named_condition, shown_condition
+from labapp.run.study.status import count_states
 from labapp.run.study.summary import GroupSummary, Mean, StudySummary
 from labapp.studies.plotting import INCHES, STYLE, as_bytes, new_figure
-from labapp.text import SIGMA_OF, axis_label, heading, pluralize
+from labapp.text import SIGMA_OF, axis_label, heading
 
 MOST_SHOWN = 60
 """Outliers that are listed: the others are in their file."""
@@ -23,7 +24,7 @@ MOST_ROWS = 6
 """Conditions that are drawn."""
 
 COLOURS = "#0072b2 #d55e00 #009e73 #cc79a7 #56b4e9 #e69f00 #333333 #999999".split()
-"""Colours that people with poor colour vision tell apart (Okabe and Ito)."""
+"""Colours that can be distinguished with poor colour vision (Okabe and Ito)."""
 
 PANEL_INCHES = (2.0, 1.8)
 
@@ -46,14 +47,14 @@ def summary_page(summary: StudySummary, made: str) -> str:
     Parameters
     ----------
     made
-        When, for its foot.
+        Date and time for the footer.
     """
     parts = [f"<h1>{escape(summary.title)}</h1>", _head(summary)]
     parts += _problems(summary)
     if summary.groups:
         parts += ["<h2>Measures against conditions</h2>", _plots_note(summary), _plots(summary)]
         parts += ["<h2>Means</h2>", _groups(summary)]
-    parts += ["<h2>Out of line</h2>", _outliers(summary)]
+    parts += ["<h2>Outliers</h2>", _outliers(summary)]
     parts += ["<h2>Recordings</h2>", _recordings(summary)]
     parts.append(f"<p class=note>Made by labapp, {escape(made)}.</p>")
     body = "\n".join(parts)
@@ -65,17 +66,10 @@ def summary_page(summary: StudySummary, made: str) -> str:
 
 
 def _head(summary: StudySummary) -> str:
-    states = [one.status.state for one in summary.recordings]
     measured = sum(one.statuses.get("ok", 0) for one in summary.recordings)
     frames = sum(one.status.frames_done for one in summary.recordings)
-    words = [f"{pluralize(len(states), 'recording')}: {states.count('done')} done"]
-    words += [
-        f"{states.count(state)} {word}"
-        for state, word in (("part", "in part"), ("waiting", "waiting"), ("failed", "failed"))
-        if state in states
-    ]
-    surface = f"{frames} frames measured, {measured} of them with a surface"
-    return f"<p>{', '.join(words)}. {surface}.</p>"
+    counts = count_states(one.status for one in summary.recordings)
+    return f"<p>{counts}. {frames} frames measured, {measured} of them with a surface.</p>"
 
 
 def _problems(summary: StudySummary) -> list[str]:
@@ -95,11 +89,12 @@ def _problems(summary: StudySummary) -> list[str]:
 
 def _plots_note(summary: StudySummary) -> str:
     varying = varying_conditions(summary)
-    colours = " Colours tell the other conditions apart." if len(varying) > 1 else ""
+    colours = " Colours distinguish the other conditions." if len(varying) > 1 else ""
     return (
-        "<p class=note>Large: mean of the recordings under one condition, with its standard "
-        f"uncertainty ({SIGMA_OF}). Small: each recording's mean.{colours} The set-up's part of "
-        "± is common to all that was measured on one bench: differences are known better.</p>"
+        "<p class=note>Large symbols: mean of the recordings under one condition, with its "
+        f"standard uncertainty ({SIGMA_OF}). Small symbols: mean of each recording.{colours} "
+        "The set-up's part of ± is common to all recordings of one bench: differences have a "
+        "smaller uncertainty.</p>"
     )
 
 
@@ -272,7 +267,7 @@ def _outliers(summary: StudySummary) -> str:
     ]
     left = len(summary.outliers) - len(rows)
     more = f"<p>{left} more are in outliers.csv.</p>" if left else ""
-    head = ["recording", "frame", "measure", "value", "usual", "standard deviations off", "file"]
+    head = ["recording", "frame", "measure", "value", "typical", "standard deviations off", "file"]
     return _table(head, rows) + more
 
 
