@@ -64,15 +64,53 @@ def pluralize(count: int, noun: str) -> str:
     return f"{count} {noun}{'s' * (count != 1)}"
 
 
-UNITS = ("bytes", "kB", "MB", "GB", "TB")
+BYTES = ("bytes", "kB", "MB", "GB", "TB")
 
 
 def format_bytes(size: float) -> str:
     """File size with a decimal unit: "512 bytes", "1.5 MB"."""
     value, unit = float(size), 0
-    while value >= 1000 and unit < len(UNITS) - 1:
+    while value >= 1000 and unit < len(BYTES) - 1:
         value, unit = value / 1000, unit + 1
-    return f"{value:.0f} {UNITS[unit]}" if unit == 0 else f"{value:.1f} {UNITS[unit]}"
+    return f"{value:.0f} {BYTES[unit]}" if unit == 0 else f"{value:.1f} {BYTES[unit]}"
+
+
+_SIMPLE = {
+    each.lower().replace("²", "2").replace("³", "3").replace("µ", "u"): each
+    for each in "A bar cm g Hz J K kA kg kHz kJ kPa kV kW l m mA min mm mm² mm³ ms N Pa ppm px s V "
+    "W µm µs".split()
+} | {"deg": "°", "c": "°C", "pct": "%", "percent": "%", "um_per_unit": "µm per mm or °"}
+
+UNITS = _SIMPLE | {
+    f"{ending}_{per}": f"{unit}/{per}"
+    for ending, unit in _SIMPLE.items()
+    for per in ("mm", "cm", "m", "s", "min", "h")
+}
+"""Endings of the names of columns and conditions, and the units that they stand for."""
+
+
+def split_unit(name: str) -> tuple[str, str]:
+    """Words and unit of a column or condition: ``travel_mm_s`` gives "travel" and "mm/s".
+
+    The unit is empty where the name does not end in one of `UNITS`.
+    """
+    words = name.split("_")
+    for count in (3, 2, 1):
+        unit = UNITS.get("_".join(words[-count:]).lower())
+        if unit is not None and len(words) > count:
+            return " ".join(words[:-count]), unit
+    return " ".join(words), ""
+
+
+def heading(name: str) -> str:
+    """A column's name above a table: ``height_mm`` is "height, mm", ``kept_to`` "kept to"."""
+    return ", ".join(filter(None, split_unit(name)))
+
+
+def axis_label(name: str) -> str:
+    """A column's name along an axis: ``height_mm`` is "height (mm)"."""
+    words, unit = split_unit(name)
+    return f"{words} ({unit})" if unit else words
 
 
 FORMULA = tuple("=+-@＝＋－＠\t\r\n")

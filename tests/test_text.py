@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from labapp.text import SETUP_MARKS, SETUP_WORDS, marked_setup_words, setup_words
+from labapp.text import SETUP_MARKS, SETUP_WORDS, marked_setup_words, setup_words, split_unit
 
 CHECK = "2026-01-31T12:00:00+00:00"
 
@@ -25,3 +25,24 @@ def test_only_one_that_was_changed_after_its_check_is_said_to_be(status: str):
     changed = setup_words(status, was_checked=CHECK) != setup_words(status)
     assert changed == (status in ("entered", "calibrated"))
     assert (CHECK[:10] in setup_words(status, was_checked=CHECK)) == changed
+
+
+@pytest.mark.parametrize(
+    ("name", "words", "unit"),
+    [
+        ("current_a", "current", "A"),
+        ("voltage_V", "voltage", "V"),
+        ("travel_mm_s", "travel", "mm/s"),
+        ("shielding_gas_l_min", "shielding gas", "l/min"),
+        ("heat_input_kJ_mm", "heat input", "kJ/mm"),
+        ("volume_mm3", "volume", "mm³"),
+        ("projection_angle_deg", "projection angle", "°"),
+        ("spot_um", "spot", "µm"),
+        ("kept_to", "kept to", ""),
+        ("gas", "gas", ""),
+        ("a", "a", ""),
+        ("more_error_um_per_unit", "more error", "µm per mm or °"),
+    ],
+)
+def test_a_unit_is_read_from_the_end_of_a_name(name: str, words: str, unit: str) -> None:
+    assert split_unit(name) == (words, unit)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -20,7 +18,7 @@ from labapp.system import quoted
 from labapp.text import pluralize
 
 if TYPE_CHECKING:
-    from labapp.run.study.status import Progress, RecordingStatus
+    from labapp.run.study.status import Progress
     from labapp.run.study.study import Study
 
 app = typer.Typer(
@@ -84,6 +82,7 @@ def run(
     stop the others. Exit code 1: not everything is measured.
     """
     from labapp.run.study.results import require_extra
+    from labapp.run.study.status import count_states
     from labapp.run.study.study import Study
 
     opened = Study(study, out)
@@ -104,19 +103,19 @@ def run(
                 note=lambda text: note(bar.console, text),
             )
         except KeyboardInterrupt:
-            states = Counter(one.state for one in opened.status(surfaces=surfaces))
-            done = f"stopped: {states['done']} of {pluralize(states.total(), 'recording')} done"
-            note(bar.console, f"{done}; what was measured is kept: run it again")
+            counts = count_states(opened.status(surfaces=surfaces))
+            note(bar.console, f"stopped: {counts}; what was measured is kept: run it again")
             raise typer.Exit(INTERRUPTED) from None
     _finish(opened, surfaces)
 
 
 @app.command()
 def status(study: File, out: Out = None) -> None:
-    """Say what is measured of each recording, and why others are not.
+    """List what is measured of each recording, and why others are not.
 
     Exit code 1: not everything is measured.
     """
+    from labapp.run.study.status import count_states
     from labapp.run.study.study import Study
 
     opened = Study(study, out)
@@ -126,7 +125,7 @@ def status(study: File, out: Out = None) -> None:
         typer.echo("  ".join(filter(None, (f"{one.state:8}{one.recording.name}", frames))))
         if one.problem:
             typer.echo(f"        {one.problem}")
-    typer.echo(_counted(found))
+    typer.echo(count_states(found))
     if any(one.state != "done" for one in found):
         raise typer.Exit(NOTHING_MEASURED)
 
@@ -153,14 +152,15 @@ def _finish(study: Study, surfaces: bool) -> None:
     """Write the results, print the means, and exit with 1 unless all is measured."""
     summary = study.results(surfaces=surfaces)
     from labapp.run.study.page import rounded
-    from labapp.run.study.plan import shown_condition
+    from labapp.run.study.plan import named_condition
+    from labapp.run.study.status import count_states
 
     states = [one.status for one in summary.recordings]
     for one in states:
         if one.state != "done" and one.problem:
             typer.echo(f"{one.recording.name}: {one.problem}", err=True)
     for group in summary.groups[:SHOWN]:
-        at = ", ".join(f"{name} {shown_condition(v)}" for name, v in group.conditions.items())
+        at = ", ".join(named_condition(name, v) for name, v in group.conditions.items())
         means = (
             f"{size} {rounded(group.means[f'{size}_mm'].mean, group.means[f'{size}_mm'].sigma)} mm"
             for size in ("width", "length", "height")
@@ -170,15 +170,8 @@ def _finish(study: Study, surfaces: bool) -> None:
     if len(summary.groups) > SHOWN:
         typer.echo(f"… and {len(summary.groups) - SHOWN} more, in summary.csv")
     if summary.outliers:
-        typer.echo(f"{pluralize(len(summary.outliers), 'value')} out of line: outliers.csv")
-    typer.echo(_counted(states))
+        typer.echo(f"{pluralize(len(summary.outliers), 'outlier')}: outliers.csv")
+    typer.echo(count_states(states))
     typer.echo(f"Results are in {study.folder}: summary.html, measures.parquet")
     if any(one.state != "done" for one in states):
         raise typer.Exit(NOTHING_MEASURED)
-
-
-def _counted(found: Sequence[RecordingStatus]) -> str:
-    """How many recordings are in each state."""
-    states = Counter(one.state for one in found)
-    counts = [f"{states[s]} {s}" for s in ("done", "part", "waiting", "failed") if states[s]]
-    return f"{pluralize(len(found), 'recording')}: {', '.join(counts)}"

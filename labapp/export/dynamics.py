@@ -21,7 +21,7 @@ from labapp.core.surface.surface import Surface
 from labapp.core.values import FloatArray
 from labapp.errors import InputError, unknown_name
 from labapp.export.frame_result import FrameResult
-from labapp.text import csv_text
+from labapp.text import csv_text, split_unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -220,11 +220,9 @@ def draw_spectrogram(plot: Any, found: Dynamics) -> None:
 
 def density_label(name: str) -> str:
     """Name and unit of a series' power spectral density."""
-    size, _, unit = name.rpartition("_") if "_" in name else (name, "", "")
-    per_hz = {"": "1/Hz", "deg": "°²/Hz"}.get(
-        unit, f"({unit})²/Hz" if unit[-1:].isdigit() else f"{unit}²/Hz"
-    )
-    return f"{size.replace('_', ' ')} ({per_hz})"
+    words, unit = split_unit(name)
+    squared = f"({unit})²" if unit.endswith(("²", "³")) else f"{unit}²"
+    return f"{words} ({squared if unit else 1}/Hz)"
 
 
 def draw_spectrum(plot: Any, found: Dynamics) -> None:

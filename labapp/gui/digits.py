@@ -108,27 +108,6 @@ def round_factor(most: float) -> float:
     return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= most)
 
 
-UNITS = {
-    "mm": "mm",
-    "mm2": "mm²",
-    "mm3": "mm³",
-    "deg": "°",
-    "px": "px",
-    "pct": "%",
-    "um per unit": "µm per mm or °",
-}
-"""How the name of a table's column ends, and the unit that it means."""
-
-
-def heading(column: str) -> str:
-    """A column's name in words: ``kept_to`` is "kept to", ``height_mm`` is "height, mm"."""
-    words = column.replace("_", " ")
-    for ending, unit in UNITS.items():
-        if words.endswith(f" {ending}"):
-            return f"{words.removesuffix(ending).rstrip()}, {unit}"
-    return words
-
-
 def cell_text(cell: str | float | None) -> str:
     """A cell of a table: three significant digits, no more than there are."""
     if cell is None or (isinstance(cell, float) and not math.isfinite(cell)):

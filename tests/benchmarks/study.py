@@ -1,14 +1,18 @@
 """Studies at scale: the same bytes from any workers, what it costs, the law that was simulated.
 
-Run as ``python -m tests.benchmarks.study FOLDER [PART …] [--frames N] [--kills N] [--seed S]``.
+Run as ``python -m tests.benchmarks.study FOLDER [PART …] [--frames N] [--simulated N]
+[--long N] [--kills N] [--seed S]``.
 Parts, in this order; without any, all but ``long``:
 
 make
     Simulates 40 recordings (4 currents, 2 gases, 5 of each) of 480x640 px into the folder, and puts
-    an empty, a corrupt and a missing one among them.
+    an empty, a corrupt and a missing one among them. ``--simulated`` frames of each are simulated,
+    and repeated forwards and backwards up to ``--frames``.
 workers
     Measures them by 1 and 2 processes, by a Dask cluster of 4 workers in one program, and by 2
     separate workers over TCP.
+speedup
+    What a second process brings.
 overhead
     What a study costs beside measuring.
 law
@@ -16,7 +20,8 @@ law
 kills
     Kills workers and programs at random moments.
 long
-    Measures 20,000 frames (``--long``) that are generated as they are read.
+    Measures a video of 100,000 frames (``--long``, 31 GB); interrupted, it goes on when called
+    again.
 
 Times are the processor's, which other programs hardly change, unless they are called wall.
 """
@@ -35,18 +40,20 @@ import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
+from typing import cast
 from unittest import mock
 
 import numpy as np
 import psutil  # type: ignore[import-untyped]
-from pyarrow import parquet
+from pyarrow import compute, dataset
 
 from labapp import Study
 from labapp.config.scenario import read_scenario
 from labapp.config.setup import read_setup
 from labapp.core.pipeline import Settings
 from labapp.export.tables import frame_tables
-from labapp.media import Frame, GreyImage, open_source
+from labapp.media import Frame, FrameSource, open_source
+from labapp.media.recording.nut import NutWriter
 from labapp.run.measurers import WarmMeasurer
 from labapp.run.study import stretches
 from labapp.run.study import study as study_module
@@ -57,7 +64,8 @@ from tests.run.study.kill import bytes_of, kill_at_random
 from tests.run.study.test_cluster import cluster
 
 CURRENTS_A, GASES, REPEATS = (80, 95, 110, 125), ("Ar", "He"), 5
-PARTS = ("make", "workers", "overhead", "law", "kills")
+STUDIED = "repeated.nut"
+PARTS = ("make", "workers", "speedup", "overhead", "law", "kills")
 
 LOCAL_CLUSTER = """
 import sys
@@ -100,24 +108,40 @@ def make_recording(folder: Path, current_a: int, gas: str, repeat: int, frames: 
     draft.unlink()
 
 
-def make(folder: Path, frames: int) -> None:
+def there_and_back(simulated: int) -> list[int]:
+    """Order in which frames are repeated: forwards and backwards, without a jump."""
+    return [*range(simulated), *range(simulated - 2, 0, -1)]
+
+
+def write_repeated(recording: Path, out: Path, frames: int) -> None:
+    """Repeat a short recording as a long one of raw frames: reading them costs next to nothing."""
+    with open_source(recording) as source:
+        images = [source.frame(k).image for k in there_and_back(len(source))]
+        rate_hz = source.frame_rate_hz or 1.0
+    out.unlink(missing_ok=True)
+    writer = NutWriter(out, images[0].shape, 8, rate_hz, "raw")
+    for number in range(frames):
+        writer.write(images[number % len(images)], number / rate_hz)
+    writer.close()
+
+
+def make(folder: Path, frames: int, simulated: int) -> None:
     """Simulate all recordings and write the study."""
     folder.mkdir(parents=True, exist_ok=True)
+    names = [(a, gas, k) for a in CURRENTS_A for gas in GASES for k in range(1, REPEATS + 1)]
     with ProcessPoolExecutor(2) as pool:
-        jobs = [
-            pool.submit(make_recording, folder, current, gas, repeat, frames)
-            for current in CURRENTS_A
-            for gas in GASES
-            for repeat in range(1, REPEATS + 1)
-        ]
-        for job in jobs:
+        for job in [pool.submit(make_recording, folder, *name, simulated) for name in names]:
             job.result()
+    for current, gas, repeat in names:
+        of = folder / f"I{current}_{gas}_{repeat}"
+        if not (of / STUDIED).exists():
+            write_repeated(of / "recording.avi", of / STUDIED, frames)
     (folder / "empty.avi").touch()
     (folder / "corrupt.avi").write_bytes(random.Random(1).randbytes(100_000))
     setup = f"I{CURRENTS_A[0]}_{GASES[0]}_1/setup.toml"
     text = f'title = "Current and gas"\nsetup = "{setup}"\n'
-    for name in ("empty", "corrupt", "missing", "I{current_a}_{gas}_*/recording"):
-        text += f'\n[[recording]]\nfile = "{name}.avi"\n'
+    for name in ("empty.avi", "corrupt.avi", "missing.avi", f"I{{current_a}}_{{gas}}_*/{STUDIED}"):
+        text += f'\n[[recording]]\nfile = "{name}"\n'
     (folder / "study.toml").write_text(text, "utf-8")
 
 
@@ -214,6 +238,60 @@ def _over_tcp(command: list[str]) -> str:
         return timed([*command, "--scheduler", address], *(one.pid for one in programs))
 
 
+# --- what a second process brings ---------------------------------------------------------------
+
+
+def speedup(folder: Path, rounds: int = 3) -> None:
+    """Measure 4 recordings by 1 and by 2 processes, and by two programs at once that share nothing.
+
+    The last is what the machine allows two processes at that moment.
+    """
+    names = [f"I{current}_{GASES[0]}_1" for current in CURRENTS_A]
+    studies = {"all": names, "half 1": names[:2], "half 2": names[2:]}
+    for study, recordings in studies.items():
+        text = f'setup = "{names[0]}/setup.toml"\n'
+        text += "".join(f'[[recording]]\nfile = "{name}/{STUDIED}"\n' for name in recordings)
+        (folder / f"{study}.toml").write_text(text, "utf-8")
+
+    def run(*ways: tuple[str, int]) -> tuple[float, float]:
+        """Wall and processor time of programs at once, each a study and its processes."""
+        begun, before = time.perf_counter(), os.times()
+        programs = []
+        for study, count in ways:
+            out = folder / f"speed-up {study}"
+            shutil.rmtree(out, ignore_errors=True)
+            command = [
+                sys.executable,
+                "-m",
+                "labapp",
+                "study",
+                "run",
+                str(folder / f"{study}.toml"),
+            ]
+            command += ["--out", str(out), "--workers", str(count)]
+            programs.append(subprocess.Popen(command, stdout=subprocess.DEVNULL))
+        assert [each.wait() for each in programs] == [0] * len(programs)
+        after = os.times()
+        used = after.children_user + after.children_system
+        return time.perf_counter() - begun, used - before.children_user - before.children_system
+
+    found = []
+    for _ in range(rounds):
+        one, two, apart = run(("all", 1)), run(("all", 2)), run(("half 1", 1), ("half 2", 1))
+        found.append((one[0] / two[0], one[0] / apart[0], two[1] / one[1], apart[1] / one[1]))
+        print(
+            f"wall: 1 process {one[0]:.1f} s, 2 processes {two[0]:.1f} s (x {found[-1][0]:.2f}), "
+            f"two programs {apart[0]:.1f} s (x {found[-1][1]:.2f}); processor: {one[1]:.1f}, "
+            f"{two[1]:.1f}, {apart[1]:.1f} s; load {os.getloadavg()[0]:.1f}",
+            flush=True,
+        )
+    wall, ceiling, used, used_apart = np.median(found, axis=0)
+    print(
+        f"medians: speed-up {wall:.2f} (two programs {ceiling:.2f}); processor time of 2 processes "
+        f"over that of 1: {used:.3f} (two programs {used_apart:.3f})"
+    )
+
+
 # --- what it costs ------------------------------------------------------------------------------
 
 
@@ -222,12 +300,12 @@ def overhead(folder: Path) -> None:
     part = folder / "eight.toml"
     names = [f"I{current}_{gas}_1" for current in CURRENTS_A for gas in GASES]
     text = f'setup = "{names[0]}/setup.toml"\n'
-    text += "".join(f'[[recording]]\nfile = "{name}/recording.avi"\n' for name in names)
+    text += "".join(f'[[recording]]\nfile = "{name}/{STUDIED}"\n' for name in names)
     part.write_text(text, "utf-8")
     setup = read_setup(folder / names[0] / "setup.toml")
 
     def measure(name: str) -> None:
-        with open_source(folder / name / "recording.avi") as source:
+        with open_source(folder / name / STUDIED) as source:
             for result in WarmMeasurer(source.frame, setup, Settings())(range(len(source))):
                 frame_tables(result, setup.calibration)
 
@@ -283,7 +361,11 @@ def law(folder: Path) -> None:
 def _truth(folder: Path, name: str) -> dict[str, float]:
     with (folder / name / "truth.csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
-    return {key: float(np.mean([float(row[key]) for row in rows])) for key in rows[0]}
+    with open_source(folder / name / STUDIED) as source:
+        frames = len(source)
+    order = there_and_back(len(rows))
+    seen = [rows[order[k % len(order)]] for k in range(frames)]
+    return {key: float(np.mean([float(row[key]) for row in seen])) for key in seen[0]}
 
 
 def _slope(summary: StudySummary, truth: Mapping[str, Mapping[str, float]], size: str) -> str:
@@ -316,66 +398,61 @@ def _slope(summary: StudySummary, truth: Mapping[str, Mapping[str, float]], size
 # --- a long recording ---------------------------------------------------------------------------
 
 
-class Stream:
-    """Frames of a swinging pool, generated as they are read: rendered ones with fresh noise."""
+class Reference:
+    """Times a constant operation between frames, against which their time is judged."""
 
-    name, frame_rate_hz, shape, warnings = "stream", 200.0, (640, 480), ()
-    description, bit_depth, index = "generated frames", 8, None
+    EVERY = 20
 
-    def __init__(self, rendered: list[GreyImage], frames: int) -> None:
-        self._rendered, self._frames = rendered, frames
-        noise = np.random.default_rng(3).normal(0, 1.5, (2 * 640, 480))
-        self._noise = np.round(noise).astype(np.int16)
-        self.made_s = 0.0
-        """Processor time that generating them took, s."""
+    def __init__(self) -> None:
+        self._values = np.random.default_rng(4).random(200_000)
+        self.took_s: list[float] = []
+        """Processor time of each."""
 
-    def __len__(self) -> int:
-        return self._frames
+    def opened(self, path: Path, index: bytes | None = None) -> FrameSource:
+        """Open a recording that times the operation every so many frames."""
+        source = open_source(path, index)
+        read = source.frame
 
-    def frame(self, number: int) -> Frame:
-        """Generate a frame."""
-        begun = time.process_time()
-        # To and fro: no jump where it begins anew.
-        place = number % (2 * len(self._rendered) - 2)
-        image = self._rendered[min(place, 2 * len(self._rendered) - 2 - place)]
-        noise = self._noise[number % 640 :][:640]
-        made = np.clip(image + noise, 0, 255).astype(np.uint8)
-        self.made_s += time.process_time() - begun
-        return Frame(number, number / self.frame_rate_hz, made)
+        def frame(number: int) -> Frame:
+            if number % self.EVERY == 0:
+                begun = time.process_time()
+                np.sort(self._values)
+                self.took_s.append(time.process_time() - begun)
+            return read(number)
 
-    def __enter__(self) -> Stream:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        return
+        return cast(FrameSource, mock.Mock(wraps=source, spec=source, frame=frame))
 
 
 def long(folder: Path, frames: int) -> None:
-    """Measure a long recording in this process; time and memory of each stretch."""
-    draft = folder / "long.scenario.toml"
-    draft.write_text(SCENARIO.format(frames=200), "utf-8")
-    scenario = read_scenario(draft)
-    rendered = [scenario.recording.frame(k).image for k in range(200)]
-    stream = Stream(rendered, frames)
-    (folder / "long.avi").write_bytes(b"generated")
-    (folder / "long.setup.toml").write_text(scenario.setup, "utf-8")
-    text = 'setup = "long.setup.toml"\n[[recording]]\nfile = "long.avi"\n'
+    """Measure a long recording in this process; time and memory of each stretch.
+
+    Interrupted, it goes on when it is called again.
+    """
+    recording = f"I{CURRENTS_A[0]}_{GASES[0]}_1"
+    if not (folder / "long.nut").exists():
+        write_repeated(folder / recording / "recording.avi", folder / "long.nut", frames)
+    text = f'setup = "{recording}/setup.toml"\n[[recording]]\nfile = "long.nut"\n'
     (folder / "long.toml").write_text(text, "utf-8")
     out = folder / "long results"
-    shutil.rmtree(out, ignore_errors=True)
-    took_ms: list[float] = []
-    memory_mb: list[float] = []
+    reference = Reference()
+    table: list[tuple[float, float, float]] = []
 
     def measure(stretch: stretches.Stretch) -> None:
-        begun, made_s = time.process_time(), stream.made_s
+        reference.took_s.clear()
+        begun = time.process_time()
         stretches.measure_stretch(stretch)
-        own_s = time.process_time() - begun - (stream.made_s - made_s)
-        took_ms.append(1e3 * own_s / len(stretch.frames))
-        memory_mb.append(psutil.Process().memory_info().rss / 1e6)
-        print(f"{len(took_ms)}: {took_ms[-1]:.2f} ms, {memory_mb[-1]:.0f} MB", flush=True)
+        own_s = time.process_time() - begun - sum(reference.took_s)
+        took_ms = 1e3 * own_s / len(stretch.frames)
+        memory_mb = psutil.Process().memory_info().rss / 1e6
+        table.append((took_ms, took_ms / (1e3 * np.mean(reference.took_s)), memory_mb))
+        print(
+            f"{stretch.frames}: {took_ms:.2f} ms, {table[-1][1]:.3f} references, "
+            f"{memory_mb:.0f} MB",
+            flush=True,
+        )
 
     with (
-        mock.patch.object(stretches, "open_source", return_value=stream),
+        mock.patch.object(stretches, "open_source", reference.opened),
         mock.patch.object(study_module, "measure_stretch", measure),
     ):
         study = Study(folder / "long.toml", out)
@@ -383,20 +460,23 @@ def long(folder: Path, frames: int) -> None:
     begun = time.process_time()
     summary = study.results()
     print(f"results {time.process_time() - begun:.1f} s; {summary.recordings[0].statuses}")
-    steady = np.array(took_ms[1:])
-    print(
-        f"{frames} frames: {np.median(steady):.2f} ms a frame, stretches {steady.min():.2f} to "
-        f"{steady.max():.2f} ms; memory after the second {memory_mb[1]:.0f}, at the end "
-        f"{memory_mb[-1]:.0f}, with results {psutil.Process().memory_info().rss / 1e6:.0f} MB"
-    )
-    path, before = out / "measures.parquet" / "long.parquet", psutil.Process().memory_info().rss
-    begun = time.process_time()
-    file = parquet.ParquetFile(path)
-    some = file.read_row_group(file.num_row_groups - 1, columns=["frame", "height_mm"])
+    for at in range(1, len(table), 10):
+        took, ratio, memory = np.median(table[at : at + 10], axis=0)
+        print(f"stretches from {at}: {took:.2f} ms, {ratio:.3f} references, {memory:.0f} MB")
+    open_lazily(out / "measures.parquet")
+
+
+def open_lazily(folder: Path) -> None:
+    """Read few values of a Parquet dataset; what that takes."""
+    before, begun = psutil.Process().memory_info().rss, time.process_time()
+    rows = dataset.dataset(folder, format="parquet")
+    last = compute.field("frame") >= rows.count_rows() - 100
+    some = rows.to_table(["frame", "height_mm"], filter=last)
     more_mb = (psutil.Process().memory_info().rss - before) / 1e6
+    size_mb = sum(each.stat().st_size for each in folder.glob("*.parquet")) / 1e6
     print(
-        f"Parquet {path.stat().st_size / 1e6:.1f} MB, {file.num_row_groups} row groups: the last "
-        f"{len(some)} rows of two columns in {time.process_time() - begun:.3f} s, {more_mb:.1f} MB"
+        f"Parquet, {size_mb:.1f} MB, {rows.count_rows()} rows: {len(some)} rows of two columns in "
+        f"{time.process_time() - begun:.3f} s, {more_mb:.1f} MB"
     )
 
 
@@ -423,14 +503,16 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("parts", nargs="*", metavar="PART")
     parser.add_argument("--frames", type=int, default=200)
-    parser.add_argument("--long", type=int, default=20_000)
+    parser.add_argument("--simulated", type=int, default=20)
+    parser.add_argument("--long", type=int, default=100_000)
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--seed", type=int, default=1)
     given = parser.parse_args()
     folder = given.folder.absolute()
     do: dict[str, Callable[[], None]] = {
-        "make": lambda: make(folder, given.frames),
+        "make": lambda: make(folder, given.frames, given.simulated),
         "workers": lambda: workers(folder),
+        "speedup": lambda: speedup(folder),
         "overhead": lambda: overhead(folder),
         "law": lambda: law(folder),
         "long": lambda: long(folder, given.long),

@@ -16,6 +16,7 @@ from labapp.gui.widgets.labels import Message
 from labapp.gui.widgets.layouts import hbox, vbox
 from labapp.gui.workspace import Workspace
 from labapp.run.live_watch import LiveWatch
+from labapp.text import split_unit
 
 if TYPE_CHECKING:
     from labapp.core.dynamics.penetration import PenetrationModel
@@ -86,7 +87,7 @@ class LivePenetration(QWidget):
         if predictor is None:
             return ()
         value, sigma, is_outside = predictor.newest
-        words = predictor.model.settings.target.rpartition("_")[0].replace("_", " ").capitalize()
+        words = split_unit(predictor.model.settings.target)[0].capitalize()
         known = math.isfinite(value)
         return (
             Figure(

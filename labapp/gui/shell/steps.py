@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -13,7 +12,7 @@ import numpy as np
 
 from labapp.core.geometry.uncertainty import ENDINGS
 from labapp.errors import InputError
-from labapp.text import pluralize
+from labapp.text import pluralize, split_unit
 
 if TYPE_CHECKING:
     from labapp.session.measured import Overview
@@ -78,9 +77,9 @@ def setup_to_do(problems: Iterable[InputError]) -> str:
         elif part not in PARTS:
             wrong.append(f"take out {problem.field}: {problem.expected}")
         elif problem.value == "missing":
-            missing.setdefault(PARTS[part], []).extend([_name(key)] if key else [])
+            missing.setdefault(PARTS[part], []).extend([split_unit(key)[0]] if key else [])
         else:
-            of = f"{_name(key)} of {PARTS[part]}"
+            of = f"{split_unit(key)[0]} of {PARTS[part]}"
             wrong.append(f"correct {of}: {problem.value} is not {problem.expected}")
     enter = [
         f"{', '.join(names[:-1])} and {names[-1]} of {part}".removeprefix(" and ")
@@ -91,11 +90,6 @@ def setup_to_do(problems: Iterable[InputError]) -> str:
     typed = [f"enter {', '.join(enter)}"] if enter else []
     words = "; ".join([*wrong, *typed, *calibrate])
     return words[:1].upper() + words[1:]
-
-
-def _name(key: str) -> str:
-    """What a value of the set-up is called: its key without the unit."""
-    return re.sub("_(mm|deg)$", "", key).replace("_", " ")
 
 
 READ_ONLY = "The session is open read-only: nothing can be changed"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 from PySide6.QtCore import QUrl
 from PySide6.QtGui import QCloseEvent, QDesktopServices
-from PySide6.QtWidgets import QAbstractItemView, QCheckBox, QTabWidget, QWidget
+from PySide6.QtWidgets import QAbstractItemView, QCheckBox, QHeaderView, QTabWidget, QWidget
 
 from labapp.gui.dialogs import ask_file, ask_folder, ask_save
 from labapp.gui.tasks import Control, Tasks
@@ -25,10 +25,11 @@ from labapp.run.measurers import measuring_pool
 from labapp.run.study.page import condition_picture, varying_conditions
 from labapp.run.study.plan import StudyRecording, folder_pattern, write_study
 from labapp.run.study.results import require_extra
-from labapp.run.study.status import Progress, RecordingStatus
+from labapp.run.study.status import Progress, RecordingStatus, count_states
 from labapp.run.study.study import Study
 from labapp.run.study.summary import StudySummary
 from labapp.simulation.parallel import end_processes, wait_for
+from labapp.text import heading
 
 if TYPE_CHECKING:
     from labapp.gui.shell.files import Files
@@ -92,7 +93,8 @@ class StudyWindow(ToolWindow):
         self.setup = PathField("Set-up", tooltip="The setup file of them all (TOML)")
         self.recordings.edited.connect(lambda _: self._show_matches())
         self.matches = wrapping_label()
-        self.form.add(self.recordings)
+        self.form.add_wide(self.recordings.label)
+        self.form.add_wide(self.recordings)
         self.form.add_wide(self.matches)
         self.add_to_form("Choose folder…", "Take all recordings in a folder", self.choose_folder)
         self.form.add(self.setup)
@@ -123,6 +125,8 @@ class StudyWindow(ToolWindow):
     def _make_results(self) -> None:
         self.words = wrapping_label(NONE_YET)
         self.list = CellTable("Recordings of the study")
+        by_content = QHeaderView.ResizeMode.ResizeToContents
+        self.list.verticalHeader().setSectionResizeMode(by_content)
         self.means = FittingTable("Means of the study")
         self.outliers = CellTable("Outliers")
         self.against = ChoiceField("Against", tooltip="The condition along the plots")
@@ -249,15 +253,21 @@ class StudyWindow(ToolWindow):
         self._show()
         if summary is not None:
             names = varying_conditions(summary)
-            self.against.set_choices([(name, name) for name in names] or [("", "none varies")])
+            self.against.set_choices(
+                [(name, heading(name)) for name in names] or [("", "none varies")]
+            )
             self._draw()
 
     def _show(self) -> None:
         if self.study is not None:
             plan = self.study.plan
-            reading = ": reading the results…" * bool(self.looks.active)
-            self.words.setText(f"{studying.state_text(plan, self.found)}{reading}")
+            reading = ". Reading the results…" * bool(self.looks.active)
+            self.words.setText(f"{plan.title}: {count_states(self.found)}{reading}")
             self.list.show_table(studying.recordings_table(plan, self.found))
+            header = self.list.horizontalHeader()
+            header.setSectionResizeMode(QHeaderView.ResizeMode.ResizeToContents)
+            # Why one failed, in as many lines as that takes.
+            header.setSectionResizeMode(header.count() - 1, QHeaderView.ResizeMode.Stretch)
         if self.summary is not None:
             self.means.show_table(studying.means_table(self.summary))
             self.outliers.show_table(studying.outliers_table(self.summary))
@@ -268,7 +278,9 @@ class StudyWindow(ToolWindow):
     def _draw(self) -> None:
         summary, condition = self.summary, self.against.value()
         if summary is not None and summary.groups:
-            self.sheet.show_png(condition_picture(summary, condition), f"Sizes against {condition}")
+            self.sheet.show_png(
+                condition_picture(summary, condition), f"Sizes against {heading(condition)}"
+            )
 
     def show_page(self) -> None:
         """Show the summary in the browser."""
@@ -291,7 +303,7 @@ class StudyWindow(ToolWindow):
         workers, scheduler = int(self.workers.value() or 1), self.scheduler.value().strip() or None
         surfaces = self.surfaces.isChecked()
 
-        def work(control: Control) -> None:
+        def work(control: Control) -> list[RecordingStatus]:
             require_extra()
             looked_s = took_s = 0.0
 
@@ -305,11 +317,14 @@ class StudyWindow(ToolWindow):
                     looked_s = time.monotonic()
                     took_s = looked_s - begun_s
 
-            study.run(workers, scheduler, surfaces=surfaces, progress=progress, note=control.part)
+            return study.run(
+                workers, scheduler, surfaces=surfaces, progress=progress, note=control.part
+            )
 
-        self.begin(
-            f"Measuring {study.plan.title}", work, lambda _: self.say("Done"), self._show_part
-        )
+        def done(found: list[RecordingStatus]) -> None:
+            self.say(count_states(found))
+
+        self.begin(f"Measuring {study.plan.title}", work, done, self._show_part)
 
     def _reread(self) -> Study:
         """The study as its file is now."""

@@ -3,30 +3,24 @@
 from __future__ import annotations
 
 import contextlib
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 
 from labapp.core.surface.measures import SIZES
 from labapp.errors import InputError
-from labapp.run.study.page import WORDS, rounded
+from labapp.run.study.page import rounded
 from labapp.run.study.plan import StudyPlan, StudyRecording, matching_recordings, shown_condition
-from labapp.run.study.status import RecordingStatus, State
+from labapp.run.study.status import STATE_WORDS, RecordingStatus, State
 from labapp.run.study.summary import StudySummary
 from labapp.session.file.database import SUFFIX
 from labapp.session.record import Record
 from labapp.session.session import Session
 from labapp.simulation.parallel import Progress
 from labapp.studies.tables import Table
-from labapp.text import pluralize
+from labapp.text import axis_label, heading, pluralize
 
-SIGNS: dict[State, str] = {
-    "done": "✓ done",
-    "part": "◐ in part",
-    "waiting": "○ waiting",
-    "failed": "▲ failed",
-}
+SIGNS: dict[State, str] = {"done": "✓", "part": "◐", "waiting": "○", "failed": "▲"}
 
 
 def recordings_table(plan: StudyPlan, found: Sequence[RecordingStatus]) -> Table:
@@ -35,13 +29,13 @@ def recordings_table(plan: StudyPlan, found: Sequence[RecordingStatus]) -> Table
         (
             one.recording.name,
             *(shown_condition(one.recording.conditions.get(name)) for name in plan.conditions),
-            SIGNS[one.state],
+            f"{SIGNS[one.state]} {STATE_WORDS[one.state]}",
             f"{one.frames_done} of {one.frames}" if one.frames else "",
-            one.problem,
+            one.problem.removeprefix(f"{one.recording.path}: "),
         )
         for one in found
     )
-    columns = ("Recording", *plan.conditions, "State", "Frames", "Reason")
+    columns = ("recording", *plan.conditions, "state", "frames", "reason")
     return Table("recordings", "Recordings of the study", columns, rows)
 
 
@@ -56,7 +50,7 @@ def means_table(summary: StudySummary) -> Table:
         )
         for one in summary.groups
     )
-    columns = (*summary.conditions, "Recordings", "Frames", *SIZES)
+    columns = (*summary.conditions, "recordings", "frames", *SIZES)
     return Table("summary", "Means of each condition, with ±", columns, rows)
 
 
@@ -66,26 +60,15 @@ def outliers_table(summary: StudySummary) -> Table:
         (
             one.recording,
             "all" if one.frame is None else str(one.frame),
-            "{}, {}".format(*WORDS[one.measure]),
+            heading(one.measure),
             f"{one.value:.4g}",
             f"{one.usual:.4g}",
             f"{one.times:.1f}",
         )
         for one in summary.outliers
     )
-    columns = ("Recording", "Frame", "Measure", "Value", "Typical", "Standard deviations off")
+    columns = ("recording", "frame", "measure", "value", "typical", "standard deviations off")
     return Table("outliers", "Frames and recordings far from the others", columns, rows)
-
-
-def state_text(plan: StudyPlan, found: Sequence[RecordingStatus]) -> str:
-    """Title of a study and how many of its recordings are in each state."""
-    states = Counter(one.state for one in found)
-    counts = ", ".join(
-        f"{states[state]} {words.split(' ', 1)[1]}"
-        for state, words in SIGNS.items()
-        if states[state]
-    )
-    return f"{plan.title}: {pluralize(len(found), 'recording')}, {counts}"
 
 
 def matches_text(pattern: str) -> str:
@@ -97,7 +80,7 @@ def matches_text(pattern: str) -> str:
     except InputError as error:
         return f"⚠ {error.expected}"
     count = pluralize(len(found), "recording")
-    names = ", ".join(dict.fromkeys(name for _, varied in found for name in varied))
+    names = ", ".join(dict.fromkeys(axis_label(name) for _, varied in found for name in varied))
     if names:
         return f"{count}; conditions: {names}"
     first = "/".join(found[0][0].parts[-2:])

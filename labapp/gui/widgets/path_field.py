@@ -36,7 +36,10 @@ class PathLine(QLineEdit):
         if self.hasFocus():
             return self.text()
         width = self._contents().width()
-        return self.fontMetrics().elidedText(self.text(), Qt.TextElideMode.ElideMiddle, width)
+        # What varies in a pattern is near its end.
+        is_pattern = bool(set("*{") & set(self.text()))
+        mode = Qt.TextElideMode.ElideLeft if is_pattern else Qt.TextElideMode.ElideMiddle
+        return self.fontMetrics().elidedText(self.text(), mode, width)
 
     def paintEvent(self, event: QPaintEvent) -> None:
         """Paint the two ends of a text that is too long; as any line otherwise."""

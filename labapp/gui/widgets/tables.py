@@ -15,8 +15,9 @@ from PySide6.QtWidgets import (
     QTableWidgetItem,
 )
 
-from labapp.gui.digits import cell_text, heading
+from labapp.gui.digits import cell_text
 from labapp.gui.widgets.labels import plain_tip
+from labapp.text import heading
 
 if TYPE_CHECKING:
     from labapp.studies.tables import Table

@@ -1,4 +1,4 @@
-"""The summary of a study as a page to look at: one HTML file, its plots inside."""
+"""The summary of a study as one HTML file with its plots."""
 
 from __future__ import annotations
 
@@ -11,10 +11,11 @@ from typing import Any
 from matplotlib import rc_context
 
 from labapp.core.surface.measures import SIZES
-from labapp.run.study.plan import Condition, shown_condition
+from labapp.run.study.plan import Condition, named_condition, shown_condition
+from labapp.run.study.status import count_states
 from labapp.run.study.summary import GroupSummary, Mean, StudySummary
 from labapp.studies.plotting import INCHES, STYLE, as_bytes, new_figure
-from labapp.text import SIGMA_OF, pluralize
+from labapp.text import SIGMA_OF, axis_label, heading
 
 MOST_SHOWN = 60
 """Outliers that are listed: the others are in their file."""
@@ -23,18 +24,9 @@ MOST_ROWS = 6
 """Conditions that are drawn."""
 
 COLOURS = "#0072b2 #d55e00 #009e73 #cc79a7 #56b4e9 #e69f00 #333333 #999999".split()
-"""Colours that people with poor colour vision tell apart (Okabe and Ito)."""
+"""Colours that can be distinguished with poor colour vision (Okabe and Ito)."""
 
 PANEL_INCHES = (2.0, 1.8)
-
-WORDS = {
-    "width_mm": ("width", "mm"),
-    "length_mm": ("length", "mm"),
-    "height_mm": ("height", "mm"),
-    "depth_mm": ("depth", "mm"),
-    "area_mm2": ("area", "mm²"),
-    "volume_mm3": ("volume", "mm³"),
-}
 
 CSS = """
 body { font: 15px/1.45 system-ui, sans-serif; color: #222; max-width: 75rem; margin: 2rem auto;
@@ -55,14 +47,14 @@ def summary_page(summary: StudySummary, made: str) -> str:
     Parameters
     ----------
     made
-        When, for its foot.
+        Date and time for the footer.
     """
     parts = [f"<h1>{escape(summary.title)}</h1>", _head(summary)]
     parts += _problems(summary)
     if summary.groups:
         parts += ["<h2>Measures against conditions</h2>", _plots_note(summary), _plots(summary)]
         parts += ["<h2>Means</h2>", _groups(summary)]
-    parts += ["<h2>Out of line</h2>", _outliers(summary)]
+    parts += ["<h2>Outliers</h2>", _outliers(summary)]
     parts += ["<h2>Recordings</h2>", _recordings(summary)]
     parts.append(f"<p class=note>Made by labapp, {escape(made)}.</p>")
     body = "\n".join(parts)
@@ -74,17 +66,10 @@ def summary_page(summary: StudySummary, made: str) -> str:
 
 
 def _head(summary: StudySummary) -> str:
-    states = [one.status.state for one in summary.recordings]
     measured = sum(one.statuses.get("ok", 0) for one in summary.recordings)
     frames = sum(one.status.frames_done for one in summary.recordings)
-    words = [f"{pluralize(len(states), 'recording')}: {states.count('done')} done"]
-    words += [
-        f"{states.count(state)} {word}"
-        for state, word in (("part", "in part"), ("waiting", "waiting"), ("failed", "failed"))
-        if state in states
-    ]
-    surface = f"{frames} frames measured, {measured} of them with a surface"
-    return f"<p>{', '.join(words)}. {surface}.</p>"
+    counts = count_states(one.status for one in summary.recordings)
+    return f"<p>{counts}. {frames} frames measured, {measured} of them with a surface.</p>"
 
 
 def _problems(summary: StudySummary) -> list[str]:
@@ -104,11 +89,12 @@ def _problems(summary: StudySummary) -> list[str]:
 
 def _plots_note(summary: StudySummary) -> str:
     varying = varying_conditions(summary)
-    colours = " Colours tell the other conditions apart." if len(varying) > 1 else ""
+    colours = " Colours distinguish the other conditions." if len(varying) > 1 else ""
     return (
-        "<p class=note>Large: mean of the recordings under one condition, with its standard "
-        f"uncertainty ({SIGMA_OF}). Small: each recording's mean.{colours} The set-up's part of "
-        "± is common to all that was measured on one bench: differences are known better.</p>"
+        "<p class=note>Large symbols: mean of the recordings under one condition, with its "
+        f"standard uncertainty ({SIGMA_OF}). Small symbols: mean of each recording.{colours} "
+        "The set-up's part of ± is common to all recordings of one bench: differences have a "
+        "smaller uncertainty.</p>"
     )
 
 
@@ -134,7 +120,7 @@ def condition_picture(summary: StudySummary, condition: str) -> bytes:
         axes = figure.subplots(2, 3, sharex=True).flatten()
         _draw_row(axes, summary, condition, others)
         for axis, size in zip(axes, SIZES, strict=True):
-            axis.set_title("{} ({})".format(*WORDS[size]))
+            axis.set_title(axis_label(size))
         return as_bytes(figure, dpi=150)
 
 
@@ -150,7 +136,7 @@ def _plots(summary: StudySummary) -> str:
             others = [name for name in varying if name not in ("", condition)]
             _draw_row(axes[row], summary, condition, others)
         for axis, size in zip(axes[0], SIZES, strict=True):
-            axis.set_title("{} ({})".format(*WORDS[size]))
+            axis.set_title(axis_label(size))
         svg = as_bytes(figure, "svg").decode()
     return f'<div class="scroll">{svg[svg.index("<svg") :]}</div>'
 
@@ -176,7 +162,7 @@ def _draw_row(
         if ticks is not None:
             axis.set_xticks(range(len(ticks)), ticks)
             axis.margins(x=0.15)
-        axis.set_xlabel(condition or "all recordings")
+        axis.set_xlabel(axis_label(condition) or "all recordings")
         axis.tick_params(labelbottom=True)
     if len(colours) > 1:
         for kind, colour in colours.items():
@@ -211,7 +197,7 @@ def _places(groups: Sequence[GroupSummary], condition: str) -> tuple[list[float]
 def _kinds(groups: Sequence[GroupSummary], others: Sequence[str]) -> list[str]:
     """The other conditions of each group in words; none of them if there are too many."""
     kinds = [
-        "\n".join(f"{name} {shown_condition(one.conditions.get(name))}" for name in others)
+        "\n".join(named_condition(name, one.conditions.get(name)) for name in others)
         for one in groups
     ]
     return kinds if len(set(kinds)) <= len(COLOURS) else [""] * len(kinds)
@@ -256,10 +242,8 @@ def _mean_cells(means: Mapping[str, Mean]) -> list[str]:
 
 
 def _groups(summary: StudySummary) -> str:
-    sizes = ["{} ({})".format(*WORDS[size]) for size in SIZES]
-    head = [*summary.conditions, "recordings", "frames", *sizes]
     return _table(
-        head,
+        map(heading, (*summary.conditions, "recordings", "frames", *SIZES)),
         (
             [
                 *(_cell(one.conditions.get(name)) for name in summary.conditions),
@@ -276,22 +260,21 @@ def _outliers(summary: StudySummary) -> str:
     rows = [
         [
             *(_t(one.recording), _n("all" if one.frame is None else one.frame)),
-            *(_t(WORDS[one.measure][0]), _n(f"{one.value:.4g}"), _n(f"{one.usual:.4g}")),
+            *(_t(heading(one.measure)), _n(f"{one.value:.4g}"), _n(f"{one.usual:.4g}")),
             *(_n(f"{one.times:.1f}"), _link(one.file)),
         ]
         for one in summary.outliers[:MOST_SHOWN]
     ]
     left = len(summary.outliers) - len(rows)
     more = f"<p>{left} more are in outliers.csv.</p>" if left else ""
-    head = ["recording", "frame", "measure", "value", "usual", "standard deviations off", "file"]
+    head = ["recording", "frame", "measure", "value", "typical", "standard deviations off", "file"]
     return _table(head, rows) + more
 
 
 def _recordings(summary: StudySummary) -> str:
-    sizes = ["{} ({})".format(*WORDS[size]) for size in SIZES]
-    head = ["recording", *summary.conditions, "state", "frames", "with a surface", *sizes]
+    conditions = map(heading, summary.conditions)
     return _table(
-        head,
+        ["recording", *conditions, "state", "frames", "with a surface", *map(heading, SIZES)],
         (
             [
                 _t(one.status.recording.name),

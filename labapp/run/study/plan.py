@@ -38,7 +38,7 @@ from labapp.errors import InputError, os_errors_as_input
 from labapp.export.tables import TABLES
 from labapp.files import as_bytes, write_file
 from labapp.media import RECORDING_SUFFIXES
-from labapp.text import unescaped_csv_text
+from labapp.text import split_unit, unescaped_csv_text
 
 A_STUDY = "a study file (TOML or CSV, UTF-8)"
 
@@ -69,6 +69,13 @@ def shown_condition(value: Condition | None) -> str:
     if value is None:
         return "–"
     return value if isinstance(value, str) else f"{value:g}"
+
+
+def named_condition(name: str, value: Condition | None) -> str:
+    """A condition's name, value and unit: "current 80 A", "gas Ar"."""
+    words, unit = split_unit(name)
+    known = "" if value is None or isinstance(value, str) else unit
+    return " ".join(filter(None, (words, shown_condition(value), known)))
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What a study says: measures against conditions, with ±, and what is out of line."""
+"""Summary of a study: mean sizes by condition, with ±, and outliers."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from labapp.run.study.plan import Condition
 from labapp.run.study.status import RecordingStatus
 
 FAR = 5.0
-"""A frame is an outlier so many standard deviations from the median, and of its own uncertainty."""
+"""Distance of an outlying frame from the median, in standard deviations and in its own ±."""
 
 SURE = 0.999
-"""A recording is one outside the interval that holds others with this probability."""
+"""A recording outside the interval that contains others with this probability is an outlier."""
 
 MAD = 1.4826
-"""Standard deviation of a normal distribution over its median absolute deviation."""
+"""Ratio of standard deviation to median absolute deviation of a normal distribution."""
 
 FEWEST_FRAMES, FEWEST_RECORDINGS = 10, 4
-"""Among fewer, none is called an outlier."""
+"""Outliers are looked for only among this many or more."""
 
 MOST_OUTLIERS = 100
-"""Of a recording."""
+"""Most outliers listed of one recording."""
 
 
 @dataclass(frozen=True)
@@ -80,9 +80,9 @@ class RecordingSummary:
     statuses: Mapping[str, int]
     """How many frames have each status."""
     setup_status: str
-    """How far the set-up can be relied on (`Measurement.setup_status`)."""
+    """Status of the set-up (`Measurement.setup_status`)."""
     doubt: str
-    """Why it is doubtful, if it is."""
+    """Reason for the status ``doubtful``; otherwise empty."""
     means: Mapping[str, Mean]
     """Mean of each of `SIZES` over its frames with a surface."""
 
@@ -141,8 +141,8 @@ def group_recordings(
 ) -> tuple[GroupSummary, ...]:
     """Means over the recordings that were made under the same conditions.
 
-    Noise is independent from recording to recording. What is wrong with the level and with the
-    set-up is taken to be the same in all of them: they do not average it out.
+    Noise is independent between recordings. Errors of the level and of the set-up are assumed to
+    be common to all of them, and do not average out.
     """
     groups: dict[tuple[Condition | None, ...], list[RecordingSummary]] = {}
     for one in recordings:
@@ -209,8 +209,8 @@ def outlying_recordings(
 ) -> list[Outlier]:
     """Recordings whose mean is far from that of the others under the same conditions.
 
-    Far is outside the interval in which another recording would lie with probability `SURE`, by
-    Student's t: of the few that there are, some are near to each other by chance.
+    Far is outside the prediction interval of Student's t for one more recording, with
+    probability `SURE`.
     """
     by_name = {one.status.recording.name: one for one in recordings}
     found = []

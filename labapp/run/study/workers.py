@@ -1,6 +1,6 @@
-"""Where a study's tasks are done: in processes of this machine, or by Dask's workers anywhere.
+"""Run a study's tasks in processes of this machine, or on workers of a Dask cluster.
 
-Both are a `concurrent.futures.Executor`; `run_jobs` keeps either busy.
+Both are a `concurrent.futures.Executor`, to which `run_jobs` submits tasks.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from labapp.simulation.parallel import POLL_S, end_processes
 from labapp.system import interrupts_blocked
 
 ATTEMPTS = 4
-"""A task is begun so often, at most: the process that does it may die, or its machine."""
+"""Most attempts at a task: the process or the machine that runs it may die."""
 
 TIMEOUT_S = 10
-"""A scheduler that does not answer for so long is not there."""
+"""Longest wait for a scheduler's answer."""
 
 A_SCHEDULER = "the address of a Dask scheduler that runs, such as tcp://127.0.0.1:8786"
 
@@ -51,15 +51,15 @@ class Job:
 
 @dataclass(frozen=True)
 class Workers:
-    """Who does tasks."""
+    """An executor of tasks."""
 
     executor: Executor
     slots: Callable[[], int]
-    """How many tasks to give them at once."""
+    """How many tasks to submit at once."""
     dashboard: str = ""
-    """Address of the page that shows what they do; empty if there is none."""
+    """Address of the dashboard; empty if there is none."""
     warning: str = ""
-    """What the user should know of them; empty if nothing."""
+    """Warning for the user; empty if none."""
 
 
 def run_jobs(
@@ -68,15 +68,15 @@ def run_jobs(
     finished: Callable[[Job, Exception | None], Iterable[Job]],
     poll: Callable[[], object],
 ) -> None:
-    """Have jobs done, many at once, the newest first to be followed up.
+    """Run jobs, several at once; jobs that follow from a finished one go before the others.
 
     Parameters
     ----------
     jobs
-        What is to be done; read as there is room.
+        The jobs; read as workers become free.
     finished
-        Called here with each job that is done, and the error if it failed for good; returns jobs
-        that follow from it, which go before others.
+        Called in this process with each finished job, and the error if its last attempt failed;
+        returns the jobs that follow from it.
     poll
         Called now and then; may raise to stop.
 
@@ -110,7 +110,7 @@ def run_jobs(
 
 
 def _error_of(future: Future[None]) -> Exception | None:
-    """What a task raised; None if nothing."""
+    """The exception that a task raised, or None."""
     if future.cancelled():
         raise InputError("--scheduler", "connection", "lost", f"{A_SCHEDULER}; then run again")
     error = future.exception()
@@ -123,7 +123,7 @@ def _error_of(future: Future[None]) -> Exception | None:
 
 
 class _Processes(Executor):
-    """Processes with a pool each: one that dies takes no other task with it."""
+    """Processes with a pool each: if one dies, tasks of the others go on."""
 
     def __init__(self, count: int) -> None:
         self._lock = threading.Lock()
@@ -131,7 +131,7 @@ class _Processes(Executor):
         self._pools: set[ProcessPoolExecutor] = set()
 
     def submit(self, work: Callable[..., Any], /, *given: Any, **named: Any) -> Future[Any]:
-        """Begin a task in an idle process, of which there must be one."""
+        """Start a task in an idle process; there must be one."""
         with self._lock:
             pool = self._idle.pop() or measuring_pool(1)
             self._pools.add(pool)
@@ -141,7 +141,7 @@ class _Processes(Executor):
         return future
 
     def _free(self, pool: ProcessPoolExecutor, done: Future[Any]) -> None:
-        """Take back a process; if it has died, another takes its place."""
+        """Mark a process as idle, or replace it if it has died."""
         died = not done.cancelled() and isinstance(done.exception(), BrokenExecutor)
         with self._lock:
             if died:
@@ -151,13 +151,13 @@ class _Processes(Executor):
             pool.shutdown(wait=False)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """End the processes, whatever they do: what a task has not written is not there."""
+        """End the processes; results of unfinished tasks are lost."""
         for pool in list(self._pools):
             end_processes(pool, wait)
 
 
 class _Here(Executor):
-    """Does each task at once, in this process."""
+    """Runs each task immediately, in this process."""
 
     def submit(self, work: Callable[..., Any], /, *given: Any, **named: Any) -> Future[Any]:
         future: Future[Any] = Future()
@@ -175,7 +175,7 @@ def local_workers(count: int | None) -> Iterator[Workers]:
     Parameters
     ----------
     count
-        How many; None: one a core; 0: none, tasks are done in this process.
+        Number of processes; None: one per core; 0: tasks run in this process.
     """
     count = (os.cpu_count() or 1) if count is None else count
     executor = _Processes(count) if count else _Here()

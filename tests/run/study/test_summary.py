@@ -1,4 +1,4 @@
-"""Means over recordings and their ±, what is out of line, and the page."""
+"""Means over recordings and their ±, outliers, and the page."""
 
 from __future__ import annotations
 
