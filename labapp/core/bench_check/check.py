@@ -197,7 +197,7 @@ def check_bench(
     verdict, patterns = judge(rig, sightings, made, free_directions)
     sizes = measure_sizes(rig, sightings, free_directions, made)
     named = {
-        f"{picture.name}, {picture.mirror.name}: {size.name}": size
+        f"{size.name} in {picture.name}": size
         for picture, own in zip(pictures, sizes, strict=True)
         for size in own
     }
@@ -379,7 +379,7 @@ def _sizes_off(sizes: Mapping[str, MeasuredSize]) -> tuple[float, str]:
         for name, one in sorted(off.items(), key=lambda pair: -abs(pair[1].deviation))
         if one.deviation**2 > NEARLY * square
     )
-    return square, "; or ".join(named) + ": is it the mirror that was named?"
+    return square, "; or ".join(named) + " (is it the mirror that was named?)"
 
 
 def _suspected(suspects: Sequence[Suspect]) -> str:
