@@ -158,12 +158,12 @@ def main() -> None:
         width, height = float(rng.uniform(5.5, 7.5)), float(rng.uniform(0.15, 0.35))
         pool = spherical_cap(width, height) if n % 2 else egg(width, width / 2, 0.6 * width, height)
         predicted = {
-            one.name: one.total_sigma_mm
+            one.name: (one.total_sigma_mm, one.setup_sigma_mm)
             for one in forecast(BEHIND_GLASS, CANDIDATES, Cap(width, height))
         }
         seed = [given.seed, n, 1]
         exact = replace(BEHIND_GLASS, uncertainty=None)
-        predicted["true"] = height_sigma(exact, Cap(width, height)).total_sigma_mm
+        predicted["true"] = height_sigma(exact, Cap(width, height)).total_sigma_mm, 0.0
         results: dict[str, tuple[Rig, ToPlane]] = {
             "true": (bench.rig, bench.view.to_plane),
             "as it is": (BEHIND_GLASS, CALIBRATION.to_plane),
@@ -188,7 +188,7 @@ def main() -> None:
         for name, (rig, to_plane) in results.items():
             found, sigma = measured(pool, bench, rig, to_plane, seed)
             by_truth = found if name == "true" else by_truth
-            row = found - height, sigma, predicted[name], found - by_truth, height
+            row = found - height, sigma, *predicted[name], found - by_truth, height
             errors[name].append(row)
         if n % 10 == 9 or n == given.benches - 1:
             report(errors, statuses)
@@ -197,17 +197,17 @@ def main() -> None:
 def report(errors: dict[str, list[tuple[float, ...]]], statuses: dict[str, dict[str, int]]) -> None:
     """Print what has come out so far."""
     print(
-        f"{'':23} {'n':>4} lost covered  RMS error  RMS ±  predicted  by set-up  (of the height, %)"
-        "  error's fall"
+        f"{'':23} {'n':>4} lost covered     error         ± predicted  | by the set-up, predicted "
+        "| error's fall  (RMS, % of the height)"
     )
     before = np.nan
     for name, rows in errors.items():
-        error, sigma, predicted, by_setup, height = np.array(rows).T
+        error, sigma, predicted, predicted_setup, by_setup, height = np.array(rows).T
         known = np.isfinite(error)
         covered = np.mean(np.abs(error[known]) < 1.96 * sigma[known])
         percent = [
             100 * float(np.sqrt(np.nanmean((part[known] / height[known]) ** 2)))
-            for part in (error, sigma, predicted, by_setup)
+            for part in (error, sigma, predicted, by_setup, predicted_setup)
         ]
         lost = int((~known).sum())
         line = " ".join(f"{value:9.2f}" for value in percent)
