@@ -146,7 +146,7 @@ class BenchCheck(ReadOnlyArrays):
 
     @property
     def undetermined(self) -> tuple[QuantityChange, ...]:
-        """Quantities that the pictures hardly tell: known about as well as before."""
+        """Quantities that the pictures hardly determine: known about as well as before."""
         return tuple(
             one
             for one in self.changes
@@ -275,7 +275,7 @@ def _labelled(
     calibration: ImageCalibration,
     free_directions: FloatArray,
 ) -> list[IntArray]:
-    """Labels of each picture: plates first, as they tell the bench that the others are seen on."""
+    """Labels of each picture: plates first, which determine the bench for the others."""
     order = sorted(range(len(pictures)), key=lambda k: not isinstance(pictures[k].mirror, Plate))
     labels: dict[int, IntArray] = {}
     near = rig, calibration
