@@ -4,7 +4,8 @@ Run as ``python -m tests.benchmarks.bench_check [--benches N] [--full M] [--seed
 drawn about one set-up, with all quantities off that have a ±, those of a glass on the plane too.
 Pools of two kinds are measured on each before and after the check, and with the true set-up, whose
 errors are those of noise and level alone. Of the first M benches dots are matched as in the app; of
-the others each dot's ray is given, which is some ten times as quick.
+the others each dot's ray is given, which is some ten times as quick. Each set of pictures is taken
+with plates that lie level to each of `LEVELS_DEG`, on the same benches with the same draws.
 """
 
 from __future__ import annotations
@@ -59,11 +60,25 @@ BEHIND_GLASS = replace(
     ),
 )
 ERRORS = BenchErrors(axis_mm=0.1, glass_mm=0.1, glass_index=0.02)
-CANDIDATES: dict[str, tuple[Mirror, ...]] = {
+PICTURES: dict[str, tuple[Plate | Cap, ...]] = {
     "plate": (Plate(0.0),),
-    "plate, two heights": (Plate(0.0), Plate(2.0)),
+    "two heights": (Plate(0.0), Plate(2.0)),
     "plate and cap": (Plate(0.0), Cap(9.75, 0.91)),
-    "level plate, cap": (Plate(0.0, tilt_sigma_deg=0.03), Cap(9.75, 0.91)),
+}
+LEVELS_DEG = (0.1, 0.02, 0.0)
+"""Standard deviations of how level plates lie, and what the check takes them for: what is assumed
+where nothing is entered, a ground plate on a surface plate, and exactly level."""
+
+
+def levelled(mirror: Plate | Cap, level_deg: float) -> Plate | Cap:
+    """A mirror; if it is a plate, level to so much."""
+    return replace(mirror, tilt_sigma_deg=level_deg) if isinstance(mirror, Plate) else mirror
+
+
+CANDIDATES: dict[str, tuple[Mirror, ...]] = {
+    f"{name}, {level:g} deg": tuple(levelled(one, level) for one in mirrors)
+    for level in LEVELS_DEG
+    for name, mirrors in PICTURES.items()
 }
 
 
@@ -143,18 +158,19 @@ def main() -> None:
         width, height = float(rng.uniform(5.5, 7.5)), float(rng.uniform(0.15, 0.35))
         pool = spherical_cap(width, height) if n % 2 else egg(width, width / 2, 0.6 * width, height)
         predicted = {
-            one.name: one.total_sigma_mm
+            one.name: (one.total_sigma_mm, one.setup_sigma_mm)
             for one in forecast(BEHIND_GLASS, CANDIDATES, Cap(width, height))
         }
         seed = [given.seed, n, 1]
         exact = replace(BEHIND_GLASS, uncertainty=None)
-        predicted["true"] = height_sigma(exact, Cap(width, height)).total_sigma_mm
+        predicted["true"] = height_sigma(exact, Cap(width, height)).total_sigma_mm, 0.0
         results: dict[str, tuple[Rig, ToPlane]] = {
             "true": (bench.rig, bench.view.to_plane),
             "as it is": (BEHIND_GLASS, CALIBRATION.to_plane),
         }
-        for name, mirrors in CANDIDATES.items():
-            shots = [(m, *seen(surface_like(m, rng), bench, rng)) for m in mirrors]
+        for k, (name, mirrors) in enumerate(CANDIDATES.items()):
+            own = np.random.default_rng([given.seed, n, 2, k % len(PICTURES)])
+            shots = [(m, *seen(surface_like(m, own), bench, own)) for m in mirrors]
             if n < given.full:
                 pictures = [Picture(m.name, m, dots_at(place), SHAPE) for m, place, _ in shots]
                 try:
@@ -172,7 +188,7 @@ def main() -> None:
         for name, (rig, to_plane) in results.items():
             found, sigma = measured(pool, bench, rig, to_plane, seed)
             by_truth = found if name == "true" else by_truth
-            row = found - height, sigma, predicted[name], found - by_truth, height
+            row = found - height, sigma, *predicted[name], found - by_truth, height
             errors[name].append(row)
         if n % 10 == 9 or n == given.benches - 1:
             report(errors, statuses)
@@ -181,19 +197,23 @@ def main() -> None:
 def report(errors: dict[str, list[tuple[float, ...]]], statuses: dict[str, dict[str, int]]) -> None:
     """Print what has come out so far."""
     print(
-        f"{'':20} {'n':>4} lost covered  RMS error  RMS ±  predicted  by set-up  (of the height, %)"
+        f"{'':23} {'n':>4} lost covered     error         ± predicted  | by the set-up, predicted "
+        "| error's fall  (RMS, % of the height)"
     )
+    before = np.nan
     for name, rows in errors.items():
-        error, sigma, predicted, by_setup, height = np.array(rows).T
+        error, sigma, predicted, predicted_setup, by_setup, height = np.array(rows).T
         known = np.isfinite(error)
         covered = np.mean(np.abs(error[known]) < 1.96 * sigma[known])
         percent = [
             100 * float(np.sqrt(np.nanmean((part[known] / height[known]) ** 2)))
-            for part in (error, sigma, predicted, by_setup)
+            for part in (error, sigma, predicted, by_setup, predicted_setup)
         ]
         lost = int((~known).sum())
         line = " ".join(f"{value:9.2f}" for value in percent)
-        print(f"{name:20} {len(rows):4} {lost:4} {100 * covered:6.1f}% {line}")
+        before = percent[0] if name == "as it is" else before
+        fall = before / percent[0]
+        print(f"{name:23} {len(rows):4} {lost:4} {100 * covered:6.1f}% {line} {fall:9.2f}")
     print({name: dict(each) for name, each in statuses.items()}, flush=True)
 
 

@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import scipy
 
-from labapp.core.bench_check.adjustment import ROBUST, Sighting, System
+from labapp.core.bench_check.adjustment import ROBUST, Sighting, System, adjust
 from labapp.core.bench_check.mirrors import Cap, Mirror, Plate
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
-from labapp.core.geometry.uncertainty import AxisPoints, RigUncertainty, covariance_of
+from labapp.core.geometry.uncertainty import (
+    INDEX,
+    AxisPoints,
+    RigUncertainty,
+    covariance_of,
+)
 from labapp.core.values import FloatArray
-from labapp.simulation.benches import BenchErrors, draw_bench
+from labapp.simulation.benches import BenchErrors, SimulatedBench, draw_bench
 from labapp.simulation.calibration.mirrors import FlatMirror
 from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import PoolSurface, trace
@@ -38,12 +44,15 @@ MIRRORS: tuple[tuple[Mirror, PoolSurface], ...] = (
 )
 
 
-def system(gross_mm: float = 0.0) -> System:
-    """Equations of a bench that is off, some of its dots by a gross error."""
-    rng = np.random.default_rng(18)
-    bench = draw_bench(RIG, VIEW, BenchErrors(), rng)
+def sightings_of(
+    mirrors: Sequence[tuple[Mirror, PoolSurface]],
+    bench: SimulatedBench,
+    rng: np.random.Generator,
+    gross_mm: float = 0.0,
+) -> list[Sighting]:
+    """Mirrors' dots, noisy, each with its ray; some off by a gross error."""
     sightings = []
-    for mirror, surface in MIRRORS:
+    for mirror, surface in mirrors:
         made = trace(surface, bench.rig)
         ray = np.argwhere(made.visible)
         place = bench.view.to_image(made.plane_mm[made.visible])
@@ -51,7 +60,14 @@ def system(gross_mm: float = 0.0) -> System:
         dots[::17] += gross_mm
         covariance = np.tile(0.026**2 * np.eye(2), (len(ray), 1, 1))
         sightings.append(Sighting(mirror, ray, dots, covariance))
-    return System.of(RIG, sightings, None)
+    return sightings
+
+
+def system(gross_mm: float = 0.0) -> System:
+    """Equations of a bench that is off, some of its dots by a gross error."""
+    rng = np.random.default_rng(18)
+    bench = draw_bench(RIG, VIEW, BenchErrors(), rng)
+    return System.of(RIG, sightings_of(MIRRORS, bench, rng, gross_mm), None)
 
 
 def test_derivatives_are_those_by_central_differences() -> None:
@@ -80,3 +96,17 @@ def test_another_method_finds_no_lower_cost(gross_mm: float) -> None:
     found = scipy.optimize.least_squares(roots, made, max_nfev=10)
     assert roots(made) @ roots(made) == pytest.approx(2 * found.cost, abs=0.01)
     np.testing.assert_allclose(made, found.x, atol=0.05)
+
+
+def test_a_plate_turned_between_two_pictures_cancels_its_wedge() -> None:
+    """The reversal method; by one picture the wedge is taken for a tilt of the bench."""
+    bench, wedge = SimulatedBench(replace(RIG, uncertainty=None), VIEW), np.tan(np.radians(0.15))
+    once, turned = ((Plate(), FlatMirror(0.0, 0.0, sign * wedge)) for sign in (1, -1))
+    tilts = [INDEX["laser.projection_angle_deg"], INDEX["imaging_plane.pitch_deg"]]
+    found = []
+    for pictures in ([once], [once, turned]):
+        mirrors = [*pictures, MIRRORS[1]]
+        made = adjust(RIG, sightings_of(mirrors, bench, np.random.default_rng(5)))
+        found.append(np.abs(made.offset[tilts]).max())
+    assert found[0] > 0.1
+    assert found[1] < 0.3 * found[0]

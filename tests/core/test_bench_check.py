@@ -341,7 +341,7 @@ def test_a_wrong_height_of_a_plate_is_named(height_mm: float):
     pairs = [(Plate(), FlatMirror()), (Plate(2.0), FlatMirror(height_mm))]
     check = check_bench([picture(*each, EXACT, rng)[0] for each in pairs], RIG, CALIBRATION)
     assert check.status == "size-off"
-    assert "plate at 2 mm: height" in check.reason
+    assert "height in plate at 2 mm" in check.reason
     size = check.pictures[1].sizes[0]
     assert size.independent_mm == pytest.approx(height_mm, abs=3 * size.independent_sigma_mm)
 

@@ -13,6 +13,7 @@ from labapp.core.bench_check.mirrors import Cap, Plate
 from labapp.core.geometry.perturbation import directions, moved_calibration, moved_rig
 from labapp.core.geometry.rig import ImagingPlane
 from labapp.core.geometry.uncertainty import (
+    INDEX,
     QUANTITIES,
     AxisPoints,
     RigUncertainty,
@@ -109,6 +110,9 @@ WRONG = {
     "imaging_plane.h_mm": 0.5,
     "imaging_plane.yaw_deg": 0.4,
     "imaging_plane.roll_deg": 0.5,
+    "imaging_plane.glass_mm": 1.3,
+    "image_calibration.z_axis_px[v]": 7.0,
+    "image_calibration.z_axis_mm": 1.5,
     "camera_lens.distortion_percent": 1.3,
     "picture.u": 0.25,
     "picture.v": 2.5,
@@ -133,6 +137,23 @@ def test_every_quantity_that_is_off_is_named_on_a_checked_bench(key, checked):
     own = next(suspect for suspect in found.suspects if suspect.name == one.name)
     assert not own.is_drift
     assert abs(own.off - WRONG[key]) < 4 * own.sigma
+
+
+def test_pitch_far_off_is_named_alone(checked):
+    """It leaves little for its assumed ±, and enough for a gross error."""
+    plane = BENCH_RIG.imaging_plane
+    size = plane.width_mm, plane.height_mm
+    pitched = ImagingPlane.of_angles(plane.origin_mm, (12.0, 0.0, 0.0), *size)
+    found = verdict_of(frames(replace(BENCH_RIG, imaging_plane=pitched)), checked)
+    assert found.is_doubtful
+    assert [one.name for one in found.suspects if not one.is_drift] == ["imaging plane, pitch"]
+
+
+def test_reason_names_all_quantities_that_residuals_cannot_tell_apart(checked):
+    higher = moved_rig(BENCH_RIG, 0.5 * np.eye(len(QUANTITIES))[INDEX["imaging_plane.h_mm"]])
+    found = verdict_of(frames(higher), checked)
+    assert len(found.suspects) > 4
+    assert all(one.name in found.reason for one in found.suspects)
 
 
 def test_lens_that_looks_beside_the_plane_s_middle_is_no_doubt():

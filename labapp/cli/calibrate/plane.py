@@ -22,7 +22,7 @@ def calibrate_plane(
         list[Path],
         typer.Argument(
             help="Picture of the target or a board in the imaging plane; of a board, more pictures "
-            "of it held anyhow may follow."
+            "of it in other poses may follow."
         ),
     ],
     unit_mm: Annotated[

@@ -146,7 +146,7 @@ class BenchCheck(ReadOnlyArrays):
 
     @property
     def undetermined(self) -> tuple[QuantityChange, ...]:
-        """Quantities that the pictures hardly tell: known about as well as before."""
+        """Quantities that the pictures hardly determine: known about as well as before."""
         return tuple(
             one
             for one in self.changes
@@ -197,7 +197,7 @@ def check_bench(
     verdict, patterns = judge(rig, sightings, made, free_directions)
     sizes = measure_sizes(rig, sightings, free_directions, made)
     named = {
-        f"{picture.name}, {picture.mirror.name}: {size.name}": size
+        f"{size.name} in {picture.name}": size
         for picture, own in zip(pictures, sizes, strict=True)
         for size in own
     }
@@ -275,7 +275,7 @@ def _labelled(
     calibration: ImageCalibration,
     free_directions: FloatArray,
 ) -> list[IntArray]:
-    """Labels of each picture: plates first, as they tell the bench that the others are seen on."""
+    """Labels of each picture: plates first, which determine the bench for the others."""
     order = sorted(range(len(pictures)), key=lambda k: not isinstance(pictures[k].mirror, Plate))
     labels: dict[int, IntArray] = {}
     near = rig, calibration
@@ -379,7 +379,7 @@ def _sizes_off(sizes: Mapping[str, MeasuredSize]) -> tuple[float, str]:
         for name, one in sorted(off.items(), key=lambda pair: -abs(pair[1].deviation))
         if one.deviation**2 > NEARLY * square
     )
-    return square, "; or ".join(named) + ": is it the mirror that was named?"
+    return square, "; or ".join(named) + " (is it the mirror that was named?)"
 
 
 def _suspected(suspects: Sequence[Suspect]) -> str:

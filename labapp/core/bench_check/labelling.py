@@ -30,7 +30,7 @@ from labapp.core.rows.lattice import empty_sites
 from labapp.core.values import CannotMeasure, FloatArray, IntArray
 
 LEAST_DOTS = 12
-"""Fewer dots with a ray tell nothing of a bench."""
+"""Fewer dots with a ray do not determine a bench."""
 
 SURROUNDED = 3
 """A ray is amid others that have so many lit neighbours of four."""
@@ -129,7 +129,9 @@ def label_picture(
     """
     pattern = rig.pattern
     if pattern.marker is None:
-        raise CannotMeasure("no-reference", "the pattern has no absent ray that would tell rows")
+        raise CannotMeasure(
+            "no-reference", "the pattern has no absent ray that would identify rows"
+        )
     if len(picture.dots) < LEAST_DOTS:
         raise CannotMeasure(
             "too-few-dots",

@@ -22,7 +22,7 @@ from labapp.core.matching.observation import Observation
 from labapp.core.values import CannotMeasure, FloatArray, IntArray, ReadOnlyArrays
 
 LEAST_PICTURES = 2
-"""One height cannot tell a mirror that is not at its height from rays that go elsewhere."""
+"""With one height, a mirror off its height looks like rays of other directions."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def calibrate_pattern(pictures: Sequence[Picture], bench: Bench) -> PatternCalib
     pictures
         Of `Plate` mirrors, two or more.
     bench
-        The set-up, which is taken as right; its pattern must be near enough to tell the rays.
+        The set-up, which is taken as right; its pattern must be near enough to identify the rays.
 
     Raises
     ------

@@ -2,7 +2,7 @@
 
 The bench adjusts itself to rays of the next row as well: the laser turns by an inter-beam angle, or
 its aim and the imaging plane move by a spacing. That leaves the same residuals, and only the prior,
-and dots beyond the pattern's edge, tell the two apart.
+and dots beyond the pattern's edge, distinguish the two.
 """
 
 from __future__ import annotations

@@ -86,7 +86,7 @@ def find_suspects(
 ) -> tuple[Suspect, ...]:
     """Find what the cost falls most by when it is free, most suspect first; empty: nothing.
 
-    Those that explain the dots alike come together: pictures cannot tell them apart.
+    Those that explain the dots alike come together: pictures cannot distinguish them.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ def find_suspects(
     most = max(first.values())
     if most < LIMIT:
         return ()
-    # To first order only, and that far off: the likeliest are adjusted in earnest.
+    # The first order is poor that far off: the likeliest are adjusted in full.
     likely = sorted(first, key=lambda key: -first[key])[:TRIED]
     found = []
     for key in likely:

@@ -1,8 +1,8 @@
 """Pictures of a board → the camera's lens and the image calibration, with their uncertainty.
 
 The board of the first picture stands in the imaging plane. One such picture is enough; further
-ones, of the same board held anyhow before the camera, tell the lens's distortion better and nearer
-to the picture's corners (`lens_fit`).
+ones, of the same board in any pose before the camera, determine the lens's distortion better and
+nearer to the picture's corners (`lens_fit`).
 """
 
 from __future__ import annotations
@@ -149,7 +149,7 @@ class BoardCalibration(SeenAxes):
         return BoardCalibration(self.size_px, tuple(seen), self.left_out)
 
     def undetermined(self) -> tuple[str, ...]:
-        """What the pictures could not tell, in words."""
+        """What the pictures could not determine, in words."""
         words = ["the focal length, which no result depends on"]
         names = {"k1": "radial distortion", "p1": "tangential distortion", "k2": "its higher power"}
         words += [

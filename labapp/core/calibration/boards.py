@@ -4,7 +4,7 @@ A board stands where the imaging plane does, upright as it is printed. O′ is i
 corner as the camera sees it; X′ runs along its lower row of inner corners, Z′ along its left
 column. A ChArUco board has a marker with a number in each white square, so that it is known which
 corners are seen where a part of it is hidden or out of the picture; a chessboard must be seen as a
-whole, and it does not tell what is up: it may be turned by 45° at most.
+whole, and it does not show which side is up: it may be turned by 45° at most.
 """
 
 from __future__ import annotations

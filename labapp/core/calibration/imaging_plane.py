@@ -35,7 +35,7 @@ def calibrate_imaging_plane(
     board
         The board, where it is one that is not printed by labapp, or the pictures show several.
     lens
-        The camera's lens, where it is known: a target does not tell it, a board does.
+        The camera's lens, where it is known: a board gives it, a target does not.
 
     Raises
     ------

@@ -1,9 +1,9 @@
 """Marks of the target whose places are known → affine map and homography, and which to use.
 
-§5.1.2 takes three points: an affine map. A camera that looks askew sees the plane in perspective,
-which more marks than three can tell. The marks lie along two axes only, so that a homography has
+§5.1.2 takes three points: an affine map. An oblique camera sees the plane in perspective, which
+more marks than three can show. The marks lie along two axes only, so that a homography has
 to be extrapolated to where the dots land: it is worth taking only if it errs less *there* (a
-focused information criterion, Claeskens and Hjort 2003). Perspective that the marks tell along one
+focused information criterion, Claeskens and Hjort 2003). Perspective that the marks show along one
 axis only is taken along that one. Where a mark is along its axis is known less well than where the
 bar is across it, and less well in the dark than in the light: each place counts by its own scatter.
 """
@@ -104,7 +104,7 @@ class MarkFits:
     Parameters
     ----------
     affine, homography
-        The fits; None for a homography that the marks cannot tell.
+        The fits; None for a homography that the marks do not determine.
     whole
         The homography with perspective along both axes, also where less is used: what the marks
         leave open; None if they are too few.
@@ -149,7 +149,7 @@ class MarkFits:
         return _field(self.corner_mm)
 
     def bound_mm(self, used: ImageCalibration) -> float:
-        """How far a map may err at the far corner: 95 % bound, mm; NaN if nothing tells.
+        """How far a map may err at the far corner: 95 % bound, mm; NaN if it is not known.
 
         The truth is a homography, with perspective along both axes, as uncertain as its fit to the
         marks: what they leave open counts in full, whichever map is used.
@@ -174,7 +174,7 @@ class MarkFits:
         """How far a map may err where dots land, and what helps where that matters."""
         bound, whole = self.bound_mm(used), self.whole
         if whole is None:
-            return (f"nothing tells how far the camera looks askew: {HELP}",)
+            return (f"how obliquely the camera looks is not known: {HELP}",)
         corner = f"{self.corner_mm:.0f}, {self.corner_mm:.0f} mm"
         bound_text = f"± {bound:.2g} mm at the plate's far corner (X′, Z′ = {corner}; 95 %)"
         if bound <= WHAT_MATTERS_MM:
@@ -223,7 +223,7 @@ def fit_marks(
     on_x, on_z = (int(np.sum(plane_mm[:, axis] == 0.0)) for axis in (1, 0))
     if min(on_x, on_z) < FEWEST_ON_AXIS or len(plane_mm) < FEWEST_MARKS:
         reason = (
-            f"{on_x} marks on O′X′ and {on_z} on O′Z′, O′ included, are too few to tell "
+            f"{on_x} marks on O′X′ and {on_z} on O′Z′, O′ included, are too few to show "
             f"perspective: {FEWEST_ON_AXIS} on each and {FEWEST_MARKS} in all are needed"
         )
         corner = FIELD * float(np.abs(plane_mm).max())
@@ -270,7 +270,7 @@ def _chosen(affine: MarkFit, fits: list[MarkFit], axis_mm: float) -> MarkFits:
     elif chance > LARGEST_CHANCE:
         reason = f"No perspective is seen: noise alone gains as much in {chance:.0%} of pictures"
     else:
-        reason = f"There is perspective, but the marks tell it too poorly: {here}"
+        reason = f"There is perspective, but the marks determine it too poorly: {here}"
     whole, corner, errors = fits[2], FIELD * axis_mm, (affine_error, error)
     return MarkFits(affine, homography, whole, corner, chance, *errors, best, reason)
 

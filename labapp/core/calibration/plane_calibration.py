@@ -61,7 +61,7 @@ class PlaneCalibrationSettings(MarkSettings):
     pointing_tolerance
         A bar's line may pass by O′ this many units off.
     middle_tolerance
-        A bar's middle may be this many units from where its length and O′ have it. This tells a
+        A bar's middle may be this many units from where its length and O′ have it. This finds a
         bar that is partly hidden: its middle moves by half of what is.
     flag_units
         How far the unit flags stand out of their bars, units.
@@ -293,7 +293,7 @@ def _measured(
         _check_pointing(axis, origin, bar, units, settings)
     ticks = _tick_marks(origin, bars, darkness, settings)
     if not ticks:
-        # Without flags in their places the ends alone must tell whether the bars are whole.
+        # Without flags in their places the ends alone must show whether the bars are whole.
         for axis, bar, units in zip(AXES, bars, (settings.x_units, settings.z_units), strict=True):
             _check_length(axis, origin, bar, units, settings)
     if ticks and settings.subpixel:

@@ -59,7 +59,11 @@ LENS_CENTER = 0.25
 middle, along either axis, over half of the plane's shorter side."""
 
 VISIBLE_MM = 1e-3
-"""A quantity that leaves less for its assumed uncertainty cannot be seen."""
+"""A quantity that leaves less for its assumed uncertainty raises no doubt. It is named where others
+do, and it explains the residuals as well: gross errors of it are visible, too …"""
+
+IMPLAUSIBLE = 30.0
+"""… unless it would be off by more times its assumed uncertainty."""
 
 UNANSWERED, FEWEST_TRIED = 0.8, 10
 """A set-up is in doubt where a larger share of so many frames has rays that match no pool."""
@@ -351,23 +355,26 @@ class _Left(ReadOnlyArrays):
         """Which of the ways that a bench may be off contradict it, the likeliest first."""
         left, weight = self.residual_mm, np.linalg.inv(self._covariance())
         found: list[tuple[float, Suspect]] = []
+        seen = 0.0
         for one in tested:
             pattern = self.by_quantity @ one.vector
             usual = QUANTITIES[INDEX[one.key]].assumed if one.key in INDEX else 1.0
-            if usual * _rms(pattern) < VISIBLE_MM:
-                continue
             weighed = weight @ pattern
             known = float(pattern @ weighed)
+            if known <= 0.0:
+                continue
             # Computed with a set-up that is off by δ, residuals are as with the dots off by −δ.
             off, sigma = -float(left @ weighed) / known, known**-0.5
-            explained = abs(off) * _rms(pattern)
-            suspect = Suspect(one.name, one.unit, off, sigma, explained, is_drift)
-            found.append(((off / sigma) ** 2, suspect))
-        most = max((drop for drop, _ in found), default=0.0)
-        if most < LIMIT:
+            drop, size = (off / sigma) ** 2, _rms(pattern)
+            is_visible = usual * size >= VISIBLE_MM
+            seen = max(seen, drop) if is_visible else seen
+            if is_visible or abs(off) <= IMPLAUSIBLE * usual:
+                suspect = Suspect(one.name, one.unit, off, sigma, abs(off) * size, is_drift)
+                found.append((drop, suspect))
+        if seen < LIMIT:
             return ()
         found.sort(key=lambda pair: -pair[0])
-        return tuple(suspect for drop, suspect in found if drop > most - ALIKE)
+        return tuple(suspect for drop, suspect in found if drop > found[0][0] - ALIKE)
 
     def _covariance(self) -> FloatArray:
         """Covariance of the residuals where the set-up is as it says, shape (2m, 2m), mm²."""
@@ -383,14 +390,17 @@ class _Left(ReadOnlyArrays):
 
 
 def _reason(suspects: Sequence[Suspect], frames: int) -> str:
-    """What the likeliest cause is, in a clause."""
+    """Which quantities explain the residuals, in a clause: all that residuals cannot tell apart."""
     first = suspects[0]
-    others = [one.name for one in suspects[1:] if one.is_drift == first.is_drift]
+    alike = [one for one in suspects if one.is_drift == first.is_drift]
     when = "have come up during the recording" if first.is_drift else f"recur in {frames} frames"
-    by = f"by {first.off:+.2g} ± {first.sigma:.1g} {first.unit}"
-    alike = f" (or {'; '.join(others[:3])})" if others else ""
-    size = f"{1e3 * first.rms_mm:.0f} µm"
-    return f"residuals of {size} {when}; likeliest cause: {first.name}, {by}{alike}"
+    found = f"residuals of {1e3 * first.rms_mm:.0f} µm {when}"
+    off = f"{first.name}, by {first.off:+.2g} ± {first.sigma:.1g} {first.unit}"
+    if len(alike) == 1:
+        return f"{found}; likeliest cause: {off}"
+    others = "; ".join(f"{one.name}, by {one.off:+.2g} {one.unit}".rstrip() for one in alike[1:])
+    one_of = f"one of these {len(alike)} is the likeliest cause, residuals cannot tell which"
+    return f"{found}; {one_of}: {off}; {others}"
 
 
 def _rms(values: FloatArray) -> float:

@@ -21,11 +21,9 @@ from labapp.config.setup import (
     unchecked_setup,
     updated_setup,
 )
-from labapp.core.bench_check.check import REASONS
 from labapp.core.bench_check.forecast import CANDIDATES
 from labapp.core.bench_check.mirrors import Ball, Cap, Plate
 from labapp.core.bench_check.suspects import Suspect
-from labapp.core.bench_check.verdict import Pattern
 from labapp.core.geometry.uncertainty import INDEX
 from labapp.core.images.find_dots import DotSettings
 from labapp.core.values import CannotMeasure
@@ -307,6 +305,7 @@ def test_a_bench_is_checked_used_kept_and_undone(
     np.testing.assert_array_equal(session.picture(picture.picture_sha256), plate)
     assert session.problems(recording=False) == []
     assert not page.use_button.isEnabled()
+    assert page.answer.text()
 
     session.update_setup({"laser": {"aim_x_mm": 0.25}})
     assert states(session)["bench_check"].mark is Mark.ATTENTION
@@ -322,6 +321,7 @@ def test_a_bench_is_checked_used_kept_and_undone(
     assert session.bench_check is None
     assert states(session)["bench_check"].mark is Mark.READY
     assert page.use_button.isEnabled()
+    assert not page.answer.text()
 
 
 @pytest.mark.slow
@@ -364,6 +364,9 @@ def test_a_refused_check_offers_what_is_off_and_no_measured_mirror(
     page.checked = replace(page.checked, check=off)
     page.refresh()
     assert page.suspect.value() == "imaging_plane.h_mm"
+    page.checked = replace(page.checked, check=replace(off, status="size-off"))
+    page.refresh()
+    assert page.suspect_part.isHidden()
     page.workspace.close()
     assert page.state(states(None)["bench_check"]) == states(None)["bench_check"]
 
@@ -375,22 +378,6 @@ def test_the_table_stands_below_the_picture_where_there_is_no_room_beside_it(
     assert page.splitter.orientation() == Qt.Orientation.Horizontal
     page.resize(500, 600)
     assert page.splitter.orientation() == Qt.Orientation.Vertical
-
-
-@pytest.mark.slow
-def test_a_cause_that_explains_more_than_the_suspect_is_named_beside_it(checked: Checked) -> None:
-    suspects = (Suspect("laser.distance_mm", "laser, distance", 784.0),)
-    for drop, named in ((1476.0, True), (700.0, False)):
-        patterns = (Pattern("plate-not-flat", drop, 0.05),)
-        off = replace(
-            checked.check,
-            status="quantity-off",
-            reason="off",
-            suspects=suspects,
-            patterns=patterns,
-        )
-        words = replace(checked, check=off).words
-        assert (REASONS["plate-not-flat"] in words) == named
 
 
 @pytest.mark.slow

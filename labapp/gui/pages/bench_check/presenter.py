@@ -12,7 +12,6 @@ from scipy.spatial import cKDTree
 
 from labapp.config.setup import Setup, parse_setup, unchecked_setup
 from labapp.core.bench_check.check import (
-    REASONS,
     UNDETERMINED,
     BenchCheck,
     CheckedPicture,
@@ -82,11 +81,8 @@ class Checked:
             ]
             return " ".join((*parts, "Press Apply to use the adjusted set-up."))
         reason = f"▲ {_sentence(self.check.reason)}"
-        if not self.check.suspects:
+        if not self.suspects:
             return reason
-        likeliest = max(self.check.patterns, key=lambda one: one.drop, default=None)
-        if likeliest is not None and likeliest.drop > self.check.suspects[0].drop:
-            reason += f" Or {REASONS[likeliest.cause]}."
         return (
             f"{reason} Are the mirror's kind, size and height right? Then measure the quantity "
             "again and correct it, or have it found from the pictures."
@@ -111,8 +107,10 @@ class Checked:
 
     @property
     def suspects(self) -> tuple[tuple[str, str], ...]:
-        """Quantities that are off by far more than their ±: (key, name)."""
-        return tuple((one.key, _sentence(one.name, "")) for one in self.check.suspects)
+        """Quantities that are off by far more than their ±: (key, name); none if a size is."""
+        is_quantity = self.check.status == "quantity-off"
+        suspects = self.check.suspects if is_quantity else ()
+        return tuple((one.key, _sentence(one.name, "")) for one in suspects)
 
 
 def check(

@@ -101,6 +101,7 @@ class BenchCheckPage(Page):
             self._list(())
         if kept is not self._kept:
             self._kept = kept
+            self.answer.setText("")
             if kept is not None and not self._is_kept():
                 self.checked = None
                 self._take_kept()
@@ -179,6 +180,7 @@ class BenchCheckPage(Page):
         dropped = self.checked is not None and self.checked.chosen != tuple(chosen)
         if dropped:
             self.checked = None
+            self.answer.setText("")
         self.list.setRowCount(len(chosen))
         for row, one in enumerate(chosen):
             for column, text in enumerate((f"{row + 1}  {one.name}", one.mirror_words)):
@@ -207,8 +209,11 @@ class BenchCheckPage(Page):
             if tuple(self.chosen) == chosen:
                 self.checked = made
                 self.workspace.changed.emit()
-                self.confirm("The pictures are checked")
+                self.answer.setText("")
+                if made.usable:
+                    self.confirm("The pictures are checked")
 
+        self._show_predicted(None)
         self.start_task("Checking the bench", work, found)
 
     def find_suspect(self) -> None:
@@ -283,11 +288,10 @@ class BenchCheckPage(Page):
         self.mirrors.offer(("Copy table", self.mirrors.copy_text))
         fill(
             self.panel_layout,
-            *(self.predict_button, hbox((self.add_button, 1), self.remove_button)),
-            *(self.list, self.mirror_form),
+            *(self.predict_button, self.predicted_words, self.predicted),
+            *(hbox((self.add_button, 1), self.remove_button), self.list, self.mirror_form),
             *(hbox((self.check_button, 1), (self.use_button, 1)), self.answer),
-            *(self.words, self._suspect_part(), self.mirrors_words, self.mirrors),
-            *(self.predicted_words, self.predicted, 1),
+            *(self.words, self._suspect_part(), self.mirrors_words, self.mirrors, 1),
         )
         self.lock_with_session(self.add_button)
         self._show_predicted(None)
@@ -345,7 +349,7 @@ class BenchCheckPage(Page):
         self.suspect.set_choices(suspects)
         if suspects and not self.suspect.value():  # the former one is not among them
             self.suspect.set_value(suspects[0][0])
-        self.suspect_part.setVisible(bool(made and made.suspects))
+        self.suspect_part.setVisible(bool(suspects))
         self._enable(used)
 
     def _enable(self, used: bool) -> None:

@@ -92,7 +92,7 @@ class PlanePage(Page):
         self.start_task("Loading the picture", lambda _: read_picture(path), loaded)
 
     def add_picture(self, path: Path) -> None:
-        """Take a further picture of the board, held anyhow before the camera."""
+        """Take a further picture of the board, in another pose before the camera."""
 
         def loaded(image: GreyImage) -> None:
             self._tilted = (*self._tilted, image)
