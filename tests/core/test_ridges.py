@@ -65,6 +65,19 @@ def test_a_bent_line_is_found_where_it_is():
     assert line.width_px == pytest.approx(2.5, rel=0.15)
 
 
+def test_a_sharp_turn_is_not_cut_off():
+    """A line of a hollow pool near its focus: straight legs, and 10 px radius between them."""
+    across = np.linspace(-40.0, 40.0, 4000)
+    path = np.stack([130.4 + across, 50.3 + 1.5 * np.hypot(across, 15.0)], axis=-1)
+    line = max(
+        find_lines(drawn((path, 60.0), noise=0.5), LineSettings()), key=lambda one: one.length_px
+    )
+    away = np.linalg.norm(line.image_px[:, None] - path, axis=-1).min(axis=-1)
+    turn = np.abs(line.image_px[:, 0] - 130.4) < 12.0
+    assert turn.sum() > 20
+    assert np.sqrt(np.mean(away[turn] ** 2)) < 0.17
+
+
 def test_ends_are_where_the_light_ends():
     path = arc((130.4, 180.2), 80.0, 0.9)
     (line,) = find_lines(drawn((path, 60.0), noise=0.5), LineSettings())

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 
 from labapp.core.images.dots import Grey, Image
-from labapp.core.lines.chains import LEAST_FOLDED, is_upright, join_chains, spread_of
+from labapp.core.lines.chains import END_WIDTHS, LEAST_FOLDED, is_upright, join_chains, spread_of
 from labapp.core.lines.gathered import gathered_spots
 from labapp.core.lines.ridges import Ridges, RidgeSettings, find_ridges
 from labapp.core.lines.smooth_path import SmoothPath
@@ -33,6 +33,10 @@ picture ends before, its middle is not known."""
 
 CENTER_ROUNDS = 4
 """Of the window that follows the middle of a line's light."""
+
+BEND_SHARE, LEAST_WINDOW_PX, WIDER = 0.4, 3.0, 1.8
+"""In the second pass a line's light is averaged over this share of its radius of curvature, between
+so many pixels and so many times the length of the first pass."""
 
 PATH_SMOOTHER = 1.8
 """The path that a line's light is averaged along is smoothed over so many times that length."""
@@ -270,10 +274,14 @@ def _line(
     if seen.sum() < least:
         return None
     path = replace(path, seen=seen)
-    off, sigma = _centers(picture, path, width, smooth_px)
-    # A bent line's light, blurred, has its ridge on the inner side: by σ²κ/2.
-    off -= path.curvature * width**2 / 2
-    path = path.moved(off, settings.smooth_px)
+    window: FloatArray = np.full(len(path.place), smooth_px)
+    for _ in range(2):
+        off, sigma = _centers(picture, path, width, window)
+        # A bent line's light, blurred, has its ridge on the inner side: by σ²κ/2.
+        path = path.moved(off - path.curvature * width**2 / 2, settings.smooth_px)
+        # The second pass corrects what smoothing took from bends: there with a narrow window.
+        radius = 1.0 / (np.abs(path.curvature) + 1e-9)
+        window = np.clip(BEND_SHARE * radius, LEAST_WINDOW_PX, WIDER * smooth_px)
     light = float(np.median(strength) * spread2**1.5 * np.sqrt(2 * np.pi))
     near, heights = round(END_PX), ridges.height[points]
     ends = [
@@ -282,6 +290,10 @@ def _line(
     ]
     size = np.array(picture.shape[::-1])
     places = np.array(ends)
+    # Light near an end, cut off obliquely by the pool's edge, is not symmetric about the line.
+    away = np.linalg.norm(path.place[:, None] - places, axis=-1).min(axis=-1)
+    clear = seen & (away > END_WIDTHS * np.sqrt(spread2))
+    seen = clear if clear.sum() >= least else seen
     edge = max(settings.edge_px, STRIP_WIDTHS * width)
     cut = ((places < edge) | (places > size - 1 - edge)).any(axis=-1)
     return LightLine(
@@ -305,12 +317,13 @@ def _within(place: FloatArray, room_px: float, picture: Grey) -> BoolArray:
 
 
 def _centers(
-    picture: Grey, path: SmoothPath, width: float, smooth_px: float
+    picture: Grey, path: SmoothPath, width: float, window_px: FloatArray
 ) -> tuple[FloatArray, float]:
     """Offset of the light's middle from a path, across it, shape (n,), px, and its uncertainty.
 
     The light beside the path is taken as a straight strip, weighed by a Gaussian window that
-    follows its middle, and averaged along the path.
+    follows its middle, and averaged along the path by Gaussian weights of the standard deviation
+    ``window_px``, shape (n,).
     """
     reach = STRIP_WIDTHS * width + 1.0
     side = np.arange(-reach, reach + 0.25, 0.5)
@@ -324,7 +337,7 @@ def _centers(
     edge = max(2, len(side) // 8)
     low, high = strip[:, :edge].mean(axis=1), strip[:, -edge:].mean(axis=1)
     along = np.arange(len(strip), dtype=float)
-    bell = np.exp(-(((along - along[:, None]) / smooth_px) ** 2) / 2) * path.seen
+    bell = np.exp(-(((along - along[:, None]) / window_px[:, None]) ** 2) / 2) * path.seen
     bell /= bell.sum(axis=1, keepdims=True) + 1e-12
     strip -= (bell @ np.minimum(low, high))[:, None]
     off = np.zeros(len(strip))
