@@ -133,7 +133,18 @@ class Results(Sequence[FrameResult]):
 
     @classmethod
     def of_session(cls, session: Session) -> Results:
-        """Return the results that a session has; frames that were not measured are left out."""
+        """Return the results that a session has; frames that were not measured are left out.
+
+        Parameters
+        ----------
+        session
+            An open session.
+
+        Returns
+        -------
+        Results
+            With its calibration and the verdict on its set-up.
+        """
         from labapp.session.session import Session
 
         require(session, Session, "Results.of_session", "session", "a Session")
@@ -262,7 +273,12 @@ class Results(Sequence[FrameResult]):
         band_hz
             Lowest and highest frequency of oscillations; None: all that the frames resolve.
         segment_s
-            Duration of a segment of the spectrogram; None: an eighth of the recording.
+            Duration of a segment of the spectrogram, s; None: an eighth of the recording.
+
+        Returns
+        -------
+        Dynamics
+            Modes, spectra, events and responses, each with its uncertainty.
 
         Raises
         ------
@@ -295,6 +311,11 @@ class Results(Sequence[FrameResult]):
         model
             One that was fitted, or read by `labapp.export.penetration.read_model`.
 
+        Returns
+        -------
+        Prediction
+            Penetration of each frame, with its uncertainty.
+
         Raises
         ------
         InputError
@@ -318,6 +339,11 @@ class Results(Sequence[FrameResult]):
             A column of the measures, such as ``width_mm``.
         axes
             Where to plot; None: in a new figure.
+
+        Returns
+        -------
+        Axes
+            Where it was plotted.
 
         Raises
         ------
@@ -355,6 +381,11 @@ class Results(Sequence[FrameResult]):
             Where to plot; None: in a new figure.
         spacing_mm
             Distance of the grid's nodes, mm.
+
+        Returns
+        -------
+        Axes
+            Where it was plotted.
 
         Raises
         ------

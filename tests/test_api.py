@@ -2,7 +2,12 @@
 
 from __future__ import annotations
 
+import inspect
+import pkgutil
+import re
+from collections.abc import Callable
 from pathlib import Path
+from types import FunctionType
 
 import matplotlib as mpl
 import numpy as np
@@ -41,6 +46,44 @@ def test_the_public_names_are_those_that_are_there() -> None:
         assert getattr(labapp, name) is not None
     with pytest.raises(AttributeError, match="nothing"):
         _ = labapp.nothing
+
+
+def documented() -> dict[str, object]:
+    """Names of the API reference, and what they stand for."""
+    text = (Path(__file__).parents[1] / "docs/reference/api.md").read_text("utf-8")
+    return {name: pkgutil.resolve_name(name) for name in re.findall(r"^::: (\S+)", text, re.M)}
+
+
+def test_what_is_exported_is_documented_and_the_reverse() -> None:
+    names = {name for name in documented() if name.count(".") == 1}
+    assert names == {f"labapp.{name}" for name in labapp.__all__ if name != "__version__"}
+
+
+@pytest.mark.parametrize(("name", "what"), documented().items())
+def test_every_documented_name_says_what_its_parameters_are(name: str, what: object) -> None:
+    silent = []
+    for each, function in public_functions(name, what).items():
+        doc = inspect.getdoc(function) or ""
+        section = doc.partition("Parameters\n----------\n")[2]
+        explained = set(re.findall(r"\w+", " ".join(re.findall(r"^\w[\w, ]*$", section, re.M))))
+        parameters = set(inspect.signature(function).parameters) - {"self", "cls"}
+        if not doc or parameters - explained:
+            silent.append((each, parameters - explained))
+    assert not silent
+    assert inspect.getdoc(what)
+
+
+def public_functions(name: str, what: object) -> dict[str, Callable[..., object]]:
+    """A function, or the methods of a class that are labapp's own."""
+    if not inspect.isclass(what):
+        return {name: what} if callable(what) else {}
+    bases = [base for base in what.__mro__ if base.__module__.startswith("labapp.")]
+    return {
+        f"{name}.{key}": getattr(what, key)
+        for base in bases
+        for key, value in vars(base).items()
+        if not key.startswith("_") and isinstance(value, FunctionType | classmethod | staticmethod)
+    }
 
 
 def test_a_recording_and_its_images_give_the_same_as_the_command_line(

@@ -14,9 +14,11 @@ class FrameResult:
     """The result of one frame."""
 
     frame: int
+    """Its number."""
     time_s: float | None
-    """Its number, and its time where it has one, s."""
+    """Its time, s; None if the recording has none."""
     measurement: Measurement
+    """Status, reason, measures, and what they were computed from."""
     track_lost: str | None = None
     """Why it was not measured from the frame before; None if it was, or was not to be."""
     rows: Mapping[str, str] | None = None

@@ -139,6 +139,11 @@ class SessionContents:
     def picture(self, sha256: str) -> GreyImage:
         """A calibration picture that the session keeps, grey levels, shape (rows, columns).
 
+        Parameters
+        ----------
+        sha256
+            Its hash, as calibrations and bench checks name it.
+
         Raises
         ------
         InputError
@@ -155,14 +160,26 @@ class SessionContents:
         return Settings() if found is None else found
 
     def correction(self, frame: int) -> Correction | None:
-        """Dots and rows of a frame as they were corrected by hand; None where there are none."""
+        """Dots and rows of a frame as they were corrected by hand; None where there are none.
+
+        Parameters
+        ----------
+        frame
+            Number of the frame.
+        """
         from labapp.core.rows.correction import Correction
 
         found = self._by_hand(frame)
         return found if isinstance(found, Correction) else None
 
     def line_correction(self, frame: int) -> LineCorrection | None:
-        """Lines of a frame as they were corrected by hand; None where there are none."""
+        """Lines of a frame as they were corrected by hand; None where there are none.
+
+        Parameters
+        ----------
+        frame
+            Number of the frame.
+        """
         from labapp.core.lines.correction import LineCorrection
 
         found = self._by_hand(frame)
@@ -214,7 +231,18 @@ class SessionContents:
         return self._frames.numbers
 
     def frame(self, number: int) -> Frame:
-        """One frame as it was imported; see `Frames.read`."""
+        """One frame as it was imported.
+
+        Parameters
+        ----------
+        number
+            Its number in the recording.
+
+        Raises
+        ------
+        InputError
+            If the session does not use it, or it is no longer what was imported.
+        """
         return self._frames.read(number)
 
     # --- what was measured ------------------------------------------------------------------
@@ -224,6 +252,8 @@ class SessionContents:
 
         Parameters
         ----------
+        frame
+            Number of the frame.
         scheme
             ``fit``, ``ers``, ``irs-opa`` …; None: the one that the settings choose.
 
@@ -241,7 +271,13 @@ class SessionContents:
         )
 
     def frame_results(self, stale: bool = True) -> Iterator[FrameResult]:
-        """Results of the frames that were measured, read one by one; ``stale``: stale ones, too."""
+        """Results of the frames that were measured, read one by one.
+
+        Parameters
+        ----------
+        stale
+            Whether to include results that are out of date.
+        """
         from labapp.export.frame_result import FrameResult
 
         times = self.overview().time_s.tolist()
@@ -252,7 +288,13 @@ class SessionContents:
                 yield FrameResult(frame, time, found.measurement)
 
     def overview(self, scheme: str | None = None) -> Overview:
-        """Status, correction, staleness and measures of every frame."""
+        """Status, correction, staleness and measures of every frame.
+
+        Parameters
+        ----------
+        scheme
+            ``fit``, ``ers``, ``irs-opa`` …; None: the one that the settings choose.
+        """
         return self._overviews.get(self._known_scheme(scheme), self._basis())
 
     @property
@@ -312,6 +354,11 @@ class SessionContents:
             Called with frames done and frames in all.
         recording
             Whether to read the recording, or the embedded frames, through too.
+
+        Returns
+        -------
+        list of str
+            The problems.
         """
         return self._database.problems() or [
             *self._documents.problems(),

@@ -62,6 +62,11 @@ class Session(SessionContents):
             Whether to open a session that is there, with all that is in it: a script that failed
             half-way can be run again, and measures only what is missing.
 
+        Returns
+        -------
+        Session
+            The session, open for writing.
+
         Raises
         ------
         InputError
@@ -83,6 +88,13 @@ class Session(SessionContents):
     def open(cls, path: str | os.PathLike[str], read_only: bool = False) -> Session:
         """Open a session file.
 
+        Parameters
+        ----------
+        path
+            Of the file.
+        read_only
+            Whether to read it only, which is possible while another program writes it.
+
         Raises
         ------
         SessionInUse
@@ -97,11 +109,24 @@ class Session(SessionContents):
     # --- what the operator says; every change can be undone ---------------------------------
 
     def set_record(self, record: Record) -> None:
-        """Replace the experiment record."""
+        """Replace the experiment record.
+
+        Parameters
+        ----------
+        record
+            Title, operator, material and welding parameters.
+        """
         self._documents.change("experiment record", {("record", NO_FRAME): record})
 
     def set_setup(self, text: str, label: str = "setup") -> None:
         """Replace the setup by that of a setup file.
+
+        Parameters
+        ----------
+        text
+            Text of the file, not its path.
+        label
+            Name of the change in the history.
 
         Raises
         ------
@@ -121,6 +146,13 @@ class Session(SessionContents):
         self, values: Mapping[str, Mapping[str, object]], label: str = "setup"
     ) -> None:
         """Set or delete (None) keys of the setup: section → key → value; it may stay incomplete.
+
+        Parameters
+        ----------
+        values
+            As ``{"laser": {"distance_mm": 36.0}}``.
+        label
+            Name of the change in the history.
 
         Raises
         ------
@@ -149,6 +181,17 @@ class Session(SessionContents):
         """Calibrate the laser from its cross-hair (Appendix I), update the rig, store the picture.
 
         Values, standard uncertainties and their correlation go into the set-up.
+
+        Parameters
+        ----------
+        l1_mm, l2_mm, l3_mm
+            Half lengths of the cross: laser's side, far side, across; readings of each, mm.
+        fan_angle_deg
+            Fan angle of the cross-hair lens, degrees.
+        picture
+            Photograph of the cross, grey levels, shape (rows, columns); it is stored only.
+        settings
+            Standard uncertainties of the readings and of the fan angle; None: the defaults.
 
         Raises
         ------
@@ -188,6 +231,11 @@ class Session(SessionContents):
         unit_mm
             Length of a unit of the target's axes, mm.
 
+        Returns
+        -------
+        PlaneCalibration
+            What was found, which has been stored.
+
         Raises
         ------
         CannotMeasure
@@ -222,6 +270,11 @@ class Session(SessionContents):
         board
             The board; None: the one of labapp's that is seen.
 
+        Returns
+        -------
+        BoardCalibration
+            What was found, which has been stored.
+
         Raises
         ------
         CannotMeasure
@@ -250,6 +303,17 @@ class Session(SessionContents):
         name: str = "picture",
     ) -> None:
         """Apply an imaging plane found in a picture or placed by hand; store both.
+
+        Parameters
+        ----------
+        found
+            The calibration.
+        unit_mm
+            Length of a unit of the target's axes, or of a square of the board, mm.
+        image
+            The picture, grey levels, shape (rows, columns).
+        name
+            Name of the picture.
 
         Raises
         ------
@@ -296,6 +360,13 @@ class Session(SessionContents):
     def set_settings(self, settings: Settings, label: str = "settings") -> None:
         """Set how frames are measured: the scheme, and the settings of every step.
 
+        Parameters
+        ----------
+        settings
+            The settings.
+        label
+            Name of the change in the history.
+
         Raises
         ------
         InputError
@@ -308,6 +379,13 @@ class Session(SessionContents):
 
     def correct(self, corrections: Mapping[int, ByHand | None], label: str = "correction") -> None:
         """Set the corrections of frames in one step; None returns a frame to automatic.
+
+        Parameters
+        ----------
+        corrections
+            Correction of each frame (`labapp.core.rows.correction`), or None.
+        label
+            Name of the change in the history.
 
         Raises
         ------
@@ -329,11 +407,23 @@ class Session(SessionContents):
         )
 
     def set_signals(self, signals: Signals | None) -> None:
-        """Store current and voltage of the weld (`read_signals`); None deletes them."""
+        """Store current and voltage of the weld.
+
+        Parameters
+        ----------
+        signals
+            Those of `labapp.session.signals.read_signals`; None deletes them.
+        """
         self._documents.change("current and voltage", {("signals", NO_FRAME): signals})
 
     def set_limits(self, limits: Limits) -> None:
-        """Set the limits of the pool's sizes; a size beyond one raises an alarm (`alarms`)."""
+        """Set the limits of the pool's sizes; a size beyond one raises an alarm.
+
+        Parameters
+        ----------
+        limits
+            Lower and upper limits (`labapp.run.limits`).
+        """
         self._documents.change("limits", {("limits", NO_FRAME): limits})
 
     def undo(self) -> Change | None:
@@ -355,17 +445,60 @@ class Session(SessionContents):
         embed: bool = False,
         progress: Progress | None = None,
     ) -> Recording:
-        """Import a recording; see `Frames.import_recording`."""
+        """Import a recording: read it through, check that it is frame-exact, store both findings.
+
+        Parameters
+        ----------
+        path
+            A video, an image, a folder of images, a stack.
+        frames
+            Frames that the session uses, ``A:B:STEP``.
+        frame_rate_hz
+            Frame rate, Hz, where the recording states none or a wrong one.
+        embed
+            Whether to store the frames in the session.
+        progress
+            Called with frames done and frames in all.
+
+        Returns
+        -------
+        Recording
+            What was found of it.
+
+        Raises
+        ------
+        InputError
+            If it cannot be read, or frames measured or corrected in this session are not in it.
+        """
         return self._frames.import_recording(
             path, frames, frame_rate_hz=frame_rate_hz, embed=embed, progress=progress
         )
 
     def refuse_another_recording(self) -> None:
-        """Refuse any recording but the present one; see `Frames.refuse_another`."""
+        """Refuse a recording other than the session's, if that would end what was made of it.
+
+        Raises
+        ------
+        InputError
+            If frames are measured or corrected.
+        """
         self._frames.refuse_another()
 
     def relink(self, path: str | os.PathLike[str], verify: bool = True) -> None:
-        """Set where the recording is now; see `Frames.relink`."""
+        """Set the path of the recording, after it was moved.
+
+        Parameters
+        ----------
+        path
+            Where it is now.
+        verify
+            Whether to read it through and compare it; else each frame is compared when it is read.
+
+        Raises
+        ------
+        InputError
+            If the file there is another recording.
+        """
         self._frames.relink(path, verify)
 
     # --- what was measured ------------------------------------------------------------------
@@ -374,6 +507,13 @@ class Session(SessionContents):
         self, frames: Iterable[int] | None = None, *, warm: bool = False
     ) -> list[tuple[int, Measurement]]:
         """Measure frames and store the results (`measure_each`).
+
+        Parameters
+        ----------
+        frames
+            Which ones; None: those not measured yet, or measured from what was changed since.
+        warm
+            Whether to measure each frame from the one before.
 
         Returns
         -------
@@ -409,6 +549,11 @@ class Session(SessionContents):
             Whether to measure each frame from the one before (`WarmChain`).
         sinks
             Where else results go once they are kept (`run.runner.run`).
+
+        Yields
+        ------
+        tuple
+            Frame and measurement.
 
         Raises
         ------
@@ -480,6 +625,11 @@ class Session(SessionContents):
             Whether to add ``report.pdf``.
         progress
             Called with steps done and in all: files, report, film, frame by frame; may raise.
+
+        Returns
+        -------
+        tuple
+            The files that were written, with their hashes.
 
         Raises
         ------

@@ -43,7 +43,15 @@ class Boundary(ReadOnlyArrays):
 
     @classmethod
     def polar(cls, center_mm: FloatArray, radius_mm: FloatArray) -> Boundary:
-        """Build on z = 0 from radii at even steps of angle from −180°, shape (m,)."""
+        """Build on z = 0 from radii at even steps of angle from −180°.
+
+        Parameters
+        ----------
+        center_mm
+            X and Y of the centre, shape (2,), mm.
+        radius_mm
+            Distances of the points from the centre, shape (m,), mm.
+        """
         count = len(radius_mm)
         theta = -180.0 + 360.0 * np.arange(count) / count
         angle = np.radians(theta)
@@ -51,11 +59,28 @@ class Boundary(ReadOnlyArrays):
         return cls(np.asarray(center_mm, float), theta, np.column_stack([xy, np.zeros(count)]))
 
     def at_height(self, z_mm: FloatArray) -> Boundary:
-        """Give the same X and Y other heights, shape (m,), mm."""
+        """Return the boundary with the same X and Y at other heights.
+
+        Parameters
+        ----------
+        z_mm
+            Heights of the points, shape (m,), mm.
+        """
         return replace(self, points_mm=np.column_stack([self.points_mm[:, :2], z_mm]))
 
     def contains(self, x_mm: FloatArray, y_mm: FloatArray) -> BoolArray:
-        """Whether (x, y), arrays of one shape, lie within the polygon of the points."""
+        """Whether points lie within the polygon of the boundary's points.
+
+        Parameters
+        ----------
+        x_mm, y_mm
+            Positions, arrays of the same shape, mm.
+
+        Returns
+        -------
+        ndarray of bool
+            Of that shape.
+        """
         x = np.asarray(x_mm, float) - self.center_mm[0]
         y = np.asarray(y_mm, float) - self.center_mm[1]
         outline = self.points_mm[:, :2] - self.center_mm

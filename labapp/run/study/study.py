@@ -103,6 +103,11 @@ class Study:
         note
             Called with sentences for the user.
 
+        Returns
+        -------
+        list of RecordingStatus
+            What is done of each recording, in the order of the file.
+
         Raises
         ------
         InputError
@@ -151,6 +156,11 @@ class Study:
         ----------
         surfaces
             Whether surfaces belong to it.
+
+        Returns
+        -------
+        list of RecordingStatus
+            Of each recording, how many of its frames are measured, and why it failed if it did.
         """
         return [self._status(one, surfaces) for one in self.plan.recordings]
 
@@ -173,6 +183,13 @@ class Study:
 
     def tasks(self, recording: StudyRecording, surfaces: bool = False) -> Tasks | None:
         """The tasks that measure a recording; None as long as it was not looked at.
+
+        Parameters
+        ----------
+        recording
+            One of the plan's.
+        surfaces
+            Whether surfaces are to be kept.
 
         Raises
         ------
@@ -206,7 +223,14 @@ class Study:
             return ""
 
     def set_problem(self, recording: StudyRecording, problem: str) -> None:
-        """Keep why a recording failed; empty: it did not.
+        """Keep why a recording failed.
+
+        Parameters
+        ----------
+        recording
+            One of the plan's.
+        problem
+            Why; empty if it did not fail.
 
         Raises
         ------
@@ -251,6 +275,11 @@ class Study:
         sections
             Table of sections (docs/penetration.md); None: none is known.
 
+        Returns
+        -------
+        FeatureTable
+            A row per measured frame.
+
         Raises
         ------
         InputError
@@ -269,6 +298,11 @@ class Study:
         ----------
         surfaces
             Whether to write `surfaces.zarr`, of recordings that were run with surfaces.
+
+        Returns
+        -------
+        StudySummary
+            Statistics of recordings and of groups.
 
         Raises
         ------
