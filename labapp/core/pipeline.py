@@ -45,7 +45,8 @@ from labapp.core.values import CannotMeasure
 if TYPE_CHECKING:  # the module compiles: it is loaded where a frame is measured
     from labapp.core.sequence.prior import Prior
 
-Passed = Callable[[str], None]
+OnStep = Callable[[str], None]
+"""Called with the name of a step that is done."""
 
 ByHand = Correction | LineCorrection
 """A frame as the operator has it: dots and rows, or the lines of a line pattern."""
@@ -164,7 +165,7 @@ def measure(
     settings: Settings,
     prior: Prior | None = None,
     correction: ByHand | None = None,
-    passed: Passed = lambda _: None,
+    on_step: OnStep = lambda _: None,
 ) -> tuple[Measurement, Prior | None]:
     """Measure the pool that a frame shows. Never raises for a bad frame: the status says why.
 
@@ -184,7 +185,7 @@ def measure(
         The frame's dots and rows, or lines, as the operator has them; they are measured in place of
         what would be found, and of the image only the shape counts. One of the other kind of
         pattern is not used.
-    passed
+    on_step
         Called with the name of each step when it is done: dots, match, measures.
 
     Returns
@@ -196,51 +197,53 @@ def measure(
     result = Measurement(
         "ok", "", settings.scheme, correction=correction, setup_status=setup_status(bench.rig)
     )
-    if (of_lines := line_rig(bench.rig)) is not None:
-        return _with_lines(result, image, of_lines, bench), None
-    rig, limits = bench.rig, replace(settings.match, correspondence=settings.correspondence)
-    shape, known = (image.shape[0], image.shape[1]), None
-    followed, tuning, near = None, None, None
+    if (lines_rig := line_rig(bench.rig)) is not None:
+        return _with_lines(result, image, lines_rig, bench), None
+    rig, match_settings = bench.rig, replace(settings.match, correspondence=settings.correspondence)
+    frame_shape, known = (image.shape[0], image.shape[1]), None
+    followed, tuning, initial = None, None, None
     try:
         if isinstance(correction, Correction):
             dots, lattice = correction.dots, correction.lattice
             result = replace(result, dots=dots, lattice=lattice)
-            match, near = match_corrected(dots, lattice, bench, shape, limits)
+            match, initial = match_corrected(dots, lattice, bench, frame_shape, match_settings)
             lattice = lattice_of_corrected(match, rig, lattice)
         elif prior is not None:
             from labapp.core.sequence.following import follow
 
             dots = quick_dots(_as_before(image, prior), prior.tuning, settings.dots.band_pass)
             result = replace(result, dots=dots)
-            passed("dots")
-            observed = Observation.of(dots, bench, shape)
-            followed = follow(prior, observed, settings.fit, limits)
+            on_step("dots")
+            observed = Observation.of(dots, bench, frame_shape)
+            followed = follow(prior, observed, settings.fit, match_settings)
             match, known = followed.match, prior.known(followed.lit)
             lattice = lattice_of_match(match, rig, len(dots))
         else:
-            dots, tuning = _dots(image, settings.dots)
-            passed("dots")
-            rows, no_rows = _lattice_or_why(dots, shape, settings.lattice)
-            result = replace(result, dots=dots, lattice=rows)
-            match, near = _match_or_why(dots, rows, no_rows, bench, shape, limits)
+            dots, tuning = _dots_and_tuning(image, settings.dots)
+            on_step("dots")
+            found_lattice, no_lattice = _lattice_or_why(dots, frame_shape, settings.lattice)
+            result = replace(result, dots=dots, lattice=found_lattice)
+            match, initial = _match_or_why(
+                dots, found_lattice, no_lattice, bench, frame_shape, match_settings
+            )
             lattice = lattice_of_match(match, rig, len(dots))
         result = replace(result, match=match, lattice=lattice)
         if settings.scheme != "fit":
             return _by_scheme(result, match, rig, settings), None
-        pool = followed.pool if followed else fit.solve(match, rig, settings.fit, near)
-        passed("match")
-        made, size = fit.complete(match, pool, rig, settings.fit, known)
+        pool = followed.pool if followed else fit.solve(match, rig, settings.fit, initial)
+        on_step("match")
+        reconstruction, sizes = fit.complete(match, pool, rig, settings.fit, known)
     except CannotMeasure as why:
         return _refused(result, why), None
-    passed("measures")
-    result = replace(result, reconstruction=made, measures=size)
+    on_step("measures")
+    result = replace(result, reconstruction=reconstruction, measures=sizes)
     if prior is not None and followed is not None:
-        return result, prior.followed_by(followed, made, size)
+        return result, prior.followed_by(followed, reconstruction, sizes)
     from labapp.core.sequence.prior import Prior
 
     if tuning is None or rig.pattern.marker is None:
         return result, None
-    return result, Prior.of(bench, tuning, match, pool, made, size)
+    return result, Prior.of(bench, tuning, match, pool, reconstruction, sizes)
 
 
 def _by_scheme(result: Measurement, match: Match, rig: Rig, settings: Settings) -> Measurement:
@@ -266,7 +269,7 @@ def _as_before(image: Image, prior: Prior) -> Image:
     return image
 
 
-def _dots(image: Image, settings: DotSettings) -> tuple[Dots, DetectorTuning | None]:
+def _dots_and_tuning(image: Image, settings: DotSettings) -> tuple[Dots, DetectorTuning | None]:
     """The dots, and what the default detector was tuned to, for the frames after this one."""
     if settings.method == "band-pass":
         return tuned_dots(image, settings.band_pass)
@@ -312,18 +315,18 @@ def _refused(result: Measurement, why: CannotMeasure) -> Measurement:
 
 def _match_or_why(
     dots: Dots,
-    rows: Lattice | None,
-    no_rows: CannotMeasure | None,
+    lattice: Lattice | None,
+    no_lattice: CannotMeasure | None,
     bench: Bench,
     frame_shape: tuple[int, int],
     settings: MatchSettings,
 ) -> tuple[Match, SplineSurface]:
     """The match (`match_rays`); where nothing explains the dots, why there are no rows."""
     try:
-        return match_rays(dots, rows, bench, frame_shape, settings)
+        return match_rays(dots, lattice, bench, frame_shape, settings)
     except CannotMeasure as why:
         nothing = why.reason == NOTHING_EXPLAINS
-        raise (no_rows if no_rows and nothing else why) from None
+        raise (no_lattice if no_lattice and nothing else why) from None
 
 
 def _lattice_or_why(

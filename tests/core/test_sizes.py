@@ -15,6 +15,7 @@ from labapp.core.values import FloatArray
 
 BASIS = SplineBasis.over(np.array([-4.0, -5.0]), np.array([4.0, 4.0]), 0.9)
 CENTER = np.array([0.1, -0.4])
+DEPTH = measures.SIZES.index("depth_mm")
 
 
 def coefficients(dent_mm: float) -> FloatArray:
@@ -58,10 +59,10 @@ def test_derivatives_are_those_of_small_changes(drop_mm: float) -> None:
     level = Level(0.0, 0.001, 1, Rear(drop_mm, -1.0, -3.2), 0.0)
     sizes, _ = measured(made, level)
     # The deepest is the rear of the rim, which is given.
-    assert np.isnan(sizes.gradient[measures.DEPTH]).all()
+    assert np.isnan(sizes.gradient[DEPTH]).all()
     for spline in np.random.default_rng(5).choice(len(made), 25, replace=False):
         change = np.zeros_like(made)
         change[spline] = step
         more, less = (measured(made + way * change, level)[0].size for way in (1, -1))
         off = sizes.gradient[:, spline] - (more - less) / (2 * step)
-        assert np.abs(np.delete(off, measures.DEPTH)).max() < 2e-3
+        assert np.abs(np.delete(off, DEPTH)).max() < 2e-3

@@ -113,9 +113,17 @@ def _take_off(
 
 
 @_inner
-def _bell(center: float, width: float, values: Grey) -> None:
-    """A Gaussian at whole numbers round 0: each value is the last times what shrinks evenly."""
-    away = -(len(values) // 2) - center
+def gaussian_samples(first: int, center: float, width: float, values: Grey) -> None:
+    """Sample a Gaussian at whole numbers from the first on, each value as the last times a ratio.
+
+    Parameters
+    ----------
+    first, center, width
+        The first number; mean and standard deviation of the Gaussian, whose largest value is 1.
+    values
+        Where the values are put, shape (n,).
+    """
+    away = first - center
     value = np.exp(-0.5 * (away / width) ** 2)
     ratio, shrinks = np.exp(-(away + 0.5) / width**2), np.exp(-1.0 / width**2)
     for k in range(len(values)):
@@ -135,8 +143,8 @@ def _centroid(patch: Grey, place: FloatArray, width: float, reach: float, lines:
     along_u, along_v, pull_u, pull_v = lines[0], lines[1], lines[2], lines[3]
     pull_u[side:] = 0.0
     for _ in range(4):
-        _bell(place[0], width, pull_u[:side])
-        _bell(place[1], width, pull_v[:side])
+        gaussian_samples(-(side // 2), place[0], width, pull_u[:side])
+        gaussian_samples(-(side // 2), place[1], width, pull_v[:side])
         along_u[:] = 0.0
         for y in range(side):
             row = np.float32(0.0)

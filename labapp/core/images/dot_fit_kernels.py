@@ -8,6 +8,7 @@ from numba import types
 from labapp.core.compiled import compiled as _compiled
 from labapp.core.compiled import compiled_for as _compiled_for
 from labapp.core.compiled import inner as _inner
+from labapp.core.images.centroid_kernels import gaussian_samples
 from labapp.core.images.dots import Grey, Picture
 from labapp.core.values import FloatArray, IntArray
 
@@ -20,18 +21,6 @@ _ints = types.Array(_i, 1, "A", readonly=True)
 
 NEIGHBOUR_SIZES, AROUND_SIZES = 3.5, 4.0
 """A dot's light is followed so many standard deviations far, and its blurred light."""
-
-
-@_inner
-def _bell(first: int, center: float, width: float, values: Grey) -> None:
-    """A Gaussian at whole numbers from the first on: each value is the last times a ratio."""
-    away = first - center
-    value = np.exp(-0.5 * (away / width) ** 2)
-    ratio, shrinks = np.exp(-(away + 0.5) / width**2), np.exp(-1.0 / width**2)
-    for k in range(len(values)):
-        values[k] = value
-        value *= ratio
-        ratio *= shrinks
 
 
 @_inner
@@ -84,8 +73,8 @@ def _patch(
     (u, v, peak, size), side = dots[k], len(patch)
     left, top = round(u) - side // 2, round(v) - side // 2
     across, down = lines[0, :side], lines[1, :side]
-    _bell(left, u, size, across)
-    _bell(top, v, size, down)
+    gaussian_samples(left, u, size, across)
+    gaussian_samples(top, v, size, down)
     for y in range(side):
         row, height = light[y], np.float32(peak) * down[y]
         for x in range(side):
@@ -95,8 +84,8 @@ def _patch(
         far = side / 2 + NEIGHBOUR_SIZES * size
         if abs(u_other - u) > far or abs(v_other - v) > far:
             continue
-        _bell(left, u_other, size, across)
-        _bell(top, v_other, size, down)
+        gaussian_samples(left, u_other, size, across)
+        gaussian_samples(top, v_other, size, down)
         for y in range(side):
             row, height = light[y], np.float32(peak) * down[y]
             for x in range(side):
@@ -206,10 +195,10 @@ def residual_sums(
         _patch(image, level, dots, others, k, patch, light, lines)
         u, v, _, size = dots[k]
         left, top = round(u) - margin, round(v) - margin
-        _bell(left, u, width[k], lines[0])
-        _bell(top, v, width[k], lines[1])
-        _bell(left, u, size, lines[2])
-        _bell(top, v, size, lines[3])
+        gaussian_samples(left, u, width[k], lines[0])
+        gaussian_samples(top, v, width[k], lines[1])
+        gaussian_samples(left, u, size, lines[2])
+        gaussian_samples(top, v, size, lines[3])
         for x in range(side):
             away[0, x], away[1, x] = left + x - u, (left + x - u) ** 2
             lines[2, x] *= lines[0, x]
@@ -301,8 +290,8 @@ def residual_modes(
         _patch(image, level, dots, others, k, patch, light, lines)
         u, v, _, size = dots[k]
         left, top = round(u) - margin, round(v) - margin
-        _bell(left, u, width[k], lines[0])
-        _bell(top, v, width[k], lines[1])
+        gaussian_samples(left, u, width[k], lines[0])
+        gaussian_samples(top, v, width[k], lines[1])
         spread = 1.0 / (1.0 / width[k] ** 2 + 1.0 / size**2)
         for x in range(side):
             away, value = single(left + x - u), single(1.0)

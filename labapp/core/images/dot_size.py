@@ -109,12 +109,6 @@ def pairs(u: IntArray, v: IntArray) -> FloatArray:
     return np.stack([u, v], axis=1).astype(float)
 
 
-def estimate_size(frame: Image) -> float:
-    """Standard deviation of the dots' light, px, of a grey frame, shape (height, width)."""
-    picture = as_picture(frame)
-    return size_of(picture, local_noise(picture))
-
-
 def size_of(picture: Picture, noise: Grey) -> float:
     """Size of a picture's dots, px: the scale at which most of its blobs peak.
 

@@ -182,7 +182,7 @@ def sure_pairs(
     """
     from labapp.core.matching import match_kernels
 
-    spread = SIGMA_INFLATION**2 * covariance_mm2 + MODEL_ERROR_MM**2 * np.eye(2)
+    spread = _enlarged(covariance_mm2)
     seen = observed.plane_mm[dots], observed.covariance_mm2[dots]
     distance, deviance = match_kernels.pair_deviances(*seen, plane_mm, spread)
     ray, next_ray, best_dot, next_dot = match_kernels.two_least(deviance)
@@ -208,12 +208,17 @@ def pair_deviances(
     """
     from labapp.core.matching import match_kernels
 
-    uncertain = SIGMA_INFLATION**2 * predicted.covariance_mm2(
-        pool, observed.rig
-    ) + MODEL_ERROR_MM**2 * np.eye(2)
-    return match_kernels.pair_deviances(
-        observed.plane_mm[dots], observed.covariance_mm2[dots], predicted.plane_mm, uncertain
-    )
+    spread = _enlarged(predicted.covariance_mm2(pool, observed.rig))
+    seen = observed.plane_mm[dots], observed.covariance_mm2[dots]
+    return match_kernels.pair_deviances(*seen, predicted.plane_mm, spread)
+
+
+def _enlarged(covariance_mm2: FloatArray) -> FloatArray:
+    """Covariance of predicted dots with the surface's and the model's error, shape (m, 2, 2), mm².
+
+    The argument has it as far as the fit itself knows it.
+    """
+    return SIGMA_INFLATION**2 * covariance_mm2 + MODEL_ERROR_MM**2 * np.eye(2)
 
 
 def false_dot_deviance(per_mm2: float = FALSE_DOTS_PER_MM2) -> float:

@@ -46,9 +46,9 @@ def classify_rays(observed: Observation, labels: IntArray, paths: RayPaths) -> R
     blocked = ray_kernels.behind_torch(paths.points_mm[known], rays, paths.slopes[known], tip)
     in_view = observed.in_view(plane[known]) & ~blocked
 
-    hushed = observed.absent | observed.hidden
+    without_dot = observed.absent | observed.hidden
     between = amid(lit)
-    is_among = (between & ~hushed).ravel()[known]
+    is_among = (between & ~without_dot).ravel()[known]
     among = known[is_among]
     merged = dot_kernels.next_apart(plane[among]) < observed.resolution_mm
     missed = among[in_view[is_among] & ~merged & ~lit.ravel()[among]]
@@ -62,7 +62,7 @@ def classify_rays(observed: Observation, labels: IntArray, paths: RayPaths) -> R
     spacing = dot_kernels.next_apart(plane[known])
     witness = np.zeros(lit.size, np.int64)
     witness[known[in_view & (spacing >= observed.resolution_mm)]] = -1
-    witness[(between | hushed).ravel()] = 0
+    witness[(between | without_dot).ravel()] = 0
     if len(unlabelled):
         # A dot that no ray was given may be the dot of a ray that seems dark.
         off = dot_kernels.two_nearest(plane[known], observed.plane_mm[unlabelled])[0][:, 0]

@@ -25,7 +25,7 @@ class WarmChain:
         What they were seen on.
     settings
         Of the measurement. Only the fit to band-passed dots, the default, can be followed.
-    passed
+    on_step
         See `pipeline.measure`; called for followed frames.
 
     Attributes
@@ -35,10 +35,10 @@ class WarmChain:
     """
 
     def __init__(
-        self, bench: Bench, settings: Settings, passed: Callable[[str], None] = lambda _: None
+        self, bench: Bench, settings: Settings, on_step: Callable[[str], None] = lambda _: None
     ) -> None:
         self.bench, self.settings = bench, settings
-        self._passed = passed
+        self._on_step = on_step
         self.track_lost: str | None = None
         self._prior: Prior | None = None
         self._after_gap = False
@@ -60,7 +60,7 @@ class WarmChain:
             self.track_lost = "no frame before it was measured"
             return None
         given = self.bench, self.settings, self._prior
-        measurement, prior = measure(image, *given, passed=self._passed)
+        measurement, prior = measure(image, *given, on_step=self._on_step)
         if prior is None:
             self.track_lost = measurement.reason
             return None

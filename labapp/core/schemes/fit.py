@@ -91,9 +91,9 @@ def reconstruct(match: Match, rig: Rig, settings: FitSettings) -> Reconstruction
 
 
 def solve(
-    match: Match, rig: Rig, settings: FitSettings, near: SplineSurface | None = None
+    match: Match, rig: Rig, settings: FitSettings, initial: SplineSurface | None = None
 ) -> FittedPool:
-    """Fit the surface, beginning with one that is near where there is one.
+    """Fit the surface (`fit_pool`), beginning with an initial one where there is one.
 
     Raises
     ------
@@ -108,7 +108,7 @@ def solve(
     if not (match.witness < 0).any():
         raise CannotMeasure("open-boundary", "no visible ray is missing: the boundary is not seen")
     dots = match.ray, match.plane_mm, match.plane_covariance_mm2, match.witness
-    pool = fit_pool(*dots, rig, settings, near, match.missing)
+    pool = fit_pool(*dots, rig, settings, initial, match.missing)
     if pool.unsettled_mm > UNSETTLED_MM:
         raise CannotMeasure("no-surface", "the surface does not settle")
     return pool
@@ -139,26 +139,28 @@ def complete(
         )
     shape, by_shape = shape_and_gradients(basis, coefficients, boundary, slope)
     gradient = np.concatenate([sizes.gradient, by_shape])
-    part = None if known is None else nearest_part(known.by_setup, sizes.size)
-    if part is not None:
-        by_setup = part.sigma
+    former = None if known is None else nearest_part(known.by_setup, sizes.size)
+    if former is not None:
+        by_setup = former.sigma
     else:
         by_setup = setup_sigma(setup_changes(match, rig, settings, pool, gradient))
-    free = None if known is None else known.free_sigma_mm
-    if free is None:
-        free = pool.free_sigma_of(basis.matrix(*points[:, :2].T))
-    made = Reconstruction(
+    free_sigma = None if known is None else known.free_sigma_mm
+    if free_sigma is None:
+        free_sigma = pool.free_sigma_of(basis.matrix(*points[:, :2].T))
+    reconstruction = Reconstruction(
         scheme="fit",
         surface=pool.surface,
         boundary=boundary,
         ray=match.ray,
         points_mm=points,
         residual_mm=pool.residual_mm,
-        sigma_mm=np.hypot(free, level.sigma_mm),
+        sigma_mm=np.hypot(free_sigma, level.sigma_mm),
         size_sigma=np.hypot(pool.sigma_of(gradient), by_setup),
         size_sigma_level=np.abs(gradient.sum(axis=1)) * level.sigma_mm,
         size_sigma_setup=by_setup,
     )
-    errors = measures.reflection_errors(made, match, rig)
-    every = np.append(sizes.size, shape)
-    return made, measures.assemble_measures(errors, every, sizes.peak_mm, center, made)
+    errors = measures.reflection_errors(reconstruction, match, rig)
+    sizes_and_shape = np.append(sizes.size, shape)
+    return reconstruction, measures.assemble_measures(
+        errors, sizes_and_shape, sizes.peak_mm, center, reconstruction
+    )

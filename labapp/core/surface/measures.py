@@ -155,8 +155,6 @@ SHAPES = ("convexity_mm", "asymmetry", "wetting_slope_deg")
 WITH_SIGMA = (*SIZES, *SHAPES)
 """What has a standard uncertainty, in the order of arrays."""
 
-DEPTH = SIZES.index("depth_mm")
-
 
 def sigma_name(name: str, part: str = "") -> str:
     """Name of a standard uncertainty, or of a part of it: ``width_sigma_level_mm``."""
