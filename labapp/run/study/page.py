@@ -1,4 +1,4 @@
-"""The summary of a study as a page to look at: one HTML file, its plots inside."""
+"""The summary of a study as one HTML file with embedded plots."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from labapp.studies.plotting import INCHES, STYLE, as_bytes, new_figure
 from labapp.text import SIGMA_OF, pluralize
 
 MOST_SHOWN = 60
-"""Outliers that are listed: the others are in their file."""
+"""Most outliers that are listed; all are in outliers.csv."""
 
 MOST_ROWS = 6
-"""Conditions that are drawn."""
+"""Most conditions that are plotted."""
 
 COLOURS = "#0072b2 #d55e00 #009e73 #cc79a7 #56b4e9 #e69f00 #333333 #999999".split()
-"""Colours that people with poor colour vision tell apart (Okabe and Ito)."""
+"""Colours that are distinguishable with colour vision deficiency (Okabe and Ito)."""
 
 PANEL_INCHES = (2.0, 1.8)
 
@@ -50,12 +50,12 @@ td.n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowra
 
 
 def summary_page(summary: StudySummary, made: str) -> str:
-    """The page, as HTML with SVG in it; nothing else is loaded.
+    """Return the page as self-contained HTML with inline SVG.
 
     Parameters
     ----------
     made
-        When, for its foot.
+        Date of creation, for the footer.
     """
     parts = [f"<h1>{escape(summary.title)}</h1>", _head(summary)]
     parts += _problems(summary)
@@ -107,13 +107,13 @@ def _plots_note(summary: StudySummary) -> str:
     colours = " Colours tell the other conditions apart." if len(varying) > 1 else ""
     return (
         "<p class=note>Large: mean of the recordings under one condition, with its standard "
-        f"uncertainty ({SIGMA_OF}). Small: each recording's mean.{colours} The set-up's part of "
-        "± is common to all that was measured on one bench: differences are known better.</p>"
+        f"uncertainty ({SIGMA_OF}). Small: mean of each recording.{colours} The set-up's part of "
+        "± is common to all recordings of one bench: differences have a smaller uncertainty.</p>"
     )
 
 
 def varying_conditions(summary: StudySummary) -> list[str]:
-    """Conditions that have more than one value."""
+    """Return the conditions that have more than one value."""
     values = {
         name: {one.conditions.get(name) for one in summary.groups} for name in summary.conditions
     }
@@ -121,12 +121,12 @@ def varying_conditions(summary: StudySummary) -> list[str]:
 
 
 def condition_picture(summary: StudySummary, condition: str) -> bytes:
-    """Each size against one condition, in two rows, as PNG; the other conditions by colour.
+    """Plot each size against one condition, as PNG, with the other conditions by colour.
 
     Parameters
     ----------
     condition
-        One of `varying_conditions`; empty: none, all recordings at one place.
+        One of `varying_conditions`; empty: none, all recordings at one position.
     """
     others = [name for name in varying_conditions(summary) if name != condition]
     with rc_context(STYLE):
@@ -139,7 +139,7 @@ def condition_picture(summary: StudySummary, condition: str) -> bytes:
 
 
 def _plots(summary: StudySummary) -> str:
-    """Small multiples: a row a condition that varies, a column a size."""
+    """Plot small multiples: one row per varying condition, one column per size."""
     varying = varying_conditions(summary)[:MOST_ROWS] or [""]
     width, height = PANEL_INCHES
     with rc_context(STYLE):
@@ -164,7 +164,7 @@ def _draw_row(
     kinds = _kinds(summary.groups, others)
     colours = dict(zip(dict.fromkeys(kinds), COLOURS, strict=False))
     for axis, size in zip(axes, SIZES, strict=True):
-        if all(group.means[size].mean == 0 for group in summary.groups):  # no course to be seen
+        if all(group.means[size].mean == 0 for group in summary.groups):
             axis.set_axis_off()
             axis.text(0.5, 0.5, "0 everywhere", ha="center", transform=axis.transAxes)
             continue
@@ -200,7 +200,7 @@ def _draw(axis: Any, place: float, mean: Mean, each: Sequence[float], colour: st
 
 
 def _places(groups: Sequence[GroupSummary], condition: str) -> tuple[list[float], list[str] | None]:
-    """Where each group stands along a condition; ticks where it is text."""
+    """Return the position of each group on a condition's axis, and tick labels if it is text."""
     values = [group.conditions.get(condition) for group in groups]
     if condition and all(isinstance(value, int | float) for value in values):
         return [float(value) for value in values if not isinstance(value, str | None)], None
@@ -209,7 +209,7 @@ def _places(groups: Sequence[GroupSummary], condition: str) -> tuple[list[float]
 
 
 def _kinds(groups: Sequence[GroupSummary], others: Sequence[str]) -> list[str]:
-    """The other conditions of each group in words; none of them if there are too many."""
+    """Return the other conditions of each group as text; empty if there are too many."""
     kinds = [
         "\n".join(f"{name} {shown_condition(one.conditions.get(name))}" for name in others)
         for one in groups
@@ -229,7 +229,7 @@ def _n(value: object) -> str:
 
 
 def _link(path: str) -> str:
-    """A cell that opens a file."""
+    """Return a cell with a link to a file."""
     return f'<td><a href="{escape(Path(path).as_uri())}">{escape(path)}</a></td>'
 
 
@@ -244,7 +244,7 @@ def _table(head: Iterable[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def rounded(value: float, sigma: float) -> str:
-    """Value and ±, as many decimals as two digits of ± have."""
+    """Format value and ±, with two significant digits of ±."""
     if not math.isfinite(sigma) or sigma <= 0:
         return f"{value:z.4g}"
     decimals = min(max(1 - math.floor(math.log10(sigma)), 0), 6)

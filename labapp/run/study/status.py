@@ -1,4 +1,4 @@
-"""What is done of a study."""
+"""Progress of a study."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ State = Literal["done", "part", "waiting", "failed"]
 
 @dataclass(frozen=True)
 class RecordingStatus:
-    """What is done of a recording."""
+    """Progress of a recording."""
 
     recording: StudyRecording
     state: State
-    """``done``; ``part`` of it is; ``waiting`` to be begun; or it ``failed``."""
+    """``done``, ``part`` (partly done), ``waiting`` (not begun) or ``failed``."""
     problem: str
     """Why it failed; empty if it did not."""
     frames: int
-    """Frames to be measured; 0 as long as that is not known."""
+    """Frames to be measured; 0 if not known yet."""
     frames_done: int
 
 
 @dataclass(frozen=True)
 class Progress:
-    """How far a run is."""
+    """Progress of a run."""
 
     frames_done: int
     frames: int
-    """All there are, estimated from the recordings that were looked at."""
+    """Number of all frames, estimated from the recordings examined so far."""
     recordings_done: int
     recordings: int
     failed: int

@@ -1,4 +1,4 @@
-"""What a study says: measures against conditions, with ±, and what is out of line."""
+"""Summary of a study: means under each condition, with ±, and outliers."""
 
 from __future__ import annotations
 
@@ -21,34 +21,34 @@ from labapp.run.study.plan import Condition
 from labapp.run.study.status import RecordingStatus
 
 FAR = 5.0
-"""A frame is an outlier so many standard deviations from the median, and of its own uncertainty."""
+"""Distance of an outlying frame from the median, in standard deviations and in its own σ."""
 
 SURE = 0.999
-"""A recording is one outside the interval that holds others with this probability."""
+"""Probability of the prediction interval outside of which a recording is an outlier."""
 
 MAD = 1.4826
-"""Standard deviation of a normal distribution over its median absolute deviation."""
+"""Ratio of standard deviation to median absolute deviation of a normal distribution."""
 
 FEWEST_FRAMES, FEWEST_RECORDINGS = 10, 4
-"""Among fewer, none is called an outlier."""
+"""Smallest samples in which outliers are sought."""
 
 MOST_OUTLIERS = 100
-"""Of a recording."""
+"""Most outlying frames per recording."""
 
 
 @dataclass(frozen=True)
 class Mean:
-    """Mean of a size, and how uncertain it is."""
+    """Mean of a size, and its uncertainty."""
 
     mean: float
     noise: float
     level: float
     setup: float
-    """Parts of its standard uncertainty; NaN where the scheme gives none."""
+    """Parts of its standard uncertainty; NaN if the scheme gives none."""
     scatter: float
-    """Standard deviation: of frames in a recording, of recordings under one condition."""
+    """Standard deviation of frames in a recording, or of recordings under one condition."""
     count: int
-    """How many of them."""
+    """Number of frames or recordings."""
 
     @property
     def sigma(self) -> float:
@@ -58,29 +58,29 @@ class Mean:
 
 @dataclass(frozen=True)
 class Outlier:
-    """A frame far from the others of its recording, or a recording from those like it."""
+    """A frame far from the others of its recording, or a recording far from similar ones."""
 
     recording: str
     file: str
     frame: int | None
-    """None: it is the mean of the recording."""
+    """None: the mean of the recording."""
     measure: str
     value: float
     usual: float
-    """The median of the others."""
+    """Median of the others."""
     times: float
-    """Its distance in standard deviations."""
+    """Distance in standard deviations."""
 
 
 @dataclass(frozen=True)
 class RecordingSummary:
-    """What was measured of a recording."""
+    """Results of a recording."""
 
     status: RecordingStatus
     statuses: Mapping[str, int]
-    """How many frames have each status."""
+    """Number of frames with each status."""
     setup_status: str
-    """How far the set-up can be relied on (`Measurement.setup_status`)."""
+    """Reliability of the set-up (`Measurement.setup_status`)."""
     doubt: str
     """Why it is doubtful, if it is."""
     means: Mapping[str, Mean]
@@ -89,14 +89,14 @@ class RecordingSummary:
 
 @dataclass(frozen=True)
 class GroupSummary:
-    """What was measured under one condition: of recordings with the same conditions."""
+    """Results of the recordings with the same conditions."""
 
     conditions: Mapping[str, Condition]
     recordings: tuple[str, ...]
     frames: int
     """Frames with a surface."""
     means: Mapping[str, Mean]
-    """Mean of each of `SIZES`; each recording counts alike."""
+    """Mean of each of `SIZES`; recordings have equal weight."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ class StudySummary:
 
 
 def recording_means(table: Table) -> dict[str, Mean]:
-    """Mean of each size over the frames with a surface; empty if there is none.
+    """Return the mean of each size over the frames with a surface; empty if there is none.
 
     Parameters
     ----------
@@ -139,10 +139,10 @@ def recording_means(table: Table) -> dict[str, Mean]:
 def group_recordings(
     conditions: Sequence[str], recordings: Sequence[RecordingSummary]
 ) -> tuple[GroupSummary, ...]:
-    """Means over the recordings that were made under the same conditions.
+    """Return means over the recordings with the same conditions.
 
-    Noise is independent from recording to recording. What is wrong with the level and with the
-    set-up is taken to be the same in all of them: they do not average it out.
+    Noise is independent between recordings. Errors of level and set-up are assumed to be common to
+    all of them, so that they do not average out.
     """
     groups: dict[tuple[Condition | None, ...], list[RecordingSummary]] = {}
     for one in recordings:
@@ -160,7 +160,7 @@ def group_recordings(
 
 
 def _order(values: Sequence[Condition | None]) -> list[tuple[int, float, str]]:
-    """Numbers before text before what is missing."""
+    """Return a sort key: numbers before text before missing values."""
     return [
         (2, 0.0, "") if v is None else (1, 0.0, v) if isinstance(v, str) else (0, float(v), "")
         for v in values
@@ -178,15 +178,15 @@ def _common(means: Sequence[Mean]) -> Mean:
 
 
 def _deviation(values: FloatArray) -> float:
-    """Standard deviation, estimated from n values; NaN of one."""
+    """Return the sample standard deviation; NaN for one value."""
     return float(np.std(values, ddof=1)) if len(values) > 1 else float("nan")
 
 
 def outlying_frames(status: RecordingStatus, table: Table) -> list[Outlier]:
-    """Frames whose size is far from the recording's median, the farthest first.
+    """Return frames with a size far from the recording's median, the farthest first.
 
-    Far is more than `FAR` times the standard deviation of most frames, and `FAR` times the frame's
-    own standard uncertainty by noise and level.
+    Far is more than `FAR` times the robust standard deviation of the frames, and `FAR` times the
+    frame's own standard uncertainty from noise and level.
     """
     measured = np.flatnonzero(table["status"] == "ok")
     if len(measured) < FEWEST_FRAMES:
@@ -207,10 +207,10 @@ def outlying_frames(status: RecordingStatus, table: Table) -> list[Outlier]:
 def outlying_recordings(
     groups: Sequence[GroupSummary], recordings: Sequence[RecordingSummary]
 ) -> list[Outlier]:
-    """Recordings whose mean is far from that of the others under the same conditions.
+    """Return recordings whose mean is far from that of the others under the same conditions.
 
-    Far is outside the interval in which another recording would lie with probability `SURE`, by
-    Student's t: of the few that there are, some are near to each other by chance.
+    Far is outside the prediction interval of a further recording with probability `SURE`, by
+    Student's t for small samples.
     """
     by_name = {one.status.recording.name: one for one in recordings}
     found = []
@@ -234,9 +234,9 @@ def outlying_recordings(
 
 
 def _times(values: FloatArray, own: FloatArray) -> FloatArray:
-    """Distance of values from their median in standard deviations, shape (n,).
+    """Return the distance of values from their median in standard deviations, shape (n,).
 
-    Of most values, or of its own if that is larger.
+    The unit is the robust standard deviation of all values, or the value's own σ if larger.
     """
     away = np.abs(values - np.median(values))
     deviation = np.maximum(MAD * np.median(away), own)

@@ -1,6 +1,6 @@
-"""Where a study's tasks are done: in processes of this machine, or by Dask's workers anywhere.
+"""Execution of a study's tasks by processes of this machine, or by Dask workers.
 
-Both are a `concurrent.futures.Executor`; `run_jobs` keeps either busy.
+Both are a `concurrent.futures.Executor`, which `run_jobs` keeps busy.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ from labapp.simulation.parallel import POLL_S, end_processes
 from labapp.system import interrupts_blocked
 
 ATTEMPTS = 4
-"""A task is begun so often, at most: the process that does it may die, or its machine."""
+"""Most attempts of a task, as its process or machine may die."""
 
 TIMEOUT_S = 10
-"""A scheduler that does not answer for so long is not there."""
+"""Time for a scheduler to answer, s."""
 
-A_SCHEDULER = "the address of a Dask scheduler that runs, such as tcp://127.0.0.1:8786"
+A_SCHEDULER = "the address of a running Dask scheduler, such as tcp://127.0.0.1:8786"
 
 
 @dataclass(frozen=True)
@@ -42,24 +42,24 @@ class Job:
     """A task for one of the workers."""
 
     about: int
-    """Which recording it is about."""
+    """Index of its recording."""
     work: Callable[..., None]
     given: tuple[Any, ...]
-    """A function of a module, and its arguments."""
+    """A module-level function, and its arguments."""
     attempt: int = 1
 
 
 @dataclass(frozen=True)
 class Workers:
-    """Who does tasks."""
+    """Executor of tasks."""
 
     executor: Executor
     slots: Callable[[], int]
-    """How many tasks to give them at once."""
+    """Number of tasks to submit at once."""
     dashboard: str = ""
-    """Address of the page that shows what they do; empty if there is none."""
+    """Address of Dask's dashboard; empty if there is none."""
     warning: str = ""
-    """What the user should know of them; empty if nothing."""
+    """Warning for the user; empty if there is none."""
 
 
 def run_jobs(
@@ -68,22 +68,22 @@ def run_jobs(
     finished: Callable[[Job, Exception | None], Iterable[Job]],
     poll: Callable[[], object],
 ) -> None:
-    """Have jobs done, many at once, the newest first to be followed up.
+    """Execute jobs in parallel, with follow-up jobs before new ones.
 
     Parameters
     ----------
     jobs
-        What is to be done; read as there is room.
+        Jobs, consumed when slots are free.
     finished
-        Called here with each job that is done, and the error if it failed for good; returns jobs
-        that follow from it, which go before others.
+        Called in this thread with each finished job, and its error after the last attempt; returns
+        follow-up jobs.
     poll
-        Called now and then; may raise to stop.
+        Called regularly; may raise to stop.
 
     Raises
     ------
     InputError
-        If the scheduler is lost.
+        If the connection to the scheduler is lost.
     """
     ready: deque[Job] = deque()
     pending: dict[Future[None], Job] = {}
@@ -110,7 +110,7 @@ def run_jobs(
 
 
 def _error_of(future: Future[None]) -> Exception | None:
-    """What a task raised; None if nothing."""
+    """Return the exception of a task; None if it raised none."""
     if future.cancelled():
         raise InputError("--scheduler", "connection", "lost", f"{A_SCHEDULER}; then run again")
     error = future.exception()
@@ -123,7 +123,7 @@ def _error_of(future: Future[None]) -> Exception | None:
 
 
 class _Processes(Executor):
-    """Processes with a pool each: one that dies takes no other task with it."""
+    """Processes in separate pools, so that the death of one affects no other task."""
 
     def __init__(self, count: int) -> None:
         self._lock = threading.Lock()
@@ -131,7 +131,7 @@ class _Processes(Executor):
         self._pools: set[ProcessPoolExecutor] = set()
 
     def submit(self, work: Callable[..., Any], /, *given: Any, **named: Any) -> Future[Any]:
-        """Begin a task in an idle process, of which there must be one."""
+        """Begin a task in an idle process; there must be one."""
         with self._lock:
             pool = self._idle.pop() or measuring_pool(1)
             self._pools.add(pool)
@@ -141,7 +141,7 @@ class _Processes(Executor):
         return future
 
     def _free(self, pool: ProcessPoolExecutor, done: Future[Any]) -> None:
-        """Take back a process; if it has died, another takes its place."""
+        """Return a process to the idle ones; replace it if it has died."""
         died = not done.cancelled() and isinstance(done.exception(), BrokenExecutor)
         with self._lock:
             if died:
@@ -151,13 +151,13 @@ class _Processes(Executor):
             pool.shutdown(wait=False)
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """End the processes, whatever they do: what a task has not written is not there."""
+        """End the processes, with their tasks; files are written atomically."""
         for pool in list(self._pools):
             end_processes(pool, wait)
 
 
 class _Here(Executor):
-    """Does each task at once, in this process."""
+    """Executes each task at once, in this process."""
 
     def submit(self, work: Callable[..., Any], /, *given: Any, **named: Any) -> Future[Any]:
         future: Future[Any] = Future()
@@ -170,12 +170,12 @@ class _Here(Executor):
 
 @contextmanager
 def local_workers(count: int | None) -> Iterator[Workers]:
-    """Processes of this machine.
+    """Start processes of this machine.
 
     Parameters
     ----------
     count
-        How many; None: one a core; 0: none, tasks are done in this process.
+        Number of processes; None: one per core; 0: execute tasks in this process.
     """
     count = (os.cpu_count() or 1) if count is None else count
     executor = _Processes(count) if count else _Here()
@@ -190,12 +190,12 @@ def local_workers(count: int | None) -> Iterator[Workers]:
 
 @contextmanager
 def dask_workers(address: str) -> Iterator[Workers]:
-    """Workers of a Dask scheduler. Needs dask[distributed], which the extra ``study`` installs.
+    """Connect to a Dask scheduler. Needs dask[distributed], which the extra ``study`` installs.
 
     Parameters
     ----------
     address
-        Of the scheduler: ``tcp://HOST:PORT``.
+        Address of the scheduler: ``tcp://HOST:PORT``.
 
     Raises
     ------
@@ -205,7 +205,7 @@ def dask_workers(address: str) -> Iterator[Workers]:
     try:
         from distributed import Client
     except ImportError as error:
-        expected = "dask, which pip install 'labapp[study]' brings"
+        expected = "dask: pip install 'labapp[study]'"
         raise InputError("--scheduler", "dask", "is not installed", expected) from error
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     try:
@@ -230,7 +230,7 @@ def dask_workers(address: str) -> Iterator[Workers]:
 
 
 class _Slots:
-    """Twice as many tasks as there are threads, so that none waits; workers come and go."""
+    """Number of tasks: twice the number of threads, so that none is idle; varies over time."""
 
     def __init__(self, client: Any) -> None:
         self._client, self._at, self._count = client, -1.0, 1
