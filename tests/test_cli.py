@@ -250,7 +250,7 @@ def test_a_full_disk_leaves_whole_frames(
     code, _, complained = labapp("reconstruct", folder, "--setup", SETUP, "--out", out)
     assert code == 2
     assert "results: No space left on device" in complained
-    assert "the 2 frames before are whole" in complained
+    assert "the 2 previous frames are complete" in complained
     assert [row["frame"] for row in table(out / "measures.csv")] == ["0", "1"]
     assert json.loads((out / "run.json").read_text())["state"] == "failed"
 

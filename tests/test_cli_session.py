@@ -949,7 +949,7 @@ def test_problems_are_told_a_line_each(labapp: Run, measured: Path) -> None:
     code, said, _ = labapp("session", "verify", measured, "--no-recording")
     assert code == 1
     assert said.splitlines() == [
-        f"result of frame {k} (fit) is not what its frame gave" for k in (1, 2)
+        f"result of frame {k} (fit) differs from its measurement" for k in (1, 2)
     ]
 
 

@@ -68,7 +68,7 @@ def dynamics(
     given = read_signals(signals, full_scale) if signals else None
     with progress_shown():
         found = _analysed(source, given, start, align, settings)
-    with os_errors_as_input(folder, "results", "room on its disk"):
+    with os_errors_as_input(folder, "results", "enough disk space"):
         for name, content in dynamics_files(found).items():
             write_file(folder / name, content)
         if film is not None:

@@ -57,7 +57,7 @@ def lines(
     with open_source(source) as recording:
         chosen = select_frames(frames, len(recording))
         folder = writable_folder(out)
-        with os_errors_as_input(folder, "results", "room on its disk"):
+        with os_errors_as_input(folder, "results", "enough disk space"):
             follow = follow or bench.rig.pattern.rows == 1
             done = _measured(recording, chosen, bench, follow)
             any_line = (

@@ -366,7 +366,7 @@ def test_a_limit_of_the_system_stops_the_run_between_frames(out: Path) -> None:
     )
     measures, dots = table(out / "measures.csv"), table(out / "dots.csv")
     assert len(measures) > 5
-    assert f"the {len(measures)} frames before are whole" in done.stdout
+    assert f"the {len(measures)} previous frames are complete" in done.stdout
     assert len(dots) == 40 * len(measures)
     assert all(None not in row.values() for row in dots)
     assert (out / "dots.csv").read_text().endswith("auto\n")

@@ -109,7 +109,10 @@ def test_blocked_rows_are_marked(tmp_path: Path, before: Correction) -> None:
         ("10,5,20,1,1", "line 2, cells: 5; expected 4"),
         ('"10,5",20,1,1', "line 2, u_px: 10,5; expected a number"),
         ("10,20,1,1\n50,20,1,1", "line 3, reflected_row, reflected_column: row 1, column 1; exp"),
-        ("10,20,1,1\n10,20,1,2", "line 3, u_px, v_px: 10, 20; expected another place than line 2"),
+        (
+            "10,20,1,1\n10,20,1,2",
+            "line 3, u_px, v_px: 10, 20; expected another position than that of line 2",
+        ),
     ],
 )
 def test_what_is_wrong_is_told_with_line_and_column(
