@@ -118,7 +118,7 @@ def test_every_frame_has_its_row_and_a_line_if_it_failed(
     assert len(lines) == 6
     assert lines[0] == "frame 0: no-dots: for the test"
     assert lines[3].startswith("frame 3: unreadable: ")
-    assert "3.png: content: cannot be decoded; expected a whole image" in lines[3]
+    assert "3.png: content: cannot be decoded; expected a complete image" in lines[3]
     assert "6 frames, 0 with a surface (5 no-dots, 1 unreadable)" in said
     assert str(out) in said
     assert code == 1  # done, and nothing could be measured

@@ -90,8 +90,8 @@ def test_a_recording_cut_off_gives_its_whole_frames(tmp_path: Path) -> None:
         np.testing.assert_array_equal([frame.image for frame in source], GREY_12[:3])
         early, timeless = source.warnings
         assert source.frame(1).time_s is None
-    assert early == "run.mraw ends early: its header says 5 frames, 3 of them whole"
-    assert "gives no record rate" in timeless
+    assert early == "run.mraw ends early: its header says 5 frames, 3 of them complete"
+    assert "has no record rate" in timeless
     raw.write_bytes(content[:200])
     with pytest.raises(InputError, match="200 bytes; expected 288 bytes or more"):
         open_source(header)
