@@ -137,7 +137,7 @@ def test_what_is_wrong_is_told_with_line_and_column(
         (f"{HEAD},blocked\n1,2,5,5,2\n", "line 2, blocked: 2; expected 1, 0 or nothing"),
         (f"{HEAD},blocked\n1,2,,,1\n", "line 2, blocked: 1; expected a dot with a row"),
         (f"{HEAD},blocked\n1,2,5,5,1\n2,2,5,6,0\n", "line 3, blocked: 0; expected 1 as in line 2"),
-        (HEAD.encode("utf-16"), "content: binary, or UTF-16; expected a table of dots (CSV"),
+        (HEAD.encode("utf-16"), "content: binary or UTF-16; expected a table of dots (CSV"),
         (f"{HEAD}\n1,2,3,é\n".encode("latin-1"), "encoding: not UTF-8"),
         (b"\x89PNG\r\n\x1a\n\0\0", "content: binary"),
         (b"x" * 1_000_000, "line 1: more than 16384 characters"),
