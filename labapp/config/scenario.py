@@ -249,7 +249,7 @@ def _pools(
             for size, time in zip(sizes.tolist(), times_s.tolist(), strict=True)
         )
     except ValueError as error:
-        raise InputError(path, "pool", error, "a pool that can be") from error
+        raise InputError(path, "pool", error, "a possible pool") from error
 
 
 def _footprint(keys: dict[str, Any], head_sign: int) -> Footprint:
