@@ -275,7 +275,7 @@ def test_a_link_is_not_followed(out: Path, writer: Writer) -> None:
 def test_a_folder_that_cannot_be_made_is_refused(tmp_path: Path, writer: Writer) -> None:
     (tmp_path / "file").write_text("")
     for folder in (tmp_path / "file", tmp_path / "file" / "below"):
-        with pytest.raises(InputError, match="expected a folder that can be written"):
+        with pytest.raises(InputError, match="expected a writable folder with enough disk space"):
             writer(folder)
 
 

@@ -143,7 +143,7 @@ def test_raw_colour_and_turned_pictures_are_said(tmp_path: Path) -> None:
         bayer, turned = source.warnings
         np.testing.assert_array_equal(source.frame(0).image, GREY_12[0])
     assert "raw colour (Bayer)" in bayer
-    assert "flipped or turned" in turned
+    assert "flipped or rotated" in turned
 
 
 def test_a_recording_cut_off_gives_its_whole_frames(tmp_path: Path) -> None:

@@ -83,12 +83,12 @@ def test_an_archive_may_give_the_times(tmp_path: Path, write: object) -> None:
 @pytest.mark.parametrize(
     ("arrays", "said"),
     [
-        ({"a": GREY, "b": GREY}, "arrays: a, b; expected a .npz that holds"),
+        ({"a": GREY, "b": GREY}, "arrays: a, b; expected a .npz with an array"),
         ({}, "arrays: none"),
         ({"frames": GREY[0]}, r"shape: \(9, 13\)"),
-        ({"frames": GREY, "time_s": np.arange(5)}, "time_s: shape .*; expected 6 times"),
+        ({"frames": GREY, "time_s": np.arange(5)}, "time_s: shape .*; expected 6 increasing times"),
         ({"frames": GREY, "time_s": np.zeros(6)}, "expected 6 increasing times"),
-        ({"frames": GREY, "time_s": np.zeros((6, 1))}, "a time for every frame"),
+        ({"frames": GREY, "time_s": np.zeros((6, 1))}, "one for every frame"),
         ({"frames": GREY, "frame_rate_hz": -2.0}, "frame_rate_hz: -2.0"),
         ({"frames": GREY, "frame_rate_hz": np.arange(2.0)}, "expected one number"),
         ({"frames": GREY, "frame_rate_hz": np.array("x")}, "type: .*an array of numbers"),

@@ -113,7 +113,7 @@ def test_frames_left_out_when_saving_are_said(tmp_path: Path) -> None:
         ({"bits": 16, "colour": "Color"}, "Color Bit: 16; expected 24"),
         ({"side": "Left"}, "EffectiveBit Side: Left"),
         ({"form": "TIFF"}, "File Format: TIFF; expected MRaw"),
-        ({"bits": 10, "columns": 15, "rows": 1}, "Image Width: 15; expected columns that make"),
+        ({"bits": 10, "columns": 15, "rows": 1}, "Image Width: 15; expected rows of 10 bit levels"),
     ],
 )
 def test_what_the_header_should_say_is_named(

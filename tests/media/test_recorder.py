@@ -296,7 +296,7 @@ def test_frames_that_are_not_as_the_others_are_left_out_and_said(tmp_path: Path)
         found = [int(each.image[0, 0]) - 100 for each in video]
         assert found == [k for k in range(30) if k not in wrong]
         assert [video.frame(k).time_s for k in (0, 5, 6)] == pytest.approx([0, 0.05, 0.08])
-    told = [each.words for each in heard if "left out: of another size" in each.words]
+    told = [each.words for each in heard if "discarded: of another size" in each.words]
     assert sum(int(words.split()[0]) for words in told) == 3
     assert [row["what"] for row in notes(take) if row["what"] in told] == told
 
