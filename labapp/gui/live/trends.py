@@ -1,4 +1,4 @@
-"""Sizes of the live pool over the last seconds, with their limits, which are entered here."""
+"""Sizes of the live pool over the last seconds, and fields for their limits."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from labapp.run.live_watch import LiveWatch
 from labapp.text import SIGMA_OF
 
 LAST_S = 30.0
-"""So much is seen at first."""
+"""Duration shown by default."""
 
 GAP_S = 0.5
-"""Over a longer time without a frame no line is drawn."""
+"""No line is drawn across longer gaps between frames."""
 
 MARKS = PLAIN, Mark("▪", "beyond its limit")
 
 ROOM_PX = 40
-"""All fields stand beside each other where so much is left beside them."""
+"""Space that must be left for all fields to be side by side."""
 
 RULE = (
     f"An alarm is raised when a size is beyond its limit by more than 2 σ, twice its ± "
@@ -41,8 +41,8 @@ RULE = (
 
 
 def trend_curves(trend: Trend, limits: Limits, names: tuple[str, ...]) -> tuple[Curve, ...]:
-    """Width, length and height over the time from now, with their limits."""
-    # Nothing was measured in a gap: a frame in it, without values, keeps a line from crossing it.
+    """Width, length and height against the time from now, with their limits."""
+    # A frame without values inside a gap keeps a line from crossing it.
     gap = np.flatnonzero(np.diff(trend.since_s) > GAP_S) + 1
     since_s = np.insert(trend.since_s, gap, trend.since_s[gap - 1] + GAP_S / 2)
     number = np.insert(trend.number, gap, trend.number[gap - 1] + 1)
@@ -135,14 +135,14 @@ class LiveTrends(QWidget):
         return form
 
     def resizeEvent(self, event: QResizeEvent) -> None:
-        """Put all fields beside each other where there is room."""
+        """Put all fields side by side if there is space."""
         super().resizeEvent(event)
         way = QBoxLayout.Direction
         is_wide = self.width() >= sum(part.minimumSize().width() for part in self._parts) + ROOM_PX
         self._below.setDirection(way.LeftToRight if is_wide else way.TopToBottom)
 
     def heightForWidth(self, _width: int) -> int:
-        """Be as low as there is room for: the plots scroll in themselves."""
+        """Use the available height: the plots can be scrolled."""
         return self.minimumSizeHint().height()
 
     # --- what it shows ------------------------------------------------------------------------
@@ -178,7 +178,7 @@ class LiveTrends(QWidget):
         self._keep(**{f"{name}_mm": ends}, field=(name, end))
 
     def _keep(self, field: tuple[str, int] | None = None, **changed: object) -> None:
-        """Keep limits in the session; those that cannot be are refused below their field."""
+        """Store limits in the session; impossible ones are refused below their field."""
         session = self._workspace.session
         if session is None:
             return
