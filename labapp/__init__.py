@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 __all__ = ["InputError", "Results", "Session", "Study", "__version__", "measure"]
 __version__ = VERSION
 
-_HOMES = {
+_MODULES = {
     "InputError": "labapp.errors",
     "Results": "labapp.api",
     "Session": "labapp.session.session",
@@ -30,10 +30,10 @@ _HOMES = {
 
 
 def __getattr__(name: str) -> object:
-    # Loaded on first use: `labapp --version` needs no numpy.
-    if name not in _HOMES:
+    # Imported on first use: `labapp --version` does not need NumPy.
+    if name not in _MODULES:
         raise AttributeError(f"module 'labapp' has no attribute {name!r}")
-    found: object = getattr(importlib.import_module(_HOMES[name]), name)
+    found: object = getattr(importlib.import_module(_MODULES[name]), name)
     return found
 
 

@@ -1,4 +1,4 @@
-"""``python -m labapp`` is the command ``labapp``."""
+"""Entry point of ``python -m labapp``, which runs the command ``labapp``."""
 
 from __future__ import annotations
 

@@ -41,10 +41,13 @@ if TYPE_CHECKING:
 TableName = Literal["measures", "dots", "points", "boundary"]
 
 MOST_NODES = 50_000_000
-"""Heights of a `Results.surfaces` grid at most: 400 MB."""
+"""Most nodes of all grids of `Results.surfaces`: 400 MB."""
 
-LIMIT_PARTS = 40
+CONTOUR_LEVELS = 40
 """Contour levels of a plotted surface."""
+
+MANY_FRAMES = 40
+"""Frames from which a plot over time has no markers."""
 
 
 def measure(
@@ -63,16 +66,16 @@ def measure(
     Parameters
     ----------
     source
-        Grey image, shape (height, width), or images, shape (n, height, width), any real type; or
-        the path of a recording or of an image.
+        Greyscale image, shape (height, width), or stack of images, shape (n, height, width), of
+        any real type; or the path of a recording or of an image.
     setup
-        The setup file's path, or a set-up that was read from one (`labapp.config.setup`).
+        Path of the setup file, or a set-up read from one (`labapp.config.setup.read_setup`).
     frames
-        Which frames, ``START:STOP:STEP`` as in a Python slice, or the number of one.
+        Frames to measure: ``START:STOP:STEP`` as in a Python slice, or the number of one frame.
     settings
-        What can be chosen, `labapp.core.pipeline.Settings`; None: the defaults.
+        Settings of the measurement; None: the defaults of `labapp.core.pipeline.Settings`.
     follow
-        Whether to measure each frame from the one before, which is some twenty times faster.
+        Whether to start from the previous frame's result, which is about twenty times faster.
     progress
         Called with the result of each frame.
 
@@ -84,13 +87,13 @@ def measure(
     Raises
     ------
     InputError
-        If the recording or the setup file cannot be read, an array is no image, or an argument
-        cannot be what it says.
+        If the recording or the setup file cannot be read, the array is not an image or a stack of
+        images, or an argument is invalid.
 
     Warns
     -----
     UserWarning
-        If the set-up has a value that no usual bench has.
+        If the set-up has an unusual value.
     """
     require(source, (*PATH, np.ndarray), "measure", "source", "a path or an array of grey levels")
     require(setup, (*PATH, Setup), "measure", "setup", "a setup file's path or a Setup")
@@ -115,21 +118,21 @@ def measure(
         selected = select_frames(frames, count, "measure")
         found = list(run(selected, with_setup_check(measurer, record), sinks))
     verdict = record.verdict()
-    status = judged_status(bench.rig, verdict)  # of the whole run, as `labapp reconstruct` has it
+    status = judged_status(bench.rig, verdict)  # of all frames together
     judged = (replace(r, measurement=replace(r.measurement, setup_status=status)) for r in found)
     return Results(tuple(judged), bench.calibration, verdict)
 
 
 @dataclass(frozen=True, repr=False)
 class Results(Sequence[FrameResult]):
-    """The results of frames, in their order: a sequence of `FrameResult`."""
+    """Results of frames, in order: a sequence of `FrameResult`."""
 
     results: tuple[FrameResult, ...]
     """Result of each frame."""
     calibration: ImageCalibration
     """Pixel ↔ imaging plane."""
     setup_check: SetupVerdict | None = None
-    """What the frames together say of the set-up; None: it was not examined."""
+    """Check of the set-up by the residuals of all frames; None: not checked."""
 
     @classmethod
     def of_session(cls, session: Session) -> Results:
@@ -184,18 +187,18 @@ class Results(Sequence[FrameResult]):
         Parameters
         ----------
         table
-            ``measures`` has a row per frame, ``dots``, ``points`` and ``boundary`` have many.
+            ``measures`` has one row per frame; ``dots``, ``points`` and ``boundary`` have many.
 
         Returns
         -------
         DataFrame
-            Unknown values are NaN. ``attrs["units"]`` has the unit of each column, and
-            ``attrs["descriptions"]`` what it holds.
+            Unknown values are NaN. ``attrs["units"]`` and ``attrs["descriptions"]`` hold the unit
+            and the description of each column.
 
         Raises
         ------
         InputError
-            If there is no such table.
+            If ``table`` is not the name of a table.
         """
         import pandas as pd
 
@@ -213,12 +216,12 @@ class Results(Sequence[FrameResult]):
         return frame
 
     def surfaces(self, spacing_mm: float = 0.1) -> xr.Dataset:
-        """Return the surfaces on one grid, NaN outside each frame's boundary.
+        """Return all surfaces on a common grid, NaN outside each frame's boundary.
 
         Parameters
         ----------
         spacing_mm
-            Distance of the grid's nodes, mm.
+            Distance between neighbouring grid nodes, mm.
 
         Returns
         -------
@@ -233,20 +236,20 @@ class Results(Sequence[FrameResult]):
         """
         import xarray as xr
 
-        there = [r for r in self.results if r.measurement.reconstruction is not None]
-        x_mm, y_mm = _axes([r.measurement for r in there], spacing_mm)
-        places = np.meshgrid(x_mm, y_mm)
-        height = np.full((len(there), len(y_mm), len(x_mm)), np.nan)
-        for grid, result in zip(height, there, strict=True):
-            made = result.measurement.reconstruction
-            assert made is not None
-            grid[...] = made.surface.height(*places)
-        times = [np.nan if r.time_s is None else r.time_s for r in there]
+        measured = [r for r in self.results if r.measurement.reconstruction is not None]
+        x_mm, y_mm = _axes([r.measurement for r in measured], spacing_mm)
+        nodes = np.meshgrid(x_mm, y_mm)
+        height = np.full((len(measured), len(y_mm), len(x_mm)), np.nan)
+        for grid, result in zip(height, measured, strict=True):
+            reconstruction = result.measurement.reconstruction
+            assert reconstruction is not None
+            grid[...] = reconstruction.surface.height(*nodes)
+        times = [np.nan if r.time_s is None else r.time_s for r in measured]
         mm = {"units": "mm"}
         return xr.Dataset(
             {"height": (("frame", "y", "x"), height, mm | {"long_name": "height of the surface"})},
             {
-                "frame": [r.frame for r in there],
+                "frame": [r.frame for r in measured],
                 "time": ("frame", times, {"units": "s"}),
                 "y": ("y", y_mm, mm | {"long_name": "Y, along the weld"}),
                 "x": ("x", x_mm, mm | {"long_name": "X, across the weld"}),
@@ -260,18 +263,18 @@ class Results(Sequence[FrameResult]):
         band_hz: tuple[float, float] | None = None,
         segment_s: float | None = None,
     ) -> Dynamics:
-        """Return modes, spectra, events and step responses of the pool over these frames.
+        """Return the pool's modes, spectra, events and step responses over these frames.
 
         Parameters
         ----------
         signals
-            Current, voltage and wire feed (`labapp.session.signals.read_signals`), whose steps the
-            pool responds to.
+            Current, voltage and wire feed (`labapp.session.signals.read_signals`), for the step
+            responses.
         of
-            Series for the spectra: a column of sizes, or ``convexity_mm``, ``asymmetry``,
+            Series to analyse: a size column of the measures, or ``convexity_mm``, ``asymmetry``,
             ``wetting_slope_deg``.
         band_hz
-            Lowest and highest frequency of oscillations; None: all that the frames resolve.
+            Lowest and highest frequency, Hz; None: all frequencies that the frame rate resolves.
         segment_s
             Duration of a segment of the spectrogram, s; None: an eighth of the recording.
 
@@ -283,7 +286,7 @@ class Results(Sequence[FrameResult]):
         Raises
         ------
         InputError
-            If frames have no time, fewer than 16 have a surface, or an argument is none.
+            If frames have no time, fewer than 16 have a surface, or an argument is invalid.
         """
         from labapp.core.dynamics.analysis import DynamicsSettings
         from labapp.export.dynamics import dynamics_of, measured_of
@@ -304,12 +307,12 @@ class Results(Sequence[FrameResult]):
         return dynamics_of(measured_of(self), timed, DynamicsSettings(of, band_hz, segment_s))
 
     def penetration(self, model: PenetrationModel) -> Prediction:
-        """Return what a model says of the penetration over these frames.
+        """Return the penetration that a model predicts over these frames.
 
         Parameters
         ----------
         model
-            One that was fitted, or read by `labapp.export.penetration.read_model`.
+            A fitted model, or one read by `labapp.export.penetration.read_model`.
 
         Returns
         -------
@@ -331,14 +334,14 @@ class Results(Sequence[FrameResult]):
     def plot(
         self, size: str = "height_mm", axes: matplotlib.axes.Axes | None = None
     ) -> matplotlib.axes.Axes:
-        """Plot a size over time (over frames where these have no time), with ± as a band.
+        """Plot a size over time, or over frames without times, with a band of ±1 σ.
 
         Parameters
         ----------
         size
             A column of the measures, such as ``width_mm``.
         axes
-            Where to plot; None: in a new figure.
+            Axes to plot in; None: those of a new figure.
 
         Returns
         -------
@@ -348,7 +351,7 @@ class Results(Sequence[FrameResult]):
         Raises
         ------
         InputError
-            If there is no such column, or it has no numbers.
+            If there is no such column, or it is not numeric.
         """
         table = self.dataframe()
         numbers = map(str, table.select_dtypes("number"))
@@ -358,7 +361,7 @@ class Results(Sequence[FrameResult]):
         axes = _checked_axes("plot", axes)
         timed = bool(np.isfinite(table["time_s"]).all())
         at, value = table["time_s" if timed else "frame"].to_numpy(), table[size].to_numpy(float)
-        (line,) = axes.plot(at, value, marker="." if len(at) < LIMIT_PARTS else "")
+        (line,) = axes.plot(at, value, marker="." if len(at) < MANY_FRAMES else "")
         name, _, unit = size.rpartition("_")
         sigma = f"{name}_sigma_{unit}"
         if sigma in table:
@@ -376,11 +379,11 @@ class Results(Sequence[FrameResult]):
         Parameters
         ----------
         index
-            Its place in these results.
+            Index of the frame in these results.
         axes
-            Where to plot; None: in a new figure.
+            Axes to plot in; None: those of a new figure.
         spacing_mm
-            Distance of the grid's nodes, mm.
+            Distance between neighbouring grid nodes, mm.
 
         Returns
         -------
@@ -390,25 +393,26 @@ class Results(Sequence[FrameResult]):
         Raises
         ------
         InputError
-            If there is no such place, or the frame there has no surface.
+            If the index is out of range, or the frame has no surface.
         """
-        places = f"a place from 0 to {len(self) - 1}" if self.results else "results of some frames"
-        require(index, (int, np.integer), "plot_surface", "index", places)
+        valid = f"an index from 0 to {len(self) - 1}" if self.results else "results of some frames"
+        require(index, (int, np.integer), "plot_surface", "index", valid)
         if not -len(self) <= index < len(self):
-            raise InputError("plot_surface", "index", index, places)
+            raise InputError("plot_surface", "index", index, valid)
         index %= len(self)
         result = self.results[index]
-        made = result.measurement.reconstruction
-        if made is None:
+        reconstruction = result.measurement.reconstruction
+        if reconstruction is None:
             why = f"{result.measurement.status}: {result.measurement.reason}"
             raise InputError(f"frame {result.frame}", "surface", why, "a frame with a surface")
         axes = _checked_axes("plot_surface", axes)
         height = self[index : index + 1].surfaces(spacing_mm)["height"][0]
-        shown = axes.contourf(height["x"], height["y"], height, LIMIT_PARTS)
-        axes.figure.colorbar(shown, ax=axes, label="height (mm)")
-        outline = np.vstack([made.boundary.points_mm, made.boundary.points_mm[:1]])
+        contours = axes.contourf(height["x"], height["y"], height, CONTOUR_LEVELS)
+        axes.figure.colorbar(contours, ax=axes, label="height (mm)")
+        boundary = reconstruction.boundary.points_mm
+        outline = np.vstack([boundary, boundary[:1]])
         axes.plot(outline[:, 0], outline[:, 1], color="black", linewidth=1)
-        axes.plot(*made.points_mm[:, :2].T, ".", color="white", markersize=2)
+        axes.plot(*reconstruction.points_mm[:, :2].T, ".", color="white", markersize=2)
         axes.set_aspect("equal")
         axes.set_xlabel("X (mm)")
         axes.set_ylabel("Y, along the weld (mm)")
@@ -433,7 +437,7 @@ def _reader(images: npt.NDArray[Any]) -> Callable[[int], Frame]:
 
 
 def _axes(measured: Iterable[Measurement], spacing_mm: float) -> tuple[FloatArray, FloatArray]:
-    """X and Y of a grid through the origin that has all boundaries in it, mm."""
+    """X and Y of a grid through the origin that encloses all boundaries, mm."""
     check_positive(spacing_mm, "surfaces", "spacing_mm", "mm")
     found = [m.reconstruction.boundary.points_mm[:, :2] for m in measured if m.reconstruction]
     if not found:
@@ -453,13 +457,13 @@ def _is_real(value: object) -> bool:
 
 
 def _checked_axes(source: str, axes: matplotlib.axes.Axes | None) -> matplotlib.axes.Axes:
-    """The axes to plot in; those of a new figure where there are none."""
+    """The axes to plot in; those of a new figure if None."""
     from matplotlib.axes import Axes
 
     if axes is None:
         import matplotlib.pyplot as plt
 
-        made: matplotlib.axes.Axes = plt.subplots(layout="constrained")[1]
-        return made
+        new_axes: matplotlib.axes.Axes = plt.subplots(layout="constrained")[1]
+        return new_axes
     require(axes, Axes, source, "axes", "matplotlib axes, or None")
     return axes

@@ -1,4 +1,4 @@
-"""Files that come with labapp and are not code: samples, scenarios, the target, the guide."""
+"""Data files distributed with labapp: samples, scenarios, the target, the guide."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def bundled(name: str) -> Path:
-    """Place of a file or folder that comes with labapp, whether it is there or not.
+    """Return the path of a file or folder distributed with labapp, whether or not it exists.
 
     The folders ``resources``, ``sample_sessions`` and ``docs/guide`` are beside the package in a
     checkout; a wheel has them inside it (``pyproject.toml``).
@@ -16,7 +16,7 @@ def bundled(name: str) -> Path:
     Parameters
     ----------
     name
-        From the top of the repository: "resources/simulations".
+        Path relative to the top of the repository, such as "resources/simulations".
     """
     package = Path(str(files("labapp")))
     inside = package / name
@@ -25,11 +25,11 @@ def bundled(name: str) -> Path:
 
 @dataclass(frozen=True)
 class SampleText:
-    """A sample session in words."""
+    """Title and description of a sample session."""
 
     title: str
     shows: str
-    """What it shows or what to try, in a line."""
+    """What it shows or what to try, in one line."""
 
 
 SAMPLE_TEXTS = {
@@ -44,4 +44,4 @@ SAMPLE_TEXTS = {
         "One line on a GMAW pool, §3.3", "1500 frames/s, pulsed current: see the timeline"
     ),
 }
-"""The sample sessions by the names of their folders; kept apart, as it is needed at the start."""
+"""The sample sessions by folder name; here, not in the sessions, as it is needed at the start."""

@@ -1,4 +1,4 @@
-"""The exception for wrong input: where it is, what it is, and what is expected instead."""
+"""The exception for invalid input: its source, field and value, and what is expected instead."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
 MAX_SHOWN = 80
-"""Characters of a wrong value that a message repeats."""
+"""Most characters of an invalid value that a message shows."""
 
 
 class InputError(Exception):
-    """Something given to the program cannot be used, and this says what would be right.
+    """Invalid input, with a description of valid input.
 
     Parameters
     ----------
     source
-        The file, folder or option it was found in.
+        The file, folder or option which has the invalid value.
     field
         The field, as the full dotted key (``laser.distance_mm``).
     value
-        What was found there, as it is to be shown.
+        The invalid value, as it is to be shown.
     expected
-        What would be right, completing "expected …".
+        What is valid, completing "expected …".
     others
-        Further problems found in the same reading, reported together.
+        Further problems of the same input, reported together.
     """
 
     def __init__(
@@ -49,12 +49,12 @@ class InputError(Exception):
         shown = str(self.value)
         if len(shown) > MAX_SHOWN:
             shown = shown[: MAX_SHOWN - 1] + "…"
-        own = f"{self.source}: {self.field}: {shown}; expected {self.expected}"
-        return "\n".join([own, *map(str, self.others)])
+        first = f"{self.source}: {self.field}: {shown}; expected {self.expected}"
+        return "\n".join([first, *map(str, self.others)])
 
     @property
     def problems(self) -> tuple[InputError, ...]:
-        """This problem and the others, each on its own."""
+        """This problem and the others, one error each."""
         return (InputError(self.source, self.field, self.value, self.expected), *self.others)
 
     @classmethod
@@ -73,20 +73,20 @@ class InputError(Exception):
 def unknown_name(
     source: str | os.PathLike[str], field: str, value: object, known: Iterable[str]
 ) -> InputError:
-    """Error for a value that is none of the known names, with the most similar of them first."""
+    """Return the error for an unknown name, which suggests the most similar known name."""
     names = list(known)
-    near = difflib.get_close_matches(str(value), names, 1)
+    similar = difflib.get_close_matches(str(value), names, 1)
     every = f"one of {', '.join(names)}"
-    expected = f"{near[0]} (the most similar name), or {every}" if near else every
+    expected = f"{similar[0]} (the most similar name), or {every}" if similar else every
     return InputError(source, field, repr(value), expected)
 
 
 def require(
     value: object, kinds: type | tuple[type, ...], source: str, field: str, expected: str
 ) -> None:
-    """Raise `InputError` unless a value is of one of some types.
+    """Raise `InputError` unless a value is an instance of the given types.
 
-    A bool counts as no number, text as no sequence.
+    A bool does not count as a number, nor a str as a sequence.
     """
     named = kinds if isinstance(kinds, tuple) else (kinds,)
     is_other = any(isinstance(value, kind) and kind not in named for kind in (bool, str))
@@ -104,12 +104,12 @@ def check_positive(value: object, source: str, field: str, unit: str) -> None:
 
 
 PATH = (str, os.PathLike)
-"""Types of a path."""
+"""Types of path arguments."""
 
 
 @contextmanager
 def os_errors_as_input(path: str | os.PathLike[str], field: str, expected: str) -> Iterator[None]:
-    """Raise an `OSError` of the block as an `InputError` about ``path``."""
+    """Convert an `OSError` raised in the block to an `InputError` about ``path``."""
     try:
         yield
     except OSError as error:

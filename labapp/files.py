@@ -1,4 +1,4 @@
-"""Atomic writing of files: a reader sees all of a new file, or the former one."""
+"""Atomic writing of files: a reader sees either the old file or the complete new one."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from labapp.errors import os_errors_as_input
 
 
 def as_bytes(text: str) -> bytes:
-    r"""UTF-8; a file name that is no text keeps its odd bytes as ``\udcXX``, as in JSON."""
+    r"""Encode as UTF-8; undecodable bytes of file names are written as ``\udcXX``, as in JSON."""
     return text.encode("utf-8", "backslashreplace")
 
 
 def beside(path: Path) -> Path:
-    """Hidden, unpredictable path in the folder of ``path``: no link can wait there to be followed.
+    """Return a hidden, unpredictable path in the folder of ``path``, safe from planted links.
 
-    A file or folder there must still be created as new (``xb``, `mkdir`), never opened.
+    The file or folder must still be created as new (``xb``, `mkdir`), never opened.
     """
     return path.with_name(f".{path.name}.{secrets.token_hex(8)}.part")
 
 
 @contextmanager
 def atomic_file(path: Path) -> Iterator[Path]:
-    """Temporary file that replaces ``path`` when the block ends without error, else is deleted.
+    """Yield a temporary file, which replaces ``path`` unless the block raises.
 
     Raises
     ------
@@ -44,14 +44,14 @@ def atomic_file(path: Path) -> Iterator[Path]:
 
 
 def write_atomically(path: Path, content: bytes) -> None:
-    """Write a temporary file and rename it to ``path``, so that no reader sees a part of it.
+    """Write a temporary file and rename it to ``path``, so that readers never see a partial file.
 
-    A file that was there keeps its permissions, and a link keeps pointing at what it did.
+    Permissions of an existing file are preserved, and links are followed, not replaced.
 
     Raises
     ------
     OSError
-        If it cannot be written; then what was there is untouched and nothing is left beside it.
+        If it cannot be written; an existing file is unchanged and no temporary file remains.
     """
     path = path.resolve()
     with atomic_file(path) as part:
@@ -64,7 +64,7 @@ def write_atomically(path: Path, content: bytes) -> None:
 
 
 def write_file(path: Path, content: bytes) -> Path:
-    """Write a file by `write_atomically`; returns its path.
+    """Write a file with `write_atomically` and return its path.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The log file: what went wrong in detail, for whoever mends it. It never stops the program."""
+"""The log file, with the details of errors. Logging never raises."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ MAX_BYTES, KEPT = 1_000_000, 3
 
 
 def log_file() -> Path:
-    """Where the log goes."""
+    """Return the path of the log file."""
     return Path(platformdirs.user_log_dir(NAME, appauthor=False)) / "labapp.log"
 
 
 def start_log() -> logging.Logger:
-    """The program's logger, writing to `log_file` where that can be written."""
+    """Return the program's logger, which writes to `log_file` if that is writable."""
     logging.raiseExceptions = False
     logger = logging.getLogger(NAME)
     logger.propagate = False
@@ -26,7 +26,7 @@ def start_log() -> logging.Logger:
         handler = _handler()
         handler.set_name(NAME)
         logger.addHandler(handler)
-    if logging.lastResort is not None:  # what `core.compiled` announces is for stderr, too
+    if logging.lastResort is not None:  # notices of `core.compiled` also go to stderr
         logger.getChild("notices").addHandler(logging.lastResort)
     return logger
 

@@ -1,24 +1,24 @@
-"""How large a picture may be, set for OpenCV, too; `labapp` imports it before all else."""
+"""Limits of image sizes, also those of OpenCV; `labapp` imports this module first."""
 
 from __future__ import annotations
 
 import os
 
 MOST_PIXELS = 2**26
-"""No picture has more (8192×8192): a file of 0.4 MB can hold one that unpacks to gigabytes."""
+"""Limit for a picture (8192×8192): a file of 0.4 MB can decompress to gigabytes."""
 
-# OpenCV looks at it once, when it is loaded, and then before it decodes.
+# OpenCV reads this once, when it is loaded.
 os.environ["OPENCV_IO_MAX_IMAGE_PIXELS"] = str(MOST_PIXELS)
 
 
 MOST_BYTES = 2**30
-"""A video's decoder holds no more in frames than this."""
+"""Memory limit for the frames that a video decoder holds."""
 
 HELD_FRAMES, HELD_REORDERED = 2, 17
-"""Frames that it may hold; of codecs that store them out of the order they are shown in."""
+"""Frames that a decoder may hold; the same for codecs that reorder frames."""
 
 
 def most_decoded(bits: int, reordered: bool) -> int:
-    """Pixels that a frame of a video may have, at the given bits of each."""
+    """Return the most pixels that a video frame may have, given the bits per pixel."""
     held = HELD_REORDERED if reordered else HELD_FRAMES
     return min(MOST_PIXELS, 8 * MOST_BYTES // (max(bits, 1) * held))

@@ -1,4 +1,4 @@
-"""What differs between Linux, macOS and Windows: no other module asks which of them it runs on."""
+"""Differences between Linux, macOS and Windows; no other module tests the operating system."""
 
 from __future__ import annotations
 
@@ -17,26 +17,26 @@ IS_LINUX = sys.platform.startswith("linux")
 
 
 def has_display(environment: Mapping[str, str]) -> bool:
-    """Whether there is a screen for windows; Windows and macOS name none in the environment."""
+    """Whether there is a display; on Windows and macOS always, as no variable names it there."""
     names = ("DISPLAY", "WAYLAND_DISPLAY")
     return IS_WINDOWS or IS_MACOS or any(environment.get(name) for name in names)
 
 
 def own_command() -> list[str]:
-    """Words of the command that starts labapp again, as this one was: frozen, or by Python."""
+    """Return the command that starts labapp in the same way, frozen or by Python, as words."""
     frozen = getattr(sys, "frozen", False)
     return [sys.executable] if frozen else [sys.executable, "-m", "labapp"]
 
 
 def sync_folder(path: Path) -> None:
-    """Have the disk hold the names that a folder has now; Windows sees to that by itself.
+    """Flush a folder's entries to disk (fsync); not needed on Windows.
 
     Raises
     ------
     OSError
-        If the disk cannot.
+        If that fails.
     """
-    if IS_WINDOWS:  # opens no folders
+    if IS_WINDOWS:  # cannot open folders
         return
     handle = os.open(path, os.O_RDONLY)
     try:
@@ -47,11 +47,11 @@ def sync_folder(path: Path) -> None:
 
 @contextmanager
 def interrupts_blocked() -> Iterator[None]:
-    """Block Ctrl-C and SIGTERM while processes are started; this one receives them afterwards.
+    """Block Ctrl-C and SIGTERM while processes are started; they are delivered afterwards.
 
-    A process that is only half set up reports errors about what it lacks. Those that are started
-    ignore Ctrl-C from then on, and heed SIGTERM when they call `ignore_interrupts`. Windows has no
-    such mask: there that call does it.
+    A process interrupted during its start-up would print tracebacks. The started processes inherit
+    the mask: they ignore Ctrl-C, and react to SIGTERM after they call `ignore_interrupts`. Windows
+    has no signal mask; there `ignore_interrupts` alone has this effect.
     """
     if IS_WINDOWS:
         yield
@@ -64,7 +64,7 @@ def interrupts_blocked() -> Iterator[None]:
 
 
 def ignore_interrupts() -> None:
-    """Ignore Ctrl-C from now on, but heed SIGTERM; in the main thread (`interrupts_blocked`)."""
+    """Ignore Ctrl-C, but not SIGTERM; to be called in the main thread (`interrupts_blocked`)."""
     if IS_WINDOWS:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
     else:
@@ -72,18 +72,18 @@ def ignore_interrupts() -> None:
 
 
 def lower_priority(nice: int) -> None:
-    """Raise the niceness of this process; without effect on Windows."""
+    """Raise the niceness of this process; no effect on Windows."""
     if not IS_WINDOWS:
         os.nice(nice)
 
 
 def library(name: str, version: int) -> str:
-    """File name of a shared library of a version: "libm.so.6" of ("m", 6) on Linux."""
+    """Return the file name of a shared library: "libm.so.6" for ("m", 6) on Linux."""
     if IS_WINDOWS:
         return f"lib{name}-{version}.dll"
     return f"lib{name}.{version}.dylib" if IS_MACOS else f"lib{name}.so.{version}"
 
 
 def quoted(text: str) -> str:
-    """A word of a command, as it is typed in the system's shell."""
+    """Quote a word of a command for the system's shell."""
     return subprocess.list2cmdline([text]) if IS_WINDOWS else shlex.quote(text)

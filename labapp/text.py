@@ -1,4 +1,4 @@
-"""Text that the window, the command line, files and messages share: counts, sizes, CSV cells."""
+"""Text shared by the app, the command line, files and messages: counts, sizes, CSV cells."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from collections.abc import Iterable, Sequence
 from datetime import datetime
 
 SIGMA_OF = "noise, level and set-up"
-"""What the ± of a pool's sizes covers."""
+"""Contributions to the ± of a pool's sizes."""
 
 HEIGHT_SIGMA_OF = "noise and level only"
-"""What the ± of single heights covers; so did those of sizes before the set-up was in them."""
+"""Contributions to the ± of single heights, and to that of sizes in older sessions."""
 
 SETUP_WORDS = {
     "entered": "The set-up was entered by hand, not calibrated; usual uncertainties are assumed.",
@@ -18,25 +18,25 @@ SETUP_WORDS = {
     "checked": "The set-up was checked against a known mirror.",
     "doubtful": "The set-up is doubtful: a value is unusual, or the recording contradicts it.",
 }
-"""What `setup_status` means to the operator."""
+"""Meaning of each `setup_status`, for the operator."""
 
 SETUP_MARKS = {"entered": "○", "calibrated": "◐", "checked": "✓", "doubtful": "▲"}
-"""Stand before these words in windows."""
+"""Symbols before these words in the app."""
 
 
 def setup_words(status: str, checked: str = "", doubt: str = "", was_checked: str = "") -> str:
-    """What a `setup_status` means; empty without one.
+    """Return the meaning of a `setup_status`; empty if there is none.
 
     Parameters
     ----------
     status
         The status.
     checked
-        When a checked set-up was, ISO 8601.
+        Date of the bench check, ISO 8601.
     doubt
-        Why a doubtful one is (`SetupVerdict.reason`).
+        Reason for the doubt (`SetupVerdict.reason`).
     was_checked
-        When one was that was changed since, ISO 8601.
+        Date of a bench check after which the set-up was changed, ISO 8601.
     """
     words = SETUP_WORDS.get(status, "")
     if status == "checked" and checked:
@@ -50,17 +50,17 @@ def setup_words(status: str, checked: str = "", doubt: str = "", was_checked: st
 
 
 def marked_setup_words(status: str, words: str) -> str:
-    """The words of a `setup_status` after its mark; empty without one."""
+    """Return the words of a `setup_status` with its symbol; empty if there is none."""
     return f"{SETUP_MARKS[status]} {words}" if words else ""
 
 
 def now() -> str:
-    """Present time, ISO 8601 with the time zone, to the second."""
+    """Return the current time, ISO 8601 with the time zone, to the second."""
     return datetime.now().astimezone().isoformat(timespec="seconds")
 
 
 def pluralize(count: int, noun: str) -> str:
-    """Count and noun, the noun in the plural unless the count is 1: "1 frame", "2 frames"."""
+    """Return count and noun, in the plural unless the count is 1: "1 frame", "2 frames"."""
     return f"{count} {noun}{'s' * (count != 1)}"
 
 
@@ -68,7 +68,7 @@ BYTES = ("bytes", "kB", "MB", "GB", "TB")
 
 
 def format_bytes(size: float) -> str:
-    """File size with a decimal unit: "512 bytes", "1.5 MB"."""
+    """Return a file size with a decimal unit: "512 bytes", "1.5 MB"."""
     value, unit = float(size), 0
     while value >= 1000 and unit < len(BYTES) - 1:
         value, unit = value / 1000, unit + 1
@@ -114,17 +114,17 @@ def axis_label(name: str) -> str:
 
 
 FORMULA = tuple("=+-@＝＋－＠\t\r\n")
-"""A spreadsheet takes a cell that begins so for a formula and evaluates it (CSV injection).
+"""Spreadsheets evaluate a cell that begins with one of these as a formula (CSV injection).
 
 Some treat full-width signs alike.
 """
 
 
 def as_cell(value: object) -> object:
-    """Value as a CSV cell: text that a spreadsheet would evaluate is escaped with a leading ``'``.
+    """Return a CSV cell: text that a spreadsheet would evaluate is escaped with a leading ``'``.
 
-    Text in which only further ``'`` stand before such a beginning is escaped too, so that removing
-    one ``'`` restores any escaped text. Numbers stay as they are.
+    Text that begins with ``'`` before such a character is escaped too, so that removing one ``'``
+    restores the original of any escaped text. Numbers are unchanged.
     """
     if not isinstance(value, str) or not value.lstrip("'").startswith(FORMULA):
         return value
@@ -136,19 +136,19 @@ def as_cell(value: object) -> object:
 
 
 def csv_text(rows: Iterable[Sequence[object]]) -> str:
-    """CSV text of rows; text that a spreadsheet would evaluate is escaped (`as_cell`)."""
+    """Return rows as CSV text; text that a spreadsheet would evaluate is escaped (`as_cell`)."""
     return unescaped_csv_text([as_cell(cell) for cell in row] for row in rows)
 
 
 def unescaped_csv_text(rows: Iterable[Sequence[object]]) -> str:
-    """CSV text of rows as they are, such as those that were read from a CSV file."""
+    """Return rows as CSV text without escaping, for rows that were read from a CSV file."""
     lines = _Lines()
     csv.writer(lines).writerows(rows)
     return "".join(lines)
 
 
 class _Lines(list[str]):
-    """Lines ending with a line feed alone; with csv's own option carriage returns stay unquoted."""
+    """Lines ending with a line feed; with csv's ``lineterminator`` a CR in a cell is not quoted."""
 
     def write(self, line: str) -> None:
         self.append(line.removesuffix("\r\n") + "\n")

@@ -118,7 +118,7 @@ def test_every_frame_has_its_row_and_a_line_if_it_failed(
     assert len(lines) == 6
     assert lines[0] == "frame 0: no-dots: for the test"
     assert lines[3].startswith("frame 3: unreadable: ")
-    assert "3.png: content: cannot be decoded; expected a whole image" in lines[3]
+    assert "3.png: content: cannot be decoded; expected a complete image" in lines[3]
     assert "6 frames, 0 with a surface (5 no-dots, 1 unreadable)" in said
     assert str(out) in said
     assert code == 1  # done, and nothing could be measured
@@ -250,7 +250,7 @@ def test_a_full_disk_leaves_whole_frames(
     code, _, complained = labapp("reconstruct", folder, "--setup", SETUP, "--out", out)
     assert code == 2
     assert "results: No space left on device" in complained
-    assert "the 2 frames before are whole" in complained
+    assert "the 2 previous frames are complete" in complained
     assert [row["frame"] for row in table(out / "measures.csv")] == ["0", "1"]
     assert json.loads((out / "run.json").read_text())["state"] == "failed"
 

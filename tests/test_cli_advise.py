@@ -38,7 +38,7 @@ def test_advice_is_told_and_written(labapp: Run, tmp_path: Path) -> None:
     )
     assert code == 0, err
     assert "laser, projection angle: 26.00 °" in told_out
-    assert "Mean height error to be expected" in told_out
+    assert "Expected mean height error" in told_out
     assert "to spare" in (out / "advice.md").read_text("utf-8")
     with (out / "advice.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))

@@ -133,7 +133,7 @@ def test_the_budget_of_a_setup_file(
         (("errors", "--out", "{}/file"), "expected a folder that can be written"),
         (("budget", "--height", "0"), "the expected pool: height: 0.0; expected 0.01 to 30 mm"),
         (("budget", "--height", "nan"), "the expected pool: height: nan; expected 0.01 to 30 mm"),
-        (("budget", "--height", "4"), "expected a pool that can be"),
+        (("budget", "--height", "4"), "expected a possible pool"),
         (("budget", "--width", "-3"), "the expected pool: width: -3.0; expected 1 to 30 mm"),
         (("budget", "--setup", "{}/none.toml"), "none.toml"),
         (("positioning", "--out", "{}", "--format", "gif"), "--format"),

@@ -359,7 +359,7 @@ def test_a_recording_that_was_moved_is_found_again(labapp: Run, measured: Path) 
     assert code == 2
     assert "stack.npy: recording: does not exist" in complained
     _, said, _ = labapp("session", "info", measured)
-    assert "stack.npy is missing; labapp session relink says where it is now" in said
+    assert "stack.npy is missing; labapp session relink sets its new path" in said
     code, _, complained = labapp("session", "relink", measured, SAMPLE / "recording.avi")
     assert code == 2
     assert "content: another recording" in complained
@@ -475,7 +475,7 @@ def test_frames_are_those_that_were_imported(labapp: Run, file: Path) -> None:
     assert said.startswith("1 frame, 1 with a surface")
     code, _, complained = labapp("session", "measure", file, "--frames", "3")
     assert code == 2
-    assert "expected some of what the session has: frames 0, 2, 4" in complained
+    assert "expected some of frames 0, 2, 4" in complained
 
 
 def test_what_a_session_lacks_is_told(labapp: Run, tmp_path: Path) -> None:
@@ -621,7 +621,7 @@ def test_an_edit_that_does_not_fit_changes_nothing(
 def test_a_frame_that_is_not_there_cannot_be_corrected(labapp: Run, measured: Path) -> None:
     code, _, complained = labapp("session", "correct", measured, "--frame", 6, "--block-row", 1)
     assert code == 2
-    assert "--frame: frame: 6; expected what the session has: frames 0 to 5" in complained
+    assert "--frame: frame: 6; expected one of frames 0 to 5" in complained
 
 
 def test_a_correction_goes_back_to_automatic(labapp: Run, measured: Path) -> None:
@@ -949,7 +949,7 @@ def test_problems_are_told_a_line_each(labapp: Run, measured: Path) -> None:
     code, said, _ = labapp("session", "verify", measured, "--no-recording")
     assert code == 1
     assert said.splitlines() == [
-        f"result of frame {k} (fit) is not what its frame gave" for k in (1, 2)
+        f"result of frame {k} (fit) differs from its measurement" for k in (1, 2)
     ]
 
 

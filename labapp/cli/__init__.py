@@ -1,9 +1,9 @@
-"""The command line: `main` and the table of its commands, each a module of its own here.
+"""The command line: `main` and its commands, one module each.
 
-Commands are thin, over the calls that the pages make too.
+Commands are thin layers over the functions that the app's pages call too.
 
-What measures is imported inside the commands: `labapp --help` answers at once, and Ctrl-C while
-it loads is handled like any other.
+Modules that take long to load are imported inside the commands, so that `labapp --help` is fast
+and Ctrl-C during an import is handled like any other.
 """
 
 from __future__ import annotations
@@ -43,18 +43,18 @@ from labapp.log import log_file, start_log
 from labapp.version import VERSION
 
 IMPATIENT_S = 2.0
-"""A second request to stop within this time is ignored: the first is being carried out."""
+"""A further interrupt within this time is ignored, as the first is still being handled, s."""
 
 app = typer.Typer(
     name="labapp",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
-    rich_markup_mode=None,  # which takes as long to load as all else
+    rich_markup_mode=None,  # would double the import time
     cls=Commands,
     context_settings={
         "help_option_names": ["-h", "--help"],
-        "max_content_width": 1000,  # the terminal's
+        "max_content_width": 1000,  # use the terminal's width
     },
     help="Measure the 3-D surface of a molten weld pool from a reflected laser dot matrix. "
     "Alone, labapp opens the app; labapp FILE opens a session or a recording in it. "
@@ -76,7 +76,7 @@ app.command()(benchmark.benchmark)
 
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
-    """Run the command line and exit: bad input in a line or two, never a traceback."""
+    """Run the command line and exit; bad input is reported without a traceback."""
     log = start_log()
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
@@ -96,7 +96,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
         except Exception as error:
             log.exception("fault")
             if stops:
-                # Compiled modules that are being loaded turn the interrupt into an ImportError.
+                # An interrupt during the import of a compiled module raises ImportError.
                 sys.exit(INTERRUPTED)
             if isinstance(error, OSError) and error.errno == errno.ENOSPC:
                 typer.echo("labapp: output: no space left where it goes; make some", err=True)
@@ -119,10 +119,10 @@ def _commands() -> frozenset[str]:
 
 @contextmanager
 def _stoppable() -> Iterator[list[tuple[float, int]]]:
-    """Interrupt at Ctrl-C or SIGTERM, but not what the first one set going.
+    """Raise KeyboardInterrupt on Ctrl-C or SIGTERM, but not again while the first is handled.
 
-    Yields when which of them came, (s, number of the signal). A program that SIGTERM interrupted
-    says so and has a code of its own: who sent it sees neither a terminal nor a ^C.
+    Yields the list of received signals, (time in s, signal number). After SIGTERM the program
+    reports it and exits with a separate code, as there is no ^C on the terminal.
     """
     stops: list[tuple[float, int]] = []
 
@@ -132,7 +132,7 @@ def _stoppable() -> Iterator[list[tuple[float, int]]]:
             stops.append((now, number))
             raise KeyboardInterrupt
 
-    heeded = {  # a job in the background ignores Ctrl-C
+    handled = {  # not a signal that is ignored, such as Ctrl-C in a background job
         number: usual
         for number, usual in (
             (signal.SIGINT, signal.default_int_handler),
@@ -140,7 +140,7 @@ def _stoppable() -> Iterator[list[tuple[float, int]]]:
         )
         if signal.getsignal(number) is usual
     }
-    for number in heeded:
+    for number in handled:
         signal.signal(number, interrupt)
     try:
         yield stops
@@ -150,9 +150,9 @@ def _stoppable() -> Iterator[list[tuple[float, int]]]:
         typer.echo("labapp: stopped by SIGTERM", err=True)
         sys.exit(TERMINATED)
     finally:
-        came = {number for _, number in stops}
-        for number, usual in heeded.items():
-            signal.signal(number, signal.SIG_IGN if number in came else usual)
+        received = {number for _, number in stops}
+        for number, usual in handled.items():
+            signal.signal(number, signal.SIG_IGN if number in received else usual)
 
 
 def _print_version(wanted: bool) -> None:
@@ -170,7 +170,7 @@ def program(
         ),
     ] = False,
 ) -> None:
-    """Hold the options of the program itself."""
+    """Define the options of the program itself."""
 
 
 app.command()(reconstruct.reconstruct)

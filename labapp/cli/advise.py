@@ -1,4 +1,4 @@
-"""`labapp advise`: where laser and imaging plane should stand for the pools expected."""
+"""`labapp advise`: the best positions of laser and imaging plane for the expected pools."""
 
 from __future__ import annotations
 
@@ -26,16 +26,17 @@ def advise(
         typer.Argument(metavar="[FILE.toml]", help="Pools and bench (TOML): docs/adviser.md."),
     ] = None,
     width: Annotated[
-        str | None, typer.Option(metavar="A:B", help="Of the pools along X, from A to B (mm).")
+        str | None, typer.Option(metavar="A:B", help="Width of the pools (X), from A to B (mm).")
     ] = None,
     length: Annotated[
-        str | None, typer.Option(metavar="A:B", help="Of the pools along Y (mm).")
+        str | None, typer.Option(metavar="A:B", help="Length of the pools (Y) (mm).")
     ] = None,
     height: Annotated[
-        str | None, typer.Option(metavar="A:B", help="Of the pools, above 0 (mm).")
+        str | None, typer.Option(metavar="A:B", help="Height of the pools, a magnitude (mm).")
     ] = None,
     convex: Annotated[
-        bool | None, typer.Option("--convex/--concave", help="Above the work piece, or below it.")
+        bool | None,
+        typer.Option("--convex/--concave", help="Pools above or below the work piece."),
     ] = None,
     angle: Annotated[
         str | None, typer.Option(metavar="A:B", help="Range of the laser's angle (degrees).")
@@ -47,7 +48,7 @@ def advise(
         str | None, typer.Option(metavar="A:B", help="Distance of the imaging plane (mm).")
     ] = None,
     quick: Annotated[
-        bool, typer.Option("--quick", help="A coarser search: a tenth of the time.")
+        bool, typer.Option("--quick", help="Search more coarsely, in a tenth of the time.")
     ] = False,
     check: Annotated[
         bool, typer.Option("--check", help="Check the advice against 50 other pools and a grid.")
@@ -57,10 +58,10 @@ def advise(
         typer.Option(min=0, max=2**31 - 1, help="Random seed."),
     ] = 4,
 ) -> None:
-    """Advise where laser and imaging plane should stand for the pools that are expected.
+    """Recommend positions of laser and imaging plane for the expected pools.
 
-    Options replace what FILE.toml says. The setup.toml that is written lacks the image
-    calibration, which the bench must be measured for: labapp calibrate plane.
+    Options override values in FILE.toml. The written setup.toml has no image calibration; this
+    must be measured on the bench: labapp calibrate plane.
     """
     from labapp.studies.adviser.keys import parse_request, read_request
 
@@ -82,7 +83,7 @@ def advise(
 
 
 def _replace(values: dict[str, Any], *options: tuple[str, str, object]) -> None:
-    """Put the options that were given, (table, key, value), in place of what a file says."""
+    """Override values of a file by the given options, (table, key, value)."""
     for table, key, value in options:
         if value is not None and isinstance(values.setdefault(table, {}), dict):
             values[table][key] = value
@@ -91,7 +92,7 @@ def _replace(values: dict[str, Any], *options: tuple[str, str, object]) -> None:
 def _advised(
     expected: ExpectedPools, limits: BenchLimits, out: Path, quick: bool, check: bool, seed: int
 ) -> bool:
-    """Search, print and write; whether any set-up is possible."""
+    """Search for set-ups, print and write the advice; returns whether any set-up is possible."""
     from labapp.studies.adviser import check as adviser_check
     from labapp.studies.adviser import search as adviser
     from labapp.studies.adviser.files import advice_files, patterns_of
@@ -116,7 +117,7 @@ def _advised(
 
 
 def _span(option: str, text: str | None) -> list[float] | None:
-    """Two numbers from ``A:B``, or twice the one of ``A``."""
+    """Parse ``A:B``, or ``A`` for a range of one value."""
     if text is None:
         return None
     try:

@@ -1,4 +1,4 @@
-"""`labapp analyze`: the tables and pictures of chapters 4 and 8, from simulation."""
+"""`labapp analyze`: tables and figures of chapters 4, 6 and 8, by simulation."""
 
 from __future__ import annotations
 
@@ -44,43 +44,44 @@ Out = Annotated[
     typer.Option(help="Folder for tables (CSV, Markdown) and pictures; files in it are replaced."),
 ]
 Tables = Annotated[
-    bool, typer.Option("--tables", help="Print the tables; without --out nothing else is made.")
+    bool, typer.Option("--tables", help="Print the tables; without --out nothing is written.")
 ]
-Format = Annotated[Literal["png", "svg"], typer.Option("--format", help="Of the pictures.")]
+Format = Annotated[Literal["png", "svg"], typer.Option("--format", help="Format of the pictures.")]
 
 
 @app.command()
 def positioning(out: Out = None, tables: Tables = False, picture: Format = "png") -> None:
-    """Which rays the torch blocks, L1, L2 and D1, and dots on and off the plane (§4.2.1)."""
-    from labapp.studies import positioning_tables as found
+    """Tabulate rays blocked by the torch, L1, L2 and D1, and dots on the imaging plane (§4.2.1)."""
+    from labapp.studies import positioning_tables as study
 
-    placements = found.coverage()
-    made = (*found.blocking_tables(), found.clearance_table(), found.coverage_table(placements))
+    placements = study.coverage()
+    computed = (*study.blocking_tables(), study.clearance_table(), study.coverage_table(placements))
     folder = results_folder(out, tables)
-    _keep(folder, AnalysisPart(made, {}, made if tables else ()))
+    _write(folder, AnalysisPart(computed, {}, computed if tables else ()))
     if folder is not None:
         from labapp.studies import pictures
 
         write_figure(folder, "figure_4_11_coverage", pictures.coverage_picture(placements), picture)
-        rig = found.positioning_rig(30.0)
+        rig = study.positioning_rig(30.0)
         side = pictures.positioning_picture(rig, 6.0, 6.0, 0.3)
         write_figure(folder, "figure_4_7_positioning", side, picture)
 
 
 @app.command()
 def correspondence(out: Out = None, tables: Tables = False, picture: Format = "png") -> None:
-    """Which way the reflected rows and columns run, by size and depth of the pool (§4.2.2)."""
-    from labapp.studies import correspondence_table as found
+    """Tabulate the order of reflected rows and columns by size and depth of the pool (§4.2.2)."""
+    from labapp.studies import correspondence_table as study
 
-    made = found.correspondence_tables()
+    computed = study.correspondence_tables()
     folder = results_folder(out, tables)
-    _keep(folder, AnalysisPart(made, {}, made if tables else ()))
+    _write(folder, AnalysisPart(computed, {}, computed if tables else ()))
     if folder is not None:
         from labapp.studies import pictures
 
-        for name, title, radius, depth in found.EXAMPLES:
-            seen = found.cap_reflections(radius, depth)
-            write_figure(folder, name, pictures.correspondence_picture(seen, title), picture)
+        for name, title, radius, depth in study.EXAMPLES:
+            reflections = study.cap_reflections(radius, depth)
+            figure = pictures.correspondence_picture(reflections, title)
+            write_figure(folder, name, figure, picture)
 
 
 @app.command()
@@ -91,7 +92,7 @@ def errors(
     part: Annotated[
         list[str] | None,
         typer.Option(
-            help=f"{', '.join(PARTS)}: what to work out; repeat for more. CE, LE, ME are "
+            help=f"Part to compute: {', '.join(PARTS)}; repeat for more. CE, LE, ME are "
             "configuration, system limitation and methodology error. Default: all."
         ),
     ] = None,
@@ -101,19 +102,21 @@ def errors(
     ] = None,
     step: Annotated[
         float,
-        typer.Option(min=0.25, max=10, help="Between the laser's places, degrees and mm (LE, ME)."),
+        typer.Option(
+            min=0.25, max=10, help="Step between laser positions, degrees and mm (LE, ME)."
+        ),
     ] = 2.0,
     frames: Annotated[
-        int, typer.Option(min=1, max=1000, help="Frames that are rendered of each surface.")
+        int, typer.Option(min=1, max=1000, help="Frames rendered of each surface.")
     ] = 3,
     draws: Annotated[
         int, typer.Option(min=10, max=100_000, help="Monte Carlo samples of the calibration.")
     ] = 400,
     picture: Format = "png",
 ) -> None:
-    """Work out the errors of chapter 8 by every scheme, beside the text's.
+    """Compute the errors of chapter 8 for every scheme, and compare them with the text's.
 
-    Each part is written before the next one begins. All of them take long: see --part.
+    Each part is written before the next one begins. All parts together take long: see --part.
     """
     options = AnalysisOptions(
         _chosen("part", part, PARTS),
@@ -125,8 +128,8 @@ def errors(
     )
     folder = writable_folder(out)
     with progress_shown() as progress:
-        for made in analyze_errors(options, progress):
-            _keep(folder, made)
+        for finished in analyze_errors(options, progress):
+            _write(folder, finished)
 
 
 @app.command()
@@ -138,8 +141,9 @@ def frame(
         tuple[float, float] | None,
         typer.Option(
             metavar="DIAMETER HEIGHT",
-            help="The frame shows a cap of this size, such as a thumb tack (mm); the height of a "
-            "hollow is below 0. The error of every scheme, with a circle as boundary (§8.2).",
+            help="Size of a spherical cap in the frame, such as a thumb tack (mm); the height of a "
+            "concave one is negative. Gives the error of every scheme for a circular boundary "
+            "(§8.2).",
         ),
     ] = None,
     out: Out = None,
@@ -147,10 +151,9 @@ def frame(
 ) -> None:
     """Compare algorithms, correspondences and base heights of IRS on a frame (Fig. 6-10, 6-13).
 
-    The correspondence by the shape of the reflected rows (§7.1) stands beside the one that was
-    found.
+    The correspondence by the shape of the reflected rows (§7.1) is listed beside the measured one.
 
-    Exit code 1: the frame's dots have no rays.
+    Exit code 1: the correspondence of the frame is unknown.
     """
     from labapp.config.setup import read_setup
     from labapp.core.pipeline import Settings, measure
@@ -169,10 +172,13 @@ def frame(
     if found.match is None:
         typer.echo(f"{source}: {found.status}: {found.reason}", err=True)
         raise typer.Exit(NOTHING_MEASURED)
-    made: tuple[Table, ...] = (shape_table(found.match), *comparison_tables(found.match, known.rig))
+    computed: tuple[Table, ...] = (
+        shape_table(found.match),
+        *comparison_tables(found.match, known.rig),
+    )
     if cap is not None:
-        made = (known_object_table(found.match, known.rig, cap), *made)
-    _keep(results_folder(out, tables), AnalysisPart(made, {}, made if tables else ()))
+        computed = (known_object_table(found.match, known.rig, cap), *computed)
+    _write(results_folder(out, tables), AnalysisPart(computed, {}, computed if tables else ()))
 
 
 @app.command()
@@ -182,16 +188,16 @@ def budget(
         Path | None,
         typer.Option(help="Setup file (TOML). Default: the set-up of §8.3.1 with a 4″ plane."),
     ] = None,
-    width: Annotated[float, typer.Option(help="Of the expected pool, along X (mm).")] = 6.0,
-    length: Annotated[float, typer.Option(help="Of the expected pool, along Y (mm).")] = 7.0,
+    width: Annotated[float, typer.Option(help="Width of the expected pool, X (mm).")] = 6.0,
+    length: Annotated[float, typer.Option(help="Length of the expected pool, Y (mm).")] = 7.0,
     height: Annotated[
-        float, typer.Option(help="Of the expected pool; below 0 for a concave one (mm).")
+        float, typer.Option(help="Height of the expected pool, negative if concave (mm).")
     ] = 0.3,
 ) -> None:
-    """Work out the error budget of a set-up for a kind of pool: predicted and simulated.
+    """Compute the error budget of a set-up for an expected pool, predicted and simulated.
 
-    The set-up is known as its file says, or as is assumed; that of §8.3.1 to 0.1 mm, 0.1 degrees
-    and 0.1 px. A dot is known to 0.3 px.
+    Uncertainties of the set-up are those in its file, or the assumed ones; those of §8.3.1 are
+    0.1 mm, 0.1 degrees and 0.1 px. The uncertainty of a dot's position is 0.3 px.
     """
     from labapp.config.setup import read_setup
 
@@ -199,21 +205,21 @@ def budget(
     pool = expected_pool(width, length, height)
     folder = results_folder(out)
     with progress_shown() as progress:
-        _keep(folder, analyze_budget(read, pool, progress))
+        _write(folder, analyze_budget(read, pool, progress))
 
 
-def _chosen(name: str, asked: list[str] | None, known: tuple[T, ...]) -> tuple[T, ...]:
-    """The requested names, in their usual order; all of them if none was given."""
-    for one in asked or ():
-        if one not in known:
-            raise InputError(f"--{name}", name, one, f"one of {', '.join(known)}")
-    return tuple(one for one in known if one in (asked or known))
+def _chosen(option: str, requested: list[str] | None, known: tuple[T, ...]) -> tuple[T, ...]:
+    """Return the requested names in the order of ``known``; all of them if none is given."""
+    for name in requested or ():
+        if name not in known:
+            raise InputError(f"--{option}", option, name, f"one of {', '.join(known)}")
+    return tuple(name for name in known if name in (requested or known))
 
 
-def _keep(folder: Path | None, made: AnalysisPart) -> None:
+def _write(folder: Path | None, part: AnalysisPart) -> None:
     """Write the results of a part, and print its short tables."""
     if folder is not None:
-        for name, content in made.files.items():
+        for name, content in part.files.items():
             write_file(folder / name, content)
-    for table in made.printed:
+    for table in part.printed:
         typer.echo(table.markdown())

@@ -1,4 +1,4 @@
-"""`labapp benchmark`: how fast this machine measures a recording, and how well."""
+"""`labapp benchmark`: speed and accuracy of measuring a simulated recording on this machine."""
 
 from __future__ import annotations
 
@@ -20,16 +20,18 @@ def benchmark(
     ] = 2000,
     cache: Annotated[
         Path | None,
-        typer.Option(help="Folder where the video is kept. Default: the user's cache folder."),
+        typer.Option(help="Folder to store the video in. Default: the user's cache folder."),
     ] = None,
     workers: Annotated[
         int | None,
-        typer.Option(min=0, help="Processes that measure; 0: none but this. Default: one a core."),
+        typer.Option(
+            min=0, help="Worker processes; 0: measure in this process. Default: one per core."
+        ),
     ] = None,
 ) -> None:
     """Measure a simulated video of an oscillating pool: speed, wrong labels, ±, frequency.
 
-    The video is simulated once, which takes minutes, and kept: 0.3 MB a frame, twice.
+    The video is simulated once, which takes minutes, and stored: two files, 0.3 MB per frame each.
     """
     import platformdirs
 

@@ -1,4 +1,4 @@
-"""`labapp cameras` and `labapp record`: what is connected, and a recording from it."""
+"""`labapp cameras` and `labapp record`: list connected cameras, and record from one."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ POLL_S = 0.05
 
 
 def cameras() -> None:
-    """List the cameras that are connected, and what can be set on each."""
+    """List the connected cameras and their settings."""
     from labapp.media.cameras import CameraError, find_cameras, open_camera
 
     found, problems = find_cameras()
@@ -45,7 +45,7 @@ def cameras() -> None:
 
 
 def _abilities(camera: Camera) -> list[str]:
-    """What can be set on a camera, and what it is set to."""
+    """Return lines about a camera's settings: ranges and current values."""
     limits, settings = camera.limits, camera.settings
 
     def span(name: str, limit: Range | None, value: float | None, unit: str) -> str:
@@ -67,15 +67,15 @@ def _abilities(camera: Camera) -> list[str]:
 
 def record(
     camera: Annotated[
-        str, typer.Argument(metavar="CAMERA", help="Its id: labapp cameras lists them.")
+        str, typer.Argument(metavar="CAMERA", help="Id of the camera, see labapp cameras.")
     ],
     *,
     out: Annotated[
-        Path | None, typer.Option(help="File of the recording (.nut); must not be there yet.")
+        Path | None, typer.Option(help="File of the recording (.nut); must not exist yet.")
     ] = None,
     session: Annotated[
         Path | None,
-        typer.Option(help="A session to record into; the file is put beside it and imported."),
+        typer.Option(help="Session to record into; the file is written beside it and imported."),
     ] = None,
     seconds: Annotated[
         float | None,
@@ -84,7 +84,7 @@ def record(
     every: Annotated[int, typer.Option(min=1, help="Every n-th frame.")] = 1,
     codec: Annotated[
         Literal["raw", "ffv1"],
-        typer.Option(help="Both lose nothing; ffv1 is less than half the size, and slower."),
+        typer.Option(help="Both are lossless; ffv1 is less than half the size, and slower."),
     ] = "raw",
     exposure: Annotated[
         float | None, typer.Option(callback=finite, help="Exposure time (µs).")
@@ -97,12 +97,12 @@ def record(
     ] = None,
     trigger: Annotated[
         Literal["free", "line"] | None,
-        typer.Option(help="By itself (free, the default), or at a signal on its input."),
+        typer.Option(help="Free-running (free, the default), or triggered by the input (line)."),
     ] = None,
 ) -> None:
-    """Record from a camera, without loss: docs/cameras.md.
+    """Record losslessly from a camera: docs/cameras.md.
 
-    Events are reported on stderr, and kept beside the recording as FILE-notes.csv.
+    Events are reported on stderr, and written beside the recording as FILE-notes.csv.
 
     Ctrl-C or SIGTERM ends the recording: what was recorded is kept, and the exit code is 0.
     """
@@ -119,7 +119,7 @@ def record(
     plan = Plan(every=every, codec=codec)
     with _opened(session) as into:
         taken = _film(camera, _place(out, session), plan, settings, seconds)
-        _tell(taken, into)
+        _finish(taken, into)
     if taken.trouble:
         raise InputError(taken.path, "recording", taken.trouble, "a place that can be written")
     if not taken.frames:
@@ -166,7 +166,7 @@ def _film(
 
 
 def _place(out: Path | None, session: Path | None) -> Callable[[], Path]:
-    """A function that gives the recording's file: the one named, or one beside the session."""
+    """Return a function that returns the recording's path: ``out``, or one beside the session."""
     from labapp.media.recording.recorder import recording_path
 
     if session is None:
@@ -176,7 +176,7 @@ def _place(out: Path | None, session: Path | None) -> Callable[[], Path]:
 
 @contextmanager
 def _opened(path: Path | None) -> Iterator[Session | None]:
-    """The session to record into, held while filming: what would refuse the film does so before."""
+    """Open the session to record into; raise before recording if it cannot take a recording."""
     from labapp.session.session import Session
 
     if path is None:
@@ -189,8 +189,8 @@ def _opened(path: Path | None) -> Iterator[Session | None]:
         yield session
 
 
-def _tell(take: Take, session: Session | None) -> None:
-    """Report what was recorded; import it where a session was named."""
+def _finish(take: Take, session: Session | None) -> None:
+    """Report what was recorded, and import it into the session, if any."""
     lost = f", {pluralize(take.lost, 'frame')} lost" * (take.lost > 0)
     typer.echo(f"{pluralize(take.frames, 'frame')}{lost} in {take.path.absolute()}")
     if session is not None and take.frames:

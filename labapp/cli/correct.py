@@ -1,7 +1,6 @@
-"""`labapp session correct`: dots and rows of a frame corrected, and carried on from frame to frame.
+"""`labapp session correct`: correct dots and rows of a frame, and apply it to following frames.
 
-Each option is an edit of `labapp.core.rows.correction`; they are applied in the order they are
-given in.
+Each option is an edit of `labapp.core.rows.correction`; edits are applied in the order given.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ if TYPE_CHECKING:
     from labapp.session.session import Session
 
 NEAR_PX = 5.0
-"""A dot is meant by a place within this distance of it."""
+"""Largest distance between a dot and the position that an option gives for it."""
 
 LABEL_LENGTH = 120
 
@@ -46,14 +45,14 @@ FORMS = {
     "reference": "ROW,COLUMN",
     "automatic": "",
 }
-"""Every edit, and what it is given. U, V, DU and DV are px, the others are whole numbers."""
+"""Edits and the form of their values. U, V, DU and DV are px, the others are whole numbers."""
 
 
 class InOrder(TyperCommand):
-    """A command that keeps in which order its options were given: `context.meta["order"]`."""
+    """A command that stores the order of its options in `context.meta["order"]`."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parse the command line, once more than usual."""
+        """Parse the command line twice, the first time for the order of the options."""
         _, _, order = self.make_parser(ctx).parse_args(args=list(args))
         ctx.meta["order"] = [parameter.name for parameter in order]
         return super().parse_args(ctx, args)
@@ -69,27 +68,27 @@ def _edit(name: str, text: str) -> Any:
 
 Dots = Annotated[
     list[str] | None,
-    _edit("dots", "Dots, rows and columns are those of a table, as in dots.csv (px)."),
+    _edit("dots", "Read dots, rows and columns from a table, as in dots.csv (px)."),
 ]
-Delete = Annotated[list[str] | None, _edit("delete", "Take out the dot at U,V (px).")]
-Add = Annotated[list[str] | None, _edit("add", "Add the dot that is at U,V (px).")]
+Delete = Annotated[list[str] | None, _edit("delete", "Delete the dot at U,V (px).")]
+Add = Annotated[list[str] | None, _edit("add", "Add the dot at U,V (px).")]
 Move = Annotated[list[str] | None, _edit("move", "Move the dot at U,V by DU,DV (px).")]
 Place = Annotated[list[str] | None, _edit("place", "Give the dot at U,V (px) a row and a column.")]
-Clear = Annotated[list[str] | None, _edit("clear", "The dot at U,V (px) has no row, no column.")]
+Clear = Annotated[list[str] | None, _edit("clear", "Remove row and column of the dot at U,V (px).")]
 ShiftRow = Annotated[
     list[str] | None, _edit("shift_row", "Shift a row by columns, to the right if positive.")
 ]
 SplitRow = Annotated[
-    list[str] | None, _edit("split_row", "From COLUMN on, the row is one of its own, above it.")
+    list[str] | None, _edit("split_row", "Split ROW: from COLUMN on, a new row above it.")
 ]
-MergeRows = Annotated[list[str] | None, _edit("merge_rows", "Dots of ROW go into row INTO.")]
-BlockRow = Annotated[list[str] | None, _edit("block_row", "The torch hides dots of this row.")]
-UnblockRow = Annotated[list[str] | None, _edit("unblock_row", "It hides none of this row.")]
+MergeRows = Annotated[list[str] | None, _edit("merge_rows", "Move the dots of ROW to row INTO.")]
+BlockRow = Annotated[list[str] | None, _edit("block_row", "Mark a row as blocked by the torch.")]
+UnblockRow = Annotated[list[str] | None, _edit("unblock_row", "Mark a row as not blocked.")]
 Reference = Annotated[
-    list[str] | None, _edit("reference", "Where the reference is, the absent centre dot.")
+    list[str] | None, _edit("reference", "Row and column of the reference, the absent centre dot.")
 ]
 Automatic = Annotated[
-    bool, typer.Option("--automatic", help="Back to what was found; edits after it start there.")
+    bool, typer.Option("--automatic", help="Discard the correction; later edits start from this.")
 ]
 
 
@@ -97,7 +96,7 @@ def correct(
     context: typer.Context,
     file: Annotated[Path, typer.Argument(metavar="FILE", help="The session (.labsession).")],
     *,
-    frame: Annotated[int, typer.Option(min=0, help="Which frame, its number in the recording.")],
+    frame: Annotated[int, typer.Option(min=0, help="Frame, by its number in the recording.")],
     dots: Dots = None,
     delete: Delete = None,
     add: Add = None,
@@ -112,17 +111,18 @@ def correct(
     reference: Reference = None,
     automatic: Automatic = False,
     carry_on: Annotated[
-        bool, typer.Option("--carry-on", help="Correct the following frames too, while it fits.")
+        bool,
+        typer.Option("--carry-on", help="Correct the following frames too, until they differ."),
     ] = False,
     measure: Annotated[bool, typer.Option(help="Measure the corrected frames.")] = True,
 ) -> None:
-    """Correct the dots and rows of a frame, by edits applied in the order given.
+    """Correct the dots and rows of a frame by edits, applied in the order given.
 
     Rows are counted from the bottom up, columns from left to right, both from 1.
 
-    A dot is named by its place in the frame: the nearest one within 5 px.
+    An edit of a dot applies to the dot nearest to the given position, within 5 px.
 
-    All edits together are one step: labapp session undo takes it back.
+    All edits of a call are undone together: labapp session undo.
     """
     from labapp.session.session import Session
 
@@ -132,9 +132,9 @@ def correct(
             "correct", "edits", "none", f"some of {', '.join(map(_option, FORMS))}, or --carry-on"
         )
     with Session.open(file) as session:
-        own = session.frames.tolist()
-        if frame not in own:
-            raise InputError("--frame", "frame", frame, f"what the session has: {frames_text(own)}")
+        known = session.frames.tolist()
+        if frame not in known:
+            raise InputError("--frame", "frame", frame, f"one of {frames_text(known)}")
         kept = _edited(session, frame, edits)
         corrections: dict[int, Correction | None] = {frame: kept}
         if carry_on:
@@ -152,7 +152,7 @@ def correct(
 
 
 def _edits_in_order(context: typer.Context) -> list[tuple[str, str]]:
-    """(name, value) of every edit, in the order they were given in."""
+    """Return (name, value) of every edit, in the order given."""
     given: dict[str, Iterator[str]] = {
         name: iter(values) if isinstance(values, list | tuple) else repeat("")
         for name, values in context.params.items()
@@ -162,20 +162,20 @@ def _edits_in_order(context: typer.Context) -> list[tuple[str, str]]:
 
 
 def _label(frames: list[int], edits: list[tuple[str, str]]) -> str:
-    """Name a change for the history."""
+    """Return the label of the change in the history."""
     message = ", ".join(f"{name.replace('_', '-')} {value}".rstrip() for name, value in edits)
     label = f"{frames_text(frames)}: {message or 'carried on'}"
     return label if len(label) <= LABEL_LENGTH else f"{label[: LABEL_LENGTH - 1]}…"
 
 
 def _edited(session: Session, frame: int, edits: list[tuple[str, str]]) -> Correction | None:
-    """The frame's correction after the edits; None if they go back to automatic."""
-    again = [place for place, (name, _) in enumerate(edits) if name == "automatic"]
-    if again:
-        edits = edits[again[-1] + 1 :]
+    """Return the frame's correction after the edits; None if --automatic is the last of them."""
+    resets = [k for k, (name, _) in enumerate(edits) if name == "automatic"]
+    if resets:
+        edits = edits[resets[-1] + 1 :]
         if not edits:
             return None
-    correction = _start(session, frame, automatic=bool(again))
+    correction = _start(session, frame, automatic=bool(resets))
     for name, value in edits:
         try:
             correction = _apply(session, frame, correction, name, value)
@@ -186,7 +186,7 @@ def _edited(session: Session, frame: int, edits: list[tuple[str, str]]) -> Corre
 
 
 def _start(session: Session, frame: int, *, automatic: bool) -> Correction:
-    """What the edits start from: the frame's correction, or what is found in it."""
+    """Return the start of the edits: the frame's correction, or its automatic dots and rows."""
     from labapp.core.pipeline import measure, start_correction
 
     corrected = session.correction(frame)
@@ -241,7 +241,7 @@ def _apply(
 
 
 def _numbers(name: str, text: str) -> list[Any]:
-    """The numbers of an edit, of the form that `FORMS` gives it."""
+    """Parse the numbers of an edit, of the form in `FORMS`."""
     form = FORMS[name]
     if [c for c in text if c in ",:"] != [c for c in form if c in ",:"]:
         raise ValueError(f"it is of the form {form}")
@@ -260,7 +260,7 @@ def _numbers(name: str, text: str) -> list[Any]:
 
 
 def _dot_at(correction: Correction, u_px: float, v_px: float) -> int:
-    """The dot that a place means."""
+    """Return the index of the dot nearest to a position."""
     import numpy as np
 
     from labapp.core.rows.correction import named
@@ -277,7 +277,7 @@ def _dot_at(correction: Correction, u_px: float, v_px: float) -> int:
 
 
 def _carried_on(session: Session, frame: int, correction: Correction) -> dict[int, Correction]:
-    """Corrections of the frames after it, as far as it fits; says up to where."""
+    """Apply a correction to the frames after it while it fits, and report where it ends."""
     from labapp.core.images.find_dots import find_dots
     from labapp.core.rows.tracking import carry_on
     from labapp.core.values import CannotMeasure
@@ -305,7 +305,7 @@ def _carried_on(session: Session, frame: int, correction: Correction) -> dict[in
 
 
 def _measure(session: Session, frames: list[int], before: Measurement | None) -> None:
-    """Measure the corrected frames, and compare the first with what it gave before."""
+    """Measure the corrected frames, and compare the first with its previous result."""
     summary = measure_frames(session, frames)
     after = session.result(frames[0])
     assert after is not None

@@ -1,4 +1,4 @@
-"""`labapp samples` and `labapp demo`: what is packed with labapp, copied or measured."""
+"""`labapp samples` and `labapp demo`: copy the bundled samples, or measure one of them."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from labapp.errors import InputError
 
 
 def samples(
-    folder: Annotated[Path, typer.Argument(help="Where to copy them; made if it is missing.")],
+    folder: Annotated[Path, typer.Argument(help="Destination; created if missing.")],
 ) -> None:
     """Copy the sample runs, the scenarios to simulate and the targets to print into a folder.
 
-    The examples of the documents can be typed as they are in that folder. Nothing is replaced.
+    The examples of the documentation work in that folder. Nothing is replaced.
     """
     import shutil
 
@@ -44,7 +44,7 @@ def demo(
         bool, typer.Option(help="Open the session in the app, where there is a display.")
     ] = True,
 ) -> None:
-    """Measure the sample run in a session of yours, export its results and draw pictures."""
+    """Measure the sample run in a new session, export its results and draw pictures."""
     from labapp.export.folder import ExportChoice
     from labapp.simulated.demo import draw_surface, open_demo
 

@@ -30,18 +30,18 @@ def detect(
             min=0.5,
             max=20.0,
             metavar="PX",
-            help="Standard deviation of a dot's light (px), about a quarter of what is seen "
-            "across; without it, it is estimated from the image. Of band-pass alone.",
+            help="Standard deviation of a dot's light (px), about a quarter of its visible "
+            "diameter. Default: estimated from the image. For the band-pass detector only.",
         ),
     ] = None,
     detector: Annotated[DetectorName, typer.Option(help=DETECTOR_HELP)] = "band-pass",
     rows: Annotated[RowsName, typer.Option(help=ROWS_HELP)] = "grow",
 ) -> None:
-    """Find the dots of one image and their rows and columns, without a setup.
+    """Find the dots of one image and their rows and columns, without a set-up.
 
     Rows are counted from the bottom up, columns from left to right.
 
-    A dot in doubt has none: its cells are empty. Exit code 1: no dot has any.
+    The cells of a dot in doubt are empty. Exit code 1: no dot has a row and a column.
     """
     from labapp.core.images.dots import BandPassSettings
     from labapp.core.images.find_dots import DotSettings

@@ -1,4 +1,4 @@
-"""`labapp dynamics`: what a pool does over a recording."""
+"""`labapp dynamics`: oscillations, modes, events and step responses over a recording."""
 
 from __future__ import annotations
 
@@ -42,20 +42,22 @@ def dynamics(
     ] = (1.0, 1.0, 1.0),
     start: Annotated[
         float | None,
-        typer.Option(callback=finite, help="Added to the signals' times it gives the recording's."),
+        typer.Option(callback=finite, help="Time of the signals' start in the recording (s)."),
     ] = None,
     align: Annotated[
         Path | None,
-        typer.Option(metavar="RECORDING", help="Find --start from the light of these frames."),
+        typer.Option(
+            metavar="RECORDING", help="Estimate --start from the brightness of these frames."
+        ),
     ] = None,
     film: Annotated[
-        str | None, typer.Option(metavar="MODE", help='Film of one mode: "(0,1)", "POD1" …')
+        str | None, typer.Option(metavar="MODE", help='Write a film of a mode: "(0,1)", "POD1" …')
     ] = None,
 ) -> None:
-    """Find oscillations, modes, events and step responses in what was measured.
+    """Determine oscillations, modes, events and step responses from measured frames.
 
-    series.csv, modes.csv, spectrum.csv, spectrogram.csv, peak.csv, events.csv, responses.csv, with
-    standard uncertainties; dynamics.png, modes.png; with --film mode.mp4.
+    Writes series.csv, modes.csv, spectrum.csv, spectrogram.csv, peak.csv, events.csv and
+    responses.csv, with standard uncertainties; dynamics.png, modes.png; with --film, mode.mp4.
     """
     from labapp.core.dynamics.analysis import DynamicsSettings
     from labapp.export.dynamics import dynamics_files, write_mode_film
@@ -63,42 +65,40 @@ def dynamics(
 
     folder = writable_folder(out)
     settings = DynamicsSettings(of, _band(band), segment)
-    own = read_signals(signals, full_scale) if signals else None
+    given = read_signals(signals, full_scale) if signals else None
     with progress_shown():
-        found = _analysed(source, own, start, align, settings)
-    with os_errors_as_input(folder, "results", "room on its disk"):
+        found = _analysed(source, given, start, align, settings)
+    with os_errors_as_input(folder, "results", "enough disk space"):
         for name, content in dynamics_files(found).items():
             write_file(folder / name, content)
         if film is not None:
             write_mode_film(folder / "mode.mp4", found, film)
-    _tell(found)
+    _print(found)
     typer.echo(f"Results are in {folder.absolute()}")
 
 
 def _analysed(
     source: Path,
-    own: Signals | None,
+    given: Signals | None,
     start: float | None,
     align: Path | None,
     settings: DynamicsSettings,
 ) -> Dynamics:
-    """Analyse a session or a folder, with its signals or those that are given."""
+    """Analyse a session or a results folder, with the given signals or the session's."""
     from labapp.export.dynamics import dynamics_of, measured_of
     from labapp.export.result_folder import measured_in
     from labapp.session.session import Session
 
     with ExitStack() as at_end:
         if source.is_dir():
-            known, measured = own, measured_in(source)
+            signals, measured = given, measured_in(source)
         else:
             session = at_end.enter_context(Session.open(source, read_only=True))
-            known, measured = (
-                own or session.signals,
-                measured_of(session.frame_results(stale=False)),
-            )
+            signals = given or session.signals
+            measured = measured_of(session.frame_results(stale=False))
         if start is not None or align is not None:
-            known = _aligned(known, start, align)
-        return dynamics_of(measured, known.timed() if known else {}, settings)
+            signals = _aligned(signals, start, align)
+        return dynamics_of(measured, signals.timed() if signals else {}, settings)
 
 
 def _band(text: str | None) -> tuple[float, float] | None:
@@ -113,29 +113,29 @@ def _band(text: str | None) -> tuple[float, float] | None:
     return low, high
 
 
-def _aligned(known: Signals | None, start: float | None, align: Path | None) -> Signals:
-    """Signals with the start that is given, or that the light of a recording gives."""
+def _aligned(signals: Signals | None, start: float | None, align: Path | None) -> Signals:
+    """Return the signals with the given start, or one estimated from a recording's brightness."""
     from dataclasses import replace
 
     from labapp.media import open_source
     from labapp.session.signals import align_signals
 
-    if known is None:
+    if signals is None:
         raise InputError("--signals", "file", "none", "one, or a session that has signals")
     if align is None:
         assert start is not None
-        return replace(known, start_s=start)
+        return replace(signals, start_s=start)
     with open_source(align) as recording:
         frames = (recording.frame(number) for number in range(len(recording)))
-        aligned, offset = align_signals(known, frames)
-    sure = f"{offset.start_s:.4f} ± {offset.sigma_s:.4f} s, correlation {offset.correlation:.2f}"
-    typer.echo(f"signals start at {sure}")
+        aligned, offset = align_signals(signals, frames)
+    start_text = f"{offset.start_s:.4f} ± {offset.sigma_s:.4f} s"
+    typer.echo(f"signals start at {start_text}, correlation {offset.correlation:.2f}")
     if offset.rival_s is not None:
         typer.echo(f"warning: {offset.rival_s:.4f} s fits about as well: give --start", err=True)
     return aligned
 
 
-def _tell(found: Dynamics) -> None:
+def _print(found: Dynamics) -> None:
     """Print frequencies, events and responses."""
     for one in found.modes:
         if figures := one.figures:

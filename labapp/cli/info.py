@@ -1,4 +1,4 @@
-"""`labapp session info`: what a session holds and how far it is, as text or JSON."""
+"""`labapp session info`: contents and state of a session, as text or JSON."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ def info(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="The session (.labsession).")],
     as_json: Annotated[bool, typer.Option("--json", help="As JSON, for programs.")] = False,
     history: Annotated[
-        bool, typer.Option("--history", help="Every change that can be undone or redone, too.")
+        bool, typer.Option("--history", help="Also list the changes that can be undone or redone.")
     ] = False,
 ) -> None:
-    """Show what a session holds, even while another program writes to it."""
+    """Show the contents of a session, even while another program writes to it."""
     from labapp.session.session import Session
 
     with Session.open(file, read_only=True) as session:
@@ -43,7 +43,7 @@ def info(
 
 
 def _facts(session: Session) -> dict[str, Any]:
-    """All facts about a session, as plain values."""
+    """Return all facts about a session as plain values."""
     from labapp.core.pipeline import Settings
     from labapp.session.measured import scheme_name
     from labapp.session.record import Record
@@ -100,7 +100,7 @@ def _facts(session: Session) -> dict[str, Any]:
 
 
 def _differences(value: Any, usual: Any, within: str = "") -> dict[str, Any]:
-    """What differs from the usual, full name → value."""
+    """Return the fields that differ from ``usual``, full name → value."""
     found: dict[str, Any] = {}
     for field in fields(value):
         name, mine, other = (
@@ -116,7 +116,7 @@ def _differences(value: Any, usual: Any, within: str = "") -> dict[str, Any]:
 
 
 def _text(facts: dict[str, Any]) -> list[str]:
-    """The facts in lines."""
+    """Format the facts as lines."""
     results = [f"{r['count']} {r['scheme']} by labapp {r['version']}" for r in facts["results"]]
     changes = facts["changes"]
     lines = [
@@ -162,8 +162,8 @@ def _recording_lines(recording: dict[str, Any] | None) -> list[tuple[str, str]]:
         *(("", f"warning: {warning}") for warning in recording["warnings"]),
     ]
     if recording["missing"]:
-        asked = "is missing; labapp session relink says where it is now"
-        lines.append(("", f"{recording['missing']} {asked}"))
+        remedy = "is missing; labapp session relink sets its new path"
+        lines.append(("", f"{recording['missing']} {remedy}"))
     return lines
 
 

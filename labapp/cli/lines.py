@@ -39,14 +39,14 @@ def lines(
         bool,
         typer.Option(
             "--follow",
-            help="Follow one line from frame to frame, as in pulsed GMAW; so is a pattern of one.",
+            help="Follow one line from frame to frame, as in pulsed GMAW; implied by one line.",
         ),
     ] = False,
 ) -> None:
-    """Find the lines of frames, what they show, the pool's state, its surface where determined.
+    """Measure recordings of a line pattern: lines, features, state and surface of the pool.
 
-    Of a line pattern: lines.csv, line_points.csv, features.csv with the state of each frame, and
-    surface_NNNNNN.csv of each frame whose lines determine the surface. Of one line that is
+    For a line pattern: lines.csv, line_points.csv, features.csv with the state of each frame, and
+    surface_NNNNNN.csv for each frame whose lines determine the surface. For one line that is
     followed: track.csv, with the pulses of the current.
     """
     from labapp.config.line_setup import read_line_setup
@@ -57,7 +57,7 @@ def lines(
     with open_source(source) as recording:
         chosen = select_frames(frames, len(recording))
         folder = writable_folder(out)
-        with os_errors_as_input(folder, "results", "room on its disk"):
+        with os_errors_as_input(folder, "results", "enough disk space"):
             follow = follow or bench.rig.pattern.rows == 1
             done = _measured(recording, chosen, bench, follow)
             any_line = (
@@ -71,7 +71,7 @@ def lines(
 
 
 def _measured(source: FrameSource, frames: range, bench: Setup, follow: bool) -> list[FrameResult]:
-    """Results of the frames that were finished, with progress on stderr."""
+    """Return the results of the finished frames, with progress on stderr."""
     from labapp.core.pipeline import Settings
     from labapp.export.frame_result import FrameResult
     from labapp.run.measurers import ColdMeasurer, LineFollower
@@ -89,14 +89,14 @@ def _measured(source: FrameSource, frames: range, bench: Setup, follow: bool) ->
 
         try:
             for _ in run(frames, measurer, [done.append, shown]):
-                pass  # the sinks have it
+                pass
         except KeyboardInterrupt:
             note(progress.console, f"stopped: {len(done)} of {len(frames)} frames are finished")
     return done
 
 
 def _write_measured(done: list[FrameResult], folder: Path, bench: Setup) -> bool:
-    """Write the tables of frames measured one by one; whether any has lines."""
+    """Write the tables of frames measured one by one; returns whether any has lines."""
     from labapp.core.lines.states import LineSeries, line_changes, line_states
     from labapp.core.recording.residual_check import doubt_of_values, judged_status
     from labapp.export.line_results import line_tables
@@ -116,7 +116,7 @@ def _write_measured(done: list[FrameResult], folder: Path, bench: Setup) -> bool
 
 
 def _write_followed(done: list[FrameResult], folder: Path) -> bool:
-    """Write the table of one line that was followed; whether it was followed in any frame."""
+    """Write the table of a followed line; returns whether it was found in any frame."""
     import numpy as np
 
     from labapp.core.lines.pulses import pulse_frequency
@@ -145,7 +145,7 @@ def _write_followed(done: list[FrameResult], folder: Path) -> bool:
 def _of_lines(
     done: list[FrameResult],
 ) -> tuple[list[int], list[float | None], list[LineFrame]]:
-    """Numbers, times and lines of the frames that could be read."""
+    """Return numbers, times and lines of the frames that could be read."""
     seen = [(one, one.measurement.lines) for one in done]
     read = [(one, lines) for one, lines in seen if lines is not None]
     return (

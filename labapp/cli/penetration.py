@@ -25,16 +25,16 @@ app = typer.Typer(
 )
 
 MATCHED_S = 0.2
-"""A transition is found if it is predicted so near, s."""
+"""Largest time difference between a transition and its prediction, s."""
 
 
 @app.command()
 def simulate(
     out: Annotated[Path, typer.Option(help="Table of features to write (.csv or .mat).")],
-    welds: Annotated[int, typer.Option(min=1, max=1000, help="How many.")] = 20,
-    seed: Annotated[int, typer.Option(min=0, help="Of the random numbers.")] = 1,
+    welds: Annotated[int, typer.Option(min=1, max=1000, help="Number of welds.")] = 20,
+    seed: Annotated[int, typer.Option(min=0, help="Random seed.")] = 1,
 ) -> None:
-    """Simulate welds with a known law of penetration, to try the other commands on."""
+    """Simulate welds with a known law of penetration, as test data for the other commands."""
     from labapp.export.features import FeatureTable
     from labapp.simulation.penetration import FEATURES, TARGET, simulate_welds
 
@@ -57,10 +57,10 @@ def table(
     ],
     out: Annotated[Path, typer.Option(help="Table to write: .csv, or .mat for MATLAB.")],
     results: Annotated[
-        Path | None, typer.Option(help="Folder of the study's results, if it is another.")
+        Path | None, typer.Option(help="Folder of the study's results, if not the default.")
     ] = None,
 ) -> None:
-    """Write the features of every frame, with ±, beside the penetration that sections tell."""
+    """Write the features of every frame, with ±, and the penetration measured on sections."""
     from labapp.run.study.sections import study_features
     from labapp.run.study.study import Study
 
@@ -83,31 +83,31 @@ def fit(
     model: Annotated[
         Literal["best", "arx", "gp"],
         typer.Option(
-            help="Linear with orders (arx), a Gaussian process (gp), or that of less error."
+            help="Linear model (arx), Gaussian process (gp), or the one with the smaller error."
         ),
     ] = "best",
     use: Annotated[
-        str, typer.Option(metavar="NAMES", help="Features, with commas between.")
+        str, typer.Option(metavar="NAMES", help="Features, separated by commas.")
     ] = "width_mm,length_mm,convexity_mm",
     orders: Annotated[
         tuple[int, int, int],
         typer.Option(
             metavar="N_A N_B N_K",
-            help="Time constants (0 to 2), steps of the features, steps of delay.",
+            help="Number of time constants (0 to 2), of feature steps, and of steps of delay.",
         ),
     ] = (1, 1, 0),
     step: Annotated[
-        float, typer.Option(min=1e-3, max=100, help="Features are averaged over such steps (s).")
+        float, typer.Option(min=1e-3, max=100, help="Step over which features are averaged (s).")
     ] = 0.1,
     full: Annotated[
         float | None,
-        typer.Option(min=1e-3, max=1000, help="Penetration from which it is full (mm)."),
+        typer.Option(min=1e-3, max=1000, help="Threshold of full penetration (mm)."),
     ] = None,
     left_out: Annotated[
-        Path | None, typer.Option(help="CSV for the predictions of each weld by the others.")
+        Path | None, typer.Option(help="CSV file for the cross-validation predictions.")
     ] = None,
 ) -> None:
-    """Fit models, examine each by welds that were left out, and write one of them."""
+    """Fit models, cross-validate each by leaving out welds, and write the better one."""
     from labapp.core.dynamics.penetration import ModelSettings
     from labapp.core.dynamics.weld_series import Orders
     from labapp.export.features import FeatureTable
@@ -122,11 +122,11 @@ def fit(
     settings = ModelSettings(names, read.target, step, Orders(*orders), full)
     kinds: tuple[Kind, ...] = ("arx", "gp") if model == "best" else (model,)
     tried: list[tuple[PenetrationModel, LeftOut]] = []
-    with progress_shown("stopped: no model was written") as tell:
+    with progress_shown("stopped: no model was written") as progress:
         for kind in kinds:
-            tried.append(read.fit(kind, settings, partial(tell, kind)))
+            tried.append(read.fit(kind, settings, partial(progress, kind)))
     for one, errors in tried:
-        typer.echo(_examined(one, errors))
+        typer.echo(_validation_text(one, errors))
     best, errors = min(tried, key=lambda each: each[1].rmse_mm)
     write_model(out, best)
     if left_out is not None:
@@ -135,8 +135,8 @@ def fit(
     typer.echo(f"  labapp penetration predict {quoted(str(out))} SOURCE --out FILE.csv")
 
 
-def _examined(model: PenetrationModel, errors: LeftOut) -> str:
-    """What the welds that were left out say of a model, in a line."""
+def _validation_text(model: PenetrationModel, errors: LeftOut) -> str:
+    """Describe the cross-validation of a model in one line."""
     import numpy as np
 
     constants = ", ".join(f"{one:.2f}" for one in model.time_constants_s) or "none"
@@ -202,7 +202,7 @@ def predict(
 
 
 def _series_of(source: Path, features: tuple[str, ...]) -> tuple[WeldSeries, ...]:
-    """Features of all that a source holds."""
+    """Return the feature series of every weld in a source."""
     from labapp.export.dynamics import measured_of
     from labapp.export.features import FeatureTable, measured_series
     from labapp.export.result_folder import measured_in
@@ -233,9 +233,9 @@ def _is_table(source: Path) -> bool:
 @app.command()
 def onnx(
     model: Annotated[Path, typer.Argument(help="What `labapp penetration fit` wrote.")],
-    out: Annotated[Path, typer.Option(help="ONNX file for its value.")],
+    out: Annotated[Path, typer.Option(help="ONNX file to write.")],
 ) -> None:
-    """Write a model as ONNX: from the means of the last steps to penetration, without its ±."""
+    """Write a model as ONNX: from feature means of the last steps to penetration, without ±."""
     from labapp.export.penetration import read_model, write_onnx
 
     read = read_model(model)

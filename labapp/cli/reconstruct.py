@@ -1,6 +1,6 @@
 """`labapp reconstruct`: measure a recording and write the results as tables and surfaces.
 
-The way of a frame: `media.open_source` reads it, a measurer (`run.measurers`) measures it
+Data flow: `media.open_source` reads a frame, a measurer (`run.measurers`) measures it
 (`core.pipeline.measure`), and `run.runner.run` passes its `FrameResult` to the sinks: the results
 folder (`export.results`), the summary, streams, progress.
 """
@@ -71,11 +71,11 @@ def reconstruct(
     ] = "fit",
     algorithm: Annotated[
         Algorithm,
-        typer.Option(help="Algorithm of IRS; the other schemes have none."),
+        typer.Option(help="Algorithm of IRS; not used by the other schemes."),
     ] = "opa",
     correspondence: Annotated[
         Literal["auto", "S/S", "S/I", "I/I"],
-        typer.Option(help="Order of columns/rows of dots to that of rays: same S, inverse I."),
+        typer.Option(help="Order of dots relative to rays, columns/rows: same S, inverse I."),
     ] = "auto",
     *,
     detector: Annotated[DetectorName, typer.Option(help=DETECTOR_HELP)] = "band-pass",
@@ -99,9 +99,9 @@ def reconstruct(
 ) -> None:
     """Measure frames and write measures, dots, points, boundaries and surfaces.
 
-    Ctrl-C or SIGTERM stops after whole frames: what was finished stays readable.
+    Ctrl-C or SIGTERM stops after a complete frame; the results of finished frames are readable.
 
-    A frame that cannot be measured keeps its row in measures.csv, with the reason.
+    A frame that cannot be measured has a row in measures.csv with its status.
     """
     from labapp.core.pipeline import Settings
 
@@ -126,7 +126,7 @@ def reconstruct(
 
 @contextmanager
 def _predicting(model: Path, out: Path) -> Iterator[Predictor]:
-    """A predictor for all frames; at the end its predictions are written beside their results."""
+    """Yield a predictor for all frames; write its predictions into ``out`` at the end."""
     from labapp.export.penetration import Predictor, prediction_csv, read_model
 
     predictor = Predictor(model.stem, read_model(model))
@@ -142,13 +142,13 @@ def _predicting(model: Path, out: Path) -> Iterator[Predictor]:
 def _stream_sinks(
     at_end: ExitStack, places: dict[str, str | None], anywhere: bool, predictor: Predictor | None
 ) -> list[Sink]:
-    """A sink for the predictor, and for each stream that has a place (`open_stream`).
+    """Return a sink for the predictor and one for each stream with an address (`open_stream`).
 
-    Streams are closed at the end.
+    Streams are closed by ``at_end``.
     """
     sinks: list[Sink] = [] if predictor is None else [predictor.add]
-    asked = {kind: place for kind, place in places.items() if place is not None}
-    if not asked:
+    requested = {kind: place for kind, place in places.items() if place is not None}
+    if not requested:
         return sinks
     from labapp.run.streams import open_stream, stream_values
 
@@ -156,7 +156,7 @@ def _stream_sinks(
         more = predictor.values if predictor is not None else dict
         return lambda result: stream.publish({**stream_values(result), **more()})
 
-    for kind, place in asked.items():
+    for kind, place in requested.items():
         stream = open_stream(kind, place, anywhere)
         at_end.callback(stream.close)
         typer.echo(f"Measures are sent from {stream.address}", err=True)
@@ -176,9 +176,9 @@ def _measure_recording(
     warm: bool,
     streams: Sequence[Sink],
 ) -> Summary:
-    """Measure, showing progress and failures on stderr and the summary on stdout.
+    """Measure, with progress and failures on stderr and the summary on stdout.
 
-    Parameters are the command's options (`reconstruct`), and sinks for the streams.
+    Parameters are the command's options (`reconstruct`) and the sinks of the streams.
     """
     from labapp.config.setup import read_setup
     from labapp.core.recording.residual_check import ResidualRecord, judged_status
@@ -208,7 +208,7 @@ def _measure_recording(
                     )
                 sinks = [results.write, summary.add, *streams, shown]
                 for _ in run(selected, with_setup_check(measurer, record), sinks):
-                    pass  # the sinks have it
+                    pass
                 summary.verdict = record.verdict()
                 results.set_setup_status(judged_status(setup.rig, summary.verdict), summary.verdict)
         except KeyboardInterrupt:

@@ -1,4 +1,4 @@
-"""`labapp session …`: an experiment in one file, by the calls that a script makes."""
+"""`labapp session …`: an experiment in one file, by the functions of the Python API."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ WhoseResults = Annotated[
     ResultsName | None,
     typer.Option(
         metavar="SCHEME",
-        help=f"Whose results: {', '.join(scheme_words())}; without it, those of the session's "
+        help=f"Scheme of the results: {', '.join(scheme_words())}. Default: that of the session's "
         "settings.",
     ),
 ]
@@ -71,16 +71,16 @@ Tables = Annotated[
 ]
 View = Annotated[
     Literal["free", "top", "side", "front"],
-    typer.Option(help="Where pictures of surfaces and the film look from; free: obliquely."),
+    typer.Option(help="View of surface pictures and the film; free: oblique."),
 ]
 Size = Annotated[
-    str, typer.Option(metavar="WIDTHxHEIGHT", help="Of these pictures and the film (px, even).")
+    str, typer.Option(metavar="WIDTHxHEIGHT", help="Size of these pictures (px, even numbers).")
 ]
 FilmRate = Annotated[
     float | None,
     typer.Option(
         callback=finite,
-        help="Frames of the film a second (Hz); without it, as fast as they were recorded.",
+        help="Frame rate of the film (Hz). Default: that of the recording.",
     ),
 ]
 
@@ -99,20 +99,20 @@ def new(
         Path, typer.Argument(metavar="FILE", help="The new session; its name ends in .labsession.")
     ],
     setup: Annotated[
-        Path | None, typer.Option(help="Setup file (TOML; mm, degrees, px) to take over.")
+        Path | None, typer.Option(help="Setup file to copy into it (TOML; mm, degrees, px).")
     ] = None,
     *,
-    title: Annotated[str, typer.Option(help="What the experiment is called.")] = "",
-    operator: Annotated[str, typer.Option(help="Who did it.")] = "",
+    title: Annotated[str, typer.Option(help="Title of the experiment.")] = "",
+    operator: Annotated[str, typer.Option(help="Name of the operator.")] = "",
     material: Annotated[str, typer.Option(help="Material of the work piece.")] = "",
     thickness_mm: Annotated[float | None, _quantity("Thickness of the work piece (mm).")] = None,
     current_a: Annotated[float | None, _quantity("Welding current (A).")] = None,
     voltage_v: Annotated[float | None, _quantity("Arc voltage (V).")] = None,
     travel_speed_mm_s: Annotated[float | None, _quantity("Travel speed (mm/s).")] = None,
     gas: Annotated[str, typer.Option(help="Shielding gas.")] = "",
-    notes: Annotated[str, typer.Option(help="Anything else.")] = "",
+    notes: Annotated[str, typer.Option(help="Further notes.")] = "",
 ) -> None:
-    """Make a session, with the set-up and the experiment record as far as they are known."""
+    """Create a session; set-up and experiment record may be added later."""
     from labapp.config.setup import read_setup
     from labapp.session.record import Record
     from labapp.session.session import Session
@@ -143,7 +143,7 @@ def set_setup(
     file: File,
     setup: Annotated[Path, typer.Argument(help="Setup file (TOML; mm, degrees, px).")],
 ) -> None:
-    """Replace the set-up: rig and image calibration. It can be undone."""
+    """Replace the set-up: rig and image calibration. This can be undone."""
     from labapp.config.setup import read_setup
     from labapp.session.session import Session
 
@@ -167,14 +167,14 @@ def import_recording(
         typer.Option(
             min=0,
             callback=finite,
-            help="Frames a second (Hz), where the recording does not say so or is wrong.",
+            help="Frame rate (Hz), if the recording has none or a wrong one.",
         ),
     ] = None,
     embed: Annotated[
-        bool, typer.Option("--embed", help="Keep the frames in the session itself, lossless.")
+        bool, typer.Option("--embed", help="Store the frames in the session itself, lossless.")
     ] = False,
 ) -> None:
-    """Take in a recording: read it through, check it, and say what was read."""
+    """Import a recording: read all of it, check it, and describe it."""
     from labapp.media.base import format_frame_rate
     from labapp.session.session import Session
 
@@ -213,9 +213,9 @@ INEXACT = (
 
 @app.command()
 def relink(
-    file: File, recording: Annotated[Path, typer.Argument(help="Where the recording is now.")]
+    file: File, recording: Annotated[Path, typer.Argument(help="New path of the recording.")]
 ) -> None:
-    """Say where the recording is now. Only the one that was imported is taken."""
+    """Set the new path of a moved recording. Only the imported recording is accepted."""
     from labapp.session.session import Session
 
     with Session.open(file) as session:
@@ -228,18 +228,18 @@ def measure(
     file: File,
     frames: Frames = None,
     everything: Annotated[
-        bool, typer.Option("--all", help="All frames, also those whose measures stand.")
+        bool, typer.Option("--all", help="All frames, including those with current measures.")
     ] = False,
     scheme: Annotated[
         SchemeName | None, typer.Option(help=f"From now on: {ABOUT_SCHEMES}.")
     ] = None,
     algorithm: Annotated[
         Algorithm | None,
-        typer.Option(help="From now on: algorithm of IRS; the other schemes have none."),
+        typer.Option(help="From now on: algorithm of IRS; not used by the other schemes."),
     ] = None,
     correspondence: Annotated[
         Literal["auto", "S/S", "S/I", "I/I"] | None,
-        typer.Option(help="From now on: order of columns/rows of dots to that of rays."),
+        typer.Option(help="From now on: order of dots relative to rays, columns/rows."),
     ] = None,
     *,
     detector: Annotated[
@@ -250,17 +250,17 @@ def measure(
 ) -> None:
     """Measure frames: those that are not measured yet or whose measures are out of date.
 
-    Scheme, algorithm, correspondence, detector and search for rows are kept as settings of the
-    session; that can be undone.
+    Scheme, algorithm, correspondence, detector and search for rows are stored as settings of the
+    session; this can be undone.
 
-    Ctrl-C or SIGTERM stops after whole frames: what was finished is kept.
+    Ctrl-C or SIGTERM stops after a complete frame; finished frames are stored.
     """
     from labapp.session.session import Session
 
     if everything and frames is not None:
         raise InputError("--all", "frames", f"and --frames {frames}", "one of the two")
     with Session.open(file) as session:
-        _ = session.setup  # what is missing in it is reported before anything is changed
+        _ = session.setup  # raises before any change if the set-up is incomplete
         chosen = choose_frames(session, frames or ":")
         options = {"scheme": scheme, "algorithm": algorithm, "correspondence": correspondence}
         given = {name: value for name, value in options.items() if value is not None}
@@ -282,7 +282,7 @@ def _set(
     detector: DetectorName | None,
     rows: RowsName | None,
 ) -> None:
-    """Make options the session's settings, in one step of its history."""
+    """Store options as the session's settings, as one change of its history."""
     settings: Settings = replace(session.settings, **options)  # type: ignore[arg-type]
     settings = with_methods(settings, detector, rows)
     if "algorithm" in options and not SCHEMES[settings.scheme].algorithms:
@@ -301,13 +301,13 @@ app.command(cls=InOrder)(correct)
 
 @app.command()
 def undo(file: File) -> None:
-    """Take back the last change of set-up, calibration, settings, dots or rows."""
+    """Undo the last change of set-up, calibration, settings, dots or rows."""
     _step(file, "undo")
 
 
 @app.command()
 def redo(file: File) -> None:
-    """Make the change again that was taken back last."""
+    """Redo the change that was undone last."""
     _step(file, "redo")
 
 
@@ -325,7 +325,7 @@ def export(
     sigma_parts: SigmaParts = False,
     surfaces: Annotated[str, _some(SURFACE_FORMATS, unit=" (mm)")] = "csv,stl",
     solid: Annotated[
-        bool, typer.Option("--solid", help="Each surface as a watertight body, too.")
+        bool, typer.Option("--solid", help="Also write each surface as a watertight solid.")
     ] = False,
     together: Annotated[str, _some(RUN_FORMATS, "Everything in one file, some")] = "none",
     hdf5: Annotated[
@@ -340,9 +340,9 @@ def export(
     ] = "png",
     report: Annotated[bool, typer.Option("--report", help="A PDF report.")] = False,
 ) -> None:
-    """Write results into a folder, which is whole or not there, with a manifest.
+    """Export results into a folder with a manifest; an incomplete folder is never left.
 
-    Results that are out of date are refused: measure again first.
+    Results that are out of date are an error: measure again first.
     """
     from labapp.export.folder import ExportChoice
     from labapp.export.tables import TABLES
@@ -413,12 +413,12 @@ def checklist(
         list[int] | None, typer.Option(min=1, help="Tick the item of this number; repeat for more.")
     ] = None,
     untick: Annotated[
-        list[int] | None, typer.Option(min=1, help="Take its tick away; repeat for more.")
+        list[int] | None, typer.Option(min=1, help="Remove the tick; repeat for more.")
     ] = None,
 ) -> None:
-    """Show the lists of Appendix II, safety, equipment and steps, and tick what is done.
+    """Show the checklists of Appendix II (safety, equipment, steps), and tick items.
 
-    The session keeps the time of each tick.
+    The session stores the time of each tick.
     """
     from datetime import datetime
 
@@ -450,10 +450,10 @@ def checklist(
 def verify(
     file: File,
     recording: Annotated[
-        bool, typer.Option(help="Read through the recording, or the frames kept, as well.")
+        bool, typer.Option(help="Also read all of the recording, or of the stored frames.")
     ] = True,
 ) -> None:
-    """Check the whole session: a problem a line, and exit code 1 if there is any."""
+    """Check the whole session; print one problem per line, with exit code 1 if there is any."""
     from labapp.session.session import Session
 
     with Session.open(file, read_only=True) as session:
@@ -479,9 +479,9 @@ def verify(
 
 @contextmanager
 def _counted(what: str) -> Iterator[Progress]:
-    """Show how far something is that Ctrl-C ends without a change.
+    """Show the progress of an operation that Ctrl-C ends without a change.
 
-    Yields what is to be called with done and total.
+    Yields a function of the number done and the total.
     """
     with progress_shown(f"stopped {what}; nothing was changed") as progress:
         yield partial(progress, what)

@@ -1,4 +1,4 @@
-"""What commands share: exit codes, progress, messages about frames and results, and files."""
+"""Parts shared by commands: exit codes, progress, messages about frames and results, files."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     SchemeName: TypeAlias = str
     ResultsName: TypeAlias = str
     Algorithm: TypeAlias = irs.Algorithm
-else:  # an option may be what its type lists
+else:  # typer reads the allowed values of an option from its type
     SchemeName = Literal[tuple(SCHEMES)]
     ResultsName = Literal[tuple(scheme_words())]
     Algorithm = Literal[tuple(name for one in SCHEMES.values() for name in one.algorithms)]
@@ -43,8 +43,7 @@ else:  # an option may be what its type lists
 ABOUT_SCHEMES = ", ".join(scheme.about for scheme in SCHEMES.values())
 
 TERMINATED, INTERRUPTED, FAULT, BAD_INPUT, NOTHING_MEASURED = 143, 130, 3, 2, 1
-"""Exit codes; 0 is done. `NOTHING_MEASURED`: done, but nothing was measured, or a session is not
-whole."""
+"""Exit codes besides 0. `NOTHING_MEASURED`: nothing was measured, or a session is not whole."""
 
 RUNS_SHOWN = 6
 
@@ -53,14 +52,14 @@ RECORDING_HELP = (
     "A video, an image, a folder of images, a TIFF or NumPy stack, a Phantom .cine, "
     "a Photron .mraw or its header."
 )
-FRAMES_HELP = "Frames A to before B, counted from 0, every STEP-th; parts may be left out."
+FRAMES_HELP = "Frames A up to but not including B, from 0, every STEP-th; parts may be omitted."
 
 Warm = Annotated[
     bool,
     typer.Option(
         "--warm",
-        help="Measure each frame from the one before: some ten times as fast where frames follow "
-        "on each other quickly.",
+        help="Start each frame from the previous frame's result: about ten times as fast, for "
+        "recordings with a high frame rate.",
     ),
 ]
 
@@ -72,16 +71,17 @@ ROWS_HELP = "How rows are found: grown from dot to dot, row search (§5.2.2), ma
 SigmaParts = Annotated[
     bool,
     typer.Option(
-        "--sigma-parts", help="The parts of each ± in measures.csv, too: noise, level, set-up."
+        "--sigma-parts",
+        help="Also write the parts of each ± to measures.csv: noise, level, set-up.",
     ),
 ]
 
 
 class Commands(typer.core.TyperGroup):
-    """Commands whose list in the help has the first sentence of each in full."""
+    """Command group whose help lists the complete first sentence of each command."""
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write the list: names and sentences."""
+        """Write the list of names and sentences."""
         with formatter.section("Commands"):
             formatter.write_dl(
                 [(name, one.get_short_help_str(limit=1000)) for name, one in self.commands.items()]
@@ -91,7 +91,7 @@ class Commands(typer.core.TyperGroup):
 def with_methods(
     settings: Settings, detector: DetectorName | None, rows: RowsName | None
 ) -> Settings:
-    """Settings with another detector and another search for rows; None: that which they have."""
+    """Return settings with another detector and row search; None: unchanged."""
     dots, lattice = settings.dots, settings.lattice
     return replace(
         settings,
@@ -101,7 +101,7 @@ def with_methods(
 
 
 def progress_bar() -> Progress:
-    """A progress bar on stderr; nothing where stderr is not a terminal."""
+    """Return a progress bar on stderr, disabled if stderr is not a terminal."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -128,14 +128,14 @@ def note(console: Console, text: str) -> None:
 
 
 def warned(setup: Setup) -> Setup:
-    """The set-up, once a warning is on stderr for each value that no usual bench has."""
+    """Print a warning on stderr for each unusual value of a set-up, and return it."""
     for warning in setup.warnings:
         typer.echo(f"warning: {warning}", err=True)
     return setup
 
 
 def progress_sink(progress: Progress, name: str, count: int) -> Sink:
-    """A sink that shows the number of results so far, and why a frame gave no surface."""
+    """Return a sink that shows the number of results, and why a frame has no surface."""
     task = progress.add_task(name, total=count)
 
     def show(result: FrameResult) -> None:
@@ -149,12 +149,12 @@ def progress_sink(progress: Progress, name: str, count: int) -> Sink:
 
 
 def command(name: str, file: Path) -> str:
-    """The shell command line of a session command; file names may have spaces."""
+    """Return the shell command line of a session command, the file name quoted."""
     return f"labapp session {name} {quoted(str(file))}"
 
 
 def frames_text(frames: Collection[int]) -> str:
-    """Frames in short: "frames 0 to 3, 7"; "no frame"."""
+    """Return frames as ranges: "frames 0 to 3, 7", or "no frame"."""
     from labapp.export.summary import format_ranges
 
     if not frames:
@@ -170,30 +170,29 @@ def finite(value: float | None) -> float | None:
 
 
 def choose_frames(session: Session, text: str) -> list[int]:
-    """Choose frames of a session by ``A:B:STEP``, numbers in its recording.
+    """Return the frames of a session selected by ``A:B:STEP``, numbers in its recording.
 
     Raises
     ------
     InputError
-        If it is not of that form, or the session has none of these.
+        If the text is not of that form, or the session has none of these frames.
     """
     from labapp.run.runner import select_frames
 
     recording = session.recording
     if recording is None:
         raise InputError(session.path, "recording", "none", "one: labapp session import")
-    asked, own = select_frames(text, recording.frames), session.frames.tolist()
-    chosen = [frame for frame in own if frame in asked]
+    requested, known = select_frames(text, recording.frames), session.frames.tolist()
+    chosen = [frame for frame in known if frame in requested]
     if not chosen:
-        some = f"some of what the session has: {frames_text(own)}"
-        raise InputError("--frames", "frames", text, some)
+        raise InputError("--frames", "frames", text, f"some of {frames_text(known)}")
     return chosen
 
 
 def measure_frames(session: Session, frames: Sequence[int], *, warm: bool = False) -> Summary:
-    """Measure frames of a session, showing progress and failures on stderr.
+    """Measure frames of a session, with progress and failures on stderr.
 
-    Ctrl-C ends the program; what was finished is kept.
+    Ctrl-C ends the program; finished frames are stored.
     """
     from labapp.export.summary import Summary
 
@@ -208,7 +207,7 @@ def measure_frames(session: Session, frames: Sequence[int], *, warm: bool = Fals
             note(progress.console, f"{done}; the others: {command('measure', session.path)}")
             raise typer.Exit(INTERRUPTED) from None
         except InputError:
-            if len(summary.frames) == len(frames):  # it is about frames that cannot be read
+            if len(summary.frames) == len(frames):  # the error is about unreadable frames
                 typer.echo(summary.text())
             elif summary.frames:
                 done = f"stopped: {len(summary.frames)} of {len(frames)} frames are done and kept"
@@ -219,19 +218,19 @@ def measure_frames(session: Session, frames: Sequence[int], *, warm: bool = Fals
 
 @contextmanager
 def report_stale_results(session: Session) -> Iterator[None]:
-    """Report which results a change makes stale, and which it makes valid again."""
+    """Report which results the block makes stale, and which it makes valid again."""
     before = _stale(session)
     yield
     after = _stale(session)
-    if fallen := after - before:
-        typer.echo(f"Now stale: {_results(fallen)}; to measure again:")
+    if newly_stale := after - before:
+        typer.echo(f"Now stale: {_results(newly_stale)}; to measure again:")
         typer.echo(f"  {command('measure', session.path)}")
-    if risen := before - after:
-        typer.echo(f"No longer stale: {_results(risen)}")
+    if valid_again := before - after:
+        typer.echo(f"No longer stale: {_results(valid_again)}")
 
 
 def _stale(session: Session) -> set[tuple[int, str]]:
-    """(frame, scheme) of every result that no longer stands."""
+    """Return (frame, scheme) of every stale result."""
     stale: set[tuple[int, str]] = set()
     for scheme in {scheme for scheme, _ in session.measured_by}:
         seen = session.overview(scheme)
@@ -245,12 +244,12 @@ def _results(results: Collection[tuple[int, str]]) -> str:
 
 
 def results_folder(out: Path | None, tables: bool = True) -> Path | None:
-    """The folder for tables and pictures, made if it is not there; None where none is requested.
+    """Return the folder for tables and pictures, created if missing; None if ``out`` is None.
 
     Raises
     ------
     InputError
-        If it cannot be written, or there is to be neither a folder nor printed ``tables``.
+        If the folder is not writable, or neither a folder nor printed ``tables`` are requested.
     """
     if out is not None:
         return writable_folder(out)
@@ -260,12 +259,12 @@ def results_folder(out: Path | None, tables: bool = True) -> Path | None:
 
 
 def writable_folder(folder: Path, option: str = "--out") -> Path:
-    """A folder that was given by an option, made if it is not there.
+    """Return the folder given by an option, created if missing.
 
     Raises
     ------
     InputError
-        If it cannot be written.
+        If it is not writable.
     """
     with os_errors_as_input(folder, option, "a folder that can be written"):
         folder.mkdir(parents=True, exist_ok=True)
@@ -285,17 +284,17 @@ def write_figure(folder: Path, name: str, figure: Figure, kind: str) -> None:
 def progress_shown(
     stopped: str = "stopped: the tables and pictures that were finished are kept",
 ) -> Iterator[parallel.Progress]:
-    """Show progress on stderr; Ctrl-C ends the program, and ``stopped`` says what is kept."""
+    """Show progress on stderr; Ctrl-C prints ``stopped`` and ends the program."""
     with progress_bar() as bar:
         tasks: dict[str, TaskID] = {}
 
-        def tell(what: str, done: int, count: int) -> None:
+        def show(what: str, done: int, count: int) -> None:
             if what not in tasks:
                 tasks[what] = bar.add_task(what, total=count)
             bar.update(tasks[what], completed=done, total=count)
 
         try:
-            yield tell
+            yield show
         except KeyboardInterrupt:
             note(bar.console, stopped)
             raise typer.Exit(INTERRUPTED) from None

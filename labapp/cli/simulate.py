@@ -1,4 +1,4 @@
-"""`labapp simulate`: a recording of a pool that is known, with its truth beside it."""
+"""`labapp simulate`: a recording of a known pool, with ground truth."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def simulate(
         Path,
         typer.Argument(
             help="Pool, bench and camera (TOML; mm, degrees, px): docs/simulation.md. Or the name "
-            f"of a scenario that comes with labapp: {', '.join(SHIPPED)}."
+            f"of a scenario distributed with labapp: {', '.join(SHIPPED)}."
         ),
     ],
     out: Annotated[
@@ -27,17 +27,18 @@ def simulate(
         typer.Option(help="Folder for the recording and its truth. An earlier one is replaced."),
     ],
     frames: Annotated[
-        int | None, typer.Option(min=1, max=1_000_000, help="How many, in place of the file's.")
+        int | None,
+        typer.Option(min=1, max=1_000_000, help="Number of frames, overrides the file's."),
     ] = None,
     seed: Annotated[
-        int | None, typer.Option(min=0, max=2**31 - 1, help="In place of the file's.")
+        int | None, typer.Option(min=0, max=2**31 - 1, help="Random seed, overrides the file's.")
     ] = None,
 ) -> None:
-    """Simulate a recording of a known pool, with the truth about every dot.
+    """Simulate a recording of a known pool, with ground truth for every dot.
 
     It can be measured like any other: labapp reconstruct DIR/recording.avi --setup DIR/setup.toml.
 
-    The folder is whole or not there. The same file and seed give the same frames.
+    An incomplete folder is never left. The same file and seed give the same frames.
     """
     from labapp.config.scenario import find_scenario, read_scenario
     from labapp.simulated.simulate import simulate as write

@@ -1,4 +1,4 @@
-"""`labapp study …`: many recordings measured alike and compared, by the calls of `run.study`."""
+"""`labapp study …`: measure and compare many recordings, by the functions of `run.study`."""
 
 from __future__ import annotations
 
@@ -24,17 +24,18 @@ if TYPE_CHECKING:
 app = typer.Typer(
     cls=Commands,
     no_args_is_help=True,
-    help="Measure many recordings alike, on all cores or a cluster, and compare them.",
+    help="Measure many recordings with the same settings, on all cores or a cluster, and compare "
+    "them.",
 )
 
 File = Annotated[Path, typer.Argument(metavar="STUDY", help="The study file (TOML or CSV).")]
 Out = Annotated[
     Path | None,
-    typer.Option(help="Folder for the results; without it, STUDY_results beside the study file."),
+    typer.Option(help="Folder for the results. Default: STUDY_results beside the study file."),
 ]
 
 SHOWN = 20
-"""Recordings that are listed one by one, at most."""
+"""Most groups that are printed one by one."""
 
 
 @app.command()
@@ -45,13 +46,13 @@ def new(
     recordings: Annotated[
         list[str],
         typer.Argument(
-            help="Recordings; or in quotes a pattern, with {name} for a condition and * for "
-            'another part that varies: "runs/I{current_a}_*.avi".'
+            help="Recordings, or a quoted pattern, with {name} for a condition and * for other "
+            'parts that vary: "runs/I{current_a}_*.avi".'
         ),
     ],
     setup: Annotated[Path, typer.Option(help="Setup file of all recordings (TOML).")],
 ) -> None:
-    """Write a study file that lists recordings, to be completed with conditions by hand."""
+    """Write a study file that lists recordings; conditions can be added by hand."""
     from labapp.run.study.plan import write_study
 
     plan = write_study(study, recordings, setup)
@@ -66,20 +67,20 @@ def run(
     out: Out = None,
     workers: Annotated[
         int | None,
-        typer.Option(min=0, max=1024, help="How many processes; without it, one a core."),
+        typer.Option(min=0, max=1024, help="Number of processes. Default: one per core."),
     ] = None,
     scheduler: Annotated[
         str | None,
-        typer.Option(metavar="ADDRESS", help="Dask scheduler to use instead: tcp://HOST:8786."),
+        typer.Option(metavar="ADDRESS", help="Use this Dask scheduler: tcp://HOST:8786."),
     ] = None,
     surfaces: Annotated[
-        bool, typer.Option("--surfaces", help="Keep surfaces, too, and write surfaces.zarr.")
+        bool, typer.Option("--surfaces", help="Also store surfaces, and write surfaces.zarr.")
     ] = False,
 ) -> None:
-    """Measure what is not measured yet, and write tables and a summary.
+    """Measure the frames that are not measured yet, and write tables and a summary.
 
-    Interrupted at any moment, it can be run again. A recording that cannot be measured does not
-    stop the others. Exit code 1: not everything is measured.
+    An interrupted study can be continued by running it again. A recording that cannot be measured
+    does not stop the others. Exit code 1: not everything is measured.
     """
     from labapp.run.study.results import require_extra
     from labapp.run.study.status import count_states
@@ -136,10 +137,10 @@ def results(
     out: Out = None,
     surfaces: Annotated[
         bool,
-        typer.Option("--surfaces", help="Write surfaces.zarr, of what was run with --surfaces."),
+        typer.Option("--surfaces", help="Also write surfaces.zarr, after a run with --surfaces."),
     ] = False,
 ) -> None:
-    """Write tables and a summary of what is measured so far: after conditions were changed, too.
+    """Write tables and a summary of the frames measured so far, with the current conditions.
 
     Exit code 1: not everything is measured.
     """

@@ -14,7 +14,7 @@ from labapp.system import has_display, own_command, quoted
 
 
 def asks_for_app(arguments: Sequence[str], commands: Collection[str]) -> bool:
-    """Whether the app is wanted: no argument at all, or one that is a file and no command."""
+    """Whether to open the app: without arguments, or with one that is a file, not a command."""
     if not arguments:
         return True
     (first, *others) = arguments
@@ -24,12 +24,12 @@ def asks_for_app(arguments: Sequence[str], commands: Collection[str]) -> bool:
 
 
 def open_app(arguments: Sequence[str]) -> int:
-    """Open the app; returns its exit code when its window was closed.
+    """Open the app, and return its exit code after its window is closed.
 
     Raises
     ------
     InputError
-        If there is no such file, no display, or what windows need is not installed.
+        If there is no such file, no display, or the packages of the app are not installed.
     """
     try:
         from labapp.gui.app import main
@@ -40,10 +40,10 @@ def open_app(arguments: Sequence[str]) -> int:
 
 
 def show_in_app(session: Path) -> None:
-    """Open a session in the app where there is a display; elsewhere print how to."""
+    """Open a session in the app if there is a display; otherwise print the command for it."""
     if not has_display(os.environ):
         typer.echo(f"To see it in the app: labapp {quoted(os.fspath(session))}")
         return
     typer.echo("The app opens with it; close its window to end.")
-    # A process of its own: whatever comes over the window, the results are there.
+    # In a separate process, so that a crash of the app does not affect this command.
     subprocess.run([*own_command(), os.fspath(session)], check=False)

@@ -1,1 +1,1 @@
-"""Files that people write: the setup of the bench, and scenarios to simulate (TOML)."""
+"""Files written by users: setups of benches and scenarios for simulation (TOML)."""

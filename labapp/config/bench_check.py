@@ -1,7 +1,7 @@
-"""The section ``[bench_check]`` of a setup file: what a check against known mirrors gave.
+"""The section ``[bench_check]`` of a setup file: the results of a check against known mirrors.
 
-It keeps what every quantity was before and after the check, and all that the check took as given.
-As soon as the file has anything else than that, the set-up no longer counts as checked.
+It stores every quantity before and after the check, and all values that the check took as given.
+The set-up no longer counts as checked as soon as the file deviates from these.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from labapp.errors import InputError
 SECTION = "bench_check"
 
 MATTERS = ("laser", "pattern", "imaging_plane", "image_calibration", "camera_lens")
-"""Sections that a check is about."""
+"""Sections that a check refers to."""
 
 _DEFAULTS = {key: 0.0 for key in INDEX if not key.startswith("image_calibration.")} | {
     "pattern.kind": DotPattern.kind,
@@ -69,7 +69,7 @@ def _is_quantity(value: object) -> bool:
 
 
 def is_correlation(value: object) -> bool:
-    """Whether this is a list of rows that are a correlation matrix, but for rounding."""
+    """Whether this is a list of rows that form a correlation matrix, except for rounding."""
     if not (isinstance(value, list) and len(value) <= _MOST):
         return False
     if not all(are_numbers(row, len(value)) for row in value):
@@ -105,11 +105,11 @@ RULES = {
         required=False,
     ),
 }
-"""Rules of its keys."""
+"""Rules for the keys of the section."""
 
 
 def contradictions(path: Path, values: Mapping[str, Any]) -> list[InputError]:
-    """Problems of keys of the section that are valid by themselves and contradict each other."""
+    """Problems of keys of the section that are each valid but contradict each other."""
     section = values.get(SECTION)
     if section is None:
         return []
@@ -123,16 +123,16 @@ def contradictions(path: Path, values: Mapping[str, Any]) -> list[InputError]:
 def checked_covariance(
     values: Mapping[str, Any], covariance: FloatArray
 ) -> tuple[FloatArray, bool]:
-    """Covariance of `QUANTITIES`, shape (q, q), and whether the set-up is as it was checked.
+    """Covariance of `QUANTITIES`, shape (q, q), and whether the set-up is unchanged since a check.
 
     Parameters
     ----------
     values
         Sections of a setup file.
     covariance
-        That by the uncertainties in its sections: it holds where the set-up is not as it was
-        checked. A check that has not every one of the `FIRST` quantities is no check of the set-up;
-        of those that came later it took as exact what it has not.
+        The covariance from the uncertainties in the sections. It applies if the set-up has changed
+        since the check or if the check lacks any of the `FIRST` quantities. Later quantities that
+        the check lacks were taken as exact.
     """
     section = values.get(SECTION)
     if section is None or changed_since_check(values):
@@ -148,7 +148,7 @@ def checked_covariance(
 
 
 def semidefinite(covariance: FloatArray) -> FloatArray:
-    """A covariance or correlation matrix without the small negative eigenvalues of rounding."""
+    """Remove negative eigenvalues due to rounding from a covariance or correlation matrix."""
     sigma = np.sqrt(np.diag(covariance))
     correlation = (covariance + covariance.T) / 2 / np.outer(sigma, sigma)
     eigenvalues, vectors = np.linalg.eigh(correlation)
@@ -159,10 +159,10 @@ def semidefinite(covariance: FloatArray) -> FloatArray:
 
 
 def changed_since_check(values: Mapping[str, Any]) -> list[str]:
-    """Keys of a setup file that are no longer what they were when it was checked.
+    """Keys of a setup file that have changed since it was checked.
 
-    A key that is left out and one with its default value are the same. Files of checks that did
-    not keep the uncertainties before them have no ``sigmas``: there these are not compared.
+    A missing key is equal to one with its default value. Files of earlier checks, which did not
+    store the uncertainties, have no ``sigmas``: there the uncertainties are not compared.
     """
     section = values[SECTION]
     after = {one["key"]: one["after"] for one in section["quantities"]}
@@ -170,7 +170,7 @@ def changed_since_check(values: Mapping[str, Any]) -> list[str]:
         key
         for key, value in after.items()
         if not _near(found := _value(values, key), value)
-        and not np.isnan(found)  # a point that the file has a homography for
+        and not np.isnan(found)  # a point, if the file has a homography instead
     ]
     pattern = values["pattern"]
     defaults = _DEFAULTS | {
@@ -183,7 +183,7 @@ def changed_since_check(values: Mapping[str, Any]) -> list[str]:
 
 
 def same_setup(one: Rig, other: Rig) -> bool:
-    """Whether two rigs are the same to a bench check, their image calibrations included."""
+    """Whether two rigs, including their image calibrations, are equal for a bench check."""
     parts = ("laser", "pattern", "imaging_plane", "uncertainty")
     return all(_equal(getattr(one, part), getattr(other, part)) for part in parts)
 
@@ -191,7 +191,7 @@ def same_setup(one: Rig, other: Rig) -> bool:
 def check_values(
     check: BenchCheck, text_values: Mapping[str, Any], date: str
 ) -> dict[str, dict[str, object]]:
-    """Section → key → value that make a setup file that of a check (`setup.update_setup`)."""
+    """Section → key → value that enter a check into a setup file (`setup.update_setup`)."""
     made: dict[str, dict[str, object]] = {}
     quantities, homography = [], "homography" in text_values["image_calibration"]
     for one in check.changes:
@@ -231,7 +231,7 @@ def check_values(
 
 
 def unchecked_values(values: Mapping[str, Any]) -> dict[str, dict[str, object]]:
-    """Section → key → value that undo a check, except for what was changed since."""
+    """Section → key → value that undo a check, except for values changed since."""
     section = values.get(SECTION)
     if section is None:
         return {}
@@ -254,7 +254,7 @@ def unchecked_values(values: Mapping[str, Any]) -> dict[str, dict[str, object]]:
 
 
 def _value(values: Mapping[str, Any], key: str) -> float:
-    """A quantity's value in a file; NaN where it has none, the default one for a key left out."""
+    """A quantity's value in a file; the default value for a missing key, NaN without one."""
     section, _, name = key.partition(".")
     name, _, axis = name.partition("[")
     lacking = [np.nan, np.nan] if axis else _DEFAULTS.get(key, np.nan)
@@ -263,7 +263,7 @@ def _value(values: Mapping[str, Any], key: str) -> float:
 
 
 def _given(values: Mapping[str, Any], adjusted: Iterable[str]) -> dict[str, object]:
-    """What a check takes as given: all of the sections that matter but adjusted keys and ±."""
+    """Values that a check takes as given: those of `MATTERS` without adjusted keys and ±."""
     names = {key.partition("[")[0] for key in adjusted}
     return {
         key: value for key, value in _keys(values) if key not in names and not key.endswith(ENDINGS)
@@ -271,7 +271,7 @@ def _given(values: Mapping[str, Any], adjusted: Iterable[str]) -> dict[str, obje
 
 
 def _uncertainties(values: Mapping[str, Any]) -> dict[str, object]:
-    """The standard uncertainties and the correlation in the sections that matter."""
+    """The standard uncertainties and the correlation in the sections `MATTERS`."""
     return {key: value for key, value in _keys(values) if key.endswith(ENDINGS)}
 
 

@@ -1,4 +1,4 @@
-"""Reading of untrusted CSV tables: bounded in size, with errors a user can act on."""
+"""Reading of untrusted CSV tables: limited in size, with errors that help the user."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LONGEST_LINE = 1 << 14
 HEAD_BYTES = 1 << 16
 
 PROBLEMS_SHOWN = 10
-"""Most problems of a table that are reported together."""
+"""Maximum number of problems of a table that are reported together."""
 
 
 @contextmanager
@@ -30,14 +30,14 @@ def open_table(path: Path, wanted: str, largest: int) -> Iterator[TextIO]:
     Parameters
     ----------
     wanted
-        What it should be, for the errors.
+        Expected content, for the errors.
     largest
-        Largest size, bytes.
+        Maximum size, bytes.
 
     Raises
     ------
     InputError
-        If it cannot be read, is too large, or is no text.
+        If the file cannot be read, is too large, or is not text.
     """
     try:
         size = path.stat().st_size
@@ -45,7 +45,7 @@ def open_table(path: Path, wanted: str, largest: int) -> Iterator[TextIO]:
             raise InputError(path, "size", f"{size} bytes", f"at most {largest} bytes")
         with path.open("rb") as head:
             if b"\0" in head.read(HEAD_BYTES):
-                raise InputError(path, "content", "binary, or UTF-16", wanted)
+                raise InputError(path, "content", "binary or UTF-16", wanted)
         with path.open(encoding="utf-8-sig", newline="") as file:
             yield file
     except OSError as error:
@@ -57,7 +57,7 @@ def open_table(path: Path, wanted: str, largest: int) -> Iterator[TextIO]:
 
 
 def bounded_lines(path: Path, file: TextIO, wanted: str) -> Iterator[str]:
-    """Lines of a file; one longer than `LONGEST_LINE` raises before it fills the memory."""
+    """Lines of a file; a line longer than `LONGEST_LINE` raises before it fills the memory."""
     for number in itertools.count(1):
         text = file.readline(LONGEST_LINE)
         if len(text) >= LONGEST_LINE:
@@ -69,7 +69,7 @@ def bounded_lines(path: Path, file: TextIO, wanted: str) -> Iterator[str]:
 
 
 def parse_number(cell: str, separator: str) -> float | None:
-    """Parse a finite number; a decimal comma is allowed unless it is the separator. Else None."""
+    """Parse a finite number, or return None; a decimal comma is allowed if not the separator."""
     if separator != ",":
         cell = cell.replace(",", ".")
     try:
@@ -82,19 +82,19 @@ def parse_number(cell: str, separator: str) -> float | None:
 def read_columns(
     path: Path, wanted: str, largest: int, words: Collection[str] = ()
 ) -> dict[str, list[str] | FloatArray]:
-    """Columns of a table by name; the separator is a comma, a semicolon or a tabulator.
+    """Columns of a table by name; the separator is a comma, a semicolon or a tab.
 
     Parameters
     ----------
     path, wanted, largest
-        As of `open_table`.
+        See `open_table`.
     words
-        Names of columns of text; all others are numbers, NaN where a cell is empty.
+        Names of text columns; all others are numbers, NaN if a cell is empty.
 
     Raises
     ------
     InputError
-        If it cannot be read, names are missing or twice, or a cell is no number.
+        If the file cannot be read, names are missing or repeated, or a cell is not a number.
     """
     with open_table(path, wanted, largest) as file:
         lines = bounded_lines(path, file, wanted)
@@ -102,7 +102,9 @@ def read_columns(
         separator = max(",;\t", key=head.count)
         names = [cell.strip() for cell in next(csv.reader([head], delimiter=separator), [])]
         if not all(names) or len(set(names)) < len(names) or not names:
-            raise InputError(path, "line 1", head.strip() or "empty", f"a name a column: {wanted}")
+            raise InputError(
+                path, "line 1", head.strip() or "empty", f"a name per column: {wanted}"
+            )
         texts: dict[str, list[str]] = {name: [] for name in names if name in words}
         numbers = {name: array("d") for name in names if name not in words}
         for line, cells in enumerate(csv.reader(lines, delimiter=separator), 2):

@@ -17,8 +17,8 @@ def read_line_setup(path: str | os.PathLike[str]) -> Setup:
     Raises
     ------
     InputError
-        If the file cannot be read, its pattern is none of lines, or anything in it is unknown,
-        missing or impossible; all that was found is reported together.
+        If the file cannot be read, its pattern is not a line pattern, or anything in it is unknown,
+        missing or impossible; all problems are reported together.
     """
     path = Path(path)
     text = read_setup_text(path)

@@ -12,7 +12,7 @@ FORMS = (
     "plate:HEIGHT or plate:HEIGHT:LEVEL (mm, degrees), cap:DIAMETER:HEIGHT, ball:DIAMETER or "
     "ball:DIAMETER:TOP (mm)"
 )
-"""How mirrors are written."""
+"""Forms of the text of a mirror."""
 
 _LARGEST_MM = 1000.0
 _LARGEST_TILT_DEG = 10.0
@@ -20,15 +20,15 @@ _SIZES = ("height_mm", "diameter_mm")
 
 
 def parse_mirror(text: str) -> Mirror:
-    """Read a mirror.
+    """Parse the text of a mirror.
 
-    Each size may have its standard uncertainty after ``+-`` or ``±``. The height of a plate may
-    be ``free``; how level it lies is a standard uncertainty itself.
+    Each size may be followed by its standard uncertainty after ``+-`` or ``±``. The height of a
+    plate may be ``free``; its level is itself a standard uncertainty.
 
     Raises
     ------
     InputError
-        If it is none of `FORMS`, or has an impossible size.
+        If the text has none of the `FORMS`, or an impossible size.
     """
     kind, *numbers = text.strip().split(":")
     makers: dict[tuple[str, int], Callable[..., Mirror]] = {
@@ -59,7 +59,7 @@ def mirror_text(mirror: Mirror) -> str:
 
 
 def _number(text: str) -> tuple[float, float | None]:
-    """A number and its ±, None where it has none."""
+    """A number and its ±, which is None if missing."""
     if text == "free":
         return 0.0, FREE_MM
     value, _, sigma = text.replace("±", "+-").partition("+-")

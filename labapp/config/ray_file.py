@@ -1,7 +1,7 @@
-"""The table of measured rays that a setup file names: ``[pattern] kind = "directions"``.
+"""The table of measured rays named in a setup file: ``[pattern] kind = "directions"``.
 
-The setup file's text takes its rays in (``rays`` in place of ``file``), so that a session, which
-keeps the text, holds all of its set-up.
+The rays are inserted into the text of the setup file (``rays`` in place of ``file``), so that a
+session, which stores the text, contains the whole set-up.
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ A_RAY_TABLE = "a table of rays (CSV, UTF-8): ray_row, ray_column and x, y, z or 
 
 LABELS = ("ray_row", "ray_column")
 UNIVERSAL, BEAM = ("x", "y", "z"), ("aside", "up", "along")
-"""Columns of a ray's unit direction: in the UCS; to the side, upwards and along the beam axis."""
+"""Columns of a ray's unit direction: in the UCS; or to the side, up and along the beam axis."""
 
 MOST_ROWS = 99
-"""Labels above this are none: no pattern has more rows or columns."""
+"""Largest row or column of a ray: no pattern has more."""
 
 LARGEST_FILE = 4_000_000
 NORM_OFF = 0.01
-"""A direction whose length differs by more from 1 is no unit vector."""
+"""Maximum deviation of the length of a unit vector from 1."""
 
 
 def with_rays(text: str, path: Path, values: Mapping[str, Any]) -> str:
-    """Text of a setup file with the rays of the table that it names in its place.
+    """Text of a setup file in which the named table is replaced by its rays.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def with_rays(text: str, path: Path, values: Mapping[str, Any]) -> str:
     Raises
     ------
     InputError
-        If it names a file elsewhere than beside it, or this is no table of rays.
+        If the named file is not in the same folder or is not a table of rays.
     """
     pattern = values.get("pattern")
     if not isinstance(pattern, dict) or pattern.get("kind") != MEASURED or "file" not in pattern:
@@ -63,7 +63,7 @@ def with_rays(text: str, path: Path, values: Mapping[str, Any]) -> str:
     step = pattern.get("inter_beam_angle_deg")
     if step is None:
         step = found["inter_beam_angle_deg"] = _inter_beam_angle(path, ray, tangents)
-    # A value that is none is refused with the others of the file.
+    # An invalid value is reported with the other problems of the file.
     made = np.round(tangents / np.tan(np.radians(step if is_number(step) and step > 0 else 1.0)), 9)
     document = tomlkit.parse(text)
     table: Any = document["pattern"]
@@ -85,7 +85,7 @@ def read_rays(path: Path, setup: Mapping[str, Any]) -> tuple[IntArray, FloatArra
     path
         The table.
     setup
-        Tables of the setup file: directions in the UCS need the beam axis and the rotation.
+        Tables of the setup file: directions in the UCS require the beam axis and the rotation.
 
     Returns
     -------
@@ -127,7 +127,7 @@ def read_rays(path: Path, setup: Mapping[str, Any]) -> tuple[IntArray, FloatArra
 
 
 def ray_table(ray: IntArray, tangents: FloatArray) -> str:
-    """Table of rays (i, j), shape (n, 2), by their tangents to the beam axis, shape (n, 2)."""
+    """Write rays (i, j), shape (n, 2), and their tangents to the beam axis, shape (n, 2)."""
     direction = np.column_stack([tangents, np.ones(len(tangents))])
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     lines = [",".join((*LABELS, *BEAM))]
@@ -137,7 +137,7 @@ def ray_table(ray: IntArray, tangents: FloatArray) -> str:
 
 
 def _numbers(path: Path, line: int, cells: list[str], at: list[int]) -> tuple[Any, ...]:
-    """Row, column and the direction's three components in a line."""
+    """Row, column and the three components of the direction in a line."""
     values = [parse_number(cells[k].strip(), ",") if k < len(cells) else None for k in at]
     i, j = values[:2]
     labels = [v for v in (i, j) if v is not None and v == int(v) and 1 <= v <= MOST_ROWS]
@@ -151,13 +151,13 @@ def _numbers(path: Path, line: int, cells: list[str], at: list[int]) -> tuple[An
 
 
 def _beam_axes(path: Path, setup: Mapping[str, Any]) -> FloatArray:
-    """Directions to the side, upwards and along the beam axis in the UCS, shape (3, 3)."""
+    """Directions to the side, up and along the beam axis in the UCS, shape (3, 3)."""
     try:
         keys = {k: float(v) for k, v in setup["laser"].items() if not k.endswith(ENDINGS)}
         axis, aside, up = Laser(**keys).axes
         turn = np.radians(float(setup["pattern"].get("rotation_deg", 0.0)))
     except (AttributeError, KeyError, TypeError, ValueError) as error:
-        expected = "a valid [laser] and rotation, by which directions in the UCS become a lens's"
+        expected = "a valid [laser] and rotation, to convert directions in the UCS to the beam axis"
         raise InputError(path, "laser", "missing or wrong", expected) from error
     sin, cos = np.sin(turn), np.cos(turn)
     return np.array([cos * aside + sin * up, cos * up - sin * aside, axis])
@@ -167,7 +167,7 @@ def _inter_beam_angle(path: Path, ray: IntArray, tangents: FloatArray) -> float:
     """The median angle between neighbours of a row, degrees."""
     beside = (np.diff(ray[:, 0]) == 0) & (np.diff(ray[:, 1]) == 1)
     if not beside.any():
-        expected = "an angle in degrees: no two rays of the table are neighbours"
+        expected = "an angle in degrees, as no two rays of the table are neighbours"
         raise InputError(path, "pattern.inter_beam_angle_deg", "missing", expected)
     steps = np.linalg.norm(np.diff(tangents, axis=0), axis=1)[beside]
     return round(float(np.degrees(np.arctan(np.median(steps)))), 6)

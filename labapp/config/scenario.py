@@ -1,6 +1,6 @@
-"""A scenario: a pool on a bench in front of a camera, as TOML; a recording is simulated from it.
+"""A scenario: a pool on a bench in front of a camera (TOML), from which a recording is simulated.
 
-It is a setup file with tables more: [pool], and [torch], [camera], [look], [recording].
+It is a setup file with the additional tables [pool], [torch], [camera], [look] and [recording].
 """
 
 from __future__ import annotations
@@ -34,10 +34,10 @@ A_SCENARIO = "a scenario (TOML, UTF-8)"
 OPTIONAL = ("torch", "camera", "look")
 
 COURSE_HZ = (0.3, 3.0)
-"""A pool's size wanders by swings between these frequencies."""
+"""Range of the frequencies by which a pool's size fluctuates."""
 
 SWINGS = 6
-"""Least number of them for a course."""
+"""Minimum number of oscillations that make up a fluctuation."""
 
 
 @dataclass(frozen=True)
@@ -45,11 +45,11 @@ class Scenario:
     """A valid scenario."""
 
     recording: Recording
-    """What it describes, to be rendered."""
+    """The recording that it describes."""
     setup: str
     """The setup file of its bench, as text."""
     text: str
-    """The scenario as it was read."""
+    """The scenario as read."""
 
     @property
     def title(self) -> str:
@@ -59,17 +59,17 @@ class Scenario:
 
 
 def shipped_scenarios() -> list[Path]:
-    """Those that come with labapp."""
+    """Scenarios that come with labapp."""
     return sorted(bundled("resources/simulations").glob("*.toml"))
 
 
 def find_scenario(name: Path) -> Path:
-    """Scenario of a command line: a file, or the name of one that comes with labapp, "egg".
+    """Find the scenario of a command line: a file, or the name of one in labapp, such as "egg".
 
     Raises
     ------
     InputError
-        If there is neither.
+        If there is no such scenario.
     """
     shipped = {path.stem: path for path in shipped_scenarios()}
     if name.is_file() or name.suffix or name.parent != Path():
@@ -87,15 +87,15 @@ def read_scenario(
     Parameters
     ----------
     path
-        The file. A surface that it names is looked for beside it.
+        The file. A surface that it names is searched in the same folder.
     frames, seed
-        In place of its own.
+        Values that replace those of the file.
 
     Raises
     ------
     InputError
         If the file, or a surface that it names, cannot be read or anything in it is unknown,
-        missing or impossible; all that was found is reported together (`InputError.problems`).
+        missing or impossible; all problems are reported together (`InputError.problems`).
     """
     path = Path(path)
     text = read_text(path, A_SCENARIO)
@@ -113,10 +113,10 @@ def read_scenario(
         problems = [*error.problems, *problems]
     calibration = bench.get("image_calibration")
     if isinstance(calibration, dict) and "homography" in calibration:
-        expected = "the three points: no other camera is simulated"
+        expected = "the three points, as no other camera is simulated"
         problems.append(InputError(path, "image_calibration", "a homography", expected))
     if "focal_px" in bench.get("camera_lens", {}):
-        expected = "none: no distortion is simulated"
+        expected = "no such value, as the distortion is not simulated"
         problems.append(InputError(path, "camera_lens", "a lens", expected))
     if problems:
         raise InputError.gather(problems)
@@ -128,7 +128,7 @@ def read_scenario(
 
 
 def _without_travel(values: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Split [torch] into what hides rays, the simulation's, and how it moves, the set-up's."""
+    """Split [torch] into the simulation's keys (shape) and the set-up's keys (travel)."""
     keys = values.get("torch")
     if not isinstance(keys, dict) or "travel" not in keys:
         return values, {}
@@ -137,11 +137,11 @@ def _without_travel(values: dict[str, Any]) -> tuple[dict[str, Any], dict[str, A
     return others | ({"torch": rest} if rest else {}), {"torch": {"travel": keys["travel"]}}
 
 
-# --- what is wrong ------------------------------------------------------------------------------
+# --- validation ---------------------------------------------------------------------------------
 
 
 def _check(path: Path, values: dict[str, Any]) -> list[InputError]:
-    """Find unknown, missing and wrong keys of the tables that are no set-up's."""
+    """Find unknown, missing and wrong keys of the tables that a set-up does not have."""
     known = {**SECTIONS, "pool": {}, **TABLES}
     problems = [unknown_key(path, table, known) for table in values if table not in known]
     problems += _check_pool(path, values.get("pool"))
@@ -155,7 +155,7 @@ def _check(path: Path, values: dict[str, Any]) -> list[InputError]:
 def _check_pool(path: Path, keys: Any) -> list[InputError]:
     rules = pool_rules(keys) if isinstance(keys, dict) else pool_rules({})
     if isinstance(keys, dict) and str(keys.get("shape")) not in SHAPES:
-        # Without its shape nothing can be said of the other keys.
+        # Without the shape the other keys cannot be checked.
         return check_keys(path, "pool", {k: keys[k] for k in keys if k == "shape"}, rules)
     problems = check_keys(path, "pool", keys, rules)
     if not isinstance(keys, dict):
@@ -168,13 +168,13 @@ def _check_pool(path: Path, keys: Any) -> list[InputError]:
 
 
 def _several(terms: Any) -> list[Any]:
-    """Tables, of which one need not be in a list; what is neither was reported already."""
+    """Tables, given as a list or as a single table; other values were already reported."""
     if isinstance(terms, dict):
         return [terms]
     return terms if isinstance(terms, list) else []
 
 
-# --- what it describes --------------------------------------------------------------------------
+# --- construction -------------------------------------------------------------------------------
 
 
 def _recording(path: Path, values: dict[str, Any], rig: Rig) -> Recording:
@@ -215,7 +215,7 @@ def _view(path: Path, calibration: dict[str, Any], camera: dict[str, Any]) -> Ca
     size: dict[str, Any] = {key: camera[key] for key in ("width_px", "height_px") if key in camera}
     bent = {key: camera[key] for key in camera if key not in size}
     if bent and "focal_px" not in bent:
-        expected = "a number from 10 to 1e+06 (px): the coefficients mean nothing without"
+        expected = "a number from 10 to 1e+06 (px), which the coefficients refer to"
         raise InputError(path, "camera.focal_px", "missing", expected)
     points: dict[str, Any] = {
         key: tuple(value) if isinstance(value, list) else value
@@ -249,11 +249,11 @@ def _pools(
             for size, time in zip(sizes.tolist(), times_s.tolist(), strict=True)
         )
     except ValueError as error:
-        raise InputError(path, "pool", error, "a pool that can be") from error
+        raise InputError(path, "pool", error, "a possible pool") from error
 
 
 def _footprint(keys: dict[str, Any], head_sign: int) -> Footprint:
-    """Area of a pool; `Footprint` takes its ends by +Y and −Y, whatever the head is."""
+    """Area of a pool; `Footprint` has its ends at +Y and −Y, wherever the head is."""
     width = keys["diameter_mm"] if keys["shape"] == "cap" else keys["width_mm"]
     half = keys.get("length_mm", width) / 2
     head, tail = keys.get("head_mm", half), keys.get("tail_mm", half)
@@ -287,7 +287,7 @@ def _sized(pool: Pool, width: float, length: float, height: float) -> Pool:
 def _course(times_s: FloatArray, seed: int) -> FloatArray:
     """Three smooth random courses at the times, shape (n, 3): mean 0, standard deviation 1.
 
-    A sum of slow swings: the same at a moment, however many frames there are.
+    Each is a sum of slow oscillations and does not depend on the number of frames.
     """
     rng = np.random.default_rng([seed, 3])
     hertz = rng.uniform(*COURSE_HZ, (SWINGS, 3))

@@ -7,7 +7,7 @@ from typing import Any
 from labapp.config.toml_keys import Rule, are_numbers, between, is_number, within
 
 LARGEST_POOL_MM = 100.0
-"""Lengths of a pool are below this."""
+"""Upper limit of a pool's lengths."""
 
 RECORDINGS = {"avi": "recording.avi", "tif": "recording.tif", "png": "recording"}
 """Format → the recording's name: a video, a TIFF stack, a folder of PNG files."""
@@ -98,7 +98,7 @@ TERMS: dict[str, dict[str, Rule]] = {
         "damping_per_s": within(0, 1e4, "1/s"),
     },
 }
-"""What is laid on a cap, each a table [pool.NAME] or several [[pool.NAME]]: name → keys."""
+"""Disturbances of a cap, each a table [pool.NAME] or several [[pool.NAME]]: name → keys."""
 
 TABLES: dict[str, dict[str, Rule]] = {
     "torch": {
@@ -116,7 +116,7 @@ TABLES: dict[str, dict[str, Rule]] = {
     "look": {
         "dot_peak": within(0, 1000, "grey levels"),
         "unevenness": within(0, 3, ""),
-        "beam_fraction": within(0, 1, "of the angle between beams"),
+        "beam_fraction": within(0, 1, "of the inter-beam angle"),
         "dot_floor_mm": between(0, 10, "mm", required=False),
         "dot_ceiling_mm": between(0, 10, "mm", required=False),
         "speckle": within(0, 1, "contrast"),
@@ -124,7 +124,7 @@ TABLES: dict[str, dict[str, Rule]] = {
         "background": within(0, 255, "grey levels"),
         "glow": within(0, 255, "grey levels"),
         "read_noise": within(0, 100, "grey levels"),
-        "photon_noise": within(0, 10, "grey levels² a grey level"),
+        "photon_noise": within(0, 10, "grey levels² per grey level"),
         "hot_pixels": _whole(0, 100_000),
         "false_dots": _whole(0, 10_000),
         "missing": within(0, 1, "probability"),
@@ -139,11 +139,11 @@ TABLES: dict[str, dict[str, Rule]] = {
         "format": _one_of(*RECORDINGS),
     },
 }
-"""Every table but the set-up's and [pool]; [torch], [camera] and [look] may be left out."""
+"""Every table except the set-up's and [pool]; [torch], [camera] and [look] are optional."""
 
 
 def pool_rules(keys: dict[str, Any]) -> dict[str, Rule]:
-    """Rules of [pool], given the keys it holds: its shape says which belong to it."""
+    """Rules for [pool], given its keys: its shape determines which keys it may have."""
     rules = SHAPES.get(str(keys.get("shape")), {})
     some = Rule("a table, or a list of them", lambda v: isinstance(v, dict | list), required=False)
     terms = {} if "file" in rules else dict.fromkeys(TERMS, some)

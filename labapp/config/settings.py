@@ -1,4 +1,4 @@
-"""Whether the settings of a measurement, as a script makes them, name what there is."""
+"""Check of the settings of a measurement that come from a script."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from labapp.errors import require, unknown_name
 
 
 def check_settings(settings: Settings, source: str) -> None:
-    """Check the names in settings; ``source`` is what they were given to.
+    """Check the names in settings; ``source`` is the function that received them.
 
     Raises
     ------
     InputError
-        If they are no `Settings`, or name a scheme, an algorithm, a correspondence or a method that
-        is none.
+        If they are not `Settings`, or name a scheme, an algorithm, a correspondence or a method
+        that does not exist.
     """
     require(settings, Settings, source, "settings", "labapp.core.pipeline.Settings")
     named = (
@@ -34,5 +34,5 @@ def check_settings(settings: Settings, source: str) -> None:
 
 
 def _choices(owner: type, field: str) -> tuple[str, ...]:
-    """Values that a field may have, by its type."""
+    """Values that the type of a field allows."""
     return get_args(get_type_hints(owner)[field])

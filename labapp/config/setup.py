@@ -44,7 +44,7 @@ from labapp.files import write_atomically
 A_SETUP = "a setup file (TOML, UTF-8)"
 
 LEAST_ANGLE_DEG = 10.0
-"""Axes of the imaging plane that look closer together than this are taken for an input error."""
+"""Smallest angle between the axes in the picture; a smaller one is taken for an input error."""
 
 
 @dataclass(frozen=True)
@@ -54,27 +54,27 @@ class Setup:
     rig: Rig
     """Laser, pattern, electrode, imaging plane; a line pattern as `LineRays`."""
     calibration: ImageCalibration
-    """Pixel ↔ imaging plane."""
+    """Conversion between pixels and imaging plane."""
     text: str
-    """The file as it was read, for the record."""
+    """The file as read, for the record."""
     checked: str = ""
-    """When the bench was checked against a known mirror, ISO 8601; empty where it was not, or was
+    """Date of the check against a known mirror, ISO 8601; empty if the bench was not checked or has
     changed since.
     """
 
     @functools.cached_property
     def bench(self) -> Bench:
-        """Rig and calibration as the measurement takes them."""
+        """Rig and calibration as used by the measurement."""
         return Bench(self.rig, self.calibration)
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Values that no usual bench has, a clause each (`implausible_values`)."""
+        """Values that are unusual for a bench, one clause each (`implausible_values`)."""
         return implausible_values(self.rig)
 
     @property
     def line_rig(self) -> LineRig | None:
-        """The rig of a line pattern; None where the pattern is one of dots."""
+        """The rig of a line pattern; None for a dot pattern."""
         return line_rig(self.rig)
 
 
@@ -84,14 +84,14 @@ def read_setup(path: str | os.PathLike[str], lines: bool = False) -> Setup:
     Raises
     ------
     InputError
-        If the file cannot be read or anything in it is unknown, missing or impossible; all that
-        was found is reported together (`InputError.problems`).
+        If the file cannot be read or anything in it is unknown, missing or impossible; all problems
+        are reported together (`InputError.problems`).
     """
     return parse_setup(read_setup_text(path), Path(path), lines)
 
 
 def read_setup_text(path: str | os.PathLike[str]) -> str:
-    """Text of a setup file; rays of the table that it names stand in it.
+    """Read the text of a setup file and insert the rays of the table that it names.
 
     Raises
     ------
@@ -110,7 +110,7 @@ def parse_setup(text: str, path: str | os.PathLike[str], lines: bool = False) ->
     Parameters
     ----------
     lines
-        Whether a line pattern is accepted, too: by what measures both, or neither.
+        Whether a line pattern is accepted, too: for callers that handle both or measure neither.
     """
     path = Path(path)
     values = parse_toml(text, path, A_SETUP)
@@ -129,7 +129,7 @@ def parse_setup(text: str, path: str | os.PathLike[str], lines: bool = False) ->
             )
         ),
     ]
-    # Values are compared with each other once each is valid by itself.
+    # Values are compared with each other only if each is valid.
     problems = problems or [*_contradictions(path, values), *contradictions(path, values)]
     if problems:
         raise InputError.gather(problems)
@@ -140,20 +140,20 @@ def parse_setup(text: str, path: str | os.PathLike[str], lines: bool = False) ->
 
 
 def update_setup(path: str | os.PathLike[str], values: Mapping[str, Mapping[str, object]]) -> None:
-    """Set keys of a setup file; everything else, comments included, stays as it was.
+    """Set keys of a setup file; everything else, including comments, is left unchanged.
 
-    The file, and sections it lacks, are made. Values go in as they are: read the file back to
-    know what is still missing or wrong.
+    The file and missing sections are created. Values are not checked: read the file back to find
+    what is still missing or wrong.
 
     Parameters
     ----------
     values
-        Section → key → value; None takes the key out.
+        Section → key → value; None removes the key.
 
     Raises
     ------
     InputError
-        If there is a file that is not TOML, or it cannot be written.
+        If the file exists and is not TOML, or cannot be written.
     """
     path = Path(path)
     text = updated_setup(read_text(path, A_SETUP) if path.exists() else "", path, values)
@@ -168,8 +168,8 @@ def updated_setup(
 ) -> str:
     """Text of a setup with keys set; ``path`` is for errors. See `update_setup`.
 
-    A calibrated value that is changed without its standard uncertainty loses it: what a
-    calibration found is not known of another value.
+    If a calibrated value is changed without its standard uncertainty, the uncertainty is removed:
+    it applies only to the value found by the calibration.
     """
     try:
         document = tomlkit.parse(text)
@@ -203,7 +203,7 @@ _SHARED = {
 
 
 def pattern_kind(text: str) -> str:
-    """Kind of pattern that the text of a setup has, which may lack anything else."""
+    """Kind of pattern in the text of a setup, which may be incomplete."""
     try:
         keys = tomlkit.parse(text).unwrap().get("pattern")
     except (tomlkit.exceptions.TOMLKitError, ValueError, RecursionError):
@@ -213,7 +213,7 @@ def pattern_kind(text: str) -> str:
 
 
 def lens_of(text: str) -> Lens | None:
-    """Lens that the text of a setup has, which may lack anything else; None where it has none."""
+    """Lens in the text of a setup, which may be incomplete; None if there is none."""
     try:
         keys = tomlkit.parse(text).unwrap().get("camera_lens")
     except (tomlkit.exceptions.TOMLKitError, ValueError, RecursionError):
@@ -228,16 +228,16 @@ def lens_of(text: str) -> Lens | None:
 
 
 def checked_setup(text: str, path: str | os.PathLike[str], check: BenchCheck, date: str) -> str:
-    """Text of a setup file with the outcome of a bench check in it; ``path`` is for errors.
+    """Enter the results of a bench check into the text of a setup file; ``path`` is for errors.
 
     Raises
     ------
     InputError
-        If the text is no valid setup, or another one than the check was made with; or if a quantity
-        has become impossible.
+        If the text is not a valid setup, differs from the setup of the check, or a quantity has
+        become impossible.
     """
     if not same_setup(check.before, parse_setup(text, Path(path)).rig):
-        changed = "changed since the pictures were checked with it"
+        changed = "changed since the check of the pictures"
         raise InputError(path, "set-up", changed, "the set-up of the check: check it again")
     values = parse_toml(text, Path(path), A_SETUP)
     made = updated_setup(text, path, _keeping_sigmas(check_values(check, values, date), values))
@@ -246,14 +246,14 @@ def checked_setup(text: str, path: str | os.PathLike[str], check: BenchCheck, da
 
 
 def unchecked_setup(text: str, path: str | os.PathLike[str]) -> str:
-    """Text of a setup file as it was before its bench check; what was changed since then stays.
+    """Text of a setup file from before its bench check, keeping the changes made since.
 
-    A new check begins with it, or the former one's pictures would count twice.
+    A new check starts from it; otherwise the pictures of the earlier check would count twice.
 
     Raises
     ------
     InputError
-        If the text is no valid setup.
+        If the text is not a valid setup.
     """
     parse_setup(text, Path(path))
     now = parse_toml(text, Path(path), A_SETUP)
@@ -268,7 +268,7 @@ def unchecked_setup(text: str, path: str | os.PathLike[str]) -> str:
 def _keeping_sigmas(
     values: Mapping[str, Mapping[str, object]], now: Mapping[str, Any]
 ) -> dict[str, dict[str, object]]:
-    """Values to set, with the uncertainties that a file has: they hold again without the check."""
+    """Values to set, with the uncertainties in the file, which apply again without the check."""
     return {
         section: {k: v for k, v in now.get(section, {}).items() if k.endswith(ENDINGS)} | dict(keys)
         for section, keys in values.items()
@@ -321,7 +321,7 @@ def _pattern(keys: Mapping[str, Any]) -> DotPattern:
 
 
 def _contradictions(path: Path, values: dict[str, Any]) -> list[InputError]:
-    """Problems of values that are valid by themselves and contradict each other."""
+    """Problems of values that are each valid but contradict each other."""
     pattern, angle = values["pattern"], values["laser"]["projection_angle_deg"]
     of_pattern = _steep_lines if pattern.get("kind") == LINES else _steep_rays
     problems = of_pattern(path, pattern, angle)
@@ -349,7 +349,7 @@ def _contradictions(path: Path, values: dict[str, Any]) -> list[InputError]:
 
 
 def _steep_rays(path: Path, pattern: dict[str, Any], angle: float) -> list[InputError]:
-    """Find what is wrong with dots: rays that are no rays of theirs, and too large a fan."""
+    """Find problems of a dot pattern: rays that it does not have, and too large a fan."""
     rows, columns = pattern["rows"], pattern["columns"]
     step = pattern["inter_beam_angle_deg"]
     problems = _rays_beyond(path, pattern)
@@ -387,7 +387,7 @@ def _steep_lines(path: Path, pattern: dict[str, Any], angle: float) -> list[Inpu
 
 
 def _rays_beyond(path: Path, pattern: dict[str, Any]) -> list[InputError]:
-    """Find rays that are named and lie beyond the pattern's rows and columns."""
+    """Find named rays that lie beyond the pattern's rows and columns."""
     rows, columns = pattern["rows"], pattern["columns"]
     return [
         InputError(
@@ -400,7 +400,7 @@ def _rays_beyond(path: Path, pattern: dict[str, Any]) -> list[InputError]:
 
 
 def _nearly_one_line(path: Path, keys: dict[str, Any]) -> list[InputError]:
-    """Find axes that no camera in front of the plane can see so close together."""
+    """Find axes that are closer together in the picture than a camera can see them."""
     if "homography" in keys:
         return []
     x_arm, z_arm = (

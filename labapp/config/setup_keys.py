@@ -24,7 +24,7 @@ from labapp.core.geometry.uncertainty import QUANTITIES
 _LENGTH = between(0, LARGEST_MM, "mm")
 _PLACE = between(-LARGEST_MM, LARGEST_MM, "mm")
 _COUNT = Rule(
-    "an odd whole number from 3 to 99, so that there is a centre",
+    "an odd whole number from 3 to 99, for a pattern with a centre",
     lambda value: type(value) is int and 3 <= value <= 99 and value % 2 == 1,
 )
 _TILT = between(-90, 90, "degrees", required=False)
@@ -33,7 +33,7 @@ _LARGEST_SIGMA = {"mm": LARGEST_MM, "°": 90.0, "px": 1e4, "%": 100.0, "": 4.0}
 
 
 def _sigmas(section: str) -> dict[str, Rule]:
-    """Keys of standard uncertainties in a section; where one is not given, a usual one is taken."""
+    """Keys of standard uncertainties in a section; a typical value replaces a missing one."""
     own = (one for one in QUANTITIES if one.key.startswith(f"{section}."))
     return {
         one.sigma_key.partition(".")[2]: within(0, _LARGEST_SIGMA[one.unit], one.unit)
@@ -190,11 +190,11 @@ SECTIONS = {
 """Every section and key; `image_calibration` holds the keys of one of its two forms."""
 
 OPTIONAL = ("camera_lens", "torch", "bench_check")
-"""Sections that need not be there."""
+"""Optional sections."""
 
 
 def rules_for(section: str, keys: object) -> dict[str, Rule]:
-    """Rules of a section, given the keys it holds.
+    """Rules for a section, given its keys.
 
     A homography replaces the three points; only a pattern of measured rays has these, and a line
     pattern has keys of its own.

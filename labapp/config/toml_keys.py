@@ -16,19 +16,19 @@ import numpy as np
 from labapp.errors import InputError
 
 LARGEST_MM = 10_000.0
-"""Lengths above this are taken for an input error of the unit."""
+"""Lengths above this are taken for an error in the unit."""
 
 LARGEST = 1e9
-"""Numbers of any kind above this are no measurement."""
+"""Upper limit of numbers of any kind."""
 
 
 def read_text(path: Path, wanted: str) -> str:
-    """Text of a file, UTF-8; ``wanted`` is what it should be, for the error.
+    """Read a UTF-8 text file; ``wanted`` is the expected content, for the error.
 
     Raises
     ------
     InputError
-        If it cannot be read, or is no text.
+        If the file cannot be read or is not text.
     """
     try:
         return path.read_bytes().decode("utf-8-sig")
@@ -39,12 +39,12 @@ def read_text(path: Path, wanted: str) -> str:
 
 
 def parse_toml(text: str, path: Path, wanted: str) -> dict[str, Any]:
-    """Tables of a file that was read from ``path``.
+    """Parse the text of a file that was read from ``path``.
 
     Raises
     ------
     InputError
-        If it is not TOML.
+        If the text is not TOML.
     """
     try:
         return tomllib.loads(text)
@@ -53,7 +53,7 @@ def parse_toml(text: str, path: Path, wanted: str) -> dict[str, Any]:
 
 
 def _syntax(text: str, error: Exception, wanted: str) -> tuple[str, str]:
-    """What stands on the line of a syntax error, and what would be right."""
+    """The line of a syntax error and what was expected."""
     place = _PLACE.search(str(error))
     lines = text.splitlines()
     if place is None or not 0 < int(place[1]) <= len(lines):
@@ -82,11 +82,11 @@ class Rule:
     """Rule for the value of a key."""
 
     expected: str
-    """What is right, in words, completing "expected …"."""
+    """The permitted values, as a phrase that completes "expected …"."""
     accepts: Callable[[object], bool]
-    """Whether a value as TOML gives it is right."""
+    """Function that tells whether a TOML value is permitted."""
     required: bool = True
-    """Whether the key must be there."""
+    """Whether the key is required."""
 
 
 def is_number(value: object) -> TypeGuard[float]:
@@ -135,13 +135,13 @@ def check_keys(
     Parameters
     ----------
     table
-        Its full name.
+        Full name of the table.
     keys
-        What was found there, a table or not; None: nothing.
+        Value found, a table or not; None if there is none.
     rules
-        Key → what it may hold.
+        Key → rule for its value.
     form
-        How the table is written; ``[table]`` unless given.
+        Notation of the table; ``[table]`` by default.
     """
     if not isinstance(keys, dict):
         needed = ", ".join(key for key, rule in rules.items() if rule.required)
@@ -171,9 +171,9 @@ def unknown_key(path: Path, full: str, known: Mapping[str, object]) -> InputErro
 
 
 def shown(value: object) -> str:
-    """A value as TOML writes it."""
+    """A value in TOML notation."""
     try:
         text = json.dumps(value, default=str, ensure_ascii=False)
     except (ValueError, RecursionError):
-        return "a number of thousands of digits, or too deep a list"
+        return "a number with thousands of digits or a list nested too deeply"
     return text.replace("NaN", "nan").replace("Infinity", "inf")

@@ -1,1 +1,1 @@
-"""What is written of results: tables, meshes, HDF5, pictures, films, whole folders of them."""
+"""Export of results: tables, meshes, HDF5, pictures, films, and folders of all these."""

@@ -1,4 +1,4 @@
-"""The pool over time: from results to `Dynamics`, tables, pictures, a film of one mode."""
+"""Dynamics of the pool: analysis of results, tables, pictures, a film of one mode."""
 
 from __future__ import annotations
 
@@ -34,33 +34,33 @@ FIGURES = (
 )
 
 FILM_FRAMES, FILM_HZ, FILM_PERIODS = 48, 24.0, 3
-"""Pictures of a period in a film of one mode, pictures a second, periods."""
+"""Pictures per period in a film of one mode, pictures per second, periods."""
 
 FILM_SWING = 0.3
-"""Amplitude in it, as a share of the pool's largest height."""
+"""Amplitude in the film, as a fraction of the pool's largest height."""
 
 Measured = tuple[int, float, Surface, Boundary, Mapping[str, float]]
 """Frame, time (s), surface, boundary, and sizes by name."""
 
 
 def measured_of(results: Iterable[FrameResult]) -> Iterator[Measured]:
-    """Frames that have a surface.
+    """Yield the frames that have a surface.
 
     Raises
     ------
     InputError
-        If one has no time.
+        If one of them has no time.
     """
     for one in results:
-        made, sizes = one.measurement.reconstruction, one.measurement.measures
-        if made is not None and sizes is not None:
+        found, sizes = one.measurement.reconstruction, one.measurement.measures
+        if found is not None and sizes is not None:
             if one.time_s is None:
                 raise no_time_base()
-            yield one.frame, one.time_s, made.unbounded, made.boundary, vars(sizes)
+            yield one.frame, one.time_s, found.unbounded, found.boundary, vars(sizes)
 
 
 def no_time_base() -> InputError:
-    """Why frames without times have no frequencies."""
+    """Return the error for frames without times, which have no frequencies."""
     right = "a recording that has a time base: import it with a frame rate"
     return InputError("dynamics", "time", "unknown", right)
 
@@ -70,21 +70,21 @@ def dynamics_of(
     signals: Mapping[str, tuple[FloatArray, FloatArray]] | None = None,
     settings: DynamicsSettings | None = None,
 ) -> Dynamics:
-    """Analyse how the pool changes over a recording.
+    """Analyse the dynamics of the pool over a recording.
 
     Parameters
     ----------
     measured
-        Frames with a surface, in their order (`measured_of`); they are taken one by one.
+        Frames with a surface, in order (`measured_of`); consumed one by one.
     signals
-        Name → times on the recording's clock, s, and values.
+        Name → times in the recording, s, and values.
     settings
         None: the defaults.
 
     Raises
     ------
     InputError
-        If there are too few frames, or a name or segment is none.
+        If there are too few frames, or a name or the segment is invalid.
     """
     chosen = settings or DynamicsSettings()
     if chosen.of not in WITH_SIGMA:
@@ -93,16 +93,16 @@ def dynamics_of(
     sigmas: list[list[float]] = []
     parts = "height_sigma_setup_mm", *sigma_names("level")
 
-    def noted() -> Iterator[tuple[int, float, Surface, Boundary]]:
+    def collected() -> Iterator[tuple[int, float, Surface, Boundary]]:
         for frame, time_s, surface, boundary, sizes in measured:
             shape = [sizes.get(name, np.nan) for name in SHAPES]
-            if not np.isfinite(shape).all():  # of a version without them
+            if not np.isfinite(shape).all():  # results of an older version
                 shape = shape_of(surface, boundary).tolist()
             rows.append([*(sizes[name] for name in SIZES), *shape])
             sigmas.append([sizes.get(name, np.nan) for name in parts])
             yield frame, time_s, surface, boundary
 
-    surfaces = SurfaceSeries.of(noted())
+    surfaces = SurfaceSeries.of(collected())
     series = dict(zip(WITH_SIGMA, np.array(rows).reshape(-1, len(WITH_SIGMA)).T, strict=True))
     highest = max(np.max(np.abs([series["height_mm"], series["depth_mm"]]), initial=0), 1e-9)
     setup, *level = (
@@ -120,7 +120,7 @@ def dynamics_of(
 
 
 def dynamics_tables(found: Dynamics) -> dict[str, str]:
-    """Tables by file name, CSV."""
+    """Return the tables as CSV, by file name."""
     courses = [
         (f"{one.name} {k}".replace(" 0", ""), one.coefficient_mm[:, k])
         for one in found.all_modes
@@ -174,10 +174,10 @@ def _response_rows(found: Dynamics) -> Iterator[list[str]]:
     names = [f"{name}{part}" for name in QUANTITIES for part in ("", "_sigma")]
     yield ["signal", "series", "step_s", "signal_change", "order", "before", *names]
     for one in found.responses:
-        step, made = one.step, one.response
-        pairs = [_cell(of[name]) for name in QUANTITIES for of in (made.value, made.sigma)]
+        step, fit = one.step, one.response
+        pairs = [_cell(of[name]) for name in QUANTITIES for of in (fit.value, fit.sigma)]
         where = [one.signal, one.series, _cell(step.time_s), _cell(step.change)]
-        yield [*where, str(made.order), _cell(made.before), *pairs]
+        yield [*where, str(fit.order), _cell(fit.before), *pairs]
 
 
 def _mode_row(one: ModeCourse) -> list[str]:
@@ -200,11 +200,11 @@ def _cell(value: float) -> str:
 
 
 def draw_spectrogram(plot: Any, found: Dynamics) -> None:
-    """Spectrogram in dB with the tracked peak, on a plot of matplotlib."""
+    """Draw the spectrogram in dB with the tracked peak, on Matplotlib axes."""
     gram = found.spectrogram
     db = 10 * np.log10(np.maximum(gram.density.T, 1e-30))
     low, high = np.nanpercentile(db, [20, 100])
-    # Segments overlap by half, so that each shows the middle of its own.
+    # Segments overlap by half: each is drawn as its middle half.
     width = gram.segment_s / (2 if len(gram.time_s) > 1 else 1)
     times = np.append(gram.time_s, gram.time_s[-1] + width) - width / 2
     step = gram.frequency_hz[0]
@@ -226,7 +226,7 @@ def density_label(name: str) -> str:
 
 
 def draw_spectrum(plot: Any, found: Dynamics) -> None:
-    """Mean spectrum with its 95 % interval."""
+    """Draw the mean spectrum with its 95 % interval."""
     mean = found.spectrogram.mean()
     plot.fill_between(mean.frequency_hz, mean.low, mean.high, alpha=0.3, linewidth=0)
     plot.semilogy(mean.frequency_hz, mean.density)
@@ -235,7 +235,7 @@ def draw_spectrum(plot: Any, found: Dynamics) -> None:
 
 
 def draw_series(plot: Any, found: Dynamics, name: str) -> None:
-    """One series with its events, the steps of signals and the fitted responses."""
+    """Draw a series with its events, the steps of signals and the fitted responses."""
     plot.plot(found.surfaces.time_s, found.series[name], ".", markersize=2, color="0.5")
     for event in found.events.get(name, ()):
         plot.axvline(event.time_s, color="C1", linewidth=0.8)
@@ -247,14 +247,14 @@ def draw_series(plot: Any, found: Dynamics, name: str) -> None:
 
 
 def draw_mode(plot: Any, found: Dynamics, one: ModeCourse, turn: float = 0.0) -> None:
-    """Height of a mode from above at a part of its period: 0, the crest."""
+    """Draw the height of a mode from above, at a fraction of its period after the crest."""
     shape = mode_heights(one, turn)
     closed = _closed(found.surfaces.nodes_mm), _closed(shape[:, None])
     (x, y), z = np.moveaxis(closed[0], -1, 0), closed[1][..., 0]
     plot.contourf(x, y, z, np.linspace(-1.05, 1.05, 22), cmap="RdBu_r")
     plot.set(aspect="equal", xlabel="X (mm)")
     figures = one.figures
-    text = "no oscillation stands out"
+    text = "no significant oscillation"
     if figures:
         hertz, mm = figures["frequency_hz"], figures["amplitude_mm"]
         text = f"{hertz[0]:.2f} ± {hertz[1]:.2g} Hz\n{1e3 * mm[0]:.1f} ± {1e3 * mm[1]:.1f} µm"
@@ -262,7 +262,7 @@ def draw_mode(plot: Any, found: Dynamics, one: ModeCourse, turn: float = 0.0) ->
 
 
 def dynamics_pictures(found: Dynamics) -> dict[str, Figure]:
-    """Pictures by name: ``dynamics`` and ``modes``."""
+    """Return the figures by name: ``dynamics`` and ``modes``."""
     from matplotlib import rc_context
 
     from labapp.studies.plotting import INCHES, STYLE, new_figure
@@ -281,7 +281,7 @@ def dynamics_pictures(found: Dynamics) -> dict[str, Figure]:
 
 
 def dynamics_files(found: Dynamics) -> dict[str, bytes]:
-    """Tables (CSV) and pictures (PNG) by file name."""
+    """Return tables (CSV) and pictures (PNG) by file name."""
     from labapp.studies.plotting import as_bytes
 
     tables = {name: text.encode() for name, text in dynamics_tables(found).items()}
@@ -290,7 +290,7 @@ def dynamics_files(found: Dynamics) -> dict[str, bytes]:
 
 
 def mode_heights(one: ModeCourse, turn: float) -> FloatArray:
-    """Heights of a mode at the nodes at a part of its period, of amplitude 1, shape (k,)."""
+    """Return a mode of amplitude 1 at the k nodes, at a fraction of its period, shape (k,)."""
     if not one.oscillations:
         return np.asarray(one.shape[0] * np.cos(2 * np.pi * turn))
     amplitude = one.oscillations[0].amplitude / one.figures["amplitude_mm"][0]
@@ -299,7 +299,7 @@ def mode_heights(one: ModeCourse, turn: float) -> FloatArray:
 
 
 def mode_scenes(found: Dynamics, one: ModeCourse) -> Iterator[Scene]:
-    """Scenes of one period of a mode on the mean surface, its amplitude enlarged."""
+    """Yield scenes of one period of a mode on the mean surface, with enlarged amplitude."""
     from labapp.export.rendering.scene import scene_of
 
     mean, figures = found.surfaces.mean_mm, one.figures
@@ -334,7 +334,7 @@ def write_mode_film(path: Path, found: Dynamics, name: str) -> None:
     Raises
     ------
     InputError
-        If there is no such mode, or pictures in 3-D cannot be drawn.
+        If there is no such mode, or 3-D pictures cannot be drawn.
     """
     from labapp.export.rendering.film import write_video
     from labapp.export.rendering.studio import draw_there, drawing_errors, drawing_process
@@ -350,6 +350,6 @@ def write_mode_film(path: Path, found: Dynamics, name: str) -> None:
 
 
 def _closed(values: FloatArray) -> FloatArray:
-    """Values at the nodes on rings that close, shape (RINGS, SPOKES + 1, …)."""
+    """Arrange values at the nodes as closed rings, shape (RINGS, SPOKES + 1, …)."""
     rings = values.reshape(RINGS, SPOKES, -1)
     return np.concatenate([rings, rings[:, :1]], axis=1)

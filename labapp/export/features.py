@@ -1,4 +1,4 @@
-"""Features of many welds with their ±, and the penetration that sections tell: CSV and MATLAB."""
+"""Tables of weld features with ±, and penetration measured on sections: CSV and MATLAB."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from labapp.files import as_bytes, write_file
 from labapp.text import csv_text
 
 LARGEST = 1 << 29
-"""Bytes of a table at most."""
+"""Largest table, bytes."""
 
 WANTED = "a table of features, as `labapp penetration table` writes it"
 
@@ -36,14 +36,14 @@ PARTS = ("noise", "level")
 
 
 def feature_sigmas(name: str, columns: Mapping[str, FloatArray]) -> tuple[FloatArray, FloatArray]:
-    """Noise and level in the ± of a feature, shape (n,) each; NaN where it has none.
+    """Return the σ of a feature from noise and from level, shape (n,) each; NaN if unknown.
 
     Parameters
     ----------
     name
         One of `WITH_SIGMA`.
     columns
-        Columns of `measures.csv`. Where parts of a ± are missing, all of it is taken for noise.
+        Columns of `measures.csv`. If parts of the ± are missing, all of it counts as noise.
     """
 
     def part(which: str) -> FloatArray:
@@ -58,7 +58,7 @@ def feature_sigmas(name: str, columns: Mapping[str, FloatArray]) -> tuple[FloatA
 def weld_series(
     name: str, time_s: FloatArray, columns: Mapping[str, FloatArray], features: Sequence[str]
 ) -> WeldSeries:
-    """Features of a recording from the columns of its sizes and shape; no section is known."""
+    """Return features of a recording from the columns of `measures.csv`, without sections."""
     value = np.column_stack([columns[each] for each in features]).astype(float)
     sigmas = [feature_sigmas(each, columns) for each in features]
     noise, level = (np.column_stack(of) for of in zip(*sigmas, strict=True))
@@ -69,7 +69,13 @@ def weld_series(
 def measured_series(
     name: str, measured: Iterable[Measured], features: Sequence[str] = WITH_SIGMA
 ) -> WeldSeries:
-    """Features of a session or a folder of results (`export.dynamics.Measured`)."""
+    """Return features of the frames of a session or a results folder.
+
+    Raises
+    ------
+    InputError
+        If no frame has a surface.
+    """
     times: list[float] = []
     rows: list[dict[str, float]] = []
     for _, time_s, _, _, sizes in measured:
@@ -83,16 +89,16 @@ def measured_series(
 
 @dataclass(frozen=True)
 class FeatureTable:
-    """Features of welds, and their penetration where sections or scans tell it."""
+    """Features of welds, and their penetration measured on sections or scans."""
 
     features: tuple[str, ...]
     """Some of `WITH_SIGMA`."""
     target: str
-    """Name of the penetration, such as ``back_width_mm``; empty if no section is known."""
+    """Name of the penetration, such as ``back_width_mm``; empty without sections."""
     welds: tuple[WeldSeries, ...]
 
     def chosen(self, features: Sequence[str]) -> Self:
-        """Return the table with some of its features, in their order.
+        """Return the table with some of its features, in the given order.
 
         Raises
         ------
@@ -121,7 +127,7 @@ class FeatureTable:
         settings: ModelSettings,
         progress: Callable[[int, int], object] = lambda _done, _of: None,
     ) -> tuple[PenetrationModel, LeftOut]:
-        """Fit a model, and predict each weld by one of the other welds.
+        """Fit a model, and cross-validate it by leaving out one weld at a time.
 
         Parameters
         ----------
@@ -129,9 +135,9 @@ class FeatureTable:
             ``arx``: linear, with explicit orders; ``gp``: a Gaussian process, which needs the extra
             ``models``.
         settings
-            Its features, target, orders, and when penetration is full.
+            Features, target, orders, and threshold of full penetration.
         progress
-            Called with how many fits are done, and of how many; may raise to stop.
+            Called with the number of fits done and the total; may raise to stop.
 
         Raises
         ------
@@ -154,7 +160,7 @@ class FeatureTable:
         Raises
         ------
         InputError
-            If it cannot be written, or the suffix is another.
+            If it cannot be written, or has another suffix.
         """
         path = Path(path)
         suffix = path.suffix.lower()
@@ -176,7 +182,7 @@ class FeatureTable:
         write_file(path, content.getvalue())
 
     def _columns(self) -> dict[str, FloatArray]:
-        """The columns of numbers, of all welds."""
+        """Return the numeric columns of all welds."""
 
         def joined(of: str) -> FloatArray:
             return np.concatenate([getattr(one, of) for one in self.welds])
@@ -199,7 +205,7 @@ class FeatureTable:
         Raises
         ------
         InputError
-            If it is none.
+            If it is not such a table.
         """
         path = Path(path)
         read = read_columns(path, WANTED, LARGEST, ("recording",))
@@ -226,7 +232,7 @@ def _welds(
     features: Sequence[str],
     target: str,
 ) -> Iterator[WeldSeries]:
-    """Series of each recording, from the rows of a table."""
+    """Yield the series of each recording, from the rows of a table."""
     unknown = np.full(len(names), np.nan)
     of = np.array(names)
     for name in dict.fromkeys(names):
@@ -247,12 +253,12 @@ def _welds(
 
 
 def as_cell(value: float) -> str:
-    """A number as a cell of a table; empty where unknown."""
+    """Format a number as a cell of a table; empty if unknown."""
     return f"{value:.7g}" if np.isfinite(value) else ""
 
 
 def needs_extra(package: str) -> InputError:
-    """Why a model cannot be fitted or written here."""
+    """Return the error for a missing package of the extra ``models``."""
     return InputError(
-        "penetration", package, "is not installed", "pip install 'labapp[models]', which brings it"
+        "penetration", package, "is not installed", "this package: pip install 'labapp[models]'"
     )

@@ -1,4 +1,4 @@
-"""Decimal text of arrays of numbers, compiled: a sequence writes every frame's tables in time."""
+"""Compiled formatting of arrays as decimal text, fast enough for the tables of every frame."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from labapp.core.compiled import compiled
 from labapp.core.values import FloatArray, IntArray
 
 LARGEST, ROUNDED = 2.0**50, 4e-16
-"""Scaled to an integer, a number above `LARGEST`, or nearer to a tie than `ROUNDED` times itself,
-may be rounded the wrong way here."""
+"""A scaled number above `LARGEST`, or closer to a tie than `ROUNDED` times its value, might be
+rounded incorrectly."""
 
 LONGEST = 24
 """Most characters of a number: sign, digits, point and comma."""
@@ -34,9 +34,9 @@ def format_fixed(values: FloatArray, digits: IntArray) -> tuple[npt.NDArray[np.u
     Returns
     -------
     text, length
-        Buffer of ASCII bytes, and how many are used; −1 if a number may be rounded wrongly.
+        Buffer of ASCII bytes, and the number used; −1 if a number might be rounded incorrectly.
     """
-    text, own = np.empty(values.size * LONGEST, np.uint8), np.empty(LONGEST, np.uint8)
+    text, reverse = np.empty(values.size * LONGEST, np.uint8), np.empty(LONGEST, np.uint8)
     at, scale, ten = 0, 10.0**digits, np.uint64(10)
     for row in range(values.shape[0]):
         for column in range(values.shape[1]):
@@ -53,10 +53,10 @@ def format_fixed(values: FloatArray, digits: IntArray) -> tuple[npt.NDArray[np.u
                 count = 0
                 while left > 0 or count <= digits[column]:
                     tenth = left // ten
-                    own[count] = 48 + np.uint8(left - ten * tenth)
+                    reverse[count] = 48 + np.uint8(left - ten * tenth)
                     left, count = tenth, count + 1
                 for k in range(count - 1, -1, -1):
-                    text[at] = own[k]
+                    text[at] = reverse[k]
                     at += 1
                     if k == digits[column] and k > 0:
                         text[at] = 46  # the point

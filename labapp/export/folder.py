@@ -1,8 +1,7 @@
-"""Export of many frames into one folder with a manifest, atomically.
+"""Atomic export of many frames into one folder with a manifest.
 
-The folder is written beside its place, as ``.NAME.….part``, and renamed when it is complete. An
-earlier export is replaced then and not before, and only if it is unchanged: files of others are
-never deleted.
+The folder is written as ``.NAME.….part`` beside the target, and renamed when it is complete. Only
+then is an earlier export replaced, and only if it is unchanged: other files are never deleted.
 """
 
 from __future__ import annotations
@@ -51,7 +50,7 @@ OLD = ".old"
 PICTURES = ("frames", "surfaces", "trends", "film")
 
 SIZES_PX = range(320, 3841, 2)
-"""Widths and heights that pictures of surfaces can have: a film's are even."""
+"""Allowed widths and heights of surface pictures; those of a film must be even."""
 
 UNITS = (
     "lengths in mm, angles in degrees, times in s, places in a frame in px; see the column names"
@@ -60,48 +59,48 @@ UNITS = (
 LARGEST_MANIFEST = 1 << 28
 
 AN_EXPORT = "a folder that labapp exported"
-ROOM = "a folder that can be written, with room on its disk; what was there is as it was"
-OWN_FOLDER = "a new or empty folder, or an earlier export that was not changed (it is replaced)"
+ROOM = "a writable folder with enough disk space; the former content is unchanged"
+OWN_FOLDER = "a new or empty folder, or an unchanged earlier export (it is replaced)"
 
 
 @dataclass(frozen=True)
 class ExportChoice:
-    """Choice of what an export contains.
+    """Contents of an export.
 
     Raises
     ------
     InputError
-        If there is no such choice.
+        If a value is invalid.
     """
 
     tables: frozenset[str] = frozenset(TABLES)
-    """Which tables as CSV: some of ``measures``, ``dots``, ``points``, ``boundary``."""
+    """Tables as CSV: some of ``measures``, ``dots``, ``points``, ``boundary``."""
     surfaces: frozenset[str] = frozenset(SURFACES)
-    """How to write each surface: some of `SURFACE_FORMATS`."""
+    """Formats of each surface: some of `SURFACE_FORMATS`."""
     solid: bool = False
-    """Whether to add each surface as a watertight body, in the mesh formats of `surfaces`."""
+    """Whether to add each surface as a watertight solid, in the mesh formats of `surfaces`."""
     hdf5: bool = False
     """Short for ``hdf5`` in `together`."""
     pictures: frozenset[str] = frozenset()
     """Some of ``frames`` (dots over each frame), ``surfaces`` (each in 3-D), ``trends`` and
-    ``film`` (the surfaces, one after the other in one view and on one colour scale).
+    ``film`` (all surfaces in the same view and on the same colour scale).
     """
     spacing_mm: float = SPACING_MM
-    """Distance of the surfaces' nodes, mm."""
+    """Distance between the surfaces' nodes, mm."""
     view: Direction = "free"
-    """Where surfaces are looked at from, in pictures and the film: ``free`` (obliquely), ``top``,
-    ``side`` or ``front``.
+    """View of surfaces in pictures and the film: ``free`` (oblique), ``top``, ``side`` or
+    ``front``.
     """
     size_px: tuple[int, int] = PICTURE_PX
     """Width and height of these, even, px."""
     film_rate_hz: float | None = None
-    """Frames of the film a second; None: as fast as they were recorded (`film.film_times`)."""
+    """Frame rate of the film, Hz; None: that of the recording (`film.film_times`)."""
     together: frozenset[str] = frozenset()
-    """How to write everything into one file: some of `RUN_FORMATS`."""
+    """Formats with everything in one file: some of `RUN_FORMATS`."""
     picture_format: str = "png"
-    """Of pictures of frames: ``png``, ``jpg`` or ``tif``."""
+    """Format of pictures of frames: ``png``, ``jpg`` or ``tif``."""
     sigma_parts: bool = False
-    """Whether `measures.csv` has the parts of standard uncertainties, too."""
+    """Whether `measures.csv` also has the parts of standard uncertainties."""
 
     def __post_init__(self) -> None:
         allowed: dict[str, Collection[str]] = {
@@ -135,7 +134,7 @@ class ExportChoice:
 
     @property
     def run_formats(self) -> list[RunFormat]:
-        """How everything is written into one file."""
+        """The chosen formats with everything in one file."""
         chosen = self.together | {"hdf5"} if self.hdf5 else self.together
         return [each for name, each in RUN_FORMATS.items() if name in chosen]
 
@@ -144,8 +143,8 @@ class ExportChoice:
 class ExportedFile:
     """A file of an export, as its manifest lists it.
 
-    ``size`` is in bytes, ``sha256`` in hex; ``rows`` of a CSV file, its header not counted, else
-    None.
+    ``size`` is in bytes, ``sha256`` in hex; ``rows`` is the number of rows of a CSV file without
+    its header, else None.
     """
 
     name: str
@@ -165,25 +164,25 @@ def export(
     extras: Mapping[str, Callable[[], bytes]] | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> tuple[ExportedFile, ...]:
-    """Write results into a folder, atomically: on an error the former content stays.
+    """Write results into a folder atomically: on an error the folder is unchanged.
 
     Parameters
     ----------
     folder
-        Where to: a new or an empty folder, or an earlier export, which is replaced.
+        Destination: a new or an empty folder, or an earlier export, which is replaced.
     measured
-        What each frame gave; taken one at a time, and once more for a film.
+        Result of each frame; iterated once, and once more for a film.
     calibration
-        Pixel ↔ imaging plane, for the dots' places on the plane.
+        Pixel ↔ imaging plane, for the dots' positions on the plane.
     provenance
-        What manifest and files of all frames say of source, setup and settings; plain values.
+        Source, set-up and settings, for the manifest and for files of all frames; plain values.
     choice
-        What to write.
+        Contents of the export.
     image_of
         Reads a frame's grey levels; needed for pictures of frames.
     extras
-        Further files, name → what makes its content, once it is sure that the folder can be
-        written: a report.
+        Further files, such as a report: name → function that returns the content, called after the
+        check that the folder can be written.
     progress
         Called with the number of frames done, those of a film counted again; may raise to stop.
 
@@ -195,7 +194,7 @@ def export(
     Raises
     ------
     InputError
-        If the folder is somebody's own, or cannot be written, or a picture cannot be drawn.
+        If the folder has other contents or cannot be written, or a picture cannot be drawn.
     """
     target = Path(folder).resolve()
     if not target.name:
@@ -221,12 +220,12 @@ def export(
 
 
 def verify_export(folder: str | os.PathLike[str]) -> list[str]:
-    """Sentences on differences between a folder and its manifest; empty if there are none.
+    """Return sentences about differences between a folder and its manifest; empty if none.
 
     Raises
     ------
     InputError
-        If the folder has no manifest that can be read.
+        If the folder has no readable manifest.
     """
     folder = Path(folder)
     listed = {file.name: file for file in _manifest(folder)}
@@ -260,7 +259,7 @@ class _Files:
             self._rows[name] = content.count(b"\n") - 1
 
     def new(self, name: str) -> Path:
-        """Path of a new file."""
+        """Return the path of a new file."""
         path = self.folder / name
         if path.name != name or name.startswith("."):
             raise InputError(self.folder, "name", name, "a plain file name")
@@ -348,7 +347,7 @@ def _made() -> dict[str, object]:
 
 
 def _about(provenance: Mapping[str, object]) -> dict[str, object]:
-    """Attributes of a file of all frames: program and provenance, the setup as TOML text."""
+    """Return attributes of a file of all frames: program, provenance, the set-up as TOML text."""
     about = {**_made(), **provenance}
     setup = about.get("setup")
     if isinstance(setup, Mapping) and "toml" in setup:
@@ -365,7 +364,7 @@ def _draw_trend(path: Path, summary: Summary) -> None:
 
 @contextmanager
 def _beside(target: Path) -> Iterator[Path]:
-    """Temporary folder that replaces the target when the block ends without error."""
+    """Yield a temporary folder, which replaces the target unless the block raises."""
     target.parent.mkdir(parents=True, exist_ok=True)
     with _alone(target):
         _check_replaceable(target)
@@ -382,7 +381,7 @@ def _beside(target: Path) -> Iterator[Path]:
 
 @contextmanager
 def _alone(target: Path) -> Iterator[None]:
-    """Lock the target against a second export; clean up after one that was killed."""
+    """Lock the target against a second export, and clean up after a killed one."""
     path = target.with_name(f".{target.name}.lock")
     lock = FileLock(path)
     try:
@@ -392,26 +391,27 @@ def _alone(target: Path) -> Iterator[None]:
             target, "export", "is being written by another program", "to wait for it"
         ) from error
     except (OSError, NotImplementedError):
-        pass  # some network drives have no locks
+        pass  # some network drives do not support locks
     try:
         if lock.is_locked:
             _tidy(target)
         yield
     finally:
         if lock.is_locked:
-            # While it is held: who comes next makes a new one. Windows removes it at the release.
+            # Before the release, so that the next export creates a new file. Windows deletes it
+            # at the release.
             with suppress(OSError):
                 path.unlink()
             lock.release()
 
 
 def _tidy(target: Path) -> None:
-    """Delete what a killed export left; restore what it was about to replace."""
+    """Delete folders left by a killed export, or restore the folder it was replacing."""
     ours = re.compile(rf"\.{re.escape(target.name)}\.[0-9a-f]{{16}}\.(part|old)")
     for path in target.parent.iterdir():
         if not ours.fullmatch(path.name) or path.is_symlink() or not path.is_dir():
             continue
-        if path.suffix == OLD and not target.exists():  # ended between the two steps of `_swap`
+        if path.suffix == OLD and not target.exists():  # killed between the renames of `_swap`
             path.rename(target)
         else:
             shutil.rmtree(path, ignore_errors=True)
@@ -431,7 +431,7 @@ def _swap(part: Path, target: Path, old: Path) -> None:
 
 
 def _check_replaceable(target: Path) -> None:
-    """Raise if the target holds anything but an unchanged export."""
+    """Raise if the target contains anything but an unchanged export."""
     if not target.exists():
         return
     if not target.is_dir():
@@ -447,7 +447,7 @@ def _check_replaceable(target: Path) -> None:
 
 
 def _manifest(folder: Path) -> tuple[ExportedFile, ...]:
-    """The files that a folder's manifest lists."""
+    """Return the files that a folder's manifest lists."""
     path = folder / MANIFEST
     try:
         if not path.is_file() or path.stat().st_size > LARGEST_MANIFEST:
@@ -467,8 +467,8 @@ def _manifest(folder: Path) -> tuple[ExportedFile, ...]:
 
 
 def _synced(path: Path) -> str:
-    """SHA-256 of a file, once it is synced to the disk."""
-    with path.open("rb+") as file:  # to be written to: Windows syncs no other
+    """Flush a file to disk, and return its SHA-256."""
+    with path.open("rb+") as file:  # Windows can only flush files opened for writing
         os.fsync(file.fileno())
     return _sha256(path)
 

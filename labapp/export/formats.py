@@ -1,6 +1,6 @@
-"""Registry of export formats: an entry here, and a function or a class that writes the files.
+"""Registry of export formats; each entry names the function or class that writes the files.
 
-Commands and the Export page read the registry; a writer is loaded when it is used.
+Commands and the Export page read the registry; writers are imported on use.
 """
 
 from __future__ import annotations
@@ -20,28 +20,29 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SurfaceFormat:
-    """A format with a file for each frame that has a surface."""
+    """A format with one file per frame that has a surface."""
 
     end: str
-    """How the names of its files end, after ``surface_NNNNNN``."""
+    """End of its file names, after ``surface_NNNNNN``."""
     title: str
     tip: str
-    """What the Export page calls it, and what it is."""
+    """Name and description on the Export page."""
     of: Literal["mesh", "nodes"]
-    """What is written: ``mesh`` for triangles (`meshes.Mesh`), which can be a watertight body too;
-    ``nodes`` for the points of a grid within the boundary, shape (n, 3), mm.
+    """Data: ``mesh`` for triangles (`meshes.Mesh`), which can also be a watertight solid; ``nodes``
+    for the points of a grid within the boundary, shape (n, 3), mm.
     """
     writer: str
-    """``module:function`` in this package: makes the file's bytes from the mesh or the nodes."""
+    """``module:function`` in this package, which returns the file's content for the mesh or nodes.
+    """
 
     def content(self, shape: object) -> bytes:
-        """Content of the file for a mesh, or for nodes."""
+        """Return the content of the file for a mesh or for nodes."""
         content: bytes = _load(self.writer)(shape)
         return content
 
 
 class RunWriter(Protocol):
-    """Writes a run into one file, frame by frame; complete when its ``with`` ends without error."""
+    """Context manager that writes a run into one file, frame by frame."""
 
     def write(
         self, frame: int, tables: Mapping[str, Table], reconstruction: Reconstruction | None
@@ -57,16 +58,16 @@ class RunFormat:
     file: str
     title: str
     tip: str
-    """What the Export page calls it, and what it is."""
+    """Name and description on the Export page."""
     writer: str
-    """``module:Class`` in this package: a `RunWriter`, made from the file's path, what is to be
-    said of its source, and the distance of the surfaces' nodes in mm.
+    """``module:Class`` in this package: a `RunWriter`, whose arguments are the file's path, its
+    provenance, and the distance between the surfaces' nodes in mm.
     """
 
     def open(
         self, path: str | os.PathLike[str], about: Mapping[str, object], spacing_mm: float
     ) -> AbstractContextManager[RunWriter]:
-        """Writer of the file; see ``writer``."""
+        """Return a writer of the file; see ``writer``."""
         opened: AbstractContextManager[RunWriter] = _load(self.writer)(
             Path(path), about, spacing_mm
         )
@@ -88,7 +89,7 @@ SURFACE_FORMATS: dict[str, SurfaceFormat] = {
     "ply": SurfaceFormat(".ply", "PLY", "Triangles for mesh programs, mm", "mesh", "meshes:ply"),
     "vtp": SurfaceFormat(".vtp", "VTP", "Triangles for ParaView, mm", "mesh", "meshes:vtp"),
 }
-"""By the words of ``--surfaces``."""
+"""Formats by their names in ``--surfaces``."""
 
 RUN_FORMATS: dict[str, RunFormat] = {
     "hdf5": RunFormat(
@@ -98,11 +99,11 @@ RUN_FORMATS: dict[str, RunFormat] = {
         "hdf5:Hdf5Writer",
     ),
 }
-"""By the words of ``--together``."""
+"""Formats by their names in ``--together``."""
 
 
 def mesh_formats() -> list[str]:
-    """Names of the surface formats that hold triangles."""
+    """Return the names of the surface formats with triangles."""
     return [name for name, each in SURFACE_FORMATS.items() if each.of == "mesh"]
 
 

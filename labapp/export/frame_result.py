@@ -1,4 +1,4 @@
-"""The result of one frame, from what measures it to all that stores, writes or shows it."""
+"""The result of one frame, passed from measurers to storage, exports and the app."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ class FrameResult:
     measurement: Measurement
     """Status, reason, measures, and what they were computed from."""
     track_lost: str | None = None
-    """Why it was not measured from the frame before; None if it was, or was not to be."""
+    """Why it was not tracked from the previous frame; None if it was, or tracking was off."""
     rows: Mapping[str, str] | None = None
-    """Its rows of each table as CSV text (`tables.table_rows`); None: not made yet."""
+    """Its rows of each table as CSV text (`tables.table_rows`); None: not computed yet."""
     residuals: Residuals | None = None
-    """Its residuals, where the measurement no longer has them."""
+    """Its residuals, if these were removed from the measurement."""
     setup_doubt: str = ""
-    """Why the set-up is doubtful, as far as the frames so far show it; empty if it is not."""
+    """Why the set-up is doubtful according to the frames so far; empty if it is not."""
 
 
 def without_surface(measurement: Measurement) -> Measurement:
-    """Status, reason and measures alone: little to pass from process to process."""
+    """Return status, reason and measures only, which processes exchange fast."""
     return replace(measurement, dots=None, lattice=None, match=None, reconstruction=None)

@@ -3,17 +3,17 @@
 ::
 
     /measures/<column>            one dataset per column of measures.csv, shape (frames,)
-    /frames/000012/dots           table: the columns of dots.csv but for frame
-    /frames/000012/points         table: the columns of points.csv but for frame
-    /frames/000012/boundary       table: the columns of boundary.csv but for frame
+    /frames/000012/dots           table: the columns of dots.csv except frame
+    /frames/000012/points         table: the columns of points.csv except frame
+    /frames/000012/boundary       table: the columns of boundary.csv except frame
     /frames/000012/surface/x_mm   shape (columns,), y_mm  shape (rows,)
     /frames/000012/surface/z_mm   shape (rows, columns); NaN outside the boundary
 
 A table is one compound dataset: ``file["frames/000012/dots"]["u_px"]`` in Python,
-``h5read(file, '/frames/000012/dots').u_px`` in MATLAB. What a frame has not is not there. Numbers
-are float64, NaN where unknown, or int64 where they never are; text is UTF-8, of fixed length in
-tables. Every dataset has the attributes ``units`` and ``description``, tables one each per column;
-the root's state the provenance. The format is that of HDF5 1.8, which every reader knows.
+``h5read(file, '/frames/000012/dots').u_px`` in MATLAB. Data that a frame lacks are absent. Numbers
+are float64, NaN if unknown, or int64 if always known; text is UTF-8, of fixed length in tables.
+Every dataset has the attributes ``units`` and ``description``, tables one of each per column; those
+of the root contain the provenance. The format is that of HDF5 1.8, for compatibility.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from labapp.export.tables import TABLES, Column, Table
 from labapp.files import as_bytes
 
 TEXT_BYTES = 8
-"""Room for a word in a table, bytes."""
+"""Length of text in a table, bytes."""
 
 LIBRARY = ("v108", "v108")
 
@@ -47,21 +47,21 @@ AXES = (
 
 
 class Hdf5Writer:
-    """Writes a run, frame by frame; use it in a ``with``. The file is complete when that ends.
+    """Context manager that writes a run, frame by frame; the file is complete on exit.
 
     Parameters
     ----------
     path
-        Where to; a file that is there is replaced.
+        Path of the file; an existing file is replaced.
     attributes
-        Of the root: text as it is, anything else as JSON.
+        Attributes of the root: text unchanged, other values as JSON.
     spacing_mm
-        Distance of the surface's nodes, mm.
+        Distance between the surface's nodes, mm.
 
     Raises
     ------
     OSError
-        If it cannot be written, here and from every method.
+        If it cannot be written; by the constructor and all methods.
     """
 
     def __init__(self, path: Path, attributes: Mapping[str, object], spacing_mm: float) -> None:
@@ -81,7 +81,7 @@ class Hdf5Writer:
     def write(
         self, frame: int, tables: Mapping[str, Table], reconstruction: Reconstruction | None
     ) -> None:
-        """Write what `frame_tables` gives of a frame, and its surface."""
+        """Write the tables of a frame (`frame_tables`) and its surface."""
         self._measures.append(tables["measures"])
         group = self._frames.create_group(f"{frame:06d}")
         for name in ("dots", "points", "boundary"):
@@ -143,7 +143,7 @@ def _put_table(group: Any, name: str, table: Table) -> None:
 
 
 def _plain(text: str) -> str:
-    """The same as HDF5 can hold it."""
+    """Return text without characters that HDF5 cannot store."""
     return as_bytes(text.replace("\0", r"\0")).decode()
 
 
@@ -164,11 +164,11 @@ def _put_surface(group: Any, reconstruction: Reconstruction, spacing_mm: float) 
 
 
 class _Disk(io.RawIOBase):
-    """File object for HDF5 that defers errors of writing to `check`: HDF5 cannot handle them.
+    """File object for HDF5 that defers write errors to `check`, as HDF5 cannot handle them.
 
-    HDF5 drops errors of writing that it meets while it tidies up, and then ends the process. So
-    the first error is kept for `check`; what is written from then on stays in memory, where HDF5
-    can read it back until it has closed its file.
+    HDF5 ignores write errors while it closes a file, and then ends the process. Therefore the first
+    error is stored for `check`, and later writes stay in memory, from where HDF5 can read them
+    until it has closed the file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -178,7 +178,7 @@ class _Disk(io.RawIOBase):
         self._kept: list[tuple[int, bytes]] = []
 
     def check(self) -> None:
-        """Raise the first error of writing, if there was one."""
+        """Raise the first write error, if any."""
         if self._failure is not None:
             raise self._failure
 
@@ -211,7 +211,7 @@ class _Disk(io.RawIOBase):
                 rest = whole
                 while rest:
                     rest = rest[self._file.write(rest) :]
-            except BaseException as error:  # Ctrl-C too: HDF5 is not to be left half-way
+            except BaseException as error:  # also Ctrl-C: HDF5 must not be interrupted
                 self._failure = error
         if self._failure is not None:
             self._kept.append((self._at, bytes(whole)))

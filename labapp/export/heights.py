@@ -1,4 +1,4 @@
-"""Heights of a pool surface where one asks: their ±, how two surfaces differ, a section."""
+"""Heights of a pool surface: ± at a point, difference of two surfaces, vertical section."""
 
 from __future__ import annotations
 
@@ -16,40 +16,40 @@ PROFILE_POINTS = 241
 def between_points(
     reconstruction: Reconstruction, values: FloatArray, x_mm: FloatArray, y_mm: FloatArray
 ) -> FloatArray:
-    """Values of the reflection points, interpolated at (x, y).
+    """Interpolate values of the reflection points at (x, y).
 
-    Linear between the points; outside them that of the nearest.
+    Linear interpolation between the points; nearest neighbour outside their hull.
 
     Parameters
     ----------
     values
-        One a reflection point, shape (p,); NaN where unknown.
+        Value of each reflection point, shape (p,); NaN if unknown.
     x_mm, y_mm
-        Where, shape (n,), mm.
+        Positions, shape (n,), mm.
 
     Returns
     -------
     FloatArray
-        Shape (n,); NaN where fewer than four are known.
+        Interpolated values, shape (n,); NaN if fewer than four values are known.
     """
     known = np.isfinite(values)
-    places, values = reconstruction.points_mm[known, :2], values[known]
-    if len(places) < 4:
+    points, values = reconstruction.points_mm[known, :2], values[known]
+    if len(points) < 4:
         return np.full(len(x_mm), np.nan)
-    inside = scipy.interpolate.LinearNDInterpolator(places, values)(x_mm, y_mm)
-    nearest = scipy.interpolate.NearestNDInterpolator(places, values)(x_mm, y_mm)
+    inside = scipy.interpolate.LinearNDInterpolator(points, values)(x_mm, y_mm)
+    nearest = scipy.interpolate.NearestNDInterpolator(points, values)(x_mm, y_mm)
     return np.asarray(np.where(np.isfinite(inside), inside, nearest))
 
 
 def sigma_at(reconstruction: Reconstruction, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
-    """Standard uncertainty of the height at (x, y), shape (n,), mm, as `between_points` has it."""
+    """Return σ of the height at (x, y), interpolated by `between_points`, shape (n,), mm."""
     return between_points(reconstruction, reconstruction.sigma_mm, x_mm, y_mm)
 
 
 def difference_at(
     one: Reconstruction, other: Reconstruction, x_mm: FloatArray, y_mm: FloatArray
 ) -> FloatArray:
-    """Height of the first surface minus the other's, shape (n,), mm; NaN outside either pool."""
+    """Return the height of the first surface minus the other's, shape (n,), mm; NaN outside."""
     return one.surface.height(x_mm, y_mm) - other.surface.height(x_mm, y_mm)
 
 
@@ -58,27 +58,27 @@ class Profile(ReadOnlyArrays):
     """A vertical section through a pool; n points, NaN outside the boundary."""
 
     along_mm: FloatArray
-    """Way along the section line from the point of it nearest the origin, shape (n,), mm."""
+    """Distance along the section line from its point nearest the origin, shape (n,), mm."""
     place_mm: FloatArray
     """(X, Y) of the points, shape (n, 2), mm."""
     height_mm: FloatArray
     sigma_mm: FloatArray
     """Height of the surface and its standard uncertainty, shape (n,), mm."""
     edge_mm: FloatArray
-    """(way, height) where the line crosses the boundary, shape (k, 2), mm."""
+    """(distance, height) of the line's crossings of the boundary, shape (k, 2), mm."""
 
 
 def profile(
     reconstruction: Reconstruction, angle_deg: float = 90.0, offset_mm: float = 0.0
 ) -> Profile:
-    """Cut a pool along a line.
+    """Return the vertical section of a pool along a line.
 
     Parameters
     ----------
     angle_deg
-        Direction of the line, from +X towards +Y: 0 cuts across, 90 along the welding direction.
+        Direction of the line, from +X towards +Y: 0 is a transverse section, 90 a longitudinal one.
     offset_mm
-        How far to the left of the origin the line passes, looking along it, mm.
+        Distance of the line from the origin, positive to the left looking along it, mm.
     """
     angle = np.radians(angle_deg)
     way = np.array([np.cos(angle), np.sin(angle)])
@@ -97,7 +97,7 @@ def profile(
 def _crossings(
     outline: FloatArray, way: FloatArray, aside: FloatArray, offset: float
 ) -> FloatArray:
-    """(way, height) where a line crosses a closed polygon, shape (k, 2), in order."""
+    """Return (distance, height) of a line's crossings of a closed polygon, shape (k, 2), sorted."""
     after = np.roll(outline, -1, axis=0)
     a, b = outline[:, :2] @ aside - offset, after[:, :2] @ aside - offset
     crosses = (a < 0) != (b < 0)

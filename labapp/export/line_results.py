@@ -1,4 +1,4 @@
-"""The tables that `labapp lines` writes: lines, their points, features and states, surfaces."""
+"""The tables of `labapp lines`: lines, their points, features and states, surfaces."""
 
 from __future__ import annotations
 
@@ -26,22 +26,21 @@ FEATURE_COLUMNS = (
     "pool_height_sigma_mm", "pool_width_mm", "pool_curvature_per_mm", "misfit", "margin",
     "setup_status",
 )  # fmt: skip
-"""``plane_…`` is of the lines on the imaging plane. ``pool_height_sigma_mm`` has no part by the
-set-up, unlike ``height_sigma_mm`` of dots; ``setup_status`` says how far the set-up can be relied
-on."""
+"""``plane_…`` are quantities of the lines on the imaging plane. ``pool_height_sigma_mm`` does not
+include the set-up, unlike ``height_sigma_mm`` of dots; ``setup_status`` is its reliability."""
 TRACK_COLUMNS = (
     "frame", "time_s", "pulse", "pulse_probability", "followed", "shift_px", "tilt_px", "bend_px",
     "agreeing_share",
 )  # fmt: skip
 EDGE_COLUMNS = ("frame", "line", "side", "x_mm", "y_mm", "sigma_mm")
 SURFACE_COLUMNS = ("x_mm", "y_mm", "z_mm", "z_sigma_mm")
-"""``z_sigma_mm`` has no part by the set-up either."""
+"""``z_sigma_mm`` does not include the set-up either."""
 
 SPACING_MM = 0.1
 
 
 def line_rows(frame: int, found: LineFrame, calibration: ImageCalibration) -> list[list[str]]:
-    """Rows of ``lines.csv``: one a line, from the lowest in the picture up."""
+    """Return rows of ``lines.csv``: one per line, from the lowest in the picture up."""
     rows = []
     numbers = _numbers(found)
     for k, one in enumerate(found.seen.lines):
@@ -61,7 +60,7 @@ def line_rows(frame: int, found: LineFrame, calibration: ImageCalibration) -> li
 
 
 def _numbers(found: LineFrame) -> list[str]:
-    """Number of each line in the pattern; empty where it is not settled."""
+    """Return the number of each line in the pattern; empty if undetermined."""
     lines = found.seen.lines
     if found.status != "ok" or found.surface is None:
         return [""] * len(lines)
@@ -70,7 +69,7 @@ def _numbers(found: LineFrame) -> list[str]:
 
 
 def point_rows(frame: int, found: LineFrame, calibration: ImageCalibration) -> list[list[str]]:
-    """Rows of ``line_points.csv``: the ridge of each line at about every pixel."""
+    """Return rows of ``line_points.csv``: the ridge of each line at about every pixel."""
     rows = []
     for k, one in enumerate(found.seen.lines):
         plane = calibration.to_plane(one.image_px)
@@ -87,7 +86,7 @@ def feature_rows(
     states: Sequence[State],
     setup_status: str,
 ) -> list[list[str]]:
-    """Rows of ``features.csv``: one a frame."""
+    """Return rows of ``features.csv``: one per frame."""
     rows = []
     for frame, time_s, one, state in zip(frames, times_s, found, states, strict=True):
         seen = one.features
@@ -114,7 +113,7 @@ def feature_rows(
 def track_rows(
     frames: Sequence[int], times_s: Sequence[float | None], found: Sequence[LineFrame]
 ) -> list[list[str]]:
-    """Rows of ``track.csv``: one a frame of one line that is followed."""
+    """Return rows of ``track.csv``: one per frame of a followed line."""
     rows = []
     for frame, time_s, one in zip(frames, times_s, found, strict=True):
         line = one.track
@@ -130,7 +129,7 @@ def track_rows(
 
 
 def edge_rows(frame: int, edges: PoolEdges) -> list[list[str]]:
-    """Rows of ``edges.csv``: one an end of a line on the solid metal."""
+    """Return rows of ``edges.csv``: one per line end on the solid metal."""
     ends = zip(edges.line, edges.side, edges.point_mm, edges.sigma_mm, strict=True)
     return [
         [str(frame), str(line), str(side), *(f"{value:.4f}" for value in (*place, sigma))]
@@ -139,7 +138,7 @@ def edge_rows(frame: int, edges: PoolEdges) -> list[list[str]]:
 
 
 def surface_rows(surface: LineSurface) -> list[list[str]]:
-    """Rows of ``surface_NNNNNN.csv``: nodes between the lines, on the pool's side of z = 0."""
+    """Return rows of ``surface_NNNNNN.csv``: nodes between lines, on the pool's side of z = 0."""
     low, high = surface.point_mm[:, :2].min(axis=0), surface.point_mm[:, :2].max(axis=0)
     x, y = np.meshgrid(*(np.arange(a, b, SPACING_MM) for a, b in zip(low, high, strict=True)))
     x, y = x.ravel(), y.ravel()
@@ -164,7 +163,7 @@ def line_tables(
     calibration: ImageCalibration,
     setup_status: str,
 ) -> dict[str, str]:
-    """All tables of the frames of a recording as CSV text, by the names of their files."""
+    """Return all tables of a recording's frames as CSV text, by file name."""
     states = line_states(LineSeries.of(found))
     numbered = list(zip(frames, found, strict=True))
     features = feature_rows(frames, times_s, found, states, setup_status)

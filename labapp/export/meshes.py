@@ -1,7 +1,7 @@
-"""The pool surface as triangles, and mesh files of it.
+"""Triangle meshes of the pool surface, and mesh files.
 
-Lengths are in mm. Triangles are counter-clockwise seen from outside, those of the pool surface
-from above: its normals point up. The same reconstruction gives the same bytes.
+Lengths are in mm. Triangles are counter-clockwise seen from outside; normals of the pool surface
+point up. The same reconstruction gives the same bytes.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ SPACING_MM = 0.1
 """Distance between the rings of a mesh, and between the nodes of a surface as CSV, mm."""
 
 SMALLEST_SPACING_MM = 0.05
-"""STL's 32-bit numbers cannot distinguish the vertices of smaller rings."""
+"""Smallest spacing, mm: 32-bit numbers of STL cannot distinguish vertices of smaller rings."""
 
 MOST_NODES = 10_000_000
-"""A surface that is written has no more nodes: one in a stranger's session may be any size."""
+"""Most nodes of a written surface; one in an untrusted session may have any size."""
 
 MOST_DRAWN = 300_000
-"""Nodes of a mesh that is only looked at."""
+"""Most nodes of a mesh for drawing."""
 
 BLOCK_MM = 1.0
-"""How far the bottom of a block lies below the lowest point of the pool, mm."""
+"""Distance of a block's bottom below the lowest point of the pool, mm."""
 
 STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corner", "<f4", (3, 3)), ("attribute", "<u2")])
 PLY_VERTEX = np.dtype([("place", "<f8", 3), ("height", "<f8")])
@@ -54,7 +54,7 @@ def refuse_too_large(reconstruction: Reconstruction, spacing_mm: float) -> None:
     Raises
     ------
     InputError
-        If it has, or its size is not known.
+        If it has too many, or its size is unknown.
     """
     count = len(reconstruction.boundary.points_mm)
     width, length = np.ptp(reconstruction.boundary.points_mm[:, :2], axis=0)
@@ -66,7 +66,7 @@ def refuse_too_large(reconstruction: Reconstruction, spacing_mm: float) -> None:
 
 
 def drawn_spacing(reconstruction: Reconstruction, spacing_mm: float) -> float:
-    """Distance of a mesh's rings for a picture, mm: wider where there would be `MOST_DRAWN`."""
+    """Return the distance between a mesh's rings for drawing at most `MOST_DRAWN` nodes, mm."""
     rings = max(MOST_DRAWN // len(reconstruction.boundary.points_mm), 1)
     return max(spacing_mm, _radius_mm(reconstruction) / rings)
 
@@ -77,15 +77,15 @@ def _radius_mm(reconstruction: Reconstruction) -> float:
 
 
 def known_nodes(reconstruction: Reconstruction, spacing_mm: float) -> FloatArray:
-    """Nodes of a grid within the boundary where the surface is known, shape (n, 3), mm."""
+    """Return the grid nodes within the boundary where the surface is known, shape (n, 3), mm."""
     each = np.column_stack(grid_nodes(reconstruction, spacing_mm))
     return np.asarray(each[np.isfinite(each).all(axis=1)])
 
 
 def open_mesh(reconstruction: Reconstruction, spacing_mm: float) -> Mesh:
-    """The pool surface, open below; it ends at the boundary.
+    """Return the pool surface as an open mesh, which ends at the boundary.
 
-    Triangles where the surface is not known are left out.
+    Triangles where the surface is unknown are omitted.
 
     Parameters
     ----------
@@ -98,12 +98,12 @@ def open_mesh(reconstruction: Reconstruction, spacing_mm: float) -> Mesh:
 
 
 def known_part(triangles: IntArray, value: FloatArray) -> tuple[IntArray, IntArray]:
-    """Part of a mesh of n vertices whose corners all have a value, shape (n,); NaN: unknown.
+    """Return the triangles of a mesh whose corners all have a known value, shape (n,).
 
     Returns
     -------
     used, triangles
-        Indices of its vertices, shape (m,), and its triangles by their places among these.
+        Indices of their vertices, shape (m,), and the triangles by indices into these.
     """
     triangles = triangles[np.isfinite(value[triangles]).all(axis=1)]
     used, corner = np.unique(triangles, return_inverse=True)
@@ -111,12 +111,12 @@ def known_part(triangles: IntArray, value: FloatArray) -> tuple[IntArray, IntArr
 
 
 def solid_mesh(reconstruction: Reconstruction, spacing_mm: float) -> Mesh:
-    """The pool surface as the top of a watertight body.
+    """Return a watertight solid with the pool surface as its top.
 
-    A pool that lies above its boundary everywhere is closed by the polygon of its boundary: the
-    body is what stands above it, with the pool's volume. Any other (concave, dented) is the top of
-    a block with vertical walls along the boundary and a flat bottom, `BLOCK_MM` below the lowest
-    point. Where the surface is not known it is made straight between where it is.
+    A pool that is above its boundary everywhere is closed by the polygon of its boundary, so that
+    the solid has the pool's volume. Any other (concave, dented) is the top of a block with vertical
+    walls along the boundary and a flat bottom, `BLOCK_MM` below the lowest point. Where the surface
+    is unknown, it is interpolated linearly.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ def solid_mesh(reconstruction: Reconstruction, spacing_mm: float) -> Mesh:
     base = _base_height(vertices[0, :2], vertices[-count:])
     vertices = _filled(vertices, count)
     rings = len(vertices) // count
-    # The polygon below is a fan about the centre: its height under each vertex, ring by ring.
+    # The boundary polygon is a fan about the centre: its height below each vertex, ring by ring.
     fraction = np.arange(1, rings)[:, None] / rings
     below = base + fraction * (vertices[-count:, 2] - base)
     convex = vertices[0, 2] > base and (vertices[1:-count, 2] > below.ravel()).all()
@@ -147,13 +147,13 @@ def solid_mesh(reconstruction: Reconstruction, spacing_mm: float) -> Mesh:
 
 
 def _base_height(center_mm: FloatArray, rim_mm: FloatArray) -> float:
-    """Height at the centre of the least-squares plane of the boundary, shape (m, 3), mm."""
+    """Return the height at the centre of the boundary's least-squares plane, mm."""
     terms = np.column_stack([np.ones(len(rim_mm)), rim_mm[:, :2] - center_mm])
     return float(np.linalg.lstsq(terms, rim_mm[:, 2], rcond=None)[0][0])
 
 
 def _filled(vertices: FloatArray, count: int) -> FloatArray:
-    """Vertices with unknown heights interpolated from the centre outwards."""
+    """Return the vertices, with unknown heights interpolated along each spoke."""
     if np.isfinite(vertices).all():
         return vertices
     filled = vertices.copy()
@@ -169,14 +169,14 @@ def _filled(vertices: FloatArray, count: int) -> FloatArray:
 
 
 def _walls(rim: IntArray, below: int) -> list[IntArray]:
-    """Triangles from the boundary's vertices down to as many others, the first at ``below``."""
+    """Return the triangles between the rim's vertices and as many below, the first at ``below``."""
     after, foot = np.roll(rim, -1), below + np.arange(len(rim))
     foot_after = np.roll(foot, -1)
     return [np.column_stack([rim, foot, foot_after]), np.column_stack([rim, foot_after, after])]
 
 
 def stl(mesh: Mesh) -> bytes:
-    """Binary STL; triangles without an area are left out."""
+    """Return binary STL, without degenerate triangles."""
     normal, corners = _facets(mesh)
     facets = np.zeros(len(corners), STL_TRIANGLE)
     facets["normal"], facets["corner"] = normal, corners
@@ -185,7 +185,7 @@ def stl(mesh: Mesh) -> bytes:
 
 
 def stl_ascii(mesh: Mesh) -> bytes:
-    """ASCII STL, with enough digits for 32-bit numbers."""
+    """Return ASCII STL, with enough digits for 32-bit numbers."""
     facet = (
         "facet normal {:.8e} {:.8e} {:.8e}\nouter loop\n"
         + "vertex {:.8e} {:.8e} {:.8e}\n" * 3
@@ -198,7 +198,7 @@ def stl_ascii(mesh: Mesh) -> bytes:
 
 
 def _facets(mesh: Mesh) -> tuple[FloatArray, FloatArray]:
-    """Unit normals, shape (k, 3), and corners, shape (k, 3, 3), of triangles with an area."""
+    """Return unit normals, shape (k, 3), and corners, shape (k, 3, 3), of the proper triangles."""
     corners = mesh.vertices_mm[mesh.triangles]
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     area = np.linalg.norm(normal, axis=1, keepdims=True)
@@ -207,7 +207,7 @@ def _facets(mesh: Mesh) -> tuple[FloatArray, FloatArray]:
 
 
 def ply(mesh: Mesh) -> bytes:
-    """Binary PLY, 64-bit, with the scalar ``height_mm`` at each vertex to colour it by."""
+    """Return binary PLY, 64-bit, with the scalar ``height_mm`` at each vertex."""
     header = "\n".join(
         [
             "ply",
@@ -228,9 +228,9 @@ def ply(mesh: Mesh) -> bytes:
 
 
 def vtp(mesh: Mesh) -> bytes:
-    """VTK XML PolyData, 64-bit, with the point array ``height_mm``; ``units`` in the field data."""
+    """Return VTK XML PolyData, 64-bit, with the point array ``height_mm``."""
     count = len(mesh.triangles)
-    units = " ".join(str(code) for code in b"mm\0")  # VTK keeps text as the codes of its letters
+    units = " ".join(str(code) for code in b"mm\0")  # VTK stores text as character codes
     points = _vtk_array("Points", mesh.vertices_mm, "<f8", components=3)
     height = _vtk_array("height_mm", mesh.vertices_mm[:, 2], "<f8")
     corners = _vtk_array("connectivity", mesh.triangles, "<i8")

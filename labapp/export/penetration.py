@@ -1,6 +1,6 @@
-"""Penetration models in files, their predictions as tables, and their ONNX graph.
+"""Files of penetration models, tables of their predictions, and export to ONNX.
 
-A model's file is JSON with numbers and a few words; nothing in it is ever executed.
+A model file is JSON with numbers and names; nothing in it is ever executed.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ from labapp.version import VERSION
 FORMAT = 1
 
 LARGEST = 1 << 25
-"""Bytes of a model's file at most."""
+"""Largest model file, bytes."""
 
 WANTED = "a penetration model, as `labapp penetration fit` writes it"
 
 OPSET, IR_VERSION = 17, 8
-"""Of ONNX graphs: old enough for runtimes of 2022."""
+"""Versions of ONNX graphs, supported by runtimes since 2022."""
 
 
 # --- files --------------------------------------------------------------------------------------
@@ -68,7 +68,7 @@ NUMBERS = ("mean_mm", "scatter_mm", "factor", "rmse_mm")
 
 
 def _fields(static: GaussianMap) -> dict[str, Any]:
-    """Its fields, without what is kept of earlier calls."""
+    """Return the fields of a map, without its cache."""
     return {name: getattr(static, name) for name in GaussianMap.__dataclass_fields__}
 
 
@@ -82,7 +82,7 @@ def read_model(path: str | os.PathLike[str]) -> PenetrationModel:
     Raises
     ------
     InputError
-        If it is none, or anything in it is impossible.
+        If it is not a model, or anything in it is invalid.
     """
     path = Path(path)
     with os_errors_as_input(path, "file", WANTED):
@@ -102,7 +102,7 @@ def read_model(path: str | os.PathLike[str]) -> PenetrationModel:
 
 
 def _model(read: Mapping[str, Any]) -> PenetrationModel:
-    """The model that a file's content describes; raises `ValueError` and others if it is none."""
+    """Return the model described by a file's content; raises `ValueError` and others."""
     orders = Orders(*(_whole(read["orders"], name) for name in ("poles", "lags", "delay")))
     features = tuple(map(str, read["features"]))
     constants = tuple(map(float, read["time_constants_s"]))
@@ -167,14 +167,14 @@ def _array(values: Any, *shape: int) -> FloatArray:
 
 
 def prediction_csv(name: str, model: PenetrationModel, found: Mapping[str, Prediction]) -> str:
-    """Predictions of recordings as CSV; every column of the model's is marked as such.
+    """Return predictions of recordings as CSV; the model's columns begin with ``model``.
 
     Parameters
     ----------
     name
-        Of the model.
+        Name of the model.
     found
-        By the recording's name.
+        Predictions by the recording's name.
     """
     target = f"model_{model.settings.target}"
     ends = (f"model_low_95_{_unit(target)}", f"model_high_95_{_unit(target)}")
@@ -194,16 +194,16 @@ def _unit(name: str) -> str:
 
 
 class Predictor:
-    """Predicts while frames come, step by step, what `PenetrationModel.predict` gives for them all.
+    """Online prediction, step by step, with the same results as `PenetrationModel.predict`.
 
     Parameters
     ----------
     name
-        Of the model.
+        Name of the model.
     model
         The model.
     keeps
-        Whether all predictions are kept for `predictions`.
+        Whether to store all predictions for `predictions`.
     """
 
     def __init__(self, name: str, model: PenetrationModel, *, keeps: bool = True) -> None:
@@ -213,7 +213,7 @@ class Predictor:
         self._step = -(1 << 62)
 
     def add(self, result: FrameResult) -> None:
-        """Take the next frame.
+        """Add the next frame.
 
         Raises
         ------
@@ -223,18 +223,18 @@ class Predictor:
         if result.time_s is None:
             raise InputError("--model", "time", "unknown", "a recording that has a time base")
         step = math.floor(result.time_s / self.model.settings.step_s + 1e-9)
-        if not 0 <= step - self._step <= LONGEST_MEMORY:  # it begins, or the clock was set
+        if not 0 <= step - self._step <= LONGEST_MEMORY:  # at the start, or if the clock was reset
             self._frames, self._step = [], step
         elif step > self._step:
             self._end_step(step)
         self._frames.append(frame_features(result, self.model.settings.features))
 
     def _end_step(self, step: int) -> None:
-        """Predict the steps before this one, and forget frames that are needed no more."""
+        """Predict the steps before this one, and discard frames that are no longer needed."""
         step_s, last = self.model.settings.step_s, self._step
         if any(np.isfinite(one.value).all() for one in self._frames):
             none = np.full((1, len(self.model.settings.features)), np.nan)
-            until = np.array([(step - 0.5) * step_s])  # steps without a frame are held, too
+            until = np.array([(step - 0.5) * step_s])  # includes steps without a frame
             end = WeldSeries("", until, none, none, none, none[:, 0], none[:, 0])
             found = self.model.predict(joined([*self._frames, end]))
             new = found.time_s > last * step_s
@@ -248,7 +248,7 @@ class Predictor:
         self._step = step
 
     def predictions(self) -> Prediction | None:
-        """All predictions, the step that has not ended with them; None if there are none."""
+        """Return all predictions, including the unfinished step; None if there are none."""
         self._end_step(self._step + 1)
         if not self._ended:
             return None
@@ -257,9 +257,9 @@ class Predictor:
 
     @property
     def newest(self) -> tuple[float, float, bool]:
-        """Penetration and ± at the last step that ended, mm; whether they are extrapolated.
+        """Penetration and ± at the last finished step, mm, and whether they are extrapolated.
 
-        NaN where nothing is known.
+        NaN if unknown.
         """
         if not self._ended:
             return math.nan, math.nan, False
@@ -267,7 +267,7 @@ class Predictor:
         return float(last.value[-1]), float(last.sigma[-1]), bool(last.is_outside[-1])
 
     def values(self) -> dict[str, float | str | None]:
-        """The newest prediction as values of a stream, with the names `streams.PENETRATION`."""
+        """Return the newest prediction as values of a stream, with names `streams.PENETRATION`."""
         value, sigma, is_outside = self.newest
         known = math.isfinite(value)
         return {
@@ -279,7 +279,7 @@ class Predictor:
 
 
 def frame_features(result: FrameResult, features: Collection[str]) -> WeldSeries:
-    """Features of one frame, a series of length 1; NaN without a surface."""
+    """Return the features of one frame as a series of length 1; NaN without a surface."""
     found = result.measurement
     sizes = vars(found.measures) if found.measures else dict.fromkeys(WITH_SIGMA, math.nan)
     columns = {name: np.array([value]) for name, value in sizes.items()}
@@ -288,7 +288,7 @@ def frame_features(result: FrameResult, features: Collection[str]) -> WeldSeries
 
 
 def joined(parts: Iterable[WeldSeries], name: str = "") -> WeldSeries:
-    """Series that follow on each other as one."""
+    """Concatenate series."""
     columns = zip(*(list(vars(one).values())[1:] for one in parts), strict=True)
     return WeldSeries(name, *(np.concatenate(column) for column in columns))
 
@@ -297,10 +297,10 @@ def joined(parts: Iterable[WeldSeries], name: str = "") -> WeldSeries:
 
 
 def write_onnx(path: Path, model: PenetrationModel) -> None:
-    """Write a model's value as an ONNX graph of plain operators (float64).
+    """Write a model, without its ±, as an ONNX graph of standard operators (float64).
 
     Input ``features``, shape (memory, k): mean of each step up to the present, oldest first, in the
-    order of the metadata ``features``. Output ``value``, shape (1,), mm. The ± is not in it.
+    order of the metadata ``features``. Output ``value``, shape (1,), mm.
 
     Raises
     ------
@@ -348,18 +348,18 @@ def write_onnx(path: Path, model: PenetrationModel) -> None:
         [helper.make_tensor_value_info("value", real, [1])],
         [numpy_helper.from_array(np.asarray(of), name) for name, of in constants.items()],
     )
-    made = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)])
-    made.ir_version = IR_VERSION
+    exported = helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)])
+    exported.ir_version = IR_VERSION
     facts = {"features": " ".join(settings.features), "step_s": f"{settings.step_s:g}"}
-    helper.set_model_props(made, {**facts, "target": settings.target, "program": "labapp"})
-    onnx.checker.check_model(made)
-    write_file(path, made.SerializeToString())
+    helper.set_model_props(exported, {**facts, "target": settings.target, "program": "labapp"})
+    onnx.checker.check_model(exported)
+    write_file(path, exported.SerializeToString())
 
 
 def _static_graph(
     static: LinearMap | GaussianMap,
 ) -> tuple[dict[str, FloatArray], list[tuple[str, str, str]]]:
-    """Constants and operators (kind, inputs, output) from ``x``, shape (1, d), to ``sum``."""
+    """Return constants and operators (kind, inputs, output) from ``x``, (1, d), to ``sum``."""
     if isinstance(static, LinearMap):
         constants = {"weights": static.weights[:-1, None], "constant": static.weights[-1:]}
         return constants, [("MatMul", "x weights", "product"), ("Add", "product constant", "sum")]

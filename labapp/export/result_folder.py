@@ -1,4 +1,4 @@
-"""Surfaces and sizes read back from a folder of results (CSV)."""
+"""Reading of surfaces and sizes from a results folder (CSV)."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ MOST_NODES = 200_000
 """Most nodes of a surface."""
 
 KEPT_NODES = 800
-"""Of more nodes of a surface only some are used: pools are smooth."""
+"""Approximate number of nodes used of a surface, as pools are smooth."""
 
 WANTED = "as `labapp reconstruct` writes it"
 
 
 def measured_in(folder: Path) -> Iterator[Measured]:
-    """Frames with a surface in a folder that `labapp reconstruct` or an export wrote.
+    """Yield the frames with a surface in a folder that `labapp reconstruct` or an export wrote.
 
     Raises
     ------
@@ -68,7 +68,7 @@ def measured_in(folder: Path) -> Iterator[Measured]:
 
 
 def _rows(path: Path) -> Iterator[dict[str, str]]:
-    """Rows of a table, by column."""
+    """Yield the rows of a table, by column."""
     with open_table(path, WANTED, LARGEST) as file:
         for row in csv.DictReader(bounded_lines(path, file, WANTED)):
             if None in row or None in row.values():
@@ -95,7 +95,7 @@ def _boundary(path: Path, rows: list[dict[str, str]]) -> Boundary:
     theta = np.array([_number(path, row, "theta_deg") for row in rows])
     if not (np.diff(theta) > 0).all():
         raise InputError(path, "theta_deg", "not ascending", WANTED)
-    # The centre that the angles are about, by least squares: (y − y_c)·cos θ = (x − x_c)·sin θ.
+    # The centre of the polar angles, by least squares: (y − y_c)·cos θ = (x − x_c)·sin θ.
     sin, cos = np.sin(np.radians(theta)), np.cos(np.radians(theta))
     right = points[:, 0] * sin - points[:, 1] * cos
     center = np.linalg.lstsq(np.column_stack([sin, -cos]), right, rcond=None)[0]

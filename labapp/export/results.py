@@ -1,4 +1,4 @@
-"""The result files of one run, complete frame by frame even if the run is interrupted."""
+"""The result files of a run, complete for every finished frame even after an interruption."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ OURS = re.compile(
     r"(measures|dots|points|boundary|penetration|surface_\d{6,})\.csv|surface_\d{6,}\.stl"
 )
 SURFACES = ("csv", "stl")
-"""What a run writes of each surface."""
+"""Formats of each surface in a run."""
 
 
 def surface_files(
@@ -40,16 +40,16 @@ def surface_files(
     *,
     as_solid: bool = False,
 ) -> dict[str, bytes]:
-    """Files of a frame's surface, name → content; empty without a surface.
+    """Return the files of a frame's surface, name → content; empty without a surface.
 
     Parameters
     ----------
     formats
         Some of `SURFACE_FORMATS`.
     spacing_mm
-        Distance of the nodes, mm.
+        Distance between nodes, mm.
     as_solid
-        Whether to add a watertight body in each of the formats that is of meshes.
+        Whether to add a watertight solid in each of the mesh formats.
     """
     if reconstruction is None:
         return {}
@@ -72,27 +72,27 @@ class ResultsWriter:
     """Writes a run's results into a folder, one frame at a time.
 
     A frame's rows are appended with one write per file, `measures.csv` last: a frame with a row
-    there is complete. When a write fails or is interrupted, that frame is rolled back. `run.json`
-    holds the provenance of the results and how the run ended.
+    there is complete. If a write fails or is interrupted, the frame is rolled back. `run.json`
+    contains the provenance of the results and the final state of the run.
 
-    Results of a former run are replaced; a folder with files of the same names and no `run.json`
-    is refused, as they may be the user's own.
+    Results of a former run are replaced; a folder with files of the same names but without
+    `run.json` is an error, as they may be the user's.
 
     Parameters
     ----------
     folder
-        Where to; made if it does not exist.
+        Destination; created if missing.
     calibration
-        Pixel ↔ imaging plane, for the dots' places on the plane.
+        Pixel ↔ imaging plane, for the dots' positions on the plane.
     provenance
-        What `run.json` is to say of the source, the setup and the options.
+        Source, set-up and options, for `run.json`.
     sigma_parts
-        Whether `measures.csv` has the parts of standard uncertainties, too.
+        Whether `measures.csv` also has the parts of standard uncertainties.
 
     Raises
     ------
     InputError
-        If the folder cannot be used. Every later failure to write raises it too.
+        If the folder cannot be used; also by all methods that write.
     """
 
     def __init__(
@@ -112,7 +112,7 @@ class ResultsWriter:
         self._run = {
             "program": "labapp",
             "version": VERSION,
-            "sigma_of": "",  # until a frame has any standard uncertainty
+            "sigma_of": "",  # set at the first frame with a standard uncertainty
             "state": "running",
             "started": now(),
             "ended": None,
@@ -132,12 +132,12 @@ class ResultsWriter:
             raise self._unwritable(error) from error
 
     def write(self, result: FrameResult) -> None:
-        """Write everything about one frame.
+        """Write all results of one frame.
 
         Raises
         ------
         InputError
-            If it cannot be written (disk full, folder gone); earlier frames are complete.
+            If it cannot be written (disk full, folder removed); earlier frames are complete.
         """
         before = {file: os.fstat(file.fileno()).st_size for file in self._files.values()}
         formats = SURFACES if self.surfaces else ()
@@ -168,14 +168,14 @@ class ResultsWriter:
         self._statuses.add(result.measurement.setup_status)
 
     def set_setup_status(self, status: str, verdict: SetupVerdict) -> None:
-        """Write what all frames say of their set-up: into `run.json`, and into every frame's row.
+        """Write the check of the set-up by all frames to `run.json` and to every frame's row.
 
         Parameters
         ----------
         status
-            How far the set-up can be relied on (`Measurement.setup_status`).
+            Reliability of the set-up (`Measurement.setup_status`).
         verdict
-            What the frames say of it.
+            Check of the set-up by all frames.
 
         Raises
         ------
@@ -201,7 +201,7 @@ class ResultsWriter:
         return self
 
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
-        """Record in `run.json` how the run ended."""
+        """Write the final state of the run to `run.json`."""
         state = "interrupted" if isinstance(error, KeyboardInterrupt) else "failed"
         self._run |= {
             "state": state if error else "finished",
@@ -224,19 +224,19 @@ class ResultsWriter:
             file.close()
 
     def _unwritable(self, error: OSError) -> InputError:
-        plural = "frame before is" if self.frames == 1 else f"{self.frames} frames before are"
-        kept = f"; the {plural} whole" if self.frames else ""
+        plural = "previous frame is" if self.frames == 1 else f"{self.frames} previous frames are"
+        finished = f"; the {plural} complete" if self.frames else ""
         return InputError(
             self.folder,
             "results",
             f"{error.strerror} ({Path(error.filename or self.folder).name})",
-            f"a folder that can be written, with room on its disk{kept}",
+            f"a writable folder with enough disk space{finished}",
         )
 
 
 def _clear(folder: Path) -> None:
-    """Delete a former run's results, `measures.csv` first: no row without its files."""
-    if (folder / RUN_FILE).is_symlink():  # `write_atomically` would write to where it points
+    """Delete a former run's results, `measures.csv` first, so that no row is without its files."""
+    if (folder / RUN_FILE).is_symlink():  # `write_atomically` would follow it
         raise InputError(folder, RUN_FILE, "is a link", "a folder whose files are its own")
     ours = [path for path in folder.iterdir() if OURS.fullmatch(path.name)]
     if ours and not _is_run(folder / RUN_FILE):
@@ -259,7 +259,7 @@ def _is_run(path: Path) -> bool:
 
 
 def _append(file: io.FileIO, text: str) -> None:
-    """Append a text; a partial write is repeated, so that a full disk raises."""
+    """Append text; partial writes are continued, so that a full disk raises."""
     content = as_bytes(text)
     while content:
         content = content[file.write(content) :]

@@ -1,4 +1,4 @@
-"""Summary of a run: number of frames by status, mean sizes."""
+"""Summary of a run: number of frames by status, and mean sizes."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Summary:
     example: FrameResult | None = None
     """The first frame with a surface."""
     verdict: SetupVerdict | None = None
-    """What the run says of its set-up, once it is known."""
+    """Check of the set-up by the run, at its end."""
 
     def add(self, result: FrameResult) -> None:
         """Add a frame."""
@@ -47,11 +47,11 @@ class Summary:
             self.example = result
 
     def series(self, name: str) -> FloatArray:
-        """One of the measures over the frames, shape (n,); NaN without a surface."""
+        """Return a measure over the frames, shape (n,); NaN without a surface."""
         return np.array([getattr(measures, name, np.nan) for _, _, measures in self.frames])
 
     def text(self) -> str:
-        """Number of frames and mean sizes as text, a line each."""
+        """Return the number of frames and mean sizes as text, one line each."""
         count = len(self.frames)
         total = f"{count} frame{'s' * (count != 1)}, {self.statuses['ok']} with a surface"
         without = [f"{n} {status}" for status, n in self.statuses.items() if status != "ok"]
@@ -76,7 +76,7 @@ class Summary:
 
 
 def format_ranges(frames: Iterable[int], to: str = "–", most: int = 12) -> str:
-    """Frame numbers as ranges, at most ``most`` of them: ``0–4, 7, 9–11``."""
+    """Format frame numbers as at most ``most`` ranges: ``0–4, 7, 9–11``."""
     runs: list[list[int]] = []
     for frame in sorted(frames):
         if runs and frame == runs[-1][-1] + 1:

@@ -1,6 +1,6 @@
-"""A measurement as tables: columns, units and values, and their CSV text.
+"""Tables of a measurement: columns, units, values, and CSV text.
 
-Values are exact; only CSV rounds them. An unknown value is NaN, and an empty cell in CSV.
+Values have full precision; only CSV is rounded. An unknown value is NaN, and an empty cell in CSV.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ UNITS = ("mm", "mm2", "mm3", "px", "deg", "s")
 NO_UNIT = "1"
 
 Table = dict[str, npt.NDArray[Any]]
-"""Column name → values, shape (rows,): int64 where always known, float64, or text (object)."""
+"""Column name → values, shape (rows,): int64 if always known, float64, or text (object)."""
 
 
 @dataclass(frozen=True)
@@ -39,13 +39,13 @@ class Column:
     """A column of a table."""
 
     name: str
-    """Its name, which ends in the unit."""
+    """Name, which ends in the unit."""
     description: str
-    """What it holds, in a few words."""
+    """Short description."""
     digits: int | None = MM_DIGITS
-    """Decimals in CSV; 0 for whole numbers, None for text."""
+    """Decimals in CSV; 0 for integers, None for text."""
     is_part: bool = False
-    """Whether it is a part of a standard uncertainty: in CSV files where these are requested."""
+    """Whether it is a part of a standard uncertainty, which is optional in CSV files."""
 
     @property
     def unit(self) -> str:
@@ -55,7 +55,7 @@ class Column:
 
 
 PARTS = ("noise", "level", "setup")
-"""The parts of a size's standard uncertainty, which are independent."""
+"""Independent parts of a size's standard uncertainty."""
 
 FRAME = Column("frame", "number of the frame in its recording, from 0", 0)
 
@@ -139,7 +139,7 @@ TABLES: dict[str, tuple[Column, ...]] = {
         ),
     ),
 }
-"""The tables and their columns, in the order in which a frame is written to them."""
+"""The tables and their columns, in the order of writing."""
 
 _NAMES = {name: [column.name for column in columns] for name, columns in TABLES.items()}
 _MEASURED = {field.name for field in fields(Measures)}
@@ -148,19 +148,19 @@ SIZES = [c.name for c in TABLES["measures"] if c.name in _MEASURED and not c.is_
 
 @cache
 def columns_of(name: str, sigma_parts: bool = False) -> tuple[Column, ...]:
-    """Columns of a table's CSV file, with or without the parts of standard uncertainties."""
+    """Return the columns of a table's CSV file, with or without parts of uncertainties."""
     return tuple(column for column in TABLES[name] if sigma_parts or not column.is_part)
 
 
 def frame_tables(result: FrameResult, calibration: ImageCalibration) -> dict[str, Table]:
-    """All that a frame has to say, table by table, with the columns of `TABLES`.
+    """Return all tables of a frame, with the columns of `TABLES`.
 
     Parameters
     ----------
     result
-        What it gave. `measures` gets a row in any case, the others none for what there is not.
+        Result of the frame. `measures` always has a row; the other tables may be empty.
     calibration
-        Pixel ↔ imaging plane, for the dots' places on the plane.
+        Pixel ↔ imaging plane, for the dots' positions on the plane.
     """
     measurement = result.measurement
     reconstruction = measurement.reconstruction
@@ -197,7 +197,7 @@ def _measures(time_s: float | None, measurement: Measurement) -> list[npt.NDArra
 
 
 def sigma_of(measurement: Measurement) -> str:
-    """Contributions to the standard uncertainties of a frame; empty where it has none."""
+    """Return the contributions to a frame's standard uncertainties; empty if it has none."""
     total, setup = (_sigmas(measurement.measures, part) for part in ("", "setup"))
     if not np.isfinite(total).any():
         return ""
@@ -205,19 +205,19 @@ def sigma_of(measurement: Measurement) -> str:
 
 
 def _sigma_parts(measured: Measures | None) -> list[float]:
-    """Noise, level and set-up: the parts of each size's standard uncertainty."""
+    """Return the parts of each size's standard uncertainty: noise, level, set-up."""
     total, level, setup = (_sigmas(measured, part) for part in ("", "level", "setup"))
     noise = np.sqrt(np.maximum(total**2 - level**2 - np.nan_to_num(setup) ** 2, 0.0))
     return [*noise.tolist(), *level.tolist(), *setup.tolist()]
 
 
 def _sigmas(measured: Measures | None, part: str) -> FloatArray:
-    """Standard uncertainty of each of `measures.WITH_SIGMA`, or a part of it; NaN where unknown."""
+    """Return the σ of each of `measures.WITH_SIGMA`, or a part of it; NaN if unknown."""
     return np.array([getattr(measured, name, math.nan) for name in measures.sigma_names(part)])
 
 
 def _dots(measurement: Measurement, calibration: ImageCalibration) -> list[npt.NDArray[Any]]:
-    """Columns of all dots; NaN for an unknown row, column or ray."""
+    """Return the columns of all dots; NaN for an unknown row, column or ray."""
     dots, lattice, match = measurement.dots, measurement.lattice, measurement.match
     if dots is None:
         return []
@@ -239,7 +239,7 @@ def _dots(measurement: Measurement, calibration: ImageCalibration) -> list[npt.N
 
 
 def _points(reconstruction: Reconstruction, measures: Measures | None) -> list[npt.NDArray[Any]]:
-    """Columns of the reflection points, with their residuals, captured minus computed."""
+    """Return the columns of the reflection points; residuals are captured minus computed."""
     residual = -reconstruction.residual_mm
     scale = (math.nan, math.nan) if measures is None else (measures.scale_x, measures.scale_z)
     return [
@@ -259,18 +259,18 @@ def _boundary(reconstruction: Reconstruction) -> list[npt.NDArray[Any]]:
 def table_rows(
     result: FrameResult, calibration: ImageCalibration, sigma_parts: bool = False
 ) -> dict[str, str]:
-    """A frame's rows of every table, as CSV text (`frame_tables`)."""
+    """Return a frame's rows of every table as CSV text (`frame_tables`)."""
     tables = frame_tables(result, calibration)
     return {name: csv_rows(name, table, sigma_parts) for name, table in tables.items()}
 
 
 def csv_header(name: str, sigma_parts: bool = False) -> str:
-    """Header line of a table's CSV file."""
+    """Return the header line of a table's CSV file."""
     return csv_text([[column.name for column in columns_of(name, sigma_parts)]])
 
 
 def csv_rows(name: str, table: Table, sigma_parts: bool = False) -> str:
-    """CSV text of a table's rows, without header, rounded to the decimals of `TABLES`."""
+    """Return a table's rows as CSV text, without header, rounded to the decimals of `TABLES`."""
     columns = columns_of(name, sigma_parts)
     text = _numeric_rows(columns, table)
     if text is not None:
@@ -285,9 +285,9 @@ def csv_rows(name: str, table: Table, sigma_parts: bool = False) -> str:
 
 
 def _numeric_rows(columns: Sequence[Column], table: Table) -> str | None:
-    """The same by compiled loops; None unless all is numbers, but for one word in the last column.
+    """Return the same with compiled loops, for numbers and a constant word in the last column.
 
-    None also where the rounding of a number to its decimals is too near to a tie.
+    None for other tables, and if a number is too close to a tie for correct rounding.
     """
     from labapp.export.fixed_point import format_fixed  # loads numba
 
@@ -308,12 +308,12 @@ def _numeric_rows(columns: Sequence[Column], table: Table) -> str | None:
 
 
 def nodes_csv(nodes: FloatArray) -> bytes:
-    """Nodes of a surface, shape (n, 3), mm, as `x_mm,y_mm,z_mm`."""
+    """Return the nodes of a surface, shape (n, 3), mm, as CSV `x_mm,y_mm,z_mm`."""
     text = io.StringIO()
     np.savetxt(text, nodes, f"%.{MM_DIGITS}f", ",", header="x_mm,y_mm,z_mm", comments="")
     return text.getvalue().encode()
 
 
 def number(value: float | None, digits: int = MM_DIGITS) -> str:
-    """A number as a CSV cell; empty where unknown."""
+    """Format a number as a CSV cell; empty if unknown."""
     return f"{value:z.{digits}f}" if value is not None and math.isfinite(value) else ""

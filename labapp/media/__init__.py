@@ -26,7 +26,7 @@ RECORDING_SUFFIXES = VIDEO_SUFFIXES | {".cine", ".npy", ".npz"} | PHOTRON_SUFFIX
 
 
 def open_source(path: str | os.PathLike[str], index: bytes | None = None) -> FrameSource:
-    """Open a recording; its type is recognised by its content first, then by its name.
+    """Open a recording; its type is recognised by its content, or else by its name.
 
     Parameters
     ----------
@@ -34,7 +34,7 @@ def open_source(path: str | os.PathLike[str], index: bytes | None = None) -> Fra
         An image, a folder of images or with one recording in it, a TIFF stack, a video, a Phantom
         .cine, a Photron .mraw or its header, a NumPy .npy or .npz.
     index
-        The `FrameSource.index` of an earlier opening; it saves reading a video through again.
+        The `FrameSource.index` of an earlier opening, with which a video need not be read again.
 
     Raises
     ------
@@ -55,13 +55,13 @@ def open_source(path: str | os.PathLike[str], index: bytes | None = None) -> Fra
 
 
 def read_picture(path: str | os.PathLike[str]) -> GreyImage:
-    """Grey levels of a picture, or of a recording's first frame; raises as `open_source` does."""
+    """Read a picture, or the first frame of a recording; raises like `open_source`."""
     with open_source(path) as source:
         return source.frame(0).image
 
 
 def _by_content(path: Path, head: bytes, index: bytes | None) -> FrameSource | None:
-    """Open what begins with bytes that only one format begins with; None for all else."""
+    """Open a file whose first bytes identify its format; None for other files."""
     if head == b"SQLite forma":
         wanted = "a recording; sessions are for labapp session: labapp session --help"
         raise InputError(path, "content", "a session, or another database", wanted)
@@ -94,7 +94,7 @@ def _by_name(path: Path, index: bytes | None) -> FrameSource:
 
 
 def _video(path: Path, index: bytes | None) -> FrameSource:
-    # PyAV is as much to load as NumPy: it is loaded where there is a video.
+    # Imported on use, as PyAV takes as long to import as NumPy.
     from labapp.media.formats.video import VideoSource
 
     return VideoSource(path, index)

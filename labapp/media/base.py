@@ -14,7 +14,7 @@ import numpy.typing as npt
 from labapp.core.values import ReadOnlyArrays
 
 GreyImage = npt.NDArray[Any]
-"""Grey levels, shape (rows, columns): uint8 or uint16 as recorded, float32 where it was neither."""
+"""Grey levels, shape (rows, columns): uint8 or uint16 as recorded, float32 for other types."""
 
 
 @dataclass(frozen=True)
@@ -22,9 +22,9 @@ class Frame(ReadOnlyArrays):
     """A frame of a source."""
 
     index: int
-    """Its place in the source, from 0."""
+    """Frame number in the source, from 0."""
     time_s: float | None
-    """Time since the source's first frame, s; None where the source has no time base."""
+    """Time since the source's first frame, s; None if the source has no time base."""
     image: GreyImage
     """Grey levels, shape (rows, columns), read-only."""
 
@@ -33,20 +33,20 @@ class FrameSource(Protocol):
     """Frames in a fixed order, each of the same shape: a video, an image, a folder of images."""
 
     name: str
-    """What to call it."""
+    """Name for display."""
     frame_rate_hz: float | None
-    """Frames a second; None where there is no time base."""
+    """Frame rate, Hz; None without a time base."""
     shape: tuple[int, int]
     """(rows, columns) of every frame."""
     warnings: tuple[str, ...]
-    """What the user should know about it, one sentence each."""
+    """Warnings for the user, one sentence each."""
     description: str = ""
-    """What was read, in words: "AVI, FFV1, 640×480 px, 8 bit grey, 60 frames/s"."""
+    """Description: "AVI, FFV1, 640×480 px, 8 bit grey, 60 frames/s"."""
     bit_depth: int = 8
     """Significant bits of a grey level: 8, 10, 12, 16; 32 for float."""
     index: bytes | None = None
-    """What opening had to find out in the file (time stamps, key frames …): ``open_source(path,
-    index)`` opens it again at once. None where opening is cheap. An index that does not fit the
+    """Information from reading the file (time stamps, key frames …), with which
+    ``open_source(path, index)`` opens it fast. None if opening is fast anyway. An index of another
     file is ignored.
     """
 
@@ -58,21 +58,18 @@ class FrameSource(Protocol):
         Raises
         ------
         InputError
-            If this frame cannot be read; other frames may still be.
+            If this frame cannot be read; other frames may be readable.
         IndexError
             If there is no such frame.
         """
         ...
 
     def reopen(self) -> Self:
-        """Open the same frames once more, with nothing left of what was read before.
-
-        A reader that keeps a place in its file opens the file again.
-        """
+        """Open the same frames again, without the state of earlier reads."""
         return copy.copy(self)
 
     def close(self) -> None:
-        """Close the file. Closing twice does no harm."""
+        """Close the file. May be called twice."""
         return
 
     def __iter__(self) -> Iterator[Frame]:
@@ -92,21 +89,21 @@ def check_index(source: FrameSource, index: int) -> None:
 
 
 def format_frame_rate(rate_hz: float) -> str:
-    """Frame rate with its unit, to five digits: "60 frames/s", "1 frame/s", "29.97 frames/s"."""
+    """Format a frame rate with its unit: "60 frames/s", "1 frame/s", "29.97 frames/s"."""
     is_whole = rate_hz == round(rate_hz) or rate_hz >= 10_000
     figure = f"{rate_hz:.0f}" if is_whole else f"{rate_hz:.5g}"
     return f"{figure} frame{'s' * (figure != '1')}/s"
 
 
 def to_grey(image: npt.NDArray[Any]) -> GreyImage:
-    """Grey levels of a decoded picture, shape (rows, columns).
+    """Convert a decoded picture to grey levels, shape (rows, columns).
 
     Parameters
     ----------
     image
-        Shape (rows, columns) or (rows, columns, 1 … 4) in OpenCV's order B, G, R, alpha. Colour
-        becomes luminance, alpha is dropped. uint8 and uint16 keep their levels; every other type
-        becomes float32.
+        Shape (rows, columns) or (rows, columns, 1 … 4) in OpenCV's order B, G, R, alpha. Colour is
+        converted to luminance, alpha is ignored. uint8 and uint16 are unchanged; other types are
+        converted to float32.
     """
     if image.dtype not in (np.uint8, np.uint16):
         image = image.astype(np.float32)

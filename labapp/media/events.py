@@ -1,4 +1,4 @@
-"""Events of cameras, recordings and pedals: one stream for the page and the log.
+"""Events of cameras, recordings and pedals, for the app and the log.
 
 They are passed to an `OnEvent`, which may be called from any thread.
 """
@@ -14,7 +14,7 @@ from datetime import datetime
 from typing import Literal
 
 Kind = Literal["note", "warning", "loss"]
-"""Information; a fault that may pass; frames that are lost for good."""
+"""Information, a possibly temporary fault, or the permanent loss of frames."""
 
 
 @dataclass(frozen=True)
@@ -22,7 +22,7 @@ class Event:
     """An event."""
 
     source: str
-    """A camera's id, a recording's file, a pedal's name."""
+    """Id of a camera, file of a recording, or name of a pedal."""
     kind: Kind
     words: str
     """One sentence for the operator."""
@@ -36,7 +36,7 @@ OnEvent = Callable[[Event], None]
 
 
 def logged(on_event: OnEvent) -> OnEvent:
-    """Callback that writes events to the program's log and passes them on."""
+    """Return a callback that also writes events to the program's log."""
     levels = {"note": logging.INFO, "warning": logging.WARNING, "loss": logging.ERROR}
 
     def log(event: Event) -> None:
@@ -51,7 +51,7 @@ def ignore_event(_: Event) -> None:
 
 
 EVERY_S = 1.0
-"""Least time between the reports of a `Tally`, s."""
+"""Shortest interval between the reports of a `Tally`, s."""
 
 
 class Tally:
@@ -71,7 +71,7 @@ class Tally:
         self._mutex = threading.Lock()
 
     def count(self, more: int = 1) -> None:
-        """Count, without a report before the next `flush`."""
+        """Count, without a report until the next `flush`."""
         with self._mutex:
             self.total += more
             self._unreported += more
@@ -82,7 +82,7 @@ class Tally:
         self.flush()
 
     def flush(self, *, now: bool = False) -> None:
-        """Report what is not reported yet, if the interval is over; with ``now`` in any case."""
+        """Report the unreported count, if the interval is over; with ``now`` in any case."""
         at_s = time.monotonic()
         with self._mutex:
             count = self._unreported

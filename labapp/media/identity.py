@@ -1,4 +1,4 @@
-"""Which recording a path leads to: its files, their digest, and a quick check for a change."""
+"""Identity of a recording: digest of its files, and a fast check for changes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ READABLE = "one that can be read"
 
 
 def identify(path: Path) -> tuple[int, str]:
-    """Size in bytes and SHA-256 of a recording; of a folder or a pair, over all its files.
+    """Return size in bytes and SHA-256 of a recording; for a folder or a pair, of all files.
 
     Raises
     ------
@@ -39,12 +39,12 @@ def identify(path: Path) -> tuple[int, str]:
 
 
 def stamp(path: Path) -> str:
-    """Digest of the names, sizes and times of change of a recording's files, without reading them.
+    """Return a digest of names, sizes and modification times of a recording's files.
 
     Raises
     ------
     InputError
-        If one of them is not there.
+        If a file is missing.
     """
     with os_errors_as_input(path, "recording", READABLE):
         seen = [(file.name, file.stat()) for file in _files(path)]

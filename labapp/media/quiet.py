@@ -1,4 +1,4 @@
-"""Silence OpenCV's own messages on the terminal; ours report what is wrong."""
+"""Suppression of OpenCV's messages on the terminal."""
 
 from __future__ import annotations
 
@@ -9,5 +9,5 @@ import cv2
 
 @functools.cache
 def quiet_opencv() -> None:
-    """Silence OpenCV; what it cannot decode is reported by its reader."""
+    """Suppress OpenCV's messages; readers report decoding errors."""
     cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)

@@ -1,4 +1,4 @@
-"""Read a recording through once at import, and check that any frame can be read."""
+"""Survey of a recording at import: read all frames, and check random access."""
 
 from __future__ import annotations
 
@@ -18,48 +18,48 @@ if TYPE_CHECKING:
     from labapp.media.formats.video import VideoSource
 
 CHECKED_FRAMES = 24
-"""Frames drawn to be read again out of order."""
+"""Number of random frames that are read again out of order."""
 
 NAMED_FRAMES = 10
-"""No more frames than this are listed in a warning."""
+"""Most frames that are listed in a warning."""
 
 
 @dataclass(frozen=True)
 class Survey(ReadOnlyArrays):
-    """Findings of reading a recording through."""
+    """Result of reading all frames of a recording."""
 
     checksum: npt.NDArray[np.uint32]
-    """`frame_checksum` of each frame, shape (n,), uint32; 0 where a frame cannot be read."""
+    """`frame_checksum` of each frame, shape (n,), uint32; 0 if a frame cannot be read."""
     readable: npt.NDArray[np.bool_]
     """Whether a frame can be read, shape (n,)."""
     time_s: FloatArray
-    """Time of each frame since the first, shape (n,), s; NaN where unknown."""
+    """Time of each frame since the first, shape (n,), s; NaN if unknown."""
     frame_exact: bool
     """Whether the frames read again out of order were the same."""
     checked: int
-    """How many were; 0 for a video that is decoded from its start in any case."""
+    """Number of these frames; 0 for a video that is always decoded from its start."""
     warnings: tuple[str, ...]
-    """What the user should know beyond the source's own warnings, one sentence each."""
+    """Warnings for the user in addition to those of the source, one sentence each."""
 
 
 def frame_checksum(image: GreyImage) -> int:
-    """CRC-32 of a frame's grey levels, row by row, the low byte first."""
+    """Return the CRC-32 of a frame's grey levels, row by row, little-endian."""
     little = np.ascontiguousarray(image, image.dtype.newbyteorder("<"))
     return zlib.crc32(little.tobytes())
 
 
 def survey(source: FrameSource, progress: Callable[[int, int], None] | None = None) -> Survey:
-    """Read every frame in order, then some out of order from the source opened anew.
+    """Read all frames in order, then some out of order from the reopened source.
 
-    A video that gives other frames then is made to decode from its start from now on
+    If a video then returns other frames, it is decoded from its start from now on
     (`VideoSource.decode_from_start`).
 
     Parameters
     ----------
     source
-        What is to be read.
+        The recording.
     progress
-        Called with the frames done and all there are to do; may raise to end the survey.
+        Called with the number of frames done and the total; may raise to stop.
     """
     order = _order(source)
     total = len(source) + len(order)
@@ -94,7 +94,7 @@ def _read(source: FrameSource, index: int) -> Frame | None:
 
 
 def _order(source: FrameSource) -> list[int]:
-    """Frames to read again: last, first, jumps both ways, then steps backwards."""
+    """Return the frames to read again: last, first, random jumps, then steps backwards."""
     video = _as_video(source)
     if video is not None and not video.seekable:
         return []
@@ -117,14 +117,14 @@ def _inexact(source: FrameSource, exact: bool) -> tuple[str, ...]:
         return ()
     video = _as_video(source)
     if video is None:
-        return (f"{source.name} gave other frames when they were read again; has it changed?",)
+        return (f"{source.name} returned other frames when read again; has it changed?",)
     before = video.warnings
     video.decode_from_start()
     return tuple(sentence for sentence in video.warnings if sentence not in before)
 
 
 def _as_video(source: FrameSource) -> VideoSource | None:
-    # Its PyAV is as much to load as NumPy, and where a session is opened nothing is surveyed.
+    # Late import, as PyAV takes as long as NumPy, and opening a session does not need it.
     from labapp.media.formats.video import VideoSource
 
     return source if isinstance(source, VideoSource) else None

@@ -1,1 +1,1 @@
-"""Frames measured one after the other: of a recording, or while a camera is live."""
+"""Measuring sequences of frames: of a recording, or of a live camera."""

@@ -1,9 +1,9 @@
-"""Alarms while a pool is filmed: raised, over, and acknowledged by the operator.
+"""Alarms of a live measurement: raised, over, and acknowledged by the operator.
 
-One is raised when a size is beyond its limit by more than chance, when so many frames in a row
-cannot be measured, or when none is for long; it is over when the size has been within its limits,
-or frames have been measured, for a second: a pool that swings about a limit is one alarm. It is
-shown until it is both over and acknowledged: none goes by unseen.
+An alarm is raised when a size is significantly beyond a limit, when a number of consecutive frames
+cannot be measured, or when no frame is measured for long. It is over when its cause has been absent
+for a second, so that a pool oscillating about a limit raises one alarm only. It is shown until it
+is both over and acknowledged.
 """
 
 from __future__ import annotations
@@ -17,24 +17,24 @@ from labapp.run.limits import NAMES, Limits, Size, Standing, sizes_of, standing
 from labapp.text import pluralize
 
 CALM_S = 1.0
-"""Time without its cause, s by the camera's clock, after which an alarm is over."""
+"""Time without its cause after which an alarm is over, s by the camera's clock."""
 
 NOT_MEASURED, SILENT, DOUBTFUL = "not-measured", "silent", "setup-doubtful"
-"""Codes of the alarms of frames that cannot be measured, of none that is, and of a set-up that they
-contradict; others are as ``width-high``."""
+"""Codes of the alarms that frames cannot be measured, that none is measured, and that the set-up is
+doubtful; the others are ``width-low`` … ``height-high``."""
 
 
 @dataclass(frozen=True)
 class Alarm:
-    """Something that the operator must see."""
+    """A condition that the operator must see."""
 
     code: str
     """``width-low`` … ``height-high``, ``not-measured``, ``silent`` or ``setup-doubtful``."""
     words: str
-    """What is wrong, a sentence without its full stop."""
+    """Description, a sentence without full stop."""
     frame: int
     time_s: float
-    """The camera's number of the frame that raised it, and its time by the camera's clock, s."""
+    """Number of the frame that raised it, and its time by the camera's clock, s."""
     holds: bool = True
     """Whether its condition still holds."""
     acknowledged: bool = False
@@ -44,36 +44,36 @@ class Alarm:
 
     @property
     def description(self) -> str:
-        """What is wrong, since which frame."""
+        """Description with the frame and the time at which it was raised."""
         return f"{self.words} (frame {self.frame}, {self.at:%H:%M:%S})"
 
 
 class Alarms:
-    """Watches the sizes of one frame after the other. May be used from several threads.
+    """Monitors the sizes of successive frames. May be used from several threads.
 
     Parameters
     ----------
     limits
-        What is watched; without any limit nothing is but the set-up.
+        Limits of the sizes; without any, only the set-up is monitored.
     """
 
     def __init__(self, limits: Limits) -> None:
         self._limits = limits
         self._shown: dict[str, Alarm] = {}
         self._held_s: dict[str, float] = {}
-        """When the cause of each alarm was last there, or may have been."""
+        """Last time at which the cause of each alarm was, or may have been, present."""
         self._unmeasured = 0
         self._newest = (0, 0.0)
-        """Number and time of the frame that was looked at last."""
+        """Number and time of the last frame."""
         self._turn = threading.Lock()
 
     @property
     def limits(self) -> Limits:
-        """What is watched."""
+        """The limits in use."""
         return self._limits
 
     def set_limits(self, limits: Limits) -> list[Alarm]:
-        """Watch other limits from the next frame on; returns the alarms that this ends."""
+        """Replace the limits from the next frame on; returns the alarms that this ends."""
         with self._turn:
             former, self._limits = self._limits, limits
             changed = [name for name in NAMES if former.of(name) != limits.of(name)]
@@ -85,7 +85,7 @@ class Alarms:
 
     @property
     def shown(self) -> tuple[Alarm, ...]:
-        """Those that hold, or were not acknowledged; the oldest first."""
+        """Alarms that hold or were not acknowledged, the oldest first."""
         return tuple(self._shown.values())
 
     def judge(
@@ -96,26 +96,26 @@ class Alarms:
         reason: str,
         setup_doubt: str = "",
     ) -> list[Alarm]:
-        """Look at the next frame.
+        """Check the next frame.
 
         Parameters
         ----------
         frame, time_s
-            The camera's number of it, and its time, s.
+            Its number by the camera, and its time, s.
         measures
-            Sizes; None where it could not be measured.
+            Sizes; None if it could not be measured.
         setup_doubt
             Why the set-up is doubtful; empty if it is not.
 
         Returns
         -------
         list of Alarm
-            Those that it raised, and those that are over (they hold no more).
+            Alarms that the frame raised, and those that are over (`Alarm.holds` is False).
         """
         with self._turn:
             self._newest = (frame, time_s)
             if measures is not None and self._misses(measures):
-                measures, reason = None, "a size that is watched is not known"
+                measures, reason = None, "a size with limits is unknown"
             counted = measures is None and self._limits.are_set
             self._unmeasured = self._unmeasured + 1 if counted else 0
             causes = self._causes(measures, reason) if self._limits.are_set else {}
@@ -137,7 +137,7 @@ class Alarms:
             return changed
 
     def silence(self, words: str) -> list[Alarm]:
-        """Raise the alarm that no frame is measured, with the reason; returns it if it is new."""
+        """Raise the alarm that no frame is measured; returns it if it is new."""
         with self._turn:
             if not self._limits.are_set:
                 return []
@@ -153,13 +153,13 @@ class Alarms:
             return new
 
     def _misses(self, measures: Measures) -> bool:
-        """Whether a size that has limits is not known."""
+        """Whether a size with limits is unknown."""
         return any(
             standing(size, self._limits.of(size.name)) == "unknown" for size in sizes_of(measures)
         )
 
     def _causes(self, measures: Measures | None, reason: str) -> dict[str, str | None]:
-        """Code → words of what is wrong in a frame; None in place of words where it is unknown."""
+        """Return code → description of each alarm cause in a frame; None if it is uncertain."""
         if measures is None:
             unknown: dict[str, str | None] = dict.fromkeys(self._shown)
             unknown.pop(SILENT, None)
@@ -198,7 +198,7 @@ class Alarms:
 
 
 def in_words(size: Size, stands: Standing, limits: Limits) -> str:
-    """A size that is beyond its limit: "Width 7.051 ± 0.028 mm is above 6.9 mm"."""
+    """Describe a size beyond its limit: "Width 7.051 ± 0.028 mm is above 6.9 mm"."""
     low, high = limits.of(size.name)
     limit, way = (low, "below") if stands == "low" else (high, "above")
     sigma = f" ± {size.sigma_mm:.3f}" if size.sigma_mm == size.sigma_mm else ""

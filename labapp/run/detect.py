@@ -1,4 +1,4 @@
-"""Dots of one image without a setup: what `labapp detect` writes."""
+"""Detection of the dots of one image without a set-up, for `labapp detect`."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ COLUMNS = "u_px v_px reflected_row reflected_column snr u_sigma_px v_sigma_px".s
 def detect_dots(
     path: str | os.PathLike[str], dot_settings: DotSettings, lattice_settings: LatticeSettings
 ) -> tuple[Dots, Lattice | None, str]:
-    """Find the dots of a source's first frame, their rows and columns, and what is in doubt.
+    """Find the dots of a source's first frame, and their rows and columns.
 
     Returns
     -------
     dots, lattice, doubt
-        The lattice is None, and the doubt a sentence, where rows and columns are not found.
+        If rows and columns are not found, the lattice is None and the doubt gives the reason.
 
     Raises
     ------
@@ -46,7 +46,7 @@ def detect_dots(
 
 
 def write_detected(path: Path, dots: Dots, lattice: Lattice | None) -> None:
-    """Write the dots as CSV, in one piece.
+    """Write the dots as CSV, atomically.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Limits of a pool's sizes while it is filmed, and whether a size is beyond one."""
+"""Limits of a pool's sizes in a live measurement, and comparison of sizes with them."""
 
 from __future__ import annotations
 
@@ -13,22 +13,19 @@ from labapp.core.values import BoolArray, FloatArray
 from labapp.errors import InputError
 
 CHANCE = 2.0
-"""Number of σ by which a size may be beyond a limit by chance: that is no alarm.
-
-σ covers noise, level and set-up.
-"""
+"""Number of σ (noise, level and set-up) by which a size may exceed a limit without an alarm."""
 
 UNMEASURED = 3
-"""Default number of frames in a row without a measurement that are an alarm."""
+"""Default number of consecutive unmeasured frames that raise an alarm."""
 
 LARGEST_MM = 1000.0
 
 Standing = Literal["", "unknown", "in order", "in doubt", "low", "high"]
-"""How a size stands to its limits: it has none; it could not be measured; within them; beyond one,
-but by chance perhaps; below the lower one; above the upper one."""
+"""A size relative to its limits: without limits; not measured; within them; beyond one, but not
+significantly; significantly below the lower one; significantly above the upper one."""
 
 NAMES = ("width", "length", "height")
-"""What has limits. For a hollow pool, height is its depth, which is negative."""
+"""Sizes with limits. For a concave pool, height means its depth, which is negative."""
 
 Ends = tuple[float | None, float | None]
 
@@ -39,9 +36,9 @@ class Size(NamedTuple):
     Parameters
     ----------
     name
-        ``width``, ``length``, ``height``; of a hollow pool ``depth``.
+        ``width``, ``length`` or ``height``; for a concave pool ``depth``.
     value_mm, sigma_mm
-        NaN where they are not known; σ: noise, level and set-up.
+        Value and σ (noise, level and set-up); NaN if unknown.
     """
 
     name: str
@@ -51,21 +48,21 @@ class Size(NamedTuple):
 
 @dataclass(frozen=True)
 class Limits:
-    """Between what the sizes of a pool are to be; the ends are mm, None where there is none.
+    """Lower and upper limits of a pool's sizes, mm; None: no limit.
 
     Raises
     ------
     InputError
-        If the lowest is not below the highest, or one is out of range.
+        If a lower limit is not below the upper one, or one is out of range.
     """
 
     width_mm: Ends = (None, None)
     length_mm: Ends = (None, None)
-    """Lowest and highest."""
+    """Lower and upper limit."""
     height_mm: Ends = (None, None)
-    """The same of the height; of a hollow pool of the depth, which is negative."""
+    """Lower and upper limit of the height, or of a concave pool's (negative) depth."""
     unmeasured: int = UNMEASURED
-    """Number of frames in a row without a measurement that are an alarm."""
+    """Number of consecutive unmeasured frames that raise an alarm."""
 
     def __post_init__(self) -> None:
         problems = []
@@ -84,18 +81,18 @@ class Limits:
             raise InputError.gather(problems)
 
     def of(self, name: str) -> Ends:
-        """Lowest and highest of a size by its name, mm; ``depth`` is ``height``."""
+        """Return lower and upper limit of a size, mm; ``depth`` has those of ``height``."""
         ends: Ends = getattr(self, f"{'height' if name == 'depth' else name}_mm")
         return ends
 
     @property
     def are_set(self) -> bool:
-        """Whether there is any."""
+        """Whether there is any limit."""
         return any(end is not None for name in NAMES for end in self.of(name))
 
     @property
     def words(self) -> str:
-        """What they are: "width 6 to 6.9 mm, height from 0.2 mm"."""
+        """The limits as text: "width 6 to 6.9 mm, height from 0.2 mm"."""
         parts = []
         for name in NAMES:
             low, high = self.of(name)
@@ -106,7 +103,7 @@ class Limits:
 
 
 def sizes_of(measures: Measures | None) -> tuple[Size, Size, Size]:
-    """Width, length and height, of a hollow pool the depth; NaN where nothing was measured."""
+    """Return width, length, and height or (if concave) depth; NaN if ``measures`` is None."""
     hollow = measures is not None and -measures.depth_mm > measures.height_mm
     width, length, height = (
         Size(name, *(getattr(measures, f"{name}{end}", math.nan) for end in ("_mm", "_sigma_mm")))
@@ -116,9 +113,9 @@ def sizes_of(measures: Measures | None) -> tuple[Size, Size, Size]:
 
 
 def standing(size: Size, ends: Ends) -> Standing:
-    """How a size stands to its limits; beyond one only if by more than `CHANCE` times its σ.
+    """Compare a size with its limits; it is low or high if beyond by more than `CHANCE` σ.
 
-    A size whose σ is not known is beyond a limit as soon as it has passed it.
+    An unknown σ counts as 0.
     """
     low, high = ends
     if low is None and high is None:
@@ -137,7 +134,7 @@ def standing(size: Size, ends: Ends) -> Standing:
 
 
 def beyond(value_mm: FloatArray, sigma_mm: FloatArray, ends: Ends) -> BoolArray:
-    """Which of many sizes are ``low`` or ``high`` (`standing`), of their shape."""
+    """Return which of many sizes are ``low`` or ``high`` (`standing`), in their shape."""
     chance = CHANCE * np.where(np.isfinite(sigma_mm), sigma_mm, 0.0)
     low, high = (math.nan if end is None else end for end in ends)
     return np.asarray((low - value_mm > chance) | (value_mm - high > chance))

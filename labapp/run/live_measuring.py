@@ -1,4 +1,4 @@
-"""Frames of a live camera measured in a process of their own, each from the one before."""
+"""Measuring the frames of a live camera in a separate process, by tracking."""
 
 from __future__ import annotations
 
@@ -18,31 +18,29 @@ from labapp.media.cameras import CameraFrame
 from labapp.simulation.parallel import end_processes, start_worker
 
 JUDGED_S = 0.2
-"""How long the quality of a frame applies to those that follow, s."""
+"""Time for which the quality of a frame is reused for the following ones, s."""
 
 SOUGHT_S = 1.0
-"""For so long after a frame that was measured, s, frames that cannot be followed are left out: the
-pool may swing back to where it was, and a frame that is measured by itself takes seconds."""
+"""Time after a measured frame for which frames that cannot be tracked are skipped, s: the pool may
+return to its previous shape, and measuring a frame without tracking takes seconds."""
 
 
 class LiveMeasuringEnded(Exception):
-    """The process has ended: it was closed, or something ended it."""
+    """The measuring process has ended: it was closed, or it died."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class LiveResult(FrameResult):
-    """What a live frame gave: status, reason and measures, without dots, rays and surface."""
+    """Result of a live frame: status, reason and measures, without dots, rays and surface."""
 
     time_s: float
     """By the camera's clock, s."""
     arrived_s: float
-    """`time.monotonic` when it came, s: the sizes are as old."""
+    """`time.monotonic` at its arrival, s."""
     quality: Quality
-    """How fit the frame is to be measured; of a followed one, that of a frame at most `JUDGED_S`
-    before.
-    """
+    """Image quality; of a tracked frame, that of a frame at most `JUDGED_S` before."""
     scene: Scene | None = None
-    """Its surface to be drawn, if wanted; None where it could not be measured."""
+    """Its surface for drawing, if requested; None if it could not be measured."""
 
 
 class LiveMeasuring:
@@ -50,18 +48,18 @@ class LiveMeasuring:
 
     def __init__(self, setup: Setup, settings: Settings, bit_depth: int) -> None:
         spawn = multiprocessing.get_context("spawn")
-        nice, given = 0, (setup, settings, bit_depth)  # its results are needed now
+        nice, given = 0, (setup, settings, bit_depth)  # normal priority: results are urgent
         self._pool = ProcessPoolExecutor(
             1, spawn, initializer=start_worker, initargs=(nice, _begin, *given)
         )
 
     def measure(self, frame: CameraFrame, drawn: bool = False) -> LiveResult | None:
-        """Measure the next frame; None where it is left out (`SOUGHT_S`).
+        """Measure the next frame; None if it is skipped (`SOUGHT_S`).
 
         Parameters
         ----------
         drawn
-            Whether its surface is to be drawn: that takes a millisecond more.
+            Whether to return its surface for drawing, which takes another millisecond.
 
         Raises
         ------
@@ -93,7 +91,7 @@ class LiveChain:
         self._judged: tuple[float, Quality] | None = None
 
     def measure(self, frame: CameraFrame, drawn: bool) -> LiveResult | None:
-        """Measure the next frame, or leave it out: see `LiveMeasuring.measure`."""
+        """Measure the next frame, or skip it: see `LiveMeasuring.measure`."""
         found = self._chain.follow(frame.image)
         if found is None:
             if time.monotonic() < self._measured_s + SOUGHT_S:
@@ -115,7 +113,7 @@ class LiveChain:
         )
 
     def _quality(self, frame: CameraFrame, found: Measurement) -> Quality:
-        """Quality of the frame, or of one just before: that takes half as long as measuring."""
+        """Return the quality of the frame, or a recent one: it takes half as long as measuring."""
         now_s, is_followed = time.monotonic(), self._chain.track_lost is None
         if self._judged is not None and is_followed and now_s < self._judged[0] + JUDGED_S:
             return self._judged[1]
@@ -125,11 +123,11 @@ class LiveChain:
 
 
 _chain: LiveChain | None = None
-"""What measures in this process."""
+"""The chain of this process."""
 
 
 def _begin(setup: Setup, settings: Settings, bit_depth: int) -> None:
-    global _chain  # noqa: PLW0603 - the process measures by one chain all its life
+    global _chain  # noqa: PLW0603 - one chain for the life of the process
     _chain = LiveChain(setup, settings, bit_depth)
 
 

@@ -1,4 +1,4 @@
-"""Sizes of a live pool over the last seconds, and how measuring keeps up."""
+"""Sizes of a live pool over the last seconds, and the rate of measuring."""
 
 from __future__ import annotations
 
@@ -16,47 +16,47 @@ from labapp.run.limits import NAMES, Limits, beyond, sizes_of
 from labapp.run.live_measuring import LiveResult
 
 RATE_S = 2.0
-"""Time over which rates are taken, s."""
+"""Time over which rates are averaged, s."""
 
 TREND_S = 120.0
-"""The trend goes back so far."""
+"""Length of the trend, s."""
 
 MOST_KEPT = 12_000
-"""Frames of the trend at most: a hundred a second."""
+"""Most frames of the trend: a hundred per second."""
 
 
 @dataclass(frozen=True)
 class Trend(ReadOnlyArrays):
-    """Sizes of the last frames that were tried; n frames, the oldest first."""
+    """Sizes of the last n frames, the oldest first."""
 
     names: tuple[str, ...]
-    """What the three sizes are: the last is ``height``, or of a hollow pool ``depth``."""
+    """Names of the three sizes: the last is ``height``, or for a concave pool ``depth``."""
     number: IntArray
-    """The camera's numbers of them, shape (n,)."""
+    """Frame numbers of the camera, shape (n,)."""
     since_s: FloatArray
-    """When they came, from now on and so negative, shape (n,), s."""
+    """Arrival times relative to now, so negative, shape (n,), s."""
     value_mm: FloatArray
     sigma_mm: FloatArray
-    """Of width, length and height, shape (3, n); NaN where they are not known."""
+    """Width, length and height, and their σ, shape (3, n); NaN if unknown."""
     beyond: BoolArray
-    """Which of them are beyond a limit, shape (3, n)."""
+    """Which sizes are beyond a limit, shape (3, n)."""
 
 
 @dataclass(frozen=True)
 class Pace:
-    """How measuring keeps up at present."""
+    """Present rate of measuring."""
 
     measured_hz: float
-    """Frames measured a second."""
+    """Frames measured per second."""
     tried: int
     failed: int
-    """How many frames were tried, and of them could not be measured."""
+    """Number of frames tried, and of those that could not be measured."""
 
 
 class _Frame(NamedTuple):
-    """A frame of the trend: numbers alone, for there are thousands.
+    """A frame of the trend.
 
-    Sizes are their values and then their σ, shape (6,), mm.
+    Sizes are the three values and their three σ, mm.
     """
 
     done_s: float
@@ -88,7 +88,7 @@ class LiveTrend:
                 self._frames.popleft()
 
     def pace(self) -> Pace:
-        """How measuring keeps up."""
+        """Return the present rate of measuring."""
         since_s = time.monotonic() - RATE_S
         with self._turn:
             late = list(takewhile(lambda each: each.done_s > since_s, reversed(self._frames)))
@@ -96,7 +96,7 @@ class LiveTrend:
         return Pace((len(late) - failed) / RATE_S, len(late), failed)
 
     def over(self, last_s: float, limits: Limits) -> Trend:
-        """Sizes of the frames of the last seconds, compared with limits."""
+        """Return the sizes of the last seconds' frames, compared with limits."""
         now_s = time.monotonic()
         with self._turn:
             late = [each for each in self._frames if each.arrived_s > now_s - last_s]

@@ -1,4 +1,4 @@
-"""Frames of a live camera measured as they come: sizes, their trend, alarms, streams."""
+"""Live measurement of a camera's frames: sizes, their trend, alarms, streams."""
 
 from __future__ import annotations
 
@@ -25,18 +25,18 @@ if TYPE_CHECKING:
     from labapp.export.penetration import Predictor
 
 SILENT_S = 10.0
-"""Time without a result, s, that is an alarm. A frame that is measured by itself takes seconds."""
+"""Time without a result that raises an alarm, s. Without tracking, a frame takes seconds."""
 
 
 class LiveWatch:
-    """Measures a camera's frames as they come, each from the one before, and watches the sizes.
+    """Measures a camera's frames by tracking, and monitors the sizes.
 
-    `take` never waits. Call `next_frame` and `measure` from one thread, the rest from any.
+    `take` never blocks. Call `next_frame` and `measure` from one thread, the rest from any.
 
     Parameters
     ----------
     setup, settings, bit_depth
-        As of `LiveMeasuring`.
+        As for `LiveMeasuring`.
     on_event
         Called when an alarm is raised, over, or acknowledged, and when limits change, with the
         event and the time of its frame by the camera's clock, s (None: now); from any thread.
@@ -52,7 +52,7 @@ class LiveWatch:
         on_event: Callable[[Event, float | None], None],
     ) -> None:
         self.alarms, self.trend = Alarms(limits), LiveTrend()
-        """What the operator must see; sizes of the last frames, and how measuring keeps up."""
+        """Alarms; sizes of the last frames, and rate of measuring."""
         self._name, self._scheme, self._on_event = name, settings.scheme, on_event
         self._measuring = LiveMeasuring(setup, settings, bit_depth)
         self._queue = FrameQueue()
@@ -64,38 +64,38 @@ class LiveWatch:
         self._measured_s, self._last = time.monotonic(), (0, 0.0)
         self._is_drawn = threading.Event()
         self.predictor: Predictor | None = None
-        """What predicts penetration from the results; may be replaced at any time."""
+        """Predictor of penetration; may be replaced at any time."""
         self._sinks = (self._judge, self.trend.add, self._predict, self._show, self._publish)
 
     def take(self, frame: CameraFrame) -> None:
-        """Take a frame of the camera; never waits."""
+        """Queue a frame of the camera; never blocks."""
         self._queue.put(frame)
 
     def close(self) -> None:
         """End the measuring, and the streams. May be called twice."""
         with self._turn:
-            self._is_closed = True  # that measuring ends now is no alarm
+            self._is_closed = True  # no alarm when measuring ends
             streams, self._streams = self._streams, {}
         self._measuring.close()
         for stream in streams.values():
             stream.close()
 
-    # --- in a thread of its own ---------------------------------------------------------------
+    # --- in the measuring thread --------------------------------------------------------------
 
     def next_frame(self) -> CameraFrame | None:
-        """The next frame to be measured; None while there is none (`FrameQueue`)."""
+        """Return the next frame to be measured; None if there is none (`FrameQueue`)."""
         frame = self._queue.next()
         if frame is None:
             self._check_silence()
         return frame
 
     def measure(self, frame: CameraFrame) -> None:
-        """Measure a frame and pass the result to all sinks; or leave it out (`LiveMeasuring`).
+        """Measure a frame and pass the result to all sinks, or skip it (`LiveMeasuring`).
 
         Raises
         ------
         LiveMeasuringEnded
-            If the process that measures has ended.
+            If the measuring process has ended.
         """
         drawn, began_s = self._is_drawn.is_set(), time.monotonic()
         try:
@@ -125,7 +125,7 @@ class LiveWatch:
             predictor.add(result)
 
     def _show(self, result: LiveResult) -> None:
-        """Hold the result and its surface for `newest` and `scene`."""
+        """Store the result and its surface for `newest` and `scene`."""
         if result.scene is not None:
             self._is_drawn.clear()
             self._scene.append(result.scene)
@@ -145,32 +145,32 @@ class LiveWatch:
     def _publish(self, result: FrameResult) -> None:
         values = stream_values(result, self.alarms.shown)
         predictor = self.predictor
-        if predictor is not None and isinstance(result, LiveResult):  # not while all is silent
+        if predictor is not None and isinstance(result, LiveResult):  # not from `_raise_silence`
             values = {**values, **predictor.values()}
-        with self._turn:  # no stream may be closed meanwhile
+        with self._turn:  # no stream may be closed during this
             for stream in self._streams.values():
                 stream.publish(values)
 
-    # --- what there is ------------------------------------------------------------------------
+    # --- results ------------------------------------------------------------------------------
 
     def newest(self) -> LiveResult | None:
-        """The last result; None if it was returned before."""
+        """Return the last result; None if it was returned before."""
         return self._newest.popleft() if self._newest else None
 
     def ask_for_scene(self) -> None:
-        """Have the surface of the next frame that is measured drawn, once."""
+        """Request the surface of the next measured frame for drawing."""
         self._is_drawn.set()
 
     def scene(self) -> Scene | None:
-        """The requested surface; None before it is there, and if it was returned before."""
+        """Return the requested surface; None if it is not available yet or was returned before."""
         return self._scene.popleft() if self._scene else None
 
     def stream(self, kind: str) -> Stream | None:
-        """The open stream of a kind, if any."""
+        """Return the open stream of a kind, if any."""
         return self._streams.get(kind)
 
     def standing(self) -> list[tuple[Event, float | None]]:
-        """Events for the notes of a recording that begins: limits, and alarms that hold."""
+        """Return events for the notes of a new recording: limits, and alarms that hold."""
         limits = self.alarms.limits
         events: list[tuple[Event, float | None]] = []
         if limits.are_set:
@@ -181,10 +181,10 @@ class LiveWatch:
                 events.append((Event(self._name, "warning", words), alarm.time_s))
         return events
 
-    # --- what is changed ----------------------------------------------------------------------
+    # --- changes ------------------------------------------------------------------------------
 
     def set_limits(self, limits: Limits) -> None:
-        """Watch other limits from the next frame on."""
+        """Replace the limits from the next frame on."""
         if limits != self.alarms.limits:
             for alarm in self.alarms.set_limits(limits):
                 self._on_event(self._changed(alarm), None)
@@ -197,10 +197,7 @@ class LiveWatch:
             self._on_event(Event(self._name, "note", words), None)
 
     def set_stream(self, kind: str, stream: Stream | None) -> None:
-        """Publish results by a stream in place of the one of its kind, which is closed.
-
-        None only closes that one; `close` closes all.
-        """
+        """Replace the stream of a kind, which is closed; None: only close it."""
         with self._turn:
             former = self._streams.pop(kind, None)
             if stream is not None and not self._is_closed:
@@ -210,7 +207,7 @@ class LiveWatch:
                 each.close()
 
     def _changed(self, alarm: Alarm) -> Event:
-        """The event of an alarm that is raised, or over."""
+        """Return the event for an alarm that is raised or over."""
         if alarm.holds:
             return Event(self._name, "warning", f"ALARM: {alarm.words} (frame {alarm.frame})")
         return Event(self._name, "note", f"alarm over: {alarm.description}")

@@ -1,11 +1,11 @@
-"""What measures the frames of a run (`runner.Measurer`).
+"""Measurers of the frames of a run (`runner.Measurer`).
 
-`ColdMeasurer` measures each frame as if it were the first, here or in a pool of processes.
-`WarmMeasurer` measures each from the one before, here; `RecordingMeasurer` does so with stretches
-of a recording in processes, which make the rows of the tables, too.
+`ColdMeasurer` measures each frame independently, in this process or in a pool of processes.
+`WarmMeasurer` tracks each frame from the previous one, in this process. `RecordingMeasurer` tracks
+stretches of a recording in several processes, which also compute the rows of the tables.
 
-Stretches are of one length, however many processes there are, and begin with a cold frame each:
-results do not depend on the machine.
+Stretches have the same length, however many processes there are, and each begins with a frame
+measured without tracking, so that results do not depend on the machine.
 """
 
 from __future__ import annotations
@@ -44,29 +44,29 @@ AHEAD = 8
 """Number of frames submitted to a pool of processes beyond the one whose result is awaited."""
 
 VOTERS, WAITS = 3, 5
-"""A frame is judged with two more that have a surface, so that of three that disagree two decide;
-so many wait at most."""
+"""Frames with a surface that vote on the rows of a frame, itself included, so that there is a
+majority; and the most frames that wait for them."""
 
 OPEN_WAITS = 20
-"""So many wait at most for a frame whose rows are open."""
+"""The most frames that wait for votes on a frame whose rows are ambiguous."""
 
 FOLLOWED_AT_ONCE = 400
-"""Frames whose pulses are told apart together: some tens of their periods."""
+"""Frames whose pulses are classified together: some tens of periods."""
 
 STRETCH = 1000
-"""Frames of a stretch: a cold frame takes as long as some two hundred that follow."""
+"""Frames of a stretch. A frame measured without tracking takes as long as 200 tracked ones."""
 
 BY_THEMSELVES = frozenset({0, 1, 2, 500})
-"""These frames of a stretch are measured by themselves, so that they can vote on its rows."""
+"""Frames of a stretch that are measured without tracking, to vote independently on its rows."""
 
 BATCH = 20
-"""Frames that a process returns at a time."""
+"""Frames that a process returns at once."""
 
 Read = Callable[[int], Frame]
 """Reads a frame by its number; raises `InputError` if it cannot."""
 
 Corrected = Callable[[int], ByHand | None]
-"""The dots and rows, or lines, of a frame as they were corrected by hand; None: they were not."""
+"""Returns a frame's manually corrected dots and rows, or lines; None if there are none."""
 
 
 # --- each frame by itself -----------------------------------------------------------------------
@@ -74,16 +74,16 @@ Corrected = Callable[[int], ByHand | None]
 
 @dataclass(frozen=True)
 class ColdMeasurer:
-    """Measures each frame as if it were the first."""
+    """Measures each frame independently of the others."""
 
     read: Read
     """Reads frames; one that cannot be read gets the status ``unreadable``."""
     setup: Setup
     settings: Settings
     corrected: Corrected = lambda _: None
-    """Gives the corrections by hand."""
+    """Returns manual corrections."""
     pool: Executor | None = None
-    """Where to measure (`measuring_pool`), some frames ahead; None: here, one after the other."""
+    """Pool of processes (`measuring_pool`), used some frames ahead; None: this process."""
 
     def __call__(self, frames: Iterable[int]) -> Generator[FrameResult]:
         """Measure frames; see `runner.Measurer`."""
@@ -91,7 +91,7 @@ class ColdMeasurer:
         return _agreeing(measured, self.setup, self.settings)
 
     def _submit(self, number: int) -> Future[FrameResult]:
-        """Read a frame here, and have it measured in the pool, or here and now."""
+        """Read a frame in this process, and measure it in the pool, or at once if there is none."""
         frame = _read(self.read, number, self.settings)
         if isinstance(frame, FrameResult):
             return _here(lambda: frame)
@@ -102,16 +102,16 @@ class ColdMeasurer:
 def _agreeing(
     measured: Generator[FrameResult], setup: Setup, settings: Settings, warm: bool = False
 ) -> Generator[FrameResult]:
-    """Results in their order, their rows decided together with those of the others (`RowVote`).
+    """Yield results in order, with rows decided by a vote among neighbouring frames (`RowVote`).
 
-    A frame is judged when two more with a surface are there, or after the next few.
+    A frame is judged as soon as `VOTERS` frames with a surface are known, or after `WAITS` frames.
 
     Parameters
     ----------
     measured
-        What was measured, in its order.
+        Results in order.
     warm
-        Whether frames follow on those before, but for where the track was lost.
+        Whether frames are tracked, except where the track was lost.
     """
     from labapp.core.recording.row_vote import Ballot, RowVote
 
@@ -145,14 +145,14 @@ def _agreeing(
 
 
 def _here(work: Callable[..., T], *given: Any) -> Future[T]:
-    """Do some work at once, as a pool without processes would."""
+    """Call a function at once, with the interface of a pool."""
     future: Future[T] = Future()
     future.set_result(work(*given))
     return future
 
 
 def _read(read: Read, number: int, settings: Settings) -> Frame | FrameResult:
-    """The frame; if it cannot be read, its result."""
+    """Return the frame, or its result if it cannot be read."""
     try:
         return read(number)
     except InputError as error:
@@ -162,7 +162,7 @@ def _read(read: Read, number: int, settings: Settings) -> Frame | FrameResult:
 def _cold(
     number: int, frame: Frame, setup: Setup, settings: Settings, correction: ByHand | None
 ) -> FrameResult:
-    """Measure a frame by itself, with its dots and rows as they were corrected."""
+    """Measure a frame independently, with its manual correction, if any."""
     with _one_thread():
         found, _ = measure(frame.image, setup.bench, settings, None, correction)
     return FrameResult(number, frame.time_s, found)
@@ -176,20 +176,20 @@ def _one_thread() -> AbstractContextManager[object]:
 
 @functools.cache
 def _threads() -> ThreadpoolController:
-    """Control of the BLAS libraries that are loaded; made once, as that takes milliseconds."""
-    import scipy.linalg  # noqa: F401 - it has a BLAS of its own, which is else loaded later
+    """Return the controller of the loaded BLAS libraries; cached, as it takes milliseconds."""
+    import scipy.linalg  # noqa: F401 - loads SciPy's own BLAS
 
     return ThreadpoolController()
 
 
 def measuring_pool(workers: int) -> ProcessPoolExecutor:
-    """Processes that measure: a window stays quick while they do."""
+    """Return a pool of measuring processes, which have low priority."""
     spawn = multiprocessing.get_context("spawn")
     return ProcessPoolExecutor(workers, spawn, initializer=start_worker, initargs=(NICE,))
 
 
 def _results_in_order(begun: Iterable[Future[T]], ahead: int) -> Generator[T]:
-    """Results in their order, some begun ahead, which are cancelled if it is closed early."""
+    """Yield results in order, with ``ahead`` futures begun, which are cancelled when closed."""
     waiting: deque[Future[T]] = deque()
     try:
         for future in begun:
@@ -211,15 +211,15 @@ def _results_in_order(begun: Iterable[Future[T]], ahead: int) -> Generator[T]:
 
 @dataclass(frozen=True)
 class LineFollower:
-    """Follows the line of a pattern of one (§3.3) through frames in order, sorted by pulse."""
+    """Follows the line of a one-line pattern (§3.3), with frames classified by current pulse."""
 
     read: Read
     setup: Setup
     settings: Settings
-    """As of `ColdMeasurer`."""
+    """As for `ColdMeasurer`."""
 
     def __call__(self, frames: Iterable[int]) -> Generator[FrameResult]:
-        """Measure frames; see `runner.Measurer`. Results come a stretch at a time."""
+        """Measure frames; see `runner.Measurer`. Results come `FOLLOWED_AT_ONCE` at a time."""
         from labapp.core.lines.frame import LineFrame
         from labapp.core.lines.track import LineTracker, track_line
 
@@ -243,24 +243,24 @@ class LineFollower:
                 yield FrameResult(number, frame.time_s, replace(found, setup_status=status))
 
 
-# --- each frame from the one before -------------------------------------------------------------
+# --- tracking from frame to frame ---------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class WarmMeasurer:
-    """Measures each frame from the one before, in stretches (`WarmChain`).
+    """Tracks each frame from the previous one, in stretches (`WarmChain`).
 
-    A frame that was corrected by hand is measured by itself, as it was corrected. Such a frame, one
-    that cannot be read and a change of the step between frames are gaps (`WarmChain.skip`).
+    A manually corrected frame is measured independently. Corrected frames, unreadable frames and
+    changes of the step between frames are gaps for the track (`WarmChain.skip`).
     """
 
     read: Read
     setup: Setup
     settings: Settings
     corrected: Corrected = lambda _: None
-    """As of `ColdMeasurer`."""
+    """As for `ColdMeasurer`."""
     pool: Executor | None = None
-    """One process to measure in (`measuring_pool`); None: here."""
+    """Pool of one process (`measuring_pool`); None: this process."""
 
     def __call__(self, frames: Iterable[int]) -> Generator[FrameResult]:
         """Measure frames; see `runner.Measurer`."""
@@ -308,7 +308,7 @@ class _ChainElsewhere:
         pool.submit(_begin_chain, setup, settings)
 
     def skip(self) -> None:
-        """Leave out a frame."""
+        """Skip a frame."""
         self._pool.submit(_skip_in_chain)
 
     def measure(self, image: GreyImage) -> Measurement:
@@ -343,29 +343,29 @@ def _measure_in_chain(image: GreyImage) -> tuple[Measurement, str | None]:
 
 @dataclass(frozen=True)
 class RecordingMeasurer:
-    """Measures each frame of a recording from the one before, many stretches at once.
+    """Tracks the frames of a recording, many stretches at once.
 
     Each process opens the recording itself. Results have the rows of the tables (`FrameResult`).
 
     Raises
     ------
     InputError
-        While frames are measured, if the recording cannot be opened.
+        During iteration, if the recording cannot be opened.
     """
 
     path: Path
     index: bytes | None
-    """The recording, and what opening it found out (`FrameSource.index`), where it was."""
+    """The recording, and its index if known (`FrameSource.index`)."""
     setup: Setup
     settings: Settings
     with_surfaces: bool = False
-    """Whether results have dots, rays and surface, too: to pass them from process to process takes
-    a twentieth of the time that it took to measure them.
+    """Whether results also have dots, rays and surface. Passing these between processes takes a
+    twentieth of the measuring time.
     """
     sigma_parts: bool = False
-    """Whether rows have the parts of standard uncertainties, too."""
+    """Whether rows also have the parts of standard uncertainties."""
     pools: Sequence[Executor] = ()
-    """Where to measure (`stretch_pools`); none: in this process."""
+    """Pools of one process each (`stretch_pools`); empty: this process."""
 
     def __call__(self, frames: Iterable[int]) -> Generator[FrameResult]:
         """Measure frames; see `runner.Measurer`."""
@@ -384,7 +384,7 @@ class RecordingMeasurer:
 
     def _in_processes(self, frames: Sequence[int]) -> Generator[FrameResult]:
         there = replace(self, pools=())
-        if there.index is None:  # found out once, for all of them
+        if there.index is None:  # determine it once for all processes
             with open_source(self.path) as source:
                 there = replace(there, index=source.index)
 
@@ -401,12 +401,12 @@ class RecordingMeasurer:
 
 
 _stretch: Generator[FrameResult] | None = None
-"""The stretch that this process measures."""
+"""The stretch of this process."""
 
 
 def _first_batch(measurer: RecordingMeasurer, frames: Sequence[int]) -> list[FrameResult]:
-    """Begin a stretch in this process, in place of the one before."""
-    global _stretch  # noqa: PLW0603 - a stretch stays in the process that began it
+    """Begin a stretch in this process, and end the previous one."""
+    global _stretch  # noqa: PLW0603 - one stretch at a time
     if _stretch is not None:
         _stretch.close()
     cv2.setNumThreads(1)
@@ -421,14 +421,14 @@ def _next_batch() -> list[FrameResult]:
 
 @contextmanager
 def stretch_pools(frames: int, workers: int | None = None) -> Iterator[list[Executor]]:
-    """Start processes for a `RecordingMeasurer`; each loads its modules meanwhile.
+    """Start processes for a `RecordingMeasurer`, which load their modules in the background.
 
     Parameters
     ----------
     frames
-        How many are to be measured: there are no more processes than stretches.
+        Number of frames to be measured; there are no more processes than stretches.
     workers
-        How many processes; None: one a core; 0: none.
+        Number of processes; None: one per core; 0: none.
     """
     stretches = -(-frames // STRETCH)
     with ExitStack() as at_end:
@@ -447,7 +447,7 @@ def await_loaded(pools: Sequence[Executor]) -> None:
 
 
 def _load() -> None:
-    """Load in this process all that measures."""
+    """Import all modules for measuring in this process."""
     import labapp.core.matching.match_kernels
     import labapp.core.rows.lattice_kernels
     import labapp.core.sequence.following

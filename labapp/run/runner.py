@@ -1,7 +1,8 @@
 """The loop that measures frames: `run`, for the command line, sessions and the benchmark.
 
-They differ in what measures (a `Measurer`, see `measurers`) and in where results go (`Sink`). A
-live camera has a loop of its own (`live_watch`): how long a frame took says which is next.
+Callers choose how frames are measured (a `Measurer`, see `measurers`) and where results go
+(`Sink`). A live camera has another loop (`live_watch`), in which the measuring time determines the
+next frame.
 """
 
 from __future__ import annotations
@@ -21,25 +22,27 @@ from labapp.export.frame_result import FrameResult
 from labapp.media import FrameSource
 
 Measurer = Callable[[Iterable[int]], Generator[FrameResult]]
-"""Measures the frames of these numbers, in their order. Closed early, it cancels what it began."""
+"""Measures frames, given by their numbers, in order. Closing it cancels frames in progress."""
 
 Sink = Callable[[FrameResult], object]
-"""Takes each result in turn. What it raises ends the run."""
+"""Receives each result in turn. An exception ends the run."""
 
-SOME_FRAMES = "A:B:STEP, frames A to before B (from 0), every STEP-th; each may be left out"
+SOME_FRAMES = (
+    "A:B:STEP, frames A up to but not including B (from 0), every STEP-th; parts may be omitted"
+)
 
 
 def run(frames: Iterable[int], measurer: Measurer, sinks: Sequence[Sink]) -> Generator[FrameResult]:
-    """Measure frames and pass each result to every sink; yields it once all have it.
+    """Measure frames, pass each result to every sink, then yield it.
 
-    To stop, close the generator, or raise in a sink: frames that were begun are cancelled.
+    To stop, close the generator or raise in a sink: frames in progress are cancelled.
 
     Parameters
     ----------
     frames
-        Their numbers, in the order in which they are measured.
+        Frame numbers, in the order of measuring.
     sinks
-        Where results go, in this order.
+        Receivers of the results, in the order of calls.
     """
     with closing(measurer(frames)) as results:
         for result in results:
@@ -49,7 +52,7 @@ def run(frames: Iterable[int], measurer: Measurer, sinks: Sequence[Sink]) -> Gen
 
 
 def with_setup_check(measurer: Measurer, record: ResidualRecord) -> Measurer:
-    """A measurer whose results have what the frames so far say of the set-up."""
+    """Return a measurer whose results include the check of the set-up by the frames so far."""
 
     def measure(frames: Iterable[int]) -> Generator[FrameResult]:
         with closing(measurer(frames)) as results:
@@ -61,19 +64,19 @@ def with_setup_check(measurer: Measurer, record: ResidualRecord) -> Measurer:
 
 
 def select_frames(text: str, count: int, source: str = "--frames") -> range:
-    """Frames that ``A:B:STEP`` selects from ``count``, as a Python slice does; ``A`` is one frame.
+    """Return the frames that ``A:B:STEP`` selects, as a Python slice does; ``A`` is one frame.
 
     Parameters
     ----------
     text, count
-        What is selected, and from how many frames.
+        The selection, and the number of frames.
     source
-        Where the text comes from, for the error.
+        Source of the text, for the error.
 
     Raises
     ------
     InputError
-        If it is not of that form, or selects nothing.
+        If the text is not of that form, or selects no frame.
     """
     require(text, str, source, "frames", f'text such as "0:100:5": {SOME_FRAMES}')
     try:
@@ -81,7 +84,7 @@ def select_frames(text: str, count: int, source: str = "--frames") -> range:
         if first is not None and not others:
             others = [first + 1 or None]
         selected = range(count)[slice(first, *others)]
-    except (TypeError, ValueError) as error:  # TypeError: no number at all, or four
+    except (TypeError, ValueError) as error:  # TypeError: empty, or four numbers
         raise InputError(source, "frames", text, SOME_FRAMES) from error
     if selected.step < 0:
         raise InputError(source, "frames", text, SOME_FRAMES)
@@ -99,7 +102,7 @@ def provenance(
     frames: range,
     warm: bool = False,
 ) -> dict[str, object]:
-    """Origin of the results, for `run.json`."""
+    """Return the provenance of the results, for `run.json`."""
     return {
         "source": {
             "path": str(Path(source_path).absolute()),

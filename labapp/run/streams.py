@@ -1,7 +1,7 @@
-"""Measures streamed to control software as they are made: lines of JSON over TCP, or OPC UA.
+"""Streams of measures to control software: lines of JSON over TCP, or OPC UA.
 
-Each stream has an event loop in a thread of its own: publishing never waits for a client. Only
-programs of this machine can connect by default, as neither protocol authenticates its clients.
+Each stream has an event loop in a separate thread, so that publishing never waits for a client.
+By default only programs of this machine can connect, as clients are not authenticated.
 """
 
 from __future__ import annotations
@@ -26,39 +26,39 @@ from labapp.run.alarms import Alarm
 from labapp.version import VERSION
 
 MOST_LISTENERS, AT_ONCE = 32, 16
-"""Most clients, and most that OPC UA accepts at once: each takes an open file, of which the
+"""Most clients, and backlog of the OPC UA server: each connection takes a file handle, of which the
 measurement needs some itself."""
 
 MOST_WAITING = 1_000_000
-"""Bytes buffered for a client; one that does not read misses lines, and is sent how many."""
+"""Most bytes buffered for a client; beyond, lines are dropped, and their number is sent later."""
 
 OPCUA_S = 0.05
 """Period at which the OPC UA variables are updated, s: clients sample them."""
 
 ALARMS = ("alarm", "unacknowledged")
-"""Names of the alarms' values, while a camera is live."""
+"""Names of the alarm values of a live camera."""
 
 WORDS = ("status", "reason", "scheme", "sigma_of", "setup_status", "setup_doubt")
-"""Names of the other values that are words."""
+"""Names of the other text values."""
 
 PENETRATION = ("penetration_mm", "penetration_sigma_mm", "penetration_model")
-"""Names of a model's prediction, where there is a model: value, ±, which model and of what."""
+"""Names of a penetration model's values, if there is one: value, ±, name and target."""
 
 NAMESPACE = "urn:labapp:measures"
 
 STARTING_S = 20.0
 
 PATIENCE_S = 1.0
-"""How long a client has to read what is buffered when the stream closes, s."""
+"""Time for clients to read buffered data when the stream closes, s."""
 
 Values = Mapping[str, int | float | str | None]
 
 
 def stream_values(result: FrameResult, alarms: Iterable[Alarm] | None = None) -> Values:
-    """Values of a frame, with the names and units of ``measures.csv``; None where unknown.
+    """Return the values of a frame, with names and units of ``measures.csv``; None if unknown.
 
-    Of a live camera alarms are added, by their codes with spaces between: ``alarm``, those that
-    hold, and ``unacknowledged``.
+    For a live camera, the codes of alarms are added, separated by spaces: those that hold
+    (``alarm``), and those that are ``unacknowledged``.
     """
     measurement = result.measurement
 
@@ -91,20 +91,20 @@ class Stream(Protocol):
     """A server of measures."""
 
     address: str
-    """Where clients connect."""
+    """Address for clients."""
 
     sent: int
-    """How many frames were sent while a client was connected."""
+    """Number of frames sent while a client was connected."""
 
     @property
     def listeners(self) -> int:
-        """How many clients are connected."""
+        """Number of connected clients."""
 
     def publish(self, values: Values) -> None:
-        """Send the values of a frame; does not wait."""
+        """Send the values of a frame without blocking."""
 
     def close(self) -> None:
-        """Send what is buffered, and end."""
+        """Send buffered data, and end."""
 
 
 class LineStream:
@@ -117,7 +117,7 @@ class LineStream:
     Parameters
     ----------
     host, port
-        Where to listen; port 0 takes a free one.
+        Address to listen at; port 0: any free port.
     anywhere
         Whether other machines may connect.
 
@@ -133,7 +133,7 @@ class LineStream:
         self._missed: dict[asyncio.StreamWriter, int] = {}
         self._loop = _Loop("labapp line stream")
         try:
-            # So many are taken in at once, those to be refused among them.
+            # The backlog includes clients that will be refused.
             serving = asyncio.start_server(self._connected, host, port, backlog=MOST_LISTENERS)
             self._server = self._loop.run(serving)
         except OSError as error:
@@ -144,16 +144,16 @@ class LineStream:
 
     @property
     def listeners(self) -> int:
-        """How many clients are connected."""
+        """Number of connected clients."""
         return len(self._missed)
 
     def publish(self, values: Values) -> None:
-        """Send the values of a frame; does not wait."""
+        """Send the values of a frame without blocking."""
         line = json.dumps(values, allow_nan=False).encode()
         self._loop.soon(lambda: self._send(line))
 
     def close(self) -> None:
-        """Send what is buffered, and end."""
+        """Send buffered data, and end."""
         self._loop.run(self._close())
         self._loop.close()
 
@@ -169,7 +169,7 @@ class LineStream:
         try:
             while await reader.read(1024):
                 pass  # what clients send is ignored
-            await writer.wait_closed()  # one that has ended its side may still read
+            await writer.wait_closed()  # a half-closed client may still read
         except OSError:
             pass  # disconnected
         finally:
@@ -191,7 +191,7 @@ class LineStream:
         for writer, missed in self._missed.items():
             if missed:
                 writer.write(b'{"missed": %d}\n' % missed)
-            writer.transport.close()  # when all is sent
+            writer.transport.close()  # after sending buffered data
         for _ in range(round(PATIENCE_S / 0.01)):
             if not self._missed:
                 return
@@ -205,8 +205,8 @@ class LineStream:
 class OpcuaStream:
     """Measures as variables of an OPC UA server, updated every `OPCUA_S` from the newest frame.
 
-    They are ``Objects/Pool/NAME`` in the namespace ``urn:labapp:measures``; NaN where unknown.
-    Needs asyncua, which the extra ``control`` installs.
+    The variables are ``Objects/Pool/NAME`` in the namespace ``urn:labapp:measures``; NaN if
+    unknown. Needs asyncua, which the extra ``control`` installs.
 
     Raises
     ------
@@ -221,9 +221,9 @@ class OpcuaStream:
             from asyncua import ua
             from asyncua.server.server import Server
         except ImportError as error:
-            expected = "asyncua, which pip install 'labapp[control]' brings"
+            expected = "asyncua: pip install 'labapp[control]'"
             raise InputError("OPC UA", "library", "missing", expected) from error
-        # Its messages on security policies and ports are replaced by errors of our own.
+        # Its messages about security policies and ports are replaced by `InputError`.
         logging.getLogger("asyncua").setLevel(logging.CRITICAL)
         self._ua = ua
         self._newest: Values | None = None
@@ -241,11 +241,11 @@ class OpcuaStream:
 
     @property
     def listeners(self) -> int:
-        """How many clients are connected."""
+        """Number of connected clients."""
         return len(self._server.bserver.clients)
 
     def publish(self, values: Values) -> None:
-        """Set the values of a frame; does not wait. The next frame may replace them unseen."""
+        """Set the values of a frame without blocking; clients may miss values."""
         self._newest = values
 
     def close(self) -> None:
@@ -256,7 +256,7 @@ class OpcuaStream:
         self._loop.close()
 
     async def _start(self, server: Any) -> Any:
-        # All that are accepted at once take a file each, before the first is refused.
+        # Each accepted connection takes a file handle before it can be refused.
         loop: Any = asyncio.get_running_loop()
         loop.create_server = partial(loop.create_server, backlog=AT_ONCE)
         await server.init()
@@ -264,7 +264,7 @@ class OpcuaStream:
         server.set_endpoint(self.address)
         server.set_server_name("labapp")
         server.set_security_policy([self._ua.SecurityPolicyType.NoSecurity])
-        server.allow_remote_admin(False)  # or anybody could write, and take variables away
+        server.allow_remote_admin(False)  # clients may only read
         space = await server.register_namespace(NAMESPACE)
         pool = await server.nodes.objects.add_object(space, "Pool")
         words = dict.fromkeys((*WORDS, *ALARMS, PENETRATION[2]), "")
@@ -293,7 +293,7 @@ def open_stream(kind: str, place: str, anywhere: bool) -> Stream:
     Raises
     ------
     InputError
-        If the place has another form, or the port cannot be opened.
+        If the address has another form, or the port cannot be opened.
     """
     host, _, port = place.rpartition(":")
     if not (port.isdecimal() and int(port) < 65536):
@@ -303,24 +303,24 @@ def open_stream(kind: str, place: str, anywhere: bool) -> Stream:
 
 
 def check_host(host: str, anywhere: bool) -> None:
-    """Refuse an address that other machines can reach, unless ``anywhere``.
+    """Check that only this machine can reach an address, unless ``anywhere``.
 
     Raises
     ------
     InputError
-        If it is refused.
+        If other machines can reach it.
     """
     try:
         is_own = host == "localhost" or ipaddress.ip_address(host).is_loopback
     except ValueError:
         is_own = False
     if not is_own and not anywhere:
-        expected = "127.0.0.1, ::1 or localhost: others may connect only if that is asked for"
+        expected = "127.0.0.1, ::1 or localhost, unless other machines are allowed to connect"
         raise InputError("stream", "host", host, expected)
 
 
 def _taken(host: str, port: int, error: OSError) -> InputError:
-    """The error for an address that cannot be bound: port taken, or not this machine's host."""
+    """Return the error for an address that cannot be bound."""
     if error.errno in (errno.EADDRINUSE, errno.EACCES):
         why = os.strerror(error.errno)
         return InputError("stream", "port", f"{host}:{port}: {why}", "a free one, from 1024 on")
@@ -328,7 +328,7 @@ def _taken(host: str, port: int, error: OSError) -> InputError:
 
 
 class _Loop:
-    """An event loop in a thread of its own."""
+    """An event loop in a separate thread."""
 
     def __init__(self, name: str) -> None:
         self._loop = asyncio.new_event_loop()

@@ -1,1 +1,1 @@
-"""What is kept: the setup of the bench, and everything a measurement leaves on disk."""
+"""Sessions: the set-up, the recording, corrections and results of an experiment in one file."""

@@ -14,7 +14,7 @@ from labapp.session.file.database import Database
 
 
 class CalibrationPictures:
-    """Calibration pictures by the SHA-256 of their PNG; one that was stored never changes."""
+    """Calibration pictures by the SHA-256 of their PNG; stored pictures never change."""
 
     def __init__(self, database: Database) -> None:
         self._database = database
@@ -31,13 +31,13 @@ class CalibrationPictures:
         return sha256
 
     def copy_from(self, other: CalibrationPictures) -> None:
-        """Store every picture of another session, too."""
+        """Also store all pictures of another session."""
         rows = other._database.rows("SELECT * FROM picture")
         with self._database.transaction() as connection:
             connection.executemany("INSERT OR IGNORE INTO picture VALUES (?, ?, ?)", rows)
 
     def get(self, sha256: str) -> GreyImage:
-        """Stored picture, grey levels, shape (rows, columns); see `Session.picture`."""
+        """Return a picture, grey levels, shape (rows, columns); see `Session.picture`."""
         content = self._database.value("SELECT content FROM picture WHERE sha256 = ?", sha256)
         image = decoded(content) if _is_intact(content, sha256) else None
         if image is None or image.ndim != 2:
@@ -47,7 +47,7 @@ class CalibrationPictures:
         return np.asarray(image)
 
     def problems(self) -> list[str]:
-        """Sentences on damaged pictures; empty if there are none."""
+        """Return sentences about damaged pictures; empty if there are none."""
         return [
             f"calibration picture {name} is damaged"
             for sha256, name, content in self._database.rows("SELECT * FROM picture")

@@ -1,6 +1,6 @@
-"""The lists of Appendix II: safety, equipment and the steps of an experiment, to be ticked.
+"""The checklists of Appendix II: safety, equipment and steps of an experiment.
 
-Items go into session files with the time of their tick: one that is renamed is in `FORMER`.
+Session files store ticked items by name with the time: renamed items are in `FORMER`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ SAFETY: Items = (
     ("Water cooling is on", "Before the welding machine is switched on."),
     ("Shielding gas is on", "Before the welding machine is switched on."),
 )
-"""Title and what it means."""
+"""Title and explanation of each item."""
 
 EQUIPMENT: Items = (
     ("Welding machine", "GTAW, with water cooling and shielding gas."),
@@ -69,15 +69,15 @@ FORMER = {
     "Welding goggles are worn": "Welding helmet is worn",
     "Welding goggles and clothes": "Welding helmet and clothes",
 }
-"""Names of items in older sessions, and their names now."""
+"""Names of items in older sessions → present names."""
 
 
 def ticked(record: Record) -> tuple[tuple[str, str], ...]:
-    """The items that are ticked, by their names now, and when (ISO 8601)."""
+    """Return the ticked items by their present names, with times (ISO 8601)."""
     return tuple((FORMER.get(item, item), time) for item, time in record.safety)
 
 
 def tick(record: Record, item: str, on: bool, now: str) -> Record:
-    """The record with an item of a list ticked at a time (ISO 8601), or its tick taken away."""
-    kept = tuple(pair for pair in ticked(record) if pair[0] != item)
-    return replace(record, safety=(*kept, (item, now)) if on else kept)
+    """Return the record with an item ticked at a time (ISO 8601), or unticked."""
+    others = tuple(pair for pair in ticked(record) if pair[0] != item)
+    return replace(record, safety=(*others, (item, now)) if on else others)

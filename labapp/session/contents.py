@@ -1,7 +1,7 @@
 """Reading a session: set-up, calibrations, corrections, frames and results.
 
-What measures and reads recordings is loaded when a session is opened, not with this module: scripts
-begin soon.
+Modules for measuring and for reading recordings are imported when a session is opened, not with
+this module, so that scripts start fast.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class SessionContents:
         self.path = database.path
         """The session file."""
         self.read_only = database.read_only
-        """Whether it was opened so."""
+        """Whether the session was opened read-only."""
         self._database = database
         self._frames = Frames(database)
         self._pictures = CalibrationPictures(database)
@@ -74,7 +74,7 @@ class SessionContents:
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    # --- what the operator says ----------------------------------------------------------------
+    # --- operator's input ----------------------------------------------------------------------
 
     @property
     def record(self) -> Record:
@@ -86,7 +86,7 @@ class SessionContents:
 
     @property
     def setup_text(self) -> str:
-        """The setup as TOML; it may be incomplete."""
+        """The set-up as TOML; it may be incomplete."""
         return self._documents.get("setup") or ""
 
     @property
@@ -113,31 +113,31 @@ class SessionContents:
 
     @property
     def has_lines(self) -> bool:
-        """Whether the pattern is one of lines rather than dots."""
+        """Whether the pattern consists of lines rather than dots."""
         from labapp.config.setup import pattern_kind
 
         return pattern_kind(self.setup_text) == "lines"
 
     @property
     def laser_calibration(self) -> LaserReadings | None:
-        """The laser calibration in use, and what it was found from; None before one."""
+        """The last laser calibration and its readings; None if there is none."""
         found: LaserReadings | None = self._documents.get("laser-calibration")
         return found
 
     @property
     def plane_calibration(self) -> PlanePicture | None:
-        """The imaging-plane calibration in use, and what it was found from; None before one."""
+        """The last imaging-plane calibration and its picture; None if there is none."""
         found: PlanePicture | None = self._documents.get("plane-calibration")
         return found
 
     @property
     def bench_check(self) -> BenchCheckRecord | None:
-        """The bench check in use, and what it was found from; None before one."""
+        """The last bench check and its pictures; None if there is none."""
         found: BenchCheckRecord | None = self._documents.get("bench-check")
         return found
 
     def picture(self, sha256: str) -> GreyImage:
-        """A calibration picture that the session keeps, grey levels, shape (rows, columns).
+        """Return a stored calibration picture, grey levels, shape (rows, columns).
 
         Parameters
         ----------
@@ -147,13 +147,13 @@ class SessionContents:
         Raises
         ------
         InputError
-            If it does not keep it, or it is damaged.
+            If it is missing or damaged.
         """
         return self._pictures.get(sha256)
 
     @property
     def settings(self) -> Settings:
-        """Scheme and settings that frames are measured with."""
+        """Scheme and settings of the measurement."""
         from labapp.core.pipeline import Settings
 
         found = self._documents.get("settings")
@@ -191,13 +191,13 @@ class SessionContents:
 
     @property
     def signals(self) -> Signals | None:
-        """Current and voltage of the weld; None where none are stored."""
+        """Current, voltage and wire feed of the weld; None if none are stored."""
         found: Signals | None = self._documents.get("signals")
         return found
 
     @property
     def limits(self) -> Limits:
-        """Lower and upper limits of the pool's sizes while it is filmed."""
+        """Lower and upper limits of the pool's sizes for live measurements."""
         from labapp.run.limits import Limits
 
         found = self._documents.get("limits")
@@ -208,7 +208,7 @@ class SessionContents:
         """Changes that can be undone or redone, the oldest first."""
         return self._documents.history()
 
-    # --- what was filmed --------------------------------------------------------------------
+    # --- recording --------------------------------------------------------------------------
 
     @property
     def recording(self) -> Recording | None:
@@ -217,7 +217,7 @@ class SessionContents:
 
     @property
     def recording_place(self) -> Path | None:
-        """Path of the recording; None before one was imported."""
+        """Path of the recording; None before the import."""
         return self._frames.place
 
     @property
@@ -245,17 +245,17 @@ class SessionContents:
         """
         return self._frames.read(number)
 
-    # --- what was measured ------------------------------------------------------------------
+    # --- results ----------------------------------------------------------------------------
 
     def result(self, frame: int, scheme: str | None = None) -> Result | None:
-        """Result of a frame and what it was measured from; None if it was not measured.
+        """Return the result of a frame and its inputs; None if it was not measured.
 
         Parameters
         ----------
         frame
             Number of the frame.
         scheme
-            ``fit``, ``ers``, ``irs-opa`` …; None: the one that the settings choose.
+            ``fit``, ``ers``, ``irs-opa`` …; None: the scheme of the settings.
 
         Raises
         ------
@@ -299,9 +299,9 @@ class SessionContents:
 
     @property
     def setup_verdict(self) -> SetupVerdict | None:
-        """What the frames that were measured with the present set-up say of it.
+        """Check of the present set-up by the frames that were measured with it.
 
-        Without any, what its values alone say; None where they are usual.
+        Without any, a check of its values alone; None if these are usual.
         """
         from labapp.core.recording.residual_check import doubt_of_values
         from labapp.session.file.blobs import pack
@@ -314,7 +314,7 @@ class SessionContents:
 
     @property
     def setup_status(self) -> str:
-        """How far the present set-up can be relied on (`Measurement`); empty if incomplete."""
+        """Reliability of the present set-up (`Measurement.setup_status`); empty if incomplete."""
         from labapp.core.recording.residual_check import judged_status
 
         basis = self._basis()
@@ -322,7 +322,7 @@ class SessionContents:
 
     @property
     def setup_words(self) -> str:
-        """The same in a sentence, with the cause of a doubt."""
+        """The set-up's status as a sentence, with the reason for a doubt."""
         from labapp.text import setup_words
 
         status, verdict, check = self.setup_status, self.setup_verdict, self.bench_check
@@ -331,11 +331,11 @@ class SessionContents:
         return setup_words(status, checked, verdict.reason if verdict else "", was_checked)
 
     def corrected_frames(self) -> IntArray:
-        """Numbers of the frames with a correction by hand, ascending, shape (n,)."""
+        """Return the numbers of manually corrected frames, ascending, shape (n,)."""
         return np.array(sorted(self._documents.fingerprints("correction")), np.int64)
 
     def stale_frames(self) -> IntArray:
-        """Numbers of the frames that are not measured or whose result is stale, shape (n,)."""
+        """Return the numbers of the frames without a result or with a stale one, shape (n,)."""
         seen = self.overview()
         missing = np.array([status == "" for status in seen.status], bool)
         return np.asarray(seen.frame[seen.stale | missing], np.int64)
@@ -346,12 +346,12 @@ class SessionContents:
         return self._results.counts()
 
     def problems(self, progress: Progress | None = None, recording: bool = True) -> list[str]:
-        """Check the whole session; a sentence for each problem, empty if it is intact.
+        """Check the whole session; returns a sentence per problem, empty if it is intact.
 
         Parameters
         ----------
         progress
-            Called with frames done and frames in all.
+            Called with the number of frames done and the total.
         recording
             Whether to read the recording, or the embedded frames, through too.
 
@@ -368,7 +368,7 @@ class SessionContents:
         ]
 
     def _known_scheme(self, scheme: str | None) -> str:
-        """Name of a scheme that results may have; None: that of the settings."""
+        """Check the name of a scheme; None: return that of the settings."""
         from labapp.core.schemes import scheme_words
 
         if scheme is None:

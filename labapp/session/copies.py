@@ -1,4 +1,4 @@
-"""Copies of sessions: of the present state, as a template for another recording, of a sample."""
+"""Copies of sessions: backups, templates for another recording, samples."""
 
 from __future__ import annotations
 
@@ -30,15 +30,15 @@ OF_A_BENCH: tuple[Kind, ...] = ("setup", "laser-calibration", "plane-calibration
 
 
 def copy_session(source: Path, path: str | os.PathLike[str]) -> Path:
-    """Copy a session as it is now, even while it is open and written to.
+    """Copy the present state of a session, even while it is open for writing.
 
-    The copy refers to the same recording, which is read through once to verify it, unless the copy
-    is in the same folder.
+    The copy refers to the same recording. Unless it is in the same folder, the recording is read
+    completely to verify it.
 
     Raises
     ------
     InputError
-        If there is a file of that name, or it cannot be written.
+        If the file exists already, or it cannot be written.
     """
     path = new_session_path(path)
     uri = f"file:{quote(os.fspath(source))}?mode=ro"
@@ -61,12 +61,12 @@ def copy_session(source: Path, path: str | os.PathLike[str]) -> Path:
 
 
 def move_session(source: Path, path: str | os.PathLike[str]) -> Path:
-    """Move a session that is not open to another name or folder; its recording stays in its place.
+    """Move a closed session to another name or folder; its recording is not moved.
 
     Raises
     ------
     InputError
-        If there is a file of that name, or it cannot be written; the session is where it was then.
+        If the file exists already, or it cannot be written; the session is not moved then.
     """
     path = new_session_path(path)
     with Session.open(source, read_only=True) as session:
@@ -81,59 +81,61 @@ def move_session(source: Path, path: str | os.PathLike[str]) -> Path:
 
 
 def use_setup_of(session: Session, path: Path) -> None:
-    """Take set-up, calibrations and bench check of another session, with their pictures.
+    """Copy set-up, calibrations and bench check from another session, with their pictures.
 
     Raises
     ------
     InputError
-        If the other session cannot be read, or its set-up is not complete.
+        If the other session cannot be read, or its set-up is incomplete.
     """
     with Session.open(path, read_only=True) as other:
         if other.setup_problems:
             raise InputError(path, "set-up", "not complete", "a session with a complete set-up")
-        held: dict[Key, Any] = {(kind, NO_FRAME): other._documents.get(kind) for kind in OF_A_BENCH}
+        copied: dict[Key, Any] = {
+            (kind, NO_FRAME): other._documents.get(kind) for kind in OF_A_BENCH
+        }
         session._pictures.copy_from(other._pictures)
-    session._documents.change(f"set-up of {path.stem}", held)
+    session._documents.change(f"set-up of {path.stem}", copied)
 
 
 def next_session(session: Session, path: str | os.PathLike[str]) -> Session:
-    """Create a session for the next recording on the same bench, with another as the template.
+    """Create a session for the next recording on the same bench, with ``session`` as template.
 
-    Record, set-up, calibrations with their pictures, settings and limits are copied; the safety
-    list, the recording and what was measured from it are not.
+    Record, set-up, calibrations with their pictures, settings and limits are copied; the ticked
+    checklists, the recording and its results are not.
 
     Raises
     ------
     InputError
-        If there is a file of that name, or it cannot be written, or the other is damaged.
+        If the file exists already, it cannot be written, or the template is damaged.
     """
-    held: dict[Key, Any] = {
+    copied: dict[Key, Any] = {
         (kind, NO_FRAME): session._documents.get(kind)
         for kind in get_args(Kind)
         if kind not in OF_A_RECORDING
     }
-    if held["record", NO_FRAME] is not None:
-        held["record", NO_FRAME] = replace(session.record, safety=())
-    made = Session.create(path)
+    if copied["record", NO_FRAME] is not None:
+        copied["record", NO_FRAME] = replace(session.record, safety=())
+    new = Session.create(path)
     try:
-        made._pictures.copy_from(session._pictures)
-        made._documents.change(f"as in {session.path.stem}", held)
+        new._pictures.copy_from(session._pictures)
+        new._documents.change(f"as in {session.path.stem}", copied)
     except BaseException:
-        made.close()
-        made.path.unlink()
+        new.close()
+        new.path.unlink()
         raise
-    return made
+    return new
 
 
 def copy_sample(name: str, folder: Path) -> Path:
-    """Copy a sample's session and recording into a folder; files that are there already stay.
+    """Copy a sample's session and recording into a folder; existing files are not replaced.
 
     Parameters
     ----------
     name
         One of `SAMPLES`.
     folder
-        Where to; made if it does not exist.
+        Destination; created if missing.
 
     Returns
     -------
@@ -143,7 +145,7 @@ def copy_sample(name: str, folder: Path) -> Path:
     Raises
     ------
     InputError
-        If the sample is not there, or the folder cannot be written.
+        If the sample is missing, or the folder cannot be written.
     """
     sample = sample_folder(name)
     session = f"{name}{SUFFIX}"

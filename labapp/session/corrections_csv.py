@@ -1,7 +1,7 @@
-"""A table of dots (CSV) as a correction, edited in a spreadsheet or by a script.
+"""Corrections from a table of dots (CSV) that was edited in a spreadsheet or by a script.
 
-The columns are those that `labapp detect` writes and a session exports as `dots.csv`; what else a
-table holds is ignored.
+The columns are those that `labapp detect` writes and that a session exports to `dots.csv`; other
+columns are ignored.
 """
 
 from __future__ import annotations
@@ -35,21 +35,21 @@ A_TABLE = f"a table of dots (CSV, UTF-8) with the columns {', '.join(NEEDED)}"
 
 LARGEST_FILE = 1 << 29
 MOST_DOTS = 10_000
-"""Beyond these a file is no table of the dots of a recording."""
+"""Most dots of a frame."""
 
 SAME_PX = 1.0
-"""A dot of the table is the one that was there within this distance …"""
+"""Largest distance between a dot of the table and its former position."""
 
 UNMOVED_PX = 1e-3
-"""… and has not been moved by hand within this one: tables round to 0.0001 px."""
+"""Smallest distance that counts as moved by hand: tables round to 0.0001 px."""
 
 USUAL_SIZE_PX = 2.0
-"""Of a dot in a frame in which none was found."""
+"""Size of a dot in a frame in which none was found."""
 
 
 @dataclass(frozen=True)
 class _Row:
-    """A line of the table; row and column are 0 where the dot has none."""
+    """A line of the table; row and column are 0 if the dot has none."""
 
     line: int
     u_px: float
@@ -62,33 +62,33 @@ class _Row:
 def read_correction(
     path: str | os.PathLike[str], frame: int, frame_shape: tuple[int, int], before: Correction
 ) -> Correction:
-    """Correction of a frame with dots, rows and columns from a table.
+    """Read the correction of a frame, with dots, rows and columns, from a table.
 
-    A dot within 1 px of a former one takes over its uncertainty, and is marked as manual only if
-    its place, row or column differs; any other dot is manual. The reference is left to be found.
+    A dot within 1 px of a former one has its uncertainty, and is marked as manual only if its
+    position, row or column differs; any other dot is manual. The reference is determined later.
 
     Parameters
     ----------
     path
-        The table; with a column ``frame``, its rows of other frames are passed over. The separator
-        is a comma, a semicolon or a tab; the decimals' a point, or, with the latter two, a comma.
+        The table; with a column ``frame``, rows of other frames are ignored. The separator is a
+        comma, a semicolon or a tab; the decimal sign a point or, with the latter two, a comma.
     frame_shape
         Height and width of the frame, px.
     before
-        The frame's dots and rows so far.
+        Present dots and rows of the frame.
 
     Raises
     ------
     InputError
-        If the file cannot be read, or anything in it is missing or impossible; the first ten
-        problems are reported together.
+        If the file cannot be read, or anything in it is missing or invalid; the first ten problems
+        are reported together.
     """
     path = Path(path)
     rows = _read(path, frame, frame_shape)
     place = np.array([(row.u_px, row.v_px) for row in rows])
     origin = _match_dots(place, before.dots.image_px)
     known = origin >= 0
-    source = np.where(known, origin, len(before.dots))  # the last: a dot placed by hand
+    source = np.where(known, origin, len(before.dots))  # the last: a manual dot
     old = _with_manual_dot(before.dots)
     dots = Dots(*(getattr(old, column.name)[source] for column in fields(Dots)))
     exact = known & (np.hypot(*(place - dots.image_px).T) <= UNMOVED_PX)
@@ -100,12 +100,12 @@ def read_correction(
     blocked = frozenset(row.row for row in rows if row.blocked)
     lattice = Lattice(site[:, 0], site[:, 1], blocked_rows=blocked)
     manual = changed | np.append(before.manual, True)[source]
-    # Left to be found: that also determines which sites it could be.
+    # The search for the reference also determines its possible sites.
     return set_reference(Correction(replace(dots, u_px=u, v_px=v), lattice, manual), None)
 
 
 def _match_dots(place: FloatArray, before: FloatArray) -> IntArray:
-    """Index of the former dot of each dot, each used at most once; −1 for none, shape (n,)."""
+    """Return the index of each dot's former dot, each used at most once; −1 if none, shape (n,)."""
     same = np.full(len(place), -1)
     if not len(before):
         return same
@@ -119,7 +119,7 @@ def _match_dots(place: FloatArray, before: FloatArray) -> IntArray:
 
 
 def _with_manual_dot(dots: Dots) -> Dots:
-    """Dots, with one appended that has the properties of a manual dot; its place is void."""
+    """Append a dot with the properties of a manual dot, at an arbitrary position."""
     size = float(np.median(dots.size_px)) if len(dots) else USUAL_SIZE_PX
     unsure = max(size, PLACED_PX)
     peak, snr = (float(np.median(x)) if len(dots) else 1.0 for x in (dots.peak, dots.snr))
@@ -128,7 +128,7 @@ def _with_manual_dot(dots: Dots) -> Dots:
 
 
 def _read(path: Path, frame: int, frame_shape: tuple[int, int]) -> list[_Row]:
-    """The table's rows of one frame; there is at least one."""
+    """Read the table's rows of one frame, at least one."""
     problems: list[InputError] = []
     rows: list[_Row] = []
     with open_table(path, A_TABLE, LARGEST_FILE) as file:
@@ -178,11 +178,11 @@ class _Reader:
             raise InputError(path, "columns", found, A_TABLE)
 
     def lines(self) -> Iterator[tuple[int, dict[str, str]]]:
-        """Number of each line of the frame, from 1, and its cells by column."""
+        """Yield the number of each line of the frame, from 1, and its cells by column."""
         width = len(self._names)
         place = self._names.index("frame") if self.has_frames else None
         for cells in self._reader:
-            # Most lines of a long table are of other frames: they are passed over at once.
+            # Fast path: most lines of a long table belong to other frames.
             plain = place is not None and len(cells) == width and len(cells[place]) < 10
             if place is not None and plain and cells[place].isdecimal():
                 if int(cells[place]) == self._frame:
@@ -218,7 +218,7 @@ class _Reader:
         if blocked is None and cells.get("blocked", ""):
             self._refuse(line, "blocked", cells["blocked"], "1, 0 or nothing")
         if blocked and row == 0:
-            self._refuse(line, "blocked", "1", "a dot with a row, for it is rows that are blocked")
+            self._refuse(line, "blocked", "1", "a dot with a row, as rows are blocked")
         if len(self._problems) > before or u is None or v is None or row is None or column is None:
             return None
         return _Row(line, u, v, row, column, blocked)
@@ -247,7 +247,7 @@ class _Reader:
 
 
 def _contradictions(path: Path, rows: list[_Row]) -> list[InputError]:
-    """Problems of lines that are valid by themselves and contradict each other."""
+    """Return problems of valid lines that contradict each other."""
     problems = []
     sites: dict[tuple[int, int], int] = {}
     places: dict[tuple[float, float], int] = {}
@@ -256,17 +256,17 @@ def _contradictions(path: Path, rows: list[_Row]) -> list[InputError]:
         site, place = (row.row, row.column), (row.u_px, row.v_px)
         if (line := places.setdefault(place, row.line)) != row.line:
             shown = f"{row.u_px:g}, {row.v_px:g}"
-            other = f"another place than line {line} has"
+            other = f"another position than that of line {line}"
             problems.append(InputError(path, f"line {row.line}, u_px, v_px", shown, other))
         if min(site) > 0 and (line := sites.setdefault(site, row.line)) != row.line:
             shown = f"row {row.row}, column {row.column}"
-            other = f"another row or column than line {line} has"
+            other = f"another row or column than that of line {line}"
             field = f"line {row.line}, reflected_row, reflected_column"
             problems.append(InputError(path, field, shown, other))
         if row.row and row.blocked is not None:
             blocked, line = marks.setdefault(row.row, (row.blocked, row.line))
             if blocked != row.blocked:
-                same = f"{int(blocked)} as in line {line}, for it is of row {row.row} too"
+                same = f"{int(blocked)} as in line {line}, which is also in row {row.row}"
                 field = f"line {row.line}, blocked"
                 problems.append(InputError(path, field, int(row.blocked), same))
     return problems

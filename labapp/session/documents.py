@@ -1,8 +1,8 @@
-"""Documents of a session, with undo and redo that are saved with it.
+"""Documents of a session, with persistent undo and redo.
 
-A document is one thing that the operator sets: the record, the setup, the settings, a calibration,
-the correction of one frame, the weld's current and voltage, the limits of its sizes. A change sets
-some of them, in one transaction with what they were before.
+A document is a unit of the operator's input: the record, the set-up, the settings, a calibration,
+the correction of one frame, the weld's signals, the limits of the sizes. A change sets some of
+them, and stores their former values, in one transaction.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ Kind = Literal[
     "limits",
 ]
 Key = tuple[Kind, int]
-"""Kind, and the frame of a correction; `NO_FRAME` for what belongs to no frame."""
+"""Kind, and the frame of a correction; `NO_FRAME` for other documents."""
 
 CLASSES: dict[str, Any] = {
     "record": Record,
@@ -54,7 +54,7 @@ OnChange = Callable[[Collection[Key]], object]
 
 MAX_CHANGES = 500
 MAX_HISTORY_BYTES = 64_000_000
-"""The oldest changes are deleted so that the history stays within both."""
+"""Limits of the history; the oldest changes are deleted."""
 
 
 @dataclass(frozen=True)
@@ -62,14 +62,14 @@ class Change:
     """One step of the history."""
 
     number: int
-    """Counts up over the session's life."""
+    """Increases over the session's life."""
     label: str
     made: str
-    """When, ISO 8601."""
+    """Time, ISO 8601."""
     undone: bool
     """Whether it was undone, and can be redone."""
     keys: tuple[Key, ...]
-    """The documents that it set."""
+    """The changed documents."""
 
 
 class Documents:
@@ -78,7 +78,7 @@ class Documents:
     Parameters
     ----------
     on_change
-        Called with the documents that a change, an undo or a redo has set, in the same transaction.
+        Called with the documents that a change, undo or redo has set, in the same transaction.
     """
 
     def __init__(self, database: Database, on_change: OnChange = lambda _: None) -> None:
@@ -88,7 +88,7 @@ class Documents:
         self._values: dict[Kind, tuple[str, Any]] = {}
 
     def get(self, kind: Kind, frame: int = NO_FRAME) -> Any:
-        """The document; None where there is none. One of no frame is unpacked once per content.
+        """Return a document; None if there is none. Those of no frame are cached by content.
 
         Raises
         ------
@@ -97,9 +97,9 @@ class Documents:
         """
         if frame == NO_FRAME:
             sha256 = self.fingerprint(kind)
-            held = self._values.get(kind)
-            if held is not None and held[0] == sha256:
-                return held[1]
+            cached = self._values.get(kind)
+            if cached is not None and cached[0] == sha256:
+                return cached[1]
         found = self._database.rows(
             "SELECT sha256, content FROM document WHERE kind = ? AND frame = ?", kind, frame
         )
@@ -112,11 +112,11 @@ class Documents:
         return value
 
     def fingerprints(self, kind: Kind) -> dict[int, str]:
-        """SHA-256 of every document of a kind, by frame."""
+        """Return the SHA-256 of every document of a kind, by frame."""
         return dict(self._database.rows("SELECT frame, sha256 FROM document WHERE kind = ?", kind))
 
     def fingerprint(self, kind: Kind, frame: int = NO_FRAME) -> str | None:
-        """SHA-256 of a document; None where there is none."""
+        """Return the SHA-256 of a document; None if there is none."""
 
         def read() -> str | None:
             found: str | None = self._database.value(
@@ -127,12 +127,12 @@ class Documents:
         return read() if frame != NO_FRAME else self._cache.get((kind, "sha256"), read)
 
     def change(self, label: str, values: Mapping[Key, object]) -> bool:
-        """Set documents in one step; None deletes one. Changes that were undone are discarded.
+        """Set documents in one change; None deletes one. Undone changes are discarded.
 
         Returns
         -------
         bool
-            False if nothing differed: then there is no step.
+            Whether anything differed; otherwise no change is stored.
 
         Raises
         ------
@@ -185,7 +185,7 @@ class Documents:
                 f"SELECT kind, frame, {side} FROM change_part WHERE change = ?", (number,)
             ).fetchall()
             for kind, frame, content in parts:
-                if content is not None:  # what is damaged is left in the history
+                if content is not None:  # raises if damaged, and leaves it in the history
                     named = f"{_named(kind, frame)} in the history"
                     unpack_from(self._database.path, named, content, CLASSES.get(kind, Never))
                 _put(connection, kind, frame, content)
@@ -195,7 +195,7 @@ class Documents:
         return next(change for change in self.history() if change.number == number)
 
     def history(self) -> tuple[Change, ...]:
-        """Changes in the history, the oldest first."""
+        """Return the changes in the history, the oldest first."""
         found: tuple[Change, ...] = self._cache.get("history", self._read_history)
         return found
 
@@ -213,7 +213,7 @@ class Documents:
         )
 
     def problems(self) -> list[str]:
-        """Sentences on documents that are damaged or contradict the history; empty if none."""
+        """Return sentences about damaged documents and contradictions with the history."""
         found = []
         expected = {
             (kind, frame): content
@@ -228,13 +228,13 @@ class Documents:
                 "WHERE undone = 1 ORDER BY change DESC"
             )
         }
-        held = {
+        stored = {
             (kind, frame): (sha256, content)
             for kind, frame, sha256, content in self._database.rows(
                 "SELECT kind, frame, sha256, content FROM document"
             )
         }
-        for (kind, frame), (sha256, content) in held.items():
+        for (kind, frame), (sha256, content) in stored.items():
             named = _named(kind, frame)
             try:
                 unpack(content, CLASSES.get(kind, Never))
@@ -245,7 +245,7 @@ class Documents:
         found += [
             f"{kind} ({frame}) is not what the history says"
             for (kind, frame), content in expected.items()
-            if held.get((kind, frame), (None, None))[1] != content
+            if stored.get((kind, frame), (None, None))[1] != content
         ]
         return found
 
@@ -272,7 +272,7 @@ def _put(connection: sqlite3.Connection, kind: str, frame: int, content: bytes |
 
 
 def _prune(connection: sqlite3.Connection) -> None:
-    """Delete the oldest changes beyond the limits; the newest always stays."""
+    """Delete the oldest changes beyond the limits, but never the newest."""
     sizes = connection.execute(
         "SELECT change, sum(coalesce(length(before), 0) + coalesce(length(after), 0)) "
         "FROM change_part GROUP BY change ORDER BY change DESC"

@@ -1,6 +1,6 @@
-"""The frames of a session: imported once from a recording, verified at every reading.
+"""The frames of a session: imported from a recording, and verified whenever they are read.
 
-The recording stays where it is and is stored as a path relative to the session; or its frames are
+The recording is not moved; the session stores its relative path. Alternatively the frames are
 embedded in the session, lossless.
 """
 
@@ -33,9 +33,9 @@ from labapp.session.record import Recording
 from labapp.text import now
 
 Progress = Callable[[int, int], None]
-"""Called with steps done and in all; may raise to stop."""
+"""Called with the number of steps done and the total; may raise to stop."""
 
-THE_RECORDING = "the recording; `labapp session relink` says where it is now"
+THE_RECORDING = "the recording; `labapp session relink` sets its new path"
 
 
 class Frames:
@@ -49,7 +49,7 @@ class Frames:
 
     @property
     def recording(self) -> Recording | None:
-        """The recording; None before one was imported."""
+        """The recording; None before the import."""
         found: Recording | None = self._cache.get("recording", self._read_recording)
         return found
 
@@ -73,7 +73,7 @@ class Frames:
         return found
 
     def time_s(self, number: int) -> float | None:
-        """Time of one frame, s; None where unknown.
+        """Return the time of a frame, s; None if unknown.
 
         Raises
         ------
@@ -95,25 +95,25 @@ class Frames:
         embed: bool = False,
         progress: Progress | None = None,
     ) -> Recording:
-        """Import a recording: read it through, check that it is frame-exact, store both findings.
+        """Import a recording: read all of it, check that it is frame-exact, store the findings.
 
         Parameters
         ----------
         path
-            A video, an image, a folder of images, a stack.
+            A video, an image, a folder of images, or a stack.
         frames
             Frames that the session uses, ``A:B:STEP``.
         frame_rate_hz
-            Frame rate, Hz, where the recording states none or a wrong one.
+            Frame rate, Hz, if the recording has none or a wrong one.
         embed
-            Store the frames in the session.
+            Whether to store the frames in the session.
         progress
-            Called with frames done and frames in all.
+            Called with the number of frames done and the total.
 
         Raises
         ------
         InputError
-            If it cannot be read, or frames measured or corrected in this session are not in it.
+            If it cannot be read, or lacks frames that are measured or corrected in this session.
         """
         require(path, PATH, "recording", "path", "the path of a recording")
         path = Path(path).absolute()
@@ -160,12 +160,12 @@ class Frames:
         with self._database.transaction() as connection:
             if before is not None and before.sha256 != recording.sha256:
                 self.refuse_another()
-            kept = self._worked_on()
-            if not kept <= set(selected):
+            used = self._worked_on()
+            if not used <= set(selected):
                 raise InputError(
                     self._database.path,
                     "frames",
-                    f"frame {min(kept - set(selected))} is measured or corrected and left out",
+                    f"frame {min(used - set(selected))} is measured or corrected and left out",
                     "frames that include these",
                 )
             connection.executemany(
@@ -192,7 +192,7 @@ class Frames:
         return recording
 
     def refuse_another(self) -> None:
-        """Refuse a recording other than the session's, if that would end what was made of it.
+        """Raise if another recording would invalidate results or corrections.
 
         Raises
         ------
@@ -209,25 +209,25 @@ class Frames:
             )
 
     def _worked_on(self) -> set[int]:
-        """Frames that are measured or corrected."""
+        """Return the frames that are measured or corrected."""
         rows = self._database.rows(
             "SELECT frame FROM result UNION SELECT frame FROM document WHERE frame >= 0"
         )
         return {frame for (frame,) in rows}
 
     def _fingerprint(self) -> str:
-        """SHA-256 of number, time and checksum of every frame."""
+        """Return the SHA-256 of number, time and checksum of all frames."""
         rows = self._database.rows("SELECT number, time_s, checksum FROM frame ORDER BY number")
         return hashlib.sha256(repr(rows).encode()).hexdigest()
 
     def read(self, number: int) -> Frame:
-        """Frame ``number`` as it was imported.
+        """Return a frame as it was imported.
 
         Raises
         ------
         InputError
-            If the session has no such frame, or its recording is missing, cannot be read, or is
-            no longer the one that was imported.
+            If the session has no such frame, or its recording is missing, cannot be read, or has
+            changed since the import.
         """
         time_s = self.time_s(number)
         (checksum,) = self._database.rows("SELECT checksum FROM frame WHERE number = ?", number)[0]
@@ -249,11 +249,11 @@ class Frames:
 
     def was_readable(self, number: int) -> bool:
         """Whether a frame of the session could be read at import."""
-        noted = self._database.value("SELECT checksum FROM frame WHERE number = ?", number)
-        return noted is not None
+        checksum = self._database.value("SELECT checksum FROM frame WHERE number = ?", number)
+        return checksum is not None
 
     def refuse_lost(self, numbers: Sequence[int]) -> None:
-        """Raise if there are frames that could be read at import and no longer can.
+        """Raise if frames that could be read at import can no longer be read.
 
         Raises
         ------
@@ -293,14 +293,14 @@ class Frames:
         Parameters
         ----------
         path
-            Where it is.
+            New path.
         verify
-            Read it through and compare it; else each frame is compared when it is read.
+            Whether to read all of it and compare it; otherwise frames are compared when read.
 
         Raises
         ------
         InputError
-            If the file there is another recording.
+            If the file is another recording.
         """
         require(path, PATH, "recording", "path", "the path of the recording")
         path = Path(path).absolute()
@@ -326,14 +326,14 @@ class Frames:
             self._source = None
 
     def problems(self, progress: Progress | None = None) -> list[str]:
-        """Sentences on problems of the recording or the embedded frames; empty if none."""
+        """Return sentences about problems of the recording or the embedded frames."""
         try:
             recording = self.recording
         except InputError as error:
             return [str(error)]
         if recording is None:
-            noted = self._database.value("SELECT max(coalesce(time_s, checksum)) FROM frame")
-            return [] if noted is None else ["there are frames, and not what they were taken from"]
+            content = self._database.value("SELECT max(coalesce(time_s, checksum)) FROM frame")
+            return [] if content is None else ["there are frames, but no recording"]
         found = []
         if recording.frames_sha256 != self._fingerprint():
             found.append("the frames' numbers, times or checksums are not those of the import")
@@ -391,11 +391,11 @@ class Frames:
 
     @property
     def place(self) -> Path | None:
-        """Path of the recording; None before one was imported."""
+        """Path of the recording; None before the import."""
         return None if self.recording is None else self._place()
 
     def _place(self) -> Path:
-        """Path of the recording: as imported, else in the session's folder."""
+        """Return the path of the recording: as stored, else in the session's folder."""
         recording = self._imported()
         folder = self._database.path.parent
         place = Path(os.path.normpath(folder / recording.path))
@@ -425,7 +425,7 @@ class Frames:
 
 
 def _encoded(image: npt.NDArray[Any]) -> bytes:
-    """Encode a frame without loss: PNG for 8 and 16 bit, else a packed array."""
+    """Encode a frame losslessly: PNG for 8 and 16 bit, else a packed array."""
     if image.dtype in (np.uint8, np.uint16):
         _, content = cv2.imencode(".png", image)
         return content.tobytes()

@@ -1,4 +1,4 @@
-"""How the lines of a session change over its recording, and the states that they show."""
+"""Trends of line features over a session's recording, and the pool's states."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LINE_QUANTITIES = (
     ("asymmetry", "Asymmetry of the lines", ""),
     ("pool_height_mm", "Pool height", "mm"),
 )
-"""Name, words and unit of what is followed; the height only where lines determine it."""
+"""Name, label and unit of the quantities; the height only if the lines determine it."""
 
 
 TRACK_QUANTITIES = (
@@ -26,33 +26,33 @@ TRACK_QUANTITIES = (
     ("tilt_px", "Tilt of the line", "px"),
     ("bend_px", "Bend of the line", "px"),
 )
-"""The same of one line that is followed (`TrackedLine`)."""
+"""The same for a line that is followed (`TrackedLine`)."""
 
 FEWEST = 60
-"""States are read from changes over some tens of frames: from so many that follow on each other."""
+"""Fewest consecutive frames for states, which are determined by changes over tens of frames."""
 
 
 @dataclass(frozen=True)
 class LineTrend(ReadOnlyArrays):
-    """What the measured frames of a line pattern show; n frames."""
+    """Features of the n measured frames of a line pattern."""
 
     frame: IntArray
     """Numbers of the frames, ascending, shape (n,)."""
     stale: BoolArray
-    """Which results no longer stand, shape (n,)."""
+    """Which results are stale, shape (n,)."""
     values: dict[str, FloatArray]
-    """By the names of `LINE_QUANTITIES`, or of `TRACK_QUANTITIES` where a line is followed, shape
-    (n,); NaN where unknown.
+    """Values by the names of `LINE_QUANTITIES`, or of `TRACK_QUANTITIES` if a line is followed,
+    shape (n,); NaN if unknown.
     """
     height_sigma_mm: FloatArray
-    """Of the pool's height, without the set-up's part, shape (n,)."""
+    """σ of the pool's height, without the set-up's part, shape (n,)."""
     states: tuple[State, ...]
-    """Of the pool in each frame (`line_states`); none where fewer than `FEWEST` frames, or not all
-    that follow on each other, were measured.
+    """State of the pool in each frame (`line_states`); empty if fewer than `FEWEST` or
+    non-consecutive frames were measured.
     """
 
     def stretches(self) -> list[tuple[State, int, int]]:
-        """Each state in turn, with its first and its last frame."""
+        """Return each state in turn, with its first and last frame."""
         found: list[tuple[State, int, int]] = []
         frames = self.frame.tolist() if self.states else []
         for state, frame in zip(self.states, frames, strict=True):
@@ -64,7 +64,7 @@ class LineTrend(ReadOnlyArrays):
 
 
 def line_trend(session: SessionContents) -> LineTrend:
-    """Collect what the lines of all measured frames show; damaged results are left out."""
+    """Return the trend of line features over all measured frames, without damaged results."""
     seen = session.overview()
     numbers, stale, found = list[int](), list[bool](), []
     for number, old in zip(seen.frame.tolist(), seen.stale.tolist(), strict=True):

@@ -29,7 +29,7 @@ SETTINGS_CHANGED = "the settings were changed"
 CORRECTION_CHANGED = "the dots or rows were corrected"
 
 MAX_STASHED_BYTES = 64_000_000
-"""Memory for results of former corrections, which undo and redo restore."""
+"""Memory for results with former corrections, which undo and redo restore."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,7 @@ class Basis:
     setup: Setup
     """Rig and image calibration."""
     settings: Settings
-    """Of every step, the scheme included."""
+    """Settings of every step, including the scheme."""
 
     @property
     def scheme(self) -> str:
@@ -47,30 +47,30 @@ class Basis:
         return scheme_name(self.settings)
 
     def fingerprints(self) -> tuple[str, str]:
-        """SHA-256 of the setup's values (comments aside) and of the settings."""
+        """Return the SHA-256 of the set-up's values, without comments, and of the settings."""
         return _setup_fingerprint(self.setup.text), fingerprint(self.settings)
 
 
 @dataclass(frozen=True)
 class Result:
-    """Stored result of one frame by one scheme."""
+    """Stored result of a frame by a scheme."""
 
     frame: int
-    """Its number in the recording."""
+    """Frame number in the recording."""
     measurement: Measurement
     scheme: str
     """Name of the scheme, as in `Basis.scheme`."""
     version: str
     """Version of labapp that measured it."""
     measured: str
-    """When, ISO 8601."""
+    """Time of the measurement, ISO 8601."""
     setup: str
-    """The setup it was measured with, TOML."""
+    """Set-up of the measurement, TOML."""
     settings: Settings
     stale: tuple[str, ...]
-    """Why it is stale, a clause each; empty if it is not."""
+    """Reasons why it is stale, one clause each; empty if it is not."""
     doubt: str = ""
-    """Why the setup it was measured with is doubtful; empty if it is not."""
+    """Why the set-up of the measurement is doubtful; empty if it is not."""
 
 
 @dataclass(frozen=True)
@@ -80,19 +80,19 @@ class Overview(ReadOnlyArrays):
     frame: IntArray
     """Numbers in the recording, ascending, shape (n,)."""
     time_s: FloatArray
-    """Times, shape (n,), s; NaN where unknown."""
+    """Times, shape (n,), s; NaN if unknown."""
     status: tuple[str, ...]
-    """Each frame's status; empty where it was not measured."""
+    """Status of each frame; empty if it was not measured."""
     corrected: BoolArray
-    """Which frames have a correction by hand, shape (n,)."""
+    """Which frames were corrected manually, shape (n,)."""
     stale: BoolArray
     """Which results are stale, shape (n,)."""
     measures: dict[str, FloatArray]
-    """Name → values, shape (n,), of `Measures`; NaN where there is none."""
+    """Name in `Measures` → values, shape (n,); NaN if unknown."""
 
 
 class _Row(NamedTuple):
-    """A stored result: its inputs, when it was measured, and the packed measurement."""
+    """A stored result: inputs, time, and the packed measurement."""
 
     version: str
     setup: bytes
@@ -113,17 +113,18 @@ class Results:
     def put(
         self, frame: int, measurement: Measurement, basis: Basis, correction: str | None
     ) -> None:
-        """Store a result; it replaces an earlier one of the same frame and scheme.
+        """Store a result; it replaces a former one of the same frame and scheme.
 
-        An earlier one of another correction is stashed for `restore`. If that correction is the
-        present one, as the new one was undone meanwhile, it stays and the new one is stashed.
+        A former result with another correction is stashed for `restore`. If its correction is the
+        present one, because the new one was undone during the measurement, the former result is
+        retained and the new one is stashed.
 
         Parameters
         ----------
         frame, measurement
-            The frame's number and its measurement.
+            Number of the frame and its measurement.
         correction
-            SHA-256 of the correction it was measured with; None without.
+            SHA-256 of the correction used; None without.
 
         Raises
         ------
@@ -131,10 +132,10 @@ class Results:
             If it cannot be saved; then nothing has changed.
         """
         setup, settings = pack(basis.setup.text), pack(basis.settings)
-        key, made = (VERSION, setup, settings), (correction, now())
-        seal = fingerprint((frame, basis.scheme, *key, *made))
+        key, origin = (VERSION, setup, settings), (correction, now())
+        seal = fingerprint((frame, basis.scheme, *key, *origin))
         content = pack((measurement, seal))
-        row = _Row(*key, *made, content)
+        row = _Row(*key, *origin, content)
         with self._database.transaction() as connection:
             former = self._row(frame, basis.scheme)
             if former is not None and self._differ_by_correction(former, row):
@@ -151,9 +152,9 @@ class Results:
                 self._restore(frame)
 
     def _restore(self, frame: int) -> None:
-        """Restore the result that a frame had with its present correction, if it is stashed.
+        """Restore the result of a frame with its present correction, if it is stashed.
 
-        It is if it was measured since the session was opened, with the same set-up and settings.
+        Only results measured since the session was opened, with the same set-up and settings, are.
         """
         present = self._corrected(frame)
         for (scheme,) in self._database.rows("SELECT scheme FROM result WHERE frame = ?", frame):
@@ -179,7 +180,7 @@ class Results:
         return _Row(*found[0]) if found else None
 
     def _corrected(self, frame: int) -> str | None:
-        """SHA-256 of a frame's correction; None without."""
+        """Return the SHA-256 of a frame's correction; None without."""
         found: str | None = self._database.value(
             "SELECT sha256 FROM document WHERE kind = 'correction' AND frame = ?", frame
         )
@@ -196,7 +197,7 @@ class Results:
         return one_inputs == other_inputs and one.correction != other.correction
 
     def _stash(self, frame: int, scheme: str, row: _Row) -> None:
-        """Hold a result for `restore`; beyond `MAX_STASHED_BYTES` the oldest are discarded."""
+        """Store a result for `restore`; beyond `MAX_STASHED_BYTES` the oldest are discarded."""
         key = frame, scheme, row.correction
         self._stashed.pop(key, None)
         self._stashed[key] = row
@@ -207,12 +208,13 @@ class Results:
     def get(
         self, frame: int, scheme: str, basis: Basis | None, correction: str | None
     ) -> Result | None:
-        """Result of a frame by a scheme; None if it was not measured.
+        """Return the result of a frame by a scheme; None if it was not measured.
 
         Parameters
         ----------
         basis, correction
-            Present inputs, to see whether it is stale; basis None where the setup is incomplete.
+            Present inputs, for the check whether it is stale; basis None if the set-up is
+            incomplete.
 
         Raises
         ------
@@ -245,12 +247,12 @@ class Results:
         )
 
     def judge_setup(self, basis: Basis) -> None:
-        """Judge a set-up by all results from it that stand, and store the verdict.
+        """Check a set-up by all its current results, and store the verdict.
 
         Parameters
         ----------
         basis
-            The inputs that results were measured from.
+            Inputs of the results.
 
         Raises
         ------
@@ -275,7 +277,7 @@ class Results:
         self.verdicts.put(given, judge_setup(basis.setup.rig, statuses, samples))
 
     def counts(self) -> dict[tuple[str, str], int]:
-        """Number of results: (scheme, version of labapp) → count."""
+        """Return the number of results: (scheme, version of labapp) → count."""
         rows = self._database.rows(
             "SELECT scheme, version, count(*) FROM result JOIN inputs ON inputs.id = result.inputs "
             "GROUP BY scheme, version ORDER BY scheme, version"
@@ -283,7 +285,7 @@ class Results:
         return {(scheme, version): count for scheme, version, count in rows}
 
     def problems(self) -> list[str]:
-        """Sentences on damaged results; empty if there are none."""
+        """Return sentences about damaged results; empty if there are none."""
         found = []
         for number, version, setup, settings in self._database.rows(
             "SELECT id, version, setup, settings FROM inputs"
@@ -299,25 +301,25 @@ class Results:
             f"SELECT id, frame, scheme, status, {names} FROM result"
         ):
             named = f"result of frame {frame} ({scheme})"
-            kept = self._database.rows(
+            stored = self._database.rows(
                 "SELECT frame, scheme, version, setup, settings, correction, measured, content "
                 "FROM result JOIN inputs ON inputs.id = inputs "
                 "LEFT JOIN detail ON result = result.id WHERE result.id = ?",
                 result,
             )
             try:
-                measurement = _verified(kept[0][-1], kept[0][:-1])
+                measurement = _verified(stored[0][-1], stored[0][:-1])
             except Damaged as error:
                 found.append(f"{named} is damaged: {error}")
                 continue
             expected = [getattr(measurement.measures, name, None) for name in MEASURES]
             expected = [None if size is None or np.isnan(size) else size for size in expected]
             if (measurement.status, expected) != (status, sizes):
-                found.append(f"{named} is not what its frame gave")
+                found.append(f"{named} differs from its measurement")
         return found
 
     def outdated(self, basis: Basis | None) -> frozenset[int]:
-        """Rows of `inputs` that differ from the present ones: their results are stale."""
+        """Return the rows of `inputs` that differ from the present ones, with stale results."""
         found = set()
         for number, setup, settings in self._database.rows(
             "SELECT id, setup, settings FROM inputs"
@@ -367,7 +369,7 @@ def _replace(
 
 
 def _verified(content: object, columns: tuple[object, ...]) -> Measurement:
-    """Measurement of a detail, once its seal is verified against the columns beside it.
+    """Return the measurement of a detail after verifying its seal against the other columns.
 
     Raises
     ------
@@ -377,13 +379,13 @@ def _verified(content: object, columns: tuple[object, ...]) -> Measurement:
     measurement: Measurement
     measurement, seal = unpack(content, tuple[Measurement, str])
     if seal != fingerprint(columns):
-        raise Damaged("it is of another frame, or was measured from something else")
+        raise Damaged("it belongs to another frame or other inputs")
     return measurement
 
 
 @functools.lru_cache(maxsize=2 * MOST)
 def _residuals(content: bytes, columns: tuple[object, ...]) -> Residuals | None:
-    """Residuals of a detail (`_verified`); None where it has none, or is damaged."""
+    """Return the residuals of a detail (`_verified`); None if it has none, or is damaged."""
     try:
         return Residuals.of(_verified(content, columns))
     except Damaged:
@@ -397,7 +399,7 @@ def _read_inputs(setup: bytes, settings: bytes) -> Basis:
 
 @functools.lru_cache(maxsize=64)
 def _setup_fingerprint(text: str) -> str:
-    """SHA-256 of a setup's values, comments aside."""
+    """Return the SHA-256 of a set-up's values, without comments."""
     setup = parse_setup(text, "setup", lines=True)
     return fingerprint((setup.rig, setup.calibration))
 
@@ -405,7 +407,7 @@ def _setup_fingerprint(text: str) -> str:
 def _differences(now: Basis | None, then: Basis) -> tuple[str, ...]:
     if now is None:
         return (SETUP_CHANGED,)
-    # Results of another scheme than the chosen one stand by what else the settings say.
+    # For results of other schemes, ignore which scheme is chosen.
     chosen = replace(now.settings, scheme=then.settings.scheme, algorithm=then.settings.algorithm)
     setup, settings = Basis(now.setup, chosen).fingerprints()
     before = then.fingerprints()
@@ -420,6 +422,6 @@ def _differences(now: Basis | None, then: Basis) -> tuple[str, ...]:
 
 
 def scheme_name(settings: Settings) -> str:
-    """Name of the scheme; with its algorithm where it has several: ``irs-opa``."""
+    """Return the name of the scheme, with the algorithm if it has several: ``irs-opa``."""
     several = SCHEMES[settings.scheme].algorithms
     return f"{settings.scheme}-{settings.algorithm}" if several else settings.scheme

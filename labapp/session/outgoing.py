@@ -1,4 +1,4 @@
-"""From a session to an export: which results go out, with their provenance."""
+"""Export of a session: selection of the results, and their provenance."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ def export_session(
     require(folder, PATH, "export", "folder", "the path of a folder")
     require(choice, ExportChoice, "export", "choice", "labapp.export.folder.ExportChoice")
     scheme = scheme or scheme_name(session.settings)
-    numbers = _standing(session, scheme, frames)
+    numbers = _current_frames(session, scheme, frames)
     if session.has_lines:
         return _export_lines(session, folder, scheme, numbers)
     before = len(numbers) * report
     total = before + len(numbers) * (2 if "film" in choice.pictures else 1)
     report_progress = progress or (lambda done, total: None)
 
-    def made() -> bytes:
+    def write_report() -> bytes:
         return report_pdf(
             session, scheme, numbers, progress=lambda done: report_progress(done, total)
         )
@@ -56,7 +56,7 @@ def export_session(
         _provenance(session, scheme, numbers),
         choice,
         image_of=lambda number: session.frame(number).image,
-        extras={"report.pdf": made} if report else None,
+        extras={"report.pdf": write_report} if report else None,
         progress=lambda done: report_progress(before + done, total),
     )
 
@@ -68,15 +68,15 @@ def write_view_film(
     size_px: tuple[int, int],
     report_progress: Progress,
 ) -> None:
-    """Write a film (MP4) of all frames of the settings' scheme, seen from a camera.
+    """Write a film (MP4) of the surfaces of all frames by the settings' scheme.
 
     Raises
     ------
     InputError
-        If a result no longer stands, nothing was measured, or it cannot be drawn or written.
+        If a result is stale, nothing was measured, or the film cannot be drawn or written.
     """
     scheme = scheme_name(session.settings)
-    numbers = _standing(session, scheme, None)
+    numbers = _current_frames(session, scheme, None)
     measured, extent = _Measured(session, scheme, numbers), Extent()
     frames = []
     for result in measured:
@@ -98,7 +98,7 @@ def write_view_film(
 def _export_lines(
     session: SessionContents, folder: str | os.PathLike[str], scheme: str, numbers: Sequence[int]
 ) -> tuple[ExportedFile, ...]:
-    """Write the tables of a line pattern, as `labapp lines` does; there are no others."""
+    """Write the tables of a line pattern, the same as `labapp lines`."""
     measured = list(_Measured(session, scheme, numbers))
     pairs = [(one, one.measurement.lines) for one in measured]
     known = [(one, lines) for one, lines in pairs if lines is not None]  # not unreadable
@@ -120,7 +120,7 @@ def _export_lines(
 
 
 class _Measured:
-    """What frames gave, read one after the other as often as it is gone through."""
+    """Results of frames, read from the session during each iteration."""
 
     def __init__(self, session: SessionContents, scheme: str, numbers: Sequence[int]) -> None:
         self._session, self._scheme, self._numbers = session, scheme, numbers
@@ -134,8 +134,10 @@ class _Measured:
             yield FrameResult(number, time_s if math.isfinite(time_s) else None, measurement)
 
 
-def _standing(session: SessionContents, scheme: str, frames: Sequence[int] | None) -> list[int]:
-    """Frames whose results go out: those measured, or some of them; all must stand."""
+def _current_frames(
+    session: SessionContents, scheme: str, frames: Sequence[int] | None
+) -> list[int]:
+    """Return the measured frames, or those of ``frames``; raise if any is stale."""
     seen = session.overview(scheme)
     chosen = np.array([status != "" for status in seen.status], bool)
     if frames is not None:
@@ -161,7 +163,7 @@ def _result(session: SessionContents, frame: int, scheme: str) -> Result:
 
 
 def _provenance(session: SessionContents, scheme: str, frames: Sequence[int]) -> dict[str, object]:
-    """Source, setup, settings and versions of an export; plain values."""
+    """Return source, set-up, settings and versions of an export as plain values."""
     recording, first = session.recording, _result(session, frames[0], scheme)
     verdict = session.setup_verdict
     source = {} if recording is None else asdict(recording)

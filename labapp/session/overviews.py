@@ -14,7 +14,7 @@ from labapp.session.file.schema import MEASURES
 from labapp.session.measured import Basis, Overview, Results
 
 MANY = 500
-"""If more frames than this changed, all are read: it takes no longer."""
+"""Number of changed frames from which all are read, which takes no longer."""
 
 ALL_FRAMES = -2
 
@@ -28,7 +28,7 @@ WATCHING = (
         for frame in (whole or f"{row}.frame",)
     ),
 )
-"""Triggers by which SQLite records the frames of each change, undo and redo included, in memory."""
+"""Triggers that record in memory the frames of each change, including undo and redo."""
 
 QUERY = (
     "SELECT number, time_s, inputs, correction, status, sha256, "
@@ -45,17 +45,17 @@ class _Table:
     number: IntArray
     time_s: FloatArray
     inputs: IntArray
-    """Of the frame; row of `inputs` that it was measured from, 0 where it was not; shape (n,)."""
+    """Number and time of the frame; row of `inputs` of its result, 0 without one; shape (n,)."""
     used: np.ndarray[tuple[int], np.dtype[np.object_]]
-    held: np.ndarray[tuple[int], np.dtype[np.object_]]
-    """SHA-256 of the correction it was measured with, and of the present one; None without."""
+    present: np.ndarray[tuple[int], np.dtype[np.object_]]
+    """SHA-256 of the correction of the result, and of the present one; None without."""
     status: np.ndarray[tuple[int], np.dtype[np.object_]]
     sizes: FloatArray
-    """Of the result: shape (n,) and (n, number of measures)."""
+    """Status and measures of the result, shape (n,) and (n, number of measures)."""
     due: set[int] = field(default_factory=set)
     """Frames that have changed since."""
     seen: tuple[Collection[int], Overview] | None = None
-    """The overview made from it last, and the outdated rows of `inputs` then."""
+    """The last overview, with the outdated rows of `inputs`."""
 
 
 class Overviews:
@@ -71,12 +71,12 @@ class Overviews:
             database.rows(statement)
 
     def get(self, scheme: str, basis: Basis | None) -> Overview:
-        """Overview by a scheme; the same object while nothing has changed.
+        """Return the overview of a scheme; the same object if nothing has changed.
 
         Parameters
         ----------
         basis
-            Present inputs; None where the setup is incomplete.
+            Present inputs; None if the set-up is incomplete.
 
         Raises
         ------
@@ -100,7 +100,7 @@ class Overviews:
             return table.seen[1]
 
     def _note_changes(self) -> None:
-        version = self._database.value("PRAGMA data_version")  # another program's changes
+        version = self._database.value("PRAGMA data_version")  # changed by other programs
         touched = {frame for (frame,) in self._database.rows("DELETE FROM touched RETURNING frame")}
         if version != self._version or ALL_FRAMES in touched:
             self._tables.clear()
@@ -112,13 +112,13 @@ class Overviews:
         rows = self._database.rows(f"{QUERY} ORDER BY number", scheme)
         array = self._database.array
         columns = list(zip(*rows, strict=True)) or [()] * (6 + len(MEASURES))
-        number, time_s, inputs, used, status, held, *sizes = columns
+        number, time_s, inputs, used, status, present, *sizes = columns
         return _Table(
             number=array(number, np.int64),
             time_s=array(time_s, np.float64),
             inputs=array([k or 0 for k in inputs], np.int64),
             used=_objects(used),
-            held=_objects(held),
+            present=_objects(present),
             status=_objects([str(word or "") for word in status]),
             sizes=array(sizes, np.float64).reshape(len(MEASURES), -1).T,
         )
@@ -131,7 +131,7 @@ class Overviews:
                 place = int(np.searchsorted(table.number, frame))
                 table.time_s[place : place + 1] = array(row[1:2], np.float64)
                 table.inputs[place : place + 1] = array([row[2] or 0], np.int64)
-                table.used[place], table.held[place] = row[3], row[5]
+                table.used[place], table.present[place] = row[3], row[5]
                 table.status[place] = str(row[4] or "")
                 table.sizes[place] = array(row[6:], np.float64)
         table.due.clear()
@@ -145,12 +145,12 @@ def _objects(values: Collection[object]) -> np.ndarray[tuple[int], np.dtype[np.o
 
 
 def _overview(table: _Table, outdated: Collection[int]) -> Overview:
-    stands = ~np.isin(table.inputs, list(outdated)) & (table.used == table.held)
+    current = ~np.isin(table.inputs, list(outdated)) & (table.used == table.present)
     return Overview(
         frame=table.number.copy(),
         time_s=table.time_s.copy(),
         status=tuple(table.status.tolist()),
-        corrected=np.asarray(table.held != np.array(None), bool),
-        stale=(table.inputs > 0) & ~stands.astype(bool),
+        corrected=np.asarray(table.present != np.array(None), bool),
+        stale=(table.inputs > 0) & ~current.astype(bool),
         measures=dict(zip(MEASURES, table.sizes.T.copy(), strict=True)),
     )

@@ -1,4 +1,4 @@
-"""What a session notes: the experiment, the calibrations' readings, the recording."""
+"""Records of a session: the experiment, calibrations with their readings, the recording."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
 
 @dataclass(frozen=True)
 class Record:
-    """The experiment record in the operator's words; empty or None where nothing was noted."""
+    """The experiment record, entered by the operator; unknown values are empty or None."""
 
     title: str = ""
     operator: str = ""
@@ -26,130 +26,130 @@ class Record:
     expected_width_mm: float | None = None
     expected_length_mm: float | None = None
     expected_height_mm: float | None = None
-    """Size of the pool that is expected; a negative height is a concave one."""
+    """Expected size of the pool; the height is negative for a concave pool."""
     notes: str = ""
     safety: tuple[tuple[str, str], ...] = ()
-    """Items of the lists of Appendix II (`checklist`) that were ticked: (item, ISO 8601) pairs."""
+    """Ticked items of the checklists of Appendix II (`checklist`): (item, ISO 8601) pairs."""
 
 
 @dataclass(frozen=True)
 class LaserReadings:
-    """A laser calibration (Appendix I) and what it was found from."""
+    """A laser calibration (Appendix I) and its readings."""
 
     l1_mm: tuple[float, ...]
     l2_mm: tuple[float, ...]
     l3_mm: tuple[float, ...]
-    """Lengths of the cross as read, mm; one or more of each."""
+    """Readings of the half lengths of the cross, mm; at least one of each."""
     fan_angle_deg: float
     """Fan angle of the cross-hair lens, degrees."""
     found: LaserCalibration
-    """What follows from them."""
+    """Result of the calibration."""
     picture_sha256: str | None = None
-    """The picture of the cross-hair, kept in the session; None where lengths were typed."""
+    """The picture of the cross-hair in the session; None if lengths were typed."""
     fan_angle_sigma_deg: float | None = None
     """Standard uncertainty of the fan angle, degrees; None in older files."""
     resolution_mm: float | None = None
-    """Smallest step of the callipers, mm; None likewise."""
+    """Smallest step of the callipers, mm; None in older files."""
 
 
 @dataclass(frozen=True)
 class PlanePicture:
-    """An imaging-plane calibration (§5.1) and what it was found from."""
+    """An imaging-plane calibration (§5.1) and its picture."""
 
     unit_mm: float
     """Length of a unit of the target's axes, or edge of a board's squares, mm."""
     found: PlaneCalibration | BoardCalibration
-    """What was found in the picture."""
+    """Result of the calibration."""
     picture_sha256: str
-    """The picture, kept in the session."""
+    """The picture in the session."""
 
 
 @dataclass(frozen=True)
 class MirrorPicture(ReadOnlyArrays):
-    """A picture of a known mirror (bench check), and what became of its n dots with a ray."""
+    """A picture of a known mirror (bench check), with the fit of its n dots that have a ray."""
 
     name: str
-    """Of the picture's file."""
+    """Name of the picture's file."""
     kind: str
     height_mm: float
-    """Height of the plate's surface, or of the top of a cap or ball, over the work piece."""
+    """Height of the plate's surface, or of the top of a cap or ball, above the work piece."""
     diameter_mm: float | None
-    """Of the cap's rim or of the ball; None for a plate."""
+    """Diameter of the cap's rim or of the ball; None for a plate."""
     picture_sha256: str
-    """The picture, kept in the session."""
+    """The picture in the session."""
     ray: IntArray
     """Ray (i, j) of each dot, counted from 1, shape (n, 2)."""
     dot_px: FloatArray
     computed_px: FloatArray
-    """Where it is, and where the adjusted bench has it, (u, v), shape (n, 2), px."""
+    """Observed dot, and dot computed with the adjusted bench, (u, v), shape (n, 2), px."""
     residual_mm: FloatArray
     """Observed minus computed dot on the plane, shape (n, 2), mm."""
     measured: tuple[tuple[str, float, float, float], ...] = ()
-    """The mirror, measured with the adjusted bench as if its size were not known: (name, known,
-    measured, standard uncertainty by the noise of the dots), mm.
+    """Sizes of the mirror measured with the adjusted bench, as if unknown: (name, known, measured,
+    standard uncertainty from dot noise), mm.
     """
     independent: tuple[tuple[float, float], ...] = ()
-    """Each of these sizes measured without its known value (`MeasuredSize.independent_mm`), and its
-    standard uncertainty, mm; empty in older files.
+    """Each of these sizes measured independently of its known value
+    (`MeasuredSize.independent_mm`), and its standard uncertainty, mm; empty in older files.
     """
     pose_sigma: tuple[tuple[str, float], ...] = ()
-    """Standard uncertainty of each parameter of the mirror's pose (`Mirror.parameters`), by its
-    name, as it was given; empty in older files.
+    """Given standard uncertainty of each parameter of the mirror's pose (`Mirror.parameters`), by
+    name; empty in older files.
     """
 
 
 @dataclass(frozen=True)
 class BenchCheckRecord(ReadOnlyArrays):
-    """A bench check and what it was found from."""
+    """A bench check and its pictures."""
 
     date: str
-    """When it was made, ISO 8601."""
+    """Time of the check, ISO 8601."""
     pictures: tuple[MirrorPicture, ...]
     quantities: tuple[str, ...]
-    """Keys of the q quantities that were adjusted (`uncertainty.QUANTITIES`)."""
+    """Keys of the q adjusted quantities (`uncertainty.QUANTITIES`)."""
     before: FloatArray
     before_sigma: FloatArray
     after: FloatArray
     after_sigma: FloatArray
     """Their values and standard uncertainties before and after, shape (q,), in their units."""
     free: tuple[str, ...] = ()
-    """Keys of what was not held by its uncertainty; in older files not kept."""
+    """Keys of the quantities adjusted without a prior; empty in older files."""
 
 
 @dataclass(frozen=True)
 class Recording:
-    """Where a session's frames come from, as it was found at import."""
+    """Source of a session's frames, as examined at import."""
 
     path: str
-    """Relative to the session's folder where that can be said, with ``/``; else absolute."""
+    """Path relative to the session's folder, with ``/``; absolute on another drive."""
     size: int
-    """Of all its files together, bytes."""
+    """Size of all its files together, bytes."""
     sha256: str
-    """Of the file; of a recording of several files, of their names and SHA-256."""
+    """SHA-256 of the file; for several files, of their names and SHA-256."""
     description: str
-    """Codec, frame size, depth and rate, in words."""
+    """Codec, frame size, depth and rate as text."""
     frames: int
     rows: int
     columns: int
     bit_depth: int
-    """Frames in the recording, of which a session may use a part; their size, px; significant bits
-    of a grey level.
+    """Number of frames in the recording, of which a session may use a part; their size, px;
+    significant bits of a grey level.
     """
     frame_rate_hz: float | None
-    """The rate that the session's times follow; None where there is no time base."""
+    """Frame rate of the session's times; None without a time base."""
     rate_is_given: bool
-    """Whether the rate was given at import; otherwise it is the recording's own."""
+    """Whether the rate was given at import; otherwise it is that of the recording."""
     frame_exact: bool
-    """Whether frames read at random were those read in order."""
+    """Whether random access returns the same frames as sequential reading."""
     selected: tuple[int, int, int]
     """Start, stop and step of the frames that the session uses."""
     embedded: bool
-    """Whether the session holds these frames itself."""
+    """Whether the frames are stored in the session itself."""
     warnings: tuple[str, ...]
-    """What the user should know, one sentence each."""
+    """Warnings for the user, one sentence each."""
     index: bytes | None
-    """What opening it again needs to know (`FrameSource.index`)."""
+    """Index for opening it again (`FrameSource.index`)."""
     imported: str
-    """When, ISO 8601."""
+    """Time of the import, ISO 8601."""
     frames_sha256: str = ""
-    """Of the number, time and checksum of every frame that the session uses."""
+    """SHA-256 of number, time and checksum of every frame that the session uses."""

@@ -1,4 +1,4 @@
-"""The sample runs, and new sessions of them."""
+"""The sample runs, and sessions created from them."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from labapp.session.record import Record
 from labapp.session.session import Session
 
 UNIT_MM = 6.35
-"""Of the target in the samples' calibration pictures."""
+"""Unit of the target in the samples' calibration pictures."""
 
 
 @dataclass(frozen=True)
 class SampleSession:
-    """What is known of a sample besides its folder."""
+    """Facts about a sample that are not in its folder."""
 
     recording: str
-    """The recording's name in the folder."""
+    """Name of the recording in the folder."""
     record: Record
     frame_rate_hz: float | None = None
-    """Of a recording without a time base that says it."""
+    """Frame rate of a recording without a time base."""
 
 
 SIMULATED = "Simulated: labapp.simulation.samples."
@@ -78,28 +78,28 @@ SAMPLES = {
 
 
 def sample_folder(name: str) -> Path:
-    """Folder of a sample that comes with labapp.
+    """Return the folder of a bundled sample.
 
     Raises
     ------
     InputError
-        If it is not there: labapp was installed without its data.
+        If it is missing, because labapp was installed without its data.
     """
     folder = bundled("sample_sessions") / name
     if not folder.is_dir():
-        expected = "a folder that comes with labapp; install it again"
+        expected = "a folder distributed with labapp; install it again"
         raise InputError(folder, "sample run", "missing", expected)
     return folder
 
 
 def begin_session(name: str, path: Path) -> Session:
-    """Make a session of a sample: record, setup, calibration, recording; nothing measured yet.
+    """Create a session from a sample: record, set-up, calibration, recording, without results.
 
     Raises
     ------
     InputError
-        If the sample lacks a part, or the session is there already or cannot be written; no
-        session is left then.
+        If the sample is incomplete, or the session exists already or cannot be written; an
+        incomplete session is deleted.
     """
     sample, folder = SAMPLES[name], sample_folder(name)
     with contextlib.ExitStack() as on_failure:

@@ -1,7 +1,7 @@
-"""A session: one file with an experiment from its record to its results, for scripts and windows.
+"""Sessions: one file with an experiment from record to results, for scripts and the app.
 
-Every call that changes something is one transaction: when it returns, the change is on the disk,
-and whatever happens before it returns leaves the session as it was.
+Every method that changes something is one transaction: when it returns, the change is on disk; if
+it fails or is interrupted, the session is unchanged.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 
 class Session(SessionContents):
-    """An open session; make it with `Session.create` or `Session.open`, use it in a ``with``."""
+    """An open session, returned by `Session.create` or `Session.open`; a context manager."""
 
     @classmethod
     def create(
@@ -50,17 +50,17 @@ class Session(SessionContents):
         *,
         exist_ok: bool = False,
     ) -> Session:
-        """Make a new session file, ``….labsession``.
+        """Create a session file, ``….labsession``.
 
         Parameters
         ----------
         path
-            Of the file.
+            Path of the file.
         record
-            The experiment record; None: an empty one, or that of the session that is there.
+            The experiment record; None: an empty one, or that of an existing session.
         exist_ok
-            Whether to open a session that is there, with all that is in it: a script that failed
-            half-way can be run again, and measures only what is missing.
+            Whether to open an existing session, with its contents: an interrupted script can be
+            run again, and measures only missing frames.
 
         Returns
         -------
@@ -70,8 +70,8 @@ class Session(SessionContents):
         Raises
         ------
         InputError
-            If there is a file of that name (with ``exist_ok``: one that is no session), or it
-            cannot be written.
+            If the file exists already (with ``exist_ok``: and is not a session), or cannot be
+            written.
         """
         from labapp.session.file.database import Database
 
@@ -100,13 +100,13 @@ class Session(SessionContents):
         SessionInUse
             If another program has it open for writing; it can still be opened read-only.
         InputError
-            If it cannot be read, is no session, or is one of a newer labapp.
+            If it cannot be read, is not a session, or is of a newer version of labapp.
         """
         from labapp.session.file.database import Database
 
         return cls(Database.open(path, read_only))
 
-    # --- what the operator says; every change can be undone ---------------------------------
+    # --- operator's input; every change can be undone ---------------------------------------
 
     def set_record(self, record: Record) -> None:
         """Replace the experiment record.
@@ -119,7 +119,7 @@ class Session(SessionContents):
         self._documents.change("experiment record", {("record", NO_FRAME): record})
 
     def set_setup(self, text: str, label: str = "setup") -> None:
-        """Replace the setup by that of a setup file.
+        """Replace the set-up by the text of a setup file.
 
         Parameters
         ----------
@@ -131,7 +131,7 @@ class Session(SessionContents):
         Raises
         ------
         InputError
-            If anything in it is unknown, missing or impossible.
+            If anything in it is unknown, missing or invalid.
         """
         from labapp.config.setup import parse_setup
 
@@ -145,7 +145,7 @@ class Session(SessionContents):
     def update_setup(
         self, values: Mapping[str, Mapping[str, object]], label: str = "setup"
     ) -> None:
-        """Set or delete (None) keys of the setup: section → key → value; it may stay incomplete.
+        """Set or delete (None) keys of the set-up: section → key → value; it may be incomplete.
 
         Parameters
         ----------
@@ -157,7 +157,7 @@ class Session(SessionContents):
         Raises
         ------
         InputError
-            If a section is not one; whether values are possible is checked by `setup`.
+            If there is no such section; values are checked by `setup`.
         """
         from labapp.config.setup_keys import SECTIONS
 
@@ -180,7 +180,7 @@ class Session(SessionContents):
     ) -> LaserCalibration:
         """Calibrate the laser from its cross-hair (Appendix I), update the rig, store the picture.
 
-        Values, standard uncertainties and their correlation go into the set-up.
+        Values, standard uncertainties and their correlation are written to the set-up.
 
         Parameters
         ----------
@@ -196,7 +196,7 @@ class Session(SessionContents):
         Raises
         ------
         InputError
-            If no laser can have drawn such a cross.
+            If the readings are not possible.
         """
         from labapp.core.calibration.laser_calibration import (
             LaserCalibrationSettings,
@@ -210,10 +210,10 @@ class Session(SessionContents):
         except (TypeError, ValueError) as error:
             expected = "readings in mm that a laser cross can have, and a fan angle in degrees"
             raise InputError("calibrate_laser", "readings", error, expected) from error
-        kept = None if picture is None else self._pictures.add("cross-hair", picture)
+        sha256 = None if picture is None else self._pictures.add("cross-hair", picture)
         lengths = tuple(l1_mm), tuple(l2_mm), tuple(l3_mm)
         known = settings.fan_angle_sigma_deg, settings.resolution_mm
-        readings = LaserReadings(*lengths, fan_angle_deg, found, kept, *known)
+        readings = LaserReadings(*lengths, fan_angle_deg, found, sha256, *known)
         values: dict[Key, Any] = {
             ("laser-calibration", NO_FRAME): readings,
             ("setup", NO_FRAME): self._updated_setup({"laser": found.setup_keys}),
@@ -239,9 +239,9 @@ class Session(SessionContents):
         Raises
         ------
         CannotMeasure
-            If the target is not found in it.
+            If the target is not found in the picture.
         InputError
-            If it cannot be read.
+            If the picture cannot be read.
         """
         from labapp.config.setup import lens_of
         from labapp.core.calibration.plane_calibration import (
@@ -266,9 +266,9 @@ class Session(SessionContents):
         Parameters
         ----------
         pictures
-            Pictures, the first of the board in the imaging plane.
+            Pictures, the first with the board in the imaging plane.
         board
-            The board; None: the one of labapp's that is seen.
+            The board; None: one of labapp's boards, which is recognised.
 
         Returns
         -------
@@ -278,9 +278,9 @@ class Session(SessionContents):
         Raises
         ------
         CannotMeasure
-            If the board is not found in one of them.
+            If the board is not found in a picture.
         InputError
-            If one cannot be read.
+            If a picture cannot be read.
         """
         from labapp.core.calibration.board_calibration import calibrate_board
         from labapp.media import read_picture
@@ -302,7 +302,7 @@ class Session(SessionContents):
         image: GreyImage,
         name: str = "picture",
     ) -> None:
-        """Apply an imaging plane found in a picture or placed by hand; store both.
+        """Apply an imaging plane found in a picture or marked by hand; store both.
 
         Parameters
         ----------
@@ -318,11 +318,11 @@ class Session(SessionContents):
         Raises
         ------
         ValueError
-            If its three points lie on one line, or its marks do not give its model.
+            If its three points are collinear, or its marks do not determine its model.
         """
         from labapp.session.record import PlanePicture
 
-        _ = found.image_calibration  # which refuses such points
+        _ = found.image_calibration  # raises ValueError
         readings = PlanePicture(unit_mm, found, self._pictures.add(name, image))
         values: dict[Key, Any] = {
             ("plane-calibration", NO_FRAME): readings,
@@ -333,14 +333,14 @@ class Session(SessionContents):
     def use_bench_check(
         self, check: BenchCheck, found: BenchCheckRecord, images: Sequence[GreyImage]
     ) -> None:
-        """Apply the bench that pictures of known mirrors led to; store both, and the pictures.
+        """Apply the result of a bench check; store it with its pictures.
 
         Parameters
         ----------
         check
-            The check, made with the set-up as it was before any earlier one (`unchecked_setup`).
+            The check, made with the set-up before any earlier check (`unchecked_setup`).
         found
-            What is kept of it; its pictures' ``picture_sha256`` are filled in here.
+            Its record; ``picture_sha256`` of the pictures are filled in.
         images
             Its pictures, grey levels, each of shape (rows, columns).
         """
@@ -358,7 +358,7 @@ class Session(SessionContents):
         self._documents.change("bench check", changed)
 
     def set_settings(self, settings: Settings, label: str = "settings") -> None:
-        """Set how frames are measured: the scheme, and the settings of every step.
+        """Set the scheme and the settings of every step of the measurement.
 
         Parameters
         ----------
@@ -370,7 +370,7 @@ class Session(SessionContents):
         Raises
         ------
         InputError
-            If they name what is not there.
+            If a name in them is unknown.
         """
         from labapp.config.settings import check_settings
 
@@ -378,7 +378,7 @@ class Session(SessionContents):
         self._documents.change(label, {("settings", NO_FRAME): settings})
 
     def correct(self, corrections: Mapping[int, ByHand | None], label: str = "correction") -> None:
-        """Set the corrections of frames in one step; None returns a frame to automatic.
+        """Set the corrections of frames in one change; None deletes the correction of a frame.
 
         Parameters
         ----------
@@ -390,16 +390,16 @@ class Session(SessionContents):
         Raises
         ------
         InputError
-            If the session has no such frame, or another kind of pattern.
+            If the session has no such frame, or the correction is for another kind of pattern.
         """
         from labapp.core.lines.correction import LineCorrection
 
         right = "corrections by frame: {5: correction}, or {5: None}"
         require(corrections, Mapping, "correct", "corrections", right)
-        other, own = ("dots", "lines") if self.has_lines else ("lines", "dots")
+        other, valid = ("dots", "lines") if self.has_lines else ("lines", "dots")
         for value in corrections.values():
             if value is not None and isinstance(value, LineCorrection) != self.has_lines:
-                raise InputError(self.path, "correction", other, f"{own}, as the pattern has")
+                raise InputError(self.path, "correction", other, f"{valid}, as the pattern has")
         for frame in corrections:
             self._frames.time_s(frame)
         self._documents.change(
@@ -434,7 +434,7 @@ class Session(SessionContents):
         """Redo the change that was undone last and return it; None if there is none."""
         return self._documents.redo()
 
-    # --- what was filmed --------------------------------------------------------------------
+    # --- recording --------------------------------------------------------------------------
 
     def import_recording(
         self,
@@ -501,7 +501,7 @@ class Session(SessionContents):
         """
         self._frames.relink(path, verify)
 
-    # --- what was measured ------------------------------------------------------------------
+    # --- results ----------------------------------------------------------------------------
 
     def measure(
         self, frames: Iterable[int] | None = None, *, warm: bool = False
@@ -518,8 +518,8 @@ class Session(SessionContents):
         Returns
         -------
         list
-            Frame and measurement of each, in their order, with status and measures only:
-            `result` has dots, rays and surface, too.
+            Frame and measurement of each, in order, with status and measures only: `result` also
+            has dots, rays and surface.
         """
         from labapp.export.frame_result import without_surface
 
@@ -534,21 +534,22 @@ class Session(SessionContents):
         warm: bool = False,
         sinks: Sequence[Sink] = (),
     ) -> Iterator[tuple[int, Measurement]]:
-        """Measure frames and store the results; yields (frame, measurement) once it is stored.
+        """Measure frames, store each result, then yield (frame, measurement).
 
         A frame that could not be read at import is stored with the status ``unreadable``. One that
-        could, and no longer can, is yielded with it, and its earlier result stays.
+        can no longer be read is yielded with this status, but its earlier result is retained.
 
         Parameters
         ----------
         frames
-            Which ones; None: those not measured yet, or measured from what was changed since.
+            Frame numbers; None: the frames that are not measured yet or have a stale result.
         pool
-            Processes to measure in (`run.measurers.measuring_pool`), one if ``warm``; None: here.
+            Pool of processes (`run.measurers.measuring_pool`), of one if ``warm``; None: measure in
+            this process.
         warm
-            Whether to measure each frame from the one before (`WarmChain`).
+            Whether to track each frame from the previous one (`WarmChain`).
         sinks
-            Where else results go once they are kept (`run.runner.run`).
+            Further receivers of the stored results (`run.runner.run`).
 
         Yields
         ------
@@ -558,8 +559,8 @@ class Session(SessionContents):
         Raises
         ------
         InputError
-            If the setup is incomplete, or a result cannot be saved; at the end, if frames are no
-            longer those that were imported.
+            If the set-up is incomplete, or a result cannot be saved; at the end, if frames have
+            changed since the import.
         """
         from labapp.run.measurers import ColdMeasurer, LineFollower, WarmMeasurer
         from labapp.run.runner import run
@@ -573,26 +574,26 @@ class Session(SessionContents):
         self._frames.refuse_missing()
         lost: list[int] = []
 
-        def keep(result: FrameResult) -> None:
+        def store(result: FrameResult) -> None:
             number, measurement = result.frame, result.measurement
             if measurement.status == "unreadable" and self._frames.was_readable(number):
                 lost.append(number)
                 return
-            # What it was measured with, whatever has been corrected meanwhile.
+            # The correction used, which may have been replaced during the measurement.
             used = measurement.correction
-            made_with = None if used is None else fingerprint(used)
-            self._results.put(number, measurement, basis, made_with)
+            self._results.put(
+                number, measurement, basis, None if used is None else fingerprint(used)
+            )
 
         given = (self.frame, basis.setup, basis.settings, self._by_hand)
         rig = basis.setup.line_rig
-        lines = rig is not None  # each frame by itself; nothing judges the set-up
-        by_itself = lines or not warm
-        measurer: Measurer = (ColdMeasurer if by_itself else WarmMeasurer)(*given, pool)
+        lines = rig is not None  # no tracking, and no check of the set-up
+        measurer: Measurer = (WarmMeasurer if warm and not lines else ColdMeasurer)(*given, pool)
         if rig is not None and rig.pattern.count == 1:
             measurer = LineFollower(*given[:3])
         numbers = (int(number) for number in chosen)
         try:
-            for result in run(numbers, measurer, [keep, *sinks]):
+            for result in run(numbers, measurer, [store, *sinks]):
                 yield result.frame, result.measurement
         finally:
             if not lines:
@@ -609,22 +610,22 @@ class Session(SessionContents):
         report: bool = False,
         progress: Progress | None = None,
     ) -> tuple[ExportedFile, ...]:
-        """Write results into a folder: all of them, or nothing and what was there stays.
+        """Export results to a folder atomically: on failure the folder is unchanged.
 
         Parameters
         ----------
         folder
             A new or empty folder, or an earlier export, which is replaced.
         choice
-            What to write; None: the tables and surfaces that `labapp reconstruct` writes.
+            Files to write; None: the tables and surfaces that `labapp reconstruct` writes.
         frames
-            Which of the measured frames; None: all.
+            Measured frames to export; None: all.
         scheme
-            ``fit``, ``ers``, ``irs-opa`` …; None: the one that the settings choose.
+            ``fit``, ``ers``, ``irs-opa`` …; None: the scheme of the settings.
         report
             Whether to add ``report.pdf``.
         progress
-            Called with steps done and in all: files, report, film, frame by frame; may raise.
+            Called with the number of steps done and the total; may raise to stop.
 
         Returns
         -------
@@ -634,7 +635,7 @@ class Session(SessionContents):
         Raises
         ------
         InputError
-            If a result no longer stands, nothing was measured, or the folder cannot be written.
+            If a result is stale, nothing was measured, or the folder cannot be written.
         """
         from labapp.export.folder import ExportChoice
         from labapp.session.outgoing import export_session
@@ -644,7 +645,7 @@ class Session(SessionContents):
         return export_session(self, folder, what, frames, chosen, report, progress)
 
     def _updated_setup(self, values: Mapping[str, Mapping[str, object]]) -> str:
-        """Text of the setup with keys set or deleted; see `update_setup`."""
+        """Return the text of the set-up with keys set or deleted; see `update_setup`."""
         from tomlkit.exceptions import ConvertError
 
         from labapp.config.setup import updated_setup

@@ -1,4 +1,4 @@
-"""What the results of a session say of their set-ups, kept with the inputs of these results."""
+"""Verdicts on the set-ups of a session by its results, stored with the results' inputs."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class SetupVerdicts:
         self._database = database
 
     def put(self, inputs: tuple[str, bytes, bytes], verdict: SetupVerdict) -> None:
-        """Store the verdict of results from these inputs: version, packed setup and settings.
+        """Store the verdict for some inputs: version, packed set-up and settings.
 
         Raises
         ------
@@ -40,9 +40,9 @@ class SetupVerdicts:
             )
 
     def of(self, setup: bytes) -> SetupVerdict | None:
-        """Verdict on a packed setup; None where nothing was measured with it.
+        """Return the verdict on a packed set-up; None if nothing was measured with it.
 
-        Of several, by other settings, one that doubts it.
+        Of several verdicts, with different settings, a doubtful one is preferred.
 
         Raises
         ------
@@ -60,12 +60,12 @@ class SetupVerdicts:
         return max(reversed(found), key=lambda one: one.is_doubtful, default=None)
 
     def doubt_of(self, setup: bytes) -> str:
-        """Why a packed setup is doubtful; empty if it is not."""
+        """Return why a packed set-up is doubtful; empty if it is not."""
         verdict = self.of(setup)
         return verdict.reason if verdict is not None and verdict.is_doubtful else ""
 
     def problems(self) -> list[str]:
-        """Sentences on damaged verdicts; empty if there are none."""
+        """Return sentences about damaged verdicts; empty if there are none."""
         found = []
         for number, verdict in self._database.rows(
             "SELECT id, verdict FROM inputs WHERE verdict IS NOT NULL"
@@ -78,7 +78,7 @@ class SetupVerdicts:
 
 
 def chosen_evenly(frames: Sequence[int]) -> list[int]:
-    """Choose as many frames as a verdict needs, evenly."""
+    """Choose evenly spaced frames, as many as a verdict needs."""
     places = np.linspace(0, len(frames) - 1, min(len(frames), MOST)).round().astype(int)
     return [frames[place] for place in places.tolist()]
 

@@ -1,4 +1,4 @@
-"""Current, voltage and wire feed of a weld, from a file of a logger: CSV, TDMS or WAV."""
+"""Current, voltage and wire feed of a weld, read from a logger's file: CSV, TDMS or WAV."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ if TYPE_CHECKING:
     from labapp.media import Frame
 
 A_TABLE = (
-    "a table (CSV, UTF-8) with a line of names: a time (s, ms, µs), and a current, a voltage or a "
+    "a table (CSV, UTF-8) with a header line: a time (s, ms, µs), and a current, a voltage or a "
     "wire feed"
 )
 A_TDMS = "TDMS with channels for current, voltage or wire feed, and a time or an increment"
-A_WAV = "WAV (PCM of 8, 16 or 32 bits, or floats): current, voltage, wire feed, a channel each"
+A_WAV = "WAV (PCM of 8, 16 or 32 bits, or floats): current, voltage, wire feed, one channel each"
 
 LARGEST_FILE = 1 << 28
 MOST_ROWS = 500_000
 LINES_ABOVE = 60
-"""Largest number of lines before the names, in which loggers describe themselves."""
+"""Most lines up to the header line; loggers write information above it."""
 
 NAMES = {
     "time": "time|zeit|t|seconds",
@@ -54,7 +54,7 @@ UNITS = {
     "voltage": {"v": 1.0, "mv": 1e-3, "kv": 1e3},
     "wire": {"m/min": 1.0, "mm/s": 0.06, "cm/s": 0.6, "m/s": 60.0, "in/min": 0.0254, "ipm": 0.0254},
 }
-"""Units of each column, and what one of them is in s, A, V, m/min. Without a unit it is these."""
+"""Units of each quantity in s, A, V, m/min, which are also the defaults."""
 
 CHANNELS = ("current", "voltage", "wire")
 
@@ -64,16 +64,16 @@ class Signals(ReadOnlyArrays):
     """Current, voltage and wire feed of a weld; n samples."""
 
     file: str
-    """Name of the file they were read from."""
+    """Name of the source file."""
     time_s: FloatArray
     """Time of each sample by the logger's clock, ascending, shape (n,), s."""
     current_a: FloatArray
     voltage_v: FloatArray
-    """Shape (n,), A and V; NaN where there is none."""
+    """Samples, shape (n,), A and V; NaN if missing."""
     start_s: float = 0.0
-    """Added to the logger's time it gives the recording's, s."""
+    """Time of the logger's zero in the recording, s."""
     wire_m_min: FloatArray = field(default_factory=lambda: np.empty(0))
-    """Shape (n,), m/min; NaN where there is none, as in files of versions without it."""
+    """Wire feed, shape (n,), m/min; NaN if missing, as in older files."""
 
     def __post_init__(self) -> None:
         if not len(self.wire_m_min):
@@ -82,24 +82,24 @@ class Signals(ReadOnlyArrays):
 
     @property
     def channels(self) -> dict[str, FloatArray]:
-        """Those of `CHANNELS` that have samples: name → values, shape (n,)."""
+        """The channels that have samples: name → values, shape (n,)."""
         every = zip(CHANNELS, (self.current_a, self.voltage_v, self.wire_m_min), strict=True)
         return {name: value for name, value in every if np.isfinite(value).any()}
 
     def timed(self) -> dict[str, tuple[FloatArray, FloatArray]]:
-        """The same with their times on the recording's clock, s."""
+        """Return the channels with their times in the recording, s."""
         return {name: (self.time_s + self.start_s, of) for name, of in self.channels.items()}
 
 
 def align_signals(signals: Signals, frames: Iterable[Frame]) -> tuple[Signals, Offset]:
-    """Signals whose start was found by correlation with the mean brightness of frames.
+    """Estimate the signals' start by correlation with the mean brightness of frames.
 
-    The channel is taken that correlates best: current, as a rule.
+    The channel with the largest correlation is used, usually the current.
 
     Raises
     ------
     InputError
-        If none correlates, or frames have no time.
+        If no channel correlates, or frames have no time.
     """
     from labapp.core.dynamics.alignment import find_offset
 
@@ -114,7 +114,7 @@ def align_signals(signals: Signals, frames: Iterable[Frame]) -> tuple[Signals, O
         if (offset := find_offset(signals.time_s, of, np.array(times), light)) is not None
     ]
     if not found:
-        right = "signals that the frames' brightness follows; or enter when they start"
+        right = "signals that correlate with the frames' brightness; or enter their start"
         raise InputError(signals.file, "start", "not found: light and signals differ", right)
     best = max(found, key=lambda one: abs(one.correlation))
     return replace(signals, start_s=best.start_s), best
@@ -122,7 +122,7 @@ def align_signals(signals: Signals, frames: Iterable[Frame]) -> tuple[Signals, O
 
 @dataclass(frozen=True)
 class _Column:
-    """Where a quantity stands in a line, and what one of its units is."""
+    """Column of a quantity: header, index, and factor of its unit."""
 
     quantity: str
     name: str
@@ -135,25 +135,25 @@ def read_signals(
 ) -> Signals:
     """Read current, voltage and wire feed from CSV, TDMS (``.tdms``) or WAV (``.wav``).
 
-    A CSV's line of names may have others above it. A name is that of the quantity, with its unit in
-    brackets or behind an underscore: ``time_s``, ``Current (A)``, ``U [V]``, ``WFS [m/min]``. The
-    separator is a comma, a semicolon or a tab; the decimals' a point, or, with the latter two, a
-    comma. An empty cell is a sample that is not there. Columns of other names are passed over.
-    Channels of TDMS are named alike, or have their unit as the property ``unit_string``. Of TDMS
-    and WAV more than `MOST_ROWS` samples are averaged to fewer.
+    The header line of a CSV file may follow other lines. A header is the name of the quantity, with
+    its unit in brackets or after an underscore: ``time_s``, ``Current (A)``, ``U [V]``,
+    ``WFS [m/min]``. The separator is a comma, a semicolon or a tab; the decimal sign a point or,
+    with the latter two, a comma. An empty cell is a missing sample. Other columns are ignored.
+    TDMS channels are named likewise, or have their unit in the property ``unit_string``. More than
+    `MOST_ROWS` samples of TDMS and WAV are averaged in blocks.
 
     Parameters
     ----------
     path
         The file.
     full_scale
-        Of WAV: what full scale of its first, second and third channel is, A, V and m/min.
+        For WAV: full scale of the first, second and third channel, A, V and m/min.
 
     Raises
     ------
     InputError
-        If the file cannot be read, or anything in it is missing or impossible; of a table, the
-        first ten problems are reported together, each with its line and column.
+        If the file cannot be read, or anything in it is missing or invalid; the first ten problems
+        of a table are reported together, each with its line and column.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -167,19 +167,19 @@ def read_signals(
 
 @contextmanager
 def _hostile(path: Path, wanted: str) -> Iterator[None]:
-    """Errors of a binary file, whatever they are, as `InputError`; its size is checked first."""
+    """Check the size of an untrusted binary file, and convert all errors to `InputError`."""
     try:
         size = path.stat().st_size
         if size > LARGEST_FILE:
             raise InputError(path, "size", f"{size} bytes", f"at most {LARGEST_FILE} bytes")
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # chunks that nobody needs
+            warnings.simplefilter("ignore")  # unknown chunks
             yield
     except InputError:
         raise
     except OSError as error:
         raise InputError(path, "file", error.strerror or error, wanted) from error
-    except Exception as error:  # a reader that a stranger's bytes lead anywhere
+    except Exception as error:  # malformed bytes can raise anything in the reader
         raise InputError(path, "content", str(error) or type(error).__name__, wanted) from error
 
 
@@ -217,7 +217,7 @@ def _read_wav(path: Path, full_scale: Sequence[float]) -> Signals:
     data = data.reshape(len(data), -1)[:, : len(CHANNELS)]
     if data.dtype.kind == "f":
         offset, scale = 0.0, 1.0
-    else:  # WAV has bytes without a sign
+    else:  # 8-bit WAV is unsigned
         scale = 2.0 ** (8 * data.itemsize - 1)
         offset = scale if data.dtype.kind == "u" else 0.0
     found = {
@@ -230,7 +230,7 @@ def _read_wav(path: Path, full_scale: Sequence[float]) -> Signals:
 def _signals(
     path: Path, time_s: FloatArray | None, found: dict[str, FloatArray], wanted: str
 ) -> Signals:
-    """Signals of equally many samples, averaged to `MOST_ROWS` at most."""
+    """Return signals, averaged in blocks to at most `MOST_ROWS` samples."""
     if time_s is None or not found:
         raise InputError(path, "channels", ", ".join(found) or "none of these", wanted)
     count = len(time_s)
@@ -292,7 +292,7 @@ def _read(path: Path, file: TextIO) -> Signals:
 
 
 def _find_names(path: Path, lines: Iterator[str]) -> tuple[int, str, list[_Column], int]:
-    """Lines up to the names and with them, the separator, the columns, cells in a line."""
+    """Return the number of the header line, the separator, the columns, and the cells per line."""
     found = ""
     for above, text in enumerate(itertools.islice(lines, LINES_ABOVE), 1):
         separator = max(",;\t", key=text.count)
@@ -310,7 +310,7 @@ def _find_names(path: Path, lines: Iterator[str]) -> tuple[int, str, list[_Colum
 
 
 def _named(cell: str, place: int) -> list[_Column]:
-    """The column of that name; none if it is of no use here."""
+    """Return the column with that header; empty if it is not one of a known quantity."""
     name = cell.strip()
     parts = re.fullmatch(r"(.*?)[\s_]*(?:[\[(]\s*(\S+?)\s*[\])])?", name)
     word, unit = (parts[1], parts[2]) if parts else (name, None)
@@ -333,7 +333,7 @@ def _take(
     held: dict[str, array[float]],
     problems: list[InputError],
 ) -> float | None:
-    """Add a line's values to what is held; its time, None where it has none."""
+    """Append a line's values to ``held``; returns its time, None if invalid."""
     time_s = None
     for column in columns:
         cell = cells[column.place].strip()

@@ -1,4 +1,4 @@
-"""How the pool changes over a recording: series of its measures, their spread, their spectrum."""
+"""Trends of the pool's measures over a recording: series, statistics, spectrum."""
 
 from __future__ import annotations
 
@@ -14,32 +14,33 @@ from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 from labapp.session.measured import Overview
 
 NEIGHBOURS = 15
-"""Number of frames around a frame with whose median it is compared …"""
+"""Number of frames in the running median with which a frame is compared."""
 
 FEWEST = 8
-"""… and with none where there are fewer in all."""
+"""Fewest frames for this comparison, and for a spectrum."""
 
 FAR_SIGMA, FAR_PART = 6.0, 0.05
-"""It is in doubt if a size is farther from that than both, in robust σ and as a part of it …"""
+"""A frame is doubtful if a size deviates from the median by more than both, in robust σ and as a
+fraction of the median."""
 
 FAR_ARE = 3.0
-"""… or its ARE is so many times the usual one: a wrong column makes it 5 times, a wrong
-orientation 10 times as large."""
+"""A frame is also doubtful if its ARE exceeds the median by this factor: a wrong column increases
+it by a factor of 5, a wrong orientation by 10."""
 
 EVEN = 0.05
-"""Steps in time that differ by a smaller part are equal."""
+"""Largest relative difference of equal time steps."""
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """A measure whose course can be shown."""
+    """A measure that can be shown as a trend."""
 
     key: str
-    """Its name in `Measures`."""
+    """Name in `Measures`."""
     label: str
     unit: str
     sigma: str = ""
-    """Name of its σ in `Measures`; empty where there is none."""
+    """Name of its σ in `Measures`; empty if there is none."""
 
 
 QUANTITIES = (
@@ -63,28 +64,28 @@ BY_KEY = {quantity.key: quantity for quantity in QUANTITIES}
 
 @dataclass(frozen=True)
 class Trend(ReadOnlyArrays):
-    """One measure over the frames that have it; n frames."""
+    """A measure over the n frames that have it."""
 
     quantity: Quantity
     frame: IntArray
     """Numbers of the frames, ascending, shape (n,)."""
     at: FloatArray
-    """Their times, s, or where any is unknown, again their numbers, shape (n,)."""
+    """Times, s, or if any is unknown, frame numbers, shape (n,)."""
     timed: bool
     """Whether ``at`` is in s."""
     place: IntArray
-    """Their places among the session's frames, ascending, shape (n,)."""
+    """Indices among the session's frames, ascending, shape (n,)."""
     value: FloatArray
     sigma: FloatArray
-    """Shape (n,), in the quantity's unit; σ is NaN where there is none."""
+    """Values and their σ, shape (n,), in the quantity's unit; σ is NaN if unknown."""
     doubtful: BoolArray
     stale: BoolArray
     corrected: BoolArray
-    """Which stand out (`doubtful_frames`), no longer stand, were corrected by hand, shape (n,)."""
+    """Which are doubtful (`doubtful_frames`), stale, corrected manually, shape (n,)."""
     counts: BoolArray
-    """Which go into the statistics and the spectrum, shape (n,)."""
+    """Which are included in the statistics and the spectrum, shape (n,)."""
     measures: Mapping[str, FloatArray]
-    """All measures of these frames by their names, each of shape (n,)."""
+    """All measures of these frames by name, each of shape (n,)."""
 
 
 @dataclass(frozen=True)
@@ -96,36 +97,34 @@ class Spread:
     deviation: float
     lowest: float
     highest: float
-    """In the measure's unit; the deviation is the root of the mean square, divided by n as in the
-    text. NaN without a frame.
+    """Statistics in the measure's unit; the standard deviation has the divisor n, as in the text.
+    NaN without a frame.
     """
     mean_sigma: float = math.nan
-    """Standard uncertainty of the mean (`sigma_of_mean`); NaN where the measure has none."""
+    """Standard uncertainty of the mean (`sigma_of_mean`); NaN if the measure has none."""
     mean_setup_sigma: float = 0.0
-    """The set-up's part of that (`setup_sigma_of_mean`)."""
+    """Part of it from the set-up (`setup_sigma_of_mean`)."""
 
 
 @dataclass(frozen=True)
 class Spectrum(ReadOnlyArrays):
-    """Amplitudes of a measure's oscillation."""
+    """Amplitude spectrum of a measure."""
 
     frequency: FloatArray
-    """From the lowest that the series resolves to half the rate, shape (k,), Hz, or 1/frame where
-    times are not known.
+    """Frequencies from the lowest resolved one to half the frame rate, shape (k,), Hz, or 1/frame
+    if times are unknown.
     """
     amplitude: FloatArray
-    """Of a sine of that frequency, shape (k,), in the measure's unit."""
+    """Amplitude of a sine of that frequency, shape (k,), in the measure's unit."""
     timed: bool
     """Whether frequencies are in Hz."""
     first: int
     last: int
-    """The frames it was computed from: all between them that the session uses."""
+    """First and last frame of the series."""
     count: int
-    """How many they are."""
+    """Number of frames of the series."""
     resolution: float
-    """Sines nearer to each other than this cannot be resolved: two steps of the frequency, the half
-    width of the Hann window's main lobe.
-    """
+    """Frequency resolution: two frequency steps, half the width of the Hann window's main lobe."""
 
     @property
     def peak(self) -> tuple[float, float]:
@@ -137,16 +136,16 @@ class Spectrum(ReadOnlyArrays):
 def trend(
     seen: Overview, key: str, without_doubtful: bool = False, doubtful: BoolArray | None = None
 ) -> Trend:
-    """The course of a measure.
+    """Return the trend of a measure.
 
     Parameters
     ----------
     key
         Name of the measure, one of `BY_KEY`.
     without_doubtful
-        Whether frames in doubt are left out of the statistics. What no longer stands always is.
+        Whether doubtful frames are excluded from the statistics. Stale results always are.
     doubtful
-        What `doubtful_frames` gives, if it is at hand.
+        Result of `doubtful_frames`, if already known.
     """
     quantity = BY_KEY[key]
     value = seen.measures[key]
@@ -172,10 +171,10 @@ def trend(
 
 
 def doubtful_frames(seen: Overview) -> BoolArray:
-    """Which frames have a surface that stands out from those around it, shape (n,).
+    """Return which frames have a surface that deviates from the neighbouring ones, shape (n,).
 
-    Width, length or height far from the median of the neighbours, or an ARE far above the usual
-    one. It says "look at this frame", not that it is wrong.
+    These have a width, length or height far from the median of the neighbours, or an ARE far above
+    the median. They should be inspected, but need not be wrong.
     """
     doubtful = np.zeros(len(seen.frame), bool)
     has = np.isfinite(seen.measures["height_mm"]) & ~seen.stale
@@ -185,7 +184,7 @@ def doubtful_frames(seen: Overview) -> BoolArray:
     out = are > FAR_ARE * np.nanmedian(are) if np.isfinite(are).any() else np.zeros(len(are), bool)
     for key in ("width_mm", "length_mm", "height_mm"):
         size = seen.measures[key][has]
-        # Mirrored, an odd one at the end does not meet itself again.
+        # With "mirror" an outlier at the end is not repeated in the window.
         usual = scipy.ndimage.median_filter(size, min(NEIGHBOURS, len(size)), mode="mirror")
         off = np.abs(size - usual)
         out |= off > np.maximum(
@@ -196,7 +195,7 @@ def doubtful_frames(seen: Overview) -> BoolArray:
 
 
 def spread(course: Trend) -> Spread:
-    """Mean, its ±, standard deviation and range of the frames that count (Eq. 7-2 … 7-4)."""
+    """Return mean, ±, standard deviation and range of the included frames (Eq. 7-2 … 7-4)."""
     value = course.value[course.counts]
     if not len(value):
         return Spread(0, *(4 * (float("nan"),)))
@@ -213,14 +212,14 @@ def spread(course: Trend) -> Spread:
 
 
 def spectrum(course: Trend) -> Spectrum:
-    """Spectrum of the longest part whose frames all count and follow each other evenly.
+    """Return the spectrum of the longest run of consecutive, evenly spaced, included frames.
 
-    The straight line through it is taken off; the window is Hann's.
+    The linear trend is removed; the window is a Hann window.
 
     Raises
     ------
     ValueError
-        If that part is too short.
+        If the run is too short.
     """
     members = _even_part(course)
     count = len(members)
@@ -229,7 +228,7 @@ def spectrum(course: Trend) -> Spectrum:
             f"a spectrum needs {FEWEST} frames in a row, evenly spaced in time; "
             f"there are {count} at most",
         )
-    from scipy.signal import detrend  # a second, of which the app's start has no use
+    from scipy.signal import detrend  # a slow import, not needed at the app's start
     from scipy.signal.windows import hann
 
     window = hann(count, sym=False)
@@ -249,7 +248,7 @@ def spectrum(course: Trend) -> Spectrum:
 
 
 def _even_part(course: Trend) -> IntArray:
-    """Indices of the longest run of frames that count, none missing, steps equal."""
+    """Return the indices of the longest run of included, consecutive, evenly spaced frames."""
     kept = np.flatnonzero(course.counts)
     if len(kept) < 2:
         return kept.astype(np.int64)

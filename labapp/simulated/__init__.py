@@ -1,1 +1,1 @@
-"""Recordings, sessions and cameras made by simulation, and what is measured of them."""
+"""Simulated recordings, sessions and cameras, and measurements of them."""

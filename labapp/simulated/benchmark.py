@@ -33,7 +33,7 @@ from labapp.simulation.parallel import Progress
 RATE_HZ, WAVE_HZ = 200.0, 37.3
 COLD = 3  # frames measured without a prior
 
-SCENARIO = f"""# A pool that swings, before a fast camera.
+SCENARIO = f"""# An oscillating pool in front of a fast camera.
 
 [pool]
 shape = "egg"
@@ -62,7 +62,7 @@ seed = 6001
 """
 
 TRUE_PX = 3.0
-"""A found dot within this distance is a true one."""
+"""Maximum distance between a detected dot and the true dot that it matches."""
 
 STEPS = ("dots", "match", "measures")
 
@@ -72,12 +72,12 @@ class Video:
     """A simulated video and its ground truth."""
 
     path: Path
-    """Raw 8-bit grey frames in an AVI: decoding costs next to nothing, as with a camera."""
+    """Raw 8-bit grey frames in an AVI: as with a camera, decoding takes almost no time."""
     setup: Setup
     height_mm: FloatArray
     """True height of the pool in each frame, shape (frames,), mm."""
     dots: list[tuple[FloatArray, IntArray]]
-    """True dots of each frame that show: place, shape (n, 2), px, and ray (i, j), shape (n, 2)."""
+    """Visible true dots of each frame: position, shape (n, 2), px; ray (i, j), shape (n, 2)."""
 
 
 def make_video(
@@ -86,7 +86,7 @@ def make_video(
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> Video:
-    """Simulate the video into a folder, or reuse the one that is there.
+    """Simulate the video into a folder, or reuse the existing one.
 
     Raises
     ------
@@ -158,15 +158,15 @@ class Latency:
 
     frame: Spread
     steps: dict[str, Spread]
-    """Wall time of a followed frame, and of its steps."""
+    """Wall time of a frame measured with a prior, and of its steps."""
     processor: Spread
-    """Processor time of a followed frame, which other programs hardly change."""
+    """Processor time of a frame with a prior, which other programs hardly affect."""
     cold_s: float
     """Processor time of a frame measured without a prior, s."""
 
 
 def time_frames(video: Video, frames: int) -> Latency:
-    """Time the first ``frames`` frames, each followed from the one before, and `COLD` without."""
+    """Time the first ``frames`` frames with the previous frame as prior, and `COLD` without."""
     cv2.setNumThreads(1)
     steps: dict[str, list[float]] = {name: [] for name in STEPS}
     last = [0.0]
@@ -188,7 +188,7 @@ def time_frames(video: Video, frames: int) -> Latency:
             start, last[0] = time.process_time(), time.perf_counter()
             begun = last[0]
             chain.measure(image)
-            if number:  # the first is cold
+            if number:  # the first has no prior
                 wall.append(time.perf_counter() - begun)
                 used.append(time.process_time() - start)
         begun = time.process_time()
@@ -202,7 +202,7 @@ def time_frames(video: Video, frames: int) -> Latency:
 
 @dataclass(frozen=True)
 class Run:
-    """Throughput and accuracy over the whole video, from its file to the CSV tables."""
+    """Throughput and accuracy for the whole video, from its file to the CSV tables."""
 
     frames: int
     seconds: float
@@ -215,9 +215,9 @@ class Run:
     """Frames with a surface; frames measured without a prior."""
     wrong: int
     labelled: float
-    """Dots with a wrong ray; share of the visible dots with the right one."""
+    """Dots with a wrong ray; share of the visible dots with the correct ray."""
     normalized_error: float
-    """Root mean square of the height's error over its σ by noise and level."""
+    """Root mean square of the height's error divided by its σ from noise and level."""
     frequency_hz: float
     true_hz: float = WAVE_HZ
     """Frequency of the height's largest oscillation, measured and true."""
@@ -252,7 +252,7 @@ def run_video(
     for row in _rows(out / "measures.csv"):
         if row["status"] == "ok":
             frame = int(row["frame"])
-            # Its set-up is exactly that of the simulated bench.
+            # The set-up is exactly that of the simulated bench.
             noise, level = (float(row[sigma_name("height_mm", p)]) for p in ("noise", "level"))
             heights[frame], sigma[frame] = float(row["height_mm"]), np.hypot(noise, level)
     normalized_error = (heights - video.height_mm) / sigma

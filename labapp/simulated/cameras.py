@@ -1,4 +1,4 @@
-"""Opening cameras by id, simulated ones included, and recording from one."""
+"""Opening of cameras by id, including simulated ones, and recording from one."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ from labapp.simulation.parallel import Progress
 SIMULATED = "simulated:"
 
 FRAMES = 48
-"""Frames rendered of a scenario, played there and back."""
+"""Number of frames rendered of a scenario, which are played forwards and backwards."""
 
 MOST_BYTE = 400_000_000
-"""Frames of a recording that a simulated camera holds; it plays the first of a longer one."""
+"""Limits of the frames of a recording that a simulated camera loads; it plays the first ones."""
 
 USUAL_HZ = 60.0
 
@@ -44,15 +44,15 @@ def camera_opener(
     progress: Progress | None = None,
     faults: Faults | None = None,
 ) -> Callable[[], Camera]:
-    """Function that opens a camera, as often as it is called; for `Feed`.
+    """Function that opens a camera at each call; for `Feed`.
 
     Parameters
     ----------
     id
-        As `find_cameras` has it; or "simulated:FILE", a scenario or any recording that is played
-        as if a camera filmed it, there and back without end.
+        Id from `find_cameras`; or "simulated:FILE", a scenario or any recording that is played like
+        the pictures of a camera, forwards and backwards endlessly.
     progress
-        Called for each frame of a scenario that is rendered.
+        Called for each rendered frame of a scenario.
 
     Raises
     ------
@@ -69,7 +69,7 @@ def simulated_device(
     progress: Progress | None = None,
     faults: Faults | None = None,
 ) -> SimulatedDevice:
-    """Make a camera that plays a file; see `camera_opener`."""
+    """Create a camera that plays a file; see `camera_opener`."""
     if path.suffix == ".toml":
         images, depth, rate_hz = _rendered(path, progress)
     else:
@@ -95,7 +95,7 @@ def _recorded(path: Path) -> tuple[list[GreyImage], int, float | None]:
         images: list[GreyImage] = []
         for frame in source:
             if frame.image.dtype not in (np.uint8, np.uint16):
-                expected = "a recording of 8 or 16 bit, as cameras give"
+                expected = "a recording with 8 or 16 bits, like that of a camera"
                 raise InputError(path, "grey levels", frame.image.dtype, expected)
             images.append(frame.image)
             if len(images) * frame.image.nbytes > MOST_BYTE:
@@ -112,7 +112,7 @@ def record(
     wait: Callable[[Feed, Take], None],
     on_event: OnEvent = ignore_event,
 ) -> Take:
-    """Record from a camera, at once.
+    """Record from a camera immediately.
 
     Parameters
     ----------
@@ -121,16 +121,17 @@ def record(
     new_path
         Returns the path of the recording.
     plan, settings
-        What is recorded, and the camera's settings.
+        Plan of the recording, and the camera's settings.
     wait
-        Returns when enough is recorded; the recording is complete also if it raises.
+        Function that returns at the end of the recording; the recording is also completed if it
+        raises.
     on_event
-        Called with every event; the notes have it, too.
+        Called with every event; the notes contain it, too.
 
     Raises
     ------
     InputError, CameraError
-        If the camera cannot be opened or set, or the file is there already.
+        If the camera cannot be opened or set, or the file exists.
     """
     recorders: list[Recorder] = []
 

@@ -1,4 +1,4 @@
-"""The sample run as a session of the user's own: what `labapp demo` measures and shows."""
+"""The sample run as a session of the user, which `labapp demo` measures and shows."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from labapp.session.session import Session
 
 
 def open_demo(folder: Path) -> Session:
-    """Open the session of the sample run in a folder; it is made there if it is not yet.
+    """Open the session of the sample run in a folder; it is created if missing.
 
-    Measuring is left to the caller.
+    The caller measures it.
 
     Raises
     ------
@@ -31,7 +31,7 @@ def open_demo(folder: Path) -> Session:
 
 
 def draw_surface(reconstruction: Reconstruction, path: Path) -> str:
-    """Draw a surface in 3-D; returns why it could not be, or nothing."""
+    """Draw a surface in 3-D; returns the reason if that is not possible, else ""."""
     try:
         write_surface_picture(path, reconstruction)
     except ImportError as error:

@@ -1,6 +1,6 @@
-"""Simulate a recording: a folder with it, its set-up, its calibration picture and its truth.
+"""Simulation of a recording: a folder with recording, set-up, calibration picture and ground truth.
 
-And a session of what was simulated.
+The recording can also be made into a session.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from labapp.session.session import Session
 from labapp.simulation.parallel import Progress
 
 SCENARIO = "scenario.toml"
-"""The scenario itself, kept beside what was made of it; by it a former simulation is known."""
+"""Name of the scenario in the folder; it identifies the folder of an earlier simulation."""
 
 FILES = {SCENARIO, "setup.toml", "calibration.png", "truth.csv", "dots_truth.csv"}
 
@@ -33,21 +33,21 @@ def simulate(
     workers: int | None = None,
     progress: Progress | None = None,
 ) -> None:
-    """Render a scenario's recording into a folder, which is complete or absent.
+    """Render a scenario's recording into a folder, which is then complete or absent.
 
-    A former simulation in it is replaced.
+    An earlier simulation in the folder is replaced.
 
     Parameters
     ----------
     workers
-        How many processes render; None: one a core. The result is the same.
+        Number of processes that render. None: one per core. The result is the same.
     progress
-        Called for each frame, and while one is waited for; what it raises leaves nothing.
+        Called for each frame and while waiting for one; if it raises, no file is left.
 
     Raises
     ------
     InputError
-        If the folder holds anything else, or cannot be written.
+        If the folder contains anything else or cannot be written.
     """
     out = Path(out).absolute()
     _check_replaceable(out)
@@ -67,12 +67,12 @@ def simulate(
 
 
 def _check_replaceable(out: Path) -> None:
-    """Refuse to replace a folder that holds anything but a former simulation."""
+    """Refuse to replace a folder that contains anything but an earlier simulation."""
     if not out.exists():
         return
     if not out.is_dir():
         raise InputError(out, "--out", "is a file", OWN_FOLDER)
-    # The lock of a session that is no longer there is nobody's.
+    # The lock of a session that no longer exists can be removed.
     names = {path.name for path in out.iterdir() if path.suffix != ".lock"}
     foreign = sorted(names - FILES - set(RECORDINGS.values()))
     if names and (foreign or SCENARIO not in names):
@@ -86,18 +86,18 @@ def begin_session(
     path: Path,
     progress: Callable[[int, int], None] | None = None,
 ) -> None:
-    """Make a session of a simulation: its set-up, its recording; nothing measured yet.
+    """Create a session of a simulation with its set-up and recording, without measurements.
 
     Parameters
     ----------
     progress
-        Called with how much of the recording is imported; what it raises leaves no session.
+        Called with the imported share of the recording; if it raises, no session is left.
 
     Raises
     ------
     InputError
-        If the folder lacks the recording, or the session is there already or cannot be written; no
-        session is left then.
+        If the folder lacks the recording, or the session exists or cannot be written. No session is
+        left then.
     """
     made, size = scenario.recording, scenario.recording.pools[0].size
     height_mm = size.height_mm if size.height_mm >= -size.depth_mm else size.depth_mm
@@ -106,7 +106,7 @@ def begin_session(
         expected_width_mm=round(size.width_mm, 2),
         expected_length_mm=round(size.length_mm, 2),
         expected_height_mm=round(height_mm, 3),
-        notes=f"Simulated, seed {made.seed}; the truth is in {folder.name}.",
+        notes=f"Simulated, seed {made.seed}; the ground truth is in {folder.name}.",
     )
     rate_hz = None if made.file.endswith(".avi") else made.frame_rate_hz
     with contextlib.ExitStack() as on_failure:

@@ -1,4 +1,4 @@
-"""What the simulated camera sees: a pool that swings, on the session's bench."""
+"""The scene of the simulated camera: an oscillating pool on the session's bench."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from labapp.media.cameras import SimulatedDevice, there_and_back
 from labapp.session.session import Session
 
 POOL = """\
-# A pool that swings
+# An oscillating pool
 
 [pool]
 shape = "egg"
@@ -68,11 +68,11 @@ x_axis_mm = 34.925
 z_axis_px = [44.0, 499.99]
 z_axis_mm = 15.875
 """
-"""Where the session's set-up is not complete, or its camera cannot be simulated."""
+"""Bench if the session's set-up is incomplete or its camera cannot be simulated."""
 
 
 def simulated_pool(session: Session) -> str:
-    """A scenario of a pool on the session's bench, as text; on the usual one where it has none."""
+    """Text of a scenario of a pool on the session's bench, or on the default bench without one."""
     try:
         return f"{POOL}\n{session.setup.text}"
     except InputError:
@@ -80,16 +80,16 @@ def simulated_pool(session: Session) -> str:
 
 
 def pool_camera(text: str, progress: Callable[[int, int], None]) -> SimulatedDevice:
-    """Make a camera that films the pool of a scenario without end.
+    """Create a camera that films the pool of a scenario endlessly.
 
-    The pool swings as fast at every rate: of a faster camera some frames are alike.
+    The pool oscillates equally fast at every frame rate: a faster camera repeats some frames.
 
     Parameters
     ----------
     text
-        Of `simulated_pool`; the usual bench stands in for one that cannot be simulated.
+        Text from `simulated_pool`; the default bench replaces one that cannot be simulated.
     progress
-        Called with the numbers of frames rendered and in all; what it raises ends it.
+        Called with the number of frames rendered and in total; an exception ends the rendering.
     """
     with tempfile.TemporaryDirectory(prefix="labapp-") as folder:
         path = Path(folder) / "pool.toml"

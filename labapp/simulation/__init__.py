@@ -1,4 +1,4 @@
-"""Known pools, the forward model and rendered frames: truth, made from the geometry alone.
+"""Known pools, the forward model and rendered frames: ground truth from the geometry alone.
 
-Nothing here calls the code that measures, so that a mistake there cannot hide itself.
+Nothing here calls the measuring code, so that an error in that code cannot stay hidden.
 """

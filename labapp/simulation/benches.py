@@ -1,4 +1,4 @@
-"""Benches that are not quite as their set-up has them, within its uncertainties."""
+"""Benches that deviate from their set-up within its uncertainties."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from labapp.core.geometry.rig import ImagingPlane, Rig
 from labapp.simulation.camera import CameraView, Lens
 
 FOCAL_PX = 2000.0
-"""Of a camera that stands well off."""
+"""Focal length of a distant camera, px."""
 
 
 @dataclass(frozen=True)
 class BenchErrors:
-    """How far a bench may be from its set-up.
+    """Size of the deviations of a bench from its set-up.
 
     Parameters
     ----------
@@ -25,8 +25,8 @@ class BenchErrors:
     distortion
         Largest radial distortion in the plane's corner, either way, as a fraction.
     axis_mm, glass_mm, glass_index
-        Standard deviation of where the image calibration's points lie on the axes, and of thickness
-        and index of the glass on the plane.
+        Standard deviation of the positions of the image calibration's points on the axes, and of
+        thickness and refractive index of the glass on the plane.
     """
 
     angle_deg: float = 0.5
@@ -42,7 +42,7 @@ class BenchErrors:
 
 @dataclass(frozen=True)
 class SimulatedBench:
-    """The bench as it stands, and how its camera sees the plane."""
+    """The true bench and its camera's true view of the plane."""
 
     rig: Rig
     view: CameraView
@@ -51,14 +51,15 @@ class SimulatedBench:
 def draw_bench(
     rig: Rig, view: CameraView, errors: BenchErrors, rng: np.random.Generator
 ) -> SimulatedBench:
-    """Draw a bench whose set-up, as taken down by the operator, is a rig and a view without lens.
+    """Draw a bench whose recorded set-up is the given rig and a view without lens.
 
     Parameters
     ----------
     rig, view
-        The set-up: the bench is this, but for the errors, and a lens about the picture's middle.
+        The set-up: the true bench differs from it by the errors and by a lens centred on the
+        picture.
     errors
-        How far it may be off.
+        Size of the deviations.
     rng
         Source of the errors.
     """
@@ -74,7 +75,7 @@ def draw_bench(
         aim_y_mm=laser.aim_y_mm + by_length[2],
     )
     pitch, yaw, roll = np.add(plane.angles_deg, by_angle[2:]).tolist()
-    # From a generator of their own: the others' draws do not depend on these.
+    # From a separate generator, so that the other draws do not depend on these.
     by_axis, by_glass = np.split(rng.spawn(1)[0].normal(size=4), 2)
     by_glass = by_glass * [errors.glass_mm, errors.glass_index]
     posed = ImagingPlane.of_angles(

@@ -1,4 +1,4 @@
-"""The camera: where it sees the imaging plane, and how its lens bends what it sees."""
+"""The camera: its view of the imaging plane and the distortion of its lens."""
 
 from __future__ import annotations
 
@@ -17,21 +17,21 @@ BLOCK = 1 << 14
 
 @dataclass(frozen=True)
 class Lens:
-    """Brown and Conrady's distortion, radial and tangential, with OpenCV's signs and order.
+    """Brown-Conrady distortion, radial and tangential, with OpenCV's signs and order.
 
-    With x, y from the middle of the picture over the focal length and r² = x² + y²:
+    With x, y measured from the centre of the picture in focal lengths, and r² = x² + y²:
     ``x′ = x·(1 + k₁r² + k₂r⁴ + k₃r⁶) + 2p₁xy + p₂(r² + 2x²)``, and
     ``y′ = y·(1 + k₁r² + k₂r⁴ + k₃r⁶) + p₁(r² + 2y²) + 2p₂xy``.
     """
 
     focal_px: float
-    """Focal length over the size of a pixel."""
+    """Focal length in pixels."""
     k1: float = 0.0
     k2: float = 0.0
     p1: float = 0.0
     p2: float = 0.0
     k3: float = 0.0
-    """Coefficients; k₁ < 0 makes a barrel."""
+    """Coefficients; k₁ < 0 gives barrel distortion."""
 
     def _radial(self, r2: FloatArray) -> FloatArray:
         return np.asarray(1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3)))
@@ -47,14 +47,14 @@ class Lens:
 
     @property
     def _reach2(self) -> float:
-        """Largest r² up to which a dot farther out is seen farther out."""
+        """Largest r² up to which the distorted radius increases with the true one."""
         turns = np.roots([7 * self.k3, 5 * self.k2, 3 * self.k1, 1.0])
         return min((float(t.real) for t in turns if t.real > 0 and t.imag == 0), default=np.inf)
 
     def distort(self, straight_px: FloatArray) -> FloatArray:
-        """From a picture without distortion, from its middle, shape (…, 2), px.
+        """Distort undistorted points, given from the picture's centre, shape (…, 2), px.
 
-        NaN so far out that the coefficients would fold it back into the picture.
+        NaN for points so far out that the coefficients would fold them back into the picture.
         """
         xy = straight_px / self.focal_px
         x, y = xy[..., 0], xy[..., 1]
@@ -86,11 +86,11 @@ class Lens:
 
 @dataclass(frozen=True)
 class CameraView:
-    """Where the camera sees the imaging plane: O′ and one point on each axis, and the picture.
+    """The camera's view of the imaging plane: O′, one point on each axis, and the picture size.
 
-    The points are those of the set-up file's ``image_calibration``, so that it can be filled in
-    from here. The camera stands far off and square to the plane: the map is affine, but for what
-    its lens does.
+    The points are those of the set-up file's ``image_calibration``, so that the file can be filled
+    in from here. The camera is far away and perpendicular to the plane: apart from the distortion
+    of the lens, the map is affine.
 
     Raises
     ------
@@ -107,14 +107,14 @@ class CameraView:
     width_px: int = 480
     height_px: int = 640
     lens: Lens | None = None
-    """What bends the picture; the three points are those without it. None: nothing."""
+    """Lens that distorts the picture; the three points are undistorted. None: no distortion."""
 
     def __post_init__(self) -> None:
         if self.lens is None:
             return
         corners = np.array([[u, v] for u in (0, self.width_px) for v in (0, self.height_px)], float)
         if not np.allclose(self.to_image(self.to_plane(corners)), corners, rtol=0, atol=1e-3):
-            raise ValueError("a distortion that folds the picture")
+            raise ValueError("the lens distortion folds the picture")
 
     @classmethod
     def rolled(
@@ -125,7 +125,7 @@ class CameraView:
         x_axis_mm: float = 69.85,
         z_axis_mm: float = 31.75,
     ) -> CameraView:
-        """Build the view of a camera that is turned about its axis, counter-clockwise."""
+        """Build the view of a camera that is rotated counter-clockwise about its axis."""
         roll = np.radians(roll_deg)
         x_step = px_per_mm * x_axis_mm * np.array([np.cos(roll), -np.sin(roll)])
         z_step = px_per_mm * z_axis_mm * np.array([-np.sin(roll), -np.cos(roll)])
@@ -170,16 +170,16 @@ class CameraView:
 
 @dataclass(frozen=True)
 class PosedView(ReadOnlyArrays):
-    """A pinhole camera, with a lens, that sees the imaging plane from anywhere."""
+    """A pinhole camera with a lens that views the imaging plane from any position."""
 
     matrix: FloatArray
-    """Shape (3, 3): (X′, Z′, 1) in mm to homogeneous (u, v, 1) in px of the straight picture."""
+    """Shape (3, 3): (X′, Z′, 1), mm, to homogeneous (u, v, 1), px, of the undistorted picture."""
     width_px: int = 480
     height_px: int = 640
     lens: Lens | None = None
-    """What bends the picture. None: nothing."""
+    """Lens that distorts the picture. None: no distortion."""
     axis_px: tuple[float, float] | None = None
-    """(u, v) of the lens's axis. None: the middle of the picture."""
+    """(u, v) of the lens's axis. None: the centre of the picture."""
 
     @classmethod
     def at(
@@ -192,18 +192,18 @@ class PosedView(ReadOnlyArrays):
         lens: Lens | None = None,
         axis_px: tuple[float, float] | None = None,
     ) -> PosedView:
-        """Build the view of a camera that has a place of the plane in the middle of its picture.
+        """Build the view of a camera with a given point of the plane at the centre of its picture.
 
         Parameters
         ----------
         center_mm
-            (X′, Z′) of that place.
+            (X′, Z′) of that point.
         px_per_mm
-            Scale there.
+            Scale at that point.
         focal_px
-            Focal length over the size of a pixel.
+            Focal length in pixels.
         turned_deg
-            By how much the plane is turned about X′, about Z′, and about the camera's axis.
+            Rotation of the plane about X′, about Z′, and about the camera's axis.
         size_px, lens, axis_px
             Width and height of the picture, and the lens.
         """
@@ -225,7 +225,7 @@ class PosedView(ReadOnlyArrays):
         spin = np.array(
             [[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1]]
         )
-        # The camera's x is to the right, its y down: Z′ counts the other way.
+        # The camera's x points right and its y down: Z′ points the other way.
         plane = spin @ turn @ tilt @ np.array([[1.0, 0.0], [0.0, -1.0], [0.0, 0.0]])
         place = np.array([0.0, 0.0, focal_px / px_per_mm]) - plane @ np.array(center_mm)
         middle = (np.array(size_px) - 1) / 2

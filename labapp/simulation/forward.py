@@ -1,7 +1,7 @@
-"""The forward model: which rays come back from a pool, and where they meet the imaging plane.
+"""The forward model: the rays that a pool reflects, and where they meet the imaging plane.
 
-Written from the geometry alone (laser of §4.2.2.2, blocking of §4.2.1), in vectors, for the rays
-of the rig's pattern, with nothing of the code that measures.
+Derived from the geometry alone (laser of §4.2.2.2, blocking of §4.2.1), in vectors, for the rays
+of the rig's pattern, without any of the measuring code.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ SAMPLES = 256
 """Steps along a ray between the highest and the lowest point of the pool."""
 
 SLACK_MM = 0.05
-"""How far above and below the pool the walk along a ray begins and ends."""
+"""Distance above and below the pool at which the search along a ray begins and ends."""
 
 CLEAR_MM = 1e-6
-"""A ray that is no deeper than this under the surface leaves it: rounding, on a flat pool."""
+"""A ray no deeper than this below the surface does not hit it: rounding on a flat pool."""
 
 HALVINGS = 52
-"""Halvings of a step: as far as double precision goes."""
+"""Bisections of a step, down to double precision."""
 
 
 class PoolSurface(Protocol):
-    """What a ray needs to know of a pool: z = f(x, y), NaN outside the boundary."""
+    """A pool surface for ray tracing: z = f(x, y), NaN outside the boundary."""
 
     def height(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
         """Height z at (x, y), arrays of one shape, mm; NaN outside the boundary."""
@@ -44,24 +44,24 @@ class PoolSurface(Protocol):
 
     @property
     def size(self) -> PoolSize:
-        """True size, of which the highest and the lowest point are needed."""
+        """True size; ray tracing needs the highest and the lowest point."""
         ...
 
 
 @dataclass(frozen=True)
 class Reflections(ReadOnlyArrays):
-    """What becomes of every ray of the pattern; ray (i, j) is at ``[i - 1, j - 1]``."""
+    """The path of every ray of the pattern; ray (i, j) is at ``[i - 1, j - 1]``."""
 
     absent: BoolArray
-    """The lens makes no such ray (the centre), shape (rows, columns)."""
+    """The pattern has no such ray (the centre), shape (rows, columns)."""
     hit: BoolArray
     """The ray meets the pool, shape (rows, columns). An absent ray is traced like any other."""
     incident_blocked: BoolArray
     reflected_blocked: BoolArray
-    """The torch is in the way of the incident or of the reflected ray, shape (rows, columns)."""
+    """The torch blocks the incident or the reflected ray, shape (rows, columns)."""
     hits_again: BoolArray
-    """The reflected ray meets the pool a second time, shape (rows, columns). It is not followed any
-    further: what else it does lights no dot where one is looked for.
+    """The reflected ray meets the pool a second time, shape (rows, columns). It is not traced
+    further: it lights no dot where one is searched for.
     """
     on_plane: BoolArray
     """The reflected ray meets the imaging plane within its edges, shape (rows, columns)."""
@@ -69,20 +69,20 @@ class Reflections(ReadOnlyArrays):
     """Reflection point, UCS, shape (rows, columns, 3), mm; NaN without one."""
     incident: FloatArray
     reflected: FloatArray
-    """Unit directions, shape (rows, columns, 3); the reflected one NaN without a hit."""
+    """Unit directions, shape (rows, columns, 3); the reflected direction is NaN without a hit."""
     plane_mm: FloatArray
-    """Where the reflected ray meets the plane, its edges ignored, IPCS (X′, Z′), shape (rows,
-    columns, 2), mm; NaN where it never does.
+    """Point where the reflected ray meets the plane, ignoring its edges, IPCS (X′, Z′), shape
+    (rows, columns, 2), mm; NaN if it does not meet it.
     """
 
     @property
     def lit(self) -> BoolArray:
-        """There is such a ray and it meets the pool; whether its dot shows is `visible`."""
+        """The ray exists and meets the pool; `visible` tells whether its dot shows."""
         return np.asarray(self.hit & ~self.absent)
 
     @property
     def blocked(self) -> BoolArray:
-        """The torch is in the way, before or after the pool."""
+        """The torch blocks the ray before or after the pool."""
         return np.asarray(self.incident_blocked | self.reflected_blocked)
 
     @property
@@ -92,17 +92,18 @@ class Reflections(ReadOnlyArrays):
 
 
 def trace(pool: PoolSurface, rig: Rig, torch: Torch | None = None) -> Reflections:
-    """Follow every ray from the laser by way of the pool to the imaging plane.
+    """Trace every ray from the laser via the pool to the imaging plane.
 
     Outside the pool's boundary is the work piece at z = 0, which scatters: a ray that meets it
-    first is not lit.
+    first is not `lit`.
 
     Parameters
     ----------
     pool, rig
-        What reflects, and what is around it.
+        The reflecting pool and the bench.
     torch
-        What hides rays; None: all that passes above the rig's electrode (`YozTorch`).
+        The torch that blocks rays. None: all rays above the rig's electrode tip are blocked
+        (`YozTorch`).
     """
     source, incident = _rays(rig)
     point, hit = _first_hit(pool, source, incident)
@@ -138,15 +139,15 @@ def exact_match(
     sigma_mm: float = 0.0,
     rng: np.random.Generator | None = None,
 ) -> Match:
-    """Build the Match that a perfect detector would hand to a reconstruction scheme.
+    """Build the Match that a perfect detector would pass to a reconstruction scheme.
 
     Parameters
     ----------
     orientation
-        The correspondence the match carries; None: the one the dots show.
+        The match's correspondence. None: that of the traced dots.
     sigma_mm
-        Standard deviation of normal noise put on every dot along X′ and along Z′, mm. The match's
-        covariance is its square, of at least 1 µm, so that it can be inverted.
+        Standard deviation of the normal noise added to every dot along X′ and along Z′, mm. The
+        match's covariance is its square, with at least 1 µm so that it can be inverted.
     rng
         Source of the noise; needed when ``sigma_mm`` is not 0.
 
@@ -160,7 +161,7 @@ def exact_match(
     plane = reflections.plane_mm[visible]
     if sigma_mm > 0:
         if rng is None:
-            raise ValueError("noise needs a random generator")
+            raise ValueError("the noise requires a random generator")
         plane = plane + rng.normal(0.0, sigma_mm, plane.shape)
     if orientation is None:
         orientation = seen_orientation(reflections)
@@ -178,7 +179,7 @@ def exact_match(
 
 
 def seen_orientation(reflections: Reflections) -> Orientation:
-    """The correspondence by how most neighbouring dots lie to each other on the plane."""
+    """Find the correspondence from the order of most neighbouring dots on the plane."""
     dots = np.where(reflections.visible[..., None], reflections.plane_mm, np.nan)
     across = np.sign(np.diff(dots[..., 0], axis=1))
     upward = np.sign(np.diff(dots[..., 1], axis=0))
@@ -190,10 +191,10 @@ def seen_orientation(reflections: Reflections) -> Orientation:
 def _rays(rig: Rig) -> tuple[FloatArray, FloatArray]:
     """Laser position, shape (3,), and unit ray directions, shape (rows, columns, 3)."""
     laser, pattern = rig.laser, rig.pattern
-    # A lamp that shines along +Z with X to its right is leaned over, and then turned about Z.
+    # A source that shines along +Z with X to its right is first tilted, then rotated about Z.
     leaned = Rotation.from_euler("X", 90.0 + laser.projection_angle_deg, degrees=True)
     placed = Rotation.from_euler("Z", laser.azimuth_deg, degrees=True) * leaned
-    # Row 1 is the topmost of the fan as the laser sends it, so it lands farthest, at the tail.
+    # Row 1 is the topmost of the fan at the laser, so it lands farthest away, at the tail.
     fan = np.ones((pattern.rows, pattern.columns, 3))
     fan[..., :2] = replace(pattern, rotation_deg=0.0).tangents
     turned = Rotation.from_euler("Z", pattern.rotation_deg, degrees=True)
@@ -207,11 +208,11 @@ def _rays(rig: Rig) -> tuple[FloatArray, FloatArray]:
 def _first_hit(
     pool: PoolSurface, source: FloatArray, direction: FloatArray
 ) -> tuple[FloatArray, BoolArray]:
-    """First point of each ray on pool or work piece, NaN unless it is the pool's; and whether.
+    """First point of each ray on the pool, NaN if it does not hit it first, and whether it does.
 
-    The rays are walked down from above the pool to below it, and the first step that goes under
-    the surface is halved. Where the pool stands off the work piece at a low rear, a ray can meet
-    the step between them; that is no reflection point either.
+    The rays are sampled from above the pool to below it, and the first step that goes below the
+    surface is bisected. Where a low rear leaves a step between the pool and the work piece, a ray
+    can meet the step; that is not a reflection point either.
     """
 
     def above(t: FloatArray) -> FloatArray:
@@ -220,7 +221,7 @@ def _first_hit(
         return np.asarray(z - np.where(np.isnan(ground), 0.0, ground))
 
     size = pool.size
-    # t of the horizontal levels from just above the highest to just below the lowest point.
+    # Ray parameter t at horizontal levels from above the highest to below the lowest point.
     levels = np.linspace(
         max(size.height_mm, 0) + SLACK_MM, min(size.depth_mm, 0) - SLACK_MM, SAMPLES
     )
@@ -242,25 +243,25 @@ def _first_hit(
 
 
 def _hits_again(pool: PoolSurface, point: FloatArray, direction: FloatArray) -> BoolArray:
-    """Whether rays that leave the pool at points along unit vectors meet it once more.
+    """Whether rays that leave the pool at points along unit vectors meet it again.
 
-    They are walked to where they are above its highest point or beyond its extent.
+    They are sampled until they are above its highest point or beyond its extent.
     """
     size = pool.size
     rise, run = direction[..., 2], np.hypot(direction[..., 0], direction[..., 1])
     with np.errstate(divide="ignore", invalid="ignore"):
         up = np.where(rise > 0, (size.height_mm - point[..., 2]) / rise, np.inf)
         away = np.hypot(size.width_mm, size.length_mm) / run
-    # From the first step on: at its own point the ray is on the surface, to rounding.
+    # Starts at the first step: at its start the ray is on the surface, to rounding.
     t = np.minimum(up, away) * np.linspace(0, 1, SAMPLES + 1)[1:, None, None]
     x, y, z = (point[..., n] + t * direction[..., n] for n in range(3))
     return np.asarray((pool.height(x, y) - z > CLEAR_MM).any(axis=0))
 
 
 def _on_imaging_plane(point: FloatArray, direction: FloatArray, rig: Rig) -> FloatArray:
-    """Where the reflected rays meet the plane, (X′, Z′), shape (…, 2), mm; NaN where never.
+    """Points where the reflected rays meet the plane, (X′, Z′), shape (…, 2), mm; NaN if none.
 
-    Before glass they are followed to its face, and refracted there by Snell's law for vectors.
+    If there is glass on the plane, the rays are refracted at its face by Snell's law for vectors.
     """
     plane = rig.imaging_plane
     if not plane.glass_mm:
@@ -280,7 +281,7 @@ def _on_imaging_plane(point: FloatArray, direction: FloatArray, rig: Rig) -> Flo
 def _meet(
     origin: FloatArray, point: FloatArray, direction: FloatArray, rig: Rig
 ) -> tuple[FloatArray, FloatArray]:
-    """Where rays meet a plane parallel to the imaging plane, (X′, Z′) from its origin, and t.
+    """Points where rays meet a plane parallel to the imaging plane, (X′, Z′), and t.
 
     Solves ``O + X′·x + Z′·z = P + t·d`` for X′, Z′ and t, ray by ray.
     """

@@ -1,4 +1,4 @@
-"""A pool of any shape: z = f(x, y) within a closed polygon, from a function or from heights."""
+"""A pool of any shape: z = f(x, y) within a closed polygon, from a function or a height map."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from labapp.core.values import BoolArray, FloatArray, ReadOnlyArrays
 from labapp.simulation.pools import PoolSize, size_of
 
 STEP = 1e-4
-"""Step of the differences that approximate a gradient, over the pool's longer side."""
+"""Step of the finite differences for a gradient, as a fraction of the pool's longer side."""
 
 MARGIN = 3
-"""Nodes beyond the known ones that continue the surface; the spline sees no farther."""
+"""Number of extrapolated nodes beyond the known ones; the spline does not reach farther."""
 
 NEIGHBOURS = 24
-"""Known nodes that a node beyond them is continued from."""
+"""Number of known nodes from which a node beyond them is extrapolated."""
 
 Function = Callable[[FloatArray, FloatArray], FloatArray]
 
 
 @dataclass(frozen=True)
 class OutlinedPool(ReadOnlyArrays):
-    """A pool that is any function of (x, y) within any closed polygon.
+    """A pool given by any function of (x, y) within any closed polygon.
 
     Raises
     ------
@@ -37,12 +37,12 @@ class OutlinedPool(ReadOnlyArrays):
     """
 
     function: Function
-    """z at (x, y), arrays of one shape, mm; defined a little beyond the outline, too."""
+    """z at (x, y), arrays of one shape, mm; also defined slightly beyond the outline."""
     outline_mm: FloatArray
-    """Corners of the boundary in their order, shape (n, 2), mm."""
+    """Corners of the boundary in order, shape (n, 2), mm."""
     slope: Function | None = None
-    """(∂z/∂x, ∂z/∂y) at (x, y), shape (…, 2); None: central differences of the function, of the
-    fourth order.
+    """(∂z/∂x, ∂z/∂y) at (x, y), shape (…, 2). None: fourth-order central differences of the
+    function.
     """
 
     def __post_init__(self) -> None:
@@ -50,7 +50,7 @@ class OutlinedPool(ReadOnlyArrays):
         x, y = np.asarray(self.outline_mm, float).reshape(-1, 2).T
         area = abs(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))) / 2
         if len(x) < 3 or not area > 0:
-            raise ValueError("an outline has at least three corners and an area")
+            raise ValueError("an outline requires at least three corners and an area")
 
     @cached_property
     def _polygon(self) -> Polygon:
@@ -102,12 +102,12 @@ class OutlinedPool(ReadOnlyArrays):
 
     @cached_property
     def size(self) -> PoolSize:
-        """True size; the peak is found by ever finer grids, to about 1e-6 mm."""
+        """True size; the peak is searched on successively finer grids, to about 1e-6 mm."""
         middle = np.asarray(self.outline_mm, float).min(axis=0) + self._extent / 2
         return size_of(self.height, self.boundary_mm(), middle, self._extent)
 
     def after(self, seconds: float) -> OutlinedPool:
-        """The same pool ``seconds`` later: it stands still."""
+        """The same pool ``seconds`` later: it does not move."""
         del seconds
         return self
 
@@ -115,18 +115,18 @@ class OutlinedPool(ReadOnlyArrays):
 def pool_from_heights(
     x_mm: FloatArray, y_mm: FloatArray, z_mm: FloatArray, outline_mm: FloatArray | None = None
 ) -> OutlinedPool:
-    """Build a pool from heights on a grid: a bicubic spline through them, with its own gradients.
+    """Build a pool from heights on a grid: a bicubic spline through them, with its gradients.
 
     Parameters
     ----------
     x_mm, y_mm
-        Of the grid's columns and of its rows, shapes (n,) and (m,), evenly rising, mm.
+        Positions of the grid's columns and rows, shapes (n,) and (m,), evenly increasing, mm.
     z_mm
-        Heights, shape (m, n), mm; NaN where there is no pool. Beyond the known ones they are
-        continued smoothly, so that the surface is smooth up to its boundary.
+        Heights, shape (m, n), mm; NaN where there is no pool. They are extrapolated smoothly
+        beyond the known nodes, so that the surface is smooth up to its boundary.
     outline_mm
-        Corners of the boundary, shape (k, 2), mm; None: half-way between the nodes that have a
-        height and those that have none.
+        Corners of the boundary, shape (k, 2), mm. None: halfway between the nodes with and those
+        without a height.
 
     Raises
     ------
@@ -135,8 +135,8 @@ def pool_from_heights(
     """
     known = np.isfinite(z_mm)
     if min(known.any(axis=0).sum(), known.any(axis=1).sum()) < 4:
-        raise ValueError("at least 4 × 4 nodes with a height")
-    # Room round the pool, for its outline and for the spline.
+        raise ValueError("at least 4 × 4 nodes must have a height")
+    # Margin around the pool for its outline and for the spline.
     room = MARGIN + 1
     x, y = (_continued(np.asarray(line, float), room) for line in (x_mm, y_mm))
     z = np.pad(np.asarray(z_mm, float), room, constant_values=np.nan)
@@ -149,7 +149,7 @@ def pool_from_heights(
 
 @dataclass(frozen=True)
 class _Heights:
-    """A spline as a function of (x, y); unlike a lambda it can go to another process."""
+    """A spline as a function of (x, y); unlike a lambda it can be pickled."""
 
     spline: RectBivariateSpline
 
@@ -161,13 +161,13 @@ class _Heights:
 
 
 def _continued(line: FloatArray, count: int) -> FloatArray:
-    """Evenly spaced places with ``count`` more before and after them."""
+    """Evenly spaced positions with ``count`` more before and after them."""
     step = (line[-1] - line[0]) / (len(line) - 1)
     return np.asarray(line[0] + step * np.arange(-count, len(line) + count))
 
 
 def _outline(x: FloatArray, y: FloatArray, known: BoolArray) -> FloatArray:
-    """Smooth line half-way between known nodes and the others; the longest, if there are more."""
+    """Smooth line halfway between known nodes and the others; the longest if there are several."""
     from contourpy import contour_generator
     from scipy.ndimage import gaussian_filter
 
@@ -178,12 +178,12 @@ def _outline(x: FloatArray, y: FloatArray, known: BoolArray) -> FloatArray:
 
 
 def _filled(x: FloatArray, y: FloatArray, z: FloatArray, known: BoolArray) -> FloatArray:
-    """Heights at every node: near the known ones continued as a thin plate, else the nearest."""
+    """Heights at every node: extrapolated as a thin plate near known nodes, else the nearest."""
     nearest = distance_transform_edt(~known, return_distances=False, return_indices=True)
     filled = z[tuple(nearest)]
     near = binary_dilation(known, np.ones((3, 3), bool), MARGIN) & ~known
     nodes = np.stack(np.meshgrid(x, y), axis=-1)
-    # Only what lies along the edge can be among the nearest.
+    # Only nodes along the edge can be among the nearest.
     edge = known & binary_dilation(~known, np.ones((3, 3), bool), 6)
     plate = RBFInterpolator(nodes[edge], z[edge], neighbors=min(NEIGHBOURS, int(edge.sum())))
     filled[near] = plate(nodes[near])

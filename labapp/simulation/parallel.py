@@ -21,10 +21,10 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 POLL_S = 0.2
-"""Interval of calls to ``progress`` while a task is waited for, s; a call may raise to stop."""
+"""Interval between calls to ``progress`` while waiting for a task, s; a call may raise to stop."""
 
 NICE = 10
-"""Niceness of processes that work for a window."""
+"""Niceness of processes started by the graphical interface."""
 
 _low = ContextVar("low", default=False)
 """Whether processes started now get a low priority."""
@@ -33,10 +33,10 @@ _shared: ContextVar[ProcessPoolExecutor | None] = ContextVar("shared", default=N
 """The processes of `shared_processes`."""
 
 ONE_THREAD = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS")
-"""Variables that limit BLAS to one thread: for small matrices more are slower."""
+"""Variables that limit BLAS to one thread: more threads are slower for small matrices."""
 
 Progress = Callable[[str, int, int], None]
-"""Called with a name of the work, steps done and steps in all; may raise to stop."""
+"""Called with the name of the work, the steps done and the number of steps; may raise to stop."""
 
 
 def in_parallel(
@@ -46,23 +46,23 @@ def in_parallel(
     progress: Progress | None = None,
     workers: int | None = None,
 ) -> list[R]:
-    """Map a function over tasks in parallel; results in the order of the tasks.
+    """Map a function over tasks in parallel; the results have the order of the tasks.
 
     Parameters
     ----------
     function
-        A function of a module, so that another process can import it.
+        A module-level function, so that another process can import it.
     tasks
-        Its arguments, one per call.
+        Arguments of the function, one per call.
     what, progress
-        Name of the work, and the callback for it.
+        Name of the work and the callback for it.
     workers
-        Number of processes; None: one per core. With 1 all is done in this one.
+        Number of processes. None: one per core. With 1, everything runs in this process.
 
     Raises
     ------
     KeyboardInterrupt
-        On Ctrl-C. This, and what ``progress`` raises, ends the tasks being done.
+        On Ctrl-C. This, and an exception of ``progress``, ends the running tasks.
     """
     tasks = list(tasks)
     report = progress or (lambda *_: None)
@@ -87,7 +87,7 @@ def in_parallel(
 
 @contextmanager
 def shared_processes(workers: int | None = None) -> Iterator[None]:
-    """Reuse the same processes for every `in_parallel` within: each takes seconds to start."""
+    """Share processes between all `in_parallel` calls within: each takes seconds to start."""
     workers = workers or os.cpu_count() or 1
     if workers <= 1:
         yield
@@ -101,7 +101,7 @@ def shared_processes(workers: int | None = None) -> Iterator[None]:
 
 
 def wait_for(future: Future[R], poll: Callable[[], None]) -> R:
-    """Result of a task in another process; ``poll`` is called meanwhile and may raise to stop."""
+    """Wait for the result of a task; ``poll`` is called meanwhile and may raise to stop."""
     while not wait([future], POLL_S).done:
         poll()
     return future.result()
@@ -124,9 +124,9 @@ def processes(
 
 
 def end_processes(pool: ProcessPoolExecutor, wait: bool = True) -> None:
-    """Terminate the processes of a pool, whatever they do; it cannot be used afterwards."""
-    # A process may be half through sending its result: the reading thread must see the end of the
-    # pipe. A pool that has ended reads no more.
+    """Terminate the processes of a pool even if they are busy; it cannot be used afterwards."""
+    # A process may be sending its result: the reading thread must see the end of the pipe. A pool
+    # that has ended does not read any more.
     results = getattr(pool, "_result_queue", None)
     if results is not None:
         results._writer.close()
@@ -138,14 +138,14 @@ def end_processes(pool: ProcessPoolExecutor, wait: bool = True) -> None:
 def start_worker(nice: int = 0, become: Callable[..., None] | None = None, *given: object) -> None:
     """Initialise a worker process; see `processes`.
 
-    Its niceness is raised by ``nice``, it computes in one thread, and it ends when its parent has
-    ended, killed even. At its own end nothing is torn down: functions that were registered with
-    `atexit` before are not called.
+    The niceness is raised by ``nice``, the process computes in one thread, and it ends when its
+    parent ends, even if that is killed. There is no clean-up when it ends: functions registered
+    earlier with `atexit` are not called.
     """
     ignore_interrupts()
     lower_priority(nice)
     os.environ.update(dict.fromkeys(ONE_THREAD, "1"))
-    threadpool_limits(1)  # of what is loaded already
+    threadpool_limits(1)  # for the libraries that are already loaded
     parent = multiprocessing.parent_process()
 
     def follow() -> None:
@@ -154,14 +154,14 @@ def start_worker(nice: int = 0, become: Callable[..., None] | None = None, *give
             os._exit(1)
 
     threading.Thread(target=follow, name="parent", daemon=True).start()
-    atexit.register(os._exit, 0)  # taking down all that is loaded would take half a second
+    atexit.register(os._exit, 0)  # unloading the libraries would take half a second
     if become is not None:
         become(*given)
 
 
 @contextmanager
 def low_priority() -> Iterator[None]:
-    """Start processes of this thread with a low priority, so that a window stays responsive."""
+    """Start this thread's processes with a low priority, so that the interface stays responsive."""
     former = _low.set(True)
     try:
         yield

@@ -1,7 +1,7 @@
-"""Welds with a known law of penetration: what the current does to pool and back side.
+"""Welds with a known law of penetration: the effect of the current on pool and back side.
 
 The pool follows the current as a first-order lag. Above a limit it melts through: a back-side bead
-appears, the pool sinks, and width, length and convexity tell of it, as in GTA welds of thin plates.
+appears, the pool sinks, and its width, length and convexity change, as in GTA welds of thin plates.
 """
 
 from __future__ import annotations
@@ -17,33 +17,33 @@ from labapp.core.values import FloatArray
 FEATURES, TARGET = ("width_mm", "length_mm", "convexity_mm"), "back_width_mm"
 
 RATE_HZ, DURATION_S, CURRENT_S = 30.0, 20.0, 2.5
-"""Frames a second, length of a weld, and how long a current lasts."""
+"""Frames per second, duration of a weld, and mean duration of a current."""
 
 POOL_S, BACK_S = 0.6, 0.25
-"""Time constants of the pool, and of the back side after it."""
+"""Time constants of the pool and of the back side that follows it."""
 
 FULL_MM = 0.5
 """Back-side width from which penetration is called full."""
 
 NOISE = np.array([0.03, 0.05, 0.008])
 LEVEL = np.array([0.02, 0.03, 0.004])
-"""Standard uncertainties of the features: of each frame, and the same in all of a weld, mm."""
+"""Standard uncertainties of the features: independent in each frame, and common to a weld, mm."""
 
 SCAN_MM, SCAN_SIGMA_MM, NO_BEAD_SIGMA_MM = 0.25, 0.08, 0.02
-"""Distance of the points of a scan, and its standard uncertainty on a bead and without one."""
+"""Spacing of the points of a scan, and its standard uncertainty on a bead and without one."""
 
 SCATTER_MM, SCATTER_S = 0.04, 1.0
-"""What the pool does not tell of the back side: standard deviation and correlation time."""
+"""Scatter of the back side that the pool does not explain: standard deviation, correlation time."""
 
 
 def back_width_mm(drive: FloatArray) -> FloatArray:
-    """The law: width of the back-side bead against the drive, 1 where it melts through."""
+    """Width of the back-side bead as a function of the drive, which is 1 at melt-through."""
     above = np.maximum(drive - 1.0, 0.0)
     return np.asarray(5.0 * above / (0.25 + above))
 
 
 def pool_features(drive: FloatArray) -> FloatArray:
-    """`FEATURES` of the pool at a drive, shape (n, 3), mm."""
+    """`FEATURES` of the pool as a function of the drive, shape (n, 3), mm."""
     bead = back_width_mm(drive)
     convexity = 0.22 - 0.06 * (drive - 1) - 0.06 * bead
     return np.column_stack([5.5 + 2.5 * (drive - 1), 7.0 + 4.5 * (drive - 1), convexity])
@@ -51,12 +51,12 @@ def pool_features(drive: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True)
 class SimulatedWeld:
-    """A weld, and the truth about it.
+    """A weld and its ground truth.
 
     Parameters
     ----------
     series
-        Features as they would be measured, and the scan of the back side.
+        Measured features and the scan of the back side.
     speed_mm_s
         Travel speed.
     back_width_mm
@@ -74,9 +74,9 @@ def simulate_welds(count: int, seed: int) -> list[SimulatedWeld]:
     Parameters
     ----------
     count
-        How many.
+        Number of welds.
     seed
-        Of the random numbers.
+        Seed of the random numbers.
     """
     rng = np.random.default_rng(seed)
     return [_weld(f"weld_{k:02d}", rng) for k in range(1, count + 1)]
@@ -108,7 +108,7 @@ def _weld(name: str, rng: np.random.Generator) -> SimulatedWeld:
 def first_order_lag(
     values: FloatArray, time_constant_s: float, rate_hz: float = RATE_HZ
 ) -> FloatArray:
-    """A first-order lag that begins at rest."""
+    """Apply a first-order lag that begins at rest."""
     pole = np.exp(-1 / (time_constant_s * rate_hz))
     start = [pole * values[0]]
     return np.asarray(signal.lfilter([1 - pole], [1.0, -pole], values, zi=start)[0])

@@ -1,7 +1,7 @@
-"""Pool surfaces of known shape: caps, ellipsoids, eggs, and what disturbs them (§4.2.1.2, §7.3).
+"""Pool surfaces of known shape: caps, ellipsoids, eggs and disturbances (§4.2.1.2, §7.3).
 
 Every pool is ``z = f(x, y)`` inside a closed boundary and undefined (NaN) outside it, with exact
-gradients up to the boundary. The boundary lies at z = 0 unless a `LowRear` is put on the pool.
+gradients up to the boundary. The boundary lies at z = 0 unless the pool has a `LowRear`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class PoolSize:
     """Extent of the boundary along X and along Y."""
     height_mm: float
     depth_mm: float
-    """Largest and smallest z, the boundary included."""
+    """Largest and smallest z, including the boundary."""
     peak_mm: tuple[float, float]
     bottom_mm: tuple[float, float]
     """(x, y) of the largest and of the smallest z."""
@@ -35,10 +35,10 @@ class PoolSize:
 
 @dataclass(frozen=True)
 class Footprint:
-    """An egg-shaped area: head and tail of different length, an ellipse when they are equal.
+    """An egg-shaped area with head and tail of different length; an ellipse if they are equal.
 
-    Points are placed by ``p = x/(width/2)`` and ``q(y)``, the fractional linear map that takes
-    the tail's end to −1, the widest place to 0 and the head's end to 1; the boundary is
+    The coordinates are ``p = x/(width/2)`` and ``q(y)``, the fractional linear map that takes the
+    end of the tail to −1, the widest point to 0 and the end of the head to 1; the boundary is
     p² + q² = 1. The map is smooth, so that no line across the pool has a kink in its curvature.
     """
 
@@ -48,16 +48,16 @@ class Footprint:
     tail_mm: float
     """Distance from the centre to the boundary along +Y and along −Y."""
     center_mm: tuple[float, float] = (0.0, 0.0)
-    """Where the pool is widest, (x, y) in the UCS."""
+    """Point where the pool is widest, (x, y) in the UCS."""
 
     def place(self, x_mm: FloatArray, y_mm: FloatArray) -> Place:
-        """Place points (x, y), arrays of one shape, in the footprint."""
+        """Convert points (x, y), arrays of one shape, to coordinates of the footprint."""
         half = self.width_mm / 2
         slope = (1 / self.tail_mm + 1 / self.head_mm) / 2
         skew = (1 / self.tail_mm - 1 / self.head_mm) / 2
         dx = np.asarray(x_mm, float) - self.center_mm[0]
         dy = np.asarray(y_mm, float) - self.center_mm[1]
-        # The map's pole is more than two lengths away, where only "outside" matters.
+        # The map's pole is more than two lengths away, clearly outside.
         dy = np.clip(dy, -2 * self.tail_mm, 2 * self.head_mm)
         below = 1 + skew * dy
         p, q = dx / half, slope * dy / below
@@ -68,7 +68,7 @@ class Footprint:
 
 @dataclass(frozen=True)
 class Place:
-    """Points placed in a footprint.
+    """Points in the coordinates of a footprint.
 
     ``x_mm, y_mm`` from its centre, ``p`` and ``q`` across and along it (±1 at its ends), their
     derivatives ``p_x`` = dp/dx and ``q_y`` = dq/dy, and ``rho2`` = p² + q², 1 at the boundary.
@@ -101,13 +101,13 @@ class Term(Protocol):
 
 @dataclass(frozen=True)
 class Dent:
-    """A Gaussian dip, as under the torch; damped by 1 − ρ² so that the boundary stays at z = 0."""
+    """A Gaussian dip, as under the torch; multiplied by 1 − ρ² to keep the boundary at z = 0."""
 
     depth_mm: float
     radius_mm: float
     """Depth and standard deviation of the dip."""
     offset_mm: tuple[float, float] = (0.0, 0.0)
-    """Its (x, y) from the pool's centre."""
+    """(x, y) of the dip from the pool's centre."""
 
     def _dip(self, place: Place) -> tuple[FloatArray, FloatArray, FloatArray]:
         x = (place.x_mm - self.offset_mm[0]) / self.radius_mm
@@ -151,16 +151,16 @@ class LowRear:
 
 @dataclass(frozen=True)
 class Oscillation:
-    """A swinging pool: the surface slides to and fro along and across, vanishing at the boundary.
+    """An oscillation of the pool along and across, zero at the boundary.
 
     ``amplitude · (1 − ρ²)² · (cos(ωt)·q + ½·sin(ωt)·p)`` has no net volume on an even pool.
     """
 
     amplitude_mm: float
-    """Largest factor of the mode."""
+    """Amplitude of the mode."""
     frequency_hz: float
     time_s: float = 0.0
-    """ω/2π, and the moment that is looked at."""
+    """ω/2π, and the time t."""
 
     def _weights(self) -> tuple[float, float]:
         phase = 2 * np.pi * self.frequency_hz * self.time_s
@@ -181,46 +181,47 @@ class Oscillation:
 
 @dataclass(frozen=True)
 class Wave:
-    """A mode of a round membrane, laid on the footprint: zero at the boundary; stands or turns.
+    """A mode of a round membrane, mapped onto the footprint: zero at the boundary.
 
     ``amplitude · J_m(j_mn·ρ) · cos(m(φ − φ₀)) · cos(ωt)`` stands, ``… cos(m(φ − φ₀) − ωt)`` travels
-    round; ρ and φ are polar in (p, q), j_mn is the n-th zero of the Bessel function J_m.
+    round; ρ and φ are polar coordinates in (p, q), j_mn is the n-th zero of the Bessel function
+    J_m.
 
     Raises
     ------
     ValueError
-        If there is no such mode, or it has no direction to travel in.
+        If there is no such mode, or a round mode is to travel.
     """
 
     mode: tuple[int, int]
-    """(m, n): nodal diameters, nodal circles with the boundary's counted; (0, 1), (1, 1), (2, 1)
-    and (0, 2) are what weld pools show.
+    """(m, n): number of nodal diameters and of nodal circles including the boundary; weld pools
+    show (0, 1), (1, 1), (2, 1) and (0, 2).
     """
     amplitude_mm: float
-    """Largest height that it adds."""
+    """Largest height that the mode adds."""
     frequency_hz: float = 0.0
     time_s: float = 0.0
-    """ω/2π, and the moment that is looked at."""
+    """ω/2π, and the time t."""
     travelling: bool = False
-    """Whether it turns, counter-clockwise seen from above, rather than stands."""
+    """Whether the wave travels round, counter-clockwise seen from above, instead of standing."""
     turned_deg: float = 0.0
     """φ₀, from +X counter-clockwise."""
     phase_deg: float = 0.0
-    """Added to ωt."""
+    """Phase added to ωt."""
     damping_per_s: float = 0.0
     """γ: the amplitude falls as exp(−γt)."""
 
     def __post_init__(self) -> None:
         if self.mode[0] < 0 or self.mode[1] < 1:
-            raise ValueError("a mode (m, n) has m from 0 and n from 1")
+            raise ValueError("a mode (m, n) must have m ≥ 0 and n ≥ 1")
         if self.travelling and self.mode[0] == 0:
-            raise ValueError("a mode (0, n) is round: it can stand, but not travel")
+            raise ValueError("a mode (0, n) is rotationally symmetric: it cannot travel")
 
     @cached_property
     def _radial(self) -> tuple[Chebyshev, Chebyshev]:
         """J_m(j_mn·ρ)/ρᵐ as a function of ρ², exact to rounding, and its derivative.
 
-        It is smooth at the centre, where ρ and φ are not, and quicker than the Bessel function.
+        It is smooth at the centre, where ρ and φ are not, and faster than the Bessel function.
         """
         m, n = self.mode
         zero = float(special.jn_zeros(m, n)[-1])
@@ -234,7 +235,7 @@ class Wave:
 
     @cached_property
     def _weight(self) -> complex:
-        """What the mode as a complex field is multiplied by, mm; its real part is the height."""
+        """Factor of the complex mode, mm; the real part of the product is the height."""
         m = self.mode[0]
         largest = special.jv(m, special.jnp_zeros(m, 1)[0]) if m else 1.0
         swing = 2 * np.pi * self.frequency_hz * self.time_s + np.radians(self.phase_deg)
@@ -264,11 +265,11 @@ class Wave:
 
 @dataclass(frozen=True)
 class Pool:
-    """A cap of an egg-shaped (or elliptic, or round) footprint, with disturbances on it.
+    """A cap with an egg-shaped, elliptic or round footprint, and disturbances on it.
 
-    The cap is ``peak · (√(1 − κρ²) − √(1 − κ)) / (1 − √(1 − κ))``: part of an ellipsoid when head
-    and tail are equal, of a sphere when the width equals them too. κ (`fullness`) is that of the
-    sphere of the pool's width unless given; 0 is a paraboloid, 1 half an ellipsoid.
+    The cap is ``peak · (√(1 − κρ²) − √(1 − κ)) / (1 − √(1 − κ))``: part of an ellipsoid if head
+    and tail are equal, part of a sphere if the footprint is round. By default κ (`fullness`) is
+    that of a sphere of the pool's width; 0 is a paraboloid, 1 half an ellipsoid.
 
     Raises
     ------
@@ -280,9 +281,9 @@ class Pool:
     peak_mm: float
     """z of the undisturbed cap at the centre, negative for a concave pool."""
     terms: tuple[Term, ...] = ()
-    """Disturbances, added up."""
+    """Disturbances, which are added up."""
     fullness: float | None = None
-    """κ above, 0 ≤ κ < 1."""
+    """κ, 0 ≤ κ < 1."""
 
     def __post_init__(self) -> None:
         foot = self.footprint
@@ -308,7 +309,7 @@ class Pool:
         """Height z at (x, y), arrays of one shape, mm; NaN outside the boundary."""
         place = self.footprint.place(x_mm, y_mm)
         kappa = self._kappa
-        # √(1 − κρ²) − √(1 − κ), over the same at ρ = 0, written so that it holds for κ → 0 too.
+        # √(1 − κρ²) − √(1 − κ), over its value at ρ = 0, in a form that also holds for κ → 0.
         rim = np.sqrt(1 - kappa)
         root = np.sqrt(np.maximum(1 - kappa * place.rho2, 0))
         z = self.peak_mm * (1 - place.rho2) * (1 + rim) / (root + rim)
@@ -329,14 +330,14 @@ class Pool:
 
     @cached_property
     def size(self) -> PoolSize:
-        """True size; the peak is found by ever finer grids, to about 1e-6 mm."""
+        """True size; the peak is searched on successively finer grids, to about 1e-6 mm."""
         foot = self.footprint
         middle = np.array([0.0, (foot.head_mm - foot.tail_mm) / 2]) + foot.center_mm
         extent = np.array([foot.width_mm, foot.head_mm + foot.tail_mm])
         return size_of(self.height, self.boundary_mm(), middle, extent)
 
     def after(self, seconds: float) -> Pool:
-        """The same pool ``seconds`` later; itself when nothing on it swings."""
+        """The same pool ``seconds`` later; itself if nothing on it oscillates."""
         if not any(isinstance(term, Oscillation | Wave) for term in self.terms):
             return self
         terms = tuple(
@@ -348,10 +349,10 @@ class Pool:
         return replace(self, terms=terms)
 
     def boundary_mm(self, count: int = 720) -> FloatArray:
-        """Points of the boundary at even steps of angle in (p, q), shape (count, 3), mm."""
+        """Points of the boundary at equal steps of angle in (p, q), shape (count, 3), mm."""
         foot = self.footprint
         angle = 2 * np.pi * np.arange(count) / count
-        # A hair inside, so that rounding does not put a point outside, where z is NaN.
+        # Slightly inside, so that rounding does not put a point outside, where z is NaN.
         p, q = (1 - 1e-12) * np.cos(angle), (1 - 1e-12) * np.sin(angle)
         slope = (1 / foot.tail_mm + 1 / foot.head_mm) / 2
         skew = (1 / foot.tail_mm - 1 / foot.head_mm) / 2
@@ -371,11 +372,11 @@ def size_of(
     Parameters
     ----------
     height
-        Gives z at (x, y), mm; NaN outside the boundary.
+        Function that returns z at (x, y), mm; NaN outside the boundary.
     rim_mm
         Points of the boundary, shape (n, 3), mm.
     middle_mm, extent_mm
-        Of the boundary's box: (x, y) of its middle, its sides along X and along Y.
+        Centre (x, y) and sides along X and Y of the boundary's bounding box.
     """
     high, peak = _largest(height, rim_mm, middle_mm, extent_mm / 2, 1.0)
     low, bottom = _largest(height, rim_mm, middle_mm, extent_mm / 2, -1.0)
@@ -390,7 +391,7 @@ def _largest(
     reach: FloatArray,
     sign: float,
 ) -> tuple[float, tuple[float, float]]:
-    """Largest of sign × z, the boundary included, and where."""
+    """Largest sign × z, including the boundary, and its (x, y)."""
     best = int(np.argmax(sign * rim[:, 2]))
     value, at = float(sign * rim[best, 2]), (float(rim[best, 0]), float(rim[best, 1]))
     for _ in range(6):
@@ -406,7 +407,7 @@ def _largest(
 def spherical_cap(
     diameter_mm: float, peak_mm: float, center_mm: tuple[float, float] = (0.0, 0.0)
 ) -> Pool:
-    """Part of a sphere, the simulated pool of Fig. 4-10; concave when ``peak_mm`` is negative."""
+    """Part of a sphere, the simulated pool of Fig. 4-10; concave if ``peak_mm`` is negative."""
     return Pool(Footprint(diameter_mm, diameter_mm / 2, diameter_mm / 2, center_mm), peak_mm)
 
 
@@ -416,7 +417,7 @@ def ellipsoidal_cap(
     peak_mm: float,
     center_mm: tuple[float, float] = (0.0, 0.0),
 ) -> Pool:
-    """Part of an ellipsoid, longer or shorter along Y than it is wide."""
+    """Part of an ellipsoid, with different length and width."""
     return Pool(Footprint(width_mm, length_mm / 2, length_mm / 2, center_mm), peak_mm)
 
 

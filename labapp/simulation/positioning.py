@@ -1,4 +1,4 @@
-"""Positioning of laser, torch and imaging plane: which rays come back (§4.2.1)."""
+"""Positioning of laser, torch and imaging plane: which rays reach the plane (§4.2.1)."""
 
 from __future__ import annotations
 
@@ -14,47 +14,47 @@ from labapp.simulation.forward import Reflections, trace
 from labapp.simulation.pools import ellipsoidal_cap
 
 USUAL_WIDTH_MM, USUAL_LENGTH_MM = 5.0, 6.0
-"""A pool in gas tungsten arc welding is at most this large (§4.2.1.1)."""
+"""Largest pool in gas tungsten arc welding (§4.2.1.1)."""
 
 RUN_OUT_MM = 60.0
-"""How far a ray that never meets the imaging plane is followed."""
+"""Length drawn of a ray that does not meet the imaging plane."""
 
 
 @dataclass(frozen=True)
 class Clearance:
-    """What the torch leaves room for, in the plane through laser and electrode (§4.2.1.1)."""
+    """Room left by the torch, in the plane through laser and electrode (§4.2.1.1)."""
 
     l1_mm: float
-    """Longest tail, electrode to the pool's end at −Y, whose incident rays the torch lets pass (Eq.
-    4-14); infinite for a laser that stands no higher than the tip.
+    """Longest tail, from the electrode to the pool's end at −Y, whose incident rays pass the torch
+    (Eq. 4-14); infinite for a laser no higher than the tip.
     """
     l2_mm: float
-    """Longest head, electrode to the pool's end at +Y, whose reflected rays the torch lets pass
+    """Longest head, from the electrode to the pool's end at +Y, whose reflected rays pass the torch
     (Eq. 4-15, 4-17, 4-18).
     """
     least_plane_mm: float
     most_plane_mm: float
     """Distances from the electrode between which a vertical imaging plane with the rig's edges
-    catches the steepest of those rays, the one that grazes the tip (Eq. 4-16 with H the height of
-    the lower and of the upper edge).
+    catches the steepest of those rays, which grazes the tip (Eq. 4-16 with H the height of the
+    lower and of the upper edge).
     """
 
 
 def clearance(rig: Rig, head_slope_deg: float = 0.0) -> Clearance:
-    """L1, L2 and the plane distances of §4.2.1.1 (Eq. 4-14 … 4-18).
+    """Calculate L1, L2 and the plane distances of §4.2.1.1 (Eq. 4-14 … 4-18).
 
     Parameters
     ----------
     head_slope_deg
-        How steeply the pool falls towards its head's edge: 0 for a flat one, β of Eq. 4-17 for a
+        Slope of the pool towards the edge of its head: 0 for a flat pool, β of Eq. 4-17 for a
         convex one, −γ of Eq. 4-18 for a concave one, degrees.
 
     Notes
     -----
-    With H2 the tip's height and the diode at height H3 and horizontal distance D2, Eq. 4-17 is
-    ``L2·tan(C + 2β) = H2``, ``(D2 − L2)·tan C = H3``. Without C it is the quadratic
-    ``t·L2² − (H2 + H3 + t·D2)·L2 + H2·(D2 − t·H3) = 0`` with t = tan 2β, of which the root wanted
-    becomes Eq. 4-15 for t = 0.
+    With H2 the height of the tip and the diode at height H3 and horizontal distance D2, Eq. 4-17 is
+    ``L2·tan(C + 2β) = H2``, ``(D2 − L2)·tan C = H3``. Eliminating C gives the quadratic
+    ``t·L2² − (H2 + H3 + t·D2)·L2 + H2·(D2 − t·H3) = 0`` with t = tan 2β. The root that becomes
+    Eq. 4-15 for t = 0 is used.
     """
     tip = rig.electrode.height_mm
     _, away, height = rig.laser.position_mm
@@ -72,7 +72,7 @@ def clearance(rig: Rig, head_slope_deg: float = 0.0) -> Clearance:
 
 
 class Fate(Enum):
-    """What becomes of a ray."""
+    """Fate of a ray."""
 
     CAUGHT = "meets the imaging plane"
     PAST = "misses the imaging plane"
@@ -88,17 +88,17 @@ class SideRay:
     """i of the ray, from 1."""
     fate: Fate
     path_mm: FloatArray
-    """(y, z) of the laser, of where it meets pool or work piece, and of its end, shape (2 or 3, 2),
-    mm.
+    """(y, z) of the laser, of the point on pool or work piece, and of the ray's end, shape
+    (2 or 3, 2), mm.
     """
 
 
 @dataclass(frozen=True)
 class SideView:
-    """The bench from the side, looking along −X: what is drawn of it, (y, z), mm."""
+    """Drawing of the bench from the side, looking along −X: (y, z), mm."""
 
     rays: tuple[SideRay, ...]
-    """Of the central column."""
+    """Rays of the central column."""
     pool_mm: FloatArray
     plane_mm: FloatArray
     """The pool's profile at x = 0, shape (n, 2); the plane's lower and upper edge, shape (2, 2)."""
@@ -108,7 +108,7 @@ class SideView:
     clearance: Clearance
     """L1, L2 and the plane distances."""
     tally: dict[Fate, int]
-    """How many rays of the whole pattern have which fate."""
+    """Number of rays of the whole pattern by fate."""
 
 
 def side_view(
@@ -117,17 +117,17 @@ def side_view(
     length_mm: float = USUAL_LENGTH_MM,
     height_mm: float = 0.0,
 ) -> SideView:
-    """Follow the rays by way of a pool of the expected size, centred under the electrode.
+    """Trace the rays via a pool of the expected size, centred under the electrode.
 
     Parameters
     ----------
     width_mm, length_mm, height_mm
-        Size of the pool, part of an ellipsoid; a negative height is a concave one.
+        Size of the pool, which is part of an ellipsoid; a negative height makes it concave.
 
     Raises
     ------
     ValueError
-        If there is no such pool.
+        If no pool can have this size.
     """
     pool = ellipsoidal_cap(width_mm, length_mm, height_mm)
     edge = np.array([length_mm / 2 * (1 - 1e-9)])

@@ -30,10 +30,10 @@ from labapp.system import interrupts_blocked
 TARGET = Target()
 
 MOMENTS = 15
-"""Samples over the exposure of a moving pool; odd, so that one is the middle."""
+"""Number of samples over the exposure of a moving pool; odd, so that one is in the middle."""
 
 AHEAD = 4
-"""Frames rendered ahead of the one being written."""
+"""Number of frames rendered ahead of the one being written."""
 
 TRUTH_COLUMNS = (
     "frame", "time_s", "width_mm", "length_mm", "height_mm", "depth_mm", "area_mm2", "volume_mm3",
@@ -46,7 +46,7 @@ DOT_COLUMNS = (
 
 
 class TruePool(PoolSurface, Protocol):
-    """Pool surface with what the ground truth needs besides."""
+    """Pool surface with the methods needed for the ground truth."""
 
     def inside(self, x_mm: FloatArray, y_mm: FloatArray) -> BoolArray:
         """Whether (x, y) is within the boundary."""
@@ -57,7 +57,7 @@ class TruePool(PoolSurface, Protocol):
         ...
 
     def after(self, seconds: float) -> TruePool:
-        """The same pool ``seconds`` later; itself when nothing moves."""
+        """The same pool ``seconds`` later; itself if nothing moves."""
         ...
 
 
@@ -69,11 +69,11 @@ class RecordedFrame(ReadOnlyArrays):
     reflections: Reflections
     """The ground truth, in the middle of the exposure."""
     image: Picture
-    """Grey levels, shape (height, width), 8 bit; 16 bit where exposures were added up or the look
-    has more bits.
+    """Grey levels, shape (height, width), 8 bit; 16 bit if exposures were added up or the look has
+    more bits.
     """
     dot_px: FloatArray
-    """(u, v) of each ray's dot, shape (rows, columns, 2), px; NaN where the ray makes none."""
+    """(u, v) of each ray's dot, shape (rows, columns, 2), px; NaN if the ray has no dot."""
     shown: BoolArray
     """Rays whose dot is in the picture, shape (rows, columns)."""
 
@@ -83,32 +83,32 @@ class Recording:
     """Description of a simulated recording; its random numbers follow from the seed."""
 
     file: str
-    """Its name: a video (``.avi``, ``.mkv``), a TIFF stack (``.tif``), or a folder of PNG files (no
-    suffix).
+    """Name of the recording: a video (``.avi``, ``.mkv``), a TIFF stack (``.tif``), or a folder of
+    PNG files (no suffix).
     """
     rig: Rig
     view: CameraView
     look: Look
-    """The bench, where the camera sees the imaging plane, and what the frames look like."""
+    """The bench, the camera's view of the imaging plane, and the appearance of the frames."""
     pools: tuple[TruePool, ...]
     """The pool of each frame, in the middle of its exposure."""
     seed: int
     frame_rate_hz: float | None = None
-    """None where the recording has no time base."""
+    """Frames per second; None if the recording has no time base."""
     exposure_s: float = 0.0
-    """How long a frame takes; dots of a pool that moves are smeared over it."""
+    """Exposure time of a frame; motion during it blurs the dots of a moving pool."""
     torches: tuple[Torch, ...] = ()
-    """The torch in each frame; empty: all that passes above the rig's electrode is hidden."""
+    """The torch in each frame; if empty, all rays above the rig's electrode tip are blocked."""
     exposures: int = 1
-    """How many exposures a frame is the sum of."""
+    """Number of exposures added up to a frame."""
     first_number: int = 0
-    """Number in the first PNG file's name."""
+    """Number in the name of the first PNG file."""
 
     truth_columns: ClassVar[tuple[str, ...]] = TRUTH_COLUMNS
     dot_columns: ClassVar[tuple[str, ...]] = DOT_COLUMNS
 
     def frame(self, index: int) -> RecordedFrame:
-        """Frame ``index``, from 0, rendered independently of the others."""
+        """Render frame ``index``, counted from 0, independently of the others."""
         torch = self.torches[index] if self.torches else None
         pools = _over_exposure(self.pools[index], self.exposure_s)
         moments = [trace(pool, self.rig, torch) for pool in pools]
@@ -126,7 +126,7 @@ class Recording:
         return RecordedFrame(self.pools[index], middle, image, exposed[0].dot_px, exposed[0].shown)
 
     def calibration_picture(self) -> GreyImage:
-        """Calibration picture, grey levels, shape (height, width)."""
+        """Render the calibration picture, grey levels, shape (height, width)."""
         rng = np.random.default_rng([self.seed, 2])
         return render_target(TARGET, self.view, TargetLook(), rng)
 
@@ -142,9 +142,9 @@ class Recording:
         Parameters
         ----------
         folder
-            Made if missing.
+            Created if missing.
         progress
-            Called for each frame, and while one is waited for; may raise to stop.
+            Called for each frame and while waiting for one; may raise to stop.
 
         Raises
         ------
@@ -176,7 +176,7 @@ class Recording:
             self._write_recording(folder / self.file, images())
 
     def _frames(self, workers: int, poll: Callable[[], None]) -> Iterator[_Rendered]:
-        """Render every frame in order; ``poll`` is called while one is waited for."""
+        """Render every frame in order; ``poll`` is called while waiting for one."""
         numbers = iter(range(len(self.pools)))
         if workers == 1:
             yield from (_render(self, number) for number in numbers)
@@ -211,7 +211,7 @@ class Recording:
 
 
 def _over_exposure(pool: TruePool, exposure_s: float) -> list[TruePool]:
-    """Pool at evenly spaced times over an exposure, centred on its own time."""
+    """The pool at evenly spaced times over an exposure centred on the pool's time."""
     if exposure_s == 0 or pool.after(exposure_s) is pool:
         return [pool]
     steps = (np.arange(MOMENTS) - (MOMENTS - 1) / 2) / MOMENTS
@@ -223,7 +223,7 @@ def _over_exposure(pool: TruePool, exposure_s: float) -> list[TruePool]:
 
 @dataclass(frozen=True)
 class _Rendered:
-    """A frame as it is written: picture and table rows."""
+    """Picture and table rows of a frame to be written."""
 
     image: Picture
     truth: Mapping[str, str]
@@ -294,7 +294,7 @@ def _truth_row(n: int, frame_rate_hz: float | None, frame: RecordedFrame) -> Map
     size = frame.pool.size
     area, volume = _area_and_volume(frame.pool)
     values = (size.width_mm, size.length_mm, size.height_mm, size.depth_mm, area, volume)
-    # As `labapp reconstruct` has it: of a hollow, the lowest point.
+    # As in `labapp reconstruct`: the lowest point of a concave pool.
     peak = size.peak_mm if size.height_mm >= -size.depth_mm else size.bottom_mm
     again = frame.reflections.lit & ~frame.reflections.blocked & frame.reflections.hits_again
     row = [
@@ -329,7 +329,7 @@ def _write_png(path: Path, image: npt.NDArray[np.uint8 | np.uint16]) -> None:
 
 @contextmanager
 def _table(path: Path, columns: tuple[str, ...]) -> Iterator[csv.DictWriter[str]]:
-    """Write a CSV file row by row; cells of other columns than its own are left out."""
+    """Write a CSV file row by row; values of columns that it does not have are left out."""
     with path.open("w", encoding="utf-8", newline="") as file:
         rows = csv.DictWriter(file, columns, extrasaction="ignore", lineterminator="\n")
         rows.writeheader()

@@ -1,8 +1,8 @@
-"""Render what the camera sees: reflected dots on the imaging plane, arc glow and noise (§3.2).
+"""Render camera frames: reflected dots on the imaging plane, arc glow and noise (§3.2).
 
-Grey and of low contrast, like the dissertation's pictures. They are made to be measured, not to be
-admired: every dot's true centre is known to rounding. Light is in grey levels of an 8-bit camera,
-whatever depth the picture is written in.
+The frames are grey and of low contrast, like the dissertation's pictures. Every dot's true centre
+is known to rounding. Light is in grey levels of an 8-bit camera, regardless of the depth in which
+the picture is written.
 """
 
 from __future__ import annotations
@@ -24,20 +24,20 @@ Picture = npt.NDArray[np.uint8 | np.uint16]
 
 @dataclass(frozen=True)
 class Look:
-    """What a frame looks like."""
+    """Appearance of a frame."""
 
     dot_peak: float = 55.0
-    """Grey levels of a dot of middling brightness over the background."""
+    """Grey levels of a dot of median brightness above the background."""
     unevenness: float = 0.22
     """Standard deviation of the logarithm of the rays' brightness."""
     beam_fraction: float = 0.045
-    """Standard deviation of a beam's light over the angle between beams: a dot is as much wider as
-    the pool spreads the pattern there.
+    """Standard deviation of a beam's light as a fraction of the inter-beam angle. A dot is widened
+    as much as the pool spreads the pattern there.
     """
     dot_floor_mm: float = 0.28
     dot_ceiling_mm: float = 0.55
-    """Least and largest standard deviation of a dot on the plane, mm: what diffraction and
-    scattering in the plane add, and where a spread dot stops being one.
+    """Smallest and largest standard deviation of a dot on the plane, mm: the blur from diffraction
+    and scattering in the plane, and the limit beyond which spread light is no longer a dot.
     """
     speckle: float = 0.35
     """Contrast of the speckle inside dots, 0 … 1."""
@@ -48,26 +48,26 @@ class Look:
     """Grey levels of the dark plane, and of the arc's glow on it where it is brightest."""
     read_noise: float = 1.2
     photon_noise: float = 0.08
-    """Standard deviation in the dark, grey levels; variance per grey level of light."""
+    """Standard deviation in darkness, grey levels; variance per grey level of light."""
     hot_pixels: int = 0
     false_dots: int = 0
     missing: float = 0.0
-    """Probability that a dot which should show does not."""
+    """Probability that a dot which should be visible is missing."""
     full_scale: float = 255.0
-    """Light at which a pixel is full: what is brighter is cut off there."""
+    """Light at which a pixel saturates."""
     bits: int = 8
-    """Depth of the picture: 255 becomes the largest number that it holds."""
+    """Depth of the picture: 255 is scaled to the largest value of this depth."""
 
 
 @dataclass(frozen=True)
 class Frame(ReadOnlyArrays):
-    """A rendered frame and what is in it."""
+    """A rendered frame and its dots."""
 
     image: Picture
-    """Shape (height, width), 8 bit, or 16 where the look has more bits than 8."""
+    """Shape (height, width), 8 bit, or 16 if the look has more than 8 bits."""
     dot_px: FloatArray
-    """(u, v) of each ray's dot, in the picture or not, shape (rows, columns, 2), px: the middle of
-    its light where it moves while it is exposed; NaN where the ray makes none.
+    """(u, v) of each ray's dot, in the picture or not, shape (rows, columns, 2), px: the mean
+    position over the exposure if it moves; NaN if the ray has no dot.
     """
     shown: BoolArray
     """Rays whose dot was drawn with its centre in the picture for at least half of the exposure,
@@ -78,7 +78,7 @@ class Frame(ReadOnlyArrays):
 def ray_brightness(
     shape: tuple[int, ...], unevenness: float, rng: np.random.Generator
 ) -> FloatArray:
-    """Draw the brightness of every ray relative to the middling one; a lens keeps its own."""
+    """Draw the brightness of every ray relative to the median; it is fixed for a lens."""
     return np.exp(rng.normal(0.0, unevenness, shape))
 
 
@@ -94,14 +94,14 @@ def render(
     Parameters
     ----------
     reflections
-        What the forward model gave; of a pool that moves, at moments evenly over the exposure.
+        Results of the forward model; for a moving pool, at evenly spaced times over the exposure.
     view, look
-        Where the camera sees the plane, and what the frame looks like.
+        The camera's view of the plane, and the appearance of the frame.
     rng
-        Source of everything that is random.
+        Source of all random numbers.
     brightness
-        Brightness of every ray, shape (rows, columns), from `ray_brightness`; None draws it
-        anew. A video passes the same to every frame.
+        Brightness of every ray, shape (rows, columns), from `ray_brightness`. None draws it anew.
+        All frames of a video have the same.
     """
     moments = [reflections] if isinstance(reflections, Reflections) else list(reflections)
     places = np.stack([view.to_image(moment.plane_mm) for moment in moments])
@@ -127,7 +127,7 @@ def render(
 
 
 def _middle(places: FloatArray, drawn: BoolArray) -> FloatArray:
-    """Mean of each dot's places, (moments, …, 2): of those drawn, or of all if none is."""
+    """Mean of each dot's positions, (moments, …, 2): of the drawn ones, or of all if none is."""
     counted = np.where(drawn.any(axis=0), drawn, np.isfinite(places[..., 0]))
     total = np.where(counted[..., None], places, 0.0).sum(axis=0)
     count = counted.sum(axis=0)[..., None]
@@ -137,8 +137,8 @@ def _middle(places: FloatArray, drawn: BoolArray) -> FloatArray:
 def _dot_covariance_px(reflections: Reflections, view: CameraView, look: Look) -> FloatArray:
     """Second moments of each dot's light, shape (rows, columns, 2, 2), px².
 
-    A beam's round profile is spread like the pattern is: by the derivative of the dot's place
-    with respect to the ray's number, taken from neighbouring dots.
+    A beam's round profile is spread like the pattern: by the derivative of the dot's position with
+    respect to the ray's number, taken from neighbouring dots.
     """
     dots = np.where(reflections.hit[..., None], reflections.plane_mm, np.nan)
     spread = np.stack([_step_to_neighbours(dots, axis) for axis in (0, 1)], axis=-1)
@@ -149,7 +149,7 @@ def _dot_covariance_px(reflections: Reflections, view: CameraView, look: Look) -
 
 
 def _step_to_neighbours(dots: FloatArray, axis: int) -> FloatArray:
-    """Mean step from the dot before and to the dot after, NaN where there is neither."""
+    """Mean step from the previous and to the next dot, NaN where there is neither."""
     step = np.diff(dots, axis=axis)
     edge = np.full_like(np.take(dots, [0], axis=axis), np.nan)
     both = np.stack([np.concatenate(p, axis=axis) for p in ((edge, step), (step, edge))])
@@ -176,7 +176,7 @@ def _draw(
 
 
 def speckle_field(shape: tuple[int, int], contrast: float, rng: np.random.Generator) -> FloatArray:
-    """Fine-grained field of mean 1 and the given contrast: fully grown speckle over a constant."""
+    """Fine-grained field of mean 1 and the given contrast: developed speckle plus a constant."""
     grain_px = 0.7
     wave = [gaussian_filter(rng.normal(size=shape), grain_px) for _ in range(2)]
     intensity = wave[0] ** 2 + wave[1] ** 2
@@ -184,7 +184,7 @@ def speckle_field(shape: tuple[int, int], contrast: float, rng: np.random.Genera
 
 
 def arc_glow(shape: tuple[int, int], look: Look) -> FloatArray:
-    """Light of the plane itself: dark, with the arc's glow broad and from below."""
+    """Light of the plane itself: dark, with a broad glow of the arc from below."""
     v, u = np.mgrid[: shape[0], : shape[1]]
     across = (u - 0.55 * shape[1]) / (0.7 * shape[1])
     upward = (v - 1.05 * shape[0]) / (0.55 * shape[0])
@@ -192,7 +192,7 @@ def arc_glow(shape: tuple[int, int], look: Look) -> FloatArray:
 
 
 def expose(light: FloatArray, look: Look, rng: np.random.Generator) -> Picture:
-    """Add photon and read noise and hot pixels, cut off what is too bright, and round."""
+    """Add photon noise, read noise and hot pixels, clip at saturation, and round."""
     variance = look.read_noise**2 + look.photon_noise * np.maximum(light, 0)
     seen = light + np.sqrt(variance) * rng.normal(size=light.shape)
     hot = rng.integers(0, light.size, look.hot_pixels)

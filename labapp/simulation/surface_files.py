@@ -20,10 +20,10 @@ from labapp.simulation.outlined_pool import OutlinedPool, pool_from_heights
 A_SURFACE = "a height map (.csv, .npy, .npz) or a mesh (.stl, .ply)"
 
 MESH_NODES = 250
-"""Nodes at most along the longer side of the grid that a mesh is read off at."""
+"""Maximum number of nodes along the longer side of the grid at which a mesh is sampled."""
 
 SMALLEST_MM, LARGEST_MM = 0.5, 200.0
-"""Longer side of a pool; anything else is a slip of the unit."""
+"""Limits of the longer side of a pool; other values indicate a wrong unit."""
 
 STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corner", "<f4", (3, 3)), ("attribute", "<u2")])
 PLY_TYPES = {
@@ -37,7 +37,7 @@ Grid = tuple[FloatArray, FloatArray, FloatArray]
 
 
 class _Unreadable(Exception):
-    """What is wrong with a file, and what would be right."""
+    """The error in a file and what was expected."""
 
     def __init__(self, what: object, expected: str) -> None:
         super().__init__(str(what), expected)
@@ -57,7 +57,7 @@ def read_pool(
                                    first, both ``spacing_mm`` apart, (0, 0) in the middle
     ``.csv`` with x_mm,y_mm,z_mm   nodes of an even grid, as `labapp reconstruct` writes
     ``.npz``                       x_mm (n), y_mm (m), z_mm (m, n)
-    ``.stl``, ``.ply``             triangles; those that look up are the pool
+    ``.stl``, ``.ply``             triangles; those that face up are the pool
     ============================== =======================================================
 
     An empty cell or nan is outside the pool.
@@ -65,16 +65,16 @@ def read_pool(
     Parameters
     ----------
     spacing_mm
-        Of a grid that does not say where its nodes are; not used for others.
+        Spacing of a grid without node positions; not used for others.
     center_mm
-        Added to every (x, y) of the file, its outline's included.
+        Added to every (x, y) of the file, including its outline.
     outline_mm
-        Corners of the boundary, shape (k, 2), mm; None: that of the heights or of the mesh.
+        Corners of the boundary, shape (k, 2), mm. None: that of the heights or of the mesh.
 
     Raises
     ------
     InputError
-        If the file cannot be read or is no such surface.
+        If the file cannot be read or is not such a surface.
     """
     path = Path(path)
     readers: dict[str, Callable[[Path, float | None], tuple[Grid, FloatArray | None]]] = {
@@ -97,7 +97,7 @@ def read_pool(
         raise InputError(path, "surface", error.what, error.expected) from error
     except OSError as error:
         raise InputError(path, "file", error.strerror or error, A_SURFACE) from error
-    except (ValueError, LookupError, EOFError, BadZipFile) as error:  # all that damage can raise
+    except (ValueError, LookupError, EOFError, BadZipFile) as error:  # raised for damaged files
         raise InputError(path, "surface", error, A_SURFACE) from error
 
 
@@ -109,19 +109,19 @@ def _npy(path: Path, spacing_mm: float | None) -> tuple[Grid, None]:
 
 
 def _even(heights: npt.NDArray[Any], spacing_mm: float | None) -> Grid:
-    """Heights without places: (0, 0) is in the middle."""
+    """Heights without positions: (0, 0) is in the middle."""
     if heights.ndim != 2 or heights.dtype.kind not in "fiu" or min(heights.shape) < 4:
         shape = f"{heights.dtype} of shape {heights.shape}"
         raise _Unreadable(shape, "numbers in at least 4 rows and 4 columns")
     if spacing_mm is None:
-        raise _Unreadable("heights without places", "spacing_mm with it")
+        raise _Unreadable("heights without positions", "spacing_mm to be given")
     y, x = (spacing_mm * (np.arange(count) - (count - 1) / 2) for count in heights.shape)
     return x, y, np.asarray(heights, float)
 
 
 def _npz(path: Path, spacing_mm: float | None) -> tuple[Grid, None]:
     del spacing_mm
-    # Opened here: numpy leaves a file open that begins like an archive and is none.
+    # Opened here: numpy leaves a file open that begins like an archive but is not one.
     with path.open("rb") as file, np.load(file, allow_pickle=False) as kept:
         lacking = {"x_mm", "y_mm", "z_mm"} - set(kept.files)
         if lacking:
@@ -141,7 +141,7 @@ def _csv(path: Path, spacing_mm: float | None) -> tuple[Grid, None]:
     nodes = _numbers(rest)
     if nodes.ndim != 2 or nodes.shape[1] != 3 or len(nodes) < 16:
         raise _Unreadable(f"{len(nodes)} nodes", "at least 4 × 4 nodes x_mm,y_mm,z_mm")
-    # Written with a few decimals: what is closer than that is the same line of the grid.
+    # Files have a few decimals: closer positions belong to the same line of the grid.
     (x, column), (y, row) = (
         np.unique(np.round(nodes[:, n], 6), return_inverse=True) for n in range(2)
     )
@@ -151,21 +151,21 @@ def _csv(path: Path, spacing_mm: float | None) -> tuple[Grid, None]:
 
 
 def _numbers(text: str) -> FloatArray:
-    """Lines of numbers with commas between them; an empty cell is NaN."""
+    """Read lines of numbers separated by commas; an empty cell is NaN."""
     rows = [
         [float(cell) if cell.strip() else np.nan for cell in line.split(",")]
         for line in text.splitlines()
         if line.strip()
     ]
     if len({len(row) for row in rows}) > 1:
-        raise _Unreadable("rows of different length", "a table")
+        raise _Unreadable("rows of different lengths", "a table")
     return np.array(rows, float)
 
 
 def _rising(line: FloatArray, name: str) -> FloatArray:
     step = np.diff(line)
     if len(line) < 4 or not (step > 0).all() or np.ptp(step) > 0.01 * step.mean():
-        raise _Unreadable(f"{name} of {len(line)} places", "4 or more places, evenly rising")
+        raise _Unreadable(f"{name} of {len(line)} positions", "4 or more, evenly increasing")
     return line
 
 
@@ -173,16 +173,16 @@ def _rising(line: FloatArray, name: str) -> FloatArray:
 
 
 def _mesh(path: Path, spacing_mm: float | None) -> tuple[Grid, FloatArray]:
-    """Read a mesh off at an even grid, and its own boundary."""
+    """Sample a mesh on an even grid, and find its boundary."""
     del spacing_mm
     data = path.read_bytes()
     corners = _stl(data) if path.suffix.lower() == ".stl" else _ply(data)
     normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     up = normal[:, 2] > 0.05 * np.linalg.norm(normal, axis=1)
     if up.sum() < 16:
-        raise _Unreadable(f"{up.sum()} triangles that look up", "at least 16, the pool's surface")
+        raise _Unreadable(f"{up.sum()} triangles that face up", "at least 16, the pool's surface")
     corners = corners[up]
-    # STL has no shared corners: those that are the same to its 32 bits are one.
+    # STL has no shared corners: corners that are equal in 32 bits are merged.
     places, index = np.unique(np.round(corners.reshape(-1, 3), 5), axis=0, return_inverse=True)
     outline = places[_boundary(index.reshape(-1, 3)), :2]
     edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2)
@@ -200,7 +200,7 @@ def _mesh(path: Path, spacing_mm: float | None) -> tuple[Grid, FloatArray]:
 
 
 def _boundary(triangles: IntArray) -> IntArray:
-    """Corners along the longest loop of edges that only one triangle has."""
+    """Corners along the longest loop of edges that belong to only one triangle."""
     edges = np.concatenate([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]])
     _, first, count = np.unique(
         np.sort(edges, axis=1), axis=0, return_index=True, return_counts=True
@@ -216,7 +216,7 @@ def _boundary(triangles: IntArray) -> IntArray:
         loops.append(loop)
     longest = max(loops, key=len, default=[])
     if len(longest) < 3:
-        raise _Unreadable("a mesh without an edge", "a surface that ends at its boundary")
+        raise _Unreadable("a closed mesh", "a surface that ends at its boundary")
     return np.array(longest)
 
 
@@ -248,7 +248,7 @@ def _ply(data: bytes) -> FloatArray:
     plain = [line for line in words[:split] if line[:1] == ["property"]]
     lists = [line for line in words[split:] if line[:1] == ["property"]]
     if len(lists) != 1 or lists[0][1] != "list" or any(line[1] == "list" for line in plain):
-        raise _Unreadable("other properties", "faces that are a list of corners and nothing else")
+        raise _Unreadable("other properties", "faces with only a list of corners")
     names = [line[2] for line in plain]
     (_, vertices), (_, faces) = elements[:2]
     if order == "":
@@ -266,5 +266,5 @@ def _ply(data: bytes) -> FloatArray:
         found_faces = np.frombuffer(body, face, faces, vertices * kind.itemsize)
         triangles = np.column_stack([found_faces["count"], found_faces["at"]])
     if triangles.ndim != 2 or triangles.shape[1] != 4 or (triangles[:, 0] != 3).any():
-        raise _Unreadable("faces of other than three corners", "PLY of triangles")
+        raise _Unreadable("faces that are not triangles", "PLY of triangles")
     return np.asarray(places[triangles[:, 1:]])

@@ -1,4 +1,4 @@
-"""What the torch hides: the text's rule, and an electrode that has a shape (§4.2.1)."""
+"""Rays blocked by the torch: the dissertation's rule, and an electrode with a shape (§4.2.1)."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ import numpy as np
 from labapp.core.values import BoolArray, FloatArray
 
 REACH_MM = 20.0
-"""How far a ray is followed from the pool: beyond the nozzle's edge."""
+"""Length of a ray that is checked from the pool on: beyond the edge of the nozzle."""
 
 STEP_MM = 0.02
 """Step along a ray, far below the width of the tip."""
 
 
 class Torch(Protocol):
-    """What stands in the way of rays."""
+    """A torch that blocks rays."""
 
     def hides(
         self, point_mm: FloatArray, incident: FloatArray, reflected: FloatArray
     ) -> tuple[BoolArray, BoolArray]:
-        """Whether it is in the way of the rays to points and of those from them.
+        """Whether the torch blocks the incident and the reflected rays at points.
 
         Parameters
         ----------
         point_mm
-            Reflection points, UCS, shape (…, 3), mm; NaN where there is none: not hidden.
+            Reflection points, UCS, shape (…, 3), mm; NaN for none, which is not blocked.
         incident, reflected
             Unit directions of the rays, shape (…, 3).
         """
@@ -36,19 +36,19 @@ class Torch(Protocol):
 
 @dataclass(frozen=True)
 class YozTorch:
-    """The text's simplification: all that crosses y = 0 above the tip is hidden (§4.2.1.1).
+    """The dissertation's simplification: rays crossing y = 0 above the tip are blocked (§4.2.1.1).
 
-    However far to the side: the incident ray of points at y < 0, the reflected one of points at
-    y > 0.
+    This applies at any distance to the side, to the incident ray of points at y < 0 and to the
+    reflected ray of points at y > 0.
     """
 
     height_mm: float
-    """Of the tip."""
+    """Height of the tip."""
 
     def hides(
         self, point_mm: FloatArray, incident: FloatArray, reflected: FloatArray
     ) -> tuple[BoolArray, BoolArray]:
-        """Whether it is in the way of the rays to points and of those from them."""
+        """Whether the torch blocks the incident and the reflected rays at points."""
         y = point_mm[..., 1]
         return (
             (y < 0) & (_height_over_origin(point_mm, -incident) > self.height_mm),
@@ -58,20 +58,20 @@ class YozTorch:
 
 @dataclass(frozen=True)
 class ConeTorch:
-    """An electrode with a conical tip, upright: it hides what it stands in the way of."""
+    """An upright electrode with a conical tip that blocks the rays which meet it."""
 
     tip_mm: tuple[float, float, float]
-    """Where the middle of the tip's flat end is, (x, y, z) in the UCS."""
+    """Centre of the tip's flat end, (x, y, z) in the UCS."""
     tip_radius_mm: float = 0.25
     radius_mm: float = 1.2
     """Radius of the flat end and of the rod."""
     half_angle_deg: float = 12.0
-    """Of the cone."""
+    """Half angle of the cone."""
 
     def hides(
         self, point_mm: FloatArray, incident: FloatArray, reflected: FloatArray
     ) -> tuple[BoolArray, BoolArray]:
-        """Whether it is in the way of the rays to points and of those from them."""
+        """Whether the torch blocks the incident and the reflected rays at points."""
         return self._stands_in(point_mm, -incident), self._stands_in(point_mm, reflected)
 
     def _stands_in(self, point_mm: FloatArray, direction: FloatArray) -> BoolArray:
@@ -85,7 +85,7 @@ class ConeTorch:
 
 
 def _height_over_origin(point: FloatArray, direction: FloatArray) -> FloatArray:
-    """Z at which the rays cross y = 0, shape (…); NaN where never."""
+    """Z at which the rays cross y = 0, shape (…); NaN if they do not."""
     with np.errstate(divide="ignore", invalid="ignore"):
         along = -point[..., 1] / direction[..., 1]
         return np.asarray(np.where(along > 0, point[..., 2] + along * direction[..., 2], np.nan))

@@ -1,6 +1,6 @@
-"""What is computed with simulated pools: chapters 4 and 8, error budgets."""
+"""Computations with simulated pools: chapters 4 and 8, error budgets."""
 
 from labapp.core import schemes
 
 SCHEMES = tuple(reversed(schemes.SCHEMES))
-"""Names of the schemes that are studied: all of them, the default last."""
+"""Names of the schemes in the studies: all of them, the default one last."""

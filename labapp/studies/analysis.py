@@ -26,7 +26,7 @@ PARTS = ("CE", "LE", "ME", "measurement", "images", "parameters")
 """Parts of the analysis."""
 
 FIGURES = {"CE": (6, 7), "LE": (8, 9), "ME": (10, 11)}
-"""Numbers in chapter 8 of the figures that show errors and ARE."""
+"""Numbers of the figures in chapter 8 that show errors and ARE."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class AnalysisPart:
     pictures: Mapping[str, bytes]
     """File name → content."""
     printed: tuple[Table, ...]
-    """Tables to print: those that are short and complete."""
+    """Tables to print: the short and complete ones."""
 
     @property
     def files(self) -> dict[str, bytes]:
@@ -173,14 +173,15 @@ def _drawn(figures: Mapping[str, Figure], kind: str) -> dict[str, bytes]:
 def analyze_budget(
     setup: Setup | None, pool: Pool, progress: Progress | None = None
 ) -> AnalysisPart:
-    """Compute the error budget of a set-up for a kind of pool, predicted and simulated.
+    """Compute the predicted and simulated error budget of a set-up for a kind of pool.
 
     Parameters
     ----------
     setup
-        None: that of §8.3.1 with a 4″ plane, known to `parameter_deviation.NOMINAL`.
+        The set-up. None: that of §8.3.1 with a 4″ plane and the uncertainties
+        `parameter_deviation.NOMINAL`.
     pool
-        The kind: see `expected_pool`.
+        The kind of pool: see `expected_pool`.
     progress
         May raise to stop.
     """
@@ -209,12 +210,12 @@ def _bench(setup: Setup | None) -> Bench:
 
 
 def expected_pool(width: float, length: float, height: float) -> Pool:
-    """Ellipsoidal pool of a width, length and height, mm; the height of a concave one is negative.
+    """Ellipsoidal pool of a width, length and height, mm; a concave pool has a negative height.
 
     Raises
     ------
     InputError
-        If there is no such pool.
+        If no pool can have this size.
     """
     from labapp.simulation.pools import ellipsoidal_cap
 
@@ -226,5 +227,5 @@ def expected_pool(width: float, length: float, height: float) -> Pool:
         return ellipsoidal_cap(width, length, height)
     except ValueError as error:
         raise InputError(
-            "the expected pool", "height", height, f"a pool that can be: {error}"
+            "the expected pool", "height", height, f"a possible pool: {error}"
         ) from error

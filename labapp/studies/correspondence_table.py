@@ -1,4 +1,4 @@
-"""Which way the reflected rows and columns run: Tables 4-4 and 4-5 (§4.2.2)."""
+"""Order of the reflected rows and columns: Tables 4-4 and 4-5 (§4.2.2)."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from labapp.simulation.pools import spherical_cap
 from labapp.studies.tables import Table
 
 RADII_MM, DEPTHS = (2, 3, 4, 5), (100, 50, 10, 5, 2)
-"""Radius, and radius over depth, of the caps of Tables 4-4 and 4-5."""
+"""Radius, and ratio of radius to depth, of the caps of Tables 4-4 and 4-5."""
 
 EXAMPLES = (
     ("figure_4_17_concave", "Fig. 4-17: concave, r = 3 mm, d = r/10", 3, -1 / 10),
     ("figure_4_18_sand_timer", "Fig. 4-18: concave, r = 4 mm, d = r/10", 4, -1 / 10),
     ("figure_4_20_convex", "Fig. 4-20: convex, r = 3 mm, d = r/10", 3, 1 / 10),
 )
-"""Name, title, radius and depth in radii of the caps that §4.2.2.3 draws."""
+"""Name, title, radius and depth in radii of the caps drawn in §4.2.2.3."""
 
 OPEN_BENCH = Rig(
     Laser(31.14, 31.48),
@@ -26,11 +26,11 @@ OPEN_BENCH = Rig(
     Electrode(1e9),
     ImagingPlane.vertical(50.0, 1e4, -1e4, 2e4, 2e4),
 )
-"""The bench of §4.2.2.2 and §8.3.1; nothing blocks, and the plane catches rays at any height."""
+"""The bench of §4.2.2.2 and §8.3.1 without blocking, with a plane that catches all rays."""
 
 
 def correspondence_tables() -> tuple[Table, Table]:
-    """Tables 4-4 and 4-5: order of columns and of rows; a star for the sand timer of Fig. 4-18."""
+    """Tables 4-4 and 4-5: order of columns and rows; a star marks the sand timer of Fig. 4-18."""
     made = []
     for number, kind, sign in ((4, "concave", -1), (5, "convex", 1)):
         rows = [
@@ -52,19 +52,19 @@ def correspondence_tables() -> tuple[Table, Table]:
 
 
 def cap_reflections(radius_mm: float, depth: float) -> Reflections:
-    """What becomes of the rays on a cap; depth in radii, negative for a concave one."""
+    """Reflections from a cap; the depth is in radii and negative for a concave cap."""
     return trace(spherical_cap(2 * radius_mm, radius_mm * depth), OPEN_BENCH)
 
 
 def correspondence_letters(reflections: Reflections) -> str:
-    """Column and row correspondence as the tables write it: ``S/S``, ``I/I*`` … ``D/D``.
+    """Column and row correspondence in the notation of the tables: ``S/S``, ``I/I*`` … ``D/D``.
 
-    Counts every lit ray whose reflection meets the plane, its edges and the torch ignored. A row
-    runs one way when X′ changes with one sign from every dot to the next that is there. Fewer
-    than half of the rows running one way: disordered. Otherwise the first letter is that of the
-    highest such row in the image, with a star where at least a quarter of the rows run the other
-    way (the sand timer of Fig. 4-18); the second is the sign that Z′ mostly changes with from one
-    dot of a column to the next.
+    It uses every lit ray whose reflection meets the plane, ignoring the plane's edges and the
+    torch. A row is ordered if X′ changes with the same sign from every existing dot to the next. If
+    fewer than half of the rows are ordered, the result is disordered. Otherwise the first letter is
+    that of the highest ordered row in the image, with a star if at least a quarter of the rows run
+    in the other direction (the sand timer of Fig. 4-18). The second letter is the sign with which
+    Z′ mostly changes from one dot of a column to the next.
 
     Raises
     ------
@@ -92,12 +92,12 @@ def correspondence_letters(reflections: Reflections) -> str:
 
 
 def _steps(line: FloatArray) -> FloatArray:
-    """Steps from each dot of a line to the next that is there."""
+    """Steps from each dot of a line to the next existing one."""
     return np.diff(line[np.isfinite(line)])
 
 
 def _way(steps: FloatArray) -> float:
-    """Sign that all steps share, 0 where they differ, NaN where there are none."""
+    """Common sign of all steps, 0 if they differ, NaN if there are none."""
     signs = np.sign(steps)
     if signs.size == 0:
         return float("nan")

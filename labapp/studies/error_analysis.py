@@ -2,13 +2,12 @@
 
 Non-optimal configuration error CE (§8.3.1), system limitation error LE (§8.3.2) and
 reconstruction methodology error ME (§8.3.3): exact reflections of known caps are reconstructed
-with the rig and the correspondence known, so that nothing but configuration, pattern and scheme
-can err. As in the text no ray is blocked, every reflection is followed to the plane's level even
-if it would meet the pool a second time on its way, and the boundary model of IRS and ERS is the
-circle.
+with known rig and correspondence, so that only configuration, pattern and scheme cause errors. As
+in the text, no ray is blocked, every reflection is followed to the plane even if it would meet the
+pool a second time, and the boundary model of IRS and ERS is the circle.
 
-Caps exactly under the middle of the pattern are odd: there slopes are 0, and Eq. 6-1 takes the
-sign of one. So caps lie a little beside it, as they would on a bench.
+Caps exactly under the centre of the pattern are a special case: slopes are 0 there, and Eq. 6-1
+uses the sign of a slope. Therefore the caps are slightly shifted, as on a real bench.
 """
 
 from __future__ import annotations
@@ -35,13 +34,13 @@ ERRORS = ("depth", "boundary", "are_mm", "actual_are_mm")
 """CE-D, CE-B (Eq. 8-2, 8-3), computed and actual ARE (Eq. 6-3, 8-4)."""
 
 ANGLES_DEG, DISTANCES_MM = (25.0, 35.0), (25.0, 35.0)
-"""Where §8.3.2 moves the laser."""
+"""Ranges of the laser's positions in §8.3.2."""
 
 ASIDE_MM = 0.1
-"""How far at most the caps' centres are from the origin, each way: a fifth of a step of dots."""
+"""Maximum distance of the caps' centres from the origin in X and Y: a fifth of the dot spacing."""
 
 CENTERS = {"CE": 5, "LE": 1, "ME": 1}
-"""How many centres each cap has."""
+"""Number of centres of each cap."""
 
 DENSE = DotPattern(39, 39, 0.385)
 """The pattern of §8.3.3."""
@@ -56,11 +55,11 @@ TEXT = {
     ("ME", "D", "all"): (None, 0.0),
     ("ME", "B", "all"): (None, 0.0),
 }
-"""Mean and worst error that the text has, with ERS (Fig. 8-6, 8-8, 8-10)."""
+"""Mean and worst error in the text, with ERS (Fig. 8-6, 8-8, 8-10)."""
 
 
 def circle_settings(scheme: str) -> Settings:
-    """Settings with the circle as boundary model (§8.2.1); fit has a boundary of its own."""
+    """Settings with the circle as boundary model (§8.2.1); fit uses its own boundary."""
     return Settings(
         scheme=scheme,
         ers=ers.ErsSettings(boundary="circle"),
@@ -71,26 +70,26 @@ def circle_settings(scheme: str) -> Settings:
 
 
 def trace_once(pool: PoolSurface, rig: Rig) -> Reflections:
-    """Reflections as the text computes them: without second reflections on the pool."""
+    """Reflections as computed in the text: without second reflections on the pool."""
     seen = trace(pool, rig)
     return replace(seen, hits_again=np.zeros_like(seen.hits_again))
 
 
 def relative_errors(measures: Measures, cap: Pool) -> tuple[float, float]:
-    """Signed error of depth (or height) and of diameter, over the true ones (Eq. 8-2, 8-3)."""
+    """Relative error of depth (or height) and of diameter, signed (Eq. 8-2, 8-3)."""
     depth = measures.height_mm if cap.peak_mm > 0 else -measures.depth_mm
     diameter = (measures.width_mm + measures.length_mm) / 2
     return depth / abs(cap.peak_mm) - 1, diameter / cap.footprint.width_mm - 1
 
 
 def computed_are(measures: Measures) -> float:
-    """Computed ARE as in the text, mm: for IRS and ERS of their own points."""
+    """Computed ARE as in the text, mm; for IRS and ERS that of their own points."""
     own = measures.own_are_mm
     return own if np.isfinite(own) else measures.are_mm
 
 
 def errors_of(match: Match, seen: Reflections, rig: Rig, cap: Pool, scheme: str) -> FloatArray:
-    """`ERRORS` of one reconstruction, shape (4,); NaN where the scheme finds no surface."""
+    """`ERRORS` of one reconstruction, shape (4,); NaN if the scheme finds no surface."""
     try:
         made = reconstruct(match, rig, circle_settings(scheme))
         measures = measure_surface(made, match, rig)
@@ -104,23 +103,23 @@ def errors_of(match: Match, seen: Reflections, rig: Rig, cap: Pool, scheme: str)
 
 @dataclass(frozen=True)
 class ErrorSurvey(ReadOnlyArrays):
-    """Errors of the schemes on caps, with the laser at one or more places."""
+    """Errors of the schemes on caps, with the laser at one or more positions."""
 
     kind: str
     """``CE``, ``LE`` or ``ME``."""
     caps: tuple[Pool, ...]
-    """The known surfaces, n of them."""
+    """The n known surfaces."""
     schemes: tuple[str, ...]
-    """The schemes, s of them."""
+    """The s schemes."""
     errors: FloatArray
-    """`ERRORS` of each cap by each scheme, shape (n, s, 4), as fractions and mm: the least over the
-    laser's places, each on its own; NaN where no place gives a surface.
+    """`ERRORS` of each cap by each scheme, shape (n, s, 4), as fractions and mm: for each error the
+    least over the laser's positions; NaN if no position gives a surface.
     """
     lost: FloatArray
-    """How often a scheme found no surface, shape (s,)."""
+    """Number of times that a scheme found no surface, shape (s,)."""
 
     def of(self, scheme: str, error: str, surface: str = "all") -> FloatArray:
-        """One of `ERRORS` of the caps: ``convex``, ``concave`` or ``all``."""
+        """One of `ERRORS` for the ``convex``, the ``concave`` or ``all`` caps."""
         sign = {"convex": 1, "concave": -1, "all": 0}[surface]
         chosen = [sign * cap.peak_mm >= 0 for cap in self.caps]
         return self.errors[chosen, self.schemes.index(scheme), ERRORS.index(error)]
@@ -134,17 +133,17 @@ def survey(
     progress: Progress | None = None,
     workers: int | None = None,
 ) -> ErrorSurvey:
-    """Errors of the schemes on the caps of §8.3.1.
+    """Compute the errors of the schemes on the caps of §8.3.1.
 
     Parameters
     ----------
     kind
-        ``CE``: the laser where it stood, 31.14°, 31.48 mm. ``LE``: the least error of all with the
+        ``CE``: the laser at its actual position, 31.14°, 31.48 mm. ``LE``: the least error with the
         laser at 25° to 35° and 25 to 35 mm. ``ME``: the same with 39 × 39 rays, 0.385° apart.
     step
-        Of the laser's places, degrees and mm.
+        Step between the laser's positions, degrees and mm.
     caps
-        The surfaces; None for the 28 of §8.3.1, each at its `CENTERS`.
+        The surfaces. None: the 28 of §8.3.1, each at its `CENTERS`.
     """
     caps, schemes = tuple(caps or aside(caps_8_3_1(), CENTERS[kind])), tuple(schemes)
     pattern = DENSE if kind == "ME" else DotPattern()
@@ -159,7 +158,7 @@ def survey(
 
 
 def aside(caps: Sequence[Pool], centers: int) -> tuple[Pool, ...]:
-    """Each cap at a number of centres near the origin (`ASIDE_MM`), the same ones each time."""
+    """Each cap at a number of centres near the origin (`ASIDE_MM`), the same at each call."""
     rng = np.random.default_rng(83)
     at = rng.uniform(-ASIDE_MM, ASIDE_MM, (len(caps), centers, 2)).tolist()
     return tuple(
@@ -170,7 +169,7 @@ def aside(caps: Sequence[Pool], centers: int) -> tuple[Pool, ...]:
 
 
 def laser_places(step: float) -> list[Laser]:
-    """Places of the laser in §8.3.2, ``step`` degrees and mm apart, both ends included."""
+    """Positions of the laser in §8.3.2, ``step`` degrees and mm apart, including both ends."""
     angles, distances = (
         np.linspace(low, high, max(round((high - low) / step), 1) + 1)
         for low, high in (ANGLES_DEG, DISTANCES_MM)
@@ -186,7 +185,7 @@ def _errors(task: tuple[Pool, Rig, tuple[str, ...]]) -> FloatArray:
 
 
 def error_table(surveys: Sequence[ErrorSurvey]) -> Table:
-    """CE, LE and ME of depth and boundary: mean and worst, beside the text's with ERS; %."""
+    """CE, LE and ME of depth and boundary: mean and worst, and those of the text with ERS; %."""
     rows = []
     for one in surveys:
         for letter, error in (("D", "depth"), ("B", "boundary")):
@@ -208,7 +207,7 @@ def error_table(surveys: Sequence[ErrorSurvey]) -> Table:
 
 
 def are_table(surveys: Sequence[ErrorSurvey]) -> Table:
-    """Computed and actual ARE (Eq. 6-3, 8-4; Fig. 8-7, 8-9, 8-11): mean, and their difference."""
+    """Mean computed and actual ARE (Eq. 6-3, 8-4; Fig. 8-7, 8-9, 8-11), and their difference."""
     rows = []
     for one in surveys:
         for surface in ("convex", "concave"):

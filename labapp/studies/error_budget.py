@@ -1,4 +1,4 @@
-"""Uncertainty of a pool's sizes by the uncertainty of its set-up, for any scheme."""
+"""Uncertainty of a pool's sizes due to the uncertainty of its set-up, for any scheme."""
 
 from __future__ import annotations
 
@@ -18,26 +18,25 @@ from labapp.studies.parameter_deviation import move
 
 @dataclass(frozen=True)
 class Contribution(ReadOnlyArrays):
-    """What one quantity's ± does to the sizes."""
+    """Effect of the ± of one quantity on the sizes."""
 
     name: str
     sigma: float
     unit: str
     assumed: bool
-    """Whether it is assumed, because none was entered."""
+    """Whether the ± is assumed because none was entered."""
     change: FloatArray
-    """What each of `SIZES` changes by with the quantity, shape (6,); NaN where there is then no
-    surface.
+    """Change of each of `SIZES` with the quantity, shape (6,); NaN if there is no surface then.
     """
 
 
 def setup_budget(
     measurement: Measurement, setup: Setup, settings: Settings
 ) -> tuple[Contribution, ...]:
-    """Reconstruct a measured frame anew with each quantity of the set-up off by its ± either way.
+    """Reconstruct a measured frame with each quantity of the set-up changed by its ± either way.
 
-    Which ray made which dot stays as it was found. Half the difference is what a size changes by,
-    as in `core.surface.setup_uncertainty`, which the default scheme has in its own ±.
+    The assignment of rays to dots is kept. The change of a size is half the difference, as in
+    `core.surface.setup_uncertainty`, which is part of the default scheme's own ±.
     """
     match, known = measurement.match, setup.rig.uncertainty
     if match is None or measurement.measures is None:
@@ -68,7 +67,7 @@ def setup_budget(
 
 
 def total(own: FloatArray, contributions: Sequence[Contribution], rig: Rig) -> FloatArray:
-    """± of sizes, shape (6,), by what they have of their own and the set-up; NaN counts as 0."""
+    """± of sizes, shape (6,), from their own ± and that of the set-up; NaN counts as 0."""
     own = np.nan_to_num(own)
     if rig.uncertainty is None or not contributions:
         return own

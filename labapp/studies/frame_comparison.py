@@ -1,9 +1,9 @@
 """IRS on one frame by algorithm, correspondence and base height (Fig. 6-10, 6-13, 6-16).
 
-Beside them the correspondence that the shape of the reflected rows allows (§7.1).
+In addition, the correspondence allowed by the shape of the reflected rows (§7.1).
 
-The dots keep their rows and columns; each correspondence gives them other rays. Dots whose rays lie
-beyond the pattern are left out. Errors are those of the scheme's own points, step 4 of §6.3.1.
+The dots keep their rows and columns; each correspondence assigns them other rays. Dots whose rays
+lie beyond the pattern are left out. Errors are those of the scheme's own points, step 4 of §6.3.1.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ COLUMNS = ("are_mm", "mre_mm", "are_inner_mm", "mre_inner_mm")
 
 
 def with_orientation(match: Match, rig: Rig, orientation: Orientation) -> Match:
-    """The same dots with the rays of another correspondence, mirrored about the marker's.
+    """The same dots with the rays of another correspondence, mirrored about the marker's ray.
 
-    No ray is a witness then: which of the others came back is not known.
+    No ray is a witness then, because it is unknown which of the other rays were reflected.
     """
     center = np.array(rig.pattern.marker or rig.pattern.reference)
     ray = center + (match.ray - center) * ways(match.orientation) * ways(orientation)
@@ -46,9 +46,9 @@ def with_orientation(match: Match, rig: Rig, orientation: Orientation) -> Match:
 
 
 def shape_table(match: Match) -> Table:
-    """Correspondences that the picture's rows allow (§7.1), and the one of least residual.
+    """Correspondences allowed by the rows in the picture (§7.1), and that of least residual.
 
-    Residuals are those of the surface fitted with each correspondence that was tried.
+    The residuals are those of the surface fitted with each tried correspondence.
     """
     shapes = match_row_shapes(match)
     allowed = ALLOWED[shapes.shape] if shapes.shape else ()
@@ -84,7 +84,7 @@ def shape_table(match: Match) -> Table:
 def comparison_tables(match: Match, rig: Rig) -> tuple[Table, Table]:
     """Reflection errors of a frame, by algorithm (Fig. 6-10) and by base height (Fig. 6-13, 6-16).
 
-    A row a correspondence and algorithm or base height; empty cells where there is no surface.
+    One row per correspondence and algorithm or base height; empty cells if there is no surface.
     """
     edge: list[tuple[Cell, ...]] = []
     one: list[tuple[Cell, ...]] = []

@@ -1,7 +1,7 @@
 """Image processing error and measurement error: frames of known surfaces, measured (§8.1, §8.2).
 
-Frames are rendered and go through the whole measurement, from the dots on; what exact reflections
-of the same surface give by the same scheme is what is left when the image processing is perfect.
+Frames are rendered and go through the whole measurement, beginning with the dots. Exact reflections
+of the same surface show the errors of the same scheme with perfect image processing.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ TACK_RIG = Rig(
     Electrode(5.0),
     ImagingPlane.vertical(40.69, 50.8, 0.0),
 )
-"""Its set-up. The text gives neither the electrode's height nor O′: here it is that of Table 4-1,
-and the 4″ plane stands on the paper, its middle opposite the torch."""
+"""Set-up of the thumb tack. The text gives neither the electrode's height nor O′: the height is
+taken from Table 4-1, and the 4″ plane stands on the paper, its centre opposite the torch."""
 
 BENCH = Rig(
     Laser(31.14, 31.48),
@@ -53,7 +53,7 @@ BENCH = Rig(
     Electrode(5.0),
     ImagingPlane.vertical(50.0, 50.8, 0.0),
 )
-"""The set-up of §8.3.1, torch and 4″ plane in place."""
+"""The set-up of §8.3.1 with torch and 4″ plane."""
 
 VIEW = CameraView.rolled((24.0, 500.0), 4.7, x_axis_mm=50.8, z_axis_mm=50.8)
 VIEW = replace(VIEW, width_px=526, height_px=526)
@@ -62,15 +62,15 @@ VIEW = replace(VIEW, width_px=526, height_px=526)
 LOOK = Look(dot_peak=60.0)
 
 WRONG_PX = 3.0
-"""A dot farther from where its ray's dot is has the wrong ray."""
+"""A dot farther than this from the true dot of its ray has the wrong ray."""
 
 TACK_TEXT = {"irs": (0.1777, 0.014903, 0.220807), "ers": (0.0912, 0.014903, 0.18815)}
-"""Height error, diameter error, and ARE in mm that §8.2 has."""
+"""Height error, diameter error, and ARE in mm, from §8.2."""
 
 
 @dataclass(frozen=True)
 class FrameErrors(ReadOnlyArrays):
-    """What one rendered frame gave, by each scheme; s of them."""
+    """Results for one rendered frame by each of s schemes."""
 
     status: str
     errors: FloatArray
@@ -78,20 +78,20 @@ class FrameErrors(ReadOnlyArrays):
     without a surface.
     """
     exact: FloatArray
-    """The same of exact reflections, shape (s, 3)."""
+    """The same for exact reflections, shape (s, 3)."""
     off_px: FloatArray
-    """Distance of each matched dot to where it truly is, shape (n,)."""
+    """Distance of each matched dot from its true position, shape (n,)."""
     missed: int
-    """Dots that show and were given no ray."""
+    """Number of visible dots without a ray."""
 
     @property
     def wrong(self) -> int:
-        """How many dots were given a wrong ray."""
+        """Number of dots with a wrong ray."""
         return int((self.off_px > WRONG_PX).sum())
 
 
 def axes_of(view: CameraView) -> AxisPoints:
-    """The image calibration that fits a view, by the three points of §5.1."""
+    """The image calibration of a view, by the three points of §5.1."""
     calibration = ImageCalibration.from_three_points(
         view.origin_px, view.x_axis_px, view.x_axis_mm, view.z_axis_px, view.z_axis_mm
     )
@@ -99,7 +99,7 @@ def axes_of(view: CameraView) -> AxisPoints:
 
 
 def exactly_seen(cap: Pool, rig: Rig) -> KnownPool:
-    """A known pool with its dots where they truly are; those that miss the plane are lost."""
+    """A known pool with its dots at their true positions; those that miss the plane are lost."""
     return KnownPool(cap, exact_match(trace_once(cap, rig), rig), rig, nominal(axes_of(VIEW)))
 
 
@@ -117,7 +117,7 @@ def frame_errors(
     Returns
     -------
     list[list[FrameErrors]]
-        Of each surface, of each frame.
+        Errors of each frame of each surface.
     """
     tasks = [(cap, rig, k, tuple(schemes)) for cap in caps for k in range(frames)]
     found = in_parallel(_frame_errors, tasks, "frames", progress, workers)
@@ -125,7 +125,7 @@ def frame_errors(
 
 
 def rendered(cap: Pool, rig: Rig, number: int) -> Frame:
-    """One of the frames of a known surface, the same each time."""
+    """Render one of the frames of a known surface; it is the same at each call."""
     seed = [round(1000 * cap.footprint.width_mm), round(1000 * abs(cap.peak_mm)), number]
     return render(trace_once(cap, rig), VIEW, LOOK, np.random.default_rng(seed))
 
@@ -155,7 +155,7 @@ def _sizes(known: KnownPool, scheme: str) -> FloatArray:
 
 
 def _off(seen: Measurement, frame: Frame) -> tuple[FloatArray, int]:
-    """Distance of the matched dots to the truth, px, and how many shown dots have no ray."""
+    """Distance of the matched dots from the truth, px, and number of visible dots without a ray."""
     if seen.match is None or seen.dots is None:
         return np.zeros(0), int(frame.shown.sum())
     found = seen.dots.image_px[seen.match.dot]
@@ -165,7 +165,7 @@ def _off(seen: Measurement, frame: Frame) -> tuple[FloatArray, int]:
 
 
 def thumb_tack_table(frames: Sequence[FrameErrors], schemes: Sequence[str] = SCHEMES) -> Table:
-    """Measurement error of §8.2, of exact reflections and of rendered frames, beside the text's."""
+    """Measurement error of §8.2: exact reflections, rendered frames, and values of the text."""
     rows = []
     for k, scheme in enumerate(schemes):
         exact = np.abs(frames[0].exact[k])
@@ -199,7 +199,7 @@ def image_error_table(
     found: Sequence[Sequence[FrameErrors]],
     schemes: Sequence[str] = SCHEMES,
 ) -> Table:
-    """Image processing error: what frames add to what exact reflections give; and the dots."""
+    """Image processing error: difference between rendered frames and exact reflections; dots."""
     rows = []
     for surface, sign in (("convex", 1), ("concave", -1)):
         frames = [

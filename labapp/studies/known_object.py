@@ -1,6 +1,6 @@
 """Measurement error on an object of known size in place of the pool (§8.2).
 
-Its boundary is a circle, for the schemes that take a boundary model (§8.2.1).
+Its boundary is a circle, for the schemes with a boundary model (§8.2.1).
 """
 
 from __future__ import annotations
@@ -20,35 +20,35 @@ LARGEST_MM = 30.0
 
 
 def known_cap(diameter_mm: float, height_mm: float) -> Pool:
-    """Spherical cap of a diameter and a height, mm; the height of a hollow is negative.
+    """Spherical cap of a diameter and a height, mm; a concave cap has a negative height.
 
     Raises
     ------
     InputError
-        If there is no such cap.
+        If no cap can have this size.
     """
     if not 1.0 <= diameter_mm <= LARGEST_MM:
         raise InputError("--known-object", "diameter", diameter_mm, f"1 to {LARGEST_MM:g} mm")
     if not 0.01 <= abs(height_mm) <= diameter_mm / 4:
-        expected = f"0.01 to {diameter_mm / 4:g} mm, a quarter of the diameter; a hollow below 0"
+        expected = f"0.01 to {diameter_mm / 4:g} mm, a quarter of the diameter; negative if concave"
         raise InputError("--known-object", "height", height_mm, expected)
     return spherical_cap(diameter_mm, height_mm)
 
 
 def known_object_table(match: Match, rig: Rig, cap: Pool) -> Table:
-    """Measurement error ME by every scheme (Eq. 8-1), as §8.2.2 has it for the thumb tack.
+    """Measurement error ME by every scheme (Eq. 8-1), as in §8.2.2 for the thumb tack.
 
     Parameters
     ----------
     match, rig
         The object's dots with their rays, and the bench.
     cap
-        The object as it is (`known_cap`).
+        The true object (`known_cap`).
 
     Returns
     -------
     Table
-        A row each scheme; empty cells where it finds no surface.
+        One row per scheme; empty cells if it finds no surface.
     """
     rows: list[tuple[Cell, ...]] = []
     diameter_mm, height_mm = cap.footprint.width_mm, cap.peak_mm

@@ -1,9 +1,9 @@
-"""Parameter deviation error: what a bench is not exactly known to be, in the sizes (§8.1).
+"""Parameter deviation error: effect of the uncertainty of a bench on the sizes (§8.1).
 
-The quantities of the bench are moved by their standard uncertainties and the same dots are
-reconstructed anew: one at a time (the law of propagation, JCGM 100:2008, 5.1), and all at once,
-drawn from normal distributions (Monte Carlo, JCGM 101:2008, 5 to 7). Which ray made which dot
-stays as it was found.
+The quantities of the bench are changed by their standard uncertainties and the same dots are
+reconstructed again: one quantity at a time (the law of propagation, JCGM 100:2008, 5.1), and all
+together, drawn from normal distributions (Monte Carlo, JCGM 101:2008, 5 to 7). The assignment of
+rays to dots is kept.
 """
 
 from __future__ import annotations
@@ -44,24 +44,24 @@ NOMINAL = {
     one.sigma_key: 0.1 if one.sigma_key.removesuffix("_sigma") in _CALIBRATED_IN_THE_TEXT else 0.0
     for one in QUANTITIES
 }
-"""Standard uncertainties by `Quantity.sigma_key`: 0.1 mm, 0.1° and 0.1 px of what the text
-calibrates (§5, Appendix I), and nothing else off."""
+"""Standard uncertainties by `Quantity.sigma_key`: 0.1 mm, 0.1° and 0.1 px for the quantities
+calibrated in the text (§5, Appendix I), and 0 for all others."""
 
 COVERAGE = 0.95
 
 DRAWS, SEED = 400, 2008
-"""How many Monte Carlo draws, and where they begin."""
+"""Number of Monte Carlo draws, and their seed."""
 
 
 def nominal(axes: AxisPoints) -> RigUncertainty:
-    """The uncertainty of a bench that is known to `NOMINAL`."""
+    """The uncertainty of a bench with the standard uncertainties `NOMINAL`."""
     return RigUncertainty(axes, *covariance_of(NOMINAL))
 
 
 def move(match: Match, rig: Rig, axes: AxisPoints, offset: FloatArray) -> tuple[Match, Rig]:
-    """The match and the rig if the bench's quantities were off by an offset, shape (q,).
+    """The match and the rig with the bench's quantities changed by an offset, shape (q,).
 
-    Which ray made which dot stays as it is.
+    The assignment of rays to dots is kept.
     """
     dots = moved_dots(match.plane_mm, rig, axes, offset)
     return replace(match, plane_mm=dots), moved_rig(rig, offset)
@@ -69,16 +69,16 @@ def move(match: Match, rig: Rig, axes: AxisPoints, offset: FloatArray) -> tuple[
 
 @dataclass(frozen=True)
 class ParameterDeviation(ReadOnlyArrays):
-    """What a bench's uncertainties do to height (or depth) and diameter of a pool."""
+    """Effect of a bench's uncertainties on height (or depth) and diameter of a pool."""
 
     uncertainty: RigUncertainty
     contribution: FloatArray
-    """What each of `QUANTITIES` changes, over the true size, by its standard uncertainty: height,
-    diameter; shape (q, 2).
+    """Relative change of height and diameter by the standard uncertainty of each of `QUANTITIES`,
+    shape (q, 2).
     """
     draws: FloatArray
-    """Relative errors of height and diameter of every draw, less those of the undisturbed bench,
-    shape (m, 2); NaN where there was no surface.
+    """Relative errors of height and diameter of every draw minus those of the undisturbed bench,
+    shape (m, 2); NaN if there was no surface.
     """
 
     @property
@@ -100,13 +100,13 @@ class ParameterDeviation(ReadOnlyArrays):
 
 @dataclass(frozen=True)
 class KnownPool:
-    """A known pool, and what is measured of it with what."""
+    """A known pool, its measured dots, and the bench."""
 
     cap: Pool
     match: Match
     rig: Rig
     uncertainty: RigUncertainty
-    """Its dots, the bench, and how well that is known."""
+    """The pool's dots, the bench, and the bench's uncertainty."""
 
 
 def parameter_deviation(
@@ -121,8 +121,8 @@ def parameter_deviation(
     Parameters
     ----------
     draws
-        How many Monte Carlo draws. The standard deviation of m draws is itself known to about
-        1/√(2m): 400 give 3.5 %.
+        Number of Monte Carlo draws. The standard deviation of m draws has a relative uncertainty of
+        about 1/√(2m): 3.5 % for 400 draws.
     """
     uncertainty, count = known.uncertainty, len(QUANTITIES)
     uncertain = np.flatnonzero(uncertainty.sigma)
@@ -139,7 +139,7 @@ def parameter_deviation(
 
 
 def moved_errors(task: tuple[KnownPool, FloatArray, str]) -> FloatArray:
-    """Relative errors of height and diameter, shape (2,), with the bench off by an offset."""
+    """Relative errors of height and diameter, shape (2,), with the bench changed by an offset."""
     known, offset, scheme = task
     match, rig = move(known.match, known.rig, known.uncertainty.axes, offset)
     try:
@@ -150,7 +150,7 @@ def moved_errors(task: tuple[KnownPool, FloatArray, str]) -> FloatArray:
 
 
 def deviation_table(found: dict[tuple[str, str], ParameterDeviation]) -> Table:
-    """Contribution of each quantity, their sum and the Monte Carlo's; by (surface, scheme)."""
+    """Contribution of each quantity, their sum and the Monte Carlo result by (surface, scheme)."""
     rows = []
     for (surface, scheme), one in found.items():
         for quantity, sigma, (height, diameter) in zip(

@@ -25,7 +25,7 @@ STYLES = (
     *(("#1b7a3d", "^"), ("#1b4f8a", "o"), ("#c05a00", "s")),
     *(("#7a3fa0", "D"), ("#b01030", "v"), ("#5f6b00", "P")),
 )
-"""Colours and markers of the schemes, in their order; then once more."""
+"""Colours and markers of the schemes, in their order; then repeated."""
 
 STYLE_OF = dict(zip(SCHEMES, itertools.cycle(STYLES), strict=False))
 COLOURS = {name: colour for name, (colour, _) in STYLE_OF.items()}
@@ -46,7 +46,7 @@ OPEN_PLANE_MM = 1e4
 
 
 def positioning_picture(rig: Rig, width_mm: float, length_mm: float, height_mm: float) -> Figure:
-    """Fig. 4-7 … 4-9: the central rays by way of a flat, a convex and a concave pool, L1 and L2."""
+    """Fig. 4-7 … 4-9: the central rays via a flat, a convex and a concave pool, L1 and L2."""
     with rc_context(STYLE):
         figure = new_figure(INCHES * 0.7, 6.4)
         plots = figure.subplots(3, sharex=True, sharey=True)
@@ -88,7 +88,7 @@ def _draw_side(plot: Any, view: SideView) -> None:
 
 
 def coverage_picture(placements: Sequence[Coverage]) -> Figure:
-    """Fig. 4-11: the dots on the plane at several distances of it."""
+    """Fig. 4-11: the dots on the plane at several distances of the plane."""
     with rc_context(STYLE):
         figure = new_figure(INCHES, INCHES)
         for plot, one in zip(figure.subplots(2, 2).ravel(), placements, strict=True):
@@ -103,9 +103,9 @@ def coverage_picture(placements: Sequence[Coverage]) -> Figure:
 
 
 def correspondence_picture(seen: Reflections, title: str) -> Figure:
-    """Fig. 4-17, 4-18, 4-20: reflected dots, and where their rays meet the pool.
+    """Fig. 4-17, 4-18, 4-20: reflected dots, and the points where their rays meet the pool.
 
-    A colour a row of rays, a marker by column in turns; thin lines join neighbours in a row.
+    One colour per row of rays, alternating markers by column; thin lines join neighbours in a row.
     """
     markers = "os^vD<>p*"
     with rc_context(STYLE):
@@ -121,29 +121,32 @@ def correspondence_picture(seen: Reflections, title: str) -> Figure:
                     plot.plot(*places[column], marker, ms=3, color=colour, mew=0)
         plane.set(xlabel="X′ − s (mm)", ylabel="Z (mm)", title="dots on the imaging plane")
         pool.set(xlabel="X (mm)", ylabel="Y (mm)", title="rays on the pool", aspect="equal")
-        for axis in (plane.xaxis, plane.yaxis):  # from the torch's middle and the work piece
+        for axis in (
+            plane.xaxis,
+            plane.yaxis,
+        ):  # measured from the torch's centre and the work piece
             axis.set_major_formatter(lambda value, _: f"{value - OPEN_PLANE_MM:g}")
         figure.suptitle(title, fontsize=8)
         return figure
 
 
 def error_picture(survey: ErrorSurvey) -> Figure:
-    """Fig. 8-6, 8-8, 8-10: errors of depth and boundary over the caps' diameter."""
+    """Fig. 8-6, 8-8, 8-10: errors of depth and boundary against the caps' diameter."""
     rows = (("depth", f"{survey.kind}-D (%)", 100.0), ("boundary", f"{survey.kind}-B (%)", 100.0))
     return _over_caps(survey, rows)
 
 
 def are_picture(survey: ErrorSurvey) -> Figure:
-    """Fig. 8-7, 8-9, 8-11: computed and actual ARE over the caps' diameter."""
+    """Fig. 8-7, 8-9, 8-11: computed and actual ARE against the caps' diameter."""
     return _over_caps(
         survey, (("are_mm", "computed ARE (mm)", 1.0), ("actual_are_mm", "actual ARE (mm)", 1.0))
     )
 
 
 def _over_caps(survey: ErrorSurvey, rows: Sequence[tuple[str, str, float]]) -> Figure:
-    """A plot for each error and each kind of surface; full lines D = B/20, dashed D = B/10.
+    """One plot per error and kind of surface; solid lines D = B/20, dashed lines D = B/10.
 
-    Lines join the means over the centres of a cap; bars reach from the least to the largest.
+    Lines join the means over the centres of a cap; bars extend from the least to the largest value.
     """
     size = np.array([(cap.footprint.width_mm, cap.peak_mm) for cap in survey.caps])
     with rc_context(STYLE):
@@ -185,16 +188,16 @@ def _over_caps(survey: ErrorSurvey, rows: Sequence[tuple[str, str, float]]) -> F
 
 
 def _capped(plot: Any, survey: ErrorSurvey, error: str, scale: float) -> None:
-    """Let ERS and fit be read where IRS is far off."""
+    """Limit the axis so that ERS and fit are legible where the error of IRS is large."""
     shown = [survey.of(scheme, error) for scheme in survey.schemes if scheme != "irs"]
     most = max((float(np.nanmax(values)) for values in shown), default=np.nan) * scale
     if np.isfinite(most) and plot.get_ylim()[1] > 2 * most:
         plot.set_ylim(0, 1.8 * most)
-        plot.annotate("IRS goes on above", (0.02, 0.92), xycoords="axes fraction", fontsize=6)
+        plot.annotate("IRS continues above", (0.02, 0.92), xycoords="axes fraction", fontsize=6)
 
 
 def bars_picture(names: Sequence[str], values: dict[str, FloatArray], label: str) -> Figure:
-    """Contributions of several quantities as bars, a colour for each of `COLOURS`."""
+    """Contributions of several quantities as bars, in the colours of `COLOURS`."""
     with rc_context(STYLE):
         figure = new_figure(INCHES, 0.32 * len(names) + 0.8)
         plot = figure.subplots()
@@ -211,7 +214,7 @@ def bars_picture(names: Sequence[str], values: dict[str, FloatArray], label: str
 
 
 def frame_picture(frame: Frame) -> Figure:
-    """A rendered frame as a negative, rings where its dots truly are."""
+    """A rendered frame as a negative, with rings at the true positions of its dots."""
     with rc_context(STYLE):
         figure = new_figure(INCHES / 2, INCHES / 2 * frame.image.shape[0] / frame.image.shape[1])
         plot = figure.subplots()

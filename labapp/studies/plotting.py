@@ -1,4 +1,4 @@
-"""How pictures for paper look: black on white, small, the same bytes each time."""
+"""Style of pictures for print: black on white, small, and reproducible byte by byte."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 INCHES = 6.7
-"""Width of a page's text."""
+"""Width of the text on a page."""
 
 STYLE = {
     "font.family": "DejaVu Sans",
@@ -19,10 +19,10 @@ STYLE = {
     "axes.edgecolor": "0.3",
     "lines.linewidth": 0.8,
     "savefig.facecolor": "white",
-    # The same picture is the same file.
+    # Equal pictures give equal files.
     "svg.hashsalt": "labapp",
 }
-"""Drawn and written within ``rc_context`` of it."""
+"""Parameters for ``rc_context``, in which pictures are drawn and written."""
 
 
 def new_figure(width: float, height: float) -> Figure:
@@ -33,7 +33,7 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def as_bytes(figure: Figure, kind: str = "png", dpi: int = 120) -> bytes:
-    """A figure as PNG or SVG, without date or the program that drew it: the same each time."""
+    """A figure as PNG or SVG without date or program name, so that the result is reproducible."""
     content = io.BytesIO()
     with rc_context(STYLE):
         metadata = {"Software": None} if kind == "png" else {"Date": None}
@@ -42,5 +42,5 @@ def as_bytes(figure: Figure, kind: str = "png", dpi: int = 120) -> bytes:
 
 
 def row_colour(row: int) -> tuple[float, float, float]:
-    """A colour that is dark enough on white and differs most between neighbouring rows."""
+    """Colour that is dark enough on white and differs strongly between neighbouring rows."""
     return colorsys.hsv_to_rgb(row * 0.381966 % 1, 0.9, 0.65)

@@ -1,7 +1,8 @@
 """Tables 4-1 and 4-2, L1, L2 and D1, and the coverage of the plane (§4.2.1, Fig. 4-11).
 
-What the text leaves open: the electrode's tip is at 5 mm (with its 0.5 mm Table 4-1 does not come
-out), and the 4″ plane stands on the work piece, its middle opposite the torch.
+Assumptions where the text gives no usable values: the electrode's tip is at 5 mm (the text's 0.5 mm
+does not reproduce Table 4-1), and the 4″ plane stands on the work piece, its centre opposite the
+torch.
 """
 
 from __future__ import annotations
@@ -22,14 +23,14 @@ SIZES_MM = ((2, 0.2), (2, 0.4), (3, 0.3), (3, 0.6), (4, 0.4), (4, 0.8))
 """Radius and depth of the caps of Tables 4-1 and 4-2."""
 
 DISTANCE_MM, TIP_MM = 30.0, 5.0
-"""Laser to origin (§4.2.1.3), and the height of the electrode's tip that gives these tables."""
+"""Distance from laser to origin (§4.2.1.3), and the electrode tip's height for these tables."""
 
 PLANES_MM = (30, 50, 70, 90)
 """Distances of the imaging plane of Fig. 4-11."""
 
 
 def blocking_tables() -> tuple[Table, Table]:
-    """Tables 4-1 and 4-2: `rb` where the torch blocks a reflected ray, `ib` an incident one."""
+    """Tables 4-1 and 4-2: `rb` if the torch blocks a reflected ray, `ib` for an incident one."""
     made = []
     for number, kind, sign in ((1, "convex", 1), (2, "concave", -1)):
         rows: list[tuple[Cell, ...]] = [
@@ -100,11 +101,11 @@ class Coverage(ReadOnlyArrays):
     """Dots of one placement of the imaging plane (Fig. 4-11)."""
 
     distance_mm: float
-    """Of the plane to the torch."""
+    """Distance of the plane from the torch."""
     plane_mm: FloatArray
-    """The dots, its edges ignored, IPCS, shape (n, 2), mm."""
+    """The dots, ignoring the plane's edges, IPCS, shape (n, 2), mm."""
     on_plane: BoolArray
-    """Which lie within its edges, shape (n,)."""
+    """Whether each dot is within the plane's edges, shape (n,)."""
 
 
 def coverage() -> tuple[Coverage, ...]:
@@ -118,7 +119,7 @@ def coverage() -> tuple[Coverage, ...]:
 
 
 def coverage_table(placements: tuple[Coverage, ...]) -> Table:
-    """How many dots are on the 4″ plane and how many off it."""
+    """Number of dots on the 4″ plane and off it."""
     rows = [
         (one.distance_mm, len(one.on_plane), int(one.on_plane.sum()), int((~one.on_plane).sum()))
         for one in placements

@@ -1,7 +1,7 @@
 """The error budget of a set-up: contribution of each source to the height by the fit scheme.
 
-Every part is predicted (`predicted_error`) and, beside it, simulated: pools like the expected one,
-measured from dots with noise, and with the calibrated quantities moved.
+Every part is predicted (`predicted_error`) and also simulated with pools like the expected one,
+measured from dots with noise and with changed calibrated quantities.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from labapp.studies.parameter_deviation import KnownPool, moved_errors
 from labapp.studies.tables import Table
 
 POOLS, MOVED_POOLS = 24, 6
-"""Pools simulated, and of them those with each quantity moved."""
+"""Number of simulated pools, and of those simulated with each quantity changed."""
 
 SHIFT_MM, STRETCH = 0.3, 0.05
 """Largest shift along X and Y, and relative change of size, of `similar_pool`."""
@@ -33,31 +33,31 @@ SHIFT_MM, STRETCH = 0.3, 0.05
 
 @dataclass(frozen=True)
 class Bench:
-    """A set-up, and how well it is known."""
+    """A set-up and its uncertainty."""
 
     rig: Rig
     uncertainty: RigUncertainty
-    """The set-up, and how well it is known."""
+    """The set-up and its uncertainty."""
     dot_sigma_mm: float = DOT_SIGMA_MM
-    """Standard uncertainty of a dot's place on the plane."""
+    """Standard uncertainty of a dot's position on the plane."""
 
 
 @dataclass(frozen=True)
 class SetupBudget(ReadOnlyArrays):
-    """Budget of the height of a kind of pool; m pools of it."""
+    """Budget of the height for m pools of a kind."""
 
     pool: Pool
     uncertainty: RigUncertainty
-    """The pool that is expected, and how well the bench is known."""
+    """The expected pool, and the uncertainty of the bench."""
     predicted: tuple[PredictedError, ...]
-    """The error of each of the m pools, predicted."""
+    """Predicted error of each of the m pools."""
     random: FloatArray
-    """Relative height error of each, simulated without calibration errors, shape (m,); NaN where
+    """Simulated relative height error of each pool without calibration errors, shape (m,); NaN if
     there was no surface.
     """
     parameters: FloatArray
-    """Relative change of the height by the standard uncertainty of each of `QUANTITIES`, simulated:
-    of some of the pools, shape (k, q).
+    """Simulated relative change of the height by the standard uncertainty of each of `QUANTITIES`
+    for some of the pools, shape (k, q).
     """
 
 

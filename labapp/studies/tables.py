@@ -17,18 +17,18 @@ class Table:
     name: str
     """Name of its file, without the ending."""
     caption: str
-    """One line that says what it shows, and which table or figure of the text it stands beside."""
+    """One line with the content of the table and the corresponding table or figure of the text."""
     columns: tuple[str, ...]
-    """Names of the columns, units in them."""
+    """Names of the columns, including units."""
     rows: tuple[tuple[Cell, ...], ...]
-    """Cells; None or NaN where a value is unknown."""
+    """Cells; None or NaN if a value is unknown."""
 
     def csv(self) -> str:
         """CSV with a header row; an unknown value is an empty cell."""
         return csv_text([self.columns, *([_text(cell, 6) for cell in row] for row in self.rows)])
 
     def markdown(self) -> str:
-        """The caption in bold, and the table with its columns in line."""
+        """The caption in bold, and the table with aligned columns."""
         cells = [list(self.columns), *([_text(cell, 3) for cell in row] for row in self.rows)]
         widths = [max(3, *map(len, column)) for column in zip(*cells, strict=True)]
         cells.insert(1, ["-" * width for width in widths])

@@ -455,10 +455,10 @@ class Run:
             wanted = {
                 "was unplugged": truth.lost,
                 "it is back after": truth.lost,
-                "not whole, left out": truth.broken,
+                "incomplete, discarded": truth.broken,
             }
             # The disk of a busy computer stalls of itself, too.
-            least = {"MB wait in memory": self.stalls, "writing has caught up": self.stalls}
+            least = {"MB are queued in memory": self.stalls, "writing has caught up": self.stalls}
             found = {words: how_many(told, words) for words in (*wanted, *least)}
             right = all(found[each] == count for each, count in wanted.items())
             right &= all(found[each] >= count for each, count in least.items())

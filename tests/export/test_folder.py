@@ -546,7 +546,7 @@ def test_a_full_disk_leaves_the_earlier_export(tmp_path: Path, kind: str) -> Non
     assert (done.returncode, done.stderr) == (0, "")
     told, state = done.stdout.splitlines()
     assert "export: File too large" in told
-    assert "expected a folder that can be written, with room on its disk" in told
+    assert "expected a writable folder with enough disk space" in told
     assert state == "[] ['out']"
 
 

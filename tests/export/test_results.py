@@ -275,7 +275,7 @@ def test_a_link_is_not_followed(out: Path, writer: Writer) -> None:
 def test_a_folder_that_cannot_be_made_is_refused(tmp_path: Path, writer: Writer) -> None:
     (tmp_path / "file").write_text("")
     for folder in (tmp_path / "file", tmp_path / "file" / "below"):
-        with pytest.raises(InputError, match="expected a folder that can be written"):
+        with pytest.raises(InputError, match="expected a writable folder with enough disk space"):
             writer(folder)
 
 
@@ -366,7 +366,7 @@ def test_a_limit_of_the_system_stops_the_run_between_frames(out: Path) -> None:
     )
     measures, dots = table(out / "measures.csv"), table(out / "dots.csv")
     assert len(measures) > 5
-    assert f"the {len(measures)} frames before are whole" in done.stdout
+    assert f"the {len(measures)} previous frames are complete" in done.stdout
     assert len(dots) == 40 * len(measures)
     assert all(None not in row.values() for row in dots)
     assert (out / "dots.csv").read_text().endswith("auto\n")

@@ -114,7 +114,7 @@ def test_times_that_do_not_grow_give_way_to_the_frame_rate(tmp_path: Path) -> No
     path = write_cine(tmp_path / "run.cine", GREY_8[:3], times=[5.0, 5.2, 5.1], FrameRate=100)
     with open_source(path) as source:
         assert [frame.time_s for frame in source] == [0, 0.01, 0.02]
-        assert "time stamps do not grow" in source.warnings[0]
+        assert "time stamps do not increase" in source.warnings[0]
 
 
 def test_a_rate_that_is_not_said_is_that_of_the_times(tmp_path: Path) -> None:
@@ -143,7 +143,7 @@ def test_raw_colour_and_turned_pictures_are_said(tmp_path: Path) -> None:
         bayer, turned = source.warnings
         np.testing.assert_array_equal(source.frame(0).image, GREY_12[0])
     assert "raw colour (Bayer)" in bayer
-    assert "flipped or turned" in turned
+    assert "flipped or rotated" in turned
 
 
 def test_a_recording_cut_off_gives_its_whole_frames(tmp_path: Path) -> None:
@@ -152,12 +152,12 @@ def test_a_recording_cut_off_gives_its_whole_frames(tmp_path: Path) -> None:
     path.write_bytes(content[: -(14 * 24 + 8) - 1])
     with open_source(path) as source:
         assert source.warnings == (
-            "run.cine ends early: its header says 5 frames, 3 of them whole",
+            "run.cine ends early: its header says 5 frames, 3 of them complete",
         )
         np.testing.assert_array_equal([frame.image for frame in source], GREY_8[:3])
         assert source.frame(2).time_s == 2
     path.write_bytes(content[: -5 * (14 * 24 + 8)])
-    with pytest.raises(InputError, match="frames: not one that is whole"):
+    with pytest.raises(InputError, match="frames: no complete one"):
         open_source(path)
 
 

@@ -247,7 +247,7 @@ def test_a_device_that_does_not_tell_what_it_sends_is_left_out_when_learning() -
         threading.Event(), lambda: [PCSENSOR, INFINITY], lambda i: devices[i.path], told.extend
     )
     assert found == Learned(INFINITY, 1)
-    assert told == ["PCsensor FootSwitch cannot be listened to: get_report_descriptor failed"]
+    assert told == ["PCsensor FootSwitch cannot be read: get_report_descriptor failed"]
 
 
 def test_where_nothing_can_be_learned_it_is_said_why() -> None:

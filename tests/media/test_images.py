@@ -199,7 +199,7 @@ def test_half_an_image_is_refused(
     path = save(tmp_path / f"frame.{suffix}", GREY)
     content = path.read_bytes()
     path.write_bytes(content[: len(content) // 2])
-    with pytest.raises(InputError, match="expected a whole image"):
+    with pytest.raises(InputError, match="expected a complete image"):
         open_source(path)
     assert capfd.readouterr() == ("", "")
 
@@ -298,7 +298,7 @@ def test_what_is_no_source_is_refused(tmp_path: Path) -> None:
     for path, said in [
         (empty, "no image or recording in it; expected a folder of images"),
         (nothing, "0 bytes; expected an image or a video"),
-        (text, "cannot be decoded; expected a whole image"),
+        (text, "cannot be decoded; expected a complete image"),
         (tmp_path / "missing.png", "No such file or directory; expected an image, a folder"),
         (text / "below.png", "Not a directory"),
     ]:

@@ -83,12 +83,12 @@ def test_an_archive_may_give_the_times(tmp_path: Path, write: object) -> None:
 @pytest.mark.parametrize(
     ("arrays", "said"),
     [
-        ({"a": GREY, "b": GREY}, "arrays: a, b; expected a .npz that holds"),
+        ({"a": GREY, "b": GREY}, "arrays: a, b; expected a .npz with an array"),
         ({}, "arrays: none"),
         ({"frames": GREY[0]}, r"shape: \(9, 13\)"),
-        ({"frames": GREY, "time_s": np.arange(5)}, "time_s: shape .*; expected 6 times"),
-        ({"frames": GREY, "time_s": np.zeros(6)}, "expected 6 times that grow"),
-        ({"frames": GREY, "time_s": np.zeros((6, 1))}, "a time for every frame"),
+        ({"frames": GREY, "time_s": np.arange(5)}, "time_s: shape .*; expected 6 increasing times"),
+        ({"frames": GREY, "time_s": np.zeros(6)}, "expected 6 increasing times"),
+        ({"frames": GREY, "time_s": np.zeros((6, 1))}, "one for every frame"),
         ({"frames": GREY, "frame_rate_hz": -2.0}, "frame_rate_hz: -2.0"),
         ({"frames": GREY, "frame_rate_hz": np.arange(2.0)}, "expected one number"),
         ({"frames": GREY, "frame_rate_hz": np.array("x")}, "type: .*an array of numbers"),
@@ -194,7 +194,9 @@ def test_a_stack_cut_off_gives_its_whole_frames(tmp_path: Path) -> None:
     content = path.read_bytes()
     path.write_bytes(content[: 128 + 117 * 4 + 50])
     with open_source(path) as source:
-        assert source.warnings == ("run.npy ends early: its header says 6 frames, 4 of them whole",)
+        assert source.warnings == (
+            "run.npy ends early: its header says 6 frames, 4 of them complete",
+        )
         np.testing.assert_array_equal([frame.image for frame in source], GREY[:4])
     path.write_bytes(content[:200])
     with pytest.raises(InputError, match="72 bytes of levels; expected 117 bytes or more"):

@@ -80,7 +80,7 @@ def test_cut_off_anywhere_it_has_all_frames_before(tmp_path: Path, codec: Codec)
             assert len(video) == whole
             for k in range(whole):
                 assert np.array_equal(video.frame(k).image, frames[k])
-            cut_off = "cut.nut ends early: its last frame is cut off"
+            cut_off = "cut.nut ends early: its last frame is truncated"
             assert video.warnings in ((), (cut_off,))
             # Of some cuts nothing is left that a frame could be told to have begun.
             assert video.warnings or cut - sizes[whole - 1] < LEAST

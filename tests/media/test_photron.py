@@ -90,8 +90,8 @@ def test_a_recording_cut_off_gives_its_whole_frames(tmp_path: Path) -> None:
         np.testing.assert_array_equal([frame.image for frame in source], GREY_12[:3])
         early, timeless = source.warnings
         assert source.frame(1).time_s is None
-    assert early == "run.mraw ends early: its header says 5 frames, 3 of them whole"
-    assert "gives no record rate" in timeless
+    assert early == "run.mraw ends early: its header says 5 frames, 3 of them complete"
+    assert "has no record rate" in timeless
     raw.write_bytes(content[:200])
     with pytest.raises(InputError, match="200 bytes; expected 288 bytes or more"):
         open_source(header)
@@ -113,7 +113,7 @@ def test_frames_left_out_when_saving_are_said(tmp_path: Path) -> None:
         ({"bits": 16, "colour": "Color"}, "Color Bit: 16; expected 24"),
         ({"side": "Left"}, "EffectiveBit Side: Left"),
         ({"form": "TIFF"}, "File Format: TIFF; expected MRaw"),
-        ({"bits": 10, "columns": 15, "rows": 1}, "Image Width: 15; expected columns that make"),
+        ({"bits": 10, "columns": 15, "rows": 1}, "Image Width: 15; expected rows of 10 bit levels"),
     ],
 )
 def test_what_the_header_should_say_is_named(

@@ -221,8 +221,8 @@ def test_a_disk_that_takes_nothing_is_said_while_memory_lasts(
     stalled, caught_up = said[::2], said[1::2]
     assert caught_up == ["writing has caught up"] * 2
     for words in stalled:
-        assert words.startswith("writing does not keep up, the disk has taken nothing for 0.")
-        assert words.endswith(" 0 MB wait in memory")
+        assert words.startswith("writing does not keep up, the disk has stalled for 0.")
+        assert words.endswith(" 0 MB are queued in memory")
     assert [row["what"] for row in notes(take)][1:-1] == said
     assert (take.frames, take.lost) == (next(numbers_from), 0)
 
@@ -261,7 +261,7 @@ def test_seconds_before_that_memory_does_not_hold_are_said(start: Start) -> None
         take = recorder.trigger()
     assert numbers(take) == list(range(2000 - take.frames, 2000))
     assert take.frames == 1_000_000 // (24 * 32 + 200)
-    assert heard.words().count("before the trigger are kept, not 60 s") == 1
+    assert heard.words().count("before the trigger are buffered, not 60 s") == 1
 
 
 def test_a_full_disk_is_said_and_what_is_there_is_whole(start: Start, tmp_path: Path) -> None:
@@ -279,7 +279,7 @@ def test_a_full_disk_is_said_and_what_is_there_is_whole(start: Start, tmp_path: 
     assert take.frames + take.lost == 100
     with open_source(tmp_path / "disk.nut") as video:
         assert [number_in(each.image) for each in video] == list(range(take.frames))
-    assert f"what was written is whole: {take.frames} frames" in heard.words()
+    assert f"written so far and intact: {take.frames} frames" in heard.words()
 
 
 def test_frames_that_are_not_as_the_others_are_left_out_and_said(tmp_path: Path) -> None:
@@ -296,7 +296,7 @@ def test_frames_that_are_not_as_the_others_are_left_out_and_said(tmp_path: Path)
         found = [int(each.image[0, 0]) - 100 for each in video]
         assert found == [k for k in range(30) if k not in wrong]
         assert [video.frame(k).time_s for k in (0, 5, 6)] == pytest.approx([0, 0.05, 0.08])
-    told = [each.words for each in heard if "left out: of another size" in each.words]
+    told = [each.words for each in heard if "discarded: of another size" in each.words]
     assert sum(int(words.split()[0]) for words in told) == 3
     assert [row["what"] for row in notes(take) if row["what"] in told] == told
 

@@ -93,7 +93,9 @@ def test_a_stack_without_pages(tmp_path: Path) -> None:
         assert source.frame(3).time_s == pytest.approx(0.006)
     path.write_bytes(path.read_bytes()[: -12 * 17 * 2 - 1])
     with open_source(path) as source:
-        assert source.warnings == ("run.tif ends early: its header says 5 frames, 3 of them whole",)
+        assert source.warnings == (
+            "run.tif ends early: its header says 5 frames, 3 of them complete",
+        )
         np.testing.assert_array_equal([frame.image for frame in source], GREY_16[:3])
 
 
@@ -222,7 +224,7 @@ def test_a_palette_is_looked_up(tmp_path: Path) -> None:
     [
         ({"t259": 50000}, r"page 0 cannot be decoded \(compression ZSTD\)"),
         ({"t256": 60000}, "8 bits|bytes for"),
-        ({"t273": 10**6}, "bytes; expected a whole image: TIFF"),
+        ({"t273": 10**6}, "bytes; expected a complete image: TIFF"),
         ({"t277": 5}, "samples a pixel: 5|bytes for"),
     ],
 )
@@ -252,7 +254,7 @@ def test_a_strip_that_would_fill_the_memory_is_refused(
             open_source(sys.argv[1])
             sys.exit("it was opened")
         except InputError as error:
-            assert "more than its pages hold" in str(error)
+            assert "more data than its pages need" in str(error)
     """
     assert peak_mb(script, path) < 300
 
@@ -294,7 +296,7 @@ def test_a_chain_of_pages_cut_off_gives_those_that_are_whole(tmp_path: Path) -> 
     path.write_bytes(content[: places[3] + 20])
     with open_source(path) as source:
         np.testing.assert_array_equal([frame.image for frame in source], GREY_8[:3])
-        assert source.warnings == ("run.tif ends early: 3 of its pages are whole",)
+        assert source.warnings == ("run.tif ends early: 3 of its pages are complete",)
 
 
 def test_damaged_files_are_refused_or_read(tmp_path: Path) -> None:

@@ -569,7 +569,7 @@ def test_a_truncated_video_gives_its_whole_frames(
         images = [frame.image for frame in source]
         assert 0 < len(images) == len(source) < 16
         assert source.warnings == (
-            f"{name} ends early: its header says 16 frames, {len(source)} of them whole",
+            f"{name} ends early: its header says 16 frames, {len(source)} of them complete",
         )
     # Not a frame too few: one more would need more bytes than there are (AVI's header is 5.6 kB).
     for image, picture in zip(images, whole, strict=False):
@@ -613,7 +613,7 @@ def test_a_video_without_one_whole_frame_is_refused(
 ) -> None:
     path = write_video(tmp_path / "v.avi", pictures, "Y800")
     path.write_bytes(path.read_bytes()[:6500])
-    with pytest.raises(InputError, match="not one that is whole"):
+    with pytest.raises(InputError, match="no complete one"):
         open_source(path)
 
 

@@ -277,7 +277,7 @@ def plain(monkeypatch: pytest.MonkeyPatch, recording: RecordingMeasurer) -> Any:
 
     def read(number: int) -> Frame:
         if number == 3:
-            raise InputError("3.png", "content", "cannot be decoded", "a whole image")
+            raise InputError("3.png", "content", "cannot be decoded", "a complete image")
         return Frame(0, number / 10, np.full((2, 2), number, np.uint8))
 
     monkeypatch.setattr(measurers, "measure", measure)

@@ -109,7 +109,10 @@ def test_blocked_rows_are_marked(tmp_path: Path, before: Correction) -> None:
         ("10,5,20,1,1", "line 2, cells: 5; expected 4"),
         ('"10,5",20,1,1', "line 2, u_px: 10,5; expected a number"),
         ("10,20,1,1\n50,20,1,1", "line 3, reflected_row, reflected_column: row 1, column 1; exp"),
-        ("10,20,1,1\n10,20,1,2", "line 3, u_px, v_px: 10, 20; expected another place than line 2"),
+        (
+            "10,20,1,1\n10,20,1,2",
+            "line 3, u_px, v_px: 10, 20; expected another position than that of line 2",
+        ),
     ],
 )
 def test_what_is_wrong_is_told_with_line_and_column(
@@ -134,7 +137,7 @@ def test_what_is_wrong_is_told_with_line_and_column(
         (f"{HEAD},blocked\n1,2,5,5,2\n", "line 2, blocked: 2; expected 1, 0 or nothing"),
         (f"{HEAD},blocked\n1,2,,,1\n", "line 2, blocked: 1; expected a dot with a row"),
         (f"{HEAD},blocked\n1,2,5,5,1\n2,2,5,6,0\n", "line 3, blocked: 0; expected 1 as in line 2"),
-        (HEAD.encode("utf-16"), "content: binary, or UTF-16; expected a table of dots (CSV"),
+        (HEAD.encode("utf-16"), "content: binary or UTF-16; expected a table of dots (CSV"),
         (f"{HEAD}\n1,2,3,é\n".encode("latin-1"), "encoding: not UTF-8"),
         (b"\x89PNG\r\n\x1a\n\0\0", "content: binary"),
         (b"x" * 1_000_000, "line 1: more than 16384 characters"),

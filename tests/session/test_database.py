@@ -267,7 +267,7 @@ def test_a_journal_that_is_a_link_is_refused(
 ):
     (tmp_path / "mine.txt").write_text("mine")
     path.with_name(f"{path.name}-journal").symlink_to(place)
-    with pytest.raises(InputError, match="journal: is no file"):
+    with pytest.raises(InputError, match="journal: is not a file"):
         Database.open(path, read_only)
     assert (tmp_path / "mine.txt").read_text() == "mine"
 

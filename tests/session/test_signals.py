@@ -62,7 +62,7 @@ def test_one_of_the_two_is_enough(table) -> None:
         ("time,current\n", "rows", "none"),
         ("", "columns", "nothing"),
         (b"time,current\n0,\xff\n", "encoding", "not UTF-8"),
-        (b"t\0i\0m\0e\0", "content", "binary, or UTF-16"),
+        (b"t\0i\0m\0e\0", "content", "binary or UTF-16"),
         ("time,current\n" + "1" * 20000, "line 2", "more than 16384 characters"),
     ],
 )

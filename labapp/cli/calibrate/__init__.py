@@ -1,4 +1,4 @@
-"""`labapp calibrate`: laser and imaging plane, and a check of both against a known mirror."""
+"""`labapp calibrate`: calibration of laser and imaging plane, and a check with known mirrors."""
 
 import typer
 

@@ -1,4 +1,4 @@
-"""`labapp calibrate bench`: the set-up checked against pictures of known mirrors."""
+"""`labapp calibrate bench`: a check of the set-up with pictures of known mirrors."""
 
 from __future__ import annotations
 
@@ -22,30 +22,30 @@ if TYPE_CHECKING:
 
 def calibrate_bench(
     *,
-    setup: Annotated[Path, typer.Option(help="Setup file (TOML), of laser and imaging plane.")],
+    setup: Annotated[Path, typer.Option(help="Setup file (TOML).")],
     pictures: Annotated[
         list[Path] | None, typer.Argument(metavar="PICTURE...", help="Pictures of mirrors.")
     ] = None,
     mirror: Annotated[
         list[str] | None,
         typer.Option(
-            help="What the picture at the same place shows: plate:HEIGHT, cap:DIAMETER:HEIGHT, "
-            "ball:DIAMETER:TOP (mm, above the work piece); each may have its standard uncertainty, "
-            "as 2+-0.01; plate:HEIGHT:LEVEL says how level it lies, ± degrees. Repeat for more "
-            "pictures."
+            help="The mirror of each picture, in the same order: plate:HEIGHT, "
+            "cap:DIAMETER:HEIGHT, ball:DIAMETER:TOP (mm, above the work piece); a standard "
+            "uncertainty may follow, as in 2+-0.01; plate:HEIGHT:LEVEL gives the ± of its level "
+            "(degrees). Repeat for more pictures."
         ),
     ] = None,
     free: Annotated[
         list[str] | None,
         typer.Option(
             metavar="KEY",
-            help="Do not hold a quantity by its uncertainty, as laser.distance_mm or picture.u.",
+            help="Quantity to adjust without its prior, such as laser.distance_mm or picture.u.",
         ),
     ] = None,
     predict: Annotated[
         bool,
         typer.Option(
-            "--predict", help="Only predict which pictures would help most; none is needed."
+            "--predict", help="Only predict which pictures would be most useful; needs none."
         ),
     ] = False,
     use: Annotated[
@@ -55,7 +55,7 @@ def calibrate_bench(
         Path | None, typer.Option(help="CSV file for the residual of every dot.")
     ] = None,
 ) -> None:
-    """Check the set-up against pictures of known mirrors, and adjust it.
+    """Check the set-up with pictures of known mirrors, and adjust it.
 
     Exit code 1: the set-up cannot be adjusted to the pictures, and is not changed.
     """
@@ -104,7 +104,7 @@ def _checked(
 
 
 def mirror_picture(path: Path, mirror: Mirror) -> Picture:
-    """The dots of a picture of a mirror."""
+    """Find the dots in a picture of a mirror."""
     from labapp.core.bench_check.labelling import Picture
     from labapp.core.images.find_dots import DotSettings, find_mirror_dots
     from labapp.media import read_picture
@@ -115,7 +115,7 @@ def mirror_picture(path: Path, mirror: Mirror) -> Picture:
 
 
 def _print_forecast(rig: Rig, mirrors: list[Mirror]) -> None:
-    """What pictures would do for the height of a usual pool."""
+    """Print the predicted ± of a typical pool's height after a check with various pictures."""
     from labapp.core.bench_check.forecast import CANDIDATES, EXPECTED, forecast
 
     every = dict(CANDIDATES)
@@ -123,10 +123,10 @@ def _print_forecast(rig: Rig, mirrors: list[Mirror]) -> None:
         every[", ".join(one.name for one in mirrors)] = tuple(mirrors)
     typer.echo(f"± of the height of a pool like a {EXPECTED.name} (mm)")
     typer.echo(f"{'pictures':40} {'set-up':>8} {'total':>8}")
-    made = forecast(rig, every)
-    for one in made:
+    predicted = forecast(rig, every)
+    for one in predicted:
         typer.echo(f"{one.name:40} {one.setup_sigma_mm:8.4f} {one.total_sigma_mm:8.4f}")
-    for name in sorted(every.keys() - {one.name for one in made}):
+    for name in sorted(every.keys() - {one.name for one in predicted}):
         typer.echo(f"not predicted: {name}: no dot of it, or of one of them, would be on the plane")
 
 
@@ -180,7 +180,7 @@ def _print_check(check: BenchCheck) -> None:
 
 
 def _residuals(check: BenchCheck) -> str:
-    """Residual of every dot, CSV."""
+    """Return the residual of every dot as CSV."""
     rows: list[list[object]] = [
         ["picture", "ray_row", "ray_column", "plane_x_mm", "plane_z_mm", "residual_x_mm",
          "residual_z_mm"]
@@ -194,7 +194,7 @@ def _residuals(check: BenchCheck) -> str:
 
 
 def _write(setup: Path, text: str, before: str, check: BenchCheck) -> None:
-    """Write the adjusted set-up, unless the file has another text by now."""
+    """Write the adjusted set-up, unless the file was changed in the meantime."""
     from labapp.config.setup import checked_setup, read_setup_text
     from labapp.text import now
 

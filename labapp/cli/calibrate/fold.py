@@ -17,17 +17,19 @@ Vector = tuple[float, float, float]
 def calibrate_fold(
     *,
     setup: Annotated[
-        Path, typer.Option(help="Setup file (TOML), with the imaging plane where it stands.")
+        Path, typer.Option(help="Setup file (TOML), with the true pose of the imaging plane.")
     ],
     point: Annotated[
         Vector, typer.Option(metavar="X Y Z", help="A point of the mirror's face (mm).")
     ],
     normal: Annotated[
-        Vector, typer.Option(metavar="X Y Z", help="Its normal, of any length and either sign.")
+        Vector, typer.Option(metavar="X Y Z", help="Its normal, of any length and sign.")
     ],
     position_sigma: Annotated[
         float,
-        typer.Option(min=0, max=100, callback=finite, help="± of its place along the normal (mm)."),
+        typer.Option(
+            min=0, max=100, callback=finite, help="± of its position along the normal (mm)."
+        ),
     ] = 0.5,
     tilt_sigma: Annotated[
         float, typer.Option(min=0, max=45, callback=finite, help="± of its tilt (degrees).")
@@ -36,10 +38,10 @@ def calibrate_fold(
         bool, typer.Option("--use", help="Write the mirror image's pose into the setup file.")
     ] = False,
 ) -> None:
-    """Compute the pose of an imaging plane that a flat mirror between pool and plane folds away.
+    """Compute the pose of the mirror image of an imaging plane behind a flat folding mirror.
 
-    Rays meet the plane where they would meet its mirror image, which stands in the set-up for it.
-    The image of the image is the plane itself.
+    Rays meet the plane where they would meet its mirror image, so the set-up has the image's pose.
+    Applied twice, the command returns the pose of the plane itself.
     """
     import numpy as np
 
@@ -62,9 +64,9 @@ def calibrate_fold(
         expected = "a mirror whose image of O′ lies on the far side of the torch, at Y below 0"
         raise InputError("--point", "image", f"O′ at Y = {-pose[0]:g} mm", expected)
     keys = [f"imaging_plane.{name}" for name in POSE]
-    own = rig.uncertainty.sigma[[INDEX[key] for key in keys]]
-    by_mirror = np.array([position_sigma, tilt_sigma, tilt_sigma])
-    sigma = image_sigma(rig.imaging_plane, mirror, own, by_mirror)
+    plane_sigma = rig.uncertainty.sigma[[INDEX[key] for key in keys]]
+    mirror_sigma = np.array([position_sigma, tilt_sigma, tilt_sigma])
+    sigma = image_sigma(rig.imaging_plane, mirror, plane_sigma, mirror_sigma)
     for name, value, one in zip(POSE, pose, sigma, strict=True):
         typer.echo(f"{name:12} {value:10.4f} ± {one:.4f}")
     if use:
@@ -80,4 +82,4 @@ POSE = ("distance_mm", "s_mm", "h_mm", "pitch_deg", "yaw_deg", "roll_deg")
 """Keys of the plane's pose, in the order of `folding.pose_of`."""
 
 STEEPEST_DEG = 85.0
-"""Yaw and roll of a plane that is nearly level turn it about nearly the same axis."""
+"""Largest pitch: near 90 degrees, yaw and roll rotate about nearly the same axis."""

@@ -23,17 +23,17 @@ def calibrate_laser(
     ] = 10.0,
     fan_angle_sigma: Annotated[
         float,
-        typer.Option(min=0, max=10, help="Its standard uncertainty (degrees); 0.1 is assumed."),
+        typer.Option(min=0, max=10, help="Its standard uncertainty (degrees)."),
     ] = 0.1,
     resolution: Annotated[
         float, typer.Option(min=0, max=10, help="Smallest step of the callipers (mm).")
     ] = 0.05,
     setup: SetupToChange = None,
 ) -> None:
-    """Find the laser's angle, distance and height from its cross-hair (Appendix I).
+    """Determine the laser's angle, distance and height from its cross-hair (Appendix I).
 
-    Read every length three times or more: ± comes from their scatter, with Student's factor for
-    few readings. A --setup gets values, standard uncertainties and their correlation.
+    Read every length at least three times: the ± is computed from the scatter of the readings,
+    with Student's factor. Values, standard uncertainties and correlation are written to --setup.
     """
     from labapp.core.calibration import laser_calibration as core
 

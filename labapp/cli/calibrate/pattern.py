@@ -1,4 +1,4 @@
-"""`labapp calibrate pattern`: the rays of a lens, one by one, from pictures on flat mirrors."""
+"""`labapp calibrate pattern`: ray directions of a lens from pictures of flat mirrors."""
 
 from __future__ import annotations
 
@@ -13,33 +13,33 @@ from labapp.errors import InputError
 from labapp.files import write_file
 
 CONTRADICTING = 3.0
-"""Pictures that differ by so many times what the dots' noise allows contradict each other."""
+"""Ratio of the pictures' disagreement to that expected from dot noise which is an error."""
 
 HIGHEST_MM = 1000.0
-"""No mirror is higher over the work piece."""
+"""Largest height of a mirror above the work piece."""
 
 
 def calibrate_pattern(
     *,
-    setup: Annotated[Path, typer.Option(help="Setup file (TOML), of laser and imaging plane.")],
+    setup: Annotated[Path, typer.Option(help="Setup file (TOML).")],
     pictures: Annotated[
         list[Path], typer.Argument(metavar="PICTURE...", help="Pictures of a flat mirror.")
     ],
     height: Annotated[
         list[float],
         typer.Option(
-            help="Height of the mirror over the work piece in the picture at the same place, mm. "
-            "Repeat for each picture; two heights or more."
+            help="Height of the mirror above the work piece in each picture, in the same order "
+            "(mm). Repeat for each picture; at least two different heights."
         ),
     ],
     out: Annotated[Path, typer.Option(help="Table of rays (CSV), beside the setup file.")],
     use: Annotated[
-        bool, typer.Option("--use", help="Name the table in the setup file, as its pattern.")
+        bool, typer.Option("--use", help="Make the table the pattern of the setup file.")
     ] = False,
 ) -> None:
-    """Measure the direction of every ray from pictures of the dots on a flat mirror.
+    """Measure the direction of every ray from pictures of a flat mirror at known heights.
 
-    Laser, imaging plane and camera are taken as the setup file has them: check the bench first.
+    Laser, imaging plane and camera are taken from the setup file: check the bench first.
     Exit code 1: the rays cannot be identified, or the heights contradict each other.
     """
     import numpy as np

@@ -30,15 +30,15 @@ def calibrate_plane(
         typer.Option(
             min=0.001,
             max=1000,
-            help="Length of a unit of the target's axes, from one flag of a bar to the next (mm): "
-            "measure it on the target. labapp's printed target and its sample run have 6.35.",
+            help="Unit of the target's axes, the distance between flags of a bar (mm): measure it "
+            "on the print. It is 6.35 for labapp's printed target and its sample run.",
         ),
     ] = 6.35,
     board: Annotated[
         str | None,
         typer.Option(
             help="The board: a name (charuco_4_inch, …) or KIND:COLUMNSxROWS:SQUARE_MM. Default: "
-            "what is printed by labapp is recognised."
+            "boards printed by labapp are recognised."
         ),
     ] = None,
     square_mm: Annotated[
@@ -49,7 +49,7 @@ def calibrate_plane(
     ] = None,
     setup: SetupToChange = None,
 ) -> None:
-    """Find the imaging plane, and with a board the lens, in a picture of the target (§5.1)."""
+    """Calibrate the imaging plane, and with a board the lens, from pictures (§5.1)."""
     from labapp.core.calibration.plane_calibration import PlaneCalibration
 
     found = _calibrated(images, unit_mm, board, setup)
@@ -72,7 +72,7 @@ def calibrate_plane(
 def _calibrated(
     images: Sequence[Path], unit_mm: float, board: str | None, setup: Path | None
 ) -> Calibration:
-    """Calibrate by pictures; with the lens that the setup has, where they show the target."""
+    """Calibrate from pictures; for pictures of the target, with the lens in the setup file."""
     from labapp.config.setup import lens_of
     from labapp.core.calibration.boards import A_BOARD, parse_board
     from labapp.core.calibration.imaging_plane import calibrate_imaging_plane
@@ -98,7 +98,7 @@ def _calibrated(
 
 
 def _show_target(found: PlaneCalibration, unit_mm: float) -> None:
-    """Print where the target's three points are, as they go into a set-up."""
+    """Print the target's three points as in a setup file."""
     points = dict(zip(("origin_px", "x_axis_px", "z_axis_px"), found.points_px, strict=True))
     lengths = {"x_axis_mm": found.x_axis_mm, "z_axis_mm": found.z_axis_mm}
     for (name, (u, v)), sigma in zip(points.items(), found.points_sigma_px, strict=True):

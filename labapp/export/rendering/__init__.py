@@ -1,1 +1,1 @@
-"""Surfaces and frames as pictures, as a film and in the 3-D view."""
+"""Rendering of surfaces and frames: pictures, films and the 3-D view."""

@@ -1,7 +1,7 @@
-"""Texts over a 3-D picture: numbers along the floor and upwards, the colour scale, captions.
+"""Labels of a 3-D picture: numbers along the axes, the colour scale, captions.
 
-They are of the screen, so that they are upright and as large from every side; before every
-picture they are put where the camera sees what they belong to.
+They are drawn in screen coordinates, upright and of constant size; before every rendering they are
+placed at the projections of their axes.
 """
 
 from __future__ import annotations
@@ -15,46 +15,46 @@ import numpy as np
 from labapp.core.values import FloatArray
 
 USUAL_DPI = 72
-"""At this resolution a point of text is a pixel."""
+"""Resolution at which a point of text is a pixel."""
 
 NUMBER_PT, TITLE_PT, CAPTION_PT = 10, 11, 9
 LETTER, LINE = 0.62, 1.3
-"""Width of a letter and height of a line, of the font's size."""
+"""Width of a letter and height of a line, relative to the font size."""
 
 GAP_PT = 5.0
-"""Between an edge, its numbers and its name."""
+"""Gap between an edge, its numbers and its name."""
 
 SHORT_PT = 24.0
-"""An edge that is seen shorter than this has no numbers."""
+"""Shortest projected edge that has numbers."""
 
 STEEP = 0.8
-"""The name of an edge that is steeper, by the sine of its angle, is written along it."""
+"""Sine of the angle of an edge from which its name is written vertically."""
 
 BAR_PT, BAR_SHARE, STRIPS = 13.0, 0.55, 128
-"""Width of the colour scale; its part of the picture's height; strips of one colour in it."""
+"""Width of the colour scale; its fraction of the picture's height; number of its strips."""
 
 NAMES = ("X (mm)", "Y, along the weld (mm)", "Z (mm)")
 SLANT = 0.4
-"""A text is beside its place, above or below, where its way is more than this to that side."""
+"""Component of a label's direction from which it is placed on that side of its anchor."""
 
 CORNERS = np.array([[0, 0], [1, 0], [1, 1], [0, 1]])
 
 
 class Label(NamedTuple):
-    """A text: its words, place in px from the lower left, and which way it leads from there."""
+    """A label: text, anchor in px from the lower left, and direction from the anchor."""
 
     words: str
     at_px: FloatArray
     way: tuple[float, float] = (0.0, 0.0)
-    """Right and up, −1 to 1: (1, 0) is to the right of its place."""
+    """Direction right and up, −1 to 1: (1, 0) is to the right of the anchor."""
     size_pt: int = NUMBER_PT
     upright: bool = False
-    """Whether it runs upwards."""
+    """Whether the text runs upwards."""
     plain: bool = True
-    """Whether nothing is drawn behind it."""
+    """Whether it has no background."""
 
     def corners(self, point_px: float) -> FloatArray:
-        """Where it begins and ends, shape (2, 2), px, as wide as the widest letters."""
+        """Return the lower left and upper right corner, shape (2, 2), px, for wide letters."""
         lines = self.words.split("\n")
         extent = np.array([max(map(len, lines)) * LETTER, len(lines) * LINE])
         extent = (extent[::-1] if self.upright else extent) * self.size_pt * point_px
@@ -62,26 +62,26 @@ class Label(NamedTuple):
         return np.stack([low, low + extent])
 
     def within(self, size_px: FloatArray, point_px: float) -> Label:
-        """Return the text moved so far that it is within a picture."""
+        """Return the label, moved into the picture."""
         low, high = self.corners(point_px)
         moved = np.clip(low, 2, np.maximum(size_px - (high - low) - 2, 2))
         return self._replace(at_px=self.at_px + moved - low)
 
     @property
     def side(self) -> FloatArray:
-        """Which way it leads, −1, 0 or 1 to the right and up, shape (2,)."""
+        """Side of the anchor, −1, 0 or 1 to the right and up, shape (2,)."""
         return np.sign(self.way) * (np.abs(self.way) > SLANT)
 
 
 def round_step(span: float, most: int) -> float:
-    """Return the least of 1, 2, 5 times a power of ten of which ``most`` or fewer make a span."""
+    """Return the smallest of 1, 2, 5 × 10ⁿ that divides a span into at most ``most`` steps."""
     least = max(span, 1e-12) / max(most, 1)
     power = 10.0 ** np.floor(np.log10(least))
     return float(next(k * power for k in (1, 2, 5, 10) if k * power >= least * (1 - 1e-9)))
 
 
 def round_ticks(low: float, high: float, most: int) -> tuple[FloatArray, list[str]]:
-    """Round numbers within a range, ascending, and how they are written."""
+    """Return round numbers within a range, ascending, and their texts."""
     step = round_step(high - low, most)
     ticks = step * np.arange(np.ceil(low / step - 1e-6), np.floor(high / step + 1e-6) + 1)
     decimals = max(0, -int(np.floor(np.log10(step) + 1e-9)))
@@ -90,14 +90,14 @@ def round_ticks(low: float, high: float, most: int) -> tuple[FloatArray, list[st
 
 @functools.cache
 def _font() -> str:
-    """File of the font: matplotlib brings it, and it has every sign that is used."""
+    """Return the font file, which is distributed with Matplotlib and has all symbols used."""
     import matplotlib
 
     return str(Path(matplotlib.get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf")
 
 
 class Overlay:
-    """Texts and the colour scale of one plotter."""
+    """Labels and colour scale of a plotter."""
 
     def __init__(self, plotter: Any, colour: str) -> None:
         import pyvista
@@ -112,26 +112,26 @@ class Overlay:
         """Lowest and highest corner of the axes."""
         self.stretch = np.ones(3)
         self.scale: tuple[str, tuple[float, float], Any] | None = None
-        """What the colours are, their range, and VTK's table of them."""
+        """Label, range and VTK lookup table of the colours."""
         self.captions: dict[str, str] = {}
-        """Texts by where they are: ``upper left``, ``lower left``, ``upper right``, ``middle``."""
+        """Texts by position: ``upper left``, ``lower left``, ``upper right``, ``middle``."""
         self.mark: tuple[FloatArray, str] | None = None
-        """A point of the surface, shape (3,), mm, and what is said of it."""
+        """A point of the surface, shape (3,), mm, and its label."""
         self.upright_mm = np.zeros((2, 3))
-        """Ends of the line along which Z is numbered."""
+        """Ends of the Z axis line."""
 
     @property
     def words(self) -> list[str]:
-        """All that is written over the picture, as it was last drawn."""
+        """All texts in the picture as last drawn."""
         return [text.GetInput() for text in self._texts if text.GetVisibility()]
 
     @property
     def point_px(self) -> float:
-        """Pixels of the picture for a point of text."""
+        """Pixels per point of text."""
         return float(self._plotter.render_window.GetDPI()) / USUAL_DPI
 
     def place(self) -> None:
-        """Put all texts in their places, as the camera is now."""
+        """Place all labels for the present camera."""
         size = np.array(self._plotter.renderer.GetSize(), float)
         if size.min() < 1:
             return
@@ -152,17 +152,17 @@ class Overlay:
             self._write(text, label.within(size, self.point_px))
 
     def project(self, points_mm: FloatArray) -> FloatArray:
-        """Places in the picture, shape (n, 2), px from the lower left, of drawn points (n, 3)."""
+        """Project drawn points, shape (n, 3), to px from the picture's lower left, shape (n, 2)."""
         return project(self._plotter.renderer, points_mm)
 
     def _apart(self, labels: list[Label], size: FloatArray) -> list[Label]:
-        """Leave out numbers that would lie on another text."""
+        """Omit numbers that would overlap other labels."""
         labels = [label.within(size, self.point_px) for label in labels]
         names = [label for label in labels if label.size_pt == TITLE_PT]
         kept, taken = names, [name.corners(self.point_px) for name in names]
         for label in (one for one in labels if one.size_pt != TITLE_PT):
             low, high = label.corners(self.point_px)
-            if not any((low < held[1]).all() and (held[0] < high).all() for held in taken):
+            if not any((low < box[1]).all() and (box[0] < high).all() for box in taken):
                 kept.append(label)
                 taken.append(np.stack([low, high]))
         return kept
@@ -170,7 +170,7 @@ class Overlay:
     # --- the axes ----------------------------------------------------------------------------
 
     def _axis(self, axis: int) -> list[Label]:
-        """Numbers and name along the edge of the floor that faces the viewer."""
+        """Label the edge of the floor that faces the viewer."""
         other, edges = 1 - axis, []
         for side in (0, 1):
             ends = np.tile(self.box_mm[0], (2, 1))
@@ -181,7 +181,7 @@ class Overlay:
         return self._numbered(edges[lowest], seen[lowest], axis)
 
     def _upwards(self) -> list[Label]:
-        """Numbers and name along the upright edge that is seen farthest left."""
+        """Label the vertical edge that is leftmost in the picture."""
         rows = self.box_mm[CORNERS, [0, 1]]
         feet = np.column_stack([rows, np.full(4, self.box_mm[0, 2])])
         left = int(np.argmin(self.project(feet * self.stretch)[:, 0]))
@@ -200,11 +200,11 @@ class Overlay:
         centre = self.project((self.box_mm * self.stretch).mean(axis=0)[None])[0]
         if aside @ (ends_px.mean(axis=0) - centre) < 0:
             aside = -aside
-        # What a number takes along the edge: its width where that runs across.
+        # Extent of a number along the edge.
         room = (3.6 * LETTER * abs(way[0]) + LINE * abs(way[1]) + 0.4) * NUMBER_PT * point
         low, high = ends_mm[:, axis].tolist()
         ticks, texts = round_ticks(low, high, max(int(length / room), 1))
-        if len(ticks) < 2:  # a single number says how long the edge is
+        if len(ticks) < 2:  # label the end of the edge instead
             ticks, texts = np.array([high]), [f"{high:g}"]
         share = (ticks - low) / (high - low)
         places_mm = ends_mm[0] + share[:, None] * (ends_mm[1] - ends_mm[0])
@@ -299,7 +299,7 @@ class Overlay:
 
 
 def project(renderer: Any, points: FloatArray) -> FloatArray:
-    """Places in a picture, shape (n, 2), px from the lower left, of points of the scene (n, 3)."""
+    """Project scene points, shape (n, 3), to a picture, shape (n, 2), px from the lower left."""
     ahead = np.column_stack([points, np.ones(len(points))]) @ view_matrix(renderer).T
     return np.asarray((ahead[:, :2] / ahead[:, 3:] + 1) / 2 * np.array(renderer.GetSize(), float))
 
@@ -307,5 +307,5 @@ def project(renderer: Any, points: FloatArray) -> FloatArray:
 def view_matrix(renderer: Any) -> FloatArray:
     """Return the matrix from the scene to the picture, both homogeneous, shape (4, 4)."""
     camera = renderer.GetActiveCamera()
-    held = camera.GetCompositeProjectionTransformMatrix(renderer.GetTiledAspectRatio(), -1, 1)
-    return np.array([[held.GetElement(i, j) for j in range(4)] for i in range(4)])
+    matrix = camera.GetCompositeProjectionTransformMatrix(renderer.GetTiledAspectRatio(), -1, 1)
+    return np.array([[matrix.GetElement(i, j) for j in range(4)] for i in range(4)])

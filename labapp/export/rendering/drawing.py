@@ -1,6 +1,6 @@
-"""A scene drawn with pyvista, in a window or off-screen.
+"""Drawing of scenes with PyVista, in a window or off-screen.
 
-pyvista is of the extra ``gui`` and is imported when something is drawn.
+PyVista belongs to the extra ``gui`` and is imported on first use.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from labapp.system import IS_LINUX
 VIEW_ANGLE_DEG = 30.0
 
 Direction = Literal["top", "side", "front", "free"]
-"""Where a scene is looked at from; ``free`` is obliquely from the camera's side."""
+"""Viewing direction; ``free`` is oblique, from the camera's side."""
 
 Triple = tuple[float, ...]
 Camera = tuple[Triple, Triple, Triple, float, float, bool, tuple[float, float]]
-"""Position, focal point, up; view angle, parallel scale, whether it is without perspective; centre
+"""Position, focal point, up; view angle, parallel scale, whether the projection is parallel; centre
 of the window."""
 
 VIEWS: dict[Direction, tuple[tuple[float, float, float], tuple[float, float, float]]] = {
@@ -34,8 +34,8 @@ VIEWS: dict[Direction, tuple[tuple[float, float, float], tuple[float, float, flo
     "front": ((0.0, -1.0, 0.0), (0.0, 0.0, 1.0)),
     "free": ((0.5, -1.5, 0.9), (0.0, 0.0, 1.0)),
 }
-"""From where, and what is up there: X runs to the right from the top and the front, Y from the
-side."""
+"""Direction to the viewer, and up: X is to the right from the top and the front, Y from the side.
+"""
 
 COLOURS = {
     "points": "#ffffff",
@@ -45,22 +45,19 @@ COLOURS = {
 }
 
 BESIDE_PX, ASIDE_PX = 110, 62
-"""What the scale takes of a picture's width, and how far that moves the pool's middle."""
+"""Width of the colour scale, and the resulting shift of the pool's centre."""
 
 CONTOURS = 8
-"""At most so many contour lines, at round heights."""
+"""Most contour lines, at round heights."""
 
 PLATE_OPACITY = 0.3
 
 ROOMY = 1.5
-"""Axes that stay are no more times as long as the scene needs."""
+"""Largest ratio of the length of steady axes to the extent of the scene."""
 
 
 def build_scene(plotter: Any, scene: Scene, steady: bool = False) -> Drawing:
-    """Add a scene to a `pyvista.Plotter`, of a window or off-screen, without rendering.
-
-    The drawing that it returns takes further scenes.
-    """
+    """Add a scene to a `pyvista.Plotter`, without rendering; returns an updatable drawing."""
     drawing = Drawing(plotter, steady)
     drawing.update(scene)
     drawing.look("free")
@@ -68,15 +65,15 @@ def build_scene(plotter: Any, scene: Scene, steady: bool = False) -> Drawing:
 
 
 class Drawing:
-    """A scene in a plotter. What is there already takes new places and colours.
+    """A scene in a plotter; updates reuse existing actors.
 
     Parameters
     ----------
     plotter
-        A `pyvista.Plotter`; nothing but scenes is drawn in it.
+        A `pyvista.Plotter` for this drawing only.
     steady
-        Whether axes stay while the next scene fills them well: they do not jump from frame to
-        frame, and new ones take long to draw. Else a picture does not depend on the scene before.
+        Whether to retain the axes while the next scene fits them: then they do not jump from frame
+        to frame, and updates are faster. Otherwise pictures do not depend on previous scenes.
     """
 
     def __init__(self, plotter: Any, steady: bool = False) -> None:
@@ -87,13 +84,13 @@ class Drawing:
         self._stretch = np.ones(3)
         self.overlay = Overlay(plotter, "black")
         """Axes, colour scale and captions."""
-        # Before every picture: its size or the camera may have changed.
+        # Before every rendering, as its size or the camera may have changed.
         plotter.renderer.AddObserver("StartEvent", lambda *_: self._place())
         self._parts: dict[str, tuple[Any, Any]] = {}
         self._made_for: dict[str, object] = {}
 
     def update(self, scene: Scene) -> None:
-        """Replace the scene, without rendering; the camera stays."""
+        """Replace the scene, without rendering; the camera is unchanged."""
         colours = (scene.foreground, scene.background)
         if self._is_new("colours", colours):
             self.plotter.clear()
@@ -121,62 +118,62 @@ class Drawing:
         self.overlay.mark = (scene.mark_mm[0], scene.mark_words) if len(scene.mark_mm) else None
 
     def look(self, direction: Direction | Camera) -> None:
-        """Look from one of the `VIEWS`, or as a camera does; sides without perspective."""
+        """Set one of the `VIEWS`, with parallel projection except ``free``, or a camera."""
         if not isinstance(direction, str):
             self.camera = direction
             return
         way, up = VIEWS[direction]
-        self.plotter.camera.view_angle = VIEW_ANGLE_DEG  # zooming has made it narrower
+        self.plotter.camera.view_angle = VIEW_ANGLE_DEG  # changed by zooming
         self.plotter.camera.parallel_projection = direction != "free"
         self.plotter.view_vector(way, viewup=up, render=False)
         bounds = (self._box * self._stretch).T.ravel().tolist()
         self.plotter.reset_camera(render=False, bounds=bounds)
-        # The numbers along the axes, and the colour scale, are as large in a small picture.
+        # Labels and colour scale have a constant size, also in a small picture.
         width, height = np.array(self.plotter.window_size) / self.overlay.point_px
         fill, below = (1.3, 78) if direction == "free" else (1.15, 85)
         room = min(fill * (height - below), 0.95 * (width - BESIDE_PX)) / min(width, height)
         self.plotter.camera.zoom(max(min(room, fill), 0.5))
-        # To the left, beside the colour scale; and up, for the names of the axes are below.
+        # Shift to the left for the colour scale, and up for the axis labels.
         self.plotter.camera.SetWindowCenter(max(0.12, min(ASIDE_PX / width, 0.25)), -34 / height)
 
     @property
     def camera(self) -> Camera:
-        """Where it is looked at from."""
-        held = self.plotter.camera
+        """The present camera."""
+        current = self.plotter.camera
         return (
-            *(tuple(held.position), tuple(held.focal_point), tuple(held.up)),
-            *(float(held.view_angle), float(held.parallel_scale)),
-            *(bool(held.parallel_projection), tuple(held.GetWindowCenter())),
+            *(tuple(current.position), tuple(current.focal_point), tuple(current.up)),
+            *(float(current.view_angle), float(current.parallel_scale)),
+            *(bool(current.parallel_projection), tuple(current.GetWindowCenter())),
         )
 
     @camera.setter
     def camera(self, camera: Camera) -> None:
-        held = self.plotter.camera
-        held.position, held.focal_point, held.up = camera[:3]
-        held.view_angle, held.parallel_scale, held.parallel_projection = camera[3:6]
-        held.SetWindowCenter(*camera[6])
+        current = self.plotter.camera
+        current.position, current.focal_point, current.up = camera[:3]
+        current.view_angle, current.parallel_scale, current.parallel_projection = camera[3:6]
+        current.SetWindowCenter(*camera[6])
         self.plotter.renderer.ResetCameraClippingRange()
 
     def _is_new(self, part: str, made_for: object) -> bool:
-        """Whether a part was made for something else and must be created again."""
+        """Whether a part must be created again, as ``made_for`` differs from the last call."""
         changed = self._made_for.get(part) != made_for
         self._made_for[part] = made_for
         return changed
 
     def _put(self, name: str, mesh: Any, colour: str, **style: Any) -> None:
         """Add or update a part; None hides it."""
-        held = self._parts.get(name)
+        existing = self._parts.get(name)
         if mesh is None:
-            if held is not None:
-                held[1].SetVisibility(False)
-        elif held is None:
+            if existing is not None:
+                existing[1].SetVisibility(False)
+        elif existing is None:
             actor = self.plotter.add_mesh(
                 mesh, color=colour, **style, lighting=False, reset_camera=False, render=False
             )
             self._parts[name] = (mesh, actor)
         else:
-            held[0].ShallowCopy(mesh)
-            held[1].SetVisibility(True)
+            existing[0].ShallowCopy(mesh)
+            existing[1].SetVisibility(True)
 
     def _surface(self, scene: Scene) -> None:
         import pyvista
@@ -189,13 +186,13 @@ class Drawing:
         mesh.set_active_scalars("values")
         made_for = scene.colour_map
         if self._made_for.get("surface") != made_for:
-            self._made_for.pop("surface", None)  # what fails below is made another time
+            self._made_for.pop("surface", None)  # retry next time if the following fails
             actor = self.plotter.add_mesh(
                 mesh,
                 scalars="values",
                 name="surface",
                 cmap=scene.colour_map,
-                clim=scene.limits,  # the values may all be unknown
+                clim=scene.limits,  # given, as all values may be unknown
                 interpolate_before_map=True,
                 ambient=0.35,
                 diffuse=0.75,
@@ -204,21 +201,21 @@ class Drawing:
                 show_scalar_bar=False,
             )
             actor.prop.interpolation = "Phong"
-            # Lines that lie on the surface are seen whole.
+            # Keep lines on the surface visible.
             actor.mapper.SetResolveCoincidentTopologyToPolygonOffset()
             actor.mapper.SetRelativeCoincidentTopologyPolygonOffsetParameters(2.0, 2.0)
             self._parts["surface"] = (mesh, actor)
             self._made_for["surface"] = made_for
-        held, actor = self._parts["surface"]
-        if held is not mesh:
-            held.ShallowCopy(mesh)
+        drawn, actor = self._parts["surface"]
+        if drawn is not mesh:
+            drawn.ShallowCopy(mesh)
         actor.mapper.lookup_table.scalar_range = scene.limits
         actor.mapper.scalar_range = scene.limits
         self.overlay.scale = scene.label, scene.limits, actor.mapper.lookup_table
         self._contours(scene, mesh)
 
     def show_pointed(self, words: str) -> bool:
-        """Say what the pointer is on, in the lower left corner; returns whether that changed."""
+        """Show the values at the pointer in the lower left corner; returns whether they changed."""
         changed = self.overlay.captions.get("lower left", "") != words
         self.overlay.captions["lower left"] = words
         return changed
@@ -236,7 +233,7 @@ class Drawing:
         self._put("contours", lines, "#000000", line_width=1, opacity=0.55)
 
     def _place(self) -> None:
-        """Put texts, and the line along which Z is numbered, where the camera sees them."""
+        """Place labels and the Z axis for the present camera."""
         self.overlay.place()
         if "upright" in self._parts:
             line = _polydata(self.overlay.upright_mm * self._stretch, "lines", 2)
@@ -267,12 +264,12 @@ class Drawing:
 
 
 def _box(scene: Scene) -> tuple[FloatArray, float]:
-    """Lowest and highest corner of the axes, shape (2, 3), and step of the floor's grid, mm.
+    """Return lowest and highest corner of the axes, shape (2, 3), and the floor's grid step, mm.
 
-    Whole steps of the grid; tenths upwards.
+    The corners are multiples of the grid step; of 0.1 mm in height.
     """
-    held = np.vstack([scene.vertices_mm, scene.within_mm])
-    low, high = held.min(axis=0), held.max(axis=0)
+    points = np.vstack([scene.vertices_mm, scene.within_mm])
+    low, high = points.min(axis=0), points.max(axis=0)
     along = round_step(float(np.max((high - low)[:2])), 10)
     step = np.array([along, along, 0.1])
     first, last = np.floor(low / step + 1e-6), np.ceil(high / step - 1e-6)
@@ -281,7 +278,7 @@ def _box(scene: Scene) -> tuple[FloatArray, float]:
 
 
 def _grid(box: FloatArray, step_mm: float) -> FloatArray:
-    """Ends of the lines of the floor's grid, two rows a line, mm."""
+    """Return the ends of the floor's grid lines, two rows per line, mm."""
     ends = []
     for axis in (0, 1):
         for at in np.arange(box[0, axis], box[1, axis] + step_mm / 2, step_mm):
@@ -292,7 +289,7 @@ def _grid(box: FloatArray, step_mm: float) -> FloatArray:
 
 
 def _plate(edge_mm: FloatArray, box: FloatArray, stretch: FloatArray) -> Any:
-    """Return the work piece's top round a pool, from its edge, shape (n, 3), to the box's sides."""
+    """Return the work piece's surface from the pool's edge, shape (n, 3), to the box's sides."""
     import pyvista
 
     if len(edge_mm) < 3:
@@ -319,13 +316,13 @@ def _between(one: str, other: str, share: float) -> str:
 
 
 def _holds(box: FloatArray, other: FloatArray) -> bool:
-    """Whether another box lies within this one and is not much smaller."""
+    """Whether another box is within this one and not much smaller."""
     within = (box[0] <= other[0] + 1e-9).all() and (other[1] <= box[1] + 1e-9).all()
     return bool(within and (np.ptp(box, axis=0) <= ROOMY * np.ptp(other, axis=0) + 1e-9).all())
 
 
 def _polydata(points: FloatArray, kind: str, length: int) -> Any:
-    """Points, or lines of a number of points each, for VTK; None without points."""
+    """Return points, or lines of ``length`` points each, for VTK; None without points."""
     import pyvista
 
     if not len(points):
@@ -337,7 +334,7 @@ def _polydata(points: FloatArray, kind: str, length: int) -> Any:
 
 
 def _normals(vertices: FloatArray, triangles: IntArray) -> npt.NDArray[np.float32]:
-    """Unit normals of the surface at its vertices, shape (n, 3)."""
+    """Return unit normals of the surface at its vertices, shape (n, 3)."""
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
     facet = np.cross(b - a, c - a)
     corners = triangles.ravel()
@@ -349,20 +346,20 @@ def _normals(vertices: FloatArray, triangles: IntArray) -> npt.NDArray[np.float3
 
 
 def draw_without_display() -> None:
-    """Let VTK draw through EGL where there is no display; call before the first drawing."""
+    """Make VTK draw through EGL if there is no display; to be called before the first drawing."""
     if IS_LINUX and not os.environ.get("DISPLAY"):
         os.environ.setdefault("VTK_DEFAULT_OPENGL_WINDOW", "vtkEGLRenderWindow")
 
 
 @functools.cache
 def can_draw() -> bool:
-    """Whether this process can draw in 3-D off-screen; VTK would end it otherwise."""
+    """Whether this process can draw in 3-D off-screen; otherwise VTK would end it."""
     try:
         import vtkmodules.vtkRenderingOpenGL2  # noqa: F401
         from vtkmodules.vtkRenderingCore import vtkRenderWindow
     except ImportError:
         return False
     draw_without_display()
-    # VTK falls back on Mesa in memory at last, whether it is there or not.
+    # VTK's last resort is OSMesa, whether it is installed or not.
     last_resort = vtkRenderWindow().GetClassName() == "vtkOSOpenGLRenderWindow"
     return not last_resort or ctypes.util.find_library("OSMesa") is not None

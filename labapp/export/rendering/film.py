@@ -1,4 +1,4 @@
-"""A film of the pool in 3-D: every frame at its time, all in one view and on one colour scale."""
+"""Films of the pool in 3-D, in true time, with a common view and colour scale."""
 
 from __future__ import annotations
 
@@ -30,19 +30,19 @@ from labapp.files import atomic_file
 
 CODEC = "mpeg4"
 QUALITY = 2
-"""Of 1, the best, to 31."""
+"""Quantiser from 1 (best) to 31."""
 
 TICKS_HZ = 60_000
-"""Ticks per second that times in a film are multiples of; MPEG-4 has no more than 65535."""
+"""Time base of a film, ticks per second; at most 65535 in MPEG-4."""
 
 UNTIMED_HZ = 10.0
-"""Frames a second where the recording has no time base and nobody said otherwise."""
+"""Default frame rate if the recording has no time base."""
 
 AHEAD = 3
 """Number of pictures drawn while one is being written."""
 
 LINE = 60
-"""Letters in a line of the text shown in place of a surface."""
+"""Characters per line of the text shown instead of a surface."""
 
 
 class Extent:
@@ -53,7 +53,7 @@ class Extent:
         self._depth, self._height = np.inf, -np.inf
 
     def add(self, measurement: Measurement) -> None:
-        """Extend to a frame; one without a surface has no effect."""
+        """Include a frame; one without a surface has no effect."""
         if measurement.reconstruction is None or measurement.measures is None:
             return
         outline, sizes = measurement.reconstruction.boundary.points_mm, measurement.measures
@@ -69,12 +69,12 @@ class Extent:
 
     @property
     def limits(self) -> tuple[float, float]:
-        """Lowest and highest point of all, mm: the colour scale."""
+        """Lowest and highest point of all frames, mm, for the colour scale."""
         return self._depth, max(self._height, self._depth + 1e-6)
 
     @property
     def within_mm(self) -> FloatArray:
-        """Two corners of the box, shape (2, 3), mm."""
+        """Lowest and highest corner of the bounding box, shape (2, 3), mm."""
         box = np.stack([self._low, self._high])
         box[:, 2] = min(box[0, 2], self._depth), max(box[1, 2], self._height)
         return box
@@ -88,31 +88,31 @@ def write_film(
     process: Executor,
     progress: Callable[[int], None],
 ) -> None:
-    """Write a film (MP4, MPEG-4) of frames; one without a surface says why it has none.
+    """Write a film (MP4, MPEG-4) of frames; without a surface, the reason is shown.
 
     Parameters
     ----------
     path
-        Where to; written beside it and renamed.
+        Path of the film; written atomically.
     measured
-        What each frame gave; taken a few at a time.
+        Result of each frame; consumed a few at a time.
     times_s
-        When each is shown: `film_times`.
+        Time of each frame in the film: `film_times`.
     extent
-        Of all frames; at least one of them has a surface.
+        Common extent of all frames, at least one of which has a surface.
     process
-        A `studio.drawing_process`, which knows size and view.
+        A `studio.drawing_process`, which has size and view.
     progress
-        Called with the number of frames done; may raise to stop, and nothing is left then.
+        Called with the number of frames done; may raise to stop, and no file is left then.
 
     Raises
     ------
     InputError
-        If the frames follow each other too fast for a film.
+        If the frame rate is too high for a film.
     ImportError
-        Without pyvista.
+        Without PyVista.
     BrokenProcessPool
-        Where nothing can be drawn.
+        If nothing can be drawn.
     OSError
         If it cannot be written.
     """
@@ -127,7 +127,7 @@ def write_film(
 
 
 def film_scene(result: FrameResult, extent: Extent) -> Scene:
-    """Scene of a frame: its surface, or the reason why there is none."""
+    """Return the scene of a frame: its surface, or the reason why there is none."""
     measurement, stamp = result.measurement, f"frame {result.frame}"
     if result.time_s is not None:
         stamp += f", {result.time_s:.4f} s"
@@ -142,17 +142,16 @@ def film_scene(result: FrameResult, extent: Extent) -> Scene:
 def film_times(
     frames: Sequence[tuple[int, float | None]], rate_hz: float | None = None
 ) -> FloatArray:
-    """Begin of each frame and end of the last, shape (n + 1,), s.
+    """Return the start of each frame in the film and the end of the last, shape (n + 1,), s.
 
-    Frames that are left out leave their time: what is shown stays until the next.
+    A frame is shown until the next one, also across omitted frames.
 
     Parameters
     ----------
     frames
         Number and time, s, of each frame, ascending.
     rate_hz
-        Frames of the film a second; None: as fast as they were recorded, or 10 a second where the
-        recording has no time base.
+        Frame rate of the film; None: that of the recording, or 10 Hz if it has no time base.
     """
     times = np.array([np.nan if time_s is None else time_s for _, time_s in frames])
     if rate_hz is not None or not np.isfinite(times).all():
@@ -170,16 +169,16 @@ def write_video(path: Path, pictures: Iterable[Picture], times_s: FloatArray) ->
     Parameters
     ----------
     path
-        Where to, MP4.
+        Path of the file, MP4.
     pictures
-        B, G, R, each of shape (height, width, 3), both even.
+        Pictures, B, G, R, each of shape (height, width, 3), both even.
     times_s
-        When each begins and the last ends, shape (n + 1,), from 0, ascending, s.
+        Start of each and end of the last, shape (n + 1,), from 0, ascending, s.
 
     Raises
     ------
     InputError
-        If they follow each other faster than 60000 a second.
+        If the frame rate exceeds 60000 Hz.
     OSError
         If it cannot be written.
     """
@@ -214,13 +213,13 @@ def _encode(container: OutputContainer, pictures: Iterable[Picture], ticks: IntA
             stream.codec_context.time_base = Fraction(1, TICKS_HZ)
         frame = av.VideoFrame.from_ndarray(picture, format="bgr24")
         frame.pts, frame.time_base = int(begin), Fraction(1, TICKS_HZ)
-        for packet in stream.encode(frame):  # the encoder keeps none back
+        for packet in stream.encode(frame):  # the encoder does not buffer frames
             packet.duration = int(end - begin)
             container.mux(packet)
 
 
 def _drawn(scenes: Iterable[Scene], process: Executor) -> Iterator[Picture]:
-    """Pictures of scenes, in order, a few drawn ahead."""
+    """Yield pictures of scenes, in order, a few drawn ahead."""
     waiting: deque[Future[Picture]] = deque()
     rest = iter(scenes)
     try:

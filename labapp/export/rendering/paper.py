@@ -1,4 +1,4 @@
-"""Pictures of scenes at paper size: so wide in mm, black on white, without empty margins."""
+"""Pictures of scenes for print: width in mm, black on white, margins cropped."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from labapp.export.rendering.studio import Picture, Studio
 MM_AN_INCH = 25.4
 
 SMALLER = 0.75
-"""Texts on paper are smaller than on the screen by this: 7.5 points."""
+"""Text size on paper relative to the screen: 7.5 points."""
 
 MARGIN_MM = 1.0
 
@@ -24,32 +24,32 @@ class Paper:
     """Size of a picture on paper."""
 
     width_mm: float = 90.0
-    """One column of a journal; two are 180 mm."""
+    """Width; the default is one column of a journal, two are 180 mm."""
     dpi: int = 300
 
     @property
     def width_px(self) -> int:
-        """Its width in pixels."""
+        """Width in pixels."""
         return round(self.width_mm / MM_AN_INCH * self.dpi)
 
 
 def paper_picture(
     scene: Scene, direction: Direction | Camera, paper: Paper, high_over_wide: float = 0.75
 ) -> Picture:
-    """Draw a scene for paper; returns a picture, shape (height, width, 3), B, G, R.
+    """Draw a scene for print; returns a picture, shape (height, width, 3), B, G, R.
 
     Parameters
     ----------
     direction
-        Where it is looked at from.
+        Viewing direction or camera.
     paper
-        Width of the picture, margins cropped.
+        Width of the cropped picture, and resolution.
     high_over_wide
-        Shape of the view, before its empty margins are cropped.
+        Aspect ratio of the view before cropping.
     """
     scene = replace(scene, foreground="#000000", background="#ffffff")
     wide, wanted = float(paper.width_px), paper.width_px
-    for _ in range(2):  # once to find the margins, once as wide as the rest is to be
+    for _ in range(2):  # the first time to determine the margins
         studio = Studio((round(wide), round(wide * high_over_wide)), direction, paper.dpi * SMALLER)
         picture = studio.draw(scene)
         studio.close()
@@ -60,7 +60,7 @@ def paper_picture(
 
 
 def _crop(picture: Picture, margin: int) -> Picture:
-    """Cut off the sides where there is nothing but white, but for a margin."""
+    """Crop the white borders, except a margin."""
     ink = picture.min(axis=2) < 250
     if not ink.any():
         return picture

@@ -1,4 +1,4 @@
-"""Where a ray meets a surface of triangles: what the pointer is on."""
+"""Intersection of a ray with a triangle mesh, to find the point at the pointer."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ EPS = 1e-9
 def first_hit(
     vertices: FloatArray, triangles: IntArray, start: FloatArray, way: FloatArray
 ) -> FloatArray | None:
-    """Return where a ray first meets a surface, shape (3,); None where it does not.
+    """Return the first intersection of a ray with a surface, shape (3,); None if there is none.
 
     Parameters
     ----------
     vertices, triangles
         The surface, shapes (n, 3) and (k, 3).
     start, way
-        The ray begins at the one and goes along the other, each of shape (3,).
+        Origin and direction of the ray, each of shape (3,).
 
     Notes
     -----
@@ -45,7 +45,7 @@ def first_hit(
 
 
 def point_over(scene: Scene, x_mm: float, y_mm: float) -> FloatArray | None:
-    """Return the point of a scene's surface at (x, y), shape (3,), mm; None beside the surface."""
+    """Return the point of a scene's surface at (x, y), shape (3,), mm; None outside the surface."""
     above, down = np.array([x_mm, y_mm, 1e3]), np.array([0.0, 0.0, -1.0])
     return first_hit(scene.vertices_mm, scene.triangles, above, down)
 
@@ -53,14 +53,14 @@ def point_over(scene: Scene, x_mm: float, y_mm: float) -> FloatArray | None:
 def seen_point(
     scene: Scene, view_matrix: FloatArray, across: float, up: float
 ) -> FloatArray | None:
-    """Return the point of a scene's surface that is seen at a place of its picture, mm.
+    """Return the point of a scene's surface that is visible at a position in the picture, mm.
 
     Parameters
     ----------
     view_matrix
-        From the scene as it is drawn to the picture, shape (4, 4).
+        Matrix from the drawn scene to the picture, shape (4, 4).
     across, up
-        The place: −1 at the left and at the bottom, 1 at the right and at the top.
+        Position: −1 at the left and the bottom, 1 at the right and the top.
     """
     stretch = np.array([1.0, 1.0, scene.exaggeration])
     ends = np.array([[across, up, -1.0, 1.0], [across, up, 1.0, 1.0]])

@@ -1,6 +1,6 @@
-"""Pictures of results: dots over their frame, the surface in 3-D, sizes over time.
+"""Pictures of results: frames with dots, the surface in 3-D, sizes over time.
 
-matplotlib and pyvista are of the extra ``gui`` and are imported when a picture is drawn.
+Matplotlib and PyVista belong to the extra ``gui`` and are imported on first use.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ from labapp.export.rendering.studio import draw_there, drawing_process
 from labapp.files import write_atomically
 
 ENLARGED = 3
-"""Screen pixels per pixel of the frame, so that labels can be read; pixels stay what they are."""
+"""Picture pixels per pixel of the frame, for legible labels; pixels are replicated."""
 
 SMALL: dict[str, list[int]] = {
-    # Enlarged pixels repeat the line above: 0.4 MB where OpenCV's choice gives 2.
+    # The filter suits replicated pixels: 0.4 MB instead of 2 MB with OpenCV's default.
     ".png": [cv2.IMWRITE_PNG_COMPRESSION, 6, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_UP],
     ".jpg": [cv2.IMWRITE_JPEG_QUALITY, 90],
     ".tif": [],
 }
-"""How pictures of frames are compressed, by the ending of their names."""
+"""Compression parameters of frame pictures, by suffix."""
 
 UNKNOWN = (150, 150, 150)
 
@@ -41,14 +41,14 @@ LEGEND = "left: row of the ray; above: its column; grey ring: in doubt, no ray"
 
 
 def frame_picture(image: npt.NDArray[Any], measurement: Measurement) -> npt.NDArray[np.uint8]:
-    """The frame with its dots ringed, rays' columns above them and rows left of the first.
+    """Draw a frame with circled dots, ray columns above the dots and ray rows at the left.
 
     Parameters
     ----------
     image
         Grey levels, shape (rows, columns).
     measurement
-        What was found in it. A dot without a ray is ringed in grey; the legend says so.
+        Its measurement. The circle of a dot without a ray is grey.
 
     Returns
     -------
@@ -70,7 +70,7 @@ def frame_picture(image: npt.NDArray[Any], measurement: Measurement) -> npt.NDAr
         colour = UNKNOWN if ray is None else _row_colour(ray[0])
         cv2.circle(picture, (u, v), 4 * ENLARGED, colour, 1, cv2.LINE_AA)
         if ray is not None:
-            # Dots of one row stand closest, and the number above must fit between them.
+            # The number above a dot must fit between the dots of a row.
             _write(picture, str(ray[1]), (u - 7, v - 6 * ENLARGED), colour, 0.45)
             leftmost.setdefault(ray[0], []).append((u, v))
     for row, places in leftmost.items():
@@ -92,13 +92,13 @@ def _write(
 
 
 def _row_colour(row: int) -> tuple[int, int, int]:
-    """Colour (B, G, R) of a row; neighbouring rows differ most."""
+    """Return the colour (B, G, R) of a row; neighbouring rows differ most."""
     red, green, blue = colorsys.hsv_to_rgb(row * 0.381966 % 1, 0.55, 1.0)
     return int(blue * 255), int(green * 255), int(red * 255)
 
 
 def write_frame_picture(path: Path, image: npt.NDArray[Any], measurement: Measurement) -> None:
-    """Write `frame_picture`; the path's ending says the format: .png, .jpg or .tif."""
+    """Write `frame_picture` in the format of the path's suffix: .png, .jpg or .tif."""
     _, content = cv2.imencode(path.suffix, frame_picture(image, measurement), SMALL[path.suffix])
     write_atomically(path, content.tobytes())
 
@@ -106,14 +106,12 @@ def write_frame_picture(path: Path, image: npt.NDArray[Any], measurement: Measur
 def write_trend_picture(
     path: Path, axis: Sequence[float | None], label: str, series: Mapping[str, FloatArray]
 ) -> None:
-    """Write a PNG of one plot per series of lengths over a common axis.
-
-    NaN leaves a gap.
+    """Write a PNG with one plot per series of lengths over a common axis, with gaps at NaN.
 
     Raises
     ------
     ImportError
-        Without matplotlib.
+        Without Matplotlib.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -143,15 +141,14 @@ def write_surface_picture(
     Parameters
     ----------
     process
-        A `drawing_process` to draw several pictures in; None starts one for this, of the usual
-        size and view.
+        A `drawing_process` for several pictures; None starts one of default size and view.
 
     Raises
     ------
     ImportError
-        Without pyvista.
+        Without PyVista.
     BrokenProcessPool
-        Where nothing can be drawn.
+        If nothing can be drawn.
     """
     with ExitStack() as stack:
         process = process or stack.enter_context(drawing_process())

@@ -1,4 +1,4 @@
-"""Scene of the pool in 3-D, independent of what draws it: window, exports or tests."""
+"""Scene of the pool in 3-D, independent of the renderer."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from labapp.export.heights import between_points, difference_at
 from labapp.export.meshes import drawn_spacing, known_part
 
 EXAGGERATION = 3.0
-"""Height over width by default: pools are flat."""
+"""Default vertical exaggeration, as pools are flat."""
 
 RAY_MM = 3.0
-"""So much of each ray is drawn: laser and imaging plane are ten pools away."""
+"""Drawn length of each ray, mm, as laser and imaging plane are far away."""
 
 SPACING_MM = 0.15
-"""Largest distance between rings of the mesh that is drawn, mm."""
+"""Largest distance between rings of the drawn mesh, mm."""
 
 HEIGHT = "height (mm)"
 
 HEIGHT_MAP, ERROR_MAP, DIFFERENCE_MAP = "viridis", "cividis", "coolwarm"
-"""Colours of heights; of ± and residuals, from 0; of differences, 0 in the middle."""
+"""Colour maps of heights; of ± and residuals, from 0; of differences, centred at 0."""
 
 Colour = Literal["height", "sigma", "residual"]
-"""What a surface is coloured by."""
+"""Quantity that colours a surface."""
 
 SPOKES = 120
-"""Approximate number of vertices a ring: its sides are within a thousandth of a pool's radius."""
+"""Approximate number of vertices per ring, for an error of a thousandth of the pool's radius."""
 
 EMPTY = np.empty((0, 3))
 
@@ -46,17 +46,17 @@ class Scene(ReadOnlyArrays):
     triangles: IntArray
     """The surface, shapes (n, 3) and (k, 3)."""
     values: FloatArray
-    """What colours it, shape (n,)."""
+    """Values for the colours, shape (n,)."""
     label: str
-    """What the values are, with their unit."""
+    """Name of the values, with their unit."""
     limits: tuple[float, float]
-    """The values at both ends of the colour scale."""
+    """Values at both ends of the colour scale."""
     colour_map: str = HEIGHT_MAP
-    """matplotlib's name: one for heights, one for ± and residuals, one for differences."""
+    """Matplotlib's name of the colour map."""
     contours: bool = False
     """Whether to draw lines of equal height."""
     plate_mm: FloatArray = field(default_factory=lambda: EMPTY)
-    """Edge of the pool, shape (m, 3), round which the work piece is drawn; empty: it is not."""
+    """Edge of the pool, shape (m, 3), around which the work piece is drawn; empty: not drawn."""
     points_mm: FloatArray = field(default_factory=lambda: EMPTY)
     """Reflection points, shape (p, 3)."""
     lines_mm: dict[str, FloatArray] = field(default_factory=dict)
@@ -66,20 +66,20 @@ class Scene(ReadOnlyArrays):
     electrode: bool = True
     """Whether to mark the electrode's axis, X = Y = 0."""
     exaggeration: float = EXAGGERATION
-    """Factor by which heights are drawn larger; the axes show true heights."""
+    """Vertical exaggeration; the axes show true heights."""
     within_mm: FloatArray = field(default_factory=lambda: EMPTY)
-    """Places that the axes hold in any case, shape (k, 3): pictures of a film share them."""
+    """Points that the axes must include, shape (k, 3), common to the pictures of a film."""
     mark_mm: FloatArray = field(default_factory=lambda: EMPTY)
-    """A point of the surface that was read off, shape (1, 3); empty without one."""
+    """A marked point of the surface, shape (1, 3); empty without one."""
     mark_words: str = ""
-    """Said of it."""
+    """Label of the marked point."""
     stamp: str = ""
-    """Said in the upper right corner."""
+    """Text in the upper right corner."""
     notice: str = ""
-    """Said in the middle: why there is no surface."""
+    """Text in the middle: why there is no surface."""
     foreground: str = "#202020"
     background: str = "#ffffff"
-    """Colours of texts and axes, and behind everything."""
+    """Colours of texts and axes, and of the background."""
 
 
 def scene_of(
@@ -87,13 +87,13 @@ def scene_of(
     colour: Colour = "height",
     limits: tuple[float, float] | None = None,
 ) -> Scene:
-    """Scene of a pool's surface, boundary and reflection points.
+    """Return the scene of a pool's surface, boundary and reflection points.
 
     Parameters
     ----------
     colour
-        By height, by its standard uncertainty, or by the residual on the imaging plane (its length,
-        interpolated between the reflection points); by height where the scheme gives none.
+        Colour by height, by its standard uncertainty, or by the length of the residual on the
+        imaging plane, interpolated between the reflection points; by height if unavailable.
     limits
         Ends of the colour scale, mm; None: those of this surface.
     """
@@ -125,9 +125,9 @@ def scene_of(
 
 
 def difference_scene(one: Reconstruction, other: Reconstruction) -> Scene:
-    """Scene of the first pool, coloured by its height minus the other's where both are known."""
+    """Return the scene of the first pool, coloured by its height minus the other's."""
     vertices, triangles = _mesh(one)
-    # Slightly within, so that the rim of one of two equal boundaries is not lost to rounding.
+    # Slightly inside, so that the rim of equal boundaries is not lost by rounding.
     x, y = (one.boundary.center_mm + (vertices[:, :2] - one.boundary.center_mm) * (1 - 1e-9)).T
     difference = difference_at(one, other, x, y)
     used, triangles = known_part(triangles, difference)
@@ -141,15 +141,14 @@ def difference_scene(one: Reconstruction, other: Reconstruction) -> Scene:
         (-reach, reach),
         colour_map=DIFFERENCE_MAP,
         lines_mm={"boundary": _closed(one.boundary.points_mm)},
-        within_mm=one.boundary.points_mm,  # there are no vertices where the two do not overlap
+        within_mm=one.boundary.points_mm,  # vertices exist only where the two overlap
     )
 
 
 def rays_of(reconstruction: Reconstruction, match: Match, rig: Rig) -> dict[str, FloatArray]:
-    """Ends of the incident and the reflected rays near the pool, by name, shapes (n, 2, 3), mm.
+    """Return the ends of incident and reflected rays near the pool, by name, shape (n, 2, 3), mm.
 
-    The reflected rays run to where the computed dots are on the imaging plane; rays without one
-    are left out.
+    Reflected rays point to the computed dots on the imaging plane; rays without one are omitted.
     """
     met = np.isfinite(reconstruction.residual_mm).all(axis=1)
     points = reconstruction.points_mm[met]
@@ -165,7 +164,7 @@ def rays_of(reconstruction: Reconstruction, match: Match, rig: Rig) -> dict[str,
 
 
 def _mesh(reconstruction: Reconstruction) -> tuple[FloatArray, IntArray]:
-    """Vertices and triangles, coarse enough for a responsive view."""
+    """Return vertices and triangles, coarse enough for a responsive view."""
     boundary = reconstruction.boundary
     some = slice(None, None, max(len(boundary.points_mm) // SPOKES, 1))
     thinned = replace(
@@ -187,7 +186,7 @@ def _limits(values: FloatArray) -> tuple[float, float]:
 def empty_scene(
     within_mm: FloatArray, limits: tuple[float, float], stamp: str, notice: str
 ) -> Scene:
-    """A picture without a surface among others of a film; parameters as of `Scene`."""
+    """Return a scene without a surface, for a film; parameters as for `Scene`."""
     return Scene(
         *(EMPTY, np.empty((0, 3), int), np.empty(0), HEIGHT, limits),
         electrode=False,

@@ -1,6 +1,6 @@
 """Off-screen drawing of scenes, in this process or another.
 
-VTK ends the process it runs in where there is no OpenGL.
+Without OpenGL, VTK ends the process in which it runs.
 """
 
 from __future__ import annotations
@@ -22,29 +22,29 @@ from labapp.export.rendering.drawing import Camera, Direction, Drawing, draw_wit
 from labapp.export.rendering.scene import Scene
 
 PICTURE_PX = (1280, 720)
-"""Width and height of a picture by default."""
+"""Default width and height of a picture."""
 
 Picture = npt.NDArray[np.uint8]
 
 
 class Studio:
-    """Draws scenes, all of one size and from one side, in one plotter.
+    """Draws scenes of the same size and view in one plotter.
 
-    It ends the process where nothing can be drawn: ask `can_draw`, or use `drawing_process`.
+    It ends the process if nothing can be drawn: check `can_draw`, or use `drawing_process`.
 
     Parameters
     ----------
     size
         Width and height of the pictures, px.
     direction
-        Where scenes are looked at from.
+        Viewing direction or camera.
     dpi
-        Resolution, which makes texts as many pixels high.
+        Resolution, which determines the size of texts.
 
     Raises
     ------
     ImportError
-        Without pyvista.
+        Without PyVista.
     """
 
     def __init__(
@@ -60,10 +60,10 @@ class Studio:
         self._direction = direction
 
     def draw(self, scene: Scene) -> Picture:
-        """A picture, shape (height, width, 3), B, G, R."""
+        """Draw a scene; returns a picture, shape (height, width, 3), B, G, R."""
         self._drawing.update(scene)
         self._drawing.look(self._direction)
-        self.plotter.render()  # which a screenshot does the first time only
+        self.plotter.render()  # a screenshot renders the first time only
         picture = self.plotter.screenshot(return_img=True)
         return np.ascontiguousarray(picture[..., ::-1])
 
@@ -75,13 +75,13 @@ class Studio:
 def drawing_process(
     size: tuple[int, int] = PICTURE_PX, direction: Direction | Camera = "free"
 ) -> ProcessPoolExecutor:
-    """A process to draw in, by `draw_there`; parameters as of `Studio`."""
+    """Return a process for `draw_there`; parameters as for `Studio`."""
     context = multiprocessing.get_context("spawn")
     return ProcessPoolExecutor(1, context, initializer=_begin, initargs=(size, direction))
 
 
 def draw_there(scene: Scene) -> Picture:
-    """Draw a scene in a `drawing_process`; its studio is made for the first picture."""
+    """Draw a scene in a `drawing_process`, whose studio is created at the first call."""
     if "studio" not in _there:
         _there["studio"] = Studio(*_there["view"])
     picture: Picture = _there["studio"].draw(scene)
@@ -102,7 +102,7 @@ def drawing_errors(what: str) -> Iterator[None]:
 
 
 _there: dict[str, Any] = {}
-"""What a drawing process holds."""
+"""View and studio of a drawing process."""
 
 
 def _begin(*view: Any) -> None:

@@ -1,4 +1,4 @@
-"""What a live camera is set to: fields of the recording page, as many as the camera has."""
+"""Settings of a live camera: fields of the recording page, depending on the camera."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ NUMBERS = {
     "gain_db": ("Gain", "dB", 1, 1.0, "Amplification: it brightens the noise, too"),
     "rate_hz": ("Rate", "frames/s", 2, 10.0, "Frames per second"),
 }
-"""Label, unit, decimals, step and tip of what is set by a number."""
+"""Label, unit, decimals, step and tip of the numerical settings."""
 
 TRIGGERS = {
     "free": "free run",
@@ -34,7 +34,7 @@ TRIGGERS = {
 }
 
 DIFFERS = 1e-3
-"""Relative difference from which on a value that the camera takes is not the requested one."""
+"""Relative difference above which the camera's value is not the requested one."""
 
 PART_WORDS = (
     "Sizes are right only where the imaging plane was calibrated with a picture of this very "
@@ -45,10 +45,10 @@ Apply = Callable[[CameraSettings], "Future[CameraSettings] | None"]
 
 
 class CameraFields(QObject):
-    """Exposure, gain, rate, trigger and region, where the camera lets them be set."""
+    """Exposure, gain, rate, trigger and region, as far as the camera allows setting them."""
 
     reset = Signal()
-    """Rate, trigger or region changed: frames differ from those before."""
+    """Rate, trigger or region changed: frames differ from the previous ones."""
 
     def __init__(self, form: FieldForm, apply: Apply) -> None:
         super().__init__(form)
@@ -86,25 +86,24 @@ class CameraFields(QObject):
     # --- what the camera is set to ------------------------------------------------------------
 
     def show_camera(self, feed: Feed, calibrated: tuple[int, int] | None = None) -> None:
-        """Show what a camera that was opened is set to, and only what it lets be set.
+        """Show the settings of an opened camera, but only those that can be changed.
 
         Parameters
         ----------
         feed
-            The camera's.
+            Feed of the camera.
         calibrated
-            (rows, columns) of the picture that the imaging plane was calibrated with, px; None:
-            not known.
+            (rows, columns) of the picture used to calibrate the imaging plane, px; None if unknown.
         """
         self._feed, self._calibrated = feed, calibrated
         self._answers.clear()
         for field in self.fields.values():
-            field.refuse("")  # what another camera refused
+            field.refuse("")  # a refusal by another camera
         self.fields["gain_db"].unit.setText(feed.camera.limits.gain_unit)
         self._show(feed.settings, feed.camera.limits)
 
     def set_recording(self, recording: bool) -> None:
-        """Keep the size of the frames as it is while they are recorded."""
+        """Prevent changes of the frame size during a recording."""
         why = "Not while it records: a recording's frames are of one size"
         for each in (self.region.editor, self.whole_button):
             each.setEnabled(not recording)
@@ -139,7 +138,7 @@ class CameraFields(QObject):
     # --- to set it ----------------------------------------------------------------------------
 
     def _set(self, name: str, value: Any) -> None:
-        """Ask for another value; `take_answers` shows what the camera made of it."""
+        """Request another value; `take_answers` shows the camera's answer."""
         if name == "region":
             try:
                 value = region_of(value)
@@ -165,11 +164,11 @@ class CameraFields(QObject):
 
     @property
     def waiting(self) -> bool:
-        """Whether the camera has still to answer."""
+        """Whether an answer of the camera is pending."""
         return bool(self._answers)
 
     def take_answers(self) -> None:
-        """Show what was really set, or why it was refused."""
+        """Show the values actually set, or why they were refused."""
         for each in [each for each in self._answers if each[2].done()]:
             self._answers.remove(each)
             if self._feed is not None:
@@ -195,7 +194,7 @@ class CameraFields(QObject):
             self.reset.emit()
 
     def _refuse(self, name: str, error: CameraError | InputError) -> None:
-        """Say beside each field what is wrong with its value, and what would be right."""
+        """Show at each field what is wrong with its value, and what is permitted."""
         if isinstance(error, CameraError):
             self.fields[name].refuse(str(error))
             return
@@ -221,12 +220,12 @@ def region_of(text: str) -> Region:
 
 
 def region_text(region: Region) -> str:
-    """A region as it is typed."""
+    """A region in the form in which it is typed."""
     return ", ".join(map(str, region))
 
 
 def setting_text(value: object) -> str:
-    """A value of a setting, for people."""
+    """A value of a setting as text."""
     if isinstance(value, tuple):
         return region_text(value)
     if isinstance(value, str):
@@ -235,7 +234,7 @@ def setting_text(value: object) -> str:
 
 
 def calibrated_px(session: Session) -> tuple[int, int] | None:
-    """(rows, columns) of the picture that the imaging plane in use was found in; None: unknown."""
+    """(rows, columns) of the picture used to calibrate the imaging plane; None if unknown."""
     kept = session.plane_calibration
     if kept is None or not calibrations_in_use(session)[1]:
         return None
@@ -247,7 +246,7 @@ def calibrated_px(session: Session) -> tuple[int, int] | None:
 
 
 def other_size(calibrated: tuple[int, int] | None, shape: tuple[int, int]) -> str:
-    """That frames, shape (rows, columns), are not as the calibration picture; empty if they are."""
+    """Warning if frames of shape (rows, columns) differ from the calibration picture, else ""."""
     if calibrated is None or calibrated == shape:
         return ""
     (rows, columns), (height, width) = calibrated, shape

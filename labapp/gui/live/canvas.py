@@ -25,7 +25,7 @@ PARTS = {
 
 
 class LiveCanvas(QWidget):
-    """A page's picture, beside which other parts can be chosen while a camera is measured."""
+    """A page's picture, and further parts to choose from while a camera is measured."""
 
     def __init__(
         self,
@@ -50,17 +50,17 @@ class LiveCanvas(QWidget):
         for part in (picture, self.surface, self.trends, scrolled(self.streams)):
             self.stack.addWidget(part)
         self.tabs.currentChanged.connect(self._choose)
-        # Alarms below: what is above stays under the hand.
+        # Alarms are at the bottom, so that nothing above them moves.
         vbox(self.tabs, (self.stack, 1), self.alarms, of=self).setSpacing(2)
         self.set_live(False)
 
     @property
     def part(self) -> str:
-        """What is seen: a key of `PARTS`."""
+        """The visible part: a key of `PARTS`."""
         return list(PARTS)[self.stack.currentIndex()]
 
     def set_live(self, live: bool) -> None:
-        """Offer all parts while a camera is measured, else the picture alone."""
+        """Offer all parts while a camera is measured, otherwise only the picture."""
         self.tabs.setVisible(live)
         if live:
             self.trends.refresh()
@@ -72,11 +72,11 @@ class LiveCanvas(QWidget):
             self.streams.show_state()
 
     def follow(self, result: LiveResult | None, watch: LiveWatch) -> bool:
-        """Show what was measured, at the camera's pace; whether anything was."""
+        """Show a new result at the camera's pace; returns whether something new was shown."""
         return self.surface.isVisible() and self.surface.follow(result, watch)
 
     def show_status(self, watch: LiveWatch) -> None:
-        """Show what is renewed a few times a second."""
+        """Show the information that is updated a few times per second."""
         self.alarms.show_alarms(watch.alarms.shown)
         if self.trends.isVisible():
             self.trends.show_trend(watch)

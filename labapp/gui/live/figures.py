@@ -1,4 +1,4 @@
-"""Large figures of a live pool: its sizes, how they stand to their limits, and how old they are."""
+"""Large figures of a live pool: its sizes, their comparison with the limits, and their age."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from labapp.run.live_trend import Pace
 from labapp.text import marked_setup_words, setup_words
 
 DECIMALS = 3
-"""Of live figures, mm."""
+"""Number of decimals of live figures in mm."""
 
 OLD_S = 2.0
-"""A figure that is older is not of the pool that is seen: it is not in order, whatever it is."""
+"""A figure older than this no longer describes the visible pool and is never in order."""
 
 LARGE = 1.9
-"""How much larger a figure is that is read from a distance."""
+"""Scale of figures that are read from a distance."""
 
 ACKNOWLEDGE_PX = 40
-"""Least height of a button that is pressed in gloves."""
+"""Minimum height of a button that is pressed with gloves."""
 
 Look = Literal["plain", "alarm", "old"]
 
@@ -42,33 +42,33 @@ NO_SETUP = "Sizes are shown here once the set-up is complete"
 
 @dataclass(frozen=True)
 class Figure:
-    """A size as it is shown."""
+    """The display of a size."""
 
     name: str
     value: str
     sigma: str
     """Texts; value and sigma in mm."""
     verdict: str = ""
-    """How it stands to its limits, in words after a sign; empty where it has none."""
+    """Comparison with the limits as text after a sign; empty without limits."""
     look: Look = "plain"
-    """Red or pale."""
+    """Appearance, such as red or pale."""
 
 
 def figures(
     result: LiveResult | None, limits: Limits | None = None, age_s: float = 0.0
 ) -> tuple[Figure, ...]:
-    """Width, length and height, of a hollow pool the depth.
+    """Width, length and height, or the depth of a concave pool.
 
-    All with the same number of decimals, whatever the ±: nothing jumps as they change.
+    All have the same number of decimals regardless of the ±, so that nothing moves on changes.
 
     Parameters
     ----------
     result
-        Of the frame measured last; None before one was.
+        Result for the last measured frame; None before the first one.
     limits
-        Of the sizes; None: there are none.
+        Limits of the sizes; None if there are none.
     age_s
-        How old the frame is, s.
+        Age of the frame, s.
     """
     sizes = sizes_of(None if result is None else result.measurement.measures)
     return tuple(_figure(size, limits or Limits(), age_s > OLD_S) for size in sizes)
@@ -89,7 +89,7 @@ def _figure(size: Size, limits: Limits, is_old: bool) -> Figure:
 
 
 def standing_text(stands: Standing, limits: Limits, name: str) -> str:
-    """How a size stands, in a few words after a sign."""
+    """Short text, after a sign, that compares a size with its limits."""
     low, high = limits.of(name)
     if stands == "low":
         return f"▲ below {low:g}"
@@ -104,7 +104,7 @@ def standing_text(stands: Standing, limits: Limits, name: str) -> str:
 
 
 def pace_text(result: LiveResult | None, pace: Pace, came_hz: float | None, age_s: float) -> str:
-    """How measuring keeps up, and why there is no figure where there is none."""
+    """Text of the rate of measurement, and the reason if there is no figure."""
     if result is None:
         return FIRST
     parts = []
@@ -123,14 +123,14 @@ def pace_text(result: LiveResult | None, pace: Pace, came_hz: float | None, age_
 
 
 def live_setup_words(result: LiveResult | None, checked: str) -> str:
-    """How far the set-up can be relied on; ``checked``: when it was checked, ISO 8601."""
+    """Text of the set-up's reliability; ``checked`` is the date of its check, ISO 8601."""
     if result is None or not (status := result.measurement.setup_status):
         return ""
     return marked_setup_words(status, setup_words(status, checked, result.setup_doubt))
 
 
 class LiveFigures(FollowsTheme, QWidget):
-    """Results in large figures, to be read from where the work is."""
+    """Results in large figures that can be read from the workplace."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -143,7 +143,7 @@ class LiveFigures(FollowsTheme, QWidget):
         self.follow_theme()
 
     def show_figures(self, shown: Sequence[Figure]) -> None:
-        """Show figures, each in a row, and no others."""
+        """Show exactly these figures, one per row."""
         for (row, _), label in self._labels.items():
             label.setVisible(row < len(shown))
         for row, figure in enumerate(shown):
@@ -168,7 +168,7 @@ class LiveFigures(FollowsTheme, QWidget):
         return self._labels[row, column]
 
     def _apply_look(self, label: QLabel, look: Look) -> None:
-        """Colour a label, only where its colour changes: that is expensive."""
+        """Colour a label, but only if its colour changes, because that is slow."""
         dark = is_dark(self.palette())
         if self._looks.get(label, ("plain", dark)) == (look, dark):
             return
@@ -182,13 +182,13 @@ class LiveFigures(FollowsTheme, QWidget):
         label.setPalette(colours)
 
     def take_colours(self) -> None:
-        """Colour the labels for the window's ground."""
+        """Colour the labels for the window's background."""
         for label, (look, _) in list(self._looks.items()):
             self._apply_look(label, look)
 
 
 class AlarmStrip(FollowsTheme, QFrame):
-    """What the operator must see, below the picture, and the button that says it was seen."""
+    """Alarms for the operator, below the picture, and the button to acknowledge them."""
 
     def __init__(self, acknowledge: Callable[[], None]) -> None:
         super().__init__()
@@ -208,19 +208,19 @@ class AlarmStrip(FollowsTheme, QFrame):
         self.hide()
 
     def take_colours(self) -> None:
-        """Say it in the red of the window's ground."""
+        """Use the red for the window's background."""
         colours = QPalette()
         colours.setColor(QPalette.ColorRole.WindowText, RED[is_dark(colours)])
         for widget in (self, self.words):
             widget.setPalette(colours)
 
     def show_alarms(self, alarms: Sequence[Alarm]) -> None:
-        """Show alarms, after those that are kept; none hides it."""
+        """Show alarms after the kept ones; without alarms the strip is hidden."""
         alarms = (*self._kept, *alarms)
         message = alarms_text(alarms)
         if message != self.words.text():
             self.words.setText(message)
-            # A screen reader says it at once.
+            # A screen reader announces it immediately.
             alert = QAccessibleEvent(self.words, QAccessible.Event.Alert)
             QAccessible.updateAccessibility(alert)
         self.button.setEnabled(not all(alarm.acknowledged for alarm in alarms))
@@ -228,19 +228,19 @@ class AlarmStrip(FollowsTheme, QFrame):
         self._alarms = alarms
 
     def keep_unacknowledged(self) -> None:
-        """Keep what was not acknowledged until it is: the camera is watched no more."""
+        """Keep unacknowledged alarms after the camera is no longer watched."""
         unseen = (alarm for alarm in self._alarms if not alarm.acknowledged)
         self._kept = tuple(replace(alarm, holds=False) for alarm in unseen)
         self.show_alarms(())
 
     def clear(self) -> None:
-        """Keep none any longer, and show none."""
+        """Remove all alarms."""
         self._kept = ()
         self.show_alarms(())
 
 
 def alarms_text(alarms: Sequence[Alarm]) -> str:
-    """Alarms, a line each."""
+    """Text of alarms, one line each."""
     lines = []
     for alarm in alarms:
         sign = "▲ ALARM" if alarm.holds else "△ over"

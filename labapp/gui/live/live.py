@@ -1,4 +1,4 @@
-"""A camera that is watched and recorded from, without widgets; its frames come in threads."""
+"""A camera that is watched and recorded, without widgets; its frames arrive in threads."""
 
 from __future__ import annotations
 
@@ -42,10 +42,10 @@ SIMULATED = "simulated"
 """Id of the simulated camera."""
 
 SHOW_S, LOOK_S = 0.025, 0.25
-"""Dots are looked for in a frame, and a frame is judged no more often."""
+"""Minimum intervals of detecting dots in a frame and of assessing a frame."""
 
 LIGHT_S = 1.0
-"""Noise and size of the dots are estimated so often: it takes a seventh of a second."""
+"""Interval of estimating noise and size of the dots, which takes a seventh of a second."""
 
 IDLE_S = 0.005
 
@@ -61,49 +61,49 @@ WAITS = {
     "software": "Live, takes a frame on request",
     "line": "Live, takes a frame at a signal on its input",
 }
-"""Of a camera that takes none by itself, by its trigger."""
+"""State of a camera that takes frames only when triggered, by its trigger."""
 
 _Work = tuple[str, Callable[[], CameraFrame | None], Callable[[CameraFrame], None], float, float]
-"""What a thread does: its name, which frame is next, what is done with it, how often at most, and
-how long it rests, of what that took."""
+"""Work of a thread: its name, the source of the next frame, the function for a frame, the minimum
+interval, and the pause as a multiple of the duration."""
 
 
 def choices(found: list[CameraInfo]) -> list[tuple[str, str]]:
-    """(id, words) of the cameras to choose from: those that are connected, and the simulated."""
+    """(id, text) of the available cameras: the connected ones and the simulated one."""
     named = [(info.id, f"{info.name} ({info.kind})") for info in found]
     return [*named, (SIMULATED, "Simulated camera")]
 
 
 @dataclass(frozen=True)
 class JudgedFrame:
-    """What was found in a frame."""
+    """Results for a frame."""
 
     dots_px: FloatArray | None
-    """(u, v) of its dots, shape (n, 2); None where they come with the frames that are shown."""
+    """(u, v) of its dots, shape (n, 2); None if they come with the shown frames."""
     quality: Quality
     """Whether it can be measured."""
 
 
 @dataclass(frozen=True)
 class LiveFrame:
-    """A frame to be shown."""
+    """A frame to show."""
 
     frame: CameraFrame
     dots_px: FloatArray | None
-    """(u, v) of its dots, shape (n, 2); None where it is not known how to find them quickly."""
+    """(u, v) of its dots, shape (n, 2); None if it is not yet known how to find them quickly."""
 
 
 class Live:
-    """A camera at work: its newest frame to look at, and what is recorded of it.
+    """A running camera: its newest frame for display, and its recordings.
 
-    Made at once; `open` and `close` wait, and belong into a task. The other methods are quick.
+    `open` and `close` block and must be called in a task. The other methods are fast.
 
     Parameters
     ----------
     place
-        Gives the file of a recording that begins.
+        Function that returns the file for a new recording.
     setup
-        Rig and image calibration that frames are measured by; None: they are only looked at.
+        Rig and image calibration for measuring frames. None: frames are not measured.
     """
 
     def __init__(
@@ -119,10 +119,10 @@ class Live:
         self.name = name
         self.plan = plan
         self.takes: list[Take] = []
-        """The recordings made, in their order."""
+        """The recordings in chronological order."""
         self.feed: Feed | None = None
         self.watch: LiveWatch | None = None
-        """Measures the frames; None where there is no set-up, and before the camera is open."""
+        """Measures the frames; None without a set-up and before the camera is open."""
         self._place, self._folder, self._wanted = place, place().parent, wanted
         self._settings, self._limits = settings, limits or Limits()
         self.setup = setup
@@ -138,7 +138,7 @@ class Live:
         self._counted: deque[tuple[float, int]] = deque()
         self._frame_byte = 0
         self.room_byte: int | None = None
-        """Free on the disk; None where that is not known."""
+        """Free space on the disk; None if unknown."""
         self._is_stale = False
         self._closing = threading.Event()
         self._turn = threading.Lock()
@@ -149,12 +149,12 @@ class Live:
     # --- begin and end ------------------------------------------------------------------------
 
     def open(self, opened: Callable[[], Camera]) -> None:
-        """Open the camera and let frames come, unless it was closed meanwhile.
+        """Open the camera and start it, unless it was closed meanwhile.
 
         Raises
         ------
         InputError, CameraError
-            If it cannot be opened, or set so.
+            If it cannot be opened or set.
         """
         feed = Feed(self.name, opened, self._take, self._say, self._wanted)
         with self._turn:
@@ -194,7 +194,7 @@ class Live:
 
     @property
     def is_open(self) -> bool:
-        """Whether frames come, or will when the camera is back."""
+        """Whether frames arrive, or will arrive once the camera is connected again."""
         return self.feed is not None and not self._closing.is_set()
 
     def _recorder(self, feed: Feed) -> Recorder:
@@ -297,11 +297,11 @@ class Live:
     # --- to look at ---------------------------------------------------------------------------
 
     def newest(self) -> LiveFrame | None:
-        """The newest frame; None if it was given already."""
+        """The newest frame; None if it was already returned."""
         return self._newest.popleft() if self._newest else None
 
     def looked(self) -> JudgedFrame | None:
-        """What was found in the frame judged last; None if it was given already."""
+        """Results for the last assessed frame; None if they were already returned."""
         return self._judged.popleft() if self._judged else None
 
     def events(self) -> list[Event]:
@@ -309,18 +309,18 @@ class Live:
         return [self._events.get() for _ in range(self._events.qsize())]
 
     def ended_takes(self) -> list[Take]:
-        """Recordings that are written to their end, each given once."""
+        """Recordings that are completely written; each is returned once."""
         ended = [t for t in self.takes if t.finished.is_set() and t.path not in self._reported]
         self._reported |= {take.path for take in ended}
         return ended
 
     @property
     def running(self) -> Take | None:
-        """The recording that frames go into now."""
+        """The current recording."""
         return self._recorders[-1].running if self._recorders else None
 
     def rate_hz(self) -> float | None:
-        """Present rate of frames, 1/s; None while it is unknown."""
+        """Current frame rate, 1/s; None if unknown."""
         now_s, counted = time.monotonic(), self._counted
         counted.append((now_s, 0 if self.feed is None else self.feed.counts.frames))
         while len(counted) > 2 and counted[1][0] < now_s - RATE_S:
@@ -329,7 +329,7 @@ class Live:
         return (last - first) / (last_s - first_s) if last_s - first_s > RATE_S / 2 else None
 
     def state_text(self) -> str:
-        """Whether frames come, and how many."""
+        """Text of the camera's state and frame rate."""
         state = "opening" if self.feed is None else self.feed.state
         rate = self.rate_hz()
         sign, words = STATES[state]
@@ -339,7 +339,7 @@ class Live:
         return f"{sign} {words}{fast}"
 
     def counts_text(self) -> str:
-        """What came, and what did not."""
+        """Text of the numbers of frames that arrived and that did not."""
         if self.feed is None:
             return ""
         counts = self.feed.counts
@@ -349,7 +349,7 @@ class Live:
         return ", ".join(parts)
 
     def ring(self) -> tuple[float, str]:
-        """How full the memory of what comes before a trigger is, 0 … 1, and that in words."""
+        """Fill level of the memory for frames before a trigger, 0 … 1, and its text."""
         recorder = self._recorders[-1] if self._recorders else None
         wanted_s = (recorder or self).plan.before_s
         if not wanted_s:

@@ -1,4 +1,4 @@
-"""What of a camera's frames is recorded: fields of the recording page."""
+"""Fields of the recording page that determine which frames of a camera are recorded."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ BEFORE_S = 2.0
 CODECS: dict[Codec, str] = {"raw": "Raw: large, quick", "ffv1": "FFV1: small, slow"}
 
 COSTS: dict[Codec, tuple[float, float]] = {"raw": (1.0, 2.3e-9), "ffv1": (0.42, 15e-9)}
-"""Part of a frame's bytes that is written, and seconds of a core a byte (docs/cameras.md)."""
+"""Written fraction of a frame's bytes, and seconds of a core per byte (docs/cameras.md)."""
 
 SHARE = 0.5
-"""Work for more of a core than this is warned of: the rest is wanted for measuring live."""
+"""Load of a core above which there is a warning: the rest is needed for measuring live."""
 
 
 class PlanFields(QObject):
     """Fields for a `Plan`."""
 
     edited = Signal()
-    """Another plan was entered."""
+    """The plan was changed by the operator."""
 
     def __init__(self, form: FieldForm) -> None:
         super().__init__(form)
@@ -77,7 +77,7 @@ class PlanFields(QObject):
         form.add_wide(self.cost)
 
     def plan(self) -> Plan:
-        """What they hold."""
+        """The plan in the fields."""
         return Plan(
             before_s=self.before.value() or 0.0,
             after_s=self.after.value(),
@@ -86,18 +86,18 @@ class PlanFields(QObject):
         )
 
     def show_cost(self, frame_byte: int, rate_hz: float | None) -> None:
-        """Say what recording so costs; nothing while size or rate of the frames is not known."""
+        """Show the cost of the recording, if size and rate of the frames are known."""
         words = cost_text(self.plan(), frame_byte, rate_hz) if frame_byte and rate_hz else ""
         self.cost.setText(words)
 
     def set_enabled(self, enabled: bool) -> None:
-        """Let another plan be entered, or not."""
+        """Enable or disable the fields."""
         for field in (self.before, self.after, self.every, self.codec):
             field.setEnabled(enabled)
 
 
 def cost_text(plan: Plan, frame_byte: int, rate_hz: float) -> str:
-    """What recording by a plan costs, about: disk and work."""
+    """Text of the approximate cost of a plan: disk space and processor time."""
     part, core_s = COSTS[plan.codec]
     byte_s = frame_byte * rate_hz / plan.every
     core = core_s * byte_s

@@ -1,4 +1,4 @@
-"""The bar below a live picture: how the camera is, and what records from it."""
+"""The bar below a live picture: state of the camera and buttons for recording."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from labapp.gui.widgets.layouts import hbox, vbox
 BEGIN, END = "● Record", "■ End recording"
 
 BUTTON_PX, RING_BAR_PX = 44, 130
-"""Least height of the buttons that are pressed in gloves; width of the bar beside them."""
+"""Minimum height of the buttons, which are pressed with gloves; width of the memory bar."""
 
 
 class RecordBar(QWidget):
-    """Buttons to record, mark and stop; whether frames come, and the state of the recording."""
+    """Buttons to record, mark and stop; state of the camera and of the recording."""
 
     def __init__(
         self,
@@ -69,7 +69,7 @@ class RecordBar(QWidget):
         self.recording.setText(live.recording_text())
 
     def show_recording(self, recording: bool) -> None:
-        """Let the button that records say whether it does: by its words, its sign, and in red."""
+        """Show on the record button whether a recording runs: by text, sign and red colour."""
         self.mark_button.setEnabled(recording)
         pressed = self.record_button
         pressed.setText(END if recording else BEGIN)

@@ -1,4 +1,4 @@
-"""Telling live measures to control software: switched on, and what became of it in words."""
+"""Sending of live measures to control software: switches, and their state as text."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ KINDS = {
         "The newest frame as variables in Objects/Pool, some twenty times a second",
     ),
 }
-"""What can be switched on: words, usual port, tip."""
+"""The available streams: text, default port, tip."""
 
 OWN, ANY = "127.0.0.1", "0.0.0.0"
 
@@ -83,19 +83,19 @@ class LiveStreams(QWidget):
     # --- what is done -------------------------------------------------------------------------
 
     def begin(self) -> None:
-        """Switch on what is ticked: a camera has been started."""
+        """Start the selected streams after a camera has been started."""
         for kind, box in self.boxes.items():
             if box.isChecked():
                 self._bring_about(kind)
 
     def _wanted(self, kind: str) -> tuple[LiveWatch | None, str, bool]:
-        """What sends, its address (empty: none), and whether other machines may connect."""
+        """The sender, its address (empty: none), and whether other machines may connect."""
         anywhere, port = self.anywhere.isChecked(), int(self.ports[kind].value() or 0)
         place = f"{ANY if anywhere else OWN}:{port}"
         return self._watch(), place if self.boxes[kind].isChecked() else "", anywhere
 
     def _bring_about(self, kind: str, _: object = None) -> None:
-        """Open a stream in the background, or end it, as is wanted; one thing after the other."""
+        """Open or close a stream in the background, one action after the other."""
         watch, place, anywhere = wanted = self._wanted(kind)
         if watch is None or self._is_at_work(kind):
             return
@@ -104,7 +104,7 @@ class LiveStreams(QWidget):
             return
 
         def work(_: Control) -> str:
-            watch.set_stream(kind, None)  # it may have this very port
+            watch.set_stream(kind, None)  # it may use the same port
             if place:
                 try:
                     watch.set_stream(kind, open_stream(kind, place, anywhere))
@@ -114,7 +114,7 @@ class LiveStreams(QWidget):
 
         def done(problem: str) -> None:
             if self._wanted(kind) != wanted:
-                self._bring_about(kind)  # something else is wanted by now
+                self._bring_about(kind)  # the request has changed meanwhile
             elif problem:
                 self._problems[kind] = problem
                 self.boxes[kind].setChecked(False)

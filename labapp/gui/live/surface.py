@@ -1,4 +1,4 @@
-"""The live pool in 3-D, drawn as often as the window can keep up with."""
+"""The live pool in 3-D, drawn as often as the window allows."""
 
 from __future__ import annotations
 
@@ -18,17 +18,18 @@ from labapp.run.live_measuring import LiveResult
 from labapp.run.live_watch import LiveWatch
 
 LASTS_S = 1.0
-"""A surface is shown so long where the frames after it cannot be measured; `OLD_S`, where no more
-are measured: it is not of the pool that is seen."""
+"""Time for which a surface stays visible if the next frames cannot be measured. If none are
+measured, it is `OLD_S`: after that it no longer describes the visible pool."""
 
 ROOMY = 1.5
-"""A colour scale stays while a surface fills this part of it: colours do not change at once."""
+"""Largest range of a colour scale, relative to that needed for a surface, at which the scale is
+kept, so that colours change less often."""
 
 WAITING = "The surface appears here once the next frame is measured"
 
 
 class LiveSurface(QWidget):
-    """The surface of the newest frame, and from where it is looked at."""
+    """The surface of the newest frame, and the view of it."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -45,12 +46,12 @@ class LiveSurface(QWidget):
         vbox(row, (self.view, 1), of=self)
 
     def follow(self, result: LiveResult | None, watch: LiveWatch) -> bool:
-        """Show the newest surface that was drawn, and ask for the next; whether there was one.
+        """Show the newest drawn surface and request the next; returns whether there was one.
 
         Parameters
         ----------
         result
-            What was measured since the last call; None: nothing.
+            Newest result since the last call; None if there is none.
         """
         scene = watch.scene()
         watch.ask_for_scene()
@@ -69,7 +70,7 @@ class LiveSurface(QWidget):
         return False
 
     def clear(self) -> None:
-        """Show nothing until a surface comes."""
+        """Show nothing until the next surface."""
         self.view.set_words(WAITING)
         self._show(None)
         self._limits = None
@@ -81,13 +82,13 @@ class LiveSurface(QWidget):
 
     def _show(self, scene: Scene | None) -> None:
         self.view.show_scene(scene)
-        self.view.repaint()  # at once: its duration determines when the next may come
+        self.view.repaint()  # immediately: its duration determines the time of the next
 
 
 def steady_limits(
     former: tuple[float, float] | None, wanted: tuple[float, float]
 ) -> tuple[float, float]:
-    """Ends of a colour scale for the next surface: the former ones while it fills them well."""
+    """Ends of a colour scale for the next surface: the previous ones if they fit well."""
     if former is not None:
         holds = former[0] <= wanted[0] and wanted[1] <= former[1]
         if holds and former[1] - former[0] <= ROOMY * (wanted[1] - wanted[0]):

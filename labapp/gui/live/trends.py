@@ -1,4 +1,4 @@
-"""Sizes of the live pool over the last seconds, with their limits, which are entered here."""
+"""Sizes of the live pool over the last seconds, and fields for their limits."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from labapp.run.live_watch import LiveWatch
 from labapp.text import SIGMA_OF
 
 LAST_S = 30.0
-"""So much is seen at first."""
+"""Duration shown by default."""
 
 GAP_S = 0.5
-"""Over a longer time without a frame no line is drawn."""
+"""No line is drawn across longer gaps between frames."""
 
 MARKS = PLAIN, Mark("▪", "beyond its limit")
 
@@ -35,7 +35,7 @@ LOW_PX = 460
 """On a canvas lower than this plots and fields would leave each other no room."""
 
 ROOM_PX = 40
-"""All fields stand beside each other where so much is left beside them."""
+"""Space that must be left for all fields to be side by side."""
 
 RULE = (
     f"An alarm is raised when a size is beyond its limit by more than 2 σ, twice its ± "
@@ -45,8 +45,8 @@ RULE = (
 
 
 def trend_curves(trend: Trend, limits: Limits, names: tuple[str, ...]) -> tuple[Curve, ...]:
-    """Width, length and height over the time from now, with their limits."""
-    # Nothing was measured in a gap: a frame in it, without values, keeps a line from crossing it.
+    """Width, length and height against the time from now, with their limits."""
+    # A frame without values inside a gap keeps a line from crossing it.
     gap = np.flatnonzero(np.diff(trend.since_s) > GAP_S) + 1
     since_s = np.insert(trend.since_s, gap, trend.since_s[gap - 1] + GAP_S / 2)
     number = np.insert(trend.number, gap, trend.number[gap - 1] + 1)
@@ -184,7 +184,7 @@ class LiveTrends(QWidget):
         self._keep(**{f"{name}_mm": ends}, field=(name, end))
 
     def _keep(self, field: tuple[str, int] | None = None, **changed: object) -> None:
-        """Keep limits in the session; those that cannot be are refused below their field."""
+        """Store limits in the session; impossible ones are refused below their field."""
         session = self._workspace.session
         if session is None:
             return

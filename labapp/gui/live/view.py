@@ -1,4 +1,4 @@
-"""The camera on the recording page: chosen, set, watched; and the bar that records."""
+"""The camera on the recording page: its choice, settings and picture; and the recording bar."""
 
 from __future__ import annotations
 
@@ -54,46 +54,46 @@ from labapp.simulated.simulated_pool import pool_camera, simulated_pool
 from labapp.text import pluralize
 
 TICK_MS = 33
-"""The picture is renewed no more often; less often where that takes long."""
+"""Minimum interval of updates of the picture; it is longer if an update takes long."""
 
 SLOW_MS = 300
-"""It is renewed so often in any case."""
+"""Maximum interval of updates of the picture."""
 
 STATUS_S = 0.2
-"""Figures are renewed no more often."""
+"""Minimum interval of updates of the figures."""
 
 RING, RING_PX = "#2fd39b", 15
-"""Round the dots that are found: a colour of the dots page; points of the screen."""
+"""Rings around detected dots: a colour of the dots page; diameter in points of the screen."""
 
 
 class LiveView(QObject):
-    """A camera that is watched in the page's picture and recorded from.
+    """A camera that is shown in the page's picture and recorded.
 
     Attributes
     ----------
     group
         Choice and settings, for the panel.
     canvas
-        The picture and what else is seen of the camera.
+        The picture and the other views of the camera.
     bar
-        What records, below the canvas; seen while live.
+        Recording bar below the canvas; visible while live.
     live
-        The camera that runs; None without one.
+        The running camera; None without one.
     measured_s
-        `time.monotonic` when the figures were renewed; 0 before they are there.
+        `time.monotonic` at the last update of the figures; 0 before the first.
     """
 
     changed = Signal()
     """A camera was started or stopped."""
     recorded = Signal(object)
-    """A recording was written to its end: a `Take`."""
+    """A recording was completely written: a `Take`."""
 
     def __init__(self, workspace: Workspace, picture: PictureView, exposure: ExposureBars) -> None:
         super().__init__(picture)
         self.workspace = workspace
         self.live: Live | None = None
         self.updates = 0
-        """How often a live frame was shown, as a picture or as a surface."""
+        """Number of times that a live frame was shown, as a picture or as a surface."""
         self._picture, self._exposure = picture, exposure
         self._ending: list[Live] = []
         self._pools: dict[str, SimulatedDevice] = {}
@@ -119,7 +119,7 @@ class LiveView(QObject):
     # --- cameras ------------------------------------------------------------------------------
 
     def find(self) -> None:
-        """Look for the cameras that are connected, in the background."""
+        """Search for connected cameras in the background."""
 
         def done(answer: tuple[list[CameraInfo], list[str]]) -> None:
             found, problems = answer
@@ -139,7 +139,7 @@ class LiveView(QObject):
             )
 
     def start(self) -> None:
-        """Show what the chosen camera sees."""
+        """Show the picture of the chosen camera."""
         session = self.workspace.session
         if session is None or self.live is not None:
             return
@@ -175,7 +175,7 @@ class LiveView(QObject):
         self.changed.emit()
 
     def _opener(self, chosen: str, session: Session) -> Callable[[Control], Callable[[], Camera]]:
-        """What makes what opens a camera; the pool is rendered at the first time only."""
+        """Function that makes the opener of a camera; the pool is rendered only the first time."""
         if chosen != SIMULATED:
             return lambda _: partial(open_camera, chosen)
         text = simulated_pool(session)
@@ -210,7 +210,7 @@ class LiveView(QObject):
         self.bar.record_button.setFocus()
 
     def stop(self) -> None:
-        """Stop the camera; a recording that runs is finished first."""
+        """Stop the camera after finishing a current recording."""
         live, self.live = self.live, None
         if live is None:
             return
@@ -231,7 +231,7 @@ class LiveView(QObject):
         self.changed.emit()
 
     def _session_closes(self) -> None:
-        """Write what is being recorded to its end before anything else goes."""
+        """Complete a current recording before the session closes."""
         for live in (*self._ending, *([self.live] if self.live is not None else [])):
             live.close()
             for event in live.events():
@@ -253,16 +253,16 @@ class LiveView(QObject):
 
     @property
     def is_live(self) -> bool:
-        """Whether frames come, or will when the camera is back."""
+        """Whether frames arrive, or will arrive once the camera is connected again."""
         return self.live is not None and self.live.is_open
 
     @property
     def recording(self) -> Take | None:
-        """The recording that runs; None if none does."""
+        """The current recording; None if there is none."""
         return None if self.live is None else self.live.running
 
     def trigger(self) -> None:
-        """Begin a recording, or end the one that runs."""
+        """Begin a recording, or end the current one."""
         live = self.live
         if live is not None and live.is_open:
             self.workspace.run_or_report(live.trigger)
@@ -270,19 +270,19 @@ class LiveView(QObject):
             self._show_state()
 
     def discard(self, take: Take) -> None:
-        """Delete a recording that runs as soon as the camera has stopped."""
+        """Delete a current recording as soon as the camera has stopped."""
         if self.live is not None and not self.live.discard(take):
             self.workspace.notified.emit(f"{take.path.name} had ended and is kept", False)
 
     def mark(self) -> bool:
-        """Note the present frame beside the recording that runs; False if none does."""
+        """Mark the current frame in the notes of the recording; False if there is none."""
         if self.live is None or self.recording is None:
             return False
         self.live.mark()
         return True
 
     def acknowledge(self) -> None:
-        """Take it that the operator has seen the alarms."""
+        """Acknowledge the alarms for the operator."""
         watch = self._watch()
         self.canvas.alarms.clear()
         if watch is not None:
@@ -293,7 +293,7 @@ class LiveView(QObject):
         return None if self.live is None else self.live.watch
 
     def _set_limits(self) -> None:
-        """Watch the session's limits: they may have been changed."""
+        """Use the session's limits, which may have changed."""
         session, watch = self.workspace.session, self._watch()
         if session is not None and watch is not None:
             watch.set_limits(session.limits)
@@ -306,7 +306,7 @@ class LiveView(QObject):
             self.live.set_plan(plan)
 
     def _begin_anew(self) -> None:
-        """Keep no frames from before the camera was set otherwise."""
+        """Discard frames from before a change of the camera's settings."""
         if self.live is not None:
             self.live.set_plan(self.live.plan)
 
@@ -338,7 +338,7 @@ class LiveView(QObject):
             self._timer.setInterval(wanted)
 
     def _follow(self, watch: LiveWatch) -> None:
-        """Show what was measured since the last call."""
+        """Show the results since the last call."""
         result = watch.newest()
         if result is not None:
             former, was_old = self._result, self._age_s > OLD_S
@@ -356,7 +356,7 @@ class LiveView(QObject):
 
     @property
     def _age_s(self) -> float:
-        """How old the figures are, s."""
+        """Age of the figures, s."""
         result = self._result
         return 0.0 if result is None else time.monotonic() - result.arrived_s
 
@@ -403,7 +403,7 @@ class LiveView(QObject):
     # --- widgets ------------------------------------------------------------------------------
 
     def _show_state(self) -> None:
-        """Show what can be done now."""
+        """Show the actions that are available now."""
         active = self.workspace.tasks.active
         if self.live is not None and self.live.feed is None and self._opening not in active:
             self.live = None  # it could not be opened, or that was cancelled
@@ -447,7 +447,7 @@ class LiveView(QObject):
         self.group = Group("Capture", form, buttons, self.answer, self.settings)
 
     def take_key(self, key: Qt.Key) -> bool:
-        """Do what a plain key means while live; whether it means anything."""
+        """Run the action of a plain key while live; returns whether it has one."""
         works = {
             Qt.Key.Key_Space: self.trigger,
             Qt.Key.Key_M: self.mark,

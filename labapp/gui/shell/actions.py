@@ -1,4 +1,4 @@
-"""Every action of the window as data: its menu, words, key, tip and what it needs."""
+"""Every action of the window as data: its menu, text, key, tip and requirement."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from labapp.gui.shell.steps import STEPS
 Needs = Literal[
     "", "session", "draft", "changing", "frames", "measuring", "undo", "redo", "work", "live"
 ]
-"""What must be there for an action to be of use; it is greyed out without."""
+"""Requirement of an action, which is greyed out if it is not met."""
 
 
 @dataclass(frozen=True)
@@ -18,19 +18,19 @@ class Action:
     """One thing the operator can do from anywhere in the window; `commands` does it."""
 
     name: str
-    """In code; unique."""
+    """Unique name used in code."""
     text: str
-    """Its words there; ``&`` before the letter that chooses it, … where it asks something first."""
+    """Text in the menu; ``&`` before the mnemonic letter, … if the action asks something first."""
     key: str
-    """Its key. One without Ctrl, Alt or F is first the key of what has the focus."""
+    """Key of the action. One without Ctrl, Alt or F goes to the focused widget first."""
     tip: str
-    """What it does, a sentence."""
+    """Explanation in one sentence."""
     needs: Needs = ""
     checkable: bool = False
     group: str = ""
-    """Of actions of which one is on."""
+    """Group of actions of which exactly one is on."""
     begins: bool = False
-    """Whether a line divides it from the one before."""
+    """Whether a line separates it from the previous one."""
     menu: str = ""
 
 

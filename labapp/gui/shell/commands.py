@@ -1,4 +1,4 @@
-"""What each action of the window does, and the window with it."""
+"""The functions of the window's actions, and creation of the window."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from labapp.gui.workspace import MEASURING
 from labapp.log import log_file
 
 FAR = 10**9
-"""More frames than there are."""
+"""A number larger than that of the frames."""
 
 NO_CAMERA = "No camera is watched: start one in the step Recording"
 
@@ -33,7 +33,7 @@ def make_window(preferences: Preferences, file: Path) -> MainWindow:
 
 
 def commands(window: MainWindow) -> dict[str, Callable[[], object]]:
-    """What the actions do in a window, by their names."""
+    """Functions of the actions in a window, by their names."""
     files, workspace, timeline = window.files, window.workspace, window.timeline
     parts = (
         window.step_list,
@@ -95,7 +95,7 @@ def commands(window: MainWindow) -> dict[str, Callable[[], object]]:
 
 
 def name_draft(window: MainWindow) -> None:
-    """Name the draft; the step and the frame in view stay."""
+    """Name the draft, keeping the step and the frame in view."""
     key, frame = window.page.key if window.page else "", window.workspace.frame
     window.files.name_draft()
     window.show_step(key)
@@ -104,7 +104,7 @@ def name_draft(window: MainWindow) -> None:
 
 
 def measure(window: MainWindow, frames: list[int] | None) -> None:
-    """Measure frames; None: those that are not measured, or whose measures are out of date."""
+    """Measure frames. None: those that are not measured or whose measures are out of date."""
     workspace, session = window.workspace, window.workspace.session
     if session is None:
         return
@@ -133,7 +133,7 @@ def enter_setup(window: MainWindow) -> None:
 
 
 def record(window: MainWindow) -> None:
-    """Begin a recording of the live camera, or end it, whatever page is in view."""
+    """Begin or end a recording of the live camera, regardless of the page in view."""
     if window.camera is None:
         window.say(NO_CAMERA, True)
     else:
@@ -141,7 +141,7 @@ def record(window: MainWindow) -> None:
 
 
 def mark(window: MainWindow) -> None:
-    """Mark the present moment in the recording that runs."""
+    """Mark the present moment in the current recording."""
     if window.camera is None:
         window.say(NO_CAMERA, True)
     elif not window.camera.mark():
@@ -167,7 +167,7 @@ def copy_table(window: MainWindow) -> None:
 
 
 def toggle_full_screen(window: MainWindow) -> None:
-    """Use all of the screen, or go back to a window."""
+    """Switch between full screen and window."""
     if window.isFullScreen():
         window.showNormal()
     else:
@@ -175,7 +175,7 @@ def toggle_full_screen(window: MainWindow) -> None:
 
 
 def show_help(window: MainWindow, kind: str) -> None:
-    """Show the guide, the keys or what the program is."""
+    """Show the guide, the keys or the information about the program."""
     HelpDialog(kind, window, window.page).show()
 
 

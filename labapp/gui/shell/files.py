@@ -25,15 +25,15 @@ if TYPE_CHECKING:
 
 
 class Files(QObject):
-    """What the window opens and makes."""
+    """Opening and creation of files by the window."""
 
     recording_requested = Signal(object, bool)
-    """The step Recording is to be shown, and to take this file or folder, unless it is None.
+    """The step Recording is to be shown and to take this file or folder, unless it is None.
 
-    The second says whether it is to be imported at once.
+    The second argument tells whether it is to be imported immediately.
     """
     refused = Signal(str)
-    """Why what was pressed on the welcome page was refused; empty: it was not."""
+    """Reason why an action of the welcome page was refused; empty if it was not."""
 
     def __init__(
         self,
@@ -49,7 +49,7 @@ class Files(QObject):
         self._camera = camera
 
     def new(self) -> bool:
-        """Ask for a file and make a session in it."""
+        """Ask for a file and create a session in it."""
         from labapp.session.session import Session
 
         proposed = dialogs.new_path(self.preferences.current.folder, "experiment")
@@ -69,14 +69,14 @@ class Files(QObject):
             self.open(path)
 
     def open_recording(self) -> None:
-        """Ask for a recording and show it at once, in a draft."""
+        """Ask for a recording and show it immediately in a draft."""
         folder = self.preferences.current.folder
         path = dialogs.ask_recording(self._window, folder, "Open recording")
         if path is not None:
             self.begin_draft(path)
 
     def begin_draft(self, recording: Path) -> None:
-        """Show a recording at once, in a session that needs no name yet."""
+        """Show a recording immediately in a session that needs no name yet."""
         if not self.may_close():
             return
 
@@ -119,7 +119,7 @@ class Files(QObject):
         return self.open(moved or draft) and moved is not None
 
     def forget(self, path: Path) -> None:
-        """Take a session off the list of recent ones; delete a draft if the operator agrees."""
+        """Remove a session from the recent ones; delete a draft if the operator agrees."""
         if is_draft(path) and path.exists():
             if not dialogs.ask_delete_draft(self._window, path):
                 return
@@ -148,7 +148,7 @@ class Files(QObject):
             self.take(path)
 
     def open_dropped(self, paths: Sequence[Path]) -> None:
-        """Open a file or folder that was dropped, once the other program has its pointer back."""
+        """Open a dropped file or folder after the other program has got its pointer back."""
         if len(paths) > 1:
             words = "Drop one file, or the folder that holds the images"
             self.workspace.notified.emit(words, True)
@@ -169,7 +169,7 @@ class Files(QObject):
         return True
 
     def take(self, path: Path) -> None:
-        """Take a recording into the session; in a draft where none is open."""
+        """Import a recording into the session, or into a draft if none is open."""
         if not path.exists():
             self.workspace.notified.emit(f"{path} does not exist", True)
         elif self.workspace.session is None:
@@ -180,7 +180,7 @@ class Files(QObject):
             self.recording_requested.emit(path, False)
 
     def save_copy(self) -> None:
-        """Ask for a file and save the session in it as it is now."""
+        """Ask for a file and save a copy of the current session in it."""
         session = self.workspace.session
         if session is None:
             return
@@ -197,7 +197,7 @@ class Files(QObject):
             )
 
     def begin_next(self, recording: Path) -> None:
-        """Ask for a file and make a session like this one in it, for a recording; show it."""
+        """Ask for a file, create a session like this one for a recording in it, and show it."""
         present = self.workspace.session
         if present is None:
             return
@@ -214,7 +214,7 @@ class Files(QObject):
             self.recording_requested.emit(None, False)
 
     def try_sample(self, name: str = "gtaw") -> None:
-        """Open a copy of a sample session, in a folder of the user's."""
+        """Open a copy of a sample session in one of the user's folders."""
         from labapp.session.copies import copy_sample
 
         folder = self.preferences.current.samples_folder / name
@@ -229,7 +229,7 @@ class Files(QObject):
             self.workspace.show(None)
 
     def may_close(self) -> bool:
-        """Ask what to do with a running recording; False if it continues and nothing is closed."""
+        """Ask what to do with a running recording; False if it continues and nothing closes."""
         camera = self._camera()
         take = None if camera is None else camera.recording
         if camera is None or take is None:
@@ -260,7 +260,7 @@ class Files(QObject):
 
 
 def title(session: Session | None) -> str:
-    """Title of a window with a session, or with none."""
+    """Title of a window with or without a session."""
     if session is None:
         return "labapp"
     notes = (" (draft)" if is_draft(session.path) else "") + " (read-only)" * session.read_only

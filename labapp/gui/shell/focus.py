@@ -1,4 +1,4 @@
-"""Keyboard focus: from one part of the window to the next, and into a part."""
+"""Keyboard focus: moving between parts of the window and into a part."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from PySide6.QtWidgets import QApplication, QStackedWidget, QWidget
 
 
 def go_to_part(parts: Sequence[QWidget], by: int) -> None:
-    """Move the focus to the next part of a window that can have it, or the one before (-1)."""
+    """Move the focus to the next part of a window that can have it, or the previous one (-1)."""
     parts = [part for part in parts if part.isVisibleTo(part.window())]
     focus = QApplication.focusWidget()
     here = [k for k, part in enumerate(parts) if focus is not None and _holds(part, focus)]
@@ -20,9 +20,9 @@ def go_to_part(parts: Sequence[QWidget], by: int) -> None:
 
 
 def give_keys(part: QWidget) -> bool:
-    """Focus a part where it had the focus last, or its first widget; False if none can have it."""
-    # Not by nextInFocusChain: PySide takes its result for a child of the widget before it. The
-    # window is last in the chain, and would be invalid once the label before it is deleted.
+    """Focus the widget of a part that had it last, or its first one; False if there is none."""
+    # Not by nextInFocusChain: PySide takes its result for a child of the previous widget. The
+    # window is last in the chain and would become invalid when the label before it is deleted.
     inside = part.findChildren(QWidget)
     last: QWidget | None = part.focusWidget()  # None for a part that never had them
     candidates = (last, part, *inside)
@@ -39,7 +39,7 @@ def takes_keys(widget: QWidget, part: QWidget) -> bool:
 
 
 def finish_edit(*parts: QWidget) -> None:
-    """Take the focus from within some parts: a field is finished when it loses the focus."""
+    """Remove the focus from some parts: a field is finished when it loses the focus."""
     focus = QApplication.focusWidget()
     if focus is not None and any(_holds(part, focus) for part in parts):
         focus.clearFocus()

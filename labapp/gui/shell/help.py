@@ -1,4 +1,4 @@
-"""The guide, the keys and what the program is: made from what the window is made from."""
+"""The guide, the keys and the information about the program, from the same data as the window."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from labapp.gui.pages.page import Page
 
 PART_OF_SCREEN = 0.85
-"""No text takes more of the screen; the rest is for the frame around it."""
+"""Largest share of the screen for a text; the rest is for the frame around it."""
 
 SIZES_PX = {"guide": (900, 700), "keys": (720, 600), "about": (520, 300)}
 
@@ -46,7 +46,7 @@ kept. A problem stays in the status line until you have read it; F4 shows all me
 
 
 def guide() -> str:
-    """What to do, step by step; HTML."""
+    """Step-by-step instructions as HTML."""
     steps = "".join(
         f"<h3>{number} {escape(step.title)}</h3><p>{escape(step.hint)}</p>"
         for number, step in enumerate(STEPS, 1)
@@ -129,7 +129,7 @@ class GuidePages(QTextBrowser):
             self.setSource(url)
 
     def loadResource(self, kind: int, name: QUrl | str) -> object:
-        """Load a page, or a picture as wide as there is room."""
+        """Load a page, or a picture with the available width."""
         loaded = super().loadResource(kind, name)
         if kind != QTextDocument.ResourceType.ImageResource.value:
             return loaded
@@ -158,7 +158,7 @@ class HelpDialog(QDialog):
         layout.addWidget(buttons)
         wanted = QSize(*SIZES_PX[kind])
         self.resize(wanted.boundedTo(self.screen().availableSize() * PART_OF_SCREEN))
-        layout.activate()  # pictures are made to fit
+        layout.activate()  # pictures are scaled to fit
         name = "welcome" if page is None else page.key
         if kind != "guide" or not self.browser.show_page(name):
             self.browser.setHtml(keys(page) if kind == "keys" else TEXTS[kind]())

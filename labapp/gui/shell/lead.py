@@ -1,4 +1,4 @@
-"""What is seen in place of a page with nothing to show: what it will show, what leads there."""
+"""The substitute for a page without content: what it will show, and the actions to get there."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from labapp.gui.widgets.layouts import hbox, vbox
 
 WORDS_PX = 340
 PICTURE_PX = (240, 144)
-"""Width of the words; size of the picture."""
+"""Width of the text; size of the picture."""
 
 
 def action_button(name: str, do: Callable[[str], object]) -> QPushButton:
-    """A button for an action of the window, with its words; ``do`` is called with its name."""
+    """A button with the text of an action of the window; ``do`` is called with its name."""
     action = next(each for each in ACTIONS if each.name == name)
     tip = f"{action.tip} ({action.key})" if action.key else action.tip
     return button(action.text, tip, lambda: do(name))
@@ -35,13 +35,13 @@ def action_grid(names: Sequence[str], do: Callable[[str], object]) -> QWidget:
     grid.setContentsMargins(0, 0, 0, 0)
     for k, name in enumerate(names):
         pressed = action_button(name, do)
-        pressed.setMinimumWidth(1)  # a narrow panel holds it, too
+        pressed.setMinimumWidth(1)  # so that it fits into a narrow panel, too
         grid.addWidget(pressed, k // 2, k % 2)
     return made
 
 
 class EmptyState(QWidget):
-    """Stands in the place of a page that has nothing to show yet."""
+    """Substitute for a page that has nothing to show yet."""
 
     action_requested = Signal(str)
     """A button was pressed: the name of the window's action."""
@@ -69,7 +69,7 @@ class EmptyState(QWidget):
         self.picture.show_step(key)
         self.words.setText(lead.words)
         for each in self.buttons:
-            each.hide()  # it is deleted only later
+            each.hide()  # it is deleted only later by Qt
             each.deleteLater()
         self.buttons = [self._button(each) for each in lead.actions]
         for k, made in enumerate(self.buttons):
@@ -87,7 +87,7 @@ class EmptyState(QWidget):
 
 
 class _Picture(QWidget):
-    """A small drawing of what a step shows."""
+    """A small drawing of the content of a step."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -110,7 +110,7 @@ class _Picture(QWidget):
 
 
 Stroke = tuple[FloatArray, bool, bool]
-"""Points, shape (n, 2), in a box of 100 × 60; whether it is in the accent colour; dots, no line."""
+"""Points, shape (n, 2), in a box of 100 × 60; whether in the accent colour; whether as dots."""
 
 
 def _draw(painter: QPainter, points: FloatArray, color: QColor, dots: bool) -> None:
@@ -131,7 +131,7 @@ def _line(*points: tuple[float, float]) -> FloatArray:
 
 
 def _frame_strokes() -> list[Stroke]:
-    """A frame of a film, and the sign for play."""
+    """A frame of a film with the play symbol."""
     film = _line((18, 6), (82, 6), (82, 54), (18, 54), (18, 6))
     return [(film, False, False), (_line((43, 20), (60, 30), (43, 40), (43, 20)), True, False)]
 
@@ -198,4 +198,4 @@ PICTURES: dict[str, Callable[[], list[Stroke]]] = {
     "plane": _plane_strokes,
     "bench_check": _mirror_strokes,
 }
-"""By the key of the step; a frame of a film for all others."""
+"""Drawings by the key of the step; all others have a frame of a film."""

@@ -1,4 +1,4 @@
-"""The menus, made from the actions that are declared."""
+"""The menus, made from the declared actions."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class Menus:
-    """The window's menus, and which of their actions are of use now."""
+    """The window's menus, and the states of their actions."""
 
     def __init__(
         self,
@@ -69,7 +69,7 @@ class Menus:
         return made
 
     def key(self, event: QKeyEvent) -> bool:
-        """Do the action of a plain key that nothing else has taken; whether there is one."""
+        """Run the action of a plain key that was not handled; returns whether there is one."""
         name = self._plain.get(event.keyCombination())
         if name is None or not self.actions[name].isEnabled():
             return False
@@ -79,7 +79,7 @@ class Menus:
     def refresh(
         self, there: Mapping[Needs, bool], on: Mapping[str, bool], undo: str, redo: str
     ) -> None:
-        """Enable what is of use now, check what is on, say what undo and redo would do."""
+        """Update which actions are enabled and checked, and the texts of undo and redo."""
         for name, made in self.actions.items():
             made.setEnabled(there[self._needs[name]])
         for name, is_on in on.items():
@@ -88,12 +88,12 @@ class Menus:
         self.actions["redo"].setText(f"&Redo {redo}".rstrip())
 
     def show_titles(self, steps: Sequence[Step]) -> None:
-        """Show steps as they are called in the session."""
+        """Show the titles of the steps in the session."""
         for step in steps:
             self.actions[f"step_{step.key}"].setText(step.title)
 
     def show_recent(self, paths: tuple[str, ...]) -> None:
-        """List the sessions opened before."""
+        """List the recently opened sessions."""
         self.recent.clear()
         self.recent.setEnabled(bool(paths))
         for number, name in enumerate(paths, 1):
@@ -105,7 +105,7 @@ class Menus:
 
 
 def is_plain(key: QKeyCombination) -> bool:
-    """Whether a key belongs first to what has the focus: no Ctrl, no Alt, and not F1 … F12."""
+    """Whether a key goes to the focused widget first: no Ctrl, no Alt, and not F1 … F12."""
     held = key.keyboardModifiers()
     function = Qt.Key.Key_F1 <= key.key() <= Qt.Key.Key_F12
     return not function and held in (
@@ -115,7 +115,7 @@ def is_plain(key: QKeyCombination) -> bool:
 
 
 def steps_of(session: Session | None) -> tuple[str, str]:
-    """Labels of the changes that undo and redo would take back and make again; or nothing."""
+    """Labels of the changes that undo and redo would affect; empty without one."""
     if session is None or session.read_only:
         return "", ""
     history = session.history

@@ -24,7 +24,7 @@ from labapp.gui.widgets.layouts import fill
 KEPT_MESSAGES = 1000
 
 TOLD = Qt.ItemDataRole.UserRole
-"""Of a line of the log: its text, since when, and how many times."""
+"""Data of a line of the log: its text, the time of its first occurrence, and the count."""
 
 
 class LogPanel(QListWidget):
@@ -41,7 +41,7 @@ class LogPanel(QListWidget):
         self.setMinimumHeight(self.fontMetrics().height() * 2)
 
     def sizeHint(self) -> QSize:
-        """Some lines; the operator may drag it higher, or lower."""
+        """Height of some lines; the operator can change it."""
         return QSize(400, self.fontMetrics().height() * 6)
 
     def add(self, text: str, problem: bool) -> None:
@@ -65,11 +65,11 @@ class LogPanel(QListWidget):
         self.scrollToBottom()
 
     def texts(self) -> list[str]:
-        """What it shows, message by message."""
+        """The displayed messages."""
         return [self.item(row).text() for row in range(self.count())]
 
     def keyPressEvent(self, event: QKeyEvent) -> None:
-        """Copy the messages that are selected."""
+        """Copy the selected messages."""
         if event.matches(QKeySequence.StandardKey.Copy):
             chosen = sorted(self.selectedItems(), key=self.row)
             QApplication.clipboard().setText("\n".join(item.text() for item in chosen))
@@ -78,13 +78,13 @@ class LogPanel(QListWidget):
 
 
 class StatusLine(QWidget):
-    """The last message, and how far the work under way is.
+    """The last message, and the progress of the current work.
 
-    A problem stays until it is dismissed or solved, whatever message follows.
+    A problem stays until it is dismissed or solved, even if other messages follow.
     """
 
     messages_requested = Signal()
-    """All messages are to be shown, or hidden again."""
+    """The list of all messages is to be shown or hidden."""
 
     def __init__(self, tasks: Tasks) -> None:
         super().__init__()
@@ -110,7 +110,7 @@ class StatusLine(QWidget):
         layout.setContentsMargins(6, 0, 6, 0)
         right = (self.title, self.bar, self.cancel_button, self.show_button)
         fill(layout, self.dismiss_button, (self.message, 1), *right)
-        # What comes and goes must not move the window's other parts.
+        # Widgets that appear and disappear must not move the window's other parts.
         self.setMinimumHeight(layout.sizeHint().height())
         tasks.changed.connect(self.show_progress)
         tasks.progressed.connect(self.show_progress)
@@ -118,7 +118,7 @@ class StatusLine(QWidget):
         self._show_message("")
 
     def say(self, text: str, problem: bool) -> None:
-        """Show a message, unless a problem is there that nobody has read; each counts once."""
+        """Show a message unless there is an unread problem; each problem is counted once."""
         if problem:
             self.unread[:] = [*(each for each in self.unread if each != text), text]
         elif self.unread:
@@ -126,24 +126,24 @@ class StatusLine(QWidget):
         self._show_message(text)
 
     def settle(self, text: str) -> None:
-        """Take a problem off the line that is over, read or not; the log still has it."""
+        """Remove a solved problem from the line, read or not; the log keeps it."""
         if text in self.unread:
             self.unread.remove(text)
             self._show_message(self.unread[-1] if self.unread else "")
 
     def mark_read(self) -> None:
-        """Take the problems off the line."""
+        """Remove the problems from the line."""
         self.unread.clear()
         self._show_message("")
 
     def cancel(self) -> None:
-        """Ask all the work under way to stop."""
+        """Request all current work to stop."""
         for task in self._tasks.active:
             task.cancel()
         self.show_progress()
 
     def show_progress(self) -> None:
-        """Show how far the work under way is, or nothing where there is none."""
+        """Show the progress of the current work, or nothing if there is none."""
         active = self._tasks.active
         for widget in (self.title, self.bar, self.cancel_button):
             widget.setVisible(bool(active))

@@ -1,4 +1,4 @@
-"""Where a session's set-up comes from: a setup file, another session, the one used last."""
+"""Sources of a session's set-up: a setup file, another session, or the last one used."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ if TYPE_CHECKING:
     from labapp.session.session import Session
 
 CAUSE = "Set-up"
-"""Of refusals, see `Workspace.say_wrong`."""
+"""Cause of refusals, see `Workspace.say_wrong`."""
 
 NO_LAST = "No session among the recent ones has a complete set-up: load a setup file, or enter it"
 
 
 class Setups(QObject):
-    """Takes a whole set-up into the session; frames that are there are measured with it at once."""
+    """Import of a whole set-up into the session, whose frames are then measured with it."""
 
     answered = Signal(str)
-    """What came of it, for beside what was pressed: why a set-up was not taken; empty at first."""
+    """Text for display at the pressed button: why a set-up was not taken; empty at first."""
 
     def __init__(
         self, window: QWidget, workspace: Workspace, preferences: PreferencesStore
@@ -41,19 +41,19 @@ class Setups(QObject):
         self.preferences = preferences
 
     def load(self) -> None:
-        """Ask for a setup file and take it."""
+        """Ask for a setup file and use it."""
         path = dialogs.ask_setup(self._window, self.workspace.folder)
         if path is not None:
             self._use(lambda session: load_setup(session, path), path.name)
 
     def use_other(self) -> None:
-        """Ask for another session and take its set-up."""
+        """Ask for another session and use its set-up."""
         path = dialogs.ask_session(self._window, self.workspace.folder)
         if path is not None:
             self._use_session(path)
 
     def use_last(self) -> None:
-        """Take the set-up of the session opened last that has a complete one."""
+        """Use the set-up of the last opened session with a complete one."""
         session = self.workspace.session
         if session is None:
             return
@@ -80,7 +80,7 @@ class Setups(QObject):
         self._use(lambda session: use_setup_of(session, path), path.stem)
 
     def _use(self, take: Callable[[Session], None], name: str) -> None:
-        """Take a set-up, and measure with it unless its calibration is of another size of frame."""
+        """Use a set-up, and measure with it unless it was calibrated for another frame size."""
         from labapp.gui.live.camera_fields import calibrated_px, other_size
 
         workspace = self.workspace
@@ -103,7 +103,7 @@ class Setups(QObject):
 
 
 def load_setup(session: Session, path: Path) -> None:
-    """Take the set-up from a setup file.
+    """Use the set-up from a setup file.
 
     Raises
     ------

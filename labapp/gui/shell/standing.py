@@ -1,4 +1,4 @@
-"""How each frame of a session stands: what its tick in the timeline shows."""
+"""The state of each frame of a session, which its tick in the timeline shows."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class FrameStatus(IntEnum):
-    """How a frame stands; where several share a pixel, the greatest shows."""
+    """State of a frame; if several frames share a pixel, the greatest is shown."""
 
     NOT_MEASURED = 0
     PULSE = 1
@@ -26,7 +26,7 @@ class FrameStatus(IntEnum):
 
     @property
     def words(self) -> str:
-        """For the operator."""
+        """Text for the operator."""
         return WORDS[self]
 
 
@@ -49,14 +49,14 @@ TICKS = (
         FrameStatus.NOT_MEASURABLE.words, "failed", "#b8321f", "#f0705a", ((0.0, 0.22), (0.78, 1.0))
     ),
 )
-"""By `FrameStatus`."""
+"""Texts by `FrameStatus`."""
 
 DOUBTFUL = (FrameStatus.DOUBTFUL, FrameStatus.NOT_MEASURABLE)
-"""What an operator has to look at."""
+"""States that the operator has to check."""
 
 
 def standings(seen: Overview) -> IntArray:
-    """How every frame stands, values of `FrameStatus`, shape (n,)."""
+    """State of every frame, values of `FrameStatus`, shape (n,)."""
     from labapp.session.trends import doubtful_frames
 
     status = np.array(seen.status, dtype=object)
@@ -72,16 +72,16 @@ def standings(seen: Overview) -> IntArray:
 def next_frame(
     frames: IntArray, wanted: BoolArray, current: int, forward: bool = True
 ) -> int | None:
-    """The nearest wanted frame after the current one, or before it; None if there is none.
+    """The nearest wanted frame after or before the current one; None if there is none.
 
     Parameters
     ----------
     frames
         Numbers of the frames, ascending, shape (n,).
     wanted
-        Which of them are wanted, shape (n,), of bool.
+        Whether each frame is wanted, shape (n,), bool.
     current
-        A frame's number.
+        Number of the current frame.
     """
     chosen = frames[wanted]
     chosen = chosen[chosen > current] if forward else chosen[chosen < current][::-1]

@@ -1,4 +1,4 @@
-"""The steps at the left, each with its mark, and the panel at the right that says what to do."""
+"""The steps at the left, each with its mark, and the panel with instructions at the right."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ LEAST_PX = 320
 """Least width of the panel: 683 are all that 1024 px are at 150 %."""
 
 STATE_LINES = 2
-"""Room for how far a step is: the panel below stays where it is, whatever there is to say."""
+"""Lines reserved for the state of a step, so that the panel below does not move."""
 
 COLOURS = {
     Mark.TODO: ("#6b7480", "#929ba6"),
@@ -48,7 +48,7 @@ COLOURS = {
     Mark.DONE: ("#1d7f45", "#58c783"),
     Mark.ATTENTION: ("#b35300", "#f2a35e"),
 }
-"""On a light and on a dark ground."""
+"""Colours on a light and on a dark background."""
 
 SIGNS = {Mark.TODO: "○", Mark.READY: "▶", Mark.DONE: "✓", Mark.ATTENTION: "▲"}
 
@@ -58,7 +58,7 @@ WARNING = ((0.5, 0.1), (0.93, 0.88), (0.07, 0.88))
 
 
 def mark_icon(mark: Mark, dark: bool, selected: QColor | None = None) -> QIcon:
-    """The mark's shape in its colour, and in another where its step is selected."""
+    """The mark's shape in its colour, or in another colour if its step is selected."""
     colour = QColor(COLOURS[mark][dark])
     icon = QIcon(_drawn(mark, colour, QColor("#22262a" if dark else "#ffffff")))
     if selected is not None:
@@ -122,13 +122,13 @@ class StepList(FollowsTheme, QListWidget):
         self.follow_theme()
 
     def sizeHint(self) -> QSize:
-        """As wide as the longest title needs."""
+        """Width of the longest title."""
         metrics = self.fontMetrics()
         texts = [metrics.horizontalAdvance(text) for text in self._texts()]
         return QSize(max([60, *texts]) + ICON_PX + 36, 200)
 
     def show_titles(self, steps: Sequence[Step]) -> None:
-        """Show the same steps, as they are called in the session."""
+        """Show the same steps with their titles in the session."""
         self._steps = tuple(steps)
         is_narrow = self.isVisible() and self.width() < self.sizeHint().width()
         for row, text in enumerate(self._texts()):
@@ -143,7 +143,7 @@ class StepList(FollowsTheme, QListWidget):
         self.show_titles(self._steps)
 
     def show_states(self, states: Mapping[str, State]) -> None:
-        """Show how far every step is."""
+        """Show the state of every step."""
         self._states = states
         dark = is_dark(self.palette())
         selected = self.palette().color(QPalette.ColorRole.HighlightedText)
@@ -172,7 +172,7 @@ class StepList(FollowsTheme, QListWidget):
 
 
 class SidePanel(FollowsTheme, QWidget):
-    """What to do now, how far the step is, and the page's own panel, which scrolls."""
+    """Instructions, state of the step, and the page's own panel, which can be scrolled."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -200,7 +200,7 @@ class SidePanel(FollowsTheme, QWidget):
         self.follow_theme()
 
     def sizeHint(self) -> QSize:
-        """Room for two columns of numbers."""
+        """Width of two columns of numbers."""
         return QSize(350, 500)
 
     def show_panel(self, panel: QWidget, step: Step) -> None:
@@ -216,7 +216,7 @@ class SidePanel(FollowsTheme, QWidget):
         self.hint.setText(step.hint)
 
     def show_state(self, state: State) -> None:
-        """Show how far the step is, and why."""
+        """Show the state of the step and its reason."""
         self._shown = state
         self.state.setText(f"{SIGNS[state.mark]}  {state.why}")
         palette = self.state.palette()
@@ -225,6 +225,6 @@ class SidePanel(FollowsTheme, QWidget):
         self.state.setPalette(palette)
 
     def take_colours(self) -> None:
-        """Say how far the step is in the colour of its mark."""
+        """Show the state of the step in the colour of its mark."""
         if self._shown is not None:
             self.show_state(self._shown)

@@ -1,4 +1,4 @@
-"""The steps of the guided way and how far each is: computed from the session, never stored."""
+"""The steps of the window and the state of each: computed from the session, never stored."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class Mark(Enum):
-    """How far a step is."""
+    """State of a step."""
 
     TODO = "to do"
     READY = "ready"
@@ -30,7 +30,7 @@ class Mark(Enum):
 
 @dataclass(frozen=True)
 class State:
-    """How far a step is, and why: the words that explain its mark and its disabled buttons."""
+    """State of a step, and its reason: the text that explains its mark and disabled buttons."""
 
     mark: Mark
     why: str
@@ -38,7 +38,7 @@ class State:
 
 @dataclass(frozen=True)
 class Offer:
-    """A button of a page that is no action of the window."""
+    """A button of a page that is not an action of the window."""
 
     text: str
     tip: str
@@ -47,11 +47,11 @@ class Offer:
 
 @dataclass(frozen=True)
 class Lead:
-    """What a page with nothing to show says: what it will show, and what leads there."""
+    """Text of a page without content: what it will show, and the actions to get there."""
 
     words: str
     actions: tuple[str | Offer, ...]
-    """Names of the window's actions, or buttons of the page's own; the first leads on best."""
+    """Names of the window's actions, or the page's own buttons; the first is recommended."""
 
 
 SETUP_ACTIONS = ("load_setup", "last_setup", "other_setup", "enter_setup")
@@ -63,11 +63,11 @@ PARTS = {
     "electrode": "the electrode",
     "imaging_plane": "the imaging plane",
 }
-"""Sections of the set-up that are typed in, in words."""
+"""Names of the sections of the set-up that are entered by the user."""
 
 
 def setup_to_do(problems: Iterable[InputError]) -> str:
-    """What to do for the set-up to be complete, in words; empty if nothing."""
+    """Text of the actions needed to complete the set-up; empty if there are none."""
     missing: dict[str, list[str]] = {}
     wrong, calibrate = [], []
     for problem in problems:
@@ -96,18 +96,18 @@ READ_ONLY = "The session is open read-only: nothing can be changed"
 
 
 def read_only(session: Session | None) -> str:
-    """That a session is open read-only, and what that means; empty if it can be changed."""
+    """Message if a session is open read-only; empty if it can be changed."""
     return READ_ONLY if session is not None and session.read_only else ""
 
 
 def recording_gone(session: Session) -> str:
-    """That the recording is not where it was, and what to do; empty if it is."""
+    """Message if the recording is missing, and what to do; empty if it is not."""
     missing = session.missing_recording
     return "" if missing is None else f"{missing.name} is missing: locate it (step Recording)"
 
 
 def why_not_measurable(session: Session) -> str:
-    """Why no frame can be measured now, and what to do; empty if frames can be."""
+    """Reason why no frame can be measured now, and what to do; empty if frames can be."""
     if session.read_only:
         return READ_ONLY
     if not len(session.frames):
@@ -119,9 +119,9 @@ def why_not_measurable(session: Session) -> str:
 
 
 def calibrations_in_use(session: Session) -> tuple[bool, bool]:
-    """Whether the set-up has the laser, and the imaging plane, that the calibrations found.
+    """Whether the set-up contains the calibrated values of laser and imaging plane.
 
-    False without a calibration, and where other values were entered after it.
+    False without a calibration and if other values were entered after it.
     """
     keys = tomllib.loads(session.setup_text)
     laser, plane = session.laser_calibration, session.plane_calibration
@@ -133,7 +133,7 @@ def calibrations_in_use(session: Session) -> tuple[bool, bool]:
 
 
 def _entered(keys: Any, found: Mapping[str, Any]) -> bool:
-    """Whether a section of the set-up holds the values found, but for rounding."""
+    """Whether a section of the set-up contains the found values, except for rounding."""
     try:
         pairs = [
             (keys[name], value)
@@ -147,25 +147,25 @@ def _entered(keys: Any, found: Mapping[str, Any]) -> bool:
 
 @dataclass(frozen=True)
 class Facts:
-    """What the steps' states are computed from."""
+    """Data from which the steps' states are computed."""
 
     session: Session
     problems: tuple[InputError, ...] = ()
-    """Of its set-up."""
+    """Problems of the set-up."""
     count: int = 0
     measured: int = 0
     without: int = 0
     stale: int = 0
-    """Number of frames, and of those measured, without a surface, stale."""
+    """Number of all frames, and of measured ones, those without a surface and stale ones."""
 
     @property
     def checked(self) -> str:
-        """When the bench was checked, see `Setup`."""
+        """Date of the bench check, see `Setup`."""
         return "" if self.problems else self.session.setup.checked
 
     @property
     def to_do(self) -> str:
-        """What the set-up lacks, in words; empty if nothing."""
+        """Text of what the set-up lacks; empty if nothing."""
         return setup_to_do(self.problems)
 
     def lacks(self, part: str) -> bool:

@@ -1,1 +1,1 @@
-"""Fields, labels and tables that the pages are made of."""
+"""Fields, labels and tables of the pages."""

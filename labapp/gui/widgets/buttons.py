@@ -1,4 +1,4 @@
-"""Buttons, and boxes to tick."""
+"""Buttons and check boxes."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from PySide6.QtWidgets import QCheckBox, QPushButton, QToolButton
 
 
 def button(text: str, tip: str, work: Callable[[], object]) -> QPushButton:
-    """A button that calls ``work``; its tooltip is its description for screen readers, too."""
+    """A button that calls ``work``; its tooltip is also its description for screen readers."""
     button = QPushButton(text)
     button.setToolTip(tip)
-    button.setAutoDefault(False)  # in a dialog Enter would press it, and it finishes a field
+    button.setAutoDefault(False)  # in a dialog Enter would press it, but Enter finishes a field
     button.clicked.connect(lambda _: work())
     return button
 
@@ -30,7 +30,7 @@ def tool_button(
 
 
 def check_box(text: str, tip: str, toggled: Callable[[bool], object]) -> QCheckBox:
-    """A box to tick, which calls ``toggled`` with whether it is ticked."""
+    """A check box that calls ``toggled`` with its new state."""
     box = QCheckBox(text)
     box.setToolTip(tip)
     box.toggled.connect(toggled)

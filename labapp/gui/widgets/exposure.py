@@ -1,4 +1,4 @@
-"""How a frame is exposed, as bars and in words."""
+"""The exposure of a frame as bars and text."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ BARS = (
     ("Saturation", "Part of the {} at the top of the scale: their centres are inaccurate"),
     ("Contrast", "How far the dots rise above their background, as a part of their level"),
 )
-"""Names, and what they mean, of dots or pixels."""
+"""Names and explanations, for dots or pixels."""
 
 
 class ExposureBars(Group):
-    """Exposure, saturation and contrast of the frame in view, and a verdict in words."""
+    """Exposure, saturation and contrast of the frame in view, and an assessment."""
 
     def __init__(self) -> None:
         form = QFormLayout()
@@ -31,7 +31,7 @@ class ExposureBars(Group):
         super().__init__("Exposure of the frame in view", form, self.verdict)
 
     def show_exposure(self, exposure: Exposure, verdict: str, good: bool) -> None:
-        """Show how a frame is exposed, and what to do about it."""
+        """Show the exposure of a frame and how to correct it."""
         of = "dots" if exposure.snr > 0 else "pixels"
         for bar, (name, tip), (part, words) in zip(self.bars, BARS, bars(exposure), strict=True):
             bar.setValue(round(100 * part))
@@ -42,7 +42,7 @@ class ExposureBars(Group):
 
 
 def bars(exposure: Exposure) -> tuple[tuple[float, str], ...]:
-    """Exposure, saturation and contrast: 0 … 1, and in words."""
+    """Exposure, saturation and contrast: 0 … 1, and as text."""
     dots = exposure.snr > 0
     contrast = f"{exposure.contrast:.0%}, {exposure.snr:.0f} × the noise" if dots else "no dots"
     clipped = f"{exposure.clipped:.0%} of the {'dots' if dots else 'pixels'} clipped"

@@ -1,8 +1,8 @@
-"""Fields for numbers, words and choices, and the form that lays them out.
+"""Fields for numbers, text and choices, and the form that lays them out.
 
 A field reports an edit only when it is finished: Enter, leaving the field, or a pause after steps.
-What is wrong stands in words below it: why the last entry was refused, until another one is taken;
-else what is wrong with the value that it holds.
+Problems are shown as text below it: the reason why the last entry was refused, until another one is
+accepted; otherwise the problem of its value.
 """
 
 from __future__ import annotations
@@ -27,29 +27,29 @@ from labapp.gui.widgets.labels import heading, plain_label, plain_tip, show_word
 from labapp.gui.widgets.layouts import hbox, vbox
 
 MOUSE_MS = 20
-"""How often it is checked whether the mouse button was released."""
+"""Interval of the check whether the mouse button was released."""
 
 BUTTONS_PX = 26
-"""Room for the step buttons and the frame of a narrow field."""
+"""Space for the step buttons and the frame of a narrow field."""
 
 STEP_PAUSE_MS = 300
-"""Steps that follow each other faster than this are one edit."""
+"""Steps at shorter intervals than this are one edit."""
 
 
 class Field(QWidget):
-    """An editor with its label, its unit and room for a problem in words."""
+    """An editor with its label, its unit and space for the text of a problem."""
 
     edited = Signal(object)
-    """The operator has entered another value: the value, None where it was emptied."""
+    """The operator has entered another value: the value, None if it was cleared."""
 
     def __init__(self, label: str, editor: QWidget, tooltip: str, unit: str = "") -> None:
         super().__init__()
         self.label = wrapping_label(label)
-        """Stands before it; a `FieldForm` places it."""
+        """Label in front of the editor; a `FieldForm` places it."""
         self.label.setBuddy(editor)
         self.label.setToolTip(tooltip)
         self.editor = editor
-        """The widget that takes the keys."""
+        """The widget that receives the keys."""
         editor.setToolTip(tooltip)
         editor.setAccessibleName(f"{label}, {unit}" if unit else label)
         self._tooltip = tooltip
@@ -63,12 +63,12 @@ class Field(QWidget):
         self.set_problem("")
 
     def set_problem(self, words: str) -> None:
-        """Say what is wrong with what the field holds; empty: nothing is."""
+        """Show a problem of the field's value; empty: none."""
         self._fault = words
         self._show_problem()
 
     def lock(self, why: str) -> None:
-        """Let nothing be entered, and say why; empty: let it."""
+        """Disable input and show the reason; empty: enable it."""
         self._set_locked(bool(why))
         self.editor.setToolTip(plain_tip(why or self._tooltip))
         self.label.setToolTip(plain_tip(why or self._tooltip))
@@ -77,7 +77,7 @@ class Field(QWidget):
         self.editor.setEnabled(not locked)
 
     def refuse(self, words: str) -> None:
-        """Say why the last entry was refused, until this field takes or is shown another value."""
+        """Show why the last entry was refused, until the field gets another value."""
         self._refusal = words
         self._show_problem()
 
@@ -93,7 +93,7 @@ class Field(QWidget):
         self._show_problem_text()
 
     def _show_problem_text(self) -> None:
-        """Make or take its room; not while a button of the mouse is down, or a click is lost."""
+        """Show or hide the text, but not while a mouse button is down: a click would be lost."""
         words = self._refusal or self._fault
         message = f"⚠ {words}" if words else ""
         if message != self.problem.text() and QGuiApplication.mouseButtons():
@@ -105,19 +105,19 @@ class Field(QWidget):
 class NumberField(Field):
     """A number with its unit, right-aligned; steps by arrow keys, buttons and wheel.
 
-    What is no number, or out of range, is shown below the field, and the former value stays. While
-    the operator types, `set_value` does not take the text from under the hand.
+    If an entry is not a number or out of range, the field shows this and keeps the previous value.
+    `set_value` does not replace the text while the operator types.
 
     Parameters
     ----------
     label, unit, tooltip
-        What it is; its unit; what it does.
+        Name, unit, and explanation.
     lowest, highest
-        The range, both ends included.
+        The range, including both ends.
     step
-        Of the arrow keys and buttons; Page Up and Down go ten.
+        Step of the arrow keys and buttons; Page Up and Down go ten steps.
     decimals
-        How many are shown; 0: whole numbers, and values are int.
+        Number of decimals shown; 0: whole numbers, and values are int.
     """
 
     def __init__(
@@ -146,7 +146,7 @@ class NumberField(Field):
         self._pause.timeout.connect(self._emit_change)
 
     def value(self) -> float | None:
-        """What the field holds; None if it is empty."""
+        """Value of the field; None if it is empty."""
         return self._value
 
     def set_value(self, value: float | None) -> None:
@@ -162,11 +162,11 @@ class NumberField(Field):
             self.set_problem("")
 
     def set_placeholder(self, words: str) -> None:
-        """Say in grey what holds while the field is empty."""
+        """Show in grey which value applies while the field is empty."""
         self._box.line.setPlaceholderText(words)
 
     def flush(self) -> None:
-        """Finish an edit under way, as leaving the field does."""
+        """Finish a current edit, as leaving the field does."""
         self._commit()
 
     def _shown(self, value: float | None) -> str:
@@ -187,13 +187,13 @@ class NumberField(Field):
                 self._value = value
             self.refuse(problem)
             self._show()
-        elif self._typed:  # what it held already, and is right
+        elif self._typed:  # the value that the field already has
             self.refuse("")
         self._typed = False
         self._emit_change()
 
     def _read(self, text: str) -> tuple[float | None, str]:
-        """Value of a text, and what is wrong with it."""
+        """Value of a text, and its problem."""
         kept = self._shown(self._value) or "nothing"
         if not text.strip():
             return None, "" if self.optional else f"A number is needed; {kept} stays"
@@ -229,7 +229,7 @@ class NumberField(Field):
 
 
 class _NumberBox(QAbstractSpinBox):
-    """The line and the arrow buttons; any text is let through, the field judges it."""
+    """The line and the arrow buttons; it accepts any text, which the field checks."""
 
     stepped = Signal(int)
 
@@ -259,16 +259,16 @@ class _NumberBox(QAbstractSpinBox):
 
 
 class TextField(Field):
-    """Words: one line, or several.
+    """Text of one or several lines.
 
     Parameters
     ----------
     label, tooltip
-        What it is; what it is for.
+        Name and purpose.
     lines
-        How many are shown; with more than one, Enter begins another and Ctrl+Enter finishes.
+        Number of lines shown; with more than one, Enter begins another and Ctrl+Enter finishes.
     line
-        Takes the keys if there is one line; None for a plain one.
+        Editor for a single line; None for a plain one.
     """
 
     def __init__(
@@ -287,11 +287,11 @@ class TextField(Field):
         self._edit.editingFinished.connect(self.flush)
 
     def value(self) -> str:
-        """The words."""
+        """The text."""
         return self._edit.text()
 
     def set_value(self, value: str) -> None:
-        """Show another text; emits no signal, and leaves alone what is being typed."""
+        """Show another text; emits no signal, and does not replace text being typed."""
         typing = self._edit.isModified() and self.value() != self._emitted
         if value != self._emitted:
             self.refuse("")
@@ -300,7 +300,7 @@ class TextField(Field):
             self._edit.setText(value)
 
     def flush(self) -> None:
-        """Finish an edit under way, as leaving the field does."""
+        """Finish a current edit, as leaving the field does."""
         if self.value() != self._emitted:
             self._emitted = self.value()
             self._enter(self._emitted)
@@ -309,14 +309,14 @@ class TextField(Field):
         if isinstance(self._edit, QLineEdit):
             super()._set_locked(locked)
             return
-        # It can still be scrolled and copied from; its ground says that it takes nothing.
+        # It can still be scrolled and copied from; its background shows that input is disabled.
         self._edit.setReadOnly(locked)
         ground = QPalette.ColorRole.Window if locked else QPalette.ColorRole.Base
         self._edit.viewport().setBackgroundRole(ground)
 
 
 class _Paragraphs(QPlainTextEdit):
-    """Several lines, left with Tab; to a field it is as a `QLineEdit`."""
+    """Several lines, left with Tab; a field uses it like a `QLineEdit`."""
 
     editingFinished = Signal()  # noqa: N815  # Qt's name
 
@@ -347,14 +347,14 @@ class _Paragraphs(QPlainTextEdit):
 
 
 class ChoiceField(Field):
-    """One of several.
+    """A choice from several options.
 
     Parameters
     ----------
     label, tooltip
-        What it is; what it does.
+        Name and explanation.
     choices
-        (key, words) pairs; keys are what `value` and ``edited`` give.
+        (key, text) pairs; `value` and ``edited`` give the keys.
     """
 
     def __init__(
@@ -372,7 +372,7 @@ class ChoiceField(Field):
         self._combo.activated.connect(self._activated)
 
     def value(self) -> str:
-        """Key of the choice; empty without one."""
+        """Key of the choice; empty if nothing is chosen."""
         return str(self._combo.currentData() or "")
 
     def set_value(self, key: str) -> None:
@@ -383,7 +383,7 @@ class ChoiceField(Field):
         self._emitted = self.value()
 
     def set_choices(self, choices: Sequence[tuple[str, str]]) -> None:
-        """Offer other choices; the present one stays if it is among them."""
+        """Offer other choices; the current one is kept if it is among them."""
         present = self.value()
         self._combo.clear()
         for key, words in choices:
@@ -393,7 +393,7 @@ class ChoiceField(Field):
         self.set_value(present or (choices[0][0] if choices else ""))
 
     def eventFilter(self, watched: QObject, event: QEvent) -> bool:
-        """Keep the wheel from changing a choice that does not have the focus."""
+        """Prevent the wheel from changing a choice without the focus."""
         if event.type() == QEvent.Type.Wheel and not self._combo.hasFocus():
             event.ignore()
             return True
@@ -406,7 +406,7 @@ class ChoiceField(Field):
 
 
 class FieldForm(QWidget):
-    """Fields under each other: labels at the left, editors and units in columns.
+    """Fields one below the other: labels at the left, editors and units in columns.
 
     A field may have another beside it, in a narrow column at the right.
     """
@@ -430,7 +430,7 @@ class FieldForm(QWidget):
             beside.editor.setMinimumWidth(digits + BUTTONS_PX)
             self._grid.addWidget(beside, row, 2, Qt.AlignmentFlag.AlignTop)
             self._grid.setColumnStretch(2, 1)
-        # Level with the editor's first line.
+        # Aligned with the editor's first line.
         height = field.editor.fontMetrics().lineSpacing() + 12
         field.label.setMinimumHeight(min(field.editor.sizeHint().height(), height))
         self._fields.append(field)

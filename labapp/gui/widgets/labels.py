@@ -9,7 +9,7 @@ from PySide6.QtWidgets import QLabel, QSizePolicy, QWidget
 
 
 def plain_label(text: str = "", parent: QWidget | None = None) -> QLabel:
-    """A label of plain text: by itself a QLabel guesses, and loads pictures that HTML names."""
+    """A label of plain text: by default a QLabel detects HTML and loads pictures named in it."""
     label = QLabel(parent)
     label.setTextFormat(Qt.TextFormat.PlainText)
     label.setText(text)
@@ -24,7 +24,7 @@ def wrapping_label(text: str = "", parent: QWidget | None = None) -> QLabel:
 
 
 def plain_tip(text: str) -> str:
-    """Text for a tooltip that shows it literally, even where it looks like HTML."""
+    """Text for a tooltip that shows it literally, even if it looks like HTML."""
     rich = QtGui.Qt.mightBeRichText(text)
     return QtGui.Qt.convertFromPlainText(text) if rich else text
 
@@ -54,13 +54,13 @@ def breakable(text: str) -> str:
 
 
 def show_words(label: QLabel, words: str) -> None:
-    """Show words, or nothing of a label without any."""
+    """Show a text; the label is hidden if it is empty."""
     label.setText(words)
     label.setVisible(bool(words))
 
 
 def keep_room(*widgets: QWidget) -> None:
-    """Let widgets that come and go keep their room: what is below them does not move."""
+    """Let hidden widgets keep their space, so that nothing below them moves."""
     for widget in widgets:
         policy = widget.sizePolicy()
         policy.setRetainSizeWhenHidden(True)
@@ -68,12 +68,12 @@ def keep_room(*widgets: QWidget) -> None:
 
 
 class Message(QLabel):
-    """A message of fixed height: nothing around it moves, whatever it says.
+    """A message of fixed height, so that nothing around it moves.
 
     Parameters
     ----------
     lines
-        How many lines fit. A longer text ends in …, and the tooltip has all of it.
+        Number of lines that fit. A longer text ends in …, and the tooltip contains all of it.
     """
 
     def __init__(self, lines: int) -> None:
@@ -84,30 +84,30 @@ class Message(QLabel):
         self.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Fixed)
 
     def sizeHint(self) -> QSize:
-        """As high as its lines, and no wider than there is room."""
+        """Height of its lines, and at most the available width."""
         return QSize(40, self._lines * self.fontMetrics().lineSpacing())
 
     def minimumSizeHint(self) -> QSize:
-        """As `sizeHint`."""
+        """Same as `sizeHint`."""
         return self.sizeHint()
 
     def hasHeightForWidth(self) -> bool:
-        """It is as high, however wide."""
+        """The height does not depend on the width."""
         return False
 
     def setText(self, words: str) -> None:
-        """Say something else; empty: nothing."""
+        """Show another text; empty: none."""
         if words != self.text():
             super().setText(words)
             self._update_tip()
 
     def resizeEvent(self, event: QResizeEvent) -> None:
-        """Update the tooltip, which has the full text where it does not fit."""
+        """Update the tooltip, which has the full text if it does not fit."""
         super().resizeEvent(event)
         self._update_tip()
 
     def shown(self) -> list[str]:
-        """The lines that are seen."""
+        """The visible lines."""
         lines: list[str] = []
         width = max(self.contentsRect().width() - max(self.indent(), 0), 1)
         wrapped = QTextOption()
@@ -127,7 +127,7 @@ class Message(QLabel):
         return lines
 
     def paintEvent(self, _event: QPaintEvent) -> None:
-        """Draw the lines that there is room for."""
+        """Draw the lines that fit."""
         with QPainter(self) as painter:
             painter.setPen(self.palette().color(self.foregroundRole()))
             place = self.contentsRect().adjusted(max(self.indent(), 0), 0, 0, 0)

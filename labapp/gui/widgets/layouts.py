@@ -1,4 +1,4 @@
-"""Layouts that are filled in one go."""
+"""Layouts that are filled in one call."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from PySide6.QtWidgets import (
 from labapp.gui.widgets.labels import heading
 
 Part = QWidget | QLayout | int | tuple[QWidget | QLayout, int]
-"""A widget or a layout, alone or with its stretch; a number: so much of a stretch, empty."""
+"""A widget or a layout, alone or with its stretch; a number is an empty stretch."""
 
 L = TypeVar("L", bound=QBoxLayout)
 
 
 def fill(layout: L, *parts: Part) -> L:
-    """Put parts after those that are there; returns the layout."""
+    """Append parts to a layout; returns the layout."""
     for part in parts:
         if isinstance(part, int):
             layout.addStretch(part)
@@ -38,17 +38,17 @@ def fill(layout: L, *parts: Part) -> L:
 
 
 def vbox(*parts: Part, of: QWidget | None = None) -> QVBoxLayout:
-    """Parts under each other, without margins; ``of`` is the widget that has this layout."""
+    """Parts one below the other, without margins; ``of`` is the widget with this layout."""
     return _bare(QVBoxLayout() if of is None else QVBoxLayout(of), parts)
 
 
 def hbox(*parts: Part, of: QWidget | None = None) -> QHBoxLayout:
-    """Parts beside each other, without margins; ``of`` is the widget that has this layout."""
+    """Parts side by side, without margins; ``of`` is the widget with this layout."""
     return _bare(QHBoxLayout() if of is None else QHBoxLayout(of), parts)
 
 
 def scrolled(widget: QWidget, name: str = "") -> QScrollArea:
-    """An area that scrolls a widget; with a name also by keys."""
+    """An area that scrolls a widget; with a name, it can also be scrolled by keys."""
     area = QScrollArea()
     area.setWidget(widget)
     area.setWidgetResizable(True)

@@ -1,4 +1,4 @@
-"""A canvas of several parts: all at once where there is room, else one at a time."""
+"""A canvas of several parts: all at once if there is space, else one at a time."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from collections.abc import Mapping, Sequence
 from PySide6.QtWidgets import QTabBar, QWidget
 
 NARROW = 100
-"""A canvas on which fewer letters stand beside each other is narrow: a small screen at 150 %."""
+"""A canvas narrower than this number of letters is narrow, as on a small screen at 150 %."""
 
 
 class PartsBar(QTabBar):
-    """Chooses what is seen of a narrow canvas; on a wide one it is not there.
+    """Tabs that choose the visible part of a narrow canvas; hidden on a wide one.
 
     Parameters
     ----------
     name
-        What is chosen, for a screen reader.
+        Name of the tabs for a screen reader.
     parts
-        Its widgets by the part's name; a widget may be in several parts.
+        Widgets by the name of the part; a widget may be in several parts.
     """
 
     def __init__(self, name: str, parts: Mapping[str, Sequence[QWidget]]) -> None:

@@ -1,4 +1,4 @@
-"""A field for a path, of which both ends are seen while nobody edits it."""
+"""A field for a path that shows both ends of the path while it is not edited."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from labapp.gui.widgets.fields import TextField
 from labapp.gui.widgets.labels import plain_tip
 
 TEXT_MARGIN_PX = 2
-"""Between the frame's contents and the text: QLineEdit's own, which Qt does not publish."""
+"""Margin between the frame's contents and the text: that of QLineEdit, which is not public."""
 
 
 class PathField(TextField):
@@ -29,10 +29,10 @@ class PathField(TextField):
 
 
 class PathLine(QLineEdit):
-    """A line whose text, too long and without the focus, is painted without its middle."""
+    """A line that omits the middle of a text that is too long while it does not have the focus."""
 
     def shown(self) -> str:
-        """The text as it is painted."""
+        """The text as painted."""
         if self.hasFocus():
             return self.text()
         width = self._contents().width()
@@ -42,7 +42,7 @@ class PathLine(QLineEdit):
         return self.fontMetrics().elidedText(self.text(), mode, width)
 
     def paintEvent(self, event: QPaintEvent) -> None:
-        """Paint the two ends of a text that is too long; as any line otherwise."""
+        """Paint the two ends of a text that is too long, otherwise the whole text."""
         shown = self.shown()
         if shown == self.text():
             super().paintEvent(event)

@@ -38,7 +38,7 @@ class ResultTable(FullTable):
         self.set_rows(())
 
     def set_rows(self, rows: Iterable[ResultRow]) -> None:
-        """Show results; cells are changed in place, so that nothing jumps."""
+        """Show results; cells are changed in place, so that nothing moves."""
         self.rows = tuple(rows)
         self.setRowCount(len(self.rows))
         for k, row in enumerate(self.rows):
@@ -48,11 +48,11 @@ class ResultTable(FullTable):
         self.fit_height()
 
     def copy_text(self) -> None:
-        """Put the selected rows, or all, on the clipboard, in tabs."""
+        """Copy the selected rows, or all, to the clipboard, separated by tabs."""
         QGuiApplication.clipboard().setText(as_text(self._chosen()))
 
     def copy_csv(self) -> None:
-        """Put all rows on the clipboard as CSV, numbers in full."""
+        """Copy all rows to the clipboard as CSV, with all digits."""
         QGuiApplication.clipboard().setText(as_csv(self.rows))
 
     def _chosen(self) -> list[ResultRow]:

@@ -1,4 +1,4 @@
-"""The ticks of the timeline, one a frame, and the frame in view on them. Quick for any length."""
+"""The ticks of the timeline, one per frame, and the frame in view. Fast for any length."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from PySide6.QtGui import (
 from PySide6.QtWidgets import QAbstractSlider, QSizePolicy, QStyle, QStyleOptionFocusRect, QToolTip
 
 GAP_FROM_PX = 4
-"""Ticks at least this wide stand apart."""
+"""Ticks of at least this width are separated by gaps."""
 
 RAIL_PX = 9
-"""Room above the ticks for the marker of the frame in view."""
+"""Space above the ticks for the marker of the frame in view."""
 
 KEYS = "← → step through the frames, Page Up and Down go a tenth, Home End to the first and last"
 
@@ -37,25 +37,25 @@ Shape = Sequence[tuple[float, float]]
 
 @dataclass(frozen=True)
 class Tick:
-    """How ticks of one kind look."""
+    """Appearance of the ticks of one kind."""
 
     words: str
     short: str
-    """The same in a word, where there is little room."""
+    """The same in one word, for narrow windows."""
     light: str
     dark: str
-    """Colour on a light and on a dark ground; empty for the palette's."""
+    """Colour on a light and on a dark background; empty for that of the palette."""
     parts: Shape
-    """(from, to) of the height, 0 at the foot and 1 at the top, so that colour is not needed."""
+    """(from, to) of the height, 0 at the bottom and 1 at the top: distinguishes without colour."""
 
 
 def aggregated(kinds: npt.NDArray[np.int64], columns: int) -> npt.NDArray[np.int64]:
-    """The kind that each column of pixels shows: the greatest of its frames, shape (columns,).
+    """Kind shown in each column of pixels: the greatest of its frames, shape (columns,).
 
     Parameters
     ----------
     kinds
-        Of the frames, at least one, shape (n,).
+        Kinds of the frames, of which there is at least one, shape (n,).
     """
     count = len(kinds)
     first = np.arange(columns, dtype=np.int64) * count // columns
@@ -65,9 +65,9 @@ def aggregated(kinds: npt.NDArray[np.int64], columns: int) -> npt.NDArray[np.int
 
 
 class Scrubber(QAbstractSlider):
-    """The ticks, and the frame in view on them; it knows positions, not what a frame is.
+    """The ticks and the frame in view; it knows only positions, not frames.
 
-    To a screen reader it is a slider, whose value is the position.
+    For a screen reader it is a slider whose value is the position.
     """
 
     moved = Signal(int)
@@ -85,7 +85,7 @@ class Scrubber(QAbstractSlider):
         self.valueChanged.connect(self.moved)  # by a screen reader
 
     def sizeHint(self) -> QSize:
-        """As wide as there is room, and high enough to distinguish the shapes."""
+        """The available width, and a height sufficient to distinguish the shapes."""
         return QSize(400, self.fontMetrics().height() * 2 + RAIL_PX)
 
     def set_kinds(self, kinds: npt.NDArray[np.int64]) -> None:
@@ -109,25 +109,25 @@ class Scrubber(QAbstractSlider):
         self.setAccessibleDescription(f"{seen}. {KEYS}")
 
     def position_text(self, position: int) -> str:
-        """A frame and how it stands."""
+        """Text of a frame and its state."""
         return f"{self.describe(position)}: {self._ticks[int(self._kinds[position])].words}"
 
     @property
     def kinds(self) -> npt.NDArray[np.int64]:
-        """Of the frames, indices into the ticks, shape (n,)."""
+        """Kinds of the frames, indices into the ticks, shape (n,)."""
         return self._kinds
 
     @property
     def position(self) -> int:
-        """Of the frame in view."""
+        """Position of the frame in view."""
         return self.value()
 
     def position_at(self, x: float) -> int:
-        """Position of the frame under a place across the widget, px."""
+        """Position of the frame at a horizontal coordinate of the widget, px."""
         return max(0, min(len(self._kinds) - 1, int(x * len(self._kinds) / max(1, self.width()))))
 
     def go_to(self, position: int) -> None:
-        """Go to the nearest position there is, as if the operator had."""
+        """Go to the nearest existing position, as if the operator had."""
         if len(self._kinds):
             position = max(0, min(len(self._kinds) - 1, position))
             if position != self.value():
@@ -136,7 +136,7 @@ class Scrubber(QAbstractSlider):
     # --- drawing ----------------------------------------------------------------------------
 
     def paintEvent(self, _event: QPaintEvent) -> None:
-        """Draw the ticks, made once for a width and kinds, and the marker over them."""
+        """Draw the ticks, which are cached for a width and kinds, and the marker over them."""
         with QPainter(self) as painter:
             if not len(self._kinds):
                 return
@@ -186,7 +186,7 @@ class Scrubber(QAbstractSlider):
         return picture
 
     def _looks(self, rows: int) -> tuple[npt.NDArray[np.uint32], npt.NDArray[np.bool_]]:
-        """Colour of each kind, shape (kinds,), and which rows of pixels it fills, (kinds, rows)."""
+        """Colour of each kind, shape (kinds,), and rows of pixels that it fills, (kinds, rows)."""
         palette = self.palette()
         dark = palette.color(QPalette.ColorRole.Window).lightness() < 128
         plain = palette.color(QPalette.ColorRole.Shadow if not dark else QPalette.ColorRole.Mid)
@@ -228,7 +228,7 @@ class Scrubber(QAbstractSlider):
         self.go_to(self.value() - (steps > 0) + (steps < 0))
 
     def keyPressEvent(self, event: QKeyEvent) -> None:
-        """Go a tenth of all frames with Page Up and Down; the other keys are the window's."""
+        """Go a tenth of all frames with Page Up and Down; the window handles the other keys."""
         page = max(1, len(self._kinds) // 10)
         if event.key() == Qt.Key.Key_PageUp:
             self.go_to(self.value() - page)

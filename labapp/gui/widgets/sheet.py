@@ -1,4 +1,4 @@
-"""A printed picture (PNG, black on white) to read through; on a dark ground, white on black."""
+"""View of a printed picture (PNG, black on white); on a dark background it is white on black."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from labapp.gui.theme import FollowsTheme, is_dark
 from labapp.gui.widgets.labels import plain_label
 
 MOST_SCALE = 1.25
-"""Largest scale at which it is shown, of its printed size."""
+"""Largest scale of the view relative to the printed size."""
 
 
 class Sheet(FollowsTheme, QScrollArea):
-    """A picture as wide as there is room, up to a little more than it was printed."""
+    """A picture of the available width, up to slightly more than its printed size."""
 
     def __init__(self, name: str) -> None:
         super().__init__()
@@ -40,28 +40,28 @@ class Sheet(FollowsTheme, QScrollArea):
         self.follow_theme()
 
     def describe(self, words: str) -> None:
-        """Say what is to be seen."""
+        """Set the description of the picture."""
         keys = "Arrow keys and Page Up and Down move it; Ctrl+C copies it"
         self.setAccessibleDescription(f"{words}. {keys}" if words else keys)
 
     def show_png(self, content: bytes, words: str) -> None:
-        """Show a picture; the words are what a screen reader says."""
+        """Show a picture; ``words`` is the text for a screen reader."""
         self._printed = QImage.fromData(content).convertToFormat(QImage.Format.Format_RGB32)
         self.describe(words)
         self.take_colours()
 
     def copy_picture(self) -> None:
-        """Put it on the clipboard, as it was printed."""
+        """Copy the picture to the clipboard as printed."""
         if not self._printed.isNull():
             QGuiApplication.clipboard().setImage(self._printed)
 
     def resizeEvent(self, event: QResizeEvent) -> None:
-        """Follow the width."""
+        """Adapt to the width."""
         super().resizeEvent(event)
         self.take_colours()
 
     def take_colours(self) -> None:
-        """Show the picture as wide as there is room, in the window's colours."""
+        """Show the picture with the available width, in the window's colours."""
         if self._printed.isNull():
             return
         ratio = self.devicePixelRatioF()
@@ -77,7 +77,7 @@ class Sheet(FollowsTheme, QScrollArea):
 
 
 def turned(levels: npt.NDArray[np.uint8], ground: int) -> npt.NDArray[np.uint8]:
-    """A picture with light and dark exchanged, its hues kept; white becomes grey level ``ground``.
+    """A picture with inverted brightness and the same hues; white becomes grey level ``ground``.
 
     Parameters
     ----------

@@ -1,4 +1,4 @@
-"""Tables of results with columns of their own, and tables as text."""
+"""Tables of results with arbitrary columns, and tables as text."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ if TYPE_CHECKING:
 
 
 HEADER_MARGIN_PX = 8
-"""Above and below the two lines of a header, together."""
+"""Total margin above and below the two lines of a header."""
 
 RIGHT = Qt.AlignmentFlag.AlignRight | Qt.AlignmentFlag.AlignVCenter
 
 
 class ReadTable(QTableWidget):
-    """A table to read: whole rows are selected, and copied by keys and menu."""
+    """A read-only table: whole rows are selected, and copied by keys and menu."""
 
     def __init__(self, name: str, tip: str, columns: Sequence[str] = ()) -> None:
         super().__init__(0, len(columns))
@@ -48,7 +48,7 @@ class ReadTable(QTableWidget):
         self.setContextMenuPolicy(Qt.ContextMenuPolicy.ActionsContextMenu)
 
     def set_cell(self, row: int, column: int, text: str, *, number: bool, tip: str = "") -> None:
-        """Show a text in a cell, changed in place so that nothing jumps; numbers are right-aligned.
+        """Show a text in a cell, changed in place so that nothing moves; numbers are right-aligned.
 
         The tooltip is ``tip``, or the text itself.
         """
@@ -63,7 +63,7 @@ class ReadTable(QTableWidget):
         item.setToolTip(plain_tip(tip or text))
 
     def select_rows(self, rows: Sequence[int]) -> None:
-        """Select rows alone; emits no signal."""
+        """Select only these rows; emits no signal."""
         if {index.row() for index in self.selectedIndexes()} == set(rows):
             return
         with QSignalBlocker(self):
@@ -80,11 +80,11 @@ class ReadTable(QTableWidget):
         return header + sum(self.rowHeight(row) for row in range(self.rowCount()))
 
     def copy_text(self) -> None:
-        """Copy what is shown to the clipboard, separated by tabs."""
+        """Copy the shown texts to the clipboard, separated by tabs."""
         QGuiApplication.clipboard().setText(table_text(self))
 
     def offer(self, *copies: tuple[str, Callable[[], None]]) -> None:
-        """Add ways to copy to the context menu, by their labels; Ctrl+C does the first."""
+        """Add copy actions to the context menu by their labels; Ctrl+C runs the first."""
         for words, work in copies:
             action = QAction(words, self)
             action.triggered.connect(work)
@@ -102,18 +102,18 @@ class FullTable(ReadTable):
         self.setVerticalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
         self.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
         self.horizontalHeader().setSectionResizeMode(0, QHeaderView.ResizeMode.Stretch)
-        # The header reports a width before the cells have it.
+        # The header reports a width before the cells get it.
         self._narrowed = QTimer(self, singleShot=True, interval=0)
         self._narrowed.timeout.connect(self.fit_height)
         self.horizontalHeader().sectionResized.connect(lambda *_: self._narrowed.start())
 
     def fit_height(self) -> None:
-        """Give long names the lines that they take, and the table the height of all rows."""
+        """Give long names the lines that they need, and the table the height of all rows."""
         self.resizeRowsToContents()
         self.setFixedHeight(self.full_height)
 
     def show_texts(self, rows: Sequence[Sequence[str]]) -> None:
-        """Show rows of texts: a name, then numbers."""
+        """Show rows of texts: a name followed by numbers."""
         self.setRowCount(len(rows))
         for row, texts in enumerate(rows):
             for column, text in enumerate(texts):
@@ -149,18 +149,18 @@ class CellTable(ReadTable):
         self.resizeRowsToContents()
 
     def copy_csv(self) -> None:
-        """Put all of it on the clipboard as CSV, as its file has it."""
+        """Copy the whole table to the clipboard as CSV, as in its file."""
         if self.table is not None:
             QGuiApplication.clipboard().setText(self.table.csv())
 
     def copy_markdown(self) -> None:
-        """Put all of it on the clipboard as Markdown."""
+        """Copy the whole table to the clipboard as Markdown."""
         if self.table is not None:
             QGuiApplication.clipboard().setText(self.table.markdown())
 
 
 class FittingTable(CellTable):
-    """A table as wide as its place: where that is narrow, the ± of a value stands beneath it."""
+    """A table with the available width; if that is narrow, the ± of a value is below the value."""
 
     def __init__(self, name: str) -> None:
         super().__init__(name)
@@ -172,12 +172,12 @@ class FittingTable(CellTable):
         self.verticalHeader().setSectionResizeMode(QHeaderView.ResizeMode.ResizeToContents)
 
     def set_cell(self, row: int, column: int, text: str, *, number: bool, tip: str = "") -> None:
-        """Show a text in a cell; no line ends behind its ±."""
+        """Show a text in a cell; a line does not end directly after ±."""
         super().set_cell(row, column, text.replace("± ", "±\N{NO-BREAK SPACE}"), number=number)
 
 
 def table_text(table: QTableView) -> str:
-    """What a table shows, tabs between its columns, its header first."""
+    """The header and the cells of a table as text, columns separated by tabs."""
     model = table.model()
     columns = [n for n in range(model.columnCount()) if not table.isColumnHidden(n)]
     rows = [[model.headerData(n, Qt.Orientation.Horizontal) for n in columns]]

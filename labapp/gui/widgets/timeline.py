@@ -1,4 +1,4 @@
-"""The timeline: one tick a frame, the frame in view, playing and jumping."""
+"""The timeline: one tick per frame, the frame in view, playing and jumping."""
 
 from __future__ import annotations
 
@@ -22,19 +22,19 @@ from labapp.gui.widgets.layouts import fill, hbox, vbox
 from labapp.gui.widgets.scrubber import Scrubber, Tick
 
 PLAY_HZ = 30.0
-"""Most frames a second while playing; every frame is shown."""
+"""Maximum number of frames per second while playing; every frame is shown."""
 
 
 class Timeline(FollowsTheme, QWidget):
     """The scrubber with its buttons, the frame's number and time.
 
-    It knows no session: numbers, times and kinds of frames are given to it.
+    It is independent of the session: it is given the numbers, times and kinds of the frames.
     """
 
     moved = Signal(int)
     """The operator went to a frame: its number."""
     jumped = Signal(str, bool)
-    """The operator asked for the next frame in doubt or corrected: ``doubtful`` or ``corrected``,
+    """The operator asked for the next doubtful or corrected frame: ``doubtful`` or ``corrected``,
     and whether forward.
     """
 
@@ -123,7 +123,7 @@ class Timeline(FollowsTheme, QWidget):
         return button
 
     def _show_icon(self, button: QToolButton, icon: QStyle.StandardPixmap) -> None:
-        """Show an icon of the style in the colour of buttons' texts: the style's own are black."""
+        """Show an icon of the style in the colour of button texts: the original icons are black."""
         self._icons[button] = icon
         ratio = self.devicePixelRatioF()
         pixmap = self.style().standardIcon(icon).pixmap(button.iconSize(), ratio)
@@ -145,9 +145,9 @@ class Timeline(FollowsTheme, QWidget):
         Parameters
         ----------
         frames
-            Their numbers, ascending, shape (n,).
+            Numbers of the frames, ascending, shape (n,).
         times_s
-            Their times, shape (n,), s; NaN where unknown.
+            Times of the frames, shape (n,), s; NaN if unknown.
         kinds
             Indices into the ticks, shape (n,).
         """
@@ -174,7 +174,7 @@ class Timeline(FollowsTheme, QWidget):
         self.position_text.setText(f"{position + 1} of {len(self._frames)}{when}")
 
     def described(self, position: int) -> str:
-        """A frame in words."""
+        """Text of a frame."""
         time_s = self._times_s[position]
         when = "" if np.isnan(time_s) else f", {time_s:.4f} s"
         return f"Frame {self._frames[position]}{when}"
@@ -206,14 +206,14 @@ class Timeline(FollowsTheme, QWidget):
                 break
 
     def resizeEvent(self, event: QResizeEvent) -> None:
-        """Give the legend its words where there is room for them."""
+        """Show the texts of the legend if there is space for them."""
         super().resizeEvent(event)
         self._show_counts()
 
     # --- going ------------------------------------------------------------------------------
 
     def step(self, by: int) -> None:
-        """Go this many frames on, or back, as far as there are any."""
+        """Go this many frames forwards or backwards, up to the first or last frame."""
         self.scrubber.go_to(self.scrubber.position + by)
 
     @property
@@ -222,7 +222,7 @@ class Timeline(FollowsTheme, QWidget):
         return self._timer.isActive()
 
     def set_playing(self, playing: bool) -> None:
-        """Play from here, or from the first frame at the last; or stop."""
+        """Play from here, or from the first frame if the last is in view; or stop."""
         playing = playing and len(self._frames) > 1
         if playing and not self.playing:
             if self.scrubber.position == len(self._frames) - 1:
@@ -249,7 +249,7 @@ class Timeline(FollowsTheme, QWidget):
         self.moved.emit(int(self._frames[position]))
 
     def _typed(self, number: int) -> None:
-        """Go to the frame with the number typed, or the nearest there is."""
+        """Go to the frame with the typed number, or the nearest one."""
         position = int(np.abs(self._frames - number).argmin())
         if position == self.scrubber.position:
             self.set_frame(int(self._frames[position]))

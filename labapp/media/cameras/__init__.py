@@ -1,4 +1,4 @@
-"""Cameras, whatever they are connected by: `find_cameras`, `open_camera`, and `Feed`."""
+"""Cameras of all kinds: `find_cameras`, `open_camera`, and `Feed`."""
 
 from __future__ import annotations
 
@@ -46,11 +46,11 @@ __all__ = [
 
 
 KINDS: list[CameraKind] = [uvc.USB_VIDEO, aravis.GENICAM]
-"""The kinds of cameras, in the order in which they are listed."""
+"""The kinds of cameras, in the order of listing."""
 
 
 def find_cameras() -> tuple[list[CameraInfo], list[str]]:
-    """Cameras that are connected, and why some kinds could not be looked for; about a second."""
+    """Return the connected cameras, and problems of kinds that cannot be searched; takes 1 s."""
     found: list[CameraInfo] = []
     problems: list[str] = []
     for kind in KINDS:
@@ -69,7 +69,7 @@ def open_camera(id: str) -> Camera:
     InputError
         If there is no such kind of camera.
     CameraError
-        If it is not there or cannot be opener: what to do about it.
+        If it is not connected or cannot be opened; the message says what to do.
     """
     for kind in KINDS:
         if id.startswith(kind.prefix):

@@ -35,26 +35,26 @@ PREFIX = "aravis:"
 KINDS = {"GigEVision": "GigE Vision", "USB3Vision": "USB3 Vision", "Fake": "Aravis's own"}
 
 DEPTHS = {"Mono8": 8, "Mono10": 10, "Mono12": 12, "Mono14": 14, "Mono16": 16}
-"""Pixel formats that are read, in the camera's own name, and their bits."""
+"""Supported pixel formats, by GenICam's names, and their bits."""
 
 BROKEN = {
-    2: "the rest of it did not come in time",
-    3: "packets of it are missing",
-    4: "its packets were numbered wrongly",
-    5: "it is larger than was said",
-    7: "it was broken off",
+    2: "its end did not arrive in time",
+    3: "packets are missing",
+    4: "its packets have wrong numbers",
+    5: "it is larger than announced",
+    7: "it was aborted",
 }
-"""What is wrong with a frame, by Aravis's status."""
+"""Problem of a frame, by Aravis's status."""
 
 SOFTWARE, USUAL_LINE = b"Software", b"Line1"
-"""What a trigger may come from, by GenICam's names."""
+"""Sources of a trigger, by GenICam's names."""
 
 LARGEST_SHORT_ID = 0xFFFF
-"""GigE Vision numbers frames from 1 to this and begins again, unless it has 64 bits for it."""
+"""Largest frame number of GigE Vision without 64-bit numbers, after which 1 follows."""
 
 
 def find_genicam() -> list[CameraInfo]:
-    """Cameras that Aravis sees; about a second.
+    """Return the cameras that Aravis finds; takes about 1 s.
 
     Raises
     ------
@@ -76,12 +76,12 @@ def find_genicam() -> list[CameraInfo]:
 
 
 class GenicamCamera(Camera):
-    """A GenICam camera that is open; see `Camera`.
+    """An open GenICam camera; see `Camera`.
 
     Raises
     ------
     CameraError
-        If it is not there, is used by another program, or gives no grey pictures.
+        If it is not connected, is used by another program, or has no greyscale format.
     """
 
     def __init__(self, info: CameraInfo) -> None:
@@ -90,11 +90,11 @@ class GenicamCamera(Camera):
         try:
             self._camera = self._aravis.open(info.id.removeprefix(PREFIX))
         except CameraError as error:
-            raise CameraLost(f"{info.name} cannot be opener: {error}") from error
+            raise CameraLost(f"{info.name} cannot be opened: {error}") from error
         self._stream: _Stream | None = None
         self._is_lost = False
         self._line = b""
-        """The input that a trigger's signal is taken from; empty where there is none."""
+        """Input for the trigger signal; empty if there is none."""
         self._hook = 0
         self._on_lost = ControlLost(self._note_loss)
         try:
@@ -115,7 +115,7 @@ class GenicamCamera(Camera):
 
     @property
     def settings(self) -> CameraSettings:
-        """What it is set to, as it says itself."""
+        """Present settings, as reported by the camera."""
         limits = self.limits
         sides = [c_int() for _ in range(4)]
         self._ask("get_region", *map(byref, sides))
@@ -129,7 +129,7 @@ class GenicamCamera(Camera):
         )
 
     def apply(self, wanted: CameraSettings) -> CameraSettings:
-        """Set what is wanted; see `Camera.apply`."""
+        """Apply settings; see `Camera.apply`."""
         if self._stream is not None:
             raise CameraError(f"{self.info.name} is running: stop it before it is set")
         check_settings(self.info, self.limits, replace(wanted, rate_hz=None))
@@ -137,7 +137,7 @@ class GenicamCamera(Camera):
         try:
             self._set(wanted)
         except (CameraError, InputError):
-            self._put_back(before, set(wanted.specified()))
+            self._restore(before, set(wanted.specified()))
             raise
         return self.settings
 
@@ -149,7 +149,7 @@ class GenicamCamera(Camera):
         if wanted.gain_db is not None:
             self._ask("set_gain", wanted.gain_db)
         if wanted.rate_hz is not None:
-            # How many frames there can be depends on their size and exposure.
+            # The highest frame rate depends on frame size and exposure.
             self.limits = self._limits()
             check_settings(self.info, self.limits, CameraSettings(rate_hz=wanted.rate_hz))
             self._ask("set_frame_rate", wanted.rate_hz)
@@ -159,10 +159,10 @@ class GenicamCamera(Camera):
             self._ask("clear_triggers")
         self.limits = self._limits()
 
-    def _put_back(self, before: CameraSettings, names: set[str]) -> None:
-        """Set what was changed as it was, each by itself; of one that is lost nothing can be."""
+    def _restore(self, before: CameraSettings, names: set[str]) -> None:
+        """Restore changed settings one by one, as far as possible."""
         if "trigger" in names:
-            names.add("rate_hz")  # a trigger takes its place
+            names.add("rate_hz")  # replaced by a trigger
         for name in ("region", "exposure_us", "gain_db", "rate_hz", "trigger"):
             if name in names:
                 with contextlib.suppress(CameraError, InputError):
@@ -198,13 +198,13 @@ class GenicamCamera(Camera):
         return "software" if source == SOFTWARE else "line"
 
     def _choose_format(self) -> int:
-        """Bits of the pixel format: the camera's own where it is grey, else that with 8 bits."""
+        """Set Mono8 unless the format is greyscale already; returns the bits of the format."""
         name = self._ask("get_pixel_format_as_string").decode()
         if name not in DEPTHS:
             try:
                 self._ask("set_pixel_format_from_string", b"Mono8")
             except CameraError as error:
-                words = f"{self.info.name} gives {name} and no grey pictures (Mono8)"
+                words = f"{self.info.name} has the format {name} and no greyscale (Mono8)"
                 raise CameraError(words) from error
             name = "Mono8"
         return DEPTHS[name]
@@ -228,7 +228,7 @@ class GenicamCamera(Camera):
     # --- frames -------------------------------------------------------------------------------
 
     def start(self) -> None:
-        """Let frames come."""
+        """Start acquisition."""
         if self._stream is not None:
             return
         self._ask("set_acquisition_mode", 0)
@@ -262,7 +262,7 @@ class GenicamCamera(Camera):
             arv.arv_stream_push_buffer(stream.handle, buffer)
 
     def _image(self, buffer: int) -> GreyImage:
-        """Copy the levels out of a buffer."""
+        """Copy the grey levels from a buffer."""
         arv, size = self._aravis.arv, c_size_t()
         place = arv.arv_buffer_get_data(buffer, byref(size))
         rows = arv.arv_buffer_get_image_height(buffer)
@@ -280,15 +280,15 @@ class GenicamCamera(Camera):
 
     @property
     def dropped(self) -> int:
-        """None: the frames' numbers show all that is lost."""
+        """Always 0: the frame numbers show all lost frames."""
         return 0
 
     def stop(self) -> None:
-        """Let no more frames come."""
+        """Stop acquisition."""
         stream, self._stream = self._stream, None
         if stream is None:
             return
-        with contextlib.suppress(CameraError):  # it may be gone
+        with contextlib.suppress(CameraError):  # it may be disconnected
             self._ask("stop_acquisition")
         self._aravis.release(stream.handle)
 
@@ -302,20 +302,20 @@ class GenicamCamera(Camera):
             self._aravis.release(camera)
 
     def _note_loss(self, *_: object) -> None:
-        """Called in a thread of Aravis when the camera is gone."""
+        """Note the loss of the camera; called in a thread of Aravis."""
         self._is_lost = True
 
 
 @dataclass
 class _Stream:
-    """Frames that come, and what is known of their numbers."""
+    """A stream of frames, with the state of their numbers."""
 
     handle: int
     turns: int = 0
     last: int = -1
 
     def number(self, frame_id: int) -> int:
-        """Number of a frame, continued where its 16 bits overflow."""
+        """Return the number of a frame, continued after an overflow of 16 bits."""
         if frame_id < self.last <= LARGEST_SHORT_ID and self.last - frame_id > LARGEST_SHORT_ID / 2:
             self.turns += 1
         self.last = frame_id

@@ -1,6 +1,6 @@
-"""A camera: what it is, what can be set, and its frames as they come.
+"""Interface of cameras: `Camera`, settings and frames.
 
-Every back-end gives the same: `Camera`. What keeps one going whatever it does is `feed.Feed`.
+All back-ends implement `Camera`; `feed.Feed` keeps one running in spite of faults.
 """
 
 from __future__ import annotations
@@ -14,24 +14,24 @@ from labapp.errors import InputError
 from labapp.media.base import GreyImage
 
 Trigger = Literal["free", "software", "line"]
-"""When a frame is taken: at the camera's own rate, by software, at a signal on its input."""
+"""Trigger of frames: free-running, by software, or by a signal at the camera's input."""
 
 Region = tuple[int, int, int, int]
-"""(u, v, width, height) of the part of the sensor that is read out, px."""
+"""(u, v, width, height) of the region of the sensor that is read out, px."""
 
 NUMBERS = {"exposure_us": "µs", "gain_db": "dB", "rate_hz": "frames/s"}
-"""What is set by a number, and its unit."""
+"""Numeric settings and their units."""
 
 BUFFERED_S, BUFFERED_BYTE, LEAST_BUFFERED = 2.0, 128_000_000, 32
-"""Frames that wait for their reader: a duration, s, limited by an amount of memory, bytes."""
+"""Size of the frame buffer: duration, s; limit of memory, bytes; fewest frames."""
 
 
 class CameraError(Exception):
-    """A camera did not do what was requested; the message says what, and what to do about it."""
+    """A request to a camera failed; the message says why, and what to do about it."""
 
 
 class CameraLost(CameraError):
-    """The camera is gone, or no longer ours: nothing more comes until it is opened again."""
+    """The camera is disconnected or used by another program, and must be opened again."""
 
 
 class BrokenFrame(CameraError):
@@ -43,16 +43,16 @@ class CameraInfo:
     """A camera that was found."""
 
     id: str
-    """What it is opened by: "uvc:0", "aravis:Vendor-Serial", "simulated:cap.toml"."""
+    """Id for opening it: "uvc:0", "aravis:Vendor-Serial", "simulated:cap.toml"."""
     name: str
-    """Maker and model, as it reports them."""
+    """Vendor and model, as it reports them."""
     kind: str
-    """How it is connected: "USB video", "GigE Vision", "USB3 Vision", "simulated"."""
+    """Interface: "USB video", "GigE Vision", "USB3 Vision", "simulated"."""
 
 
 @dataclass(frozen=True)
 class Range:
-    """What a number may be set to: from ``lowest`` to ``highest``, both included."""
+    """Range of a setting, from ``lowest`` to ``highest``, both included."""
 
     lowest: float
     highest: float
@@ -60,7 +60,7 @@ class Range:
 
 @dataclass(frozen=True, kw_only=True)
 class Limits:
-    """What can be set on a camera; None for what cannot."""
+    """Ranges of a camera's settings; None: cannot be set."""
 
     exposure_us: Range | None = None
     gain_db: Range | None = None
@@ -69,32 +69,32 @@ class Limits:
     sensor: tuple[int, int]
     """(width, height) of the whole picture, px."""
     least_region: tuple[int, int] | None = None
-    """(width, height) of the smallest region, px; None where no region can be set."""
+    """(width, height) of the smallest region, px; None if no region can be set."""
     triggers: tuple[Trigger, ...] = ("free",)
-    """The triggers it knows, "free" among them."""
+    """Supported triggers, including "free"."""
     gain_unit: str = "dB"
-    """Of the gain, for people; empty where it is in the driver's own steps."""
+    """Unit of the gain for display; empty for driver-specific steps."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CameraSettings:
-    """What a camera is set to, or is to be; None: unknown, or left as it is."""
+    """Present or requested settings of a camera; None: unknown, or unchanged."""
 
     exposure_us: float | None = None
-    """How long light is gathered for a frame, µs."""
+    """Exposure time, µs."""
     gain_db: float | None = None
-    """Amplification, dB (of USB video the driver's own number)."""
+    """Gain, dB (for USB video in steps of the driver)."""
     rate_hz: float | None = None
     region: Region | None = None
     trigger: Trigger | None = None
 
     def specified(self) -> dict[str, Any]:
-        """Settings that are not None, by name."""
+        """Return the settings that are not None, by name."""
         found = {each.name: getattr(self, each.name) for each in fields(self)}
         return {name: value for name, value in found.items() if value is not None}
 
     def describe(self) -> str:
-        """Settings that are not None as text: "exposure 800 µs, rate 200 frames/s"."""
+        """Describe the settings that are not None: "exposure 800 µs, rate 200 frames/s"."""
         parts = []
         for name, value in self.specified().items():
             unit = NUMBERS.get(name)
@@ -105,12 +105,12 @@ class CameraSettings:
 
 @dataclass(frozen=True)
 class CameraFrame(ReadOnlyArrays):
-    """A frame as a camera gave it."""
+    """A frame of a camera."""
 
     number: int
-    """The camera's own count; a gap means frames that were lost in transfer."""
+    """Frame number by the camera; a gap means frames lost in transfer."""
     time_s: float
-    """The camera's clock, s; by the computer's where the camera has none."""
+    """Time by the camera's clock, s; by the computer's if the camera has none."""
     arrived_s: float
     """`time.monotonic` at its arrival, s."""
     image: GreyImage = field(repr=False)
@@ -118,68 +118,68 @@ class CameraFrame(ReadOnlyArrays):
 
 
 class Camera(Protocol):
-    """A camera that is open. Used by one thread at a time."""
+    """An open camera. To be used by one thread at a time."""
 
     info: CameraInfo
-    """Which it is."""
+    """Its id, name and kind."""
     limits: Limits
-    """What can be set."""
+    """Ranges of its settings."""
     bit_depth: int
     """Significant bits of a grey level."""
 
     @property
     def settings(self) -> CameraSettings:
-        """What it is set to, as the camera says: it rounds, and one setting bounds another."""
+        """Present settings by the camera, which rounds values, and whose settings interact."""
         ...
 
     def apply(self, wanted: CameraSettings) -> CameraSettings:
-        """Set what is not None in ``wanted``; not while frames come.
+        """Apply the settings that are not None; not during acquisition.
 
         Returns
         -------
         CameraSettings
-            What it is set to now.
+            The resulting settings.
 
         Raises
         ------
         InputError
             If a value is out of range or cannot be set; nothing is changed then.
         CameraError
-            If the camera refuses.
+            If the camera rejects a setting.
         """
         ...
 
     def start(self) -> None:
-        """Let frames come, numbered from any number on."""
+        """Start acquisition; frame numbers begin anywhere."""
         ...
 
     def read(self, timeout_s: float) -> CameraFrame | None:
-        """Wait for the next frame; None when none came in time.
+        """Wait for the next frame; None after the timeout.
 
         Raises
         ------
         BrokenFrame
-            If an incomplete one arrived.
+            If an incomplete frame arrived.
         CameraLost
-            If none will come any more.
+            If the camera is disconnected.
         """
         ...
 
     def trigger(self) -> None:
-        """Take a frame now; with the trigger "software" only."""
+        """Trigger a frame; only with the trigger "software"."""
         ...
 
     @property
     def dropped(self) -> int:
-        """Frames since `start` that camera or driver had no room for and no number shows."""
+        """Frames since `start` that camera or driver dropped without a gap in the numbers."""
         ...
 
     def stop(self) -> None:
-        """Let no more frames come; settings may be changed then. Twice does no harm."""
+        """Stop acquisition, after which settings may be changed. May be called twice."""
         ...
 
     def close(self) -> None:
-        """Release the camera. Closing twice does no harm."""
+        """Release the camera. May be called twice."""
         ...
 
     def __enter__(self) -> Self:
@@ -191,32 +191,30 @@ class Camera(Protocol):
 
 @dataclass(frozen=True)
 class CameraKind:
-    """What cameras of a kind are found and opened by."""
+    """A kind of cameras, with functions to find and open them."""
 
     form: str
-    """How an id is written: what all ids of the kind begin with, to the colon, and a word for the
-    rest: "uvc:NUMBER".
-    """
+    """Form of the ids: common prefix with a colon, and a word for the rest: "uvc:NUMBER"."""
     find: Callable[[], list[CameraInfo]]
-    """Lists those that are connected; may raise `CameraError` where that is unknown."""
+    """Lists the connected cameras; may raise `CameraError` if that is impossible."""
     open: Callable[[str], Camera]
-    """Opens the camera of an id; may raise `InputError` for an id that no camera has, and
-    `CameraError` where the camera is not there or cannot be opened.
+    """Opens a camera by its id; may raise `InputError` for an invalid id, and `CameraError` if the
+    camera is not connected or cannot be opened.
     """
 
     @property
     def prefix(self) -> str:
-        """What its ids begin with."""
+        """Common prefix of the ids."""
         return self.form[: self.form.index(":") + 1]
 
 
 def check_settings(info: CameraInfo, limits: Limits, wanted: CameraSettings) -> None:
-    """Refuse what a camera cannot be set to.
+    """Check settings against a camera's limits.
 
     Raises
     ------
     InputError
-        That names every such setting.
+        If settings are out of range or cannot be set; it names all of them.
     """
     problems = []
     for name, unit in NUMBERS.items():
@@ -260,6 +258,6 @@ def _cannot(info: CameraInfo, name: str, value: object) -> InputError:
 
 
 def buffered(frame_byte: int, rate_hz: float | None) -> int:
-    """How many frames are to wait for their reader, who comes late where a computer is busy."""
+    """Return the size of the frame buffer, which bridges delays of the reader."""
     wanted = round(BUFFERED_S * (rate_hz or 0.0))
     return max(LEAST_BUFFERED, min(wanted, BUFFERED_BYTE // frame_byte))

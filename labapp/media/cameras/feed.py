@@ -28,16 +28,16 @@ from labapp.media.events import Event, Kind, OnEvent, Tally, ignore_event
 from labapp.text import pluralize
 
 WAIT_S = 0.1
-"""Longest wait for a frame before `stop` is checked, s."""
+"""Timeout for a frame before `stop` is checked, s."""
 
 SOON_S = 0.01
-"""… and with a software trigger, s."""
+"""The same with a software trigger, s."""
 
 SILENT_S = 2.0
-"""Time, s, without a frame after which a free-running camera is stalled; or that of 20 frames."""
+"""Time without a frame after which a free-running camera is stalled, s; at least 20 frames."""
 
 HOPELESS_S = 6.0
-"""… and after so much longer it is opened again."""
+"""Further time after which it is opened again, s."""
 
 RETRY_S = (0.1, 0.2, 0.5, 1.0)
 """Pauses between attempts to open a lost camera; the last is repeated."""
@@ -52,38 +52,38 @@ class Counts:
     frames: int
     """Complete frames delivered."""
     broken: int
-    """Incomplete frames, left out."""
+    """Incomplete frames, which were discarded."""
     dropped: int
     """Frames that never arrived, by gaps in the camera's numbers and its driver's count."""
     lost: int
-    """How often the camera was lost."""
+    """Number of times that the camera was lost."""
 
 
 class Feed:
     """Acquisition thread of a camera.
 
-    A camera that is unplugged or stalls is opened again with the same settings, until `stop`; an
-    incomplete frame, or one of another size or type, is left out. Each raises an event.
+    A camera that is unplugged or stalls is opened again with the same settings, until `stop`;
+    incomplete frames, or frames of another size or type, are discarded. Each raises an event.
 
     Parameters
     ----------
     opener
-        Opens the camera: raises `CameraError` while it cannot.
+        Opens the camera, or raises `CameraError`.
     on_frame
-        Called with every frame, in the feed's thread: it must not wait. Frames are numbered from
-        0 on; numbers of frames that did not arrive are left out, and of those there was no time for
-        while the camera was set, as far as its rate is known. `CameraFrame.time_s` is the time
-        since the first, by the camera's clock, continued when the camera is opened again.
+        Called with every frame, in the feed's thread; it must not block. Frames are numbered from
+        0 on; the numbers of frames that did not arrive are skipped, and those of the frames missed
+        during a change of settings, if the rate is known. `CameraFrame.time_s` is the time since
+        the first frame, by the camera's clock, continued when the camera is opened again.
     on_event
         Called with every event.
     settings
-        What the camera is set to whenever it was opened. Where no trigger is set it takes
-        frames by itself, whatever mode it was left in.
+        Settings applied whenever the camera is opened. Without a trigger it is free-running,
+        whatever its previous mode.
 
     Raises
     ------
     InputError, CameraError
-        If the camera cannot be opened, or set so, the first time.
+        If the camera cannot be opened or set the first time.
     """
 
     def __init__(
@@ -107,13 +107,13 @@ class Feed:
         self._triggers = threading.Semaphore(0)
         self._frames = self._lost = 0
         self._broken = Tally(
-            lambda n: self._emit("loss", f"{pluralize(n, 'frame')} not whole, left out")
+            lambda n: self._emit("loss", f"{pluralize(n, 'frame')} incomplete, discarded")
         )
         self._dropped = Tally(
-            lambda n: self._emit("loss", f"{pluralize(n, 'frame')} lost on the way")
+            lambda n: self._emit("loss", f"{pluralize(n, 'frame')} lost in transfer")
         )
         self._setting_message = ""
-        """Event to be raised when frames come again after a setting."""
+        """Event to be raised when frames arrive after a change of settings."""
         self._arrived_s: float | None = None
         self._next = 0
         self._first_s: float | None = None
@@ -129,7 +129,7 @@ class Feed:
 
     @property
     def settings(self) -> CameraSettings:
-        """Settings of the camera when it was opened or set last."""
+        """Settings of the camera when it was last opened or set."""
         return self._connection.settings
 
     @property
@@ -138,16 +138,16 @@ class Feed:
         return self.camera.bit_depth
 
     def apply(self, wanted: CameraSettings) -> Future[CameraSettings]:
-        """Set the camera between two frames, now and whenever it is opened again.
+        """Apply settings between two frames, and again whenever the camera is opened.
 
-        It gives no frames meanwhile, of some cameras for half a second.
+        Acquisition is interrupted, with some cameras for half a second.
 
         Returns
         -------
         Future
-            The resulting settings. `InputError` or `CameraError` where it refuses: it goes on as
-            it was set before. A camera that is away is set when it is back; of a feed that has
-            ended it is refused.
+            The resulting settings; or `InputError` or `CameraError` if they are rejected, in which
+            case the former settings remain. A lost camera is set when it is back. After the end of
+            the feed it is a `CameraError`.
         """
         answer: Future[CameraSettings] = Future()
         self._requests.put((wanted, answer))
@@ -156,11 +156,11 @@ class Feed:
         return answer
 
     def trigger(self) -> None:
-        """Trigger a frame; without effect while the camera is lost or not triggered by software."""
+        """Trigger a frame; no effect while the camera is lost or not triggered by software."""
         self._triggers.release()
 
     def stop(self) -> None:
-        """Stop and close the camera. Twice does no harm."""
+        """Stop and close the camera. May be called twice."""
         self._ending.set()
         if self._thread is not threading.current_thread():
             self._thread.join()
@@ -233,7 +233,7 @@ class Feed:
             self._deliver(frame)
 
     def _apply_requests(self) -> None:
-        """Apply the settings requested meanwhile; numbers and times continue."""
+        """Apply requested settings; frame numbers and times continue."""
         while not self._requests.empty():
             wanted, answer = self._requests.get()
             self._emit_set()
@@ -312,7 +312,7 @@ class Feed:
         self._on_frame(replace(frame, number=number, time_s=time_s))
 
     def _end_setting(self, arrived_s: float) -> int:
-        """Raise the event of a setting; returns how many frames there would have been."""
+        """Raise the event of a change of settings; returns the number of frames missed."""
         gap_s = arrived_s - (self._arrived_s or arrived_s)
         self._emit_set(f"; {gap_s:.2f} s without frames")
         return max(0, round(gap_s * (self._connection.former_hz or 0.0)) - 1)
@@ -339,7 +339,7 @@ class Feed:
                     self._emit("warning", str(error))
                 continue
             while self._triggers.acquire(blocking=False):
-                pass  # of a moment that has gone
+                pass  # outdated triggers
             away_s = time.monotonic() - gone_s
             self._emit("note", f"it is back after {away_s:.1f} s, set as before")
             return
@@ -354,10 +354,10 @@ class _Connection:
         self.shape = (rows, columns)
         self.dtype = np.uint8 if camera.bit_depth <= 8 else np.uint16
         self.spoiled = 0
-        """Frames that were left out since the last complete one."""
+        """Frames discarded since the last complete one."""
         self.offset_s: float | None = None
         self.former_hz: float | None = None
-        """The rate at which frames came before it was set."""
+        """Frame rate before the change of settings."""
         self._number: int | None = None
         self._overrun = 0
 
@@ -372,7 +372,7 @@ class _Connection:
         return self.former_hz if self._number is None else self.settings.rate_hz
 
     def missing(self, frame: CameraFrame, overrun: int) -> int:
-        """Number of frames missing before this one."""
+        """Return the number of frames missing before this one."""
         gap = 0 if self._number is None else max(0, frame.number - self._number - 1)
         more, self._overrun = max(0, overrun - self._overrun), overrun
         self._number = frame.number

@@ -1,7 +1,7 @@
-"""What is called of Aravis and GLib, which GenICam cameras are reached by, through ctypes.
+"""Bindings of Aravis and GLib, the libraries for GenICam cameras, by ctypes.
 
-No PyGObject: it would have to be built for every Python (docs/adr/0014). Loaded on first
-for; everything here may be called from any thread.
+PyGObject is not used, as it would have to be built for every Python (docs/adr/0014). The libraries
+are loaded on first use; everything here may be called from any thread.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ SIGNATURES: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "arv_stream_push_buffer": (VOID, (STREAM, BUFFER)),
     "arv_stream_timeout_pop_buffer": (BUFFER, (STREAM, c_uint64)),
 }
-"""Functions that do not fail: what they return, and what they are given."""
+"""Functions that do not fail: return type and argument types."""
 
 NUMBER, TEXT, YES, BOUNDS, WHOLES = (
     (c_double, ()),
@@ -91,7 +91,7 @@ OF_CAMERA: dict[str, tuple[Any, tuple[Any, ...]]] = {
     "get_payload": (c_uint, ()),
     "create_stream": (STREAM, (c_void_p, c_void_p)),
 }
-"""Functions arv_camera_…, which are given a camera first and last where to say what went wrong."""
+"""Functions arv_camera_…, with the camera as first and a GError as last argument in addition."""
 
 ControlLost = ctypes.CFUNCTYPE(None, c_void_p, c_void_p)
 
@@ -140,7 +140,7 @@ class Aravis:
         function.restype, function.argtypes = result, arguments
 
     def open(self, device: str) -> int:
-        """Open a camera by its id; to be freed by `release`."""
+        """Open a camera by its id; to be released by `release`."""
         return int(self._asked("arv_camera_new", device.encode()))
 
     def ask(self, camera: int, name: str, *given: Any) -> Any:
@@ -149,7 +149,7 @@ class Aravis:
         Raises
         ------
         CameraError
-            With what Aravis says.
+            With Aravis's message.
         """
         return self._asked(f"arv_camera_{name}", camera, *given)
 
@@ -161,7 +161,7 @@ class Aravis:
         return first.value, second.value
 
     def texts(self, camera: int, name: str) -> list[bytes]:
-        """Call arv_camera_NAME, which gives texts; none where the camera has no such feature."""
+        """Call arv_camera_NAME, which returns texts; empty if the camera lacks the feature."""
         count = c_uint()
         try:
             found = self.ask(camera, name, byref(count))
@@ -177,14 +177,14 @@ class Aravis:
         self._gobject.g_object_unref(thing)
 
     def when_lost(self, camera: int, call: Any) -> int:
-        """Have a `ControlLost` called when the camera is gone; returns a number for `unhook`."""
+        """Connect a `ControlLost` callback to the loss of a camera; returns an id for `unhook`."""
         device = self.arv.arv_camera_get_device(camera)
         return int(
             self._gobject.g_signal_connect_data(device, b"control-lost", call, None, None, 0)
         )
 
     def unhook(self, camera: int, number: int) -> None:
-        """Call what `when_lost` was given no more."""
+        """Disconnect the callback of `when_lost`."""
         device = self.arv.arv_camera_get_device(camera)
         self._gobject.g_signal_handler_disconnect(device, number)
 
@@ -200,5 +200,5 @@ class Aravis:
 
 @functools.cache
 def aravis() -> Aravis:
-    """The library, loaded on first use; see `Aravis`."""
+    """Return the library, loaded on first use; see `Aravis`."""
     return Aravis()

@@ -1,6 +1,6 @@
-"""A camera that is simulated: any pictures at any rate, and every fault that a real one has.
+"""Simulated camera: any pictures at any frame rate, with the faults of real cameras.
 
-What it is plugged into is a `SimulatedDevice`, which runs while cameras are opened and closed.
+`SimulatedDevice` is the hardware, which exists while cameras are opened and closed.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ HIGHEST_HZ = 10_000.0
 
 
 def there_and_back(images: Sequence[GreyImage]) -> Callable[[int], GreyImage]:
-    """Pictures of a film that is played without end: its end is seldom like its beginning."""
+    """Return pictures of an endless film, forwards and backwards in turn, to avoid jumps."""
     last = len(images) - 1
     order = [*range(last), *range(last, 0, -1)] or [0]
     return lambda number: images[order[number % len(order)]]
@@ -43,35 +43,35 @@ def there_and_back(images: Sequence[GreyImage]) -> Callable[[int], GreyImage]:
 
 @dataclass(frozen=True)
 class Faults:
-    """What goes wrong by itself; everything random follows from the seed."""
+    """Simulated faults, random with a seed."""
 
     garbage: float = 0.0
-    """Part of the frames that arrive cut off, of another size or of another type, 0 … 1."""
+    """Fraction of frames that are truncated, of another size or of another type, 0 … 1."""
     dropped: float = 0.0
-    """Part of the frames that never arrive, 0 … 1."""
+    """Fraction of frames that never arrive, 0 … 1."""
     unplug_every: int = 0
     unplugged_s: float = 0.2
-    """Number of frames after which the cable is out, and for how long, s; 0: never."""
+    """Number of frames between disconnections, and their duration, s; 0: never."""
     stall_every: int = 0
     stalled_s: float = 0.5
-    """Number of frames after which none come, and for how long, s; 0: never."""
+    """Number of frames between stalls, and their duration, s; 0: never."""
     seed: int = 0
 
 
 class SimulatedDevice:
-    """A camera on the bench that is not there.
+    """Simulated camera hardware.
 
     Parameters
     ----------
     name
-        What to call it; its id is "simulated:" and that.
+        Name; the id is "simulated:" and the name.
     picture
-        Frame k, shape (rows, columns), uint8 or uint16; called by the thread that reads, at the
-        camera's rate, with k = 0, 1, 2 …
+        Returns frame k, shape (rows, columns), uint8 or uint16; called by the reading thread at the
+        frame rate, with k = 0, 1, 2 …
     bit_depth
         Significant bits of a grey level.
     rate_hz
-        Frames a second at first.
+        Initial frame rate.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class SimulatedDevice:
         self.sensor = (columns, rows)
         self.settings = CameraSettings(rate_hz=rate_hz, region=(0, 0, columns, rows))
         self.taken = 0
-        """Frames exposed since it was made; random numbers follow from the seed and this number."""
+        """Number of frames exposed, which with the seed determines the random numbers."""
         self.disconnects = 0
         self._unplugged_until_s = 0.0
         self._stalled_until_s = 0.0
@@ -110,29 +110,29 @@ class SimulatedDevice:
 
     @property
     def plugged(self) -> bool:
-        """Whether its cable is in."""
+        """Whether it is connected."""
         return time.monotonic() >= self._unplugged_until_s
 
     @property
     def stalled_s(self) -> float:
-        """How much longer no frame comes, s."""
+        """Remaining duration of a stall, s."""
         return max(0.0, self._stalled_until_s - time.monotonic())
 
     def unplug(self, seconds: float = float("inf")) -> None:
-        """Pull its cable for a time."""
+        """Disconnect it for a time."""
         self.disconnects += 1
         self._unplugged_until_s = time.monotonic() + seconds
 
     def plug(self) -> None:
-        """Put its cable back."""
+        """Connect it again."""
         self._unplugged_until_s = 0.0
 
     def stall(self, seconds: float) -> None:
-        """Let no frame come for a time."""
+        """Deliver no frames for a time."""
         self._stalled_until_s = time.monotonic() + seconds
 
     def expose(self) -> tuple[GreyImage, Literal["", "lost", "cut off"]]:
-        """Take the next frame, and what happens to it on its way."""
+        """Expose the next frame; returns it with its fate in transfer."""
         number, faults = self.taken, self.faults
         self.taken += 1
         u, v, width, height = self.settings.region or (0, 0, *self.sensor)
@@ -154,7 +154,7 @@ class SimulatedDevice:
 
 
 class SimulatedCamera(Camera):
-    """A `SimulatedDevice` that is open; see `Camera`."""
+    """An open `SimulatedDevice`; see `Camera`."""
 
     def __init__(self, device: SimulatedDevice) -> None:
         self.info = device.info
@@ -174,21 +174,21 @@ class SimulatedCamera(Camera):
 
     @property
     def settings(self) -> CameraSettings:
-        """What it is set to."""
+        """Present settings."""
         return replace(self._device.settings, trigger=self._device.settings.trigger or "free")
 
     def apply(self, wanted: CameraSettings) -> CameraSettings:
-        """Set what is wanted; see `Camera.apply`."""
+        """Apply settings; see `Camera.apply`."""
         if self._begun_s is not None:
             raise CameraError(f"{self.info.name} is running: stop it before it is set")
         check_settings(self.info, self.limits, wanted)
         for name in ("exposure_us", "gain_db"):
-            assert getattr(wanted, name) is None  # no limits: refused above
+            assert getattr(wanted, name) is None  # checked above, as there are no limits
         self._device.settings = replace(self._device.settings, **wanted.specified())
         return self.settings
 
     def start(self) -> None:
-        """Let frames come."""
+        """Start acquisition."""
         self._begun_s = time.monotonic()
         self._next = self._overrun = 0
         columns, rows = (self.settings.region or (0, 0, *self.limits.sensor))[2:]
@@ -200,7 +200,7 @@ class SimulatedCamera(Camera):
         until_s = time.monotonic() + timeout_s
         while True:
             number = self._await(until_s)
-            # One that was pulled out and put back meanwhile has to be opened anew, too.
+            # Also if it was disconnected and connected again.
             if not self._device.plugged or self._device.disconnects > self._disconnects:
                 self._begun_s = None
                 raise CameraLost(f"{self.info.name} was unplugged")
@@ -208,24 +208,24 @@ class SimulatedCamera(Camera):
                 return None
             image, fate = self._device.expose()
             if fate == "cut off":
-                raise BrokenFrame("it was cut off on its way")
+                raise BrokenFrame("it was truncated in transfer")
             if fate != "lost":
                 now_s = time.monotonic()
                 return CameraFrame(number, self._clock_s(number, now_s), now_s, image)
 
     def trigger(self) -> None:
-        """Take a frame now."""
+        """Trigger a frame."""
         if self.settings.trigger != "software":
             raise CameraError(f'{self.info.name} is not set to the trigger "software"')
         self._pulled.release()
 
     @property
     def dropped(self) -> int:
-        """Frames its reader came too late for."""
+        """Frames dropped because the reader was too slow."""
         return self._overrun
 
     def stop(self) -> None:
-        """Let no more frames come."""
+        """Stop acquisition."""
         self._begun_s = None
 
     def close(self) -> None:
@@ -233,7 +233,7 @@ class SimulatedCamera(Camera):
         self.stop()
 
     def _await(self, until_s: float) -> int | None:
-        """Wait until the next frame is due; its number, None if it is due only later."""
+        """Wait until the next frame is due, and return its number; None after ``until_s``."""
         if self._begun_s is None:
             raise CameraError(f"{self.info.name} was not started")
         if self.settings.trigger == "software":
@@ -251,7 +251,7 @@ class SimulatedCamera(Camera):
         now_s = time.monotonic()
         if (stalled_s := self._device.stalled_s) > 0:
             time.sleep(max(0.0, min(stalled_s, until_s - now_s)))
-            # It did not count on meanwhile.
+            # Frames are not counted during a stall.
             self._begun_s += time.monotonic() - now_s
             return None
         due_s = self._begun_s + self._next * period_s
@@ -268,7 +268,7 @@ class SimulatedCamera(Camera):
         return self._next
 
     def _clock_s(self, number: int, now_s: float) -> float:
-        """When frame ``number`` was taken, s."""
+        """Return the time of a frame, s."""
         if self.settings.trigger == "software" or self._begun_s is None:
             return now_s
         return self._begun_s + number / (self._device.settings.rate_hz or 1.0)

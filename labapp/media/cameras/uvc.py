@@ -1,4 +1,4 @@
-"""USB cameras that every system has a driver for (UVC, Video4Linux), through OpenCV."""
+"""USB cameras with standard drivers (UVC, Video4Linux), through OpenCV."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ EXPOSURE, GAIN = 0x009A0902, 0x00980913
 """Controls by Video4Linux's numbers (linux/v4l2-controls.h)."""
 
 QUERY = struct.Struct("II32siiiiI8x")
-"""v4l2_queryctrl: id, type, name, least, most, step, usual, flags."""
+"""v4l2_queryctrl: id, type, name, minimum, maximum, step, default, flags."""
 
 QUERY_CONTROL = 0xC0445624
 DISABLED = 0x0001
@@ -46,25 +46,25 @@ DISABLED = 0x0001
 EXPOSURE_UNIT_US = 100.0
 
 MANUAL = 1
-"""Of the exposure, in Video4Linux: nothing changes it but who sets it."""
+"""Video4Linux's value for manual exposure."""
 
 GREY_FORMATS = {"GREY": 8, "Y16 ": 16}
-"""Formats without colour, and their bits; of any other the luminance is taken."""
+"""Greyscale formats and their bits; other formats are converted to luminance."""
 
 HIGHEST_HZ = 1000.0
 
 Capture = Callable[[int], Any]
-"""Opens `cv2.VideoCapture` of a device's number."""
+"""Opens `cv2.VideoCapture` by a device number."""
 
 Query = Callable[[int, int], Range | None]
-"""What a control of a device may be set to: (device's number, control)."""
+"""Range of a control of a device: (device number, control)."""
 
 Present = Callable[[int], bool]
-"""Whether there is such a device."""
+"""Whether a device exists, by its number."""
 
 
 def find_uvc(listed: Path = LISTED) -> list[CameraInfo]:
-    """Cameras that the system lists; of a camera's several devices the one with its pictures."""
+    """Return the cameras listed by the system, with the first device of each."""
     found = []
     for entry in sorted(listed.glob("video*"), key=lambda path: int(path.name[5:] or 0)):
         with contextlib.suppress(OSError):
@@ -83,18 +83,18 @@ def _is_present(number: int) -> bool:
 
 
 def query_control(number: int, control: int) -> Range | None:
-    """Ask the driver what a control may be set to; None where there is no such control."""
+    """Query the driver for the range of a control; None if there is no such control."""
     if not IS_LINUX:
         return None
     import fcntl
 
-    asked = QUERY.pack(control, 0, b"", 0, 0, 0, 0, 0)
+    query = QUERY.pack(control, 0, b"", 0, 0, 0, 0, 0)
     try:
         device = os.open(f"/dev/video{number}", os.O_RDWR | os.O_NONBLOCK)
     except OSError:
         return None
     try:
-        fields = QUERY.unpack(fcntl.ioctl(device, QUERY_CONTROL, asked))
+        fields = QUERY.unpack(fcntl.ioctl(device, QUERY_CONTROL, query))
     except OSError:
         return None
     finally:
@@ -103,15 +103,15 @@ def query_control(number: int, control: int) -> Range | None:
 
 
 class UvcCamera(Camera):
-    """A USB camera that is open; see `Camera`.
+    """An open USB camera; see `Camera`.
 
-    Its driver numbers no frames: what is lost on the way does not show. OpenCV's own driver
-    chooses the nearest size and rate that the camera has.
+    Its driver does not number frames, so that lost frames are not detected. OpenCV chooses the
+    nearest size and rate that the camera supports.
 
     Raises
     ------
     CameraError
-        If it is not there, or not to be opened.
+        If it is not connected or cannot be opened.
     """
 
     def __init__(
@@ -131,7 +131,7 @@ class UvcCamera(Camera):
         self.bit_depth = self._choose_format()
         exposure, gain = query(self._number, EXPOSURE), query(self._number, GAIN)
         if exposure is not None:
-            # Refused by one that has no automatic exposure.
+            # Fails for cameras without automatic exposure.
             self._capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, MANUAL)
             exposure = Range(
                 exposure.lowest * EXPOSURE_UNIT_US, exposure.highest * EXPOSURE_UNIT_US
@@ -139,7 +139,7 @@ class UvcCamera(Camera):
         self.limits = Limits(
             exposure_us=exposure,
             gain_db=gain,
-            gain_unit="",  # in steps of the driver's own
+            gain_unit="",  # driver-specific steps
             rate_hz=Range(1.0, HIGHEST_HZ),
             sensor=(self._get(cv2.CAP_PROP_FRAME_WIDTH), self._get(cv2.CAP_PROP_FRAME_HEIGHT)),
         )
@@ -148,7 +148,7 @@ class UvcCamera(Camera):
 
     @property
     def settings(self) -> CameraSettings:
-        """What it is set to, as its driver says."""
+        """Present settings, as reported by the driver."""
         exposure = self._capture.get(cv2.CAP_PROP_EXPOSURE) * EXPOSURE_UNIT_US
         rate_hz = self._capture.get(cv2.CAP_PROP_FPS)
         return CameraSettings(
@@ -160,7 +160,7 @@ class UvcCamera(Camera):
         )
 
     def apply(self, wanted: CameraSettings) -> CameraSettings:
-        """Set what is wanted; see `Camera.apply`."""
+        """Apply settings; see `Camera.apply`."""
         if self._running:
             raise CameraError(f"{self.info.name} is running: stop it before it is set")
         check_settings(self.info, self.limits, wanted)
@@ -173,13 +173,13 @@ class UvcCamera(Camera):
         return self.settings
 
     def start(self) -> None:
-        """Let frames come."""
+        """Start acquisition."""
         self._running, self._count = True, 0
 
     def read(self, timeout_s: float) -> CameraFrame | None:
         """Wait for the next frame; see `Camera.read`.
 
-        OpenCV's time limit cannot be set: it waits ten seconds for a camera that is silent.
+        OpenCV's own timeout of ten seconds cannot be changed.
         """
         if not self._running:
             raise CameraError(f"{self.info.name} was not started")
@@ -199,16 +199,16 @@ class UvcCamera(Camera):
         return CameraFrame(number, time_s, arrived_s, to_grey(image))
 
     def trigger(self) -> None:
-        """Not possible."""
-        raise CameraError(f"{self.info.name} takes frames by itself only")
+        """Raise, as triggers are not supported."""
+        raise CameraError(f"{self.info.name} is free-running only")
 
     @property
     def dropped(self) -> int:
-        """None that its driver would report."""
+        """Always 0, as the driver does not report dropped frames."""
         return 0
 
     def stop(self) -> None:
-        """Let no more frames come."""
+        """Stop acquisition."""
         self._running = False
 
     def close(self) -> None:
@@ -221,10 +221,10 @@ class UvcCamera(Camera):
 
     def _set(self, name: int, value: float) -> None:
         if not self._capture.set(name, value):
-            raise CameraError(f"{self.info.name} refuses a setting that it says to have ({value})")
+            raise CameraError(f"{self.info.name} rejects a setting within its range ({value})")
 
     def _choose_format(self) -> int:
-        """Bits of the format: one without colour where the camera has it."""
+        """Set a greyscale format if there is one; returns the bits of the format."""
         for name, bits in GREY_FORMATS.items():
             code = cv2.VideoWriter.fourcc(*name)
             self._capture.set(cv2.CAP_PROP_FOURCC, code)
@@ -239,7 +239,7 @@ class UvcCamera(Camera):
             return f"{self.info.name} is not connected"
         if not os.access(device, os.R_OK | os.W_OK):
             join = "sudo usermod -aG video $USER"
-            return f"{device} may not be read: join the group that may ({join}) and log in anew"
+            return f"no permission to read {device}: join its group ({join}) and log in again"
         return f"{self.info.name} is used by another program: close that"
 
 

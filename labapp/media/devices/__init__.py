@@ -1,1 +1,1 @@
-"""Foot switches and controllers: USB devices that are pressed and turned."""
+"""USB input devices: foot switches and 3-D controllers."""

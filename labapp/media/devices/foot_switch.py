@@ -1,4 +1,4 @@
-"""Foot switches: which pedal was pressed, learned by pressing it, and what it does."""
+"""Foot switches: detection of pedals, and their actions."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from labapp.media.devices.hid import (
 from labapp.media.events import OnEvent, ignore_event
 
 Action = Literal["trigger", "mark", "next"]
-"""Begin a recording; mark the frame; go to the next step."""
+"""Trigger a recording, mark the frame, or go to the next step."""
 
 ACTIONS: tuple[Action, ...] = ("trigger", "mark", "next")
 
 BOUNCE_S = 0.05
-"""A pedal that is down again within this time of having been down was pressed once."""
+"""Time for debouncing: a pedal pressed again within it counts once, s."""
 
 GLANCE_MS = 10
-"""Time, ms, that each device is read in turn while one is learned."""
+"""Time for which each device is polled in turn by `learn`, ms."""
 
 MODIFIERS = 0xE0
 """The first of the keys that a keyboard sends as bits (Ctrl, Shift …)."""
@@ -42,7 +42,7 @@ MODIFIERS = 0xE0
 
 @dataclass(frozen=True)
 class PedalMap:
-    """A foot switch and what its pedals do."""
+    """A foot switch and the actions of its pedals."""
 
     device: str
     """Its `HidInfo.key`."""
@@ -50,23 +50,23 @@ class PedalMap:
     keyboard: bool
     """Whether it sends keys."""
     actions: Mapping[int, Action] = field(default_factory=dict)
-    """Pedal's number → what it does."""
+    """Number of a pedal → its action."""
 
     def with_action(self, pedal: int, action: Action | None) -> PedalMap:
-        """Copy with another action of a pedal; None: no action."""
+        """Return a copy with another action of a pedal; None: no action."""
         actions = {key: value for key, value in self.actions.items() if key != pedal}
         if action is not None:
             actions[pedal] = action
         return replace(self, actions=actions)
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values, for the preferences."""
+        """Return plain values, for the preferences."""
         actions = {str(pedal): action for pedal, action in self.actions.items()}
         return {**vars(self), "actions": actions}
 
     @classmethod
     def from_dict(cls, values: Any) -> PedalMap:
-        """Inverse of `as_dict`.
+        """Create from the result of `as_dict`.
 
         Raises
         ------
@@ -94,7 +94,7 @@ class Learned:
     pedal: int
 
     def mapped(self, action: Action) -> PedalMap:
-        """Foot switch with an action of this pedal."""
+        """Return a foot switch with an action of this pedal."""
         info = self.info
         return PedalMap(info.key, info.name, info.is_keyboard, {self.pedal: action})
 
@@ -102,8 +102,8 @@ class Learned:
 class Pedals:
     """State of a device's pedals, from its reports.
 
-    A keyboard's report lists its keys; of any other device every bit may be a pedal, and those
-    that are set without one, as by a joystick's axes, count for nothing.
+    A keyboard's report lists its keys; for other devices every bit may be a pedal, and bits that
+    are not mapped, such as those of a joystick's axes, have no effect.
     """
 
     def __init__(self, keyboard: bool) -> None:
@@ -112,16 +112,16 @@ class Pedals:
 
     @property
     def down(self) -> frozenset[int]:
-        """Pedals that are down by the last reports."""
+        """Pedals that are pressed according to the last reports."""
         return frozenset().union(*self._down.values())
 
     def pressed(self, number: int, report: bytes) -> frozenset[int]:
-        """Pedals that are down by a report and were not before.
+        """Return the pedals that are newly pressed in a report.
 
         Parameters
         ----------
         number
-            Report ID; 0 where there is none; −1: the device is gone.
+            Report ID; 0 if there is none; −1: the device is disconnected.
         report
             Its bytes, without the ID.
         """
@@ -135,7 +135,7 @@ class Pedals:
 
 
 def _keys(report: bytes) -> frozenset[int]:
-    """Keys that are down: a byte of modifiers, one that is unused, then keys by their numbers."""
+    """Return the pressed keys from a byte of modifiers, an unused byte, and key numbers."""
     modifiers = {MODIFIERS + bit for bit in range(8) if report[:1] and report[0] >> bit & 1}
     # 1 to 3 mean errors, such as too many keys.
     return frozenset(modifiers | {key for key in report[2:] if key > 3})
@@ -147,7 +147,7 @@ def _bits(number: int, report: bytes) -> frozenset[int]:
 
 
 class FootSwitch(HidReader):
-    """A foot switch in use, whenever it is plugged in.
+    """A foot switch in use, which may be unplugged and plugged in again.
 
     Parameters
     ----------
@@ -178,11 +178,11 @@ class FootSwitch(HidReader):
         return info.key == self.pedals.device
 
     def on_report(self, number: int, report: bytes) -> None:
-        """Do the actions of the pedals that were pressed."""
+        """Call the actions of the pressed pedals."""
         now_s, before = time.monotonic(), self._known.down
         new = self._known.pressed(number, report)
         first = [p for p in sorted(new) if now_s - self._down_s.get(p, -math.inf) >= BOUNCE_S]
-        # One that is released now was down until now: contacts bounce then, too.
+        # Including released pedals, as contacts also bounce on release.
         self._down_s |= dict.fromkeys(before | new, now_s)
         if number < 0:
             self._down_s.clear()
@@ -198,14 +198,14 @@ def learn(
     opener: Open = open_hid,
     on_problems: Callable[[list[str]], None] = lambda _: None,
 ) -> Learned | None:
-    """Wait for a pedal on any device but 3-D controllers and mice.
+    """Wait for a pedal on any device except 3-D controllers and mice.
 
     Parameters
     ----------
     ending
         Set to stop waiting.
     on_problems
-        Called once with why some devices cannot be read.
+        Called once with the reasons why some devices cannot be read.
 
     Returns
     -------
@@ -215,7 +215,7 @@ def learn(
     Raises
     ------
     HidError
-        If no device can be listened to: why, and what to do.
+        If no device can be read; the message says why and what to do.
     """
     problems: list[str] = []
     with ExitStack() as devices:
@@ -255,6 +255,6 @@ def _listen(
         try:
             numbered = has_numbers(device.get_report_descriptor())
         except (OSError, ValueError) as error:
-            problems.append(f"{info.name} cannot be listened to: {error}")
+            problems.append(f"{info.name} cannot be read: {error}")
             continue
         yield info, device, numbered, Pedals(info.is_keyboard)

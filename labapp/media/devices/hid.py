@@ -1,4 +1,4 @@
-"""USB devices that are pressed and turned (HID): found, read, kept through unplugging."""
+"""USB input devices (HID): finding, reading, and reconnection."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from labapp.media.events import Event, Kind, OnEvent, ignore_event
 from labapp.system import IS_LINUX
 
 LONGEST = 64
-"""Bytes of a report, at most."""
+"""Most bytes of a report."""
 
 WAIT_MS = 30
-"""Time, ms, that a report is waited for before reading checks whether to end."""
+"""Timeout for a report before `stop` is checked, ms."""
 
 RETRY_S = 0.5
-"""Pause between attempts to open a device that is gone."""
+"""Pause between attempts to open a missing device, s."""
 
 MISSING = "hidapi is needed to read foot switches: pip install 'labapp[gui]'"
 
@@ -41,7 +41,7 @@ KNOWN: Mapping[tuple[int, int], str] = {
     (0x3553, 0xB001): "PCsensor FootSwitch",
     (0x05F3, 0x00FF): "VEC Infinity foot pedal",
 }
-"""Foot switches by (vendor, product): those that the rules let in."""
+"""Foot switches by (vendor, product), to which the udev rules give access."""
 
 
 class HidError(Exception):
@@ -50,37 +50,37 @@ class HidError(Exception):
 
 @dataclass(frozen=True)
 class HidInfo:
-    """A device, or one of the several that it shows itself as."""
+    """A device, or one interface of a device with several."""
 
     path: str
-    """Its device file: "/dev/hidraw3"."""
+    """Device file: "/dev/hidraw3"."""
     vendor: int
     product: int
     interface: int
-    """USB's numbers."""
+    """Numbers by USB."""
     usage: tuple[int, int]
     """(page, usage) of HID: (1, 6) is a keyboard, (1, 8) a 3-D controller."""
     name: str
-    """Its own name."""
+    """Name for display."""
 
     @property
     def key(self) -> str:
-        """Identifies it wherever it is plugged in: "0c45:7403:1"."""
+        """Identifier independent of the port: "0c45:7403:1"."""
         return f"{self.vendor:04x}:{self.product:04x}:{self.interface}"
 
     @property
     def is_pedal(self) -> bool:
-        """Whether it is a foot switch that is known."""
+        """Whether it is a known foot switch."""
         return (self.vendor, self.product) in KNOWN
 
     @property
     def is_3d(self) -> bool:
-        """Whether it is a controller with six axes."""
+        """Whether it is a six-axis controller."""
         return self.usage == (1, 8)
 
     @property
     def is_mouse(self) -> bool:
-        """Whether it moves the pointer."""
+        """Whether it is a mouse."""
         return self.usage == (1, 2)
 
     @property
@@ -90,10 +90,10 @@ class HidInfo:
 
 
 class HidDevice(Protocol):
-    """A device that is open, as hidapi has it."""
+    """An open device, with the interface of hidapi."""
 
     def read(self, n: int, timeout_ms: int = 0) -> list[int]:
-        """Wait for a report, up to ``n`` bytes; empty when none came in time; OSError if gone."""
+        """Wait for a report of up to ``n`` bytes; empty after the timeout; OSError if lost."""
         ...
 
     def close(self) -> None:
@@ -101,7 +101,7 @@ class HidDevice(Protocol):
         ...
 
     def get_report_descriptor(self) -> list[int]:
-        """Report descriptor (HID 1.11, §6.2.2)."""
+        """Return the report descriptor (HID 1.11, §6.2.2)."""
         ...
 
 
@@ -109,11 +109,11 @@ Find = Callable[[], Iterable[HidInfo]]
 Open = Callable[[HidInfo], HidDevice]
 
 _mutex = threading.Lock()
-"""hidapi keeps one global last error: calls from several threads are serialised."""
+"""Serialises calls from several threads, as hidapi has a global last error."""
 
 
 def find_hid() -> list[HidInfo]:
-    """Connected devices, known foot switches first.
+    """Return the connected devices, known foot switches first.
 
     Raises
     ------
@@ -139,8 +139,8 @@ def find_hid() -> list[HidInfo]:
 
 def _name(entry: Mapping[str, Any]) -> str:
     known = KNOWN.get((entry["vendor_id"], entry["product_id"]))
-    own = f"{entry['manufacturer_string'] or ''} {entry['product_string'] or ''}".strip()
-    return known or own or f"{entry['vendor_id']:04x}:{entry['product_id']:04x}"
+    reported = f"{entry['manufacturer_string'] or ''} {entry['product_string'] or ''}".strip()
+    return known or reported or f"{entry['vendor_id']:04x}:{entry['product_id']:04x}"
 
 
 def open_hid(info: HidInfo) -> HidDevice:
@@ -149,7 +149,7 @@ def open_hid(info: HidInfo) -> HidDevice:
     Raises
     ------
     HidError
-        If it is not there or may not be read: which rule to install, and how.
+        If it is not connected or not readable; the message says which rule to install, and how.
     """
     device: HidDevice = _hidraw().device()
     try:
@@ -161,24 +161,24 @@ def open_hid(info: HidInfo) -> HidDevice:
 
 
 def why_closed(info: HidInfo) -> str:
-    """Why a device cannot be opened, and what to do."""
+    """Explain why a device cannot be opened, and what to do."""
     if IS_LINUX and not os.path.exists(info.path):
         return f"{info.name} is not connected"
     if may_be_read(info):
-        return f"{info.name} does not answer: plug it in anew"
+        return f"{info.name} does not answer: plug it in again"
     return (
-        f"{info.name} may not be read. Install the rule that lets you: {commands(info)}, and plug "
-        "it in anew"
+        f"no permission to read {info.name}. Install the udev rule: {commands(info)}, and plug it "
+        "in again"
     )
 
 
 def may_be_read(info: HidInfo) -> bool:
-    """Whether the user may read a device; True except on Linux, which can say beforehand."""
+    """Whether the user has permission to read a device; can be checked on Linux only."""
     return not IS_LINUX or os.access(info.path, os.R_OK | os.W_OK)
 
 
 def commands(info: HidInfo) -> str:
-    """Shell commands that allow reading a device: they install `RULES`, or a rule for it alone."""
+    """Return shell commands that allow reading a device, by `RULES` or a rule for it alone."""
     rules = bundled(RULES)
     if (info.is_pedal or info.is_3d) and rules.is_file():
         install = f"sudo cp {shlex.quote(str(rules))} {RULES_FOLDER}"
@@ -215,7 +215,7 @@ def has_numbers(descriptor: Iterable[int]) -> bool:
 class HidReader:
     """Reader thread of a device, which reconnects after unplugging; base of devices in use.
 
-    It begins at once: a subclass is ready before it calls ``__init__``.
+    The thread starts in ``__init__``, which subclasses must call last.
 
     Parameters
     ----------
@@ -253,14 +253,14 @@ class HidReader:
         Parameters
         ----------
         number
-            Report ID, or 0; −1 when the device is gone: what was pressed is released.
+            Report ID, or 0; −1 when the device is lost: everything is released.
         report
             Its bytes, without the ID.
         """
         raise NotImplementedError
 
     def stop(self) -> None:
-        """Stop reading. Twice does no harm."""
+        """Stop reading. May be called twice."""
         self._ending.set()
         if self._thread is not threading.current_thread():
             self._thread.join()
@@ -285,7 +285,7 @@ class HidReader:
         self.connected = False
 
     def _on_disconnect(self, words: str) -> None:
-        """Raise an event on why nothing is read, once for each reason."""
+        """Raise an event with the reason, once for each reason."""
         if self.connected:
             self.connected = False
             self._gone_s = time.monotonic()
@@ -312,20 +312,20 @@ class HidReader:
             device.close()
 
     def _deliver(self, number: int, report: bytes) -> None:
-        """Call `on_report`; an error in it is an event and ends no reading."""
+        """Call `on_report`; an error in it raises an event and does not end reading."""
         try:
             self.on_report(number, report)
         except Exception as error:
             if not isinstance(error, InputError):
                 logging.getLogger("labapp").exception("%s, report %s", self._name, report.hex())
-            self._emit("warning", f"what it was pressed for failed: {error}")
+            self._emit("warning", f"its action failed: {error}")
 
     def _emit(self, kind: Kind, words: str) -> None:
         self._on_event(Event(self._name, kind, words))
 
 
 def _hidraw() -> Any:
-    """Module of hidapi that reads through the operating system's drivers."""
+    """Import the module of hidapi that reads through the operating system's drivers."""
     try:
         if IS_LINUX:
             import hidraw

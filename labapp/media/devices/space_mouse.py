@@ -1,4 +1,4 @@
-"""3Dconnexion's controllers: six axes, to turn what is seen in 3-D."""
+"""3Dconnexion six-axis controllers, for the 3-D view."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from labapp.media.devices.hid import (
 from labapp.media.events import Kind, OnEvent, ignore_event
 
 RETRY_S = 2.0
-"""Pause between looks for one: most benches have none."""
+"""Pause between searches, s; most benches have no controller."""
 
 FULL = 350.0
-"""What an axis gives at its stop."""
+"""Value of an axis at its stop."""
 
 TRANSLATION, ROTATION, BUTTONS = 1, 2, 3
 """Numbers of the reports; newer devices send the rotation with the translation."""
@@ -30,23 +30,23 @@ TRANSLATION, ROTATION, BUTTONS = 1, 2, 3
 
 @dataclass(frozen=True)
 class SixAxes:
-    """How a controller is held; each axis −1 … 1."""
+    """State of a controller; each axis −1 … 1."""
 
     right: float = 0.0
     near: float = 0.0
     down: float = 0.0
-    """Pushed to the right, towards the operator, down."""
+    """Translation to the right, towards the operator, down."""
     pitch: float = 0.0
     roll: float = 0.0
     yaw: float = 0.0
-    """Turned about the first, the second, the third of these, right-handed."""
+    """Rotation about these axes, right-handed."""
     buttons: frozenset[int] = frozenset()
-    """Those that are down, by number from 0."""
+    """Numbers of the pressed buttons, from 0."""
 
     def after(self, number: int, report: bytes) -> SixAxes:
-        """How it is held after a report of this number; unchanged by other reports.
+        """Return the state after a report; unknown reports do not change it.
 
-        Number −1, the device is gone: released.
+        Number −1: the device is lost, everything is released.
         """
         if number < 0:
             return SixAxes()
@@ -72,7 +72,7 @@ class SpaceMouse(HidReader):
     on_move
         Called with its state whenever that changes, in the reader's thread.
     on_event
-        Called with every event but that none is connected.
+        Called with every event, except that no controller is connected.
     """
 
     def __init__(
@@ -83,7 +83,7 @@ class SpaceMouse(HidReader):
         opener: Open = open_hid,
     ) -> None:
         self._on_move, self._on_event = on_move, on_event
-        self._held = SixAxes()
+        self._state = SixAxes()
         super().__init__("3-D controller", on_event, find, opener, RETRY_S)
 
     def matches(self, info: HidInfo) -> bool:
@@ -91,11 +91,11 @@ class SpaceMouse(HidReader):
         return info.is_3d
 
     def on_report(self, number: int, report: bytes) -> None:
-        """Report a change."""
-        held = self._held.after(number, report)
-        if held != self._held:
-            self._held = held
-            self._on_move(held)
+        """Update the state, and report changes."""
+        state = self._state.after(number, report)
+        if state != self._state:
+            self._state = state
+            self._on_move(state)
 
     def _emit(self, kind: Kind, words: str) -> None:
         if words not in (AWAY, MISSING):

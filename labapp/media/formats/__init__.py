@@ -1,1 +1,1 @@
-"""Readers of recordings: one module for each format, and what they share."""
+"""Readers of recordings, one module per format, and shared parts."""

@@ -1,7 +1,7 @@
-"""What the boxes of an MP4 or MOV promise, looked at before FFmpeg makes room for it.
+"""Check of the counts in the boxes of an MP4 or MOV, before FFmpeg allocates memory for them.
 
-FFmpeg keeps some fifty bytes for every sample that a box counts, and again in every edit. The
-count itself takes four bytes, whatever is in the file.
+FFmpeg allocates some fifty bytes for every sample that a box counts, and again for every edit. A
+count takes four bytes only, whatever the file contains.
 """
 
 from __future__ import annotations
@@ -14,27 +14,27 @@ from pathlib import Path
 from labapp.errors import InputError
 
 BEGINNINGS = frozenset(b"ftyp styp moov moof mdat wide free skip pnot udta uuid".split())
-"""Types of the box that such a file begins with."""
+"""Types of the first box of such a file."""
 
 COUNT_AT = {b"stsz": 12, b"stz2": 12, b"trun": 8, b"elst": 8}
-"""Boxes that count samples or edits; the bytes from their type to the number."""
+"""Boxes with a count of samples or edits; offset of the count from their type, bytes."""
 
 COUNTED = re.compile(b"|".join(COUNT_AT))
 
 PACKED = re.compile(b"cmov")
-"""A box with all the others in it, packed as nobody does today."""
+"""An obsolete box that contains all others, compressed."""
 
 MOST_ENTRIES = 2**22
-"""Samples, times edits, that any file may count; a large one may two for each of its bytes."""
+"""Limit of samples times edits; for a large file two per byte."""
 
 
 def mp4_formats(path: Path) -> tuple[str, ...]:
-    """FFmpeg's names for MP4 and MOV if a file is one, by its first bytes; else none.
+    """Return FFmpeg's names of MP4 and MOV if a file is one, by its first bytes; else empty.
 
     Raises
     ------
     InputError
-        If it counts more samples than can be in it.
+        If it counts more samples than it can contain.
     OSError
         If it cannot be read.
     """
@@ -50,13 +50,13 @@ def mp4_formats(path: Path) -> tuple[str, ...]:
 
 
 def _entries(content: mmap.mmap) -> float:
-    """Samples that the boxes count, times their edits."""
+    """Return the number of samples by the boxes, times that of edits."""
     samples, edits = 0, 0
     for start, end in _described(content):
         if any(PACKED.finditer(content, start, end)):
             return float("inf")
         for kind, place in [(m[0], m.start()) for m in COUNTED.finditer(content, start, end)]:
-            # A length of 1 is followed, behind the type, by the true one.
+            # A length of 1 means that the 64-bit length follows the type.
             at = place + COUNT_AT[kind] + 8 * (content[place - 4 : place] == b"\0\0\0\1")
             count = int.from_bytes(content[at : at + 4], "big")
             edits += count * (kind == b"elst")
@@ -65,7 +65,7 @@ def _entries(content: mmap.mmap) -> float:
 
 
 def _described(content: mmap.mmap) -> Iterator[tuple[int, int]]:
-    """Where the outermost boxes begin and end, those with the frames themselves left out."""
+    """Yield start and end of the outermost boxes, except those with frame data."""
     at = 0
     while at + 8 <= len(content):
         length, kind = int.from_bytes(content[at : at + 4], "big"), content[at + 4 : at + 8]

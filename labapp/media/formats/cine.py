@@ -1,4 +1,4 @@
-"""Phantom .cine recordings, from the layout Vision Research publishes ("Cine File Format")."""
+"""Phantom .cine recordings, by the format published by Vision Research ("Cine File Format")."""
 
 from __future__ import annotations
 
@@ -32,27 +32,27 @@ A_CINE = "a Phantom .cine recording, saved uncompressed or packed"
 CINEFILEHEADER = struct.Struct("<2s3HiIiI3I2I")
 BITMAPINFOHEADER = struct.Struct("<I2i2H2I2i2I")
 
-# Fields of SETUP that are used: offset from its start. All its parts are packed to 1 byte.
+# Fields of SETUP that are used: offset from its start, without alignment.
 FRAME_RATE_16, MARK, LENGTH = 0, 140, 142
 FLIP_H, FLIP_V, FRAME_RATE, CFA, ROTATE, REAL_BPP = 756, 760, 768, 808, 884, 896
 SETUP_USED = 900
 
 LEAD, UNINTERPOLATED = 1, 2
-"""Compression of CINEFILEHEADER: lossy JPEG; the raw levels behind a colour filter."""
+"""Compression in CINEFILEHEADER: lossy JPEG; raw levels of a colour filter array."""
 
 PACKED_BITS = {256: 10, 1024: 12}
 """biCompression of packed levels: bits of each."""
 
 TIME_ONLY = 1002
-"""Type of the tagged block that holds a time stamp for every image."""
+"""Type of the tagged block with a time stamp for every image."""
 
 MAX_BLOCKS = 1000
-"""Tagged blocks that are looked through; recordings have two or three."""
+"""Most tagged blocks that are searched; recordings have two or three."""
 
 
 @dataclass(frozen=True)
 class _Format:
-    """How an image is stored; `image_bytes` without padding of the rows."""
+    """Storage format of an image; `image_bytes` is without padding of the rows."""
 
     rows: int
     columns: int
@@ -73,7 +73,7 @@ class _Format:
 
 @dataclass(frozen=True)
 class _Setup:
-    """What is used of the structure SETUP."""
+    """Fields of the structure SETUP that are used."""
 
     length: int
     frame_rate_hz: float | None
@@ -85,13 +85,13 @@ class _Setup:
 class CineSource(StoredFrames):
     """A Phantom recording: 8 and 16 bit, packed 10 and 12 bit, grey, colour or raw Bayer.
 
-    Levels are those of the sensor, in its bits (RealBPP); packed 10 bit levels are made linear
-    with 12 bits by the published table. Times are the recorded time stamps (block 1002).
+    Levels are those of the sensor, with its bits (RealBPP); packed 10 bit levels are converted to
+    linear 12 bit levels by the published table. Times are the recorded time stamps (block 1002).
 
     Raises
     ------
     InputError
-        If it is no such recording or there is no complete frame in it.
+        If it is not such a recording, or has no complete frame.
     """
 
     def __init__(self, path: Path) -> None:
@@ -116,18 +116,18 @@ class CineSource(StoredFrames):
         if time_s is not None and not increasing(time_s[:count]):
             time_s = None
             warnings.append(
-                f"{path.name}: its time stamps do not grow, times follow the frame rate instead"
+                f"{path.name}: its time stamps do not increase; times follow from the frame rate"
             )
         rate = setup.frame_rate_hz
         if rate is None and time_s is not None and count > 1:
             rate = plausible_rate(float(1 / np.median(np.diff(time_s[:count]))))
         if compression == UNINTERPOLATED and setup.filtered:
             warnings.append(
-                f"{path.name} is raw colour (Bayer): its levels are read as grey, unmixed"
+                f"{path.name} is raw colour (Bayer): its levels are read as grey levels"
             )
         if setup.shown_turned:
             warnings.append(
-                f"{path.name} is marked to be shown flipped or turned: it is read as it was stored"
+                f"{path.name} is marked to be shown flipped or rotated: it is read as stored"
             )
         self.warnings = tuple(warnings)
         super().__init__(
@@ -165,12 +165,12 @@ class CineSource(StoredFrames):
 
 @cache
 def _linear_12_bit() -> npt.NDArray[np.uint16]:
-    """Published level with 12 bits, linear, for every level with 10 bits; shape (1024,)."""
+    """Return the published linear 12 bit level of every 10 bit level, shape (1024,)."""
     return np.loadtxt(bundled("resources/formats/cine_10_to_12_bit.txt"), np.uint16)
 
 
 def _decode(content: bytes, form: _Format, stride: int) -> GreyImage:
-    """Grey levels, shape (rows, columns), the first row at the top."""
+    """Decode grey levels, shape (rows, columns), the first row at the top."""
     if form.packed_bits:
         levels = unpack_bits(content, form.packed_bits)[: form.rows * form.columns]
         image: npt.NDArray[np.uint16] = levels.reshape(form.rows, form.columns)
@@ -206,7 +206,7 @@ def _read_format(path: Path, at: int, size: int) -> _Format:
     if bit_count not in ((8, 16) if packed else (8, 16, 24, 48)):
         expected = "16" if packed else "8, 16, 24 or 48"
         raise InputError(path, "biBitCount", bit_count, expected)
-    # Packed images are stored from the top; of the others a negative height says so.
+    # Packed images are stored top-down; others if their height is negative.
     form = _Format(abs(rows), columns, bit_count, packed, packed is not None or rows < 0)
     if form.image_bytes > size:
         raise InputError(
@@ -225,7 +225,7 @@ def _read_setup(path: Path, at: int, size: int) -> _Setup:
     (length,) = struct.unpack_from("<H", content, LENGTH)
 
     def field(offset: int) -> int | None:
-        # SETUP grew with the versions of the camera's software: older ones end earlier.
+        # SETUP is shorter in older versions of the camera's software.
         if offset + 4 > min(length, used):
             return None
         return int(struct.unpack_from("<i", content, offset)[0])
@@ -246,20 +246,20 @@ def _read_setup(path: Path, at: int, size: int) -> _Setup:
 def _read_places(
     path: Path, at: int, claimed: int, size: int, form: _Format
 ) -> tuple[npt.NDArray[np.uint64], int]:
-    """Offset of every complete image, shape (n,), and the number of images there should be."""
+    """Return the offset of every complete image, shape (n,), and the claimed number of images."""
     if claimed == 0:
         raise InputError(path, "ImageCount", 0, "1 frame or more")
     possible = min(claimed, max(size - at, 0) // 8, size // (8 + form.image_bytes))
     places = np.frombuffer(read_bytes(path, at, 8 * possible) if possible else b"", "<u8")
     whole = np.flatnonzero((places > 0) & (places <= max(size - 8 - form.image_bytes, 0)))
     if not len(whole):
-        raise InputError(path, "frames", "not one that is whole", A_CINE)
-    # One in the middle that cannot be right keeps its number; those after the last are cut off.
+        raise InputError(path, "frames", "no complete one", A_CINE)
+    # An invalid offset in the middle keeps its number; those after the last valid one are dropped.
     return places[: whole[-1] + 1], claimed
 
 
 def _read_times(path: Path, at: int, end: int, count: int) -> FloatArray | None:
-    """Time of the images since the first, s, from the tagged blocks in ``at`` … ``end``."""
+    """Read the images' times since the first, s, from the tagged blocks at ``at`` … ``end``."""
     size = file_size(path)
     for _ in range(MAX_BLOCKS):
         if at + 8 > min(end, size):
@@ -269,7 +269,7 @@ def _read_times(path: Path, at: int, end: int, count: int) -> FloatArray | None:
             return None
         if kind == TIME_ONLY and block - 8 >= 8 * count:
             stamps = np.frombuffer(read_bytes(path, at + 8, 8 * count), "<u4").reshape(-1, 2)
-            # TIME64: fractions of 2⁻³² s, whose two lowest bits are flags, and seconds.
+            # TIME64: fraction in 2⁻³² s, whose two lowest bits are flags, and seconds.
             fraction = (stamps[:, 0] & 0xFFFFFFFC).astype(np.float64) / 2**32
             seconds = stamps[:, 1].astype(np.float64)
             elapsed: FloatArray = (seconds - seconds[0]) + (fraction - fraction[0])

@@ -1,4 +1,4 @@
-"""Frames from image files: one picture, or a folder of them."""
+"""Frames from image files: one picture, or a folder of pictures."""
 
 from __future__ import annotations
 
@@ -21,16 +21,16 @@ IMAGE_SUFFIXES = frozenset(
     ".png .bmp .jpg .jpeg .jp2 .webp .pgm .ppm .pbm .pnm .pfm .exr".split()
 ) | set(TIFF_SUFFIXES)
 PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
-AN_IMAGE = f"a whole image of at most {MOST_PIXELS} px: PNG, TIFF, BMP, JPEG, PGM"
+AN_IMAGE = f"a complete image of at most {MOST_PIXELS} px: PNG, TIFF, BMP, JPEG, PGM"
 
 
 class ImageSequence(StoredFrames):
-    """Pictures of one shape, read one at a time.
+    """Pictures of the same shape, read one at a time.
 
     Raises
     ------
     InputError
-        If not one of them can be read.
+        If none of them can be read.
     """
 
     def __init__(self, path: Path, pictures: Sequence[Path]) -> None:
@@ -70,26 +70,26 @@ class ImageSequence(StoredFrames):
 
 
 def images_in(path: Path) -> list[Path]:
-    """The image files in a folder, in natural order (``2.png`` before ``10.png``)."""
+    """Return the image files in a folder, in natural order (``2.png`` before ``10.png``)."""
     return [entry for entry in files_in(path) if entry.suffix.lower() in IMAGE_SUFFIXES]
 
 
 def files_in(path: Path) -> list[Path]:
-    """What is in a folder, in natural order, without hidden files."""
+    """Return the entries of a folder, in natural order, without hidden ones."""
     with os_errors_as_input(path, "folder", "a folder that may be read"):
         entries = [entry for entry in path.iterdir() if not entry.name.startswith(".")]
     return sorted(entries, key=lambda entry: natural_key(entry.name))
 
 
 def read_image(path: Path) -> GreyImage:
-    """Grey levels of one picture in a file, shape (rows, columns).
+    """Read an image file as grey levels, shape (rows, columns).
 
     Raises
     ------
     InputError
-        If it cannot be opened, is no complete image, holds several, or NaN or infinity.
+        If it cannot be opened, is not a complete image, or contains several, NaN or infinity.
     """
-    # Read here rather than by OpenCV: it says why a file cannot be opened.
+    # Not read by OpenCV, for specific errors.
     with os_errors_as_input(path, "file", "a file that may be read"):
         regular_size(path)
         content = path.read_bytes()
@@ -109,7 +109,7 @@ def read_image(path: Path) -> GreyImage:
 
 
 def decoded(content: bytes) -> npt.NDArray[Any] | None:
-    """The picture that an encoded one holds; None if it is damaged, or too large."""
+    """Decode a picture; None if it is damaged or too large."""
     if not content or _is_cut_off(content):
         return None
     try:
@@ -120,7 +120,7 @@ def decoded(content: bytes) -> npt.NDArray[Any] | None:
 
 
 def _is_cut_off(content: bytes) -> bool:
-    """Whether a chunk of a PNG is longer than what is there; OpenCV makes room for all of it."""
+    """Whether a chunk of a PNG exceeds the file, for which OpenCV would allocate memory."""
     at = len(PNG_MAGIC)
     if content[:at] != PNG_MAGIC:
         return False
@@ -130,7 +130,7 @@ def _is_cut_off(content: bytes) -> bool:
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:
-    """Sort key that takes digits as numbers: ``frame2`` before ``frame10``."""
+    """Return a sort key that compares digits as numbers: ``frame2`` before ``frame10``."""
     return [
         (0, int(part), "") if part.isdecimal() else (1, 0, part.casefold())
         for part in re.split(r"(\d+)", name)

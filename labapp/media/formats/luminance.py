@@ -1,4 +1,4 @@
-"""Grey levels of decoded video frames, whatever their pixel format."""
+"""Grey levels of decoded video frames of any pixel format."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ from av.video.frame import VideoFrame
 from labapp.media.base import GreyImage, to_grey
 
 WHOLE_BITS = (8, 9, 10, 12, 14, 16)
-"""Bits of the formats that keep a grey level in a byte or two, in the lowest ones."""
+"""Bits of the formats that store a grey level in the lowest bits of one or two bytes."""
 
 
 def bit_depth_of(frame: VideoFrame) -> int:
-    """Significant bits of the grey levels `grey_of` gives."""
+    """Return the significant bits of the grey levels of `grey_of`."""
     bits = frame.format.components[0].bits
     return bits if _has_luminance(frame) else 8 if bits <= 8 else 16
 
 
 def grey_of(frame: VideoFrame) -> GreyImage:
-    """Grey levels of a decoded frame, shape (rows, columns), turned as the recording says.
+    """Return the grey levels of a decoded frame, shape (rows, columns), rotated by its metadata.
 
-    Grey keeps its levels; of Y′CbCr the luminance is taken and, where it is limited to 16 … 235
-    (ITU-R BT.601), spread over the full range, as it would be in a picture; of colours `to_grey`.
+    Grey levels are unchanged; for Y′CbCr the luminance is used and, if limited to 16 … 235
+    (ITU-R BT.601), expanded to the full range; colours are converted by `to_grey`.
     """
     bits = frame.format.components[0].bits
     if not _has_luminance(frame):
@@ -44,7 +44,7 @@ def grey_of(frame: VideoFrame) -> GreyImage:
 
 
 def _has_luminance(frame: VideoFrame) -> bool:
-    """Whether the first plane holds the grey levels and nothing else."""
+    """Whether the first plane contains the grey levels only."""
     name = frame.format.name
     planar = name.startswith("yuv") and frame.format.is_planar
     grey = name.startswith("gray") and not name.startswith("grayf")
@@ -59,7 +59,7 @@ def _turned(image: GreyImage, rotation_deg: int) -> GreyImage:
 
 @functools.cache
 def _full_range(bits: int) -> npt.NDArray[Any]:
-    """Full-range level of every limited one, shape (2^bits,)."""
+    """Return the full-range level of every limited level, shape (2^bits,)."""
     top = 2**bits - 1
     unit = 2 ** (bits - 8)
     levels: npt.NDArray[Any] = np.rint((np.arange(top + 1) - 16 * unit) * (top / (219 * unit)))

@@ -1,4 +1,4 @@
-"""Frames from NumPy's files: a stack in a .npy, or one in a .npz with its times."""
+"""Frames from NumPy files: a stack in a .npy, or in a .npz with times."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ NPY_MAGIC = b"\x93NUMPY"
 ZIP_MAGIC = b"PK\x03\x04"
 
 A_STACK = "an array of shape (frames, rows, columns) or (frames, rows, columns, 3 or 4)"
-A_NPZ = f"a .npz that holds {A_STACK} named frames"
+A_NPZ = f"a .npz with {A_STACK} named frames"
 
 BIT_DEPTHS = {"bool": 8, "uint8": 8, "uint16": 16}
 
 MAX_HEADER = 2**16
-"""Headers are about a hundred bytes."""
+"""Largest header, bytes; usual are about a hundred."""
 
 NAMED = {"descr": "type"}
 EXPECTED = {
@@ -42,35 +42,35 @@ EXPECTED = {
     "fortran_order": "True or False",
     "shape": A_STACK,
 }
-"""What an entry of the header is called in a message, and what it should be."""
+"""Name of a header entry in messages, and its expected value."""
 
 MOST_HELD = 2**30
-"""A compressed array is held in memory, unpacked: no more bytes than this."""
+"""Largest compressed array, which is decompressed in memory, bytes."""
 
-NOT_HELD = f"at most {MOST_HELD} bytes, or an array saved as it is (numpy.savez)"
+NOT_HELD = f"at most {MOST_HELD} bytes, or an uncompressed array (numpy.savez)"
 
 A_DEFLATED = "an array as numpy.savez or numpy.savez_compressed writes it"
 
 READ_BYTES = 2**20
 
 AS_NUMPY_DOES = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-"""How arrays are kept. Of other kinds zipfile unpacks all it has read at once, without bounds."""
+"""Supported compressions. For others zipfile decompresses without a limit."""
 
 DEFLATE_RATIO = 1032
-"""Largest factor by which Deflate makes data smaller."""
+"""Largest compression ratio of Deflate."""
 
 
 class NumpyStack(StoredFrames):
     """An array (frames, rows, columns), grey, or (frames, rows, columns, 3 or 4), R, G, B, alpha.
 
-    An array that is stored as it is (.npy, and .npz as `numpy.savez` writes it) stays in the
-    file, mapped; a compressed one is held in memory. Booleans become 0 and 255; types other than
-    uint8 and uint16 become float32. A .npz may give ``time_s`` or ``frame_rate_hz``.
+    An uncompressed array (.npy, and .npz by `numpy.savez`) is memory-mapped; a compressed one is
+    loaded. Booleans become 0 and 255; types other than uint8 and uint16 become float32. A .npz may
+    contain ``time_s`` or ``frame_rate_hz``.
 
     Raises
     ------
     InputError
-        If it holds no such array, Python objects, or no complete frame.
+        If it has no such array, Python objects, or no complete frame.
     """
 
     def __init__(self, path: Path, *, archive: bool) -> None:
@@ -98,7 +98,7 @@ class NumpyStack(StoredFrames):
         )
 
     def close(self) -> None:
-        """Release the file, which is mapped as long as its array exists."""
+        """Release the file, which is mapped while its array exists."""
         self._frames = self._frames[:0].copy()
 
     def _grey(self, index: int) -> GreyImage:
@@ -111,10 +111,10 @@ class NumpyStack(StoredFrames):
 
 
 def _header(path: Path, file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Shape, whether it is in Fortran order, and type of the array that begins in ``file``.
+    """Read shape, Fortran order and type of the array at the position of ``file``.
 
-    The header is the text of a Python dict. It is searched rather than evaluated: of a damaged
-    one Python's parser says the most different things.
+    The header is the text of a Python dict. It is searched rather than evaluated, as evaluation of
+    a damaged one can raise many errors.
     """
     head = file.read(12)
     if len(head) < 12 or head[:6] != NPY_MAGIC or head[6] not in (1, 2, 3):
@@ -143,7 +143,7 @@ def _is_stack(path: Path, shape: tuple[int, ...]) -> None:
 
 
 def _map_array(path: Path, file: IO[bytes], start: int, end: int) -> tuple[npt.NDArray[Any], int]:
-    """The complete frames of the array at bytes ``start`` … ``end``, and how many it claims."""
+    """Map the complete frames of the array at bytes ``start`` … ``end``; returns the claim, too."""
     file.seek(start)
     shape, columns_first, kind = _header(path, file)
     _is_stack(path, shape)
@@ -163,7 +163,7 @@ def _map_array(path: Path, file: IO[bytes], start: int, end: int) -> tuple[npt.N
 def _from_archive(
     path: Path,
 ) -> tuple[npt.NDArray[Any], FloatArray | None, float | None]:
-    """Frames, times and frame rate of a .npz."""
+    """Read frames, times and frame rate of a .npz."""
     with path.open("rb") as file:
         try:
             archive = zipfile.ZipFile(file)
@@ -187,7 +187,7 @@ def _from_archive(
                 lambda at, shape: _is_times(at, shape, len(frames)),
             )
             if not increasing(time_s.astype(np.float64)):
-                raise InputError(path, "time_s", "times that do not", _times_of(len(frames)))
+                raise InputError(path, "time_s", "not increasing", _times_of(len(frames)))
             time_s = time_s.astype(np.float64) - float(time_s[0])
             if len(frames) > 1:
                 rate = plausible_rate(float(1 / np.median(np.diff(time_s))))
@@ -209,7 +209,7 @@ def _archived_frames(
             raise InputError(path, "arrays", ", ".join(sorted(members)) or "none", A_NPZ)
         entry = members[stacks[0]]
     if entry.compress_type == zipfile.ZIP_STORED and not entry.flag_bits & 1:
-        # The array follows the member's own header, whose name and extra field vary in length.
+        # The array follows the member's local header, with name and extra field of variable length.
         file.seek(entry.header_offset)
         head = file.read(30)
         if len(head) == 30 and head[:4] == ZIP_MAGIC:
@@ -226,13 +226,13 @@ def _archived_frames(
 
 
 def _check_sum(path: Path, archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> None:
-    """Read a member through: at its end its checksum must fit."""
+    """Read all of a member, by which zipfile verifies its checksum."""
     try:
         with archive.open(entry) as file:
             while file.read(READ_BYTES):
                 pass
     except Exception as error:  # as in `_load`
-        raise InputError(path, entry.filename, error, "a whole array") from error
+        raise InputError(path, entry.filename, error, "a complete array") from error
 
 
 def _is_times(path: Path, shape: tuple[int, ...], count: int) -> None:
@@ -241,8 +241,8 @@ def _is_times(path: Path, shape: tuple[int, ...], count: int) -> None:
 
 
 def _times_of(count: int) -> str:
-    """What times are expected to be."""
-    return f"{count} times that grow, a time for every frame, s"
+    """Describe valid times."""
+    return f"{count} increasing times, one for every frame, s"
 
 
 def _is_one(path: Path, shape: tuple[int, ...]) -> None:
@@ -256,7 +256,7 @@ def _load(
     entry: zipfile.ZipInfo,
     check: Callable[[Path, tuple[int, ...]], None],
 ) -> npt.NDArray[Any]:
-    """Read a member whose shape passes ``check``; nothing larger than it can hold."""
+    """Read a member whose shape passes ``check``, if its size is plausible."""
     try:
         with archive.open(entry) as file:
             shape, columns_first, kind = _header(path, file)
@@ -269,12 +269,12 @@ def _load(
             if needed > MOST_HELD:
                 raise InputError(path, entry.filename, f"{needed} bytes, compressed", NOT_HELD)
             content = file.read(needed)
-            done = len(content) + len(file.read(1))  # to the end, where the checksum is looked at
+            done = len(content) + len(file.read(1))  # up to the end, where the checksum is verified
     except InputError:
         raise
     except Exception as error:
-        # Damage, a password, a compression that is not there: each raises a kind of its own.
-        raise InputError(path, entry.filename, error, "a whole array") from error
+        # Damage, a password or an unsupported compression raise different errors.
+        raise InputError(path, entry.filename, error, "a complete array") from error
     if done != needed:
         raise InputError(path, entry.filename, f"{done} bytes", f"{needed} bytes")
     return np.ndarray(shape, kind, content, order="F" if columns_first else "C")

@@ -1,4 +1,4 @@
-"""Index of a video's packets: built by reading it through, stored for the next opening."""
+"""Index of a video's packets, built by reading the file, and stored for the next opening."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ BoolArray = npt.NDArray[np.bool_]
 MAGIC = b"labapp video index 1\n"
 
 MOST_HEADERS_BYTE = 256
-"""Most bytes between two packets of a file with a video only; more are a missing packet."""
+"""Most bytes between two packets of a file with a single stream; more mean a missing packet."""
 
 MOST_AHEAD = 16
 """Most frames by which a codec's decoding order differs from the display order."""
@@ -45,25 +45,25 @@ class Packets:
     """Packets of a video in file order; n packets."""
 
     placed_by: str
-    """What identifies a packet: its offset in the file ("pos") or a time stamp ("pts", "dts")."""
+    """Identifier of packets: offset in the file ("pos") or a time stamp ("pts", "dts")."""
     place: IntArray
-    """That identifier, shape (n,)."""
+    """Identifier of each packet, shape (n,)."""
     pts: IntArray
     dts: IntArray
-    """Presentation and decoding time stamps, shape (n,), ticks; `UNKNOWN` where there is none."""
+    """Presentation and decoding time stamps, shape (n,), ticks; or `UNKNOWN`."""
     key: BoolArray
     """Whether it is a key frame, shape (n,)."""
     shown: BoolArray
-    """Whether it gives a frame, shape (n,): edited MP4s hold packets that are not shown."""
+    """Whether it yields a frame, shape (n,); edited MP4s contain packets that are not shown."""
     holed: bool = True
-    """Whether there are gaps, by damaged packets. True if in doubt."""
+    """Whether there are gaps from damaged packets. True if in doubt."""
 
     def __len__(self) -> int:
         return len(self.place)
 
     @classmethod
     def read(cls, packets: Iterable[Packet[Any]], file_byte: int) -> Self:
-        """Packets as read; no more of them than the file has bytes for."""
+        """Create from packets as read, limited by the size of the file."""
         rows = []
         ends = []
         byte = 0
@@ -92,16 +92,15 @@ class Packets:
     def listed(
         cls, entries: Sequence[IndexEntry], stream: int, claimed: int, path: Path
     ) -> Self | None:
-        """Packets by the index at the end of an AVI, without reading them.
+        """Create from the index at the end of an AVI, without reading the packets.
 
-        Every chunk that it names must be in the file, in their order and hardly anything else
-        between them; after the last nothing but the index; and there must be as many as the header
-        claims.
+        All chunks of the index must be in the file, in order and without large gaps, followed by
+        the index only; and their number must be that in the header.
 
         Returns
         -------
         Packets or None
-            None if the index does not fit the file, which must then be read through.
+            None if the index does not match the file, which must then be read.
         """
         if not entries or len(entries) != claimed:
             return None
@@ -128,11 +127,11 @@ class Packets:
         return cls("pos", place + 8, stamp, stamp, key, np.ones(len(shown), bool))
 
     def completed(self, entries: Iterable[IndexEntry], file_byte: int) -> Self:
-        """Packets completed by the index at the end of an AVI; unchanged if it contradicts them.
+        """Complete with the index at the end of an AVI; unchanged if it contradicts the packets.
 
-        Reading counts packets and may stop at a damaged one; the index knows them all.
+        Reading may stop at a damaged packet; the index lists all of them.
         """
-        # The index says where a chunk is, a packet where what is in it is.
+        # The index has the offset of a chunk, a packet that of its content.
         rows = [
             (entry.pos + 8, entry.timestamp, entry.is_keyframe)
             for entry in entries
@@ -144,12 +143,12 @@ class Packets:
         return type(self)("pos", place, stamp, stamp, key > 0, np.ones(len(place), bool))
 
     def without_last(self) -> Self:
-        """Packets without the last in the file."""
+        """Return the packets without the last one in the file."""
         names = ("place", "pts", "dts", "key", "shown")
         return dataclasses.replace(self, **{name: getattr(self, name)[:-1] for name in names})
 
     def with_keys(self, key: BoolArray) -> Self:
-        """Packets with other key frames."""
+        """Return the packets with other key frames."""
         return dataclasses.replace(self, key=key)
 
     def stamps_differ(self) -> bool:
@@ -158,7 +157,7 @@ class Packets:
 
 
 def _chunk(file: BinaryIO, at: int) -> tuple[bytes, int, int]:
-    """Name, size and end of the chunk at an offset of an AVI."""
+    """Read name, size and end of the chunk at an offset of an AVI."""
     file.seek(at)
     head = file.read(8)
     size = int.from_bytes(head[4:], "little")
@@ -170,12 +169,12 @@ def _differ(values: IntArray) -> bool:
 
 
 def number_by_order(packets: Packets) -> IntArray:
-    """Frame number of each packet, shape (n,), for codecs without reordering; −1: none."""
+    """Return the frame number of each packet, shape (n,), without reordering; −1: none."""
     return np.where(packets.shown, np.cumsum(packets.shown) - 1, -1)
 
 
 def number_by_stamp(packets: Packets) -> IntArray:
-    """Frame number of each packet, shape (n,), in the order of their stamps; −1: none."""
+    """Return the frame number of each packet, shape (n,), in order of time stamps; −1: none."""
     number = np.full(len(packets), -1, np.int64)
     order = np.argsort(packets.pts)
     order = order[packets.shown[order]]
@@ -190,9 +189,9 @@ class Timing:
     tick_s: float
     """Unit of the time stamps, s."""
     rate_hz: float | None
-    """Average frame rate; None where unknown."""
+    """Average frame rate; None if unknown."""
     claimed: int
-    """Number of frames; 0 where unknown."""
+    """Number of frames; 0 if unknown."""
     stamped: bool
     """Whether presentation time stamps are reliable."""
     from_0: bool
@@ -201,7 +200,7 @@ class Timing:
 
 @dataclass(frozen=True)
 class PacketTable(ReadOnlyArrays):
-    """Index by which any frame of a video is found."""
+    """Index for random access to the frames of a video."""
 
     placed_by: str
     place: IntArray
@@ -212,23 +211,23 @@ class PacketTable(ReadOnlyArrays):
     number: IntArray
     """Frame number of each packet, shape (n,); −1: none."""
     time_s: FloatArray
-    """Time of each frame since the first, shape (frames,), s; NaN where there is no time base."""
+    """Time of each frame since the first, shape (frames,), s; NaN without a time base."""
     frame_rate_hz: float | None
     shape: tuple[int, int] = (0, 0)
     bit_depth: int = 8
     description: str = ""
     warnings: tuple[str, ...] = ()
-    """As of a `FrameSource`."""
+    """As in `FrameSource`."""
     seekable: bool = True
     """Whether seeking is reliable."""
     slice_crc: bool = False
-    """Whether packets carry checksums, as FFV1's may."""
+    """Whether packets have checksums, as FFV1's may."""
 
     @classmethod
     def build(cls, packets: Packets, number: IntArray, timing: Timing, name: str) -> Self:
-        """Build the index: number of every packet's frame, and time of every frame.
+        """Build the index: frame number of every packet, and time of every frame.
 
-        ``number`` is the frame of each packet, shape (n,), were no packet missing.
+        ``number`` is the frame number of each packet, shape (n,), if no packet were missing.
         """
         shown = number >= 0
         stamp_s = np.full(int(number.max(initial=-1)) + 1, np.nan)
@@ -240,7 +239,7 @@ class PacketTable(ReadOnlyArrays):
         place = _places(elapsed_s, timing, packets)
         number = np.where(shown, place[number], -1)
         time_s = _times(elapsed_s, place, timing)
-        # Fewer frames over the whole time are a varying rate, not an early end.
+        # Fewer frames over the whole duration mean a varying rate, not an early end.
         last = np.nan_to_num(elapsed_s[-1] * (timing.rate_hz or 0), nan=-1.0)
         early = max(len(time_s), round(last) + 1) < timing.claimed
         key = packets.key & (number >= 0)
@@ -254,24 +253,24 @@ class PacketTable(ReadOnlyArrays):
             timing.rate_hz,
             warnings=(
                 f"{name} ends early: its header says {timing.claimed} frames, "
-                f"{len(elapsed_s)} of them whole",
+                f"{len(elapsed_s)} of them complete",
             )
             * early,
         )
 
     def seek_stamps(self, packet: int) -> list[int]:
-        """Time stamps to seek to for a key packet, the likeliest first; empty: read from 0."""
+        """Return time stamps for seeking to a key packet, the best first; empty: read from 0."""
         if not self.seekable or packet == 0:
             return []
         stamps = self.seek[np.count_nonzero(self.key[:packet])].tolist()
         return [stamp for stamp in dict.fromkeys(stamps) if stamp != UNKNOWN]
 
     def without_seeking(self) -> Self:
-        """Index by which every frame is decoded from the start."""
+        """Return the index with seeking disabled."""
         return dataclasses.replace(self, seekable=False)
 
     def to_bytes(self, fingerprint: tuple[int, int]) -> bytes:
-        """Serialise, for the file with this fingerprint."""
+        """Serialise for the file with this fingerprint."""
         buffer = io.BytesIO()
         values = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         arrays = {k: v for k, v in values.items() if isinstance(v, np.ndarray)}
@@ -284,7 +283,7 @@ class PacketTable(ReadOnlyArrays):
 
     @classmethod
     def from_bytes(cls, content: bytes, fingerprint: tuple[int, int]) -> Self | None:
-        """Inverse of `to_bytes`; None if damaged, forged or of another file."""
+        """Deserialise the result of `to_bytes`; None if damaged, forged or of another file."""
         head = len(MAGIC)
         body = content[head + 4 :]
         if content[:head] != MAGIC or content[head : head + 4] != zlib.crc32(body).to_bytes(
@@ -295,7 +294,7 @@ class PacketTable(ReadOnlyArrays):
             table = cls._read(body, fingerprint)
             return table if table is not None and _is_as_built(table) else None
         except Exception:
-            return None  # of what was forged NumPy, zipfile and json say the most different things
+            return None  # forged content can raise many errors in NumPy, zipfile and json
 
     @classmethod
     def _read(cls, body: bytes, fingerprint: tuple[int, int]) -> Self | None:
@@ -307,14 +306,14 @@ class PacketTable(ReadOnlyArrays):
         others["shape"] = tuple(others["shape"])
         others["warnings"] = tuple(others["warnings"])
         with np.load(io.BytesIO(content[end:]), allow_pickle=False) as arrays:
-            # What is stored as it is cannot be more than there is.
+            # Uncompressed members cannot exceed the available bytes.
             if any(entry.compress_type != zipfile.ZIP_STORED for entry in arrays.zip.infolist()):
                 return None
             return cls(**others, **{name: arrays[name] for name in ARRAYS})
 
 
 def _is_as_built(table: Any) -> bool:
-    """Whether an index is valid: that of a session may be forged."""
+    """Whether an index is valid, as that of a session may be forged."""
     packets, frames = table.place.shape, table.time_s.shape
     shapes = (packets, packets, (np.count_nonzero(table.key), 2), packets, frames)
     arrays = [getattr(table, name) for name in ARRAYS]
@@ -334,10 +333,11 @@ def _is_as_built(table: Any) -> bool:
 
 
 def _places(elapsed_s: FloatArray, timing: Timing, packets: Packets) -> IntArray:
-    """Number of each frame, shape (n,), with missing frames counted where time stamps show them.
+    """Return the number of each frame, shape (n,), counting missing frames shown by time stamps.
 
-    They do if all are multiples of the interval and the last is where the header claims. If the
-    file has no gaps, and those of time are not near a cut end, the camera left the frames out.
+    Time stamps show them if all are multiples of the interval, and the last one is that claimed by
+    the header. If the file has no gaps, and gaps in time are not near a truncated end, the camera
+    omitted the frames, which are not counted.
     """
     plain = np.arange(len(elapsed_s))
     missing = len(plain) < timing.claimed <= 2 * len(plain)
@@ -352,12 +352,12 @@ def _places(elapsed_s: FloatArray, timing: Timing, packets: Packets) -> IntArray
 
 
 def _times(elapsed_s: FloatArray, place: IntArray, timing: Timing) -> FloatArray:
-    """Time of each frame since the first, shape (frames,), s."""
+    """Return the time of each frame since the first, shape (frames,), s."""
     if timing.rate_hz is None:
         since_first: FloatArray = elapsed_s - elapsed_s[0]
         return since_first
     regular: FloatArray = np.arange(place[-1] + 1) / timing.rate_hz
-    # Containers round stamps to ticks (Matroska: 1 ms); what is further off was at another time.
+    # Containers round stamps to ticks (Matroska: 1 ms); larger deviations are real.
     if (np.abs(elapsed_s - regular[place]) > 1.5 * timing.tick_s).any():
         regular[place] = elapsed_s
     return regular

@@ -1,4 +1,4 @@
-"""Photron recordings: levels in a .mraw, beside it a .cihx (XML) or .cih (text) header."""
+"""Photron recordings: a .mraw with grey levels, and a .cihx (XML) or .cih (text) header."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ HEADER_SUFFIXES = (".cihx", ".cih")
 PHOTRON_SUFFIXES = frozenset({".mraw", *HEADER_SUFFIXES})
 
 MAX_HEADER_BYTES = 16 * 2**20
-"""Headers are a few kilobytes; a longer file of that name is none."""
+"""Largest header; usual are a few kilobytes."""
 
 MAX_SIDE = 2**16
-"""More rows or columns than any camera has."""
+"""Most rows or columns, more than of any camera."""
 
 FIELDS = {
     "rate": ("recordInfo/recordRate", "Record Rate(fps)"),
@@ -40,18 +40,18 @@ FIELDS = {
     "format": ("imageFileInfo/fileFormat", "File Format"),
     "step": ("frameInfo/skipFrame", "Save Step"),
 }
-"""Where a field stands: path in the XML, key in the text."""
+"""Location of a field: path in the XML, key in the text."""
 
 
 @dataclass(frozen=True)
 class _Header:
-    """Fields of a header; errors name them as in the file."""
+    """Fields of a header; errors have their names in the file."""
 
     path: Path
     texts: dict[str, str]
 
     def name(self, field: str) -> str:
-        """Name of ``field`` in the file."""
+        """Return the name of a field in the file."""
         xml, text = FIELDS[field]
         return xml if self.path.suffix.lower() == ".cihx" else text
 
@@ -59,9 +59,9 @@ class _Header:
         return InputError(self.path, self.name(field), self.texts.get(field) or "missing", expected)
 
     def integer(self, field: str, low: int, high: int) -> int:
-        """Integer in ``low`` … ``high``."""
+        """Parse an integer in ``low`` … ``high``."""
         text = self.texts.get(field, "")
-        # Not longer than any number in range: int() takes its time with thousands of digits.
+        # The length is checked, as int() is slow with thousands of digits.
         if text.isascii() and text.isdigit() and len(text) < 20 and low <= int(text) <= high:
             return int(text)
         raise self.wrong(field, f"a whole number, {low} to {high}")
@@ -76,19 +76,19 @@ class _Header:
 class PhotronSource(StoredFrames):
     """A Photron recording: 8 and 16 bit, packed 10 and 12 bit, grey or colour (R, G, B).
 
-    Levels are the effective bits (EffectiveBit Depth): those of a recording whose effective bits
-    are the higher ones (EffectiveBit Side) are shifted down.
+    Levels have the effective bits (EffectiveBit Depth); if these are the higher ones (EffectiveBit
+    Side), levels are shifted down.
 
     Parameters
     ----------
     path
-        The .mraw or its header; the other of the two is found beside it under the same name.
+        The .mraw or its header; the other file has the same name in the same folder.
 
     Raises
     ------
     InputError
-        If the other file is missing or one of two, the header does not say what is needed, or
-        there is no complete frame.
+        If the other file is missing or ambiguous, the header is incomplete, or there is no complete
+        frame.
     """
 
     def __init__(self, path: Path) -> None:
@@ -113,22 +113,22 @@ class PhotronSource(StoredFrames):
         claimed = header.integer("frames", 1, 2**40)
         self._frame_bytes, rest = divmod(rows * columns * bits, 8)
         if rest:
-            raise header.wrong("columns", f"columns that make whole bytes of {bits} bit levels")
+            raise header.wrong("columns", f"rows of {bits} bit levels that fill whole bytes")
         whole = min(claimed, file_size(self._raw) // self._frame_bytes)
         if whole < 1:
             raise InputError(
                 self._raw,
                 "size",
                 f"{file_size(self._raw)} bytes",
-                f"{self._frame_bytes} bytes or more: one whole frame",
+                f"{self._frame_bytes} bytes or more: one complete frame",
             )
         warnings = [*ends_early(self._raw.name, claimed, whole)]
         if header.rate() is None:
-            warnings.append(f"{header_path.name} gives no record rate: its frames have no time")
+            warnings.append(f"{header_path.name} has no record rate: its frames have no time")
         if header.texts.get("step", "1") not in ("", "0", "1"):
             warnings.append(
-                f"{header_path.name} says that not every frame was saved "
-                f"({header.name('step')} {header.texts['step']}): times follow the record rate"
+                f"{header_path.name}: not every frame was saved "
+                f"({header.name('step')} {header.texts['step']}): times follow from the record rate"
             )
         self.warnings = tuple(warnings)
         super().__init__(
@@ -156,7 +156,7 @@ class PhotronSource(StoredFrames):
 
 
 def _pair(path: Path) -> tuple[Path, Path]:
-    """The .mraw and its header, one of which is ``path``."""
+    """Return the .mraw and its header, one of which is ``path``."""
     suffix = path.suffix.lower()
     looked_for = HEADER_SUFFIXES if suffix == ".mraw" else (".mraw",)
     with os_errors_as_input(path.parent, "folder", "a folder to read"):
@@ -188,7 +188,7 @@ def _from_xml(path: Path, content: bytes) -> dict[str, str]:
     start, end = content.find(b"<cih>"), content.rfind(b"</cih>")
     if start < 0 or end < start:
         raise InputError(path, "content", "no <cih> … </cih>", "a Photron .cihx header")
-    # Texts may be in the code page of the camera's computer; no field that is used is.
+    # Other fields may be in another encoding.
     text = content[start : end + len(b"</cih>")].decode("utf-8", "replace").replace("\0", "")
     try:
         root = ET.fromstring(text)

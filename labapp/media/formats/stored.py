@@ -1,4 +1,4 @@
-"""Base of readers whose frames lie at known offsets in a file."""
+"""Base class of readers whose frames are at known offsets in a file."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class StoredFrames(FrameSource):
     Parameters
     ----------
     kind
-        Begin of the description: "Phantom cine".
+        Start of the description: "Phantom cine".
     count
         Number of frames, at least 1.
     shape
@@ -31,7 +31,7 @@ class StoredFrames(FrameSource):
     bit_depth
         Significant bits of a grey level.
     frame_rate_hz
-        Frame rate, Hz; None where unknown.
+        Frame rate, Hz; None if unknown.
     time_s
         Time of every frame since the first, shape (count,), s; None: from the frame rate.
 
@@ -89,20 +89,20 @@ class StoredFrames(FrameSource):
 
 
 def too_large(path: Path, rows: int, columns: int) -> InputError:
-    """Error for a frame of more than `MOST_PIXELS` pixels."""
+    """Return the error for a frame of more than `MOST_PIXELS` pixels."""
     size = f"{columns}×{rows} px"
     return InputError(path, "frame size", size, f"at most {MOST_PIXELS} px in a frame")
 
 
 def ends_early(name: str, claimed: int, whole: int) -> tuple[str, ...]:
-    """Warning for a recording with fewer complete frames than its header claims; else empty."""
+    """Return a warning if a recording has fewer complete frames than its header claims."""
     if whole >= claimed:
         return ()
-    return (f"{name} ends early: its header says {claimed} frames, {whole} of them whole",)
+    return (f"{name} ends early: its header says {claimed} frames, {whole} of them complete",)
 
 
 def plausible_rate(value: float) -> float | None:
-    """``value`` as a frame rate, Hz; None where it cannot be one."""
+    """Return ``value`` as a frame rate, Hz; None if it is not plausible."""
     return float(value) if np.isfinite(value) and 0 < value < 1e12 else None
 
 
@@ -119,7 +119,7 @@ def finite(path: Path, image: GreyImage) -> GreyImage:
 
 
 def regular_size(path: Path) -> int:
-    """Size of a regular file, bytes; a device has no end, and a pipe would block.
+    """Return the size of a regular file, bytes; devices and pipes would block.
 
     Raises
     ------
@@ -133,12 +133,12 @@ def regular_size(path: Path) -> int:
     if stat.S_ISDIR(found.st_mode):
         raise IsADirectoryError(errno.EISDIR, "is a folder")
     if not stat.S_ISREG(found.st_mode):
-        raise OSError(errno.EINVAL, "a device or a pipe, no file")
+        raise OSError(errno.EINVAL, "a device or a pipe, not a file")
     return found.st_size
 
 
 def file_size(path: Path) -> int:
-    """Size of a regular file, bytes.
+    """Return the size of a regular file, bytes.
 
     Raises
     ------
@@ -157,7 +157,7 @@ def read_bytes(path: Path, offset: int, size: int) -> bytes:
     Raises
     ------
     InputError
-        If the file cannot be opened or has not that many.
+        If the file cannot be opened or is too short.
     """
     try:
         with path.open("rb") as file:
@@ -173,21 +173,21 @@ def read_bytes(path: Path, offset: int, size: int) -> bytes:
 
 
 def unpack_bits(packed: bytes, bits: int) -> npt.NDArray[np.uint16]:
-    """Unpack levels of ``bits`` bits stored one after the other, the highest bit first.
+    """Unpack levels of ``bits`` bits, stored without gaps, the highest bit first.
 
     Parameters
     ----------
     packed
-        n levels in n·bits/8 bytes; bits too few for one more level are left out.
+        n levels in n·bits/8 bytes; remaining bits are ignored.
     bits
         1 … 16.
 
     Returns
     -------
-    Shape (n,).
+    Levels, shape (n,).
     """
     content = np.frombuffer(packed, np.uint8)
-    if bits == 12:  # By far the most frequent: three bytes hold two levels.
+    if bits == 12:  # Fast path for the most frequent case: three bytes are two levels.
         triples = content[: len(content) // 3 * 3].reshape(-1, 3).astype(np.uint16)
         pairs: npt.NDArray[np.uint16] = np.empty((len(triples), 2), np.uint16)
         pairs[:, 0] = triples[:, 0] << 4 | triples[:, 1] >> 4

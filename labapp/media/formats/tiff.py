@@ -1,4 +1,4 @@
-"""Frames from TIFF files: each page is one, or each picture of a stack without pages."""
+"""Frames from TIFF files: pages, or the pictures of a stack in one page."""
 
 from __future__ import annotations
 
@@ -38,30 +38,30 @@ if TYPE_CHECKING:
 TIFF_MAGICS = (b"II*\0", b"MM\0*", b"II+\0", b"MM\0+")
 TIFF_SUFFIXES = frozenset({".tif", ".tiff"})
 
-A_TIFF = "a whole image: TIFF, uncompressed or with Deflate, LZW, PackBits or JPEG"
+A_TIFF = "a complete image: TIFF, uncompressed or with Deflate, LZW, PackBits or JPEG"
 
 MOST_BITS = 64 * MOST_PIXELS
-"""Of a page, unpacked: four samples of 16 bit a pixel."""
+"""Largest decompressed page: four samples of 16 bit per pixel."""
 
 MAX_RATIO = 2000
-"""No compression that is read makes a picture more times smaller than this."""
+"""Largest compression ratio of the supported compressions."""
 
 UNPACKERS: dict[int, Callable[[], Any]] = {
     8: zlib.decompressobj,
     32946: zlib.decompressobj,
     34925: lzma.LZMADecompressor,
 }
-"""By compression: Deflate and LZMA, which tifffile unpacks without a bound."""
+"""Decompressors of Deflate and LZMA, which tifffile decompresses without a limit."""
 
 BY_TIFFFILE = {1, *UNPACKERS}
-"""Compressions decoded by tifffile; others, which it may unpack without a bound, by OpenCV."""
+"""Compressions decoded by tifffile; others, which it may not limit, by OpenCV."""
 
 MIN_IS_WHITE, MIN_IS_BLACK, RGB, COLOUR_FILTER = 0, 1, 2, 32803
-"""Photometric interpretations whose levels are read as they are; others go through OpenCV."""
+"""Photometric interpretations whose levels are read directly; others are decoded by OpenCV."""
 
 SECONDS = {"s": 1.0, "sec": 1.0, "ms": 1e-3, "msec": 1e-3, "µs": 1e-6, "us": 1e-6, "min": 60.0}
 
-# tifffile logs what it finds wrong; the errors and warnings here say it to the user.
+# Problems are reported by errors and warnings of this module instead of tifffile's log.
 logging.getLogger("tifffile").addHandler(logging.NullHandler())
 
 Result = TypeVar("Result")
@@ -70,20 +70,20 @@ Result = TypeVar("Result")
 class TiffStack(StoredFrames):
     """The pages of a TIFF file, or the pictures that one page describes (ImageJ, large stacks).
 
-    Page k is found through the chain of directories, without decoding those before it. What
-    tifffile cannot decode by itself goes to OpenCV. A frame interval comes from ImageJ's
-    ``finterval`` or ``fps``, or from OME's ``TimeIncrement`` or ``DeltaT``.
+    Page k is found through the chain of directories, without decoding the previous pages. Pages
+    that tifffile cannot decode are decoded by OpenCV. The frame interval is ImageJ's ``finterval``
+    or ``fps``, or OME's ``TimeIncrement`` or ``DeltaT``.
 
     Raises
     ------
     InputError
-        If not one page can be read.
+        If no page can be read.
     """
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._size = file_size(path)
-        import tifffile  # not needed by the usual recordings
+        import tifffile  # imported on use, as most recordings do not need it
 
         self._tiff = _guarded(path, lambda: tifffile.TiffFile(path, is_ome=False))
         try:
@@ -108,7 +108,7 @@ class TiffStack(StoredFrames):
             if described > count:
                 self.warnings = ends_early(path.name, described, count)
             elif count < pages or self._names_another(count):
-                self.warnings = (f"{path.name} ends early: {count} of its pages are whole",)
+                self.warnings = (f"{path.name} ends early: {count} of its pages are complete",)
         page, image = self._first_whole(count)
         rate, time_s = _time_base(self._tiff, count)
         super().__init__(
@@ -123,11 +123,11 @@ class TiffStack(StoredFrames):
         )
 
     def reopen(self) -> Self:
-        """Open the same file once more."""
+        """Open the same file again."""
         return type(self)(self._path)
 
     def close(self) -> None:
-        """Close the file. Closing twice does no harm."""
+        """Close the file. May be called twice."""
         self._tiff.close()
 
     def _first_whole(self, count: int) -> tuple[tifffile.TiffPage, GreyImage]:
@@ -178,11 +178,11 @@ class TiffStack(StoredFrames):
             )
         grey = to_grey(np.asarray(images[0]))
         if 8 < page.bitspersample < 16 and grey.dtype == np.uint16:
-            grey = grey >> (16 - page.bitspersample)  # OpenCV fills the higher bits.
+            grey = grey >> (16 - page.bitspersample)  # OpenCV uses the higher bits.
         return grey
 
     def _whole_pages(self, pages: int) -> int:
-        """Number of pages without those cut off at the end."""
+        """Return the number of pages without truncated ones at the end."""
         for count in range(pages, 1, -1):
             with contextlib.suppress(InputError):
                 page = self._page(count - 1)
@@ -191,7 +191,7 @@ class TiffStack(StoredFrames):
         return 1
 
     def _names_another(self, pages: int) -> bool:
-        """Whether the last directory refers to another, which is not in the file."""
+        """Whether the last directory refers to another one, which is missing."""
         last = self._page(pages - 1)
         tiff = self._tiff.tiff
         end = last.offset + tiff.tagnosize + len(last.tags) * tiff.tagsize
@@ -201,7 +201,7 @@ class TiffStack(StoredFrames):
 
 
 def _guarded(path: Path, read: Callable[[], Result]) -> Result:
-    """Result of ``read``; any error of tifffile on a damaged file becomes an `InputError`."""
+    """Call ``read``, and convert any error of tifffile to an `InputError`."""
     try:
         return read()
     except InputError:
@@ -210,7 +210,7 @@ def _guarded(path: Path, read: Callable[[], Result]) -> Result:
         reason = error.strerror or error
         raise InputError(path, "file", reason, "a file that may be read") from error
     except Exception as error:
-        # Its readers of tags raise nearly every kind of error, none of them by contract.
+        # tifffile raises nearly every kind of error for damaged tags.
         raise InputError(path, "content", "cannot be decoded", A_TIFF) from error
 
 
@@ -219,13 +219,13 @@ def _page_of(tiff: tifffile.TiffFile, number: int) -> tifffile.TiffPage:
 
 
 def _end(page: tifffile.TiffPage) -> int:
-    """First byte after the data of a page; 0 where it has none."""
+    """Return the offset after the data of a page; 0 if it has none."""
     parts = zip(page.dataoffsets, page.databytecounts, strict=False)
     return max((at + count for at, count in parts), default=0)
 
 
 def _described_frames(tiff: tifffile.TiffFile) -> int:
-    """Number of pictures by the first page's metadata; 0 where unknown."""
+    """Return the number of pictures in the first page's metadata; 0 if unknown."""
     page = _page_of(tiff, 0)
     if tiff.is_imagej:
         return int((tiff.imagej_metadata or {}).get("images", 0))
@@ -238,7 +238,7 @@ def _described_frames(tiff: tifffile.TiffFile) -> int:
 def _read_page(
     path: Path, page: tifffile.TiffPage, size: int, offset: int | None
 ) -> GreyImage | None:
-    """Grey levels of a page, or of the picture at ``offset``; None if tifffile cannot read it."""
+    """Read a page, or the picture at ``offset``, as grey levels; None if tifffile cannot."""
     _check_room(path, page, size)
     if page.photometric not in (MIN_IS_WHITE, MIN_IS_BLACK, RGB, COLOUR_FILTER):
         return None
@@ -274,17 +274,17 @@ def _check_room(path: Path, page: tifffile.TiffPage, size: int) -> None:
 
 
 def _check_unpacked(path: Path, page: tifffile.TiffPage) -> None:
-    """Raise if strips or tiles unpack to more than they should hold."""
+    """Raise if strips or tiles decompress to more than their size."""
     if (unpacker := UNPACKERS.get(page.compression)) is None:
         return
     most = math.prod(page.chunks) * -(-page.bitspersample // 8)
     for at, count in zip(page.dataoffsets, page.databytecounts, strict=False):
         if len(unpacker().decompress(read_bytes(path, at, count), most + 1)) > most:
-            raise InputError(path, "content", "more than its pages hold", A_TIFF)
+            raise InputError(path, "content", "more data than its pages need", A_TIFF)
 
 
 def _samples(path: Path, page: tifffile.TiffPage, offset: int | None) -> npt.NDArray[Any] | None:
-    """Samples as tifffile orders them: (planes, depth, rows, columns, samples)."""
+    """Read samples in tifffile's order: (planes, depth, rows, columns, samples)."""
     if page.dtype is None or page.compression not in BY_TIFFFILE:
         return None
     if offset is not None:
@@ -295,14 +295,14 @@ def _samples(path: Path, page: tifffile.TiffPage, offset: int | None) -> npt.NDA
             return page.asarray(squeeze=False, maxworkers=1).reshape(page.shaped)
         except Exception as error:
             if isinstance(error, ImportError) or "imagecodecs" in str(error):
-                return None  # It has no decoder for this compression.
+                return None  # no decoder for this compression
             raise
     plain = page.compression == 1 and page.fillorder == 1 and not page.is_tiled
     return _unpack_rows(path, page) if plain and page.samplesperpixel == 1 else None
 
 
 def _unpack_rows(path: Path, page: tifffile.TiffPage) -> npt.NDArray[np.uint16]:
-    """Levels of an uncompressed page with 9 … 15 bits each; every row begins with a new byte."""
+    """Unpack an uncompressed page with 9 … 15 bits per level and byte-aligned rows."""
     row = -(-page.imagewidth * page.bitspersample // 8)
     content = b"".join(
         read_bytes(path, at, count)
@@ -314,7 +314,7 @@ def _unpack_rows(path: Path, page: tifffile.TiffPage) -> npt.NDArray[np.uint16]:
 
 
 def _to_levels(image: npt.NDArray[Any], page: tifffile.TiffPage) -> GreyImage:
-    """Grey levels of samples, shape (rows, columns, samples)."""
+    """Convert samples, shape (rows, columns, samples), to grey levels."""
     if image.dtype == bool:
         image = image.astype(np.uint8) * np.uint8(255)
     image = image.astype(image.dtype.newbyteorder("="), copy=False)
@@ -331,7 +331,7 @@ def _bit_depth(page: tifffile.TiffPage, image: GreyImage) -> int:
 
 
 def _time_base(tiff: tifffile.TiffFile, count: int) -> tuple[float | None, FloatArray | None]:
-    """Frame rate, Hz, and times of the frames, s, as far as the metadata give them."""
+    """Return frame rate, Hz, and times of the frames, s, from the metadata; None if unknown."""
     metadata = tiff.imagej_metadata or {} if tiff.is_imagej else {}
     interval = _seconds(metadata.get("finterval"), str(metadata.get("tunit", "s")))
     if interval is not None:
@@ -369,7 +369,7 @@ def _ome_time_base(description: str, count: int) -> tuple[float | None, FloatArr
 
 
 def _seconds(value: object, unit: str) -> float | None:
-    """Positive time in s; None where invalid."""
+    """Return a positive time in s; None if invalid."""
     number = _number(value)
     scale = SECONDS.get(unit.replace("\\u00B5", "µ"))
     return None if number is None or scale is None or number <= 0 else number * scale

@@ -37,13 +37,13 @@ from labapp.media.formats.packets import (
 from labapp.pixels import most_decoded
 
 NEAR_PACKETS = 8
-"""The next key frame is reached by decoding when it is no further than this, else by seeking."""
+"""Largest distance of a key frame that is reached by decoding rather than by seeking."""
 
 DAMAGED_READS = 50
-"""More failures than this to read a packet, one after the other, are the end."""
+"""Number of consecutive failures to read a packet that counts as the end of the file."""
 
 READ_S = 8.0
-"""No one step of opening or reading takes longer, s: a damaged table can send FFmpeg astray."""
+"""Timeout of each step of opening and reading, s, as FFmpeg can hang on a damaged table."""
 
 CONTAINERS = {
     "avi": "AVI",
@@ -61,7 +61,7 @@ CONTAINERS = {
     "ivf": "IVF",
     "yuv4mpegpipe": "Y4M",
 }
-"""What is opened besides MP4, by FFmpeg's names. No playlists (they name other files), no text."""
+"""Supported containers besides MP4, by FFmpeg's names; no playlists, which refer to other files."""
 
 CODECS = {
     "mjpeg": "MJPG",
@@ -74,40 +74,40 @@ CODECS = {
 A_VIDEO = "a video that FFmpeg can decode: AVI, MKV or MP4 with FFV1, MJPG, H.264 or raw frames"
 
 SEEK_WARNING = (
-    "{name} does not allow to seek exactly, so every frame is decoded from the start: right, but "
-    "slow; re-encode it as FFV1 or MJPG to move through it quickly"
+    "{name} does not support exact seeking, so every frame is decoded from the start: correct, but "
+    "slow; re-encode it as FFV1 or MJPG for fast access"
 )
 
 
 class VideoSource(FrameSource):
-    """A video with an index of all packets, so that any frame is found exactly.
+    """A video with an index of all packets, for exact random access.
 
-    The file is read through once without decoding, unless it is an AVI whose index fits it: where
-    each packet is, which are key frames, and which frame, in the order they are shown, comes of
-    each. A packet is given its place in that table as its time stamp before it is decoded; the
-    frame that comes out carries it, so a frame is known for certain wherever reading began. Only
-    where the container keeps neither the order frames are shown in nor which are key frames (H.264
-    in AVI; an AVI cut before its index) is everything decoded once to learn them.
+    Unless it is an AVI with a matching index, the file is read once without decoding, to determine
+    offset, key frame flag and frame number, in display order, of each packet. Before decoding, the
+    time stamp of a packet is replaced by its index in the table; the decoded frame has the same
+    stamp, so that its number is certain wherever reading began. Only if the container has neither
+    display order nor key frame flags (H.264 in AVI; an AVI truncated before its index), everything
+    is decoded once to determine them.
 
-    A frame that cannot be decoded completely is refused, and so are those that build on it.
+    Frames that cannot be decoded completely, and frames that depend on them, are errors.
 
     Parameters
     ----------
     index
-        `index` of an earlier source, to open the file without reading it through.
+        `index` of an earlier source, to open the file without reading all of it.
 
     Raises
     ------
     InputError
-        If there is no complete frame in it.
+        If it has no complete frame.
     """
 
     _shown: tuple[int, VideoFrame] | None
     """Last frame read, with its number."""
     _ahead: tuple[int, VideoFrame] | None
-    """A later frame, decoded while looking for one that cannot be decoded."""
+    """A later frame, decoded during the search for one that cannot be decoded."""
     _next: int
-    """Number of the next frame that the decoder can give."""
+    """Number of the next frame that the decoder can return."""
     _fed: int
     """Index of the packet read last."""
 
@@ -143,11 +143,11 @@ class VideoSource(FrameSource):
         return len(self._table.time_s)
 
     def close(self) -> None:
-        """Close the file. Closing twice does no harm."""
+        """Close the file. May be called twice."""
         self._container.close()
 
     def reopen(self) -> Self:
-        """Open the same video once more; see `FrameSource.reopen`."""
+        """Open the same video again; see `FrameSource.reopen`."""
         return type(self)(self._path, self.index)
 
     @property
@@ -167,7 +167,7 @@ class VideoSource(FrameSource):
         if self._shown is None or self._shown[0] != index:
             self._shown = self._find(index)
         if self._shown is None:
-            raise InputError(self._path, f"frame {index}", "cannot be decoded", "a whole frame")
+            raise InputError(self._path, f"frame {index}", "cannot be decoded", "a complete frame")
         image = grey_of(self._shown[1])
         if image.shape != self.shape:
             rows, columns = self.shape
@@ -181,7 +181,7 @@ class VideoSource(FrameSource):
         return Frame(index, None if math.isnan(time_s) else time_s, image)
 
     def _find(self, index: int) -> tuple[int, VideoFrame] | None:
-        """Number and frame ``index``; None if it cannot be decoded."""
+        """Return frame ``index`` with its number; None if it cannot be decoded."""
         before = np.flatnonzero(self._table.number[self._keys] <= index)
         key = int(self._keys[before[-1]]) if len(before) else 0
         far = self._table.seekable and key > self._fed + NEAR_PACKETS
@@ -189,8 +189,8 @@ class VideoSource(FrameSource):
             self._seek(key)
         found = self._decode_to(index)
         if found is None and self._table.seekable:
-            # Reading may have stuck at damage before it; or what follows a key frame may build on
-            # what is before it (H.264's open groups). So get there the other way.
+            # Reading may have stopped at damage before it; or frames after a key frame depend on
+            # frames before it (open GOP of H.264). So try the other way.
             if self._from_start:
                 self._seek(key)
             else:
@@ -210,7 +210,7 @@ class VideoSource(FrameSource):
         return found
 
     def _restart(self) -> None:
-        """Open the file again, before its first frame."""
+        """Open the file again, at its first frame."""
         self._open()
         self._continue_with(self._listed_packets())
 
@@ -232,7 +232,7 @@ class VideoSource(FrameSource):
     def _seek(self, key: int) -> None:
         """Seek to packet ``key`` or one before it, identified by the packet found there."""
         if self._fed < 0:
-            # A palette comes with the first packet only.
+            # Only the first packet has the palette.
             next(self._decoded, None)
         for stamp in self._table.seek_stamps(key):
             with contextlib.suppress(FFmpegError):
@@ -245,7 +245,7 @@ class VideoSource(FrameSource):
         self._restart()
 
     def _listed_packets(self) -> Iterator[tuple[int, Packet[VideoStream]]]:
-        """Packets from here on, each with its index in the table."""
+        """Yield the packets from the present position, with their indices in the table."""
         for packet in _packets(self._container, self._stream):
             ordinal = self._ordinal.get(getattr(packet, self._table.placed_by))
             if ordinal is not None:
@@ -254,10 +254,10 @@ class VideoSource(FrameSource):
     def _decode(
         self, packets: Iterator[tuple[int, Packet[VideoStream]]]
     ) -> Iterator[tuple[int, VideoFrame]]:
-        """Numbers and frames, in the decoder's order.
+        """Yield numbers and frames, in the decoder's order.
 
-        After a packet that is missing or damaged nothing is decoded before the next key frame:
-        decoders would continue with what they have, and only some would say so.
+        After a missing or damaged packet nothing is decoded until the next key frame, as decoders
+        would continue with wrong data, mostly without an error.
         """
         sound, begun = False, 0
         for ordinal, packet in packets:
@@ -276,13 +276,13 @@ class VideoSource(FrameSource):
         for frame in frames:
             ordinal = -1 if frame.pts is None else frame.pts
             number = int(self._table.number[ordinal]) if ordinal >= 0 else -1
-            # What is shown before the key frame it follows builds on what was not decoded.
+            # A frame shown before its preceding key frame depends on frames that were not decoded.
             stray = ordinal > begun and number < self._table.number[begun]
             if number >= self._next and not stray and not frame.is_corrupt:
                 yield number, frame
 
     def _table_of_file(self) -> PacketTable:
-        """Index of the file, by its own index or by reading it through."""
+        """Build the index, from the file's own index or by reading all of it."""
         is_avi = self._container.format.name == "avi"
         codec = self._stream.codec_context.codec
         timing = Timing(
@@ -294,7 +294,7 @@ class VideoSource(FrameSource):
         )
         packets, indexed, is_cut = self._all_packets(is_avi, timing.claimed)
         if not len(packets):
-            raise InputError(self._path, "frames", "not one that is whole", A_VIDEO)
+            raise InputError(self._path, "frames", "no complete one", A_VIDEO)
         number = number_by_order(packets)
         if codec.reorder and timing.stamped and packets.stamps_differ():
             number = number_by_stamp(packets)
@@ -306,7 +306,7 @@ class VideoSource(FrameSource):
             key, _ = self._decode_through(packets)
             packets = packets.with_keys(key)
         if not (number >= 0).any():
-            raise InputError(self._path, "frames", "not one that is whole", A_VIDEO)
+            raise InputError(self._path, "frames", "no complete one", A_VIDEO)
         table = PacketTable.build(packets, number, timing, self.name)
         self._open()
         first, packet = self._first_frame()
@@ -319,13 +319,13 @@ class VideoSource(FrameSource):
             description=self._describe(first),
             slice_crc=codec.name == "ffv1" and slices_whole(bytes(packet)),
             warnings=table.warnings
-            + (f"{self.name} ends early: its last frame is cut off",) * is_cut,
-            # MPEG program streams have stamps for some packets only; the others' are guessed.
+            + (f"{self.name} ends early: its last frame is truncated",) * is_cut,
+            # MPEG program streams have stamps for some packets only.
             seekable=self._container.format.name != "mpeg",
         )
 
     def _all_packets(self, is_avi: bool, claimed: int) -> tuple[Packets, bool, bool]:
-        """All packets, whether the file's index confirms them, and whether the last is cut off."""
+        """Return all packets, whether an index confirms them, and whether the last is truncated."""
         entries = list(self._stream.index_entries) if is_avi else []
         listed = Packets.listed(entries, self._stream.index, claimed, self._path)
         if listed is not None:
@@ -341,9 +341,9 @@ class VideoSource(FrameSource):
         return packets, False, is_cut
 
     def _is_whole(self, last: Sequence[Packet[VideoStream]]) -> bool:
-        """Whether the last of packets is, if it can be decoded by itself; if not, it is taken for.
+        """Whether the last packet is complete, as far as a key frame shows it.
 
-        Of FFV1 that has checksums, as the packet before it shows, they must be right.
+        The checksums of FFV1 must be right, if the packet before it has checksums.
         """
         if not last or not last[-1].is_keyframe:
             return True
@@ -353,7 +353,7 @@ class VideoSource(FrameSource):
         return _decode_as(self._stream, last[-1], 0) is not None
 
     def _decode_through(self, packets: Packets) -> tuple[BoolArray, IntArray]:
-        """Key frames, and the frame of each packet in the order shown, by decoding everything."""
+        """Decode everything to determine key frames, and display order of each packet."""
         self._open()
         key = np.zeros(len(packets), bool)
         number = np.full(len(packets), -1, np.int64)
@@ -371,21 +371,21 @@ class VideoSource(FrameSource):
         return key, number
 
     def _first_frame(self) -> tuple[VideoFrame, Packet[VideoStream]]:
-        """First complete frame, and the packet after which the decoder gave it."""
+        """Return the first complete frame, and the packet after which it was decoded."""
         last = None
         for packet in itertools.chain(_packets(self._container, self._stream), [None]):
             last = packet or last
             for frame in _decode_as(self._stream, packet, 0) or []:
                 if last is not None and not frame.is_corrupt:
                     return frame, last
-        raise InputError(self._path, "frames", "not one that is whole", A_VIDEO)
+        raise InputError(self._path, "frames", "no complete one", A_VIDEO)
 
     def _rate(self) -> float | None:
         rate = float(self._stream.average_rate or 0)
         return rate if math.isfinite(rate) and rate > 0 else None
 
     def _claimed(self) -> int:
-        """Number of frames in the header; 0 where unknown."""
+        """Return the number of frames in the header; 0 if unknown."""
         if self._stream.frames:
             return self._stream.frames
         whole_file = self._container.format.name.startswith("matroska")
@@ -411,7 +411,7 @@ class VideoSource(FrameSource):
 
 
 def _fingerprint(path: Path) -> tuple[int, int]:
-    """Size, bytes, and checksum of both ends of a file, to see whether it is the same."""
+    """Return the size, bytes, and a checksum of both ends of a file, which identify it."""
     part = 1 << 16
     with os_errors_as_input(path, "file", "a file that may be read"), path.open("rb") as file:
         ends = file.read(part)
@@ -439,14 +439,14 @@ def _open(path: Path) -> tuple[InputContainer, VideoStream]:
     try:
         stream = container.streams.best("video")
         if not isinstance(stream, VideoStream) or stream.codec_context is None:
-            raise InputError(path, "content", "no pictures", A_VIDEO)
+            raise InputError(path, "content", "no video stream", A_VIDEO)
         context = stream.codec_context
         bits = 64 if context.format is None else context.format.padded_bits_per_pixel
         most = most_decoded(bits, context.codec.reorder)
         if context.width * context.height > most:
             size = f"{context.width}×{context.height} px"
-            raise InputError(path, "frame size", size, f"at most {most} px in a frame of its kind")
-        # Frame threads would hold back each requested frame until more are read.
+            raise InputError(path, "frame size", size, f"at most {most} px for this format")
+        # Frame threading would delay each frame until more are read.
         context.thread_type = "SLICE"
         context.options = {"max_pixels": str(most), "err_detect": "explode"}
     except BaseException:
@@ -456,7 +456,7 @@ def _open(path: Path) -> tuple[InputContainer, VideoStream]:
 
 
 def _packets(container: InputContainer, stream: VideoStream) -> Iterator[Packet[VideoStream]]:
-    """Complete packets in file order; unreadable ones are skipped."""
+    """Yield complete packets in file order; unreadable ones are skipped."""
     failures = 0
     while failures < DAMAGED_READS:
         try:
@@ -467,7 +467,7 @@ def _packets(container: InputContainer, stream: VideoStream) -> Iterator[Packet[
         except ExitError:
             return
         except (FFmpegError, IndexError):
-            # PyAV has no place for a stream that damage makes appear amid the file.
+            # PyAV raises IndexError for a spurious stream in a damaged file.
             failures += 1
         else:
             return
@@ -476,7 +476,7 @@ def _packets(container: InputContainer, stream: VideoStream) -> Iterator[Packet[
 def _kept(
     packets: Iterable[Packet[VideoStream]], last: deque[Packet[VideoStream]]
 ) -> Iterator[Packet[VideoStream]]:
-    """Pass packets through; the latest stay in ``last``."""
+    """Yield packets, and store the latest in ``last``."""
     for packet in packets:
         last.append(packet)
         yield packet
@@ -485,10 +485,10 @@ def _kept(
 def _decode_as(
     stream: VideoStream, packet: Packet[VideoStream] | None, stamp: int
 ) -> list[VideoFrame] | None:
-    """Frames of the decoder for ``packet`` with time stamp ``stamp``; None if it is damaged."""
+    """Decode a packet with another time stamp; None if it is damaged."""
     if packet is not None:
         packet.pts = packet.dts = stamp
     try:
         return stream.codec_context.decode(packet)
-    except (FFmpegError, ValueError):  # PyAV raises the latter for a codec it does not know
+    except (FFmpegError, ValueError):  # ValueError for an unknown codec
         return None

@@ -1,1 +1,1 @@
-"""Recordings that are made: what a camera gives, on the disk."""
+"""Recording of camera frames to disk."""

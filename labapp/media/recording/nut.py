@@ -1,6 +1,6 @@
-"""Writing of lossless video that can be read up to wherever it is cut off.
+"""Writing of lossless video that remains readable when truncated.
 
-NUT (docs/adr/0015): every frame is written at once, with its own time to the microsecond.
+NUT (docs/adr/0015): every frame is written immediately, with its own time stamp in µs.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ Codec = Literal["ffv1", "raw"]
 TICKS_HZ = 1_000_000
 
 BUFFER_BYTE = 1 << 22
-"""A frame that fits goes to the file in one piece."""
+"""Size of the output buffer; smaller frames are written at once."""
 
 FFV1 = {"level": "3", "slices": "4", "slicecrc": "1", "g": "1", "context": "0"}
-"""Every frame by itself, four slices for as many threads, each with a checksum."""
+"""Intra frames only, four slices for four threads, each with a checksum."""
 
 
 class ByteFile(Protocol):
     """Unbuffered binary file."""
 
     def write(self, content: memoryview) -> int:
-        """Write all or the beginning, and return the number of bytes; or raise OSError."""
+        """Write all or a part, and return the number of bytes; or raise OSError."""
         ...
 
     def close(self) -> None:
@@ -42,11 +42,11 @@ class ByteFile(Protocol):
 
 
 class WrongFrame(ValueError):
-    """A frame does not fit the video and was left out; the next one may fit."""
+    """A frame has the wrong format and was discarded; the next one may be valid."""
 
 
 class _CompleteWriter:
-    """Repeats partial writes: a disk that is nearly full takes a part at first."""
+    """Continues partial writes, which occur when a disk is nearly full."""
 
     def __init__(self, file: ByteFile) -> None:
         self._file = file
@@ -70,16 +70,16 @@ class NutWriter:
     bit_depth
         Significant bits of a grey level: up to 8 for uint8, else for uint16.
     rate_hz
-        Frame rate in the header, Hz; frames have time stamps of their own.
+        Frame rate in the header, Hz; each frame has its own time stamp.
     codec
-        ``ffv1``: about half the size; ``raw``: the levels as they are.
+        ``ffv1``: about half the size; ``raw``: uncompressed.
     file
         Written instead of a file at ``path``.
 
     Raises
     ------
     InputError
-        If the file is there already or cannot be made.
+        If the file exists already or cannot be created.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class NutWriter:
         self._file = _CompleteWriter(_create(path) if file is None else file)
         self._shape, self._top = shape, 2**bit_depth - 1
         self._dtype = np.uint8 if bit_depth <= 8 else np.uint16
-        # An index at the end would have to be kept in memory: 240 bytes a frame, for hours.
+        # No index at the end, which would take 240 bytes of memory per frame.
         options = {"flush_packets": "1", "write_index": "0"}
         self._container = av.open(
             self._file, "w", format="nut", options=options, buffer_size=BUFFER_BYTE
@@ -110,7 +110,7 @@ class NutWriter:
         )
         stream.time_base = stream.codec_context.time_base = Fraction(1, TICKS_HZ)
         if codec == "ffv1":
-            # Golomb-Rice is the faster coder; it has 8 bits only.
+            # Golomb-Rice is the faster coder, but for 8 bits only.
             coder = {"coder": "0" if bit_depth <= 8 else "1"}
             stream.codec_context.options = FFV1 | coder
             stream.codec_context.thread_count = threads
@@ -118,21 +118,21 @@ class NutWriter:
         self._last = -1
 
     def write(self, image: GreyImage, time_s: float) -> None:
-        """Write a frame; when this returns it is in the file.
+        """Write a frame to the file without buffering.
 
         Parameters
         ----------
         image
             Grey levels of the right shape and type.
         time_s
-            Since the first frame, s; one that is not later than that before counts as 1 µs later.
+            Time since the first frame, s; at least 1 µs after the previous one.
 
         Raises
         ------
         OSError
-            If it cannot be written: frames before it are intact.
+            If it cannot be written; previous frames are intact.
         WrongFrame
-            If it is of another shape or has levels of more bits.
+            If it has another shape or type, or levels with more bits.
         """
         if image.shape != self._shape or image.dtype != self._dtype or image.max() > self._top:
             raise WrongFrame(f"a frame of {image.shape}, {image.dtype}, up to {image.max()}")
@@ -150,7 +150,7 @@ class NutWriter:
         Raises
         ------
         OSError
-            If what is left of it cannot be written: the file is complete without it.
+            If the end cannot be written; the file is readable without it.
         """
         try:
             self._container.close()
@@ -161,7 +161,7 @@ class NutWriter:
 
 
 def _levels(bit_depth: int, codec: Codec) -> int:
-    """Bits of the pixel format: FFmpeg has some depths only, and reads raw video with 16 only."""
+    """Return the bits of the pixel format, which FFmpeg supports; 16 for raw video."""
     return 16 if codec == "raw" else next(n for n in (10, 12, 14, 16) if n >= bit_depth)
 
 

@@ -1,6 +1,6 @@
-"""Records what a camera gives: from some seconds before the trigger on, without waiting for a disk.
+"""Recorder of camera frames with a pre-trigger buffer, which never waits for the disk.
 
-Frames go through a queue to a thread that writes; queue and ring buffer share a bounded memory.
+A queue passes frames to a writing thread; queue and ring buffer share a limited memory.
 """
 
 from __future__ import annotations
@@ -25,41 +25,39 @@ from labapp.media.recording.take_files import Note, Take, TakeFiles, notes_of
 from labapp.text import pluralize
 
 FRAME_BYTE = 200
-"""What a frame takes in memory besides its levels, about."""
+"""Approximate memory of a frame besides its grey levels."""
 
 SWITCH_S = 5e-4
-"""So soon a thread of Python gives way to another; after its own 5 ms a frame would be written
-slower than 200 of them come a second, while a window draws."""
+"""Switch interval of Python's threads, s; with the default of 5 ms, 200 frames/s could not be
+written while a window is drawn."""
 
 STALL_S = 1.0
-"""A disk that takes longer for a frame is reported as stalled."""
+"""Time to write a frame from which the disk is reported as stalled, s."""
 
 RATE_HZ = 25.0
-"""Frame rate in the video's header where the camera's is unknown."""
+"""Frame rate in the video's header if that of the camera is unknown."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What of a camera's frames is recorded.
+    """Settings of a recording.
 
     Raises
     ------
     InputError
-        If one is out of range.
+        If a value is out of range.
     """
 
     before_s: float = 0.0
-    """Time recorded from before the trigger, s."""
+    """Time recorded before the trigger, s."""
     after_s: float | None = None
-    """Duration from the first frame after it, s; None: until it is stopped."""
+    """Duration from the first frame after the trigger, s; None: until stopped."""
     every: int = 1
-    """Every n-th frame."""
+    """Record every n-th frame."""
     codec: Codec = "raw"
-    """``raw``, or ``ffv1``: less than half the size, for some 4 ms of a core a frame of 640×480."""
+    """``raw``, or ``ffv1``: less than half the size, but some 4 ms of a core per 640×480 frame."""
     memory_mb: float = 512.0
-    """What frames that wait may take, MB: those from before the trigger, and those that the disk
-    had no time for yet.
-    """
+    """Memory for frames from before the trigger and frames not written yet, MB."""
 
     def __post_init__(self) -> None:
         problems = [
@@ -84,8 +82,8 @@ _Item = tuple[Take, CameraFrame | Note | None]
 class Recorder:
     """Records frames of a camera, with a buffer of those before the trigger.
 
-    `take` never waits: frames that are not written yet are queued in memory, and left out, with an
-    event, only when that is full. The methods may be called from any thread.
+    `take` never blocks: frames are queued in memory, and dropped, with an event, only when that is
+    full. The methods may be called from any thread.
 
     Parameters
     ----------
@@ -127,7 +125,7 @@ class Recorder:
         self._thread = threading.Thread(target=self._write_on, name="recorder", daemon=True)
         self._thread.start()
 
-    # --- what is wanted -----------------------------------------------------------------------
+    # --- control ------------------------------------------------------------------------------
 
     @property
     def running(self) -> Take | None:
@@ -146,7 +144,7 @@ class Recorder:
             return self._ring[-1].time_s - self._ring[0].time_s if self._ring else 0.0
 
     def take(self, frame: CameraFrame) -> None:
-        """Accept a frame of the camera; never waits."""
+        """Accept a frame of the camera; never blocks."""
         events: list[tuple[Kind, str]] = []
         with self._condition:
             self._newest_s = frame.time_s
@@ -177,7 +175,7 @@ class Recorder:
         Raises
         ------
         InputError
-            If there is such a file, or its notes, already; or the recorder was closed.
+            If the file or its notes exist already, or the recorder is closed.
         """
         with self._condition:
             if self._closing:
@@ -212,11 +210,11 @@ class Recorder:
                 self._condition.notify()
 
     def close(self) -> None:
-        """End the recording, and wait until all of it is written. Twice does no harm."""
+        """End the recording, and wait until all of it is written. May be called twice."""
         self.stop()
         with self._condition:
             self._closing = True
-            if self._running is not None:  # triggered meanwhile
+            if self._running is not None:  # triggered after `stop`
                 self._end(self._running)
             self._held_byte -= sum(_size(frame) for frame in self._ring)
             self._ring.clear()
@@ -233,10 +231,10 @@ class Recorder:
     # --- in the camera's thread ---------------------------------------------------------------
 
     def _record(self, take: Take, frame: CameraFrame, size: int | None) -> list[tuple[Kind, str]]:
-        """Queue a frame; ``size`` None: there is no memory for it."""
+        """Queue a frame; ``size`` None: memory is full."""
         events: list[tuple[Kind, str]] = []
         if take.ends_s is None and self.plan.after_s is not None:
-            # Not from the newest frame at the trigger on: the camera may have been away since.
+            # Not counted from the trigger, as the camera may have been lost since.
             take.ends_s = frame.time_s + self.plan.after_s
         if take.ends_s is not None and frame.time_s > take.ends_s - 1 / TICKS_HZ:
             self._end(take)
@@ -253,14 +251,15 @@ class Recorder:
         return events
 
     def _falls_behind(self) -> list[tuple[Kind, str]]:
-        """Event that writing falls behind, the first time that it does."""
+        """Return an event the first time that writing falls behind."""
         writing_s = time.monotonic() - self._writing_since_s
         if self._is_behind or (self._held_byte <= self._memory_byte / 2 and writing_s < STALL_S):
             return []
         self._is_behind = True
-        stalls = f", the disk has taken nothing for {writing_s:.1f} s" * (writing_s >= STALL_S)
+        stalls = f", the disk has stalled for {writing_s:.1f} s" * (writing_s >= STALL_S)
         megabytes = self._held_byte / 1e6
-        return [("warning", f"writing does not keep up{stalls}: {megabytes:.0f} MB wait in memory")]
+        words = f"writing does not keep up{stalls}: {megabytes:.0f} MB are queued in memory"
+        return [("warning", words)]
 
     def _ring_is_short(self, frame: CameraFrame) -> list[tuple[Kind, str]]:
         if self._is_short:
@@ -268,16 +267,16 @@ class Recorder:
         self._is_short = True
         kept_s = frame.time_s - self._ring[0].time_s
         words = (
-            f"only {kept_s:.2f} s before the trigger are kept, not {self.plan.before_s:g} s: "
-            f"{self.plan.memory_mb:g} MB hold no more"
+            f"only {kept_s:.2f} s before the trigger are buffered, not {self.plan.before_s:g} s: "
+            f"the memory is limited to {self.plan.memory_mb:g} MB"
         )
         return [("warning", words)]
 
     def _apart(self, path: Path) -> Path:
-        """Path, numbered where another recording of ours has it."""
-        own, wanted = {take.path for take in self.takes}, path
+        """Return the path, numbered if it is that of an earlier recording."""
+        used, wanted = {take.path for take in self.takes}, path
         for number in itertools.count(2):
-            if path not in own:
+            if path not in used:
                 break
             path = wanted.with_stem(f"{wanted.stem}-{number}")
         for there in (path, notes_of(path)):
@@ -334,7 +333,7 @@ class Recorder:
         return self._open(take.path, shape, self._bit_depth, self._rate_hz, self.plan.codec)
 
     def _release(self, item: CameraFrame | Note | None, take: Take) -> None:
-        """Free the memory of a written frame; raise an event once the queue is empty again."""
+        """Free the memory of a written frame; raise an event when the queue is empty again."""
         caught_up = False
         with self._condition:
             self._writing_since_s = float("inf")
@@ -349,22 +348,22 @@ class Recorder:
             self._on_event(take.summary)
 
     def _give_up(self, take: Take, error: Exception) -> None:
-        """Mark a recording as failed and raise an event; what is written stays."""
+        """Mark a recording as failed and raise an event; written frames are intact."""
         if not isinstance(error, OSError | InputError):
             logging.getLogger("labapp").exception("recording %s", take.path)
         reason = (isinstance(error, OSError) and error.strerror) or error
         take.trouble = f"cannot be written: {reason}"
-        words = f"{take.trouble}; what was written is whole: {pluralize(take.frames, 'frame')}"
+        words = f"{take.trouble}; written so far and intact: {pluralize(take.frames, 'frame')}"
         self._on_event(Event(take.path.name, "loss", words))
 
 
 def _size(frame: CameraFrame) -> int:
-    """Memory of a frame, bytes."""
+    """Return the memory of a frame, bytes."""
     return frame.image.nbytes + FRAME_BYTE
 
 
 def recording_path(folder: Path, stem: str) -> Path:
-    """Unused path for a recording that begins now, named by date and time."""
+    """Return an unused path for a new recording, with date and time."""
     begun = time.strftime("%Y-%m-%d-%H%M%S")
     path, count = folder / f"{stem}-{begun}.nut", 1
     while os.path.lexists(path) or os.path.lexists(notes_of(path)):
@@ -374,7 +373,7 @@ def recording_path(folder: Path, stem: str) -> Path:
 
 
 def recordings_beside(folder: Path, stem: str) -> list[Path]:
-    """The files in a folder that `recording_path` has named with this stem, the oldest first.
+    """Return the files in a folder named by `recording_path` with this stem, the oldest first.
 
     Raises
     ------

@@ -17,22 +17,22 @@ from labapp.media.recording.nut import NutWriter
 from labapp.text import as_cell, pluralize
 
 NOTES = ("time_s", "frame", "source", "kind", "what")
-"""Columns of the notes beside a recording; the frame is the one that was next at that time."""
+"""Columns of the notes beside a recording; the frame is the next one at that time."""
 
 NOTED_LATE = 10_000
-"""Number of frames that a note may be late: measuring a frame can take seconds."""
+"""Largest delay of a note, frames; measuring a frame can take seconds."""
 
 
 @dataclass(frozen=True)
 class Note:
-    """A row of the notes; its time by the camera's clock, s."""
+    """A row of the notes, with its time by the camera's clock, s."""
 
     time_s: float
     event: Event
 
 
 def notes_of(path: Path) -> Path:
-    """Path of the notes of a recording."""
+    """Return the path of the notes of a recording."""
     return path.with_name(f"{path.stem}-notes.csv")
 
 
@@ -41,24 +41,24 @@ class Take:
     """One recording, from its trigger on."""
 
     path: Path
-    """The video. Notes are beside it, see `notes`."""
+    """Path of the video. Notes are beside it, see `notes`."""
     frames: int = 0
-    """Written so far."""
+    """Number of frames written."""
     lost: int = 0
-    """Left out for want of room in memory, or of a disk; or not as the others are."""
+    """Number of frames dropped because memory or disk were full, or their format was wrong."""
     trouble: str = ""
     """Why writing ended early; empty if it did not."""
     finished: threading.Event = field(default_factory=threading.Event)
-    """Set when nothing more is written."""
+    """Set when writing has ended."""
     triggered_s: float = 0.0
     ends_s: float | None = None
-    """When it was triggered and when it ends by itself, by the camera's clock, s; None: not known
-    yet, or never.
+    """Time of the trigger and of the automatic end, by the camera's clock, s; None: unknown yet, or
+    never.
     """
 
     @property
     def summary(self) -> Event:
-        """Event that sums up the recording."""
+        """Event with the number of frames recorded and lost."""
         words = f"{pluralize(self.frames, 'frame')} recorded" + f", {self.lost} lost" * (
             self.lost > 0
         )
@@ -133,7 +133,7 @@ class TakeFiles:
 
     def _emit_wrong(self, count: int) -> None:
         frames = pluralize(count, "frame")
-        words = f"{frames} left out: of another size, or brighter than the camera's bits allow"
+        words = f"{frames} discarded: of another size, or with levels above the camera's bits"
         event = Event(self.take.path.name, "loss", words)
         self._on_event(event)
         self.process(Note(self._last_s, event))
@@ -152,7 +152,7 @@ class TakeFiles:
         row = (f"{time_s:.6f}", frame, as_cell(event.source), event.kind, as_cell(event.words))
         text = io.StringIO(newline="")
         try:
-            began = not self.take.notes.exists()  # or a link to nowhere, which `x` does not follow
+            began = not self.take.notes.exists()  # mode x also fails for a broken link
             csv.writer(text, lineterminator="\n").writerows([NOTES, row] if began else [row])
             with self.take.notes.open("x" if began else "a", encoding="utf-8", newline="") as file:
                 file.write(text.getvalue())

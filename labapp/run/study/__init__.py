@@ -1,1 +1,1 @@
-"""A study: many recordings measured alike, on all cores or a cluster, and compared (`Study`)."""
+"""Studies: many recordings, measured on all cores or a cluster, and compared (`Study`)."""

@@ -18,10 +18,10 @@ from labapp.studies.plotting import INCHES, STYLE, as_bytes, new_figure
 from labapp.text import SIGMA_OF, axis_label, heading
 
 MOST_SHOWN = 60
-"""Outliers that are listed: the others are in their file."""
+"""Most outliers that are listed; all are in outliers.csv."""
 
 MOST_ROWS = 6
-"""Conditions that are drawn."""
+"""Most conditions that are plotted."""
 
 COLOURS = "#0072b2 #d55e00 #009e73 #cc79a7 #56b4e9 #e69f00 #333333 #999999".split()
 """Colours that can be distinguished with poor colour vision (Okabe and Ito)."""
@@ -42,7 +42,7 @@ td.n { text-align: right; font-variant-numeric: tabular-nums; white-space: nowra
 
 
 def summary_page(summary: StudySummary, made: str) -> str:
-    """The page, as HTML with SVG in it; nothing else is loaded.
+    """Return the page as self-contained HTML with inline SVG.
 
     Parameters
     ----------
@@ -99,7 +99,7 @@ def _plots_note(summary: StudySummary) -> str:
 
 
 def varying_conditions(summary: StudySummary) -> list[str]:
-    """Conditions that have more than one value."""
+    """Return the conditions that have more than one value."""
     values = {
         name: {one.conditions.get(name) for one in summary.groups} for name in summary.conditions
     }
@@ -107,12 +107,12 @@ def varying_conditions(summary: StudySummary) -> list[str]:
 
 
 def condition_picture(summary: StudySummary, condition: str) -> bytes:
-    """Each size against one condition, in two rows, as PNG; the other conditions by colour.
+    """Plot each size against one condition, as PNG, with the other conditions by colour.
 
     Parameters
     ----------
     condition
-        One of `varying_conditions`; empty: none, all recordings at one place.
+        One of `varying_conditions`; empty: none, all recordings at one position.
     """
     others = [name for name in varying_conditions(summary) if name != condition]
     with rc_context(STYLE):
@@ -125,7 +125,7 @@ def condition_picture(summary: StudySummary, condition: str) -> bytes:
 
 
 def _plots(summary: StudySummary) -> str:
-    """Small multiples: a row a condition that varies, a column a size."""
+    """Plot small multiples: one row per varying condition, one column per size."""
     varying = varying_conditions(summary)[:MOST_ROWS] or [""]
     width, height = PANEL_INCHES
     with rc_context(STYLE):
@@ -150,7 +150,7 @@ def _draw_row(
     kinds = _kinds(summary.groups, others)
     colours = dict(zip(dict.fromkeys(kinds), COLOURS, strict=False))
     for axis, size in zip(axes, SIZES, strict=True):
-        if all(group.means[size].mean == 0 for group in summary.groups):  # no course to be seen
+        if all(group.means[size].mean == 0 for group in summary.groups):
             axis.set_axis_off()
             axis.text(0.5, 0.5, "0 everywhere", ha="center", transform=axis.transAxes)
             continue
@@ -186,7 +186,7 @@ def _draw(axis: Any, place: float, mean: Mean, each: Sequence[float], colour: st
 
 
 def _places(groups: Sequence[GroupSummary], condition: str) -> tuple[list[float], list[str] | None]:
-    """Where each group stands along a condition; ticks where it is text."""
+    """Return the position of each group on a condition's axis, and tick labels if it is text."""
     values = [group.conditions.get(condition) for group in groups]
     if condition and all(isinstance(value, int | float) for value in values):
         return [float(value) for value in values if not isinstance(value, str | None)], None
@@ -195,7 +195,7 @@ def _places(groups: Sequence[GroupSummary], condition: str) -> tuple[list[float]
 
 
 def _kinds(groups: Sequence[GroupSummary], others: Sequence[str]) -> list[str]:
-    """The other conditions of each group in words; none of them if there are too many."""
+    """Return the other conditions of each group as text; empty if there are too many."""
     kinds = [
         "\n".join(named_condition(name, one.conditions.get(name)) for name in others)
         for one in groups
@@ -215,7 +215,7 @@ def _n(value: object) -> str:
 
 
 def _link(path: str) -> str:
-    """A cell that opens a file."""
+    """Return a cell with a link to a file."""
     return f'<td><a href="{escape(Path(path).as_uri())}">{escape(path)}</a></td>'
 
 
@@ -230,7 +230,7 @@ def _table(head: Iterable[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def rounded(value: float, sigma: float) -> str:
-    """Value and ±, as many decimals as two digits of ± have."""
+    """Format value and ±, with two significant digits of ±."""
     if not math.isfinite(sigma) or sigma <= 0:
         return f"{value:z.4g}"
     decimals = min(max(1 - math.floor(math.log10(sigma)), 0), 6)

@@ -1,4 +1,4 @@
-"""The study file: many recordings, each with its set-up, its settings and its conditions.
+"""The study file: recordings, each with set-up, settings and conditions.
 
 TOML, with defaults for all recordings at the top::
 
@@ -10,7 +10,7 @@ TOML, with defaults for all recordings at the top::
     conditions = { current_a = 100, gas = "Ar" }
 
     [[recording]]
-    file = "runs/I{current_a}_{repeat}.avi"     # every file of that form
+    file = "runs/I{current_a}_{repeat}.avi"     # every matching file
 
 or CSV with a column ``file``, columns named like the other keys, and a column for each condition.
 """
@@ -51,21 +51,21 @@ COLUMNS = TABLES["measures"]
 """Columns of the table of all frames, after the recording's name and conditions."""
 
 RESERVED = frozenset({"recording", *(column.name for column in COLUMNS)})
-"""Names that conditions cannot have: columns of the table that they are put into."""
+"""Names that conditions cannot have, as the table of all frames has such columns."""
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 CONDITION = re.compile(r"[A-Za-z][A-Za-z0-9_]{0,49}")
 FIELD = re.compile(r"\{([^{}]*)\}")
 
 PARTS_OF_NAME = (slice(-1, None), slice(-2, -1), slice(-2, None), slice(-3, None))
-"""Parts of a recording's path that become its name, the first that tell it from others: the file's
-name, its folder's, both …"""
+"""Parts of a recording's path that may become its name, the first that are unique: file name,
+folder name, both …"""
 
 Condition = float | str
 
 
 def shown_condition(value: Condition | None) -> str:
-    """A condition's value as text; a dash where it is not known."""
+    """Return a condition's value as text; a dash if unknown."""
     if value is None:
         return "–"
     return value if isinstance(value, str) else f"{value:g}"
@@ -83,24 +83,24 @@ class StudyRecording:
     """A recording of a study."""
 
     name: str
-    """Its name in results; also the name of its files there."""
+    """Name in results, also of its files there."""
     path: Path
-    """Where it is."""
+    """Path of the recording."""
     setup: Path
-    """Its setup file."""
+    """Path of the setup file."""
     frames: str = ":"
-    """Its frames, ``A:B:STEP``."""
+    """Frames to measure, ``A:B:STEP``."""
     settings: Settings = field(default_factory=Settings)
-    """How it is measured."""
+    """Settings of the measurement."""
     warm: bool = True
-    """Whether each frame is measured from the one before."""
+    """Whether frames are tracked from the previous ones."""
     conditions: Mapping[str, Condition] = field(default_factory=dict)
-    """Under which conditions it was made; a missing one is not known."""
+    """Experimental conditions; a missing one is unknown."""
 
 
 @dataclass(frozen=True)
 class StudyPlan:
-    """What a study file says."""
+    """Contents of a study file."""
 
     title: str
     recordings: tuple[StudyRecording, ...]
@@ -128,7 +128,7 @@ DEFAULTS: dict[str, Rule] = {
     "correspondence": _one_of(("auto", "S/S", "S/I", "I/I")),
     "warm": Rule("true or false", lambda value: isinstance(value, bool), required=False),
 }
-"""Keys that may stand at the top for all recordings, and in each."""
+"""Keys that are allowed at the top, for all recordings, and in each recording."""
 
 OF_RECORDING: dict[str, Rule] = {
     "file": Rule(
@@ -151,8 +151,8 @@ def read_study(path: str | os.PathLike[str]) -> StudyPlan:
     Raises
     ------
     InputError
-        If it cannot be read, or anything in it is unknown, missing or impossible; all that was
-        found is reported together. Recordings and setup files need not be there.
+        If it cannot be read, or anything in it is unknown, missing or invalid; all problems are
+        reported together. Recordings and setup files need not exist.
     """
     path = Path(path)
     read = _read_csv if path.suffix.lower() == ".csv" else _read_toml
@@ -205,29 +205,29 @@ def write_study(
     setup: str | os.PathLike[str],
     replace: bool = False,
 ) -> StudyPlan:
-    """Write a new study file that lists recordings; paths in it are relative where they can be.
+    """Write a new study file that lists recordings, with relative paths if possible.
 
     Parameters
     ----------
     path
-        Of the file, ``.toml`` or ``.csv``.
+        Path of the file, ``.toml`` or ``.csv``.
     recordings
-        Paths of recordings, or patterns of them, from where the program runs.
+        Paths or patterns of recordings, relative to the current directory.
     setup
-        Setup file of them all.
+        Setup file of all recordings.
     replace
-        Whether a study that is there may be replaced; nothing else is.
+        Whether to replace an existing study file; other files are never replaced.
 
     Raises
     ------
     InputError
-        If the file is there already or cannot be written, or a pattern matches nothing.
+        If the file exists already or cannot be written, or a pattern matches nothing.
     """
     path = Path(path)
     if path.suffix.lower() not in (".toml", ".csv"):
         raise InputError(path, "name", path.suffix or "no suffix", ".toml or .csv")
     if path.exists() and replace:
-        read_study(path)  # refuses what is none
+        read_study(path)  # raises if it is not a study file
     elif path.exists():
         raise InputError(path, "file", "is there already", "a new file")
     folder = path.parent.absolute()
@@ -251,25 +251,25 @@ def write_study(
 
 
 def matching_recordings(text: str) -> list[tuple[Path, dict[str, Condition]]]:
-    """Recordings that a path or a pattern leads to, with the conditions that are in their paths.
+    """Return the recordings that match a path or a pattern, with the conditions in their paths.
 
     Raises
     ------
     InputError
-        If the pattern is wrong or matches nothing.
+        If the pattern is invalid or matches nothing.
     """
     return list(itertools.islice(_files(Path("study"), "recording", text), MOST_RECORDINGS))
 
 
 def folder_pattern(folder: Path) -> Path:
-    """A pattern of the recordings in a folder; where there is none, of those in its folders.
+    """Return a pattern for the recordings in a folder, or else in its subfolders.
 
-    Of several kinds, that of which there are most.
+    Of several file types, the most frequent one is matched.
 
     Raises
     ------
     InputError
-        If there is none.
+        If there is no recording.
     """
     with os_errors_as_input(folder, "folder", "a folder that can be read"):
         for depth in ("*", "*/*"):
@@ -284,7 +284,7 @@ def folder_pattern(folder: Path) -> Path:
 
 
 def _relative(path: Path, folder: Path) -> str:
-    """A path from a folder, with ``/``; as it is where there is no way."""
+    """Return a path relative to a folder, with ``/``; absolute if there is no relative path."""
     try:
         return Path(os.path.relpath(path, folder)).as_posix()
     except ValueError:  # on another drive
@@ -292,7 +292,7 @@ def _relative(path: Path, folder: Path) -> str:
 
 
 def _toml(value: Condition) -> str:
-    """A value as TOML writes it."""
+    """Format a value as TOML."""
     whole = isinstance(value, float) and value.is_integer()
     return str(tomlkit.item(int(value) if whole else value).as_string())
 
@@ -313,7 +313,7 @@ def _recording(
 
 
 def _read_toml(path: Path) -> tuple[dict[str, Any], list[tuple[str, Any]]]:
-    """Keys at the top, and each recording's with the name of its place."""
+    """Read the keys at the top, and (location, keys) of each recording."""
     with open_table(path, A_STUDY, LARGEST_FILE) as file:
         values = parse_toml(file.read(), path, A_STUDY)
     entries = values.pop("recording", [])
@@ -333,7 +333,7 @@ def _read_toml(path: Path) -> tuple[dict[str, Any], list[tuple[str, Any]]]:
 
 
 def _read_csv(path: Path) -> tuple[dict[str, Any], list[tuple[str, Any]]]:
-    """The same of a table: a row is a recording, a column that is no key a condition."""
+    """Read a table likewise: one row per recording; columns that are not keys are conditions."""
     entries: list[tuple[str, Any]] = []
     with open_table(path, A_STUDY, LARGEST_FILE) as file:
         lines = bounded_lines(path, file, A_STUDY)
@@ -366,13 +366,13 @@ def _read_csv(path: Path) -> tuple[dict[str, Any], list[tuple[str, Any]]]:
 
 
 def _value(cell: str, separator: str = ",") -> Condition:
-    """A condition's value: a number if it reads like one."""
+    """Return a condition's value, as a number if it is one."""
     number = parse_number(cell, separator)
     return cell if number is None else number
 
 
 def _conditions(path: Path, where: str, entry: object) -> Iterator[InputError]:
-    """Problems of a recording's conditions."""
+    """Yield the problems of a recording's conditions."""
     given = entry.get("conditions") if isinstance(entry, dict) else None
     if not isinstance(given, dict):
         return
@@ -387,7 +387,7 @@ def _conditions(path: Path, where: str, entry: object) -> Iterator[InputError]:
 
 
 def _wrong_condition(name: str) -> str | None:
-    """What is right in place of a condition's name that is none; None if it is one."""
+    """Return what is expected instead of an invalid name of a condition; None if it is valid."""
     if not CONDITION.fullmatch(name):
         return "a name of letters, digits and _, a letter first, at most 50"
     if name.lower() in RESERVED:
@@ -396,7 +396,7 @@ def _wrong_condition(name: str) -> str | None:
 
 
 def _files(path: Path, where: str, text: str) -> Iterator[tuple[Path, dict[str, Condition]]]:
-    """Recordings that a path leads to, sorted; with the conditions that are in their names."""
+    """Yield the recordings that match a path, sorted, with the conditions in their names."""
     folder = path.parent.absolute()
     if (folder / text).exists() or not set(text) & set("*{}"):
         yield folder / text, {}
@@ -428,7 +428,7 @@ def _files(path: Path, where: str, text: str) -> Iterator[tuple[Path, dict[str, 
 
 
 def _names(path: Path, found: Sequence[tuple[str, dict[str, Any], Path, Any]]) -> list[str]:
-    """A name for each recording, no two alike even where case does not count."""
+    """Return a name for each recording, unique even if case is ignored."""
     level = [0] * len(found)
     while True:
         names = [
@@ -448,7 +448,7 @@ def _names(path: Path, found: Sequence[tuple[str, dict[str, Any], Path, Any]]) -
 
 
 def _plain(file: Path, parts: slice) -> str:
-    """A name made of parts of a path."""
+    """Return a name from parts of a path, with plain characters."""
     chosen = [*file.parts[1:-1], file.stem][parts]
     name = re.sub(r"[^A-Za-z0-9.-]+", "_", "-".join(chosen)).strip("._-")
     return name[-100:].lstrip("._-") or "x"

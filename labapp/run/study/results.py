@@ -1,13 +1,13 @@
-"""The results of a study, put together from what its tasks wrote.
+"""Assembly of the results of a study from the files of its tasks.
 
 ::
 
-    measures.parquet/NAME.parquet    a row a frame: recording, conditions, `plan.COLUMNS`
-    surfaces.zarr/NAME               z_mm(frame, y, x), where surfaces were kept
-    recordings.csv                   a row a recording: state, problem, frames, means and ±
-    summary.csv                      a row a condition: means, ±, scatter between recordings
+    measures.parquet/NAME.parquet    row per frame: recording, conditions, `plan.COLUMNS`
+    surfaces.zarr/NAME               z_mm(frame, y, x), if surfaces were stored
+    recordings.csv                   row per recording: state, problem, frames, means and ±
+    summary.csv                      row per condition: means, ±, scatter between recordings
     outliers.csv                     frames and recordings far from the others
-    summary.html                     the same to look at
+    summary.html                     the same as a page
 """
 
 from __future__ import annotations
@@ -51,14 +51,12 @@ from labapp.run.study.summary import (
 )
 from labapp.text import csv_text, now
 
-EXTRA = "pip install 'labapp[study]' brings"
-
 CHUNK = 64
-"""Frames of a chunk of surfaces."""
+"""Frames per chunk of surfaces."""
 
 
 def require_extra() -> None:
-    """Raise unless the packages that write results are there.
+    """Check that the packages that write results are installed.
 
     Raises
     ------
@@ -69,7 +67,7 @@ def require_extra() -> None:
         try:
             __import__(name)
         except ImportError as error:
-            expected = f"this package, which {EXTRA}"
+            expected = "this package: pip install 'labapp[study]'"
             raise InputError("study", name, "is not installed", expected) from error
 
 
@@ -130,14 +128,14 @@ def _is_number(plan: StudyPlan, name: str) -> bool:
 
 
 def _counted(status: RecordingStatus, frames: int) -> RecordingStatus:
-    """A status with the frames that could be read: damaged files count no longer."""
+    """Return the status with the number of readable frames, without those of damaged files."""
     if frames == status.frames_done:
         return status
     return replace(status, state="part" if frames else "waiting", frames_done=frames)
 
 
 def assembled(tasks: Tasks) -> tuple[Table | None, SetupVerdict | None]:
-    """All rows of a recording as far as it is measured, and what they say of the set-up.
+    """Return all measured rows of a recording, and their verdict on the set-up.
 
     A damaged file is deleted, so that its stretch is measured again.
     """
@@ -280,7 +278,7 @@ def _put(
     group: Any, name: str, values: Any, dimensions: Sequence[str], unit: str, description: str
 ) -> None:
     about = _about(dimensions, unit, description)
-    # No fill value: readers take it for unknown.
+    # No fill value, which readers would interpret as missing.
     group.create_array(name, data=values, fill_value=None, attributes=about)
 
 
@@ -290,7 +288,7 @@ def _about(dimensions: Sequence[str], unit: str, description: str) -> dict[str, 
 
 @contextmanager
 def _replaced(target: Path, beside: Path) -> Iterator[Path]:
-    """Temporary folder that takes the place of another when the block ends without error."""
+    """Yield a temporary folder, which replaces ``target`` unless the block raises."""
     part = beside / f".{secrets.token_hex(8)}.part"
     part.mkdir()
     try:

@@ -1,4 +1,4 @@
-"""Sections and scans of the back side, brought to the frames of a study's recordings."""
+"""Assignment of sections and back-side scans to the frames of a study's recordings."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ LARGEST_FILE = 64_000_000
 
 WANTED = (
     "a table with recording, position_mm or time_s, one column of penetration such as "
-    "back_width_mm, and perhaps its ± such as back_width_sigma_mm"
+    "back_width_mm, and optionally its ± such as back_width_sigma_mm"
 )
 
 PLACES = ("time_s", "position_mm", "start_mm", "travel_mm_s")
-"""Columns that say where a section is."""
+"""Columns for the position of a section."""
 
 NEAR_S = 0.1
-"""A section belongs to the nearest frame with a surface, if that is so near."""
+"""Largest time between a section and the nearest frame with a surface, s."""
 
 
 def study_features(
     plan: StudyPlan, tables: Mapping[str, Table], sections: Path | None
 ) -> tuple[FeatureTable, int]:
-    """Features of the recordings with sections, and how many sections no frame is near to.
+    """Return features of the recordings with sections, and the number of unassigned sections.
 
     Parameters
     ----------
@@ -44,13 +44,13 @@ def study_features(
     tables
         Columns of each recording (`Study.tables`).
     sections
-        Table of sections (`WANTED`); ``start_mm`` and ``travel_mm_s`` may be columns, and come
-        before conditions. None: no sections, and all recordings.
+        Table of sections (`WANTED`); ``start_mm`` and ``travel_mm_s`` may be columns, which
+        override conditions. None: no sections, and all recordings.
 
     Raises
     ------
     InputError
-        If the table of sections is wrong, or none of them is near a frame.
+        If the table of sections is invalid, or none of them is near a frame.
     """
     series = {name: _series(name, table) for name, table in tables.items()}
     if not series:
@@ -80,7 +80,7 @@ def _series(name: str, table: Table) -> WeldSeries:
 def _read(
     plan: StudyPlan, path: Path
 ) -> tuple[str, np.ndarray, FloatArray, FloatArray, FloatArray]:
-    """Name of the penetration; recording, time, penetration and ± of each section."""
+    """Read the name of the penetration; recording, time, penetration and ± of each section."""
     read = read_columns(path, WANTED, LARGEST_FILE, ("recording",))
     names = read.pop("recording", None)
     columns = {name: of for name, of in read.items() if isinstance(of, np.ndarray)}
@@ -117,7 +117,7 @@ def _read(
 def _given(
     plan: StudyPlan, of: np.ndarray, columns: Mapping[str, FloatArray], name: str
 ) -> FloatArray:
-    """A column of sections; where it is empty, the condition of that name."""
+    """Return a column of sections; where it is empty, the condition of that name."""
     conditions = {one.name: one.conditions.get(name) for one in plan.recordings}
     by_name = [conditions[each] for each in of.tolist()]
     condition = np.array([np.nan if isinstance(v, str) or v is None else v for v in by_name], float)
@@ -128,7 +128,7 @@ def _given(
 def _joined(
     one: WeldSeries, time_s: FloatArray, value: FloatArray, sigma: FloatArray
 ) -> tuple[WeldSeries, int]:
-    """Features with sections at their nearest frames, and how many sections are near to none."""
+    """Assign sections to the nearest frames; also returns the number of unassigned sections."""
     target, target_sigma = np.full((2, len(one.time_s)), np.nan)
     if not len(one.time_s):
         return one, len(time_s)

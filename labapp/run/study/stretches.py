@@ -1,8 +1,8 @@
-"""The tasks of a study, which processes anywhere do: a recording looked at, a stretch measured.
+"""The tasks of a study, for processes on any machine: examine a recording, measure a stretch.
 
-Each writes one file, complete or absent, that is named by all that its content follows from: a task
-that was done once is not done again, and one that is done twice writes the same bytes. The files
-are plain JSON and NumPy arrays; nothing in them is ever executed.
+Each task atomically writes one file, named by a digest of its inputs: a finished task is not
+repeated, and a repeated one writes the same bytes. The files are plain JSON and NumPy arrays;
+nothing in them is ever executed.
 """
 
 from __future__ import annotations
@@ -44,24 +44,24 @@ from labapp.system import sync_folder
 from labapp.version import VERSION
 
 FORMAT = 2
-"""Of the files; raised when a new program cannot use old ones."""
+"""Format of the files; increased when a new program cannot use old ones."""
 
 KEPT_RESIDUALS = 2 * MOST
-"""Frames of a recording whose residuals are kept, at most, to judge its set-up by."""
+"""Most frames of a recording whose residuals are stored, for the check of the set-up."""
 
 LARGEST_INDEX = 1 << 28
 LARGEST_STRETCH = 1 << 32
-"""Bounds of a file's content, bytes."""
+"""Limits of a file's content, bytes."""
 
-ROOM = "a folder that can be written, with room on its disk; what was done is kept: run again"
+ROOM = "a writable folder with enough disk space; finished frames are stored: run again"
 
 
 class CannotStore(InputError):
-    """A result cannot be written: no other one could."""
+    """A result cannot be written, which ends the run, as no other could be."""
 
 
 _turn = threading.Lock()
-"""One stretch at a time in a process: a cluster's workers may have several threads."""
+"""Lock for one stretch at a time per process, as a cluster's workers may have several threads."""
 
 
 # --- recordings ---------------------------------------------------------------------------------
@@ -69,7 +69,7 @@ _turn = threading.Lock()
 
 @dataclass(frozen=True)
 class FoundRecording:
-    """What a recording is, as far as its tasks need to know."""
+    """Facts about a recording that its tasks need."""
 
     stamp: str
     """Names, sizes and times of its files (`identity.stamp`)."""
@@ -85,13 +85,13 @@ class FoundRecording:
 
 
 def recording_file(folder: Path, recording: Path) -> Path:
-    """File about a recording in the folder of the results."""
+    """Return the path of the facts about a recording, in the folder of the results."""
     name = hashlib.sha256(as_bytes(str(recording))).hexdigest()[:32]
     return folder / "recordings" / f"{name}.json"
 
 
 def look_at_recording(recording: Path, folder: Path) -> None:
-    """Open a recording, identify it, and write what was found.
+    """Open a recording, identify it, and write the facts about it.
 
     Raises
     ------
@@ -118,7 +118,7 @@ def look_at_recording(recording: Path, folder: Path) -> None:
 
 
 def found_recording(recording: Path, folder: Path) -> FoundRecording | None:
-    """What was found of a recording, unless it has changed since, or was not looked at yet.
+    """Return the facts about a recording; None if not examined yet, or changed since.
 
     Raises
     ------
@@ -145,7 +145,7 @@ def found_recording(recording: Path, folder: Path) -> FoundRecording | None:
 
 @dataclass(frozen=True)
 class Stretch:
-    """Some frames of a recording that follow on each other, to be measured by one task."""
+    """Consecutive frames of a recording, to be measured by one task."""
 
     folder: Path
     """Folder of the results."""
@@ -157,14 +157,14 @@ class Stretch:
     warm: bool
     frames: range
     kept: range
-    """Frames whose residuals are kept."""
+    """Frames whose residuals are stored."""
     surfaces: bool = False
-    """Whether surfaces are kept, too."""
+    """Whether surfaces are also stored."""
     version: str = VERSION
 
     @property
     def key(self) -> str:
-        """Digest of everything that the result follows from."""
+        """Digest of all inputs of the result."""
         facts = {
             "format": FORMAT,
             "version": self.version,
@@ -178,12 +178,12 @@ class Stretch:
         return hashlib.sha256(as_bytes(json.dumps(facts, sort_keys=True))).hexdigest()[:40]
 
     def file(self, surfaces: bool) -> Path:
-        """File of the result, with surfaces or without."""
+        """Return the path of the result, with or without surfaces."""
         return self.folder / "stretches" / f"{self.key}{'-surfaces' * surfaces}.npz"
 
     @property
     def done(self) -> Path | None:
-        """File of the result; None if there is none yet. Surfaces bring all the rest, too."""
+        """Path of the result; None if there is none yet. A file with surfaces has all results."""
         choices = [self.file(True)] if self.surfaces else [self.file(False), self.file(True)]
         return next((each for each in choices if each.is_file()), None)
 
@@ -199,7 +199,7 @@ def stretches_of(
     warm: bool,
     surfaces: bool,
 ) -> list[Stretch]:
-    """Tasks that measure frames of a recording: as `RecordingMeasurer` divides them."""
+    """Return the tasks for the frames of a recording, divided as by `RecordingMeasurer`."""
     length = measurers.STRETCH
     every = -(-len(frames) // KEPT_RESIDUALS)
     identity = f"{found.size} {found.sha256}"
@@ -218,16 +218,16 @@ def stretches_of(
 
 
 def measure_stretch(stretch: Stretch) -> None:
-    """Measure a stretch and write its file; if it is there already, nothing is done.
+    """Measure a stretch and write its file, unless it exists already.
 
     Raises
     ------
     InputError
-        If the recording is no longer what it was, or cannot be opened, or this is another version
-        of labapp; `CannotStore` if the file cannot be written.
+        If the recording has changed or cannot be opened, or this is another version of labapp;
+        `CannotStore` if the file cannot be written.
     """
     if stretch.version != VERSION:
-        wanted = f"{stretch.version}, as where the study is run"
+        wanted = f"{stretch.version}, the version that runs the study"
         raise InputError("worker", "labapp", VERSION, wanted)
     with _turn:
         if stretch.done is not None:
@@ -247,7 +247,7 @@ def measure_stretch(stretch: Stretch) -> None:
 
 
 def _measured(stretch: Stretch, measurer: Measurer) -> bytes:
-    """The results of a stretch as one file."""
+    """Return the results of a stretch as the content of a file."""
     rows: list[Table] = []
     residuals: list[tuple[int, Residuals]] = []
     surfaces: list[tuple[int, FloatArray, tuple[int, int]]] = []
@@ -279,9 +279,9 @@ def _measured(stretch: Stretch, measurer: Measurer) -> bytes:
 
 
 def _grid(surface: Reconstruction) -> tuple[FloatArray, tuple[int, int]]:
-    """Heights on a grid, shape (rows, columns), NaN outside; indices (row, column) of the first.
+    """Return heights on a grid, shape (rows, columns), NaN outside, and its first (row, column).
 
-    Node (row, column) lies at Y = row · spacing, X = column · spacing.
+    Node (row, column) is at Y = row · spacing, X = column · spacing.
     """
     refuse_too_large(surface, SPACING_MM)
     x, y, z = grid_nodes(surface, SPACING_MM)
@@ -300,7 +300,7 @@ class StretchFile:
     Raises
     ------
     ValueError
-        If the file is damaged, or not that of the stretch; here and from every method.
+        If the file is damaged or belongs to another stretch; by the constructor and all methods.
     """
 
     def __init__(self, stretch: Stretch, path: Path) -> None:
@@ -323,7 +323,7 @@ class StretchFile:
         return found
 
     def measures(self) -> Table:
-        """The columns `plan.COLUMNS`, a row a frame."""
+        """Return the columns `plan.COLUMNS`, one row per frame."""
         table = {c.name: self._array(f"measures/{c.name}") for c in COLUMNS}
         frames = table["frame"].tolist()
         if frames != list(self._frames) or any(len(v) != len(frames) for v in table.values()):
@@ -331,7 +331,7 @@ class StretchFile:
         return table
 
     def residuals(self) -> dict[int, Residuals]:
-        """Residuals of some frames."""
+        """Return the residuals of the frames that have any."""
         found = {}
         for frame in self._numbers("residuals/", "/ray"):
             of = f"residuals/{frame}/"
@@ -342,16 +342,16 @@ class StretchFile:
         return found
 
     def surfaces(self) -> Sequence[int]:
-        """Frames that have a surface."""
+        """Return the frames that have a surface."""
         return self._numbers("surfaces/", "/z_mm")
 
     def low(self, frame: int) -> tuple[int, int]:
-        """Indices (row, column) of the first node of a frame's surface."""
+        """Return the indices (row, column) of the first node of a frame's surface."""
         row, column = self._array(f"surfaces/{frame}/low").tolist()
         return row, column
 
     def surface(self, frame: int) -> FloatArray:
-        """Heights of a frame's surface, shape (rows, columns), mm."""
+        """Return the heights of a frame's surface, shape (rows, columns), mm."""
         return np.asarray(self._array(f"surfaces/{frame}/z_mm"))
 
     def _numbers(self, begin: str, end: str) -> list[int]:
@@ -366,7 +366,7 @@ class StretchFile:
 
 
 def _write(path: Path, content: bytes) -> None:
-    """Write a file, complete or absent, and its name, to the disk."""
+    """Write a file atomically, and flush it and its name to disk."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         write_atomically(path, content)

@@ -1,4 +1,4 @@
-"""A study: its recordings measured, what is done of it, and its results (`Study`)."""
+"""Studies: running, progress and results (`Study`)."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ if TYPE_CHECKING:
 MARKER = "study.json"
 OWN_FOLDER = "a new or empty folder, or one with results of a study"
 OLD_S = 3600.0
-"""A temporary file this old is one that a killed process left."""
+"""Age at which a temporary file must be from a killed process, s."""
 
 
 class Study:
-    """A study: a file that names recordings, and a folder with what was measured of them.
+    """A study: a file that lists recordings, and a folder with their results.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ class Study:
     Raises
     ------
     InputError
-        If the file is no study, or the folder holds anything else.
+        If the file is not a study file, or the folder has other contents.
     """
 
     def __init__(self, path: Path, out: Path | None = None) -> None:
@@ -85,21 +85,21 @@ class Study:
         progress: Callable[[Progress], object] = lambda _: None,
         note: Callable[[str], object] = lambda _: None,
     ) -> list[RecordingStatus]:
-        """Measure what is not measured yet; interrupted at any moment, it can be run again.
+        """Measure the frames that are not measured yet; can be repeated after any interruption.
 
-        A recording that cannot be measured does not stop the others: its status says why.
+        A recording that cannot be measured does not stop the others: its status gives the reason.
 
         Parameters
         ----------
         workers
-            How many processes; None: one a core; 0: none, all is done in this one.
+            Number of processes; None: one per core; 0: measure in this process.
         scheduler
-            Address of a Dask scheduler, whose workers take the place of processes. They must see
+            Address of a Dask scheduler, whose workers are used instead of processes. They must see
             recordings and results under the same paths.
         surfaces
-            Whether to keep surfaces, too.
+            Whether to store surfaces, too.
         progress
-            Called now and then; may raise to stop.
+            Called regularly; may raise to stop.
         note
             Called with sentences for the user.
 
@@ -111,8 +111,8 @@ class Study:
         Raises
         ------
         InputError
-            If results cannot be written, another run is going on, or the scheduler is lost. What
-            was done is kept.
+            If results cannot be written, the study is being run already, or the connection to the
+            scheduler is lost. Finished frames are stored.
         """
         with self._alone():
             hired = local_workers(workers) if scheduler is None else dask_workers(scheduler)
@@ -125,7 +125,7 @@ class Study:
 
     @contextmanager
     def _alone(self) -> Iterator[None]:
-        """Make the folder, lock it against a second run, and delete what killed runs left."""
+        """Create the folder, lock it against a second run, and delete files of killed runs."""
         with os_errors_as_input(self.folder, "folder", OWN_FOLDER):
             self.folder.mkdir(parents=True, exist_ok=True)
             lock = FileLock(self.folder / ".lock")
@@ -135,7 +135,7 @@ class Study:
                 expected = "the other run to end, or to be stopped"
                 raise InputError(self.folder, "study", "is being run", expected) from error
             except NotImplementedError:
-                pass  # some network drives have no locks
+                pass  # some network drives do not support locks
         try:
             marker = {"program": "labapp", "version": VERSION, "study": self.path.name}
             write_file(self.folder / MARKER, as_bytes(json.dumps(marker) + "\n"))
@@ -150,7 +150,7 @@ class Study:
     # --- what is done ---------------------------------------------------------------------------
 
     def status(self, *, surfaces: bool = False) -> list[RecordingStatus]:
-        """What is done of each recording, in the order of the file.
+        """Return the progress of each recording, in the order of the file.
 
         Parameters
         ----------
@@ -182,7 +182,7 @@ class Study:
         return RecordingStatus(recording, state, problem, len(tasks.frames), count)
 
     def tasks(self, recording: StudyRecording, surfaces: bool = False) -> Tasks | None:
-        """The tasks that measure a recording; None as long as it was not looked at.
+        """Return the tasks that measure a recording; None if it was not examined yet.
 
         Parameters
         ----------
@@ -194,7 +194,7 @@ class Study:
         Raises
         ------
         InputError
-            If there is none: the recording is missing, or its setup or frames are wrong.
+            If the recording is missing, or its set-up or frames are invalid.
         """
         setup = read_setup(recording.setup)
         found = found_recording(recording.path, self.folder)
@@ -216,7 +216,7 @@ class Study:
         return self.folder / "problems" / f"{recording.name}.txt"
 
     def _problem(self, recording: StudyRecording) -> str:
-        """Why a recording failed when it was last run; empty if it did not."""
+        """Return why a recording failed in the last run; empty if it did not."""
         try:
             return self._problem_file(recording).read_text("utf-8")[:1000].strip()
         except (OSError, UnicodeDecodeError):
@@ -248,7 +248,7 @@ class Study:
     # --- results --------------------------------------------------------------------------------
 
     def tables(self) -> dict[str, Table]:
-        """Sizes and shape of all frames, ``plan.COLUMNS``, of each recording that has results.
+        """Return the columns ``plan.COLUMNS`` of each recording that has results.
 
         Raises
         ------
@@ -260,7 +260,7 @@ class Study:
         found = {}
         with self._alone():
             for one in self.plan.recordings:
-                with suppress(InputError):  # the status says so
+                with suppress(InputError):  # reported by the status
                     tasks = self.tasks(one)
                     table = None if tasks is None else assembled(tasks)[0]
                     if table is not None:
@@ -268,12 +268,12 @@ class Study:
         return found
 
     def features(self, sections: Path | None = None) -> FeatureTable:
-        """Features of all frames beside the penetration that sections tell (`FeatureTable.fit`).
+        """Return features of all frames, and penetration from sections (`FeatureTable.fit`).
 
         Parameters
         ----------
         sections
-            Table of sections (docs/penetration.md); None: none is known.
+            Table of sections (docs/penetration.md); None: no sections.
 
         Returns
         -------
@@ -283,7 +283,7 @@ class Study:
         Raises
         ------
         InputError
-            If nothing is measured yet, or the table is wrong.
+            If nothing is measured yet, or the table is invalid.
         """
         from labapp.run.study.sections import study_features
 
@@ -292,12 +292,12 @@ class Study:
         )[0]
 
     def results(self, *, surfaces: bool = False) -> StudySummary:
-        """Put together what is measured, and write it: tables, a summary, surfaces.
+        """Write the results so far: tables, a summary, surfaces.
 
         Parameters
         ----------
         surfaces
-            Whether to write `surfaces.zarr`, of recordings that were run with surfaces.
+            Whether to write `surfaces.zarr`, for recordings that were run with surfaces.
 
         Returns
         -------
@@ -314,7 +314,7 @@ class Study:
         with self._alone():
             parts = []
             for status in self.status():
-                with suppress(InputError):  # the status says so
+                with suppress(InputError):  # reported by the status
                     parts.append((status, self.tasks(status.recording)))
                     continue
                 parts.append((status, None))
@@ -322,7 +322,7 @@ class Study:
 
 
 class _Run:
-    """One run of a study: which tasks are left, and what becomes of them."""
+    """One run of a study: the remaining tasks and their outcome."""
 
     def __init__(
         self,
@@ -335,13 +335,13 @@ class _Run:
         self._progress = progress
         self._recordings = study.plan.recordings
         self._left: dict[int, int] = {}
-        """Stretches left of each recording that was looked at."""
+        """Remaining stretches of each examined recording."""
         self._frames: dict[int, int] = {}
         self._done = 0
         self._failed: set[int] = set()
 
     def go(self, workers: Workers) -> None:
-        """Measure what is left."""
+        """Do the remaining tasks."""
         run_jobs(self._first_jobs(), workers, self._finished, self._report)
         self._report()
 
@@ -350,7 +350,7 @@ class _Run:
             yield from self._jobs(number, look=True)
 
     def _jobs(self, number: int, look: bool) -> list[Job]:
-        """What is left to do of a recording: its stretches, or first to look at it."""
+        """Return the remaining jobs of a recording: its stretches, or first its examination."""
         recording = self._recordings[number]
         try:
             tasks = self._study.tasks(recording, self._surfaces)
@@ -392,7 +392,7 @@ class _Run:
         return []
 
     def _fail(self, number: int, error: Exception) -> None:
-        """Keep why a recording failed, and say so once."""
+        """Store why a recording failed, and notify the user once."""
         recording = self._recordings[number]
         text = str(error) if isinstance(error, InputError) else _fault(error)
         self._study.set_problem(recording, text)
@@ -410,7 +410,7 @@ class _Run:
 
 
 def _fault(error: Exception) -> str:
-    """What to say of an error that is no bad input, in a sentence."""
+    """Describe an error that is not an `InputError` in a sentence."""
     name = type(error).__name__
     if name in ("BrokenProcessPool", "KilledWorker"):
         return "the processes that measured it died again and again: is there enough memory?"

@@ -38,17 +38,17 @@ MOST_OUTLIERS = 100
 
 @dataclass(frozen=True)
 class Mean:
-    """Mean of a size, and how uncertain it is."""
+    """Mean of a size, and its uncertainty."""
 
     mean: float
     noise: float
     level: float
     setup: float
-    """Parts of its standard uncertainty; NaN where the scheme gives none."""
+    """Parts of its standard uncertainty; NaN if the scheme gives none."""
     scatter: float
-    """Standard deviation: of frames in a recording, of recordings under one condition."""
+    """Standard deviation of frames in a recording, or of recordings under one condition."""
     count: int
-    """How many of them."""
+    """Number of frames or recordings."""
 
     @property
     def sigma(self) -> float:
@@ -58,27 +58,27 @@ class Mean:
 
 @dataclass(frozen=True)
 class Outlier:
-    """A frame far from the others of its recording, or a recording from those like it."""
+    """A frame far from the others of its recording, or a recording far from similar ones."""
 
     recording: str
     file: str
     frame: int | None
-    """None: it is the mean of the recording."""
+    """None: the mean of the recording."""
     measure: str
     value: float
     usual: float
-    """The median of the others."""
+    """Median of the others."""
     times: float
-    """Its distance in standard deviations."""
+    """Distance in standard deviations."""
 
 
 @dataclass(frozen=True)
 class RecordingSummary:
-    """What was measured of a recording."""
+    """Results of a recording."""
 
     status: RecordingStatus
     statuses: Mapping[str, int]
-    """How many frames have each status."""
+    """Number of frames with each status."""
     setup_status: str
     """Status of the set-up (`Measurement.setup_status`)."""
     doubt: str
@@ -89,14 +89,14 @@ class RecordingSummary:
 
 @dataclass(frozen=True)
 class GroupSummary:
-    """What was measured under one condition: of recordings with the same conditions."""
+    """Results of the recordings with the same conditions."""
 
     conditions: Mapping[str, Condition]
     recordings: tuple[str, ...]
     frames: int
     """Frames with a surface."""
     means: Mapping[str, Mean]
-    """Mean of each of `SIZES`; each recording counts alike."""
+    """Mean of each of `SIZES`; recordings have equal weight."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +111,7 @@ class StudySummary:
 
 
 def recording_means(table: Table) -> dict[str, Mean]:
-    """Mean of each size over the frames with a surface; empty if there is none.
+    """Return the mean of each size over the frames with a surface; empty if there is none.
 
     Parameters
     ----------
@@ -139,7 +139,7 @@ def recording_means(table: Table) -> dict[str, Mean]:
 def group_recordings(
     conditions: Sequence[str], recordings: Sequence[RecordingSummary]
 ) -> tuple[GroupSummary, ...]:
-    """Means over the recordings that were made under the same conditions.
+    """Return means over the recordings with the same conditions.
 
     Noise is independent between recordings. Errors of the level and of the set-up are assumed to
     be common to all of them, and do not average out.
@@ -160,7 +160,7 @@ def group_recordings(
 
 
 def _order(values: Sequence[Condition | None]) -> list[tuple[int, float, str]]:
-    """Numbers before text before what is missing."""
+    """Return a sort key: numbers before text before missing values."""
     return [
         (2, 0.0, "") if v is None else (1, 0.0, v) if isinstance(v, str) else (0, float(v), "")
         for v in values
@@ -178,15 +178,15 @@ def _common(means: Sequence[Mean]) -> Mean:
 
 
 def _deviation(values: FloatArray) -> float:
-    """Standard deviation, estimated from n values; NaN of one."""
+    """Return the sample standard deviation; NaN for one value."""
     return float(np.std(values, ddof=1)) if len(values) > 1 else float("nan")
 
 
 def outlying_frames(status: RecordingStatus, table: Table) -> list[Outlier]:
-    """Frames whose size is far from the recording's median, the farthest first.
+    """Return frames with a size far from the recording's median, the farthest first.
 
-    Far is more than `FAR` times the standard deviation of most frames, and `FAR` times the frame's
-    own standard uncertainty by noise and level.
+    Far is more than `FAR` times the robust standard deviation of the frames, and `FAR` times the
+    frame's own standard uncertainty from noise and level.
     """
     measured = np.flatnonzero(table["status"] == "ok")
     if len(measured) < FEWEST_FRAMES:
@@ -207,7 +207,7 @@ def outlying_frames(status: RecordingStatus, table: Table) -> list[Outlier]:
 def outlying_recordings(
     groups: Sequence[GroupSummary], recordings: Sequence[RecordingSummary]
 ) -> list[Outlier]:
-    """Recordings whose mean is far from that of the others under the same conditions.
+    """Return recordings whose mean is far from that of the others under the same conditions.
 
     Far is outside the prediction interval of Student's t for one more recording, with
     probability `SURE`.
@@ -234,9 +234,9 @@ def outlying_recordings(
 
 
 def _times(values: FloatArray, own: FloatArray) -> FloatArray:
-    """Distance of values from their median in standard deviations, shape (n,).
+    """Return the distance of values from their median in standard deviations, shape (n,).
 
-    Of most values, or of its own if that is larger.
+    The unit is the robust standard deviation of all values, or the value's own σ if larger.
     """
     away = np.abs(values - np.median(values))
     deviation = np.maximum(MAD * np.median(away), own)

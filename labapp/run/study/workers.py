@@ -34,7 +34,7 @@ ATTEMPTS = 4
 TIMEOUT_S = 10
 """Longest wait for a scheduler's answer."""
 
-A_SCHEDULER = "the address of a Dask scheduler that runs, such as tcp://127.0.0.1:8786"
+A_SCHEDULER = "the address of a running Dask scheduler, such as tcp://127.0.0.1:8786"
 
 
 @dataclass(frozen=True)
@@ -42,10 +42,10 @@ class Job:
     """A task for one of the workers."""
 
     about: int
-    """Which recording it is about."""
+    """Index of its recording."""
     work: Callable[..., None]
     given: tuple[Any, ...]
-    """A function of a module, and its arguments."""
+    """A module-level function, and its arguments."""
     attempt: int = 1
 
 
@@ -78,12 +78,12 @@ def run_jobs(
         Called in this process with each finished job, and the error if its last attempt failed;
         returns the jobs that follow from it.
     poll
-        Called now and then; may raise to stop.
+        Called regularly; may raise to stop.
 
     Raises
     ------
     InputError
-        If the scheduler is lost.
+        If the connection to the scheduler is lost.
     """
     ready: deque[Job] = deque()
     pending: dict[Future[None], Job] = {}
@@ -170,7 +170,7 @@ class _Here(Executor):
 
 @contextmanager
 def local_workers(count: int | None) -> Iterator[Workers]:
-    """Processes of this machine.
+    """Start processes of this machine.
 
     Parameters
     ----------
@@ -190,12 +190,12 @@ def local_workers(count: int | None) -> Iterator[Workers]:
 
 @contextmanager
 def dask_workers(address: str) -> Iterator[Workers]:
-    """Workers of a Dask scheduler. Needs dask[distributed], which the extra ``study`` installs.
+    """Connect to a Dask scheduler. Needs dask[distributed], which the extra ``study`` installs.
 
     Parameters
     ----------
     address
-        Of the scheduler: ``tcp://HOST:PORT``.
+        Address of the scheduler: ``tcp://HOST:PORT``.
 
     Raises
     ------
@@ -205,7 +205,7 @@ def dask_workers(address: str) -> Iterator[Workers]:
     try:
         from distributed import Client
     except ImportError as error:
-        expected = "dask, which pip install 'labapp[study]' brings"
+        expected = "dask: pip install 'labapp[study]'"
         raise InputError("--scheduler", "dask", "is not installed", expected) from error
     logging.getLogger("distributed").setLevel(logging.CRITICAL)
     try:
@@ -230,7 +230,7 @@ def dask_workers(address: str) -> Iterator[Workers]:
 
 
 class _Slots:
-    """Twice as many tasks as there are threads, so that none waits; workers come and go."""
+    """Number of tasks: twice the number of threads, so that none is idle; varies over time."""
 
     def __init__(self, client: Any) -> None:
         self._client, self._at, self._count = client, -1.0, 1

@@ -1,1 +1,1 @@
-"""The session file: a database, its schema, and values as bytes."""
+"""The session file: database, schema, and serialisation of values."""

@@ -1,8 +1,8 @@
-"""Serialisation of values, exact to the bit: the blobs of the session file.
+"""Bit-exact serialisation of values: the blobs of the session file.
 
-A blob is ``LAB1``, the crc32 of what follows, and the compressed value: a JSON tree of plain
-values that refers to the arrays behind it by their offsets. Nothing in a blob is ever executed,
-and changed bytes are detected.
+A blob is ``LAB1``, the CRC-32 of what follows, and the compressed value: a JSON tree of plain
+values, which refers by offsets to the arrays after it. Nothing in a blob is ever executed, and
+changed bytes are detected.
 """
 
 from __future__ import annotations
@@ -34,21 +34,21 @@ SURFACES: dict[str, tuple[Any, str, Any, tuple[int, ...]]] = {
     "ThinPlateSurface": (ThinPlateSurface, "points_mm", FloatArray, (3,)),
     "FlatSurface": (FlatSurface, "level_mm", float, ()),
 }
-"""Surfaces that are not dataclasses: the class, its one argument, that one's type and shape."""
+"""Surfaces that are not dataclasses: class, its argument, the argument's type and shape."""
 
 SURFACE_NAMES = {made: name for name, (made, *_) in SURFACES.items()}
 
 LARGEST = 100_000_000
-"""Bound of an unpacked value, and of all its arrays, bytes: few bytes cannot fill the memory.
+"""Limit of an unpacked value, and of all its arrays, bytes; a small blob could fill the memory.
 
-An array that is stored once may be referred to a thousand times; each becomes an array of its own.
+Each reference to a stored array becomes a separate array.
 """
 
 LARGEST_TREE = 8_000_000
-"""Of these, bytes of JSON: every two of them may become a list of sixty bytes."""
+"""Limit of the JSON part, bytes: two bytes may become a list of sixty bytes."""
 
 MOST_SURFACE_POINTS = 4000
-"""Most points of all surfaces of a value: a thin plate's system grows with their square."""
+"""Most points of all surfaces of a value: a thin-plate system grows with their square."""
 
 UNREADABLE = (
     *(zlib.error, ValueError, TypeError, KeyError, IndexError, AttributeError, OverflowError),
@@ -59,7 +59,7 @@ CONTAINERS: dict[str, Any] = {kind.__name__: kind for kind in (list, tuple, froz
 
 
 class Damaged(ValueError):
-    """Bytes that differ from what was once written."""
+    """Stored bytes are damaged."""
 
 
 def pack(value: object) -> bytes:
@@ -68,9 +68,9 @@ def pack(value: object) -> bytes:
     Raises
     ------
     TypeError
-        If a value of another class is in it.
+        If it contains a value of another class.
     InputError
-        If it is larger than `LARGEST`, or its part without arrays than `LARGEST_TREE`.
+        If it is larger than `LARGEST`, or its JSON part than `LARGEST_TREE`.
     """
     content = _canonical(value)
     tree = int.from_bytes(content[:4], "little")
@@ -82,13 +82,13 @@ def pack(value: object) -> bytes:
 
 
 def unpack(blob: object, kind: Any = Any) -> Any:
-    """Deserialise what `pack` gave, of a class or type; numbers bit for bit, arrays read-only.
+    """Deserialise the result of `pack`, of a class or type, with read-only arrays.
 
     Raises
     ------
     Damaged
-        If the bytes were changed or cut off, or hold another type, a class unknown to this version,
-        or one whose fields do not fit it.
+        If the bytes were changed or truncated, or contain another type, an unknown class, or one
+        with invalid fields.
     """
     if not isinstance(blob, bytes):
         raise Damaged("it is no blob")
@@ -109,7 +109,7 @@ def unpack(blob: object, kind: Any = Any) -> Any:
 
 
 def unpack_from(path: Path, named: str, blob: object, kind: Any) -> Any:
-    """`unpack` what a session file holds under a name.
+    """`unpack` a value of a session file; errors have its name.
 
     Raises
     ------
@@ -131,12 +131,12 @@ def _decompressed(content: bytes) -> bytes:
 
 
 def fingerprint(value: object) -> str:
-    """SHA-256 of a value; equal values have equal fingerprints."""
+    """Return the SHA-256 of a value; equal values have equal fingerprints."""
     return hashlib.sha256(_canonical(value)).hexdigest()
 
 
 def fingerprint_of(blob: bytes) -> str:
-    """`fingerprint` of a packed value at the time of packing; fields added since do not change it.
+    """Return the `fingerprint` at the time of packing, not changed by fields added since.
 
     Raises
     ------
@@ -154,7 +154,7 @@ def _canonical(value: object) -> bytes:
 
 
 def _tree(value: object, arrays: dict[bytes, int]) -> object:
-    """JSON tree of a value; its arrays go into ``arrays``, bytes → offset, equal ones once."""
+    """Return the JSON tree of a value; adds its arrays to ``arrays``, bytes → offset."""
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, np.generic):
@@ -169,7 +169,7 @@ def _tree(value: object, arrays: dict[bytes, int]) -> object:
     if isinstance(value, dict):
         return {"dict": [[key, _tree(item, arrays)] for key, item in value.items()]}
     if isinstance(value, BoundedSurface):
-        value = value.unbounded  # the boundary is kept beside it, in the reconstruction
+        value = value.unbounded  # the reconstruction stores the boundary
     if type(value) in SURFACE_NAMES:
         name = SURFACE_NAMES[type(value)]
         return {name: _tree(getattr(value, SURFACES[name][1]), arrays)}
@@ -190,7 +190,7 @@ def _place(array: npt.NDArray[Any], arrays: dict[bytes, int]) -> int:
 
 
 class _Reader:
-    """Builds a value from its JSON tree and the bytes of its arrays, within bounds."""
+    """Builds a value from its JSON tree and the bytes of its arrays, within limits."""
 
     def __init__(self, content: memoryview) -> None:
         self._content = content
@@ -239,15 +239,15 @@ class _Reader:
         count = math.prod(shape)
         self._take(count * np.dtype(dtype).itemsize)
         found = np.frombuffer(self._content, dtype, count, place) if count else np.empty(0, dtype)
-        array = found.reshape(shape).copy()  # aligned, and free of the rest
+        array = found.reshape(shape).copy()  # aligned, without a reference to the content
         array.flags.writeable = False
         return array
 
-    def _surface(self, kind: str, from_what: Any) -> Any:
+    def _surface(self, kind: str, argument: Any) -> Any:
         surface, _, hint, shape = SURFACES[kind]
-        if not is_a(from_what, hint) or (shape and np.shape(from_what)[1:] != shape):
-            raise TypeError(f"a {kind} of a {type(from_what).__name__}")
-        self._points_left -= len(from_what) if shape else 0
+        if not is_a(argument, hint) or (shape and np.shape(argument)[1:] != shape):
+            raise TypeError(f"a {kind} of a {type(argument).__name__}")
+        self._points_left -= len(argument) if shape else 0
         if self._points_left < 0:
-            raise ValueError(f"its surfaces are made from more than {MOST_SURFACE_POINTS} points")
-        return surface(from_what)
+            raise ValueError(f"its surfaces have more than {MOST_SURFACE_POINTS} points")
+        return surface(argument)

@@ -1,7 +1,7 @@
-"""The session file as a database: one writer, atomic transactions, errors a user can act on.
+"""The session file as a database: one writer, atomic transactions, errors for users.
 
-The journal is SQLite's rollback journal (docs/adr/0011): between two changes the file is complete
-by itself, so that it can be copied, moved and kept on a network drive.
+The journal is SQLite's rollback journal (docs/adr/0011): between changes the session is a single
+complete file, which can be copied, moved and stored on a network drive.
 """
 
 from __future__ import annotations
@@ -29,25 +29,25 @@ from labapp.session.file.schema import APPLICATION_ID, MIGRATIONS, TABLES, VERSI
 SUFFIX = ".labsession"
 A_SESSION = f"a labapp session ({SUFFIX})"
 
-INTACT_SESSION = "a whole session: a copy from before"
+INTACT_SESSION = "an intact session, such as a backup"
 
 BUSY_S = 5.0
-"""Time that a reader waits for the writer's change to end, and the writer for a reader."""
+"""Time that readers and the writer wait for each other, s."""
 
 LARGEST_BLOB = 1 << 30
 
 HEADER_BYTES = 100
 SQLITE_MAGIC = b"SQLite format 3\x00"
 ROLLBACK_JOURNAL = b"\x01\x01"
-"""In the header, of the program that wrote the file last and of those that may read it."""
+"""Write and read version of the file format in the header."""
 
 COUNTERS = "CREATE TABLE sqlite_sequence(name,seq)"
-"""SQLite's own table, for AUTOINCREMENT."""
+"""SQLite's internal table for AUTOINCREMENT."""
 
 JOURNAL_MAGIC = b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7"
-"""A journal begins with it, and ends with it if it names a super-journal before."""
+"""First bytes of a journal; also its last bytes if it names a super-journal."""
 
-OWN_JOURNAL = "one that labapp wrote, or none: this came from elsewhere"
+OWN_JOURNAL = "a journal written by labapp, or none: this one is from another program"
 
 
 class SessionInUse(InputError):
@@ -63,9 +63,9 @@ class Database:
 
     def __init__(self, path: Path, read_only: bool, lock: FileLock | None) -> None:
         self.path = path
-        """The file."""
+        """Path of the file."""
         self.read_only = read_only
-        """Whether it was opened so."""
+        """Whether it was opened read-only."""
         self._lock = lock
         self._mutex = threading.RLock()
         self._temporary: Path | None = None
@@ -73,17 +73,17 @@ class Database:
 
     @classmethod
     def create(cls, path: str | os.PathLike[str]) -> Database:
-        """Make a new session file.
+        """Create a session file.
 
         Raises
         ------
         InputError
-            If there is a file of that name, or it cannot be written.
+            If the file exists already, or it cannot be written.
         """
         path = new_session_path(path)
         lock = _lock(path)
         try:
-            # Made beside its place: a crash on the way leaves no session that is none.
+            # Created as a temporary file, so that a crash leaves no invalid session.
             with (
                 atomic_file(path) as part,
                 _translated_errors(path),
@@ -107,14 +107,14 @@ class Database:
 
     @classmethod
     def open(cls, path: str | os.PathLike[str], read_only: bool = False) -> Database:
-        """Open a session file. One of an earlier version is copied, then brought up to date.
+        """Open a session file. A file of an earlier version is backed up, then migrated.
 
         Raises
         ------
         SessionInUse
-            If it is to be written and another program has it open for that.
+            If it is to be opened for writing, and another program has done so.
         InputError
-            If it cannot be read, is no session, or is one of a newer version.
+            If it cannot be read, is not a session, or has a newer version.
         """
         require(path, PATH, "session", "path", "the path of a .labsession")
         path = Path(path).absolute()
@@ -136,14 +136,14 @@ class Database:
 
     @classmethod
     def _open_to_read(cls, path: Path) -> Database:
-        """Open without changing the file; a migration or a rollback is done in a copy."""
+        """Open without changing the file; migration and rollback are done in a copy."""
         if _check_header(path) == VERSION:
             database = cls(path, read_only=True, lock=None)
             try:
                 _roll_back(database._connection)
                 return database._checked()
             except sqlite3.OperationalError:
-                database.close()  # an unfinished change is to be rolled back
+                database.close()  # an unfinished change must be rolled back
             except BaseException:
                 database.close()
                 raise
@@ -172,7 +172,7 @@ class Database:
         _release(self._lock)
 
     def rows(self, sql: str, *values: object) -> list[tuple[Any, ...]]:
-        """All rows of a query, read at once so that no reader blocks the writer.
+        """Return all rows of a query, fetched at once so that readers do not block the writer.
 
         Raises
         ------
@@ -183,17 +183,17 @@ class Database:
             return self._connection.execute(sql, values).fetchall()
 
     def value(self, sql: str, *values: object) -> Any:
-        """First value of the first row of a query; None if there is none."""
+        """Return the first value of the first row of a query; None if there is none."""
         found = self.rows(sql, *values)
         return found[0][0] if found else None
 
     def array(self, values: Sequence[object], kind: type[np.generic]) -> npt.NDArray[Any]:
-        """Values of a column as an array; None becomes NaN.
+        """Return the values of a column as an array; None becomes NaN.
 
         Raises
         ------
         InputError
-            If they are not numbers, which is damage.
+            If they are not numbers: the file is damaged.
         """
         try:
             return np.array(values, kind)
@@ -202,12 +202,12 @@ class Database:
 
     @contextmanager
     def transaction(self) -> Iterator[sqlite3.Connection]:
-        """Atomic change of the file; a nested one joins the outer.
+        """Change the file atomically; a nested transaction joins the outer one.
 
         Raises
         ------
         InputError
-            If the session is read-only or the file cannot be written; what it held before stands.
+            If the session is read-only or the file cannot be written; the file is unchanged then.
         """
         if self.read_only:
             raise InputError(
@@ -228,7 +228,7 @@ class Database:
                 raise
 
     def problems(self) -> list[str]:
-        """SQLite's own findings on the file's integrity; empty if there are none."""
+        """Return problems found by SQLite's integrity checks; empty if there are none."""
         found = [str(text) for (text,) in self.rows("PRAGMA integrity_check")]
         loose = self.rows("PRAGMA foreign_key_check")
         return [text for text in found if text != "ok"] + [
@@ -236,7 +236,7 @@ class Database:
         ]
 
     def _checked(self) -> Database:
-        """Refuse a file whose tables are not those of this version."""
+        """Raise if the tables are not those of this version."""
         try:
             with _translated_errors(self.path):
                 _check_tables(self._connection, self.path)
@@ -247,12 +247,12 @@ class Database:
 
 
 def new_session_path(path: str | os.PathLike[str]) -> Path:
-    """Absolute path of a session to be created.
+    """Return the absolute path of a session to be created.
 
     Raises
     ------
     InputError
-        If that is no name of a session, or there is a file of that name.
+        If the name does not end in `SUFFIX`, or the file exists already.
     """
     require(path, PATH, "session", "path", "the path of a .labsession")
     path = Path(path).absolute()
@@ -264,10 +264,8 @@ def new_session_path(path: str | os.PathLike[str]) -> Path:
 
 
 def _check_header(path: Path) -> int:
-    """Version of a session file, read without SQLite, whose errors would not say what is wrong."""
-    from labapp.media.formats.stored import (
-        regular_size,  # late: it loads what reads every recording
-    )
+    """Return the version of a session file, read without SQLite for more specific errors."""
+    from labapp.media.formats.stored import regular_size  # late import: it is slow
 
     with os_errors_as_input(path, "file", A_SESSION):
         regular_size(path)
@@ -278,7 +276,7 @@ def _check_header(path: Path) -> int:
     if int.from_bytes(header[68:72], "big") != APPLICATION_ID:
         raise InputError(path, "content", "a database of another program", A_SESSION)
     if header[18:20] != ROLLBACK_JOURNAL:
-        # SQLite would leave files of its own beside it, even to read.
+        # SQLite would create further files beside it, even for reading.
         raise InputError(path, "content", "another kind of journal, or damaged", INTACT_SESSION)
     version = int.from_bytes(header[60:64], "big")
     if version > VERSION:
@@ -294,22 +292,22 @@ def _check_header(path: Path) -> int:
 
 
 def _journal_of(path: Path) -> Path:
-    """Where SQLite keeps the journal of a session: beside the file itself, not beside a link."""
+    """Return the path of SQLite's journal: beside the file itself, not beside a link to it."""
     return Path(f"{os.path.realpath(path)}-journal")
 
 
 def _check_journal(path: Path) -> None:
-    """Refuse a journal that is not one of ours, before SQLite sees it.
+    """Raise if there is a foreign journal, before SQLite reads it.
 
-    A journal that ends with the name of a super-journal has SQLite read that file as a list of
-    further journals, and delete it. Only changes over several databases have one: no session's.
+    If a journal ends with the name of a super-journal, SQLite reads that file as a list of further
+    journals, and deletes it. Only changes of several databases have one, never those of a session.
     """
     journal = _journal_of(path)
     try:
         if not os.path.lexists(journal):
             return
         if not stat.S_ISREG(journal.lstat().st_mode):
-            raise InputError(journal, "journal", "is no file", OWN_JOURNAL)
+            raise InputError(journal, "journal", "is not a file", OWN_JOURNAL)
         with journal.open("rb") as file:
             size = file.seek(0, os.SEEK_END)
             file.seek(max(0, size - len(JOURNAL_MAGIC)))
@@ -357,23 +355,23 @@ def _closing(connection: sqlite3.Connection) -> Iterator[sqlite3.Connection]:
 
 
 def _roll_back(connection: sqlite3.Connection) -> None:
-    """Have SQLite roll back an unfinished change, as it does at the first reading."""
+    """Roll back an unfinished change, which SQLite does at the first read."""
     connection.execute("SELECT count(*) FROM sqlite_master").fetchone()
 
 
 def _check_tables(connection: sqlite3.Connection, path: Path) -> None:
-    """Refuse tables that are not those of this version; ``path`` is for the error."""
-    # Every statement counts, whatever the name: a trigger could rewrite results. Without one are
-    # the indexes of unique columns only.
+    """Raise if the tables are not those of this version; ``path`` is for the error."""
+    # Compare every statement: a trigger could rewrite results. Only the automatic indexes of unique
+    # columns have none.
     found = connection.execute("SELECT sql FROM sqlite_master WHERE sql IS NOT NULL").fetchall()
     if sorted(str(sql) for (sql,) in found) != sorted((*TABLES, COUNTERS)):
         raise InputError(path, "tables", "not those of a session", A_SESSION)
 
 
 def _migrate(path: Path, version: int) -> None:
-    """Migrate a file to the present version; a copy of the former one stays beside it.
+    """Migrate a file to the present version, with a backup beside it.
 
-    A file that would be refused afterwards is refused before anything is written.
+    A trial migration, rolled back, raises the errors before anything is written.
     """
     _apply_migrations(path, version, path, end="ROLLBACK")
     kept = path.with_name(f"{path.stem}.version-{version}{SUFFIX}")
@@ -384,12 +382,12 @@ def _migrate(path: Path, version: int) -> None:
 
 
 def _apply_migrations(file: Path, version: int, path: Path, end: str = "COMMIT") -> None:
-    """Migrate a file in a transaction that ends so; errors name ``path``.
+    """Migrate a file in a transaction that ends with ``end``; errors name ``path``.
 
     Raises
     ------
     InputError
-        If its tables would not be those of a session; the file is unchanged.
+        If the tables would not be those of a session; the file is unchanged then.
     """
     with _closing(_connect(file, read_only=False)) as connection:
         connection.execute("BEGIN IMMEDIATE")
@@ -402,7 +400,7 @@ def _apply_migrations(file: Path, version: int, path: Path, end: str = "COMMIT")
 
 
 def _lock(path: Path) -> FileLock:
-    """Lock the session for writing. The lock ends with the process, however that ends."""
+    """Lock the session for writing; the operating system releases the lock with the process."""
     lock = FileLock(path.with_name(f".{path.name}.lock"))
     try:
         if not path.parent.is_dir():
@@ -441,7 +439,7 @@ SQLITE_ERRORS: Sequence[tuple[tuple[int, ...], str, str, str]] = (
     (
         (sqlite3.SQLITE_BUSY, sqlite3.SQLITE_LOCKED),
         "session",
-        "another program is using it and does not let go",
+        "in use by another program",
         "to try again, or close it there",
     ),
     (

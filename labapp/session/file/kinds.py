@@ -24,7 +24,7 @@ def check_fields(value: Any, shapes: Mapping[str, str]) -> None:
     Parameters
     ----------
     shapes
-        Shape of every array, as in ``"n 3"``; equal letters are equal lengths.
+        Shape of every array, such as ``"n 3"``; equal letters are equal lengths.
 
     Raises
     ------

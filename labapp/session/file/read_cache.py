@@ -9,12 +9,12 @@ from labapp.session.file.database import Database
 
 
 class ReadCache:
-    """Values by name: a window reads them often, and must not wait while results are saved.
+    """Cached values, so that the app need not wait for the database while results are saved.
 
     Parameters
     ----------
     database
-        Where they are from. This program alone writes to it, unless it is open read-only.
+        Source of the values. Only this program writes to it, unless it is open read-only.
     """
 
     def __init__(self, database: Database) -> None:
@@ -23,18 +23,18 @@ class ReadCache:
         self._version: object = None
 
     def get(self, name: Hashable, read: Callable[[], Any]) -> Any:
-        """Cached value of a name; on a miss, ``read()``."""
+        """Return the cached value of a name; on a miss, that of ``read()``."""
         if self._database.read_only:
-            version = self._database.value("PRAGMA data_version")  # another program's changes
+            version = self._database.value("PRAGMA data_version")  # changed by other programs
             if version != self._version:
                 self._version = version
                 self.clear()
         values = self._values
         if name not in values:
-            # Cleared meanwhile, it goes into a dict that nobody reads any more.
+            # If `clear` is called during the read, the value goes into a discarded dict.
             values[name] = read()
         return values[name]
 
     def clear(self) -> None:
-        """Discard every value, as after a change."""
+        """Discard all values, after a change."""
         self._values = {}

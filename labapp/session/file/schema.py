@@ -1,21 +1,20 @@
-"""Tables of the session file, and how files of earlier versions are brought up to date.
+"""Tables of the session file, and migrations of files of earlier versions.
 
-What the operator says is in `document`, one row per thing; every change of it is in `change` with
-the value before and after. What was filmed is in `recording` and `frame`, what was measured in
-`result`, with the `inputs` it was measured from and what all results from these say of the set-up.
-Nothing else is stored that follows from these.
+The operator's input is in `document`, one row per document; `change` has every change with the
+values before and after. `recording` and `frame` have the frames, `result` the measurements, and
+`inputs` their inputs with the verdict on the set-up. Data derived from these are not stored.
 """
 
 from __future__ import annotations
 
 APPLICATION_ID = 0x4C414250
-"""“LABP”, in SQLite's header: what makes a database a session."""
+"""“LABP” in SQLite's header, which identifies a session."""
 
 VERSION = 5
-"""Of the tables below. A change to them adds 1, and a step to `MIGRATIONS`."""
+"""Version of the tables below. A change to them adds 1, and a step to `MIGRATIONS`."""
 
 NO_FRAME = -1
-"""In place of a frame's number, for documents that belong to no frame."""
+"""Frame number of documents that belong to no frame."""
 
 MEASURES = (
     "are_mm mre_mm are_inner_mm mre_inner_mm width_mm length_mm height_mm depth_mm area_mm2 "
@@ -30,7 +29,7 @@ MEASURES = (
     "convexity_sigma_level_mm asymmetry_sigma_level wetting_slope_sigma_level_deg "
     "convexity_sigma_setup_mm asymmetry_sigma_setup wetting_slope_sigma_setup_deg"
 ).split()
-"""Columns of `result` that repeat `Measures`, so that trends need not unpack every frame."""
+"""Columns of `result` that duplicate `Measures`, so that trends need not unpack every frame."""
 
 TABLES = (
     """CREATE TABLE document (
@@ -104,4 +103,4 @@ MIGRATIONS: dict[int, tuple[str, ...]] = {
     3: ("ALTER TABLE inputs ADD COLUMN verdict BLOB",),
     4: tuple(f"ALTER TABLE result ADD COLUMN {name} REAL" for name in MEASURES[32:44]),
 }
-"""From each earlier version, the statements that lead to the next."""
+"""Version → statements that migrate to the next version."""

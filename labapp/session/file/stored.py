@@ -1,8 +1,8 @@
-"""The names that values have in session files: a format of its own (docs/session-file.md).
+"""Names of classes and fields in session files (docs/session-file.md).
 
-A class or a field of the program may be renamed without a change to any file: here stands what it
-is called there, for ever. `tests/session/data/stored_names.json` holds every name that was ever
-written; a test fails where one can no longer be read, or a new one is not in it.
+A class or a field can be renamed in the program without a change of the files: this module defines
+its permanent name there. `tests/session/data/stored_names.json` has every name ever written; a test
+fails if one can no longer be read, or a new one is missing.
 """
 
 from __future__ import annotations
@@ -54,22 +54,22 @@ from labapp.session.signals import Signals
 
 @dataclass(frozen=True)
 class Stored:
-    """How values of a class are kept."""
+    """Storage of the instances of a class."""
 
     kind: Any
     renamed: Mapping[str, str] = field(default_factory=dict)
-    """Names of fields in files, and those of the class, where the two differ."""
+    """Names of fields in files → in the class, where these differ."""
     retired: Collection[str] = ()
-    """Names of fields that files of earlier versions have: left out when they are read."""
+    """Names of fields in files of earlier versions that are ignored."""
     shapes: Mapping[str, str] = field(default_factory=dict)
     """Shape of every array; equal letters are equal lengths."""
     fits: Callable[[Any], bool] = lambda _: True
-    """Whether the fields of a value fit each other."""
+    """Whether the fields of a value are consistent."""
 
     def names(self) -> dict[str, str]:
-        """Names of the fields in files, and those of the class."""
+        """Return the names of all fields, in files → in the class."""
         in_files = {ours: theirs for theirs, ours in self.renamed.items()}
-        names = (own.name for own in fields(self.kind))
+        names = (each.name for each in fields(self.kind))
         return {in_files.get(name, name): name for name in names}
 
 
@@ -114,7 +114,7 @@ def _boards_fit(value: Any) -> bool:
 
 
 def _lines_fit(value: Any) -> bool:
-    """Whether each line has points, and a surface is of lines that are there and not folded."""
+    """Whether each line has points, and a surface belongs to the lines that are not folded."""
     lines, surface = value.seen.lines, value.surface
     count = sum(not one.folded for one in lines)
     return all(len(one.image_px) > 1 for one in lines) and (
@@ -257,6 +257,6 @@ STORED = {
     "SetupVerdict": Stored(SetupVerdict),
     "Suspect": Stored(Suspect),
 }
-"""What a session may hold, by its name there."""
+"""Classes in a session, by their names there."""
 
 NAMES = {stored.kind: name for name, stored in STORED.items()}

@@ -33,7 +33,7 @@ from labapp.session.report.results import (
 from labapp.version import VERSION
 
 POOL_MM = (7.0, 0.3)
-"""Length and height of the pool in the side view where none is expected or measured."""
+"""Length and height of the pool in the side view if none is expected or measured."""
 
 
 def report_pdf(
@@ -43,24 +43,24 @@ def report_pdf(
     now: datetime.datetime | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> bytes:
-    """Report on a session as PDF, A4; sections without content say so.
+    """Return a report on a session as PDF, A4; sections without content say so.
 
     Parameters
     ----------
     scheme
-        Whose results; None: of the one that the settings choose.
+        Scheme of the results; None: that of the settings.
     frames
-        Which frames; None: all of the session's.
+        Frames to report; None: all frames of the session.
     now
-        The report's date; None: this moment. The same session, libraries and date give the same
-        bytes.
+        Date of the report; None: the present time. The same session, libraries and date give the
+        same bytes.
     progress
         Called with the number of frames done; may raise to stop.
 
     Raises
     ------
     InputError
-        If a frame is asked for that the session does not have, or what it notes is damaged.
+        If the session does not have a requested frame, or is damaged.
     """
     now = now or datetime.datetime.now().astimezone()
     report = ReportData.of(session, scheme, frames, progress)
@@ -114,7 +114,7 @@ def _experiment(story: Story, report: ReportData, title: str) -> None:
         story.part("Safety and preparation")
         story.listing([(time.replace("T", " "), item) for item, time in ticked(record)])
     else:
-        story.text("No item of the lists of safety and preparation was ticked.")
+        story.text("No item of the checklists was ticked.")
     story.part("Recording")
     _recording(story, session)
     story.part("Measured by")
@@ -164,8 +164,8 @@ def _recording(story: Story, session: SessionContents) -> None:
     )
     if (missing := session.missing_recording) is not None:
         story.text(
-            f"The recording is not where it was ({missing.name}): what was measured "
-            "stands, its frames cannot be shown."
+            f"The recording is missing ({missing.name}): the results are valid, but its frames "
+            "cannot be shown."
         )
 
 
@@ -198,7 +198,7 @@ def _set_up(story: Story, report: ReportData) -> None:
 
 
 def _pool_size(report: ReportData) -> tuple[float, float]:
-    """Length and height of the pool for the side view, mm: measured, else expected."""
+    """Return length and height of the pool for the side view, mm: measured, else expected."""
     record = report.session.record
     length, height = data.values(report.lines, "length_mm"), data.values(report.lines, "height_mm")
     depth = data.values(report.lines, "depth_mm")
@@ -280,7 +280,7 @@ def _plane(story: Story, report: ReportData) -> None:
     x_sigma, z_sigma, angle_sigma = found.scales_and_angle_sigma
     unit = "a square of the board" if is_board else "a unit of the axes"
     story.table(
-        f"What was found in the calibration picture; {unit} is {plane.unit_mm:.6g} mm. "
+        f"Points found in the calibration picture; {unit} is {plane.unit_mm:.6g} mm. "
         f"Scale {along_x:.4f} ± {x_sigma:.4f} px/mm along O′X′, "
         f"{along_z:.4f} ± {z_sigma:.4f} px/mm along O′Z′; "
         f"{found.angle_deg:.3f} ± {angle_sigma:.3f}° between them.",
@@ -328,8 +328,8 @@ def _bench_check(story: Story, report: ReportData) -> None:
         for name, *values in one.measured
     ]
     story.table(
-        "The mirrors, measured with the adjusted set-up as if their size were not known; "
-        "±: noise of the dots alone.",
+        "Sizes of the mirrors, measured with the adjusted set-up as if they were unknown; "
+        "±: dot noise only.",
         [["picture", "mirror", "known (mm)", "measured (mm)", "± (mm)"], *sizes],
         "llrrr",
         (0.3, 0.22, 0.16, 0.18, 0.14),
@@ -339,7 +339,7 @@ def _bench_check(story: Story, report: ReportData) -> None:
 
 
 def _is_laser(found: LaserCalibration, rig: Rig) -> bool:
-    """Whether the rig's laser is where this calibration found it."""
+    """Whether the rig's laser has the position of this calibration."""
     laser = rig.laser
     known = [found.angle_deg, found.distance_mm], [laser.projection_angle_deg, laser.distance_mm]
     return bool(np.allclose(*known, rtol=1e-6))
@@ -348,7 +348,7 @@ def _is_laser(found: LaserCalibration, rig: Rig) -> bool:
 def _is_calibration(
     found: PlaneCalibration | BoardCalibration, calibration: ImageCalibration
 ) -> bool:
-    """Whether the image calibration is the one that was found in the picture."""
-    own = found.image_calibration
-    same = np.allclose(own.matrix, calibration.matrix, rtol=1e-6, atol=1e-9)
-    return bool(same) and (own.lens is None) == (calibration.lens is None)
+    """Whether the image calibration is the one determined from the picture."""
+    original = found.image_calibration
+    same = np.allclose(original.matrix, calibration.matrix, rtol=1e-6, atol=1e-9)
+    return bool(same) and (original.lens is None) == (calibration.lens is None)

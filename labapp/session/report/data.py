@@ -27,10 +27,10 @@ from labapp.studies.error_budget import Contribution, total
 from labapp.text import pluralize
 
 DOUBTFUL_MARGIN = 5.0
-"""A frame is doubtful where another correspondence comes within this factor of the residual."""
+"""A frame is doubtful if the residual of another correspondence is within this factor."""
 
 ALL_FRAMES, SOME_FRAMES = 60, 20
-"""So many frames are listed one by one; of more, so many of the first and of the last."""
+"""Most frames that are all listed; of more, the number listed from the start and from the end."""
 
 NUMBER = re.compile(r"\d+(?:\.\d+)?")
 
@@ -54,33 +54,33 @@ class FrameLine:
 
     frame: int
     time_s: float
-    """Its number, and its time where it has one, else NaN."""
+    """Number, and time or NaN."""
     status: str = ""
     reason: str = ""
-    """As in `Measurement`; empty where it was not measured."""
+    """As in `Measurement`; empty if it was not measured."""
     stale: tuple[str, ...] = ()
-    """Why its result no longer stands, a clause each."""
+    """Reasons why its result is stale, one clause each."""
     corrected: bool = False
-    """Whether it was measured from dots and rows corrected by hand."""
+    """Whether it was measured with manually corrected dots and rows."""
     doubtful: bool = False
     """Whether another correspondence explains its dots nearly as well."""
     dots: int | None = None
     orientation: str = ""
     rows_allow: bool | None = None
-    """Whether the shape of the reflected rows allows its correspondence (§7.1); None: open."""
+    """Whether the shape of the reflected rows allows its correspondence (§7.1); None: unknown."""
     version: str = ""
-    """The labapp that measured it."""
+    """Version of labapp that measured it."""
     measures: Measures | None = None
     """Its sizes; None without a surface."""
 
     @property
     def counts(self) -> bool:
-        """Whether its sizes are in the means."""
+        """Whether its sizes are included in the means."""
         return self.measures is not None and not self.stale
 
     @property
     def state(self) -> str:
-        """Mark in the trends: ``measured``, ``doubtful``, ``stale``, else the status."""
+        """State in the trends: ``measured``, ``doubtful``, ``stale`` …, else the status."""
         if self.stale:
             return "stale"
         if self.measures is None:
@@ -90,7 +90,7 @@ class FrameLine:
         return "corrected by hand" if self.corrected else "measured"
 
     def size(self, name: str) -> float:
-        """One of its measures; NaN without a surface."""
+        """Return one of its measures; NaN without a surface."""
         return float(getattr(self.measures, name, math.nan))
 
 
@@ -100,7 +100,7 @@ class ReportData:
 
     session: SessionContents
     scheme: str
-    """Name of the scheme whose results are reported."""
+    """Name of the scheme of the results."""
     lines: list[FrameLine]
     setup: Setup | None
     """The present setup; None if it is incomplete."""
@@ -115,7 +115,7 @@ class ReportData:
         frames: Sequence[int] | None,
         progress: Callable[[int], None] | None = None,
     ) -> ReportData:
-        """Collect the frames of a session, or all; parameters as of `report_pdf`."""
+        """Collect the data of a report; parameters as for `report_pdf`."""
         scheme = scheme or scheme_name(session.settings)
         setup: Setup | None = None
         problems: tuple[InputError, ...] = ()
@@ -133,14 +133,14 @@ def frame_lines(
     frames: Sequence[int] | None,
     progress: Callable[[int], None] | None = None,
 ) -> list[FrameLine]:
-    """One line per frame from its result; a damaged result has the status ``damaged``.
+    """Return one line per frame from its result; a damaged result has the status ``damaged``.
 
     ``progress`` is called with the number of frames done; it may raise to stop.
 
     Raises
     ------
     InputError
-        If a frame is asked for that the session does not have.
+        If the session does not have a requested frame.
     """
     seen = session.overview(scheme)
     times = dict(zip(seen.frame.tolist(), seen.time_s.tolist(), strict=True))
@@ -164,7 +164,7 @@ def _frame_line(session: SessionContents, scheme: str, number: int, time_s: floa
     try:
         result = session.result(number, scheme)
     except InputError as error:
-        return FrameLine(number, time_s, "damaged", f"what was kept is damaged: {error.value}")
+        return FrameLine(number, time_s, "damaged", f"the result is damaged: {error.value}")
     if result is None:
         return FrameLine(number, time_s)
     found = result.measurement
@@ -187,13 +187,13 @@ def _frame_line(session: SessionContents, scheme: str, number: int, time_s: floa
 
 
 def rows_sentence(lines: Iterable[FrameLine]) -> str:
-    """In how many frames the shape of the rows allows the correspondence of least residual."""
+    """State in how many frames the shape of the rows allows the correspondence (§7.1)."""
     checked = [line for line in lines if line.rows_allow is not None]
     if not checked:
         return ""
     others = [line.frame for line in checked if not line.rows_allow]
     words = (
-        f"The shape of the reflected rows (§7.1) allows the correspondence of least residual in "
+        f"The shape of the reflected rows (§7.1) agrees with the correspondence in "
         f"{len(checked) - len(others)} of {pluralize(len(checked), 'frame')}"
     )
     return f"{words}, not in {format_ranges(others, ' to ', 6)}." if others else f"{words}."
@@ -205,9 +205,9 @@ def is_doubtful(measurement: Measurement) -> bool:
 
 
 def representative(lines: Iterable[FrameLine]) -> FrameLine | None:
-    """Frame whose height is nearest to the median; None if no frame counts.
+    """Return the frame whose height is nearest to the median; None if no frame counts.
 
-    For concave pools the depth is compared: whichever is farther from the work piece.
+    For concave pools the depth is compared.
     """
     counted = [line for line in lines if line.counts]
     if not counted:
@@ -218,27 +218,27 @@ def representative(lines: Iterable[FrameLine]) -> FrameLine | None:
 
 
 def values(lines: Iterable[FrameLine], name: str) -> FloatArray:
-    """Finite values of a measure over the frames that count, shape (n,)."""
+    """Return the finite values of a measure over the frames that count, shape (n,)."""
     found = np.array([line.size(name) for line in lines if line.counts])
     return np.asarray(found[np.isfinite(found)], np.float64)
 
 
 def number(value: float | None, digits: int) -> str:
-    """A number with fixed decimals, without the sign of −0; a dash if unknown."""
+    """Format a number with fixed decimals, without the sign of −0; a dash if unknown."""
     return UNKNOWN if value is None or not math.isfinite(value) else f"{value:z.{digits}f}"
 
 
 def with_unit(value: float | None, unit: str) -> str:
-    """A number with its unit; empty if None."""
+    """Format a number with its unit; empty if None."""
     return "" if value is None else f"{value:.6g} {unit}"
 
 
 def status_cells(lines: Sequence[FrameLine]) -> Cells:
-    """Outcomes with reason, number of frames and frame numbers; those that count first."""
+    """Tabulate outcomes with reason, number of frames and frame numbers; those that count first."""
     groups: dict[tuple[str, str], list[FrameLine]] = {}
     for line in lines:
         status, why = _outcome(line)
-        # The same sentence with other numbers in it is the same reason; the first is shown.
+        # Sentences that differ in numbers only are one reason; the first is shown.
         groups.setdefault((status, NUMBER.sub("#", why)), []).append(line)
     ranked = sorted(groups.items(), key=lambda item: (item[0][0] != "in the mean", item[0]))
     rows = [
@@ -259,7 +259,7 @@ def _outcome(line: FrameLine) -> tuple[str, str]:
 
 
 def statistics_cells(lines: Sequence[FrameLine]) -> Cells:
-    """Mean and its ±, standard deviation (Eq. 7-2 … 7-4), extremes, range, ± of a frame."""
+    """Tabulate mean and ±, standard deviation (Eq. 7-2 … 7-4), extremes, range, ± of a frame."""
     rows = []
     series = series_of([line.measures for line in lines if line.counts and line.measures])
     for name, (label, digits) in STATISTICS.items():
@@ -276,7 +276,7 @@ def statistics_cells(lines: Sequence[FrameLine]) -> Cells:
 
 
 def frame_cells(lines: Sequence[FrameLine]) -> Cells:
-    """Sizes and state of every frame; of more than `ALL_FRAMES` the first and the last."""
+    """Tabulate sizes and state of every frame; of more than `ALL_FRAMES` the first and last."""
     head = ["frame", "time (s)", "dots", *("width", "length", "height", "volume", "ARE"), "state"]
     shown = list(lines)
     if len(shown) > ALL_FRAMES:
@@ -302,7 +302,7 @@ def frame_cells(lines: Sequence[FrameLine]) -> Cells:
 def budget_cells(
     lines: Sequence[FrameLine], contributions: Sequence[Contribution], rig: Rig
 ) -> Cells:
-    """± of dots and fit, of each quantity of the set-up, and of all together."""
+    """Tabulate the ± from dots and fit, from each quantity of the set-up, and from all together."""
     digits = [STATISTICS[name][1] for name in SIZES]
     noise = np.array([_median_without_setup(lines, name) for name in SIZES])
     rows = [["dots and fit (median)", "", *_row(noise, digits)]]
@@ -319,7 +319,7 @@ def budget_cells(
 
 
 def _median_without_setup(lines: Sequence[FrameLine], name: str) -> float:
-    """Median ± of a size by noise and level; NaN where there is none."""
+    """Return the median ± of a size from noise and level; NaN if there is none."""
     each = np.array(
         [
             [line.size(sigma_name(name, part)) for part in ("", "setup")]
@@ -338,7 +338,7 @@ def _row(figures: FloatArray, digits: Sequence[int]) -> list[str]:
 
 
 def settings_cells(settings: Settings) -> Cells:
-    """Settings that differ from the defaults."""
+    """Tabulate the settings that differ from the defaults."""
     default = dict(_flat(Settings()))
     rows = [
         [name, str(value), str(default[name])]
@@ -358,7 +358,7 @@ def _flat(settings: Any, prefix: str = "") -> Iterable[tuple[str, object]]:
 
 
 def rig_cells(setup: Setup, status: str = "") -> Cells:
-    """The rig and the image calibration, with units; how far they can be relied on."""
+    """Tabulate the rig and the image calibration, with units and the set-up's status."""
     rig, plane = setup.rig, setup.rig.imaging_plane
     absent = ", ".join(f"({i}, {j})" for i, j in sorted(rig.pattern.absent_rays)[:8])
     x, y, z = plane.origin_mm
@@ -413,7 +413,7 @@ def _tilt_rows(plane: ImagingPlane) -> Cells:
 
 
 def _image_scale(setup: Setup) -> tuple[float, float, float]:
-    """Scale along O′X′ and O′Z′ at O′, px/mm, and the angle between them, degrees."""
+    """Return the scales along O′X′ and O′Z′ at O′, px/mm, and the angle between them, degrees."""
     step = 1e-3
     seen = setup.calibration.to_image(step * np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]))
     x_arm, z_arm = (seen[1:] - seen[0]) / step
@@ -422,7 +422,7 @@ def _image_scale(setup: Setup) -> tuple[float, float, float]:
 
 
 def corrections_cells(session: SessionContents, frames: Sequence[int]) -> Cells:
-    """Frames with a correction: dots, how many by hand, blocked rows."""
+    """Tabulate the corrected frames: dots, manual dots, blocked rows."""
     rows = []
     seen = session.overview()
     corrected = set(seen.frame[seen.corrected].tolist())
@@ -438,4 +438,4 @@ def corrections_cells(session: SessionContents, frames: Sequence[int]) -> Cells:
                     f"blocked rows {', '.join(map(str, blocked))}" if blocked else "",
                 ]
             )
-    return [["frame", "dots", "of them by hand", ""], *rows]
+    return [["frame", "dots", "manual dots", ""], *rows]

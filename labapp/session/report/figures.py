@@ -31,21 +31,21 @@ STATES = {
     "doubtful": {"marker": "o", "color": "#c05a00", "markerfacecolor": "white"},
     "stale": {"marker": "x", "color": "0.6", "markerfacecolor": "0.6"},
 }
-"""How frames are drawn over time: report apart by shape as well as colour."""
+"""Markers of frames over time; they differ by shape as well as colour."""
 
 
 @dataclass(frozen=True)
 class Series:
-    """A size over the frames; n of them."""
+    """A size over n frames."""
 
     label: str
     values: FloatArray
     sigma: FloatArray
-    """Shape (n,); NaN where there is none."""
+    """Values and their σ, shape (n,); NaN if unknown."""
 
 
 def side_view(rig: Rig, pool_mm: tuple[float, float]) -> bytes:
-    """The rig from the side, to scale, with a pool of (length, height), mm: laser, torch, rays."""
+    """Draw the rig from the side, to scale, with a pool of (length, height), mm."""
     laser, plane = rig.laser.position_mm, rig.imaging_plane
     top = plane.origin_mm + plane.height_mm * plane.z_axis
     middle = (rig.pattern.columns - 1) // 2
@@ -72,7 +72,7 @@ def side_view(rig: Rig, pool_mm: tuple[float, float]) -> bytes:
 
 
 def _draw_ray(view: Any, rig: Rig, direction: FloatArray, *, central: bool) -> None:
-    """A ray down to the work piece, and from there, as from a flat mirror, to the plane."""
+    """Draw a ray to the work piece, and its reflection from a flat mirror to the imaging plane."""
     laser = rig.laser.position_mm
     foot = intersect_level(laser, direction)
     after = reflect(direction, np.array([0.0, 0.0, 1.0]))
@@ -83,7 +83,7 @@ def _draw_ray(view: Any, rig: Rig, direction: FloatArray, *, central: bool) -> N
 
 
 def _draw_torch(view: Any, tip_mm: float, roof_mm: float) -> None:
-    """The electrode, a taper and a rod; sizes across it are not those of a torch."""
+    """Draw the electrode as a tapered rod; its width is not to scale."""
     rod = [(0, tip_mm), (1.2, tip_mm + 4), (1.2, roof_mm), (-1.2, roof_mm), (-1.2, tip_mm + 4)]
     view.add_patch(Polygon(np.array(rod), closed=True, fc="0.75", ec="0.3", lw=0.6, zorder=1))
 
@@ -113,7 +113,7 @@ def _label_rig(view: Any, rig: Rig, top: FloatArray) -> None:
 
 
 def target_picture(image: GreyImage, points_px: Sequence[Sequence[float]]) -> bytes:
-    """The calibration picture with O′ and both axes, to a point on each, drawn over it."""
+    """Draw the calibration picture with O′ and both axes."""
     origin, *ends = (np.array(point) for point in points_px)
     tips = [origin + 1.25 * (end - origin) for end in ends]
     corners = np.array([origin, *tips])
@@ -148,14 +148,14 @@ def target_picture(image: GreyImage, points_px: Sequence[Sequence[float]]) -> by
 
 
 def trends(axis: FloatArray, label: str, series: list[Series], states: list[str]) -> bytes:
-    """Sizes over time, one plot each, with ± one σ; every frame marked by its state.
+    """Plot sizes over time, one panel each, with ± one σ; markers show the state of each frame.
 
     Parameters
     ----------
     axis, label
-        Time or number of each frame, shape (n,), and what it is.
+        Time or number of each frame, shape (n,), and the label of the axis.
     states
-        Which of `STATES` each frame has; what is in none is not drawn.
+        State of each frame; frames with states other than `STATES` are not drawn.
     """
     with rc_context(STYLE):
         figure = new_figure(INCHES, 1.2 * len(series) + 0.4)
@@ -193,14 +193,14 @@ def _draw_trend(plot: Any, axis: FloatArray, series: Series, states: list[str]) 
 
 
 def dots_picture(image: GreyImage | None, measurement: Measurement) -> bytes:
-    """A frame, as a negative, with its dots ringed, a colour a row of rays.
+    """Draw a frame as a negative with its dots circled, coloured by row of rays.
 
     Parameters
     ----------
     image
-        The frame; None where it cannot be read: the dots alone.
+        The frame; None if it cannot be read: only the dots are drawn.
     measurement
-        What was found in it; there are dots.
+        Its measurement, with dots.
     """
     dots, match = measurement.dots, measurement.match
     assert dots is not None
@@ -232,12 +232,12 @@ def dots_picture(image: GreyImage | None, measurement: Measurement) -> bytes:
 
 
 def height_map(measurement: Measurement) -> bytes:
-    """The surface from above: height, boundary, reflection points, centre and peak."""
+    """Draw the surface from above: height, boundary, reflection points, centre and peak."""
     found, size = measurement.reconstruction, measurement.measures
     assert found is not None
     assert size is not None
     vertices, triangles = surface_mesh(found, drawn_spacing(found, 0.1))
-    # A surface that interpolates need not reach the boundary everywhere.
+    # An interpolating surface may not extend to the boundary everywhere.
     triangles = triangles[np.isfinite(vertices[triangles]).all(axis=(1, 2))]
     x, y, z = np.nan_to_num(vertices).T
     outline = np.vstack([found.boundary.points_mm, found.boundary.points_mm[:1]])
@@ -260,7 +260,7 @@ def height_map(measurement: Measurement) -> bytes:
 
 
 def dots_compared(measurement: Measurement) -> bytes:
-    """Captured and computed reflected dots over each other, on the imaging plane."""
+    """Draw captured and computed reflected dots on the imaging plane."""
     found, match = measurement.reconstruction, measurement.match
     assert found is not None
     assert match is not None
@@ -281,7 +281,7 @@ def dots_compared(measurement: Measurement) -> bytes:
 
 
 def positions(axis: FloatArray, label: str, places: Mapping[str, FloatArray]) -> bytes:
-    """The pool's centre and peak over time, X above Y (Fig. 7-15)."""
+    """Plot the pool's centre and peak over time, X above Y (Fig. 7-15)."""
     with rc_context(STYLE):
         figure = new_figure(INCHES, 2.3)
         plots = figure.subplots(2, sharex=True)

@@ -1,4 +1,4 @@
-"""A4 pages of text, tables and figures: what `report` is written with."""
+"""Layout of the report: A4 pages of text, tables and figures."""
 
 from __future__ import annotations
 
@@ -34,22 +34,22 @@ from reportlab.platypus import (
 )
 
 FONT = "DejaVuSans"
-"""Has Greek, Cyrillic and the signs of the field; comes with matplotlib."""
+"""Has Greek, Cyrillic and the symbols used; distributed with Matplotlib."""
 
 EASTERN = {
     "[\u1100-\u11ff\uac00-\ud7a3]+": "HYSMyeongJo-Medium",
     "[\u2e80-\u312f\u3400-\u9fff\uf900-\ufaff\uff00-\uffef]+": "STSong-Light",
 }
-"""Fonts that the PDF's reader brings along, for Korean, and for Chinese and Japanese."""
+"""Fonts of PDF readers for Korean, and for Chinese and Japanese."""
 
 MARGIN = 20 * mm
 WIDTH = A4[0] - 2 * MARGIN
 TALLEST = A4[1] - 4 * MARGIN
 DPI = 220
-"""Of figures."""
+"""Resolution of figures."""
 
 Cells = list[list[str]]
-"""A table's text, row by row, the header first."""
+"""Text of a table, row by row, the header first."""
 
 UNPRINTABLE = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\ud800-\udfff￾￿]")
 
@@ -73,7 +73,7 @@ HEAD_NUMBER = _style("head number", 8, leading=10, fontName=BOLD, alignment=TA_R
 
 
 def plain(text: str) -> str:
-    """What anybody may have typed, as a paragraph's markup: nothing in it is markup."""
+    """Escape user input for a paragraph, so that nothing in it is markup."""
     lines = UNPRINTABLE.sub("\N{REPLACEMENT CHARACTER}", text.expandtabs(4)).splitlines()
     marked = "<br/>".join(escape(line) for line in lines)
     for letters, font in EASTERN.items():
@@ -82,52 +82,52 @@ def plain(text: str) -> str:
 
 
 class Story:
-    """What a report says, from top to bottom; its tables and figures are counted."""
+    """Content of a report in order, with numbered tables and figures."""
 
     def __init__(self) -> None:
         _register_fonts()
         self.flowables: list[Flowable] = []
-        """All of it, in order."""
+        """All content, in order."""
         self.tables: list[Cells] = []
         self.captions: list[str] = []
-        """Each table's text, and each caption, for who wants to read them."""
+        """Text of all tables, and all captions."""
         self._figures = 0
         self._headings: list[Flowable] = []
 
     def title(self, text: str) -> None:
-        """The report's title."""
+        """Add the report's title."""
         self.flowables.append(Paragraph(plain(text), TITLE))
 
     def heading(self, text: str) -> None:
-        """A section's heading; it stays with what follows."""
+        """Add the heading of a section, on the same page as what follows."""
         self._headings.append(Paragraph(plain(text), HEADING))
 
     def part(self, text: str) -> None:
-        """A heading within a section."""
+        """Add a heading within a section."""
         self._headings.append(Paragraph(plain(text), PART))
 
     def text(self, text: str) -> None:
-        """A paragraph."""
+        """Add a paragraph."""
         self._add(Paragraph(plain(text), BODY))
 
     def listing(self, rows: Sequence[tuple[str, str]], first: float = 0.3) -> None:
-        """Names and values, one pair a line, without a caption; empty values are left out."""
+        """Add names and values, one pair per line, without a caption; empty values are omitted."""
         cells = [[name, value] for name, value in rows if value]
         if cells:
             self.tables.append(cells)
             self._add(_table(cells, "ll", [first, 1 - first], header=False))
 
     def table(self, caption: str, cells: Cells, align: str, widths: Sequence[float]) -> None:
-        """A table with its caption above.
+        """Add a table with its caption above.
 
         Parameters
         ----------
         cells
-            Its text, the header first.
+            Text of the table, the header first.
         align
             ``l`` or ``r`` for each column.
         widths
-            Share of each column in the page's width.
+            Width of each column as a fraction of the text width.
         """
         self.tables.append(cells)
         number = len([c for c in self.captions if c.startswith("Table")]) + 1
@@ -135,7 +135,7 @@ class Story:
         self._add(above, _table(cells, align, widths, header=True))
 
     def figure(self, caption: str, png: bytes) -> None:
-        """A figure of `DPI` with its caption below; smaller where it would not fit."""
+        """Add a figure of `DPI` with its caption below, reduced if it does not fit."""
         self._figures += 1
         across, down = ImageReader(io.BytesIO(png)).getSize()
         scale = min(72 / DPI, WIDTH / across, TALLEST / down)
@@ -148,12 +148,12 @@ class Story:
         return Paragraph(plain(text), CAPTION)
 
     def _add(self, *flowables: Flowable) -> None:
-        """Put what belongs together on one page, with the headings over it, if one can hold it."""
+        """Add content and the headings above it, on one page if possible."""
         self.flowables.append(KeepTogether([*self._headings, *flowables]))
         self._headings = []
 
     def pdf(self, header: str, footer: str, title: str) -> bytes:
-        """The pages, with a header and a footer on each; the same bytes for the same story."""
+        """Return the PDF, with header and footer on each page; reproducible to the byte."""
 
         class Pages(_CountedPages):
             margins = (header, footer)
@@ -167,7 +167,7 @@ class Story:
 
 
 class _Document(BaseDocTemplate):  # type: ignore[misc]
-    """One frame a page; headings go into the outline."""
+    """Document with one frame per page, and headings in the outline."""
 
     def __init__(self, file: io.BytesIO, **more: Any) -> None:
         super().__init__(file, **more)
@@ -222,14 +222,14 @@ class _CountedPages(Canvas):  # type: ignore[misc]
 
 
 def _fitted(text: str) -> str:
-    """One line's worth of a text."""
+    """Truncate a text to one line of the header."""
     text = " ".join(UNPRINTABLE.sub(" ", text).split())
     fits = next((n for n in range(len(text)) if _width(text[: n + 1]) > WIDTH - 15), len(text))
     return text if fits == len(text) else text[:fits] + "…"
 
 
 def _width(text: str) -> float:
-    """Its width in the header; Eastern letters are as wide as they are high."""
+    """Return the width of a text in the header; East Asian characters are about square."""
     wide = sum(any(re.match(letters, c) for letters in EASTERN) for c in text)
     return float(pdfmetrics.stringWidth(text, FONT, 7.5)) + 4 * wide
 

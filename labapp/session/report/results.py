@@ -1,4 +1,4 @@
-"""The report's results: sizes and trends, one frame in pictures, error budget, corrections."""
+"""Results in the report: sizes and trends, an example frame, error budget, corrections."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from labapp.studies.error_budget import setup_budget
 from labapp.text import SIGMA_OF
 
 LATEST_CHANGES = 40
-"""Number of the newest changes that are listed."""
+"""Number of latest changes that are listed."""
 
 NOT_COVERED = (
-    "Not in it: that the pool is taken for a mirror and the imaging plane for a perfectly "
-    "diffuse, flat one; a wrong correspondence (a row or a column more or less); the length of the "
-    "calibration target's unit; the pool's motion during the exposure. Quantities are moved one by "
-    "one, to first order."
+    "Not included: deviations of the pool from a mirror and of the imaging plane from a diffuse, "
+    "flat one; a wrong correspondence (shifted by a row or a column); the length of the "
+    "calibration target's unit; motion of the pool during the exposure. Quantities are varied one "
+    "by one, to first order."
 )
 
 
@@ -38,17 +38,17 @@ def add_results(story: Story, report: ReportData) -> None:
         return
     counted = [line for line in lines if line.counts]
     story.text(
-        f"{len(lines)} frames, scheme {report.scheme}: {len(counted)} with a surface that stands. "
-        "Stale results, made from calibrations, settings or corrections that were changed since, "
-        "are in no mean."
+        f"{len(lines)} frames, scheme {report.scheme}: {len(counted)} with a current surface. "
+        "Means do not include stale results, whose calibrations, settings or corrections were "
+        "changed since."
     )
-    story.table("What the frames came to.", data.status_cells(lines), "llrl", (0.2, 0.4, 0.1, 0.3))
+    story.table("Outcomes of the frames.", data.status_cells(lines), "llrl", (0.2, 0.4, 0.1, 0.3))
     if counted:
         story.table(
-            f"Sizes over the {len(counted)} frames that count. Standard deviation: root of the "
+            f"Sizes over the {len(counted)} frames in the mean. Standard deviation: root of the "
             "variance of Eq. 7-2 … 7-4 (divided by the number of frames). ±: standard uncertainty "
-            f"of the mean, and the median of each frame's ({SIGMA_OF}): levels of frames whose "
-            "outline is the same err together. – where the scheme gives none.",
+            f"of the mean, and the median of each frame's ({SIGMA_OF}): level errors of frames "
+            "with the same outline are correlated. –: the scheme gives none.",
             data.statistics_cells(lines),
             "lrrrrrrrr",
             (0.19, 0.09, *[0.102] * 7),
@@ -57,7 +57,7 @@ def add_results(story: Story, report: ReportData) -> None:
             story.text(report.session.setup_words)
         _trends(story, lines)
     elif any(line.status for line in lines):
-        story.text("No frame has a surface that stands, so there is no mean.")
+        story.text("No frame has a current surface, so there is no mean.")
     else:
         story.text("Nothing was measured yet.")
         return
@@ -90,15 +90,15 @@ def _trends(story: Story, lines: list[FrameLine]) -> None:
     ]
     states = [line.state for line in lines]
     story.figure(
-        f"Sizes over time with ± one σ of each frame ({SIGMA_OF}); dotted: mean. Doubtful: another "
-        f"correspondence comes within a factor of {data.DOUBTFUL_MARGIN:g} of the residual; stale: "
-        "made from what was changed since, in no mean.",
+        f"Sizes over time with ± one σ of each frame ({SIGMA_OF}); dotted: mean. Doubtful: the "
+        f"residual of another correspondence is within a factor of {data.DOUBTFUL_MARGIN:g}; "
+        "stale: inputs were changed since, not in the mean.",
         figures.trends(axis, label, series, states),
     )
-    kept = np.array([[line.counts] for line in lines])
+    counts = np.array([[line.counts] for line in lines])
     places = {
         name: np.where(
-            kept,
+            counts,
             np.column_stack([_each(lines, f"{key}_x_mm"), _each(lines, f"{key}_y_mm")]),
             np.nan,
         )
@@ -118,7 +118,7 @@ def _each(lines: Sequence[FrameLine], name: str) -> FloatArray:
 
 
 def add_example(story: Story, report: ReportData) -> None:
-    """Add one frame in pictures: that of median height, else the first with dots."""
+    """Add pictures of one frame: that of median height, else the first with dots."""
     line = data.representative(report.lines) or next((x for x in report.lines if x.dots), None)
     if line is None:
         return
@@ -133,9 +133,9 @@ def add_example(story: Story, report: ReportData) -> None:
     _dots(story, report, line.frame, found)
     if found.reconstruction is not None and found.measures is not None:
         story.figure(
-            f"Frame {line.frame}: height over the work piece. Black: boundary; white: reflection "
-            "points; cross: centre; triangle: where it is farthest from the work piece. "
-            "The electrode is over X = Y = 0.",
+            f"Frame {line.frame}: height above the work piece. Black: boundary; white: reflection "
+            "points; cross: centre; triangle: point farthest from the work piece. "
+            "The electrode is above X = Y = 0.",
             figures.height_map(found),
         )
         own = found.measures.own_are_mm
@@ -166,7 +166,7 @@ def add_budget(story: Story, report: ReportData) -> None:
     story.heading("5  Error budget")
     line = data.representative(report.lines)
     if line is None:
-        story.text("No frame has a surface that stands, so there is none.")
+        story.text("No frame has a current surface, so there is none.")
         return
     session = report.session
     result = session.result(line.frame, report.scheme)
@@ -174,26 +174,25 @@ def add_budget(story: Story, report: ReportData) -> None:
     setup = parse_setup(result.setup, session.path)
     contributions = setup_budget(result.measurement, setup, result.settings)
     story.table(
-        f"What each ± (one σ) changes in the sizes. Set-up: frame {line.frame}, measured anew with "
-        "the quantity moved by its ± either way, the correspondence kept. *: no ± was given; a "
-        "usual one is assumed. Correlations of the quantities count in the last row.",
+        f"Effect of each ± (one σ) on the sizes. Set-up: frame {line.frame}, measured again with "
+        "the quantity changed by its ± in either direction, for the same correspondence. *: no ± "
+        "was given; a usual one is assumed. The last row includes correlations.",
         data.budget_cells(report.lines, contributions, setup.rig),
         "lrrrrrrr",
         (0.31, 0.1, *[0.0983] * 6),
     )
     if not len(data.values(report.lines, "height_sigma_mm")):
-        story.text(f"The scheme {report.scheme} gives no ± of its own: the total is without it.")
+        story.text(f"The scheme {report.scheme} gives no ± of its own: it is not in the total.")
     if any(np.isnan(one.change).any() for one in contributions):
-        story.text("–: the surface could not be made with the quantity moved; not in the total.")
+        story.text("–: no surface was found with the changed quantity; not in the total.")
     story.text(
-        "It covers the noise of the dots' centres, the level of the work piece as far as the "
-        "scheme tells it, and where laser, imaging plane and picture stand to each other. "
-        + NOT_COVERED
+        "It covers the noise of the dots' centres, the level of the work piece if the scheme "
+        "estimates it, and the positions of laser, imaging plane and camera. " + NOT_COVERED
     )
 
 
 def add_corrections(story: Story, report: ReportData) -> None:
-    """Add the corrections by hand and the session's history."""
+    """Add manual corrections and the session's history."""
     story.heading("6  Corrections by hand, and history")
     cells = data.corrections_cells(report.session, [line.frame for line in report.lines])
     if len(cells) > 1:

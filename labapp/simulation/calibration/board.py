@@ -1,6 +1,6 @@
-"""ChArUco boards and chessboards in the imaging plane: as pictures, and for the printer.
+"""ChArUco boards and chessboards in the imaging plane: as pictures and for printing.
 
-Which square is black and where a marker's bits are is laid out here, not by what finds the corners.
+The layout of squares and marker bits is defined here, independently of the corner detection.
 """
 
 from __future__ import annotations
@@ -16,18 +16,19 @@ from labapp.core.calibration.boards import Board
 from labapp.core.values import BoolArray, FloatArray
 
 MARKER_CELLS = 6
-"""Cells of a marker each way, its black rim of one cell included."""
+"""Cells along each side of a marker, including its black border of one cell."""
 
 PLATES_MM = {"4_inch": (101.6, 101.6), "letter_a4": (210.0, 279.4)}
-"""Width and height of what a board is printed on, by the end of its name; the latter fits both."""
+"""Width and height of the printed sheet or plate, by the end of the board's name; "letter_a4" fits
+both paper sizes."""
 
 CUT_MM, TICK_MM = 0.1, 1.6
-"""Thickness of the line round the plate; edge of the ticks beside O′."""
+"""Thickness of the line around the plate; length of the ticks beside O′."""
 
 
 @dataclass(frozen=True)
 class PrintedBoard:
-    """A board on white, IPCS about its O′."""
+    """A board on a white background, in the IPCS with origin at its O′."""
 
     board: Board
 
@@ -41,7 +42,7 @@ class PrintedBoard:
         ink = on & ((row + column) % 2 == 0)
         if board.kind == "chessboard":
             return np.asarray(ink)
-        # Where in its square a point is, from its upper left corner, in cells of the marker.
+        # Position of a point in its square, from the square's upper left corner.
         x, y = np.mod(place[..., 0], 1.0), 1.0 - np.mod(place[..., 1], 1.0)
         rim = (1.0 - board.marker_mm / board.square_mm) / 2.0
         cell = [
@@ -58,7 +59,7 @@ class PrintedBoard:
         return np.asarray(ink | (in_marker & black))
 
     def rectangles_mm(self) -> FloatArray:
-        """All that is black as (X′ from, Z′ from, X′ to, Z′ to), shape (m, 4), mm."""
+        """Black areas as (X′ from, Z′ from, X′ to, Z′ to), shape (m, 4), mm."""
         board, edge = self.board, self.board.square_mm
         cell = board.marker_mm / MARKER_CELLS
         found = []
@@ -79,7 +80,7 @@ class PrintedBoard:
 
     @cached_property
     def _numbers(self) -> FloatArray:
-        """Which of its markers is in each square, shape (rows, columns); −1 in a black one."""
+        """Index of the marker in each square, shape (rows, columns); −1 in a black square."""
         board = self.board
         row, column = np.indices((board.rows, board.columns))
         white = (row + column) % 2 == 1
@@ -87,7 +88,7 @@ class PrintedBoard:
 
     @cached_property
     def _markers(self) -> BoolArray:
-        """Which cells of each marker are black, shape (markers, 6, 6)."""
+        """Whether each cell of each marker is black, shape (markers, 6, 6)."""
         name = f"DICT_{self.board.dictionary.upper()}"
         dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
         drawn = [
@@ -98,7 +99,7 @@ class PrintedBoard:
 
     @property
     def plate_mm(self) -> tuple[float, float]:
-        """Width and height of what it is printed on."""
+        """Width and height of the printed sheet or plate."""
         for end, size in PLATES_MM.items():
             if self.board.name.endswith(end):
                 return size
@@ -107,14 +108,14 @@ class PrintedBoard:
 
     @property
     def origin_mm(self) -> tuple[float, float]:
-        """O′ from the left and from the lower edge of the plate."""
+        """Distance of O′ from the left and from the lower edge of the plate."""
         board, (width, height) = self.board, self.plate_mm
         left = (width - board.columns * board.square_mm) / 2
         low = (height - board.rows * board.square_mm) / 2
         return left + board.square_mm, low + board.square_mm
 
     def notes(self) -> tuple[str, str]:
-        """What is printed above and below the squares."""
+        """Text printed above and below the squares."""
         board, (x, z) = self.board, self.origin_mm
         markers = f"{board.dictionary} {board.ids.start}-{board.ids.stop - 1}"
         of = f" | markers {markers}, {board.marker_mm:g} mm" if board.kind == "charuco" else ""
@@ -128,7 +129,7 @@ class PrintedBoard:
 
 
 def _runs(bits: BoolArray) -> list[tuple[int, int]]:
-    """Begin and end of each run of black cells."""
+    """Start and end of each run of black cells."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], bits.astype(int), [0]])))
     return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
@@ -183,18 +184,18 @@ def board_pdf(board: Board) -> bytes:
 
 
 def _sheet(printed: PrintedBoard) -> list[tuple[float, float, float, float]]:
-    """Black rectangles on the plate, from its lower left: left, low, width and height, mm."""
+    """Black rectangles (left, bottom, width, height) from the plate's lower left corner, mm."""
     origin, edge = np.array(printed.origin_mm), printed.board.square_mm
     low, high = np.hsplit(printed.rectangles_mm(), 2)
     rectangles = np.hstack([origin + low, high - low])
-    # Ticks in the white beside the board, at the height of O′ and below it.
+    # Ticks in the white margin, to the left of O′ and below it.
     (x, z), out = printed.origin_mm, edge + 0.4
     ticks = [(x - out - TICK_MM, z - 0.1, TICK_MM, 0.2), (x - 0.1, z - out - TICK_MM, 0.2, TICK_MM)]
     return [*(tuple(row) for row in rectangles.tolist()), *ticks]
 
 
 def _words(printed: PrintedBoard) -> list[tuple[float, float, float, str]]:
-    """Texts on the plate: left and foot of each from its lower left, size, mm, and the text."""
+    """Texts on the plate: (left, baseline, size, text), mm from the plate's lower left corner."""
     (width, height), (x, z) = printed.plate_mm, printed.origin_mm
     edge = printed.board.square_mm
     size = 2.0 if width < 150 else 3.4

@@ -12,12 +12,12 @@ from labapp.simulation.pools import PoolSize
 
 @dataclass(frozen=True)
 class FlatMirror:
-    """A square plate, flat or bent, that lies level or tilted.
+    """A square plate, flat or bent, level or tilted.
 
     Parameters
     ----------
     height_mm
-        z over the origin.
+        z at the origin.
     rise_x, rise_y
         Slopes along X and along Y.
     bend_per_mm
@@ -48,7 +48,7 @@ class FlatMirror:
 
     @property
     def size(self) -> PoolSize:
-        """Highest and lowest point at the corners or between them, with room to spare."""
+        """Size with the highest and the lowest point, with a margin."""
         reach = self.side_mm / 2
         bent = sum(abs(bend) * reach**2 / 2 for bend in self.bend_per_mm)
         rise = (abs(self.rise_x) + abs(self.rise_y)) * reach + bent
@@ -64,9 +64,9 @@ class BallMirror:
     Parameters
     ----------
     diameter_mm, top_mm
-        Its diameter, and z of its highest point.
+        Diameter of the ball, and z of its highest point.
     center_mm
-        (x, y) of that.
+        (x, y) of the highest point.
     """
 
     diameter_mm: float
@@ -80,7 +80,7 @@ class BallMirror:
             return x, y, np.sqrt(square)
 
     def height(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
-        """Height z at (x, y), arrays of one shape, mm; NaN beside the ball, or below z = 0."""
+        """Height z at (x, y), arrays of one shape, mm; NaN outside the ball and below z = 0."""
         z = self.top_mm - self.diameter_mm / 2 + self._from_center(x_mm, y_mm)[2]
         return np.where(z >= 0, z, np.nan)
 
@@ -92,7 +92,7 @@ class BallMirror:
 
     @property
     def size(self) -> PoolSize:
-        """True size of what stands above the work piece."""
+        """True size of the part above the work piece."""
         radius, top = self.diameter_mm / 2, self.top_mm
         width = 2 * radius if top > radius else 2 * np.sqrt(top * (2 * radius - top))
         return PoolSize(float(width), float(width), top, 0.0, self.center_mm, self.center_mm)

@@ -1,8 +1,8 @@
-"""The imaging plane's own marks: the design of Fig. 5-1 (c), as a picture and for the printer.
+"""The marks on the imaging plane: the design of Fig. 5-1 (c), as a picture and for printing.
 
-A thick dot at O′, and along each axis a bar with unit flags that begins at the first unit, so
-that dot and bars are three objects. The bars end at X′ = 10 and at Z′ = 4 units: their middles
-are at (5.5, 0) and (0, 2.5), the points of Eq. 5-6.
+A thick dot at O′ and, along each axis, a bar with unit flags. The bars begin at the first unit, so
+that the dot and the bars are three separate objects. They end at X′ = 10 and at Z′ = 4 units, which
+puts their midpoints at (5.5, 0) and (0, 2.5), the points of Eq. 5-6.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from labapp.simulation.render import GreyImage
 
 
 class Print(Protocol):
-    """What is printed on the imaging plane, or on a board in its place."""
+    """A print on the imaging plane or on a board in its place."""
 
     def inked(self, plane_mm: FloatArray) -> BoolArray:
         """Whether points (X′, Z′), shape (…, 2), mm, are black, shape (…)."""
@@ -36,25 +36,25 @@ class Target:
     """
     x_units: int = 10
     z_units: int = 4
-    """Where the bars end; they begin at 1."""
+    """Ends of the bars, in units; they begin at 1."""
     bar_mm: float = 1.6
     flag_mm: float = 0.4
     dot_mm: float = 4.0
-    """Thickness of the bars, thickness of the unit flags, diameter of the origin's dot."""
+    """Thickness of the bars, thickness of the unit flags, diameter of the dot at the origin."""
     flag_length_mm: float = 1.2
-    """How far a flag stands out on either side of its bar."""
+    """Length of a flag on either side of its bar."""
     plate_mm: float = 101.6
     margin_mm: float = 7.0
     """Edge of the square plate; distance of O′ from its left and its lower edge."""
 
     @property
     def x_middle_mm(self) -> float:
-        """X′ of the middle of the bar on O′X′."""
+        """X′ of the midpoint of the bar on O′X′."""
         return (1 + self.x_units) / 2 * self.unit_mm
 
     @property
     def z_middle_mm(self) -> float:
-        """Z′ of the middle of the bar on O′Z′."""
+        """Z′ of the midpoint of the bar on O′Z′."""
         return (1 + self.z_units) / 2 * self.unit_mm
 
     def rectangles_mm(self) -> FloatArray:
@@ -80,20 +80,20 @@ class Target:
 
 @dataclass(frozen=True)
 class TargetLook:
-    """What the calibration picture looks like: dim and of low contrast, as in Fig. 5-2."""
+    """Appearance of the calibration picture: dim and of low contrast, as in Fig. 5-2."""
 
     light: float = 32.0
     dark: float = 12.0
     """Grey levels of plane and marks in the middle of the picture."""
     vignetting: float = 0.35
-    """Fraction of the light that is lost at the corners."""
+    """Fraction of the light lost at the corners."""
     slope: float = 0.25
-    """Fraction by which the light falls from one side of the picture to the other."""
+    """Fraction by which the light decreases from one side of the picture to the other."""
     blur_px: float = 0.9
     noise: float = 1.3
     """Standard deviation of the camera's blur, px, and of its noise, grey levels."""
     specks: int = 60
-    """How many dead and hot pixels there are (the impulse noise of Eq. 5-2)."""
+    """Number of dead and hot pixels (the impulse noise of Eq. 5-2)."""
 
 
 def render_target(

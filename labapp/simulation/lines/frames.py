@@ -1,8 +1,8 @@
-"""The twin of line patterns: reflected lines as light on the imaging plane (§3.2.1).
+"""Simulated line patterns: reflected lines as light on the imaging plane (§3.2.1).
 
-Each line is followed as a dense row of rays by the forward model of the dots. Their light is added
-up where they land, so that a line is bright where the pool gathers it and faint where it spreads
-it; folds, crossings and ends come out of the rays alone.
+The forward model of the dots traces each line as a dense row of rays. Their light is added up where
+they land, so that a line is bright where the pool focuses the light and faint where it spreads it;
+folds, crossings and ends follow from the rays alone.
 """
 
 from __future__ import annotations
@@ -23,17 +23,17 @@ from labapp.simulation.torch import Torch
 
 RAYS_A_LINE = 321
 FINER = 20
-"""Light is added up at so many places between two rays that are followed."""
+"""Number of points between two traced rays at which light is added."""
 
 EDGE = 2.0
-"""Rays are followed in the middle of a line and so many standard deviations beside it; its light is
-added up at places between them."""
+"""Rays are traced at the centre of a line and this many standard deviations on either side; light
+is added at points between them."""
 
 PLATE_MM = 60.0, 30.0, 30.0, 0.0
-"""Width, head, rear and height of the solid metal about the pool, mm."""
+"""Width, head, rear and height of the solid metal around the pool, mm."""
 
 ACROSS = np.linspace(-2.5, 2.5, 11)
-"""These places, standard deviations."""
+"""Points across a line at which light is added, standard deviations."""
 
 
 @dataclass(frozen=True)
@@ -50,28 +50,29 @@ class _DenseLines(DotPattern):
 
 @dataclass(frozen=True)
 class LineLook:
-    """What a frame of lines looks like.
+    """Appearance of a frame of lines.
 
     Parameters
     ----------
     light
-        Background, glow, speckle, blur and noise of the frame; what it says of dots is not used.
+        Background, glow, speckle, blur and noise of the frame; its values for dots are not used.
     line_peak
-        Grey levels of the ridge of a line of middling brightness over the background.
+        Grey levels of the ridge of a line of median brightness above the background.
     sigma_mm
-        Standard deviation across a line of what diffraction and scattering in the plane add, mm.
+        Standard deviation of the blur across a line from diffraction and from scattering in the
+        plane, mm.
     beam_fraction
-        Standard deviation of a line's light across it, over the interline angle.
+        Standard deviation of a line's light across the line, as a fraction of the interline angle.
     fringes
-        Brightness of the diffraction fringes beside the outermost lines, outwards, over that of a
-        line.
+        Brightness of the diffraction fringes outside the outermost lines, from the inside outwards,
+        relative to a line.
     gaps
         Number of gaps in the lines: oxides on the pool hide the light (§3.2.2).
     gap_mm
-        Largest width of what hides it, on the pool, mm.
+        Largest width of an oxide on the pool, mm.
     metal
-        Light of the solid metal's reflection over that of a flat pool: 0 on mild steel (Fig. 3-10
-        a), while stainless steel reflects straight lines beside the pool (Fig. 3-10 b).
+        Light reflected by the solid metal relative to a flat pool: 0 on mild steel (Fig. 3-10 a),
+        while stainless steel reflects straight lines beside the pool (Fig. 3-10 b).
     """
 
     light: Look = field(default_factory=Look)
@@ -86,18 +87,18 @@ class LineLook:
 
 @dataclass(frozen=True)
 class TrueLine(ReadOnlyArrays):
-    """A reflected line as it is.
+    """The ground truth of a reflected line.
 
     Parameters
     ----------
     number
         Number of the line, from 1.
     fan
-        Angle in the fan of its rays that show, rad, shape (n,).
+        Fan angle of its visible rays, rad, shape (n,).
     image_px
-        (u, v) of their places, shape (n, 2), px.
+        (u, v) of these rays, shape (n, 2), px.
     point_mm
-        Their reflection points, shape (n, 3), mm.
+        Reflection points of these rays, shape (n, 3), mm.
     """
 
     number: int
@@ -108,14 +109,14 @@ class TrueLine(ReadOnlyArrays):
 
 @dataclass(frozen=True)
 class LineFrame(ReadOnlyArrays):
-    """A rendered frame of lines and the truth about it.
+    """A rendered frame of lines and its ground truth.
 
     Parameters
     ----------
     image
-        Shape (height, width), 8 bit, or 16 where the look has more bits than 8.
+        Shape (height, width), 8 bit, or 16 if the look has more than 8 bits.
     lines
-        Each line that shows; a line in parts has one entry.
+        Each visible line; a line in parts has one entry.
     light_px
         Light of lines and fringes without background and noise, shape (height, width).
     """
@@ -139,16 +140,16 @@ def render_lines(
     Parameters
     ----------
     pool
-        What reflects; None: solid metal, that is no line.
+        The reflecting pool. None: solid metal, that is no line.
     rig, view, look
-        The bench, where the camera sees the plane, and what the frame looks like.
+        The bench, the camera's view of the plane, and the appearance of the frame.
     rng
-        Source of everything that is random.
+        Source of all random numbers.
     torch
-        What hides rays; None: all that passes above the rig's electrode.
+        The torch that blocks rays. None: all rays above the rig's electrode tip are blocked.
     gain
-        Grey levels for the light of a line on a flat mirror; None: set as an operator would, so
-        that lines have `LineLook.line_peak`.
+        Grey levels for the light of a line on a flat mirror. None: set such that the lines have
+        `LineLook.line_peak`, as an operator would do.
     """
     shape = view.height_px, view.width_px
     light, lines = np.zeros(shape), tuple[TrueLine, ...]()
@@ -170,7 +171,7 @@ def _line_light(
     rng: np.random.Generator,
     torch: Torch | None,
 ) -> tuple[FloatArray, tuple[TrueLine, ...]]:
-    """Light of all lines and fringes, a flat mirror's ridge about 1, and the lines that show."""
+    """Light of all lines and fringes (the ridge on a flat mirror is about 1) and visible lines."""
     pattern, fringes = rig.pattern, np.asarray(look.fringes)
     beside = np.arange(1, len(fringes) + 1)
     number = np.concatenate([1 - beside, np.arange(1, pattern.count + 1), pattern.count + beside])
@@ -234,7 +235,7 @@ def _add_light(light: FloatArray, image_px: FloatArray, shows: BoolArray, weight
 
 
 def _filled(offsets: FloatArray) -> FloatArray:
-    """Offsets of rays, shape (n, 2), with those of the nearest known ray where they are NaN."""
+    """Offsets of rays, shape (n, 2), with NaN replaced by the value of the nearest known ray."""
     known = np.flatnonzero(np.isfinite(offsets[:, 0]))
     if not len(known):
         return np.zeros_like(offsets)
@@ -243,7 +244,7 @@ def _filled(offsets: FloatArray) -> FloatArray:
 
 
 def _gaps(point_mm: FloatArray, look: LineLook, rng: np.random.Generator) -> BoolArray:
-    """Rays of each line, shape (lines, rays), that something on the pool hides."""
+    """Rays of each line, shape (lines, rays), hidden by oxides on the pool."""
     hidden: BoolArray = np.zeros(point_mm.shape[:2], bool)
     for _ in range(look.gaps):
         line, ray = rng.integers(0, hidden.shape[0]), rng.integers(0, hidden.shape[1])
@@ -253,7 +254,7 @@ def _gaps(point_mm: FloatArray, look: LineLook, rng: np.random.Generator) -> Boo
 
 
 def _usual_ridge(light: FloatArray, lines: tuple[TrueLine, ...]) -> float:
-    """Median light on the lines' ridges; 0 where there is none."""
+    """Median light on the lines' ridges; 0 if there are no lines."""
     if not lines:
         return 0.0
     u, v = np.rint(np.concatenate([one.image_px for one in lines])).astype(np.int64).T

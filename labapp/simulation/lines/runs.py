@@ -29,7 +29,7 @@ class RunFrame:
     Parameters
     ----------
     pool
-        The pool; None: there is none yet.
+        The pool; None before there is one.
     state
         One of `PHASES`.
     """
@@ -41,16 +41,16 @@ class RunFrame:
 def penetration_run(frames: int, rng: np.random.Generator) -> tuple[RunFrame, ...]:
     """Draw a run like that of Fig. 3-11: the pool grows to full penetration, then becomes convex.
 
-    From A to B it grows, hollow; from B to C it stays; from C to D, faster, it shrinks and its
-    surface rises; from D to E it is convex and small, so that an outer line is lost. It swings a
-    little all the time (Fig. 3-12).
+    From A to B the pool grows and is concave; from B to C it does not change; from C to D it
+    shrinks faster and its surface rises; from D to E it is convex and small, so that an outer line
+    is lost. It oscillates slightly all the time (Fig. 3-12).
 
     Parameters
     ----------
     frames
-        How many there are.
+        Number of frames.
     rng
-        Source of sizes and of where the phases end.
+        Source of the sizes and of the ends of the phases.
     """
     shares = np.array([0.08, 0.2, 0.26, 0.18, 0.28]) * rng.uniform(0.85, 1.15, 5)
     ends = np.rint(np.cumsum(shares / shares.sum()) * frames).astype(int)
@@ -77,18 +77,18 @@ def penetration_run(frames: int, rng: np.random.Generator) -> tuple[RunFrame, ..
 
 @dataclass(frozen=True)
 class GmawLook:
-    """What disturbs frames of pulsed GMAW (§3.3, Fig. 3-20).
+    """Disturbances of frames of pulsed GMAW (§3.3, Fig. 3-20).
 
     Parameters
     ----------
     frame_rate_hz, exposure_s
-        Of the high-speed camera.
+        Frame rate and exposure time of the high-speed camera.
     pulse_hz, duty
-        Of the current pulses, and the share of their period that they last.
+        Frequency and duty cycle of the current pulses.
     pulse_light, base_light
-        Grey levels of the arc's light on the plane while the pulse is on, and while it is off.
+        Grey levels of the arc's light on the plane during the pulse and between pulses.
     flicker
-        Standard deviation of the arc's light, over itself.
+        Relative standard deviation of the arc's light.
     spatter
         Mean number of drops that fly through a frame.
     glare
@@ -108,7 +108,7 @@ class GmawLook:
 
 @dataclass(frozen=True)
 class GmawFrame(ReadOnlyArrays):
-    """A frame of GMAW and the truth about it.
+    """A frame of GMAW and its ground truth.
 
     Parameters
     ----------
@@ -117,7 +117,7 @@ class GmawFrame(ReadOnlyArrays):
     on
         Whether the pulse is on for more than half of the exposure.
     line_px
-        (u, v) of the reflected line, shape (n, 2), px, whether it can be seen or not.
+        (u, v) of the reflected line, shape (n, 2), px, whether it is visible or not.
     """
 
     image: Picture
@@ -136,9 +136,9 @@ def gmaw_run(
     look: GmawLook | None = None,
     lines: LineLook | None = None,
 ) -> Iterator[GmawFrame]:
-    """Render a recording of one line on a steep pool that swings, under pulses, spatter and glare.
+    """Render a recording of one line on a steep oscillating pool with pulses, spatter and glare.
 
-    The pool's swing is rendered at `PHASES_A_PERIOD` phases; a frame shows the nearest one.
+    The pool's oscillation is rendered at `PHASES_A_PERIOD` phases; a frame shows the nearest one.
     """
     look = look or GmawLook()
     lines = lines or LineLook(fringes=(), line_peak=60.0, sigma_mm=0.3)
@@ -172,7 +172,7 @@ def gmaw_run(
 
 
 def _pulse_share(periods: float, look: GmawLook) -> float:
-    """Share of an exposure in which the pulse is on; its middle is after so many periods."""
+    """Share of an exposure in which the pulse is on; ``periods`` is the time of its middle."""
     half = look.exposure_s * look.pulse_hz / 2
     moments = periods + np.linspace(-half, half, 33)
     return float(np.mean(moments % 1.0 < look.duty))

@@ -1,1 +1,1 @@
-"""Where laser and imaging plane should stand for the pools expected."""
+"""The configuration adviser: positions of laser and imaging plane for the expected pools."""

@@ -1,4 +1,4 @@
-"""What a bench lets be chosen, and how far a set-up stays within it (§4.2.1)."""
+"""Limits of a bench, and margins of a set-up within them (§4.2.1)."""
 
 from __future__ import annotations
 
@@ -27,21 +27,21 @@ CONSTRAINTS: dict[Constraint, tuple[str, str]] = {
     "once": ("no ray meets the pool twice", "rays"),
     "dots": ("dots that a surface needs", "dots"),
 }
-"""What a set-up must keep: in words, and the unit of its margin, which is negative if broken."""
+"""Text of each constraint on a set-up, and unit of its margin, which is negative if violated."""
 
 RINGS, AROUND = np.linspace(0.4, 1.0, 7), 48
-"""Where on a pool rays are followed to see how far their dots go: ellipses, points on each."""
+"""Ellipses on a pool, and points on each, from which rays are traced to find the dots' extent."""
 
 FAR_MM = 1e3
-"""A dot that never comes, or a ray that runs along the plane, counts as so far off."""
+"""Distance assumed for a dot that does not exist and for a ray parallel to the plane."""
 
 LEAST_DOTS = 16
-"""With fewer the middle of the smallest pool hangs on a handful of slopes."""
+"""Fewest dots: with fewer, the middle of the smallest pool depends on only a few slopes."""
 
 
 @dataclass(frozen=True)
 class Place:
-    """Where laser and imaging plane stand; mm and degrees as in a setup file."""
+    """Position of laser and imaging plane; mm and degrees as in a setup file."""
 
     projection_angle_deg: float
     distance_mm: float
@@ -52,42 +52,42 @@ class Place:
 
 @dataclass(frozen=True)
 class BenchLimits:
-    """What can be moved how far, and what is as it is."""
+    """Ranges of the adjustable quantities, and values of the fixed ones."""
 
     angle_deg: Range = (25.0, 35.0)
     distance_mm: Range = (25.0, 35.0)
-    """Laser: projection angle and distance, from the least to the most."""
+    """Ranges of the laser's projection angle and distance."""
     plane_mm: Range = (30.0, 100.0)
-    """Distance of the imaging plane."""
+    """Range of the imaging plane's distance."""
     s_mm: Range = (0.0, 101.6)
     h_mm: Range = (0.0, 20.0)
-    """Where O′ can stand: to the left of the electrode, and above the work piece."""
+    """Ranges of the position of O′: to the left of the electrode, and above the work piece."""
     plate_mm: tuple[float, float] = (101.6, 101.6)
     """Width and height of the imaging plane."""
     edge_mm: float = 1.0
-    """Least distance of dots from its edges."""
+    """Minimum distance of dots from the edges of the plane."""
     electrode_mm: float = 5.0
     """Height of the tip."""
     pattern: DotPattern = field(default_factory=DotPattern)
     px_per_mm: float = 4.7
-    """Of the camera, on the imaging plane."""
+    """Scale of the camera on the imaging plane."""
     spacing_px: float = 6.0
-    """Neighbouring dots that lie closer cannot be resolved."""
+    """Minimum distance of neighbouring dots that can be resolved."""
     dot_sigma_px: float = 0.3
-    """Standard uncertainty of a dot's place."""
+    """Standard uncertainty of a dot's position."""
     sigma: Mapping[str, float] = field(default_factory=lambda: dict(NOMINAL))
     """Standard uncertainties of the bench's quantities, by `Quantity.sigma_key`."""
     angle_distance_correlation: float = 0.0
-    """Of the laser's projection angle and distance."""
+    """Correlation of the laser's projection angle and distance."""
 
     @property
     def dot_sigma_mm(self) -> float:
-        """Standard uncertainty of a dot's place on the plane, mm."""
+        """Standard uncertainty of a dot's position on the plane, mm."""
         return self.dot_sigma_px / self.px_per_mm
 
     @property
     def axes(self) -> AxisPoints:
-        """The image calibration of a camera that looks straight at the plate (§5.1)."""
+        """The image calibration of a camera perpendicular to the plate (§5.1)."""
         across, up = self.plate_mm
         scale = self.px_per_mm
         calibration = ImageCalibration.from_three_points(
@@ -98,13 +98,13 @@ class BenchLimits:
 
     @property
     def uncertainty(self) -> RigUncertainty:
-        """How well the bench will be known, wherever laser and plane stand."""
+        """Uncertainty of the bench, independent of the positions of laser and plane."""
         return RigUncertainty(
             self.axes, *covariance_of(self.sigma, self.angle_distance_correlation)
         )
 
     def rig(self, place: Place) -> Rig:
-        """The bench with laser and plane at a place."""
+        """The bench with laser and plane at a position."""
         return Rig(
             Laser(place.projection_angle_deg, place.distance_mm),
             self.pattern,
@@ -114,15 +114,15 @@ class BenchLimits:
 
 
 class LaserPlace:
-    """What a place of the laser makes of the expected pools, wherever the plane stands.
+    """Reflections from the expected pools for a position of the laser, for any plane position.
 
-    Rays are followed to the extreme pools themselves rather than where the pattern's rays happen
-    to fall: a pool a little to the side has one right at its edge.
+    Rays are traced to points on the extreme pools instead of along the pattern's rays: a slightly
+    shifted pool has a ray right at its edge.
 
     Parameters
     ----------
     angle_deg, distance_mm
-        The laser's place.
+        Position of the laser.
     """
 
     def __init__(
@@ -137,9 +137,9 @@ class LaserPlace:
         self.seen = [trace(pool, rig) for pool in expected.corners(shifted=False)]
 
     def _followed(self, pool: Pool) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Points on a pool in the pattern's reach, shape (n, 3), where rays go from there, and Z.
+        """Points on a pool in the pattern's reach, shape (n, 3), their reflected rays, and Z.
 
-        Z is that at which the incident or the reflected ray crosses y = 0.
+        Z is the height at which the incident or the reflected ray crosses y = 0.
         """
         rim = pool.boundary_mm(AROUND)[:, :2]
         center = np.array(pool.footprint.center_mm)
@@ -164,7 +164,7 @@ class LaserPlace:
         beam = np.array([0.0, -np.cos(alpha), -np.sin(alpha)])
         up = np.array([0.0, -np.sin(alpha), np.cos(alpha)])
         forward = incident @ beam
-        # Half a ray more than there is, for what lies between.
+        # Half a step beyond the outermost rays, for points between rays.
         across, along = (
             np.tan(np.radians(pattern.inter_beam_angle_deg)) * count / 2
             for count in (pattern.columns, pattern.rows)
@@ -173,7 +173,7 @@ class LaserPlace:
         return np.asarray(inside & (np.abs(incident @ up) <= along * forward))
 
     def place(self, plane_mm: float) -> Place:
-        """Put the plate where the dots are farthest from its edges, as far as s and h go."""
+        """Place the plate such that the dots are farthest from its edges, within s and h."""
         x, z = _dots(self.points, self.away, plane_mm).T
         across, up = self.limits.plate_mm
         s = float(np.clip((across - x.min() - x.max()) / 2, *self.limits.s_mm))
@@ -181,7 +181,7 @@ class LaserPlace:
         return Place(self.laser.projection_angle_deg, self.laser.distance_mm, plane_mm, s, h)
 
     def margins(self, place: Place) -> dict[Constraint, float]:
-        """By how much each of `CONSTRAINTS` is kept; negative: broken."""
+        """Margin of each of `CONSTRAINTS`; negative if violated."""
         limits = self.limits
         x, z = _dots(self.points, self.away, place.plane_mm).T
         x, z = x + place.s_mm, z - place.h_mm
@@ -213,5 +213,5 @@ def _dots(points: FloatArray, away: FloatArray, plane_mm: float) -> FloatArray:
 
 
 def broken(margins: dict[Constraint, float]) -> float:
-    """How far a set-up is from being possible, 0 if it is: the broken margins' sum."""
+    """Sum of the violated margins; 0 if the set-up is possible."""
     return -sum(min(margin, 0.0) for margin in margins.values())

@@ -1,4 +1,4 @@
-"""The adviser's word against fresh simulation, and against every set-up of a grid."""
+"""Check of an advice by a new simulation and against every set-up of a grid."""
 
 from __future__ import annotations
 
@@ -19,33 +19,33 @@ TEXT_PLACE = Place(31.14, 31.48, 50.0, 50.8, 0.0)
 """The set-up of §8.3.1, on the 4″ plane."""
 
 FRESH_SEED = 1_000_003
-"""Of pools that the adviser has not seen."""
+"""Seed of pools that the adviser did not use."""
 
 BLOCK = 10
-"""Pools that one process measures before it takes others."""
+"""Number of pools per task of a process."""
 
 
 @dataclass(frozen=True)
 class Check(ReadOnlyArrays):
-    """What fresh pools say of an advice; n pools, each at k places, m set-ups of a grid.
+    """Results for new pools; n pools, each at k positions, and m set-ups of a grid.
 
-    Which rays come back hangs on where a pool lies under the torch, to a fraction of a row, and one
-    place a pool leaves the mean over 50 of them swinging by a tenth.
+    The reflected rays depend on the position of a pool under the torch to a fraction of a row. With
+    one position per pool, the mean over 50 pools varies by a tenth.
     """
 
     advice: Advice
     chosen: FloatArray
     text: FloatArray
-    """Error of the height (mm), hidden rays and rays that miss the plane, of every pool at every
-    place with the recommended set-up and with that of §8.3.1, shape (n, k, 3); infinite errors
-    where there is no surface.
+    """Error of the height (mm), number of blocked rays and of rays that miss the plane, for every
+    pool at every position with the recommended set-up and with that of §8.3.1, shape (n, k, 3); the
+    error is infinite if there is no surface.
     """
     places: tuple[Place, ...]
     errors: FloatArray
     """The grid's possible set-ups and their mean errors on the same pools, shape (m,), mm."""
     rematch: FloatArray
-    """Errors of the recommended set-up and of that of the grid that did best, on n pools more,
-    shape (2, n, k), mm: on the first pools it did best by luck, too.
+    """Errors of the recommended set-up and of the best one of the grid on n further pools, shape
+    (2, n, k), mm: on the first pools the latter was partly best by chance.
     """
 
     @property
@@ -55,13 +55,13 @@ class Check(ReadOnlyArrays):
 
     @property
     def text_error_mm(self) -> float:
-        """Mean error of the set-up of §8.3.1, over the pools that it can measure."""
+        """Mean error of the set-up of §8.3.1 over the pools that it can measure."""
         error = self.text[..., 0]
         return float(error[np.isfinite(error)].mean())
 
     @property
     def text_breaks(self) -> tuple[str, ...]:
-        """What the set-up of §8.3.1 does not keep, in words: its dots run into each other, say."""
+        """Texts of the constraints that the set-up of §8.3.1 violates, such as merging dots."""
         angle, distance = TEXT_PLACE.projection_angle_deg, TEXT_PLACE.distance_mm
         laser = LaserPlace(self.advice.expected, self.advice.limits, angle, distance)
         margins = laser.margins(TEXT_PLACE)
@@ -69,7 +69,7 @@ class Check(ReadOnlyArrays):
 
     @property
     def off_prediction(self) -> float:
-        """Deviation of the error from the predicted one, as a share of that."""
+        """Relative deviation of the error from the predicted one."""
         return self.error_mm / self.advice.error_mm - 1
 
 
@@ -81,17 +81,17 @@ def check(
     progress: Progress | None = None,
     workers: int | None = None,
 ) -> Check:
-    """Measure fresh pools with the recommended set-up, with §8.3.1's and with all of a grid.
+    """Measure new pools with the recommended set-up, with that of §8.3.1 and with all of a grid.
 
     Parameters
     ----------
     advice
-        A possible one.
+        A possible set-up.
     pools, places
-        How many, and at how many places each, with the dots' noise and the calibration's errors
-        drawn anew.
+        Number of pools, and number of positions of each, with newly drawn noise of the dots and
+        errors of the calibration.
     grid
-        Angles, distances and plane distances, evenly over the bench's limits.
+        Numbers of angles, distances and plane distances, evenly over the bench's limits.
     """
     expected, limits = advice.expected, advice.limits
     rivals = _possible(advice, grid)
@@ -131,7 +131,7 @@ def _possible(advice: Advice, grid: tuple[int, int, int]) -> list[Place]:
 
 
 def check_text(found: Check) -> str:
-    """What was found, in words."""
+    """Text of the results of a check."""
     micro = 1000.0
     hidden, missing = (int(found.chosen[..., k].sum()) for k in (1, 2))
     lost = int(np.isinf(found.text[..., 0]).sum())

@@ -1,7 +1,7 @@
-"""Which dot patterns stay resolvable on a bench, for the pools that are expected.
+"""Dot patterns that are resolvable on a bench, for the expected pools.
 
-A denser pattern covers the pool with more rays, and its dots lie nearer to each other. Where they
-run into one another they have no place of their own, and give no labels.
+A denser pattern covers the pool with more rays, but its dots are closer to each other. Where dots
+merge, they have no positions and give no labels.
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ from labapp.studies.adviser.expected_pools import ExpectedPools
 from labapp.studies.tables import Table
 
 SQUARE_ROWS = (13, 19, 25, 31, 37, 43, 51)
-"""Rows of the square patterns that are compared; the hexagonal one has two rows more than 19."""
+"""Rows of the compared square patterns; the hexagonal one has two rows more than 19."""
 
 CROWDED_SHARE = 0.05
-"""Share of a pool's dots that may lie nearer to the next one."""
+"""Share of a pool's dots that may be closer to the next one."""
 
 
 @dataclass(frozen=True)
 class PatternFit:
-    """What a pattern does on the extreme pools that are expected.
+    """Properties of a pattern on the extreme expected pools.
 
     Parameters
     ----------
     pattern
         The pattern.
     least_dots, most_dots
-        Dots on the plane, of the pools with the fewest and with the most.
+        Dots on the plane for the pools with the fewest and with the most.
     spacing_px
-        Distance to the next dot that 95 % of the dots keep, on the pool where it is least, px.
+        Minimum distance to the next dot for 95 % of the dots, on the pool where it is smallest, px.
     resolvable
-        Whether that is at least what the camera needs (`BenchLimits.spacing_px`).
+        Whether this distance is at least that required by the camera (`BenchLimits.spacing_px`).
     """
 
     pattern: DotPattern
@@ -55,7 +55,7 @@ class PatternFit:
 
 
 def same_fan(pattern: DotPattern) -> tuple[DotPattern, ...]:
-    """Square patterns and a hexagonal one with the fan of a pattern, from the coarsest."""
+    """Square patterns and a hexagonal one with the fan of a pattern, the coarsest first."""
     fan_deg = (pattern.rows - 1) * pattern.inter_beam_angle_deg
     square = [DotPattern(n, n, fan_deg / (n - 1)) for n in SQUARE_ROWS]
     hexagonal = DotPattern(21, 21, fan_deg / (20 * np.sqrt(3) / 2), kind="hexagonal")
@@ -68,14 +68,14 @@ def compare_patterns(
     place: Place,
     patterns: Sequence[DotPattern] | None = None,
 ) -> tuple[PatternFit, ...]:
-    """Compare patterns with laser and imaging plane at a place.
+    """Compare patterns with laser and imaging plane at a position.
 
     Parameters
     ----------
     expected, limits, place
-        The pools, of which the extreme ones are followed; the bench; where it stands.
+        The pools, of which the extreme ones are traced; the bench; its position.
     patterns
-        Those to be compared. None: `same_fan` of the bench's own, and that itself.
+        Patterns to compare. None: the pattern of the bench and its `same_fan`.
     """
     own = limits.pattern
     chosen = patterns if patterns is not None else dict.fromkeys([*same_fan(own), own])
@@ -96,7 +96,7 @@ def compare_patterns(
 
 
 def densest(fits: Sequence[PatternFit]) -> PatternFit | None:
-    """The resolvable pattern with the most dots on the smallest pool; None where none is."""
+    """The resolvable pattern with the most dots on the smallest pool; None if there is none."""
     return max(
         (one for one in fits if one.resolvable),
         key=lambda one: (one.least_dots, one.most_dots),
@@ -105,13 +105,13 @@ def densest(fits: Sequence[PatternFit]) -> PatternFit | None:
 
 
 def pattern_table(fits: Sequence[PatternFit]) -> Table:
-    """The comparison, from the coarsest pattern on."""
+    """The comparison, the coarsest pattern first."""
     best = densest(fits)
     return Table(
         "patterns",
-        "Dot patterns of the same fan at the recommended place: dots of the pools with the fewest "
-        "and the most, and the distance to the next dot that 95 % of them keep"
-        + (f". Densest that is resolvable: {best.name}" if best else ". None is resolvable"),
+        "Dot patterns with the same fan at the recommended position: dots of the pools with the "
+        "fewest and the most, and minimum distance to the next dot for 95 % of the dots"
+        + (f". Densest resolvable pattern: {best.name}" if best else ". None is resolvable"),
         ("pattern", "least_dots", "most_dots", "spacing_px", "resolvable"),
         tuple(
             (

@@ -1,4 +1,4 @@
-"""What leaves the adviser: the files of an advice, and the set-up that follows from it."""
+"""Output of the adviser: the files of an advice, and the recommended set-up."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ HEAD = """\
 
 
 def advice_files(advice: Advice) -> dict[str, bytes]:
-    """Words, tables, picture, and the set-up where there is one: file name → content."""
+    """Text, tables, picture and, if there is one, the set-up: file name → content."""
     patterns = patterns_of(advice) if advice.possible else None
     tables = [] if patterns is None else [cost_table(advice), patterns]
     words = "\n\n".join([advice_text(advice), *(table.markdown() for table in tables)])
@@ -38,12 +38,12 @@ def advice_files(advice: Advice) -> dict[str, bytes]:
 
 
 def patterns_of(advice: Advice) -> Table:
-    """Dot patterns of the same fan at the recommended place (`dense_patterns`)."""
+    """Dot patterns with the same fan at the recommended position (`dense_patterns`)."""
     return pattern_table(compare_patterns(advice.expected, advice.limits, advice.best.place))
 
 
 def advised_setup(advice: Advice) -> dict[str, dict[str, Any]]:
-    """The recommended set-up: section → key → value, hundredths of a mm and of a degree."""
+    """The recommended set-up: section → key → value, rounded to 0.01 mm and 0.01°."""
     place, limits = advice.best.place, advice.limits
     return {
         "laser": {

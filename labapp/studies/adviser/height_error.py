@@ -1,4 +1,4 @@
-"""The error of the height that a set-up gives pools of a kind: simulated, and predicted."""
+"""Error of the height for a set-up and a kind of pool: simulated and predicted."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from labapp.studies.error_analysis import relative_errors
 from labapp.studies.parameter_deviation import move
 
 MEAN_OF_SIGMA = float(np.sqrt(2 / np.pi))
-"""Mean distance from 0 of a normal deviate of standard deviation 1."""
+"""Mean absolute value of a normal deviate of standard deviation 1."""
 
 
 @dataclass(frozen=True)
 class Trial:
-    """A set-up, and which pools of a sample it is tried on."""
+    """A set-up, and the pools of a sample on which it is tested."""
 
     limits: BenchLimits
     place: Place
@@ -36,13 +36,13 @@ class Trial:
 
 
 def simulated_errors(trial: Trial) -> FloatArray:
-    """Measure pools with a set-up, by the fit; a row a pool, shape (n, 3).
+    """Measure pools with a set-up by the fit scheme; one row per pool, shape (n, 3).
 
-    Error of the height, mm, infinite where there is no surface; rays that the torch hides; rays
-    that miss the plane.
+    Error of the height, mm, infinite if there is no surface; number of rays blocked by the torch;
+    number of rays that miss the plane.
 
-    The set-up is where the operator takes it to be, and the rays come from where it really is
-    (`move`, by the sample's errors): dots and rays as they would be on the bench.
+    The measurement uses the assumed set-up, and the rays come from the true one, which differs by
+    the sample's errors (`move`).
     """
     limits, sample = trial.limits, trial.sample
     rig, known = limits.rig(trial.place), limits.uncertainty
@@ -67,9 +67,9 @@ def simulated_errors(trial: Trial) -> FloatArray:
 
 
 def predicted_errors(trial: Trial) -> FloatArray:
-    """Mean distance of the height from the truth that is predicted for each pool, shape (n,), mm.
+    """Predicted mean absolute error of the height of each pool, shape (n,), mm.
 
-    Some five times as quick as to simulate it, and without its luck; see `predict_error`.
+    About five times as fast as the simulation, and without its scatter; see `predict_error`.
     """
     limits, rig = trial.limits, trial.limits.rig(trial.place)
     found = [
@@ -91,7 +91,7 @@ def blocks(
     size: int,
     calibrated: bool = True,
 ) -> list[Trial]:
-    """Every place with every pool of a sample, in parts of ``size`` pools, place by place."""
+    """Trials of every set-up with all pools of a sample, ``size`` pools each, set-up by set-up."""
     count = len(sample.pools)
     return [
         Trial(limits, place, sample, first, min(first + size, count), calibrated)

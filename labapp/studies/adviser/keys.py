@@ -37,7 +37,7 @@ LARGEST_SIGMA = 10.0
 
 
 def calibration_values(known: RigUncertainty) -> dict[str, float]:
-    """How well a bench is known, as the keys of ``[calibration]``: key → value."""
+    """Uncertainty of a bench as the keys of ``[calibration]``: key → value."""
     sigma = known.sigma_by_key
     values = {name: min(sigma[key], LARGEST_SIGMA) for name, key in CALIBRATION.items()}
     shared = float(known.correlation[ANGLE, DISTANCE])
@@ -97,7 +97,7 @@ def read_request(path: Path) -> dict[str, Any]:
     Raises
     ------
     InputError
-        If the file cannot be read, or is no TOML.
+        If the file cannot be read or is not TOML.
     """
     return parse_toml(read_text(path, A_REQUEST), path, A_REQUEST)
 
@@ -112,12 +112,12 @@ def parse_request(
     values
         Table → key → value.
     source
-        Where it comes from, for messages.
+        Origin of the values, for messages.
 
     Raises
     ------
     InputError
-        If anything is unknown, missing or impossible; all that was found together.
+        If anything is unknown, missing or impossible; all problems are reported together.
     """
     path = Path(source)
     problems = [unknown_key(path, key, TABLES) for key in values if key not in TABLES]

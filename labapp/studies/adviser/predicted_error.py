@@ -1,8 +1,9 @@
-"""Predicted error of a pool's height for a set-up, without simulation: fast enough to search.
+"""Predicted error of a pool's height for a set-up, without simulation: fast enough for a search.
 
-One linear step from the truth takes the place of the fit: the smooth surface is fitted once to the
-true slopes at the true reflection points, and what the parts of the budget do to it is worked out
-from that. Some 10 ms a pool, 50 ms with the calibration's part; the fit itself takes 100 to 200.
+The fit is replaced by one linear step from the truth: the smooth surface is fitted once to the
+true slopes at the true reflection points, and the effect of each part of the budget is calculated
+from it. This takes about 10 ms per pool, or 50 ms with the calibration's part; the fit itself takes
+100 to 200 ms.
 """
 
 from __future__ import annotations
@@ -27,10 +28,10 @@ from labapp.simulation.forward import Reflections, trace
 from labapp.simulation.pools import Pool
 
 DOT_SIGMA_MM = 0.053
-"""Standard uncertainty of a dot's place on the plane: 0.3 px of a camera that sees all of it."""
+"""Standard uncertainty of a dot's position on the plane: 0.3 px of a camera that sees all of it."""
 
 LEAST_DOTS = 9
-"""No surface is fitted to fewer."""
+"""Fewest dots to which a surface is fitted."""
 
 RIM_POINTS = 72
 
@@ -43,28 +44,28 @@ class PredictedError(ReadOnlyArrays):
     """Predicted standard uncertainties of a pool's height, mm."""
 
     boundary_mm: float
-    """Uncertainty of the level: the rays that came back leave open where the pool ends."""
+    """Uncertainty of the level: the reflected rays do not determine exactly where the pool ends."""
     shape_mm: float
-    """What the smooth surface misses between and beyond the dots: exact slopes, no noise."""
+    """Error of the smooth surface between and beyond the dots, for exact slopes without noise."""
     dots_mm: float
-    """The dots' uncertainty on the plane."""
+    """Contribution of the dots' uncertainty on the plane."""
     parameters_mm: FloatArray
-    """What each of the bench's `QUANTITIES` changes by its standard uncertainty, shape (q,); zero
-    where not requested.
+    """Contribution of the standard uncertainty of each of the bench's `QUANTITIES`, shape (q,);
+    zero if not requested.
     """
     setup_mm: float
-    """These together, with their correlations."""
+    """Sum of these contributions with their correlations."""
     dots: int
     blocked: int
     off_plane: int
     lost: int
-    """Dots that show; rays from the pool that the torch hides; whose reflection misses the plane's
-    edges; that meet the pool again.
+    """Number of visible dots; of rays from the pool that the torch blocks; of reflections that miss
+    the plane; of rays that meet the pool again.
     """
 
     @property
     def random_mm(self) -> float:
-        """Combined standard uncertainty but for the calibration: what varies between frames."""
+        """Combined standard uncertainty without the calibration: the part that varies by frame."""
         return float(np.sqrt(self.boundary_mm**2 + self.shape_mm**2 + self.dots_mm**2))
 
     @property
@@ -85,16 +86,16 @@ def predict_error(
     Parameters
     ----------
     pool
-        A pool of the kind that is expected, its boundary on the work piece.
+        A pool of the expected kind with its boundary on the work piece.
     dot_sigma_mm
-        Standard uncertainty of a dot's place on the plane.
+        Standard uncertainty of a dot's position on the plane.
     uncertainty
-        How well the set-up is known; None: exactly.
+        Uncertainty of the set-up. None: known exactly.
 
     Returns
     -------
     PredictedError
-        With infinite parts where fewer than nine dots show.
+        With infinite parts if fewer than nine dots are visible.
     """
     seen = trace(pool, rig)
     counted = PredictedError(
@@ -123,7 +124,7 @@ def predict_error(
 
 
 class _Model:
-    """Smooth surface through the true slopes, and its response to changes of them."""
+    """Smooth surface through the true slopes, and its response to changes in them."""
 
     def __init__(self, pool: Pool, rig: Rig, seen: Reflections, dot_sigma_mm: float) -> None:
         from labapp.core.surface.kernels import ray_kernels
@@ -143,7 +144,7 @@ class _Model:
         corners = np.vstack([self.points[:, :2], self.rim, self.peak_xy])
         self.basis = basis_around(corners, rays, settings.knot_mm)
         self.stiffness = CORRELATED_MM2 / settings.jerk**2
-        # The weights are those of the fit; the noise is what it will be.
+        # The weights are those of the fit; the noise is the expected one.
         variance = dot_sigma_mm**2 + settings.floor_mm**2
         covariance = np.broadcast_to(variance * np.eye(2), (len(self.points), 2, 2))
         laser, pose = rig.laser.position_mm, rig.imaging_plane.pose_mm
@@ -159,7 +160,7 @@ class _Model:
         return fit_slopes(self.basis, points[:, :2], slopes, self.weights, self.stiffness)
 
     def height(self, fitted: SlopeFit, rim: FloatArray) -> float:
-        """Height of the peak over the boundary's mean, mm, positive for either sign of pool."""
+        """Height of the peak above the boundary's mean, mm, positive for both kinds of pool."""
         peak = fitted.surface.height(self.peak_xy[:1], self.peak_xy[1:])[0]
         return self.sign * float(peak - fitted.surface.height(*rim.T).mean())
 
@@ -177,7 +178,7 @@ class _Model:
         return float((within - beyond) / np.sqrt(12))
 
     def _inward(self, xy: FloatArray) -> FloatArray:
-        """Height over the work piece that the pool has, or would have if it went on, at its rim.
+        """Height of the pool, or of its continuation, above the work piece near its rim.
 
         Shape (rows, columns) for points of shape (rows, columns, 2), mm; to first order.
         """
@@ -188,7 +189,7 @@ class _Model:
         return np.asarray((1 - rho) * np.abs(fall).mean())
 
     def _deciding(self) -> tuple[IntArray, ...]:
-        """Indices of the rays that place the level: lit and dark ones nearest the rim."""
+        """Indices of the rays that determine the level: lit and dark ones nearest the rim."""
         sides = []
         for side in (self.seen.visible, self.dark):
             nearest = np.argsort(np.abs(self.inward[side]))[:DECIDING]
@@ -205,7 +206,7 @@ class _Model:
         return change
 
     def _believed(self, offset: FloatArray, axes: AxisPoints) -> float:
-        """Height that is measured if the bench is taken to be off by ``offset``."""
+        """Height that is measured if the assumed bench deviates by ``offset``."""
         plane = moved_dots(self.plane, self.rig, axes, offset)
         rig = aimed_as(self.rig.laser, moved_rig(self.rig, offset))
         source = rig.laser.position_mm

@@ -1,4 +1,4 @@
-"""An advice as words, tables and a picture."""
+"""An advice as text, tables and a picture."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ WORDS = {
     "s_mm": ("imaging plane, s", "mm"),
     "h_mm": ("imaging plane, h", "mm"),
 }
-"""A quantity of `Place` in words, and its unit."""
+"""Name and unit of each quantity of `Place`."""
 
 KEPT, BROKEN = "#1b7a3d", "#b01030"
 
@@ -36,23 +36,23 @@ def advice_text(advice: Advice) -> str:
             "",
             *_place_lines(best),
             "",
-            f"Mean height error to be expected: {_micro(advice.error_mm)} ± "
+            f"Expected mean height error: {_micro(advice.error_mm)} ± "
             f"{_micro(advice.sigma_mm)} µm, {100 * advice.error_mm / height:.2g} % of "
             f"{height:.3g} mm; {_micro(advice.random_mm)} µm with the calibration known exactly.",
             "",
-            "It keeps:",
+            "Its margins:",
             "",
             *(f"* {constraint_text(name, margin)}" for name, margin in best.margins.items()),
         ]
     else:
         lines = [
-            "No set-up within these limits keeps all it must for every pool expected.",
+            "No set-up within these limits meets all conditions for every expected pool.",
             "",
-            "Nearest is:",
+            "The nearest set-up is:",
             "",
             *_place_lines(best),
             "",
-            "What stands in the way:",
+            "It does not meet:",
             "",
             *(
                 f"* {constraint_text(name, margin)}"
@@ -75,7 +75,7 @@ def _micro(value_mm: float) -> str:
 
 
 def advice_table(advice: Advice) -> Table:
-    """The recommended set-up (first), what was compared, and each mm and degree away."""
+    """The recommended set-up (first), the compared ones, and those at each mm and degree away."""
     rows = [
         _row("recommended" if advice.possible else "nearest", advice.best, advice.error_mm),
         *(_row("grid", one, one.error_mm) for one in advice.grid),
@@ -88,7 +88,7 @@ def advice_table(advice: Advice) -> Table:
     columns = [f"{name}_margin_{unit}" for name, (_, unit) in CONSTRAINTS.items()]
     return Table(
         "advice",
-        "Set-ups: predicted mean height error, mm, and by how much they keep what they must",
+        "Set-ups: predicted mean height error, mm, and margins of the conditions",
         ("what", *MOVED, "error_mm", *columns),
         tuple(rows),
     )
@@ -100,11 +100,11 @@ def _row(what: str, one: Candidate, error_mm: float) -> tuple[Cell, ...]:
 
 
 def cost_table(advice: Advice) -> Table:
-    """What each mm and degree away costs on the mean, as far as all is kept, and what breaks."""
+    """Mean cost of each mm and degree away, up to the first violated constraints."""
     rows: list[tuple[Cell, ...]] = []
     for sweep in advice.sweeps:
         own = int(np.argmin(np.abs(sweep.value - getattr(advice.best.place, sweep.name))))
-        # From one pool to the next which rays come back changes: a short way's slope is luck.
+        # The reflected rays change from pool to pool: the slope over a short way is chance.
         short = np.ptp(sweep.value) / 2 / max(len(sweep.value) - 1, 1)
         for way in (-1, 1):
             path = list(range(own + way, len(sweep.value) if way > 0 else -1, way))
@@ -131,8 +131,8 @@ def cost_table(advice: Advice) -> Table:
             )
     return Table(
         "cost",
-        "Cost of each mm and degree away from the recommended set-up, µm of error; kept and broken "
-        "where it was looked at",
+        "Cost of each mm and degree away from the recommended set-up, µm of error; last value that "
+        "meets all conditions and first that does not, of those checked",
         (
             "quantity",
             "unit",
@@ -147,7 +147,7 @@ def cost_table(advice: Advice) -> Table:
 
 
 def advice_picture(advice: Advice) -> Figure:
-    """Draw the bench from the side, where the laser may stand, and what a mm or degree costs."""
+    """Draw the bench from the side, the possible laser positions and the cost of deviations."""
     with rc_context(STYLE):
         figure = new_figure(INCHES, INCHES * 1.15)
         plots = figure.subplot_mosaic(
@@ -197,7 +197,7 @@ def _draw_bench(plot: Any, advice: Advice) -> None:
 
 
 def _draw_map(plot: Any, advice: Advice) -> None:
-    """Where the laser may stand: the least error over the plane's distances, crosses for none."""
+    """Draw the least error over the plane's distances by laser position; crosses: impossible."""
     least: dict[tuple[float, float], float] = {}
     for one in advice.grid:
         at = (one.place.projection_angle_deg, one.place.distance_mm)
@@ -212,7 +212,7 @@ def _draw_map(plot: Any, advice: Advice) -> None:
     best = advice.best.place
     plot.plot(best.projection_angle_deg, best.distance_mm, "*", ms=9, color="k", mfc="w")
     plot.set(xlabel="projection angle (°)", ylabel="laser distance (mm)")
-    plot.set_title("where the laser may stand (× nowhere)", loc="left", fontsize=7.5)
+    plot.set_title("laser positions (×: not possible)", loc="left", fontsize=7.5)
 
 
 def _draw_sweep(plot: Any, advice: Advice, sweep: Any) -> None:

@@ -1,9 +1,9 @@
-"""The configuration adviser: optimal places of laser and imaging plane for expected pools.
+"""Search for the optimal positions of laser and imaging plane for expected pools.
 
-The set-up within a bench's limits with the least expected error of the height: every place of a
-grid is checked against the constraints (`LaserPlace`), the feasible ones are compared by the
-predicted error on ever more pools, the best are refined by Nelder–Mead, and the pools are measured
-with the finalists in simulation.
+It finds the set-up within a bench's limits with the least expected error of the height: every
+position of a grid is checked against the constraints (`LaserPlace`), the feasible ones are compared
+by the predicted error on an increasing number of pools, the best are refined by Nelder–Mead, and
+the finalists are compared by simulated measurements of the pools.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Effort:
     grid: tuple[int, int, int] = (6, 6, 4)
     """Numbers of angles, distances and plane distances of the grid."""
     pools: tuple[int, int, int] = (8, 32, 128)
-    """Numbers of pools on which all feasible places, the best ten, and the finalists are compared.
+    """Number of pools for comparing all feasible positions, the best ten, and the finalists.
     """
     steps: int = 24
     """Function evaluations of a refinement."""
@@ -63,7 +63,7 @@ class Effort:
 
 
 QUICK = Effort(grid=(5, 4, 3), pools=(2, 4, 12), steps=6, finalists=2, sweep=3)
-"""A tenth of the time: its expected error is known to a fifth."""
+"""Takes a tenth of the time; the expected error is accurate to a fifth."""
 
 
 @dataclass(frozen=True)
@@ -84,19 +84,19 @@ class Candidate:
 
 @dataclass(frozen=True)
 class Sweep(ReadOnlyArrays):
-    """Sensitivity to one quantity, with the others as recommended; n places."""
+    """Sensitivity to one quantity, with the others as recommended; n values."""
 
     name: str
-    """Of the quantity in `Place`."""
+    """Name of the quantity in `Place`."""
     value: FloatArray
-    """Its values, mm or degrees, shape (n,)."""
+    """Values of the quantity, mm or degrees, shape (n,)."""
     error_mm: FloatArray
-    """Predicted mean error there, constraints ignored, shape (n,)."""
+    """Predicted mean error at each value, ignoring the constraints, shape (n,)."""
     margins: tuple[dict[Constraint, float], ...]
-    """Margins there, n of them."""
+    """Margins at each of the n values."""
 
     def breaks(self, number: int) -> tuple[Constraint, ...]:
-        """Constraints that are violated there."""
+        """Constraints that are violated at a value."""
         return tuple(name for name, margin in self.margins[number].items() if margin < 0)
 
 
@@ -107,22 +107,22 @@ class Advice:
     expected: ExpectedPools
     limits: BenchLimits
     best: Candidate
-    """The recommended set-up; where none is feasible, the one with the least violation."""
+    """The recommended set-up; if none is feasible, the one with the least violation."""
     error_mm: float
     sigma_mm: float
-    """Expected mean error of its height, and the standard uncertainty of that mean; NaN where no
+    """Expected mean error of its height, and the standard uncertainty of that mean; NaN if no
     set-up is feasible.
     """
     random_mm: float
     """The same mean with the calibration known exactly."""
     grid: tuple[Candidate, ...]
-    """The places of the grid, laser place by laser place."""
+    """The positions of the grid, one laser position after the other."""
     sweeps: tuple[Sweep, ...]
     """Sensitivity to each quantity."""
 
     @property
     def possible(self) -> bool:
-        """Whether any set-up within the limits keeps all it must."""
+        """Whether any set-up within the limits meets all constraints."""
         return self.best.possible
 
 
@@ -141,9 +141,9 @@ def advise(
     expected, limits
         The pools, and the bench's limits.
     seed
-        Of the pools and errors that set-ups are compared on: the same one gives the same advice.
+        Seed of the pools and errors for the comparison: the same seed gives the same advice.
     progress, workers
-        See `in_parallel`. What ``progress`` raises ends the search.
+        See `in_parallel`. An exception of ``progress`` ends the search.
     """
     search = _Search(expected, limits, effort or Effort(), seed, progress, workers)
     with shared_processes(workers):
@@ -209,7 +209,7 @@ class _Search:
         return tuple(one for some in found for one in some)
 
     def scored(self, candidates: Sequence[Candidate], stage: int) -> list[Candidate]:
-        """Predict their errors on the pools of a stage."""
+        """Predict the candidates' errors on the pools of a stage."""
         sample = self.samples[stage]
         tasks = blocks(self.limits, [one.place for one in candidates], sample, len(sample.pools))
         what = ("predicted errors", "the best")[stage]
@@ -220,7 +220,7 @@ class _Search:
         ]
 
     def refined(self, candidates: list[Candidate]) -> list[Candidate]:
-        """The best, and where the way on from the best two of them leads."""
+        """The best candidates, and the refinements of the best two of them."""
         best = _best(candidates, max(self.effort.finalists - 2, 1))
         tasks = [
             (self.expected, self.limits, one, self.samples[1], self.effort.steps)
@@ -230,15 +230,15 @@ class _Search:
         return list({one.place: one for one in [*found, *best]}.values())
 
     def nearest(self, start: Candidate) -> Candidate:
-        """The set-up that breaks least, from the grid's."""
+        """The set-up with the least violation, starting from the grid's."""
         return _way_on((self.expected, self.limits, start, None, 3 * self.effort.steps))
 
     def decided(self, finalists: list[Candidate]) -> tuple[Candidate, float, float, float]:
-        """Simulate the finalists; the best, its mean error, that one's σ, its random part.
+        """Simulate the finalists; returns the best, its mean error, the σ of it, its random part.
 
-        Each simulated mean still swings by a tenth with the luck of its pools. The prediction, set
-        right by one factor for all finalists, does not; but it does not see everything. So the mean
-        of both, on a logarithmic scale, is what counts.
+        Each simulated mean still varies by a tenth with the drawn pools. The prediction, corrected
+        by one factor for all finalists, does not, but does not cover everything. Therefore the
+        finalists are compared by the mean of both on a logarithmic scale.
         """
         sample, count = self.samples[2], len(finalists)
         tasks = blocks(self.limits, [one.place for one in finalists], sample, 8)
@@ -249,7 +249,7 @@ class _Search:
         simulated = errors.mean(axis=1)
         kept = np.isfinite(simulated)
         if not kept.any():
-            # Some pool gave no surface whatever the set-up: the prediction is all there is.
+            # Some pool has no surface with any set-up: only the prediction is left.
             best = int(predicted.argmin())
             return finalists[best], float(predicted[best]), float("inf"), float("nan")
         factor = np.exp(np.log(simulated[kept] / predicted[kept]).mean())
@@ -281,7 +281,7 @@ def _at_planes(
 def _way_on(
     task: tuple[ExpectedPools, BenchLimits, Candidate, Sample | None, int],
 ) -> Candidate:
-    """Walk to less predicted error, or, without a sample, to less that is broken (Nelder–Mead)."""
+    """Minimise the predicted error or, without a sample, the violation (Nelder–Mead)."""
     expected, limits, start, sample, steps = task
     ranges = np.array([limits.angle_deg, limits.distance_mm, limits.plane_mm])
     span = np.maximum(ranges[:, 1] - ranges[:, 0], 1e-9)
@@ -324,7 +324,7 @@ def _swept(task: tuple[ExpectedPools, BenchLimits, Candidate, str, Sample, int])
         place = replace(best.place, **{name: float(value)})
         laser = LaserPlace(expected, limits, place.projection_angle_deg, place.distance_mm)
         margins.append(laser.margins(place))
-        # Where the plate stands along itself changes what is seen, not how well.
+        # Shifting the plate in its plane changes what is seen, but not the accuracy.
         moved = best.error_mm
         if name not in ("s_mm", "h_mm"):
             wide = replace(limits, plate_mm=(4 * limits.plate_mm[0], 4 * limits.plate_mm[1]))
@@ -343,7 +343,7 @@ def spans(limits: BenchLimits) -> dict[str, Range]:
 
 
 def constraint_text(name: Constraint, margin: float) -> str:
-    """Text of a margin: by how much a constraint holds or is violated."""
+    """Text of a margin: the amount by which a constraint is met or violated."""
     label, unit = CONSTRAINTS[name]
     much = f"{abs(margin):.3g} {unit}"
     if name == "once":

@@ -448,7 +448,7 @@ def test_faults_are_told_in_words(window: MainWindow, page: CapturePage, device,
     qtbot.waitUntil(lambda: view.bar.state.text().startswith("● Live"))
     assert "it is back after" in said_in(window)
     device.faults = Faults(garbage=1.0)
-    qtbot.waitUntil(lambda: "not whole, left out" in said_in(window))
+    qtbot.waitUntil(lambda: "incomplete, discarded" in said_in(window))
     device.faults = Faults()
     updates = view.updates
     qtbot.waitUntil(lambda: view.updates > updates + 2)

@@ -83,7 +83,7 @@ def test_nothing_recorded_is_lost_and_all_is_said(
             qtbot.waitUntil(lambda n=stalls: how_many(told(), CAUGHT_UP) > n)
     qtbot.waitUntil(lambda: truth.broken > 5)
     device.faults = Faults()
-    qtbot.waitUntil(lambda: how_many(told(), "not whole, left out") == truth.broken)
+    qtbot.waitUntil(lambda: how_many(told(), "incomplete, discarded") == truth.broken)
     ended_s = time.monotonic()
     view.trigger()
     qtbot.waitUntil(take.finished.is_set)
@@ -97,7 +97,7 @@ def test_nothing_recorded_is_lost_and_all_is_said(
     assert found.frames == take.frames
     with take.notes.open(encoding="utf-8", newline="") as file:
         noted = [row["what"] for row in csv.DictReader(file)]
-    for words in ("was unplugged", "it is back after", "not whole, left out"):
+    for words in ("was unplugged", "it is back after", "incomplete, discarded"):
         assert how_many(noted, words) == how_many(told(), words), words
     for words in (BEHIND, CAUGHT_UP):
         assert how_many(noted, words) >= len(STALLED), words

@@ -127,7 +127,7 @@ def test_a_frame_with_packets_missing_is_left_out_and_counted(plug: Plug) -> Non
             assert set(np.unique(np.diff(frame.image.astype(int), axis=axis))) <= {1, -254}
     gaps = int((np.diff([frame.number for frame in frames]) - 1).sum())
     assert gaps <= counts.broken + counts.dropped
-    assert "not whole, left out" in heard.words()
+    assert "incomplete, discarded" in heard.words()
 
 
 def test_settings_are_read_back_and_refused_in_words(plug: Plug) -> None:

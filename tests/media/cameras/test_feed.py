@@ -85,8 +85,8 @@ def test_it_survives_fifty_disconnects_and_garbage_and_says_all_of_it() -> None:
     said = heard.words()
     assert said.count("was unplugged. Trying to get it back") == counts.lost
     assert said.count("it is back after") >= counts.lost - 1
-    assert "not whole, left out" in said
-    assert "lost on the way" in said
+    assert "incomplete, discarded" in said
+    assert "lost in transfer" in said
 
 
 def test_a_camera_that_stalls_is_said_to_and_goes_on(
