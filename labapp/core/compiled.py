@@ -1,7 +1,7 @@
-"""How functions are compiled for the processor (docs/adr/0018).
+"""Compile functions for the processor and cache the machine code (docs/adr/0018).
 
-Modules that compile are imported where they are used: that takes half a second, which belongs to
-a measurement and not to the app's start.
+Modules with compiled functions are imported where they are used: their import takes half a second,
+which would otherwise delay the start of the app.
 """
 
 from __future__ import annotations
@@ -36,49 +36,49 @@ HOW: dict[str, Any] = {
     "error_model": "numpy",
     "fastmath": {"reassoc", "contract", "nsz"},
 }
-"""Sums may be taken in any order and division by zero gives infinity or NaN, as in NumPy."""
+"""Sums may be reordered; division by zero gives infinity or NaN, as in NumPy."""
 
 NOTICES = "labapp.notices"
-"""Logger of what the user should read while waiting; `labapp.log` shows it on stderr."""
+"""Logger of messages for a waiting user; `labapp.log` shows them on stderr."""
 
 MAY_COMPILE = Event()
-"""Cleared while another process compiles: meanwhile it would stop all threads of this one."""
+"""Cleared while another process compiles: compiling here would block all threads meanwhile."""
 
 MAY_COMPILE.set()
 
 _numba_is_set = Lock()
-"""Held while numba is set to compile as it is done here: its settings are the process's."""
+"""Held while numba's settings are changed, which are global to the process."""
 
 FORMAT = 2
-"""Of what is kept on the disk; raised when it is compiled in another way than before."""
+"""Version of the cache; increased when functions are compiled differently."""
 
 OLD_S = 60 * 86400.0
-"""What was compiled for a source that nobody has is deleted after so long, s."""
+"""Age at which unused cache entries are deleted, s."""
 
 
 def compiled(*signature: types.Type) -> Callable[[F], F]:
-    """Compile for arguments of these types, or take what was compiled before from the disk.
+    """Compile for arguments of these types, or load the machine code from the cache on disk.
 
-    What is kept there is compiled anew when the function's file changes, or one that compiles and
-    that it imports at its top: it may call the compiled functions of these.
+    A function is recompiled when its file changes, or a kernel module that the file imports at its
+    top, whose compiled functions it may call.
     """
     return lambda function: _kept(function, signature)
 
 
 def compiled_for(*signatures: tuple[types.Type, ...]) -> Callable[[F], F]:
-    """Do what `compiled` does for each of several kinds of arguments."""
+    """Compile as `compiled` does for several signatures."""
     return lambda function: _kept(function, list(signatures))
 
 
 def inner(function: F) -> F:
-    """Compile a function that only compiled functions call."""
+    """Compile a function that is called only by compiled functions."""
     return _kept(function)
 
 
 class BySource(_CacheLocator):
-    """Keeps what is compiled by its module's name and its sources, wherever its file is.
+    """Cache entry keyed by the module's name and its sources, independent of the file's path.
 
-    A second checkout or environment of a user finds what the first one compiled.
+    A second checkout or environment of a user thus shares the cache of the first.
     """
 
     def __init__(self, function: Any, file: str) -> None:
@@ -87,7 +87,7 @@ class BySource(_CacheLocator):
 
     @classmethod
     def from_function(cls, function: Any, file: str) -> BySource | None:
-        """Return the place of a function; None where it cannot be written to."""
+        """Return the cache entry of a function; None if it is not writable."""
         try:
             place = cls(function, file)
             is_new = not Path(place.get_cache_path()).exists()
@@ -108,17 +108,17 @@ class BySource(_CacheLocator):
         return self._source
 
     def get_disambiguator(self) -> str:
-        """Return what tells functions of one name apart."""
+        """Return the line number, which distinguishes functions of the same name."""
         return str(self._line)
 
 
 class OwnCopies(JITCodeLibrary):
-    """Compiled code that calls its own copies of other functions, and nobody else's.
+    """Compiled code that calls only its own copies of other functions.
 
-    The machine code of a function has a copy of each function that it calls. numba lets the linker
-    take one copy for all of a process: the first one, which is the function's own where it was
-    compiled, and that of the caller loaded first where all came from the disk. Copies are
-    optimised among other code each, so that their sums differ in the last digits.
+    The machine code of a function contains a copy of each function that it calls. numba lets the
+    linker use one copy for the whole process: the first one. This is the function's own copy if it
+    was just compiled, but that of the caller loaded first if all were loaded from disk. Copies are
+    optimised in different contexts, so that their sums differ in the last digits.
     """
 
     def _optimize_final_module(self) -> None:
@@ -129,12 +129,12 @@ class OwnCopies(JITCodeLibrary):
 
 
 def is_kept(module: str, file: Path) -> bool:
-    """Whether anything that a module's file compiles is kept on the disk."""
+    """Whether the cache has an entry for a module's file."""
     return (_folder() / _digest(module, file)).exists()
 
 
 def _digest(module: str, file: Path) -> str:
-    # What is kept names its module, too.
+    # Cached code also refers to its module by name.
     whole = sha256(f"{FORMAT} {module}\0".encode())
     for source in sorted(set(_sources(module, file))):
         whole.update(source)
@@ -142,7 +142,7 @@ def _digest(module: str, file: Path) -> str:
 
 
 def _sources(module: str, file: Path) -> Iterator[bytes]:
-    """Yield what a file says, and what those say that compile and that it imports at its top."""
+    """Yield the source of a file and of the kernel modules that it imports at its top."""
     source = file.read_bytes()
     yield source
     package, depth = module.partition(".")[0], module.count(".")
@@ -159,7 +159,7 @@ def _folder() -> Path:
 
 @cache
 def _announce() -> None:
-    # Once in a process, however many files it compiles.
+    # Once per process, however many files it compiles.
     logging.getLogger(NOTICES).warning(
         "First use of this version: labapp is being compiled for this computer's processor. "
         "This takes one to two minutes and is done once."
@@ -174,14 +174,14 @@ def _delete_old(folder: Path) -> None:
 
 
 def _one_at_a_time(function: Any) -> AbstractContextManager[object]:
-    """Have one process at a time compile a function, which the others then load."""
+    """Lock the cache entry: one process compiles a function, the others then load it."""
     place = BySource.from_function(function, function.__code__.co_filename)
     return nullcontext() if place is None else FileLock(Path(place.get_cache_path()) / "lock")
 
 
 def _kept(function: F, *signature: Any) -> F:
     MAY_COMPILE.wait()
-    # A numba that does not know the setting keeps what it compiles where it always does.
+    # A numba version without this setting uses its default cache.
     usual = getattr(_config, "CACHE_LOCATOR_CLASSES", "")
     codegen: Any = cpu_target.target_context.codegen()
     with _numba_is_set:
@@ -190,7 +190,7 @@ def _kept(function: F, *signature: Any) -> F:
         try:
             with _one_at_a_time(function) if signature else nullcontext():
                 made: F = _njit(*signature, cache=True, **HOW)(function)
-        except RuntimeError:  # nowhere to keep it
+        except RuntimeError:  # no writable cache
             made = _njit(*signature, **HOW)(function)
         finally:
             _config.CACHE_LOCATOR_CLASSES = usual

@@ -1,16 +1,16 @@
-"""Frame → Measurement: the steps of the measurement, in order, and nothing else.
+"""Measure a frame: the steps of the measurement in order.
 
 1. `find_dots`: the reflected dots of the frame (§5.2.1).
 2. `find_lattice`: their rows and columns in the picture, as far as they can be determined (§5.2.2).
 3. `match_rays`: which ray made which dot (§4.2.2); then rows and columns are those of the rays.
-4. `reconstruct`: the pool's surface and boundary, by the scheme that is chosen (ch. 6, 7).
+4. `reconstruct`: the pool's surface and boundary, by the selected scheme (ch. 6, 7).
 5. `measure_surface`: its size and the reflection errors (Eq. 6-3 … 6-8).
 
-Of a frame that the operator has corrected, his dots and rows take the place of steps 1 and 2. With
-a prior, what the frame before left, dots have the rays of those that it predicts there (`follow`),
-and no rows are needed for it: the other steps are the same.
+If the operator corrected the frame, the corrected dots and rows replace the results of steps 1
+and 2. With a prior from the previous frame, dots are matched to the predicted dots (`follow`),
+which needs no rows; the other steps are the same.
 
-A line pattern has steps of its own (`measure_lines`): its points do not say which ray made them.
+A line pattern is measured differently (`measure_lines`): its points do not identify their rays.
 """
 
 from __future__ import annotations
@@ -49,25 +49,25 @@ OnStep = Callable[[str], None]
 """Called with the name of a step that is done."""
 
 ByHand = Correction | LineCorrection
-"""A frame as the operator has it: dots and rows, or the lines of a line pattern."""
+"""The operator's correction of a frame: dots and rows, or the lines of a line pattern."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """Everything that can be chosen about a measurement.
+    """Settings of a measurement.
 
     Parameters
     ----------
     scheme
         One of `SCHEMES`.
     algorithm
-        Of IRS: ``opa``, ``epa-r``, ``epa-c`` or ``epa-rc``. It goes before that of ``irs``.
+        IRS algorithm: ``opa``, ``epa-r``, ``epa-c`` or ``epa-rc``. Overrides that of ``irs``.
     correspondence
-        ``auto``, or the orientation to use (`match.Orientation`). It goes before that of ``match``.
+        ``auto``, or the orientation to use (`match.Orientation`). Overrides that of ``match``.
     dots, lattice, match
         Settings of steps 1 to 3.
     fit, ers, irs, zonal, modal
-        Settings of the schemes; only those of ``scheme`` count.
+        Settings of the schemes; only those of ``scheme`` are used.
     """
 
     scheme: str = "fit"
@@ -85,26 +85,25 @@ class Settings:
 
 @dataclass(frozen=True)
 class Measurement:
-    """The results of the steps for one frame, as far as they went.
+    """Results of the completed steps for one frame.
 
     Parameters
     ----------
     status
         ``ok``, or one word for why there is no surface.
     reason
-        The same in a sentence; empty if all went well.
+        The reason in one sentence; empty if the status is ``ok``.
     scheme
         Scheme requested.
     dots, lattice, match, reconstruction, measures
-        Results of steps 1 to 5; None from the step on that could not be done. The lattice may be
-        None before that, too: rays can be identified without it.
+        Results of steps 1 to 5; None from the first step that failed. The lattice may also be None
+        if no step failed, because rays can be identified without it.
     correction
-        The operator's dots and rows, or lines; None if they are as they were found.
+        The operator's dots and rows, or lines; None if they were detected automatically.
     setup_status
-        How far the set-up can be relied on (`RigUncertainty.status`); empty where it is exact.
+        Reliability of the set-up (`RigUncertainty.status`); empty if it is exact.
     lines
-        What the lines of a line pattern gave; None where the pattern is one of dots, which have all
-        that is above.
+        Results for a line pattern; None for a dot pattern, whose results are the fields above.
     """
 
     status: str
@@ -122,28 +121,28 @@ class Measurement:
 
 @dataclass(frozen=True, kw_only=True)
 class OpenMeasurement(Measurement):
-    """An ``ambiguous-rows`` frame, of which other frames of the recording may decide the rows.
+    """An ``ambiguous-rows`` frame, whose rows other frames of the recording may determine.
 
     Parameters
     ----------
     candidates
-        The matches that are open.
+        Possible matches.
     """
 
     candidates: tuple[Candidate, ...]
 
     @property
     def refused(self) -> Measurement:
-        """The measurement by itself."""
+        """The measurement without the candidates."""
         return Measurement(**{each.name: getattr(self, each.name) for each in fields(Measurement)})
 
     def decided(self, match: Match, rig: Rig, settings: Settings) -> Measurement:
-        """The measurement with the match of one of the candidates, by the scheme of the settings.
+        """Complete the measurement with the match of one of the candidates.
 
         Parameters
         ----------
         match, rig, settings
-            That match, the bench, and how the frame is measured.
+            Match to use, rig and settings of the measurement.
         """
         assert self.dots is not None
         lattice = lattice_of_match(match, rig, len(self.dots))
@@ -155,7 +154,7 @@ class OpenMeasurement(Measurement):
 
 
 def setup_status(rig: Rig) -> str:
-    """How far a rig can be relied on (`Measurement`)."""
+    """Reliability of a rig (`Measurement`)."""
     return "" if rig.uncertainty is None else rig.uncertainty.status
 
 
@@ -167,7 +166,7 @@ def measure(
     correction: ByHand | None = None,
     on_step: OnStep = lambda _: None,
 ) -> tuple[Measurement, Prior | None]:
-    """Measure the pool that a frame shows. Never raises for a bad frame: the status says why.
+    """Measure the pool in a frame. A bad frame raises no error: the status gives the reason.
 
     Parameters
     ----------
@@ -178,9 +177,9 @@ def measure(
     settings
         See `Settings`.
     prior
-        What the frame before left to this one: then dots get their rays where it predicts them, and
-        the status is ``track-lost``, or another that is not ``ok``, where it does not lead here.
-        None: the frame is measured by itself.
+        Prior from the previous frame: dots are then matched to the dots that it predicts. If the
+        prediction fails, the status is ``track-lost`` or another that is not ``ok``.
+        None: the frame is measured independently.
     correction
         The frame's dots and rows, or lines, as the operator has them; they are measured in place of
         what would be found, and of the image only the shape counts. One of the other kind of
@@ -191,7 +190,7 @@ def measure(
     Returns
     -------
     measurement, prior
-        The results; what they leave to the next frame, None where there is no surface that can be
+        The results, and the prior for the next frame; None if there is no surface that can be
         followed.
     """
     result = Measurement(
@@ -247,7 +246,7 @@ def measure(
 
 
 def _by_scheme(result: Measurement, match: Match, rig: Rig, settings: Settings) -> Measurement:
-    """The result with the surface of a scheme that needs no more than the match."""
+    """Add the surface of a scheme that needs only the match."""
     made = reconstruct(match, rig, settings)
     size = measures.measure_surface(made, match, rig)
     return replace(result, reconstruction=made, measures=size)
@@ -261,11 +260,11 @@ def _with_lines(result: Measurement, image: Image, rig: LineRig, bench: Bench) -
 
 
 def _as_before(image: Image, prior: Prior) -> Image:
-    """The image, which must have the size of the one before."""
+    """Check that the image has the size of the previous frame."""
     if image.shape != prior.tuning.noise.shape:
         from labapp.core.sequence.following import TrackLost
 
-        raise TrackLost("the frame has another size than the one before")
+        raise TrackLost("the frame differs in size from the previous frame")
     return image
 
 
@@ -277,10 +276,10 @@ def _dots_and_tuning(image: Image, settings: DotSettings) -> tuple[Dots, Detecto
 
 
 def start_correction(measurement: Measurement) -> Correction:
-    """The correction that a frame was measured with, or one that begins with what was found.
+    """Return the frame's correction, or a new one made from the detected dots and rows.
 
-    The latter has a reference only where the frame was matched: a hole that stands out among the
-    rows is no more than a candidate until the rays agree.
+    A new one has a reference only if the frame was matched: without a match, a conspicuous hole in
+    the rows is only a candidate.
     """
     if isinstance(measurement.correction, Correction):
         return measurement.correction
@@ -291,7 +290,7 @@ def start_correction(measurement: Measurement) -> Correction:
 
 
 def reconstruct(match: Match, rig: Rig, settings: Settings) -> Reconstruction:
-    """Reconstruct the surface by the scheme that the settings name.
+    """Reconstruct the surface by the scheme of the settings.
 
     Raises
     ------
@@ -299,14 +298,14 @@ def reconstruct(match: Match, rig: Rig, settings: Settings) -> Reconstruction:
         If the scheme finds no surface.
     """
     scheme = SCHEMES[settings.scheme]
-    own: Any = getattr(settings, scheme.name) if scheme.settings else None
+    options: Any = getattr(settings, scheme.name) if scheme.settings else None
     if scheme.algorithms:
-        own = replace(own, algorithm=settings.algorithm)
-    return scheme.reconstruct(match, rig, own)
+        options = replace(options, algorithm=settings.algorithm)
+    return scheme.reconstruct(match, rig, options)
 
 
 def _refused(result: Measurement, why: CannotMeasure) -> Measurement:
-    """The measurement of a frame without an answer; rows that an operator gave stay refused."""
+    """Measurement of a frame without a surface; rows given by the operator stay refused."""
     result = replace(result, status=why.status, reason=why.reason)
     if isinstance(why, RowsOpen) and result.correction is None:
         return OpenMeasurement(**vars(result), candidates=why.candidates)
@@ -321,7 +320,7 @@ def _match_or_why(
     frame_shape: tuple[int, int],
     settings: MatchSettings,
 ) -> tuple[Match, SplineSurface]:
-    """The match (`match_rays`); where nothing explains the dots, why there are no rows."""
+    """Match the rays (`match_rays`); if nothing explains the dots, give the error of the rows."""
     try:
         return match_rays(dots, lattice, bench, frame_shape, settings)
     except CannotMeasure as why:
@@ -332,7 +331,7 @@ def _match_or_why(
 def _lattice_or_why(
     dots: Dots, frame_shape: tuple[int, int], settings: LatticeSettings
 ) -> tuple[Lattice | None, CannotMeasure | None]:
-    """Rows and columns, or why there are none: the optics may still identify the rays."""
+    """Find rows and columns, or the error: the rays may still be identified without them."""
     try:
         return find_lattice(dots, frame_shape, settings), None
     except CannotMeasure as why:

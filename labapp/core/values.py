@@ -1,4 +1,4 @@
-"""What every step shares: array types, frozen values, and the answer "cannot be measured"."""
+"""Types shared by all steps: arrays, read-only dataclasses, and the error of a failed frame."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ BoolArray = npt.NDArray[np.bool_]
 
 
 class CannotMeasure(Exception):
-    """A frame has no answer, and this says why.
+    """Error raised if a frame cannot be measured.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ class ReadOnlyArrays:
 
 
 def median(values: FloatArray) -> float:
-    """Median of numbers, shape (n,); NaN of none, or where one is: `np.median` in less time."""
+    """Median of an array, shape (n,); NaN if it is empty or has a NaN. Faster than `np.median`."""
     count = len(values)
     if not count:
         return float("nan")

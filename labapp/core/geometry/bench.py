@@ -1,4 +1,4 @@
-"""The bench that frames are measured on, and what follows from it for all of them."""
+"""The bench on which frames are recorded, and quantities derived from it for all frames."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from labapp.core.values import FloatArray
 
 @dataclass(frozen=True)
 class Bench:
-    """A rig, and how the camera sees its imaging plane.
+    """A rig and the image calibration of its imaging plane.
 
     Parameters
     ----------
@@ -30,13 +30,13 @@ class Bench:
 
     @cached_property
     def rays(self) -> ProjectedRays:
-        """The rays of the pattern, and where they would land."""
+        """The rays of the pattern and their landing points on the work piece."""
         return project_rays(self.rig.laser, self.rig.pattern)
 
     def frame_px(self, frame_shape: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
         """First and last pixel (u, v) of a frame, undistorted, shapes (2,).
 
-        A distorting lens bends the frame's edges: the rectangle is the one within them.
+        With lens distortion the frame's edges are curved: the result is the rectangle within them.
         """
         if frame_shape not in self._frames_px:
             height, width = frame_shape

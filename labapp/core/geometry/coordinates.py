@@ -10,7 +10,7 @@ import numpy as np
 from labapp.core.values import FloatArray, ReadOnlyArrays
 
 RADIAL_STEPS = 6
-"""Of Newton's method, for the inverse of a radial distortion."""
+"""Newton steps for the inverse of a radial distortion."""
 
 UNDISTORTED_PX = 1e-6
 """Tolerance of undistortion, px."""
@@ -18,7 +18,7 @@ UNDISTORTED_PX = 1e-6
 
 @dataclass(frozen=True)
 class Lens:
-    """How a camera's lens distorts its picture: OpenCV's model with five coefficients.
+    """Lens distortion: OpenCV's model with five coefficients.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ class Lens:
     distortion: tuple[float, float, float, float, float]
 
     def distorted(self, ideal_px: FloatArray) -> FloatArray:
-        """Where the lens puts what a pinhole would have at (u, v), shape (…, 2), px."""
+        """Distort ideal (pinhole) image points (u, v), shape (…, 2), px."""
         x, y = np.moveaxis((np.asarray(ideal_px, float) - self.center_px) / self.focal_px, -1, 0)
         k1, k2, p1, p2, k3 = self.distortion
         square = x * x + y * y
@@ -50,7 +50,7 @@ class Lens:
         return np.asarray(bent * self.focal_px + self.center_px)
 
     def ideal(self, image_px: FloatArray) -> FloatArray:
-        """Where a pinhole would have what the picture has at (u, v), shape (…, 2), px."""
+        """Undistort image points (u, v) to those of a pinhole camera, shape (…, 2), px."""
         import cv2
 
         image_px = np.asarray(image_px, float)
@@ -67,19 +67,19 @@ class Lens:
 
 @dataclass(frozen=True)
 class RadialDistortion(ReadOnlyArrays):
-    """A distortion of the picture that is known by what it does to places on the imaging plane.
+    """Radial distortion defined on the imaging plane.
 
-    A place that the calibration without it has at p is at ``p + percent/100·(|p − m|/c)²·(p − m)``,
-    with m the middle of the plane and c half its diagonal.
+    A point p of the calibration without it is at ``p + percent/100·(|p − m|/c)²·(p − m)``, where m
+    is the centre of the plane and c half its diagonal.
 
     Parameters
     ----------
     matrix, lens
-        Of the image calibration without it (`ImageCalibration`).
+        Those of the image calibration without it (`ImageCalibration`).
     half_mm
-        Half the plane's width and height: its middle, shape (2,), mm.
+        Half the plane's width and height: its centre, shape (2,), mm.
     percent
-        By how much it moves a dot in the plane's corner, in percent of its way to the middle.
+        Shift of a dot in the plane's corner, in percent of its distance from the centre.
     """
 
     matrix: FloatArray
@@ -88,7 +88,7 @@ class RadialDistortion(ReadOnlyArrays):
     percent: float
 
     def ideal(self, image_px: FloatArray) -> FloatArray:
-        """Where the calibration without it sees what the picture has at (u, v), (…, 2), px."""
+        """Undistort image points (u, v), shape (…, 2), px."""
         image_px = image_px if self.lens is None else self.lens.ideal(image_px)
         out = _apply(self.matrix, image_px) - self.half_mm
         share = (
@@ -119,7 +119,7 @@ class ImageCalibration(ReadOnlyArrays):
         Shape (3, 3): homogeneous (u, v, 1) in px, undistorted, to (X′, Z′, 1)
         in mm.
     lens
-        The lens's distortion; None where there is none.
+        Distortion of the lens; None if there is none.
 
     Raises
     ------
@@ -161,7 +161,7 @@ class ImageCalibration(ReadOnlyArrays):
         x_axis_mm, z_axis_mm
             X′ of the former, Z′ of the latter, mm.
         lens
-            The distortion of the picture that the three points are in.
+            Distortion of the picture in which the points were located.
 
         Raises
         ------
@@ -186,7 +186,7 @@ class ImageCalibration(ReadOnlyArrays):
 
     @property
     def plain_lens(self) -> Lens | None:
-        """The lens, but for a radial distortion that is known on the plane."""
+        """The lens without a `RadialDistortion`."""
         return self.lens.lens if isinstance(self.lens, RadialDistortion) else self.lens
 
     @property
@@ -213,7 +213,7 @@ class ImageCalibration(ReadOnlyArrays):
         return _inverse(self.matrix)
 
     def jacobian(self, image_px: FloatArray) -> FloatArray:
-        """∂(X′, Z′)/∂(u, v) at (u, v), shape (…, 2, 2), mm/px, the lens taken as ideal."""
+        """∂(X′, Z′)/∂(u, v) at (u, v), shape (…, 2, 2), mm/px, neglecting the distortion."""
         image_px = np.asarray(image_px, float)
         plane = self.to_plane(image_px)
         image_px = self.ideal_px(image_px)

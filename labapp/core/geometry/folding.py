@@ -1,8 +1,8 @@
-"""A flat folding mirror between pool and imaging plane (§9.2): the plane's mirror image.
+"""A flat folding mirror between pool and imaging plane (§9.2), replaced by the plane's image.
 
-Rays that a flat mirror turns to a plane arrive where they would have met the plane's mirror image
-behind it: a rig has that image as its imaging plane, and no mirror. The picture may be of either
-side of the paper: the image calibration holds which.
+Rays reflected by a flat mirror onto a plane are equivalent to rays that reach the plane's mirror
+image behind it: the rig has that image as its imaging plane, and no mirror. The camera may see
+either side of the paper: the image calibration determines which.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class FoldingMirror(ReadOnlyArrays):
     normal: FloatArray
 
     def image_of(self, plane: ImagingPlane) -> ImagingPlane:
-        """Mirror image of a plane: where its rays seem to go, seen from the pool."""
+        """Mirror image of a plane, as it appears from the pool."""
         unit = self.normal / np.linalg.norm(self.normal)
         turn = np.eye(3) - 2.0 * np.outer(unit, unit)
         origin = self.point_mm + turn @ (plane.origin_mm - self.point_mm)
@@ -59,7 +59,7 @@ def pose_of(plane: ImagingPlane) -> FloatArray:
 
 
 def plane_of(pose: FloatArray, like: ImagingPlane) -> ImagingPlane:
-    """Plane of a pose (`pose_of`), of another's size and glass."""
+    """Plane with a pose (`pose_of`) and with the size and the glass of another plane."""
     distance, s, h = pose[:3]
     pitch, yaw, roll = pose[3:].tolist()
     posed = ImagingPlane.of_angles(np.array([-s, -distance, h]), (pitch, yaw, roll))
@@ -72,16 +72,17 @@ def image_sigma(
 ) -> FloatArray:
     """Standard uncertainty of the pose of a plane's mirror image, shape (6,), by linear response.
 
-    A tilt of the mirror turns the image by twice as much. What the six have in common is left out.
+    A tilt of the mirror rotates the image by twice that angle. Correlations are neglected.
 
     Parameters
     ----------
     plane, mirror
-        Where they are.
+        Imaging plane and mirror.
     sigma
         Standard uncertainty of the plane's own pose (`pose_of`), shape (6,).
     mirror_sigma
-        Of the mirror's place along its normal, mm, and of its tilt either way, degrees, shape (3,).
+        Standard uncertainty of the mirror's position along its normal, mm, and of its tilt about
+        both axes, degrees, shape (3,).
     """
     pose = pose_of(plane)
     image = pose_of(mirror.image_of(plane))
@@ -97,7 +98,7 @@ def image_sigma(
 
 
 def _change(after: FloatArray, before: FloatArray) -> FloatArray:
-    """Change of a pose a unit step; angles may pass 180°."""
+    """Change of a pose per unit step; angles are wrapped at 180°."""
     change = after - before
     change[3:] = (change[3:] + 180.0) % 360.0 - 180.0
     return change / STEP

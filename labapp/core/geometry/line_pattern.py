@@ -1,7 +1,7 @@
 """The projected line pattern: k lines, each a fan of rays in one plane (§3.1.2, §3.2.1, Fig. 3-9).
 
-Unlike a dot, a point of a reflected line does not say which ray made it: only the plane of rays is
-known, and the place along the fan is open.
+Unlike a dot, a point of a reflected line does not identify its ray: only the plane of rays is
+known, not the position along the fan.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from labapp.core.values import FloatArray
 class LinePattern:
     """Parallel lines across the beam axis.
 
-    Line i, from 1, grows towards the head of the pool (+Y), as rows of dots do; the place in the
-    fan grows with X. Line i at angle φ has the direction
+    Line i, from 1, grows towards the head of the pool (+Y), as rows of dots do; the position in
+    the fan grows with X. Line i at angle φ has the direction
     ``a + tan(φ)·e + tan((c − i)·γ)·n`` with c = (count + 1)/2 and the interline angle γ.
 
     Parameters
@@ -32,7 +32,7 @@ class LinePattern:
     fan_angle_deg
         Angle from one end of a line to the other, degrees.
     rotation_deg
-        By how much the pattern is turned about the beam axis, degrees, as `DotPattern` has it.
+        Rotation of the pattern about the beam axis, degrees, as in `DotPattern`.
     """
 
     count: int = 5
@@ -53,7 +53,7 @@ class LinePattern:
         line
             Number of the line, from 1; numbers beyond 1 … count are diffraction fringes.
         fan
-            Angle φ in the fan, rad; both of shapes that broadcast.
+            Angle φ in the fan, rad; the shapes of both must broadcast.
         """
         up = np.tan(((self.count + 1) / 2 - line) * np.radians(self.interline_angle_deg))
         tangents = np.stack(np.broadcast_arrays(np.tan(fan), up), axis=-1)
@@ -63,15 +63,15 @@ class LinePattern:
 
 
 KIND = "lines"
-"""Kind of a pattern of lines in setup files."""
+"""Kind of a line pattern in setup files."""
 
 RAYS_A_LINE = 41
-"""So many rays stand for a line where single rays are followed."""
+"""Number of rays that represent a line if single rays are traced."""
 
 
 @dataclass(frozen=True)
 class LineRays(DotPattern):
-    """A line pattern as rays, a row for each line: for drawings, and for what counts rays.
+    """A line pattern as rays, one row for each line, for drawings and for counts of rays.
 
     Parameters
     ----------
@@ -101,12 +101,12 @@ class LineRays(DotPattern):
 
 @dataclass(frozen=True)
 class LineRig:
-    """A bench with a line pattern: everything whose place must be known to measure.
+    """A rig with a line pattern.
 
     Parameters
     ----------
     laser, pattern, electrode, imaging_plane
-        What it is made of.
+        Its components.
     """
 
     laser: Laser
@@ -116,7 +116,7 @@ class LineRig:
 
 
 def line_rig(rig: Rig) -> LineRig | None:
-    """The rig of a line pattern; None where the rig has one of dots."""
+    """The rig as one with a line pattern; None if it has a dot pattern."""
     if not isinstance(rig.pattern, LineRays):
         return None
     return LineRig(rig.laser, rig.pattern.lines, rig.electrode, rig.imaging_plane)

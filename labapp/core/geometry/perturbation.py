@@ -1,7 +1,7 @@
 """A bench whose quantities (`uncertainty.QUANTITIES`) differ from their nominal values.
 
 An offset is a vector over the quantities, in their units: the true value is the nominal one plus
-the offset. Which ray made which dot stays.
+the offset. The correspondence of rays and dots does not change.
 """
 
 from __future__ import annotations
@@ -24,23 +24,23 @@ _DISTORTION = INDEX["camera_lens.distortion_percent"]
 _PICTURE = [*POINTS, *_AXES, _DISTORTION]
 
 OF_PICTURE = np.isin(np.arange(len(INDEX)), _PICTURE)
-"""Which quantities are the picture's: they move the dots that are seen, see `moved_dots`; the
-others, the rig's, move those that are computed."""
+"""Mask of the quantities of the picture, which move captured dots (`moved_dots`); the others, of
+the rig, move computed dots."""
 
 
 @dataclass(frozen=True)
 class Direction(ReadOnlyArrays):
-    """A way in which a bench may be off.
+    """A possible error of a bench.
 
     Parameters
     ----------
     key
         Key of the quantity (`Quantity.key`), or ``picture.u``, ``picture.v``, ``picture.scale`` for
-        the whole of the image calibration.
+        the image calibration as a whole.
     name, unit
-        What it is called, and what it is measured in.
+        Name and unit.
     vector
-        Offset of the quantities for one unit of it, shape (q,).
+        Offset of the quantities per unit, shape (q,).
     """
 
     key: str
@@ -50,7 +50,7 @@ class Direction(ReadOnlyArrays):
 
 
 def directions(rig: Rig) -> tuple[Direction, ...]:
-    """Ways in which a bench may be off: by each quantity, and by its whole picture."""
+    """Possible errors of a bench: of each quantity, and of the picture as a whole."""
     single = [
         Direction(one.key, one.name, one.unit, np.eye(len(QUANTITIES))[k])
         for k, one in enumerate(QUANTITIES)
@@ -69,7 +69,7 @@ def directions(rig: Rig) -> tuple[Direction, ...]:
 
 
 def moved_rig(rig: Rig, offset: FloatArray) -> Rig:
-    """Rig with its quantities off by an offset, shape (q,)."""
+    """Rig with an offset added to its quantities, shape (q,)."""
     laser = {name: getattr(rig.laser, name) + offset[k] for name, k in _LASER}
     pattern = {name: getattr(rig.pattern, name) + offset[k] for name, k in _PATTERN}
     plane, by = rig.imaging_plane, {name: offset[k] for name, k in _PLANE}
@@ -91,9 +91,9 @@ def moved_rig(rig: Rig, offset: FloatArray) -> Rig:
 
 
 def aimed_as(laser: Laser, rig: Rig) -> Rig:
-    """The rig moved along the work piece until its laser aims where another does.
+    """Translate a rig along the work piece so that its laser aims where another does.
 
-    No size changes by that, and the surface stays where its splines are.
+    The pool's dimensions do not change, and the surface stays within the domain of its spline.
     """
     aside = np.array([rig.laser.aim_x_mm - laser.aim_x_mm, rig.laser.aim_y_mm - laser.aim_y_mm, 0])
     back = replace(rig.laser, aim_x_mm=laser.aim_x_mm, aim_y_mm=laser.aim_y_mm)
@@ -102,10 +102,10 @@ def aimed_as(laser: Laser, rig: Rig) -> Rig:
 
 
 def moved_dots(plane_mm: FloatArray, rig: Rig, axes: AxisPoints, offset: FloatArray) -> FloatArray:
-    """Dots on the plane, shape (n, 2), mm, with its picture's quantities off by an offset, (q,).
+    """Dots on the plane, shape (n, 2), mm, for an offset of the picture's quantities, (q,).
 
-    The dots stay where they are in the picture: `moved_calibration` has them elsewhere on the
-    plane. The lens that the camera is calibrated with is in both, and cancels.
+    The dots do not move in the picture, but `moved_calibration` maps them to other points of the
+    plane. The calibrated camera lens is part of both mappings and cancels.
     """
     if not offset[_PICTURE].any():
         return plane_mm
@@ -120,10 +120,10 @@ def moved_dots(plane_mm: FloatArray, rig: Rig, axes: AxisPoints, offset: FloatAr
 def moved_calibration(
     axes: AxisPoints, plane: ImagingPlane, offset: FloatArray
 ) -> ImageCalibration:
-    """Image calibration with its points and its distortion on the plane off by an offset, (q,).
+    """Image calibration with an offset of its points and its distortion on the plane, (q,).
 
-    What was taken for the moved points is where the true ones are; how far along the axes these lie
-    may be off, too. The camera's lens stays as it is, its centre too.
+    The moved points take the plane positions of the original ones, whose positions along the axes
+    may also have an offset. The camera lens and its centre do not change.
     """
     calibration = axes.calibration
     base = ImageCalibration(calibration.matrix, calibration.plain_lens)
@@ -138,9 +138,9 @@ def moved_calibration(
 
 
 def moved_bench(rig: Rig, offset: FloatArray) -> tuple[Rig, ImageCalibration]:
-    """Rig and image calibration, with the quantities off by an offset, shape (q,).
+    """Rig and image calibration with an offset added to the quantities, shape (q,).
 
-    The rig's uncertainty has the new calibration and the covariance that there was.
+    The rig's uncertainty has the new calibration and the original covariance.
     """
     assert rig.uncertainty is not None
     axes = rig.uncertainty.axes
@@ -151,7 +151,7 @@ def moved_bench(rig: Rig, offset: FloatArray) -> tuple[Rig, ImageCalibration]:
 
 
 def quantity_values(rig: Rig) -> FloatArray:
-    """Values of `QUANTITIES` that a rig with its uncertainty has, shape (q,), in their units."""
+    """Values of `QUANTITIES` of a rig with uncertainty, shape (q,), in their units."""
     assert rig.uncertainty is not None
     axes, plane = rig.uncertainty.axes, rig.imaging_plane
     x_mm, y_mm, z_mm = plane.origin_mm.tolist()

@@ -1,4 +1,4 @@
-"""What is bolted to the bench: laser, dot pattern, electrode, imaging plane.
+"""The rig: laser, dot pattern, electrode and imaging plane.
 
 All positions are in the universal coordinate system (UCS): origin on the work piece under the
 electrode tip, Y along the weld, towards the laser, Z up, X to the right as the camera sees it; mm.
@@ -26,11 +26,11 @@ class Laser:
     projection_angle_deg
         Elevation of the beam axis above the work piece, degrees (Appendix I's α₅).
     distance_mm
-        Distance from the diode to where the beam axis meets the work piece, mm.
+        Distance from the diode to the intersection of beam axis and work piece, mm.
     azimuth_deg
-        By how much the laser is turned out of the YOZ plane, anticlockwise from above, degrees.
+        Rotation of the laser out of the YOZ plane, anticlockwise from above, degrees.
     aim_x_mm, aim_y_mm
-        Where the beam axis meets the work piece, mm; ideally the origin.
+        Intersection of beam axis and work piece, mm; ideally the origin.
     """
 
     projection_angle_deg: float
@@ -41,7 +41,7 @@ class Laser:
 
     @cached_property
     def axes(self) -> FloatArray:
-        """Beam axis, and across it: to the side (with X) and upwards; unit rows, shape (3, 3)."""
+        """Unit vectors along the beam axis, to its side (with X) and upwards, shape (3, 3)."""
         angle, azimuth = np.radians([self.projection_angle_deg, self.azimuth_deg])
         sin, cos = np.sin(angle), np.cos(angle)
         aside, away = np.sin(azimuth), np.cos(azimuth)
@@ -71,18 +71,18 @@ class DotPattern:
     Parameters
     ----------
     rows, columns
-        Number of rays each way.
+        Numbers of rows and columns of rays.
     inter_beam_angle_deg
         Angle between neighbouring rays at the centre, degrees.
     absent
         Rays ``(i, j)``, counted from 1, that the lens does not make. None: the centre.
     kind
-        How the rays lie to each other: one of `PATTERNS`, or `MEASURED`.
+        Arrangement of the rays: one of `PATTERNS`, or `MEASURED`.
     rotation_deg
-        By how much the pattern is turned about the beam axis, degrees: where it is positive, rays
-        of a row go the higher the larger their j.
+        Rotation of the pattern about the beam axis, degrees: if positive, the elevation of the
+        rays of a row increases with j.
     measured
-        The rays of the kind `MEASURED`, all that there are; of other kinds none.
+        All rays of a pattern of kind `MEASURED`; empty for other kinds.
     """
 
     rows: int = 19
@@ -105,7 +105,7 @@ class DotPattern:
 
     @cached_property
     def marker(self) -> tuple[int, int] | None:
-        """The absent ray whose hole tells the rows: the one nearest the centre, or None."""
+        """The absent ray whose hole identifies the rows: the nearest to the centre, or None."""
         center = np.array(self.reference)
         return min(
             sorted(self.absent_rays - self._outside),
@@ -130,13 +130,13 @@ class DotPattern:
 
     @cached_property
     def absent_rays(self) -> frozenset[tuple[int, int]]:
-        """Rays ``(i, j)`` that are not there: absent, outside the outline, or not measured."""
+        """Rays ``(i, j)`` that do not exist: absent, outside the outline, or not measured."""
         assert self.absent is not None
         return self.absent | self._outside | self._within - self._listed
 
     @cached_property
     def _listed(self) -> frozenset[tuple[int, int]]:
-        """Measured rays; of other kinds all within the outline."""
+        """Measured rays; for other kinds all rays within the outline."""
         if self.kind != MEASURED:
             return self._within
         i, j = self.reference
@@ -149,7 +149,7 @@ class DotPattern:
 
     @cached_property
     def _outside(self) -> frozenset[tuple[int, int]]:
-        """Rays outside the outline: of measured ones those not between others of their row."""
+        """Rays outside the outline; if measured, outside the range of the rays of their row."""
         if self.kind != MEASURED:
             return PATTERNS[self.kind].beyond(self.rows, self.columns)
         ends = {i: [j for row, j in self._listed if row == i] for i in range(1, self.rows + 1)}
@@ -162,22 +162,22 @@ class DotPattern:
 
 @dataclass(frozen=True)
 class Electrode:
-    """The torch's electrode: its tip stands ``height_mm`` above the origin."""
+    """The torch's electrode: its tip is ``height_mm`` above the origin."""
 
     height_mm: float = 5.0
 
 
 _LEVEL = 1e-9
-"""A plane whose normal has no larger part along the work piece lies level."""
+"""Largest horizontal component of the unit normal of a horizontal plane."""
 
 
 @dataclass(frozen=True)
 class ImagingPlane(ReadOnlyArrays):
-    """The imaging plane, of any pose: O′ and the directions of O′X′ and O′Z′ in the UCS.
+    """The imaging plane with any pose: O′ and the directions of O′X′ and O′Z′ in the UCS.
 
-    It is the surface that scatters, a sheet of paper, on which dots and calibration target are
-    seen. A plane-parallel glass may lie on it on the pool's side (§3.1): rays go through the glass
-    to the paper, and the camera sees the paper from its other side.
+    It is the scattering surface, a sheet of paper, on which dots and calibration target are
+    visible. A plane-parallel glass plate may cover its pool side (§3.1): rays pass through the
+    glass to the paper, and the camera sees the other side of the paper.
 
     Parameters
     ----------
@@ -221,7 +221,7 @@ class ImagingPlane(ReadOnlyArrays):
     ) -> ImagingPlane:
         """Build the plane at O′, shape (3,), mm, from its pitch, yaw and roll, degrees.
 
-        The vertical plane is turned about its own normal by roll (O′X′ rises), then about X by
+        The vertical plane is rotated about its own normal by roll (O′X′ rises), then about X by
         pitch (its top leans to the camera), then about Z by yaw (O′X′ turns towards +Y).
         """
         sin, cos = np.sin(np.radians(angles_deg)), np.cos(np.radians(angles_deg))
@@ -237,7 +237,7 @@ class ImagingPlane(ReadOnlyArrays):
         x, y, z = self.normal.tolist()
         pitch, yaw = np.arctan2(-z, np.hypot(x, y)), np.arctan2(x, -y)
         roll = np.arctan2(self.x_axis[2], self.z_axis[2])
-        if np.hypot(x, y) < _LEVEL:  # yaw and roll turn a level plane about the same axis
+        if np.hypot(x, y) < _LEVEL:  # yaw and roll rotate a horizontal plane about the same axis
             yaw, roll = np.arctan2(self.x_axis[1], self.x_axis[0]), 0.0
         return float(np.degrees(pitch)), float(np.degrees(yaw)), float(np.degrees(roll))
 
@@ -245,7 +245,7 @@ class ImagingPlane(ReadOnlyArrays):
     def normal(self) -> FloatArray:
         """Unit normal, shape (3,); for the vertical plane it points at the camera, −Y."""
         (a, b, c), (d, e, f) = self.x_axis.tolist(), self.z_axis.tolist()
-        return np.array([b * f - c * e, c * d - a * f, a * e - b * d])  # np.cross takes longer
+        return np.array([b * f - c * e, c * d - a * f, a * e - b * d])  # faster than np.cross
 
     @cached_property
     def pose_mm(self) -> FloatArray:
@@ -268,21 +268,21 @@ class ImagingPlane(ReadOnlyArrays):
 
 
 Travel = Literal["+y", "-y"]
-"""Which way the torch moves over the work piece: where the head of the pool is."""
+"""Direction of travel of the torch, in which the head of the pool lies."""
 
 
 @dataclass(frozen=True)
 class Rig:
-    """Everything on the bench whose place must be known to measure.
+    """All components of the bench whose position must be known.
 
     Parameters
     ----------
     laser, pattern, electrode, imaging_plane
-        What it is made of.
+        Components.
     uncertainty
-        How well it is known; None: exactly.
+        Their uncertainty; None: exactly known.
     travel
-        Which way the torch moves: the pool's head is there, and its rear on the other side.
+        Direction of travel of the torch, in which the pool's head lies.
     """
 
     laser: Laser
