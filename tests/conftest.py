@@ -13,6 +13,8 @@ from pathlib import Path
 import platformdirs
 import pytest
 from hypothesis import settings
+from xdist.remote import Producer
+from xdist.scheduler import LoadScopeScheduling
 
 from labapp import cli, log
 
@@ -45,6 +47,23 @@ def lacks(words: str) -> None:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """What takes long is begun first: at the end a worker would wait for it."""
     items.sort(key=lambda item: item.get_closest_marker("slow") is None)
+
+
+SHARING = ("test_adviser.py", "test_error_analysis.py", "test_tour.py", "test_wheel.py")
+"""Files of which one worker runs all tests: what these share takes long to make."""
+
+
+class Scheduling(LoadScopeScheduling):
+    """Give a worker the next test, or all tests of a file that shares."""
+
+    def _split_scope(self, nodeid: str) -> str:
+        file = nodeid.partition("::")[0]
+        return file if file.endswith(SHARING) else nodeid
+
+
+def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> Scheduling:
+    """Return the scheduling of the tests in several workers."""
+    return Scheduling(config, log)
 
 
 @pytest.hookimpl(trylast=True)

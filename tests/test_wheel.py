@@ -17,7 +17,7 @@ from tests.waiting import PATIENCE_S
 
 ROOT = Path(__file__).resolve().parents[1]
 
-pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("wheel")]  # one worker builds it
+pytestmark = pytest.mark.slow
 
 Start = Callable[..., str]
 

@@ -36,9 +36,6 @@ def environment(home: Path, platform: str) -> dict[str, str]:
     return {**kept, "QT_QPA_PLATFORM": platform, **{k: str(v) for k, v in folders.items()}}
 
 
-with_pictures = pytest.mark.xdist_group("tour")  # in one worker, which takes the tour once
-
-
 @pytest.fixture(scope="module")
 def taken(opengl: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, Path]:
     """The pictures' folder, what was said, and the home folder of who took the tour."""
@@ -66,7 +63,6 @@ def named(taken: tuple[Path, str, Path], part: str) -> list[Path]:
     return sorted(taken[0].glob(f"[0-9][0-9]-{part}.png"))
 
 
-@with_pictures
 @pytest.mark.soak
 @pytest.mark.xvfb
 def test_every_picture_is_there_as_large_as_asked_for_and_shows_something(
@@ -83,7 +79,6 @@ def test_every_picture_is_there_as_large_as_asked_for_and_shows_something(
         assert len(np.unique(picture)) > 20, name
 
 
-@with_pictures
 @pytest.mark.soak
 @pytest.mark.xvfb
 def test_no_two_pictures_are_the_same(taken: tuple[Path, str, Path]):
@@ -92,7 +87,6 @@ def test_no_two_pictures_are_the_same(taken: tuple[Path, str, Path]):
     assert len(set(seen)) == len(seen)
 
 
-@with_pictures
 @pytest.mark.soak
 @pytest.mark.xvfb
 @pytest.mark.parametrize("key", ["welcome", *PAGES])
@@ -100,7 +94,6 @@ def test_every_page_has_a_picture(taken: tuple[Path, str, Path], key: str):
     assert named(taken, key) + named(taken, f"{key}-*")
 
 
-@with_pictures
 @pytest.mark.soak
 @pytest.mark.xvfb
 def test_every_menu_has_a_picture(taken: tuple[Path, str, Path]):
@@ -146,7 +139,6 @@ def _titles_in(function: ast.FunctionDef, path: Path) -> Iterator[str]:
         )
 
 
-@with_pictures
 @pytest.mark.soak
 @pytest.mark.xvfb
 def test_every_question_for_a_file_and_every_other_question_has_a_picture(
@@ -159,7 +151,6 @@ def test_every_question_for_a_file_and_every_other_question_has_a_picture(
     assert not [t for t in titles if not any(one.startswith(t) for one in shown)]
 
 
-@with_pictures
 @pytest.mark.soak
 @pytest.mark.xvfb
 def test_every_dialog_class_has_a_picture(taken: tuple[Path, str, Path]):
@@ -176,7 +167,6 @@ def test_every_dialog_class_has_a_picture(taken: tuple[Path, str, Path]):
         assert named(taken, f"dialog-{kind}")
 
 
-@with_pictures
 @pytest.mark.soak
 @pytest.mark.xvfb
 def test_the_3d_views_are_drawn(taken: tuple[Path, str, Path]):
@@ -192,7 +182,6 @@ def test_the_3d_views_are_drawn(taken: tuple[Path, str, Path]):
         assert np.abs(one.astype(int) - other).mean() > 1
 
 
-@with_pictures
 @pytest.mark.soak
 @pytest.mark.xvfb
 def test_nothing_is_left_in_the_home_folder_but_the_log(taken: tuple[Path, str, Path]):

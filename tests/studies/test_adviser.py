@@ -29,9 +29,6 @@ EFFORT = Effort(grid=(2, 2, 1), pools=(2, 3, 8), steps=3, finalists=2, sweep=2)
 LITTLE = Effort(grid=(2, 1, 1), pools=(1, 1, 2), steps=1, finalists=1, sweep=2)
 
 
-with_advice = pytest.mark.xdist_group("advice")  # in one worker, which computes it once
-
-
 @pytest.fixture(scope="module")
 def advice() -> Advice:
     return advise(EXPECTED, LIMITS, EFFORT, workers=1)
@@ -147,7 +144,6 @@ def test_a_pool_without_dots_has_no_height() -> None:
 # --- the advice (Show 4, reduced) ---------------------------------------------------------------
 
 
-@with_advice
 @pytest.mark.slow
 def test_advice_is_possible_within_the_limits_and_the_same_again(advice: Advice) -> None:
     assert advice.possible
@@ -164,7 +160,6 @@ def test_advice_is_possible_within_the_limits_and_the_same_again(advice: Advice)
     assert (again.best, again.error_mm) == (once.best, once.error_mm)
 
 
-@with_advice
 @pytest.mark.slow
 def test_fresh_pools_are_whole_and_as_well_measured_as_promised(checked: Check) -> None:
     assert not checked.chosen[..., 1:].any()
@@ -177,7 +172,6 @@ def test_fresh_pools_are_whole_and_as_well_measured_as_promised(checked: Check) 
     assert "6 fresh pools at 4 places each: 0 rays hidden, 0 off the plane" in check_text(checked)
 
 
-@with_advice
 def test_what_the_texts_set_up_does_not_keep_is_said(checked: Check) -> None:
     # There the dots of a hollow cross: exact ones are told apart, those of a frame are not.
     hollow = ExpectedPools((5.0, 5.5), (5.5, 6.0), (0.25, 0.3), kind="concave")
@@ -186,7 +180,6 @@ def test_what_the_texts_set_up_does_not_keep_is_said(checked: Check) -> None:
     assert other.text_breaks[0] in check_text(other)
 
 
-@with_advice
 def test_sweeps_tell_where_a_set_up_breaks(advice: Advice) -> None:
     names = {sweep.name: sweep for sweep in advice.sweeps}
     assert list(names) == ["projection_angle_deg", "distance_mm", "plane_mm", "s_mm", "h_mm"]
@@ -197,7 +190,6 @@ def test_sweeps_tell_where_a_set_up_breaks(advice: Advice) -> None:
     assert "across" in names["s_mm"].breaks(0)
 
 
-@with_advice
 def test_cost_of_a_mm_is_the_slope_of_its_curve(advice: Advice) -> None:
     best = replace(advice.best, place=Place(30.0, 30.0, 60.0, 50.0, 0.0))
     value, error = np.array([40.0, 50.0, 60.0, 70.0]), np.array([5.0, 4.0, 3.0, 2.5]) / 1000

@@ -22,8 +22,6 @@ from labapp.studies.image_error import BENCH, TACK, TACK_RIG, VIEW, axes_of, exa
 from labapp.studies.parameter_deviation import move, nominal
 from labapp.studies.setup_budget import SetupBudget, budget_table, similar_pool
 
-with_survey = pytest.mark.xdist_group("survey")  # in one worker, which computes it once
-
 
 @pytest.fixture(scope="module")
 def ce() -> ErrorSurvey:
@@ -31,7 +29,6 @@ def ce() -> ErrorSurvey:
     return survey("CE", caps=aside(caps_8_3_1(), 1), workers=1)
 
 
-@with_survey
 @pytest.mark.slow
 def test_ers_errs_as_the_text_has_it(ce: ErrorSurvey) -> None:
     # Fig. 8-6: CE-D 8.0 % on the mean, 26.9 % at worst; CE-B up to 2.51 %.
@@ -45,7 +42,6 @@ def test_ers_errs_as_the_text_has_it(ce: ErrorSurvey) -> None:
     assert np.mean(computed > actual) > 0.8
 
 
-@with_survey
 @pytest.mark.parametrize("surface", ["convex", "concave"])
 def test_fit_is_below_ers(ce: ErrorSurvey, surface: str) -> None:
     for error in ("depth", "boundary"):
@@ -75,7 +71,6 @@ def test_a_denser_pattern_leaves_less() -> None:
     assert me.of("ers", "actual_are_mm").mean() < le.of("ers", "actual_are_mm").mean()
 
 
-@with_survey
 def test_tables_tell_mean_and_worst_beside_the_text(ce: ErrorSurvey) -> None:
     made = error_table([ce])
     row = dict(zip(made.columns, made.rows[2], strict=True))
