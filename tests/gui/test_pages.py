@@ -59,7 +59,7 @@ hands = types.SimpleNamespace(
 )
 way._other_pages(hands)
 found = {
-    "listed": [listed.item(row).text() for row in range(listed.count())],
+    "listed": [listed.item(row).toolTip() for row in range(listed.count())],
     "keys": [action.shortcut().toString(), "Ctrl+9" in keys()],
     "enabled": action.isEnabled(),
     "guide": "Play with the toy." in guide(),
@@ -89,7 +89,7 @@ def test_a_page_that_is_added_is_everywhere(tmp_path: Path):
     )
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout.splitlines()[-1])
-    assert [text.split(maxsplit=1)[-1] for text in found["listed"]][-2:] == ["Export", "The toy"]
+    assert [tip.partition(":")[0] for tip in found["listed"]][-2:] == ["9 Export", "10 The toy"]
     assert found["keys"] == ["", True]  # it is the tenth
     assert found["enabled"]
     assert found["guide"]

@@ -299,11 +299,11 @@ def test_buttons_are_of_use_when_what_they_need_is_chosen(
 
     assert enabled() == always
     assert not panel.row.editor.isEnabled()
-    assert "Choose" in panel.buttons["Delete"].toolTip()
+    assert "Select" in panel.buttons["Delete"].toolTip()
     click(page, editor.dots_px[10])
     assert enabled() == always | dots | row | one
     assert panel.row.editor.isEnabled()
-    assert "Choose" not in panel.buttons["Split up"].toolTip()
+    assert "Select" not in panel.buttons["Split up"].toolTip()
     page.choose(editor.choose_rows, [4])
     assert enabled() == always | dots | row
     page.choose(editor.choose_rows, [4, 5])
@@ -471,13 +471,13 @@ def test_a_button_asks_for_the_click_it_needs(
     button.click()
     assert panel.chosen.text().startswith("Click where the dark centre of the pattern is")
     key(page, Qt.Key.Key_Escape)
-    assert panel.chosen.text().startswith("Nothing chosen")
+    assert panel.chosen.text().startswith("Nothing selected")
     button.click()
     click(page, place)
     kept = session.correction(3)
     assert kept is not None
     assert kept.lattice.reference == (6, 8)  # as blocked_rows/README.md has it
-    assert panel.chosen.text().startswith("Nothing chosen")
+    assert panel.chosen.text().startswith("Nothing selected")
     assert "press Reference" not in panel.why.text()
     assert button.mapTo(page.panel, QPoint()) == left
     assert unfitted == [[3]]
