@@ -50,6 +50,19 @@ def inner_dot(labels: IntArray) -> int:
     return int(labels[9, 11])
 
 
+def test_a_label_without_a_neighbour_is_not_supported() -> None:
+    # Nothing beside it says whether its dot is that ray's or the next one's.
+    observed, labels = scene()
+    row, column = 10, int(np.flatnonzero(labels[10] != UNLABELLED)[0])
+    alone = labels[row, column]
+    labels = labels.copy()
+    labels[row - 1 : row + 2, : column + 3] = UNLABELLED
+    labels[row, column] = alone
+    assert alone in left_out(observed, labels)
+    labels[row, column + 1 : column + 3] = scene()[1][row, column + 1 : column + 3]
+    assert alone not in left_out(observed, labels)
+
+
 @pytest.mark.parametrize("seed", range(4))
 def test_right_labels_are_supported(seed: int) -> None:
     assert left_out(*scene(seed)) == []

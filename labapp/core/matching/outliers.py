@@ -93,7 +93,8 @@ def unsupported(observed: Observation, fitted: FittedLabels) -> IntArray:
     ray that lands outside the boundary of the others is unlikely to have come back at all. Dots
     much wider than those around them are two in one, also less wide ones where a ray
     without a dot would make its own beside them. With few neighbours, at the rim, a label must
-    be nearer to its prediction than elsewhere. Where all are farther off than what is known
+    be nearer to its prediction than elsewhere, and one without any may as well be the next ray's:
+    nothing beside it fixes its place in the row. Where all are farther off than what is known
     of dots and surface explains, these are as much more uncertain.
 
     A false dot takes its neighbours' predictions along: of neighbours that fail only the one that
@@ -142,7 +143,13 @@ def unsupported(observed: Observation, fitted: FittedLabels) -> IntArray:
         stray,
         limits,
     )
-    return np.asarray(labels[fails | _wide(observed, fitted)])
+    return np.asarray(labels[fails | _wide(observed, fitted) | isolated(lit)])
+
+
+def isolated(lit: BoolArray) -> BoolArray:
+    """Labelled rays without a labelled one beside them, also diagonally, shape (rows, columns)."""
+    blocks = np.lib.stride_tricks.sliding_window_view(np.pad(lit, 1), (3, 3))
+    return np.asarray(lit & (blocks.sum(axis=(2, 3)) == 1))
 
 
 def _wide(observed: Observation, fitted: FittedLabels) -> BoolArray:
