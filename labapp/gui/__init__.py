@@ -1,1 +1,1 @@
-"""The windows: views know no session, presenters compute what is shown, nothing is stored twice."""
+"""Graphical interface: views do not know the session, presenters compute the displayed values."""

@@ -1,4 +1,4 @@
-"""The app: what has to be there, the window, and what happens when something goes wrong."""
+"""Start of the app: requirements, the window, and error reporting."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ WITHOUT = "labapp --help lists the commands"
 BAD_INPUT = 2
 
 LOAD_AFTER_MS = 300
-"""The window is there first; then what it will need is loaded behind it."""
+"""Delay, ms, before modules needed later are loaded; the window is shown first."""
 
 NEEDED_LATER = (
     "labapp.session.frames",
@@ -54,19 +54,19 @@ NEEDED_LATER = (
     *(f"labapp.gui.pages.{key}" for key in ("surface", "dots", "trends", "capture", "setup")),
     "pyvistaqt",
 )
-"""Sessions, the pages and what draws in 3-D: one or two seconds."""
+"""Sessions, pages and 3-D drawing, which take one or two seconds to load."""
 
 HEARTBEAT_MS = 300
-"""So often Python gets a turn to notice Ctrl-C in the terminal, or SIGTERM, and to free memory."""
+"""Interval, ms, at which Python can handle Ctrl-C or SIGTERM and free memory."""
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Open the app, and a session or a recording in it; returns when its window was closed.
+    """Open the app, and a session or a recording in it; return when its window is closed.
 
     Raises
     ------
     InputError
-        If there is no such file, or no display.
+        If the file does not exist or there is no display.
     """
     path = Path(arguments[0]).absolute() if arguments else None
     if path is not None and not path.exists():
@@ -87,7 +87,7 @@ def main(arguments: Sequence[str]) -> int:
 
 @contextlib.contextmanager
 def open_window(app: QApplication, preferences: Preferences, file: Path) -> Iterator[MainWindow]:
-    """Show the window; signals, error reporting and garbage collection are restored after it."""
+    """Show the window; restore signals, error reporting and garbage collection afterwards."""
     from labapp.gui.shell.commands import make_window
 
     window = make_window(preferences, file)
@@ -123,16 +123,16 @@ def open_window(app: QApplication, preferences: Preferences, file: Path) -> Iter
 
 
 def collect_garbage(count: int) -> None:
-    """Free what is unreachable, in the thread that calls.
+    """Free unreachable objects in the calling thread.
 
-    Python would do so in whichever thread makes the next object. Widgets among the garbage would
-    be destroyed there, beside the window's own thread, and the two wait for each other for ever.
+    Python would otherwise do so in whichever thread creates the next object. Unreachable widgets
+    would be destroyed in that thread instead of the GUI thread, and the two would deadlock.
 
     Parameters
     ----------
     count
-        How often it was called: every tenth call also takes objects that were there at the call
-        before, every hundredth all, as Python's own thresholds have it.
+        Number of this call: every tenth call also collects objects that survived the previous
+        collection, every hundredth all objects, as with Python's default thresholds.
     """
     young, limit = gc.get_count()[0], gc.get_threshold()[0]
     if count % 100 == 0:
@@ -142,10 +142,10 @@ def collect_garbage(count: int) -> None:
 
 
 class FirstUse(QObject):
-    """Has what is not compiled yet compiled beside the window, which shows that while it lasts."""
+    """Compiles missing modules in the background; the window shows this while it lasts."""
 
     found = Signal(list)
-    """Modules are not compiled: their names."""
+    """Some modules are not compiled: their names."""
 
     def __init__(self, tasks: Tasks, parent: QObject) -> None:
         super().__init__(parent)
@@ -157,16 +157,16 @@ class FirstUse(QObject):
 
 
 def _load_what_is_needed(not_compiled: Callable[[list[str]], object]) -> None:
-    """Load it while the operator looks at the first page."""
+    """Load the modules needed later while the operator looks at the first page."""
     if modules := compiling.not_compiled():
         not_compiled(modules)
-    with contextlib.suppress(ImportError):  # there may be nothing to draw with in 3-D
+    with contextlib.suppress(ImportError):  # 3-D drawing may not be installed
         for name in NEEDED_LATER:
             importlib.import_module(name)
 
 
 def start_app() -> QApplication:
-    """Qt's application, made if there is none yet.
+    """The Qt application, created if there is none yet.
 
     Raises
     ------
@@ -176,7 +176,7 @@ def start_app() -> QApplication:
     if not (has_display(os.environ) or os.environ.get("QT_QPA_PLATFORM")):
         value = "none: neither DISPLAY nor WAYLAND_DISPLAY is set"
         raise InputError("the app", "display", value, f"a desktop; {WITHOUT}")
-    # Before numpy is loaded: the matrices are small, and waiting threads keep the window from it.
+    # Set before NumPy is loaded: the matrices are small, and BLAS threads would slow the window.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     present = QApplication.instance()
@@ -196,7 +196,7 @@ def start_app() -> QApplication:
 
 
 class ErrorReporter(QObject):
-    """Uncaught errors: all of them to the log, and in words to the operator; the window stays."""
+    """Logs all uncaught errors and reports them to the operator; the window stays open."""
 
     _happened = Signal(str, bool)
 
@@ -206,13 +206,13 @@ class ErrorReporter(QObject):
         self._former = sys.excepthook, threading.excepthook
 
     def install(self) -> None:
-        """Take the errors from now on."""
+        """Handle uncaught errors from now on."""
         self._former = sys.excepthook, threading.excepthook
         sys.excepthook = self.take
         threading.excepthook = self._take_in_thread
 
     def uninstall(self) -> None:
-        """Leave them to who had them before."""
+        """Restore the previous exception hooks."""
         sys.excepthook, threading.excepthook = self._former
 
     def take(
@@ -229,7 +229,7 @@ class ErrorReporter(QObject):
 
 
 def _take_message(kind: QtMsgType, _context: QMessageLogContext, message: str) -> None:
-    """What Qt says goes to the log; that it cannot open a window, to the terminal too."""
+    """Log a message of Qt; print it to the terminal, too, if no window can be opened."""
     log = start_log()
     if kind == QtMsgType.QtFatalMsg:
         log.critical("Qt: %s", message)

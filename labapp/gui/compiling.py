@@ -1,4 +1,4 @@
-"""The first use of a version: its loops are compiled in a process beside the window's."""
+"""First use of a version: its loops are compiled in a separate process."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ COMPILED = (
     "labapp.core.sequence.prior",
     "labapp.export.fixed_point",
 )
-"""Modules that compile (docs/adr/0018), those of a frame's dots first."""
+"""Modules that compile (docs/adr/0018); those for the dots of a frame come first."""
 
 
 def not_compiled() -> list[str]:
-    """Names of the modules whose compiled code is not on the disk."""
+    """Names of the modules whose compiled code is not on disk."""
     from labapp.core.compiled import is_kept
 
     specs = [(name, find_spec(name)) for name in COMPILED]
@@ -38,7 +38,7 @@ def not_compiled() -> list[str]:
 
 
 def compile_aside(modules: list[str], control: Control) -> None:
-    """Compile modules in another process; what needs them here waits, and the window does not."""
+    """Compile modules in another process; code that needs them waits, the window does not."""
     import cv2  # noqa: F401 - changes sys.path meanwhile, which the process would get
 
     from labapp.core.compiled import MAY_COMPILE

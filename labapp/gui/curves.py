@@ -1,4 +1,4 @@
-"""What plots show: curves of points with their σ, marks and keys. Without Qt."""
+"""Data of plots: curves of points with their σ, marks and keys. Without Qt."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from labapp.gui.digits import rounded
 
 @dataclass(frozen=True)
 class Mark:
-    """How a point looks, and what that means."""
+    """Symbol of a point, and its meaning."""
 
     sign: str
     """● or ○ (circles, filled and open), ■ or ▪ (squares, the small one red), × (a cross)."""
@@ -29,7 +29,7 @@ def _none() -> IntArray:
 
 @dataclass(frozen=True)
 class Curve(ReadOnlyArrays):
-    """One plot's curve; n points."""
+    """One curve of a plot; n points."""
 
     name: str
     unit: str
@@ -38,27 +38,27 @@ class Curve(ReadOnlyArrays):
     y: FloatArray
     """Shape (n,); x ascends, a NaN in y is a gap."""
     sigma: FloatArray = field(default_factory=lambda: np.zeros(0))
-    """± of each y, shape (n,); NaN where there is none. Empty: no bars."""
+    """± of each y, shape (n,); NaN where it is unknown. Empty: no error bars."""
     key: IntArray = field(default_factory=_none)
-    """What each point stands for (a frame's number), ascending, shape (n,). Empty: points are not
-    drawn and cannot be chosen, only the line is.
+    """Identifier of each point (a frame number), ascending, shape (n,). If empty, only the line is
+    drawn and no point can be selected.
     """
     mark: IntArray = field(default_factory=_none)
-    """Index of each point's mark, shape (n,); empty as ``key`` is."""
+    """Index of each point's mark, shape (n,); empty if ``key`` is."""
     marks: tuple[Mark, ...] = (PLAIN,)
-    """What the marks are, the usual one first."""
+    """The marks, the usual one first."""
     level: float = float("nan")
-    """A dashed line at that height: the mean; NaN for none."""
+    """Height of a dashed line (the mean); NaN for none."""
     decimals: int = 3
-    """Decimals of y where no σ gives them."""
+    """Decimals of y where σ is unknown."""
     from_zero: bool = False
     limits: tuple[float | None, float | None] = (None, None)
-    """Lines at the lower and the upper limit of y, always in view; None for none."""
+    """Lower and upper limit of y, drawn as lines that are always in view; None for none."""
     events: FloatArray = field(default_factory=lambda: np.zeros(0))
-    """Places on the axis where the curve changes, each a dotted line."""
+    """Positions on the axis where the curve changes, each drawn as a dotted line."""
     quick: bool = False
-    """Whether points have a mark only where it is not the usual one: the curve is redrawn many
-    times a second.
+    """Whether marks are drawn only where they are not the usual one, because the curve is redrawn
+    many times per second.
     """
 
     @property
@@ -75,11 +75,11 @@ class Axis:
     unit: str
     """"Time", "s"."""
     decimals: int = 4
-    """Decimals of a place on it, in text."""
+    """Decimals of a position on the axis, in text."""
     key_name: str = "frame"
-    """What a point's key is: "frame"."""
+    """Meaning of a point's key: "frame"."""
     span: tuple[float, float] | None = None
-    """Both ends of what is to be seen in any case; None: the curves alone."""
+    """Both ends of the range that is always visible; None: the range of the curves."""
 
     @property
     def title(self) -> str:
@@ -88,7 +88,7 @@ class Axis:
 
 
 def point_text(curve: Curve, index: int, axis: Axis) -> str:
-    """A point for the read-out and the screen reader."""
+    """Text of a point for the read-out and the screen reader."""
     sigma = float(curve.sigma[index]) if len(curve.sigma) else None
     value, spread = rounded(float(curve.y[index]), sigma, curve.decimals)
     message = f"{curve.name} {value}{f' ± {spread}' if spread else ''} {curve.unit}".strip()
@@ -102,7 +102,7 @@ def point_text(curve: Curve, index: int, axis: Axis) -> str:
 
 
 def nearest(curve: Curve, x: float) -> int | None:
-    """Index of the point nearest to a place on the axis; None if there is no point."""
+    """Index of the point nearest to a position on the axis; None if there is no point."""
     if not len(curve.x):
         return None
     after = int(np.searchsorted(curve.x, x))
@@ -111,7 +111,7 @@ def nearest(curve: Curve, x: float) -> int | None:
 
 
 def next_key(curves: Sequence[Curve], current: int, step: int) -> int | None:
-    """The key a number of points after the present one (before: negative); None without points."""
+    """The key ``step`` points after the current one (negative: before it); None without points."""
     keyed = [curve.key for curve in curves if len(curve.key)]
     if not keyed:
         return None
@@ -124,7 +124,7 @@ def next_key(curves: Sequence[Curve], current: int, step: int) -> int | None:
 
 
 def as_table(curves: Sequence[Curve], axis: Axis) -> str:
-    """Values of all curves that have keys, in tabs with a line of names: for a spreadsheet."""
+    """Values of all curves with keys as tab-separated text with a header, for a spreadsheet."""
     keyed = [curve for curve in curves if len(curve.key)]
     keys = np.unique(np.concatenate([curve.key for curve in keyed])) if keyed else _none()
     names = [axis.key_name, axis.title]

@@ -1,4 +1,4 @@
-"""What the window asks: which file, and whether."""
+"""Dialogs that ask for a file or a decision."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ EVERYTHING = "All files (*)"
 
 
 def recordings() -> str:
-    """The filter of a file dialog for everything that can be imported."""
+    """File dialog filter for everything that can be imported."""
     from labapp.media import RECORDING_SUFFIXES
     from labapp.media.formats.images import IMAGE_SUFFIXES
     from labapp.media.formats.tiff import TIFF_SUFFIXES
@@ -26,7 +26,7 @@ def recordings() -> str:
 
 
 def ask_file(parent: QWidget, title: str, folder: Path, kinds: str = "") -> Path | None:
-    """Ask for a file that is there; ``kinds`` is Qt's filter: "Tables (*.csv)"."""
+    """Ask for an existing file; ``kinds`` is Qt's filter: "Tables (*.csv)"."""
     name, _ = QFileDialog.getOpenFileName(parent, title, str(folder), kinds)
     return Path(name) if name else None
 
@@ -38,7 +38,7 @@ def ask_folder(parent: QWidget, title: str, folder: Path) -> Path | None:
 
 
 def ask_save(parent: QWidget, title: str, proposed: Path, kinds: str) -> Path | None:
-    """Ask for a file to write, which may be there already."""
+    """Ask for a file to write, which may already exist."""
     name, _ = QFileDialog.getSaveFileName(parent, title, str(proposed), kinds)
     return Path(name) if name else None
 
@@ -49,8 +49,8 @@ def ask_session(parent: QWidget, folder: Path) -> Path | None:
 
 
 def ask_new_session(parent: QWidget, proposed: Path, title: str = "New session") -> Path | None:
-    """Ask for the file of a new session; the ending is added where it was left out."""
-    options = QFileDialog.Option.DontConfirmOverwrite  # nothing is ever written over
+    """Ask for the file of a new session; a missing suffix is added."""
+    options = QFileDialog.Option.DontConfirmOverwrite  # no file is ever overwritten
     name, _ = QFileDialog.getSaveFileName(parent, title, str(proposed), SESSIONS, options=options)
     if not name:
         return None
@@ -59,7 +59,7 @@ def ask_new_session(parent: QWidget, proposed: Path, title: str = "New session")
 
 
 def ask_recording(parent: QWidget, folder: Path, title: str = "Import recording") -> Path | None:
-    """Ask for a recording that is a file."""
+    """Ask for a recording file."""
     return ask_file(parent, title, folder, f"{recordings()};;{EVERYTHING}")
 
 
@@ -69,7 +69,7 @@ def ask_setup(parent: QWidget, folder: Path) -> Path | None:
 
 
 def ask_read_only(parent: QWidget, path: Path) -> bool:
-    """Offer to open read-only a session that another program has open."""
+    """Offer to open a session read-only because it is open in another program."""
     box = QMessageBox(parent)
     box.setObjectName("read-only")
     box.setIcon(QMessageBox.Icon.Question)
@@ -90,7 +90,7 @@ def ask_read_only(parent: QWidget, path: Path) -> bool:
 
 
 def ask_delete_draft(parent: QWidget, path: Path) -> bool:
-    """Ask whether a draft is to be deleted."""
+    """Ask whether to delete a draft."""
     box = QMessageBox(parent)
     box.setObjectName("delete-draft")
     box.setIcon(QMessageBox.Icon.Question)
@@ -111,7 +111,7 @@ def ask_delete_draft(parent: QWidget, path: Path) -> bool:
 
 
 def ask_recording_end(parent: QWidget, name: str) -> Literal["keep", "discard", "go on"]:
-    """Ask what becomes of a recording that runs when its session is to be closed."""
+    """Ask what to do with a running recording when its session is to be closed."""
     box = QMessageBox(parent)
     box.setObjectName("recording-runs")
     box.setIcon(QMessageBox.Icon.Question)
@@ -137,7 +137,7 @@ def ask_recording_end(parent: QWidget, name: str) -> Literal["keep", "discard", 
 
 
 def new_path(folder: Path, stem: str, suffix: str = SUFFIX) -> Path:
-    """A path that does not exist yet, for a session, or for a folder (no suffix)."""
+    """A path that does not exist yet, for a session or, without a suffix, for a folder."""
     path, number = folder / f"{stem}{suffix}", 1
     while path.exists():
         number += 1

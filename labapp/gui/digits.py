@@ -1,4 +1,4 @@
-"""Numbers as an operator reads them: units, and no more digits than are known. Without Qt."""
+"""Numbers for display: with units and only the significant digits. Without Qt."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import numpy as np
 from labapp.text import csv_text
 
 MINUS = "−"
-"""As wide as a digit's plus; a hyphen reads as a dash."""
+"""Minus sign, as wide as a plus; a hyphen reads as a dash."""
 
 NOTHING = "–"
-"""Stands where there is no number."""
+"""Placeholder for a missing number."""
 
 EXTRA_DECIMALS = 3
-"""A number with this many decimals more than its field shows was typed so: all are shown."""
+"""Largest number of additional decimals that a field shows because they were entered."""
 
 
 @dataclass(frozen=True)
@@ -26,19 +26,19 @@ class ResultRow:
 
     name: str
     value: float | str | None
-    """A number, or words; None or NaN where there is none."""
+    """A number or text; None or NaN if there is none."""
     sigma: float | None = None
-    """Its standard uncertainty; None where there is none."""
+    """Its standard uncertainty; None if there is none."""
     unit: str = ""
     """"mm", "°", "px/mm" …"""
     decimals: int = 3
-    """How many to show where no σ says it."""
+    """Decimals to show if σ is unknown."""
     note: str = ""
-    """More about it, as a tooltip."""
+    """Further explanation, shown as a tooltip."""
 
     @property
     def texts(self) -> tuple[str, str, str, str]:
-        """Name, value, ± and unit as they are shown."""
+        """Displayed name, value, ± and unit."""
         if isinstance(self.value, str):
             return self.name, self.value, "", self.unit
         value, sigma = rounded(self.value, self.sigma, self.decimals)
@@ -46,14 +46,14 @@ class ResultRow:
 
 
 def rounded(value: float | None, sigma: float | None, decimals: int = 3) -> tuple[str, str]:
-    """A value and its σ as texts: σ to two significant digits, the value to the same place.
+    """Text of a value and of its σ: σ to two significant digits, the value to the same place.
 
     Parameters
     ----------
     value, sigma
-        None or NaN: unknown.
+        None or NaN if unknown.
     decimals
-        Of the value where σ is unknown or 0.
+        Decimals of the value if σ is unknown or 0.
     """
     if value is None or not math.isfinite(value):
         return NOTHING, ""
@@ -70,20 +70,20 @@ def with_sigma(value: float | None, sigma: float | None) -> str:
 
 
 def plain(value: float, decimals: int) -> str:
-    """A number with the given decimals (negative: rounded to tens …), without a negative zero."""
+    """A number with the given decimals (negative: rounded to tens, …), never a negative zero."""
     text = f"{round(value, decimals):.{max(decimals, 0)}f}"
     return text.lstrip("-") if float(text) == 0 else text.replace("-", MINUS)
 
 
 def entered(value: float, decimals: int) -> str:
-    """A number in a field: with its decimals, or with a few more where somebody typed more."""
+    """A number in a field: with the field's decimals, or a few more if more were entered."""
     whole = np.format_float_positional(value, trim="-")
     more = len(whole.partition(".")[2])
     return plain(value, more if decimals < more <= decimals + EXTRA_DECIMALS else decimals)
 
 
 def parsed(text: str) -> float | None:
-    """The number that was typed, with a point or a comma; None if it is not one."""
+    """The entered number, with a decimal point or comma; None if it is not a finite number."""
     try:
         value = float(text.strip().replace(MINUS, "-").replace(",", "."))
     except ValueError:
@@ -92,24 +92,24 @@ def parsed(text: str) -> float | None:
 
 
 def as_text(rows: Iterable[ResultRow]) -> str:
-    """Result rows for a text or a letter: one line each, in tabs."""
+    """Result rows as tab-separated lines, for a document."""
     return "\n".join("\t".join(row.texts) for row in rows)
 
 
 def as_csv(rows: Iterable[ResultRow]) -> str:
-    """Result rows for a program: comma-separated, numbers in full."""
+    """Result rows as comma-separated values at full precision, for a program."""
     cells = ((row.name, row.value, row.sigma, row.unit) for row in rows)
     return csv_text([("quantity", "value", "sigma", "unit"), *cells])
 
 
 def round_factor(most: float) -> float:
-    """1, 2 or 5 times a power of ten, the largest that is not above ``most`` (positive)."""
+    """The largest 1, 2 or 5 times a power of ten that does not exceed ``most`` (positive)."""
     power: float = 10.0 ** math.floor(math.log10(most))
     return max(step * power for step in (1.0, 2.0, 5.0) if step * power <= most)
 
 
 def cell_text(cell: str | float | None) -> str:
-    """A cell of a table: three significant digits, no more than there are."""
+    """Text of a table cell: a float has three significant digits, and all before the point."""
     if cell is None or (isinstance(cell, float) and not math.isfinite(cell)):
         return NOTHING
     if isinstance(cell, float):

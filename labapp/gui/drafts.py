@@ -1,4 +1,4 @@
-"""Drafts: sessions without a name yet, in a folder of the app's own."""
+"""Drafts: sessions without a name yet, in a folder of the app."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def drafts_folder() -> Path:
-    """Folder of the drafts; it may not exist yet."""
+    """Folder of the drafts, which may not exist yet."""
     return platformdirs.user_data_path(NAME, appauthor=False) / "drafts"
 
 
@@ -28,7 +28,7 @@ def is_draft(path: Path) -> bool:
 
 
 def drafts() -> list[Path]:
-    """The drafts, the last changed first."""
+    """Files of the drafts, the most recently changed first."""
     try:
         found = [(path.stat().st_mtime, path) for path in drafts_folder().glob(f"*{SUFFIX}")]
     except OSError:
@@ -42,7 +42,7 @@ def new_draft(recording: Path) -> Session:
     Raises
     ------
     InputError
-        If it cannot be written.
+        If the draft cannot be written.
     """
     from labapp.session.session import Session
 
@@ -53,7 +53,7 @@ def new_draft(recording: Path) -> Session:
 
 
 def folder_of(session: Session) -> Path:
-    """Folder for files made from a session: its own; of a draft that of its recording."""
+    """Folder for files made from a session: its own, or that of the recording for a draft."""
     if not is_draft(session.path):
         return session.path.parent
     place = session.recording_place

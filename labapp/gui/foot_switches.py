@@ -1,4 +1,4 @@
-"""The foot switches in use, whatever page is in view: found, learned, kept, and what is pressed."""
+"""Foot switches, regardless of the page in view: detection, learning, storage and presses."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from labapp.media.devices.hid import AWAY, LONGEST, UNPLUGGED, HidError, HidInfo
 from labapp.media.events import Event
 
 POLL_MS = 20
-"""What is pressed is done within this."""
+"""Interval, ms, at which presses are handled."""
 
 DEAF_S = 0.5
 """Time, s, in which presses are ignored after one that was learned."""
@@ -32,7 +32,7 @@ DOES: dict[Action, str] = {
 }
 
 CALLS: dict[Action, str] = {"trigger": "record", "mark": "mark", "next": "next_step"}
-"""Actions of the window's menus."""
+"""Names of the window's menu actions."""
 
 
 @dataclass
@@ -44,12 +44,12 @@ class InUse:
 
     @property
     def pedals(self) -> PedalMap:
-        """Which it is, and what its pedals do."""
+        """The device, and the actions of its pedals."""
         return self.switch.pedals
 
     @property
     def words(self) -> str:
-        """Whether it can be pressed, and if not what to do."""
+        """State of the connection, and what to do if there is none."""
         name = self.pedals.name
         if self.switch.connected:
             return f"● {name}: connected"
@@ -62,18 +62,18 @@ class InUse:
 
 @dataclass(frozen=True)
 class DevicesFound:
-    """What was found plugged in."""
+    """Result of a search for devices."""
 
     usable: tuple[str, ...] = ()
-    """Names of the foot switches that are known and can be read."""
+    """Names of the known foot switches that can be read."""
     closed: tuple[HidInfo, ...] = ()
-    """Devices that may not be read, those that are known first."""
+    """Devices without read permission, the known ones first."""
     problem: str = ""
-    """Why nothing could be looked for; empty if it could."""
+    """Reason why the search failed; empty if it did not."""
 
     @property
     def words(self) -> str:
-        """What was found, a sentence or two."""
+        """Text of the result, one or two sentences."""
         if self.problem:
             return self.problem
         parts = [f"Found: {', '.join(self.usable)}."] if self.usable else []
@@ -88,30 +88,30 @@ class DevicesFound:
 class FootSwitches(QObject):
     """Foot switches: a pressed pedal runs an action of the window's menus.
 
-    Nothing runs while none is in use. Devices are read in threads of their own; what they tell is
-    taken from a queue.
+    Nothing runs while none is in use. Each device is read in a separate thread, which puts its
+    events into a queue.
     """
 
     changed = Signal()
-    """What is shown of them changed."""
+    """The displayed information changed."""
     kept = Signal(object)
-    """The foot switches in use or their actions changed: as plain values, to be stored."""
+    """The foot switches in use or their actions changed: plain values to be stored."""
     pressed = Signal(str)
-    """The name of the menus' action that a pedal was pressed for."""
+    """A pedal was pressed: the name of its menu action."""
     notified = Signal(str, bool)
-    """Something for the operator to read: a sentence, and whether it is a problem."""
+    """A message for the operator: its text, and whether it is a problem."""
 
     def __init__(self, tasks: Tasks, parent: QObject | None = None) -> None:
         super().__init__(parent)
         self._tasks = tasks
         self.in_use: dict[str, InUse] = {}
-        """By the device's key."""
+        """Foot switches in use, by the device's key."""
         self.found: DevicesFound | None = None
-        """What was plugged in at the last look; None before one."""
+        """Result of the last search; None before the first."""
         self.learned: Learned | None = None
-        """The pedal that was pressed to be learned, until its action is chosen."""
+        """The learned pedal, until its action is chosen."""
         self.unavailable: tuple[str, ...] = ()
-        """Why some devices cannot be listened to while a pedal is waited for."""
+        """Reasons why some devices cannot be read while waiting for a pedal."""
         self._deaf_until_s = 0.0
         self._learning: Task | None = None
         self._looking: Task | None = None
@@ -123,7 +123,7 @@ class FootSwitches(QObject):
     # --- in use -------------------------------------------------------------------------------
 
     def use(self, kept: Iterable[Mapping[str, Any]]) -> None:
-        """Start the foot switches that were stored; a damaged entry is reported."""
+        """Start the stored foot switches; report damaged entries."""
         for values in kept:
             try:
                 pedals = PedalMap.from_dict(values)
@@ -134,14 +134,14 @@ class FootSwitches(QObject):
         self.changed.emit()
 
     def stop(self) -> None:
-        """Use none any more; they stay remembered."""
+        """Stop all foot switches; they stay in the preferences."""
         self._timer.stop()
         for each in self.in_use.values():
             each.switch.stop()
         self.in_use.clear()
 
     def assign(self, key: str, pedal: int, action: Action | None) -> None:
-        """Let a pedal of a device in use do something else; None: nothing."""
+        """Assign another action to a pedal of a device in use; None: no action."""
         switch = self.in_use[key].switch
         switch.pedals = switch.pedals.with_action(pedal, action)
         if not switch.pedals.actions:
@@ -154,7 +154,7 @@ class FootSwitches(QObject):
     def _begin(self, pedals: PedalMap) -> None:
         if pedals.device in self.in_use or not pedals.actions:
             return
-        # Calls come in the device's thread: it is given the queue, and nothing of Qt.
+        # Callbacks run in the device's thread, so they get the queue and no Qt object.
         hear = partial(_put, self._received, pedals.device)
         switch = FootSwitch(pedals, hear, hear, hid.find_hid, hid.open_hid)
         self.in_use[pedals.device] = InUse(switch)
@@ -166,7 +166,7 @@ class FootSwitches(QObject):
         self.changed.emit()
 
     def _take(self) -> None:
-        """Do the actions of pedals that were pressed, and report events."""
+        """Run the actions of pressed pedals, and report events."""
         deaf = self.learns or time.monotonic() < self._deaf_until_s
         for _ in range(self._received.qsize()):
             key, received = self._received.get_nowait()
@@ -177,7 +177,7 @@ class FootSwitches(QObject):
                 warned = received.kind == "warning" and received.words != AWAY
                 self.notified.emit(str(received), warned)
                 if warned and received.words != UNPLUGGED:
-                    self.look()  # what it may not be read for
+                    self.look()  # to find devices without permission
                 self.changed.emit()
             elif not deaf:
                 self._do(received)
@@ -190,20 +190,20 @@ class FootSwitches(QObject):
         else:
             self.pressed.emit(CALLS[action])
 
-    # --- to find and learn them ---------------------------------------------------------------
+    # --- detection and learning ---------------------------------------------------------------
 
     @property
     def looks(self) -> bool:
-        """Whether it is being looked what is plugged in."""
+        """Whether a search for devices is running."""
         return self._looking in self._tasks.active
 
     @property
     def learns(self) -> bool:
-        """Whether a pedal is waited for."""
+        """Whether the app waits for a pedal to be learned."""
         return self._learning is not None and self._learning in self._tasks.active
 
     def look(self) -> None:
-        """See what is plugged in, in the background."""
+        """Search for devices in the background."""
 
         def done(found: DevicesFound) -> None:
             self.found = found
@@ -213,7 +213,7 @@ class FootSwitches(QObject):
             self._looking = self._tasks.start("Looking for foot switches", lambda _: _found(), done)
 
     def learn(self) -> None:
-        """Wait for a pedal to be pressed, in the background, until `give_up`."""
+        """Wait in the background for a pedal to be pressed, until `give_up`."""
         if self.learns:
             return
         self.learned, self.unavailable = None, ()
@@ -236,14 +236,14 @@ class FootSwitches(QObject):
         self.changed.emit()
 
     def give_up(self) -> None:
-        """Wait for no pedal any more, or leave the one that was pressed."""
+        """Stop waiting for a pedal, or discard the learned one."""
         if self._learning is not None:
             self._learning.cancel()
         self.learned = None
         self.changed.emit()
 
     def use_learned(self, action: Action) -> None:
-        """Let the pedal that was pressed do something from now on, and remember it."""
+        """Assign an action to the learned pedal, and store it."""
         learned, self.learned = self.learned, None
         if learned is None:
             return
@@ -255,7 +255,7 @@ class FootSwitches(QObject):
 
     @property
     def proposed(self) -> Action:
-        """What the pedal that was pressed does already, or else the first that none does yet."""
+        """Current action of the learned pedal, or else the first action that no pedal has."""
         actions: dict[int, Action] = {}
         if self.learned is not None and self.learned.info.key in self.in_use:
             actions = dict(self.in_use[self.learned.info.key].pedals.actions)
@@ -266,7 +266,7 @@ class FootSwitches(QObject):
 
 
 def pedal_name(number: int, keyboard: bool) -> str:
-    """A pedal as it is called: of a device with buttons its number from 1, else its key."""
+    """Name of a pedal: its number from 1 for a device with buttons, otherwise its key."""
     if not keyboard:
         return f"pedal {number % (8 * LONGEST) + 1}"
     letters = {4 + k: letter for k, letter in enumerate("ABCDEFGHIJKLMNOPQRSTUVWXYZ1234567890")}
@@ -292,7 +292,7 @@ def _found() -> DevicesFound:
 
 
 def _learned(control: Control) -> Learned | str | None:
-    """Wait for a pedal; why none can be read, in words."""
+    """Wait for a pedal; return the reason as text if no device can be read."""
 
     def report_problems(problems: list[str]) -> None:
         if not control.cancelled.is_set():

@@ -1,4 +1,4 @@
-"""What the app remembers between starts. Nothing in it can stop the program from starting."""
+"""Preferences stored between starts. Their file can never prevent a start of the program."""
 
 from __future__ import annotations
 
@@ -23,45 +23,45 @@ KEPT_RECENT = 12
 THEMES = ("system", "light", "dark")
 LARGEST_BYTES = 1_000_000
 LOCK_S = 2.0
-"""Time, s, that a window waits for the change of another."""
+"""Time, s, that a window waits while another one writes."""
 
 
 @dataclass(frozen=True)
 class Preferences:
-    """What is remembered."""
+    """Stored preferences."""
 
     recent: tuple[str, ...] = ()
-    """Session files, the last opened first."""
+    """Session files, the most recently opened first."""
     theme: str = "system"
     geometry: str = ""
     layout: str = ""
-    """Geometry and state of the window as Qt gives them, base64; empty for the default."""
+    """Geometry and state of the window as returned by Qt, base64; empty for the default."""
     last_folder: str = ""
-    """Where a file was chosen last; empty for the documents folder."""
+    """Folder of the last chosen file; empty for the documents folder."""
     foot_switches: tuple[Mapping[str, Any], ...] = ()
-    """What their pedals do, each as `PedalMap.as_dict` has it."""
+    """Actions of their pedals, each as returned by `PedalMap.as_dict`."""
 
     def with_recent(self, path: Path, folder: Path | None = None) -> Preferences:
-        """The same with a session as the last opened, and its folder, or another, as the last."""
+        """Copy with a session as the most recent, and its folder (or ``folder``) as the last."""
         name = str(path.absolute())
         others = (other for other in self.recent if other != name)
         last = str(folder or path.parent)
         return replace(self, recent=(name, *others)[:KEPT_RECENT], last_folder=last)
 
     def without_recent(self, path: Path) -> Preferences:
-        """The same with a session forgotten."""
+        """Copy without a session among the recent ones."""
         name = str(path.absolute())
         return replace(self, recent=tuple(other for other in self.recent if other != name))
 
     @property
     def folder(self) -> Path:
-        """Where a file dialog begins."""
+        """Initial folder of a file dialog."""
         last = Path(self.last_folder)
         return last if self.last_folder and last.is_dir() else documents_folder()
 
     @property
     def samples_folder(self) -> Path:
-        """Where copies of samples go."""
+        """Folder for copies of the samples."""
         documents = platformdirs.user_documents_path()
         if documents.is_dir():
             return documents / NAME
@@ -69,24 +69,24 @@ class Preferences:
 
 
 class PreferencesStore(QObject):
-    """The preferences of a window and their file, which other windows change, too."""
+    """Preferences of a window and their file, which other windows change, too."""
 
     changed = Signal()
-    """A preference was stored."""
+    """A preference changed."""
     failed = Signal(str)
-    """A preference could not be written, and why. It still applies to this window."""
+    """A preference could not be written: the reason. It still applies to this window."""
 
     def __init__(self, preferences: Preferences, path: Path) -> None:
         super().__init__()
         self.current = preferences
-        """The preferences that hold now."""
+        """The current preferences."""
         self.path = path
 
     def remember(self, change: Callable[[Preferences], Preferences]) -> None:
-        """Change what is remembered by now, one window at a time, and write it."""
+        """Change the stored preferences and write them, one window at a time."""
         lock = FileLock(self.path.with_name(f".{self.path.name}.lock"), timeout=LOCK_S)
         with ExitStack() as held:
-            with suppress(OSError, Timeout):  # better written without a turn than not at all
+            with suppress(OSError, Timeout):  # better written without the lock than not at all
                 self.path.parent.mkdir(parents=True, exist_ok=True)
                 held.enter_context(lock)
             self.recall()
@@ -97,30 +97,30 @@ class PreferencesStore(QObject):
         self.changed.emit()
 
     def recall(self) -> None:
-        """Look up what is remembered: other windows may have added to it, or it is gone."""
+        """Read the file, which other windows may have changed; if it is gone, nothing changes."""
         found, problem = read_preferences(self.path)
         if not problem and self.path.exists():
             self.current = found
 
 
 def documents_folder() -> Path:
-    """The user's documents, or the home folder where there are none."""
+    """The user's documents folder, or the home folder if there is none."""
     documents = platformdirs.user_documents_path()
     return documents if documents.is_dir() else Path.home()
 
 
 def preferences_file() -> Path:
-    """Where preferences are kept."""
+    """Path of the preferences file."""
     return Path(platformdirs.user_config_dir(NAME, appauthor=False)) / "preferences.json"
 
 
 def read_preferences(path: Path) -> tuple[Preferences, str]:
-    """Read preferences; what cannot be used is kept aside and the defaults hold.
+    """Read preferences; an unusable file is renamed and the defaults are returned.
 
     Returns
     -------
     preferences, problem
-        ``problem`` is the message for the operator; empty if nothing was wrong.
+        ``problem`` is the message for the operator; empty if there was no problem.
     """
     try:
         if path.stat().st_size > LARGEST_BYTES:
@@ -141,7 +141,7 @@ def read_preferences(path: Path) -> tuple[Preferences, str]:
 
 
 def write_preferences(path: Path, preferences: Preferences) -> str:
-    """Write preferences, all or nothing; returns what went wrong, or nothing."""
+    """Write preferences atomically; return the message of a failure, otherwise an empty text."""
     held = {"version": VERSION, **dataclasses.asdict(preferences)}
     try:
         path.parent.mkdir(parents=True, exist_ok=True)

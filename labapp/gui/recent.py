@@ -1,4 +1,4 @@
-"""What the welcome page shows of a session."""
+"""Summary of a session on the welcome page."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ THUMBNAIL_PX = (128, 96)
 
 @dataclass(frozen=True)
 class Recent:
-    """A session opened before."""
+    """A recently opened session."""
 
     path: Path
     title: str
-    """Of the experiment, or the file's name."""
+    """Title of the experiment, or the name of the file."""
     about: str
-    """Date, frames, what is measured; or why it cannot be opened."""
+    """Date, numbers of frames and of measured ones; or why it cannot be opened."""
     thumbnail: GreyImage | None = None
-    """Its first frame, small; None where it cannot be read."""
+    """Small picture of its first frame; None if it cannot be read."""
     there: bool = True
     """Whether it can be opened."""
 
 
 def look_at(path: Path) -> Recent:
-    """Look into a session file without changing anything."""
+    """Read the summary of a session file without changing anything."""
     from labapp.session.session import Session
 
     try:

@@ -1,6 +1,6 @@
-"""Long work off the GUI thread: progress, cancel, and errors in words and in the log.
+"""Long work outside the GUI thread: progress, cancelling, and reporting and logging of errors.
 
-A worker thread holds no QObject: it puts what happens into a queue, which a timer of the GUI thread
+A worker thread holds no QObject: it puts events into a queue, which a timer of the GUI thread
 empties.
 """
 
@@ -23,33 +23,33 @@ from labapp.log import NAME
 POLL_MS = 10
 
 DONE, PROBLEM = "✓", "▲"
-"""Before what came of work, beside what was pressed: shape says it as well as colour."""
+"""Symbols before a result shown at the pressed button; they are clear without colour, too."""
 
 PROGRESS_MS = 100
-"""Progress is reported no more often."""
+"""Shortest interval, ms, between reports of progress."""
 
 STOP_S = 5.0
-"""Time, s, that a cancelled task is waited for."""
+"""Longest time, s, to wait for a cancelled task."""
 
 
 class Cancelled(Exception):
-    """The operator has cancelled the task; raised in its work at the next report of progress."""
+    """The operator cancelled the task; raised in its work at the next report of progress."""
 
 
 @dataclass
 class Control:
-    """What a task's work talks to."""
+    """Interface of a task to its work."""
 
     events: queue.SimpleQueue[tuple[str, Any]] = field(default_factory=queue.SimpleQueue)
-    """Receives its events."""
+    """Queue of the events."""
     reached: tuple[int, int] = (0, 0)
-    """How far the work is: done, and in all."""
+    """Progress: amount done, and total."""
     stage: str = ""
-    """What of it is being done; empty where it has no parts."""
+    """Current stage of the work; empty if it has no stages."""
     cancelled: threading.Event = field(default_factory=threading.Event)
 
     def progress(self, done: int, total: int, stage: str = "") -> None:
-        """Say how far the work is.
+        """Report the progress of the work.
 
         Raises
         ------
@@ -75,33 +75,33 @@ Work = Callable[[Control], Any]
 
 @dataclass
 class Task:
-    """One piece of work under way."""
+    """A running task."""
 
     title: str
-    """What it does, for the operator: "Measuring"."""
+    """Name of the work for the operator: "Measuring"."""
     control: Control
     thread: threading.Thread
     on_part: Callable[[Any], None] | None
     on_done: Callable[[Any], None] | None
     beside: Callable[[str], object] | None
-    """Called on the GUI thread with parts, with the result, and with why it failed."""
+    """These are called on the GUI thread with parts, the result, and the reason of a failure."""
     kind: str
-    """Tasks of one kind share a failure: "Exporting", whatever the folder."""
+    """Tasks of the same kind share a failure: "Exporting" for any folder."""
     is_lasting: bool
     """Whether it continues when another session is opened."""
 
     @property
     def done(self) -> int:
-        """How much is done."""
+        """Amount of work done."""
         return self.control.reached[0]
 
     @property
     def total(self) -> int:
-        """How much there is to do; 0 while that is not known."""
+        """Total amount of work; 0 while it is unknown."""
         return self.control.reached[1]
 
     def cancel(self) -> None:
-        """Ask the work to stop; what it has finished stays."""
+        """Request the work to stop; finished parts are kept."""
         self.control.cancelled.set()
 
 
@@ -134,7 +134,7 @@ class Tasks(QObject):
         kind: str = "",
         is_lasting: bool = False,
     ) -> Task:
-        """Begin work in a thread of its own.
+        """Start work in a separate thread.
 
         Parameters
         ----------
@@ -144,9 +144,9 @@ class Tasks(QObject):
             Called on the GUI thread with what ``work`` returns, and with each `Control.part`.
             Not called after a cancel or a failure.
         beside
-            Shows why it failed beside what was pressed, too; called with nothing at the beginning.
+            Also shows the reason of a failure at the pressed button; called with "" at the start.
         kind
-            A failure is forgotten when work of its kind begins again; empty: its title.
+            A failure is cleared when work of its kind starts again; empty: its title.
         is_lasting
             Whether it continues when another session is opened.
         """
@@ -163,12 +163,12 @@ class Tasks(QObject):
         return task
 
     def cancel_all(self, lasting: bool = True) -> None:
-        """Cancel everything and wait until it has stopped; nothing is called afterwards.
+        """Cancel all tasks and wait until they have stopped; no callback is called afterwards.
 
         Parameters
         ----------
         lasting
-            Whether tasks that are lasting are cancelled, too.
+            Whether lasting tasks are cancelled, too.
         """
         ended = [task for task in self.active if lasting or not task.is_lasting]
         for task in ended:
@@ -182,7 +182,7 @@ class Tasks(QObject):
 
     def _poll(self) -> None:
         for task in list(self.active):
-            # No more than there are now: what comes meanwhile waits for the hands.
+            # Only the events present now: user input is handled before later ones.
             for _ in range(task.control.events.qsize()):
                 if task in self.active:
                     self._take(task, *task.control.events.get_nowait())
@@ -217,7 +217,7 @@ def _run(work: Work, control: Control) -> None:
     except Cancelled:
         control.events.put(("cancelled", None))
     except Exception as error:
-        if control.cancelled.is_set():  # what it worked on may have been closed under it
+        if control.cancelled.is_set():  # its session may have been closed meanwhile
             logging.getLogger(NAME).info("after a cancel", exc_info=error)
             control.events.put(("cancelled", None))
         else:
@@ -225,7 +225,7 @@ def _run(work: Work, control: Control) -> None:
 
 
 def error_text(error: Exception) -> str:
-    """The message for an error; the log gets its traceback."""
+    """Message for an error; its traceback is logged."""
     log = logging.getLogger(NAME)
     if isinstance(error, InputError | CannotMeasure | ValueError):
         log.error("refused", exc_info=error)

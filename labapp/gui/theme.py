@@ -31,13 +31,13 @@ COLOURS = {
     Role.Dark: ("#8f98a3", "#14171a"),
     Role.Shadow: ("#5d656f", "#0b0c0e"),
 }
-"""On a light and on a dark ground."""
+"""Colours by role: on a light and on a dark background."""
 
 RED = QColor("#b8321f"), QColor("#f0705a")
-"""Of alarms, limits, and a recording under way: on a light and on a dark ground."""
+"""Colour of alarms, limits and a running recording: on a light and on a dark background."""
 
 DISABLED = {False: "#8b939d", True: "#767e88"}
-"""Text of what is disabled, light and dark."""
+"""Text colour of disabled widgets, by whether the theme is dark."""
 
 
 def palette(dark: bool) -> QPalette:
@@ -54,22 +54,22 @@ def palette(dark: bool) -> QPalette:
 
 
 def is_dark(look: QPalette) -> bool:
-    """Whether a palette is a dark one; what no role can say is chosen by this."""
+    """Whether a palette is dark, to choose colours that have no role in it."""
     return look.color(Role.Window).lightness() < 128
 
 
 class FollowsTheme:
-    """Of a widget that takes colours which its palette alone does not give; before its class."""
+    """Base of widgets with colours outside the palette; precedes Qt's class in the bases."""
 
     _follows = False
 
     def follow_theme(self) -> None:
-        """Take the window's colours, now and whenever they change."""
+        """Use the window's colours, now and whenever they change."""
         self._follows = True
         self.take_colours()
 
     def take_colours(self) -> None:
-        """Take the window's colours."""
+        """Use the window's current colours."""
 
     def changeEvent(self, event: QEvent) -> None:
         """Follow a change of theme."""
@@ -79,7 +79,7 @@ class FollowsTheme:
 
 
 def apply_theme(app: QApplication, theme: str) -> None:
-    """Show the app light, dark or as the desktop is; dark where the desktop does not say."""
+    """Use the light, the dark or the desktop's theme; dark if the desktop does not specify it."""
     if app.style().name().lower() != "fusion":
         app.setStyle("Fusion")
     desktop_is_light = app.styleHints().colorScheme() == Qt.ColorScheme.Light

@@ -1,4 +1,4 @@
-"""What is open in a window: a session and a frame; signals say when something changes."""
+"""State of a window: the open session and the frame in view; signals report changes."""
 
 from __future__ import annotations
 
@@ -26,41 +26,41 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 MEASURING, MISSING = "Measuring", "Recording"
-"""Causes of problems: see `Workspace.say_wrong`."""
+"""Causes of problems, see `Workspace.say_wrong`."""
 
 MEASURED_S = 0.25
-"""What is measured behind the operator's back is shown no more often."""
+"""Shortest interval, s, between updates for frames measured in the background."""
 
 
 class Workspace(QObject):
-    """The session that a window shows, the frame in view, and the work under way.
+    """The session of a window, the frame in view, and the running tasks.
 
     Pages read the session through `session`, change it through `attempt`, and start long work
-    through `tasks`. They show what the session holds whenever a signal says that it changed.
+    through `tasks`. They are updated whenever a signal reports a change of the session.
     """
 
     closing = Signal()
-    """The session that is open will be closed: an edit under way can still be kept in it."""
+    """The open session is about to be closed; an edit in progress can still be stored in it."""
     opened = Signal()
     """Another session is open, or none."""
     changed = Signal()
-    """A document, the recording or a result changed; pages in view show the session again."""
+    """A document, the recording or a result changed; visible pages are updated."""
     measured = Signal()
-    """Frames that are not in view were measured; sent some times a second while more follow."""
+    """Frames not in view were measured; emitted a few times per second while more follow."""
     frame_changed = Signal(int)
     """Another frame is in view."""
     notified = Signal(str, bool)
-    """Something for the operator to read: a sentence, and whether it is a problem."""
+    """A message for the operator: its text, and whether it is a problem."""
     settled = Signal(str)
-    """A reported problem is solved: its words."""
+    """A reported problem is solved: its text."""
     action_requested = Signal(str)
-    """Run an action of the window's menus, by its name."""
+    """Run an action of the window's menus: its name."""
     next_session_requested = Signal(object)
-    """Begin a session like this one for a recording: its file."""
+    """Create a session like this one for a recording: its file."""
     analysed = Signal(object)
-    """How the pool changes over time was analysed: a `Dynamics`."""
+    """The change of the pool over time was analysed: a `Dynamics`."""
     foot_switches_changed = Signal(object)
-    """The actions of the pedals are to be stored, as plain values."""
+    """The actions of the pedals are to be stored: plain values."""
 
     def __init__(self, parent: QObject | None = None) -> None:
         super().__init__(parent)
@@ -70,7 +70,7 @@ class Workspace(QObject):
         self._warm_pool: ProcessPoolExecutor | None = None
         self._overview: Overview | None = None
         self._measuring: list[Task] = []
-        # Connected first: the slots connected later see the frames as they are.
+        # Connected first, so that slots connected later get an up-to-date overview.
         self.opened.connect(self._forget)
         self.changed.connect(self._forget)
         self.tasks = Tasks(self)
@@ -81,7 +81,7 @@ class Workspace(QObject):
 
     @cached_property
     def foot_switches(self) -> FootSwitches:
-        """The foot switches in use; what they need is loaded on first use."""
+        """The foot switches in use; their modules are loaded on first use."""
         from labapp.gui.foot_switches import FootSwitches
 
         made = FootSwitches(self.tasks, self)
@@ -92,11 +92,11 @@ class Workspace(QObject):
 
     @property
     def folder(self) -> Path:
-        """Where a file dialog begins (`drafts.folder_of`); without a session the home folder."""
+        """Initial folder of a file dialog (`drafts.folder_of`); home folder without a session."""
         return Path.home() if self.session is None else folder_of(self.session)
 
     def show(self, session: Session | None) -> None:
-        """Show a session in place of the present one, which is closed."""
+        """Close the current session and show another one, or none."""
         for cause in list(self._problems):
             self.settle(cause)
         if self.session is not None:
@@ -114,7 +114,7 @@ class Workspace(QObject):
         self.changed.emit()
 
     def close(self) -> None:
-        """Stop all work and close the session: the window goes."""
+        """Stop all tasks and close the session before the window closes."""
         if "foot_switches" in vars(self):
             self.foot_switches.stop()
         self._stop_measuring()
@@ -122,22 +122,22 @@ class Workspace(QObject):
         self.tasks.cancel_all()
 
     def _stop_measuring(self) -> None:
-        """End the processes: a frame that is half measured is not kept, and could take seconds."""
+        """End the processes: a partly measured frame is not kept, and could take seconds."""
         for task in self.tasks.active:
             if not task.is_lasting:
-                task.cancel()  # or it would take the end of its processes for a fault
+                task.cancel()  # otherwise the end of its processes would be a failure
         pools, self._pool, self._warm_pool = (self._pool, self._warm_pool), None, None
         for pool in filter(None, pools):
             parallel.end_processes(pool)
 
     def say_wrong(self, cause: str, words: str) -> None:
-        """Report a problem that lasts until its cause is settled or another session is opened."""
+        """Report a problem, which lasts until its cause is settled or another session is opened."""
         self.settle(cause)
         self._problems[cause] = words
         self.notified.emit(words, True)
 
     def settle(self, cause: str) -> None:
-        """Take it that a problem is over, if there was one."""
+        """Mark the problem of a cause as solved, if there is one."""
         words = self._problems.pop(cause, "")
         if words:
             self.settled.emit(words)
@@ -145,14 +145,14 @@ class Workspace(QObject):
     def run_or_report(
         self, work: Callable[[], T], cause: str = "", beside: Callable[[str], object] | None = None
     ) -> T | None:
-        """Run something short; report a refusal as a message, and return None.
+        """Run a short operation; report an error as a message, and return None.
 
         Parameters
         ----------
         cause
-            What a refusal lasts as long as, see `say_wrong`; empty: until it was read.
+            Error shown until this cause is settled, see `say_wrong`; empty: until it is read.
         beside
-            Shows a refusal beside what was pressed, too; called with nothing where all went well.
+            Also shows the error at the pressed button; called with an empty text on success.
         """
         try:
             done = work()
@@ -176,7 +176,7 @@ class Workspace(QObject):
         cause: str = "",
         beside: Callable[[str], object] | None = None,
     ) -> bool:
-        """Change the session and emit `changed`; False if it was refused, which is reported."""
+        """Change the session and emit `changed`; report an error and return False if it fails."""
         session = self.session
         if session is None or self.run_or_report(lambda: (change(session),), cause, beside) is None:
             return False
@@ -184,11 +184,11 @@ class Workspace(QObject):
         return True
 
     def undo(self) -> None:
-        """Take back the last change."""
+        """Undo the last change."""
         self._step("undo", "Undone", "Nothing to undo")
 
     def redo(self) -> None:
-        """Make the last change again that was taken back."""
+        """Redo the last undone change."""
         self._step("redo", "Redone", "Nothing to redo")
 
     def _step(self, name: str, done: str, nothing: str) -> None:
@@ -204,7 +204,7 @@ class Workspace(QObject):
             self.changed.emit()
 
     def overview(self) -> Overview | None:
-        """All frames at a glance, looked up once after each change; None without a session.
+        """Overview of all frames, read once after each change; None without a session.
 
         Raises
         ------
@@ -226,7 +226,7 @@ class Workspace(QObject):
 
     @property
     def measuring(self) -> Task | None:
-        """The measuring under way; None if there is none."""
+        """The running measurement; None if there is none."""
         return next((task for task in self.tasks.active if task.title == MEASURING), None)
 
     def measure(
@@ -236,16 +236,16 @@ class Workspace(QObject):
         warm: bool = False,
         beside: Callable[[str], object] | None = None,
     ) -> None:
-        """Measure frames in the background; None: those not measured, or stale.
+        """Measure frames in the background; None: those that are not measured, or stale.
 
-        Frames that are kept make `measured` go out; that in view, and the last, `changed`.
+        Stored frames emit `measured`; the frame in view, and the end of the task, emit `changed`.
 
         Parameters
         ----------
         warm
-            Whether each frame is measured from the one before, as fits a fast recording.
+            Whether each frame starts from the previous one, as suits a fast recording.
         beside
-            Says beside what was pressed what came of it, too.
+            Also shows the outcome at the pressed button.
         """
         session = self.session
         if session is None:
@@ -264,11 +264,11 @@ class Workspace(QObject):
                     if number == self.frame:
                         control.part(None)
                     elif time.monotonic() - emitted_s > MEASURED_S:
-                        # Looked up here: the window would wait for results that are being saved.
+                        # Read in this thread: the window would wait while results are saved.
                         control.part(session.overview())
                         emitted_s = time.monotonic()
             except (BrokenProcessPool, CancelledError) as error:
-                control.check()  # ended on purpose
+                control.check()  # raises if it was ended on purpose
                 self._pool = self._warm_pool = None
                 raise ValueError(
                     "a process that measures has ended; what was measured is kept: measure again"
@@ -302,7 +302,7 @@ class Workspace(QObject):
         return self._pool
 
     def _show_end(self) -> None:
-        """Have everything shown that was kept, however the measuring has ended."""
+        """Update the window with all stored results when a measurement has ended."""
         ended = [task for task in self._measuring if task not in self.tasks.active]
         if ended:
             self._measuring = [task for task in self._measuring if task not in ended]

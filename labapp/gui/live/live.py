@@ -227,7 +227,7 @@ class Live:
             ("verdict", partial(newest_of, self._to_judge), self._judge, LOOK_S, 1.0),
         ]
         if self.watch is not None:
-            # That is done elsewhere, and what is left out makes the steps longer: no rest.
+            # No pause: the work runs in a process, and skipped frames would lengthen the steps.
             works.append(("figures", self.watch.next_frame, self.watch.measure, 0.0, 0.0))
         for work in works:
             name = f"live {work[0]}"
@@ -243,7 +243,7 @@ class Live:
         every_s: float,
         rest: float,
     ) -> None:
-        """Do something with one frame after the other, and nothing in between."""
+        """Call a function with one frame after the other."""
         try:
             while not self._closing.is_set():
                 frame = following()
@@ -268,7 +268,7 @@ class Live:
         self._newest.append(LiveFrame(frame, places))
 
     def _dots_in(self, image: GreyImage, light: DetectorTuning | None) -> Dots | None:
-        """Dots of a frame, quickly where its light is known; None if there is none."""
+        """Dots of a frame, found quickly if its light is known; None if there are none."""
         try:
             if light is not None:
                 return quick_dots(image, light, self._dots.band_pass)
@@ -358,7 +358,7 @@ class Live:
         return kept_s / wanted_s, f"{kept_s:.1f} of {wanted_s:g} s"
 
     def recording_text(self) -> str:
-        """What is being recorded, or became of the last recording, and for how long is room."""
+        """Text of the current or last recording, and the remaining recording time."""
         take, parts = self.running, []
         if take is not None:
             parts = [f"● Recording: {pluralize(take.frames, 'frame')} written, {take.lost} lost"]
@@ -376,12 +376,12 @@ class Live:
     # --- to do --------------------------------------------------------------------------------
 
     def trigger(self) -> None:
-        """Begin a recording, or end the one that runs.
+        """Begin a recording, or end the current one.
 
         Raises
         ------
         InputError
-            If there is a file of that name already.
+            If the file already exists.
         """
         if not self.is_open:
             return
@@ -396,7 +396,7 @@ class Live:
                 recorder.note(event, time_s)
 
     def discard(self, take: Take) -> bool:
-        """End a recording and have `close` delete it; False if it had ended before: it is kept."""
+        """End a recording, which `close` then deletes; False if it had ended before and is kept."""
         with self._turn:
             if self.running is not take:
                 return False
@@ -406,17 +406,17 @@ class Live:
         return True
 
     def mark(self) -> None:
-        """Note the present frame beside the recording that runs."""
+        """Mark the current frame in the notes of the current recording."""
         self._say(Event(self.name, "note", "marked by hand"))
 
     def set_plan(self, plan: Plan) -> None:
-        """Record otherwise, and forget frames of before: from now on, or from a recording's end."""
+        """Change the plan and discard earlier frames, now or at the end of the recording."""
         self.plan = plan
         self._is_stale = True
         self._renew()
 
     def _renew(self) -> None:
-        """Give what follows to another recorder where one is wanted and nothing is recorded."""
+        """Replace the recorder if this was requested and there is no recording."""
         if not self._is_stale:
             return
         with self._turn:
@@ -424,11 +424,11 @@ class Live:
                 return
             former = self._recorders[-1]
             self._recorders.append(self._recorder(self.feed))
-        # What it has still to write is waited for elsewhere; `close` waits for it, too.
+        # Another thread waits until it has written everything; `close` waits, too.
         threading.Thread(target=former.close, name="recorder ends", daemon=True).start()
 
     def apply(self, wanted: CameraSettings) -> Future[CameraSettings] | None:
-        """Set the camera between two frames; what it is set to is answered when it is."""
+        """Set the camera between two frames; the future gives the values actually set."""
         return self.feed.apply(wanted) if self.feed is not None and self.is_open else None
 
 
@@ -441,12 +441,12 @@ def _places_px(dots: Dots | None) -> FloatArray:
 
 
 def rays_of(setup: Setup | None) -> int | None:
-    """How many rays the lens makes; None where the set-up is not complete."""
+    """Number of rays of the pattern; None if the set-up is incomplete."""
     return None if setup is None else setup.rig.pattern.rows * setup.rig.pattern.columns
 
 
 def setup_of(session: Session) -> Setup | None:
-    """The set-up of a session; None where it is not complete, or has lines in place of dots."""
+    """The set-up of a session; None if it is incomplete or its pattern consists of lines."""
     try:
         return None if session.has_lines else session.setup
     except InputError:
@@ -454,7 +454,7 @@ def setup_of(session: Session) -> Setup | None:
 
 
 def _lasting(seconds: float) -> str:
-    """A time in words: the larger, the coarser."""
+    """Text of a duration; longer ones are rounded more coarsely."""
     for unit, size in (("days", 86_400), ("h", 3600), ("min", 60)):
         if seconds >= 2 * size:
             return f"{seconds / size:.0f} {unit}"

@@ -1,4 +1,4 @@
-"""A penetration model beside the live sizes: chosen by the operator, marked as a model's."""
+"""Predictions of a penetration model, shown beside the live sizes and marked as a model's."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ MODELS = "Penetration models (*.json)"
 
 
 class LivePenetration(QWidget):
-    """Chooses a model, or none, which it is at every start."""
+    """Choice of a model; there is none at every start."""
 
     def __init__(self, workspace: Workspace, watch: Callable[[], LiveWatch | None]) -> None:
         super().__init__()
@@ -43,13 +43,13 @@ class LivePenetration(QWidget):
         self.set_model(None)
 
     def choose(self) -> None:
-        """Ask for a model, and predict with it from the next frame on."""
+        """Ask for a model, and use it from the next frame on."""
         path = ask_file(self, "Choose a penetration model", self._workspace.folder, MODELS)
         if path is None:
             return
 
         def work(_: Control) -> PenetrationModel:
-            from labapp.export.penetration import read_model  # loads much of SciPy
+            from labapp.export.penetration import read_model  # loads a large part of SciPy
 
             return read_model(path)
 
@@ -59,7 +59,7 @@ class LivePenetration(QWidget):
         self._workspace.tasks.start("Reading the model", work, done, beside=self.words.setText)
 
     def set_model(self, named: tuple[str, PenetrationModel] | None) -> None:
-        """Predict with another model; None: with none."""
+        """Use another model; None: no model."""
         self._model = named
         self.none_button.setVisible(named is not None)
         words = ""
@@ -70,7 +70,7 @@ class LivePenetration(QWidget):
         self.begin()
 
     def begin(self) -> None:
-        """Predict with the chosen model: a camera has been started, or the model was chosen."""
+        """Use the chosen model with the current camera."""
         watch = self._watch()
         if watch is None:
             return
@@ -81,7 +81,7 @@ class LivePenetration(QWidget):
             watch.predictor = Predictor(*self._model, keeps=False)
 
     def figures(self, is_old: bool) -> tuple[Figure, ...]:
-        """What the model says, as a figure; none without one."""
+        """Figure with the prediction of the model; empty without a model."""
         watch = self._watch()
         predictor = None if watch is None else watch.predictor
         if predictor is None:

@@ -154,7 +154,7 @@ class LiveStreams(QWidget):
 
 
 def stream_text(stream: Stream | None, at_work: bool, problem: str) -> str:
-    """A stream's address, its number of listeners, and the number of frames sent."""
+    """Text of a stream's address, number of clients and number of frames sent."""
     if problem:
         return f"⚠ {problem}"
     if stream is None:
@@ -165,7 +165,7 @@ def stream_text(stream: Stream | None, at_work: bool, problem: str) -> str:
 
 
 def problem_text(error: InputError) -> str:
-    """Why a stream cannot be opened, and what to do."""
+    """Text of the reason why a stream cannot be opened, and what to do."""
     if error.field == "port":
         return f"{error.value}. {IN_USE}"
     return f"{error.value}: it needs {error.expected}."

@@ -32,7 +32,7 @@ GAP_S = 0.5
 MARKS = PLAIN, Mark("▪", "beyond its limit")
 
 LOW_PX = 460
-"""On a canvas lower than this plots and fields would leave each other no room."""
+"""On a lower canvas there is no space for both plots and fields."""
 
 ROOM_PX = 40
 """Space that must be left for all fields to be side by side."""
@@ -144,7 +144,7 @@ class LiveTrends(QWidget):
         return form
 
     def resizeEvent(self, event: QResizeEvent) -> None:
-        """Put all fields beside each other where there is room; show plots or fields where not."""
+        """Place all fields side by side if they fit; on a low canvas show plots or fields."""
         super().resizeEvent(event)
         self.canvas_parts.fit(self, LOW_PX)
         way = QBoxLayout.Direction

@@ -206,7 +206,7 @@ class LiveView(QObject):
         self._rings.show()
         self._timer.start(TICK_MS)
         self._show_state()
-        # Where Space records even as the key of what has the focus.
+        # Here Space records, also as the key of the focused widget.
         self.bar.record_button.setFocus()
 
     def stop(self) -> None:
@@ -217,7 +217,7 @@ class LiveView(QObject):
         self._timer.stop()
         self._rings.hide()
         if live.watch is not None:
-            self.canvas.show_status(live.watch)  # alarms, to the last
+            self.canvas.show_status(live.watch)  # shows the last alarms
         self.canvas.set_live(False)
         self._ending.append(live)
         title = "Stopping the camera" if live.running is None else "Finishing the recording"
@@ -346,7 +346,7 @@ class LiveView(QObject):
             self._show_figures(watch)
             if was_old or former is None or former.measurement.status != result.measurement.status:
                 self._status_s = 0.0  # the text about the figures is cleared with them
-            if self._age_s <= OLD_S:  # else it is not of what is in view
+            if self._age_s <= OLD_S:  # otherwise it does not describe the visible pool
                 self._show_quality(result.quality)
         self.updates += self.canvas.follow(result, watch)
 

@@ -1,4 +1,4 @@
-"""The steps of the guided way, one page each."""
+"""The pages of the steps of the guided procedure."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 
 def _maker(key: str, name: str) -> Callable[[Workspace], Page]:
-    """What makes a step's page; its module is loaded with the first: the window is there before."""
+    """A function that creates a step's page; its module is imported on first use."""
 
     def make(workspace: Workspace) -> Page:
         page: Page = getattr(importlib.import_module(f"{__name__}.{key}"), name)(workspace)
@@ -26,4 +26,4 @@ def _maker(key: str, name: str) -> Callable[[Workspace], Page]:
 PAGES: Mapping[str, Callable[[Workspace], Page]] = {
     step.key: _maker(step.key, step.page) for step in STEPS
 }
-"""What makes each step's page, by key."""
+"""Functions that create the pages, by the keys of the steps."""

@@ -1,4 +1,4 @@
-"""What every page of the guided way is to the window."""
+"""Base class of the pages of the guided procedure."""
 
 from __future__ import annotations
 
@@ -23,48 +23,48 @@ if TYPE_CHECKING:
 
 
 class Page(QWidget):
-    """One step: its canvas, which is this widget, and the panel that stands at its right.
+    """Page of a step: its canvas, which is this widget, and the panel at its right.
 
     The window calls `refresh` when the page comes into view and whenever, while it is in view, the
-    session, its results or the frame in view changed. A page keeps nothing that the session holds.
+    session, its results or the frame in view changed. A page stores no data of the session.
     """
 
     key = ""
     """Key of its step in `steps.STEPS`."""
     lead_changed = Signal()
-    """What is shown in place of the page changed: see `lead`."""
+    """The substitute for the page changed, see `lead`."""
     shows_all_frames = False
-    """Whether it shows what all frames gave, and not only the one in view."""
+    """Whether it shows the results of all frames instead of only the one in view."""
 
     def __init__(self, workspace: Workspace) -> None:
         super().__init__()
         self.workspace = workspace
         self.panel = QWidget()
-        """Parameters and results; the window puts the step's hint above it."""
+        """Parameters and results; the window shows the step's instructions above."""
         self.canvas_layout = vbox(of=self)
         self.panel_layout = QVBoxLayout(self.panel)
         self.setObjectName(f"page-{self.key}")
         self.panel.setObjectName(f"panel-{self.key}")
         self.answer = Message(2)
-        """Says what came of what was pressed: what was done, or why not; stands beside that."""
+        """Message at the pressed button: what was done, or why it was not."""
         self._answers = {self.answer}
         self._changing: list[QWidget] = []
         workspace.opened.connect(self._take_session)
 
     @property
     def session(self) -> Session:
-        """The session that is open; a page is in view only while one is."""
+        """The open session; a page is in view only if there is one."""
         session = self.workspace.session
         assert session is not None
         return session
 
     @property
     def locked(self) -> str:
-        """Why nothing in the session can be changed; empty if it can."""
+        """Reason why the session cannot be changed; empty if it can."""
         return read_only(self.workspace.session)
 
     def confirm(self, words: str, beside: Message | None = None) -> None:
-        """Say that what was pressed is done: in `answer`, or another message beside that."""
+        """Report the success of an action in `answer` or in another message at the button."""
         self._answer_in(beside).setText(f"{DONE} {words}")
         self.workspace.notified.emit(words, False)
 
@@ -76,18 +76,18 @@ class Page(QWidget):
         kind: str = "",
         beside: Message | None = None,
     ) -> Task:
-        """Begin work in the background, see `Tasks.start`; `answer` says why it failed."""
+        """Start work in the background, see `Tasks.start`; a failure is shown in `answer`."""
         say = self._answer_in(beside).setText
         return self.workspace.tasks.start(title, work, on_done, beside=say, kind=kind)
 
     def _answer_in(self, beside: Message | None) -> Message:
-        """The message that says what came of it; it is emptied with the session."""
+        """The message for an outcome; it is cleared when another session is opened."""
         message = beside or self.answer
         self._answers.add(message)
         return message
 
     def lock_with_session(self, *widgets: QWidget) -> None:
-        """Have these, which change the session, be of no use while it is open read-only."""
+        """Disable these widgets, which change the session, while it is open read-only."""
         self._changing += widgets
         for widget in widgets:
             if not isinstance(widget, Field):
@@ -104,7 +104,7 @@ class Page(QWidget):
                 widget.setToolTip(why or widget.property("usual tip"))
 
     def _take_session(self) -> None:
-        """What was said of the former session is of no interest in another."""
+        """Clear messages about the previous session."""
         for message in self._answers:
             message.setText("")
         for side in (self, self.panel):
@@ -113,38 +113,38 @@ class Page(QWidget):
         self._lock()
 
     def refresh(self) -> None:
-        """Show what the session holds now; ``workspace.session`` is not None."""
+        """Show the current contents of the session; ``workspace.session`` is not None."""
 
     def state(self, found: State) -> State:
-        """How far the step is, as the session has it or as only the page knows."""
+        """State of the step: that of the session, unless the page knows better."""
         return found
 
     def lead(self, found: Lead | None) -> Lead | None:
-        """What is shown in place of the page, as the session has it or as only the page knows."""
+        """Substitute for the page: that of the session, unless the page knows better."""
         return found
 
     def leave(self) -> None:
-        """The page goes out of view, or the window closes: stop what only it needs."""
+        """Stop all that only this page needs, when it is hidden or the window closes."""
 
     def take(self, path: Path, at_once: bool = False) -> None:
-        """Take a recording that was dropped on the window or chosen in its menu; for ``capture``.
+        """Accept a recording dropped on the window or chosen in its menu; for ``capture``.
 
-        The page is in view. ``at_once``: import all of it, and go on to its dots.
+        The page is in view. ``at_once``: import the whole recording, and go on to its dots.
         """
 
     def takes_files(self, paths: Sequence[Path]) -> bool:
-        """Take files dropped on the window that are the page's own; whether it did."""
+        """Accept dropped files that concern this page; return whether it did."""
         return False
 
     @property
     def camera(self) -> LiveView | None:
-        """The live camera that the page watches, in view or not; None if it watches none."""
+        """The page's live camera, even if the page is hidden; None if there is none."""
         return None
 
     def takes_key(self, event: QKeyEvent) -> bool:
-        """Do what a plain key means here that nothing in view has taken; whether it did."""
+        """Handle a plain key that no visible widget handled; return whether it did."""
         return False
 
     def picture(self) -> QPixmap:
-        """What *Copy picture* puts on the clipboard."""
+        """The picture that *Copy picture* copies to the clipboard."""
         return self.grab()

@@ -1,4 +1,4 @@
-"""The first page: sessions opened before, a new one, and samples to try."""
+"""The welcome page: recently opened sessions, a new one, and samples."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ from labapp.gui.widgets.layouts import fill, hbox, scrolled, vbox
 from labapp.gui.workspace import Workspace
 
 BUTTONS = ("open_recording", "open", "new", "study")
-"""Actions of the window; the first leads to a surface soonest."""
+"""Actions of the window; the first is the quickest way to a surface."""
 
 WIDTH_PX = 960
 
 
 class Welcome(FollowsTheme, QWidget):
-    """Buttons that begin; recent sessions with thumbnail, date and frames; samples."""
+    """Buttons for a start; recent sessions with thumbnail, date and frames; samples."""
 
     action_requested = Signal(str)
     """A button was pressed: the name of its action."""
@@ -82,7 +82,7 @@ class Welcome(FollowsTheme, QWidget):
         samples = QWidget()
         for name, text in SAMPLE_TEXTS.items():
             offer = self.samples[name] = QCommandLinkButton(text.title, text.shows)
-            offer.setIcon(QIcon())  # the style's arrow is black on a dark ground, too
+            offer.setIcon(QIcon())  # the style's arrow is black even on a dark background
             offer.setToolTip("Open a copy of this sample, in a folder of yours")
             offer.setMinimumWidth(1)
             offer.clicked.connect(lambda *_, name=name: self.sample_chosen.emit(name))
@@ -103,7 +103,7 @@ class Welcome(FollowsTheme, QWidget):
         self.follow_theme()
 
     def show_recent(self, paths: Sequence[Path]) -> None:
-        """List these sessions; what is in them is looked at in the background."""
+        """List sessions; their summaries are read in the background."""
         self._shown, self._gone = tuple(paths), []
         self.list.clear()
         blank = QPixmap(*THUMBNAIL_PX)
@@ -126,7 +126,7 @@ class Welcome(FollowsTheme, QWidget):
             self._workspace.tasks.start("Looking at recent sessions", look, on_part=self._show)
 
     def keyPressEvent(self, event: QKeyEvent) -> None:
-        """Take a session off the list."""
+        """Remove a session from the list."""
         if event.key() == Qt.Key.Key_Delete and self.list.hasFocus():
             for item in self.list.selectedItems():
                 self.forgotten.emit(item.data(Qt.ItemDataRole.UserRole))
@@ -134,7 +134,7 @@ class Welcome(FollowsTheme, QWidget):
             super().keyPressEvent(event)
 
     def _show(self, recent: Recent) -> None:
-        """Show what was found in a session."""
+        """Show the summary of a session."""
         if recent.path not in self._shown:
             return
         item = self.list.item(self._shown.index(recent.path))
@@ -150,7 +150,7 @@ class Welcome(FollowsTheme, QWidget):
             item.setIcon(QIcon(QPixmap.fromImage(image)))
 
     def take_colours(self) -> None:
-        """Have sessions that are not there be paler."""
+        """Draw missing sessions in a paler colour."""
         for path in self._gone:
             item = self.list.item(self._shown.index(path))
             item.setForeground(self.palette().placeholderText())

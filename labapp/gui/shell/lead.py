@@ -69,7 +69,7 @@ class EmptyState(QWidget):
         self.picture.show_step(key)
         self.words.setText(lead.words)
         for each in self.buttons:
-            each.hide()  # it is deleted only later by Qt
+            each.hide()  # Qt deletes it only later
             each.deleteLater()
         self.buttons = [self._button(each) for each in lead.actions]
         for k, made in enumerate(self.buttons):

@@ -97,7 +97,7 @@ class StatusLine(QWidget):
         self.dismiss_button.setAccessibleName("Dismiss the problem")
         tip = "Show or hide all messages (F4)"
         self.show_button = button("Messages", tip, self.messages_requested.emit)
-        self.show_button.setFocusPolicy(Qt.FocusPolicy.NoFocus)  # it has its key
+        self.show_button.setFocusPolicy(Qt.FocusPolicy.NoFocus)  # it has a keyboard shortcut
         self.title = plain_label()
         self.bar = QProgressBar()
         self.bar.setFixedWidth(180)

@@ -34,10 +34,10 @@ from labapp.gui.widgets.layouts import fill, scrolled
 ICON_PX = 18
 
 NUMBER_PX = 14
-"""Room around icon and number of a step."""
+"""Space around icon and number of a step."""
 
 LEAST_PX = 320
-"""Least width of the panel: 683 are all that 1024 px are at 150 %."""
+"""Minimum width of the panel; a screen of 1024 px at 150 % is only 683 px wide."""
 
 STATE_LINES = 2
 """Lines reserved for the state of a step, so that the panel below does not move."""
@@ -116,7 +116,7 @@ class StepList(FollowsTheme, QListWidget):
             item.setSizeHint(QSize(0, self.fontMetrics().height() + 14))
             self.addItem(item)
         self.show_titles(steps)
-        # On a small screen the numbers and marks are left, with the titles in their tooltips.
+        # On a small screen only numbers and marks are visible; the titles are in their tooltips.
         self.setMinimumWidth(self.fontMetrics().horizontalAdvance("10") + ICON_PX + NUMBER_PX)
         self.currentRowChanged.connect(self._told)
         self.follow_theme()
@@ -138,7 +138,7 @@ class StepList(FollowsTheme, QListWidget):
         return [f"{row}  {step.title}" for row, step in enumerate(self._steps, 1)]
 
     def resizeEvent(self, event: QResizeEvent) -> None:
-        """Show numbers alone where the titles have no room."""
+        """Show only numbers if there is no space for the titles."""
         super().resizeEvent(event)
         self.show_titles(self._steps)
 
@@ -155,12 +155,12 @@ class StepList(FollowsTheme, QListWidget):
             item.setData(Qt.ItemDataRole.AccessibleTextRole, message)
 
     def take_colours(self) -> None:
-        """Draw the marks in the window's colours."""
+        """Draw the marks in the colours of the theme."""
         if self._states:
             self.show_states(self._states)
 
     def show_step(self, key: str) -> None:
-        """Mark the step in view; none for the welcome page."""
+        """Select the step in view; none for the welcome page."""
         keys = [step.key for step in self._steps]
         self.blockSignals(True)
         self.setCurrentRow(keys.index(key) if key in keys else -1)
@@ -207,7 +207,7 @@ class SidePanel(FollowsTheme, QWidget):
         """Show a page's panel."""
         if panel not in self._areas:
             area = scrolled(panel, f"{step.title}: parameters and results")
-            # Where it came and went, words would wrap otherwise, and what is below them move.
+            # If it came and went, line breaks would change and the widgets below would move.
             area.setVerticalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOn)
             self._areas[panel] = area
             self.stack.addWidget(area)

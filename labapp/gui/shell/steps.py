@@ -270,7 +270,7 @@ def _surface(facts: Facts) -> State:
 
 
 def results(facts: Facts) -> State:
-    """State of a step that needs nothing but results: ready as soon as there are some."""
+    """State of a step that needs only results: ready as soon as there are any."""
     if facts.measured:
         return State(Mark.READY, pluralize(facts.measured, "frame"))
     return State(Mark.TODO, "Measure some frames first")
@@ -282,28 +282,28 @@ def _export(facts: Facts) -> State:
 
 @dataclass(frozen=True)
 class Step:
-    """One step of the guided way."""
+    """One step of the guided procedure."""
 
     key: str
-    """Its name in code: its page is in ``labapp.gui.pages.KEY``."""
+    """Name in code; the page is in ``labapp.gui.pages.KEY``."""
     title: str
-    """Its name for the operator."""
+    """Name for the operator."""
     hint: str
-    """What to do there, in two or three sentences."""
+    """Instructions in two or three sentences."""
     page: str
-    """The page's class."""
+    """Name of the page's class."""
     state: Callable[[Facts], State] = results
     needs_frames: bool = True
     """Whether it needs a recording; ``state`` is not called before there is one."""
     shows: str = ""
-    """What it shows as soon as it has something to show, a sentence."""
+    """Contents of the page as soon as there are any, one sentence."""
     needs_results: bool = False
-    """Whether it shows nothing before a frame is measured."""
+    """Whether the page is empty until a frame is measured."""
     lines: tuple[str, str, str] = ("", "", "")
-    """Title, hint and what it shows where the pattern is one of lines; empty: no others."""
+    """Replacements of ``title``, ``hint`` and ``shows`` for a pattern of lines; empty: none."""
 
     def of(self, session: Session | None) -> Step:
-        """The step as it is called in a session."""
+        """The step with the texts for the pattern of a session."""
         if session is None or not self.lines[0] or not session.has_lines:
             return self
         title, hint, shows = self.lines
@@ -399,11 +399,11 @@ STEPS = (
         needs_results=True,
     ),
 )
-"""The registry of the app's pages: list, menu, keys, guide and window are made from it."""
+"""The steps; step list, menu, keys, guide and window are made from this tuple."""
 
 
 def states(session: Session | None, seen: Overview | None = None) -> dict[str, State]:
-    """State of every step, by its key; ``seen`` is the session's overview, if it is at hand."""
+    """State of every step by its key; ``seen`` is the session's overview if already available."""
     if session is None:
         return {step.key: State(Mark.TODO, "Open or make a session first") for step in STEPS}
     facts, bare = _facts(session, seen), session.recording is None
@@ -414,12 +414,12 @@ def states(session: Session | None, seen: Overview | None = None) -> dict[str, S
 def lead(
     step: Step, session: Session, seen: Overview | None = None, measuring: bool = False
 ) -> Lead | None:
-    """What a step shows in place of its page; None if there is something on the page.
+    """Substitute for the page of a step without content; None if the page has content.
 
     Parameters
     ----------
     seen
-        The session's overview, if it is at hand.
+        The session's overview if already available.
     measuring
         Whether frames are being measured.
     """
@@ -439,11 +439,11 @@ def lead(
 
 
 def first_step(session: Session) -> str:
-    """Key of the step to begin with: results if there are some, else what is to be done next."""
+    """Key of the first step to show: results if there are any, otherwise the next to do."""
     if session.recording is not None:
         measured = {status for status in session.overview().status if status != ""}
         if "followed" in measured and "ok" not in measured:
-            return "trends"  # one line: it is followed, and gives no surface
+            return "trends"  # a single line is tracked, but gives no surface
         return "surface" if measured else "dots"
     return "capture" if states(session)["setup"].why == "Complete" else "setup"
 

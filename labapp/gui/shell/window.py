@@ -1,4 +1,4 @@
-"""The window: steps at the left, the page, its panel at the right, the timeline at the bottom."""
+"""The main window: steps at the left, page, panel at the right, timeline at the bottom."""
 
 from __future__ import annotations
 
@@ -44,10 +44,10 @@ if TYPE_CHECKING:
     from labapp.gui.live.view import LiveView
 
 Commands = Callable[["MainWindow"], Mapping[str, Callable[[], object]]]
-"""What each action does in a window, by its name."""
+"""Returns the functions of the actions in a window, by the actions' names."""
 
 REST = 4
-"""After showing a change the window waits this multiple of its duration, to stay responsive."""
+"""Pause after displaying a change, as a multiple of its duration, to keep the window responsive."""
 
 LONGEST_REST_MS = 1000
 
@@ -55,20 +55,20 @@ LAYOUT_VERSION = 1
 
 SIZE_PX = (1600, 1000)
 PART_OF_SCREEN = 0.92
-"""Size at the first start, and the most of the screen that it takes."""
+"""Size at the first start, and the largest fraction of the screen that it covers."""
 
 OF_A_FRAME = (
     *("measure_frame", "next_doubtful", "previous_doubtful", "next_corrected"),
     *("previous_corrected", "first", "last", "play"),
 )
-"""Actions in the timeline's own menu."""
+"""Actions in the timeline's menu."""
 
 PAGE_PX = QSize(300, 336)
-"""Least size of a page: with all panels 680 × 492; 1024 × 768 at 150 % are 682 × 512."""
+"""Minimum size of a page; with all panels 680 × 492, as 1024 × 768 at 150 % is 682 × 512."""
 
 
 class MainWindow(QMainWindow):
-    """The app's one window."""
+    """The main window of the app."""
 
     def __init__(self, preferences: PreferencesStore, commands: Commands) -> None:
         super().__init__()
@@ -77,11 +77,11 @@ class MainWindow(QMainWindow):
         preferences.setParent(self)
         self.workspace = Workspace(self)
         self.pages: dict[str, Page] = {}
-        """The pages made by now, by their keys."""
+        """Pages created so far, by key."""
         self.files = Files(self, self.workspace, preferences, lambda: self.camera)
         self.setups = Setups(self, self.workspace, preferences)
         self.standings: IntArray = np.zeros(0, np.int64)
-        """How each frame stands, shape (n,)."""
+        """State of each frame (`FrameStatus`), shape (n,)."""
         self.page: Page | None = None
         """The page in view; None for the welcome page."""
         self._steps = tuple(step for step in STEPS if step.key in PAGES)
@@ -106,7 +106,7 @@ class MainWindow(QMainWindow):
     def _make_views(self) -> None:
         self.welcome = Welcome(self.workspace)
         self.stack = QStackedWidget()
-        self.stack.setMinimumSize(PAGE_PX)  # else hidden pages could make the window grow
+        self.stack.setMinimumSize(PAGE_PX)  # otherwise hidden pages could enlarge the window
         self.empty = EmptyState()
         for each in (self.welcome, self.empty):
             self.stack.addWidget(each)
@@ -172,12 +172,12 @@ class MainWindow(QMainWindow):
     # --- actions ----------------------------------------------------------------------------
 
     def do(self, name: str) -> None:
-        """Do an action of the menus."""
+        """Run an action of the menus."""
         self._commands[name]()
         self._show_actions()
 
     def _show_actions(self) -> None:
-        """Show in the menus what is of use now, and what is on."""
+        """Update which actions of the menus are enabled and checked."""
         session, frames = self.workspace.session, len(self.standings) > 0
         undo, redo = steps_of(session)
         there: dict[Needs, bool] = {
@@ -203,14 +203,14 @@ class MainWindow(QMainWindow):
     # --- what is in view --------------------------------------------------------------------
 
     def say(self, text: str, problem: bool = False) -> None:
-        """Show a message; a problem stays in the status line until it was read."""
+        """Show a message; a problem stays in the status line until it is read."""
         self.log_panel.add(text, problem)
         self.status_line.say(text, problem)
         if problem:
             self.timeline.set_playing(False)
 
     def show_step(self, key: str) -> None:
-        """Bring a step's page into view; it is made when it is first shown."""
+        """Show the page of a step; it is created on first use."""
         if self.workspace.session is None or key not in PAGES:
             return
         if key not in self.pages:
@@ -232,25 +232,25 @@ class MainWindow(QMainWindow):
             self._show_lead()
             if not listed:
                 seen = page if self.stack.currentWidget() is page else self.empty
-                seen.setFocus()  # or they stay with what is hidden now
+                seen.setFocus()  # otherwise a hidden widget keeps the focus
         self.step_list.show_step(key)
         self._show_page()
         self._show_actions()
 
     @property
     def camera(self) -> LiveView | None:
-        """The live camera, whatever page is in view; None while none is watched."""
+        """The live camera, regardless of the page in view; None if there is none."""
         return next((page.camera for page in self.pages.values() if page.camera), None)
 
     def go_step(self, by: int) -> None:
-        """Go some steps on, or back."""
+        """Go forward or back by some steps."""
         if self.page is not None:
             keys = [step.key for step in self._steps]
             place = keys.index(self.page.key) + by
             self.show_step(keys[max(0, min(len(keys) - 1, place))])
 
     def jump(self, kind: str, forward: bool) -> None:
-        """Go to the next frame that is ``doubtful`` or ``corrected``, or the one before."""
+        """Go to the next or previous frame that is ``doubtful`` or ``corrected``."""
         session = self.workspace.session
         if session is None:
             return
@@ -266,19 +266,19 @@ class MainWindow(QMainWindow):
             self.workspace.show_frame(found)
 
     def _show_recording(self, path: Path | None, at_once: bool) -> None:
-        """Show the step Recording, and have it take a recording."""
+        """Show the step Recording, and pass a recording to its page."""
         self.show_step("capture")
         if path is not None and self.page is not None:
             self.page.take(path, at_once)
 
     def show_answer(self, words: str) -> None:
-        """Say beside what was pressed what came of it."""
+        """Show the outcome of an action at the pressed button."""
         self.empty.answer.setText(words)
         if self.page is not None:
             self.page.answer.setText(words)
 
     def _list_recent(self) -> None:
-        """List the sessions opened before, in other windows too."""
+        """List recently opened sessions, including those opened in other windows."""
         self.preferences.recall()
         recent = self.preferences.current.recent
         self.menus.show_recent(recent)
@@ -287,7 +287,7 @@ class MainWindow(QMainWindow):
             self.welcome.show_recent([*paths, *(path for path in drafts() if path not in paths)])
 
     def _forget(self, path: Path) -> None:
-        """Take a session off the list of recent ones, see `Files.forget`."""
+        """Remove a session from the list of recent ones, see `Files.forget`."""
         self.files.forget(path)
         self._list_recent()
 
@@ -298,10 +298,10 @@ class MainWindow(QMainWindow):
             self.page = None
 
     def _session_opened(self) -> None:
-        """Show another session from the start, or the welcome page."""
+        """Show a newly opened session, or the welcome page."""
         session = self.workspace.session
         self.timeline.set_playing(False)
-        self.status_line.say("", False)  # the message was about another session
+        self.status_line.say("", False)  # the message concerned another session
         self._leave()
         self.side_panel.read_only.setVisible(session is not None and session.read_only)
         self._show_session()
@@ -329,7 +329,7 @@ class MainWindow(QMainWindow):
             self._show_session()
 
     def _show_session(self) -> None:
-        """Show what the session holds now, everywhere."""
+        """Update the whole window with the current contents of the session."""
         began = time.perf_counter()
         self._changes_due = False
         self._show_frames()
@@ -340,7 +340,7 @@ class MainWindow(QMainWindow):
         self._rest.start(min(LONGEST_REST_MS, round(REST * took_ms)))
 
     def _show_frames(self) -> None:
-        """Show how all frames stand, and with them the steps."""
+        """Show the states of all frames and of the steps."""
         session = self.workspace.session
         seen = self.workspace.run_or_report(self.workspace.overview)
         if seen is None:
@@ -358,9 +358,9 @@ class MainWindow(QMainWindow):
         self.step_list.show_states(self._states | own)
 
     def _show_measured(self) -> None:
-        """Show that frames were measured that are not in view."""
+        """Update the window after measurement of frames that are not in view."""
         if self._rest.isActive():
-            return  # more will follow, and the last is shown with all the rest
+            return  # more follow, and the last one updates everything
         if self.page is None or self.page.shows_all_frames:
             self._show_session()
         else:
@@ -374,7 +374,7 @@ class MainWindow(QMainWindow):
             self._show_lead()
 
     def _show_lead(self) -> None:
-        """Show the page in view, or what leads on while there is nothing on it."""
+        """Show the current page, or its substitute while it has no content."""
         page, session = self.page, self.workspace.session
         if page is None or session is None:
             return
@@ -397,12 +397,12 @@ class MainWindow(QMainWindow):
     # --- look -------------------------------------------------------------------------------
 
     def set_theme(self, theme: str) -> None:
-        """Show the app light, dark or as the desktop is."""
+        """Set and store the theme: light, dark or that of the desktop."""
         self.preferences.remember(lambda before: replace(before, theme=theme))
         self.apply_theme()
 
     def apply_theme(self) -> None:
-        """Apply the theme that is remembered; the desktop may have changed."""
+        """Apply the stored theme; the desktop's theme may have changed."""
         app = QApplication.instance()
         if isinstance(app, QApplication):
             apply_theme(app, self.preferences.current.theme)
@@ -416,13 +416,13 @@ class MainWindow(QMainWindow):
         self._show_docks()
 
     def _show_docks(self, everywhere: bool = False) -> None:
-        """Show the panels that are wanted; on the welcome page only the log."""
+        """Show the selected panels; on the welcome page only the log."""
         here = everywhere or self.workspace.session is not None
         for name, dock in self._docks.items():
             dock.setVisible(self._wanted[name] and (here or name == "log"))
 
     def reset_layout(self) -> None:
-        """Put the panels back where they were at the first start."""
+        """Restore the default arrangement of the panels."""
         self.restoreState(self._plain_layout, LAYOUT_VERSION)
         self._wanted = {name: name != "log" for name in self._wanted}
         self._show_docks()
@@ -439,18 +439,18 @@ class MainWindow(QMainWindow):
                 restore(QByteArray.fromBase64(text.encode("ascii", "replace")))
         if preferences.layout:
             self._wanted = {name: not dock.isHidden() for name, dock in self._docks.items()}
-            self._wanted["log"] = False  # its messages are from before
+            self._wanted["log"] = False  # its messages are old
 
     # --- events -----------------------------------------------------------------------------
 
     def keyPressEvent(self, event: QKeyEvent) -> None:
-        """Do what a plain key means that nothing else has taken."""
+        """Run the action of a plain key that no other widget handled."""
         taken = self.page is not None and self.page.takes_key(event)
         if not taken and not self.menus.key(event):
             super().keyPressEvent(event)
 
     def changeEvent(self, event: QEvent) -> None:
-        """Look at what other windows have remembered when this one is worked in again."""
+        """Read the preferences again on activation; other windows may have changed them."""
         super().changeEvent(event)
         if event.type() == QEvent.Type.ActivationChange and self.isActiveWindow():
             before = self.preferences.current
@@ -461,21 +461,22 @@ class MainWindow(QMainWindow):
                 self.apply_theme()
 
     def dragEnterEvent(self, event: QDragEnterEvent) -> None:
-        """Take files."""
+        """Accept files."""
         if any(url.isLocalFile() for url in event.mimeData().urls()):
             event.acceptProposedAction()
 
     def dropEvent(self, event: QDropEvent) -> None:
-        """Give what was dropped to the page in view, or open it."""
+        """Pass dropped files to the page in view, or open them."""
         paths = [Path(url.toLocalFile()) for url in event.mimeData().urls() if url.isLocalFile()]
         event.acceptProposedAction()
         if self.page is None or not self.page.takes_files(paths):
             self.files.open_dropped(paths)
 
     def closeEvent(self, event: QCloseEvent) -> None:
-        """Stop all work, remember the layout and close the session.
+        """Stop all tasks, store the layout and close the session.
 
-        The operator is asked about a recording that runs; the program closes without a question.
+        If the user closes the window, a running recording needs a decision; a close by the program
+        asks nothing.
         """
         if event.spontaneous() and not self.files.may_close():
             event.ignore()

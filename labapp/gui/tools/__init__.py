@@ -1,6 +1,6 @@
-"""The tools: windows beside the main one, each a view and its presenter, loaded when first opened.
+"""Tools: windows beside the main one, each with a view and a presenter, imported on first use.
 
-A tool's window is kept when it is closed: what it found is there when it is opened again.
+A closed tool window is kept, so that its results are there when it is opened again.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ TOOLS = {
     "adviser": "AdviserWindow",
     "analysis": "AnalysisWindow",
 }
-"""Module here → the window in it."""
+"""Name of the window class by module."""
 
 
 def show_tool(key: str, sessions: Files, window: QWidget) -> ToolWindow:
-    """Bring a tool's window into view; it is made on first use."""
+    """Show the window of a tool; it is created on first use."""
     from PySide6.QtWidgets import QDialog
 
     tool: ToolWindow | None = window.findChild(QDialog, f"tool-{key}")  # type: ignore[assignment]

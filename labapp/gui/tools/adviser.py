@@ -1,4 +1,4 @@
-"""The configuration adviser's window: pools and bench at the left, the advice at the right."""
+"""Window of the configuration adviser: pools and bench at the left, advice at the right."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ NUMBERS = (
 
 
 class AdviserWindow(ToolWindow):
-    """Asks for pools and limits, searches, and offers what it found to the session."""
+    """Asks for pools and limits, searches a set-up, and offers it to the session."""
 
     key = "adviser"
     title = "Configuration adviser"
@@ -122,7 +122,7 @@ class AdviserWindow(ToolWindow):
     # --- asking ------------------------------------------------------------------------------
 
     def prefill(self) -> None:
-        """Take pool and rig from the session, where they are others than last time."""
+        """Fill in pool and rig of the session if they changed since the last time."""
         values = self.workspace.run_or_report(lambda: advising.question(self.workspace.session))
         if values is None or values == self._basis:
             return
@@ -137,7 +137,7 @@ class AdviserWindow(ToolWindow):
             number.set_value(values[table][name])
 
     def values(self) -> advising.Values:
-        """The request as the fields have it."""
+        """The request in the fields."""
         values = {table: dict(keys) for table, keys in self._asked.items()}
         values["pools"]["kind"] = self.kind.value()
         for key, field in self.ranges.items():
@@ -151,7 +151,7 @@ class AdviserWindow(ToolWindow):
         return values
 
     def start(self) -> None:
-        """Search, in the background."""
+        """Search in the background."""
         request = self.workspace.run_or_report(lambda: parse_request(self.values(), "the adviser"))
         if request is None:
             return
@@ -166,7 +166,7 @@ class AdviserWindow(ToolWindow):
     # --- what was found ------------------------------------------------------------------------
 
     def show_advice(self, advice: Advice, files: dict[str, bytes]) -> None:
-        """Show an advice and what of it can be saved."""
+        """Show an advice, and enable saving of its files."""
         self.advice, self.files = advice, files
         words = advising.headline(advice)
         self.headline.setText(words)
@@ -175,7 +175,7 @@ class AdviserWindow(ToolWindow):
         if advice.possible:
             self.costs.show_table(cost_table(advice))
             bar = self.costs.horizontalScrollBar().sizeHint().height()
-            self.costs.setFixedHeight(self.costs.full_height + bar)  # what is around it scrolls
+            self.costs.setFixedHeight(self.costs.full_height + bar)  # the surrounding area scrolls
         for group, shown in zip(self.groups, (True, True, advice.possible), strict=True):
             group.setVisible(shown)
         self.sheet.show_png(files["advice.png"], words)
@@ -183,7 +183,7 @@ class AdviserWindow(ToolWindow):
         self.show_state()
 
     def show_state(self) -> None:
-        """Enable what is of use now."""
+        """Enable the actions that are available now."""
         if not hasattr(self, "start_button"):
             return
         session, advice = self.workspace.session, self.advice
@@ -193,7 +193,7 @@ class AdviserWindow(ToolWindow):
         self.save_button.setEnabled(bool(self.files))
 
     def use(self) -> None:
-        """Put the set-up into the session's."""
+        """Use the recommended set-up in the session."""
         advice = self.advice
         if advice is not None and self.workspace.attempt(lambda s: advising.use(s, advice)):
             self.workspace.notified.emit(

@@ -1,4 +1,4 @@
-"""What the adviser's window asks and shows, and what it puts into a session: without Qt."""
+"""Data of the adviser's window: request, results, and use in a session. Without Qt."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from labapp.studies.adviser.search import Advice
 USUAL_HEIGHT_MM = 0.25
 
 ABOUT = 0.1
-"""Pools are expected within so much of the size that the session has."""
+"""Relative range of pool sizes around that of the session."""
 
 Values = dict[str, dict[str, Any]]
-"""Table → key → value, as `advice_keys.parse_request` takes them."""
+"""Table → key → value, as required by `advice_keys.parse_request`."""
 
 
 def question(session: Session | None) -> Values:
-    """What to ask: the session's expected pool and rig, within a usual bench's limits."""
+    """Default request: the session's expected pool and rig, within the limits of a usual bench."""
     record = None if session is None else session.record
     width = (record and record.expected_width_mm) or USUAL_WIDTH_MM
     length = (record and record.expected_length_mm) or USUAL_LENGTH_MM
@@ -74,7 +74,7 @@ def _about(size_mm: float) -> list[float]:
 
 
 def headline(advice: Advice) -> str:
-    """The advice in a sentence, or why there is none."""
+    """The advice in a sentence, or the reason why there is none."""
     if advice.possible:
         height = advice.expected.mean_height_mm
         share = 100 * advice.error_mm / height
@@ -90,7 +90,7 @@ def headline(advice: Advice) -> str:
 
 
 def place_rows(advice: Advice) -> tuple[ResultRow, ...]:
-    """The set-up."""
+    """Rows of the recommended set-up."""
     place = advice.best.place
     return tuple(
         ResultRow(words, float(getattr(place, name)), unit=unit, decimals=2)
@@ -99,7 +99,7 @@ def place_rows(advice: Advice) -> tuple[ResultRow, ...]:
 
 
 def kept_rows(advice: Advice) -> tuple[ResultRow, ...]:
-    """By how much the set-up keeps what it must."""
+    """Rows of the margins by which the set-up satisfies its constraints."""
     return tuple(
         ResultRow(
             CONSTRAINTS[name][0],
@@ -113,7 +113,7 @@ def kept_rows(advice: Advice) -> tuple[ResultRow, ...]:
 
 
 def use(session: Session, advice: Advice) -> None:
-    """Put the recommended set-up into a session's, as one step; the plane stands upright then."""
+    """Use the recommended set-up, with a vertical plane, in a session; one step of undo."""
     values = advised_setup(advice)
     values["imaging_plane"] |= {"pitch_deg": None, "yaw_deg": None}
     session.update_setup(values, "advised set-up")

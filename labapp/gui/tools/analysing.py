@@ -1,4 +1,4 @@
-"""What the window of the error analysis offers, and in which words it shows what came out."""
+"""Data of the error analysis window: its options, and texts of its results."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ PARTS = (
         "What the calibration's uncertainties do, one by one and by Monte Carlo",
     ),
 )
-"""What can be worked out: key, words, and what it is."""
+"""Parts that can be computed: key, text and explanation."""
 
 SCHEME_CHOICES = (("", "all of them"), *((scheme, scheme) for scheme in SCHEMES))
 
@@ -38,16 +38,16 @@ OPENED, USUAL = "opened", "usual"
 SETUPS = ((OPENED, "of the session"), (USUAL, "of §8.3.1, 4″ plane"))
 
 USUAL_MM = (6.0, 7.0, 0.3)
-"""Width, length and height of a pool where none is expected."""
+"""Width, length and height of the pool if none is expected, mm."""
 
 
 def has_setup(session: Session | None) -> bool:
-    """Whether a session has a set-up that is complete."""
+    """Whether a session has a complete set-up."""
     return session is not None and not session.setup_problems
 
 
 def expected_mm(session: Session | None) -> tuple[float, float, float]:
-    """Width, length and height of the pool that a session expects, or the usual ones."""
+    """Width, length and height of a session's expected pool, or the usual ones, mm."""
     if session is None:
         return USUAL_MM
     record = session.record
@@ -57,7 +57,7 @@ def expected_mm(session: Session | None) -> tuple[float, float, float]:
 
 
 def result_title(name: str) -> str:
-    """Name of a table or picture in words: ``figure_8_6_CE`` is "Figure 8-6: CE"."""
+    """Title of a table or picture: "Figure 8-6: CE" for ``figure_8_6_CE``."""
     stem, _, kind = name.partition(".")
     figure = re.fullmatch(r"figure_(\d+)_(\d+)_(.+)", stem)
     words = (figure[3] if figure else stem).replace("_", " ")

@@ -1,4 +1,4 @@
-"""The error analysis: what to work out at the left, tables and pictures at the right."""
+"""Window of the error analysis: options at the left, tables and pictures at the right."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ SIZES = (
 
 
 class AnalysisWindow(ToolWindow):
-    """Works out parts of chapter 8 and the budget of a set-up, and shows each when it is done."""
+    """Computes parts of chapter 8 and the uncertainty budget of a set-up, and shows each result."""
 
     key = "analysis"
     title = "Error analysis"
@@ -46,7 +46,7 @@ class AnalysisWindow(ToolWindow):
     def __init__(self, sessions: Files, window: QWidget) -> None:
         self.tables: dict[str, Table] = {}
         self.pictures: dict[str, bytes] = {}
-        """What the last run gave, by name."""
+        """Pictures of the last run, by name."""
         self._anew = False
         self._basis: object = None
         super().__init__(sessions, window)
@@ -137,7 +137,7 @@ class AnalysisWindow(ToolWindow):
     # --- what is to be worked out --------------------------------------------------------------
 
     def prefill(self) -> None:
-        """Take pool and set-up from the session, where they are others than last time."""
+        """Fill in pool and set-up of the session if they changed since the last time."""
         session = self.workspace.session
         sizes = (
             self.workspace.run_or_report(lambda: analysing.expected_mm(session))
@@ -152,7 +152,7 @@ class AnalysisWindow(ToolWindow):
             field.set_value(value)
 
     def start(self) -> None:
-        """Compute what is ticked, in the background, one part after the other."""
+        """Compute the ticked parts in the background, one after the other."""
         for field in (*self.sizes.values(), self.step, self.frames, self.draws):
             field.flush()
         ticked = tuple(key for key, box in self.parts.items() if box.isChecked())
@@ -178,7 +178,7 @@ class AnalysisWindow(ToolWindow):
         self.begin("Computing", work, lambda _: self.say("Done"), self.show_part)
 
     def _budget(self) -> tuple[Setup | None, Pool]:
-        """Set-up and pool of the budget, as chosen."""
+        """Set-up and pool chosen for the budget."""
         session = self.workspace.session
         pool = expected_pool(*(float(field.value() or 0) for field in self.sizes.values()))
         if self.setup.value() == USUAL:
@@ -190,7 +190,7 @@ class AnalysisWindow(ToolWindow):
     # --- what came out -------------------------------------------------------------------------
 
     def show_part(self, made: AnalysisPart) -> None:
-        """Show what a part gave; what an earlier run gave goes with the first one."""
+        """Show the results of a part; the first one replaces those of an earlier run."""
         if self._anew:
             self.tables, self.pictures, self.files = {}, {}, {}
             self._anew = False
@@ -218,7 +218,7 @@ class AnalysisWindow(ToolWindow):
             self.stack.setCurrentWidget(self.sheet)
 
     def show_state(self) -> None:
-        """Enable what is of use now."""
+        """Enable the actions that are available now."""
         if not hasattr(self, "start_button"):
             return
         ticked = any(box.isChecked() for box in self.parts.values())

@@ -1,4 +1,4 @@
-"""The window of the pool over time: what to analyse at the left; spectra, modes, events."""
+"""Window of the pool's dynamics: options at the left; spectra, modes and events."""
 
 from __future__ import annotations
 
@@ -27,20 +27,20 @@ if TYPE_CHECKING:
     from labapp.session.measured import Overview
 
 FILM_MS = 80
-"""From a picture of a mode's film to the next."""
+"""Interval of the pictures in the film of a mode."""
 
 CHANGED = "Results have changed since: press Analyse again."
 
 
 class DynamicsWindow(ToolWindow):
-    """Analyses how the pool of the session changes over its recording, and shows it."""
+    """Analyses the change of the session's pool over the recording, and shows the results."""
 
     key = "dynamics"
     title = "Pool over time"
 
     def __init__(self, sessions: Files, window: QWidget) -> None:
         self.drawn: shown.Drawn | None = None
-        """What is shown; None before the first analysis."""
+        """The displayed analysis; None before the first one."""
         self._of: Overview | None = None
         self._event_frames: tuple[int, ...] = ()
         self._film: list[bytes] = []
@@ -123,7 +123,7 @@ class DynamicsWindow(ToolWindow):
     # --- analysing -----------------------------------------------------------------------------
 
     def prefill(self) -> None:
-        """Analyse what the session holds, where it is not what is shown."""
+        """Analyse the session's results unless they are already shown."""
         if not shown.same_results(self.workspace.overview(), self._of):
             self.start()
 
@@ -193,21 +193,21 @@ class DynamicsWindow(ToolWindow):
 
     @staticmethod
     def _strongest(found: Dynamics) -> int:
-        """Row of the Bessel mode with the largest share that oscillates, or of the first."""
+        """Row of the Bessel mode with the largest oscillating share, or of the first."""
         return max(
             range(len(found.modes)),
             key=lambda k: (bool(found.modes[k].oscillations), found.modes[k].share),
         )
 
     def _forget(self) -> None:
-        """Show nothing of a session that is closed."""
+        """Remove the results of a closed session."""
         self.tasks.cancel_all()
         self._turn.stop()
         self.drawn, self._of = None, None
         self.tabs.hide()
 
     def save(self, folder: Path) -> None:
-        """Write the results, as the command does; the pictures for paper are drawn first."""
+        """Write the results, as the command does; first draw the pictures for print."""
         from labapp.export.dynamics import dynamics_files
 
         assert self.drawn is not None
@@ -222,7 +222,7 @@ class DynamicsWindow(ToolWindow):
     # --- one mode, one event -------------------------------------------------------------------
 
     def _show_mode(self) -> None:
-        """Show the mode that is selected."""
+        """Show the selected mode."""
         self._turn.stop()
         self._film = []
         row = self.modes.currentRow()
@@ -232,7 +232,7 @@ class DynamicsWindow(ToolWindow):
         self.show_state()
 
     def play(self) -> None:
-        """Play one period of the selected mode over and over, or stop."""
+        """Play one period of the selected mode repeatedly, or stop."""
         drawn, row = self.drawn, self.modes.currentRow()
         if self._turn.isActive():
             self._turn.stop()
@@ -275,7 +275,7 @@ class DynamicsWindow(ToolWindow):
         super().closeEvent(event)
 
     def show_state(self) -> None:
-        """Enable what is of use now, and say what can be determined."""
+        """Enable the actions that are available now, and show what can be determined."""
         if not hasattr(self, "start_button"):
             return
         session = self.workspace.session

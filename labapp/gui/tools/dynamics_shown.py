@@ -1,4 +1,4 @@
-"""What the window of the pool over time shows, and why there is nothing to show: without Qt."""
+"""Data of the window of the pool's dynamics, or reasons why there are none. Without Qt."""
 
 from __future__ import annotations
 
@@ -35,10 +35,10 @@ class Drawn:
 SERIES = [(name, BY_KEY[name].label) for name in WITH_SIGMA]
 
 WIDE, HIGH, DPI = 4.9, 3.9, 120
-"""Size of a picture, inches, and its dots an inch: readable in a narrow window."""
+"""Size of a picture, inches, and dots per inch: readable in a narrow window."""
 
 FILM_TURNS = 16
-"""Pictures of a mode in one period."""
+"""Number of pictures in one period of a mode."""
 
 RESPONSE = {
     "change": "Change",
@@ -55,7 +55,7 @@ NO_STEPS = (
 
 
 def impossible(session: Session | None, seen: Overview | None) -> str:
-    """Why oscillations and events of a session cannot be determined; empty where they can."""
+    """Reason why a session's dynamics cannot be determined; empty if they can."""
     if session is None or seen is None:
         return "No session is open."
     if session.has_lines:
@@ -75,7 +75,7 @@ def impossible(session: Session | None, seen: Overview | None) -> str:
 
 
 def same_results(one: Overview | None, other: Overview | None) -> bool:
-    """Whether the same frames have the same sizes, and these still stand."""
+    """Whether two overviews have the same times, heights and stale frames."""
     if one is None or other is None:
         return one is other
     pairs = (
@@ -87,7 +87,7 @@ def same_results(one: Overview | None, other: Overview | None) -> bool:
 
 
 def range_text(seen: Overview) -> str:
-    """Which oscillations the frames can show."""
+    """Text of the oscillations that the frames can resolve."""
     there = np.isfinite(seen.measures["height_mm"]) & ~seen.stale
     time_s = seen.time_s[there]
     step = float(np.median(np.diff(time_s)))
@@ -115,7 +115,7 @@ def peak_text(found: Dynamics) -> str:
 
 
 def modes_table(found: Dynamics) -> Table:
-    """A row a mode: its strongest oscillation with ±."""
+    """Table with a row per mode: its strongest oscillation with ±."""
     names = ("frequency_hz", "amplitude_mm", "phase_deg", "damping_per_s")
     scales = (1.0, 1e3, 1.0, 1.0)
     rows = []
@@ -131,7 +131,7 @@ def modes_table(found: Dynamics) -> Table:
 
 
 def events_table(found: Dynamics) -> tuple[Table, tuple[int, ...]]:
-    """A row an event in the order of time, and the frame nearest to each."""
+    """Table with a row per event in chronological order, and the frame nearest to each."""
     every = sorted(
         ((one, name) for name, events in found.events.items() for one in events),
         key=lambda pair: pair[0].time_s,
@@ -154,7 +154,7 @@ def events_table(found: Dynamics) -> tuple[Table, tuple[int, ...]]:
 
 
 def responses_table(found: Dynamics) -> Table:
-    """A row a quantity of a response to a step of a signal."""
+    """Table with a row per quantity of a response to a step of a signal."""
     rows = []
     for one in found.responses:
         value, sigma = one.response.value, one.response.sigma
@@ -168,7 +168,7 @@ def responses_table(found: Dynamics) -> Table:
 
 
 def no_responses(found: Dynamics, signals: bool) -> str:
-    """Why there is no response."""
+    """Reason why there is no response."""
     steps = any(found.events.get(name) for name in ("current", "voltage", "wire"))
     if not signals:
         return NO_STEPS.format("no current, voltage or wire feed was imported.")
@@ -178,7 +178,7 @@ def no_responses(found: Dynamics, signals: bool) -> str:
 
 
 def series_label(name: str) -> str:
-    """A series or a signal in words, with its unit."""
+    """Label of a series or signal with its unit."""
     if name in BY_KEY:
         quantity = BY_KEY[name]
         return f"{quantity.label} ({quantity.unit})" if quantity.unit else quantity.label
@@ -232,7 +232,7 @@ def series_picture(found: Dynamics) -> bytes:
 
 
 def mode_picture(found: Dynamics, one: ModeCourse, turn: float = 0.0) -> bytes:
-    """A mode from above at a part of its period, and its coefficients over time."""
+    """A mode from above at a phase of its period, and its coefficients over time."""
     from matplotlib import rc_context
 
     from labapp.export.dynamics import draw_mode

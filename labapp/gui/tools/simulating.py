@@ -1,4 +1,4 @@
-"""What the simulator's window offers and shows of a scenario: without Qt."""
+"""Data of the simulator's window: scenarios and their preview. Without Qt."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ class ScenarioPreview:
     """A scenario with its first frame."""
 
     scenario: Scenario
-    """As it was read, with one frame."""
+    """The scenario as read, but with one frame."""
     frames: int
-    """Number of frames that it asks for."""
+    """Number of frames given in the scenario."""
     frame: RecordedFrame
-    """The first one, with its truth."""
+    """The first frame with its true values."""
 
     @property
     def dots_px(self) -> FloatArray:
-        """(u, v) of the dots that are in the picture, shape (n, 2)."""
+        """(u, v) of the dots in the picture, shape (n, 2), px."""
         return self.frame.dot_px[self.frame.shown]
 
 
@@ -43,13 +43,13 @@ def preview(path: Path, seed: int | None) -> ScenarioPreview:
 
 
 def choices(own: Path | None) -> list[tuple[str, str]]:
-    """(path, words) of the scenarios to choose from: the operator's own first, if there is one."""
+    """(path, text) of the available scenarios; the operator's own, if any, comes first."""
     paths = [own] if own is not None and own not in shipped_scenarios() else []
     return [(str(path), path.stem.replace("_", " ")) for path in (*paths, *shipped_scenarios())]
 
 
 def rows(shown: ScenarioPreview, frames: int) -> tuple[ResultRow, ...]:
-    """What is known of a scenario's first frame, and of a recording of that many frames."""
+    """Rows about a scenario's first frame, and about a recording of ``frames`` frames."""
     recording, frame = shown.scenario.recording, shown.frame
     size, seen = frame.pool.size, frame.reflections
     free = seen.lit & ~seen.blocked

@@ -1,4 +1,4 @@
-"""The simulator's window: a scenario at the left, its first frame with true dots at the right."""
+"""Window of the simulator: a scenario at the left, its first frame with true dots at the right."""
 
 from __future__ import annotations
 
@@ -29,20 +29,20 @@ if TYPE_CHECKING:
     from labapp.gui.shell.files import Files
 
 RING, RING_PX = "#2fd39b", 15
-"""Round the true dots: a colour of the dots page; points of the screen."""
+"""Rings around the true dots: a colour of the dots page; diameter in points of the screen."""
 
 
 class SimulatorWindow(ToolWindow):
-    """Shows a scenario, writes its recording with the truth, and opens that as a session."""
+    """Shows a scenario, writes its recording with the true values, and opens it as a session."""
 
     key = "simulator"
     title = "Simulator"
 
     def __init__(self, sessions: Files, window: QWidget) -> None:
         self.preview: ScenarioPreview | None = None
-        """The scenario that is shown; None until its first frame is drawn."""
+        """The displayed scenario; None until its first frame is drawn."""
         self.made: tuple[Scenario, Path] | None = None
-        """The scenario that was written last, and where to."""
+        """The last written scenario, and its folder."""
         self._own: Path | None = None
         self._proposed = ""
         self._turn = threading.Lock()
@@ -110,20 +110,20 @@ class SimulatorWindow(ToolWindow):
     # --- what is to be simulated ---------------------------------------------------------------
 
     def prefill(self) -> None:
-        """Propose a folder at the first time; draw what is chosen where it is not drawn."""
+        """Propose a folder the first time; draw the chosen scenario unless it is drawn already."""
         if not self._proposed:
             self._propose(self._preferences.current.folder)
         if self.preview is None and not self.previews.active:
             self.show_scenario()
 
     def show_scenario(self) -> None:
-        """Draw the scenario that is chosen, with its seed and number of frames."""
+        """Draw the chosen scenario, and show its seed and number of frames."""
         if self.folder.value() == self._proposed:
             self._propose(Path(self._proposed).parent)
         self._draw(None)
 
     def take(self, path: Path) -> None:
-        """Choose a scenario of the operator's own."""
+        """Choose the operator's own scenario."""
         self._own = path
         self.scenario.set_choices(simulating.choices(path))
         self.scenario.set_value(str(path))
@@ -136,7 +136,7 @@ class SimulatorWindow(ToolWindow):
             self.take(path)
 
     def choose_folder(self) -> None:
-        """Ask where the simulation goes."""
+        """Ask for the folder of the simulation."""
         start = Path(self.folder.value()).parent
         if folder := ask_folder(self, "Folder for the simulation", start):
             self._propose(folder)
@@ -149,7 +149,7 @@ class SimulatorWindow(ToolWindow):
     # --- its first frame -----------------------------------------------------------------------
 
     def _draw(self, seed: int | None) -> None:
-        """Draw the first frame in the background; the last request is shown."""
+        """Draw the first frame in the background; only the last request is shown."""
         path = self.scenario.value()
         for task in self.previews.active:
             task.cancel()
@@ -195,13 +195,13 @@ class SimulatorWindow(ToolWindow):
     # --- writing, opening ----------------------------------------------------------------------
 
     def show_state(self) -> None:
-        """Enable what is of use now."""
+        """Enable the actions that are available now."""
         if hasattr(self, "start_button"):
             self.start_button.setEnabled(not self.working and self.preview is not None)
             self.open_button.setEnabled(not self.working and self.made is not None)
 
     def start(self) -> None:
-        """Write recording and truth, in the background; the folder is complete or absent."""
+        """Write recording and true values in the background; the folder is complete or absent."""
         for field in (self.frames, self.seed, self.folder):
             field.flush()
         path, seed = Path(self.scenario.value()), int(self.seed.value() or 0)
@@ -226,7 +226,7 @@ class SimulatorWindow(ToolWindow):
         self.show_state()
 
     def open_session(self) -> None:
-        """Make a session of what was written last, in its folder, and open it."""
+        """Create a session of the last written recording, in its folder, and open it."""
         if self.made is None:
             return
         scenario, folder = self.made
@@ -240,10 +240,10 @@ class SimulatorWindow(ToolWindow):
 
     def _open(self, path: Path) -> None:
         if self._sessions.open(path):
-            self._propose(path.parent.parent)  # the next one does not replace what is open
+            self._propose(path.parent.parent)  # the next recording must not replace the open one
             self.close()
 
     def closeEvent(self, event: QCloseEvent) -> None:
-        """Stop drawing, too."""
+        """Also stop drawing."""
         self.previews.cancel_all()
         super().closeEvent(event)

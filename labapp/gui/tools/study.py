@@ -1,4 +1,4 @@
-"""The window of studies: which recordings at the left; progress and results at the right."""
+"""Window of studies: recordings at the left; progress and results at the right."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 STUDIES = "Studies (*.toml *.csv)"
 
 LOOK_S = 1.0
-"""The list is renewed no more often while the study is run."""
+"""Shortest interval, s, between updates of the list while the study runs."""
 
 NONE_YET = (
     "A study is a file that names recordings, each with its set-up and the conditions it was made "
@@ -46,18 +46,18 @@ NONE_YET = (
 
 
 class StudyWindow(ToolWindow):
-    """Opens or makes a study, runs it, and shows what came out."""
+    """Opens or creates a study, runs it, and shows the results."""
 
     key = "study"
     title = "Study of many recordings"
 
     def __init__(self, sessions: Files, window: QWidget) -> None:
         self.study: Study | None = None
-        """The study that is shown; None before one was opened."""
+        """The displayed study; None before one is opened."""
         self.found: list[RecordingStatus] = []
-        """What is done of each recording."""
+        """Progress of each recording."""
         self.summary: StudySummary | None = None
-        """Its results; None before there are any."""
+        """Results of the study; None before there are any."""
         super().__init__(sessions, window)
         self._sessions = sessions
         self.looks = Tasks(self)
@@ -166,7 +166,7 @@ class StudyWindow(ToolWindow):
             self.take_folder(folder)
 
     def take_folder(self, folder: Path) -> None:
-        """Propose the recordings in a folder, and a setup file that is beside one of them."""
+        """Propose the recordings in a folder, and a setup file beside one of them."""
         pattern = self.workspace.run_or_report(lambda: folder_pattern(folder))
         if pattern is None:
             return
@@ -186,7 +186,7 @@ class StudyWindow(ToolWindow):
             self.setup.set_value(str(path))
 
     def choose_new(self) -> None:
-        """Ask where the new study goes, and make it."""
+        """Ask for the file of a new study, and create it."""
         for field in (self.recordings, self.setup):
             field.flush()
         if not self.recordings.value().strip() or not self.setup.value().strip():
@@ -197,9 +197,9 @@ class StudyWindow(ToolWindow):
             self.make(path)
 
     def make(self, path: Path) -> None:
-        """Make the study that the form describes, and open it."""
+        """Create the study described by the form, and open it."""
         given = [self.recordings.value().strip()], self.setup.value().strip()
-        # Whether one that is there is replaced, the dialog has asked.
+        # The dialog has asked whether to replace an existing file.
         if self.workspace.run_or_report(lambda: write_study(path, *given, replace=True)):
             self.show_study(path)
 
@@ -214,7 +214,7 @@ class StudyWindow(ToolWindow):
     # --- what is done of it --------------------------------------------------------------------
 
     def _look(self) -> None:
-        """Read in the background what is done, and put its results together."""
+        """Read the progress in the background, and combine the results."""
         self.looks.cancel_all()
         study, surfaces = self.study, self.surfaces.isChecked()
         if study is None:
@@ -225,7 +225,7 @@ class StudyWindow(ToolWindow):
             control.part(found)
             if not any(one.frames_done for one in found):
                 return None
-            # In a process: the window would be slow meanwhile, and so would this.
+            # In a process: a thread would be slow, and would slow down the window.
             pool = measuring_pool(1)
             try:
                 begun = pool.submit(_results, study.path, study.folder, surfaces)
@@ -236,12 +236,12 @@ class StudyWindow(ToolWindow):
         self.looks.start("Reading the study", work, self._show_summary, self._show_part)
 
     def _look_at_end(self) -> None:
-        """Show what is done when a run has ended, however."""
+        """Show the progress when a run has ended in any way."""
         if not self.working:
             self._look()
 
     def _show_part(self, part: list[RecordingStatus] | str) -> None:
-        """Show what is done, or a sentence."""
+        """Show the progress, or a message."""
         if isinstance(part, str):
             self.workspace.notified.emit(part, False)
             return
@@ -266,7 +266,7 @@ class StudyWindow(ToolWindow):
             self.list.show_table(studying.recordings_table(plan, self.found))
             header = self.list.horizontalHeader()
             header.setSectionResizeMode(QHeaderView.ResizeMode.ResizeToContents)
-            # Why one failed, in as many lines as that takes.
+            # The reason of a failure, wrapped to as many lines as needed.
             header.setSectionResizeMode(header.count() - 1, QHeaderView.ResizeMode.Stretch)
         if self.summary is not None:
             self.means.show_table(studying.means_table(self.summary))
@@ -327,14 +327,14 @@ class StudyWindow(ToolWindow):
         self.begin(f"Measuring {study.plan.title}", work, done, self._show_part)
 
     def _reread(self) -> Study:
-        """The study as its file is now."""
+        """Read the study from its file again."""
         assert self.study is not None
         return Study(self.study.path)
 
     # --- one recording -------------------------------------------------------------------------
 
     def selected(self) -> tuple[StudyRecording, int | None] | None:
-        """The recording that is selected, and the frame, in the table in view; None without one."""
+        """Recording and frame selected in the visible table; None without a selection."""
         table = self.outliers if self.tabs.currentWidget() is self.outliers else self.list
         row = table.currentRow()
         if not table.isVisible() or not table.selectedItems() or table.table is None:
@@ -347,7 +347,7 @@ class StudyWindow(ToolWindow):
         return None
 
     def open_selected(self) -> None:
-        """Make a session of the selected recording, measured as here, and open it at the frame."""
+        """Create a session of the selected recording, measured as in the study, and open it."""
         chosen, study = self.selected(), self.study
         if chosen is None or study is None or self.working:
             return
@@ -366,12 +366,12 @@ class StudyWindow(ToolWindow):
         self.begin(f"Opening {recording.name}", work, opened)
 
     def closeEvent(self, event: QCloseEvent) -> None:
-        """Stop reading, too."""
+        """Also stop reading."""
         self.looks.cancel_all()
         super().closeEvent(event)
 
     def show_state(self) -> None:
-        """Enable what is of use now."""
+        """Enable the actions that are available now."""
         if hasattr(self, "start_button"):
             self.start_button.setEnabled(self.study is not None and not self.working)
             self.open_button.setEnabled(self.selected() is not None and not self.working)
@@ -379,5 +379,5 @@ class StudyWindow(ToolWindow):
 
 
 def _results(path: Path, folder: Path, surfaces: bool) -> StudySummary:
-    """Put the results of a study together and write them, in another process."""
+    """Combine the results of a study and write them; called in another process."""
     return Study(path, folder).results(surfaces=surfaces)

@@ -1,4 +1,4 @@
-"""What the window of studies shows of one, and the session of one of its recordings: without Qt."""
+"""Data of the window of studies, and sessions of single recordings. Without Qt."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ SIGNS: dict[State, str] = {"done": "✓", "part": "◐", "waiting": "○", "fail
 
 
 def recordings_table(plan: StudyPlan, found: Sequence[RecordingStatus]) -> Table:
-    """A row a recording: conditions, state, progress, and why it failed."""
+    """Table with a row per recording: conditions, state, progress, and reason of a failure."""
     rows = tuple(
         (
             one.recording.name,
@@ -40,7 +40,7 @@ def recordings_table(plan: StudyPlan, found: Sequence[RecordingStatus]) -> Table
 
 
 def means_table(summary: StudySummary) -> Table:
-    """A row a group of recordings with the same conditions: mean of each size and its ±."""
+    """Table with a row per group of equal conditions: mean of each size and its ±."""
     rows = tuple(
         (
             *(shown_condition(one.conditions.get(name)) for name in summary.conditions),
@@ -55,7 +55,7 @@ def means_table(summary: StudySummary) -> Table:
 
 
 def outliers_table(summary: StudySummary) -> Table:
-    """A row a frame, or a recording, that is far from the others."""
+    """Table with a row per frame or recording that is far from the others."""
     rows = tuple(
         (
             one.recording,
@@ -72,7 +72,7 @@ def outliers_table(summary: StudySummary) -> Table:
 
 
 def matches_text(pattern: str) -> str:
-    """How many recordings a pattern fits, and which conditions are in their paths."""
+    """Text of the number of recordings that match a pattern, and of conditions in their paths."""
     if not pattern:
         return ""
     try:
@@ -91,20 +91,20 @@ def matches_text(pattern: str) -> str:
 
 
 def session_path(folder: Path, recording: StudyRecording) -> Path:
-    """The session of one of a study's recordings, in the folder of the results."""
+    """Path of the session of a study's recording, in the folder of the results."""
     return folder / "sessions" / f"{recording.name}{SUFFIX}"
 
 
 def begin_session(folder: Path, recording: StudyRecording, progress: Progress) -> Path:
-    """Make a session of a recording of a study, measured as in the study, unless it is there.
+    """Create a session of a study's recording, measured as in the study, unless it exists.
 
     Parameters
     ----------
     folder
-        Of the study's results.
+        Folder of the study's results.
     progress
-        Called with what is done, and frames done and in all; may raise to stop. No session is left
-        then while the recording is imported; later, what was measured is.
+        Called with the current stage, the frames done, and their total; may raise to stop. If it
+        raises during the import, no session is left; later, the measured frames are kept.
 
     Raises
     ------
@@ -138,7 +138,7 @@ def begin_session(folder: Path, recording: StudyRecording, progress: Progress) -
 
 
 def _record(recording: StudyRecording) -> Record:
-    """What a session notes of a recording: conditions that it has a field for, others in words."""
+    """Record of a recording: conditions with a field of their own, others as notes."""
     kinds = {each.name: str(each.type) for each in fields(Record)}
     known, others = {}, []
     for name, value in recording.conditions.items():

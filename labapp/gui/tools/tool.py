@@ -1,4 +1,4 @@
-"""What all tool windows share: a form, results, and work with progress that can be stopped."""
+"""Base class of tool windows: a form, results, and tasks with progress that can be stopped."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ if TYPE_CHECKING:
 SIZE_PX = (1120, 700)
 PART_OF_SCREEN = 0.9
 FORM_PX = 336
-"""Width of the form: two numbers beside their name."""
+"""Width of the form: a name and two numbers."""
 
 
 class ToolWindow(QDialog):
     """A window with a form at the left, results at the right and buttons below.
 
-    Closing it stops its work, and keeps what it shows.
+    Closing it stops its task, and keeps the displayed results.
     """
 
     key = ""
@@ -45,9 +45,9 @@ class ToolWindow(QDialog):
         super().__init__(window)
         self.workspace = sessions.workspace
         self.tasks = Tasks(self)
-        """The tool's own work."""
+        """Tasks of the tool."""
         self.files: dict[str, bytes] = {}
-        """What it found as files: name → content."""
+        """Results as files: name → content."""
         self._task: Task | None = None
         self._pressed: QWidget | None = None
         self.setObjectName(f"tool-{self.key}")
@@ -56,7 +56,7 @@ class ToolWindow(QDialog):
         self.form = FieldForm()
         found = QWidget()
         self.results = vbox(of=found)
-        """Where the tool puts its results; its fields go into `form`."""
+        """Layout of the tool's results; its fields are in `form`."""
         self.message = Message(1)
         self.message.setAccessibleName("Last message")
         self.bar = QProgressBar()
@@ -93,31 +93,31 @@ class ToolWindow(QDialog):
         self.buttons.insertStretch(0, 1)
 
     def add_button(self, words: str, tip: str, do: Callable[[], object]) -> QPushButton:
-        """Put a button before those that are there."""
+        """Add a button before the existing ones."""
         made = button(words, tip, do)
         self.buttons.insertWidget(0, made)
         return made
 
     def add_save_button(self, words: str, tip: str) -> None:
-        """Put the button that writes `files` to a folder."""
+        """Add the button that writes `files` to a folder."""
         self.save_button = self.add_button(words, tip, self.choose_folder)
 
     def add_to_form(self, words: str, tip: str, do: Callable[[], object]) -> None:
-        """Put a button below the fields that are there."""
+        """Add a button below the existing fields."""
         self.form.add_wide(button(words, tip, do))
 
     # --- what tools say for themselves ---------------------------------------------------------
 
     def prefill(self) -> None:
-        """Put what the session holds into the form, where it changed since last time."""
+        """Fill in values of the session that changed since the last time."""
 
     def show_state(self) -> None:
-        """Enable what is of use now."""
+        """Enable the actions that are available now."""
 
     # --- showing, closing ----------------------------------------------------------------------
 
     def open_beside(self) -> None:
-        """Come into view, in front, with what the session holds."""
+        """Show the window in front, with the values of the session."""
         self.prefill()
         self.show_state()
         if self.focusWidget() is None:
@@ -127,7 +127,7 @@ class ToolWindow(QDialog):
         self.activateWindow()
 
     def _order_keys(self) -> None:
-        """Have Tab lead from the form's first field, through the results, to the buttons."""
+        """Let Tab go from the form's first field through the results to the buttons."""
         items = [self.buttons.itemAt(n) for n in range(self.buttons.count())]
         buttons = [item.widget() for item in items if item is not None]
         for one, next_one in itertools.pairwise(filter(None, buttons)):
@@ -137,14 +137,14 @@ class ToolWindow(QDialog):
         next(fields).setFocus()
 
     def reject(self) -> None:
-        """Esc: stop the work under way; without any close the window."""
+        """Handle Esc: stop the running task, or close the window if there is none."""
         if self.tasks.active:
             self.cancel()
         else:
             super().reject()
 
     def closeEvent(self, event: QCloseEvent) -> None:
-        """Stop the work."""
+        """Stop the task."""
         if self.tasks.active:
             self.tasks.cancel_all()
             self.say("Stopped")
@@ -154,7 +154,7 @@ class ToolWindow(QDialog):
 
     @property
     def working(self) -> bool:
-        """Whether work is under way."""
+        """Whether a task is running."""
         return bool(self.tasks.active)
 
     def begin(
@@ -164,7 +164,7 @@ class ToolWindow(QDialog):
         done: Callable[[Any], None],
         part: Callable[[Any], None] | None = None,
     ) -> None:
-        """Begin work, one at a time; see `Tasks.start`."""
+        """Start a task, only one at a time; see `Tasks.start`."""
 
         def behind(control: Control) -> Any:
             try:
@@ -179,16 +179,16 @@ class ToolWindow(QDialog):
         self._pressed = self.focusWidget()
         self._task = self.tasks.start(title, behind, done, part)
         if self.focusWidget() is not self._pressed:
-            self.cancel_button.setFocus()  # it is disabled, and the keys went on to Close
+            self.cancel_button.setFocus()  # it was disabled, and the focus moved to Close
 
     def cancel(self) -> None:
-        """Ask the work to stop."""
+        """Request the task to stop."""
         for task in self.tasks.active:
             task.cancel()
         self._show_progress()
 
     def choose_folder(self) -> None:
-        """Ask where to write what was found."""
+        """Ask for the folder of the results."""
         title = f"{self.save_button.text().removesuffix('…')} in"
         if folder := ask_folder(self, title, self.workspace.folder):
             self.save(folder)
@@ -207,7 +207,7 @@ class ToolWindow(QDialog):
             self.say(f"Saved in {folder}")
 
     def say(self, text: str, problem: bool = False) -> None:
-        """Show a message on the line below."""
+        """Show a message in the line below."""
         self.message.setText(f"{PROBLEM} {text}" if problem else text)
 
     def _repeat_message(self, text: str, problem: bool) -> None:

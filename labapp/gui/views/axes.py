@@ -1,4 +1,4 @@
-"""Plots whose numbers are in the unit of the axis' label, and drawings to scale made of them."""
+"""Plots with axis numbers in the labelled unit, and drawings to scale made of them."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from labapp.gui.widgets.layouts import hbox, vbox
 class PlainAxis(pg.AxisItem):  # type: ignore[misc]
     """An axis that never scales its numbers.
 
-    pyqtgraph scales them by the range in view whenever a label is set, and even when scaling is
-    switched off once more: an axis in mm would read in µm and still say mm.
+    pyqtgraph scales them by the visible range whenever a label is set, even if scaling is switched
+    off: the numbers of an axis in mm would be in µm, but its label would still say mm.
     """
 
     def updateAutoSIPrefix(self) -> None:
-        """Leave the numbers as they are."""
+        """Keep the numbers unscaled."""
         self._updateLabel()
 
 
@@ -34,7 +34,7 @@ def plain_axes() -> dict[str, PlainAxis]:
 
 
 def make_plot(x_label: str, y_label: str = "", equal: bool = True) -> pg.PlotWidget:
-    """Make a plot that leaves keys and the right button to its parent."""
+    """Create a plot that leaves keys and the right mouse button to its parent."""
     plot: Any = pg.PlotWidget(axisItems=plain_axes())
     plot.setFocusPolicy(Qt.FocusPolicy.NoFocus)
     plot.setMenuEnabled(False)
@@ -46,22 +46,22 @@ def make_plot(x_label: str, y_label: str = "", equal: bool = True) -> pg.PlotWid
 
 
 def show_axes(plots: Sequence[pg.PlotWidget], shown: bool) -> None:
-    """Show the axes of drawings to scale, or leave their room to what is drawn."""
+    """Show or hide the axes of drawings to scale; hidden axes leave more space for the drawing."""
     for plot in plots:
         for side in ("left", "bottom"):
             plot.showAxis(side, shown)
 
 
 def paint_axes(plot: pg.PlotWidget | pg.PlotItem, lines: QColor, text: QColor) -> None:
-    """Draw a plot's axes and ticks, and their numbers and labels, in these colours."""
+    """Set the colours of a plot's axes and ticks, and of their numbers and labels."""
     for side in ("left", "bottom"):
         axis = plot.getAxis(side)
         axis.setPen(lines)
-        axis.setTextPen(text)  # after the pen, which would colour the label too
+        axis.setTextPen(text)  # after the pen, which also colours the label
 
 
 class Sketch(Drawn):
-    """A drawing to scale with words below it; they stand in the middle where nothing is drawn."""
+    """A drawing to scale with text below it; without a drawing the text is centred."""
 
     def __init__(self, name: str, *plots: tuple[pg.PlotWidget | QLayout, int]) -> None:
         super().__init__(name)
@@ -72,7 +72,7 @@ class Sketch(Drawn):
         self._column.setSpacing(0)
 
     def say(self, words: str, drawn: bool) -> None:
-        """Show words, which a screen reader says, too, below the drawing or in its place."""
+        """Show text below the drawing or in its place, and describe the drawing with it."""
         self.words.setText(words)
         self.describe(words)
         for plot in self._plots:
@@ -86,14 +86,14 @@ class Sketch(Drawn):
 def draw_line(
     plot: pg.PlotWidget, points: FloatArray, pen: object, **symbol: object
 ) -> pg.PlotDataItem:
-    """Join points, shape (n, 2), in a plot; NaN breaks the line."""
+    """Draw a line through points, shape (n, 2), in a plot; NaN interrupts the line."""
     return plot.plot(points[:, 0], points[:, 1], pen=pen, connect="finite", **symbol)
 
 
 def draw_text(
     plot: pg.PlotWidget, words: str, place: FloatArray, color: QColor, anchor: tuple[float, float]
 ) -> None:
-    """Put words at a place, shape (2,), above all else."""
+    """Draw text at a position, shape (2,), in front of all other items."""
     item = pg.TextItem(words, color=color, anchor=anchor)
     item.setZValue(10)
     item.setPos(float(place[0]), float(place[1]))

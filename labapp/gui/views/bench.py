@@ -1,4 +1,4 @@
-"""The bench from the side and from above, to scale; its dimensions are fields."""
+"""Drawing to scale of the bench, from the side and from above, with fields for its dimensions."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from labapp.gui.widgets.layouts import vbox
 from labapp.simulation.positioning import Fate, SideView
 
 RED, BLUE = {True: "#ff6b5e", False: "#c62828"}, {True: "#6cb6ff", False: "#1565c0"}
-"""By whether the background is dark."""
+"""Colours by whether the background is dark."""
 
 TORCH_MM, SHOULDER_MM = 14.0, 3.5
-"""How far up the torch is drawn, and the radius of its electrode."""
+"""Drawn height of the torch, and radius of its electrode."""
 
 
 DRAWN = {
@@ -38,32 +38,32 @@ DRAWN = {
     "imaging_plane.s_mm": "s",
     "imaging_plane.width_mm": "width",
 }
-"""Dimensions that are fields of the drawing, and what stands before the number."""
+"""Dimensions with a field in the drawing, and their labels."""
 
 IN_TOP_VIEW = ("imaging_plane.s_mm", "imaging_plane.width_mm")
 
 BESIDE, BESIDE_PX = 3, 400
-"""So many fields stand beside each other below the drawing, one less on a narrower canvas."""
+"""Fields per row below the drawing, and the canvas width below which there is one less."""
 
 NARROW_PX = 760
-"""On a narrower canvas the enlarged view has no room."""
+"""On a narrower canvas there is no space for the enlarged view."""
 
 SMALL_PX = (480, 400)
-"""On a canvas narrower or lower than this the fields would hide the drawing."""
+"""On a narrower or lower canvas the fields would hide the drawing."""
 
 CLICK_PX = 22
-"""A click this near to the letter of a dimension means it."""
+"""Largest distance, px, of a click from the letter of a dimension to select it."""
 
 
 class BenchView(Sketch):
     """Views of the bench along −X (Y to the right, Z up) and from above (X downwards), mm.
 
-    The fates of the rays differ by line as well as by colour: solid, dashed, dotted.
+    The fates of the rays differ in line style (solid, dashed, dotted) as well as in colour.
 
     Parameters
     ----------
     fields
-        The fields of the dimensions, by the keys of `DRAWN`.
+        Fields of the dimensions, by the keys of `DRAWN`.
     """
 
     def __init__(self, fields: Mapping[str, NumberField]) -> None:
@@ -77,7 +77,7 @@ class BenchView(Sketch):
         super().__init__(
             "Drawing of the bench from the side and from above", (self._views, 3), (self.near, 2)
         )
-        self._plots = [self.whole, self.top, self.near]  # shown and hidden with what is drawn
+        self._plots = [self.whole, self.top, self.near]  # shown and hidden together
         self._said = ""
         self._is_small = False
         self.boxes = {
@@ -96,7 +96,7 @@ class BenchView(Sketch):
         self.follow_theme()
 
     def show_bench(self, rig: Rig | None, view: SideView | None, words: str) -> None:
-        """Draw a bench, or none; the words stand below and are what a screen reader says."""
+        """Draw a bench, or none, with text below that also describes it to a screen reader."""
         former, self._view, self._rig, self._said = self._view, view, rig, words
         self._arrange()
         self._draw()
@@ -115,12 +115,12 @@ class BenchView(Sketch):
             self.near.setRange(xRange=(-left, right), yRange=(-0.4 * right, right), padding=0)
 
     def resizeEvent(self, event: QResizeEvent) -> None:
-        """Leave out what there is no room for."""
+        """Hide the parts for which there is no space."""
         super().resizeEvent(event)
         self._arrange()
 
     def _arrange(self) -> None:
-        """On a small canvas put the views side by side, the fields below them."""
+        """On a small canvas place the views side by side and the fields below them."""
         is_drawn = self._view is not None
         width, height = SMALL_PX
         is_small = self.width() < width or self.height() < height
@@ -143,7 +143,7 @@ class BenchView(Sketch):
             self.fit()
 
     def _move_fields(self) -> None:
-        """Put the fields below the drawing, so many beside each other; or on it."""
+        """Place the fields in rows below the drawing, or on it."""
         for k, box in enumerate(self.boxes.values()):
             self._grid.removeWidget(box)
             if self._beside:
@@ -153,7 +153,7 @@ class BenchView(Sketch):
                 box.show()
 
     def _place_fields(self) -> None:
-        """Put the fields at their dimensions, none over another, nor over what is drawn there."""
+        """Place the fields at their dimensions, without overlapping each other or obstacles."""
         if self._rig is None or self._view is None or self._is_small:
             return
         taken = {plot: self.obstacles(plot) for plot in (self.whole, self.top)}
@@ -162,7 +162,7 @@ class BenchView(Sketch):
             box.put_at(place, taken[box.plot])
 
     def obstacles(self, plot: pg.PlotWidget) -> list[QRect]:
-        """Names on a plot, the torch and the laser: what no field is to lie on, in its pixels."""
+        """Rectangles of names and torch on a plot, which no field may cover, in its pixels."""
         items = [each for each in plot.items() if isinstance(each, pg.TextItem)]
         found = [plot.mapFromScene(each.sceneBoundingRect()).boundingRect() for each in items]
         if plot is self.whole and self._view is not None:
@@ -174,7 +174,7 @@ class BenchView(Sketch):
         return found
 
     def _choose(self, plot: pg.PlotWidget, event: Any) -> None:
-        """A click on the letter of a dimension leads to its field."""
+        """Focus the field of a dimension whose letter was clicked."""
         if self._rig is None or self._view is None or not self._is_small:
             return
         box, at = plot.getViewBox(), event.scenePos()
@@ -187,7 +187,7 @@ class BenchView(Sketch):
                 editor.selectAll()
 
     def take_colours(self) -> None:
-        """Draw in the window's colours."""
+        """Draw in the colours of the theme."""
         palette = self.palette()
         self._ground = palette.color(QPalette.ColorRole.Base)
         self._ink = palette.color(QPalette.ColorRole.Text)
@@ -198,7 +198,7 @@ class BenchView(Sketch):
         self._draw()
 
     def _faint(self, share: float) -> QColor:
-        """The text's colour, mixed with the background."""
+        """Text colour mixed with the background."""
         mixed = [
             round(share * ink + (1 - share) * ground)
             for ink, ground in zip(
@@ -237,7 +237,7 @@ class BenchView(Sketch):
                 draw_text(self.boxes[key].plot, DRAWN[key], place, self._ink, anchor)
 
     def _draw_from_above(self, rig: Rig, view: SideView) -> None:
-        """Plane, pool, torch and the edges of the fan, (y, x)."""
+        """Draw plane, pool, weld axis, laser and fan edges from above, (y, x)."""
         plane, half = rig.imaging_plane, float(view.pool_mm[-1, 0])
         ends = np.array([[0.0, 0.0], [plane.width_mm, 0.0]])
         draw_line(self.top, plane.to_universal(ends)[:, [1, 0]], pg.mkPen(self._ink, width=4))
@@ -283,7 +283,7 @@ class BenchView(Sketch):
         plot.plot(*laser[:, None], pen=None, symbol="s", symbolSize=13, symbolBrush=self._ink)
 
     def _draw_labels(self, view: SideView) -> None:
-        """Names, and L1 and L2 as measured lengths under the work piece."""
+        """Draw names, and L1 and L2 as dimensions below the work piece."""
         torch = view.tip_mm + np.array([0.0, TORCH_MM])
         draw_text(self.whole, "torch", torch, self._ink, (0.5, 1.0))
         draw_text(self.whole, "laser", view.laser_mm, self._ink, (0.5, 1.5))
@@ -307,14 +307,14 @@ class BenchView(Sketch):
 
 
 def _near(view: SideView) -> tuple[float, float]:
-    """How far from the electrode the enlarged part goes, to the left and to the right, mm."""
+    """Extent of the enlarged part to the left and right of the electrode, mm."""
     right = 1.3 * float(max(view.pool_mm[-1, 0], view.clearance.l2_mm, 3.0))
     l1_mm = view.clearance.l1_mm
     return max(right, min(1.1 * l1_mm, 3 * right) if np.isfinite(l1_mm) else 0.0), right
 
 
 def _across(rig: Rig) -> tuple[float, float]:
-    """Lowest and highest X that the view from above shows, mm."""
+    """Lowest and highest X in the view from above, mm."""
     x = rig.imaging_plane.to_universal(np.array([[0.0, 0.0], [rig.imaging_plane.width_mm, 0.0]]))
     return float(min(x[:, 0].min(), -10.0)), float(max(x[:, 0].max(), 10.0))
 
@@ -327,7 +327,7 @@ def _fan_deg(rig: Rig) -> float:
 
 
 def _dimensions(rig: Rig, view: SideView) -> dict[str, tuple[FloatArray, FloatArray]]:
-    """The line of each dimension, shape (n, 2), and the middle of its field, shape (2,), mm."""
+    """Line of each dimension, shape (n, 2), and centre of its field, shape (2,), mm."""
     laser, alpha = view.laser_mm, np.radians(rig.laser.projection_angle_deg)
     lower, upper = view.plane_mm
     outside = lower[0] - 3
@@ -357,13 +357,13 @@ def _dimensions(rig: Rig, view: SideView) -> dict[str, tuple[FloatArray, FloatAr
 
 
 def _broken(paths: list[FloatArray]) -> FloatArray:
-    """Paths end to end, NaN between them: one item draws them all."""
+    """Paths concatenated with NaN between them, so that one item draws them all."""
     gap = np.full((1, 2), np.nan)
     return np.concatenate([part for path in paths for part in (path, gap)])
 
 
 def _extent(view: SideView) -> tuple[float, float, float]:
-    """Left, right and upper end of what is drawn, mm."""
+    """Left, right and upper limit of the drawing, mm."""
     left = min(float(view.plane_mm[:, 0].min()), -10.0) - 4
     right = max(float(view.laser_mm[0]), 10.0) + 6
     caught = [ray.path_mm[-1, 1] for ray in view.rays if ray.fate is Fate.CAUGHT]

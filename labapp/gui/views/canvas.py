@@ -20,14 +20,14 @@ from labapp.gui.theme import FollowsTheme
 
 
 class Drawn(FollowsTheme, QWidget):
-    """A drawing to look at; without keys of its own Tab goes past it.
+    """A drawing; without keys of its own it cannot get the focus.
 
     Parameters
     ----------
     name
-        What it shows, for a screen reader.
+        Name of the drawing for a screen reader.
     keys
-        What can be done with the keys, for a screen reader.
+        Description of the keys for a screen reader.
     """
 
     ROLE = QAccessible.Role.Graphic
@@ -46,7 +46,7 @@ class Drawn(FollowsTheme, QWidget):
         self.setAccessibleDescription(". ".join(part for part in parts if part))
 
     def paintEvent(self, _event: QPaintEvent) -> None:
-        """Draw the focus frame; what lies on the widget leaves a px at the edge."""
+        """Draw the focus frame, in a margin of 1 px that child widgets leave free."""
         if self.hasFocus():
             with QPainter(self) as painter:
                 self.paint_frame(painter)
@@ -58,12 +58,12 @@ class Drawn(FollowsTheme, QWidget):
 
 
 class Plotted(Drawn):
-    """A drawing that has axes."""
+    """A drawing with axes."""
 
     ROLE = QAccessible.Role.Chart
 
     def add_menu(self, *works: tuple[str, Callable[[], object]]) -> None:
-        """Add a menu for the right button, of words and what they do; Ctrl+C does the first."""
+        """Add a context menu of texts and functions; Ctrl+C calls the first."""
         self.setContextMenuPolicy(Qt.ContextMenuPolicy.ActionsContextMenu)
         for words, work in works:
             action = QAction(words, self)
@@ -75,7 +75,7 @@ class Plotted(Drawn):
 
 
 def _accessible(_class_name: str, thing: QObject) -> QAccessibleInterface | None:
-    """Qt has no accessible role for a widget that it does not know."""
+    """Accessible interface with the role of a drawing, which Qt cannot know."""
     return QAccessibleWidget(thing, thing.ROLE) if isinstance(thing, Drawn) else None
 
 

@@ -1,4 +1,4 @@
-"""A plot of its own with words above it: zoom, values under the pointer, copied and saved."""
+"""A single plot with text above it: zoom, values under the pointer, copying and saving."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ ZOOM = 1.25
 
 
 class Chart(Plotted):
-    """One plot with a line of words above it, in the colours of the window.
+    """One plot with a line of text above it, in the colours of the theme.
 
     Parameters
     ----------
     unit
-        Of the values under the pointer, with a space before it.
+        Unit of the values under the pointer, with a leading space.
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class Chart(Plotted):
         )
 
     def copy_picture(self) -> None:
-        """Put what is seen on the clipboard."""
+        """Copy the visible plot to the clipboard."""
         QGuiApplication.clipboard().setPixmap(self.plot.grab())
 
     def _moved_to(self, at: QPointF) -> None:
@@ -63,17 +63,17 @@ class Chart(Plotted):
         self._at.setVisible(inside)
 
     def leaveEvent(self, event: QEvent) -> None:
-        """Show no values any more."""
+        """Hide the values."""
         self._at.hide()
         super().leaveEvent(event)
 
     def say(self, words: str) -> None:
-        """Put words above the plot."""
+        """Show text above the plot."""
         self.title.setText(words)
         self.describe(words)
 
     def take_colours(self) -> None:
-        """Take the window's colours."""
+        """Use the colours of the theme."""
         palette = self.palette()
         self.text = palette.color(QPalette.ColorRole.Text)
         self.accent = palette.color(QPalette.ColorRole.Highlight)

@@ -1,4 +1,4 @@
-"""The laser over its cross hair from the side and from above, to scale (Fig. A-1)."""
+"""Drawing to scale of the laser and its cross hair, from the side and from above (Fig. A-1)."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from labapp.gui.widgets.layouts import vbox
 Lengths = tuple[float, float, float]
 
 LOW_PX = 420
-"""On a canvas lower than this the axes would leave the cross no room."""
+"""On a lower canvas the axes would leave no space for the cross."""
 
 
 class CrossHairView(Sketch):
-    """Diode, beam and the fan's edges; the cross on the work piece with l₁, l₂, l₃ as fields; mm.
+    """Diode, beam, fan edges, and the cross on the work piece with fields for l₁, l₂, l₃; mm.
 
     Parameters
     ----------
     names, fields
-        Of l₁, l₂, l₃.
+        Names and fields of l₁, l₂, l₃.
     """
 
     def __init__(self, names: Sequence[str], fields: Sequence[NumberField]) -> None:
@@ -45,21 +45,21 @@ class CrossHairView(Sketch):
         self.follow_theme()
 
     def resizeEvent(self, event: QResizeEvent) -> None:
-        """Leave out the axes on a low canvas: the lengths are the fields."""
+        """Hide the axes on a low canvas; the fields show the lengths."""
         super().resizeEvent(event)
         show_axes((self.plot, self.top), self.height() >= LOW_PX)
 
     def show_laser(
         self, found: LaserCalibration, lengths_mm: Lengths, fan_angle_deg: float, words: str
     ) -> None:
-        """Draw a laser and its cross; the words stand below."""
+        """Draw a laser and its cross with text below."""
         self._shown = found, lengths_mm, fan_angle_deg
         self.say(words, True)
         self.take_colours()
         self._place_fields()
 
     def take_colours(self) -> None:
-        """Draw in the window's colours."""
+        """Draw in the colours of the theme."""
         ground = self.palette().color(QPalette.ColorRole.Base)
         ink = self.palette().color(QPalette.ColorRole.Text)
         for plot in (self.plot, self.top):
@@ -100,7 +100,7 @@ class CrossHairView(Sketch):
         self.top.setRange(xRange=(-l2 - 4, right), yRange=(-2 * l3, 2 * l3))
 
     def _place_fields(self) -> None:
-        """Put the fields at the lengths that they are of."""
+        """Place the fields at their lengths."""
         if self._shown is not None:
             l1, l2, l3 = self._shown[1]
             taken: list[QRect] = []
@@ -117,6 +117,6 @@ class CrossHairView(Sketch):
 
 
 def _dimension_lines(l1: float, l2: float, l3: float) -> list[list[list[float]]]:
-    """The lines of l₁, l₂ and l₃ beside the cross, seen from above."""
+    """Dimension lines of l₁, l₂ and l₃ beside the cross, seen from above."""
     level, beside = -0.8 * l3, 0.6
     return [[[0, level], [l1, level]], [[-l2, level], [0, level]], [[beside, 0], [beside, l3]]]

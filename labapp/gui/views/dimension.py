@@ -1,4 +1,4 @@
-"""A field on a drawing, at the dimension that it is of."""
+"""A field placed at its dimension in a drawing."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ STEPS = sorted(
     ((dx, dy) for dx in range(-240, 241, 20) for dy in range(-160, 161, 4)),
     key=lambda step: (abs(step[1]) + 2 * abs(step[0]), step),
 )
-"""How far, px, a box gives way to others, the nearest places first."""
+"""Displacements, px, of a box that would overlap others, the nearest first."""
 
 
 class DimensionBox(QWidget):
@@ -35,12 +35,12 @@ class DimensionBox(QWidget):
         row.setSizeConstraint(QLayout.SizeConstraint.SetFixedSize)
 
     def put_at(self, place: FloatArray, others: list[QRect]) -> None:
-        """Put its middle at a place of the plot, shape (2,), or beside what lies there already.
+        """Centre the box at a position of the plot, shape (2,), or nearby if that is occupied.
 
         Parameters
         ----------
         others
-            What lies on the plot; this box is added.
+            Rectangles occupied on the plot; that of this box is added.
         """
         scene = self.plot.getViewBox().mapViewToScene(QPointF(*place.tolist()))
         rect = QRect(QPoint(), self.sizeHint())

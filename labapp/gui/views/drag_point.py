@@ -1,4 +1,4 @@
-"""A named point in a picture, dragged or nudged; and how far an arrow key nudges."""
+"""A named point in a picture that can be dragged or moved with the arrow keys."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from PySide6.QtGui import QColor, QKeyEvent
 
 NUDGE_PX = 0.1
 FAR_NUDGE_PX = 1.0
-"""How far an arrow key moves a point, without and with Shift."""
+"""Step of an arrow key, px, without and with Shift."""
 
 ARROWS = {
     Qt.Key.Key_Left: (-1, 0),
@@ -23,7 +23,7 @@ SHIFT = Qt.KeyboardModifier.ShiftModifier
 
 
 def arrow_step(event: QKeyEvent) -> tuple[float, float] | None:
-    """How far an arrow key nudges, (du, dv) px; None for any other key."""
+    """Step of an arrow key, (du, dv) px; None for any other key."""
     if event.key() not in ARROWS or event.modifiers() & (CONTROL | ALT):
         return None
     size = FAR_NUDGE_PX if event.modifiers() & SHIFT else NUDGE_PX
@@ -32,10 +32,10 @@ def arrow_step(event: QKeyEvent) -> tuple[float, float] | None:
 
 
 class DragPoint(pg.TargetItem):  # type: ignore[misc]
-    """A named point to drag, or to nudge with the arrow keys."""
+    """A named point that can be dragged or moved with the arrow keys."""
 
     moved = Signal(float, float)
-    """It was dragged or nudged, or is being dragged: u, v."""
+    """The point was or is being moved by the operator: u, v, px."""
 
     def __init__(self, name: str, u: float, v: float, color: str = "#ffb000") -> None:
         self.name = name
@@ -54,11 +54,11 @@ class DragPoint(pg.TargetItem):  # type: ignore[misc]
 
     @property
     def place(self) -> tuple[float, float]:
-        """(u, v), px."""
+        """Position (u, v), px."""
         return float(self.pos().x()), float(self.pos().y())
 
     def set_place(self, u: float, v: float) -> None:
-        """Move it without a signal; ignored while it is being dragged."""
+        """Move the point without a signal; ignored while it is being dragged."""
         if self.moving:
             return
         blocked = self.blockSignals(True)
@@ -66,12 +66,12 @@ class DragPoint(pg.TargetItem):  # type: ignore[misc]
         self.blockSignals(blocked)
 
     def nudge(self, du: float, dv: float) -> None:
-        """Move it a little, as the arrow keys do; not where it cannot be dragged either."""
+        """Move the point by (du, dv) px, as the arrow keys do, unless it is fixed."""
         if not self.movable:
             return
         u, v = self.place
         self.setPos(u + du, v + dv)
 
     def show_chosen(self, chosen: bool) -> None:
-        """Show whether the arrow keys move it."""
+        """Show whether the arrow keys move the point."""
         self.setPen(pg.mkPen(self._color, width=2.5 if chosen else 1.5))

@@ -1,6 +1,6 @@
-"""A picture with what pages lay over it: zoom, pan, contrast, places in px, points to drag.
+"""View of a picture with overlays of pages: zoom, pan, contrast, read-out, points to drag.
 
-Places are (u, v) in px as everywhere: u right, v down, the first pixel's centre at (0, 0).
+Positions are (u, v) in px: u right, v down, the centre of the first pixel at (0, 0).
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ pg.setConfigOptions(imageAxisOrder="row-major", antialias=True)
 
 ZOOM_STEP = 1.25
 MOST_ZOOM_PX = 4.0
-"""No fewer pixels than this fill the view."""
+"""Smallest number of pixels across the view."""
 
 DARKEST, BRIGHTEST = 1.0, 99.7
-"""Percentiles of the levels that are drawn black and white."""
+"""Percentiles of the grey levels that are drawn black and white."""
 
 CONTRAST_STEPS = 25
 """Number of steps of the contrast slider that halve or double the range of levels."""
@@ -57,19 +57,19 @@ KEYS = (
 
 
 class Tool:
-    """What the left button does in a picture; this one leaves all to the picture, which pans."""
+    """Actions of the mouse in a picture; this base class does nothing, so that drags pan."""
 
     def click(self, u: float, v: float, modifiers: Qt.KeyboardModifier) -> None:
-        """The left button was pressed and released at a place."""
+        """Handle a click with the left button at (u, v)."""
 
     def point_out(self, u: float, v: float) -> None:
-        """The right button was clicked: choose what is there, for the menu."""
+        """Handle a click with the right button: select the object there for the menu."""
 
     def double_click(self, u: float, v: float) -> None:
-        """It was pressed twice."""
+        """Handle a double click with the left button."""
 
     def begin(self, u: float, v: float, modifiers: Qt.KeyboardModifier) -> bool:
-        """Begin a drag at a place; False leaves it to the picture."""
+        """Begin a drag at (u, v); return False to leave it to the picture."""
         return False
 
     def drag(self, u: float, v: float) -> None:
@@ -79,21 +79,21 @@ class Tool:
         """End the drag."""
 
     def takes(self, event: QKeyEvent) -> bool:
-        """Whether a key is the tool's; the others go to the picture and to the window."""
+        """Whether the tool handles a key; others go to the picture and to the window."""
         return False
 
     def key(self, event: QKeyEvent) -> None:
-        """A key that the tool takes was pressed, or repeats while it is held."""
+        """Handle a key of the tool; called repeatedly while it is held down."""
 
     def release(self) -> None:
-        """The key was released, or the picture lost the focus."""
+        """Handle the release of the key, or the loss of the focus."""
 
 
 class PictureView(Drawn):
-    """A grey picture; overlays are pyqtgraph items that `add` puts over it, in px."""
+    """A grey picture with overlays: pyqtgraph items in px, see `add`."""
 
     pointed = Signal(float, float, object)
-    """Where the pointer is and the level there: u, v, level (None outside the picture)."""
+    """Position of the pointer and the grey level there: u, v, level (None outside the picture)."""
     changed = Signal()
     """Another picture is shown, or none."""
 
@@ -102,9 +102,9 @@ class PictureView(Drawn):
         self.tool = Tool()
         """What the left button does."""
         self.points: list[DragPoint] = []
-        """The points to drag."""
+        """Points that can be dragged."""
         self.menu_actions: Sequence[QAction] = ()
-        """What the page does with what is right-clicked, above the view's own actions."""
+        """Actions of the page for the object clicked, listed above the view's actions."""
         self._image: GreyImage | None = None
         self._levels = (0.0, 1.0)
         self._fits = True
@@ -120,11 +120,11 @@ class PictureView(Drawn):
         self._item.setZValue(-100)
         self.box.addItem(self._item)
         self._place = plain_label()
-        # Or the window would grow as the pointer comes.
+        # Otherwise the window would grow when the pointer enters.
         self._place.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Preferred)
         self._empty = wrapping_label("", self.canvas)
         self._empty.setAlignment(Qt.AlignmentFlag.AlignCenter)
-        # It lies over the whole canvas, which takes the mouse.
+        # It covers the canvas, which must get the mouse events.
         self._empty.setAttribute(Qt.WidgetAttribute.WA_TransparentForMouseEvents)
         layout = QVBoxLayout(self)
         layout.setContentsMargins(1, 1, 1, 1)
@@ -141,9 +141,9 @@ class PictureView(Drawn):
     # --- the picture --------------------------------------------------------------------------
 
     def show_picture(self, grey: GreyImage | None, why_not: str = "") -> None:
-        """Show a picture, shape (rows, columns), or none and why in words.
+        """Show a picture, shape (rows, columns), or the reason why there is none.
 
-        Zoom and contrast stay where the picture is of the same size and about as bright.
+        Zoom is kept if the size is the same; contrast is kept if also the brightness is similar.
         """
         former, self._image = self._image, grey
         self.changed.emit()
@@ -161,50 +161,50 @@ class PictureView(Drawn):
         self.describe(f"{columns} by {rows} px")
         self._item.setRect(QRectF(-0.5, -0.5, columns, rows))
         if not same:
-            side = max(rows, columns)  # all of it also fits a narrow view
+            side = max(rows, columns)  # the whole picture also fits into a narrow view
             u, v = columns + side, rows + side
             self.box.setLimits(xMin=-side, xMax=u, yMin=-side, yMax=v, minXRange=MOST_ZOOM_PX)
             self.fit()
 
     @property
     def picture(self) -> GreyImage | None:
-        """What is shown."""
+        """The displayed picture."""
         return self._image
 
     def add(self, item: QGraphicsItem) -> None:
-        """Put an overlay over the picture."""
+        """Add an overlay."""
         self.box.addItem(item, ignoreBounds=True)
 
     def remove(self, item: QGraphicsItem) -> None:
-        """Take an overlay away."""
+        """Remove an overlay."""
         self.box.removeItem(item)
 
     def add_point(self, point: DragPoint) -> None:
-        """Put a point to drag over the picture."""
+        """Add a point that can be dragged."""
         self.add(point)
         self.points.append(point)
         point.moved.connect(lambda *_: self.choose_point(point))
         self.choose_point(self._current or point)
 
     def choose_point(self, point: DragPoint) -> None:
-        """Let the arrow keys move a point."""
+        """Select the point that the arrow keys move."""
         self._current = point
         for each in self.points:
             each.show_chosen(each is point)
 
     def grab_picture(self) -> QImage:
-        """Return what is seen, overlays and all."""
+        """The visible picture with its overlays."""
         picture: QImage = self.canvas.grab().toImage()
         return picture
 
     def show_levels(self) -> None:
-        """Show histogram and line profile beside the picture."""
+        """Show the histogram and line profile in a dialog."""
         from labapp.gui.views.picture_levels import LevelsDialog
 
         LevelsDialog(self, self).show()
 
     def open_menu(self, at: QPoint) -> None:
-        """Open the menu at a place of the screen."""
+        """Open the menu at a position on the screen."""
         menu = QMenu(self)
         menu.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
         menu.addActions(self.menu_actions)
@@ -219,36 +219,36 @@ class PictureView(Drawn):
         menu.popup(at)
 
     def contextMenuEvent(self, event: QContextMenuEvent) -> None:
-        """Open the menu by its key; of the mouse the canvas tells clicks from drags."""
+        """Open the menu by its key; for the mouse the canvas distinguishes clicks and drags."""
         if event.reason() == QContextMenuEvent.Reason.Keyboard:
             self.open_menu(self.mapToGlobal(self.rect().center()))
 
     # --- zoom and contrast --------------------------------------------------------------------
 
     def fit(self) -> None:
-        """Fit the picture into the view, also when the view is resized."""
+        """Fit the picture into the view, now and whenever the view is resized."""
         self._fits, self._region = True, None
         self._refit()
 
     def show_region(self, low: tuple[float, float], high: tuple[float, float]) -> None:
-        """Fit what lies between two places (u, v), px, into the view, with a margin."""
+        """Fit the region between two corners (u, v), px, into the view, with a margin."""
         (u, v), (right, down) = low, high
         self._fits, self._region = True, QRectF(u, v, right - u, down - v)
         self._refit()
 
     def zoom(self, factor: float) -> None:
-        """Zoom about the middle; more than 1 makes it larger."""
+        """Zoom about the centre; a factor above 1 enlarges."""
         self._stop_fitting()
         self.box.scaleBy((1 / factor, 1 / factor))
 
     def pan(self, right: float, down: float) -> None:
-        """Move what is seen by shares of the view."""
+        """Move the visible region by fractions of its size."""
         self._stop_fitting()
         seen = self.box.viewRect()
         self.box.translateBy(x=right * seen.width(), y=down * seen.height())
 
     def _stop_fitting(self) -> None:
-        """Stop fitting: the operator has zoomed or moved."""
+        """Stop fitting after the operator zoomed or moved the picture."""
         self._fits = False
 
     def _refit(self) -> None:
@@ -262,11 +262,11 @@ class PictureView(Drawn):
 
     @property
     def px_per_point(self) -> float:
-        """Picture px that one point of the screen covers."""
+        """Number of picture px per point of the screen."""
         return float(abs(self.box.viewPixelSize()[0]))
 
     def auto_contrast(self) -> None:
-        """Fit black and white to the picture."""
+        """Adjust the levels of black and white to the picture."""
         if self._image is not None:
             self._levels = auto_levels(self._image)
         self._contrast.setValue(0)
@@ -318,11 +318,11 @@ class PictureView(Drawn):
         self.pointed.emit(u, v, level)
 
     def take_colours(self) -> None:
-        """Take the ground from the window's."""
+        """Use a darker shade of the window's background."""
         self.canvas.setBackground(self.palette().color(QPalette.ColorRole.Window).darker(120))
 
     def event(self, event: QEvent) -> bool:
-        """Keep keys that the tool or a point takes from the window's shortcuts."""
+        """Let the tool or a point handle its keys before the window's shortcuts."""
         if event.type() == QEvent.Type.ShortcutOverride:
             assert isinstance(event, QKeyEvent)
             if self.tool.takes(event) or self._step(event) is not None:
@@ -331,7 +331,7 @@ class PictureView(Drawn):
         return super().event(event)
 
     def keyPressEvent(self, event: QKeyEvent) -> None:
-        """Give a key to the tool, to the point chosen, or to zoom and contrast."""
+        """Handle a key by the tool, by the selected point, or as zoom or contrast."""
         step, key = self._step(event), event.key()
         simple: dict[int, Callable[[], object]] = {
             Qt.Key.Key_Plus: lambda: self.zoom(ZOOM_STEP),
@@ -367,7 +367,7 @@ class PictureView(Drawn):
         super().focusOutEvent(event)
 
     def _step(self, event: QKeyEvent) -> tuple[float, float] | None:
-        """Where an arrow key leads a point; without points Shift and an arrow lead the view."""
+        """Step of an arrow key, px; without a selected point only with Shift, which pans."""
         if self._current is None and not event.modifiers() & SHIFT:
             return None
         return arrow_step(event)
@@ -379,7 +379,7 @@ class PictureView(Drawn):
 
 
 class _Box(pg.ViewBox):  # type: ignore[misc]
-    """The view's own coordinates are px; its mouse is the tool's, then the picture's."""
+    """View box with coordinates in px; mouse events go to the tool first, then to the picture."""
 
     def __init__(self, view: PictureView) -> None:
         super().__init__(lockAspect=True, invertY=True, enableMenu=False, defaultPadding=0)
@@ -421,7 +421,7 @@ class _Box(pg.ViewBox):  # type: ignore[misc]
 
 
 def auto_levels(grey: GreyImage) -> tuple[float, float]:
-    """Levels to draw black and white, by percentiles of a part of the pixels."""
+    """Levels to draw black and white: percentiles of a subset of the pixels."""
     thin = max(1, min(grey.shape) // 256)
     part = grey[::thin, ::thin]
     finite: BoolArray = np.isfinite(part)
@@ -432,7 +432,7 @@ def auto_levels(grey: GreyImage) -> tuple[float, float]:
 
 
 def level_at(grey: GreyImage | None, u: float, v: float) -> float | None:
-    """Level of the pixel at a place; None outside the picture."""
+    """Level of the pixel at (u, v); None outside the picture."""
     if grey is None or not (np.isfinite(u) and np.isfinite(v)):
         return None
     row, column = round(v), round(u)
@@ -441,6 +441,6 @@ def level_at(grey: GreyImage | None, u: float, v: float) -> float | None:
 
 
 def _alike(one: tuple[float, float], other: tuple[float, float]) -> bool:
-    """Whether two ranges of levels are near enough for a film not to flicker."""
+    """Whether two ranges of levels are so similar that keeping one avoids flicker in a film."""
     span = max(one[1] - one[0], other[1] - other[0])
     return max(abs(one[0] - other[0]), abs(one[1] - other[1])) < 0.3 * span

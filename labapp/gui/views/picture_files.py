@@ -1,4 +1,4 @@
-"""Pictures written to files at the size they have on paper: 3-D views, plots and frames."""
+"""Writing of 3-D views, plots and frames to image files with their size on paper."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ VECTORS = f"{RASTERS};;SVG (*.svg)"
 SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg")
 SVG = ".svg"
 SVG_DPI = 96
-"""What programs take a pixel of an SVG for."""
+"""Resolution, pixels per inch, that programs assume for an SVG file."""
 
 
 class PaperDialog(QDialog):
-    """Asks how wide a picture is on paper and how fine; the next time it begins with that."""
+    """Asks for the width of a picture on paper and its resolution; remembers the last values."""
 
     paper = Paper()
     folder = Path.home()
-    """Where the last picture was saved."""
+    """Folder of the last saved picture."""
 
     def __init__(self, parent: QWidget) -> None:
         super().__init__(parent)
@@ -81,22 +81,22 @@ def ask_paper(parent: QWidget, proposed: Path, kinds: str) -> tuple[Path, Paper]
 
 
 def with_suffix(path: Path, *more: str) -> Path:
-    """Return the path, with .png where it has no ending of a picture."""
+    """The path, with .png added if it has no suffix of a picture format."""
     known = path.suffix.lower() in (*SUFFIXES, *more)
     return path if known else path.with_name(f"{path.name}.png")
 
 
 def write_image(path: Path, image: QImage, dpi: float) -> bool:
-    """Write an image that says how large it is on paper; returns whether that worked."""
+    """Write an image with its resolution; return whether that succeeded."""
     per_m = round(dpi / MM_AN_INCH * 1000)
     image.setDotsPerMeterX(per_m)
     image.setDotsPerMeterY(per_m)
-    # Of PNG this is how small, of JPEG how good.
+    # PNG: 0 is the strongest compression; JPEG: 95 is a high image quality.
     return image.save(str(path), quality=95 if path.suffix.lower().startswith(".jp") else 0)
 
 
 def write_plot(path: Path, drawn: QWidget, canvas: QGraphicsView, paper: Paper) -> bool:
-    """Write what a plot shows, dark on light: SVG, or pixels; returns whether that worked."""
+    """Write a plot, dark on light, as SVG or pixels; return whether that succeeded."""
     with _light(drawn):
         if path.suffix.lower() == SVG:
             return _write_svg(path, canvas, paper)
@@ -111,7 +111,7 @@ def _paint(device: Any, canvas: QGraphicsView) -> None:
     with QPainter(device) as painter:
         painter.setRenderHint(QPainter.RenderHint.Antialiasing)
         marks = [item for item in canvas.scene().items() if hasattr(item, "setExportMode")]
-        for item in marks:  # or marks would be small pictures, as on the screen
+        for item in marks:  # otherwise marks would be bitmaps at screen resolution
             item.setExportMode(True, {"painter": painter, "resolutionScale": 1.0})
         try:
             canvas.render(painter, QRectF(painter.viewport()), canvas.viewport().rect())
@@ -136,7 +136,7 @@ def _write_svg(path: Path, canvas: QGraphicsView, paper: Paper) -> bool:
 
 @contextmanager
 def _light(drawn: QWidget) -> Iterator[None]:
-    """Give a widget the light colours."""
+    """Use the light colours for a widget within the context."""
     drawn.setPalette(palette(False))
     try:
         yield
@@ -145,7 +145,7 @@ def _light(drawn: QWidget) -> Iterator[None]:
 
 
 def save_picture(drawn: QWidget, image: QImage) -> None:
-    """Ask for a file and write a picture to it as it is seen."""
+    """Ask for a file and write a picture to it as displayed."""
     proposed = PaperDialog.folder / "picture.png"
     if path := ask_save(drawn, "Save picture", proposed, RASTERS):
         PaperDialog.folder, path = path.parent, with_suffix(path)
@@ -163,7 +163,7 @@ def _report(path: Path, written: bool, drawn: QWidget) -> None:
 
 
 def save_plot(drawn: QWidget, canvas: QGraphicsView, name: str) -> Callable[[], None]:
-    """Return what asks for a file and writes a plot to it."""
+    """A function that asks for a file and writes a plot to it."""
 
     def save() -> None:
         if answer := ask_paper(drawn, PaperDialog.folder / f"{name}.png", VECTORS):

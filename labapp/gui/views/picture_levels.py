@@ -1,4 +1,4 @@
-"""The levels of a picture: their histogram, and a profile along a line dragged over it."""
+"""Grey levels of a picture: histogram, and profile along a line that can be dragged."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ BINS = 128
 
 
 def profile(grey: GreyImage, ends_px: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the levels along a line, interpolated linearly, every px.
+    """Levels along a line, interpolated linearly, at intervals of 1 px.
 
     Parameters
     ----------
     ends_px
-        Its ends (u, v), shape (2, 2).
+        Ends (u, v) of the line, shape (2, 2).
 
     Returns
     -------
     tuple of arrays
-        Places from the first end, px, and levels; NaN outside the picture.
+        Distances from the first end, px, and levels; NaN outside the picture.
     """
     length = float(np.hypot(*(ends_px[1] - ends_px[0])))
     along = np.linspace(0.0, length, max(2, round(length) + 1))
@@ -41,25 +41,25 @@ def profile(grey: GreyImage, ends_px: FloatArray) -> tuple[FloatArray, FloatArra
 
 
 class Shown(Protocol):
-    """What shows a picture and what lies over it: a `picture.PictureView`."""
+    """View of a picture with overlays: a `picture.PictureView`."""
 
     @property
     def picture(self) -> GreyImage | None:
-        """The picture; None where there is none."""
+        """The picture; None if there is none."""
 
     @property
     def changed(self) -> SignalInstance:
         """Emitted when another picture is shown."""
 
     def add(self, item: QGraphicsItem) -> None:
-        """Put something over the picture."""
+        """Add an overlay."""
 
     def remove(self, item: QGraphicsItem) -> None:
-        """Take it away."""
+        """Remove an overlay."""
 
 
 class LevelsDialog(QDialog):
-    """Follows a picture while it is open."""
+    """Histogram and line profile of a picture, updated with it."""
 
     def __init__(self, view: Shown, parent: QWidget) -> None:
         super().__init__(parent)
@@ -88,7 +88,7 @@ class LevelsDialog(QDialog):
         self.show_levels()
 
     def show_levels(self) -> None:
-        """Show histogram and profile of the picture as it is now."""
+        """Show histogram and profile of the current picture."""
         grey = self._view.picture
         if grey is None:
             self._counts.setData([0, 1], [0])

@@ -1,6 +1,6 @@
-"""Curves over a common axis, one plot under the other: zoom, read-out, points to go to, copies.
+"""Plots of curves below each other over a common axis: zoom, read-out, selection, copies.
 
-The wheel and dragging work along the common axis; what goes up always fits what is seen.
+The wheel and dragging act along the common axis; the vertical axes always fit the visible part.
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ from labapp.gui.widgets.layouts import fill, scrolled
 pg.setConfigOptions(imageAxisOrder="row-major", antialias=True)
 
 MOST_POINTS = 1500
-"""Where more are in view, they are drawn as a line, and only special ones keep their mark."""
+"""If more points are visible, only the line and points with a special mark are drawn."""
 
 NEAR = 18.0
-"""A click this near to a point, in screen pixels, means it."""
+"""Largest distance, screen pixels, of a click from a point to select it."""
 
 AXIS_WIDTH = 60
 TITLE_HEIGHT = 18
 NUMBER_LINES = 1.3
-"""Height of a number at an axis, in lines of its font."""
+"""Height of a number at an axis, as a multiple of the line height of its font."""
 
 LEAST_HEIGHT = 76
-"""A plot is no lower than this; where they do not fit, they scroll."""
+"""Minimum height of a plot; plots that do not fit can be scrolled."""
 
 SYMBOLS = {"●": "o", "○": "o", "■": "s", "▪": "s", "×": "x"}
 KEYS = "← → step through the points, Home End to the first and last, + − zoom, F shows all"
@@ -52,10 +52,10 @@ Role = QPalette.ColorRole
 
 
 class PlotStack(Plotted):
-    """Plots under each other."""
+    """Plots below each other."""
 
     chosen = Signal(int)
-    """The operator chose a point, with the pointer or the keys: its key."""
+    """The operator selected a point with the pointer or the keys: its key."""
 
     def __init__(self, name: str = "Plots") -> None:
         super().__init__(name, KEYS)
@@ -94,7 +94,7 @@ class PlotStack(Plotted):
     # --- what it shows ------------------------------------------------------------------------
 
     def show_curves(self, curves: Sequence[Curve], axis: Axis) -> None:
-        """Show curves, each in a plot of its own; the part in view stays if they are the same."""
+        """Show each curve in a separate plot; keep the visible range for the same curves."""
         titles = [curve.title for curve in curves]
         same = titles == [curve.title for curve in self.curves] and axis == self.axis
         self.curves, self.axis = tuple(curves), axis
@@ -108,10 +108,10 @@ class PlotStack(Plotted):
         if not (same and self._current is None and self._place is None):
             self.set_current(
                 self._current, self._place
-            )  # else the value under the pointer stays shown
+            )  # otherwise the value under the pointer stays visible
 
     def set_current(self, key: int | None, place: float | None = None) -> None:
-        """Mark the point with a key in every plot, or a place where no curve has it."""
+        """Mark the point with a key in every plot, or a position if no curve has the key."""
         self._current, self._place = key, place
         found = [(curve, _index_of(curve, key)) for curve in self.curves]
         points = [(curve, index) for curve, index in found if index is not None]
@@ -124,7 +124,7 @@ class PlotStack(Plotted):
         )
 
     def fit(self) -> None:
-        """Show all of the axis."""
+        """Show the whole axis."""
         ends = [(float(c.x[0]), float(c.x[-1])) for c in self.curves if len(c.x)]
         ends += [self.axis.span] if self.axis.span else []
         if ends and self._plots:
@@ -133,30 +133,30 @@ class PlotStack(Plotted):
             self._plots[0].setXRange(low - room, high + room, padding=0)
 
     def zoom(self, factor: float) -> None:
-        """Zoom about the middle of the axis; more than 1 shows less of it."""
+        """Zoom about the centre of the axis; a factor above 1 enlarges."""
         if self._plots:
             self._plots[0].getViewBox().scaleBy(x=1 / factor)
 
     # --- copies -------------------------------------------------------------------------------
 
     def grab_picture(self) -> QImage:
-        """Return what is seen."""
+        """The visible plots as an image."""
         picture: QImage = self.canvas.grab().toImage()
         return picture
 
     def copy_picture(self) -> None:
-        """Put what is seen on the clipboard."""
+        """Copy the visible plots to the clipboard."""
         QGuiApplication.clipboard().setImage(self.grab_picture())
 
     def copy_table(self) -> None:
-        """Put the points of all curves on the clipboard, in tabs."""
+        """Copy the points of all curves to the clipboard, tab-separated."""
         QGuiApplication.clipboard().setText(as_table(self.curves, self.axis))
 
     # --- within -------------------------------------------------------------------------------
 
     def _lay_out(self) -> None:
         for plot in self._plots:
-            plot.hide()  # one that is only taken out may still be drawn
+            plot.hide()  # a plot that is only removed may still be drawn
         self.canvas.clear()
         self._plots = []
         for row in range(len(self.curves)):
@@ -172,7 +172,7 @@ class PlotStack(Plotted):
         self.take_colours()
 
     def take_colours(self) -> None:
-        """Draw in the window's colours."""
+        """Draw in the colours of the theme."""
         look = self.palette()
         self.canvas.setBackground(look.color(Role.Base))
         for plot, curve in zip(self._plots, self.curves, strict=True):
@@ -190,7 +190,7 @@ class PlotStack(Plotted):
 
     def _show_read_out(self, words: str) -> None:
         self.read_out.setText(words or " ")
-        # It grows where a line wraps, and does not shrink: what is above must not jump.
+        # It grows if a line wraps and never shrinks, so that the plots above do not jump.
         height = self.read_out.heightForWidth(self.read_out.width())
         self.read_out.setFixedHeight(max(self.read_out.minimumHeight(), height))
         self.read_out.setToolTip(plain_tip(words))
@@ -253,7 +253,7 @@ class PlotStack(Plotted):
 
 
 class _Plot(pg.PlotItem):  # type: ignore[misc]
-    """One curve with its axis: line, bars, points, level, and two upright lines."""
+    """One curve with its axes: line, error bars, points, level, and two vertical lines."""
 
     def __init__(self, over: _Plot | None) -> None:
         super().__init__(axisItems=plain_axes())
@@ -268,11 +268,11 @@ class _Plot(pg.PlotItem):  # type: ignore[misc]
         if over is not None:
             self.setXLink(over)
         for side in ("left", "bottom"):
-            # Its grid is half of what drawing costs, and stepping moves only the upright line.
+            # The grid takes half of the drawing time, and stepping moves only the vertical line.
             self.getAxis(side).setCacheMode(QGraphicsItem.CacheMode.DeviceCoordinateCache)
         self.getAxis("left").setWidth(AXIS_WIDTH)
         box.sigResized.connect(lambda *_: self._thin_out())
-        # Above the plot: beside a low one its name would be cut off.
+        # Above the plot: beside a low plot the name would be cut off.
         self.titleLabel.setVisible(True)
         self.titleLabel.setMaximumHeight(TITLE_HEIGHT)
         self.layout.setRowFixedHeight(0, TITLE_HEIGHT)
@@ -296,7 +296,7 @@ class _Plot(pg.PlotItem):  # type: ignore[misc]
         box.sigXRangeChanged.connect(lambda *_: self._show_points())
 
     def apply_palette(self, curve: Curve, look: QPalette) -> None:
-        """Take a palette's colours and a curve's title: an axis is redrawn, which is expensive."""
+        """Use a palette's colours and a curve's title; this redraws the axes, which is slow."""
         self._look = look
         accent, text = look.color(Role.Accent), look.color(Role.Text)
         paint_axes(self, look.color(Role.Mid), text)
@@ -316,7 +316,7 @@ class _Plot(pg.PlotItem):  # type: ignore[misc]
             self.getViewBox().setLimits(yMin=0)
 
     def _thin_out(self) -> None:
-        """Have no more numbers upwards than there is room for; the axis itself knows no font."""
+        """Limit the numbers at the vertical axis to the available height and font size."""
         height = max(self.getViewBox().height(), 1.0)
         room = height / (NUMBER_LINES * QFontMetricsF(QGuiApplication.font()).height())
         self.getAxis("left").setTickDensity(min(1.0, room / max(math.log(height), 2.0)))
@@ -344,19 +344,19 @@ class _Plot(pg.PlotItem):  # type: ignore[misc]
             self.addItem(line, ignoreBounds=True)
 
     def mark_place(self, x: float | None) -> None:
-        """Draw an upright line at a place, or none."""
+        """Draw a vertical line at a position, or none."""
         self.current.setVisible(x is not None)
         if x is not None:
             self.current.setValue(x)
 
     def show_cross(self, x: float | None) -> None:
-        """Draw the pointer's upright line, or none."""
+        """Draw the vertical line of the pointer, or none."""
         self.cross.setVisible(x is not None)
         if x is not None:
             self.cross.setValue(x)
 
     def _show_points(self) -> None:
-        """Draw points and bars in view, as far as they can be distinguished."""
+        """Draw the visible points and error bars, unless there are too many to distinguish."""
         curve = self._curve
         if curve is None or not len(curve.key):
             self.points.clear()
@@ -417,7 +417,7 @@ def _index_of(curve: Curve, key: int | None) -> int | None:
 
 
 def _joined(texts: Sequence[str]) -> str:
-    """Points of one frame in one sentence: where it is only once."""
+    """Texts of the points of one frame, joined so that their position appears only once."""
     if not texts:
         return ""
     where = texts[0].partition(": ")[0]

@@ -1,4 +1,4 @@
-"""A field for a range: the least and the most of a quantity beside each other."""
+"""A field for a range: minimum and maximum of a quantity side by side."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from labapp.gui.widgets.layouts import hbox
 
 
 class RangeField(Field):
-    """Two numbers with one unit; ``edited`` gives both."""
+    """Two numbers with one unit; ``edited`` carries both."""
 
     def __init__(
         self,
@@ -35,23 +35,23 @@ class RangeField(Field):
         pair = QWidget()
         hbox((self.least, 1), (self.most, 1), of=pair)
         for field in (self.least, self.most):
-            field.unit.hide()  # said once, after both
+            field.unit.hide()  # shown once, after both
             field.edited.connect(self._emit_change)
         super().__init__(label, pair, tooltip, unit)
         pair.setFocusProxy(self.least)
 
     def value(self) -> tuple[float, float]:
-        """Least and most."""
+        """Minimum and maximum."""
         return self.least.value() or 0.0, self.most.value() or 0.0
 
     def set_value(self, ends: tuple[float, float]) -> None:
-        """Show another range; emits no signal."""
+        """Show another range without a signal."""
         self.least.set_value(ends[0])
         self.most.set_value(ends[1])
         self._judge()
 
     def flush(self) -> None:
-        """Finish an edit under way, as leaving the field does."""
+        """Finish an edit in progress, as when the field loses the focus."""
         self.least.flush()
         self.most.flush()
 

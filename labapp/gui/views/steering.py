@@ -1,4 +1,4 @@
-"""A 3-D controller turns, moves and zooms the 3-D view that is seen."""
+"""Turning, moving and zooming of the visible 3-D view with a 3-D controller."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from labapp.media.events import Event
 TICK_MS = 33
 
 LONGEST_S = 0.1
-"""A view that is slow to draw is turned as if so much time had passed, at most."""
+"""Longest time step, s, so that a slowly drawn view does not jump."""
 
 TURN_DEG_S, MOVE_S, ZOOM_S = 120.0, 0.8, 1.5
-"""At the stop: degrees a second; heights of the view a second; e-folds a second."""
+"""At full deflection: degrees, heights of the view, and factors of e per second."""
 
 DEAD = 0.04
-"""A controller at rest may still report so much."""
+"""Dead zone: largest deflection that a controller may report at rest."""
 
 OBLIQUE = 0
-"""The button that looks obliquely again."""
+"""Button that restores the oblique view."""
 
 
 class Steering(QObject):
-    """Reads the controller while `start` has been called and `stop` has not."""
+    """Reads the controller between the calls of `start` and `stop`."""
 
     def __init__(
         self, view: Callable[[], View3d], say: Callable[[str], object], parent: QObject
@@ -39,7 +39,7 @@ class Steering(QObject):
         self._view, self._say = view, say
         self._told: set[str] = set()
         self._mouse: SpaceMouse | None = None
-        # Filled in the controller's thread, which holds nothing of Qt.
+        # Filled in the controller's thread, which uses no Qt object.
         self._held: deque[SixAxes] = deque([SixAxes()], maxlen=1)
         self._events: queue.SimpleQueue[Event] = queue.SimpleQueue()
         self._ticked_s = 0.0
@@ -47,14 +47,14 @@ class Steering(QObject):
         self._timer.timeout.connect(self._tick)
 
     def start(self) -> None:
-        """Steer from now on, whenever a controller is plugged in."""
+        """Start steering; a controller may be plugged in at any time."""
         if self._mouse is None:
             self._held.append(SixAxes())
             self._mouse = SpaceMouse(self._held.append, self._events.put)
             self._timer.start()
 
     def stop(self) -> None:
-        """Steer no more. Twice does no harm."""
+        """Stop steering; may be called twice."""
         self._timer.stop()
         if self._mouse is not None:
             self._mouse.stop()
@@ -72,9 +72,9 @@ class Steering(QObject):
 
 
 def steer(view: View3d, held: SixAxes, seconds: float) -> None:
-    """Turn, move and zoom a view as long as a controller has been held so.
+    """Turn, move and zoom a view by the deflections of a controller during some seconds.
 
-    What is seen follows the hand: pushed to the right it goes there, pulled it comes nearer,
+    The scene follows the hand: pushed to the right it moves to the right, pulled it comes nearer,
     turned it turns.
     """
     if OBLIQUE in held.buttons:
@@ -94,5 +94,5 @@ def steer(view: View3d, held: SixAxes, seconds: float) -> None:
 
 
 def _beyond(value: float) -> float:
-    """Value of an axis beyond the dead zone."""
+    """Deflection of an axis beyond the dead zone, scaled to −1 … 1."""
     return math.copysign(max(0.0, abs(value) - DEAD) / (1 - DEAD), value)

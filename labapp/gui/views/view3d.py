@@ -1,4 +1,4 @@
-"""The 3-D view: a scene that can be turned, and read off."""
+"""The 3-D view: a scene that can be turned, with read-out of surface points."""
 
 from __future__ import annotations
 
@@ -39,15 +39,15 @@ LOOKS: dict[Direction, tuple[str, str]] = {
 """Text and tooltip of the buttons for the directions of view."""
 
 TURN_DEG = 10.0
-"""An arrow key turns the scene so far."""
+"""Rotation by an arrow key."""
 
 ZOOM = 1.15
-"""So much nearer or farther at a step of the wheel, or + and −."""
+"""Zoom factor of a step of the wheel, + or −."""
 
 DEGREES_A_PIXEL = 0.4
 
 ZOOM_PX = 12.0
-"""The right button zooms by `ZOOM` for so much of a way."""
+"""Distance of a drag with the right button that zooms by `ZOOM`."""
 
 KEYS: dict[Qt.Key, Direction] = {
     Qt.Key.Key_1: "top",
@@ -73,17 +73,17 @@ NOTHING_HERE = "The 3-D view needs OpenGL, which is missing here. All figures ar
 
 
 class View3d(Drawn):
-    """A scene to look at from all sides; make it with `view3d_kinds.make_view3d`.
+    """A scene that can be viewed from all sides; create it with `view3d_kinds.make_view3d`.
 
     The left button turns it, the middle one, or Shift, moves it, the right one and the wheel zoom.
-    A click reads a point off, a click with the right button opens the menu, which has actions of
-    the page, too.
+    A click reads off a point; a click with the right button opens the menu, which also contains
+    actions of the page.
     """
 
     camera_changed = Signal(object)
     """The direction of view changed: its `Camera`."""
     pointed = Signal(str)
-    """The point of the surface that the pointer is on, in words; empty where it is on none."""
+    """Text of the surface point at the pointer; empty if there is none."""
 
     def __init__(self, name: str = "3-D view") -> None:
         super().__init__(name, KEYS_TOLD)
@@ -94,12 +94,12 @@ class View3d(Drawn):
         self._wanted: Camera | Direction | None = None
         self._fits = True
         self._fitted_px: tuple[int, ...] = ()
-        """Whether all is in view, not turned or zoomed by hand; and the size for which it was."""
+        """Whether the scene is fitted to the view, and the last size of the view."""
         self._side: Direction = "free"
         self._at = self._pressed = QPointF()
         self._point_mm: tuple[float, float] | None = None
         self.sigma_at: Callable[[float, float], float] | None = None
-        """Standard uncertainty of the height at (x, y), mm; None where there is none."""
+        """Standard uncertainty of the height at (x, y), mm; None if unknown."""
         self.setMouseTracking(True)
         self._add_actions()
         self.follow_theme()
@@ -123,11 +123,11 @@ class View3d(Drawn):
 
     @property
     def scene(self) -> Scene | None:
-        """What is shown."""
+        """The displayed scene."""
         return self._scene
 
     def show_scene(self, scene: Scene | None) -> None:
-        """Show a scene in the colours of the window; None shows nothing."""
+        """Show a scene in the colours of the theme; None: show nothing."""
         if scene is not None:
             palette = self.palette()
             scene = replace(
@@ -140,13 +140,13 @@ class View3d(Drawn):
         self._refresh()
 
     def set_words(self, words: str) -> None:
-        """Set the text that is shown without a scene, and its description with one."""
+        """Set the text that is shown without a scene and describes a scene."""
         self._words = words
         self.describe(words)
         self.update()
 
     def look(self, direction: Direction) -> None:
-        """Look from the top, the side, the front, or obliquely (``free``)."""
+        """View the scene from the top, the side, the front, or obliquely (``free``)."""
         self._wanted = self._side = direction
         if self._drawing is not None:
             self._drawing.look(direction)
@@ -154,7 +154,7 @@ class View3d(Drawn):
         self._fits = True
 
     def _refit(self) -> None:
-        """Bring all into view again in a window of another size, unless it was moved by hand."""
+        """Fit the scene to a new size of the view, unless the operator moved it."""
         assert self._drawing is not None
         size = tuple(self._drawing.plotter.window_size)
         if self._fits and size != self._fitted_px:
@@ -162,16 +162,16 @@ class View3d(Drawn):
         self._fitted_px = size
 
     def fit(self) -> None:
-        """Look at all of it from the side that was chosen last."""
+        """Show the whole scene from the last chosen direction."""
         self.look(self._side)
 
     @property
     def camera(self) -> Camera | None:
-        """Where it is looked at from; None before anything was drawn."""
+        """Current camera; None before the first drawing."""
         return None if self._drawing is None else self._drawing.camera
 
     def set_camera(self, camera: Camera) -> None:
-        """Take over another view's camera; emits no signal."""
+        """Use the camera of another view without a signal."""
         self._fits = False
         if self._drawing is None:
             self._wanted = camera
@@ -180,19 +180,19 @@ class View3d(Drawn):
             self._refresh()
 
     def picture(self) -> npt.NDArray[np.uint8] | None:
-        """What is seen, shape (height, width, 3), R, G, B; None where nothing is."""
+        """The visible picture, shape (height, width, 3), R, G, B; None if there is none."""
         if self._drawing is None or self._scene is None:
             return None
         self._drawing.plotter.render()
         return np.ascontiguousarray(self._drawing.plotter.screenshot(return_img=True))
 
     def image(self) -> QImage | None:
-        """What is seen, for the clipboard or a file."""
+        """The visible picture for the clipboard or a file."""
         picture = self.picture()
         return None if picture is None else as_image(picture)
 
     def copy_picture(self) -> None:
-        """Put what is seen on the clipboard."""
+        """Copy the visible picture to the clipboard."""
         image = self.image()
         if image is not None:
             QGuiApplication.clipboard().setImage(image)
@@ -206,14 +206,14 @@ class View3d(Drawn):
     # --- points that are read off --------------------------------------------------------------
 
     def surface_point(self, at: QPointF) -> FloatArray | None:
-        """Return the point of the surface that is seen at a place of the view, shape (3,), mm."""
+        """Surface point visible at a position in the view, shape (3,), mm, or None."""
         if self._scene is None or self._drawing is None:
             return None
         across, up = 2 * at.x() / max(self.width(), 1) - 1, 1 - 2 * at.y() / max(self.height(), 1)
         return seen_point(self._scene, view_matrix(self._drawing.plotter.renderer), across, up)
 
     def point_words(self, point_mm: FloatArray) -> str:
-        """Return a point of the surface in words, with the ± of its height where that is known."""
+        """Text of a surface point, with the ± of its height if known."""
         x, y, z = point_mm.tolist()
         sigma = np.nan if self.sigma_at is None else self.sigma_at(x, y)
         more = f" ± {sigma:.4f}" if np.isfinite(sigma) else ""
@@ -221,11 +221,11 @@ class View3d(Drawn):
 
     @property
     def read_off(self) -> str:
-        """The point that was read off, in words; empty without one."""
+        """Text of the point that was read off; empty if there is none."""
         return "" if self._scene is None else self._scene.mark_words.replace("\n", " ")
 
     def read_point(self, at: QPointF) -> None:
-        """Read off the point at a place of the view; beside the surface the mark is taken away."""
+        """Read off the point at a position in the view; off the surface, remove the mark."""
         point = self.surface_point(at)
         self._point_mm = None if point is None else (float(point[0]), float(point[1]))
         self._mark()
@@ -238,12 +238,12 @@ class View3d(Drawn):
         self._refresh()
 
     def copy_point(self) -> None:
-        """Put the point that was read off on the clipboard."""
+        """Copy the point that was read off to the clipboard."""
         if self.read_off:
             QGuiApplication.clipboard().setText(self.read_off)
 
     def _mark(self) -> None:
-        """Mark the point that was read off; at the same X and Y on another frame's surface."""
+        """Mark the point that was read off, at the same X and Y on the surface of another frame."""
         scene, words, mark = self._scene, "", np.empty((0, 3))
         if scene is None:
             return
@@ -268,11 +268,11 @@ class View3d(Drawn):
         raise NotImplementedError
 
     def _refresh(self) -> None:
-        """Have what changed be seen, soon."""
+        """Schedule a redraw."""
         raise NotImplementedError
 
     def _draw(self) -> bool:
-        """Bring the drawing up to the scene; False if there is nothing to see."""
+        """Update the drawing to the scene; return False if there is nothing to show."""
         if self._scene is None or not can_draw():
             return False
         if self._drawing is None:
@@ -296,7 +296,7 @@ class View3d(Drawn):
         self.camera_changed.emit(self.camera)
 
     def turn(self, azimuth_deg: float, elevation_deg: float, roll_deg: float = 0.0) -> None:
-        """Turn the scene to the right, down, and against the clock."""
+        """Turn the scene to the right, down, and anticlockwise."""
         if self._drawing is not None:
             camera = self._drawing.plotter.camera
             camera.Azimuth(-azimuth_deg)
@@ -307,13 +307,13 @@ class View3d(Drawn):
             self._turned()
 
     def zoom(self, factor: float) -> None:
-        """Come nearer, or with a factor below 1 go farther."""
+        """Zoom by a factor; above 1 enlarges."""
         if self._drawing is not None:
             self._drawing.plotter.camera.Zoom(factor)
             self._turned()
 
     def move_scene(self, way: QPointF) -> None:
-        """Move the scene to the right and down, by pixels of the layout."""
+        """Move the scene to the right and down, by logical pixels."""
         if self._drawing is None:
             return
         camera = self._drawing.plotter.camera
@@ -329,7 +329,7 @@ class View3d(Drawn):
         self._turned()
 
     def event(self, event: QEvent) -> bool:
-        """Take the view's keys before the window's actions do."""
+        """Handle the view's keys before the window's actions."""
         if event.type() == QEvent.Type.ShortcutOverride:
             assert isinstance(event, QKeyEvent)
             if event.key() in TURNS or event.key() in KEYS:
@@ -337,11 +337,11 @@ class View3d(Drawn):
         return super().event(event)
 
     def mousePressEvent(self, event: QMouseEvent) -> None:
-        """Begin to turn, to move or to zoom."""
+        """Begin to turn, move or zoom."""
         self._at = self._pressed = event.position()
 
     def mouseMoveEvent(self, event: QMouseEvent) -> None:
-        """Turn, move or zoom; without a button show what the pointer is on."""
+        """Turn, move or zoom; without a button show the surface point at the pointer."""
         way, self._at = event.position() - self._at, event.position()
         buttons, shift = event.buttons(), event.modifiers() & Qt.KeyboardModifier.ShiftModifier
         if not buttons:
@@ -355,7 +355,7 @@ class View3d(Drawn):
             self.zoom(ZOOM ** (-way.y() / ZOOM_PX))
 
     def mouseReleaseEvent(self, event: QMouseEvent) -> None:
-        """Read a point off, or open the menu, where the mouse was not moved."""
+        """Read off a point or open the menu if the mouse was not moved."""
         if not self._is_click(event):
             return
         if event.button() == Qt.MouseButton.LeftButton:
@@ -373,7 +373,7 @@ class View3d(Drawn):
             self.open_menu(self.mapToGlobal(self.rect().center()))
 
     def open_menu(self, at: QPoint) -> None:
-        """Open the menu of all that can be done with the view."""
+        """Open the menu with all actions of the view."""
         menu = QMenu(self)
         menu.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose)
         menu.setToolTipsVisible(True)
@@ -390,12 +390,12 @@ class View3d(Drawn):
         self.pointed.emit(words)
 
     def leaveEvent(self, event: QEvent) -> None:
-        """Show no point any more."""
+        """Hide the text of the point."""
         self._show_pointed("")
         super().leaveEvent(event)
 
     def keyPressEvent(self, event: QKeyEvent) -> None:
-        """Turn, zoom, or look from one of four sides."""
+        """Turn, zoom, or view from one of four directions."""
         key = Qt.Key(event.key())
         if key in TURNS:
             self.turn(*TURNS[key])
@@ -409,7 +409,7 @@ class View3d(Drawn):
             super().keyPressEvent(event)
 
     def take_colours(self) -> None:
-        """Draw in the window's colours."""
+        """Draw in the colours of the theme."""
         if self._scene is not None:
             self.show_scene(self._scene)
 
@@ -420,7 +420,7 @@ class View3d(Drawn):
 
 
 def as_image(picture: npt.NDArray[np.uint8]) -> QImage:
-    """A picture, shape (height, width, 3), R, G, B, as Qt has it; it keeps no hold of the array."""
+    """Convert a picture, shape (height, width, 3), R, G, B, to a QImage; copies the array."""
     height, width, _ = picture.shape
     whole = np.ascontiguousarray(picture)
     return QImage(whole.data, width, height, 3 * width, QImage.Format.Format_RGB888).copy()

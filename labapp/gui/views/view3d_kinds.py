@@ -1,8 +1,9 @@
-"""What the 3-D view is drawn with: the window's own OpenGL, or off-screen.
+"""Kinds of 3-D views: drawn with the window's OpenGL, or off-screen.
 
-Where Qt has no OpenGL for VTK (no display, or Wayland) the scene is drawn off-screen and shown as
-a picture. So it is where the processor draws: a window with OpenGL in it is composed as a whole for
-every picture, which costs more than the scene does. Where nothing can be drawn, words say so.
+If Qt has no OpenGL for VTK (no display, or Wayland), the scene is drawn off-screen and shown as a
+picture. The same applies to rendering without a graphics card: a window that contains OpenGL is
+composed as a whole for every picture, which takes longer than drawing the scene. If drawing is
+impossible, a text says so.
 """
 
 from __future__ import annotations
@@ -33,17 +34,17 @@ from labapp.gui.views.view3d import NOTHING_HERE, ZOOM, View3d, as_image
 GL_RENDERER = 0x1F01
 
 SHARED = ("xcb", "windows", "cocoa")
-"""Qt's desktops whose OpenGL it shares with VTK."""
+"""Qt platforms on which VTK can use Qt's OpenGL."""
 
 ON_THE_PROCESSOR = (
     *("llvmpipe", "softpipe", "software", "swiftshader", "swrast"),
     *("gdi generic", "basic render"),
 )
-"""Parts of the names of what draws OpenGL without a graphics card."""
+"""Parts of the names of OpenGL renderers that use no graphics card."""
 
 
 class OffscreenView(View3d):
-    """Draws off-screen when it is painted, and shows the picture."""
+    """Draws the scene off-screen when it is painted, and shows the picture."""
 
     def __init__(self, name: str = "3-D view") -> None:
         super().__init__(name)
@@ -51,7 +52,7 @@ class OffscreenView(View3d):
         self._pointed_at = ""
 
     def _new_plotter(self) -> Any:
-        # Not `pyvista.Plotter`: it is not waited for while another thread loads it.
+        # Not `pyvista.Plotter`, which may be incomplete while another thread imports it.
         from pyvista.plotting import Plotter
 
         plotter: Any = Plotter(off_screen=True, window_size=list(self._pixels()))
@@ -113,7 +114,7 @@ class OffscreenView(View3d):
 
 
 class InteractiveView(View3d):
-    """Holds a `pyvistaqt.QtInteractor`, made when the view is first shown."""
+    """Contains a `pyvistaqt.QtInteractor`, created when the view is first shown."""
 
     def __init__(self, name: str = "3-D view") -> None:
         super().__init__(name)
@@ -128,7 +129,7 @@ class InteractiveView(View3d):
         plotter: Any = QtInteractor(
             self, auto_update=False, multi_samples=1, line_smoothing=False, point_smoothing=False
         )
-        # Keys are this view's: VTK's own would end the program with q.
+        # This view handles the keys: with VTK's bindings q would end the program.
         plotter.setFocusPolicy(Qt.FocusPolicy.NoFocus)
         plotter.render_window.SetDPI(round(USUAL_DPI * self.devicePixelRatioF()))
         plotter.disable_anti_aliasing()
@@ -142,7 +143,7 @@ class InteractiveView(View3d):
         return plotter
 
     def eventFilter(self, watched: QObject, event: QEvent) -> bool:
-        """Read points off and open the menu; VTK turns, moves and zooms by itself."""
+        """Read off points and open the menu; VTK itself turns, moves and zooms."""
         if event.type() == QEvent.Type.Resize:
             self._refresh()  # when it has its new size
         if isinstance(event, QMouseEvent) and self._drawing is not None:
@@ -165,7 +166,7 @@ class InteractiveView(View3d):
         self.camera_changed.emit(self.camera)
 
     def _refresh(self) -> None:
-        # Several changes of one event are one picture.
+        # Several changes during one event need only one picture.
         self._late.start()
 
     def _render(self) -> None:
@@ -175,12 +176,12 @@ class InteractiveView(View3d):
             assert self._drawing is not None
             self._drawing.plotter.setVisible(True)
             self._refit()
-            QWidget.update(self._drawing.plotter)  # which renders, once
+            QWidget.update(self._drawing.plotter)  # which renders once
         elif self._drawing is not None:
             self._drawing.plotter.setVisible(False)
 
     def showEvent(self, event: QShowEvent) -> None:
-        """Draw what there is by now."""
+        """Draw the current scene."""
         super().showEvent(event)
         self._refresh()
 
@@ -202,20 +203,20 @@ class InteractiveView(View3d):
 
 
 def make_view3d(name: str = "3-D view") -> View3d:
-    """A view in the window's own OpenGL where a card draws it for Qt and VTK, else of pictures."""
+    """View with the window's OpenGL if a graphics card draws for Qt and VTK, else off-screen."""
     if QGuiApplication.platformName() in SHARED and has_card(_renderer()):
         return InteractiveView(name)
     return OffscreenView(name)
 
 
 def has_card(renderer: str) -> bool:
-    """Whether a graphics card draws, by OpenGL's name of what does; empty for nothing."""
+    """Whether the OpenGL renderer of this name (empty: none) is a graphics card."""
     return bool(renderer) and not any(part in renderer.lower() for part in ON_THE_PROCESSOR)
 
 
 @functools.cache
 def _renderer() -> str:
-    """What draws OpenGL for Qt; empty without."""
+    """Name of Qt's OpenGL renderer; empty if there is none."""
     context, surface = QOpenGLContext(), QOffscreenSurface()
     surface.create()
     if not (context.create() and context.makeCurrent(surface)):

@@ -1,4 +1,4 @@
-"""The pictures in the bench check's list, and the mirrors that they show."""
+"""Pictures in the list of the bench check, and the mirrors that they show."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from labapp.session.record import MirrorPicture
 from labapp.session.session import Session
 
 KINDS = (("plate", "Flat plate"), ("cap", "Cap or thumb tack"), ("ball", "Bearing ball"))
-"""Kinds of mirror, and how they are named."""
+"""Kinds of mirror, and their names."""
 
 USUAL: Mapping[str, tuple[float, float | None]] = {
     "plate": (0.0, None),
     "cap": (0.91, 9.75),
     "ball": (10.0, 10.0),
 }
-"""Height and diameter that a mirror of a kind has at first, mm."""
+"""Default height and diameter of a mirror by its kind, mm."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,7 +26,7 @@ class Chosen:
     """A picture in the list."""
 
     name: str
-    """Of its file."""
+    """Name of its file."""
     image: GreyImage
     """Grey levels, shape (rows, columns)."""
     kind: str = "plate"
@@ -36,7 +36,7 @@ class Chosen:
     height_sigma_mm: float | None = None
     """Standard uncertainty of the height; None: the usual one."""
     level_sigma_deg: float | None = None
-    """How level a plate lies; None: the usual one."""
+    """Standard uncertainty of a plate's level; None: the usual one."""
 
     @property
     def usual_mirror(self) -> Plate | Cap | Ball:
@@ -49,7 +49,7 @@ class Chosen:
 
     @property
     def usual_height_sigma_mm(self) -> float:
-        """Standard uncertainty of the height where none is entered, mm."""
+        """Standard uncertainty of the height if none is entered, mm."""
         usual = self.usual_mirror
         return float(usual.sigma[usual.parameters.index("height_mm")])
 
@@ -66,13 +66,13 @@ class Chosen:
 
     @property
     def mirror_words(self) -> str:
-        """The mirror in words."""
+        """Text describing the mirror."""
         name = self.mirror.name
         return name[:1].upper() + name[1:]
 
     @property
     def problem(self) -> str:
-        """Why there is no such mirror; empty if there can be."""
+        """Reason why the mirror is impossible; empty if it is not."""
         if self.kind == "cap" and not self.height_mm > 0:
             return "A cap is higher than 0 mm"
         return ""
@@ -102,7 +102,7 @@ class Chosen:
 
 
 def kept_pictures(session: Session) -> tuple[Chosen, ...]:
-    """The pictures of the check that the session keeps."""
+    """Pictures of the check stored in the session."""
     found = session.bench_check
     return tuple(
         Chosen.of_kept(one, session.picture(one.picture_sha256))

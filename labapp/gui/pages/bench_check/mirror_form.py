@@ -1,4 +1,4 @@
-"""The fields of a mirror: its kind, its sizes, and how well these are known."""
+"""Fields of a mirror: its kind, its sizes and their uncertainties."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ class MirrorForm(FieldForm):
     Parameters
     ----------
     selected
-        Gives that picture.
+        Returns that picture.
     change
-        Called with it, once it has another mirror.
+        Called with the picture when its mirror was changed.
     """
 
     def __init__(self, selected: Callable[[], Chosen], change: Callable[[Chosen], object]) -> None:
@@ -74,16 +74,16 @@ class MirrorForm(FieldForm):
 
     @property
     def fields(self) -> tuple[ChoiceField | NumberField, ...]:
-        """All of them, in their order."""
+        """All fields in order."""
         return self.kind, self.diameter, self.height_field, self.height_sigma, self.level
 
     def flush(self) -> None:
-        """Finish the edit under way."""
+        """Finish an edit in progress."""
         for field in (self.diameter, self.height_field, self.height_sigma, self.level):
             field.flush()
 
     def show_mirror(self, one: Chosen | None, locked: str) -> None:
-        """Show the mirror of a picture; None: there is none. ``locked``: why nothing may change."""
+        """Show the mirror of a picture, or none. ``locked``: reason why changes are refused."""
         for field in self.fields:
             field.lock(locked or ("" if one else "Add a picture first"))
         if one is None:

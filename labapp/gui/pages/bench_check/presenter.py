@@ -1,4 +1,4 @@
-"""What the bench-check page shows: mirrors and their pictures, and what follows for the bench."""
+"""Data of the bench-check page: mirrors, their pictures, and the result for the bench."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ from labapp.session.session import Session
 from labapp.text import now
 
 PICTURES = IMAGE_SUFFIXES
-"""How names of pictures end that can be dropped on the page."""
+"""Suffixes of pictures that can be dropped on the page."""
 
 REACH_PX = 8.0
-"""How near to a dot the pointer must be."""
+"""Largest distance, px, of the pointer from a dot."""
 
 Progress = Callable[[int, int, str], None]
 
@@ -52,22 +52,22 @@ Progress = Callable[[int, int, str], None]
 
 @dataclass(frozen=True, eq=False)
 class Checked:
-    """A check that was made here."""
+    """A check made on this page."""
 
     chosen: tuple[Chosen, ...]
     setup_text: str
-    """The pictures and the set-up that it was made with."""
+    """The pictures and the set-up used."""
     check: BenchCheck
     record: BenchCheckRecord
-    """The check as a session stores it; its pictures are not stored yet."""
+    """The check in the form that a session stores; its pictures are not yet stored."""
     height_sigma_mm: tuple[float, float] | None = None
-    """± of the height of the expected pool before and after; None where it cannot be measured."""
+    """± of the expected pool's height before and after; None if it cannot be measured."""
     blind: tuple[BlindSpot, ...] = ()
-    """Heights of mirrors whose error the pictures hardly contradict."""
+    """Heights of mirrors whose errors the pictures hardly reveal."""
 
     @property
     def words(self) -> str:
-        """The verdict, and what to do next."""
+        """Text of the verdict, and of the next action."""
         if self.usable:
             parts = [f"✓ {_fit_words(self.record)}", *self._freed()]
             if self.height_sigma_mm is not None:
@@ -89,7 +89,7 @@ class Checked:
         )
 
     def _freed(self) -> list[str]:
-        """What quantities found from the pictures alone have become."""
+        """Texts of the quantities determined from the pictures alone."""
         found = []
         for one in self.check.changes:
             if one.key in self.check.free:
@@ -107,7 +107,7 @@ class Checked:
 
     @property
     def suspects(self) -> tuple[tuple[str, str], ...]:
-        """Quantities that are off by far more than their ±: (key, name); none if a size is."""
+        """Quantities whose error far exceeds their ±: (key, name); none if a size is wrong."""
         is_quantity = self.check.status == "quantity-off"
         suspects = self.check.suspects if is_quantity else ()
         return tuple((one.key, _sentence(one.name, "")) for one in suspects)
@@ -121,19 +121,19 @@ def check(
     free: Sequence[str] = (),
     pool: Cap = EXPECTED,
 ) -> Checked:
-    """Adjust the set-up to pictures of known mirrors; `CannotMeasure` says why not.
+    """Adjust the set-up to pictures of known mirrors; `CannotMeasure` gives a reason.
 
     Parameters
     ----------
     setup_file, settings
-        Text and path of the set-up, and how dots are found. What an earlier check has found of the
-        bench is left out, or its pictures would count twice.
+        Text and path of the set-up, and the settings of the detector. Results of an earlier check
+        are ignored, as its pictures would otherwise count twice.
     progress
-        Called with parts done, parts in all, and what is being done; may raise.
+        Called with the parts done, their total, and the current stage; may raise.
     free
-        Quantities that are to be found from the pictures alone, see `check_bench`.
+        Quantities determined from the pictures alone, see `check_bench`.
     pool
-        The pool that is expected.
+        The expected pool.
     """
     text, path = setup_file
     setup = parse_setup(unchecked_setup(text, path), path)
@@ -161,7 +161,7 @@ def check(
 
 
 def check_sizes(session: Session, chosen: Sequence[Chosen]) -> None:
-    """Raise `CannotMeasure` if a picture is not of the size of the camera's others.
+    """Raise `CannotMeasure` if the size of a picture differs from that of the camera's others.
 
     These are the recording, the picture of the imaging plane, or the first in the list.
     """
@@ -185,7 +185,7 @@ def check_sizes(session: Session, chosen: Sequence[Chosen]) -> None:
 def _of_pool(
     found: BenchCheck, pool: Cap
 ) -> tuple[tuple[float, float] | None, tuple[BlindSpot, ...]]:
-    """± of the pool's height before and after, and what would not be noticed."""
+    """± of the pool's height before and after, and errors that would not be noticed."""
     try:
         before, after = (height_sigma(rig, pool) for rig in (found.before, found.rig))
         blind = blind_spots(found, pool)
@@ -235,7 +235,7 @@ def _sentence(words: str, end: str = ".") -> str:
 
 
 def kept_words(session: Session) -> str:
-    """The stored check in words; empty without one."""
+    """Text of the stored check; empty if there is none."""
     found = session.bench_check
     if found is None:
         return ""
@@ -250,10 +250,10 @@ def kept_words(session: Session) -> str:
 
 @dataclass(frozen=True)
 class QuantityRow:
-    """A line of the table of quantities."""
+    """A row of the table of quantities."""
 
     group: str
-    """What it is a quantity of."""
+    """Object to which the quantity belongs."""
     texts: tuple[str, str, str, str, str]
     """Name, value ± before, value ± after, unit, and whether the pictures determine it."""
     determined: bool
@@ -267,13 +267,13 @@ KEY = (
     f"±: standard uncertainty. {DETERMINED} determined by the pictures; {NOT_DETERMINED} hardly: "
     f"its ± is still more than {UNDETERMINED:.0%} of that before"
 ).replace("%", " %")
-"""What the signs in the table mean."""
+"""Legend of the signs in the table."""
 
 
 def quantity_rows(record: BenchCheckRecord) -> tuple[QuantityRow, ...]:
-    """Quantities before and after a check; one that is known hardly better is not determined.
+    """Quantities before and after a check; one that is hardly better known is not determined.
 
-    Those that are known exactly, such as the glass where there is none, are left out.
+    Exactly known quantities, such as those of a missing glass, are left out.
     """
     rows = []
     arrays = (record.before, record.before_sigma, record.after, record.after_sigma)
@@ -294,9 +294,7 @@ def quantity_rows(record: BenchCheckRecord) -> tuple[QuantityRow, ...]:
             DETERMINED if determined else NOT_DETERMINED,
         )
         rows.append(QuantityRow(_sentence(group, ""), texts, determined))
-    groups = list(
-        dict.fromkeys(row.group for row in rows)
-    )  # quantities that came later join theirs
+    groups = list(dict.fromkeys(row.group for row in rows))  # later quantities join their group
     return tuple(sorted(rows, key=lambda row: groups.index(row.group)))
 
 
@@ -304,9 +302,9 @@ MIRROR_COLUMNS = ("True, mm", "Adjusted", "Without it")
 
 
 def mirror_rows(record: BenchCheckRecord) -> tuple[tuple[str, str, str], ...]:
-    """Every mirror's true size; as the adjusted set-up measures it; and as measured without it.
+    """Size of every mirror: true, measured with the adjusted set-up, and measured without it.
 
-    The last is empty for a check that a former version has stored.
+    The last is empty for a check stored by an earlier version.
     """
     names = {"plate": "Plate", "cap": "Cap", "ball": "Ball"}
     rows = []
@@ -321,25 +319,25 @@ def mirror_rows(record: BenchCheckRecord) -> tuple[tuple[str, str, str], ...]:
 
 @dataclass(frozen=True)
 class Overlay:
-    """What is drawn over a picture."""
+    """Overlay of a picture."""
 
     dot_px: FloatArray
-    """The dots with a ray, shape (n, 2)."""
+    """Dots with a known ray, shape (n, 2), px."""
     arrows_px: FloatArray
-    """From each dot towards where the adjusted bench has it, enlarged, shape (2n, 2): beginnings
-    and ends in turn.
+    """Enlarged arrows from each dot towards its position by the adjusted bench, shape (2n, 2):
+    starts and ends in turn.
     """
     numbers: tuple[tuple[str, float, float, bool], ...]
-    """Words at places: (text, u, v, whether it is a row's); each at its first dot."""
+    """Labels (text, u, v, whether it is a row's), each at the first dot."""
     words: str
-    """What is drawn, and how much the arrows are enlarged."""
+    """Text of the content, and of the enlargement of the arrows."""
 
 
 def overlay(picture: MirrorPicture, height_px: int) -> Overlay:
-    """Dots, their rays' numbers, and residuals to be seen in a picture of such a height."""
+    """Dots, numbers of their rays, and residuals enlarged for a picture of this height."""
     residual = picture.computed_px - picture.dot_px
     length = np.hypot(*residual.T)
-    # Nine in ten end before the next dot, so that dots stay in sight.
+    # Nine of ten end before the next dot, so that the dots stay visible.
     longest = min(height_px / 30, _spacing_px(picture.dot_px))
     times = round_factor(longest / max(float(np.quantile(length, 0.9)), 1e-6))
     ends = picture.dot_px + times * residual
@@ -353,7 +351,7 @@ def overlay(picture: MirrorPicture, height_px: int) -> Overlay:
 
 
 def _spacing_px(dot_px: FloatArray) -> float:
-    """Median distance of a dot to the nearest other."""
+    """Median distance between nearest dots."""
     distance, _ = cKDTree(dot_px).query(dot_px, k=2)
     return float(np.median(distance[:, 1]))
 
@@ -374,7 +372,7 @@ def _numbers(picture: MirrorPicture) -> tuple[tuple[str, float, float, bool], ..
 
 
 def ray_words(picture: MirrorPicture, u: float, v: float) -> str:
-    """The ray of the dot at a place, and its residual; empty where there is none."""
+    """Text of the ray and residual of the dot at a position; empty if there is none."""
     off = np.hypot(*(picture.dot_px - [u, v]).T)
     if not len(off) or off.min() > REACH_PX:
         return ""
@@ -384,23 +382,23 @@ def ray_words(picture: MirrorPicture, u: float, v: float) -> str:
 
 
 def expected_pool(record: Record) -> Cap:
-    """The pool that the set-up expects, or a usual one."""
+    """The expected pool of the record, or a usual one."""
     width, height = record.expected_width_mm, record.expected_height_mm
     return Cap(width, height) if width and height and height > 0 else EXPECTED
 
 
 @dataclass(frozen=True)
 class Predicted:
-    """What pictures would do for the ± of the height of the expected pool."""
+    """Predicted effect of pictures on the ± of the expected pool's height."""
 
     words: str
-    """Of which pool, and what is not predicted."""
+    """Text of the pool, and of what is not predicted."""
     rows: tuple[tuple[str, str], ...]
-    """Set of pictures, and ± after it in mm; the first line is without pictures."""
+    """Set of pictures, and the resulting ± in mm; the first row is without pictures."""
 
 
 def predicted(setup: Setup, record: Record) -> Predicted:
-    """Predict the ± of the height of the expected pool, now and after each set of pictures.
+    """Predict the ± of the expected pool's height, now and after each set of pictures.
 
     Raises
     ------
@@ -424,4 +422,4 @@ def predicted(setup: Setup, record: Record) -> Predicted:
 
 
 NO_DOTS = "no dots"
-"""Of a set of pictures one of which would have no dots on the imaging plane."""
+"""Text for a set with a picture that would have no dots on the imaging plane."""

@@ -1,4 +1,4 @@
-"""The bench-check page: pictures of known mirrors, the dots in them, and quantities that follow."""
+"""The bench-check page: pictures of known mirrors, their dots, and the resulting quantities."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ from labapp.session.record import BenchCheckRecord, MirrorPicture
 NO_PICTURE = "Put a known mirror where the pool will be; add a picture of its dots, or drop it."
 
 NAME_LETTERS = 14
-"""Least width of a quantity's name in the table: the longest takes two lines."""
+"""Minimum width, letters, of a quantity's name in the table: the longest takes two lines."""
 
 COLOR = "#ffb000"
 LIST_ROWS, ROW_PX = 3, 24
 TABLE_PX, WIDE_PX = 400, 720
-"""Width of the table of quantities, and of a page that has room for it beside the picture."""
+"""Width of the table of quantities, and page width at which it fits beside the picture."""
 
 
 class BenchCheckPage(Page):
@@ -72,14 +72,14 @@ class BenchCheckPage(Page):
         self.splitter.addWidget(self.found)
         self.splitter.setStretchFactor(0, 1)
         self.splitter.setSizes([WIDE_PX - TABLE_PX, TABLE_PX])
-        # The splitter has its new size only after the page has it.
+        # The splitter is resized only after the page.
         self._arranged = QTimer(self, singleShot=True, interval=0)
         self._arranged.timeout.connect(self._arrange)
         self.canvas_layout.addWidget(self.splitter)
         self._make_panel()
 
     def resizeEvent(self, event: QResizeEvent) -> None:
-        """Put the table below the picture where there is no room beside it."""
+        """Place the table below the picture if there is no space beside it."""
         super().resizeEvent(event)
         wide = self.width() >= WIDE_PX
         way = Qt.Orientation.Horizontal if wide else Qt.Orientation.Vertical
@@ -93,7 +93,7 @@ class BenchCheckPage(Page):
         self.splitter.setSizes([size - table, table])
 
     def refresh(self) -> None:
-        """Show the check that the session keeps when it changed."""
+        """Show the stored check if it changed."""
         session, kept = self.session, self.session.bench_check
         if session.path != self._path:
             self._path, self._kept, self.checked = session.path, None, None
@@ -108,7 +108,7 @@ class BenchCheckPage(Page):
         self._follow()
 
     def state(self, found: State) -> State:
-        """How far the step is: a check may be made that is not in use yet."""
+        """State of the step, which may have a check that is not yet in use."""
         made, session = self.checked, self.workspace.session
         if made is None or session is None or self._is_kept():
             return found
@@ -119,12 +119,12 @@ class BenchCheckPage(Page):
         return State(Mark.ATTENTION, "The pictures contradict the set-up")
 
     def lead(self, found: Lead | None) -> Lead | None:
-        """Where a picture can come from, while there is none."""
+        """Sources of a picture while there is none."""
         add = Offer("&Add picture…", "Of a mirror of known shape", self._choose)
         return found if self.chosen else Lead(NO_PICTURE, (add,))
 
     def _is_kept(self) -> bool:
-        """Whether what is shown is what the session keeps."""
+        """Whether the displayed check is the stored one."""
         kept = self._kept
         return bool(self.checked and kept and self.checked.record.date == kept.date)
 
@@ -141,7 +141,7 @@ class BenchCheckPage(Page):
     # --- the list -----------------------------------------------------------------------------
 
     def load(self, *paths: Path) -> None:
-        """Add pictures; each shows a plate at first."""
+        """Add pictures, initially of a plate."""
 
         def loaded(pictures: Sequence[Chosen]) -> None:
             self._list([*self.chosen, *pictures], len(self.chosen))
@@ -153,7 +153,7 @@ class BenchCheckPage(Page):
         )
 
     def takes_files(self, paths: Sequence[Path]) -> bool:
-        """Add pictures that are dropped."""
+        """Add dropped pictures."""
         pictures = [path for path in paths if path.suffix.lower() in presenter.PICTURES]
         if self.locked or len(pictures) < len(paths):
             return False
@@ -161,13 +161,13 @@ class BenchCheckPage(Page):
         return True
 
     def remove(self) -> None:
-        """Take the selected picture off the list."""
+        """Remove the selected picture from the list."""
         if self.chosen:
             at = self._at()
             self._list([one for k, one in enumerate(self.chosen) if k != at], max(0, at - 1))
 
     def change(self, one: Chosen) -> None:
-        """Have the selected picture show another mirror."""
+        """Change the mirror of the selected picture."""
         at = self._at()
         self._list([one if k == at else other for k, other in enumerate(self.chosen)], at)
 
@@ -175,7 +175,7 @@ class BenchCheckPage(Page):
         return max(0, min(self.list.currentRow(), len(self.chosen) - 1))
 
     def _list(self, chosen: Sequence[Chosen], at: int = 0) -> None:
-        """Show a list of pictures; what was found with another no longer counts."""
+        """Show a list of pictures; results of another list are discarded."""
         self.chosen = list(chosen)
         dropped = self.checked is not None and self.checked.chosen != tuple(chosen)
         if dropped:
@@ -217,7 +217,7 @@ class BenchCheckPage(Page):
         self.start_task("Checking the bench", work, found)
 
     def find_suspect(self) -> None:
-        """Check again, with a quantity found from the pictures alone."""
+        """Repeat the check, with a quantity determined from the pictures alone."""
         self.check([self.suspect.value()])
 
     def use(self) -> None:
@@ -232,7 +232,7 @@ class BenchCheckPage(Page):
             self.confirm("The adjusted set-up is in use; undo restores the former one")
 
     def predict(self) -> None:
-        """Predict what pictures would do for the ± of the pool's height."""
+        """Predict the effect of pictures on the ± of the pool's height."""
         session = self.session
         setup, record = session.setup, session.record
         self.start_task(
@@ -247,7 +247,7 @@ class BenchCheckPage(Page):
         self.predicted.setVisible(made is not None)
 
     def leave(self) -> None:
-        """Finish the edit under way."""
+        """Finish an edit in progress."""
         self.mirror_form.flush()
 
     # --- the panel ----------------------------------------------------------------------------
@@ -302,7 +302,7 @@ class BenchCheckPage(Page):
         tip = "Check again with this quantity free: its entered value is ignored"
         self.suspect_part = QWidget()
         find = button("Find it from the pictures", tip, self.find_suspect)
-        # Names are long: the label stands above them.
+        # Names are long, so the label is above them.
         vbox(self.suspect.label, self.suspect, find, of=self.suspect_part)
         return self.suspect_part
 
@@ -316,7 +316,7 @@ class BenchCheckPage(Page):
     # --- what is shown ------------------------------------------------------------------------
 
     def _record(self) -> BenchCheckRecord | None:
-        """The check that is shown: that made here, or the kept one of the same pictures."""
+        """The displayed check: a new one, or the stored one of the same pictures."""
         if self.checked is not None:
             return self.checked.record
         kept = self._kept
@@ -326,7 +326,7 @@ class BenchCheckPage(Page):
         return kept if same else None
 
     def _follow(self) -> None:
-        """Show what follows from the list and the check."""
+        """Show the results of the list and the check."""
         if self.workspace.session is None:
             return
         if self.checked is not None and not self._is_kept():
@@ -337,7 +337,7 @@ class BenchCheckPage(Page):
         self._show_picture(None if record is None else record.pictures[self._at()])
         self.quantities.show_rows(() if record is None else presenter.quantity_rows(record))
         self.found.setVisible(record is not None)
-        # A refused bench measures nothing.
+        # A rejected bench measures nothing.
         stands = record is not None and (made is None or made.usable)
         self.mirrors.show_texts(presenter.mirror_rows(record) if record and stands else ())
         for shown in (self.mirrors_words, self.mirrors):
@@ -347,7 +347,7 @@ class BenchCheckPage(Page):
         show_words(self.words, words)
         suspects = made.suspects if made else ()
         self.suspect.set_choices(suspects)
-        if suspects and not self.suspect.value():  # the former one is not among them
+        if suspects and not self.suspect.value():  # the previous one is not among them
             self.suspect.set_value(suspects[0][0])
         self.suspect_part.setVisible(bool(suspects))
         self._enable(used)
@@ -425,14 +425,14 @@ class _QuantityTable(ReadTable):
         name = "Quantities of the set-up, before and after the check"
         super().__init__(name, f"{name}: Ctrl+C copies it", COLUMNS)
         self.horizontalHeader().setSectionResizeMode(0, QHeaderView.ResizeMode.Fixed)
-        # Long names take more lines; the header reports a width before the cells have it.
+        # Long names are wrapped; the header reports a width before the cells have it.
         self._narrowed = QTimer(self, singleShot=True, interval=0)
         self._narrowed.timeout.connect(self._fit_names)
         self.horizontalHeader().sectionResized.connect(lambda *_: self._narrowed.start())
         self.offer(("Copy table", self.copy_text))
 
     def resizeEvent(self, event: QResizeEvent) -> None:
-        """Give the names the room that is left, but never less than they need in two lines."""
+        """Use the remaining width for the names, but at least the width for two lines."""
         super().resizeEvent(event)
         self._narrowed.start()
 
@@ -443,7 +443,7 @@ class _QuantityTable(ReadTable):
         self.resizeRowsToContents()
 
     def show_rows(self, rows: Sequence[presenter.QuantityRow]) -> None:
-        """Show quantities, each group of them below its heading."""
+        """Show quantities in groups with headings."""
         self.setRowCount(0)
         group = ""
         for row in rows:

@@ -1,4 +1,4 @@
-"""Step 4: where the frames come from."""
+"""Step 4: the recording or camera that provides the frames."""
 
 from labapp.gui.pages.capture.page import CapturePage
 

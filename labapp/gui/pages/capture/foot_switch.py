@@ -1,4 +1,4 @@
-"""Foot switches on the recording page: which are in use, what their pedals do, and new ones."""
+"""Foot switches on the recording page: those in use, actions of their pedals, new ones."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ CHOICES = [*((action, words) for action, words in DOES.items()), (NOTHING, "no a
 NONE_YET = "No foot switch is in use. Plug one in, press Learn a pedal, and step on it."
 
 LINES = 5
-"""Of the commands."""
+"""Number of visible lines of the commands."""
 
 LISTENING = "Step on the pedal that is to be used…"
 
@@ -58,7 +58,7 @@ class FootSwitchPanel(Group):
         leave = button("Discard", "Leave this pedal as it is", self.switches.give_up)
         self.learned = QWidget()
         vbox(form, hbox(self.use_button, leave), of=self.learned)
-        # The buttons stand above the words, which need more or less room.
+        # The buttons are above the text, whose height varies.
         fill(
             self.column,
             *(hbox(self.learn_button, self.look_button), self.words, self.rows),
@@ -94,7 +94,7 @@ class FootSwitchPanel(Group):
     # --- what is shown ------------------------------------------------------------------------
 
     def refresh(self) -> None:
-        """Show how the foot switches are now."""
+        """Show the current state of the foot switches."""
         switches = self.switches
         parts = [each.words for each in switches.in_use.values()] or [NONE_YET]
         if switches.found is not None:
@@ -118,7 +118,7 @@ class FootSwitchPanel(Group):
         self._show_commands()
 
     def _show_rows(self) -> None:
-        """A field for each pedal; rebuilt only where the pedals have changed."""
+        """Show a field for each pedal; rebuild them only if the pedals changed."""
         held = {key: each.pedals for key, each in self.switches.in_use.items()}
         wanted = {(key, pedal): does for key in held for pedal, does in held[key].actions.items()}
         if wanted.keys() != self.pedals.keys():

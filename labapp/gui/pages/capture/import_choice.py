@@ -1,4 +1,4 @@
-"""What of a recording is imported, and into which session: fields of the recording page."""
+"""Fields of the recording page for the frames to import, and the session to import into."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ NEXT_TIP = "Make a session with the same set-up and calibration, and import it t
 
 
 class ImportChoice(Group):
-    """Which frames to import; seen while a recording is looked at."""
+    """Frames to import; visible during the preview of a recording."""
 
     edited = Signal()
-    """Something else was chosen."""
+    """The choice changed."""
 
     def __init__(
         self,
@@ -77,7 +77,7 @@ class ImportChoice(Group):
         return form
 
     def begin(self, preview: Preview) -> None:
-        """Begin with all frames of a recording."""
+        """Start with all frames of a recording."""
         last = preview.frames - 1
         for field, value in ((self.first, 0), (self.last, last), (self.every, 1)):
             field.highest = max(1, last)
@@ -87,7 +87,7 @@ class ImportChoice(Group):
         self.source_words.setText(f"{preview.path.name}\n{message}")
 
     def choice(self) -> Choice:
-        """What is chosen."""
+        """The current choice."""
         first, last, every = (
             int(field.value() or 0) for field in (self.first, self.last, self.every)
         )
@@ -96,12 +96,12 @@ class ImportChoice(Group):
     def show_choice(
         self, session: Session | None, preview: Preview | None, working: bool, measured: bool
     ) -> None:
-        """Show what would be imported, and why it cannot be where it cannot.
+        """Show what would be imported, or the reason why it cannot be.
 
         Parameters
         ----------
         session, preview
-            Where to, and what; None: there is none.
+            Destination and recording; None if there is none.
         working
             Whether a recording is being imported.
         measured

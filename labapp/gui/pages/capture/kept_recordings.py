@@ -1,4 +1,4 @@
-"""Recordings made beside a session that are not its own: to look at, or to begin a session with."""
+"""Recordings beside a session that are not imported: preview, or use in a new session."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from labapp.session.session import Session
 
 
 class KeptRecordings(Group):
-    """Their list, seen where there are any."""
+    """List of these recordings, visible if there are any."""
 
     def __init__(
         self, look: Callable[[Path], object], begin_next: Callable[[Path], object]
@@ -35,14 +35,14 @@ class KeptRecordings(Group):
         self.hide()
 
     def list_beside(self, session: Session, running: Take | None) -> None:
-        """List those of a session, the newest first, without the one that runs."""
+        """List the recordings of a session, newest first, without the running one."""
         folder = folder_of(session)
         others = [session.recording_place]
         others += [] if running is None else [running.path]
         try:
             found = recordings_beside(folder, session.path.stem)
         except OSError:
-            found = []  # problems of the folder are reported on writing to it
+            found = []  # problems of the folder are reported when it is written to
         kept = [path for path in reversed(found) if path not in others]
         self.choice.set_choices([(str(path), _choice_text(path)) for path in kept])
         if kept:
@@ -51,11 +51,11 @@ class KeptRecordings(Group):
 
 
 def kept_text(take: Take, why_kept: str) -> str:
-    """What became of a recording that is not imported."""
+    """Text about a recording that is kept but not imported."""
     return f"{take.path.name} is kept beside the session: {why_kept}. See Other recordings"
 
 
 def _choice_text(path: Path) -> str:
-    """Name of a recording beside the session, and whether a session was begun with it."""
+    """Name of a recording beside the session, and whether another session uses it."""
     used = path.with_suffix(SUFFIX).exists()
     return f"{path.name}, has its own session" if used else path.name

@@ -1,4 +1,4 @@
-"""The recording page: choose, look, import; what was read; how the frame in view is exposed."""
+"""The recording page: choice, preview and import; facts; exposure of the frame in view."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from labapp.session.session import Session
 from labapp.text import pluralize
 
 REST_MS = 120
-"""Time, ms, that a frame stays in view before its exposure is judged."""
+"""Time, ms, that a frame stays in view before its exposure is assessed."""
 
 CAPTURE_SHOWS = "The frames of a video, of images or a stack, or what a camera sees."
 
@@ -50,7 +50,7 @@ def _nothing() -> None:
 
 
 class CapturePage(Page):
-    """Where the frames come from."""
+    """Choice, import and live capture of the recording."""
 
     key = "capture"
 
@@ -67,7 +67,7 @@ class CapturePage(Page):
         self._rest.timeout.connect(self._judge)
         self._last_folder = Path()
         self._listed: Session | None = None
-        """The session that recordings beside it are listed of."""
+        """Session whose other recordings are listed."""
         self.title = wrapping_label()
         self.title.setContentsMargins(8, 4, 8, 0)
         self.picture_view = PictureView("Frame of the recording")
@@ -87,7 +87,7 @@ class CapturePage(Page):
     # --- what it shows ------------------------------------------------------------------------
 
     def refresh(self) -> None:
-        """Show the session's recording, or the one to be imported."""
+        """Show the session's recording, or the one to import."""
         session = self.workspace.session
         if session is None:
             return
@@ -102,7 +102,7 @@ class CapturePage(Page):
         self._look()
 
     def state(self, found: State) -> State:
-        """How far the step is: a recording may be chosen that the session does not have yet."""
+        """State of the step, which may have a chosen recording that is not yet imported."""
         session = self.workspace.session
         if self.live_view.live is not None:
             message = (
@@ -117,7 +117,7 @@ class CapturePage(Page):
         return State(Mark.READY, f"{name} is not imported yet: press Import")
 
     def lead(self, found: Lead | None) -> Lead | None:
-        """Where a recording can come from, while there is none to be seen."""
+        """Sources of a recording while there is none to show."""
         session = self.workspace.session
         if session is None or session.recording or self.preview or self.live_view.live:
             return found
@@ -128,7 +128,7 @@ class CapturePage(Page):
         return Lead(CAPTURE_SHOWS, (file, folder, camera))
 
     def leave(self) -> None:
-        """Judge no frame that is not in view; a camera and its recording continue."""
+        """Stop assessing frames; a camera and its recording continue."""
         if self._rest.isActive():
             self._rest.stop()
             self._seen = None
@@ -137,18 +137,18 @@ class CapturePage(Page):
 
     @property
     def camera(self) -> LiveView | None:
-        """The live camera; None while none is watched."""
+        """The live camera; None if there is none."""
         return self.live_view if self.live_view.is_live else None
 
     def takes_key(self, event: QKeyEvent) -> bool:
-        """Space records, M marks and A acknowledges alarms while a camera is watched."""
+        """Handle keys of a live camera: Space records, M marks, A acknowledges alarms."""
         plain = event.modifiers() in (Qt.KeyboardModifier.NoModifier, KEYPAD)
         if not plain or self.camera is None:
             return False
         return event.isAutoRepeat() or self.live_view.take_key(Qt.Key(event.key()))
 
     def _live_changed(self) -> None:
-        """A camera was started or stopped: its picture is in view, or the session's."""
+        """Show the camera's picture after its start, or the session's after its stop."""
         live = self.live_view.live
         self._rest.stop()
         self._wanted = self._seen = None
@@ -161,7 +161,7 @@ class CapturePage(Page):
         self.workspace.changed.emit()
 
     def _recorded(self, take: Take) -> None:
-        """Import what was recorded, or say why not."""
+        """Import a finished recording, or report why it is not imported."""
         session, why_kept = self.workspace.session, ""
         if session is None or not take.frames:
             self.workspace.notified.emit(f"{take.path.name}: nothing was recorded", True)
@@ -220,7 +220,7 @@ class CapturePage(Page):
         if seen.exposure is None:
             if seen.image is None:
                 self.exposure.hide()
-            return  # else the verdict on the frame before stays until this one is judged
+            return  # the previous frame's exposure stays until this one is assessed
         self.exposure.show()
         verdict = seen.exposure.verdict
         message = f"{verdict.capitalize()}. {seen.exposure.advice}"
@@ -229,7 +229,7 @@ class CapturePage(Page):
     # --- frames to look at --------------------------------------------------------------------
 
     def _look(self) -> None:
-        """Read the frame in view in the background; of several requests, the last."""
+        """Read the frame in view in the background; only the last of several requests counts."""
         if self.live_view.live is not None:
             return
         session, preview = self.workspace.session, self.preview
@@ -245,7 +245,7 @@ class CapturePage(Page):
             self._read()
 
     def _judge(self) -> None:
-        """Judge the exposure of the frame that has stayed in view."""
+        """Assess the exposure of the frame in view."""
         if self._wanted == self._seen and self._reading not in self.workspace.tasks.active:
             self._read(judged=True)
 
@@ -276,12 +276,12 @@ class CapturePage(Page):
     # --- choosing and importing ---------------------------------------------------------------
 
     def choose_file(self) -> None:
-        """Ask for a recording that is a file."""
+        """Ask for a recording file."""
         if path := ask_recording(self, self._folder()):
             self.take(path)
 
     def choose_folder(self) -> None:
-        """Ask for a recording that is a folder of images."""
+        """Ask for a folder of images."""
         if path := ask_folder(self, "Choose a folder of images", self._folder()):
             self.take(path)
 
@@ -289,7 +289,7 @@ class CapturePage(Page):
         return self._last_folder if self._last_folder.name else self.workspace.folder
 
     def take(self, path: Path, at_once: bool = False) -> None:
-        """Look at a recording, to import it; or import all of it at once, see `Page.take`."""
+        """Preview a recording for import, or import all of it immediately, see `Page.take`."""
         self._last_folder = path.parent
         self.live_view.stop()
         if self._opening in self.workspace.tasks.active and self._opening is not None:
@@ -315,17 +315,17 @@ class CapturePage(Page):
         )
 
     def choice(self) -> Choice | None:
-        """What is chosen to be imported; None before a recording was chosen."""
+        """Choice of frames to import; None before a recording was chosen."""
         return None if self.preview is None else self.chosen.choice()
 
     def import_chosen(self) -> None:
-        """Import what was chosen, in the background."""
+        """Import the chosen frames in the background."""
         preview, choice = self.preview, self.choice()
         if preview is not None and choice is not None and choice.count:
             self._import(preview.path, choice.frames, choice.rate_hz, choice.embed)
 
     def begin_next(self) -> None:
-        """Import what was chosen into a new session, with this one's set-up."""
+        """Import the chosen frames into a new session with the same set-up."""
         preview, choice = self.preview, self.choice()
         if preview is not None and choice is not None and choice.count:
             self._import_next(preview.path, choice.frames, choice.rate_hz, choice.embed)
@@ -350,7 +350,7 @@ class CapturePage(Page):
             recording = session.import_recording(
                 path, frames, frame_rate_hz=rate_hz, embed=embed, progress=control.progress
             )
-            session.overview()  # looked up here: the window would wait for it
+            session.overview()  # read in this thread: the window would wait for it
             return recording
 
         def done(recording: Recording) -> None:
@@ -365,16 +365,16 @@ class CapturePage(Page):
             then()
 
         self._importing = self.start_task(f"Importing {path.name}", work, done, kind="Importing")
-        self._listed = None  # one of them may be the session's own then
+        self._listed = None  # one of them may be the session's recording now
         self._show_import()
 
     def _measure(self) -> None:
-        """Measure the recording, each frame from the one before, where that can be."""
+        """Measure the recording, each frame starting from the previous one, if possible."""
         if not why_not_measurable(self.session):
             self.workspace.measure(warm=True)
 
     def _go_to_dots(self) -> None:
-        """Go on to the dots, unless the operator has gone elsewhere."""
+        """Go to the dots, unless the operator left this page."""
         if self.isVisible():
             self.workspace.action_requested.emit("step_dots")
 
@@ -382,35 +382,35 @@ class CapturePage(Page):
         preview, self.preview = self.preview, None
         self._seen = None
         if preview is not None and self.workspace.session is not None:
-            # Not here: a frame may be being read.
+            # In a task, as a frame may still be being read.
             self.workspace.tasks.start(f"Closing {preview.path.name}", lambda _: preview.close())
         elif preview is not None:
             preview.close()
         self._show_import()
 
     def _forget(self) -> None:
-        """Forget what was to be imported into the session before."""
+        """Discard the choice for the previous session."""
         self._listed = None
         self._drop_preview()
 
     def cancel_choice(self) -> None:
-        """Look at the session's frames again; nothing is imported."""
+        """Return to the session's frames without an import."""
         self._drop_preview()
         self.refresh()
         self.workspace.changed.emit()
 
     def find_recording(self) -> None:
-        """Ask where a missing recording is now."""
+        """Ask for the new location of a missing recording."""
         missing = self.session.missing_recording
         if missing is None:
             return
-        # A folder of images has no ending; files are chosen otherwise.
+        # A folder of images has no suffix and needs another dialog than a file.
         ask = ask_file if missing.suffix else ask_folder
         if found := ask(self, f"Locate {missing.name}", self._folder()):
             self.relink(found)
 
     def relink(self, path: Path) -> None:
-        """Say where the recording is now; another one is refused, in words."""
+        """Set the new location of the recording; a different recording is refused."""
         session = self.session
 
         def done(_: object) -> None:
@@ -439,11 +439,11 @@ class CapturePage(Page):
         self.exposure.hide()
         keep_room(self.exposure)
         self.foot_switch = FootSwitchPanel(self.workspace.foot_switches)
-        # Below the other buttons: it comes when a recording ends.
+        # Below the other buttons, as it appears when a recording ends.
         self.kept = KeptRecordings(
             self.take, lambda path: self._import_next(path, ":", None, False)
         )
-        self.facts = QGridLayout()  # a form keeps heights of the width before: lines are cut off
+        self.facts = QGridLayout()  # a form layout keeps old heights, which cuts off lines
         self.facts.setColumnStretch(1, 1)
         self.facts_group = Group("What was read", self.facts)
         fill(

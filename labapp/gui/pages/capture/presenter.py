@@ -1,4 +1,4 @@
-"""What the recording page shows: what was read, what would be imported, how frames are exposed."""
+"""Data of the recording page: facts of the recording, choice to import, exposure."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ from labapp.text import format_bytes
 
 @dataclass(frozen=True)
 class Seen:
-    """A frame to look at."""
+    """A frame to show."""
 
     title: str
     image: GreyImage | None
-    """Grey levels, shape (rows, columns); None where it cannot be read."""
+    """Grey levels, shape (rows, columns); None if it cannot be read."""
     exposure: Exposure | None
-    """How it is exposed; None where it cannot be read, or was not judged yet."""
+    """Its exposure; None if it cannot be read or is not yet assessed."""
     words: str = ""
-    """Why it cannot be read; empty if it can."""
+    """Reason why it cannot be read; empty if it can."""
 
 
 class Preview:
-    """A recording that may be imported; frames may be read from any thread.
+    """Preview of a recording for import; frames may be read in any thread.
 
     Raises
     ------
@@ -51,7 +51,7 @@ class Preview:
         self.warnings = self._source.warnings
 
     def look(self, number: int, settings: DotSettings | None) -> Seen:
-        """Read a frame and judge its exposure, unless there are no settings to find dots by."""
+        """Read a frame, and assess its exposure if there are settings to find dots."""
         title = f"{self.path.name}, frame {number} (of 0 to {self.frames - 1}), not imported yet"
         with self._turn:
             try:
@@ -68,7 +68,7 @@ class Preview:
 
 
 def look(session: Session, number: int, judged: bool = True) -> Seen:
-    """Read a frame of the session and, if wanted, judge its exposure."""
+    """Read a frame of the session and, if ``judged``, assess its exposure."""
     recording = session.recording
     title = f"Frame {number} of the session"
     try:
@@ -93,30 +93,30 @@ def _judged(
 
 @dataclass(frozen=True)
 class Choice:
-    """Which frames of a recording to import, and how."""
+    """Frames of a recording to import, and options."""
 
     first: int
     last: int
     every: int = 1
     """Frames ``first``, ``first + every`` … up to ``last``."""
     rate_hz: float | None = None
-    """The rate it was filmed at; None: the recording's own."""
+    """Frame rate of the camera, 1/s; None: that stored in the recording."""
     embed: bool = False
-    """Whether the session keeps the frames itself."""
+    """Whether the frames are stored in the session."""
 
     @property
     def frames(self) -> str:
-        """As `Session.import_recording` takes them."""
+        """The frames in the form required by `Session.import_recording`."""
         return f"{self.first}:{self.last + 1}:{self.every}"
 
     @property
     def count(self) -> int:
-        """How many frames they are."""
+        """Number of frames."""
         return len(range(self.first, self.last + 1, self.every))
 
 
 def choice_text(preview: Preview, choice: Choice) -> str:
-    """What would be imported."""
+    """Text of what would be imported."""
     count = f"{choice.count} of {preview.frames} frames"
     rate = choice.rate_hz or preview.frame_rate_hz
     if rate is None:
@@ -125,7 +125,7 @@ def choice_text(preview: Preview, choice: Choice) -> str:
 
 
 def refusal(session: Session | None, choice: Choice | None, working: bool) -> str:
-    """Why nothing can be imported now; empty if it can."""
+    """Reason why nothing can be imported now; empty if it can."""
     if session is None:
         return "Open or make a session first"
     if session.read_only:
@@ -140,7 +140,7 @@ def refusal(session: Session | None, choice: Choice | None, working: bool) -> st
 
 
 def recording_facts(recording: Recording) -> tuple[tuple[str, str], ...]:
-    """What was read at import: (what, words) pairs."""
+    """Facts read at import: (name, text) pairs."""
     start, stop, step = recording.selected
     used = len(range(start, stop, step))
     which = "all" if used == recording.frames else f"{used}, {start} to {stop - 1}"
@@ -164,12 +164,12 @@ def recording_facts(recording: Recording) -> tuple[tuple[str, str], ...]:
 
 
 def local_time(iso: str) -> str:
-    """A time with its zone as the clock on the wall shows it."""
+    """Text of an ISO 8601 time in local time."""
     return f"{datetime.fromisoformat(iso).astimezone():%Y-%m-%d %H:%M}"
 
 
 def missing_text(session: Session) -> str:
-    """That the recording is not where it was, and what follows; empty if it is."""
+    """Message if the recording is missing, with the consequences; empty if it is not."""
     missing = session.missing_recording
     if missing is None:
         return ""

@@ -1,4 +1,4 @@
-"""Step 5: the dots of a frame, their rows, and how they are corrected by hand."""
+"""Step 5: the dots of a frame, their rows, and corrections by hand."""
 
 from labapp.gui.pages.dots.view import DotsPage
 

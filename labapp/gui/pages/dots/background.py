@@ -1,4 +1,4 @@
-"""What the dots page does in the background: read, look for dots, carry on."""
+"""Background tasks of the dots page: reading, detection, propagation of corrections."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from labapp.gui.workspace import Workspace
 from labapp.media import GreyImage
 
 REST_MS = 120
-"""Time, ms, that a frame stays in view before its dots are searched."""
+"""Time, ms, that a frame stays in view before its dots are detected."""
 
 
 class Looking(QObject):
-    """Reads the frame in view, and looks for dots where the session knows none.
+    """Reads the frame in view, and detects its dots if the session has none.
 
-    One task at a time: when it ends, what is wanted by then comes next.
+    One task runs at a time; when it ends, the last request is processed.
 
     Attributes
     ----------
     frame
-        Number of the frame that was read last.
+        Number of the last frame read.
     image
-        That frame; None where it could not be read.
+        That frame; None if it could not be read.
     why
-        Why not.
+        Reason why it could not be read.
     found
-        What was found last.
+        Last detected dots.
     """
 
     ready = Signal()
-    """There is something new to show."""
+    """New data can be shown."""
 
     def __init__(self, workspace: Workspace) -> None:
         super().__init__()
@@ -48,7 +48,7 @@ class Looking(QObject):
         workspace.opened.connect(self.forget)
 
     def forget(self) -> None:
-        """Another session is open."""
+        """Discard all data after another session was opened."""
         self.frame: int | None = None
         self.image: GreyImage | None = None
         self.why = ""
@@ -75,12 +75,12 @@ class Looking(QObject):
         self._task = self._space.tasks.start(f"Reading frame {frame}", work, done)
 
     def look(self) -> None:
-        """Look for dots in the frame that was read, if it stays in view."""
+        """Detect dots in the last frame read, if it stays in view."""
         if not self._busy and not self._rest.isActive():
             self._rest.start()
 
     def stop(self) -> None:
-        """Look for nothing more."""
+        """Cancel pending detection."""
         self._rest.stop()
 
     @property
@@ -106,7 +106,7 @@ class Looking(QObject):
 
 
 def carry_on(page: Page, seen: DotsState, most: int | None, answer: Message) -> None:
-    """Carry the correction of a frame on, one step that can be undone; then measure."""
+    """Propagate the correction of a frame to later frames, one step of undo; then measure."""
     workspace, session = page.workspace, page.session
 
     def finished(carried: Carried) -> None:

@@ -1,7 +1,6 @@
-"""What is chosen in a frame and what the operator does to it; without Qt.
+"""Selection and edits of the dots of a frame. Without Qt.
 
-Every edit is one of `labapp.core.rows.correction`, handed to the session as one step that can be
-undone.
+Every edit is one of `labapp.core.rows.correction`, and one step of undo in the session.
 """
 
 from __future__ import annotations
@@ -19,25 +18,25 @@ from labapp.core.values import FloatArray, IntArray
 from labapp.gui.pages.dots import picking
 
 Commit = Callable[[str, Callable[[], Correction | None]], bool]
-"""Make an edit, one step of that name; False if it was refused, which is reported."""
+"""Makes an edit, one step of that name; reports an error and returns False if refused."""
 
 NOTHING: IntArray = np.zeros(0, np.int64)
 
 
 class Editor:
-    """The hand on one frame: a selection, a drag under way, and the edits."""
+    """Editing of one frame: selection, drag in progress, and edits."""
 
     def __init__(self, commit: Commit) -> None:
         self._commit = commit
         self.correction: Correction | None = None
-        """The dots and rows that are shown; None without any."""
+        """Displayed dots and rows; None if there are none."""
         self.selection = NOTHING
-        """Indices of the chosen dots, ascending."""
+        """Indices of the selected dots, ascending."""
         self.shift_px: FloatArray = np.zeros(2)
-        """How far a drag or a held key has brought the chosen dots so far, shape (2,)."""
+        """Displacement of the selected dots by a drag or held key in progress, shape (2,), px."""
 
     def show(self, correction: Correction | None, same_frame: bool) -> None:
-        """Work on what a frame shows now; the selection stays where its dots do."""
+        """Show a correction; the selection is kept for the same frame unless dots were removed."""
         before = self.correction
         self.correction = correction
         stays = same_frame and before is not None and correction is not None
@@ -50,7 +49,7 @@ class Editor:
 
     @property
     def dots_px(self) -> FloatArray:
-        """Where the dots are drawn, shape (n, 2), px, a drag under way included."""
+        """Drawn positions of the dots, shape (n, 2), px, including a drag in progress."""
         if self.correction is None:
             return np.zeros((0, 2))
         place = self.correction.dots.image_px.copy()
@@ -60,11 +59,11 @@ class Editor:
     # --- choosing -----------------------------------------------------------------------------
 
     def at(self, u: float, v: float, within_px: float) -> int | None:
-        """Which dot is at a place; None if none is."""
+        """Index of the dot at a position; None if there is none."""
         return picking.nearest(self.dots_px, u, v, within_px)
 
     def click(self, u: float, v: float, within_px: float, add: bool) -> None:
-        """Choose the dot at a place, alone or in addition; adding a chosen one deselects it."""
+        """Select the dot at a position; with ``add``, toggle it in the selection."""
         dot = self.at(u, v, within_px)
         if dot is None:
             self.selection = self.selection if add else NOTHING
@@ -74,12 +73,12 @@ class Editor:
             self.selection = np.array([dot])
 
     def box(self, one: tuple[float, float], other: tuple[float, float], add: bool) -> None:
-        """Choose the dots in a box."""
+        """Select the dots in a box."""
         inside = picking.in_box(self.dots_px, one, other)
         self.selection = np.union1d(self.selection, inside) if add else inside
 
     def choose_rows(self, rows: list[int]) -> None:
-        """Choose all dots of some rows; row 0 is the dots in doubt."""
+        """Select all dots of some rows; row 0 contains the doubtful dots."""
         if self.correction is not None:
             self.selection = np.flatnonzero(np.isin(self.correction.lattice.row, rows))
 
@@ -88,16 +87,16 @@ class Editor:
         self.selection = np.arange(len(self.dots_px))
 
     def choose_doubtful(self) -> None:
-        """Choose the dots without a row or a column."""
+        """Select the dots without a row or column."""
         if self.correction is not None:
             self.selection = np.flatnonzero(~self.correction.sited)
 
     def choose_none(self) -> None:
-        """Let all dots go."""
+        """Clear the selection."""
         self.selection = NOTHING
 
     def choose_next(self, step: int) -> None:
-        """Choose the next dot, or the one before: row by row from the bottom, left to right."""
+        """Select the next or previous dot: row by row from the bottom, left to right."""
         if self.correction is None or not len(self.correction.dots):
             return
         lattice = self.correction.lattice
@@ -109,7 +108,7 @@ class Editor:
 
     @property
     def rows(self) -> list[int]:
-        """Rows that the chosen dots are in, ascending."""
+        """Rows of the selected dots, ascending."""
         if self.correction is None:
             return []
         rows = np.unique(self.correction.lattice.row[self.selection])
@@ -118,7 +117,7 @@ class Editor:
     # --- edits --------------------------------------------------------------------------------
 
     def add(self, image: Image, u: float, v: float, settings: Settings) -> bool:
-        """Add the dot at the pointer, numbered by its neighbours if they determine its place."""
+        """Add the dot at the pointer, numbered by its neighbours if they determine its site."""
 
         def edit(correction: Correction) -> Correction:
             added = core.add_dot(correction, image, u, v, settings.dots.band_pass)
@@ -141,7 +140,7 @@ class Editor:
         return done
 
     def drop(self) -> bool:
-        """Let the chosen dots be where `shift_px` has brought them."""
+        """Move the selected dots by `shift_px`."""
         (du, dv), chosen = self.shift_px.tolist(), self.selection
         self.shift_px = np.zeros(2)
         if du == dv == 0:
@@ -149,28 +148,28 @@ class Editor:
         return self._edit(_of("move", chosen), lambda c: core.move_dots(c, chosen, du, dv))
 
     def assign(self, row: int | None = None, column: int | None = None) -> bool:
-        """Give the chosen dots a row, a column or both."""
+        """Set the row, the column or both of the selected dots."""
         chosen, what = self.selection, "row" if column is None else "column"
         label = f"{what} of {_count(chosen)}"
         return self._edit(label, lambda c: core.assign(c, chosen, row, column))
 
     def number(self) -> bool:
-        """Give the chosen dots the row and column that follow from their neighbours."""
+        """Set the row and column of the selected dots from their neighbours."""
         chosen = self.selection
         label = f"number {_count(chosen)}"
         return self._edit(label, lambda c: picking.numbered_by_neighbours(c, _some(chosen)))
 
     def put_in_doubt(self) -> bool:
-        """Put the selected dots in doubt: without row and column."""
+        """Mark the selected dots as doubtful: without row and column."""
         chosen = self.selection
         return self._edit(_of("put in doubt", chosen), lambda c: core.clear_rows(c, chosen))
 
     def shift(self, columns: int) -> bool:
-        """Shift the rows of the chosen dots by columns: right if positive."""
+        """Shift the rows of the selected dots by columns, to the right if positive."""
         rows = self.rows
 
         def edit(correction: Correction) -> Correction:
-            # The rows may be renumbered after each; they are shifted from what they were.
+            # Each shift may renumber rows, so all start from the original numbers.
             for row in _wanted(rows):
                 correction = core.shift_row(correction, row, columns)
             return correction
@@ -179,7 +178,7 @@ class Editor:
         return self._edit(f"shift {_named(rows)} {way}", edit)
 
     def split(self, above: bool = True) -> bool:
-        """Split the row of the one chosen dot: from it on to the right it is a row of its own."""
+        """Split the row of the selected dot: the dot and those to its right form a new row."""
         chosen = self.selection
 
         def edit(correction: Correction) -> Correction:
@@ -205,7 +204,7 @@ class Editor:
         return self._edit(f"merge {_named(rows)}", edit)
 
     def block(self) -> bool:
-        """Mark the rows of the chosen dots as blocked by the torch; if all are, unmark them."""
+        """Mark the rows of the selected dots as blocked by the torch, or unmark them if all are."""
         rows, correction = self.rows, self.correction
         marked = correction is not None and set(rows) <= correction.lattice.blocked_rows
 
@@ -217,11 +216,11 @@ class Editor:
         return self._edit(f"{'un' if marked else ''}block {_named(rows)}", edit)
 
     def set_reference(self, site: Site | None) -> bool:
-        """Say at which row and column the reference is; None leaves it to be found."""
+        """Set the site of the reference; None: determine it automatically."""
         return self._edit("reference", lambda c: core.set_reference(c, site))
 
     def point_at_reference(self, u: float, v: float) -> bool:
-        """Say that the reference is the site at a place."""
+        """Set the site at a position as the reference."""
 
         def edit(correction: Correction) -> Correction:
             found = picking.site_at(correction, u, v)
@@ -232,7 +231,7 @@ class Editor:
         return self._edit("reference", edit)
 
     def back_to_automatic(self) -> bool:
-        """Forget the correction."""
+        """Remove the correction."""
         return self._commit("back to automatic", lambda: None)
 
     def _edit(self, label: str, edit: Callable[[Correction], Correction]) -> bool:

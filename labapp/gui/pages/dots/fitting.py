@@ -1,4 +1,4 @@
-"""The fit that follows an edit: one at a time, and the last edit wins."""
+"""Refit after an edit: one at a time, and only the last edit counts."""
 
 from __future__ import annotations
 
@@ -17,48 +17,48 @@ from labapp.run.measurers import measuring_pool
 from labapp.simulation.parallel import end_processes
 
 WARM_MS = 1500
-"""The page is shown first; its processes begin then."""
+"""Delay, ms, of the start of the processes after the page is shown."""
 
 AGAIN_MS = 50
-"""Time, ms, after which an edit that cannot replace the fit before it yet tries again."""
+"""Interval, ms, of attempts to replace the previous fit after an edit."""
 
 
 class Processes:
-    """A process to fit in, and another, warm, that takes its place when it is ended."""
+    """A process for fits, and a warm spare one that replaces it when it is killed."""
 
     def __init__(self) -> None:
         self._pools: list[tuple[ProcessPoolExecutor, Future[Settings]]] = []
 
     def begin(self) -> None:
-        """Have both: the second is there at once when the first is ended."""
+        """Start missing processes, so that a spare one is always available."""
         while len(self._pools) < 2:
             pool = measuring_pool(1)
-            # Making settings loads all modules of the measurement.
+            # Creating settings imports all modules of the measurement.
             self._pools.append((pool, pool.submit(Settings)))
 
     @property
     def begun(self) -> bool:
-        """Whether there are any."""
+        """Whether the processes were started."""
         return bool(self._pools)
 
     @property
     def first(self) -> ProcessPoolExecutor:
-        """The one to fit in."""
+        """The process for fits."""
         self.begin()
         return self._pools[0][0]
 
     @property
     def ready(self) -> bool:
-        """Whether the second could begin at once."""
+        """Whether the spare process is ready."""
         return len(self._pools) == 2 and self._pools[1][1].done()
 
     def replace(self) -> None:
-        """Kill the first, and put the second in its place."""
+        """Kill the first process, and replace it by the spare one."""
         end_processes(self._pools.pop(0)[0], wait=False)
         self.begin()
 
     def end(self) -> None:
-        """End both."""
+        """End both processes."""
         while self._pools:
             end_processes(self._pools.pop()[0], wait=False)
 
@@ -66,8 +66,8 @@ class Processes:
 class Refit:
     """Measures a frame again whenever its dots or rows were changed by hand.
 
-    One fit at a time, in a process of its own: a long measurement does not hold it up. An edit made
-    meanwhile ends it at once and begins another, of what the frame has then.
+    One fit runs at a time, in a separate process, so that a long measurement does not delay it. An
+    edit during a fit ends it immediately and starts another one with the new correction.
     """
 
     def __init__(self, workspace: Workspace) -> None:
@@ -76,7 +76,7 @@ class Refit:
         self._begun: tuple[int, object] | None = None
         self._seen: tuple[int, bool] | None = None
         self.processes = Processes()
-        """The processes that fit."""
+        """Processes for the fits."""
         self._warm, self._again = QTimer(workspace), QTimer(workspace)
         for timer, rest_ms, work in (
             (self._warm, WARM_MS, self.processes.begin),
@@ -89,18 +89,18 @@ class Refit:
 
     @property
     def pending(self) -> bool:
-        """Whether a fit is under way."""
+        """Whether a fit is running."""
         return self._task is not None and self._task in self._space.tasks.active
 
     def want(self, frame: int, due: bool) -> None:
-        """Fit a frame if it is due: what it was measured from has been changed by hand."""
+        """Fit a frame if it is due because its dots or rows were changed by hand."""
         session = self._space.session
         if session is None or why_not_measurable(session):
             return
         self._seen = frame, due
         if not self.processes.begun and not self._warm.isActive():
             self._warm.start()
-        # A fit that was refused or cancelled is not begun again until something else is tried.
+        # A refused or cancelled fit is not repeated until something else changes.
         state = (frame, session.history)
         if state == self._begun:
             return
@@ -136,13 +136,13 @@ class Refit:
                 for _ in session.measure_each([frame], _Patient(pool, control)):
                     control.check()
             except BrokenProcessPool as error:
-                control.check()  # ended on purpose
+                control.check()  # raises if it was ended on purpose
                 raise ValueError("the process that fits has ended: measure the frame") from error
 
         self._task = space.tasks.start("Fitting", work, lambda _: space.changed.emit())
 
     def _forget(self) -> None:
-        """Another session is open, or none."""
+        """Discard requests after another session was opened."""
         self._warm.stop()
         self._again.stop()
         self._task = self._begun = self._seen = None
@@ -150,7 +150,7 @@ class Refit:
 
 
 class _Patient(Executor):
-    """A pool whose results are waited for only as long as the task is wanted."""
+    """A pool whose results are waited for only until the task is cancelled."""
 
     def __init__(self, pool: Executor, control: Control) -> None:
         self._pool, self._control = pool, control

@@ -1,4 +1,4 @@
-"""What the page shows of a frame of a line pattern, without Qt."""
+"""Data of the dots page for a frame of a line pattern. Without Qt."""
 
 from __future__ import annotations
 
@@ -33,48 +33,48 @@ STATUSES = {
 
 @dataclass(frozen=True)
 class DrawnLine:
-    """A line as it is drawn."""
+    """A line to draw."""
 
     name: str
-    """Its number in the pattern; in brackets its place from the lowest up where no number is sure.
+    """Its number in the pattern, or in brackets its position from the lowest up if that is unsure.
     """
     image_px: FloatArray
     """(u, v) of its ridge, shape (n, 2), px."""
     ends_px: FloatArray
     """(u, v) of its ends, shape (2, 2), px."""
     cut: BoolArray
-    """Whether each end is at the picture's edge, shape (2,)."""
+    """Whether each end is at the edge of the picture, shape (2,)."""
     folded: bool
 
 
 @dataclass(frozen=True)
 class LinesState:
-    """What the page shows of one frame."""
+    """Data shown for one frame."""
 
     words: str
-    """What is seen, in a sentence or two."""
+    """Text describing the frame, one or two sentences."""
     lines: tuple[DrawnLine, ...] = ()
-    """From the lowest in the picture up."""
+    """Lines from the lowest in the picture up."""
     listed: tuple[tuple[str, ...], ...] = ()
-    """A row of the list for each line, from the top of the picture down: see `COLUMNS`."""
+    """Row of the list for each line, from the top of the picture down, see `COLUMNS`."""
     rows: tuple[ResultRow, ...] = ()
-    """What the lines show, and what they say of the pool."""
+    """Results for the lines and the pool."""
     why: str = ""
-    """Why there is no surface, or why the result is stale; empty if neither."""
+    """Reason why there is no surface or the result is stale; empty if neither."""
     correction: LineCorrection | None = None
-    """What an edit begins with; None where no lines are known."""
+    """Start of an edit; None if no lines are known."""
     by_hand: bool = False
     """Whether the lines were corrected by hand."""
     due: bool = False
-    """Whether they are to be measured again, as they were corrected."""
+    """Whether they must be measured again after a correction."""
 
 
 COLUMNS = ("Line", "Length, px", "Width, px", "Gap, px", "Ends")
-"""Of the list of lines."""
+"""Columns of the list of lines."""
 
 
 def show_lines(session: Session, frame: int) -> LinesState:
-    """What a frame shows: its lines as they were corrected or measured."""
+    """Data of a frame: its corrected or measured lines."""
     correction = session.line_correction(frame)
     try:
         result = session.result(frame)
@@ -102,7 +102,7 @@ def show_lines(session: Session, frame: int) -> LinesState:
 
 
 def _followed(found: LineFrame, why: str) -> LinesState:
-    """What a frame shows of one line that is followed; it has no edits."""
+    """Data of a frame with a single tracked line, which cannot be edited."""
     rows = [ResultRow("Pulse", found.pulse, decimals=2, note="Probability that a pulse is on")]
     track = found.track
     if track is None:
@@ -120,7 +120,7 @@ def _followed(found: LineFrame, why: str) -> LinesState:
 
 
 def _with_lines(state: LinesState, names: Sequence[str], by_hand: bool, due: bool) -> LinesState:
-    """The state with its lines to be drawn and listed."""
+    """Copy of the state with lines to draw and list."""
     assert state.correction is not None
     named = tuple(zip(names, state.correction.seen.lines, strict=True))
     drawn = (DrawnLine(name, one.image_px, one.ends_px, one.cut, one.folded) for name, one in named)
@@ -129,12 +129,12 @@ def _with_lines(state: LinesState, names: Sequence[str], by_hand: bool, due: boo
 
 
 def _places(number: IntArray) -> list[str]:
-    """Numbers by hand; the place of a line, in brackets, where it has none."""
+    """Numbers set by hand, or the position of a line, in brackets, if it has none."""
     return [str(n) if n else f"({k + 1})" for k, n in enumerate(number.tolist())]
 
 
 def line_names(found: LineFrame, by_hand: IntArray | None = None) -> tuple[str, ...]:
-    """Number of each line in the pattern; its place, in brackets, where that is not settled."""
+    """Number of each line in the pattern, or its position, in brackets, if that is unsure."""
     places = _places(np.zeros(len(found.seen.lines), np.int64) if by_hand is None else by_hand)
     if found.status != "ok" or found.surface is None:
         return tuple(places)

@@ -1,4 +1,4 @@
-"""Correcting the lines of a frame: what is chosen, and edits that are each one step of undo."""
+"""Correction of the lines of a frame: selection, and edits that are each one step of undo."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from labapp.gui.views.drag_point import SHIFT
 from labapp.gui.views.picture import Tool
 
 MakeAction = Callable[[str, str, str, Callable[[], object]], QAction]
-"""Makes an action of the page: its words, its key, what it does in a sentence, and it."""
+"""Creates an action of the page from its text, key, tip and function."""
 
 REACH = 12.0
-"""A line is meant by a pointer this near, in points of the screen."""
+"""Largest distance of the pointer from a line to select it, points of the screen."""
 
 CUT_WHERE = "Click where the line is to be cut (Esc: leave it)"
 
@@ -38,14 +38,14 @@ UNMET = {
 
 
 class LinesHand(Tool):
-    """Chooses lines by clicks and corrects them.
+    """Selection of lines by clicks, and their correction.
 
     Parameters
     ----------
     page, overlay
-        Whose frame it works on, and the lines over its picture.
+        The page of the frame, and the lines over its picture.
     make_action, pointer
-        Makes an action of the page; says where the pointer is in the frame.
+        Creates an action of the page; returns the position of the pointer in the frame.
     """
 
     def __init__(
@@ -58,9 +58,9 @@ class LinesHand(Tool):
         self._page, self._overlay = page, overlay
         self._make_action, self._pointer = make_action, pointer
         self.state = LinesState("")
-        """What is shown."""
+        """The displayed data."""
         self.chosen: list[int] = []
-        """Places of the chosen lines, from the lowest up."""
+        """Positions of the selected lines, counted from the lowest up."""
         self._cuts = False
         self._needs: list[tuple[QAction, str, str]] = []
         self.actions = [
@@ -72,7 +72,7 @@ class LinesHand(Tool):
                          "Forget the corrections of this frame", self.automatic, "corrected"),
         ]  # fmt: skip
         self.panel = LinesPanel(self.actions)
-        """What stands beside the frame."""
+        """Panel at the side of the frame."""
         listed = self.panel.lines
         listed.itemSelectionChanged.connect(lambda: self.choose(listed.places))
         self.panel.number.edited.connect(self.number)
@@ -88,14 +88,14 @@ class LinesHand(Tool):
     # --- what is shown and chosen -------------------------------------------------------------
 
     def show(self, state: LinesState, same_frame: bool) -> None:
-        """Work on what a frame shows now."""
+        """Show the data of a frame."""
         if not same_frame or len(state.lines) != len(self.state.lines):
             self.chosen = []
         self.state = state
         self._draw()
 
     def choose(self, lines: list[int]) -> None:
-        """Choose lines."""
+        """Select lines."""
         self.chosen = lines
         self._draw()
 
@@ -120,7 +120,7 @@ class LinesHand(Tool):
             action.setToolTip(f"{unmet}. {tip}" if unmet else tip)
 
     def click(self, u: float, v: float, modifiers: Qt.KeyboardModifier) -> None:
-        """Choose the line at a place, Shift: in addition; or cut it there."""
+        """Select the line at a position (Shift: add it to the selection), or cut it there."""
         if self._cuts:
             self._cuts = False
             self.cut_at(u, v)
@@ -134,27 +134,27 @@ class LinesHand(Tool):
             self.choose([line[0]])
 
     def point_out(self, u: float, v: float) -> None:
-        """Choose the line for the menu, unless it is among the chosen ones."""
+        """Select the line for the menu, unless it is selected already."""
         line = self._at(u, v)
         if line is None or line[0] not in self.chosen:
             self.choose([] if line is None else [line[0]])
 
     def _at(self, u: float, v: float) -> tuple[int, int] | None:
-        """Line at a place and its point there; None without one."""
+        """Line at a position and its point there; None if there is none."""
         if self.state.correction is None or not self.state.lines:
             return None
         line, point, away = nearest_line(self.state.correction.seen.lines, u, v)
         return (line, point) if away <= REACH * self._overlay.px_per_point else None
 
     def escape(self) -> None:
-        """Choose no line; no cut is awaited any more."""
+        """Clear the selection, and cancel a pending cut."""
         self._cuts = False
         self.choose([])
 
     # --- edits --------------------------------------------------------------------------------
 
     def cut(self) -> None:
-        """Cut the line under the pointer; without one there, where the next click is."""
+        """Cut the line under the pointer, or else at the next click."""
         place = self._pointer()
         if place is not None and self._at(*place) is not None:
             self.cut_at(*place)
@@ -163,7 +163,7 @@ class LinesHand(Tool):
             self._draw()
 
     def cut_at(self, u: float, v: float) -> None:
-        """Cut the line at a place."""
+        """Cut the line at a position."""
         at = self._at(u, v)
 
         def edit(now: LineCorrection) -> LineCorrection:
@@ -174,7 +174,7 @@ class LinesHand(Tool):
         self._edit("cut a line", edit)
 
     def join(self) -> None:
-        """Join the two chosen lines."""
+        """Join the two selected lines."""
         one, other = self.chosen
         self._edit("join two lines", lambda now: join_lines(now, one, other))
 
@@ -190,7 +190,7 @@ class LinesHand(Tool):
         self._edit("delete lines", edit)
 
     def number(self, value: float | None) -> None:
-        """Give the chosen line its number in the pattern; None leaves it to be found."""
+        """Set the number of the selected line in the pattern; None: determine it automatically."""
         if len(self.chosen) == 1:
             line, rig = self.chosen[0], self._page.session.setup.line_rig
             assert rig is not None
@@ -198,7 +198,7 @@ class LinesHand(Tool):
             self._edit("number a line", lambda now: number_line(now, line, number, count))
 
     def automatic(self) -> None:
-        """Forget the correction."""
+        """Remove the correction."""
         self._edit("back to automatic", lambda _: None)
 
     def _edit(self, label: str, edit: Callable[[LineCorrection], LineCorrection | None]) -> None:

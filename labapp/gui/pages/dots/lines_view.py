@@ -1,8 +1,8 @@
-"""Reflected lines as they are drawn over a frame, and the panel beside it.
+"""Overlay of reflected lines on a frame, and the panel at its side.
 
-Every line has its colour and its number. A ring is an end, a square one where the picture cuts the
-line off or a hand cut it; a dashed line is folded: its halves lie on each other. A chosen line is
-drawn wider.
+Every line has a colour and a number. A ring marks an end; a square marks an end at the edge of the
+picture or of a cut by hand. A dashed line is folded, so that its halves coincide. A selected line
+is drawn wider.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ END = 11.0
 """Diameter of the mark of an end, points of the screen."""
 
 BESIDE = 14.0
-"""How far beside a line's right end its number stands, points of the screen."""
+"""Distance of a line's number from its right end, points of the screen."""
 
 
 class LinesOverlay:
-    """The lines over a picture."""
+    """Lines drawn over a picture."""
 
     def __init__(self, view: PictureView) -> None:
         self._view = view
@@ -42,7 +42,7 @@ class LinesOverlay:
         view.box.sigXRangeChanged.connect(lambda *_: self._place_labels())
 
     def show(self, lines: tuple[DrawnLine, ...], chosen: Sequence[int] = ()) -> None:
-        """Draw lines in place of those drawn before."""
+        """Draw lines instead of the previous ones."""
         for item in (*self._items, *(label for label, _ in self._labels)):
             self._view.box.removeItem(item)
         self._items, self._labels = [], []
@@ -70,7 +70,7 @@ class LinesOverlay:
 
     @property
     def px_per_point(self) -> float:
-        """Pixels of the picture in a point of the screen."""
+        """Number of picture px per point of the screen."""
         return self._view.px_per_point
 
     def _place_labels(self) -> None:
@@ -80,7 +80,7 @@ class LinesOverlay:
 
 
 class LinesPanel(QWidget):
-    """What stands beside the frame of a line pattern."""
+    """Panel at the side of a frame of a line pattern."""
 
     def __init__(self, edits: Sequence[QAction]) -> None:
         super().__init__()
@@ -104,7 +104,7 @@ class LinesPanel(QWidget):
         )
 
     def show_chosen(self, lines: Sequence[int], asked: str, number: int, why: str) -> None:
-        """Show the chosen lines, from the lowest up: what is asked for, and a number by hand."""
+        """Show the selected lines, a pending request, and a number set by hand."""
         count = len(lines)
         words = f"{count} selected" if count else "Click a line to select it, Shift adds one"
         self.chosen.setText(asked or words)
@@ -113,7 +113,7 @@ class LinesPanel(QWidget):
         self.lines.select_rows([self.lines.rowCount() - 1 - k for k in lines])
 
     def show_frame(self, state: LinesState) -> None:
-        """Show what the session says of the frame in view."""
+        """Show the session's data of the frame in view."""
         self.seen.setText(state.words)
         show_words(self.why, f"⚠ {state.why[:1].upper()}{state.why[1:]}" if state.why else "")
         self.lines.show_lines(state.listed)
@@ -121,7 +121,7 @@ class LinesPanel(QWidget):
 
 
 class LineList(ReadTable):
-    """The lines of a frame from the top down; choosing a row chooses its line."""
+    """List of a frame's lines from the top down; selecting a row selects its line."""
 
     def __init__(self) -> None:
         super().__init__("Lines", "Lines of the frame, from the top down", list(COLUMNS))
@@ -129,7 +129,7 @@ class LineList(ReadTable):
         header.setSectionResizeMode(len(COLUMNS) - 1, QHeaderView.ResizeMode.Stretch)
 
     def show_lines(self, listed: tuple[tuple[str, ...], ...]) -> None:
-        """List lines."""
+        """Show the rows of the lines."""
         self.setRowCount(len(listed))
         for k, cells in enumerate(listed):
             for column, text in enumerate(cells):
@@ -138,13 +138,13 @@ class LineList(ReadTable):
 
     @property
     def places(self) -> list[int]:
-        """Places of the chosen lines, from the lowest up, ascending."""
+        """Positions of the selected lines, counted from the lowest up, ascending."""
         rows = {index.row() for index in self.selectedIndexes()}
         return sorted(self.rowCount() - 1 - row for row in rows)
 
 
 def _with_gaps(points: np.ndarray) -> np.ndarray:
-    """Points of a line, NaN where it has a gap: nothing is drawn there."""
+    """Points of a line with NaN in its gaps, where nothing is drawn."""
     gaps = np.flatnonzero(np.linalg.norm(np.diff(points, axis=0), axis=-1) > 3.0) + 1
     return np.insert(points, gaps, np.nan, axis=0)
 

@@ -1,8 +1,8 @@
-"""Dots, rows and columns as they are drawn over a frame: few items, whatever the number of dots.
+"""Overlay of dots, rows and columns on a frame: few items for any number of dots.
 
-Every row has its colour and its number. A ring is a dot, a square one that a hand has placed; a
-dashed ring is in doubt, a hatched one in a row that the torch blocks, whose line is dashed too. A
-small cross is where the measured surface puts a dot; a large ring is the reference.
+Every row has a colour and a number. A ring marks a dot, and a square a dot placed by hand. A dashed
+ring is doubtful; a hatched one is in a row blocked by the torch, whose line is dashed, too. A small
+cross marks a position computed from the measured surface; a large ring marks the reference.
 """
 
 from __future__ import annotations
@@ -22,27 +22,27 @@ from labapp.gui.pages.dots import picking
 from labapp.gui.views.picture import PictureView
 
 ROW_COLORS = ("#e69f00", "#56b4e9", "#2fd39b", "#f0e442", "#6f9bff", "#ff7a3c", "#e58cc0")
-"""Okabe and Ito's, safe for the colour-blind, as light as they have to be over a dark frame."""
+"""Colours by Okabe and Ito, safe for the colour-blind, light enough for a dark frame."""
 
 DOUBT = "#ffffff"
 CHOSEN = "#ffffff"
 COMPUTED = "#ff5c5c"
 BLOCKED = "⊘"
-"""Beside the number of a row that the torch blocks."""
+"""Sign at the number of a row blocked by the torch."""
 
 TINY, LEAST, MOST, CHOSEN_MORE = 7.0, 13.0, 60.0, 4.0
-"""Diameters of rings, points of the screen: where dots crowd, else never less, never more, and
-more for chosen dots."""
+"""Diameters of rings, points of the screen: for crowded dots, otherwise minimum and maximum, and
+increment for selected dots."""
 
 CROSS = 9.0
-"""Width of a cross, points of the screen; less in a ring that is smaller than usual."""
+"""Width of a cross, points of the screen; less in a smaller ring."""
 
 DOT_WIDTHS = 6.0
-"""A ring is so many σ of a dot's light wide at a near zoom: round the dot, not on it."""
+"""Diameter of a ring in σ of a dot's light at high zoom, so that it surrounds the dot."""
 
 
 class DotsOverlay:
-    """The marks of the dots page over a picture."""
+    """Marks of the dots page over a picture."""
 
     def __init__(self, view: PictureView) -> None:
         self._view = view
@@ -74,7 +74,7 @@ class DotsOverlay:
         selection: IntArray,
         computed_px: FloatArray,
     ) -> None:
-        """Draw dots at places, shape (n, 2), px, which are the correction's unless dragged."""
+        """Draw dots at positions, shape (n, 2), px: those of the correction unless dragged."""
         if correction is not self._correction:
             self._correction = correction
             self._joints = _joints(correction)
@@ -88,7 +88,7 @@ class DotsOverlay:
         self._draw_reference(correction)
 
     def _ring(self) -> float:
-        """Diameter of a ring at the present zoom, points of the screen."""
+        """Diameter of a ring at the current zoom, points of the screen."""
         if self._correction is None or not len(self._correction.dots):
             return LEAST
         width = DOT_WIDTHS * float(np.median(self._correction.dots.size_px))
@@ -99,7 +99,7 @@ class DotsOverlay:
         return CROSS * min(self._size / LEAST, 1.0)
 
     def _rescale(self) -> None:
-        """Draw rings round the dots at another zoom."""
+        """Adjust the rings to another zoom."""
         correction, (dots_px, selection) = self._correction, self._drawn
         if self._ring() != self._size:
             self._size = self._ring()
@@ -117,13 +117,13 @@ class DotsOverlay:
         self._draw_labels(self._correction, self._drawn[0])
 
     def show_box(self, one: tuple[float, float], other: tuple[float, float]) -> None:
-        """Show the box that the pointer draws."""
+        """Show the selection box."""
         corners = np.sort(np.array([one, other]), axis=0)
         self._box.setRect(QRectF(*corners[0], *(corners[1] - corners[0])))
         self._box.show()
 
     def hide_box(self) -> None:
-        """The box is drawn."""
+        """Hide the selection box."""
         self._box.hide()
 
     def _draw_lines(self, dots_px: FloatArray) -> None:
@@ -183,7 +183,7 @@ class _Marks(pg.ScatterPlotItem):  # type: ignore[misc]
     """Marks that leave clicks to the picture's tool."""
 
     def mouseClickEvent(self, event: Any) -> None:
-        """Leave it."""
+        """Ignore the click."""
         event.ignore()
 
 
@@ -206,7 +206,7 @@ def _look(row: int, sited: bool, blocked: bool, chosen: bool) -> tuple[QPen, QBr
 
 
 def _apart(dots_px: FloatArray) -> float:
-    """How far dots are from their nearest, px, the median; infinite for one or none."""
+    """Median distance between nearest dots, px; infinite for fewer than two dots."""
     if len(dots_px) < 2:
         return np.inf
     return float(np.median(scipy.spatial.cKDTree(dots_px).query(dots_px, 2)[0][:, 1]))

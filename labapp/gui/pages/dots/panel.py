@@ -1,4 +1,4 @@
-"""The panel of the dots page: what is seen, the edits, the fit, the rows, the detector."""
+"""Panel of the dots page: description of the frame, edits, fit, rows, detector."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ COLUMNS_OF_BUTTONS = 3
 
 
 class MeasureLead(QStackedWidget):
-    """Offers to measure, or where a set-up can come from; of one height: nothing below it moves."""
+    """Buttons for measuring, or for getting a set-up; of constant height, so that nothing moves."""
 
     def __init__(self, do: Callable[[str], object]) -> None:
         super().__init__()
@@ -56,14 +56,14 @@ class MeasureLead(QStackedWidget):
         self.setSizePolicy(QSizePolicy.Policy.Preferred, QSizePolicy.Policy.Fixed)
 
     def offer(self, without_setup: bool, why_not: str) -> None:
-        """Offer one of the two; greyed out where neither can be."""
+        """Offer one of the two; disabled if neither is possible."""
         self.setCurrentIndex(int(without_setup))
         self.setEnabled(not why_not)
         self.setToolTip(plain_tip(why_not))
 
 
 class DotsPanel(QWidget):
-    """What stands beside the frame; the page listens to its fields and its list of rows."""
+    """Panel at the side of the frame; the page uses the signals of its fields and list of rows."""
 
     def __init__(
         self,
@@ -71,7 +71,7 @@ class DotsPanel(QWidget):
         frames: Sequence[QAction],
     ) -> None:
         super().__init__()
-        # The buttons stay under the hand, whatever there is to say.
+        # The buttons do not move, whatever the texts are.
         self.seen, self.chosen, self.why = Message(3), Message(2), wrapping_label()
         self.carried = Message(2)
         self.fit = ResultTable("Fit before the last edit and after it")
@@ -96,7 +96,7 @@ class DotsPanel(QWidget):
     def show_frame(
         self, seen: str, why: str, fit: Sequence[ResultRow], rows: Sequence[RowLine] | None
     ) -> None:
-        """Show what the session says of the frame in view; None leaves the list of rows."""
+        """Show the session's data of the frame in view; None keeps the list of rows."""
         self.seen.setText(seen)
         show_words(self.why, f"⚠ {why[:1].upper()}{why[1:]}" if why else "")
         self.fit.set_rows(fit)
@@ -104,19 +104,19 @@ class DotsPanel(QWidget):
             self.rows.show_lines(rows)
 
     def show_chosen(self, words: str, rows: Sequence[int], site: tuple[int, int]) -> None:
-        """Show what is chosen: in words, its rows, and the site of a single dot (0: none)."""
+        """Show the selection: text, rows, and the site of a single dot (0: none)."""
         self.chosen.setText(words)
         self.rows.choose(rows)
         self.row.set_value(site[0] or None)
         self.column.set_value(site[1] or None)
 
     def show_unmet_needs(self, unmet_need: Mapping[str, str]) -> bool:
-        """Grey out the buttons of edits that lack something, and say what; by their words.
+        """Disable the buttons of edits with unmet needs, given by the buttons' texts.
 
         Returns
         -------
         bool
-            Whether the one with the focus is among them.
+            Whether the button with the focus is among them.
         """
         focused = False
         for words, why in unmet_need.items():
@@ -128,7 +128,7 @@ class DotsPanel(QWidget):
         return focused
 
     def lock_sites(self, dots: str, reference: str) -> None:
-        """Take no row and column of dots, or of the reference, and say why; empty: take them."""
+        """Lock row and column of the dots, or of the reference, with a reason; empty: unlock."""
         for why, fields in (
             (dots, (self.row, self.column)),
             (reference, (self.reference_row, self.reference_column)),
@@ -137,13 +137,13 @@ class DotsPanel(QWidget):
                 field.lock(why)
 
     def show_reference(self, site: tuple[int, int] | None) -> None:
-        """Show where the reference is."""
+        """Show the site of the reference."""
         row, column = site or (None, None)
         self.reference_row.set_value(row)
         self.reference_column.set_value(column)
 
     def show_settings(self, settings: Settings) -> None:
-        """Show how dots are found."""
+        """Show the settings of the detector."""
         self.method.set_value(settings.dots.method)
         self.row_search.set_value(settings.lattice.method)
         for number, field in zip(NUMBERS, self.numbers, strict=True):
@@ -152,7 +152,7 @@ class DotsPanel(QWidget):
             field.label.setVisible(number.method == settings.dots.method)
 
     def _sites(self) -> QGridLayout:
-        """Row and column of the chosen dots, and of the reference."""
+        """Fields for row and column of the selected dots, and of the reference."""
 
         def field(label: str, tip: str) -> NumberField:
             made = NumberField(
@@ -180,7 +180,7 @@ class DotsPanel(QWidget):
 
     @property
     def reference(self) -> Site | None:
-        """Row and column that were entered for the reference; None without both."""
+        """Entered row and column of the reference; None if either is missing."""
         row, column = self.reference_row.value(), self.reference_column.value()
         return None if row is None or column is None else (int(row), int(column))
 
@@ -210,7 +210,7 @@ class DotsPanel(QWidget):
 
 
 def button_grid(actions: Sequence[QAction], buttons: dict[str, QToolButton]) -> QGridLayout:
-    """Lay out a button for each action; ``buttons`` gets them by their words."""
+    """Grid with a button for each action; ``buttons`` is filled with them by their texts."""
     grid = QGridLayout()
     grid.setSpacing(3)
     for k, action in enumerate(actions):
@@ -224,7 +224,7 @@ def button_grid(actions: Sequence[QAction], buttons: dict[str, QToolButton]) -> 
 
 
 class _RowList(ReadTable):
-    """The rows from the top down; choosing a line chooses its dots."""
+    """List of rows from the top down; selecting a line selects its dots."""
 
     def __init__(self) -> None:
         tip = (
@@ -239,7 +239,7 @@ class _RowList(ReadTable):
         self.show_lines(())
 
     def show_lines(self, lines: Sequence[RowLine]) -> None:
-        """Show rows; what is chosen stays with its row."""
+        """Show rows; the selection is kept by row."""
         lines = lines[:MOST_ROWS]
         chosen = self.chosen()
         with QSignalBlocker(self):
@@ -251,14 +251,14 @@ class _RowList(ReadTable):
                     self.set_cell(k, column, text, number=column < 3)
         self.choose(chosen)
         self.resizeRowsToContents()
-        # What is below must not jump from frame to frame.
+        # Widgets below must not jump from frame to frame.
         self.setFixedHeight(max(self.full_height, self.minimumHeight() if lines else 0))
 
     def chosen(self) -> list[int]:
-        """Rows of the chosen lines."""
+        """Rows of the selected lines."""
         lines = sorted({index.row() for index in self.selectedIndexes()})
         return [self._numbers[k] for k in lines if k < len(self._numbers)]
 
     def choose(self, rows: Sequence[int]) -> None:
-        """Select the lines of rows; emits no signal."""
+        """Select the lines of rows without a signal."""
         self.select_rows([k for k, row in enumerate(self._numbers) if row in rows])

@@ -1,4 +1,4 @@
-"""What lies where in a frame: dots under the pointer, joined dots, sites. Arrays only, no Qt."""
+"""Geometry of a frame's dots: dots at the pointer, joined dots, sites. Without Qt."""
 
 from __future__ import annotations
 
@@ -9,21 +9,21 @@ from labapp.core.rows.lattice import Site
 from labapp.core.values import FloatArray, IntArray
 
 NEIGHBOURS = 8
-"""Number of numbered dots that a site is estimated from."""
+"""Number of numbered dots used to estimate a site."""
 
 FAR_OFF = 0.35
-"""A dot farther than this share of a step from every site is not numbered."""
+"""Distance from the nearest site, in steps, above which a dot is not numbered."""
 
 
 def nearest(dots_px: FloatArray, u: float, v: float, within_px: float) -> int | None:
-    """Which dot is at a place; None if none is near enough.
+    """Index of the dot nearest to a position; None if none is near enough.
 
     Parameters
     ----------
     dots_px
         (u, v) of the dots, shape (n, 2), px.
     within_px
-        Farthest distance, px.
+        Largest distance, px.
     """
     if len(dots_px) == 0:
         return None
@@ -33,17 +33,17 @@ def nearest(dots_px: FloatArray, u: float, v: float, within_px: float) -> int | 
 
 
 def in_box(dots_px: FloatArray, one: tuple[float, float], other: tuple[float, float]) -> IntArray:
-    """Which dots lie in the box with these two corners, its edges included, shape (m,)."""
+    """Indices of the dots in the box with these corners, edges included, shape (m,)."""
     corners = np.array([one, other])
     inside = (dots_px >= corners.min(axis=0)) & (dots_px <= corners.max(axis=0))
     return np.flatnonzero(inside.all(axis=1))
 
 
 def joints(row: IntArray, column: IntArray) -> tuple[IntArray, IntArray]:
-    """Dots that follow each other along rows, and along columns: pairs, each shape (m, 2).
+    """Pairs of consecutive dots along rows, and along columns, each of shape (m, 2).
 
-    Along a row the next dot is joined wherever it is; along a column only that of the next row, so
-    that a column that a row shifted by mistake runs through is seen to break.
+    Along a row the next dot is joined at any distance; along a column only a dot of the next row,
+    so that a row shifted by mistake visibly interrupts the columns.
     """
     sited = np.flatnonzero((row > 0) & (column > 0))
     order = sited[np.lexsort((column[sited], row[sited]))]
@@ -56,7 +56,7 @@ def joints(row: IntArray, column: IntArray) -> tuple[IntArray, IntArray]:
 
 
 def row_ends(row: IntArray, dots_px: FloatArray) -> tuple[tuple[int, int], ...]:
-    """Each row's number and its leftmost dot."""
+    """Number and leftmost dot of each row."""
     ends = []
     for k in np.unique(row[row > 0]).tolist():
         members = np.flatnonzero(row == k)
@@ -65,9 +65,9 @@ def row_ends(row: IntArray, dots_px: FloatArray) -> tuple[tuple[int, int], ...]:
 
 
 def site_at(correction: Correction, u: float, v: float) -> tuple[Site, float] | None:
-    """Which site (k, t) is at a place, and how far its middle is, in steps; None without rows.
+    """Site (k, t) at a position, and the distance of its centre in steps; None without rows.
 
-    It follows from the numbered dots round the place.
+    It is estimated from the numbered dots around the position.
     """
     sited = np.flatnonzero(correction.sited)
     places = correction.dots.image_px[sited]
@@ -87,7 +87,7 @@ def site_at(correction: Correction, u: float, v: float) -> tuple[Site, float] | 
 
 
 def site_px(correction: Correction, site: Site) -> FloatArray | None:
-    """Where a site is, shape (2,), px: at its dot, or amid its neighbours; None without rows."""
+    """Position of a site, shape (2,), px: of its dot or from its neighbours; None without rows."""
     row, column = correction.lattice.row, correction.lattice.column
     places = correction.dots.image_px
     own = np.flatnonzero((row == site[0]) & (column == site[1]))
@@ -113,7 +113,7 @@ def site_px(correction: Correction, site: Site) -> FloatArray | None:
 
 
 def numbered_by_neighbours(correction: Correction, dots: IntArray) -> Correction:
-    """Give dots the row and column that follow from the dots around them.
+    """Set the row and column of dots from the dots around them.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What the dots page shows of a session, without Qt."""
+"""Data of the dots page, computed from a session. Without Qt."""
 
 from __future__ import annotations
 
@@ -28,38 +28,38 @@ from labapp.text import SIGMA_OF, pluralize
 NO_PLACES: FloatArray = np.zeros((0, 2))
 
 Wanted = tuple[int, DotSettings, LatticeSettings]
-"""A frame, and how dots and rows are to be looked for in it."""
+"""A frame, and the settings for detecting its dots and rows."""
 
 Origin = Literal["corrected", "measured", "found", "looked for"]
 
 
 @dataclass(frozen=True)
 class DetectedDots:
-    """What a detector found in a frame."""
+    """Dots and rows detected in a frame."""
 
     frame: int
     by: tuple[DotSettings, LatticeSettings]
-    """The settings that it was found with."""
+    """Settings of the detection."""
     correction: Correction
-    """Dots and rows, as a correction would begin."""
+    """Dots and rows as the start of a correction."""
     why: str
-    """What could not be found, a sentence; empty if all was."""
+    """What could not be found, one sentence; empty if all was."""
 
 
 @dataclass(frozen=True)
 class DotsState:
-    """What the page shows of one frame."""
+    """Data shown for one frame."""
 
     frame: int
     origin: Origin
     correction: Correction | None
-    """The dots and rows, and what an edit begins with; None while they are looked for."""
+    """Dots and rows, the start of an edit; None during the detection."""
     computed_px: FloatArray
-    """Where the measured surface puts the dots, shape (m, 2), px."""
+    """Positions of the dots computed from the measured surface, shape (m, 2), px."""
     result: Result | None
-    """What the frame gave last, which may no longer stand."""
+    """Last result of the frame, which may be stale."""
     why: str
-    """What could not be done, a sentence or two."""
+    """Reasons for missing data, one or two sentences."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class Figures:
 
     status: str
     matched: int
-    """Number of dots whose ray is known."""
+    """Number of dots with a known ray."""
     are_mm: float
     mre_mm: float
     """Reflection errors."""
@@ -79,7 +79,7 @@ class Figures:
 
 @dataclass(frozen=True)
 class RowLine:
-    """One line of the list of rows; row 0 is that of the dots in doubt."""
+    """One line of the list of rows; row 0 contains the doubtful dots."""
 
     row: int
     dots: int
@@ -91,7 +91,7 @@ class RowLine:
 
 
 def shown(session: Session, frame: int, found: DetectedDots | None) -> DotsState:
-    """What a frame shows: its correction, else what was measured, else what was found."""
+    """Data of a frame: its correction, else its measurement, else the detected dots."""
     correction = session.correction(frame)
     result, damage = _result(session, frame)
     computed = computed_px(result)
@@ -109,7 +109,7 @@ def shown(session: Session, frame: int, found: DetectedDots | None) -> DotsState
 
 
 def wanted(session: Session, frame: int) -> Wanted | None:
-    """What has to be looked for in a frame, and how; None if the session knows its dots."""
+    """Detection needed for a frame; None if the session has its dots."""
     if session.correction(frame) is not None:
         return None
     by, result = _by(session), _result(session, frame)[0]
@@ -117,7 +117,7 @@ def wanted(session: Session, frame: int) -> Wanted | None:
 
 
 def _result(session: Session, frame: int) -> tuple[Result | None, str]:
-    """What a frame gave; a damaged result is none, and why."""
+    """Result of a frame, or None and the reason if it is damaged."""
     try:
         return session.result(frame), ""
     except InputError as error:
@@ -130,14 +130,14 @@ def _by(session: Session) -> tuple[DotSettings, LatticeSettings]:
 
 
 def _automatic(result: Result, by: tuple[DotSettings, LatticeSettings]) -> bool:
-    """Whether a result holds what these settings find."""
+    """Whether a result contains the automatic detection with these settings."""
     measurement = result.measurement
     same = (result.settings.dots, result.settings.lattice) == by
     return same and measurement.correction is None and measurement.dots is not None
 
 
 def detect(image: Image, frame: int, by: tuple[DotSettings, LatticeSettings]) -> DetectedDots:
-    """Find dots and rows in a frame without measuring it."""
+    """Detect dots and rows in a frame without measuring it."""
     dots: Dots | None = None
     lattice: Lattice | None = None
     why = ""
@@ -151,9 +151,9 @@ def detect(image: Image, frame: int, by: tuple[DotSettings, LatticeSettings]) ->
 
 
 def computed_px(result: Result | None) -> FloatArray:
-    """Where a measured surface puts the dots that were matched, shape (m, 2), px.
+    """Positions of matched dots computed from the measured surface, shape (m, 2), px.
 
-    Dots whose rays do not meet it are left out.
+    Dots whose rays do not intersect the surface are omitted.
     """
     if result is None:
         return NO_PLACES
@@ -173,7 +173,7 @@ def computed_px(result: Result | None) -> FloatArray:
 
 
 def needs_fit(seen: DotsState) -> bool:
-    """Whether a frame's fit has to be redone because its dots or rows were changed by hand."""
+    """Whether a frame must be refitted because its dots or rows were changed by hand."""
     if seen.result is None:
         return seen.origin == "corrected"
     return CORRECTION_CHANGED in seen.result.stale
@@ -183,7 +183,7 @@ def needs_fit(seen: DotsState) -> bool:
 
 
 def sentence(seen: DotsState) -> str:
-    """What is seen, in a sentence or two."""
+    """Text describing the frame, one or two sentences."""
     if seen.correction is None:
         return "Looking for the dots…"
     lattice, dots = seen.correction.lattice, seen.correction.dots
@@ -205,7 +205,7 @@ def sentence(seen: DotsState) -> str:
 
 
 def row_lines(correction: Correction) -> tuple[RowLine, ...]:
-    """The list of rows, from the top of the picture down as they are seen, doubtful dots last."""
+    """The list of rows in the order of the picture from the top down, doubtful dots last."""
     lattice = correction.lattice
     reference = lattice.reference or (0, 0)
     numbers = {int(k) for k in lattice.row} | set(lattice.blocked_rows) | {reference[0]}
@@ -223,7 +223,7 @@ def row_lines(correction: Correction) -> tuple[RowLine, ...]:
 
 
 def chosen_words(correction: Correction | None, selection: Sequence[int]) -> str:
-    """What is chosen, in a few words."""
+    """Short text describing the selection."""
     if correction is None or not len(selection):
         return "Nothing selected: click a dot, or draw a box"
     if len(selection) > 1:
@@ -237,11 +237,11 @@ def chosen_words(correction: Correction | None, selection: Sequence[int]) -> str
 
 
 Need = Literal["", "rows", "reference", "dots", "site", "row", "two rows", "corrected"]
-"""What an edit is of use for."""
+"""Requirement of an edit."""
 
 
 def unmet_need(need: Need, seen: DotsState | None, selection: IntArray, rows: Sequence[int]) -> str:
-    """What an edit lacks that needs something, as what to do; empty if it is all there."""
+    """Instruction if the requirement of an edit is not met; empty if it is."""
     if seen is None or seen.correction is None:
         return "The dots of this frame are not known yet"
     lattice, sited = seen.correction.lattice, seen.correction.sited
@@ -270,7 +270,7 @@ UNMET: dict[Need, str] = {
 
 
 def figures(result: Result | None) -> Figures | None:
-    """What a result says of its fit; None if it was not measured."""
+    """Figures of the fit of a result; None if it was not measured."""
     if result is None:
         return None
     measurement = result.measurement
@@ -284,7 +284,7 @@ def figures(result: Result | None) -> Figures | None:
 
 
 def compared(before: Figures | None, after: Figures | None, pending: str = "") -> list[ResultRow]:
-    """The fit before the last edit and after it; ``pending`` is shown for what is not known yet."""
+    """Rows of the fit before and after the last edit; ``pending`` replaces unknown values."""
 
     def pair(texts: Sequence[str]) -> str:
         first, last = texts
@@ -317,25 +317,25 @@ def compared(before: Figures | None, after: Figures | None, pending: str = "") -
 
 @dataclass(frozen=True)
 class Carried:
-    """How far a correction could be carried on."""
+    """Result of propagating a correction."""
 
     corrections: dict[int, Correction]
-    """Frame → correction, without the frame it began with."""
+    """Frame → correction, without the initial frame."""
     words: str
-    """Where it stopped and why, a sentence."""
+    """Where and why it stopped, one sentence."""
 
 
 def carry(session: Session, seen: DotsState, most: int | None, control: Control) -> Carried:
-    """Carry a frame's dots and rows on over the following frames, as far as they fit.
+    """Propagate a frame's dots and rows to the following frames, as long as they fit.
 
-    What was carried when the operator cancels stays.
+    If the operator cancels, the corrections made so far are kept.
 
     Parameters
     ----------
     seen
-        The frame to begin with.
+        The initial frame.
     most
-        No more frames than this; None: to the end.
+        Maximum number of frames; None: to the end.
     """
     later = session.frames[session.frames > seen.frame].tolist()[:most]
     settings, last = session.settings.dots, _confirmed(seen)
@@ -358,7 +358,7 @@ def carry(session: Session, seen: DotsState, most: int | None, control: Control)
 
 
 def _confirmed(seen: DotsState) -> Correction:
-    """The dots of a frame with the rows that its measurement has confirmed, if it stands."""
+    """Dots of a frame with the rows confirmed by its measurement unless that is stale."""
     assert seen.correction is not None
     result = seen.result
     if result is None or result.stale or result.measurement.lattice is None:
@@ -385,7 +385,7 @@ ROW_SEARCHES = (
 
 @dataclass(frozen=True)
 class DetectorNumber:
-    """A number of a detector that can be set; see the settings class for what it is."""
+    """A numerical setting of a detector, explained in the settings class."""
 
     method: str
     name: str
@@ -400,7 +400,7 @@ class DetectorNumber:
 
     @property
     def group(self) -> str:
-        """Name of the method's part of `DotSettings`."""
+        """Name of the method's group in `DotSettings`."""
         return self.method.replace("-", "_")
 
 
@@ -425,7 +425,7 @@ NUMBERS = (
 
 
 def detector_value(settings: Settings, number: DetectorNumber) -> float | None:
-    """What a number of a detector is set to."""
+    """Value of a numerical setting of a detector."""
     value: float | None = getattr(getattr(settings.dots, number.group), number.name)
     return value
 
@@ -433,16 +433,16 @@ def detector_value(settings: Settings, number: DetectorNumber) -> float | None:
 def with_detector_value(
     settings: Settings, number: DetectorNumber, value: float | None
 ) -> Settings:
-    """The settings with another number of a detector."""
+    """Copy of settings with another value of a detector's setting."""
     part: Any = replace(getattr(settings.dots, number.group), **{number.name: value})
     return replace(settings, dots=replace(settings.dots, **{number.group: part}))
 
 
 def with_method(settings: Settings, method: Any) -> Settings:
-    """The settings with another detector."""
+    """Copy of settings with another detector."""
     return replace(settings, dots=replace(settings.dots, method=method))
 
 
 def with_row_search(settings: Settings, method: Any) -> Settings:
-    """The settings with another search for rows."""
+    """Copy of settings with another search for rows."""
     return replace(settings, lattice=replace(settings.lattice, method=method))

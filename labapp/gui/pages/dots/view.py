@@ -1,6 +1,6 @@
-"""The page of the pattern: the frame, its dots and rows, the keys and buttons that correct them.
+"""The dots page: the frame, its dots and rows, and keys and buttons for their correction.
 
-Of a line pattern it shows the lines in their place (`lines_hand`).
+For a line pattern it shows lines instead (`lines_hand`).
 """
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ NO_REFERENCE = "The reference is not known: if you know it from other frames, pr
 NOT_YET = "The frame is being measured as it was found: edit it when its rows are there"
 
 REACH = 9.0
-"""A dot is meant by a pointer this near, in points of the screen."""
+"""Largest distance of the pointer from a dot to select it, points of the screen."""
 
 
 class Command(NamedTuple):
-    """One thing a key or button does: its words, its key, what it does in a sentence, and it.
+    """Command of a key or button: text, key, tip, function and need.
 
-    A button is greyed out without what it needs; the key then says what that is.
+    If the need is not met, the button is disabled and the key reports what is missing.
     """
 
     text: str
@@ -54,7 +54,7 @@ class Command(NamedTuple):
 
 
 class DotsPage(Page):
-    """Step 5: what was found is shown, and corrected by hand."""
+    """Step 5: display of the detected dots, and correction by hand."""
 
     key = "dots"
 
@@ -70,7 +70,7 @@ class DotsPage(Page):
         self.seen: DotsState | None = None
         self._before: tuple[int, Figures | None] | None = None
         self.pointer: tuple[float, float] | None = None
-        """Where the pointer is in the frame."""
+        """Position of the pointer in the frame, (u, v), px."""
         self._lines_frame = -1
         self._in_view = False
         self._unmet: dict[str, str] = {}
@@ -116,7 +116,7 @@ class DotsPage(Page):
         self.view.pointed.connect(self._point)
         self.view.canvas.installEventFilter(self)
         self.looking.ready.connect(self._again)
-        # The window may show a change a little later; the next edit must begin with it.
+        # The window may show a change with a delay; the next edit must start from it.
         self.workspace.changed.connect(self._again)
         self.workspace.tasks.changed.connect(self._show_lead)
         self.workspace.opened.connect(self._forget)
@@ -124,7 +124,7 @@ class DotsPage(Page):
     # --- what is shown ------------------------------------------------------------------------
 
     def refresh(self) -> None:
-        """Show the frame in view as the session has it now."""
+        """Show the session's current data of the frame in view."""
         session = self.session
         self._in_view = True
         frame = self.workspace.frame
@@ -133,7 +133,7 @@ class DotsPage(Page):
             return
         if self.looking.frame != frame:
             self.looking.read(frame)
-            return  # the frame before it, with its own dots, stays until this one is read
+            return  # the previous frame with its dots stays until this one is read
         same = self.seen is not None and self.seen.frame == frame
         if self.looking.image is None or self.view.picture is not self.looking.image:
             self.view.show_picture(self.looking.image, self.looking.why)
@@ -158,7 +158,7 @@ class DotsPage(Page):
         self.draw()
 
     def _show_pattern(self, lines: bool) -> None:
-        """Show the marks, the panel and the hand of dots, or those of lines."""
+        """Show the marks, the panel and the tool for dots, or those for lines."""
         if lines == self.lines_panel.isVisibleTo(self.panel):
             return
         self.lines_panel.setVisible(lines)
@@ -198,7 +198,7 @@ class DotsPage(Page):
                 figures,
                 pending,
             ),
-            # The list keeps its size while dots are looked for: nothing jumps.
+            # The list keeps its size during the detection, so that nothing jumps.
             None if seen.correction is None else presenter.row_lines(seen.correction),
         )
 
@@ -209,7 +209,7 @@ class DotsPage(Page):
             self.measure_lead.offer(bool(session.setup_problems), self.locked or measuring)
 
     def draw(self) -> None:
-        """Draw the marks, a drag under way included."""
+        """Draw the marks, including a drag in progress."""
         computed = presenter.NO_PLACES if self.seen is None else self.seen.computed_px
         editor = self.editor
         self.overlay.show(editor.correction, editor.dots_px, editor.selection, computed)
@@ -226,7 +226,7 @@ class DotsPage(Page):
         self._show_unmet_needs()
 
     def _show_unmet_needs(self) -> None:
-        """Grey out what is of no use now."""
+        """Disable edits whose needs are not met."""
         seen, editor = self.seen, self.editor
 
         def unmet_need(need: Need) -> str:
@@ -237,26 +237,26 @@ class DotsPage(Page):
             self._unmet = found
             self.dots_panel.lock_sites(unmet_need("dots"), unmet_need(""))
             if self.dots_panel.show_unmet_needs(found):
-                self.view.setFocus()  # or the focus would go on to another button
+                self.view.setFocus()  # otherwise the focus would move to another button
 
     def choose(self, way: Callable[..., None], *given: object) -> None:
-        """Choose dots some way, and show it."""
+        """Select dots by a function, and show the selection."""
         way(*given)
         self.draw()
 
     def leave(self) -> None:
-        """End a drag or nudge under way; a running fit continues."""
+        """End a drag or nudge in progress; a running fit continues."""
         self._in_view = False
         self.hand.release()
-        self.hand.give_up()  # a click that is awaited must not carry over to another session
+        self.hand.give_up()  # a pending click must not affect another session
         self.looking.stop()
 
     def picture(self) -> QPixmap:
-        """The frame with its marks."""
+        """Picture of the frame with its marks."""
         return QPixmap.fromImage(self.view.grab_picture())
 
     def eventFilter(self, watched: QObject, event: QEvent) -> bool:
-        """Note when the pointer leaves the picture."""
+        """Detect that the pointer leaves the picture."""
         if event.type() == QEvent.Type.Leave:
             self.pointer = None
         return super().eventFilter(watched, event)
@@ -278,7 +278,7 @@ class DotsPage(Page):
     # --- what is changed ----------------------------------------------------------------------
 
     def _commit(self, label: str, edit: Callable[[], Correction | None]) -> bool:
-        """Make an edit of the frame in view one step of the session."""
+        """Apply an edit of the frame in view as one step of undo."""
         seen = self.seen
         if seen is None:
             return False
@@ -317,14 +317,14 @@ class DotsPage(Page):
             self._set(lambda now: presenter.with_detector_value(now, number, value), label)
 
     def add_at(self, u: float, v: float) -> None:
-        """Add the dot at a place."""
+        """Add the dot at a position."""
         image, session = self.looking.image, self.workspace.session
         if image is not None and session is not None:
             self.editor.add(image, u, v, session.settings)
             self.draw()
 
     def _at_pointer(self, do: Callable[[float, float], object], ask: str) -> None:
-        """Do something where the pointer is; a button asks for a click first."""
+        """Call a function with the pointer's position; a button asks for a click first."""
         if self.pointer is not None:
             do(*self.pointer)
         else:
@@ -356,7 +356,7 @@ class DotsPage(Page):
         self.draw()
 
     def _type_row(self) -> None:
-        if why := self._unmet.get("Delete", ""):  # which needs as much
+        if why := self._unmet.get("Delete", ""):  # which has the same need
             self.workspace.notified.emit(why, True)
         else:
             self.dots_panel.row.editor.setFocus(Qt.FocusReason.ShortcutFocusReason)
@@ -364,7 +364,7 @@ class DotsPage(Page):
     # --- keys and buttons ---------------------------------------------------------------------
 
     def action(self, text: str, key: str, tip: str, do: Callable[[], object]) -> QAction:
-        """Make an action of the page and its panel: its words, its key, what it does."""
+        """Create an action of the page and its panel from its text, key, tip and function."""
         action = QAction(text, self)
         tip = f"{tip} ({key})" if key else tip
         action.setToolTip(tip)
@@ -446,7 +446,7 @@ class DotsPage(Page):
 
 
 class Hand(Tool):
-    """The pointer and the arrow keys on the dots."""
+    """Tool for selecting and moving dots with the pointer and the arrow keys."""
 
     def __init__(self, page: DotsPage) -> None:
         self._page = page
@@ -454,26 +454,26 @@ class Hand(Tool):
         self._boxing = self._adds = False
         self._next_click: Callable[[float, float], object] | None = None
         self.asked = ""
-        """What a button asks a click for; empty if none does."""
+        """Text of the action that needs a click; empty if none does."""
 
     @property
     def busy(self) -> bool:
-        """Whether a drag is under way or a click is awaited."""
+        """Whether a drag is in progress or a click is pending."""
         return self._start is not None or self._next_click is not None
 
     def ask(self, do: Callable[[float, float], object], words: str) -> None:
-        """Do something where the next click is."""
+        """Call a function with the position of the next click."""
         self._next_click, self.asked = do, words
 
     def give_up(self) -> None:
-        """Leave the dots where they were."""
+        """Cancel a drag or a pending click; the dots keep their positions."""
         self._start = self._next_click = None
         self.asked = ""
         self._page.editor.shift_px[:] = 0
         self._page.overlay.hide_box()
 
     def click(self, u: float, v: float, modifiers: Qt.KeyboardModifier) -> None:
-        """Choose a dot, Shift: in addition; or do what a button awaits a click for."""
+        """Select a dot (Shift: add it to the selection), or run the pending action."""
         if self._next_click is not None:
             do, self._next_click, self.asked = self._next_click, None, ""
             do(u, v)
@@ -482,7 +482,7 @@ class Hand(Tool):
         self._page.choose(self._page.editor.click, u, v, self._reach(), bool(modifiers & SHIFT))
 
     def point_out(self, u: float, v: float) -> None:
-        """Choose the dot for the menu, unless it is among the chosen ones."""
+        """Select the dot for the menu, unless it is selected already."""
         if self._page.editor.at(u, v, self._reach()) not in self._page.editor.selection.tolist():
             self.give_up()
             self.click(u, v, Qt.KeyboardModifier.NoModifier)
@@ -492,7 +492,7 @@ class Hand(Tool):
         self._page.add_at(u, v)
 
     def begin(self, u: float, v: float, modifiers: Qt.KeyboardModifier) -> bool:
-        """Take hold of a dot, and of the others chosen with it; or begin a box."""
+        """Begin to drag a dot and those selected with it, or begin a selection box."""
         editor = self._page.editor
         add = bool(modifiers & SHIFT)
         on = None if self._page.locked else editor.at(u, v, self._reach())
@@ -502,7 +502,7 @@ class Hand(Tool):
         return True
 
     def drag(self, u: float, v: float) -> None:
-        """Move what is held, or draw the box."""
+        """Move the dragged dots, or draw the selection box."""
         if self._start is None:
             return
         if self._boxing:
@@ -512,7 +512,7 @@ class Hand(Tool):
             self._page.draw()
 
     def end(self, u: float, v: float) -> None:
-        """End the drag: one step that can be undone, or a selection."""
+        """End the drag: one step of undo, or a selection."""
         if self._start is None:
             return
         start, self._start = self._start, None
@@ -524,19 +524,19 @@ class Hand(Tool):
             self._page.editor.drop()
 
     def takes(self, event: QKeyEvent) -> bool:
-        """Arrow keys are for the chosen dots; without any they go through the frames."""
+        """Whether an arrow key moves selected dots; without a selection it changes the frame."""
         held = len(self._page.editor.selection) > 0 and not self._page.locked
         return held and arrow_step(event) is not None
 
     def key(self, event: QKeyEvent) -> None:
-        """Nudge; all of a held key is one step that can be undone."""
+        """Nudge the selected dots; a held key is one step of undo."""
         step = arrow_step(event)
         if step is not None:
             self._page.editor.shift_px += step
             self._page.draw()
 
     def release(self) -> None:
-        """Let the nudged dots be where they are."""
+        """Finish a nudge at the current positions of the dots."""
         if self._start is None and self._page.editor.shift_px.any():
             self._page.editor.drop()
 

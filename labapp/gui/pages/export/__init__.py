@@ -1,4 +1,4 @@
-"""Step 8: what leaves the session."""
+"""Step 8: export of results."""
 
 from labapp.gui.pages.export.page import ExportPage
 

@@ -1,4 +1,4 @@
-"""The export page: ticks, frames, folder; what would be written, what was."""
+"""The export page: items, frames and folder; planned and written files."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ WHICH = (
 
 
 class ExportPage(Page):
-    """What leaves the session."""
+    """Choice and export of results."""
 
     key = "export"
 
@@ -70,11 +70,11 @@ class ExportPage(Page):
     # --- what it shows ------------------------------------------------------------------------
 
     def refresh(self) -> None:
-        """Show what would be written of what the session holds now."""
+        """Show what would be written from the current session."""
         session, frame = self.session, self.workspace.frame
         moved = self._in_view not in (None, frame)
         self._in_view = frame
-        if moved:  # the frame in view is another one, and nothing else
+        if moved:  # only the frame in view changed
             if self.request.which == "view":
                 self._show_plan(session)
             return
@@ -100,7 +100,7 @@ class ExportPage(Page):
         self._boxes["solid"].setEnabled(self.request.has_mesh)
         part, drawn = self.request.which == "part", self.request.has_view
         film = "film" in self.request.some("pictures")
-        # Greyed, not hidden: what is below stays where it is.
+        # Disabled, not hidden, so that nothing below moves.
         for fields, used in (
             ((self.first, self.last, self.every), part),
             ((self.view, self.picture_size), drawn),
@@ -172,18 +172,18 @@ class ExportPage(Page):
         self._ticked()
 
     def choose_folder(self) -> None:
-        """Ask for a folder; where it holds something else, a new one in it is taken."""
+        """Ask for a folder; use a new subfolder if it contains something else."""
         here = Path(self.folder.value() or proposed_folder(self.session))
         if folder := ask_folder(self, "Export folder", here.parent):
             self.folder.set_value(str(folder_within(folder, self.session)))
 
     def measure_again(self) -> None:
-        """Measure what is missing or no longer stands of the frames chosen."""
+        """Measure the chosen frames that are unmeasured or stale."""
         if self.plan is not None:
             self.workspace.measure(self.plan.again.tolist(), beside=self._say)
 
     def export(self) -> None:
-        """Write what is ticked, in the background."""
+        """Export the ticked items in the background."""
         session, made, request = self.session, self.plan, self.request
         if made is None or made.why_not:
             return
@@ -207,7 +207,7 @@ class ExportPage(Page):
         self._show_state()
 
     def _say(self, words: str) -> None:
-        """Say beside the buttons what came of them, until something else is to be written."""
+        """Show the outcome at the buttons until the request changes."""
         self._said = words
         self._show_state()
 
@@ -300,7 +300,7 @@ class ExportPage(Page):
         self.export_button = button("Export", "", self.export)
         tip = "Show what was exported in the file manager"
         self.open_button = button("Open the folder", tip, self.open_folder)
-        # The buttons stand above the words, which need more or less room.
+        # The buttons are above the text, whose height varies.
         fill(
             self.panel_layout,
             *(form, self.folder.label, self.folder, choose),

@@ -1,4 +1,4 @@
-"""What an export would write, whether it can be written, and what came of it."""
+"""Plan of an export, reasons against it, and its result."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ REPORT_FILE = "report.pdf"
 SHOWN_PROBLEMS = 5
 
 BRIEF_S = 3.0
-"""A film that is over sooner is too short to watch."""
+"""Duration, s, below which a film is too short to watch."""
 
 VIEWS = (
     ("free", "obliquely"),
@@ -55,7 +55,7 @@ SIZES = ((1280, 720), (1920, 1080), (2560, 1440), (800, 600))
 
 @dataclass(frozen=True)
 class Item:
-    """Something that can be ticked."""
+    """An item that can be ticked."""
 
     key: str
     """``tables:dots``, ``surfaces:stl``, ``solid``, ``together:hdf5``, ``report``."""
@@ -64,7 +64,7 @@ class Item:
 
 
 def groups() -> tuple[tuple[str, tuple[Item, ...]], ...]:
-    """What can be ticked: (heading, items) of each group."""
+    """Items that can be ticked: (heading, items) of each group."""
     return (
         (
             "Tables (CSV)",
@@ -124,20 +124,20 @@ USUAL = frozenset(
 
 @dataclass(frozen=True)
 class ExportRequest:
-    """What the operator wants to export."""
+    """Export requested by the operator."""
 
     ticked: frozenset[str] = USUAL
-    """Keys of the `Item` that are ticked."""
+    """Keys of the ticked `Item`."""
     which: str = "all"
     """``all``, ``view`` (the frame in view) or ``part``."""
     first: int = 0
     last: int = 0
     every: int = 1
-    """The part: frames ``first``, ``first + every`` … up to ``last``."""
+    """Frames of the part: ``first``, ``first + every`` … up to ``last``."""
     scheme: str = ""
     """Scheme whose results are written; empty: that of the settings."""
     spacing_mm: float = SPACING_MM
-    """Distance of the surfaces' nodes."""
+    """Spacing of the surfaces' nodes."""
     view: Direction = "free"
     size_px: tuple[int, int] = PICTURE_PX
     picture_format: str = "png"
@@ -145,7 +145,7 @@ class ExportRequest:
     """As in `ExportChoice`."""
 
     def some(self, kind: str) -> frozenset[str]:
-        """What is ticked of a kind."""
+        """Ticked items of a kind."""
         return frozenset(key.partition(":")[2] for key in self.ticked if key.startswith(f"{kind}:"))
 
     @property
@@ -155,11 +155,11 @@ class ExportRequest:
 
     @property
     def has_view(self) -> bool:
-        """Whether surfaces are drawn in 3-D, from somewhere and in some size."""
+        """Whether surfaces are drawn in 3-D, which needs a camera and a size."""
         return bool(self.some("pictures") & {"surfaces", "film"})
 
     def choice(self) -> ExportChoice:
-        """As the session takes it."""
+        """The request in the form required by the session."""
         return ExportChoice(
             tables=self.some("tables"),
             surfaces=self.some("surfaces"),
@@ -179,25 +179,25 @@ class ExportPlan:
     """What would be written."""
 
     scheme: str
-    """Whose results."""
+    """Scheme whose results are written."""
     frames: IntArray
-    """Numbers of the frames that are measured and chosen, shape (n,)."""
+    """Numbers of the chosen frames that are measured, shape (n,)."""
     again: IntArray
     """Chosen frames that are stale or unmeasured, shape (k,)."""
     why_not: str
-    """Why nothing can be written; empty if it can."""
+    """Reason why nothing can be written; empty if it can."""
     notes: tuple[str, ...]
-    """What to know otherwise, a sentence each."""
+    """Further notes, a sentence each."""
     files: tuple[str, ...]
-    """What would be in the folder, a line each."""
+    """Files in the folder, a line each."""
     surfaces: int
-    """How many of the frames have a surface."""
+    """Number of frames with a surface."""
     area_mm2: float
     """Mean area of the surfaces; 0 without any."""
 
 
 def plan(session: Session, request: ExportRequest, frame: int) -> ExportPlan:
-    """What would be written, and whether it can be."""
+    """Plan of an export, and the reason if it is impossible."""
     own = scheme_name(session.settings)
     scheme = request.scheme or own
     seen = session.overview(scheme)
@@ -236,7 +236,7 @@ def plan(session: Session, request: ExportRequest, frame: int) -> ExportPlan:
 
 
 def film_note(frames: IntArray, time_s: FloatArray, rate_hz: float | None) -> str:
-    """How long the film takes, and what to do where that is too short to see anything."""
+    """Text of the duration of the film, with advice if it is too short."""
     timed = [(int(k), t if np.isfinite(t) else None) for k, t in zip(frames, time_s, strict=True)]
     lasts_s = float(film_times(timed, rate_hz)[-1])
     message = f"The film lasts {lasts_s:.3g} s."
@@ -318,31 +318,31 @@ def schemes(session: Session) -> tuple[tuple[str, str], ...]:
 
 
 def proposed_folder(session: Session) -> Path:
-    """Where to write if nobody says otherwise."""
+    """Default folder of an export."""
     return folder_of(session) / f"{session.path.stem}-results"
 
 
 def folder_within(folder: Path, session: Session) -> Path:
-    """The folder itself where an export can be; one in it where it holds something else."""
+    """The folder if it can contain the export, otherwise a subfolder of it."""
     try:
         own = not any(folder.iterdir()) or (folder / MANIFEST).is_file()
     except OSError:
-        own = True  # the export reports what is wrong with it
+        own = True  # the export reports the problem
     return folder if own else folder / proposed_folder(session).name
 
 
 @dataclass(frozen=True)
 class Written:
-    """What came of an export."""
+    """Result of an export."""
 
     folder: Path
     files: tuple[ExportedFile, ...]
     problems: tuple[str, ...]
-    """What in it differs from its manifest; empty if nothing does."""
+    """Differences from its manifest; empty if there are none."""
 
     @property
     def words(self) -> str:
-        """For the operator."""
+        """Text for the operator."""
         size = format_bytes(sum(file.size for file in self.files))
         message = f"{len(self.files)} files and the manifest, {size}, are in {self.folder}."
         if not self.problems:
@@ -358,8 +358,8 @@ def write(
     folder: Path,
     progress: Progress,
 ) -> Written:
-    """Export, then read everything again and compare it with the manifest."""
-    # The report's matrices are small: more threads than one get in each other's way.
+    """Export, then read all files again and compare them with the manifest."""
+    # The report's matrices are small, so several threads would slow each other down.
     with threadpool_limits(limits=1, user_api="blas"):
         files = session.export(
             folder,

@@ -1,26 +1,26 @@
-"""About how large an export will be, by what exports of the samples were."""
+"""Estimate of the size of an export, based on exports of the samples."""
 
 from __future__ import annotations
 
 from labapp.gui.pages.export.presenter import ExportRequest
 
 ROWS = {"measures": 400.0, "dots": 5_500.0, "points": 7_000.0, "boundary": 14_000.0}
-"""Bytes a frame of each table."""
+"""Bytes per frame in each table."""
 
 NODE = {"csv": 28.0}
-"""Bytes a node of a surface that is a grid of points."""
+"""Bytes per node of a surface stored as a grid of points."""
 
 TRIANGLE = {"stl": 50.0, "stl-ascii": 247.0, "ply": 29.0, "vtp": 64.0}
-"""Bytes a triangle of each mesh."""
+"""Bytes per triangle of each mesh format."""
 
 EDGE_TRIANGLES = 22_000
-"""Triangles along the boundary, whatever the grid; inside there are two a node."""
+"""Triangles along the boundary for any grid; inside there are two per node."""
 
 PIXEL = {"png": 1.5, "jpg": 0.3, "tif": 3.0}
-"""Bytes a pixel of a picture of a frame."""
+"""Bytes per pixel of a picture of a frame."""
 
 SURFACE_PIXEL, FILM_PIXEL = 0.16, 0.03
-"""Bytes a pixel of a picture of a surface, and of a frame of a film."""
+"""Bytes per pixel of a picture of a surface, and of a frame of a film."""
 
 TREND_PICTURE, REPORT, HDF5_FRAME, HDF5_NODE = 80_000.0, 2_000_000.0, 80_000.0, 6.5
 
@@ -28,12 +28,12 @@ TREND_PICTURE, REPORT, HDF5_FRAME, HDF5_NODE = 80_000.0, 2_000_000.0, 80_000.0, 
 def estimated_bytes(
     request: ExportRequest, frames: int, surfaces: int, area_mm2: float, frame_px: int
 ) -> float:
-    """Return about how many bytes will be written.
+    """Approximate number of bytes that will be written.
 
     Parameters
     ----------
     frames, surfaces
-        How many frames are written, and how many of them have a surface.
+        Numbers of written frames, and of those with a surface.
     area_mm2
         Mean area of the surfaces.
     frame_px

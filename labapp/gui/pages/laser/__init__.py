@@ -1,4 +1,4 @@
-"""Laser: its angle and distance from the cross hair on the work piece (Appendix I)."""
+"""Laser: its angle and distance, determined from the cross hair (Appendix I)."""
 
 from labapp.gui.pages.laser.view import LaserPage
 

@@ -1,4 +1,4 @@
-"""What the laser page shows: lengths of the cross, the laser that follows, what is in use."""
+"""Data of the laser page: lengths of the cross, the resulting laser, and values in use."""
 
 from __future__ import annotations
 
@@ -29,44 +29,44 @@ MEANINGS = (
 FAN_ANGLE_DEG = 10.0
 
 EXAMPLE_MM = (4.65, 6.23, 2.75)
-"""l₁, l₂, l₃ that are drawn before there are readings: a laser 31.5 mm away at 31°."""
+"""l₁, l₂, l₃ drawn while there are no readings: a laser 31.5 mm away at 31°."""
 
 Place = tuple[float, float]
 
 ENDS = ("laser's side", "far side", "left", "right")
-"""The ends of the cross in a picture, by the names of their points."""
+"""Names of the points at the ends of the cross in a picture."""
 
 SCALE = ("scale 1", "scale 2")
 
 
 @dataclass(frozen=True)
 class Readings:
-    """Lengths as they were typed."""
+    """Entered lengths."""
 
     lengths_mm: tuple[tuple[float, ...], tuple[float, ...], tuple[float, ...]] = ((), (), ())
     """Readings of l₁, l₂, l₃, mm; any number of each."""
     fan_angle_deg: float = FAN_ANGLE_DEG
-    """Of the cross-hair lens."""
+    """Fan angle of the cross-hair lens."""
     settings: LaserCalibrationSettings = field(default_factory=LaserCalibrationSettings)
-    """How well the fan angle and a reading are known."""
+    """Uncertainties of the fan angle and of a reading."""
     wrong: tuple[str, ...] = ()
-    """What was typed and is no length, a sentence each."""
+    """Entries that are no lengths, a sentence each."""
 
 
 @dataclass(frozen=True)
 class LaserResult:
-    """What follows from readings."""
+    """Result of the readings."""
 
     found: LaserCalibration | None
-    """The laser; None where none follows."""
+    """The laser; None if it cannot be computed."""
     why_not: str
-    """Why none follows, in words."""
+    """Reason why it cannot be computed."""
     rows: tuple[ResultRow, ...]
     """Means of the lengths, and the laser."""
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What the operator should know of the readings."""
+        """Warnings about the readings."""
         return () if self.found is None else tuple(map(_spoken, self.found.warnings))
 
 
@@ -75,7 +75,7 @@ def typed(
     fan_angle_deg: float,
     settings: LaserCalibrationSettings | None = None,
 ) -> Readings:
-    """Readings from the cells of the table, (row, column) → text."""
+    """Readings in the cells of the table, (row, column) → text."""
     lengths: list[list[float]] = [[], [], []]
     wrong = []
     for (row, column), text in sorted(cells.items()):
@@ -92,7 +92,7 @@ def typed(
 
 
 def kept(session: Session) -> Readings | None:
-    """The readings of the calibration in use; None before one."""
+    """Readings of the calibration in use; None if there is none."""
     calibration = session.laser_calibration
     if calibration is None:
         return None
@@ -107,7 +107,7 @@ def kept(session: Session) -> Readings | None:
 
 
 def result(readings: Readings) -> LaserResult:
-    """The laser computed from the lengths from readings, or why none does."""
+    """The laser computed from readings, or the reason why it cannot be."""
     spread = tuple(
         _mean_row(name, meaning, np.array(lengths, float))
         for name, meaning, lengths in zip(NAMES, MEANINGS, readings.lengths_mm, strict=True)
@@ -136,17 +136,17 @@ def result(readings: Readings) -> LaserResult:
 
 @dataclass(frozen=True)
 class Drawn:
-    """A laser to be drawn."""
+    """A laser to draw."""
 
     found: LaserCalibration
     lengths_mm: tuple[float, float, float]
     fan_angle_deg: float
     is_example: bool
-    """Whether it is that of `EXAMPLE_MM`, as none follows from the readings."""
+    """Whether it is the laser of `EXAMPLE_MM` because the readings give none."""
 
 
 def drawn(readings: Readings, found: LaserCalibration | None) -> Drawn:
-    """The laser computed from the lengths from readings, or an example."""
+    """The laser computed from readings, or an example."""
     if found is not None:
         l1, l2, l3 = (float(np.mean(lengths)) for lengths in readings.lengths_mm)
         return Drawn(found, (l1, l2, l3), readings.fan_angle_deg, False)
@@ -156,7 +156,7 @@ def drawn(readings: Readings, found: LaserCalibration | None) -> Drawn:
 
 
 def in_use(session: Session) -> tuple[ResultRow, ...]:
-    """The laser as the set-up has it."""
+    """The laser in the set-up."""
     shown = setup_shown(session)
     calibrated = calibrations_in_use(session)[0]
     note = "From this session's calibration" if calibrated else "As entered"
@@ -176,7 +176,7 @@ def in_use(session: Session) -> tuple[ResultRow, ...]:
 
 
 def first_places(shape: tuple[int, int]) -> dict[str, Place]:
-    """Where the points lie before they are dragged, in a picture of shape (rows, columns)."""
+    """Initial positions of the points in a picture of shape (rows, columns)."""
     rows, columns = shape
     at = {
         SCALE[0]: (0.25, 0.9),
@@ -192,7 +192,7 @@ def first_places(shape: tuple[int, int]) -> dict[str, Place]:
 def cross_lengths(places: Mapping[str, Place], scale_mm: float) -> tuple[float, float, float]:
     """l₁, l₂, l₃ of a cross in a picture taken square to the work piece, mm.
 
-    The centre is where the line between the two ends along the beam cuts the one across.
+    The centre is the intersection of the line along the beam and the line across it.
 
     Parameters
     ----------
@@ -231,7 +231,7 @@ def _mean_row(name: str, meaning: str, lengths: FloatArray) -> ResultRow:
 
 
 def _spoken(words: str) -> str:
-    """The core's names of the lengths as the page has them."""
+    """A message of the core with the page's names of the lengths."""
     for number, name in enumerate(NAMES, 1):
         words = words.replace(f"l{number}_mm", name).replace(f"l{number} ", f"{name} ")
     return words

@@ -1,4 +1,4 @@
-"""The laser page: readings of the cross, or a picture of it, and the laser that follows."""
+"""The laser page: readings of the cross, or a picture of it, and the resulting laser."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ LEAST_ROWS = 4
 
 
 class LaserPage(Page):
-    """Lengths of the cross in a table, typed or taken from a picture; the laser follows."""
+    """Lengths of the cross in a table, typed or from a picture, and the resulting laser."""
 
     key = "laser"
 
@@ -60,7 +60,7 @@ class LaserPage(Page):
         self._show_way("callipers")
 
     def refresh(self) -> None:
-        """Show the readings in use when they changed, and the values in use."""
+        """Show changed readings in use, and the values in use."""
         kept = presenter.kept(self.session)
         loaded = (self.session.path, kept)
         if loaded != self._loaded:
@@ -71,7 +71,7 @@ class LaserPage(Page):
         self._follow()
 
     def readings(self) -> Readings:
-        """What the table holds."""
+        """Readings in the table."""
         cells = {
             (row, column): item.text()
             for row in range(self.table.rowCount())
@@ -85,11 +85,11 @@ class LaserPage(Page):
         return presenter.typed(cells, self.fan.value() or presenter.FAN_ANGLE_DEG, settings)
 
     def load_picture(self, path: Path) -> None:
-        """Show a picture of the cross, with the points to drag."""
+        """Show a picture of the cross with points to drag."""
         self.start_task("Loading the picture", lambda _: read_picture(path), self._show_picture)
 
     def add_reading(self) -> None:
-        """Put the lengths from the picture into the table, as one more reading."""
+        """Add the lengths from the picture to the table as another reading."""
         lengths = self._cross()
         if lengths is None:
             return
@@ -100,7 +100,7 @@ class LaserPage(Page):
         self._follow()
 
     def use(self) -> None:
-        """Put the laser that follows into the rig."""
+        """Use the resulting laser in the rig."""
         readings = self.readings()
         picture = self._from_picture
         lengths_mm, fan_deg, settings = (
@@ -227,7 +227,7 @@ class LaserPage(Page):
         self._follow()
 
     def _grow(self) -> None:
-        """Keep an empty line below."""
+        """Keep an empty row at the end."""
         last = self.table.rowCount() - 1
         if any(self._text(last, column) for column in range(3)):
             self.table.setRowCount(last + 2)
@@ -238,7 +238,7 @@ class LaserPage(Page):
         return "" if item is None else item.text().strip()
 
     def _follow(self) -> None:
-        """Show what follows from the readings."""
+        """Show the result of the readings."""
         readings = self.readings()
         result = presenter.result(readings)
         self.result.set_rows(result.rows)
@@ -255,14 +255,14 @@ class LaserPage(Page):
         self._show_lengths(readings)
 
     def _show_lengths(self, readings: Readings) -> None:
-        """Show the lengths in the drawing: the only reading, or the mean of several."""
+        """Show the lengths, or means of several readings, in the drawing."""
         several = max(map(len, readings.lengths_mm)) > 1
         for field, lengths in zip(self.length_fields, readings.lengths_mm, strict=True):
             field.set_value(sum(lengths) / len(lengths) if lengths else None)
             field.lock(self.locked or (SEVERAL if several else ""))
 
     def _enter_length(self, column: int, value: float | None) -> None:
-        """Put the length that was entered in the drawing into the table."""
+        """Write a length entered in the drawing to the table."""
         self.table.setItem(0, column, _cell("" if value is None else _length(value)))
 
     # --- the picture ------------------------------------------------------------------------
@@ -289,7 +289,7 @@ class LaserPage(Page):
         self._dragged()
 
     def places(self) -> dict[str, Place]:
-        """(u, v) of the points, by name, px."""
+        """(u, v) of the points by name, px."""
         return {name: point.place for name, point in self._points.items()}
 
     def _cross(self) -> tuple[float, float, float] | None:
@@ -335,16 +335,16 @@ class _ReadingsTable(QTableWidget):
         self.setAccessibleName("Readings of l₁, l₂ and l₃ in mm")
         self.setToolTip("; ".join(f"{n}: {m}" for n, m in zip(NAMES, MEANINGS, strict=True)))
         self.horizontalHeader().setSectionResizeMode(QHeaderView.ResizeMode.Stretch)
-        self.setTabKeyNavigation(False)  # while a number is typed Tab still goes to the next cell
+        self.setTabKeyNavigation(False)  # while a number is edited, Tab still goes to the next cell
         self.fit()
 
     def fit(self) -> None:
-        """As high as its lines, up to eight."""
+        """Fit the height to the rows, at most eight."""
         header = self.horizontalHeader().sizeHint().height() + 2 * self.frameWidth()
         self.setFixedHeight(header + min(self.rowCount(), 8) * self.rowHeight(0))
 
     def keyPressEvent(self, event: QKeyEvent) -> None:
-        """Delete empties the selected cells."""
+        """Clear the selected cells with Delete."""
         if event.key() in (Qt.Key.Key_Delete, Qt.Key.Key_Backspace):
             for item in self.selectedItems():
                 item.setText("")
@@ -359,5 +359,5 @@ def _cell(text: str) -> QTableWidgetItem:
 
 
 def _length(value_mm: float) -> str:
-    """A length to 0.01 mm, as callipers show it; more digits where they were typed."""
+    """Text of a length to 0.01 mm, as on callipers, or with more digits if entered."""
     return max(f"{value_mm:.2f}", f"{value_mm:g}", key=len)

@@ -1,4 +1,4 @@
-"""What the imaging-plane page shows: O′ and the axes, found or placed by hand, and their ±."""
+"""Data of the imaging-plane page: O′ and the axes, found or placed by hand, and their ±."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from labapp.session.session import Session
 from labapp.simulation.calibration.target import Target
 
 POINTS = ("O′", "O′X′", "O′Z′")
-"""Names of the three points: the origin, and the middles of the two bars."""
+"""Names of the three points: the origin, and the centres of the two bars."""
 
 HAND_SIGMA_PX = 0.5
-"""Standard uncertainty of a point that was placed by hand, px."""
+"""Standard uncertainty of a point placed by hand, px."""
 
 UNPLACED = float("inf")
-"""That of a point that nobody has placed yet."""
+"""Standard uncertainty of a point not yet placed."""
 
 UNIT_MM = Target().unit_mm
 
@@ -39,13 +39,13 @@ Place = tuple[float, float]
 
 
 def find(images: Sequence[GreyImage], unit_mm: float, lens: Lens | None) -> Calibration:
-    """O′ and the axes, or the corners of a board; `CannotMeasure` says why not."""
+    """Find O′ and the axes, or the corners of a board; raises `CannotMeasure` with the reason."""
     settings = PlaneCalibrationSettings(unit_mm=unit_mm)
     return calibrate_imaging_plane(images, settings, lens=lens)
 
 
 def first_points(shape: tuple[int, int], unit_mm: float) -> PlaneCalibration:
-    """Points to begin with where nothing is found, in a picture of shape (rows, columns)."""
+    """Initial points, if nothing is found, in a picture of shape (rows, columns)."""
     rows, columns = shape
     side = 0.8 * min(rows, columns)
     u, v = 0.1 * columns, 0.9 * rows
@@ -65,7 +65,7 @@ def first_points(shape: tuple[int, int], unit_mm: float) -> PlaneCalibration:
 
 
 def moved(found: PlaneCalibration, point: int, place: Place) -> PlaneCalibration:
-    """The calibration with one of its points placed by hand; it is that of the three points."""
+    """The three-point calibration with one point placed by hand."""
     sigma = list(found.sigma_px)
     sigma[point] = HAND_SIGMA_PX
     of_point = {("origin_px", "x_axis_px", "z_axis_px")[point]: place}
@@ -79,7 +79,7 @@ def moved(found: PlaneCalibration, point: int, place: Place) -> PlaneCalibration
 
 
 def with_unit(found: Calibration, unit_mm: float) -> Calibration:
-    """The same points on a target of another unit; a board as it is."""
+    """The same points on a target of another unit; a board is unchanged."""
     if isinstance(found, BoardCalibration):
         return found
     x_mm = sum(DESIGN.x_units) / 2 * unit_mm
@@ -92,7 +92,7 @@ def _of_units(found: PlaneCalibration, unit_mm: float) -> PlaneCalibration:
 
 
 def places(found: Calibration) -> tuple[Place, Place, Place]:
-    """The three points, px."""
+    """Positions of the three points, px."""
     if isinstance(found, BoardCalibration):
         origin, on_x, on_z = (_place(point) for point in found.points_px)
         return origin, on_x, on_z
@@ -101,18 +101,18 @@ def places(found: Calibration) -> tuple[Place, Place, Place]:
 
 @dataclass(frozen=True)
 class PlaneResult:
-    """What follows from the points and the marks."""
+    """Result of the points and marks."""
 
     rows: tuple[ResultRow, ...] = ()
     """Scales and angle with ±, and the residuals."""
     why_not: str = ""
-    """Why they cannot be used; empty if they can."""
+    """Reason why they cannot be used; empty if they can."""
     warnings: tuple[str, ...] = ()
-    """What the operator should look at."""
+    """Warnings for the operator."""
 
 
 def result(found: Calibration | None) -> PlaneResult:
-    """Scales, angle and their ± of a calibration, and what is wrong with it."""
+    """Scales, angle and their ± of a calibration, and its problems."""
     if found is None:
         return PlaneResult(why_not="Load a picture of the target or of a board first")
     if isinstance(found, BoardCalibration):
@@ -152,7 +152,7 @@ def _scale_rows(found: Calibration) -> list[ResultRow]:
 
 
 def _board_rows(found: BoardCalibration) -> list[ResultRow]:
-    """Lens and residual of a board, and how far places may be off."""
+    """Lens and residual of a board, and the error of positions."""
     value, sigma = found.distortion_percent
     seen = f"{len(found.seen[0].index)} of {len(found.board.corners_mm)}"
     worst = float(np.hypot(*found.fit.residuals_px.T).max())
@@ -181,7 +181,7 @@ def _board_rows(found: BoardCalibration) -> list[ResultRow]:
 
 
 def _residual_rows(found: PlaneCalibration) -> list[ResultRow]:
-    """What each fit leaves over at the marks, and which is used."""
+    """Residuals of each fit at the marks, and the fit in use."""
     fits = found.fits
     if fits is None:
         return []
@@ -201,7 +201,7 @@ def _residual_rows(found: PlaneCalibration) -> list[ResultRow]:
 
 
 def choices(found: Calibration | None) -> tuple[tuple[Model, str], ...]:
-    """The models that can be used, and how they are named; the better fit says so."""
+    """The possible models and their names; the better fit is marked."""
     if isinstance(found, BoardCalibration):
         lens = "Homography, no lens" if found.fit.lens is None else "Lens and homography"
         return (("homography", lens),)
@@ -216,7 +216,7 @@ def choices(found: Calibration | None) -> tuple[tuple[Model, str], ...]:
 
 
 def why(found: Calibration | None) -> str:
-    """Why the model that is proposed is."""
+    """Reason why the model is proposed."""
     if isinstance(found, BoardCalibration):
         return f"Not determined: {'; '.join(found.undetermined())}."
     if found is None or UNPLACED in found.sigma_px:
@@ -236,15 +236,15 @@ class ResidualMap:
 
     begin_px: FloatArray
     end_px: FloatArray
-    """Arrows from the marks towards their modelled places, shape (n, 2), px."""
+    """Ends of arrows from the marks towards their modelled positions, shape (n, 2), px."""
     share: FloatArray
-    """Length of each over the longest, shape (n,), 0 … 1."""
+    """Lengths relative to the longest, shape (n,), 0 … 1."""
     words: str
-    """How much they are enlarged, and the longest."""
+    """Text of the enlargement and the longest residual."""
 
 
 def residual_map(found: Calibration | None, height_px: int) -> ResidualMap | None:
-    """Residuals of the model as arrows, enlarged to be seen in a picture of such a height."""
+    """Residuals of the model as arrows, enlarged for a picture of this height."""
     if isinstance(found, BoardCalibration):
         begin, residual = found.seen[0].image_px, found.residual_px
     elif found is None or found.fits is None or found.model == "three points":
@@ -254,13 +254,13 @@ def residual_map(found: Calibration | None, height_px: int) -> ResidualMap | Non
         begin = np.array(found.marks)[:, 2:4]
     length = np.hypot(*residual.T)
     longest = max(float(length.max()), 1e-9)
-    times = round_factor(0.1 * height_px / longest)  # the longest: at most a tenth of the picture
+    times = round_factor(0.1 * height_px / longest)  # at most a tenth of the picture
     words = f"Arrows: residuals × {times:g}, the longest {longest:.2f} px"
     return ResidualMap(begin, begin + times * residual, length / longest, words)
 
 
 def in_use(session: Session) -> tuple[ResultRow, ...]:
-    """Scales and angle of the image calibration that the set-up has."""
+    """Scales and angle of the image calibration in the set-up."""
     names = (("Scale along X′", "px/mm"), ("Scale along Z′", "px/mm"), ("Angle", "°"))
     values, sigmas = [np.nan] * 3, [None] * 3
     kept = session.plane_calibration if calibrations_in_use(session)[1] else None
@@ -274,7 +274,7 @@ def in_use(session: Session) -> tuple[ResultRow, ...]:
             else ImageCalibration.from_three_points(**keys, lens=lens)
         )
     except (TypeError, ValueError, KeyError):
-        pass  # it is not there, or not right: the set-up page says what
+        pass  # it is missing or wrong; the set-up page shows the reason
     else:
         x_mm, z_mm = (kept.found.x_axis_mm, kept.found.z_axis_mm) if kept else (1.0, 1.0)
         points = calibration.to_image(np.array([[0.0, 0.0], [x_mm, 0.0], [0.0, z_mm]]))
@@ -290,7 +290,7 @@ def in_use(session: Session) -> tuple[ResultRow, ...]:
 
 
 def axes(found: Calibration, unit_mm: float) -> tuple[FloatArray, FloatArray]:
-    """The axes and their unit marks as they should lie in the picture.
+    """Expected positions of the axes and their unit marks in the picture.
 
     Returns
     -------

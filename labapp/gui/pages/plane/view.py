@@ -1,4 +1,4 @@
-"""The imaging-plane page: the target's picture, O′ and the axes over it, found or dragged."""
+"""The imaging-plane page: picture of the target with O′ and the axes, found or dragged."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ NO_PICTURE = (
 ADD = "A further picture of the same board, tilted or nearer to a corner of the picture"
 
 PRINTS = ("imaging_plane_4_inch", *BOARDS)
-"""What can be printed: the text's target, and the boards."""
+"""Targets that can be printed: that of the dissertation, and the boards."""
 
 COLOR = "#ffb000"
 
 
 class PlanePage(Page):
-    """A picture with three points; scales and angle follow them."""
+    """A picture with three points, and the resulting scales and angle."""
 
     key = "plane"
 
@@ -67,7 +67,7 @@ class PlanePage(Page):
         self._make_panel()
 
     def refresh(self) -> None:
-        """Show the picture and the points in use when they changed, and the values in use."""
+        """Show changed picture and points in use, and the values in use."""
         kept = self.session.plane_calibration
         loaded = (self.session.path, kept)
         if loaded != self._loaded:
@@ -82,7 +82,7 @@ class PlanePage(Page):
         self._follow()
 
     def load(self, path: Path) -> None:
-        """Show a picture of the target and look for O′ and the axes in it."""
+        """Show a picture of the target and find O′ and the axes in it."""
 
         def loaded(image: GreyImage) -> None:
             self._name, self._tilted = path.name, ()
@@ -92,7 +92,7 @@ class PlanePage(Page):
         self.start_task("Loading the picture", lambda _: read_picture(path), loaded)
 
     def add_picture(self, path: Path) -> None:
-        """Take a further picture of the board, in another pose before the camera."""
+        """Add a picture of the board in another pose."""
 
         def loaded(image: GreyImage) -> None:
             self._tilted = (*self._tilted, image)
@@ -101,7 +101,7 @@ class PlanePage(Page):
         self.start_task("Loading the picture", lambda _: read_picture(path), loaded)
 
     def take_kept(self) -> None:
-        """Show the picture that the session keeps, and the points in use."""
+        """Show the stored picture and the points in use."""
         session, kept = self.session, self.session.plane_calibration
         if kept is None:
             return
@@ -120,7 +120,7 @@ class PlanePage(Page):
         )
 
     def find_axes(self) -> None:
-        """Look for O′ and the axes."""
+        """Find O′ and the axes."""
         image = self.view.picture
         if image is None:
             return
@@ -137,7 +137,7 @@ class PlanePage(Page):
         )
 
     def use(self) -> None:
-        """Use what is shown."""
+        """Use the displayed calibration."""
         image, found, unit = self.view.picture, self.found, self._unit()
         if image is None or found is None:
             return
@@ -149,7 +149,7 @@ class PlanePage(Page):
             self.confirm("The calibration is in use; undo restores the former one", self.applied)
 
     def lead(self, found: Lead | None) -> Lead | None:
-        """Where a picture can come from, while there is none."""
+        """Sources of a picture while there is none."""
         if self.view.picture is not None:
             return found
         load = Offer("&Load picture…", "Of the target, or of a board", self._choose)
@@ -157,7 +157,7 @@ class PlanePage(Page):
         return Lead(NO_PICTURE, (load, Offer("&Save for printing…", tip, self._choose_target)))
 
     def leave(self) -> None:
-        """Finish the edit under way."""
+        """Finish an edit in progress."""
         self.unit.flush()
 
     # --- the panel --------------------------------------------------------------------------
@@ -271,7 +271,7 @@ class PlanePage(Page):
             self.add_picture(path)
 
     def save_target(self, path: Path) -> None:
-        """Write the target for the printer."""
+        """Write the target to a file for printing."""
         name = str(self.print.value())
 
         def content() -> bytes:
@@ -327,13 +327,13 @@ class PlanePage(Page):
         self._follow()
 
     def drag(self, point: int, u: float, v: float) -> None:
-        """One of the points is dragged."""
+        """Move one of the points."""
         if isinstance(self.found, PlaneCalibration):
             self.found = presenter.moved(self.found, point, (u, v))
             self._follow()
 
     def choose_model(self, model: Model) -> None:
-        """Use another model than is proposed."""
+        """Use another model than the proposed one."""
         if isinstance(self.found, PlaneCalibration):
             self._place(replace(self.found, model=model))
 
@@ -351,7 +351,7 @@ class PlanePage(Page):
         colors = pg.colormap.get("viridis").map(0.3 + 0.7 * shown.share, mode="qcolor")
         for begin, end, color in zip(shown.begin_px, shown.end_px, colors, strict=True):
             u, v = zip(begin, end, strict=True)
-            # The dot is where the mark is: an arrow by shape as well as by colour.
+            # The dot is at the mark, so that the direction is clear without colour, too.
             item = pg.PlotDataItem(
                 u, v, pen=pg.mkPen(color, width=2.5), symbol="o", symbolBrush=color
             )
@@ -361,7 +361,7 @@ class PlanePage(Page):
             self._residuals.append(item)
 
     def _follow(self) -> None:
-        """Show what follows from the points."""
+        """Show the result of the points."""
         result = presenter.result(self.found)
         self.model.set_choices(presenter.choices(self.found))
         is_board = isinstance(self.found, BoardCalibration)
@@ -392,7 +392,7 @@ class PlanePage(Page):
         if self.found is not None:
             try:
                 line, marks = presenter.axes(self.found, self._unit())
-            except ValueError:  # the three points lie on one line for now
+            except ValueError:  # the three points lie on one line at present
                 return
             self._axes.setData(line[:, 0], line[:, 1])
             self._marks.setData(marks[:, 0], marks[:, 1])

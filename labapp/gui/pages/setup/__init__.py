@@ -1,4 +1,4 @@
-"""Set-up: the experiment's record, the safety list, and what is bolted to the bench."""
+"""Set-up: the record of the experiment, the safety list, and the bench."""
 
 from labapp.gui.pages.setup.view import SetupPage
 

@@ -1,4 +1,4 @@
-"""What the set-up page shows of a session: without Qt."""
+"""Data of the set-up page, computed from a session. Without Qt."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ class Entry:
     label: str
     unit: str = ""
     tooltip: str = ""
-    """What it is; its unit; more about it."""
+    """Label, unit and tooltip."""
     lowest: float = 0.0
     highest: float = 0.0
     step: float = 1.0
     decimals: int = 1
-    """Range and decimals of its number; lowest = highest: it takes text."""
+    """Range and decimals of the number; lowest = highest for a text field."""
     usual: float | None = None
-    """What the text has for it (Appendix II); None: nothing."""
+    """Value in the dissertation (Appendix II); None if there is none."""
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """Kinds of pattern that have it."""
+        """Kinds of pattern that have this field."""
         section, _, name = self.key.partition(".")
         if section != "pattern":
             return tuple(kind for kind, _ in KINDS)
@@ -110,16 +110,16 @@ RIG: tuple[tuple[str, tuple[Entry, ...]], ...] = (
               "Of that glass; empty: 1.5", 1, 4, 0.01, 3),
     )),
 )  # fmt: skip
-"""Of the rig, by headings."""
+"""Fields of the rig, by headings."""
 
 DEFAULTS = {entry.key: entry.usual or 0.0 for _, entries in RIG for entry in entries} | {
     "imaging_plane.s_mm": 45.0,
     "imaging_plane.h_mm": 3.0,
     "imaging_plane.glass_index": 1.5,
 }
-"""What is seen of the bench, in grey, where nothing is entered.
+"""Values drawn in grey while nothing is entered.
 
-Of what must be entered it is only drawn, never measured with.
+Where an entry is required, the value is only drawn and never used for measurements.
 """
 
 NOT_ENTERED = "Grey numbers are the dissertation's bench, not yours: click one and type."
@@ -138,10 +138,10 @@ UNCERTAIN_ONLY = ("Image calibration", (
     Entry("camera_lens.distortion_percent_sigma", "Lens distortion", "%",
           "Of the picture in the plane's corner, of its distance from the middle", 0, 100, 0.1, 2),
 ))  # fmt: skip
-"""Whose standard uncertainty alone is entered here: step 3 finds the points."""
+"""Fields for standard uncertainties only: the points are found in step 3."""
 
 ASSUMED = {one.sigma_key: one.assumed for one in QUANTITIES}
-"""What is assumed of each quantity where no standard uncertainty is entered."""
+"""Assumed standard uncertainties of quantities without an entry."""
 
 TRAVELS = (("+y", "towards +Y"), ("-y", "towards −Y"))
 
@@ -150,11 +150,11 @@ KINDS = (
     (MEASURED, "measured rays"),
     (LINES, "lines"),
 )
-"""Kinds of pattern, and how they are called."""
+"""Kinds of pattern, and their names."""
 
 
 def sigma_entry(entry: Entry) -> Entry | None:
-    """The field of a value's standard uncertainty; None where it has none."""
+    """Field for the standard uncertainty of a value; None if it has none."""
     key = f"{entry.key}_sigma"
     if key not in ASSUMED:
         return None
@@ -198,33 +198,33 @@ EXPERIMENT = (
 
 @dataclass(frozen=True)
 class SetupState:
-    """What the page shows."""
+    """Data shown by the page."""
 
     values: dict[str, float | None]
-    """By the keys of `RIG`; None where there is none."""
+    """Values by the keys of `RIG`; None if there is none."""
     sigmas: dict[str, float | None]
-    """Standard uncertainties by the keys of `ASSUMED`; None where none is entered."""
+    """Standard uncertainties by the keys of `ASSUMED`; None if none is entered."""
     usual_sigmas: dict[str, float]
-    """What holds where none is entered: what is assumed, or what the bench check gave."""
+    """Values used if none are entered: assumed ones, or those of the bench check."""
     sigma_words: str
-    """What the standard uncertainties are."""
+    """Explanation of the standard uncertainties."""
     kind: str
-    """Kind of the pattern, of `KINDS`."""
+    """Kind of pattern, one of `KINDS`."""
     travel: str
-    """Which way the torch moves, of `TRAVELS`."""
+    """Direction of the torch's travel, one of `TRAVELS`."""
     status: str
-    """How far the set-up can be relied on, in words; empty while it is not complete."""
+    """Text of the reliability of the set-up; empty while it is incomplete."""
     problems: dict[str, str]
-    """What is wrong, in words, by the same keys."""
+    """Problems as text, by the same keys."""
     missing: frozenset[str]
-    """Keys of the values that have to be entered still."""
+    """Keys of the values that still have to be entered."""
     others: tuple[str, ...]
-    """What is wrong elsewhere in the setup, a sentence each."""
+    """Other problems of the setup, a sentence each."""
     record: Record
 
 
 def shown(session: Session) -> SetupState:
-    """What the page shows of a session."""
+    """Data to show for a session."""
     sections: dict[str, Any] = tomllib.loads(session.setup_text)
     keys = [entry.key for _, entries in RIG for entry in entries]
     values = {key: _number(sections, key) for key in keys}
@@ -237,7 +237,7 @@ def shown(session: Session) -> SetupState:
     found = rig(session)
     if words := session.setup_words:
         status = marked_setup_words(session.setup_status, words)
-    else:  # the imaging plane may be missing still
+    else:  # the imaging plane may still be missing
         doubt = None if found is None else doubt_of_values(found)
         usual = "" if found is None else judged_status(found, doubt)
         reason = doubt.reason if doubt else ""
@@ -277,7 +277,7 @@ def shown(session: Session) -> SetupState:
 
 
 def _usual_sigmas(found: Rig | None) -> tuple[dict[str, float], str]:
-    """What holds of each standard uncertainty that is not entered, and a note on it."""
+    """Standard uncertainties used if none are entered, and a note on them."""
     words = "Right: ±, one standard uncertainty. In grey: "
     known = None if found is None else found.uncertainty
     if known is None or not known.checked:
@@ -293,7 +293,7 @@ def _number(sections: dict[str, Any], key: str) -> float | None:
 
 
 def rig(session: Session) -> Rig | None:
-    """The rig, as soon as it is complete; the image calibration may still be missing."""
+    """The rig, or None if it is incomplete; the image calibration may be missing."""
     if not session.setup_problems:
         return session.setup.rig
     anything = {"homography": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]}
@@ -308,7 +308,7 @@ def rig(session: Session) -> Rig | None:
 
 
 def default_rig(session: Session) -> Rig | None:
-    """The rig with the dissertation's dimensions where none are entered; None: a value is wrong."""
+    """The rig with dimensions of the dissertation for missing ones; None if a value is wrong."""
     state = shown(session)
     anything = {"homography": [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]}
     values: dict[str, dict[str, object]] = {
@@ -326,19 +326,19 @@ def default_rig(session: Session) -> Rig | None:
 
 @dataclass(frozen=True)
 class BenchState:
-    """The bench as it is drawn."""
+    """Data for the drawing of the bench."""
 
     rig: Rig | None
-    """What is drawn; None where a value is wrong."""
+    """The drawn rig; None if a value is wrong."""
     view: SideView | None
-    """Its rays; None without a rig, or with a pool that cannot be."""
+    """Its rays; None without a rig or if the pool is impossible."""
     words: str
-    """The same in words, or why it is not drawn."""
+    """Description of the drawing, or the reason why there is none."""
     rows: tuple[ResultRow, ...] = ()
 
 
 def bench(session: Session) -> BenchState:
-    """The bench as it is set up, with the pool that is expected."""
+    """The bench of a session with the expected pool."""
     found, record, entered = default_rig(session), session.record, rig(session) is not None
     if found is None:
         return BenchState(None, None, "The drawing appears when every number is possible.")
@@ -389,9 +389,9 @@ REACH = "The plane catches the steepest ray that passes the torch between these 
 
 
 def put(session: Session, key: str, value: float | None) -> None:
-    """Put a value of the rig, or its standard uncertainty, into the setup; None takes it out.
+    """Set a value of the rig, or its standard uncertainty, in the setup; None removes it.
 
-    A calibrated value that is changed loses its ± (`config.setup.updated_setup`).
+    A changed calibrated value loses its ± (`config.setup.updated_setup`).
     """
     section, _, name = key.partition(".")
     value_key = key.removesuffix("_sigma")
@@ -402,19 +402,19 @@ def put(session: Session, key: str, value: float | None) -> None:
 
 
 def put_kind(session: Session, kind: str) -> None:
-    """Enter the kind of pattern, without the keys that only the kind before has."""
+    """Set the kind of pattern, and remove keys that only the previous kind has."""
     known = (*SECTIONS["pattern"], *RAYS, *LINE_PATTERN)
     keys = {key: None for key in known if key not in rules_for("pattern", {"kind": kind})}
     session.update_setup({"pattern": {**keys, "kind": kind}}, "set-up, pattern")
 
 
 def put_travel(session: Session, travel: str) -> None:
-    """Say which way the torch moves."""
+    """Set the direction of the torch's travel."""
     session.update_setup({"torch": {"travel": travel}}, "set-up, welding direction")
 
 
 def put_usual(session: Session) -> None:
-    """Put the usual values in where something is missing; what is there stays."""
+    """Set missing values to the usual ones; existing values are kept."""
     state = shown(session)
     values = state.values
     missing: dict[str, dict[str, object]] = {}
@@ -428,5 +428,5 @@ def put_usual(session: Session) -> None:
 
 
 def note(session: Session, name: str, value: str | float | None) -> None:
-    """Note one item of the experiment record."""
+    """Set one item of the experiment record."""
     session.set_record(replace(session.record, **{name: value}))  # type: ignore[arg-type]

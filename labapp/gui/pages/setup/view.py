@@ -1,4 +1,4 @@
-"""The set-up page: four tabs beside the drawing of the bench."""
+"""The set-up page: four tabs at the side of the drawing of the bench."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ EXPERIMENT_TAB, SAFETY_TAB, BENCH_TAB, STEPS_TAB = range(4)
 
 
 class SetupPage(Page):
-    """Experiment, lists of Appendix II and bench; the bench is drawn as it is entered."""
+    """Experiment, lists of Appendix II, and bench with its drawing."""
 
     key = "setup"
 
@@ -71,7 +71,7 @@ class SetupPage(Page):
             self.tabs.addTab(_top(content), title)
 
         def show_tab(number: int) -> None:
-            # Or the highest tab would have the others scroll over nothing.
+            # Otherwise the other tabs could be scrolled to the height of the highest one.
             for tab, content in enumerate(contents):
                 content.setVisible(tab == number)
 
@@ -87,7 +87,7 @@ class SetupPage(Page):
         self.panel_layout.setContentsMargins(0, 0, 0, 0)
 
     def refresh(self) -> None:
-        """Show record, safety list and setup as the session holds them."""
+        """Show record, safety list and setup of the session."""
         session, shown = self.session, presenter.shown(self.session)
         for key, field in (*self.rig_fields.items(), *self.drawn_fields.items()):
             field.set_value(shown.values[key])
@@ -122,17 +122,17 @@ class SetupPage(Page):
             self.table.setVisible(bool(bench.rows))
 
     def _show_kind(self, kind: str) -> None:
-        """Show the fields that a kind of pattern has."""
+        """Show the fields for a kind of pattern."""
         for _, entries in RIG:
             for entry in entries:
                 field, sigma = self.rig_fields[entry.key], presenter.sigma_entry(entry)
                 field.setVisible(kind in entry.kinds)
                 field.label.setVisible(kind in entry.kinds)
-                if sigma is not None:  # whose label is nowhere
+                if sigma is not None:  # its label is not shown
                     self.sigma_fields[sigma.key].setVisible(kind in sigma.kinds)
 
     def leave(self) -> None:
-        """Finish the edit under way."""
+        """Finish an edit in progress."""
         numbers = (
             *(*self.rig_fields.values(), *self.sigma_fields.values()),
             *self.drawn_fields.values(),
@@ -141,7 +141,7 @@ class SetupPage(Page):
             field.flush()
 
     def load(self, path: Path) -> None:
-        """Take the setup from a file."""
+        """Load the setup from a file."""
         if self.workspace.attempt(
             lambda session: session.set_setup(
                 read_setup(path, lines=True).text, f"set-up from {path.name}"

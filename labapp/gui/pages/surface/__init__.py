@@ -1,4 +1,4 @@
-"""The surface step: measure, look at the surface, judge it, compare schemes."""
+"""Surface step: measure, show and assess the surface, compare schemes."""
 
 from labapp.gui.pages.surface.view import SurfacePage
 

@@ -1,4 +1,4 @@
-"""The surface page's charts: reflected dots over each other, the pool from above, its section."""
+"""Charts of the surface page: reflected dots, the pool from above, its section."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ BAND_ALPHA = 70
 
 
 class DotsChart(Chart):
-    """Captured dots as rings, computed ones as crosses, their errors drawn longer."""
+    """Captured dots as rings, computed dots as crosses, enlarged errors."""
 
     def __init__(self) -> None:
         super().__init__("Reflected dots on the imaging plane", "X′ (mm)", "Z′ (mm)", equal=True)
@@ -33,7 +33,7 @@ class DotsChart(Chart):
         dots: tuple[FloatArray, FloatArray] | None,
         without: str = "No reflected dots to compare",
     ) -> None:
-        """Show captured and computed dots, each of shape (n, 2), mm; None shows why not."""
+        """Show captured and computed dots, each of shape (n, 2), mm; None: show the reason."""
         captured, computed = dots if dots is not None else (np.empty((0, 2)), np.empty((0, 2)))
         scale = error_scale(captured, computed)
         self._captured.setData(pos=captured)
@@ -73,7 +73,7 @@ class PlanChart(Chart):
         self.follow_theme()
 
     def show_pool(self, boundary: Boundary | None, section: tuple[float, float] | None) -> None:
-        """Show a boundary and the section line through it; None shows nothing of it."""
+        """Show a boundary and the section line through it; None: do not show it."""
         points = np.empty((0, 3)) if boundary is None else boundary.points_mm
         closed = np.vstack([points, points[:1]])
         self._outline.setData(closed[:, 0], closed[:, 1])
@@ -123,7 +123,7 @@ class PlanChart(Chart):
 
 
 class ProfileChart(Chart):
-    """Height along the section line, ± as a band, the boundary as diamonds."""
+    """Height along the section line with ± as a band and the boundary as diamonds."""
 
     def __init__(self) -> None:
         super().__init__("Height profile", "Along the section line (mm)", "Height (mm)", False)
@@ -136,7 +136,7 @@ class ProfileChart(Chart):
         self.follow_theme()
 
     def show_profile(self, cut: Profile | None, edge: str = "boundary") -> None:
-        """Show a profile, which ends at an edge; None shows nothing."""
+        """Show a profile, which ends at an edge; None: show nothing."""
         if cut is None or not len(cut.edge_mm):
             for curve in (self._low, self._high, self._height):
                 curve.setData([], [])

@@ -1,4 +1,4 @@
-"""Two schemes side by side: their surfaces seen alike, where they differ, and by how much."""
+"""Two schemes side by side: surfaces with a common camera, difference, and figures."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from labapp.gui.workspace import Workspace
 
 COLUMNS = ("", "First", "Second", "Difference", "Unit")
 NUMBERS = (1, 2, 3)
-"""Columns of numbers."""
+"""Columns with numbers."""
 
 
 class CompareView(QWidget):
-    """The frame in view by two schemes; the cameras of all views turn together."""
+    """The frame in view reconstructed by two schemes; all views share one camera."""
 
     def __init__(self, workspace: Workspace) -> None:
         super().__init__()
@@ -64,12 +64,12 @@ class CompareView(QWidget):
         return self.first.view, self.second.view, self.difference
 
     def begin(self, scheme: str) -> None:
-        """Compare a scheme with one that is made otherwise."""
+        """Compare a scheme with one of a different kind."""
         self.first.choice.set_value(scheme)
         self.second.choice.set_value(other_scheme(scheme))
 
     def refresh(self, options: Options) -> None:
-        """Show the frame in view by the two schemes, computed in the background."""
+        """Reconstruct the frame in view by both schemes in the background, and show it."""
         session, frame = self.workspace.session, self.workspace.frame
         assert session is not None
         schemes = (self.first.choice.value(), self.second.choice.value())
@@ -83,7 +83,7 @@ class CompareView(QWidget):
             self._task.cancel()
 
         def work(_: Control) -> Comparison:
-            # The matrices are small: more threads than one get in the window's way.
+            # The matrices are small, and several threads would slow the window.
             with threadpool_limits(limits=1, user_api="blas"):
                 return compared(session, frame, schemes, options)
 
@@ -94,7 +94,7 @@ class CompareView(QWidget):
         self._task = self.workspace.tasks.start("Comparing", work, done)
 
     def leave(self) -> None:
-        """Stop what only this view needs."""
+        """Stop all that only this view needs."""
         self._shown_for = None
         if self._task is not None:
             self._task.cancel()
@@ -119,7 +119,7 @@ class CompareView(QWidget):
         self._make_room()
 
     def resizeEvent(self, event: QResizeEvent) -> None:
-        """Have all figures be seen where there is room for it."""
+        """Show all figures if there is space."""
         super().resizeEvent(event)
         self.parts.fit(self)
         self._make_room()
@@ -137,7 +137,7 @@ def _side_by_side(*widgets: QWidget) -> QWidget:
 
 
 class _SchemeBox(QWidget):
-    """A scheme to choose and its surface."""
+    """Choice of a scheme, and its surface."""
 
     def __init__(self, order: str) -> None:
         super().__init__()
@@ -153,7 +153,7 @@ class _FiguresTable(ReadTable):
         name = "Figures of both schemes and their difference"
         super().__init__(name, "Figures of both schemes, and the first minus the second", COLUMNS)
         self.setWordWrap(False)
-        # All columns have room: the scroll bar would take a line's place.
+        # All columns fit, and a scroll bar would take the space of a row.
         self.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
         for column in NUMBERS:
             self.horizontalHeader().setSectionResizeMode(column, QHeaderView.ResizeMode.Stretch)

@@ -23,25 +23,25 @@ from labapp.gui.pages.surface.presenter import (
 from labapp.session.session import Session
 
 Row = tuple[str, str, str, str, str]
-"""Quantity, the first's, the other's, first minus other, unit."""
+"""Quantity, value of the first and of the other, first minus other, unit."""
 
 
 def other_scheme(scheme: str) -> str:
-    """The scheme to compare with at first: the first in the list that is made otherwise."""
+    """Default scheme to compare with: the first in the list of a different kind."""
     made = scheme.partition("-")[0]
     return next(name for name in SCHEMES if name.partition("-")[0] != made)
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """A frame by two schemes."""
+    """A frame reconstructed by two schemes."""
 
     scenes: tuple[Scene | None, Scene | None]
-    """Result of the first and the second; None where it has no surface."""
+    """Scenes of the first and the second; None without a surface."""
     words: tuple[str, str]
-    """Why it has none; empty where it has."""
+    """Reasons why there is no surface; empty if there is one."""
     difference: Scene | None
-    """Surface of the first, coloured by the difference; None where they do not overlap."""
+    """Surface of the first, coloured by the difference; None if they do not overlap."""
     rows: tuple[Row, ...]
     """Figures of both and their difference."""
     text: str
@@ -51,9 +51,9 @@ class Comparison:
 def compared(
     session: Session, frame: int, schemes: tuple[str, str], options: Options
 ) -> Comparison:
-    """Reconstruct a frame by two schemes and hold them against each other.
+    """Reconstruct a frame by two schemes and compare the results.
 
-    Both surfaces are coloured on one scale, if by the same quantity.
+    If both surfaces are coloured by the same quantity, they share one scale.
     """
     found: list[Measurement | None] = []
     words = []
@@ -94,7 +94,7 @@ def compared(
 
 
 def _with_one_range(scenes: list[Scene | None]) -> list[Scene | None]:
-    """Give scenes that show the same quantity one range of colours."""
+    """Scenes with a common range of colours if they show the same quantity."""
     drawn = [each for each in scenes if each is not None]
     if len({each.label for each in drawn}) != 1:
         return scenes
@@ -103,16 +103,16 @@ def _with_one_range(scenes: list[Scene | None]) -> list[Scene | None]:
 
 
 def by_scheme(session: Session, frame: int, scheme: str) -> Measurement:
-    """What a scheme makes of a frame's dots as they are matched now; the session is not changed.
+    """Measurement by a scheme with the current match of a frame; the session is not changed.
 
-    What the session holds of that scheme is taken if it still stands.
+    A stored result of the scheme is used if it is not stale.
 
     Raises
     ------
     CannotMeasure
         If the frame has no match, or the scheme finds no surface.
     InputError
-        If what the session holds is damaged.
+        If the stored data are damaged.
     """
     kept = session.result(frame, scheme)
     if kept is not None and not kept.stale and kept.measurement.reconstruction is not None:
@@ -136,7 +136,7 @@ def by_scheme(session: Session, frame: int, scheme: str) -> Measurement:
 def compared_rows(one: Measures, other: Measures) -> tuple[Row, ...]:
     """Sizes and errors of both, and the first minus the other, as texts.
 
-    The larger ± says how many digits are shown of both.
+    The larger ± determines the digits of both.
     """
     rows = []
     for name, value, of_sigma, unit, _ in SIZES:

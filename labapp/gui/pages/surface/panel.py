@@ -1,4 +1,4 @@
-"""The surface page's panel: scheme and correspondence, measuring, and what came out."""
+"""Panel of the surface page: scheme and correspondence, measuring, and results."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ from labapp.gui.workspace import Workspace
 from labapp.session.measured import scheme_name
 
 SIGNS = {"measured": "✓", "stale": "⟳", "failed": "✗", "unmeasured": "○"}
-"""How a frame stands, by shape."""
+"""Signs for the state of a frame."""
 
 
 class SurfacePanel:
-    """Fills a page's panel."""
+    """Contents of the page's panel."""
 
     def __init__(self, workspace: Workspace, layout: QVBoxLayout, answer: Message) -> None:
         self.workspace, self._answer = workspace, answer
@@ -91,7 +91,7 @@ class SurfacePanel:
         grid.addWidget(self.missing, 1, 0)
         grid.addWidget(self.all, 1, 1)
         grid.addWidget(self.progress, 2, 0)
-        grid.addWidget(self.again, 2, 0)  # in the same place: it is of use when nothing is measured
+        grid.addWidget(self.again, 2, 0)  # in the same place: enabled while nothing is measured
         grid.addWidget(self.cancel, 2, 1)
         return grid
 
@@ -146,7 +146,7 @@ class SurfacePanel:
         self._measure([self.workspace.frame])
 
     def not_measured(self) -> None:
-        """Measure the frames that are not measured, or whose measures are out of date."""
+        """Measure the frames that are unmeasured or stale."""
         self._measure(None)
 
     def all_frames(self) -> None:

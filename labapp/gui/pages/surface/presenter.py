@@ -1,4 +1,4 @@
-"""What the surface page shows of a frame, computed from the session. Without Qt."""
+"""Data of the surface page for a frame, computed from the session. Without Qt."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from labapp.session.session import Session
 from labapp.text import HEIGHT_SIGMA_OF, SIGMA_OF, marked_setup_words, setup_words
 
 SCHEMES = scheme_words()
-"""Name that results are kept under → words for the operator."""
+"""Stored name of a scheme → text for the operator."""
 
 SCHEME_CHOICES = [(name, words.long) for name, words in SCHEMES.items()]
 
@@ -45,7 +45,7 @@ SIZES = (
     ("Area", "area_mm2", "area_sigma_mm2", "mm²", "Within the boundary, seen from above"),
     ("Volume", "volume_mm3", "volume_sigma_mm3", "mm³", "Between surface and work piece"),
 )
-"""Words, value and σ in `Measures`, unit, and what it is."""
+"""Label, names of value and σ in `Measures`, unit, and explanation."""
 
 ERRORS = (
     ("ARE", "are_mm", "Average reflection error: computed from captured dots (Eq. 6-3)"),
@@ -57,13 +57,13 @@ ERRORS = (
         "ARE of the scheme's own points, as in the dissertation: the boundary is not in it",
     ),
 )
-"""Words, value in `Measures`, and what it is; the last is shown where the scheme gives it."""
+"""Label, name in `Measures`, and explanation; the last is shown if the scheme gives it."""
 
 NO_SIGMA = "This scheme gives no ±"
 
 
 def with_scheme(settings: Settings, name: str) -> Settings:
-    """The same settings with the scheme of a name of `SCHEMES`."""
+    """Copy of settings with a scheme, given by its name in `SCHEMES`."""
     scheme, _, algorithm = name.partition("-")
     changed: dict[str, object] = {"scheme": scheme}
     if algorithm:
@@ -73,7 +73,7 @@ def with_scheme(settings: Settings, name: str) -> Settings:
 
 @dataclass(frozen=True)
 class Options:
-    """What the 3-D view shows, as the operator ticked it."""
+    """Options of the 3-D view chosen by the operator."""
 
     colour: Colour = "height"
     points: bool = True
@@ -83,42 +83,42 @@ class Options:
     rays: bool = False
     electrode: bool = True
     same_colours: bool = False
-    """Whether all frames share one scale of colours."""
+    """Whether all frames share one colour scale."""
     exaggeration: float = 3.0
-    """Factor by which heights are drawn larger."""
+    """Factor by which heights are exaggerated."""
     section: tuple[float, float] | None = (90.0, 0.0)
     """Angle, degrees, and offset, mm, of the section line; None without one."""
 
 
 @dataclass(frozen=True)
 class SurfaceState:
-    """What the page shows of one frame."""
+    """Data shown for one frame."""
 
     result: Result | None
-    """Its stored result; None if it was not measured by the scheme."""
+    """Stored result; None if it was not measured by the scheme."""
     state: Literal["measured", "stale", "failed", "unmeasured"]
     words: str
-    """The result in words; where there is no surface or it is stale, the reason."""
+    """Text of the result, or the reason why there is no surface or it is stale."""
     setup_words: str = ""
-    """How far the set-up of a surface can be relied on."""
+    """Text of the reliability of the set-up."""
     provenance: str = ""
     """Frame, scheme, version, time, and whether dots were corrected by hand."""
     sizes: tuple[ResultRow, ...] = ()
     errors: tuple[ResultRow, ...] = ()
-    """Lines of the tables; empty without a surface."""
+    """Rows of the tables; empty without a surface."""
     trials: tuple[ResultRow, ...] = ()
-    """The correspondences that were tried, and their errors."""
+    """The tested correspondences, and their errors."""
     verdict: str = ""
-    """How clearly one of them was chosen."""
+    """Text of how clear the choice among them is."""
 
     @property
     def reconstruction(self) -> Reconstruction | None:
-        """The surface; None without."""
+        """The surface; None if there is none."""
         return None if self.result is None else pool_of(self.result.measurement)
 
 
 def pool_of(measurement: Measurement) -> Reconstruction | None:
-    """The surface of a measurement; of lines that between them, where they determine it."""
+    """Surface of a measurement; for lines that between them, if they determine it."""
     if measurement.lines is None:
         return measurement.reconstruction
     surface = measurement.lines.surface
@@ -126,7 +126,7 @@ def pool_of(measurement: Measurement) -> Reconstruction | None:
 
 
 def line_size_rows(found: LineFrame) -> tuple[ResultRow, ...]:
-    """Height and width under lines that determine them; empty otherwise."""
+    """Rows of height and width under lines that determine them; otherwise empty."""
     surface = found.surface
     if surface is None or found.status != "ok":
         return ()
@@ -140,12 +140,12 @@ def line_size_rows(found: LineFrame) -> tuple[ResultRow, ...]:
 
 
 def shown(session: Session, frame: int) -> SurfaceState:
-    """What to show of a frame by the scheme of the settings.
+    """Data to show for a frame measured by the scheme of the settings.
 
     Raises
     ------
     InputError
-        If what the session holds is damaged.
+        If the stored data are damaged.
     """
     if not len(session.frames):
         return SurfaceState(
@@ -206,7 +206,7 @@ def _setup_words(result: Result) -> str:
 
 
 def provenance(result: Result) -> str:
-    """Where a result comes from, in one line."""
+    """Origin of a result in one line."""
     by_hand = result.measurement.correction is not None
     when = result.measured[:16].replace("T", " ")
     dots = "dots corrected by hand" if by_hand else "dots found automatically"
@@ -217,7 +217,7 @@ def provenance(result: Result) -> str:
 
 
 def size_rows(measures: Measures | None) -> tuple[ResultRow, ...]:
-    """Width … volume, each ±; empty without measures."""
+    """Rows of width … volume, each with ±; empty without measures."""
     if measures is None:
         return ()
     return tuple(
@@ -233,7 +233,7 @@ def size_rows(measures: Measures | None) -> tuple[ResultRow, ...]:
 
 
 def _sigma_words(measures: Measures, value: str, unit: str) -> str:
-    """What is in the ± of a size, and how much of it."""
+    """Text of the contributions to the ± of a size."""
     total, level, setup = (
         getattr(measures, sigma_name(value, part), np.nan) for part in ("", "level", "setup")
     )
@@ -248,7 +248,7 @@ def _sigma_words(measures: Measures, value: str, unit: str) -> str:
 
 
 def error_rows(measures: Measures | None) -> tuple[ResultRow, ...]:
-    """ARE … MRE-I, and the scheme's own ARE where it has one; empty without measures."""
+    """Rows of ARE … MRE-I, and the scheme's own ARE if it has one; empty without measures."""
     if measures is None:
         return ()
     return tuple(
@@ -259,7 +259,7 @@ def error_rows(measures: Measures | None) -> tuple[ResultRow, ...]:
 
 
 def trial_rows(match: Match | None) -> tuple[ResultRow, ...]:
-    """Each correspondence that was tried and its error on the imaging plane, the best first."""
+    """Rows of the tested correspondences and their errors on the imaging plane, best first."""
     if match is None:
         return ()
     return tuple(
@@ -275,7 +275,7 @@ def trial_rows(match: Match | None) -> tuple[ResultRow, ...]:
 
 
 def verdict(match: Match | None) -> str:
-    """How much better the chosen correspondence is than the next."""
+    """Text of how much better the chosen correspondence is than the next."""
     if match is None:
         return ""
     if not np.isfinite(match.margin):
@@ -286,7 +286,7 @@ def verdict(match: Match | None) -> str:
 
 
 def rig_of(result: Result) -> Rig:
-    """The rig that a result was measured with."""
+    """The rig with which a result was measured."""
     return _rig(result.setup)
 
 
@@ -296,7 +296,7 @@ def _rig(setup: str) -> Rig:
 
 
 def height_limits(seen: Overview) -> tuple[float, float] | None:
-    """Lowest and highest height of all frames, mm; None without any."""
+    """Lowest and highest height of all frames, mm; None if there are none."""
     low, high = seen.measures["depth_mm"], seen.measures["height_mm"]
     known = np.isfinite(low) & np.isfinite(high)
     if not known.any() or high[known].max() <= low[known].min():
@@ -311,14 +311,14 @@ def scene(
     limits: tuple[float, float] | None,
     cut: Profile | None,
 ) -> Scene | None:
-    """What the 3-D view shows of a measurement; None without a surface.
+    """Scene of a measurement for the 3-D view; None without a surface.
 
     Parameters
     ----------
     limits
         Colour scale that all frames share, mm; None: that of this frame.
     cut
-        The section to mark on the surface; None for none.
+        Section to mark on the surface; None for none.
     """
     reconstruction, match = pool_of(measurement), measurement.match
     if reconstruction is None:
@@ -357,7 +357,7 @@ def reflected_dots(measurement: Measurement) -> tuple[FloatArray, FloatArray] | 
 
 
 def error_scale(captured: FloatArray, computed: FloatArray) -> float:
-    """How many times as long errors are drawn, that the longest fills a tenth of the picture."""
+    """Enlargement of drawn errors at which the longest fills a tenth of the picture."""
     if not len(captured):
         return 1.0
     longest = float(np.fmax.reduce(np.linalg.norm(computed - captured, axis=1), initial=0.0))

@@ -1,4 +1,4 @@
-"""The surface page: the pool in 3-D, its dots, its section, its figures; two schemes compared."""
+"""The surface page: 3-D view, dots, section and figures of the pool; comparison of schemes."""
 
 from __future__ import annotations
 
@@ -63,13 +63,13 @@ from labapp.session.measured import scheme_name
 from labapp.text import HEIGHT_SIGMA_OF
 
 LEAST_PLAN_WIDTH = 100
-"""In a narrow window the section's fields would leave it less, too little to drag the line."""
+"""Minimum width at which the section line can be dragged beside the section's fields."""
 
 CHARTS_SOON_MS = 20
-"""Charts are drawn after the 3-D view, not in one go with it: the window stays quick."""
+"""Delay, ms, of the charts after the 3-D view, so that the window stays responsive."""
 
 CHARTS_REST_MS = 250
-"""Charts are drawn no more often: they cost more than the 3-D view does."""
+"""Shortest interval, ms, between drawing charts, which is slower than the 3-D view."""
 
 COLOURED = [("height", "by height"), ("sigma", "by ±"), ("residual", "by residual")]
 
@@ -78,13 +78,13 @@ FILM_PX = (1280, 720)
 SCREEN_DPI = 96.0
 
 GAP_PX = 6
-"""Between groups of tools, and between their lines."""
+"""Gap between groups of tools, and between their lines."""
 
 ANSWER_PX = 80
-"""Least room beside the buttons that save, to say where."""
+"""Minimum space for the message beside the save buttons."""
 
 NARROW_FIELD = 84
-"""Width of a field of two digits: all tools are in one line of a small screen."""
+"""Width of a field for two digits, so that all tools fit in one line on a small screen."""
 
 SHOWN_PARTS = {
     "points": ("Reflection &points", "White dots: where the rays meet the surface"),
@@ -98,7 +98,7 @@ SHOWN_PARTS = {
 
 
 class SurfacePage(Page):
-    """Measure the frames and look at the surface."""
+    """Measurement of the frames, and display of the surface."""
 
     key = "surface"
 
@@ -240,7 +240,7 @@ class SurfacePage(Page):
         )
 
     def _view_actions(self) -> None:
-        """Add what this page does with the 3-D view to the view's own menu."""
+        """Add the page's actions to the menu of the 3-D view."""
         for words, key, work in (
             ("Save picture…", "", self.save_picture),
             ("Film of the recording…", "", self.save_film),
@@ -271,7 +271,7 @@ class SurfacePage(Page):
     # --- what is shown -----------------------------------------------------------------------
 
     def refresh(self) -> None:
-        """Show the frame in view by the scheme that the session's settings choose."""
+        """Show the frame in view, measured by the scheme of the settings."""
         try:
             self.surface_state = shown(self.session, self.workspace.frame)
         except InputError as error:
@@ -290,12 +290,12 @@ class SurfacePage(Page):
         self.compare.leave()
 
     def picture(self) -> QPixmap:
-        """The 3-D picture; comparing, all there is."""
+        """The 3-D picture, or the whole comparison."""
         image = None if self.stack.currentWidget() is self.compare else self.view.image()
         return self.grab() if image is None else QPixmap.fromImage(image)
 
     def copy_picture(self) -> None:
-        """Put the picture on the clipboard."""
+        """Copy the picture to the clipboard."""
         QGuiApplication.clipboard().setPixmap(self.picture())
         self.confirm("The picture is on the clipboard", self.saved)
 
@@ -306,7 +306,7 @@ class SurfacePage(Page):
             self.write_picture(*asked)
 
     def write_picture(self, path: Path, paper: Paper | None = None) -> None:
-        """Write the picture at its size on paper; comparing, as it is seen. A failure is reported.
+        """Write the picture at its size on paper, or a comparison as displayed; report a failure.
 
         Without ``paper`` it is one column wide.
         """
@@ -325,7 +325,7 @@ class SurfacePage(Page):
             self.saved.setText(f"{PROBLEM} {path} cannot be written")
 
     def save_film(self) -> None:
-        """Ask for a file and write a film of all frames to it, seen as the 3-D view is now."""
+        """Ask for a file and write a film of all frames to it, with the current camera."""
         proposed = self.workspace.folder / f"{self.session.path.stem}.mp4"
         if path := ask_save(self, "Save film", proposed, "Film (*.mp4)"):
             self.write_film(path)
@@ -347,7 +347,7 @@ class SurfacePage(Page):
         self.start_task(f"Writing {path.name}", work, done, kind="Film", beside=self.saved)
 
     def toggle_scale(self) -> None:
-        """Draw heights as they are, or exaggerated as before."""
+        """Switch between true heights and the previous exaggeration."""
         now = self.options.exaggeration
         self._set(exaggeration=1.0 if now != 1.0 else self._exaggerated)
 
@@ -380,7 +380,7 @@ class SurfacePage(Page):
             self._rest.start(CHARTS_SOON_MS)
 
     def _show_charts(self) -> None:
-        """Bring the charts up to date; when frames rush by, every so often and at last."""
+        """Update the charts; while frames change quickly, only at intervals and at the end."""
         if self._charts_due is not None:
             self._charts_due()
             self._charts_due = None
@@ -409,7 +409,7 @@ class SurfacePage(Page):
             self.compare.refresh(self.options)
         else:
             self._show_surface()
-            self._show_charts()  # what the hand does is seen at once
+            self._show_charts()  # a drag is shown immediately
 
     def _enter_section(self, _: object) -> None:
         self._set_section(float(self.angle.value() or 0.0), float(self.offset.value() or 0.0))
@@ -421,17 +421,17 @@ class SurfacePage(Page):
         self._steered().look(direction)
 
     def _steered(self) -> View3d:
-        """The view that is turned; the others of a comparison turn with it."""
+        """The steered view; the others of a comparison follow it."""
         comparing = self.stack.currentWidget() is self.compare
         return self.compare.first.view if comparing else self.view
 
     def showEvent(self, event: QShowEvent) -> None:
-        """Let a 3-D controller turn what is seen."""
+        """Start steering by a 3-D controller."""
         super().showEvent(event)
         self.steering.start()
 
     def hideEvent(self, event: QHideEvent) -> None:
-        """Leave a 3-D controller to other programs."""
+        """Release the 3-D controller to other programs."""
         super().hideEvent(event)
         self.steering.stop()
 
@@ -446,7 +446,7 @@ class SurfacePage(Page):
 
 
 class _Tools(QWidget):
-    """Groups of tools: as many beside each other as there is room for."""
+    """Groups of tools, wrapped to the available width."""
 
     def __init__(self, *groups: QHBoxLayout) -> None:
         super().__init__()
@@ -481,7 +481,7 @@ class _Tools(QWidget):
 
 
 class _Toggle(QToolButton):
-    """A button that is seen to be pressed: Fusion hardly darkens it."""
+    """A button with a clear pressed state, which Fusion hardly shows."""
 
     def initStyleOption(self, option: QStyleOptionToolButton) -> None:
         super().initStyleOption(option)
@@ -494,5 +494,5 @@ class _Toggle(QToolButton):
 
 
 def _sigma(reconstruction: Reconstruction, x_mm: float, y_mm: float) -> float:
-    """Standard uncertainty of the height at a place, mm; NaN where the scheme gives none."""
+    """Standard uncertainty of the height at a position, mm; NaN if the scheme gives none."""
     return float(sigma_at(reconstruction, np.array([x_mm]), np.array([y_mm]))[0])

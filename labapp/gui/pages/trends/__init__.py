@@ -1,4 +1,4 @@
-"""Step 7: how the pool changes over the recording."""
+"""Step 7: changes of the pool over the recording."""
 
 from labapp.gui.pages.trends.page import TrendsPage
 

@@ -34,7 +34,7 @@ TABLES = f"Tables (*.csv *.txt *.tsv *.tdms);;{EVERYTHING}"
 
 
 class TrendsPage(Page):
-    """How the pool changes over the recording."""
+    """Changes of the pool over the recording."""
 
     key = "trends"
     shows_all_frames = True
@@ -68,7 +68,7 @@ class TrendsPage(Page):
         """Show the session's results."""
         session, frame = self.session, self.workspace.frame
         if self._in_view not in (None, frame):
-            # The frame in view is another one, and nothing else: stepping must be quick.
+            # Only the frame in view changed; stepping must be quick.
             self._in_view = frame
             self._mark(frame)
             return
@@ -103,7 +103,7 @@ class TrendsPage(Page):
             self.refresh()
 
     def _forget(self) -> None:
-        """Show no events of another session."""
+        """Remove the events of the previous session."""
         self._events = {}
         self.leave()
 
@@ -112,7 +112,7 @@ class TrendsPage(Page):
         self._in_view = None
 
     def picture(self) -> QPixmap:
-        """Return the plots without what is round them."""
+        """The plots without their surroundings."""
         return QPixmap.fromImage(self.plots.grab_picture())
 
     def _show_signals(self, signals: Signals | None, read_only: bool) -> None:
@@ -148,7 +148,7 @@ class TrendsPage(Page):
             self.read_signals(path)
 
     def read_signals(self, path: Path) -> None:
-        """Read a table with current and voltage, and keep it in the session."""
+        """Read a table with current and voltage, and store it in the session."""
         self._keep(f"Reading {path.name}", lambda: read_signals(path))
 
     def _start_at(self, start_s: object) -> None:
@@ -158,7 +158,7 @@ class TrendsPage(Page):
             self._keep("Moving current and voltage", lambda: moved)
 
     def _keep(self, title: str, signals: Callable[[], Signals]) -> None:
-        """Keep signals in the session, in the background: they may be half a million."""
+        """Store signals in the session, in the background: there may be half a million samples."""
         session = self.session
 
         def work(_: Control) -> Signals:

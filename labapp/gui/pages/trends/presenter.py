@@ -1,4 +1,4 @@
-"""What the trends page shows, computed from the session: curves, their spread, a spectrum."""
+"""Data of the trends page, computed from a session: curves, their spread, a spectrum."""
 
 from __future__ import annotations
 
@@ -51,38 +51,38 @@ SIGNALS = {
 
 @dataclass(frozen=True)
 class TrendOptions:
-    """What the operator wants to see."""
+    """Options chosen by the operator."""
 
     shown: tuple[str, ...] = (*FIRST_SHOWN, *SIGNALS)
-    """Measures, and channels of `SIGNALS`."""
+    """Displayed measures and channels of `SIGNALS`."""
     without_doubtful: bool = False
-    """Whether frames in doubt are left out of statistics and spectrum."""
+    """Whether statistics and spectrum exclude doubtful frames."""
     spectrum_of: str = ""
     """A measure; empty for no spectrum."""
 
 
 @dataclass(frozen=True)
 class TrendsState:
-    """What the page shows."""
+    """Data shown by the page."""
 
     curves: tuple[Curve, ...]
     axis: Axis
-    """Of the course over time; the axis holds all frames."""
+    """Curves over time, and their axis, which covers all frames."""
     places: dict[int, float]
-    """Where every frame is on the axis, by its number."""
+    """Position of every frame on the axis, by its number."""
     rows: tuple[ResultRow, ...]
-    """Mean ± standard deviation, range, and ± of the mean where it has one: rows of a measure."""
+    """Rows for each measure: mean ± standard deviation, range, and ± of the mean if known."""
     words: str
-    """How many frames count, and why others do not."""
+    """Number of frames included, and reasons why others are not."""
     setup_words: str
-    """How far the set-up can be relied on; empty where it is not complete."""
+    """Text of the reliability of the set-up; empty if it is incomplete."""
     spectrum: tuple[Curve, ...]
     spectrum_axis: Axis
-    """Spectrum of the chosen measure; no curve where there is none."""
+    """Spectrum of the chosen measure, and its axis; no curve if there is none."""
     spectrum_words: str
-    """The strongest oscillation, or why there is no spectrum."""
+    """Text of the strongest oscillation, or the reason why there is no spectrum."""
     signals_words: str
-    """Of current and voltage."""
+    """Text about current and voltage."""
 
 
 def show(
@@ -91,14 +91,14 @@ def show(
     seen: Overview | None = None,
     events: Mapping[str, tuple[Event, ...]] = MappingProxyType({}),
 ) -> TrendsState:
-    """What to show of a session.
+    """Data to show for a session.
 
     Parameters
     ----------
     seen
-        Its overview, if it is at hand.
+        Overview of the session if already available.
     events
-        Events by measure and signal, s, as they were last worked out.
+        Last determined events by measure and signal, s.
     """
     seen, signals = seen or session.overview(), session.signals
     if session.has_lines:
@@ -137,7 +137,7 @@ def show(
 
 
 def _show_lines(session: Session, options: TrendOptions, seen: Overview) -> TrendsState:
-    """What lines show over the recording; they have no choice of measures and no spectrum."""
+    """Data of a line pattern over the recording; no choice of measures, no spectrum."""
     found = line_trend(session)
     timed = bool(np.isfinite(seen.time_s).all()) and len(seen.time_s) > 0
     at = seen.time_s if timed else seen.frame.astype(float)
@@ -185,7 +185,7 @@ def _show_lines(session: Session, options: TrendOptions, seen: Overview) -> Tren
 
 
 def _followed(x: FloatArray, shift_px: FloatArray, timed: bool) -> str:
-    """How often a line was followed, and its strongest oscillation."""
+    """Text of the number of frames in which a line was tracked, and its strongest oscillation."""
     known = np.isfinite(shift_px)
     words = f"The line is followed in {known.sum()} of {len(x)} frames."
     hertz, strength = oscillation_frequency(x[known], shift_px[known]) if timed else (np.nan, 0.0)
@@ -251,7 +251,7 @@ def _counted(seen: Overview, course: Trend) -> str:
 
 
 def _without_shape(courses: Sequence[Trend]) -> str:
-    """Which measures are shown that results of versions before did not have."""
+    """Text of the displayed measures that are missing in results of earlier versions."""
     names = [one.quantity.label for one in courses if not len(one.frame)]
     if not names or all(not len(one.frame) for one in courses):
         return ""
@@ -292,7 +292,7 @@ def _signal_curves(
     shown: Sequence[str],
     events: Mapping[str, tuple[Event, ...]],
 ) -> list[Curve]:
-    """Signals while the recording runs, and a little before and after."""
+    """Curves of the signals during the recording, and shortly before and after."""
     time_s = signals.time_s + signals.start_s
     low, high = float(seen.time_s.min()), float(seen.time_s.max())
     room = 0.05 * (high - low) or 0.5
