@@ -1,6 +1,6 @@
-"""Loops that tell a frame's noise and the size of its dots, compiled (`dot_size`).
+"""Inner loops of the estimates of noise and dot size, compiled (`dot_size`, docs/adr/0018).
 
-Arrays may be read-only, and of any layout but for pictures (docs/adr/0018).
+Arrays may be read-only; pictures must be contiguous, other arrays need not be.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ _ints = types.Array(_i, 1, "A", readonly=True)
 
 @_compiled_for(*((own, _i, _i) for own in (_grey, _byte)))
 def tile_noise(image: Picture, rows: int, columns: int) -> Grey:
-    """Noise of a picture's tiles, shape (rows, columns): see `dot_size.local_noise`.
+    """Estimate the noise in a picture's tiles, shape (rows, columns); see `dot_size.local_noise`.
 
-    Every second pixel of every second row stands for the others.
+    Every second pixel of every second row is used.
     """
     height, width = image.shape
     made = np.empty((rows, columns), np.float32)
@@ -48,7 +48,7 @@ def tile_noise(image: Picture, rows: int, columns: int) -> Grey:
 
 @_compiled(_grey, _ints, _ints, _f)
 def answers(band: Grey, u: IntArray, v: IntArray, step: float) -> FloatArray:
-    """Largest value of a picture, made smaller ``step``-fold, about each pixel of the large one."""
+    """Largest of 3 × 3 values of a ``step`` times smaller picture about each full-size pixel."""
     height, width = band.shape
     made = np.empty(len(u))
     for k in range(len(u)):
@@ -70,7 +70,7 @@ def parts(
     within: float,
     share: float,
 ) -> BoolArray:
-    """Whether a whole lies within some distance of each place that has this share of its strength.
+    """Whether each place is near a whole with at least a share of the place's strength.
 
     Places and wholes have shapes (n, 2) and (m, 2).
     """
