@@ -1,4 +1,4 @@
-"""The bench that frames are measured on, and what follows from it for all of them."""
+"""The bench: a rig with its image calibration, and quantities derived from both."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from labapp.core.values import FloatArray
 
 @dataclass(frozen=True)
 class Bench:
-    """A rig, and how the camera sees its imaging plane.
+    """A rig and its image calibration.
 
     Parameters
     ----------
     rig
         Laser, pattern, electrode and imaging plane.
     calibration
-        From the image to the imaging plane.
+        Mapping between the image and the imaging plane.
     """
 
     rig: Rig
@@ -30,13 +30,13 @@ class Bench:
 
     @cached_property
     def rays(self) -> ProjectedRays:
-        """The rays of the pattern, and where they would land."""
+        """The rays of the pattern and their intersections with the work piece."""
         return project_rays(self.rig.laser, self.rig.pattern)
 
     def frame_px(self, frame_shape: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
-        """First and last pixel (u, v) of a frame, undistorted, shapes (2,).
+        """Undistorted first and last pixel (u, v) of a frame, shapes (2,).
 
-        A distorting lens bends the frame's edges: the rectangle is the one within them.
+        Undistortion curves the frame's edges; the result is the rectangle inscribed in them.
         """
         if frame_shape not in self._frames_px:
             height, width = frame_shape

@@ -1,4 +1,7 @@
-"""Image ↔ imaging plane (Eq. 4-6 … 4-13); imaging plane ↔ universal is `rig.ImagingPlane`."""
+"""Transformation between image and imaging plane (Eq. 4-6 … 4-13).
+
+`rig.ImagingPlane` transforms between imaging plane and universal coordinates.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ import numpy as np
 from labapp.core.values import FloatArray, ReadOnlyArrays
 
 RADIAL_STEPS = 6
-"""Of Newton's method, for the inverse of a radial distortion."""
+"""Number of Newton steps for the inverse of a radial distortion."""
 
 UNDISTORTED_PX = 1e-6
 """Tolerance of undistortion, px."""
@@ -18,7 +21,7 @@ UNDISTORTED_PX = 1e-6
 
 @dataclass(frozen=True)
 class Lens:
-    """How a camera's lens distorts its picture: OpenCV's model with five coefficients.
+    """Lens distortion: OpenCV's model with five coefficients.
 
     Parameters
     ----------
@@ -35,7 +38,7 @@ class Lens:
     distortion: tuple[float, float, float, float, float]
 
     def distorted(self, ideal_px: FloatArray) -> FloatArray:
-        """Where the lens puts what a pinhole would have at (u, v), shape (…, 2), px."""
+        """Distort ideal pinhole image points (u, v), shape (…, 2), px."""
         x, y = np.moveaxis((np.asarray(ideal_px, float) - self.center_px) / self.focal_px, -1, 0)
         k1, k2, p1, p2, k3 = self.distortion
         square = x * x + y * y
@@ -50,7 +53,7 @@ class Lens:
         return np.asarray(bent * self.focal_px + self.center_px)
 
     def ideal(self, image_px: FloatArray) -> FloatArray:
-        """Where a pinhole would have what the picture has at (u, v), shape (…, 2), px."""
+        """Undistort image points (u, v), shape (…, 2), px, to those of an ideal pinhole."""
         import cv2
 
         image_px = np.asarray(image_px, float)
@@ -67,19 +70,19 @@ class Lens:
 
 @dataclass(frozen=True)
 class RadialDistortion(ReadOnlyArrays):
-    """A distortion of the picture that is known by what it does to places on the imaging plane.
+    """Radial distortion that is defined by displacements on the imaging plane.
 
-    A place that the calibration without it has at p is at ``p + percent/100·(|p − m|/c)²·(p − m)``,
-    with m the middle of the plane and c half its diagonal.
+    A point that the uncorrected calibration maps to p is at
+    ``p + percent/100·(|p − m|/c)²·(p − m)``, with m the plane's centre and c half its diagonal.
 
     Parameters
     ----------
     matrix, lens
-        Of the image calibration without it (`ImageCalibration`).
+        Those of the uncorrected image calibration (`ImageCalibration`).
     half_mm
-        Half the plane's width and height: its middle, shape (2,), mm.
+        Half of the plane's width and height, which is its centre, shape (2,), mm.
     percent
-        By how much it moves a dot in the plane's corner, in percent of its way to the middle.
+        Displacement at the plane's corner, in percent of the distance to the centre.
     """
 
     matrix: FloatArray
@@ -88,7 +91,7 @@ class RadialDistortion(ReadOnlyArrays):
     percent: float
 
     def ideal(self, image_px: FloatArray) -> FloatArray:
-        """Where the calibration without it sees what the picture has at (u, v), (…, 2), px."""
+        """Undistort image points (u, v), shape (…, 2), px."""
         image_px = image_px if self.lens is None else self.lens.ideal(image_px)
         out = _apply(self.matrix, image_px) - self.half_mm
         share = (
@@ -116,15 +119,14 @@ class ImageCalibration(ReadOnlyArrays):
     Parameters
     ----------
     matrix
-        Shape (3, 3): homogeneous (u, v, 1) in px, undistorted, to (X′, Z′, 1)
-        in mm.
+        Shape (3, 3): undistorted homogeneous (u, v, 1) in px to (X′, Z′, 1) in mm.
     lens
-        The lens's distortion; None where there is none.
+        The lens distortion; None if there is none.
 
     Raises
     ------
     ValueError
-        If the matrix cannot be inverted.
+        If the matrix is not finite, not of this shape, or singular.
     """
 
     matrix: FloatArray
@@ -161,12 +163,12 @@ class ImageCalibration(ReadOnlyArrays):
         x_axis_mm, z_axis_mm
             X′ of the former, Z′ of the latter, mm.
         lens
-            The distortion of the picture that the three points are in.
+            Lens distortion of the picture in which the three points were marked.
 
         Raises
         ------
         ValueError
-            If the three points lie on one line.
+            If the three points are collinear.
         """
         seen = np.array([origin_px, x_axis_px, z_axis_px], float)
         origin, on_x, on_z = seen if lens is None else lens.ideal(seen)
@@ -179,41 +181,41 @@ class ImageCalibration(ReadOnlyArrays):
         return cls(_inverse(to_image), lens)
 
     def with_distortion(self, percent: float, half_mm: FloatArray) -> ImageCalibration:
-        """Replace the radial distortion, see `RadialDistortion`."""
+        """Return a calibration with another radial distortion (`RadialDistortion`)."""
         lens = self.plain_lens
         bent = RadialDistortion(self.matrix, lens, half_mm, percent) if percent else lens
         return ImageCalibration(self.matrix, bent)
 
     @property
     def plain_lens(self) -> Lens | None:
-        """The lens, but for a radial distortion that is known on the plane."""
+        """The lens distortion without the radial distortion on the plane."""
         return self.lens.lens if isinstance(self.lens, RadialDistortion) else self.lens
 
     @property
     def distortion_percent(self) -> float:
-        """Radial distortion in the plane's corner, percent, see `RadialDistortion`."""
+        """Radial distortion at the plane's corner, percent (`RadialDistortion`)."""
         return self.lens.percent if isinstance(self.lens, RadialDistortion) else 0.0
 
     def ideal_px(self, image_px: FloatArray) -> FloatArray:
-        """(u, v), shape (…, 2), px, undistorted."""
+        """Undistort image points (u, v), shape (…, 2), px."""
         return image_px if self.lens is None else self.lens.ideal(image_px)
 
     def to_plane(self, image_px: FloatArray) -> FloatArray:
-        """(u, v), shape (…, 2), px, to IPCS (X′, Z′), shape (…, 2), mm."""
+        """Transform (u, v), shape (…, 2), px, to IPCS (X′, Z′), shape (…, 2), mm."""
         return _apply(self.matrix, self.ideal_px(image_px))
 
     def to_image(self, plane_mm: FloatArray) -> FloatArray:
-        """IPCS (X′, Z′), shape (…, 2), mm, to (u, v), shape (…, 2), px."""
+        """Transform IPCS (X′, Z′), shape (…, 2), mm, to (u, v), shape (…, 2), px."""
         ideal = _apply(self.from_plane, plane_mm)
         return ideal if self.lens is None else self.lens.distorted(ideal)
 
     @cached_property
     def from_plane(self) -> FloatArray:
-        """Homography from the plane to the image without distortion, shape (3, 3)."""
+        """Homography from the plane to the undistorted image, shape (3, 3)."""
         return _inverse(self.matrix)
 
     def jacobian(self, image_px: FloatArray) -> FloatArray:
-        """∂(X′, Z′)/∂(u, v) at (u, v), shape (…, 2, 2), mm/px, the lens taken as ideal."""
+        """Jacobian ∂(X′, Z′)/∂(u, v), (…, 2, 2), mm/px; that of the distortion is neglected."""
         image_px = np.asarray(image_px, float)
         plane = self.to_plane(image_px)
         image_px = self.ideal_px(image_px)

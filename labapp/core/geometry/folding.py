@@ -1,8 +1,8 @@
-"""A flat folding mirror between pool and imaging plane (§9.2): the plane's mirror image.
+"""A flat folding mirror between pool and imaging plane (§9.2), and the plane's mirror image.
 
-Rays that a flat mirror turns to a plane arrive where they would have met the plane's mirror image
-behind it: a rig has that image as its imaging plane, and no mirror. The picture may be of either
-side of the paper: the image calibration holds which.
+Rays that a flat mirror reflects to a plane would without it meet the plane's mirror image at the
+corresponding points. A rig has that image as its imaging plane, and no mirror. The camera may view
+either side of the paper; the image calibration accounts for that.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ class FoldingMirror(ReadOnlyArrays):
     Parameters
     ----------
     point_mm
-        A point of its face, UCS, shape (3,), mm.
+        A point of its surface, UCS, shape (3,), mm.
     normal
-        Normal of its face, of any length and either sign, shape (3,).
+        Normal of its surface, of any length and either sign, shape (3,).
     """
 
     point_mm: FloatArray
     normal: FloatArray
 
     def image_of(self, plane: ImagingPlane) -> ImagingPlane:
-        """Mirror image of a plane: where its rays seem to go, seen from the pool."""
+        """Return the mirror image of a plane."""
         unit = self.normal / np.linalg.norm(self.normal)
         turn = np.eye(3) - 2.0 * np.outer(unit, unit)
         origin = self.point_mm + turn @ (plane.origin_mm - self.point_mm)
@@ -43,7 +43,7 @@ class FoldingMirror(ReadOnlyArrays):
         )
 
     def moved(self, offset_mm: float, tilt_deg: tuple[float, float]) -> FoldingMirror:
-        """The mirror shifted along its normal, and tilted about two axes in its face."""
+        """Return the mirror shifted along its normal and tilted about two axes in its surface."""
         unit = self.normal / np.linalg.norm(self.normal)
         first = np.cross(unit, np.eye(3)[np.argmin(np.abs(unit))])
         first /= np.linalg.norm(first)
@@ -53,13 +53,13 @@ class FoldingMirror(ReadOnlyArrays):
 
 
 def pose_of(plane: ImagingPlane) -> FloatArray:
-    """Distance, s, h (mm), pitch, yaw and roll (degrees) of a plane, shape (6,)."""
+    """Pose of a plane: distance, s, h (mm), pitch, yaw and roll (degrees), shape (6,)."""
     x, y, z = plane.origin_mm
     return np.array([-y, -x, z, *plane.angles_deg])
 
 
 def plane_of(pose: FloatArray, like: ImagingPlane) -> ImagingPlane:
-    """Plane of a pose (`pose_of`), of another's size and glass."""
+    """Plane with a given pose (`pose_of`) and the size and glass of another plane."""
     distance, s, h = pose[:3]
     pitch, yaw, roll = pose[3:].tolist()
     posed = ImagingPlane.of_angles(np.array([-s, -distance, h]), (pitch, yaw, roll))
@@ -70,18 +70,19 @@ def plane_of(pose: FloatArray, like: ImagingPlane) -> ImagingPlane:
 def image_sigma(
     plane: ImagingPlane, mirror: FoldingMirror, sigma: FloatArray, mirror_sigma: FloatArray
 ) -> FloatArray:
-    """Standard uncertainty of the pose of a plane's mirror image, shape (6,), by linear response.
+    """Standard uncertainty of the pose of a plane's mirror image, shape (6,), to first order.
 
-    A tilt of the mirror turns the image by twice as much. What the six have in common is left out.
+    A tilt of the mirror rotates the image by twice as much. Correlations of the six are neglected.
 
     Parameters
     ----------
     plane, mirror
-        Where they are.
+        The plane and the mirror.
     sigma
-        Standard uncertainty of the plane's own pose (`pose_of`), shape (6,).
+        Standard uncertainty of the plane's pose (`pose_of`), shape (6,).
     mirror_sigma
-        Of the mirror's place along its normal, mm, and of its tilt either way, degrees, shape (3,).
+        Standard uncertainty of the mirror's position along its normal, mm, and of its two tilts,
+        degrees, shape (3,).
     """
     pose = pose_of(plane)
     image = pose_of(mirror.image_of(plane))
@@ -97,7 +98,7 @@ def image_sigma(
 
 
 def _change(after: FloatArray, before: FloatArray) -> FloatArray:
-    """Change of a pose a unit step; angles may pass 180°."""
+    """Difference quotient of a pose; angles may pass 180°."""
     change = after - before
     change[3:] = (change[3:] + 180.0) % 360.0 - 180.0
     return change / STEP

@@ -1,7 +1,7 @@
 """The projected line pattern: k lines, each a fan of rays in one plane (§3.1.2, §3.2.1, Fig. 3-9).
 
-Unlike a dot, a point of a reflected line does not say which ray made it: only the plane of rays is
-known, and the place along the fan is open.
+The ray of a point of a reflected line is not known, unlike that of a dot: only the plane of rays is
+known, and the angle in the fan is a free parameter.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from labapp.core.values import FloatArray
 class LinePattern:
     """Parallel lines across the beam axis.
 
-    Line i, from 1, grows towards the head of the pool (+Y), as rows of dots do; the place in the
-    fan grows with X. Line i at angle φ has the direction
+    Lines i are numbered from 1 towards the head of the pool (+Y), as are rows of dots; the angle
+    in the fan increases with X. Line i at angle φ has the direction
     ``a + tan(φ)·e + tan((c − i)·γ)·n`` with c = (count + 1)/2 and the interline angle γ.
 
     Parameters
@@ -32,7 +32,7 @@ class LinePattern:
     fan_angle_deg
         Angle from one end of a line to the other, degrees.
     rotation_deg
-        By how much the pattern is turned about the beam axis, degrees, as `DotPattern` has it.
+        Rotation of the pattern about the beam axis, degrees; sign as in `DotPattern`.
     """
 
     count: int = 5
@@ -46,14 +46,14 @@ class LinePattern:
         return float(np.radians(self.fan_angle_deg) / 2)
 
     def tangents(self, line: FloatArray, fan: FloatArray) -> FloatArray:
-        """Tangents of rays to the beam axis, to the side and upwards, shape (…, 2).
+        """Tangents of the angles of rays to the beam axis, sideways and upwards, shape (…, 2).
 
         Parameters
         ----------
         line
             Number of the line, from 1; numbers beyond 1 … count are diffraction fringes.
         fan
-            Angle φ in the fan, rad; both of shapes that broadcast.
+            Angle φ in the fan, rad; the two broadcast.
         """
         up = np.tan(((self.count + 1) / 2 - line) * np.radians(self.interline_angle_deg))
         tangents = np.stack(np.broadcast_arrays(np.tan(fan), up), axis=-1)
@@ -63,15 +63,15 @@ class LinePattern:
 
 
 KIND = "lines"
-"""Kind of a pattern of lines in setup files."""
+"""The kind of line patterns in setup files."""
 
 RAYS_A_LINE = 41
-"""So many rays stand for a line where single rays are followed."""
+"""Number of rays per line if a line is represented by single rays."""
 
 
 @dataclass(frozen=True)
 class LineRays(DotPattern):
-    """A line pattern as rays, a row for each line: for drawings, and for what counts rays.
+    """A line pattern represented by rays, one row for each line, for drawings and ray counts.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ class LineRays(DotPattern):
 
     @property
     def tangents(self) -> FloatArray:
-        """Tangents of the rays to the beam axis, shape (rows, columns, 2)."""
+        """Tangents of the angles of the rays to the beam axis, shape (rows, columns, 2)."""
         fan = np.linspace(-self.lines.half_fan, self.lines.half_fan, self.columns)
         return self.lines.tangents(np.arange(1.0, self.rows + 1)[:, None], fan)
 
@@ -101,12 +101,12 @@ class LineRays(DotPattern):
 
 @dataclass(frozen=True)
 class LineRig:
-    """A bench with a line pattern: everything whose place must be known to measure.
+    """A rig with a line pattern.
 
     Parameters
     ----------
     laser, pattern, electrode, imaging_plane
-        What it is made of.
+        Its parts.
     """
 
     laser: Laser
@@ -116,7 +116,7 @@ class LineRig:
 
 
 def line_rig(rig: Rig) -> LineRig | None:
-    """The rig of a line pattern; None where the rig has one of dots."""
+    """Return the rig of a line pattern; None if the rig has a dot pattern."""
     if not isinstance(rig.pattern, LineRays):
         return None
     return LineRig(rig.laser, rig.pattern.lines, rig.electrode, rig.imaging_plane)
@@ -125,7 +125,7 @@ def line_rig(rig: Rig) -> LineRig | None:
 def line_directions(
     laser: Laser, pattern: LinePattern, line: FloatArray, fan: FloatArray
 ) -> FloatArray:
-    """Unit directions of rays of lines, shape (…, 3); see `LinePattern.tangents`."""
+    """Unit directions of the rays of lines, shape (…, 3); see `LinePattern.tangents`."""
     axis, across, along = laser.axes
     tangents = pattern.tangents(line, fan)
     direction = axis + tangents[..., :1] * across + tangents[..., 1:] * along

@@ -1,4 +1,4 @@
-"""Rays, the reflection law, and where rays meet planes (Eq. 4-1 … 4-4)."""
+"""Rays, the law of reflection, and intersections of rays with planes (Eq. 4-1 … 4-4)."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from labapp.core.values import BoolArray, FloatArray, ReadOnlyArrays
 
 @lru_cache(maxsize=64)
 def ray_directions(laser: Laser, pattern: DotPattern) -> FloatArray:
-    """Unit direction of every projected ray (Eq. 4-1, Fig. 4-14).
+    """Unit directions of all projected rays (Eq. 4-1, Fig. 4-14).
 
     Returns
     -------
     FloatArray
-        Shape (rows, columns, 3), not to be written to; ray (i, j), counted from 1, is at
-        ``[i - 1, j - 1]``. i grows with Y on the work piece, j with X.
+        Shape (rows, columns, 3), read-only; ray (i, j), counted from 1, is at
+        ``[i - 1, j - 1]``. i increases with Y on the work piece, j with X.
     """
     axis, across, along = laser.axes
     tangents = pattern.tangents
@@ -38,17 +38,17 @@ def surface_normal(gradient: FloatArray) -> FloatArray:
 def reflect(direction: FloatArray, normal: FloatArray) -> FloatArray:
     """Direction after reflection at a surface with the given normal, shapes (…, 3) (Eq. 4-4).
 
-    The length of ``direction`` is kept; ``normal`` need not be a unit vector.
+    The length of ``direction`` is preserved; ``normal`` need not be a unit vector.
     """
     k = np.vecdot(direction, normal) / np.vecdot(normal, normal)
     return np.asarray(direction - 2.0 * k[..., None] * normal)
 
 
 def bisecting_gradient(incident: FloatArray, reflected: FloatArray) -> FloatArray:
-    """Gradient (f_x, f_y), shape (…, 2), of the surface that turns one direction into the other.
+    """Gradient (f_x, f_y), shape (…, 2), of the surface that reflects one direction to the other.
 
-    The normal bisects the reversed incident ray and the reflected one (Eq. 4-3). Both
-    directions, shape (…, 3), of any length.
+    The normal bisects the reversed incident ray and the reflected one (Eq. 4-3). The directions,
+    shape (…, 3), may have any length.
     """
     back, forth = (way / np.sqrt(np.vecdot(way, way))[..., None] for way in (incident, reflected))
     normal = forth - back
@@ -58,10 +58,10 @@ def bisecting_gradient(incident: FloatArray, reflected: FloatArray) -> FloatArra
 def intersect_imaging_plane(
     origin_mm: FloatArray, direction: FloatArray, plane: ImagingPlane
 ) -> FloatArray:
-    """Where rays meet the imaging plane, as IPCS (X′, Z′), shape (…, 2), mm.
+    """Intersect rays with the imaging plane: IPCS (X′, Z′), shape (…, 2), mm.
 
-    A ray that runs away from the plane or along it gives NaN. The plane is taken as unbounded. In
-    its glass a ray is nearer to the normal: the dot is shifted back along the ray's way aside.
+    NaN for a ray parallel to the plane or away from it. The plane is unbounded. In its glass a ray
+    is refracted towards the normal, which shifts the dot against the ray's lateral direction.
     """
     normal = plane.normal
     along = np.asarray(direction @ normal)
@@ -80,15 +80,14 @@ def intersect_imaging_plane(
 def direction_to_dots(
     point_mm: FloatArray, plane_mm: FloatArray, plane: ImagingPlane
 ) -> FloatArray:
-    """Directions in which rays leave points for their dots, shape (…, 3), not normalised.
+    """Directions of rays from points to their dots, shape (…, 3), not normalised.
 
-    Through glass Snell's law is solved for the angle at which the ray reaches it, by Newton's
-    method for the tangent of that angle.
+    With glass, Snell's law is solved for the tangent of the angle of incidence by Newton's method.
 
     Parameters
     ----------
     point_mm, plane_mm
-        Where they start, UCS, shape (…, 3), and their dots, IPCS, shape (…, 2), mm.
+        Start points, UCS, shape (…, 3), and dots, IPCS, shape (…, 2), mm.
     plane
         The imaging plane.
     """
@@ -109,35 +108,38 @@ def direction_to_dots(
 
 
 _SNELL_STEPS = 4
-"""Newton steps to the direction through glass: exact to rounding."""
+"""Newton steps for the direction through glass; sufficient for machine precision."""
 
 
 def _in_glass(index: float, tangent2: FloatArray) -> FloatArray:
-    """Tangent of the rays' angles to the normal in glass over that in air, given its square."""
+    """Ratio of the tangents of a ray's angles to the normal in glass and air.
+
+    ``tangent2`` is the squared tangent in air.
+    """
     return np.asarray(1.0 / np.sqrt(index**2 + (index**2 - 1.0) * tangent2))
 
 
 def intersect_level(
     origin_mm: FloatArray, direction: FloatArray, z_mm: FloatArray | float = 0.0
 ) -> FloatArray:
-    """Where rays meet the horizontal plane z = z_mm, one or one each (…, 1), shape (…, 3), mm."""
+    """Intersect rays with horizontal planes z = z_mm, scalar or (…, 1): points, (…, 3), mm."""
     return np.asarray(origin_mm + ((z_mm - origin_mm[..., 2:]) / direction[..., 2:]) * direction)
 
 
 @dataclass(frozen=True)
 class ProjectedRays(ReadOnlyArrays):
-    """The rays of a pattern, and where they would land on the work piece, z = 0.
+    """The rays of a pattern and their intersections with the work piece, z = 0.
 
     Parameters
     ----------
     directions
         Unit directions, shape (rows, columns, 3).
     landing_mm
-        Landing points, shape (rows, columns, 3), mm.
+        Intersections with the work piece, shape (rows, columns, 3), mm.
     spacing_mm
         Distance between neighbouring landing points along X and along Y, shape (2,), mm.
     absent
-        Rays that the lens does not make, shape (rows, columns).
+        Whether a ray is absent from the pattern, shape (rows, columns).
     """
 
     directions: FloatArray
@@ -148,7 +150,7 @@ class ProjectedRays(ReadOnlyArrays):
 
 @lru_cache(maxsize=64)
 def project_rays(laser: Laser, pattern: DotPattern) -> ProjectedRays:
-    """Rays of a pattern from a laser, and their landing points."""
+    """Compute the rays of a pattern from a laser, and their landing points."""
     directions = ray_directions(laser, pattern)
     landing = intersect_level(laser.position_mm, directions)
     absent = np.zeros(directions.shape[:2], bool)
@@ -158,7 +160,7 @@ def project_rays(laser: Laser, pattern: DotPattern) -> ProjectedRays:
 
 
 def landing_spacing(landing_mm: FloatArray) -> FloatArray:
-    """Distance between neighbours of a grid of landing points along X and along Y, (2,), mm."""
+    """Median distance of neighbouring landing points along X and along Y, shape (2,), mm."""
     across = np.median(np.diff(landing_mm[..., 0], axis=1))
     along = np.median(np.diff(landing_mm[..., 1], axis=0))
     return np.asarray(np.abs([across, along]), float)

@@ -1,7 +1,7 @@
-"""The kinds of dot pattern: where the rays of a lens go. Here is their list.
+"""The registry of dot patterns: directions of the rays of a lens.
 
-A kind is an entry of `PATTERNS`. It gives the tangents of the rays to the beam axis: where they
-pass through a screen across the axis at distance 1, to the side (with X) and upwards.
+A kind is an entry of `PATTERNS`. It gives the tangents of the rays' angles to the beam axis: their
+intersections with a screen normal to the axis at distance 1, sideways (with X) and upwards.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ Tangents = Callable[[int, int, float], FloatArray]
 """Rows, columns, angle between neighbours at the centre (rad) → tangents (aside, up), shape
 (rows, columns, 2).
 
-Rows run from the top of the fan to its bottom, columns with X; the centre is (0, 0). With two rows
-or two columns more, the rays amid them are the same.
+Rows run from the top of the fan to its bottom, columns with X; the centre is (0, 0). Two more rows
+or columns must not change the other rays.
 """
 
 
@@ -29,11 +29,11 @@ class PatternKind:
     Parameters
     ----------
     title
-        What people call it.
+        Name shown to users.
     tangents
-        Where its rays go.
+        Directions of its rays.
     outline
-        Rows and columns → which rays it has, shape (rows, columns); None: all of them.
+        Rows and columns → mask of the rays that exist, shape (rows, columns); None: all of them.
     """
 
     title: str
@@ -41,7 +41,7 @@ class PatternKind:
     outline: Callable[[int, int], BoolArray] | None = None
 
     def beyond(self, rows: int, columns: int) -> frozenset[tuple[int, int]]:
-        """Rays ``(i, j)`` of the rows and columns that lie outside the outline."""
+        """Rays ``(i, j)`` outside the outline."""
         if self.outline is None:
             return frozenset()
         outside = np.argwhere(~self.outline(rows, columns)) + 1
@@ -54,16 +54,16 @@ def square(rows: int, columns: int, step: float) -> FloatArray:
 
 
 def hexagonal(rows: int, columns: int, step: float) -> FloatArray:
-    """Rays with six neighbours, all as far: every other row is half a step aside (with X).
+    """Rays with six equidistant neighbours: every other row is offset by half a step along X.
 
-    The middle row is not; rows are √3/2 of a step apart.
+    The middle row is not offset; rows are √3/2 of a step apart.
     """
     row, column = _from_center(rows, columns)
     return _tangents(row * np.sqrt(3.0) / 2.0, column + row % 2 / 2.0, step)
 
 
 def hexagon(rows: int, columns: int) -> BoolArray:
-    """Rays of a hexagonal pattern within the hexagon on its middle row, shape (rows, columns).
+    """Mask of the rays in the hexagon about the middle row, shape (rows, columns).
 
     With as many rows as columns it is regular: n rays on each side, 2n − 1 rows, and
     3n(n − 1) + 1 rays in all. With fewer rows its upper and lower corners are cut off.
@@ -74,7 +74,7 @@ def hexagon(rows: int, columns: int) -> BoolArray:
 
 
 def _from_center(rows: int, columns: int) -> tuple[FloatArray, FloatArray]:
-    """Numbers of rows, shape (rows, 1), and columns, shape (1, columns), from the centre ray."""
+    """Row numbers, shape (rows, 1), and column numbers, shape (1, columns), from the centre."""
     row, column = np.arange(float(rows)), np.arange(float(columns))
     return (row - (rows - 1) / 2)[:, None], (column - (columns - 1) / 2)[None]
 
@@ -91,20 +91,20 @@ PATTERNS: dict[str, PatternKind] = {
 """All kinds with rays at given angles, by their name in setup files."""
 
 MEASURED = "directions"
-"""The kind whose rays were measured one by one: `measured_steps` says where they go."""
+"""The kind with individually measured rays (`measured_steps`)."""
 
 FEWEST_RAYS = 9
-"""Fewer measured rays are no pattern."""
+"""Least number of measured rays of a pattern."""
 
 MeasuredRay = tuple[int, int, float, float]
-"""Row and column of a ray from the centre ray; its tangents over that of the inter-beam angle."""
+"""Row and column of a ray from the centre; its tangents over that of the inter-beam angle."""
 
 
 def measured_steps(rays: tuple[MeasuredRay, ...], rows: int, columns: int) -> FloatArray:
     """Tangents of measured rays over that of the inter-beam angle, shape (rows, columns, 2).
 
-    Where no ray was measured, the next ones of its row say where it would be, by straight lines;
-    in rows of fewer than two, the rows two and four above or below: so rows may be staggered.
+    Rays that were not measured are interpolated and extrapolated linearly in their row; in rows of
+    fewer than two measured rays, from every other row, since rows may be staggered.
     """
     steps = np.full((rows, columns, 2), np.nan)
     for row, column, *place in rays:
@@ -118,7 +118,7 @@ def measured_steps(rays: tuple[MeasuredRay, ...], rows: int, columns: int) -> Fl
 
 
 def _filled(line: FloatArray) -> FloatArray:
-    """Places in a line, shape (n, 2), with those that are NaN between and beyond the others."""
+    """Interpolate and extrapolate the NaN of a line of points, shape (n, 2), linearly."""
     at, known = np.arange(len(line)), np.flatnonzero(np.isfinite(line[:, 0]))
     if len(known) < 2:
         return line

@@ -1,7 +1,7 @@
-"""A bench whose quantities (`uncertainty.QUANTITIES`) differ from their nominal values.
+"""Perturbed benches: quantities (`uncertainty.QUANTITIES`) that differ from their nominal values.
 
 An offset is a vector over the quantities, in their units: the true value is the nominal one plus
-the offset. Which ray made which dot stays.
+the offset. The correspondence of rays and dots does not change.
 """
 
 from __future__ import annotations
@@ -24,23 +24,23 @@ _DISTORTION = INDEX["camera_lens.distortion_percent"]
 _PICTURE = [*POINTS, *_AXES, _DISTORTION]
 
 OF_PICTURE = np.isin(np.arange(len(INDEX)), _PICTURE)
-"""Which quantities are the picture's: they move the dots that are seen, see `moved_dots`; the
-others, the rig's, move those that are computed."""
+"""Mask of the quantities of the picture, which move the captured dots (`moved_dots`); those of the
+rig move the computed ones."""
 
 
 @dataclass(frozen=True)
 class Direction(ReadOnlyArrays):
-    """A way in which a bench may be off.
+    """A direction in the space of quantities in which a bench may be in error.
 
     Parameters
     ----------
     key
         Key of the quantity (`Quantity.key`), or ``picture.u``, ``picture.v``, ``picture.scale`` for
-        the whole of the image calibration.
+        a common shift or scale of the image calibration.
     name, unit
-        What it is called, and what it is measured in.
+        Its name and unit.
     vector
-        Offset of the quantities for one unit of it, shape (q,).
+        Offset of the quantities per unit, shape (q,).
     """
 
     key: str
@@ -50,7 +50,7 @@ class Direction(ReadOnlyArrays):
 
 
 def directions(rig: Rig) -> tuple[Direction, ...]:
-    """Ways in which a bench may be off: by each quantity, and by its whole picture."""
+    """Directions of each quantity, and of a shift and scale of the whole picture."""
     single = [
         Direction(one.key, one.name, one.unit, np.eye(len(QUANTITIES))[k])
         for k, one in enumerate(QUANTITIES)
@@ -69,7 +69,7 @@ def directions(rig: Rig) -> tuple[Direction, ...]:
 
 
 def moved_rig(rig: Rig, offset: FloatArray) -> Rig:
-    """Rig with its quantities off by an offset, shape (q,)."""
+    """Return the rig with its quantities changed by an offset, shape (q,)."""
     laser = {name: getattr(rig.laser, name) + offset[k] for name, k in _LASER}
     pattern = {name: getattr(rig.pattern, name) + offset[k] for name, k in _PATTERN}
     plane, by = rig.imaging_plane, {name: offset[k] for name, k in _PLANE}
@@ -91,9 +91,9 @@ def moved_rig(rig: Rig, offset: FloatArray) -> Rig:
 
 
 def aimed_as(laser: Laser, rig: Rig) -> Rig:
-    """The rig moved along the work piece until its laser aims where another does.
+    """Return the rig moved along the work piece so that its laser aims where another does.
 
-    No size changes by that, and the surface stays where its splines are.
+    This changes no size, and the surface stays in the domain of its splines.
     """
     aside = np.array([rig.laser.aim_x_mm - laser.aim_x_mm, rig.laser.aim_y_mm - laser.aim_y_mm, 0])
     back = replace(rig.laser, aim_x_mm=laser.aim_x_mm, aim_y_mm=laser.aim_y_mm)
@@ -102,10 +102,10 @@ def aimed_as(laser: Laser, rig: Rig) -> Rig:
 
 
 def moved_dots(plane_mm: FloatArray, rig: Rig, axes: AxisPoints, offset: FloatArray) -> FloatArray:
-    """Dots on the plane, shape (n, 2), mm, with its picture's quantities off by an offset, (q,).
+    """Return dots on the plane, shape (n, 2), mm, with the picture changed by an offset, (q,).
 
-    The dots stay where they are in the picture: `moved_calibration` has them elsewhere on the
-    plane. The lens that the camera is calibrated with is in both, and cancels.
+    Positions in the picture are fixed; `moved_calibration` maps them to other positions on the
+    plane. The calibrated lens distortion is the same before and after, and cancels.
     """
     if not offset[_PICTURE].any():
         return plane_mm
@@ -120,10 +120,10 @@ def moved_dots(plane_mm: FloatArray, rig: Rig, axes: AxisPoints, offset: FloatAr
 def moved_calibration(
     axes: AxisPoints, plane: ImagingPlane, offset: FloatArray
 ) -> ImageCalibration:
-    """Image calibration with its points and its distortion on the plane off by an offset, (q,).
+    """Return the calibration with points and distortion on the plane changed by an offset, (q,).
 
-    What was taken for the moved points is where the true ones are; how far along the axes these lie
-    may be off, too. The camera's lens stays as it is, its centre too.
+    The image points changed by the offset map to the axis points on the plane, whose coordinates
+    may change, too. The camera's lens, with its centre, does not change.
     """
     calibration = axes.calibration
     base = ImageCalibration(calibration.matrix, calibration.plain_lens)
@@ -138,9 +138,9 @@ def moved_calibration(
 
 
 def moved_bench(rig: Rig, offset: FloatArray) -> tuple[Rig, ImageCalibration]:
-    """Rig and image calibration, with the quantities off by an offset, shape (q,).
+    """Return rig and image calibration with the quantities changed by an offset, shape (q,).
 
-    The rig's uncertainty has the new calibration and the covariance that there was.
+    The rig's uncertainty has the new calibration and the same covariance.
     """
     assert rig.uncertainty is not None
     axes = rig.uncertainty.axes
@@ -151,7 +151,7 @@ def moved_bench(rig: Rig, offset: FloatArray) -> tuple[Rig, ImageCalibration]:
 
 
 def quantity_values(rig: Rig) -> FloatArray:
-    """Values of `QUANTITIES` that a rig with its uncertainty has, shape (q,), in their units."""
+    """Values of `QUANTITIES` of a rig with uncertainty, shape (q,), in their units."""
     assert rig.uncertainty is not None
     axes, plane = rig.uncertainty.axes, rig.imaging_plane
     x_mm, y_mm, z_mm = plane.origin_mm.tolist()

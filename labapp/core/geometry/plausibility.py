@@ -1,8 +1,8 @@
-"""Which values of a set-up no usual bench has: most are slips of the unit, or of half for whole.
+"""Detection of implausible set-up values: most are errors of the unit or by a factor of two.
 
-A surface absorbs most of what is wrong with a set-up, so that residuals do not show a laser ten
-times too far away or an electrode in centimetres. Limits are generous: the dissertation's benches
-and those that the adviser proposes lie well within them.
+A surface absorbs most errors of a set-up, so that residuals do not reveal a laser distance that is
+ten times too large or an electrode height in centimetres. The limits are wide: the dissertation's
+benches and those that the adviser proposes are well within them.
 """
 
 from __future__ import annotations
@@ -27,26 +27,26 @@ USUAL: dict[str, tuple[Range, str]] = {
     "imaging_plane.width_mm": ((25.0, 300.0), "mm"),
     "imaging_plane.height_mm": ((25.0, 300.0), "mm"),
 }
-"""Usual values by their keys in the setup file, and their unit."""
+"""Usual range and unit of values, by their keys in the setup file."""
 
 NO_TORCH_MM = 100.0
-"""An electrode that stands higher says that there is no torch."""
+"""Electrode heights of at least this mean that there is no torch."""
 
 USUAL_FAN_DEG = 8.0, 25.0
-"""Angle from a dot pattern's first ray to its last; half and twice the usual 13.9° lie outside."""
+"""Usual angle between a dot pattern's first and last ray; half and twice 13.9° lie outside."""
 
 USUAL_SHARE = 0.09, 1.5
-"""How far along the plane's axes the points of the image calibration lie, in shares of its size."""
+"""Usual coordinates of the image calibration's points on the axes, as fractions of the plane."""
 
 BESIDE = 0.5
-"""The beam, reflected by a level work piece, lands at most so far beside the imaging plane, in
-shares of the plane's size."""
+"""Largest distance outside the imaging plane, as a fraction of its size, at which the beam lands
+after reflection by a level work piece."""
 
 
 def implausible_values(rig: Rig) -> tuple[str, ...]:
-    """Values of a rig that are unusual: a clause each, with its key, the value and the usual range.
+    """Describe the unusual values of a rig, each with its key, value and usual range.
 
-    There are none where the rig is taken as exact, or was checked against a known mirror.
+    Empty if the rig is exact or was checked against a known mirror.
     """
     if rig.uncertainty is None or rig.uncertainty.checked:
         return ()
@@ -80,7 +80,7 @@ def _implausible(rig: Rig) -> Iterator[str]:
 
 
 def _beam_beside(rig: Rig) -> Iterator[str]:
-    """Say where the beam would land if that is far beside the imaging plane."""
+    """Report where the beam lands if that is far outside the imaging plane."""
     plane, laser = rig.imaging_plane, rig.laser
     aim = np.array([laser.aim_x_mm, laser.aim_y_mm, 0.0])
     lands = intersect_imaging_plane(aim, laser.axes[0] * [1.0, 1.0, -1.0], plane)

@@ -1,4 +1,4 @@
-"""What is bolted to the bench: laser, dot pattern, electrode, imaging plane.
+"""The rig: laser, dot pattern, electrode, imaging plane.
 
 All positions are in the universal coordinate system (UCS): origin on the work piece under the
 electrode tip, Y along the weld, towards the laser, Z up, X to the right as the camera sees it; mm.
@@ -26,11 +26,11 @@ class Laser:
     projection_angle_deg
         Elevation of the beam axis above the work piece, degrees (Appendix I's α₅).
     distance_mm
-        Distance from the diode to where the beam axis meets the work piece, mm.
+        Distance from the diode to the intersection of beam axis and work piece, mm.
     azimuth_deg
-        By how much the laser is turned out of the YOZ plane, anticlockwise from above, degrees.
+        Rotation of the laser out of the YOZ plane, anticlockwise from above, degrees.
     aim_x_mm, aim_y_mm
-        Where the beam axis meets the work piece, mm; ideally the origin.
+        Intersection of the beam axis with the work piece, mm; ideally the origin.
     """
 
     projection_angle_deg: float
@@ -41,7 +41,7 @@ class Laser:
 
     @cached_property
     def axes(self) -> FloatArray:
-        """Beam axis, and across it: to the side (with X) and upwards; unit rows, shape (3, 3)."""
+        """Unit vectors along the beam axis, sideways (with X) and upwards; rows, shape (3, 3)."""
         angle, azimuth = np.radians([self.projection_angle_deg, self.azimuth_deg])
         sin, cos = np.sin(angle), np.cos(angle)
         aside, away = np.sin(azimuth), np.cos(azimuth)
@@ -71,18 +71,18 @@ class DotPattern:
     Parameters
     ----------
     rows, columns
-        Number of rays each way.
+        Number of rows and of columns of rays.
     inter_beam_angle_deg
         Angle between neighbouring rays at the centre, degrees.
     absent
         Rays ``(i, j)``, counted from 1, that the lens does not make. None: the centre.
     kind
-        How the rays lie to each other: one of `PATTERNS`, or `MEASURED`.
+        Arrangement of the rays: one of `PATTERNS`, or `MEASURED`.
     rotation_deg
-        By how much the pattern is turned about the beam axis, degrees: where it is positive, rays
-        of a row go the higher the larger their j.
+        Rotation of the pattern about the beam axis, degrees; if positive, rays of a row are the
+        higher the larger j.
     measured
-        The rays of the kind `MEASURED`, all that there are; of other kinds none.
+        All rays of the kind `MEASURED`; empty for other kinds.
     """
 
     rows: int = 19
@@ -105,7 +105,7 @@ class DotPattern:
 
     @cached_property
     def marker(self) -> tuple[int, int] | None:
-        """The absent ray whose hole tells the rows: the one nearest the centre, or None."""
+        """The absent ray nearest the centre, whose hole identifies the rows; None without any."""
         center = np.array(self.reference)
         return min(
             sorted(self.absent_rays - self._outside),
@@ -115,7 +115,7 @@ class DotPattern:
 
     @property
     def tangents(self) -> FloatArray:
-        """Tangents of the rays to the beam axis, see `Tangents`, shape (rows, columns, 2)."""
+        """Tangents of the rays' angles to the beam axis (`Tangents`), shape (rows, columns, 2)."""
         step = np.radians(self.inter_beam_angle_deg)
         if self.kind == MEASURED:
             steps = measured_steps(self.measured, self.rows, self.columns)
@@ -130,13 +130,13 @@ class DotPattern:
 
     @cached_property
     def absent_rays(self) -> frozenset[tuple[int, int]]:
-        """Rays ``(i, j)`` that are not there: absent, outside the outline, or not measured."""
+        """Rays ``(i, j)`` that do not exist: absent, outside the outline, or not measured."""
         assert self.absent is not None
         return self.absent | self._outside | self._within - self._listed
 
     @cached_property
     def _listed(self) -> frozenset[tuple[int, int]]:
-        """Measured rays; of other kinds all within the outline."""
+        """Measured rays; for other kinds, all within the outline."""
         if self.kind != MEASURED:
             return self._within
         i, j = self.reference
@@ -149,7 +149,7 @@ class DotPattern:
 
     @cached_property
     def _outside(self) -> frozenset[tuple[int, int]]:
-        """Rays outside the outline: of measured ones those not between others of their row."""
+        """Rays outside the outline: for measured patterns, those beyond the ends of their row."""
         if self.kind != MEASURED:
             return PATTERNS[self.kind].beyond(self.rows, self.columns)
         ends = {i: [j for row, j in self._listed if row == i] for i in range(1, self.rows + 1)}
@@ -162,22 +162,22 @@ class DotPattern:
 
 @dataclass(frozen=True)
 class Electrode:
-    """The torch's electrode: its tip stands ``height_mm`` above the origin."""
+    """The torch's electrode: its tip is ``height_mm`` above the origin."""
 
     height_mm: float = 5.0
 
 
 _LEVEL = 1e-9
-"""A plane whose normal has no larger part along the work piece lies level."""
+"""A plane is level if the horizontal component of its unit normal is smaller than this."""
 
 
 @dataclass(frozen=True)
 class ImagingPlane(ReadOnlyArrays):
     """The imaging plane, of any pose: O′ and the directions of O′X′ and O′Z′ in the UCS.
 
-    It is the surface that scatters, a sheet of paper, on which dots and calibration target are
-    seen. A plane-parallel glass may lie on it on the pool's side (§3.1): rays go through the glass
-    to the paper, and the camera sees the paper from its other side.
+    It is the scattering surface, a sheet of paper, on which dots and calibration target are seen.
+    A plane-parallel glass may cover it on the pool's side (§3.1): rays pass through the glass to
+    the paper, and the camera views the paper from the other side.
 
     Parameters
     ----------
@@ -243,46 +243,46 @@ class ImagingPlane(ReadOnlyArrays):
 
     @cached_property
     def normal(self) -> FloatArray:
-        """Unit normal, shape (3,); for the vertical plane it points at the camera, −Y."""
+        """Unit normal, shape (3,); for the vertical plane it points to the camera, −Y."""
         (a, b, c), (d, e, f) = self.x_axis.tolist(), self.z_axis.tolist()
-        return np.array([b * f - c * e, c * d - a * f, a * e - b * d])  # np.cross takes longer
+        return np.array([b * f - c * e, c * d - a * f, a * e - b * d])  # np.cross is slower
 
     @cached_property
     def pose_mm(self) -> FloatArray:
         """O′, the directions of O′X′ and O′Z′, the normal, and the glass, for compiled functions.
 
-        Shape (5, 3); the last row is thickness and index of the glass, and 0.
+        Shape (5, 3); the last row is the thickness of the glass, its refractive index, and 0.
         """
         glass = np.array([self.glass_mm, self.glass_index, 0.0])
         return np.array([self.origin_mm, self.x_axis, self.z_axis, self.normal, glass])
 
     def to_universal(self, plane_mm: FloatArray) -> FloatArray:
-        """IPCS (X′, Z′), shape (…, 2), to UCS points, shape (…, 3), mm (Eq. 4-5)."""
+        """Transform IPCS (X′, Z′), shape (…, 2), to UCS points, shape (…, 3), mm (Eq. 4-5)."""
         plane_mm = np.asarray(plane_mm, float)
         return self.origin_mm + plane_mm[..., :1] * self.x_axis + plane_mm[..., 1:] * self.z_axis
 
     def from_universal(self, point_mm: FloatArray) -> FloatArray:
-        """UCS points on the plane, shape (…, 3), to IPCS (X′, Z′), shape (…, 2), mm."""
+        """Transform UCS points on the plane, shape (…, 3), to IPCS (X′, Z′), shape (…, 2), mm."""
         offset = np.asarray(point_mm, float) - self.origin_mm
         return np.stack([offset @ self.x_axis, offset @ self.z_axis], axis=-1)
 
 
 Travel = Literal["+y", "-y"]
-"""Which way the torch moves over the work piece: where the head of the pool is."""
+"""Direction of travel of the torch over the work piece, in which the head of the pool points."""
 
 
 @dataclass(frozen=True)
 class Rig:
-    """Everything on the bench whose place must be known to measure.
+    """The parts of the bench whose positions a measurement requires.
 
     Parameters
     ----------
     laser, pattern, electrode, imaging_plane
-        What it is made of.
+        Its parts.
     uncertainty
-        How well it is known; None: exactly.
+        Its uncertainty; None: it is exact.
     travel
-        Which way the torch moves: the pool's head is there, and its rear on the other side.
+        Direction of travel of the torch: that of the pool's head; the rear is opposite.
     """
 
     laser: Laser
@@ -294,5 +294,5 @@ class Rig:
 
     @property
     def head_sign(self) -> int:
-        """+1 where the pool's head lies towards +Y, −1 where it lies towards −Y."""
+        """+1 if the pool's head points to +Y, −1 if it points to −Y."""
         return 1 if self.travel == "+y" else -1

@@ -1,7 +1,7 @@
-"""How well a bench is known: the quantities that place it, and their covariance (JCGM 100).
+"""Uncertainty of a bench: the quantities that define it and their covariance (JCGM 100).
 
-Reflections alone do not tell a wrong bench from a right one, so what is not known of it goes into
-the ± of every result (`core.surface.setup_uncertainty`).
+Reflections alone do not reveal errors of the bench, so its uncertainty is propagated to the ± of
+every result (`core.surface.setup_uncertainty`).
 """
 
 from __future__ import annotations
@@ -18,16 +18,17 @@ from labapp.core.values import FloatArray, ReadOnlyArrays
 
 @dataclass(frozen=True)
 class Quantity:
-    """A quantity of the bench that is known with some uncertainty.
+    """A quantity of the bench that has an uncertainty.
 
     Parameters
     ----------
     key
         ``section.key`` of the setup file; ``[u]`` or ``[v]`` follows for a point in the picture.
     name, unit
-        What it is called, and what it is measured in.
+        Its name and unit.
     assumed
-        Its standard uncertainty where none is given: tape, protractor and a look at the picture.
+        Standard uncertainty assumed if none is given: that of a tape measure, a protractor, or a
+        point marked in the picture.
     """
 
     key: str
@@ -47,7 +48,7 @@ def _point(key: str, name: str) -> tuple[Quantity, Quantity]:
 
 
 ENDINGS = ("_sigma", "_correlation", "_covariance_px2")
-"""Of keys of a setup file that say how well others are known."""
+"""Endings of the setup-file keys that give uncertainties of others."""
 
 QUANTITIES = (
     Quantity("laser.projection_angle_deg", "laser, projection angle", "°", 0.5),
@@ -76,15 +77,15 @@ QUANTITIES = (
         "image_calibration.z_axis_mm", "image calibration, Z′ of the point on O′Z′", "mm", 0.1
     ),
 )
-"""All of them, in the order of vectors and matrices: those that came later at the end."""
+"""All quantities, in the order of vectors and matrices; new ones are appended."""
 
 INDEX = {quantity.key: k for k, quantity in enumerate(QUANTITIES)}
 
 FIRST = 20
-"""So many were there at first; what knows of these only takes the others as exact."""
+"""Number of quantities of the first version, for which the others are exact."""
 
 GLASS = frozenset({"imaging_plane.glass_mm", "imaging_plane.glass_index"})
-"""Keys of what is known exactly of a plane without glass."""
+"""Keys of the quantities that are exact for a plane without glass."""
 
 CALIBRATED = frozenset(
     one.key
@@ -92,17 +93,17 @@ CALIBRATED = frozenset(
     if (one.key.startswith("image_calibration.") and one.key.endswith("]"))
     or one.key in ("laser.projection_angle_deg", "laser.distance_mm")
 )
-"""Keys of what steps 2 and 3 calibrate (Appendix I, §5.1)."""
+"""Keys of the quantities that steps 2 and 3 calibrate (Appendix I, §5.1)."""
 
 POINTS = [k for key, k in INDEX.items() if key.endswith("]")]
-"""Of the quantities: u and v of O′ and of the points on O′X′ and O′Z′."""
+"""Indices of u and v of O′ and of the points on O′X′ and O′Z′."""
 
 ANGLE, DISTANCE = INDEX["laser.projection_angle_deg"], INDEX["laser.distance_mm"]
 
 
 @dataclass(frozen=True)
 class AxisPoints:
-    """Image calibration, and where on the axes the points lie that it was made from (§5.1).
+    """An image calibration and the coordinates of its points on the axes (§5.1).
 
     Parameters
     ----------
@@ -119,19 +120,19 @@ class AxisPoints:
 
 @dataclass(frozen=True)
 class RigUncertainty(ReadOnlyArrays):
-    """How well a rig and its image calibration are known.
+    """Uncertainty of a rig and its image calibration.
 
     Parameters
     ----------
     axes
         The image calibration and its points.
     covariance
-        Of `QUANTITIES`, shape (q, q), in the squares of their units. One of the first of them only
-        has the others known exactly.
+        Covariance of `QUANTITIES`, shape (q, q), in the squares of their units. If it is smaller,
+        the missing last quantities are exact.
     assumed
         Keys of the quantities whose uncertainty was not given.
     checked
-        Whether the bench was adjusted to a known mirror, and is as it was then.
+        Whether the bench was adjusted to a known mirror and not changed since.
     """
 
     axes: AxisPoints
@@ -152,7 +153,7 @@ class RigUncertainty(ReadOnlyArrays):
 
     @property
     def sigma_by_key(self) -> dict[str, float]:
-        """The same by `Quantity.sigma_key`; of a point in the picture the larger of u and v."""
+        """The same by `Quantity.sigma_key`; for a point in the picture, the larger of u and v."""
         found: dict[str, float] = {}
         for one, sigma in zip(QUANTITIES, self.sigma.tolist(), strict=True):
             found[one.sigma_key] = max(sigma, found.get(one.sigma_key, 0.0))
@@ -160,9 +161,9 @@ class RigUncertainty(ReadOnlyArrays):
 
     @property
     def status(self) -> str:
-        """How far the set-up can be relied on.
+        """Reliability of the set-up.
 
-        ``checked``; ``calibrated`` where laser and image calibration gave their own ±; ``entered``.
+        ``checked``; ``calibrated`` if the ± of laser and image are from calibration; ``entered``.
         """
         if self.checked:
             return "checked"
@@ -170,15 +171,15 @@ class RigUncertainty(ReadOnlyArrays):
 
     @property
     def correlation(self) -> FloatArray:
-        """Their correlation, shape (q, q); 0 where one is known exactly."""
+        """Correlation matrix, shape (q, q); 0 for exact quantities."""
         sigma = np.where(self.sigma > 0.0, self.sigma, 1.0)
         return np.asarray(self.covariance / np.outer(sigma, sigma))
 
     @cached_property
     def root(self) -> FloatArray:
-        """Lower root R of the covariance, shape (q, q): offsets R·n of normal deviates n.
+        """Cholesky factor R of the covariance, shape (q, q): R·n are random offsets for normal n.
 
-        The column of a quantity that is known exactly is 0.
+        Rows and columns of exact quantities are 0.
         """
         root, uncertain = np.zeros_like(self.covariance), np.flatnonzero(self.sigma)
         some = np.ix_(uncertain, uncertain)
@@ -187,7 +188,7 @@ class RigUncertainty(ReadOnlyArrays):
         return root
 
     def combined(self, changes: FloatArray) -> FloatArray:
-        """Standard uncertainty, shape (m,), from changes by each quantity's σ, shape (m, q)."""
+        """Combined standard uncertainty, (m,), from changes by each quantity's σ, shape (m, q)."""
         variance = np.einsum("mp,pq,mq->m", changes, self.correlation, changes)
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
 
@@ -199,20 +200,21 @@ def covariance_of(
     *,
     has_glass: bool = False,
 ) -> tuple[FloatArray, frozenset[str]]:
-    """Covariance of `QUANTITIES`, shape (q, q), and the keys of those that are assumed.
+    """Return the covariance of `QUANTITIES`, (q, q), and the keys with an assumed uncertainty.
 
     Parameters
     ----------
     given
         Standard uncertainties by `Quantity.sigma_key`, in their units.
     laser_correlation
-        Of projection angle and distance, which Appendix I takes from the same lengths.
+        Correlation of projection angle and distance, which Appendix I derives from the same
+        lengths.
     points_covariance_px2
-        Of u and v of O′ and of the points on O′X′ and O′Z′, which are found in the same picture,
-        shape (6, 6). Each point's part is scaled to its own standard uncertainty, which is along
-        u and v the same without it. None: there is no correlation.
+        Covariance of u and v of O′ and of the points on O′X′ and O′Z′, which are found in the same
+        picture, shape (6, 6). It is scaled to the standard uncertainty of each point, which without
+        it is the same along u and v. None: no correlation.
     has_glass
-        Whether there is a glass on the imaging plane, which is known exactly where there is none.
+        Whether there is a glass on the imaging plane; without, its quantities are exact.
     """
     exact = frozenset() if has_glass else GLASS
     usual = [0.0 if one.key in exact else one.assumed for one in QUANTITIES]
@@ -228,5 +230,5 @@ def covariance_of(
 
 
 def point_sigma_px(covariance_px2: FloatArray) -> FloatArray:
-    """Standard uncertainty of n points along either direction, of their covariance, (2n, 2n)."""
+    """Standard uncertainty of points, RMS of u and v, shape (n,), from a covariance, (2n, 2n)."""
     return np.asarray(np.sqrt(np.diag(covariance_px2).reshape(-1, 2).mean(axis=1)))
