@@ -1,7 +1,7 @@
-"""How functions are compiled for the processor (docs/adr/0018).
+"""Compilation of functions for the processor, with a cache on the disk (docs/adr/0018).
 
-Modules that compile are imported where they are used: that takes half a second, which belongs to
-a measurement and not to the app's start.
+Modules with compiled functions are imported inside the functions that use them: the import takes
+half a second, which would delay the start of the app.
 """
 
 from __future__ import annotations
@@ -36,49 +36,50 @@ HOW: dict[str, Any] = {
     "error_model": "numpy",
     "fastmath": {"reassoc", "contract", "nsz"},
 }
-"""Sums may be taken in any order and division by zero gives infinity or NaN, as in NumPy."""
+"""Compiler options: sums may be reordered; division by zero gives infinity or NaN, as in NumPy."""
 
 NOTICES = "labapp.notices"
-"""Logger of what the user should read while waiting; `labapp.log` shows it on stderr."""
+"""Logger of notices for a waiting user; `labapp.log` shows them on stderr."""
 
 MAY_COMPILE = Event()
-"""Cleared while another process compiles: meanwhile it would stop all threads of this one."""
+"""Cleared while another process compiles, since waiting for it would block all threads of this
+process."""
 
 MAY_COMPILE.set()
 
 _numba_is_set = Lock()
-"""Held while numba is set to compile as it is done here: its settings are the process's."""
+"""Lock for the time that numba's process-wide settings are changed for a compilation."""
 
 FORMAT = 2
-"""Of what is kept on the disk; raised when it is compiled in another way than before."""
+"""Version of the cache; increased when functions are compiled in a different way."""
 
 OLD_S = 60 * 86400.0
-"""What was compiled for a source that nobody has is deleted after so long, s."""
+"""Cache entries older than this are deleted, s."""
 
 
 def compiled(*signature: types.Type) -> Callable[[F], F]:
-    """Compile for arguments of these types, or take what was compiled before from the disk.
+    """Compile for arguments of these types, or load the compiled function from the cache.
 
-    What is kept there is compiled anew when the function's file changes, or one that compiles and
-    that it imports at its top: it may call the compiled functions of these.
+    The cache entry is invalid if the function's file changes, or a ``_kernels`` module that it
+    imports at the top, as it may call that module's compiled functions.
     """
     return lambda function: _kept(function, signature)
 
 
 def compiled_for(*signatures: tuple[types.Type, ...]) -> Callable[[F], F]:
-    """Do what `compiled` does for each of several kinds of arguments."""
+    """Compile as `compiled` does, for each of several signatures."""
     return lambda function: _kept(function, list(signatures))
 
 
 def inner(function: F) -> F:
-    """Compile a function that only compiled functions call."""
+    """Compile a function that is called by compiled functions only."""
     return _kept(function)
 
 
 class BySource(_CacheLocator):
-    """Keeps what is compiled by its module's name and its sources, wherever its file is.
+    """Cache locator by module name and digest of the sources, independent of the file's path.
 
-    A second checkout or environment of a user finds what the first one compiled.
+    Different checkouts and environments of a user share their cache entries.
     """
 
     def __init__(self, function: Any, file: str) -> None:
@@ -87,7 +88,7 @@ class BySource(_CacheLocator):
 
     @classmethod
     def from_function(cls, function: Any, file: str) -> BySource | None:
-        """Return the place of a function; None where it cannot be written to."""
+        """Return the locator of a function; None if its folder cannot be written to."""
         try:
             place = cls(function, file)
             is_new = not Path(place.get_cache_path()).exists()
@@ -100,7 +101,7 @@ class BySource(_CacheLocator):
         return place
 
     def get_cache_path(self) -> str:
-        """Return the folder of the function's file."""
+        """Return the cache folder of the function's file."""
         return str(_folder() / self._source)
 
     def get_source_stamp(self) -> str:
@@ -108,17 +109,17 @@ class BySource(_CacheLocator):
         return self._source
 
     def get_disambiguator(self) -> str:
-        """Return what tells functions of one name apart."""
+        """Return the line number, which distinguishes functions of the same name."""
         return str(self._line)
 
 
 class OwnCopies(JITCodeLibrary):
-    """Compiled code that calls its own copies of other functions, and nobody else's.
+    """Compiled code that calls only its own copies of other functions, for reproducible results.
 
-    The machine code of a function has a copy of each function that it calls. numba lets the linker
-    take one copy for all of a process: the first one, which is the function's own where it was
-    compiled, and that of the caller loaded first where all came from the disk. Copies are
-    optimised among other code each, so that their sums differ in the last digits.
+    The machine code of a function contains a copy of each function that it calls. By default the
+    linker uses one copy in the whole process: the first, which depends on whether functions were
+    compiled or loaded from the cache, and in which order. Copies are optimised in different
+    contexts, so that their sums differ in the last digits.
     """
 
     def _optimize_final_module(self) -> None:
@@ -129,12 +130,12 @@ class OwnCopies(JITCodeLibrary):
 
 
 def is_kept(module: str, file: Path) -> bool:
-    """Whether anything that a module's file compiles is kept on the disk."""
+    """Whether the cache has an entry for a module's file."""
     return (_folder() / _digest(module, file)).exists()
 
 
 def _digest(module: str, file: Path) -> str:
-    # What is kept names its module, too.
+    # Cached code contains the name of its module.
     whole = sha256(f"{FORMAT} {module}\0".encode())
     for source in sorted(set(_sources(module, file))):
         whole.update(source)
@@ -142,7 +143,7 @@ def _digest(module: str, file: Path) -> str:
 
 
 def _sources(module: str, file: Path) -> Iterator[bytes]:
-    """Yield what a file says, and what those say that compile and that it imports at its top."""
+    """Yield the contents of a file and, recursively, of the kernel modules imported at its top."""
     source = file.read_bytes()
     yield source
     package, depth = module.partition(".")[0], module.count(".")
@@ -159,7 +160,7 @@ def _folder() -> Path:
 
 @cache
 def _announce() -> None:
-    # Once in a process, however many files it compiles.
+    # Once per process, for any number of compiled files.
     logging.getLogger(NOTICES).warning(
         "First use of this version: labapp is being compiled for this computer's processor. "
         "This takes one to two minutes and is done once."
@@ -174,14 +175,14 @@ def _delete_old(folder: Path) -> None:
 
 
 def _one_at_a_time(function: Any) -> AbstractContextManager[object]:
-    """Have one process at a time compile a function, which the others then load."""
+    """Lock that lets one process compile a function while the others wait and then load it."""
     place = BySource.from_function(function, function.__code__.co_filename)
     return nullcontext() if place is None else FileLock(Path(place.get_cache_path()) / "lock")
 
 
 def _kept(function: F, *signature: Any) -> F:
     MAY_COMPILE.wait()
-    # A numba that does not know the setting keeps what it compiles where it always does.
+    # Versions of numba without this setting use their default cache.
     usual = getattr(_config, "CACHE_LOCATOR_CLASSES", "")
     codegen: Any = cpu_target.target_context.codegen()
     with _numba_is_set:
@@ -190,7 +191,7 @@ def _kept(function: F, *signature: Any) -> F:
         try:
             with _one_at_a_time(function) if signature else nullcontext():
                 made: F = _njit(*signature, cache=True, **HOW)(function)
-        except RuntimeError:  # nowhere to keep it
+        except RuntimeError:  # no cache folder is writable
             made = _njit(*signature, **HOW)(function)
         finally:
             _config.CACHE_LOCATOR_CLASSES = usual

@@ -1,4 +1,4 @@
-"""Match: the matched pairs of ray and dot, which `matching` finds and every scheme begins with."""
+"""The match: pairs of ray and dot, found by `matching` and used by every scheme."""
 
 from __future__ import annotations
 
@@ -10,36 +10,36 @@ import numpy as np
 from labapp.core.values import CannotMeasure, FloatArray, IntArray, ReadOnlyArrays
 
 Orientation = Literal["S/S", "S/I", "I/I"]
-"""Column/row correspondence: S grows the same way as the rays, I the other way."""
+"""Column/row correspondence: S for the same order as the rays, I for the inverse order."""
 
 ORIENTATIONS: tuple[Orientation, ...] = ("S/S", "S/I", "I/I")
 
 
 def ways(orientation: Orientation) -> IntArray:
-    """Whether reflected rows grow with the rays', and columns: +1 or −1 each, shape (2,)."""
+    """Signs of the order of reflected rows and columns relative to the rays', ±1, shape (2,)."""
     by_column, by_row = orientation.split("/")
     return np.array([1 if by_row == "S" else -1, 1 if by_column == "S" else -1])
 
 
 def missing_share(missed: int, pairs: int) -> float:
-    """Share of the dots that are missing, where so many rays amid so many pairs have no dot.
+    """Estimate the share of missing dots from the numbers of missed rays and of pairs.
 
-    The mean of its posterior, with a twentieth of a dot missing beforehand: never none.
+    The posterior mean, with a prior of 0.05 missing dots, so that it is never 0.
     """
     return (missed + 0.05) / (pairs + missed + 1)
 
 
 @dataclass(frozen=True)
 class Trial:
-    """How well the matched dots fit with one orientation.
+    """Residual of the matched dots for one orientation.
 
     Parameters
     ----------
     orientation
         The correspondence.
     residual_mm
-        Root mean square distance of computed from captured dots, mm; infinite if no surface has
-        this correspondence.
+        Root mean square distance between computed and captured dots, mm; infinite if no surface
+        has this correspondence.
     """
 
     orientation: Orientation
@@ -48,30 +48,30 @@ class Trial:
 
 @dataclass(frozen=True)
 class Match(ReadOnlyArrays):
-    """Matched pairs of ray and reflected dot, n of them.
+    """The n matched pairs of ray and reflected dot.
 
     Parameters
     ----------
     orientation
-        The correspondence that was settled on.
+        The chosen correspondence.
     dot
         Index of each pair's dot in `Dots`, shape (n,).
     ray
         Its ray (i, j), counted from 1, shape (n, 2).
     reflected
-        Its reflected row and column (k, t), counted from 1, shape (n, 2); 0 where it is
-        not known.
+        Its reflected row and column (k, t), counted from 1, shape (n, 2); 0 if unknown.
     plane_mm
-        The dot on the imaging plane, IPCS (X′, Z′), shape (n, 2), mm.
+        Position of the dot on the imaging plane, IPCS (X′, Z′), shape (n, 2), mm.
     plane_covariance_mm2
-        Covariance of that, shape (n, 2, 2), mm².
+        Covariance of the position, shape (n, 2, 2), mm².
     witness
-        Shape (rows, columns) of the pattern: +1 where the ray came back, −1 where it did not,
-        0 where it cannot testify (absent, blocked by the torch, off the plane, in doubt).
+        Evidence of each ray, shape (rows, columns) of the pattern: +1 if it was reflected by the
+        pool, −1 if it was not, 0 if unknown (absent, blocked by the torch, off the plane, or in
+        doubt).
     trials
-        Every orientation that was tried, the best first.
+        All orientations tried, the best first.
     missing
-        Share of the dots that are missing: the probability that a ray that came back has no dot.
+        Share of missing dots: the probability that a ray reflected by the pool has no dot.
     """
 
     orientation: Orientation
@@ -86,7 +86,7 @@ class Match(ReadOnlyArrays):
 
     @property
     def margin(self) -> float:
-        """Residual of the best other orientation over that of the chosen one."""
+        """Ratio of the residual of the best other orientation to that of the chosen one."""
         others = [t.residual_mm for t in self.trials if t.orientation != self.orientation]
         own = [t.residual_mm for t in self.trials if t.orientation == self.orientation]
         return min(others) / max(own[0], 1e-9) if own and others else float("inf")
@@ -94,17 +94,17 @@ class Match(ReadOnlyArrays):
 
 @dataclass(frozen=True)
 class Candidate:
-    """One of the matches of a frame whose rows are open: the marker in one of several holes.
+    """One of the possible matches of a frame with ambiguous rows: the marker in one of the holes.
 
     Parameters
     ----------
     match
-        The match; None where no surface has its rays with the set-up as it is entered.
+        The match; None if no surface fits it with the nominal set-up.
     step
-        Rows and columns by which its rays are on from those of the first candidate.
+        Offset of its rays from those of the first candidate, in rows and columns.
     cost
-        −2 log likelihood of it with the set-up that it is likeliest with, within its uncertainty,
-        less that of the first candidate.
+        −2 log likelihood, maximised over the set-up within its uncertainty, relative to the first
+        candidate.
     """
 
     match: Match | None
@@ -113,14 +113,14 @@ class Candidate:
 
 
 class RowsOpen(CannotMeasure):
-    """``ambiguous-rows``, with the matches that one frame leaves open.
+    """``ambiguous-rows``, with the possible matches of the frame.
 
     Parameters
     ----------
     reason
         One sentence for the operator.
     candidates
-        First the one that is likeliest with the set-up as it is entered.
+        The possible matches; first the likeliest with the nominal set-up.
     """
 
     def __init__(self, reason: str, candidates: tuple[Candidate, ...]) -> None:

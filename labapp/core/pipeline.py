@@ -1,16 +1,16 @@
-"""Frame → Measurement: the steps of the measurement, in order, and nothing else.
+"""Frame → Measurement: the sequence of the measurement's steps.
 
 1. `find_dots`: the reflected dots of the frame (§5.2.1).
 2. `find_lattice`: their rows and columns in the picture, as far as they can be determined (§5.2.2).
-3. `match_rays`: which ray made which dot (§4.2.2); then rows and columns are those of the rays.
-4. `reconstruct`: the pool's surface and boundary, by the scheme that is chosen (ch. 6, 7).
+3. `match_rays`: the correspondence of rays and dots (§4.2.2), which redefines rows and columns.
+4. `reconstruct`: the pool's surface and boundary, by the chosen scheme (ch. 6, 7).
 5. `measure_surface`: its size and the reflection errors (Eq. 6-3 … 6-8).
 
-Of a frame that the operator has corrected, his dots and rows take the place of steps 1 and 2. With
-a prior, what the frame before left, dots have the rays of those that it predicts there (`follow`),
-and no rows are needed for it: the other steps are the same.
+For a frame corrected by the operator, the corrected dots and rows replace steps 1 and 2. With a
+prior from the previous frame, dots are identified by the positions it predicts (`follow`) instead
+of by rows; the other steps are the same.
 
-A line pattern has steps of its own (`measure_lines`): its points do not say which ray made them.
+Line patterns are measured differently (`measure_lines`), as the rays of their points are unknown.
 """
 
 from __future__ import annotations
@@ -46,28 +46,28 @@ if TYPE_CHECKING:  # the module compiles: it is loaded where a frame is measured
     from labapp.core.sequence.prior import Prior
 
 OnStep = Callable[[str], None]
-"""Called with the name of a step that is done."""
+"""Called with the name of each completed step."""
 
 ByHand = Correction | LineCorrection
-"""A frame as the operator has it: dots and rows, or the lines of a line pattern."""
+"""The operator's correction of a frame: dots and rows, or the lines of a line pattern."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """Everything that can be chosen about a measurement.
+    """Settings of a measurement.
 
     Parameters
     ----------
     scheme
         One of `SCHEMES`.
     algorithm
-        Of IRS: ``opa``, ``epa-r``, ``epa-c`` or ``epa-rc``. It goes before that of ``irs``.
+        Algorithm of IRS: ``opa``, ``epa-r``, ``epa-c`` or ``epa-rc``. Overrides that of ``irs``.
     correspondence
-        ``auto``, or the orientation to use (`match.Orientation`). It goes before that of ``match``.
+        ``auto``, or the orientation to use (`match.Orientation`). Overrides that of ``match``.
     dots, lattice, match
         Settings of steps 1 to 3.
     fit, ers, irs, zonal, modal
-        Settings of the schemes; only those of ``scheme`` count.
+        Settings of the schemes; only those of ``scheme`` are used.
     """
 
     scheme: str = "fit"
@@ -85,26 +85,25 @@ class Settings:
 
 @dataclass(frozen=True)
 class Measurement:
-    """The results of the steps for one frame, as far as they went.
+    """The results of the completed steps for one frame.
 
     Parameters
     ----------
     status
-        ``ok``, or one word for why there is no surface.
+        ``ok``, or one word for the reason that there is no surface.
     reason
-        The same in a sentence; empty if all went well.
+        The reason in a sentence; empty if the status is ``ok``.
     scheme
         Scheme requested.
     dots, lattice, match, reconstruction, measures
-        Results of steps 1 to 5; None from the step on that could not be done. The lattice may be
-        None before that, too: rays can be identified without it.
+        Results of steps 1 to 5; None from the failed step on. The lattice may be None without a
+        failure, since rays can be identified without it.
     correction
-        The operator's dots and rows, or lines; None if they are as they were found.
+        The operator's dots and rows, or lines; None if they were found automatically.
     setup_status
-        How far the set-up can be relied on (`RigUncertainty.status`); empty where it is exact.
+        Reliability of the set-up (`RigUncertainty.status`); empty if it is exact.
     lines
-        What the lines of a line pattern gave; None where the pattern is one of dots, which have all
-        that is above.
+        Results for a line pattern; None for a dot pattern, whose results are those above.
     """
 
     status: str
@@ -122,28 +121,28 @@ class Measurement:
 
 @dataclass(frozen=True, kw_only=True)
 class OpenMeasurement(Measurement):
-    """An ``ambiguous-rows`` frame, of which other frames of the recording may decide the rows.
+    """An ``ambiguous-rows`` frame, whose rows may be determined from other frames of the recording.
 
     Parameters
     ----------
     candidates
-        The matches that are open.
+        The possible matches.
     """
 
     candidates: tuple[Candidate, ...]
 
     @property
     def refused(self) -> Measurement:
-        """The measurement by itself."""
+        """The measurement without the candidates."""
         return Measurement(**{each.name: getattr(self, each.name) for each in fields(Measurement)})
 
     def decided(self, match: Match, rig: Rig, settings: Settings) -> Measurement:
-        """The measurement with the match of one of the candidates, by the scheme of the settings.
+        """Complete the measurement with the match of one of the candidates.
 
         Parameters
         ----------
         match, rig, settings
-            That match, the bench, and how the frame is measured.
+            The match, the rig, and the settings of the measurement.
         """
         assert self.dots is not None
         lattice = lattice_of_match(match, rig, len(self.dots))
@@ -155,7 +154,7 @@ class OpenMeasurement(Measurement):
 
 
 def setup_status(rig: Rig) -> str:
-    """How far a rig can be relied on (`Measurement`)."""
+    """Reliability of a rig (`Measurement`)."""
     return "" if rig.uncertainty is None else rig.uncertainty.status
 
 
@@ -167,32 +166,30 @@ def measure(
     correction: ByHand | None = None,
     on_step: OnStep = lambda _: None,
 ) -> tuple[Measurement, Prior | None]:
-    """Measure the pool that a frame shows. Never raises for a bad frame: the status says why.
+    """Measure the pool in a frame. Does not raise for a bad frame, whose status gives the reason.
 
     Parameters
     ----------
     image
         Grey frame, shape (height, width), any real type.
     bench
-        Bench that the frame was recorded on.
+        Bench on which the frame was recorded.
     settings
         See `Settings`.
     prior
-        What the frame before left to this one: then dots get their rays where it predicts them, and
-        the status is ``track-lost``, or another that is not ``ok``, where it does not lead here.
-        None: the frame is measured by itself.
+        Prior from the previous frame, which predicts where the rays have their dots. If the
+        prediction fails, the status is ``track-lost`` or another that is not ``ok``. None: the
+        frame is measured independently.
     correction
-        The frame's dots and rows, or lines, as the operator has them; they are measured in place of
-        what would be found, and of the image only the shape counts. One of the other kind of
-        pattern is not used.
+        The operator's dots and rows, or lines, which are used instead of automatic detection; of
+        the image only the shape is then used. Ignored if it is for the other kind of pattern.
     on_step
-        Called with the name of each step when it is done: dots, match, measures.
+        Called with the name of each completed step: dots, match, measures.
 
     Returns
     -------
     measurement, prior
-        The results; what they leave to the next frame, None where there is no surface that can be
-        followed.
+        The results, and the prior for the next frame; None if it cannot be tracked.
     """
     result = Measurement(
         "ok", "", settings.scheme, correction=correction, setup_status=setup_status(bench.rig)
@@ -247,40 +244,40 @@ def measure(
 
 
 def _by_scheme(result: Measurement, match: Match, rig: Rig, settings: Settings) -> Measurement:
-    """The result with the surface of a scheme that needs no more than the match."""
+    """Add the surface of a scheme that only requires the match."""
     made = reconstruct(match, rig, settings)
     size = measures.measure_surface(made, match, rig)
     return replace(result, reconstruction=made, measures=size)
 
 
 def _with_lines(result: Measurement, image: Image, rig: LineRig, bench: Bench) -> Measurement:
-    """The result of a frame of a line pattern."""
+    """Measure a frame of a line pattern."""
     by_hand = result.correction if isinstance(result.correction, LineCorrection) else None
     found = measure_lines(image, rig, bench.calibration, LineMeasureSettings(), by_hand)
     return replace(result, status=found.status, reason=found.reason, lines=found)
 
 
 def _as_before(image: Image, prior: Prior) -> Image:
-    """The image, which must have the size of the one before."""
+    """Return the image; raise TrackLost if its size differs from that of the previous frame."""
     if image.shape != prior.tuning.noise.shape:
         from labapp.core.sequence.following import TrackLost
 
-        raise TrackLost("the frame has another size than the one before")
+        raise TrackLost("the frame differs in size from the previous one")
     return image
 
 
 def _dots_and_tuning(image: Image, settings: DotSettings) -> tuple[Dots, DetectorTuning | None]:
-    """The dots, and what the default detector was tuned to, for the frames after this one."""
+    """Find the dots, and the default detector's tuning for the following frames."""
     if settings.method == "band-pass":
         return tuned_dots(image, settings.band_pass)
     return find_dots(image, settings), None
 
 
 def start_correction(measurement: Measurement) -> Correction:
-    """The correction that a frame was measured with, or one that begins with what was found.
+    """Return the correction of a measured frame, or a new one from the dots and rows found.
 
-    The latter has a reference only where the frame was matched: a hole that stands out among the
-    rows is no more than a candidate until the rays agree.
+    A new one has a reference only if the frame was matched; until then, a hole among the rows is
+    only a candidate.
     """
     if isinstance(measurement.correction, Correction):
         return measurement.correction
@@ -306,7 +303,7 @@ def reconstruct(match: Match, rig: Rig, settings: Settings) -> Reconstruction:
 
 
 def _refused(result: Measurement, why: CannotMeasure) -> Measurement:
-    """The measurement of a frame without an answer; rows that an operator gave stay refused."""
+    """Return the failed measurement, with candidates unless the rows are the operator's."""
     result = replace(result, status=why.status, reason=why.reason)
     if isinstance(why, RowsOpen) and result.correction is None:
         return OpenMeasurement(**vars(result), candidates=why.candidates)
@@ -321,7 +318,7 @@ def _match_or_why(
     frame_shape: tuple[int, int],
     settings: MatchSettings,
 ) -> tuple[Match, SplineSurface]:
-    """The match (`match_rays`); where nothing explains the dots, why there are no rows."""
+    """Match the rays (`match_rays`); if nothing explains the dots, raise why there are no rows."""
     try:
         return match_rays(dots, lattice, bench, frame_shape, settings)
     except CannotMeasure as why:
@@ -332,7 +329,7 @@ def _match_or_why(
 def _lattice_or_why(
     dots: Dots, frame_shape: tuple[int, int], settings: LatticeSettings
 ) -> tuple[Lattice | None, CannotMeasure | None]:
-    """Rows and columns, or why there are none: the optics may still identify the rays."""
+    """Find rows and columns, or the reason for their absence; rays may be identified without."""
     try:
         return find_lattice(dots, frame_shape, settings), None
     except CannotMeasure as why:

@@ -1,6 +1,6 @@
-"""Frame and what was found in it → whether it is fit to be measured, in words (§9.2).
+"""Assessment of a frame's quality from its grey levels and its measurement (§9.2).
 
-The gate before and during capture: exposure, blur, rows, reference, and the height's ± to expect.
+The quality gate before and during capture: exposure, blur, rows, reference, and the height's ±.
 """
 
 from __future__ import annotations
@@ -21,45 +21,45 @@ from labapp.core.surface.measures import Measures
 from labapp.core.values import CannotMeasure
 
 Grade = Literal["good", "doubtful", "bad"]
-"""Measure on; measured, but not as well as it could be; not to be measured."""
+"""Suitable for measurement; measurable with reduced quality; not suitable."""
 
 GRADES: tuple[Grade, ...] = ("good", "doubtful", "bad")
 
 BLURRED = 0.6
-"""Dots are about to merge when the valley between a tenth of them and their neighbours is flatter:
-what blurs them by 2 px more, in the sample runs, loses dots."""
+"""Dots are about to merge if a tenth of the valleys between neighbours are shallower than this. In
+the sample runs, a further blur of 2 px then loses dots."""
 
 FEW = 0.1
-"""Part of the rays that should show at the least; the sample runs show 0.18 to 0.27."""
+"""Least share of the rays that should be visible; it is 0.18 to 0.27 in the sample runs."""
 
 MANY = 1.5
-"""More dots than so many times the rays are no dots: what merges or is blurred falls into noise."""
+"""Largest ratio of dots to rays; more are noise, as of merged or blurred dots."""
 
 HOLE = 0.5
-"""No dot is nearer to the reference's place than this part of the distance between dots."""
+"""Least distance of any dot to the reference's position, in distances between dots."""
 
 USUAL_RAYS = 361
-"""Where the lens is not known."""
+"""Number of rays assumed if the pattern is unknown."""
 
 UNMEASURED = "not-measured"
-"""Status of a frame for which there is no set-up to measure it by."""
+"""Status of a frame without a set-up."""
 
 FATAL = frozenset({"blank", "no dots", "dots merge"})
-"""Verdicts on the exposure that leave nothing to measure."""
+"""Verdicts on the exposure that exclude a measurement."""
 
 
 @dataclass(frozen=True)
 class Remark:
-    """One thing about a frame.
+    """Assessment of one aspect of a frame.
 
     Parameters
     ----------
     about
-        What was looked at.
+        The aspect.
     grade
-        How good it is.
+        Its grade.
     words
-        What it is, and what to do about it; one or two sentences.
+        Description and advice; one or two sentences.
     """
 
     about: Literal["exposure", "blur", "rows", "reference", "measurement", "height ±"]
@@ -69,23 +69,23 @@ class Remark:
 
 @dataclass(frozen=True)
 class Quality:
-    """How fit a frame is to be measured.
+    """Suitability of a frame for measurement.
 
     Parameters
     ----------
     exposure
         Levels, saturation, contrast, merging.
     dots
-        How many were found.
+        Number of dots found.
     blocked_rows
-        How many rows have dots that the torch hides, where rays could be matched.
+        Number of rows with dots hidden by the torch; 0 if rays could not be matched.
     reference
-        Whether the hole of the absent ray was seen, where rays could be matched.
+        Whether the hole of the absent ray is visible; False if rays could not be matched.
     height_sigma_mm
-        The ± that the height has (of a hollow the depth), standard uncertainty; NaN where the
-        frame cannot be measured or the scheme gives none.
+        Standard uncertainty of the height, or of the depth for a concave pool; NaN if the frame
+        cannot be measured or the scheme gives none.
     remarks
-        What was looked at, the worst first.
+        Assessment of each aspect, the worst first.
     """
 
     exposure: Exposure
@@ -97,12 +97,12 @@ class Quality:
 
     @property
     def grade(self) -> Grade:
-        """That of the worst remark."""
+        """The grade of the worst remark."""
         return self.remarks[0].grade
 
     @property
     def words(self) -> str:
-        """What is wrong, or that nothing is."""
+        """Description of all defects, or of the first aspect if there are none."""
         wrong = [remark.words for remark in self.remarks if remark.grade != "good"]
         return " ".join(wrong) or self.remarks[0].words
 
@@ -112,16 +112,16 @@ def look(
     settings: Settings,
     bench: Bench | None = None,
 ) -> Measurement:
-    """Measure a frame as far as can be: dots and rows only where there is no set-up yet.
+    """Measure a frame; without a set-up, only its dots and rows are found.
 
     Parameters
     ----------
     image
         Grey levels, shape (rows, columns).
     settings
-        Those of the measurement.
+        Settings of the measurement.
     bench
-        What it was seen on; None before that is known.
+        Bench on which it was recorded; None if unknown.
     """
     height, width = image.shape
     found = Measurement(UNMEASURED, "there is no set-up yet", settings.scheme)
@@ -130,7 +130,7 @@ def look(
         found = replace(found, dots=dots)
         rays = USUAL_RAYS if bench is None else bench.rig.pattern.rows * bench.rig.pattern.columns
         if len(dots) > MANY * rays:
-            # Rows are sought among them for minutes.
+            # The search for rows among so many would take minutes.
             words = f"{len(dots)} spots stand out, where the lens makes {rays} dots at most"
             raise CannotMeasure("too-many-dots", words)
         if bench is not None:
@@ -148,23 +148,23 @@ def judge_quality(
     rays: int | None = None,
     most_sigma_mm: float | None = None,
 ) -> Quality:
-    """Judge a frame by its grey levels and by what was found in it.
+    """Assess a frame from its grey levels and its measurement.
 
     Parameters
     ----------
     image
         Grey levels, shape (rows, columns).
     measurement
-        What it gave: `look`, or the live chain.
+        Its measurement, by `look` or live.
     bit_depth
-        Significant bits of a grey level; None where not known.
+        Significant bits of a grey level; None if unknown.
     rays
-        How many the lens makes; None where not known.
+        Number of rays of the pattern; None if unknown.
     most_sigma_mm
-        The height's ± that is wanted at most, mm.
+        Largest acceptable standard uncertainty of the height, mm; None for no limit.
     """
     dots, sizes = measurement.dots, measurement.measures
-    # Until the rays agree a hole in the rows, or at their ends, is no more than a candidate.
+    # Without a match, a hole in the rows or at their ends is only a candidate.
     lattice = measurement.lattice if measurement.match is not None else None
     exposure = judge_exposure(image, dots, bit_depth)
     blocked = 0 if lattice is None else len(lattice.blocked_rows)
@@ -177,7 +177,7 @@ def judge_quality(
         if lattice is not None:
             remarks.append(_of_reference(reference))
         remarks += _of_measurement(measurement, sigma_mm, most_sigma_mm)
-    remarks.sort(key=lambda remark: -GRADES.index(remark.grade))  # else in the order of looking
+    remarks.sort(key=lambda remark: -GRADES.index(remark.grade))  # stable: order of assessment
     count = 0 if dots is None else len(dots)
     return Quality(exposure, count, blocked, reference, sigma_mm, tuple(remarks))
 
@@ -192,7 +192,9 @@ def _of_exposure(exposure: Exposure) -> Remark:
 def _of_blur(exposure: Exposure) -> Remark:
     if exposure.valley < BLURRED and exposure.verdict != "dots merge":
         full = f"{1 - exposure.valley:.0%}"
-        words = f"Dots are blurred, the gaps between them {full} full of light: focus the lens."
+        words = (
+            f"Dots are blurred: the gaps between them have {full} of their light. Focus the lens."
+        )
         return Remark("blur", "doubtful", words)
     return Remark("blur", "good", "The dots are sharp.")
 
@@ -212,14 +214,12 @@ def _of_rows(dots: Dots, blocked: int, rays: int | None) -> Remark:
 def _of_reference(reference: bool) -> Remark:
     if reference:
         return Remark("reference", "good", "The reference is seen.")
-    words = (
-        "The reference, the hole of the absent ray, is not seen: a row may be taken for another."
-    )
+    words = "The reference, the hole of the absent ray, is not visible: rows may be misidentified."
     return Remark("reference", "doubtful", words)
 
 
 def _hole_seen(dots: Dots, lattice: Lattice) -> bool:
-    """Whether dots stand on two opposite sides of the reference, and none in its place."""
+    """Whether there are dots on two opposite sides of the reference, and none at its position."""
     if lattice.reference is None:
         return False
     k, t = lattice.reference
@@ -256,6 +256,6 @@ def _of_measurement(
 
 
 def _peak_sigma(sizes: Measures) -> float:
-    """The ± of what is farther from the work piece, the highest or the lowest point."""
+    """Standard uncertainty of the height or depth, whichever is farther from the work piece."""
     hollow = -sizes.depth_mm > sizes.height_mm
     return sizes.depth_sigma_mm if hollow else sizes.height_sigma_mm

@@ -1,4 +1,4 @@
-"""What every step shares: array types, frozen values, and the answer "cannot be measured"."""
+"""Types that all steps share: array types, read-only dataclasses, and `CannotMeasure`."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ BoolArray = npt.NDArray[np.bool_]
 
 
 class CannotMeasure(Exception):
-    """A frame has no answer, and this says why.
+    """A frame cannot be measured.
 
     Parameters
     ----------
     status
-        One word with hyphens, as it goes into ``measures.csv``: ``no-dots``, ``no-reference``,
+        One hyphenated word, as written to ``measures.csv``: ``no-dots``, ``no-reference``,
         ``ambiguous-rows``, ``too-few-dots``, …
     reason
         One sentence for the operator.
@@ -30,7 +30,7 @@ class CannotMeasure(Exception):
 
 
 class ReadOnlyArrays:
-    """Base of a dataclass whose array fields are read-only."""
+    """Base class of dataclasses whose array fields are read-only."""
 
     def __post_init__(self) -> None:
         fields = vars(self)
@@ -41,7 +41,7 @@ class ReadOnlyArrays:
 
 
 def median(values: FloatArray) -> float:
-    """Median of numbers, shape (n,); NaN of none, or where one is: `np.median` in less time."""
+    """Median of numbers, shape (n,), as `np.median`, but faster; NaN if n = 0 or any is NaN."""
     count = len(values)
     if not count:
         return float("nan")
