@@ -190,10 +190,10 @@ def _kept(function: F, *signature: Any) -> F:
         codegen._library_class = OwnCopies
         try:
             with _one_at_a_time(function) if signature else nullcontext():
-                made: F = _njit(*signature, cache=True, **HOW)(function)
+                result: F = _njit(*signature, cache=True, **HOW)(function)
         except RuntimeError:  # no cache folder is writable
-            made = _njit(*signature, **HOW)(function)
+            result = _njit(*signature, **HOW)(function)
         finally:
             _config.CACHE_LOCATOR_CLASSES = usual
             del codegen._library_class
-    return made
+    return result

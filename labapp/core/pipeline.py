@@ -245,9 +245,9 @@ def measure(
 
 def _by_scheme(result: Measurement, match: Match, rig: Rig, settings: Settings) -> Measurement:
     """Add the surface of a scheme that only requires the match."""
-    made = reconstruct(match, rig, settings)
-    size = measures.measure_surface(made, match, rig)
-    return replace(result, reconstruction=made, measures=size)
+    reconstruction = reconstruct(match, rig, settings)
+    sizes = measures.measure_surface(reconstruction, match, rig)
+    return replace(result, reconstruction=reconstruction, measures=sizes)
 
 
 def _with_lines(result: Measurement, image: Image, rig: LineRig, bench: Bench) -> Measurement:

@@ -125,5 +125,5 @@ def _filled(line: FloatArray) -> FloatArray:
     left = known[np.clip(np.searchsorted(known, at, "right") - 1, 0, len(known) - 2)]
     right = known[np.clip(np.searchsorted(known, at, "right"), 1, len(known) - 1)]
     share = ((at - left) / (right - left))[:, None]
-    made = line[left] + share * (line[right] - line[left])
-    return np.where(np.isfinite(line), line, made)
+    filled = line[left] + share * (line[right] - line[left])
+    return np.where(np.isfinite(line), line, filled)

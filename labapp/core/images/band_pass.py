@@ -18,16 +18,16 @@ from labapp.core.images.dot_fit import fit_dots
 from labapp.core.images.dot_size import (
     SLENDER,
     as_picture,
+    band_noise,
     blur,
+    estimate_size,
     kernel,
     local_noise,
-    mended,
     noise_gain,
     pairs,
     peak_disc,
     scratch,
-    size_of,
-    with_grain,
+    without_spikes,
 )
 from labapp.core.images.dots import BandPassSettings, Dots, Grey, Image, Picture
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, ReadOnlyArrays
@@ -160,7 +160,7 @@ def quick_dots(frame: Image, tuning: DetectorTuning, settings: BandPassSettings)
     """
     if frame.shape != tuning.noise.shape:
         raise ValueError(f"a frame of {frame.shape}, a tuning of {tuning.noise.shape}")
-    picture = mended(as_picture(frame), tuning.noise, tuning.size_px)
+    picture = without_spikes(as_picture(frame), tuning.noise, tuning.size_px)
     return _found(tuning, _BandPassed(picture, tuning.size_px), settings)
 
 
@@ -176,7 +176,7 @@ def crowded_dots(frame: Image, settings: BandPassSettings) -> Dots:
         ``no-dots`` if nothing stands out of the noise.
     """
     tuning, seen = _tuned(as_picture(frame), settings)
-    return _downwards(_fitted(seen, _kept(tuning, seen, settings), tuning.noise))
+    return _top_to_bottom(_fitted(seen, _kept(tuning, seen, settings), tuning.noise))
 
 
 def dot_at(
@@ -238,11 +238,11 @@ def typical(brightness: FloatArray) -> float:
 def _tuned(picture: Picture, settings: BandPassSettings) -> tuple[DetectorTuning, _BandPassed]:
     """Return a picture's tuning and its band-passed picture."""
     noise = local_noise(picture)
-    size = settings.size_px or size_of(picture, noise)
-    seen = _BandPassed(mended(picture, noise, size), size)
+    size = settings.size_px or estimate_size(picture, noise)
+    seen = _BandPassed(without_spikes(picture, noise, size), size)
     white = float(np.median(noise[::8, ::8])) / noise_gain(size)
     every = 4 // seen.step
-    grain = with_grain(seen.band[::every, ::every], white) / max(white, 1e-9)
+    grain = band_noise(seen.band[::every, ::every], white) / max(white, 1e-9)
     least = 1e-3 * max(map(abs, cv2.minMaxLoc(seen.band)[:2])) + 1e-6
     floor = noise * np.float32(settings.threshold * grain / noise_gain(size))
     np.maximum(floor, np.float32(settings.threshold * least), out=floor)
@@ -284,15 +284,15 @@ class _BandPassed:
         if good.all():
             return u, v, bright
         suspects = u[~good], v[~good]
-        whole = mended(self.picture, tuning.noise, self.size, suspects)
-        if whole is not self.picture:
-            usual = typical(bright[good]) if good.any() else 0.0
-            self.picture = whole
+        repaired = without_spikes(self.picture, tuning.noise, self.size, suspects)
+        if repaired is not self.picture:
+            typical_brightness = typical(bright[good]) if good.any() else 0.0
+            self.picture = repaired
             self._pass()
             u, v, bright = self._over(tuning)
             near = dot_kernels.two_nearest(pairs(u, v), pairs(*suspects))[0][:, 0]
             good = self._dot_like(u, v, bright)
-            good &= (near > 2.0 * self.size) | (bright >= REMAINS_SHARE * usual)
+            good &= (near > 2.0 * self.size) | (bright >= REMAINS_SHARE * typical_brightness)
         return u[good], v[good], bright[good]
 
     def _over(self, tuning: DetectorTuning) -> Peaks:
@@ -352,8 +352,8 @@ class _BandPassed:
                 cv2.resize(image, shape[::-1], into, 0, 0, cv2.INTER_AREA), np.float32
             )
         left = variance / scale**2 - (1 - scale**-2) / 12
-        made = blur(image, float(np.sqrt(left)), scratch(f"around {scale} blurred", shape))
-        return made, AROUND_SIZES * self.size
+        blurred = blur(image, float(np.sqrt(left)), scratch(f"around {scale} blurred", shape))
+        return blurred, AROUND_SIZES * self.size
 
 
 def widen(image: Grey, into: Grey, variance_px2: float) -> None:
@@ -383,7 +383,7 @@ def smaller_blurred(image: Grey, variance_px2: float) -> Grey:
 def _found(tuning: DetectorTuning, seen: _BandPassed, settings: BandPassSettings) -> Dots:
     u, v, bright = _kept(tuning, seen, settings)
     dots = _described(seen, (u, v, bright), tuning.noise, settings.speckle_px)
-    return _downwards(dots)
+    return _top_to_bottom(dots)
 
 
 def _kept(tuning: DetectorTuning, seen: _BandPassed, settings: BandPassSettings) -> Peaks:
@@ -399,7 +399,7 @@ def _kept(tuning: DetectorTuning, seen: _BandPassed, settings: BandPassSettings)
     return u[keep], v[keep], bright[keep]
 
 
-def _downwards(dots: Dots) -> Dots:
+def _top_to_bottom(dots: Dots) -> Dots:
     order = np.argsort(dots.v_px)
     return Dots(*(values[order] for values in vars(dots).values()))
 
@@ -407,8 +407,8 @@ def _downwards(dots: Dots) -> Dots:
 @lru_cache(maxsize=8)
 def _nine(sigma: float, widest: float) -> Grey:
     """Gaussian weights centred on a pixel and its two neighbours, padded to the widest kernel."""
-    own, side = kernel(sigma), len(kernel(widest))
-    line = np.pad(own, (side - len(own)) // 2)
+    weights, side = kernel(sigma), len(kernel(widest))
+    line = np.pad(weights, (side - len(weights)) // 2)
     nine = np.stack([np.pad(line, (k, 2 - k)) for k in range(3)])
     nine.flags.writeable = False
     return np.asarray(nine)
@@ -454,9 +454,9 @@ def _fitted(seen: _BandPassed, peaks: Peaks, noise: Grey) -> Dots:
     """Compute the same for overlapping dots by a joint fit (`fit_dots`)."""
     (u, v, bright), size = peaks, seen.size
     peak = bright / PEAK_GAIN
-    own = np.maximum(noise[v, u], 1e-3 * np.max(peak)).astype(np.float64)
+    dot_noise = np.maximum(noise[v, u], 1e-3 * np.max(peak)).astype(np.float64)
     start = np.stack([u, v, peak, np.full(len(u), size)], axis=1).astype(np.float64)
-    fitted = fit_dots(seen.picture, seen.around(), start, own)
+    fitted = fit_dots(seen.picture, seen.around(), start, dot_noise)
     return Dots(
         u_px=fitted.u_px,
         v_px=fitted.v_px,
@@ -464,5 +464,5 @@ def _fitted(seen: _BandPassed, peaks: Peaks, noise: Grey) -> Dots:
         v_sigma_px=np.hypot(fitted.v_sigma_px, LEAST_SIGMA_PX),
         size_px=np.clip(fitted.size_px, 0.3 * size, 3.0 * size),
         peak=peak,
-        snr=peak / own,
+        snr=peak / dot_noise,
     )

@@ -37,13 +37,13 @@ def _fold(line: Grey, taps: Grey, step: int, count: int, out: Grey) -> None:
     The first ``count`` results are written to ``out``.
     """
     rim = len(taps) // 2
-    middle, made = line[rim * step :], out[:count]
+    middle, result = line[rim * step :], out[:count]
     for x in range(count):
-        made[x] = taps[rim] * middle[x]
+        result[x] = taps[rim] * middle[x]
     for k in range(rim):
         weight, one, other = taps[k], line[k * step :], line[(2 * rim - k) * step :]
         for x in range(count):
-            made[x] += weight * (one[x] + other[x])
+            result[x] += weight * (one[x] + other[x])
 
 
 @_inner
@@ -75,7 +75,7 @@ def _blurred(image: Picture, taps: Grey, u: int, v: int, lines: Grey, patch: Gre
 
 
 @_inner
-def _beneath(at: int, by: float, count: int) -> tuple[int, float]:
+def _interpolation(at: int, by: float, count: int) -> tuple[int, float]:
     """Index and fraction for interpolation in a picture that is ``by`` times smaller."""
     place = min(max((at + 0.5) / by - 0.5, 0.0), count - 1.0)
     before = min(int(place), max(count - 2, 0))
@@ -83,7 +83,7 @@ def _beneath(at: int, by: float, count: int) -> tuple[int, float]:
 
 
 @_inner
-def _take_off(
+def _subtract_background(
     patch: Grey, around: Grey, by: float, u: int, v: int, shape: tuple[int, int], across: Grey
 ) -> None:
     """Subtract the background, a downsampled picture, from a patch whose first pixel is (u, v).
@@ -91,11 +91,11 @@ def _take_off(
     Negative differences and pixels outside the picture are set to 0.
     """
     (side, even), zero = patch.shape, np.float32(0.0)
-    top, _ = _beneath(v, by, around.shape[0])
-    last, _ = _beneath(v + side - 1, by, around.shape[0])
+    top, _ = _interpolation(v, by, around.shape[0])
+    last, _ = _interpolation(v + side - 1, by, around.shape[0])
     last = min(last + 1, around.shape[0] - 1)
     for x in range(even):
-        column, on = _beneath(u + x, by, around.shape[1])
+        column, on = _interpolation(u + x, by, around.shape[1])
         after = min(column + 1, around.shape[1] - 1)
         for row in range(top, last + 1):
             low, high = around[row, column], around[row, after]
@@ -105,7 +105,7 @@ def _take_off(
         if not 0 <= v + y < shape[0]:
             patch[y] = zero
             continue
-        row, part = _beneath(v + y, by, around.shape[0])
+        row, part = _interpolation(v + y, by, around.shape[0])
         low, high = across[row - top], across[min(row + 1, last) - top]
         share = np.float32(part)
         for x in range(even):
@@ -201,7 +201,7 @@ def centroids(
     lines = np.empty((4, even), single)
     for k in range(count):
         _blurred(image, taps, u[k], v[k], squares, patch)
-        _take_off(patch, around, by, u[k] - margin, v[k] - margin, image.shape, across)
+        _subtract_background(patch, around, by, u[k] - margin, v[k] - margin, image.shape, across)
         moment[k] = _centroid(patch, offset[:, k], width[k], reach, lines)
     return offset, moment
 
@@ -209,7 +209,7 @@ def centroids(
 @_compiled_for(*((own, _ints, _ints, _grey, _grey) for own in (_grey, _byte)))
 def finest(image: Picture, u: IntArray, v: IntArray, narrow: Grey, wide: Grey) -> FloatArray:
     """Largest difference of two filters in the 3 × 3 pixels about each (`band_pass._nine`)."""
-    side, made = narrow.shape[1], np.empty(len(u))
+    side, result = narrow.shape[1], np.empty(len(u))
     column, across = np.empty(side, np.float32), np.empty((6, side), np.float32)
     filters = np.concatenate((narrow, wide))
     for k in range(len(u)):
@@ -229,5 +229,5 @@ def finest(image: Picture, u: IntArray, v: IntArray, narrow: Grey, wide: Grey) -
                 for y in range(side):
                     value += narrow[i, y] * across[j, y] - wide[i, y] * across[3 + j, y]
                 most = max(most, value)
-        made[k] = most
-    return made
+        result[k] = most
+    return result

@@ -107,15 +107,15 @@ def fit_dots(
     from labapp.core.images import dot_fit_kernels as kernels
     from labapp.core.images.dot_kernels import next_apart
 
-    dots, usual = np.array(start, np.float64), float(np.median(start[:, 3]))
+    dots, median_size = np.array(start, np.float64), float(np.median(start[:, 3]))
     by, blur = picture.shape[1] / around[0].shape[1], around[1]
-    number, begin = kernels.neighbours(dots[:, 0], dots[:, 1], REACH_SIZES * usual)
+    number, begin = kernels.neighbours(dots[:, 0], dots[:, 1], REACH_SIZES * median_size)
     move = np.inf
     next_px = next_apart(np.ascontiguousarray(dots[:, :2]))
 
     for last in range(ROUNDS + 1):
-        usual = float(np.median(dots[:, 3]))
-        width = np.clip(WINDOW_SHARE * next_px, CLOSE_WINDOW * usual, WINDOW * usual)
+        median_size = float(np.median(dots[:, 3]))
+        width = np.clip(WINDOW_SHARE * next_px, CLOSE_WINDOW * median_size, WINDOW * median_size)
         margin = int(np.ceil(2.2 * width.max())) + 1
         rest = kernels.without_dots(around[0], by, blur, dots)
         where = picture, rest, blur, dots, width, number, begin, margin
@@ -128,15 +128,15 @@ def fit_dots(
     variance = noise**2 * modes[:2, :, 1] + speckle * modes[:2, :, 2]
     sigma = np.sqrt(variance / free) / _pull(dots, width)
     u, v = start[:, :2].T
-    most, (high, wide) = ASTRAY * usual, picture.shape
+    most, (high, wide) = ASTRAY * median_size, picture.shape
     # The band-pass reflects the picture at its edges, which draws peaks near them outwards.
     at_rim = np.minimum(np.minimum(u, wide - 1 - u), np.minimum(v, high - 1 - v)) < most
     astray = np.hypot(dots[:, 0] - u, dots[:, 1] - v) > np.where(at_rim, 2 * most, most)
     return FittedDots(
         u_px=np.where(astray, u, dots[:, 0]),
         v_px=np.where(astray, v, dots[:, 1]),
-        u_sigma_px=np.where(astray, usual, sigma[0]),
-        v_sigma_px=np.where(astray, usual, sigma[1]),
+        u_sigma_px=np.where(astray, median_size, sigma[0]),
+        v_sigma_px=np.where(astray, median_size, sigma[1]),
         size_px=dots[:, 3].copy(),
         speckle_px2=speckle,
     )
@@ -165,13 +165,13 @@ def _improve(dots: FloatArray, sums: FloatArray, width: FloatArray) -> float:
     g2 = grown * by_wide
     det = n00 * n11 - n01**2
     with np.errstate(divide="ignore", invalid="ignore"):
-        own = (n11 * n02 - n01 * n12) / det, (n00 * n12 - n01 * n02) / det
-        curvature = n22 - n02 * own[0] - n12 * own[1]
-        slope = g2 - by_own * own[0] - plain * own[1]
-    usual = float(np.median(size))
+        coupling = (n11 * n02 - n01 * n12) / det, (n00 * n12 - n01 * n02) / det
+        curvature = n22 - n02 * coupling[0] - n12 * coupling[1]
+        slope = g2 - by_own * coupling[0] - plain * coupling[1]
+    median_size = float(np.median(size))
     pooled = slope.sum() / curvature.sum()
     hold = ALIKE * curvature.mean()
-    growth = (slope + hold * (pooled - np.log(size / usual))) / (curvature + hold)
+    growth = (slope + hold * (pooled - np.log(size / median_size))) / (curvature + hold)
     growth = np.clip(growth, -MOST_GROWTH, MOST_GROWTH)
     rest_own, rest_plain = by_own - n02 * growth, plain - n12 * growth
     higher = (n11 * rest_own - n01 * rest_plain) / det
@@ -185,10 +185,10 @@ def _improve(dots: FloatArray, sums: FloatArray, width: FloatArray) -> float:
 
 def _free_share(dots: FloatArray, number: IntArray, begin: IntArray) -> FloatArray:
     """Share of a dot's noise that is not absorbed by the fit of its neighbours, shape (n,)."""
-    own = np.repeat(np.arange(len(dots)), np.diff(begin))
-    away = np.hypot(*(dots[number, :2] - dots[own, :2]).T) / dots[own, 3]
+    dot = np.repeat(np.arange(len(dots)), np.diff(begin))
+    away = np.hypot(*(dots[number, :2] - dots[dot, :2]).T) / dots[dot, 3]
     taken = np.minimum(MOST_TAKEN, OVERLAP * np.exp(-((away / OVERLAP_SIZES) ** 2)))
-    return np.exp(-np.bincount(own, taken, len(dots)))
+    return np.exp(-np.bincount(dot, taken, len(dots)))
 
 
 def _speckle(modes: FloatArray, dots: FloatArray, noise: FloatArray, free: FloatArray) -> float:

@@ -105,9 +105,9 @@ def _patch(
         row[:first] = 0.0
         row[last:] = 0.0
         seen, own = image[top + y, left + first : left + last], light[y, first:last]
-        made = row[first:last]
-        for x in range(len(made)):
-            made[x] = np.float32(seen[x]) - own[x] - (dark + slope * np.float32(first + x))
+        result = row[first:last]
+        for x in range(len(result)):
+            result[x] = np.float32(seen[x]) - own[x] - (dark + slope * np.float32(first + x))
 
 
 @_inner
@@ -143,7 +143,7 @@ def _folded_bell(center: float, by: float, width: float, values: Grey) -> tuple[
 @_compiled(_grey, _f, _f, _f2)
 def without_dots(around: Grey, by: float, blur: float, dots: FloatArray) -> Grey:
     """Subtract the light of dots, shape (n, 4), from a blurred, ``by`` times smaller picture."""
-    made = around.copy()
+    result = around.copy()
     across, down = np.empty(around.shape[1], np.float32), np.empty(around.shape[0], np.float32)
     for k in range(len(dots)):
         u, v, peak, size = dots[k]
@@ -151,10 +151,10 @@ def without_dots(around: Grey, by: float, blur: float, dots: FloatArray) -> Grey
         left, right = _folded_bell(u, by, np.sqrt(wide), across)
         top, bottom = _folded_bell(v, by, np.sqrt(wide), down)
         for y in range(top, bottom):
-            row, height = made[y], np.float32(peak * size**2 / wide) * down[y]
+            row, height = result[y], np.float32(peak * size**2 / wide) * down[y]
             for x in range(left, right):
                 row[x] -= height * across[x]
-    return made
+    return result
 
 
 @_compiled_for(*((own, _grey, _f, _f2, _f1, _ints, _ints, _i) for own in (_grey, _byte)))
@@ -186,7 +186,7 @@ def residual_sums(
     margin
         Half side of the square about a dot in which light is integrated, px.
     """
-    side, made, by = (
+    side, result, by = (
         2 * margin + 1,
         np.zeros((len(dots), 6)),
         image.shape[1] / surroundings.shape[1],
@@ -216,14 +216,14 @@ def residual_sums(
                 row_own += lines[2, x] * value
                 row_wide += lines[2, x] * value * away[1, x]
             away_v, down = top + y - v, lines[1, y]
-            made[k, 0] += down * row
-            made[k, 1] += down * row_u
-            made[k, 2] += down * row * away_v
+            result[k, 0] += down * row
+            result[k, 1] += down * row_u
+            result[k, 2] += down * row * away_v
             down *= lines[3, y]
-            made[k, 3] += down * row_own
-            made[k, 4] += down * (row_wide + away_v**2 * row_own)
-        made[k, 5] = lines[0].sum() * lines[1].sum()
-    return made
+            result[k, 3] += down * row_own
+            result[k, 4] += down * (row_wide + away_v**2 * row_own)
+        result[k, 5] = lines[0].sum() * lines[1].sum()
+    return result
 
 
 @_inner
@@ -276,7 +276,7 @@ def residual_modes(
     order; a shift of a round dot contributes to the first order only. The last axis holds the
     projection, the sum of the squared mode, and the sum of the squared product of mode and light.
     """
-    side, made, by = (
+    side, result, by = (
         2 * margin + 1,
         np.zeros((6, len(dots), 3)),
         image.shape[1] / surroundings.shape[1],
@@ -316,7 +316,7 @@ def residual_modes(
                     square += weighed * weighed * power[2 * n, x]
                 moments[n], squares[n] = moment, square
             q, down = top + y - v, float(lines[1, y])
-            _add_modes(made[:, k, 0], down, q, spread, moments)
-            _add_squares(made[:, k, 1], down**2, q, spread, white)
-            _add_squares(made[:, k, 2], down**2, q, spread, squares)
-    return made
+            _add_modes(result[:, k, 0], down, q, spread, moments)
+            _add_squares(result[:, k, 1], down**2, q, spread, white)
+            _add_squares(result[:, k, 2], down**2, q, spread, squares)
+    return result

@@ -96,7 +96,7 @@ def next_apart(places: FloatArray) -> FloatArray:
 
 
 @_inner
-def _tops(band: Grey, disc: BoolArray, v: int, u: int) -> bool:
+def _is_peak(band: Grey, disc: BoolArray, v: int, u: int) -> bool:
     """Whether no pixel of a disc about a pixel exceeds it."""
     (height, width), reach, own = band.shape, len(disc) // 2, band[v, u]
     if (u > 0 and band[v, u - 1] > own) or (u < width - 1 and band[v, u + 1] > own):
@@ -137,7 +137,7 @@ def peaks(band: Grey, floor: Grey, disc: BoolArray) -> IntArray:
             for u in range(
                 first, last if _any_over(own[first:last], floors[first:last]) else first
             ):
-                if not (own[u] > floors[u] and _tops(band, disc, v, u)):
+                if not (own[u] > floors[u] and _is_peak(band, disc, v, u)):
                     continue
                 if count == found.shape[1]:
                     more = np.empty((2, 2 * count), np.int64)
@@ -151,7 +151,7 @@ def peaks(band: Grey, floor: Grey, disc: BoolArray) -> IntArray:
 @_compiled(_grey, _ints, _ints, _f)
 def ridges(band: Grey, u: IntArray, v: IntArray, slender: float) -> BoolArray:
     """Whether the ratio of principal curvatures of peaks exceeds a limit; edges are reflected."""
-    (height, width), made = band.shape, np.empty(len(u), np.bool_)
+    (height, width), result = band.shape, np.empty(len(u), np.bool_)
     for k in range(len(u)):
         above, below = abs(v[k] - 1), height - 1 - abs(height - 2 - v[k])
         left, right = abs(u[k] - 1), width - 1 - abs(width - 2 - u[k])
@@ -160,8 +160,8 @@ def ridges(band: Grey, u: IntArray, v: IntArray, slender: float) -> BoolArray:
         along = own - band[above, u[k]] - band[below, u[k]]
         skew = band[above, left] + band[below, right] - band[above, right] - band[below, left]
         both = across * along - skew * skew / 16.0
-        made[k] = slender * (across + along) ** 2 > (1.0 + slender) ** 2 * both
-    return made
+        result[k] = slender * (across + along) ** 2 > (1.0 + slender) ** 2 * both
+    return result
 
 
 @_inner
@@ -210,7 +210,7 @@ def _enlarged(band: Grey, v: int, u: int, taps: Grey, patch: Grey, four: Grey) -
 
 
 @_inner
-def _tops_enlarged(fours: Grey, number: IntArray, disc: BoolArray, v: int, u: int) -> bool:
+def _is_upsampled_peak(fours: Grey, number: IntArray, disc: BoolArray, v: int, u: int) -> bool:
     """Whether no upsampled pixel of a disc about a pixel exceeds it.
 
     ``fours``, shape (n, 4), holds the upsampled values of n pixels of the band, and ``number``,
@@ -264,7 +264,7 @@ def enlarged_peaks(
         most = fours[k].max()  # the other three cannot be peaks
         for m in range(4):
             v, u = 2 * lit[k, 0] + m // 2, 2 * lit[k, 1] + m % 2
-            if fours[k, m] < most or not _tops_enlarged(fours, number, disc, v, u):
+            if fours[k, m] < most or not _is_upsampled_peak(fours, number, disc, v, u):
                 continue
             if most > floor[v, u]:
                 found[0, count], found[1, count], high[count] = u, v, most
@@ -276,14 +276,14 @@ def enlarged_peaks(
 @_compiled_for(*((own,) for own in (_grey, _byte)))
 def halved(image: Picture) -> Grey:
     """Downsample an image twofold by averaging 2 × 2 pixels, without rounding."""
-    made = np.empty((image.shape[0] // 2, image.shape[1] // 2), np.float32)
-    for v in range(made.shape[0]):
-        above, below, own = image[2 * v], image[2 * v + 1], made[v]
-        for u in range(made.shape[1]):
+    result = np.empty((image.shape[0] // 2, image.shape[1] // 2), np.float32)
+    for v in range(result.shape[0]):
+        above, below, own = image[2 * v], image[2 * v + 1], result[v]
+        for u in range(result.shape[1]):
             one = np.float32(above[2 * u]) + np.float32(above[2 * u + 1])
             other = np.float32(below[2 * u]) + np.float32(below[2 * u + 1])
             own[u] = np.float32(0.25) * (one + other)
-    return made
+    return result
 
 
 @_inner
@@ -349,7 +349,7 @@ def _darkest(image: Picture, v: int, u: int, reach: int, step: int) -> float:
 
 
 @_inner
-def _times_deeper(
+def _ratio_of_falls(
     over_ground: float, one: float, two: float, near: float, far: float, sharper: float
 ) -> float:
     """Fall of light at a pixel over that at a dot's peak: to the next pixels or those beyond."""
@@ -395,7 +395,7 @@ def spikes(
                 for step in (reach, 1):
                     ground = _darkest(image, v, u, reach, step)
                     high, low, lower = own - ground - over, one - ground, two - ground
-                    times = _times_deeper(high, low, lower, near, far, sharper)
+                    times = _ratio_of_falls(high, low, lower, near, far, sharper)
                     if high > 0.0 and times <= sharper:
                         break
                 if not (high > 0.0 and times > sharper):
@@ -415,9 +415,9 @@ def spikes(
 
 
 @_compiled(_ints, _ints, types.Array(types.boolean, 1, "A", readonly=True))
-def hanging_together(u: IntArray, v: IntArray, begun: BoolArray) -> BoolArray:
+def connected_pixels(u: IntArray, v: IntArray, begun: BoolArray) -> BoolArray:
     """Select the seed pixels and all pixels that are 8-connected to them."""
-    made, waiting = begun.copy(), np.flatnonzero(begun)
+    result, waiting = begun.copy(), np.flatnonzero(begun)
     next_ones = np.empty(len(u), np.int64)
     next_ones[: len(waiting)] = waiting
     count, done = len(waiting), 0
@@ -425,10 +425,10 @@ def hanging_together(u: IntArray, v: IntArray, begun: BoolArray) -> BoolArray:
         own = next_ones[done]
         done += 1
         for k in range(len(u)):
-            if not made[k] and abs(u[k] - u[own]) <= 1 and abs(v[k] - v[own]) <= 1:
-                made[k], next_ones[count] = True, k
+            if not result[k] and abs(u[k] - u[own]) <= 1 and abs(v[k] - v[own]) <= 1:
+                result[k], next_ones[count] = True, k
                 count += 1
-    return made
+    return result
 
 
 @_compiled(_ints, _ints, _f)

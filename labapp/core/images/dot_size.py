@@ -76,12 +76,12 @@ def local_noise(picture: Picture) -> Grey:
     return np.asarray(cv2.resize(1.4826 * medians, (width, height)), np.float32)
 
 
-def mended(
-    picture: Picture, noise: Grey, size: float, doubted: tuple[IntArray, IntArray] | None = None
+def without_spikes(
+    picture: Picture, noise: Grey, size: float, suspects: tuple[IntArray, IntArray] | None = None
 ) -> Picture:
     """Replace pixels that are too bright for dots of a size, px, by their surroundings.
 
-    These are certain spikes, spikes near one of the ``doubted`` pixels (columns and rows), and
+    These are certain spikes, spikes near one of the ``suspects`` pixels (columns and rows), and
     spikes connected to either. A picture without spikes is returned unchanged.
     """
     from labapp.core.images import dot_kernels
@@ -93,15 +93,15 @@ def mended(
     sharp = picture[v, u] - beside > SPIKE * noise[v, u]
     u, v, times, beside = u[sharp], v[sharp], times[sharp], beside[sharp]
     begun = times > CERTAIN
-    if doubted is not None:
-        away = dot_kernels.two_nearest(pairs(u, v), pairs(*doubted))[0][:, 0]
+    if suspects is not None:
+        away = dot_kernels.two_nearest(pairs(u, v), pairs(*suspects))[0][:, 0]
         begun |= away <= 1.5 * size + 1.0
     if not begun.any():
         return picture
-    hot = dot_kernels.hanging_together(u, v, begun)
-    whole = picture.copy()
-    whole[v[hot], u[hot]] = np.rint(beside[hot]) if picture.dtype == np.uint8 else beside[hot]
-    return whole
+    hot = dot_kernels.connected_pixels(u, v, begun)
+    result = picture.copy()
+    result[v[hot], u[hot]] = np.rint(beside[hot]) if picture.dtype == np.uint8 else beside[hot]
+    return result
 
 
 def pairs(u: IntArray, v: IntArray) -> FloatArray:
@@ -109,7 +109,7 @@ def pairs(u: IntArray, v: IntArray) -> FloatArray:
     return np.stack([u, v], axis=1).astype(float)
 
 
-def size_of(picture: Picture, noise: Grey) -> float:
+def estimate_size(picture: Picture, noise: Grey) -> float:
     """Estimate the size of a picture's dots, px: the scale at which most of its blobs peak.
 
     A blob is a maximum over position and scale of the scale-normalised band-pass. It votes with
@@ -122,7 +122,7 @@ def size_of(picture: Picture, noise: Grey) -> float:
     level = float(np.median(noise[::8, ::8]))
     size = _size_from(picture, level, COARSE)
     if size is None:
-        size = _size_from(mended(picture, noise, SCALES_PX[0]), level, 0)
+        size = _size_from(without_spikes(picture, noise, SCALES_PX[0]), level, 0)
     return size or USUAL_PX
 
 
@@ -188,7 +188,7 @@ def _blobs(bands: dict[int, tuple[int, Grey]], scale: int, noise: float) -> _Blo
     step, band = bands[scale]
     white = noise / noise_gain(SCALES_PX[scale])
     every = -(-8 // step)
-    floor = OVER_NOISE * with_grain(band[::every, ::every], white) + 1e-6
+    floor = OVER_NOISE * band_noise(band[::every, ::every], white) + 1e-6
     disc = peak_disc(SCALES_PX[scale] / step).astype(bool)
     x, y = dot_kernels.peaks(band, np.full((1, 1), floor, np.float32), disc)
     good = ~dot_kernels.ridges(band, x, y, SLENDER)
@@ -246,7 +246,7 @@ def noise_gain(size: float) -> float:
     return float(1 / np.sqrt(power))
 
 
-def with_grain(band: Grey, white: float) -> float:
+def band_noise(band: Grey, white: float) -> float:
     """Estimate the noise of a band-passed picture; ``white`` is what white noise would give.
 
     Correlated noise (compression, a soft sensor) passes the band more; the excess is estimated
@@ -256,7 +256,7 @@ def with_grain(band: Grey, white: float) -> float:
     return white * min(max(1.0, excess), 3.0)
 
 
-_own = threading.local()
+_local = threading.local()
 
 
 def scratch(name: str, shape: tuple[int, int]) -> Grey:
@@ -264,15 +264,15 @@ def scratch(name: str, shape: tuple[int, int]) -> Grey:
 
     It is reused for frames of the same size, since allocation would take as long as the filters.
     """
-    kept: dict[str, Grey] = _own.__dict__
+    buffers: dict[str, Grey] = _local.__dict__
     count = shape[0] * shape[1]
-    if name not in kept or kept[name].size < count:
-        kept.pop(name, None)
-        made = np.empty(count, np.float32)
-        if made.nbytes > KEPT_BYTES:
-            return made.reshape(shape)
-        kept[name] = made
-    return kept[name][:count].reshape(shape)
+    if name not in buffers or buffers[name].size < count:
+        buffers.pop(name, None)
+        buffer = np.empty(count, np.float32)
+        if buffer.nbytes > KEPT_BYTES:
+            return buffer.reshape(shape)
+        buffers[name] = buffer
+    return buffers[name][:count].reshape(shape)
 
 
 def blur(picture: Picture, sigma: float, into: Grey | None = None) -> Grey:

@@ -134,13 +134,13 @@ def _sites_to_add(whole: dict[int, Site], other: dict[int, Site]) -> dict[int, S
     shared = list(whole.keys() & other.keys())
     if len(shared) < LEAST_SHARED:
         return None
-    own, its = (np.array([sites[dot] for dot in shared]) for sites in (whole, other))
+    in_whole, in_other = (np.array([sites[dot] for dot in shared]) for sites in (whole, other))
     # A row of one grid may be a diagonal of the other.
-    turn, _, rank, _ = np.linalg.lstsq(_centered(its), _centered(own), rcond=None)
+    turn, _, rank, _ = np.linalg.lstsq(_centered(in_other), _centered(in_whole), rcond=None)
     if rank < 2:
         return None
     turn = np.rint(turn).astype(np.int64)
-    offset = own - its @ turn
+    offset = in_whole - in_other @ turn
     if abs(round(np.linalg.det(turn))) != 1 or np.ptp(offset, axis=0).any():
         return None
     sites = np.array(list(other.values())) @ turn + offset[0]
@@ -290,8 +290,8 @@ def _without_slips(grid: IntArray, plane: ComplexArray) -> IntArray:
     slant = np.full(len(grid), np.nan)
     for k in np.nonzero(~np.isnan(lean).all(axis=1))[0]:
         slant[k + 1] = np.median(lean[k][~np.isnan(lean[k])])
-    usual = np.median(slant[~np.isnan(slant)]) if not np.isnan(slant).all() else 0.0
-    sound = (np.abs(slant - usual) < MOST_SLIP) & (np.abs(slant) < MOST_SLANT)
+    median_slant = np.median(slant[~np.isnan(slant)]) if not np.isnan(slant).all() else 0.0
+    sound = (np.abs(slant - median_slant) < MOST_SLIP) & (np.abs(slant) < MOST_SLANT)
     part = np.cumsum(~sound)
     kept: BoolArray = part == np.bincount(part, (grid >= 0).sum(axis=1)).argmax()
     return grid[kept]

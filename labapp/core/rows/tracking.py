@@ -117,9 +117,9 @@ def _steps(correction: Correction) -> FloatArray | None:
         if not known.any():
             return None
         steps[~known, :, axis] = np.median(steps[known, :, axis], axis=0)
-    usual = np.median(steps, axis=0)
+    median_step = np.median(steps, axis=0)
     size = np.linalg.norm(steps, axis=1)
-    steps[np.abs(np.linalg.det(steps)) < 0.2 * size[:, 0] * size[:, 1]] = usual
+    steps[np.abs(np.linalg.det(steps)) < 0.2 * size[:, 0] * size[:, 1]] = median_step
     return steps if np.abs(np.linalg.det(steps)).min() > 0 else None
 
 
@@ -131,9 +131,9 @@ def _likeliest_motion(
     settings: CarrySettings,
 ) -> Motion | None:
     """The motion that matches most dots; None if one shifted by a row or column is as good."""
-    usual = np.median(steps[sited], axis=0)
+    median_step = np.median(steps[sited], axis=0)
     share = np.linspace(-settings.reach, settings.reach, 7)
-    near = [usual @ np.array([t, k]) for k in share for t in share]
+    near = [median_step @ np.array([t, k]) for k in share for t in share]
     first = max(near, key=lambda shift: _count(before + shift, after, steps, sited, settings))
     motion = _followed(before, after, steps, first, settings)
     found = _found(motion(before), after, steps, settings)
@@ -168,11 +168,11 @@ def _followed(
     weights = np.linalg.lstsq(terms(before, 0), moved - before, rcond=None)[0]
     for degree in (1, 1, 1, 2, 2, 2, 2):
         found = _found(moved, after, steps, settings)
-        own = np.flatnonzero(found != LOST)
-        if len(own) < 12:
+        matched = np.flatnonzero(found != LOST)
+        if len(matched) < 12:
             break
-        way = after[found[own]] - before[own]
-        weights = np.linalg.lstsq(terms(before[own], degree), way, rcond=None)[0]
+        way = after[found[matched]] - before[matched]
+        weights = np.linalg.lstsq(terms(before[matched], degree), way, rcond=None)[0]
         moved = before + terms(before, degree) @ weights
     last = next(d for d in range(3) if len(weights) == (d + 1) * (d + 2) // 2)
     return lambda place: place + terms(place, last) @ weights
@@ -186,8 +186,8 @@ def _found(
         np.einsum("nab,nmb->nma", np.linalg.inv(steps), after - moved[:, None]), axis=-1
     )
     nearest = np.argmin(away, axis=1)
-    own = np.arange(len(moved))
-    sure = (away[own, nearest] < settings.gate) & (np.argmin(away, axis=0)[nearest] == own)
+    index = np.arange(len(moved))
+    sure = (away[index, nearest] < settings.gate) & (np.argmin(away, axis=0)[nearest] == index)
     sure &= np.sum(away < settings.clear, axis=1) == 1
     return np.where(sure, nearest, LOST)
 
