@@ -590,7 +590,7 @@ def test_every_edit_reaches_the_frame(labapp: Run, measured: Path) -> None:
         ("--delete nan,1", "U is a number (px)"),
         ("--move 30,140:1", "it is of the form U,V:DU,DV"),
         ("--place 30,140:1.5,1", "ROW is a whole number"),
-        ("--place 30,140:1,2", "row 1, column 2 is the place of dot"),
+        ("--place 30,140:1,2", "row 1, column 2 is already assigned to dot"),
         ("--add 500,1", "(500, 1) px is not in the frame"),
         ("--add 30,140", "is there already"),
         ("--shift-row 40:1", "row 40 has no dots"),

@@ -100,7 +100,7 @@ class BySource(_CacheLocator):
         return place
 
     def get_cache_path(self) -> str:
-        """Return the folder of the function's file."""
+        """Return the cache folder of the function's file."""
         return str(_folder() / self._source)
 
     def get_source_stamp(self) -> str:
@@ -195,4 +195,4 @@ def _kept(function: F, *signature: Any) -> F:
         finally:
             _config.CACHE_LOCATOR_CLASSES = usual
             del codegen._library_class
-    return made
+    return result

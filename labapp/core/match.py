@@ -10,7 +10,7 @@ import numpy as np
 from labapp.core.values import CannotMeasure, FloatArray, IntArray, ReadOnlyArrays
 
 Orientation = Literal["S/S", "S/I", "I/I"]
-"""Column/row correspondence: S grows the same way as the rays, I the other way."""
+"""Column/row correspondence: S for the same order as the rays, I for the inverse order."""
 
 ORIENTATIONS: tuple[Orientation, ...] = ("S/S", "S/I", "I/I")
 
@@ -31,7 +31,7 @@ def missing_share(missed: int, pairs: int) -> float:
 
 @dataclass(frozen=True)
 class Trial:
-    """How well the matched dots fit with one orientation.
+    """Residual of the matched dots for one orientation.
 
     Parameters
     ----------
@@ -48,7 +48,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Match(ReadOnlyArrays):
-    """Matched pairs of ray and reflected dot, n of them.
+    """The n matched pairs of ray and reflected dot.
 
     Parameters
     ----------

@@ -46,7 +46,7 @@ if TYPE_CHECKING:  # the module compiles: it is loaded where a frame is measured
     from labapp.core.sequence.prior import Prior
 
 OnStep = Callable[[str], None]
-"""Called with the name of a step that is done."""
+"""Called with the name of each completed step."""
 
 ByHand = Correction | LineCorrection
 """The operator's correction of a frame: dots and rows, or the lines of a line pattern."""
@@ -90,7 +90,7 @@ class Measurement:
     Parameters
     ----------
     status
-        ``ok``, or one word for why there is no surface.
+        ``ok``, or one word for the reason that there is no surface.
     reason
         The reason in one sentence; empty if the status is ``ok``.
     scheme
@@ -173,7 +173,7 @@ def measure(
     image
         Grey frame, shape (height, width), any real type.
     bench
-        Bench that the frame was recorded on.
+        Bench on which the frame was recorded.
     settings
         See `Settings`.
     prior
@@ -181,11 +181,10 @@ def measure(
         prediction fails, the status is ``track-lost`` or another that is not ``ok``.
         None: the frame is measured independently.
     correction
-        The frame's dots and rows, or lines, as the operator has them; they are measured in place of
-        what would be found, and of the image only the shape counts. One of the other kind of
-        pattern is not used.
+        The operator's dots and rows, or lines, which are used instead of automatic detection; of
+        the image only the shape is then used. Ignored if it is for the other kind of pattern.
     on_step
-        Called with the name of each step when it is done: dots, match, measures.
+        Called with the name of each completed step: dots, match, measures.
 
     Returns
     -------
@@ -253,7 +252,7 @@ def _by_scheme(result: Measurement, match: Match, rig: Rig, settings: Settings) 
 
 
 def _with_lines(result: Measurement, image: Image, rig: LineRig, bench: Bench) -> Measurement:
-    """The result of a frame of a line pattern."""
+    """Measure a frame of a line pattern."""
     by_hand = result.correction if isinstance(result.correction, LineCorrection) else None
     found = measure_lines(image, rig, bench.calibration, LineMeasureSettings(), by_hand)
     return replace(result, status=found.status, reason=found.reason, lines=found)
@@ -269,7 +268,7 @@ def _as_before(image: Image, prior: Prior) -> Image:
 
 
 def _dots_and_tuning(image: Image, settings: DotSettings) -> tuple[Dots, DetectorTuning | None]:
-    """The dots, and what the default detector was tuned to, for the frames after this one."""
+    """Find the dots, and the default detector's tuning for the following frames."""
     if settings.method == "band-pass":
         return tuned_dots(image, settings.band_pass)
     return find_dots(image, settings), None

@@ -177,7 +177,7 @@ def judge_quality(
         if lattice is not None:
             remarks.append(_of_reference(reference))
         remarks += _of_measurement(measurement, sigma_mm, most_sigma_mm)
-    remarks.sort(key=lambda remark: -GRADES.index(remark.grade))  # else in the order of looking
+    remarks.sort(key=lambda remark: -GRADES.index(remark.grade))  # stable: order of assessment
     count = 0 if dots is None else len(dots)
     return Quality(exposure, count, blocked, reference, sigma_mm, tuple(remarks))
 
@@ -192,7 +192,9 @@ def _of_exposure(exposure: Exposure) -> Remark:
 def _of_blur(exposure: Exposure) -> Remark:
     if exposure.valley < BLURRED and exposure.verdict != "dots merge":
         full = f"{1 - exposure.valley:.0%}"
-        words = f"Dots are blurred, the gaps between them {full} full of light: focus the lens."
+        words = (
+            f"Dots are blurred: the gaps between them have {full} of their light. Focus the lens."
+        )
         return Remark("blur", "doubtful", words)
     return Remark("blur", "good", "The dots are sharp.")
 
@@ -212,9 +214,7 @@ def _of_rows(dots: Dots, blocked: int, rays: int | None) -> Remark:
 def _of_reference(reference: bool) -> Remark:
     if reference:
         return Remark("reference", "good", "The reference is seen.")
-    words = (
-        "The reference, the hole of the absent ray, is not seen: a row may be taken for another."
-    )
+    words = "The reference, the hole of the absent ray, is not visible: rows may be misidentified."
     return Remark("reference", "doubtful", words)
 
 

@@ -17,7 +17,7 @@ class CannotMeasure(Exception):
     Parameters
     ----------
     status
-        One word with hyphens, as it goes into ``measures.csv``: ``no-dots``, ``no-reference``,
+        One hyphenated word, as written to ``measures.csv``: ``no-dots``, ``no-reference``,
         ``ambiguous-rows``, ``too-few-dots``, …
     reason
         One sentence for the operator.
@@ -30,7 +30,7 @@ class CannotMeasure(Exception):
 
 
 class ReadOnlyArrays:
-    """Base of a dataclass whose array fields are read-only."""
+    """Base class of dataclasses whose array fields are read-only."""
 
     def __post_init__(self) -> None:
         fields = vars(self)

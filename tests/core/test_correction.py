@@ -108,7 +108,7 @@ def test_a_site_is_refused_where_another_dot_has_it() -> None:
     u, v = before.dots.image_px[owner]
     with pytest.raises(ValueError, match=rf"dot {owner} at \({u:.1f}, {v:.1f}\) px"):
         assign(before, [LAST], row=2, column=2)
-    with pytest.raises(ValueError, match="cannot be that of"):
+    with pytest.raises(ValueError, match="cannot be assigned to"):
         assign(before, [0, LAST], row=9, column=9)
 
 
@@ -164,7 +164,7 @@ def test_a_split_row_is_two_and_merged_again_is_one(above: bool) -> None:
 
 
 def test_rows_that_share_columns_are_not_merged() -> None:
-    with pytest.raises(ValueError, match="row 1, column 1 is the place of dot 0"):
+    with pytest.raises(ValueError, match="row 1, column 1 is already assigned to dot 0"):
         merge_rows(grid(), 2, 1)
 
 
@@ -191,9 +191,9 @@ REFUSED: list[tuple[Callable[[Correction], Correction], str]] = [
     (lambda c: delete_dots(c, [LAST + 1]), f"no dot {LAST + 1}; there are {LAST + 1}"),
     (lambda c: move_dots(c, [-1], 0.0, 0.0), "no dot -1"),
     (lambda c: move_dots(c, [0], float("nan"), 0.0), "cannot be moved"),
-    (lambda c: clear_rows(c, np.array([0.5])), "by their numbers"),
+    (lambda c: clear_rows(c, np.array([0.5])), "by their integer indices"),
     (lambda c: assign(c, [0]), "a row or a column is needed"),
-    (lambda c: assign(c, [0], row=100000), "100000 is no row"),
+    (lambda c: assign(c, [0], row=100000), "100000 is not a valid row"),
     (lambda c: shift_row(c, 7, 1), "row 7 has no dots"),
     (lambda c: shift_row(c, 0, 1), "row 0 has no dots"),
     (lambda c: split_row(c, 2, 1), "row 2 has no dots on both sides of column 1"),
@@ -218,11 +218,11 @@ def test_a_wrong_edit_is_refused_with_a_sentence(
 def test_a_correction_that_makes_no_sense_is_none() -> None:
     good = grid()
     n = len(good.dots)
-    with pytest.raises(ValueError, match="is the place of dot 0"):
+    with pytest.raises(ValueError, match="is already assigned to dot 0"):
         replace(good, lattice=Lattice(np.ones(n, np.int64), np.ones(n, np.int64)))
     with pytest.raises(ValueError, match="counted from 1"):
         replace(good, lattice=Lattice(np.full(n, -1), np.zeros(n, np.int64)))
-    with pytest.raises(ValueError, match="every dot needs"):
+    with pytest.raises(ValueError, match="same length"):
         replace(good, manual=good.manual[1:])
 
 

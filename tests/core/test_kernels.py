@@ -543,7 +543,7 @@ def test_pixels_that_hang_together_are_those_of_one_spot() -> None:
     v, u = np.nonzero(spots)
     begun = random().uniform(size=len(u)) < 0.1
     spot = np.asarray(cv2.connectedComponents(spots)[1])[v, u]
-    made = dot_kernels.hanging_together(u, v, begun)
+    made = dot_kernels.connected_pixels(u, v, begun)
     np.testing.assert_array_equal(made, np.isin(spot, spot[begun]))
     assert begun.sum() < made.sum() < len(u)
 

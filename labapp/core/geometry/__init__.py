@@ -1,1 +1,1 @@
-"""The bench: laser, rays, imaging plane; coordinates of image, plane and work piece."""
+"""Geometry of the bench: laser, rays, imaging plane, and coordinate systems."""

@@ -22,7 +22,7 @@ class Bench:
     rig
         Laser, pattern, electrode and imaging plane.
     calibration
-        From the image to the imaging plane.
+        Mapping between the image and the imaging plane.
     """
 
     rig: Rig
@@ -34,7 +34,7 @@ class Bench:
         return project_rays(self.rig.laser, self.rig.pattern)
 
     def frame_px(self, frame_shape: tuple[int, int]) -> tuple[FloatArray, FloatArray]:
-        """First and last pixel (u, v) of a frame, undistorted, shapes (2,).
+        """Undistorted first and last pixel (u, v) of a frame, shapes (2,).
 
         With lens distortion the frame's edges are curved: the result is the rectangle within them.
         """

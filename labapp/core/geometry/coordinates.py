@@ -1,4 +1,7 @@
-"""Image ↔ imaging plane (Eq. 4-6 … 4-13); imaging plane ↔ universal is `rig.ImagingPlane`."""
+"""Transformation between image and imaging plane (Eq. 4-6 … 4-13).
+
+`rig.ImagingPlane` transforms between imaging plane and universal coordinates.
+"""
 
 from __future__ import annotations
 
@@ -116,15 +119,14 @@ class ImageCalibration(ReadOnlyArrays):
     Parameters
     ----------
     matrix
-        Shape (3, 3): homogeneous (u, v, 1) in px, undistorted, to (X′, Z′, 1)
-        in mm.
+        Shape (3, 3): undistorted homogeneous (u, v, 1) in px to (X′, Z′, 1) in mm.
     lens
         Distortion of the lens; None if there is none.
 
     Raises
     ------
     ValueError
-        If the matrix cannot be inverted.
+        If the matrix is not finite, not of this shape, or singular.
     """
 
     matrix: FloatArray
@@ -166,7 +168,7 @@ class ImageCalibration(ReadOnlyArrays):
         Raises
         ------
         ValueError
-            If the three points lie on one line.
+            If the three points are collinear.
         """
         seen = np.array([origin_px, x_axis_px, z_axis_px], float)
         origin, on_x, on_z = seen if lens is None else lens.ideal(seen)
@@ -179,7 +181,7 @@ class ImageCalibration(ReadOnlyArrays):
         return cls(_inverse(to_image), lens)
 
     def with_distortion(self, percent: float, half_mm: FloatArray) -> ImageCalibration:
-        """Replace the radial distortion, see `RadialDistortion`."""
+        """Return a calibration with another radial distortion (`RadialDistortion`)."""
         lens = self.plain_lens
         bent = RadialDistortion(self.matrix, lens, half_mm, percent) if percent else lens
         return ImageCalibration(self.matrix, bent)
@@ -191,25 +193,25 @@ class ImageCalibration(ReadOnlyArrays):
 
     @property
     def distortion_percent(self) -> float:
-        """Radial distortion in the plane's corner, percent, see `RadialDistortion`."""
+        """Radial distortion at the plane's corner, percent (`RadialDistortion`)."""
         return self.lens.percent if isinstance(self.lens, RadialDistortion) else 0.0
 
     def ideal_px(self, image_px: FloatArray) -> FloatArray:
-        """(u, v), shape (…, 2), px, undistorted."""
+        """Undistort image points (u, v), shape (…, 2), px."""
         return image_px if self.lens is None else self.lens.ideal(image_px)
 
     def to_plane(self, image_px: FloatArray) -> FloatArray:
-        """(u, v), shape (…, 2), px, to IPCS (X′, Z′), shape (…, 2), mm."""
+        """Transform (u, v), shape (…, 2), px, to IPCS (X′, Z′), shape (…, 2), mm."""
         return _apply(self.matrix, self.ideal_px(image_px))
 
     def to_image(self, plane_mm: FloatArray) -> FloatArray:
-        """IPCS (X′, Z′), shape (…, 2), mm, to (u, v), shape (…, 2), px."""
+        """Transform IPCS (X′, Z′), shape (…, 2), mm, to (u, v), shape (…, 2), px."""
         ideal = _apply(self.from_plane, plane_mm)
         return ideal if self.lens is None else self.lens.distorted(ideal)
 
     @cached_property
     def from_plane(self) -> FloatArray:
-        """Homography from the plane to the image without distortion, shape (3, 3)."""
+        """Homography from the plane to the undistorted image, shape (3, 3)."""
         return _inverse(self.matrix)
 
     def jacobian(self, image_px: FloatArray) -> FloatArray:

@@ -25,9 +25,9 @@ class FoldingMirror(ReadOnlyArrays):
     Parameters
     ----------
     point_mm
-        A point of its face, UCS, shape (3,), mm.
+        A point of its surface, UCS, shape (3,), mm.
     normal
-        Normal of its face, of any length and either sign, shape (3,).
+        Normal of its surface, of any length and either sign, shape (3,).
     """
 
     point_mm: FloatArray
@@ -43,7 +43,7 @@ class FoldingMirror(ReadOnlyArrays):
         )
 
     def moved(self, offset_mm: float, tilt_deg: tuple[float, float]) -> FoldingMirror:
-        """The mirror shifted along its normal, and tilted about two axes in its face."""
+        """Return the mirror shifted along its normal and tilted about two axes in its surface."""
         unit = self.normal / np.linalg.norm(self.normal)
         first = np.cross(unit, np.eye(3)[np.argmin(np.abs(unit))])
         first /= np.linalg.norm(first)
@@ -53,7 +53,7 @@ class FoldingMirror(ReadOnlyArrays):
 
 
 def pose_of(plane: ImagingPlane) -> FloatArray:
-    """Distance, s, h (mm), pitch, yaw and roll (degrees) of a plane, shape (6,)."""
+    """Pose of a plane: distance, s, h (mm), pitch, yaw and roll (degrees), shape (6,)."""
     x, y, z = plane.origin_mm
     return np.array([-y, -x, z, *plane.angles_deg])
 
@@ -70,7 +70,7 @@ def plane_of(pose: FloatArray, like: ImagingPlane) -> ImagingPlane:
 def image_sigma(
     plane: ImagingPlane, mirror: FoldingMirror, sigma: FloatArray, mirror_sigma: FloatArray
 ) -> FloatArray:
-    """Standard uncertainty of the pose of a plane's mirror image, shape (6,), by linear response.
+    """Standard uncertainty of the pose of a plane's mirror image, shape (6,), to first order.
 
     A tilt of the mirror rotates the image by twice that angle. Correlations are neglected.
 
@@ -79,7 +79,7 @@ def image_sigma(
     plane, mirror
         Imaging plane and mirror.
     sigma
-        Standard uncertainty of the plane's own pose (`pose_of`), shape (6,).
+        Standard uncertainty of the plane's pose (`pose_of`), shape (6,).
     mirror_sigma
         Standard uncertainty of the mirror's position along its normal, mm, and of its tilt about
         both axes, degrees, shape (3,).

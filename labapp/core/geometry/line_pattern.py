@@ -46,7 +46,7 @@ class LinePattern:
         return float(np.radians(self.fan_angle_deg) / 2)
 
     def tangents(self, line: FloatArray, fan: FloatArray) -> FloatArray:
-        """Tangents of rays to the beam axis, to the side and upwards, shape (…, 2).
+        """Tangents of the angles of rays to the beam axis, sideways and upwards, shape (…, 2).
 
         Parameters
         ----------
@@ -90,7 +90,7 @@ class LineRays(DotPattern):
 
     @property
     def tangents(self) -> FloatArray:
-        """Tangents of the rays to the beam axis, shape (rows, columns, 2)."""
+        """Tangents of the angles of the rays to the beam axis, shape (rows, columns, 2)."""
         fan = np.linspace(-self.lines.half_fan, self.lines.half_fan, self.columns)
         return self.lines.tangents(np.arange(1.0, self.rows + 1)[:, None], fan)
 
@@ -125,7 +125,7 @@ def line_rig(rig: Rig) -> LineRig | None:
 def line_directions(
     laser: Laser, pattern: LinePattern, line: FloatArray, fan: FloatArray
 ) -> FloatArray:
-    """Unit directions of rays of lines, shape (…, 3); see `LinePattern.tangents`."""
+    """Unit directions of the rays of lines, shape (…, 3); see `LinePattern.tangents`."""
     axis, across, along = laser.axes
     tangents = pattern.tangents(line, fan)
     direction = axis + tangents[..., :1] * across + tangents[..., 1:] * along

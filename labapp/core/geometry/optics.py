@@ -13,7 +13,7 @@ from labapp.core.values import BoolArray, FloatArray, ReadOnlyArrays
 
 @lru_cache(maxsize=64)
 def ray_directions(laser: Laser, pattern: DotPattern) -> FloatArray:
-    """Unit direction of every projected ray (Eq. 4-1, Fig. 4-14).
+    """Unit directions of all projected rays (Eq. 4-1, Fig. 4-14).
 
     Returns
     -------
@@ -132,11 +132,11 @@ class ProjectedRays(ReadOnlyArrays):
     directions
         Unit directions, shape (rows, columns, 3).
     landing_mm
-        Landing points, shape (rows, columns, 3), mm.
+        Intersections with the work piece, shape (rows, columns, 3), mm.
     spacing_mm
         Distance between neighbouring landing points along X and along Y, shape (2,), mm.
     absent
-        Rays that the lens does not make, shape (rows, columns).
+        Whether a ray is absent from the pattern, shape (rows, columns).
     """
 
     directions: FloatArray
@@ -147,7 +147,7 @@ class ProjectedRays(ReadOnlyArrays):
 
 @lru_cache(maxsize=64)
 def project_rays(laser: Laser, pattern: DotPattern) -> ProjectedRays:
-    """Rays of a pattern from a laser, and their landing points."""
+    """Compute the rays of a pattern from a laser, and their landing points."""
     directions = ray_directions(laser, pattern)
     landing = intersect_level(laser.position_mm, directions)
     absent = np.zeros(directions.shape[:2], bool)
@@ -157,7 +157,7 @@ def project_rays(laser: Laser, pattern: DotPattern) -> ProjectedRays:
 
 
 def landing_spacing(landing_mm: FloatArray) -> FloatArray:
-    """Distance between neighbours of a grid of landing points along X and along Y, (2,), mm."""
+    """Median distance of neighbouring landing points along X and along Y, shape (2,), mm."""
     across = np.median(np.diff(landing_mm[..., 0], axis=1))
     along = np.median(np.diff(landing_mm[..., 1], axis=0))
     return np.asarray(np.abs([across, along]), float)

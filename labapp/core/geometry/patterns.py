@@ -74,7 +74,7 @@ def hexagon(rows: int, columns: int) -> BoolArray:
 
 
 def _from_center(rows: int, columns: int) -> tuple[FloatArray, FloatArray]:
-    """Numbers of rows, shape (rows, 1), and columns, shape (1, columns), from the centre ray."""
+    """Row numbers, shape (rows, 1), and column numbers, shape (1, columns), from the centre."""
     row, column = np.arange(float(rows)), np.arange(float(columns))
     return (row - (rows - 1) / 2)[:, None], (column - (columns - 1) / 2)[None]
 

@@ -1,4 +1,4 @@
-"""A bench whose quantities (`uncertainty.QUANTITIES`) differ from their nominal values.
+"""Perturbed benches: quantities (`uncertainty.QUANTITIES`) that differ from their nominal values.
 
 An offset is a vector over the quantities, in their units: the true value is the nominal one plus
 the offset. The correspondence of rays and dots does not change.
@@ -133,8 +133,8 @@ def moved_calibration(
     moved = base.ideal_px(base.to_image(plane_mm) + offset[POINTS].reshape(3, 2))
     back = np.linalg.solve(_with_ones(moved), true).T
     stretch = np.diag([*(1.0 + offset[_AXES] / [axes.x_mm, axes.z_mm]), 1.0])
-    made = ImageCalibration(stretch @ base.matrix @ back, base.lens)
-    return made.with_distortion(percent, _half_mm(plane))
+    changed = ImageCalibration(stretch @ base.matrix @ back, base.lens)
+    return changed.with_distortion(percent, _half_mm(plane))
 
 
 def moved_bench(rig: Rig, offset: FloatArray) -> tuple[Rig, ImageCalibration]:

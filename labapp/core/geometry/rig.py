@@ -115,7 +115,7 @@ class DotPattern:
 
     @property
     def tangents(self) -> FloatArray:
-        """Tangents of the rays to the beam axis, see `Tangents`, shape (rows, columns, 2)."""
+        """Tangents of the rays' angles to the beam axis (`Tangents`), shape (rows, columns, 2)."""
         step = np.radians(self.inter_beam_angle_deg)
         if self.kind == MEASURED:
             steps = measured_steps(self.measured, self.rows, self.columns)
@@ -243,7 +243,7 @@ class ImagingPlane(ReadOnlyArrays):
 
     @cached_property
     def normal(self) -> FloatArray:
-        """Unit normal, shape (3,); for the vertical plane it points at the camera, −Y."""
+        """Unit normal, shape (3,); for the vertical plane it points to the camera, −Y."""
         (a, b, c), (d, e, f) = self.x_axis.tolist(), self.z_axis.tolist()
         return np.array([b * f - c * e, c * d - a * f, a * e - b * d])  # faster than np.cross
 
@@ -251,18 +251,18 @@ class ImagingPlane(ReadOnlyArrays):
     def pose_mm(self) -> FloatArray:
         """O′, the directions of O′X′ and O′Z′, the normal, and the glass, for compiled functions.
 
-        Shape (5, 3); the last row is thickness and index of the glass, and 0.
+        Shape (5, 3); the last row is the thickness of the glass, its refractive index, and 0.
         """
         glass = np.array([self.glass_mm, self.glass_index, 0.0])
         return np.array([self.origin_mm, self.x_axis, self.z_axis, self.normal, glass])
 
     def to_universal(self, plane_mm: FloatArray) -> FloatArray:
-        """IPCS (X′, Z′), shape (…, 2), to UCS points, shape (…, 3), mm (Eq. 4-5)."""
+        """Transform IPCS (X′, Z′), shape (…, 2), to UCS points, shape (…, 3), mm (Eq. 4-5)."""
         plane_mm = np.asarray(plane_mm, float)
         return self.origin_mm + plane_mm[..., :1] * self.x_axis + plane_mm[..., 1:] * self.z_axis
 
     def from_universal(self, point_mm: FloatArray) -> FloatArray:
-        """UCS points on the plane, shape (…, 3), to IPCS (X′, Z′), shape (…, 2), mm."""
+        """Transform UCS points on the plane, shape (…, 3), to IPCS (X′, Z′), shape (…, 2), mm."""
         offset = np.asarray(point_mm, float) - self.origin_mm
         return np.stack([offset @ self.x_axis, offset @ self.z_axis], axis=-1)
 
@@ -294,5 +294,5 @@ class Rig:
 
     @property
     def head_sign(self) -> int:
-        """+1 where the pool's head lies towards +Y, −1 where it lies towards −Y."""
+        """+1 if the pool's head points to +Y, −1 if it points to −Y."""
         return 1 if self.travel == "+y" else -1

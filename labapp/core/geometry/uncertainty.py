@@ -200,7 +200,7 @@ def covariance_of(
     *,
     has_glass: bool = False,
 ) -> tuple[FloatArray, frozenset[str]]:
-    """Covariance of `QUANTITIES`, shape (q, q), and the keys of those that are assumed.
+    """Return the covariance of `QUANTITIES`, (q, q), and the keys with an assumed uncertainty.
 
     Parameters
     ----------

@@ -1,1 +1,1 @@
-"""From a frame to the places of its dots."""
+"""Detection of the dots in a frame."""

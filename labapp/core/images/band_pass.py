@@ -1,8 +1,8 @@
-"""The default detector: a band-pass at the dots' own size, which the frame itself tells.
+"""The default detector: a band-pass filter at the dots' size, which is estimated from the frame.
 
-One search serves the first frame and the frames that follow, with the `DetectorTuning` of the
-first: dot size and noise. Wide Gaussians are taken of a smaller picture, and what concerns few
-pixels is worked out for these alone.
+The first frame and the following frames are searched in the same way, with the dot size and noise
+of the first (`DetectorTuning`). Wide Gaussian blurs are computed on a downsampled picture, and
+quantities that are needed at few pixels are computed only there.
 """
 
 from __future__ import annotations
@@ -18,83 +18,83 @@ from labapp.core.images.dot_fit import fit_dots
 from labapp.core.images.dot_size import (
     SLENDER,
     as_picture,
+    band_noise,
     blur,
+    estimate_size,
     kernel,
     local_noise,
-    mended,
     noise_gain,
     pairs,
     peak_disc,
     scratch,
-    size_of,
-    with_grain,
+    without_spikes,
 )
 from labapp.core.images.dots import BandPassSettings, Dots, Grey, Image, Picture
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, ReadOnlyArrays
 
 Peaks = tuple[IntArray, IntArray, FloatArray]
-"""Columns and rows of pixels, and the height of the band there."""
+"""Columns and rows of pixels, and the value of the band-passed picture there."""
 
 HOT_RATIO = 1.6
-"""What a cluster of hot pixels answers to a band of a third of the dots' size, over its answer to
-theirs."""
+"""Lowest ratio of a hot-pixel cluster's response to a band at a third of the dot size and its
+response to the band at the dot size."""
 
 REMAINS_SHARE = 0.5
-"""A dot with mended pixels is at least this fraction of the typical dot; remains of hot pixels are
-fainter."""
+"""A peak near repaired pixels is a dot if it has at least this fraction of the typical dot's
+brightness; residues of hot pixels are fainter."""
 
 FAINT_SIGMA = 3.0
-"""A peak that the operator points at stands this many noise σ above the background: half of what
-any other must (`BandPassSettings.threshold`)."""
+"""Threshold, in noise σ above the background, for a peak that the operator points at: half of that
+for other peaks (`BandPassSettings.threshold`)."""
 
 ROUND_PX2 = 0.25
-"""Variance, px² of the smaller picture, that making a picture smaller and large again adds."""
+"""Variance that downsampling and upsampling add, px² of the downsampled picture."""
 
 LEAST_PX2 = 0.8
-"""A blur of less, px² of the smaller picture, is not taken of it."""
+"""Least variance of a blur that is computed on a downsampled picture, px² of that picture."""
 
 CENTROID_WIDENING = 1.4
-"""Centroids are taken over windows wider by this than a dot is found by: over more of its grains of
-speckle, which then move it less."""
+"""Width of the window for centroids over that for detection. A wider window averages over more
+speckle grains, which then move the centroid less."""
 
 MOST_SURROUNDINGS = 0.3
-"""Where the dots' surroundings are a larger share of the picture, all of it is blurred at once."""
+"""If the dots' windows cover a larger share of the picture, all of it is blurred at once."""
 
 HALVED_PX, NEARLY = 1.5, 0.75
-"""Dots of this size are sought at half the size: a peak over the floor has a pixel there that is
-over so much of it."""
+"""Dots of at least this size are searched for at half resolution, where a peak above the threshold
+has a pixel above this fraction of it."""
 
 PEAK_GAIN = 1 / 1.64 - 1 / 3.56
-"""What a Gaussian dot of the band's own size keeps of its height: 1/(1 + 0.8²) − 1/(1 + 1.6²)."""
+"""Peak height of a Gaussian dot of the band's size after the band-pass, over its height before:
+1/(1 + 0.8²) − 1/(1 + 1.6²)."""
 
 WIDTH_KEPT = 0.8
-"""What is left of a Gaussian dot's width when its surroundings are taken off."""
+"""Width of a Gaussian dot after its background is subtracted, over its width before."""
 
 AROUND_SIZES = 4.2
-"""The surroundings of dots that are fitted together are blurred by so many of their sizes."""
+"""Standard deviation of the blur that gives the background in the joint fit, in dot sizes."""
 
 AROUND_PX2 = 3.0
-"""Variance of that blur, px² of the smaller picture it is taken of, at least: it is followed by its
-values at pixels."""
+"""Least variance of that blur, px² of the downsampled picture, so that its samples resolve it."""
 
 LEAST_SIGMA_PX = 0.02
-"""Added to the uncertainty of places of dots that are fitted together, in squares, px."""
+"""Added in quadrature to the position uncertainty of jointly fitted dots, px."""
 
 
 @dataclass(frozen=True)
 class DetectorTuning(ReadOnlyArrays):
-    """What the detector is set to by a frame: dot size and noise, good for the frames after it.
+    """Dot size and noise estimated from a frame, for use with the following frames.
 
-    It holds as long as light and camera stay as they are.
+    Valid as long as illumination and camera settings do not change.
 
     Parameters
     ----------
     size_px
         Standard deviation of a dot's light, px.
     noise
-        Of the camera round each pixel, grey levels, shape (height, width).
+        Local standard deviation of the camera's noise, grey levels, shape (height, width).
     floor
-        What a peak of the band-passed frame must exceed, shape (height, width).
+        Threshold for peaks of the band-passed frame, shape (height, width).
     """
 
     size_px: float
@@ -103,17 +103,17 @@ class DetectorTuning(ReadOnlyArrays):
 
     @classmethod
     def of(cls, frame: Image, settings: BandPassSettings) -> DetectorTuning:
-        """The tuning for a frame, shape (height, width), any real type, and those like it."""
+        """Estimate the tuning from a frame, shape (height, width), of any real type."""
         return _tuned(as_picture(frame), settings)[0]
 
     @cached_property
     def coarse(self) -> Grey:
-        """What a pixel of the band at half the size is over if a peak may be there."""
+        """Threshold for pixels of the half-resolution band that may contain a peak."""
         return np.asarray(np.float32(NEARLY) * self.floor[::2, ::2])
 
 
 def band_pass_dots(frame: Image, settings: BandPassSettings) -> Dots:
-    """Find dots as peaks of a difference of Gaussians at the dots' own size.
+    """Find dots as peaks of a difference of Gaussians at the dots' size.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def band_pass_dots(frame: Image, settings: BandPassSettings) -> Dots:
 
 
 def tuned_dots(frame: Image, settings: BandPassSettings) -> tuple[Dots, DetectorTuning]:
-    """Find the dots of a frame (`band_pass_dots`), and the tuning for those after it."""
+    """Find the dots of a frame (`band_pass_dots`) and the tuning for the following frames."""
     picture = as_picture(np.asarray(frame))
     if picture.ndim != 2 or min(picture.shape) < 8 or not float(np.ptp(picture)) > 0:
         raise CannotMeasure("no-dots", "the frame is blank or too small to hold a dot")
@@ -140,35 +140,35 @@ def tuned_dots(frame: Image, settings: BandPassSettings) -> tuple[Dots, Detector
 
 
 def quick_dots(frame: Image, tuning: DetectorTuning, settings: BandPassSettings) -> Dots:
-    """Find the dots of a frame with the tuning of a frame before: `band_pass_dots` in less time.
+    """Find the dots of a frame with the tuning of a previous frame; faster than `band_pass_dots`.
 
     Parameters
     ----------
     frame
         Grey image of the tuning's shape, any real type.
     tuning
-        Of a frame before.
+        The tuning of a previous frame.
     settings
-        See `BandPassSettings`; the size is the tuning's.
+        See `BandPassSettings`; its size is ignored in favour of the tuning's.
 
     Raises
     ------
     CannotMeasure
         ``no-dots`` if nothing stands out of the noise.
     ValueError
-        If the frame has another size than that of the tuning.
+        If the frame and the tuning differ in shape.
     """
     if frame.shape != tuning.noise.shape:
         raise ValueError(f"a frame of {frame.shape}, a tuning of {tuning.noise.shape}")
-    picture = mended(as_picture(frame), tuning.noise, tuning.size_px)
+    picture = without_spikes(as_picture(frame), tuning.noise, tuning.size_px)
     return _found(tuning, _BandPassed(picture, tuning.size_px), settings)
 
 
 def crowded_dots(frame: Image, settings: BandPassSettings) -> Dots:
-    """Find dots that overlap, such as those of a plate, and fit them together.
+    """Find overlapping dots, such as those of a flat mirror, by a joint fit.
 
-    Neighbours' light moves centroids of such dots by half a pixel. The joint fit takes several
-    times as long, so it is not for the frames of a recording.
+    Light of neighbouring dots shifts centroids of such dots by half a pixel. The joint fit takes
+    several times as long and is therefore not used for the frames of a recording.
 
     Raises
     ------
@@ -176,30 +176,30 @@ def crowded_dots(frame: Image, settings: BandPassSettings) -> Dots:
         ``no-dots`` if nothing stands out of the noise.
     """
     tuning, seen = _tuned(as_picture(frame), settings)
-    return _downwards(_fitted(seen, _kept(tuning, seen, settings), tuning.noise))
+    return _top_to_bottom(_fitted(seen, _kept(tuning, seen, settings), tuning.noise))
 
 
 def dot_at(
     frame: Image, u_px: float, v_px: float, others: Dots, settings: BandPassSettings
 ) -> Dots:
-    """Describe the one dot that is pointed at: the nearest peak there, or else the place itself.
+    """Find the dot at a position: the nearest peak, or the position itself if there is none.
 
     Parameters
     ----------
     frame
         Grey image, shape (height, width), any real type.
     u_px, v_px
-        Place in the frame, px.
+        Position in the frame, px.
     others
-        The dots there are; their peaks are not taken again and their light is kept out.
+        The dots found so far; their peaks are excluded and their light is masked.
     settings
         See `BandPassSettings`.
 
     Returns
     -------
     Dots
-        One dot, with centroid and uncertainty as `band_pass_dots` gives them. Where no peak of
-        its own is within two dots' sizes it is at (u_px, v_px), uncertain by a dot's size.
+        One dot, with centroid and uncertainty as from `band_pass_dots`. Without another peak
+        within two dot sizes, it is at (u_px, v_px) with the dot size as its uncertainty.
     """
     size = settings.size_px or (float(np.median(others.size_px)) if len(others) else None)
     like = BandPassSettings(size, FAINT_SIGMA, 0.0, settings.speckle_px)
@@ -229,20 +229,20 @@ def dot_at(
 
 
 def typical(brightness: FloatArray) -> float:
-    """Half of all the light is in dots brighter than this: many faint specks do not move it."""
+    """Return the light-weighted median brightness, which is insensitive to many faint specks."""
     order = np.sort(brightness)
     light = np.cumsum(order)
     return float(order[np.searchsorted(light, 0.5 * light[-1])])
 
 
 def _tuned(picture: Picture, settings: BandPassSettings) -> tuple[DetectorTuning, _BandPassed]:
-    """A picture's tuning, and the picture in the band, which it follows from."""
+    """Return a picture's tuning and its band-passed picture."""
     noise = local_noise(picture)
-    size = settings.size_px or size_of(picture, noise)
-    seen = _BandPassed(mended(picture, noise, size), size)
+    size = settings.size_px or estimate_size(picture, noise)
+    seen = _BandPassed(without_spikes(picture, noise, size), size)
     white = float(np.median(noise[::8, ::8])) / noise_gain(size)
     every = 4 // seen.step
-    grain = with_grain(seen.band[::every, ::every], white) / max(white, 1e-9)
+    grain = band_noise(seen.band[::every, ::every], white) / max(white, 1e-9)
     least = 1e-3 * max(map(abs, cv2.minMaxLoc(seen.band)[:2])) + 1e-6
     floor = noise * np.float32(settings.threshold * grain / noise_gain(size))
     np.maximum(floor, np.float32(settings.threshold * least), out=floor)
@@ -250,10 +250,9 @@ def _tuned(picture: Picture, settings: BandPassSettings) -> tuple[DetectorTuning
 
 
 class _BandPassed:
-    """A picture and its band at the dots' size, on this thread's scratch pictures.
+    """A picture and its band-pass at the dot size, in this thread's scratch memory.
 
-    The band is that of the picture at half its size where the dots are large enough; ``step`` is
-    how many times smaller it is.
+    The band is at half resolution if the dots are large enough; ``step`` is the factor.
     """
 
     def __init__(self, picture: Picture, size: float) -> None:
@@ -273,10 +272,10 @@ class _BandPassed:
         cv2.subtract(self._narrow, self._wide, dst=self.band)
 
     def peaks(self, tuning: DetectorTuning) -> Peaks:
-        """Peaks over the floor that may be dots'.
+        """Return the peaks above the threshold that may be dots.
 
-        Where some may not, for they are as sharp as hot pixels or as long as lines of them, these
-        pixels are mended, as there may be a dot under them: one as bright as others are.
+        Peaks as sharp as hot pixels or as elongated as lines of them are suspect. Their pixels
+        are repaired, since a dot of usual brightness may lie beneath them.
         """
         from labapp.core.images import dot_kernels
 
@@ -285,19 +284,19 @@ class _BandPassed:
         if good.all():
             return u, v, bright
         suspects = u[~good], v[~good]
-        whole = mended(self.picture, tuning.noise, self.size, suspects)
-        if whole is not self.picture:
-            usual = typical(bright[good]) if good.any() else 0.0
-            self.picture = whole
+        repaired = without_spikes(self.picture, tuning.noise, self.size, suspects)
+        if repaired is not self.picture:
+            typical_brightness = typical(bright[good]) if good.any() else 0.0
+            self.picture = repaired
             self._pass()
             u, v, bright = self._over(tuning)
             near = dot_kernels.two_nearest(pairs(u, v), pairs(*suspects))[0][:, 0]
             good = self._dot_like(u, v, bright)
-            good &= (near > 2.0 * self.size) | (bright >= REMAINS_SHARE * usual)
+            good &= (near > 2.0 * self.size) | (bright >= REMAINS_SHARE * typical_brightness)
         return u[good], v[good], bright[good]
 
     def _over(self, tuning: DetectorTuning) -> Peaks:
-        """Peaks over the floor."""
+        """Return the peaks above the threshold."""
         from labapp.core.images import dot_kernels
 
         band, floor, disc = self.band, tuning.floor, peak_disc(self.size)
@@ -308,7 +307,7 @@ class _BandPassed:
         return u, v, band[v, u].astype(float)
 
     def _dot_like(self, u: IntArray, v: IntArray, bright: FloatArray) -> BoolArray:
-        """Whether peaks are round, and answer no more to a much finer band than to the dots'."""
+        """Whether peaks are round and do not respond more strongly to a much finer band."""
         from labapp.core.images import centroid_kernels, dot_kernels
 
         scale = max(0.4, self.size / 3.0)
@@ -320,9 +319,9 @@ class _BandPassed:
     def light(
         self, u: IntArray, v: IntArray, width: FloatArray, reach: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Centroids, (u, v), and moments of the light over its surroundings.
+        """Return centroids (u, v) and second moments of the background-subtracted light.
 
-        Windows move for a few steps only: beside a brighter dot they would move on to that.
+        Windows are moved a few times only; otherwise they would drift to a brighter neighbour.
         """
         from labapp.core.images import centroid_kernels
 
@@ -338,7 +337,7 @@ class _BandPassed:
         return np.stack([u + x, v + y]), moment
 
     def around(self) -> tuple[Grey, float]:
-        """The picture, made smaller and blurred, and the blur's standard deviation, px."""
+        """Return the downsampled, blurred picture and the blur's standard deviation, px."""
         image, (height, width), scale = self._narrow, self._narrow.shape, 1
         variance = (AROUND_SIZES**2 - 0.8**2) * (self.size / self.step) ** 2
         while (
@@ -353,19 +352,19 @@ class _BandPassed:
                 cv2.resize(image, shape[::-1], into, 0, 0, cv2.INTER_AREA), np.float32
             )
         left = variance / scale**2 - (1 - scale**-2) / 12
-        made = blur(image, float(np.sqrt(left)), scratch(f"around {scale} blurred", shape))
-        return made, AROUND_SIZES * self.size
+        blurred = blur(image, float(np.sqrt(left)), scratch(f"around {scale} blurred", shape))
+        return blurred, AROUND_SIZES * self.size
 
 
 def widen(image: Grey, into: Grey, variance_px2: float) -> None:
-    """Blur by a Gaussian of some variance, px², by way of a smaller picture."""
+    """Blur by a Gaussian of the given variance, px², computed on a downsampled picture."""
     cv2.resize(smaller_blurred(image, variance_px2), image.shape[::-1], dst=into)
 
 
 def smaller_blurred(image: Grey, variance_px2: float) -> Grey:
-    """A smaller picture of an image that is blurred by a Gaussian of some variance, px².
+    """Downsample an image and blur it by a Gaussian of the given variance, px² of the image.
 
-    Where the blur is narrow, or the picture's sides cannot be divided, it is no smaller.
+    It is not downsampled if the blur is narrow or the picture's sides are not divisible.
     """
     (height, width), scale = image.shape, 1
     while (
@@ -384,52 +383,52 @@ def smaller_blurred(image: Grey, variance_px2: float) -> Grey:
 def _found(tuning: DetectorTuning, seen: _BandPassed, settings: BandPassSettings) -> Dots:
     u, v, bright = _kept(tuning, seen, settings)
     dots = _described(seen, (u, v, bright), tuning.noise, settings.speckle_px)
-    return _downwards(dots)
+    return _top_to_bottom(dots)
 
 
 def _kept(tuning: DetectorTuning, seen: _BandPassed, settings: BandPassSettings) -> Peaks:
-    """Peaks that are bright enough, each once."""
+    """Return the peaks that are bright enough, without duplicates."""
     from labapp.core.images import dot_kernels
 
     u, v, bright = seen.peaks(tuning)
     if len(u) == 0:
         raise CannotMeasure("no-dots", "no dot stands out of the frame's noise")
     keep = np.flatnonzero(bright >= settings.contrast * typical(bright))
-    # The top of a dot may be flat.
+    # A dot with a flat top has several peaks.
     keep = keep[dot_kernels.first_of_each(u[keep], v[keep], max(1.5, seen.size))]
     return u[keep], v[keep], bright[keep]
 
 
-def _downwards(dots: Dots) -> Dots:
+def _top_to_bottom(dots: Dots) -> Dots:
     order = np.argsort(dots.v_px)
     return Dots(*(values[order] for values in vars(dots).values()))
 
 
 @lru_cache(maxsize=8)
 def _nine(sigma: float, widest: float) -> Grey:
-    """Gaussian weights of a pixel and its two neighbours on a line, as long as the widest's."""
-    own, side = kernel(sigma), len(kernel(widest))
-    line = np.pad(own, (side - len(own)) // 2)
+    """Gaussian weights centred on a pixel and its two neighbours, padded to the widest kernel."""
+    weights, side = kernel(sigma), len(kernel(widest))
+    line = np.pad(weights, (side - len(weights)) // 2)
     nine = np.stack([np.pad(line, (k, 2 - k)) for k in range(3)])
     nine.flags.writeable = False
     return np.asarray(nine)
 
 
 def window_widths(next_px: FloatArray, reach: float) -> FloatArray:
-    """Widths of the Gaussian windows of dots so far from the next one, shape (n,), px.
+    """Return window widths from the distances to the nearest dots, shape (n,), px.
 
-    A window that ends half-way to the next dot keeps its light out.
+    A window that ends half-way to the nearest dot excludes its light.
     """
     return np.minimum(1.1 * reach, np.maximum(0.275 * next_px, 0.75))
 
 
 def margin_of(reach: float) -> int:
-    """So far from a peak, px, light is weighed."""
+    """Half side of the square about a peak in which light is integrated, px."""
     return int(np.ceil(2.2 * reach)) + 1
 
 
 def _described(seen: _BandPassed, peaks: Peaks, noise: Grey, speckle_px: float) -> Dots:
-    """Centroid, its uncertainty, size, peak and signal-to-noise of each peak."""
+    """Compute position, uncertainty, size, height and signal-to-noise ratio of each peak."""
     from labapp.core.images import dot_kernels
 
     (u, v, bright), size = peaks, seen.size
@@ -452,12 +451,12 @@ def _described(seen: _BandPassed, peaks: Peaks, noise: Grey, speckle_px: float) 
 
 
 def _fitted(seen: _BandPassed, peaks: Peaks, noise: Grey) -> Dots:
-    """The same of dots that overlap, from a joint fit (`fit_dots`)."""
+    """Compute the same for overlapping dots by a joint fit (`fit_dots`)."""
     (u, v, bright), size = peaks, seen.size
     peak = bright / PEAK_GAIN
-    own = np.maximum(noise[v, u], 1e-3 * np.max(peak)).astype(np.float64)
+    dot_noise = np.maximum(noise[v, u], 1e-3 * np.max(peak)).astype(np.float64)
     start = np.stack([u, v, peak, np.full(len(u), size)], axis=1).astype(np.float64)
-    fitted = fit_dots(seen.picture, seen.around(), start, own)
+    fitted = fit_dots(seen.picture, seen.around(), start, dot_noise)
     return Dots(
         u_px=fitted.u_px,
         v_px=fitted.v_px,
@@ -465,5 +464,5 @@ def _fitted(seen: _BandPassed, peaks: Peaks, noise: Grey) -> Dots:
         v_sigma_px=np.hypot(fitted.v_sigma_px, LEAST_SIGMA_PX),
         size_px=np.clip(fitted.size_px, 0.3 * size, 3.0 * size),
         peak=peak,
-        snr=peak / own,
+        snr=peak / dot_noise,
     )

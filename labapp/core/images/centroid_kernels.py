@@ -1,6 +1,6 @@
 """Inner loops over the light of each dot, compiled for the processor (docs/adr/0018).
 
-Arrays may be read-only, and of any layout but for pictures.
+Arrays may be read-only; pictures must be contiguous, other arrays need not be.
 """
 
 from __future__ import annotations
@@ -20,35 +20,38 @@ _byte = types.Array(types.uint8, 2, "C", readonly=True)
 _ints = types.Array(_i, 1, "A", readonly=True)
 
 SETTLED_PX = 1e-4
-"""A centroid that moved by less stays."""
+"""The iteration ends when a centroid moves by less."""
 
 
 @_inner
 def _mirrored(at: int, count: int) -> int:
-    """A pixel's number where a picture goes on beyond its edge as in a mirror."""
+    """Index of a pixel with reflection at the edges of the picture."""
     at %= 2 * count
     return 2 * count - 1 - at if at >= count else at
 
 
 @_inner
 def _fold(line: Grey, taps: Grey, step: int, count: int, out: Grey) -> None:
-    """Filter a line by even taps that are so many numbers apart, into as many as are counted."""
+    """Convolve a line with a symmetric filter whose taps are ``step`` elements apart.
+
+    The first ``count`` results are written to ``out``.
+    """
     rim = len(taps) // 2
-    middle, made = line[rim * step :], out[:count]
+    middle, result = line[rim * step :], out[:count]
     for x in range(count):
-        made[x] = taps[rim] * middle[x]
+        result[x] = taps[rim] * middle[x]
     for k in range(rim):
         weight, one, other = taps[k], line[k * step :], line[(2 * rim - k) * step :]
         for x in range(count):
-            made[x] += weight * (one[x] + other[x])
+            result[x] += weight * (one[x] + other[x])
 
 
 @_inner
 def _blurred(image: Picture, taps: Grey, u: int, v: int, lines: Grey, patch: Grey) -> None:
-    """Blur a square round a pixel, shape (side, any), by an even filter along rows and columns.
+    """Blur a square about a pixel, shape (side, any), by a symmetric separable filter.
 
-    The two lines, as long as the square and what the filter reaches beyond it, are memory to write
-    on: rows follow each other there, and where one ends the filter reaches into the next.
+    ``lines`` is scratch memory for two copies of the square with the filter's margin. Rows are
+    stored one after the other; where the filter runs into the next row, the result is not used.
     """
     side, rim = len(patch), len(taps) // 2
     wide, reach = side + 2 * rim, side // 2 + rim
@@ -72,27 +75,27 @@ def _blurred(image: Picture, taps: Grey, u: int, v: int, lines: Grey, patch: Gre
 
 
 @_inner
-def _beneath(at: int, by: float, count: int) -> tuple[int, float]:
-    """Number of the pixel of a picture ``by`` times smaller before one, and how far on it is."""
+def _interpolation(at: int, by: float, count: int) -> tuple[int, float]:
+    """Index and fraction for interpolation in a picture that is ``by`` times smaller."""
     place = min(max((at + 0.5) / by - 0.5, 0.0), count - 1.0)
     before = min(int(place), max(count - 2, 0))
     return before, place - before
 
 
 @_inner
-def _take_off(
+def _subtract_background(
     patch: Grey, around: Grey, by: float, u: int, v: int, shape: tuple[int, int], across: Grey
 ) -> None:
-    """Take what is around, a smaller picture, off a patch whose first pixel is (u, v).
+    """Subtract the background, a downsampled picture, from a patch whose first pixel is (u, v).
 
-    Nothing is left outside the picture, and of what is darker.
+    Negative differences and pixels outside the picture are set to 0.
     """
     (side, even), zero = patch.shape, np.float32(0.0)
-    top, _ = _beneath(v, by, around.shape[0])
-    last, _ = _beneath(v + side - 1, by, around.shape[0])
+    top, _ = _interpolation(v, by, around.shape[0])
+    last, _ = _interpolation(v + side - 1, by, around.shape[0])
     last = min(last + 1, around.shape[0] - 1)
     for x in range(even):
-        column, on = _beneath(u + x, by, around.shape[1])
+        column, on = _interpolation(u + x, by, around.shape[1])
         after = min(column + 1, around.shape[1] - 1)
         for row in range(top, last + 1):
             low, high = around[row, column], around[row, after]
@@ -102,7 +105,7 @@ def _take_off(
         if not 0 <= v + y < shape[0]:
             patch[y] = zero
             continue
-        row, part = _beneath(v + y, by, around.shape[0])
+        row, part = _interpolation(v + y, by, around.shape[0])
         low, high = across[row - top], across[min(row + 1, last) - top]
         share = np.float32(part)
         for x in range(even):
@@ -114,14 +117,14 @@ def _take_off(
 
 @_inner
 def gaussian_samples(first: int, center: float, width: float, values: Grey) -> None:
-    """Sample a Gaussian at whole numbers from the first on, each value as the last times a ratio.
+    """Sample a Gaussian at consecutive integers, by a recursive ratio of neighbouring values.
 
     Parameters
     ----------
     first, center, width
-        The first number; mean and standard deviation of the Gaussian, whose largest value is 1.
+        First integer; mean and standard deviation of the Gaussian, whose peak value is 1.
     values
-        Where the values are put, shape (n,).
+        Output array, shape (n,).
     """
     away = first - center
     value = np.exp(-0.5 * (away / width) ** 2)
@@ -134,10 +137,10 @@ def gaussian_samples(first: int, center: float, width: float, values: Grey) -> N
 
 @_inner
 def _centroid(patch: Grey, place: FloatArray, width: float, reach: float, lines: Grey) -> float:
-    """Move a place, shape (2,), from a patch's middle to the centroid; returns the second moment.
+    """Set a place, shape (2,), relative to the patch's middle, to the centroid; return the moment.
 
-    What is weighed is in a Gaussian window that moves along. The four lines, as long as a row, are
-    memory to write on.
+    The light is weighted by a Gaussian window that follows the centroid; the moment is the second
+    central one. ``lines`` is scratch memory for four rows.
     """
     (side, even), moment = patch.shape, 0.0
     along_u, along_v, pull_u, pull_v = lines[0], lines[1], lines[2], lines[3]
@@ -162,7 +165,7 @@ def _centroid(patch: Grey, place: FloatArray, width: float, reach: float, lines:
             square += (along_u[at] + along_v[at]) * away * away
         mean_u, mean_v = mean_u / total, mean_v / total
         moment = square / total - mean_u * mean_u - mean_v * mean_v
-        # The window holds the mean back; half as much again brings it home in a few steps.
+        # The window biases the mean towards its centre: over-relaxation speeds up convergence.
         change_u, change_v = 1.5 * (mean_u - place[0]), 1.5 * (mean_v - place[1])
         place[0] = min(max(place[0] + change_u, -reach), reach)
         place[1] = min(max(place[1] + change_v, -reach), reach)
@@ -182,13 +185,13 @@ def centroids(
     width: FloatArray,
     reach: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Centroids and second moments of light round pixels: see `band_pass._described`.
+    """Compute centroids and second moments of the light about pixels (`band_pass._described`).
 
-    Light is the image, blurred by an even filter, over what is around it, a picture that may be
-    smaller. Centroids are given as offsets from the pixels, shape (2, n).
+    The light is the image, blurred by a symmetric filter, minus the background ``around``, which
+    may be downsampled. Centroids are offsets from the pixels, shape (2, n).
     """
     count, side, rim = len(u), 2 * margin + 1, len(taps) // 2
-    even = (side + 7) // 8 * 8  # numbers are added eight at a time
+    even = (side + 7) // 8 * 8  # padded for vector instructions
     by, single = image.shape[1] / around.shape[1], np.float32
     offset, moment, patch = np.zeros((2, count)), np.empty(count), np.zeros((side, even), single)
     squares, across = (
@@ -198,15 +201,15 @@ def centroids(
     lines = np.empty((4, even), single)
     for k in range(count):
         _blurred(image, taps, u[k], v[k], squares, patch)
-        _take_off(patch, around, by, u[k] - margin, v[k] - margin, image.shape, across)
+        _subtract_background(patch, around, by, u[k] - margin, v[k] - margin, image.shape, across)
         moment[k] = _centroid(patch, offset[:, k], width[k], reach, lines)
     return offset, moment
 
 
 @_compiled_for(*((own, _ints, _ints, _grey, _grey) for own in (_grey, _byte)))
 def finest(image: Picture, u: IntArray, v: IntArray, narrow: Grey, wide: Grey) -> FloatArray:
-    """Largest difference of two filters among nine pixels round each (`band_pass._nine`)."""
-    side, made = narrow.shape[1], np.empty(len(u))
+    """Largest difference of two filters in the 3 × 3 pixels about each (`band_pass._nine`)."""
+    side, result = narrow.shape[1], np.empty(len(u))
     column, across = np.empty(side, np.float32), np.empty((6, side), np.float32)
     filters = np.concatenate((narrow, wide))
     for k in range(len(u)):
@@ -226,5 +229,5 @@ def finest(image: Picture, u: IntArray, v: IntArray, narrow: Grey, wide: Grey) -
                 for y in range(side):
                     value += narrow[i, y] * across[j, y] - wide[i, y] * across[3 + j, y]
                 most = max(most, value)
-        made[k] = most
-    return made
+        result[k] = most
+    return result

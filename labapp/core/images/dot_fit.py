@@ -1,9 +1,9 @@
-"""Joint fit of all dots to a picture: places that neighbours' light does not move, and their σ.
+"""Joint fit of all dots to a picture: positions unbiased by neighbouring dots, and their σ.
 
-Every dot is a round Gaussian; what neighbours and surroundings add to its window is taken off by
-the others' fit. Speckle, which is in proportion to the light, scatters the places more than the
-camera's noise does. How strong it is, the residual light tells: in modes that a shift of the dot
-has no share in.
+Every dot is modelled as a round Gaussian; the light of neighbours and background in its window is
+subtracted by their models. Speckle, which is proportional to the light, scatters the positions more
+than the camera's noise does. Its strength is estimated from the residual light, in modes that are
+orthogonal to a shift of the dot.
 """
 
 from __future__ import annotations
@@ -16,52 +16,53 @@ from labapp.core.images.dots import Grey, Picture
 from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
 
 WINDOW, CLOSE_WINDOW = 1.54, 1.3
-"""Widths of a dot's window, over the frame's dot size: of one that stands alone, and among others.
-The wider, the less speckle moves the place, and the more noise and neighbours do."""
+"""Largest and smallest width of a dot's window, in dot sizes: of an isolated dot and of a dot with
+close neighbours. A wider window reduces the effect of speckle, but increases that of noise and
+neighbours."""
 
 WINDOW_SHARE = 0.275
-"""Of the way to the next dot, which a window is no wider than if it is wider than the least."""
+"""Window width over the distance to the nearest dot, between these limits."""
 
 ROUNDS, SETTLED_PX = 12, 0.002
-"""Rounds of the fit at most; places have settled that move by less."""
+"""Most iterations of the fit; it has converged when positions move by less than this, px."""
 
 ALIKE = 1.0
-"""Weight of the frame's size in each dot's, over that of the dot's own light."""
+"""Weight of the common dot size over that of the dot's own light in the estimate of its size."""
 
 MOST_GROWTH, MOST_MOVE = 0.25, 1.0
-"""A size changes by no more than this share in a round, nor a place by more than this, px."""
+"""Largest relative change of a size and largest change of a position, px, in one iteration."""
 
 REACH_SIZES = 10.0
-"""Dots so many sizes apart have no light in each other's windows."""
+"""Dots that are this many sizes apart have no light in each other's windows."""
 
 ASTRAY = 2.0
-"""A place that the fit moves by more dot sizes is not the dot's: it stays where it was."""
+"""A fitted position farther than this many dot sizes from its start is replaced by the start."""
 
 BLUR_PX, BLUR_POWER = 0.8, 1.8
-"""Standard deviation of a camera's blur, as a rule; from one order of modes to the next, speckle
-keeps (1 − blur²/size²) to this power of its power."""
+"""Typical standard deviation of a camera's blur, and the exponent of (1 − blur²/size²) in the ratio
+of speckle power in one order of modes to that in the previous one."""
 
 USUAL_PX2 = 0.2
-"""Strength of speckle, px², and its standard uncertainty, before a frame tells."""
+"""Prior strength of speckle, px², which is also its standard uncertainty."""
 
 LEAST_RATIO, RULE_SIGMA = 0.05, 0.8
-"""Speckle keeps at least so much of its power two orders on; standard uncertainty of the rule's
-logarithm."""
+"""Least ratio of speckle power two orders on; standard uncertainty of its logarithm as predicted
+from the blur."""
 
 OVERLAP, OVERLAP_SIZES, MOST_TAKEN = 1.2, 2.35, 0.11
-"""What the fit of a neighbour so many sizes away takes up of a dot's noise: a Gaussian of that, of
-this height and width, and no more than the last."""
+"""Share of a dot's noise that the fit of a neighbour absorbs: a Gaussian of their distance, in
+sizes, with this height and width, limited to the last number."""
 
 ALONE = 0.9
-"""A dot stands alone whose neighbours' fit leaves more of its noise."""
+"""A dot is isolated if its neighbours' fit leaves more than this share of its noise."""
 
 OUTLIER = 9.0
-"""Projections whose square exceeds its expectation by so much are cut off there."""
+"""Squares of projections are clipped at this many times their expectation."""
 
 
 @dataclass(frozen=True)
 class FittedDots(ReadOnlyArrays):
-    """Dots by the fit; every array has shape (n,).
+    """Fitted dots; every array has shape (n,).
 
     Parameters
     ----------
@@ -72,7 +73,7 @@ class FittedDots(ReadOnlyArrays):
     size_px
         Standard deviation of the dot's light.
     speckle_px2
-        Strength of the speckle in the frame: its contrast squared times the area of a grain.
+        Strength of the speckle in the frame: its squared contrast times the area of a grain.
     """
 
     u_px: FloatArray
@@ -89,32 +90,32 @@ def fit_dots(
     start: FloatArray,
     noise: FloatArray,
 ) -> FittedDots:
-    """Fit dots to a picture.
+    """Fit dots to a picture by iterated least squares.
 
     Parameters
     ----------
     picture
         Shape (height, width).
     around
-        The picture, made smaller and blurred by a Gaussian, and that Gaussian's standard deviation
-        in pixels of the picture.
+        The picture, downsampled and blurred by a Gaussian, and that Gaussian's standard deviation
+        in pixels of the original picture.
     start
-        Place u and v, peak and size of each dot to begin with, shape (n, 4).
+        Initial u, v, peak and size of each dot, shape (n, 4).
     noise
-        The camera's noise at each dot, shape (n,), grey levels.
+        Standard deviation of the camera's noise at each dot, shape (n,), grey levels.
     """
     from labapp.core.images import dot_fit_kernels as kernels
     from labapp.core.images.dot_kernels import next_apart
 
-    dots, usual = np.array(start, np.float64), float(np.median(start[:, 3]))
+    dots, median_size = np.array(start, np.float64), float(np.median(start[:, 3]))
     by, blur = picture.shape[1] / around[0].shape[1], around[1]
-    number, begin = kernels.neighbours(dots[:, 0], dots[:, 1], REACH_SIZES * usual)
+    number, begin = kernels.neighbours(dots[:, 0], dots[:, 1], REACH_SIZES * median_size)
     move = np.inf
     next_px = next_apart(np.ascontiguousarray(dots[:, :2]))
 
     for last in range(ROUNDS + 1):
-        usual = float(np.median(dots[:, 3]))
-        width = np.clip(WINDOW_SHARE * next_px, CLOSE_WINDOW * usual, WINDOW * usual)
+        median_size = float(np.median(dots[:, 3]))
+        width = np.clip(WINDOW_SHARE * next_px, CLOSE_WINDOW * median_size, WINDOW * median_size)
         margin = int(np.ceil(2.2 * width.max())) + 1
         rest = kernels.without_dots(around[0], by, blur, dots)
         where = picture, rest, blur, dots, width, number, begin, margin
@@ -127,30 +128,31 @@ def fit_dots(
     variance = noise**2 * modes[:2, :, 1] + speckle * modes[:2, :, 2]
     sigma = np.sqrt(variance / free) / _pull(dots, width)
     u, v = start[:, :2].T
-    most, (high, wide) = ASTRAY * usual, picture.shape
-    # The band-pass mirrors the picture at its rim, and a dot there has its peak nearer to it.
+    most, (high, wide) = ASTRAY * median_size, picture.shape
+    # The band-pass reflects the picture at its edges, which draws peaks near them outwards.
     at_rim = np.minimum(np.minimum(u, wide - 1 - u), np.minimum(v, high - 1 - v)) < most
     astray = np.hypot(dots[:, 0] - u, dots[:, 1] - v) > np.where(at_rim, 2 * most, most)
     return FittedDots(
         u_px=np.where(astray, u, dots[:, 0]),
         v_px=np.where(astray, v, dots[:, 1]),
-        u_sigma_px=np.where(astray, usual, sigma[0]),
-        v_sigma_px=np.where(astray, usual, sigma[1]),
+        u_sigma_px=np.where(astray, median_size, sigma[0]),
+        v_sigma_px=np.where(astray, median_size, sigma[1]),
         size_px=dots[:, 3].copy(),
         speckle_px2=speckle,
     )
 
 
 def _pull(dots: FloatArray, width: FloatArray) -> FloatArray:
-    """What the first moment in the window changes by with a dot's place, shape (n,)."""
+    """Derivative of the first moment in the window with respect to the position, shape (n,)."""
     _, _, peak, size = dots.T
     return np.asarray(peak / size**2 * 2 * np.pi / (1 / width**2 + 1 / size**2) ** 2)
 
 
 def _improve(dots: FloatArray, sums: FloatArray, width: FloatArray) -> float:
-    """Improve places, peaks and sizes by one round of least squares; returns the largest move.
+    """Update positions, peaks and sizes by one least-squares step; return the largest move.
 
-    Peak, size and dark level are solved for together, dot by dot; sizes are drawn to the frame's.
+    Peak, size and dark level are solved for jointly for each dot. Sizes are regularised towards
+    the median of the frame.
     """
     peak, size = dots[:, 2].copy(), dots[:, 3].copy()
     plain, by_u, by_v, by_own, by_wide, window = sums.T
@@ -163,13 +165,13 @@ def _improve(dots: FloatArray, sums: FloatArray, width: FloatArray) -> float:
     g2 = grown * by_wide
     det = n00 * n11 - n01**2
     with np.errstate(divide="ignore", invalid="ignore"):
-        own = (n11 * n02 - n01 * n12) / det, (n00 * n12 - n01 * n02) / det
-        curvature = n22 - n02 * own[0] - n12 * own[1]
-        slope = g2 - by_own * own[0] - plain * own[1]
-    usual = float(np.median(size))
+        coupling = (n11 * n02 - n01 * n12) / det, (n00 * n12 - n01 * n02) / det
+        curvature = n22 - n02 * coupling[0] - n12 * coupling[1]
+        slope = g2 - by_own * coupling[0] - plain * coupling[1]
+    median_size = float(np.median(size))
     pooled = slope.sum() / curvature.sum()
     hold = ALIKE * curvature.mean()
-    growth = (slope + hold * (pooled - np.log(size / usual))) / (curvature + hold)
+    growth = (slope + hold * (pooled - np.log(size / median_size))) / (curvature + hold)
     growth = np.clip(growth, -MOST_GROWTH, MOST_GROWTH)
     rest_own, rest_plain = by_own - n02 * growth, plain - n12 * growth
     higher = (n11 * rest_own - n01 * rest_plain) / det
@@ -182,20 +184,20 @@ def _improve(dots: FloatArray, sums: FloatArray, width: FloatArray) -> float:
 
 
 def _free_share(dots: FloatArray, number: IntArray, begin: IntArray) -> FloatArray:
-    """Share of a dot's noise that its near neighbours' fit does not take up, shape (n,)."""
-    own = np.repeat(np.arange(len(dots)), np.diff(begin))
-    away = np.hypot(*(dots[number, :2] - dots[own, :2]).T) / dots[own, 3]
+    """Share of a dot's noise that is not absorbed by the fit of its neighbours, shape (n,)."""
+    dot = np.repeat(np.arange(len(dots)), np.diff(begin))
+    away = np.hypot(*(dots[number, :2] - dots[dot, :2]).T) / dots[dot, 3]
     taken = np.minimum(MOST_TAKEN, OVERLAP * np.exp(-((away / OVERLAP_SIZES) ** 2)))
-    return np.exp(-np.bincount(own, taken, len(dots)))
+    return np.exp(-np.bincount(dot, taken, len(dots)))
 
 
 def _speckle(modes: FloatArray, dots: FloatArray, noise: FloatArray, free: FloatArray) -> float:
-    """Strength of the speckle, px², as it is in modes of the first order.
+    """Estimate the strength of the speckle in modes of the first order, px².
 
-    Grains that are not small beside a dot have less power in a higher order, by about the same
-    ratio from each to the next. The camera's blur, as it is as a rule, tells the ratio roughly, and
-    the third and fifth order of dots that stand alone tell it, too. Half of what it may be
-    off by is added, as a strength of none would be trusted most.
+    If grains are not small compared with a dot, their power falls from order to order, by about
+    the same ratio. The ratio is predicted from a typical camera blur and combined with the ratio of
+    the fifth and third order of isolated dots. Half of the standard uncertainty is added, since an
+    underestimate would make positions seem too certain.
     """
     third, alone = _power(modes[2:4], noise, free), free > ALONE
     sharp = 1 - (BLUR_PX / max(float(np.median(dots[:, 3])), 1.2 * BLUR_PX)) ** 2
@@ -215,10 +217,10 @@ def _speckle(modes: FloatArray, dots: FloatArray, noise: FloatArray, free: Float
 
 
 def _power(modes: FloatArray, noise: FloatArray, free: FloatArray) -> tuple[float, float]:
-    """Power of residuals over that of the light in modes, without the noise's, and its σ; px².
+    """Noise-corrected power of residuals in modes over that of the light, and its σ; px².
 
-    Of speckle, whose grains are broader than pixels, neighbours' fit takes up about three times as
-    much as of noise.
+    The fit of neighbours absorbs about three times as much of speckle, whose grains are larger
+    than pixels, as of noise.
     """
     square, white = modes[..., 0] ** 2 / free, noise**2 * modes[..., 1]
     shone = free**2 * modes[..., 2] + 1e-30

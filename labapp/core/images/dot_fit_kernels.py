@@ -20,12 +20,12 @@ _byte = types.Array(types.uint8, 2, "C", readonly=True)
 _ints = types.Array(_i, 1, "A", readonly=True)
 
 NEIGHBOUR_SIZES, AROUND_SIZES = 3.5, 4.0
-"""A dot's light is followed so many standard deviations far, and its blurred light."""
+"""Range of a dot's light and of its blurred light, in standard deviations."""
 
 
 @_inner
 def _between(picture: Grey, u: float, v: float, by: float) -> float:
-    """Value of a picture, which is ``by`` times smaller, at a place in the large one."""
+    """Interpolate a picture that is ``by`` times smaller at a position in the full-size one."""
     height, width = picture.shape
     x = min(max((u + 0.5) / by - 0.5, 0.0), width - 1.0)
     y = min(max((v + 0.5) / by - 0.5, 0.0), height - 1.0)
@@ -39,7 +39,10 @@ def _between(picture: Grey, u: float, v: float, by: float) -> float:
 
 @_compiled(_f1, _f1, _f)
 def neighbours(u: FloatArray, v: FloatArray, reach: float) -> tuple[IntArray, IntArray]:
-    """Numbers of the other places within reach of each, and where each one's numbers begin."""
+    """Indices of the places within reach of each, concatenated, and the start of each list.
+
+    Place k has the neighbours ``number[begin[k]:begin[k + 1]]``.
+    """
     count, total = len(u), 0
     begin = np.zeros(count + 1, np.int64)
     number = np.empty(16 * count + 16, np.int64)
@@ -66,9 +69,10 @@ def _patch(
     light: Grey,
     lines: Grey,
 ) -> None:
-    """Residual light round a dot, all dots and the surroundings taken off, and all dots' light.
+    """Compute the residual light about a dot, and the modelled light of all dots there.
 
-    Both are of shape (side, side); nothing is left outside the picture.
+    The residual is the image minus all dots and the background, 0 outside the picture. Both have
+    shape (side, side).
     """
     (u, v, peak, size), side = dots[k], len(patch)
     left, top = round(u) - side // 2, round(v) - side // 2
@@ -101,16 +105,16 @@ def _patch(
         row[:first] = 0.0
         row[last:] = 0.0
         seen, own = image[top + y, left + first : left + last], light[y, first:last]
-        made = row[first:last]
-        for x in range(len(made)):
-            made[x] = np.float32(seen[x]) - own[x] - (dark + slope * np.float32(first + x))
+        result = row[first:last]
+        for x in range(len(result)):
+            result[x] = np.float32(seen[x]) - own[x] - (dark + slope * np.float32(first + x))
 
 
 @_inner
 def _level(
     surroundings: Grey, by: float, blur: float, dot: FloatArray
 ) -> tuple[float, float, float]:
-    """Dark level at a dot, and its slopes."""
+    """Background level at a dot, and its slopes along u and v."""
     u, v, far = dot[0], dot[1], blur / 2
     right, left = _between(surroundings, u + far, v, by), _between(surroundings, u - far, v, by)
     below, above = _between(surroundings, u, v + far, by), _between(surroundings, u, v - far, by)
@@ -120,9 +124,9 @@ def _level(
 
 @_inner
 def _folded_bell(center: float, by: float, width: float, values: Grey) -> tuple[int, int]:
-    """A Gaussian at the pixels of a smaller picture whose edges are mirrors; from where, to where.
+    """Sample a Gaussian in a ``by`` times smaller picture with reflecting edges.
 
-    It is that of a place in the large picture, and of a width there.
+    Center and width are in pixels of the full-size picture. Returns the range of pixels set.
     """
     count, at, far = len(values), (center + 0.5) / by - 0.5, width / by
     first, last = int(at - AROUND_SIZES * far), int(at + AROUND_SIZES * far) + 1
@@ -138,8 +142,8 @@ def _folded_bell(center: float, by: float, width: float, values: Grey) -> tuple[
 
 @_compiled(_grey, _f, _f, _f2)
 def without_dots(around: Grey, by: float, blur: float, dots: FloatArray) -> Grey:
-    """A picture, ``by`` times smaller and blurred, without the light of dots, shape (n, 4)."""
-    made = around.copy()
+    """Subtract the light of dots, shape (n, 4), from a blurred, ``by`` times smaller picture."""
+    result = around.copy()
     across, down = np.empty(around.shape[1], np.float32), np.empty(around.shape[0], np.float32)
     for k in range(len(dots)):
         u, v, peak, size = dots[k]
@@ -147,10 +151,10 @@ def without_dots(around: Grey, by: float, blur: float, dots: FloatArray) -> Grey
         left, right = _folded_bell(u, by, np.sqrt(wide), across)
         top, bottom = _folded_bell(v, by, np.sqrt(wide), down)
         for y in range(top, bottom):
-            row, height = made[y], np.float32(peak * size**2 / wide) * down[y]
+            row, height = result[y], np.float32(peak * size**2 / wide) * down[y]
             for x in range(left, right):
                 row[x] -= height * across[x]
-    return made
+    return result
 
 
 @_compiled_for(*((own, _grey, _f, _f2, _f1, _ints, _ints, _i) for own in (_grey, _byte)))
@@ -164,24 +168,25 @@ def residual_sums(
     begin: IntArray,
     margin: int,
 ) -> FloatArray:
-    """Sums over the residual light in each dot's window, shape (n, 6).
+    """Weighted sums of the residual light in each dot's window, shape (n, 6).
 
-    Of it alone, times u, times v, times the dot's profile, that times r², and of the window.
+    The weights are 1, u, v, the dot's profile, and the profile times r²; the last column is the
+    sum of the window.
 
     Parameters
     ----------
     image, surroundings, blur
-        The picture; what `without_dots` leaves of it; the blur's standard deviation, px.
+        The picture; the background from `without_dots`; the blur's standard deviation, px.
     dots
-        Place, peak and size of each dot, shape (n, 4).
+        Position u, v, peak and size of each dot, shape (n, 4).
     width
-        Of each dot's Gaussian window, shape (n,), px.
+        Width of each dot's Gaussian window, shape (n,), px.
     number, begin
         See `neighbours`.
     margin
-        So far from a dot light is weighed, px.
+        Half side of the square about a dot in which light is integrated, px.
     """
-    side, made, by = (
+    side, result, by = (
         2 * margin + 1,
         np.zeros((len(dots), 6)),
         image.shape[1] / surroundings.shape[1],
@@ -211,21 +216,21 @@ def residual_sums(
                 row_own += lines[2, x] * value
                 row_wide += lines[2, x] * value * away[1, x]
             away_v, down = top + y - v, lines[1, y]
-            made[k, 0] += down * row
-            made[k, 1] += down * row_u
-            made[k, 2] += down * row * away_v
+            result[k, 0] += down * row
+            result[k, 1] += down * row_u
+            result[k, 2] += down * row * away_v
             down *= lines[3, y]
-            made[k, 3] += down * row_own
-            made[k, 4] += down * (row_wide + away_v**2 * row_own)
-        made[k, 5] = lines[0].sum() * lines[1].sum()
-    return made
+            result[k, 3] += down * row_own
+            result[k, 4] += down * (row_wide + away_v**2 * row_own)
+        result[k, 5] = lines[0].sum() * lines[1].sum()
+    return result
 
 
 @_inner
 def _add_modes(
     sums: FloatArray, weight: float, q: float, spread: float, moments: FloatArray
 ) -> None:
-    """Add a row's part of the projections on the modes, by its moments along u up to the fifth."""
+    """Add a row's contribution to the projections on the modes; moments up to the fifth."""
     p, less = moments, q * q - 4 * spread
     b, c = 2 * q * q - 12 * spread, q**4 - 12 * spread * q * q + 24 * spread**2
     sums[0] += weight * p[1]
@@ -240,7 +245,7 @@ def _add_modes(
 def _add_squares(
     sums: FloatArray, weight: float, q: float, spread: float, moments: FloatArray
 ) -> None:
-    """Add a row's part of the sums of the modes' squares, by its even moments up to the tenth."""
+    """Add a row's contribution to the sums of squared modes; even moments up to the tenth."""
     s, square, less = moments, q * q, q * q - 4 * spread
     b, c = 2 * q * q - 12 * spread, q**4 - 12 * spread * q * q + 24 * spread**2
     sums[0] += weight * s[1]
@@ -265,13 +270,13 @@ def residual_modes(
     begin: IntArray,
     margin: int,
 ) -> FloatArray:
-    """Projections of the residual light on modes of each dot, shape (6, n, 3), see `residual_sums`.
+    """Project the residual light of each dot on modes, shape (6, n, 3); see `residual_sums`.
 
-    The modes are polynomials of the place in the window, two each of the first, third and fifth
-    order; of a round dot's shift the first alone have a share. Of each: the projection, the sum of
-    the mode's square, and of the square of mode times light.
+    The modes are windowed polynomials of the position, two each of the first, third and fifth
+    order; a shift of a round dot contributes to the first order only. The last axis holds the
+    projection, the sum of the squared mode, and the sum of the squared product of mode and light.
     """
-    side, made, by = (
+    side, result, by = (
         2 * margin + 1,
         np.zeros((6, len(dots), 3)),
         image.shape[1] / surroundings.shape[1],
@@ -311,7 +316,7 @@ def residual_modes(
                     square += weighed * weighed * power[2 * n, x]
                 moments[n], squares[n] = moment, square
             q, down = top + y - v, float(lines[1, y])
-            _add_modes(made[:, k, 0], down, q, spread, moments)
-            _add_squares(made[:, k, 1], down**2, q, spread, white)
-            _add_squares(made[:, k, 2], down**2, q, spread, squares)
-    return made
+            _add_modes(result[:, k, 0], down, q, spread, moments)
+            _add_squares(result[:, k, 1], down**2, q, spread, white)
+            _add_squares(result[:, k, 2], down**2, q, spread, squares)
+    return result

@@ -1,6 +1,6 @@
 """Inner loops over the dots of a frame, compiled for the processor (docs/adr/0018).
 
-Arrays may be read-only, and of any layout but for pictures.
+Arrays may be read-only; pictures must be contiguous, other arrays need not be.
 """
 
 from __future__ import annotations
@@ -29,9 +29,10 @@ _mask = types.Array(types.boolean, 2, "C", readonly=True)
 def on_plane(
     matrix: FloatArray, image: FloatArray, sigma: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Put dots of some standard deviations on the imaging plane (`ImageCalibration`).
+    """Map dots and their standard uncertainties to the imaging plane (`ImageCalibration`).
 
-    Gives the places, shape (n, 2), their covariance and how many mm a pixel is there, shape (n,).
+    Returns positions, shape (n, 2), mm, their covariance, shape (n, 2, 2), mm², and the local
+    scale, shape (n,), mm/px.
     """
     count = len(image)
     plane, covariance, scale = np.empty((count, 2)), np.empty((count, 2, 2)), np.empty(count)
@@ -54,9 +55,9 @@ def on_plane(
 
 @_compiled(_f2, _f2)
 def two_nearest(places: FloatArray, among: FloatArray) -> tuple[FloatArray, IntArray]:
-    """Distance and number of the two nearest of some places, shape (m, 2), from each of others.
+    """Distances and indices of the two places in ``among``, shape (m, 2), nearest to each place.
 
-    Shapes (n, 2); where there is no second one it is infinitely far off and has the number m.
+    Both have shape (n, 2); a missing neighbour has infinite distance and the index m.
     """
     count = len(places)
     distance, number = np.empty((count, 2)), np.empty((count, 2), np.int64)
@@ -80,7 +81,7 @@ def two_nearest(places: FloatArray, among: FloatArray) -> tuple[FloatArray, IntA
 
 @_compiled(_f2)
 def next_apart(places: FloatArray) -> FloatArray:
-    """Distance of each place, shape (n, 2), from the next one, shape (n,); infinite of one."""
+    """Distance of each place, shape (n, 2), to the nearest other, shape (n,); infinite if n = 1."""
     count = len(places)
     x, y, least = places[:, 0].copy(), places[:, 1].copy(), np.full(count, np.inf)
     for k in range(count):
@@ -95,11 +96,11 @@ def next_apart(places: FloatArray) -> FloatArray:
 
 
 @_inner
-def _tops(band: Grey, disc: BoolArray, v: int, u: int) -> bool:
-    """Whether no pixel of a disc round one is over it."""
+def _is_peak(band: Grey, disc: BoolArray, v: int, u: int) -> bool:
+    """Whether no pixel of a disc about a pixel exceeds it."""
     (height, width), reach, own = band.shape, len(disc) // 2, band[v, u]
     if (u > 0 and band[v, u - 1] > own) or (u < width - 1 and band[v, u + 1] > own):
-        return False  # most are refused by their neighbours
+        return False  # a quick test that rejects most pixels
     for y in range(max(v - reach, 0), min(v + reach + 1, height)):
         for x in range(max(u - reach, 0), min(u + reach + 1, width)):
             if disc[y - v + reach, x - u + reach] and band[y, x] > own:
@@ -109,7 +110,7 @@ def _tops(band: Grey, disc: BoolArray, v: int, u: int) -> bool:
 
 @_inner
 def _any_over(values: Grey, floor: Grey) -> bool:
-    """Whether any of some values is over its floor; all are looked at, several at once."""
+    """Whether any value exceeds its floor; without an early exit, so that it vectorises."""
     some = np.int32(0)
     for k in range(len(values)):
         some |= np.int32(values[k] > floor[k])
@@ -117,14 +118,14 @@ def _any_over(values: Grey, floor: Grey) -> bool:
 
 
 BLOCK = 32
-"""So many pixels of a row are passed over at once where none is over its floor."""
+"""Number of pixels of a row that are skipped at once if none exceeds its floor."""
 
 
 @_compiled(_grey, _grey, _mask)
 def peaks(band: Grey, floor: Grey, disc: BoolArray) -> IntArray:
-    """Columns and rows, shape (2, n), of pixels over the floor that none of a disc is over.
+    """Find local maxima over a disc that exceed the floor: columns and rows, shape (2, n).
 
-    A floor of shape (1, 1) holds everywhere.
+    A floor of shape (1, 1) applies everywhere.
     """
     height, width = band.shape
     found, count = np.empty((2, 256), np.int64), 0
@@ -136,7 +137,7 @@ def peaks(band: Grey, floor: Grey, disc: BoolArray) -> IntArray:
             for u in range(
                 first, last if _any_over(own[first:last], floors[first:last]) else first
             ):
-                if not (own[u] > floors[u] and _tops(band, disc, v, u)):
+                if not (own[u] > floors[u] and _is_peak(band, disc, v, u)):
                     continue
                 if count == found.shape[1]:
                     more = np.empty((2, 2 * count), np.int64)
@@ -149,8 +150,8 @@ def peaks(band: Grey, floor: Grey, disc: BoolArray) -> IntArray:
 
 @_compiled(_grey, _ints, _ints, _f)
 def ridges(band: Grey, u: IntArray, v: IntArray, slender: float) -> BoolArray:
-    """Whether peaks are so many times more curved one way than the other; edges are mirrors."""
-    (height, width), made = band.shape, np.empty(len(u), np.bool_)
+    """Whether the ratio of principal curvatures of peaks exceeds a limit; edges are reflected."""
+    (height, width), result = band.shape, np.empty(len(u), np.bool_)
     for k in range(len(u)):
         above, below = abs(v[k] - 1), height - 1 - abs(height - 2 - v[k])
         left, right = abs(u[k] - 1), width - 1 - abs(width - 2 - u[k])
@@ -159,13 +160,13 @@ def ridges(band: Grey, u: IntArray, v: IntArray, slender: float) -> BoolArray:
         along = own - band[above, u[k]] - band[below, u[k]]
         skew = band[above, left] + band[below, right] - band[above, right] - band[below, left]
         both = across * along - skew * skew / 16.0
-        made[k] = slender * (across + along) ** 2 > (1.0 + slender) ** 2 * both
-    return made
+        result[k] = slender * (across + along) ** 2 > (1.0 + slender) ** 2 * both
+    return result
 
 
 @_inner
 def _lit_pixels(band: Grey, low: Grey) -> IntArray:
-    """Rows and columns, shape (n, 2), of the pixels over ``low``, row by row."""
+    """Rows and columns, shape (n, 2), of the pixels that exceed ``low``, row by row."""
     height, width = band.shape
     lit, count = np.empty((width, 2), np.int64), 0
     for v in range(height):
@@ -186,11 +187,10 @@ def _lit_pixels(band: Grey, low: Grey) -> IntArray:
 
 @_inner
 def _enlarged(band: Grey, v: int, u: int, taps: Grey, patch: Grey, four: Grey) -> None:
-    """Put the values of the four pixels that one of a band is made into, row by row, into ``four``.
+    """Upsample one pixel of a band twofold; its four values are written to ``four``, row by row.
 
-    Between the band's pixels it is interpolated by polynomials through six of them, of which the
-    ``taps`` are the weights a quarter of the way from the third to the fourth. The patch, of shape
-    (7, 7), is memory to write on.
+    The interpolation is by polynomials through six pixels; ``taps`` are their weights a quarter of
+    the way from the third to the fourth. ``patch``, shape (7, 7), is scratch memory.
     """
     (height, width), single = band.shape, np.float32
     inside = 3 <= v < height - 3 and 3 <= u < width - 3
@@ -210,15 +210,15 @@ def _enlarged(band: Grey, v: int, u: int, taps: Grey, patch: Grey, four: Grey) -
 
 
 @_inner
-def _tops_enlarged(fours: Grey, number: IntArray, disc: BoolArray, v: int, u: int) -> bool:
-    """Whether none of the larger pixels of a disc round one is over it.
+def _is_upsampled_peak(fours: Grey, number: IntArray, disc: BoolArray, v: int, u: int) -> bool:
+    """Whether no upsampled pixel of a disc about a pixel exceeds it.
 
-    Those of each of n pixels of the band have shape (n, 4); what is not among the n, by their
-    numbers, shape (height, width), below 0, does not count.
+    ``fours``, shape (n, 4), holds the upsampled values of n pixels of the band, and ``number``,
+    shape (height, width), the index of each pixel in it; pixels with a negative index are ignored.
     """
     (height, width), reach = number.shape, len(disc) // 2
     own = fours[number[v >> 1, u >> 1], 2 * (v & 1) + (u & 1)]
-    for k in range(2 * reach + 1):  # from its own row outwards: what is over it is mostly near
+    for k in range(2 * reach + 1):  # from its row outwards, as larger pixels are mostly close
         y = v + (k + 1) // 2 * (1 if k & 1 else -1)
         if not 0 <= y < 2 * height:
             continue
@@ -234,21 +234,22 @@ def _tops_enlarged(fours: Grey, number: IntArray, disc: BoolArray, v: int, u: in
 def enlarged_peaks(
     band: Grey, low: Grey, floor: Grey, disc: BoolArray
 ) -> tuple[IntArray, FloatArray]:
-    """Peaks of a band made twice as large where it is over ``low``, of its shape (`peaks`).
+    """Find peaks of a band that is upsampled twofold where it exceeds ``low`` (`peaks`).
 
     Parameters
     ----------
     band, low
-        Shape (height, width); where the band is not over it, no peak is, and nothing over one.
+        Shape (height, width); pixels that do not exceed ``low`` contain no peak and do not
+        compete with one.
     floor
-        What peaks are over, of twice that shape.
+        Threshold for peaks, shape (2·height, 2·width).
     disc
         See `peaks`.
 
     Returns
     -------
     places, heights
-        Columns and rows, shape (2, n), and the larger band there, shape (n,).
+        Columns and rows, shape (2, n), and the upsampled band there, shape (n,).
     """
     lit = _lit_pixels(band, low)
     number = np.full(band.shape, -1, np.int64)
@@ -260,10 +261,10 @@ def enlarged_peaks(
         _enlarged(band, lit[k, 0], lit[k, 1], taps, patch, fours[k])
     found, high, count = np.empty((2, 4 * len(lit)), np.int64), np.empty(4 * len(lit)), 0
     for k in range(len(lit)):
-        most = fours[k].max()  # the others of the four are no peaks
+        most = fours[k].max()  # the other three cannot be peaks
         for m in range(4):
             v, u = 2 * lit[k, 0] + m // 2, 2 * lit[k, 1] + m % 2
-            if fours[k, m] < most or not _tops_enlarged(fours, number, disc, v, u):
+            if fours[k, m] < most or not _is_upsampled_peak(fours, number, disc, v, u):
                 continue
             if most > floor[v, u]:
                 found[0, count], found[1, count], high[count] = u, v, most
@@ -274,22 +275,22 @@ def enlarged_peaks(
 
 @_compiled_for(*((own,) for own in (_grey, _byte)))
 def halved(image: Picture) -> Grey:
-    """Means of squares of two by two pixels; of bytes they are not rounded."""
-    made = np.empty((image.shape[0] // 2, image.shape[1] // 2), np.float32)
-    for v in range(made.shape[0]):
-        above, below, own = image[2 * v], image[2 * v + 1], made[v]
-        for u in range(made.shape[1]):
+    """Downsample an image twofold by averaging 2 × 2 pixels, without rounding."""
+    result = np.empty((image.shape[0] // 2, image.shape[1] // 2), np.float32)
+    for v in range(result.shape[0]):
+        above, below, own = image[2 * v], image[2 * v + 1], result[v]
+        for u in range(result.shape[1]):
             one = np.float32(above[2 * u]) + np.float32(above[2 * u + 1])
             other = np.float32(below[2 * u]) + np.float32(below[2 * u + 1])
             own[u] = np.float32(0.25) * (one + other)
-    return made
+    return result
 
 
 @_inner
 def _beside(image: Picture, v: int, u: int, away: int) -> float:
-    """Mean of the two pixels so far above and below one, or left and right, whichever is less.
+    """Mean of the pixels at a distance above and below, or left and right, whichever is less.
 
-    Beyond an edge the picture is mirrored at its last pixel.
+    At an edge the picture is reflected about its last pixel.
     """
     height, width = image.shape
     above, below, left, right = v - away, v + away, u - away, u + away
@@ -303,12 +304,12 @@ def _beside(image: Picture, v: int, u: int, away: int) -> float:
 
 @_inner
 def _falls(image: Picture, v: int, near: Line, far: Line, falls: Line) -> None:
-    """Twice how far the light falls from each pixel of a row to what is beside it, grey levels.
+    """Compute twice the fall of light from each pixel of a row to its surroundings, grey levels.
 
-    ``near`` and ``far`` are memory to write on, each as long as a row.
+    ``near`` and ``far`` are scratch memory, each as long as a row.
     """
     (height, width), first, last = image.shape, 0, 0
-    if 2 <= v < height - 2 and width > 4:  # no edge between these: several are taken at once
+    if 2 <= v < height - 2 and width > 4:  # away from the edges: vectorised
         first, last = 2, width - 2
         row, inner = image[v], falls[first:last]
         _least_sum(image[v - 1, 2:], image[v + 1, 2:], row[1:], row[3:], inner, near)
@@ -327,7 +328,7 @@ def _falls(image: Picture, v: int, near: Line, far: Line, falls: Line) -> None:
 def _least_sum(
     above: Picture, below: Picture, left: Picture, right: Picture, other: Line, least: Line
 ) -> None:
-    """Put the lesser of two sums into ``least``; one sum a loop takes the most pixels at once."""
+    """Write the lesser of two sums to ``least``; separate loops vectorise best."""
     for u in range(len(other)):
         least[u] = above[u] + below[u]
     for u in range(len(other)):
@@ -338,7 +339,7 @@ def _least_sum(
 
 @_inner
 def _darkest(image: Picture, v: int, u: int, reach: int, step: int) -> float:
-    """Least of every ``step``-th pixel of a square round one, what is within the picture."""
+    """Minimum over every ``step``-th pixel of a square about a pixel, within the picture."""
     (height, width), least = image.shape, float(image[v, u])
     for y in range(v - reach, v + reach + 1, step):
         for x in range(u - reach, u + reach + 1, step):
@@ -348,10 +349,10 @@ def _darkest(image: Picture, v: int, u: int, reach: int, step: int) -> float:
 
 
 @_inner
-def _times_deeper(
+def _ratio_of_falls(
     over_ground: float, one: float, two: float, near: float, far: float, sharper: float
 ) -> float:
-    """How many times deeper a pixel falls than a dot's: towards the next pixels or those beyond."""
+    """Fall of light at a pixel over that at a dot's peak: to the next pixels or those beyond."""
     times = over_ground / max(near * one, 1e-3 * over_ground)
     return times if times > sharper else over_ground / max(far * two, 1e-3 * over_ground)
 
@@ -360,20 +361,20 @@ def _times_deeper(
 def spikes(
     image: Picture, over: float, size: float, sharper: float, reach: int
 ) -> tuple[IntArray, FloatArray]:
-    """Pixels that no dot has: columns and rows, shape (2, n).
+    """Find pixels that are too sharp for dots: columns and rows, shape (2, n).
 
-    Light of dots that are Gaussians of this size or larger, however many, falls from a pixel to the
-    mean of two on both sides of it at most as one Gaussian does from its top. Spikes fall so many
-    times deeper, towards the darkest pixel of a square of half side ``reach``, and ``over`` grey
-    levels besides. Asked for are the pixels next to it and next to those, as some spikes are of two
-    by two pixels. The second array, shape (2, n), is how many times deeper each falls and what is
-    beside it, grey levels.
+    The light of any number of Gaussian dots of this size or larger falls from a pixel to the mean
+    of two opposite neighbours by at most as much as one Gaussian falls from its peak, relative to
+    the darkest pixel of a square of half side ``reach``. Spikes fall ``sharper`` times as much, and
+    by ``over`` grey levels besides. The neighbours at distances 1 and 2 are tested, as some spikes
+    have 2 × 2 pixels. The second array, shape (2, n), is each spike's ratio of falls and the grey
+    level beside it.
     """
     height, width = image.shape
     found, values, count = np.empty((2, 64), np.int64), np.empty((2, 64)), 0
     near, far = np.exp(0.5 / size**2), np.exp(2.0 / size**2)
-    far = far if far < 4.0 else np.inf  # dots so small have no light so far off
-    # Of bytes these are integers of two bytes.
+    far = far if far < 4.0 else np.inf  # smaller dots have no light at distance 2
+    # For a picture of bytes these are 16-bit integers.
     falls, floor = image[0] * np.int16(0), image[0] * np.int16(0)
     sums, others = falls.copy(), falls.copy()
     floor[:] = 2.0 * over
@@ -390,18 +391,18 @@ def spikes(
                     continue
                 own = float(image[v, u])
                 one, two = _beside(image, v, u, 1), _beside(image, v, u, 2)
-                # The darkest of some pixels may show already that it falls no deeper.
+                # A coarse search for the darkest pixel may already exclude a spike.
                 for step in (reach, 1):
                     ground = _darkest(image, v, u, reach, step)
                     high, low, lower = own - ground - over, one - ground, two - ground
-                    times = _times_deeper(high, low, lower, near, far, sharper)
+                    times = _ratio_of_falls(high, low, lower, near, far, sharper)
                     if high > 0.0 and times <= sharper:
                         break
                 if not (high > 0.0 and times > sharper):
                     continue
                 fit = two
                 if high > sharper * max(near * low, 1e-3 * high):
-                    # The pixel next to it may be a spike as well.
+                    # The neighbour may belong to the same spike.
                     fit = min(one, ground + far / near * lower) if far < np.inf else one
                 if count == found.shape[1]:
                     more, further = np.empty((2, 2 * count), np.int64), np.empty((2, 2 * count))
@@ -414,9 +415,9 @@ def spikes(
 
 
 @_compiled(_ints, _ints, types.Array(types.boolean, 1, "A", readonly=True))
-def hanging_together(u: IntArray, v: IntArray, begun: BoolArray) -> BoolArray:
-    """Which pixels are begun with, or hang together with such by their sides or corners."""
-    made, waiting = begun.copy(), np.flatnonzero(begun)
+def connected_pixels(u: IntArray, v: IntArray, begun: BoolArray) -> BoolArray:
+    """Select the seed pixels and all pixels that are 8-connected to them."""
+    result, waiting = begun.copy(), np.flatnonzero(begun)
     next_ones = np.empty(len(u), np.int64)
     next_ones[: len(waiting)] = waiting
     count, done = len(waiting), 0
@@ -424,15 +425,15 @@ def hanging_together(u: IntArray, v: IntArray, begun: BoolArray) -> BoolArray:
         own = next_ones[done]
         done += 1
         for k in range(len(u)):
-            if not made[k] and abs(u[k] - u[own]) <= 1 and abs(v[k] - v[own]) <= 1:
-                made[k], next_ones[count] = True, k
+            if not result[k] and abs(u[k] - u[own]) <= 1 and abs(v[k] - v[own]) <= 1:
+                result[k], next_ones[count] = True, k
                 count += 1
-    return made
+    return result
 
 
 @_compiled(_ints, _ints, _f)
 def first_of_each(u: IntArray, v: IntArray, within: float) -> IntArray:
-    """Numbers of the pixels that none before them is near that stays."""
+    """Indices of pixels with no earlier selected pixel within a distance."""
     kept = np.empty(len(u), np.int64)
     count = 0
     for k in range(len(u)):

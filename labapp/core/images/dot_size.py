@@ -1,4 +1,4 @@
-"""What a frame says of itself before its dots are sought: noise, spikes, the size of its dots."""
+"""Estimates from a frame before its dots are detected: noise, spikes, and dot size."""
 
 from __future__ import annotations
 
@@ -14,57 +14,57 @@ from labapp.core.images.dots import Grey, Image, Picture
 from labapp.core.values import BoolArray, FloatArray, IntArray
 
 TILE_PX = 40
-"""Noise is taken over tiles of about this side."""
+"""Noise is estimated in tiles of about this side."""
 
 SPIKE = 6.0
-"""A pixel is a spike from so many noise σ over the light of a dot on."""
+"""A spike exceeds the light that a dot could have by at least this many noise σ."""
 
 DOUBTED, CERTAIN = 1.5, 6.0
-"""… and from so many times that light on, beside what is certainly a spike or doubted to be a dot,
-and elsewhere. Speckle makes dots much sharper than Gaussians are."""
+"""Least ratio of a spike's fall of light to that of a dot: next to a certain spike or a suspect
+peak, and elsewhere. The latter is large since speckle makes dots much sharper than Gaussians."""
 
 SLENDER = 10.0
-"""A peak that is curved so many times more one way than the other is a ridge's, no dot's."""
+"""A peak with a larger ratio of principal curvatures is part of a ridge, not a dot."""
 
 USUAL_PX = 2.5
-"""Size of dots in a frame in which none is seen."""
+"""Dot size assumed for a frame in which none can be estimated."""
 
 SCALES_PX = 0.63 * 2 ** (np.arange(11) / 2)
-"""Sizes that are looked at: from under the sharpest a camera gives to eighty pixels across."""
+"""Scales that are searched: from below the sharpest dots of a camera to dots 80 px across."""
 
 COARSE = 2
-"""The finest of these scales that a picture of half the size has."""
+"""Index of the finest of these scales that is computed at half resolution."""
 
 OVER_NOISE = 8.0
-"""A blob's answer stands so many times over that of the frame's noise."""
+"""Least response of a blob over that of the frame's noise."""
 
 MOST_BLOBS = 3000
-"""So many of a scale's blobs are looked at, those that answer most: more than a pattern has dots.
+"""Number of a scale's strongest blobs that are used; more than a pattern has dots.
 
-Where part of a picture is blank the noise of the rest has a blob every few pixels."""
+If part of a picture is blank, noise in the rest makes a blob every few pixels."""
 
 WHOLE = 0.6
-"""A blob with this share of the answer of smaller ones within it has them as its parts."""
+"""Smaller blobs within a blob are its parts if it has at least this share of their response."""
 
 BEST = 0.884
-"""The band that answers most to a Gaussian dot is that of so much of the dot's size."""
+"""Scale of the band with the largest response to a Gaussian dot, over the dot's size."""
 
 KEPT_BYTES = 2**23
-"""Larger pictures to work on are not kept for the next frame."""
+"""Larger scratch pictures are not kept for the next frame."""
 
 
 def as_picture(frame: Image) -> Picture:
-    """Bytes as they are, other grey levels as single precision; for OpenCV and compiled loops."""
+    """Convert to a contiguous array of bytes, if it is one, or else of single precision."""
     if frame.dtype == np.uint8:
         return np.ascontiguousarray(frame, np.uint8)
     return np.ascontiguousarray(frame, np.float32)
 
 
 def local_noise(picture: Picture) -> Grey:
-    """Standard deviation of the camera's noise round each pixel, grey levels.
+    """Estimate the local standard deviation of the camera's noise, grey levels.
 
-    Taken from a difference that smooth structure, dots included, does not pass (Immerkær 1996),
-    by the scaled median over tiles.
+    From a difference operator that suppresses smooth structure, dots included (Immerkær 1996), by
+    the scaled median over tiles.
     """
     from labapp.core.images import size_kernels
 
@@ -76,13 +76,13 @@ def local_noise(picture: Picture) -> Grey:
     return np.asarray(cv2.resize(1.4826 * medians, (width, height)), np.float32)
 
 
-def mended(
-    picture: Picture, noise: Grey, size: float, doubted: tuple[IntArray, IntArray] | None = None
+def without_spikes(
+    picture: Picture, noise: Grey, size: float, suspects: tuple[IntArray, IntArray] | None = None
 ) -> Picture:
-    """Put what is beside them in the place of pixels too bright for dots of a size, px.
+    """Replace pixels that are too bright for dots of a size, px, by their surroundings.
 
-    Mended is what is certainly a spike, or is near one of the ``doubted`` pixels (columns and
-    rows), and what hangs together with that. A picture without such is given back.
+    These are certain spikes, spikes near one of the ``suspects`` pixels (columns and rows), and
+    spikes connected to either. A picture without spikes is returned unchanged.
     """
     from labapp.core.images import dot_kernels
 
@@ -93,15 +93,15 @@ def mended(
     sharp = picture[v, u] - beside > SPIKE * noise[v, u]
     u, v, times, beside = u[sharp], v[sharp], times[sharp], beside[sharp]
     begun = times > CERTAIN
-    if doubted is not None:
-        away = dot_kernels.two_nearest(pairs(u, v), pairs(*doubted))[0][:, 0]
+    if suspects is not None:
+        away = dot_kernels.two_nearest(pairs(u, v), pairs(*suspects))[0][:, 0]
         begun |= away <= 1.5 * size + 1.0
     if not begun.any():
         return picture
-    hot = dot_kernels.hanging_together(u, v, begun)
-    whole = picture.copy()
-    whole[v[hot], u[hot]] = np.rint(beside[hot]) if picture.dtype == np.uint8 else beside[hot]
-    return whole
+    hot = dot_kernels.connected_pixels(u, v, begun)
+    result = picture.copy()
+    result[v[hot], u[hot]] = np.rint(beside[hot]) if picture.dtype == np.uint8 else beside[hot]
+    return result
 
 
 def pairs(u: IntArray, v: IntArray) -> FloatArray:
@@ -109,25 +109,25 @@ def pairs(u: IntArray, v: IntArray) -> FloatArray:
     return np.stack([u, v], axis=1).astype(float)
 
 
-def size_of(picture: Picture, noise: Grey) -> float:
-    """Size of a picture's dots, px: the scale at which most of its blobs peak.
+def estimate_size(picture: Picture, noise: Grey) -> float:
+    """Estimate the size of a picture's dots, px: the scale at which most of its blobs peak.
 
-    A blob is a maximum over place and scale of the scale-normalised band-pass, and votes by its
-    answer times its size, or grains of speckle would outvote the dots they are in. A blob within a
-    larger one that answers about as much is a lobe or a grain of it, and does not vote. Spikes
-    peak at the smallest scale and gradients at the largest: a size that is one of those is none.
+    A blob is a maximum over position and scale of the scale-normalised band-pass. It votes with
+    its response times its size, since speckle grains would otherwise outvote the dots they are in.
+    A blob within a larger one of about the same response is a lobe or a grain of it and does not
+    vote. Spikes peak at the smallest scale and gradients at the largest, which are not accepted.
 
-    The picture at half its size tells most sizes; the whole of it costs four times as much.
+    Half resolution is sufficient for most sizes; full resolution costs four times as much.
     """
     level = float(np.median(noise[::8, ::8]))
     size = _size_from(picture, level, COARSE)
     if size is None:
-        size = _size_from(mended(picture, noise, SCALES_PX[0]), level, 0)
+        size = _size_from(without_spikes(picture, noise, SCALES_PX[0]), level, 0)
     return size or USUAL_PX
 
 
 def _size_from(picture: Picture, level: float, finest: int) -> float | None:
-    """Size of the dots by the scales from the finest on; None if it may be less, or is not seen."""
+    """Estimate the dot size from scales ≥ ``finest``; None if it may be smaller or has no blobs."""
     from labapp.core.images import size_kernels
 
     bands = dict(_bands(picture, finest))
@@ -158,9 +158,10 @@ def _size_from(picture: Picture, level: float, finest: int) -> float | None:
 
 @dataclass
 class _Blobs:
-    """Maxima of one scale's band: places, shape (n, 2), and the answers of scales there.
+    """Maxima of one scale's band: positions, shape (n, 2), and responses there, shape (n,) each.
 
-    Those of the next smaller scale, of its own, of the next larger one, of all the largest.
+    The responses are at the next smaller scale, at this one, at the next larger one, and the
+    largest of all scales.
     """
 
     scale: int
@@ -176,7 +177,7 @@ class _Blobs:
         self.votes = self.tops.copy()
 
     def beyond(self) -> FloatArray:
-        """How far past its own scale each one peaks, scales, by a parabola."""
+        """Offset of each peak from this scale, in scale steps, by a parabola."""
         bend = np.minimum(self.less - 2 * self.own + self.more, -1e-9)
         return np.asarray(np.clip(0.5 * (self.less - self.more) / bend, -0.5, 0.5))
 
@@ -187,7 +188,7 @@ def _blobs(bands: dict[int, tuple[int, Grey]], scale: int, noise: float) -> _Blo
     step, band = bands[scale]
     white = noise / noise_gain(SCALES_PX[scale])
     every = -(-8 // step)
-    floor = OVER_NOISE * with_grain(band[::every, ::every], white) + 1e-6
+    floor = OVER_NOISE * band_noise(band[::every, ::every], white) + 1e-6
     disc = peak_disc(SCALES_PX[scale] / step).astype(bool)
     x, y = dot_kernels.peaks(band, np.full((1, 1), floor, np.float32), disc)
     good = ~dot_kernels.ridges(band, x, y, SLENDER)
@@ -205,16 +206,16 @@ def _blobs(bands: dict[int, tuple[int, Grey]], scale: int, noise: float) -> _Blo
 
 
 def _bands(picture: Picture, finest: int = 0) -> Iterator[tuple[int, tuple[int, Grey]]]:
-    """Each scale's number from the finest on, how many times smaller its picture is, and its band.
+    """Yield each scale's index from the finest on, its downsampling factor, and its band.
 
-    The scales grow by √2: the blur that is taken off one (`band_pass.band`) is what the next but
-    one begins with. Four of them are of the first picture, and two of each smaller one.
+    The scales grow by √2, so that the wide blur of one is the narrow blur of the next but one.
+    Four of them are computed from the first picture, and two from each smaller one.
     """
     step, scale = 2 ** (finest // 2), finest
     picture = _smaller(picture, step)
     while scale < len(SCALES_PX) and min(picture.shape) >= 8:
         count = min(4 if scale == finest else 2, len(SCALES_PX) - scale)
-        lost = (1 - step**-2) / 12  # what averaging has blurred already, px²
+        lost = (1 - step**-2) / 12  # variance of the averaging in downsampling, px²
         blurred = [
             blur(
                 picture,
@@ -224,13 +225,13 @@ def _bands(picture: Picture, finest: int = 0) -> Iterator[tuple[int, tuple[int, 
             for k in range(scale, scale + count + 2)
         ]
         for k, (fine, wide) in enumerate(zip(blurred, blurred[2:], strict=False), scale):
-            # What the finer blur was written to is free for its difference.
+            # The finer blur is no longer needed and is overwritten by the difference.
             yield k, (step, np.asarray(cv2.subtract(fine, wide, dst=fine), np.float32))
         picture, step, scale = _smaller(picture, 2), 2 * step, scale + count
 
 
 def _smaller(picture: Picture, step: int) -> Picture:
-    """Make a picture so many times smaller, by the means of its pixels."""
+    """Downsample a picture by a factor, by averaging pixels."""
     if step == 1:
         return picture
     height, width = picture.shape
@@ -239,43 +240,43 @@ def _smaller(picture: Picture, step: int) -> Picture:
 
 
 def noise_gain(size: float) -> float:
-    """White noise before the band over white noise after it, for a dot of the given size."""
+    """Ratio of white noise before the band-pass to that after it, for the given dot size."""
     a, b = (0.8 * size) ** 2, (1.6 * size) ** 2
     power = 1 / (4 * np.pi) * (1 / a + 1 / b - 4 / (a + b))
     return float(1 / np.sqrt(power))
 
 
-def with_grain(band: Grey, white: float) -> float:
-    """Noise of a band-passed picture in which white noise would be so much.
+def band_noise(band: Grey, white: float) -> float:
+    """Estimate the noise of a band-passed picture; ``white`` is what white noise would give.
 
-    Noise with grain (compression, a soft sensor) passes more; the quieter half tells how much.
+    Correlated noise (compression, a soft sensor) passes the band more; the excess is estimated
+    from the median absolute value.
     """
     excess = 1.4826 * float(np.median(np.abs(band))) / max(white, 1e-9)
     return white * min(max(1.0, excess), 3.0)
 
 
-_own = threading.local()
+_local = threading.local()
 
 
 def scratch(name: str, shape: tuple[int, int]) -> Grey:
-    """Return this thread's picture of a name to write on, shape (height, width).
+    """Return this thread's scratch picture of the given name, shape (height, width).
 
-    Frames of one size follow on each other: made anew for each, pictures would cost as much as the
-    work on them.
+    It is reused for frames of the same size, since allocation would take as long as the filters.
     """
-    kept: dict[str, Grey] = _own.__dict__
+    buffers: dict[str, Grey] = _local.__dict__
     count = shape[0] * shape[1]
-    if name not in kept or kept[name].size < count:
-        kept.pop(name, None)
-        made = np.empty(count, np.float32)
-        if made.nbytes > KEPT_BYTES:
-            return made.reshape(shape)
-        kept[name] = made
-    return kept[name][:count].reshape(shape)
+    if name not in buffers or buffers[name].size < count:
+        buffers.pop(name, None)
+        buffer = np.empty(count, np.float32)
+        if buffer.nbytes > KEPT_BYTES:
+            return buffer.reshape(shape)
+        buffers[name] = buffer
+    return buffers[name][:count].reshape(shape)
 
 
 def blur(picture: Picture, sigma: float, into: Grey | None = None) -> Grey:
-    """Blur by a Gaussian, px; of bytes no other picture is made in between."""
+    """Blur by a Gaussian of the given standard deviation, px, without an intermediate copy."""
     taps = kernel(sigma)
     edge = cv2.BORDER_REFLECT
     return np.asarray(
@@ -285,7 +286,7 @@ def blur(picture: Picture, sigma: float, into: Grey | None = None) -> Grey:
 
 @lru_cache(maxsize=64)
 def kernel(sigma: float) -> Grey:
-    """Gaussian weights of pixels on a line; kept, as a recording has one size of dot."""
+    """One-dimensional Gaussian kernel; cached, as the dot size is constant in a recording."""
     taps = cv2.getGaussianKernel(round(8 * sigma + 1) | 1, sigma, cv2.CV_32F)
     line = np.asarray(taps, np.float32).ravel()
     line.flags.writeable = False
@@ -293,6 +294,6 @@ def kernel(sigma: float) -> Grey:
 
 
 def peak_disc(size: float) -> BoolArray:
-    """Pixels round a peak that none of may be brighter: a mask, shape (side, side)."""
+    """Neighbourhood in which a peak must be the maximum: a disc mask, shape (side, side)."""
     reach = 2 * max(1, round(1.2 * size)) + 1
     return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach)), bool)

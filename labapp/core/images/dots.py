@@ -1,7 +1,7 @@
-"""Reflected dots and how well each is known (§5.2.1, §5.3).
+"""Reflected dots and their uncertainties (§5.2.1, §5.3).
 
-`find_dots` finds them: by the default detector, `band_pass`, or by the text's two chains, which are
-in `threshold_dots`. The former's settings are here: they are read where nothing is measured, too.
+`find_dots` finds them, by the default detector, `band_pass`, or by one of the dissertation's two in
+`threshold_dots`. The default detector's settings are here, so that reading them does not load it.
 """
 
 from __future__ import annotations
@@ -55,18 +55,18 @@ class Dots(ReadOnlyArrays):
 
 @dataclass(frozen=True)
 class BandPassSettings:
-    """How the default detector decides.
+    """Settings of the default detector.
 
     Parameters
     ----------
     size_px
         Standard deviation of a dot's light; None: estimated from the frame.
     threshold
-        A dot's band-passed peak stands this many local noise σ above the background.
+        Least height of a dot's band-passed peak above the background, in local noise σ.
     contrast
-        … and is at least this fraction of the frame's typical dot.
+        Least height of that peak as a fraction of the frame's typical dot.
     speckle_px
-        Part of the position's uncertainty that no signal-to-noise removes.
+        Part of the position's uncertainty that does not depend on the signal-to-noise ratio, px.
     """
 
     size_px: float | None = None

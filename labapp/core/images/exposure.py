@@ -1,4 +1,4 @@
-"""Frame and its dots → whether the exposure is right, in words, before anything is measured."""
+"""Assessment of a frame's exposure from its grey levels and dots, before it is measured."""
 
 from __future__ import annotations
 
@@ -16,19 +16,19 @@ from labapp.core.values import BoolArray, FloatArray
 Verdict = Literal["blank", "no dots", "too dark", "saturated", "dots merge", "low contrast", "good"]
 
 CLIPPED_DOTS = 0.05
-"""A frame is saturated if more than this part of its dots is clipped …"""
+"""A frame is saturated if more than this share of its dots is clipped."""
 
 CLIPPED_PIXELS = 0.02
-"""… or, where none is found, of its pixels."""
+"""A frame without dots is saturated if more than this share of its pixels is clipped."""
 
 FAINT_SNR = 7.0
-"""Below it the noise moves a dot by more than its speckle does: 0.8/SNR > 0.12 px."""
+"""Below this, noise shifts a dot by more than speckle does: 0.8/SNR > 0.12 px."""
 
 DARK = 0.25
-"""Faint dots whose brightest level is below this part of the full scale are under-exposed."""
+"""Faint dots whose brightest level is below this fraction of full scale are under-exposed."""
 
 MERGING = 0.4
-"""Dots begin to be lost when the valley between a tenth of them and their neighbours is flatter."""
+"""Dots begin to be lost if a tenth of the valleys between neighbours are shallower than this."""
 
 AROUND = 4.0
 """The background of a dot is the darkest place within this many distances to neighbours."""
@@ -51,19 +51,19 @@ class Exposure:
     Parameters
     ----------
     level
-        Level of the bright dots (of the bright pixels, where there is no dot) as part of the full
+        Level of the bright dots (of the bright pixels, if there are no dots) as a fraction of full
         scale, 0 … 1.
     clipped
-        Part of the dots (of the pixels) that is clipped, 0 … 1.
+        Fraction of the dots (of the pixels) that is clipped, 0 … 1.
     contrast
-        A typical dot's height above its background as part of its level, 0 … 1; 0 without dots.
+        A typical dot's height above its background over its level, 0 … 1; 0 without dots.
     snr
         A typical dot's height over the noise; 0 without dots.
     valley
-        Depth of the valley between close neighbours as part of their height: 1 where they stand
-        apart, 0 where they have run together; NaN without neighbours.
+        Depth of the valley between close neighbours over their height: 1 if they are separate, 0
+        if they have merged; NaN without neighbours.
     verdict
-        One or two words.
+        The result, in one or two words.
     """
 
     level: float
@@ -75,22 +75,22 @@ class Exposure:
 
     @property
     def advice(self) -> str:
-        """What it means, or what to do, in a sentence."""
+        """Advice to the operator, in a sentence."""
         return ADVICE[self.verdict]
 
 
 def judge_exposure(image: Image, dots: Dots | None, bit_depth: int | None) -> Exposure:
-    """Judge a frame's exposure by its grey levels and the dots found in it.
+    """Assess a frame's exposure from its grey levels and the dots found in it.
 
     Parameters
     ----------
     image
         Grey levels, shape (rows, columns).
     dots
-        The dots found in it; None or no dot where none stands out.
+        The dots found in it; None or empty if there are none.
     bit_depth
-        Significant bits of a grey level; None (or 32, of float levels) where the full scale is not
-        known: then the brightest pixel stands for it.
+        Significant bits of a grey level. None (or 32, for float levels) if full scale is unknown;
+        the brightest pixel is then used.
     """
     grey = np.asarray(image, np.float32)
     top = float(grey.max(initial=0.0))
@@ -126,7 +126,7 @@ def _without_dots(grey: Grey, level: float, clipped: float) -> Verdict:
 
 
 def _clipped(grey: Grey, full: float) -> BoolArray:
-    """Pixels at full scale, and plateaus at the brightest level: a 12-bit camera's 16-bit file."""
+    """Pixels at full scale, or on plateaus at the brightest level (12-bit data in 16-bit files)."""
     top = (grey == grey.max(initial=0.0)) & (np.ptp(grey) > 0 if grey.size else False)
     cross = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
     plateau = cv2.erode(top.astype(np.uint8), cross, borderValue=0).astype(bool)
@@ -134,7 +134,7 @@ def _clipped(grey: Grey, full: float) -> BoolArray:
 
 
 def _valley(grey: Grey, dots: Dots) -> float:
-    """Tenth percentile of the depths half-way between each dot and its nearest neighbour."""
+    """Tenth percentile of the valley depths half-way between dots and their nearest neighbours."""
     if len(dots) < 2:
         return float("nan")
     smooth = cv2.GaussianBlur(grey, (0, 0), 1.0)

@@ -1,4 +1,4 @@
-"""Frame → Dots, by the default detector or by one of the text's two (§5.2.1, §5.3)."""
+"""Frame → Dots, by the default detector or by one of the dissertation's two (§5.2.1, §5.3)."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from labapp.core.values import CannotMeasure
 
 @dataclass(frozen=True)
 class DotSettings:
-    """Which detector finds the dots, and how each decides.
+    """Choice of the detector, and the settings of each.
 
     Parameters
     ----------
     method
         ``band-pass`` (the default), ``block-threshold`` (§5.2.1) or ``wavelet`` (§5.3).
     band_pass, block_threshold, wavelet
-        Settings of each; only those of the method count.
+        Settings of each; only those of ``method`` are used.
     """
 
     method: Literal["band-pass", "block-threshold", "wavelet"] = "band-pass"
@@ -54,7 +54,7 @@ def find_dots(frame: Image, settings: DotSettings) -> Dots:
 
 
 def find_mirror_dots(frame: Image, settings: DotSettings) -> Dots:
-    """Find the dots of a plate, ball or cap: those of the default detector are fitted together.
+    """Find the dots of a flat mirror, ball or cap; the default detector fits them jointly.
 
     Raises
     ------

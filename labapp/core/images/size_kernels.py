@@ -1,6 +1,6 @@
-"""Loops that tell a frame's noise and the size of its dots, compiled (`dot_size`).
+"""Inner loops of the estimates of noise and dot size, compiled (`dot_size`, docs/adr/0018).
 
-Arrays may be read-only, and of any layout but for pictures (docs/adr/0018).
+Arrays may be read-only; pictures must be contiguous, other arrays need not be.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ _ints = types.Array(_i, 1, "A", readonly=True)
 
 @_compiled_for(*((own, _i, _i) for own in (_grey, _byte)))
 def tile_noise(image: Picture, rows: int, columns: int) -> Grey:
-    """Noise of a picture's tiles, shape (rows, columns): see `dot_size.local_noise`.
+    """Estimate the noise in a picture's tiles, shape (rows, columns); see `dot_size.local_noise`.
 
-    Every second pixel of every second row stands for the others.
+    Every second pixel of every second row is used.
     """
     height, width = image.shape
-    made = np.empty((rows, columns), np.float32)
+    result = np.empty((rows, columns), np.float32)
     for i in range(rows):
         top, bottom = max(i * height // rows, 1), min((i + 1) * height // rows, height - 1)
         for j in range(columns):
@@ -42,23 +42,23 @@ def tile_noise(image: Picture, rows: int, columns: int) -> Grey:
                     ends += float(image[v - 1, u + 1]) + float(image[v + 1, u - 1])
                     some[count] = abs(4.0 * float(image[v, u]) - 2.0 * sides + ends) / 6.0
                     count += 1
-            made[i, j] = np.median(some)
-    return made
+            result[i, j] = np.median(some)
+    return result
 
 
 @_compiled(_grey, _ints, _ints, _f)
 def answers(band: Grey, u: IntArray, v: IntArray, step: float) -> FloatArray:
-    """Largest value of a picture, made smaller ``step``-fold, about each pixel of the large one."""
+    """Largest of 3 × 3 values of a ``step`` times smaller picture about each full-size pixel."""
     height, width = band.shape
-    made = np.empty(len(u))
+    result = np.empty(len(u))
     for k in range(len(u)):
         x, y = round((u[k] + 0.5) / step - 0.5), round((v[k] + 0.5) / step - 0.5)
         most = -np.inf
         for at_y in range(max(y - 1, 0), min(y + 2, height)):
             for at_x in range(max(x - 1, 0), min(x + 2, width)):
                 most = max(most, band[at_y, at_x])
-        made[k] = most
-    return made
+        result[k] = most
+    return result
 
 
 @_compiled(_f2, _f1, _f2, _f1, _f, _f)
@@ -70,15 +70,15 @@ def parts(
     within: float,
     share: float,
 ) -> BoolArray:
-    """Whether a whole lies within some distance of each place that has this share of its strength.
+    """Whether each place is near a whole with at least a share of the place's strength.
 
     Places and wholes have shapes (n, 2) and (m, 2).
     """
-    made = np.zeros(len(places), np.bool_)
+    result = np.zeros(len(places), np.bool_)
     for k in range(len(places)):
         for m in range(len(wholes)):
             x, y = places[k, 0] - wholes[m, 0], places[k, 1] - wholes[m, 1]
             if x * x + y * y <= within * within and of_whole[m] >= share * strength[k]:
-                made[k] = True
+                result[k] = True
                 break
-    return made
+    return result

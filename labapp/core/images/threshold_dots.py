@@ -1,4 +1,4 @@
-"""The dissertation's two chains from a frame to Dots: block threshold (§5.2.1), wavelet (§5.3)."""
+"""The dissertation's two dot detectors: block threshold (§5.2.1) and wavelet (§5.3)."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ Frame = npt.NDArray[Any]
 
 @dataclass(frozen=True)
 class BlockThresholdSettings:
-    """What §5.2.1 chooses for 480 × 640 frames of 256 grey levels.
+    """Settings of the block threshold; defaults of §5.2.1 for 480 × 640 frames of 256 grey levels.
 
     Parameters
     ----------
     block_px
         Side of a block R_i, px; the frame is divided evenly into blocks of about this size.
     delta_grey
-        ΔI of Eq. 5-9, in 256ths of the range of the frame's type: on a 16-bit frame it is
-        multiplied by 257; on a frame of floats it is taken as it stands.
+        ΔI of Eq. 5-9, in 256ths of the range of the frame's type: it is multiplied by 257 for a
+        16-bit frame and used unchanged for a frame of floats.
     median_px
         Side of the median filter, px (odd).
     size_divisor
-        A dot smaller than the average size over this is noise (Eq. 5-11).
+        Regions smaller than the average size divided by this are noise (Eq. 5-11).
     dilation
-        Part of L_a and W_a to dilate by. The text has the whole, which runs dots together that
-        stand closer than about twice their own width.
+        Dilation as a fraction of L_a and W_a. The text uses 1, which merges dots that are closer
+        than about twice their width.
     """
 
     block_px: int = 40
@@ -44,23 +44,23 @@ class BlockThresholdSettings:
 
 @dataclass(frozen=True)
 class WaveletSettings:
-    """The improved chain of §5.3; the text names the steps and leaves the numbers open.
+    """Settings of the improved detector of §5.3; the text names the steps but not the values.
 
     Parameters
     ----------
     denoise_px
-        Side of the Gaussian that takes out the camera's noise, px (odd).
+        Side of the Gaussian filter that reduces the camera's noise, px (odd).
     wavelet, levels
         Wavelet and number of levels; 2**levels px is the scale above which light is background.
     background
         Factor on the coarsest approximation: 0 removes it.
     soft_threshold
-        Details are shrunk by this many standard deviations of the camera's noise.
+        Soft threshold for the details, in standard deviations of the camera's noise.
     window_px
         Side of the adaptive threshold's window, px (odd).
     offset_sigma
-        The adaptive threshold lies this many standard deviations of the camera's noise above the
-        mean of its window.
+        Offset of the adaptive threshold above the mean of its window, in standard deviations of
+        the camera's noise.
     median_px, closing_px
         Sides of the median filter and of the square that dilates, then erodes, px (odd).
     """
@@ -84,7 +84,7 @@ def block_threshold_dots(frame: Frame, settings: BlockThresholdSettings | None =
     frame
         Grey levels, shape (rows, columns), of any integer or float type.
     settings
-        None for the text's.
+        None for those of the text.
 
     Returns
     -------
@@ -102,8 +102,8 @@ def block_threshold_dots(frame: Frame, settings: BlockThresholdSettings | None =
     binary: Frame = (grey > _block_means(grey, settings.block_px) + delta).astype(np.uint8)
     binary = cv2.medianBlur(binary, settings.median_px)
 
-    # Eq. 5-10 and 5-11. S_a is the average after the median filter: before it, the grains that
-    # the filter is there to remove would make up most of the average.
+    # Eq. 5-10 and 5-11. S_a is the average after the median filter; before it, most regions are
+    # the small noise regions that the filter removes.
     labels, boxes = _components(binary)
     if len(boxes) == 0:
         return _dots(labels, 0, grey, frame.dtype)
@@ -158,8 +158,8 @@ def wavelet_dots(frame: Frame, settings: WaveletSettings | None = None) -> Dots:
 
 
 def _enhance(grey: FloatArray, noise: float, settings: WaveletSettings) -> FloatArray:
-    """Damp the coarsest approximation and shrink the details by the noise, shape as given."""
-    import pywt  # not needed by the usual chain
+    """Attenuate the coarsest approximation and soft-threshold the details, shape as given."""
+    import pywt  # not needed by the default detector
 
     levels = min(settings.levels, pywt.dwtn_max_level(grey.shape, settings.wavelet))
     if levels < 1:
@@ -204,21 +204,21 @@ def _block_means(grey: FloatArray, block_px: int) -> FloatArray:
 
 
 def _odd(extent: float) -> int:
-    """Return the odd length nearest to an extent, so that a dilation moves no centre."""
+    """Return the odd length nearest to an extent, so that a dilation is symmetric."""
     return 2 * int(extent / 2.0) + 1
 
 
 def _components(binary: Frame) -> tuple[npt.NDArray[np.int32], Any]:
-    """Labels from 1 and the statistics of each, without the background's."""
+    """Label connected regions from 1, with the statistics of each, without the background's."""
     _, labels, boxes, _ = cv2.connectedComponentsWithStats(binary, connectivity=8)
     return np.asarray(labels, np.int32), boxes[1:]
 
 
 def _noise(grey: FloatArray, dtype: np.dtype[Any]) -> float:
-    """Standard deviation of white noise, from the frame less its 3 × 3 mean.
+    """Standard deviation of white noise, from the frame minus its 3 × 3 mean.
 
-    Estimated by the median absolute deviation, so that dots do not count. Never below the
-    rounding of integer grey levels.
+    Estimated by the median absolute deviation, which is robust to dots. Not less than the
+    rounding error of integer grey levels.
     """
     fine = grey - cv2.blur(grey, (3, 3))
     sigma = 1.4826 * float(np.median(np.abs(fine - np.median(fine)))) / np.sqrt(8.0 / 9.0)
@@ -227,7 +227,7 @@ def _noise(grey: FloatArray, dtype: np.dtype[Any]) -> float:
 
 
 def _local_background(grey: FloatArray, dark: BoolArray, window_px: int = 41) -> FloatArray:
-    """Mean of the pixels that belong to no dot in a window round each pixel, shape as given."""
+    """Mean of the pixels outside dots in a window about each pixel, shape as given."""
     window = (window_px, window_px)
     weight = cv2.blur(dark.astype(np.float64), window)
     light = cv2.blur(np.where(dark, grey, 0.0), window)
@@ -244,10 +244,10 @@ def _dots(
 
         σ_u = sqrt(1/12 + (w / snr)²),  w² = variance of the region's pixels along u:
 
-    the region's ends are whole pixels (1/12), and noise moves its contour by a part of its width
-    that falls with the signal-to-noise ratio. On rendered frames this covers the errors of both
-    chains where a region is one dot; it knows nothing of two dots that were run together.
-    The size is that of the light within the region: a third low where the region is tight.
+    the region's ends are whole pixels (1/12), and noise moves its contour by a fraction of its
+    width that falls with the signal-to-noise ratio. On rendered frames this covers the errors of
+    both detectors if a region is one dot; it does not account for merged dots. The size is that of
+    the light within the region, which is a third too small if the region is tight.
     """
     if count == 0:
         return Dots(*(np.empty(0) for _ in range(7)))

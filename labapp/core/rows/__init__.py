@@ -1,1 +1,1 @@
-"""Rows and columns of the dots, found or corrected by hand."""
+"""Rows and columns of the dots, found automatically or corrected by the operator."""

@@ -1,11 +1,11 @@
-"""Dots and rows as the operator left them, and the edits that lead there (§5.2.2, §5.3).
+"""The operator's correction of a frame's dots and rows, and its edits (§5.2.2, §5.3).
 
-A correction is absolute: what was seen and confirmed is what is measured, whatever a later
-detector would find. Every edit is a function that returns a new correction. A wrong dot, row or
-number raises ValueError with a sentence for the operator; the correction is then as it was.
+A correction is absolute: the dots and rows that the operator confirmed are measured, independently
+of what a later detector would find. Every edit is a function that returns a new correction. An
+invalid dot, row or number raises ValueError with a message for the operator.
 
-Rows are counted from the bottom up and columns from left to right, both from 1. Edits may name
-numbers below 1 (a row under the lowest): all rows or columns are then counted anew.
+Rows are counted from the bottom up and columns from left to right, both from 1. Edits may use
+numbers below 1 (a row below the lowest): all rows or columns are then renumbered from 1.
 """
 
 from __future__ import annotations
@@ -22,29 +22,29 @@ from labapp.core.rows.lattice import Lattice, Site, find_holes
 from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 
 PLACED_PX = 0.5
-"""A dot that was moved by hand is at least so uncertain, px."""
+"""Least standard uncertainty of a dot that was moved by hand, px."""
 
 MOST = 1000
-"""Rows and columns are no farther than this from 0: no pattern has so many."""
+"""Largest absolute value of a row or column number; no pattern has so many."""
 
-_NONE = -(10**9)  # no row, no column, while numbers below 1 may stand for one
+_NONE = -(10**9)  # no row or column, while numbers below 1 are valid
 
 Indices = Sequence[int] | IntArray
 
 
 @dataclass(frozen=True)
 class Correction(ReadOnlyArrays):
-    """The dots and rows of one frame as the operator left them.
+    """The dots and rows of one frame as the operator corrected them.
 
     Parameters
     ----------
     dots
-        The dots, n of them.
+        The n dots.
     lattice
-        Their rows and columns, 0 for none; a dot may have the one without the other. No two dots
-        have the same site. Its reference is binding, and so are its blocked rows.
+        Their rows and columns, 0 for none; a dot may have only one of them. No two dots have the
+        same site. Its reference and its blocked rows are not determined anew.
     manual
-        Which dots were placed, moved or given a row or column by hand, shape (n,).
+        Whether each dot was placed, moved or assigned a row or column by hand, shape (n,).
 
     Raises
     ------
@@ -62,22 +62,22 @@ class Correction(ReadOnlyArrays):
         row, column = self.lattice.row, self.lattice.column
         columns = [getattr(self.dots, field.name) for field in fields(Dots)]
         if {array.shape for array in (*columns, row, column, self.manual)} != {(len(self.dots),)}:
-            raise ValueError("every dot needs a place, a row, a column and a mark")
+            raise ValueError("dots, rows, columns and manual must have the same length")
         if min(row.min(initial=0), column.min(initial=0)) < 0:
             raise ValueError("rows and columns are counted from 1")
         shared = _shared(row, column)
         if shared is not None:
             one, other = shared
             raise ValueError(
-                f"row {row[one]}, column {column[one]} is the place of {named(self.dots, one)} "
-                f"and cannot be that of {named(self.dots, other)} too"
+                f"row {row[one]}, column {column[one]} is already assigned to "
+                f"{named(self.dots, one)} and cannot be assigned to {named(self.dots, other)} too"
             )
 
     @classmethod
     def of(cls, dots: Dots | None, lattice: Lattice | None) -> Correction:
-        """Start from what was found; rows and columns are 0 where none were.
+        """Start from the dots and rows that were found; None for none.
 
-        Dots that a search put on one site are left in doubt.
+        Dots that a search assigned to the same site get no row and column.
         """
         if dots is None:
             dots = Dots(*(np.zeros(0) for _ in fields(Dots)))
@@ -94,7 +94,7 @@ class Correction(ReadOnlyArrays):
 
     @property
     def sited(self) -> BoolArray:
-        """Which dots have both a row and a column, shape (n,)."""
+        """Whether each dot has both a row and a column, shape (n,)."""
         return np.asarray((self.lattice.row > 0) & (self.lattice.column > 0))
 
 
@@ -105,19 +105,24 @@ def add_dot(
     v_px: float,
     settings: BandPassSettings | None = None,
 ) -> Correction:
-    """Add the dot that is pointed at, as the last one, without a row.
+    """Append the dot at the pointer, without a row and column.
 
-    It snaps to the peak under the pointer; where there is none it is placed as pointed at, with
-    the size of a dot for its uncertainty (see `dot_at`).
+    It snaps to the peak under the pointer. If there is none, it is placed at the pointer, with the
+    size of a dot as its uncertainty (see `dot_at`).
 
     Parameters
     ----------
     image
         Grey frame, shape (height, width).
     u_px, v_px
-        Where the pointer is, px.
+        Position of the pointer, px.
     settings
-        Of the band-pass detector.
+        Settings of the band-pass detector.
+
+    Raises
+    ------
+    ValueError
+        If the position is outside the frame or at an existing dot.
     """
     if image.ndim != 2 or not (_inside(u_px, image.shape[1]) and _inside(v_px, image.shape[0])):
         raise ValueError(f"({u_px:g}, {v_px:g}) px is not in the frame")
@@ -142,7 +147,7 @@ def add_dot(
 
 
 def delete_dots(correction: Correction, dots: Indices) -> Correction:
-    """Take dots out; those after them move up in the count."""
+    """Delete dots; the indices of later dots decrease."""
     keep = np.delete(np.arange(len(correction.dots)), _chosen(correction, dots))
     lattice = correction.lattice
     return _rebuilt(
@@ -155,7 +160,7 @@ def delete_dots(correction: Correction, dots: Indices) -> Correction:
 
 
 def move_dots(correction: Correction, dots: Indices, du_px: float, dv_px: float) -> Correction:
-    """Move dots by (du, dv), px. They become as uncertain as a hand is steady (`PLACED_PX`)."""
+    """Move dots by (du, dv), px; their standard uncertainty is then at least `PLACED_PX`."""
     if not (abs(du_px) < 1e5 and abs(dv_px) < 1e5):
         raise ValueError(f"dots cannot be moved by ({du_px:g}, {dv_px:g}) px")
     moved = _mask(correction, dots)
@@ -173,7 +178,7 @@ def move_dots(correction: Correction, dots: Indices, du_px: float, dv_px: float)
 def assign(
     correction: Correction, dots: Indices, row: int | None = None, column: int | None = None
 ) -> Correction:
-    """Give dots a row, a column or both. Refused where another dot has that site."""
+    """Assign a row, a column or both to dots; ValueError if another dot has that site."""
     if row is None and column is None:
         raise ValueError("a row or a column is needed")
     chosen = _mask(correction, dots)
@@ -186,9 +191,9 @@ def assign(
 
 
 def clear_rows(correction: Correction, dots: Indices) -> Correction:
-    """Put dots back into doubt: no row, no column.
+    """Remove the row and column of dots.
 
-    The surface may still tell their rays; a dot that is to count for nothing has to be deleted.
+    Their rays may still be determined from the surface; a dot to be ignored has to be deleted.
     """
     chosen = _mask(correction, dots)
     sites = _Sites.of(correction)
@@ -197,7 +202,7 @@ def clear_rows(correction: Correction, dots: Indices) -> Correction:
 
 
 def shift_row(correction: Correction, row: int, columns: int) -> Correction:
-    """Shift a whole row by columns: right if positive. A reference in it goes along."""
+    """Shift a row, and the reference if it is in it, by a number of columns; right if positive."""
     sites = _Sites.of(correction)
     chosen = sites.dots_in(row) & (sites.column != _NONE)
     sites.column[chosen] += _number(columns, "number of columns")
@@ -207,17 +212,17 @@ def shift_row(correction: Correction, row: int, columns: int) -> Correction:
 
 
 def split_row(correction: Correction, row: int, column: int, above: bool = True) -> Correction:
-    """Split a row in two: from ``column`` on it becomes a row of its own, next to the old one.
+    """Split a row in two: the dots from ``column`` on form a new row above or below the old one.
 
-    The new row comes above what is left of the old one, or below; the rows beyond are counted
-    on. A reference and a blocked mark go with their part, the mark with both.
+    Higher rows are renumbered. The reference moves with its part; if the row is blocked, both parts
+    are.
     """
     sites = _Sites.of(correction)
     inside = sites.dots_in(row)
     part = inside & (sites.column >= _number(column, "column"))
     if not part.any() or part.sum() == inside.sum():
         raise ValueError(f"row {row} has no dots on both sides of column {column}")
-    # The upper of the two is counted on, with all rows above.
+    # The upper part and all rows above it move up by one.
     upper = part if above else inside & ~part
     sites.row[upper | (sites.row > row)] += 1
     if sites.reference is not None:
@@ -230,7 +235,7 @@ def split_row(correction: Correction, row: int, column: int, above: bool = True)
 
 
 def merge_rows(correction: Correction, row: int, into: int) -> Correction:
-    """Make one row of two: the dots of ``row`` go into the other, the rows above close up."""
+    """Merge the dots of ``row`` into another row; rows above ``row`` move down by one."""
     if row == into:
         raise ValueError(f"row {row} cannot be merged with itself")
     sites = _Sites.of(correction)
@@ -248,9 +253,9 @@ def merge_rows(correction: Correction, row: int, into: int) -> Correction:
 
 
 def block_row(correction: Correction, row: int, blocked: bool = True) -> Correction:
-    """Mark a row as one with dots hidden by the torch, or as one without.
+    """Set whether a row has dots hidden by the torch.
 
-    Where dots of a blocked row are missing, their rays say nothing about the boundary.
+    Missing dots of a blocked row are not used as evidence for the boundary.
     """
     sites = _Sites.of(correction)
     if blocked:
@@ -263,7 +268,7 @@ def block_row(correction: Correction, row: int, blocked: bool = True) -> Correct
 
 
 def set_reference(correction: Correction, site: Site | None) -> Correction:
-    """Say at which site (k, t) the reference is; None leaves it to be found."""
+    """Set the site (k, t) of the reference; None for automatic."""
     sites = _Sites.of(correction)
     if site is not None:
         site = _number(site[0], "row"), _number(site[1], "column")
@@ -272,13 +277,13 @@ def set_reference(correction: Correction, site: Site | None) -> Correction:
 
 
 def named(dots: Dots, index: int) -> str:
-    """Say which dot it is, for the operator."""
+    """Describe a dot by its index and position, for messages."""
     return f"dot {index} at ({dots.u_px[index]:.1f}, {dots.v_px[index]:.1f}) px"
 
 
 @dataclass
 class _Sites:
-    """Rows, columns, reference and blocked rows while an edit is made; numbers may be below 1."""
+    """Rows, columns, reference and blocked rows during an edit; numbers may be below 1."""
 
     row: IntArray
     column: IntArray
@@ -292,14 +297,14 @@ class _Sites:
         return cls(row, column, lattice.reference, set(lattice.blocked_rows))
 
     def dots_in(self, row: int) -> BoolArray:
-        """Which dots are in a row, of which there must be some."""
+        """Mask of the dots in a row; ValueError if there are none."""
         chosen = np.asarray(self.row == _number(row, "row"))
         if not chosen.any():
             raise ValueError(f"row {row} has no dots")
         return chosen
 
     def applied(self, correction: Correction, by_hand: BoolArray) -> Correction:
-        """The correction with these sites, counted from 1, and more dots marked."""
+        """Return the correction with these sites, renumbered from 1, and more manual dots."""
         reference = self.reference or (1, 1)
         up = _shortfall(self.row, [reference[0], *self.blocked])
         right = _shortfall(self.column, [reference[1]])
@@ -313,13 +318,13 @@ class _Sites:
 
 
 def _shortfall(numbers: IntArray, others: list[int]) -> int:
-    """By how much all numbers have to grow for the least to be 1; 0 if it is."""
+    """Offset by which all numbers must increase for the least to be 1; 0 if none is below 1."""
     numbers = numbers[numbers != _NONE]
     return 1 - min(1, *others, int(numbers.min(initial=1)))
 
 
 def _rebuilt(correction: Correction) -> Correction:
-    """The correction with the sites that could be the reference, as the dots now lie."""
+    """Recompute the candidate sites of the reference for the current dots and rows."""
     lattice, dots = correction.lattice, np.flatnonzero(correction.sited)
     if lattice.reference is not None:
         return replace(correction, lattice=replace(lattice, candidates=(lattice.reference,)))
@@ -330,7 +335,7 @@ def _rebuilt(correction: Correction) -> Correction:
 
 
 def _shared(row: IntArray, column: IntArray) -> tuple[int, int] | None:
-    """Two dots that have one site, the first of them first; None if no two have."""
+    """Find two dots with the same site, in ascending order; None if there are none."""
     dots = np.flatnonzero((row > 0) & (column > 0))
     order = dots[np.lexsort((dots, column[dots], row[dots]))]
     for one, other in pairwise(order.tolist()):
@@ -340,7 +345,7 @@ def _shared(row: IntArray, column: IntArray) -> tuple[int, int] | None:
 
 
 def _each(function: Callable[..., FloatArray], *dots: Dots) -> Dots:
-    """Dots made column by column."""
+    """Apply a function to each field of dots."""
     return Dots(*(function(*(getattr(d, column.name) for d in dots)) for column in fields(Dots)))
 
 
@@ -349,7 +354,7 @@ def _chosen(correction: Correction, dots: Indices) -> IntArray:
     if chosen.ndim != 1 or len(chosen) == 0:
         raise ValueError("no dot is selected")
     if chosen.dtype.kind not in "iu":
-        raise ValueError("dots are chosen by their numbers")
+        raise ValueError("dots must be given by their integer indices")
     wrong = chosen[(chosen < 0) | (chosen >= len(correction.dots))]
     if len(wrong):
         raise ValueError(f"there is no dot {wrong[0]}; there are {len(correction.dots)}, from 0")
@@ -364,7 +369,7 @@ def _mask(correction: Correction, dots: Indices) -> BoolArray:
 
 def _number(value: int, what: str) -> int:
     if abs(value) > MOST:
-        raise ValueError(f"{value} is no {what} of a dot matrix")
+        raise ValueError(f"{value} is not a valid {what}; its absolute value is at most {MOST}")
     return int(value)
 
 

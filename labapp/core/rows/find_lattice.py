@@ -1,4 +1,4 @@
-"""Dots → Lattice, by the default search or by one of the text's two (§5.2.2, §5.3)."""
+"""Dots → Lattice, by the default search or by one of the dissertation's two (§5.2.2, §5.3)."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from labapp.core.rows.row_search import MaskRowsSettings, RowSearchSettings, mas
 
 @dataclass(frozen=True)
 class LatticeSettings:
-    """Which search finds rows and columns, and how each decides.
+    """Choice of the search for rows and columns, and the settings of each.
 
     Parameters
     ----------
     method
         ``grow`` (the default), ``rows`` (§5.2.2) or ``masks`` (§5.3).
     grow, rows, masks
-        Settings of each; only those of the method count.
+        Settings of each; only those of ``method`` are used.
     """
 
     method: Literal["grow", "rows", "masks"] = "grow"
@@ -35,7 +35,7 @@ def find_lattice(dots: Dots, frame_shape: tuple[int, int], settings: LatticeSett
     Raises
     ------
     CannotMeasure
-        ``too-few-dots`` or ``no-rows`` if none can be found.
+        ``too-few-dots`` or ``no-rows`` if no rows can be found.
     """
     if settings.method == "rows":
         return search_rows(dots, settings.rows)

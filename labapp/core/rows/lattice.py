@@ -14,24 +14,25 @@ Site = tuple[int, int]
 """Reflected row k and column t, counted from 1."""
 
 HOLE_DISTANCE = 0.25
-"""A site between two dots is a hole where no dot is nearer to their middle, in their distance."""
+"""A site between two dots is a hole if no dot is closer to their midpoint than this share of their
+distance."""
 
 _NEXT: tuple[Site, ...] = ((0, 1), (0, -1), (1, 0), (-1, 0))
 
 
 @dataclass(frozen=True)
 class Lattice(ReadOnlyArrays):
-    """Which reflected row and column each dot is in.
+    """The reflected row and column of each dot.
 
     Parameters
     ----------
     row, column
         Reflected row k (from the bottom up) and column t (from left to right) of each dot, both
-        counted from 1, shape (n,) for n dots; 0 where the dot is in doubt and has none.
+        counted from 1, shape (n,) for n dots; 0 for dots in doubt, which have none.
     reference
-        Site (k, t) of the absent centre dot, where one stands out; None where none does.
+        Site (k, t) of the absent centre dot; None if it is ambiguous or unknown.
     candidates
-        Every site (k, t) that could be the absent centre dot, the likeliest first.
+        All sites (k, t) that could be the absent centre dot, the likeliest first.
     blocked_rows
         Rows k with dots hidden by the torch.
     """
@@ -49,7 +50,7 @@ def lattice_of_sites(
     reference: Site | None = None,
     candidates: tuple[Site, ...] = (),
 ) -> Lattice:
-    """Build the lattice of ``count`` dots from the dot at each site (k, t), counted from 1."""
+    """Build the lattice of ``count`` dots from a mapping of sites (k, t), from 1, to dots."""
     row, column = np.zeros(count, np.int64), np.zeros(count, np.int64)
     for (k, t), dot in grid.items():
         row[dot], column[dot] = k, t
@@ -58,9 +59,9 @@ def lattice_of_sites(
 
 
 def find_holes(grid: dict[Site, int], dots: Dots) -> list[tuple[Site, int]]:
-    """Empty sites with lit neighbours left and right and on how many sides in all (3 or 4).
+    """Find empty sites with dots on the left and right, and on 3 or 4 sides in all.
 
-    ``grid`` is the dot at each site (k, t). The holes with most such sides come first.
+    ``grid`` maps sites (k, t) to dots. Returns sites and numbers of sides, 4 before 3.
     """
     if not grid:
         return []
@@ -86,7 +87,7 @@ def empty_sites(lattice: Lattice) -> list[Site]:
 
 
 def _blocked_rows(grid: dict[Site, int]) -> frozenset[int]:
-    """Rows that lack two or more neighbouring dots between lit ones: hidden by the torch."""
+    """Rows that lack two or more adjacent dots between others: hidden by the torch."""
     rows: dict[int, list[int]] = {}
     for k, t in grid:
         rows.setdefault(k, []).append(t)

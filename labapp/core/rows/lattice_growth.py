@@ -1,10 +1,11 @@
-"""The default search for rows and columns: a grid grows from neighbour to neighbour.
+"""The default search for rows and columns: region growing of a grid from dot to dot.
 
-Each new dot is predicted from the local steps both ways. Its contract: no dot is given a wrong row
-or column; a dot in doubt is given none. The text's two searches are in `row_search`.
+Each new dot is predicted from the local steps in both directions. The search is conservative: a dot
+in doubt gets no row and column rather than wrong ones. The dissertation's two searches are in
+`row_search`.
 
-A *grid* is an array of the dot at each site, −1 where there is none, shape (rows, columns). Places
-of dots are complex numbers here, u − iv, px: to the right and up.
+A *grid* is an array of the dot at each site, −1 if there is none, shape (rows, columns). Positions
+of dots are complex numbers here, u − iv, px: right and up.
 """
 
 from __future__ import annotations
@@ -19,30 +20,30 @@ from labapp.core.rows.lattice import Lattice, Site, find_holes, lattice_of_sites
 from labapp.core.values import BoolArray, CannotMeasure, ComplexArray, FloatArray, IntArray
 
 MOST_STEPS = 1000
-"""A grid grows no further than so many steps from the dot that it begins at."""
+"""Largest number of steps that a grid grows from its seed."""
 
 LEAST_SHARED = 4
-"""Grids are merged that have so many dots in common, not all on one line, in the same rows and
-columns."""
+"""Grids are merged if they have at least this many dots in common, not all on one line, and agree
+on their rows and columns."""
 
 MOST_SLIP, MOST_SLANT = 0.55, 0.7
-"""A row has slipped by a column where its columns slant by more than the first more than those of
-other rows, or by more than the second at all, in steps along the row: half a step and a little."""
+"""A row is misaligned by a column if the slant of its columns differs from that of other rows by at
+least the first, or is at least the second, in steps along the row: both slightly over a half."""
 
 
 @dataclass(frozen=True)
 class GrowSettings:
-    """How the default search decides.
+    """Settings of the default search.
 
     Parameters
     ----------
     gate
-        A dot is taken for a site if it lies within this fraction of the local step from where
-        the site is predicted.
+        A dot is assigned to a site if it lies within this fraction of the local step from the
+        site's predicted position.
     doubt
-        … and is left in doubt if another dot lies within this many times that distance.
+        It is left in doubt if another dot lies within this many times its distance from there.
     least, share
-        A grid of fewer dots, or of a smaller share of them, is no grid.
+        Least number of dots of a grid, and least share of all dots.
     """
 
     gate: float = 0.36
@@ -57,7 +58,7 @@ def grow_lattice(dots: Dots, settings: GrowSettings) -> Lattice:
     Raises
     ------
     CannotMeasure
-        ``too-few-dots`` if fewer dots than a grid needs were found, ``no-rows`` if they do not
+        ``too-few-dots`` if there are fewer dots than a grid needs, ``no-rows`` if they do not
         form one.
     """
     from labapp.core.rows.lattice_kernels import BORDER, grow
@@ -103,11 +104,11 @@ def grow_lattice(dots: Dots, settings: GrowSettings) -> Lattice:
 
 
 def merge_grids(grids: list[IntArray]) -> IntArray:
-    """Merge grids that overlap with the largest, as far as they agree on all dots they share.
+    """Merge the largest grid with the grids that overlap it and agree on all common dots.
 
-    Each is the dot at each site, −1 where there is none, shape (rows, columns); so is the result.
-    A gap between tiles of a pattern ends a grid's growth in most places, and not in all: grids of
-    two tiles then have some dots of each other.
+    Grids and result are arrays of the dot at each site, −1 if there is none, shape (rows, columns).
+    A gap between parts of a pattern may stop a grid's growth in most places but not in all; grids
+    of two parts then have dots in common.
     """
     first, *rest = sorted(grids, key=_count, reverse=True)
     whole = _site_of(first)
@@ -124,22 +125,22 @@ def merge_grids(grids: list[IntArray]) -> IntArray:
 
 
 def _site_of(grid: IntArray) -> dict[int, Site]:
-    """The site of each dot of a grid."""
+    """Map each dot of a grid to its site."""
     return {dot: (k, t) for k, t, dot in np.stack(_sites(grid), axis=-1).tolist()}
 
 
 def _sites_to_add(whole: dict[int, Site], other: dict[int, Site]) -> dict[int, Site] | None:
-    """Sites of another grid's further dots in a grid; None where the two do not agree."""
+    """Sites in a grid of the additional dots of another; None if the two do not agree."""
     shared = list(whole.keys() & other.keys())
     if len(shared) < LEAST_SHARED:
         return None
-    own, its = (np.array([sites[dot] for dot in shared]) for sites in (whole, other))
-    # What is a row of one may be a diagonal of the other.
-    turn, _, rank, _ = np.linalg.lstsq(_centered(its), _centered(own), rcond=None)
+    in_whole, in_other = (np.array([sites[dot] for dot in shared]) for sites in (whole, other))
+    # A row of one grid may be a diagonal of the other.
+    turn, _, rank, _ = np.linalg.lstsq(_centered(in_other), _centered(in_whole), rcond=None)
     if rank < 2:
         return None
     turn = np.rint(turn).astype(np.int64)
-    offset = own - its @ turn
+    offset = in_whole - in_other @ turn
     if abs(round(np.linalg.det(turn))) != 1 or np.ptp(offset, axis=0).any():
         return None
     sites = np.array(list(other.values())) @ turn + offset[0]
@@ -156,11 +157,11 @@ def _centered(sites: IntArray) -> FloatArray:
 
 
 def _seeds(plane: ComplexArray) -> list[tuple[int, complex, complex]]:
-    """Dots that lie midway between two neighbours, the most regular first.
+    """Find dots midway between two neighbours, the most regular first.
 
-    Returns triples of the dot, the step to such a neighbour, and the step across: to the other
-    such neighbour where there is one, otherwise to the nearest dot well off the first line (rows
-    may be ten times further apart than the dots within them).
+    Returns triples of the dot, the step to one of these neighbours, and a step in another
+    direction: to a neighbour of another such pair if there is one, or else to the nearest dot well
+    off the first line (the distance of rows may be ten times that of the dots within them).
     """
     points = np.stack([plane.real, plane.imag], axis=-1)
     near = scipy.spatial.cKDTree(points).query(points, k=min(41, len(points)))[1][:, 1:]
@@ -176,7 +177,7 @@ def _seeds(plane: ComplexArray) -> list[tuple[int, complex, complex]]:
         first = step[shortest]
         crossing = np.where(_sine_between(first, step) > 0.4, size, np.inf)
         off_line = _sine_between(first, offset) > 0.6
-    # A dot off the line is taken after all that have another one opposite.
+    # A dot off the line without an opposite one is the last choice.
     last = np.where(off_line.any(axis=1), np.finfo(float).max, np.inf)
     size_across = np.column_stack([crossing, last])
     across = np.column_stack([step, offset[dots, off_line.argmax(axis=1)]])
@@ -200,7 +201,7 @@ def _sine_between(first: ComplexArray, second: ComplexArray) -> FloatArray:
 
 
 def _largest_part(sites: IntArray) -> tuple[IntArray, IntArray, IntArray]:
-    """Row, column and dot of the largest connected part of what `grow` returns; none of one dot."""
+    """Row, column and dot of the largest part from `grow`; empty if it is a single dot."""
     k, t, dot, part = sites.T
     size = np.bincount(part)[part]
     kept = (part == part[size.argmax()]) & (size > 1)
@@ -208,43 +209,43 @@ def _largest_part(sites: IntArray) -> tuple[IntArray, IntArray, IntArray]:
 
 
 def _count(grid: IntArray) -> int:
-    """How many sites of a grid have a dot."""
+    """Number of dots of a grid."""
     return int((grid >= 0).sum())
 
 
 def _sites(grid: IntArray) -> tuple[IntArray, IntArray, IntArray]:
-    """Row, column and dot of each site that has one, shape (s,) each."""
+    """Row, column and dot of each occupied site, shape (s,) each."""
     k, t = np.nonzero(grid >= 0)
     return k, t, grid[k, t]
 
 
 def _grid_of(k: IntArray, t: IntArray, dot: IntArray) -> IntArray:
-    """Dot at each site, −1 where there is none, shape (rows, columns)."""
+    """Build the array of the dot at each site, −1 if there is none, shape (rows, columns)."""
     grid = np.full((np.ptp(k) + 1, np.ptp(t) + 1), -1)
     grid[k - k.min(), t - t.min()] = dot
     return grid
 
 
 def _places(grid: IntArray, plane: ComplexArray) -> ComplexArray:
-    """Place of each site's dot, px; NaN where there is none."""
+    """Position of each site's dot, px; NaN if there is none."""
     return np.where(grid >= 0, plane[grid], complex(np.nan, np.nan))
 
 
 def _reduced(grid: IntArray, plane: ComplexArray) -> IntArray:
-    """Index by the two shortest steps: a grid grown next to a hole may run along diagonals.
+    """Renumber a grid by its two shortest steps, since a grid grown at a hole may be diagonal.
 
-    Lagrange's reduction of the lattice, its inner products summed over the cells.
+    Lagrange's reduction of the lattice, with inner products summed over the cells.
     """
     place = _places(grid, plane)
     a, b = place[:-1, 1:] - place[:-1, :-1], place[1:, :-1] - place[:-1, :-1]
     with np.errstate(divide="ignore", invalid="ignore"):  # two dots in one place
         along, across = np.nansum(np.abs(a) / np.abs(b)), np.nansum(np.abs(b) / np.abs(a))
         mixed = np.nansum((a * b.conj()).real / (np.abs(a) * np.abs(b)))
-    row, column = (1, 0), (0, 1)  # how many times the old k and t go into the new k, the new t
+    row, column = (1, 0), (0, 1)  # coefficients of the old k and t in the new k and in the new t
     for _ in range(8):
         if 2 * abs(mixed) <= 1.05 * min(along, across):
             break
-        if along <= across:  # step over rows less as many steps along them
+        if along <= across:  # subtract a multiple of the step along rows from that across them
             m = round(mixed / along)
             column = column[0] + m * row[0], column[1] + m * row[1]
             mixed, across = mixed - m * along, across - 2 * m * mixed + m * m * along
@@ -253,14 +254,14 @@ def _reduced(grid: IntArray, plane: ComplexArray) -> IntArray:
             row = row[0] + m * column[0], row[1] + m * column[1]
             mixed, along = mixed - m * across, along - 2 * m * mixed + m * m * across
     rows, columns = (abs(a) * grid.shape[0] + abs(b) * grid.shape[1] for a, b in (row, column))
-    if rows * columns > 4 * MOST_STEPS**2:  # steps that differ so much are of no grid
+    if rows * columns > 4 * MOST_STEPS**2:  # degenerate steps
         return grid
     k, t, dot = _sites(grid)
     return _grid_of(row[0] * k + row[1] * t, column[0] * k + column[1] * t, dot)
 
 
 def _upright(grid: IntArray, plane: ComplexArray) -> IntArray:
-    """Turn the grid so that rows run left to right and are counted from the bottom up."""
+    """Orient the grid so that columns count from left to right and rows from the bottom up."""
     place = _places(grid, plane)
     along, across = np.diff(place, axis=1), np.diff(place, axis=0)
     level = [
@@ -277,11 +278,11 @@ def _upright(grid: IntArray, plane: ComplexArray) -> IntArray:
 
 
 def _without_slips(grid: IntArray, plane: ComplexArray) -> IntArray:
-    """Keep the most rows that hang together without a slip.
+    """Keep the largest block of adjacent rows without misalignment.
 
-    Neighbour by neighbour a row may be joined to the next one column off all along, or by dots of
-    two rows in turn. Its columns then slant by a whole step more than those of other rows, which
-    bowed and fanned rows do not.
+    A row may be joined to the next with an offset of one column, or from alternating dots of two
+    rows. Its columns then slant by a whole step more than those of other rows; those of curved or
+    fanned rows do not.
     """
     place = _places(grid, plane)
     with np.errstate(divide="ignore", invalid="ignore"):  # two dots in one place
@@ -289,15 +290,15 @@ def _without_slips(grid: IntArray, plane: ComplexArray) -> IntArray:
     slant = np.full(len(grid), np.nan)
     for k in np.nonzero(~np.isnan(lean).all(axis=1))[0]:
         slant[k + 1] = np.median(lean[k][~np.isnan(lean[k])])
-    usual = np.median(slant[~np.isnan(slant)]) if not np.isnan(slant).all() else 0.0
-    sound = (np.abs(slant - usual) < MOST_SLIP) & (np.abs(slant) < MOST_SLANT)
+    median_slant = np.median(slant[~np.isnan(slant)]) if not np.isnan(slant).all() else 0.0
+    sound = (np.abs(slant - median_slant) < MOST_SLIP) & (np.abs(slant) < MOST_SLANT)
     part = np.cumsum(~sound)
     kept: BoolArray = part == np.bincount(part, (grid >= 0).sum(axis=1)).argmax()
     return grid[kept]
 
 
 def _steps_along(place: ComplexArray) -> ComplexArray:
-    """Step along its row at each site: across it, or to the one neighbour there is, else NaN."""
+    """Step along the row at each site: central or one-sided difference, or NaN."""
     wide = np.pad(place, ((0, 0), (1, 1)), constant_values=np.nan)
     left, right = place - wide[:, :-2], wide[:, 2:] - place
     step = np.where(np.isnan(left), right, left)

@@ -1,6 +1,6 @@
-"""Inner loops of `lattice_growth`: a grid growing over the dots, compiled (docs/adr/0018).
+"""Inner loops of `lattice_growth`, the growth of a grid over the dots, compiled (docs/adr/0018).
 
-Dots are complex numbers, px, in order of their real parts.
+Positions of dots are complex numbers, px, sorted by their real parts.
 """
 
 from __future__ import annotations
@@ -14,26 +14,26 @@ from labapp.core.compiled import compiled, inner
 from labapp.core.values import BoolArray, ComplexArray, FloatArray, IntArray
 
 BORDER = 3
-"""A site's dot is predicted from sites so far from it at most."""
+"""Largest distance, in sites, from which a site's dot is predicted."""
 
 MOST_PREDICTIONS = 16
-"""A site has so many predictions at most: three along each of four ways, and one a corner."""
+"""Most predictions of a site: three in each of four directions, and one for each corner."""
 
 LEAST_RATIO, MOST_RATIO = 0.6, 1.6
-"""Steps beside each other on one surface differ by no smaller and no larger factor."""
+"""Least and largest ratio of adjacent steps."""
 
 LOOSER = 1.4
-"""A prediction that no neighbouring row bears out may be so many times farther off."""
+"""Factor on the tolerance of a prediction that is not supported by a neighbouring row."""
 
 SEED_GATE = 0.3
-"""The first neighbours lie within this share of a step from where they are predicted."""
+"""Tolerance of the predictions of the seed's neighbours, in steps."""
 
 MOST_OPEN = 0.6
-"""The two ways round a sound cell end within this share of its sides; after a slip they end a whole
-one apart."""
+"""Largest closure error of a valid cell, in sides: the difference between the two paths around it.
+After a misalignment by one column it is about 1."""
 
 Claim = tuple[float, int, int, int]
-"""How badly its predictions fit a site's dot; the site's row and column; the dot."""
+"""Cost of a site's dot, from its distance to predictions; the site's row and column; the dot."""
 
 _f, _i, _c = types.float64, types.int64, types.complex128
 _plane = types.Array(_c, 1, "C", readonly=True)
@@ -42,9 +42,9 @@ _sites = types.Array(_i, 2, "C")
 
 @inner
 def _nearest(plane: ComplexArray, place: complex, within: float) -> tuple[int, float, float]:
-    """The dot nearest to a place, its distance and the next one's, of dots within a distance.
+    """The dot nearest to a place, its distance and that of the second nearest, within a radius.
 
-    Where there is none the dot is −1 and the distance infinite.
+    Without a dot, its index is −1 and the distance infinite.
     """
     start, end = 0, len(plane)
     while start < end:
@@ -68,7 +68,7 @@ def _nearest(plane: ComplexArray, place: complex, within: float) -> tuple[int, f
 
 @inner
 def _clamped(ratio: complex) -> complex:
-    """A ratio of steps, its size held between `LEAST_RATIO` and `MOST_RATIO`."""
+    """Clip the magnitude of a ratio of steps to `LEAST_RATIO` … `MOST_RATIO`."""
     size = abs(ratio)
     return ratio * (min(max(size, LEAST_RATIO), MOST_RATIO) / size) if size > 0.0 else 1.0 + 0.0j
 
@@ -77,12 +77,10 @@ def _clamped(ratio: complex) -> complex:
 def _predictions(
     plane: ComplexArray, dot_at: IntArray, k: int, t: int, gate: float
 ) -> tuple[ComplexArray, FloatArray]:
-    """Where the site's dot should be; the local step, and how far off the dot may be.
+    """Predict the position of a site's dot, shape (p,), with local steps and tolerances, (p, 2).
 
-    Steps are complex numbers, so that a row's turning and stretching go on as a ratio: arcs and
-    fans of rows are followed exactly.
-
-    Returns shapes (p,) and (p, 2).
+    Steps are complex numbers, so that their ratio extrapolates both rotation and scale of a row:
+    arcs and fans of rows are followed exactly.
     """
     places, sizes, count = (
         np.empty(MOST_PREDICTIONS, np.complex128),
@@ -94,7 +92,7 @@ def _predictions(
         if one < 0 or two < 0:
             continue
         step = plane[one] - plane[two]
-        for ek, et in ((dk, dt), (dt, dk), (-dt, -dk)):  # its own row, and those beside it
+        for ek, et in ((dk, dt), (dt, dk), (-dt, -dk)):  # the same row, and the adjacent ones
             near, next_one = dot_at[k + ek, t + et], dot_at[k + dk + ek, t + dt + et]
             far = dot_at[k + 2 * dk + ek, t + 2 * dt + et]
             if near >= 0 and next_one >= 0 and far >= 0:
@@ -127,9 +125,9 @@ def _claim(
     gate: float,
     doubt: float,
 ) -> Claim:
-    """The dot that the predictions of the site point at, and how badly they fit; −1 if none.
+    """The dot that a site's predictions agree on, and its cost; −1 if there is none.
 
-    Every prediction that falls on a dot must fall on the same one, and most must.
+    At least half of the predictions must match a dot, and all of these the same one.
     """
     places, sizes = _predictions(plane, dot_at, k, t, gate)
     chosen, fitting, error = -1, 0, 0.0
@@ -150,7 +148,7 @@ def _claim(
 def _seed_claims(
     plane: ComplexArray, middle: int, seed: int, first: complex, second: complex
 ) -> list[Claim]:
-    """A dot and its neighbours: claims that come before all others, in this order."""
+    """Claims of the seed and its neighbours, which precede all others in this order."""
     queue = [(-5.0, middle, middle, seed)]
     for dk, dt, step in ((0, 1, first), (0, -1, -first), (1, 0, second), (-1, 0, -second)):
         dot, distance, _ = _nearest(plane, plane[seed] + step, SEED_GATE * abs(step))
@@ -161,7 +159,7 @@ def _seed_claims(
 
 @inner
 def _root(parent: IntArray, dot: int) -> int:
-    """The dot at the root of another's tree."""
+    """The root of a dot's tree (union-find)."""
     while parent[dot] != dot:
         parent[dot] = parent[parent[dot]]
         dot = parent[dot]
@@ -170,7 +168,7 @@ def _root(parent: IntArray, dot: int) -> int:
 
 @inner
 def _connected_parts(plane: ComplexArray, dot_at: IntArray, placed: list[Claim]) -> IntArray:
-    """Parent of each dot in trees (union-find) of those that sound cells connect (`MOST_OPEN`)."""
+    """Parents in a union-find forest of dots that are connected by valid cells (`MOST_OPEN`)."""
     parent = np.arange(len(plane))
     for _, k, t, dot in placed:
         right, up, across = dot_at[k, t + 1], dot_at[k + 1, t], dot_at[k + 1, t + 1]
@@ -194,25 +192,25 @@ def grow(
     gate: float,
     doubt: float,
 ) -> IntArray:
-    """Grow a grid from a dot, best fitting site first, and find its connected parts.
+    """Grow a grid from a seed, in order of cost, and find its connected parts.
 
     Parameters
     ----------
     plane
         The dots, shape (n,).
     dot_at
-        −1 at every site, shape (m, m); a scratch pad, left as it was. The grid grows from its
-        middle, and not into its outer BORDER sites.
+        Scratch array of −1, shape (m, m), which is restored. The grid grows from its middle, but
+        not into the outermost BORDER sites.
     seed, first, second
-        The dot to begin with, and the steps to the next column and to the next row, px.
+        The first dot, and the steps to the next column and to the next row, px.
     gate, doubt
         As in `lattice_growth.GrowSettings`.
 
     Returns
     -------
     IntArray
-        Of each site its row and column in ``dot_at``, its dot, and a dot that stands for the part
-        it is connected with by sound cells (`_connected_parts`), shape (s, 4).
+        Row and column in ``dot_at``, dot, and representative dot of the connected part
+        (`_connected_parts`) of each site, shape (s, 4).
     """
     taken, middle, end = np.zeros(len(plane), np.bool_), len(dot_at) // 2, len(dot_at) - BORDER
     queue, placed = _seed_claims(plane, middle, seed, first, second), [(0.0, 0, 0, 0)][:0]
@@ -221,7 +219,7 @@ def grow(
         badness, k, t, dot = claim
         if dot_at[k, t] >= 0 or taken[dot]:
             continue
-        if badness >= 0.0:  # what is known round the site may have changed since
+        if badness >= 0.0:  # the neighbourhood may have changed since
             again = _claim(plane, dot_at, taken, k, t, gate, doubt)
             if again != claim:
                 if again[3] >= 0:

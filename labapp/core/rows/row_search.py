@@ -1,8 +1,8 @@
 """The dissertation's two searches for rows and columns: by neighbours (§5.2.2), by masks (§5.3).
 
-Both work on x to the right and z up, that is (u, −v) in px: the text uses imaging plane
-coordinates, and its angles and orders need no more than that. Where the text leaves a choice it
-is made here so that a dot in doubt gets no row and no column rather than a wrong one.
+Both use x to the right and z up, that is (u, −v) in px, instead of the text's imaging plane
+coordinates; this is sufficient for its angles and orders. Where the text leaves a choice, a dot in
+doubt gets no row and column rather than wrong ones.
 """
 
 from __future__ import annotations
@@ -24,24 +24,24 @@ Row = IntArray
 
 @dataclass(frozen=True)
 class RowSearchSettings:
-    """What §5.2.2 chooses.
+    """Settings of the search of §5.2.2.
 
     Parameters
     ----------
     row_angle_deg
         A row ends where the line to the next dot is steeper than this (Fig. 5-14).
     row_turn_deg
-        A row ends where it turns by more than this from one dot to the next.
+        A row ends where its direction changes by more than this from one dot to the next.
     column_angle_deg
-        Dots of neighbouring rows are one column only if the line through them is within this
+        Dots of neighbouring rows are in one column only if the line through them is within this
         angle of the vertical (Fig. 5-17).
     column_gate
-        … and a row gets columns only if its most vertical line leads to a place within this part
-        of its step: where none does, the columns may have drifted by one.
+        A row gets columns only if the horizontal offset of its most vertical line is at most this
+        fraction of its step; otherwise the columns may be wrong by one.
     reference_columns
-        How many middle columns of the longest row tell blocked rows and the reference.
+        Number of middle columns of the longest row that determine blocked rows and the reference.
     least_dots
-        A row of fewer dots is no row: a lone dot has no row angle to check it by.
+        Least number of dots of a row; a single dot has no row angle to check.
     """
 
     row_angle_deg: float = 60.0
@@ -60,7 +60,7 @@ class MaskRowsSettings:
     ----------
     oblique_deg
         Slope of the two structuring elements of Fig. 5-26: up to the right in the left half of
-        the pattern, down to the right in the right half, as convex arcs run.
+        the pattern, down to the right in the right half, as in convex arcs.
     length, thickness
         Their length and thickness.
     widening
@@ -69,16 +69,16 @@ class MaskRowsSettings:
         Two regions side by side are one row if their facing ends differ in height by less than
         this.
     reference_gap
-        Such a row has the reference if the clear width between its two masks, which reach half
-        a step beyond their last dots, is below this many steps; otherwise it is blocked. A step
-        is the mean horizontal distance of the row's dots.
+        Such a row has the reference if the gap between its two masks, which extend half a step
+        beyond their last dots, is below this many steps; otherwise it is blocked. A step is the
+        mean horizontal distance of the row's dots.
     row_angle_deg
-        A region that holds a step steeper than this is more than one row.
+        A region with a step steeper than this contains more than one row.
     line_gate
-        A place in a row is of the reference column if it is within this part of the row's step
-        from the vertical line.
+        A position in a row is in the reference column if it is within this fraction of the row's
+        step from the vertical line.
     least_dots
-        A region of fewer dots is no row.
+        Least number of dots of a row.
     """
 
     oblique_deg: float = 20.0
@@ -93,7 +93,7 @@ class MaskRowsSettings:
 
 
 def search_rows(dots: Dots, settings: RowSearchSettings | None = None) -> Lattice:
-    """Rows by nearest neighbours, columns by column angle (§5.2.2, Fig. 5-13 … 5-19).
+    """Find rows by nearest neighbours, columns by column angles (§5.2.2, Fig. 5-13 … 5-19).
 
     Raises
     ------
@@ -140,7 +140,7 @@ def search_rows(dots: Dots, settings: RowSearchSettings | None = None) -> Lattic
 def mask_rows(
     dots: Dots, frame_shape: tuple[int, int], settings: MaskRowsSettings | None = None
 ) -> Lattice:
-    """Rows by dilated masks, columns from a vertical line (§5.3, Fig. 5-25 … 5-28).
+    """Find rows by dilated masks, columns from a vertical line (§5.3, Fig. 5-25 … 5-28).
 
     Parameters
     ----------
@@ -185,7 +185,7 @@ def _places(dots: Dots) -> FloatArray:
 
 
 def _neighbour_rows(place: FloatArray, settings: RowSearchSettings) -> list[Row]:
-    """Go from the leftmost dot left over to the nearest on its right, again and again."""
+    """Form rows: from the leftmost remaining dot repeatedly to the nearest on its right."""
     left_over = np.ones(len(place), bool)
     rows = []
     while left_over.any():
@@ -211,11 +211,11 @@ def _neighbour_rows(place: FloatArray, settings: RowSearchSettings) -> list[Row]
 
 
 def _stacked(place: FloatArray, rows: list[Row]) -> list[Row]:
-    """Rows from the bottom up: those that lie one above the other, from the longest outwards.
+    """Select the rows, from the bottom up, that lie above one another, from the longest outwards.
 
-    The first that does not lie wholly above (below) the one before it, with half of its dots or
-    of that one's in its range, is a piece of a row or runs from one row into another. It and all
-    beyond it are in doubt: their numbers would be wrong.
+    The first that is not entirely above (below) the previous one, or overlaps it horizontally with
+    fewer than half of the dots of either, is a fragment of a row or a mixture of rows. It and all
+    rows beyond it are in doubt, since their numbers would be wrong.
     """
     rows = sorted(rows, key=lambda row: float(place[row, 1].max()))
     longest = int(np.argmax([len(row) for row in rows]))
@@ -228,7 +228,7 @@ def _stacked(place: FloatArray, rows: list[Row]) -> list[Row]:
 
 
 def _above(upper: FloatArray, lower: FloatArray) -> bool:
-    """Whether one row lies wholly above another where both are, and both are at enough places."""
+    """Whether a row is above another throughout their common range, which must be long enough."""
     over = (upper[:, 0] >= lower[0, 0]) & (upper[:, 0] <= lower[-1, 0])
     under = (lower[:, 0] >= upper[0, 0]) & (lower[:, 0] <= upper[-1, 0])
     if max(over.mean(), under.mean()) < 0.5:
@@ -241,11 +241,11 @@ def _above(upper: FloatArray, lower: FloatArray) -> bool:
 def _columns_by_angle(
     row: FloatArray, known: FloatArray, known_columns: IntArray, settings: RowSearchSettings
 ) -> IntArray:
-    """Columns of a row's dots, shape (n,): those of the dots most vertically beyond them.
+    """Columns of a row's dots, shape (n,), from the most nearly vertical lines to a known row.
 
-    A pair counts when each is the other's most vertical one. From the most vertical pair of all
-    the row is then counted outwards as far as counting and angles agree; a dot without a pair
-    gets the counted column if it stands between two that agree.
+    Two dots are a pair if each is the other's most nearly vertical neighbour. From the most nearly
+    vertical pair the columns are counted outwards as long as counts and pairs agree; a dot without
+    a pair gets the counted column if it is between two that agree.
     """
     step = row[:, None] - known[None]
     lean = np.degrees(np.arctan2(np.abs(step[..., 0]), np.abs(step[..., 1])))
@@ -266,16 +266,16 @@ def _columns_by_angle(
     if agreed.sum() < 2 or drift > settings.column_gate * float(np.median(np.diff(row[:, 0]))):
         return np.zeros(len(row), np.int64)
     first, last = np.flatnonzero(agreed)[[0, -1]]
-    # A counted column below 1 lies left of the longest row: in doubt like the dots off its ends.
+    # Columns below 1 are left of the longest row, and in doubt as are dots beyond its ends.
     within = (dot >= first) & (dot <= last) & (counted > 0)
     return np.where(within, counted, 0)
 
 
 def _counted(x: FloatArray, anchor: int) -> tuple[IntArray, BoolArray]:
-    """Columns relative to the anchor by counting along a row, and which are sure; shape (n,).
+    """Columns relative to the anchor by counting along a row, and which are certain; shape (n,).
 
-    A step counts as many columns as it is longer than the typical step beside it; beyond a step
-    that is no whole number of them the count is not sure.
+    A step is as many columns as its ratio to the median neighbouring step, rounded; beyond a step
+    whose ratio is not near an integer, the count is uncertain.
     """
     gap = np.diff(x)
     jump, whole = np.ones(len(gap), np.int64), np.ones(len(gap), bool)
@@ -310,7 +310,7 @@ def _row_masks(
     """Connected row masks, labelled from 1 (Fig. 5-27)."""
     element = _oblique_element(spacing, settings)
     masks = np.zeros(frame_shape, np.uint8)
-    # The half of the picture is the half of the pattern: a pattern need not lie in the middle.
+    # The halves are those of the pattern, which need not be in the middle of the picture.
     middle = float(np.median(place[:, 0]))
     pixels = np.round(place * (1, -1)).astype(int)
     pixels = np.clip(pixels, 0, (frame_shape[1] - 1, frame_shape[0] - 1))
@@ -327,7 +327,7 @@ def _row_masks(
 
 
 def _oblique_element(spacing: float, settings: MaskRowsSettings) -> npt.NDArray[np.uint8]:
-    """Return the structuring element of the left half: a thick line up to the right."""
+    """Structuring element of the left half: a thick line up to the right."""
     half_length = settings.length * spacing / 2.0
     reach = int(np.ceil(half_length + settings.thickness * spacing)) + 1
     y, x = np.mgrid[-reach : reach + 1, -reach : reach + 1]
@@ -342,7 +342,7 @@ def _oblique_element(spacing: float, settings: MaskRowsSettings) -> npt.NDArray[
 def _regions(
     place: FloatArray, labels: npt.NDArray[np.int32], settings: MaskRowsSettings
 ) -> list[Row]:
-    """Dots of each mask that holds one row; where rows ran together they are in doubt."""
+    """Dots of each mask with a single row; dots of merged rows are left in doubt."""
     height, width = labels.shape
     u = np.clip(np.round(place[:, 0]).astype(int), 0, width - 1)
     v = np.clip(np.round(-place[:, 1]).astype(int), 0, height - 1)
@@ -407,16 +407,15 @@ def _columns_by_line(
     holes: list[tuple[int, int]],
     settings: MaskRowsSettings,
 ) -> tuple[list[IntArray], list[tuple[int, int]]]:
-    """Columns by a vertical line through the middle of the reference row, then by counting.
+    """Assign columns by a vertical line through the middle of the reference row, then by counting.
 
-    The line goes through the missing dot's place, midway between its neighbours: there the
-    columns of the pattern stand upright, while those beside it lean. Without a row that has the
-    reference, the row with most dots serves. ``holes`` are the rows with a missing dot and the
-    number of dots left of it; their sites (k, t) are returned too.
+    The line passes through the missing dot, midway between its neighbours, where the columns of the
+    pattern are vertical; columns to either side are inclined. Without a reference row, the row with
+    most dots is used. ``holes`` are the rows with a missing dot and the number of dots left of it;
+    their sites (k, t) are returned too.
 
-    A row crosses the line at one of its dots, or at a gap where its count leaves one out. Where
-    it does at neither, or ends before it, that row and those beyond it are in doubt: the columns
-    may have drifted by one.
+    A row must cross the line at one of its dots or at a missing dot. If it does not, or ends before
+    the line, that row and those beyond it are in doubt, since their columns may be wrong by one.
     """
     if holes:
         base, before = holes[0]

@@ -1,9 +1,9 @@
-"""Carry a correction on to the next frame: the same dots, a little further on.
+"""Apply a correction to the next frame, by tracking its dots.
 
-From frame to frame the dots of a pool move together and, as the pool changes, a little apart. A
-smooth motion is followed and each dot looked for where it leads, in units of the rows' and columns'
-own steps. One row looks much like the next, so that motion must also find more dots again than any
-that leads a row or a column further.
+From frame to frame the dots of a pool move together, with small differences as the pool changes.
+A smooth motion is estimated, and each dot is matched near its predicted position; distances are in
+units of the local steps along rows and columns. Since adjacent rows look alike, the motion must
+also match more dots than motions that differ from it by one row or column.
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ from labapp.core.values import BoolArray, FloatArray, IntArray
 LOST = -1
 
 Motion = Callable[[FloatArray], FloatArray]
-"""Places in one frame, shape (n, 2), to where they are in the next, px."""
+"""Maps positions in one frame, shape (n, 2), to positions in the next, px."""
 
 
 @dataclass(frozen=True)
 class CarrySettings:
-    """When a correction still fits.
+    """Settings of `carry_on`.
 
     Parameters
     ----------
     found
-        Share of the dots with a row that must be found again. Dots placed by hand that are not
-        found do not count: what no detector sees cannot be tracked.
+        Least share of the dots with a row that must be matched. Manual dots that are not matched
+        are not counted, since the detector may not find them.
     gate, clear
-        A dot is found within this share of a step from where it is expected, if no other lies
-        within the other.
+        A dot is matched within the distance ``gate`` from its predicted position if no other lies
+        within ``clear``, in steps.
     reach
-        The dots together move by less than this share of a step.
+        Largest common motion of the dots, in steps.
     ahead
-        A motion that leads a row or a column further must find this share of the dots fewer.
+        Motions that differ by a row or a column must match fewer dots, by this share of all.
     """
 
     found: float = 0.85
@@ -57,20 +57,20 @@ def carry_on(
     Parameters
     ----------
     correction
-        Of the frame before. With the rows that its measurement has (`Measurement.lattice`) dots
-        that came new are carried on too.
+        Correction of the previous frame. With the rows of its measurement (`Measurement.lattice`),
+        new dots are tracked too.
     dots
-        What was found in the next frame.
+        The dots found in the next frame.
     settings
         See `CarrySettings`.
 
     Returns
     -------
     Correction or None
-        The dots of the next frame. Those found again have the row, the column and the mark of the
-        dot before, the others none; reference and blocked rows stay. None where it no longer fits:
-        too few dots are found again, a dot is where the reference should be dark, or the dots may
-        as well have moved by a row or a column.
+        Correction of the next frame. Matched dots have the row, column and manual flag of the
+        previous frame's dot, other dots have none; reference and blocked rows are unchanged. None
+        if the correction no longer fits: too few dots are matched, a dot is at the reference, or
+        a motion by one more row or column is about as likely.
     """
     settings = settings or CarrySettings()
     lattice = correction.lattice
@@ -97,9 +97,9 @@ def carry_on(
 
 
 def _steps(correction: Correction) -> FloatArray | None:
-    """Each dot's steps along its row and across rows, shape (n, 2, 2), px; None without rows.
+    """Local steps along and across rows at each dot, shape (n, 2, 2), px; None without rows.
 
-    ``steps[n, :, 0]`` leads to the next column and ``steps[n, :, 1]`` to the next row.
+    ``steps[n, :, 0]`` is the step to the next column, ``steps[n, :, 1]`` that to the next row.
     """
     lattice, place = correction.lattice, correction.dots.image_px
     sited = np.flatnonzero(correction.sited)
@@ -117,9 +117,9 @@ def _steps(correction: Correction) -> FloatArray | None:
         if not known.any():
             return None
         steps[~known, :, axis] = np.median(steps[known, :, axis], axis=0)
-    usual = np.median(steps, axis=0)
+    median_step = np.median(steps, axis=0)
     size = np.linalg.norm(steps, axis=1)
-    steps[np.abs(np.linalg.det(steps)) < 0.2 * size[:, 0] * size[:, 1]] = usual
+    steps[np.abs(np.linalg.det(steps)) < 0.2 * size[:, 0] * size[:, 1]] = median_step
     return steps if np.abs(np.linalg.det(steps)).min() > 0 else None
 
 
@@ -130,16 +130,16 @@ def _likeliest_motion(
     sited: BoolArray,
     settings: CarrySettings,
 ) -> Motion | None:
-    """The motion that finds most dots again; None if one a row or a column further is as good."""
-    usual = np.median(steps[sited], axis=0)
+    """The motion that matches most dots; None if one shifted by a row or column is as good."""
+    median_step = np.median(steps[sited], axis=0)
     share = np.linspace(-settings.reach, settings.reach, 7)
-    near = [usual @ np.array([t, k]) for k in share for t in share]
+    near = [median_step @ np.array([t, k]) for k in share for t in share]
     first = max(near, key=lambda shift: _count(before + shift, after, steps, sited, settings))
     motion = _followed(before, after, steps, first, settings)
     found = _found(motion(before), after, steps, settings)
     count = int(np.sum(found[sited] != LOST))
     for cell in np.array([(1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1), (1, -1), (-1, 1)]):
-        # Not the same shift for all: a row further is another distance at each dot.
+        # The shift by a row or column differs from dot to dot.
         start = motion(before) + steps @ cell
         further = _followed(before, after, steps, start - before, settings)
         other = _found(further(before), after, steps, settings)
@@ -157,7 +157,7 @@ def _followed(
     shift: FloatArray,
     settings: CarrySettings,
 ) -> Motion:
-    """A motion that begins with a shift, shape (2,) or (n, 2), and bends to the dots it finds."""
+    """Refine a motion from a shift, shape (2,) or (n, 2), by polynomials fitted to matched dots."""
     center, scale = before.mean(axis=0), max(float(np.ptp(before)), 1.0)
 
     def terms(place: FloatArray, degree: int) -> FloatArray:
@@ -168,11 +168,11 @@ def _followed(
     weights = np.linalg.lstsq(terms(before, 0), moved - before, rcond=None)[0]
     for degree in (1, 1, 1, 2, 2, 2, 2):
         found = _found(moved, after, steps, settings)
-        own = np.flatnonzero(found != LOST)
-        if len(own) < 12:
+        matched = np.flatnonzero(found != LOST)
+        if len(matched) < 12:
             break
-        way = after[found[own]] - before[own]
-        weights = np.linalg.lstsq(terms(before[own], degree), way, rcond=None)[0]
+        way = after[found[matched]] - before[matched]
+        weights = np.linalg.lstsq(terms(before[matched], degree), way, rcond=None)[0]
         moved = before + terms(before, degree) @ weights
     last = next(d for d in range(3) if len(weights) == (d + 1) * (d + 2) // 2)
     return lambda place: place + terms(place, last) @ weights
@@ -181,13 +181,13 @@ def _followed(
 def _found(
     moved: FloatArray, after: FloatArray, steps: FloatArray, settings: CarrySettings
 ) -> IntArray:
-    """Which dot each one is, one to one, where its place is known; `LOST` where none is."""
+    """Match predicted positions to dots one to one, shape (n,); `LOST` where there is no match."""
     away = np.linalg.norm(
         np.einsum("nab,nmb->nma", np.linalg.inv(steps), after - moved[:, None]), axis=-1
     )
     nearest = np.argmin(away, axis=1)
-    own = np.arange(len(moved))
-    sure = (away[own, nearest] < settings.gate) & (np.argmin(away, axis=0)[nearest] == own)
+    index = np.arange(len(moved))
+    sure = (away[index, nearest] < settings.gate) & (np.argmin(away, axis=0)[nearest] == index)
     sure &= np.sum(away < settings.clear, axis=1) == 1
     return np.where(sure, nearest, LOST)
 
@@ -205,7 +205,7 @@ def _count(
 def _reference_lit(
     correction: Correction, motion: Motion, after: FloatArray, settings: CarrySettings
 ) -> bool:
-    """Whether a dot is where the reference was dark between two dots of its row."""
+    """Whether a dot is at the reference, which had no dot between two neighbours in its row."""
     lattice = correction.lattice
     if lattice.reference is None:
         return False
