@@ -100,7 +100,7 @@ def _matched(observed: Observation, labels: IntArray) -> tuple[float, IntArray] 
 
 
 def _caps(observed: Observation) -> FloatArray:
-    """Caps to try, with the area that the number of dots gives: see `quadric_kernels.score_caps`."""
+    """Caps to try, with the area given by the number of dots (`quadric_kernels.score_caps`)."""
     area = len(observed.plane_mm) * observed.spacing_mm.prod()
     caps = []
     for aspect, height, x, y in product(_ASPECTS, _HEIGHTS, _ASIDE, _ALONG):

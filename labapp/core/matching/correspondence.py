@@ -265,7 +265,7 @@ def _by_caps(observed: Observation) -> list[Hypothesis]:
 def _by_quadrics(
     observed: Observation, lattice: Lattice | None, orientations: tuple[Orientation, ...]
 ) -> list[Hypothesis]:
-    """Hypotheses from the quadrics that explain the dots around a hole, also extended by the grid."""
+    """Hypotheses from the quadrics that explain the dots around a hole, extended by the grid."""
     found = []
     for guess in search_quadrics(observed):
         hypothesis = grow_and_evaluate(observed, guess.labels)

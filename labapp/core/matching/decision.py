@@ -45,7 +45,8 @@ FEW_LEFT = 0.05
 missed: no other is searched for."""
 
 MOST_STRAY = 0.5
-"""If a larger share of the dots is stray, a hypothesis is not repaired; another one is searched for.
+"""If a larger share of the dots is stray, a hypothesis is not repaired; another one is searched
+for.
 """
 
 MOST_DIFFERING = 0.2
@@ -72,8 +73,8 @@ NOTHING_EXPLAINS = "no surface explains the reflected dots"
 """Reason for ``no-match`` if most of the dots have no ray."""
 
 PAIR, BESIDE_SPACINGS = 2, 1.5
-"""Up to this number of adjacent missed rays, or of adjacent stray dots, is not taken for a row. Dots
-are adjacent within `BESIDE_SPACINGS` spacings."""
+"""Up to this number of adjacent missed rays, or of adjacent stray dots, is not taken for a row.
+Dots are adjacent within `BESIDE_SPACINGS` spacings."""
 
 MOST_SCATTERED, MOST_MISSED_APART = 0.3, 0.12
 """Largest share of stray dots and missed rays together, relative to the labelled dots, that is
@@ -296,7 +297,7 @@ def fitted_labels(observed: Observation, best: Hypothesis, fit: FitSettings) -> 
 def _cheapest(
     observed: Observation, found: list[Hypothesis], margin: float
 ) -> tuple[Hypothesis, list[Hypothesis], list[Hypothesis], FitSettings]:
-    """The cheapest hypothesis, all found, its neighbours by a row or two, and their fit settings."""
+    """The cheapest hypothesis, all found, its neighbours by a row or two, and the fit settings."""
     best = min(found, key=lambda hypothesis: hypothesis.cost)
     fit = USUAL_KNOTS
     neighbours: list[Hypothesis] = []

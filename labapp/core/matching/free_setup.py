@@ -1,9 +1,9 @@
 """Whether another hole could be the marker's, given the uncertainty of the set-up.
 
 If the set-up is wrong, labels shifted by a row or a column may have smaller residuals than correct
-ones: a shift of the labels moves dots much as an error of the set-up by a fraction of the spacing of
-the rays does. Hypotheses are therefore compared with a free set-up: each uses the set-up with which
-it is likeliest, and its cost includes the deviation of this set-up from the given one.
+ones: a shift of the labels moves dots much as an error of the set-up by a fraction of the spacing
+of the rays does. Hypotheses are therefore compared with a free set-up: each uses the set-up with
+which it is likeliest, and its cost includes the deviation of this set-up from the given one.
 
 Holes are distinguished by the boundary, the smoothness of the surface and the uncertainty of the
 set-up. The residuals hardly contribute: the surface follows the dots of either hypothesis about

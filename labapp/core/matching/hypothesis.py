@@ -1,8 +1,8 @@
 """Hypothesis: one assignment of rays to all dots of a frame, and its cost.
 
 The cost is in units of χ²: squared residuals of the dots over their variance, a fixed cost for each
-stray dot and each missed ray, the contradictions of the rays near the boundary, and the roughness of
-the surface.
+stray dot and each missed ray, the contradictions of the rays near the boundary, and the roughness
+of the surface.
 """
 
 from __future__ import annotations
@@ -261,7 +261,7 @@ def rough_costs(observed: Observation, labels: IntArray, pool: FittedPool) -> tu
 def _misfit(
     observed: Observation, labels: IntArray, pool: FittedPool, paths: RayPaths
 ) -> tuple[RayClasses, Marker | None, float]:
-    """Classes of rays and dots, state of the marker, and cost of residuals, strays and missed rays."""
+    """Ray classes, state of the marker, and cost of residuals, stray dots and missed rays."""
     lit = labels != UNLABELLED
     classes = classify_rays(observed, labels, paths)
     marker = _marker_state(observed, lit, pool)

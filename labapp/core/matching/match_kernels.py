@@ -103,7 +103,7 @@ def within_view(
 
 @compiled(types.Array(types.boolean, 2, "A", readonly=True))
 def amid(lit: BoolArray) -> BoolArray:
-    """Mask of rays that are lit or between lit ones of their row or column, shape (rows, columns)."""
+    """Mask of rays that are lit or between lit ones in a row or column, shape (rows, columns)."""
     rows, columns = lit.shape
     mask = np.zeros((rows, columns), np.bool_)
     for i in range(rows):

@@ -37,9 +37,9 @@ RESOLVED_SIZES = 2.2
 equal Gaussians have a single peak up to 2, and pixels and noise blur them further."""
 
 KEPT_BYTES, COUNTED_EVERY = 100_000_000, 32
-"""Approximate limit for the factors of the cached fits of a frame, bytes; splines and stiffness take
-twice as much. That is over a thousand fits of a usual pool. The size is checked once in so many
-fits."""
+"""Approximate limit for the factors of the cached fits of a frame, bytes; splines and stiffness
+take twice as much. That is over a thousand fits of a usual pool. The size is checked once in so
+many fits."""
 
 EDGE_MM, EDGE_PX = 0.5, 4.0
 """A dot nearer to the edge of the plane or of the frame may be cut off and does not count as in
@@ -214,7 +214,7 @@ class Observation(ReadOnlyArrays):
 
     @cached_property
     def _view(self) -> tuple[FloatArray, FloatArray]:
-        """Limits of the view on the plane, mm, and in the image, px, each (low, high), shape (2, 2)."""
+        """Limits (low, high) of the view on the plane, mm, and in the image, px, shapes (2, 2)."""
         plane = self.rig.imaging_plane
         low = np.minimum(self.plane_mm.min(axis=0), 0.0) + EDGE_MM
         high = np.maximum(self.plane_mm.max(axis=0), [plane.width_mm, plane.height_mm]) - EDGE_MM
@@ -249,7 +249,7 @@ def count_labels(labels: IntArray) -> int:
 
 
 def amid(lit: BoolArray) -> BoolArray:
-    """Mask of rays that are lit or between lit ones of their row or column, shape (rows, columns)."""
+    """Mask of rays that are lit or between lit ones in a row or column, shape (rows, columns)."""
     from labapp.core.matching import match_kernels
 
     return match_kernels.amid(lit)

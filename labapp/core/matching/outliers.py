@@ -1,4 +1,4 @@
-"""Detection of labels that a fitted surface does not support, for frames with and without a prior."""
+"""Labels that a fitted surface does not support, for frames with and without a prior."""
 
 from __future__ import annotations
 
@@ -25,20 +25,21 @@ from labapp.core.values import BoolArray, FloatArray, IntArray
 WIDE = 1.45
 """A dot wider than the median of its neighbours by this factor is taken for two merged dots. Of
 15,000 dots of rendered frames, 17 were as wide: 13 of them were more than 1 px off, four at most
-0.8 px. With a stricter limit, 1.35, known frames lost correct labels at the rim and a tenth of their
-accuracy."""
+0.8 px. With a stricter limit, 1.35, known frames lost correct labels at the rim and a tenth of
+their accuracy."""
 
 WIDE_BESIDE, BESIDE_RESOLUTIONS = 1.3, 1.5
-"""Limit of the width if the predicted dot of a ray without a dot is nearer than the second, in units
-of `Observation.resolution_mm`: the dot may be that of both rays, and lie between them."""
+"""Limit of the width if the predicted dot of a ray without a dot is nearer than the second, in
+units of `Observation.resolution_mm`: the dot may be that of both rays, and lie between them."""
 
 MEDIAN_CHI2 = 2 * np.log(2)
 """Median of χ² with two degrees of freedom."""
 
 RIM_NEIGHBOURS, RIM_SIGMA2, RIM_TIMES = 3, 4.0, 20.0
-"""For a label with at most `RIM_NEIGHBOURS` labelled neighbours, the squared distance in σ² may be at
-most `RIM_SIGMA2`, or `RIM_TIMES` times the median of all, whichever is larger. Of 130 correct labels
-of this kind, in pools of every kind, the largest was 2.4 σ²; false dots are at any distance."""
+"""For a label with at most `RIM_NEIGHBOURS` labelled neighbours, the squared distance in σ² may be
+at most `RIM_SIGMA2`, or `RIM_TIMES` times the median of all, whichever is larger. Of 130 correct
+labels of this kind, in pools of every kind, the largest was 2.4 σ²; false dots are at any
+distance."""
 
 MOST_LEVERAGE = 0.998
 """Upper limit of the leverage when the residual of a dot to a fit without it is computed."""
@@ -90,9 +91,9 @@ def unsupported(observed: Observation, fitted: FittedLabels) -> IntArray:
     Each is compared with the surface fitted to all the others. Its pair with its ray must be
     likelier by `RIVAL_MARGIN` than a false dot, than a pair of its ray with a stray dot, and than a
     pair of the dot with a missed ray. A ray that lands outside the boundary given by the others is
-    unlikely to have returned. Dots much wider than their neighbours are two merged dots, as are less
-    wide ones next to the predicted dot of a ray without a dot. At the rim, where a label has few
-    neighbours, it must be nearer to its prediction. If the distances of all exceed what the
+    unlikely to have returned. Dots much wider than their neighbours are two merged dots, as are
+    less wide ones next to the predicted dot of a ray without a dot. At the rim, where a label has
+    few neighbours, it must be nearer to its prediction. If the distances of all exceed what the
     uncertainties of dots and surface explain, these are scaled up accordingly.
 
     A false dot shifts the predictions of its neighbours. Of adjacent labels that fail, only the one

@@ -139,7 +139,7 @@ def covariance_of_dots(
 
 
 def predict(observed: Observation, pool: FittedPool, where: BoolArray) -> Prediction:
-    """Predict the dots of the rays in a mask, shape (rows, columns); omit rays that miss the plane."""
+    """Predict the dots of those rays in a mask, shape (rows, columns), that reach the plane."""
     from labapp.core.images import dot_kernels
     from labapp.core.surface.kernels import ray_kernels
 

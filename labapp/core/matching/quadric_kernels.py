@@ -142,7 +142,7 @@ def match_predicted_dots(
 def _cap_dots(
     cap: FloatArray, rays: FloatArray, bench: tuple[FloatArray, FloatArray], dots: FloatArray
 ) -> BoolArray:
-    """Write the dots of rays reflected by a cap into ``dots``, (n, 2); return which it meets, (n,)."""
+    """Write the dots of rays off a cap into ``dots``, shape (n, 2); return which rays meet it."""
     x_mm, y_mm, along_x, along_y, height = cap
     laser, plane = bench
     quadric, point, there = np.zeros(5), np.empty(3), np.zeros(len(rays), np.bool_)

@@ -203,7 +203,8 @@ class _Window:
         core = (slice(None), *self.core)
         explains = np.flatnonzero(hit[core].sum(axis=(1, 2)) >= CORE_TIGHT)
         seen = self.observed.in_view(np.nan_to_num(patterns[core][explains], nan=1e6))
-        # A ray next to the hole that should have a dot but has none is evidence against the quadric.
+        # A ray next to the hole that should have a dot but has none is evidence against the
+        # quadric.
         silent = seen & ~self.absent[self.core] & ~hit[core][explains]
         for k, count in zip(explains, silent.sum(axis=(1, 2)).tolist(), strict=True):
             yield self._guess(hit[k], dot[k], off[k], count)

@@ -1,4 +1,4 @@
-"""Classification of rays as returned or not, and of dots and rays that a surface leaves unexplained."""
+"""Classification of rays as returned or not; dots and rays that a surface leaves unexplained."""
 
 from __future__ import annotations
 

@@ -26,8 +26,8 @@ MIDDLE = 0.25
 distance."""
 
 LEAST_ROW, MOST_BEYOND = 3, 0.6
-"""One or two dots beyond the last row may be false; three that one surface explains are not. If more
-than this share of all dots is stray, the cause is not a row that growth did not reach."""
+"""One or two dots beyond the last row may be false; three that one surface explains are not. If
+more than this share of all dots is stray, the cause is not a row that growth did not reach."""
 
 LEAST_BETWEEN = 2
 """Two dots midway between those of two rows belong to a row that was omitted."""
@@ -137,8 +137,8 @@ def with_rows_beyond(observed: Observation, found: list[Hypothesis]) -> list[Hyp
 def _rows_begun(observed: Observation, hypothesis: Hypothesis, most: int = 8) -> list[Hypothesis]:
     """Assign a stray dot to each candidate ray beyond the labelled ones, and grow the labels.
 
-    The ``most`` likeliest pairs are tried, except those that an earlier one has led to. As a surface
-    can fit any single dot, the labels must grow by at least `LEAST_ROW` dots.
+    The ``most`` likeliest pairs are tried, except those that an earlier one has led to. As a
+    surface can fit any single dot, the labels must grow by at least `LEAST_ROW` dots.
     """
     labels = hypothesis.labels
     found: list[Hypothesis] = []
