@@ -1,1 +1,1 @@
-"""Which ray made which dot, and how sure."""
+"""Correspondence of rays and reflected dots, and its reliability."""

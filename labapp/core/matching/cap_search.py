@@ -1,8 +1,8 @@
-"""Hypotheses from the whole pool: caps whose rays fall on the dots.
+"""Initial labels from a global model of the pool: caps whose predicted dots match the dots.
 
-A pool is nearly a cap, and how many dots it makes says how large it is. Where a dip or ripples
-leave no rows on the picture, the dots outside them still lie near to where a cap of about the
-right height and place has them: enough to begin with.
+A pool is approximately a cap, and the number of its dots gives its size. Where a dip or ripples
+leave no visible rows in the image, the dots outside them are still close to those of a cap of
+about the right height and position, which suffices as a start.
 """
 
 from __future__ import annotations
@@ -17,49 +17,49 @@ from labapp.core.matching.observation import QUICK, UNLABELLED, Observation, try
 from labapp.core.values import FloatArray, IntArray
 
 _ASPECTS = (0.9, 1.1, 1.35)
-"""Length over width that are tried."""
+"""Ratios of length to width that are tried."""
 
 _HEIGHTS = (0.025, 0.035, 0.045, 0.055, 0.07, -0.03, -0.045, -0.06, -0.08, -0.1)
-"""Height over width; below 0 of a concave pool."""
+"""Ratios of height to width that are tried; negative for a concave pool."""
 
 _ASIDE, _ALONG = np.linspace(-0.6, 0.6, 5), np.linspace(-1.2, 1.2, 9)
-"""Where its middle lies, X and Y, mm."""
+"""Positions of the centre that are tried, X and Y, mm."""
 
 GATE = 0.45
-"""A ray finds its dot within this fraction of the way to the next predicted one."""
+"""A dot matches a ray within this fraction of the distance to the nearest other prediction."""
 
 LEAST_RAYS = 10
-"""Fewer rays than this make no cap."""
+"""Minimum number of rays that meet a cap."""
 
 LIT_MARKER_PENALTY, DARK_PENALTY = 5.0, 0.5
-"""What a dot at the marker's absent ray, and a ray without a dot, take off a score of about 1 for
-each ray with a dot."""
+"""Penalties for a dot at the marker's absent ray, and for a ray without a dot. Each ray with a dot
+adds about 1 to the score."""
 
 LIT_GATE = 0.3
-"""The marker is lit by a dot within this fraction of the usual way to the next predicted one."""
+"""The marker is lit if a dot lies within this fraction of the median spacing of predictions."""
 
 ALIKE, MOST_CAPS = 0.9, 150
-"""Two caps are one hypothesis where such a share of the rays that find a dot find the same; and so
-many are looked at closer. With 29 of 30 rays right, a cap may find fewer dots than one with 21 of
-33: what tells them apart is how smooth a surface has their dots."""
+"""Two caps are the same hypothesis if this share of the rays with a dot in both have the same dot;
+and the number of caps that are examined further. A cap with 29 of 30 rays correct may match fewer
+dots than one with 21 of 33: the smoothness of the surface through their dots distinguishes them."""
 
 
 def search_caps(observed: Observation, most: int = 24) -> list[IntArray]:
-    """Find the caps whose rays fall on the dots best.
+    """Find the caps whose predicted dots match the observed dots best.
 
-    The best of them are sorted by what a surface through their dots explains.
+    The best of them are sorted by the cost of a surface fitted to their dots.
 
     Parameters
     ----------
     observed
         The dots and the rig.
     most
-        How many to return at most, no two the same.
+        Maximum number of label arrays to return; all are different.
 
     Returns
     -------
     list of IntArray
-        Index of the dot of each ray or `UNLABELLED`, shape (rows, columns); the best first.
+        Index of the dot of each ray or `UNLABELLED`, shape (rows, columns), best first.
     """
     from labapp.core.matching import quadric_kernels
 
@@ -90,7 +90,7 @@ def search_caps(observed: Observation, most: int = 24) -> list[IntArray]:
 
 
 def _matched(observed: Observation, labels: IntArray) -> tuple[float, IntArray] | None:
-    """Labels of the dots that a surface through those of a cap predicts, and their cost."""
+    """Cost and labels after one fit to the labels of a cap and one prediction from that fit."""
     pool = try_fit(observed, labels, QUICK)
     if pool is None:
         return None
@@ -100,7 +100,7 @@ def _matched(observed: Observation, labels: IntArray) -> tuple[float, IntArray] 
 
 
 def _caps(observed: Observation) -> FloatArray:
-    """Caps to be tried, each as large as there are dots for: see `quadric_kernels.score_caps`."""
+    """Caps to try, with the area given by the number of dots (`quadric_kernels.score_caps`)."""
     area = len(observed.plane_mm) * observed.spacing_mm.prod()
     caps = []
     for aspect, height, x, y in product(_ASPECTS, _HEIGHTS, _ASIDE, _ALONG):

@@ -1,7 +1,7 @@
-"""The operator's rows and columns → Match: what he set is binding (§4.2.2, §7.1).
+"""Matching of dots whose rows and columns the operator has set (§4.2.2, §7.1).
 
-His sites name the rays; the surface tells the rays of the dots that he left open, and whether any
-surface has what he set.
+These are binding and determine the rays. The surface gives the rays of the other dots, and shows
+whether the correction is consistent.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from labapp.core.surface.spline import SplineSurface
 from labapp.core.values import CannotMeasure, IntArray
 
 AGREED = 0.8
-"""Such a share of the dots must agree on where the reference is."""
+"""Minimum share of the dots that must agree on the site of the reference."""
 
 OFF_SPACINGS, FEW_OFF = 0.25, 0.04
-"""A dot given a row and a column is off where it is farther from the surface's than this share of
-the way to the next dot. Where a larger share of the dots than the second is off, and more than two,
-the correction does not fit."""
+"""A dot with a given row and column is off if its residual exceeds this fraction of the distance to
+the nearest dot. If more than this share of the dots is off, and more than two, the correction does
+not fit."""
 
 
 def match_corrected(
@@ -45,26 +45,25 @@ def match_corrected(
     frame_shape: tuple[int, int],
     settings: MatchSettings,
 ) -> tuple[Match, SplineSurface]:
-    """Find the ray of every dot of a frame that the operator has corrected: what he set is binding.
+    """Determine the ray of every dot of a frame that the operator has corrected.
 
-    With a reference, every dot that has a row and a column gets the ray that these give; without
-    one, the rows and columns are matched as a block, by `match_rays`. Of the other dots the
-    surface tells the rays, never against a row or a column that a dot has. Reflected numbers stay
-    the operator's.
+    With a reference, the row and the column of a dot determine its ray; without one, the rows and
+    columns are matched as a block by `match_rays`. The rays of the other dots follow from the
+    surface, but never contradict a given row or column. Reflected rows and columns keep the
+    operator's numbers.
 
     Parameters
     ----------
     dots, lattice
-        The dots as corrected. 0 for no row or no column; missing dots of blocked rows do not
-        testify.
+        The corrected dots, and their rows and columns, 0 for none. Missing dots of blocked rows
+        give no information about the boundary.
     bench, frame_shape, settings
         See `match_rays`.
 
     Raises
     ------
     CannotMeasure
-        As `match_rays`; ``no-match`` also where no surface has the rows and columns given, which
-        the reason says.
+        As `match_rays`; also ``no-match`` if no surface fits the given rows and columns.
     """
     rows = _whole_sites(lattice)
     count = int((rows.row > 0).sum())
@@ -87,7 +86,7 @@ def match_corrected(
         raise CannotMeasure(
             "no-match",
             "the correction does not fit: counted from this reference, dots lie where the matrix "
-            "has no rays, or no surface has them there",
+            "has no rays, or no surface explains their places",
         )
     best = min(bound, key=lambda b: b.hypothesis.cost)
     _check_bound(best, rows, settings)
@@ -95,9 +94,9 @@ def match_corrected(
         if other is not best and other.hypothesis.cost < best.hypothesis.cost + settings.margin:
             raise CannotMeasure(
                 "ambiguous-orientation",
-                f"{best.orientation} and {other.orientation} explain the dots alike",
+                f"{best.orientation} and {other.orientation} explain the dots equally well",
             )
-    # Which rays came back follows from the fit that frames without a correction get.
+    # The witness comes from the same fit as for frames without a correction.
     usual = evaluate(best.observed, best.hypothesis.labels)
     final = best.hypothesis if usual is None else replace(best.hypothesis, witness=usual.witness)
     match = match_of_hypothesis(best.observed, final, best.orientation, reference)
@@ -105,9 +104,9 @@ def match_corrected(
 
 
 def lattice_of_corrected(match: Match, rig: Rig, given: Lattice) -> Lattice:
-    """Rows and columns by their rays (`lattice_of_match`), with the operator's blocked rows.
+    """Rows and columns from the rays (`lattice_of_match`), with the operator's blocked rows.
 
-    Numbers are those of ``given`` unless the rays have dots below or left of its first.
+    Numbers are those of ``given`` unless dots lie below or left of its first row or column.
     """
     lattice = lattice_of_match(match, rig, len(given.row))
     sited = np.flatnonzero((given.row > 0) & (given.column > 0))
@@ -117,10 +116,10 @@ def lattice_of_corrected(match: Match, rig: Rig, given: Lattice) -> Lattice:
 
 @dataclass(frozen=True)
 class _Bound:
-    """What follows from the operator's sites with one orientation.
+    """Hypothesis from the operator's sites with one orientation.
 
-    ``contested`` are dots with a site whose rays the surface would give to others, or them to
-    other rays; then no dot without a site has a ray.
+    ``contested`` holds the dots with a site where the grown labels contradict it: they assign its
+    ray to another dot, or the dot to another ray. No dot without a site then has a ray.
     """
 
     observed: Observation
@@ -130,7 +129,7 @@ class _Bound:
 
 
 def _whole_sites(lattice: Lattice) -> Lattice:
-    """The lattice without dots that have a row or a column alone."""
+    """Remove from a lattice the dots that have only a row or only a column."""
     sited = (lattice.row > 0) & (lattice.column > 0)
     return replace(
         lattice, row=np.where(sited, lattice.row, 0), column=np.where(sited, lattice.column, 0)
@@ -140,7 +139,7 @@ def _whole_sites(lattice: Lattice) -> Lattice:
 def _bound(
     observed: Observation, given: Lattice, reference: Site, orientation: Orientation
 ) -> _Bound | None:
-    """Label dots as sites say, and others as the surface does; None if no surface has them."""
+    """Label dots by their sites, and the others by the surface; None if no surface fits them."""
     pattern, way, rows = observed.rig.pattern, ways(orientation), _whole_sites(given)
     marker = pattern.marker or pattern.reference
     hidden = (marker[0] + (k - reference[0]) * int(way[0]) for k in given.blocked_rows)
@@ -174,7 +173,7 @@ def _bound(
 
 
 def _found_reference(match: Match, rows: Lattice, rig: Rig) -> Site:
-    """Site of the reference in the operator's rows, as the rays tell it."""
+    """Site of the reference in the operator's rows, from the rays of a match."""
     pattern = rig.pattern
     site = np.stack([rows.row, rows.column], axis=-1)[match.dot]
     away = (match.ray - (pattern.marker or pattern.reference)) * ways(match.orientation)
@@ -188,7 +187,7 @@ def _found_reference(match: Match, rows: Lattice, rig: Rig) -> Site:
 
 
 def _check_bound(bound: _Bound, rows: Lattice, settings: MatchSettings) -> None:
-    """Refuse sites that the surface cannot reconcile, and name the row that is worst."""
+    """Raise ``no-match`` if the surface contradicts the sites, and name the worst row."""
     observed, labels = bound.observed, bound.hypothesis.labels
     dot = labels[labels != UNLABELLED]
     next_mm = scipy.spatial.cKDTree(observed.plane_mm).query(observed.plane_mm, k=2)[0][dot, 1]
@@ -198,14 +197,14 @@ def _check_bound(bound: _Bound, rows: Lattice, settings: MatchSettings) -> None:
         raise CannotMeasure(
             "no-match",
             f"the correction does not fit: {len(wrong)} of {sited} dots given a row and a column "
-            f"are far from where any surface has them, most in row {_most(rows.row[wrong])}",
+            f"are far from any surface's prediction, most in row {_most(rows.row[wrong])}",
         )
     stray = bound.hypothesis.stray_count
     if stray > settings.stray[0] + settings.stray[1] * len(observed.plane_mm):
         reason = f"the correction leaves {stray} of {len(observed.plane_mm)} dots without a ray"
         if len(bound.contested):
             row = _most(rows.row[bound.contested])
-            reason += f", as the surface would have dots elsewhere that are given row {row}"
+            reason += f", as the surface contradicts dots that are given row {row}"
         raise CannotMeasure("no-match", reason)
 
 

@@ -1,15 +1,16 @@
-"""Lattice → Match: which ray made which dot, and how sure (§4.2.2, §5.2.3, §7.1).
+"""Correspondence of rays and dots, and its reliability (§4.2.2, §5.2.3, §7.1).
 
-`match_rays` goes three steps:
+`match_rays` has three steps:
 
-1. First labels. The absent centre dot gives the rays of a whole grid at once, for each orientation.
-   Where rows bow too much for a grid to grow, labels come from the optics instead: quadrics whose
-   rays round a hole fall on dots (`quadric_search`), or caps as large as the pool (`cap_search`).
-2. Labels grow (`label_growth`) and are evaluated (`hypothesis`): fit the surface to the dots
-   labelled so far, predict where every ray's dot should be, label the dots that one ray alone can
-   have made, and fit again until nothing changes. That finds the dots the grid left in doubt and
-   drops the ones it got wrong. Swapped, jumped and left out rows are repaired (`repair`).
-3. Of the hypotheses the cheapest is taken, if no other comes near it (`decision`).
+1. Initial labels. The absent centre dot gives the rays of a complete grid, for each orientation.
+   Where rows bend too much for a grid to grow, labels come from models of the surface instead:
+   quadrics that explain the dots around a hole (`quadric_search`), or caps as large as the pool
+   (`cap_search`).
+2. Labels are grown (`label_growth`) and evaluated (`hypothesis`): fit the surface to the labelled
+   dots, predict the dot of every ray, label the dots with an unambiguous ray, and fit again until
+   nothing changes. This labels the dots that the grid left in doubt and removes wrong labels.
+   Swapped, skipped and omitted rows are repaired (`repair`).
+3. The cheapest hypothesis is accepted if no other is close (`decision`).
 """
 
 from __future__ import annotations
@@ -74,11 +75,10 @@ from labapp.core.surface.spline import SplineSurface
 from labapp.core.values import CannotMeasure, FloatArray, IntArray
 
 MOST_SITES = 8
-"""So many sites of the marker in the grid lead to a hypothesis, of those that fit best."""
-
+"""Maximum number of best-fitting sites of the marker in the grid that are grown to a hypothesis."""
 
 MOST_REPAIRED = 4
-"""So many hypotheses from caps are repaired, where none explains the frame as it is."""
+"""Maximum number of hypotheses from caps that are repaired if none explains the frame."""
 
 
 def match_rays(
@@ -88,12 +88,12 @@ def match_rays(
     frame_shape: tuple[int, int],
     settings: MatchSettings,
 ) -> tuple[Match, SplineSurface]:
-    """Find the ray of every dot that one ray alone can have made, and a surface that has them.
+    """Find the ray of every dot that has an unambiguous one, and the surface that explains them.
 
     Parameters
     ----------
     dots, lattice
-        What the frame shows; no lattice where none could be grown.
+        Dots of the frame, and their rows and columns; None if no lattice could be grown.
     bench
         The bench.
     frame_shape
@@ -108,15 +108,15 @@ def match_rays(
         no absent ray or no hole can be the absent dot, ``ambiguous-rows`` if several can;
         ``ambiguous-orientation``; ``no-match`` if no surface explains the dots.
     RowsOpen
-        ``ambiguous-rows`` if several can, perhaps with a set-up that is off within its uncertainty:
-        other frames of the recording may tell which.
+        ``ambiguous-rows`` if several can, perhaps with a set-up that is wrong within its
+        uncertainty. Other frames of the recording may decide between them.
     """
     if len(dots) < LEAST_LABELS:
         raise CannotMeasure(
             "too-few-dots", f"only {len(dots)} dots found; at least {LEAST_LABELS} are needed"
         )
     if bench.rig.pattern.marker is None:
-        raise CannotMeasure("no-reference", "the pattern has no absent ray, which tells rows apart")
+        raise CannotMeasure("no-reference", "the pattern has no absent ray to identify the rows by")
     observed = Observation.of(dots, bench, frame_shape)
     orientations = settings.orientations
     found: list[Hypothesis] = []
@@ -124,7 +124,7 @@ def match_rays(
         found = with_repaired(observed, found + first_labels(observed, lattice, orientations))
         if any_explains(observed, found):
             break
-    # Where nothing explains most dots, what is found is not decided on, but caps are tried at once.
+    # If no hypothesis explains most dots, caps are tried at once.
     hopeless = bool(found) and not any(nearly_explains(observed, each) for each in found)
     try:
         decided = None if hopeless else _decide_among(observed, found, lattice, settings)
@@ -138,8 +138,8 @@ def match_rays(
     match = match_of_hypothesis(observed, best, best.orientation(observed))
     if open_holes:
         raise RowsOpen(
-            "several holes in the rows can be the absent centre dot, perhaps with the set-up a "
-            "little off",
+            "several holes in the rows can be the absent centre dot, perhaps because the set-up is "
+            "slightly wrong",
             tuple(_candidates(observed, match, open_holes)),
         )
     return match, best.pool.surface
@@ -148,7 +148,7 @@ def match_rays(
 def _candidates(
     observed: Observation, own: Match, open_holes: list[FreeHypothesis]
 ) -> Iterator[Candidate]:
-    """Matches of the hypotheses that are left open, the likeliest one's own first."""
+    """Yield the matches of the open hypotheses, that of the likeliest first."""
     least = open_holes[0]
     yield Candidate(own, (0, 0), 0.0)
     for each in open_holes[1:]:
@@ -162,11 +162,11 @@ def _candidates(
 def _decide_among(
     observed: Observation, found: list[Hypothesis], lattice: Lattice | None, settings: MatchSettings
 ) -> tuple[Hypothesis, list[FreeHypothesis]]:
-    """Decide on one of the hypotheses, or on what one leads to; `CannotMeasure` as `match_rays`."""
+    """Add rows beyond the labelled ones, and choose a hypothesis; errors as in `match_rays`."""
     found = with_rows_beyond(observed, found)
-    # Labels may have grown into an orientation that is not asked for.
-    asked = settings.orientations
-    found = [hypothesis for hypothesis in found if hypothesis.orientation(observed) in asked]
+    # Labels may have grown into an orientation that the settings exclude.
+    allowed = settings.orientations
+    found = [hypothesis for hypothesis in found if hypothesis.orientation(observed) in allowed]
     if not found:
         if lattice is not None and not lattice.candidates:
             raise CannotMeasure("no-reference", "no hole in the rows can be the absent dot")
@@ -175,9 +175,9 @@ def _decide_among(
 
 
 def lattice_of_match(match: Match, rig: Rig, count: int) -> Lattice:
-    """Rows and columns of ``count`` dots by their rays, which replace those found in the picture.
+    """Rows and columns of ``count`` dots from their rays, which replace those found in the image.
 
-    They index dots that the picture alone leaves in doubt, and no dot without a ray.
+    They include dots that the image alone leaves in doubt, and exclude dots without a ray.
     """
     way, marker = ways(match.orientation), rig.pattern.marker or rig.pattern.reference
     k, t = np.array(marker) * way + (match.reflected - match.ray * way)[0]
@@ -194,16 +194,17 @@ def lattice_of_match(match: Match, rig: Rig, count: int) -> Lattice:
 def _by_grid(
     observed: Observation, lattice: Lattice | None, orientations: tuple[Orientation, ...]
 ) -> list[Hypothesis]:
-    """Hypotheses from the grid with the marker at each site that could be it, each orientation."""
+    """Hypotheses from the grid with the marker at each candidate site, in each orientation."""
     return [] if lattice is None else _by_sites(observed, lattice, lattice.candidates, orientations)
 
 
 def _by_empty_sites(
     observed: Observation, lattice: Lattice | None, orientations: tuple[Orientation, ...]
 ) -> list[Hypothesis]:
-    """Hypotheses from the grid with the marker at each empty site, also beside it.
+    """Hypotheses from the grid with the marker at each empty site in it or next to it.
 
-    False dots, missing ones or the torch may leave the marker without three lit neighbours.
+    Because of false or missing dots, or the torch, the marker may have fewer than three lit
+    neighbours.
     """
     return (
         [] if lattice is None else _by_sites(observed, lattice, empty_sites(lattice), orientations)
@@ -216,9 +217,10 @@ def _by_sites(
     sites: Iterable[Site],
     orientations: tuple[Orientation, ...],
 ) -> list[Hypothesis]:
-    """Hypotheses from the grid with the marker at some of its sites, each orientation.
+    """Hypotheses from the grid with the marker at given sites, in each orientation.
 
-    Few grow: those whose surface fits best, first a quick one, then that with which labels grow.
+    Only the best-fitting ones are grown. They are selected first by a quick fit, then by the fit
+    with which labels grow.
     """
     pattern = observed.rig.pattern
     assert pattern.marker is not None
@@ -238,14 +240,14 @@ def _by_sites(
 def _fitting(
     observed: Observation, labelled: list[IntArray], settings: FitSettings
 ) -> list[tuple[float, IntArray]]:
-    """Labels with the root mean square residual of a surface through them, mm, the least first."""
+    """Labels with the root mean square residual of their fit, mm, in ascending order."""
     pools = ((try_fit(observed, labels, settings), labels) for labels in labelled)
     found = [(pool.residual_rms_mm, labels) for pool, labels in pools if pool is not None]
     return sorted(found, key=lambda one: one[0])
 
 
 def _by_caps(observed: Observation) -> list[Hypothesis]:
-    """Hypotheses from the caps that the dots lie on best, the cheapest of them repaired."""
+    """Hypotheses from the caps that match the dots best; the cheapest of them are repaired."""
     found: list[Hypothesis] = []
     for labels in search_caps(observed):
         hypothesis = grow_and_evaluate(observed, labels)
@@ -263,7 +265,7 @@ def _by_caps(observed: Observation) -> list[Hypothesis]:
 def _by_quadrics(
     observed: Observation, lattice: Lattice | None, orientations: tuple[Orientation, ...]
 ) -> list[Hypothesis]:
-    """Hypotheses from the quadrics that explain the dots round some hole, with the grid's help."""
+    """Hypotheses from the quadrics that explain the dots around a hole, extended by the grid."""
     found = []
     for guess in search_quadrics(observed):
         hypothesis = grow_and_evaluate(observed, guess.labels)
@@ -280,17 +282,17 @@ def _by_quadrics(
 
 
 def match_of_hypothesis(
-    observed: Observation, best: Hypothesis, own: Orientation, reference: Site | None = None
+    observed: Observation, best: Hypothesis, orientation: Orientation, reference: Site | None = None
 ) -> Match:
-    """The match of a hypothesis with its orientation, ``own``, and how the other ones would fit.
+    """Build the match of a hypothesis with its orientation, and try the other orientations.
 
     Reflected rows and columns count from 1, or so that the reference has the given site (k, t).
     """
-    trials = [Trial(own, best.residual_mm)]
-    for orientation in ORIENTATIONS:
-        if orientation != own:
-            other = try_fit(observed, reoriented_labels(observed, best.labels, own, orientation))
-            trials.append(Trial(orientation, np.inf if other is None else other.residual_rms_mm))
+    trials = [Trial(orientation, best.residual_mm)]
+    for other in ORIENTATIONS:
+        if other != orientation:
+            pool = try_fit(observed, reoriented_labels(observed, best.labels, orientation, other))
+            trials.append(Trial(other, np.inf if pool is None else pool.residual_rms_mm))
     at = np.argwhere(best.labels != UNLABELLED)
     dot = best.labels[at[:, 0], at[:, 1]]
     trials.sort(key=lambda trial: trial.residual_mm)
@@ -304,7 +306,7 @@ def match_of_hypothesis(
         certain_witness(observed, best.witness, paths, covariance_of),
         best.missed_count,
     )
-    return match_of_pairs(observed, at, dot, own, witness, missed, trials, reference)
+    return match_of_pairs(observed, at, dot, orientation, witness, missed, trials, reference)
 
 
 def match_of_pairs(
@@ -317,7 +319,7 @@ def match_of_pairs(
     trials: Iterable[Trial],
     reference: Site | None = None,
 ) -> Match:
-    """The match of n pairs of ray and dot.
+    """Build the match of n pairs of ray and dot.
 
     Parameters
     ----------
@@ -330,9 +332,9 @@ def match_of_pairs(
     orientation, witness, trials
         See `Match`.
     missed
-        How many rays amid the others have no dot.
+        Number of rays between lit rays that have no dot.
     reference
-        Reflected row and column (k, t) of the marker; None: so that rows and columns begin at 1.
+        Reflected row and column (k, t) of the marker. None: rows and columns begin at 1.
     """
     pattern = observed.rig.pattern
     numbers = (at + 1 - (pattern.marker or pattern.reference)) * ways(orientation)

@@ -1,4 +1,4 @@
-"""Decide which of the hypotheses about a frame's rays stands, or that none does."""
+"""Choice among the hypotheses of a frame: accept the cheapest, or refuse all."""
 
 from __future__ import annotations
 
@@ -37,63 +37,66 @@ from labapp.core.surface.pool_fit import FitSettings
 from labapp.core.values import CannotMeasure, IntArray, median
 
 MISFIT_MM, MISFIT_TIMES = 0.15, 3.0
-"""Labels that leave larger residuals, mm, and so many times those of the best, are not followed:
-with wrong rays they are mostly ten times those with the right ones."""
+"""Labels whose residuals exceed both the first, mm, and this multiple of the best residuals are
+discarded: residuals with wrong rays are usually ten times those with the correct ones."""
 
 FEW_LEFT = 0.05
-"""With no larger share of the dots left over, and as few missing, a hypothesis explains a frame: no
-other is looked for."""
+"""A hypothesis explains a frame if at most this share of the dots is stray, and as few rays are
+missed: no other is searched for."""
 
 MOST_STRAY = 0.5
-"""With a larger share of the dots left over, a hypothesis is not repaired but another one looked
-for."""
+"""If a larger share of the dots is stray, a hypothesis is not repaired; another one is searched
+for.
+"""
 
 MOST_DIFFERING = 0.2
-"""Where near-equals have other rays for a larger share of the dots, the whole is ambiguous."""
+"""If hypotheses of nearly equal cost assign different rays to a larger share of the dots, the frame
+is ambiguous."""
 
 CONTRADICTED_BITS = 0.5
-"""Mean surprise of a ray near the boundary above which the surface is not the pool's: less than 0.3
-even where the set-up is a little off, more than 1 where labels are wrong for that."""
+"""Mean surprise of the rays near the boundary, bits, above which the surface is rejected: less than
+0.3 even if the set-up is slightly wrong, more than 1 if the labels are wrong for that reason."""
 
 CLOSE_COST = 40.0
-"""A rival whose cost is within this of the cheapest's is looked at closer, in units of χ²: a dip
-under the torch, or dots that labels a row on have not yet found, may add as much to a cost."""
+"""A rival whose cost is within this of the lowest is examined further, in units of χ²: a dip under
+the torch, or dots that shifted labels have not yet found, may add as much to a cost."""
 
 QUICK_MISFIT_TIMES = 4.0
-"""Labels whose quick surface leaves so many times the residual of the best's are no rivals: those
-that came near, of 700 beside 160 pools with a dip, left less than 2.5 times as much."""
+"""Labels whose quick fit has more than this multiple of the best residual are not rivals. Of 700
+shifted labels of 160 pools with a dip, those that came close had less than 2.5 times as much."""
 
 FAR_COST = 30.0
-"""With rough surfaces, labels that cost more than the best by so much, and by `CLOSE_COST` besides
-where the marker counts, do not come near it with settled ones."""
+"""Labels that cost more than the best by this with rough fits, and by `CLOSE_COST` in addition if
+the marker is included, do not come close to it with converged fits."""
 
 NOTHING_EXPLAINS = "no surface explains the reflected dots"
-"""Why there is no match, where not even most of the dots have a ray."""
+"""Reason for ``no-match`` if most of the dots have no ray."""
 
 PAIR, BESIDE_SPACINGS = 2, 1.5
-"""So many missed rays, or dots without a ray, side by side are no row; dots are where they are
-nearer to one another than so many spacings."""
+"""Up to this number of adjacent missed rays, or of adjacent stray dots, is not taken for a row.
+Dots are adjacent within `BESIDE_SPACINGS` spacings."""
 
 MOST_SCATTERED, MOST_MISSED_APART = 0.3, 0.12
-"""Where dots without a ray and missed rays lie apart, so many of both, as a share of the dots with
-a ray, are put up with: false dots lie apart, and those that fail at random; dots of a row that was
-left out or jumped do not. With so many missed rays no other hypothesis is looked for."""
+"""Largest share of stray dots and missed rays together, relative to the labelled dots, that is
+accepted if they are isolated: false dots and random failures are isolated, whereas the dots of a
+row that was omitted or skipped are not. With at most the second share of missed rays no other
+hypothesis is searched for."""
 
 
 @dataclass(frozen=True)
 class MatchSettings:
-    """How the correspondence is decided.
+    """Settings for the choice of the correspondence.
 
     Parameters
     ----------
     correspondence
-        ``auto`` tries every orientation; otherwise the one to use. `pipeline.measure` puts
-        `Settings.correspondence` here.
+        ``auto`` tries every orientation; otherwise the one to use. `pipeline.measure` sets it from
+        `Settings.correspondence`.
     margin
-        Two hypotheses whose costs differ by less, in units of χ², cannot be told apart.
+        Two hypotheses whose costs differ by less, in units of χ², cannot be distinguished.
     stray, missed
-        How many dots without a ray, and rays without a dot amid the others, are put up with: a
-        number, and a share of the dots (`most_strays`, `leaves_much`) to be added to it.
+        How many stray dots and missed rays are accepted: a number, and a share of the dots
+        (`most_strays`, `leaves_much`) that is added to it.
     """
 
     correspondence: Literal["auto", "S/S", "S/I", "I/I"] = "auto"
@@ -103,15 +106,15 @@ class MatchSettings:
 
     @property
     def orientations(self) -> tuple[Orientation, ...]:
-        """Orientations to be tried."""
+        """Orientations to try."""
         return ORIENTATIONS if self.correspondence == "auto" else (self.correspondence,)
 
     def most_strays(self, hypothesis: Hypothesis) -> float:
-        """Return how many dots without a ray are put up with, wherever they lie."""
+        """Return how many stray dots are accepted, wherever they lie."""
         return self.stray[0] + self.stray[1] * (hypothesis.label_count + hypothesis.stray_count)
 
     def leaves_much(self, hypothesis: Hypothesis) -> bool:
-        """Whether more is left unexplained than is put up with wherever it lies."""
+        """Whether more dots or rays are unexplained than are accepted wherever they lie."""
         most_missed = self.missed[0] + self.missed[1] * hypothesis.label_count
         return (
             hypothesis.stray_count > self.most_strays(hypothesis)
@@ -120,7 +123,7 @@ class MatchSettings:
 
 
 def explains(observed: Observation, hypothesis: Hypothesis) -> bool:
-    """Whether few dots are left over, few are missing and lie apart, and the marker is not lit."""
+    """Whether there are few stray dots, few and isolated missed rays, and no dot at the marker."""
     few = max(2, FEW_LEFT * len(observed.plane_mm))
     most = MOST_MISSED_APART * hypothesis.label_count if _missed_lie_apart(hypothesis) else 0.0
     missed = hypothesis.missed_count <= max(few, most)
@@ -128,7 +131,7 @@ def explains(observed: Observation, hypothesis: Hypothesis) -> bool:
 
 
 def nearly_explains(observed: Observation, hypothesis: Hypothesis) -> bool:
-    """Whether most dots have their ray: what is left may be a row, or a dip."""
+    """Whether most dots have a ray; the rest may be a row, or a dip."""
     return hypothesis.stray_count <= MOST_STRAY * len(observed.plane_mm)
 
 
@@ -140,40 +143,40 @@ def any_explains(observed: Observation, found: list[Hypothesis]) -> bool:
 def decide(
     observed: Observation, found: list[Hypothesis], settings: MatchSettings
 ) -> tuple[Hypothesis, list[FreeHypothesis]]:
-    """Take the cheapest hypothesis, if nothing else comes near it and it leaves little open.
+    """Choose the cheapest hypothesis if no other is close and it leaves little unexplained.
 
-    It is held against the others, against itself up to two rows or columns further on (labels that
-    grew from the wrong hole may come to almost the right place), and against itself with the other
-    orientations. Dots on which near-equals disagree lose their ray.
+    It is compared with the others, with itself shifted by up to two rows or columns (labels grown
+    from a wrong hole may end almost at the correct place), and with itself in the other
+    orientations. Dots on which hypotheses of nearly equal cost disagree lose their ray.
 
     Returns
     -------
     best, open_holes
-        The hypothesis; and where several holes can be the marker's, perhaps with a set-up within
-        its uncertainty, that hypothesis and its rivals (`holes_left_open`).
+        The hypothesis; and, if several holes can be the marker's, perhaps with the set-up changed
+        within its uncertainty, that hypothesis and its rivals (`holes_left_open`).
 
     Raises
     ------
     CannotMeasure
-        ``no-match``, ``no-reference`` or ``ambiguous-orientation``; ``ambiguous-rows`` where there
-        is a dot in the only hole, or a part of the rows is open.
+        ``no-match``, ``no-reference`` or ``ambiguous-orientation``; ``ambiguous-rows`` if there is
+        a dot in the only hole, or a part of the rows is ambiguous.
     """
     best, found, neighbours, fit = _cheapest(observed, found, settings.margin)
-    cheapest = best  # compared with others before what is doubtful in it, as in them, is taken away
+    cheapest = best  # compared with the others before doubtful labels are removed, as from none
     if fit is FINE_KNOTS:
         cheapest = evaluate_twice(observed, best.labels, fit, best.pool) or best
     best = without_doubtful_outermost(observed, without_false_ends(observed, best, fit), fit)
     if fit is FINE_KNOTS:
         best = evaluate_twice(observed, best.labels, fit, best.pool) or best
     _refuse_unexplained(observed, best, settings)
-    own = best.orientation(observed)
+    orientation = best.orientation(observed)
     _refuse_marker(observed, best, found)
     doubtful: list[int] = []
     rivals: list[Hypothesis] = []
     others = (
-        reoriented_labels(observed, best.labels, own, way)
-        for way in settings.orientations
-        if way != own
+        reoriented_labels(observed, best.labels, orientation, other)
+        for other in settings.orientations
+        if other != orientation
     )
     for other in [*found, *neighbours, *_rivals(observed, best, others, fit)]:
         if _stands_against(observed, cheapest, other, fit, settings):
@@ -181,10 +184,10 @@ def decide(
         differing, shared = _differing(best, other)
         if len(differing) <= MOST_DIFFERING * shared:
             doubtful += differing
-        elif other.orientation(observed) != own:
+        elif other.orientation(observed) != orientation:
             raise CannotMeasure(
                 "ambiguous-orientation",
-                f"{own} and {other.orientation(observed)} explain the dots alike",
+                f"{orientation} and {other.orientation(observed)} explain the dots equally well",
             )
         else:
             rivals.append(other)
@@ -195,16 +198,16 @@ def decide(
 
 
 def _refuse_marker(observed: Observation, best: Hypothesis, found: list[Hypothesis]) -> None:
-    """Raise ``no-reference`` or ``ambiguous-rows`` where the marker is not dark amid lit rays."""
+    """Raise ``no-reference`` or ``ambiguous-rows`` unless the marker is dark between lit rays."""
     if best.marker == "lit":
         others_explain = any_explains(observed, [h for h in found if h.marker == "dark"])
         raise CannotMeasure(
             "ambiguous-rows" if others_explain else "no-reference",
-            "where the best rows have the absent centre dot, there is a dot",
+            "the best rows have a dot where the absent centre dot would be",
         )
     if best.marker == "unknown":
         raise CannotMeasure(
-            "no-reference", "the absent centre dot is not amid dots that have their ray"
+            "no-reference", "the absent centre dot is not between dots that have a ray"
         )
 
 
@@ -214,17 +217,17 @@ def _with_rivals(
     cheapest: Hypothesis,
     rivals: list[Hypothesis],
 ) -> list[FreeHypothesis]:
-    """The holes left open, with those of rivals that are near with the set-up as it is entered.
+    """Add to the open holes those of rivals that are close with the set-up as entered.
 
-    Rivals cost so much more than the cheapest, which is the best before doubtful labels were taken
-    away. ``ambiguous-rows`` where one differs in a part of the rows alone.
+    Costs of rivals are relative to ``cheapest``, the best hypothesis before the removal of doubtful
+    labels. Raise ``ambiguous-rows`` if a rival differs only in a part of the rows.
     """
     if rivals and not open_holes:
         open_holes = [FreeHypothesis(best.labels, cost=best.cost)]
     for rival in rivals:
         step = _step(best, rival)
         if not any(step):
-            raise CannotMeasure("ambiguous-rows", "parts of the rows can be one on or not")
+            raise CannotMeasure("ambiguous-rows", "parts of the rows can be shifted by one")
         if step not in {each.step for each in open_holes}:
             with_marker = rival.cost - cheapest.cost
             without = rival.cost_without_marker - cheapest.cost_without_marker
@@ -234,20 +237,20 @@ def _with_rivals(
 
 
 def _step(one: Hypothesis, other: Hypothesis) -> tuple[int, int]:
-    """Rows and columns by which most dots have their rays on in another hypothesis."""
+    """Rows and columns by which the rays of most dots are shifted in another hypothesis."""
     count = max(one.labels.max(), other.labels.max()) + 1
     at = np.full((2, count, 2), np.nan)
     for place, labels in zip(at, (one.labels, other.labels), strict=True):
         rays = np.argwhere(labels != UNLABELLED)
         place[labels[tuple(rays.T)]] = rays
     shared = np.isfinite(at).all(axis=(0, 2))
-    steps, many = np.unique((at[1] - at[0])[shared], axis=0, return_counts=True)
-    row, column = steps[np.argmax(many)]
+    steps, counts = np.unique((at[1] - at[0])[shared], axis=0, return_counts=True)
+    row, column = steps[np.argmax(counts)]
     return int(row), int(column)
 
 
 def supported(observed: Observation, best: Hypothesis, fit: FitSettings) -> Hypothesis:
-    """The hypothesis without the labels that the surface through the others does not support."""
+    """Remove the labels that the surface through the other dots does not support."""
     for _ in range(MOST_LEFT_OUT):
         settled = _settled(observed, best, fit)
         wrong = unsupported(observed, fitted_labels(observed, settled, fit))
@@ -260,7 +263,7 @@ def supported(observed: Observation, best: Hypothesis, fit: FitSettings) -> Hypo
 def _without(
     observed: Observation, best: Hypothesis, dots: IntArray | list[int], fit: FitSettings
 ) -> Hypothesis:
-    """The hypothesis without the labels of some dots, whose rays say nothing of the boundary."""
+    """Remove the labels of some dots; the witness of their rays becomes unknown."""
     certain = np.where(np.isin(best.labels, dots), UNLABELLED, best.labels)
     if (certain == best.labels).all():
         return best
@@ -269,7 +272,7 @@ def _without(
 
 
 def _settled(observed: Observation, best: Hypothesis, fit: FitSettings) -> Hypothesis:
-    """The hypothesis with its fit run on, as far as that of a reconstruction."""
+    """Continue the fit of a hypothesis until it has converged as for a reconstruction."""
     fit = replace(fit, settled_mm=FitSettings().settled_mm)
     try:
         return replace(best, pool=observed.fit(best.labels, best.witness, fit, best.pool))
@@ -278,7 +281,7 @@ def _settled(observed: Observation, best: Hypothesis, fit: FitSettings) -> Hypot
 
 
 def fitted_labels(observed: Observation, best: Hypothesis, fit: FitSettings) -> FittedLabels:
-    """The hypothesis's labels and surface, as `unsupported` takes them."""
+    """Labels and surface of a hypothesis, as the input of `unsupported`."""
     basis, paths = best.pool.surface.basis, paths_of(observed, best.pool)
     missed = np.ravel_multi_index(tuple(best.missed_rays.T), best.labels.shape)
     classes = RayClasses(best.witness, missed, best.stray_dots)
@@ -294,13 +297,13 @@ def fitted_labels(observed: Observation, best: Hypothesis, fit: FitSettings) -> 
 def _cheapest(
     observed: Observation, found: list[Hypothesis], margin: float
 ) -> tuple[Hypothesis, list[Hypothesis], list[Hypothesis], FitSettings]:
-    """The cheapest hypothesis, those found, its neighbours a row or two on, and the fit of all."""
+    """The cheapest hypothesis, all found, its neighbours by a row or two, and the fit settings."""
     best = min(found, key=lambda hypothesis: hypothesis.cost)
     fit = USUAL_KNOTS
     neighbours: list[Hypothesis] = []
     if best.stray_count or best.missed_count:
         neighbours = _rivals(observed, best, shifted_labels(observed, best.labels), fit)
-    # What these knots leave of a dip may decide between rivals so close.
+    # Residuals of a dip that these knots cannot follow may decide between rivals this close.
     near = any(rival.cost < best.cost + CLOSE_COST for rival in neighbours)
     if near or best.residual_mm > KNOT_ERROR_MM:
         fit, neighbours = FINE_KNOTS, []
@@ -310,14 +313,14 @@ def _cheapest(
         best = min(found, key=lambda hypothesis: hypothesis.cost, default=best)
     if not neighbours and not _beyond_doubt(observed, best, margin):
         best, neighbours = _with_neighbours(observed, best, fit)
-    if fit is FINE_KNOTS:  # what takes labels away compares costs of these knots alone
+    if fit is FINE_KNOTS:  # labels are removed by comparing costs of these knots alone
         best = evaluate(observed, best.labels, fit, initial=best.pool) or best
     return best, found, neighbours, fit
 
 
 def _refuse_unexplained(observed: Observation, best: Hypothesis, settings: MatchSettings) -> None:
-    """Raise ``no-match`` where too much is left unexplained, or what is left may be a row."""
-    # Missed rays side by side are a hole or a row: then so many dots without a ray may be theirs.
+    """Raise ``no-match`` if too much is left unexplained, or what is left may be a row."""
+    # Adjacent missed rays are a hole or a row: stray dots may then be their dots.
     scattered = (
         best.marker == "dark"
         and _missed_lie_apart(best)
@@ -330,13 +333,13 @@ def _refuse_unexplained(observed: Observation, best: Hypothesis, settings: Match
         raise CannotMeasure(
             "no-match",
             f"the best surface leaves {_counted(best.stray_count, 'dot')} without a ray and "
-            f"{_counted(best.missed_count, 'ray')} without a dot amid {best.label_count} pairs",
+            f"{_counted(best.missed_count, 'ray')} without a dot among {best.label_count} pairs",
         )
     if best.pool.level.rays and best.pool.level.disagreement > CONTRADICTED_BITS:
         raise CannotMeasure(
             "no-match",
-            "no boundary of the best surface has the rays that came back inside and the others "
-            "outside: is the set-up right?",
+            "no boundary of the best surface separates the rays that came back from those that "
+            "did not: is the set-up correct?",
         )
 
 
@@ -347,14 +350,15 @@ def _stands_against(
     fit: FitSettings,
     settings: MatchSettings,
 ) -> bool:
-    """Whether the best stands against another: it costs less, by a margin.
+    """Whether the best hypothesis costs less than another by the margin.
 
-    With fine knots it may cost less with both kinds of knots, and with one of them by the margin. A
-    false dot may lie at the marker: another that costs less but for that is a rival.
+    With fine knots it is enough that it costs less with both kinds of knots, and by the margin with
+    one of them. As the dot at the marker may be false, another hypothesis that costs less without
+    the marker is a rival.
     """
     if other.cost_without_marker < best.cost_without_marker:
         return False
-    # With the set-up off and many false dots, wrong rows were ahead by more than one margin.
+    # With a wrong set-up and many false dots, wrong rows led by more than one margin.
     many_false = best.stray_count > settings.most_strays(best)
     margin = (2 if many_false else 1) * settings.margin
     if other.cost >= best.cost + margin:
@@ -371,9 +375,9 @@ def _stands_against(
 
 
 def _beyond_doubt(observed: Observation, best: Hypothesis, margin: float) -> bool:
-    """Whether nothing is left unexplained, so that no shift of the labels can come near.
+    """Whether nothing is left unexplained, so that no shifted labels can come close.
 
-    Any shift puts a dot on the marker's absent ray and leaves the hole to a ray without a dot.
+    Any shift places a dot at the marker's absent ray, and a ray without a dot in the hole.
     """
     if best.stray_count or best.missed_count or best.marker != "dark":
         return False
@@ -384,11 +388,11 @@ def _beyond_doubt(observed: Observation, best: Hypothesis, margin: float) -> boo
 def _with_neighbours(
     observed: Observation, best: Hypothesis, fit: FitSettings
 ) -> tuple[Hypothesis, list[Hypothesis]]:
-    """The cheapest hypothesis that shifts by a row or two lead to; and its neighbours.
+    """The cheapest hypothesis that shifts by a row or two lead to, and its neighbours.
 
-    The labels of one that comes close grow first: shifted, it may lack dots at its ends.
+    Shifted labels that come close are grown first, as they may lack dots at their ends.
     """
-    while True:  # each round is cheaper than the one before
+    while True:  # each round is cheaper than the previous one
         neighbours = _rivals(observed, best, shifted_labels(observed, best.labels), fit)
         near = [each.labels for each in neighbours if each.cost < best.cost + CLOSE_COST]
         grown = [h for labels in near if (h := grow_and_evaluate(observed, labels, fit))]
@@ -404,16 +408,18 @@ def _with_neighbours(
 def _rivals(
     observed: Observation, best: Hypothesis, labelled: Iterable[IntArray], fit: FitSettings
 ) -> list[Hypothesis]:
-    """Evaluate other labels beside a hypothesis, as far as they may come near it.
+    """Evaluate other labels as rivals of a hypothesis, except those that cannot come close to it.
 
-    A surface has to go through their dots as well; with wide knots they have to explain nearly as
-    much with a rough surface. (With fine ones there is a dip, of which that leaves too much.)
+    Their residuals must be comparable. With the usual knots, their cost with a rough fit must be
+    comparable too. (Fine knots are used for a dip, which the rough fit does not follow.)
     """
     most_mm = max(MISFIT_MM, MISFIT_TIMES * best.residual_mm)
     quick = try_fit(observed, best.labels, QUICK, best.pool)
     rough = try_fit(observed, best.labels, initial=best.pool)
     far_mm = np.inf if quick is None else QUICK_MISFIT_TIMES * quick.residual_rms_mm
-    own = None if rough is None or fit is FINE_KNOTS else rough_costs(observed, best.labels, rough)
+    costs = (
+        None if rough is None or fit is FINE_KNOTS else rough_costs(observed, best.labels, rough)
+    )
     rivals = []
     for labels in labelled:
         sketch = try_fit(observed, labels, QUICK, best.pool)
@@ -422,9 +428,9 @@ def _rivals(
         pool = try_fit(observed, labels, initial=best.pool)
         if pool is None or pool.residual_rms_mm >= most_mm:
             continue
-        if own is not None:
+        if costs is not None:
             unlit, cost = rough_costs(observed, labels, pool)
-            if unlit > own[0] + FAR_COST and cost > own[1] + FAR_COST + CLOSE_COST:
+            if unlit > costs[0] + FAR_COST and cost > costs[1] + FAR_COST + CLOSE_COST:
                 continue
         hypothesis = evaluate_twice(observed, labels, fit, pool)
         rivals += [] if hypothesis is None else [hypothesis]
@@ -432,7 +438,7 @@ def _rivals(
 
 
 def _missed_lie_apart(hypothesis: Hypothesis) -> bool:
-    """Whether no more than `PAIR` rays without a dot are together, or one more round a corner."""
+    """Whether at most `PAIR` missed rays are connected, or one more around a corner."""
     seen = np.zeros(hypothesis.labels.shape, np.uint8)
     seen[tuple(hypothesis.missed_rays.T)] = 1
     found = cv2.connectedComponentsWithStats(seen, connectivity=4)[2][1:]
@@ -441,7 +447,7 @@ def _missed_lie_apart(hypothesis: Hypothesis) -> bool:
 
 
 def _strays_lie_apart(observed: Observation, hypothesis: Hypothesis) -> bool:
-    """Whether no more than `PAIR` dots without a ray are side by side."""
+    """Whether at most `PAIR` stray dots are adjacent."""
     dots = observed.plane_mm[hypothesis.labels[hypothesis.labels != UNLABELLED]]
     spacing = median(scipy.spatial.cKDTree(dots).query(dots, k=2)[0][:, 1])
     stray_dots = observed.plane_mm[hypothesis.stray_dots]
@@ -452,7 +458,7 @@ def _strays_lie_apart(observed: Observation, hypothesis: Hypothesis) -> bool:
 
 
 def _differing(one: Hypothesis, other: Hypothesis) -> tuple[list[int], int]:
-    """Dots that have different rays in the two, and how many have a ray in both."""
+    """Dots with different rays in two hypotheses, and the number of dots with a ray in both."""
     rays = [{int(dot): at for at, dot in np.ndenumerate(h.labels)} for h in (one, other)]
     shared = rays[0].keys() & rays[1].keys() - {UNLABELLED}
     return [dot for dot in shared if rays[0][dot] != rays[1][dot]], len(shared)

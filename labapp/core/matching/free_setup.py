@@ -1,12 +1,13 @@
-"""Whether another hole could be the marker's if the set-up were off by about its uncertainty.
+"""Whether another hole could be the marker's, given the uncertainty of the set-up.
 
-Where the set-up is off, labels a row or a column off may leave smaller residuals than right ones: a
-shift of the labels moves dots much as a set-up that is off by a part of the rays' spacing. So
-hypotheses are compared with the set-up free: each is given the one that it is likeliest with, and
-costs more the unlikelier that is.
+If the set-up is wrong, labels shifted by a row or a column may have smaller residuals than correct
+ones: a shift of the labels moves dots much as an error of the set-up by a fraction of the spacing
+of the rays does. Hypotheses are therefore compared with a free set-up: each uses the set-up with
+which it is likeliest, and its cost includes the deviation of this set-up from the given one.
 
-What tells holes apart is the boundary, the smoothness of the surface and the uncertainty of the
-set-up. The residuals hardly do: the surface follows the dots of either hypothesis about as well.
+Holes are distinguished by the boundary, the smoothness of the surface and the uncertainty of the
+set-up. The residuals hardly contribute: the surface follows the dots of either hypothesis about
+equally well.
 """
 
 from __future__ import annotations
@@ -34,18 +35,18 @@ from labapp.core.values import IntArray
 
 @dataclass(frozen=True)
 class FreeHypothesis:
-    """Labels with the set-up that they are likeliest with, within its uncertainty.
+    """Labels with the set-up with which they are likeliest, given its uncertainty.
 
     Parameters
     ----------
     labels
-        They, or what they grow to there where that costs less.
+        The given labels, or those grown from them with that set-up if these cost less.
     step
-        Rows and columns by which the labels are on from those of the best hypothesis.
+        Rows and columns by which the labels are shifted from those of the best hypothesis.
     given_cost
-        Cost of the labels as they were given, in units of χ².
+        Cost of the given labels, in units of χ²; infinite without a surface.
     cost
-        That of `labels`; infinite, as the one before, without a surface.
+        Cost of `labels`, in units of χ²; infinite without a surface.
     """
 
     labels: IntArray
@@ -57,27 +58,27 @@ class FreeHypothesis:
 def holes_left_open(
     observed: Observation, best: Hypothesis, fit: FitSettings, margin: float
 ) -> list[FreeHypothesis]:
-    """Hypotheses with the marker in each hole that it may be in, with the set-up free.
+    """Hypotheses for each hole that may be the marker's, with a free set-up.
 
-    Labels are those of the hypothesis, and the same up to two rows or columns on which cost less
-    than a margin more. Other shifts put a dot on the marker's ray, which no set-up explains. A rig
-    that is known exactly leaves nothing open.
+    Labels are those of the hypothesis, and those shifted by up to two rows or columns whose cost is
+    higher by less than a margin. Shifts that place a dot at the marker's absent ray are omitted, as
+    no set-up explains it. If the rig is known exactly, there are none.
 
     Parameters
     ----------
     observed
         The dots, and the bench with its uncertainty.
     best
-        The hypothesis that is compared.
+        The best hypothesis.
     fit
-        How it is evaluated (`evaluate_twice`).
+        Fit settings of the evaluation (`evaluate_twice`).
     margin
-        In units of χ².
+        Largest difference in cost, in units of χ².
 
     Returns
     -------
     list
-        The hypothesis itself first, then its rivals; empty where it has none.
+        The hypothesis itself first, then its rivals; empty if it has none.
     """
     steps = [] if observed.rig.uncertainty is None else _steps_to_other_holes(observed, best)
     if not steps:
@@ -94,7 +95,7 @@ def holes_left_open(
 
 
 def _steps_to_other_holes(observed: Observation, best: Hypothesis) -> list[tuple[int, int]]:
-    """Rows and columns by which labels are shifted for the marker to be in another hole."""
+    """Shifts of the labels, in rows and columns, that place the marker in another hole."""
     marker = observed.rig.pattern.marker
     assert marker is not None
     holes = np.pad(best.labels == UNLABELLED, 2)  # beyond the pattern is no hole
@@ -104,11 +105,11 @@ def _steps_to_other_holes(observed: Observation, best: Hypothesis) -> list[tuple
 def _with_setup_free(
     observed: Observation, hypothesis: Hypothesis, fit: FitSettings, most: float = np.inf
 ) -> FreeHypothesis:
-    """Labels with the set-up that they are likeliest with.
+    """Evaluate labels with the set-up with which they are likeliest.
 
-    That set-up is found in one Gauss–Newton step, which takes the squares of the residuals and of
-    the set-up's deviations, in σ, to their least sum, the surface fitted anew. Costs are infinite
-    without a surface, and where that of the labels as they are is not below ``most``.
+    That set-up is found by one Gauss–Newton step, which minimises the sum of the squared residuals
+    and squared deviations of the set-up, both in σ, while the surface is refitted. Costs are
+    infinite without a surface, and if the cost of the given labels is not below ``most``.
     """
     labels, known = hypothesis.labels, observed.rig.uncertainty
     pool = try_fit(observed, labels, USUAL_KNOTS, hypothesis.pool)
@@ -119,13 +120,13 @@ def _with_setup_free(
     pairs = at + 1, observed.plane_mm[dot], observed.covariance_mm2[dot]
     sigma = np.repeat(np.sqrt(variance_mm2(observed, dot)), 2)
     change = residual_changes(*pairs, observed.rig, USUAL_KNOTS, pool).reshape(len(sigma), -1)
-    met = np.isfinite(change).all(axis=1)  # a ray at the rim may leave the splines
-    jacobian = change[met] / sigma[met, None]
-    rhs = -jacobian.T @ (pool.residual_mm.ravel() / sigma)[met]
-    deviates = np.linalg.solve(jacobian.T @ jacobian + np.eye(len(rhs)), rhs)
-    rig, plane_mm = bench_off(observed.rig, known.root @ deviates, observed.plane_mm)
+    finite = np.isfinite(change).all(axis=1)  # a ray at the rim may leave the splines
+    jacobian = change[finite] / sigma[finite, None]
+    rhs = -jacobian.T @ (pool.residual_mm.ravel() / sigma)[finite]
+    deviation = np.linalg.solve(jacobian.T @ jacobian + np.eye(len(rhs)), rhs)
+    rig, plane_mm = bench_off(observed.rig, known.root @ deviation, observed.plane_mm)
     moved = replace(observed, bench=Bench(rig, observed.bench.calibration), plane_mm=plane_mm)
-    found, setup_cost = evaluate_twice(moved, labels, fit, pool), float(deviates @ deviates)
+    found, setup_cost = evaluate_twice(moved, labels, fit, pool), float(deviation @ deviation)
     if found is None or found.cost + setup_cost >= most:
         return FreeHypothesis(labels)
     more = grow_and_evaluate(moved, labels)

@@ -1,7 +1,8 @@
-"""Hypothesis: one way to label all dots of a frame with rays, and its cost.
+"""Hypothesis: one assignment of rays to all dots of a frame, and its cost.
 
-The cost is in units of χ²: residuals of the dots over their variance, a fixed sum for every dot
-without a ray and every ray without a dot, and what the rays near the boundary have against it.
+The cost is in units of χ²: squared residuals of the dots over their variance, a fixed cost for each
+stray dot and each missed ray, the contradictions of the rays near the boundary, and the roughness
+of the surface.
 """
 
 from __future__ import annotations
@@ -38,53 +39,54 @@ from labapp.core.surface.pool_fit import CORRELATED_MM2, FitSettings, FittedPool
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray
 
 KNOT_ERROR_MM = 0.045
-"""How far dots may be off the right surface, mm, because its knots cannot follow a dent."""
+"""Standard error of dots, mm, because the knots of the correct surface cannot follow a dent."""
 
 USUAL_KNOTS = FitSettings(settled_mm=1e-3)
 FINE_KNOTS, WIDE_KNOTS = replace(USUAL_KNOTS, knot_mm=0.5), replace(USUAL_KNOTS, knot_mm=1.0)
-"""Fits that a hypothesis is evaluated with: their knots are those of the final fit; or fine enough
-for a narrow dip under the torch, whose residuals would hide what is unexplained; or so wide that a
-row which somebody shifted stands out."""
+"""Fit settings for the evaluation of a hypothesis. Their knots are those of the final fit; fine
+enough for a narrow dip under the torch, whose residuals would mask what is unexplained; or wide
+enough that a row which the operator has shifted stands out."""
 
 BEYOND_SPACINGS, FEW_BEYOND = 0.25, 2
-"""A lit ray is beyond the boundary when it lands so far outside, in spacings of the rays; up to so
-many of them are put down to false dots."""
+"""A lit ray is beyond the boundary if it lands farther outside than this, in spacings of the rays;
+up to this number of them is attributed to false dots."""
 
 STRAY_COST, MISSED_COST, LIT_MARKER_COST = 16.0, 12.0, 60.0
-"""What a dot without a ray, a ray without its dot amid the others, and a dot where the marker's
-absent ray would make one, cost, in units of χ². The last costs most, as it is rarely a false dot:
-labels a row or a column off put one there nearly always."""
+"""Costs of a stray dot, of a missed ray, and of a dot at the marker's absent ray, in units of χ².
+The last is largest, as such a dot is rarely false: labels shifted by a row or a column nearly
+always place a dot there."""
 
 SETUP_ERROR_MM, MOST_BOUNDARY_COST = 0.01, 60.0
-"""How far the set-up may be off at the boundary, as height, mm; and the most that rays near the
-boundary may cost a hypothesis, in units of χ²."""
+"""Error of the height at the boundary due to the set-up, mm; and the largest cost of the rays near
+the boundary, in units of χ²."""
 
 ROUGHNESS_FREEDOM = 100.0
-"""Degrees of freedom of a surface's expected third derivatives: how large they are is known as well
-as from so many."""
+"""Degrees of freedom with which the expected size of a surface's third derivatives is known."""
 
 Marker = Literal["dark", "lit", "unknown"]
-"""What shows where the marker's absent ray would make its dot: ``lit``, a dot; ``dark``, nothing,
-amid labelled rays; ``unknown``, nothing, but nothing need be seen there."""
+"""State of the place of the marker's absent dot: ``lit``, there is a dot; ``dark``, there is none,
+between labelled rays; ``unknown``, there is none, but none need be visible there either."""
 
 WEAK_NEIGHBOURS, FALSE_MARGIN = 3, 2 * np.log(10)
-"""A label with at most so many labelled neighbours rests on what lies to one side of it. By so much
-more of deviance, ten times in likelihood, its ray must beat a false dot: beyond the last row most
-rays are dark."""
+"""A label with at most this number of labelled neighbours is weak: it depends on the dots on one
+side of it. Its deviance must be lower than that of a false dot by this additional margin, a factor
+of ten in likelihood: beyond the last row most rays are dark."""
 
 MARKER_SPACINGS = 1 / 3
-"""A dot shows at the marker where it is nearer than this share of the way to the next dot."""
+"""The marker is lit if a dot is nearer than this fraction of the distance to the nearest
+prediction."""
 
 STEPS = tuple((i, j) for i, j in product(range(-2, 3), repeat=2) if 0 < abs(i) + abs(j) < 3)
-"""Rows and columns that labels are shifted by."""
+"""Rows and columns by which labels are shifted."""
 
 AGREED = 0.8
-"""Such a share of a hypothesis's dots in the grid must agree with it on where its rays are."""
+"""Minimum share of the dots of a hypothesis in the grid that must have the same offset of rays from
+sites."""
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """Labels, the surface fitted to them, and what that leaves unexplained.
+    """Labels, the surface fitted to them, and what the surface leaves unexplained.
 
     Parameters
     ----------
@@ -95,17 +97,17 @@ class Hypothesis:
     witness
         See `Match.witness`.
     missed_rays, missed_mm
-        Rows and columns of the rays amid the others that have no dot, counted from 0, shape (m, 2);
-        where the surface puts their dots, IPCS, shape (m, 2), mm.
+        Rows and columns of the rays between lit rays that have no dot, counted from 0, shape
+        (m, 2); their predicted dots, IPCS, shape (m, 2), mm.
     stray_dots
         Indices of the dots that have no ray, shape (s,).
     marker
-        What shows at the marker's absent ray; None if the pattern has no marker.
+        State of the marker's absent dot; None if the pattern has no marker.
     misfit_without_marker
-        χ² of the dots, `STRAY_COST` and `MISSED_COST` for each that is left over, and the cost of
-        the boundary.
+        χ² of the dots, `STRAY_COST` and `MISSED_COST` for each stray dot and missed ray, and the
+        cost of the boundary.
     roughness
-        −2 log probability of the surface, for its third derivatives.
+        −2 log probability of the third derivatives of the surface.
     """
 
     labels: IntArray
@@ -120,7 +122,7 @@ class Hypothesis:
 
     @property
     def misfit(self) -> float:
-        """What is left unexplained, in units of χ²: a dot at the marker counts, too."""
+        """Cost of what is left unexplained, in units of χ², including a dot at the marker."""
         return self.misfit_without_marker + LIT_MARKER_COST * (self.marker == "lit")
 
     @property
@@ -130,22 +132,22 @@ class Hypothesis:
 
     @property
     def cost_without_marker(self) -> float:
-        """The same where it does not count that a dot, perhaps a false one, is at the marker."""
+        """Cost without that of a dot at the marker, which may be a false dot."""
         return self.misfit_without_marker + self.roughness
 
     @property
     def stray_count(self) -> int:
-        """How many dots have no ray."""
+        """Number of dots without a ray."""
         return len(self.stray_dots)
 
     @property
     def missed_count(self) -> int:
-        """How many rays amid the others have no dot."""
+        """Number of rays between lit rays that have no dot."""
         return len(self.missed_rays)
 
     @property
     def label_count(self) -> int:
-        """How many dots have a ray."""
+        """Number of dots with a ray."""
         return count_labels(self.labels)
 
     @property
@@ -154,7 +156,7 @@ class Hypothesis:
         return self.pool.residual_rms_mm
 
     def orientation(self, observed: Observation) -> Orientation:
-        """Say which correspondence the labels amount to."""
+        """Determine the orientation of the labels."""
         at = np.argwhere(self.labels != UNLABELLED)
         place = np.full((*self.labels.shape, 2), np.nan)
         place[at[:, 0], at[:, 1]] = observed.plane_mm[self.labels[at[:, 0], at[:, 1]]]
@@ -169,13 +171,13 @@ def grow_and_evaluate(
     settings: FitSettings = USUAL_KNOTS,
     knot_mm: float | None = None,
 ) -> Hypothesis | None:
-    """Let labels grow (`grow_labels`) and evaluate what they lead to; None if that is nowhere."""
+    """Grow labels (`grow_labels`) and evaluate the result; None if no surface fits it."""
     grown = grow_labels(observed, labels, knot_mm)
     hypothesis = None if grown is None else evaluate(observed, grown, settings)
     if hypothesis is None:
         return None
     outside = _outside(observed, hypothesis)
-    # Many lit rays beyond the contour are a rear that lies low; one or two are false dots.
+    # Many lit rays beyond the contour indicate a rear below the work piece; one or two, false dots.
     if not 0 < len(outside) <= FEW_BEYOND:
         return hypothesis
     labels = hypothesis.labels.copy()
@@ -184,7 +186,7 @@ def grow_and_evaluate(
 
 
 def _outside(observed: Observation, hypothesis: Hypothesis) -> IntArray:
-    """Labelled rays that landed well beyond where all the others put the boundary."""
+    """Labelled rays that land well outside the boundary of the fit."""
     at = np.argwhere(hypothesis.labels != UNLABELLED)
     x, y = observed.landing_mm[at[:, 0], at[:, 1], :2].T
     height, slope = hypothesis.pool.surface.height_and_gradient(x, y)
@@ -200,9 +202,9 @@ def evaluate(
     settings: FitSettings = USUAL_KNOTS,
     initial: FittedPool | None = None,
 ) -> Hypothesis | None:
-    """Fit the surface to labels as they are and work out their cost; None if no surface has them.
+    """Fit the surface to given labels and compute their cost; None if no surface fits them.
 
-    The fit begins with the initial one, which saves rounds where it is near.
+    The fit starts from ``initial``, which saves rounds if it is close.
     """
     pool = try_fit(observed, labels, initial=initial)
     if pool is None:
@@ -225,35 +227,32 @@ def evaluate(
 def evaluate_twice(
     observed: Observation, labels: IntArray, fit: FitSettings, initial: FittedPool
 ) -> Hypothesis | None:
-    """Evaluate labels; with fine knots the cost is the mean of theirs and of the usual knots' cost.
+    """Evaluate labels; with fine knots the cost is the mean of those with fine and usual knots.
 
-    The usual knots leave much of a dip, fine ones let wrong labels have the rough surface they
-    need. A marker that is lit with either is lit.
+    The usual knots do not follow a dip; fine ones allow the rough surface that wrong labels need.
+    A marker that is lit with the usual knots counts as lit.
     """
-    own = evaluate(observed, labels, fit, initial=initial)
-    if own is None or fit is not FINE_KNOTS:
-        return own
+    hypothesis = evaluate(observed, labels, fit, initial=initial)
+    if hypothesis is None or fit is not FINE_KNOTS:
+        return hypothesis
     usual = evaluate(observed, labels, USUAL_KNOTS, initial=initial)
     if usual is None:
         return None
-    marker = "lit" if usual.marker == "lit" else own.marker
-    return replace(
-        own,
-        marker=marker,
-        misfit_without_marker=(own.misfit_without_marker + usual.misfit_without_marker) / 2,
-        roughness=(own.roughness + usual.roughness) / 2,
-    )
+    marker = "lit" if usual.marker == "lit" else hypothesis.marker
+    misfit = (hypothesis.misfit_without_marker + usual.misfit_without_marker) / 2
+    roughness = (hypothesis.roughness + usual.roughness) / 2
+    return replace(hypothesis, marker=marker, misfit_without_marker=misfit, roughness=roughness)
 
 
 def paths_of(observed: Observation, pool: FittedPool) -> RayPaths:
-    """What a fitted surface makes of all rays."""
+    """Paths of all rays for a fitted surface."""
     return RayPaths.of(observed.bench, pool.surface.basis, pool.surface.coefficients)
 
 
 def rough_costs(observed: Observation, labels: IntArray, pool: FittedPool) -> tuple[float, float]:
-    """Cost without and with the marker of labels with a surface as it is (`Hypothesis`).
+    """Misfit of labels for a given surface, without and with the marker (`Hypothesis`).
 
-    What the rays near the boundary cost is not in it: that would need a further fit.
+    The cost of the boundary is not included, as it would need a further fit.
     """
     _, marker, cost = _misfit(observed, labels, pool, paths_of(observed, pool))
     return cost, cost + LIT_MARKER_COST * (marker == "lit")
@@ -262,7 +261,7 @@ def rough_costs(observed: Observation, labels: IntArray, pool: FittedPool) -> tu
 def _misfit(
     observed: Observation, labels: IntArray, pool: FittedPool, paths: RayPaths
 ) -> tuple[RayClasses, Marker | None, float]:
-    """Missed rays and stray dots, state of the marker, and what the dots and these two cost."""
+    """Ray classes, state of the marker, and cost of residuals, stray dots and missed rays."""
     lit = labels != UNLABELLED
     classes = classify_rays(observed, labels, paths)
     marker = _marker_state(observed, lit, pool)
@@ -273,32 +272,32 @@ def _misfit(
 
 
 def variance_mm2(observed: Observation, dots: IntArray) -> FloatArray:
-    """Variance of dots, shape (n,), along either axis of the plane, with the knots' error, mm²."""
+    """Mean variance of dots along the axes of the plane, with `KNOT_ERROR_MM`, shape (n,), mm²."""
     covariance = observed.covariance_mm2[dots]
     return np.asarray(covariance.trace(axis1=-2, axis2=-1) / 2 + KNOT_ERROR_MM**2)
 
 
 def _boundary_cost(level: Level) -> float:
-    """−2 log likelihood of which rays near the boundary are lit, less where the set-up may be off.
+    """−2 log likelihood of the rays near the boundary, reduced for errors of the set-up.
 
-    They tilt the surface: of a shallow pool the boundary then says little, and rays that contradict
-    any level may do so for the set-up alone.
+    Errors of the set-up tilt the surface. The boundary of a shallow pool then gives little
+    information, and rays may contradict any level because of the set-up alone.
     """
     share = level.rise_mm**2 / (level.rise_mm**2 + SETUP_ERROR_MM**2)
     return min(2 * share * level.negative_log_likelihood, MOST_BOUNDARY_COST)
 
 
 def _roughness_cost(pool: FittedPool, settings: FitSettings) -> float:
-    """−2 log probability of a surface's third derivatives, whose size is known by about.
+    """−2 log probability of a surface's third derivatives, whose expected size is uncertain.
 
-    Wrong labels need a rougher surface than right ones nearly always.
+    Wrong labels nearly always need a rougher surface than correct ones.
     """
     ratio = CORRELATED_MM2 / settings.jerk**2 * pool.surface.roughness() / ROUGHNESS_FREEDOM
     return ROUGHNESS_FREEDOM * float(np.log1p(ratio))
 
 
 def _marker_state(observed: Observation, lit: BoolArray, pool: FittedPool) -> Marker | None:
-    """What shows where the marker's absent ray would make its dot; None without a marker."""
+    """State of the place of the marker's absent dot; None without a marker."""
     site = observed.rig.pattern.marker
     if site is None:
         return None
@@ -306,10 +305,10 @@ def _marker_state(observed: Observation, lit: BoolArray, pool: FittedPool) -> Ma
     around = np.zeros_like(lit)
     around[max(at[0] - 1, 0) : at[0] + 2, max(at[1] - 1, 0) : at[1] + 2] = True
     predicted = predict(observed, pool, around)
-    own = (predicted.at == at).all(axis=-1)
-    if not own.any():
+    is_marker = (predicted.at == at).all(axis=-1)
+    if not is_marker.any():
         return "unknown"
-    place, spacing = predicted.plane_mm[own][0], predicted.spacing_mm[own][0]
+    place, spacing = predicted.plane_mm[is_marker][0], predicted.spacing_mm[is_marker][0]
     if np.linalg.norm(observed.plane_mm - place, axis=-1).min() < spacing * MARKER_SPACINGS:
         return "lit"
     return "dark" if amid(lit)[at] else "unknown"
@@ -318,9 +317,9 @@ def _marker_state(observed: Observation, lit: BoolArray, pool: FittedPool) -> Ma
 def without_false_ends(
     observed: Observation, hypothesis: Hypothesis, settings: FitSettings = USUAL_KNOTS
 ) -> Hypothesis:
-    """Take labels away that alone put a dark ray amid the lit ones, as far as that costs less.
+    """Remove labels because of which alone a dark ray lies between lit ones, if that costs less.
 
-    Beyond the last row a false dot may lie where a ray's should.
+    Beyond the last row a false dot may lie where the dot of a ray is predicted.
     """
     lit = hypothesis.labels != UNLABELLED
     fewer = []
@@ -337,10 +336,10 @@ def without_false_ends(
 def without_doubtful_outermost(
     observed: Observation, hypothesis: Hypothesis, settings: FitSettings = USUAL_KNOTS
 ) -> Hypothesis:
-    """Take outermost labels away that a false dot explains as well as their ray.
+    """Remove outermost labels that a false dot explains as well as their ray does.
 
-    Each weak label is held against the surface through all that are not weak. How many false dots
-    there are, those without a ray tell.
+    Each weak label is compared with the prediction of the surface through all others. The density
+    of false dots is estimated from the stray dots.
     """
     lit = hypothesis.labels != UNLABELLED
     weak = lit & (neighbours_of(lit) <= WEAK_NEIGHBOURS)
@@ -365,7 +364,7 @@ def without_doubtful_outermost(
 
 
 def _alone_around(lit: BoolArray, ray: list[int]) -> list[tuple[int, int]]:
-    """Lit rays, counted from 0, that alone put a dark ray amid the lit ones."""
+    """Lit rays, counted from 0, because of which alone a dark ray lies between lit ones."""
     i, j = ray
     across = [np.flatnonzero(lit[i, :j]), np.flatnonzero(lit[i, j + 1 :]) + j + 1]
     along = [np.flatnonzero(lit[:i, j]), np.flatnonzero(lit[i + 1 :, j]) + i + 1]
@@ -379,7 +378,7 @@ def _alone_around(lit: BoolArray, ray: list[int]) -> list[tuple[int, int]]:
 def labels_from_lattice(
     lattice: Lattice, hole: Site, ray: Site, orientation: Orientation, shape: tuple[int, int]
 ) -> IntArray:
-    """Label the whole grid, with the hole (k, t) where the absent ray (i, j) would have its dot.
+    """Label a complete grid, given the site (k, t) of the hole and its absent ray (i, j).
 
     Labels have the pattern's shape (rows, columns); dots at sites beyond it get no ray.
     """
@@ -391,7 +390,7 @@ def labels_from_lattice(
 def extended_over_grid(
     hypothesis: Hypothesis, lattice: Lattice, orientation: Orientation
 ) -> IntArray | None:
-    """Labels of a hypothesis and of the whole grid, where the two agree; None if they do not."""
+    """Extend the labels of a hypothesis over the grid; None if the two disagree."""
     labels = hypothesis.labels
     at = np.argwhere(labels != UNLABELLED)
     dot = labels[at[:, 0], at[:, 1]]
@@ -411,17 +410,17 @@ def extended_over_grid(
 
 
 def shifted_labels(observed: Observation, labels: IntArray) -> Iterator[IntArray]:
-    """Yield the same labels up to two rows or columns on.
+    """Yield labels shifted by up to two rows or columns.
 
-    A shift bends the surface a little and leaves the residuals nearly as they were: what a single
-    frame tells worst.
+    A shift changes the surface slightly and hardly affects the residuals. It is what a single frame
+    determines least well.
     """
     for step in STEPS:
         yield shifted_by(observed, labels, step)
 
 
 def shifted_by(observed: Observation, labels: IntArray, step: tuple[int, ...]) -> IntArray:
-    """The same labels some rows and columns on."""
+    """Shift labels by rows and columns."""
     at = np.argwhere(labels != UNLABELLED)
     shifted = _labels_of_pairs(at + 1 + step, labels[tuple(at.T)], labels.shape)
     shifted[observed.absent] = UNLABELLED
@@ -431,7 +430,7 @@ def shifted_by(observed: Observation, labels: IntArray, step: tuple[int, ...]) -
 def reoriented_labels(
     observed: Observation, labels: IntArray, before: Orientation, after: Orientation
 ) -> IntArray:
-    """Label the same dots with another orientation: rays are mirrored about the marker's."""
+    """Label the same dots with another orientation: rays are mirrored about the marker."""
     at = np.argwhere(labels != UNLABELLED)
     center = np.array(observed.rig.pattern.marker or observed.rig.pattern.reference)
     ray = center + (at + 1 - center) * ways(before) * ways(after)

@@ -1,7 +1,7 @@
-"""From a few labelled dots to all of them: fit the surface, predict every ray's dot, match, again.
+"""Extend a few labelled dots to all dots: fit the surface, predict each ray's dot, match, repeat.
 
-Predicted by the surface rather than by neighbours on the picture, dots are told apart where rows
-bow, fan out or cross; a dot that two predictions could claim is given to neither.
+Predictions come from the surface rather than from neighbouring dots in the image, so that dots are
+distinguished even where rows bend, fan out or cross. An ambiguous dot is left unlabelled.
 """
 
 from __future__ import annotations
@@ -27,30 +27,31 @@ from labapp.core.surface.pool_fit import FitSettings, FittedPool
 from labapp.core.values import IntArray, median
 
 FEW_UNLABELLED = 0.06
-"""Share of the dots that may be false or hidden: with more than that left over, more is tried."""
+"""Share of the dots that may be false or hidden. If more remain unlabelled, growth is retried."""
 
 FEW_LABELS = 25
-"""A whole grid labels more dots than this, a quadric round a hole fewer."""
+"""A complete grid labels more dots than this; a quadric around a hole labels fewer."""
 
-# Only knots as fine as the final fit's follow a dent; a few labels lead farther with wider ones.
+# Only knots as fine as those of the final fit follow a dent; with few labels, wider knots
+# extrapolate farther.
 _STIFF_WIDE = replace(STIFF, knot_mm=1.2, jerk=0.036)
 _SOFT_WIDE = replace(_STIFF_WIDE, jerk=SOFT.jerk)
 
 MOST_ITERATIONS = 15
-"""Labels that still change after so many iterations go to and fro."""
+"""Maximum number of iterations: labels that still change after these oscillate."""
 
 LEAST_NEIGHBOURS = 4
-"""Of the eight rays round one: with fewer labelled it is at the edge of the labelled ones."""
+"""A ray with fewer labelled rays than this among its eight neighbours is at the rim."""
 
 OUTLIER_TIMES, OUTLIER_SPACINGS = 6.0, 0.25
-"""A label is an outlier where its residual is larger than so many medians of all, and than this
-share of the way to the next dot."""
+"""A label is an outlier if its residual exceeds both this multiple of the median residual and this
+fraction of the distance to the nearest dot."""
 
 
 def grow_labels(
     observed: Observation, labels: IntArray, knot_mm: float | None = None
 ) -> IntArray | None:
-    """Follow the surface from the labels given until nothing changes.
+    """Grow labels by repeated surface fits and predictions until they no longer change.
 
     Parameters
     ----------
@@ -59,43 +60,44 @@ def grow_labels(
     labels
         Index of each ray's dot or `UNLABELLED`, shape (rows, columns).
     knot_mm
-        Spacing of the surface's knots, mm, where most dots are labelled already and a dip is left;
-        None: as far as labels lead farthest.
+        Knot spacing of the surface, mm, if most dots are labelled already and a dip remains. None:
+        several settings are tried, and the one that labels most dots is used.
 
     Returns
     -------
     IntArray or None
-        The labels, of the same shape; None if they lead nowhere.
+        The labels, of the same shape; None if no surface fits them.
     """
     best: IntArray | None = None
     enough = (1 - FEW_UNLABELLED) * len(observed.plane_mm)
     few = count_labels(labels) < FEW_LABELS
     if knot_mm is not None:
-        course = [replace(SOFT, knot_mm=knot_mm)]
+        stages = [replace(SOFT, knot_mm=knot_mm)]
     else:
-        course = [_STIFF_WIDE, _SOFT_WIDE, _STIFF_WIDE] if few else [STIFF, SOFT, STIFF]
+        stages = [_STIFF_WIDE, _SOFT_WIDE, _STIFF_WIDE] if few else [STIFF, SOFT, STIFF]
     for attempt in range(2):
-        for settings in course:
+        for settings in stages:
             grown = _settled(observed, labels, settings)
             if grown is not None and (best is None or count_labels(grown) > count_labels(best)):
                 best = grown
             labels = labels if best is None else best
             if best is not None and count_labels(best) == len(observed.plane_mm):
-                return best  # there is no more to be had
+                return best
         if best is None or count_labels(best) >= enough or attempt:
             break
-        # A wrong label at the rim bars the way and holds itself up: take the rim off once.
+        # A wrong label at the rim blocks growth and bends the surface to itself: remove the rim
+        # once.
         labels = _without_outermost(best)
     return best
 
 
 def _without_outermost(labels: IntArray) -> IntArray:
-    """Only labels with most of their neighbours labelled."""
+    """Keep only the labels of rays of which at least `LEAST_NEIGHBOURS` neighbours are labelled."""
     return np.where(neighbours_of(labels != UNLABELLED) >= LEAST_NEIGHBOURS, labels, UNLABELLED)
 
 
 def _settled(observed: Observation, labels: IntArray, settings: FitSettings) -> IntArray | None:
-    """Predict and match until the labels no longer change, or come round again."""
+    """Predict and match until the labels no longer change, or repeat an earlier state."""
     before: list[bytes] = []
     pool: FittedPool | None = None
     while len(before) < MOST_ITERATIONS:
@@ -112,11 +114,11 @@ def _settled(observed: Observation, labels: IntArray, settings: FitSettings) -> 
 
 
 def matched_labels(observed: Observation, pool: FittedPool, labels: IntArray) -> IntArray:
-    """Labels for dots that one ray alone can have made, and rays that made one dot alone.
+    """Label the dots that are uniquely assigned to a ray by `sure_pairs`.
 
-    Likelihoods are those of `sure_pairs`. Rays a ring farther out than any that is given a dot
-    stand as rivals: where the prediction is so uncertain that the dots of the next row but one come
-    into question, nobody gets them.
+    Rays may be labelled within one ring of the labelled rays. Those of a second ring take part as
+    rivals: where the prediction is so uncertain that a dot could belong to the next row but one,
+    it stays unlabelled.
     """
     matched = np.full(labels.shape, UNLABELLED, np.int64)
     far = predict(observed, pool, within_rings(labels, 2))
@@ -126,14 +128,14 @@ def matched_labels(observed: Observation, pool: FittedPool, labels: IntArray) ->
     dot, ray = sure_pairs(observed, dots, far.plane_mm, covariance)
     at = far.at[ray]
     taken = within_rings(labels, 1)[at[:, 0], at[:, 1]] & ~observed.absent[at[:, 0], at[:, 1]]
-    # Dots that run into each other have no place of their own.
+    # The positions of dots that merge are not those of either ray.
     taken &= far.spacing_mm[ray] > observed.resolution_mm
     matched[at[taken, 0], at[taken, 1]] = dot[taken]
     return matched
 
 
 def _without_outliers(observed: Observation, labels: IntArray, settings: FitSettings) -> IntArray:
-    """Drop labels far from where the surface through all of them puts their dot."""
+    """Remove labels whose residual from the surface through all of them is an outlier."""
     if len(observed.plane_mm) < 2:
         return labels
     spacing = scipy.spatial.cKDTree(observed.plane_mm).query(observed.plane_mm, k=2)[0][:, 1]

@@ -1,4 +1,4 @@
-"""Inner loops of matching dots with rays, compiled (docs/adr/0018)."""
+"""Compiled inner loops for matching dots with rays (docs/adr/0018)."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ _i1, _i2 = (types.Array(types.int64, n, "A", readonly=True) for n in (1, 2))
 def pair_deviances(
     places: FloatArray, covariance: FloatArray, predicted: FloatArray, uncertain: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """How far n places are from m predictions, and how unlikely that makes each pair.
+    """Squared Mahalanobis distances and deviances of n places from m predictions.
 
     Places and predictions have shapes (n, 2) and (m, 2), their covariances (n, 2, 2) and (m, 2, 2).
 
     Returns
     -------
     distance, deviance
-        Squared distances in σ², and −2 log likelihoods but for a constant, both of shape (n, m).
+        Squared distances in σ², and −2 log likelihoods up to a constant, both of shape (n, m).
     """
     distance = np.empty((len(places), len(predicted)))
     deviance = np.empty((len(places), len(predicted)))
@@ -45,24 +45,24 @@ def pair_deviances(
 def left_out(
     residual: FloatArray, dot: FloatArray, computed: FloatArray, unsettled: float, most: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Residuals of n dots to fits without each of them, and the covariance of these predictions.
+    """Leave-one-out residuals of n dots, and the covariance of the leave-one-out predictions.
 
-    Residuals to the fit with all have shape (n, 2), covariances of dots and of what the fit
-    computes for them (n, 2, 2). Residuals are off by ``unsettled``, a standard deviation, where the
-    fit has not converged. A dot draws the fit to itself by no larger a share than ``most``.
+    Residuals to the fit with all dots have shape (n, 2), covariances of the dots and of their
+    computed places (n, 2, 2). ``unsettled`` is the standard deviation of the residuals due to
+    incomplete convergence of the fit. The leverage of a dot is limited to ``most``.
     """
     off, spread = np.empty((len(residual), 2)), np.empty((len(residual), 2, 2))
     for n in range(len(residual)):
         a, b, c = dot[n, 0, 0], dot[n, 0, 1], dot[n, 1, 1]
         share = most
-        for _ in range(100):  # what the fit computes may be of a round before
+        for _ in range(100):  # the covariance of the fit may come from an earlier round
             xx, xy = a - share * computed[n, 0, 0], b - share * computed[n, 0, 1]
             yy = c - share * computed[n, 1, 1]
             area = xx * yy - xy * xy
             if xx > 0.0 and area > (1.0 - most) ** 2 * (a * c - b * b):
                 break
             share *= 0.98
-        # What the dot's covariance is times the inverse of that of its residual.
+        # Covariance of the dot times the inverse of that of its residual.
         p, q = (a * yy - b * xy) / area, (b * xx - a * xy) / area
         r, s = (b * yy - c * xy) / area, (c * xx - b * xy) / area
         x, y = residual[n, 0], residual[n, 1]
@@ -82,13 +82,13 @@ def within_view(
     plane: FloatArray,
     image: FloatArray,
 ) -> BoolArray:
-    """Which of n places on the plane are in view, also where they are off by margins.
+    """Whether n places on the plane are in view even if displaced by margins.
 
-    Places and margins along either axis have shape (n, 2), mm; the homography from there to the
-    image shape (3, 3); the least and the largest places and pixels in view shape (2, 2), the least
-    first.
+    Places and margins along either axis have shape (n, 2), mm; the homography from the plane to the
+    image shape (3, 3); the limits of the view on the plane and in the image, (low, high), shape
+    (2, 2).
     """
-    made = np.ones(len(places), np.bool_)
+    visible = np.ones(len(places), np.bool_)
     for k in range(len(places)):
         for corner in range(4):
             x = places[k, 0] + (1.0 if corner < 2 else -1.0) * margin[k, 0]
@@ -96,48 +96,48 @@ def within_view(
             w = to_image[2, 0] * x + to_image[2, 1] * z + to_image[2, 2]
             u = (to_image[0, 0] * x + to_image[0, 1] * z + to_image[0, 2]) / w
             v = (to_image[1, 0] * x + to_image[1, 1] * z + to_image[1, 2]) / w
-            made[k] &= plane[0, 0] < x < plane[1, 0] and plane[0, 1] < z < plane[1, 1]
-            made[k] &= image[0, 0] < u < image[1, 0] and image[0, 1] < v < image[1, 1]
-    return made
+            visible[k] &= plane[0, 0] < x < plane[1, 0] and plane[0, 1] < z < plane[1, 1]
+            visible[k] &= image[0, 0] < u < image[1, 0] and image[0, 1] < v < image[1, 1]
+    return visible
 
 
 @compiled(types.Array(types.boolean, 2, "A", readonly=True))
 def amid(lit: BoolArray) -> BoolArray:
-    """Rays between lit ones in their row or in their column, shape (rows, columns)."""
+    """Mask of rays that are lit or between lit ones in a row or column, shape (rows, columns)."""
     rows, columns = lit.shape
-    made = np.zeros((rows, columns), np.bool_)
+    mask = np.zeros((rows, columns), np.bool_)
     for i in range(rows):
-        some = np.flatnonzero(lit[i])
-        if len(some):
-            made[i, some[0] : some[-1] + 1] = True
+        at = np.flatnonzero(lit[i])
+        if len(at):
+            mask[i, at[0] : at[-1] + 1] = True
     for j in range(columns):
-        some = np.flatnonzero(lit[:, j])
-        if len(some):
-            made[some[0] : some[-1] + 1, j] = True
-    return made
+        at = np.flatnonzero(lit[:, j])
+        if len(at):
+            mask[at[0] : at[-1] + 1, j] = True
+    return mask
 
 
 @compiled(types.Array(types.boolean, 2, "A", readonly=True))
 def between(lit: BoolArray) -> BoolArray:
-    """Rays with lit ones on either side, in their row or in their column, (rows, columns)."""
+    """Mask of rays with lit ones on both sides in their row or column, shape (rows, columns)."""
     rows, columns = lit.shape
-    made = np.zeros((rows, columns), np.bool_)
+    mask = np.zeros((rows, columns), np.bool_)
     for i in range(rows):
-        some = np.flatnonzero(lit[i])
-        if len(some) > 1:
-            made[i, some[0] + 1 : some[-1]] = True
+        at = np.flatnonzero(lit[i])
+        if len(at) > 1:
+            mask[i, at[0] + 1 : at[-1]] = True
     for j in range(columns):
-        some = np.flatnonzero(lit[:, j])
-        if len(some) > 1:
-            made[some[0] + 1 : some[-1], j] = True
-    return made
+        at = np.flatnonzero(lit[:, j])
+        if len(at) > 1:
+            mask[at[0] + 1 : at[-1], j] = True
+    return mask
 
 
 @compiled(_f2)
 def two_least(values: FloatArray) -> tuple[IntArray, FloatArray, IntArray, FloatArray]:
-    """Where each row's least value is and its second least; the same of each column.
+    """Index of the smallest value of each row and the second smallest value; the same per column.
 
-    Values have shape (n, m), m > 0; where there is no second it is infinite.
+    Values have shape (n, m), m > 0. The second smallest value is infinite if there is none.
     """
     rows, columns = values.shape
     column, next_in_row = np.zeros(rows, np.int64), np.full(rows, np.inf)
@@ -159,9 +159,9 @@ def two_least(values: FloatArray) -> tuple[IntArray, FloatArray, IntArray, Float
 
 @compiled(_f2)
 def medians_around(values: FloatArray) -> FloatArray:
-    """Median of those within two rows and columns of each value, without it; NaN stands for none.
+    """Median of the values within two rows and columns of each value, without itself.
 
-    Values have shape (rows, columns), medians the same: NaN where there is no value, too.
+    Values and medians have shape (rows, columns); NaN stands for no value.
     """
     rows, columns = values.shape
     medians, around = np.full((rows, columns), np.nan), np.empty(24)
@@ -187,9 +187,9 @@ def medians_around(values: FloatArray) -> FloatArray:
 def _deviances(
     off: FloatArray, covariance: FloatArray, excess: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Squared lengths of residuals, shape (n, 2), in σ, and deviances, as of `pair_deviances`.
+    """Squared Mahalanobis lengths and deviances of residuals, shape (n, 2) (`pair_deviances`).
 
-    Covariances, shape (n, 2, 2), are so many times as large.
+    Covariances, shape (n, 2, 2), are multiplied by ``excess``.
     """
     distance, deviance = np.empty(len(off)), np.empty(len(off))
     for n in range(len(off)):
@@ -209,10 +209,10 @@ def _least_deviance(
     of_others: FloatArray,
     excess: float,
 ) -> float:
-    """Least deviance of a place from others, as of `pair_deviances`; infinite from none.
+    """Smallest deviance of a place from others (`pair_deviances`); infinite if there are none.
 
-    Covariances, shapes (2, 2) and (m, 2, 2), are so many times as large; others of which it is NaN
-    do not count.
+    Covariances, shapes (2, 2) and (m, 2, 2), are multiplied by ``excess``; others with NaN are
+    ignored.
     """
     least = np.inf
     for m in range(len(others)):
@@ -228,17 +228,17 @@ def _least_deviance(
 
 @inner
 def _with_variance(covariance: FloatArray, variance: float) -> FloatArray:
-    """Covariances, shape (n, 2, 2), and a variance along both axes more."""
-    made = covariance.copy()
-    for n in range(len(made)):
-        made[n, 0, 0] += variance
-        made[n, 1, 1] += variance
-    return made
+    """Add a variance along both axes to covariances, shape (n, 2, 2)."""
+    total = covariance.copy()
+    for n in range(len(total)):
+        total[n, 0, 0] += variance
+        total[n, 1, 1] += variance
+    return total
 
 
 @inner
 def _is_worst_around(worst: FloatArray, i: int, j: int) -> bool:
-    """Whether none of the eight values round one, of shape (rows, columns), is over it."""
+    """Whether none of the eight neighbours of a value, in shape (rows, columns), exceeds it."""
     rows, columns = worst.shape
     for k in range(max(i - 1, 0), min(i + 2, rows)):
         for m in range(max(j - 1, 0), min(j + 2, columns)):
@@ -257,26 +257,27 @@ def failing_labels(
     stray: IntArray,
     limits: FloatArray,
 ) -> BoolArray:
-    """Labels that their ray alone does not explain, of neighbours the worst (`outliers`).
+    """Mask of labels that are not explained by their ray, the worst of adjacent ones (`outliers`).
 
     Parameters
     ----------
     labels
-        Index of each ray's dot, below 0 where it has none, shape (rows, columns).
+        Index of each ray's dot, negative if it has none, shape (rows, columns).
     dots
         Places of dots and their covariances, shapes (d, 2), mm, and (d, 2, 2), mm².
     surface
-        Dots that the surface makes of all R rays, row by row, and their covariances as far as the
-        surface is uncertain, shapes (R, 2), mm, and (R, 2, 2), mm²; NaN where unknown.
+        Computed dots of all R rays, row by row, and their covariances due to that of the surface,
+        shapes (R, 2), mm, and (R, 2, 2), mm²; NaN where unknown.
     shows
-        Probability that a labelled ray came back and has a dot, row by row, shape (n,).
+        Probability that a labelled ray returned and has a dot, row by row, shape (n,).
     missed, stray
-        Numbers of rays without a dot amid the others, and of dots without a ray.
+        Flat indices of rays without a dot between lit ones, and indices of dots without a ray.
     limits
-        Least variance of a dot in the fit, mm²; how far points still moved; largest leverage (both
-        `left_out`); inflation of the surface's variance; variance of its model, mm²; median of χ²;
-        deviance of a false dot; the largest squared distance; margin over rivals. At the rim: the
-        most labelled neighbours; the largest squared distance, or so many times the median one.
+        Smallest variance of a dot in the fit, mm²; unsettled part of residuals and largest leverage
+        (both `left_out`); inflation of the surface's variance; variance of its model, mm²; median
+        of χ²; deviance of a false dot; the largest squared distance; margin over rivals. At the
+        rim: the largest number of labelled neighbours; the largest squared distance, absolute and
+        as a multiple of the median.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""What matching starts from: the dots of a frame on the imaging plane, and the bench.
+"""Input of the matching: the dots of a frame on the imaging plane, and the bench.
 
 An array over the rays of the pattern has the shape (rows, columns): the *labels*, the index of each
 ray's dot, and masks, such as the rays that are *lit* because they have a dot.
@@ -26,37 +26,37 @@ from labapp.core.values import (
 )
 
 UNLABELLED = -1
-"""In labels: the ray has no dot."""
+"""Label of a ray without a dot."""
 
 LEAST_LABELS = 6
-"""Fewer labelled dots are no start: a quadric has three slopes each way, and the six dots nearest a
-hole give twice that."""
+"""Minimum number of labelled dots for a fit: the slopes of a quadric have three parameters along
+each axis, and the six dots nearest to a hole give twice as many values."""
 
 RESOLVED_SIZES = 2.2
-"""Dots nearer to each other than this many of their standard deviations are taken for one: two
+"""Dots nearer to each other than this multiple of their standard deviation are not resolved: two
 equal Gaussians have a single peak up to 2, and pixels and noise blur them further."""
 
 KEPT_BYTES, COUNTED_EVERY = 100_000_000, 32
-"""Factors of the fits that are kept of a frame take about so many bytes at most, splines and
-stiffness twice as many: over a thousand fits of a usual pool. They are counted now and then."""
+"""Approximate limit for the factors of the cached fits of a frame, bytes; splines and stiffness
+take twice as much. That is over a thousand fits of a usual pool. The size is checked once in so
+many fits."""
 
 EDGE_MM, EDGE_PX = 0.5, 4.0
-"""A dot nearer to the edge of the plane or of the frame may be cut off, and is not in view: about
-the radius of a dot."""
+"""A dot nearer to the edge of the plane or of the frame may be cut off and does not count as in
+view: about the radius of a dot."""
 
-# Surfaces that are fitted while dots are being labelled are stiffer than the final one: a wrong
-# label must stand out rather than be bent to. A shallow pool is followed farther by a stiff
-# surface, a steep one only by a soft one.
+# Surfaces fitted during labelling are stiffer than the final one, so that a wrong label has a large
+# residual instead of bending the surface. A stiff surface extrapolates a shallow pool farther; a
+# steep pool needs a soft one.
 STIFF = FitSettings(rounds=5, jerk=0.05, floor_mm=0.03, settled_mm=2e-3)
 SOFT = replace(STIFF, jerk=0.12)
 QUICK = replace(SOFT, knot_mm=1.5, rounds=3)
-"""Of the surface by which many sets of labels are sorted: the right one is not far from the first
-in that order."""
+"""Fit settings for ranking many sets of labels: the correct one is near the top of the ranking."""
 
 
 @dataclass(frozen=True)
 class Observation(ReadOnlyArrays):
-    """The n dots of one frame on the imaging plane, and the bench that they were seen on.
+    """The n dots of one frame on the imaging plane, and the bench.
 
     Parameters
     ----------
@@ -65,13 +65,13 @@ class Observation(ReadOnlyArrays):
     covariance_mm2
         Their covariance, shape (n, 2, 2), mm².
     size_mm
-        Standard deviation of the light of each, shape (n,), mm.
+        Standard deviation of the intensity profile of each, shape (n,), mm.
     bench
         The bench.
     frame_shape
         Height and width of the frame, px.
     hidden_rows
-        Rows i of the pattern whose missing dots the operator says are hidden.
+        Rows i of the pattern whose missing dots are hidden, as set by the operator.
     """
 
     plane_mm: FloatArray
@@ -83,7 +83,7 @@ class Observation(ReadOnlyArrays):
 
     @classmethod
     def of(cls, dots: Dots, bench: Bench, frame_shape: tuple[int, int]) -> Observation:
-        """Put the dots of a frame, of some height and width, px, on the imaging plane."""
+        """Map the dots of a frame, of shape (height, width), px, to the imaging plane."""
         from labapp.core.images import dot_kernels
 
         sigma = np.stack([dots.u_sigma_px, dots.v_sigma_px], axis=-1)
@@ -93,12 +93,12 @@ class Observation(ReadOnlyArrays):
 
     @cached_property
     def resolution_mm(self) -> float:
-        """How near another dot may be before the two run into each other, mm."""
+        """Distance below which two dots merge, mm."""
         return RESOLVED_SIZES * median(self.size_mm)
 
     @property
     def rig(self) -> Rig:
-        """That of the bench."""
+        """The rig of the bench."""
         return self.bench.rig
 
     @property
@@ -144,20 +144,21 @@ class Observation(ReadOnlyArrays):
         settings: FitSettings,
         initial: FittedPool | None = None,
     ) -> FittedPool:
-        """Fit the surface to labelled dots, kept for the next time it is asked for.
+        """Fit the surface to labelled dots, with a cache.
 
-        Hypotheses lead to the same labels again and again.
+        Different hypotheses often lead to the same labels.
 
         Parameters
         ----------
         labels
             Index of each ray's dot or `UNLABELLED`, shape (rows, columns).
         witness
-            See `Match.witness`; 0 everywhere: the level is guessed from the outermost labels.
+            See `Match.witness`. If it is 0 everywhere, the level is guessed from the outermost
+            labels.
         settings
             See `FitSettings`.
         initial
-            A fit to begin with, whose surface is near; None: the flat work piece.
+            A fit to start from, whose surface is close; None: the flat work piece.
 
         Raises
         ------
@@ -171,11 +172,11 @@ class Observation(ReadOnlyArrays):
             dots = self.plane_mm[dot], self.covariance_mm2[dot]
             surface = None if initial is None else initial.surface
             try:
-                made = fit_pool(at + 1, *dots, witness, self.rig, settings, surface)
+                pool = fit_pool(at + 1, *dots, witness, self.rig, settings, surface)
                 if len(self._fitted) % COUNTED_EVERY == 0:
                     self._forget_oldest()
-                self._fitted[key] = made
-            except CannotMeasure as failure:  # its traceback would keep the fit's arrays
+                self._fitted[key] = pool
+            except CannotMeasure as failure:  # its traceback would keep the arrays of the fit alive
                 self._fitted[key] = (failure.status, failure.reason)
         found = self._fitted[key]
         if isinstance(found, tuple):
@@ -183,7 +184,7 @@ class Observation(ReadOnlyArrays):
         return found
 
     def _forget_oldest(self) -> None:
-        """Forget the oldest fits where their factors take more than `KEPT_BYTES` together."""
+        """Drop the oldest fits from the cache while all factors exceed `KEPT_BYTES`."""
         sizes = {k: p.factor.nbytes for k, p in self._fitted.items() if isinstance(p, FittedPool)}
         over = sum(sizes.values()) - KEPT_BYTES
         for key, size in sizes.items():
@@ -197,23 +198,23 @@ class Observation(ReadOnlyArrays):
         return {}
 
     def in_view(self, plane_mm: FloatArray, margin_mm: FloatArray | float = 0.0) -> BoolArray:
-        """Whether dots at places on the plane, shape (…, 2), mm, would be seen.
+        """Whether dots at places on the plane, shape (…, 2), mm, would be visible.
 
-        They are on the plane and in the frame, farther from the edge than `EDGE_MM` and `EDGE_PX`,
-        also where they are off by a margin, of their shape, mm, along either axis. The plane
-        reaches as far as its size says, and as far as dots are seen on it: O′ need not be its very
+        They must be on the plane and in the frame, farther from the edge than `EDGE_MM` and
+        `EDGE_PX`, even if displaced by a margin, of their shape, mm, along either axis. The plane
+        extends over its nominal size and over all observed dots, as O′ need not be exactly its
         corner.
         """
         from labapp.core.matching import match_kernels
 
         margin = np.full(plane_mm.shape, margin_mm)
         at, view = (plane_mm.reshape(-1, 2), margin.reshape(-1, 2)), self._view
-        made = match_kernels.within_view(*at, self.bench.calibration.from_plane, *view)
-        return made.reshape(plane_mm.shape[:-1])
+        visible = match_kernels.within_view(*at, self.bench.calibration.from_plane, *view)
+        return visible.reshape(plane_mm.shape[:-1])
 
     @cached_property
     def _view(self) -> tuple[FloatArray, FloatArray]:
-        """Least and largest places on the plane, mm, and pixels in view, shapes (2, 2)."""
+        """Limits (low, high) of the view on the plane, mm, and in the image, px, shapes (2, 2)."""
         plane = self.rig.imaging_plane
         low = np.minimum(self.plane_mm.min(axis=0), 0.0) + EDGE_MM
         high = np.maximum(self.plane_mm.max(axis=0), [plane.width_mm, plane.height_mm]) - EDGE_MM
@@ -227,9 +228,9 @@ def try_fit(
     settings: FitSettings = SOFT,
     initial: FittedPool | None = None,
 ) -> FittedPool | None:
-    """Fit the surface to the dots labelled so far, the level guessed from the outermost of them.
+    """Fit the surface to the labelled dots, with the level guessed from the outermost of them.
 
-    None where there are fewer than `LEAST_LABELS`, or no surface has them (`Observation.fit`).
+    None if there are fewer than `LEAST_LABELS`, or no surface fits them (`Observation.fit`).
     """
     if count_labels(labels) < LEAST_LABELS:
         return None
@@ -243,30 +244,30 @@ def try_fit(
 
 
 def count_labels(labels: IntArray) -> int:
-    """How many rays have a dot."""
+    """Number of rays with a dot."""
     return int(np.sum(labels != UNLABELLED))
 
 
 def amid(lit: BoolArray) -> BoolArray:
-    """Rays between lit ones in their row or in their column, shape (rows, columns)."""
+    """Mask of rays that are lit or between lit ones in a row or column, shape (rows, columns)."""
     from labapp.core.matching import match_kernels
 
     return match_kernels.amid(lit)
 
 
 def neighbours_of(lit: BoolArray) -> IntArray:
-    """How many of the eight rays round each are lit, shape (rows, columns)."""
+    """Number of lit rays among the eight neighbours of each, shape (rows, columns)."""
     ones, border = lit.astype(np.int32), cv2.BORDER_CONSTANT
     return np.asarray(cv2.boxFilter(ones, -1, (3, 3), normalize=False, borderType=border) - ones)
 
 
 def within_rings(labels: IntArray, rings: int) -> BoolArray:
-    """Labelled rays and their neighbours, so many rings of them, a mask, shape (rows, columns)."""
+    """Mask of labelled rays and a number of rings of neighbours, shape (rows, columns)."""
     return widened(labels != UNLABELLED, rings)
 
 
 def widened(mask: BoolArray, rings: int) -> BoolArray:
-    """A mask over rays, shape (rows, columns), and the neighbours, so many rings of them."""
+    """Dilate a mask over rays, shape (rows, columns), by a number of rings."""
     lit = np.ascontiguousarray(mask).view(np.uint8)
     return cv2.dilate(lit, _BESIDE, iterations=rings).view(bool)
 

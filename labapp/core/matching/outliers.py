@@ -1,4 +1,4 @@
-"""Labels that a fitted surface does not support, whether its frame had a prior or not."""
+"""Labels that a fitted surface does not support, for frames with and without a prior."""
 
 from __future__ import annotations
 
@@ -23,55 +23,56 @@ from labapp.core.surface.spline import SplineBasis
 from labapp.core.values import BoolArray, FloatArray, IntArray
 
 WIDE = 1.45
-"""A dot so many times as wide as the median of those around it is two in one. Of 15,000 dots of
-rendered frames 17 were as wide: 13 of them were more than 1 px, four at most 0.8 px, off. Of a
-stricter rule, 1.35, known frames lost right labels at the rim and a tenth of their accuracy."""
+"""A dot wider than the median of its neighbours by this factor is taken for two merged dots. Of
+15,000 dots of rendered frames, 17 were as wide: 13 of them were more than 1 px off, four at most
+0.8 px. With a stricter limit, 1.35, known frames lost correct labels at the rim and a tenth of
+their accuracy."""
 
 WIDE_BESIDE, BESIDE_RESOLUTIONS = 1.3, 1.5
-"""Where a ray that has no dot would make one nearer than the second, times
-`Observation.resolution_mm`, a dot so many times as wide as the first may be both, and lie between.
-"""
+"""Limit of the width if the predicted dot of a ray without a dot is nearer than the second, in
+units of `Observation.resolution_mm`: the dot may be that of both rays, and lie between them."""
 
 MEDIAN_CHI2 = 2 * np.log(2)
 """Median of χ² with two degrees of freedom."""
 
 RIM_NEIGHBOURS, RIM_SIGMA2, RIM_TIMES = 3, 4.0, 20.0
-"""A label with at most so many labelled neighbours may be as many σ² off as the second says, or as
-the third times the median of all, whichever is more: of 130 such labels that were right, in pools
-of every kind, the farthest was 2.4 σ² off, while a false dot lies anywhere near."""
+"""For a label with at most `RIM_NEIGHBOURS` labelled neighbours, the squared distance in σ² may be
+at most `RIM_SIGMA2`, or `RIM_TIMES` times the median of all, whichever is larger. Of 130 correct
+labels of this kind, in pools of every kind, the largest was 2.4 σ²; false dots are at any
+distance."""
 
 MOST_LEVERAGE = 0.998
-"""A dot to which the surface goes wholly is left out as if it went there by this share."""
+"""Upper limit of the leverage when the residual of a dot to a fit without it is computed."""
 
 MOST_LEFT_OUT = 4
-"""So often labels are taken away and the surface is fitted again to the others."""
+"""Maximum number of rounds in which labels are removed and the surface is refitted."""
 
 LEVER = 10.0
-"""How far a dot moves when its reflection point does: twice the way to the plane, some 55 mm, times
-the surface's curvature, some 0.1 a mm."""
+"""Displacement of a dot per displacement of its reflection point: twice the distance to the plane,
+about 55 mm, times the curvature of the surface, about 0.1 mm⁻¹."""
 
 
 @dataclass(frozen=True)
 class FittedLabels:
-    """Labels, the surface fitted to them, and what it makes of all R rays.
+    """Labels, the surface fitted to them, and the paths of all R rays.
 
     Parameters
     ----------
     labels
         Index of each ray's dot or `UNLABELLED`, shape (rows, columns).
     basis, level
-        Of the surface: its splines, and the level that it lies at.
+        Splines and level of the surface.
     paths
-        What it makes of all rays.
+        Paths of all rays for this surface.
     covariance_mm2
-        Covariance of the dots of labelled rays, as far as the surface is uncertain, and of missed
-        rays, shape (R, 2, 2), mm²; those of others do not count.
+        Covariance of the dots of labelled and missed rays due to that of the surface, shape
+        (R, 2, 2), mm²; entries of other rays are ignored.
     classes
         The rays, classified with this surface.
     floor_mm
-        Least uncertainty of a dot in the fit (`FitSettings`), mm.
+        Lower limit of the uncertainty of a dot in the fit (`FitSettings`), mm.
     unsettled_mm
-        How far reflection points still moved in the fit's last round, mm.
+        Largest displacement of a reflection point in the last round of the fit, mm.
     """
 
     labels: IntArray
@@ -85,7 +86,7 @@ class FittedLabels:
 
 
 def unsupported(observed: Observation, fitted: FittedLabels) -> IntArray:
-    """Return the labelled dots that their ray alone does not explain.
+    """Return the labelled dots that are not explained by their ray.
 
     Each is held against the surface fitted to all the others: its ray must be likelier by
     `RIVAL_MARGIN` to have made it than a false dot to lie there, than its ray to have made another
@@ -97,8 +98,8 @@ def unsupported(observed: Observation, fitted: FittedLabels) -> IntArray:
     nothing beside it fixes its place in the row. Where all are farther off than what is known
     of dots and surface explains, these are as much more uncertain.
 
-    A false dot takes its neighbours' predictions along: of neighbours that fail only the one that
-    is farthest off, in σ, is returned. The others may stand once it is gone.
+    A false dot shifts the predictions of its neighbours. Of adjacent labels that fail, only the one
+    with the largest distance in σ is returned, as the others may pass after its removal.
 
     Parameters
     ----------
@@ -153,7 +154,7 @@ def isolated(lit: BoolArray) -> BoolArray:
 
 
 def _wide(observed: Observation, fitted: FittedLabels) -> BoolArray:
-    """Labels whose dots may be two in one, for their width, shape (rows, columns)."""
+    """Mask of labels whose dots may be two merged dots because of their width, (rows, columns)."""
     from labapp.core.matching import match_kernels
 
     lit, plane_mm = fitted.labels != UNLABELLED, fitted.paths.plane_mm
@@ -169,11 +170,11 @@ def _wide(observed: Observation, fitted: FittedLabels) -> BoolArray:
 
 
 def _inside(observed: Observation, fitted: FittedLabels, missing: float) -> FloatArray:
-    """Probability of each of the n labelled rays to land inside the boundary, shape (n,).
+    """Probability that each of the n labelled rays landed inside the boundary, shape (n,).
 
-    That of rays between others is 1, that of others at most 1/2: that of `level.find_level`, with
-    the level's uncertainty, and as much blur as the rays near the boundary contradict it. Where a
-    ray seems to land outside, the level is that which the others give.
+    It is 1 for rays between other lit rays and at most 1/2 for the others. If such a ray seems to
+    land outside, the probability is that of the model of `level.find_level`, marginalised over the
+    levels and blurs that the other rays allow.
     """
     from labapp.core.matching import match_kernels
     from labapp.core.surface.kernels import spline_kernels

@@ -1,4 +1,4 @@
-"""Where a fitted surface puts the dots of rays, and how likely a dot there is a ray's."""
+"""Predicted dots of rays for a fitted surface, and likelihoods of pairs of ray and dot."""
 
 from __future__ import annotations
 
@@ -15,44 +15,44 @@ from labapp.core.surface.spline import SplineBasis
 from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 
 GATE_SIGMA2, RIVAL_MARGIN = 20.0, 6.0
-"""A dot may be a ray's if its squared Mahalanobis distance from the prediction is below the first,
-and is if the deviance of every rival is larger by the second. (A right pair is beyond the gate once
-in 22,000; a margin of 6 makes it 20 times as likely as its rival.)"""
+"""A dot may belong to a ray if its squared Mahalanobis distance from the prediction is below the
+first; it does if the deviance of every rival is larger by the second. (A correct pair exceeds the
+gate once in 22,000; a margin of 6 makes it 20 times as likely as its rival.)"""
 
 SIGMA_INFLATION = 1.4
-"""By how much the surface's own uncertainty is enlarged while dots are labelled: beyond the last
-labelled row it rests on how smooth pools are expected to be."""
+"""Factor applied to the σ of the surface while dots are labelled: beyond the last labelled row the
+σ relies on the assumed smoothness of pools."""
 
 MODEL_ERROR_MM = 0.06
-"""How far the right surface's predictions may be off, mm, for what no spline of it can follow."""
+"""Standard error of correct predictions due to detail that the splines cannot represent, mm."""
 
 FALSE_DOTS_PER_MM2 = 5e-4
-"""False dots to be expected on the imaging plane: a few in a frame. Where a prediction is vague,
-one of them is as likely a cause of a dot as the ray."""
+"""Expected density of false dots on the imaging plane: a few per frame. Where a prediction is
+uncertain, a dot is as likely to be false as to belong to the ray."""
 
 OUT_OF_VIEW_SIGMA, LEAST_LINE = 2.5, 3
-"""A row of rays beside the last lit one may have left the view where at least so many (the second)
-of its dots are predicted in view by less than so many σ: that they are not seen does not make them
+"""A row of rays next to the last lit row may have left the view if at least `LEAST_LINE` of its
+dots are predicted in view by less than `OUT_OF_VIEW_SIGMA` σ. Its rays then are not known to be
 dark."""
 
 NEAR_EDGE_MM = 8.0
-"""Only so near the edge of the view it is worked out how uncertain predictions are."""
+"""The uncertainty of predictions is computed only within this distance of the edge of the view."""
 
 
 @dataclass(frozen=True)
 class RayPaths(ReadOnlyArrays):
-    """Where all R rays of the pattern, row by row, meet a surface, and the dots they make.
+    """Intersections of all R rays of the pattern, row by row, with a surface, and their dots.
 
     Parameters
     ----------
     coefficients
-        Of the surface's splines, shape (p,), mm.
+        Spline coefficients of the surface, shape (p,), mm.
     points_mm
         Reflection points, shape (R, 3), mm.
     slopes
-        The surface's gradient there, shape (R, 2).
+        Gradient of the surface there, shape (R, 2).
     plane_mm
-        Dots, IPCS, shape (R, 2), mm; NaN for rays that leave the splines or never meet the plane.
+        Dots, IPCS, shape (R, 2), mm; NaN for rays that leave the splines or miss the plane.
     """
 
     coefficients: FloatArray
@@ -69,7 +69,7 @@ class RayPaths(ReadOnlyArrays):
         near_mm: FloatArray | None = None,
         steps: int = 12,
     ) -> RayPaths:
-        """Intersect and reflect the rays, from points nearby, shape (R, 3), or from z = 0."""
+        """Intersect and reflect the rays; start at nearby points, shape (R, 3), or at z = 0."""
         from labapp.core.surface.kernels import ray_kernels
 
         start = bench.rays.landing_mm.reshape(-1, 3) if near_mm is None else near_mm
@@ -80,7 +80,7 @@ class RayPaths(ReadOnlyArrays):
 
 @dataclass(frozen=True)
 class Prediction:
-    """Where the surface puts the dots of some rays, m of them.
+    """Predicted dots of m rays.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ class Prediction:
     spacing_mm: FloatArray
 
     def part(self, which: BoolArray) -> Prediction:
-        """The same of some of the rays, by a mask of shape (m,)."""
+        """Return the prediction of the rays selected by a mask of shape (m,)."""
         return Prediction(
             self.at[which],
             self.points_mm[which],
@@ -111,7 +111,7 @@ class Prediction:
         )
 
     def covariance_mm2(self, pool: FittedPool, rig: Rig) -> FloatArray:
-        """Covariance of the dots, as far as the surface is uncertain, shape (m, 2, 2), mm²."""
+        """Covariance of the dots due to that of the surface, shape (m, 2, 2), mm²."""
         basis = pool.surface.basis
         return covariance_of_dots(rig, basis, pool.factor, self.points_mm, self.plane_mm)
 
@@ -119,7 +119,7 @@ class Prediction:
 def covariance_of_dots(
     rig: Rig, basis: SplineBasis, factor: FloatArray, points_mm: FloatArray, plane_mm: FloatArray
 ) -> FloatArray:
-    """Covariance of computed dots, as far as the surface is uncertain, shape (n, 2, 2), mm².
+    """Covariance of computed dots due to that of the surface, shape (n, 2, 2), mm².
 
     Parameters
     ----------
@@ -129,8 +129,7 @@ def covariance_of_dots(
         The surface's splines, and the Cholesky factor of their normal matrix
         (`solver.normal_factor`).
     points_mm, plane_mm
-        Reflection points, shape (n, 3), and the dots that the surface makes there, IPCS, shape
-        (n, 2), mm.
+        Reflection points, shape (n, 3), and the dots computed for them, IPCS, shape (n, 2), mm.
     """
     from labapp.core.surface.kernels import solver_kernels
 
@@ -140,7 +139,7 @@ def covariance_of_dots(
 
 
 def predict(observed: Observation, pool: FittedPool, where: BoolArray) -> Prediction:
-    """Predict the dots of the rays in a mask, shape (rows, columns), that reach the plane."""
+    """Predict the dots of those rays in a mask, shape (rows, columns), that reach the plane."""
     from labapp.core.images import dot_kernels
     from labapp.core.surface.kernels import ray_kernels
 
@@ -154,31 +153,31 @@ def predict(observed: Observation, pool: FittedPool, where: BoolArray) -> Predic
         4,
         pose,
     )
-    sane = np.isfinite(plane[:, 0])
-    at, points, slopes, plane = at[sane], points[sane], slopes[sane], plane[sane]
+    finite = np.isfinite(plane[:, 0])
+    at, points, slopes, plane = at[finite], points[finite], slopes[finite], plane[finite]
     return Prediction(at, points, slopes, plane, dot_kernels.next_apart(plane))
 
 
 def sure_pairs(
     observed: Observation, dots: IntArray, plane_mm: FloatArray, covariance_mm2: FloatArray
 ) -> tuple[IntArray, IntArray]:
-    """Pairs of a dot that one ray alone can have made and the ray that can have made it alone.
+    """Find the unambiguous pairs of dot and ray.
 
-    The ray is likelier by `RIVAL_MARGIN` than any other for the dot, the dot than any other for
-    the ray, and both than a false dot.
+    A pair is unambiguous if it is likelier by `RIVAL_MARGIN` than the dot with any other ray, the
+    ray with any other dot, and a false dot.
 
     Parameters
     ----------
     observed, dots
-        The frame's dots, and indices of the n among them that come into question.
+        The frame's dots, and the indices of the n candidates among them.
     plane_mm, covariance_mm2
-        Where a surface puts the dots of m > 0 rays, IPCS, shape (m, 2), mm, and their covariance,
-        as far as the surface is uncertain, shape (m, 2, 2).
+        Predicted dots of m > 0 rays, IPCS, shape (m, 2), mm, and their covariance due to that of
+        the surface, shape (m, 2, 2), mm².
 
     Returns
     -------
     dot, ray
-        Index of the dot and position of the ray among the m, of each pair.
+        For each pair, the index of the dot and the position of the ray among the m.
     """
     from labapp.core.matching import match_kernels
 
@@ -196,15 +195,15 @@ def sure_pairs(
 def pair_deviances(
     observed: Observation, pool: FittedPool, predicted: Prediction, dots: IntArray
 ) -> tuple[FloatArray, FloatArray]:
-    """How far dots, n of them, are from m predictions, and how unlikely that makes each pair.
+    """Distances and deviances of n dots from m predictions.
 
-    Covariances of dot and prediction are added.
+    The covariance of a pair is the sum of those of dot and prediction.
 
     Returns
     -------
     distance, deviance
-        Squared Mahalanobis distances, and deviances: −2 log likelihoods but for a constant that is
-        the same for all pairs. Both of shape (n, m).
+        Squared Mahalanobis distances, and deviances: −2 log likelihoods up to a constant common to
+        all pairs. Both of shape (n, m).
     """
     from labapp.core.matching import match_kernels
 
@@ -214,15 +213,12 @@ def pair_deviances(
 
 
 def _enlarged(covariance_mm2: FloatArray) -> FloatArray:
-    """Covariance of predicted dots with the surface's and the model's error, shape (m, 2, 2), mm².
-
-    The argument has it as far as the fit itself knows it.
-    """
+    """Inflate the covariance from the fit, shape (m, 2, 2), mm², and add the model error."""
     return SIGMA_INFLATION**2 * covariance_mm2 + MODEL_ERROR_MM**2 * np.eye(2)
 
 
 def false_dot_deviance(per_mm2: float = FALSE_DOTS_PER_MM2) -> float:
-    """Deviance of a false dot, comparable with `pair_deviances`, where there are so many a mm²."""
+    """Deviance of a false dot for a density of false dots, comparable with `pair_deviances`."""
     return -2 * float(np.log(2 * np.pi * per_mm2))
 
 
@@ -232,16 +228,17 @@ def lines_out_of_view(
     plane_mm: FloatArray,
     covariance_of: Callable[[BoolArray], FloatArray],
 ) -> BoolArray:
-    """Rays of rows or columns that may have left the view, a mask of shape (rows, columns).
+    """Mask of rays in rows or columns that may have left the view, shape (rows, columns).
 
     Parameters
     ----------
     observed
         The dots and the rig.
     at, plane_mm
-        Dark rays beside the lit ones, as in `Prediction`, shapes (m, 2), mm.
+        Dark rays next to lit ones and their predicted dots, as in `Prediction`, shapes (m, 2), mm.
     covariance_of
-        Covariance of the dots of some of them, by a mask of shape (m,), shape (…, 2, 2), mm².
+        Function of a mask over these rays, shape (m,), that returns the covariance of their dots,
+        shape (…, 2, 2), mm².
     """
     unsure = ~observed.in_view(plane_mm, NEAR_EDGE_MM)
     lines = _lines_of(at[unsure], observed.absent.shape)
@@ -253,7 +250,7 @@ def lines_out_of_view(
 
 
 def _lines_of(at: IntArray, shape: tuple[int, ...]) -> BoolArray:
-    """Rays, shape (m, 2), of which `LEAST_LINE` are in a row or a column, as a mask of a shape."""
+    """Mask of the rays, shape (m, 2), whose row or column holds `LEAST_LINE` or more of them."""
     mask = np.zeros(shape, bool)
     mask[tuple(at.T)] = True
     rows, columns = mask.sum(axis=1, keepdims=True), mask.sum(axis=0, keepdims=True)

@@ -1,4 +1,4 @@
-"""Quadrics whose rays fall on the dots, and how well they do, compiled (docs/adr/0018)."""
+"""Compiled reflection off quadrics and caps, and matching of their dots (docs/adr/0018)."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ _f1, _f2, _f3, _f4 = (types.Array(_f, n, "A", readonly=True) for n in (1, 2, 3, 
 _mask = types.Array(types.boolean, 2, "A", readonly=True)
 
 LONGEST_QUADRIC_STEP_MM = 1.0
-"""The same for quadrics, which go on beyond the pool."""
+"""Longest Newton step along a ray to a quadric, which continues beyond the pool."""
 
 QUADRIC_STEPS = 3
-"""Newton steps from the plane z = 0, or that of the cap's top, to a quadric."""
+"""Newton steps to a quadric from the plane z = 0, or from the horizontal plane at a cap's top."""
 
 
 @_inner
 def _quadric_at(quadric: FloatArray, x: float, y: float) -> tuple[float, float, float]:
-    """Height and slopes of a quadric at a place from its centre: g_x, g_y, κ_x, κ_xy, κ_y."""
+    """Height and slopes at (x, y) from the centre of a quadric (g_x, g_y, κ_x, κ_xy, κ_y)."""
     along_x = quadric[0] + quadric[2] * x + quadric[3] * y
     along_y = quadric[1] + quadric[3] * x + quadric[4] * y
     return ((quadric[0] + along_x) * x + (quadric[1] + along_y) * y) / 2.0, along_x, along_y
@@ -47,12 +47,12 @@ def reflect_off_quadrics(
     rays, laser
         Shapes (n, 3) and (3,), mm.
     plane
-        See the module.
+        See `ray_kernels`.
 
     Returns
     -------
     points, dots
-        Shape (m, n, 3), mm, and IPCS, shape (m, n, 2), mm; NaN where a ray runs away.
+        Shape (m, n, 3), mm, and IPCS, shape (m, n, 2), mm; NaN where a ray diverges.
     """
     points = np.empty((len(quadrics), len(rays), 3))
     dots = np.empty((len(quadrics), len(rays), 2))
@@ -79,7 +79,7 @@ def reflect_off_quadrics(
 
 @_inner
 def _distance(one: FloatArray, other: FloatArray) -> float:
-    """Distance of two dots; infinite where there is none."""
+    """Distance of two dots; infinite if either is NaN."""
     distance = np.hypot(one[0] - other[0], one[1] - other[1])
     return distance if np.isfinite(distance) else np.inf
 
@@ -88,25 +88,25 @@ def _distance(one: FloatArray, other: FloatArray) -> float:
 def match_predicted_dots(
     pattern: FloatArray, places: FloatArray, absent: BoolArray, gate: float
 ) -> tuple[BoolArray, IntArray, FloatArray]:
-    """Which predicted dots fall on which of some places.
+    """Match predicted dots with the nearest observed ones.
 
     Parameters
     ----------
     pattern
         Predicted dots, shape (m, rows, columns, 2), mm; NaN where there is none.
     places
-        Dots that were found, shape (d, 2), mm.
+        Observed dots, shape (d, 2), mm.
     absent
-        Rays that make no dot, shape (rows, columns).
+        Rays that the lens does not make, shape (rows, columns).
     gate
-        Share of the way to the next predicted dot in the row or the column within which a place is
-        a predicted dot's.
+        Largest distance of a match, as a fraction of the distance to the nearest predicted dot of
+        the row or the column.
 
     Returns
     -------
     hit, dot, off
-        Whether a place is within the gate; the nearest place; how far off it is, in units of the
-        gate. Shape (m, rows, columns) each.
+        Whether an observed dot is within the gate; index of the nearest one; its distance in units
+        of the gate. Shape (m, rows, columns) each.
     """
     count, rows, columns = pattern.shape[:3]
     hit = np.zeros((count, rows, columns), np.bool_)
@@ -142,7 +142,7 @@ def match_predicted_dots(
 def _cap_dots(
     cap: FloatArray, rays: FloatArray, bench: tuple[FloatArray, FloatArray], dots: FloatArray
 ) -> BoolArray:
-    """Put the dots that a cap makes of rays into ``dots``, (n, 2); which rays it meets, (n,)."""
+    """Write the dots of rays off a cap into ``dots``, shape (n, 2); return which rays meet it."""
     x_mm, y_mm, along_x, along_y, height = cap
     laser, plane = bench
     quadric, point, there = np.zeros(5), np.empty(3), np.zeros(len(rays), np.bool_)
@@ -175,7 +175,11 @@ def _nearest_pairs(
     spacing: FloatArray,
     away: FloatArray,
 ) -> BoolArray:
-    """Nearest place of each own dot, how far it and the next own dot are; and which are mutual."""
+    """Find the nearest observed dot of each predicted one, and return which pairs are mutual.
+
+    Write its index into ``dot``, its distance into ``away``, and the distance to the nearest other
+    prediction into ``spacing``.
+    """
     back, ray_of = np.full(len(places), np.inf), np.empty(len(places), np.int64)
     spacing[: len(own)] = np.inf
     for a in range(len(own)):
@@ -209,26 +213,26 @@ def score_caps(
     absent: BoolArray,
     settings: FloatArray,
 ) -> tuple[FloatArray, IntArray]:
-    """How well places on the plane fit the dots that caps make of rays, and which is whose.
+    """Score caps by how well their predicted dots match the observed ones, and label the rays.
 
     Parameters
     ----------
     caps
-        Paraboloids over ellipses: middle X and Y, semi-axes along them, height, shape (m, 5), mm.
+        Paraboloids over ellipses: centre X and Y, semi-axes along them, height, shape (m, 5), mm.
     rays, laser, plane
         See `reflect_off_quadrics`.
     places, absent
-        Shape (d, 2), mm; which rays make no dot, shape (n,).
+        Observed dots, shape (d, 2), mm; which rays the lens does not make, shape (n,).
     settings
-        Least rays; the gate, a share of the way to the next predicted dot; what a ray without its
-        place takes off; share of the way within which an absent ray has a place, and what that
-        takes off (`cap_search`).
+        Minimum number of rays; the gate, a fraction of the distance to the nearest other
+        prediction; penalty for a ray without a dot; the gate for a dot at an absent ray, and the
+        penalty for it (`cap_search`).
 
     Returns
     -------
     score, labels
-        The higher the better, −inf for too few rays, shape (m,); and index of the place that is
-        each ray's, −1 where none is, shape (m, n).
+        The higher the better, −inf for too few rays, shape (m,); and index of each ray's dot, −1
+        where it has none, shape (m, n).
     """
     least, gate, dark, lit_gate, lit = settings
     count, bench = len(rays), (laser, plane)
@@ -264,7 +268,7 @@ def score_caps(
 
 @_inner
 def _solve_small(normal: FloatArray, right: FloatArray) -> FloatArray:
-    """Solve small normal equations by elimination; what they leave open is 0."""
+    """Solve small normal equations by elimination; undetermined unknowns are set to 0."""
     count, most = len(right), normal.max()
     for k in range(count):
         if not normal[k, k] > 1e-10 * most:
@@ -293,10 +297,10 @@ def fit_quadrics(
     absent: BoolArray,
     gate: float,
 ) -> FloatArray:
-    """Fit quadrics, shape (m, 5), to the places that their rays next to the middle one fall near.
+    """Fit quadrics, shape (m, 5), to the dots that match their rays next to the central one.
 
-    Least squares of slopes: every ray that falls on a place asks for the slopes that turn it
-    there (`bisecting_slopes`). One on which fewer than four fall stays as it is.
+    Least squares of slopes: the dot of each matched ray gives the slopes that reflect the ray to it
+    (`bisecting_slopes`). A quadric with fewer than four matched rays is not changed.
 
     Parameters
     ----------
@@ -311,7 +315,7 @@ def fit_quadrics(
     flat, out = rays.copy().reshape(rows * columns, 3), quadrics.copy()
     normal, right, by, dot = np.empty((5, 5)), np.empty(5), np.zeros((2, 5)), np.empty(3)
     for q in range(len(out)):
-        for _ in range(2):  # they land elsewhere then
+        for _ in range(2):  # the reflection points move with the quadric
             points, dots = reflect_off_quadrics(center, out[q : q + 1], flat, laser, plane)
             hit, number, _ = match_predicted_dots(
                 dots.reshape(1, rows, columns, 2), places, absent, gate
@@ -329,13 +333,13 @@ def fit_quadrics(
                     at = dot[0], dot[1], dot[2]
                     if plane[4, 0] != 0.0:
                         at = without_glass(point, at, plane)
-                    asked = bisecting_slopes(laser, point, at[0], at[1], at[2])
+                    slopes = bisecting_slopes(laser, point, at[0], at[1], at[2])
                     x, y = point[0] - center[0], point[1] - center[1]
                     by[0, 0], by[0, 2], by[0, 3] = 1.0, x, y
                     by[1, 1], by[1, 3], by[1, 4] = 1.0, x, y
                     for axis in range(2):
                         for m in range(5):
-                            right[m] += by[axis, m] * asked[axis]
+                            right[m] += by[axis, m] * slopes[axis]
                             for n in range(5):
                                 normal[m, n] += by[axis, m] * by[axis, n]
             if count < 4:

@@ -1,9 +1,10 @@
-"""Hypotheses from the optics: quadrics whose rays round the absent centre fall on dots.
+"""Initial labels from a local model of the pool: quadrics that explain the dots around a hole.
 
-Where rows bow so far that no grid grows on the picture, the surface can still be found from the
-few dots round the hole: near its middle a pool is a quadric. The hole fixes its slope, the two
-dots beside it the curvature across, and the curvature along is tried out. What then falls near
-the dots round the hole is fitted to them and held against more of them.
+Where rows bend so much that no grid can be grown in the image, the surface can still be found from
+the few dots around the hole: near its centre a pool is a quadric. The hole determines its slope,
+the two dots beside the hole the transverse curvature; several longitudinal curvatures are tried.
+Quadrics whose predictions lie near the dots around the hole are fitted to these and then compared
+with more dots.
 """
 
 from __future__ import annotations
@@ -19,47 +20,47 @@ from labapp.core.matching.observation import UNLABELLED, Observation
 from labapp.core.values import BoolArray, FloatArray, IntArray
 
 WINDOW_REACH = 3
-"""Rows and columns each way from the reference whose dots a quadric is held against."""
+"""Rows and columns on either side of the reference whose dots a quadric is compared with."""
 
 LOOSE_GATE, TIGHT_GATE = 0.5, 0.33
-"""A ray finds its dot within this fraction of the spacing of the predicted dots: at first, and
+"""A dot matches a ray within this fraction of the spacing of the predicted dots: at first, and
 once the quadric is fitted."""
 
 _LIFTS = np.array([0.0, 0.2, -0.2, 0.4, -0.4])
-"""How far the hole may lie off the middle of the two dots beside it, in their distance."""
+"""Offsets of the hole along Z′ from the midpoint of the two dots beside it, in their distance."""
 
 _RATIOS = np.geomspace(0.35, 2.2, 12)
-"""Curvature along over curvature across that is tried."""
+"""Ratios of longitudinal to transverse curvature that are tried."""
 
 _FLATTEST, _STEEPEST = 0.004, 0.6
-"""Curvature below which no dots could be told apart, and above which no pool is, mm⁻¹."""
+"""Curvature below which dots could not be resolved, and upper limit for pools, mm⁻¹."""
 
 
 ROW_SLOPE, REGULAR, LEAST_GAP = 0.6, 0.42, 0.3
-"""A hole is looked for between two dots of a row no steeper than the first. As one dot is missing
-between them, the next one on should lie half as far off as they are apart, on one side at least: it
-does within the second. No dot is in the hole: none is nearer to it than the third. The latter two
-are shares of the distance of the two dots."""
+"""A hole is searched for between two dots of a row whose slope is at most the first. As one dot is
+missing between them, the next dot of the row is expected at half their distance, on one side at
+least, with a tolerance of the second. No dot may be nearer to the hole than the third. The latter
+two are fractions of the distance of the two dots."""
 
 CORE_LOOSE, CORE_TIGHT = 5, 6
-"""So many of the eight rays round the reference must find their dots: loosely, at first, and once
-the quadric is fitted."""
+"""How many of the eight rays around the reference must have a dot: at first, with `LOOSE_GATE`, and
+once the quadric is fitted."""
 
 SILENT_COST, NEARNESS_GAIN = 3.0, 4.0
-"""What a ray beside the reference that should have a dot and has none takes off a guess's score,
-and what dots exactly where they are predicted add to it; a ray with a dot counts 1."""
+"""Penalty in the score for each ray next to the reference that should have a dot and has none, and
+gain for dots exactly at their predictions; a ray with a dot counts 1."""
 
 
 @dataclass(frozen=True)
 class QuadricGuess:
-    """The dots that a quadric's rays fall on.
+    """Labels that follow from a quadric.
 
     Parameters
     ----------
     labels
         Index of the dot of each ray next to the reference or `UNLABELLED`, shape (rows, columns).
     score
-        How many rays found their dot, less for those that should have and did not, and more for
+        Number of rays with a dot, minus a penalty for those that should have one, plus a gain for
         dots near their predictions.
     """
 
@@ -68,18 +69,18 @@ class QuadricGuess:
 
 
 def search_quadrics(observed: Observation, most: int = 8) -> list[QuadricGuess]:
-    """Find the quadrics that explain the dots round some hole best, the best first.
+    """Find the quadrics that best explain the dots around a hole, best first.
 
     Parameters
     ----------
     observed
         The dots and the rig.
     most
-        How many to return at most; no two with the same labels.
+        Maximum number of guesses to return; all labels are different.
     """
     marker = observed.rig.pattern.marker
     if marker is None or min(marker) < 2 or np.any(np.array(marker) >= observed.rays.shape[:2]):
-        return []  # without rays all round it, a hole cannot be recognised
+        return []  # without rays on all sides a hole cannot be recognised
     window = _Window(observed, marker)
     found: dict[bytes, QuadricGuess] = {}
     quadrics = [_quadrics(window, *hole) for hole in _holes(observed, window.tree)]
@@ -93,7 +94,7 @@ def search_quadrics(observed: Observation, most: int = 8) -> list[QuadricGuess]:
 def _holes(
     observed: Observation, tree: scipy.spatial.cKDTree
 ) -> Iterator[tuple[FloatArray, float]]:
-    """Empty places between two dots, IPCS, and half the dots' distance along X′, mm."""
+    """Yield empty places between two dots, IPCS, and half the distance of these along X′, mm."""
     dots = observed.plane_mm
     near = tree.query(dots, k=min(10, len(dots)))[1][:, 1:]
     one, other = dots[np.repeat(np.arange(len(dots)), near.shape[1])], dots[near.ravel()]
@@ -111,11 +112,12 @@ def _holes(
 
 
 def _quadrics(window: _Window, hole: FloatArray, half_width: float) -> FloatArray:
-    """Quadrics that put the reference into the hole, and loosely the dots round it in place.
+    """Quadrics that reflect the reference into the hole and roughly explain the dots around it.
 
-    z = g·x + ½(κ_x x² + 2κ_xy xy + κ_y y²), x and y from where the reference would land on the
-    work piece: (g_x, g_y, κ_x, κ_xy, κ_y) of each, shape (m, 5), mm⁻¹. Every curvature along is
-    tried, and both signs of the curvature across that put the neighbouring dots where they are.
+    z = g·x + ½(κ_x x² + 2κ_xy xy + κ_y y²), x and y relative to where the reference would land on
+    the work piece: (g_x, g_y, κ_x, κ_xy, κ_y) of each, shape (m, 5), curvatures in mm⁻¹. All
+    longitudinal curvatures are tried, and both signs of the transverse curvature that reproduces
+    the neighbouring dots.
     """
     observed = window.observed
     laser, plane = observed.rig.laser.position_mm, observed.rig.imaging_plane
@@ -140,7 +142,7 @@ def _quadrics(window: _Window, hole: FloatArray, half_width: float) -> FloatArra
 
 
 class _Window:
-    """The rays round the reference, and the dots they may fall on."""
+    """The rays around the reference, and the dots that may be theirs."""
 
     def __init__(self, observed: Observation, marker: tuple[int, int]) -> None:
         i, j = (n - 1 for n in marker)
@@ -157,12 +159,12 @@ class _Window:
         self.absent = observed.absent[self.part]
         self.middle = (reach, reach)
         self.core = slice(reach - 1, reach + 2), slice(reach - 1, reach + 2)
-        rim = max(reach - 2, 0)  # the core, and where there is one a ring round it
+        rim = max(reach - 2, 0)  # the core, and the ring around it if there is one
         self.near = slice(rim, 2 * reach + 1 - rim), slice(rim, 2 * reach + 1 - rim)
         self.core_of_near = tuple(slice(reach - 1 - rim, reach + 2 - rim) for _ in range(2))
 
     def intersect(self, quadrics: FloatArray, rays: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Reflection points of rays, shape (n, 3), on quadrics, shape (m, 5), and their dots.
+        """Reflection points of n rays on m quadrics, and their dots.
 
         Shapes (m, n, 3), mm, and IPCS, (m, n, 2), mm (`quadric_kernels.reflect_off_quadrics`).
         """
@@ -176,17 +178,16 @@ class _Window:
     def hits(
         self, pattern: FloatArray, gate: float, absent: BoolArray
     ) -> tuple[BoolArray, IntArray, FloatArray]:
-        """Which predicted dots, shape (m, rows, columns, 2), fall on a dot, on which, how far off.
+        """Match predicted dots, shape (m, rows, columns, 2), with the observed ones.
 
-        The last is in units of the gate: a share of the way to the next predicted dot in the row
-        or the column.
+        See `quadric_kernels.match_predicted_dots`.
         """
         from labapp.core.matching import quadric_kernels
 
         return quadric_kernels.match_predicted_dots(pattern, self.observed.plane_mm, absent, gate)
 
     def fitted(self, quadrics: FloatArray) -> FloatArray:
-        """Fit quadrics to the dots that their rays next to the reference fall near."""
+        """Fit quadrics to the dots that match their rays next to the reference."""
         from labapp.core.matching import quadric_kernels
 
         laser, places = self.observed.rig.laser.position_mm, self.observed.plane_mm
@@ -195,28 +196,29 @@ class _Window:
         return quadric_kernels.fit_quadrics(center, quadrics, *bench, LOOSE_GATE)
 
     def scored(self, quadrics: FloatArray) -> Iterator[QuadricGuess]:
-        """Hold quadrics against the dots; yield those that explain the dots round the hole."""
+        """Yield a scored guess for each quadric that explains the dots around the hole."""
         patterns = self.intersect(quadrics, self.rays.reshape(-1, 3))[1]
         patterns = patterns.reshape(-1, *self.rays.shape[:2], 2)
         hit, dot, off = self.hits(patterns, TIGHT_GATE, self.absent)
         core = (slice(None), *self.core)
         explains = np.flatnonzero(hit[core].sum(axis=(1, 2)) >= CORE_TIGHT)
         seen = self.observed.in_view(np.nan_to_num(patterns[core][explains], nan=1e6))
-        # A ray next to the hole that should show its dot and does not speaks against the quadric.
+        # A ray next to the hole that should have a dot but has none is evidence against the
+        # quadric.
         silent = seen & ~self.absent[self.core] & ~hit[core][explains]
         for k, count in zip(explains, silent.sum(axis=(1, 2)).tolist(), strict=True):
             yield self._guess(hit[k], dot[k], off[k], count)
 
     def _guess(self, hit: BoolArray, dot: IntArray, off: FloatArray, silent: int) -> QuadricGuess:
-        own = np.where(hit, dot, UNLABELLED)
-        chosen, count = np.unique(own[hit], return_counts=True)
-        own[np.isin(own, chosen[count > 1])] = UNLABELLED
+        matched = np.where(hit, dot, UNLABELLED)
+        chosen, count = np.unique(matched[hit], return_counts=True)
+        matched[np.isin(matched, chosen[count > 1])] = UNLABELLED
         nearness = 1 - np.mean(off[hit])
-        # Farther out the pool is no quadric, and the next row's dots may be hit instead.
+        # Farther out the pool is not a quadric, and dots of the next row may be matched instead.
         core = (self.core[0], slice(self.core[1].start - 1, self.core[1].stop + 1))
-        near = np.full(own.shape, UNLABELLED)
-        near[core] = own[core]
+        near = np.full(matched.shape, UNLABELLED)
+        near[core] = matched[core]
         labels = np.full(self.observed.rays.shape[:2], UNLABELLED, np.int64)
         labels[self.part] = near
-        score = np.sum(own != UNLABELLED) - SILENT_COST * silent + NEARNESS_GAIN * nearness
+        score = np.sum(matched != UNLABELLED) - SILENT_COST * silent + NEARNESS_GAIN * nearness
         return QuadricGuess(labels, float(score))

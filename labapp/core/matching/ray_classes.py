@@ -1,4 +1,4 @@
-"""Which rays came back, which did not, and which dots and rays a surface leaves unexplained."""
+"""Classification of rays as returned or not; dots and rays that a surface leaves unexplained."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from labapp.core.values import FloatArray, IntArray
 
 @dataclass(frozen=True)
 class RayClasses:
-    """What the rays say with a surface under them.
+    """Classes of rays and dots for a given surface.
 
     Parameters
     ----------
     witness
-        +1 came back, −1 did not, 0 cannot tell, shape (rows, columns) (see `Match.witness`).
+        +1 returned, −1 did not, 0 unknown, shape (rows, columns) (see `Match.witness`).
     missed
-        Numbers of the rays amid the others that have no dot, row by row, shape (m,).
+        Flat indices of the rays between lit rays that have no dot, shape (m,).
     stray
         Indices of the dots that have no ray, shape (s,).
     """
@@ -34,7 +34,7 @@ class RayClasses:
 def classify_rays(observed: Observation, labels: IntArray, paths: RayPaths) -> RayClasses:
     """Classify every ray, for labels of shape (rows, columns) and a surface fitted to them.
 
-    Neither a dot nor a ray is left over where the surface lets dots run into each other.
+    Where the surface predicts that dots merge, neither a dot nor a ray counts as unexplained.
     """
     from labapp.core.images import dot_kernels
     from labapp.core.surface.kernels import ray_kernels
@@ -64,7 +64,7 @@ def classify_rays(observed: Observation, labels: IntArray, paths: RayPaths) -> R
     witness[known[in_view & (spacing >= observed.resolution_mm)]] = -1
     witness[(between | without_dot).ravel()] = 0
     if len(unlabelled):
-        # A dot that no ray was given may be the dot of a ray that seems dark.
+        # A stray dot near a prediction may be the dot of a ray that seems dark.
         off = dot_kernels.two_nearest(plane[known], observed.plane_mm[unlabelled])[0][:, 0]
         witness[known[off < spacing]] = 0
     witness[lit.ravel()] = 1
@@ -77,22 +77,23 @@ def certain_witness(
     paths: RayPaths,
     covariance_of: Callable[[IntArray], FloatArray],
 ) -> IntArray:
-    """The witness without rows that are dark but may have left the view.
+    """Return the witness with dark rows set to unknown if they may have left the view.
 
-    Beside the last row that is seen the fit goes on as smoothly as it can, while a pool's edge
-    grows steep: the dots of the next row may lie farther out than they are predicted.
+    Beyond the last visible row the fit extrapolates smoothly, whereas the pool gets steeper towards
+    its edge: the dots of the next row may lie farther out than predicted.
 
     Parameters
     ----------
     observed, paths
-        The frame's dots, and what the surface makes of the rays.
+        The frame's dots, and the ray paths for the surface.
     witness
-        Of `classify_rays`.
+        The witness of `classify_rays`.
     covariance_of
-        Covariance of the dots of some rays, by their numbers, shape (m,): shape (m, 2, 2), mm².
+        Function of the flat indices of rays, shape (m,), that returns the covariance of their
+        dots, shape (m, 2, 2), mm².
     """
     rim = np.flatnonzero((witness < 0) & widened(witness > 0, 1))
     at = np.stack(np.divmod(rim, witness.shape[1]), axis=-1)
-    some = paths.plane_mm[rim]
-    lost = lines_out_of_view(observed, at, some, lambda which: covariance_of(rim[which]))
+    plane_mm = paths.plane_mm[rim]
+    lost = lines_out_of_view(observed, at, plane_mm, lambda which: covariance_of(rim[which]))
     return np.where(lost, 0, witness)

@@ -1,4 +1,4 @@
-"""Repair labels that leave dots or rays unexplained: swapped, jumped or left out rows."""
+"""Repair of labels that leave dots or rays unexplained: swapped, skipped or omitted rows."""
 
 from __future__ import annotations
 
@@ -19,49 +19,51 @@ from labapp.core.matching.prediction import (
 from labapp.core.values import BoolArray, IntArray
 
 DISCARDED_RINGS = 2
-"""So many rings of labels round what is unexplained are discarded and assigned again."""
+"""Number of rings of labels around unexplained rays and dots that are discarded and reassigned."""
 
 MIDDLE = 0.25
-"""A dot is in the middle between two where it is nearer to it than this share of their distance."""
+"""A dot is midway between two others if it is nearer to their midpoint than this fraction of their
+distance."""
 
 LEAST_ROW, MOST_BEYOND = 3, 0.6
-"""A dot or two beyond the last row may be false; three that one surface has are not. If a larger
-share than this of all dots is left over, the cause is not a row that growth did not reach."""
+"""One or two dots beyond the last row may be false; three that one surface explains are not. If
+more than this share of all dots is stray, the cause is not a row that growth did not reach."""
 
 LEAST_BETWEEN = 2
-"""Two dots in the middle between those of two rows are of a row that was left out."""
+"""Two dots midway between those of two rows belong to a row that was omitted."""
 
 
 def with_repaired(observed: Observation, found: list[Hypothesis]) -> list[Hypothesis]:
-    """Add what the cheapest hypothesis leads to when it is repaired, as long as that is cheaper.
+    """Add the repaired versions of the cheapest hypothesis, as long as each is cheaper.
 
-    Labels round what is unexplained are discarded, jumped rows closed up, left out ones let in, and
-    a dip is followed with finer knots.
+    Labels around unexplained rays and dots are discarded, gaps of skipped rows are closed, omitted
+    rows are inserted, and a dip is followed with finer knots.
 
-    Labels that are still to be repaired bend the surface: its roughness does not count yet.
+    Labels that still need repair bend the surface, so its roughness is not included in the
+    comparison yet.
 
     Where rows cross in a dip, growth may swap them; the swapped labels then bend the surface and
-    hold each other up. The surface through the labels round about knows better.
+    support each other. The surface through the surrounding labels is more reliable.
     """
     best = min(found, key=lambda hypothesis: hypothesis.misfit, default=None)
     while best is not None:
         labels = np.where(_about_unexplained(observed, best), UNLABELLED, best.labels)
         tried = [labels] if (labels != best.labels).any() else []
         tried += [*_closed_up(best), *_opened_up(observed, best)]
-        led = [h for labels in tried if (h := grow_and_evaluate(observed, labels))]
+        repaired = [h for labels in tried if (h := grow_and_evaluate(observed, labels))]
         if not explains(observed, best):
             finer = grow_and_evaluate(observed, best.labels, knot_mm=FINE_KNOTS.knot_mm)
-            led += [finer] if finer is not None else []
-        cheapest = min(led, key=lambda hypothesis: hypothesis.misfit, default=best)
+            repaired += [finer] if finer is not None else []
+        cheapest = min(repaired, key=lambda hypothesis: hypothesis.misfit, default=best)
         best = cheapest if cheapest.misfit < best.misfit else None
         found = found if best is None else [*found, best]
     return found
 
 
 def _closed_up(hypothesis: Hypothesis) -> Iterator[IntArray]:
-    """Yield labels with a jumped row or column closed up, from either side.
+    """Yield labels with the gap of a skipped row or column closed, from either side.
 
-    A row of rays was jumped where most of the rays without a dot are in it.
+    A row of rays was skipped if most of the missed rays are in it.
     """
     labels = hypothesis.labels
     for axis in (0, 1):
@@ -75,9 +77,9 @@ def _closed_up(hypothesis: Hypothesis) -> Iterator[IntArray]:
 
 
 def _opened_up(observed: Observation, hypothesis: Hypothesis) -> Iterator[IntArray]:
-    """Yield labels with room for a row or column of dots that was left out between two.
+    """Yield labels with a gap for a row or column of dots that was omitted between two.
 
-    The dots without a ray are in the middle between those of two rays; the shorter side moves on.
+    The stray dots are midway between those of two rays; the smaller part of the labels is shifted.
     """
     labels, stray_dots = hypothesis.labels, observed.plane_mm[hypothesis.stray_dots]
     for axis in (0, 1) if len(stray_dots) else ():
@@ -97,10 +99,7 @@ def _opened_up(observed: Observation, hypothesis: Hypothesis) -> Iterator[IntArr
 
 
 def _about_unexplained(observed: Observation, hypothesis: Hypothesis) -> BoolArray:
-    """Rays without a dot or nearest to a dot without a ray, and `DISCARDED_RINGS` of neighbours.
-
-    A mask, shape (rows, columns).
-    """
+    """Mask of missed rays, of rays nearest to stray dots, and of `DISCARDED_RINGS` around them."""
     missed_rays, stray = hypothesis.missed_rays, hypothesis.stray_dots
     about = np.zeros(hypothesis.labels.shape, bool)
     about[tuple(missed_rays.T)] = True
@@ -114,14 +113,14 @@ def _about_unexplained(observed: Observation, hypothesis: Hypothesis) -> BoolArr
 
 
 def with_rows_beyond(observed: Observation, found: list[Hypothesis]) -> list[Hypothesis]:
-    """Add what the cheapest hypotheses lead to if a row that growth did not reach is begun.
+    """Extend the cheapest hypotheses by a row that growth did not reach, and add the results.
 
-    Beyond the last row a surface may be so uncertain that several rays come into question for
-    every dot there; then `grow_labels` gives none of them a ray. Here each is tried, and what has
-    come of it is a hypothesis to be held against the others: a row given to the wrong rays costs
-    the dots of the rays that it jumps, or costs nearly as much as another hypothesis.
+    Beyond the last row a surface may be so uncertain that each dot there has several candidate
+    rays; `grow_labels` then labels none. Here each candidate is tried, and the result is a
+    hypothesis like the others: a row assigned to the wrong rays is penalised for the rays that it
+    skips, or costs nearly as much as another hypothesis.
     """
-    # The cheapest of all, and of those that have the marker dark: all it lacks may be a row.
+    # The cheapest of all, and the cheapest with a dark marker, which may lack only a row.
     groups = (found, [hypothesis for hypothesis in found if hypothesis.marker == "dark"])
     starts = [min(group, key=lambda hypothesis: hypothesis.misfit) for group in groups if group]
     for start in starts[:1] + [start for start in starts[1:] if start is not starts[0]]:
@@ -136,10 +135,10 @@ def with_rows_beyond(observed: Observation, found: list[Hypothesis]) -> list[Hyp
 
 
 def _rows_begun(observed: Observation, hypothesis: Hypothesis, most: int = 8) -> list[Hypothesis]:
-    """Give a dot without a ray to each ray that may have made it, and follow where that leads.
+    """Assign a stray dot to each candidate ray beyond the labelled ones, and grow the labels.
 
-    The ``most`` likeliest pairs are tried, less those that another one has led to. One dot can be
-    made to fit: `LEAST_ROW` dots more have to find their rays.
+    The ``most`` likeliest pairs are tried, except those that an earlier one has led to. As a
+    surface can fit any single dot, the labels must grow by at least `LEAST_ROW` dots.
     """
     labels = hypothesis.labels
     found: list[Hypothesis] = []

@@ -1,7 +1,7 @@
 """Shape of the reflected rows, and which correspondences it allows (§4.2.2.3, §7.1).
 
-Convex rows, whose middle is highest in the picture, are those of a convex pool (S/S) or of a deep
-concave one (I/I); concave rows are those of a shallow concave pool (S/I, S/S).
+Convex rows, whose middle is highest in the image, come from a convex pool (S/S) or a deep concave
+one (I/I); concave rows come from a shallow concave pool (S/I, S/S).
 """
 
 from __future__ import annotations
@@ -23,25 +23,25 @@ ALLOWED: dict[Shape, tuple[Orientation, ...]] = {
 """Correspondences that ERS tries by the shape of the reflected image (§7.1)."""
 
 LEAST_DOTS = 4
-"""A row of fewer dots has no shape that noise would not change."""
+"""Minimum number of dots of a row whose shape is determined: that of shorter rows is noise."""
 
 
 @dataclass(frozen=True)
 class RowShapes:
-    """How many reflected rows are convex, and how many concave."""
+    """Numbers of convex and of concave reflected rows."""
 
     convex: int
     concave: int
 
     @property
     def shape(self) -> Shape | None:
-        """Shape of most rows; None where neither prevails."""
+        """Shape of the majority of the rows; None if there is no majority."""
         if self.convex == self.concave:
             return None
         return "convex" if self.convex > self.concave else "concave"
 
     def allows(self, orientation: Orientation) -> bool | None:
-        """Whether the rule of §7.1 allows a correspondence; None where neither shape prevails."""
+        """Whether the rule of §7.1 allows an orientation; None without a majority."""
         return None if self.shape is None else orientation in ALLOWED[self.shape]
 
 
@@ -55,12 +55,12 @@ def row_shapes(plane_mm: FloatArray, row: IntArray) -> RowShapes:
     row
         Reflected row k of each, shape (n,); 0: none.
     """
-    bend = []
+    curvatures = []
     for k in np.unique(row[row > 0]):
         x, z = plane_mm[row == k].T
         if len(x) >= LEAST_DOTS:
-            bend.append(np.polynomial.Polynomial.fit(x, z, 2).coef[2])
-    signs = np.sign(bend)
+            curvatures.append(np.polynomial.Polynomial.fit(x, z, 2).coef[2])
+    signs = np.sign(curvatures)
     return RowShapes(int(np.sum(signs < 0)), int(np.sum(signs > 0)))
 
 

@@ -1,1 +1,1 @@
-"""The frames of one recording: each from the one before, and whether they agree on the rows."""
+"""Frames of one recording: tracking from frame to frame, row vote and check of the set-up."""

@@ -1,7 +1,6 @@
-"""Frames one after the other: each measured from what the one before left, or else by itself.
+"""Measurement of consecutive frames: each with the prior of the previous frame, or else without.
 
-The same frames give the same answers: nothing depends on the clock or on how many are measured at
-once.
+The same frames give the same results: nothing depends on the clock or on the number of processes.
 """
 
 from __future__ import annotations
@@ -22,16 +21,16 @@ class WarmChain:
     Parameters
     ----------
     bench
-        What they were seen on.
+        The bench.
     settings
-        Of the measurement. Only the fit to band-passed dots, the default, can be followed.
+        Settings of the measurement. Only the fit to band-passed dots, the default, can be followed.
     on_step
         See `pipeline.measure`; called for followed frames.
 
     Attributes
     ----------
     track_lost
-        Why the last frame was measured by itself; None where it was followed.
+        Why the last frame was measured without a prior; None if it was followed.
     """
 
     def __init__(
@@ -44,20 +43,20 @@ class WarmChain:
         self._after_gap = False
 
     def skip(self) -> None:
-        """Leave out a frame: those before and after it are not equally spaced in time.
+        """Skip a frame, after which frames are no longer equally spaced in time.
 
-        The next frame is sought around the last one, without extrapolation of how the pool swung.
+        The next frame is predicted from the last one, without extrapolation of the oscillation.
         """
         if self._prior is not None:
             self._prior, self._after_gap = self._prior.after_gap(), True
 
     def follow(self, image: Image) -> Measurement | None:
-        """Measure the next frame from those before; None where they do not lead to it.
+        """Measure the next frame with the prior; None if the track is lost.
 
-        No search is started, and a frame after it may be followed again.
+        No search is started, and a later frame may be followed again.
         """
         if self._prior is None:
-            self.track_lost = "no frame before it was measured"
+            self.track_lost = "no earlier frame was measured"
             return None
         given = self.bench, self.settings, self._prior
         measurement, prior = measure(image, *given, on_step=self._on_step)
@@ -69,14 +68,11 @@ class WarmChain:
         return measurement
 
     def measure(self, image: Image) -> Measurement:
-        """Measure the next frame from those before, or else by itself (`search`)."""
+        """Measure the next frame with the prior, or else without one (`search`)."""
         return self.follow(image) or self.search(image)
 
     def search(self, image: Image) -> Measurement:
-        """Measure the next frame as if it were the first.
-
-        Where that succeeds, those after it may be followed from it.
-        """
+        """Measure the next frame as if it were the first; later frames may be followed from it."""
         self.track_lost = self.track_lost or "it was measured by itself"
         measurement, prior = measure(image, self.bench, self.settings)
         former = self._prior
@@ -89,7 +85,7 @@ class WarmChain:
         return measurement
 
     def _keep(self, prior: Prior | None) -> None:
-        """Keep a frame's prior; after a gap without the memory of the frames before that."""
+        """Store a frame's prior; after a gap without the surfaces of the frames before the gap."""
         if prior is not None and self._after_gap:
             prior = replace(prior, past=prior.past[-1:], slopes=prior.slopes[-1:])
         self._prior, self._after_gap = prior, False

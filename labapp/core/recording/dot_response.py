@@ -1,8 +1,8 @@
-"""Response of the dots to the quantities of a set-up, less what a pool's surface could absorb.
+"""Response of the dots to the quantities of a set-up that the pool's surface cannot absorb.
 
-Most of what a quantity moves the dots by looks like another surface. A dot has two coordinates and
-a surface one height for both: what is left does not fit the gradient of any surface (its curl),
-and is known without the surface being known. The fit's own stiffness is not in it.
+Most of the displacement of the dots due to a quantity is equivalent to a change of the surface. As
+a dot has two coordinates and a surface one height, the rest is not the gradient of any surface (it
+has a curl), and is known even if the surface is not. The stiffness of the fit is not included.
 """
 
 from __future__ import annotations
@@ -26,33 +26,32 @@ from labapp.core.surface.spline import SplineSurface
 from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 
 SHARE = 0.1
-"""Share of a quantity's assumed uncertainty that it is off by for the differences …"""
+"""Step of the finite differences by quantities, as a share of the assumed uncertainty."""
 
 STEP = 1e-4
-"""… and step along rays, mm, and of slopes."""
+"""Step of the finite differences along rays, mm, and by slopes."""
 
 NEWTON_STEPS = 8
-"""From where a ray lands on the work piece to where it meets the surface."""
+"""Newton steps from the landing point of a ray on the work piece to the surface."""
 
 CLOSED = 1e-6
-"""What surfaces move the dots by in weaker combinations, in squares of the strongest, is rounding,
-and is not absorbed."""
+"""Eigenvalues below this share of the largest are rounding errors: their modes are not absorbed."""
 
 
 @dataclass(frozen=True)
 class DotResponse(ReadOnlyArrays):
-    """Response of m rays' dots on the imaging plane, X′ and Z′ in turn, about one surface.
+    """Response of m rays' dots on the imaging plane, X′ and Z′ interleaved, for one surface.
 
     Parameters
     ----------
     absorbed
-        Orthonormal basis of what surfaces move the dots by, shape (2m, a).
+        Orthonormal basis of the displacements that changes of the surface cause, shape (2m, a).
     by_quantity
-        Computed minus captured dots, less what is absorbed, for each of `QUANTITIES` off by one
-        unit, shape (2m, q), mm.
+        Derivative of computed minus captured dots by each of `QUANTITIES`, without the absorbed
+        part, shape (2m, q), mm per unit.
     by_lens_center
-        The same, but for its sign, of a distortion of 1 % in the plane's corner whose centre lies 1
-        mm off the plane's middle, along X′ and Z′, shape (2m, 2), mm.
+        The same, up to the sign, for a distortion of 1 % in the plane's corner whose centre is 1 mm
+        off the centre of the plane, along X′ and Z′, shape (2m, 2), mm.
     """
 
     absorbed: FloatArray
@@ -60,12 +59,12 @@ class DotResponse(ReadOnlyArrays):
     by_lens_center: FloatArray
 
     def unabsorbed(self, dots: FloatArray) -> FloatArray:
-        """What no surface could explain of changes of the dots, shape (m, 2): shape (2m,)."""
+        """Part of dot displacements, shape (m, 2), that no surface explains, shape (2m,)."""
         return _without(self.absorbed, dots.ravel())
 
     @property
     def freedom(self) -> int:
-        """Degrees of freedom that are left."""
+        """Number of degrees of freedom that are not absorbed."""
         count, absorbed = self.absorbed.shape
         return int(count - absorbed)
 
@@ -73,12 +72,12 @@ class DotResponse(ReadOnlyArrays):
 def dot_responses(
     rig: Rig, surfaces: Sequence[SplineSurface], ray: IntArray
 ) -> tuple[BoolArray, list[DotResponse]]:
-    """Work out the response about each of some surfaces.
+    """Compute the response for each of several surfaces.
 
     Parameters
     ----------
     rig
-        The bench, with its uncertainty.
+        The rig, with its uncertainty.
     surfaces
         Surfaces of a recording's frames.
     ray
@@ -89,9 +88,9 @@ def dot_responses(
     known, responses
         Which rays meet all surfaces and the plane, shape (n,); the responses of these m.
     """
-    every = [(_by_spline(rig, one, ray), *_by_bench(rig, one, ray)) for one in surfaces]
-    known = np.isfinite(np.concatenate(sum(every, ()), axis=-1)).all(axis=(1, 2))
-    return np.asarray(known), [_response(*(by[known] for by in one)) for one in every]
+    changes = [(_by_spline(rig, one, ray), *_by_bench(rig, one, ray)) for one in surfaces]
+    known = np.isfinite(np.concatenate(sum(changes, ()), axis=-1)).all(axis=(1, 2))
+    return np.asarray(known), [_response(*(by[known] for by in one)) for one in changes]
 
 
 def _response(
@@ -110,7 +109,7 @@ def _without(absorbed: FloatArray, moved: FloatArray) -> FloatArray:
 
 
 def _by_bench(rig: Rig, surface: SplineSurface, ray: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Changes of the dots of one surface: by each quantity, (n, 2, q); by the lens's centre."""
+    """Derivatives of the dots by each quantity, shape (n, 2, q), and by the lens's centre."""
     from labapp.core.surface.kernels import ray_kernels
 
     assert rig.uncertainty is not None
@@ -134,7 +133,7 @@ def _by_bench(rig: Rig, surface: SplineSurface, ray: IntArray) -> tuple[FloatArr
 
 
 def _by_lens_center(plane_mm: FloatArray, plane: ImagingPlane) -> FloatArray:
-    """Change of dots, shape (n, 2, 2), see `DotResponse.by_lens_center`."""
+    """Displacement of dots, shape (n, 2, 2), see `DotResponse.by_lens_center`."""
     half = np.array([plane.width_mm, plane.height_mm]) / 2
     out = plane_mm - half
     square = np.sum(out**2, axis=-1)[:, None, None]
@@ -143,7 +142,7 @@ def _by_lens_center(plane_mm: FloatArray, plane: ImagingPlane) -> FloatArray:
 
 
 def _by_spline(rig: Rig, surface: SplineSurface, ray: IntArray) -> FloatArray:
-    """Change of the computed dots by each spline of a surface, shape (n, 2, p)."""
+    """Derivatives of the computed dots by each spline coefficient of a surface, shape (n, 2, p)."""
     from labapp.core.surface.kernels import solver_kernels
 
     rays, at = project_rays(rig.laser, rig.pattern), tuple(ray.T - 1)
@@ -154,7 +153,7 @@ def _by_spline(rig: Rig, surface: SplineSurface, ray: IntArray) -> FloatArray:
     slope = surface.gradient(x, y)
 
     def dots(along: float, aside: tuple[float, float]) -> FloatArray:
-        """Dots from points moved along their rays, where slopes are changed."""
+        """Dots of points moved along their rays, with changed slopes."""
         moved = point + along * direction
         tilt = surface.gradient(moved[:, 0], moved[:, 1]) + np.array(aside)
         to = reflect(direction, surface_normal(tilt))

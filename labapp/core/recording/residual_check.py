@@ -1,14 +1,15 @@
-"""What the residuals of a recording say of its set-up.
+"""Check of a set-up by the residuals of a recording.
 
-Most of what is wrong with a set-up goes into the surface: residuals do not show it. What no surface
-can absorb (`dot_response`) is the same in every frame, or changes over the recording where a part
-moves, while noise averages out. The mean residual of each ray, and its change over the recording,
-are compared with the response to each quantity (score test): one is off where the cost falls by
-more than `LIMIT` once it is free. The cost of the mean has the set-up's own covariance, so that
-what its ± covers is no contradiction; nothing should move during a recording. What fits no quantity
-(speckle, a surface finer than the fit's) is the noise that both are compared with.
+Most of the error of a set-up is absorbed by the surface and does not appear in the residuals. The
+part that no surface can absorb (`dot_response`) is the same in every frame, or changes over the
+recording if a part moves, while noise averages out. The mean residual of each ray, and its change
+over the recording, are compared with the response to each quantity (score test): a quantity is
+wrong if the cost falls by more than `LIMIT` when it is freed. The cost of the mean includes the
+covariance of the set-up, so that errors within its ± are not a contradiction; the cost of the
+change does not, as nothing should move during a recording. The part that fits no quantity (speckle,
+a surface finer than that of the fit) is the noise with which both are compared.
 
-A set-up that is far off leaves few residuals to look at: hardly a frame is measured at all.
+With a grossly wrong set-up few residuals exist, as hardly any frame can be measured.
 """
 
 from __future__ import annotations
@@ -30,51 +31,55 @@ from labapp.core.surface.spline import SplineSurface
 from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
 
 MOST = 64
-"""So many frames are kept, evenly over the recording …"""
+"""Maximum number of frames whose residuals are kept, evenly spaced over the recording."""
 
 PARTS = 3
-"""The first and the last of so many parts of a recording tell what has changed."""
+"""A recording is divided into this number of parts; changes are those from the first to the
+last."""
 
 FEWEST, FREEDOM = 6, 20
-"""… and so many, with so many degrees of freedom that no surface absorbs, make a verdict."""
+"""Minimum numbers of frames, and of degrees of freedom that no surface absorbs, for a verdict."""
 
 OFTEN = 0.5
-"""A ray counts if it has a dot in this share of the frames."""
+"""A ray is used if it has a dot in at least this share of the frames."""
 
 LIMIT = 11.0
-"""A quantity is off where the cost falls by more with it free: 3.3 standard deviations."""
+"""A quantity is wrong if the cost falls by more when it is freed: 3.3 standard deviations."""
 
 ALIKE = 6.0
-"""Quantities that the cost falls by nearly as much with explain the residuals alike."""
+"""Quantities whose reductions of the cost differ by less explain the residuals equally well."""
 
 MODEL_MM = 1e-3
-"""Standard uncertainty, root mean square over the dots on the plane, of what a set-up's pattern may
-have of spots that overlap and of shapes that no spline has."""
+"""Standard uncertainty of the response due to overlapping dots and to shapes that the splines
+cannot represent, rms over the dots on the plane."""
 
 NONLINEAR = 0.05
-"""And as a share of all that no surface absorbs: the response is linear to that share."""
+"""Standard uncertainty of the response due to nonlinearity, as a share of the unabsorbed
+residual."""
 
 LENS_CENTER = 0.25
-"""Standard uncertainty of the centre of the distortion on the plane, which is taken for the plane's
-middle, along either axis, over half of the plane's shorter side."""
+"""Standard uncertainty of the centre of the distortion along either axis, relative to half of the
+shorter side of the plane. The centre is assumed to be that of the plane."""
 
 VISIBLE_MM = 1e-3
-"""A quantity that leaves less for its assumed uncertainty raises no doubt. It is named where others
-do, and it explains the residuals as well: gross errors of it are visible, too …"""
+"""A quantity with a smaller effect for its assumed uncertainty raises no doubt. It is named if
+others raise a doubt and it explains the residuals as well, since gross errors of it are visible."""
 
 IMPLAUSIBLE = 30.0
-"""… unless it would be off by more times its assumed uncertainty."""
+"""Such a quantity is not named if its error would exceed this multiple of its assumed
+uncertainty."""
 
 UNANSWERED, FEWEST_TRIED = 0.8, 10
-"""A set-up is in doubt where a larger share of so many frames has rays that match no pool."""
+"""A set-up is doubtful if a larger share of at least this number of frames matches no pool."""
 
 AGAIN, AT_LEAST = 1.25, 1000
-"""While frames come, they are judged again at so many times as many, or at so many more."""
+"""During a recording the set-up is judged again when the number of frames has grown by this factor,
+or by this number."""
 
 NO_MATCH = frozenset({"no-match", "no-surface"})
-"""Statuses of frames that contradict a set-up. ``no-reference`` and ``ambiguous-rows`` do not: the
-right one gives them, too, where the pool lies beside the absent ray or a dot next to it is missing.
-"""
+"""Statuses of frames that contradict a set-up. ``no-reference`` and ``ambiguous-rows`` do not: they
+also occur with a correct set-up, if the pool lies beside the absent ray or a dot next to it is
+missing."""
 
 DOUBTFUL = "doubtful"
 """`Measurement.setup_status` of a set-up that its recording contradicts."""
@@ -85,22 +90,23 @@ FIXED = (
     "pattern.inter_beam_angle_deg",
     "camera_lens.",
 )
-"""Keys of what cannot change during a recording begin so."""
+"""Prefixes of the keys of quantities that cannot change during a recording."""
 
 
 @dataclass(frozen=True)
 class Suspect:
-    """A quantity whose pattern the residuals have.
+    """A quantity whose response is found in the residuals.
 
     Parameters
     ----------
     name, unit
-        What it is called (`perturbation.directions`), and what it is measured in.
+        Name of the quantity (`perturbation.directions`), and its unit.
     off, sigma
-        By how much the residuals have it off if it alone is, and the standard uncertainty of that,
-        the other quantities' ± included; of a drift, from the first to the last part.
+        Its error as estimated from the residuals if only this quantity is wrong, and the standard
+        uncertainty of the estimate, including the ± of the other quantities; for a drift, the
+        change from the first to the last part.
     rms_mm
-        What of the residuals it explains, root mean square, mm.
+        Rms of the residuals that it explains, mm.
     is_drift
         Whether it has changed during the recording.
     """
@@ -115,14 +121,14 @@ class Suspect:
 
 @dataclass(frozen=True)
 class SetupVerdict:
-    """What a recording says of its set-up.
+    """Verdict of a recording on its set-up.
 
     Parameters
     ----------
     is_doubtful
-        Whether it contradicts the set-up.
+        Whether the recording contradicts the set-up.
     reason
-        Why, or why nothing can be said, in a clause.
+        Why, or why no verdict is possible, in a clause.
     suspects
         Quantities that would explain it, the likeliest first.
     """
@@ -134,7 +140,7 @@ class SetupVerdict:
 
 @dataclass(frozen=True)
 class Residuals(ReadOnlyArrays):
-    """Residuals of the n dots of a frame, and the surface that left them.
+    """Residuals of the n dots of a frame, and the fitted surface.
 
     Parameters
     ----------
@@ -143,7 +149,7 @@ class Residuals(ReadOnlyArrays):
     residual_mm
         Computed minus captured dot, shape (n, 2), mm.
     surface
-        The fit's surface.
+        The surface of the scheme fit.
     """
 
     ray: IntArray
@@ -152,7 +158,7 @@ class Residuals(ReadOnlyArrays):
 
     @classmethod
     def of(cls, measurement: Measurement) -> Self | None:
-        """Those of a frame; None where the fit did not measure it."""
+        """Residuals of a frame; None if it was not measured by the scheme fit."""
         match, made = measurement.match, measurement.reconstruction
         if match is None or made is None or not isinstance(made.unbounded, SplineSurface):
             return None
@@ -163,12 +169,12 @@ class Residuals(ReadOnlyArrays):
 
 @dataclass
 class ResidualRecord:
-    """Residuals of a recording's frames, as many as a verdict needs.
+    """Residuals of a sample of a recording's frames, for the verdict on its set-up.
 
     Parameters
     ----------
     rig
-        The bench that the frames are measured with.
+        The rig with which the frames are measured.
     """
 
     rig: Rig
@@ -184,14 +190,14 @@ class ResidualRecord:
             self._judged = 0, doubt
 
     def add(self, measurement: Measurement, residuals: Residuals | None = None) -> None:
-        """Add the next frame, in their order.
+        """Add the next frame; frames must be added in order.
 
         Parameters
         ----------
         measurement
-            What was measured.
+            The measurement of the frame.
         residuals
-            Its residuals, where the measurement no longer has them.
+            Its residuals, if the measurement no longer contains them.
         """
         self._statuses[measurement.status] += 1
         found = residuals or Residuals.of(measurement)
@@ -206,9 +212,10 @@ class ResidualRecord:
             self._every *= 2
 
     def judged(self, measurement: Measurement, residuals: Residuals | None = None) -> Measurement:
-        """Add the next frame; returns it with what is known of the set-up by now.
+        """Add the next frame, and return its measurement with the current status of the set-up.
 
-        The newest frames weigh as much as all before: what has moved is soon seen.
+        The newest frames are weighted as much as all earlier ones, so that a movement is detected
+        early.
         """
         self.add(measurement, residuals)
         count, last = sum(self._statuses.values()), self._judged[0]
@@ -222,23 +229,23 @@ class ResidualRecord:
 
     @property
     def doubt(self) -> str:
-        """Why the set-up is doubtful, as far as it is known by now; empty if it is not."""
+        """Reason for which the set-up is currently doubtful; empty if it is not."""
         last = self._judged[1]
         return last.reason if last.is_doubtful else ""
 
     def verdict(self) -> SetupVerdict:
-        """Whether the frames contradict the set-up, and which quantity would explain it."""
+        """Judge whether the frames contradict the set-up, and which quantity would explain it."""
         return judge_setup(self.rig, self._statuses, self._samples)
 
 
 def doubt_of_values(rig: Rig) -> SetupVerdict | None:
-    """Doubt of a set-up with values that no usual bench has (`implausible_values`); or None."""
+    """Verdict on a set-up with implausible values (`implausible_values`); None if it has none."""
     unusual = implausible_values(rig)
     return SetupVerdict(True, "; ".join(unusual)) if unusual else None
 
 
 def judged_status(rig: Rig, verdict: SetupVerdict | None) -> str:
-    """How far a rig can be relied on (`pipeline.setup_status`), with what its recording says."""
+    """Status of a set-up (`pipeline.setup_status`), including the verdict of its recording."""
     is_doubtful = verdict is not None and verdict.is_doubtful
     return setup_status(rig) and (DOUBTFUL if is_doubtful else setup_status(rig))
 
@@ -248,16 +255,16 @@ def judge_setup(
 ) -> SetupVerdict:
     """Judge whether a recording contradicts its set-up, and which quantity would explain it.
 
-    Values that no usual bench has are a doubt whatever the recording says.
+    A set-up with implausible values is doubtful whatever the recording shows.
 
     Parameters
     ----------
     rig
-        The bench that the frames were measured with.
+        The rig with which the frames were measured.
     statuses
-        How many frames have each status.
+        Number of frames with each status.
     samples
-        Residuals of frames, evenly over the recording, in their order.
+        Residuals of frames, evenly spaced over the recording, in order.
     """
     if doubt := doubt_of_values(rig):
         return doubt
@@ -292,7 +299,7 @@ def judge_setup(
     pattern, uncertain = patterns.mean(axis=0), np.concatenate([patterns @ root, centers], axis=-1)
     bent = NONLINEAR * _rms(left)
     mean = _Left(left.mean(axis=0), pattern, uncertain.mean(axis=0), freedom, bent)
-    # A set-up that is off leaves something else where the pool has become another.
+    # With a wrong set-up, the unabsorbed residuals also change if the pool changes.
     drift = _Left(left[-1] - left[0], pattern, uncertain[-1] - uncertain[0], freedom, bent)
     every = directions(rig)
     moved = drift.suspects([one for one in every if not one.key.startswith(FIXED)], is_drift=True)
@@ -304,7 +311,7 @@ def judge_setup(
 
 
 def _lens_center_sigma(rig: Rig) -> float:
-    """Standard uncertainty of the distortion's centre times the distortion, mm·percent."""
+    """Standard uncertainty of the centre of the distortion times the distortion, mm·percent."""
     known, plane = rig.uncertainty, rig.imaging_plane
     assert known is not None
     sigma = float(known.sigma[INDEX["camera_lens.distortion_percent"]])
@@ -313,9 +320,9 @@ def _lens_center_sigma(rig: Rig) -> float:
 
 
 def _by_ray(samples: Sequence[Residuals], shape: tuple[int, int]) -> tuple[IntArray, FloatArray]:
-    """Rays (i, j) that often have a dot, shape (n, 2); their residuals, shape (frames, n, 2).
+    """Rays (i, j) that often have a dot, shape (n, 2), and their residuals, shape (frames, n, 2).
 
-    Where a frame lacks one, it is the mean of the others.
+    Missing residuals are replaced by the mean of those of the other frames.
     """
     every = np.full((len(samples), *shape, 2), np.nan)
     for place, one in zip(every, samples, strict=True):
@@ -328,21 +335,21 @@ def _by_ray(samples: Sequence[Residuals], shape: tuple[int, int]) -> tuple[IntAr
 
 @dataclass(frozen=True)
 class _Left(ReadOnlyArrays):
-    """What no surface could explain of m rays' residuals, X′ and Z′ in turn.
+    """Unabsorbed residuals of m rays, X′ and Z′ interleaved.
 
     Parameters
     ----------
     residual_mm
-        Their mean, or how it has changed, shape (2m,), mm.
+        Their mean, or its change, shape (2m,), mm.
     by_quantity
         Response to each of `QUANTITIES`, shape (2m, q).
     uncertain
-        Root of the covariance that the uncertainties of the set-up and of the centre of the lens's
-        distortion give it, shape (2m, q + 2).
+        Root of their covariance due to the uncertainties of the set-up and of the centre of the
+        distortion, shape (2m, q + 2).
     freedom
         Degrees of freedom.
     bent_mm
-        Standard uncertainty of the response, as it is not quite linear, root mean square, mm.
+        Standard uncertainty of the response due to its nonlinearity, rms, mm.
     """
 
     residual_mm: FloatArray
@@ -352,19 +359,19 @@ class _Left(ReadOnlyArrays):
     bent_mm: float
 
     def suspects(self, tested: Sequence[Direction], *, is_drift: bool) -> tuple[Suspect, ...]:
-        """Which of the ways that a bench may be off contradict it, the likeliest first."""
+        """Find the perturbations of the bench that explain the residuals, likeliest first."""
         left, weight = self.residual_mm, np.linalg.inv(self._covariance())
         found: list[tuple[float, Suspect]] = []
         seen = 0.0
         for one in tested:
             pattern = self.by_quantity @ one.vector
             usual = QUANTITIES[INDEX[one.key]].assumed if one.key in INDEX else 1.0
-            weighed = weight @ pattern
-            known = float(pattern @ weighed)
-            if known <= 0.0:
+            weighted = weight @ pattern
+            information = float(pattern @ weighted)
+            if information <= 0.0:
                 continue
-            # Computed with a set-up that is off by δ, residuals are as with the dots off by −δ.
-            off, sigma = -float(left @ weighed) / known, known**-0.5
+            # Residuals of a set-up with an error δ have the sign of a response to −δ.
+            off, sigma = -float(left @ weighted) / information, information**-0.5
             drop, size = (off / sigma) ** 2, _rms(pattern)
             is_visible = usual * size >= VISIBLE_MM
             seen = max(seen, drop) if is_visible else seen
@@ -377,7 +384,7 @@ class _Left(ReadOnlyArrays):
         return tuple(suspect for drop, suspect in found if drop > found[0][0] - ALIKE)
 
     def _covariance(self) -> FloatArray:
-        """Covariance of the residuals where the set-up is as it says, shape (2m, 2m), mm²."""
+        """Covariance of the residuals if the set-up is correct within its ±, (2m, 2m), mm²."""
         left, count = self.residual_mm, len(self.residual_mm)
         assumed = np.array([one.assumed for one in QUANTITIES])
         explained = np.column_stack([self.by_quantity * assumed, self.uncertain[:, -2:]])
@@ -390,16 +397,16 @@ class _Left(ReadOnlyArrays):
 
 
 def _reason(suspects: Sequence[Suspect], frames: int) -> str:
-    """Which quantities explain the residuals, in a clause: all that residuals cannot tell apart."""
+    """Name in a clause the quantities that explain the residuals equally well."""
     first = suspects[0]
     alike = [one for one in suspects if one.is_drift == first.is_drift]
-    when = "have come up during the recording" if first.is_drift else f"recur in {frames} frames"
+    when = "appeared during the recording" if first.is_drift else f"recur in {frames} frames"
     found = f"residuals of {1e3 * first.rms_mm:.0f} µm {when}"
     off = f"{first.name}, by {first.off:+.2g} ± {first.sigma:.1g} {first.unit}"
     if len(alike) == 1:
         return f"{found}; likeliest cause: {off}"
     others = "; ".join(f"{one.name}, by {one.off:+.2g} {one.unit}".rstrip() for one in alike[1:])
-    one_of = f"one of these {len(alike)} is the likeliest cause, residuals cannot tell which"
+    one_of = f"the likeliest cause is one of these {len(alike)}, which residuals cannot distinguish"
     return f"{found}; {one_of}: {off}; {others}"
 
 

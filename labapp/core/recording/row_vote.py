@@ -1,12 +1,13 @@
-"""Frames of a recording decide on the rows together.
+"""Consensus of the frames of a recording on the assignment of rows.
 
-One that is a row off the others is not answered. One that leaves open which hole is the marker's
-gets the rows of the frames before and after it, where the costs of all frames add up to speak for
-them: that of a rival must be higher over time, as the set-up is the same for all.
+A frame whose rows are shifted relative to the majority is rejected. A frame in which several holes
+can be the marker's gets the rows of the previous and the next frame if the costs summed over all
+such frames support them: as the set-up is the same for all frames, a wrong assignment must cost
+more in the long run.
 
-A pool whose rays are a row off lies a ray's spacing aside and is tilted: its surface is 50 µm from
-that of the frame before, where waves and a boundary that wanders by 2 % make 5 to 20. With its rays
-moved back by that row it is as near again as frames are to each other.
+A pool whose rays are shifted by a row is displaced by the spacing of the rays and tilted: its
+surface differs by 50 µm from that of the previous frame, whereas waves and a boundary that wanders
+by 2 % cause 5 to 20 µm. With its rays shifted back, it differs by no more than other frames do.
 """
 
 from __future__ import annotations
@@ -26,33 +27,35 @@ from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.values import CannotMeasure, FloatArray, IntArray
 
 ALIKE = 0.15
-"""Surfaces that differ by less have the same rows, a share of their root mean square height."""
+"""Surfaces that differ by less than this share of their rms height have the same rows."""
 
 NEARER = 2.0
-"""Rows have slipped if shifted labels bring the surface so many times nearer to the one before."""
+"""Rows have slipped if shifted labels reduce the difference from the previous surface by this
+factor."""
 
 DECIDES = 2.0
-"""An open frame is decided where all frames together speak for its rows, against each rival, by so
-many margins: as two that are sure do."""
+"""An open frame is decided if all frames together support its rows against each rival by this
+number of margins, which is the support of two unambiguous frames."""
 
 SLIPS = tuple(np.array(by) for by in product((0, 1, -1, 2, -2), repeat=2) if 0 in by and any(by))
-"""Rows and columns by which they may have."""
+"""Rows and columns by which rows may have slipped."""
 
 
 Placed = tuple[Reconstruction, tuple[int, int]]
-"""A surface, and by how many rows and columns its rays are off those of the first frame."""
+"""A surface, and the shift of its rays from those of the first frame, in rows and columns."""
 
 
 @dataclass
 class Ballot:
-    """What a frame says about the rows of a recording.
+    """Vote of a frame on the rows of a recording.
 
     Parameters
     ----------
     measured
-        The frame.
+        Measurement of the frame.
     at
-        Rows and columns by which its rays are off the first frame's; None without a surface.
+        Shift of its rays from those of the first frame, in rows and columns; None without a
+        surface.
     after
         The next frame with a surface; None while there is none.
     """
@@ -68,39 +71,39 @@ class Ballot:
 
 
 class RowVote:
-    """Counts how many frames of a recording agree on the rows.
+    """Count the votes of the frames of a recording on the rows.
 
     Parameters
     ----------
     rig
-        The bench.
+        The rig.
     settings
-        Of the measurement.
+        Settings of the measurement.
     """
 
     def __init__(self, rig: Rig, settings: Settings) -> None:
         self._rig, self._settings = rig, settings
         self._places = project_rays(rig.laser, rig.pattern).landing_mm[..., :2].reshape(-1, 2)
         self._votes: Counter[tuple[int, int]] = Counter()
-        """How many frames are so many rows and columns off the first."""
+        """Number of frames by the shift of their rays from the first frame, in rows and columns."""
         self._at = (0, 0)
-        """How far the frames are off the first that follow now."""
+        """Shift of the frames that are currently followed."""
         self._usual: Placed | None = None
-        """The last frame that agrees with most."""
+        """The last frame that agrees with the majority."""
         self._before: Placed | None = None
-        """The last frame that was answered."""
+        """The last frame with an accepted surface."""
         self._undecided: list[Ballot] = []
-        """Open frames since the last one with a surface that are not judged yet."""
+        """Open frames since the last one with a surface that have not been judged yet."""
         self._decided: Counter[tuple[int, int]] = Counter()
-        """How many open frames have candidates with rows so far off the first."""
+        """Number of open frames with a candidate, by its shift."""
         self._lost: dict[tuple[int, int], dict[tuple[int, int], float]] = {}
-        """How many margins these lack for a sure frame, by rows and by what step a rival is on."""
+        """Margins that these lack compared with unambiguous frames, by shift and rival's step."""
 
     def add(self, measured: Measurement, followed: bool = False) -> Ballot:
         """Count the next frame.
 
-        One that was followed from those before has their rows, and no vote of its own. One that was
-        corrected by hand has a vote, but those after it were not followed from it.
+        A followed frame has the rows of the previous one, and no vote of its own. A frame that was
+        corrected by hand has a vote, but later frames are not followed from it.
         """
         surface, at = measured.reconstruction, self._at
         if surface is None:
@@ -123,10 +126,10 @@ class RowVote:
         return Ballot(measured, at)
 
     def judged(self, ballot: Ballot) -> Measurement:
-        """Return the measurement of a frame that was added, if it stands or can be decided.
+        """Return the measurement of an added frame, decided or rejected by the vote.
 
-        Without a majority for its rows it is ``ambiguous-rows``; not if an operator gave them.
-        Frames are judged in their order.
+        Without a majority for its rows it is ``ambiguous-rows``, unless an operator has set them.
+        Frames must be judged in order.
         """
         measured, at = ballot.measured, ballot.at
         if isinstance(measured, OpenMeasurement):
@@ -140,18 +143,19 @@ class RowVote:
             self._before = measured.reconstruction, at
             return measured
         reason = f"{of - agree} of {of} frames measured by themselves have their rows elsewhere"
-        kept = replace(measured, match=None, reconstruction=None, measures=None)
-        return replace(kept, status="ambiguous-rows", reason=reason)
+        rejected = replace(measured, match=None, reconstruction=None, measures=None)
+        return replace(rejected, status="ambiguous-rows", reason=reason)
 
     def _has_majority(self, at: tuple[int, int]) -> bool:
         return 2 * self._votes[at] > self._votes.total()
 
     def _decide(self, measured: OpenMeasurement, after: Placed | None) -> Measurement:
-        """The measurement of an open frame with the rows of the frames beside it, or refused.
+        """Measure an open frame with the rows of the adjacent frames, or refuse it.
 
-        It is refused where they disagree on the rows, or are near no candidate's surface or several
-        ones'; and where all frames together do not speak for it. Where there are frames on one side
-        alone the candidate must be the likeliest: the pool may have gone on by a row.
+        It is refused if these disagree on the rows, if their surfaces are close to those of no
+        candidate or of several, and if all frames together do not support the rows. With an
+        adjacent frame on one side only, the candidate must be the likeliest one, as the pool may
+        have moved by a row.
         """
         beside = [one for one in (self._before, after) if one is not None]
         places = {at for _, at in beside}
@@ -180,7 +184,7 @@ class RowVote:
         return made
 
     def _alike(self, candidates: tuple[Candidate, ...], beside: list[Reconstruction]) -> int | None:
-        """Index of the candidate whose surface alone is near all of these; None without one."""
+        """Index of the one candidate whose surface is close to all of these; None without one."""
         made = [self._heights_of(each.match) for each in candidates]
         found: set[int | None] = set()
         for one in beside:
@@ -192,7 +196,7 @@ class RowVote:
         return found.pop() if len(found) == 1 else None
 
     def _heights_of(self, match: Match | None) -> FloatArray | None:
-        """Heights with a match's rays; None where no surface has them."""
+        """Heights of the surface fitted to a match; None if there is none."""
         if match is None:
             return None
         try:
@@ -201,7 +205,7 @@ class RowVote:
             return None
 
     def _slip(self, measured: Measurement, usual: Reconstruction) -> IntArray:
-        """Rows and columns by which a frame's rays are off those of another."""
+        """Shift of a frame's rays relative to those of another, in rows and columns."""
         assert measured.match is not None
         assert measured.reconstruction is not None
         heights = self._heights(usual)
@@ -220,12 +224,12 @@ class RowVote:
         return slip
 
     def _heights(self, surface: Reconstruction) -> FloatArray:
-        """Height where each ray would land, 0 outside the pool, mm."""
+        """Heights at the landing points of the rays, 0 outside the pool, mm."""
         return np.nan_to_num(surface.surface.height(*self._places.T))
 
 
 def _moved(match: Match, by: IntArray) -> Match:
-    """Match the dots with the rays so many rows and columns on."""
+    """Shift the rays of a match by rows and columns."""
     size = np.array(match.witness.shape)
     ray = match.ray + by
     on = ((ray >= 1) & (ray <= size)).all(axis=-1)

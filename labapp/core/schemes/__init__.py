@@ -1,7 +1,7 @@
-"""The ways from matched dots to a surface, of one signature: here is their list.
+"""Registry of the reconstruction schemes, which compute a surface from matched dots.
 
-A scheme is a file of this folder and an entry of `SCHEMES`; whoever offers, runs, names or draws
-schemes reads them from here. Nothing is imported that computes: the command line lists them, too.
+A scheme is a module of this package and an entry of `SCHEMES`, which is the only list of schemes.
+The modules are imported on first use, so that the command line can list schemes quickly.
 """
 
 from __future__ import annotations
@@ -18,32 +18,33 @@ if TYPE_CHECKING:
 
 
 class Words(NamedTuple):
-    """What people call a scheme: in a line with others, and in a list to choose from."""
+    """Display names of a scheme: a short one, and a long one for lists of choices."""
 
     short: str
     long: str
 
     @property
     def title(self) -> str:
-        """The long words without what is explained after a colon."""
+        """The long name up to the first colon."""
         return self.long.partition(":")[0]
 
 
 @dataclass(frozen=True)
 class Scheme:
-    """A way from matched dots to a surface.
+    """A reconstruction scheme.
 
     Parameters
     ----------
     name
-        What it is chosen and kept by, without a hyphen; its module in this folder and its own
-        settings in `pipeline.Settings` are called so, too.
+        Identifier for options and stored results, without a hyphen; also the name of its module and
+        of its settings in `pipeline.Settings`.
     about
-        What it is, for the help of the command line.
+        Description for the help of the command line.
     words
-        What people call it; where it has algorithms, each with its own.
+        Display names; for a scheme with several algorithms, those of each algorithm.
     settings
-        Class of its settings, in its module; in session files for ever. Empty: it has none.
+        Name of the class of its settings, in its module; stored in session files, so it must never
+        change. Empty: it has none.
     """
 
     name: str
@@ -53,24 +54,24 @@ class Scheme:
 
     @property
     def algorithms(self) -> tuple[str, ...]:
-        """Names of its algorithms; empty where it has but one."""
+        """Names of its algorithms; empty if it has only one."""
         return () if isinstance(self.words, Words) else tuple(self.words)
 
     @property
     def settings_class(self) -> Any:
-        """The class of its settings, which it must have."""
+        """Class of its settings; the scheme must have some."""
         return getattr(self._module, self.settings)
 
     def reconstruct(self, match: Match, rig: Rig, settings: Any) -> Reconstruction:
-        """Reconstruct the pool surface from matched dots, by its settings; None: it has none.
+        """Reconstruct the pool surface from matched dots; settings are None if it has none.
 
         Raises
         ------
         CannotMeasure
-            If it finds no surface.
+            If no surface is found.
         """
-        found: Reconstruction = self._module.reconstruct(match, rig, settings)
-        return found
+        reconstruction: Reconstruction = self._module.reconstruct(match, rig, settings)
+        return reconstruction
 
     @property
     def _module(self) -> Any:
@@ -111,7 +112,7 @@ SCHEMES: dict[str, Scheme] = {
 
 
 def scheme_words() -> dict[str, Words]:
-    """Words for every scheme with each of its algorithms, by the name results are kept under."""
+    """Display names of every scheme and algorithm, by the name under which results are stored."""
     found: dict[str, Words] = {}
     for name, scheme in SCHEMES.items():
         if isinstance(scheme.words, Words):

@@ -28,7 +28,7 @@ class ErsSettings:
     Parameters
     ----------
     loops
-        How many loops at most; they end when the reflection points have settled.
+        Maximum number of loops; they end when the reflection points have converged.
     boundary
         Boundary model: ``piecewise`` (§6.3.2) or ``circle`` (§8.2.1).
     """

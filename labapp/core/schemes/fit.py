@@ -1,4 +1,4 @@
-"""The fit, our own scheme and the default: surface, boundary and their uncertainty (`pool_fit`)."""
+"""Scheme fit, the default: surface, boundary and their uncertainty (`pool_fit`)."""
 
 from __future__ import annotations
 
@@ -20,58 +20,58 @@ from labapp.core.surface.spline import SplineSurface
 from labapp.core.values import CannotMeasure, FloatArray, ReadOnlyArrays
 
 LEAST_DOTS = 9
-"""A surface from fewer reflections is a guess."""
+"""Minimum number of reflections for a surface."""
 
 UNSETTLED_MM = 0.02
-"""A reflection point that still moves as far in the last round has not been found."""
+"""The fit has not converged if a reflection point still moves by this in the last round."""
 
 
 CHANGED = 0.1
-"""The set-up's part of the uncertainty is worked out anew where a size differs by this share from
-those that it was worked out for."""
+"""The set-up's part of the uncertainty is recomputed if a size differs by more than this share from
+those for which it was computed."""
 
 
 @dataclass(frozen=True)
 class SetupPart(ReadOnlyArrays):
-    """The set-up's part of the uncertainty of sizes, and the sizes that it was worked out for.
+    """The set-up's part of the uncertainty of sizes, and the sizes for which it was computed.
 
     Parameters
     ----------
     sigma
-        Of each of `measures.WITH_SIGMA`, shape (9,).
+        Standard uncertainty of each of `measures.WITH_SIGMA`, shape (9,).
     sizes
-        Shape (6,), mm, mm², mm³.
+        The sizes, shape (6,), mm, mm², mm³.
     """
 
     sigma: FloatArray
     sizes: FloatArray
 
     def change_to(self, sizes: FloatArray) -> float:
-        """Largest change of a size, shape (6,), as a share of it; depth as a share of height."""
+        """Largest relative change of a size, shape (6,); height and depth have a common scale."""
         scale = np.abs(self.sizes)
         scale[2:4] = scale[2:4].max()
         return float(np.max(np.abs(sizes - self.sizes) / scale))
 
 
 def nearest_part(parts: tuple[SetupPart, ...], sizes: FloatArray) -> SetupPart | None:
-    """The part of the nearest sizes, shape (6,); None where all are farther than `CHANGED`."""
+    """The part with the nearest sizes, shape (6,); None if all differ by more than `CHANGED`."""
     nearest = min(parts, key=lambda part: part.change_to(sizes), default=None)
     return nearest if nearest and nearest.change_to(sizes) <= CHANGED else None
 
 
 @dataclass(frozen=True)
 class Known:
-    """What is known of a pool from the frame before.
+    """Quantities known from the previous frame.
 
     Parameters
     ----------
     boundary
-        Where it ended.
+        Its boundary.
     free_sigma_mm
-        Uncertainty of the height of the n reflection points, their level apart, shape (n,), mm;
-        None: to be worked out.
+        Uncertainty of the height of the n reflection points without the part of the level, shape
+        (n,), mm; None: it must be computed.
     by_setup
-        The set-up's part of the uncertainty, as it was worked out for some sizes before.
+        The set-up's part of the uncertainty, as computed earlier for some sizes.
     """
 
     boundary: Boundary
@@ -80,7 +80,7 @@ class Known:
 
 
 def reconstruct(match: Match, rig: Rig, settings: FitSettings) -> Reconstruction:
-    """Fit one smooth surface to all reflections (`fit_pool`), and follow it to its boundary.
+    """Fit one smooth surface to all reflections (`fit_pool`), and trace its boundary.
 
     Raises
     ------
@@ -93,13 +93,13 @@ def reconstruct(match: Match, rig: Rig, settings: FitSettings) -> Reconstruction
 def solve(
     match: Match, rig: Rig, settings: FitSettings, initial: SplineSurface | None = None
 ) -> FittedPool:
-    """Fit the surface (`fit_pool`), beginning with an initial one where there is one.
+    """Fit the surface (`fit_pool`), starting from an initial one if given.
 
     Raises
     ------
     CannotMeasure
-        ``too-few-dots`` for fewer than nine matched dots; ``no-surface`` if the rays cannot be
-        met with a surface; ``open-boundary`` if no ray tells where it ends.
+        ``too-few-dots`` for fewer than nine matched dots; ``no-surface`` if no surface fits the
+        dots; ``open-boundary`` if no dark ray constrains the boundary.
     """
     if len(match.ray) < LEAST_DOTS:
         raise CannotMeasure(
@@ -117,7 +117,7 @@ def solve(
 def complete(
     match: Match, pool: FittedPool, rig: Rig, settings: FitSettings, known: Known | None = None
 ) -> tuple[Reconstruction, measures.Measures]:
-    """Boundary and sizes of a fitted surface, and all their uncertainties.
+    """Compute the boundary, the sizes and all uncertainties of a fitted surface.
 
     Raises
     ------

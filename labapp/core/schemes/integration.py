@@ -1,9 +1,9 @@
-"""What zonal and modal integration share: a slope field → heights, loop by loop.
+"""Common part of zonal and modal integration: iterative integration of a slope field.
 
-Both take the slopes that the reflections ask for, fit heights to all of them at once by least
-squares, and move the reflection points along their rays to these heights, until nothing changes.
-Slopes leave the height of the whole open: it is such that the surface, continued by the slope of
-the nearest point, is level with the work piece at the boundary in the mean.
+Both determine the slopes from the reflections, fit heights to all of them by least squares, and
+move the reflection points along their rays to these heights, until nothing changes. As slopes leave
+a constant height undetermined, it is chosen such that the mean height at the boundary, extrapolated
+by the slope of the nearest point, is that of the work piece.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from labapp.core.surface.reconstruction import Reconstruction
 from labapp.core.values import CannotMeasure, FloatArray
 
 Integrate = Callable[[ReflectedRays, FloatArray, FloatArray], FloatArray]
-"""Rays, their points' (x, y), shape (n, 2), mm, and gradients there, shape (n, 2) → heights but for
-a constant, shape (n,), mm."""
+"""Function of the rays, their points' (x, y), shape (n, 2), mm, and the gradients there, shape
+(n, 2), that returns heights up to a constant, shape (n,), mm."""
 
 
 def reconstruct_by(
@@ -61,7 +61,7 @@ def reconstruct_by(
 def _height_at_boundary(
     place: FloatArray, z: FloatArray, gradient: FloatArray, boundary: Boundary
 ) -> float:
-    """Mean height at the boundary by the slope of the point nearest to each of its points."""
+    """Mean height at the boundary, extrapolated by the slope of the nearest reflection point."""
     edge = boundary.points_mm[:, :2]
     near = scipy.spatial.cKDTree(place).query(edge)[1]
     return float(np.mean(z[near] + np.sum(gradient[near] * (edge - place[near]), axis=-1)))

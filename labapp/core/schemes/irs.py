@@ -30,7 +30,8 @@ Algorithm = Literal["opa", "epa-r", "epa-c", "epa-rc"]
 """One-point algorithm; edge-points algorithm with row slopes, column slopes or both."""
 
 Move = Callable[[FloatArray, FloatArray], FloatArray]
-"""Step 2: normals and distances before, to distances of the slope-oriented points."""
+"""Step 2: function of the normals and previous distances that returns the distances of the
+slope-oriented points."""
 
 
 @dataclass(frozen=True)
@@ -42,12 +43,12 @@ class IrsSettings:
     algorithm
         ``opa``, ``epa-r``, ``epa-c`` or ``epa-rc``.
     loops
-        How many loops at most; they end when the reflection points have settled.
+        Maximum number of loops; they end when the reflection points have converged.
     base_heights_mm
         Heights of the base point that the one-point algorithm tries, mm.
     are_margin
-        Heights whose ARE is within this share of the least explain the dots equally well, and
-        the one nearest z = 0 is taken of them; 0 takes the least ARE whatever it is worth.
+        Heights whose ARE exceeds the smallest by no more than this share explain the dots equally
+        well, and the one nearest z = 0 is chosen; with 0 the smallest ARE is chosen.
     boundary
         Boundary model: ``piecewise`` (§6.3.2) or ``circle`` (§8.2.1).
     """
@@ -80,7 +81,7 @@ def reconstruct(match: Match, rig: Rig, settings: IrsSettings | None = None) -> 
 def estimates(
     match: Match, rig: Rig, rays: ReflectedRays, settings: IrsSettings
 ) -> list[tuple[float, Estimate]]:
-    """The best estimate for every height of the base point, mm, that has one (Fig. 6-13).
+    """Best estimates for all heights of the base point, mm, that have one (Fig. 6-13).
 
     The edge-points algorithm has one base height, 0.
     """
@@ -88,17 +89,17 @@ def estimates(
         moves = _one_point(match, rays, settings.base_heights_mm)
     else:
         moves = [(0.0, _edge_points(rays, settings.algorithm))]
-    made = (
+    found = (
         (height, best_of_loops(match, rig, rays, move, CloughTocherSurface, settings.loops))
         for height, move in moves
     )
-    return [(height, estimate) for height, estimate in made if estimate is not None]
+    return [(height, estimate) for height, estimate in found if estimate is not None]
 
 
 def lower_left(match: Match) -> int:
-    """Index of the dot in the lower left corner of the image, the base point's (§6.4.2).
+    """Index of the dot in the lower left corner of the image, that of the base point (§6.4.2).
 
-    The leftmost dot of the lowest reflected row; where no dot has a reflected row, of the row of
+    The leftmost dot of the lowest reflected row; if no dot has a reflected row, that of the row of
     rays that lies lowest on the imaging plane.
     """
     row = match.reflected[:, 0]
@@ -111,7 +112,7 @@ def lower_left(match: Match) -> int:
 
 
 def _best(found: list[tuple[float, Estimate]], are_margin: float) -> Estimate:
-    """Of (base height, estimate), the one of least ARE; of equals the one nearest z = 0."""
+    """Select the estimate of least ARE; among equivalent ones that with a base nearest z = 0."""
     if not found:
         raise CannotMeasure("no-surface", "the reflection points diverge from the first loop on")
     least = min(estimate.are_mm for _, estimate in found)
@@ -122,7 +123,7 @@ def _best(found: list[tuple[float, Estimate]], are_margin: float) -> Estimate:
 def _one_point(
     match: Match, rays: ReflectedRays, heights_mm: tuple[float, ...]
 ) -> list[tuple[float, Move]]:
-    """One-point algorithm: all points from one, whose height is tried (Fig. 6-6)."""
+    """One-point algorithm: all points are reached from one, for several heights (Fig. 6-6)."""
     paths = Paths.along(parents_from(rays.ray, lower_left(match)), rays.direction)
 
     def move_from(height_mm: float) -> Move:
@@ -133,13 +134,13 @@ def _one_point(
 
 
 def _edge_points(rays: ReflectedRays, algorithm: Algorithm) -> Move:
-    """Edge-points algorithm: all points from the ends of their row or column (Fig. 6-5)."""
+    """Edge-points algorithm: points are reached from the ends of their row or column (Fig. 6-5)."""
     rows, columns = lines(rays.ray, axis=0), lines(rays.ray, axis=1)
     row_paths, column_paths = _both_ways(rows, rays), _both_ways(columns, rays)
     edge = _ends(rows, len(rays.ray))
 
     def move(normals: FloatArray, before: FloatArray) -> FloatArray:
-        # `before` is z = 0 in the first loop, and the loop before's positions from then on.
+        # `before` is z = 0 in the first loop, and the positions of the previous loop later.
         by_rows = _mean(row_paths, normals, before)
         if algorithm == "epa-r":
             return by_rows
@@ -150,7 +151,7 @@ def _edge_points(rays: ReflectedRays, algorithm: Algorithm) -> Move:
 
 
 def _both_ways(chains: list[IntArray], rays: ReflectedRays) -> tuple[Paths, Paths]:
-    """Paths that follow each chain from its one end and from its other."""
+    """Paths along each chain from either end."""
     reverse = [chain[::-1] for chain in chains]
     return (
         Paths.along(parents_along(chains), rays.direction),
@@ -159,12 +160,12 @@ def _both_ways(chains: list[IntArray], rays: ReflectedRays) -> tuple[Paths, Path
 
 
 def _mean(paths: tuple[Paths, Paths], normals: FloatArray, base: FloatArray) -> FloatArray:
-    """Average of the two positions that the two base points of a chain give."""
+    """Mean of the two positions that follow from the two base points of a chain."""
     return (paths[0].follow(normals, base) + paths[1].follow(normals, base)) / 2
 
 
 def _ends(rows: list[IntArray], count: int) -> BoolArray:
-    """Which points are edge points: the first and the last of each row."""
+    """Mask of the edge points: the first and the last of each row."""
     edge = np.zeros(count, bool)
     for row in rows:
         edge[row[[0, -1]]] = True

@@ -1,8 +1,9 @@
-"""Modal integration of slopes: polynomials over the pool whose gradients fit them best.
+"""Modal integration of slopes: least-squares fit of the gradients of polynomials to the slopes.
 
-As wave-front sensors do it with Zernike polynomials (Southwell 1980; R. J. Noll, J. Opt. Soc. Am.
-66, 207–211, 1976). Those up to a radial order span the polynomials of that degree, so any other
-basis of them gives the same fit; products of Chebyshev polynomials are used here.
+The method is that of wave-front sensors with Zernike polynomials (Southwell 1980; R. J. Noll, J.
+Opt. Soc. Am. 66, 207–211, 1976). The Zernike polynomials up to a radial order span all polynomials
+of that degree, so that any other basis gives the same fit; products of Chebyshev polynomials are
+used here.
 """
 
 from __future__ import annotations
@@ -28,10 +29,10 @@ class ModalSettings:
     Parameters
     ----------
     order
-        Radial order of the highest Zernike polynomials; with few points a lower one, so that there
+        Highest radial order of the Zernike polynomials. It is reduced for few points, so that there
         are at least three slopes for each polynomial.
     loops
-        How many loops at most; they end when the reflection points have settled.
+        Maximum number of loops; they end when the reflection points have converged.
     boundary
         Boundary model: ``piecewise`` (§6.3.2) or ``circle`` (§8.2.1).
     """
@@ -52,7 +53,7 @@ def reconstruct(match: Match, rig: Rig, settings: ModalSettings | None = None) -
 
 
 def heights(place: FloatArray, gradient: FloatArray, order: int) -> FloatArray:
-    """Heights of the polynomial whose gradients fit best, but for a constant, shape (n,), mm.
+    """Heights of the best-fitting polynomial up to a constant, shape (n,), mm.
 
     Parameters
     ----------
@@ -79,11 +80,11 @@ def heights(place: FloatArray, gradient: FloatArray, order: int) -> FloatArray:
 
 
 def _terms(order: int) -> int:
-    """How many polynomials there are up to an order, the constant apart."""
+    """Number of polynomials up to an order, without the constant."""
     return (order + 1) * (order + 2) // 2 - 1
 
 
 def _slopes(at: FloatArray, order: int) -> FloatArray:
-    """Derivatives of the Chebyshev polynomials T₀ … at places, shape (n, order + 1)."""
+    """Derivatives of the Chebyshev polynomials T₀ … T_order, shape (n, order + 1)."""
     derived = [chebyshev.chebval(at, chebyshev.chebder(one)) for one in np.eye(order + 1)]
     return np.stack(derived, axis=-1)

@@ -1,15 +1,15 @@
 """Slope field and slope-oriented points: steps 1 and 2 of IRS and ERS, and their loop (§6.3.1).
 
-A reflection point lies on its ray, so its distance from the laser says where it is. Going from
-one point to the next happens in the plane through the laser and both points: the row plane
+A reflection point lies on its ray, so that it is given by its distance from the laser. A step from
+one point to the next takes place in the plane through the laser and both points: the row plane
 within a row, the column plane within a column. There the line of slope S through P_a meets the
-ray of P_b at a distance that is a *multiple* of P_a's own::
+ray of P_b at a distance that is a *multiple* of that of P_a::
 
     s_b = s_a · (d_a,m − S·d_a,h) / (d_b,m − S·d_b,h)
 
 with d the ray's direction along the plane's horizontal axis h and its upward axis m. A chain of
-steps is therefore a sum of logarithms, and every point's distance follows from its base point's
-by one product with a matrix that says which steps lead to it.
+steps is therefore a sum of logarithms, and the distances of all points follow from those of their
+base points by one product with a matrix that indicates which steps lead to which point.
 """
 
 from __future__ import annotations
@@ -38,24 +38,24 @@ from labapp.core.values import CannotMeasure, FloatArray, IntArray, ReadOnlyArra
 
 FEWEST_DOTS = 9
 FEWEST_ROWS = 3
-"""Less than this says nothing of a surface along the pool."""
+"""Minimum numbers of dots and of rows for a surface."""
 
 SETTLED_MM = 1e-5
 """The loops end when no reflection point moves farther than this."""
 
 PATIENCE = 10
-"""They also end when the ARE has not become less for this many loops.
+"""The loops also end when the ARE has not decreased for this many loops.
 
-Where the slope changes its sign, Eq. 6-1 rises a little too far from either side, so that the
-edge points of the edge-points algorithm boundary_slope from loop to loop and never settle.
+Where the slope changes its sign, Eq. 6-1 rises slightly too far from either side, so that the edge
+points of the edge-points algorithm climb from loop to loop and never converge.
 """
 
 
 @dataclass(frozen=True)
 class ReflectedRays(ReadOnlyArrays):
-    """The rays that came back, with what came back of them; n of them.
+    """The n rays that came back, and their reflected dots.
 
-    The absent centre reference is the last one where its dot can be stood in for (§6.3.1).
+    The absent centre reference is the last one if a substitute for its dot exists (§6.3.1).
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ class ReflectedRays(ReadOnlyArrays):
     imaging_plane
         The imaging plane.
     measured
-        How many of them, the first ones, are dots of the match.
+        Number of rays, the first ones, whose dots are those of the match.
     """
 
     laser_mm: FloatArray
@@ -89,12 +89,12 @@ class ReflectedRays(ReadOnlyArrays):
         return np.asarray((z_mm - self.laser_mm[2]) / self.direction[:, 2])
 
     def normals(self, distance_mm: FloatArray) -> FloatArray:
-        """Normals (3-D slopes) the reflection law asks for at those points, shape (n, 3)."""
+        """Normals (3-D slopes) at those points by the law of reflection, shape (n, 3)."""
         reflected = direction_to_dots(self.points(distance_mm), self.plane_mm, self.imaging_plane)
         return surface_normal(bisecting_gradient(self.direction, reflected))
 
     def reflected(self, point_mm: FloatArray, gradient: FloatArray) -> FloatArray:
-        """Dots that points of that gradient would make, IPCS, shape (n, 2), mm (step 4)."""
+        """Computed dots for points and gradients, IPCS, shape (n, 2), mm (step 4)."""
         return intersect_imaging_plane(
             point_mm, reflect(self.direction, surface_normal(gradient)), self.imaging_plane
         )
@@ -102,7 +102,7 @@ class ReflectedRays(ReadOnlyArrays):
     def residual(self, surface: Surface, boundary: Boundary) -> FloatArray:
         """Computed minus captured dots of the measured rays, shape (measured, 2), mm.
 
-        Each ray is met with the surface; NaN where it does not meet it within the boundary.
+        Each ray is intersected with the surface; NaN if it misses it within the boundary.
         """
         points = intersect(surface, self.laser_mm, self.direction)
         points[~boundary.contains(points[:, 0], points[:, 1])] = np.nan
@@ -111,10 +111,10 @@ class ReflectedRays(ReadOnlyArrays):
 
 
 def reflected_rays(match: Match, rig: Rig) -> ReflectedRays:
-    """Collect the matched rays, the absent centre's among them.
+    """Collect the matched rays, including the absent centre reference.
 
-    The centre reference has no dot; where both its neighbours in the row have one, the mean of
-    theirs is taken for it, "considering the continuity of the rows" (§6.3.1).
+    The centre reference has no dot; if both its neighbours in the row have one, the mean of these
+    is used for it, "considering the continuity of the rows" (§6.3.1).
 
     Raises
     ------
@@ -153,9 +153,9 @@ class Paths(ReadOnlyArrays):
     Parameters
     ----------
     base
-        Base point each point is reached from, shape (n,).
+        Base point of each point, shape (n,).
     start, end
-        The points every step leads from and to, shape (s,).
+        Start and end point of each step, shape (s,).
     horizontal, upward
         Axes of each step's plane through the laser and both points, shape (s, 3).
     start_components, end_components
@@ -201,14 +201,14 @@ class Paths(ReadOnlyArrays):
         )
 
     def follow(self, normal: FloatArray, base_distance_mm: FloatArray) -> FloatArray:
-        """Distance of every slope-oriented point from the laser (step 2).
+        """Distances of all slope-oriented points from the laser (step 2).
 
         Parameters
         ----------
         normal
             Normals of the slope field, shape (n, 3).
         base_distance_mm
-            Distance of the base points, shape (n,), read at `base` only, mm.
+            Distances of the points, shape (n,), of which only those of `base` are used, mm.
 
         Returns
         -------
@@ -218,8 +218,8 @@ class Paths(ReadOnlyArrays):
         slope_a = -_dot(normal[self.start], self.horizontal) / _dot(normal[self.start], self.upward)
         slope_b = -_dot(normal[self.end], self.horizontal) / _dot(normal[self.end], self.upward)
         mean = (slope_a + slope_b) / 2
-        # Points are left open by SETTLED_MM, slopes by what they change over that way. One that is
-        # less is nothing, and has no sign to lend: the mean keeps its own.
+        # Points are known to SETTLED_MM, slopes to their change over that distance. A smaller slope
+        # is zero within its error and has no sign: the mean then keeps its own sign.
         way = base_distance_mm[self.base[self.end]] * self.apart
         has_sign = np.abs(slope_a) > SETTLED_MM / way * np.abs(slope_b - slope_a)
         slope = np.where(has_sign, np.sign(slope_a) * np.abs(mean), mean)  # Eq. 6-1, 7-1
@@ -232,7 +232,7 @@ class Paths(ReadOnlyArrays):
 
 
 def _steps_to(parent: IntArray, end: IntArray) -> tuple[IntArray, FloatArray]:
-    """Base point of each point, and which steps lead to it: shapes (n,) and (n, s)."""
+    """Base point of each point, and mask of the steps that lead to it: shapes (n,) and (n, s)."""
     number = np.full(len(parent), -1)
     number[end] = np.arange(len(end))
     base = np.arange(len(parent))
@@ -257,7 +257,7 @@ def _components(vector: FloatArray, horizontal: FloatArray, upward: FloatArray) 
 def lines(ray: IntArray, axis: int) -> list[IntArray]:
     """Indices of the rays in every row (axis 0) or column (axis 1), each in ascending order.
 
-    A line may have gaps: its next ray is the next one that is there.
+    A line may have gaps, which are skipped.
     """
     return [
         members[np.argsort(ray[members, 1 - axis])]
@@ -310,7 +310,7 @@ def _spread(parent: IntArray, row: IntArray, start: int) -> None:
 
 
 def _crossing(ray: IntArray, before: IntArray, row: IntArray, middle: int) -> tuple[int, int]:
-    """Where to go from one row to the next: a point of each."""
+    """Start and end point of the step from one row to the next."""
     apart = np.abs(ray[before, 1][:, None] - ray[row, 1])
     off_middle = np.abs(ray[row, 1] - middle)
     # The nearest columns first (the same one if there is any), then the nearest to the middle.
@@ -320,10 +320,9 @@ def _crossing(ray: IntArray, before: IntArray, row: IntArray, middle: int) -> tu
 
 @dataclass(frozen=True)
 class Estimate:
-    """What one loop gives: points, the surface through them and how it explains the dots.
+    """Result of one loop: points, shape (n, 3), the surface through them, and its ARE.
 
-    ``points_mm`` has shape (n, 3); ``are_mm``, Eq. 6-3, leaves out the centre reference, which is
-    no actual dot.
+    ``are_mm``, Eq. 6-3, excludes the centre reference, which is not an actual dot.
     """
 
     points_mm: FloatArray
@@ -339,23 +338,24 @@ def best_of_loops(
     surface_through: Callable[[FloatArray], SurfaceThroughPoints],
     loops: int,
 ) -> Estimate | None:
-    """Repeat steps 1 to 4 from the flat work piece and keep the estimate of least ARE.
+    """Repeat steps 1 to 4 from the flat work piece, and return the estimate of least ARE.
 
-    The surface passes through points that lie on the rays, so that these points are where the
-    rays meet it in the next loop's step 1.
+    The surface passes through points on the rays, which therefore are the intersections of step 1
+    of the next loop.
 
     Parameters
     ----------
     match, rig
-        What is to be explained.
+        Matched dots, and the rig.
     rays
-        What `reflected_rays` made of them.
+        Result of `reflected_rays` for these.
     move
-        Step 2: (normals, shape (n, 3), and distances before, shape (n,)) to distances, shape (n,).
+        Step 2: function of the normals, shape (n, 3), and the previous distances, shape (n,), that
+        returns the distances, shape (n,).
     surface_through
-        Step 3: the surface through points, shape (n, 3).
+        Step 3: function of points, shape (n, 3), that returns the surface through them.
     loops
-        How many at most, see `SETTLED_MM` and `PATIENCE`.
+        Maximum number of loops, see `SETTLED_MM` and `PATIENCE`.
 
     Returns
     -------
@@ -386,7 +386,7 @@ def best_of_loops(
 def reconstruction_within(
     scheme: str, match: Match, rays: ReflectedRays, best: Estimate, boundary: Boundary
 ) -> Reconstruction:
-    """The reconstruction with the surface through an estimate's points and the boundary (step 5).
+    """Reconstruct the surface through the points of an estimate and the boundary (step 5).
 
     Raises
     ------

@@ -1,9 +1,9 @@
-"""Zonal integration of slopes (Southwell 1980), on the rays' own grid.
+"""Zonal integration of slopes (Southwell 1980) on the grid of the rays.
 
 W. H. Southwell, Wave-front estimation from wave-front slope measurements, J. Opt. Soc. Am. 70,
-998–1006 (1980): between neighbours the height changes by the mean of their slopes, and of all these
-changes together the heights are the least-squares solution. His geometry is a square grid; here the
-neighbours lie where the rays meet the surface.
+998–1006 (1980): the difference in height of neighbours follows from the mean of their slopes, and
+the heights are the least-squares solution for all differences. The original geometry is a square
+grid; here the points lie where the rays meet the surface.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class ZonalSettings:
     Parameters
     ----------
     loops
-        How many loops at most; they end when the reflection points have settled.
+        Maximum number of loops; they end when the reflection points have converged.
     boundary
         Boundary model: ``piecewise`` (§6.3.2) or ``circle`` (§8.2.1).
     """
@@ -44,9 +44,9 @@ def reconstruct(match: Match, rig: Rig, settings: ZonalSettings | None = None) -
 
 
 def heights(rays: ReflectedRays, place: FloatArray, gradient: FloatArray) -> FloatArray:
-    """Heights but for a constant; see `integration.Integrate`.
+    """Heights up to a constant; see `integration.Integrate`.
 
-    Points that no neighbours join to the others have the height of least norm, 0.
+    Points that are not connected to others by neighbours get the minimum-norm height, 0.
     """
     chains = [*lines(rays.ray, axis=0), *lines(rays.ray, axis=1)]
     start, end = np.concatenate([np.stack([one[:-1], one[1:]]) for one in chains], axis=1)

@@ -1,1 +1,1 @@
-"""Frames that follow each other: each measured from the one before."""
+"""Sequences of frames: tracking from frame to frame, and means over frames."""

@@ -1,12 +1,12 @@
-"""Which ray made which dot, where the frames before predict where dots should be.
+"""Correspondence of rays and dots by prediction from the previous frames.
 
-The surface is extrapolated from its oscillation (`prior.predictions`). Where that does not find the
-dots, as at the start, they are followed from the absent one outwards, ring by ring. The dots found
-have their rays; others beside them get theirs from the surface fitted to these. An answer is given
-only where the absent ray's place is dark amid lit ones, and where no more is left unexplained than
-without a prior.
+The surface is extrapolated from its oscillation (`prior.predictions`). If no prediction finds the
+dots, as at the start, they are tracked from the absent one outwards, ring by ring. The tracked dots
+keep their rays; dots next to them get theirs from the surface fitted to the tracked ones. The
+result is accepted only if the absent ray is dark between lit ones, and if no more is left
+unexplained than would be accepted without a prior.
 
-Contract of `correspondence`: a dot that is not sure of its ray gets none.
+As in `correspondence`, a dot whose ray is ambiguous gets none.
 """
 
 from __future__ import annotations
@@ -36,51 +36,50 @@ from labapp.core.surface.solver import Rounds
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, median
 
 FOUND = 0.85
-"""Share of the dots of the frame before that must be found again."""
+"""Minimum share of the previous frame's dots that must be found again."""
 
 STEADY = 0.2
-"""… and half of them within this share of the way to the next dot of where they were predicted."""
+"""Maximum median distance of these from their predictions, in spacings of the predicted dots."""
 
 FIRST_RING, GROWING_ROUNDS, GROWN_FROM = 2, 3, 12
-"""Where no prediction finds the dots, they are first looked for so near the absent one, in so many
-rounds a ring, from so many surfaces of the past."""
+"""If no prediction finds the dots: number of rings around the absent one in which they are searched
+first, rounds of the fit per ring, and number of past surfaces that are tried."""
 
 GATE, CLEARLY = 0.35, 2.0
-"""A dot is a tracked ray's within this share of the way to the next predicted dot, if no other dot
-is, and no other ray within so many times its distance."""
+"""A dot belongs to a tracked ray if it is the only one within `GATE` spacings of its prediction,
+and if every other prediction is farther from it by the factor `CLEARLY`."""
 
 RIVALS = 3
-"""So many of the nearest rays contend for a dot, and so many other dots for a ray: the next ones
-are farther off by a row or a column."""
+"""Number of nearest rays that are candidates for a dot, and of other dots that are candidates for a
+ray: the next ones are farther away by a row or a column."""
 
 ASTRAY = 0.25
-"""A dot that far from its fitted place, in shares of the way to the next, is not its ray's."""
+"""A label with a larger residual, in spacings of the computed dots, may be removed."""
 
 WORSE = 2.0
-"""The residual is at most so many times that of the frame that was matched without a prior."""
+"""Maximum ratio of the residual to that of the frame that was matched without a prior."""
 
 HELD = 8
-"""For so many frames the datum is carried on while a dot beside the absent one is not seen."""
+"""Maximum number of frames through which the datum is carried while not all neighbours of the
+absent ray are lit."""
 
 PREDICTED = 0.1
-"""So near half of the dots must be to where they were predicted, of the way to the next one, for
-the datum to be carried on: a pool that has gone on by a row lights other rays, and all of them
-fit."""
+"""Maximum median distance of the dots from their predictions, in spacings, for the datum to be
+carried: if the pool has moved by a row, other rays are lit, and all of them fit."""
 
 ROUGHLY_MM = 0.03
-"""Where no reflection point moved by more, what is left to move does not change which dots have
-which rays."""
+"""When no reflection point moves by more, further rounds do not change the labels."""
 
 WIDENINGS, MANY = 3, 4
-"""Where so many dots at once are found to have rays, others beyond them may: it is looked again, so
-often at most."""
+"""Maximum number of rounds in which labels are extended, and the number of new labels in a round
+that makes another round worthwhile."""
 
 RAISED_MM = 0.01
-"""After a smaller shift of the surface its level is not looked for again."""
+"""After a smaller shift of the surface its level is not determined again."""
 
 
 class TrackLost(CannotMeasure):
-    """A prior does not lead to this frame; says why in a sentence."""
+    """A frame cannot be measured with the prior; the reason is a sentence."""
 
     def __init__(self, reason: str) -> None:
         super().__init__("track-lost", reason)
@@ -89,12 +88,12 @@ class TrackLost(CannotMeasure):
 def follow(
     prior: Prior, observed: Observation, settings: FitSettings, limits: MatchSettings
 ) -> Followed:
-    """Find the ray of every dot, and the surface, from the frames before.
+    """Find the ray of every dot, and the surface, by prediction from the previous frames.
 
     Raises
     ------
     TrackLost
-        If the prior does not lead here.
+        If the prediction does not fit the frame.
     CannotMeasure
         If there is no surface.
     """
@@ -118,7 +117,7 @@ def follow(
             break
         fit = fit.without_dots(wrong)
     else:
-        raise TrackLost("too many dots are not where one surface has them")
+        raise TrackLost("too many dots do not fit one surface")
     rays, dots = fit.rays, fit.labels.ravel()[fit.rays]
     _check_explained(classes, limits, len(observed.plane_mm), len(rays))
     pool = fitted_pool(fit.rounds, level, observed.rig, observed.plane_mm[dots])
@@ -127,32 +126,32 @@ def follow(
     paths = fit.paths()
     is_seen = _datum_is_seen(observed, paths, off)
     if not is_seen and prior.unseen >= HELD:
-        raise TrackLost("the dots beside the absent one have not been seen for long")
-    own = prior.match.orientation
-    others = (trial for trial in prior.match.trials if trial.orientation != own)
-    trials = (Trial(own, pool.residual_rms_mm), *others)
+        raise TrackLost("the dots beside the absent one have been missing for too long")
+    orientation = prior.match.orientation
+    others = (trial for trial in prior.match.trials if trial.orientation != orientation)
+    trials = (Trial(orientation, pool.residual_rms_mm), *others)
     at = np.stack(np.divmod(rays, fit.labels.shape[1]), axis=-1)
     missed = len(classes.missed)
-    match = match_of_pairs(observed, at, dots, own, classes.witness, missed, trials)
+    match = match_of_pairs(observed, at, dots, orientation, classes.witness, missed, trials)
     return Followed(match, pool, paths, fit.labels != UNLABELLED, is_seen)
 
 
 @dataclass
 class _Fit:
-    """A fit to labelled dots, and how far it has come.
+    """State of an iterative fit to labelled dots.
 
     Parameters
     ----------
     prior, observed, settings
-        What it begins from, the frame's dots, and how it is fitted.
+        The prior, the frame's dots, and the settings of the fit.
     labels
         Index of each ray's dot or `UNLABELLED`, shape (rows, columns).
     rays
-        Numbers of the n rays that have one, row by row, shape (n,).
+        Flat indices of the n rays that have a dot, shape (n,).
     near
-        What a surface nearby makes of all rays.
+        Paths of all rays for the initial surface.
     rounds
-        The rounds.
+        The rounds of the fit.
     """
 
     prior: Prior
@@ -173,10 +172,10 @@ class _Fit:
         labels: IntArray,
         near: RayPaths,
     ) -> _Fit:
-        """Begin it with a surface nearby."""
+        """Start the fit from the surface of ``near``."""
         rays = np.flatnonzero(labels != UNLABELLED)
         if len(rays) < LEAST_DOTS:
-            raise TrackLost("hardly a dot is left that has a ray")
+            raise TrackLost("too few dots have a ray")
         dots, landing = labels.ravel()[rays], observed.landing_mm.reshape(-1, 3)[rays]
         seen = observed.plane_mm[dots], observed.covariance_mm2[dots]
         equations = normal_equations(prior.basis, observed.rig, landing, *seen, settings)
@@ -185,29 +184,29 @@ class _Fit:
         return cls(prior, observed, settings, labels, rays, near, rounds)
 
     def with_labels(self, labels: IntArray) -> _Fit:
-        """The fit of other labels, from where this one ended."""
+        """Start a fit to other labels from the current surface."""
         return _Fit.of(self.prior, self.observed, self.settings, labels, self.paths())
 
     def without_dots(self, dots: IntArray) -> _Fit:
-        """The fit without some dots, from where this one ended."""
+        """Start a fit without some dots from the current surface."""
         return self.with_labels(np.where(np.isin(self.labels, dots), UNLABELLED, self.labels))
 
     def run(self, until_mm: float) -> None:
-        """Run rounds until no reflection point moves by so much."""
+        """Run rounds until no reflection point moves by more than ``until_mm``."""
         self.rounds.run(MOST_ROUNDS, until_mm)
 
     def settle(self) -> None:
-        """Run rounds to the end."""
+        """Run rounds until the fit has converged."""
         self.run(SETTLED_MM)
         self.check_settled()
 
     def check_settled(self) -> None:
-        """Raise `TrackLost` where reflection points still move."""
+        """Raise `TrackLost` if the reflection points still move."""
         if not self.rounds.moved_mm < UNSETTLED_MM:
             raise TrackLost("the surface does not settle")
 
     def paths(self) -> RayPaths:
-        """What the surface makes of all rays, kept for the next time."""
+        """Paths of all rays for the current surface, cached."""
         coefficients = self.rounds.coefficients
         if self._paths is None or self._paths[0] is not coefficients:
             points = self.near.points_mm.copy()
@@ -217,20 +216,20 @@ class _Fit:
         return self._paths[1]
 
     def covariance_of(self, paths: RayPaths, rays: IntArray) -> FloatArray:
-        """Covariance of some rays' dots, as far as the surface is uncertain, (m, 2, 2), mm²."""
+        """Covariance of the dots of m rays due to that of the surface, shape (m, 2, 2), mm²."""
         factor = self.rounds.equations.factor
         assert factor is not None
         at = paths.points_mm[rays], paths.plane_mm[rays]
         return covariance_of_dots(self.observed.rig, self.prior.basis, factor, *at)
 
     def covariance_around(self) -> FloatArray:
-        """Covariance of the dots of lit rays and those beside them, NaN of others, (R, 2, 2)."""
+        """Covariance of the dots of lit rays and their neighbours, else NaN, shape (R, 2, 2)."""
         paths = self.paths()
         known = np.isfinite(paths.plane_mm[:, 0])
         rays = np.flatnonzero(widened(self.labels != UNLABELLED, 1).ravel() & known)
-        made = np.full((len(known), 2, 2), np.nan)
-        made[rays] = self.covariance_of(paths, rays)
-        return made
+        covariance = np.full((len(known), 2, 2), np.nan)
+        covariance[rays] = self.covariance_of(paths, rays)
+        return covariance
 
 
 # --- from the prediction to labels --------------------------------------------------------------
@@ -239,18 +238,18 @@ class _Fit:
 def _found_again(
     prior: Prior, observed: Observation, settings: FitSettings
 ) -> tuple[RayPaths, IntArray, float]:
-    """Ray paths that find the dots again, the labels they give, and how far dots are off.
+    """Find the dots again; return ray paths, labels, and the distance of dots from predictions.
 
-    That is the median share of the way to the next dot, from where they were predicted. Where no
-    prediction finds them, a surface is grown from the last one, and from those before it: then dots
-    were nowhere predicted, and it is infinite.
+    The distance is the median over the dots, in spacings of the predicted dots. If no prediction
+    finds the dots, a surface is grown from the last one or an earlier one; the distance then is
+    infinite.
     """
     lit, count, last = prior.lit, int(prior.lit.sum()), prior.paths.points_mm
-    # A surface is sure of rays amid the lit ones, too, whose dots may have been missed.
-    own, looked_for = (lit | amid(lit)) & ~observed.absent, widened(lit, 2)
+    # Rays between lit ones, whose dots may have been missed, are predicted reliably too.
+    tracked, looked_for = (lit | amid(lit)) & ~observed.absent, widened(lit, 2)
     for coefficients in predictions(prior):
         paths = RayPaths.of(observed.bench, prior.basis, coefficients, last, 1)
-        labels, off = _tracked(observed, paths, own, looked_for)
+        labels, off = _tracked(observed, paths, tracked, looked_for)
         if len(off) >= FOUND * count and (half := median(off)) < STEADY:
             return paths, labels, half
     found = 0
@@ -268,7 +267,7 @@ def _grown(
 ) -> tuple[RayPaths, IntArray]:
     """Find the dots again from the absent one outwards, ring by ring.
 
-    Dots in the middle move least from frame to frame; how they moved tells how those around do.
+    Dots in the middle move least from frame to frame, and their motion predicts that of the others.
     """
     i, j = np.indices(prior.lit.shape) + 1
     marker = observed.rig.pattern.marker
@@ -289,20 +288,21 @@ def _grown(
 def _tracked(
     observed: Observation, paths: RayPaths, lit: BoolArray, looked_for: BoolArray
 ) -> tuple[IntArray, FloatArray]:
-    """Dots of the rays that were lit before, each by the one prediction that is near.
+    """Label the dots that are close to exactly one prediction.
 
     Parameters
     ----------
     observed, paths
-        The frame's dots, and the surface that predicts them.
+        The frame's dots, and the predicted ray paths.
     lit, looked_for
-        Rays that may have dots, and those and their rivals, shape (rows, columns).
+        Masks of the rays that may be labelled, and of these and their rivals, shape
+        (rows, columns).
 
     Returns
     -------
     labels, off
-        Index of each ray's dot or `UNLABELLED`, shape (rows, columns); how far those found are from
-        where they were predicted, in shares of the way to the next predicted dot, shape (found,).
+        Index of each ray's dot or `UNLABELLED`, shape (rows, columns); distances of the labelled
+        dots from their predictions, in spacings of the predicted dots, shape (found,).
     """
     labels = np.full(lit.shape, UNLABELLED)
     near = np.flatnonzero(looked_for.ravel() & np.isfinite(paths.plane_mm[:, 0]))
@@ -322,9 +322,9 @@ def _tracked(
 
 
 def _widened(fit: _Fit) -> IntArray:
-    """Labels that the fitted surface supports, and new ones beside them that it makes sure of.
+    """Remove labels with large residuals, and add unambiguous ones next to the remaining labels.
 
-    A new label is one of `sure_pairs`, as where labels grow without a prior (`label_growth`).
+    New labels are determined by `sure_pairs`, as without a prior (`label_growth`).
     """
     observed, paths, lit = fit.observed, fit.paths(), fit.labels != UNLABELLED
     known = np.isfinite(paths.plane_mm[:, 0])
@@ -367,7 +367,7 @@ def _unsupported(fit: _Fit, covariance: FloatArray, classes: RayClasses, level: 
 
 
 def _with_level(prior: Prior, fit: _Fit, covariance: FloatArray) -> tuple[RayClasses, Level]:
-    """Classify the rays, and shift the surface to the level that they give."""
+    """Classify the rays, and shift the surface to the level that follows from them."""
     observed, paths = fit.observed, fit.paths()
     found = classify_rays(observed, fit.labels, paths)
     witness = certain_witness(observed, found.witness, paths, lambda some: covariance[some])
@@ -389,19 +389,20 @@ def _check_explained(classes: RayClasses, limits: MatchSettings, dots: int, rays
     if stray > limits.stray[0] + limits.stray[1] * dots:
         raise TrackLost(f"{stray} dots have no ray")
     if missed > limits.missed[0] + limits.missed[1] * rays:
-        raise TrackLost(f"{missed} rays amid the others have no dot")
+        raise TrackLost(f"{missed} rays between the others have no dot")
 
 
 def _datum_is_seen(observed: Observation, paths: RayPaths, off: float) -> bool:
     """Whether all four neighbours of the absent ray are lit.
 
-    A dot too far off for the fit (`_unsupported`) is still light in its place.
+    A dot that the fit rejects (`_unsupported`) still counts as light here.
 
     Raises
     ------
     TrackLost
-        If the absent ray's place is lit; or a neighbour is dark and the dots are not where they
-        were predicted, or three are: no hole tells the rows then (`lattice.find_holes`).
+        If there is a dot at the absent ray; if a neighbour is dark and the dots are not where they
+        were predicted; or if three neighbours are dark, as the hole then does not identify the rows
+        (`lattice.find_holes`).
     """
     pattern = observed.rig.pattern
     assert pattern.marker is not None

@@ -1,11 +1,11 @@
-"""How uncertain the mean of a size over the frames of a recording is.
+"""Standard uncertainty of the mean of a size over the frames of a recording.
 
-The noise of one frame says nothing of the next one's. What is not known of the set-up is the same
-error in all of them. So is the level's, in part: it comes from which rays land inside the boundary,
-and while the boundary stays where it is, the same rays put it at the same wrong place. In simulated
-recordings the errors of two frames' levels are correlated by exp(−D²/2ℓ²), with D the distance of
-their outlines in standard uncertainties: 1 for a pool that swings within its boundary, and nothing
-where that has moved by three of them.
+The noise of different frames is independent. The error of the set-up is the same in all frames.
+That of the level is partly the same: the level follows from the rays that land inside the boundary,
+and while the boundary does not move, the same rays give the same error. In simulated recordings the
+errors of two frames' levels are correlated by exp(−D²/2ℓ²), with D the distance of their outlines
+in standard uncertainties: 1 for a pool that oscillates within its boundary, and practically 0 if
+the boundary has moved by three of them.
 """
 
 from __future__ import annotations
@@ -20,17 +20,17 @@ from labapp.core.surface.measures import Measures, sigma_name
 from labapp.core.values import FloatArray
 
 DISTANCE = 0.6
-"""ℓ: from recordings of the twin, pools that swing or whose boundary wanders by 0.2 to 2 %."""
+"""ℓ, from simulated recordings of pools that oscillate or whose boundary wanders by 0.2 to 2 %."""
 
 TINY_MM = 1e-9
 """Lower bound of the uncertainty of an outline."""
 
 MOST = 1000
-"""From so many frames at most, evenly spaced, the correlation is worked out."""
+"""Maximum number of frames, evenly spaced, from which the correlation is computed."""
 
 
 def series_of(measured: Sequence[Measures]) -> dict[str, FloatArray]:
-    """All measures of n frames by their names, each of shape (n,)."""
+    """All measures of n frames by name, each of shape (n,)."""
     return {
         field.name: np.array([getattr(each, field.name) for each in measured])
         for field in fields(Measures)
@@ -38,21 +38,21 @@ def series_of(measured: Sequence[Measures]) -> dict[str, FloatArray]:
 
 
 def sigma_of_mean(name: str, series: Mapping[str, FloatArray]) -> float:
-    """Standard uncertainty of a size's mean over n frames with a surface.
+    """Standard uncertainty of the mean of a size over n frames with a surface.
 
     Parameters
     ----------
     name
-        Of the size, as in `Measures`.
+        Name of the size, as in `Measures`.
     series
-        The measures of these frames by their names, each of shape (n,). Where the level's part of
-        an uncertainty is NaN, as versions before did not keep it, it is taken for all of it; where
-        the set-up's is, for none.
+        The measures of these frames by name, each of shape (n,). If the level's part of an
+        uncertainty is NaN, as in results of earlier versions, it is assumed to be all of it; if the
+        set-up's part is NaN, it is assumed to be 0.
 
     Returns
     -------
     float
-        NaN where a frame has no uncertainty, or there is none.
+        NaN if a frame has no uncertainty, or there are no frames.
     """
     if sigma_name(name) not in series or not len(series[name]):
         return math.nan
@@ -65,13 +65,13 @@ def sigma_of_mean(name: str, series: Mapping[str, FloatArray]) -> float:
 
 
 def noise_sigma_of_mean(name: str, series: Mapping[str, FloatArray]) -> float:
-    """The noise's part of `sigma_of_mean`: frames are independent."""
+    """Contribution of noise to `sigma_of_mean`; it is independent between frames."""
     sigma, level = _without_setup(series, name), _level(series, name)
     return float(np.sqrt(np.sum(np.maximum(sigma**2 - level**2, 0.0))) / len(sigma))
 
 
 def level_sigma_of_mean(name: str, series: Mapping[str, FloatArray]) -> float:
-    """The level's part of `sigma_of_mean`: frames whose boundary is alike have the same error."""
+    """Contribution of the level to `sigma_of_mean`, correlated if boundaries are similar."""
     level = _level(series, name)
     count = len(level)
     variance = np.sum(level**2) / count**2
@@ -84,29 +84,29 @@ def level_sigma_of_mean(name: str, series: Mapping[str, FloatArray]) -> float:
 
 
 def setup_sigma_of_mean(name: str, series: Mapping[str, FloatArray]) -> float:
-    """The set-up's part of `sigma_of_mean`: frames do not average it out. 0 where it is unknown."""
+    """Contribution of the set-up to `sigma_of_mean`, common to all frames; 0 if unknown."""
     return float(_setup(series, name).mean())
 
 
 def _setup(series: Mapping[str, FloatArray], name: str) -> FloatArray:
-    """The set-up's part of a size's uncertainty, shape (n,); 0 where it is unknown."""
+    """Uncertainty of a size due to the set-up, shape (n,); 0 if unknown."""
     return np.nan_to_num(series.get(sigma_name(name, "setup"), np.zeros(len(series[name]))))
 
 
 def _level(series: Mapping[str, FloatArray], name: str) -> FloatArray:
-    """The level's part of a size's uncertainty, shape (n,); all but the set-up's if unknown."""
+    """Uncertainty of a size due to the level, shape (n,); all but the set-up's part if unknown."""
     level = series[sigma_name(name, "level")]
     return np.where(np.isfinite(level), level, _without_setup(series, name))
 
 
 def _without_setup(series: Mapping[str, FloatArray], name: str) -> FloatArray:
-    """Uncertainty of a size by noise and level, shape (n,)."""
+    """Uncertainty of a size due to noise and level, shape (n,)."""
     total, setup = series[sigma_name(name)], _setup(series, name)
     return np.asarray(np.sqrt(np.maximum(total**2 - setup**2, 0.0)))
 
 
 def level_correlation(series: Mapping[str, FloatArray], frames: slice | np.ndarray) -> FloatArray:
-    """Correlation of the errors of some frames' levels, shape (m, m)."""
+    """Correlation of the level errors of m frames, shape (m, m)."""
     moved = [
         series[name][frames] / max(np.median(_without_setup(series, size)[frames]), TINY_MM) * share
         for size, center in (("width_mm", "center_x_mm"), ("length_mm", "center_y_mm"))

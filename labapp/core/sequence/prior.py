@@ -1,4 +1,4 @@
-"""What a measured frame leaves to the next: its prior, and where that predicts the surface."""
+"""Prior of a frame from the previous ones, and prediction of its surface."""
 
 from __future__ import annotations
 
@@ -24,18 +24,18 @@ from labapp.core.surface.spline import SplineBasis
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray
 
 MEMORY, ORDER, TEACHERS = 32, 8, 3
-"""Frames that predictions are learnt from, and from how many of them, at most, one is made; every
-third lit ray is sufficient."""
+"""Number of past frames from which the recurrence is estimated, its maximum order, and the stride
+over lit rays: every third one is sufficient."""
 
 RIDGE = 1e-4
-"""Penalty on the recurrence's coefficients, a share of the trace of its normal matrix."""
+"""Penalty on the coefficients of the recurrence, as a share of the trace of its normal matrix."""
 
 MOST_ROUNDS, SETTLED_MM = 8, 3e-4
-"""Rounds of a fit from a surface nearby; no reflection point moves by more in the last."""
+"""Maximum number of rounds of a fit that starts from a close surface, and its convergence limit."""
 
 POINTS_EVERY, SETUP_EVERY, SINKS_EVERY = 8, 128, 16
-"""Every so many frames the uncertainty of the reflection points is worked out anew, that of the
-sizes by the set-up for whatever sizes there are, and whether the rear lies below the work piece."""
+"""Intervals in frames after which the uncertainty of the reflection points, the part of the set-up
+in the uncertainty of the sizes, and the drop of the rear are recomputed."""
 
 
 @dataclass(frozen=True)
@@ -45,11 +45,11 @@ class Followed:
     Parameters
     ----------
     match, pool, paths
-        The pairs, the surface fitted to them, and what that makes of all rays.
+        The pairs, the surface fitted to them, and the paths of all rays.
     lit
         Rays that have a dot, shape (rows, columns).
     datum_is_seen
-        Whether the absent ray's place is dark amid four lit ones.
+        Whether the absent ray is dark and all its four neighbours are lit.
     """
 
     match: Match
@@ -61,36 +61,36 @@ class Followed:
 
 @dataclass(frozen=True)
 class Prior:
-    """State passed from a frame to the next.
+    """State passed from one frame to the next.
 
     Parameters
     ----------
     tuning
         Size of dots and noise.
     match
-        Of the frame that was matched without a prior.
+        Match of the frame that was matched without a prior.
     residual_mm
-        Root mean square residual there, mm.
+        Root mean square residual of that frame, mm.
     basis
         The splines.
     paths, lit, boundary, level
-        What the last surface makes of the R rays of the pattern; which of them had dots, shape
-        (rows, columns); where the pool ends, and z = 0.
+        Paths of the R rays of the pattern for the last surface; which of them had dots, shape
+        (rows, columns); boundary and level of the pool.
     past, slopes
-        Spline coefficients of the last frames, the newest last, shape (frames, p), mm, and the
-        slopes of those surfaces where rays met them, shape (frames, R, 2).
+        Spline coefficients of the last frames, newest last, shape (frames, p), mm, and the slopes
+        of those surfaces at the reflection points, shape (frames, R, 2).
     open_mm
-        Uncertainty of the level when the drop of the rear was last found along with it, mm.
+        Uncertainty of the level when the drop of the rear was last fitted with it, mm.
     free_sigma_mm
-        Uncertainty of the height where each ray meets the surface, its level apart, as it was last
-        worked out, shape (R,), mm; NaN where it never was. It changes slowly.
+        Uncertainty of the height of each ray's reflection point without the part of the level, as
+        last computed, shape (R,), mm; NaN if it never was. It changes slowly.
     by_setup
-        The set-up's part of the uncertainty of sizes, for each of the sizes that it was worked out
-        for since it was last worked out anew for all: a pool that oscillates has them again.
+        Parts of the set-up in the uncertainty of sizes, each with the sizes for which it was
+        computed: the sizes of a pool that oscillates recur.
     unseen
-        Frames since the absent ray's place was last seen dark amid four lit ones.
+        Number of frames since `Followed.datum_is_seen` was last true.
     count
-        Frames that were followed.
+        Number of followed frames.
     """
 
     tuning: DetectorTuning
@@ -119,7 +119,7 @@ class Prior:
         made: Reconstruction,
         measures: Measures,
     ) -> Prior:
-        """That of a frame that was matched without one."""
+        """Build the prior from a frame that was matched without one."""
         basis, coefficients = pool.surface.basis, pool.surface.coefficients
         paths, level = RayPaths.of(bench, basis, coefficients), replace(pool.level, shift_mm=0.0)
         return cls(
@@ -139,9 +139,9 @@ class Prior:
         )
 
     def followed_by(self, followed: Followed, made: Reconstruction, measures: Measures) -> Prior:
-        """That of the next frame, which followed on this one."""
+        """Build the prior from a frame that was followed with this one."""
         by_setup, sizes = () if self.setup_is_due else self.by_setup, measures.sizes
-        if nearest_part(by_setup, sizes) is None:  # then it was worked out
+        if nearest_part(by_setup, sizes) is None:  # it was computed for these sizes
             by_setup = *by_setup, SetupPart(made.size_sigma_setup, sizes)
         paths, lit, pool = followed.paths, followed.lit, followed.pool
         free = self.free_sigma_mm.copy()
@@ -163,18 +163,18 @@ class Prior:
 
     @property
     def drop_is_free(self) -> bool:
-        """Whether the next frame's level is found along with the drop of the rear."""
+        """Whether the drop of the rear is fitted with the level in the next frame."""
         return self.count % SINKS_EVERY == SINKS_EVERY - 1
 
     @property
     def setup_is_due(self) -> bool:
-        """Whether the set-up's part is worked out anew in the next frame, whatever its sizes."""
+        """Whether the part of the set-up is recomputed in the next frame, whatever its sizes."""
         return self.count % SETUP_EVERY == SETUP_EVERY - 1
 
     def known(self, lit: BoolArray) -> Known:
-        """What is known of the next frame's pool, which lights these rays, shape (rows, columns).
+        """Quantities known for the next frame, given its lit rays, shape (rows, columns).
 
-        What changes slowly is worked out anew now and then.
+        Slowly changing quantities are recomputed at intervals.
         """
         free = self.free_sigma_mm[lit.ravel()]
         is_known = self.count % POINTS_EVERY != 0 and bool(np.isfinite(free).all())
@@ -182,12 +182,12 @@ class Prior:
         return Known(self.boundary, free if is_known else None, by_setup)
 
     def after_gap(self) -> Prior:
-        """That of a frame which was not measured: dots may be anywhere near."""
+        """Build the prior after a frame that was not measured: only the last surface is kept."""
         past, slopes = self.past[-1:], self.slopes[-1:]
         return replace(self, unseen=self.unseen + 1, past=past, slopes=slopes)
 
     def with_past_of(self, former: Prior, bench: Bench, settings: FitSettings) -> Prior:
-        """The prior in the splines of a former one, with what that remembers, if they suit it."""
+        """Convert the prior to the splines of a former one and adopt its past, if possible."""
         x, y = bench.rays.landing_mm[..., 0], bench.rays.landing_mm[..., 1]
         if (self.basis.contains(x, y) != former.basis.contains(x, y)).any():
             return self
@@ -203,7 +203,7 @@ class Prior:
         )
 
     def _in_splines(self, former: Prior, bench: Bench, settings: FitSettings) -> RayPaths | None:
-        """The surface fitted in the splines of a former prior; None where it does not settle."""
+        """Refit the surface in the splines of a former prior; None if it does not converge."""
         match, basis = self.match, former.basis
         at = tuple(match.ray.T - 1)
         ray = np.ravel_multi_index(at, self.lit.shape)
@@ -222,10 +222,10 @@ class Prior:
 
 
 def predictions(prior: Prior) -> Iterator[FloatArray]:
-    """Spline coefficients that the next frame may have, the likeliest first.
+    """Yield predicted spline coefficients of the next frame, likeliest first.
 
-    A linear recurrence, learnt from the slopes at lit rays in the frames before, extrapolates a
-    sum of a few oscillations.
+    A linear recurrence, estimated from the slopes at lit rays in the previous frames, extrapolates
+    a sum of a few oscillations.
     """
     past, order = prior.past, min(ORDER, len(prior.past) // 2)
     if order > 2:
@@ -243,36 +243,36 @@ def predictions(prior: Prior) -> Iterator[FloatArray]:
     types.int64,
 )
 def recurrence(slopes: FloatArray, rays: IntArray, order: int) -> FloatArray:
-    """Coefficients of the linear recurrence by which frames follow on each other, shape (order,).
+    """Coefficients of the linear recurrence over frames, newest frame first, shape (order,).
 
-    The newest frame's first: ridge regression over the slopes of some rays in M frames, shape
-    (M, R, 2), each over its mean.
+    They are estimated by ridge regression of the slopes of some rays in M frames, shape (M, R, 2),
+    relative to their means.
     """
     gram, right = np.zeros((order, order)), np.zeros(order)
-    own = np.empty(len(slopes))
-    next_ones = own[order:]
+    series = np.empty(len(slopes))
+    targets = series[order:]
     for ray in rays:
         for axis in range(2):
             mean = 0.0
             for m in range(len(slopes)):
-                own[m] = slopes[m, ray, axis]
-                mean += own[m] / len(slopes)
+                series[m] = slopes[m, ray, axis]
+                mean += series[m] / len(slopes)
             for m in range(len(slopes)):
-                own[m] -= mean
+                series[m] -= mean
             for k in range(order):
-                one, product = own[order - 1 - k :], 0.0
-                for m in range(len(next_ones)):
-                    product += one[m] * next_ones[m]
+                one, product = series[order - 1 - k :], 0.0
+                for m in range(len(targets)):
+                    product += one[m] * targets[m]
                 right[k] += product
                 for other in range(k + 1):
-                    two, product = own[order - 1 - other :], 0.0
-                    for m in range(len(next_ones)):
+                    two, product = series[order - 1 - other :], 0.0
+                    for m in range(len(targets)):
                         product += one[m] * two[m]
                     gram[k, other] += product
     for k in range(order):
         for other in range(k):
             gram[other, k] = gram[k, other]
-    held = RIDGE * np.trace(gram)
+    penalty = RIDGE * np.trace(gram)
     for k in range(order):
-        gram[k, k] += held
+        gram[k, k] += penalty
     return np.linalg.solve(gram, right).astype(np.float64)

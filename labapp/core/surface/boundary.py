@@ -1,4 +1,4 @@
-"""The pool's boundary: piecewise polar model, circle, contour (§6.3.2, §8.2.1)."""
+"""Boundary of the pool: piecewise polar model and circle (§6.3.2, §8.2.1)."""
 
 from __future__ import annotations
 
@@ -16,10 +16,11 @@ BoundaryModel = Literal["piecewise", "circle"]
 """Three cubic pieces and two transitions (§6.3.2.2), or a circle (§8.2.1)."""
 
 POINTS = 360
-"""Points of a modelled boundary: one per degree."""
+"""Number of points of a modelled boundary: one per degree."""
 
 LARGEST_STRETCH = 1.5
-"""A model farther out than this times its farthest edge point has run away."""
+"""Maximum ratio of the model's largest radius to that of its edge points; beyond it the model
+diverges."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ class Boundary(ReadOnlyArrays):
 
     @classmethod
     def polar(cls, center_mm: FloatArray, radius_mm: FloatArray) -> Boundary:
-        """Build on z = 0 from radii at even steps of angle from −180°.
+        """Build a boundary on z = 0 from radii at equally spaced angles from −180°.
 
         Parameters
         ----------
@@ -84,7 +85,7 @@ class Boundary(ReadOnlyArrays):
         x = np.asarray(x_mm, float) - self.center_mm[0]
         y = np.asarray(y_mm, float) - self.center_mm[1]
         outline = self.points_mm[:, :2] - self.center_mm
-        # Find the side that each point's angle falls on, then on which hand of it the point is.
+        # Find the side of the polygon at each point's angle, then whether the point is inside it.
         theta = np.degrees(np.arctan2(y, x))
         before = np.searchsorted(self.theta_deg, theta, side="right") - 1
         a = outline[before]
@@ -101,7 +102,7 @@ class EdgePoints(ReadOnlyArrays):
     left_mm, right_mm
         (X, Y) of the two points of each row, shape (r, 2), mm.
     steps
-        Steps from ray to ray between each row's ends, shape (r,).
+        Number of rays from each row's first to its last, minus 1, shape (r,).
     """
 
     left_mm: FloatArray
@@ -112,8 +113,8 @@ class EdgePoints(ReadOnlyArrays):
     def center_mm(self) -> FloatArray:
         """Middle of the longest row, the origin O′ of the polar coordinates, shape (2,), mm.
 
-        Often several rows are as long in steps, and which of them is the widest in mm only says
-        which lies farthest from the laser: the mean of their middles is taken.
+        Often several rows have the same number of steps, and the widest of them in mm is only the
+        one farthest from the laser: the mean of their middles is used.
         """
         longest = self.steps == self.steps.max()
         return np.asarray((self.left_mm[longest] + self.right_mm[longest]).mean(axis=0) / 2)
@@ -130,7 +131,7 @@ def boundary_on_work_piece(match: Match, rig: Rig, model: BoundaryModel) -> Boun
     Raises
     ------
     CannotMeasure
-        ``no-boundary`` if there are fewer than two rows, or the model runs away from its points.
+        ``no-boundary`` if there are fewer than two rows, or the model diverges from its points.
     """
     edges = edge_points(match, rig)
     return circle(edges) if model == "circle" else piecewise(edges, rig.head_sign)
@@ -139,11 +140,11 @@ def boundary_on_work_piece(match: Match, rig: Rig, model: BoundaryModel) -> Boun
 def edge_points(match: Match, rig: Rig) -> EdgePoints:
     """Estimate where the boundary crosses each row of rays, on z = 0 (Eq. 6-9 … 6-12).
 
-    It lies between the landing of the row's last ray that came back and that of its outer
-    neighbour that did not; the middle has the least mean square error. Beyond the pattern's edge
-    the neighbour is the ray that would come next. Rows that end at a ray which cannot testify
-    (hidden by the torch, in doubt) say nothing of the boundary and are left out, as the text
-    leaves out fragmental rows (§7.3) — unless fewer than three rows would be left.
+    It lies between the landing points of the row's last ray that came back and of its outer
+    neighbour that did not; the midpoint has the least mean square error. At the edge of the pattern
+    the neighbour is the ray that would be next. Rows that end at a ray with an unknown witness
+    (hidden by the torch, in doubt) give no information about the boundary and are omitted, as the
+    text omits fragmental rows (§7.3), unless fewer than three rows would be left.
 
     Raises
     ------
@@ -155,7 +156,7 @@ def edge_points(match: Match, rig: Rig) -> EdgePoints:
         raise CannotMeasure("no-boundary", "a boundary needs at least two rows of dots")
     first = np.array([match.ray[match.ray[:, 0] == i, 1].min() for i in rows])
     last = np.array([match.ray[match.ray[:, 0] == i, 1].max() for i in rows])
-    # The witness of the rays before the first and after the last; −1, "no", beyond the pattern.
+    # Beyond the pattern the witness is −1: no ray came back.
     witness = np.pad(match.witness, 1, constant_values=-1)
     sure = (witness[rows, first - 1] != 0) & (witness[rows, last + 1] != 0)
     if sure.sum() >= 3:
@@ -169,14 +170,14 @@ def edge_points(match: Match, rig: Rig) -> EdgePoints:
 
 
 def _landings(rig: Rig) -> FloatArray:
-    """(X, Y) of ray (i, j) on z = 0 at ``[i, j]``, with one more ray round the pattern."""
+    """(X, Y) of ray (i, j) on z = 0 at ``[i, j]``, with an additional ring around the pattern."""
     pattern = rig.pattern
     wider = replace(pattern, rows=pattern.rows + 2, columns=pattern.columns + 2, absent=None)
     return intersect_level(rig.laser.position_mm, ray_directions(rig.laser, wider))[..., :2]
 
 
 def circle(edges: EdgePoints) -> Boundary:
-    """Circle about the middle of the longest row, of the least-squares radius (§8.2.1)."""
+    """Circle about the middle of the longest row, with the least-squares radius (§8.2.1)."""
     radius = np.linalg.norm(edges.all_mm - edges.center_mm, axis=-1).mean()
     return Boundary.polar(edges.center_mm, np.full(POINTS, radius))
 
@@ -186,32 +187,32 @@ def piecewise(edges: EdgePoints, head_sign: int = 1) -> Boundary:
 
     θ runs clockwise from +X here, as in Fig. 6-8 (b): the head is at −90°, the rear at 90°. A
     piece with fewer than five points gets a polynomial of lower order: 2 for four points, 1 for
-    three, the mean for fewer. Where left and right piece do not cross at the rear, one goes over
-    into the other linearly between the rearmost points instead of at β₃.
+    three, the mean for fewer. If the left and right pieces do not cross at the rear, the model
+    changes linearly from one to the other between the rearmost points instead of at β₃.
 
     Parameters
     ----------
     edges
         The rows' ends.
     head_sign
-        +1 where the head lies towards +Y, −1 where it lies towards −Y: then θ runs the other way
-        round, so that the head is at −90° again.
+        +1 if the head lies towards +Y. −1 if it lies towards −Y: θ then runs counter-clockwise, so
+        that the head is at −90° again.
 
     Raises
     ------
     CannotMeasure
-        ``no-boundary`` if a piece has no points or runs away from them.
+        ``no-boundary`` if a piece has no points or diverges from them.
     """
     center = edges.center_mm
     dx, dy = (edges.all_mm - center).T
     theta, radius = np.degrees(np.arctan2(-head_sign * dy, dx)), np.hypot(dx, dy)
-    # A pair level with the centre lies at 0° and 180° but for rounding.
+    # A pair at the Y of the centre lies at 0° and 180° up to rounding.
     theta = np.where(np.abs(np.abs(theta) - 180) < 1e-9, 180.0, theta)
     left, right = np.abs(theta) >= 90, np.abs(theta) < 90
     head = (theta <= 1e-9) | (theta == 180)
     if not (left.any() and right.any()):
         raise CannotMeasure("no-boundary", "all ends of rows lie on one side of the pool")
-    # Eq. 6-15: θ_L and θ_R grow from the rear to the head, θ_H from left to right.
+    # Eq. 6-15: θ_L and θ_R increase from the rear to the head, θ_H from left to right.
     left_piece = _Piece(_theta_left(theta[left]), radius[left])
     right_piece = _Piece(90 - theta[right], radius[right])
     head_piece = _Piece(_theta_head(theta[head]), radius[head])
@@ -241,15 +242,15 @@ def piecewise(edges: EdgePoints, head_sign: int = 1) -> Boundary:
         ),
     )
     if not (model > 0).all() or model.max() > LARGEST_STRETCH * radius.max():
-        raise CannotMeasure("no-boundary", "the boundary model runs away from the rows' ends")
-    # Ours is counter-clockwise from +X: with the head at +Y, θ of the text is −θ of ours.
+        raise CannotMeasure("no-boundary", "the boundary model diverges from the rows' ends")
+    # θ of `Boundary` runs counter-clockwise from +X; with the head at +Y it is −θ of the text.
     return Boundary.polar(center, np.roll(model[::-1], 1) if head_sign > 0 else model)
 
 
 def _share_of_left(
     theta: FloatArray, difference: FloatArray, right_end: float, left_end: float
 ) -> FloatArray:
-    """Share of the left piece in the rear half, 0 … 1: a step at β₃, where the pieces cross."""
+    """Weight of the left piece in the rear half, 0 … 1: a step at β₃, where the pieces cross."""
     gap = np.flatnonzero((theta >= right_end) & (theta <= left_end))
     crossings = gap[:-1][difference[gap[:-1]] * difference[gap[1:]] <= 0]
     if len(crossings):
@@ -269,11 +270,11 @@ def _theta_head(theta: FloatArray) -> FloatArray:
 
 
 class _Piece:
-    """Least-squares polynomial r(θ), of third order where there are points enough (Eq. 6-16)."""
+    """Least-squares polynomial r(θ), of third order if there are enough points (Eq. 6-16)."""
 
     def __init__(self, theta_deg: FloatArray, radius_mm: FloatArray) -> None:
         order = int(np.clip(len(radius_mm) - 2, 0, 3))
-        # In half turns the powers stay near 1, which keeps the least squares well conditioned.
+        # In units of 180° the powers are at most about 1: the least squares are well conditioned.
         powers = np.vander(theta_deg / 180, order + 1)
         self._weights = np.linalg.lstsq(powers, radius_mm, rcond=None)[0]
 

@@ -1,7 +1,7 @@
-"""The boundary of a fitted surface: where it comes down to the work piece, or to a lower rear.
+"""Boundary of a fitted surface: where it reaches the work piece, or a rear that lies lower.
 
-It is traced outwards from a centre (`trace_boundary`), or from the boundary of a surface that is
-near (`retrace_boundary`), by Newton steps along each direction.
+It is traced from a centre outwards (`trace_boundary`), or from the boundary of a similar surface
+(`retrace_boundary`), by Newton steps along each direction.
 """
 
 from __future__ import annotations
@@ -14,23 +14,24 @@ from labapp.core.surface.spline import SplineBasis
 from labapp.core.values import CannotMeasure, FloatArray
 
 LONGEST_MM, LAST_MM = 0.3, 3e-3
-"""Longest Newton step where the boundary is near; and the step after which none is taken, as the
-next would be of some nanometres."""
+"""Longest Newton step if the boundary is close, and the step length at which the iteration ends, as
+the next step would be some nanometres."""
 
 ON_BOUNDARY_MM = 1e-3
-"""Before the last step the surface is at the boundary's height to within this at every point, or
-the boundary is looked for anew."""
+"""Tolerance of the surface's height at the boundary before the last step. If it is exceeded at any
+point, the boundary is traced from the centre."""
 
 DIRECTIONS, CELLS = 360, 63
-"""Boundary points, and cells on the way out in which the first crossing is looked for."""
+"""Number of boundary points, and of intervals per direction in which the first crossing is
+searched for."""
 
 
 def trace_boundary(
     basis: SplineBasis, coefficients: FloatArray, level: Level, center_mm: FloatArray
 ) -> tuple[Boundary, FloatArray]:
-    """Trace the boundary: first place on the way out where the surface comes down to its height.
+    """Trace the boundary: the first place in each direction where the surface reaches its height.
 
-    That is the work piece, z = 0, or a rear that lies below it.
+    This height is that of the work piece, z = 0, or of a rear that lies below it.
 
     Parameters
     ----------
@@ -39,18 +40,18 @@ def trace_boundary(
     level
         The side of the work piece that the pool is on, and its rear.
     center_mm
-        Where the ways out begin, shape (2,), mm.
+        Origin of the directions, shape (2,), mm.
 
     Returns
     -------
     boundary, boundary_slope
-        The boundary of m points, one a direction; gradient there of the surface's height over the
-        boundary's, shape (m, 2).
+        The boundary of m points, one per direction; gradient there of the surface's height above
+        the boundary's, shape (m, 2).
 
     Raises
     ------
     CannotMeasure
-        ``open-boundary`` if it does not in some direction, within the surface's rectangle.
+        ``open-boundary`` if the surface does not reach it in some direction within its rectangle.
     """
     from labapp.core.surface.kernels import outline_kernels, spline_kernels
 
@@ -62,7 +63,7 @@ def trace_boundary(
     place = center_mm + reach[..., None] * way[:, None]
     height = spline_kernels.surface_at(basis.grid, coefficients, place.reshape(-1, 2))[0]
     inside = level.sign * (height.reshape(reach.shape) - level.rear.height(place[..., 1])) > 0
-    # The centre of a dented pool may lie below the work piece: start where the pool is reached.
+    # The centre of a dented pool may lie below the work piece: start at the first point inside.
     entered = np.cumsum(inside, axis=1) > 0
     crossing = entered[:, :-1] & inside[:, :-1] & ~inside[:, 1:]
     if not crossing.any(axis=1).all():
@@ -85,10 +86,10 @@ def retrace_boundary(
     center_mm: FloatArray,
     before: Boundary,
 ) -> tuple[Boundary, FloatArray]:
-    """Trace the boundary from that of a surface nearby: `trace_boundary` in less time.
+    """Trace the boundary from that of a similar surface, which is faster than `trace_boundary`.
 
-    Parameters, return values and errors are the same, and ``before``, the boundary nearby. Where
-    steps from there do not lead to the boundary, it is traced from the centre.
+    Parameters, return values and errors are the same; ``before`` is the boundary of the similar
+    surface. If steps from there do not converge, the boundary is traced from the centre.
     """
     from labapp.core.surface.kernels import outline_kernels
 
@@ -109,7 +110,7 @@ def retrace_boundary(
 def _boundary_of(
     rear: Rear, center_mm: FloatArray, theta_deg: FloatArray, way: FloatArray, radius: FloatArray
 ) -> Boundary:
-    """Build a boundary of radii, shape (m,), along directions, shape (m, 2)."""
+    """Build a boundary from radii, shape (m,), along directions, shape (m, 2)."""
     place = center_mm + radius[:, None] * way
     points = np.column_stack([place, rear.height(place[:, 1])])
     return Boundary(np.asarray(center_mm, float), theta_deg, points)

@@ -1,4 +1,4 @@
-"""The two smooth surfaces through scattered points: step 3 of IRS and of ERS (Eq. 6-2, 7-2)."""
+"""Two smooth surfaces through scattered points: step 3 of IRS and of ERS (Eq. 6-2, 7-2)."""
 
 from __future__ import annotations
 
@@ -12,14 +12,16 @@ from labapp.core.surface.surface import Surface
 from labapp.core.values import CannotMeasure, FloatArray
 
 DIFFERENCE_MM = 1e-4
-"""Half the span of a difference quotient."""
+"""Step of the finite differences."""
 
 INNER_SHARE = 0.95
-"""Share of the way from centre to boundary beyond which reflection points are left out."""
+"""Reflection points farther out than this share of the distance from centre to boundary are
+omitted.
+"""
 
 
 class SurfaceThroughPoints(Surface, Protocol):
-    """A surface made to pass through points, which knows its gradient there."""
+    """A surface that interpolates points, with its gradient at these."""
 
     @property
     def point_gradient(self) -> FloatArray:
@@ -30,8 +32,8 @@ class SurfaceThroughPoints(Surface, Protocol):
 class CloughTocherSurface:
     """Triangle-based cubic interpolation: once differentiable, NaN outside the convex hull.
 
-    The method [61] of §6.3.1. The gradients at the points are those of least curvature, so those
-    on the hull, known from one side only, are the least certain (Fig. 6-15).
+    The method [61] of §6.3.1. The gradients at the points minimise curvature; those on the hull,
+    determined from one side only, are the least certain (Fig. 6-15).
 
     Parameters
     ----------
@@ -81,7 +83,7 @@ class ThinPlateSurface:
     """Thin-plate spline: passes through the points with the least bending, and extrapolates.
 
     The method [64] of §7.1. ``z = a₀ + a₁x + a₂y + Σ wᵢ·rᵢ²·ln rᵢ²``, with Σwᵢ = Σwᵢxᵢ = Σwᵢyᵢ = 0;
-    far from the points it straightens out.
+    far from the points it becomes linear.
 
     Parameters
     ----------
@@ -146,9 +148,9 @@ class ThinPlateSurface:
 def whole_surface(points_mm: FloatArray, boundary: Boundary) -> CloughTocherSurface:
     """Interpolate through reflection points and boundary together (§6.4, step 5 of §7.1).
 
-    The boundary model knows nothing of the surface, and a reflection point high over the work
-    piece lies nearer the laser than where its ray would land. One that comes to lie beside or
-    beyond the boundary is left out: two heights at nearly one place would make a cliff there.
+    The boundary model is independent of the surface, and a reflection point high above the work
+    piece lies nearer to the laser than the landing point of its ray. A point close to the boundary
+    or beyond it is omitted: two different heights at nearly the same place would form a cliff.
 
     Parameters
     ----------

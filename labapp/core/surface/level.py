@@ -1,8 +1,8 @@
-"""The level: where z = 0 lies on a surface that slopes give up to a constant.
+"""Level: height of z = 0 on a surface that slopes determine up to a constant.
 
-It comes from the witnesses, the rays of which it is known whether they came back: a lit ray landed
-inside the boundary, a dark one outside. The boundary is on the work piece, but for the pool's rear,
-which may lie below it (§7.2).
+It is estimated from the witnesses, the rays of which it is known whether they came back: a lit ray
+landed inside the boundary, a dark one outside. The boundary is on the work piece, except at the
+pool's rear, which may lie below it (§7.2).
 """
 
 from __future__ import annotations
@@ -16,19 +16,20 @@ from labapp.core.surface.spline import SplineBasis
 from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 
 SCAN_LEVELS = 300
-"""Levels that are tried where nothing is known of it."""
+"""Number of levels that are tried if no estimate is given."""
 
 MOST_AT_ENDS, MOST_AT_FAR_ENDS = 1e-6, 0.02
-"""With more of the level's probability at the ends of its grid, a wider grid is searched: the first
-of a narrow grid (reach below 1), the second of a wide one."""
+"""A wider grid is searched if the probability at the ends of the grid exceeds this: the first for a
+narrow grid (reach below 1), the second for a wide one."""
 
-# Blurs: width of the step from inside to outside, in dot spacings, from a boundary that is known
-# as sharply as the surface is to one that half the neighbouring rays contradict.
+# Blurs: width of the step from inside to outside, in dot spacings, from a sharp boundary to one
+# that half of the neighbouring rays contradict.
 _BLURS = np.geomspace(1 / 200, 1 / 4, 9)
 _WIDEST_BLUR = _BLURS[-1:]
 _BLURS = np.array([_BLURS, 1.2 * np.log(_BLURS)])  # −log of the prior, nats: sharp is likelier
 
-# Drops: how deep a rear may lie, mm. One in five lies below the work piece, as deep as any other.
+# Drops: depths of the rear, mm. One rear in five lies below the work piece; its depths are equally
+# likely.
 _DROPS_MM = np.concatenate([[0.0], np.linspace(0.01, 0.15, 10)])
 _SHARE_SUNK = 0.2
 _SUNK_COST = -float(np.log(_SHARE_SUNK / (1 - _SHARE_SUNK) / (len(_DROPS_MM) - 1)))  # nats
@@ -36,14 +37,14 @@ _SUNK_COST = -float(np.log(_SHARE_SUNK / (1 - _SHARE_SUNK) / (len(_DROPS_MM) - 1
 
 @dataclass(frozen=True)
 class Rear:
-    """How far the boundary lies below the work piece towards the pool's end (§7.2).
+    """Depth of the boundary below the work piece at the pool's rear (§7.2).
 
     Parameters
     ----------
     drop_mm
-        Depth at the end, mm; 0 for a boundary on the work piece all round.
+        Depth at the end, mm; 0 if the entire boundary is on the work piece.
     start_mm, end_mm
-        Where the boundary leaves the work piece, and where the pool's rear ends, along Y, mm.
+        Y where the boundary leaves the work piece, and where the pool's rear ends, mm.
     """
 
     drop_mm: float = 0.0
@@ -52,13 +53,13 @@ class Rear:
 
     @property
     def as_array(self) -> FloatArray:
-        """Drop, start and end for compiled functions, shape (3,), mm."""
+        """Drop, start and end as an array for compiled functions, shape (3,), mm."""
         return np.array([self.drop_mm, self.start_mm, self.end_mm])
 
     def height(self, y_mm: FloatArray) -> FloatArray:
-        """Height of the boundary at y, of the shape of ``y_mm``, mm: 0, falling as a parabola.
+        """Height of the boundary at y, of the shape of ``y_mm``, mm.
 
-        It falls towards the end, whichever side that is on.
+        It is 0 up to the start and decreases as a parabola towards the end, on whichever side.
         """
         share = np.maximum((self.start_mm - y_mm) / (self.start_mm - self.end_mm), 0.0)
         return -self.drop_mm * share**2
@@ -66,23 +67,23 @@ class Rear:
 
 @dataclass(frozen=True)
 class Level:
-    """Where z = 0 lies on a surface that is known up to its level.
+    """Level of a surface that is known up to a constant.
 
     Parameters
     ----------
     shift_mm
-        What to add to the surface's height, mm.
+        Shift to add to the surface's height, mm.
     sigma_mm
         Its standard uncertainty, mm.
     sign
-        +1 for a pool that stands above the work piece inside its boundary, −1 for one below.
+        +1 for a pool above the work piece inside its boundary, −1 for one below.
     rear
-        Where the boundary lies below the work piece.
+        Part of the boundary below the work piece.
     negative_log_likelihood
-        Of the rays near the boundary, being lit or dark: 0 where every lit one lands inside and
-        every dark one outside, or where no ray is known to be dark.
+        −log likelihood of the lit and dark rays near the boundary: 0 if every lit one lands inside
+        and every dark one outside, or if no ray is known to be dark.
     rays, rise_mm
-        How many these are; by how much the surface rises there from one ray to the next, mm.
+        Number of these rays; typical change of the height there from one ray to the next, mm.
     """
 
     shift_mm: float
@@ -95,18 +96,18 @@ class Level:
 
     @property
     def disagreement(self) -> float:
-        """Mean surprise of the rays near the boundary, bits; infinite where there are none."""
+        """Mean surprise of the rays near the boundary, bits; infinite if there are none."""
         return self.negative_log_likelihood / np.log(2) / self.rays if self.rays else np.inf
 
 
 @dataclass(frozen=True)
 class Witnesses(ReadOnlyArrays):
-    """Rays of which it is known whether they came back, m of them.
+    """The m rays of which it is known whether they came back.
 
     Parameters
     ----------
     landing_mm
-        Where they would land on z = 0, shape (m, 3), mm.
+        Landing points on z = 0, shape (m, 3), mm.
     sign
         +1 came back, −1 did not, shape (m,).
     spacing_mm
@@ -132,7 +133,7 @@ class Witnesses(ReadOnlyArrays):
         basis: SplineBasis,
         missing: float,
     ) -> Witnesses:
-        """Those of `Match.witness`, shape (rows, columns), that would land among some splines."""
+        """Select those of `Match.witness`, shape (rows, columns), within the spline domain."""
         landing = rays.landing_mm
         known = (witness != 0) & basis.contains(landing[..., 0], landing[..., 1])
         return cls(landing[known], witness[known], rays.spacing_mm, head_sign, missing)
@@ -144,7 +145,7 @@ class Witnesses(ReadOnlyArrays):
         drop_mm: float | None = None,
         about: tuple[float, int, float] | None = None,
     ) -> Level:
-        """Find the level of a surface of these splines (`find_level`)."""
+        """Find the level of a spline surface (`find_level`)."""
         from labapp.core.surface.kernels import spline_kernels
 
         there = spline_kernels.surface_at(basis.grid, coefficients, self.landing_mm)
@@ -154,9 +155,9 @@ class Witnesses(ReadOnlyArrays):
     def negative_log_evidence(
         self, basis: SplineBasis, coefficients: FloatArray, level: Level
     ) -> float:
-        """−log of the probability of who came back, over all levels near one and all blurs, nats.
+        """−log probability of the witnesses, marginalised over levels near one and blurs, nats.
 
-        The surface lies at that level; how its rear lies is held. A constant is left out.
+        The surface is at that level, and its rear is fixed. A constant is omitted.
         """
         from labapp.core.surface.kernels import level_kernels, spline_kernels
 
@@ -179,27 +180,27 @@ def find_level(
     """Find the level at which lit rays land inside the boundary and dark ones outside.
 
     A ray that lands a distance d inside the boundary came back with probability
-    1/(1 + exp(−d/s)), and then has a dot unless that is missing. Level, blur s and drop of the
-    rear are weighed on a grid; the level's mean and standard deviation are taken over it.
+    1/(1 + exp(−d/s)), and then has a dot unless that is missing. The posterior of level, blur s and
+    drop of the rear is evaluated on a grid, which gives mean and standard deviation of the level.
 
     Parameters
     ----------
     height, slope
-        Of the surface, up to its level, where m witnesses would land on z = 0: shape (m,), mm, and
-        gradients, shape (m, 2).
+        Heights, up to the level, and gradients of the surface at the landing points of m witnesses
+        on z = 0, shapes (m,), mm, and (m, 2).
     y
-        Where they would land along Y, shape (m,), mm.
+        Y of the landing points, shape (m,), mm.
     witness
         +1 lit, −1 dark, shape (m,).
     spacing_mm
         Distance between neighbouring landing points along X and along Y, shape (2,), mm.
     rear
         +1 where the head lies towards +Y and the rear towards −Y, −1 for the reverse
-        (`Rig.head_sign`); and how deep the rear lies, mm, None: found along with the level.
+        (`Rig.head_sign`); and the depth of the rear, mm, or None to find it along with the level.
     about
-        A level that is near, as its shift, mm, its sign, and how far from there the level may be,
-        in rises: heights by which the surface changes from one ray to the next. Where the grid's
-        ends are likely, a wider one is searched. None: all are tried.
+        Initial estimate of the level: its shift, mm, its sign, and the reach of the search in
+        rises, the typical change of the height from one ray to the next. If the ends of the grid
+        are likely, a wider one is searched. None: all levels are tried.
     missing
         Probability that a ray that came back has no dot (`Match.missing`).
     """
@@ -211,7 +212,7 @@ def find_level(
         *level_kernels.scan_levels(*seen, SCAN_LEVELS, _WIDEST_BLUR),
         1.0,
     )
-    # Only a pool that stands above the work piece is seen to sink at its rear.
+    # Only pools above the work piece have been observed to sink at the rear.
     some = _DROPS_MM if drop_mm is None and sign > 0 else np.array([drop_mm or 0.0])
     search = np.array([head_sign, shift, sign, reach, missing, _SUNK_COST])
     found, rays = level_kernels.search_level(*seen, search, some, _BLURS)
@@ -223,14 +224,14 @@ def find_level(
 
 
 def guess_level(height: FloatArray, outer: BoolArray) -> Level:
-    """Guess the level where no dark ray tells where the pool ends: the outer points lie at 0.
+    """Guess the level if no ray is dark: the mean height of the outer points is set to 0.
 
     Parameters
     ----------
     height
-        Of the surface at reflection points, up to its level, shape (n,), mm.
+        Heights of the surface at reflection points, up to the level, shape (n,), mm.
     outer
-        Which of them lie far from their middle, shape (n,).
+        Mask of the points far from their centre, shape (n,).
     """
     from labapp.core.surface.kernels import level_kernels
 

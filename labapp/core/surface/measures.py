@@ -22,12 +22,12 @@ RINGS = 16
 """Samples along each radius; Gauss–Legendre, so that smooth pools are integrated exactly."""
 
 STENCIL_MM = 0.1
-"""Half the size of the patch that an extreme is refined on."""
+"""Half the size of the patch on which an extreme is refined."""
 
 
 @dataclass(frozen=True)
 class ReflectionErrors(ReadOnlyArrays):
-    """How far the computed dots are from the captured ones, mapped onto the work piece.
+    """Distances of computed from captured dots, mapped onto the work piece.
 
     Parameters
     ----------
@@ -37,8 +37,8 @@ class ReflectionErrors(ReadOnlyArrays):
         The same without the first and the last row and both ends of each row (ARE-I, MRE-I of
         §6.4.2), mm; NaN if nothing is left.
     per_dot_mm
-        E_ij of each reflection point (Eq. 6-5), shape (n,), mm; NaN, and in none of the above,
-        where the ray does not meet the surface.
+        E_ij of each reflection point (Eq. 6-5), shape (n,), mm; NaN, and excluded from the above,
+        if the ray does not meet the surface.
     scale
         See `reflection_scale`, shape (2,).
     """
@@ -53,7 +53,7 @@ class ReflectionErrors(ReadOnlyArrays):
 
 @dataclass(frozen=True)
 class Measures:
-    """Measures of one pool. Lengths in mm, z over the work piece.
+    """Measures of one pool. Lengths in mm, z above the work piece.
 
     Parameters
     ----------
@@ -70,26 +70,26 @@ class Measures:
     center_x_mm, center_y_mm
         The "center point of the weld pool" (§7.2): origin of the boundary's polar coordinates.
     peak_x_mm, peak_y_mm
-        Where the surface is farthest from the work piece: the highest point of a convex pool,
-        the lowest of a concave one.
+        Point of the surface farthest from the work piece: the highest point of a convex pool, the
+        lowest of a concave one.
     width_sigma_mm, length_sigma_mm, height_sigma_mm, depth_sigma_mm
-        Standard uncertainties, by noise, level and set-up; NaN where the scheme gives none, and of
-        the depth where it is the boundary's.
+        Standard uncertainties due to noise, level and set-up; NaN if the scheme gives none, and for
+        a depth that is that of the boundary.
     area_sigma_mm2, volume_sigma_mm3
         The same of area and volume.
     width_sigma_level_mm … volume_sigma_level_mm3
-        The level's part of these six; NaN also in results of versions that did not keep it.
+        Part of the level in these six; NaN also in results of versions that did not store it.
     width_sigma_setup_mm … volume_sigma_setup_mm3
-        The set-up's part; NaN in results of versions whose ± were those of noise and level only.
+        Part of the set-up; NaN in results of versions whose ± included noise and level only.
     convexity_mm, asymmetry, wetting_slope_deg
-        See `shape_of`; NaN, as all that follows, in results of versions without them.
+        See `shape_of`; NaN, as are all that follow, in results of versions without them.
     convexity_sigma_mm … wetting_slope_sigma_setup_deg
-        Their standard uncertainties, and the level's and the set-up's part.
+        Their standard uncertainties, and the parts of level and set-up.
     own_are_mm
-        See `Reconstruction`; NaN where the scheme gives none.
+        See `Reconstruction`; NaN if the scheme gives none.
     scale_x, scale_z
-        What takes a residual along X′, Z′ to the error along X, Y on the work piece: W_p/W_r and
-        L_p/L_r (Eq. 6-5). NaN in results of versions that did not keep them.
+        Factors from a residual along X′, Z′ to the error along X, Y on the work piece: W_p/W_r and
+        L_p/L_r (Eq. 6-5). NaN in results of versions that did not store them.
     """
 
     are_mm: float
@@ -142,18 +142,18 @@ class Measures:
 
     @property
     def sizes(self) -> FloatArray:
-        """The six of `SIZES`, shape (6,), mm, mm², mm³."""
+        """Values of `SIZES`, shape (6,), mm, mm², mm³."""
         return np.array([getattr(self, name) for name in SIZES])
 
 
 SIZES = ("width_mm", "length_mm", "height_mm", "depth_mm", "area_mm2", "volume_mm3")
-"""The sizes, in the order of arrays."""
+"""Names of the sizes, in the order of arrays."""
 
 SHAPES = ("convexity_mm", "asymmetry", "wetting_slope_deg")
-"""What `shape_of` gives, in its order."""
+"""Names of the results of `shape_of`, in their order."""
 
 WITH_SIGMA = (*SIZES, *SHAPES)
-"""What has a standard uncertainty, in the order of arrays."""
+"""Names of the measures with a standard uncertainty, in the order of arrays."""
 
 
 def sigma_name(name: str, part: str = "") -> str:
@@ -185,7 +185,7 @@ def assemble_measures(
     center_mm: FloatArray,
     reconstruction: Reconstruction,
 ) -> Measures:
-    """Put errors, sizes and shape, shape (9,), peak, centre and the reconstruction's σ together."""
+    """Assemble errors, sizes and shape, shape (9,), peak, centre and σ of a reconstruction."""
     sigmas = {
         "": reconstruction.size_sigma,
         "level": reconstruction.size_sigma_level,
@@ -213,20 +213,20 @@ def assemble_measures(
 
 
 def reflection_scale(match: Match, rig: Rig) -> FloatArray:
-    """W_p/W_r and L_p/L_r: from the imaging plane to the work piece, shape (2,) (Eq. 6-7, 6-8).
+    """Scale W_p/W_r, L_p/L_r from imaging plane to work piece, shape (2,) (Eq. 6-7, 6-8).
 
-    The ranges of the projected dots on z = 0 along X and Y over those of the reflected dots along
-    X′ and Z′.
+    Ratios of the ranges of the projected dots on z = 0 along X and Y to those of the reflected dots
+    along X′ and Z′.
     """
     projected = project_rays(rig.laser, rig.pattern).landing_mm[tuple(match.ray.T - 1)][:, :2]
     return np.asarray(np.ptp(projected, axis=0) / np.ptp(match.plane_mm, axis=0))
 
 
 def reflection_errors(reconstruction: Reconstruction, match: Match, rig: Rig) -> ReflectionErrors:
-    """Reflection errors of any scheme's reconstruction (Eq. 6-3 … 6-8).
+    """Reflection errors of a reconstruction by any scheme (Eq. 6-3 … 6-8).
 
-    Only actual reflected dots count: the centre reference that IRS and ERS add is "not an actual
-    visible point" (§6.2), and its stand-in's error would say nothing.
+    Only actual reflected dots are included: the centre reference that IRS and ERS add is "not an
+    actual visible point" (§6.2), and the error of its substitute would be meaningless.
     """
     scale = reflection_scale(match, rig)
     error = np.hypot(*(reconstruction.residual_mm * scale).T)
@@ -243,7 +243,7 @@ def reflection_errors(reconstruction: Reconstruction, match: Match, rig: Rig) ->
 
 
 def inside_points(ray: IntArray) -> BoolArray:
-    """Which points are neither in the first or last row nor at an end of their row, shape (n,)."""
+    """Mask of points neither in the first or last row nor at an end of their row, shape (n,)."""
     order = np.lexsort(ray.T[::-1])
     row = ray[order, 0]
     first = np.concatenate([[True], row[1:] > row[:-1]])
@@ -261,7 +261,7 @@ def surface_sizes(surface: Surface, boundary: Boundary) -> tuple[FloatArray, Flo
     node, weight = np.polynomial.legendre.leggauss(RINGS)
     fraction = (node + 1) / 2
     samples = spoke_points(surface, boundary, fraction)
-    # ∫∫ z dA in triangles about the centre: each spoke stands for half of the two beside it.
+    # ∫∫ z dA over triangles about the centre: each spoke represents half of the two adjacent ones.
     volume = wedge @ (samples[..., 2] @ (weight * fraction))
     points = np.vstack([samples.reshape(-1, 3), outline])
     high = refined(surface.height, boundary, points[np.nanargmax(points[:, 2])], sign=1.0)
@@ -271,14 +271,14 @@ def surface_sizes(surface: Surface, boundary: Boundary) -> tuple[FloatArray, Flo
 
 
 def wedges(boundary: Boundary) -> FloatArray:
-    """Area that each boundary point stands for, shape (m,), mm²; the sum is the polygon's."""
+    """Area represented by each boundary point, shape (m,), mm²; the sum is the polygon's area."""
     x, y = (boundary.points_mm[:, :2] - boundary.center_mm).T
     after = (x * np.roll(y, -1) - y * np.roll(x, -1)) / 2
     return np.asarray((after + np.roll(after, 1)) / 2)
 
 
 def spoke_points(surface: Surface, boundary: Boundary, fraction: FloatArray) -> FloatArray:
-    """Surface points at fractions of the way from centre to boundary, shape (m, rings, 3)."""
+    """Surface points at fractions of the distance from centre to boundary, (m, rings, 3)."""
     offset = boundary.points_mm[:, None, :2] - boundary.center_mm
     xy = boundary.center_mm + fraction[:, None] * offset
     return np.concatenate([xy, surface.height(xy[..., 0], xy[..., 1])[..., None]], axis=-1)
@@ -288,7 +288,8 @@ _PATCH = STENCIL_MM * np.mgrid[-1:2, -1:2].reshape(2, 9)
 _PARABOLOID = np.linalg.pinv(
     np.stack([np.ones(9), *_PATCH, _PATCH[0] ** 2, _PATCH[0] * _PATCH[1], _PATCH[1] ** 2], axis=1)
 )[1:]
-"""Offsets of a patch's nine points; slopes and curvatures of the paraboloid through them."""
+"""Offsets of the nine points of a patch; matrix that gives the coefficients of the paraboloid
+fitted to their heights, without the constant."""
 
 
 def refined(
@@ -297,9 +298,9 @@ def refined(
     start_mm: FloatArray,
     sign: float,
 ) -> FloatArray:
-    """Extreme near a sample, shape (3,): the vertex of the paraboloid through a patch round it.
+    """Extreme near a sample, shape (3,): the vertex of a paraboloid fitted to a patch around it.
 
-    An extreme at the boundary, or where the patch has no vertex, stays where it is.
+    An extreme at the boundary, or whose paraboloid has no such vertex, is not changed.
     """
     z = height(start_mm[0] + _PATCH[0], start_mm[1] + _PATCH[1])
     if not np.isfinite(z).all():

@@ -1,4 +1,4 @@
-"""Points and triangles of a pool's surface within its boundary, for files and pictures."""
+"""Grid points and triangle mesh of a pool surface within its boundary, for files and figures."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from labapp.core.values import FloatArray, IntArray
 def grid_nodes(
     reconstruction: Reconstruction, spacing_mm: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Nodes within the boundary of a grid through the origin: x, y, z, each shape (n,), mm."""
+    """Nodes x, y, z of a grid through the origin within the boundary, shape (n,) each, mm."""
     boundary = reconstruction.boundary
     low = np.ceil(boundary.points_mm[:, :2].min(axis=0) / spacing_mm)
     high = np.floor(boundary.points_mm[:, :2].max(axis=0) / spacing_mm)
@@ -23,12 +23,12 @@ def grid_nodes(
 
 
 def surface_mesh(reconstruction: Reconstruction, spacing_mm: float) -> tuple[FloatArray, IntArray]:
-    """Triangles that end exactly at the boundary: rings of its shape about its centre.
+    """Triangle mesh that ends exactly at the boundary, made of scaled copies of the boundary.
 
     Parameters
     ----------
     reconstruction
-        What to mesh.
+        The reconstruction.
     spacing_mm
         Largest distance between rings, mm; along a ring there is a vertex per boundary point.
 

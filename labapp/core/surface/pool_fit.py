@@ -1,16 +1,17 @@
-"""`fit_pool`: one smooth surface through all reflections; matching and the scheme fit use it.
+"""Fit of one smooth surface to all reflections, for the matching and for the scheme fit.
 
-An iterated linear least-squares fit. It begins with the work piece, z = 0, or with a surface that
-is near. Each round
+The fit is an iterated linear least-squares problem. It starts from the work piece, z = 0, or from a
+given surface. Each round
 
-1. takes two slopes at each reflection point from the bisector of its ray and the direction to its
+1. computes two slopes at each reflection point from the bisector of its ray and the direction to
+its
    dot (Eq. 4-3);
-2. solves for the spline surface that best has these slopes, held smooth (`solver`);
-3. shifts it to its level, which slopes leave open (`level`);
+2. solves for the smooth spline surface that fits these slopes best (`solver`);
+3. shifts it to its level, which slopes do not determine (`level`);
 4. intersects the rays with it, which gives the next reflection points.
 
-Slopes are weighted by the inverse of the covariance that the dots' places on the imaging plane give
-them, so that it is the reflection residual there whose squares are least.
+Slopes are weighted by the inverse of their covariance, propagated from that of the dots on the
+imaging plane, so that the sum of squared residuals on the imaging plane is minimised.
 """
 
 from __future__ import annotations
@@ -35,20 +36,21 @@ from labapp.core.values import (
 )
 
 MARGIN_ROWS, LEAST_MARGIN_MM = 2.5, 2.0
-"""How far beyond the outermost reflection points the splines go on: in rows of rays, and at least,
-mm. Before the boundary is reached the torch may hide some, or dots miss the imaging plane: of a
-dense pattern that is as wide a strip of the pool, and more rows."""
+"""Margin of the splines beyond the outermost reflection points, in rows of rays, and its minimum,
+mm. Between these points and the boundary the torch may hide dots, or dots may miss the imaging
+plane; this strip of the pool has the same width for a dense pattern, but more rows."""
 
 MOST_SPLINES = 3000
-"""Rays that spread over more than these, 24 × 28 mm with knots 0.5 mm apart, are of no pool, but of
-a laser set up ten times too far away. Time grows with the square, and hypotheses are many."""
+"""Maximum number of splines, 24 × 28 mm with knots 0.5 mm apart. Rays that spread over more are not
+those of a pool, but of a laser set up ten times too far away. The time grows with the square of the
+number, and there are many hypotheses."""
 
 CORRELATED_MM2 = 1.0
 """Area over which a pool's third derivatives are correlated, mm²."""
 
 FIRST_REACH, LEVEL_REACH = 0.4, 0.3
-"""Reach of the search for a level (`find_level`) near that of a surface nearby, and near that of
-the round before."""
+"""Reach of the search for the level (`find_level`) around that of a given surface, and around that
+of the previous round."""
 
 NEWTON_STEPS = 4
 """Steps from a reflection point to that on the surface of the next round."""
@@ -61,15 +63,15 @@ class FitSettings:
     Parameters
     ----------
     rounds
-        Most rounds of the fit.
+        Maximum number of rounds of the fit.
     knot_mm
         Spacing of the spline knots, mm.
     jerk
         Expected third derivatives of the surface, mm⁻²: the smaller, the smoother.
     floor_mm
-        Added to the standard uncertainty of every dot on the imaging plane, in squares, mm.
+        Added in quadrature to the standard uncertainty of every dot on the imaging plane, mm.
     settled_mm
-        The rounds end when no reflection point moves by more.
+        The rounds end when no reflection point moves by more, mm.
     """
 
     rounds: int = 12
@@ -81,7 +83,7 @@ class FitSettings:
 
 @dataclass(frozen=True)
 class FittedPool(ReadOnlyArrays):
-    """A fitted surface, where the n matched rays meet it, and how well it is known.
+    """A fitted surface, its n reflection points, and its uncertainty.
 
     Parameters
     ----------
@@ -96,7 +98,7 @@ class FittedPool(ReadOnlyArrays):
     residual_mm
         Computed minus captured dot on the imaging plane (X′, Z′), shape (n, 2), mm.
     unsettled_mm
-        How far the reflection point that moved most moved in the last round, mm.
+        Largest displacement of a reflection point in the last round, mm.
     """
 
     surface: SplineSurface
@@ -125,7 +127,7 @@ class FittedPool(ReadOnlyArrays):
         return propagate_sigma(self.factor, gradients, self.mean_splines, self.level.sigma_mm)
 
     def free_sigma_of(self, gradients: FloatArray) -> FloatArray:
-        """The same without what the level adds."""
+        """Standard uncertainty of quantities without the part of the level."""
         return propagate_sigma(self.factor, gradients, self.mean_splines, 0.0)
 
 
@@ -139,18 +141,19 @@ def fit_pool(
     initial: SplineSurface | None = None,
     missing: float = 0.0,
 ) -> FittedPool:
-    """Fit the surface that turns each ray to its dot.
+    """Fit the surface that reflects each ray to its dot.
 
     Parameters
     ----------
     ray, plane_mm, plane_covariance_mm2, witness
-        Of n matched pairs, see `Match`. Without a dark ray in ``witness`` the level is guessed.
+        Data of n matched pairs, see `Match`. Without a dark ray in ``witness`` the level is
+        guessed.
     rig
-        The bench.
+        The rig.
     settings
         See `FitSettings`.
     initial
-        A surface to begin with: fewer rounds are needed where it is near. None: z = 0.
+        A surface to start from: fewer rounds are needed if it is close. None: z = 0.
     missing
         Probability that a ray that came back has no dot, for the level (`Match.missing`).
 
@@ -188,9 +191,9 @@ def normal_equations(
     plane_covariance_mm2: FloatArray,
     settings: FitSettings,
 ) -> NormalEquations:
-    """Normal equations of n dots on the plane, shape (n, 2), whose rays meet the surface nearby.
+    """Normal equations of n dots on the plane, shape (n, 2), for approximate reflection points.
 
-    Points nearby have shape (n, 3); the others are as in `fit_pool`.
+    These points have shape (n, 3); the other parameters are those of `fit_pool`.
     """
     from labapp.core.surface.kernels import ray_kernels
 
@@ -212,31 +215,31 @@ def rounds_with_level(
     raised_mm: float = 0.0,
     outer: BoolArray | None = None,
 ) -> Level:
-    """Run rounds of the fit, each with the level that the witnesses give; returns the last one.
+    """Run rounds of the fit with the level from the witnesses, and return the final level.
 
     Parameters
     ----------
     rounds
-        The fit, which is advanced.
+        The fit, which is modified.
     witnesses
-        Rays that tell the level.
+        Rays that determine the level.
     most, until_mm
         See `Rounds.run`.
     near
-        Level of a surface nearby, which the first search begins from. None: all are tried.
+        Initial estimate of the level for the first search. None: all levels are tried.
     drop_is_free
         Whether the drop of the rear is found along with the level, in the first half of the rounds.
-        Held, it leaves the level as open as it was before.
+        While it is fixed, the uncertainty of the level is not reduced.
     raised_mm
-        After a shift of the surface by less the level is not looked for again.
+        After a shift of the surface by less, the level is not determined again.
     outer
-        Which of the n reflection points lie far from their middle, shape (n,): the level is guessed
-        from these, where no witness is dark (`guess_level`).
+        Mask of the reflection points far from their centre, shape (n,), from which the level is
+        guessed if no witness is dark (`guess_level`).
 
     Raises
     ------
     CannotMeasure
-        ``no-surface`` if no surface has the slopes.
+        ``no-surface`` if no surface fits the slopes.
     """
     from labapp.core.surface.kernels import spline_kernels
 
@@ -250,7 +253,7 @@ def rounds_with_level(
             height = spline_kernels.surface_at(basis.grid, rounds.coefficients, rounds.points_mm)[0]
             level = guess_level(height, outer)
             return level.shift_mm
-        # The drop is held from half-way on, or the iteration may oscillate.
+        # The drop is fixed in the second half of the rounds, as the iteration may oscillate.
         is_held = not drop_is_free or 2 * count > most
         reach = LEVEL_REACH if count else FIRST_REACH
         found = witnesses.level(
@@ -268,13 +271,13 @@ def rounds_with_level(
 
 
 def _outer(places_mm: FloatArray) -> BoolArray:
-    """Which of n places, shape (n, 2), are farther from their middle than half of them."""
+    """Mask of the places, shape (n, 2), farther from their centre than the median distance."""
     from_middle = np.linalg.norm(places_mm - places_mm.mean(axis=0), axis=-1)
     return np.asarray(from_middle > median(from_middle))
 
 
 def fitted_pool(rounds: Rounds, level: Level, rig: Rig, plane_mm: FloatArray) -> FittedPool:
-    """Return what rounds with their level came to, for dots on the plane, shape (n, 2).
+    """Build the result of rounds with their level, for dots on the plane, shape (n, 2).
 
     Raises
     ------
@@ -295,14 +298,14 @@ def fitted_pool(rounds: Rounds, level: Level, rig: Rig, plane_mm: FloatArray) ->
 
 
 def basis_around(places_mm: FloatArray, rays: ProjectedRays, knot_mm: float) -> SplineBasis:
-    """Splines over places, shape (n, 2), mm, and as far beyond as a pool may go on.
+    """Splines over places, shape (n, 2), mm, with a margin for the rest of the pool.
 
     Parameters
     ----------
     places_mm
-        Reflection points, and what else is to be covered.
+        Reflection points, and other places to be covered.
     rays
-        The rays, whose spacing the margin follows.
+        The rays, whose spacing determines the margin.
     knot_mm
         Spacing of the spline knots, mm.
     """

@@ -1,4 +1,4 @@
-"""What every reconstruction scheme returns."""
+"""Result of a reconstruction scheme."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from labapp.core.surface.surface import Surface
 from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 
 ROUNDING = 1e-9
-"""Share of the way from the centre by which a place may lie beyond the boundary and be on it."""
+"""Relative tolerance of the distance from the centre for a point on the boundary."""
 
 
 @dataclass(frozen=True)
@@ -22,9 +22,9 @@ class BoundedSurface:
     Parameters
     ----------
     unbounded
-        The surface, which may go on beyond.
+        The surface, which may continue beyond the boundary.
     boundary
-        Where it ends.
+        The boundary.
     """
 
     unbounded: Surface
@@ -47,38 +47,38 @@ class BoundedSurface:
 
 @dataclass(frozen=True)
 class Reconstruction(ReadOnlyArrays):
-    """A pool surface and how far it explains the reflected dots.
+    """A pool surface, and the residuals of the reflected dots.
 
     Parameters
     ----------
     scheme
-        Which scheme made it.
+        Name of the scheme.
     surface
-        z = f(x, y); NaN outside the boundary, whatever surface it is made with (`unbounded`).
+        z = f(x, y); NaN outside the boundary. The surface that is passed may be unbounded.
     boundary
         The pool's boundary.
     ray
         Ray (i, j) of each reflection point, counted from 1, shape (n, 2).
     points_mm
-        Reflection points, UCS, shape (n, 3), mm. Those of IRS and ERS are where the scheme put
-        them; `surface`, which the boundary holds too, need not pass through them.
+        Reflection points, UCS, shape (n, 3), mm. For IRS and ERS they are those of the scheme;
+        `surface`, which also interpolates the boundary, need not pass through them.
     residual_mm
-        Computed minus captured reflected dot on the imaging plane (X′, Z′), shape (n, 2), mm:
-        where the ray goes from `surface`; NaN if it does not meet it within the boundary.
+        Computed minus captured reflected dot on the imaging plane (X′, Z′), shape (n, 2), mm,
+        computed with `surface`; NaN if the ray does not meet it within the boundary.
     sigma_mm
-        Standard uncertainty of each reflection point's height, noise and level only, shape (n,),
-        mm; NaN where the scheme gives none.
+        Standard uncertainty of each reflection point's height due to noise and level, shape (n,),
+        mm; NaN if the scheme gives none.
     size_sigma
-        Standard uncertainty of each of `measures.WITH_SIGMA`, shape (9,); NaN where the scheme
-        gives none. Of shape (6,), as in files of versions without the last three, it is extended.
+        Standard uncertainty of each of `measures.WITH_SIGMA`, shape (9,); NaN if the scheme gives
+        none. Shape (6,), as in files of versions without the last three, is extended by NaN.
     size_sigma_level
-        The level's part of that, shape (9,). In frames that follow on each other it is much the
-        same error (`core.sequence.mean`).
+        Part of the level, shape (9,). It is nearly the same error in consecutive frames
+        (`core.sequence.mean`).
     size_sigma_setup
-        The set-up's part, shape (9,): the same error in all frames of a recording.
+        Part of the set-up, shape (9,): the same error in all frames of a recording.
     own_are_mm
-        ARE of the points as the scheme has them, with the surface through nothing else (step 4 of
-        §6.3.1 and §7.1), mm, as the dissertation defines it. NaN for fit, whose points lie on it.
+        ARE of the scheme's points with the surface through these alone (step 4 of §6.3.1 and §7.1),
+        mm, as the dissertation defines it. NaN for fit, whose points lie on its surface.
     """
 
     scheme: str
@@ -102,5 +102,5 @@ class Reconstruction(ReadOnlyArrays):
 
     @property
     def unbounded(self) -> Surface:
-        """The surface as the scheme made it, which may go on beyond the boundary."""
+        """The surface of the scheme, which may continue beyond the boundary."""
         return self.surface.unbounded if isinstance(self.surface, BoundedSurface) else self.surface

@@ -1,11 +1,11 @@
 """The set-up's part of the uncertainty of sizes, by linear propagation (JCGM 100, 5.1.2).
 
 The bench is perturbed by each column of a square root of its covariance, with the rays and the
-witnesses that the fit had. A column is a quantity's standard uncertainty or, where quantities are
+witnesses of the fit. A column is the standard uncertainty of a quantity or, if quantities are
 correlated, one of the independent error components. The surface responds linearly: its coefficients
 solve the normal equations, so that their change follows from that of the right-hand side (implicit
-differentiation). The level responds to few rays, in steps: it is found anew with the bench
-perturbed either way, and half the difference is taken, over ± one standard uncertainty.
+differentiation). The level depends on few rays and responds in steps: it is determined again with
+the bench perturbed by plus and minus one standard uncertainty, and half the difference is used.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ ROUNDS = 3
 """Rounds in which the reflection points follow the surface: the remaining error is 0.1 %."""
 
 SHARE = 1e-4
-"""Share of a column by which the bench is off for the change of the right-hand side: where
-reflection points go far from those of the factor, weakly determined modes diverge. For the same
-reason the factor is not the fit's, which followed frames reuse while points hardly move."""
+"""Share of a column by which the bench is perturbed for the change of the right-hand side: if
+reflection points move far from those of the factor, weakly determined modes diverge. For the same
+reason the factor of the fit is not used, which followed frames reuse while points hardly move."""
 
 NEWTON_STEPS = 8
-"""From where a ray lands on the work piece to where it meets the surface."""
+"""Newton steps from the landing point of a ray on the work piece to the surface."""
 
 Perturbed = tuple[Rig, FloatArray]
-"""A rig, and where the dots are on its plane, shape (n, 2), mm."""
+"""A rig, and the dots on its imaging plane, shape (n, 2), mm."""
 
 REACH = 0.6
-"""Reach of the search for the level (`find_level`) about that of the surface as it was."""
+"""Reach of the search for the level (`find_level`) around that of the unperturbed surface."""
 
 
 def setup_changes(
@@ -49,17 +49,17 @@ def setup_changes(
     Parameters
     ----------
     match, rig, settings
-        What was fitted, with what.
+        Input of the fit.
     pool
-        What came of it, p splines.
+        Result of the fit, with p splines.
     gradient
         Derivatives of m sizes by the spline coefficients, shape (m, p).
 
     Returns
     -------
     FloatArray
-        Shape (m, q), in the sizes' units; the causes are the columns of `RigUncertainty.root`. None
-        where the rig is known exactly.
+        Shape (m, q), in the units of the sizes, one column per column of `RigUncertainty.root`; q
+        is 0 if the rig is known exactly.
     """
     known = rig.uncertainty
     if known is None:
@@ -96,13 +96,13 @@ def residual_changes(
 ) -> FloatArray:
     """Changes of a fit's residuals due to each independent error component of the bench.
 
-    The surface is fitted anew. Rays, dots and covariance are those of n pairs, see `Match`; the rig
-    has its uncertainty.
+    The surface is refitted. Rays, dots and covariance are those of n pairs, see `Match`; the rig
+    must have an uncertainty.
 
     Returns
     -------
     FloatArray
-        Shape (n, 2, q), mm; the causes are the columns of `RigUncertainty.root`.
+        Shape (n, 2, q), mm, with one entry per column of `RigUncertainty.root`.
     """
     from labapp.core.surface.kernels import ray_kernels
 
@@ -130,7 +130,7 @@ def _response(
     pool: FittedPool,
     benches: Sequence[Perturbed],
 ) -> FloatArray:
-    """Changes of a fit's p coefficients on q benches perturbed a little, shape (p, q), mm."""
+    """Changes of a fit's p coefficients for q slightly perturbed benches, shape (p, q), mm."""
     from labapp.core.surface.kernels import solver_kernels, spline_kernels
 
     points, surface = pool.points_mm, pool.surface
@@ -142,7 +142,7 @@ def _response(
     def right_side(
         points_mm: FloatArray, laser_mm: FloatArray, plane: FloatArray, dots_mm: FloatArray
     ) -> FloatArray:
-        """Right-hand side of the equations with the surface as it is, shape (p,)."""
+        """Right-hand side of the equations for the given surface, shape (p,)."""
         at = grid, coefficients, points_mm, own.weights
         return solver_kernels.gradient_rhs(*at, laser_mm, plane, dots_mm)
 
@@ -158,15 +158,15 @@ def _response(
         rises = rays / (rays[:, 2] - np.vecdot(np.transpose(slopes), rays[:, :2]))[:, None]
         for _ in range(ROUNDS):
             raised = spline_kernels.surface_at(grid, changes[k], there)[0][:, None]
-            asked = right_side(there + raised * rises, *seen) - base
-            changes[k] = solver_kernels.solve(factor, asked[None])[0]
-            # Slopes leave the level open.
+            change = right_side(there + raised * rises, *seen) - base
+            changes[k] = solver_kernels.solve(factor, change[None])[0]
+            # Slopes do not determine the level.
             changes[k] -= spline_kernels.surface_at(grid, changes[k], there)[0].mean()
     return changes.T
 
 
 def bench_off(rig: Rig, offset: FloatArray, plane_mm: FloatArray) -> Perturbed:
-    """The rig with its quantities off by an offset, shape (q,); the dots on its plane, mm."""
+    """Perturb the quantities of a rig by an offset, shape (q,), and the dots on its plane, mm."""
     assert rig.uncertainty is not None
     dots = moved_dots(plane_mm, rig, rig.uncertainty.axes, offset)
     return aimed_as(rig.laser, moved_rig(rig, offset)), dots

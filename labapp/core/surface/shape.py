@@ -1,8 +1,8 @@
-"""Shape of a pool's surface as numbers: what later work takes penetration from.
+"""Shape parameters of a pool's surface, from which later work estimates penetration.
 
 Width, length and convexity together predicted the width of the back-side bead best (W. J. Zhang et
 al., "Characterization of Three-Dimensional Weld Pool Surface in GTAW", Weld. J. 91 (2012) 195-s).
-Asymmetry and slope at the boundary tell of a torch beside the joint, of undercut and of wetting.
+Asymmetry and slope at the boundary indicate a torch beside the joint, undercut and wetting.
 """
 
 from __future__ import annotations
@@ -18,13 +18,13 @@ from labapp.core.surface.surface import Surface
 from labapp.core.values import FloatArray
 
 RIM = 0.99
-"""Share of the way from the centre to the boundary where its slope is taken."""
+"""Fraction of the distance from centre to boundary at which the slope is evaluated."""
 
 SPOKES = 48
 """Directions from the middle of the boundary, the first along −Y; a multiple of 4."""
 
 STEP_MM = 0.01
-"""Of the differences for the derivatives of slopes."""
+"""Step of the finite differences of slopes."""
 
 _NODE, _WEIGHT = np.polynomial.legendre.leggauss(8)
 FRACTION, WEIGHT = (_NODE + 1) / 2, _WEIGHT / 2
@@ -34,23 +34,23 @@ _ENDS = [0, SPOKES // 2]
 """Spokes along the longitudinal section: towards −Y and +Y."""
 
 _RIGHT = (1 + np.sign(np.round(_WAY[:, :1], 9))) / 2
-"""What of each spoke counts as right of that section, shape (SPOKES, 1)."""
+"""Share of each spoke that is right of that section, shape (SPOKES, 1)."""
 
 
 def shape_of(surface: Surface, boundary: Boundary) -> FloatArray:
     """Return convexity (mm), asymmetry and wetting slope (°) of a surface, shape (3,).
 
     * Convexity: mean height of the longitudinal section through the middle of the boundary, its
-      area over its length. Negative of a concave pool.
+      area over its length. Negative for a concave pool.
     * Asymmetry: volume between surface and work piece right of that section (+X) minus that left
-      of it, over both; hollows count as heights.
-    * Wetting slope: angle of the surface to the work piece at the boundary, the mean along it;
-      positive where the surface rises inwards.
+      of it, over their sum; volumes below the work piece are positive too.
+    * Wetting slope: mean angle along the boundary between the surface and the work piece; positive
+      if the surface rises inwards.
 
     Parameters
     ----------
     surface
-        It has a height and a slope everywhere within the boundary.
+        Surface that is defined everywhere within the boundary.
     boundary
         The pool's boundary.
     """
@@ -85,7 +85,7 @@ def shape_and_gradients(
     )
     gradients = []
     for places, shares, by_middle in terms:
-        # The middle of the boundary moves by half of what each side of it does.
+        # The middle of the boundary moves by half the displacement of each side.
         every = np.concatenate([*places, outline[extremes, :2]])
         share = np.concatenate([*shares, by_middle * half])
         gradients.append(
@@ -96,7 +96,7 @@ def shape_and_gradients(
 
 @dataclass(frozen=True)
 class _Evaluated:
-    """A spline surface within its rectangle, by the compiled kernels."""
+    """A spline surface within its rectangle, evaluated by the compiled kernels."""
 
     basis: SplineBasis
     coefficients: FloatArray
@@ -121,7 +121,7 @@ each; and the derivative by X of the boundary's middle."""
 
 @dataclass(frozen=True)
 class _Samples:
-    """A surface sampled on spokes from the middle of its boundary, and beside the boundary.
+    """Samples of a surface on spokes from the middle of its boundary, and next to the boundary.
 
     Parameters
     ----------
@@ -130,8 +130,9 @@ class _Samples:
     place_mm, height_mm
         Shape (s, r, 2) and (s, r).
     length_mm, inward, rim_mm, rise
-        At each of m boundary points: the boundary's part that it stands for, shape (m,); the
-        normal and the place where the slope is taken, shape (m, 2); that slope, shape (m,).
+        At each of m boundary points: the length of boundary that it represents, shape (m,); the
+        inward normal and the place where the slope is evaluated, shape (m, 2); the slope, shape
+        (m,).
     """
 
     middle_mm: FloatArray
@@ -159,13 +160,13 @@ class _Samples:
 
     @property
     def section_mm(self) -> tuple[FloatArray, FloatArray]:
-        """Places along the longitudinal section, shape (2r, 2), and lengths that they stand for."""
+        """Places along the longitudinal section, shape (2r, 2), and lengths they represent."""
         lengths = self.reach_mm[_ENDS][:, None] * WEIGHT
         return self.place_mm[_ENDS].reshape(-1, 2), lengths.ravel()
 
     @property
     def area_mm2(self) -> FloatArray:
-        """Area that each sample stands for, shape (s, r)."""
+        """Area represented by each sample, shape (s, r)."""
         return self.reach_mm[:, None] ** 2 * (WEIGHT * FRACTION) * (2 * np.pi / SPOKES)
 
     @cached_property
@@ -194,14 +195,14 @@ def _around(
 
 
 def _moved(boundary_slope: FloatArray) -> FloatArray:
-    """How boundary points move per mm that the surface rises, shape (m, 2): −∇h/|∇h|²."""
+    """Displacement of boundary points per mm of rise of the surface, shape (m, 2): −∇h/|∇h|²."""
     return np.asarray(-boundary_slope / np.sum(boundary_slope**2, axis=1)[:, None])
 
 
 def _convexity_terms(
     samples: _Samples, surface: Surface, boundary: Boundary, boundary_slope: FloatArray
 ) -> _Terms:
-    """Its ends stay on the boundary as the section moves aside with the middle."""
+    """Terms of the convexity; the ends of the section stay on the boundary as the middle moves."""
     places, lengths = samples.section_mm
     middle, length = samples.middle_mm, lengths.sum()
     ends = middle + samples.reach_mm[_ENDS][:, None] * _WAY[_ENDS]
@@ -213,14 +214,14 @@ def _convexity_terms(
 
 
 def _asymmetry_terms(samples: _Samples, boundary: Boundary, boundary_slope: FloatArray) -> _Terms:
-    """The section that divides the volume moves with the middle."""
+    """Terms of the asymmetry; the section that divides the volume moves with the middle."""
     outline, middle, lean = boundary.points_mm, samples.middle_mm, samples.shape[1]
     height, area = samples.height_mm, samples.area_mm2
     total = np.sum(area * np.abs(height))
     right = (1 + np.sign(outline[:, 0] - middle[0])) / 2
     outwards = -np.sum(samples.inward * _moved(boundary_slope), axis=1)
     outwards *= np.abs(outline[:, 2]) * samples.length_mm
-    # Of the right side 1 − asymmetry counts, of the left −(1 + asymmetry).
+    # The weight of the right side is 1 − asymmetry, that of the left −(1 + asymmetry).
     within = ((2 * _RIGHT - 1 - lean) * area * np.sign(height)).ravel() / total
     across = samples.section_mm[1] @ np.abs(height[_ENDS]).ravel()
     places = [samples.place_mm.reshape(-1, 2), outline[:, :2]]
@@ -230,7 +231,7 @@ def _asymmetry_terms(samples: _Samples, boundary: Boundary, boundary_slope: Floa
 def _wetting_terms(
     samples: _Samples, surface: Surface, boundary: Boundary, boundary_slope: FloatArray
 ) -> _Terms:
-    """The surface turns; the boundary moves to where it is steeper or less, and its parts grow."""
+    """Terms of the wetting slope: tilt of the surface, and displacement of the boundary."""
     length, rise, moved = samples.length_mm, samples.rise, _moved(boundary_slope)
     step = STEP_MM * samples.inward
     more, less = samples.rim_mm + step, samples.rim_mm - step

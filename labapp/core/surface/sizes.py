@@ -1,4 +1,4 @@
-"""Sizes of a fitted surface, and their derivatives by its coefficients (for their uncertainty)."""
+"""Sizes of a fitted surface, and their derivatives by its coefficients for their uncertainty."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from labapp.core.values import FloatArray
 
 _NODE, WEIGHT = np.polynomial.legendre.leggauss(measures.RINGS)
 FRACTION = (_NODE + 1) / 2
-"""Gauss–Legendre weights of the samples on the way from the centre to a boundary point, and their
-places as fractions of that way."""
+"""Gauss–Legendre weights of the samples on a spoke from the centre to a boundary point, and their
+positions as fractions of its length."""
 
 STRIDE = 4
-"""Every fourth boundary point has a spoke of samples: the surface is smooth."""
+"""Stride over boundary points: every fourth one has a spoke, as the surface is smooth."""
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """Width, length, height, depth, area and volume, and how they change with the splines.
+    """Width, length, height, depth, area and volume, and their derivatives.
 
     Parameters
     ----------
     size
-        In this order, shape (6,), mm, mm², mm³.
+        The sizes in this order, shape (6,), mm, mm², mm³.
     peak_mm
-        Where the surface is farthest from the work piece, shape (2,).
+        (x, y) where the surface is farthest from the work piece, shape (2,).
     gradient
-        Derivatives by the spline coefficients, shape (6, p). NaN of the depth of a pool that stands
-        above the work piece, where it is its boundary's: that is assumed to be a parabola at the
-        rear, and not measured.
+        Derivatives by the spline coefficients, shape (6, p). NaN for the depth of a pool above the
+        work piece if the lowest point is on the boundary, whose rear is assumed to be a parabola
+        and not measured.
     holds
-        Whether the surface is on one side of the boundary's height from the centre to it.
+        Whether the surface is on one side of the boundary's height between centre and boundary.
     """
 
     size: FloatArray
@@ -52,9 +52,9 @@ def sizes_and_gradients(
     boundary: Boundary,
     boundary_slope: FloatArray,
 ) -> Sizes:
-    """Measure a surface within its boundary as `measures.surface_sizes` does, with fewer samples.
+    """Compute `measures.surface_sizes` with fewer samples, and the derivatives.
 
-    ``boundary_slope`` is that of `boundary_trace`, shape (m, 2).
+    ``boundary_slope``, shape (m, 2), is returned by `trace_boundary`.
     """
     from labapp.core.surface.kernels import outline_kernels, spline_kernels
 
@@ -71,7 +71,7 @@ def sizes_and_gradients(
     extremes, changes = [], np.zeros((2, len(coefficients)))
     for sign, change in zip((1.0, -1.0), changes, strict=True):
         within, extreme = (places[np.argmax(sign * places[:, 2])] for places in (samples, outline))
-        # On the boundary an extreme stays where it is; within it may lie between samples.
+        # An extreme on the boundary is not refined; one within it may lie between samples.
         if sign * within[2] >= sign * extreme[2]:
             extreme = measures.refined(height, boundary, within, sign)
             change[:] = spline_kernels.gradient_of_sum(
@@ -87,7 +87,7 @@ def sizes_and_gradients(
     width, length = np.ptp(outline[:, :2], axis=0)
     area, volume = share.sum(), share @ samples[:, 2]
     above = (level.sign * over > 0).reshape(-1, len(FRACTION))
-    # The middle of a dented pool may lie lower; nothing lies lower farther out than it.
+    # The middle of a dented pool may lie below the boundary's height, but no part farther out may.
     entered = np.maximum.accumulate(above, axis=1)
     return Sizes(
         np.array([width, length, high[2], low[2], area, volume]),

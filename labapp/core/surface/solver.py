@@ -1,9 +1,9 @@
-"""The normal equations of the fit: the update of a surface that the dots require.
+"""Normal equations of the fit.
 
-The normal matrix of the spline coefficients is a band, so that its Cholesky factor costs little.
-With one factor several rounds of the fit are solved: each takes the slopes where the rays now meet
-the surface, and solves for the remaining residual. Rounds end at the same surface whatever factor
-they are solved with.
+The normal matrix of the spline coefficients is banded, so that its Cholesky factor is cheap to
+compute. One factor is used for several rounds of the fit: each evaluates the slopes at the current
+reflection points, and solves for the remaining residual. The rounds converge to the same surface
+whatever factor is used.
 """
 
 from __future__ import annotations
@@ -17,13 +17,16 @@ from labapp.core.surface.spline import SplineBasis, SplineSurface
 from labapp.core.values import CannotMeasure, FloatArray
 
 REUSE_MM = 5e-3
-"""By default a factor is used again where no reflection point has moved by more: that is small
-beside the splines' cells."""
+"""By default a factor is reused if no reflection point has moved by more, which is small compared
+with the cells of the splines."""
+
+
+NO_SURFACE = "no surface has the slopes that the dots require"
 
 
 @dataclass
 class NormalEquations:
-    """Normal equations of n rays that meet a surface of p splines, and their dots.
+    """Normal equations of n rays and their dots for a surface of p splines.
 
     Parameters
     ----------
@@ -36,12 +39,12 @@ class NormalEquations:
     dots_mm
         The dots in the UCS, shape (n, 3), mm.
     weights
-        Inverse covariance of the slopes that the dots ask for, shape (n, 2, 2).
+        Inverse covariance of the slopes that follow from the dots, shape (n, 2, 2).
     factor
-        Cholesky factor of the normal matrix (`normal_factor`); None: not known yet.
+        Cholesky factor of the normal matrix (`normal_factor`); None: not computed yet.
     reuse_mm
-        The factor is used again where no reflection point has moved by more. With an
-        outdated one weakly determined modes diverge, the sooner the smaller the σ of the dots.
+        The factor is reused if no reflection point has moved by more. With an outdated factor
+        weakly determined modes diverge, the sooner the smaller the σ of the dots.
     """
 
     basis: SplineBasis
@@ -62,24 +65,25 @@ class NormalEquations:
     ) -> FloatArray:
         """Coefficients after one step of the fit, shape (p,), mm: one linear least-squares problem.
 
-        The reflection points stay where they are; the slopes there become those that turn the rays
-        to their dots, as far as roughness allows. The mean height of the points stays.
+        The reflection points and their mean height are fixed. The slopes there become those that
+        reflect the rays to their dots, as far as the roughness penalty allows.
 
         Parameters
         ----------
         coefficients
-            The surface so far, shape (p,), mm.
+            The current surface, shape (p,), mm.
         points_mm
-            Where the rays meet it, shape (n, 3), mm.
+            The reflection points on it, shape (n, 3), mm.
         moved_mm
-            How far the farthest of these moved in the last round, mm.
+            Largest displacement of these in the last round, mm.
         smooth_about
-            Coefficients of a surface the difference to which is held smooth; 0: the surface itself.
+            Coefficients of a surface; the roughness of the difference from it is penalised. 0: that
+            of the surface itself.
 
         Raises
         ------
         CannotMeasure
-            ``no-surface`` if the slopes do not settle the surface.
+            ``no-surface`` if the slopes do not determine the surface.
         """
         from labapp.core.surface.kernels import solver_kernels
 
@@ -99,23 +103,23 @@ class NormalEquations:
 
 @dataclass
 class Rounds:
-    """Rounds of the fit of n rays to their dots, and how far they have come.
+    """Rounds of the fit of n rays to their dots, and their current state.
 
-    Each solves for the surface that has the slopes at the reflection points as they are, and moves
+    Each round solves for the surface with the slopes at the current reflection points, and moves
     these along their rays to it.
 
     Parameters
     ----------
     equations
-        Of the dots.
+        The normal equations.
     rays
-        Their rays' unit directions, shape (n, 3).
+        Unit directions of the rays, shape (n, 3).
     coefficients
-        The surface so far, shape (p,), mm.
+        The current surface, shape (p,), mm.
     points_mm
-        Where the rays meet it, shape (n, 3), mm.
+        The reflection points on it, shape (n, 3), mm.
     moved_mm
-        How far the reflection point that moved most moved in the last round, mm.
+        Largest displacement of a reflection point in the last round, mm.
     """
 
     equations: NormalEquations
@@ -137,20 +141,21 @@ class Rounds:
         Parameters
         ----------
         most
-            How many rounds at most.
+            Maximum number of rounds.
         until_mm
             See above, mm.
         newton_steps
-            Steps from a reflection point to the surface of the next round.
+            Newton steps from a reflection point to the surface of the next round.
         smooth_about
             See `NormalEquations.step`.
         shift
-            What to add to the surface's height in a round, counted from 0, mm.
+            Function of the number of the round, counted from 0, that returns the shift to add to
+            the surface's height, mm.
 
         Raises
         ------
         CannotMeasure
-            ``no-surface`` if the slopes do not settle the surface.
+            ``no-surface`` if the slopes do not determine the surface.
         """
         from labapp.core.surface.kernels import solver_kernels
 
@@ -163,7 +168,7 @@ class Rounds:
                 grid, self.coefficients, self.rays, self.points_mm, newton_steps
             )
             if np.isnan(self.moved_mm):
-                raise CannotMeasure("no-surface", "no surface has the slopes that the dots ask for")
+                raise CannotMeasure("no-surface", NO_SURFACE)
             if self.moved_mm < until_mm:
                 break
 
@@ -173,7 +178,8 @@ def normal_factor(
 ) -> FloatArray:
     """Cholesky factor of the normal matrix of slopes at points, lower band, shape (width + 1, p).
 
-    Slopes leave the level open; it is held by the spline in their middle, which moves nothing else.
+    Slopes do not determine the level; it is fixed by the spline in their middle, which affects
+    nothing else.
 
     Parameters
     ----------
@@ -193,7 +199,7 @@ def normal_factor(
 
     lower, has_one = solver_kernels.normal_factor(basis.grid, stiffness, points_mm, weights)
     if not has_one:
-        raise CannotMeasure("no-surface", "no surface has the slopes that the dots ask for")
+        raise CannotMeasure("no-surface", NO_SURFACE)
     return lower
 
 
@@ -212,8 +218,8 @@ def propagate_sigma(
     gradients
         Derivatives by the spline coefficients.
     mean_splines
-        Mean value of each spline over the reflection points, shape (p,): slopes give the surface
-        but for its mean there.
+        Mean value of each spline over the reflection points, shape (p,): slopes determine the
+        surface up to its mean there.
     level_sigma_mm
         Standard uncertainty of the level, mm.
     """
@@ -228,14 +234,14 @@ def propagate_sigma(
 
 @dataclass(frozen=True)
 class SlopeFit:
-    """The surface that best has given slopes, up to its level.
+    """Least-squares surface through given slopes, up to its level.
 
     Parameters
     ----------
     surface
         The surface, its mean height over the points 0.
     factor
-        Cholesky factor of the normal matrix with one spline held, lower band, shape
+        Cholesky factor of the normal matrix with one spline fixed, lower band, shape
         (width + 1, splines).
     mean_splines
         Mean value of each spline over the points, shape (splines,).
@@ -246,7 +252,7 @@ class SlopeFit:
     mean_splines: FloatArray
 
     def sigma_of(self, gradients: FloatArray) -> FloatArray:
-        """Standard uncertainty of quantities that the level does not change, shape (m,)."""
+        """Standard uncertainty of quantities that do not depend on the level, shape (m,)."""
         return propagate_sigma(self.factor, gradients, self.mean_splines, 0.0)
 
 
@@ -262,21 +268,21 @@ def fit_slopes(
     Parameters
     ----------
     basis
-        Splines to build it of.
+        The splines.
     points_mm
-        Where the slopes are known, (x, y), shape (n, 2), mm; held to the basis's rectangle.
+        Points of the slopes, (x, y), shape (n, 2), mm, within the rectangle of the basis.
     slopes
         (∂z/∂x, ∂z/∂y) there, shape (n, 2).
     weights
         Inverse of each slope's covariance, shape (n, 2, 2).
     stiffness
-        Weight of the roughness, mm⁶: the area over which the third derivatives go together, over
+        Weight of the roughness, mm⁶: the area over which the third derivatives are correlated, over
         their expected variance.
 
     Raises
     ------
     CannotMeasure
-        ``no-surface`` if the slopes do not settle the surface.
+        ``no-surface`` if the slopes do not determine the surface.
     """
     from labapp.core.surface.kernels import solver_kernels, spline_kernels
 

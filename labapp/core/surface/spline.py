@@ -1,7 +1,7 @@
-"""A smooth pool surface in splines.
+"""Smooth pool surface represented by splines.
 
-The basis holds a dent under the torch and an oscillating pool; the penalty on the change of
-curvature keeps it from running away where no ray came back (there it goes on as a quadric).
+The basis can represent a dent under the torch and an oscillating pool. The penalty on the change of
+curvature makes the surface continue as a quadric where no ray came back.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 
 DEGREE = 3
 
-# The four cubic splines over one cell, as polynomials of the place t in it, 0 … 1: row k holds the
-# coefficients of tᵏ. The next tables are their derivatives by t.
+# The four cubic splines over one cell, as polynomials of the local coordinate t, 0 … 1: row k holds
+# the coefficients of tᵏ. The next tables are their derivatives by t.
 _CUBICS = np.array([[1, 4, 1, 0], [-3, 0, 3, 0], [3, -6, 3, 0], [-1, 3, -3, 1]]) / 6
 _PIECES = [_CUBICS]
 for _ in range(DEGREE):
@@ -35,7 +35,7 @@ class Cells:
         The 4 × 4 splines that are not zero in each, as columns of `SplineBasis.matrix`, x first,
         shape (n, 16).
     power
-        Powers 0 … 3 of the place in the cell along x and along y, shape (2, n, 4).
+        Powers 0 … 3 of the local coordinate along x and along y, shape (2, n, 4).
     step_mm
         Size of a cell along x and along y, shape (2,), mm.
     """
@@ -64,10 +64,7 @@ class Cells:
 
 @lru_cache(maxsize=16)
 def _values_and_slopes(*step_mm: float) -> FloatArray:
-    """Pieces of the splines and, beside them, of their derivatives, a cell's size each, (2, 4, 8).
-
-    Kept, as a basis is asked thousands of times.
-    """
+    """Polynomials of the splines and of their derivatives for each cell size, shape (2, 4, 8)."""
     pieces = np.stack([np.hstack([_PIECES[0], _PIECES[1] / step]) for step in step_mm])
     pieces.flags.writeable = False
     return pieces
@@ -75,9 +72,9 @@ def _values_and_slopes(*step_mm: float) -> FloatArray:
 
 @lru_cache(maxsize=256)
 def _products(count: int) -> FloatArray:
-    """∫ of the products of the derivatives, of order 0 … 3, of so many splines along an axis.
+    """Integrals of products of the derivatives, of order 0 … 3, of splines along an axis.
 
-    In cells of size 1; of each spline with itself and the next three, shape (4, count, 4).
+    For cells of size 1, and for each spline with itself and the next three, shape (4, count, 4).
     """
     node, weight = np.polynomial.legendre.leggauss(DEGREE + 1)
     power = ((node + 1) / 2)[:, None] ** np.arange(DEGREE + 1)
@@ -106,7 +103,7 @@ class SplineBasis(ReadOnlyArrays):
     y_knots: FloatArray
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Leave what is kept of earlier calls behind: it is many times larger."""
+        """Exclude cached results from pickling, as they are many times larger."""
         return SplineBasis, (self.x_knots, self.y_knots)
 
     @classmethod
@@ -153,7 +150,7 @@ class SplineBasis(ReadOnlyArrays):
         return np.column_stack([self.low_mm, self.high_mm, self.step_mm, cells])
 
     def cells(self, x_mm: FloatArray, y_mm: FloatArray) -> Cells:
-        """Find the cells of points, each shape (n,); the outermost go on beyond the rectangle."""
+        """Find the cells of points, each shape (n,); the outermost extend beyond the rectangle."""
         nx, ny = self.shape
         place = (np.array([x_mm, y_mm]) - self.low_mm[:, None]) / self.step_mm[:, None]
         last = np.array([[nx - DEGREE - 1], [ny - DEGREE - 1]])
@@ -167,7 +164,7 @@ class SplineBasis(ReadOnlyArrays):
 
     @cached_property
     def _corner(self) -> IntArray:
-        """Columns of a cell's splines over that of its first one, shape (16,)."""
+        """Columns of a cell's splines relative to that of its first one, shape (16,)."""
         side = np.arange(DEGREE + 1)
         return (side[:, None] * self.shape[1] + side).ravel()
 
@@ -188,7 +185,7 @@ class SplineBasis(ReadOnlyArrays):
     def roughness(self) -> FloatArray:
         """Matrix P of ∫∫ z_xxx² + 3 z_xxy² + 3 z_xyy² + z_yyy² = cᵀPc.
 
-        Its lower band, shape (width + 1, splines), as LAPACK has it.
+        Lower band, shape (width + 1, splines), in LAPACK's storage.
         """
         from labapp.core.surface.kernels import solver_kernels
 
@@ -196,7 +193,7 @@ class SplineBasis(ReadOnlyArrays):
         return solver_kernels.roughness(_products(nx), _products(ny), self.step_mm)
 
     def stiffness(self, weight: float) -> FloatArray:
-        """`roughness` times a weight, kept for the next time."""
+        """`roughness` times a weight, cached."""
         if weight not in self._stiffness:
             self._stiffness[weight] = weight * self.roughness
         return self._stiffness[weight]
@@ -233,7 +230,7 @@ class SplineSurface(ReadOnlyArrays):
     def height_and_gradient(
         self, x_mm: FloatArray, y_mm: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Both at once, in little more time than either takes."""
+        """Height and gradient at once, in little more time than either alone."""
         x, y = np.asarray(x_mm, float), np.asarray(y_mm, float)
         inside = self.basis.contains(x, y)
         cells = self.basis.cells(x[inside], y[inside])
@@ -247,8 +244,8 @@ class SplineSurface(ReadOnlyArrays):
 
     def roughness(self) -> float:
         """∫∫ z_xxx² + 3 z_xxy² + 3 z_xyy² + z_yyy² over the rectangle, mm⁻²."""
-        band, own = self.basis.roughness, self.coefficients
-        return float(own @ scipy.linalg.blas.dsbmv(len(band) - 1, 1.0, band, own, lower=1))
+        band, c = self.basis.roughness, self.coefficients
+        return float(c @ scipy.linalg.blas.dsbmv(len(band) - 1, 1.0, band, c, lower=1))
 
     def raised(self, by_mm: float) -> SplineSurface:
         """Shift the whole surface up."""

@@ -1,4 +1,4 @@
-"""A pool surface z = f(x, y), and where rays meet it (Eq. 4-1, 6-2)."""
+"""Pool surface z = f(x, y), and its intersection with rays (Eq. 4-1, 6-2)."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ import numpy as np
 from labapp.core.values import FloatArray
 
 TOLERANCE_MM = 1e-9
-"""How near to the surface a meeting point must come."""
+"""Tolerance of the height of an intersection."""
 
 STEP_MM = 0.5
-"""Longest Newton step along a ray: a ray that grazes would otherwise jump off the pool."""
+"""Longest Newton step along a ray: a grazing ray would otherwise jump off the pool."""
 
 NEWTON_STEPS = 12
 SCAN_LEVELS = 81
@@ -20,7 +20,7 @@ HALVINGS = 50
 
 
 class Surface(Protocol):
-    """A height over the work piece; NaN where it is not defined."""
+    """Height above the work piece; NaN where it is undefined."""
 
     def height(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
         """Height z at (x, y), arrays of one shape, mm."""
@@ -32,7 +32,7 @@ class Surface(Protocol):
 
 
 class FlatSurface:
-    """The work piece itself, z = level: the first estimate of both schemes (step 0)."""
+    """Horizontal plane z = level: the initial estimate of both schemes (step 0)."""
 
     def __init__(self, level_mm: float = 0.0) -> None:
         self.level_mm = level_mm
@@ -53,28 +53,28 @@ def intersect(
     *,
     reach_mm: float = 2.0,
 ) -> FloatArray:
-    """Where rays from one point meet a surface.
+    """Intersect rays from one point with a surface.
 
-    Bounded Newton steps from z = 0; the rays for which they do not settle (grazing, or starting
-    outside the surface's domain) are walked down from ``reach_mm`` to ``−reach_mm`` and the first
-    step that goes under the surface is halved.
+    Bounded Newton steps from z = 0. Rays for which these do not converge (grazing, or starting
+    outside the domain of the surface) are sampled from ``reach_mm`` down to ``−reach_mm``, and the
+    first interval in which the ray passes below the surface is bisected.
 
     Parameters
     ----------
     surface
         The surface.
     origin_mm
-        Where all rays start, above the surface, shape (3,), mm.
+        Common origin of the rays, above the surface, shape (3,), mm.
     directions
         Their directions, of any length but not zero, shape (n, 3).
     reach_mm
-        The surface is looked for at |z| ≤ reach_mm.
+        Intersections are searched for at |z| ≤ reach_mm.
 
     Returns
     -------
     FloatArray
-        Meeting points, shape (n, 3), mm; NaN where the ray does not come down or misses the
-        surface's domain.
+        Intersections, shape (n, 3), mm; NaN if the ray does not descend or misses the domain of
+        the surface.
     """
     origin = np.asarray(origin_mm, float)
     direction = np.asarray(directions, float)
@@ -91,7 +91,7 @@ def intersect(
 def _newton(
     surface: Surface, origin: FloatArray, direction: FloatArray, reach: float
 ) -> FloatArray:
-    """Distance to the surface along each ray, shape (n,); NaN where the steps do not settle."""
+    """Distance to the surface along each ray, shape (n,); NaN if the steps do not converge."""
     distance = -origin[2] / direction[:, 2]
     above = np.full(len(direction), np.nan)
     for _ in range(NEWTON_STEPS):
@@ -104,14 +104,14 @@ def _newton(
         descent = direction[:, 2] - np.sum(slope * direction[:, :2], axis=-1)
         with np.errstate(divide="ignore", invalid="ignore"):
             step = np.clip(-above / descent, -STEP_MM, STEP_MM)
-        # A ray that leaves the surface (descent ≥ 0) is going the wrong way.
+        # Where descent ≥ 0, a Newton step would go in the wrong direction.
         distance = np.where(open_ & (descent < 0), distance + step, distance)
     low = np.abs(origin[2] + distance * direction[:, 2]) <= reach
     return np.where((np.abs(above) <= TOLERANCE_MM) & low, distance, np.nan)
 
 
 def _walk(surface: Surface, origin: FloatArray, direction: FloatArray, reach: float) -> FloatArray:
-    """The same by walking down in steps and halving the first that goes under, shape (n,)."""
+    """Distance to the first crossing from above, by sampling and bisection, shape (n,)."""
     levels = np.linspace(reach, -reach, SCAN_LEVELS)
     distances = (levels[:, None] - origin[2]) / direction[:, 2]
 

@@ -1,4 +1,4 @@
-"""Inner loops of `level`, compiled for the processor (docs/adr/0018)."""
+"""Compiled inner loops of `level` (docs/adr/0018)."""
 
 from __future__ import annotations
 
@@ -14,26 +14,27 @@ _f1, _f2, _f3 = (types.Array(_f, n, "A", readonly=True) for n in (1, 2, 3))
 _i1 = types.Array(_i, 1, "A", readonly=True)
 
 EPS = 1e-12
-"""1 plus less than this is taken for 1: a thousand such factors change no level."""
+"""A factor of 1 plus less than this is replaced by 1: a thousand of them do not change the
+level."""
 
 FARTHEST = -np.log(EPS)
-"""A factor whose logarithm is farther below 0 is such a one."""
+"""Terms exp(−x) with a larger x are such factors."""
 
 STEPS_A_REACH = 120
-"""Steps of the grid of levels over a reach of 1 on either side."""
+"""Number of grid steps per unit of reach on either side."""
 
 NEAR_RISES = 3.0
-"""Witnesses whose rays land farther than so many spacings from the boundary do not count."""
+"""Witnesses whose rays land farther than this from the boundary, in spacings, are ignored."""
 
 FACTORS = 1000
-"""So many factors of at most 2 have a product that does not overflow."""
+"""Number of factors of at most 2 whose product does not overflow."""
 
 
 @_inner
 def _multiply(factors: FloatArray, k: int, way: int, factor: float, shrinks: float) -> None:
-    """Multiply by 1 + factor from k on one way, while the factor shrinks to nothing.
+    """Multiply entries from k on in one direction by 1 + factor, as the factor decays to `EPS`.
 
-    Four factors shrink side by side, so that none waits for the one before it.
+    Four factors are updated in parallel to avoid a chain of dependent operations.
     """
     count, square = len(factors), shrinks * shrinks
     second, third, fourth = factor * shrinks, factor * square, factor * square * shrinks
@@ -66,12 +67,12 @@ def _accumulate(
 ) -> None:
     """Add log(1 + exp(−(start + k · slope))) to every level k.
 
-    Along the levels the exponential is a geometric progression, away from where it is 1. Where the
-    exponent is above 0 it is taken out of the logarithm, into ``starts`` and ``slopes``.
+    Along the levels the exponential is a geometric progression. Where its exponent is positive it
+    is taken out of the logarithm, into ``starts`` and ``slopes``.
     """
     count = len(factors)
     if min(start, start + (count - 1) * slope) > FARTHEST:
-        return  # nothing to add: most witnesses are far on the right side
+        return  # nothing to add: most witnesses are far on the correct side
     turn = -start / slope if slope != 0.0 else np.inf * start
     turn = int(min(max(np.ceil(turn), 0.0), count)) if not np.isnan(turn) else 0
     begins, ends = (0, turn) if slope > 0.0 else (turn, count)
@@ -95,11 +96,11 @@ def level_negative_log_likelihood(
     count: int,
     blurs: FloatArray,
 ) -> FloatArray:
-    """−log likelihood of witnesses at levels: −log P of each being lit, or dark.
+    """−log likelihood of lit and dark witnesses at levels.
 
-    With x = side · (over + level) / blur, a ray that is lit has P = 1/(1 + exp(−x)), but for a
-    factor that all levels share. One that is dark has 1/(1 + exp(−x)) too, as its side is the other
-    one, or lands inside and its dot is missing: P = (1 + m · exp(−x))/(1 + exp(−x)).
+    With x = side · (over + level) / blur, a lit ray has P = 1/(1 + exp(−x)), up to a factor common
+    to all levels. A dark ray, whose side has the opposite sign, either lands outside, or lands
+    inside and its dot is missing: P = (1 + m · exp(−x))/(1 + exp(−x)).
 
     Parameters
     ----------
@@ -158,7 +159,7 @@ def level_posterior(
     first: float,
     step: float,
 ) -> tuple[float, float, float, float]:
-    """Posterior of the level and of the rear's drop, blurs marginalised.
+    """Posterior of the level and of the rear's drop, marginalised over blurs.
 
     Parameters
     ----------
@@ -204,9 +205,10 @@ def level_posterior(
 
 @_inner
 def rises_of(slope: FloatArray, spacing: FloatArray) -> tuple[FloatArray, float]:
-    """Height by which a surface changes from one ray to the next, straight across the contour.
+    """Change of a surface's height from one ray to the next along the gradient.
 
-    Where m rays land, shape (m,), mm, and not less than a quarter of the median, the second value.
+    Returns its values at m landing points, limited to at least a quarter of the median, shape (m,),
+    mm, and the median.
     """
     rises = np.empty(len(slope))
     for n in range(len(rises)):
@@ -225,7 +227,7 @@ def scan_levels(
     count: int,
     blur: FloatArray,
 ) -> tuple[float, int]:
-    """Shift, mm, and sign that the witnesses contradict least, of so many shifts, with one blur.
+    """Shift, mm, and sign with the largest likelihood, among ``count`` shifts and with one blur.
 
     The first five arguments are those of `level.find_level`.
     """
@@ -255,7 +257,7 @@ def search_level(
     drops: FloatArray,
     blurs: FloatArray,
 ) -> tuple[FloatArray, int]:
-    """Weigh levels near one, blurs and drops of the rear on a grid.
+    """Evaluate the posterior of levels, blurs and drops of the rear on a grid.
 
     Parameters
     ----------
@@ -318,10 +320,10 @@ def negative_log_evidence(
     missing: float,
     blurs: FloatArray,
 ) -> float:
-    """−log of the probability of the witnesses over all levels near 0 and all blurs, nats.
+    """−log probability of the witnesses, marginalised over levels near 0 and blurs, nats.
 
-    Height of the boundary where the m rays land, ``rear``, shape (m,), mm. ``blurs`` are those of
-    `search_level`, the others those of `level.find_level`. A constant is left out.
+    ``rear`` is the height of the boundary at the m landing points, shape (m,), mm. ``blurs`` is
+    that of `search_level`, the others are those of `level.find_level`. A constant is omitted.
     """
     rises, usual = rises_of(slope, spacing)
     near = np.flatnonzero(np.abs(height) < NEAR_RISES * rises)
@@ -345,9 +347,9 @@ def negative_log_evidence(
 
 @_compiled(_f1, types.Array(types.boolean, 1, "A", readonly=True))
 def guess_level(height: FloatArray, outer: BoolArray) -> tuple[float, float, float]:
-    """Shift that puts outer points at 0, standard deviation of heights, mean of the inner ones.
+    """Shift that sets the mean of outer points to 0, std of all heights, mean of inner heights.
 
-    Heights up to their level, mm, and which are outer, shape (n,).
+    Parameters are the heights up to their level, mm, and the mask of outer points, shape (n,).
     """
     inner = ~outer
     shift, mean = -np.sum(height * outer) / outer.sum(), np.sum(height * inner) / inner.sum()
