@@ -259,7 +259,7 @@ def _mark(mask: BoolArray) -> Mark:
 
 
 def _thin(mark: Mark) -> Mark:
-    """Replace the mark's centre and direction by those of its thinned pixels (Eq. 5-5, unrounded)."""
+    """Take centre and direction of the mark from its thinned pixels (Eq. 5-5, unrounded)."""
     v, u = np.nonzero(mark.mask)
     top, left = int(v.min()), int(u.min())
     line = _mark(thinned(mark.mask[top : v.max() + 1, left : u.max() + 1]))
