@@ -134,7 +134,8 @@ def step_response(
     """Fit the response of a series to a step; None if it is not significant.
 
     First- and second-order models are fitted by least squares; the latter is chosen if it
-    overshoots and fits clearly better. Noise may be correlated: ± are widened by its autocorrelation.
+    overshoots and fits clearly better. Noise may be correlated: ± are widened by its
+    autocorrelation.
 
     Parameters
     ----------
