@@ -1,9 +1,9 @@
-"""Bundle adjustment of the bench and of the mirrors' poses to the dots that the mirrors made.
+"""Bundle adjustment of the bench and of the mirrors' poses to the reflected dots.
 
-The unknowns are standardised: an offset of the bench's quantities is ``factor @ x``, with
-``factor @ factor.T`` their prior covariance, and a pose is its expected one plus its standard
-uncertainties times x. So the prior of every unknown is a normal distribution of mean 0 and
-variance 1, and a quantity that is known exactly has none.
+The unknowns are standardised: the offset of the bench's quantities is ``factor @ x``, with
+``factor @ factor.T`` their prior covariance, and a pose is the expected pose plus its standard
+uncertainties times x. The prior of every unknown is therefore the standard normal distribution. A
+quantity that is known exactly has no unknown.
 """
 
 from __future__ import annotations
@@ -22,30 +22,30 @@ from labapp.core.geometry.uncertainty import QUANTITIES
 from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 
 FLOOR_MM = 0.02
-"""Added to the standard uncertainty of every dot on the plane, in squares: what rays depart from
-the lens's ideal pattern, and the mirror from its ideal shape."""
+"""Added in quadrature to the standard uncertainty of every dot on the plane: deviations of the rays
+from the lens's ideal pattern, and of the mirror from its ideal shape."""
 
 ROBUST = 3.0
-"""Residuals beyond this many standard uncertainties count less than by their squares (soft L1)."""
+"""Residuals beyond this many standard uncertainties are down-weighted (soft L1)."""
 
 STEP = 1e-5
-"""Of the forward differences, in usual standard uncertainties."""
+"""Step of the forward differences, in usual standard uncertainties."""
 
 ROUNDS, FEW_STEPS, MOST_STEPS = 12, 3, 40
-"""Of tightening the robust loss; steps in each of them, and in the last."""
+"""Iterations that tighten the robust loss; steps in each of them, and in the last."""
 
 SETTLED = 0.95
-"""A scale of the residuals has settled that shrinks by no more than to this share."""
+"""The scale of the residuals has converged if it shrinks to no less than this share."""
 
 DAMPING, MOST_DAMPED = 1e-4, 1e6
-"""Of the steps: at first, and at most."""
+"""Initial and largest damping of the steps."""
 
 CONVERGED = 1e-3
-"""A step that the cost falls by less with is the last: unknowns move by 0.03 of their standard
+"""The iteration stops if a step lowers the cost by less: unknowns move by 0.03 of their standard
 uncertainties."""
 
 PLACES = 9
-"""Along X and Y, where a mirror whose place is free may be at first."""
+"""Number of initial positions along X and Y of a mirror whose position is free."""
 
 LOST = 50.0
 """Standardised residual of a ray that never meets the plane."""
@@ -53,7 +53,7 @@ LOST = 50.0
 
 @dataclass(frozen=True)
 class Sighting(ReadOnlyArrays):
-    """A mirror, and the n dots that its reflections made.
+    """A mirror and the n dots of the rays that it reflected.
 
     Parameters
     ----------
@@ -63,7 +63,7 @@ class Sighting(ReadOnlyArrays):
         Row and column of each dot's ray in the pattern's arrays, counted from 0, shape (n, 2).
     plane_mm, covariance_mm2
         The dots by the set-up before the check, IPCS, shape (n, 2), mm, and their covariance, shape
-        (n, 2, 2).
+        (n, 2, 2), mm².
     """
 
     mirror: Mirror
@@ -74,30 +74,30 @@ class Sighting(ReadOnlyArrays):
 
 @dataclass(frozen=True)
 class Adjustment(ReadOnlyArrays):
-    """The bench and the poses that explain the dots best.
+    """The bench and the poses that fit the dots best.
 
     Parameters
     ----------
     offset
-        By how much the bench's quantities are off, shape (q,).
+        Estimated offsets of the bench's quantities, shape (q,).
     covariance
-        Of them after the adjustment, shape (q, q).
+        Their covariance after the adjustment, shape (q, q).
     poses, pose_covariances
-        Of the mirrors, each of shape (d,) and (d, d).
+        Poses of the mirrors and their covariances, each of shape (d,) and (d, d).
     residual_mm
         Observed minus computed dots of each sighting, shapes (n, 2), mm.
     standardised
-        The same over the standard uncertainties, of all sightings, shape (m,).
+        Residuals of all sightings over their standard uncertainties, shape (m,).
     weight
-        Of each of these by the robust loss, shape (m,).
+        Weight of each of these by the robust loss, shape (m,).
     scale
-        By how much the dots' residuals exceed their standard uncertainties; at least 1.
+        Ratio of the scatter of the residuals to their standard uncertainties; at least 1.
     unknown
         The standardised unknowns, shape (p,): those of the bench, then those of the poses.
     jacobian
-        Derivatives of ``standardised`` by them, shape (m, p).
+        Derivatives of ``standardised`` w.r.t. the unknowns, shape (m, p).
     cost
-        Sum of squares of residuals, robust, and of the unknowns.
+        Robust sum of squares of the residuals, plus the sum of squares of the unknowns.
     """
 
     offset: FloatArray
@@ -113,17 +113,17 @@ class Adjustment(ReadOnlyArrays):
     cost: float
 
     def drop(self, columns: FloatArray) -> tuple[float, FloatArray]:
-        """By how much the cost would fall, and with what amplitudes, with effects left out so far.
+        """Reduction of the cost if further effects are added to the model, to first order.
 
         Parameters
         ----------
         columns
-            Derivatives of ``standardised`` by k amplitudes whose prior variance is 1, shape (m, k).
+            Derivatives of ``standardised`` w.r.t. k amplitudes with prior variance 1, shape (m, k).
 
         Returns
         -------
         drop, amplitudes
-            In units of a χ² with k degrees of freedom; shape (k,). To first order (score test).
+            Reduction as a χ² with k degrees of freedom (score test); amplitudes, shape (k,).
         """
         weighted = self.weight[:, None] * columns / self.scale**2
         across = self.jacobian.T @ weighted
@@ -151,10 +151,10 @@ def adjust(
     sightings
         The mirrors and their dots.
     released
-        Directions in the space of the bench's quantities that the prior is widened along, by their
+        Directions in the space of the bench's quantities along which the prior is widened by their
         length, shape (k, q).
     start
-        Unknowns to begin with, of an adjustment to the same mirrors; None: the expected bench.
+        Initial unknowns, from an adjustment to the same mirrors; None: the expected bench.
     """
     system = System.of(rig, sightings, released)
     unknown = system.start() if start is None or len(start) != system.size else start
@@ -163,7 +163,7 @@ def adjust(
 
 @dataclass(frozen=True)
 class System:
-    """The equations of an adjustment: the bench's unknowns, and then those of each pose."""
+    """Equations of an adjustment; the unknowns of the bench precede those of each pose."""
 
     rig: Rig
     sightings: tuple[Sighting, ...]
@@ -171,7 +171,7 @@ class System:
 
     @classmethod
     def of(cls, rig: Rig, sightings: Sequence[Sighting], released: FloatArray | None) -> System:
-        """The equations with the prior widened, see `adjust`."""
+        """Set up the equations with the prior widened, see `adjust`."""
         known = rig.uncertainty
         assert known is not None
         root = known.root if released is None else np.column_stack([known.root, released.T])
@@ -179,7 +179,7 @@ class System:
 
     @cached_property
     def parts(self) -> list[slice]:
-        """Of the unknowns: the bench's, and those of each pose."""
+        """Slices of the unknowns: of the bench, then of each pose."""
         count = [self.factor.shape[1], *(len(s.mirror.sigma) for s in self.sightings)]
         ends = np.cumsum(count).tolist()
         return [slice(end - n, end) for n, end in zip(count, ends, strict=True)]
@@ -191,7 +191,7 @@ class System:
 
     @cached_property
     def roots(self) -> list[FloatArray]:
-        """What makes each sighting's residuals standardised, shapes (n, 2, 2)."""
+        """Whitening matrices of each sighting's residuals, shapes (n, 2, 2)."""
         made = []
         for one in self.sightings:
             covariance = one.covariance_mm2 + FLOOR_MM**2 * np.eye(2)
@@ -199,7 +199,7 @@ class System:
         return made
 
     def start(self) -> FloatArray:
-        """The expected bench, each mirror placed where its dots fit best."""
+        """Initial unknowns: the expected bench, each mirror where its dots fit best."""
         unknown = np.zeros(self.size)
         for k, one in enumerate(self.sightings):
             tried = [unknown[self.parts[k + 1]], *_places(one, self.rig)]
@@ -208,14 +208,14 @@ class System:
         return unknown
 
     def pose(self, k: int, unknown: FloatArray) -> FloatArray:
-        """Pose of a sighting's mirror, of its unknowns."""
+        """Pose of a sighting's mirror from its unknowns."""
         mirror = self.sightings[k].mirror
         return np.asarray(mirror.pose + mirror.sigma * unknown)
 
     def observed(self, k: int, offset: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """A sighting's dots on the plane with its picture off, and what whitens residuals there.
+        """Dots of a sighting on the plane for an offset, and the whitening of their residuals.
 
-        The dots' noise is that of the picture: it does not shrink on a plane of another scale.
+        The noise of the dots is constant in the picture, so on the plane it changes with the scale.
 
         Returns
         -------
@@ -230,7 +230,7 @@ class System:
         return moved[0], self.roots[k] @ np.linalg.inv(enlargement)
 
     def computed(self, k: int, offset: FloatArray, pose: FloatArray) -> FloatArray:
-        """Where a bench that is off has the dots of a sighting, shape (n, 2), mm."""
+        """Computed dots of a sighting for an offset of the bench, shape (n, 2), mm."""
         one = self.sightings[k]
         rig = moved_rig(self.rig, offset)
         return landing_points(one.mirror, self.pose(k, pose), rig, tuple(one.ray.T))[0]
@@ -251,7 +251,7 @@ class System:
         return _standardised(*self.observed(k, offset), self.computed(k, offset, pose))
 
     def jacobian(self, unknown: FloatArray) -> FloatArray:
-        """Their derivatives, shape (m, p): a pose moves the dots of its own mirror alone."""
+        """Derivatives of `residuals`, shape (m, p): a pose affects the dots of its mirror only."""
         bench, *poses = (unknown[part] for part in self.parts)
         offset, used = self.factor @ bench, np.asarray(self.factor.any(axis=1))
         made = np.zeros((2 * sum(len(s.ray) for s in self.sightings), self.size))
@@ -267,9 +267,9 @@ class System:
     def by_quantities(
         self, k: int, offset: FloatArray, pose: FloatArray, used: BoolArray
     ) -> FloatArray:
-        """Derivatives of a sighting's residuals by some quantities, shape (2n, q); 0 by the others.
+        """Derivatives of a sighting's residuals w.r.t. the used quantities, shape (2n, q); 0 else.
 
-        Quantities of the picture move the observed dots, all others the computed ones.
+        Quantities of the picture change the observed dots, all others the computed ones.
         """
         dots, landed = self.observed(k, offset), self.computed(k, offset, pose)
         still = _standardised(*dots, landed)
@@ -285,15 +285,15 @@ class System:
         return made
 
     def _rows(self, k: int) -> slice:
-        """Of all residuals: those of a sighting."""
+        """Slice of a sighting's residuals."""
         first = 2 * sum(len(s.ray) for s in self.sightings[:k])
         return slice(first, first + 2 * len(self.sightings[k].ray))
 
     def solved_from(self, unknown: FloatArray) -> Adjustment:
-        """The adjustment that unknowns lead to."""
+        """Iterate from initial unknowns to the adjustment."""
         scale = max(1.0, _spread(self.residuals(unknown)))
         for _ in range(ROUNDS):
-            # Gross errors first: the loss tightens as the residuals shrink.
+            # A large scale first tolerates gross errors; the loss tightens as residuals shrink.
             if scale == 1.0:
                 break
             unknown = self.minimised(unknown, scale, FEW_STEPS)
@@ -308,16 +308,16 @@ class System:
         return self.adjustment(unknown, scale)
 
     def solved(self, made: Adjustment) -> Adjustment:
-        """The adjustment that another of the same dots leads to, with more quantities free.
+        """Continue from another adjustment to the same dots, with more quantities free.
 
-        Their costs can be compared: the scale of the residuals stays.
+        The scale of the residuals is the same, so that the costs are comparable.
         """
         extra = self.size - len(made.unknown)
         unknown = np.insert(made.unknown, self.parts[0].stop - extra, np.zeros(extra))
         return self.adjustment(self.minimised(unknown, made.scale, MOST_STEPS), made.scale)
 
     def by_bench(self, made: Adjustment) -> FloatArray:
-        """Derivatives of the residuals by all quantities of the bench, shape (m, q)."""
+        """Derivatives of the residuals w.r.t. all quantities of the bench, shape (m, q)."""
         every = np.ones(len(made.offset), bool)
         unknown = (made.unknown[part] for part in self.parts[1:])
         return np.concatenate(
@@ -325,16 +325,16 @@ class System:
         )
 
     def by_dots(self, k: int, change_mm: FloatArray) -> FloatArray:
-        """What changes of a sighting's residuals, shape (n, 2, c), mm, are to all, shape (m, c)."""
+        """Expand changes of a sighting's residuals, (n, 2, c), mm, to all standardised, (m, c)."""
         made = np.zeros((2 * sum(len(s.ray) for s in self.sightings), change_mm.shape[2]))
         own = np.einsum("nij,njc->nic", self.roots[k], change_mm)
         made[self._rows(k)] = np.where(np.isfinite(own), own, 0.0).reshape(-1, change_mm.shape[2])
         return made
 
     def minimised(self, unknown: FloatArray, scale: float, steps: int) -> FloatArray:
-        """Unknowns of least cost, with the dots' standard uncertainties times a scale.
+        """Minimise the cost, with the dots' standard uncertainties multiplied by a scale.
 
-        By Levenberg and Marquardt's method on the normal equations, which the prior keeps regular.
+        Levenberg–Marquardt on the normal equations, which the prior keeps regular.
         The Hessian of the robust loss ρ is approximated by Jᵀ(ρ′ + 2ρ″r²)J (Triggs et al. 2000,
         Bundle adjustment – a modern synthesis, section 4.3); for soft L1 that is Jᵀρ′³J.
         """
@@ -360,7 +360,7 @@ class System:
         return unknown
 
     def adjustment(self, unknown: FloatArray, scale: float) -> Adjustment:
-        """The result, with the covariances that follow from the normal equations."""
+        """Return the result, with covariances from the normal equations."""
         standardised, jacobian = self.residuals(unknown), self.jacobian(unknown)
         square = (standardised / scale) ** 2
         loss, weight = soft_l1(square)
@@ -395,7 +395,7 @@ def _standardised(
 
 
 def _cost(residual: FloatArray, unknown: FloatArray) -> float:
-    """Sum of squares of residuals, robust, and of the unknowns."""
+    """Robust sum of squares of the residuals, plus the sum of squares of the unknowns."""
     return float(soft_l1(residual**2)[0].sum() + unknown @ unknown)
 
 
@@ -411,7 +411,7 @@ def _spread(standardised: FloatArray) -> float:
 
 
 def _places(sighting: Sighting, rig: Rig) -> list[FloatArray]:
-    """Standardised poses of a mirror whose place is free: its top where rays pass, roughly."""
+    """Standardised initial poses of a mirror of free position: a grid where the rays pass."""
     mirror = sighting.mirror
     if "x_mm" not in mirror.parameters:
         return []

@@ -1,4 +1,4 @@
-"""Pictures of known mirrors → the bench as it stands, what it is known to, and a verdict."""
+"""Check of the bench with pictures of known mirrors: adjusted set-up, uncertainty and verdict."""
 
 from __future__ import annotations
 
@@ -34,27 +34,27 @@ from labapp.core.values import CannotMeasure, FloatArray, IntArray, ReadOnlyArra
 Status = Literal["ok", "quantity-off", "size-off"] | Verdict
 
 ROUNDS = 3
-"""Of adjusting to all pictures and labelling anew."""
+"""Largest number of iterations of adjusting to all pictures and relabelling."""
 
 WIDE = 10.0
-"""So many times its standard uncertainty a quantity may be off for rays to be found still."""
+"""Factor of the standard uncertainties in the last attempt to label a picture."""
 
 FAR_BETTER = 2.0
-"""So many times as much the cost falls with a cause that explains the dots far better."""
+"""A cause explains the dots far better if it reduces the cost by this factor more."""
 
 NEARLY = 0.6
-"""Another cause is named as well that explains more than this share of what the likeliest does."""
+"""Another cause is also reported if it explains more than this share of the likeliest one's."""
 
 SLIPPED = 10.0
-"""Rays are those of the next row or column where the cost falls by more with these."""
+"""The rays are taken to be one row or column off if that reduces the cost by more than this."""
 
 UNDETERMINED = 0.8
-"""A quantity is not determined whose ± after the check is more than this share of that before."""
+"""A quantity is undetermined if its ± after the check exceeds this share of that before."""
 
 
 @dataclass(frozen=True)
 class CheckedPicture(ReadOnlyArrays):
-    """A picture and what the adjusted bench makes of it; n dots with a ray.
+    """A picture and its results by the adjusted bench; n dots with a ray.
 
     Parameters
     ----------
@@ -96,27 +96,26 @@ class BenchCheck(ReadOnlyArrays):
     Parameters
     ----------
     status
-        ``ok``; ``quantity-off`` where a quantity is off by far more than its ± allows; ``size-off``
-        where a mirror's known size is contradicted; or the verdict, where that is not
-        ``noise-like``, or explains the dots far better than these. Only with ``ok`` is the new
-        set-up to be used.
+        ``ok``; ``quantity-off`` if a quantity is off by far more than its ±; ``size-off`` if a
+        mirror's known size is contradicted; or the verdict, if it is not ``noise-like`` or explains
+        the dots far better than these. The new set-up may be used only if the status is ``ok``.
     reason
-        The same in a sentence; empty with ``ok``.
+        Explanation of the status in a sentence; empty for ``ok``.
     verdict, patterns
-        What the residuals look like, see `judge`.
+        Classification of the residuals, see `judge`.
     suspects
-        Quantities that are off by far more than their ±, the likeliest first; those that explain
-        the dots alike come together.
+        Quantities that are off by far more than their ±, the likeliest first. Quantities that
+        explain the dots equally well are listed together.
     free
         Keys of suspects whose prior was widened on request.
     before
         The set-up before the check.
     rig, calibration
-        The set-up after it, with its uncertainty, which is marked as checked with ``ok``.
+        The set-up after the check, with its uncertainty, which is marked as checked if ``ok``.
     pictures
-        What became of each picture, in the order given.
+        Results of each picture, in the order given.
     sightings, adjustment
-        What was adjusted to, and the adjustment itself.
+        The labelled dots of each mirror, and the adjustment to them.
     """
 
     status: Status
@@ -146,7 +145,7 @@ class BenchCheck(ReadOnlyArrays):
 
     @property
     def undetermined(self) -> tuple[QuantityChange, ...]:
-        """Quantities that the pictures hardly determine: known about as well as before."""
+        """Quantities that the pictures hardly determine: their ± is about the same as before."""
         return tuple(
             one
             for one in self.changes
@@ -175,11 +174,11 @@ def check_bench(
     Parameters
     ----------
     pictures
-        One or several pictures of mirrors, each in its own place.
+        One or several pictures of mirrors, each with its own pose.
     rig, calibration
-        The set-up as it is known; its uncertainty is the prior.
+        The set-up before the check; its uncertainty is the prior.
     free
-        Keys of suspects (`suspects.suspect_keys`) that are not to be held by their uncertainty.
+        Keys of suspects (`suspects.suspect_keys`) whose prior is widened.
 
     Raises
     ------
@@ -244,7 +243,7 @@ def _adjusted(
     Returns
     -------
     adjustment, sightings, labels
-        The adjusted set-up; the dots of each picture that it was adjusted to; and their labels.
+        The adjusted set-up; the dots of each picture that were used; and their labels.
     """
     labels = _labelled(pictures, rig, calibration, free_directions)
     made: Adjustment | None = None
@@ -275,7 +274,7 @@ def _labelled(
     calibration: ImageCalibration,
     free_directions: FloatArray,
 ) -> list[IntArray]:
-    """Labels of each picture: plates first, which determine the bench for the others."""
+    """Label each picture; plates first, as they determine the bench for the others."""
     order = sorted(range(len(pictures)), key=lambda k: not isinstance(pictures[k].mirror, Plate))
     labels: dict[int, IntArray] = {}
     near = rig, calibration
@@ -290,10 +289,10 @@ def _labelled(
 def _first_label(
     picture: Picture, benches: Sequence[tuple[Rig, ImageCalibration]], free_directions: FloatArray
 ) -> tuple[Labelled, Rig]:
-    """Labels by the first bench that has any, and its rig, which their adjustment begins with.
+    """Return the labels from the first bench that succeeds, and its rig.
 
-    A mirror of another kind or size than given, or a quantity that is far off, misleads the
-    adjustments after it.
+    The alternatives are needed because a mirror of another kind or size than given, or a quantity
+    that is far off, misleads the subsequent adjustments.
     """
     for bench in benches[:-1]:
         try:
@@ -304,7 +303,7 @@ def _first_label(
 
 
 def _wide(rig: Rig) -> Rig:
-    """The bench with much larger uncertainties than it is given."""
+    """Return the rig with its uncertainties multiplied by `WIDE`."""
     assert rig.uncertainty is not None
     covariance = WIDE**2 * rig.uncertainty.covariance
     return replace(rig, uncertainty=replace(rig.uncertainty, covariance=covariance))
@@ -313,7 +312,7 @@ def _wide(rig: Rig) -> Rig:
 def adjusted_bench(
     rig: Rig, made: Adjustment, checked: bool = False
 ) -> tuple[Rig, ImageCalibration]:
-    """The rig and the image calibration that an adjustment leads to, with their uncertainty."""
+    """Return the adjusted rig and image calibration, with their uncertainty."""
     after, calibration = moved_bench(rig, made.offset)
     assert after.uncertainty is not None
     assumed = frozenset() if checked else after.uncertainty.assumed
@@ -340,9 +339,9 @@ def _status(
     slip: float,
     sizes: Mapping[str, MeasuredSize],
 ) -> tuple[Status, str]:
-    """What is off: a quantity or a size, unless a cause that the model lacks explains far more.
+    """Determine what is off: a quantity or a size, unless an unmodelled cause explains far more.
 
-    The reason also names other causes that explain nearly as much.
+    The reason also states other causes that explain nearly as much.
     """
     lacks = verdict if verdict != "noise-like" else patterns[0].cause
     explained = max((one.drop for one in patterns if one.cause == lacks), default=0.0)
@@ -355,7 +354,7 @@ def _status(
         "quantity-off": (suspected, _suspected(suspects)),
         lacks: (explained, REASONS[lacks]),
     }
-    # What the model lacks pulls the sizes along.
+    # An unmodelled cause also biases the sizes.
     if verdict != "noise-like" and explained >= max(FAR_BETTER * suspected, contradiction):
         status: Status = verdict
     elif contradiction > suspected:
@@ -370,7 +369,7 @@ def _status(
 
 
 def _sizes_off(sizes: Mapping[str, MeasuredSize]) -> tuple[float, str]:
-    """By how much the dots contradict the sizes of mirrors, in units of χ², and which sizes."""
+    """Largest contradiction of the mirrors' sizes by the dots, as a χ², and the sizes in words."""
     off = {name: one for name, one in sizes.items() if one.is_contradicted}
     square = max((one.deviation**2 for one in off.values()), default=0.0)
     named = (
@@ -383,7 +382,7 @@ def _sizes_off(sizes: Mapping[str, MeasuredSize]) -> tuple[float, str]:
 
 
 def _suspected(suspects: Sequence[Suspect]) -> str:
-    """The suspects in words."""
+    """Describe the suspects in words."""
     names = " or ".join(one.name for one in suspects)
     sure = np.sqrt(suspects[0].drop) if suspects else 0.0
     return f"{names}: off by far more than the ± in the set-up ({sure:.0f} standard deviations)"

@@ -1,4 +1,4 @@
-"""What pictures of mirrors would do for the ± of a pool's height, before they are taken."""
+"""Predicted ± of a pool's height after a bench check, before the pictures are taken."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from labapp.core.surface.pool_fit import FitSettings
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray
 
 DOT_MM = 0.03
-"""Standard uncertainty of a dot's place on the plane that is expected."""
+"""Expected standard uncertainty of a dot's position on the plane, mm."""
 
 EXPECTED = Cap(6.7, 0.3)
 """A pool of the usual size (Table of §7.3)."""
@@ -46,9 +46,9 @@ class Forecast:
     Parameters
     ----------
     name
-        The pictures, in words.
+        Description of the pictures.
     setup_sigma_mm, total_sigma_mm
-        The set-up's part of it, and with noise and level, once the bench is checked with these
+        Contribution of the set-up, and total with noise and level, after a check with these
         pictures.
     """
 
@@ -60,10 +60,10 @@ class Forecast:
 def forecast(
     rig: Rig, candidates: Mapping[str, Sequence[Mirror]] = CANDIDATES, pool: Cap = EXPECTED
 ) -> tuple[Forecast, ...]:
-    """Predict the ± of a pool's height as the set-up is known, and after each set of pictures.
+    """Predict the ± of a pool's height with the present set-up, and after each set of pictures.
 
-    By linear propagation of the covariance; the first of the results is without pictures. Pictures
-    with a mirror none of whose dots would be on the imaging plane are left out.
+    By linear propagation of the covariance; the first result is without pictures. Sets with a
+    mirror none of whose dots would be on the imaging plane are left out.
 
     Raises
     ------
@@ -84,7 +84,7 @@ def forecast(
 
 
 def height_sigma(rig: Rig, pool: Cap = EXPECTED) -> Forecast:
-    """± of the height of an expected pool with a set-up as it is known."""
+    """Predict the ± of the expected pool's height with the present set-up."""
     return _of_height("as it is", rig, pool)
 
 
@@ -97,9 +97,9 @@ class BlindSpot:
     picture
         Name of its picture.
     noticed_mm
-        A smaller error of it is not noticed (`MeasuredSize.noticed_mm`).
+        Smallest detectable error of the height (`MeasuredSize.noticed_mm`).
     pool_mm
-        By how much such an error puts the expected pool's height off.
+        Error of the expected pool's height that results from it.
     """
 
     picture: str
@@ -108,11 +108,12 @@ class BlindSpot:
 
 
 def blind_spots(check: BenchCheck, pool: Cap = EXPECTED) -> tuple[BlindSpot, ...]:
-    """Heights of mirrors whose unnoticed error exceeds the ± of the expected pool's height.
+    """Mirror heights whose undetected error would exceed the ± of the expected pool's height.
 
-    None unless the check's status is ``ok``: its set-up is not to be used otherwise. A height that
-    is wrong beyond its own ± is in no result's. The check is repeated with it
-    (external reliability: Baarda 1968, A testing procedure for use in geodetic networks).
+    Empty unless the check's status is ``ok``, as its set-up must not be used otherwise. No
+    uncertainty covers a given height that is wrong beyond its ±. The check is therefore repeated
+    with a wrong height (external reliability: Baarda 1968, A testing procedure for use in geodetic
+    networks).
 
     Raises
     ------
@@ -131,15 +132,15 @@ def blind_spots(check: BenchCheck, pool: Cap = EXPECTED) -> tuple[BlindSpot, ...
 
 
 def _misled(check: BenchCheck, k: int, error_mm: float, pool: Cap) -> float:
-    """By how much a wrong height of a mirror would put a pool's height off, mm.
+    """Error of a pool's height caused by a wrong height of a mirror, mm.
 
-    0 where the pool could not be measured then: no wrong height comes out.
+    0 if the pool could not be measured, as no wrong result would be given.
     """
     wrong = replace(check.sightings[k], mirror=_raised(check.sightings[k].mirror, error_mm))
     sightings = [wrong if n == k else one for n, one in enumerate(check.sightings)]
     system = System.of(check.before, sightings, released(check.before, check.free))
     made, unknown = check.adjustment, check.adjustment.unknown.copy()
-    # The pose stays where it was found, and is that far from what is expected now.
+    # The estimated pose is kept; it differs by the error from the pose expected now.
     at = system.parts[k + 1].start + wrong.mirror.parameters.index("height_mm")
     unknown[at] -= error_mm / wrong.mirror.sigma[at - system.parts[k + 1].start]
     again = system.adjustment(system.minimised(unknown, made.scale, MOST_STEPS), made.scale)
@@ -158,7 +159,7 @@ def _misled(check: BenchCheck, k: int, error_mm: float, pool: Cap) -> float:
 
 
 def _raised(mirror: Mirror, by_mm: float) -> Mirror:
-    """The mirror, taken to be higher."""
+    """Return the mirror with its given height raised."""
     if isinstance(mirror, Ball):
         return replace(mirror, top_mm=float(mirror.pose[2]) + by_mm)
     assert isinstance(mirror, Plate | Cap)
@@ -166,7 +167,7 @@ def _raised(mirror: Mirror, by_mm: float) -> Mirror:
 
 
 def expected_sighting(mirror: Mirror, rig: Rig) -> Sighting | None:
-    """The dots of a mirror in its expected pose that are expected on the plane; None: no dots."""
+    """Return the dots on the plane of a mirror in its expected pose; None if there are none."""
     mirror = placed(mirror, rig)
     plane, shown = _shown(mirror, rig)
     if not shown.any():
@@ -186,7 +187,7 @@ def _shown(mirror: Mirror, rig: Rig) -> tuple[FloatArray, BoolArray]:
 
 
 def _expected_match(rig: Rig, pool: Cap) -> Match:
-    """The dots of a pool that are expected on the plane, with their rays."""
+    """Expected dots of a pool on the plane, with their rays."""
     plane, shown = _shown(pool, rig)
     ray = np.argwhere(shown) + 1
     ground = intersect_level(rig.laser.position_mm, ray_directions(rig.laser, rig.pattern))

@@ -1,10 +1,9 @@
-"""The sizes of known mirrors as the bench measures them: the proof of an adjusted set-up.
+"""Sizes of known mirrors as measured by the bench: the validation of an adjusted set-up.
 
-Bench and mirrors are adjusted together, so a mirror's known size is in the new set-up: that this
-set-up measures it again shows that nothing is in its way, and proves little. So each mirror is also
-measured without its known size, by the set-up before the check, the other mirrors and its own dots
-together: where that differs from the known size by more than both are known to, one of them is
-wrong.
+Bench and mirrors are adjusted together, so the new set-up depends on a mirror's known size. That
+this set-up reproduces the size is therefore only a weak test. Each mirror is also measured without
+its known size, from the set-up before the check, the other mirrors and its own dots together. If
+the result differs from the known size by more than their uncertainties allow, one of them is wrong.
 """
 
 from __future__ import annotations
@@ -21,16 +20,16 @@ from labapp.core.geometry.rig import Rig
 from labapp.core.values import FloatArray
 
 LOOSE = 0.5
-"""Standard uncertainty of a size that is to be measured, over the size."""
+"""Relative prior standard uncertainty of a size that is to be measured."""
 
 LOOSE_PLATE_MM = 5.0
-"""The same of a plate's height."""
+"""Prior standard uncertainty of a plate's height that is to be measured, mm."""
 
 STEP_MM = 1e-4
-"""Of the differences that propagate uncertainties to sizes."""
+"""Step of the differences that propagate uncertainties to sizes, mm."""
 
 CONTRADICTED = 3.0
-"""A known size is wrong, or the set-up is, where they differ by more standard uncertainties."""
+"""Limit of the deviation, in standard uncertainties, beyond which size or set-up is wrong."""
 
 
 @dataclass(frozen=True)
@@ -42,12 +41,12 @@ class MeasuredSize:
     name
         ``height`` or ``radius``.
     known_mm, known_sigma_mm
-        As it was given.
+        Given size.
     measured_mm, sigma_mm
-        As the adjusted set-up measures it, and its uncertainty by the noise of the dots. The known
-        size had a part in the adjustment: not an independent measurement.
+        Size measured with the adjusted set-up, and its uncertainty from the noise of the dots. Not
+        an independent measurement, as the known size entered the adjustment.
     independent_mm, independent_sigma_mm
-        As it is measured without the known size; total uncertainty: noise and set-up.
+        Size measured without the known size; total uncertainty from noise and set-up.
     """
 
     name: str
@@ -66,7 +65,7 @@ class MeasuredSize:
 
     @property
     def noticed_mm(self) -> float:
-        """Error of the known size from which on the dots contradict it, as a rule."""
+        """Smallest error of the known size that the dots usually contradict, mm."""
         return CONTRADICTED * float(np.hypot(self.independent_sigma_mm, self.known_sigma_mm))
 
     @property
@@ -78,7 +77,7 @@ class MeasuredSize:
 def measure_sizes(
     rig: Rig, sightings: Sequence[Sighting], released: FloatArray, made: Adjustment
 ) -> tuple[tuple[MeasuredSize, ...], ...]:
-    """Measure the sizes of each mirror: the height, and of a ball or cap the radius before it.
+    """Measure the sizes of each mirror: its height, preceded by the radius of a ball or cap.
 
     Parameters
     ----------
@@ -117,7 +116,7 @@ def _by_adjusted_bench(
 def _without_size(
     rig: Rig, sightings: Sequence[Sighting], released: FloatArray, made: Adjustment, k: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Pose of a mirror by an adjustment in which its size is free, and its covariance."""
+    """Pose of a mirror, and its covariance, by an adjustment in which its size is free."""
     own = sightings[k].mirror
     loose = _loosened(own)
     others = [replace(s, mirror=loose) if n == k else s for n, s in enumerate(sightings)]
@@ -131,7 +130,7 @@ def _without_size(
 def _propagated(
     size: Callable[[FloatArray], float], pose: FloatArray, covariance: FloatArray
 ) -> tuple[float, float]:
-    """A size of a pose, and its standard uncertainty."""
+    """Size of a mirror at a pose, and its standard uncertainty."""
     value = size(pose)
     slope = np.array([size(pose + step) - value for step in STEP_MM * np.eye(len(pose))]) / STEP_MM
     return value, float(np.sqrt(slope @ covariance @ slope))
@@ -149,7 +148,7 @@ def _sizes(mirror: Mirror) -> dict[str, Callable[[FloatArray], float]]:
 
 
 def _loosened(mirror: Mirror) -> Mirror:
-    """The mirror, its sizes hardly known."""
+    """Return the mirror with large uncertainties of its sizes."""
     if isinstance(mirror, Plate):
         return replace(mirror, height_sigma_mm=LOOSE_PLATE_MM)
     if isinstance(mirror, Cap):

@@ -1,9 +1,9 @@
-"""Dots of a mirror's picture → their rays.
+"""Assignment of rays to the dots in a picture of a mirror.
 
-The rows and columns that the picture shows, with the hole of the absent ray, give the rays of a
-grid at once, however wrong the set-up is. Bench and mirror are adjusted to these, predict where
-every ray's dot should be, and dots get the rays that they are near; this is repeated until nothing
-changes.
+The rows and columns in the picture and the hole of the absent ray determine the rays of a grid
+directly, however wrong the set-up is. Bench and mirror are adjusted to these labels and predict the
+dot of every ray. Each dot close to a predicted one is assigned to its ray. This is repeated until
+no label changes.
 """
 
 from __future__ import annotations
@@ -30,50 +30,50 @@ from labapp.core.rows.lattice import empty_sites
 from labapp.core.values import CannotMeasure, FloatArray, IntArray
 
 LEAST_DOTS = 12
-"""Fewer dots with a ray do not determine a bench."""
+"""Least number of dots with a ray that determines a bench."""
 
 SURROUNDED = 3
-"""A ray is amid others that have so many lit neighbours of four."""
+"""A ray is surrounded if at least this number of its four neighbours are lit."""
 
 NEAR = 0.3
-"""A dot is taken for a ray's where it is nearer to where it should be than this share of the way to
-the next ray's."""
+"""Largest distance of a dot from its predicted position, as a share of the distance to the next
+ray's dot."""
 
 STRAY, MISSED = 10.0, 6.0
-"""What a dot without a ray costs, and a ray without a dot amid others, in units of −2 log
+"""Cost of a dot without a ray, and of a surrounded ray without a dot, in units of −2 log
 likelihood."""
 
 MARGIN = 20.0
-"""Rays that cost less than so much more than the best are as likely."""
+"""Labels are ambiguous if others cost less than this much more than the best."""
 
 MOST_STARTS = 4
-"""So many first labels of a kind are tried, those first that leave fewest dots and rays."""
+"""Largest number of initial labels of each kind that are tried, those of least penalty first."""
 
 MOST_WORSE = 40.0
-"""First labels that leave dots and rays which cost so much more than the best's are not tried."""
+"""Initial labels whose penalty exceeds the least one by more than this are not tried."""
 
 EXPLAINED = 0.85
-"""Such a share of the dots has a ray where a mirror explains them."""
+"""Least share of the dots that have a ray if the mirror explains them."""
 
 GRID_MM, LOOSE = 0.25, 0.45
-"""Steps between places where a ball or cap is looked for; `NEAR` there, as the bench may be off."""
+"""Spacing of the trial positions of a ball or cap; `NEAR` for these, as the bench may be off."""
 
 ROUNDS = 8
-"""Of adjusting and labelling anew, at most."""
+"""Largest number of iterations of adjusting and relabelling."""
 
 
 @dataclass(frozen=True)
 class Picture:
-    """Dots that were found in a picture of a mirror.
+    """Dots detected in a picture of a mirror.
 
     Parameters
     ----------
     name
-        What it is called, for messages.
+        Name of the picture, for messages.
     mirror
-        What it shows.
+        The mirror in the picture.
     dots
-        What `find_dots` found.
+        Dots from `find_dots`.
     frame_shape
         Height and width of the picture, px.
     """
@@ -86,16 +86,16 @@ class Picture:
 
 @dataclass(frozen=True)
 class Labelled:
-    """Rays of a picture's dots, by themselves.
+    """Rays of the dots of a single picture.
 
     Parameters
     ----------
     labels
         Index of each ray's dot, −1 without one, shape (rows, columns).
     adjustment
-        Of the bench and this mirror alone.
+        Adjustment of the bench and this mirror alone.
     cost
-        −2 log likelihood but for a constant, dots without rays and rays without dots included.
+        −2 log likelihood up to a constant, including dots without rays and rays without dots.
     """
 
     labels: IntArray
@@ -109,7 +109,7 @@ def label_picture(
     calibration: ImageCalibration,
     released: FloatArray | None = None,
 ) -> Labelled:
-    """Find the ray of every dot of a picture.
+    """Assign a ray to every dot of a picture.
 
     Parameters
     ----------
@@ -123,9 +123,9 @@ def label_picture(
     Raises
     ------
     CannotMeasure
-        ``too-few-dots``; ``no-reference`` where no gap among the dots can be the absent ray's;
-        ``ambiguous-rows`` where several can; ``no-match`` where the mirror explains the dots
-        with none.
+        ``too-few-dots``; ``no-reference`` if no gap among the dots can be the absent ray's;
+        ``ambiguous-rows`` if several can; ``no-match`` if the mirror does not explain the dots
+        with any of them.
     """
     pattern = rig.pattern
     if pattern.marker is None:
@@ -167,14 +167,14 @@ def label_picture(
 
 
 def _likeliest(starts: list[IntArray], observed: Observation) -> list[IntArray]:
-    """The labels that leave fewest dots and rays, none that leaves many more than the best."""
+    """Initial labels with the least penalty, without those much worse than the best."""
     penalties = np.array([_penalty(labels, observed) for labels in starts])
     order = np.argsort(penalties, kind="stable")[:MOST_STARTS]
     return [starts[k] for k in order if penalties[k] <= penalties.min() + MOST_WORSE]
 
 
 def _by_grid(observed: Observation, picture: Picture) -> list[IntArray]:
-    """Labels by the rows and columns in the picture, the absent ray at each site without a dot."""
+    """Labels from the rows and columns in the picture, for the absent ray at each empty site."""
     pattern = observed.rig.pattern
     try:
         lattice = find_lattice(picture.dots, picture.frame_shape, LatticeSettings())
@@ -187,10 +187,10 @@ def _by_grid(observed: Observation, picture: Picture) -> list[IntArray]:
 
 
 def _by_places(observed: Observation, picture: Picture) -> list[IntArray]:
-    """Labels by where the expected bench has the dots of a ball or cap, at places all over.
+    """Labels from the dots predicted for a ball or cap on a grid of trial positions.
 
-    A row or column on, with the mirror moved as much, they fit a bench that may be off as well: the
-    absent ray is put at each hole that the lit ones leave.
+    Labels shifted by a row or column, with the mirror moved accordingly, fit a bench that may be
+    off equally well. The absent ray is therefore tried at each hole among the lit rays.
     """
     mirror, rig = picture.mirror, observed.rig
     if "x_mm" not in mirror.parameters:
@@ -215,7 +215,7 @@ def _by_places(observed: Observation, picture: Picture) -> list[IntArray]:
 
 
 def moved_labels(labels: IntArray, by: IntArray) -> IntArray:
-    """Labels so many rows and columns on; what leaves the pattern gets no ray."""
+    """Shift labels by rows and columns; dots shifted out of the pattern get no ray."""
     made = np.full_like(labels, UNLABELLED)
     at = np.argwhere(labels != UNLABELLED)
     to = at + by
@@ -232,7 +232,7 @@ def _explains(observed: Observation, one: Labelled) -> bool:
 def sighting_of(
     observed: Observation, mirror: Mirror, labels: IntArray, *, with_absent: bool = False
 ) -> Sighting:
-    """Ray–dot pairs of a labelling; on request with dots of rays that should be absent."""
+    """Return the ray–dot pairs of labels; optionally with dots of rays that should be absent."""
     at = np.argwhere((labels != UNLABELLED) & (with_absent | ~observed.absent))
     dot = labels[tuple(at.T)]
     return Sighting(mirror, at, observed.plane_mm[dot], observed.covariance_mm2[dot])
@@ -245,10 +245,10 @@ def relabelled(
     pose: FloatArray,
     share: float = NEAR,
 ) -> IntArray:
-    """Labels by where a bench that is off and a mirror at a pose put every ray's dot.
+    """Label dots by the predicted dots of all rays, for an offset of the bench and a mirror's pose.
 
-    A dot is taken that is nearer to a ray's than a share of the way to the next. An absent ray has
-    one where a dot lies in its hole.
+    A dot is assigned to a ray if its distance from the predicted dot is less than a share of the
+    distance to the next ray's dot. An absent ray gets a label if a dot lies in its hole.
     """
     assert observed.rig.uncertainty is not None
     computed, hit = landing_points(mirror, pose, moved_rig(observed.rig, offset))
@@ -272,7 +272,7 @@ def _grown(
     released: FloatArray | None,
     labels: IntArray,
 ) -> Labelled | None:
-    """Labels that bench and mirror, adjusted to them, lead to; None where these have no hole."""
+    """Iterate adjustment and labelling from initial labels; None without the absent ray's hole."""
     start = None
     for _ in range(ROUNDS):
         if (labels != UNLABELLED).sum() < LEAST_DOTS:
@@ -291,18 +291,18 @@ def _grown(
 
 
 def _coarse(made: Adjustment) -> float:
-    """−2 log of how much wider than their uncertainty residuals are."""
+    """Cost of residuals that are wider than their uncertainty, −2 log likelihood."""
     return 2 * len(made.standardised) * float(np.log(made.scale))
 
 
 def _different(found: list[Labelled]) -> list[Labelled]:
-    """The cheapest first, each set of labels once."""
+    """Sort by cost, each set of labels once."""
     once = {one.labels.tobytes(): one for one in sorted(found, key=lambda one: -one.cost)}
     return sorted(once.values(), key=lambda one: one.cost)
 
 
 def _penalty(labels: IntArray, observed: Observation) -> float:
-    """What dots without a ray cost, and rays without a dot that are amid lit ones."""
+    """Cost of dots without a ray, and of surrounded rays without a dot."""
     lit = labels != UNLABELLED
     missed = int((~lit & ~observed.absent & (_lit_neighbours(labels) >= SURROUNDED)).sum())
     on_hole = int((lit & observed.absent).sum())
@@ -311,13 +311,13 @@ def _penalty(labels: IntArray, observed: Observation) -> float:
 
 
 def _lit_neighbours(labels: IntArray) -> IntArray:
-    """How many of the four neighbours of each ray have a dot, shape (rows, columns)."""
+    """Number of the four neighbours of each ray that have a dot, shape (rows, columns)."""
     around = np.pad(labels != UNLABELLED, 1).astype(np.int64)
     return np.asarray(around[:-2, 1:-1] + around[2:, 1:-1] + around[1:-1, :-2] + around[1:-1, 2:])
 
 
 def _step(plane_mm: FloatArray) -> FloatArray:
-    """Way to the nearest neighbouring ray's dot, shape (rows, columns); infinite without one."""
+    """Distance to the nearest neighbouring ray's dot, (rows, columns); infinite without one."""
     step = np.full(plane_mm.shape[:2], np.inf)
     for axis in (0, 1):
         length = np.linalg.norm(np.diff(plane_mm, axis=axis), axis=-1)

@@ -1,6 +1,6 @@
-"""Mirrors of known shape, and where the rays that they reflect meet the imaging plane.
+"""Mirrors of known shape, and the points where reflected rays meet the imaging plane.
 
-A mirror has a *pose*, a vector of what is not known of it exactly, held by standard uncertainties.
+A mirror has a *pose*, the vector of its uncertain parameters, with standard uncertainties.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from labapp.core.geometry.rig import Rig
 from labapp.core.values import BoolArray, FloatArray, IntArray
 
 FREE_MM = 10.0
-"""Standard uncertainty of a length that is not known, mm."""
+"""Standard uncertainty of an unknown length, mm."""
 
 
 class Mirror(Protocol):
-    """What the check needs of a mirror; its pose has d parameters."""
+    """Interface of a mirror in a bench check; its pose has d parameters."""
 
     @property
     def name(self) -> str:
@@ -33,12 +33,12 @@ class Mirror(Protocol):
 
     @property
     def parameters(self) -> tuple[str, ...]:
-        """Names of the pose's parameters, which end in their unit."""
+        """Names of the pose's parameters, with the unit as suffix."""
         ...
 
     @property
     def pose(self) -> FloatArray:
-        """The pose that is expected, shape (d,)."""
+        """Expected pose, shape (d,)."""
         ...
 
     @property
@@ -49,7 +49,7 @@ class Mirror(Protocol):
     def meet(
         self, source_mm: FloatArray, direction: FloatArray, pose: FloatArray
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
-        """Where rays meet the mirror at a pose.
+        """Intersect rays with the mirror at a pose.
 
         Parameters
         ----------
@@ -61,7 +61,7 @@ class Mirror(Protocol):
         Returns
         -------
         point_mm, normal, hit
-            Point and upward normal, shapes (…, 3), also a little beyond the mirror's edge, so that
+            Point and upward normal, shapes (…, 3), also slightly beyond the mirror's edge, so that
             they are smooth functions of the pose; whether the ray meets the mirror, shape (…).
         """
         ...
@@ -76,11 +76,11 @@ class Plate:
     height_mm
         Height of its surface over the work piece at the origin.
     height_sigma_mm
-        How well that is known. The usual one is for a plate in place of the work piece, or a gauge
-        block on it.
+        Standard uncertainty of the height. The default is for a plate in place of the work piece,
+        or a gauge block on it.
     tilt_sigma_deg
-        How level it lies, along X and along Y: the usual one is for a plate on the work piece or a
-        levelled table.
+        Standard uncertainty of the tilt along X and along Y. The default is for a plate on the work
+        piece or a levelled table.
     """
 
     height_mm: float = 0.0
@@ -94,7 +94,7 @@ class Plate:
 
     @property
     def parameters(self) -> tuple[str, ...]:
-        """Height at the origin, and by how much it rises along X and along Y."""
+        """Height at the origin, and tilt along X and along Y."""
         return ("height_mm", "tilt_x_deg", "tilt_y_deg")
 
     @property
@@ -128,9 +128,9 @@ class Cap:
     diameter_mm, height_mm
         Diameter of its rim, which lies on the work piece, and height of its top.
     diameter_sigma_mm, height_sigma_mm
-        How well these are known: the usual ones are a caliper's and a dial gauge's.
+        Standard uncertainties of these; the defaults are those of a caliper and a dial gauge.
     place_sigma_mm
-        How near the origin its top is placed, along X and along Y.
+        Standard uncertainty of its top's position about the origin, along X and along Y.
     """
 
     diameter_mm: float
@@ -186,13 +186,14 @@ class Ball:
     diameter_mm
         Its diameter.
     top_mm
-        Height of its top over the work piece. None: it lies on it, and the top is a diameter up.
+        Height of its top over the work piece. None: the ball lies on the work piece, and the height
+        is the diameter.
     diameter_sigma_mm, top_sigma_mm
-        How well these are known.
+        Standard uncertainties of these.
     place_sigma_mm
-        How near it is placed to `place_mm`, along X and along Y.
+        Standard uncertainty of its position about `place_mm`, along X and along Y.
     place_mm
-        X and Y where its top is expected, see `placed`.
+        Expected X and Y of its top, see `placed`.
     """
 
     diameter_mm: float
@@ -240,7 +241,7 @@ class Ball:
 
 
 def placed(mirror: Mirror, rig: Rig) -> Mirror:
-    """The mirror where it is expected on a bench: a ball's top lies on the beam axis."""
+    """Return the mirror at its expected position: a ball's top lies on the beam axis."""
     if not isinstance(mirror, Ball):
         return mirror
     laser = rig.laser
@@ -249,14 +250,14 @@ def placed(mirror: Mirror, rig: Rig) -> Mirror:
 
 
 def sphere_radius(diameter_mm: float, height_mm: float) -> float:
-    """Radius of the sphere that a cap of some rim diameter and height is part of, mm."""
+    """Radius of the sphere of a cap with a given rim diameter and height, mm."""
     return (diameter_mm**2 / 4 + height_mm**2) / (2 * height_mm)
 
 
 def landing_points(
     mirror: Mirror, pose: FloatArray, rig: Rig, of: tuple[IntArray, ...] = ()
 ) -> tuple[FloatArray, BoolArray]:
-    """Where rays that a mirror reflects meet the imaging plane.
+    """Points where rays reflected by a mirror meet the imaging plane.
 
     Parameters
     ----------
@@ -268,9 +269,9 @@ def landing_points(
     Returns
     -------
     plane_mm, hit
-        IPCS (X′, Z′), shape (rows, columns, 2) or (n, 2), mm, the plane's edges ignored, NaN where
-        a ray never meets it; whether the ray meets the mirror and the plane. Absent rays are
-        followed like others.
+        IPCS (X′, Z′), shape (rows, columns, 2) or (n, 2), mm, the plane's edges ignored, NaN if a
+        ray does not meet it; whether the ray meets the mirror and the plane. Absent rays are
+        traced like others.
     """
     rays, source = ray_directions(rig.laser, rig.pattern)[of], rig.laser.position_mm
     point, normal, hit = mirror.meet(source, rays, pose)
@@ -281,7 +282,7 @@ def landing_points(
 def _meet_sphere(
     source_mm: FloatArray, direction: FloatArray, center_mm: FloatArray, radius_mm: float
 ) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """First point on a sphere and its outward normal; a ray that passes it by has its nearest."""
+    """First intersection with a sphere (else a point near it), and the normal from its centre."""
     offset = center_mm - source_mm
     along = direction @ offset
     square = radius_mm**2 - (offset @ offset - along**2)

@@ -1,9 +1,10 @@
-"""The directions of a lens's rays, one by one, from pictures of the pattern on flat mirrors.
+"""Directions of a lens's individual rays, from pictures of the pattern on flat mirrors.
 
-A level mirror at height z sends a ray as if it came from the laser's image, as far below the mirror
-as the laser is above it, and went straight on: the direction from there to the dot, mirrored back,
-is the ray's. Two heights give different directions where a mirror is not level or at its height, or
-the imaging plane leans. A laser that is elsewhere is hardly seen: its rays seem to go elsewhere.
+A level mirror at height z reflects a ray as if it came straight from the laser's mirror image, as
+far below the mirror as the laser is above it. The direction from there to the dot, mirrored back,
+is the ray's. Two heights give different directions if a mirror is not level or not at its height,
+or if the imaging plane is tilted. A wrong laser position is hardly detected: it changes the
+directions of all rays instead.
 """
 
 from __future__ import annotations
@@ -22,26 +23,26 @@ from labapp.core.matching.observation import Observation
 from labapp.core.values import CannotMeasure, FloatArray, IntArray, ReadOnlyArrays
 
 LEAST_PICTURES = 2
-"""With one height, a mirror off its height looks like rays of other directions."""
+"""With one height, a wrong mirror height is indistinguishable from other ray directions."""
 
 
 @dataclass(frozen=True)
 class PatternCalibration(ReadOnlyArrays):
-    """Rays that were measured one by one; n of them.
+    """Individually measured rays, n of them.
 
     Parameters
     ----------
     ray
         Ray (i, j), counted from 1, shape (n, 2).
     tangents
-        Its tangents to the beam axis, to the side and upwards, shape (n, 2).
+        Its tangents to the beam axis, sideways and upwards, shape (n, 2).
     sigma
-        Their standard uncertainty from the dots' noise, the set-up taken as right, shape (n, 2).
+        Their standard uncertainty from the dots' noise, the set-up taken as exact, shape (n, 2).
     off_deg
-        Root mean square by which the rays differ from those that the set-up had, degrees.
+        Root mean square angle between these rays and those of the set-up, degrees.
     disagreement
-        Root mean square of how much the pictures differ, over what the dots' noise allows: about 1
-        where the mirrors' heights and the imaging plane are right.
+        Root mean square difference between the pictures, relative to the dots' noise: about 1 if
+        the mirrors' heights and the imaging plane are correct.
     """
 
     ray: IntArray
@@ -57,14 +58,15 @@ def calibrate_pattern(pictures: Sequence[Picture], bench: Bench) -> PatternCalib
     Parameters
     ----------
     pictures
-        Of `Plate` mirrors, two or more.
+        Two or more pictures of `Plate` mirrors.
     bench
-        The set-up, which is taken as right; its pattern must be near enough to identify the rays.
+        The set-up, taken as exact; its pattern must be good enough to identify the rays.
 
     Raises
     ------
     CannotMeasure
-        As `label_picture`; ``too-few-dots`` if no `FEWEST_RAYS` rays are in two pictures or more.
+        As `label_picture`; ``too-few-dots`` if fewer than `FEWEST_RAYS` rays are in two or more
+        pictures.
     """
     rig, shape = bench.rig, (bench.rig.pattern.rows, bench.rig.pattern.columns)
     weight, weighted, squares = (np.zeros((*shape, 2)) for _ in range(3))

@@ -1,8 +1,8 @@
-"""Whether all rays are one row or column off: the hole of another dot was taken for the absent ray.
+"""Test whether all rays are one row or column off: another hole was taken for the absent ray.
 
-The bench adjusts itself to rays of the next row as well: the laser turns by an inter-beam angle, or
-its aim and the imaging plane move by a spacing. That leaves the same residuals, and only the prior,
-and dots beyond the pattern's edge, distinguish the two.
+The bench can also be adjusted to rays of the next row: the laser turns by an inter-beam angle, or
+its aim and the imaging plane move by a spacing. The residuals are then the same; only the prior and
+dots beyond the pattern's edge distinguish the two.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from labapp.core.matching.observation import UNLABELLED, Observation
 from labapp.core.values import FloatArray, IntArray
 
 SLIPS = ((1, 0), (-1, 0), (0, 1), (0, -1))
-"""Rows and columns by which rays may have slipped."""
+"""Rows and columns by which rays may be off."""
 
 FEW_STEPS, STEPS = 4, 15
-"""Of the adjustment to each of these, and to the likeliest."""
+"""Steps of the adjustment to each of these, and to the likeliest."""
 
 Seen = tuple[Observation, Mirror, IntArray]
 """A picture's dots, its mirror, and the index of each ray's dot."""
@@ -40,10 +40,10 @@ def slip_drop(
     made: Adjustment,
     released: FloatArray,
 ) -> float:
-    """By how much the cost falls with the rays of the next row or column; −inf: it cannot.
+    """Reduction of the cost with the rays of the next row or column; −inf if there is none.
 
-    Dots without a ray count as in `label_picture`: where all others fit, more of them than the
-    prior costs speak against it at once.
+    Dots without a ray cost as in `label_picture`. An alternative is excluded at once if its
+    additional stray dots cost more than could be gained.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def slip_drop(
     """
     strays = _strays(seen)
     prior = float(made.unknown @ made.unknown)
-    excess = prior + max(made.cost - prior - len(made.standardised), 0.0)  # all that is not noise
+    excess = prior + max(made.cost - prior - len(made.standardised), 0.0)  # all but the noise
     slipped = (
         [(observed, mirror, moved_labels(labels, by)) for observed, mirror, labels in seen]
         for by in np.array(SLIPS)
@@ -83,7 +83,7 @@ def _adjusted(
     released: FloatArray,
     near: Adjustment | None = None,
 ) -> Adjustment:
-    """Adjustment to labels, roughly or from one nearby; the absent ray may have a dot."""
+    """Adjust to labels, roughly or from a similar adjustment; the absent ray may have a dot."""
     sightings = [sighting_of(*one, with_absent=True) for one in seen]
     system = System.of(rig, sightings, released)
     start, steps = (system.start(), FEW_STEPS) if near is None else (near.unknown, STEPS)
@@ -95,5 +95,5 @@ def _lit(one: Seen) -> int:
 
 
 def _strays(seen: Sequence[Seen]) -> int:
-    """How many dots have no ray."""
+    """Number of dots without a ray."""
     return sum(len(one[0].plane_mm) - _lit(one) for one in seen)

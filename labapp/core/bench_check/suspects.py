@@ -1,7 +1,7 @@
-"""Which quantity is off by far more than its ± allows.
+"""Identification of a quantity that is off by far more than its ±.
 
-A prior that is wrong pulls every other quantity along. So each quantity, and each way in which the
-whole picture may be off, is freed in turn: the one that the cost falls most by is suspected.
+A wrong prior biases every other quantity. Each quantity, and each common change of the whole
+picture, is therefore freed in turn. The one that reduces the cost most is suspected.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ FREE_OWN = {
     "picture.v": 200.0,
     "picture.scale": 50.0,
 }
-"""The same of those that have their own, by their keys."""
+"""Exceptions to `FREE`, by their keys."""
 
 LIMIT = 20.0
-"""A quantity is off by more than its ± allows where the cost falls by more with it free: 4.5
-standard deviations."""
+"""A quantity is suspected if freeing it reduces the cost by more than this: 4.5 standard
+deviations."""
 
 TRIED = 8
 """Number of suspects tried."""
 
 ALIKE = 6.0
-"""Suspects that the cost falls by nearly as much with explain the dots alike."""
+"""Suspects explain the dots equally well if their reductions of the cost differ by less."""
 
 
 @dataclass(frozen=True)
@@ -53,10 +53,9 @@ class Suspect:
         Its key (`Quantity.key`), or ``picture.u``, ``picture.v``, ``picture.scale`` for the whole
         of the image calibration.
     name
-        What it is called.
+        Its name.
     drop
-        By how much the cost falls with it free: the square of how many standard deviations it
-        is off by.
+        Reduction of the cost if it is free: the square of its deviation in standard deviations.
     """
 
     key: str
@@ -65,7 +64,7 @@ class Suspect:
 
 
 def released(rig: Rig, keys: Sequence[str]) -> FloatArray:
-    """Directions in the space of the quantities that keys of suspects free, shape (k, q).
+    """Directions in the space of the quantities that are freed by keys of suspects, shape (k, q).
 
     Raises
     ------
@@ -77,16 +76,17 @@ def released(rig: Rig, keys: Sequence[str]) -> FloatArray:
 
 
 def suspect_keys() -> tuple[str, ...]:
-    """Keys of all that can be freed."""
+    """Keys of all quantities that can be freed."""
     return (*INDEX, "picture.u", "picture.v", "picture.scale")
 
 
 def find_suspects(
     rig: Rig, sightings: Sequence[Sighting], made: Adjustment, already: FloatArray
 ) -> tuple[Suspect, ...]:
-    """Find what the cost falls most by when it is free, most suspect first; empty: nothing.
+    """Find the quantities that reduce the cost most when freed, the likeliest first.
 
-    Those that explain the dots alike come together: pictures cannot distinguish them.
+    Quantities that explain the dots equally well are returned together, as the pictures cannot
+    distinguish them. Empty if none is suspected.
 
     Parameters
     ----------
@@ -95,7 +95,7 @@ def find_suspects(
     made
         The adjustment to these.
     already
-        What was free in it, see `released`.
+        Directions already free in it, see `released`.
     """
     every = {one.key: one for one in directions(rig)}
     system = System.of(rig, sightings, already)
@@ -104,7 +104,7 @@ def find_suspects(
     most = max(first.values())
     if most < LIMIT:
         return ()
-    # The first order is poor that far off: the likeliest are adjusted in full.
+    # The first-order estimate is poor for large offsets: the likeliest are adjusted in full.
     likely = sorted(first, key=lambda key: -first[key])[:TRIED]
     found = []
     for key in likely:
@@ -119,6 +119,6 @@ def find_suspects(
 
 
 def _free(one: Direction) -> FloatArray:
-    """Offset of the quantities by the standard uncertainty of a direction that is freed."""
+    """Direction of a freed quantity, scaled to its prior standard uncertainty."""
     free = FREE_OWN[one.key] if one.key in FREE_OWN else FREE[one.unit]
     return free * one.vector

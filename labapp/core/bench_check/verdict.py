@@ -1,8 +1,8 @@
-"""Whether the residuals of a bench check are noise, or have a pattern, and of what.
+"""Classification of the residuals of a bench check: noise, or a pattern with a known cause.
 
-Each cause that the model lacks would give residuals of some patterns. They are fitted to what the
-adjustment leaves, together with bench and mirrors (score test); that which explains most, if it is
-much, is the verdict.
+Each unmodelled cause produces characteristic patterns of residuals. These are fitted to the
+residuals of the adjustment, together with bench and mirrors (score test). The cause that explains
+most is the verdict, if it is significant.
 """
 
 from __future__ import annotations
@@ -25,30 +25,30 @@ Verdict = Literal[
 ]
 
 PATTERN_MM = 0.012
-"""A pattern of a smaller root mean square is of no consequence."""
+"""A pattern with a smaller root mean square is ignored."""
 
 SURE = 30.0
-"""A pattern is there where the cost falls by so much more than by its number of amplitudes …"""
+"""A pattern is significant if it reduces the cost by this plus its number of amplitudes …"""
 
 SHARE = 0.15
-"""… and by this share of what the dots cost."""
+"""… and by more than this share of the cost of the dots."""
 
 COARSE = 2.0
-"""Residuals so many times as large as their uncertainty are not noise."""
+"""Residuals larger than their uncertainty by more than this factor are not noise."""
 
 
 @dataclass(frozen=True)
 class Pattern:
-    """A cause, and how much of the residuals it explains.
+    """A cause, and the part of the residuals that it explains.
 
     Parameters
     ----------
     cause
         The cause.
     drop
-        By how much the cost falls with it, in units of χ².
+        Reduction of the cost, in units of χ².
     rms_mm
-        Root mean square of what it explains, mm.
+        Root mean square of the explained part, mm.
     """
 
     cause: Verdict
@@ -59,7 +59,7 @@ class Pattern:
 def judge(
     rig: Rig, sightings: Sequence[Sighting], made: Adjustment, released: FloatArray
 ) -> tuple[Verdict, tuple[Pattern, ...]]:
-    """Judge the residuals of an adjustment: the verdict, and the patterns, the likeliest first.
+    """Classify the residuals of an adjustment: the verdict, and the patterns, the likeliest first.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ def judge(
 
 
 def _causes(rig: Rig, made: Adjustment, system: System) -> Iterator[tuple[Verdict, FloatArray]]:
-    """Each cause, with what its amplitudes change the standardised residuals by, shape (m, c)."""
+    """Each cause, with the changes of the standardised residuals per amplitude, shape (m, c)."""
     bench = moved_rig(rig, made.offset)
     every = list(enumerate(zip(system.sightings, made.poses, strict=True)))
     bent = [system.by_dots(k, _bent_picture(s, rig)) for k, (s, _) in every]
@@ -100,7 +100,7 @@ def _causes(rig: Rig, made: Adjustment, system: System) -> Iterator[tuple[Verdic
 
 
 def _bent_picture(sighting: Sighting, rig: Rig) -> FloatArray:
-    """Radial distortion of the third and the fifth power, and decentring, shape (n, 2, 4), mm."""
+    """Radial distortion of third and fifth order, and decentring, shape (n, 2, 4), mm."""
     half = np.array([rig.imaging_plane.width_mm, rig.imaging_plane.height_mm]) / 2
     reach = float(np.linalg.norm(half))
     x, y = ((sighting.plane_mm - half) / reach).T
@@ -114,7 +114,7 @@ def _bent_picture(sighting: Sighting, rig: Rig) -> FloatArray:
 
 
 def _other_lens(sighting: Sighting, pose: FloatArray, rig: Rig) -> FloatArray:
-    """Rays whose tangents are stretched, slanted or bent, shape (n, 2, c), mm."""
+    """Effect of scaled, sheared or distorted ray tangents, shape (n, 2, c), mm."""
     tangents = rig.pattern.tangents[tuple(sighting.ray.T)]
     reach = float(np.abs(rig.pattern.tangents).max())
     x, y = (tangents / reach).T
@@ -134,7 +134,7 @@ def _other_lens(sighting: Sighting, pose: FloatArray, rig: Rig) -> FloatArray:
 
 
 def _bent_plate(sighting: Sighting, pose: FloatArray, rig: Rig) -> FloatArray:
-    """A plate that is bent as a polynomial of the second and third order, shape (n, 2, 7), mm."""
+    """Effect of a plate bent as a polynomial of second and third order, shape (n, 2, 7), mm."""
     rays = ray_directions(rig.laser, rig.pattern)[tuple(sighting.ray.T)]
     point, normal, _ = sighting.mirror.meet(rig.laser.position_mm, rays, pose)
     reach = float(np.ptp(point[:, :2], axis=0).max()) / 2
@@ -153,7 +153,7 @@ def _bent_plate(sighting: Sighting, pose: FloatArray, rig: Rig) -> FloatArray:
 
 
 def _slipped(sighting: Sighting, pose: FloatArray, rig: Rig) -> FloatArray:
-    """All rays a row or a column on, shape (n, 2, 2), mm."""
+    """Effect of rays shifted by a row or a column, shape (n, 2, 2), mm."""
     plane, _ = landing_points(sighting.mirror, pose, rig)
     along = np.stack([np.gradient(plane, axis=axis) for axis in (0, 1)], axis=-1)
     return np.asarray(along[tuple(sighting.ray.T)])
@@ -162,5 +162,5 @@ def _slipped(sighting: Sighting, pose: FloatArray, rig: Rig) -> FloatArray:
 def _changes(
     landed: Callable[[FloatArray], FloatArray], modes: Sequence[FloatArray], step: float = 1e-4
 ) -> FloatArray:
-    """Minus the derivatives of computed dots by amplitudes of modes, shape (n, 2, c)."""
+    """Negative derivatives of the computed dots w.r.t. the amplitudes of modes, shape (n, 2, c)."""
     return np.stack([(landed(-step * m) - landed(step * m)) / (2 * step) for m in modes], axis=-1)

@@ -1,4 +1,4 @@
-"""Pictures of a board → the camera's lens and the image calibration, with their uncertainty.
+"""Camera lens and image calibration, with uncertainties, from pictures of a calibration board.
 
 The board of the first picture stands in the imaging plane. One such picture is enough; further
 ones, of the same board in any pose before the camera, determine the lens's distortion better and
@@ -21,32 +21,32 @@ from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.values import CannotMeasure, FloatArray
 
 STRAY, LEAST_STRAY_PX = 6.0, 0.3
-"""A corner is left out that is so many times the usual residual off, and by at least so much, …"""
+"""A corner is rejected if its residual exceeds both this multiple of the median and this length."""
 
 MOST_STRAY = 0.15
-"""… but no more than this share of them: then the board is not what it is taken for."""
+"""If more than this share of the corners would be rejected, the board is not the assumed one."""
 
 LARGEST_RMS = 1.0 / 640.0
-"""Largest residual of a board that is flat, root mean square, over the picture's longer side."""
+"""Largest root-mean-square residual of a flat board, as a share of the picture's longer side."""
 
 MOST_PICTURES = 100
 
 FEW_COVERED = 0.5
-"""Where corners span less of the picture, how it is distorted beyond them is a guess."""
+"""If the corners span a smaller share of the picture, the distortion outside is uncertain."""
 
 
 @dataclass(frozen=True)
 class BoardCalibration(SeenAxes):
-    """The corners of a board in each picture, and what follows from them.
+    """Detected board corners in each picture, and the calibration derived from them.
 
     Parameters
     ----------
     size_px
         Width and height of the pictures.
     seen
-        The corners in each picture; the first is of the board in the imaging plane.
+        The corners in each picture; in the first picture the board is in the imaging plane.
     left_out
-        How many corners were left out, as they are not where the others have them.
+        Number of corners rejected as outliers.
     """
 
     size_px: tuple[int, int]
@@ -77,7 +77,7 @@ class BoardCalibration(SeenAxes):
     def distortion_percent(self) -> tuple[float, float]:
         """Distortion in the picture's corner, %, and its standard uncertainty.
 
-        Where none is seen, what it still may be.
+        If no distortion is detected: 0 and an upper estimate of its size.
         """
         if "k1" in self.fit.terms:
             return self.fit.distortion_percent()
@@ -87,7 +87,7 @@ class BoardCalibration(SeenAxes):
 
     @property
     def image_calibration(self) -> ImageCalibration:
-        """The calibration that the measurement uses."""
+        """The image calibration used for measurements."""
         return self.fit.calibration()
 
     @property
@@ -102,23 +102,23 @@ class BoardCalibration(SeenAxes):
 
     @property
     def affine_covariance_px2(self) -> FloatArray:
-        """Covariance of these points for an affine change of the picture, shape (6, 6), px²."""
+        """Covariance of these points under an affine change of the picture, shape (6, 6), px²."""
         corners = self.board.corners_mm
         return self._affine_covariance_px2(corners, self.fit.covariance_px2(corners))
 
     @property
     def residual_px(self) -> FloatArray:
-        """Computed minus found place of each corner of the first picture, shape (n, 2), px."""
+        """Computed minus measured position of each corner of the first picture, (n, 2), px."""
         return self.fit.residuals_px[: len(self.seen[0].index)]
 
     @property
     def covered(self) -> float:
-        """Share of the picture that corners, of all pictures together, span."""
+        """Share of the picture spanned by the corners of all pictures together."""
         return covered(_views(self.seen), self.size_px)
 
     @cached_property
     def corner_sigma_mm(self) -> float:
-        """Largest standard uncertainty of a place on the plane in the picture's corners, mm."""
+        """Largest standard uncertainty of a position on the plane at the picture's corners, mm."""
         width, height = self.size_px
         corners = np.array([[u, v] for u in (0, width - 1) for v in (0, height - 1)], float)
         plane = self.image_calibration.to_plane(corners)
@@ -128,7 +128,7 @@ class BoardCalibration(SeenAxes):
 
     @property
     def setup_keys(self) -> dict[str, dict[str, object]]:
-        """The same as keys of a setup file by section; None for one that must not be there."""
+        """Calibration as setup-file keys by section; None for a key that must be removed."""
         calibration, lens = self.image_calibration, self.fit.lens
         image: dict[str, object] = {
             **dict.fromkeys((*POINTS, "x_axis_mm", "z_axis_mm")),
@@ -143,13 +143,13 @@ class BoardCalibration(SeenAxes):
         return {"image_calibration": image, "camera_lens": camera}
 
     def with_square(self, square_mm: float) -> BoardCalibration:
-        """The same pictures of a board whose squares are of another size."""
+        """Return the calibration for the same pictures with another square size."""
         board = self.board.with_square(square_mm)
         seen = (replace(one, board=board) for one in self.seen)
         return BoardCalibration(self.size_px, tuple(seen), self.left_out)
 
     def undetermined(self) -> tuple[str, ...]:
-        """What the pictures could not determine, in words."""
+        """Return descriptions of the quantities that the pictures do not determine."""
         words = ["the focal length, which no result depends on"]
         names = {"k1": "radial distortion", "p1": "tangential distortion", "k2": "its higher power"}
         words += [
@@ -165,7 +165,7 @@ class BoardCalibration(SeenAxes):
         return tuple(words)
 
     def fit_lines(self) -> list[str]:
-        """Lens, residuals and what is left open, in words."""
+        """Return text lines on the lens, the residuals and undetermined quantities."""
         found = len(self.seen[0].index), len(self.board.corners_mm)
         value, sigma = self.distortion_percent
         lens = f"{value:+.3f} ± {sigma:.3f} % in the picture's corner"
@@ -185,12 +185,12 @@ class BoardCalibration(SeenAxes):
 
 
 def calibrate_board(images: Sequence[Image], board: Board | None = None) -> BoardCalibration:
-    """Calibrate the camera by pictures of a board.
+    """Calibrate the camera from pictures of a board.
 
     Parameters
     ----------
     images
-        Pictures, shape (rows, columns[, channels]) each, the first of the board in the imaging
+        Pictures, shape (rows, columns[, channels]) each; in the first, the board is in the imaging
         plane.
     board
         The board; None: the one of `boards.BOARDS` that the first picture shows.
@@ -198,10 +198,10 @@ def calibrate_board(images: Sequence[Image], board: Board | None = None) -> Boar
     Raises
     ------
     ValueError
-        If there is no picture, or one is none.
+        If there are no pictures, more than `MOST_PICTURES`, or an image is not a valid picture.
     CannotMeasure
-        ``no-board`` if the board is not found in one of them, ``wrong-board`` if another is, or the
-        corners are not where those of a flat board can be.
+        ``no-board`` if the board is not found in one of them or the sizes differ, ``wrong-board``
+        if another board is found or the corners do not fit a flat board.
     """
     if not 1 <= len(images) <= MOST_PICTURES:
         raise ValueError(f"a camera is calibrated by 1 to {MOST_PICTURES} pictures")
@@ -223,7 +223,7 @@ def calibrate_board(images: Sequence[Image], board: Board | None = None) -> Boar
 
 
 def _without_strays(found: BoardCalibration) -> BoardCalibration:
-    """The calibration without corners that are not where the others have them."""
+    """Reject outlying corners until none is left."""
     total = sum(len(one.index) for one in found.seen)
     while True:
         off = np.hypot(*found.fit.residuals_px.T)

@@ -1,8 +1,8 @@
-"""One inner corner of a board, to a small part of a pixel: a model of its grey levels is fitted.
+"""Sub-pixel position of an inner board corner, from a model fitted to the grey levels.
 
 Two edges cross: the light is ``m + c·erf(a/w)·erf(b/w)``, with a and b the distances from the edges
-and w the camera's blur. White noise then costs about as little as it can; OpenCV's `cornerSubPix`
-takes the slopes of the picture instead, and errs three times as much in a dim one.
+and w the camera's blur. For white noise the least-squares fit is nearly optimal. OpenCV's
+`cornerSubPix` uses the picture's gradients; its error in a dim picture is three times as large.
 """
 
 from __future__ import annotations
@@ -13,26 +13,26 @@ import scipy
 from labapp.core.values import FloatArray
 
 ROUNDS = 12
-"""Gauss–Newton steps; they have settled by then, or do not."""
+"""Number of Gauss–Newton steps; the fit has converged by then, or does not converge."""
 
 FIRST_BLUR_PX, LEAST_BLUR_PX = 1.2, 0.3
-"""Blur to begin with, and the least, px."""
+"""Initial and least blur, px."""
 
 LEAST_CONTRAST = 4.0
-"""Contrast of a corner over what the model leaves; below, it is no corner or hidden."""
+"""Least ratio of a corner's contrast to the residual scatter; below, it is no corner or hidden."""
 
 
 def fit_corner(grey: FloatArray, place_px: FloatArray, radius_px: float) -> FloatArray | None:
-    """Place of a corner, shape (2,), px; None if the picture shows none there.
+    """Return the position of a corner, shape (2,), px; None if there is none.
 
     Parameters
     ----------
     grey
         Grey levels, shape (rows, columns).
     place_px
-        (u, v) where it should be, to about a pixel, shape (2,).
+        Initial (u, v), accurate to about a pixel, shape (2,), px.
     radius_px
-        How far around the picture shows nothing but the corner.
+        Radius around it within which the picture shows only this corner, px.
     """
     reach = int(np.ceil(radius_px))
     u0, v0 = np.rint(place_px).astype(int).tolist()
@@ -61,9 +61,9 @@ def fit_corner(grey: FloatArray, place_px: FloatArray, radius_px: float) -> Floa
 
 
 def _first(u: FloatArray, v: FloatArray, light: FloatArray) -> FloatArray:
-    """Corner to begin with: u, v, directions of both edges' normals, blur, middle and contrast."""
+    """Initial parameters: u, v, directions of both edges' normals, blur, middle and contrast."""
     middle = float(light.mean())
-    # ∓ in the quadrants: the saddle's axes are where the second moment of the light turns.
+    # The sign alternates between quadrants: the second moments of the light give the saddle's axes.
     apart = light - middle
     turn = 0.5 * np.arctan2(np.sum(apart * (u * u - v * v)), -2.0 * np.sum(apart * u * v))
     contrast = float(np.quantile(light, 0.9) - np.quantile(light, 0.1)) / 2.0
@@ -75,7 +75,7 @@ def _first(u: FloatArray, v: FloatArray, light: FloatArray) -> FloatArray:
 
 
 def _model(fitted: FloatArray, u: FloatArray, v: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Light at each pixel, shape (n,), and its derivatives by the parameters, shape (n, 7)."""
+    """Light at each pixel, shape (n,), and its derivatives w.r.t. the parameters, shape (n, 7)."""
     du, dv = u - fitted[0], v - fitted[1]
     blur, middle, contrast = fitted[4:]
     parts = []

@@ -1,10 +1,10 @@
-"""Boards for the camera's calibration: ChArUco boards and chessboards, and their inner corners.
+"""Camera calibration boards (ChArUco and chessboard) and the detection of their inner corners.
 
-A board stands where the imaging plane does, upright as it is printed. O′ is its lower left inner
-corner as the camera sees it; X′ runs along its lower row of inner corners, Z′ along its left
-column. A ChArUco board has a marker with a number in each white square, so that it is known which
-corners are seen where a part of it is hidden or out of the picture; a chessboard must be seen as a
-whole, and it does not show which side is up: it may be turned by 45° at most.
+A board stands in the imaging plane, upright as printed. O′ is its lower left inner corner as the
+camera sees it; X′ runs along its lower row of inner corners, Z′ along its left column. A ChArUco
+board has a numbered marker in each white square. The markers identify the visible corners even if
+part of the board is hidden or outside the picture. A chessboard must be completely visible. It does
+not show which side is up and may therefore be rotated by at most 45°.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, R
 Kind = Literal["charuco", "chessboard"]
 
 FEWEST_CORNERS, FEWEST_LINES = 12, 3
-"""A board is found by so many inner corners, in so many rows and so many columns."""
+"""Least number of inner corners, and of rows and columns that contain them, to accept a board."""
 
 FEWEST_MARKERS = 4
-"""So many markers of a ChArUco board are no accident."""
+"""Least number of markers that identifies a ChArUco board."""
 
 MARGIN = 0.15
-"""White between a marker and its square, a share of the square's edge."""
+"""White margin between a marker and its square, as a share of the square's edge."""
 
 REACH = 0.19
-"""Radius of what is looked at about a corner, of a square's edge: a marker begins at 0.21."""
+"""Radius of the window about a corner, as a share of a square's edge: a marker begins at 0.21."""
 
 SMALLEST_PX = 12.0
 """Smallest square whose corners are found, px."""
@@ -47,13 +47,13 @@ class Board:
     Parameters
     ----------
     name
-        What it is called.
+        Name of the board.
     kind
         ``charuco``, with markers in the white squares, or ``chessboard``.
     columns, rows
-        Squares each way.
+        Number of squares in each direction.
     square_mm
-        Edge of a square: measure it on the print.
+        Edge length of a square as measured on the print, mm.
     dictionary
         Name of the markers' dictionary in OpenCV, without ``DICT_``.
     first_id
@@ -75,7 +75,7 @@ class Board:
 
     @property
     def ids(self) -> range:
-        """Numbers of its markers."""
+        """Numbers of the board's markers; empty for a chessboard."""
         count = self.columns * self.rows // 2 if self.kind == "charuco" else 0
         return range(self.first_id, self.first_id + count)
 
@@ -87,7 +87,7 @@ class Board:
 
     @property
     def is_possible(self) -> bool:
-        """Whether there is such a board: 4 to 60 squares each way, of 0.1 to 1000 mm."""
+        """Whether the size is valid: 4 to 60 squares in each direction, of 0.1 to 1000 mm."""
         sides = (self.columns, self.rows)
         return 4 <= min(sides) <= max(sides) <= 60 and 0.1 <= self.square_mm <= 1000.0
 
@@ -119,12 +119,12 @@ _FORM = re.compile(r"(charuco|chessboard):(\d{1,3})x(\d{1,3}):(\d+(?:\.\d+)?)(?:
 
 
 def parse_board(text: str) -> Board:
-    """Board of its name in `BOARDS`, or of its kind and size, such as ``chessboard:9x7:10``.
+    """Return a board by its name in `BOARDS` or its kind and size, such as ``chessboard:9x7:10``.
 
     Raises
     ------
     ValueError
-        If it is neither, or no such board can be.
+        If the text is neither, or describes an invalid board.
     """
     if text in BOARDS:
         return BOARDS[text]
@@ -157,14 +157,14 @@ def parse_board(text: str) -> Board:
 
 @dataclass(frozen=True)
 class BoardCorners(ReadOnlyArrays):
-    """Inner corners of a board that are seen in a picture.
+    """Inner corners of a board that were detected in a picture.
 
     Parameters
     ----------
     board
         The board.
     index
-        Of each in `Board.corners_mm`, shape (n,).
+        Index of each corner in `Board.corners_mm`, shape (n,).
     image_px
         (u, v) of each, shape (n, 2), px.
     """
@@ -179,7 +179,7 @@ class BoardCorners(ReadOnlyArrays):
         return np.asarray(self.board.corners_mm[self.index])
 
     def keep(self, which: BoolArray) -> BoardCorners:
-        """Those that are marked, shape (n,)."""
+        """Return the corners selected by a mask, shape (n,)."""
         return BoardCorners(self.board, self.index[which], self.image_px[which])
 
 
@@ -191,14 +191,15 @@ def find_board(image: Image, board: Board | None = None) -> BoardCorners:
     image
         Grey or BGR(A) picture, shape (rows, columns[, channels]), of any integer or float type.
     board
-        The board; None: whichever of `BOARDS` it is.
+        The board; None: the one of `BOARDS` that the picture shows.
 
     Raises
     ------
     ValueError
-        If the image is no picture.
+        If the image is not a valid picture.
     CannotMeasure
-        ``no-board`` if none is found, ``wrong-board`` if another one is; the reason says which.
+        ``no-board`` if no board is found, ``wrong-board`` if another one is; the reason states
+        which.
     """
     levels = grey_levels(image)
     grey = _stretched(levels)
@@ -231,7 +232,7 @@ def _recognised(grey: npt.NDArray[np.uint8]) -> Board:
     size = _chessboard_size(grey)
     for board in BOARDS.values():
         if board.kind == "chessboard" and size == (board.columns - 1, board.rows - 1):
-            # Two prints of one number of squares differ in size alone, which the user knows.
+            # Boards with the same number of squares differ only in size, which the user supplies.
             return board
     if size is not None:
         raise CannotMeasure(
@@ -246,7 +247,7 @@ def _recognised(grey: npt.NDArray[np.uint8]) -> Board:
 
 
 def _share(board: Board, ids: IntArray) -> int:
-    """How many of the markers that are seen are a board's; 0 if too few to be no accident."""
+    """Number of detected markers that belong to a board; 0 if below `FEWEST_MARKERS`."""
     own = int(np.isin(ids, board.ids).sum())
     return own if own >= FEWEST_MARKERS else 0
 
@@ -268,7 +269,7 @@ def _charuco(grey: npt.NDArray[np.uint8], board: Board) -> BoardCorners:
 
 
 def _no_charuco(grey: npt.NDArray[np.uint8], board: Board, seen: Any) -> CannotMeasure:
-    """Why no corner of a board is found."""
+    """Return the error that explains why no corner of a board was found."""
     others = np.setdiff1d(_markers(grey, board.dictionary), np.array(board.ids))
     if len(others) >= FEWEST_MARKERS:
         return CannotMeasure(
@@ -285,7 +286,7 @@ def _no_charuco(grey: npt.NDArray[np.uint8], board: Board, seen: Any) -> CannotM
 
 
 def _refined(grey: FloatArray, found: BoardCorners) -> BoardCorners:
-    """The corners as the grey levels around them have them; those that look otherwise left out."""
+    """Refine the corners on the grey levels; drop those that do not look like a corner."""
     pitch = _pitch_px(found)
     if pitch < SMALLEST_PX:
         raise CannotMeasure(
@@ -301,7 +302,7 @@ def _refined(grey: FloatArray, found: BoardCorners) -> BoardCorners:
 
 
 def _pitch_px(found: BoardCorners) -> float:
-    """Distance of neighbouring corners in the picture, px; infinite where there are none."""
+    """Median distance of neighbouring corners in the picture, px; infinite if there are none."""
     nearest = [
         np.sort(np.hypot(*(found.image_px - place).T))[1:2] for place in found.image_px.tolist()
     ]
@@ -327,7 +328,7 @@ def _chessboard(grey: npt.NDArray[np.uint8], board: Board) -> BoardCorners:
             "chessboard must be whole and have a white rim; of a ChArUco board a part is enough.",
         )
     grid = np.asarray(corners, np.float64).reshape(board.rows - 1, board.columns - 1, 2)
-    # Which way the rows run is unknown: upright is how a board stands.
+    # The detector does not determine the direction of the rows: the board is assumed upright.
     if grid[:, -1, 0].mean() < grid[:, 0, 0].mean():
         grid = grid[:, ::-1]
     if grid[-1, :, 1].mean() < grid[0, :, 1].mean():
@@ -336,7 +337,7 @@ def _chessboard(grey: npt.NDArray[np.uint8], board: Board) -> BoardCorners:
 
 
 def _chessboard_size(grey: npt.NDArray[np.uint8]) -> tuple[int, int] | None:
-    """Inner corners along a row and along a column of the chessboard in a picture."""
+    """Number of inner corners along a row and a column of the chessboard; None if there is none."""
     flags = cv2.CALIB_CB_EXHAUSTIVE | cv2.CALIB_CB_LARGER
     done, corners, meta = cv2.findChessboardCornersSBWithMeta(grey, (3, 3), flags)
     if not done:
@@ -349,7 +350,7 @@ def _chessboard_size(grey: npt.NDArray[np.uint8]) -> tuple[int, int] | None:
 
 
 def _markers(grey: npt.NDArray[np.uint8], dictionary: str) -> IntArray:
-    """Numbers of the markers that a picture shows."""
+    """Numbers of the markers in a picture."""
     detector = cv2.aruco.ArucoDetector(_dictionary(dictionary), _marker_parameters())
     answer: tuple[Any, ...] = detector.detectMarkers(grey)
     ids = answer[1]
@@ -367,7 +368,7 @@ def _dictionary(name: str) -> Any:
 
 
 def _stretched(grey: FloatArray) -> npt.NDArray[np.uint8]:
-    """Grey levels from 0 to 255, whatever contrast the picture has."""
+    """Stretch the grey levels to the range 0 to 255."""
     low, high = np.percentile(grey, (0.5, 99.5))
     share = (grey - low) / max(float(high - low), 1e-9)
     return np.asarray(np.rint(255.0 * np.clip(share, 0.0, 1.0)), np.uint8)

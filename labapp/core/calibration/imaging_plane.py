@@ -1,4 +1,4 @@
-"""Calibration pictures → image calibration, whatever they show: the text's target or a board."""
+"""Image calibration from pictures of either the dissertation's target or a board."""
 
 from __future__ import annotations
 
@@ -24,25 +24,25 @@ def calibrate_imaging_plane(
     board: Board | None = None,
     lens: Lens | None = None,
 ) -> Calibration:
-    """Calibrate the camera by what the first picture shows in the imaging plane.
+    """Calibrate the camera from pictures of the target or of a board in the imaging plane.
 
     Parameters
     ----------
     images
-        Pictures; more than one are of a board (`calibrate_board`).
+        Pictures; if there is more than one, they must show a board (`calibrate_board`).
     settings
-        Of the target (`calibrate_plane`); None for the defaults.
+        Settings for the target (`calibrate_plane`); None for the defaults.
     board
-        The board, where it is one that is not printed by labapp, or the pictures show several.
+        The board; needed if it is not one of labapp's, or if the pictures show several.
     lens
-        The camera's lens, where it is known: a board gives it, a target does not.
+        The camera's lens, if known: a board determines it, the target does not.
 
     Raises
     ------
     ValueError
-        If there is no picture, or one is none.
+        If there are no pictures, or an image is not a valid picture.
     CannotMeasure
-        ``no-target``, ``no-board`` or ``wrong-board``; the reason says what is missing.
+        ``no-target``, ``no-board`` or ``wrong-board``; the reason states what is missing.
     """
     if board is not None or len(images) != 1 or is_charuco(images[0]):
         return calibrate_board(images, board)

@@ -1,4 +1,4 @@
-"""Cross-hair lengths → angle, distance and height of the laser (Appendix I).
+"""Angle, distance and height of the laser from the lengths of a projected cross (Appendix I).
 
 A cross-hair lens with a known fan angle θ draws a cross on the work piece. With α = θ/2, the
 half lengths of the cross are, by the law of sines in the beam's plane,
@@ -9,9 +9,9 @@ half lengths of the cross are, by the law of sines in the beam's plane,
 
 for a laser at distance x from the centre of the cross, its beam at elevation α₅.
 
-Every ± is a standard uncertainty u such that ±1.96·u covers 95 %, also from few readings: it is
-Student's factor over 1.96 times what their scatter gives, with the effective degrees of freedom of
-Welch and Satterthwaite (JCGM 100, G.4).
+Every ± is a standard uncertainty u such that ±1.96·u covers 95 %, even for few readings: the
+standard uncertainty from their scatter is multiplied by Student's factor over 1.96, with the
+effective degrees of freedom of Welch and Satterthwaite (JCGM 100, G.4).
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ from labapp.core.geometry.rig import Laser
 from labapp.core.values import FloatArray
 
 COVERAGE_FACTOR = 1.959964
-"""Half width of an interval that covers 95 % of a normal distribution, over its σ."""
+"""Half width of the 95 % interval of a normal distribution, in units of σ."""
 
 
 @dataclass(frozen=True)
 class LaserCalibration:
-    """Where the laser stands; every quantity with its standard uncertainty.
+    """Position and orientation of the laser, with standard uncertainties.
 
     Parameters
     ----------
@@ -45,12 +45,11 @@ class LaserCalibration:
     horizontal_mm, horizontal_sigma_mm
         Horizontal distance d_l from the diode to the origin, mm.
     expected_l1_mm
-        The l₁ that follows from l₂, l₃ and the fan angle, mm: the check on the measured one.
+        l₁ computed from l₂, l₃ and the fan angle, mm; compared with the measured l₁.
     warnings
-        Sentences for the operator about lengths that fit each other badly, and about what was
-        assumed.
+        Sentences for the operator about inconsistent lengths and about assumptions.
     correlation
-        Of angle and distance, which follow from the same l₃ and fan angle.
+        Correlation of angle and distance, which both depend on l₃ and the fan angle.
     """
 
     angle_deg: float
@@ -67,12 +66,12 @@ class LaserCalibration:
 
     @property
     def laser(self) -> Laser:
-        """The laser as the rig wants it."""
+        """The laser of the rig."""
         return Laser(projection_angle_deg=self.angle_deg, distance_mm=self.distance_mm)
 
     @property
     def setup_keys(self) -> dict[str, object]:
-        """The same as keys of ``[laser]``, with their uncertainties."""
+        """Keys of the section ``[laser]`` of a setup file, with their uncertainties."""
         return {
             "projection_angle_deg": self.angle_deg,
             "projection_angle_deg_sigma": self.angle_sigma_deg,
@@ -84,23 +83,23 @@ class LaserCalibration:
 
 @dataclass(frozen=True)
 class LaserCalibrationSettings:
-    """How exactly the lengths are known, and what counts as a contradiction.
+    """Uncertainties of the lengths, and limits of their disagreement.
 
     Parameters
     ----------
     resolution_mm
-        Smallest step of the callipers or ruler, mm. A length is known no better than a reading
-        that is uniform within it, however many there are.
+        Resolution of the callipers or ruler, mm. The uncertainty of a length is at least that of
+        a uniform distribution of this width, however many readings there are.
     reading_sigma_mm
-        Standard deviation of a reading, mm, assumed where there is only one.
+        Standard deviation of a reading, mm, assumed if there is only one.
     fan_angle_sigma_deg
-        Standard uncertainty of the lens's fan angle, degrees; the default is assumed, as makers
-        seldom say.
+        Standard uncertainty of the lens's fan angle, degrees; the default is an assumption, as
+        manufacturers seldom state it.
     doubt_sigma
-        Lengths that disagree by more than this many standard uncertainties give a warning.
+        Lengths that disagree by more than this many standard uncertainties cause a warning.
     refuse_sigma, refuse_fraction
         Lengths that disagree by more than this many standard uncertainties and by more than this
-        part of the length are refused.
+        fraction of the length are refused.
     """
 
     resolution_mm: float = 0.05
@@ -118,10 +117,10 @@ def calibrate_laser(
     fan_angle_deg: float = 10.0,
     settings: LaserCalibrationSettings | None = None,
 ) -> LaserCalibration:
-    """Find the laser from its cross-hair on the work piece (Appendix I, Fig. A-1).
+    """Determine the laser's position from its cross on the work piece (Appendix I, Fig. A-1).
 
     Angle and distance come from l₂ and l₃ as in Appendix I; l₁ then follows and is compared with
-    the measured one. A beam square to the work piece, l₁ = l₂ = l₃, is the case α₅ = 90°.
+    the measured one. A beam perpendicular to the work piece (l₁ = l₂ = l₃) has α₅ = 90°.
 
     Parameters
     ----------
@@ -136,8 +135,8 @@ def calibrate_laser(
     Raises
     ------
     ValueError
-        If a reading is not a length, or the lengths contradict each other. The message names the
-        length, its value and what would be right.
+        If a reading is not a positive length, or the lengths contradict each other. The message
+        names the length, its value and the accepted values.
     """
     settings = settings or LaserCalibrationSettings()
     if not 0.0 < fan_angle_deg < 90.0:
@@ -187,12 +186,12 @@ def calibrate_laser(
 
 
 def _appendix_i(l2: float, l3: float, half: float) -> tuple[FloatArray, FloatArray]:
-    """Angle, distance, height, horizontal distance, l₁; and their Jacobian by (l₂, l₃, α).
+    """Angle, distance, height, horizontal distance, l₁; and their Jacobian w.r.t. (l₂, l₃, α).
 
     Shapes (5,) and (5, 3); radians and mm. With α₂ = 90° + α, the law of sines gives
     sin α₃ = (l₃/l₂)·sin α₂, and the elevation is α₅ = α₃ + α.
     """
-    ratio = min(l3 / l2, 1.0)  # l₃ above l₂ by less than their uncertainty: square to the plane
+    ratio = min(l3 / l2, 1.0)  # l₃ > l₂ within their uncertainty: beam perpendicular to the plane
     sine = ratio * np.cos(half)
     angle = np.arcsin(sine) + half
     d_angle = np.array([-sine / l2, sine / l3, -ratio * np.sin(half)]) / np.sqrt(1.0 - sine**2)
@@ -216,7 +215,7 @@ def _appendix_i(l2: float, l3: float, half: float) -> tuple[FloatArray, FloatArr
 
 
 class _Length(NamedTuple):
-    """Mean of so many readings, its standard uncertainty and the degrees of freedom of that."""
+    """Mean of the readings, its standard uncertainty, its degrees of freedom, and their number."""
 
     mean_mm: float
     sigma_mm: float
@@ -237,7 +236,7 @@ def _length(readings: npt.ArrayLike, name: str, settings: LaserCalibrationSettin
         if not (np.isfinite(value) and value > 0.0):
             raise ValueError(f"{name} = {value:g}: a reading is a positive number of mm")
     mean, count = float(values.mean()), values.size
-    # Readings that scatter by more than the resolution are rounded either way: their mean is not.
+    # Averaging reduces the rounding error of readings only if they scatter beyond the resolution.
     least = settings.resolution_mm / np.sqrt(12.0)
     if count == 1:
         return _Length(mean, max(settings.reading_sigma_mm, least), np.inf, count)
@@ -248,8 +247,8 @@ def _length(readings: npt.ArrayLike, name: str, settings: LaserCalibrationSettin
 def _expanded(parts: FloatArray, freedom: FloatArray) -> float:
     """Standard uncertainty of a sum of independent parts, shape (n,), with Student's factor.
 
-    The factor, with the effective degrees of freedom, is that of the parts that scatter gives;
-    what is known otherwise is added in squares, as it has none.
+    The factor, with the effective degrees of freedom, applies to the parts estimated from scatter.
+    Parts with infinite degrees of freedom are added in quadrature without it.
     """
     squares = parts**2
     scatter = float(squares[np.isfinite(freedom)].sum())
@@ -259,7 +258,7 @@ def _expanded(parts: FloatArray, freedom: FloatArray) -> float:
 
 
 def _student(freedom: float) -> float:
-    """Student's factor for 95 % over that of a normal distribution."""
+    """95 % quantile factor of Student's distribution over that of the normal distribution."""
     if np.isinf(freedom):
         return 1.0
     return float(scipy.special.stdtrit(freedom, 0.975)) / COVERAGE_FACTOR
@@ -273,7 +272,7 @@ def _check_order(
     settings: LaserCalibrationSettings,
     warnings: list[str],
 ) -> None:
-    """Refuse a length above l₂, the longest half of the cross; warn when it is barely above."""
+    """Refuse a length greater than l₂, the longest half; warn if it is only slightly greater."""
     excess = length - l2
     if excess > settings.refuse_sigma * sigma:
         raise ValueError(
@@ -294,7 +293,7 @@ def _check_l1(
     settings: LaserCalibrationSettings,
     warnings: list[str],
 ) -> None:
-    """Compare the measured l₁ with the one that follows from l₂, l₃ and the fan angle."""
+    """Compare the measured l₁ with that computed from l₂, l₃ and the fan angle."""
     off = abs(l1 - expected)
     if off > settings.refuse_sigma * sigma and off > settings.refuse_fraction * expected:
         raise ValueError(

@@ -1,13 +1,13 @@
-"""Pictures of known places on a plane → the lens's distortion, and a homography a picture.
+"""Lens distortion, and a homography for each picture, from pictures of known points on a plane.
 
-Each picture has a homography of its own, all have one lens: Brown and Conrady's k₁, k₂, p₁, p₂
-about the middle of the picture. So one picture is enough, square or askew, and any others add to
-it. Of the camera itself nothing more is assumed, and nothing can be found: pictures of planes
-square to it leave the focal length open, which only scales the coefficients. It is taken as the
-longer side of the picture. That the lens's axis passes beside the middle is, to first order,
-tangential distortion and perspective, which are free.
+Each picture has its own homography; all share one lens with Brown and Conrady's coefficients
+k₁, k₂, p₁, p₂ about the middle of the picture. One picture from any direction is therefore enough;
+further pictures improve the fit. The focal length cannot be determined from pictures of planes
+perpendicular to the axis, and it only scales the coefficients. It is set to the longer side of the
+picture. A lens axis off the middle is, to first order, equivalent to tangential distortion and
+perspective, which are free.
 
-A term of the distortion is taken where noise alone would hardly gain as much by it (F-test).
+A distortion term is included if noise alone is unlikely to reduce the residuals as much (F-test).
 """
 
 from __future__ import annotations
@@ -22,24 +22,24 @@ from labapp.core.geometry.coordinates import ImageCalibration, Lens
 from labapp.core.values import FloatArray, ReadOnlyArrays
 
 LARGEST_CHANCE = 0.001
-"""A term is left out while noise alone gains as much with a larger probability than this."""
+"""Significance level of the F-test: a term is left out if its p-value is larger."""
 
 LEAST_SIGMA_PX = 0.02
-"""No corner is known better than this, however well a fit goes through it."""
+"""Lower limit of a corner's standard uncertainty, however small the residuals are, px."""
 
 TERMS = ("k1", "p1", "p2", "k2")
-"""Coefficients in the order of parameters."""
+"""Coefficients in the order of the parameters."""
 
 LEAST_COVERED = 0.35
-"""Further terms than k₁ are a guess where the places span a smaller share of the picture."""
+"""Terms beyond k₁ are fitted only if the points span at least this share of the picture."""
 
 GROUPS = (("k1",), ("p1", "p2"), ("k2",))
-"""Terms that are taken together."""
+"""Terms that are included together."""
 
 
 @dataclass(frozen=True)
 class PlaneView(ReadOnlyArrays):
-    """Known places on a plane, and where a picture has them.
+    """Known points on a plane and their positions in a picture.
 
     Parameters
     ----------
@@ -55,25 +55,25 @@ class PlaneView(ReadOnlyArrays):
 
 @dataclass(frozen=True)
 class LensFit(ReadOnlyArrays):
-    """A lens and homographies, fitted to m pictures.
+    """A lens and homographies fitted to m pictures.
 
     Parameters
     ----------
     size_px
         Width and height of the pictures.
     terms
-        Terms of the distortion that are in it, of `TERMS`.
+        Distortion terms in the fit, a subset of `TERMS`.
     parameters
         8 entries of each homography, in units of the picture's and the plane's size, then the
         coefficients of ``terms``, shape (8m + t,).
     covariance
-        Of the parameters, shape (8m + t, 8m + t), from the residuals.
+        Covariance of the parameters, shape (8m + t, 8m + t), from the residuals.
     frames
-        Middle and size of each picture's places on its plane, shape (m, 3), mm.
+        Middle and size of each picture's points on its plane, shape (m, 3), mm.
     residuals_px
-        Computed minus found place of each, all pictures, shape (n, 2), px.
+        Computed minus measured position of each point, all pictures, shape (n, 2), px.
     chances
-        How probable it is that noise alone gains as much by a term that is left out, by its name.
+        p-value (F-test) of each term that is left out, by its name.
     """
 
     size_px: tuple[int, int]
@@ -91,13 +91,13 @@ class LensFit(ReadOnlyArrays):
 
     @property
     def sigma_px(self) -> float:
-        """Standard uncertainty of a place along either axis, from the residuals, px."""
+        """Standard uncertainty of a position along either axis, from the residuals, px."""
         spare = max(self.residuals_px.size - len(self.parameters), 1)
         return max(float(np.sqrt(np.sum(self.residuals_px**2) / spare)), LEAST_SIGMA_PX)
 
     @cached_property
     def lens(self) -> Lens | None:
-        """The lens; None where no distortion is seen."""
+        """The lens; None if no distortion is detected."""
         if not self.terms:
             return None
         return _lens(self.size_px, _coefficients(self.terms, self.parameters))
@@ -113,7 +113,7 @@ class LensFit(ReadOnlyArrays):
         return ImageCalibration(matrix / matrix[2, 2], self.lens)
 
     def covariance_px2(self, plane_mm: FloatArray, picture: int = 0) -> FloatArray:
-        """Covariance of where a picture has places (X, Z), shape (n, 2), mm; (2n, 2n), px²."""
+        """Covariance, shape (2n, 2n), px², of the image positions of (X, Z), shape (n, 2), mm."""
         unit = (plane_mm - self.frames[picture, :2]) / self.frames[picture, 2]
         coefficients = _coefficients(self.terms, self.parameters)
         own = self.parameters[8 * picture : 8 * picture + 8]
@@ -125,7 +125,7 @@ class LensFit(ReadOnlyArrays):
         return np.asarray(slopes @ self.covariance @ slopes.T)
 
     def distortion_percent(self) -> tuple[float, float]:
-        """Radial distortion in the picture's corner, of the way from its middle, and its ±, %."""
+        """Radial distortion in the picture's corner, % of its distance to the middle, and its ±."""
         corner = float(np.hypot(*_middle(self.size_px))) / _scale(self.size_px)
         powers = {"k1": corner**2, "k2": corner**4}
         of = np.array([100.0 * powers.get(term, 0.0) for term in self.terms])
@@ -136,24 +136,24 @@ class LensFit(ReadOnlyArrays):
 
 
 def fit_lens(views: Sequence[PlaneView], size_px: tuple[int, int]) -> LensFit:
-    """Fit a lens, with the terms that the pictures show, and a homography to each picture.
+    """Fit a lens, with the significant distortion terms, and a homography to each picture.
 
     Parameters
     ----------
     views
-        What is seen in each picture: at least 5 places that span the plane, 12 in all.
+        Points seen in each picture: at least 5 that span the plane, at least 12 in total.
     size_px
         Width and height of the pictures.
 
     Raises
     ------
     ValueError
-        If the places of a picture do not span its plane.
+        If the points of a picture do not span its plane.
     """
     best = fit_terms(views, size_px, ())
     left = list(GROUPS if covered(views, size_px) >= LEAST_COVERED else GROUPS[:1])
     while True:
-        # The higher power alone would be a guess of what lies beyond the outermost corners.
+        # k₂ without k₁ would only extrapolate beyond the outermost corners.
         open_to = [group for group in left if group != ("k2",) or "k1" in best.terms]
         tried = [(group, fit_terms(views, size_px, (*best.terms, *group))) for group in open_to]
         chances = [_chance(best, larger) for _, larger in tried]
@@ -169,7 +169,7 @@ def fit_lens(views: Sequence[PlaneView], size_px: tuple[int, int]) -> LensFit:
 
 
 def covered(views: Sequence[PlaneView], size_px: tuple[int, int]) -> float:
-    """Share of a picture that the places in all of them together span."""
+    """Share of the picture spanned by the points of all pictures together (convex hull)."""
     from scipy.spatial import ConvexHull
 
     places = np.concatenate([view.image_px for view in views])
@@ -179,7 +179,7 @@ def covered(views: Sequence[PlaneView], size_px: tuple[int, int]) -> float:
 def fit_terms(
     views: Sequence[PlaneView], size_px: tuple[int, int], terms: Sequence[str]
 ) -> LensFit:
-    """Fit a lens of given terms, see `fit_lens`."""
+    """Fit a lens with given distortion terms, see `fit_lens`."""
     from scipy.optimize import least_squares
 
     terms = tuple(term for term in TERMS if term in terms)
@@ -227,7 +227,7 @@ def fit_terms(
 
 
 def _chance(smaller: LensFit, larger: LensFit) -> float:
-    """How probable it is that noise alone gains as much by a fit's further terms (F-test)."""
+    """p-value of the additional terms of the larger fit (F-test)."""
     from scipy.special import fdtrc
 
     more = len(larger.terms) - len(smaller.terms)
@@ -241,9 +241,10 @@ def _chance(smaller: LensFit, larger: LensFit) -> float:
 def _seen(
     unit: FloatArray, homography: FloatArray, coefficients: FloatArray, focal: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Where places are seen, over the focal length from the middle, shape (n, 2); derivatives.
+    """Image positions from the middle over the focal length, shape (n, 2), and derivatives.
 
-    Those by the homography, shape (2n, 8), and by k₁, p₁, p₂, k₂, shape (2n, 4), are in px.
+    The derivatives w.r.t. the homography, shape (2n, 8), and k₁, p₁, p₂, k₂, shape (2n, 4), are
+    in px.
     """
     ones = np.column_stack([unit, np.ones(len(unit))])
     rows = np.append(homography, 1.0).reshape(3, 3) @ ones.T
@@ -304,7 +305,7 @@ def _frame(plane_mm: FloatArray) -> FloatArray:
 
 
 def _coefficients(terms: Sequence[str], parameters: FloatArray) -> FloatArray:
-    """k₁, p₁, p₂, k₂ of parameters that end with those of some terms."""
+    """Return k₁, p₁, p₂, k₂; terms that are not fitted are 0."""
     found = np.zeros(len(TERMS))
     found[[TERMS.index(term) for term in terms]] = parameters[len(parameters) - len(terms) :]
     return found

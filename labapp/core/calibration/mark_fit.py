@@ -1,11 +1,11 @@
-"""Marks of the target whose places are known → affine map and homography, and which to use.
+"""Affine map and homography fitted to the marks of the target, and the choice between them.
 
-§5.1.2 takes three points: an affine map. An oblique camera sees the plane in perspective, which
-more marks than three can show. The marks lie along two axes only, so that a homography has
-to be extrapolated to where the dots land: it is worth taking only if it errs less *there* (a
-focused information criterion, Claeskens and Hjort 2003). Perspective that the marks show along one
-axis only is taken along that one. Where a mark is along its axis is known less well than where the
-bar is across it, and less well in the dark than in the light: each place counts by its own scatter.
+§5.1.2 uses three points: an affine map. An oblique camera sees the plane in perspective, which
+requires more than three marks to detect. The marks lie along two axes only, so a homography has
+to be extrapolated to the region of the dots. It is chosen only if its expected error is smaller
+*there* (a focused information criterion, Claeskens and Hjort 2003). Perspective detected along one
+axis only is fitted along that axis. The position of a mark is less certain along its axis than
+across it, and less certain in dark regions: each coordinate is weighted by its own scatter.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.values import FloatArray, ReadOnlyArrays
 
 Model = Literal["three points", "affine", "homography"]
-"""What takes pixels to the plane: the text's three points, or a fit to all marks."""
+"""Map from pixels to the plane: the dissertation's three points, or a fit to all marks."""
 
 FEWEST_ON_AXIS, FEWEST_MARKS = 4, 9
-"""A homography wants so many marks on each axis, O′ included, and so many in all."""
+"""Least number of marks on each axis, O′ included, and in total, for a homography."""
 
 LARGEST_CHANCE = 0.001
-"""A homography is doubted while noise alone gains as much with a larger probability than this."""
+"""Significance level of the F-test: perspective is rejected if its p-value is larger."""
 
 WHAT_MATTERS_MM = 0.5
-"""A map that may err more where dots land is said to."""
+"""The operator is warned if the map's error in the region of the dots may be larger."""
 
 AFFINE = (0, 1, 2, 3, 4, 5)
 PERSPECTIVE = ((6,), (7,), (6, 7))
-"""Entries of the matrix, row by row, that make it affine; and perspective along X′, Z′, both."""
+"""Free matrix entries, row by row: of an affine map; of perspective along X′, Z′ and both."""
 
 HELP = "set the camera square, or use more marks"
 
@@ -41,32 +41,32 @@ FIELD = 1.5
 """Dots land within the square from O′ whose side is this many times the longer axis."""
 
 LEAST_SIGMA_PX = 0.02
-"""No mark is known better than this, however well a fit goes through it."""
+"""Lower limit of a mark's standard uncertainty, however small the residuals are, px."""
 
 ROUNDS = 5
-"""Of fitting and estimating the scatter in turn; it has settled by then."""
+"""Iterations of fitting and estimating the scatter; they have converged by then."""
 
 
 @dataclass(frozen=True)
 class MarkFit(ReadOnlyArrays):
-    """Imaging plane → picture, fitted to marks.
+    """Map from the imaging plane to the picture, fitted to marks.
 
     Parameters
     ----------
     matrix
         Shape (3, 3): (X′, Z′, 1) in mm to homogeneous (u, v, 1) in px; its last entry is 1.
     free
-        Entries of it, row by row, that were fitted; the others are those of an affine map.
+        Matrix entries, counted row by row, that were fitted; the others are those of an affine map.
     covariance
-        Of these entries, from the residuals.
+        Covariance of these entries, from the residuals.
     residual_px, residual_mm
-        Computed minus measured place of each mark, shape (n, 2).
+        Computed minus measured position of each mark, shape (n, 2).
     left_out_px
-        The same of each mark when the others alone are fitted, to first order, shape (n, 2), px.
+        Leave-one-out residual of each mark, to first order, shape (n, 2), px.
     spare
-        Degrees of freedom that each residual leaves along and across its axis, shape (n, 2).
+        Residual degrees of freedom of each mark along and across its axis, shape (n, 2).
     variance
-        Of the residuals, in units of what the marks' scatter has them.
+        Variance of the residuals, relative to that expected from the marks' scatter.
     """
 
     matrix: FloatArray
@@ -80,16 +80,16 @@ class MarkFit(ReadOnlyArrays):
 
     @property
     def calibration(self) -> ImageCalibration:
-        """Picture → imaging plane."""
+        """Map from the picture to the imaging plane."""
         return _calibration(self.matrix)
 
     def covariance_px2(self, plane_mm: FloatArray) -> FloatArray:
-        """Covariance of where points (X′, Z′), shape (n, 2), are seen: u, v, u, v, …, px²."""
+        """Covariance of the image positions u, v, u, v, … of (X′, Z′), shape (n, 2), px²."""
         rows = _jacobian(self.matrix, plane_mm)[:, self.free]
         return np.asarray(rows @ self.covariance @ rows.T)
 
     def moved(self) -> list[ImageCalibration]:
-        """Calibrations that are one σ off, each along another main direction of the covariance."""
+        """Calibrations displaced by one σ along each principal axis of the covariance."""
         # In units of each entry's own σ: the entries differ by orders of magnitude.
         scale = np.sqrt(np.diag(self.covariance))
         power, way = np.linalg.eigh(self.covariance / np.outer(scale, scale))
@@ -99,25 +99,26 @@ class MarkFit(ReadOnlyArrays):
 
 @dataclass(frozen=True)
 class MarkFits:
-    """Both fits to the same marks, and which of them errs less where the dots land.
+    """Both fits to the same marks, and the one with the smaller error in the region of the dots.
 
     Parameters
     ----------
     affine, homography
         The fits; None for a homography that the marks do not determine.
     whole
-        The homography with perspective along both axes, also where less is used: what the marks
-        leave open; None if they are too few.
+        The homography with perspective along both axes, even if a simpler one is used: it gives
+        the uncertainty left by the marks; None if there are too few marks.
     corner_mm
-        X′ = Z′ of the far corner of where dots land, mm.
+        X′ = Z′ of the far corner of the region of the dots, mm.
     chance
-        How probable it is that noise alone gains as much by perspective as was gained (F-test).
+        p-value of perspective (F-test).
     affine_error_mm, homography_error_mm
-        How far each is expected to err where dots land, root mean square; NaN without homography.
+        Expected root-mean-square error of each fit in the region of the dots; NaN without a
+        homography.
     best
         The better model.
     reason
-        Why, in a sentence.
+        Reason for the choice, in a sentence.
     """
 
     affine: MarkFit
@@ -131,12 +132,12 @@ class MarkFits:
     reason: str
 
     def of(self, model: Model) -> MarkFit:
-        """The fit of a model.
+        """Return the fit of a model.
 
         Raises
         ------
         ValueError
-            If these marks do not give it.
+            If these marks do not determine it.
         """
         fit = {"affine": self.affine, "homography": self.homography}.get(model)
         if fit is None:
@@ -145,14 +146,14 @@ class MarkFits:
 
     @property
     def field_mm(self) -> FloatArray:
-        """(X′, Z′) of places all over where dots land, shape (n, 2), mm."""
+        """Grid of points (X′, Z′) over the region of the dots, shape (n, 2), mm."""
         return _field(self.corner_mm)
 
     def bound_mm(self, used: ImageCalibration) -> float:
-        """How far a map may err at the far corner: 95 % bound, mm; NaN if it is not known.
+        """95 % bound of a map's error at the far corner, mm; NaN if unknown.
 
-        The truth is a homography, with perspective along both axes, as uncertain as its fit to the
-        marks: what they leave open counts in full, whichever map is used.
+        The true map is taken to be a homography with perspective along both axes, with the
+        covariance of its fit. Its full uncertainty counts, whichever map is used.
         """
         if self.whole is None:
             return float("nan")
@@ -160,10 +161,10 @@ class MarkFits:
         seen = self.whole.calibration.to_image(corner)
         slope = used.jacobian(seen)[0]
         off = (used.to_plane(seen) - corner)[0]
-        # Scatter along an axis is itself known from the few residuals there only.
+        # The scatter along an axis is estimated from few residuals: Student's factor.
         wider = scipy.special.stdtrit(self.whole.spare[:, 0].sum(), 0.975) / 1.96
         covariance = wider**2 * slope @ self.whole.covariance_px2(corner) @ slope.T
-        # |off + noise|² is nearly c·χ²(n) with its mean and variance (Satterthwaite 1946).
+        # |off + noise|² is approximated by c·χ²(n) of equal mean and variance (Satterthwaite 1946).
         mean = off @ off + np.trace(covariance)
         spread = 2 * np.sum(covariance**2) + 4 * off @ covariance @ off
         n = 2 * mean**2 / max(spread, 1e-300)
@@ -171,7 +172,7 @@ class MarkFits:
         return float(np.sqrt(mean * quantile))
 
     def bound_words(self, used: ImageCalibration) -> tuple[str, ...]:
-        """How far a map may err where dots land, and what helps where that matters."""
+        """Return text on the map's possible error in the region of the dots, and on remedies."""
         bound, whole = self.bound_mm(used), self.whole
         if whole is None:
             return (f"how obliquely the camera looks is not known: {HELP}",)
@@ -206,7 +207,8 @@ def fit_marks(
     plane_mm, image_px
         (X′, Z′), mm, and (u, v), px, of at least 4 marks on the two axes, shape (n, 2).
     noise
-        Of the picture at each mark, shape (n,), in any unit: a mark's scatter goes with it.
+        Noise of the picture at each mark, shape (n,), in any unit; a mark's scatter is taken to be
+        proportional to it.
 
     Raises
     ------
@@ -236,12 +238,12 @@ def fit_marks(
 def _by_scatter(
     plane_mm: FloatArray, image_px: FloatArray, noise: FloatArray, affine: MarkFit
 ) -> FloatArray:
-    """What turns each mark's residual to along and across its axis, in σ, shape (n, 2, 2)."""
+    """Matrices that give each mark's residual along and across its axis, in σ, shape (n, 2, 2)."""
     on_x = plane_mm[:, 1:] == 0.0
     along = np.where(on_x, affine.matrix[:2, 0], affine.matrix[:2, 1])
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     turn = np.stack([along, along[:, ::-1] * [-1.0, 1.0]], axis=1)
-    # Nothing bounds the dot at O′ along an axis: it scatters as little as the bars do across.
+    # The dot at O′ has no end along an axis: it scatters as little as the bars do across theirs.
     is_along = np.stack([plane_mm.any(axis=1), np.zeros(len(plane_mm), bool)], axis=1)
     noises = np.stack([noise, noise], axis=1)
     sigma = LEAST_SIGMA_PX * noises
@@ -255,7 +257,7 @@ def _by_scatter(
 
 
 def _chosen(affine: MarkFit, fits: list[MarkFit], axis_mm: float) -> MarkFits:
-    """Choose the homography, and whether its gain is no accident and outweighs its greater ±."""
+    """Choose the perspective terms, then between the affine map and the homography."""
     k = int(np.argmin([fit.variance for fit in fits[:2]]))
     if _gains(fits[k], fits[2], axis_mm):
         k = 2
@@ -276,31 +278,31 @@ def _chosen(affine: MarkFit, fits: list[MarkFit], axis_mm: float) -> MarkFits:
 
 
 def _chance(smaller: MarkFit, larger: MarkFit) -> float:
-    """How probable it is that noise alone gains as much by a fit's further entries (F-test)."""
+    """p-value of the additional entries of the larger fit (F-test)."""
     more, spare = len(larger.free) - len(smaller.free), float(larger.spare.sum())
     gain = smaller.variance * (spare + more) - larger.variance * spare
     return float(scipy.special.fdtrc(more, spare, max(gain, 0.0) / more / larger.variance))
 
 
 def _gains(smaller: MarkFit, larger: MarkFit, axis_mm: float) -> bool:
-    """Whether a fit's further entries are no accident, and it errs less where dots land."""
+    """Whether the larger fit is significantly better and its error at the dots is smaller."""
     before, after = _expected_errors_mm(smaller, larger, axis_mm)
     return _chance(smaller, larger) <= LARGEST_CHANCE and after < before
 
 
 def _expected_errors_mm(smaller: MarkFit, larger: MarkFit, axis_mm: float) -> tuple[float, float]:
-    """Root mean square error of two fits where dots land, if the larger is right but for noise."""
+    """RMS error of two fits in the region of the dots, if the larger is unbiased."""
     field = _field(FIELD * axis_mm)
     seen = larger.calibration.to_image(field)
     mm2_per_px2 = np.abs(np.linalg.det(larger.calibration.jacobian(seen)))
 
     def spread(fit: MarkFit) -> float:
-        # With one noise for both: the residuals of a map that is wrong hold its bias too.
+        # The same noise for both: the residuals of a wrong map also contain its bias.
         noise = np.diag(fit.covariance_px2(field)).reshape(-1, 2).sum(axis=1) / fit.variance
         return float(np.mean(noise * mm2_per_px2)) * larger.variance
 
     apart = root_mean_square(smaller.calibration.to_plane(seen) - field)
-    # The difference of nested fits has the difference of their variances (Hausman).
+    # The variance of the difference of nested fits is the difference of their variances (Hausman).
     bias = max(apart**2 - (spread(larger) - spread(smaller)), 0.0)
     return float(np.sqrt(bias + spread(smaller))), float(np.sqrt(spread(larger)))
 
@@ -308,7 +310,7 @@ def _expected_errors_mm(smaller: MarkFit, larger: MarkFit, axis_mm: float) -> tu
 def _fit(
     plane_mm: FloatArray, image_px: FloatArray, free: tuple[int, ...], whiten: FloatArray
 ) -> MarkFit:
-    """Least squares in the picture over some entries of the matrix, residuals as whitened."""
+    """Fit some entries of the matrix by least squares of the whitened residuals in the picture."""
     # Lengths of about 1 keep the equations well conditioned.
     size = np.abs(plane_mm).max()
     plane = plane_mm / size
@@ -323,7 +325,7 @@ def _fit(
         by_mark = _jacobian(_with(matrix, free, step), plane)[:, free]
         return np.asarray((whiten @ by_mark.reshape(-1, 2, len(free))).reshape(-1, len(free)))
 
-    # Loaded here: the start of every program would wait for it.
+    # Imported here to keep the program's start fast.
     from scipy.optimize import least_squares
 
     found = least_squares(off, np.zeros(len(free)), jac=slopes, method="lm", x_scale="jac")
@@ -376,7 +378,7 @@ def _jacobian(matrix: FloatArray, plane: FloatArray) -> FloatArray:
 
 
 def _with(matrix: FloatArray, free: tuple[int, ...], step: FloatArray) -> FloatArray:
-    """The matrix with a step added to some entries, counted row by row."""
+    """Return the matrix with a step added to some entries, counted row by row."""
     flat = matrix.ravel().copy()
     flat[list(free)] += step
     return flat.reshape(3, 3)

@@ -1,11 +1,11 @@
-"""Calibration picture → image calibration: O′ and a point on each axis (§5.1, Fig. 5-1 c).
+"""Image calibration from a picture of the target: O′ and a point on each axis (§5.1, Fig. 5-1 c).
 
 The imaging plane shows a dot at O′ and a dark bar along each axis. The picture is levelled,
 thresholded, median filtered and dilated until three objects are left; these are thinned and
-told apart by shape. The text takes their centres to a whole pixel; by default each is then
-measured on the grey levels to a fraction of one, and every place is checked against the design:
-a wrong calibration is worse than none. The ends and unit flags of the bars are more marks than
-three points: an affine map and a homography are fitted to them, and the better is taken.
+distinguished by shape. The dissertation rounds their centres to whole pixels. By default each is
+then measured on the grey levels with sub-pixel accuracy, and every position is checked against the
+design, because a wrong calibration is worse than none. The ends and unit flags of the bars give
+more than three marks: an affine map and a homography are fitted to them, and the better is used.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ AXES = ("O′X′", "O′Z′")
 
 @dataclass(frozen=True)
 class PlaneCalibrationSettings(MarkSettings):
-    """The target's design and how far it may be off; how it is looked for is inherited.
+    """Design of the target and its tolerances; the detection settings are inherited.
 
     Parameters
     ----------
@@ -53,20 +53,21 @@ class PlaneCalibrationSettings(MarkSettings):
     subpixel
         Measure on grey levels; False gives the whole pixels of Eq. 5-5.
     scale_tolerance
-        The px/mm of the two axes may differ by this part.
+        Largest relative difference between the px/mm of the two axes.
     angle_tolerance_deg
-        The angle between the axes may differ from 90° by this much.
+        Largest deviation of the angle between the axes from 90°, degrees.
     sigma_limit_px
-        Largest standard uncertainty of a point that is accepted, px.
+        Largest accepted standard uncertainty of a point, px.
     pointing_tolerance
-        A bar's line may pass by O′ this many units off.
+        Largest distance of a bar's midline from O′, units.
     middle_tolerance
-        A bar's middle may be this many units from where its length and O′ have it. This finds a
-        bar that is partly hidden: its middle moves by half of what is.
+        Largest distance of a bar's middle from the position expected from its length and O′, units.
+        This detects a partly hidden bar: its middle moves by half of the hidden length.
     flag_units
-        How far the unit flags stand out of their bars, units.
+        Length by which the unit flags protrude from their bars, units.
     mark_tolerance
-        A mark may be this many units from where the others have it, perspective allowed for.
+        Largest distance of a mark from the position predicted by the others, with perspective,
+        units.
     """
 
     unit_mm: float = 6.35
@@ -84,25 +85,25 @@ class PlaneCalibrationSettings(MarkSettings):
 
 @dataclass(frozen=True)
 class PlaneCalibration(SeenAxes):
-    """Where O′ and the axes are in the picture, and what takes its pixels to the plane.
+    """Image positions of O′ and the axes, and the map from pixels to the plane.
 
     Parameters
     ----------
     origin_px, x_axis_px, z_axis_px
         (u, v) of O′ and of the middles of the bars on O′X′ and O′Z′, px.
     x_axis_mm, z_axis_mm
-        X′ and Z′ of these middles, mm (5.5 and 2.5 units in the text, Eq. 5-6).
+        X′ and Z′ of these middles, mm (5.5 and 2.5 units in the dissertation, Eq. 5-6).
     sigma_px
         Standard uncertainty of each of the three points along either direction, px.
     threshold
-        Grey level at O′ below which the three objects were found.
+        Grey-level threshold at O′ with which the three objects were found.
     marks
         X′, Z′ (mm), u and v (px) of O′ and of the ends and flags of the bars, and the noise of
-        the picture there (any unit); empty where only the three points are known.
+        the picture there (any unit); empty if only the three points are known.
     model
-        What is used: the three points, or a fit to the marks.
+        Map in use: the three points, or a fit to the marks.
     lens
-        The camera's lens, where it is known from elsewhere (`board_calibration`).
+        The camera's lens, if known from another calibration (`board_calibration`).
     """
 
     origin_px: tuple[float, float]
@@ -127,7 +128,7 @@ class PlaneCalibration(SeenAxes):
 
     @property
     def points_px(self) -> FloatArray:
-        """(u, v) of O′ and of the points on O′X′ and O′Z′ as the model has them, shape (3, 2)."""
+        """(u, v) of O′ and of the points on O′X′ and O′Z′ by the model, shape (3, 2), px."""
         if self.fits is None or self.model == "three points":
             return np.array([self.origin_px, self.x_axis_px, self.z_axis_px])
         straight = self.fits.of(self.model).calibration.to_image(self._points_mm)
@@ -142,7 +143,7 @@ class PlaneCalibration(SeenAxes):
 
     @property
     def affine_covariance_px2(self) -> FloatArray:
-        """Covariance of these points for an affine change of the picture, shape (6, 6), px²."""
+        """Covariance of these points under an affine change of the picture, shape (6, 6), px²."""
         if self.fits is None or self.model != "homography":
             return self.points_covariance_px2
         field = self.fits.field_mm
@@ -150,16 +151,16 @@ class PlaneCalibration(SeenAxes):
 
     @property
     def image_calibration(self) -> ImageCalibration:
-        """The calibration that the measurement uses.
+        """The image calibration used for measurements.
 
         Raises
         ------
         ValueError
-            If the three points lie on one line, or the marks do not give the model.
+            If the three points are collinear, or the marks do not determine the model.
         """
         if self.model != "three points" and self.fits is None:
             raise ValueError(f"without marks there is no {self.model}")
-        # As the set-up's keys give it, to the last digit: what is proposed is what is used.
+        # Identical to the calibration read back from the set-up's keys.
         if self.model == "homography":
             assert self.fits is not None
             matrix = self.fits.of(self.model).calibration.matrix
@@ -171,9 +172,9 @@ class PlaneCalibration(SeenAxes):
 
     @property
     def setup_keys(self) -> dict[str, dict[str, object]]:
-        """The same as keys of a setup file by section, with the points' standard uncertainties.
+        """Calibration as setup-file keys by section, with the points' standard uncertainties.
 
-        None for a key that must not be there.
+        None for a key that must be removed.
         """
         lengths = {"x_axis_mm": self.x_axis_mm, "z_axis_mm": self.z_axis_mm}
         known = self.setup_uncertainty
@@ -186,7 +187,7 @@ class PlaneCalibration(SeenAxes):
         return {"image_calibration": {**points, **lengths, **gone, **known}}
 
     def fit_lines(self) -> list[str]:
-        """What the fits to the marks leave over, which is used and why, in words."""
+        """Return text lines on the residuals of the fits and the choice of the model."""
         if self.fits is None:
             return ["used       the three points: too few marks where the target has them"]
         named = (("affine", self.fits.affine), ("homography", self.fits.homography))
@@ -203,12 +204,12 @@ class PlaneCalibration(SeenAxes):
         return [*lines, *(f"{'error':<10} {words}" for words in self.bound_words())]
 
     def bound_words(self) -> tuple[str, ...]:
-        """How far the model may err where dots land; nothing without marks."""
+        """Return text on the model's possible error at the dots; empty without marks."""
         straight = ImageCalibration(self.image_calibration.matrix)
         return () if self.fits is None else self.fits.bound_words(straight)
 
     def with_scale(self, factor: float) -> PlaneCalibration:
-        """The same picture of a target that is larger by a factor."""
+        """Return the calibration for the same picture of a target scaled by a factor."""
         return replace(
             self,
             x_axis_mm=self.x_axis_mm * factor,
@@ -229,15 +230,15 @@ def calibrate_plane(
     settings
         The target's design and limits; None for the defaults.
     lens
-        The camera's lens, where it is known.
+        The camera's lens, if known.
 
     Raises
     ------
     ValueError
-        If the image is no picture.
+        If the image is not a valid picture.
     CannotMeasure
-        ``no-target`` if O′ and the two bars are not found where the design has them; the reason
-        says what is missing or does not fit.
+        ``no-target`` if O′ and the two bars are not found as designed; the reason states what is
+        missing or does not fit.
     """
     settings = settings or PlaneCalibrationSettings()
     grey = grey_levels(image)
@@ -248,7 +249,7 @@ def calibrate_plane(
             marks = three_marks(binary, settings)
             return _measured(marks, darkness, background, threshold, settings, lens)
         except Refusal as refusal:
-            # What failed last in the chain came closest: its reason helps the operator most.
+            # The attempt that failed at the latest stage was closest: report its reason.
             if refusal.stage > failure.stage:
                 failure = refusal
     raise CannotMeasure("no-target", failure.reason)
@@ -262,7 +263,7 @@ def _measured(
     settings: PlaneCalibrationSettings,
     lens: Lens | None,
 ) -> PlaneCalibration:
-    """Measure the three objects and hold them to the design."""
+    """Measure the three objects and check them against the design."""
     dot, x_mark, z_mark = marks
     origin, origin_sigma = dot_center(dot, darkness)
     x_bar, z_bar = measured_bar(x_mark, darkness, "O′X′"), measured_bar(z_mark, darkness, "O′Z′")
@@ -293,7 +294,7 @@ def _measured(
         _check_pointing(axis, origin, bar, units, settings)
     ticks = _tick_marks(origin, bars, darkness, settings)
     if not ticks:
-        # Without flags in their places the ends alone must show whether the bars are whole.
+        # Without flags, only the ends can show whether the bars are completely visible.
         for axis, bar, units in zip(AXES, bars, (settings.x_units, settings.z_units), strict=True):
             _check_length(axis, origin, bar, units, settings)
     if ticks and settings.subpixel:
@@ -318,7 +319,7 @@ def _tick_marks(
     darkness: FloatArray,
     settings: PlaneCalibrationSettings,
 ) -> tuple[tuple[float, float, float, float, float], ...]:
-    """O′, the ends of the bars and their flags; none if too few are where the design has them."""
+    """O′, the ends of the bars and their flags; empty if too few agree with the design."""
     unit_px = float(np.hypot(*(bars[0].middle - origin))) / (sum(settings.x_units) / 2.0)
     places = [(0.0, 0.0, origin)]
     least = 1
@@ -339,7 +340,7 @@ def _tick_marks(
         off = np.hypot(*fit.left_out_px.T)
         worst = int(np.argmax(off))
         stray = off[worst] > max(5.0 * float(np.median(off)), 0.3)
-        # A scratch or a speck can be taken for a flag; O′ and the ends have been checked.
+        # A scratch or a speck can be mistaken for a flag; O′ and the ends have been checked.
         if stray and worst and marks[worst][:2] not in ends:
             del marks[worst]
             continue
@@ -374,12 +375,13 @@ def _check_length(
     units: tuple[float, float],
     settings: PlaneCalibrationSettings,
 ) -> None:
-    """Refuse a bar that does not begin and end where it should."""
+    """Refuse a bar whose length does not match the design."""
     begin, end = units
     unit_px = float(np.hypot(*(bar.middle - origin))) / ((begin + end) / 2.0)
     expected = (end - begin) / 2.0 * unit_px
-    # With 2s of it hidden a bar's half is s shorter, but s·(end - begin) / (end + begin) of that
-    # is expected of its new middle. Half a pixel an end may be off even in a coarse picture.
+    # If 2s of a bar is hidden, its half length is s shorter, but the expected half length also
+    # shrinks by s·(end - begin) / (end + begin), as the middle moves. An end may be half a pixel
+    # off even in a coarse picture.
     tolerance = max(settings.middle_tolerance * 2.0 * begin / (begin + end) * unit_px, 0.5)
     if abs(bar.half_length - expected) > tolerance:
         raise Refusal(

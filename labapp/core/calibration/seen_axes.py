@@ -1,4 +1,4 @@
-"""O′ and a point on each axis as a calibration picture has them: scales, angle and their ±."""
+"""Scales and angle, with their ±, from O′ and a point on each axis in a calibration picture."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ POINTS = ("origin_px", "x_axis_px", "z_axis_px")
 
 
 class SeenAxes:
-    """What follows from three points in a picture and their covariance."""
+    """Quantities derived from three points in a picture and their covariance."""
 
     x_axis_mm: float
     z_axis_mm: float
@@ -37,17 +37,18 @@ class SeenAxes:
 
     @property
     def affine_covariance_px2(self) -> FloatArray:
-        """Covariance of these points for an affine change of the picture, shape (6, 6), px².
+        """Covariance of these points under an affine change of the picture, shape (6, 6), px².
 
-        A set-up perturbs its image calibration by these three points alone. Where the map has more
-        than six parameters, this is the change nearest to its own over where dots land.
+        A set-up perturbs its image calibration through these three points alone. For a map with
+        more than six parameters, this is the least-squares affine approximation over the region of
+        the dots.
         """
         return self.points_covariance_px2
 
     def _affine_covariance_px2(
         self, plane_mm: FloatArray, covariance_px2: FloatArray
     ) -> FloatArray:
-        """The same, from the covariance of where points (X′, Z′), shape (n, 2), mm, are seen."""
+        """The same, from the covariance of the image positions of (X′, Z′), shape (n, 2), mm."""
         x, z = (plane_mm / [self.x_axis_mm, self.z_axis_mm]).T
         shares = np.stack([1.0 - x - z, x, z], axis=-1)  # barycentric coordinates
         nearest = np.kron(np.linalg.pinv(shares), np.eye(2))
@@ -55,7 +56,7 @@ class SeenAxes:
 
     @property
     def setup_uncertainty(self) -> dict[str, object]:
-        """Keys of ``[image_calibration]``: ± of each point, and the covariance of them all."""
+        """Keys of ``[image_calibration]``: ± of each point, and their joint covariance."""
         covariance = self.affine_covariance_px2
         keys = {
             f"{name}_sigma": sigma
@@ -71,7 +72,7 @@ class SeenAxes:
 
     @property
     def angle_deg(self) -> float:
-        """Angle from O′X′ to O′Z′ as the picture shows it, anticlockwise, degrees."""
+        """Angle from O′X′ to O′Z′ in the picture, anticlockwise, degrees."""
         return float(self._scales_and_angle(self.points_px)[2])
 
     @property

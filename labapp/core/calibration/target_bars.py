@@ -1,7 +1,7 @@
-"""The target's three marks measured on the grey levels, and the unit flags of its bars (§5.1).
+"""Sub-pixel measurement of the target's three marks and of the unit flags of its bars (§5.1).
 
-`target_marks` finds the dot and the two bars; here each is measured to a fraction of a pixel, and
-with the dot, the ends and the flags of the bars there are marks enough to fit a map to.
+`target_marks` finds the dot and the two bars. Here each is measured to a fraction of a pixel. The
+dot, the ends and the flags of the bars are the marks to which a map is fitted.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from labapp.core.calibration.target_marks import Mark, Refusal
 from labapp.core.values import FloatArray, ReadOnlyArrays
 
 END_PX = 4.0
-"""The end of a bar is within so many pixels of where it is first seen."""
+"""Largest distance of a bar's end from its first estimate, px."""
 
 
 @dataclass(frozen=True)
@@ -30,10 +30,10 @@ class Bar(ReadOnlyArrays):
     half_length, half_width, sigma_px
         Half its length and width; standard uncertainty of the middle, px.
     darkness
-        Of the bar, as a part of the light.
+        Darkness of the bar, as a fraction of the light.
     midline
-        Cuts across it, shape (m, 2): place along it from its middle, and how far the middle of
-        the cut is off the straight midline; px.
+        Cross-sections, shape (m, 2): position along the bar from its middle, and the deviation of
+        the cross-section's middle from the straight midline; px.
     """
 
     middle: FloatArray
@@ -53,8 +53,8 @@ class Bar(ReadOnlyArrays):
 def dot_center(dot: Mark, darkness: FloatArray) -> tuple[FloatArray, float]:
     """(u, v) of the dot's centre and its standard uncertainty, px.
 
-    A pixel weighs by the part of it that the dot covers: 0 below a fifth, 1 above four fifths of
-    the dot's darkness, linear between, so that uneven light does not pull the centre.
+    A pixel is weighted by the fraction of it that the dot covers: 0 below a fifth, 1 above four
+    fifths of the dot's darkness, linear between, so that uneven light does not bias the centre.
     """
     v, u = np.nonzero(cv2.dilate(dot.mask.astype(np.uint8), np.ones((5, 5), np.uint8)))
     dark = darkness[v, u]
@@ -73,10 +73,10 @@ def dot_center(dot: Mark, darkness: FloatArray) -> tuple[FloatArray, float]:
 
 
 def measured_bar(mark: Mark, darkness: FloatArray, axis: str) -> Bar:
-    """Measure a bar: midline from cuts across it, ends where its darkness falls to half.
+    """Measure a bar: midline from cross-sections, ends where its darkness falls to half.
 
-    The middle between the ends does not depend on how the light falls along the bar, as a
-    centroid would. Cuts through unit flags are outliers of the midline and are left out.
+    Unlike a centroid, the middle between the ends does not depend on the light along the bar.
+    Cross-sections through unit flags are outliers of the midline and are rejected.
     """
     step = 0.5
     margin = 1.5 * mark.width
@@ -99,7 +99,7 @@ def measured_bar(mark: Mark, darkness: FloatArray, axis: str) -> Bar:
     offset = weight @ across / np.maximum(total, 1e-12)
     slope, intercept, scatter = _robust_line(along[core], offset[core])
 
-    # Ends on the bar's inner part: the midline is there even where flags stand out.
+    # Ends are measured on the bar's inner part, which flags do not affect.
     half_width = float(np.median(total[core])) * step / 2.0
     midline = np.abs(across[None, :] - intercept - slope * along[:, None])
     inner = midline < max(0.65 * half_width, step)
@@ -107,7 +107,7 @@ def measured_bar(mark: Mark, darkness: FloatArray, axis: str) -> Bar:
     low, low_sigma = _end(-along[::-1], profile[::-1], mark.length / 2.0, axis)
     high, high_sigma = _end(along, profile, mark.length / 2.0, axis)
     middle = (high - low) / 2.0
-    # Cuts 1 px and a blur apart share their noise: about a third of them are independent.
+    # The noise of neighbouring cross-sections is correlated: about a third are independent.
     midline_sigma = scatter / np.sqrt(max(core.sum() * step / 3.0, 1.0))
     sigma = np.sqrt((low_sigma**2 + high_sigma**2) / 8.0 + midline_sigma**2 / 2.0)
     direction = mark.direction + slope * normal
@@ -139,11 +139,11 @@ def _robust_line(x: FloatArray, y: FloatArray) -> tuple[float, float, float]:
 def _end(
     along: FloatArray, profile: FloatArray, half_length: float, axis: str
 ) -> tuple[float, float]:
-    """Where a profile first falls to half of what it is within, going up; with its σ, px.
+    """First position along a profile where it falls to half its level inside the bar, and σ, px.
 
-    The level is that of the bar's last part on this side: light may fall along the bar. It is
-    then measured anew between the levels on either side of the end, as light is not level there:
-    O′ and both bars lie close together.
+    The level is that of the bar's last part on this side, as the light may vary along the bar. The
+    position is then refined between the levels on either side of the end, as the background differs
+    there: O′ and both bars lie close together.
     """
     begin, end = 0.5 * half_length, 0.8 * half_length
     part = profile[(along >= begin) & (along <= end)]
@@ -174,20 +174,20 @@ def bar_marks(
     flag_units: float,
     darkness: FloatArray,
 ) -> list[tuple[float, FloatArray]]:
-    """Both ends of a bar, and those of its unit flags that are seen.
+    """Return both ends of a bar and its visible unit flags.
 
     Parameters
     ----------
     bar, origin
         The bar, and (u, v) of O′, px.
     units
-        Where the bar begins and ends.
+        Begin and end of the bar, units.
     flags_along
         Direction of the flags in the picture: that of the other axis.
     flag_units
-        How far a flag stands out on at least one side of the bar, units.
+        Length by which a flag protrudes on at least one side of the bar, units.
     darkness
-        Part of the light lacking, shape (rows, columns).
+        Missing fraction of the light, shape (rows, columns).
 
     Returns
     -------
@@ -200,7 +200,7 @@ def bar_marks(
     near, far = (
         float((bar.middle - origin) @ bar.direction + side * bar.half_length) for side in (-1, 1)
     )
-    # O′ and both ends give the places along the axis as a camera sees them: s = a·t / (1 + k·t).
+    # O′ and both ends determine the projection along the axis: s = a·t / (1 + k·t).
     k = (end * near / begin - far) / (end * (far - near))
     a = near / begin * (1.0 + k * begin)
     unit_px = (far - near) / (end - begin)
@@ -214,7 +214,7 @@ def bar_marks(
     place, deviation = bar.midline.T
     marks = []
     for t, along in sorted(found):
-        # Beside the flag, which may stand out on one side only and would pull the middle.
+        # Beside the flag, which may protrude on one side only and would bias the middle.
         beside = np.abs(place + bar.half_length - along) / unit_px
         near_by = deviation[(beside > 0.1) & (beside < 0.45)]
         across = float(np.median(near_by)) if near_by.size else 0.0
@@ -230,10 +230,10 @@ def _flag(
     flag_units: float,
     darkness: FloatArray,
 ) -> float | None:
-    """How far along the bar from a guess a flag is, px; None if it is not seen."""
+    """Displacement of a flag along the bar from an initial guess, px; None if it is not visible."""
     step = 0.25
     along = np.arange(-0.35 * unit_px, 0.35 * unit_px + step / 2, step)
-    # Clear of the bar and its blur, and of the flag's own end.
+    # Avoid the bar with its blur, and the flag's end.
     clear = bar.half_width / abs(float(flags_along @ bar.normal))
     out = clear + np.arange(1.0, max(0.85 * flag_units * unit_px, 1.5), 0.5)
     profile = np.zeros_like(along)
@@ -250,17 +250,17 @@ def _flag(
     reach = max(0.1 * unit_px, 3.0)
     at = float(along[peak])
     profile = np.maximum(profile - 0.2 * profile[peak], 0.0)
-    for _ in range(5):  # the centroid of what is around the last one
+    for _ in range(5):  # centroid of the surroundings of the previous one
         weight = profile * np.clip(reach + 0.5 - np.abs(along - at), 0.0, 1.0)
         at = float(weight @ along / weight.sum())
     return at if abs(at) < 0.35 * unit_px - reach else None
 
 
 def local_noise(darkness: FloatArray, place_px: FloatArray, reach_px: float) -> float:
-    """Noise of the darkness within so many px of a place, from its steps; in a unit of its own."""
+    """Relative noise of the darkness around a position, from differences of neighbouring pixels."""
     u, v = np.round(place_px).astype(int)
     reach = max(round(reach_px), 5)
     near_by = darkness[max(v - reach, 0) : v + reach + 1, max(u - reach, 0) : u + reach + 1]
     steps = np.sort(np.abs(np.diff(near_by, axis=1)).ravel())
-    # Without the edges of marks. A mean: a median of whole grey levels would be one of few values.
+    # Exclude the edges of marks. Mean, not median: grey levels are quantised.
     return float(steps[: int(0.7 * len(steps))].mean())

@@ -1,7 +1,7 @@
-"""Calibration picture → the three marks of the imaging plane: a dot and two bars (§5.1.2).
+"""Detection of the three marks of the imaging plane, a dot and two bars, in a picture (§5.1.2).
 
-The steps of the text: segmentation, median filter, dilation until three objects are left,
-thinning. `plane_calibration` measures the marks and holds them to the design.
+The steps of the dissertation: segmentation, median filter, dilation until three objects are left,
+thinning. `plane_calibration` measures the marks and checks them against the design.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ Image = npt.NDArray[Any]
 
 @dataclass(frozen=True)
 class MarkSettings:
-    """How the three marks are looked for.
+    """Settings for the detection of the three marks.
 
     Parameters
     ----------
     threshold
-        Grey level below which a pixel is dark (the text's T = 14); None tries several.
+        Grey level below which a pixel is dark (T = 14 in the dissertation); None tries several.
     median_px
         Side of the median filter in a picture of 640 px; scaled with the picture.
     dilations
-        Most dilations by 3 × 3, likewise scaled.
+        Largest number of dilations by 3 × 3, likewise scaled.
     speck_fraction
-        An object smaller than this part of the largest is a speck.
+        An object smaller than this fraction of the largest is a speck.
     roll_deg
-        The bars may be turned by this much from the horizontal and the vertical.
+        Largest rotation of the bars from the horizontal and the vertical, degrees.
     """
 
     threshold: float | None = None
@@ -44,7 +44,7 @@ class MarkSettings:
 
 
 class Refusal(Exception):
-    """One threshold gave no calibration: how far it came, and why it stopped."""
+    """No calibration with one threshold: the stage that failed, and the reason."""
 
     def __init__(self, stage: int, reason: str) -> None:
         super().__init__(reason)
@@ -61,10 +61,10 @@ class Mark(ReadOnlyArrays):
     mask
         Its pixels after dilation, shape of the picture.
     center, direction
-        (u, v) of its centre, px; unit vector of its longest extent. Of all pixels, then of the
-        thinned ones.
+        (u, v) of its centre, px; unit vector of its longest extent. At first from all pixels, then
+        from the thinned ones.
     length, width
-        Extents along and across that, px.
+        Extents along and across this direction, px.
     """
 
     mask: BoolArray
@@ -75,18 +75,18 @@ class Mark(ReadOnlyArrays):
 
 
 def grey_levels(image: Image) -> FloatArray:
-    """Grey levels of a picture without its impulse noise, shape (rows, columns).
+    """Return the grey levels of a picture without impulse noise, shape (rows, columns).
 
     Raises
     ------
     ValueError
-        If the image is no picture.
+        If the image is not a valid picture.
     CannotMeasure
-        ``no-target`` if it is too small to hold one.
+        ``no-target`` if it is too small to contain a target.
     """
     image = np.asarray(image)
     if image.ndim == 3 and image.shape[2] in (1, 3, 4):
-        # Rec. 601 luminance of blue, green, red: what OpenCV takes a colour picture to.
+        # Rec. 601 luminance of blue, green, red, as in OpenCV.
         weights = np.array([0.114, 0.587, 0.299]) if image.shape[2] > 1 else np.ones(1)
         image = image[..., : len(weights)].astype(np.float64) @ weights
     if image.ndim != 2:
@@ -98,14 +98,14 @@ def grey_levels(image: Image) -> FloatArray:
         raise CannotMeasure(
             "no-target", f"A picture of {grey.shape[1]} × {grey.shape[0]} px is too small."
         )
-    # Impulse noise (Eq. 5-2) would reach the sub-pixel places; straight edges do not move.
+    # Impulse noise (Eq. 5-2) would bias sub-pixel positions; the filter keeps straight edges.
     return np.asarray(cv2.medianBlur(grey.astype(np.float32), 3), np.float64)
 
 
 def levelled(grey: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Light of the bare plane, and the part of it that each pixel lacks; both shaped as given.
+    """Background light of the plane, and the fraction missing at each pixel; both shaped as given.
 
-    The plane's light is the median over a window that any mark fills by less than half.
+    The background is the median over a window of which any mark fills less than half.
     """
     height, width = grey.shape
     factor = max(2, max(height, width) // 160)
@@ -129,30 +129,30 @@ def levelled(grey: FloatArray) -> tuple[FloatArray, FloatArray]:
 def segmented(
     grey: FloatArray, darkness: FloatArray, settings: MarkSettings
 ) -> list[tuple[float | None, npt.NDArray[np.uint8]]]:
-    """Binary pictures to try, the text's way first (Eq. 5-1, 5-3).
+    """Return binary pictures to try, the dissertation's filter first (Eq. 5-1, 5-3).
 
     Parameters
     ----------
     grey, darkness
-        Grey levels, and the part of the light lacking, shape (rows, columns).
+        Grey levels, and the missing fraction of the light, shape (rows, columns).
     settings
-        With a threshold, only this one is tried.
+        If it has a threshold, only this one is tried.
 
     Returns
     -------
     list
-        (part of the light lacking, or None for the fixed threshold; picture of 0 and 1).
+        (threshold of the missing fraction, or None for the fixed threshold; picture of 0 and 1).
     """
     scale = max(grey.shape) / 640.0
     median = _odd(settings.median_px * scale)
     if settings.threshold is not None:
-        # Eq. 5-1 on the grey levels themselves.
+        # Eq. 5-1 on the grey levels.
         pairs: list[tuple[float | None, BoolArray]] = [(None, grey < settings.threshold)]
     else:
         smooth = np.asarray(cv2.GaussianBlur(darkness, (0, 0), max(scale, 0.5)), np.float64)
         pairs = [(level, smooth > level) for level in _levels(smooth)]
     binaries = [(level, binary.astype(np.uint8)) for level, binary in pairs]
-    # The text's filter first; half of it for bars so thin that the filter takes them too.
+    # The dissertation's filter first; half its size for thin bars that it would remove.
     return [
         (level, np.asarray(cv2.medianBlur(binary, side), np.uint8))
         for side in dict.fromkeys((median, _odd(median / 2.0)))
@@ -161,7 +161,7 @@ def segmented(
 
 
 def _levels(darkness: FloatArray) -> list[float]:
-    """Thresholds to try: Otsu's, the triangle's, then steps from clear marks to faint ones."""
+    """Thresholds to try: Otsu's method, the triangle method, then fixed shares of the darkness."""
     low, high = 0.0, float(np.quantile(darkness, 0.998))
     noise = 1.4826 * float(np.median(np.abs(darkness)))
     if high <= 3.0 * noise or high < 1e-6:
@@ -176,12 +176,12 @@ def _levels(darkness: FloatArray) -> list[float]:
 
 
 def three_marks(binary: npt.NDArray[np.uint8], settings: MarkSettings) -> tuple[Mark, Mark, Mark]:
-    """Dot, bar on O′X′ and bar on O′Z′ in a binary picture.
+    """Return the dot, the bar on O′X′ and the bar on O′Z′ in a binary picture.
 
     Raises
     ------
     Refusal
-        If it does not hold these three.
+        If the picture does not contain exactly these three.
     """
     labels, touching = _three_objects(binary, settings)
     marks = [_mark(labels == label) for label in (1, 2, 3)]
@@ -216,7 +216,7 @@ def three_marks(binary: npt.NDArray[np.uint8], settings: MarkSettings) -> tuple[
 def _three_objects(
     binary: npt.NDArray[np.uint8], settings: MarkSettings
 ) -> tuple[npt.NDArray[np.int32], bool]:
-    """Labels 1, 2, 3 of the objects, and whether another runs out of the picture."""
+    """Labels 1, 2, 3 of the objects, and whether another is cut by the picture's edge."""
     kept, touching = _without_specks(binary, settings.speck_fraction)
     square = np.ones((3, 3), np.uint8)
     count, labels = cv2.connectedComponents(kept, connectivity=8)
@@ -237,7 +237,7 @@ def _three_objects(
 def _without_specks(
     binary: npt.NDArray[np.uint8], fraction: float
 ) -> tuple[npt.NDArray[np.uint8], bool]:
-    """Take out specks and what touches the edge; also whether anything sizeable touches it."""
+    """Remove specks and objects at the edge; also return whether a large one touches the edge."""
     _, labels, boxes, _ = cv2.connectedComponentsWithStats(binary, connectivity=8)
     left, top, width, height, area = boxes[1:].T
     if area.size == 0:
@@ -259,7 +259,7 @@ def _mark(mask: BoolArray) -> Mark:
 
 
 def _thin(mark: Mark) -> Mark:
-    """Take the mark's centre and direction from its thinned pixels (Eq. 5-5 without floor)."""
+    """Take centre and direction of the mark from its thinned pixels (Eq. 5-5, unrounded)."""
     v, u = np.nonzero(mark.mask)
     top, left = int(v.min()), int(u.min())
     line = _mark(thinned(mark.mask[top : v.max() + 1, left : u.max() + 1]))
@@ -274,8 +274,8 @@ def _thin(mark: Mark) -> Mark:
 def thinned(mask: BoolArray) -> BoolArray:
     """Thin an object to lines of one pixel, until nothing changes (§5.1.2, step 3).
 
-    Zhang and Suen's two passes, each on all pixels at once. (OpenCV has thinning in its contrib
-    modules only; it is 20 lines.)
+    Algorithm of Zhang and Suen, each pass on all pixels at once. OpenCV has thinning in its contrib
+    modules only.
 
     Parameters
     ----------
@@ -301,7 +301,7 @@ def thinned(mask: BoolArray) -> BoolArray:
             else:
                 open_side = ~(north & east & west) & ~(north & south & west)
             remove = image & (count >= 2) & (count <= 6) & (begins == 1) & open_side
-            # The passes would wipe out a square of 2 × 2, which no longer can be thinned.
+            # The passes would delete a 2 × 2 square, which cannot be thinned further.
             if remove.any() and (image & ~remove).any():
                 image = image & ~remove
                 changed = True

@@ -1,4 +1,4 @@
-"""When a logger's clock began, found by correlating a signal with the light of the frames."""
+"""Clock offset of a data logger, from the correlation of a signal with the frames' brightness."""
 
 from __future__ import annotations
 
@@ -10,28 +10,28 @@ from scipy import optimize, signal
 from labapp.core.values import FloatArray
 
 LEAST_CORRELATION = 0.5
-"""Of signal and light, where they are taken to belong together."""
+"""Least absolute correlation of signal and light that is accepted."""
 
 LEAST_OVERLAP = 0.25
-"""Share of the shorter of the two that the other must cover."""
+"""Least overlap of signal and light, as a share of the largest possible one."""
 
 RIVAL = 0.8
-"""Share of the best correlation's square above which another place is as good: pulses."""
+"""Another offset is ambiguous above this share of the best squared correlation: periodic pulses."""
 
 
 @dataclass(frozen=True)
 class Offset:
-    """Where a signal lies on the recording's clock.
+    """Offset of a signal on the recording's clock.
 
     Parameters
     ----------
     start_s, sigma_s
-        Added to the signal's times it gives the recording's; standard uncertainty by the scatter of
-        the light.
+        Offset to add to the signal's times to obtain the recording's, and its standard uncertainty
+        from the scatter of the light.
     correlation
-        Of signal and light there; negative where more current makes less light.
+        Correlation of signal and light at this offset; negative if more current gives less light.
     rival_s
-        Another start that fits about as well; None: there is none.
+        Another offset that fits about as well; None if there is none.
     """
 
     start_s: float
@@ -43,10 +43,10 @@ class Offset:
 def find_offset(
     signal_s: FloatArray, values: FloatArray, light_s: FloatArray, light: FloatArray
 ) -> Offset | None:
-    """Offset of a signal's clock by correlation with the mean brightness of frames.
+    """Estimate the offset of a signal's clock by correlation with the mean brightness of frames.
 
-    The light is taken to be a linear function of the signal averaged over a frame, which holds
-    nearly for current and arc light; frames may be missing.
+    The light is modelled as a linear function of the signal averaged over a frame, which holds
+    approximately for current and arc light. Frames may be missing.
 
     Parameters
     ----------
@@ -58,7 +58,7 @@ def find_offset(
     Returns
     -------
     Offset or None
-        None where the two do not correlate (`LEAST_CORRELATION`).
+        None if the two do not correlate (`LEAST_CORRELATION`).
     """
     there = np.isfinite(values)
     signal_s, values = signal_s[there], values[there]
@@ -66,7 +66,7 @@ def find_offset(
         return None
     step = float(np.median(np.diff(light_s)))
     even_s = np.arange(signal_s[0], signal_s[-1], step / 4)
-    # The mean of the signal over a frame, as the camera sees it.
+    # Mean of the signal over each frame's duration.
     area = np.concatenate([[0], np.cumsum(np.diff(signal_s) * (values[1:] + values[:-1]) / 2)])
     ends = np.clip(np.stack([even_s, even_s + step]), signal_s[0], signal_s[-1])
     first, last = np.interp(ends, signal_s, area)
@@ -109,7 +109,7 @@ def find_offset(
 def _correlations(
     even_s: FloatArray, mean: FloatArray, light_s: FloatArray, light: FloatArray, step: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Starts, shape (k,), s, and the correlation of signal and light at each."""
+    """Offsets, shape (k,), s, and the correlation of signal and light at each."""
     place = np.round((light_s - light_s[0]) / step).astype(int)
     lit, mask = np.zeros(place[-1] + 1), np.zeros(place[-1] + 1)
     lit[place], mask[place] = light - light.mean(), 1.0

@@ -1,4 +1,4 @@
-"""Everything that a recording's surfaces and sizes say of the pool over time, in one value."""
+"""Analysis of the pool's dynamics over a recording, from its surfaces and sizes."""
 
 from __future__ import annotations
 
@@ -15,24 +15,25 @@ from labapp.core.dynamics.steps import Event, StepResponse, find_events, step_re
 from labapp.core.values import FloatArray
 
 RESPONDING = ("width_mm", "length_mm", "height_mm", "convexity_mm")
-"""Series whose events and responses are looked for."""
+"""Series in which events and responses are searched."""
 
 LEVEL_SIGMAS = 2.0
-"""Least change of an event. The errors of two frames' levels are the same while the boundary stays,
-and independent where it has moved (`core.sequence.mean`): their difference is σ√2 at most."""
+"""Least change of an event, in σ of the level. The errors of two frames' levels are equal if the
+boundary is the same, and independent if it has moved (`core.sequence.mean`): the standard
+uncertainty of their difference is at most σ√2."""
 
 MOST_STEPS = 8
-"""A signal with more changes is pulsed: responses to single ones are not looked for."""
+"""A signal with more changes is pulsed: responses to its individual steps are not analysed."""
 
 
 @dataclass(frozen=True)
 class DynamicsSettings:
-    """What can be chosen.
+    """Settings of the analysis.
 
     Parameters
     ----------
     of
-        Series whose spectra and peak are made.
+        Name of the series whose spectra and spectral peak are computed.
     band_hz, segment_s
         See `fit_oscillations` and `spectrogram`.
     """
@@ -54,22 +55,22 @@ class Response:
 
 @dataclass(frozen=True)
 class Dynamics:
-    """What the pool does over a recording; n frames.
+    """Dynamics of the pool over a recording; n frames.
 
     Parameters
     ----------
     surfaces
-        The surfaces it is worked out from.
+        The analysed surfaces.
     series
         Sizes and shape of each, name → values, shape (n,).
     settings
-        What was chosen.
+        Settings of the analysis.
     modes, pod
-        Bessel modes and POD.
+        Bessel modes and POD modes.
     spectrogram, peak
-        Of ``settings.of``.
+        Spectrogram and spectral peak of the series ``settings.of``.
     events
-        Change points by series, and by signal.
+        Change points of each series and each signal.
     responses
         Responses to the steps of signals.
     """
@@ -86,7 +87,7 @@ class Dynamics:
 
     @property
     def all_modes(self) -> tuple[ModeCourse, ...]:
-        """Bessel modes, then those of the POD."""
+        """Bessel modes, followed by POD modes."""
         return (*self.modes, *self.pod)
 
 
@@ -105,19 +106,19 @@ def analyse(
     surfaces, series
         See `Dynamics`.
     signals
-        Name → times on the recording's clock, s, and values, of current, voltage, wire feed.
+        Name → times on the recording's clock, s, and values, e.g. of current, voltage, wire feed.
     settings
         See `DynamicsSettings`.
     scale_sigma
         See `bessel_modes`.
     level_sigma
-        The level's part of the standard uncertainty of series, by name: a change by less than
-        `LEVEL_SIGMAS` of it may be one of the level's error, and is no event.
+        The level's contribution to the standard uncertainty of each series, by name: a change of
+        less than `LEVEL_SIGMAS` of it may be due to the error of the level, and is not an event.
 
     Raises
     ------
     ValueError
-        If there are fewer than `FEWEST` frames, or a segment has fewer.
+        If there are fewer than `FEWEST` frames, or fewer in a segment.
     """
     time = surfaces.time_s
     if len(time) < FEWEST:
@@ -151,7 +152,7 @@ def analyse(
 def _responses(
     time: FloatArray, series: Mapping[str, FloatArray], steps: Mapping[str, tuple[Event, ...]]
 ) -> tuple[Response, ...]:
-    """Responses of every series to every step of signals that have few; each until the next."""
+    """Fit responses of every series to every step of signals with few steps, until the next one."""
     found = []
     for signal, events in steps.items():
         if len(events) > MOST_STEPS:
@@ -167,7 +168,7 @@ def _responses(
 
 
 def _sharpened(event: Event, at: FloatArray, value: FloatArray) -> Event:
-    """An event of a signal to the sample: the best split in two levels within 4 σ of it."""
+    """Refine an event of a signal to one sample: the best split into two levels within 4 σ."""
     near = np.flatnonzero(np.abs(at - event.time_s) <= 4 * event.sigma_s)
     if len(near) < 4:
         return event

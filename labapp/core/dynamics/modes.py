@@ -1,12 +1,12 @@
-"""Modes of an oscillating pool: Bessel modes on its own outline, and POD of its surfaces.
+"""Modes of an oscillating pool: Bessel modes mapped to its outline, and POD of its surfaces.
 
-Every surface is sampled at the nodes of a unit disk: ρ = 1 is its own boundary, ρ and φ are polar
-in (x/half width, y/half length) about the middle of the boundary, ρ scaled by the boundary's
-distance in the direction φ. On an ellipse that is affine, and a mode of a round membrane, which a
-pool held at its rim has nearly, J_m(j_mn·ρ)·cos m(φ − φ₀), stays one. Modes (0, 1), (1, 1), (2, 1)
-and (0, 2) are those that dot patterns of GTA weld pools show ("Oscillation Modes of Weld Pool in
-Stationary GTA Welding Using Structure Laser Method", Chin. J. Mech. Eng. 34 (2021); K. Zhang et
-al., Weld. J. 96 (2017) 143-s).
+Every surface is sampled at the nodes of a unit disk: ρ = 1 is its own boundary; ρ and φ are polar
+coordinates in (x/half width, y/half length) about the middle of the boundary, with ρ scaled by the
+boundary's distance in the direction φ. For an ellipse this map is affine and preserves the modes of
+a circular membrane, J_m(j_mn·ρ)·cos m(φ − φ₀), which approximate those of a pool pinned at its rim.
+Modes (0, 1), (1, 1), (2, 1) and (0, 2) are observed in dot patterns of GTA weld pools ("Oscillation
+Modes of Weld Pool in Stationary GTA Welding Using Structure Laser Method", Chin. J. Mech. Eng. 34
+(2021); K. Zhang et al., Weld. J. 96 (2017) 143-s).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from labapp.core.surface.surface import Surface
 from labapp.core.values import ComplexArray, FloatArray, IntArray, ReadOnlyArrays
 
 MODES = ((0, 1), (1, 1), (2, 1), (0, 2))
-"""(m, n): nodal diameters, nodal circles with the boundary's counted."""
+"""(m, n): number of nodal diameters, and of nodal circles including the boundary."""
 
 RINGS, SPOKES = 12, 32
 
@@ -36,7 +36,7 @@ PHI = np.tile(2 * np.pi * np.arange(SPOKES) / SPOKES, RINGS)
 """The nodes of the unit disk, shape (k,): rings outwards, counter-clockwise from +X."""
 
 DISK_WEIGHT = RHO * np.repeat(RING_WEIGHT, SPOKES) * 2 * np.pi / SPOKES
-"""Area that each node stands for on the unit disk, shape (k,); the sum is π."""
+"""Area represented by each node on the unit disk, shape (k,); the sum is π."""
 
 POD_MODES = 4
 
@@ -48,13 +48,13 @@ class SurfaceSeries(ReadOnlyArrays):
     Parameters
     ----------
     frame, time_s
-        Shape (n,), ascending; s.
+        Frame numbers and times, shape (n,), ascending; s.
     height_mm
-        Shape (n, k).
+        Heights at the nodes, shape (n, k).
     nodes_mm
-        Where the nodes are on the mean outline, (x, y), shape (k, 2).
+        Positions (x, y) of the nodes for the mean outline, shape (k, 2).
     area_mm2
-        Area that each stands for there, shape (k,).
+        Area represented by each node on it, shape (k,).
     """
 
     frame: IntArray
@@ -65,13 +65,13 @@ class SurfaceSeries(ReadOnlyArrays):
 
     @classmethod
     def of(cls, surfaces: Iterable[tuple[int, float, Surface, Boundary]]) -> SurfaceSeries:
-        """Sample surfaces.
+        """Sample surfaces at the nodes.
 
         Parameters
         ----------
         surfaces
-            Number, time (s), surface and boundary of each frame. The surface has a height at all
-            places within the boundary.
+            Number, time (s), surface and boundary of each frame. The surface must be defined
+            everywhere within the boundary.
         """
         frames, times, heights, places = [], [], [], []
         for frame, time_s, surface, boundary in surfaces:
@@ -97,7 +97,7 @@ class SurfaceSeries(ReadOnlyArrays):
 
 @dataclass(frozen=True)
 class ModeCourse(ReadOnlyArrays):
-    """One mode over a recording; n frames, c shapes (two of a mode with nodal diameters).
+    """Time series of one mode; n frames, c shapes (two for a mode with nodal diameters).
 
     Parameters
     ----------
@@ -106,15 +106,15 @@ class ModeCourse(ReadOnlyArrays):
     shape
         Height at the nodes per mm of coefficient, shape (c, k); largest absolute value 1.
     coefficient_mm
-        Shape (n, c).
+        Coefficients, shape (n, c).
     share
         Share of the surfaces' variance, weighted by area.
     oscillations
-        Damped sinusoids in the coefficients, the strongest first; empty: none stands out.
+        Damped sinusoids in the coefficients, the strongest first; empty if none is significant.
     nodal_diameters
-        m; 0 of a POD mode.
+        m; 0 for a POD mode.
     scale_sigma
-        Relative standard uncertainty of all heights, by the set-up.
+        Relative standard uncertainty of all heights due to the set-up.
     """
 
     name: str
@@ -129,16 +129,17 @@ class ModeCourse(ReadOnlyArrays):
     def figures(self) -> dict[str, tuple[float, float]]:
         """Quantities of the strongest oscillation by name, each with its standard uncertainty.
 
-        ``amplitude_mm`` is the largest height at the first frame; ``phase_deg`` that of its cosine
-        there; ``damping_per_s`` its decay rate γ; ``direction_deg`` where the crest lies, from +X
-        counter-clockwise; ``turning`` from −1 (travels clockwise) over 0 (stands) to 1.
+        ``amplitude_mm`` is the largest height at the first frame; ``phase_deg`` the phase of its
+        cosine there; ``damping_per_s`` the decay rate γ; ``direction_deg`` the direction of the
+        crest, counter-clockwise from +X; ``turning`` ranges from −1 (clockwise travelling wave)
+        through 0 (standing wave) to 1 (counter-clockwise).
         """
         if not self.oscillations:
             return {}
         one = self.oscillations[0]
         value, sigma = one.quantities(_swing)
         sigma[0] = np.hypot(sigma[0], value[0] * self.scale_sigma)
-        # The opposite direction half a period later is the same oscillation.
+        # Reversing the direction and shifting the phase by half a period changes nothing.
         halves = np.floor(value[2] / 180)
         value[1] = (value[1] + 180 * halves + 180) % 360 - 180
         value[2] -= 180 * halves
@@ -155,7 +156,7 @@ class ModeCourse(ReadOnlyArrays):
 
 
 def disk_nodes(boundary: Boundary) -> FloatArray:
-    """Where the nodes of the unit disk are within a boundary, (x, y), shape (k, 2), mm."""
+    """Positions (x, y) of the unit disk's nodes within a boundary, shape (k, 2), mm."""
     outline = boundary.points_mm[:, :2]
     middle = (outline.min(axis=0) + outline.max(axis=0)) / 2
     half = np.ptp(outline, axis=0) / 2
@@ -168,7 +169,7 @@ def disk_nodes(boundary: Boundary) -> FloatArray:
 
 
 def bessel_shapes(mode: tuple[int, int]) -> FloatArray:
-    """Shapes of a mode at the nodes, largest value 1: one if m = 0, else cos and sin, (c, k)."""
+    """Shapes of a mode at the nodes, largest value 1, (c, k): one if m = 0, else cos and sin."""
     m, n = mode
     radial = special.jv(m, special.jn_zeros(m, n)[-1] * RHO)
     largest = special.jv(m, special.jnp_zeros(m, 1)[0]) if m else 1.0
@@ -182,17 +183,17 @@ def bessel_modes(
     scale_sigma: float = 0.0,
     band_hz: tuple[float, float] | None = None,
 ) -> tuple[ModeCourse, ...]:
-    """Bessel modes of a pool on its own outline, by least squares with the disk's area as weight.
+    """Fit Bessel modes to the surfaces by least squares, weighted by area on the unit disk.
 
     Parameters
     ----------
     series
         The surfaces of a recording.
     modes
-        Modes (m, n), fitted together.
+        Modes (m, n), fitted jointly.
     scale_sigma
-        Relative standard uncertainty of heights by the set-up: the same in all frames, it is added
-        to the noise in the ± of amplitudes.
+        Relative standard uncertainty of heights due to the set-up, common to all frames; it is
+        added to the noise in the ± of amplitudes.
     band_hz
         See `fit_oscillations`.
     """
@@ -219,11 +220,10 @@ def pod_modes(
     scale_sigma: float = 0.0,
     band_hz: tuple[float, float] | None = None,
 ) -> tuple[ModeCourse, ...]:
-    """Proper orthogonal decomposition: the shapes that hold most of the surfaces' variance.
+    """Proper orthogonal decomposition: the shapes with the largest share of the variance.
 
-    Singular vectors of the heights less their mean, weighted by the area on the mean outline
-    (Sirovich 1987). Parameters as of `bessel_modes`; ``count`` modes are returned, fewer of fewer
-    frames.
+    Singular vectors of the heights minus their mean, weighted by area on the mean outline
+    (Sirovich 1987). Parameters as in `bessel_modes`; at most ``count`` modes are returned.
     """
     root = np.sqrt(series.area_mm2)
     moving: FloatArray = (series.height_mm - series.mean_mm) * root
@@ -243,8 +243,8 @@ def pod_modes(
 def _swing(amplitude: ComplexArray) -> FloatArray:
     """Amplitude, phase (deg), m times direction (deg), turning of one or two channels, shape (4,).
 
-    The two are parts of Z = cos part + i·sin part = L·exp(iωτ) + R·exp(−iωτ), which turn left and
-    right; the crest is largest, |L| + |R|, where both have one direction.
+    The two form Z = cos part + i·sin part = L·exp(iωτ) + R·exp(−iωτ), with components that rotate
+    counter-clockwise and clockwise. The crest is largest, |L| + |R|, when both are aligned.
     """
     if len(amplitude) == 1:
         return np.array([abs(amplitude[0]), np.degrees(np.angle(amplitude[0])), 0.0, 0.0])
@@ -258,10 +258,10 @@ def _swing(amplitude: ComplexArray) -> FloatArray:
 
 
 def _areas(nodes_mm: FloatArray) -> FloatArray:
-    """Area of each node on the outline that nodes lie on, shape (k,), mm².
+    """Area represented by each node at its position in the pool, shape (k,), mm².
 
-    The map of the disk is linear along a spoke, so that the area is the disk's times the spoke's
-    cross product with its change round the pool.
+    The map from the disk is linear along a spoke. The area is therefore the disk's area times the
+    cross product of the spoke and its derivative w.r.t. the angle.
     """
     grid = nodes_mm.reshape(RINGS, SPOKES, 2)
     spoke = (grid[-1] - grid[0]) / (RHO[-1] - RHO[0])

@@ -1,8 +1,8 @@
-"""Damped sinusoids in a series, with their uncertainty: nonlinear least squares on the samples.
+"""Damped sinusoids in a series, with uncertainties, by nonlinear least squares on the samples.
 
-The samples need not be even: frames that are missing are left out, nothing is filled in. Of a given
-frequency and damping the model is linear (variable projection, Golub & Pereyra 1973). Noise need
-not be white: its variance is that of the residual's periodogram beside the frequency.
+The samples need not be evenly spaced; missing frames are not interpolated. For given frequency and
+damping the model is linear (variable projection, Golub & Pereyra 1973). The noise need not be
+white: its variance is taken from the residual's periodogram near the frequency.
 """
 
 from __future__ import annotations
@@ -16,19 +16,20 @@ from scipy.special import stdtrit
 from labapp.core.values import ComplexArray, FloatArray, ReadOnlyArrays
 
 FALSE_ALARM = 1e-3
-"""Probability of an oscillation where there is only noise."""
+"""Probability that pure noise gives an oscillation."""
 
 TREND = 2
-"""Degree of the polynomial that is the series without its oscillations."""
+"""Degree of the polynomial trend."""
 
 FEWEST = 16
-"""Samples that an oscillation is looked for in."""
+"""Least number of samples per oscillation."""
 
 BESIDE = np.concatenate([np.arange(-12, -1), np.arange(2, 13)])
-"""Where the noise is taken, in 1/duration from the frequency: the fit has removed that between."""
+"""Distances from the frequency at which the noise is estimated, in 1/duration; closer in, the fit
+has removed it."""
 
 DAMPING_STARTS = (0.5, 6.0)
-"""In 1/duration."""
+"""Initial decay rates, in 1/duration."""
 
 
 @dataclass(frozen=True)
@@ -38,11 +39,12 @@ class Oscillation(ReadOnlyArrays):
     Parameters
     ----------
     frequency_hz, damping_per_s
-        ω/2π, and the decay rate γ of the amplitude; negative where it grows.
+        ω/2π, and the decay rate γ of the amplitude; negative if it grows.
     amplitude
         A of each channel, shape (c,), in the unit of the series.
     covariance
-        Of frequency, damping, then real and imaginary part of each A, shape (2 + 2c, 2 + 2c).
+        Covariance of frequency, damping, and the real and imaginary part of each A, shape
+        (2 + 2c, 2 + 2c).
     """
 
     frequency_hz: float
@@ -61,12 +63,12 @@ class Oscillation(ReadOnlyArrays):
         return float(np.sqrt(self.covariance[1, 1]))
 
     def quantities(self, of: Callable[[ComplexArray], FloatArray]) -> tuple[FloatArray, FloatArray]:
-        """Quantities of the amplitudes and their standard uncertainties, to first order.
+        """Return quantities of the amplitudes and their standard uncertainties, to first order.
 
         Parameters
         ----------
         of
-            Gives k quantities, shape (k,), of complex amplitudes, shape (c,).
+            Function of the complex amplitudes, shape (c,), that returns k quantities, shape (k,).
         """
         step = 1e-6 * max(float(np.abs(self.amplitude).max()), 1e-12)
         slopes = [
@@ -79,7 +81,7 @@ class Oscillation(ReadOnlyArrays):
         return of(self.amplitude), np.sqrt(variance)
 
     def at(self, time_s: FloatArray) -> FloatArray:
-        """Value of each channel at times from the first sample, shape (n, c)."""
+        """Value of each channel at times since the first sample, shape (n, c)."""
         rate = 2j * np.pi * self.frequency_hz - self.damping_per_s
         return np.asarray((np.exp(rate * time_s)[:, None] * self.amplitude).real)
 
@@ -90,20 +92,20 @@ def fit_oscillations(
     most: int = 3,
     band_hz: tuple[float, float] | None = None,
 ) -> tuple[Oscillation, ...]:
-    """Damped sinusoids in a series, the strongest first.
+    """Fit damped sinusoids to a series; the strongest is returned first.
 
-    One after the other is added where the residual's periodogram is largest, and all are fitted
-    together, as long as noise would make as much with a probability of less than `FALSE_ALARM` and
-    none lies at an end of the band.
+    Sinusoids are added one by one at the maximum of the residual's periodogram, and all are
+    refitted jointly. This stops if the probability that noise gives the same reduction is not less
+    than `FALSE_ALARM`, or if a frequency lies at an end of the band.
 
     Parameters
     ----------
     time_s
-        Times of n samples, ascending, shape (n,), s; they need not be even.
+        Times of n samples, ascending, shape (n,), s; they need not be evenly spaced.
     values
-        Shape (n,), or (n, c) of c channels that swing with one frequency.
+        Values, shape (n,), or (n, c) for c channels with common frequencies.
     most
-        Largest number of oscillations; one for every `FEWEST` samples at most.
+        Largest number of oscillations; at most one for every `FEWEST` samples.
     band_hz
         Lowest and highest frequency. None: from two periods in the series to half the frame rate.
     """
@@ -113,7 +115,7 @@ def fit_oscillations(
         return ()
     step = float(np.median(np.diff(time)))
     band = band_hz or (2 / (time[-1] + step), 0.5 / step)
-    edge = 0.05 / (time[-1] + step)  # what is at an end of the band lies beyond it
+    edge = 0.05 / (time[-1] + step)  # a maximum at an end of the band lies outside it
     fitted = _Fit(time, value, np.empty((0, 2)))
     while len(fitted.rates) < min(most, len(time) // FEWEST):
         start = 2 * np.pi * _strongest(time, fitted.residual, step, band)
@@ -130,7 +132,7 @@ def fit_oscillations(
 
 
 class _Fit:
-    """The model's linear part of given rates (ω, γ), shape (k, 2), by least squares."""
+    """Linear least-squares fit of the model for given rates (ω, γ), shape (k, 2)."""
 
     def __init__(self, time: FloatArray, value: FloatArray, rates: FloatArray) -> None:
         self.time, self.value, self.rates = time, value, rates
@@ -148,18 +150,18 @@ class _Fit:
         return np.asarray(self.weights[2 * k] + 1j * self.weights[2 * k + 1])
 
     def noise(self, k: int, step: float) -> FloatArray:
-        """Variance of white noise as strong as that beside component k, shape (c,)."""
+        """Variance of white noise with the spectral density near component k, shape (c,)."""
         span = float(self.time[-1]) + step
         near = self.rates[k, 0] / (2 * np.pi) + BESIDE / span
         near = near[(near > 1 / span) & (near < 0.5 / step)]
         turned = np.exp(-2j * np.pi * near[:, None] * self.time)
         power = np.mean(np.abs(turned @ self.residual) ** 2, axis=0) / len(self.time)
-        # As of few samples (JCGM 100, G.3): two degrees of freedom a frequency.
+        # Student's factor (JCGM 100, G.3): two degrees of freedom per frequency.
         student = stdtrit(2 * len(near), 0.975) / stdtrit(np.inf, 0.975)
         return np.asarray(np.maximum(power * student**2, 1e-30))
 
     def oscillation(self, k: int, step: float) -> Oscillation:
-        """Component k with its covariance."""
+        """Return component k with its covariance."""
         channels, count = self.value.shape[1], len(self.rates)
         linear = self.columns.shape[1]
         size = 2 * count + linear * channels
@@ -189,7 +191,7 @@ class _Fit:
 def _strongest(
     time: FloatArray, residual: FloatArray, step: float, band: tuple[float, float]
 ) -> float:
-    """Frequency of the largest power of all channels together, Hz."""
+    """Frequency of the largest total power of all channels, Hz."""
     place = np.round(time / step).astype(int)
     even = np.zeros((place[-1] + 1, residual.shape[1]))
     even[place] = residual
@@ -203,7 +205,7 @@ def _strongest(
 def _refine(
     time: FloatArray, value: FloatArray, rates: FloatArray, band: tuple[float, float]
 ) -> _Fit:
-    """The fit whose rates are optimal, near those given."""
+    """Optimise the rates, starting from those given."""
     from scipy.optimize import least_squares
 
     span, scale = float(time[-1]), np.tile([1.0, 1.0], len(rates)) / float(time[-1])
@@ -219,7 +221,7 @@ def _refine(
 
 
 def _stands_out(without: _Fit, with_it: _Fit, step: float) -> bool:
-    """Whether the last component explains more than noise at any of the frequencies would."""
+    """Whether the last component is significant, given the number of frequencies tried."""
     from scipy.stats import chi2
 
     last, channels = len(with_it.rates) - 1, with_it.value.shape[1]

@@ -1,12 +1,12 @@
-"""Penetration from what is measured of the pool's surface: models, their ± and their errors.
+"""Penetration models from measured features of the pool's surface: fit, uncertainty, validation.
 
-Width, length and convexity of the pool tell of the back-side bead (W. J. Zhang et al., Weld. J. 91
-(2012) 195-s). The back side cannot be seen while welding, so that a model is simulated from the
-pool alone: y(t) = g(x(t)), where x are the features after a filter 1/A(q) of unit gain. Of ARX, g
-is linear: A(q)·y = B(q)·u + c, fitted to the simulated output, in which A is found by search and B
-by linear least squares. Of a Gaussian process, g has the covariance σ²·exp(−½ Σ (Δx_d/ℓ_d)²); the ±
-of features enters as in A. McHutchon & C. E. Rasmussen, "Gaussian Process Training with Input
-Noise" (NIPS 2011): Σ (∂g/∂x_d · σ_d)² is added to the variance.
+Width, length and convexity of the pool correlate with the back-side bead (W. J. Zhang et al., Weld.
+J. 91 (2012) 195-s). The back side is not visible during welding. The model is therefore simulated
+from the pool alone: y(t) = g(x(t)), where x are the features after a filter 1/A(q) of unit gain.
+For ARX, g is linear: A(q)·y = B(q)·u + c, fitted to the simulated output; A is found by search and
+B by linear least squares. For a Gaussian process, g has the covariance σ²·exp(−½ Σ (Δx_d/ℓ_d)²);
+the ± of features is included as in A. McHutchon & C. E. Rasmussen, "Gaussian Process Training with
+Input Noise" (NIPS 2011): Σ (∂g/∂x_d · σ_d)² is added to the variance.
 """
 
 from __future__ import annotations
@@ -39,26 +39,26 @@ from labapp.core.values import BoolArray, FloatArray, ReadOnlyArrays
 Kind = Literal["arx", "gp"]
 
 SURE_95 = 1.959964
-"""Half of a 95 % interval in standard deviations."""
+"""Half width of a 95 % interval in standard deviations."""
 
 LONGEST_S = 5.0
-"""Longest time constant."""
+"""Longest time constant, s."""
 
 
 @dataclass(frozen=True)
 class ModelSettings:
-    """What can be chosen of a model.
+    """Settings of a model.
 
     Parameters
     ----------
     features, target
-        Names of the features and of what is predicted.
+        Names of the features and of the predicted quantity.
     step_s
-        Features are averaged over such steps, s.
+        Time step over which features are averaged, s.
     orders
-        Of the dynamics.
+        Orders of the dynamics.
     full_mm
-        Penetration from which it is full; None: not known.
+        Threshold of full penetration; None: unknown.
     """
 
     features: tuple[str, ...]
@@ -75,11 +75,11 @@ class Prediction(ReadOnlyArrays):
     Parameters
     ----------
     time_s
-        Middle of each step, shape (n,), s. It is known at the step's end.
+        Middle of each step, shape (n,), s. The prediction is available at the step's end.
     value, sigma
         Penetration and its standard uncertainty, mm; NaN where features are missing.
     is_outside
-        Whether a regressor is beyond those that the model was fitted to.
+        Whether a regressor is outside the range to which the model was fitted.
     """
 
     time_s: FloatArray
@@ -105,23 +105,23 @@ class PenetrationModel(ReadOnlyArrays):
     Parameters
     ----------
     kind, settings
-        What it is.
+        Kind and settings of the model.
     time_constants_s
-        Of A(q).
+        Time constants of A(q).
     center, scale
-        What standardises the regressors, shape (d,).
+        Offset and scale that standardise the regressors, shape (d,).
     low, high
-        Range of the regressors that it was fitted to, shape (d,).
+        Range of the regressors to which it was fitted, shape (d,).
     mean_mm
         Mean penetration.
     static
-        From standardised regressors to penetration.
+        Map from standardised regressors to penetration.
     scatter_mm
-        Standard deviation of what features do not explain.
+        Standard deviation not explained by the features.
     factor
-        What ± is multiplied by, from the errors of welds that were left out.
+        Factor applied to ±, from cross-validation (leave one weld out).
     rmse_mm
-        Root mean square of those errors; NaN where there are none.
+        Root-mean-square error of the cross-validation; NaN without it.
     """
 
     kind: Kind
@@ -144,7 +144,7 @@ class PenetrationModel(ReadOnlyArrays):
 
     @property
     def memory(self) -> int:
-        """How many steps before the present one a prediction depends on."""
+        """Number of previous steps on which a prediction depends."""
         orders = self.settings.orders
         return len(self.response) + orders.delay + orders.lags
 
@@ -186,23 +186,23 @@ def fit_model(
     settings: ModelSettings,
     like: PenetrationModel | None = None,
 ) -> PenetrationModel:
-    """Fit a model; its ± is that of these welds (`validated_model` examines it by others).
+    """Fit a model; its ± is estimated from the same welds (`validated_model` cross-validates it).
 
     Parameters
     ----------
     welds
-        With the features of the settings, in their order.
+        Welds with the features of the settings, in their order.
     kind
         ``arx``, or ``gp``, which needs scikit-learn.
     settings
         See `ModelSettings`.
     like
-        A model of nearly the same welds, from whose parameters the search begins.
+        A model of nearly the same welds, whose parameters are the initial values of the search.
 
     Raises
     ------
     ValueError
-        If there are too few sections, or they tell nothing.
+        If there are too few sections, or all have the same penetration.
     ImportError
         If scikit-learn is missing.
     """
@@ -233,7 +233,7 @@ def fit_model(
 def _find_time_constants(
     steps: Sequence[WeldSeries], settings: ModelSettings, like: PenetrationModel | None
 ) -> tuple[float, ...]:
-    """Time constants whose linear model fits best."""
+    """Find the time constants whose linear model fits best."""
     orders, least = settings.orders, 0.2 * settings.step_s
     if not orders.poles:
         return ()
@@ -257,16 +257,16 @@ def _find_time_constants(
 
 @dataclass(frozen=True)
 class LeftOut(ReadOnlyArrays):
-    """Predictions at sections of welds, each by a model of the other welds.
+    """Leave-one-weld-out predictions at the sections, each by a model of the other welds.
 
     Parameters
     ----------
     weld
         Name of each section's weld, shape (n,).
     time_s, measured, measured_sigma
-        Of the sections, s, mm.
+        Time and measured penetration of each section with its standard uncertainty, s, mm.
     predicted, sigma
-        Prediction, mm.
+        Predicted penetration and its standard uncertainty, mm.
     full_mm
         See `ModelSettings`.
     """
@@ -281,24 +281,24 @@ class LeftOut(ReadOnlyArrays):
 
     @property
     def rmse_mm(self) -> float:
-        """Root mean square of predicted less measured."""
+        """Root mean square of predicted minus measured, mm."""
         return float(np.sqrt(np.mean((self.predicted - self.measured) ** 2)))
 
     @property
     def bias_mm(self) -> float:
-        """Mean of predicted less measured."""
+        """Mean of predicted minus measured, mm."""
         return float(np.mean(self.predicted - self.measured))
 
     @property
     def cover(self) -> float:
-        """Share of sections in their 95 % interval."""
+        """Share of sections within their 95 % interval."""
         spread = np.hypot(self.sigma, self.measured_sigma)
         return float(np.mean(np.abs(self.predicted - self.measured) <= SURE_95 * spread))
 
     def transitions(self) -> tuple[FloatArray, FloatArray]:
-        """Times at which sections become fully penetrated, and the nearest predicted, s.
+        """Times of measured transitions to full penetration, and the nearest predicted ones, s.
 
-        NaN where none is predicted. Both are empty where ``full_mm`` is unknown.
+        NaN if none is predicted. Both are empty if ``full_mm`` is unknown.
         """
         known: list[float] = []
         found: list[float] = []
@@ -319,17 +319,17 @@ def validated_model(
     settings: ModelSettings,
     progress: Callable[[int, int], object] = lambda _done, _of: None,
 ) -> tuple[PenetrationModel, LeftOut]:
-    """Fit a model, and predict each weld by one of the others.
+    """Fit a model and cross-validate it by leaving out one weld at a time.
 
-    Its ± is multiplied so that the mean square of those errors is explained, if it is more than
-    the ± says: sections of one weld are not independent.
+    If the mean square of the prediction errors exceeds that expected from ±, the ± is scaled up
+    accordingly: sections of one weld are not independent.
 
     Parameters
     ----------
     welds, kind, settings
-        As of `fit_model`.
+        As in `fit_model`.
     progress
-        Called with how many fits are done, and of how many; may raise to stop.
+        Called with the number of completed fits and their total; may raise to stop.
 
     Raises
     ------

@@ -1,8 +1,8 @@
-"""Power spectral densities over time with confidence intervals, and the peak that they follow.
+"""Power spectral densities over time with confidence intervals, and tracking of the peak.
 
-Even frames: segments with Hann's window, half overlapped (Welch 1967; `scipy.signal`). Where
-frames are missing, nothing is filled in: each segment has the periodogram of Lomb and Scargle, with
-the same window as weights (Scargle 1982; `scipy.signal.lombscargle`).
+Evenly spaced frames: segments with Hann's window and 50 % overlap (Welch 1967; `scipy.signal`). If
+frames are missing, none are interpolated: each segment uses the Lomb–Scargle periodogram, with the
+same window as weights (Scargle 1982; `scipy.signal.lombscargle`).
 """
 
 from __future__ import annotations
@@ -17,16 +17,17 @@ from labapp.core.dynamics.oscillation import FEWEST, fit_oscillations
 from labapp.core.values import FloatArray, ReadOnlyArrays
 
 EVEN = 0.05
-"""Steps in time that differ by a smaller part of a frame are equal."""
+"""Largest relative deviation of time steps that are treated as equal."""
 
 SEGMENTS = 8
-"""A recording has so many segments, not counting those between, unless their duration is given."""
+"""Default number of segments of a recording, not counting the overlapping ones between."""
 
 LEAST_FILLED = 0.5
-"""A segment with fewer of its frames has no spectrum."""
+"""Least share of a segment's frames that must be present for a spectrum."""
 
 OVERLAP_SHARE = 1 / 36
-"""Squared correlation of two segments' powers, Hann's window, half overlapped (Welch 1967)."""
+"""Squared correlation of the powers of neighbouring segments, Hann's window, 50 % overlap (Welch
+1967)."""
 
 
 @dataclass(frozen=True)
@@ -36,11 +37,11 @@ class Spectrum(ReadOnlyArrays):
     Parameters
     ----------
     frequency_hz, density
-        Shape (f,), Hz and unit²/Hz.
+        Frequencies and densities, shape (f,), Hz and unit²/Hz.
     low, high
         Confidence interval of the density (χ²), shape (f,).
     degrees_of_freedom
-        Of the χ² distribution.
+        Degrees of freedom of the χ² distribution.
     """
 
     frequency_hz: FloatArray
@@ -52,7 +53,7 @@ class Spectrum(ReadOnlyArrays):
 
 @dataclass(frozen=True)
 class Spectrogram(ReadOnlyArrays):
-    """Power spectral densities of s segments; NaN where too many frames are missing.
+    """Power spectral densities of s segments; NaN if too many frames are missing.
 
     Parameters
     ----------
@@ -63,7 +64,7 @@ class Spectrogram(ReadOnlyArrays):
     density
         Shape (s, f), unit²/Hz; each has two degrees of freedom.
     method
-        How they were made.
+        Method of estimation.
     segment_s
         Duration of a segment, s.
     """
@@ -75,7 +76,7 @@ class Spectrogram(ReadOnlyArrays):
     segment_s: float
 
     def mean(self, confidence: float = 0.95) -> Spectrum:
-        """The mean density of all segments, with its confidence interval."""
+        """Mean density of all segments, with its confidence interval."""
         there = np.isfinite(self.density[:, 0])
         count = int(there.sum())
         density = self.density[there].mean(axis=0) if count else self.density.sum(axis=0)
@@ -86,7 +87,7 @@ class Spectrogram(ReadOnlyArrays):
 
 @dataclass(frozen=True)
 class PeakTrack(ReadOnlyArrays):
-    """Strongest oscillation of each segment; NaN where none stands out.
+    """Strongest oscillation of each segment; NaN if none is significant.
 
     Parameters
     ----------
@@ -108,7 +109,7 @@ def spectrogram(
     Parameters
     ----------
     time_s, values
-        Shape (n,), times ascending, s. Frames that are missing are left out of both.
+        Times, ascending, s, and values, shape (n,). Missing frames are omitted from both.
     segment_s
         Duration of a segment; None: an eighth of the series.
 
@@ -145,8 +146,8 @@ def track_peak(
 ) -> PeakTrack:
     """Frequency of the strongest oscillation of each segment, by `fit_oscillations`.
 
-    The segments are those of `spectrogram`, with the same parameters; ``band_hz`` as of
-    `fit_oscillations`. Where the frequency changes within a segment, it is that at its middle.
+    Segments and parameters as in `spectrogram`; ``band_hz`` as in `fit_oscillations`. If the
+    frequency changes within a segment, the result is that at its middle.
     """
     step, length = _step_and_length(time_s, segment_s)
     begins = _begins(time_s, step, length)
@@ -176,7 +177,7 @@ def _step_and_length(time_s: FloatArray, segment_s: float | None) -> tuple[float
 
 
 def _begins(time_s: FloatArray, step: float, length: int) -> FloatArray:
-    """When each segment begins, half a frame before its first, shape (s,)."""
+    """Begin of each segment, half a frame before its first frame, shape (s,), s."""
     frames = round((time_s[-1] - time_s[0]) / step) + 1
     first = np.arange(0, frames - length + 1, length - length // 2)
     return np.asarray(time_s[0] + (first - 0.5) * step)
@@ -189,7 +190,7 @@ def _within(time_s: FloatArray, begin: float, step: float, length: int) -> np.nd
 def _lomb_scargle(
     time: FloatArray, value: FloatArray, frequency: FloatArray, step: float, length: int
 ) -> FloatArray:
-    """Density of a segment, scaled so that white noise has that of a segment without gaps."""
+    """Density of a segment, scaled so that white noise gives that of a segment without gaps."""
     window = np.sin(np.pi * time / (length * step)) ** 2
     trend = np.polynomial.Polynomial.fit(time, value, 1, w=np.sqrt(window + 1e-6))
     rest = value - trend(time)

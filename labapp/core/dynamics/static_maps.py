@@ -1,4 +1,4 @@
-"""What takes filtered features to penetration: a linear function, a Gaussian process."""
+"""Static maps from filtered features to penetration: linear function and Gaussian process."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from scipy import linalg
 from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
 
 MOST_POINTS, SEARCHED_POINTS = 600, 200
-"""Sections that a Gaussian process keeps at most, and by which its parameters are found."""
+"""Largest numbers of sections of a Gaussian process: kept, and used to fit its parameters."""
 
 
 class StaticMap(Protocol):
-    """What takes standardised regressors to penetration less its mean."""
+    """Map from standardised regressors to penetration minus its mean."""
 
     def evaluate(self, x: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Value, its variance, and the gradient, shapes (n,), (n,), (n, d)."""
+        """Return value, variance and gradient at ``x``, shapes (n,), (n,), (n, d)."""
 
 
 @dataclass(frozen=True)
 class LinearMap(ReadOnlyArrays):
-    """B(q) and c: weights, the constant last, shape (d + 1,), and their covariance."""
+    """B(q) and c: weights, the constant last, shape (d + 1,), and their covariance matrix."""
 
     weights: FloatArray
     covariance: FloatArray
@@ -39,13 +39,13 @@ class LinearMap(ReadOnlyArrays):
 
 @dataclass(frozen=True)
 class GaussianMap(ReadOnlyArrays):
-    """A Gaussian process given m sections.
+    """A Gaussian process conditioned on m sections.
 
     Parameters
     ----------
     points, values, variances
-        Regressors, shape (m, d); penetration less its mean, mm, and the variance of each, shape
-        (m,).
+        Regressors, shape (m, d); penetration minus its mean, mm, and the variance of each, mm²,
+        shape (m,).
     lengths, signal
         ℓ, shape (d,), and σ², mm².
     """
@@ -57,7 +57,7 @@ class GaussianMap(ReadOnlyArrays):
     signal: float
 
     def covariance(self, x: FloatArray) -> FloatArray:
-        """Covariance of the process at places x with that at the points, shape (n, m)."""
+        """Covariance of the process at x with that at the points, shape (n, m), mm²."""
         a, b = x / self.lengths, self.points / self.lengths
         square = (a**2).sum(1)[:, None] + (b**2).sum(1) - 2 * a @ b.T
         return np.asarray(self.signal * np.exp(-np.maximum(square, 0) / 2))
@@ -103,7 +103,7 @@ class Sections:
 
 
 def fit_linear(rows: Sections) -> tuple[LinearMap, float]:
-    """Weights by least squares, and the variance that sections and features do not explain."""
+    """Fit weights by least squares; also return the variance not due to sections and features."""
     columns = np.column_stack([rows.x, np.ones(len(rows.y))])
     inverse = np.linalg.pinv(columns.T @ columns)
     weights = inverse @ columns.T @ rows.y
@@ -114,7 +114,7 @@ def fit_linear(rows: Sections) -> tuple[LinearMap, float]:
 
 
 def fit_gaussian(rows: Sections, like: StaticMap | None) -> tuple[GaussianMap, float]:
-    """Sections, their variances and the kernel's parameters by maximum likelihood."""
+    """Fit a Gaussian process by maximum likelihood; also return the unexplained variance, mm²."""
     from sklearn.gaussian_process import GaussianProcessRegressor
     from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
@@ -124,7 +124,7 @@ def fit_gaussian(rows: Sections, like: StaticMap | None) -> tuple[GaussianMap, f
     kernel += WhiteKernel(0.05, (1e-6, 2.0))
     searched, kept = (_spread(len(rows.y), most) for most in (SEARCHED_POINTS, MOST_POINTS))
     variances = rows.y_sigma**2
-    for _ in range(2):  # without the features' ±, then with it, by the slopes found before
+    for _ in range(2):  # first without the features' ±, then with it, using the gradients found
         regressor = GaussianProcessRegressor(kernel, alpha=variances[searched] / size + 1e-8)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # a parameter at its bound
@@ -145,5 +145,5 @@ def fit_gaussian(rows: Sections, like: StaticMap | None) -> tuple[GaussianMap, f
 
 
 def _spread(count: int, most: int) -> IntArray:
-    """At most so many of the numbers below ``count``, evenly."""
+    """At most ``most`` evenly spaced integers below ``count``."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))

@@ -1,7 +1,7 @@
-"""Events in a series, and how it responds to a step of what drives it.
+"""Change points of a series, and its response to a step of a driving signal.
 
-Events are changes of a series that is piecewise linear between them: the partition with the least
-sum of squares and a penalty for each change, exactly, by dynamic programming (Jackson et al. 2005;
+Events are the change points of a piecewise linear series: the partition with the least sum of
+squares plus a penalty for each change, found exactly by dynamic programming (Jackson et al. 2005;
 penalty of Yao 1988). A response is that of a first- or second-order system with a delay.
 """
 
@@ -17,21 +17,21 @@ from scipy import ndimage, optimize
 from labapp.core.values import FloatArray, ReadOnlyArrays
 
 BLOCKS = 200
-"""A series is averaged to so many samples at most."""
+"""A series is averaged to at most this many samples (blocks)."""
 
 LEAST_BLOCKS = 4
-"""Shortest time between two events, in these."""
+"""Shortest time between two events, in blocks."""
 
 PENALTY = 6.0
-"""Cost of an event, in variances of the noise times ln(samples): it has three
-parameters, and noise alone has an event in 2 of 100 series."""
+"""Penalty of an event, in units of the noise variance times ln(samples): it has three
+parameters, and pure noise gives an event in 2 of 100 series."""
 
 LAGS = (1, 2, 4, 8)
-"""Lags of the second differences that the noise of a pool's series is taken from, in blocks: that
-of correlated noise grows with the lag."""
+"""Lags of the second differences from which the noise of a pool's series is estimated, in blocks:
+for correlated noise they grow with the lag."""
 
 SECOND_ORDER_GAIN = 10.0
-"""Least fall of the cost, in variances, where a response overshoots rather than not (BIC)."""
+"""Least reduction of the cost, in variances, for a second-order response (BIC)."""
 
 
 @dataclass(frozen=True)
@@ -41,11 +41,11 @@ class Event:
     Parameters
     ----------
     time_s, sigma_s
-        When it is, and the standard uncertainty.
+        Time of the event and its standard uncertainty.
     change
-        How much higher the series is after it, in its unit; where its slope changes that is near 0.
+        Step of the series, in its unit; near 0 if only its slope changes.
     slope_change_per_s
-        How much faster it rises after it.
+        Change of the slope.
     """
 
     time_s: float
@@ -55,9 +55,9 @@ class Event:
 
 
 QUANTITIES = ("change", "delay_s", "time_constant_s", "rise_time_s", "overshoot")
-"""Quantities of a step response: how much the series changes in the end, in its unit; from the step
-to the response's beginning; τ of the first order, of the second 1/(ζω₀), with which it settles;
-from 10 to 90 % of the change; largest excess as a share of the change, 0 of the first order."""
+"""Quantities of a step response: final change of the series, in its unit; time from the step to the
+beginning of the response; τ of the first order, or the settling constant 1/(ζω₀) of the second;
+rise time from 10 to 90 % of the change; overshoot as a share of the change, 0 for first order."""
 
 
 @dataclass(frozen=True)
@@ -67,15 +67,15 @@ class StepResponse(ReadOnlyArrays):
     Parameters
     ----------
     step_s
-        When the driving signal changed.
+        Time at which the driving signal changed.
     before
-        The series before it.
+        Level of the series before the step.
     value, sigma
-        Of each of `QUANTITIES` by name; standard uncertainties.
+        Values and standard uncertainties of `QUANTITIES`, by name.
     order
         1 or 2.
     fitted
-        The model at the samples that were used, shape (2, n): time, s, and value.
+        The model at the fitted samples, shape (2, n): time, s, and value.
     """
 
     step_s: float
@@ -93,22 +93,21 @@ def find_events(
     least: float = 0.0,
     lags: tuple[int, ...] = LAGS,
 ) -> tuple[Event, ...]:
-    """Change points of a series, in their order.
+    """Find the change points of a series, in order of time.
 
-    Noise alone has less than one in 1000 frames, also where it is correlated over some 5 of them.
+    Pure noise gives fewer than one in 1000 frames, even if it is correlated over about 5 of them.
 
     Parameters
     ----------
     time_s, values
-        Shape (n,), times ascending, s.
+        Times, ascending, s, and values, shape (n,).
     resolution_s
-        Changes within less are not looked for: at least the period of the pool's oscillation, which
-        is averaged out. Never less than the `BLOCKS`-th part of the series.
+        Time resolution: at least the period of the pool's oscillation, which is averaged out. Never
+        less than 1/`BLOCKS` of the series.
     least
-        Least range of the series on both sides of an event, by its lines; what changes by less is
-        none.
+        Least range of the fitted lines on both sides of an event; smaller changes are ignored.
     lags
-        See `LAGS`; (1,) of a series whose noise is white and that may have many events.
+        See `LAGS`; (1,) for a series with white noise that may have many events.
     """
     if len(time_s) < 4 * LEAST_BLOCKS:
         return ()
@@ -132,19 +131,20 @@ def find_events(
 def step_response(
     time_s: FloatArray, values: FloatArray, step_s: float, until_s: float | None = None
 ) -> StepResponse | None:
-    """Response of a series to a step; None where it does not respond beyond its noise.
+    """Fit the response of a series to a step; None if it is not significant.
 
-    First and second order are fitted by least squares; the latter is taken where it overshoots and
-    explains clearly more. Noise may be correlated: ± are widened by its autocorrelation.
+    First- and second-order models are fitted by least squares; the latter is chosen if it
+    overshoots and fits clearly better. Noise may be correlated: ± are widened by its
+    autocorrelation.
 
     Parameters
     ----------
     time_s, values
-        Shape (n,), times ascending, s.
+        Times, ascending, s, and values, shape (n,).
     step_s
-        When the driving signal changed.
+        Time at which the driving signal changed.
     until_s
-        End of what belongs to the response: the next step. None: that of the series.
+        End of the response, e.g. the next step. None: the end of the series.
     """
     used = time_s <= (time_s[-1] if until_s is None else until_s)
     time, value = time_s[used] - step_s, values[used]
@@ -159,7 +159,7 @@ def step_response(
         high = [np.inf, np.inf, span / 2, 3 * span]
         fits.append(_fitted(_first_order, time, value, start, high))
     first = min(fits, key=lambda one: one.cost)
-    # Starts from several periods: the cost has a minimum near each.
+    # Several initial periods, as the cost has local minima.
     fits = []
     for period in span * np.array([0.05, 0.15, 0.4]):
         start = [before, change, 0.0, period / 4, 0.5]
@@ -191,14 +191,14 @@ def step_response(
 
 
 def _noise(level: FloatArray, lags: tuple[int, ...]) -> float:
-    """Variance of the noise of samples, from their second differences (robust to changes)."""
+    """Noise variance of samples from their second differences (robust to changes)."""
     seconds = [
         level[2 * lag :] - 2 * level[lag:-lag] + level[: -2 * lag]
         for lag in lags
         if 4 * lag < len(level)
     ]
     spread = 1.4826 * max(float(np.median(np.abs(one))) for one in seconds) / np.sqrt(6)
-    # Without noise, a thousandth of the range stands for it.
+    # Lower limit for noise-free series: a thousandth of the range.
     return float(max(spread**2, (1e-3 * float(np.ptp(level))) ** 2, 1e-30))
 
 
@@ -213,9 +213,9 @@ def _range(
 
 
 def _partition(at: FloatArray, level: FloatArray, penalty: float) -> list[int]:
-    """Ends of the optimal pieces, beginning with 0 and ending with n.
+    """Ends of the optimal pieces, starting with 0 and ending with n.
 
-    The last sample of a piece counts in none: the change may lie amid what it is the mean of.
+    The last sample of a piece is excluded from the fit: the change may lie within its block.
     """
     count = len(at)
     best, previous = np.full(count + 1, np.inf), np.zeros(count + 1, int)
@@ -233,7 +233,7 @@ def _partition(at: FloatArray, level: FloatArray, penalty: float) -> list[int]:
 
 
 def _line_costs(at: FloatArray, level: FloatArray) -> Callable[..., FloatArray]:
-    """Sum of squares about the straight line of samples from begins, shape (m,), to an end."""
+    """Return a function for the residual sum of squares of lines from begins, (m,), to an end."""
     x, y = at - at.mean(), level - level.mean()
     sums = np.cumsum(np.stack([np.ones_like(x), x, y, x * x, x * y, y * y]), axis=1)
     sums = np.hstack([np.zeros((6, 1)), sums])
@@ -249,7 +249,7 @@ def _line_costs(at: FloatArray, level: FloatArray) -> Callable[..., FloatArray]:
 def _event(
     at: FloatArray, level: FloatArray, before: tuple[int, int], after: tuple[int, int], noise: float
 ) -> Event:
-    """The change between two pieces, and how well its place is known (profile likelihood)."""
+    """Event between two pieces, with the uncertainty of its time from the profile likelihood."""
     cost = _line_costs(at, level)
     middles = np.arange(before[0] + 3, after[1] - 2)
     total = np.array(
@@ -271,13 +271,13 @@ def _event(
 
 
 def _first_order(x: FloatArray, time: FloatArray) -> FloatArray:
-    """Value at times from the step; x: before, change, delay, τ."""
+    """First-order response at times since the step; x: before, change, delay, τ."""
     late = np.maximum(time - x[2], 0)
     return np.asarray(x[0] + x[1] * -np.expm1(-late / x[3]))
 
 
 def _second_order(x: FloatArray, time: FloatArray) -> FloatArray:
-    """The same; x: before, change, delay, 1/ω₀, ζ < 1."""
+    """Second-order response at times since the step; x: before, change, delay, 1/ω₀, ζ < 1."""
     late = np.maximum(time - x[2], 0) / x[3]
     root = np.sqrt(1 - x[4] ** 2)
     swing = np.cos(root * late) + x[4] / root * np.sin(root * late)
@@ -291,7 +291,7 @@ def _fitted(
     start: list[float],
     high: list[float],
 ) -> optimize.OptimizeResult:
-    """Least squares with the delay from 0 on, 1/ω₀ or τ and ζ above 0."""
+    """Fit a model by least squares, with the delay bounded by about 0, and τ or 1/ω₀ and ζ > 0."""
     tiny = 1e-4 * float(time[-1])
     low = [-np.inf, -np.inf, -tiny, tiny, 0.02][: len(start)]
     scale = max(abs(start[1]), float(value.std()), 1e-12)
@@ -306,10 +306,10 @@ def _overshoot(zeta: float) -> float:
 
 
 def _rise(zeta: float | None) -> float:
-    """Time from 10 to 90 %, in τ or 1/ω₀."""
+    """Rise time from 10 to 90 %, in units of τ or 1/ω₀."""
     if zeta is None:
         return float(np.log(9))
-    peak = np.pi / np.sqrt(1 - zeta**2)  # it rises all the way to there
+    peak = np.pi / np.sqrt(1 - zeta**2)  # the response is monotonic up to the peak
     unit = np.array([0.0, 1.0, 0.0, 1.0, zeta])
     crossing = [
         optimize.brentq(lambda t, h=height: _second_order(unit, np.array(t)) - h, 0, peak)
@@ -319,9 +319,9 @@ def _rise(zeta: float | None) -> float:
 
 
 def _inflation(residual: FloatArray) -> float:
-    """By how much correlated noise widens variances of what varies slowly, at least 1.
+    """Factor by which correlated noise increases variances of slow parameters, at least 1.
 
-    The residual's power at low frequency over its mean.
+    Ratio of the residual's low-frequency power to its mean power.
     """
     power = np.abs(np.fft.rfft(residual - residual.mean()))[1:] ** 2
     low = max(len(power) // 20, 5)

@@ -1,4 +1,4 @@
-"""A weld's features over time, filtered to what a penetration model takes, and its transitions."""
+"""Time series of a weld's features, regressors of a penetration model, and transitions."""
 
 from __future__ import annotations
 
@@ -12,34 +12,34 @@ from scipy import signal
 from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
 
 MOST_HELD = 5
-"""Steps without a frame for which the features before them are held."""
+"""Largest number of steps without a frame for which the previous features are held."""
 
 MOST_STEPS = 1_000_000
-"""Steps of a weld at most."""
+"""Largest number of steps of a weld."""
 
 LONGEST_MEMORY = 10_000
-"""Steps that a prediction depends on at most."""
+"""Largest number of steps on which a prediction depends."""
 
 HOLD_S = 0.3
-"""For so long a state lasts at least: what is shorter is noise about the limit."""
+"""Shortest duration of a state, s; shorter ones are noise about the limit."""
 
 
 @dataclass(frozen=True)
 class WeldSeries(ReadOnlyArrays):
-    """Features of one weld over time, and its penetration where sections or scans tell it.
+    """Features of one weld over time, and its penetration where measured on sections or scans.
 
     Parameters
     ----------
     name
-        The recording's.
+        Name of the recording.
     time_s
-        Shape (n,), ascending, s.
+        Times, shape (n,), ascending, s.
     value
-        Features, shape (n, k); a row with NaN is left out.
+        Features, shape (n, k); a row with NaN is ignored.
     noise, level
-        Their standard uncertainties by noise, independent from frame to frame, and by the level,
-        the same in all frames; shape (n, k). That by the set-up is the same in all welds of a
-        bench, and part of the model.
+        Their standard uncertainties from noise, independent from frame to frame, and from the
+        level, common to all frames; shape (n, k). The uncertainty from the set-up is common to all
+        welds of a bench, and part of the model.
     target, target_sigma
         Measured penetration and its standard uncertainty, shape (n,), mm; NaN where unknown.
     """
@@ -54,9 +54,10 @@ class WeldSeries(ReadOnlyArrays):
 
 
 def in_steps(weld: WeldSeries, step_s: float) -> WeldSeries:
-    """Mean over each even step; one without frames has the features before it, for `MOST_HELD`.
+    """Average a series over equal time steps.
 
-    From the first frame with all features to the last of all frames.
+    A step without frames holds the previous features, for at most `MOST_HELD` steps. The steps run
+    from the first frame with all features to the last frame.
 
     Raises
     ------
@@ -107,11 +108,11 @@ class Orders:
     Parameters
     ----------
     poles
-        n_a: how many time constants A(q) has, 0 to 2.
+        n_a: number of time constants of A(q), 0 to 2.
     lags
-        n_b: how many steps of the features enter.
+        n_b: number of steps of the features used.
     delay
-        n_k: how many steps before the present the first of them is.
+        n_k: delay of the first of them, steps.
     """
 
     poles: int = 1
@@ -120,7 +121,7 @@ class Orders:
 
 
 def impulse_response(time_constants_s: Sequence[float], step_s: float) -> FloatArray:
-    """1/A(q) as a finite response whose sum is 1, shape (m,): first-order lags in a row."""
+    """Finite impulse response of 1/A(q), first-order lags in series, with unit sum, shape (m,)."""
     count = int(np.ceil(8 * sum(time_constants_s) / step_s)) + 1
     response = np.eye(1, count)[0]
     for time_s in time_constants_s:
@@ -131,9 +132,9 @@ def impulse_response(time_constants_s: Sequence[float], step_s: float) -> FloatA
 def regressors(
     steps: WeldSeries, response: FloatArray, orders: Orders
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Filtered features at each step, and their noise and level; each of shape (n, lags·k).
+    """Return filtered features at each step, and their noise and level; each (n, lags·k).
 
-    Before the first step, and after a gap, the features are taken to have been what they are then.
+    At the beginning, and after a gap, the features are assumed to have been constant before.
     """
     count, width = steps.value.shape
     found = np.full((3, count, orders.lags * width), np.nan)
@@ -153,9 +154,9 @@ def regressors(
 
 
 def find_transitions(time_s: FloatArray, value: FloatArray, full_mm: float) -> FloatArray:
-    """Times at which penetration becomes full, shape (k,), s; linear between samples.
+    """Find the times at which penetration becomes full, shape (k,), s, by linear interpolation.
 
-    States that last less than `HOLD_S` are taken to be noise. NaN values are left out.
+    States shorter than `HOLD_S` are treated as noise. NaN values are ignored.
     """
     known = np.isfinite(value)
     time_s, value = time_s[known], value[known]

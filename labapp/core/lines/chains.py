@@ -1,4 +1,4 @@
-"""Chains of ridge points joined to lines, through gaps and crossings."""
+"""Joining of chains of ridge points to lines, across gaps and crossings."""
 
 from __future__ import annotations
 
@@ -8,51 +8,52 @@ from labapp.core.lines.ridges import Ridges
 from labapp.core.values import BoolArray, FloatArray, IntArray
 
 TANGENT_POINTS = 20
-"""The direction in which a chain ends is that of so many of its points."""
+"""Number of points that determine the direction at a chain's end."""
 
 END_WIDTHS = 1.5
-"""A line's ridge is not followed nearer to its end than so many standard deviations of its smoothed
-light: there, it turns aside."""
+"""A ridge is not used within this many standard deviations of its smoothed light from its end,
+where it turns aside."""
 
 UPRIGHT = 0.35
-"""A line is upright that is narrower than this share of its height."""
+"""A line is upright if its width is less than this share of its height."""
 
 DIP, LEAST_FOLDED = 0.6, 6
-"""An upright chain is cut where it falls below this share of what it is on both sides; parts of
+"""An upright chain is cut where its strength falls below this share of that on both sides; parts of
 fewer points are left out."""
 
 WHISKER_PX, WHISKER_OFF = 16, 3.0
-"""A chain of fewer points that is no farther than so many times the ridges' scale from a stronger
-one is part of that one's side."""
+"""A chain of fewer points within this many times the ridges' scale of a stronger chain belongs to
+the flank of that chain."""
 
 SHORT_PX = 25
-"""Chains of fewer points are not joined when one is more above than beside the other."""
+"""Chains of fewer points are not joined if one lies above rather than beside the other."""
 
 ALIKE = 2.5
-"""Parts of one line are not brighter one than the other by a larger factor."""
+"""Largest ratio of brightness between parts of one line."""
 
 GAP_SHARE = 0.1
-"""A gap is longer where the pool spreads the line: by so much of the length of what it parts."""
+"""A gap may be longer by this share of the joined chains' lengths, as the pool spreads them."""
 
 WITHIN, INSET_PX = 0.25, 2.0
-"""An upright or short chain below another is not part of it where its middle is farther in than so
-much of its extent, or all of it so many pixels: that is a folded line below an arch, and no leg."""
+"""An upright or short chain below another is not part of it if its middle is inside the other by
+more than this share of its extent, or all of it by this many pixels: it is then a folded line below
+an arch, not a leg of the arch."""
 
 BRIEF = 0.3
-"""Cosine of the largest turn at a short chain's end where it follows on a longer one."""
+"""Cosine of the largest turn at a short chain's end where it continues a longer one."""
 
 
 def join_chains(
     ridges: Ridges, chosen: IntArray, scale_px: float, gap_px: float, turn_deg: float
 ) -> list[IntArray]:
-    """Join chains to lines; the points of each line, in order.
+    """Join chains to lines; return the points of each line in order.
 
     Parameters
     ----------
     ridges
-        Of the frame.
+        Ridges of the frame.
     chosen
-        Which of its chains count, shape (k,).
+        Indices of the chains to use, shape (k,).
     scale_px
         The ridges' scale, px.
     gap_px, turn_deg
@@ -68,7 +69,7 @@ def join_chains(
 
 
 def _parts(ridges: Ridges, points: IntArray) -> list[IntArray]:
-    """A chain in parts where it is upright and dips: folded lines, one above the other."""
+    """Split an upright chain where its strength dips: folded lines, one above the other."""
     if not is_upright(ridges.image_px[points]):
         return [points]
     height = ridges.height[points]
@@ -80,7 +81,7 @@ def _parts(ridges: Ridges, points: IntArray) -> list[IntArray]:
 
 
 def _without_whiskers(ridges: Ridges, chains: list[IntArray], scale: float) -> list[IntArray]:
-    """Chains without the short ones that stand off a stronger one's side."""
+    """Remove short chains on the flank of a stronger one."""
     bright = [float(ridges.strength[chain].sum()) for chain in chains]
     kept: list[IntArray] = []
     for k in np.argsort(bright)[::-1]:
@@ -95,7 +96,7 @@ def _without_whiskers(ridges: Ridges, chains: list[IntArray], scale: float) -> l
 
 
 def _core(ridges: Ridges, points: IntArray) -> IntArray:
-    """Points of a chain without its ends, where the ridge is weak and turns aside."""
+    """Return a chain without its ends, where the ridge is weak and turns aside."""
     strength = ridges.strength[points]
     bright = np.flatnonzero(strength > np.median(strength) / 2)
     points = points[bright[0] : bright[-1] + 1]
@@ -104,7 +105,7 @@ def _core(ridges: Ridges, points: IntArray) -> IntArray:
 
 
 def is_upright(place: FloatArray) -> bool:
-    """Whether a line of places, shape (n, 2), goes up rather than across."""
+    """Whether a line of points, shape (n, 2), is steep rather than flat."""
     across, up = np.ptp(place, axis=0)
     return bool(across < UPRIGHT * up)
 
@@ -112,11 +113,11 @@ def is_upright(place: FloatArray) -> bool:
 def spread_of(ridges: Ridges, points: IntArray) -> float:
     """Standard deviation of the smoothed frame's light across ridge points, px."""
     ratio = float(np.median(ridges.height[points] / ridges.strength[points]))
-    return float(np.sqrt(max(ratio, 1.0)))  # what a brighter neighbour outshines has none
+    return float(np.sqrt(max(ratio, 1.0)))  # a brighter neighbour can make it meaningless
 
 
 def _join(ridges: Ridges, chains: list[IntArray], gap_px: float, turn_deg: float) -> list[IntArray]:
-    """Join chains end to end, the best pair of ends first; points of each line in order."""
+    """Join chains end to end, the best pair of ends first; return each line's points in order."""
     if not chains:
         return []
     place, out = _chain_ends(ridges, chains)
@@ -127,7 +128,7 @@ def _join(ridges: Ridges, chains: list[IntArray], gap_px: float, turn_deg: float
         behind = np.vecdot(-step, out[None]) / length
     least = np.cos(np.radians(turn_deg))
     near = length < 3.0
-    # A short chain has no direction of its own to rely on: that of a longer one decides.
+    # The direction of a short chain is unreliable: that of the longer one decides.
     brief = np.repeat([len(chain) < WHISKER_PX for chain in chains], 2)
     fine_ahead = (ahead > least) | (brief[:, None] & ~brief & (ahead > BRIEF))
     fits = fine_ahead & fine_ahead.T | near & (np.vecdot(out[:, None], out[None]) < 0)
@@ -158,7 +159,7 @@ def _join(ridges: Ridges, chains: list[IntArray], gap_px: float, turn_deg: float
 
 
 def _inside(ridges: Ridges, chains: list[IntArray]) -> BoolArray:
-    """Whether each chain, or its middle, is well within the columns of each other, shape (k, k)."""
+    """Whether each chain, or its middle, is well within the columns of another, shape (k, k)."""
     columns = [ridges.image_px[chain, 0] for chain in chains]
     middle = np.array([each.mean() for each in columns])
     low, high = np.array([[each.min(), each.max()] for each in columns]).T
@@ -169,14 +170,14 @@ def _inside(ridges: Ridges, chains: list[IntArray]) -> BoolArray:
 
 
 def _chain_ends(ridges: Ridges, chains: list[IntArray]) -> tuple[FloatArray, FloatArray]:
-    """Places of both ends of each chain and outward unit vectors there, shape (2·chains, 2)."""
+    """Positions of both ends of each chain and outward unit vectors there, shape (2·chains, 2)."""
     place, out = [], []
     for chain in chains:
         for points in (chain, chain[::-1]):
             at = ridges.image_px[points[:TANGENT_POINTS]]
             place.append(at[0])
             away = at[0] - at[-1]
-            # A chain that bends goes on bending: its end's direction is twice as far turned.
+            # Extrapolate the bend: the direction at the end has turned twice as far.
             first = at[0] - at[len(at) // 2]
             away = 2 * first / np.linalg.norm(first) - away / np.linalg.norm(away)
             out.append(away / np.linalg.norm(away))

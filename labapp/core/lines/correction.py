@@ -1,7 +1,7 @@
-"""Lines of a frame corrected by hand: cut, joined, numbered, deleted.
+"""Manual correction of the lines of a frame: cut, join, number, delete.
 
-Each edit returns a new correction, and raises `ValueError`, with what would be right, where it
-makes no sense. A frame is measured from these lines in place of what would be found in its picture.
+Each edit returns a new correction. An invalid edit raises `ValueError` with a message that says
+what is valid. A frame is measured from the corrected lines instead of those detected.
 """
 
 from __future__ import annotations
@@ -16,23 +16,23 @@ from labapp.core.lines.numbering import LinesSeen, heights
 from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
 
 LEAST_POINTS = 8
-"""A piece of a line has so many points at least."""
+"""Least number of points of a piece of a line."""
 
 GAP_PX = 1.5
-"""Points of a line that are farther apart have a gap between them, px."""
+"""Neighbouring points of a line that are farther apart are separated by a gap, px."""
 
 
 @dataclass(frozen=True)
 class LineCorrection(ReadOnlyArrays):
-    """The lines of a frame as the operator wants them; k lines.
+    """The lines of a frame as corrected by the operator; k lines.
 
     Parameters
     ----------
     seen
         The lines, from the lowest in the picture up.
     number
-        Number of each in the pattern where it was given by hand, 0 elsewhere, shape (k,). Pieces of
-        one line have the same.
+        Number of each in the pattern if given by hand, otherwise 0, shape (k,). Pieces of one line
+        have the same number.
     """
 
     seen: LinesSeen
@@ -40,19 +40,22 @@ class LineCorrection(ReadOnlyArrays):
 
     @classmethod
     def of(cls, seen: LinesSeen) -> LineCorrection:
-        """Begin with what was found."""
+        """Start from the detected lines."""
         return cls(seen, np.zeros(len(seen.lines), np.int64))
 
 
 def nearest_line(lines: Sequence[LightLine], u_px: float, v_px: float) -> tuple[int, int, float]:
-    """Line and point of it nearest to a place, and how far away that is, px; there is one."""
+    """Indices of the line and of its point nearest to a position, and their distance, px.
+
+    ``lines`` must not be empty.
+    """
     away = [np.linalg.norm(one.image_px - (u_px, v_px), axis=-1) for one in lines]
     line = int(np.argmin([each.min() for each in away]))
     return line, int(np.argmin(away[line])), float(away[line].min())
 
 
 def cut_line(correction: LineCorrection, line: int, point: int) -> LineCorrection:
-    """Cut a line in two at one of its points; the ends made so are not on the pool's boundary."""
+    """Cut a line in two at one of its points; the new ends are not on the pool's boundary."""
     one = correction.seen.lines[line]
     if min(point, len(one.image_px) - point) < LEAST_POINTS:
         raise ValueError("that is too near to the line's end to cut it there")
@@ -64,7 +67,7 @@ def cut_line(correction: LineCorrection, line: int, point: int) -> LineCorrectio
 
 
 def join_lines(correction: LineCorrection, first: int, second: int) -> LineCorrection:
-    """Join two lines at those of their ends that are nearest to each other."""
+    """Join two lines at their nearest ends."""
     if first == second:
         raise ValueError("choose the two pieces of the line")
     numbers = {int(correction.number[k]) for k in (first, second)} - {0}
@@ -83,7 +86,7 @@ def join_lines(correction: LineCorrection, first: int, second: int) -> LineCorre
 
 
 def number_line(correction: LineCorrection, line: int, number: int, count: int) -> LineCorrection:
-    """Give a line its number in a pattern of ``count`` lines; 0 leaves it to be found."""
+    """Set the number of a line in a pattern of ``count`` lines; 0: determine it automatically."""
     if not 0 <= number <= count:
         raise ValueError(f"the pattern's lines are 1 to {count}, growing towards the head")
     numbers = correction.number.copy()
@@ -92,11 +95,11 @@ def number_line(correction: LineCorrection, line: int, number: int, count: int) 
 
 
 def delete_line(correction: LineCorrection, line: int) -> LineCorrection:
-    """Take a line out: it is none of the pattern's."""
+    """Delete a line that is not part of the pattern."""
     seen = correction.seen
     outermost = line == 0, line == len(seen.lines) - 1
     changed = _with(correction, [line], [])
-    # What lies beside the next line is no longer known to be a fringe.
+    # Whether a fringe lies beside the next line is now unknown.
     below, above = (
         fringe and not gone
         for fringe, gone in zip((seen.fringe_below, seen.fringe_above), outermost, strict=True)
@@ -108,7 +111,7 @@ def delete_line(correction: LineCorrection, line: int) -> LineCorrection:
 def _with(
     correction: LineCorrection, without: list[int], more: list[tuple[LightLine, int]]
 ) -> LineCorrection:
-    """The correction with other lines in place of some, from the lowest up."""
+    """Replace some lines of a correction by others, from the lowest up."""
     kept = [
         (one, int(number))
         for k, (one, number) in enumerate(
@@ -144,7 +147,7 @@ def _part(
 
 
 def _reversed(line: LightLine) -> LightLine:
-    """A line from its other end."""
+    """Return a line with its direction reversed."""
     return replace(
         line,
         image_px=line.image_px[::-1],
@@ -157,7 +160,7 @@ def _reversed(line: LightLine) -> LightLine:
 
 
 def _joined(one: LightLine, other: LightLine) -> LightLine:
-    """Two lines as one, the second after the first."""
+    """Concatenate two lines."""
     image_px = np.concatenate([one.image_px, other.image_px])
     share = len(one.image_px) / len(image_px)
 

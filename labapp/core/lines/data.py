@@ -1,4 +1,4 @@
-"""A frame's lines on the imaging plane: the points and ends that the fit compares."""
+"""Points and ends of a frame's lines on the imaging plane: the data of the fit."""
 
 from __future__ import annotations
 
@@ -10,22 +10,20 @@ from labapp.core.lines.model import LineData
 from labapp.core.values import FloatArray
 
 POINT_STEP_PX = 10.0
-"""Distance of the points that a line gives, px."""
+"""Spacing of the points of a line, px."""
 
 SMOOTHED = 2 * np.sqrt(np.pi)
-"""A line that is smoothed by a Gaussian has an independent point every so many of its standard
-deviations."""
+"""Spacing of independent points of a line smoothed by a Gaussian, in its standard deviations."""
 
 SIGMA_FACTOR, FLOOR_PX = 1.3, 0.06
-"""A ridge's scatter along its line is larger than its speckle explains by this factor; and what no
-line is better than, px."""
+"""Ratio of the scatter of a ridge to that expected from speckle; and the least uncertainty, px."""
 
 END_SIGMA_PX = 1.0
 """Standard uncertainty of a line's end along it, px."""
 
 
 def line_data(lines: tuple[LightLine, ...], calibration: ImageCalibration) -> LineData:
-    """Points and ends of lines, from the lowest up, on the imaging plane."""
+    """Return points and ends of lines, from the lowest up, on the imaging plane."""
     points = [_points(one, calibration) for one in lines]
     ends = [_ends(one, calibration) for one in lines]
     place, normal, sigma = (np.concatenate(column) for column in zip(*points, strict=True))
@@ -40,7 +38,7 @@ def line_data(lines: tuple[LightLine, ...], calibration: ImageCalibration) -> Li
 def _points(
     line: LightLine, calibration: ImageCalibration
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Places, normals and uncertainties of points about every `POINT_STEP_PX`."""
+    """Positions, normals and uncertainties of points about every `POINT_STEP_PX`."""
     count = len(line.image_px)
     chosen = np.linspace(0, count - 1, max(5, round(count / POINT_STEP_PX))).round().astype(int)
     chosen = np.unique(chosen)
@@ -52,7 +50,7 @@ def _points(
 
 
 def _ends(line: LightLine, calibration: ImageCalibration) -> tuple[FloatArray, FloatArray]:
-    """Places and uncertainties of the ends that are the line's own."""
+    """Positions and uncertainties of the ends that are not cut off."""
     own = ~line.cut
     across = np.stack([-line.tangent[:, 1], line.tangent[:, 0]], axis=-1)[[0, -1]][own]
     place, _, scale = _on_plane(line.ends_px[own], across, calibration)
@@ -62,7 +60,7 @@ def _ends(line: LightLine, calibration: ImageCalibration) -> tuple[FloatArray, F
 def _on_plane(
     image_px: FloatArray, tangent: FloatArray, calibration: ImageCalibration
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Places, unit tangents and mm a pixel across them, from places and tangents in the image."""
+    """Positions, unit tangents and mm per pixel across them, from those in the image."""
     place = calibration.to_plane(image_px)
     jacobian = calibration.jacobian(image_px)
     along = (jacobian @ tangent[..., None])[..., 0]

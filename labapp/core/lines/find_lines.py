@@ -1,7 +1,7 @@
-"""Reflected lines of a frame: ridges joined through gaps and crossings, smoothed, with their ends.
+"""Detection of the reflected lines of a frame: joined and smoothed ridges, with their ends.
 
-The pattern's own lines and the diffraction fringes beside them (§3.2.1, Fig. 3-9) are told apart by
-`numbering`.
+`numbering` distinguishes the pattern's own lines from the diffraction fringes beside them (§3.2.1,
+Fig. 3-9).
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from labapp.core.lines.smooth_path import SmoothPath
 from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 
 END_PX, END_REACH_PX = 10.0, 30.0
-"""A line's light near its end is the median over so much of it; its end is looked for so far ahead
-of where its ridge was followed, px."""
+"""Length over which the light near a line's end is averaged (median), and length beyond the ridge
+within which the end is searched, px."""
 
 
 GAP_SHARE = 0.4
@@ -28,59 +28,59 @@ GAP_SHARE = 0.4
 
 
 STRIP_WIDTHS = 2.6
-"""The light beside a line is read so many standard deviations of it to either side; where the
-picture ends before, its middle is not known."""
+"""Half width of the strip along a line in which its light is read, in standard deviations of the
+light; the line's middle is unknown where the strip extends beyond the picture."""
 
 CENTER_ROUNDS = 4
-"""Of the window that follows the middle of a line's light."""
+"""Iterations of the window that follows the middle of a line's light."""
 
 BEND_SHARE, LEAST_WINDOW_PX, WIDER = 0.4, 3.0, 1.8
-"""In the second pass a line's light is averaged over this share of its radius of curvature, between
-so many pixels and so many times the length of the first pass."""
+"""In the second pass a line's light is averaged over this share of its radius of curvature, at
+least this many pixels and at most this multiple of the first pass's length."""
 
 PATH_SMOOTHER = 1.8
-"""The path that a line's light is averaged along is smoothed over so many times that length."""
+"""Ratio of the smoothing length of the path to the length over which light is averaged along it."""
 
 SPOT_WIDTHS = 6.0
-"""A line shorter than so many times its width is a spot: it has no direction of its own."""
+"""A line shorter than this many times its width is a spot without a direction."""
 
 SPECK_WIDTHS, SPECK_LIGHT = 2.0, 0.15
-"""What comes so many of its widths near to a line, and has no more than this share of its light in
-all, is part of that line's side."""
+"""A line within this many of its widths of another, with at most this share of its total light, is
+a speck on the flank of the other."""
 
 GATHERED_WIDTHS, GATHERED_LIGHT = (14.0, 36.0), 0.15
-"""All lines with this share of the brightest one's light lie within so many of their widths across
-and up: the pool gathers them to spots, too near each other for ridges."""
+"""Largest extent across and up, in line widths, of lines that the pool gathers to spots, and least
+share of the brightest line's light of a line that counts."""
 
 GLOW_ROUNDS = 5
-"""Of the fit of the light under the lines."""
+"""Iterations of the fit of the background light."""
 
 GRAIN_COLUMNS = 3.3
-"""So many columns of pixels along a line share a grain of speckle."""
+"""Correlation length of the speckle along a line, pixel columns."""
 
 
 @dataclass(frozen=True)
 class LineSettings:
-    """How lines are found.
+    """Settings for the detection of lines.
 
     Parameters
     ----------
     ridges
-        Of the first pass; in the second, the scale is that of the lines' own width.
+        Settings of the first pass; in the second, the scale is the measured width of the lines.
     least_scale_px, most_scale_px
-        Limits of that scale.
+        Limits of that scale, px.
     least_px
-        Shortest chain of ridge points and shortest line that count, px.
+        Length of the shortest chain of ridge points and of the shortest line, px.
     gap_px
         Longest gap that is joined, px.
     turn_deg
         Largest turn at either side of a gap, degrees.
     smooth_px, smooth_widths, smooth_share
-        Standard deviation of the weights by which a line is smoothed along itself: px, at least,
-        and so many times its width; of a longer line, which bends less, so much of its length, up
-        to the second number of widths.
+        Standard deviation of the Gaussian weights that smooth a line along its length: at least
+        this many px; otherwise a share of its length, limited to the two multiples of its width.
     edge_px
-        A line that ends so near to the picture's edge is cut off there, px; a wide one farther.
+        A line that ends within this distance of the picture's edge is cut off there, px; the
+        distance is larger for a wide line.
     """
 
     ridges: RidgeSettings = field(default_factory=RidgeSettings)
@@ -97,30 +97,30 @@ class LineSettings:
 
 @dataclass(frozen=True)
 class LightLine(ReadOnlyArrays):
-    """A reflected line, from its left end to its right one.
+    """A reflected line, from its left end to its right end.
 
     Parameters
     ----------
     image_px
-        (u, v) of its ridge at about every pixel, gaps left out, shape (n, 2), px.
+        (u, v) of its ridge at about every pixel, without gaps, shape (n, 2), px.
     tangent
         Unit vector along it, shape (n, 2).
     sigma_px
-        Standard uncertainty of the ridge across itself, shape (n,), px.
+        Standard uncertainty of the ridge across the line, shape (n,), px.
     curvature
         Of the ridge, 1/px, shape (n,); positive where it turns to the right (clockwise as seen).
     ends_px
         (u, v) where its light falls to half, shape (2, 2), px.
     cut
-        Whether each end is at the picture's edge rather than the line's own, shape (2,).
+        Whether each end is cut off and not a true end of the line, shape (2,).
     width_px
         Standard deviation of its light across it, px.
     light
-        Its light over its length: integral across it, grey levels·px, the median of its points.
+        Light per length: integral across the line, median over its points, grey levels·px.
     gap_px
         Length of its longest gap, px.
     smoothed_px
-        Standard deviation of the weights that it is smoothed by along itself, px.
+        Standard deviation of the Gaussian weights that smooth it along its length, px.
     """
 
     image_px: FloatArray
@@ -141,12 +141,12 @@ class LightLine(ReadOnlyArrays):
 
     @property
     def folded(self) -> bool:
-        """Whether its halves lie on each other or in a spot: the pool gathers them (a caustic)."""
+        """Whether the line is folded onto itself or gathered to a spot (a caustic)."""
         return is_upright(self.image_px) or self.length_px < SPOT_WIDTHS * self.width_px
 
 
 def find_lines(frame: Image, settings: LineSettings) -> tuple[LightLine, ...]:
-    """Find all bright lines of a grey frame, shape (height, width), fringes included."""
+    """Find all bright lines in a grey frame, shape (height, width), including fringes."""
     ridges = find_ridges(frame, settings.ridges)
     scale = settings.ridges.scale_px
     long = _long_chains(ridges, settings)
@@ -169,7 +169,7 @@ def find_lines(frame: Image, settings: LineSettings) -> tuple[LightLine, ...]:
 
 
 def _bright(lines: tuple[LightLine, ...]) -> list[LightLine]:
-    """Those with a good share of the most light that one has."""
+    """Return the lines with at least a share of the brightest line's light."""
     total = np.array([one.light * one.length_px for one in lines])
     return [
         one for one, light in zip(lines, total, strict=True) if light > GATHERED_LIGHT * max(total)
@@ -187,7 +187,7 @@ def _is_gathered(lines: tuple[LightLine, ...]) -> bool:
 
 
 def _spots(picture: Grey, lines: tuple[LightLine, ...]) -> tuple[LightLine, ...]:
-    """Folded lines at the spots of a column of light."""
+    """Return folded lines at the spots of a column of light."""
     bright = _bright(lines)
     width = float(np.median([one.width_px for one in bright]))
     column = np.concatenate([one.image_px for one in bright])
@@ -210,7 +210,7 @@ def _spots(picture: Grey, lines: tuple[LightLine, ...]) -> tuple[LightLine, ...]
 
 
 def _without_specks(lines: tuple[LightLine, ...]) -> tuple[LightLine, ...]:
-    """Lines without the specks of light on the side of one, which have some of its light, too."""
+    """Remove specks on the flank of a brighter line."""
 
     def is_speck(one: LightLine, other: LightLine) -> bool:
         if one.length_px * one.light > SPECK_LIGHT * other.length_px * other.light:
@@ -222,9 +222,9 @@ def _without_specks(lines: tuple[LightLine, ...]) -> tuple[LightLine, ...]:
 
 
 def glow(picture: Grey) -> Grey:
-    """Smooth light under a picture's lines: a cubic in u and v that few of its pixels lie below.
+    """Background light of a picture: a cubic in u and v, fitted without the bright lines.
 
-    Its slope would draw the middle of a line's light to the brighter side.
+    Its gradient would bias the middle of a line's light to the brighter side.
     """
     height, width = picture.shape
     size = max(width // 8, 8), max(height // 8, 8)
@@ -253,7 +253,7 @@ def _long_chains(ridges: Ridges, settings: LineSettings) -> IntArray:
 def _line(
     picture: Grey, ridges: Ridges, points: IntArray, scale: float, settings: LineSettings
 ) -> LightLine | None:
-    """A line of ridge points in order; None where too little is left of it."""
+    """Measure a line of ordered ridge points; None if it is too short."""
     strength = ridges.strength[points]
     points = points[strength > GAP_SHARE * np.median(strength)]
     place, strength = ridges.image_px[points], ridges.strength[points]
@@ -268,7 +268,7 @@ def _line(
     low, high = (each * width for each in settings.smooth_widths)
     wanted = float(np.clip(settings.smooth_share * len(place), low, high))
     smooth_px = min(max(wanted, settings.smooth_px), len(place) / 8)
-    # What wavers in the path would stay in the line: it is smoother than the line.
+    # Fluctuations of the path would remain in the line: the path is smoothed more.
     path = SmoothPath.through(place, PATH_SMOOTHER * smooth_px)
     seen = path.seen & _within(path.place, STRIP_WIDTHS * width, picture)
     if seen.sum() < least:
@@ -277,9 +277,9 @@ def _line(
     window: FloatArray = np.full(len(path.place), smooth_px)
     for _ in range(2):
         off, sigma = _centers(picture, path, width, window)
-        # A bent line's light, blurred, has its ridge on the inner side: by σ²κ/2.
+        # Blur moves the ridge of a curved line to the inner side by σ²κ/2.
         path = path.moved(off - path.curvature * width**2 / 2, settings.smooth_px)
-        # The second pass corrects what smoothing took from bends: there with a narrow window.
+        # The second pass corrects the bias of smoothing at bends with a narrower window.
         radius = 1.0 / (np.abs(path.curvature) + 1e-9)
         window = np.clip(BEND_SHARE * radius, LEAST_WINDOW_PX, WIDER * smooth_px)
     light = float(np.median(strength) * spread2**1.5 * np.sqrt(2 * np.pi))
@@ -290,7 +290,7 @@ def _line(
     ]
     size = np.array(picture.shape[::-1])
     places = np.array(ends)
-    # Light near an end, cut off obliquely by the pool's edge, is not symmetric about the line.
+    # Near an end that the pool's edge cuts obliquely, the light is not symmetric about the line.
     away = np.linalg.norm(path.place[:, None] - places, axis=-1).min(axis=-1)
     clear = seen & (away > END_WIDTHS * np.sqrt(spread2))
     seen = clear if clear.sum() >= least else seen
@@ -311,7 +311,7 @@ def _line(
 
 
 def _within(place: FloatArray, room_px: float, picture: Grey) -> BoolArray:
-    """Which places, (u, v), shape (n, 2), are so far within a picture, shape (n,)."""
+    """Whether positions (u, v), shape (n, 2), are inside a picture by a margin, shape (n,)."""
     last = np.array(picture.shape[::-1]) - 1 - room_px
     return np.asarray(((place >= room_px) & (place <= last)).all(axis=-1))
 
@@ -319,10 +319,10 @@ def _within(place: FloatArray, room_px: float, picture: Grey) -> BoolArray:
 def _centers(
     picture: Grey, path: SmoothPath, width: float, window_px: FloatArray
 ) -> tuple[FloatArray, float]:
-    """Offset of the light's middle from a path, across it, shape (n,), px, and its uncertainty.
+    """Offset of the light's middle across a path, shape (n,), px, and its standard uncertainty.
 
-    The light beside the path is taken as a straight strip, weighed by a Gaussian window that
-    follows its middle, and averaged along the path by Gaussian weights of the standard deviation
+    The light beside the path is resampled to a straight strip, weighted by a Gaussian window that
+    follows its middle, and averaged along the path with Gaussian weights of standard deviation
     ``window_px``, shape (n,).
     """
     reach = STRIP_WIDTHS * width + 1.0
@@ -348,14 +348,14 @@ def _centers(
         moment = (window * strip * away).sum(axis=1)
         total = np.maximum(bell @ weight, 1e-9 + 0.1 * np.median(np.abs(weight)))
         step = bell @ moment / total
-        off = np.clip(off + 1.5 * step, -width, width)  # (2 + 1)/2: the window draws it back
+        off = np.clip(off + 1.5 * step, -width, width)  # (2 + 1)/2: the window biases it back
     scatter = 1.5 * (moment - (bell @ moment / total) * weight)
     variance = GRAIN_COLUMNS * (bell**2 @ scatter**2) / total**2
     return off, float(np.sqrt(np.median(variance[path.seen])))
 
 
 def _end(smooth: Grey, path: SmoothPath, end: int, height: float) -> FloatArray:
-    """Where the light ahead of a path's end falls to half, (u, v), px."""
+    """Position beyond a path's end where the light falls to half, (u, v), px."""
     sign = -1.0 if end == 0 else 1.0
     inward = slice(0, round(END_PX)) if end == 0 else slice(-round(END_PX), None)
     curvature = float(np.median(path.curvature[inward]))

@@ -1,9 +1,9 @@
-"""The pool surface under reflected lines: what the text could not reconstruct (§3.2.2).
+"""Fit of a pool surface to reflected lines, which the dissertation does not reconstruct (§3.2.2).
 
-A point of a line gives one equation, its distance across from the predicted curve; an end of a line
-lies on the boundary, z = 0. The lines differ in nothing but their order, so that surfaces of both
-curvatures are fitted, first as quadrics, with each numbering that is possible; the one that
-contradicts lines and ends least is refined in splines, held smooth.
+A point of a line gives one equation, its perpendicular distance from the predicted curve; an end of
+a line lies on the boundary, z = 0. The lines are identified by their order only. Surfaces of both
+curvatures are therefore fitted, first as quadrics, with each possible numbering. The best of them
+are refined as splines with a smoothness prior.
 """
 
 from __future__ import annotations
@@ -22,48 +22,48 @@ from labapp.core.surface.spline import SplineBasis, SplineSurface
 from labapp.core.values import CannotMeasure, FloatArray, IntArray, ReadOnlyArrays
 
 RADII_MM = (6.0, 9.0, 14.0, 24.0, 45.0, 120.0)
-"""Radii of curvature that quadrics begin with, convex and concave."""
+"""Initial radii of curvature of the quadrics, convex and concave."""
 
 QUADRIC_SIGMA_MM = 0.1
-"""How far a pool's lines are from those of a quadric, mm on the imaging plane."""
+"""Typical deviation of a pool's lines from those of a quadric, mm on the imaging plane."""
 
 HALF_WIDTH_MM = 2.8
-"""Half the width of the pools that they belong to."""
+"""Half width of the pools for these radii."""
 
 POOR_COST = 2.0
-"""A quadric that costs more a point is sought from a second radius, too."""
+"""If the cost per point is larger, the quadric is also fitted from a second initial radius."""
 
 NEAR_COST, NEAR_COST_MORE = 4.0, 60.0
-"""Quadrics that cost less than so many times the best one, and so much more, are refined."""
+"""Quadrics that cost less than this multiple of the best one, plus this, are refined."""
 
 QUADRIC_ROUNDS, SPLINE_ROUNDS = 20, 20
 MARGIN_MM = 0.8
 
 AGREES = 3.0
-"""A point or an end farther off than so many of its standard uncertainties does not agree."""
+"""Largest standardised residual of a point or an end that agrees with the surface."""
 
 
 LEAST_LINES = 3
-"""Two lines and their ends are met by surfaces of both curvatures: they determine none."""
+"""Least number of lines that determine a surface: surfaces of both curvatures fit two lines."""
 
 
 @dataclass(frozen=True)
 class LineFitSettings:
-    """How the fit decides.
+    """Settings of the fit.
 
     Parameters
     ----------
     knot_mm
         Spacing of the spline knots, mm.
     jerk
-        Third derivatives of the surface that are to be expected, mm⁻². With 0.005, lines are met as
-        well, and the height of hollow pools comes out 3 % too large, more than its ±.
+        Expected third derivatives of the surface, mm⁻². With 0.005 the lines fit equally well, but
+        the height of hollow pools is 3 % too large, more than its ±.
     settled
-        The rounds end when the cost falls by less.
+        The iteration stops if a step reduces the cost by less.
     margin
-        By how much the cost of another sign or numbering must be higher.
+        Least difference of the cost of another sign or numbering from the best.
     most_relative_sigma
-        A height is determined when its standard uncertainty is at most this share of it.
+        A height is determined if its relative standard uncertainty is at most this.
     most_misfit
         Largest χ² over its degrees of freedom of a surface that fits.
     """
@@ -78,25 +78,26 @@ class LineFitSettings:
 
 @dataclass(frozen=True)
 class LineSurface(ReadOnlyArrays):
-    """A surface that reflects the lines as they are seen, and how well it is known.
+    """A surface fitted to the reflected lines, and its uncertainty.
 
     Parameters
     ----------
     surface
         The surface, z = 0 at the boundary.
     covariance
-        Of its coefficients, shape (p, p), mm².
+        Covariance of its coefficients, shape (p, p), mm².
     numbers
         Number of each line in the pattern, from the lowest in the picture up, shape (k,).
     point_mm
-        Where the rays of the points and ends that agree with it meet the surface, shape (n, 3), mm.
+        Points of the surface met by the rays of the points and ends that agree with it, shape
+        (n, 3), mm.
     misfit
         χ² of points and ends over its degrees of freedom.
     margin
-        By how much the next best sign or numbering costs more; infinite where there is none.
+        Additional cost of the next best sign or numbering; infinite if there is none.
     status
-        ``ok``, or ``profile`` where the lines leave a direction open: then heights are no
-        measurement, slopes along the lines may be one.
+        ``ok``, or ``profile`` if the lines do not fully determine the surface: its heights are then
+        not a measurement, although slopes along the lines may be.
     """
 
     surface: SplineSurface
@@ -109,7 +110,7 @@ class LineSurface(ReadOnlyArrays):
 
     @cached_property
     def peak_mm(self) -> FloatArray:
-        """(x, y, z) of the highest point under the lines, of a hollow the lowest, mm."""
+        """(x, y, z) of the highest point under the lines, or of the lowest of a hollow, mm."""
         low, high = self.point_mm[:, :2].min(axis=0), self.point_mm[:, :2].max(axis=0)
         x, y = (np.linspace(*ends, 81) for ends in zip(low, high, strict=True))
         x, y = (each.ravel() for each in np.meshgrid(x, y))
@@ -124,7 +125,7 @@ class LineSurface(ReadOnlyArrays):
 
     @cached_property
     def height_sigma_mm(self) -> float:
-        """Its standard uncertainty, mm."""
+        """Standard uncertainty of `height_mm`, mm."""
         return float(self.sigma_mm(*self.peak_mm[:2, None])[0])
 
     def sigma_mm(self, x_mm: FloatArray, y_mm: FloatArray) -> FloatArray:
@@ -144,10 +145,10 @@ class LineSurface(ReadOnlyArrays):
 
     @property
     def curvature_per_mm(self) -> float:
-        """Mean curvature of the quadric nearest to the surface, 1/mm; positive when convex."""
+        """Mean curvature of the least-squares quadric of the surface, 1/mm; positive if convex."""
         x, y = self.point_mm[:, 0], self.point_mm[:, 1]
         z = self.surface.height(x, y)
-        known = np.isfinite(z)  # a ray may meet the surface beyond its splines
+        known = np.isfinite(z)  # a ray may meet the surface outside the splines' domain
         terms = _monomials(x - x.mean(), y - y.mean())[known]
         fitted = np.linalg.lstsq(terms, z[known], rcond=None)[0]
         return float(-fitted[3] - fitted[5])
@@ -155,7 +156,7 @@ class LineSurface(ReadOnlyArrays):
 
 @dataclass(frozen=True)
 class _Hypothesis:
-    """A numbering, and the quadric that suits it best."""
+    """A numbering and its best-fitting quadric."""
 
     numbers: FloatArray
     model: LineModel
@@ -176,7 +177,7 @@ def fit_lines(
     data
         Points and ends of the lines, on the imaging plane.
     numberings
-        Numbers that the lines, from the lowest up, may have, each shape (k,).
+        Possible numbers of the lines, from the lowest up, each shape (k,).
     rig
         The bench.
     settings
@@ -214,7 +215,7 @@ def _status(one: LineSurface, margin: float, settings: LineFitSettings) -> str:
 
 
 def _differ(one: LineSurface, other: LineSurface) -> bool:
-    """Whether two surfaces are two answers rather than the same one twice."""
+    """Whether two surfaces are different solutions."""
     apart = abs(one.height_mm - other.height_mm)
     return apart > 0.05 * abs(other.height_mm) + 2 * other.height_sigma_mm
 
@@ -227,7 +228,7 @@ def _monomials(x: FloatArray, y: FloatArray) -> FloatArray:
 
 
 def _quadric_basis(basis: SplineBasis) -> FloatArray:
-    """Coefficients of 1, x, y, x², xy, y² in the splines, shape (p, 6): they are in it exactly."""
+    """Spline coefficients of 1, x, y, x², xy, y², shape (p, 6); the representation is exact."""
     x, y = (
         np.linspace(low, high, 12) for low, high in zip(basis.low_mm, basis.high_mm, strict=True)
     )
@@ -242,7 +243,7 @@ def _quadric_basis(basis: SplineBasis) -> FloatArray:
 def _best_quadric(
     data: LineData, numbers: FloatArray, rig: LineRig, settings: LineFitSettings
 ) -> _Hypothesis:
-    """For a numbering, the quadric that suits the lines best."""
+    """Fit the best quadric to the lines for a numbering."""
     half = rig.pattern.half_fan
     corner = line_directions(
         rig.laser,
@@ -260,7 +261,7 @@ def _best_quadric(
         end_sigma_mm=np.hypot(data.end_sigma_mm, 0.3),
     )
     y = ground[:, 1].mean()
-    # Numbers that grow upwards in the picture are those of a flat or convex pool.
+    # Numbers increase upwards in the picture for a flat or convex pool.
     sign = 1.0 if model.numbers[-1] > model.numbers[0] else -1.0
     starts = []
     for radius in RADII_MM:
@@ -283,7 +284,7 @@ def _cost(model: LineModel, coefficients: FloatArray, data: LineData) -> float:
 
 
 def _robust(residual: FloatArray) -> FloatArray:
-    """Huber's cost of residuals: quadratic to 3, linear beyond."""
+    """Huber loss of residuals: quadratic up to 3, linear beyond."""
     size = np.abs(residual)
     return np.asarray(np.where(size < 3.0, size**2, 6.0 * size - 9.0))
 
@@ -295,7 +296,7 @@ def _weights(residual: FloatArray) -> FloatArray:
 def _fit_quadric(
     model: LineModel, into: FloatArray, start: FloatArray, data: LineData
 ) -> tuple[FloatArray, float]:
-    """Levenberg's and Marquardt's steps over the six coefficients of a quadric."""
+    """Fit the six coefficients of a quadric by the Levenberg–Marquardt method."""
     scale = np.array([0.3, 0.1, 0.1, 0.05, 0.05, 0.05])
     quadric, damping = start, 1e-2
     linear = model.residuals(into @ quadric, data)
@@ -303,7 +304,7 @@ def _fit_quadric(
     for _ in range(QUADRIC_ROUNDS):
         weights = _weights(linear.residual)
         jacobian = linear.jacobian @ into * scale
-        normal = (jacobian * weights[:, None]).T @ jacobian + np.eye(6)  # a prior of its scale
+        normal = (jacobian * weights[:, None]).T @ jacobian + np.eye(6)  # prior with σ = scale
         right = jacobian.T @ (weights * linear.residual) - quadric / scale
         step = np.linalg.solve(normal + damping * np.diag(np.diag(normal)), right)
         tried = quadric + scale * np.clip(step, -2.0, 2.0)
@@ -336,7 +337,7 @@ def _dense(band: FloatArray) -> FloatArray:
 def _refined(
     start: _Hypothesis, data: LineData, settings: LineFitSettings
 ) -> tuple[LineSurface, float]:
-    """The smooth surface nearest to a quadric that suits the lines, and its cost."""
+    """Refine a quadric as a smooth spline surface; return it and its cost."""
     points = start.model.residuals(start.coefficients, data).point_mm[:, :2]
     low, high = points.min(axis=0) - MARGIN_MM, points.max(axis=0) + MARGIN_MM
     basis = SplineBasis.over(low, high, settings.knot_mm)
@@ -366,7 +367,7 @@ def _refined(
 
 
 def _cauchy(residual: FloatArray) -> FloatArray:
-    """Cauchy's cost of residuals: one that is far off, as of an end in a gap, costs little."""
+    """Cauchy loss of residuals: outliers, such as an end in a gap, have little influence."""
     return np.asarray(AGREES**2 * np.log1p((residual / AGREES) ** 2))
 
 
@@ -377,7 +378,7 @@ def _fit_splines(
     stiffness: FloatArray,
     settings: LineFitSettings,
 ) -> tuple[FloatArray, FloatArray, float, Linearized]:
-    """Coefficients, their covariance, the cost, and the equations there."""
+    """Return the coefficients, their covariance, the cost and the linearised equations."""
     c, damping = first, 1e-3
     linear = model.residuals(c, data)
     cost = float(np.sum(_cauchy(linear.residual)) + c @ stiffness @ c)

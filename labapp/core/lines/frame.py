@@ -1,4 +1,4 @@
-"""One frame of a line pattern: lines, what they show, and the surface where they determine it."""
+"""Measurement of one frame of a line pattern: lines, their features and the fitted surface."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ FOLLOWED = {
     "pulse": "a pulse of the current outshines the line",
     "line-lost": "the line is not where it is expected",
 }
-"""Why there is no line of a pattern of one in a frame."""
+"""Reasons why the line of a one-line pattern was not measured in a frame."""
 
 UNNUMBERED = "the lines, or the numbers given by hand, are not those of neighbours in the pattern"
 
 
 @dataclass(frozen=True)
 class LineMeasureSettings:
-    """How lines are found, and how the surface under them is fitted."""
+    """Settings for the detection of lines and the fit of the surface."""
 
     lines: LineSettings = field(default_factory=LineSettings)
     fit: LineFitSettings = field(default_factory=LineFitSettings)
@@ -39,26 +39,26 @@ class LineMeasureSettings:
 
 @dataclass(frozen=True)
 class LineFeatures:
-    """What a frame's lines show, on the imaging plane.
+    """Features of a frame's lines on the imaging plane.
 
     Parameters
     ----------
     count
-        How many of the pattern's lines are seen: the pool's size in steps of the lines' distance
+        Number of the pattern's lines that are visible: the pool's size in units of the line spacing
         (Fig. 3-14: from five to four as the pool shrinks).
     length_mm
-        Of all lines together.
+        Total length of all lines.
     width_mm, height_mm
         Extent of the lines along X′ and Z′.
     area_mm2
-        Between the lowest and the highest line.
+        Area between the lowest and the highest line.
     spacing_mm
         Mean distance of neighbouring lines at their middles.
     curvature_per_mm
-        Median of the lines' curvature at their middles, positive where they are arched upwards.
+        Median of the lines' curvature at their middles, positive if they are arched upwards.
     asymmetry
-        Of the lines about their highest points: (right − left)/(right + left) of their extents
-        along X′, the mean of all.
+        Mean asymmetry of the lines about their highest points: (right − left)/(right + left) of
+        their extents along X′.
     """
 
     count: int
@@ -73,25 +73,25 @@ class LineFeatures:
 
 @dataclass(frozen=True)
 class LineFrame:
-    """What a frame of a line pattern gave.
+    """Results of a frame of a line pattern.
 
     Parameters
     ----------
     status
-        ``ok``; ``profile`` where the lines leave a direction of the surface open; ``no-lines``,
-        ``folded-lines``, ``too-few-lines``, ``line-numbers``, ``no-surface``. Of one line that is
-        followed: ``followed``, ``pulse``, ``line-lost``.
+        ``ok``; ``profile`` if the lines do not fully determine the surface; ``no-lines``,
+        ``folded-lines``, ``too-few-lines``, ``line-numbers``, ``no-surface``. For a tracked single
+        line: ``followed``, ``pulse``, ``line-lost``.
     reason
-        One sentence where there is no surface; empty otherwise.
+        One sentence if there is no surface; empty otherwise.
     seen, features
-        The lines, and what they show.
+        The lines and their features.
     surface
-        The surface nearest to them; a measurement only where the status is ``ok``.
+        The fitted surface; a measurement only if the status is ``ok``.
     track, pulse
-        Of a pattern of one line: where it was followed to, None where it was not; the probability
-        that a pulse of the current is on, NaN in other patterns.
+        For a pattern of one line: the tracked line, or None; and the probability that a current
+        pulse is on, NaN for other patterns.
     edges
-        Points of the pool's edge, where the solid metal reflects the lines beside it; or None.
+        Points of the pool's edge from lines reflected by the solid metal beside it; or None.
     """
 
     status: str
@@ -105,7 +105,7 @@ class LineFrame:
 
     @classmethod
     def of_track(cls, track: TrackedLine | None, on: bool, pulse: float) -> LineFrame:
-        """A frame of one line that is followed; ``on``: a pulse outshines it."""
+        """Result of a frame with a tracked single line; ``on``: a pulse outshines it."""
         status = "pulse" if on else "line-lost" if track is None else "followed"
         reason = FOLLOWED.get(status, "")
         nothing = LinesSeen((), False, False, 0)
@@ -120,7 +120,10 @@ def measure_lines(
     settings: LineMeasureSettings,
     correction: LineCorrection | None = None,
 ) -> LineFrame:
-    """Measure one grey frame, shape (height, width), of a line pattern, as it was corrected."""
+    """Measure one grey frame, shape (height, width), of a line pattern.
+
+    A ``correction`` replaces the detected lines.
+    """
     count = rig.pattern.count
     edges = pool_edges(image, rig, calibration)
     if correction is None:
@@ -138,7 +141,7 @@ def _measured(
     calibration: ImageCalibration,
     settings: LineMeasureSettings,
 ) -> LineFrame:
-    """What lines show, and the surface under them."""
+    """Determine the features of the lines and fit the surface."""
     count, seen = rig.pattern.count, correction.seen
     features = line_features(seen.lines, calibration)
     if not seen.lines:
@@ -159,7 +162,7 @@ def _measured(
 
 
 def _numberings(seen: LinesSeen, by_hand: IntArray, count: int) -> list[FloatArray]:
-    """Numbers that the lines may have, from the lowest up, growing either way."""
+    """Possible numbers of the lines, from the lowest up, in increasing or decreasing order."""
     if by_hand.all():
         return [by_hand.astype(float)]
     given = by_hand > 0
@@ -180,7 +183,7 @@ def _numberings(seen: LinesSeen, by_hand: IntArray, count: int) -> list[FloatArr
 
 
 def line_features(lines: tuple[LightLine, ...], calibration: ImageCalibration) -> LineFeatures:
-    """What lines, from the lowest up, show on the imaging plane."""
+    """Return the features of lines, from the lowest up, on the imaging plane."""
     if not lines:
         return LineFeatures(0)
     places = [calibration.to_plane(one.image_px) for one in lines]
@@ -203,7 +206,7 @@ def line_features(lines: tuple[LightLine, ...], calibration: ImageCalibration) -
 
 
 def _area_between(low: FloatArray, high: FloatArray) -> float:
-    """Area of the polygon along one line and back along the other, mm²."""
+    """Area of the polygon between two lines, mm²."""
     x, z = np.concatenate([low, high[::-1]]).T
     return float(abs(np.sum(x * np.roll(z, -1) - z * np.roll(x, -1))) / 2)
 

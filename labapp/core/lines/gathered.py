@@ -1,8 +1,8 @@
-"""Lines that the pool gathers to points, one above the other (a caustic).
+"""Detection of lines that the pool gathers to spots, one above the other (a caustic).
 
-A hollow of about the focal length's depth reflects each line to a spot of a few pixels. Ridges lead
-from spot to spot, as the column that they make is longer than a spot is wide: the spots are found
-as peaks of the light down that column.
+A hollow of about the focal length's depth reflects each line to a spot of a few pixels. Ridges then
+run from spot to spot, as the column of spots is longer than a spot is wide. The spots are detected
+as peaks of the light along that column.
 """
 
 from __future__ import annotations
@@ -15,21 +15,21 @@ from labapp.core.lines.ridges import sampled
 from labapp.core.values import FloatArray
 
 REACH_WIDTHS = 3.0
-"""Light is added up so many widths of a line to either side of the column, and looked for so far
-beyond its ends; twice as far where the spots are, fringes lie."""
+"""Half width, in line widths, over which light is summed across the column. The search extends
+beyond the column's ends by four times as much."""
 
 SHARPENED = 0.7
-"""Peaks are those of the second derivative at this share of a line's width: it tells spots apart
-that the sum of their light does not."""
+"""Peaks are detected in the second derivative at this share of a line's width, which separates
+spots that merge in the light itself."""
 
 LEAST_PEAK, LEAST_NOISE = 0.05, 5.0
-"""A spot has at least this share of the brightest one's peak, and so many times the noise."""
+"""Least peak of a spot, as a share of the brightest one's and as a multiple of the noise."""
 
 
 def gathered_spots(
     picture: Grey, column_px: FloatArray, width_px: float
 ) -> list[tuple[FloatArray, float]]:
-    """Spots of a column: (u, v), px, and the light of each, grey levels·px².
+    """Return the spots of a column: (u, v), px, and the light of each, grey levels·px².
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ def gathered_spots(
         max(v.min() - 4 * reach, 0.0), min(v.max() + 4 * reach, picture.shape[0] - 1.0), 0.5
     )
     sharp, light = _down(picture, foot + lean * down, down, width_px)
-    # Most of the column is light: the noise is that of two strips beside it.
+    # The column itself is mostly bright: estimate the noise from two strips beside it.
     dark = [
         _down(picture, foot + lean * down + side * reach, down, width_px)[0] for side in (-3.0, 3.0)
     ]
@@ -68,7 +68,7 @@ def gathered_spots(
 def _down(
     picture: Grey, u: FloatArray, v: FloatArray, width_px: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Light across a column at places each half pixel down it, sharpened and as it is."""
+    """Light summed across a column at every half pixel along it: sharpened, and unfiltered."""
     beside = np.arange(-REACH_WIDTHS * width_px, REACH_WIDTHS * width_px + 0.5)
     at = np.stack(np.broadcast_arrays(u[:, None] + beside, v[:, None]), axis=-1)
     light = sampled(picture, at.reshape(-1, 2)).reshape(len(v), -1).sum(axis=1).astype(float)

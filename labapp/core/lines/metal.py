@@ -1,9 +1,9 @@
-"""Edges of the pool from the solid metal beside it (§3.2.1, Fig. 3-10 b).
+"""Pool edges from lines reflected by the solid metal beside the pool (§3.2.1, Fig. 3-10 b).
 
-Stainless steel reflects the lines beside the pool, too: as a flat mirror at z = 0, so that where
-each ray of each line lands is known. The straight lines overlap on the imaging plane; their
-brightness along the fan is solved for together. Where a line's light ends, from outside inwards,
-its ray meets the boundary: a point (x, y) of the pool's edge.
+Solid stainless steel reflects the lines as a flat mirror at z = 0, so the landing point of each ray
+is known. The straight lines overlap on the imaging plane; their brightness along the fan is
+determined jointly. Where a line's light ends, from outside inwards, its ray meets the boundary:
+this gives a point (x, y) of the pool's edge.
 """
 
 from __future__ import annotations
@@ -22,52 +22,53 @@ from labapp.core.lines.ridges import sampled
 from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
 
 FAN_STEPS = 241
-"""Places along the fan at which the lines' light is solved for."""
+"""Number of positions along the fan at which the lines' light is determined."""
 
 OUTER_STEPS = 12
-"""A line on the metal is lit within so many steps of the end of its fan; at these steps, the width
-of the lines is chosen."""
+"""A line on the metal must be lit within this many steps of the end of its fan; the width of the
+lines is determined at these steps."""
 
 WIDTHS_PX = (0.8, 1.2, 1.6, 2.0, 2.5, 3.0)
-"""Standard deviations of a line's light across it that are tried; the one that fits is taken."""
+"""Trial standard deviations of a line's light across it; the best-fitting one is used."""
 
 BESIDE_PX = 6.0
-"""How far beyond the outermost straight lines light is read."""
+"""Distance beyond the outermost straight lines over which light is read."""
 
 SMOOTHED_STEPS = 1.5
 """Standard deviation of the smoothing along the fan, steps."""
 
 LEAST_LIGHT = 5.0
-"""Light of a line on the metal, over its noise."""
+"""Least ratio of the light of a line on the metal to its noise."""
 
 FRINGES = 2
-"""Diffraction fringes to either side of the pattern (Fig. 3-9) that have light of their own."""
+"""Number of diffraction fringes fitted on either side of the pattern (Fig. 3-9)."""
 
 METAL_WIDTHS, METAL_SHARE = 2.5, 0.7
-"""A line of which so much is within so many widths of the straight lines is one of these."""
+"""A line is reflected by the metal if at least this share of it is within this many widths of the
+straight lines."""
 
 LEAST_LINES = 4
-"""Fewer cannot show that they end on a smooth boundary: a parabola passes through three ends."""
+"""Least number of lines to test for a smooth boundary: a parabola passes through any three ends."""
 
 MOST_OFF_MM, FLOOR_MM = 0.15, 0.1
-"""The ends on one side are on a smooth boundary to so many mm RMS: lines of the pool that cross the
-straight ones end elsewhere. And what an end is not better known than, mm: blur spreads it."""
+"""Largest RMS distance of the ends on one side from a smooth boundary, mm (lines of the pool that
+cross the straight ones end elsewhere); and the least uncertainty of an end, mm, due to blur."""
 
 
 @dataclass(frozen=True)
 class PoolEdges(ReadOnlyArrays):
-    """Where lines on the solid metal end at the pool: n points of its edge.
+    """Ends of lines on the solid metal at the pool: n points of its edge.
 
     Parameters
     ----------
     line
         Number of the line in the pattern, shape (n,).
     side
-        −1: the end towards −X; 1: the other, shape (n,).
+        −1: the edge towards −X; 1: the other, shape (n,).
     point_mm
         (x, y) on the work piece, shape (n, 2), mm.
     sigma_mm
-        Standard uncertainty along the line, by the noise of its light, shape (n,), mm.
+        Standard uncertainty along the line, from the noise of its light, shape (n,), mm.
     width_px
         Standard deviation of a straight line's light across it, px.
     """
@@ -80,9 +81,9 @@ class PoolEdges(ReadOnlyArrays):
 
 
 def pool_edges(image: Image, rig: LineRig, calibration: ImageCalibration) -> PoolEdges | None:
-    """Edges of the pool in a frame, shape (height, width); None where the metal reflects no lines.
+    """Find the pool's edges in a frame, shape (height, width); None if the metal reflects no lines.
 
-    None, too, for a pattern of fewer than `LEAST_LINES`.
+    Also None for a pattern of fewer than `LEAST_LINES`.
 
     Parameters
     ----------
@@ -131,7 +132,7 @@ def pool_edges(image: Image, rig: LineRig, calibration: ImageCalibration) -> Poo
 def without_metal(
     lines: tuple[LightLine, ...], edges: PoolEdges, rig: LineRig, calibration: ImageCalibration
 ) -> tuple[LightLine, ...]:
-    """Lines but for those that are light of the metal: most of each is where that lands."""
+    """Remove lines that were reflected by the metal: most of each lies on a straight line."""
     half = rig.pattern.half_fan
     number = np.arange(1.0, rig.pattern.count + 1)
     path = _straight_lines(rig, calibration, number, np.linspace(-half, half, FAN_STEPS))[1]
@@ -148,7 +149,7 @@ def _away(place: FloatArray, others: FloatArray) -> FloatArray:
 
 
 def _bends(place_mm: FloatArray) -> float:
-    """RMS distance along X of points (x, y) from a parabola through them, mm."""
+    """RMS distance along X of points (x, y) from a fitted parabola, mm."""
     x, y = place_mm.T
     return float(np.std(x - np.polyval(np.polyfit(y, x, 2), y)) * np.sqrt(len(x) / (len(x) - 3)))
 
@@ -156,7 +157,7 @@ def _bends(place_mm: FloatArray) -> float:
 def _straight_lines(
     rig: LineRig, calibration: ImageCalibration, number: FloatArray, fan: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Where rays meet the work piece, shape (k, f, 3), mm, and their light, shape (k, f, 2), px."""
+    """Points of rays on the work piece, shape (k, f, 3), mm, and in the image, (k, f, 2), px."""
     direction = line_directions(rig.laser, rig.pattern, number[:, None], fan)
     point = intersect_level(rig.laser.position_mm, direction)
     away = reflect(direction, np.array([0.0, 0.0, 1.0]))
@@ -166,8 +167,8 @@ def _straight_lines(
 def _light_along(picture: Grey, path: FloatArray) -> tuple[FloatArray, float, float]:
     """Light of each line along the fan, shape (k, f), its noise, and the lines' width, px.
 
-    At each step of the fan, the light across all lines is the sum of their profiles and of a
-    straight background.
+    At each step of the fan, the light across all lines is modelled as the sum of their profiles and
+    a linear background.
     """
     count, steps, _ = path.shape
     middle = path.mean(axis=0)
@@ -190,24 +191,24 @@ def _light_along(picture: Grey, path: FloatArray) -> tuple[FloatArray, float, fl
 def _fitted(
     seen: FloatArray, side: FloatArray, place: FloatArray, width: float
 ) -> tuple[FloatArray, float, float]:
-    """Least-squares fit of profiles on a straight background at each step of the fan.
+    """Least-squares fit of profiles on a linear background at each step of the fan.
 
     Parameters
     ----------
     seen
         Grey levels across the lines, shape (f, s).
     side
-        Where they are, shape (s,), px.
+        Positions of the grey levels, shape (s,), px.
     place
-        Where the lines are, shape (f, k), px.
+        Positions of the lines, shape (f, k), px.
     width
         Standard deviation of the profiles, px.
 
     Returns
     -------
     light, misfit, gain
-        Amplitudes of the profiles, shape (f, k); the sum of all squared residuals; and the root
-        mean square of an amplitude's noise, per noise of a pixel.
+        Amplitudes of the profiles, shape (f, k); the sum of all squared residuals; and the RMS
+        noise of an amplitude relative to the noise of a pixel.
     """
     count = place.shape[1]
     bells = np.exp(-(((side[:, None] - place[:, None]) / width) ** 2) / 2)
@@ -222,9 +223,9 @@ def _fitted(
 
 
 def _end(light: FloatArray, noise: float) -> tuple[float, float, float] | None:
-    """Where a line's light ends, from its outer end inwards: the step, its level, its slope there.
+    """End of a line's light, from outside inwards: the step, its level and its slope there.
 
-    None where there is none, or where it does not end.
+    None if there is no light, or if it does not end.
     """
     top = np.maximum.accumulate(light)
     ends = np.flatnonzero((top > LEAST_LIGHT * noise) & (light < top / 2))

@@ -1,7 +1,8 @@
-"""Where a spline surface reflects the lines of a pattern to, and how that depends on the surface.
+"""Reflection of a line pattern by a spline surface, and its derivatives w.r.t. the surface.
 
-The plane of rays that made a point of a reflected line is known, its place along the fan is not:
-`LineModel.residuals` compares the point with the nearest of the predicted curve, one equation each.
+For a point of a reflected line the plane of rays is known, but not the position along the fan:
+`LineModel.residuals` compares the point with the nearest point of the predicted curve, which gives
+one equation.
 """
 
 from __future__ import annotations
@@ -17,28 +18,28 @@ from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 
 NEWTON_STEPS = 4
 STEP_MM, FAN_STEP = 1e-5, 1e-5
-"""Of the differences that derivatives are taken from, mm and rad."""
+"""Steps of the numerical derivatives, mm and rad."""
 
 END_HEIGHT_MM = 0.004
-"""How well the boundary is at z = 0, mm."""
+"""Standard uncertainty of the height of the boundary, z = 0, mm."""
 
 
 @dataclass(frozen=True)
 class LineData(ReadOnlyArrays):
-    """What the lines of a frame say: n points of k lines, and their m ends.
+    """Measured lines of a frame: n points of k lines, and their m ends.
 
     Parameters
     ----------
     line
-        Which of the k lines, from the lowest in the picture up, each point is on, shape (n,).
+        Index of each point's line, from the lowest in the picture up, shape (n,).
     plane_mm, normal
-        Places on the imaging plane (IPCS), and unit vectors across the line there, shape (n, 2).
+        Positions on the imaging plane (IPCS), and unit vectors across the line, shape (n, 2).
     sigma_mm
         Standard uncertainty across the line, shape (n,), mm.
     end_line
-        Which line each end is of, shape (m,).
+        Index of each end's line, shape (m,).
     end_mm
-        Places of the ends, shape (m, 2).
+        Positions of the ends, shape (m, 2), mm.
     end_sigma_mm
         Standard uncertainty along the line, shape (m,), mm.
     """
@@ -61,9 +62,9 @@ class Curves(ReadOnlyArrays):
     fan
         Angles in the fan, shape (f,), rad.
     point_mm
-        Where the rays meet the surface, shape (k, f, 3), mm.
+        Intersections of the rays with the surface, shape (k, f, 3), mm.
     plane_mm
-        Where they land on the imaging plane, shape (k, f, 2), mm; NaN where they do not.
+        Their landing points on the imaging plane, shape (k, f, 2), mm; NaN if there is none.
     """
 
     fan: FloatArray
@@ -73,18 +74,18 @@ class Curves(ReadOnlyArrays):
 
 @dataclass(frozen=True)
 class Linearized(ReadOnlyArrays):
-    """Equations of the fit at a surface: residuals over their σ, and their Jacobian.
+    """Linearised equations of the fit at a surface: standardised residuals and their Jacobian.
 
     Parameters
     ----------
     residual
         Observed minus predicted, over the standard uncertainty, shape (n + m,).
     jacobian
-        Derivatives of the prediction by the coefficients, over the same, shape (n + m, p), mm⁻¹.
+        Derivatives of the prediction w.r.t. the coefficients, over the same, (n + m, p), mm⁻¹.
     point_mm
-        Where the ray nearest to each point and end meets the surface, shape (n + m, 3), mm.
+        Intersection of the surface with the ray nearest to each point and end, (n + m, 3), mm.
     fan
-        Its angle in the fan, rad, shape (n + m,).
+        Angle of that ray in the fan, shape (n + m,), rad.
     """
 
     residual: FloatArray
@@ -95,7 +96,7 @@ class Linearized(ReadOnlyArrays):
 
 @dataclass(frozen=True)
 class LineModel:
-    """Predicts the lines ``numbers``, those of `LineData` from the lowest up.
+    """Model that predicts the lines ``numbers``, in the order of `LineData`.
 
     Parameters
     ----------
@@ -106,7 +107,7 @@ class LineModel:
     numbers
         Number of each of k lines, from 1, shape (k,).
     rays
-        How many rays of each line are followed.
+        Number of rays traced for each line.
     """
 
     rig: LineRig
@@ -115,7 +116,7 @@ class LineModel:
     rays: int = 121
 
     def curves(self, coefficients: FloatArray) -> Curves:
-        """Curves that a surface reflects the lines to."""
+        """Predict the reflected curves of all lines."""
         half = self.rig.pattern.half_fan
         fan = np.linspace(-half, half, self.rays)
         number = np.repeat(self.numbers, self.rays)
@@ -125,7 +126,7 @@ class LineModel:
         return Curves(fan, point.reshape(*form, 3), plane.reshape(*form, 2))
 
     def residuals(self, coefficients: FloatArray, data: LineData) -> Linearized:
-        """Equations of points (across their line) and ends (z = 0 there, or the fan's end)."""
+        """Return the equations of points (across the line) and ends (z = 0, or end of the fan)."""
         curves = self.curves(coefficients)
         line = np.concatenate([data.line, data.end_line])
         place = np.concatenate([data.plane_mm, data.end_mm])
@@ -134,7 +135,7 @@ class LineModel:
         rate, _ = self._rates(coefficients, number, fan)
         point, direction, slope = self._meet(coefficients, number, fan)
         plane = self._land(point, direction, slope)
-        # The polyline's nearest place to the curve's: one step of Newton's.
+        # One Newton step from the nearest point of the polyline to that of the curve.
         ahead = np.vecdot(rate, place - plane) / np.maximum(np.vecdot(rate, rate), 1e-6)
         step = curves.fan[1] - curves.fan[0]
         fan = np.clip(fan + np.clip(ahead, -step, step), curves.fan[0], curves.fan[-1])
@@ -149,14 +150,14 @@ class LineModel:
         change += by_slope[:, :, :1] * slope_x[:, None] + by_slope[:, :, 1:] * slope_y[:, None]
         count = len(data.line)
         off = place - plane
-        # Across the predicted curve: along it, the place is open and moves with the surface.
+        # Compare across the predicted curve only: the position along it is undetermined.
         across = np.stack([-rate[:count, 1], rate[:count, 0]], axis=-1)
         across *= np.sign(np.vecdot(across, data.normal))[:, None]
         across /= np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-9)
         residual, local = np.empty(len(line)), np.empty(value.shape)
         residual[:count] = np.vecdot(across, off[:count]) / data.sigma_mm
         local[:count] = (across[:, :, None] * change[:count]).sum(axis=1) / data.sigma_mm[:, None]
-        # A higher surface meets the ray earlier: the meeting point rises by less, or more.
+        # A higher surface meets the ray earlier, which changes the rise of the intersection.
         descent = np.minimum(direction[:, 2] - np.vecdot(slope, direction[:, :2]), -0.05)
         rises = (direction[:, 2] / descent)[:, None] * value
         ends = slice(count, None)
@@ -171,7 +172,7 @@ class LineModel:
     def _rates(
         self, coefficients: FloatArray, number: FloatArray, fan: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Change of the place on the plane, (n, 2), and of z, (n,), along the fan, mm/rad."""
+        """Derivatives of plane position, (n, 2), and z, (n,), w.r.t. the fan angle, mm/rad."""
         before, after = (
             self._meet(coefficients, number, fan + sign * FAN_STEP) for sign in (-1.0, 1.0)
         )
@@ -181,7 +182,7 @@ class LineModel:
     def _meet(
         self, coefficients: FloatArray, number: FloatArray, fan: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Where rays meet the surface, (n, 3), their directions, and its slopes there, (n, 2)."""
+        """Intersections of rays with the surface, (n, 3), directions, and slopes there, (n, 2)."""
         laser = self.rig.laser
         direction = line_directions(laser, self.rig.pattern, number, fan)
         source = laser.position_mm
@@ -198,7 +199,7 @@ class LineModel:
     def surface_at(
         self, coefficients: FloatArray, point_mm: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Height, shape (n,), and slopes, shape (n, 2); the outermost cells go on outside."""
+        """Height, shape (n,), and slopes, shape (n, 2); the outermost cells are extrapolated."""
         cells = self.basis.cells(point_mm[:, 0], point_mm[:, 1])
         every = np.vecdot(cells.value_and_slopes(), coefficients[cells.splines])
         return every[0], every[1:].T
@@ -210,7 +211,7 @@ class LineModel:
     def _derivatives(
         self, coefficients: FloatArray, point: FloatArray, direction: FloatArray, slope: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """∂(X′, Z′) by the surface's height, shape (n, 2), and by its slopes, (n, 2, 2)."""
+        """∂(X′, Z′) w.r.t. the surface's height, shape (n, 2), and its slopes, (n, 2, 2)."""
         here = self._land(point, direction, slope)
         by_slope = np.stack(
             [
@@ -219,7 +220,7 @@ class LineModel:
             ],
             axis=-1,
         )
-        # A higher surface meets the ray earlier, where its slopes are others.
+        # A higher surface meets the ray earlier, where the slopes differ.
         descent = direction[:, 2] - np.vecdot(slope, direction[:, :2])
         earlier = point + (STEP_MM / np.minimum(descent, -0.05))[:, None] * direction
         slope_there = self.surface_at(coefficients, earlier)[1]
@@ -237,10 +238,10 @@ def _end_equations(
     rises: FloatArray,
     change: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """An end of the light is the boundary, z = 0, unless the fan itself ends there."""
+    """Equations of the ends: z = 0 on the boundary, unless the fan itself ends there."""
     length = np.maximum(np.linalg.norm(rate, axis=-1), 1.0)
     along = rate / length[:, None]
-    by_place = rise / length  # change of z at the end for a change of its place along the line
+    by_place = rise / length  # dz per displacement of the end along the line
     sigma = np.hypot(by_place * data.end_sigma_mm, END_HEIGHT_MM)
     moved = (along[:, :, None] * change).sum(axis=1)
     residual, local = -height / sigma, (rises - by_place[:, None] * moved) / sigma[:, None]
@@ -251,7 +252,7 @@ def _end_equations(
 
 
 def nearest_on_curves(curves: Curves, line: IntArray, place_mm: FloatArray) -> FloatArray:
-    """Angle in the fan, rad, of the point of a line's curve nearest to each place, shape (n,)."""
+    """Angle in the fan, rad, of the curve's point nearest to each position, shape (n,)."""
     curve = np.nan_to_num(curves.plane_mm, nan=1e6)
     start, step = curve[:, :-1], np.diff(curve, axis=1)
     length2 = np.maximum(np.vecdot(step, step), 1e-12)

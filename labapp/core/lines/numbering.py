@@ -1,8 +1,8 @@
-"""Which of a frame's lines the pattern made, from the lowest up; the others are fringes (Fig. 3-9).
+"""Selection of the pattern's lines in a frame, excluding diffraction fringes (Fig. 3-9).
 
-All light of a line over its length changes little from line to line, however the pool spreads them:
-a diffraction fringe has a fraction of it. What is seen of the pattern is a run of neighbours, as a
-pool that shrinks loses outer lines first (Fig. 3-14).
+The total light of a line varies little from line to line, however the pool spreads it. A
+diffraction fringe has a fraction of it. The visible lines are consecutive, as a shrinking pool
+loses the outer lines first (Fig. 3-14).
 """
 
 from __future__ import annotations
@@ -17,20 +17,20 @@ from labapp.core.lines.find_lines import LightLine
 from labapp.core.values import FloatArray
 
 FRINGE_LIGHT, FRINGE_TOTAL = 0.45, 0.4
-"""A fringe is fainter than this share of its neighbour further in: per length, and in all."""
+"""A fringe is fainter than this share of its inner neighbour: per length, and in total."""
 
 FAINTEST_TOTAL = 0.02
-"""What has less light in all than this share of the brightest line is no line."""
+"""A line with less than this share of the brightest line's total light is ignored."""
 
 LEG_PX, PART_WIDTHS = 30.0, 2.5
-"""Longest leg of a line that is nearly folded, px; longer ones are upright. Short parts that are
-nearer than so many of their widths are of one such line."""
+"""Longest leg of a nearly folded line, px; longer legs are upright. Short parts within this many
+widths of each other belong to one such line."""
 
 LEAST_TOTAL = 0.06
-"""What has less light in all than this share of its neighbour further in is not of the pattern."""
+"""A line of the pattern has at least this share of its inner neighbour's total light."""
 
 NEAREST, FARTHEST = 0.3, 2.5
-"""A fringe is so many times as far from the line beside it as that from the next one."""
+"""Range of a fringe's distance from the adjacent line, in units of the line spacing."""
 
 
 @dataclass(frozen=True)
@@ -40,12 +40,12 @@ class LinesSeen:
     Parameters
     ----------
     lines
-        From the lowest in the picture up.
+        The lines, from the lowest in the picture up.
     fringe_below, fringe_above
-        Whether a diffraction fringe is seen beside the lowest, the highest: there, no line of the
-        pattern is missing.
+        Whether a diffraction fringe is seen beside the lowest or the highest line: no line of the
+        pattern is missing on that side.
     left_out
-        How many bright lines are not the pattern's: fringes, scratches, reflections.
+        Number of bright lines that do not belong to the pattern: fringes, scratches, reflections.
     """
 
     lines: tuple[LightLine, ...]
@@ -54,10 +54,10 @@ class LinesSeen:
     left_out: int
 
     def first_numbers(self, count: int, same_order: bool) -> range:
-        """Numbers that the lowest line can have, of a pattern of ``count`` lines.
+        """Possible numbers of the lowest line in a pattern of ``count`` lines.
 
-        With ``same_order`` numbers grow upwards, as a flat or convex pool reflects them, and
-        otherwise downwards; the fringes settle them where they are seen.
+        With ``same_order`` numbers increase upwards, as for a flat or convex pool, otherwise
+        downwards. A visible fringe determines the number.
         """
         missing = count - len(self.lines)
         low = 0 if self.fringe_below or not self.fringe_above else missing
@@ -68,7 +68,7 @@ class LinesSeen:
 
 
 def number_lines(lines: tuple[LightLine, ...], count: int) -> LinesSeen:
-    """Take the pattern's lines, ``count`` at most, out of all that a frame shows."""
+    """Select the pattern's lines, at most ``count``, from all lines of a frame."""
     if not lines:
         return LinesSeen((), False, False, 0)
     total = np.array([one.light * one.length_px for one in lines])
@@ -96,7 +96,7 @@ def number_lines(lines: tuple[LightLine, ...], count: int) -> LinesSeen:
 
 
 def _are_legs(one: LightLine, other: LightLine) -> bool:
-    """Whether two lines are parts of one that is nearly folded: its legs, or what is at its top."""
+    """Whether two lines are parts of one nearly folded line: its legs, or a leg and its top."""
     if not all(each.length_px < LEG_PX or is_upright(each.image_px) for each in (one, other)):
         return False
     (low, high), (bottom, top) = (
@@ -109,7 +109,7 @@ def _are_legs(one: LightLine, other: LightLine) -> bool:
 
 
 def heights(lines: Sequence[LightLine]) -> FloatArray:
-    """−v of each line where it is nearest to the column that most of them cross, px."""
+    """−v of each line where it is nearest to the median column of the lines' ends, px."""
     middle = np.median([np.mean(one.ends_px[:, 0]) for one in lines])
     nearest = [int(np.argmin(np.abs(one.image_px[:, 0] - middle))) for one in lines]
     return np.array([-one.image_px[k, 1] for one, k in zip(lines, nearest, strict=True)])
@@ -120,7 +120,7 @@ def _from_below(lines: list[LightLine]) -> list[LightLine]:
 
 
 def _pattern_lines(light: FloatArray, total: FloatArray, brightest: int) -> list[int]:
-    """Which lines are as bright as the next of the pattern's nearer to the brightest one."""
+    """Indices of lines about as bright as their inner neighbour, outwards from the brightest."""
     real = [brightest]
     for way in (range(brightest - 1, -1, -1), range(brightest + 1, len(light))):
         inner = brightest
@@ -133,7 +133,7 @@ def _pattern_lines(light: FloatArray, total: FloatArray, brightest: int) -> list
 
 
 def _is_fringe(height: FloatArray, real: list[int], side: int) -> bool:
-    """Whether what is beside the outermost line has a fringe's distance from it."""
+    """Whether the neighbour of the outermost line is at a fringe's distance from it."""
     outer, inner = (real[0], real[1:2]) if side < 0 else (real[-1], real[-2:-1])
     beside = outer + side
     if not 0 <= beside < len(height):

@@ -1,8 +1,8 @@
-"""Frames in which a welding pulse is on, from the light alone (§3.3, Fig. 3-20).
+"""Detection of frames in which a welding pulse is on, from their brightness (§3.3, Fig. 3-20).
 
 "When pulse is on the image is dominated by the arc light and when it is off the fluctuated laser
-light reflected from molten weld pool surface is shown." A frame's brightness falls into two
-classes; as pulses repeat, the frame's place in their period is a prior.
+light reflected from molten weld pool surface is shown." The brightness of frames forms two
+classes. As pulses are periodic, the phase of a frame in the period is used as a prior.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from labapp.core.images.dots import Image
 from labapp.core.values import BoolArray, FloatArray, ReadOnlyArrays
 
 EVERY_PX = 4
-"""One pixel of so many along u and along v is enough for a frame's brightness."""
+"""Pixel step along u and v for a frame's brightness."""
 
 BINS = 25
-"""Parts of the period in which the share of frames with a pulse is counted."""
+"""Number of phase bins in which the share of frames with a pulse is counted."""
 
 LEAST_CONTRAST = 4.0
-"""Two classes of brightness are this many of their widths apart, or there are no pulses."""
+"""Least distance between the two classes of brightness, in their widths; otherwise no pulses."""
 
 
 @dataclass(frozen=True)
@@ -33,9 +33,9 @@ class Pulses(ReadOnlyArrays):
     on
         Whether the pulse is on, shape (n,).
     probability
-        That it is on, shape (n,).
+        Probability that the pulse is on, shape (n,).
     frequency_hz
-        Of the pulses; NaN where they do not repeat, or there are none.
+        Frequency of the pulses; NaN if they are not periodic, or there are none.
     """
 
     on: BoolArray
@@ -44,19 +44,19 @@ class Pulses(ReadOnlyArrays):
 
 
 def frame_brightness(frame: Image) -> float:
-    """Median of a frame's pixels, grey levels: spatter, lines and small glare do not move it."""
+    """Median grey level of a frame: insensitive to spatter, lines and small areas of glare."""
     return float(np.median(np.asarray(frame[::EVERY_PX, ::EVERY_PX], np.float32)))
 
 
 def classify_pulses(brightness: FloatArray, frame_rate_hz: float | None = None) -> Pulses:
-    """Sort frames by pulse on and off.
+    """Classify frames by whether the pulse is on.
 
     Parameters
     ----------
     brightness
-        Of each frame in order (`frame_brightness`), shape (n,).
+        Brightness of each frame in order (`frame_brightness`), shape (n,).
     frame_rate_hz
-        Frames a second; None: unknown, and the period is no prior.
+        Frame rate, Hz; None: unknown, so the period is not used as a prior.
     """
     light = np.log(np.maximum(np.asarray(brightness, float), 0.5))
     threshold, contrast = _two_classes(light)
@@ -72,7 +72,7 @@ def classify_pulses(brightness: FloatArray, frame_rate_hz: float | None = None) 
 
 
 def _two_classes(light: FloatArray) -> tuple[float, float]:
-    """Threshold between two classes of least spread (Otsu), and their distance in widths."""
+    """Otsu's threshold between two classes, and their distance in widths."""
     ordered = np.sort(light)
     count = np.arange(1, len(ordered))
     below, total = np.cumsum(ordered)[:-1], ordered.sum()
@@ -84,7 +84,7 @@ def _two_classes(light: FloatArray) -> tuple[float, float]:
     first, second = ordered[: cut + 1], ordered[cut + 1 :]
     width = max(_spread(first), _spread(second), 0.02)
     distance = float(np.median(second) - np.median(first))
-    # Half-way in light, not in its logarithm: a pulse over half of an exposure is half as bright.
+    # Midpoint of the light, not of its logarithm: a pulse over half an exposure is half as bright.
     levels = np.exp([np.median(first), np.median(second)])
     return float(np.log(levels.mean())), distance / width
 
@@ -94,7 +94,7 @@ def _spread(values: FloatArray) -> float:
 
 
 def _log_odds(light: FloatArray, on: BoolArray) -> FloatArray:
-    """Log odds of a pulse from brightness: Laplace's distributions about both medians."""
+    """Log odds of a pulse from the brightness relative to both medians."""
     level = np.exp(light)
     off_level, on_level = (float(np.median(level[part])) for part in (~on, on))
     step = on_level - off_level
@@ -102,14 +102,14 @@ def _log_odds(light: FloatArray, on: BoolArray) -> FloatArray:
 
 
 def pulse_frequency(on: BoolArray, frame_rate_hz: float) -> float:
-    """Frequency of the pulses, Hz; NaN where they do not repeat.
+    """Frequency of the pulses, Hz; NaN if they are not periodic.
 
     Parameters
     ----------
     on
         Whether the pulse is on in each frame, shape (n,).
     frame_rate_hz
-        Frames a second.
+        Frame rate, Hz.
     """
     count = len(on)
     if count < 16:
@@ -124,10 +124,10 @@ def pulse_frequency(on: BoolArray, frame_rate_hz: float) -> float:
 
 
 def _prior_odds(on: BoolArray, per_frame: float) -> FloatArray:
-    """Log odds of a pulse from the frame's place in the period."""
+    """Log odds of a pulse from the frame's phase in the period."""
     best, sharpest = np.zeros(len(on)), -1.0
     frames = np.arange(len(on))
-    # The period to so much that the phase is right at both ends.
+    # Refine the period so that the phase is correct at both ends of the recording.
     for rate in per_frame + np.linspace(-1, 1, 41) / (4 * len(on)):
         place = np.floor(frames * rate % 1.0 * BINS).astype(int)
         shares = (np.bincount(place, on, BINS) + 0.5) / (np.bincount(place, minlength=BINS) + 1.0)

@@ -1,4 +1,4 @@
-"""The part of a pool surface that lies between reflected lines, where they determine it."""
+"""The part of a pool surface between reflected lines, which determine it."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from labapp.core.values import FloatArray
 
 
 def between_lines(surface: LineSurface) -> Reconstruction:
-    """The surface of lines that determine it, which ends at the hull of their points.
+    """Return the fitted surface within the convex hull of the lines' points.
 
-    Its ``boundary`` is the edge of what is known, not that of the pool.
+    Its ``boundary`` is the edge of the known region, not that of the pool.
     """
     points = surface.point_mm
     center = points[:, :2].mean(axis=0)
@@ -32,7 +32,7 @@ def between_lines(surface: LineSurface) -> Reconstruction:
 
 
 def _reach(points_mm: FloatArray) -> FloatArray:
-    """How far the hull of points about the origin, shape (n, 2), reaches each way, shape (m,)."""
+    """Polar radius of the hull of points about the origin, shape (n, 2), by angle, shape (m,)."""
     from scipy.spatial import ConvexHull
 
     planes = ConvexHull(points_mm).equations  # normals, and offsets below 0

@@ -1,4 +1,4 @@
-"""Compiled loops over ridge points: linking them to chains."""
+"""Compiled loops that link ridge points to chains."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def _next_point(
     free: IntArray,
     at: int,
 ) -> int:
-    """Neighbour of point ``at`` that goes on along ``tangent[-1]``; −1 if there is none."""
+    """Neighbour of point ``at`` that continues along ``tangent[-1]``; −1 if there is none."""
     height, width = index.shape
     forth_u, forth_v = tangent[-1, 0], tangent[-1, 1]
     best, least = -1, 1e9
@@ -57,7 +57,7 @@ def _take_beside(
     free: IntArray,
     at: int,
 ) -> None:
-    """Take the points beside a point of a ridge, and not ahead of it: they are the same ridge."""
+    """Mark the points beside, not ahead of, a ridge point as used: they are the same ridge."""
     height, width = index.shape
     for du in range(-1, 2):
         for dv in range(-1, 2):
@@ -79,24 +79,24 @@ def link(
     order: IntArray,
     seeds: int,
 ) -> tuple[IntArray, IntArray]:
-    """Link ridge points to chains, from the strongest on, both ways along the ridge.
+    """Link ridge points to chains in both directions, starting from the strongest.
 
     Parameters
     ----------
     index
-        Number of the point in each pixel, −1 where there is none, shape (height, width), int32.
+        Number of the point in each pixel, −1 if there is none, shape (height, width), int32.
     pixel, place, tangent
-        Of n points: pixel (u, v), place (u, v), px, and unit vector along the ridge, each shape
-        (n, 2); ``tangent`` has one more row, which is written to.
+        Pixel (u, v), position (u, v), px, and unit vector along the ridge of n points, each shape
+        (n, 2); ``tangent`` has one more row, which is used as work space.
     order
-        The points from the strongest to the weakest, shape (n,).
+        Point numbers from the strongest to the weakest, shape (n,).
     seeds
-        Only so many of the strongest begin a chain.
+        Number of the strongest points that may start a chain.
 
     Returns
     -------
     tuple
-        Points of all chains, one chain after the other, and where each begins, with the end.
+        Points of all chains, concatenated, and the start index of each chain, plus the end.
     """
     count = len(order)
     free = np.ones(count, np.int64)

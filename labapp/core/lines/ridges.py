@@ -1,8 +1,9 @@
-"""Ridges of a grey frame to subpixel: Steger's detector of curvilinear structures.
+"""Sub-pixel detection of ridges in a grey frame: Steger's detector of curvilinear structures.
 
 C. Steger, "An unbiased detector of curvilinear structures", IEEE PAMI 20 (1998) 113-125. At each
-pixel the frame, smoothed by a Gaussian, is a parabola across the direction of strongest curvature;
-its top is a ridge point where it lies in the pixel. Points are linked to chains along the ridge.
+pixel the Gaussian-smoothed frame is approximated by a parabola along the direction of strongest
+curvature. Its maximum is a ridge point if it lies in the pixel. Points are linked to chains along
+the ridge.
 """
 
 from __future__ import annotations
@@ -18,27 +19,28 @@ from labapp.core.images.dots import Grey, Image
 from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
 
 WITHIN_PX = 0.6
-"""A ridge point lies so near its pixel's centre along u and along v: a little over half."""
+"""Largest distance of a ridge point from its pixel's centre along u and v: slightly above half."""
 
 REMAP_LIMIT = 32766
-"""Most places of a row that `cv2.remap` takes."""
+"""Largest number of columns that `cv2.remap` accepts."""
 
 FLANKS = 2.5
-"""The background of a ridge is seen so many standard deviations of the smoothed line beside it."""
+"""Distance from a ridge at which its background is read, in standard deviations of the smoothed
+line."""
 
 
 @dataclass(frozen=True)
 class RidgeSettings:
-    """How ridges are found.
+    """Settings for the detection of ridges.
 
     Parameters
     ----------
     scale_px
-        Standard deviation of the Gaussian that the frame is smoothed by, px: about that of a line's
-        light across it, and not below 1/√3 of it.
+        Standard deviation of the smoothing Gaussian, px: about that of a line's light across it,
+        and not below 1/√3 of it.
     seed, floor
-        Curvature across the ridge, over its noise, of the strongest point of a chain and of all its
-        points at least.
+        Least ratio of the curvature across the ridge to its noise, for the first point of a chain
+        and for all its points.
     """
 
     scale_px: float = 2.0
@@ -55,15 +57,15 @@ class Ridges(ReadOnlyArrays):
     image_px
         (u, v), shape (n, 2), px.
     tangent
-        Unit vector along the ridge, shape (n, 2); which way is open.
+        Unit vector along the ridge, shape (n, 2); its sign is arbitrary.
     strength
         Curvature across the ridge of the smoothed frame, grey levels/px², shape (n,).
     height
-        Of the smoothed frame's ridge over its background, grey levels, shape (n,).
+        Height of the smoothed frame's ridge over its background, grey levels, shape (n,).
     starts
-        Where each of k chains begins, and n, shape (k + 1,).
+        Start index of each of k chains, and n, shape (k + 1,).
     noise
-        Standard deviation of ``strength`` where there is no ridge.
+        Standard deviation of ``strength`` without a ridge.
     smooth
         The smoothed frame, shape (height, width).
     """
@@ -82,7 +84,7 @@ class Ridges(ReadOnlyArrays):
 
 @lru_cache(maxsize=8)
 def _derivative_kernels(scale_px: float) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Gaussian and its first two derivatives, sampled; a parabola's come out exactly."""
+    """Sampled Gaussian and its first two derivatives, normalised to be exact for a parabola."""
     reach = int(np.ceil(4 * scale_px))
     x = np.arange(-reach, reach + 1.0)
     bell = np.exp(-(x**2) / (2 * scale_px**2))
@@ -94,7 +96,7 @@ def _derivative_kernels(scale_px: float) -> tuple[FloatArray, FloatArray, FloatA
 
 
 def find_ridges(frame: Image, settings: RidgeSettings) -> Ridges:
-    """Find the bright ridges of a grey frame, shape (height, width), and link them to chains."""
+    """Find bright ridges in a grey frame, shape (height, width), and link them to chains."""
     from labapp.core.lines import ridge_kernels
 
     picture = np.ascontiguousarray(frame, np.float32)
@@ -107,7 +109,7 @@ def find_ridges(frame: Image, settings: RidgeSettings) -> Ridges:
         filtered(*pair) for pair in ((bell, bell), (bend, bell), (bell, bend), (slope, slope))
     )
     noise = 1.4826 * float(np.median(np.abs(uu[::3, ::3] - np.median(uu[::3, ::3])))) + 1e-9
-    # The larger curvature, of a maximum: from the trace and the determinant of the Hessian.
+    # Smaller eigenvalue of the Hessian: the strongest curvature of a maximum.
     half, root = (uu + vv) / 2, np.sqrt(((uu - vv) / 2) ** 2 + uv * uv)
     v, u = np.nonzero(half - root < -settings.floor * noise)
     h, r = half[v, u].astype(float), root[v, u].astype(float)
@@ -134,8 +136,8 @@ def find_ridges(frame: Image, settings: RidgeSettings) -> Ridges:
 
 
 def sampled(picture: Grey, place: FloatArray) -> Grey:
-    """Grey levels at places (u, v), shape (n, 2); outside, those of the edge; shape (n,)."""
-    rows = -(-len(place) // REMAP_LIMIT)  # cv2.remap takes no more columns
+    """Interpolated grey levels at (u, v), shape (n, 2); outside, those of the edge; shape (n,)."""
+    rows = -(-len(place) // REMAP_LIMIT)  # limit of cv2.remap
     at = np.resize(place, (rows, -(-len(place) // max(rows, 1)), 2)).astype(np.float32)
     light = cv2.remap(
         picture, at[..., 0], at[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
@@ -144,11 +146,11 @@ def sampled(picture: Grey, place: FloatArray) -> Grey:
 
 
 def _height(smooth: Grey, place: FloatArray, along: FloatArray, scale_px: float) -> FloatArray:
-    """Height of a smoothed frame's ridges over the mean of both flanks, shape (n,)."""
+    """Height of a smoothed frame's ridges over the darker flank, shape (n,)."""
     reach = FLANKS * np.sqrt(2.0) * scale_px
     across = np.stack([-along[:, 1], along[:, 0]], axis=-1)
     if not len(place):
         return np.zeros(0)
     left, top, right = (sampled(smooth, place + side * reach * across) for side in (-1.0, 0.0, 1.0))
-    # A neighbouring line may be on one flank.
+    # The darker flank, as a neighbouring line may lie on the other.
     return np.asarray(top - np.minimum(left, right), float)

@@ -1,4 +1,4 @@
-"""Smooth paths through points: where a line of light runs, its direction and its curvature."""
+"""Smooth paths through points: position, direction and curvature of a line of light."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from labapp.core.values import BoolArray, FloatArray, ReadOnlyArrays
 
 @dataclass(frozen=True)
 class SmoothPath(ReadOnlyArrays):
-    """A smooth path at every pixel of its length, n of them.
+    """A smooth path sampled at every pixel of its length, n samples.
 
     Parameters
     ----------
     place, tangent
         (u, v), px, and unit vectors along the path, shape (n, 2).
     curvature
-        Of the path, shape (n,), px⁻¹.
+        Curvature of the path, shape (n,), px⁻¹.
     seen
-        Where points are near, shape (n,).
+        Whether there are data points nearby, shape (n,).
     """
 
     place: FloatArray
@@ -30,9 +30,9 @@ class SmoothPath(ReadOnlyArrays):
 
     @classmethod
     def through(cls, points: FloatArray, smooth_px: float) -> SmoothPath:
-        """Smooth a line of points, shape (m, 2), px."""
+        """Fit a smooth path through ordered points, shape (m, 2), px."""
         along = _length_along(points)
-        # Points that jump to and fro make a longer line than the path.
+        # Scatter makes the polyline of the points longer than the path.
         rough = _local_fit(along, points, along, np.ones(len(along)), smooth_px)[0]
         along = _length_along(rough)
         weights = _robust_weights(points, rough)
@@ -49,17 +49,17 @@ class SmoothPath(ReadOnlyArrays):
 
     @property
     def across(self) -> FloatArray:
-        """Unit vector across it, to the right of ``tangent`` as seen, shape (n, 2)."""
+        """Unit vector across the path, to the right of ``tangent`` in the image, shape (n, 2)."""
         return np.stack([-self.tangent[:, 1], self.tangent[:, 0]], axis=-1)
 
     @property
     def longest_gap(self) -> float:
-        """Length of the longest part that is not seen, px."""
+        """Length of the longest part without data points, px."""
         on = np.flatnonzero(self.seen)
         return float(np.max(np.diff(on), initial=1) - 1)
 
     def moved(self, off: FloatArray, smooth_px: float) -> SmoothPath:
-        """The path moved across itself by ``off``, shape (n,), px."""
+        """Return the path displaced across its direction by ``off``, shape (n,), px."""
         place = self.place + off[:, None] * self.across
         at = _length_along(place)
         fit = _local_fit(at, place, at, np.ones(len(at)), smooth_px / 2)
@@ -73,14 +73,14 @@ def _length_along(points: FloatArray) -> FloatArray:
 def _local_fit(
     along: FloatArray, values: FloatArray, at: FloatArray, weights: FloatArray, width: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Value and first two derivatives at places of parabolas fitted locally, shape (m, 2) each.
+    """Value and first two derivatives of locally fitted parabolas, shape (m, 2) each.
 
     Parameters
     ----------
     along, values, weights
-        Place along the line, shape (n,), values there, shape (n, 2), and their weights, shape (n,).
+        Position along the line, shape (n,), values, shape (n, 2), and their weights, shape (n,).
     at
-        Places along the line, shape (m,).
+        Positions along the line, shape (m,).
     width
         Standard deviation of the Gaussian weights.
     """
@@ -95,7 +95,7 @@ def _local_fit(
 
 
 def _robust_weights(points: FloatArray, smooth: FloatArray) -> FloatArray:
-    """Tukey's weights of points by their distance from the smoothed line, shape (n,)."""
+    """Tukey's biweights of points from their distance to the smoothed line, shape (n,)."""
     away = np.linalg.norm(points - smooth, axis=-1)
     limit = 4.685 * 1.4826 * float(np.median(away)) + 1e-6
     return np.asarray(np.maximum(1 - (away / limit) ** 2, 0.0) ** 2 + 1e-6)

@@ -1,16 +1,16 @@
-"""The state of the pool over time, as §3.2.1 reads it from reflected lines.
+"""State of the pool over time from reflected lines (§3.2.1).
 
-| state | what the text reads | rule |
+| state | dissertation | rule |
 | --- | --- | --- |
 | ``no-pool`` | "a blurred plane without any lines" at point A (Fig. 3-11) | no line is seen |
-| ``growing`` | from A to B "the weld pool grows" (Fig. 3-11) | the pool's width rises, or lines have appeared and do not yet give one |
+| ``growing`` | from A to B "the weld pool grows" (Fig. 3-11) | the pool's width increases, or lines have appeared but do not yet determine it |
 | ``concave`` | full penetration, steady (Fig. 3-12) | turn below zero, not changing |
 | ``flattening`` | "from being concave towards being convex", the size falls (Fig. 3-13) | turn rises |
 | ``convex`` | partial penetration, images larger, lines fewer (Fig. 3-14) | turn above zero, not changing |
 
-The text reads shapes by eye; here width and turn are those of the surface that was fitted. The turn
-is its curvature times its width, the angle between its normals at both ends of the lines: lines
-determine it better than either, as a wider and flatter surface reflects them nearly alike.
+The dissertation judges shapes by eye; here width and turn are those of the fitted surface. The turn
+is its curvature times its width, the angle between its normals at both ends of the lines. The lines
+determine it better than either factor, as a wider and flatter surface reflects them almost equally.
 """  # noqa: E501
 
 from __future__ import annotations
@@ -29,49 +29,49 @@ from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 State = Literal["no-pool", "growing", "concave", "flattening", "convex"]
 
 SURE_MARGIN = 6.0
-"""A frame's curvature counts where the other sign costs so much more (`LineSurface.margin`)."""
+"""Least margin of the other sign at which a frame's curvature is used (`LineSurface.margin`)."""
 
 BETWEEN = 6
-"""A change is not interrupted for fewer frames."""
+"""Interruptions of a change up to this distance between frames are closed."""
 
 STEADY_FRAMES, SLOPING_FRAMES, CORNER_REACH = 25, 12, 8
-"""A corner is sought so near to where a change seems to begin, from so many frames before it and in
-it."""
+"""Numbers of frames before and in a change that determine its corner, and the search range about
+its first estimate, frames."""
 
 RAMP_REACH = 16
-"""A ramp begins and ends so near to where a change seems to."""
+"""Search range about the first estimates of a ramp's begin and end, frames."""
 
 LEAST_KNOWN, MOST_OFF = 5, 6.0
-"""A ramp needs so many frames on both sides; no frame costs more, −log likelihood."""
+"""Least number of frames on both sides of a ramp; and largest cost of a frame, −log likelihood."""
 
 UNEVEN = 0.05
-"""Standard deviation of frames from a straight ramp, over its height."""
+"""Standard deviation of frames from a straight ramp, relative to its height."""
 
 APPEARING_FRAMES = 15
-"""Growth that shows so soon after the first lines began with them."""
+"""Growth detected within this many frames of the first lines is taken to begin with them."""
 
 LEAST_FRAMES = 8
-"""A change lasts so long at least."""
+"""Shortest change, frames."""
 
 TUKEY = 3.0
-"""Values farther than so many standard deviations from the local line have little weight."""
+"""Values farther than this many standard deviations from the local line have little weight."""
 
 
 @dataclass(frozen=True)
 class StateSettings:
-    """How states are read.
+    """Settings for the detection of states.
 
     Parameters
     ----------
     window
         Standard deviation of the weights of the local fit over time, frames.
     share
-        A state of change lasts while the rate of change is above this share of its largest: about
-        half, as a local fit to a corner has half the rate beyond it.
+        A change lasts while its rate exceeds this share of the largest rate: about half, as a local
+        fit at a corner gives half the rate beyond it.
     sigmas
-        And above so many standard uncertainties.
+        The rate must also exceed this many standard uncertainties.
     least_growth_mm, least_turn
-        What width and turn must change by over a window to count at all, mm and rad.
+        Least change of width and turn over a window, mm and rad.
     """
 
     window: float = 5.0
@@ -83,17 +83,17 @@ class StateSettings:
 
 @dataclass(frozen=True)
 class LineSeries(ReadOnlyArrays):
-    """What the frames of a recording show, each array with an entry a frame.
+    """Time series of a recording, each array with one entry per frame.
 
     Parameters
     ----------
     count
-        Lines seen.
+        Number of visible lines.
     width_mm
-        Of the pool along X, between the lines' ends; NaN where unknown.
+        Width of the pool along X, between the lines' ends; NaN if unknown.
     turn
-        Angle between the surface's normals across the pool, rad, positive when convex; NaN where
-        unknown or where its sign is in doubt.
+        Angle between the surface's normals across the pool, rad, positive if convex; NaN if unknown
+        or if its sign is uncertain.
     """
 
     count: IntArray
@@ -102,7 +102,7 @@ class LineSeries(ReadOnlyArrays):
 
     @classmethod
     def of(cls, frames: Sequence[LineFrame]) -> LineSeries:
-        """Collect the series from frames in order."""
+        """Collect the series from consecutive frames."""
         count = np.array([one.features.count for one in frames], np.int64)
         width, turn = np.full(len(frames), np.nan), np.full(len(frames), np.nan)
         for k, one in enumerate(frames):
@@ -129,7 +129,7 @@ def line_states(series: LineSeries, settings: StateSettings | None = None) -> tu
     flattens = _changes(turning, turning_sigma, settings.least_turn, settings)
     flattens = lit & ~grows & _ramps(flattens, series.turn, lit & ~grows)
     known = np.flatnonzero(np.isfinite(turn))
-    # Lines that have just appeared may be too few for a surface; later, the last state lasts.
+    # The first lines may be too few for a surface; later, interpolation bridges unknown frames.
     unknown = np.arange(len(lit)) < known.min(initial=len(lit))
     turn = np.interp(np.arange(len(lit)), known, turn[known]) if len(known) else turn
     states: list[State] = []
@@ -162,14 +162,14 @@ def line_changes(series: LineSeries, least_frames: int = 3) -> list[tuple[int, i
 def local_line(
     values: FloatArray, on: BoolArray, window: float
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Value, rate and its σ, over a window of frames, of robust lines fitted locally, shape (n,).
+    """Fit robust local lines: value, rate per window and σ of the rate, each shape (n,).
 
     Parameters
     ----------
     values
-        A value a frame, shape (n,), NaN where unknown.
+        One value per frame, shape (n,), NaN if unknown.
     on
-        Frames that count, shape (n,); elsewhere the result is NaN.
+        Frames to use, shape (n,); elsewhere the result is NaN.
     window
         Standard deviation of the Gaussian weights, frames.
     """
@@ -201,7 +201,7 @@ def local_line(
 def _changes(
     rate: FloatArray, sigma: FloatArray, least: float, settings: StateSettings
 ) -> BoolArray:
-    """Frames in which a value rises at about its largest rate."""
+    """Frames in which a value increases at about its largest rate."""
     known = np.isfinite(rate)
     if not known.any():
         return known
@@ -209,7 +209,7 @@ def _changes(
     if not real.any():
         return real
     largest = float(np.quantile(rate[real], 0.7))
-    # Where a change begins and ends, its rate is half and less sure: what adjoins a sure change.
+    # At the ends of a change its rate is halved and less certain: include adjacent frames.
     fast = np.nan_to_num(rate) > settings.share * largest
     parts, _ = label(known & (fast | _closed(fast)))
     sure = [part for part in np.unique(parts[real]) if np.sum(parts == part) >= LEAST_FRAMES]
@@ -217,7 +217,7 @@ def _changes(
 
 
 def _well_known(change: BoolArray, values: FloatArray) -> BoolArray:
-    """Changes in which at least half of the frames have a value."""
+    """Keep changes in which at least half of the frames have a value."""
     parts, count = label(change)
     known = np.isfinite(values)
     kept = [part for part in range(1, count + 1) if known[parts == part].mean() >= 0.5]
@@ -225,7 +225,7 @@ def _well_known(change: BoolArray, values: FloatArray) -> BoolArray:
 
 
 def _with_corners(change: BoolArray, values: FloatArray, on: BoolArray) -> BoolArray:
-    """Changes that begin and end at the corners of the values, steady outside and a line inside."""
+    """Adjust the ends of changes to corners of the values: constant outside, a line inside."""
     parts, count = label(change)
     result = np.zeros(len(change), bool)
     for part in range(1, count + 1):
@@ -237,7 +237,7 @@ def _with_corners(change: BoolArray, values: FloatArray, on: BoolArray) -> BoolA
 
 
 def _ramps(change: BoolArray, values: FloatArray, on: BoolArray) -> BoolArray:
-    """Changes as ramps between two levels."""
+    """Adjust the ends of changes by fitting ramps between two levels."""
     parts, count = label(change)
     result = np.zeros(len(change), bool)
     for part in range(1, count + 1):
@@ -248,7 +248,7 @@ def _ramps(change: BoolArray, values: FloatArray, on: BoolArray) -> BoolArray:
 
 
 def _ramp(values: FloatArray, on: BoolArray, begin: int, end: int) -> tuple[int, int]:
-    """First frame of a change near ``begin``, and the first after it: a line between two levels."""
+    """First frame of a change near ``begin``, and first after it, by a ramp between two levels."""
     known = on & np.isfinite(values)
     known[: max(begin - STEADY_FRAMES, 0)] = known[end + STEADY_FRAMES :] = False
     frames = np.flatnonzero(known)
@@ -273,7 +273,7 @@ def _ramp(values: FloatArray, on: BoolArray, begin: int, end: int) -> tuple[int,
 
 
 def _corner(values: FloatArray, on: BoolArray, near: int) -> int:
-    """First frame of a change near ``near``: before, values are constant, then on a line."""
+    """First frame of a change near ``near``: values are constant before and linear after."""
     window = np.arange(max(near - STEADY_FRAMES, 0), min(near + SLOPING_FRAMES, len(values)))
     window = window[on[window] & np.isfinite(values[window])]
     if np.sum(window < near) < 5 or np.sum(window >= near) < 5:
@@ -294,7 +294,7 @@ def _corner(values: FloatArray, on: BoolArray, near: int) -> int:
 
 
 def _closed(on: BoolArray) -> BoolArray:
-    """Frames between two that are on and at most `BETWEEN` apart."""
+    """Close gaps between frames that are on and at most `BETWEEN` apart."""
     frames = np.arange(len(on))
     last = np.maximum.accumulate(np.where(on, frames, -BETWEEN))
     after = np.minimum.accumulate(np.where(on, frames, len(on) + BETWEEN)[::-1])[::-1]
@@ -302,7 +302,7 @@ def _closed(on: BoolArray) -> BoolArray:
 
 
 def _just_appeared(lit: BoolArray, grows: BoolArray) -> BoolArray:
-    """Frames between the first lines of a pool and the first frames that show its growth."""
+    """Frames between the first lines of a pool and the first detection of its growth."""
     result = np.zeros(len(lit), bool)
     for first in np.flatnonzero(np.diff(lit.astype(int)) == 1) + 1:
         later = np.flatnonzero(grows[first : first + APPEARING_FRAMES])
@@ -312,6 +312,6 @@ def _just_appeared(lit: BoolArray, grows: BoolArray) -> BoolArray:
 
 
 def _steady(on: BoolArray) -> BoolArray:
-    """Whether most of the five frames about each are on."""
+    """Majority filter over five frames."""
     padded = np.pad(on.astype(float), 2, mode="edge")
     return np.asarray(np.convolve(padded, np.ones(5), "valid") >= 3)

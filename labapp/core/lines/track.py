@@ -1,8 +1,8 @@
-"""One line followed from frame to frame (§3.3): its shift, tilt and bend as time series.
+"""Tracking of a single line from frame to frame (§3.3): shift, tilt and bend as time series.
 
-In a strip about where the line was, each column gives the place of its brightest light; a shape
-near the last one is fitted through them with Tukey's weights, so that what spatter, glare, droplets
-and bridging do to some columns is left out, and how much was left out is reported.
+In a strip about the line's previous position, each column gives the position of its brightest
+light. A shape is fitted to these with Tukey's biweights. Columns disturbed by spatter, glare,
+droplets or bridging are thereby rejected, and the share of accepted columns is reported.
 """
 
 from __future__ import annotations
@@ -20,30 +20,31 @@ from labapp.core.lines.pulses import Pulses, classify_pulses, frame_brightness
 from labapp.core.values import BoolArray, FloatArray, ReadOnlyArrays
 
 OVERSAMPLE = 8
-"""Frequencies tried in the inverse of a recording's length."""
+"""Number of trial frequencies per inverse of the recording's duration."""
 
 RECENT, BLINDED, BLINDED_LEVELS = 40, 4.0, 6.0
-"""A frame that is so many times as bright as the darkest of the last ones is blinded."""
+"""A frame is blinded if it is brighter than this multiple of the darkest of the recent frames, plus
+this many grey levels."""
 
 
 @dataclass(frozen=True)
 class TrackSettings:
-    """How a line is followed.
+    """Settings for tracking a line.
 
     Parameters
     ----------
     reach_px
-        How far above and below its place in the frame before a line is looked for, px.
+        Search range above and below the line's position in the previous frame, px.
     column_px
-        Distance of the columns that are read, px.
+        Spacing of the columns that are read, px.
     width_px
         Standard deviation of the line's light across it, px.
     least_share
-        A line is lost where a smaller share of its columns agrees.
+        The line is lost if a smaller share of its columns agrees.
     least_contrast
-        And where its light over its surroundings is less than so many of the noise.
+        Least ratio of a column's light over its surroundings to the noise.
     lines
-        How the line is found where it is not yet followed.
+        Settings for the initial detection of the line.
     """
 
     reach_px: float = 14.0
@@ -61,12 +62,12 @@ class TrackedLine(ReadOnlyArrays):
     Parameters
     ----------
     u_px, v_px
-        Its columns and its fitted place in each, shape (n,), px.
+        Its columns and its fitted position in each, shape (n,), px.
     shift_px, tilt_px, bend_px
-        Its shape less that of the reference: mean, rise over half of its length, and rise of its
-        ends over its middle, px downwards.
+        Difference of its shape from the reference: mean, rise over half its length, and rise of its
+        ends relative to its middle, px downwards.
     share
-        Share of the columns that agree with it.
+        Share of the columns that agree with the fit.
     """
 
     u_px: FloatArray
@@ -78,7 +79,7 @@ class TrackedLine(ReadOnlyArrays):
 
 
 class LineTracker:
-    """Follows one line; begin with a frame in which it can be seen."""
+    """Tracker of one line; the first frame should show the line."""
 
     def __init__(self, settings: TrackSettings | None = None) -> None:
         self.settings = settings or TrackSettings()
@@ -89,12 +90,12 @@ class LineTracker:
         self._since = 0
 
     def follow(self, frame: Image) -> TrackedLine | None:
-        """The line in the next frame, shape (height, width); None where it is lost."""
+        """Return the line in the next frame, shape (height, width); None if it is lost."""
         picture = np.ascontiguousarray(frame, np.float32)
         if self._columns is None and not self._begin(picture):
             return None
         found = self._read(picture, self.settings.reach_px)
-        if found is None and self._since >= 3:  # it may be farther away by now
+        if found is None and self._since >= 3:  # it may have moved farther
             found = self._read(picture, 2 * self.settings.reach_px)
         self._since = 0 if found is not None else self._since + 1
         return found
@@ -145,7 +146,7 @@ class LineTracker:
 
 
 def _band(strip: Grey, width: float) -> Grey:
-    """Light of the line's width over its surroundings, down each column."""
+    """Band-pass filter of each column at the line's width."""
     return np.asarray(_down(strip, width) - _down(strip, 2.5 * width))
 
 
@@ -159,7 +160,7 @@ def _down(strip: Grey, sigma: float) -> Grey:
 
 
 def _robust_shape(terms: FloatArray, off: FloatArray, clear: BoolArray) -> tuple[FloatArray, float]:
-    """Shift, tilt and bend through the columns' places, and the share of columns that agree."""
+    """Fit shift, tilt and bend to the columns' positions; also the share of columns that agree."""
     start = float(np.median(off[clear]))
     fit, limit = np.array([start, 0.0, 0.0]), 8.0
     weights = clear.astype(float)
@@ -177,17 +178,17 @@ def _robust_shape(terms: FloatArray, off: FloatArray, clear: BoolArray) -> tuple
 
 @dataclass(frozen=True)
 class LineFilm:
-    """One line over a recording.
+    """Tracking results of one line over a recording.
 
     Parameters
     ----------
     pulses
         Frames with and without a pulse.
     lines
-        The line in each frame; None where it is lost or a pulse blinds the frame.
+        The line in each frame; None if it is lost or a pulse is on.
     frequency_hz, strength
-        Of the line's strongest oscillation, and its share of the variance; NaN and 0 where there
-        is no time base or too little was followed.
+        Frequency of the line's strongest oscillation, and its share of the variance; NaN and 0 if
+        there is no time base or too few frames were tracked.
     """
 
     pulses: Pulses
@@ -202,10 +203,10 @@ def track_line(
     settings: TrackSettings | None = None,
     tracker: LineTracker | None = None,
 ) -> LineFilm:
-    """Sort the frames of a recording by pulse, and follow its line in those without one.
+    """Classify the frames of a recording by pulse, and track its line in those without a pulse.
 
-    The line is read in every frame that is not blinded; what was read in frames that turn out, with
-    the others known, to have a pulse is dropped. ``tracker`` is that of the frames before.
+    The line is measured in every frame that is not blinded. Results of frames that are later
+    classified as having a pulse are discarded. ``tracker`` is that of the preceding frames.
     """
     tracker = tracker or LineTracker(settings)
     bright, lines = list[float](), list[TrackedLine | None]()
@@ -230,18 +231,18 @@ def oscillation_frequency(
 ) -> tuple[float, float]:
     """Frequency of the strongest oscillation, Hz, and its share of the values' variance.
 
-    By Lomb's and Scargle's periodogram, as frames with a pulse are missing.
+    By the Lomb–Scargle periodogram, as frames with a pulse are missing.
 
     Parameters
     ----------
     time_s, values
-        Where the line was followed, each shape (n,).
+        Times, s, and values of the tracked frames, each shape (n,).
     lowest_hz, highest_hz
-        Where the frequency is looked for.
+        Frequency range of the search.
     """
     if len(values) < 16:
         return float("nan"), 0.0
-    # What drifts is no oscillation.
+    # Remove the drift.
     smooth = np.polynomial.Polynomial.fit(time_s, values, 3)(time_s)
     swing = values - smooth
     limit = 6.0 * 1.4826 * float(np.median(np.abs(swing))) + 1e-9
