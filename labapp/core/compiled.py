@@ -195,4 +195,4 @@ def _kept(function: F, *signature: Any) -> F:
         finally:
             _config.CACHE_LOCATOR_CLASSES = usual
             del codegen._library_class
-    return result
+    return made
