@@ -75,14 +75,11 @@ def impossible(session: Session | None, seen: Overview | None) -> str:
 
 
 def same_results(one: Overview | None, other: Overview | None) -> bool:
-    """Whether two overviews have the same times, heights and stale frames."""
+    """Whether two overviews have the same times, measures and stale frames."""
     if one is None or other is None:
         return one is other
-    pairs = (
-        (one.time_s, other.time_s),
-        (one.stale, other.stale),
-        (one.measures["height_mm"], other.measures["height_mm"]),
-    )
+    pairs = [(one.time_s, other.time_s), (one.stale, other.stale)]
+    pairs += [(values, other.measures[name]) for name, values in one.measures.items()]
     return all(np.array_equal(a.astype(float), b.astype(float), equal_nan=True) for a, b in pairs)
 
 
