@@ -20,11 +20,11 @@ def main() -> None:
     pages = "".join(page.read_text("utf-8") for page in GUIDE.glob("*.md"))
     wanted = set(re.findall(r"\(pictures/(\S+)\.png\)", pages))
     PICTURES.mkdir(exist_ok=True)
-    for old in PICTURES.glob("*.png"):
-        old.unlink()
     with tempfile.TemporaryDirectory() as out:
         tour = [sys.executable, "-m", "tests.tour", "--out", out]
         subprocess.run(tour, cwd=GUIDE.parents[1], check=True)
+        for old in PICTURES.glob("*.png"):
+            old.unlink()
         for name in sorted(wanted):
             (taken,) = Path(out).glob(f"[0-9][0-9]-{name}.png")
             picture = Image.open(taken).convert("RGB")
