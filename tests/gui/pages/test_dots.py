@@ -397,7 +397,7 @@ def test_a_refused_edit_says_why_and_changes_nothing(
     page.dots_panel.row.edited.emit(5)  # where other dots are
     assert [problem for _, problem in said] == [True] * 6
     assert "no dot is selected" in said[0][0]
-    assert "and cannot be that of" in said[-1][0]
+    assert "already assigned" in said[-1][0]
     assert len(session.history) == steps
     assert unfitted == []
 
