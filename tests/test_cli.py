@@ -297,7 +297,7 @@ def test_measures_are_told_while_they_are_made(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("options", "said"),
     [
-        (("--lines", "0.0.0.0:0"), "only if that is asked for"),
+        (("--lines", "0.0.0.0:0"), "other machines"),
         (("--opcua", "port"), "PORT or HOST:PORT"),
     ],
 )

@@ -308,7 +308,7 @@ CAP = 'shape = "cap"\ndiameter_mm = 7.0\nheight_mm = 0.3\n'
         (CAP.replace("0.3", "3.6"), "", {}, "its sides would overhang"),
         ('shape = "surface"\nfile = "a.csv"\nwave = []', "", {}, "pool.wave: unknown key"),
         (CAP + '[[pool.wave]]\nmode = [0, 1]\namplitude_mm = 0.1\nfrequency_hz = 1\n'
-         'kind = "travelling"', "", {}, "it can stand, but not travel"),
+         'kind = "travelling"', "", {}, "cannot travel"),
     ],
 )  # fmt: skip
 def test_a_wrong_key_is_named_with_what_is_allowed(

@@ -60,4 +60,4 @@ def test_a_run_that_is_stopped_says_what_is_kept(
     monkeypatch.setattr(Study, "run", stopped)
     code, _, err = labapp("study", "run", study_file)
     assert code == 130
-    assert "0 of 5 recordings" in err
+    assert "4 waiting" in err
