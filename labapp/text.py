@@ -77,16 +77,19 @@ def format_bytes(size: float) -> str:
 
 _SIMPLE = {
     each.lower().replace("²", "2").replace("³", "3").replace("µ", "u"): each
-    for each in "A bar cm g Hz J K kA kg kHz kJ kPa kV kW l m mA min mm mm² mm³ ms N Pa ppm px s V "
-    "W µm µs".split()
+    for each in "A bar cm Hz kA kg kHz kJ kPa kV kW l m mA min mm mm² mm³ ms ppm px s V W µm "
+    "µs".split()
 } | {"deg": "°", "c": "°C", "pct": "%", "percent": "%", "um_per_unit": "µm per mm or °"}
 
 UNITS = _SIMPLE | {
-    f"{ending}_{per}": f"{unit}/{per}"
+    f"{ending}_{over}{per}": f"{unit}/{per}"
     for ending, unit in _SIMPLE.items()
     for per in ("mm", "cm", "m", "s", "min", "h")
+    for over in ("", "per_")
 }
-"""Endings of the names of columns and conditions, and the units that they stand for."""
+"""Endings of the names of columns and conditions, and the units that they stand for.
+
+Letters that name other things more often, as in ``plate_n`` or ``ray_k``, stand for none."""
 
 
 def split_unit(name: str) -> tuple[str, str]:
@@ -102,7 +105,7 @@ def split_unit(name: str) -> tuple[str, str]:
     return " ".join(words), ""
 
 
-def heading(name: str) -> str:
+def column_heading(name: str) -> str:
     """A column's name above a table: ``height_mm`` is "height, mm", ``kept_to`` "kept to"."""
     return ", ".join(filter(None, split_unit(name)))
 

@@ -164,13 +164,6 @@ class Hand:
         QTest.keyClick(line, Qt.Key.Key_Return)
 
 
-def shows_its_text(button: QAbstractButton) -> bool:
-    """Whether nothing of a button's text is cut off; a style may want more room than it needs."""
-    icon = 0 if button.icon().isNull() else button.iconSize().width() + 4
-    needed = button.fontMetrics().horizontalAdvance(button.text()) + icon + 8
-    return button.width() >= min(needed, button.sizeHint().width() - 1)
-
-
 def _focused() -> QWidget:
     focused = QApplication.focusWidget()
     assert focused is not None, "nothing has the focus"

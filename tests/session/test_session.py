@@ -446,7 +446,7 @@ def test_damage_is_told_and_the_rest_still_shows(session: Session):
     problems = session.problems()
     assert len(problems) == 2
     assert "result of frame 0 (fit) is damaged" in problems[0]
-    assert "result of frame 2 (fit)" in problems[1]
+    assert "result of frame 2 (fit) differs" in problems[1]
 
 
 # --- out and back -----------------------------------------------------------------------------

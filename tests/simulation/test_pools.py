@@ -230,10 +230,11 @@ def test_what_stands_still_is_the_same_pool_later():
 
 
 @pytest.mark.parametrize(
-    ("mode", "travelling"), [((-1, 1), False), ((1, 0), False), ((0, 2), True)]
+    ("mode", "travelling", "words"),
+    [((-1, 1), False, "m ≥ 0"), ((1, 0), False, "n ≥ 1"), ((0, 2), True, "cannot travel")],
 )
-def test_waves_that_cannot_be_are_refused(mode, travelling):
-    with pytest.raises(ValueError, match="mode"):
+def test_waves_that_cannot_be_are_refused(mode, travelling, words):
+    with pytest.raises(ValueError, match=words):
         Wave(mode, 0.1, travelling=travelling)
 
 

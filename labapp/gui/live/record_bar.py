@@ -56,7 +56,6 @@ class RecordBar(QWidget):
         self.record_button.setText(END)
         self.record_button.setMinimumWidth(self.record_button.sizeHint().width())
         self.record_button.setText(BEGIN)
-        self.mark_button.setMinimumWidth(1)  # the style's minimum is wider than a short text needs
         vbox(line, self.recording, hbox(*buttons), of=self).setContentsMargins(8, 2, 8, 4)
 
     def show_status(self, live: Live) -> None:

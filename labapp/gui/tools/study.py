@@ -29,7 +29,7 @@ from labapp.run.study.status import Progress, RecordingStatus, count_states
 from labapp.run.study.study import Study
 from labapp.run.study.summary import StudySummary
 from labapp.simulation.parallel import end_processes, wait_for
-from labapp.text import heading
+from labapp.text import column_heading
 
 if TYPE_CHECKING:
     from labapp.gui.shell.files import Files
@@ -254,7 +254,7 @@ class StudyWindow(ToolWindow):
         if summary is not None:
             names = varying_conditions(summary)
             self.against.set_choices(
-                [(name, heading(name)) for name in names] or [("", "none varies")]
+                [(name, column_heading(name)) for name in names] or [("", "none varies")]
             )
             self._draw()
 
@@ -279,7 +279,7 @@ class StudyWindow(ToolWindow):
         summary, condition = self.summary, self.against.value()
         if summary is not None and summary.groups:
             self.sheet.show_png(
-                condition_picture(summary, condition), f"Sizes against {heading(condition)}"
+                condition_picture(summary, condition), f"Sizes against {column_heading(condition)}"
             )
 
     def show_page(self) -> None:

@@ -18,7 +18,7 @@ from labapp.session.record import Record
 from labapp.session.session import Session
 from labapp.simulation.parallel import Progress
 from labapp.studies.tables import Table
-from labapp.text import axis_label, heading, pluralize
+from labapp.text import axis_label, column_heading, pluralize
 
 SIGNS: dict[State, str] = {"done": "✓", "part": "◐", "waiting": "○", "failed": "▲"}
 
@@ -60,7 +60,7 @@ def outliers_table(summary: StudySummary) -> Table:
         (
             one.recording,
             "all" if one.frame is None else str(one.frame),
-            heading(one.measure),
+            column_heading(one.measure),
             f"{one.value:.4g}",
             f"{one.usual:.4g}",
             f"{one.times:.1f}",

@@ -17,7 +17,7 @@ from PySide6.QtWidgets import (
 
 from labapp.gui.digits import cell_text
 from labapp.gui.widgets.labels import plain_tip
-from labapp.text import heading
+from labapp.text import column_heading
 
 if TYPE_CHECKING:
     from labapp.studies.tables import Table
@@ -141,7 +141,7 @@ class CellTable(ReadTable):
         self.setAccessibleDescription(f"{table.caption}. Arrow keys move; Ctrl+C copies it")
         self.setColumnCount(len(table.columns))
         self.setRowCount(len(table.rows))
-        self.setHorizontalHeaderLabels([heading(column) for column in table.columns])
+        self.setHorizontalHeaderLabels([column_heading(column) for column in table.columns])
         self.clearContents()  # a column of another table may have been right-aligned
         for row, cells in enumerate(table.rows):
             for column, cell in enumerate(cells):

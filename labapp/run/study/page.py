@@ -15,7 +15,7 @@ from labapp.run.study.plan import Condition, named_condition, shown_condition
 from labapp.run.study.status import count_states
 from labapp.run.study.summary import GroupSummary, Mean, StudySummary
 from labapp.studies.plotting import INCHES, STYLE, as_bytes, new_figure
-from labapp.text import SIGMA_OF, axis_label, heading
+from labapp.text import SIGMA_OF, axis_label, column_heading
 
 MOST_SHOWN = 60
 """Most outliers that are listed; all are in outliers.csv."""
@@ -243,7 +243,7 @@ def _mean_cells(means: Mapping[str, Mean]) -> list[str]:
 
 def _groups(summary: StudySummary) -> str:
     return _table(
-        map(heading, (*summary.conditions, "recordings", "frames", *SIZES)),
+        map(column_heading, (*summary.conditions, "recordings", "frames", *SIZES)),
         (
             [
                 *(_cell(one.conditions.get(name)) for name in summary.conditions),
@@ -260,7 +260,7 @@ def _outliers(summary: StudySummary) -> str:
     rows = [
         [
             *(_t(one.recording), _n("all" if one.frame is None else one.frame)),
-            *(_t(heading(one.measure)), _n(f"{one.value:.4g}"), _n(f"{one.usual:.4g}")),
+            *(_t(column_heading(one.measure)), _n(f"{one.value:.4g}"), _n(f"{one.usual:.4g}")),
             *(_n(f"{one.times:.1f}"), _link(one.file)),
         ]
         for one in summary.outliers[:MOST_SHOWN]
@@ -272,9 +272,16 @@ def _outliers(summary: StudySummary) -> str:
 
 
 def _recordings(summary: StudySummary) -> str:
-    conditions = map(heading, summary.conditions)
+    conditions = map(column_heading, summary.conditions)
     return _table(
-        ["recording", *conditions, "state", "frames", "with a surface", *map(heading, SIZES)],
+        [
+            "recording",
+            *conditions,
+            "state",
+            "frames",
+            "with a surface",
+            *map(column_heading, SIZES),
+        ],
         (
             [
                 _t(one.status.recording.name),

@@ -52,7 +52,7 @@ from labapp.run.live_trend import Pace, Trend
 from labapp.session.session import Session
 from labapp.text import SETUP_MARKS
 from tests.gui.conftest import SAMPLES
-from tests.gui.hand import Hand, shows_its_text
+from tests.gui.hand import Hand
 from tests.gui.test_accessibility import check_round
 from tests.waiting import PATIENCE_S, connect
 
@@ -513,5 +513,5 @@ def test_every_part_by_keyboard_and_on_a_small_screen(
     qtbot.waitUntil(lambda: (window.width(), window.height()) == (911, 512))
     for button in window.findChildren(QAbstractButton):
         if button.isVisible() and button.text():
-            assert shows_its_text(button), button.text()
+            assert button.width() >= button.sizeHint().width() - 1, button.text()
     assert page.live_view.bar.record_button.isVisible()
