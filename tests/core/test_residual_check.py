@@ -139,11 +139,12 @@ def test_every_quantity_that_is_off_is_named_on_a_checked_bench(key, checked):
     assert abs(own.off - WRONG[key]) < 4 * own.sigma
 
 
-def test_pitch_far_off_is_named_alone(checked):
+@pytest.mark.parametrize("pitch_deg", [10.0, -8.0])
+def test_pitch_far_off_is_named_alone(checked, pitch_deg):
     """It leaves little for its assumed ±, and enough for a gross error."""
     plane = BENCH_RIG.imaging_plane
     size = plane.width_mm, plane.height_mm
-    pitched = ImagingPlane.of_angles(plane.origin_mm, (12.0, 0.0, 0.0), *size)
+    pitched = ImagingPlane.of_angles(plane.origin_mm, (pitch_deg, 0.0, 0.0), *size)
     found = verdict_of(frames(replace(BENCH_RIG, imaging_plane=pitched)), checked)
     assert found.is_doubtful
     assert [one.name for one in found.suspects if not one.is_drift] == ["imaging plane, pitch"]
