@@ -51,6 +51,15 @@ def test_a_pool_with_a_dip_has_its_rows_told_right(seed: int) -> None:
     assert abs(got.height) < 0.03
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [60031, 60151])
+def test_rows_that_cross_in_a_narrow_dip_are_found_with_finer_knots(seed: int) -> None:
+    """Stiff knots led back to the swapped labels: three wrong ones, and no answer."""
+    got = answer(*draw(seed))
+    assert (got.status, got.wrong) == ("ok", 0)
+    assert got.right >= 0.9 * got.shown
+
+
 def test_a_cap_takes_no_answer_s_place() -> None:
     """Begun with caps beside all else, this pool had five wrong labels at its rim."""
     got = answer(*draw(7306))

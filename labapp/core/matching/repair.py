@@ -43,17 +43,20 @@ def with_repaired(observed: Observation, found: list[Hypothesis]) -> list[Hypoth
     comparison yet.
 
     Where rows cross in a dip, growth may swap them; the swapped labels then bend the surface and
-    support each other. The surface through the surrounding labels is more reliable.
+    support each other. The surface through the surrounding labels is more reliable, and follows
+    the dip with finer knots.
     """
     best = min(found, key=lambda hypothesis: hypothesis.misfit, default=None)
     while best is not None:
         labels = np.where(_about_unexplained(observed, best), UNLABELLED, best.labels)
-        tried = [labels] if (labels != best.labels).any() else []
-        tried += [*_closed_up(best), *_opened_up(observed, best)]
-        repaired = [h for labels in tried if (h := grow_and_evaluate(observed, labels))]
-        if not explains(observed, best):
-            finer = grow_and_evaluate(observed, best.labels, knot_mm=FINE_KNOTS.knot_mm)
-            repaired += [finer] if finer is not None else []
+        tried = [*_closed_up(best), *_opened_up(observed, best)]
+        finer = [] if explains(observed, best) else [best.labels]
+        if (labels != best.labels).any():
+            tried, finer = [labels, *tried], [labels, *finer]
+        grown = [grow_and_evaluate(observed, labels) for labels in tried]
+        knot_mm = FINE_KNOTS.knot_mm
+        grown += [grow_and_evaluate(observed, labels, knot_mm=knot_mm) for labels in finer]
+        repaired = [hypothesis for hypothesis in grown if hypothesis is not None]
         cheapest = min(repaired, key=lambda hypothesis: hypothesis.misfit, default=best)
         best = cheapest if cheapest.misfit < best.misfit else None
         found = found if best is None else [*found, best]
