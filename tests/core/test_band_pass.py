@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from labapp.core.images import dot_size
-from labapp.core.images.band_pass import band_pass_dots
+from labapp.core.images.band_pass import _tuned, band_pass_dots
 from labapp.core.images.dots import BandPassSettings
 from labapp.core.values import CannotMeasure, FloatArray
 
@@ -192,3 +192,18 @@ def test_noise_beside_a_blank_part_has_no_more_blobs_than_are_looked_at() -> Non
     bands = dict(dot_size._bands(frame))
     counts = [len(dot_size._blobs(bands, scale, 0.0).own) for scale in sorted(bands)[:-1]]
     assert max(counts) == dot_size.MOST_BLOBS
+
+
+def test_ripples_of_a_compressed_picture_are_neither_peaks_nor_spikes() -> None:
+    """Compression leaves flat areas without noise, beside which every ripple would stand out."""
+    noise = np.random.default_rng(3).normal(20.0, 1.5, SHAPE)
+    image = np.clip(np.rint(draw(grid(), 2.0, 40.0) + noise), 0, 255).astype(np.uint8)
+    coded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 40])[1]
+    frame = np.asarray(cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE))
+    assert np.median(np.abs(np.diff(frame.astype(int)))) == 0
+    tuning, seen = _tuned(frame, BandPassSettings())
+    assert len(seen.peaks(tuning)[0]) <= 1.5 * len(grid())
+    assert np.mean(seen.picture != frame) < 0.001
+    dots = band_pass_dots(frame, BandPassSettings())
+    assert len(dots) == len(grid())
+    assert np.abs(offsets(dots.image_px, grid())).max() < 0.5

@@ -416,18 +416,26 @@ def spikes(
 
 @_compiled(_ints, _ints, types.Array(types.boolean, 1, "A", readonly=True))
 def connected_pixels(u: IntArray, v: IntArray, begun: BoolArray) -> BoolArray:
-    """Select the seed pixels and all pixels that are 8-connected to them."""
+    """Select the seed pixels and all pixels that are 8-connected to them.
+
+    The pixels are in the order of the picture's rows, and of the columns within a row.
+    """
     result, waiting = begun.copy(), np.flatnonzero(begun)
     next_ones = np.empty(len(u), np.int64)
     next_ones[: len(waiting)] = waiting
+    width = u.max() + 2 if len(u) else 2  # one more than there are, which separates the rows
+    place = v * width + u
     count, done = len(waiting), 0
     while done < count:
-        own = next_ones[done]
+        own = place[next_ones[done]]
         done += 1
-        for k in range(len(u)):
-            if not result[k] and abs(u[k] - u[own]) <= 1 and abs(v[k] - v[own]) <= 1:
-                result[k], next_ones[count] = True, k
-                count += 1
+        for row in (own - width, own, own + width):
+            k = np.searchsorted(place, row - 1)
+            while k < len(place) and place[k] <= row + 1:
+                if not result[k]:
+                    result[k], next_ones[count] = True, k
+                    count += 1
+                k += 1
     return result
 
 

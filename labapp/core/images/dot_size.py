@@ -16,6 +16,10 @@ from labapp.core.values import BoolArray, FloatArray, IntArray
 TILE_PX = 40
 """Noise is estimated in tiles of about this side."""
 
+LEAST_BYTE_NOISE = 0.5
+"""Least noise of a picture of bytes, grey levels. Video compression leaves flat areas, in which no
+noise is seen; in the ripples around them thousands of peaks and spikes would stand out of none."""
+
 SPIKE = 6.0
 """A spike exceeds the light that a dot could have by at least this many noise σ."""
 
@@ -64,7 +68,7 @@ def local_noise(picture: Picture) -> Grey:
     """Estimate the local standard deviation of the camera's noise, grey levels.
 
     From a difference operator that suppresses smooth structure, dots included (Immerkær 1996), by
-    the scaled median over tiles.
+    the scaled median over tiles; at least `LEAST_BYTE_NOISE` for bytes.
     """
     from labapp.core.images import size_kernels
 
@@ -73,7 +77,10 @@ def local_noise(picture: Picture) -> Grey:
     medians = size_kernels.tile_noise(picture, rows, columns)
     if min(medians.shape) >= 3:
         medians = np.asarray(cv2.medianBlur(medians, 3), np.float32)
-    return np.asarray(cv2.resize(1.4826 * medians, (width, height)), np.float32)
+    sigma = 1.4826 * medians
+    if picture.dtype == np.uint8:
+        sigma = np.maximum(sigma, np.float32(LEAST_BYTE_NOISE))
+    return np.asarray(cv2.resize(sigma, (width, height)), np.float32)
 
 
 def without_spikes(
