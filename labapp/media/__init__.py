@@ -24,6 +24,9 @@ VIDEO_SUFFIXES = frozenset(
 )
 RECORDING_SUFFIXES = VIDEO_SUFFIXES | {".cine", ".npy", ".npz"} | PHOTRON_SUFFIXES
 
+NAME_ONE = "name the one to open, or measure them all as a study"
+"""Advice for a folder with several recordings."""
+
 
 def open_source(path: str | os.PathLike[str], index: bytes | None = None) -> FrameSource:
     """Open a recording; its type is recognised by its content, or else by its name.
@@ -118,10 +121,10 @@ def _open_folder(path: Path, index: bytes | None) -> FrameSource:
         return open_source(found[0], index)
     if found:
         names = ", ".join(entry.name for entry in found)
-        raise InputError(path, "folder", names, "one recording in it, or name the one to open")
-    raise InputError(
-        path,
-        "folder",
-        "no image or recording in it",
-        "a folder of images (PNG, TIFF, BMP, JPEG, PGM) or with one video in it",
-    )
+        raise InputError(path, "folder", names, f"one recording in it; {NAME_ONE}")
+    wanted = "a folder of images (PNG, TIFF, BMP, JPEG, PGM) or with one video in it"
+    if any(entry.is_dir() for entry in path.iterdir()):
+        raise InputError(
+            path, "folder", "folders, but no image or recording", f"{wanted}; {NAME_ONE}"
+        )
+    raise InputError(path, "folder", "no image or recording in it", wanted)

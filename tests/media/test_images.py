@@ -291,12 +291,14 @@ def test_what_is_no_regular_file_is_refused(tmp_path: Path, name: str) -> None:
 def test_what_is_no_source_is_refused(tmp_path: Path) -> None:
     empty = tmp_path / "empty"
     empty.mkdir()
+    (tmp_path / "day" / "run").mkdir(parents=True)
     nothing = tmp_path / "frame.png"
     nothing.touch()
     text = tmp_path / "text.png"
     text.write_text("not an image\n" * 50)
     for path, said in [
         (empty, "no image or recording in it; expected a folder of images"),
+        (tmp_path / "day", "folders, but no image or recording; .* as a study"),
         (nothing, "0 bytes; expected an image or a video"),
         (text, "cannot be decoded; expected a complete image"),
         (tmp_path / "missing.png", "No such file or directory; expected an image, a folder"),
