@@ -342,7 +342,13 @@ class Pool:
         foot = self.footprint
         middle = np.array([0.0, (foot.head_mm - foot.tail_mm) / 2]) + foot.center_mm
         extent = np.array([foot.width_mm, foot.head_mm + foot.tail_mm])
-        return size_of(self.height, self.boundary_mm(), middle, extent)
+        if self.terms:
+            return size_of(self.height, self.boundary_mm(), middle, extent)
+        # The extremes of an undisturbed cap are its centre and its boundary.
+        ends = np.vstack([[*foot.center_mm, self.peak_mm], self.boundary_mm()]).tolist()
+        high, low = max(ends, key=lambda end: end[2]), min(ends, key=lambda end: end[2])
+        (x, y, top), (u, v, bottom) = high, low
+        return PoolSize(*extent.tolist(), top, bottom, (x, y), (u, v))
 
     def after(self, seconds: float) -> Pool:
         """The same pool ``seconds`` later; itself if nothing on it oscillates."""
