@@ -59,6 +59,7 @@ SHARING = (
     "pages/test_bench_check.py",
     "session/test_line_sessions.py",
     "session/test_report.py",
+    "study/test_study.py",
     "simulated/test_glass_and_travel.py",
     "simulated/test_simulate.py",
     "test_adviser.py",
