@@ -49,7 +49,29 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: item.get_closest_marker("slow") is None)
 
 
-SHARING = ("test_adviser.py", "test_error_analysis.py", "test_tour.py", "test_wheel.py")
+SHARING = (
+    "core/test_board_calibration.py",
+    "core/test_correspondence.py",
+    "core/test_pipeline.py",
+    "core/test_quality.py",
+    "core/test_warm.py",
+    "export/test_penetration.py",
+    "pages/test_bench_check.py",
+    "session/test_line_sessions.py",
+    "session/test_report.py",
+    "study/test_study.py",
+    "simulated/test_glass_and_travel.py",
+    "simulated/test_simulate.py",
+    "test_adviser.py",
+    "test_api.py",
+    "test_cli_session.py",
+    "test_cli_simulate.py",
+    "test_error_analysis.py",
+    "test_measurers.py",
+    "test_tools_study.py",
+    "test_tour.py",
+    "test_wheel.py",
+)
 """Files of which one worker runs all tests: what these share takes long to make."""
 
 

@@ -46,6 +46,15 @@ class SeenDots:
     ray: IntArray
 
 
+def gaussian_dots(shape: tuple[int, int], places_px: FloatArray, size_px: float) -> FloatArray:
+    """Sum of round Gaussian dots of peak 1 at (u, v), shape (n, 2), px: each is a product."""
+    along, across = (
+        np.exp(-((np.arange(length)[:, None] - at) ** 2) / (2 * size_px**2))
+        for length, at in zip(shape, places_px.T[::-1], strict=True)
+    )
+    return np.asarray(along @ across.T)
+
+
 def see(
     pool: PoolSurface,
     rng: np.random.Generator,

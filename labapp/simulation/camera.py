@@ -36,13 +36,12 @@ class Lens:
     def _radial(self, r2: FloatArray) -> FloatArray:
         return np.asarray(1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3)))
 
-    def _tangential(self, x: FloatArray, y: FloatArray, r2: FloatArray) -> FloatArray:
-        return np.stack(
-            [
-                2 * self.p1 * x * y + self.p2 * (r2 + 2 * x**2),
-                self.p1 * (r2 + 2 * y**2) + 2 * self.p2 * x * y,
-            ],
-            axis=-1,
+    def _tangential(
+        self, x: FloatArray, y: FloatArray, r2: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        return (
+            2 * self.p1 * x * y + self.p2 * (r2 + 2 * x**2),
+            self.p1 * (r2 + 2 * y**2) + 2 * self.p2 * x * y,
         )
 
     @property
@@ -59,7 +58,7 @@ class Lens:
         xy = straight_px / self.focal_px
         x, y = xy[..., 0], xy[..., 1]
         r2 = x**2 + y**2
-        seen = xy * self._radial(r2)[..., None] + self._tangential(x, y, r2)
+        seen = xy * self._radial(r2)[..., None] + np.stack(self._tangential(x, y, r2), axis=-1)
         return np.asarray(np.where((r2 < self._reach2)[..., None], seen * self.focal_px, np.nan))
 
     def straighten(self, seen_px: FloatArray) -> FloatArray:
@@ -71,17 +70,35 @@ class Lens:
         return np.asarray(xy.reshape(np.shape(seen_px)) * self.focal_px)
 
     def _straightened(self, seen: FloatArray) -> FloatArray:
-        xy, bent = seen, self.p1 != 0 or self.p2 != 0
+        # Coordinate by coordinate: NumPy is slow along an axis of length 2.
+        seen_x, seen_y = np.ascontiguousarray(seen.T)
+        if self.p1 == 0 and self.p2 == 0:
+            return seen * self._shortening(seen_x**2 + seen_y**2)[..., None]
+        x, y = seen_x, seen_y
         with np.errstate(all="ignore"):
             for _ in range(ROUNDS):
-                x, y = xy[..., 0], xy[..., 1]
                 r2 = x**2 + y**2
-                former = xy
-                shifted = seen - self._tangential(x, y, r2) if bent else seen
-                xy = shifted / self._radial(r2)[..., None]
-                if not np.nanmax(np.abs(xy - former), initial=0.0) > 1e-13:
+                before, radial = (x, y), self._radial(r2)
+                aside_x, aside_y = self._tangential(x, y, r2)
+                x, y = (seen_x - aside_x) / radial, (seen_y - aside_y) / radial
+                if max(_largest(x - before[0]), _largest(y - before[1])) <= 1e-13:
                     break
-        return xy
+        return np.stack([x, y], axis=-1)
+
+    def _shortening(self, seen2: FloatArray) -> FloatArray:
+        """Ratio of the true to the distorted radius, by radial terms alone, for squares of it."""
+        ratio = np.ones_like(seen2)
+        with np.errstate(all="ignore"):
+            for _ in range(ROUNDS):
+                before, ratio = ratio, 1.0 / self._radial(seen2 * ratio**2)
+                if _largest(ratio - before) <= 1e-13:
+                    break
+        return ratio
+
+
+def _largest(change: FloatArray) -> float:
+    """Largest absolute value, NaN ignored."""
+    return float(np.fmax.reduce(np.abs(change), initial=0.0))
 
 
 @dataclass(frozen=True)
@@ -252,5 +269,7 @@ class PosedView(ReadOnlyArrays):
 
 
 def _projected(matrix: FloatArray, points: FloatArray) -> FloatArray:
-    seen = points @ matrix[:, :2].T + matrix[:, 2]
-    return np.asarray(seen[..., :2] / seen[..., 2:])
+    # Coordinate by coordinate: NumPy is slow along an axis of length 2.
+    first, second = np.moveaxis(points, -1, 0)
+    seen = [by_first * first + by_second * second + by for by_first, by_second, by in matrix]
+    return np.stack([seen[0] / seen[2], seen[1] / seen[2]], axis=-1)

@@ -6,6 +6,7 @@ of the rig's pattern, without any of the measuring code.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -27,8 +28,14 @@ SLACK_MM = 0.05
 CLEAR_MM = 1e-6
 """A ray no deeper than this below the surface does not hit it: rounding on a flat pool."""
 
-HALVINGS = 52
-"""Bisections of a step, down to double precision."""
+TOGETHER = 16
+"""Steps of all rays that are computed at a time: few enough to stay in the processor's cache."""
+
+ROUNDS = 60
+"""At most, of the search for a reflection point within a step."""
+
+EXACT_MM = 1e-13
+"""Distance of a point from the surface at which the search ends."""
 
 
 class PoolSurface(Protocol):
@@ -118,12 +125,14 @@ def trace(pool: PoolSurface, rig: Rig, torch: Torch | None = None) -> Reflection
     absent = np.zeros(hit.shape, bool)
     for i, j in rig.pattern.absent_rays:
         absent[i - 1, j - 1] = True
+    hits_again = np.zeros(hit.shape, bool)
+    hits_again[hit] = _hits_again(pool, point[hit], reflected[hit])
     return Reflections(
         absent=absent,
         hit=hit,
         incident_blocked=incident_blocked,
         reflected_blocked=reflected_blocked,
-        hits_again=_hits_again(pool, point, reflected),
+        hits_again=hits_again,
         on_plane=np.asarray(((plane >= 0) & (plane <= limit)).all(axis=-1)),
         point_mm=point,
         incident=incident,
@@ -210,12 +219,12 @@ def _first_hit(
 ) -> tuple[FloatArray, BoolArray]:
     """First point of each ray on the pool, NaN if it does not hit it first, and whether it does.
 
-    The rays are sampled from above the pool to below it, and the first step that goes below the
-    surface is bisected. Where a low rear leaves a step between the pool and the work piece, a ray
-    can meet the step; that is not a reflection point either.
+    The rays are sampled from above the pool to below it, and the crossing is searched within the
+    first step that goes below the surface. Where a low rear leaves a step between the pool and the
+    work piece, a ray can meet the step; that is not a reflection point either.
     """
 
-    def above(t: FloatArray) -> FloatArray:
+    def above(t: FloatArray, direction: FloatArray) -> FloatArray:
         x, y, z = (source[n] + t * direction[..., n] for n in range(3))
         ground = pool.height(x, y)
         return np.asarray(z - np.where(np.isnan(ground), 0.0, ground))
@@ -228,22 +237,53 @@ def _first_hit(
     falls = direction[..., 2] < 0
     down = np.where(falls, direction[..., 2], -1.0)
     steps = (levels[:, None, None] - source[2]) / down
-    under = above(steps) <= 0
+    parts = (slice(first, first + TOGETHER) for first in range(0, SAMPLES, TOGETHER))
+    under = np.concatenate([above(steps[part], direction) <= 0 for part in parts])
     first = np.maximum(np.argmax(under, axis=0), 1)
     far = np.take_along_axis(steps, first[None], axis=0)[0]
     near = np.take_along_axis(steps, first[None] - 1, axis=0)[0]
-    for _ in range(HALVINGS):
-        middle = (near + far) / 2
-        below = above(middle) <= 0
-        near, far = np.where(below, near, middle), np.where(below, middle, far)
+    meets = falls & under.any(axis=0)
+    far[meets] = _crossing(above, near[meets], far[meets], direction[meets])
     point = source + far[..., None] * direction
     ground = pool.height(point[..., 0], point[..., 1])
-    hit = falls & under.any(axis=0) & (np.abs(point[..., 2] - ground) < 1e-9)
+    hit = meets & (np.abs(point[..., 2] - ground) < 1e-9)
     return np.where(hit[..., None], point, np.nan), np.asarray(hit)
 
 
+def _crossing(
+    above: Callable[[FloatArray, FloatArray], FloatArray],
+    near: FloatArray,
+    far: FloatArray,
+    direction: FloatArray,
+) -> FloatArray:
+    """Ray parameter where a ray goes below the surface between two others, shape (n,).
+
+    False position with the Illinois algorithm (Dowell & Jarratt 1971); each third step halves, so
+    that the search also ends at a step of the surface.
+    """
+    found, left = far.copy(), np.arange(len(far))
+    of_near, of_far = above(near, direction), above(far, direction)
+    for k in range(ROUNDS):
+        share = 0.5 if k % 3 == 2 else of_far / (of_far - of_near)
+        middle = far - share * (far - near)
+        of_middle = above(middle, direction[left])
+        below = of_middle <= 0
+        # The end that stays loses half its weight, else it would stay for ever.
+        of_near = np.where(below, of_near / 2, of_middle)
+        of_far = np.where(below, of_middle, of_far / 2)
+        near, far = np.where(below, near, middle), np.where(below, middle, far)
+        found[left] = np.where(np.abs(of_middle) < EXACT_MM, middle, far)
+        still = np.abs(of_middle) >= EXACT_MM
+        left, near, far, of_near, of_far = (
+            values[still] for values in (left, near, far, of_near, of_far)
+        )
+        if not len(left):
+            break
+    return found
+
+
 def _hits_again(pool: PoolSurface, point: FloatArray, direction: FloatArray) -> BoolArray:
-    """Whether rays that leave the pool at points along unit vectors meet it again.
+    """Whether rays that leave the pool at points along unit vectors, (n, 3), meet it again.
 
     They are sampled until they are above its highest point or beyond its extent.
     """
@@ -253,9 +293,13 @@ def _hits_again(pool: PoolSurface, point: FloatArray, direction: FloatArray) -> 
         up = np.where(rise > 0, (size.height_mm - point[..., 2]) / rise, np.inf)
         away = np.hypot(size.width_mm, size.length_mm) / run
     # Starts at the first step: at its start the ray is on the surface, to rounding.
-    t = np.minimum(up, away) * np.linspace(0, 1, SAMPLES + 1)[1:, None, None]
-    x, y, z = (point[..., n] + t * direction[..., n] for n in range(3))
-    return np.asarray((pool.height(x, y) - z > CLEAR_MM).any(axis=0))
+    share, reach = np.arange(1, SAMPLES + 1) / SAMPLES, np.minimum(up, away)
+    met = np.zeros(rise.shape, bool)
+    for first in range(0, SAMPLES, TOGETHER):
+        t = reach * share[first : first + TOGETHER, None]
+        x, y, z = (point[..., n] + t * direction[..., n] for n in range(3))
+        met |= (pool.height(x, y) - z > CLEAR_MM).any(axis=0)
+    return met
 
 
 def _on_imaging_plane(point: FloatArray, direction: FloatArray, rig: Rig) -> FloatArray:

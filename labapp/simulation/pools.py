@@ -58,11 +58,11 @@ class Footprint:
         dx = np.asarray(x_mm, float) - self.center_mm[0]
         dy = np.asarray(y_mm, float) - self.center_mm[1]
         # The map's pole is more than two lengths away, clearly outside.
-        dy = np.clip(dy, -2 * self.tail_mm, 2 * self.head_mm)
+        dy = np.minimum(np.maximum(dy, -2 * self.tail_mm), 2 * self.head_mm)
         below = 1 + skew * dy
         p, q = dx / half, slope * dy / below
         return Place(
-            x_mm=dx, y_mm=dy, p=p, q=q, p_x=1 / half, q_y=slope / below**2, rho2=p**2 + q**2
+            x_mm=dx, y_mm=dy, p=p, q=q, p_x=1 / half, slope=slope, below=below, rho2=p**2 + q**2
         )
 
 
@@ -71,7 +71,8 @@ class Place:
     """Points in the coordinates of a footprint.
 
     ``x_mm, y_mm`` from its centre, ``p`` and ``q`` across and along it (±1 at its ends), their
-    derivatives ``p_x`` = dp/dx and ``q_y`` = dq/dy, and ``rho2`` = p² + q², 1 at the boundary.
+    derivatives ``p_x`` = dp/dx and ``q_y`` = dq/dy = slope/below², and ``rho2`` = p² + q², 1 at the
+    boundary.
     """
 
     x_mm: FloatArray
@@ -79,8 +80,14 @@ class Place:
     p: FloatArray
     q: FloatArray
     p_x: float
-    q_y: FloatArray
+    slope: float
+    below: FloatArray
     rho2: FloatArray
+
+    @property
+    def q_y(self) -> FloatArray:
+        """dq/dy."""
+        return np.asarray(self.slope / self.below**2)
 
     def gradient(self, by_p: FloatArray, by_q: FloatArray) -> FloatArray:
         """(∂/∂x, ∂/∂y), shape (…, 2), of a function whose ∂/∂p and ∂/∂q are given."""
@@ -246,10 +253,11 @@ class Wave:
 
     def height(self, place: Place) -> FloatArray:
         """Height that it adds, mm."""
-        radial, _ = self._radial
+        radial = self._radial[0](np.minimum(place.rho2, 1))
+        if not self.mode[0]:
+            return np.asarray(self._weight.real * radial)
         run = place.p + 1j * place.q
-        mode = radial(np.minimum(place.rho2, 1)) * run ** self.mode[0]
-        return np.asarray((self._weight * mode).real)
+        return np.asarray((self._weight * radial * run ** self.mode[0]).real)
 
     def gradient(self, place: Place) -> FloatArray:
         """Gradient that it adds, shape (…, 2)."""
@@ -334,7 +342,13 @@ class Pool:
         foot = self.footprint
         middle = np.array([0.0, (foot.head_mm - foot.tail_mm) / 2]) + foot.center_mm
         extent = np.array([foot.width_mm, foot.head_mm + foot.tail_mm])
-        return size_of(self.height, self.boundary_mm(), middle, extent)
+        if self.terms:
+            return size_of(self.height, self.boundary_mm(), middle, extent)
+        # The extremes of an undisturbed cap are its centre and its boundary.
+        ends = np.vstack([[*foot.center_mm, self.peak_mm], self.boundary_mm()]).tolist()
+        high, low = max(ends, key=lambda end: end[2]), min(ends, key=lambda end: end[2])
+        (x, y, top), (u, v, bottom) = high, low
+        return PoolSize(*extent.tolist(), top, bottom, (x, y), (u, v))
 
     def after(self, seconds: float) -> Pool:
         """The same pool ``seconds`` later; itself if nothing on it oscillates."""

@@ -10,6 +10,7 @@ from labapp.core.images import dot_size
 from labapp.core.images.band_pass import _tuned, band_pass_dots
 from labapp.core.images.dots import BandPassSettings
 from labapp.core.values import CannotMeasure, FloatArray
+from tests.scenes import gaussian_dots
 
 SHAPE = (240, 320)
 
@@ -23,11 +24,7 @@ def grid(spacing: float = 24.0) -> FloatArray:
 
 
 def draw(places: FloatArray, size: float, peak: float) -> FloatArray:
-    v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
-    frame = np.zeros(SHAPE)
-    for a, b in places:
-        frame += peak * np.exp(-((u - a) ** 2 + (v - b) ** 2) / (2 * size**2))
-    return frame
+    return peak * gaussian_dots(SHAPE, places, size)
 
 
 def offsets(found: FloatArray, true: FloatArray) -> FloatArray:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import cv2
 import numpy as np
 import pytest
@@ -30,6 +32,7 @@ def lens(percent: float, **terms: float) -> Lens | None:
     return Lens(FOCAL_PX, k1=percent / 100 / CORNER**2, **terms) if percent else None
 
 
+@cache
 def shot(
     board, percent=0.0, turned=(1.0, -2.0, 1.3), center=None, seed=1, px_per_mm=5.0, axis=None
 ):
@@ -42,6 +45,13 @@ def shot(
     return view, render_target(PrintedBoard(board), view, look, np.random.default_rng(seed))
 
 
+@cache
+def calibrated(board, percent=-1.0):
+    """The board's view of the usual pose, and what it is calibrated to."""
+    view, image = shot(board, percent)
+    return view, calibrate_board([image])
+
+
 def off_mm(found: BoardCalibration, view: PosedView) -> np.ndarray:
     """How far places all over the picture are from where they are on the plane, mm."""
     u, v = np.linspace(5, WIDTH - 6, 9), np.linspace(5, HEIGHT - 6, 9)
@@ -52,8 +62,7 @@ def off_mm(found: BoardCalibration, view: PosedView) -> np.ndarray:
 @pytest.mark.parametrize("board", [CHARUCO, CHESS], ids=lambda board: board.kind)
 @pytest.mark.parametrize("percent", [-1.0, 0.5, 0.0])
 def test_lens_and_plane_are_found(board, percent):
-    view, image = shot(board, percent, seed=3)
-    found = calibrate_board([image])
+    view, found = calibrated(board, percent)
     value, sigma = found.distortion_percent
     assert found.board == board
     assert abs(value - percent) < 3 * sigma < 0.15
@@ -63,8 +72,7 @@ def test_lens_and_plane_are_found(board, percent):
 
 
 def test_corners_are_as_noisy_as_is_said():
-    view, image = shot(CHARUCO, -1.0)
-    found = calibrate_board([image])
+    view, found = calibrated(CHARUCO)
     true = view.to_image(found.seen[0].plane_mm)
     off = found.seen[0].image_px - true
     assert np.sqrt(np.mean(off**2)) == pytest.approx(found.fit.sigma_px, rel=0.2)
@@ -125,7 +133,7 @@ def test_further_pictures_tell_more_and_agree_with_opencv():
     view, first = shot(CHARUCO, -1.0)
     poses = [((15, 0, 0), (40, 20)), ((0, -15, 3), (30, 60)), ((-10, 12, -4), (50, 50))]
     more = [shot(CHARUCO, -1.0, turned, center, k)[1] for k, (turned, center) in enumerate(poses)]
-    one, all_ = calibrate_board([first]), calibrate_board([first, *more])
+    one, all_ = calibrated(CHARUCO)[1], calibrate_board([first, *more])
     assert all_.distortion_percent[1] < 0.8 * one.distortion_percent[1]
     assert off_mm(all_, view).max() < 0.04
     on_board = [np.column_stack([s.plane_mm, np.zeros(len(s.index))]) for s in all_.seen]
@@ -225,7 +233,7 @@ def test_known_lens_straightens_the_target():
     rng, target = np.random.default_rng(2), Target()
     view = PosedView.at((36.0, 36.0), 6.2, turned_deg=(0, 0, 0.6), lens=lens(-1.0))
     picture = render_target(target, view, TargetLook(), rng)
-    known = calibrate_board([shot(CHARUCO, -1.0)[1]]).image_calibration.lens
+    known = calibrated(CHARUCO)[1].image_calibration.lens
     settings = PlaneCalibrationSettings(unit_mm=target.unit_mm)
     with_lens = calibrate_imaging_plane([picture], settings, lens=known)
     without = calibrate_imaging_plane([picture], settings)
@@ -233,14 +241,14 @@ def test_known_lens_straightens_the_target():
 
 
 def test_setup_keys_are_those_of_a_setup_file():
-    keys = calibrate_board([shot(CHARUCO, -1.0)[1]]).setup_keys
+    keys = calibrated(CHARUCO)[1].setup_keys
     for section, values in keys.items():
         assert set(values) <= set(SECTIONS[section])
         assert all(SECTIONS[section][k].accepts(v) for k, v in values.items() if v is not None)
 
 
 def test_square_scales_the_plane():
-    found = calibrate_board([shot(CHARUCO)[1]])
+    _, found = calibrated(CHARUCO, 0.0)
     larger = found.with_square(8.4)
     assert larger.px_per_mm[0] == pytest.approx(found.px_per_mm[0] * 8.0 / 8.4)
     assert larger.distortion_percent == pytest.approx(found.distortion_percent)

@@ -39,6 +39,7 @@ def answered_with_set_up_off(kind: str, seed: int, *, is_exact: bool = False) ->
     return answer(pool, seen, replace(off, uncertainty=None) if is_exact else off)
 
 
+@pytest.mark.slow
 def test_what_lies_apart_is_put_up_with_as_far_as_a_wrong_set_up_leaves_it() -> None:
     """Of a looser rule all labels were wrong, with thirteen dots and six rays left over."""
     got = answered_with_set_up_off("rippled", 7020, is_exact=True)

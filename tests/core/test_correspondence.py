@@ -175,6 +175,7 @@ def test_the_orientation_is_right_and_far_ahead(answers: list[Answer]) -> None:
     assert seen == {"S/S", "I/I"}
 
 
+@pytest.mark.slow
 def test_a_match_is_whole(answers: list[Answer]) -> None:
     for answer, match in answered(answers):
         assert len(np.unique(match.dot)) == len(match.dot)
@@ -191,6 +192,7 @@ def test_a_match_is_whole(answers: list[Answer]) -> None:
         assert (offset == offset[0]).all()
 
 
+@pytest.mark.slow
 def test_rays_that_are_said_to_have_stayed_away_did(answers: list[Answer]) -> None:
     # Neither those that the torch hides nor those that miss the plane. A dot that the test took
     # out at the rim cannot be known to have been there.
@@ -539,6 +541,7 @@ def test_a_few_rows_round_the_reference_are_enough() -> None:
     assert len(match.dot) >= 0.95 * len(seen.ray)
 
 
+@pytest.mark.slow
 def test_scattered_dots_have_no_rays() -> None:
     scattered = np.random.default_rng(1).uniform(40.0, 440.0, (60, 2))
     match, status = matched(as_dots(scattered))

@@ -12,7 +12,7 @@ from labapp.core.rows.find_lattice import LatticeSettings, find_lattice
 from labapp.core.rows.lattice_growth import grow_lattice
 from labapp.core.rows.row_search import mask_rows, search_rows
 from labapp.core.values import CannotMeasure, FloatArray
-from tests.scenes import as_dots
+from tests.scenes import as_dots, gaussian_dots
 
 SHAPE = (400, 420)
 
@@ -26,11 +26,8 @@ def places() -> FloatArray:
 
 @pytest.fixture(scope="module")
 def frame() -> FloatArray:
-    v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
     noise = np.random.default_rng(0).normal(30.0, 0.6, SHAPE)
-    for a, b in places():
-        noise += 60.0 * np.exp(-((u - a) ** 2 + (v - b) ** 2) / (2 * 2.4**2))
-    return noise
+    return noise + 60.0 * gaussian_dots(SHAPE, places(), 2.4)
 
 
 @pytest.mark.parametrize("method", ["band-pass", "block-threshold", "wavelet"])

@@ -76,6 +76,7 @@ def test_with_dots_missing_and_false_no_row_is_wrong(seed: int, missing: int, fa
     assert answer(*draw(seed, missing, false)).wrong == 0
 
 
+@pytest.mark.slow
 def test_the_boundary_alone_speaks_against_no_rows() -> None:
     """Its likelihood, unbounded, had rows that are right lose to others."""
     got = answer(*draw(9007, missing=6, false=3))
@@ -165,6 +166,7 @@ def test_a_row_that_may_have_left_the_view_is_not_called_dark() -> None:
     assert abs(size.height_mm - pool.size.height_mm) < 2 * size.height_sigma_mm
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [51000, 51009, 51018])
 def test_a_dot_that_is_missing_at_the_rim_does_not_lower_the_pool(seed: int) -> None:
     """A dark ray beside the boundary may have come back, as often as dots are missing elsewhere."""

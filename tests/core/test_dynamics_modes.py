@@ -63,6 +63,7 @@ def two_modes(rng):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("rate_hz", [200, 1000])
 def test_two_modes_at_once_with_noise_and_lost_frames(rate_hz):
     rng = np.random.default_rng(7)

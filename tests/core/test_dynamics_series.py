@@ -71,6 +71,7 @@ def second_order(time, zeta, omega):
     return 1 + parts.sum(axis=1).real
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [1, 2])
 def test_a_step_response_against_truth(order):
     rng, time = np.random.default_rng(order), np.arange(1000) / 200
@@ -97,6 +98,7 @@ def test_a_step_response_against_truth(order):
     assert 0.88 < np.mean(np.abs(scores) < 1.96) <= 1
 
 
+@pytest.mark.slow
 def test_noise_does_not_respond():
     rng, time = np.random.default_rng(9), np.arange(1000) / 200
     found = [step_response(time, rng.normal(5, 0.02, 1000), 1.5) for _ in range(10)]

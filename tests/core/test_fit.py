@@ -72,6 +72,7 @@ def test_head_and_rear_of_a_pool_may_miss_the_plane(width_mm: float, depth_mm: f
     assert sizes.length_mm == pytest.approx(width_mm, rel=0.02)
 
 
+@pytest.mark.slow
 def test_the_28_caps_of_8_3_1() -> None:
     depth, width, length, ratio = [], [], [], []
     for cap in caps_8_3_1():

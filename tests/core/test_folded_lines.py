@@ -17,6 +17,7 @@ from tests.setups import FIVE_LINES
 VIEW = CameraView((2.0, 638.0), (452.0, 638.0), 60.0, (2.0, 188.0), 60.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("number", "sign"),
     [

@@ -323,6 +323,7 @@ def test_a_frame_of_one_or_a_few_dots_is_answered(count: int) -> None:
     assert result.reason
 
 
+@pytest.mark.slow
 def test_a_step_that_cannot_be_done_keeps_those_before_it(
     images: dict[int, npt.NDArray[np.generic]],
 ) -> None:

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from labapp.core.images.band_pass import DetectorTuning, band_pass_dots, quick_dots
 from labapp.core.images.dots import BandPassSettings
 from labapp.core.values import CannotMeasure, FloatArray
+from tests.scenes import gaussian_dots
 
 SIZE_PX = 2.0
 SHAPE = (480, 320)
@@ -18,10 +19,9 @@ SHAPE = (480, 320)
 
 def frame(place: FloatArray, rng: np.random.Generator, hot: int = 0) -> FloatArray:
     """Gaussian dots of 40 grey levels at places (u, v) in noise of 1.5, and hot pixels."""
-    v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
+    v = np.arange(SHAPE[0])[:, None]
     image = 20.0 + 10.0 * v / SHAPE[0] + rng.normal(0.0, 1.5, SHAPE)
-    for at in place:
-        image += 40.0 * np.exp(-((u - at[0]) ** 2 + (v - at[1]) ** 2) / (2 * SIZE_PX**2))
+    image += 40.0 * gaussian_dots(SHAPE, place, SIZE_PX)
     image[rng.integers(0, SHAPE[0], hot), rng.integers(0, SHAPE[1], hot)] += 120.0
     return np.clip(np.rint(image), 0, 255).astype(np.uint8)
 
@@ -73,8 +73,7 @@ def test_dots_in_a_part_of_the_picture_are_those_of_the_whole_of_it(
     group = group[(group[:, 0] < 160.0) & (np.abs(group[:, 1] - 180.0) < 90.0)]
     first, faint = frame(group, rng), [255.0 + seed, 431.0 + seed]
     image = frame(group, rng, hot=6).astype(float)
-    v, u = np.mgrid[: SHAPE[0], : SHAPE[1]]
-    image += 12.0 * np.exp(-((u - faint[0]) ** 2 + (v - faint[1]) ** 2) / (2 * SIZE_PX**2))
+    image += 12.0 * gaussian_dots(SHAPE, np.array([faint]), SIZE_PX)
     tuning = DetectorTuning.of(first, BandPassSettings())
     made = []
     for halved in (0.0, np.inf):

@@ -25,8 +25,8 @@ from labapp.studies.setup_budget import SetupBudget, budget_table, similar_pool
 
 @pytest.fixture(scope="module")
 def ce() -> ErrorSurvey:
-    """Every scheme on the 28 caps of §8.3.1, each at one of its centres."""
-    return survey("CE", caps=aside(caps_8_3_1(), 1), workers=1)
+    """Two schemes on the 28 caps of §8.3.1, each at one of its centres."""
+    return survey("CE", ("ers", "fit"), caps=aside(caps_8_3_1(), 1), workers=1)
 
 
 @pytest.mark.slow
@@ -56,8 +56,9 @@ def test_fit_is_below_ers(ce: ErrorSurvey, surface: str) -> None:
 
 @pytest.mark.slow
 def test_the_best_place_of_the_laser_leaves_ers_less_than_one_percent() -> None:
-    # Fig. 8-8: 0.6 % at most. The deep hollows are the worst of the 28.
-    found = survey("LE", ["ers"], caps=caps_8_3_1()[21:], workers=1)
+    # Fig. 8-8: 0.6 % at most. The deep hollows are the worst of the 28. The fewer the places of the
+    # laser (here 10/3° and 10/3 mm apart), the larger their least error.
+    found = survey("LE", ["ers"], 10 / 3, caps=caps_8_3_1()[21:], workers=1)
     assert found.lost[0] == 0
     assert found.of("ers", "depth").max() < 0.01
 
@@ -65,7 +66,7 @@ def test_the_best_place_of_the_laser_leaves_ers_less_than_one_percent() -> None:
 @pytest.mark.slow
 def test_a_denser_pattern_leaves_less() -> None:
     # §8.3.3, with the laser at nine places.
-    caps = caps_8_3_1()[1::5]
+    caps = caps_8_3_1()[1::9]
     le, me = (survey(kind, ["ers"], 5.0, caps, workers=1) for kind in ("LE", "ME"))
     assert me.of("ers", "depth").mean() < le.of("ers", "depth").mean()
     assert me.of("ers", "actual_are_mm").mean() < le.of("ers", "actual_are_mm").mean()

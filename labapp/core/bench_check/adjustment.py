@@ -14,9 +14,20 @@ from functools import cached_property, partial
 
 import numpy as np
 
-from labapp.core.bench_check.mirrors import Mirror, landing_points
-from labapp.core.geometry.optics import intersect_level, ray_directions
-from labapp.core.geometry.perturbation import OF_PICTURE, moved_dots, moved_rig
+from labapp.core.bench_check.mirrors import Mirror, landing_points, reflected_rays
+from labapp.core.geometry.optics import (
+    intersect_imaging_plane,
+    intersect_level,
+    ray_directions,
+)
+from labapp.core.geometry.perturbation import (
+    OF_PICTURE,
+    OF_PLANE,
+    dots_in_picture,
+    dots_on_moved_plane,
+    moved_plane,
+    moved_rig,
+)
 from labapp.core.geometry.rig import Rig
 from labapp.core.geometry.uncertainty import QUANTITIES
 from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
@@ -198,6 +209,20 @@ class System:
             made.append(np.linalg.inv(np.linalg.cholesky(covariance)))
         return made
 
+    @cached_property
+    def in_picture(self) -> list[FloatArray]:
+        """`dots_in_picture` of each sighting, and of the points 1 mm along X′ and Z′, (3n, 2)."""
+        known = self.rig.uncertainty
+        assert known is not None
+        return [
+            dots_in_picture(
+                np.concatenate([one.plane_mm, *(one.plane_mm + step for step in np.eye(2))]),
+                self.rig,
+                known.axes,
+            )
+            for one in self.sightings
+        ]
+
     def start(self) -> FloatArray:
         """Initial unknowns: the expected bench, each mirror where its dots fit best."""
         unknown = np.zeros(self.size)
@@ -222,23 +247,25 @@ class System:
         plane_mm, whitening
             Shape (n, 2), mm; matrices that make residuals of unit variance, shape (n, 2, 2).
         """
-        known, seen = self.rig.uncertainty, self.sightings[k].plane_mm
+        if not offset[OF_PICTURE].any():
+            return self.sightings[k].plane_mm, self.roots[k]
+        known = self.rig.uncertainty
         assert known is not None
-        places = np.concatenate([seen, *(seen + step for step in np.eye(2))])
-        moved = moved_dots(places, self.rig, known.axes, offset).reshape(3, -1, 2)
-        enlargement = np.stack([moved[1] - moved[0], moved[2] - moved[0]], axis=-1)
-        return moved[0], self.roots[k] @ np.linalg.inv(enlargement)
+        moved = dots_on_moved_plane(self.in_picture[k], self.rig, known.axes, offset)
+        at, right, above = moved.reshape(3, -1, 2)
+        enlargement = np.stack([right - at, above - at], axis=-1)
+        return at, self.roots[k] @ np.linalg.inv(enlargement)
 
-    def computed(self, k: int, offset: FloatArray, pose: FloatArray) -> FloatArray:
-        """Computed dots of a sighting for an offset of the bench, shape (n, 2), mm."""
+    def computed(self, k: int, rig: Rig, pose: FloatArray) -> FloatArray:
+        """Computed dots of a sighting on a moved rig, shape (n, 2), mm."""
         one = self.sightings[k]
-        rig = moved_rig(self.rig, offset)
         return landing_points(one.mirror, self.pose(k, pose), rig, tuple(one.ray.T))[0]
 
     def residual_mm(self, k: int, bench: FloatArray, pose: FloatArray) -> FloatArray:
         """Observed minus computed dots of a sighting, shape (n, 2), mm."""
         offset = self.factor @ bench
-        return np.asarray(self.observed(k, offset)[0] - self.computed(k, offset, pose))
+        computed = self.computed(k, moved_rig(self.rig, offset), pose)
+        return np.asarray(self.observed(k, offset)[0] - computed)
 
     def residuals(self, unknown: FloatArray) -> FloatArray:
         """Standardised residuals of all sightings, shape (m,)."""
@@ -248,17 +275,19 @@ class System:
     def standardised(self, k: int, bench: FloatArray, pose: FloatArray) -> FloatArray:
         """Residuals of a sighting over their standard uncertainties, shape (2n,)."""
         offset = self.factor @ bench
-        return _standardised(*self.observed(k, offset), self.computed(k, offset, pose))
+        computed = self.computed(k, moved_rig(self.rig, offset), pose)
+        return _standardised(*self.observed(k, offset), computed)
 
     def jacobian(self, unknown: FloatArray) -> FloatArray:
         """Derivatives of `residuals`, shape (m, p): a pose affects the dots of its mirror only."""
         bench, *poses = (unknown[part] for part in self.parts)
         offset, used = self.factor @ bench, np.asarray(self.factor.any(axis=1))
+        rig = moved_rig(self.rig, offset)
         made = np.zeros((2 * sum(len(s.ray) for s in self.sightings), self.size))
         for k, (pose, part) in enumerate(zip(poses, self.parts[1:], strict=True)):
             rows, dots = self._rows(k), self.observed(k, offset)
             made[rows, self.parts[0]] = self.by_quantities(k, offset, pose, used) @ self.factor
-            computed = partial(self.computed, k, offset)
+            computed = partial(self.computed, k, rig)
             still = _standardised(*dots, computed(pose))
             for p, step in zip(range(part.start, part.stop), STEP * np.eye(len(pose)), strict=True):
                 made[rows, p] = (_standardised(*dots, computed(pose + step)) - still) / STEP
@@ -269,9 +298,13 @@ class System:
     ) -> FloatArray:
         """Derivatives of a sighting's residuals w.r.t. the used quantities, shape (2n, q); 0 else.
 
-        Quantities of the picture change the observed dots, all others the computed ones.
+        Quantities of the picture change the observed dots, all others the computed ones; those of
+        the imaging plane do so without a change of the reflected rays.
         """
-        dots, landed = self.observed(k, offset), self.computed(k, offset, pose)
+        dots, (one, at) = self.observed(k, offset), (self.sightings[k], self.pose(k, pose))
+        rig = moved_rig(self.rig, offset)
+        *ray, _ = reflected_rays(one.mirror, at, rig, tuple(one.ray.T))
+        landed = intersect_imaging_plane(*ray, rig.imaging_plane)
         still = _standardised(*dots, landed)
         made = np.zeros((len(still), len(QUANTITIES)))
         for q in np.flatnonzero(used):
@@ -279,8 +312,12 @@ class System:
             moved[q] += (step := STEP * QUANTITIES[q].assumed)
             if OF_PICTURE[q]:
                 changed = _standardised(*self.observed(k, moved), landed)
+            elif OF_PLANE[q]:
+                plane = moved_plane(self.rig.imaging_plane, moved)
+                changed = _standardised(*dots, intersect_imaging_plane(*ray, plane))
             else:
-                changed = _standardised(*dots, self.computed(k, moved, pose))
+                moved_computed = self.computed(k, moved_rig(self.rig, moved), pose)
+                changed = _standardised(*dots, moved_computed)
             made[:, q] = (changed - still) / step
         return made
 

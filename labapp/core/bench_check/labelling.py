@@ -259,9 +259,10 @@ def relabelled(
     if len(at) < 2 or not len(dots):
         return labels
     near = share * _step(np.where(hit[..., None], computed, np.nan))[hit]
-    distance, dot = scipy.spatial.cKDTree(dots).query(computed[hit])
-    back = scipy.spatial.cKDTree(computed[hit]).query(dots)[1]
-    mutual = (back[dot] == np.arange(len(at))) & (distance < near)
+    apart = scipy.spatial.distance.cdist(computed[hit], dots)
+    dot, back = apart.argmin(axis=1), apart.argmin(axis=0)
+    ray = np.arange(len(at))
+    mutual = (back[dot] == ray) & (apart[ray, dot] < near)
     labels[tuple(at[mutual].T)] = dot[mutual]
     return labels
 

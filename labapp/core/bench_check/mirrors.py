@@ -273,10 +273,18 @@ def landing_points(
         ray does not meet it; whether the ray meets the mirror and the plane. Absent rays are
         traced like others.
     """
-    rays, source = ray_directions(rig.laser, rig.pattern)[of], rig.laser.position_mm
-    point, normal, hit = mirror.meet(source, rays, pose)
-    plane = intersect_imaging_plane(point, reflect(rays, normal), rig.imaging_plane)
+    point, direction, hit = reflected_rays(mirror, pose, rig, of)
+    plane = intersect_imaging_plane(point, direction, rig.imaging_plane)
     return plane, np.asarray(hit & np.isfinite(plane[..., 0]))
+
+
+def reflected_rays(
+    mirror: Mirror, pose: FloatArray, rig: Rig, of: tuple[IntArray, ...] = ()
+) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Reflected rays, as `landing_points`: points, UCS, mm, and directions, shapes (…, 3); hits."""
+    rays = ray_directions(rig.laser, rig.pattern)[of]
+    point, normal, hit = mirror.meet(rig.laser.position_mm, rays, pose)
+    return point, reflect(rays, normal), hit
 
 
 def _meet_sphere(

@@ -13,7 +13,10 @@ import scipy
 from labapp.core.values import FloatArray
 
 ROUNDS = 12
-"""Number of Gauss–Newton steps; the fit has converged by then, or does not converge."""
+"""At most, of Gauss–Newton steps; the fit has converged by then, or does not converge."""
+
+CONVERGED = 1e-6
+"""The fit has converged if no parameter (px, rad, grey levels) changes by more."""
 
 FIRST_BLUR_PX, LEAST_BLUR_PX = 1.2, 0.3
 """Initial and least blur, px."""
@@ -53,6 +56,8 @@ def fit_corner(grey: FloatArray, place_px: FloatArray, radius_px: float) -> Floa
         fitted[4] = max(fitted[4], LEAST_BLUR_PX)
         if np.hypot(*fitted[:2]) > radius_px / 2 or not np.isfinite(fitted).all():
             return None
+        if np.abs(step).max() < CONVERGED:
+            break
     left = float(np.std(light - _model(fitted, u, v)[0]))
     between = abs(float(np.sin(fitted[2] - fitted[3])))
     if abs(fitted[6]) < LEAST_CONTRAST * left or between < 0.5:

@@ -154,10 +154,18 @@ def segmented(
     binaries = [(level, binary.astype(np.uint8)) for level, binary in pairs]
     # The dissertation's filter first; half its size for thin bars that it would remove.
     return [
-        (level, np.asarray(cv2.medianBlur(binary, side), np.uint8))
+        (level, _binary_median(binary, side))
         for side in dict.fromkeys((median, _odd(median / 2.0)))
         for level, binary in binaries
     ]
+
+
+def _binary_median(binary: npt.NDArray[np.uint8], side: int) -> npt.NDArray[np.uint8]:
+    """Return what `cv2.medianBlur` does for a picture of 0 and 1, many times as fast: a count."""
+    count = cv2.boxFilter(
+        binary, cv2.CV_16U, (side, side), normalize=False, borderType=cv2.BORDER_REPLICATE
+    )
+    return np.asarray(2 * count > side * side, np.uint8)
 
 
 def _levels(darkness: FloatArray) -> list[float]:

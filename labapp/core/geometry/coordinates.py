@@ -92,12 +92,15 @@ class RadialDistortion(ReadOnlyArrays):
 
     def ideal(self, image_px: FloatArray) -> FloatArray:
         """Undistort image points (u, v), shape (…, 2), px."""
+        return _apply(_inverse(self.matrix), self.to_plane(image_px))
+
+    def to_plane(self, image_px: FloatArray) -> FloatArray:
+        """Transform image points (u, v), shape (…, 2), px, to undistorted IPCS (X′, Z′), mm."""
         image_px = image_px if self.lens is None else self.lens.ideal(image_px)
         out = _apply(self.matrix, image_px) - self.half_mm
-        share = (
-            self.percent / 100 * np.sum(out**2, axis=-1, keepdims=True) / np.sum(self.half_mm**2)
-        )
-        return _apply(_inverse(self.matrix), self.half_mm + (1 + share) * out)
+        strength = self.percent / 100 / np.sum(self.half_mm**2)
+        share = strength * (out[..., 0] ** 2 + out[..., 1] ** 2)
+        return np.asarray(self.half_mm + (1 + share[..., None]) * out)
 
     def distorted(self, ideal_px: FloatArray) -> FloatArray:
         """Inverse of `ideal`."""
@@ -136,7 +139,8 @@ class ImageCalibration(ReadOnlyArrays):
         matrix = np.array(self.matrix, float)
         if matrix.shape != (3, 3) or not np.isfinite(matrix).all():
             raise ValueError("an image calibration is a 3 × 3 matrix of finite numbers")
-        if np.linalg.cond(matrix) > 1e12:
+        stretches = np.linalg.svd(matrix, compute_uv=False)
+        if not stretches[0] <= 1e12 * stretches[-1]:
             raise ValueError("the image calibration cannot be inverted: its axes coincide")
         object.__setattr__(self, "matrix", matrix)
         super().__post_init__()
@@ -182,9 +186,19 @@ class ImageCalibration(ReadOnlyArrays):
 
     def with_distortion(self, percent: float, half_mm: FloatArray) -> ImageCalibration:
         """Return a calibration with another radial distortion (`RadialDistortion`)."""
-        lens = self.plain_lens
-        bent = RadialDistortion(self.matrix, lens, half_mm, percent) if percent else lens
-        return ImageCalibration(self.matrix, bent)
+        return ImageCalibration.distorted(self.matrix, self.plain_lens, percent, half_mm)
+
+    @classmethod
+    def distorted(
+        cls, matrix: FloatArray, lens: Lens | None, percent: float, half_mm: FloatArray
+    ) -> ImageCalibration:
+        """Build from a homography, a lens and a radial distortion (`RadialDistortion`)."""
+        return cls(matrix, RadialDistortion(matrix, lens, half_mm, percent) if percent else lens)
+
+    @cached_property
+    def undistorted(self) -> ImageCalibration:
+        """The calibration without a `RadialDistortion`."""
+        return ImageCalibration(self.matrix, self.plain_lens)
 
     @property
     def plain_lens(self) -> Lens | None:
@@ -202,6 +216,8 @@ class ImageCalibration(ReadOnlyArrays):
 
     def to_plane(self, image_px: FloatArray) -> FloatArray:
         """Transform (u, v), shape (…, 2), px, to IPCS (X′, Z′), shape (…, 2), mm."""
+        if isinstance(self.lens, RadialDistortion):
+            return self.lens.to_plane(image_px)
         return _apply(self.matrix, self.ideal_px(image_px))
 
     def to_image(self, plane_mm: FloatArray) -> FloatArray:
@@ -230,6 +246,11 @@ def _inverse(matrix: FloatArray) -> FloatArray:
 
 
 def _apply(matrix: FloatArray, points: FloatArray) -> FloatArray:
+    # Coordinate by coordinate: NumPy is slow along an axis of length 2.
     points = np.asarray(points, float)
-    projected = points @ matrix[:, :2].T + matrix[:, 2]
-    return np.asarray(projected[..., :2] / projected[..., 2:])
+    first, second, made = points[..., 0], points[..., 1], np.empty(points.shape)
+    (a, b, c), (d, e, f), (g, h, k) = matrix.tolist()
+    scale = g * first + h * second + k
+    made[..., 0] = (a * first + b * second + c) / scale
+    made[..., 1] = (d * first + e * second + f) / scale
+    return made

@@ -27,6 +27,9 @@ OF_PICTURE = np.isin(np.arange(len(INDEX)), _PICTURE)
 """Mask of the quantities of the picture, which move captured dots (`moved_dots`); the others, of
 the rig, move computed dots."""
 
+OF_PLANE = np.isin(np.arange(len(INDEX)), [k for _, k in _PLANE])
+"""Mask of the quantities of the imaging plane, which do not change the reflected rays."""
+
 
 @dataclass(frozen=True)
 class Direction(ReadOnlyArrays):
@@ -72,22 +75,28 @@ def moved_rig(rig: Rig, offset: FloatArray) -> Rig:
     """Rig with an offset added to its quantities, shape (q,)."""
     laser = {name: getattr(rig.laser, name) + offset[k] for name, k in _LASER}
     pattern = {name: getattr(rig.pattern, name) + offset[k] for name, k in _PATTERN}
-    plane, by = rig.imaging_plane, {name: offset[k] for name, k in _PLANE}
-    if any(by.values()):
-        origin = plane.origin_mm + np.array([-by["s_mm"], -by["distance_mm"], by["h_mm"]])
-        turned = [by["pitch_deg"], by["yaw_deg"], by["roll_deg"]]
-        pitch, yaw, roll = np.add(plane.angles_deg, turned).tolist()
-        posed = ImagingPlane.of_angles(origin, (pitch, yaw, roll))
-        axes = posed.x_axis, posed.z_axis
-        glass = plane.glass_mm + by["glass_mm"], plane.glass_index + by["glass_index"]
-        plane = replace(plane, origin_mm=origin, x_axis=axes[0], z_axis=axes[1])
-        plane = replace(plane, glass_mm=glass[0], glass_index=glass[1])
     return replace(
         rig,
         laser=replace(rig.laser, **laser),
         pattern=replace(rig.pattern, **pattern),
-        imaging_plane=plane,
+        imaging_plane=moved_plane(rig.imaging_plane, offset),
     )
+
+
+def moved_plane(plane: ImagingPlane, offset: FloatArray) -> ImagingPlane:
+    """Imaging plane with an offset added to its quantities, shape (q,)."""
+    by = {name: offset[k] for name, k in _PLANE}
+    if not any(by.values()):
+        return plane
+    pitch, yaw, roll = plane.angles_deg
+    moved = ImagingPlane.of_angles(
+        plane.origin_mm + np.array([-by["s_mm"], -by["distance_mm"], by["h_mm"]]),
+        (pitch + by["pitch_deg"], yaw + by["yaw_deg"], roll + by["roll_deg"]),
+        plane.width_mm,
+        plane.height_mm,
+    )
+    glass = plane.glass_mm + by["glass_mm"], plane.glass_index + by["glass_index"]
+    return replace(moved, glass_mm=glass[0], glass_index=glass[1])
 
 
 def aimed_as(laser: Laser, rig: Rig) -> Rig:
@@ -109,12 +118,28 @@ def moved_dots(plane_mm: FloatArray, rig: Rig, axes: AxisPoints, offset: FloatAr
     """
     if not offset[_PICTURE].any():
         return plane_mm
+    return dots_on_moved_plane(dots_in_picture(plane_mm, rig, axes), rig, axes, offset)
+
+
+def dots_in_picture(plane_mm: FloatArray, rig: Rig, axes: AxisPoints) -> FloatArray:
+    """Dots on the plane, (n, 2), mm, in the picture of a camera without a lens of its own, px."""
+    return _lensless(axes.calibration, rig.imaging_plane).to_image(plane_mm)
+
+
+def dots_on_moved_plane(
+    image_px: FloatArray, rig: Rig, axes: AxisPoints, offset: FloatArray
+) -> FloatArray:
+    """Points `dots_in_picture`, (n, 2), px, on the plane for an offset, mm, see `moved_dots`."""
     plane = rig.imaging_plane
-    before, after = (
-        ImageCalibration(one.matrix).with_distortion(one.distortion_percent, _half_mm(plane))
-        for one in (axes.calibration, moved_calibration(axes, plane, offset))
-    )
-    return after.to_plane(before.to_image(plane_mm))
+    return _lensless(moved_calibration(axes, plane, offset), plane).to_plane(image_px)
+
+
+def _lensless(calibration: ImageCalibration, plane: ImagingPlane) -> ImageCalibration:
+    """Calibration with its distortion on the plane, but without the camera's lens."""
+    if calibration.plain_lens is None:
+        return calibration
+    percent = calibration.distortion_percent
+    return ImageCalibration.distorted(calibration.matrix, None, percent, _half_mm(plane))
 
 
 def moved_calibration(
@@ -126,15 +151,16 @@ def moved_calibration(
     may also have an offset. The camera lens and its centre do not change.
     """
     calibration = axes.calibration
-    base = ImageCalibration(calibration.matrix, calibration.plain_lens)
+    base = calibration.undistorted
     percent = calibration.distortion_percent + float(offset[_DISTORTION])
-    plane_mm = _axis_points_mm(axes)
-    true = _with_ones(base.ideal_px(base.to_image(plane_mm)))
-    moved = base.ideal_px(base.to_image(plane_mm) + offset[POINTS].reshape(3, 2))
+    points_px = base.to_image(_axis_points_mm(axes))
+    true = _with_ones(base.ideal_px(points_px))
+    moved = base.ideal_px(points_px + offset[POINTS].reshape(3, 2))
     back = np.linalg.solve(_with_ones(moved), true).T
     stretch = np.diag([*(1.0 + offset[_AXES] / [axes.x_mm, axes.z_mm]), 1.0])
-    changed = ImageCalibration(stretch @ base.matrix @ back, base.lens)
-    return changed.with_distortion(percent, _half_mm(plane))
+    return ImageCalibration.distorted(
+        np.asarray(stretch @ base.matrix @ back), base.lens, percent, _half_mm(plane)
+    )
 
 
 def moved_bench(rig: Rig, offset: FloatArray) -> tuple[Rig, ImageCalibration]:
@@ -164,8 +190,7 @@ def quantity_values(rig: Rig) -> FloatArray:
             values[k] = getattr(part, name)
     for name, k in _PLANE:
         values[k] = at[name]
-    base = ImageCalibration(axes.calibration.matrix, axes.calibration.plain_lens)
-    values[POINTS] = base.to_image(_axis_points_mm(axes)).ravel()
+    values[POINTS] = axes.calibration.undistorted.to_image(_axis_points_mm(axes)).ravel()
     values[_AXES] = axes.x_mm, axes.z_mm
     values[_DISTORTION] = axes.calibration.distortion_percent
     return values

@@ -17,6 +17,12 @@ from labapp.core.values import BoolArray, FloatArray
 from labapp.simulation.camera import CameraView, PosedView
 from labapp.simulation.render import GreyImage
 
+FINE = 4
+"""Points along each side of a pixel at which the print is looked up."""
+
+STRIP_ROWS = 4
+"""Rows of pixels that are rendered at a time: few enough to stay in the processor's cache."""
+
 
 class Print(Protocol):
     """A print on the imaging plane or on a board in its place."""
@@ -100,17 +106,30 @@ def render_target(
     target: Print, view: CameraView | PosedView, look: TargetLook, rng: np.random.Generator
 ) -> GreyImage:
     """Render the calibration picture, shape (height, width), grey levels."""
-    fine = 4
     shape = (view.height_px, view.width_px)
-    u, v = ((np.arange(fine * size) + 0.5) / fine - 0.5 for size in (view.width_px, view.height_px))
-    points = view.to_plane(np.stack(np.meshgrid(u, v), axis=-1))
-    ink = target.inked(points).reshape(shape[0], fine, shape[1], fine).mean(axis=(1, 3))
+    ink = np.vstack(
+        [
+            _share_of_ink(target, view, range(row, min(row + STRIP_ROWS, shape[0])))
+            for row in range(0, shape[0], STRIP_ROWS)
+        ]
+    )
     y, x = (np.linspace(-1, 1, size) for size in shape)
     fall = 1 - look.vignetting * (x**2 + y[:, None] ** 2) / 2 + look.slope * x / 2
     seen = gaussian_filter((look.light + (look.dark - look.light) * ink) * fall, look.blur_px)
     seen += look.noise * rng.normal(size=shape)
     seen.flat[rng.integers(0, seen.size, look.specks)] = rng.choice([2.0, 60.0], look.specks)
     return np.asarray(np.clip(np.rint(seen), 0, 255).astype(np.uint8))
+
+
+def _share_of_ink(target: Print, view: CameraView | PosedView, rows: range) -> FloatArray:
+    """Return the black share of each pixel of some rows, shape (rows, width)."""
+    columns = range(view.width_px)
+    u, v = (
+        (np.arange(FINE * over.start, FINE * over.stop) + 0.5) / FINE - 0.5
+        for over in (columns, rows)
+    )
+    ink = target.inked(view.to_plane(np.stack(np.meshgrid(u, v), axis=-1)))
+    return np.asarray(ink.reshape(len(rows), FINE, len(columns), FINE).mean(axis=(1, 3)))
 
 
 def target_svg(target: Target) -> str:

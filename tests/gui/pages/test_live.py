@@ -396,14 +396,14 @@ def test_what_was_recorded_is_measured_afterwards(
     window.workspace.attempt(
         lambda session: session.set_setup((SAMPLES / "gtaw" / "setup.toml").read_text("utf-8"))
     )
-    film = SimulatedDevice("pool", lambda _: image, rate_hz=100)
+    film = SimulatedDevice("pool", lambda _: image, rate_hz=20)
     monkeypatch.setattr(live_view, "pool_camera", lambda *_: film)
     page.live_view.plan_fields.measured.setChecked(wanted)
     start(page, qtbot)
     hand, view, session = Hand(window), page.live_view, window.workspace.session
     page.setFocus()
     hand.press(Qt.Key.Key_Space)
-    qtbot.waitUntil(lambda: view.live.running.frames > 10)
+    qtbot.waitUntil(lambda: view.live.running.frames > 3)
     hand.press(Qt.Key.Key_Space)
     qtbot.waitUntil(lambda: session.recording is not None)
     qtbot.waitUntil(lambda: not window.workspace.tasks.active)

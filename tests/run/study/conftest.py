@@ -28,8 +28,13 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def study_file(simulated: Path, tmp_path: Path) -> Path:
     """A study of two parts of the recording, and of three recordings that are none."""
-    (tmp_path / "empty.avi").touch()
-    (tmp_path / "corrupt.avi").write_bytes(b"RIFF no video at all" * 20)
+    return write_study(tmp_path, simulated)
+
+
+def write_study(folder: Path, simulated: Path) -> Path:
+    """Write `study_file` into a folder."""
+    (folder / "empty.avi").touch()
+    (folder / "corrupt.avi").write_bytes(b"RIFF no video at all" * 20)
     setup, recording = simulated / "setup.toml", simulated / "recording.avi"
     text = f"""
 setup = '{setup}'
@@ -46,6 +51,6 @@ conditions = {{ current_a = 100, gas = "Ar" }}
 """
     for name in ("empty", "corrupt", "missing"):
         text += f'[[recording]]\nfile = "{name}.avi"\nconditions = {{ current_a = 80 }}\n'
-    path = tmp_path / "study.toml"
+    path = folder / "study.toml"
     path.write_text(text, "utf-8")
     return path

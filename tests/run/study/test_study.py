@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import errno
 import hashlib
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from labapp.media import open_source
 from labapp.run import measurers
 from labapp.run.study import stretches, workers
 from labapp.run.study import study as study_module
+from tests.run.study.conftest import write_study
 
 STATES = ["done", "done", "failed", "failed", "failed"]
 
@@ -31,6 +33,23 @@ STATES = ["done", "done", "failed", "failed", "failed"]
 def _short(monkeypatch: pytest.MonkeyPatch) -> None:
     """Stretches of three frames: a recording has some."""
     monkeypatch.setattr(measurers, "STRETCH", 3)
+
+
+@pytest.fixture(scope="module")
+def measured_once(simulated: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder of the study, measured in stretches of three frames."""
+    folder = tmp_path_factory.mktemp("measured")
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(measurers, "STRETCH", 3)
+        Study(write_study(folder, simulated)).run(0)
+    return folder
+
+
+@pytest.fixture
+def measured_file(measured_once: Path, tmp_path: Path) -> Path:
+    """A copy of `study_file` and of what was measured."""
+    shutil.copytree(measured_once, tmp_path, dirs_exist_ok=True)
+    return tmp_path / "study.toml"
 
 
 def bytes_of(folder: Path) -> dict[str, str]:
@@ -70,10 +89,9 @@ def test_what_can_be_measured_is_and_the_others_say_why(study_file: Path) -> Non
 
 
 def test_figures_are_those_of_reconstruct(
-    study_file: Path, simulated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    measured_file: Path, simulated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    study = Study(study_file)
-    study.run(0)
+    study = Study(measured_file)
     study.results()
     monkeypatch.undo()
     monkeypatch.setattr(measurers, "STRETCH", 3)
@@ -90,10 +108,9 @@ def test_figures_are_those_of_reconstruct(
 
 
 def test_nothing_that_is_done_is_done_again(
-    study_file: Path, monkeypatch: pytest.MonkeyPatch
+    measured_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    study = Study(study_file)
-    study.run(0)
+    study = Study(measured_file)
     before = bytes_of(study.folder)
     assert len(before) == 4
     measured: list[object] = []
@@ -104,29 +121,26 @@ def test_nothing_that_is_done_is_done_again(
 
 
 def test_another_setup_other_settings_and_another_recording_are_measured_anew(
-    study_file: Path, simulated: Path, tmp_path: Path
+    measured_file: Path, simulated: Path, tmp_path: Path
 ) -> None:
-    study = Study(study_file)
-    study.run(0)
-    text = study_file.read_text("utf-8")
+    text = measured_file.read_text("utf-8")
     changed = text.replace('name = "first"', 'name = "first"\nscheme = "ers"')
-    study_file.write_text(changed, "utf-8")
-    assert [one.state for one in Study(study_file).status()[:2]] == ["waiting", "done"]
+    measured_file.write_text(changed, "utf-8")
+    assert [one.state for one in Study(measured_file).status()[:2]] == ["waiting", "done"]
     setup = (simulated / "setup.toml").read_text("utf-8")
     (tmp_path / "other.toml").write_text(setup + "# other\n", "utf-8")
     changed = text.replace('name = "second"', 'name = "second"\nsetup = "other.toml"')
-    study_file.write_text(changed, "utf-8")
-    assert [one.state for one in Study(study_file).status()[:2]] == ["done", "waiting"]
-    study_file.write_text(text.replace('frames = ":5"', 'frames = ":6"'), "utf-8")
-    first = Study(study_file).status()[0]
+    measured_file.write_text(changed, "utf-8")
+    assert [one.state for one in Study(measured_file).status()[:2]] == ["done", "waiting"]
+    measured_file.write_text(text.replace('frames = ":5"', 'frames = ":6"'), "utf-8")
+    first = Study(measured_file).status()[0]
     assert (first.state, first.frames_done) == ("part", 3)
 
 
-def test_conditions_change_without_measuring(study_file: Path) -> None:
-    Study(study_file).run(0)
-    text = study_file.read_text("utf-8").replace('gas = "Ar"', 'gas = "He", speed = 2')
-    study_file.write_text(text, "utf-8")
-    study = Study(study_file)
+def test_conditions_change_without_measuring(measured_file: Path) -> None:
+    text = measured_file.read_text("utf-8").replace('gas = "Ar"', 'gas = "He", speed = 2')
+    measured_file.write_text(text, "utf-8")
+    study = Study(measured_file)
     assert [one.state for one in study.status()] == STATES
     study.results()
     rows = rows_of(study.folder)
@@ -135,10 +149,10 @@ def test_conditions_change_without_measuring(study_file: Path) -> None:
 
 
 @pytest.mark.slow
-def test_processes_and_this_one_give_the_same_bytes(study_file: Path, tmp_path: Path) -> None:
-    made = {}
-    for count in (0, 1, 2):
-        study = Study(study_file, tmp_path / f"out_{count}")
+def test_processes_and_this_one_give_the_same_bytes(measured_file: Path, tmp_path: Path) -> None:
+    made = {0: bytes_of(Study(measured_file).folder)}
+    for count in (1, 2):
+        study = Study(measured_file, tmp_path / f"out_{count}")
         assert [one.state for one in study.run(count)] == STATES
         made[count] = bytes_of(study.folder)
     assert made[0] == made[1] == made[2]
@@ -188,9 +202,8 @@ def test_a_full_disk_stops_a_run_and_loses_nothing(
     assert [one.state for one in study.run(0)] == STATES
 
 
-def test_a_damaged_file_is_measured_again(study_file: Path) -> None:
-    study = Study(study_file)
-    study.run(0)
+def test_a_damaged_file_is_measured_again(measured_file: Path) -> None:
+    study = Study(measured_file)
     before = bytes_of(study.folder)
     damaged = sorted((study.folder / "stretches").glob("*.npz"))
     for path, content in zip(
@@ -206,13 +219,11 @@ def test_a_damaged_file_is_measured_again(study_file: Path) -> None:
 
 
 def test_a_recording_that_was_changed_is_looked_at_again(
-    study_file: Path, simulated: Path, tmp_path: Path
+    measured_file: Path, simulated: Path, tmp_path: Path
 ) -> None:
-    study = Study(study_file)
-    study.run(0)
     (tmp_path / "missing.avi").write_bytes((simulated / "recording.avi").read_bytes())
-    assert Study(study_file).status()[4].problem
-    found = Study(study_file).run(0)[4]
+    assert Study(measured_file).status()[4].problem
+    found = Study(measured_file).run(0)[4]
     assert (found.state, found.problem, found.frames) == ("done", "", 9)
 
 
@@ -242,9 +253,8 @@ def test_a_recording_with_a_wrong_key_does_not_stop_the_others(study_file: Path,
     assert key in found[0].problem
 
 
-def test_the_dataset_opens_lazily_and_says_its_units(study_file: Path) -> None:
-    study = Study(study_file)
-    study.run(0)
+def test_the_dataset_opens_lazily_and_says_its_units(measured_file: Path) -> None:
+    study = Study(measured_file)
     study.results()
     scanned = pl.scan_parquet(study.folder / "measures.parquet" / "*.parquet")
     mean = scanned.filter(pl.col("current_a") == 100).select(pl.col("height_mm").mean())
@@ -255,15 +265,14 @@ def test_the_dataset_opens_lazily_and_says_its_units(study_file: Path) -> None:
     schema = parquet.read_schema(study.folder / "measures.parquet" / "first.parquet")
     assert schema.field("height_sigma_mm").metadata[b"units"] == b"mm"
     # A recording that is no longer in the study is no longer in its results.
-    text = study_file.read_text("utf-8").replace('name = "second"', 'name = "other"')
-    study_file.write_text(text, "utf-8")
-    Study(study_file).results()
+    text = measured_file.read_text("utf-8").replace('name = "second"', 'name = "other"')
+    measured_file.write_text(text, "utf-8")
+    Study(measured_file).results()
     assert set(rows_of(study.folder)["recording"]) == {"first", "other"}
 
 
-def test_surfaces_are_an_array_over_frames(study_file: Path, simulated: Path) -> None:
-    study = Study(study_file)
-    study.run(0)
+def test_surfaces_are_an_array_over_frames(measured_file: Path, simulated: Path) -> None:
+    study = Study(measured_file)
     study.results(surfaces=True)
     assert not (study.folder / "surfaces.zarr").exists()  # none were kept
     study.run(0, surfaces=True)
@@ -311,10 +320,9 @@ def test_tasks_that_raise_are_tried_again_and_then_reported(
 
 
 def test_temporary_files_that_a_killed_run_left_are_deleted(
-    study_file: Path, monkeypatch: pytest.MonkeyPatch
+    measured_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    study = Study(study_file)
-    study.run(0)
+    study = Study(measured_file)
     left = files.beside(study.folder / "stretches" / "x.npz")
     left.touch()
     study.run(0)
