@@ -120,3 +120,23 @@ def test_a_line_is_followed_through_pulses_spatter_and_glare():
     assert len(errors) >= 0.95 * len(off)
     assert np.median(errors) < 0.6
     assert film.frequency_hz == pytest.approx(36.0, abs=1.0)
+
+
+def test_a_tracked_line_ends_where_its_light_ends():
+    rng = np.random.default_rng(3)
+    v, u = np.mgrid[:120, :320].astype(float)
+    film = []
+    for k in range(12):
+        arch = 50.0 + 2.0 * np.sin(k) + (u - 150) ** 2 / 400
+        light = 90 * np.exp(-((v - arch) ** 2) / 9) * (np.abs(u - 150) < 70)
+        if k == 0:  # light of something else continues the line in the first frame
+            light += 90 * np.exp(-((v - 62.0) ** 2) / 9) * (np.abs(u - 240) < 20)
+        film.append(np.clip(20 + light + rng.normal(size=v.shape), 0, 255).astype(np.uint8))
+    tracked = track_line(film, None).lines
+    first, others = tracked[0], tracked[1:]
+    assert first is not None
+    assert first.u_px[-1] > 235
+    for line in others:
+        assert line is not None
+        assert abs(line.u_px[0] - 80) < 9
+        assert abs(line.u_px[-1] - 220) < 9
