@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -30,6 +32,18 @@ def run_series(seed: int, noise: float = 0.004) -> tuple[LineSeries, list[str]]:
     bend[unknown], width[unknown] = np.nan, np.nan
     bend[::37] = 0.2  # a wrong surface now and then
     return LineSeries(np.where(lit, count, 0), width, bend * width), truth
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_change_begins_where_a_steady_value_ceases_to_be_known(seed: int):
+    series, _ = run_series(seed)
+    turn = series.turn.copy()
+    part = (np.arange(110, 150) - 109.5) / 40  # it speeds up, so that a straight ramp begins late
+    low, high = np.nanmedian(turn[60:105]), np.nanmedian(turn[155:])
+    turn[110:150] = low + (high - low) * part * (0.7 + 0.3 * part)
+    turn[110:129] = np.nan  # a caustic as soon as the pool flattens
+    states = line_states(replace(series, turn=turn))
+    assert abs(states.index("flattening") - 110) <= 2
 
 
 @pytest.mark.parametrize("seed", range(3))
