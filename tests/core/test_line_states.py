@@ -154,3 +154,22 @@ def test_a_tracked_line_ends_where_its_light_ends():
         assert line is not None
         assert abs(line.u_px[0] - 80) < 9
         assert abs(line.u_px[-1] - 220) < 9
+
+
+def test_pulses_are_told_by_the_current_where_the_light_does_not_tell_them():
+    rng = np.random.default_rng(12)
+    on = np.arange(600) * 120 / 1500 % 1.0 < 0.4
+    dim = 20 + 0.3 * on + rng.normal(size=600)  # a filter that lets next to nothing through
+    assert not classify_pulses(dim, 1500.0).on.any()
+    current = np.where(on, 300.0, 80.0) + 10 * rng.normal(size=600)
+    current[200:260] = np.nan  # the logger paused: the period tells
+    pulses = classify_pulses(dim, 1500.0, current)
+    assert np.mean(pulses.on == on) > 0.99
+    assert pulses.frequency_hz == pytest.approx(120.0, abs=0.5)
+    light = np.where(on, 190.0, 22.0) * np.exp(0.08 * rng.normal(size=600))
+    light[::50] = 100.0  # spatter or glare, which the current tells from a pulse
+    assert (classify_pulses(light, None, current).on == on)[::50].mean() > 0.8
+    steady = np.full(600, 150.0)
+    assert np.array_equal(
+        classify_pulses(light, 1500.0, steady).on, classify_pulses(light, 1500.0).on
+    )

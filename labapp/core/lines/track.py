@@ -217,11 +217,13 @@ def track_line(
     frame_rate_hz: float | None,
     settings: TrackSettings | None = None,
     tracker: LineTracker | None = None,
+    current_a: FloatArray | None = None,
 ) -> LineFilm:
     """Classify the frames of a recording by pulse, and track its line in those without a pulse.
 
     The line is measured in every frame that is not blinded. Results of frames that are later
-    classified as having a pulse are discarded. ``tracker`` is that of the preceding frames.
+    classified as having a pulse are discarded. ``tracker`` is that of the preceding frames;
+    ``current_a`` as in `classify_pulses`.
     """
     tracker = tracker or LineTracker(settings)
     bright, lines = list[float](), list[TrackedLine | None]()
@@ -230,7 +232,7 @@ def track_line(
         recent = bright[-RECENT:]
         blinded = bright[-1] > BLINDED * min(recent) + BLINDED_LEVELS
         lines.append(None if blinded else tracker.follow(frame))
-    pulses = classify_pulses(np.array(bright), frame_rate_hz)
+    pulses = classify_pulses(np.array(bright), frame_rate_hz, current_a)
     kept = tuple(None if on else one for one, on in zip(lines, pulses.on, strict=True))
     if frame_rate_hz is None:
         return LineFilm(pulses, kept, float("nan"), 0.0)
