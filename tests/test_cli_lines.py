@@ -115,3 +115,21 @@ def test_one_line_is_followed(labapp: Run, setup: Path, tmp_path: Path):
     assert code == 0
     shift = [float(row["shift_px"]) for row in rows(tmp_path / "out" / "track.csv")]
     assert np.diff(shift) == pytest.approx([0.5, 0.5, 0.5], abs=0.15)
+
+
+def test_a_current_is_read_for_one_line_only(labapp: Run, setup: Path, tmp_path: Path):
+    (tmp_path / "frames").mkdir()
+    for k in range(2):
+        cv2.imwrite(str(tmp_path / "frames" / f"{k}.png"), np.full((60, 80), 20, np.uint8))
+    (tmp_path / "log.csv").write_text("time_s,current_A\n0,80\n1,300\n", "utf-8")
+    (tmp_path / "volts.csv").write_text("time_s,voltage_V\n0,12\n1,13\n", "utf-8")
+    source, out = str(tmp_path / "frames"), str(tmp_path / "out")
+    given = ["lines", source, "--setup", str(setup), "--out", out]
+    code, _, err = labapp(*given, "--signals", str(tmp_path / "log.csv"))
+    assert code == 2
+    assert "--signals" in err
+    code, _, err = labapp(*given, "--follow", "--signals", str(tmp_path / "volts.csv"))
+    assert code == 2
+    assert "volts.csv" in err
+    code, _, _ = labapp(*given, "--follow", "--signals", str(tmp_path / "log.csv"))
+    assert code == 1  # there is no line

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -14,18 +15,20 @@ from labapp.cli.shared import (
     INTERRUPTED,
     NOTHING_MEASURED,
     RECORDING_HELP,
+    finite,
     note,
     progress_bar,
     warned,
     writable_folder,
 )
-from labapp.errors import os_errors_as_input
+from labapp.errors import InputError, os_errors_as_input
 from labapp.files import write_file
 from labapp.text import csv_text
 
 if TYPE_CHECKING:
     from labapp.config.setup import Setup
     from labapp.core.lines.frame import LineFrame
+    from labapp.core.values import FloatArray
     from labapp.export.frame_result import FrameResult
     from labapp.media import FrameSource
 
@@ -42,6 +45,17 @@ def lines(
             help="Follow one line from frame to frame, as in pulsed GMAW; implied by one line.",
         ),
     ] = False,
+    signals: Annotated[
+        Path | None,
+        typer.Option(
+            help="Weld current (CSV, TDMS, WAV), to tell pulses by, besides the light; with one "
+            "line that is followed."
+        ),
+    ] = None,
+    start: Annotated[
+        float,
+        typer.Option(callback=finite, help="Time of the signals' start in the recording (s)."),
+    ] = 0.0,
 ) -> None:
     """Measure recordings of a line pattern: lines, features, state and surface of the pool.
 
@@ -54,12 +68,13 @@ def lines(
     from labapp.run.runner import select_frames
 
     bench = warned(read_line_setup(setup))
+    follow = follow or bench.rig.pattern.rows == 1
+    current = None if signals is None else _current(signals, start, follow)
     with open_source(source) as recording:
         chosen = select_frames(frames, len(recording))
         folder = writable_folder(out)
         with os_errors_as_input(folder, "results", "enough disk space"):
-            follow = follow or bench.rig.pattern.rows == 1
-            done = _measured(recording, chosen, bench, follow)
+            done = _measured(recording, chosen, bench, follow, current)
             any_line = (
                 _write_followed(done, folder) if follow else _write_measured(done, folder, bench)
             )
@@ -70,14 +85,33 @@ def lines(
         raise typer.Exit(NOTHING_MEASURED)
 
 
-def _measured(source: FrameSource, frames: range, bench: Setup, follow: bool) -> list[FrameResult]:
+def _current(path: Path, start: float, follow: bool) -> tuple[FloatArray, FloatArray]:
+    """Return times in the recording, s, and weld current, A."""
+    from labapp.session.signals import read_signals
+
+    if not follow:
+        raise InputError("labapp lines", "--signals", path, "a pattern of one line, or --follow")
+    found = replace(read_signals(path), start_s=start).timed()
+    if "current" not in found:
+        raise InputError(path, "channels", ", ".join(found), "a current")
+    return found["current"]
+
+
+def _measured(
+    source: FrameSource,
+    frames: range,
+    bench: Setup,
+    follow: bool,
+    current: tuple[FloatArray, FloatArray] | None,
+) -> list[FrameResult]:
     """Return the results of the finished frames, with progress on stderr."""
     from labapp.core.pipeline import Settings
     from labapp.export.frame_result import FrameResult
     from labapp.run.measurers import ColdMeasurer, LineFollower
     from labapp.run.runner import run
 
-    measurer = (LineFollower if follow else ColdMeasurer)(source.frame, bench, Settings())
+    given = (source.frame, bench, Settings())
+    measurer = LineFollower(*given, current) if follow else ColdMeasurer(*given)
     done = list[FrameResult]()
     with progress_bar() as progress:
         task = progress.add_task(source.name, total=len(frames))

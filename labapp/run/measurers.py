@@ -29,6 +29,7 @@ from threadpoolctl import ThreadpoolController
 from labapp.config.setup import Setup
 from labapp.core.pipeline import ByHand, Measurement, Settings, measure, setup_status
 from labapp.core.recording.residual_check import Residuals
+from labapp.core.values import FloatArray
 from labapp.errors import InputError
 from labapp.export.frame_result import FrameResult, without_surface
 from labapp.export.tables import table_rows
@@ -217,6 +218,8 @@ class LineFollower:
     setup: Setup
     settings: Settings
     """As for `ColdMeasurer`."""
+    current: tuple[FloatArray, FloatArray] | None = None
+    """Times in the recording (s) and weld current (A), each shape (n,); None: not recorded."""
 
     def __call__(self, frames: Iterable[int]) -> Generator[FrameResult]:
         """Measure frames; see `runner.Measurer`. Results come `FOLLOWED_AT_ONCE` at a time."""
@@ -227,10 +230,10 @@ class LineFollower:
         while chosen := list(islice(numbers, FOLLOWED_AT_ONCE)):
             begun = [(number, _read(self.read, number, self.settings)) for number in chosen]
             seen = [frame for _, frame in begun if isinstance(frame, Frame)]
-            steps = np.diff([np.nan if one.time_s is None else one.time_s for one in seen])
-            step = float(np.median(steps)) if len(steps) else 0.0
-            film = track_line((one.image for one in seen), 1 / step if step > 0 else None,
-                              tracker=tracker)  # fmt: skip
+            time_s = np.array([np.nan if one.time_s is None else one.time_s for one in seen])
+            step = float(np.median(np.diff(time_s))) if len(seen) > 1 else 0.0
+            rate = 1 / step if step > 0 else None
+            film = track_line((one.image for one in seen), rate, None, tracker, self._at(time_s))
             pulses = film.pulses
             followed = zip(film.lines, pulses.on.tolist(), pulses.probability.tolist(), strict=True)
             for number, frame in begun:
@@ -241,6 +244,12 @@ class LineFollower:
                 found = Measurement(lines.status, lines.reason, self.settings.scheme, lines=lines)
                 status = setup_status(self.setup.rig)
                 yield FrameResult(number, frame.time_s, replace(found, setup_status=status))
+
+    def _at(self, time_s: FloatArray) -> FloatArray | None:
+        """Weld current at times, A, NaN beyond the recorded ones; None if there is none."""
+        if self.current is None:
+            return None
+        return np.asarray(np.interp(time_s, *self.current, left=np.nan, right=np.nan))
 
 
 # --- tracking from frame to frame ---------------------------------------------------------------

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -30,6 +32,18 @@ def run_series(seed: int, noise: float = 0.004) -> tuple[LineSeries, list[str]]:
     bend[unknown], width[unknown] = np.nan, np.nan
     bend[::37] = 0.2  # a wrong surface now and then
     return LineSeries(np.where(lit, count, 0), width, bend * width), truth
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_change_begins_where_a_steady_value_ceases_to_be_known(seed: int):
+    series, _ = run_series(seed)
+    turn = series.turn.copy()
+    part = (np.arange(110, 150) - 109.5) / 40  # it speeds up, so that a straight ramp begins late
+    low, high = np.nanmedian(turn[60:105]), np.nanmedian(turn[155:])
+    turn[110:150] = low + (high - low) * part * (0.7 + 0.3 * part)
+    turn[110:129] = np.nan  # a caustic as soon as the pool flattens
+    states = line_states(replace(series, turn=turn))
+    assert abs(states.index("flattening") - 110) <= 2
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -120,3 +134,42 @@ def test_a_line_is_followed_through_pulses_spatter_and_glare():
     assert len(errors) >= 0.95 * len(off)
     assert np.median(errors) < 0.6
     assert film.frequency_hz == pytest.approx(36.0, abs=1.0)
+
+
+def test_a_tracked_line_ends_where_its_light_ends():
+    rng = np.random.default_rng(3)
+    v, u = np.mgrid[:120, :320].astype(float)
+    film = []
+    for k in range(12):
+        arch = 50.0 + 2.0 * np.sin(k) + (u - 150) ** 2 / 400
+        light = 90 * np.exp(-((v - arch) ** 2) / 9) * (np.abs(u - 150) < 70)
+        if k == 0:  # light of something else continues the line in the first frame
+            light += 90 * np.exp(-((v - 62.0) ** 2) / 9) * (np.abs(u - 240) < 20)
+        film.append(np.clip(20 + light + rng.normal(size=v.shape), 0, 255).astype(np.uint8))
+    tracked = track_line(film, None).lines
+    first, others = tracked[0], tracked[1:]
+    assert first is not None
+    assert first.u_px[-1] > 235
+    for line in others:
+        assert line is not None
+        assert abs(line.u_px[0] - 80) < 9
+        assert abs(line.u_px[-1] - 220) < 9
+
+
+def test_pulses_are_told_by_the_current_where_the_light_does_not_tell_them():
+    rng = np.random.default_rng(12)
+    on = np.arange(600) * 120 / 1500 % 1.0 < 0.4
+    dim = 20 + 0.3 * on + rng.normal(size=600)  # a filter that lets next to nothing through
+    assert not classify_pulses(dim, 1500.0).on.any()
+    current = np.where(on, 300.0, 80.0) + 10 * rng.normal(size=600)
+    current[200:260] = np.nan  # the logger paused: the period tells
+    pulses = classify_pulses(dim, 1500.0, current)
+    assert np.mean(pulses.on == on) > 0.99
+    assert pulses.frequency_hz == pytest.approx(120.0, abs=0.5)
+    light = np.where(on, 190.0, 22.0) * np.exp(0.08 * rng.normal(size=600))
+    light[::50] = 100.0  # spatter or glare, which the current tells from a pulse
+    assert (classify_pulses(light, None, current).on == on)[::50].mean() > 0.8
+    steady = np.full(600, 150.0)
+    assert np.array_equal(
+        classify_pulses(light, 1500.0, steady).on, classify_pulses(light, 1500.0).on
+    )

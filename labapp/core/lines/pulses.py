@@ -2,7 +2,8 @@
 
 "When pulse is on the image is dominated by the arc light and when it is off the fluctuated laser
 light reflected from molten weld pool surface is shown." The brightness of frames forms two
-classes. As pulses are periodic, the phase of a frame in the period is used as a prior.
+classes; a recorded current does so, too. As pulses are periodic, the phase of a frame in the period
+is used as a prior.
 """
 
 from __future__ import annotations
@@ -48,7 +49,11 @@ def frame_brightness(frame: Image) -> float:
     return float(np.median(np.asarray(frame[::EVERY_PX, ::EVERY_PX], np.float32)))
 
 
-def classify_pulses(brightness: FloatArray, frame_rate_hz: float | None = None) -> Pulses:
+def classify_pulses(
+    brightness: FloatArray,
+    frame_rate_hz: float | None = None,
+    current_a: FloatArray | None = None,
+) -> Pulses:
     """Classify frames by whether the pulse is on.
 
     Parameters
@@ -57,18 +62,34 @@ def classify_pulses(brightness: FloatArray, frame_rate_hz: float | None = None) 
         Brightness of each frame in order (`frame_brightness`), shape (n,).
     frame_rate_hz
         Frame rate, Hz; None: unknown, so the period is not used as a prior.
+    current_a
+        Weld current during each frame, A, shape (n,), NaN where unknown; None: not recorded.
     """
-    light = np.log(np.maximum(np.asarray(brightness, float), 0.5))
-    threshold, contrast = _two_classes(light)
-    off_all = np.zeros(len(light), bool)
-    if contrast < LEAST_CONTRAST:
-        return Pulses(off_all, np.zeros(len(light)), float("nan"))
-    odds = _log_odds(light, light > threshold)
+    given = [np.asarray(brightness, float)]
+    given += [] if current_a is None else [np.asarray(current_a, float)]
+    found = [odds for level in given if (odds := _class_odds(level)) is not None]
+    if not found:
+        off_all = np.zeros(len(given[0]), bool)
+        return Pulses(off_all, np.zeros(len(off_all)), float("nan"))
+    odds = np.sum(found, axis=0)
     frequency = float("nan") if frame_rate_hz is None else pulse_frequency(odds > 0, frame_rate_hz)
     if np.isfinite(frequency):
         assert frame_rate_hz is not None
         odds = odds + _prior_odds(odds > 0, frequency / frame_rate_hz)
     return Pulses(odds > 0, 1 / (1 + np.exp(-np.clip(odds, -50, 50))), frequency)
+
+
+def _class_odds(level: FloatArray) -> FloatArray | None:
+    """Log odds of a pulse from brightness or current; None if it does not form two classes."""
+    odds, known = np.zeros(len(level)), np.isfinite(level)
+    light = np.log(np.maximum(level[known], 0.5))
+    if not len(light):
+        return None
+    threshold, contrast = _two_classes(light)
+    if contrast < LEAST_CONTRAST:
+        return None
+    odds[known] = _log_odds(light, light > threshold)
+    return odds
 
 
 def _two_classes(light: FloatArray) -> tuple[float, float]:

@@ -243,8 +243,20 @@ def _ramps(change: BoolArray, values: FloatArray, on: BoolArray) -> BoolArray:
     for part in range(1, count + 1):
         first, last = np.flatnonzero(parts == part)[[0, -1]]
         begin, end = _ramp(values, on, int(first), int(last) + 1)
-        result[begin:end] = True
+        result[_gap_before(begin, on & np.isfinite(values)) : end] = True
     return result
+
+
+def _gap_before(begin: int, known: BoolArray) -> int:
+    """First frame of a gap in front of a change; ``begin`` if there is none.
+
+    A steady pool whose value was known does not cease to show it: it has begun to change.
+    """
+    before = np.flatnonzero(known[:begin])
+    if not len(before):
+        return begin
+    first = int(before[-1]) + 1
+    return first if known[max(first - LEAST_FRAMES, 0) : first].mean() > 0.5 else begin
 
 
 def _ramp(values: FloatArray, on: BoolArray, begin: int, end: int) -> tuple[int, int]:

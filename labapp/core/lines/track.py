@@ -27,6 +27,10 @@ RECENT, BLINDED, BLINDED_LEVELS = 40, 4.0, 6.0
 this many grey levels."""
 
 
+NEIGHBOURS = 7
+"""Number of columns, about each column, most of which must agree for the line to reach there."""
+
+
 @dataclass(frozen=True)
 class TrackSettings:
     """Settings for tracking a line.
@@ -62,7 +66,8 @@ class TrackedLine(ReadOnlyArrays):
     Parameters
     ----------
     u_px, v_px
-        Its columns and its fitted position in each, shape (n,), px.
+        Its columns, from the first to the last where its light is seen, and its fitted position in
+        each, shape (n,), px.
     shift_px, tilt_px, bend_px
         Difference of its shape from the reference: mean, rise over half its length, and rise of its
         ends relative to its middle, px downwards.
@@ -136,13 +141,14 @@ class LineTracker:
         clear = top > settings.least_contrast * noise
         if clear.sum() < 6:
             return None
-        fit, share = _robust_shape(self._terms, off, clear)
+        fit, agrees = _robust_shape(self._terms, off, clear)
+        share = float(np.mean(agrees))
         if share < settings.least_share:
             return None
         self._shape = self._shape + fit
         shift, tilt, bend_px = self._shape.tolist()
-        fitted = middle + self._terms @ fit
-        return TrackedLine(self._columns, fitted, shift, tilt, bend_px, share)
+        fitted, lit = middle + self._terms @ fit, _lit(agrees)
+        return TrackedLine(self._columns[lit], fitted[lit], shift, tilt, bend_px, share)
 
 
 def _band(strip: Grey, width: float) -> Grey:
@@ -159,8 +165,10 @@ def _down(strip: Grey, sigma: float) -> Grey:
     return np.asarray(down)
 
 
-def _robust_shape(terms: FloatArray, off: FloatArray, clear: BoolArray) -> tuple[FloatArray, float]:
-    """Fit shift, tilt and bend to the columns' positions; also the share of columns that agree."""
+def _robust_shape(
+    terms: FloatArray, off: FloatArray, clear: BoolArray
+) -> tuple[FloatArray, BoolArray]:
+    """Fit shift, tilt and bend to the columns' positions; also which columns agree."""
     start = float(np.median(off[clear]))
     fit, limit = np.array([start, 0.0, 0.0]), 8.0
     weights = clear.astype(float)
@@ -168,12 +176,19 @@ def _robust_shape(terms: FloatArray, off: FloatArray, clear: BoolArray) -> tuple
         away = off - terms @ fit
         weights = np.maximum(1 - (away / limit) ** 2, 0.0) ** 2 * clear
         if weights.sum() < 6:
-            return fit, 0.0
+            return fit, np.zeros(len(off), bool)
         weighted = terms * weights[:, None]
         fit = np.linalg.solve(weighted.T @ terms + 1e-3 * np.eye(3), weighted.T @ off)
         scatter = 1.4826 * float(np.median(np.abs((off - terms @ fit)[weights > 0])))
         limit = float(np.clip(5.0 * scatter, 2.0, 8.0))
-    return fit, float(np.mean((np.abs(off - terms @ fit) < limit) & clear))
+    return fit, (np.abs(off - terms @ fit) < limit) & clear
+
+
+def _lit(agrees: BoolArray) -> slice:
+    """Columns from the first to the last that agrees together with most of its neighbours."""
+    amid = np.convolve(agrees, np.ones(NEIGHBOURS), "same") > NEIGHBOURS / 2
+    lit = np.flatnonzero(agrees & amid)
+    return slice(lit[0], lit[-1] + 1) if len(lit) else slice(None)
 
 
 @dataclass(frozen=True)
@@ -202,11 +217,13 @@ def track_line(
     frame_rate_hz: float | None,
     settings: TrackSettings | None = None,
     tracker: LineTracker | None = None,
+    current_a: FloatArray | None = None,
 ) -> LineFilm:
     """Classify the frames of a recording by pulse, and track its line in those without a pulse.
 
     The line is measured in every frame that is not blinded. Results of frames that are later
-    classified as having a pulse are discarded. ``tracker`` is that of the preceding frames.
+    classified as having a pulse are discarded. ``tracker`` is that of the preceding frames;
+    ``current_a`` as in `classify_pulses`.
     """
     tracker = tracker or LineTracker(settings)
     bright, lines = list[float](), list[TrackedLine | None]()
@@ -215,7 +232,7 @@ def track_line(
         recent = bright[-RECENT:]
         blinded = bright[-1] > BLINDED * min(recent) + BLINDED_LEVELS
         lines.append(None if blinded else tracker.follow(frame))
-    pulses = classify_pulses(np.array(bright), frame_rate_hz)
+    pulses = classify_pulses(np.array(bright), frame_rate_hz, current_a)
     kept = tuple(None if on else one for one, on in zip(lines, pulses.on, strict=True))
     if frame_rate_hz is None:
         return LineFilm(pulses, kept, float("nan"), 0.0)

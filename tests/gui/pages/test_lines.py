@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -15,9 +16,10 @@ from pytestqt.qtbot import QtBot
 
 from labapp.gui.pages.dots import DotsPage
 from labapp.gui.pages.dots.fitting import Processes, Refit
+from labapp.gui.pages.dots.lines import show_lines
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
-from tests.gui.conftest import KEPT, let_draw
+from tests.gui.conftest import KEPT, SAMPLES, let_draw
 from tests.setups import FIVE_LINES as SETUP
 
 SHIFT, NONE = Qt.KeyboardModifier.ShiftModifier, Qt.KeyboardModifier.NoModifier
@@ -136,3 +138,16 @@ def test_a_corrected_frame_is_measured_as_it_was_corrected(page: DotsPage) -> No
     press(page, Qt.Key.Key_Backspace, Qt.KeyboardModifier.ControlModifier)
     assert len(lines(page)) == 3
     assert session.corrected_frames().tolist() == []
+
+
+def test_no_two_lines_of_a_frame_have_the_same_number(tmp_path: Path) -> None:
+    sample = SAMPLES / "five_lines"
+    shutil.copytree(sample, tmp_path / "five_lines")
+    with Session.open(tmp_path / "five_lines" / "five_lines.labsession") as session:
+        folded = 0
+        for frame in range(64):
+            lines = show_lines(session, frame).lines
+            numbers = [line.name.strip("()") for line in lines if line.name != "–"]
+            assert len(set(numbers)) == len(numbers), frame
+            folded += any(line.name == "–" for line in lines)
+        assert folded

@@ -10,15 +10,20 @@ import numpy as np
 import pyqtgraph as pg
 import pytest
 from PySide6.QtCore import QPoint, QRect, Qt
+from PySide6.QtGui import QImage
 from PySide6.QtTest import QTest
 from pytestqt.qtbot import QtBot
+from scipy.ndimage import label
 
 from labapp.config.setup import read_setup
 from labapp.config.setup_keys import SECTIONS
+from labapp.core.geometry.line_pattern import LinePattern, LineRays
+from labapp.core.geometry.rig import DotPattern
 from labapp.core.geometry.uncertainty import ANGLE, DISTANCE, INDEX, POINTS, QUANTITIES
 from labapp.gui.pages.setup import SetupPage, presenter
 from labapp.gui.pages.setup.presenter import RIG
 from labapp.gui.views.bench import DRAWN
+from labapp.gui.views.pattern import PatternView
 from labapp.gui.workspace import Workspace
 from labapp.session.checklist import SAFETY, STEPS, tick
 from labapp.session.session import Session
@@ -216,6 +221,7 @@ def test_the_grid_of_dots_is_chosen(page: SetupPage) -> None:
     page.workspace.undo()
     assert session.setup.rig.pattern.kind == "square"
     # Measured rays come with a setup file; another grid has none of them.
+    assert page.pattern.accessibleDescription().startswith("360 rays")
     page.kind.edited.emit("directions")
     assert any("pattern.rays" in words for words in presenter.shown(session).others)
     page.workspace.undo()
@@ -391,3 +397,30 @@ def test_a_tab_is_no_higher_than_what_it_holds(page: SetupPage) -> None:
         page.tabs.setCurrentIndex(number)
         heights.append(page.tabs.heightForWidth(350))
     assert max(heights[:2]) < heights[2]
+
+
+def ink(view: PatternView) -> np.ndarray:
+    """Mask of the pixels of the drawing that are not background, shape (height, width)."""
+    image = view.grab().toImage().convertToFormat(QImage.Format.Format_Grayscale8)
+    grey = np.array(image.bits(), np.uint8).reshape(image.height(), image.bytesPerLine())
+    return grey[:, : image.width()] != grey[0, 0]
+
+
+def test_the_pattern_is_drawn_with_its_absent_rays_and_its_rotation(qtbot: QtBot) -> None:
+    view = PatternView()
+    qtbot.addWidget(view)
+    view.resize(132, 132)
+    view.show_pattern(DotPattern(5, 5, 1.0), "")
+    dots, holes = label(ink(view))[1], label(~ink(view))[1]
+    assert (dots, holes) == (25, 2)  # the ring of the centre has a hole of its own
+    view.show_pattern(DotPattern(5, 5, 1.0, absent=frozenset({(3, 3), (1, 5)})), "")
+    assert label(~ink(view))[1] == 3
+    view.show_pattern(DotPattern(21, 21, 0.72, kind="hexagonal"), "")
+    assert not ink(view)[:20, :20].any()
+    view.show_pattern(LineRays.of(LinePattern(5, 0.5, 5.0)), "")
+    rows, columns = np.nonzero(ink(view))
+    assert label(ink(view))[1] == 5
+    assert np.ptp(columns) > np.ptp(rows)
+    view.show_pattern(LineRays.of(LinePattern(5, 0.5, 5.0, rotation_deg=30.0)), "")
+    rows, columns = np.nonzero(ink(view))
+    assert rows[columns.argmin()] > rows[columns.argmax()]  # rows rise with X

@@ -36,8 +36,8 @@ class DrawnLine:
     """A line to draw."""
 
     name: str
-    """Its number in the pattern, or in brackets its position from the lowest up if that is unsure.
-    """
+    """Its number in the pattern; in brackets its position from the lowest up if that is unsure;
+    a dash for a folded line beside numbered ones."""
     image_px: FloatArray
     """(u, v) of its ridge, shape (n, 2), px."""
     ends_px: FloatArray
@@ -133,15 +133,14 @@ def _places(number: IntArray) -> list[str]:
     return [str(n) if n else f"({k + 1})" for k, n in enumerate(number.tolist())]
 
 
-def line_names(found: LineFrame, by_hand: IntArray | None = None) -> tuple[str, ...]:
-    """Number of each line in the pattern, or its position, in brackets, if that is unsure."""
-    places = _places(np.zeros(len(found.seen.lines), np.int64) if by_hand is None else by_hand)
+def line_names(found: LineFrame, by_hand: IntArray) -> tuple[str, ...]:
+    """Name of each line, see `DrawnLine`."""
     if found.status != "ok" or found.surface is None:
-        return tuple(places)
+        return tuple(_places(by_hand))
     numbers = iter(found.surface.numbers.tolist())
     return tuple(
-        place if one.folded else str(next(numbers))
-        for place, one in zip(places, found.seen.lines, strict=True)
+        (str(given) if given else "–") if one.folded else str(next(numbers))
+        for given, one in zip(by_hand.tolist(), found.seen.lines, strict=True)
     )
 
 

@@ -19,7 +19,7 @@ from labapp.gui.digits import ResultRow
 from labapp.session.record import Record
 from labapp.session.session import Session
 from labapp.simulation.positioning import USUAL_LENGTH_MM, USUAL_WIDTH_MM, Fate, SideView, side_view
-from labapp.text import marked_setup_words, setup_words
+from labapp.text import marked_setup_words, pluralize, setup_words
 
 
 @dataclass(frozen=True)
@@ -335,6 +335,8 @@ class BenchState:
     words: str
     """Description of the drawing, or the reason why there is none."""
     rows: tuple[ResultRow, ...] = ()
+    pattern_words: str = ""
+    """Description of the drawing of the pattern."""
 
 
 def bench(session: Session) -> BenchState:
@@ -350,7 +352,8 @@ def bench(session: Session) -> BenchState:
     try:
         view = side_view(found, *size)
     except ValueError as error:
-        return BenchState(found, None, f"There is no such pool: {error}.")
+        words = f"There is no such pool: {error}."
+        return BenchState(found, None, words, pattern_words=pattern_words(found.pattern))
     tally, room = view.tally, view.clearance
     width, length, height = size
     given = None not in (record.expected_width_mm, record.expected_length_mm)
@@ -379,7 +382,16 @@ def bench(session: Session) -> BenchState:
         ResultRow("Least plane distance", room.least_plane_mm, unit="mm", decimals=1, note=REACH),
         ResultRow("Most plane distance", room.most_plane_mm, unit="mm", decimals=1, note=REACH),
     )
-    return BenchState(found, view, words, rows if entered else ())
+    return BenchState(found, view, words, rows if entered else (), pattern_words(found.pattern))
+
+
+def pattern_words(pattern: DotPattern) -> str:
+    """Description of the drawing of a pattern."""
+    seen = "As the camera sees it come out of the laser: X to the right, 1 on top"
+    if isinstance(pattern, LineRays):
+        return f"{pluralize(pattern.rows, 'line')}. {seen}"
+    made = pattern.rows * pattern.columns - len(pattern.absent_rays)
+    return f"{pluralize(made, 'ray')}; rings are rays that the lens does not make. {seen}"
 
 
 REACH = "The plane catches the steepest ray that passes the torch between these two (Eq. 4-16)"

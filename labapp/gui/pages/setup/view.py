@@ -24,6 +24,7 @@ from labapp.gui.pages.setup.presenter import (
     Entry,
 )
 from labapp.gui.views.bench import DRAWN, BenchView
+from labapp.gui.views.pattern import PatternView
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField, TextField
 from labapp.gui.widgets.labels import Message, heading, show_words, wrapping_label
@@ -118,6 +119,8 @@ class SetupPage(Page):
             self._drawn = basis
             bench = presenter.bench(session)
             self.bench.show_bench(bench.rig, bench.view, bench.words)
+            pattern = None if bench.rig is None else bench.rig.pattern
+            self.pattern.show_pattern(pattern, bench.pattern_words)
             self.table.set_rows(bench.rows)
             self.table.setVisible(bool(bench.rows))
 
@@ -233,6 +236,8 @@ class SetupPage(Page):
                 )
                 self.kind = self._choice("Kind", KINDS, tip, presenter.put_kind)
                 form.add(self.kind)
+                self.pattern = PatternView()
+                form.add_wide(self.pattern)
             for entry in entries:
                 form.add(self._rig_field(entry), self._sigma_field(presenter.sigma_entry(entry)))
             if title == "Torch":
