@@ -13,18 +13,41 @@ from labapp.version import VERSION
 
 if TYPE_CHECKING:
     from labapp.api import Results, measure
+    from labapp.core.pipeline import Settings
     from labapp.errors import InputError
+    from labapp.export.folder import ExportChoice
+    from labapp.export.formats import RunFormat, SurfaceFormat, add_export_format
     from labapp.run.study.study import Study
+    from labapp.session.record import Record
     from labapp.session.session import Session
 
-__all__ = ["InputError", "Results", "Session", "Study", "__version__", "measure"]
+__all__ = [
+    "ExportChoice",
+    "InputError",
+    "Record",
+    "Results",
+    "RunFormat",
+    "Session",
+    "Settings",
+    "Study",
+    "SurfaceFormat",
+    "__version__",
+    "add_export_format",
+    "measure",
+]
 __version__ = VERSION
 
 _MODULES = {
+    "ExportChoice": "labapp.export.folder",
     "InputError": "labapp.errors",
+    "Record": "labapp.session.record",
     "Results": "labapp.api",
+    "RunFormat": "labapp.export.formats",
     "Session": "labapp.session.session",
+    "Settings": "labapp.core.pipeline",
     "Study": "labapp.run.study.study",
+    "SurfaceFormat": "labapp.export.formats",
+    "add_export_format": "labapp.export.formats",
     "measure": "labapp.api",
 }
 

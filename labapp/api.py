@@ -23,6 +23,7 @@ from labapp.core.recording.residual_check import ResidualRecord, SetupVerdict, j
 from labapp.core.values import FloatArray
 from labapp.errors import PATH, InputError, check_positive, require, unknown_name
 from labapp.export.frame_result import FrameResult
+from labapp.export.meshes import open_mesh, refuse_too_large
 from labapp.export.tables import TABLES, frame_tables
 from labapp.media import Frame, open_source
 from labapp.run.measurers import ColdMeasurer, WarmMeasurer
@@ -383,7 +384,7 @@ class Results(Sequence[FrameResult]):
         axes
             Axes to plot in; None: those of a new figure.
         spacing_mm
-            Distance between neighbouring grid nodes, mm.
+            Distance between the nodes of the surface that is drawn, mm.
 
         Returns
         -------
@@ -393,7 +394,8 @@ class Results(Sequence[FrameResult]):
         Raises
         ------
         InputError
-            If the index is out of range, or the frame has no surface.
+            If the index is out of range, the frame has no surface, or the surface would have too
+            many nodes.
         """
         valid = f"an index from 0 to {len(self) - 1}" if self.results else "results of some frames"
         require(index, (int, np.integer), "plot_surface", "index", valid)
@@ -406,13 +408,17 @@ class Results(Sequence[FrameResult]):
             why = f"{result.measurement.status}: {result.measurement.reason}"
             raise InputError(f"frame {result.frame}", "surface", why, "a frame with a surface")
         axes = _checked_axes("plot_surface", axes)
-        height = self[index : index + 1].surfaces(spacing_mm)["height"][0]
-        contours = axes.contourf(height["x"], height["y"], height, CONTOUR_LEVELS)
+        check_positive(spacing_mm, "plot_surface", "spacing_mm", "mm")
+        refuse_too_large(reconstruction, spacing_mm)
+        mesh = open_mesh(reconstruction, spacing_mm)  # up to the boundary; a grid ends in steps
+        x, y, height = mesh.vertices_mm.T
+        contours = axes.tricontourf(x, y, mesh.triangles, height, CONTOUR_LEVELS)
         axes.figure.colorbar(contours, ax=axes, label="height (mm)")
         boundary = reconstruction.boundary.points_mm
         outline = np.vstack([boundary, boundary[:1]])
         axes.plot(outline[:, 0], outline[:, 1], color="black", linewidth=1)
         axes.plot(*reconstruction.points_mm[:, :2].T, ".", color="white", markersize=2)
+        axes.use_sticky_edges = False  # room for the line of the boundary
         axes.set_aspect("equal")
         axes.set_xlabel("X (mm)")
         axes.set_ylabel("Y, along the weld (mm)")

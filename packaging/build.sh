@@ -11,6 +11,11 @@ rm -rf "$out"
 mkdir -p "$out"
 "$python" -m PyInstaller --noconfirm --log-level WARN --distpath build/frozen \
     --workpath build/pyinstaller packaging/labapp.spec
+# Symbols for debuggers are a tenth of the folder. Libraries that auditwheel changed (*.libs) stay as they are.
+for package in vtkmodules pyarrow numcodecs llvmlite; do
+    find "build/frozen/labapp/_internal/$package" -type f \( -name '*.so' -o -name '*.so.*' \) \
+        -exec strip --strip-unneeded {} +
+done
 tar -C build/frozen -czf "$out/labapp-$version-linux-$(uname -m).tar.gz" labapp
 
 if command -v dpkg-deb >/dev/null; then

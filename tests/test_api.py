@@ -145,7 +145,18 @@ def test_frames_may_be_followed_sliced_and_shown(image: np.ndarray) -> None:
     axes = found.plot("width_mm")
     (line,) = axes.get_lines()
     assert line.get_ydata() == pytest.approx(found.dataframe()["width_mm"])
-    assert found.plot_surface(2).get_xlabel() == "X (mm)"
+    axes = found.plot_surface(2)
+    assert axes.get_xlabel() == "X (mm)"
+    made = found[2].measurement.reconstruction
+    assert made is not None
+    color = axes.collections[0].get_facecolor()  # one for each band of heights
+    assert len(color) > 10
+    bands = axes.collections[0].get_paths()
+    rim = made.boundary.center_mm + 0.998 * (
+        made.boundary.points_mm[:, :2] - made.boundary.center_mm
+    )
+    shown = np.any([band.contains_points(rim) for band in bands], axis=0)
+    assert shown.mean() > 0.99  # no steps along the boundary
 
 
 def test_the_results_of_a_session_are_those_that_it_has() -> None:

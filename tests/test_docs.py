@@ -132,10 +132,18 @@ def examples(text: str) -> list[list[str]]:
     return [shlex.split(line, comments=True) for line in lines]
 
 
+def shown_files(text: str) -> dict[str, str]:
+    """Files that a text shows whole, by name."""
+    shown = re.findall(
+        r'^```toml title="(.+?)"\n(.*?)```', (ROOT / text).read_text("utf-8"), re.M | re.S
+    )
+    return dict(shown)
+
+
 @pytest.mark.parametrize("text", TEXTS)
 def test_examples_can_be_typed_as_they_are(text: str, tmp_path: Path) -> None:
     """The options are there, and so is every file: in a checkout, or made by an example before."""
-    made = {"bench.toml"}  # shown in the text itself
+    made = {"bench.toml", *shown_files(text)}
     for words in examples(text):
         command: object = typer.main.get_command(cli.app)
         context, rest = None, words
@@ -162,6 +170,8 @@ def test_examples_run_one_after_the_other(
     for folder in ("sample_sessions", "resources"):
         shutil.copytree(ROOT / folder, tmp_path / folder)
     monkeypatch.chdir(tmp_path)
+    for name, content in shown_files(text).items():
+        Path(name).write_text(content, "utf-8")
     for words in examples(text):
         if any(words[: len(long)] == long for long in LONG):
             continue

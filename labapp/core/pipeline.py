@@ -279,6 +279,11 @@ def start_correction(measurement: Measurement) -> Correction:
 
     A new one has a reference only if the frame was matched: without a match, a conspicuous hole in
     the rows is only a candidate.
+
+    Parameters
+    ----------
+    measurement
+        Measurement of the frame.
     """
     if isinstance(measurement.correction, Correction):
         return measurement.correction

@@ -1,17 +1,23 @@
 """Registry of export formats; each entry names the function or class that writes the files.
 
-Commands and the Export page read the registry; writers are imported on use.
+Commands and the Export page read the registry; writers are imported on use. Installed packages add
+formats through the entry points of the group ``labapp.exports``, scripts by `add_export_format`.
 """
 
 from __future__ import annotations
 
 import importlib
+import logging
 import os
-from collections.abc import Mapping
+import re
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, Protocol
+
+from labapp.errors import InputError
 
 if TYPE_CHECKING:
     from labapp.core.surface.reconstruction import Reconstruction
@@ -31,13 +37,28 @@ class SurfaceFormat:
     """Data: ``mesh`` for triangles (`meshes.Mesh`), which can also be a watertight solid; ``nodes``
     for the points of a grid within the boundary, shape (n, 3), mm.
     """
-    writer: str
-    """``module:function`` in this package, which returns the file's content for the mesh or nodes.
+    writer: str | Callable[[Any], bytes]
+    """Function that returns the file's content for the mesh or nodes; also as ``module:function``
+    in this package.
     """
 
     def content(self, shape: object) -> bytes:
-        """Return the content of the file for a mesh or for nodes."""
-        content: bytes = _load(self.writer)(shape)
+        """Return the content of a file.
+
+        Parameters
+        ----------
+        shape
+            The mesh or the nodes, see ``of``.
+
+        Raises
+        ------
+        InputError
+            If the writer does not return bytes.
+        """
+        content = _load(self.writer)(shape)
+        if not isinstance(content, bytes):
+            kind = type(content).__name__
+            raise InputError(f"export format {self.title}", "writer returned", kind, "bytes")
         return content
 
 
@@ -47,7 +68,17 @@ class RunWriter(Protocol):
     def write(
         self, frame: int, tables: Mapping[str, Table], reconstruction: Reconstruction | None
     ) -> None:
-        """Add a frame: its number, its rows of every table, and its surface."""
+        """Add a frame.
+
+        Parameters
+        ----------
+        frame
+            Number of the frame.
+        tables
+            Its rows of every table, by the table's name.
+        reconstruction
+            Its surface; None if it has none.
+        """
         ...
 
 
@@ -59,15 +90,25 @@ class RunFormat:
     title: str
     tip: str
     """Name and description on the Export page."""
-    writer: str
-    """``module:Class`` in this package: a `RunWriter`, whose arguments are the file's path, its
-    provenance, and the distance between the surfaces' nodes in mm.
+    writer: str | Callable[[Path, Mapping[str, object], float], AbstractContextManager[RunWriter]]
+    """Class of a `RunWriter`, whose arguments are the file's path, its provenance, and the distance
+    between the surfaces' nodes in mm; also as ``module:Class`` in this package.
     """
 
     def open(
         self, path: str | os.PathLike[str], about: Mapping[str, object], spacing_mm: float
     ) -> AbstractContextManager[RunWriter]:
-        """Return a writer of the file; see ``writer``."""
+        """Return a writer of the file.
+
+        Parameters
+        ----------
+        path
+            Path of the file.
+        about
+            Provenance: program, version, source and settings.
+        spacing_mm
+            Distance between the surfaces' nodes, mm.
+        """
         opened: AbstractContextManager[RunWriter] = _load(self.writer)(
             Path(path), about, spacing_mm
         )
@@ -107,6 +148,55 @@ def mesh_formats() -> list[str]:
     return [name for name, each in SURFACE_FORMATS.items() if each.of == "mesh"]
 
 
-def _load(writer: str) -> Any:
+def add_export_format(name: str, added: SurfaceFormat | RunFormat) -> None:
+    """Add an export format to those of this program.
+
+    Parameters
+    ----------
+    name
+        Name for `ExportChoice`, ``--surfaces`` and ``--together``: lower-case letters, digits and
+        hyphens.
+    added
+        The format.
+
+    Raises
+    ------
+    InputError
+        If the name is invalid, or another format has the name or writes the same file.
+    """
+    source = f"export format {name}"
+    if not isinstance(added, SurfaceFormat | RunFormat):
+        raise InputError(source, "type", type(added).__name__, "SurfaceFormat or RunFormat")
+    if not re.fullmatch("[a-z][a-z0-9-]*", name) or name == "none":
+        raise InputError(source, "name", name, "lower-case letters, digits and hyphens, not none")
+    if name in SURFACE_FORMATS or name in RUN_FORMATS:
+        raise InputError(source, "name", name, "a name that no other format has")
+    if isinstance(added, SurfaceFormat):
+        if added.end in {each.end for each in SURFACE_FORMATS.values()}:
+            raise InputError(source, "end", added.end, "an end that no other format has")
+        SURFACE_FORMATS[name] = added
+    else:
+        if added.file in {each.file for each in RUN_FORMATS.values()}:
+            raise InputError(source, "file", added.file, "a file that no other format has")
+        RUN_FORMATS[name] = added
+
+
+def _add_installed() -> None:
+    for point in entry_points(group="labapp.exports"):
+        try:
+            add_export_format(point.name, point.load())
+        except Exception as error:  # of another package: labapp works without its format
+            logging.getLogger("labapp.notices").warning(
+                "export format %s (%s) is not available: %s", point.name, point.value, error
+            )
+
+
+def _load(writer: str | Callable[..., Any]) -> Callable[..., Any]:
+    if callable(writer):
+        return writer
     module, _, name = writer.partition(":")
-    return getattr(importlib.import_module(f"{__package__}.{module}"), name)
+    found: Callable[..., Any] = getattr(importlib.import_module(f"{__package__}.{module}"), name)
+    return found
+
+
+_add_installed()

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import inspect
 import json
+import os
+import subprocess
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -21,6 +23,7 @@ from labapp.export.formats import (
     SURFACE_FORMATS,
     RunFormat,
     SurfaceFormat,
+    add_export_format,
     mesh_formats,
 )
 from labapp.export.frame_result import FrameResult
@@ -121,6 +124,73 @@ def test_the_command_line_offers_and_writes_them(
     ]
 
 
+PACKAGE = """
+import labapp
+
+def asc(nodes):
+    return "".join(f"{x:.6f};{y:.6f};{z:.6f}\\n" for x, y, z in nodes).encode()
+
+ASC = labapp.SurfaceFormat(".asc", "ASC", "x; y; z, mm", "nodes", asc)
+"""
+
+
+def test_a_package_adds_formats_by_an_entry_point(tmp_path: Path) -> None:
+    site = tmp_path / "site"
+    about = site / "toy_format-1.dist-info"
+    about.mkdir(parents=True)
+    (site / "toy_format.py").write_text(PACKAGE)
+    (about / "METADATA").write_text("Metadata-Version: 2.1\nName: toy-format\nVersion: 1\n")
+    (about / "entry_points.txt").write_text(
+        "[labapp.exports]\nasc = toy_format:ASC\nbroken = toy_format:NOTHING\n"
+    )
+    out = tmp_path / "out"
+    ended = subprocess.run(
+        [
+            *(sys.executable, "-m", "labapp", "session", "export", SAMPLE, "--out", out),
+            *("--frames", "4", "--no-tables", "--surfaces", "asc,csv"),
+        ],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(site), str(ROOT)])},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert ended.returncode == 0, ended.stderr
+    assert "broken" in ended.stderr
+    assert "Traceback" not in ended.stderr
+    points = np.loadtxt(out / "surface_000004.asc", delimiter=";")
+    table = np.loadtxt(out / "surface_000004.csv", delimiter=",", skiprows=1)
+    np.testing.assert_array_equal(points, table)
+
+
+def test_a_script_adds_a_format_under_a_name_and_an_end_of_its_own() -> None:
+    toy = SurfaceFormat(".toy", "Toy", "A toy, mm", "nodes", xyz)
+    add_export_format("toy", toy)
+    try:
+        assert ExportChoice(surfaces=frozenset({"toy"})).surfaces == {"toy"}
+        for name, added, field in (
+            ("toy", SurfaceFormat(".new", "Toy", "", "nodes", xyz), "name"),
+            ("hdf5", SurfaceFormat(".new", "Toy", "", "nodes", xyz), "name"),
+            ("two,names", SurfaceFormat(".new", "Toy", "", "nodes", xyz), "name"),
+            ("none", SurfaceFormat(".new", "Toy", "", "nodes", xyz), "name"),
+            ("new", SurfaceFormat(".stl", "Toy", "", "nodes", xyz), "end"),
+            ("new", RunFormat("results.h5", "Toy", "", Frames), "file"),
+            ("new", xyz, "type"),
+        ):
+            with pytest.raises(InputError) as refused:
+                add_export_format(name, added)
+            assert refused.value.field == field
+        assert "new" not in SURFACE_FORMATS
+    finally:
+        del SURFACE_FORMATS["toy"]
+
+
+def test_a_writer_that_returns_no_bytes_is_named() -> None:
+    text = SurfaceFormat(".toy", "Toy", "A toy, mm", "nodes", lambda nodes: str(len(nodes)))
+    with pytest.raises(InputError) as refused:
+        text.content(np.zeros((2, 3)))
+    assert (refused.value.source, refused.value.value) == ("export format Toy", "str")
+
+
 def test_hdf5_is_one_of_the_formats_of_a_whole_run() -> None:
     short = ExportChoice(hdf5=True, together=frozenset({"json"}))
     assert [each.file for each in short.run_formats] == ["results.h5", "frames.json"]
@@ -133,6 +203,7 @@ def test_hdf5_is_one_of_the_formats_of_a_whole_run() -> None:
 @pytest.mark.parametrize("name", [*SURFACE_FORMATS, *RUN_FORMATS])
 def test_every_format_has_a_writer_and_a_place_in_the_documents(name: str) -> None:
     each = (SURFACE_FORMATS | RUN_FORMATS)[name]
+    assert isinstance(each.writer, str)
     module, _, function = each.writer.partition(":")
     made = getattr(__import__(f"labapp.export.{module}", fromlist=[function]), function)
     if isinstance(each, SurfaceFormat):

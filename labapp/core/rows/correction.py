@@ -75,9 +75,16 @@ class Correction(ReadOnlyArrays):
 
     @classmethod
     def of(cls, dots: Dots | None, lattice: Lattice | None) -> Correction:
-        """Start from the dots and rows that were found; None for none.
+        """Start from the dots and rows that were found.
 
         Dots that a search assigned to the same site get no row and column.
+
+        Parameters
+        ----------
+        dots
+            The dots; None for none.
+        lattice
+            Their rows and columns; None for none.
         """
         if dots is None:
             dots = Dots(*(np.zeros(0) for _ in fields(Dots)))
@@ -112,12 +119,14 @@ def add_dot(
 
     Parameters
     ----------
+    correction
+        The frame's correction, which stays as it is.
     image
         Grey frame, shape (height, width).
     u_px, v_px
         Position of the pointer, px.
     settings
-        Settings of the band-pass detector.
+        Settings of the band-pass detector; None: the defaults.
 
     Raises
     ------
@@ -147,7 +156,15 @@ def add_dot(
 
 
 def delete_dots(correction: Correction, dots: Indices) -> Correction:
-    """Delete dots; the indices of later dots decrease."""
+    """Delete dots; the indices of later dots decrease.
+
+    Parameters
+    ----------
+    correction
+        The frame's correction, which stays as it is.
+    dots
+        Indices of the dots, from 0.
+    """
     keep = np.delete(np.arange(len(correction.dots)), _chosen(correction, dots))
     lattice = correction.lattice
     return _rebuilt(
@@ -160,7 +177,22 @@ def delete_dots(correction: Correction, dots: Indices) -> Correction:
 
 
 def move_dots(correction: Correction, dots: Indices, du_px: float, dv_px: float) -> Correction:
-    """Move dots by (du, dv), px; their standard uncertainty is then at least `PLACED_PX`."""
+    """Move dots; their standard uncertainty is then at least `PLACED_PX`.
+
+    Parameters
+    ----------
+    correction
+        The frame's correction, which stays as it is.
+    dots
+        Indices of the dots, from 0.
+    du_px, dv_px
+        Distance to the right and downwards, px.
+
+    Raises
+    ------
+    ValueError
+        If the distance is not finite or too large.
+    """
     if not (abs(du_px) < 1e5 and abs(dv_px) < 1e5):
         raise ValueError(f"dots cannot be moved by ({du_px:g}, {dv_px:g}) px")
     moved = _mask(correction, dots)
@@ -178,7 +210,22 @@ def move_dots(correction: Correction, dots: Indices, du_px: float, dv_px: float)
 def assign(
     correction: Correction, dots: Indices, row: int | None = None, column: int | None = None
 ) -> Correction:
-    """Assign a row, a column or both to dots; ValueError if another dot has that site."""
+    """Assign a row, a column or both to dots.
+
+    Parameters
+    ----------
+    correction
+        The frame's correction, which stays as it is.
+    dots
+        Indices of the dots, from 0.
+    row, column
+        The row k and the column t; None: unchanged.
+
+    Raises
+    ------
+    ValueError
+        If neither is given, or another dot has that site.
+    """
     if row is None and column is None:
         raise ValueError("a row or a column is needed")
     chosen = _mask(correction, dots)
@@ -194,6 +241,13 @@ def clear_rows(correction: Correction, dots: Indices) -> Correction:
     """Remove the row and column of dots.
 
     Their rays may still be determined from the surface; a dot to be ignored has to be deleted.
+
+    Parameters
+    ----------
+    correction
+        The frame's correction, which stays as it is.
+    dots
+        Indices of the dots, from 0.
     """
     chosen = _mask(correction, dots)
     sites = _Sites.of(correction)
@@ -202,7 +256,22 @@ def clear_rows(correction: Correction, dots: Indices) -> Correction:
 
 
 def shift_row(correction: Correction, row: int, columns: int) -> Correction:
-    """Shift a row, and the reference if it is in it, by a number of columns; right if positive."""
+    """Shift a row, and the reference if it is in it, by a number of columns.
+
+    Parameters
+    ----------
+    correction
+        The frame's correction, which stays as it is.
+    row
+        The row k.
+    columns
+        Number of columns; to the right if positive.
+
+    Raises
+    ------
+    ValueError
+        If the row has no dots.
+    """
     sites = _Sites.of(correction)
     chosen = sites.dots_in(row) & (sites.column != _NONE)
     sites.column[chosen] += _number(columns, "number of columns")
@@ -216,6 +285,22 @@ def split_row(correction: Correction, row: int, column: int, above: bool = True)
 
     Higher rows are renumbered. The reference moves with its part; if the row is blocked, both parts
     are.
+
+    Parameters
+    ----------
+    correction
+        The frame's correction, which stays as it is.
+    row
+        The row k.
+    column
+        First column t of the new row.
+    above
+        Whether the new row is above the old one, else below.
+
+    Raises
+    ------
+    ValueError
+        If the row has no dots on both sides.
     """
     sites = _Sites.of(correction)
     inside = sites.dots_in(row)
@@ -235,7 +320,22 @@ def split_row(correction: Correction, row: int, column: int, above: bool = True)
 
 
 def merge_rows(correction: Correction, row: int, into: int) -> Correction:
-    """Merge the dots of ``row`` into another row; rows above ``row`` move down by one."""
+    """Merge the dots of a row into another row; rows above it move down by one.
+
+    Parameters
+    ----------
+    correction
+        The frame's correction, which stays as it is.
+    row
+        The row that ends.
+    into
+        The row that gets its dots.
+
+    Raises
+    ------
+    ValueError
+        If they are the same row, a row has no dots, or two dots would have one site.
+    """
     if row == into:
         raise ValueError(f"row {row} cannot be merged with itself")
     sites = _Sites.of(correction)
@@ -256,6 +356,20 @@ def block_row(correction: Correction, row: int, blocked: bool = True) -> Correct
     """Set whether a row has dots hidden by the torch.
 
     Missing dots of a blocked row are not used as evidence for the boundary.
+
+    Parameters
+    ----------
+    correction
+        The frame's correction, which stays as it is.
+    row
+        The row k.
+    blocked
+        Whether it is blocked.
+
+    Raises
+    ------
+    ValueError
+        If the row is to be unmarked and is not marked.
     """
     sites = _Sites.of(correction)
     if blocked:
@@ -268,7 +382,15 @@ def block_row(correction: Correction, row: int, blocked: bool = True) -> Correct
 
 
 def set_reference(correction: Correction, site: Site | None) -> Correction:
-    """Set the site (k, t) of the reference; None for automatic."""
+    """Set the site of the reference.
+
+    Parameters
+    ----------
+    correction
+        The frame's correction, which stays as it is.
+    site
+        Row and column (k, t); None: found automatically.
+    """
     sites = _Sites.of(correction)
     if site is not None:
         site = _number(site[0], "row"), _number(site[1], "column")
