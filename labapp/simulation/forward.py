@@ -274,11 +274,10 @@ def _crossing(
         near, far = np.where(below, near, middle), np.where(below, middle, far)
         found[left] = np.where(np.abs(of_middle) < EXACT_MM, middle, far)
         still = np.abs(of_middle) >= EXACT_MM
-        left, near, far, of_near, of_far = (
-            values[still] for values in (left, near, far, of_near, of_far)
-        )
-        if not len(left):
+        if not still.any():
             break
+        left, near, far = left[still], near[still], far[still]
+        of_near, of_far = of_near[still], of_far[still]
     return found
 
 

@@ -346,9 +346,10 @@ class Pool:
             return size_of(self.height, self.boundary_mm(), middle, extent)
         # The extremes of an undisturbed cap are its centre and its boundary.
         ends = np.vstack([[*foot.center_mm, self.peak_mm], self.boundary_mm()]).tolist()
-        high, low = max(ends, key=lambda end: end[2]), min(ends, key=lambda end: end[2])
-        (x, y, top), (u, v, bottom) = high, low
-        return PoolSize(*extent.tolist(), top, bottom, (x, y), (u, v))
+        x, y, top = max(ends, key=lambda end: float(end[2]))
+        u, v, bottom = min(ends, key=lambda end: float(end[2]))
+        width, length = extent.tolist()
+        return PoolSize(width, length, top, bottom, (x, y), (u, v))
 
     def after(self, seconds: float) -> Pool:
         """The same pool ``seconds`` later; itself if nothing on it oscillates."""

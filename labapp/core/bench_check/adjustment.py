@@ -303,8 +303,8 @@ class System:
         """
         dots, (one, at) = self.observed(k, offset), (self.sightings[k], self.pose(k, pose))
         rig = moved_rig(self.rig, offset)
-        *ray, _ = reflected_rays(one.mirror, at, rig, tuple(one.ray.T))
-        landed = intersect_imaging_plane(*ray, rig.imaging_plane)
+        point, direction, _ = reflected_rays(one.mirror, at, rig, tuple(one.ray.T))
+        landed = intersect_imaging_plane(point, direction, rig.imaging_plane)
         still = _standardised(*dots, landed)
         made = np.zeros((len(still), len(QUANTITIES)))
         for q in np.flatnonzero(used):
@@ -314,7 +314,7 @@ class System:
                 changed = _standardised(*self.observed(k, moved), landed)
             elif OF_PLANE[q]:
                 plane = moved_plane(self.rig.imaging_plane, moved)
-                changed = _standardised(*dots, intersect_imaging_plane(*ray, plane))
+                changed = _standardised(*dots, intersect_imaging_plane(point, direction, plane))
             else:
                 moved_computed = self.computed(k, moved_rig(self.rig, moved), pose)
                 changed = _standardised(*dots, moved_computed)

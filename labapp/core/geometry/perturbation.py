@@ -159,7 +159,10 @@ def moved_calibration(
     back = np.linalg.solve(_with_ones(moved), true).T
     stretch = np.diag([*(1.0 + offset[_AXES] / [axes.x_mm, axes.z_mm]), 1.0])
     return ImageCalibration.distorted(
-        np.asarray(stretch @ base.matrix @ back), base.lens, percent, _half_mm(plane)
+        np.asarray(stretch @ base.matrix @ back),
+        calibration.plain_lens,
+        percent,
+        _half_mm(plane),
     )
 
 

@@ -225,13 +225,12 @@ def _add_light(light: FloatArray, image_px: FloatArray, shows: BoolArray, weight
     place = place[np.isfinite(place).all(axis=-1)]
     corner = np.floor(place).astype(np.int64)
     share = place - corner
-    for du in (0, 1):
-        for dv in (0, 1):
-            u, v = corner[:, 0] + du, corner[:, 1] + dv
-            part = np.abs(1 - du - share[:, 0]) * np.abs(1 - dv - share[:, 1])
-            kept = (u >= 0) & (u < width) & (v >= 0) & (v < height)
-            flat: IntArray = v[kept] * width + u[kept]
-            light += weight * np.bincount(flat, part[kept], light.size).reshape(light.shape)
+    du, dv = np.array([[0, 0, 1, 1], [0, 1, 0, 1]])[..., None]
+    u, v = corner[:, 0] + du, corner[:, 1] + dv
+    part = np.abs(1 - du - share[:, 0]) * np.abs(1 - dv - share[:, 1])
+    kept = (u >= 0) & (u < width) & (v >= 0) & (v < height)
+    flat: IntArray = v[kept] * width + u[kept]
+    light += weight * np.bincount(flat, part[kept], light.size).reshape(light.shape)
 
 
 def _filled(offsets: FloatArray) -> FloatArray:
