@@ -171,7 +171,13 @@ def _decide_among(
         if lattice is not None and not lattice.candidates:
             raise CannotMeasure("no-reference", "no hole in the rows can be the absent dot")
         raise CannotMeasure("no-match", NOTHING_EXPLAINS)
-    return decide(observed, found, settings)
+    best, open_holes = decide(observed, found, settings)
+    lit = best.labels != UNLABELLED
+    if any(np.mean(each.labels[lit] == best.labels[lit]) > 0.5 for each in found):
+        return best, open_holes
+    # Shifted labels were chosen, which may lack a row on one side.
+    wider = with_rows_beyond(observed, [best])[1:]
+    return decide(observed, found + wider, settings) if wider else (best, open_holes)
 
 
 def lattice_of_match(match: Match, rig: Rig, count: int) -> Lattice:

@@ -76,6 +76,10 @@ PAIR, BESIDE_SPACINGS = 2, 1.5
 """Up to this number of adjacent missed rays, or of adjacent stray dots, is not taken for a row.
 Dots are adjacent within `BESIDE_SPACINGS` spacings."""
 
+ROW, ROW_SPACINGS = 5, 2.2
+"""So many stray dots, each within `ROW_SPACINGS` spacings of the next, are a row: beyond the last
+labelled one, where rows fan out, dots are farther apart than the others."""
+
 MOST_SCATTERED, MOST_MISSED_APART = 0.3, 0.12
 """Largest share of stray dots and missed rays together, relative to the labelled dots, that is
 accepted if they are isolated: false dots and random failures are isolated, whereas the dots of a
@@ -447,14 +451,14 @@ def _missed_lie_apart(hypothesis: Hypothesis) -> bool:
 
 
 def _strays_lie_apart(observed: Observation, hypothesis: Hypothesis) -> bool:
-    """Whether at most `PAIR` stray dots are adjacent."""
+    """Whether at most `PAIR` stray dots are adjacent, and fewer than `ROW` lie in a chain."""
     dots = observed.plane_mm[hypothesis.labels[hypothesis.labels != UNLABELLED]]
     spacing = median(scipy.spatial.cKDTree(dots).query(dots, k=2)[0][:, 1])
     stray_dots = observed.plane_mm[hypothesis.stray_dots]
-    beside = scipy.spatial.cKDTree(stray_dots).query_ball_point(
-        stray_dots, BESIDE_SPACINGS * spacing, return_length=True
-    )
-    return bool((beside <= PAIR).all())
+    apart = scipy.spatial.distance.cdist(stray_dots, stray_dots)
+    beside = (apart <= BESIDE_SPACINGS * spacing).sum(axis=0)
+    chain = scipy.sparse.csgraph.connected_components(apart <= ROW_SPACINGS * spacing)[1]
+    return bool((beside <= PAIR).all() and (np.bincount(chain) < ROW).all())
 
 
 def _differing(one: Hypothesis, other: Hypothesis) -> tuple[list[int], int]:
