@@ -48,8 +48,8 @@ def lines(
     signals: Annotated[
         Path | None,
         typer.Option(
-            help="Weld current (CSV, TDMS, WAV), to tell pulses by, besides the light; with one "
-            "line that is followed."
+            help="Recorded weld current (CSV, TDMS, WAV), which shows the pulses as the light "
+            "does; only with --follow or a pattern of one line."
         ),
     ] = None,
     start: Annotated[

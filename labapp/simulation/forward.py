@@ -6,11 +6,11 @@ of the rig's pattern, without any of the measuring code.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
+from scipy.optimize.elementwise import find_root
 from scipy.spatial.transform import Rotation
 
 from labapp.core.geometry.rig import Rig
@@ -30,12 +30,6 @@ CLEAR_MM = 1e-6
 
 TOGETHER = 16
 """Steps of all rays that are computed at a time: few enough to stay in the processor's cache."""
-
-ROUNDS = 60
-"""At most, of the search for a reflection point within a step."""
-
-EXACT_MM = 1e-13
-"""Distance of a point from the surface at which the search ends."""
 
 
 class PoolSurface(Protocol):
@@ -224,8 +218,8 @@ def _first_hit(
     work piece, a ray can meet the step; that is not a reflection point either.
     """
 
-    def above(t: FloatArray, direction: FloatArray) -> FloatArray:
-        x, y, z = (source[n] + t * direction[..., n] for n in range(3))
+    def above(t: FloatArray, *along: FloatArray) -> FloatArray:
+        x, y, z = (start + t * part for start, part in zip(source, along, strict=True))
         ground = pool.height(x, y)
         return np.asarray(z - np.where(np.isnan(ground), 0.0, ground))
 
@@ -237,48 +231,19 @@ def _first_hit(
     falls = direction[..., 2] < 0
     down = np.where(falls, direction[..., 2], -1.0)
     steps = (levels[:, None, None] - source[2]) / down
+    along = np.moveaxis(direction, -1, 0)
     parts = (slice(first, first + TOGETHER) for first in range(0, SAMPLES, TOGETHER))
-    under = np.concatenate([above(steps[part], direction) <= 0 for part in parts])
+    under = np.concatenate([above(steps[part], *along) <= 0 for part in parts])
     first = np.maximum(np.argmax(under, axis=0), 1)
     far = np.take_along_axis(steps, first[None], axis=0)[0]
     near = np.take_along_axis(steps, first[None] - 1, axis=0)[0]
     meets = falls & under.any(axis=0)
-    far[meets] = _crossing(above, near[meets], far[meets], direction[meets])
+    within = near[meets], far[meets]
+    far[meets] = find_root(above, within, args=tuple(along[:, meets])).x
     point = source + far[..., None] * direction
     ground = pool.height(point[..., 0], point[..., 1])
     hit = meets & (np.abs(point[..., 2] - ground) < 1e-9)
     return np.where(hit[..., None], point, np.nan), np.asarray(hit)
-
-
-def _crossing(
-    above: Callable[[FloatArray, FloatArray], FloatArray],
-    near: FloatArray,
-    far: FloatArray,
-    direction: FloatArray,
-) -> FloatArray:
-    """Ray parameter where a ray goes below the surface between two others, shape (n,).
-
-    False position with the Illinois algorithm (Dowell & Jarratt 1971); each third step halves, so
-    that the search also ends at a step of the surface.
-    """
-    found, left = far.copy(), np.arange(len(far))
-    of_near, of_far = above(near, direction), above(far, direction)
-    for k in range(ROUNDS):
-        share = 0.5 if k % 3 == 2 else of_far / (of_far - of_near)
-        middle = far - share * (far - near)
-        of_middle = above(middle, direction[left])
-        below = of_middle <= 0
-        # The end that stays loses half its weight, else it would stay for ever.
-        of_near = np.where(below, of_near / 2, of_middle)
-        of_far = np.where(below, of_middle, of_far / 2)
-        near, far = np.where(below, near, middle), np.where(below, middle, far)
-        found[left] = np.where(np.abs(of_middle) < EXACT_MM, middle, far)
-        still = np.abs(of_middle) >= EXACT_MM
-        if not still.any():
-            break
-        left, near, far = left[still], near[still], far[still]
-        of_near, of_far = of_near[still], of_far[still]
-    return found
 
 
 def _hits_again(pool: PoolSurface, point: FloatArray, direction: FloatArray) -> BoolArray:

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 from labapp.core.geometry.bench import Bench
+from labapp.core.matching import decision
 from labapp.core.matching.hypothesis import Hypothesis, evaluate, shifted_labels
 from labapp.core.matching.observation import UNLABELLED, Observation
 from labapp.core.schemes import fit
 from labapp.core.schemes.fit import FitSettings
 from labapp.core.surface.measures import measure_surface
-from labapp.core.values import IntArray
+from labapp.core.values import CannotMeasure, IntArray
 from tests.benchmarks.dips import answer, draw, matched
 from tests.scenes import BENCH_RIG, BENCH_VIEW, FRAME_SHAPE, SeenDots
 
@@ -52,6 +53,24 @@ def test_a_pool_with_a_dip_has_its_rows_told_right(seed: int) -> None:
     assert (got.status, got.wrong) == ("ok", 0)
     assert got.right >= 0.95 * got.shown
     assert abs(got.height) < 0.03
+
+
+@pytest.mark.slow
+def test_a_row_beyond_shifted_labels_is_sought(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(decision, "ROW", 1000)  # else the labels without it would be refused
+    got = answer(*draw(ROW_LEFT_OVER))
+    assert (got.status, got.wrong, got.right) == ("ok", 0, got.shown)
+
+
+def test_labels_without_a_row_of_dots_explain_too_little() -> None:
+    observed, labels = observation_of(draw(ROW_LEFT_OVER)[1])
+    rows = np.flatnonzero((labels != UNLABELLED).any(axis=1))
+    labels[rows[-1]] = UNLABELLED
+    lacking = weighed(observed, labels)
+    assert (lacking.stray_count, lacking.missed_count, lacking.marker) == (9, 0, "dark")
+    with pytest.raises(CannotMeasure) as refused:
+        decision.decide(observed, [lacking], decision.MatchSettings())
+    assert refused.value.status == "no-match"
 
 
 @pytest.mark.slow

@@ -13,7 +13,7 @@ import scipy
 from labapp.core.values import FloatArray
 
 ROUNDS = 12
-"""At most, of Gauss–Newton steps; the fit has converged by then, or does not converge."""
+"""Maximum number of Gauss–Newton steps; the fit has converged by then, or does not converge."""
 
 CONVERGED = 1e-6
 """The fit has converged if no parameter (px, rad, grey levels) changes by more."""
