@@ -54,6 +54,16 @@ def test_states_of_a_run(seed: int):
     assert [s for k, s in enumerate(states) if k in (5, 35, 80, 130, 180)] == list(PHASES)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_pool_grows_from_its_first_lines_though_they_are_too_few(seed: int):
+    series, truth = run_series(seed)
+    width, turn = series.width_mm.copy(), series.turn.copy()
+    width[15:26], turn[15:26] = np.nan, np.nan
+    width[26:34] = width[34]  # the growth is seen later than within 15 frames of the first lines
+    states = line_states(replace(series, width_mm=width, turn=turn))
+    assert set(states[15:50]) == {"growing"} == set(truth[15:50])
+
+
 def test_a_steady_pool_neither_grows_nor_flattens():
     rng = np.random.default_rng(4)
     turn = -0.36 + 0.024 * rng.normal(size=120)

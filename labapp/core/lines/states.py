@@ -48,7 +48,8 @@ UNEVEN = 0.05
 """Standard deviation of frames from a straight ramp, relative to its height."""
 
 APPEARING_FRAMES = 15
-"""Growth detected within this many frames of the first lines is taken to begin with them."""
+"""Growth detected within this many frames of the first known width is taken to begin with the first
+lines."""
 
 LEAST_FRAMES = 8
 """Shortest change, frames."""
@@ -125,7 +126,7 @@ def line_states(series: LineSeries, settings: StateSettings | None = None) -> tu
     grows = _changes(growth, growth_sigma, settings.least_growth_mm, settings)
     grows = _well_known(grows, series.width_mm)
     grows = lit & _with_corners(grows, series.width_mm, lit)
-    grows |= _just_appeared(lit, grows)
+    grows |= _just_appeared(lit, np.isfinite(series.width_mm), grows)
     flattens = _changes(turning, turning_sigma, settings.least_turn, settings)
     flattens = lit & ~grows & _ramps(flattens, series.turn, lit & ~grows)
     known = np.flatnonzero(np.isfinite(turn))
@@ -313,11 +314,16 @@ def _closed(on: BoolArray) -> BoolArray:
     return np.asarray(after - last <= BETWEEN)
 
 
-def _just_appeared(lit: BoolArray, grows: BoolArray) -> BoolArray:
-    """Frames between the first lines of a pool and the first detection of its growth."""
+def _just_appeared(lit: BoolArray, known: BoolArray, grows: BoolArray) -> BoolArray:
+    """Frames between the first lines of a pool and the first detection of its growth.
+
+    The first lines may be too few for a width, so that the growth is detected from the first known
+    width on.
+    """
     result = np.zeros(len(lit), bool)
     for first in np.flatnonzero(np.diff(lit.astype(int)) == 1) + 1:
-        later = np.flatnonzero(grows[first : first + APPEARING_FRAMES])
+        begun = first + int(np.argmax(known[first:]))
+        later = np.flatnonzero(grows[first : begun + APPEARING_FRAMES])
         if len(later):
             result[first : first + later[0]] = True
     return result
