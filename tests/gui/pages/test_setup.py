@@ -22,8 +22,8 @@ from labapp.core.geometry.rig import DotPattern
 from labapp.core.geometry.uncertainty import ANGLE, DISTANCE, INDEX, POINTS, QUANTITIES
 from labapp.gui.pages.setup import SetupPage, presenter
 from labapp.gui.pages.setup.presenter import RIG
-from labapp.gui.views.bench import DRAWN
-from labapp.gui.views.pattern import PatternView
+from labapp.gui.views.drawings.bench import DRAWN
+from labapp.gui.views.drawings.pattern import PatternView
 from labapp.gui.workspace import Workspace
 from labapp.session.checklist import SAFETY, STEPS, tick
 from labapp.session.session import Session

@@ -13,8 +13,8 @@ from labapp.gui.dialogs import ask_file
 from labapp.gui.pages.laser import presenter
 from labapp.gui.pages.laser.presenter import ENDS, MEANINGS, NAMES, SCALE, Place, Readings
 from labapp.gui.pages.page import Page
-from labapp.gui.views.cross_hair import CrossHairView
 from labapp.gui.views.drag_point import DragPoint
+from labapp.gui.views.drawings.cross_hair import CrossHairView
 from labapp.gui.views.picture import PictureView
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField

@@ -23,8 +23,8 @@ from labapp.gui.pages.setup.presenter import (
     UNCERTAIN_ONLY,
     Entry,
 )
-from labapp.gui.views.bench import DRAWN, BenchView
-from labapp.gui.views.pattern import PatternView
+from labapp.gui.views.drawings.bench import DRAWN, BenchView
+from labapp.gui.views.drawings.pattern import PatternView
 from labapp.gui.widgets.buttons import button
 from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField, TextField
 from labapp.gui.widgets.labels import Message, heading, show_words, wrapping_label

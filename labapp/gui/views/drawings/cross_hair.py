@@ -11,7 +11,7 @@ from PySide6.QtGui import QPalette, QResizeEvent
 
 from labapp.core.calibration.laser_calibration import LaserCalibration
 from labapp.gui.views.axes import Sketch, draw_line, draw_text, make_plot, paint_axes, show_axes
-from labapp.gui.views.dimension import DimensionBox
+from labapp.gui.views.drawings.dimension import DimensionBox
 from labapp.gui.widgets.fields import NumberField
 from labapp.gui.widgets.layouts import vbox
 

@@ -15,7 +15,7 @@ from PySide6.QtWidgets import QAbstractSpinBox, QBoxLayout, QGridLayout, QWidget
 from labapp.core.geometry.rig import Rig
 from labapp.core.values import FloatArray
 from labapp.gui.views.axes import Sketch, draw_line, draw_text, make_plot, paint_axes, show_axes
-from labapp.gui.views.dimension import DimensionBox
+from labapp.gui.views.drawings.dimension import DimensionBox
 from labapp.gui.widgets.fields import NumberField
 from labapp.gui.widgets.labels import plain_tip
 from labapp.gui.widgets.layouts import vbox

@@ -1,0 +1,1 @@
+"""Drawings of the bench, the cross hair and the pattern, with fields at their dimensions."""
