@@ -381,13 +381,15 @@ def test_a_mirror_alone_in_the_usual_look_measures_itself(kind: str, seed: int):
 
 
 @pytest.mark.slow
-def test_noise_of_the_dots_is_not_taken_for_a_wrong_scale():
+@pytest.mark.parametrize("level_deg", [0.1, 0.0])
+def test_noise_of_the_dots_is_not_taken_for_a_wrong_scale(level_deg: float):
     """On a plane of smaller scale residuals are smaller, which once counted for it."""
+    plate = Plate(tilt_sigma_deg=level_deg)
     rng = np.random.default_rng(0)
     made = trace(FlatMirror(), EXACT.rig)
     place = VIEW.to_image(made.plane_mm)[made.visible]
     dots = as_dots(place + rng.normal(0, 0.2, place.shape), 0.2)
-    check = check_bench([Picture("plate", Plate(), dots, SHAPE)], RIG, CALIBRATION)
+    check = check_bench([Picture("plate", plate, dots, SHAPE)], RIG, CALIBRATION)
     assert (check.status, check.suspects) == ("ok", ())
 
 

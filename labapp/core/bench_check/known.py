@@ -121,8 +121,10 @@ def _without_size(
     loose = _loosened(own)
     others = [replace(s, mirror=loose) if n == k else s for n, s in enumerate(sightings)]
     system = System.of(rig, others, released)
+    # A part of the pose that is known exactly is no unknown: its uncertainty stays zero.
+    narrower = np.divide(own.sigma, loose.sigma, out=np.ones_like(own.sigma), where=loose.sigma > 0)
     unknown = made.unknown.copy()
-    unknown[system.parts[k + 1]] *= own.sigma / loose.sigma
+    unknown[system.parts[k + 1]] *= narrower
     found = system.adjustment(system.minimised(unknown, made.scale, MOST_STEPS), made.scale)
     return found.poses[k], found.pose_covariances[k]
 
