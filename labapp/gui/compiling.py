@@ -20,7 +20,8 @@ COMPILED = (
         f"labapp.core.surface.kernels.{name}_kernels"
         for name in ("spline", "ray", "solver", "outline", "level")
     ),
-    *(f"labapp.core.matching.{name}_kernels" for name in ("match", "quadric")),
+    "labapp.core.matching.match_kernels",
+    "labapp.core.matching.initial.quadric_kernels",
     "labapp.core.lines.ridge_kernels",
     "labapp.core.sequence.prior",
     "labapp.export.fixed_point",

@@ -31,7 +31,8 @@ from labapp.core.images import (
     dots,
     size_kernels,
 )
-from labapp.core.matching import match_kernels, quadric_kernels
+from labapp.core.matching import match_kernels
+from labapp.core.matching.initial import quadric_kernels
 from labapp.core.sequence.prior import RIDGE, recurrence
 from labapp.core.surface.kernels import (
     level_kernels,

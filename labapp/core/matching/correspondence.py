@@ -4,8 +4,8 @@
 
 1. Initial labels. The absent centre dot gives the rays of a complete grid, for each orientation.
    Where rows bend too much for a grid to grow, labels come from models of the surface instead:
-   quadrics that explain the dots around a hole (`quadric_search`), or caps as large as the pool
-   (`cap_search`).
+   quadrics that explain the dots around a hole (`initial.quadrics`), or caps as large as the pool
+   (`initial.caps`).
 2. Labels are grown (`label_growth`) and evaluated (`hypothesis`): fit the surface to the labelled
    dots, predict the dot of every ray, label the dots with an unambiguous ray, and fit again until
    nothing changes. This labels the dots that the grid left in doubt and removes wrong labels.
@@ -33,7 +33,6 @@ from labapp.core.match import (
     missing_share,
     ways,
 )
-from labapp.core.matching.cap_search import search_caps
 from labapp.core.matching.decision import (
     MISFIT_MM,
     MISFIT_TIMES,
@@ -57,6 +56,8 @@ from labapp.core.matching.hypothesis import (
     paths_of,
     reoriented_labels,
 )
+from labapp.core.matching.initial.caps import search_caps
+from labapp.core.matching.initial.quadrics import search_quadrics
 from labapp.core.matching.observation import (
     LEAST_LABELS,
     QUICK,
@@ -66,7 +67,6 @@ from labapp.core.matching.observation import (
     try_fit,
 )
 from labapp.core.matching.prediction import covariance_of_dots
-from labapp.core.matching.quadric_search import search_quadrics
 from labapp.core.matching.ray_classes import certain_witness
 from labapp.core.matching.repair import with_repaired, with_rows_beyond
 from labapp.core.rows.lattice import Lattice, Site, empty_sites

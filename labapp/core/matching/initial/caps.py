@@ -61,7 +61,7 @@ def search_caps(observed: Observation, most: int = 24) -> list[IntArray]:
     list of IntArray
         Index of the dot of each ray or `UNLABELLED`, shape (rows, columns), best first.
     """
-    from labapp.core.matching import quadric_kernels
+    from labapp.core.matching.initial import quadric_kernels
 
     rig = observed.rig
     bench = (

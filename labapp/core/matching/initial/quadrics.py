@@ -168,7 +168,7 @@ class _Window:
 
         Shapes (m, n, 3), mm, and IPCS, (m, n, 2), mm (`quadric_kernels.reflect_off_quadrics`).
         """
-        from labapp.core.matching import quadric_kernels
+        from labapp.core.matching.initial import quadric_kernels
 
         laser = self.observed.rig.laser.position_mm
         return quadric_kernels.reflect_off_quadrics(
@@ -182,13 +182,13 @@ class _Window:
 
         See `quadric_kernels.match_predicted_dots`.
         """
-        from labapp.core.matching import quadric_kernels
+        from labapp.core.matching.initial import quadric_kernels
 
         return quadric_kernels.match_predicted_dots(pattern, self.observed.plane_mm, absent, gate)
 
     def fitted(self, quadrics: FloatArray) -> FloatArray:
         """Fit quadrics to the dots that match their rays next to the reference."""
-        from labapp.core.matching import quadric_kernels
+        from labapp.core.matching.initial import quadric_kernels
 
         laser, places = self.observed.rig.laser.position_mm, self.observed.plane_mm
         center, plane = self.landing_mm[:2], self.plane

@@ -226,7 +226,7 @@ def score_caps(
     settings
         Minimum number of rays; the gate, a fraction of the distance to the nearest other
         prediction; penalty for a ray without a dot; the gate for a dot at an absent ray, and the
-        penalty for it (`cap_search`).
+        penalty for it (`caps`).
 
     Returns
     -------

@@ -1,0 +1,1 @@
+"""Initial labels, from which the labels of all dots are grown."""
