@@ -73,7 +73,7 @@ def states(tool: StudyWindow) -> dict[str, str]:
 
 
 def test_a_study_is_made_run_and_a_recording_of_it_opened(
-    study: StudyWindow, recordings: Path, qtbot: QtBot
+    window: MainWindow, study: StudyWindow, recordings: Path, qtbot: QtBot
 ):
     assert not study.start_button.isEnabled()
     make(study, recordings, qtbot)
@@ -99,6 +99,10 @@ def test_a_study_is_made_run_and_a_recording_of_it_opened(
     assert workspace.session.record.current_a == 100
     seen = workspace.session.overview()
     assert list(seen.status) == ["ok"] * 3
+    assert not study.isVisible()
+    window.do("study")
+    assert study.isVisible()
+    assert study.list.selectedItems()
 
 
 def test_a_stopped_run_keeps_what_is_done(study: StudyWindow, recordings: Path, qtbot: QtBot):

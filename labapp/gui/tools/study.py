@@ -361,7 +361,10 @@ class StudyWindow(ToolWindow):
                 if frame is not None:
                     self.workspace.show_frame(frame)
                 self.workspace.action_requested.emit("step_surface")
-                self.say(f"{recording.name} is open in the main window")
+                # It would cover the main window, above which its desktop keeps it.
+                self.close()
+                words = f"{recording.name} is open; Tools, {self.title} shows the study again"
+                self.workspace.notified.emit(words, False)
 
         self.begin(f"Opening {recording.name}", work, opened)
 
