@@ -1,7 +1,7 @@
 """Modes, chirps and step responses of simulated series against their truth.
 
-Run as ``python -m tests.benchmarks.dynamics [--count N] [--seed S]``. Every case draws its own pool,
-frequencies, phases and damping.
+Run as ``python -m tests.benchmarks.dynamics [--count N] [--seed S]``. Every case draws its own
+pool, frequencies, phases and damping.
 
 modes
     Two modes at once over 1 s, noise 0.6 µm in each shape, 5 % of the frames lost, at 200 and 1000
