@@ -1,7 +1,7 @@
 """Modes, chirps and step responses of simulated series against their truth.
 
-Run as ``python -m tests.benchmarks.dynamics [--count N] [--seed S]``. Every case draws its own
-pool, frequencies, phases and damping.
+Run as ``python -m tests.benchmarks.dynamics [PART …] [--count N] [--seed S]``. Every case
+draws its own pool, frequencies, phases and damping.
 
 modes
     Two modes at once over 1 s, noise 0.6 µm in each shape, 5 % of the frames lost, at 200 and 1000
@@ -132,15 +132,19 @@ def steps(count: int, seed: int, order: int) -> None:
 def main() -> None:
     """Print all parts."""
     parser = argparse.ArgumentParser()
+    parser.add_argument("parts", nargs="*", default=["modes", "chirp", "step"])
     parser.add_argument("--count", type=int, default=40)
     parser.add_argument("--seed", type=int, default=1)
     given = parser.parse_args()
-    for rate_hz in (200, 1000):
-        for noise_mm in (6e-4, 0.0):
-            modes(given.count, given.seed, rate_hz, noise_mm)
-    chirps(given.count, given.seed)
-    for order in (1, 2):
-        steps(given.count, given.seed, order)
+    if "modes" in given.parts:
+        for rate_hz in (200, 1000):
+            for noise_mm in (6e-4, 0.0):
+                modes(given.count, given.seed, rate_hz, noise_mm)
+    if "chirp" in given.parts:
+        chirps(given.count, given.seed)
+    if "step" in given.parts:
+        for order in (1, 2):
+            steps(given.count, given.seed, order)
 
 
 if __name__ == "__main__":

@@ -118,7 +118,8 @@ def there_and_back(simulated: int) -> list[int]:
 def write_repeated(recording: Path, out: Path, frames: int) -> None:
     """Repeat a short recording as a long one of raw frames: reading them costs next to nothing."""
     with open_source(recording) as source:
-        images = [source.frame(k).image for k in there_and_back(len(source))]
+        each = [source.frame(k).image for k in range(len(source))]  # in order: far faster
+        images = [each[k] for k in there_and_back(len(each))]
         rate_hz = source.frame_rate_hz or 1.0
     out.unlink(missing_ok=True)
     writer = NutWriter(out, images[0].shape, 8, rate_hz, "raw")
