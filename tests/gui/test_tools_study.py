@@ -134,7 +134,7 @@ def test_means_fit_into_the_window(study: StudyWindow, qtbot: QtBot):
     assert study.means.rowHeight(0) >= 2 * study.means.fontMetrics().height()
 
 
-def test_what_is_no_study_is_refused(study: StudyWindow, tmp_path: Path):
+def test_what_is_no_study_is_refused(study: StudyWindow, recordings: Path, tmp_path: Path):
     (tmp_path / "wrong.toml").write_text("recordings = 1\n", "utf-8")
     study.show_study(tmp_path / "wrong.toml")
     assert study.study is None
@@ -144,3 +144,12 @@ def test_what_is_no_study_is_refused(study: StudyWindow, tmp_path: Path):
     study.recordings.set_value(str(tmp_path / "none_*.avi"))
     study._show_matches()
     assert study.matches.text().startswith("⚠")
+    study.recordings.set_value(str(tmp_path / f"{'long' * 80}_*.avi"))
+    study._show_matches()
+    assert study.matches.text().startswith("⚠")
+    study.take_folder(recordings)
+    assert not study.message.text()
+    study.setup.set_value(str(tmp_path / "none.toml"))
+    study.make(tmp_path / "new.toml")
+    assert "none.toml" in study.message.text()
+    assert not (tmp_path / "new.toml").exists()
