@@ -99,7 +99,7 @@ def align_signals(signals: Signals, frames: Iterable[Frame]) -> tuple[Signals, O
     Raises
     ------
     InputError
-        If no channel correlates, or frames have no time.
+        If no channel correlates, frames have no time, or the signals are far too long.
     """
     from labapp.core.dynamics.alignment import find_offset
 
@@ -108,11 +108,15 @@ def align_signals(signals: Signals, frames: Iterable[Frame]) -> tuple[Signals, O
     if len(times) < len(seen):
         raise InputError("signals", "start", "unknown", "a recording that has a time base")
     light = np.array([bright for _, bright in seen])
-    found = [
-        offset
-        for of in signals.channels.values()
-        if (offset := find_offset(signals.time_s, of, np.array(times), light)) is not None
-    ]
+    try:
+        found = [
+            offset
+            for of in signals.channels.values()
+            if (offset := find_offset(signals.time_s, of, np.array(times), light)) is not None
+        ]
+    except ValueError as error:
+        right = "signals about as long as the recording, their time in the unit that it names"
+        raise InputError(signals.file, "time", str(error), right) from error
     if not found:
         right = "signals that correlate with the frames' brightness; or enter their start"
         raise InputError(signals.file, "start", "not found: light and signals differ", right)
