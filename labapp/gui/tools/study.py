@@ -276,7 +276,10 @@ class StudyWindow(ToolWindow):
             plan = self.study.plan
             reading = ". Reading the results…" * bool(self.looks.active)
             self.words.setText(f"{plan.title}: {count_states(self.found)}{reading}")
+            chosen = self.list.currentRow() if self.list.selectedItems() else -1
             self.list.show_table(studying.recordings_table(plan, self.found))
+            if chosen >= 0:
+                self.list.selectRow(chosen)
             header = self.list.horizontalHeader()
             header.setSectionResizeMode(QHeaderView.ResizeMode.ResizeToContents)
             # The reason of a failure, wrapped to as many lines as needed.
@@ -308,7 +311,10 @@ class StudyWindow(ToolWindow):
         """Run the study in the background."""
         for field in (self.workers, self.scheduler):
             field.flush()
-        study = self.study and self._try(self._reread)
+        if self.study is None:
+            return
+        path = self.study.path
+        study = self._try(lambda: Study(path))  # as its file is now
         if study is None:
             return
         self.study = study
@@ -338,11 +344,6 @@ class StudyWindow(ToolWindow):
             self.say(count_states(found))
 
         self.begin(f"Measuring {study.plan.title}", work, done, self._show_part)
-
-    def _reread(self) -> Study:
-        """Read the study from its file again."""
-        assert self.study is not None
-        return Study(self.study.path)
 
     # --- one recording -------------------------------------------------------------------------
 
