@@ -73,11 +73,21 @@ def test_a_folder_of_results_gives_what_its_session_gives(gtaw: Path, tmp_path: 
         np.testing.assert_allclose(one.coefficient_mm, other.coefficient_mm, atol=5e-4)
     for name, values in of_session.series.items():
         np.testing.assert_allclose(values, of_folder.series[name], rtol=0.05, atol=0.02)
-    (tmp_path / "results" / "boundary.csv").write_text(
-        "frame,theta_deg,x_mm,y_mm,z_mm\n0,0,a,0,0\n"
-    )
-    with pytest.raises(InputError):
-        dynamics_of(measured_in(tmp_path / "results"))
+    measures = tmp_path / "results" / "measures.csv"
+    head, first, *others = measures.read_text("utf-8").splitlines()
+    cells = dict(zip(head.split(","), first.split(","), strict=True))
+    for column, cell in (("frame", "nan"), ("time_s", "1e300"), ("time_s", "inf")):
+        wrong = ",".join({**cells, column: cell}.values())
+        measures.write_text("\n".join([head, wrong, *others]), "utf-8")
+        with pytest.raises(InputError, match=column):
+            dynamics_of(measured_in(measures.parent))
+    measures.write_text("\n".join([head.replace("width_mm", "w"), first, *others]), "utf-8")
+    with pytest.raises(InputError, match="width_mm"):
+        dynamics_of(measured_in(measures.parent))
+    (measures.parent / "boundary.csv").write_text("frame,theta_deg,x_mm,y_mm,z_mm\n0,0,a,0,0\n")
+    measures.write_text("\n".join([head, first, *others]), "utf-8")
+    with pytest.raises(InputError, match="boundary"):
+        dynamics_of(measured_in(measures.parent))
 
 
 @pytest.mark.parametrize(
@@ -85,6 +95,7 @@ def test_a_folder_of_results_gives_what_its_session_gives(gtaw: Path, tmp_path: 
     [
         ("--of", "shade_mm"),
         ("--band", "9:3"),
+        ("--band", "9:inf"),
         ("--segment", "0.01"),
         ("--start", "1"),
         ("--film", "(9,9)"),

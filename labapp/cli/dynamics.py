@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -108,7 +109,7 @@ def _band(text: str | None) -> tuple[float, float] | None:
         low, high = map(float, text.split(":"))
     except ValueError:
         low = high = 0.0
-    if not 0 < low < high:
+    if not 0 < low < high < math.inf:
         raise InputError("--band", "band", text, "LOW:HIGH, two frequencies above 0 (Hz)")
     return low, high
 

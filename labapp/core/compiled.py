@@ -134,8 +134,9 @@ def is_kept(module: str, file: Path) -> bool:
 
 
 def _digest(module: str, file: Path) -> str:
-    # Cached code also refers to its module by name.
-    whole = sha256(f"{FORMAT} {module}\0".encode())
+    # Cached code also refers to its module by name. numba empties the cache of another version:
+    # two environments with different ones would compile in turns.
+    whole = sha256(f"{FORMAT} {numba.__version__} {module}\0".encode())
     for source in sorted(set(_sources(module, file))):
         whole.update(source)
     return whole.hexdigest()[:24]

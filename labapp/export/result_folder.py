@@ -12,7 +12,7 @@ import numpy as np
 from labapp.config.csv_tables import bounded_lines, open_table
 from labapp.core.surface.boundary import Boundary
 from labapp.core.surface.interpolation import CloughTocherSurface
-from labapp.core.surface.measures import SHAPES
+from labapp.core.surface.measures import SHAPES, SIZES
 from labapp.core.values import FloatArray
 from labapp.errors import InputError
 from labapp.export.dynamics import Measured, no_time_base
@@ -37,14 +37,21 @@ def measured_in(folder: Path) -> Iterator[Measured]:
     InputError
         If a table is missing or damaged, or frames have no time.
     """
-    outlines = itertools.groupby(_rows(folder / "boundary.csv"), lambda row: row["frame"])
+    outlines = itertools.groupby(_rows(folder / "boundary.csv"), lambda row: row.get("frame"))
     outline = next(outlines, None)
     path = folder / "measures.csv"
+    before_s = -np.inf
     for row in _rows(path):
         if row.get("status") != "ok":
             continue
         if not row.get("time_s"):
             raise no_time_base()
+        frame, time_s = _number(path, row, "frame"), _number(path, row, "time_s")
+        if not frame.is_integer() or frame < 0:
+            raise InputError(path, "frame", row["frame"], "the number of a frame")
+        if not before_s < time_s < np.inf:
+            raise InputError(path, f"time_s of frame {frame:g}", row["time_s"], "an ascending time")
+        before_s = time_s
         while outline is not None and outline[0] != row["frame"]:
             outline = next(outlines, None)
         if outline is None:
@@ -53,18 +60,12 @@ def measured_in(folder: Path) -> Iterator[Measured]:
             )
         sizes = {
             name: _number(path, row, name)
-            for name in row
+            for name in (*row, *SIZES)
             if name.endswith(("_mm", "mm2", "mm3")) or name in SHAPES
         }
         boundary = _boundary(folder / "boundary.csv", list(outline[1]))
-        frame, time_s = int(_number(path, row, "frame")), _number(path, row, "time_s")
-        yield (
-            frame,
-            time_s,
-            _surface(folder / f"surface_{frame:06d}.csv", boundary),
-            boundary,
-            sizes,
-        )
+        surface = _surface(folder / f"surface_{int(frame):06d}.csv", boundary)
+        yield int(frame), time_s, surface, boundary, sizes
 
 
 def _rows(path: Path) -> Iterator[dict[str, str]]:

@@ -31,8 +31,8 @@ if TYPE_CHECKING:
     from labapp.media import Frame
 
 A_TABLE = (
-    "a table (CSV, UTF-8) with a header line: a time (s, ms, µs), and a current, a voltage or a "
-    "wire feed"
+    "a table (CSV, UTF-8) with a header line: a time (s, ms, µs), and a current (A), a voltage (V) "
+    "or a wire feed (m/min)"
 )
 A_TDMS = "TDMS with channels for current, voltage or wire feed, and a time or an increment"
 A_WAV = "WAV (PCM of 8, 16 or 32 bits, or floats): current, voltage, wire feed, one channel each"
@@ -50,8 +50,8 @@ NAMES = {
 }
 UNITS = {
     "time": {"s": 1.0, "sec": 1.0, "ms": 1e-3, "us": 1e-6, "µs": 1e-6, "μs": 1e-6},
-    "current": {"a": 1.0, "ma": 1e-3, "ka": 1e3},
-    "voltage": {"v": 1.0, "mv": 1e-3, "kv": 1e3},
+    "current": {"a": 1.0, "ma": 1e-3, "ka": 1e3, "amps": 1.0, "amperes": 1.0},
+    "voltage": {"v": 1.0, "mv": 1e-3, "kv": 1e3, "volts": 1.0},
     "wire": {"m/min": 1.0, "mm/s": 0.06, "cm/s": 0.6, "m/s": 60.0, "in/min": 0.0254, "ipm": 0.0254},
 }
 """Units of each quantity in s, A, V, m/min, which are also the defaults."""
@@ -99,7 +99,7 @@ def align_signals(signals: Signals, frames: Iterable[Frame]) -> tuple[Signals, O
     Raises
     ------
     InputError
-        If no channel correlates, or frames have no time.
+        If no channel correlates, frames have no time, or the signals are far too long.
     """
     from labapp.core.dynamics.alignment import find_offset
 
@@ -108,11 +108,15 @@ def align_signals(signals: Signals, frames: Iterable[Frame]) -> tuple[Signals, O
     if len(times) < len(seen):
         raise InputError("signals", "start", "unknown", "a recording that has a time base")
     light = np.array([bright for _, bright in seen])
-    found = [
-        offset
-        for of in signals.channels.values()
-        if (offset := find_offset(signals.time_s, of, np.array(times), light)) is not None
-    ]
+    try:
+        found = [
+            offset
+            for of in signals.channels.values()
+            if (offset := find_offset(signals.time_s, of, np.array(times), light)) is not None
+        ]
+    except ValueError as error:
+        right = "signals about as long as the recording, their time in the unit that it names"
+        raise InputError(signals.file, "time", str(error), right) from error
     if not found:
         right = "signals that correlate with the frames' brightness; or enter their start"
         raise InputError(signals.file, "start", "not found: light and signals differ", right)
@@ -193,9 +197,11 @@ def _read_tdms(path: Path) -> Signals:
     time_s: FloatArray | None = None
     with path.open("rb") as raw, TdmsFile.open(raw) as file:
         for channel in (channel for group in file.groups() for channel in group.channels()):
-            unit = channel.properties.get("unit_string")
-            name = f"{channel.name} [{unit}]" if unit else channel.name
-            named = _named(name, 0) or _named(channel.name, 0)
+            unit = channel.properties.get("unit_string") or None
+            named = _named(channel.name, 0, unit)
+            if not named and unit and (other := _named(channel.name, 0)):
+                right = f"one of {', '.join(UNITS[other[0].quantity])}"
+                raise InputError(path, f"unit of {channel.name}", unit, right)
             if not named or named[0].quantity in found:
                 continue
             bytes_held = len(channel) * max(getattr(channel.dtype, "itemsize", 8), 1)
@@ -244,6 +250,7 @@ def _signals(
     share = np.diff(np.append(begins, count))
 
     def mean(values: FloatArray) -> FloatArray:
+        values = np.where(np.isfinite(values), values, np.nan)
         return np.asarray(np.add.reduceat(values, begins) / share)
 
     of = {
@@ -309,8 +316,11 @@ def _find_names(path: Path, lines: Iterator[str]) -> tuple[int, str, list[_Colum
     raise InputError(path, "columns", found or "nothing", A_TABLE)
 
 
-def _named(cell: str, place: int) -> list[_Column]:
-    """Return the column with that header; empty if it is not one of a known quantity."""
+def _named(cell: str, place: int, beside: str | None = None) -> list[_Column]:
+    """Return the column with that header; empty if it is not one of a known quantity and unit.
+
+    ``beside`` is its unit if the header has none.
+    """
     name = cell.strip()
     parts = re.fullmatch(r"(.*?)[\s_]*(?:[\[(]\s*(\S+?)\s*[\])])?", name)
     word, unit = (parts[1], parts[2]) if parts else (name, None)
@@ -319,6 +329,8 @@ def _named(cell: str, place: int) -> list[_Column]:
         own = unit.lower() if unit is not None else None
         if own is None and (behind := end.rpartition("_"))[0] and behind[2] in units:
             end, own = behind[0], behind[2]
+        if own is None and beside is not None:
+            own = beside.strip().lower()
         if re.fullmatch(NAMES[quantity], end) and (own is None or own in units):
             return [_Column(quantity, name, place, units[own] if own is not None else 1.0)]
     return []

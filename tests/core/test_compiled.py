@@ -72,7 +72,7 @@ def test_a_process_that_compiles_computes_what_one_that_loads_does(tmp_path):
     assert printed[0] == printed[1]
 
 
-def test_what_is_kept_depends_on_the_compiled_functions_that_are_imported(tmp_path):
+def test_what_is_kept_depends_on_what_was_compiled_and_by_what(tmp_path, monkeypatch):
     package = tmp_path / "package"
     (package / "far").mkdir(parents=True)
     files = {
@@ -90,3 +90,5 @@ def test_what_is_kept_depends_on_the_compiled_functions_that_are_imported(tmp_pa
         found.append(compiled._digest(*own))
     assert len(set(found)) == 4, "all but the one that is not imported"
     assert found[-1] == found[-2]
+    monkeypatch.setattr("numba.__version__", "0.0")
+    assert compiled._digest(*own) not in found, "another numba discards what this one kept"

@@ -209,6 +209,12 @@ def test_the_offset_of_a_logger_by_the_light():
     assert np.mean(np.abs(scores) < 1.96) >= 0.9
 
 
+def test_a_logger_whose_milliseconds_pass_for_seconds_is_refused():
+    logged_s, frame_s = np.arange(0, 600_000, 100.0), np.arange(600) / 1000
+    with pytest.raises(ValueError, match="frames/s"):
+        find_offset(logged_s, np.sin(logged_s), frame_s, np.sin(frame_s))
+
+
 def test_an_offset_among_regular_pulses_has_a_rival_and_noise_has_none():
     logged_s, frame_s = np.arange(0, 12, 1 / 2000), np.arange(600) / 200
     pulses = np.where(logged_s % 0.5 < 0.2, 120.0, 60.0)

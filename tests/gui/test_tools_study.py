@@ -73,7 +73,7 @@ def states(tool: StudyWindow) -> dict[str, str]:
 
 
 def test_a_study_is_made_run_and_a_recording_of_it_opened(
-    study: StudyWindow, recordings: Path, qtbot: QtBot
+    window: MainWindow, study: StudyWindow, recordings: Path, qtbot: QtBot
 ):
     assert not study.start_button.isEnabled()
     make(study, recordings, qtbot)
@@ -99,6 +99,10 @@ def test_a_study_is_made_run_and_a_recording_of_it_opened(
     assert workspace.session.record.current_a == 100
     seen = workspace.session.overview()
     assert list(seen.status) == ["ok"] * 3
+    assert not study.isVisible()
+    window.do("study")
+    assert study.isVisible()
+    assert study.list.selectedItems()
 
 
 def test_a_stopped_run_keeps_what_is_done(study: StudyWindow, recordings: Path, qtbot: QtBot):
@@ -130,7 +134,7 @@ def test_means_fit_into_the_window(study: StudyWindow, qtbot: QtBot):
     assert study.means.rowHeight(0) >= 2 * study.means.fontMetrics().height()
 
 
-def test_what_is_no_study_is_refused(study: StudyWindow, tmp_path: Path):
+def test_what_is_no_study_is_refused(study: StudyWindow, recordings: Path, tmp_path: Path):
     (tmp_path / "wrong.toml").write_text("recordings = 1\n", "utf-8")
     study.show_study(tmp_path / "wrong.toml")
     assert study.study is None
@@ -140,3 +144,12 @@ def test_what_is_no_study_is_refused(study: StudyWindow, tmp_path: Path):
     study.recordings.set_value(str(tmp_path / "none_*.avi"))
     study._show_matches()
     assert study.matches.text().startswith("⚠")
+    study.recordings.set_value(str(tmp_path / f"{'long' * 80}_*.avi"))
+    study._show_matches()
+    assert study.matches.text().startswith("⚠")
+    study.take_folder(recordings)
+    assert not study.message.text()
+    study.setup.set_value(str(tmp_path / "none.toml"))
+    study.make(tmp_path / "new.toml")
+    assert "none.toml" in study.message.text()
+    assert not (tmp_path / "new.toml").exists()

@@ -129,6 +129,18 @@ def test_tdms_with_an_increment_and_units(tmp_path: Path) -> None:
     assert list(found.channels) == ["current", "voltage", "wire"]
 
 
+@pytest.mark.parametrize("name", ["Current", "Current (A)"])
+def test_tdms_whose_unit_is_another_is_refused(tmp_path: Path, name: str) -> None:
+    """A shunt's volts are no amperes; a unit in the name is the one that counts."""
+    given = {"wf_increment": 0.001, "unit_string": "V"}
+    path = write_tdms(tmp_path / "a.tdms", [(name, np.array([1.0, np.inf]), given)])
+    if name == "Current":
+        with pytest.raises(InputError, match="unit of Current"):
+            read_signals(path)
+    else:
+        np.testing.assert_array_equal(read_signals(path).current_a, [1, np.nan])
+
+
 def test_wav_is_scaled_and_averaged_to_what_a_session_holds(tmp_path: Path, monkeypatch) -> None:
     from scipy.io import wavfile
 

@@ -15,6 +15,9 @@ LEAST_CORRELATION = 0.5
 LEAST_OVERLAP = 0.25
 """Least overlap of signal and light, as a share of the largest possible one."""
 
+LONGEST = 20_000_000
+"""Longest signal and light that are correlated, in quarters of a frame: what fits into memory."""
+
 RIVAL = 0.8
 """Another offset is ambiguous above this share of the best squared correlation: periodic pulses."""
 
@@ -59,12 +62,20 @@ def find_offset(
     -------
     Offset or None
         None if the two do not correlate (`LEAST_CORRELATION`).
+
+    Raises
+    ------
+    ValueError
+        If one of them is longer than `LONGEST` quarters of a frame: a unit of time may be wrong.
     """
     there = np.isfinite(values)
     signal_s, values = signal_s[there], values[there]
     if len(values) < 8 or len(light) < 8 or np.ptp(values) == 0 or np.ptp(light) == 0:
         return None
     step = float(np.median(np.diff(light_s)))
+    longest_s = max(float(np.ptp(signal_s)), float(np.ptp(light_s)))
+    if longest_s > LONGEST * step / 4:
+        raise ValueError(f"{longest_s:g} s, at {1 / step:g} frames/s")
     even_s = np.arange(signal_s[0], signal_s[-1], step / 4)
     # Mean of the signal over each frame's duration.
     area = np.concatenate([[0], np.cumsum(np.diff(signal_s) * (values[1:] + values[:-1]) / 2)])

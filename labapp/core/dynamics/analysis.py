@@ -22,6 +22,9 @@ LEVEL_SIGMAS = 2.0
 boundary is the same, and independent if it has moved (`core.sequence.mean`): the standard
 uncertainty of their difference is at most σ√2."""
 
+LONGEST = 10_000_000
+"""Longest series, in steps between frames, that fits into memory as evenly spaced samples."""
+
 MOST_STEPS = 8
 """A signal with more changes is pulsed: responses to its individual steps are not analysed."""
 
@@ -118,11 +121,14 @@ def analyse(
     Raises
     ------
     ValueError
-        If there are fewer than `FEWEST` frames, or fewer in a segment.
+        If there are fewer than `FEWEST` frames, or fewer in a segment, or a few frames are spread
+        over more than `LONGEST` of their steps.
     """
     time = surfaces.time_s
     if len(time) < FEWEST:
         raise ValueError(f"{len(time)} frames have a surface; {FEWEST} are needed")
+    if np.ptp(time) > LONGEST * np.median(np.diff(time)):
+        raise ValueError(f"their times range over {np.ptp(time):g} s: too long for their rate")
     modes = bessel_modes(surfaces, scale_sigma=scale_sigma, band_hz=settings.band_hz)
     slowest = [one.oscillations[0].frequency_hz for one in modes if one.oscillations]
     period = 1 / min(slowest) if slowest else 0.0

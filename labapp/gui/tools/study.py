@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import os
 import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from PySide6.QtCore import QUrl
 from PySide6.QtGui import QCloseEvent, QDesktopServices
 from PySide6.QtWidgets import QAbstractItemView, QCheckBox, QHeaderView, QTabWidget, QWidget
 
+from labapp.config.setup import read_setup
 from labapp.gui.dialogs import ask_file, ask_folder, ask_save
 from labapp.gui.tasks import Control, Tasks
 from labapp.gui.tools import studying
@@ -23,7 +25,7 @@ from labapp.gui.widgets.sheet import Sheet
 from labapp.gui.widgets.tables import CellTable, FittingTable
 from labapp.run.measurers import measuring_pool
 from labapp.run.study.page import condition_picture, varying_conditions
-from labapp.run.study.plan import StudyRecording, folder_pattern, write_study
+from labapp.run.study.plan import StudyPlan, StudyRecording, folder_pattern, write_study
 from labapp.run.study.results import require_extra
 from labapp.run.study.status import Progress, RecordingStatus, count_states
 from labapp.run.study.study import Study
@@ -33,6 +35,8 @@ from labapp.text import column_heading
 
 if TYPE_CHECKING:
     from labapp.gui.shell.files import Files
+
+T = TypeVar("T")
 
 STUDIES = "Studies (*.toml *.csv)"
 
@@ -167,7 +171,7 @@ class StudyWindow(ToolWindow):
 
     def take_folder(self, folder: Path) -> None:
         """Propose the recordings in a folder, and a setup file beside one of them."""
-        pattern = self.workspace.run_or_report(lambda: folder_pattern(folder))
+        pattern = self._try(lambda: folder_pattern(folder))
         if pattern is None:
             return
         self.recordings.set_value(str(pattern))
@@ -198,14 +202,23 @@ class StudyWindow(ToolWindow):
 
     def make(self, path: Path) -> None:
         """Create the study described by the form, and open it."""
-        given = [self.recordings.value().strip()], self.setup.value().strip()
-        # The dialog has asked whether to replace an existing file.
-        if self.workspace.run_or_report(lambda: write_study(path, *given, replace=True)):
+        recordings, setup = self.recordings.value().strip(), Path(self.setup.value().strip())
+
+        def write() -> StudyPlan:
+            read_setup(setup)  # raises now what each recording would fail by
+            # The dialog has asked whether to replace an existing file.
+            return write_study(path, [recordings], setup, replace=True)
+
+        if self._try(write):
             self.show_study(path)
+
+    def _try(self, work: Callable[[], T]) -> T | None:
+        """Run a short operation; an error is shown here until the next one succeeds."""
+        return self.workspace.run_or_report(work, self.title, self.say)
 
     def show_study(self, path: Path) -> None:
         """Open a study."""
-        study = self.workspace.run_or_report(lambda: Study(path))
+        study = self._try(lambda: Study(path))
         if study is not None:
             self.study, self.found, self.summary = study, [], None
             self.say(f"{path}")
@@ -263,7 +276,10 @@ class StudyWindow(ToolWindow):
             plan = self.study.plan
             reading = ". Reading the results…" * bool(self.looks.active)
             self.words.setText(f"{plan.title}: {count_states(self.found)}{reading}")
+            chosen = self.list.currentRow() if self.list.selectedItems() else -1
             self.list.show_table(studying.recordings_table(plan, self.found))
+            if chosen >= 0:
+                self.list.selectRow(chosen)
             header = self.list.horizontalHeader()
             header.setSectionResizeMode(QHeaderView.ResizeMode.ResizeToContents)
             # The reason of a failure, wrapped to as many lines as needed.
@@ -295,7 +311,10 @@ class StudyWindow(ToolWindow):
         """Run the study in the background."""
         for field in (self.workers, self.scheduler):
             field.flush()
-        study = self.study and self.workspace.run_or_report(self._reread)
+        if self.study is None:
+            return
+        path = self.study.path
+        study = self._try(lambda: Study(path))  # as its file is now
         if study is None:
             return
         self.study = study
@@ -325,11 +344,6 @@ class StudyWindow(ToolWindow):
             self.say(count_states(found))
 
         self.begin(f"Measuring {study.plan.title}", work, done, self._show_part)
-
-    def _reread(self) -> Study:
-        """Read the study from its file again."""
-        assert self.study is not None
-        return Study(self.study.path)
 
     # --- one recording -------------------------------------------------------------------------
 
@@ -361,7 +375,11 @@ class StudyWindow(ToolWindow):
                 if frame is not None:
                     self.workspace.show_frame(frame)
                 self.workspace.action_requested.emit("step_surface")
+                # It would cover the main window, above which its desktop keeps it.
+                self.close()
                 self.say(f"{recording.name} is open in the main window")
+                words = f"{recording.name} is open; Tools, {self.title} shows the study again"
+                self.workspace.notified.emit(words, False)
 
         self.begin(f"Opening {recording.name}", work, opened)
 

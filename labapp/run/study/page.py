@@ -12,7 +12,7 @@ from matplotlib import rc_context
 
 from labapp.core.surface.measures import SIZES
 from labapp.run.study.plan import Condition, named_condition, shown_condition
-from labapp.run.study.status import count_states
+from labapp.run.study.status import STATE_WORDS, count_states
 from labapp.run.study.summary import GroupSummary, Mean, StudySummary
 from labapp.studies.plotting import INCHES, STYLE, as_bytes, new_figure
 from labapp.text import SIGMA_OF, axis_label, column_heading
@@ -286,7 +286,7 @@ def _recordings(summary: StudySummary) -> str:
             [
                 _t(one.status.recording.name),
                 *(_cell(one.status.recording.conditions.get(c)) for c in summary.conditions),
-                *(_t(one.status.state), _n(one.status.frames_done)),
+                *(_t(STATE_WORDS[one.status.state]), _n(one.status.frames_done)),
                 *(_n(one.statuses.get("ok", 0)), *_mean_cells(one.means)),
             ]
             for one in summary.recordings

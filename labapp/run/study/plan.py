@@ -111,7 +111,7 @@ class StudyPlan:
 def _text(longest: int = LONGEST_TEXT) -> Rule:
     return Rule(
         f"text of 1 to {longest} characters",
-        lambda value: isinstance(value, str) and 0 < len(value) <= longest,
+        lambda value: isinstance(value, str) and 0 < len(value) <= longest and "\0" not in value,
         required=False,
     )
 
@@ -398,7 +398,7 @@ def _wrong_condition(name: str) -> str | None:
 def _files(path: Path, where: str, text: str) -> Iterator[tuple[Path, dict[str, Condition]]]:
     """Yield the recordings that match a path, sorted, with the conditions in their names."""
     folder = path.parent.absolute()
-    if (folder / text).exists() or not set(text) & set("*{}"):
+    if os.path.exists(folder / text) or not set(text) & set("*{}"):
         yield folder / text, {}
         return
     fields = FIELD.findall(text)
@@ -442,9 +442,9 @@ def _names(path: Path, found: Sequence[tuple[str, dict[str, Any], Path, Any]]) -
         if any(level[k] + 1 == len(PARTS_OF_NAME) for k in alike):
             break
         level = [one + (k in alike) for k, one in enumerate(level)]
-    twice = min(alike)
-    where = found[twice][0]
-    raise InputError(path, f"{where}.name", names[twice], "a name that no other recording has")
+    twice = [k for k in sorted(alike) if names[k].casefold() == names[min(alike)].casefold()]
+    expected = f"each file once, with a name that {found[twice[0]][0]} does not have"
+    raise InputError(path, f"{found[twice[1]][0]}.name", names[twice[1]], expected)
 
 
 def _plain(file: Path, parts: slice) -> str:

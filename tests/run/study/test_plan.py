@@ -121,8 +121,10 @@ def test_a_file_whose_name_looks_like_a_pattern_is_itself(tmp_path: Path) -> Non
         (
             'setup = "s"\n[[recording]]\nfile = "x"\nname = "a"\n'
             '[[recording]]\nfile = "y"\nname = "A"',
-            "recording[1].name",
+            "recording[2].name",
         ),
+        ('setup = "s\\u0000"\n[[recording]]\nfile = "a"', "setup"),
+        (f'setup = "s"\n[[recording]]\nfile = "{"a" * 300}*.avi"', "recording[1].file"),
     ],
 )
 def test_what_is_wrong_is_named(tmp_path: Path, text: str, field: str) -> None:
