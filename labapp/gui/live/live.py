@@ -344,7 +344,7 @@ class Live:
             return ""
         counts = self.feed.counts
         parts = [pluralize(counts.frames, "frame")]
-        parts += [f"{counts.dropped} dropped", f"{counts.broken} not whole"]
+        parts += [f"{counts.dropped} dropped", f"{counts.broken} broken"]
         parts += [f"lost {pluralize(counts.lost, 'time')}"] * (counts.lost > 0)
         return ", ".join(parts)
 

@@ -76,6 +76,7 @@ class Welcome(FollowsTheme, QWidget):
         )
         self.list.setIconSize(QSize(*THUMBNAIL_PX))
         self.list.setTextElideMode(Qt.TextElideMode.ElideMiddle)
+        self.list.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
         self.list.itemActivated.connect(self._open)
         self.list.setFrameShape(QFrame.Shape.StyledPanel)
         self.list.setAlternatingRowColors(True)
