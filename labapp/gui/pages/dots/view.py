@@ -32,7 +32,7 @@ from labapp.gui.views.picture import PictureView, Tool
 from labapp.gui.widgets.layouts import fill
 from labapp.gui.workspace import Workspace
 
-NO_REFERENCE = "The reference is not known: if you know it from other frames, press Reference"
+NO_REFERENCE = "If you know the reference from other frames, press Reference"
 
 NOT_YET = "The frame is being measured as it was found: edit it when its rows are there"
 

@@ -44,7 +44,7 @@ BRIEF_S = 3.0
 """Duration, s, below which a film is too short to watch."""
 
 VIEWS = (
-    ("free", "obliquely"),
+    ("free", "oblique"),
     ("top", "from the top"),
     ("side", "from the side"),
     ("front", "from the front, as the camera"),
@@ -76,7 +76,7 @@ def groups() -> tuple[tuple[str, tuple[Item, ...]], ...]:
             ),
         ),
         (
-            "Surfaces, a file a frame",
+            "Surfaces, one file per frame",
             (
                 *_formats("surfaces", SURFACE_FORMATS),
                 Item(
@@ -287,11 +287,11 @@ def _files(request: ExportRequest, count: int, surfaces: int) -> tuple[str, ...]
     many = [each.end for name, each in SURFACE_FORMATS.items() if name in formats]
     if "surfaces" in request.some("pictures"):
         many.append(".png")
-    lines += [f"surface_NNNNNN{end}, {surfaces} of them" for end in many if surfaces]
+    lines += [f"surface_NNNNNN{end} ({pluralize(surfaces, 'file')})" for end in many if surfaces]
     if request.choice().solid and surfaces:
         lines.append(f"the same as solids, {surfaces} of each format")
     if "frames" in request.some("pictures"):
-        lines.append(f"frame_NNNNNN.{request.picture_format}, {count} of them")
+        lines.append(f"frame_NNNNNN.{request.picture_format} ({pluralize(count, 'file')})")
     if "trends" in request.some("pictures"):
         lines.append(TREND_FILE)
     if "film" in request.some("pictures") and surfaces:
