@@ -53,7 +53,7 @@ STATES = {
     "opening": ("○", "Opening the camera…"),
     "running": ("●", "Live"),
     "stalled": ("▲", "No frames arrive, though it is connected: missing frames are not recorded"),
-    "lost": ("▲", "Not connected: it is tried again and again. What was recorded is kept"),
+    "lost": ("▲", "Not connected: trying again. What was recorded is kept"),
     "ended": ("▲", "It has ended: start it again"),
 }
 

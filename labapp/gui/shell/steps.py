@@ -442,7 +442,7 @@ def lead(
     if facts.problems:
         begun = all("." in problem.field for problem in facts.problems)
         names = (SETUP_ACTIONS[-1], *SETUP_ACTIONS[:-1]) if begun else SETUP_ACTIONS
-        missing = setup_to_do(facts.problems) if begun else "What is missing is the set-up"
+        missing = setup_to_do(facts.problems) if begun else "The set-up is missing"
         return Lead(f"{step.shows} {missing}.", names)
     return Lead(step.shows, MEASURE_ACTIONS)
 

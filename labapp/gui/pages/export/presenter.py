@@ -69,9 +69,9 @@ def groups() -> tuple[tuple[str, tuple[Item, ...]], ...]:
         (
             "Tables (CSV)",
             (
-                Item("tables:measures", "Measures", "A row a frame: width, length, height, ARE…"),
-                Item("tables:dots", "Dots", "A row a dot: its place, row, column and ray"),
-                Item("tables:points", "Points", "A row a reflection point, with its residual"),
+                Item("tables:measures", "Measures", "One row per frame: width, length, height…"),
+                Item("tables:dots", "Dots", "One row per dot: its place, row, column and ray"),
+                Item("tables:points", "Points", "One row per reflection point, with its residual"),
                 Item("tables:boundary", "Boundary", "The pool's boundary, point by point"),
             ),
         ),
@@ -243,7 +243,7 @@ def film_note(frames: IntArray, time_s: FloatArray, rate_hz: float | None) -> st
     if rate_hz is None and not np.isfinite(time_s).all():
         return f"{message} The recording has no time base: {UNTIMED_HZ:g} frames/s."
     if rate_hz is None and len(frames) > 1 and lasts_s < BRIEF_S:
-        return f"{message} To see it slowed, enter its frames/s: 10, say."
+        return f"{message} To see it slowed, enter its frames/s, for example 10."
     return message
 
 

@@ -190,7 +190,7 @@ class SetupPage(Page):
         layout = QVBoxLayout(page)
         for item, meaning in items:
             box = QCheckBox(item)
-            box.setToolTip(f"{meaning} The time of the tick is kept.")
+            box.setToolTip(f"{meaning} The time of the tick is recorded.")
             box.setAccessibleDescription(meaning)
             box.clicked.connect(lambda on, item=item: self._tick(item, on))
             layout.addWidget(box)
