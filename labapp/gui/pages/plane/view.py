@@ -254,9 +254,8 @@ class PlanePage(Page):
         self.in_use = ResultTable("Image calibration in use")
         fill(
             self.panel_layout,
-            *(model, self.use_button, self.applied, help_text),
-            *(self.words, self.result, self.why, plain_label("In use now"), self.in_use),
-            *(self._print_form(), 1),
+            *(model, self.use_button, self.applied, help_text, self._print_form()),
+            *(self.words, self.result, self.why, plain_label("In use now"), self.in_use, 1),
         )
 
     def _choose(self) -> None:
