@@ -692,3 +692,21 @@ def test_edits_that_follow_each_other_at_once_all_stand(
     kept = session.correction(0)
     assert kept is not None
     assert kept.lattice.blocked_rows == before.lattice.blocked_rows | {2, 4, 5}
+
+
+def test_a_measured_frame_without_dots_says_so_and_why(
+    page: DotsPage, qtbot: QtBot, copy_sample: CopySample, tmp_path: Path
+) -> None:
+    dark, sample = tmp_path / "dark.npy", copy_sample("blocked_rows")
+    np.save(dark, np.zeros((1, 640, 480), np.uint8))
+    with Session.create(tmp_path / "dark.labsession") as session:
+        session.import_recording(dark)
+        session.set_setup((sample.parent / "setup.toml").read_text())
+        session.measure([0])
+    session = show(page, qtbot, tmp_path / "dark.labsession", 0)
+    result = session.result(0)
+    assert result is not None
+    assert result.measurement.status == "no-dots"
+    assert origin(page) == "measured"
+    assert presenter.NO_DOTS in page.dots_panel.seen.text()
+    assert result.measurement.reason[1:] in page.dots_panel.seen.text()

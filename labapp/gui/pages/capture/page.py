@@ -167,7 +167,7 @@ class CapturePage(Page):
         if session.read_only:
             why_kept = "the session is read-only"
         elif session.recording is not None or self._importing in self.workspace.tasks.active:
-            why_kept = "the session has one"
+            why_kept = "the session has a recording"
         if why_kept:
             self._listed = None
             self._show_import()
