@@ -342,9 +342,7 @@ class DotsPage(Page):
 
     def _automatic(self) -> None:
         if self.seen is not None and self.seen.origin != "corrected":
-            self.workspace.notified.emit(
-                "This frame is as it was found: nothing was corrected", False
-            )
+            self.workspace.notified.emit(presenter.UNMET["corrected"], False)
         else:
             self.editor.back_to_automatic()
 
