@@ -50,3 +50,13 @@ def test_every_picture_is_shown_and_small():
     there = list((GUIDE / "pictures").iterdir())
     assert {path.name for path in there} == shown
     assert sum(path.stat().st_size for path in there) < 2_500_000
+
+
+def test_buttons_of_the_guide_that_open_dialogs_are_in_the_window():
+    pytest.importorskip("PySide6")
+    from tests.gui.words import sentences
+
+    there = {words.replace("&", "") for _, words in sentences()}
+    for page in PAGES:
+        named = re.findall(r"(?<!\*)\*([^*]+…)\*(?!\*)", page.read_text("utf-8"))
+        assert {one_line(name) for name in named} <= there, page.name

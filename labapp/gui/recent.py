@@ -61,7 +61,7 @@ def _counted(statuses: Sequence[str]) -> str:
     without = sum(status not in ("", "ok") for status in statuses)
     some = "all" if measured == len(statuses) else measured or "none"
     message = f"{pluralize(len(statuses), 'frame')}, {some} measured"
-    return f"{message}, {without} could not be" if without else message
+    return f"{message}, {without} failed" if without else message
 
 
 def _thumbnail(session: Session, frames: np.ndarray) -> GreyImage | None:

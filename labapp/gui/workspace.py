@@ -281,7 +281,7 @@ class Workspace(QObject):
             words += f", {failed} without a surface" if failed else ""
             self.notified.emit(words, False)
             if beside is not None:
-                beside(f"{DONE} {words}")
+                beside(f"{PROBLEM if failed else DONE} {words}")
 
         def kept(seen: Overview | None) -> None:
             if seen is None:

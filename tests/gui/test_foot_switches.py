@@ -228,7 +228,7 @@ def test_pedals_act_on_the_live_recording_whatever_page_is_in_view(
     view.stop()
     qtbot.waitUntil(lambda: not window.workspace.tasks.active)
     bench.press(INFINITY, *LEFT)
-    qtbot.waitUntil(lambda: "No camera is watched: start one in the step" in said_in(window))
+    qtbot.waitUntil(lambda: "No camera is live: start one in the step" in said_in(window))
 
 
 def test_a_question_is_answered_before_the_next_step(

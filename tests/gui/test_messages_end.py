@@ -175,3 +175,16 @@ def test_a_picture_that_was_saved_or_not_is_said_beside_its_button(
     page.write_picture(tmp_path / "nowhere" / "pool.png")
     assert page.saved.text().startswith("▲")
     assert opened.status_line.unread
+
+
+def test_a_problem_of_a_session_ends_with_it_and_one_of_the_start_does_not(
+    window: MainWindow, copy_sample: CopySample
+):
+    first, second = copy_sample("gtaw"), copy_sample("thumb_tack")
+    window.say("Preferences", True)
+    assert window.files.open(first)
+    assert window.status_line.unread == ["Preferences"]
+    window.say("of the first session", True)
+    assert window.files.open(second)
+    assert window.status_line.unread == []
+    assert "of the first session" in window.log_panel.texts()[-1]

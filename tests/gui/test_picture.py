@@ -205,10 +205,15 @@ def test_the_mouse_reaches_the_picture_as_the_desktop_sends_it(view: PictureView
     assert noting.seen[0] == ("click", pytest.approx(80, abs=1), pytest.approx(60, abs=1))
 
 
-def test_the_pointers_place_does_not_make_the_view_wider(view: PictureView) -> None:
+def test_the_pointers_place_is_seen_whole_in_a_narrow_view(view: PictureView) -> None:
     before = view.minimumSizeHint().width()
+    view.resize(300, 300)
+    let_draw()
     view.box.scene().sigMouseMoved.emit(view.box.mapViewToScene(QPointF(100.0, 50.0)))
     assert "level" in view._place.text()
+    assert view._place.isVisible()
+    assert view._place.width() >= view._place.sizeHint().width()
+    assert view.canvas.rect().contains(view._place.geometry())
     assert view.minimumSizeHint().width() == before
 
 

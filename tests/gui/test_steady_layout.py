@@ -10,8 +10,11 @@ from PySide6.QtCore import QPoint, Qt
 from PySide6.QtTest import QTest
 from PySide6.QtWidgets import (
     QAbstractButton,
+    QApplication,
     QLabel,
+    QPushButton,
     QScrollArea,
+    QWidget,
 )
 from pytestqt.qtbot import QtBot
 
@@ -20,9 +23,10 @@ from labapp.gui.pages.setup.view import BENCH_TAB, SAFETY_TAB
 from labapp.gui.shell.window import MainWindow
 from labapp.gui.widgets.fields import Field
 from labapp.gui.widgets.labels import Message
+from labapp.gui.widgets.layouts import scrolled
 from labapp.session.checklist import SAFETY
 from labapp.session.session import Session
-from tests.gui.conftest import CopySample, let_draw
+from tests.gui.conftest import KEPT, CopySample, let_draw
 
 LONG = "words that need more room than there is on a line, and on the next one, too; " * 4
 
@@ -182,3 +186,52 @@ def test_a_message_that_is_too_long_ends_in_dots_and_its_tip_has_it_all(qtbot: Q
     assert all(label.fontMetrics().horizontalAdvance(line) <= 200 for line in lines)
     label.setText("first\nsecond\nthird")
     assert label.shown() == ["first", "second third"]
+
+
+@pytest.mark.parametrize(
+    ("key", "words"),
+    [
+        ("laser", "Apply"),
+        ("plane", "Apply"),
+        ("bench_check", "Check"),
+        ("capture", "Start"),
+        ("dots", "Measure all frames"),
+        ("surface", "Not measured"),
+        ("export", "Export"),
+    ],
+)
+def test_primary_buttons_are_in_view_on_a_small_screen(
+    opened: MainWindow, qtbot: QtBot, key: str, words: str
+) -> None:
+    opened.resize(1024, 700)
+    opened.show_step(key)
+    let_draw()
+    assert opened.page is not None
+    found = [
+        each
+        for each in opened.page.panel.findChildren(QAbstractButton)
+        if each.text().replace("&", "") == words and each.isVisible()
+    ]
+    assert [each.visibleRegion().boundingRect() for each in found] == [found[0].rect()]
+
+
+def test_a_panel_stays_where_it_is_when_a_clicked_button_is_disabled(qtbot: QtBot) -> None:
+    inner = QWidget()
+    clicked, beyond = QPushButton("Apply", inner), QPushButton("beyond", inner)
+    inner.setMinimumSize(100, 900)
+    beyond.move(0, 800)
+    area = scrolled(inner)
+    KEPT.append(area)
+    area.resize(200, 200)
+    area.show()
+    area.activateWindow()
+    qtbot.waitUntil(area.isActiveWindow)
+    clicked.clicked.connect(lambda: clicked.setEnabled(False))
+    QTest.mouseClick(clicked, LEFT)
+    assert QApplication.focusWidget() is not clicked
+    assert area.verticalScrollBar().value() == 0
+    clicked.setEnabled(True)
+    clicked.setFocus()
+    QTest.keyClick(clicked, Qt.Key.Key_Tab)
+    assert beyond.hasFocus()
+    assert area.verticalScrollBar().value() > 0

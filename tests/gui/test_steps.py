@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from labapp.config.setup import parse_setup
 from labapp.errors import InputError
 from labapp.gui.shell.steps import STEPS, Mark, setup_to_do, states
 from labapp.session.session import Session
+from tests.gui.conftest import SAMPLES
 
 LASER = "[laser]\nprojection_angle_deg = 31.14\ndistance_mm = 31.48\n"
 PATTERN = "[pattern]\nrows = 19\ncolumns = 19\ninter_beam_angle_deg = 0.77\n"
@@ -67,3 +69,17 @@ def test_a_pattern_of_lines_gives_its_step_another_name(tmp_path: Path) -> None:
         assert named.title == "Pattern"
         assert "lines" in named.hint
         assert all(step.of(session) == step for step in STEPS if step is not dots)
+
+
+def test_a_recording_without_any_surface_is_not_done(tmp_path: Path) -> None:
+    dark, setup = tmp_path / "dark.npy", SAMPLES / "gtaw" / "setup.toml"
+    np.save(dark, np.zeros((2, 640, 480), np.uint8))
+    with Session.create(tmp_path / "new.labsession") as session:
+        session.import_recording(dark)
+        session.set_setup(setup.read_text())
+        assert states(session)["surface"].mark is Mark.READY
+        session.measure([0])
+        assert states(session)["surface"].mark is Mark.READY
+        session.measure([1])
+        found = states(session)
+    assert {found[key].mark for key in ("dots", "surface", "trends", "export")} == {Mark.ATTENTION}

@@ -136,7 +136,7 @@ def test_frames_are_seen_before_any_set_up_and_are_a_draft_that_can_be_named(
     assert window.page is not None
     seen = window.page
     hand.qtbot.waitUntil(lambda: seen.seen is not None and seen.seen.correction is not None)
-    assert not window.page.dots_panel.why.text().startswith("⚠")
+    assert "⚠" not in window.page.dots_panel.seen.text()
     window.workspace.attempt(lambda own: own.set_record(Record(title="Mine")))
     window.workspace.show_frame(1)
     named = tmp_path / "named.labsession"

@@ -151,8 +151,8 @@ def calibrate_laser(
     once = [name for name, one in zip(names, (l1, l2, l3), strict=True) if one.readings == 1]
     warnings = (
         [
-            f"One reading of {', '.join(once)}: it is taken to be known to "
-            f"±{settings.reading_sigma_mm:g} mm; read three times or more."
+            f"One reading of {', '.join(once)}: ±{settings.reading_sigma_mm:g} mm is assumed; "
+            "take three readings or more."
         ]
         if once
         else []

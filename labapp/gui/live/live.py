@@ -53,7 +53,7 @@ STATES = {
     "opening": ("○", "Opening the camera…"),
     "running": ("●", "Live"),
     "stalled": ("▲", "No frames arrive, though it is connected: missing frames are not recorded"),
-    "lost": ("▲", "Not connected: it is tried again and again. What was recorded is kept"),
+    "lost": ("▲", "Not connected: trying again. What was recorded is kept"),
     "ended": ("▲", "It has ended: start it again"),
 }
 
@@ -344,7 +344,7 @@ class Live:
             return ""
         counts = self.feed.counts
         parts = [pluralize(counts.frames, "frame")]
-        parts += [f"{counts.dropped} dropped", f"{counts.broken} not whole"]
+        parts += [f"{counts.dropped} dropped", f"{counts.broken} broken"]
         parts += [f"lost {pluralize(counts.lost, 'time')}"] * (counts.lost > 0)
         return ", ".join(parts)
 

@@ -22,7 +22,7 @@ KINDS = {
     "lines": (
         "Lines of JSON over TCP",
         5020,
-        "A line a frame, to every program that connects",
+        "One line per frame, to every program that connects",
     ),
     "opcua": (
         "OPC UA",

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from PySide6.QtCore import QSize, Qt, Signal
-from PySide6.QtGui import QColor, QIcon, QImage, QKeyEvent, QPixmap
+from PySide6.QtGui import QColor, QIcon, QImage, QKeyEvent, QPainter, QPixmap
 from PySide6.QtWidgets import (
     QCommandLinkButton,
     QFrame,
@@ -76,6 +76,7 @@ class Welcome(FollowsTheme, QWidget):
         )
         self.list.setIconSize(QSize(*THUMBNAIL_PX))
         self.list.setTextElideMode(Qt.TextElideMode.ElideMiddle)
+        self.list.setHorizontalScrollBarPolicy(Qt.ScrollBarPolicy.ScrollBarAlwaysOff)
         self.list.itemActivated.connect(self._open)
         self.list.setFrameShape(QFrame.Shape.StyledPanel)
         self.list.setAlternatingRowColors(True)
@@ -106,10 +107,8 @@ class Welcome(FollowsTheme, QWidget):
         """List sessions; their summaries are read in the background."""
         self._shown, self._gone = tuple(paths), []
         self.list.clear()
-        blank = QPixmap(*THUMBNAIL_PX)
-        blank.fill(QColor(0, 0, 0, 0))
         for path in paths:
-            item = QListWidgetItem(QIcon(blank), f"{path.stem}\n \n{path.parent}")
+            item = QListWidgetItem(_icon(None), f"{path.stem}\n \n{path.parent}")
             item.setData(Qt.ItemDataRole.UserRole, path)
             item.setToolTip(plain_tip(str(path)))
             self.list.addItem(item)
@@ -147,7 +146,7 @@ class Welcome(FollowsTheme, QWidget):
             rows, columns = recent.thumbnail.shape
             grey = QImage.Format.Format_Grayscale8
             image = QImage(recent.thumbnail.tobytes(), columns, rows, columns, grey).copy()
-            item.setIcon(QIcon(QPixmap.fromImage(image)))
+            item.setIcon(_icon(image))
 
     def take_colours(self) -> None:
         """Draw missing sessions in a paler colour."""
@@ -157,3 +156,15 @@ class Welcome(FollowsTheme, QWidget):
 
     def _open(self, item: QListWidgetItem) -> None:
         self.chosen.emit(item.data(Qt.ItemDataRole.UserRole))
+
+
+def _icon(image: QImage | None) -> QIcon:
+    """A thumbnail in the middle of a blank of the same size for all: the texts are aligned."""
+    picture = QPixmap(*THUMBNAIL_PX)
+    picture.fill(QColor(0, 0, 0, 0))
+    if image is not None:
+        place = image.rect()
+        place.moveCenter(picture.rect().center())
+        with QPainter(picture) as painter:
+            painter.drawImage(place, image)
+    return QIcon(picture)

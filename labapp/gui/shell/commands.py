@@ -24,7 +24,7 @@ from labapp.log import log_file
 FAR = 10**9
 """A number larger than that of the frames."""
 
-NO_CAMERA = "No camera is watched: start one in the step Recording"
+NO_CAMERA = "No camera is live: start one in the step Recording"
 
 
 def make_window(preferences: Preferences, file: Path) -> MainWindow:

@@ -54,7 +54,7 @@ def guide() -> str:
     ticks = "".join(f"<li>{escape(standing.words)}</li>" for standing in FrameStatus)
     frames = (
         "<h3>The frames</h3><p>The bar at the bottom has a tick for every frame. Its colour, its "
-        f"height and its tip tell how the frame stands:</p><ul>{ticks}</ul>"
+        f"height and its tip show the state of the frame:</p><ul>{ticks}</ul>"
     )
     return f"<h2>Guide</h2>{INTRODUCTION}{steps}{frames}{CLOSING}"
 

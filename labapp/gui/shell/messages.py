@@ -132,7 +132,7 @@ class StatusLine(QWidget):
             self._show_message(self.unread[-1] if self.unread else "")
 
     def mark_read(self) -> None:
-        """Remove the problems from the line."""
+        """Remove the problems, and any other message, from the line."""
         self.unread.clear()
         self._show_message("")
 

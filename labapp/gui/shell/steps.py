@@ -262,6 +262,8 @@ def _surface(facts: Facts) -> State:
         return State(Mark.ATTENTION, f"{facts.stale} of {frames} out of date: measure again")
     if facts.measured < facts.count:
         return State(Mark.READY, f"{facts.count - facts.measured} of {frames} not measured yet")
+    if facts.without == facts.count:
+        return State(Mark.ATTENTION, no_surface(facts.count))
     if facts.without:
         measured = f"{facts.count - facts.without} of {frames} are measured"
         return State(Mark.DONE, f"{measured}, {facts.without} could not be")
@@ -269,8 +271,15 @@ def _surface(facts: Facts) -> State:
     return State(Mark.DONE, f"{every} measured")
 
 
+def no_surface(count: int) -> str:
+    """Text if none of the measured frames has a surface."""
+    return f"None of {count} frames has a surface" if count > 1 else "The frame has no surface"
+
+
 def results(facts: Facts) -> State:
     """State of a step that needs only results: ready as soon as there are any."""
+    if facts.measured and facts.without == facts.measured:
+        return State(Mark.ATTENTION, f"{no_surface(facts.measured)}: see step 6")
     if facts.measured:
         return State(Mark.READY, pluralize(facts.measured, "frame"))
     return State(Mark.TODO, "Measure some frames first")
@@ -433,7 +442,7 @@ def lead(
     if facts.problems:
         begun = all("." in problem.field for problem in facts.problems)
         names = (SETUP_ACTIONS[-1], *SETUP_ACTIONS[:-1]) if begun else SETUP_ACTIONS
-        missing = setup_to_do(facts.problems) if begun else "What is missing is the set-up"
+        missing = setup_to_do(facts.problems) if begun else "The set-up is missing"
         return Lead(f"{step.shows} {missing}.", names)
     return Lead(step.shows, MEASURE_ACTIONS)
 

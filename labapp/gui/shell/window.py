@@ -146,6 +146,7 @@ class MainWindow(QMainWindow):
         self.files.refused.connect(self.welcome.refused.setText)
         self.setups.answered.connect(self.show_answer)
         space.closing.connect(self._leave)
+        space.closing.connect(self.status_line.mark_read)  # the messages concern that session
         space.opened.connect(self._session_opened)
         space.changed.connect(self._changed)
         space.measured.connect(self._show_measured)
@@ -301,7 +302,6 @@ class MainWindow(QMainWindow):
         """Show a newly opened session, or the welcome page."""
         session = self.workspace.session
         self.timeline.set_playing(False)
-        self.status_line.say("", False)  # the message concerned another session
         self._leave()
         self.side_panel.read_only.setVisible(session is not None and session.read_only)
         self._show_session()

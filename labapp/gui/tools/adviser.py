@@ -197,5 +197,5 @@ class AdviserWindow(ToolWindow):
         advice = self.advice
         if advice is not None and self.workspace.attempt(lambda s: advising.use(s, advice)):
             self.workspace.notified.emit(
-                "The advised set-up is in: measure in steps 2 and 3 where it really stands", False
+                "The advised set-up is applied: calibrate laser and plane in steps 2 and 3", False
             )

@@ -119,7 +119,7 @@ class AnalysisWindow(ToolWindow):
         line.add(self.which)
         self.words = wrapping_label(
             "Tick what is to be computed, then press Run. All of it is simulated; the "
-            "calibration is taken to be known to 0.1 mm, 0.1° and 0.1 px, a dot to 0.3 px."
+            "calibration is assumed to be known to 0.1 mm, 0.1° and 0.1 px, a dot to 0.3 px."
         )
         self.words.setAlignment(Qt.AlignmentFlag.AlignTop)
         self.table = CellTable("Table of the error analysis")

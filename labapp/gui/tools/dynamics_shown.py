@@ -68,7 +68,7 @@ def impossible(session: Session | None, seen: Overview | None) -> str:
     count = int((np.isfinite(seen.measures["height_mm"]) & ~seen.stale).sum())
     if count < FEWEST:
         return (
-            f"Too few frames: {count} of {len(seen.frame)} have a surface that stands, and "
+            f"Too few frames: {count} of {len(seen.frame)} have a surface that is up to date, and "
             f"{FEWEST} are needed. Measure more of them (F5)."
         )
     return ""

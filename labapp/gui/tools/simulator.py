@@ -83,7 +83,7 @@ class SimulatorWindow(ToolWindow):
         self.seed.edited.connect(lambda seed: self._draw(int(seed)))
         self.folder = PathField(
             "Folder",
-            tooltip="Where to: a new or empty folder, or a former simulation, which is replaced",
+            tooltip="A new or empty folder, or a former simulation, which is replaced",
         )
         self.table = ResultTable("True values of the first frame")
         self.form.add(self.scenario)

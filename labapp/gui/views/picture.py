@@ -35,7 +35,7 @@ from labapp.core.values import BoolArray
 from labapp.gui.views.canvas import Drawn
 from labapp.gui.views.drag_point import ALT, CONTROL, SHIFT, DragPoint, arrow_step
 from labapp.gui.views.picture_files import save_picture
-from labapp.gui.widgets.labels import plain_label, wrapping_label
+from labapp.gui.widgets.labels import plain_label, show_words, wrapping_label
 from labapp.media import GreyImage
 
 pg.setConfigOptions(imageAxisOrder="row-major", antialias=True)
@@ -119,9 +119,11 @@ class PictureView(Drawn):
         self._item = pg.ImageItem()
         self._item.setZValue(-100)
         self.box.addItem(self._item)
-        self._place = plain_label()
-        # Otherwise the window would grow when the pointer enters.
-        self._place.setSizePolicy(QSizePolicy.Policy.Ignored, QSizePolicy.Policy.Preferred)
+        # On the picture: below it there is no room in a narrow view.
+        self._place = plain_label("", self.canvas)
+        self._place.setAutoFillBackground(True)
+        self._place.setAttribute(Qt.WidgetAttribute.WA_TransparentForMouseEvents)
+        self._place.hide()
         self._empty = wrapping_label("", self.canvas)
         self._empty.setAlignment(Qt.AlignmentFlag.AlignCenter)
         # It covers the canvas, which must get the mouse events.
@@ -307,14 +309,18 @@ class PictureView(Drawn):
         label.setBuddy(self._contrast)
         bar.addWidget(self._contrast)
         button("Auto", "Automatic contrast", "Fit contrast to the picture (0)", self.auto_contrast)
-        bar.addWidget(self._place, 1)
+        bar.addStretch(1)
         return bar
 
     def _moved(self, at: QPointF) -> None:
         place = self.box.mapSceneToView(at)
         u, v = float(place.x()), float(place.y())
         level = level_at(self._image, u, v)
-        self._place.setText("" if level is None else f"u {u:.1f}, v {v:.1f} px, level {level:g}")
+        words = "" if level is None else f"u {u:.1f}, v {v:.1f} px, level {level:g}"
+        show_words(self._place, words)
+        self._place.adjustSize()
+        room = self.canvas.height() - self._place.height()
+        self._place.move(0, 0 if at.y() > self.canvas.height() / 2 else room)
         self.pointed.emit(u, v, level)
 
     def take_colours(self) -> None:

@@ -6,6 +6,7 @@ from typing import TypeVar
 
 from PySide6.QtCore import Qt
 from PySide6.QtWidgets import (
+    QApplication,
     QBoxLayout,
     QFrame,
     QHBoxLayout,
@@ -47,9 +48,26 @@ def hbox(*parts: Part, of: QWidget | None = None) -> QHBoxLayout:
     return _bare(QHBoxLayout() if of is None else QHBoxLayout(of), parts)
 
 
+class _ScrollArea(QScrollArea):
+    """Scrolls to the widget that Tab leads to, and stays where it is if a widget is disabled.
+
+    Qt passes the focus of a disabled widget on as if Tab were pressed. The button that was clicked
+    would move away from the pointer.
+    """
+
+    def focusNextPrevChild(self, forward: bool) -> bool:
+        """Move the focus; scroll only if the widget that had it can still have it."""
+        bar, focus = self.verticalScrollBar(), QApplication.focusWidget()
+        before = bar.value()
+        moved = super().focusNextPrevChild(forward)
+        if focus is not None and not focus.isEnabled():
+            bar.setValue(before)
+        return moved
+
+
 def scrolled(widget: QWidget, name: str = "") -> QScrollArea:
     """An area that scrolls a widget; with a name, it can also be scrolled by keys."""
-    area = QScrollArea()
+    area = _ScrollArea()
     area.setWidget(widget)
     area.setWidgetResizable(True)
     area.setFrameShape(QFrame.Shape.NoFrame)

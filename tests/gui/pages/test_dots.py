@@ -465,7 +465,7 @@ def test_a_button_asks_for_the_click_it_needs(
 ) -> None:
     session = show(page, qtbot, copy_sample("blocked_rows"), 3)
     panel = page.dots_panel
-    assert "press Reference" in panel.why.text()
+    assert "press Reference" in panel.seen.text()
     button = next(b for b in panel.findChildren(QToolButton) if b.text() == "Reference")
     place, left = np.array([278.0, 281.0]), button.mapTo(page.panel, QPoint())
     button.click()
@@ -478,7 +478,7 @@ def test_a_button_asks_for_the_click_it_needs(
     assert kept is not None
     assert kept.lattice.reference == (6, 8)  # as blocked_rows/README.md has it
     assert panel.chosen.text().startswith("Nothing selected")
-    assert "press Reference" not in panel.why.text()
+    assert "press Reference" not in panel.seen.text()
     assert button.mapTo(page.panel, QPoint()) == left
     assert unfitted == [[3]]
 
@@ -619,7 +619,7 @@ def test_a_damaged_result_is_told_and_the_dots_are_looked_for(
     monkeypatch.setattr(Session, "result", damaged)
     session = show(page, qtbot, path, 1)
     assert origin(page) == "found"
-    assert "result of frame 1: damaged" in page.dots_panel.why.text()
+    assert "result of frame 1: damaged" in page.dots_panel.seen.text()
     assert page.editor.correction is not None
     session.correct({1: page.editor.correction})
     page.refresh()
@@ -692,3 +692,21 @@ def test_edits_that_follow_each_other_at_once_all_stand(
     kept = session.correction(0)
     assert kept is not None
     assert kept.lattice.blocked_rows == before.lattice.blocked_rows | {2, 4, 5}
+
+
+def test_a_measured_frame_without_dots_says_so_and_why(
+    page: DotsPage, qtbot: QtBot, copy_sample: CopySample, tmp_path: Path
+) -> None:
+    dark, sample = tmp_path / "dark.npy", copy_sample("blocked_rows")
+    np.save(dark, np.zeros((1, 640, 480), np.uint8))
+    with Session.create(tmp_path / "dark.labsession") as session:
+        session.import_recording(dark)
+        session.set_setup((sample.parent / "setup.toml").read_text())
+        session.measure([0])
+    session = show(page, qtbot, tmp_path / "dark.labsession", 0)
+    result = session.result(0)
+    assert result is not None
+    assert result.measurement.status == "no-dots"
+    assert origin(page) == "measured"
+    assert presenter.NO_DOTS in page.dots_panel.seen.text()
+    assert result.measurement.reason[1:] in page.dots_panel.seen.text()

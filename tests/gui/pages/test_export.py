@@ -57,7 +57,7 @@ def test_pictures_of_frames_have_the_format_that_is_chosen(
 ) -> None:
     request = ExportRequest(ticked=frozenset({"pictures:frames"}), picture_format=suffix)
     with Session.open(gtaw) as session:
-        assert f"frame_NNNNNN.{suffix}, 30 of them" in plan(session, request, 0).files
+        assert f"frame_NNNNNN.{suffix} (30 files)" in plan(session, request, 0).files
         written = write(session, request, [0], tmp_path / "out", lambda *_: None)
         rows, columns = session.frame(0).image.shape
     (picture,) = written.files
@@ -82,7 +82,7 @@ def test_what_would_be_written_of_which_frames(gtaw: Path) -> None:
             "dots.csv",
             "points.csv",
             "boundary.csv",
-            "surface_NNNNNN.csv, 30 of them",
+            "surface_NNNNNN.csv (30 files)",
         )
         assert every.files[-1].startswith("manifest.json")
         assert every.notes == (f"{SETUP_MARKS['entered']} {session.setup_words}",)
@@ -99,7 +99,7 @@ def test_frames_without_a_surface_are_told_and_the_recording_missed(copy_sample)
     with Session.open(path) as session:
         made = plan(session, ExportRequest(), 0)
         assert made.notes[1:] == ("3 frames without a surface: in the tables with the reason.",)
-        assert "surface_NNNNNN.stl, 3 of them" in made.files
+        assert "surface_NNNNNN.stl (3 files)" in made.files
     (path.parent / "recording.mkv").unlink()
     with Session.open(path) as session:
         assert plan(session, ExportRequest(), 0).why_not == ""
@@ -283,7 +283,7 @@ def test_a_format_that_is_added_can_be_ticked(gtaw: Path, tmp_path: Path, monkey
     assert (points.text(), points.toolTip(), whole.text()) == ("Points", "A toy, mm", "Toy")
     for box in page._boxes.values():
         box.setChecked(box in (points, whole))
-    assert page.files.text().splitlines()[:2] == ["surface_NNNNNN.xyz, 30 of them", "toy.bin"]
+    assert page.files.text().splitlines()[:2] == ["surface_NNNNNN.xyz (30 files)", "toy.bin"]
     whole.setChecked(False)
     write(session_of(page), page.request, [3], tmp_path / "out", lambda done, total: None)
     assert (tmp_path / "out/surface_000003.xyz").read_bytes().endswith(b" points")

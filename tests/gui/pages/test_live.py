@@ -343,7 +343,7 @@ def test_start_record_and_import_by_mouse_and_keys(
     hand.press(Qt.Key.Key_R, Qt.KeyboardModifier.ControlModifier)
     qtbot.waitUntil(lambda: view.live.running.frames > 5)
     hand.press(Qt.Key.Key_R, Qt.KeyboardModifier.ControlModifier)
-    qtbot.waitUntil(lambda: "is kept beside the session" in said_in(window))
+    qtbot.waitUntil(lambda: "Other recordings" in said_in(window))
     assert len(session.frames) == take.frames
     hand.button("Stop camera")
     qtbot.waitUntil(lambda: not window.workspace.tasks.active)

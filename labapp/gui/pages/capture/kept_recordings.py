@@ -52,7 +52,7 @@ class KeptRecordings(Group):
 
 def kept_text(take: Take, why_kept: str) -> str:
     """Text about a recording that is kept but not imported."""
-    return f"{take.path.name} is kept beside the session: {why_kept}. See Other recordings"
+    return f"{take.path.name} is under Other recordings ({why_kept})"
 
 
 def _choice_text(path: Path) -> str:

@@ -105,9 +105,7 @@ class CapturePage(Page):
         """State of the step, which may have a chosen recording that is not yet imported."""
         session = self.workspace.session
         if self.live_view.live is not None:
-            message = (
-                "A camera is watched: Space here, Ctrl+R and the pedal begin and end a recording"
-            )
+            message = "The camera is live: Space, Ctrl+R or a pedal starts and stops a recording"
             return State(Mark.READY, message)
         if self.preview is None or session is None or session.recording is not None:
             return found
@@ -167,9 +165,9 @@ class CapturePage(Page):
             self.workspace.notified.emit(f"{take.path.name}: nothing was recorded", True)
             return
         if session.read_only:
-            why_kept = "the session is open read-only"
+            why_kept = "the session is read-only"
         elif session.recording is not None or self._importing in self.workspace.tasks.active:
-            why_kept = "the session has a recording already"
+            why_kept = "the session has a recording"
         if why_kept:
             self._listed = None
             self._show_import()

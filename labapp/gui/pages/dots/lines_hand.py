@@ -15,6 +15,7 @@ from labapp.core.lines.correction import (
     nearest_line,
     number_line,
 )
+from labapp.gui.pages.dots import presenter
 from labapp.gui.pages.dots.lines import LinesState
 from labapp.gui.pages.dots.lines_view import LinesOverlay, LinesPanel
 from labapp.gui.pages.page import Page
@@ -33,7 +34,7 @@ UNMET = {
     "lines": "There are no lines that can be corrected in this frame",
     "line": "Select a line first",
     "two": "Select two lines first",
-    "corrected": "This frame is as it was found: nothing was corrected",
+    "corrected": presenter.UNMET["corrected"],
 }
 
 

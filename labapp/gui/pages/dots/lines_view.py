@@ -12,11 +12,11 @@ from collections.abc import Sequence
 import numpy as np
 import pyqtgraph as pg
 from PySide6.QtCore import Qt
-from PySide6.QtGui import QAction, QColor, QPen
+from PySide6.QtGui import QAction
 from PySide6.QtWidgets import QHeaderView, QToolButton, QWidget
 
 from labapp.gui.pages.dots.lines import COLUMNS, DrawnLine, LinesState
-from labapp.gui.pages.dots.overlay import row_color
+from labapp.gui.pages.dots.overlay import cosmetic_pen, row_color
 from labapp.gui.pages.dots.panel import button_grid
 from labapp.gui.views.picture import PictureView
 from labapp.gui.widgets.fields import FieldForm, NumberField
@@ -53,13 +53,13 @@ class LinesOverlay:
     def _draw(self, line: DrawnLine, color: str, chosen: bool) -> None:
         style = Qt.PenStyle.DashLine if line.folded else Qt.PenStyle.SolidLine
         curve = pg.PlotCurveItem(
-            *_with_gaps(line.image_px).T, pen=_pen(color, style, 5 if chosen else 2)
+            *_with_gaps(line.image_px).T, pen=cosmetic_pen(color, 5 if chosen else 2, style)
         )
         ends = pg.ScatterPlotItem(
             *line.ends_px.T,
             symbol=["s" if cut else "o" for cut in line.cut.tolist()],
             size=END,
-            pen=_pen(color),
+            pen=cosmetic_pen(color, 2),
             brush=None,
         )
         label = pg.TextItem(line.name, color, anchor=(0, 0.5), fill=(0, 0, 0, 60))
@@ -147,9 +147,3 @@ def _with_gaps(points: np.ndarray) -> np.ndarray:
     """Points of a line with NaN in its gaps, where nothing is drawn."""
     gaps = np.flatnonzero(np.linalg.norm(np.diff(points, axis=0), axis=-1) > 3.0) + 1
     return np.insert(points, gaps, np.nan, axis=0)
-
-
-def _pen(color: str, style: Qt.PenStyle = Qt.PenStyle.SolidLine, width: int = 2) -> QPen:
-    pen = QPen(QColor(color), width, style)
-    pen.setCosmetic(True)
-    return pen

@@ -55,7 +55,7 @@ class DotsOverlay:
         self._computed = _Marks(pxMode=True, symbol="+", pen=None, brush=QColor(COMPUTED))
         self._reference = _Marks(pxMode=True, pen=pg.mkPen(CHOSEN, width=2), brush=None)
         self._box = pg.QtWidgets.QGraphicsRectItem()
-        self._box.setPen(_pen(CHOSEN, 1, Qt.PenStyle.DashLine))
+        self._box.setPen(cosmetic_pen(CHOSEN, 1, Qt.PenStyle.DashLine))
         self._box.hide()
         self._labels: list[pg.TextItem] = []
         for item in (self._columns, self._rows, self._blocked, self._computed):
@@ -197,7 +197,7 @@ def _look(row: int, sited: bool, blocked: bool, chosen: bool) -> tuple[QPen, QBr
     """Outline and filling of a dot."""
     color = row_color(row) if row else DOUBT
     style = Qt.PenStyle.SolidLine if sited else Qt.PenStyle.DashLine
-    pen = _pen(CHOSEN if chosen else color, 2 if chosen else 1.5, style)
+    pen = cosmetic_pen(CHOSEN if chosen else color, 2 if chosen else 1.5, style)
     if blocked:
         return pen, QBrush(QColor(color), Qt.BrushStyle.BDiagPattern)
     filling = QColor(color)
@@ -222,14 +222,15 @@ def _joints(correction: Correction | None) -> tuple[IntArray, ...]:
     return along_columns, along_rows[~blocked], along_rows[blocked]
 
 
-def _pen(color: str, width: float, style: Qt.PenStyle = Qt.PenStyle.SolidLine) -> QPen:
+def cosmetic_pen(color: str, width: float, style: Qt.PenStyle = Qt.PenStyle.SolidLine) -> QPen:
+    """A pen whose width, px of the screen, does not grow with the zoom."""
     pen = QPen(QColor(color), width, style)
     pen.setCosmetic(True)
     return pen
 
 
 def _line(color: str, alpha: int, style: Qt.PenStyle = Qt.PenStyle.SolidLine) -> pg.PlotCurveItem:
-    pen = _pen(color, 1, style)
+    pen = cosmetic_pen(color, 1, style)
     shade = QColor(color)
     shade.setAlpha(alpha)
     pen.setColor(shade)

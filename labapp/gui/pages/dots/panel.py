@@ -33,8 +33,6 @@ from labapp.gui.widgets.labels import (
     heading,
     plain_label,
     plain_tip,
-    show_words,
-    wrapping_label,
 )
 from labapp.gui.widgets.layouts import Group, vbox
 from labapp.gui.widgets.result_table import ResultTable
@@ -72,7 +70,7 @@ class DotsPanel(QWidget):
     ) -> None:
         super().__init__()
         # The buttons do not move, whatever the texts are.
-        self.seen, self.chosen, self.why = Message(3), Message(2), wrapping_label()
+        self.seen, self.chosen = Message(5), Message(2)
         self.carried = Message(2)
         self.fit = ResultTable("Fit before the last edit and after it")
         self.buttons: dict[str, QToolButton] = {}
@@ -88,7 +86,7 @@ class DotsPanel(QWidget):
             *(self.seen, heading("Correct"), self.chosen, self._sites()),
             self._buttons(edits),
             *(heading("Following frames"), form, self._buttons(frames), self.carried),
-            *(heading("Fit"), self.why, self.fit, heading("Rows"), self.rows),
+            *(heading("Fit"), self.fit, heading("Rows"), self.rows),
             *(heading("Detector"), self._detector(), 1),
             of=self,
         )
@@ -97,8 +95,7 @@ class DotsPanel(QWidget):
         self, seen: str, why: str, fit: Sequence[ResultRow], rows: Sequence[RowLine] | None
     ) -> None:
         """Show the session's data of the frame in view; None keeps the list of rows."""
-        self.seen.setText(seen)
-        show_words(self.why, f"⚠ {why[:1].upper()}{why[1:]}" if why else "")
+        self.seen.setText(f"{seen}\n⚠ {why[:1].upper()}{why[1:]}." if why else seen)
         self.fit.set_rows(fit)
         if rows is not None:
             self.rows.show_lines(rows)

@@ -27,6 +27,8 @@ from labapp.text import SIGMA_OF, pluralize
 
 NO_PLACES: FloatArray = np.zeros((0, 2))
 
+NO_DOTS = "Lower the detector's threshold below, add dots, or record with more light."
+
 Wanted = tuple[int, DotSettings, LatticeSettings]
 """A frame, and the settings for detecting its dots and rows."""
 
@@ -133,7 +135,7 @@ def _automatic(result: Result, by: tuple[DotSettings, LatticeSettings]) -> bool:
     """Whether a result contains the automatic detection with these settings."""
     measurement = result.measurement
     same = (result.settings.dots, result.settings.lattice) == by
-    return same and measurement.correction is None and measurement.dots is not None
+    return same and measurement.correction is None
 
 
 def detect(image: Image, frame: int, by: tuple[DotSettings, LatticeSettings]) -> DetectedDots:
@@ -195,6 +197,8 @@ def sentence(seen: DotsState) -> str:
         "found": "As found, not measured",
         "looked for": "",
     }[seen.origin]
+    if not len(dots):
+        return f"{message}: no dots. {NO_DOTS}"
     words = f"{message}: {pluralize(len(dots), 'dot')} in {pluralize(rows, 'row')}"
     words += f", {doubtful} in doubt" if doubtful else ", none in doubt"
     if lattice.reference is None:

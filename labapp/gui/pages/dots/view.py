@@ -32,7 +32,7 @@ from labapp.gui.views.picture import PictureView, Tool
 from labapp.gui.widgets.layouts import fill
 from labapp.gui.workspace import Workspace
 
-NO_REFERENCE = "The reference is not known: if you know it from other frames, press Reference"
+NO_REFERENCE = "If you know the reference from other frames, press Reference"
 
 NOT_YET = "The frame is being measured as it was found: edit it when its rows are there"
 
@@ -342,9 +342,7 @@ class DotsPage(Page):
 
     def _automatic(self) -> None:
         if self.seen is not None and self.seen.origin != "corrected":
-            self.workspace.notified.emit(
-                "This frame is as it was found: nothing was corrected", False
-            )
+            self.workspace.notified.emit(presenter.UNMET["corrected"], False)
         else:
             self.editor.back_to_automatic()
 

@@ -119,7 +119,7 @@ class ExportPage(Page):
         active = self.workspace.tasks.active
         writing = self._writing in active
         measuring = self.workspace.measuring is not None
-        why_not = "It is being written." if writing else made.why_not
+        why_not = "Writing…" if writing else made.why_not
         self.export_button.setEnabled(not why_not)
         self.export_button.setToolTip(
             plain_tip(
@@ -287,7 +287,7 @@ class ExportPage(Page):
             form.add(field)
         self.folder = PathField(
             "Folder",
-            tooltip="Where to: a new or empty folder, or an earlier export, which is replaced",
+            tooltip="A new or empty folder, or an earlier export, which is replaced",
         )
         choose = button("Choose folder…", "Choose where to write", self.choose_folder)
         self.notes = wrapping_label()
@@ -310,7 +310,7 @@ class ExportPage(Page):
 
     def _make_view_fields(self) -> None:
         self.view = ChoiceField(
-            "3-D seen", VIEWS, tooltip="Where pictures of surfaces and the film look from"
+            "3-D view", VIEWS, tooltip="Direction of view of pictures of surfaces and of the film"
         )
         self.view.edited.connect(lambda key: self._change_request(view=key))
         sizes = [(f"{width}x{height}", f"{width} × {height} px") for width, height in SIZES]

@@ -44,7 +44,7 @@ BRIEF_S = 3.0
 """Duration, s, below which a film is too short to watch."""
 
 VIEWS = (
-    ("free", "obliquely"),
+    ("free", "oblique"),
     ("top", "from the top"),
     ("side", "from the side"),
     ("front", "from the front, as the camera"),
@@ -69,14 +69,14 @@ def groups() -> tuple[tuple[str, tuple[Item, ...]], ...]:
         (
             "Tables (CSV)",
             (
-                Item("tables:measures", "Measures", "A row a frame: width, length, height, ARE…"),
-                Item("tables:dots", "Dots", "A row a dot: its place, row, column and ray"),
-                Item("tables:points", "Points", "A row a reflection point, with its residual"),
+                Item("tables:measures", "Measures", "One row per frame: width, length, height…"),
+                Item("tables:dots", "Dots", "One row per dot: its place, row, column and ray"),
+                Item("tables:points", "Points", "One row per reflection point, with its residual"),
                 Item("tables:boundary", "Boundary", "The pool's boundary, point by point"),
             ),
         ),
         (
-            "Surfaces, a file a frame",
+            "Surfaces, one file per frame",
             (
                 *_formats("surfaces", SURFACE_FORMATS),
                 Item(
@@ -243,7 +243,7 @@ def film_note(frames: IntArray, time_s: FloatArray, rate_hz: float | None) -> st
     if rate_hz is None and not np.isfinite(time_s).all():
         return f"{message} The recording has no time base: {UNTIMED_HZ:g} frames/s."
     if rate_hz is None and len(frames) > 1 and lasts_s < BRIEF_S:
-        return f"{message} To see it slowed, enter its frames/s: 10, say."
+        return f"{message} To see it slowed, enter its frames/s, for example 10."
     return message
 
 
@@ -287,11 +287,11 @@ def _files(request: ExportRequest, count: int, surfaces: int) -> tuple[str, ...]
     many = [each.end for name, each in SURFACE_FORMATS.items() if name in formats]
     if "surfaces" in request.some("pictures"):
         many.append(".png")
-    lines += [f"surface_NNNNNN{end}, {surfaces} of them" for end in many if surfaces]
+    lines += [f"surface_NNNNNN{end} ({pluralize(surfaces, 'file')})" for end in many if surfaces]
     if request.choice().solid and surfaces:
         lines.append(f"the same as solids, {surfaces} of each format")
     if "frames" in request.some("pictures"):
-        lines.append(f"frame_NNNNNN.{request.picture_format}, {count} of them")
+        lines.append(f"frame_NNNNNN.{request.picture_format} ({pluralize(count, 'file')})")
     if "trends" in request.some("pictures"):
         lines.append(TREND_FILE)
     if "film" in request.some("pictures") and surfaces:

@@ -111,7 +111,7 @@ class LaserPage(Page):
         if self.workspace.attempt(
             lambda session: session.calibrate_laser(*lengths_mm, fan_deg, picture, settings)
         ):
-            self.confirm("The set-up has this laser; undo restores the former one", self.applied)
+            self.confirm("Applied to the set-up; undo restores the former laser", self.applied)
 
     # --- the panel --------------------------------------------------------------------------
 

@@ -193,12 +193,7 @@ class PlanePage(Page):
         )
         form.add_wide(self.find_button)
         form.add_wide(self.answer)
-        self._add_print_fields(form)
-        help_text = wrapping_label(
-            "Drag a point that is not right: O′ to the middle of the dot, the others to the "
-            "middles of their bars. P chooses the next one, arrow keys move it by 0.1 px."
-        )
-        fill(self.panel_layout, form, help_text)
+        fill(self.panel_layout, form)
         self._make_results()
         self.lock_with_session(self.unit, self.square)
 
@@ -221,7 +216,8 @@ class PlanePage(Page):
         )
         form.add_wide(self.add_button)
 
-    def _add_print_fields(self, form: FieldForm) -> None:
+    def _print_form(self) -> FieldForm:
+        form = FieldForm()
         self.print = ChoiceField(
             "To print",
             tuple((name, name.replace("_", " ")) for name in PRINTS),
@@ -237,6 +233,7 @@ class PlanePage(Page):
         )
         self.saved = Message(2)
         form.add_wide(self.saved)
+        return form
 
     def _make_results(self) -> None:
         model = FieldForm()
@@ -248,13 +245,17 @@ class PlanePage(Page):
         self.model.edited.connect(self.choose_model)
         model.add(self.model)
         self.use_button, self.applied = button("Apply", "", self.use), Message(2)
+        help_text = wrapping_label(
+            "Drag a point that is not right: O′ to the middle of the dot, the others to the "
+            "middles of their bars. P chooses the next one, arrow keys move it by 0.1 px."
+        )
         self.words, self.why = wrapping_label(), wrapping_label()
         self.result = ResultTable("The calibration computed from points and marks")
         self.in_use = ResultTable("Image calibration in use")
         fill(
             self.panel_layout,
-            *(model, self.use_button, self.applied, self.words, self.result, self.why),
-            *(plain_label("In use now"), self.in_use, 1),
+            *(model, self.use_button, self.applied, help_text, self._print_form()),
+            *(self.words, self.result, self.why, plain_label("In use now"), self.in_use, 1),
         )
 
     def _choose(self) -> None:

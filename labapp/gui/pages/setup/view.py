@@ -8,7 +8,6 @@ from pathlib import Path
 
 from PySide6.QtWidgets import QCheckBox, QLabel, QTabWidget, QVBoxLayout, QWidget
 
-from labapp.config.setup import read_setup
 from labapp.files import write_file
 from labapp.gui.dialogs import SETUP_FILES, ask_save, ask_setup
 from labapp.gui.pages.page import Page
@@ -23,6 +22,7 @@ from labapp.gui.pages.setup.presenter import (
     UNCERTAIN_ONLY,
     Entry,
 )
+from labapp.gui.shell.setups import load_setup
 from labapp.gui.views.drawings.bench import DRAWN, BenchView
 from labapp.gui.views.drawings.pattern import PatternView
 from labapp.gui.widgets.buttons import button
@@ -146,11 +146,7 @@ class SetupPage(Page):
     def load(self, path: Path) -> None:
         """Load the setup from a file."""
         if self.workspace.attempt(
-            lambda session: session.set_setup(
-                read_setup(path, lines=True).text, f"set-up from {path.name}"
-            ),
-            "Loading",
-            self.answer.setText,
+            lambda session: load_setup(session, path), "Loading", self.answer.setText
         ):
             self.confirm(f"Set-up loaded from {path.name}")
 
@@ -190,7 +186,7 @@ class SetupPage(Page):
         layout = QVBoxLayout(page)
         for item, meaning in items:
             box = QCheckBox(item)
-            box.setToolTip(f"{meaning} The time of the tick is kept.")
+            box.setToolTip(f"{meaning} The time of the tick is recorded.")
             box.setAccessibleDescription(meaning)
             box.clicked.connect(lambda on, item=item: self._tick(item, on))
             layout.addWidget(box)

@@ -176,7 +176,8 @@ class TrendsPage(Page):
 
     def _make_panel(self) -> None:
         self.nothing = wrapping_label(
-            "Nothing to show yet: tick a measure at the right, or measure some frames first."
+            "No frame has a value of the measures ticked at the right. Tick others, or see in the "
+            "steps Dots and Surface why there is no surface."
         )
         self.nothing.setAlignment(Qt.AlignmentFlag.AlignCenter)
         self.canvas_layout.addWidget(self.nothing, 1)

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pyqtgraph as pg
-from PySide6.QtCore import QRect, Qt
+from PySide6.QtCore import QPointF, QRect, Qt
 from PySide6.QtGui import QPalette, QResizeEvent
 
 from labapp.core.calibration.laser_calibration import LaserCalibration
@@ -100,10 +100,13 @@ class CrossHairView(Sketch):
         self.top.setRange(xRange=(-l2 - 4, right), yRange=(-2 * l3, 2 * l3))
 
     def _place_fields(self) -> None:
-        """Place the fields at their lengths."""
+        """Place the fields at their lengths, and not over the cross."""
         if self._shown is not None:
             l1, l2, l3 = self._shown[1]
-            taken: list[QRect] = []
+            view = self.top.getViewBox()
+            ends = (view.mapViewToScene(QPointF(*end)) for end in ((-l2, l3), (l1, -l3)))
+            upper, lower = (self.top.mapFromScene(end) for end in ends)
+            taken = [QRect(upper, lower).normalized()]
             places = ((0.9 * l1, -1.5 * l3), (-0.9 * l2, -1.5 * l3), (4.5, 0.7 * l3))
             for box, place in zip(self.boxes, places, strict=True):
                 box.put_at(np.array(place), taken)
