@@ -20,6 +20,7 @@ from labapp.config.setup import Setup, read_setup
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.recording.residual_check import ResidualRecord, SetupVerdict, judged_status
+from labapp.core.surface.measures import sigma_name
 from labapp.core.values import FloatArray
 from labapp.errors import PATH, InputError, check_positive, require, unknown_name
 from labapp.export.frame_result import FrameResult
@@ -363,13 +364,17 @@ class Results(Sequence[FrameResult]):
         timed = bool(np.isfinite(table["time_s"]).all())
         at, value = table["time_s" if timed else "frame"].to_numpy(), table[size].to_numpy(float)
         (line,) = axes.plot(at, value, marker="." if len(at) < MANY_FRAMES else "")
-        name, _, unit = size.rpartition("_")
-        sigma = f"{name}_sigma_{unit}"
+        unit = table.attrs["units"][size]
+        name = size if unit == "1" else size.removesuffix(f"_{unit}")
+        sigma = sigma_name(size)
         if sigma in table:
             band = table[sigma].to_numpy(float)
             axes.fill_between(at, value - band, value + band, alpha=0.3, color=line.get_color())
         axes.set_xlabel("time (s)" if timed else "frame")
-        axes.set_ylabel(f"{name.replace('_', ' ')} ({unit})")
+        if not timed:
+            axes.xaxis.get_major_locator().set_params(integer=True, min_n_ticks=1)
+        shown = "" if unit == "1" else f" ({unit.replace('2', '²').replace('3', '³')})"
+        axes.set_ylabel(name.replace("_", " ") + shown)
         return axes
 
     def plot_surface(
@@ -397,6 +402,8 @@ class Results(Sequence[FrameResult]):
             If the index is out of range, the frame has no surface, or the surface would have too
             many nodes.
         """
+        from matplotlib.ticker import MaxNLocator
+
         valid = f"an index from 0 to {len(self) - 1}" if self.results else "results of some frames"
         require(index, (int, np.integer), "plot_surface", "index", valid)
         if not -len(self) <= index < len(self):
@@ -413,7 +420,9 @@ class Results(Sequence[FrameResult]):
         mesh = open_mesh(reconstruction, spacing_mm)  # up to the boundary; a grid ends in steps
         x, y, height = mesh.vertices_mm.T
         contours = axes.tricontourf(x, y, mesh.triangles, height, CONTOUR_LEVELS)
-        axes.figure.colorbar(contours, ax=axes, label="height (mm)")
+        bar = axes.figure.colorbar(contours, ax=axes, label="height (mm)")
+        bar.locator = MaxNLocator(6)  # round numbers, instead of every fourth level
+        bar.update_ticks()
         boundary = reconstruction.boundary.points_mm
         outline = np.vstack([boundary, boundary[:1]])
         axes.plot(outline[:, 0], outline[:, 1], color="black", linewidth=1)

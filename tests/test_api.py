@@ -159,6 +159,41 @@ def test_frames_may_be_followed_sliced_and_shown(image: np.ndarray) -> None:
     assert shown.mean() > 0.99  # no steps along the boundary
 
 
+@pytest.mark.parametrize(
+    ("size", "label", "sigma"),
+    [
+        ("height_mm", "height (mm)", "height_sigma_mm"),
+        ("volume_mm3", "volume (mm³)", "volume_sigma_mm3"),
+        ("asymmetry", "asymmetry", "asymmetry_sigma"),
+        ("dots", "dots", None),
+    ],
+)
+def test_a_plot_names_size_and_unit_and_has_a_band(
+    results: labapp.Results, size: str, label: str, sigma: str | None
+) -> None:
+    axes = results.plot(size)
+    assert axes.get_ylabel() == label
+    assert all(tick == round(tick) for tick in axes.get_xticks())  # frames
+    table = results.dataframe().iloc[MEASURED]
+    bands = [band.get_paths()[0].vertices[:, 1] for band in axes.collections]
+    spans = [float(np.ptp(band)) for band in bands]
+    assert spans == ([] if sigma is None else [pytest.approx(2 * table[sigma])])
+
+
+def test_what_is_printed_is_short(results: labapp.Results) -> None:
+    measured, blank = results[MEASURED], results[BLANK]
+    assert "no-dots" in repr(blank)
+    assert measured.measurement.measures is not None
+    height = f"{measured.measurement.measures.height_mm:.3f}"
+    for each in (measured, measured.measurement, measured.measurement.measures):
+        assert height in repr(each)
+    made = measured.measurement.reconstruction
+    assert made is not None
+    parts = (made.boundary, measured.measurement.dots, measured.measurement.match)
+    for each in (measured, blank, measured.measurement, measured.measurement.measures, *parts):
+        assert len(repr(each)) < 400, repr(each)
+
+
 def test_the_results_of_a_session_are_those_that_it_has() -> None:
     with labapp.Session.open(SAMPLE / "gtaw.labsession", read_only=True) as session:
         of_session = labapp.Results.of_session(session)

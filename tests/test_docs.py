@@ -8,7 +8,7 @@ import re
 import shlex
 import shutil
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import matplotlib as mpl
 import pytest
@@ -16,7 +16,9 @@ import typer.core
 import typer.main
 
 from labapp import cli
+from labapp.core.bench_check.check import Status
 from labapp.export.folder import verify_export
+from labapp.export.tables import TABLES
 from labapp.session.session import Session
 from tests.conftest import Run
 
@@ -113,6 +115,34 @@ def test_the_worked_example_of_the_command_line_says_what_it_says(
     assert verify_export("results") == []
 
 
+def test_the_columns_of_the_tables_are_those_that_are_written() -> None:
+    """In their order; of ``a … b`` the table has all from a to b."""
+    text = (ROOT / "docs/results.md").read_text("utf-8")
+    for table, columns in TABLES.items():
+        names = [column.name for column in columns]
+        found: list[str] = []
+        section = text.partition(f"### {table}.csv")[2].partition("\n## ")[0].partition("\n### ")[0]
+        for cell in re.findall(r"^\| (`.*?) \|", section, re.MULTILINE):
+            first, *others = re.findall(r"`(\w+)`", cell)
+            if "…" in cell:
+                found += names[names.index(first) : names.index(others[-1]) + 1]
+            else:
+                found += [first, *others]
+        assert found == names
+
+
+def test_every_status_is_explained() -> None:
+    given = {word for part in get_args(Status) for word in get_args(part)}
+    for path in (ROOT / "labapp").rglob("*.py"):
+        pattern = r'(?:CannotMeasure|Measurement|LineFrame|RowsOpen)\(\s*"([a-z-]+)"'
+        given |= set(re.findall(pattern, path.read_text("utf-8")))
+    assert {"too-many-dots", "unreadable", "size-off", "folded-lines"} <= given
+    explained = set(
+        re.findall(r"`([a-z-]+)`", (ROOT / "docs/troubleshooting.md").read_text("utf-8"))
+    )
+    assert given - explained == {"noise-like"}  # what is left of a check that is ok
+
+
 TEXTS = ["README.md", *sorted(str(path.relative_to(ROOT)) for path in ROOT.glob("docs/*.md"))]
 
 LONG = (
@@ -193,7 +223,16 @@ def test_examples_run_one_after_the_other(
             exec(example, {})
 
 
-def test_commands_in_the_texts_have_no_gaps() -> None:
+def test_commands_in_the_texts_have_no_gaps_and_options_that_there_are() -> None:
+    program = typer.main.get_command(cli.app)
     for text in (*TEXTS, *(str(path.relative_to(ROOT)) for path in ROOT.glob("docs/guide/*.md"))):
-        found = re.findall(r"`((?:\./run )?labapp [^`]*)`", (ROOT / text).read_text("utf-8"))
+        found = re.findall(r"`(?:\./run )?labapp ([^`]*)`", (ROOT / text).read_text("utf-8"))
         assert not [command for command in found if "…" in command], text
+        for words in (shlex.split(command) for command in found):
+            command: object = program
+            while isinstance(command, typer.core.TyperGroup) and words and words[0][0].islower():
+                command = command.commands[words.pop(0)]
+            if isinstance(command, typer.core.TyperCommand):
+                known = [name for each in command.params for name in each.opts]
+                for word in words:
+                    assert word in known or not word.startswith("--"), (text, command.name, word)

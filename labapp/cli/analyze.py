@@ -149,9 +149,10 @@ def frame(
     out: Out = None,
     tables: Tables = False,
 ) -> None:
-    """Compare algorithms, correspondences and base heights of IRS on a frame (Fig. 6-10, 6-13).
+    """Compare algorithms, correspondences and base heights of IRS on a frame.
 
-    The correspondence by the shape of the reflected rows (§7.1) is listed beside the measured one.
+    The tables are those of Fig. 6-10, 6-13 and 6-16. The correspondence by the shape of the
+    reflected rows (§7.1) is listed beside the measured one.
 
     Exit code 1: the correspondence of the frame is unknown.
     """

@@ -46,7 +46,7 @@ class Trial:
     residual_mm: float
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Match(ReadOnlyArrays):
     """The n matched pairs of ray and reflected dot.
 

@@ -83,7 +83,7 @@ class Settings:
     modal: modal.ModalSettings = field(default_factory=modal.ModalSettings)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Measurement:
     """Results of the completed steps for one frame.
 
@@ -118,8 +118,21 @@ class Measurement:
     setup_status: str = ""
     lines: LineFrame | None = None
 
+    def __repr__(self) -> str:
+        return f"<labapp measurement: {self.summary}>"
 
-@dataclass(frozen=True, kw_only=True)
+    @property
+    def summary(self) -> str:
+        """Status and scheme, and the height or the reason that there is none."""
+        words = [self.status, self.scheme]
+        if self.measures is not None:
+            words.append(self.measures.summary)
+        elif self.reason:
+            words.append(self.reason)
+        return ", ".join(words)
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
 class OpenMeasurement(Measurement):
     """An ``ambiguous-rows`` frame, whose rows other frames of the recording may determine.
 

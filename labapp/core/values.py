@@ -39,6 +39,14 @@ class ReadOnlyArrays:
                 view = fields[name] = item[...]
                 view.setflags(write=False)
 
+    def __repr__(self) -> str:
+        # For dataclasses with ``repr=False``: shapes instead of a thousand numbers.
+        parts = [
+            f"{name}=<{item.shape}>" if isinstance(item, np.ndarray) else f"{name}={item!r}"
+            for name, item in vars(self).items()
+        ]
+        return f"{type(self).__name__}({', '.join(parts)})"
+
 
 def median(values: FloatArray) -> float:
     """Median of an array, shape (n,); NaN if it is empty or has a NaN. Faster than `np.median`."""

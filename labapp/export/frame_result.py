@@ -9,7 +9,7 @@ from labapp.core.pipeline import Measurement
 from labapp.core.recording.residual_check import Residuals
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class FrameResult:
     """The result of one frame."""
 
@@ -27,6 +27,10 @@ class FrameResult:
     """Its residuals, if these were removed from the measurement."""
     setup_doubt: str = ""
     """Why the set-up is doubtful according to the frames so far; empty if it is not."""
+
+    def __repr__(self) -> str:
+        time = "" if self.time_s is None else f" at {self.time_s:.6g} s"
+        return f"<labapp frame {self.frame}{time}: {self.measurement.summary}>"
 
 
 def without_surface(measurement: Measurement) -> Measurement:

@@ -38,7 +38,7 @@ PLY_VERTEX = np.dtype([("place", "<f8", 3), ("height", "<f8")])
 PLY_FACE = np.dtype([("count", "u1"), ("corner", "<i4", 3)])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Mesh(ReadOnlyArrays):
     """Triangles; n vertices, k triangles."""
 

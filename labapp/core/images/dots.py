@@ -18,7 +18,7 @@ Grey = npt.NDArray[np.float32]
 Picture = Grey | npt.NDArray[np.uint8]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Dots(ReadOnlyArrays):
     """Reflected dots found in one frame; every array has shape (n,).
 

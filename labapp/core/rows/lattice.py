@@ -20,7 +20,7 @@ distance."""
 _NEXT: tuple[Site, ...] = ((0, 1), (0, -1), (1, 0), (-1, 0))
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Lattice(ReadOnlyArrays):
     """The reflected row and column of each dot.
 

@@ -23,7 +23,7 @@ LARGEST_STRETCH = 1.5
 diverges."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Boundary(ReadOnlyArrays):
     """A closed boundary around a centre, one point per polar angle.
 

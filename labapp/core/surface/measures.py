@@ -51,7 +51,7 @@ class ReflectionErrors(ReadOnlyArrays):
     scale: FloatArray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Measures:
     """Measures of one pool. Lengths in mm, z above the work piece.
 
@@ -140,6 +140,18 @@ class Measures:
     asymmetry_sigma_setup: float = math.nan
     wetting_slope_sigma_setup_deg: float = math.nan
 
+    def __repr__(self) -> str:
+        return f"<labapp measures: {self.summary}>"
+
+    @property
+    def summary(self) -> str:
+        """Width, length and height, with ± where they have one."""
+        words = []
+        for size in ("width", "length", "height"):
+            value, sigma = getattr(self, f"{size}_mm"), getattr(self, f"{size}_sigma_mm")
+            words.append(f"{size} {value:.3f}" + (f" ± {sigma:.3f}" if sigma >= 0 else "") + " mm")
+        return ", ".join(words)
+
     @property
     def sizes(self) -> FloatArray:
         """Values of `SIZES`, shape (6,), mm, mm², mm³."""
@@ -207,7 +219,7 @@ def assemble_measures(
         peak_y_mm=float(peak_mm[1]),
         scale_x=float(errors.scale[0]),
         scale_z=float(errors.scale[1]),
-        **dict(zip(WITH_SIGMA, size.tolist(), strict=True)),
+        **dict(zip(WITH_SIGMA, (size + 0.0).tolist(), strict=True)),
         **size_sigmas,
     )
 

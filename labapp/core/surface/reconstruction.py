@@ -45,7 +45,7 @@ class BoundedSurface:
         return self.boundary.contains(x + place[0], y + place[1])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Reconstruction(ReadOnlyArrays):
     """A pool surface, and the residuals of the reflected dots.
 
