@@ -40,6 +40,14 @@ class ReadOnlyArrays:
                 view.setflags(write=False)
 
 
+def robust_sigma(residuals: npt.ArrayLike) -> float:
+    """Standard deviation of normal residuals about 0, by their median size: outliers hardly count.
+
+    The median size of normal deviates is their standard deviation over 1.4826.
+    """
+    return 1.4826 * float(np.median(np.abs(residuals)))
+
+
 def median(values: FloatArray) -> float:
     """Median of an array, shape (n,); NaN if it is empty or has a NaN. Faster than `np.median`."""
     count = len(values)

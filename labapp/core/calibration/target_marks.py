@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from labapp.core.values import BoolArray, CannotMeasure, FloatArray, ReadOnlyArrays
+from labapp.core.values import BoolArray, CannotMeasure, FloatArray, ReadOnlyArrays, robust_sigma
 
 Image = npt.NDArray[Any]
 
@@ -156,7 +156,7 @@ def _binary_median(binary: npt.NDArray[np.uint8], side: int) -> npt.NDArray[np.u
 def _levels(darkness: FloatArray) -> list[float]:
     """Thresholds to try: Otsu's method, the triangle method, then fixed shares of the darkness."""
     low, high = 0.0, float(np.quantile(darkness, 0.998))
-    noise = 1.4826 * float(np.median(np.abs(darkness)))
+    noise = robust_sigma(darkness)
     if high <= 3.0 * noise or high < 1e-6:
         return []
     eight_bit = np.clip(np.round((darkness - low) / (high - low) * 255.0), 0, 255)
