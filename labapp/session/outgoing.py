@@ -20,8 +20,8 @@ from labapp.export.rendering.film import Extent, film_times, write_film
 from labapp.export.rendering.studio import drawing_errors, drawing_process
 from labapp.session.contents import SessionContents
 from labapp.session.frames import Progress
-from labapp.session.measured import Result, scheme_name
 from labapp.session.report import report_pdf
+from labapp.session.results.measured import Result, scheme_name
 
 
 def export_session(

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from labapp.config.line_setup import read_line_setup
-from labapp.core.lines import ridges as ridges_module
-from labapp.core.lines.find_lines import find_lines
-from labapp.core.lines.numbering import number_lines
-from labapp.core.lines.ridges import find_ridges, sampled
+from labapp.core.lines.detection import ridges as ridges_module
+from labapp.core.lines.detection.find_lines import find_lines
+from labapp.core.lines.detection.numbering import number_lines
+from labapp.core.lines.detection.ridges import find_ridges, sampled
 from labapp.simulation.camera import CameraView
 from labapp.simulation.lines.frames import LineLook, render_lines
 from labapp.simulation.pools import egg

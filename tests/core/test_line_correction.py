@@ -14,9 +14,9 @@ from labapp.core.lines.correction import (
     nearest_line,
     number_line,
 )
-from labapp.core.lines.find_lines import LightLine, find_lines
+from labapp.core.lines.detection.find_lines import LightLine, find_lines
+from labapp.core.lines.detection.numbering import LinesSeen, number_lines
 from labapp.core.lines.frame import measure_lines
-from labapp.core.lines.numbering import LinesSeen, number_lines
 from labapp.simulation.lines.frames import LineLook, render_lines
 from labapp.simulation.pools import egg
 from tests.benchmarks.lines import CALIBRATION, RIG, VIEW

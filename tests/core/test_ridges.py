@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from labapp.core.lines.find_lines import find_lines
-from labapp.core.lines.numbering import number_lines
-from labapp.core.lines.ridges import find_ridges
+from labapp.core.lines.detection.find_lines import find_lines
+from labapp.core.lines.detection.numbering import number_lines
+from labapp.core.lines.detection.ridges import find_ridges
 from labapp.core.values import FloatArray
 
 SHAPE = (200, 260)

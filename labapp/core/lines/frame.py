@@ -11,10 +11,10 @@ from labapp.core.geometry.line_pattern import LineRig
 from labapp.core.images.dots import Image
 from labapp.core.lines.correction import LineCorrection
 from labapp.core.lines.data import line_data
-from labapp.core.lines.find_lines import LightLine, find_lines
+from labapp.core.lines.detection.find_lines import LightLine, find_lines
+from labapp.core.lines.detection.numbering import LinesSeen, number_lines
 from labapp.core.lines.fit import LineSurface, fit_lines
 from labapp.core.lines.metal import PoolEdges, pool_edges, without_metal
-from labapp.core.lines.numbering import LinesSeen, number_lines
 from labapp.core.lines.track import TrackedLine
 from labapp.core.values import CannotMeasure, FloatArray, IntArray
 

@@ -24,7 +24,7 @@ from scipy.ndimage import label
 
 from labapp.core.lines.fit import LEAST_LINES
 from labapp.core.lines.frame import LineFrame
-from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
+from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays, robust_sigma
 
 State = Literal["no-pool", "growing", "concave", "flattening", "convex"]
 
@@ -255,7 +255,7 @@ def _ramp(values: FloatArray, on: BoolArray, begin: int, end: int) -> tuple[int,
     if min(map(len, sides)) < LEAST_KNOWN:
         return begin, end
     low, high = (float(np.median(side)) for side in sides)
-    scatter = [1.4826 * float(np.median(np.abs(side - np.median(side)))) for side in sides]
+    scatter = [robust_sigma(side - np.median(side)) for side in sides]
     best, least = (begin, end), np.inf
     for first in range(max(begin - RAMP_REACH, 0), begin + RAMP_REACH + 1):
         for last in range(max(end - RAMP_REACH, first + LEAST_FRAMES), end + RAMP_REACH + 1):

@@ -15,9 +15,9 @@ import numpy as np
 import scipy
 
 from labapp.core.images.dots import Grey, Image
-from labapp.core.lines.find_lines import find_lines
+from labapp.core.lines.detection.find_lines import find_lines
 from labapp.core.lines.pulses import Pulses, classify_pulses, frame_brightness
-from labapp.core.values import BoolArray, FloatArray, ReadOnlyArrays
+from labapp.core.values import BoolArray, FloatArray, ReadOnlyArrays, robust_sigma
 
 OVERSAMPLE = 8
 """Number of trial frequencies per inverse of the recording's duration."""
@@ -123,7 +123,7 @@ class LineTracker:
         before, top, after = (band[best + k, columns].astype(float) for k in (-1, 0, 1))
         bend = before - 2 * top + after
         off = side[best] + np.where(bend < 0, (before - after) / (2 * np.minimum(bend, -1e-9)), 0.0)
-        noise = 1.4826 * float(np.median(np.abs(band - np.median(band)))) + 1e-6
+        noise = robust_sigma(band - np.median(band)) + 1e-6
         clear = top > LEAST_CONTRAST * noise
         if clear.sum() < 6:
             return None
@@ -165,7 +165,7 @@ def _robust_shape(
             return fit, np.zeros(len(off), bool)
         weighted = terms * weights[:, None]
         fit = np.linalg.solve(weighted.T @ terms + 1e-3 * np.eye(3), weighted.T @ off)
-        scatter = 1.4826 * float(np.median(np.abs((off - terms @ fit)[weights > 0])))
+        scatter = robust_sigma((off - terms @ fit)[weights > 0])
         limit = float(np.clip(5.0 * scatter, 2.0, 8.0))
     return fit, (np.abs(off - terms @ fit) < limit) & clear
 

@@ -20,7 +20,7 @@ from labapp.errors import InputError
 from labapp.session.file.blobs import Damaged, damage_as_input, fingerprint, pack, unpack
 from labapp.session.file.database import Database
 from labapp.session.file.schema import MEASURES
-from labapp.session.setup_verdicts import SetupVerdicts, chosen_evenly
+from labapp.session.results.setup_verdicts import SetupVerdicts, chosen_evenly
 from labapp.text import now
 from labapp.version import VERSION
 

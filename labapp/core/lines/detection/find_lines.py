@@ -12,10 +12,16 @@ import cv2
 import numpy as np
 
 from labapp.core.images.dots import Grey, Image
-from labapp.core.lines.chains import END_WIDTHS, LEAST_FOLDED, is_upright, join_chains, spread_of
-from labapp.core.lines.gathered import gathered_spots
-from labapp.core.lines.ridges import SCALE_PX, Ridges, find_ridges
-from labapp.core.lines.smooth_path import SmoothPath
+from labapp.core.lines.detection.chains import (
+    END_WIDTHS,
+    LEAST_FOLDED,
+    is_upright,
+    join_chains,
+    spread_of,
+)
+from labapp.core.lines.detection.gathered import gathered_spots
+from labapp.core.lines.detection.ridges import SCALE_PX, Ridges, find_ridges
+from labapp.core.lines.detection.smooth_path import SmoothPath
 from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 
 END_PX, END_REACH_PX = 10.0, 30.0

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from labapp.cli.correct import InOrder, correct
-from labapp.cli.info import info
+from labapp.cli.session.correct import InOrder, correct
+from labapp.cli.session.info import info
 from labapp.cli.shared import (
     ABOUT_SCHEMES,
     DETECTOR_HELP,

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from labapp.core.images.dots import Grey, Image
-from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
+from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays, robust_sigma
 
 WITHIN_PX = 0.6
 """Largest distance of a ridge point from its pixel's centre along u and v: slightly above half."""
@@ -89,7 +89,7 @@ def find_ridges(frame: Image, scale_px: float = SCALE_PX) -> Ridges:
 
     ``scale_px`` is the standard deviation of the smoothing Gaussian.
     """
-    from labapp.core.lines import ridge_kernels
+    from labapp.core.lines.detection import ridge_kernels
 
     picture = np.ascontiguousarray(frame, np.float32)
     bell, slope, bend = _derivative_kernels(scale_px)
@@ -100,7 +100,7 @@ def find_ridges(frame: Image, scale_px: float = SCALE_PX) -> Ridges:
     smooth, uu, vv, uv = (
         filtered(*pair) for pair in ((bell, bell), (bend, bell), (bell, bend), (slope, slope))
     )
-    noise = 1.4826 * float(np.median(np.abs(uu[::3, ::3] - np.median(uu[::3, ::3])))) + 1e-9
+    noise = robust_sigma(uu[::3, ::3] - np.median(uu[::3, ::3])) + 1e-9
     # Smaller eigenvalue of the Hessian: the strongest curvature of a maximum.
     half, root = (uu + vv) / 2, np.sqrt(((uu - vv) / 2) ** 2 + uv * uv)
     v, u = np.nonzero(half - root < -FLOOR * noise)
