@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Iterable, Sequence
 from datetime import datetime
 
@@ -136,6 +137,11 @@ def as_cell(value: object) -> object:
     except ValueError:
         return f"'{value}"
     return value
+
+
+def number_cell(value: float) -> str:
+    """Return a number with seven digits as a CSV cell; empty if it is NaN or infinite."""
+    return f"{value:.7g}" if math.isfinite(value) else ""
 
 
 def csv_text(rows: Iterable[Sequence[object]]) -> str:

@@ -757,7 +757,7 @@ def test_the_version_is_told(labapp: Run) -> None:
             {"scipy", "cv2", "av", "numba", "h5py", "matplotlib", "labapp.core.pipeline"},
         ),
         (
-            "import labapp.session.frames, labapp.session.measured",
+            "import labapp.session.frames, labapp.session.results.measured",
             {"scipy.linalg", "scipy.spatial", "scipy.special", "av", "numba", "h5py", "matplotlib"},
         ),
     ],

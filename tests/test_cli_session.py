@@ -26,7 +26,7 @@ from labapp.errors import InputError
 from labapp.run import measurers
 from labapp.session.checklist import SAFETY, STEPS
 from labapp.session.frames import Frames
-from labapp.session.measured import Results
+from labapp.session.results.measured import Results
 from labapp.session.session import Session
 from tests.conftest import Run
 from tests.same import assert_same

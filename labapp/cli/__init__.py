@@ -21,9 +21,6 @@ import typer.core
 import typer.main
 
 from labapp.cli import (
-    advise,
-    analyze,
-    benchmark,
     calibrate,
     cameras,
     demo,
@@ -33,10 +30,10 @@ from labapp.cli import (
     penetration,
     reconstruct,
     session,
-    simulate,
     study,
 )
 from labapp.cli.shared import BAD_INPUT, FAULT, INTERRUPTED, TERMINATED, Commands
+from labapp.cli.simulation import advise, analyze, benchmark, simulate
 from labapp.cli.window import asks_for_app, open_app
 from labapp.errors import InputError
 from labapp.log import log_file, start_log

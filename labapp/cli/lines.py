@@ -27,7 +27,6 @@ from labapp.text import csv_text
 
 if TYPE_CHECKING:
     from labapp.config.setup import Setup
-    from labapp.core.lines.frame import LineFrame
     from labapp.core.values import FloatArray
     from labapp.export.frame_result import FrameResult
     from labapp.media import FrameSource
@@ -133,9 +132,9 @@ def _write_measured(done: list[FrameResult], folder: Path, bench: Setup) -> bool
     """Write the tables of frames measured one by one; returns whether any has lines."""
     from labapp.core.lines.states import LineSeries, line_changes, line_states
     from labapp.core.recording.residual_check import doubt_of_values, judged_status
-    from labapp.export.line_results import line_tables
+    from labapp.export.line_results import line_tables, of_lines
 
-    frames, times_s, found = _of_lines(done)
+    frames, times_s, found = of_lines(done)
     status = judged_status(bench.rig, doubt_of_values(bench.rig))
     for name, text in line_tables(frames, times_s, found, bench.calibration, status).items():
         write_file(folder / name, text.encode())
@@ -157,7 +156,7 @@ def _write_followed(done: list[FrameResult], folder: Path) -> bool:
     from labapp.core.lines.track import oscillation_frequency
     from labapp.export import line_results as tables
 
-    frames, times_s, found = _of_lines(done)
+    frames, times_s, found = tables.of_lines(done)
     rows = tables.track_rows(frames, times_s, found)
     write_file(folder / "track.csv", csv_text([tables.TRACK_COLUMNS, *rows]).encode())
     on = np.array([one.status == "pulse" for one in found], bool)
@@ -174,16 +173,3 @@ def _write_followed(done: list[FrameResult], folder: Path) -> bool:
     if np.isfinite(hertz):
         typer.echo(f"strongest oscillation: {hertz:.2f} Hz, {strength:.0%} of the line's motion")
     return bool(known.any())
-
-
-def _of_lines(
-    done: list[FrameResult],
-) -> tuple[list[int], list[float | None], list[LineFrame]]:
-    """Return numbers, times and lines of the frames that could be read."""
-    seen = [(one, one.measurement.lines) for one in done]
-    read = [(one, lines) for one, lines in seen if lines is not None]
-    return (
-        [one.frame for one, _ in read],
-        [one.time_s for one, _ in read],
-        [lines for _, lines in read],
-    )

@@ -12,7 +12,7 @@ from labapp.cli.shared import Commands, progress_shown
 from labapp.errors import InputError
 from labapp.files import as_bytes, write_file
 from labapp.system import quoted
-from labapp.text import csv_text, pluralize
+from labapp.text import csv_text, number_cell, pluralize
 
 if TYPE_CHECKING:
     from labapp.core.dynamics.penetration import Kind, LeftOut, PenetrationModel, Prediction
@@ -153,14 +153,12 @@ def _validation_text(model: PenetrationModel, errors: LeftOut) -> str:
 
 
 def _left_out_rows(errors: LeftOut) -> list[list[str]]:
-    from labapp.export.features import as_cell
-
     columns = vars(errors)
     names = ["time_s", "measured", "measured_sigma", "predicted", "sigma"]
     head = ["recording", "time_s", *(f"{name}_mm" for name in names[1:])]
     numbers = zip(*(columns[name].tolist() for name in names), strict=True)
     rows = zip(errors.weld, numbers, strict=True)
-    return [head, *([weld, *map(as_cell, each)] for weld, each in rows)]
+    return [head, *([weld, *map(number_cell, each)] for weld, each in rows)]
 
 
 @app.command()

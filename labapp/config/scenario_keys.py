@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from labapp.config.toml_keys import Rule, are_numbers, between, is_number, within
+from labapp.config.toml_keys import Rule, are_numbers, between, is_number, one_of, whole, within
 
 LARGEST_POOL_MM = 100.0
 """Upper limit of a pool's lengths."""
@@ -13,18 +13,6 @@ RECORDINGS = {"avi": "recording.avi", "tif": "recording.tif", "png": "recording"
 """Format → the recording's name: a video, a TIFF stack, a folder of PNG files."""
 
 BITS = (8, 12, 16)
-
-
-def _whole(low: int, high: int, required: bool = False) -> Rule:
-    return Rule(
-        f"a whole number from {low} to {high}",
-        lambda value: type(value) is int and low <= value <= high,
-        required,
-    )
-
-
-def _one_of(*words: str, required: bool = False) -> Rule:
-    return Rule(" or ".join(f'"{word}"' for word in words), lambda v: v in words, required)
 
 
 def _places(count: int, what: str, required: bool = False) -> Rule:
@@ -79,7 +67,7 @@ SHAPES: dict[str, dict[str, Rule]] = {
 }
 """Shape → keys of [pool] besides `shape`."""
 
-SHAPE = _one_of(*SHAPES, required=True)
+SHAPE = one_of(*SHAPES, required=True)
 
 TERMS: dict[str, dict[str, Rule]] = {
     "dent": {
@@ -92,7 +80,7 @@ TERMS: dict[str, dict[str, Rule]] = {
         "mode": Rule("[m, n], whole numbers: m from 0 and n from 1, both up to 8", _is_mode),
         "amplitude_mm": within(0, 10, "mm", required=True),
         "frequency_hz": within(0, 1e5, "Hz", required=True),
-        "kind": _one_of("standing", "travelling"),
+        "kind": one_of("standing", "travelling"),
         "turned_deg": _ANGLE,
         "phase_deg": _ANGLE,
         "damping_per_s": within(0, 1e4, "1/s"),
@@ -108,8 +96,8 @@ TABLES: dict[str, dict[str, Rule]] = {
         "half_angle_deg": within(0, 89, "degrees"),
     },
     "camera": {
-        "width_px": _whole(64, 8192),
-        "height_px": _whole(64, 8192),
+        "width_px": whole(64, 8192),
+        "height_px": whole(64, 8192),
         "focal_px": within(10, 1e6, "px"),
         **{name: within(-10, 10, "") for name in ("k1", "k2", "p1", "p2", "k3")},
     },
@@ -125,18 +113,18 @@ TABLES: dict[str, dict[str, Rule]] = {
         "glow": within(0, 255, "grey levels"),
         "read_noise": within(0, 100, "grey levels"),
         "photon_noise": within(0, 10, "grey levels² per grey level"),
-        "hot_pixels": _whole(0, 100_000),
-        "false_dots": _whole(0, 10_000),
+        "hot_pixels": whole(0, 100_000),
+        "false_dots": whole(0, 10_000),
         "missing": within(0, 1, "probability"),
         "full_scale": between(0, 255.5, "grey levels", required=False),
         "bits": Rule("8, 12 or 16", lambda v: type(v) is int and v in BITS, False),
     },
     "recording": {
-        "frames": _whole(1, 1_000_000, required=True),
+        "frames": whole(1, 1_000_000, required=True),
         "frame_rate_hz": between(0, 1e6, "Hz"),
         "exposure_ms": within(0, 1e5, "ms"),
-        "seed": _whole(0, 2**31 - 1, required=True),
-        "format": _one_of(*RECORDINGS),
+        "seed": whole(0, 2**31 - 1, required=True),
+        "format": one_of(*RECORDINGS),
     },
 }
 """Every table except the set-up's and [pool]; [torch], [camera] and [look] are optional."""

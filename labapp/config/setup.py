@@ -171,10 +171,7 @@ def updated_setup(
     If a calibrated value is changed without its standard uncertainty, the uncertainty is removed:
     it applies only to the value found by the calibration.
     """
-    try:
-        document = tomlkit.parse(text)
-    except (tomlkit.exceptions.TOMLKitError, ValueError, RecursionError) as error:
-        raise InputError(path, "syntax", error, A_SETUP) from error
+    document = _parsed(text, path)
     for section, keys in values.items():
         if section not in document:
             document.add(section, tomlkit.table())
@@ -204,27 +201,27 @@ _SHARED = {
 
 def pattern_kind(text: str) -> str:
     """Kind of pattern in the text of a setup, which may be incomplete."""
-    try:
-        keys = tomlkit.parse(text).unwrap().get("pattern")
-    except (tomlkit.exceptions.TOMLKitError, ValueError, RecursionError):
-        return DotPattern.kind
-    kind = keys.get("kind") if isinstance(keys, dict) else None
+    kind = _section(text, "pattern").get("kind")
     return kind if isinstance(kind, str) else DotPattern.kind
 
 
 def lens_of(text: str) -> Lens | None:
     """Lens in the text of a setup, which may be incomplete; None if there is none."""
+    keys = _section(text, "camera_lens")
+    names = ("focal_px", "center_px", "distortion")
+    lens: dict[str, Any] = {name: keys.get(name) for name in names}
+    if check_keys(Path(), "camera_lens", lens, SECTIONS["camera_lens"]):
+        return None
+    return Lens(**{name: tuple(value) for name, value in lens.items()})
+
+
+def _section(text: str, name: str) -> dict[str, Any]:
+    """A section of the text of a setup; empty if it is missing or the text is not TOML."""
     try:
-        keys = tomlkit.parse(text).unwrap().get("camera_lens")
-    except (tomlkit.exceptions.TOMLKitError, ValueError, RecursionError):
-        return None
-    lens = ("focal_px", "center_px", "distortion")
-    rules = rules_for("camera_lens", keys)
-    if not isinstance(keys, dict) or not set(lens) <= keys.keys():
-        return None
-    if check_keys(Path(), "camera_lens", {name: keys[name] for name in lens}, rules):
-        return None
-    return Lens(**{name: tuple(keys[name]) for name in lens})
+        section = _parsed(text, "").unwrap().get(name)
+    except InputError:
+        return {}
+    return section if isinstance(section, dict) else {}
 
 
 def checked_setup(text: str, path: str | os.PathLike[str], check: BenchCheck, date: str) -> str:
@@ -276,12 +273,17 @@ def _keeping_sigmas(
 
 
 def _without_section(text: str, path: str | os.PathLike[str], section: str) -> str:
-    try:
-        document = tomlkit.parse(text)
-    except (tomlkit.exceptions.TOMLKitError, ValueError, RecursionError) as error:
-        raise InputError(path, "syntax", error, A_SETUP) from error
+    document = _parsed(text, path)
     document.pop(section, None)
     return tomlkit.dumps(document)
+
+
+def _parsed(text: str, path: str | os.PathLike[str]) -> tomlkit.TOMLDocument:
+    """Text as a document that keeps comments; ``path`` is for the error."""
+    try:
+        return tomlkit.parse(text)
+    except (tomlkit.exceptions.TOMLKitError, ValueError, RecursionError) as error:
+        raise InputError(path, "syntax", error, A_SETUP) from error
 
 
 def pattern_values(pattern: DotPattern) -> dict[str, object]:

@@ -14,6 +14,8 @@ from labapp.config.toml_keys import (
     between,
     is_matrix,
     is_number,
+    one_of,
+    whole,
     within,
 )
 from labapp.core.geometry.line_pattern import KIND as LINES
@@ -113,10 +115,8 @@ RAYS = {
     ),
 }
 LINE_PATTERN = {
-    "kind": Rule(f'"{LINES}"', lambda value: value == LINES),
-    "count": Rule(
-        "a whole number from 1 to 99", lambda value: type(value) is int and 1 <= value <= 99
-    ),
+    "kind": one_of(LINES, required=True),
+    "count": whole(1, 99, required=True),
     "interline_angle_deg": between(0, 45, "degrees"),
     "fan_angle_deg": between(0, 90, "degrees"),
     "rotation_deg": _TILT,
@@ -179,11 +179,7 @@ SECTIONS = {
         **_sigmas("camera_lens"),
     },
     "torch": {
-        "travel": Rule(
-            " or ".join(f'"{way}"' for way in get_args(Travel)),
-            lambda value: value in get_args(Travel),
-            required=False,
-        ),
+        "travel": one_of(*get_args(Travel)),
     },
     "bench_check": bench_check.RULES,
 }

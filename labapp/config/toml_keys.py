@@ -127,6 +127,20 @@ def within(low: float, high: float, unit: str, required: bool = False) -> Rule:
     )
 
 
+def whole(low: int, high: int, required: bool = False) -> Rule:
+    """A whole number from ``low`` to ``high``."""
+    return Rule(
+        f"a whole number from {low} to {high}",
+        lambda value: type(value) is int and low <= value <= high,
+        required,
+    )
+
+
+def one_of(*words: str, required: bool = False) -> Rule:
+    """One of some words."""
+    return Rule(" or ".join(f'"{word}"' for word in words), lambda v: v in words, required)
+
+
 def check_keys(
     path: Path, table: str, keys: object, rules: Mapping[str, Rule], form: str = ""
 ) -> list[InputError]:

@@ -26,7 +26,7 @@ from labapp.core.images.band_pass import DetectorTuning, quick_dots, tuned_dots
 from labapp.core.images.dots import Dots, Image
 from labapp.core.images.find_dots import DotSettings, find_dots
 from labapp.core.lines.correction import LineCorrection
-from labapp.core.lines.frame import LineFrame, LineMeasureSettings, measure_lines
+from labapp.core.lines.frame import LineFrame, measure_lines
 from labapp.core.match import Candidate, Match, RowsOpen
 from labapp.core.matching.corrected_rows import lattice_of_corrected, match_corrected
 from labapp.core.matching.correspondence import lattice_of_match, match_rays
@@ -267,7 +267,7 @@ def _by_scheme(result: Measurement, match: Match, rig: Rig, settings: Settings) 
 def _with_lines(result: Measurement, image: Image, rig: LineRig, bench: Bench) -> Measurement:
     """Measure a frame of a line pattern."""
     by_hand = result.correction if isinstance(result.correction, LineCorrection) else None
-    found = measure_lines(image, rig, bench.calibration, LineMeasureSettings(), by_hand)
+    found = measure_lines(image, rig, bench.calibration, by_hand)
     return replace(result, status=found.status, reason=found.reason, lines=found)
 
 

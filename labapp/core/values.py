@@ -48,6 +48,14 @@ class ReadOnlyArrays:
         return f"{type(self).__name__}({', '.join(parts)})"
 
 
+def robust_sigma(residuals: npt.ArrayLike) -> float:
+    """Standard deviation of normal residuals about 0, by their median size: outliers hardly count.
+
+    The median size of normal deviates is their standard deviation over 1.4826.
+    """
+    return 1.4826 * float(np.median(np.abs(residuals)))
+
+
 def median(values: FloatArray) -> float:
     """Median of an array, shape (n,); NaN if it is empty or has a NaN. Faster than `np.median`."""
     count = len(values)

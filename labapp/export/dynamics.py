@@ -21,7 +21,7 @@ from labapp.core.surface.surface import Surface
 from labapp.core.values import FloatArray
 from labapp.errors import InputError, unknown_name
 from labapp.export.frame_result import FrameResult
-from labapp.text import csv_text, split_unit
+from labapp.text import csv_text, number_cell, split_unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -167,7 +167,10 @@ def _event_rows(found: Dynamics) -> Iterator[list[str]]:
     yield ["series", "time_s", "time_sigma_s", "change", "slope_change_per_s"]
     for name, events in found.events.items():
         for one in events:
-            yield [name, *map(_cell, (one.time_s, one.sigma_s, one.change, one.slope_change_per_s))]
+            yield [
+                name,
+                *map(number_cell, (one.time_s, one.sigma_s, one.change, one.slope_change_per_s)),
+            ]
 
 
 def _response_rows(found: Dynamics) -> Iterator[list[str]]:
@@ -175,25 +178,21 @@ def _response_rows(found: Dynamics) -> Iterator[list[str]]:
     yield ["signal", "series", "step_s", "signal_change", "order", "before", *names]
     for one in found.responses:
         step, fit = one.step, one.response
-        pairs = [_cell(of[name]) for name in QUANTITIES for of in (fit.value, fit.sigma)]
-        where = [one.signal, one.series, _cell(step.time_s), _cell(step.change)]
-        yield [*where, str(fit.order), _cell(fit.before), *pairs]
+        pairs = [number_cell(of[name]) for name in QUANTITIES for of in (fit.value, fit.sigma)]
+        where = [one.signal, one.series, number_cell(step.time_s), number_cell(step.change)]
+        yield [*where, str(fit.order), number_cell(fit.before), *pairs]
 
 
 def _mode_row(one: ModeCourse) -> list[str]:
     figures = one.figures
-    cells = [_cell(x) for n in FIGURES for x in figures.get(n, (np.nan, np.nan))]
+    cells = [number_cell(x) for n in FIGURES for x in figures.get(n, (np.nan, np.nan))]
     others = " ".join(f"{o.frequency_hz:.4g}" for o in one.oscillations[1:])
-    return [one.name, _cell(one.share), *cells, others]
+    return [one.name, number_cell(one.share), *cells, others]
 
 
 def _columns(columns: Mapping[str, Any]) -> str:
     rows = zip(*columns.values(), strict=True)
-    return csv_text([list(columns), *(list(map(_cell, row)) for row in rows)])
-
-
-def _cell(value: float) -> str:
-    return f"{value:.7g}" if np.isfinite(value) else ""
+    return csv_text([list(columns), *(list(map(number_cell, row)) for row in rows)])
 
 
 # --- pictures ---------------------------------------------------------------------------------

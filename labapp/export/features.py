@@ -25,7 +25,7 @@ from labapp.core.values import FloatArray
 from labapp.errors import InputError
 from labapp.export.dynamics import Measured
 from labapp.files import as_bytes, write_file
-from labapp.text import csv_text
+from labapp.text import csv_text, number_cell
 
 LARGEST = 1 << 29
 """Largest table, bytes."""
@@ -169,7 +169,9 @@ class FeatureTable:
         names = [name for one in self.welds for name in [one.name] * len(one.time_s)]
         columns = self._columns()
         if suffix == ".csv":
-            cells = [[as_cell(value) for value in column.tolist()] for column in columns.values()]
+            cells = [
+                [number_cell(value) for value in column.tolist()] for column in columns.values()
+            ]
             rows = zip(names, *cells, strict=True)
             write_file(path, as_bytes(csv_text([["recording", *columns], *rows])))
             return
@@ -250,11 +252,6 @@ def _welds(
         )
         measured = taken(target), taken(sigma_name(target)) if target else unknown[rows]
         yield WeldSeries(name, time_s, value, noise, level, *measured)
-
-
-def as_cell(value: float) -> str:
-    """Format a number as a cell of a table; empty if unknown."""
-    return f"{value:.7g}" if np.isfinite(value) else ""
 
 
 def needs_extra(package: str) -> InputError:

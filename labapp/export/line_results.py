@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -11,6 +11,7 @@ from labapp.core.lines.fit import LineSurface
 from labapp.core.lines.frame import LineFrame
 from labapp.core.lines.metal import PoolEdges
 from labapp.core.lines.states import LineSeries, State, line_states
+from labapp.export.frame_result import FrameResult
 from labapp.text import csv_text
 
 LINE_COLUMNS = (
@@ -154,6 +155,19 @@ def surface_rows(surface: LineSurface) -> list[list[str]]:
 
 def _cell(value: float | None) -> str:
     return "" if value is None or not np.isfinite(value) else f"{value:.5f}"
+
+
+def of_lines(
+    results: Iterable[FrameResult],
+) -> tuple[list[int], list[float | None], list[LineFrame]]:
+    """Return numbers, times and lines of the frames that could be read."""
+    seen = [(one, one.measurement.lines) for one in results]
+    read = [(one, lines) for one, lines in seen if lines is not None]
+    return (
+        [one.frame for one, _ in read],
+        [one.time_s for one, _ in read],
+        [lines for _, lines in read],
+    )
 
 
 def line_tables(

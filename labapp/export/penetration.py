@@ -22,10 +22,10 @@ from labapp.core.dynamics.weld_series import LONGEST_MEMORY, MOST_HELD, Orders, 
 from labapp.core.surface.measures import WITH_SIGMA, sigma_name
 from labapp.core.values import FloatArray
 from labapp.errors import InputError, os_errors_as_input
-from labapp.export.features import as_cell, needs_extra, weld_series
+from labapp.export.features import needs_extra, weld_series
 from labapp.export.frame_result import FrameResult
 from labapp.files import as_bytes, write_file
-from labapp.text import csv_text
+from labapp.text import csv_text, number_cell
 from labapp.version import VERSION
 
 FORMAT = 1
@@ -185,7 +185,7 @@ def prediction_csv(name: str, model: PenetrationModel, found: Mapping[str, Predi
         columns = one.time_s, one.value, one.sigma, one.low_95, one.high_95
         for values, outside in zip(np.column_stack(columns), one.is_outside, strict=True):
             status = "extrapolated" if outside else "ok" if np.isfinite(values[1]) else "unknown"
-            rows.append([recording, *map(as_cell, values.tolist()), status, name])
+            rows.append([recording, *map(number_cell, values.tolist()), status, name])
     return csv_text(rows)
 
 

@@ -22,7 +22,7 @@ COMPILED = (
     ),
     "labapp.core.matching.match_kernels",
     "labapp.core.matching.initial.quadric_kernels",
-    "labapp.core.lines.ridge_kernels",
+    "labapp.core.lines.detection.ridge_kernels",
     "labapp.core.sequence.prior",
     "labapp.export.fixed_point",
 )

@@ -20,7 +20,7 @@ from labapp.text import pluralize
 
 if TYPE_CHECKING:
     from labapp.gui.foot_switches import FootSwitches
-    from labapp.session.measured import Overview
+    from labapp.session.results.measured import Overview
     from labapp.session.session import Session
 
 T = TypeVar("T")

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from labapp.session.documents import Change
     from labapp.session.file.database import Database
     from labapp.session.frames import Progress
-    from labapp.session.measured import Basis, Overview, Result
     from labapp.session.record import (
         BenchCheckRecord,
         LaserReadings,
@@ -36,6 +35,7 @@ if TYPE_CHECKING:
         Record,
         Recording,
     )
+    from labapp.session.results.measured import Basis, Overview, Result
     from labapp.session.signals import Signals
 
 
@@ -46,8 +46,8 @@ class SessionContents:
         from labapp.session.calibration_pictures import CalibrationPictures
         from labapp.session.documents import Documents
         from labapp.session.frames import Frames
-        from labapp.session.measured import Results
-        from labapp.session.overviews import Overviews
+        from labapp.session.results.measured import Results
+        from labapp.session.results.overviews import Overviews
 
         self.path = database.path
         """The session file."""
@@ -379,12 +379,12 @@ class SessionContents:
         return scheme
 
     def _scheme(self) -> str:
-        from labapp.session.measured import scheme_name
+        from labapp.session.results.measured import scheme_name
 
         return scheme_name(self.settings)
 
     def _basis(self) -> Basis | None:
-        from labapp.session.measured import Basis
+        from labapp.session.results.measured import Basis
 
         try:
             return Basis(self.setup, self.settings)

@@ -95,32 +95,13 @@ class Frames:
         embed: bool = False,
         progress: Progress | None = None,
     ) -> Recording:
-        """Import a recording: read all of it, check that it is frame-exact, store the findings.
-
-        Parameters
-        ----------
-        path
-            A video, an image, a folder of images, or a stack.
-        frames
-            Frames that the session uses, ``A:B:STEP``.
-        frame_rate_hz
-            Frame rate, Hz, if the recording has none or a wrong one.
-        embed
-            Whether to store the frames in the session.
-        progress
-            Called with the number of frames done and the total.
-
-        Raises
-        ------
-        InputError
-            If it cannot be read, or lacks frames that are measured or corrected in this session.
-        """
+        """Import a recording; see `Session.import_recording`."""
         require(path, PATH, "recording", "path", "the path of a recording")
         path = Path(path).absolute()
         if frame_rate_hz is not None:
             check_positive(frame_rate_hz, str(path), "frame rate", "frames a second")
-        if frame_rate_hz is not None and not 0 < frame_rate_hz < 1e8:
-            raise InputError(path, "frame rate", frame_rate_hz, "frames a second above 0")
+            if frame_rate_hz >= 1e8:
+                raise InputError(path, "frame rate", frame_rate_hz, "frames a second above 0")
         with open_source(path) as source:
             selected = select_frames(frames, len(source), str(path))
             found = survey(source, progress)
@@ -192,13 +173,7 @@ class Frames:
         return recording
 
     def refuse_another(self) -> None:
-        """Raise if another recording would invalidate results or corrections.
-
-        Raises
-        ------
-        InputError
-            If frames are measured or corrected.
-        """
+        """Raise if frames are measured or corrected; see `Session.refuse_another_recording`."""
         recording = self.recording
         if recording is not None and self._worked_on():
             raise InputError(
@@ -288,20 +263,7 @@ class Frames:
             raise InputError(missing, "recording", "does not exist", THE_RECORDING)
 
     def relink(self, path: str | os.PathLike[str], verify: bool = True) -> None:
-        """Set the path of the recording.
-
-        Parameters
-        ----------
-        path
-            New path.
-        verify
-            Whether to read all of it and compare it; otherwise frames are compared when read.
-
-        Raises
-        ------
-        InputError
-            If the file is another recording.
-        """
+        """Set the path of the recording; see `Session.relink`."""
         require(path, PATH, "recording", "path", "the path of the recording")
         path = Path(path).absolute()
         recording = self._imported()
@@ -312,9 +274,9 @@ class Frames:
                 f"another recording ({found[0]} bytes)",
                 f"{Path(recording.path).name} as it was imported ({recording.size} bytes)",
             )
-        values = {**vars(recording), "path": self._relative(path)}
+        moved = replace(recording, path=self._relative(path))
         with self._database.transaction() as connection:
-            connection.execute("UPDATE recording SET content = ?", (pack(Recording(**values)),))
+            connection.execute("UPDATE recording SET content = ?", (pack(moved),))
         self.close()
 
     def close(self) -> None:

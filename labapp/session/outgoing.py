@@ -14,14 +14,14 @@ import numpy as np
 from labapp.errors import PATH, InputError, os_errors_as_input, require
 from labapp.export.folder import ExportChoice, ExportedFile, export
 from labapp.export.frame_result import FrameResult
-from labapp.export.line_results import line_tables
+from labapp.export.line_results import line_tables, of_lines
 from labapp.export.rendering.drawing import Camera, Direction
 from labapp.export.rendering.film import Extent, film_times, write_film
 from labapp.export.rendering.studio import drawing_errors, drawing_process
 from labapp.session.contents import SessionContents
 from labapp.session.frames import Progress
-from labapp.session.measured import Result, scheme_name
 from labapp.session.report import report_pdf
+from labapp.session.results.measured import Result, scheme_name
 
 
 def export_session(
@@ -99,16 +99,8 @@ def _export_lines(
     session: SessionContents, folder: str | os.PathLike[str], scheme: str, numbers: Sequence[int]
 ) -> tuple[ExportedFile, ...]:
     """Write the tables of a line pattern, the same as `labapp lines`."""
-    measured = list(_Measured(session, scheme, numbers))
-    pairs = [(one, one.measurement.lines) for one in measured]
-    known = [(one, lines) for one, lines in pairs if lines is not None]  # not unreadable
-    texts = line_tables(
-        [one.frame for one, _ in known],
-        [one.time_s for one, _ in known],
-        [lines for _, lines in known],
-        session.setup.calibration,
-        session.setup_status,
-    )
+    measured = of_lines(_Measured(session, scheme, numbers))
+    texts = line_tables(*measured, session.setup.calibration, session.setup_status)
     return export(
         folder,
         (),

@@ -565,7 +565,7 @@ class Session(SessionContents):
         from labapp.run.measurers import ColdMeasurer, LineFollower, WarmMeasurer
         from labapp.run.runner import run
         from labapp.session.file.blobs import fingerprint
-        from labapp.session.measured import Basis
+        from labapp.session.results.measured import Basis
 
         if frames is not None:
             require(frames, Iterable, "measure", "frames", "frame numbers: [0, 1, 2]")

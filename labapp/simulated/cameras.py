@@ -39,11 +39,7 @@ MOST_BYTE = 400_000_000
 USUAL_HZ = 60.0
 
 
-def camera_opener(
-    id: str,
-    progress: Progress | None = None,
-    faults: Faults | None = None,
-) -> Callable[[], Camera]:
+def camera_opener(id: str, progress: Progress | None = None) -> Callable[[], Camera]:
     """Function that opens a camera at each call; for `Feed`.
 
     Parameters
@@ -60,7 +56,7 @@ def camera_opener(
         If there is no such kind of camera, or a file cannot be played.
     """
     if id.startswith(SIMULATED):
-        return simulated_device(Path(id.removeprefix(SIMULATED)), progress, faults).open
+        return simulated_device(Path(id.removeprefix(SIMULATED)), progress).open
     return partial(open_camera, id)
 
 

@@ -19,7 +19,7 @@ from scipy.spatial import cKDTree
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.line_pattern import LinePattern, LineRig
 from labapp.core.geometry.rig import Electrode, ImagingPlane, Laser
-from labapp.core.lines.frame import LineFrame, LineMeasureSettings, measure_lines
+from labapp.core.lines.frame import LineFrame, measure_lines
 from labapp.core.lines.states import LineSeries, line_changes, line_states
 from labapp.core.lines.track import track_line
 from labapp.simulation.camera import CameraView
@@ -97,14 +97,14 @@ def draw(image: np.ndarray, found: LineFrame, path: Path) -> None:
 
 def five(pools: int, seed: int, pictures: Path | None) -> None:
     """Lines, ridge and surface of pools convex and concave in turn."""
-    settings, rows, squares, points, took = LineMeasureSettings(), [], 0.0, 0, 0.0
+    rows, squares, points, took = [], 0.0, 0, 0.0
     for n in range(pools):
         rng = np.random.default_rng([seed, n])
         sign = 1 if n % 2 == 0 else -1
         pool = draw_pool(rng, sign)
         true = render_lines(pool, RIG, VIEW, LineLook(gaps=2), rng)
         begin = time.perf_counter()
-        found = measure_lines(true.image, RIG, CALIBRATION, settings)
+        found = measure_lines(true.image, RIG, CALIBRATION)
         took += time.perf_counter() - begin
         numbers, errors = ridge_errors(found, true)
         right = lines_right(true, numbers)
@@ -139,13 +139,12 @@ def five(pools: int, seed: int, pictures: Path | None) -> None:
 
 def runs(frames: int, seed: int, keep: Path | None) -> None:
     """States of three penetration runs like that of Fig. 3-11 … 3-14."""
-    settings = LineMeasureSettings()
     for n in range(3):
         rng = np.random.default_rng([seed, 100 + n])
         run, measured = penetration_run(frames, rng), []
         for one in run:
             image = render_lines(one.pool, RIG, VIEW, LineLook(gaps=1), rng).image
-            measured.append(measure_lines(image, RIG, CALIBRATION, settings))
+            measured.append(measure_lines(image, RIG, CALIBRATION))
         series = LineSeries.of(measured)
         states = line_states(series)
         truth = [one.state for one in run]

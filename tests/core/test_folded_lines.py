@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from labapp.config.line_setup import read_line_setup
-from labapp.core.lines.find_lines import LineSettings, find_lines
-from labapp.core.lines.numbering import number_lines
-from labapp.core.lines.ridges import RidgeSettings, find_ridges, sampled
+from labapp.core.lines.detection import ridges as ridges_module
+from labapp.core.lines.detection.find_lines import find_lines
+from labapp.core.lines.detection.numbering import number_lines
+from labapp.core.lines.detection.ridges import find_ridges, sampled
 from labapp.simulation.camera import CameraView
 from labapp.simulation.lines.frames import LineLook, render_lines
 from labapp.simulation.pools import egg
@@ -38,7 +39,7 @@ def test_each_line_is_found_once(tmp_path, number: int, sign: int):
     center = rng.uniform(-0.2, 0.2), rng.uniform(-0.2, 0.2)
     pool = egg(width, head, length - head, sign * rng.uniform(0.1, 0.4), center)
     true = render_lines(pool, rig, VIEW, LineLook(gaps=2), rng)
-    seen = number_lines(find_lines(true.image, LineSettings()), 5)
+    seen = number_lines(find_lines(true.image), 5)
     nearest = []
     for one in seen.lines:
         away = {
@@ -53,9 +54,11 @@ def test_each_line_is_found_once(tmp_path, number: int, sign: int):
     assert nearest == ([1, 2, 3, 4, 5] if sign > 0 else [5, 4, 3, 2, 1])
 
 
-def test_a_frame_of_very_many_ridges():
+def test_a_frame_of_very_many_ridges(monkeypatch):
+    monkeypatch.setattr(ridges_module, "SEED", 1.0)
+    monkeypatch.setattr(ridges_module, "FLOOR", 0.5)
     noise = np.random.default_rng(1).normal(100, 30, (900, 900)).astype(np.float32)
-    ridges = find_ridges(noise, RidgeSettings(1.0, 1.0, 0.5))
+    ridges = find_ridges(noise, 1.0)
     assert len(ridges.image_px) > 2**15
     assert len(ridges.height) == len(ridges.image_px)
 

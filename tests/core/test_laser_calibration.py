@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from labapp.core.calibration import laser_calibration
 from labapp.core.calibration.laser_calibration import LaserCalibrationSettings, calibrate_laser
 
 
@@ -59,11 +60,12 @@ def test_a_square_beam_has_three_equal_lengths() -> None:
 
 @pytest.mark.parametrize("count", [3, 5, 10])
 @pytest.mark.parametrize("fan_sigma", [0.0, 0.1])
-def test_intervals_cover_the_laser_with_few_readings(count: int, fan_sigma: float) -> None:
+def test_intervals_cover_the_laser_with_few_readings(
+    count: int, fan_sigma: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(laser_calibration, "REFUSE_SIGMA", np.inf)
     rng = np.random.default_rng(7)
-    settings = LaserCalibrationSettings(
-        resolution_mm=0.01, fan_angle_sigma_deg=fan_sigma, refuse_sigma=np.inf
-    )
+    settings = LaserCalibrationSettings(resolution_mm=0.01, fan_angle_sigma_deg=fan_sigma)
     truth = np.array([31.14, 31.48, 31.48 * np.sin(np.radians(31.14))])
     covered, apart = [], []
     for _ in range(1500):

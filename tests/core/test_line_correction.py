@@ -14,14 +14,12 @@ from labapp.core.lines.correction import (
     nearest_line,
     number_line,
 )
-from labapp.core.lines.find_lines import LightLine, LineSettings, find_lines
-from labapp.core.lines.frame import LineMeasureSettings, measure_lines
-from labapp.core.lines.numbering import LinesSeen, number_lines
+from labapp.core.lines.detection.find_lines import LightLine, find_lines
+from labapp.core.lines.detection.numbering import LinesSeen, number_lines
+from labapp.core.lines.frame import measure_lines
 from labapp.simulation.lines.frames import LineLook, render_lines
 from labapp.simulation.pools import egg
 from tests.benchmarks.lines import CALIBRATION, RIG, VIEW
-
-SETTINGS = LineMeasureSettings()
 
 
 def straight(v_px: float, u_px: tuple[int, int] = (100, 300)) -> LightLine:
@@ -107,14 +105,14 @@ def picture() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def found(picture: np.ndarray) -> LineCorrection:
-    seen = number_lines(find_lines(picture, LineSettings()), 5)
+    seen = number_lines(find_lines(picture), 5)
     assert len(seen.lines) == 5
     return LineCorrection.of(seen)
 
 
 def measured(picture: np.ndarray, correction: LineCorrection):
     assert isinstance(CALIBRATION, ImageCalibration)
-    return measure_lines(picture, RIG, CALIBRATION, SETTINGS, correction)
+    return measure_lines(picture, RIG, CALIBRATION, correction)
 
 
 @pytest.mark.slow

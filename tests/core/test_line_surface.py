@@ -11,7 +11,7 @@ from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.line_pattern import LinePattern, LineRig, line_directions
 from labapp.core.geometry.rig import Electrode, ImagingPlane, Laser
 from labapp.core.lines.fit import fit_lines
-from labapp.core.lines.frame import LineMeasureSettings, measure_lines
+from labapp.core.lines.frame import measure_lines
 from labapp.core.lines.model import LineData, LineModel
 from labapp.core.surface.spline import SplineBasis
 from labapp.core.values import CannotMeasure
@@ -124,7 +124,7 @@ def test_one_line_alone_is_no_surface():
 @pytest.mark.parametrize(("peak_mm", "numbers"), [(0.25, [1, 2, 3, 4, 5]), (-0.3, [5, 4, 3, 2, 1])])
 def test_frames_give_height_numbers_and_features(peak_mm: float, numbers: list[int]):
     frame = rendered(spherical_cap(6.0, peak_mm), look=LineLook(gaps=1))
-    found = measure_lines(frame.image, RIG, CALIBRATION, LineMeasureSettings())
+    found = measure_lines(frame.image, RIG, CALIBRATION)
     assert found.status == "ok"
     assert found.surface is not None
     assert found.surface.numbers.tolist() == numbers
@@ -141,11 +141,11 @@ def test_frames_give_height_numbers_and_features(peak_mm: float, numbers: list[i
 def test_a_caustic_is_no_surface():
     """A hollow of this depth gathers each line to a point: nothing must be read from it."""
     frame = rendered(spherical_cap(6.0, -0.138))
-    found = measure_lines(frame.image, RIG, CALIBRATION, LineMeasureSettings())
+    found = measure_lines(frame.image, RIG, CALIBRATION)
     assert found.status != "ok"
 
 
 def test_solid_metal_shows_no_line():
-    found = measure_lines(rendered(None).image, RIG, CALIBRATION, LineMeasureSettings())
+    found = measure_lines(rendered(None).image, RIG, CALIBRATION)
     assert found.status == "no-lines"
     assert found.features.count == 0

@@ -10,7 +10,7 @@ import pytest
 from labapp.config.line_setup import read_line_setup
 from labapp.core.geometry.line_pattern import line_directions
 from labapp.core.geometry.optics import intersect_level
-from labapp.core.lines.frame import LineMeasureSettings, measure_lines
+from labapp.core.lines.frame import measure_lines
 from labapp.core.lines.metal import pool_edges
 from labapp.simulation.camera import CameraView
 from labapp.simulation.lines.frames import LineLook, render_lines
@@ -44,7 +44,7 @@ def true_edges(rig, pool) -> dict[tuple[int, int], np.ndarray]:
 def test_lines_on_stainless_steel_end_at_the_pool(bench):
     rig, rng = bench.line_rig, np.random.default_rng(3)
     image = render_lines(HOLLOW, rig, VIEW, LineLook(metal=0.4), rng).image
-    found = measure_lines(image, rig, bench.calibration, LineMeasureSettings())
+    found = measure_lines(image, rig, bench.calibration)
     edges, true = found.edges, true_edges(rig, HOLLOW)
     assert edges is not None
     ends = zip(edges.line.tolist(), edges.side.tolist(), edges.point_mm, strict=True)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
 
-from labapp.core.lines.find_lines import LineSettings, find_lines
-from labapp.core.lines.numbering import number_lines
-from labapp.core.lines.ridges import RidgeSettings, find_ridges
+from labapp.core.lines.detection.find_lines import find_lines
+from labapp.core.lines.detection.numbering import number_lines
+from labapp.core.lines.detection.ridges import find_ridges
 from labapp.core.values import FloatArray
 
 SHAPE = (200, 260)
@@ -43,7 +43,7 @@ def drawn(
 def test_ridge_points_lie_on_a_slanted_line():
     at = np.linspace(0, 1, 4000)[:, None]
     frame = drawn((np.array([30.3, 60.7]) + at * np.array([190.0, 61.0]), 60.0), noise=0.2)
-    ridges = find_ridges(frame, RidgeSettings())
+    ridges = find_ridges(frame)
     main = slice(*ridges.starts[:2]) if len(ridges) == 1 else slice(None)
     points = ridges.image_px[main]
     inner = (points[:, 0] > 45) & (points[:, 0] < 205)
@@ -57,7 +57,7 @@ def test_a_bent_line_is_found_where_it_is():
     """Smoothing draws the ridge of a bent line inwards by more than its noise."""
     path = arc((130.4, 140.2), 45.0, 1.2)
     frame = drawn((path, 60.0), width=2.5, noise=0.5)
-    line = max(find_lines(frame, LineSettings()), key=lambda one: one.light * one.length_px)
+    line = max(find_lines(frame), key=lambda one: one.light * one.length_px)
     radius = np.linalg.norm(line.image_px - [130.4, 140.2], axis=-1)
     assert abs(np.mean(radius) - 45.0) < 0.05
     assert np.sqrt(np.mean((radius - 45.0) ** 2)) < 0.1
@@ -69,9 +69,7 @@ def test_a_sharp_turn_is_not_cut_off():
     """A line of a hollow pool near its focus: straight legs, and 10 px radius between them."""
     across = np.linspace(-40.0, 40.0, 4000)
     path = np.stack([130.4 + across, 50.3 + 1.5 * np.hypot(across, 15.0)], axis=-1)
-    line = max(
-        find_lines(drawn((path, 60.0), noise=0.5), LineSettings()), key=lambda one: one.length_px
-    )
+    line = max(find_lines(drawn((path, 60.0), noise=0.5)), key=lambda one: one.length_px)
     away = np.linalg.norm(line.image_px[:, None] - path, axis=-1).min(axis=-1)
     turn = np.abs(line.image_px[:, 0] - 130.4) < 12.0
     assert turn.sum() > 20
@@ -80,7 +78,7 @@ def test_a_sharp_turn_is_not_cut_off():
 
 def test_ends_are_where_the_light_ends():
     path = arc((130.4, 180.2), 80.0, 0.9)
-    (line,) = find_lines(drawn((path, 60.0), noise=0.5), LineSettings())
+    (line,) = find_lines(drawn((path, 60.0), noise=0.5))
     assert np.abs(line.ends_px - path[[0, -1]]).max() < 0.8
     assert not line.cut.any()
 
@@ -88,7 +86,7 @@ def test_ends_are_where_the_light_ends():
 def test_a_line_that_leaves_the_picture_is_cut():
     at = np.linspace(0, 1, 4000)[:, None]
     frame = drawn((np.array([40.0, 90.0]) + at * np.array([218.0, 20.0]), 60.0))
-    (line,) = find_lines(frame, LineSettings())
+    (line,) = find_lines(frame)
     assert line.cut.tolist() == [False, True]
 
 
@@ -96,7 +94,7 @@ def test_gaps_are_bridged_and_reported():
     path = arc((130.0, 180.0), 90.0, 1.0)
     first, second = path[path[:, 0] < 144.5], path[path[:, 0] > 155.5]
     frame = drawn((first, 60.0), (second, 60.0))
-    (line,) = find_lines(frame, LineSettings())
+    (line,) = find_lines(frame)
     assert 6 < line.gap_px < 30
     assert np.abs(line.ends_px - path[[0, -1]]).max() < 1.0
 
@@ -108,7 +106,7 @@ def five(*bright: float, spacing: float = 22.0) -> list[tuple[FloatArray, float]
 
 def test_fringes_are_left_out_and_settle_the_numbers():
     frame = drawn(*five(9.0, 50.0, 55.0, 60.0, 10.0))
-    seen = number_lines(find_lines(frame, LineSettings()), 3)
+    seen = number_lines(find_lines(frame), 3)
     assert len(seen.lines) == 3
     assert seen.fringe_below
     assert seen.fringe_above
@@ -118,17 +116,17 @@ def test_fringes_are_left_out_and_settle_the_numbers():
 
 
 def test_missing_lines_leave_the_numbers_open_unless_a_fringe_is_seen():
-    alone = number_lines(find_lines(drawn(*five(50.0, 55.0, 60.0)), LineSettings()), 5)
+    alone = number_lines(find_lines(drawn(*five(50.0, 55.0, 60.0))), 5)
     assert list(alone.first_numbers(5, same_order=True)) == [1, 2, 3]
     assert list(alone.first_numbers(5, same_order=False)) == [3, 4, 5]
-    above = number_lines(find_lines(drawn(*five(50.0, 55.0, 60.0, 10.0)), LineSettings()), 5)
+    above = number_lines(find_lines(drawn(*five(50.0, 55.0, 60.0, 10.0))), 5)
     assert list(above.first_numbers(5, same_order=True)) == [3]
-    below = number_lines(find_lines(drawn(*five(9.0, 55.0, 60.0, 50.0)), LineSettings()), 5)
+    below = number_lines(find_lines(drawn(*five(9.0, 55.0, 60.0, 50.0))), 5)
     assert list(below.first_numbers(5, same_order=True)) == [1]
     assert list(below.first_numbers(5, same_order=False)) == [5]
 
 
 def test_an_empty_frame_has_no_line():
     frame = 20.0 + np.random.default_rng(1).normal(size=SHAPE)
-    seen = number_lines(find_lines(frame, LineSettings()), 5)
+    seen = number_lines(find_lines(frame), 5)
     assert seen.lines == ()

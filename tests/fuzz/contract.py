@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from labapp import cli
-from labapp.cli.info import _facts, _text
+from labapp.cli.session.info import _facts, _text
 from labapp.config.setup import read_setup, update_setup
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.rows.correction import Correction

@@ -30,8 +30,8 @@ from labapp.core.surface.spline import SplineBasis, SplineSurface
 from labapp.core.surface.surface import Surface
 from labapp.export.folder import ExportChoice, export
 from labapp.export.frame_result import FrameResult
-from labapp.session.measured import Basis
 from labapp.session.record import PlanePicture, Record
+from labapp.session.results.measured import Basis
 from labapp.session.session import Session
 from tests.media.cine_writer import write_cine
 from tests.media.photron_writer import write_photron

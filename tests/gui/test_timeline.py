@@ -11,7 +11,7 @@ from labapp.gui.shell.window import TICKS
 from labapp.gui.widgets.scrubber import aggregated
 from labapp.gui.widgets.timeline import Timeline
 from labapp.session.file.schema import MEASURES
-from labapp.session.measured import Overview
+from labapp.session.results.measured import Overview
 
 
 def overview(status: list[str], corrected: list[bool], stale: list[bool]) -> Overview:

@@ -16,7 +16,7 @@ from unittest import mock
 from labapp.session.documents import Documents
 from labapp.session.file.blobs import pack, unpack
 from labapp.session.frames import Frames
-from labapp.session.measured import Results
+from labapp.session.results.measured import Results
 
 Key = tuple[str, int]
 Values = dict[Key, bytes | None]

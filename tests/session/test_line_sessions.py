@@ -19,7 +19,7 @@ from labapp.gui.pages.dots.lines import show_lines
 from labapp.gui.pages.setup import presenter as setup_page
 from labapp.gui.pages.surface import presenter as surface_page
 from labapp.gui.pages.trends import presenter as trends_page
-from labapp.session.line_trends import LineTrend, line_trend
+from labapp.session.results.line_trends import LineTrend, line_trend
 from labapp.session.session import Session
 from labapp.simulation.lines.frames import LineLook, render_lines
 from labapp.simulation.pools import Pool, egg

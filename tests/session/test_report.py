@@ -22,12 +22,12 @@ from labapp.core.schemes import ers
 from labapp.core.surface.measures import SIZES, measure_surface
 from labapp.errors import InputError
 from labapp.export.summary import format_ranges
-from labapp.session.measured import CORRECTION_CHANGED, SETUP_CHANGED
 from labapp.session.record import Record
 from labapp.session.report import data, figures, layout, report_pdf
 from labapp.session.report.data import FrameLine, ReportData
 from labapp.session.report.layout import Story, plain
 from labapp.session.report.results import add_corrections, add_example, add_results
+from labapp.session.results.measured import CORRECTION_CHANGED, SETUP_CHANGED
 from labapp.session.session import Session
 from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.pools import spherical_cap

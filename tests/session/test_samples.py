@@ -12,7 +12,7 @@ import pytest
 from labapp.errors import InputError
 from labapp.session import samples
 from labapp.session.copies import copy_sample
-from labapp.session.line_trends import line_trend
+from labapp.session.results.line_trends import line_trend
 from labapp.session.samples import SAMPLES, sample_folder
 from labapp.session.session import Session
 

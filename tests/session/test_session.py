@@ -23,8 +23,8 @@ from labapp.export.results import ResultsWriter
 from labapp.media import open_source
 from labapp.run.measurers import measuring_pool
 from labapp.session.file.blobs import pack
-from labapp.session.measured import CORRECTION_CHANGED, SETTINGS_CHANGED, SETUP_CHANGED
 from labapp.session.record import Record
+from labapp.session.results.measured import CORRECTION_CHANGED, SETTINGS_CHANGED, SETUP_CHANGED
 from labapp.session.session import Session
 from tests.scripts import run_python
 from tests.session.test_blobs import same

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from labapp.session.file.schema import MEASURES
-from labapp.session.measured import Overview
-from labapp.session.trends import FEWEST, doubtful_frames, spectrum, spread, trend
+from labapp.session.results.measured import Overview
+from labapp.session.results.trends import FEWEST, doubtful_frames, spectrum, spread, trend
 
 RATE_HZ = 60.0
 

@@ -20,7 +20,7 @@ from labapp.core.geometry.rig import Electrode
 from labapp.session.file.blobs import HEAD, MAGIC, SURFACES, Damaged, pack, unpack
 from labapp.session.file.schema import VERSION
 from labapp.session.file.stored import NAMES, STORED, Stored
-from labapp.session.measured import CORRECTION_CHANGED, SETTINGS_CHANGED
+from labapp.session.results.measured import CORRECTION_CHANGED, SETTINGS_CHANGED
 from labapp.session.session import Session
 
 WRITTEN = sorted((Path(__file__).parent / "data").glob("version_*.labsession"))

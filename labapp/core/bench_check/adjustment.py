@@ -30,7 +30,7 @@ from labapp.core.geometry.perturbation import (
 )
 from labapp.core.geometry.rig import Rig
 from labapp.core.geometry.uncertainty import QUANTITIES
-from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
+from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays, robust_sigma
 
 FLOOR_MM = 0.02
 """Added in quadrature to the standard uncertainty of every dot on the plane: deviations of the rays
@@ -228,7 +228,9 @@ class System:
         unknown = np.zeros(self.size)
         for k, one in enumerate(self.sightings):
             tried = [unknown[self.parts[k + 1]], *_places(one, self.rig)]
-            costs = [_spread(self.standardised(k, unknown[self.parts[0]], pose)) for pose in tried]
+            costs = [
+                robust_sigma(self.standardised(k, unknown[self.parts[0]], pose)) for pose in tried
+            ]
             unknown[self.parts[k + 1]] = tried[int(np.argmin(costs))]
         return unknown
 
@@ -328,18 +330,18 @@ class System:
 
     def solved_from(self, unknown: FloatArray) -> Adjustment:
         """Iterate from initial unknowns to the adjustment."""
-        scale = max(1.0, _spread(self.residuals(unknown)))
+        scale = max(1.0, robust_sigma(self.residuals(unknown)))
         for _ in range(ROUNDS):
             # A large scale first tolerates gross errors; the loss tightens as residuals shrink.
             if scale == 1.0:
                 break
             unknown = self.minimised(unknown, scale, FEW_STEPS)
-            before, scale = scale, max(1.0, _spread(self.residuals(unknown)))
+            before, scale = scale, max(1.0, robust_sigma(self.residuals(unknown)))
             if scale > SETTLED * before:
                 break
         for _ in range(ROUNDS):
             unknown = self.minimised(unknown, scale, MOST_STEPS)
-            before, scale = scale, max(1.0, _spread(self.residuals(unknown)))
+            before, scale = scale, max(1.0, robust_sigma(self.residuals(unknown)))
             if scale > SETTLED * before:
                 break
         return self.adjustment(unknown, scale)
@@ -440,11 +442,6 @@ def soft_l1(square: FloatArray) -> FloatArray:
     """Robust loss of squared residuals and its derivative, shape (2, m)."""
     root = np.sqrt(1 + square / ROBUST**2)
     return np.stack([2 * ROBUST**2 * (root - 1), 1 / root])
-
-
-def _spread(standardised: FloatArray) -> float:
-    """Robust standard deviation of residuals about 0."""
-    return float(1.4826 * np.median(np.abs(standardised)))
 
 
 def _places(sighting: Sighting, rig: Rig) -> list[FloatArray]:

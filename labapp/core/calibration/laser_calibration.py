@@ -29,6 +29,10 @@ from labapp.core.values import FloatArray
 COVERAGE_FACTOR = 1.959964
 """Half width of the 95 % interval of a normal distribution, in units of σ."""
 
+DOUBT_SIGMA, REFUSE_SIGMA, REFUSE_FRACTION = 2.0, 4.0, 0.05
+"""Lengths that disagree by more standard uncertainties than the first cause a warning; by more than
+the second, and by more than this fraction of the length, they are refused."""
+
 
 @dataclass(frozen=True)
 class LaserCalibration:
@@ -83,7 +87,7 @@ class LaserCalibration:
 
 @dataclass(frozen=True)
 class LaserCalibrationSettings:
-    """Uncertainties of the lengths, and limits of their disagreement.
+    """Uncertainties of the lengths and of the fan angle.
 
     Parameters
     ----------
@@ -95,19 +99,11 @@ class LaserCalibrationSettings:
     fan_angle_sigma_deg
         Standard uncertainty of the lens's fan angle, degrees; the default is an assumption, as
         manufacturers seldom state it.
-    doubt_sigma
-        Lengths that disagree by more than this many standard uncertainties cause a warning.
-    refuse_sigma, refuse_fraction
-        Lengths that disagree by more than this many standard uncertainties and by more than this
-        fraction of the length are refused.
     """
 
     resolution_mm: float = 0.05
     reading_sigma_mm: float = 0.1
     fan_angle_sigma_deg: float = 0.1
-    doubt_sigma: float = 2.0
-    refuse_sigma: float = 4.0
-    refuse_fraction: float = 0.05
 
 
 def calibrate_laser(
@@ -130,7 +126,7 @@ def calibrate_laser(
     fan_angle_deg
         Fan angle θ of the cross-hair lens, degrees.
     settings
-        Uncertainties and limits; None for the defaults.
+        Uncertainties; None for the defaults.
 
     Raises
     ------
@@ -159,7 +155,7 @@ def calibrate_laser(
     )
     for name, length in (("l1_mm", l1), ("l3_mm", l3)):
         apart = float(np.hypot(length.expanded, l2.expanded))
-        _check_order(name, length.mean_mm, l2.mean_mm, apart, settings, warnings)
+        _check_order(name, length.mean_mm, l2.mean_mm, apart, warnings)
 
     values, jacobian = _appendix_i(l2.mean_mm, l3.mean_mm, float(np.radians(fan_angle_deg / 2.0)))
     half_sigma = np.radians(settings.fan_angle_sigma_deg / 2.0)
@@ -169,7 +165,7 @@ def calibrate_laser(
     sigma = np.array([_expanded(own, freedom) for own in parts])
     shared, alone = parts[0] @ parts[1], np.linalg.norm(parts[:2], axis=1).prod()
     angle, distance, height, horizontal, expected_l1 = (float(v) for v in values)
-    _check_l1(l1.mean_mm, expected_l1, float(np.hypot(l1.expanded, sigma[4])), settings, warnings)
+    _check_l1(l1.mean_mm, expected_l1, float(np.hypot(l1.expanded, sigma[4])), warnings)
     return LaserCalibration(
         angle_deg=float(np.degrees(angle)),
         angle_sigma_deg=float(np.degrees(sigma[0])),
@@ -264,17 +260,10 @@ def _student(freedom: float) -> float:
     return float(scipy.special.stdtrit(freedom, 0.975)) / COVERAGE_FACTOR
 
 
-def _check_order(
-    name: str,
-    length: float,
-    l2: float,
-    sigma: float,
-    settings: LaserCalibrationSettings,
-    warnings: list[str],
-) -> None:
+def _check_order(name: str, length: float, l2: float, sigma: float, warnings: list[str]) -> None:
     """Refuse a length greater than l₂, the longest half; warn if it is only slightly greater."""
     excess = length - l2
-    if excess > settings.refuse_sigma * sigma:
+    if excess > REFUSE_SIGMA * sigma:
         raise ValueError(
             f"{name} = {length:.4g} is longer than l2_mm = {l2:.4g}: l2 is the half that points "
             f"away from the laser and is the longest; {name} is at most {l2:.4g}"
@@ -286,22 +275,16 @@ def _check_order(
         )
 
 
-def _check_l1(
-    l1: float,
-    expected: float,
-    sigma: float,
-    settings: LaserCalibrationSettings,
-    warnings: list[str],
-) -> None:
+def _check_l1(l1: float, expected: float, sigma: float, warnings: list[str]) -> None:
     """Compare the measured l₁ with that computed from l₂, l₃ and the fan angle."""
     off = abs(l1 - expected)
-    if off > settings.refuse_sigma * sigma and off > settings.refuse_fraction * expected:
+    if off > REFUSE_SIGMA * sigma and off > REFUSE_FRACTION * expected:
         raise ValueError(
             f"l1_mm = {l1:.4g} contradicts l2_mm and l3_mm: with these and the fan angle it "
             f"should be {expected:.4g} ± {sigma:.2g}; measure the three lengths again and check "
             "that the cross is aligned with the tilt of the laser"
         )
-    if off > settings.doubt_sigma * sigma:
+    if off > DOUBT_SIGMA * sigma:
         warnings.append(
             f"l1_mm = {l1:.4g} differs from the {expected:.4g} ± {sigma:.2g} that follow from "
             "l2_mm, l3_mm and the fan angle."

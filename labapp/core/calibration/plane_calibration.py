@@ -27,7 +27,6 @@ from labapp.core.calibration.target_bars import (
 from labapp.core.calibration.target_marks import (
     Image,
     Mark,
-    MarkSettings,
     Refusal,
     grey_levels,
     levelled,
@@ -39,10 +38,26 @@ from labapp.core.values import CannotMeasure, FloatArray
 
 AXES = ("O′X′", "O′Z′")
 
+MOST_SIGMA_PX = 0.5
+"""Largest accepted standard uncertainty of a point, px."""
+
+MOST_ASIDE = 0.08
+"""Largest distance of a bar's midline from O′, units."""
+
+MIDDLE_OFF = 0.1
+"""Largest distance of a bar's middle from the position expected from its length and O′, units. This
+detects a partly hidden bar: its middle moves by half of the hidden length."""
+
+FLAG_UNITS = 0.19
+"""Length by which the unit flags protrude from their bars, units."""
+
+MARK_OFF = 0.05
+"""Largest distance of a mark from the position predicted by the others, with perspective, units."""
+
 
 @dataclass(frozen=True)
-class PlaneCalibrationSettings(MarkSettings):
-    """Design of the target and its tolerances; the detection settings are inherited.
+class PlaneCalibrationSettings:
+    """Design of the target, and how it is found.
 
     Parameters
     ----------
@@ -50,37 +65,23 @@ class PlaneCalibrationSettings(MarkSettings):
         Length of a unit of the axes, mm, "measured in advance" (§5.1.2).
     x_units, z_units
         Where the bars on O′X′ and O′Z′ begin and end, units.
+    threshold
+        Grey level below which a pixel is dark (T = 14 in the dissertation); None tries several.
     subpixel
         Measure on grey levels; False gives the whole pixels of Eq. 5-5.
     scale_tolerance
         Largest relative difference between the px/mm of the two axes.
     angle_tolerance_deg
         Largest deviation of the angle between the axes from 90°, degrees.
-    sigma_limit_px
-        Largest accepted standard uncertainty of a point, px.
-    pointing_tolerance
-        Largest distance of a bar's midline from O′, units.
-    middle_tolerance
-        Largest distance of a bar's middle from the position expected from its length and O′, units.
-        This detects a partly hidden bar: its middle moves by half of the hidden length.
-    flag_units
-        Length by which the unit flags protrude from their bars, units.
-    mark_tolerance
-        Largest distance of a mark from the position predicted by the others, with perspective,
-        units.
     """
 
     unit_mm: float = 6.35
     x_units: tuple[float, float] = (1.0, 10.0)
     z_units: tuple[float, float] = (1.0, 4.0)
+    threshold: float | None = None
     subpixel: bool = True
     scale_tolerance: float = 0.2
     angle_tolerance_deg: float = 30.0
-    sigma_limit_px: float = 0.5
-    pointing_tolerance: float = 0.08
-    middle_tolerance: float = 0.1
-    flag_units: float = 0.19
-    mark_tolerance: float = 0.05
 
 
 @dataclass(frozen=True)
@@ -244,9 +245,9 @@ def calibrate_plane(
     grey = grey_levels(image)
     background, darkness = levelled(grey)
     failure = Refusal(-1, "The picture shows no dark marks on a light plane.")
-    for threshold, binary in segmented(grey, darkness, settings):
+    for threshold, binary in segmented(grey, darkness, settings.threshold):
         try:
-            marks = three_marks(binary, settings)
+            marks = three_marks(binary)
             return _measured(marks, darkness, background, threshold, settings, lens)
         except Refusal as refusal:
             # The attempt that failed at the latest stage was closest: report its reason.
@@ -270,7 +271,7 @@ def _measured(
     points = [origin, x_bar.middle, z_bar.middle]
     sigma = [origin_sigma, x_bar.sigma_px, z_bar.sigma_px]
     for name, uncertain in zip(("dot of O′", "bar on O′X′", "bar on O′Z′"), sigma, strict=True):
-        if uncertain > settings.sigma_limit_px:
+        if uncertain > MOST_SIGMA_PX:
             raise Refusal(
                 4, f"The {name} is blurred or partly covered: known to ±{uncertain:.1f} px only."
             )
@@ -291,12 +292,12 @@ def _measured(
     )
     bars = (x_bar, z_bar)
     for axis, bar, units in zip(AXES, bars, (settings.x_units, settings.z_units), strict=True):
-        _check_pointing(axis, origin, bar, units, settings)
+        _check_pointing(axis, origin, bar, units)
     ticks = _tick_marks(origin, bars, darkness, settings)
     if not ticks:
         # Without flags, only the ends can show whether the bars are completely visible.
         for axis, bar, units in zip(AXES, bars, (settings.x_units, settings.z_units), strict=True):
-            _check_length(axis, origin, bar, units, settings)
+            _check_length(axis, origin, bar, units)
     if ticks and settings.subpixel:
         found = replace(found, marks=ticks)
         assert found.fits is not None
@@ -325,7 +326,7 @@ def _tick_marks(
     least = 1
     for k, units in enumerate((settings.x_units, settings.z_units)):
         bar, other = bars[k], bars[1 - k].direction
-        along = bar_marks(bar, origin, units, other, settings.flag_units, darkness)
+        along = bar_marks(bar, origin, units, other, FLAG_UNITS, darkness)
         places += [(t, 0.0, place) if k == 0 else (0.0, t, place) for t, place in along]
         least += 2 + (int(np.ceil(units[1])) - int(np.floor(units[0])) - 1) // 2
     marks = [
@@ -344,37 +345,25 @@ def _tick_marks(
         if stray and worst and marks[worst][:2] not in ends:
             del marks[worst]
             continue
-        if off[worst] > settings.mark_tolerance * unit_px:
+        if off[worst] > MARK_OFF * unit_px:
             return ()
         unit = settings.unit_mm
         return tuple((x * unit, z * unit, u, v, noise) for x, z, u, v, noise in marks)
     return ()
 
 
-def _check_pointing(
-    axis: str,
-    origin: FloatArray,
-    bar: Bar,
-    units: tuple[float, float],
-    settings: PlaneCalibrationSettings,
-) -> None:
+def _check_pointing(axis: str, origin: FloatArray, bar: Bar, units: tuple[float, float]) -> None:
     """Refuse a bar that does not point at O′."""
     arm = bar.middle - origin
     unit_px = float(np.hypot(*arm)) / (sum(units) / 2.0)
     passes_by = abs(arm[0] * bar.direction[1] - arm[1] * bar.direction[0]) / unit_px
-    if passes_by > settings.pointing_tolerance:
+    if passes_by > MOST_ASIDE:
         raise Refusal(
             4, f"The bar on {axis} does not point at O′: it passes {passes_by:.2g} units off."
         )
 
 
-def _check_length(
-    axis: str,
-    origin: FloatArray,
-    bar: Bar,
-    units: tuple[float, float],
-    settings: PlaneCalibrationSettings,
-) -> None:
+def _check_length(axis: str, origin: FloatArray, bar: Bar, units: tuple[float, float]) -> None:
     """Refuse a bar whose length does not match the design."""
     begin, end = units
     unit_px = float(np.hypot(*(bar.middle - origin))) / ((begin + end) / 2.0)
@@ -382,7 +371,7 @@ def _check_length(
     # If 2s of a bar is hidden, its half length is s shorter, but the expected half length also
     # shrinks by s·(end - begin) / (end + begin), as the middle moves. An end may be half a pixel
     # off even in a coarse picture.
-    tolerance = max(settings.middle_tolerance * 2.0 * begin / (begin + end) * unit_px, 0.5)
+    tolerance = max(MIDDLE_OFF * 2.0 * begin / (begin + end) * unit_px, 0.5)
     if abs(bar.half_length - expected) > tolerance:
         raise Refusal(
             5,

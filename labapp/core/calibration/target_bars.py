@@ -13,7 +13,7 @@ import numpy as np
 import scipy
 
 from labapp.core.calibration.target_marks import Mark, Refusal
-from labapp.core.values import FloatArray, ReadOnlyArrays
+from labapp.core.values import FloatArray, ReadOnlyArrays, robust_sigma
 
 END_PX = 4.0
 """Largest distance of a bar's end from its first estimate, px."""
@@ -68,7 +68,7 @@ def dot_center(dot: Mark, darkness: FloatArray) -> tuple[FloatArray, float]:
     center = weight @ place / total
     edge = (weight > 0.0) & (weight < 1.0)
     spread = np.sum((place[edge] - center) ** 2) / 2.0
-    noise = 1.4826 * float(np.median(np.abs(darkness - np.median(darkness))))
+    noise = robust_sigma(darkness - np.median(darkness))
     return center, float(np.hypot(noise / span * np.sqrt(spread) / total, 0.05))
 
 
@@ -131,7 +131,7 @@ def _robust_line(x: FloatArray, y: FloatArray) -> tuple[float, float, float]:
     for _ in range(4):
         slope, intercept = np.polyfit(x[use], y[use], 1)
         residual = y - intercept - slope * x
-        scatter = 1.4826 * float(np.median(np.abs(residual)))
+        scatter = robust_sigma(residual)
         use = np.abs(residual) <= max(2.5 * scatter, 1e-6)
     return float(slope), float(intercept), scatter
 
@@ -243,7 +243,7 @@ def _flag(
             darkness, [grid[..., 1], grid[..., 0]], order=1, mode="nearest"
         ).mean(axis=1)
     profile -= np.median(profile)
-    noise = 1.4826 * float(np.median(np.abs(profile)))
+    noise = robust_sigma(profile)
     peak = int(np.argmax(scipy.ndimage.gaussian_filter1d(profile, 0.7 / step)))
     if profile[peak] < max(0.1 * bar.darkness, 4.0 * noise):
         return None

@@ -13,34 +13,19 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from labapp.core.values import BoolArray, CannotMeasure, FloatArray, ReadOnlyArrays
+from labapp.core.values import BoolArray, CannotMeasure, FloatArray, ReadOnlyArrays, robust_sigma
 
 Image = npt.NDArray[Any]
 
+MEDIAN_PX, DILATIONS = 7, 12
+"""Side of the median filter, and largest number of dilations by 3 × 3, in a picture of 640 px; both
+are scaled with the picture."""
 
-@dataclass(frozen=True)
-class MarkSettings:
-    """Settings for the detection of the three marks.
+SPECK_FRACTION = 0.02
+"""An object smaller than this fraction of the largest is a speck."""
 
-    Parameters
-    ----------
-    threshold
-        Grey level below which a pixel is dark (T = 14 in the dissertation); None tries several.
-    median_px
-        Side of the median filter in a picture of 640 px; scaled with the picture.
-    dilations
-        Largest number of dilations by 3 × 3, likewise scaled.
-    speck_fraction
-        An object smaller than this fraction of the largest is a speck.
-    roll_deg
-        Largest rotation of the bars from the horizontal and the vertical, degrees.
-    """
-
-    threshold: float | None = None
-    median_px: int = 7
-    dilations: int = 12
-    speck_fraction: float = 0.02
-    roll_deg: float = 30.0
+MOST_ROLL_DEG = 30.0
+"""Largest rotation of the bars from the horizontal and the vertical, degrees."""
 
 
 class Refusal(Exception):
@@ -127,7 +112,7 @@ def levelled(grey: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def segmented(
-    grey: FloatArray, darkness: FloatArray, settings: MarkSettings
+    grey: FloatArray, darkness: FloatArray, threshold: float | None
 ) -> list[tuple[float | None, npt.NDArray[np.uint8]]]:
     """Return binary pictures to try, the dissertation's filter first (Eq. 5-1, 5-3).
 
@@ -135,8 +120,8 @@ def segmented(
     ----------
     grey, darkness
         Grey levels, and the missing fraction of the light, shape (rows, columns).
-    settings
-        If it has a threshold, only this one is tried.
+    threshold
+        Grey level below which a pixel is dark; None tries several.
 
     Returns
     -------
@@ -144,10 +129,10 @@ def segmented(
         (threshold of the missing fraction, or None for the fixed threshold; picture of 0 and 1).
     """
     scale = max(grey.shape) / 640.0
-    median = _odd(settings.median_px * scale)
-    if settings.threshold is not None:
+    median = _odd(MEDIAN_PX * scale)
+    if threshold is not None:
         # Eq. 5-1 on the grey levels.
-        pairs: list[tuple[float | None, BoolArray]] = [(None, grey < settings.threshold)]
+        pairs: list[tuple[float | None, BoolArray]] = [(None, grey < threshold)]
     else:
         smooth = np.asarray(cv2.GaussianBlur(darkness, (0, 0), max(scale, 0.5)), np.float64)
         pairs = [(level, smooth > level) for level in _levels(smooth)]
@@ -171,7 +156,7 @@ def _binary_median(binary: npt.NDArray[np.uint8], side: int) -> npt.NDArray[np.u
 def _levels(darkness: FloatArray) -> list[float]:
     """Thresholds to try: Otsu's method, the triangle method, then fixed shares of the darkness."""
     low, high = 0.0, float(np.quantile(darkness, 0.998))
-    noise = 1.4826 * float(np.median(np.abs(darkness)))
+    noise = robust_sigma(darkness)
     if high <= 3.0 * noise or high < 1e-6:
         return []
     eight_bit = np.clip(np.round((darkness - low) / (high - low) * 255.0), 0, 255)
@@ -183,7 +168,7 @@ def _levels(darkness: FloatArray) -> list[float]:
     return [float(level) for level in named + steps if level > 2.0 * noise]
 
 
-def three_marks(binary: npt.NDArray[np.uint8], settings: MarkSettings) -> tuple[Mark, Mark, Mark]:
+def three_marks(binary: npt.NDArray[np.uint8]) -> tuple[Mark, Mark, Mark]:
     """Return the dot, the bar on O′X′ and the bar on O′Z′ in a binary picture.
 
     Raises
@@ -191,7 +176,7 @@ def three_marks(binary: npt.NDArray[np.uint8], settings: MarkSettings) -> tuple[
     Refusal
         If the picture does not contain exactly these three.
     """
-    labels, touching = _three_objects(binary, settings)
+    labels, touching = _three_objects(binary)
     marks = [_mark(labels == label) for label in (1, 2, 3)]
     dots = [mark for mark in marks if mark.length < 1.8 * mark.width]
     bars = [mark for mark in marks if mark.length > 3.0 * mark.width]
@@ -205,7 +190,7 @@ def three_marks(binary: npt.NDArray[np.uint8], settings: MarkSettings) -> tuple[
     tilt = [abs(np.degrees(np.arctan2(bar.direction[1], bar.direction[0]))) for bar in bars]
     flat = [min(angle, 180.0 - angle) for angle in tilt]
     x_bar, z_bar = (bars[k] for k in np.argsort(flat))
-    if min(flat) > settings.roll_deg or max(flat) < 90.0 - settings.roll_deg:
+    if min(flat) > MOST_ROLL_DEG or max(flat) < 90.0 - MOST_ROLL_DEG:
         raise Refusal(
             3,
             "The two bars are not one across and one upright: they are "
@@ -221,14 +206,12 @@ def three_marks(binary: npt.NDArray[np.uint8], settings: MarkSettings) -> tuple[
     return _thin(dot), _thin(x_bar), _thin(z_bar)
 
 
-def _three_objects(
-    binary: npt.NDArray[np.uint8], settings: MarkSettings
-) -> tuple[npt.NDArray[np.int32], bool]:
+def _three_objects(binary: npt.NDArray[np.uint8]) -> tuple[npt.NDArray[np.int32], bool]:
     """Labels 1, 2, 3 of the objects, and whether another is cut by the picture's edge."""
-    kept, touching = _without_specks(binary, settings.speck_fraction)
+    kept, touching = _without_specks(binary)
     square = np.ones((3, 3), np.uint8)
     count, labels = cv2.connectedComponents(kept, connectivity=8)
-    for _ in range(round(settings.dilations * max(binary.shape) / 640.0)):
+    for _ in range(round(DILATIONS * max(binary.shape) / 640.0)):
         if count <= 4:
             break
         kept = np.asarray(cv2.dilate(kept, square), np.uint8)
@@ -242,9 +225,7 @@ def _three_objects(
     return np.asarray(labels, np.int32), touching
 
 
-def _without_specks(
-    binary: npt.NDArray[np.uint8], fraction: float
-) -> tuple[npt.NDArray[np.uint8], bool]:
+def _without_specks(binary: npt.NDArray[np.uint8]) -> tuple[npt.NDArray[np.uint8], bool]:
     """Remove specks and objects at the edge; also return whether a large one touches the edge."""
     _, labels, boxes, _ = cv2.connectedComponentsWithStats(binary, connectivity=8)
     left, top, width, height, area = boxes[1:].T
@@ -252,7 +233,7 @@ def _without_specks(
         return binary, False
     rows, columns = binary.shape
     inside = (left > 0) & (top > 0) & (left + width < columns) & (top + height < rows)
-    sizeable = area >= fraction * area[inside].max(initial=1)
+    sizeable = area >= SPECK_FRACTION * area[inside].max(initial=1)
     keep = np.concatenate([[False], inside & sizeable])
     return keep[labels].astype(np.uint8), bool((~inside & sizeable).any())
 

@@ -179,32 +179,29 @@ def bessel_shapes(mode: tuple[int, int]) -> FloatArray:
 
 def bessel_modes(
     series: SurfaceSeries,
-    modes: tuple[tuple[int, int], ...] = MODES,
     scale_sigma: float = 0.0,
     band_hz: tuple[float, float] | None = None,
 ) -> tuple[ModeCourse, ...]:
-    """Fit Bessel modes to the surfaces by least squares, weighted by area on the unit disk.
+    """Fit the `MODES` to the surfaces by least squares, weighted by area on the unit disk.
 
     Parameters
     ----------
     series
         The surfaces of a recording.
-    modes
-        Modes (m, n), fitted jointly.
     scale_sigma
         Relative standard uncertainty of heights due to the set-up, common to all frames; it is
         added to the noise in the ± of amplitudes.
     band_hz
         See `fit_oscillations`.
     """
-    shapes = [bessel_shapes(mode) for mode in modes]
+    shapes = [bessel_shapes(mode) for mode in MODES]
     stacked = np.vstack(shapes)
     gram = (stacked * DISK_WEIGHT) @ stacked.T
     moving = series.height_mm - series.mean_mm
     weights = np.asarray(np.linalg.solve(gram, (stacked * DISK_WEIGHT) @ moving.T).T, float)
     total = max(float(np.sum(moving**2 @ series.area_mm2)), 1e-30)
     found, begin = [], 0
-    for mode, shape in zip(modes, shapes, strict=True):
+    for mode, shape in zip(MODES, shapes, strict=True):
         own = weights[:, begin : begin + len(shape)]
         begin += len(shape)
         share = float(np.sum((own @ shape) ** 2 @ series.area_mm2)) / total
@@ -216,20 +213,19 @@ def bessel_modes(
 
 def pod_modes(
     series: SurfaceSeries,
-    count: int = POD_MODES,
     scale_sigma: float = 0.0,
     band_hz: tuple[float, float] | None = None,
 ) -> tuple[ModeCourse, ...]:
     """Proper orthogonal decomposition: the shapes with the largest share of the variance.
 
     Singular vectors of the heights minus their mean, weighted by area on the mean outline
-    (Sirovich 1987). Parameters as in `bessel_modes`; at most ``count`` modes are returned.
+    (Sirovich 1987). Parameters as in `bessel_modes`; at most `POD_MODES` are returned.
     """
     root = np.sqrt(series.area_mm2)
     moving: FloatArray = (series.height_mm - series.mean_mm) * root
     energy, vectors = np.linalg.eigh(moving.T @ moving)
     found = []
-    for k in range(1, min(count, len(moving) - 1) + 1):
+    for k in range(1, min(POD_MODES, len(moving) - 1) + 1):
         shape = vectors[:, -k] / root
         largest = shape[np.argmax(np.abs(shape))]
         course: FloatArray = (moving @ vectors[:, -k:][:, :1]) * largest

@@ -128,9 +128,7 @@ def find_events(
     )
 
 
-def step_response(
-    time_s: FloatArray, values: FloatArray, step_s: float, until_s: float | None = None
-) -> StepResponse | None:
+def step_response(time_s: FloatArray, values: FloatArray, step_s: float) -> StepResponse | None:
     """Fit the response of a series to a step; None if it is not significant.
 
     First- and second-order models are fitted by least squares; the latter is chosen if it
@@ -143,27 +141,24 @@ def step_response(
         Times, ascending, s, and values, shape (n,).
     step_s
         Time at which the driving signal changed.
-    until_s
-        End of the response, e.g. the next step. None: the end of the series.
     """
-    used = time_s <= (time_s[-1] if until_s is None else until_s)
-    time, value = time_s[used] - step_s, values[used]
+    time = time_s - step_s
     after = time > 0
     if after.sum() < 8 or (~after).sum() < 4:
         return None
-    span, before = float(time[-1]), float(value[~after].mean())
-    change = float(value[time > 0.7 * span].mean()) - before
+    span, before = float(time[-1]), float(values[~after].mean())
+    change = float(values[time > 0.7 * span].mean()) - before
     fits = []
     for tau in span * np.array([0.02, 0.1, 0.3]):
         start = [before, change, 0.0, tau]
         high = [np.inf, np.inf, span / 2, 3 * span]
-        fits.append(_fitted(_first_order, time, value, start, high))
+        fits.append(_fitted(_first_order, time, values, start, high))
     first = min(fits, key=lambda one: one.cost)
     # Several initial periods, as the cost has local minima.
     fits = []
     for period in span * np.array([0.05, 0.15, 0.4]):
         start = [before, change, 0.0, period / 4, 0.5]
-        fits.append(_fitted(_second_order, time, value, start, [*high[:3], 3 * span, 0.99]))
+        fits.append(_fitted(_second_order, time, values, start, [*high[:3], 3 * span, 0.99]))
     second = min(fits, key=lambda one: one.cost)
     variance = 2 * second.cost / len(time)
     correlated = _inflation(second.fun)
@@ -186,7 +181,7 @@ def step_response(
     sigma = np.sqrt(np.einsum("ij,jk,ik->i", slope, covariance, slope))
     found = dict(zip(QUANTITIES, quantities(best.x).tolist(), strict=True))
     known = dict(zip(QUANTITIES, sigma.tolist(), strict=True))
-    course = np.stack([time_s[used], model(best.x, time)])
+    course = np.stack([time_s, model(best.x, time)])
     return StepResponse(step_s, float(best.x[0]), found, known, order, course)
 
 

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from labapp.core.images.dots import Grey, Image, Picture
-from labapp.core.values import BoolArray, FloatArray, IntArray
+from labapp.core.values import BoolArray, FloatArray, IntArray, robust_sigma
 
 TILE_PX = 40
 """Noise is estimated in tiles of about this side."""
@@ -259,7 +259,7 @@ def band_noise(band: Grey, white: float) -> float:
     Correlated noise (compression, a soft sensor) passes the band more; the excess is estimated
     from the median absolute value.
     """
-    excess = 1.4826 * float(np.median(np.abs(band))) / max(white, 1e-9)
+    excess = robust_sigma(band) / max(white, 1e-9)
     return white * min(max(1.0, excess), 3.0)
 
 

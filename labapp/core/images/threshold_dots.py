@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from labapp.core.images.dots import Dots
-from labapp.core.values import BoolArray, FloatArray
+from labapp.core.values import BoolArray, FloatArray, robust_sigma
 
 Frame = npt.NDArray[Any]
 
@@ -221,7 +221,7 @@ def _noise(grey: FloatArray, dtype: np.dtype[Any]) -> float:
     rounding error of integer grey levels.
     """
     fine = grey - cv2.blur(grey, (3, 3))
-    sigma = 1.4826 * float(np.median(np.abs(fine - np.median(fine)))) / np.sqrt(8.0 / 9.0)
+    sigma = robust_sigma(fine - np.median(fine)) / np.sqrt(8.0 / 9.0)
     floor = 1.0 / np.sqrt(12.0) if np.issubdtype(dtype, np.integer) else 1e-12
     return float(max(sigma, floor))
 

@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from labapp.core.lines.find_lines import LightLine
-from labapp.core.lines.numbering import LinesSeen, heights
+from labapp.core.lines.detection.find_lines import LightLine
+from labapp.core.lines.detection.numbering import LinesSeen, heights
 from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
 
 LEAST_POINTS = 8

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from labapp.core.geometry.coordinates import ImageCalibration
-from labapp.core.lines.find_lines import LightLine
+from labapp.core.lines.detection.find_lines import LightLine
 from labapp.core.lines.model import LineData
 from labapp.core.values import FloatArray
 

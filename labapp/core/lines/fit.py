@@ -46,34 +46,22 @@ AGREES = 3.0
 LEAST_LINES = 3
 """Least number of lines that determine a surface: surfaces of both curvatures fit two lines."""
 
+KNOT_MM = 0.9
+"""Spacing of the spline knots, mm."""
 
-@dataclass(frozen=True)
-class LineFitSettings:
-    """Settings of the fit.
+JERK = 0.03
+"""Expected third derivatives of the surface, mm⁻². With 0.005 the lines fit equally well, but the
+height of hollow pools is 3 % too large, more than its ±."""
 
-    Parameters
-    ----------
-    knot_mm
-        Spacing of the spline knots, mm.
-    jerk
-        Expected third derivatives of the surface, mm⁻². With 0.005 the lines fit equally well, but
-        the height of hollow pools is 3 % too large, more than its ±.
-    settled
-        The iteration stops if a step reduces the cost by less.
-    margin
-        Least difference of the cost of another sign or numbering from the best.
-    most_relative_sigma
-        A height is determined if its relative standard uncertainty is at most this.
-    most_misfit
-        Largest χ² over its degrees of freedom of a surface that fits.
-    """
+SETTLED = 0.05
+"""The iteration stops if a step reduces the cost by less."""
 
-    knot_mm: float = 0.9
-    jerk: float = 0.03
-    settled: float = 0.05
-    margin: float = 6.0
-    most_relative_sigma: float = 0.1
-    most_misfit: float = 0.85
+LEAST_MARGIN = 6.0
+"""Least difference of the cost of another sign or numbering from the best."""
+
+MOST_RELATIVE_SIGMA, MOST_MISFIT = 0.1, 0.85
+"""Largest relative standard uncertainty of a height that is determined, and largest χ² over its
+degrees of freedom of a surface that fits."""
 
 
 @dataclass(frozen=True)
@@ -164,12 +152,7 @@ class _Hypothesis:
     cost: float
 
 
-def fit_lines(
-    data: LineData,
-    numberings: list[FloatArray],
-    rig: LineRig,
-    settings: LineFitSettings | None = None,
-) -> LineSurface:
+def fit_lines(data: LineData, numberings: list[FloatArray], rig: LineRig) -> LineSurface:
     """Fit the surface that reflects the lines of a frame.
 
     Parameters
@@ -180,38 +163,34 @@ def fit_lines(
         Possible numbers of the lines, from the lowest up, each shape (k,).
     rig
         The bench.
-    settings
-        See `LineFitSettings`.
 
     Raises
     ------
     CannotMeasure
         ``too-few-lines`` with fewer than two lines.
     """
-    settings = settings or LineFitSettings()
     if data.line.max(initial=-1) < 1:
         raise CannotMeasure("too-few-lines", "one line alone does not settle a surface")
     tried = sorted(
-        (_best_quadric(data, numbers, rig, settings) for numbers in numberings),
+        (_best_quadric(data, numbers, rig) for numbers in numberings),
         key=lambda one: one.cost,
     )
     limit = NEAR_COST * tried[0].cost + NEAR_COST_MORE
     near = [one for one in tried if one.cost < limit][:3]
-    refined = sorted((_refined(one, data, settings) for one in near), key=lambda one: one[1])
+    refined = sorted((_refined(one, data) for one in near), key=lambda one: one[1])
     best, cost = refined[0]
     others = [other - cost for one, other in refined[1:] if _differ(one, best)]
     others += [one.cost - tried[0].cost for one in tried[len(near) :]]
     margin = min(others, default=np.inf)
-    return replace(best, margin=margin, status=_status(best, margin, settings))
+    return replace(best, margin=margin, status=_status(best, margin))
 
 
-def _status(one: LineSurface, margin: float, settings: LineFitSettings) -> str:
-    sure = one.height_sigma_mm <= settings.most_relative_sigma * abs(one.height_mm)
-    fits = one.misfit <= settings.most_misfit
+def _status(one: LineSurface, margin: float) -> str:
+    sure = one.height_sigma_mm <= MOST_RELATIVE_SIGMA * abs(one.height_mm)
+    fits = one.misfit <= MOST_MISFIT
     enough = len(np.unique(one.numbers)) >= LEAST_LINES
-    return (
-        "ok" if enough and sure and fits and one.bulges and margin >= settings.margin else "profile"
-    )
+    determined = enough and sure and fits and one.bulges and margin >= LEAST_MARGIN
+    return "ok" if determined else "profile"
 
 
 def _differ(one: LineSurface, other: LineSurface) -> bool:
@@ -240,9 +219,7 @@ def _quadric_basis(basis: SplineBasis) -> FloatArray:
     )
 
 
-def _best_quadric(
-    data: LineData, numbers: FloatArray, rig: LineRig, settings: LineFitSettings
-) -> _Hypothesis:
+def _best_quadric(data: LineData, numbers: FloatArray, rig: LineRig) -> _Hypothesis:
     """Fit the best quadric to the lines for a numbering."""
     half = rig.pattern.half_fan
     corner = line_directions(
@@ -252,7 +229,7 @@ def _best_quadric(
         np.array([-half, half]),
     )
     ground = intersect_level(rig.laser.position_mm, corner).reshape(-1, 3)[:, :2]
-    basis = SplineBasis.over(ground.min(axis=0), ground.max(axis=0), settings.knot_mm)
+    basis = SplineBasis.over(ground.min(axis=0), ground.max(axis=0), KNOT_MM)
     model = LineModel(rig, basis, np.asarray(numbers, float), 41)
     into = _quadric_basis(basis)
     softer = replace(
@@ -334,13 +311,11 @@ def _dense(band: FloatArray) -> FloatArray:
     return dense + np.tril(dense, -1).T
 
 
-def _refined(
-    start: _Hypothesis, data: LineData, settings: LineFitSettings
-) -> tuple[LineSurface, float]:
+def _refined(start: _Hypothesis, data: LineData) -> tuple[LineSurface, float]:
     """Refine a quadric as a smooth spline surface; return it and its cost."""
     points = start.model.residuals(start.coefficients, data).point_mm[:, :2]
     low, high = points.min(axis=0) - MARGIN_MM, points.max(axis=0) + MARGIN_MM
-    basis = SplineBasis.over(low, high, settings.knot_mm)
+    basis = SplineBasis.over(low, high, KNOT_MM)
     model = replace(start.model, basis=basis, rays=81)
     x, y = (np.linspace(a, b, 20) for a, b in zip(low, high, strict=True))
     x, y = (each.ravel() for each in np.meshgrid(x, y))
@@ -351,8 +326,8 @@ def _refined(
     first: FloatArray = np.asarray(
         np.linalg.solve(rows.T @ rows + 1e-9 * rough, rows.T @ height), np.float64
     )
-    stiffness = rough / (settings.jerk**2 * CORRELATED_MM2)
-    coefficients, covariance, cost, linear = _fit_splines(model, first, data, stiffness, settings)
+    stiffness = rough / (JERK**2 * CORRELATED_MM2)
+    coefficients, covariance, cost, linear = _fit_splines(model, first, data, stiffness)
     agrees = np.abs(linear.residual) <= AGREES
     surface = LineSurface(
         SplineSurface(basis, coefficients),
@@ -372,11 +347,7 @@ def _cauchy(residual: FloatArray) -> FloatArray:
 
 
 def _fit_splines(
-    model: LineModel,
-    first: FloatArray,
-    data: LineData,
-    stiffness: FloatArray,
-    settings: LineFitSettings,
+    model: LineModel, first: FloatArray, data: LineData, stiffness: FloatArray
 ) -> tuple[FloatArray, FloatArray, float, Linearized]:
     """Return the coefficients, their covariance, the cost and the linearised equations."""
     c, damping = first, 1e-3
@@ -392,7 +363,7 @@ def _fit_splines(
         there = model.residuals(c + step, data)
         new = float(np.sum(_cauchy(there.residual)) + (c + step) @ stiffness @ (c + step))
         if new < cost:
-            done = cost - new < settings.settled
+            done = cost - new < SETTLED
             c, linear, cost, damping = c + step, there, new, damping / 10
             if done:
                 break

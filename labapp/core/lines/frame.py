@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -11,10 +11,10 @@ from labapp.core.geometry.line_pattern import LineRig
 from labapp.core.images.dots import Image
 from labapp.core.lines.correction import LineCorrection
 from labapp.core.lines.data import line_data
-from labapp.core.lines.find_lines import LightLine, LineSettings, find_lines
-from labapp.core.lines.fit import LineFitSettings, LineSurface, fit_lines
+from labapp.core.lines.detection.find_lines import LightLine, find_lines
+from labapp.core.lines.detection.numbering import LinesSeen, number_lines
+from labapp.core.lines.fit import LineSurface, fit_lines
 from labapp.core.lines.metal import PoolEdges, pool_edges, without_metal
-from labapp.core.lines.numbering import LinesSeen, number_lines
 from labapp.core.lines.track import TrackedLine
 from labapp.core.values import CannotMeasure, FloatArray, IntArray
 
@@ -27,14 +27,6 @@ FOLLOWED = {
 """Reasons why the line of a one-line pattern was not measured in a frame."""
 
 UNNUMBERED = "the lines, or the numbers given by hand, are not those of neighbours in the pattern"
-
-
-@dataclass(frozen=True)
-class LineMeasureSettings:
-    """Settings for the detection of lines and the fit of the surface."""
-
-    lines: LineSettings = field(default_factory=LineSettings)
-    fit: LineFitSettings = field(default_factory=LineFitSettings)
 
 
 @dataclass(frozen=True)
@@ -117,7 +109,6 @@ def measure_lines(
     image: Image,
     rig: LineRig,
     calibration: ImageCalibration,
-    settings: LineMeasureSettings,
     correction: LineCorrection | None = None,
 ) -> LineFrame:
     """Measure one grey frame, shape (height, width), of a line pattern.
@@ -127,20 +118,15 @@ def measure_lines(
     count = rig.pattern.count
     edges = pool_edges(image, rig, calibration)
     if correction is None:
-        lines = find_lines(image, settings.lines)
+        lines = find_lines(image)
         if edges is not None:
             lines = without_metal(lines, edges, rig, calibration)
         correction = LineCorrection.of(number_lines(lines, count))
-    found = _measured(correction, rig, calibration, settings)
+    found = _measured(correction, rig, calibration)
     return replace(found, edges=edges)
 
 
-def _measured(
-    correction: LineCorrection,
-    rig: LineRig,
-    calibration: ImageCalibration,
-    settings: LineMeasureSettings,
-) -> LineFrame:
+def _measured(correction: LineCorrection, rig: LineRig, calibration: ImageCalibration) -> LineFrame:
     """Determine the features of the lines and fit the surface."""
     count, seen = rig.pattern.count, correction.seen
     features = line_features(seen.lines, calibration)
@@ -154,7 +140,7 @@ def _measured(
     if not numberings:
         return LineFrame("line-numbers", UNNUMBERED, seen, features, None)
     try:
-        surface = fit_lines(data, numberings, rig, settings.fit)
+        surface = fit_lines(data, numberings, rig)
     except CannotMeasure as problem:
         return LineFrame(problem.status, problem.reason, seen, features, None)
     open_ = "" if surface.status == "ok" else "the lines leave a direction of the surface open"

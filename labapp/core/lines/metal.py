@@ -17,8 +17,8 @@ from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.line_pattern import LineRig, line_directions
 from labapp.core.geometry.optics import intersect_imaging_plane, intersect_level, reflect
 from labapp.core.images.dots import Grey, Image
-from labapp.core.lines.find_lines import LightLine
-from labapp.core.lines.ridges import sampled
+from labapp.core.lines.detection.find_lines import LightLine
+from labapp.core.lines.detection.ridges import sampled
 from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
 
 FAN_STEPS = 241

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from labapp.core.images.dots import Image
-from labapp.core.values import BoolArray, FloatArray, ReadOnlyArrays
+from labapp.core.values import BoolArray, FloatArray, ReadOnlyArrays, robust_sigma
 
 EVERY_PX = 4
 """Pixel step along u and v for a frame's brightness."""
@@ -111,7 +111,7 @@ def _two_classes(light: FloatArray) -> tuple[float, float]:
 
 
 def _spread(values: FloatArray) -> float:
-    return 1.4826 * float(np.median(np.abs(values - np.median(values))))
+    return robust_sigma(values - np.median(values))
 
 
 def _log_odds(light: FloatArray, on: BoolArray) -> FloatArray:

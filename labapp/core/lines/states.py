@@ -24,7 +24,7 @@ from scipy.ndimage import label
 
 from labapp.core.lines.fit import LEAST_LINES
 from labapp.core.lines.frame import LineFrame
-from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
+from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays, robust_sigma
 
 State = Literal["no-pool", "growing", "concave", "flattening", "convex"]
 
@@ -54,32 +54,21 @@ lines."""
 LEAST_FRAMES = 8
 """Shortest change, frames."""
 
+LASTING_FRAMES = 3
+"""Number of frames after which another number of lines is lasting."""
+
 TUKEY = 3.0
 """Values farther than this many standard deviations from the local line have little weight."""
 
+WINDOW = 5.0
+"""Standard deviation of the weights of the local fit over time, frames."""
 
-@dataclass(frozen=True)
-class StateSettings:
-    """Settings for the detection of states.
+LASTING_SHARE, SURE_SIGMAS = 0.55, 4.0
+"""A change lasts while its rate exceeds this share of the largest rate (about half, as a local fit
+at a corner gives half the rate beyond it) and this many of its standard uncertainties."""
 
-    Parameters
-    ----------
-    window
-        Standard deviation of the weights of the local fit over time, frames.
-    share
-        A change lasts while its rate exceeds this share of the largest rate: about half, as a local
-        fit at a corner gives half the rate beyond it.
-    sigmas
-        The rate must also exceed this many standard uncertainties.
-    least_growth_mm, least_turn
-        Least change of width and turn over a window, mm and rad.
-    """
-
-    window: float = 5.0
-    share: float = 0.55
-    sigmas: float = 4.0
-    least_growth_mm: float = 0.1
-    least_turn: float = 0.03
+LEAST_GROWTH_MM, LEAST_TURN = 0.1, 0.03
+"""Least change of width and turn over a window, mm and rad."""
 
 
 @dataclass(frozen=True)
@@ -116,18 +105,16 @@ class LineSeries(ReadOnlyArrays):
         return cls(count, width, turn)
 
 
-def line_states(series: LineSeries, settings: StateSettings | None = None) -> tuple[State, ...]:
+def line_states(series: LineSeries) -> tuple[State, ...]:
     """State of the pool in each frame; see the module's table."""
-    settings = settings or StateSettings()
-    window = settings.window
     lit = _steady(series.count > 0)
-    _, growth, growth_sigma = local_line(series.width_mm, lit, window)
-    turn, turning, turning_sigma = local_line(series.turn, lit, window)
-    grows = _changes(growth, growth_sigma, settings.least_growth_mm, settings)
+    _, growth, growth_sigma = local_line(series.width_mm, lit, WINDOW)
+    turn, turning, turning_sigma = local_line(series.turn, lit, WINDOW)
+    grows = _changes(growth, growth_sigma, LEAST_GROWTH_MM)
     grows = _well_known(grows, series.width_mm)
     grows = lit & _with_corners(grows, series.width_mm, lit)
     grows |= _just_appeared(lit, np.isfinite(series.width_mm), grows)
-    flattens = _changes(turning, turning_sigma, settings.least_turn, settings)
+    flattens = _changes(turning, turning_sigma, LEAST_TURN)
     flattens = lit & ~grows & _ramps(flattens, series.turn, lit & ~grows)
     known = np.flatnonzero(np.isfinite(turn))
     # The first lines may be too few for a surface; later, interpolation bridges unknown frames.
@@ -146,14 +133,14 @@ def line_states(series: LineSeries, settings: StateSettings | None = None) -> tu
     return tuple(states)
 
 
-def line_changes(series: LineSeries, least_frames: int = 3) -> list[tuple[int, int, int]]:
+def line_changes(series: LineSeries) -> list[tuple[int, int, int]]:
     """Lasting changes of the number of lines: (frame, before, after) of each (Fig. 3-14)."""
     changes: list[tuple[int, int, int]] = []
     now, since, before = -1, 0, -1
     for frame, count in enumerate(series.count.tolist()):
         if count != now:
             now, since = count, frame
-        if frame - since + 1 == least_frames and now != before:
+        if frame - since + 1 == LASTING_FRAMES and now != before:
             if before >= 0:
                 changes.append((since, before, now))
             before = now
@@ -199,19 +186,17 @@ def local_line(
     return result[0], result[1], result[2]
 
 
-def _changes(
-    rate: FloatArray, sigma: FloatArray, least: float, settings: StateSettings
-) -> BoolArray:
+def _changes(rate: FloatArray, sigma: FloatArray, least: float) -> BoolArray:
     """Frames in which a value increases at about its largest rate."""
     known = np.isfinite(rate)
     if not known.any():
         return known
-    real = known & (rate > np.maximum(settings.sigmas * np.nan_to_num(sigma), least))
+    real = known & (rate > np.maximum(SURE_SIGMAS * np.nan_to_num(sigma), least))
     if not real.any():
         return real
     largest = float(np.quantile(rate[real], 0.7))
     # At the ends of a change its rate is halved and less certain: include adjacent frames.
-    fast = np.nan_to_num(rate) > settings.share * largest
+    fast = np.nan_to_num(rate) > LASTING_SHARE * largest
     parts, _ = label(known & (fast | _closed(fast)))
     sure = [part for part in np.unique(parts[real]) if np.sum(parts == part) >= LEAST_FRAMES]
     return np.asarray(np.isin(parts, sure) & (parts > 0))
@@ -270,7 +255,7 @@ def _ramp(values: FloatArray, on: BoolArray, begin: int, end: int) -> tuple[int,
     if min(map(len, sides)) < LEAST_KNOWN:
         return begin, end
     low, high = (float(np.median(side)) for side in sides)
-    scatter = [1.4826 * float(np.median(np.abs(side - np.median(side)))) for side in sides]
+    scatter = [robust_sigma(side - np.median(side)) for side in sides]
     best, least = (begin, end), np.inf
     for first in range(max(begin - RAMP_REACH, 0), begin + RAMP_REACH + 1):
         for last in range(max(end - RAMP_REACH, first + LEAST_FRAMES), end + RAMP_REACH + 1):

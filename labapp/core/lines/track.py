@@ -8,16 +8,16 @@ droplets or bridging are thereby rejected, and the share of accepted columns is 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 import scipy
 
 from labapp.core.images.dots import Grey, Image
-from labapp.core.lines.find_lines import LineSettings, find_lines
+from labapp.core.lines.detection.find_lines import find_lines
 from labapp.core.lines.pulses import Pulses, classify_pulses, frame_brightness
-from labapp.core.values import BoolArray, FloatArray, ReadOnlyArrays
+from labapp.core.values import BoolArray, FloatArray, ReadOnlyArrays, robust_sigma
 
 OVERSAMPLE = 8
 """Number of trial frequencies per inverse of the recording's duration."""
@@ -30,33 +30,20 @@ this many grey levels."""
 NEIGHBOURS = 7
 """Number of columns, about each column, most of which must agree for the line to reach there."""
 
+REACH_PX = 14.0
+"""Search range above and below the line's position in the previous frame, px."""
 
-@dataclass(frozen=True)
-class TrackSettings:
-    """Settings for tracking a line.
+COLUMN_PX = 3.0
+"""Spacing of the columns that are read, px."""
 
-    Parameters
-    ----------
-    reach_px
-        Search range above and below the line's position in the previous frame, px.
-    column_px
-        Spacing of the columns that are read, px.
-    width_px
-        Standard deviation of the line's light across it, px.
-    least_share
-        The line is lost if a smaller share of its columns agrees.
-    least_contrast
-        Least ratio of a column's light over its surroundings to the noise.
-    lines
-        Settings for the initial detection of the line.
-    """
+LEAST_SHARE = 0.5
+"""The line is lost if a smaller share of its columns agrees."""
 
-    reach_px: float = 14.0
-    column_px: float = 3.0
-    width_px: float = 2.2
-    least_share: float = 0.5
-    least_contrast: float = 1.5
-    lines: LineSettings = field(default_factory=LineSettings)
+LEAST_CONTRAST = 1.5
+"""Least ratio of a column's light over its surroundings to the noise."""
+
+LOWEST_HZ, HIGHEST_HZ = 5.0, 100.0
+"""Range of the frequencies of a line's oscillation."""
 
 
 @dataclass(frozen=True)
@@ -86,8 +73,8 @@ class TrackedLine(ReadOnlyArrays):
 class LineTracker:
     """Tracker of one line; the first frame should show the line."""
 
-    def __init__(self, settings: TrackSettings | None = None) -> None:
-        self.settings = settings or TrackSettings()
+    def __init__(self) -> None:
+        self._width_px = np.nan  # standard deviation of the line's light across it
         self._columns: FloatArray | None = None
         self._reference = np.zeros(0)
         self._terms = np.zeros((0, 3))
@@ -99,51 +86,50 @@ class LineTracker:
         picture = np.ascontiguousarray(frame, np.float32)
         if self._columns is None and not self._begin(picture):
             return None
-        found = self._read(picture, self.settings.reach_px)
+        found = self._read(picture, REACH_PX)
         if found is None and self._since >= 3:  # it may have moved farther
-            found = self._read(picture, 2 * self.settings.reach_px)
+            found = self._read(picture, 2 * REACH_PX)
         self._since = 0 if found is not None else self._since + 1
         return found
 
     def _begin(self, picture: Grey) -> bool:
-        lines = find_lines(picture, self.settings.lines)
+        lines = find_lines(picture)
         if not lines:
             return False
         line = max(lines, key=lambda one: one.light * one.length_px)
         u, v = line.image_px.T
         order = np.argsort(u)
-        columns = np.arange(np.ceil(u.min()), u.max(), self.settings.column_px)
+        columns = np.arange(np.ceil(u.min()), u.max(), COLUMN_PX)
         if len(columns) < 10:
             return False
         place = (columns - columns.mean()) / (np.ptp(columns) / 2)
         self._terms = np.stack([np.ones_like(place), place, place**2 - 1 / 3], axis=-1)
         self._columns, self._reference = columns, np.interp(columns, u[order], v[order])
         self._shape = np.zeros(3)
-        self.settings = replace(self.settings, width_px=float(np.clip(line.width_px, 1.0, 5.0)))
+        self._width_px = float(np.clip(line.width_px, 1.0, 5.0))
         return True
 
     def _read(self, picture: Grey, reach: float) -> TrackedLine | None:
         assert self._columns is not None
-        settings = self.settings
         middle = self._reference + self._terms @ self._shape
         side = np.arange(-reach, reach + 1.0)
         v = (middle[None] + side[:, None]).astype(np.float32)
         u = np.broadcast_to(self._columns.astype(np.float32), v.shape)
         strip = cv2.remap(picture, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        band = _band(np.asarray(strip), settings.width_px)
+        band = _band(np.asarray(strip), self._width_px)
         inner = slice(2, -2)
         best = np.argmax(band[inner], axis=0) + 2
         columns = np.arange(len(best))
         before, top, after = (band[best + k, columns].astype(float) for k in (-1, 0, 1))
         bend = before - 2 * top + after
         off = side[best] + np.where(bend < 0, (before - after) / (2 * np.minimum(bend, -1e-9)), 0.0)
-        noise = 1.4826 * float(np.median(np.abs(band - np.median(band)))) + 1e-6
-        clear = top > settings.least_contrast * noise
+        noise = robust_sigma(band - np.median(band)) + 1e-6
+        clear = top > LEAST_CONTRAST * noise
         if clear.sum() < 6:
             return None
         fit, agrees = _robust_shape(self._terms, off, clear)
         share = float(np.mean(agrees))
-        if share < settings.least_share:
+        if share < LEAST_SHARE:
             return None
         self._shape = self._shape + fit
         shift, tilt, bend_px = self._shape.tolist()
@@ -179,7 +165,7 @@ def _robust_shape(
             return fit, np.zeros(len(off), bool)
         weighted = terms * weights[:, None]
         fit = np.linalg.solve(weighted.T @ terms + 1e-3 * np.eye(3), weighted.T @ off)
-        scatter = 1.4826 * float(np.median(np.abs((off - terms @ fit)[weights > 0])))
+        scatter = robust_sigma((off - terms @ fit)[weights > 0])
         limit = float(np.clip(5.0 * scatter, 2.0, 8.0))
     return fit, (np.abs(off - terms @ fit) < limit) & clear
 
@@ -215,7 +201,6 @@ class LineFilm:
 def track_line(
     frames: Iterable[Image],
     frame_rate_hz: float | None,
-    settings: TrackSettings | None = None,
     tracker: LineTracker | None = None,
     current_a: FloatArray | None = None,
 ) -> LineFilm:
@@ -225,7 +210,7 @@ def track_line(
     classified as having a pulse are discarded. ``tracker`` is that of the preceding frames;
     ``current_a`` as in `classify_pulses`.
     """
-    tracker = tracker or LineTracker(settings)
+    tracker = tracker or LineTracker()
     bright, lines = list[float](), list[TrackedLine | None]()
     for frame in frames:
         bright.append(frame_brightness(frame))
@@ -243,9 +228,7 @@ def track_line(
     return LineFilm(pulses, kept, *oscillation_frequency(time_s, shift))
 
 
-def oscillation_frequency(
-    time_s: FloatArray, values: FloatArray, lowest_hz: float = 5.0, highest_hz: float = 100.0
-) -> tuple[float, float]:
+def oscillation_frequency(time_s: FloatArray, values: FloatArray) -> tuple[float, float]:
     """Frequency of the strongest oscillation, Hz, and its share of the values' variance.
 
     By the Lomb–Scargle periodogram, as frames with a pulse are missing.
@@ -254,8 +237,6 @@ def oscillation_frequency(
     ----------
     time_s, values
         Times, s, and values of the tracked frames, each shape (n,).
-    lowest_hz, highest_hz
-        Frequency range of the search.
     """
     if len(values) < 16:
         return float("nan"), 0.0
@@ -265,7 +246,7 @@ def oscillation_frequency(
     limit = 6.0 * 1.4826 * float(np.median(np.abs(swing))) + 1e-9
     kept = np.abs(swing) < limit
     step = 1.0 / (OVERSAMPLE * max(float(np.ptp(time_s)), 1e-9))
-    rates = np.arange(lowest_hz, highest_hz, step)
+    rates = np.arange(LOWEST_HZ, HIGHEST_HZ, step)
     power = scipy.signal.lombscargle(
         time_s[kept], swing[kept], 2 * np.pi * rates, normalize=True, floating_mean=True
     )

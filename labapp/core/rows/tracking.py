@@ -9,7 +9,6 @@ also match more dots than motions that differ from it by one row or column.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -23,35 +22,22 @@ LOST = -1
 Motion = Callable[[FloatArray], FloatArray]
 """Maps positions in one frame, shape (n, 2), to positions in the next, px."""
 
+LEAST_FOUND = 0.85
+"""Least share of the dots with a row that must be matched. Manual dots that are not matched are not
+counted, since the detector may not find them."""
 
-@dataclass(frozen=True)
-class CarrySettings:
-    """Settings of `carry_on`.
+GATE, CLEAR = 0.3, 0.5
+"""A dot is matched within the first distance from its predicted position if no other lies within
+the second, in steps."""
 
-    Parameters
-    ----------
-    found
-        Least share of the dots with a row that must be matched. Manual dots that are not matched
-        are not counted, since the detector may not find them.
-    gate, clear
-        A dot is matched within the distance ``gate`` from its predicted position if no other lies
-        within ``clear``, in steps.
-    reach
-        Largest common motion of the dots, in steps.
-    ahead
-        Motions that differ by a row or a column must match fewer dots, by this share of all.
-    """
+REACH = 0.5
+"""Largest common motion of the dots, in steps."""
 
-    found: float = 0.85
-    gate: float = 0.3
-    clear: float = 0.5
-    reach: float = 0.5
-    ahead: float = 0.04
+AHEAD = 0.04
+"""Motions that differ by a row or a column must match fewer dots, by this share of all."""
 
 
-def carry_on(
-    correction: Correction, dots: Dots, settings: CarrySettings | None = None
-) -> Correction | None:
+def carry_on(correction: Correction, dots: Dots) -> Correction | None:
     """Apply the rows of a correction to the dots of the next frame.
 
     Parameters
@@ -61,8 +47,6 @@ def carry_on(
         new dots are tracked too.
     dots
         The dots found in the next frame.
-    settings
-        See `CarrySettings`.
 
     Returns
     -------
@@ -72,21 +56,20 @@ def carry_on(
         if the correction no longer fits: too few dots are matched, a dot is at the reference, or
         a motion by one more row or column is about as likely.
     """
-    settings = settings or CarrySettings()
     lattice = correction.lattice
     steps = _steps(correction)
     if steps is None or len(dots) == 0:
         return None
     before, after = correction.dots.image_px, dots.image_px
-    motion = _likeliest_motion(before, after, steps, correction.sited, settings)
+    motion = _likeliest_motion(before, after, steps, correction.sited)
     if motion is None:
         return None
-    found = _found(motion(before), after, steps, settings)
+    found = _found(motion(before), after, steps)
     numbered = (lattice.row > 0) | (lattice.column > 0)
     wanted = numbered & ~(correction.manual & (found == LOST))
-    if np.sum(found[wanted] != LOST) < settings.found * wanted.sum():
+    if np.sum(found[wanted] != LOST) < LEAST_FOUND * wanted.sum():
         return None
-    if _reference_lit(correction, motion, after, settings):
+    if _reference_lit(correction, motion, after):
         return None
     row, column, manual = (np.zeros(len(dots), kind) for kind in (np.int64, np.int64, bool))
     old = np.flatnonzero(found != LOST)
@@ -124,38 +107,30 @@ def _steps(correction: Correction) -> FloatArray | None:
 
 
 def _likeliest_motion(
-    before: FloatArray,
-    after: FloatArray,
-    steps: FloatArray,
-    sited: BoolArray,
-    settings: CarrySettings,
+    before: FloatArray, after: FloatArray, steps: FloatArray, sited: BoolArray
 ) -> Motion | None:
     """The motion that matches most dots; None if one shifted by a row or column is as good."""
     median_step = np.median(steps[sited], axis=0)
-    share = np.linspace(-settings.reach, settings.reach, 7)
+    share = np.linspace(-REACH, REACH, 7)
     near = [median_step @ np.array([t, k]) for k in share for t in share]
-    first = max(near, key=lambda shift: _count(before + shift, after, steps, sited, settings))
-    motion = _followed(before, after, steps, first, settings)
-    found = _found(motion(before), after, steps, settings)
+    first = max(near, key=lambda shift: _count(before + shift, after, steps, sited))
+    motion = _followed(before, after, steps, first)
+    found = _found(motion(before), after, steps)
     count = int(np.sum(found[sited] != LOST))
     for cell in np.array([(1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1), (1, -1), (-1, 1)]):
         # The shift by a row or column differs from dot to dot.
         start = motion(before) + steps @ cell
-        further = _followed(before, after, steps, start - before, settings)
-        other = _found(further(before), after, steps, settings)
+        further = _followed(before, after, steps, start - before)
+        other = _found(further(before), after, steps)
         if np.mean(other[sited] == found[sited]) > 0.5:
             continue
-        if np.sum(other[sited] != LOST) > count - settings.ahead * sited.sum():
+        if np.sum(other[sited] != LOST) > count - AHEAD * sited.sum():
             return None
     return motion
 
 
 def _followed(
-    before: FloatArray,
-    after: FloatArray,
-    steps: FloatArray,
-    shift: FloatArray,
-    settings: CarrySettings,
+    before: FloatArray, after: FloatArray, steps: FloatArray, shift: FloatArray
 ) -> Motion:
     """Refine a motion from a shift, shape (2,) or (n, 2), by polynomials fitted to matched dots."""
     center, scale = before.mean(axis=0), max(float(np.ptp(before)), 1.0)
@@ -167,7 +142,7 @@ def _followed(
     moved, degree = before + shift, 0
     weights = np.linalg.lstsq(terms(before, 0), moved - before, rcond=None)[0]
     for degree in (1, 1, 1, 2, 2, 2, 2):
-        found = _found(moved, after, steps, settings)
+        found = _found(moved, after, steps)
         matched = np.flatnonzero(found != LOST)
         if len(matched) < 12:
             break
@@ -178,33 +153,23 @@ def _followed(
     return lambda place: place + terms(place, last) @ weights
 
 
-def _found(
-    moved: FloatArray, after: FloatArray, steps: FloatArray, settings: CarrySettings
-) -> IntArray:
+def _found(moved: FloatArray, after: FloatArray, steps: FloatArray) -> IntArray:
     """Match predicted positions to dots one to one, shape (n,); `LOST` where there is no match."""
     away = np.linalg.norm(
         np.einsum("nab,nmb->nma", np.linalg.inv(steps), after - moved[:, None]), axis=-1
     )
     nearest = np.argmin(away, axis=1)
     index = np.arange(len(moved))
-    sure = (away[index, nearest] < settings.gate) & (np.argmin(away, axis=0)[nearest] == index)
-    sure &= np.sum(away < settings.clear, axis=1) == 1
+    sure = (away[index, nearest] < GATE) & (np.argmin(away, axis=0)[nearest] == index)
+    sure &= np.sum(away < CLEAR, axis=1) == 1
     return np.where(sure, nearest, LOST)
 
 
-def _count(
-    moved: FloatArray,
-    after: FloatArray,
-    steps: FloatArray,
-    sited: BoolArray,
-    settings: CarrySettings,
-) -> int:
-    return int(np.sum(_found(moved, after, steps, settings)[sited] != LOST))
+def _count(moved: FloatArray, after: FloatArray, steps: FloatArray, sited: BoolArray) -> int:
+    return int(np.sum(_found(moved, after, steps)[sited] != LOST))
 
 
-def _reference_lit(
-    correction: Correction, motion: Motion, after: FloatArray, settings: CarrySettings
-) -> bool:
+def _reference_lit(correction: Correction, motion: Motion, after: FloatArray) -> bool:
     """Whether a dot is at the reference, which had no dot between two neighbours in its row."""
     lattice = correction.lattice
     if lattice.reference is None:
@@ -216,4 +181,4 @@ def _reference_lit(
         return False
     left, right = motion(correction.dots.image_px[[beside[0][0], beside[2][0]]])
     away = np.linalg.norm(after - (left + right) / 2, axis=1).min()
-    return bool(away < settings.gate * np.linalg.norm(right - left) / 2)
+    return bool(away < GATE * np.linalg.norm(right - left) / 2)

@@ -11,7 +11,7 @@ from labapp.core.values import BoolArray, IntArray
 from labapp.gui.widgets.scrubber import Tick
 
 if TYPE_CHECKING:
-    from labapp.session.measured import Overview
+    from labapp.session.results.measured import Overview
 
 
 class FrameStatus(IntEnum):
@@ -57,7 +57,7 @@ DOUBTFUL = (FrameStatus.DOUBTFUL, FrameStatus.NOT_MEASURABLE)
 
 def standings(seen: Overview) -> IntArray:
     """State of every frame, values of `FrameStatus`, shape (n,)."""
-    from labapp.session.trends import doubtful_frames
+    from labapp.session.results.trends import doubtful_frames
 
     status = np.array(seen.status, dtype=object)
     measured, fine = status != "", np.isin(status, ("ok", "followed"))

@@ -15,7 +15,7 @@ from labapp.errors import InputError
 from labapp.text import pluralize, split_unit
 
 if TYPE_CHECKING:
-    from labapp.session.measured import Overview
+    from labapp.session.results.measured import Overview
     from labapp.session.session import Session
 
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from labapp.core.dynamics.analysis import Dynamics
     from labapp.export.dynamics import Measured
     from labapp.gui.shell.files import Files
-    from labapp.session.measured import Overview
+    from labapp.session.results.measured import Overview
 
 FILM_MS = 80
 """Interval of the pictures in the film of a mode."""

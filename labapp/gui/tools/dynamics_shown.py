@@ -11,14 +11,14 @@ import numpy as np
 from labapp.core.dynamics.oscillation import FEWEST
 from labapp.core.surface.measures import WITH_SIGMA
 from labapp.gui.digits import with_sigma
-from labapp.session.trends import BY_KEY
+from labapp.session.results.trends import BY_KEY
 from labapp.studies.tables import Table
 from labapp.text import pluralize
 
 if TYPE_CHECKING:
     from labapp.core.dynamics.analysis import Dynamics
     from labapp.core.dynamics.modes import ModeCourse
-    from labapp.session.measured import Overview
+    from labapp.session.results.measured import Overview
     from labapp.session.session import Session
 
 

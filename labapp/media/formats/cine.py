@@ -20,6 +20,7 @@ from labapp.media.formats.stored import (
     file_size,
     increasing,
     plausible_rate,
+    rate_of,
     read_bytes,
     unpack_bits,
 )
@@ -120,7 +121,7 @@ class CineSource(StoredFrames):
             )
         rate = setup.frame_rate_hz
         if rate is None and time_s is not None and count > 1:
-            rate = plausible_rate(float(1 / np.median(np.diff(time_s[:count]))))
+            rate = rate_of(time_s[:count])
         if compression == UNINTERPOLATED and setup.filtered:
             warnings.append(
                 f"{path.name} is raw colour (Bayer): its levels are read as grey levels"

@@ -13,7 +13,13 @@ import numpy.typing as npt
 
 from labapp.errors import InputError, os_errors_as_input
 from labapp.media.base import GreyImage, to_grey
-from labapp.media.formats.stored import StoredFrames, finite, regular_size
+from labapp.media.formats.stored import (
+    StoredFrames,
+    check_shape,
+    finite,
+    first_readable,
+    regular_size,
+)
 from labapp.media.formats.tiff import TIFF_MAGICS, TIFF_SUFFIXES, TiffStack
 from labapp.pixels import MOST_PIXELS
 
@@ -35,7 +41,7 @@ class ImageSequence(StoredFrames):
 
     def __init__(self, path: Path, pictures: Sequence[Path]) -> None:
         self._pictures = tuple(pictures)
-        image = self._first_whole()
+        image = first_readable(lambda index: read_image(self._pictures[index]), len(self._pictures))
         kinds = sorted({picture.suffix.lstrip(".").upper() for picture in self._pictures} - {""})
         kind = " and ".join(kinds) or "image"
         super().__init__(
@@ -46,27 +52,9 @@ class ImageSequence(StoredFrames):
             8 * image.dtype.itemsize,
         )
 
-    def _first_whole(self) -> GreyImage:
-        refused: list[InputError] = []
-        for picture in self._pictures:
-            try:
-                return read_image(picture)
-            except InputError as error:
-                refused.append(error)
-        raise refused[0]
-
     def _grey(self, index: int) -> GreyImage:
         picture = self._pictures[index]
-        image = read_image(picture)
-        if image.shape != self.shape:
-            rows, columns = self.shape
-            raise InputError(
-                picture,
-                "size",
-                f"{image.shape[1]}×{image.shape[0]} px",
-                f"{columns}×{rows} px like the pictures before it",
-            )
-        return image
+        return check_shape(picture, "size", read_image(picture), self.shape, "pictures")
 
 
 def images_in(path: Path) -> list[Path]:

@@ -23,6 +23,7 @@ from labapp.media.formats.stored import (
     finite,
     increasing,
     plausible_rate,
+    rate_of,
 )
 
 NPY_MAGIC = b"\x93NUMPY"
@@ -190,7 +191,7 @@ def _from_archive(
                 raise InputError(path, "time_s", "not increasing", _times_of(len(frames)))
             time_s = time_s.astype(np.float64) - float(time_s[0])
             if len(frames) > 1:
-                rate = plausible_rate(float(1 / np.median(np.diff(time_s))))
+                rate = rate_of(time_s)
         if "frame_rate_hz" in members:
             rate_array = _load(path, archive, members["frame_rate_hz"], _is_one)
             rate = plausible_rate(float(rate_array.ravel()[0]))

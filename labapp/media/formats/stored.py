@@ -5,8 +5,9 @@ from __future__ import annotations
 import errno
 import math
 import stat
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +16,8 @@ from labapp.core.values import FloatArray
 from labapp.errors import InputError
 from labapp.media.base import Frame, FrameSource, GreyImage, check_index, format_frame_rate
 from labapp.pixels import MOST_PIXELS
+
+Read = TypeVar("Read")
 
 
 class StoredFrames(FrameSource):
@@ -104,6 +107,33 @@ def ends_early(name: str, claimed: int, whole: int) -> tuple[str, ...]:
 def plausible_rate(value: float) -> float | None:
     """Return ``value`` as a frame rate, Hz; None if it is not plausible."""
     return float(value) if np.isfinite(value) and 0 < value < 1e12 else None
+
+
+def rate_of(time_s: FloatArray) -> float | None:
+    """Return the frame rate of two or more times by their median step, Hz; None if implausible."""
+    return plausible_rate(float(1 / np.median(np.diff(time_s))))
+
+
+def first_readable(read: Callable[[int], Read], count: int) -> Read:
+    """Return the first of ``count`` pictures that can be read; raise the first error if none."""
+    refused: list[InputError] = []
+    for index in range(count):
+        try:
+            return read(index)
+        except InputError as error:
+            refused.append(error)
+    raise refused[0]
+
+
+def check_shape(
+    path: Path, field: str, image: GreyImage, shape: tuple[int, int], others: str
+) -> GreyImage:
+    """Return ``image``; raise unless it has the shape (rows, columns) of the others before it."""
+    if image.shape != shape:
+        rows, columns = shape
+        found = f"{image.shape[1]}×{image.shape[0]} px"
+        raise InputError(path, field, found, f"{columns}×{rows} px like the {others} before it")
+    return image
 
 
 def increasing(time_s: FloatArray) -> bool:

@@ -21,11 +21,14 @@ from labapp.errors import InputError
 from labapp.media.base import GreyImage, to_grey
 from labapp.media.formats.stored import (
     StoredFrames,
+    check_shape,
     ends_early,
     file_size,
     finite,
+    first_readable,
     increasing,
     plausible_rate,
+    rate_of,
     read_bytes,
     too_large,
     unpack_bits,
@@ -109,7 +112,7 @@ class TiffStack(StoredFrames):
                 self.warnings = ends_early(path.name, described, count)
             elif count < pages or self._names_another(count):
                 self.warnings = (f"{path.name} ends early: {count} of its pages are complete",)
-        page, image = self._first_whole(count)
+        page, image = first_readable(lambda k: (self._page(k), self._decode(k)), count)
         rate, time_s = _time_base(self._tiff, count)
         super().__init__(
             path,
@@ -130,30 +133,13 @@ class TiffStack(StoredFrames):
         """Close the file. May be called twice."""
         self._tiff.close()
 
-    def _first_whole(self, count: int) -> tuple[tifffile.TiffPage, GreyImage]:
-        refused: list[InputError] = []
-        for index in range(count):
-            try:
-                return self._page(index), self._decode(index)
-            except InputError as error:
-                refused.append(error)
-        raise refused[0]
-
     def _page(self, index: int) -> tifffile.TiffPage:
         number = 0 if self._stride else index
         return _guarded(self._path, lambda: _page_of(self._tiff, number))
 
     def _grey(self, index: int) -> GreyImage:
         image = self._decode(index)
-        if image.shape != self.shape:
-            rows, columns = self.shape
-            raise InputError(
-                self._path,
-                f"page {index}, size",
-                f"{image.shape[1]}×{image.shape[0]} px",
-                f"{columns}×{rows} px like the pages before it",
-            )
-        return image
+        return check_shape(self._path, f"page {index}, size", image, self.shape, "pages")
 
     def _decode(self, index: int) -> GreyImage:
         page = self._page(index)
@@ -365,7 +351,7 @@ def _ome_time_base(description: str, count: int) -> tuple[float | None, FloatArr
     time_s = time_s[:count] - time_s[0]
     if not increasing(time_s):
         return None, None
-    return plausible_rate(float(1 / np.median(np.diff(time_s)))), time_s
+    return rate_of(time_s), time_s
 
 
 def _seconds(value: object, unit: str) -> float | None:

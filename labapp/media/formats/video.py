@@ -34,6 +34,7 @@ from labapp.media.formats.packets import (
     number_by_order,
     number_by_stamp,
 )
+from labapp.media.formats.stored import check_shape
 from labapp.pixels import most_decoded
 
 NEAR_PACKETS = 8
@@ -169,14 +170,7 @@ class VideoSource(FrameSource):
         if self._shown is None:
             raise InputError(self._path, f"frame {index}", "cannot be decoded", "a complete frame")
         image = grey_of(self._shown[1])
-        if image.shape != self.shape:
-            rows, columns = self.shape
-            raise InputError(
-                self._path,
-                f"frame {index}, size",
-                f"{image.shape[1]}×{image.shape[0]} px",
-                f"{columns}×{rows} px like the frames before it",
-            )
+        check_shape(self._path, f"frame {index}, size", image, self.shape, "frames")
         time_s = float(self._table.time_s[index])
         return Frame(index, None if math.isnan(time_s) else time_s, image)
 

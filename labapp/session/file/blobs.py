@@ -12,6 +12,8 @@ import json
 import math
 import struct
 import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -116,8 +118,15 @@ def unpack_from(path: Path, named: str, blob: object, kind: Any) -> Any:
     InputError
         If it is damaged.
     """
-    try:
+    with damage_as_input(path, named):
         return unpack(blob, kind)
+
+
+@contextmanager
+def damage_as_input(path: Path, named: str) -> Iterator[None]:
+    """Convert `Damaged` raised in the block to an `InputError` about a value of a session file."""
+    try:
+        yield
     except Damaged as error:
         raise InputError(path, named, error, "what was written there") from error
 

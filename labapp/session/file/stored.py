@@ -23,11 +23,11 @@ from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser,
 from labapp.core.geometry.uncertainty import AxisPoints, RigUncertainty
 from labapp.core.images import dots, find_dots, threshold_dots
 from labapp.core.lines.correction import LineCorrection
-from labapp.core.lines.find_lines import LightLine
+from labapp.core.lines.detection.find_lines import LightLine
+from labapp.core.lines.detection.numbering import LinesSeen
 from labapp.core.lines.fit import LineSurface
 from labapp.core.lines.frame import LineFeatures, LineFrame
 from labapp.core.lines.metal import PoolEdges
-from labapp.core.lines.numbering import LinesSeen
 from labapp.core.lines.track import TrackedLine
 from labapp.core.match import Match, Trial
 from labapp.core.matching.decision import MatchSettings

@@ -21,8 +21,8 @@ from labapp.core.values import FloatArray
 from labapp.errors import InputError
 from labapp.export.summary import format_ranges
 from labapp.session.contents import SessionContents
-from labapp.session.measured import scheme_name
 from labapp.session.report.layout import Cells
+from labapp.session.results.measured import scheme_name
 from labapp.studies.error_budget import Contribution, total
 from labapp.text import pluralize
 

@@ -110,12 +110,12 @@ class Story:
         """Add a paragraph."""
         self._add(Paragraph(plain(text), BODY))
 
-    def listing(self, rows: Sequence[tuple[str, str]], first: float = 0.3) -> None:
+    def listing(self, rows: Sequence[tuple[str, str]]) -> None:
         """Add names and values, one pair per line, without a caption; empty values are omitted."""
         cells = [[name, value] for name, value in rows if value]
         if cells:
             self.tables.append(cells)
-            self._add(_table(cells, "ll", [first, 1 - first], header=False))
+            self._add(_table(cells, "ll", [0.3, 0.7], header=False))
 
     def table(self, caption: str, cells: Cells, align: str, widths: Sequence[float]) -> None:
         """Add a table with its caption above.

@@ -12,6 +12,7 @@ from labapp.config.toml_keys import (
     Rule,
     are_numbers,
     check_keys,
+    one_of,
     parse_toml,
     read_text,
     unknown_key,
@@ -54,7 +55,7 @@ def _range(low: float, high: float, unit: str, required: bool = False) -> Rule:
 
 
 POOLS = {
-    "kind": Rule('"convex" or "concave"', lambda v: v in ("convex", "concave"), False),
+    "kind": one_of("convex", "concave"),
     "width_mm": _range(1, 50, "mm", True),
     "length_mm": _range(1, 50, "mm", True),
     "height_mm": _range(0.01, 10, "mm; above 0 for concave pools, too", True),

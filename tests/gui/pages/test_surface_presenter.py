@@ -12,7 +12,7 @@ from labapp.export.rendering.scene import DIFFERENCE_MAP
 from labapp.gui.pages.surface import comparison, presenter
 from labapp.gui.pages.surface.presenter import Options
 from labapp.gui.shell.steps import why_not_measurable
-from labapp.session.measured import scheme_name
+from labapp.session.results.measured import scheme_name
 from labapp.session.session import Session
 from labapp.text import SETUP_MARKS
 from tests.gui.conftest import CopySample

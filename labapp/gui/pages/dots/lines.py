@@ -8,13 +8,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from labapp.core.lines.correction import LineCorrection
-from labapp.core.lines.find_lines import LightLine
+from labapp.core.lines.detection.find_lines import LightLine
+from labapp.core.lines.detection.numbering import LinesSeen
 from labapp.core.lines.frame import LineFrame
-from labapp.core.lines.numbering import LinesSeen
 from labapp.core.values import BoolArray, FloatArray, IntArray
 from labapp.errors import InputError
 from labapp.gui.digits import ResultRow
-from labapp.session.measured import CORRECTION_CHANGED, Result
+from labapp.session.results.measured import CORRECTION_CHANGED, Result
 from labapp.session.session import Session
 from labapp.text import pluralize
 

@@ -21,7 +21,7 @@ from labapp.core.values import CannotMeasure, FloatArray, IntArray
 from labapp.errors import InputError
 from labapp.gui.digits import ResultRow, plain
 from labapp.gui.tasks import Cancelled, Control
-from labapp.session.measured import CORRECTION_CHANGED, Result
+from labapp.session.results.measured import CORRECTION_CHANGED, Result
 from labapp.session.session import Session
 from labapp.text import SIGMA_OF, pluralize
 

@@ -32,7 +32,7 @@ from labapp.export.rendering.film import UNTIMED_HZ, film_times
 from labapp.export.rendering.studio import PICTURE_PX
 from labapp.gui.drafts import folder_of
 from labapp.session.frames import Progress
-from labapp.session.measured import SETUP_CHANGED, scheme_name
+from labapp.session.results.measured import SETUP_CHANGED, scheme_name
 from labapp.session.session import Session
 from labapp.text import format_bytes, marked_setup_words, pluralize
 

@@ -27,7 +27,7 @@ from labapp.gui.widgets.labels import (
 from labapp.gui.widgets.layouts import fill
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
-from labapp.session.measured import scheme_name
+from labapp.session.results.measured import scheme_name
 
 SIGNS = {"measured": "✓", "stale": "⟳", "failed": "✗", "unmeasured": "○"}
 """Signs for the state of a frame."""

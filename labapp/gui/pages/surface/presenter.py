@@ -21,7 +21,7 @@ from labapp.core.values import FloatArray
 from labapp.export.heights import Profile
 from labapp.export.rendering.scene import Colour, Scene, rays_of, scene_of
 from labapp.gui.digits import ResultRow
-from labapp.session.measured import Overview, Result, scheme_name
+from labapp.session.results.measured import Overview, Result, scheme_name
 from labapp.session.session import Session
 from labapp.text import HEIGHT_SIGMA_OF, SIGMA_OF, marked_setup_words, setup_words
 

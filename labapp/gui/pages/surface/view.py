@@ -59,7 +59,7 @@ from labapp.gui.widgets.labels import Message
 from labapp.gui.widgets.layouts import fill, hbox, vbox
 from labapp.gui.widgets.parts import PartsBar
 from labapp.gui.workspace import Workspace
-from labapp.session.measured import scheme_name
+from labapp.session.results.measured import scheme_name
 from labapp.text import HEIGHT_SIGMA_OF
 
 LEAST_PLAN_WIDTH = 100

@@ -22,8 +22,8 @@ from labapp.gui.widgets.labels import Message, heading, keep_room, wrapping_labe
 from labapp.gui.widgets.layouts import fill, hbox
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.workspace import Workspace
+from labapp.session.results.trends import QUANTITIES
 from labapp.session.signals import Signals, read_signals
-from labapp.session.trends import QUANTITIES
 
 if TYPE_CHECKING:
     from labapp.core.dynamics.steps import Event

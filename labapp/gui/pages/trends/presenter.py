@@ -14,16 +14,16 @@ from labapp.core.lines.track import oscillation_frequency
 from labapp.core.values import FloatArray, IntArray
 from labapp.gui.curves import Axis, Curve, Mark
 from labapp.gui.digits import ResultRow, rounded
-from labapp.session.line_trends import (
+from labapp.session.results.line_trends import (
     FEWEST,
     LINE_QUANTITIES,
     TRACK_QUANTITIES,
     line_trend,
 )
-from labapp.session.measured import Overview
+from labapp.session.results.measured import Overview
+from labapp.session.results.trends import BY_KEY, Trend, doubtful_frames, spectrum, spread, trend
 from labapp.session.session import Session
 from labapp.session.signals import Signals
-from labapp.session.trends import BY_KEY, Trend, doubtful_frames, spectrum, spread, trend
 from labapp.text import SIGMA_OF, marked_setup_words
 
 if TYPE_CHECKING:

@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from labapp.core.lines.chains import is_upright
-from labapp.core.lines.find_lines import LightLine
+from labapp.core.lines.detection.chains import is_upright
+from labapp.core.lines.detection.find_lines import LightLine
 from labapp.core.values import FloatArray
 
 FRINGE_LIGHT, FRINGE_TOTAL = 0.45, 0.4

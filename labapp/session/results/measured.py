@@ -17,10 +17,10 @@ from labapp.core.recording.residual_check import DOUBTFUL, MOST, Residuals, judg
 from labapp.core.schemes import SCHEMES
 from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 from labapp.errors import InputError
-from labapp.session.file.blobs import Damaged, fingerprint, pack, unpack
+from labapp.session.file.blobs import Damaged, damage_as_input, fingerprint, pack, unpack
 from labapp.session.file.database import Database
 from labapp.session.file.schema import MEASURES
-from labapp.session.setup_verdicts import SetupVerdicts, chosen_evenly
+from labapp.session.results.setup_verdicts import SetupVerdicts, chosen_evenly
 from labapp.text import now
 from labapp.version import VERSION
 
@@ -224,11 +224,8 @@ class Results:
         row = self._row(frame, scheme)
         if row is None:
             return None
-        path, named = self._database.path, f"result of frame {frame}"
-        try:
+        with damage_as_input(self._database.path, f"result of frame {frame}"):
             measurement = _verified(row.content, (frame, scheme, *row[:-1]))
-        except Damaged as error:
-            raise InputError(path, named, error, "what was written there") from error
         inputs = self._inputs(row.setup, row.settings)
         doubt = self.verdicts.doubt_of(row.setup)
         if doubt and measurement.setup_status:

@@ -11,8 +11,8 @@ import numpy as np
 import scipy
 
 from labapp.core.images.dots import Grey
-from labapp.core.lines.ridges import sampled
-from labapp.core.values import FloatArray
+from labapp.core.lines.detection.ridges import sampled
+from labapp.core.values import FloatArray, robust_sigma
 
 REACH_WIDTHS = 3.0
 """Half width, in line widths, over which light is summed across the column. The search extends
@@ -51,7 +51,7 @@ def gathered_spots(
     dark = [
         _down(picture, foot + lean * down + side * reach, down, width_px)[0] for side in (-3.0, 3.0)
     ]
-    noise = 1.4826 * float(np.median(np.abs(dark)))
+    noise = robust_sigma(dark)
     least = max(LEAST_PEAK * float(sharp.max()), LEAST_NOISE * noise)
     inner = sharp[1:-1]
     tops = 1 + np.flatnonzero((inner > sharp[:-2]) & (inner >= sharp[2:]) & (inner > least))

@@ -6,16 +6,22 @@ Fig. 3-9).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
 from labapp.core.images.dots import Grey, Image
-from labapp.core.lines.chains import END_WIDTHS, LEAST_FOLDED, is_upright, join_chains, spread_of
-from labapp.core.lines.gathered import gathered_spots
-from labapp.core.lines.ridges import Ridges, RidgeSettings, find_ridges
-from labapp.core.lines.smooth_path import SmoothPath
+from labapp.core.lines.detection.chains import (
+    END_WIDTHS,
+    LEAST_FOLDED,
+    is_upright,
+    join_chains,
+    spread_of,
+)
+from labapp.core.lines.detection.gathered import gathered_spots
+from labapp.core.lines.detection.ridges import SCALE_PX, Ridges, find_ridges
+from labapp.core.lines.detection.smooth_path import SmoothPath
 from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 
 END_PX, END_REACH_PX = 10.0, 30.0
@@ -58,41 +64,22 @@ GLOW_ROUNDS = 5
 GRAIN_COLUMNS = 3.3
 """Correlation length of the speckle along a line, pixel columns."""
 
+LEAST_SCALE_PX, MOST_SCALE_PX = 1.6, 4.0
+"""Limits of the smoothing in the second pass, which is the measured width of the lines, px."""
 
-@dataclass(frozen=True)
-class LineSettings:
-    """Settings for the detection of lines.
+LEAST_PX = 7.0
+"""Length of the shortest chain of ridge points and of the shortest line, px."""
 
-    Parameters
-    ----------
-    ridges
-        Settings of the first pass; in the second, the scale is the measured width of the lines.
-    least_scale_px, most_scale_px
-        Limits of that scale, px.
-    least_px
-        Length of the shortest chain of ridge points and of the shortest line, px.
-    gap_px
-        Longest gap that is joined, px.
-    turn_deg
-        Largest turn at either side of a gap, degrees.
-    smooth_px, smooth_widths, smooth_share
-        Standard deviation of the Gaussian weights that smooth a line along its length: at least
-        this many px; otherwise a share of its length, limited to the two multiples of its width.
-    edge_px
-        A line that ends within this distance of the picture's edge is cut off there, px; the
-        distance is larger for a wide line.
-    """
+LONGEST_GAP_PX, MOST_TURN_DEG = 14.0, 45.0
+"""Longest gap that is joined, px, and largest turn at either side of it, degrees."""
 
-    ridges: RidgeSettings = field(default_factory=RidgeSettings)
-    least_scale_px: float = 1.6
-    most_scale_px: float = 4.0
-    least_px: float = 7.0
-    gap_px: float = 14.0
-    turn_deg: float = 45.0
-    smooth_px: float = 6.0
-    smooth_widths: tuple[float, float] = (3.0, 4.5)
-    smooth_share: float = 0.05
-    edge_px: float = 6.0
+SMOOTH_PX, SMOOTH_WIDTHS, SMOOTH_SHARE = 6.0, (3.0, 4.5), 0.05
+"""Standard deviation of the Gaussian weights that smooth a line along its length: at least this
+many px; otherwise a share of its length, limited to the two multiples of its width."""
+
+EDGE_PX = 6.0
+"""A line that ends within this distance of the picture's edge is cut off there, px; the distance is
+larger for a wide line."""
 
 
 @dataclass(frozen=True)
@@ -145,23 +132,21 @@ class LightLine(ReadOnlyArrays):
         return is_upright(self.image_px) or self.length_px < SPOT_WIDTHS * self.width_px
 
 
-def find_lines(frame: Image, settings: LineSettings) -> tuple[LightLine, ...]:
+def find_lines(frame: Image) -> tuple[LightLine, ...]:
     """Find all bright lines in a grey frame, shape (height, width), including fringes."""
-    ridges = find_ridges(frame, settings.ridges)
-    scale = settings.ridges.scale_px
-    long = _long_chains(ridges, settings)
+    ridges = find_ridges(frame)
+    long = _long_chains(ridges)
     if not len(long):
         return ()
     of_long = np.concatenate([np.arange(*ridges.starts[k : k + 2]) for k in long])
     ratio = ridges.height[of_long] / ridges.strength[of_long]
-    width = float(np.sqrt(max(np.median(ratio) - scale**2, 0.0)))
-    scale = float(np.clip(width, settings.least_scale_px, settings.most_scale_px))
-    ridges = find_ridges(frame, replace(settings.ridges, scale_px=scale))
-    long = _long_chains(ridges, settings)
-    joined = join_chains(ridges, long, scale, settings.gap_px, settings.turn_deg)
+    width = float(np.sqrt(max(np.median(ratio) - SCALE_PX**2, 0.0)))
+    scale = float(np.clip(width, LEAST_SCALE_PX, MOST_SCALE_PX))
+    ridges = find_ridges(frame, scale)
+    joined = join_chains(ridges, _long_chains(ridges), scale, LONGEST_GAP_PX, MOST_TURN_DEG)
     picture = np.ascontiguousarray(frame, np.float32)
     picture = picture - glow(picture)
-    found = (_line(picture, ridges, one, scale, settings) for one in joined)
+    found = (_line(picture, ridges, one, scale) for one in joined)
     lines = tuple(one for one in found if one is not None)
     if _is_gathered(lines):
         return _spots(picture, lines)
@@ -243,31 +228,29 @@ def glow(picture: Grey) -> Grey:
     return np.asarray(cv2.resize(smooth, (width, height), interpolation=cv2.INTER_LINEAR))
 
 
-def _long_chains(ridges: Ridges, settings: LineSettings) -> IntArray:
-    return np.flatnonzero(np.diff(ridges.starts) >= settings.least_px)
+def _long_chains(ridges: Ridges) -> IntArray:
+    return np.flatnonzero(np.diff(ridges.starts) >= LEAST_PX)
 
 
 # --- a line ---------------------------------------------------------------------------------------
 
 
-def _line(
-    picture: Grey, ridges: Ridges, points: IntArray, scale: float, settings: LineSettings
-) -> LightLine | None:
+def _line(picture: Grey, ridges: Ridges, points: IntArray, scale: float) -> LightLine | None:
     """Measure a line of ordered ridge points; None if it is too short."""
     strength = ridges.strength[points]
     points = points[strength > GAP_SHARE * np.median(strength)]
     place, strength = ridges.image_px[points], ridges.strength[points]
     spread2 = spread_of(ridges, points) ** 2
-    least = LEAST_FOLDED / 2 if is_upright(place) else settings.least_px
+    least = LEAST_FOLDED / 2 if is_upright(place) else LEAST_PX
     if len(points) < least:
         return None
     first, last = place[0], place[-1]
     if first[1] > last[1] if is_upright(place) else first[0] > last[0]:
         points, place = points[::-1], place[::-1]
     width = float(np.sqrt(max(spread2 - scale**2, (0.75 * scale) ** 2)))
-    low, high = (each * width for each in settings.smooth_widths)
-    wanted = float(np.clip(settings.smooth_share * len(place), low, high))
-    smooth_px = min(max(wanted, settings.smooth_px), len(place) / 8)
+    low, high = (each * width for each in SMOOTH_WIDTHS)
+    wanted = float(np.clip(SMOOTH_SHARE * len(place), low, high))
+    smooth_px = min(max(wanted, SMOOTH_PX), len(place) / 8)
     # Fluctuations of the path would remain in the line: the path is smoothed more.
     path = SmoothPath.through(place, PATH_SMOOTHER * smooth_px)
     seen = path.seen & _within(path.place, STRIP_WIDTHS * width, picture)
@@ -278,7 +261,7 @@ def _line(
     for _ in range(2):
         off, sigma = _centers(picture, path, width, window)
         # Blur moves the ridge of a curved line to the inner side by σ²κ/2.
-        path = path.moved(off - path.curvature * width**2 / 2, settings.smooth_px)
+        path = path.moved(off - path.curvature * width**2 / 2, SMOOTH_PX)
         # The second pass corrects the bias of smoothing at bends with a narrower window.
         radius = 1.0 / (np.abs(path.curvature) + 1e-9)
         window = np.clip(BEND_SHARE * radius, LEAST_WINDOW_PX, WIDER * smooth_px)
@@ -294,7 +277,7 @@ def _line(
     away = np.linalg.norm(path.place[:, None] - places, axis=-1).min(axis=-1)
     clear = seen & (away > END_WIDTHS * np.sqrt(spread2))
     seen = clear if clear.sum() >= least else seen
-    edge = max(settings.edge_px, STRIP_WIDTHS * width)
+    edge = max(EDGE_PX, STRIP_WIDTHS * width)
     cut = ((places < edge) | (places > size - 1 - edge)).any(axis=-1)
     return LightLine(
         image_px=path.place[seen],

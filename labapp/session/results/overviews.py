@@ -11,7 +11,7 @@ import numpy as np
 from labapp.core.values import FloatArray, IntArray
 from labapp.session.file.database import Database
 from labapp.session.file.schema import MEASURES
-from labapp.session.measured import Basis, Overview, Results
+from labapp.session.results.measured import Basis, Overview, Results
 
 MANY = 500
 """Number of changed frames from which all are read, which takes no longer."""

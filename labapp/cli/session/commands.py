@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from labapp.cli.correct import InOrder, correct
-from labapp.cli.info import info
+from labapp.cli.session.correct import InOrder, correct
+from labapp.cli.session.info import info
 from labapp.cli.shared import (
     ABOUT_SCHEMES,
     DETECTOR_HELP,
@@ -42,7 +42,7 @@ from labapp.cli.shared import (
 from labapp.core.schemes import SCHEMES, scheme_words
 from labapp.errors import InputError
 from labapp.export.formats import RUN_FORMATS, SURFACE_FORMATS
-from labapp.text import pluralize
+from labapp.text import now, pluralize
 
 if TYPE_CHECKING:
     from labapp.core.pipeline import Settings
@@ -420,8 +420,6 @@ def checklist(
 
     The session stores the time of each tick.
     """
-    from datetime import datetime
-
     from labapp.session import checklist as lists
     from labapp.session.session import Session
 
@@ -431,11 +429,10 @@ def checklist(
             if number > len(items):
                 raise InputError(option, "item", number, f"1 to {len(items)}")
     with Session.open(file, read_only=not (tick or untick)) as session:
-        now = datetime.now().astimezone().isoformat(timespec="seconds")
         for ticked, numbers in ((True, tick), (False, untick)):
             for number in numbers or ():
                 item = items[number - 1]
-                session.set_record(lists.tick(session.record, item, ticked, now))
+                session.set_record(lists.tick(session.record, item, ticked, now()))
         times, number = dict(lists.ticked(session.record)), 0
         for name, some in lists.LISTS.items():
             typer.echo(f"{name}: {sum(item in times for item, _ in some)} of {len(some)}")

@@ -45,8 +45,8 @@ def info(
 def _facts(session: Session) -> dict[str, Any]:
     """Return all facts about a session as plain values."""
     from labapp.core.pipeline import Settings
-    from labapp.session.measured import scheme_name
     from labapp.session.record import Record
+    from labapp.session.results.measured import scheme_name
 
     seen, recording = session.overview(), session.recording
     laser, plane = session.laser_calibration, session.plane_calibration

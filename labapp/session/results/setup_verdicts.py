@@ -8,8 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from labapp.core.recording.residual_check import MOST, SetupVerdict
-from labapp.errors import InputError
-from labapp.session.file.blobs import Damaged, pack, unpack
+from labapp.session.file.blobs import Damaged, damage_as_input, pack, unpack
 from labapp.session.file.database import Database
 
 
@@ -52,11 +51,8 @@ class SetupVerdicts:
         rows = self._database.rows(
             "SELECT verdict FROM inputs WHERE setup = ? AND verdict IS NOT NULL ORDER BY id", setup
         )
-        try:
+        with damage_as_input(self._database.path, "verdict"):
             found = [_unpacked(verdict) for (verdict,) in rows]
-        except Damaged as error:
-            path = self._database.path
-            raise InputError(path, "verdict", error, "what was written there") from error
         return max(reversed(found), key=lambda one: one.is_doubtful, default=None)
 
     def doubt_of(self, setup: bytes) -> str:

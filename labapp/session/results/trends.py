@@ -11,7 +11,7 @@ import scipy
 
 from labapp.core.sequence.mean import setup_sigma_of_mean, sigma_of_mean
 from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
-from labapp.session.measured import Overview
+from labapp.session.results.measured import Overview
 
 NEIGHBOURS = 15
 """Number of frames in the running median with which a frame is compared."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from labapp.core.lines.ridges import Ridges
+from labapp.core.lines.detection.ridges import Ridges
 from labapp.core.values import BoolArray, FloatArray, IntArray
 
 TANGENT_POINTS = 20

@@ -16,7 +16,7 @@ import cv2
 import numpy as np
 
 from labapp.core.images.dots import Grey, Image
-from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
+from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays, robust_sigma
 
 WITHIN_PX = 0.6
 """Largest distance of a ridge point from its pixel's centre along u and v: slightly above half."""
@@ -28,24 +28,13 @@ FLANKS = 2.5
 """Distance from a ridge at which its background is read, in standard deviations of the smoothed
 line."""
 
+SCALE_PX = 2.0
+"""Standard deviation of the smoothing Gaussian unless the lines' width is known, px: about that of
+a line's light across it, and not below 1/√3 of it."""
 
-@dataclass(frozen=True)
-class RidgeSettings:
-    """Settings for the detection of ridges.
-
-    Parameters
-    ----------
-    scale_px
-        Standard deviation of the smoothing Gaussian, px: about that of a line's light across it,
-        and not below 1/√3 of it.
-    seed, floor
-        Least ratio of the curvature across the ridge to its noise, for the first point of a chain
-        and for all its points.
-    """
-
-    scale_px: float = 2.0
-    seed: float = 7.0
-    floor: float = 3.0
+SEED, FLOOR = 7.0, 3.0
+"""Least ratio of the curvature across the ridge to its noise, for the first point of a chain and
+for all its points."""
 
 
 @dataclass(frozen=True)
@@ -95,12 +84,15 @@ def _derivative_kernels(scale_px: float) -> tuple[FloatArray, FloatArray, FloatA
     return bell, slope, bend
 
 
-def find_ridges(frame: Image, settings: RidgeSettings) -> Ridges:
-    """Find bright ridges in a grey frame, shape (height, width), and link them to chains."""
-    from labapp.core.lines import ridge_kernels
+def find_ridges(frame: Image, scale_px: float = SCALE_PX) -> Ridges:
+    """Find bright ridges in a grey frame, shape (height, width), and link them to chains.
+
+    ``scale_px`` is the standard deviation of the smoothing Gaussian.
+    """
+    from labapp.core.lines.detection import ridge_kernels
 
     picture = np.ascontiguousarray(frame, np.float32)
-    bell, slope, bend = _derivative_kernels(settings.scale_px)
+    bell, slope, bend = _derivative_kernels(scale_px)
 
     def filtered(along_u: FloatArray, along_v: FloatArray) -> Grey:
         return np.asarray(cv2.sepFilter2D(picture, cv2.CV_32F, along_u, along_v))
@@ -108,10 +100,10 @@ def find_ridges(frame: Image, settings: RidgeSettings) -> Ridges:
     smooth, uu, vv, uv = (
         filtered(*pair) for pair in ((bell, bell), (bend, bell), (bell, bend), (slope, slope))
     )
-    noise = 1.4826 * float(np.median(np.abs(uu[::3, ::3] - np.median(uu[::3, ::3])))) + 1e-9
+    noise = robust_sigma(uu[::3, ::3] - np.median(uu[::3, ::3])) + 1e-9
     # Smaller eigenvalue of the Hessian: the strongest curvature of a maximum.
     half, root = (uu + vv) / 2, np.sqrt(((uu - vv) / 2) ** 2 + uv * uv)
-    v, u = np.nonzero(half - root < -settings.floor * noise)
+    v, u = np.nonzero(half - root < -FLOOR * noise)
     h, r = half[v, u].astype(float), root[v, u].astype(float)
     strength = r - h
     # Unit vector across the ridge: the eigenvector of the eigenvalue half − root.
@@ -126,12 +118,12 @@ def find_ridges(frame: Image, settings: RidgeSettings) -> Ridges:
     index: Any = np.full(picture.shape, -1, np.int32)
     index[pixel[:, 1], pixel[:, 0]] = np.arange(len(pixel))
     order = np.argsort(-strength, kind="stable")
-    seeds = int(np.sum(strength > settings.seed * noise))
+    seeds = int(np.sum(strength > SEED * noise))
     along = np.zeros((len(place) + 1, 2))
     along[:-1, 0], along[:-1, 1] = -across[:, 1], across[:, 0]
     chosen, starts = ridge_kernels.link(index, pixel, place, along, order, seeds)
     place, along, strength = place[chosen], along[chosen], strength[chosen]
-    height = _height(smooth, place, along, settings.scale_px)
+    height = _height(smooth, place, along, scale_px)
     return Ridges(place, along, strength, height, starts, noise, smooth)
 
 

@@ -1,0 +1,1 @@
+"""Commands that compute with simulated pools and recordings."""

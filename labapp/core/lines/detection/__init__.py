@@ -1,0 +1,1 @@
+"""The lines in a frame: ridges, their joining to lines, and which are the pattern's own."""

@@ -1,0 +1,1 @@
+"""The results of a session: stored measurements, overviews, verdicts on the set-up, trends."""
