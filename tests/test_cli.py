@@ -18,7 +18,7 @@ import cv2
 import numpy as np
 import pytest
 
-from labapp import cli, log
+from labapp import log
 from labapp.core.pipeline import Measurement, Settings
 from labapp.errors import InputError
 from labapp.export import results
@@ -729,18 +729,6 @@ def test_help_lists_commands_with_whole_sentences(labapp: Run, command: str) -> 
     listed = said.partition("Commands:")[2]
     assert listed
     assert "..." not in listed
-
-
-def test_every_status_is_explained() -> None:
-    root = Path(cli.__file__).parents[1]
-    raised = {
-        status
-        for path in root.rglob("*.py")
-        for status in re.findall(r'CannotMeasure\(\s*"([^"]+)"', path.read_text(encoding="utf-8"))
-    }
-    assert "ambiguous-rows" in raised
-    explained = (root.parent / "docs" / "method.md").read_text(encoding="utf-8")
-    assert not {status for status in raised if f"| `{status}` |" not in explained}
 
 
 def test_the_version_is_told(labapp: Run) -> None:
