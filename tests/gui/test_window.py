@@ -240,6 +240,19 @@ def test_what_was_said_of_another_session_goes_but_no_problem(
     assert "The disk is full" in plain.status_line.message.text()
 
 
+def test_another_session_shows_the_beginning_of_a_panel(
+    window: MainWindow, copy_sample: CopySample, qtbot: QtBot
+):
+    window.files.open(copy_sample("gtaw"))
+    window.show_step("dots")
+    bar = window.side_panel.stack.currentWidget().verticalScrollBar()
+    qtbot.waitUntil(lambda: bar.maximum() > 0)
+    bar.setValue(bar.maximum())
+    window.files.open(copy_sample("blocked_rows"))
+    window.show_step("dots")
+    assert bar.value() == 0
+
+
 def test_the_same_again_is_one_line_with_how_often(plain: MainWindow):
     before = plain.log_panel.count()
     for _ in range(3):

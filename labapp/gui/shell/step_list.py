@@ -215,6 +215,11 @@ class SidePanel(FollowsTheme, QWidget):
         self.title.setText(step.title)
         self.hint.setText(step.hint)
 
+    def scroll_to_top(self) -> None:
+        """Show the beginning of every panel, where it says what is in view."""
+        for area in self._areas.values():
+            area.verticalScrollBar().setValue(0)
+
     def show_state(self, state: State) -> None:
         """Show the state of the step and its reason."""
         self._shown = state

@@ -304,6 +304,7 @@ class MainWindow(QMainWindow):
         self.timeline.set_playing(False)
         self._leave()
         self.side_panel.read_only.setVisible(session is not None and session.read_only)
+        self.side_panel.scroll_to_top()
         self._show_session()
         if session is None:
             self.stack.setCurrentWidget(self.welcome)
