@@ -12,7 +12,6 @@ from PySide6.QtCore import QUrl
 from PySide6.QtGui import QCloseEvent, QDesktopServices
 from PySide6.QtWidgets import QAbstractItemView, QCheckBox, QHeaderView, QTabWidget, QWidget
 
-from labapp.config.setup import read_setup
 from labapp.gui.dialogs import ask_file, ask_folder, ask_save
 from labapp.gui.tasks import Control, Tasks
 from labapp.gui.tools import studying
@@ -25,7 +24,7 @@ from labapp.gui.widgets.sheet import Sheet
 from labapp.gui.widgets.tables import CellTable, FittingTable
 from labapp.run.measurers import measuring_pool
 from labapp.run.study.page import condition_picture, varying_conditions
-from labapp.run.study.plan import StudyPlan, StudyRecording, folder_pattern, write_study
+from labapp.run.study.plan import StudyRecording, folder_pattern, write_study
 from labapp.run.study.results import require_extra
 from labapp.run.study.status import Progress, RecordingStatus, count_states
 from labapp.run.study.study import Study
@@ -202,14 +201,9 @@ class StudyWindow(ToolWindow):
 
     def make(self, path: Path) -> None:
         """Create the study described by the form, and open it."""
-        recordings, setup = self.recordings.value().strip(), Path(self.setup.value().strip())
-
-        def write() -> StudyPlan:
-            read_setup(setup)  # raises now what each recording would fail by
-            # The dialog has asked whether to replace an existing file.
-            return write_study(path, [recordings], setup, replace=True)
-
-        if self._try(write):
+        recordings, setup = self.recordings.value().strip(), self.setup.value().strip()
+        # The dialog has asked whether to replace an existing file.
+        if self._try(lambda: write_study(path, [recordings], setup, replace=True)):
             self.show_study(path)
 
     def _try(self, work: Callable[[], T]) -> T | None:

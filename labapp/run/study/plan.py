@@ -31,6 +31,7 @@ from typing import Any
 import tomlkit
 
 from labapp.config.csv_tables import bounded_lines, open_table, parse_number
+from labapp.config.setup import read_setup
 from labapp.config.toml_keys import Rule, check_keys, is_number, parse_toml, shown, unknown_key
 from labapp.core.pipeline import Settings
 from labapp.core.schemes import SCHEMES
@@ -221,7 +222,8 @@ def write_study(
     Raises
     ------
     InputError
-        If the file exists already or cannot be written, or a pattern matches nothing.
+        If the file exists already or cannot be written, a pattern matches nothing, or the set-up is
+        not valid.
     """
     path = Path(path)
     if path.suffix.lower() not in (".toml", ".csv"):
@@ -230,6 +232,7 @@ def write_study(
         read_study(path)  # raises if it is not a study file
     elif path.exists():
         raise InputError(path, "file", "is there already", "a new file")
+    read_setup(setup)  # otherwise each recording would fail by it
     folder = path.parent.absolute()
     found = [each for text in recordings for each in matching_recordings(text)]
     names = list(dict.fromkeys(name for _, varied in found for name in varied))

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import pytest
 
 from labapp.errors import InputError
 from labapp.run.study.plan import MOST_RECORDINGS, read_study, write_study
+
+SAMPLES = Path(__file__).parents[3] / "sample_sessions"
 
 
 def written(folder: Path, text: str, name: str = "study.toml") -> Path:
@@ -151,8 +154,12 @@ def test_a_new_file_says_what_it_was_made_from(
 ) -> None:
     for file in ("I80_a.avi", "I90_b.avi", "=odd.avi"):
         (tmp_path / file).touch()
+    shutil.copy(SAMPLES / "gtaw" / "setup.toml", tmp_path / "bench.toml")
     (tmp_path / "sub").mkdir()
     monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=r"none\.toml"):
+        write_study(tmp_path / "sub" / name, ["=odd.avi"], "none.toml")
+    assert not (tmp_path / "sub" / name).exists()
     plan = write_study(tmp_path / "sub" / name, ["I{current_a}_*.avi", "=odd.avi"], "bench.toml")
     assert plan == read_study(tmp_path / "sub" / name)
     assert [one.path.resolve() for one in plan.recordings] == [
