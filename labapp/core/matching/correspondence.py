@@ -260,7 +260,7 @@ def _by_caps(observed: Observation) -> list[Hypothesis]:
         if hypothesis is not None:
             found.append(hypothesis)
             if explains(observed, hypothesis):
-                return found
+                return with_repaired(observed, found)
     for start in sorted(found, key=lambda hypothesis: hypothesis.misfit)[:MOST_REPAIRED]:
         found += with_repaired(observed, [start])[1:]
         if any_explains(observed, found):
