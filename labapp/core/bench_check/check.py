@@ -324,11 +324,11 @@ REASONS: dict[Verdict, str] = {
     "noise-like": "",
     "distortion": "the picture is distorted in another way: calibrate the camera's lens",
     "plate-not-flat": "the plate is not flat: take a better one",
-    "wrong-lens": "the rays are not those of the pattern: is it another lens?",
-    "row-slipped": "the dots fit the rays of the next row or column better: is the absent ray "
-    "another, or its hole mistaken?",
-    "unexplained": "no bench and no mirror of this kind explain the dots: is it the mirror that "
-    "was named, and did anything move between the pictures?",
+    "wrong-lens": "the rays are not those of the pattern: is the lens that of the set-up?",
+    "row-slipped": "the dots fit the rays of the next row or column better: check which ray is "
+    "absent, and that the hole in the dots is its own",
+    "unexplained": "no bench and no mirror of this kind explain the dots: check that the mirror is "
+    "the one entered, and that nothing moved between the pictures",
 }
 
 
@@ -378,7 +378,7 @@ def _sizes_off(sizes: Mapping[str, MeasuredSize]) -> tuple[float, str]:
         for name, one in sorted(off.items(), key=lambda pair: -abs(pair[1].deviation))
         if one.deviation**2 > NEARLY * square
     )
-    return square, "; or ".join(named) + " (is it the mirror that was named?)"
+    return square, "; or ".join(named) + " (check that the mirror is the one entered)"
 
 
 def _suspected(suspects: Sequence[Suspect]) -> str:

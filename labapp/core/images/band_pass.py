@@ -392,7 +392,7 @@ def _kept(tuning: DetectorTuning, seen: _BandPassed, settings: BandPassSettings)
 
     u, v, bright = seen.peaks(tuning)
     if len(u) == 0:
-        raise CannotMeasure("no-dots", "no dot stands out of the frame's noise")
+        raise CannotMeasure("no-dots", "no dot is brighter than the frame's noise")
     keep = np.flatnonzero(bright >= settings.contrast * typical(bright))
     # A dot with a flat top has several peaks.
     keep = keep[dot_kernels.first_of_each(u[keep], v[keep], max(1.5, seen.size))]

@@ -49,7 +49,7 @@ def find_dots(frame: Image, settings: DotSettings) -> Dots:
     else:
         dots = band_pass_dots(frame, settings.band_pass)
     if len(dots) == 0:
-        raise CannotMeasure("no-dots", "no dot stands out of the frame's background")
+        raise CannotMeasure("no-dots", "no dot is brighter than the frame's background")
     return dots
 
 

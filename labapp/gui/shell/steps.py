@@ -351,8 +351,8 @@ STEPS = (
         "bench_check",
         "Bench check",
         "Take a picture of a mirror of known shape under the laser: a flat plate, a thumb tack, a "
-        "bearing ball. Its dots show where laser and plane really stand. A plate and a cap "
-        "together tell most. This step is optional.",
+        "bearing ball. Its dots show where laser and plane really are. A plate and a cap "
+        "together give the most information. This step is optional.",
         "BenchCheckPage",
         _bench_check,
         needs_frames=False,
