@@ -71,6 +71,13 @@ def test_a_steady_pool_neither_grows_nor_flattens():
     assert set(line_states(series)) == {"concave"}
 
 
+def test_convex_pool_that_bulges_further_is_not_flattening():
+    rng = np.random.default_rng(5)
+    turn = np.interp(np.arange(120), [60, 80], [0.2, 0.5]) + 0.01 * rng.normal(size=120)
+    series = LineSeries(np.full(120, 4), 4.5 + 0.02 * rng.normal(size=120), turn)
+    assert set(line_states(series)) == {"convex"}
+
+
 def test_frames_without_a_surface_keep_the_state_before_them():
     turn = np.concatenate([np.full(100, -0.3), np.full(40, np.nan)])
     width = np.where(np.isfinite(turn), 6.0, np.nan)

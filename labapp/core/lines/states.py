@@ -5,7 +5,7 @@
 | ``no-pool`` | "a blurred plane without any lines" at point A (Fig. 3-11) | no line is seen |
 | ``growing`` | from A to B "the weld pool grows" (Fig. 3-11) | the pool's width increases, or lines have appeared but do not yet determine it |
 | ``concave`` | full penetration, steady (Fig. 3-12) | turn below zero, not changing |
-| ``flattening`` | "from being concave towards being convex", the size falls (Fig. 3-13) | turn rises |
+| ``flattening`` | "from being concave towards being convex", the size falls (Fig. 3-13) | turn rises from below zero |
 | ``convex`` | partial penetration, images larger, lines fewer (Fig. 3-14) | turn above zero, not changing |
 
 The dissertation judges shapes by eye; here width and turn are those of the fitted surface. The turn
@@ -114,7 +114,7 @@ def line_states(series: LineSeries) -> tuple[State, ...]:
     grows = _well_known(grows, series.width_mm)
     grows = lit & _with_corners(grows, series.width_mm, lit)
     grows |= _just_appeared(lit, np.isfinite(series.width_mm), grows)
-    flattens = _changes(turning, turning_sigma, LEAST_TURN)
+    flattens = _from_below_zero(_changes(turning, turning_sigma, LEAST_TURN), turn)
     flattens = lit & ~grows & _ramps(flattens, series.turn, lit & ~grows)
     known = np.flatnonzero(np.isfinite(turn))
     # The first lines may be too few for a surface; later, interpolation bridges unknown frames.
@@ -207,6 +207,21 @@ def _well_known(change: BoolArray, values: FloatArray) -> BoolArray:
     parts, count = label(change)
     known = np.isfinite(values)
     kept = [part for part in range(1, count + 1) if known[parts == part].mean() >= 0.5]
+    return np.asarray(np.isin(parts, kept) & change)
+
+
+def _from_below_zero(change: BoolArray, turn: FloatArray) -> BoolArray:
+    """Keep changes before which the pool was not clearly convex.
+
+    That is judged from the last known values, as the sign of a small turn is often unknown.
+    """
+    parts, count = label(change)
+    kept = []
+    for part in range(1, count + 1):
+        before = turn[: np.argmax(parts == part) + 1]
+        before = before[np.isfinite(before)][-SLOPING_FRAMES:]
+        if len(before) < SLOPING_FRAMES or before.min() < 0:
+            kept.append(part)
     return np.asarray(np.isin(parts, kept) & change)
 
 
