@@ -260,8 +260,9 @@ def _line(picture: Grey, ridges: Ridges, points: IntArray, scale: float) -> Ligh
     window: FloatArray = np.full(len(path.place), smooth_px)
     for _ in range(2):
         off, sigma = _centers(picture, path, width, window)
-        # Blur moves the ridge of a curved line to the inner side by σ²κ/2.
-        path = path.moved(off - path.curvature * width**2 / 2, SMOOTH_PX)
+        # Blur moves the ridge of a curved line to the inner side by σ²κ/2, if its radius exceeds σ.
+        bend = np.clip(path.curvature, -1 / width, 1 / width)
+        path = path.moved(off - bend * width**2 / 2, SMOOTH_PX)
         # The second pass corrects the bias of smoothing at bends with a narrower window.
         radius = 1.0 / (np.abs(path.curvature) + 1e-9)
         window = np.clip(BEND_SHARE * radius, LEAST_WINDOW_PX, WIDER * smooth_px)
