@@ -84,11 +84,11 @@ class Hand:
         raise AssertionError(f"Tab does not lead to {_name_of(widget)}")
 
     def button(self, words: str) -> None:
-        """Click the button with these words on the page in view."""
+        """Click the button with this text."""
         self.click(self.find(words))
 
     def find(self, words: str) -> QAbstractButton:
-        """The button with these words that is in view."""
+        """The only visible button with this text."""
         buttons = [
             button
             for button in self.window.findChildren(QAbstractButton)

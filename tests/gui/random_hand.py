@@ -255,7 +255,7 @@ class RandomHand:
 
     def _seen(self, *kinds: type[QWidget]) -> list[QWidget]:
         """Enabled widgets of these types that the mouse can reach, in a fixed order."""
-        found = []
+        reachable = []
         for window in QApplication.topLevelWidgets():
             if not window.isVisible() or isinstance(window, QMenu):
                 continue
@@ -263,8 +263,8 @@ class RandomHand:
                 if isinstance(widget, kinds) and widget.isVisible() and widget.isEnabled():
                     target = window.childAt(widget.mapTo(window, widget.rect().center()))
                     if target is not None and (target is widget or widget.isAncestorOf(target)):
-                        found.append(widget)
-        return found
+                        reachable.append(widget)
+        return reachable
 
     def _place(self, widget: QWidget) -> QPoint:
         """A random point in the visible part of a widget, in window coordinates."""

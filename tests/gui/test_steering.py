@@ -78,7 +78,7 @@ def test_view_follows_the_controller(view: View3d):
     # Tilted towards the operator, the top comes nearer and the front goes down.
     view.look("front")
     assert moved_px(view, SixAxes(pitch=1.0), FRONT)[1] > 0.01
-    # Rolled against the clock, the right side goes up.
+    # Rolled counterclockwise, the right side goes up.
     view.look("front")
     right, down = moved_px(view, SixAxes(roll=1.0), RIGHT)
     assert down < -0.01

@@ -134,10 +134,12 @@ def test_frames_are_shown_without_a_setup_as_a_draft(
     assert len(session.frames) == FRAMES
     assert window.workspace.folder == bench
     assert window.page is not None
-    seen = window.page
-    hand.qtbot.waitUntil(lambda: seen.seen is not None and seen.seen.correction is not None)
+    dots_page = window.page
+    hand.qtbot.waitUntil(
+        lambda: dots_page.seen is not None and dots_page.seen.correction is not None
+    )
     assert "⚠" not in window.page.dots_panel.seen.text()
-    window.workspace.attempt(lambda own: own.set_record(Record(title="Mine")))
+    window.workspace.attempt(lambda s: s.set_record(Record(title="Mine")))
     window.workspace.show_frame(1)
     named = tmp_path / "named.labsession"
     monkeypatch.setattr(dialogs, "ask_new_session", lambda *_: named)

@@ -341,14 +341,14 @@ def _simulator(hands: Hands) -> None:
 def _study(hands: Hands) -> None:
     """Create and run a study of the simulated recording."""
     hands.do("step_setup")
-    made = hands.window.findChild(SimulatorWindow).made
+    simulated = hands.window.findChild(SimulatorWindow).made
     tool = _tool(hands, "study", StudyWindow)
     hands.answer_dialog("study", lambda: hands.press("Open study…"))
     hands.answer_dialog("study-recordings", lambda: hands.press("Choose folder…"))
     hands.answer_dialog("study-setup", lambda: hands.press("Choose set-up…"))
-    tool.take_folder(made[1])
+    tool.take_folder(simulated[1])
     hands.answer_dialog("new-study", lambda: hands.press("Make study…"))
-    tool.make(made[1].parent / "study.toml")
+    tool.make(simulated[1].parent / "study.toml")
     hands.wait(lambda: tool.found and not tool.looks.active, "the study to be read")
     hands.press("Run")
     hands.wait(lambda: tool.summary and not tool.looks.active, "the study to be measured")

@@ -620,8 +620,8 @@ def test_opening_a_camera_can_be_cancelled(
 def test_found_cameras_can_be_chosen(
     window: MainWindow, page: CapturePage, qtbot: QtBot, monkeypatch
 ):
-    found = [CameraInfo("uvc:0", "Microscope", "USB video")], ["Aravis is not installed"]
-    monkeypatch.setattr(live_view, "find_cameras", lambda: found)
+    result = [CameraInfo("uvc:0", "Microscope", "USB video")], ["Aravis is not installed"]
+    monkeypatch.setattr(live_view, "find_cameras", lambda: result)
     page.live_view.find_button.click()
     qtbot.waitUntil(lambda: "1 camera found. Aravis is not installed" in log_of(window))
     assert page.live_view.camera.value() == SIMULATED

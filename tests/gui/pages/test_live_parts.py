@@ -176,15 +176,15 @@ class Prepared:
 
     def measure(self, frame: CameraFrame, drawn: bool) -> LiveResult:
         Prepared.gate.wait(PATIENCE_S)
-        found = Prepared.found
+        measurement = Prepared.found
         return LiveResult(
             frame=frame.number,
             time_s=frame.time_s,
             arrived_s=frame.arrived_s,
-            measurement=found,
-            track_lost=None if found.status == "ok" else found.reason,
+            measurement=measurement,
+            track_lost=None if measurement.status == "ok" else measurement.reason,
             quality=Prepared.quality,
-            scene=surface() if drawn and found.measures is not None else None,
+            scene=surface() if drawn and measurement.measures is not None else None,
         )
 
     def close(self) -> None:

@@ -325,23 +325,23 @@ def test_board_is_detected_applied_and_undone(
     before = session.setup_text
     page.load(board_picture(tmp_path / "board.png"))
     qtbot.waitUntil(lambda: isinstance(page.found, BoardCalibration), timeout=30_000)
-    found = page.found
-    assert isinstance(found, BoardCalibration)
+    board = page.found
+    assert isinstance(board, BoardCalibration)
     assert page.square.value() == 8.0
     assert page.add_button.isEnabled()
     assert not any(point.isVisible() for point in page.points)
-    rows = {row.name: row for row in presenter.result(found).rows}
+    rows = {row.name: row for row in presenter.result(board).rows}
     assert rows["Distortion"].value == pytest.approx(-0.96, abs=0.1)
-    residuals = presenter.residual_map(found, 640)
+    residuals = presenter.residual_map(board, 640)
     assert residuals is not None
-    assert len(residuals.share) == len(found.seen[0].index)
+    assert len(residuals.share) == len(board.seen[0].index)
     page.use()
     stored = session.plane_calibration
     assert stored is not None
     assert isinstance(stored.found, BoardCalibration)
-    np.testing.assert_array_equal(stored.found.seen[0].image_px, found.seen[0].image_px)
+    np.testing.assert_array_equal(stored.found.seen[0].image_px, board.seen[0].image_px)
     assert session.setup is not None
-    assert session.setup.calibration.lens == found.image_calibration.lens
+    assert session.setup.calibration.lens == board.image_calibration.lens
     assert calibrations_in_use(session)[1]
     assert lens_of(session.setup_text) is not None
     session.undo()
