@@ -1,7 +1,7 @@
-"""A hand on the window: mouse and keyboard, and nothing else.
+"""Operate the window by mouse and keyboard alone.
 
-A click goes to the window at the place where the widget is seen: what lies over it gets it. What is
-out of sight is gone to with Tab, as an operator without a mouse does.
+A click is sent to the window at the position of the widget: a widget that covers it gets the click.
+A widget out of view is reached with Tab, as by an operator without a mouse.
 """
 
 from __future__ import annotations
@@ -34,41 +34,41 @@ POLL_MS = 20
 
 
 class Hand:
-    """Works a window.
+    """Operates a window as an operator would.
 
     Parameters
     ----------
     window
-        In view, and active.
+        Visible and active.
     """
 
     def __init__(self, window: MainWindow) -> None:
         self.window = window
 
     def press(self, key: Qt.Key, modifiers: Qt.KeyboardModifier = NONE) -> None:
-        """Press a key on whatever has the focus."""
-        if QApplication.activeWindow() is None:  # after a dialog; a desktop gives it back
+        """Press a key on the widget with the focus."""
+        if QApplication.activeWindow() is None:  # after a dialog; a desktop would activate it again
             self.window.activateWindow()
             QApplication.processEvents()
         QTest.keyClick(QApplication.focusWidget() or self.window, key, modifiers)
-        QApplication.processEvents()  # as between two presses of a finger
+        QApplication.processEvents()  # as between two key presses
 
     def write(self, text: str) -> None:
-        """Write over what the widget with the focus holds."""
+        """Replace the text of the widget with the focus."""
         self.press(Qt.Key.Key_A, CONTROL)
         self.type(text)
 
     def type(self, text: str) -> None:
-        """Type on whatever has the focus; a key may give it to another widget."""
+        """Type into the widget with the focus; a key may move the focus."""
         for letter in text:
             QTest.keyClicks(_focused(), letter)
 
     def click(self, widget: QWidget, at: QPoint | None = None) -> None:
-        """Click a widget; one that is out of sight is gone to first, which scrolls it into view."""
-        if not _is_seen(widget, at):
+        """Click a widget; one out of view gets the focus first, which scrolls it into view."""
+        if not _is_clickable(widget, at):
             self.go_to(widget)
-        assert _is_seen(widget, at), f"{_named(widget)} cannot be seen"
-        assert widget.isEnabled(), f"{_named(widget)} cannot be used"
+        assert _is_clickable(widget, at), f"{_name_of(widget)} cannot be seen"
+        assert widget.isEnabled(), f"{_name_of(widget)} cannot be used"
         # Through the window, as the desktop sends it.
         window = widget.window()
         place = widget.mapTo(window, at or _hot_spot(widget))
@@ -81,23 +81,23 @@ class Hand:
             if present is not None and (present is widget or widget.isAncestorOf(present)):
                 return
             self.press(Qt.Key.Key_Tab)
-        raise AssertionError(f"Tab does not lead to {_named(widget)}")
+        raise AssertionError(f"Tab does not lead to {_name_of(widget)}")
 
     def button(self, words: str) -> None:
-        """Click the button with these words on the page in view."""
+        """Click the button with this text."""
         self.click(self.find(words))
 
     def find(self, words: str) -> QAbstractButton:
-        """The button with these words that is in view."""
-        found = [
+        """The only visible button with this text."""
+        buttons = [
             button
             for button in self.window.findChildren(QAbstractButton)
             if button.text().replace("&", "") == words and button.isVisible()
         ]
-        if len(found) > 1:  # what leads on from an empty page is in its panel, too
-            found = [each for each in found if not self.window.empty.isAncestorOf(each)]
-        assert len(found) == 1, f"{len(found)} buttons “{words}” are in view"
-        return found[0]
+        if len(buttons) > 1:  # the button of an empty page is in the side panel, too
+            buttons = [each for each in buttons if not self.window.empty.isAncestorOf(each)]
+        assert len(buttons) == 1, f"{len(buttons)} buttons “{words}” are in view"
+        return buttons[0]
 
     def enter(self, field: Field, text: str) -> None:
         """Go to a field, write in it, and finish with Enter."""
@@ -113,10 +113,10 @@ class Hand:
             if field.editor.currentText() == words:
                 return
             self.press(Qt.Key.Key_Down)
-        raise AssertionError(f"{_named(field)} does not offer “{words}”")
+        raise AssertionError(f"{_name_of(field)} does not offer “{words}”")
 
     def tick(self, words: str, on: bool) -> None:
-        """Tick a box, or take its tick away."""
+        """Check or uncheck a check box."""
         box = self.find(words)
         assert isinstance(box, QCheckBox)
         if box.isChecked() != on:
@@ -136,7 +136,7 @@ class Hand:
         self.press(Qt.Key.Key_Return)
 
     def point(self, view: PictureView, u: float, v: float) -> QPoint:
-        """Where a place in a picture is seen, (u, v) in px."""
+        """The widget position of the picture point (u, v), px."""
         place: QPoint = view.canvas.mapFromScene(view.box.mapViewToScene(QPointF(u, v)))
         return place
 
@@ -148,7 +148,7 @@ class Hand:
         timer.start()
 
     def _answer(self, timer: QTimer, path: Path) -> None:
-        """Press Enter until it is taken: the first may go to the list of completions."""
+        """Press Enter until it is accepted: the first may go to the list of completions."""
         dialog = QApplication.activeModalWidget()
         if not isinstance(dialog, QFileDialog):
             return
@@ -171,22 +171,22 @@ def _focused() -> QWidget:
 
 
 def _hot_spot(widget: QWidget) -> QPoint:
-    """Where a click means it: the box of a tick, the middle of anything else."""
+    """Where a click takes effect: the box of a check box, the centre of any other widget."""
     if isinstance(widget, QCheckBox):
         return QPoint(10, widget.height() // 2)
     return widget.rect().center()
 
 
-def _is_seen(widget: QWidget, at: QPoint | None) -> bool:
-    """Whether a click at that place meets the widget, and nothing that lies over it."""
+def _is_clickable(widget: QWidget, at: QPoint | None) -> bool:
+    """Whether a click at that position hits the widget and no other that covers it."""
     place = at or _hot_spot(widget)
     window = widget.window()
     inside = QRect(QPoint(), window.size()).contains(widget.mapTo(window, place))
     if not (widget.isVisible() and inside):
         return False
-    met = window.childAt(widget.mapTo(window, place))
-    return met is not None and (met is widget or widget.isAncestorOf(met))
+    target = window.childAt(widget.mapTo(window, place))
+    return target is not None and (target is widget or widget.isAncestorOf(target))
 
 
-def _named(widget: QWidget) -> str:
+def _name_of(widget: QWidget) -> str:
     return widget.accessibleName() or getattr(widget, "text", lambda: "")() or repr(widget)

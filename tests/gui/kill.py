@@ -1,9 +1,9 @@
-"""The app killed while it imports or measures: run by `test_long_work.py`, or by hand.
+"""Kill the app while it imports or measures: run by `test_long_work.py`, or by hand.
 
-``python tests/gui/kill.py FOLDER KILLS SEED``: a process of its own opens the window on a session
-and works as an operator has it work; it is killed at random moments. After each kill the session
-must open and be whole, hold every result that was there for the operator to see, and either all of
-the recording's frames or none; and no process may be left over.
+``python tests/gui/kill.py FOLDER KILLS SEED``: a child process opens the window on a session, and
+imports or measures as for an operator; it is killed at random moments. After each kill the session
+must open without problems, and contain every result that the operator could see and either all
+frames of the recording or none; and no process may be left over.
 """
 
 from __future__ import annotations
@@ -27,37 +27,37 @@ FRAMES = 600
 SIDE_PX = 64
 SAMPLE = Path(labapp.__file__).parents[1] / "sample_sessions" / "gtaw" / "setup.toml"
 GONE_S = 60.0
-TOLD = 4
-"""Bytes a number."""
+NUMBER_BYTES = 4
+"""Bytes per number."""
 
 
 # --- in the process that is killed ------------------------------------------------------------
 
 
 def work(path: Path, recording: Path, pipe: int) -> None:
-    """Import where there are no frames yet, else measure; tell each frame that is done."""
+    """Import if there are no frames yet, else measure; report each finished frame."""
     from PySide6.QtCore import QTimer
 
     from labapp.gui.app import start_app
     from labapp.gui.preferences import Preferences
     from labapp.gui.shell.commands import make_window
 
-    def tell(number: int) -> None:
-        os.write(pipe, number.to_bytes(TOLD, "little"))
+    def report(number: int) -> None:
+        os.write(pipe, number.to_bytes(NUMBER_BYTES, "little"))
 
-    measure, take_in = Session.measure, Session.import_recording
+    measure, import_recording = Session.measure, Session.import_recording
 
     def measured(session, frames=None, pool=None):  # type: ignore[no-untyped-def]
         for number, measurement in measure(session, frames, pool):
-            tell(number)
+            report(number)
             yield number, measurement
 
-    def imported(session, *given, progress, **named):  # type: ignore[no-untyped-def]
+    def imported(session, *args, progress, **kwargs):  # type: ignore[no-untyped-def]
         def step(done: int, total: int) -> None:
-            tell(done)
+            report(done)
             progress(done, total)
 
-        return take_in(session, *given, progress=step, **named)
+        return import_recording(session, *args, progress=step, **kwargs)
 
     Session.measure = measured  # type: ignore[method-assign]
     Session.import_recording = imported  # type: ignore[method-assign]
@@ -83,11 +83,11 @@ def work(path: Path, recording: Path, pipe: int) -> None:
     app.exec()
 
 
-# --- who kills it -----------------------------------------------------------------------------
+# --- in the process that kills ----------------------------------------------------------------
 
 
-def killed(path: Path, recording: Path, rng: random.Random) -> list[int]:
-    """Let the app work and kill it; the frames that it told of."""
+def run_and_kill(path: Path, recording: Path, rng: random.Random) -> list[int]:
+    """Run the app and kill it; return the frames that it reported."""
     reading, writing = os.pipe()
     environment = {**os.environ, "QT_QPA_PLATFORM": "offscreen", "XDG_STATE_HOME": str(path.parent)}
     child = subprocess.Popen(
@@ -97,29 +97,29 @@ def killed(path: Path, recording: Path, rng: random.Random) -> list[int]:
         start_new_session=True,
     )
     os.close(writing)
-    told: list[int] = []
+    reported: list[int] = []
     try:
-        told += some(reading, 1 + rng.randrange(40))
+        reported += read_numbers(reading, 1 + rng.randrange(40))
         time.sleep(rng.uniform(0, 0.02))
     finally:
         os.kill(child.pid, signal.SIGKILL)
         child.wait()
-    told += some(reading, FRAMES)
+    reported += read_numbers(reading, FRAMES)
     os.close(reading)
     wait_for_all(child.pid)
-    return told
+    return reported
 
 
-def some(pipe: int, most: int) -> list[int]:
-    """The next numbers told, or fewer if nobody is left to tell."""
-    told: list[int] = []
-    while len(told) < most and (part := os.read(pipe, TOLD)):
-        told.append(int.from_bytes(part, "little"))
-    return told
+def read_numbers(pipe: int, count: int) -> list[int]:
+    """The next numbers reported, or fewer if the writing process has ended."""
+    numbers: list[int] = []
+    while len(numbers) < count and (part := os.read(pipe, NUMBER_BYTES)):
+        numbers.append(int.from_bytes(part, "little"))
+    return numbers
 
 
 def wait_for_all(group: int) -> None:
-    """Wait until the processes that measured have gone as well."""
+    """Wait until the processes that measured have ended as well."""
     ends = time.monotonic() + GONE_S
     try:
         while time.monotonic() < ends:
@@ -131,8 +131,8 @@ def wait_for_all(group: int) -> None:
     raise SystemExit("a process that measured was left over")
 
 
-def check(path: Path, known: set[int], told: list[int], importing: bool) -> set[int]:
-    """The frames with results; ends the program where something is lost or not whole."""
+def check(path: Path, known: set[int], reported: list[int], importing: bool) -> set[int]:
+    """The frames with results; exits if anything is lost or damaged."""
     with Session.open(path) as session:
         problems = session.problems()
         count = len(session.frames)
@@ -141,16 +141,16 @@ def check(path: Path, known: set[int], told: list[int], importing: bool) -> set[
         raise SystemExit(f"not whole: {problems}")
     if count not in (0, FRAMES):
         raise SystemExit(f"{count} of {FRAMES} frames were imported")
-    if not importing and not (known | set(told)) <= has:
-        raise SystemExit(f"lost: {sorted((known | set(told)) - has)}")
-    if not importing and len(has - known - set(told)) > 1:
+    if not importing and not (known | set(reported)) <= has:
+        raise SystemExit(f"lost: {sorted((known | set(reported)) - has)}")
+    if not importing and len(has - known - set(reported)) > 1:
         raise SystemExit("more than the frame in work was kept and not told")
     return has
 
 
 def measured_frames(session: Session) -> Iterator[int]:
-    seen = session.overview()
-    for number, status in zip(seen.frame.tolist(), seen.status, strict=True):
+    overview = session.overview()
+    for number, status in zip(overview.frame.tolist(), overview.status, strict=True):
         if status:
             yield number
 
@@ -162,28 +162,28 @@ def main(folder: Path, kills: int, seed: int) -> None:
     path = folder / "killed.labsession"
     with Session.create(path) as session:
         session.set_setup(SAMPLE.read_text("utf-8"))
-    told = {"importing": 0, "measuring": 0}
+    counts = {"importing": 0, "measuring": 0}
     known: set[int] = set()
     for kill in range(kills):
         importing = kill < kills // 2
         if kill == kills // 2:
             with Session.open(path) as session:
                 session.import_recording(recording)
-        acknowledged = killed(path, recording, rng)
-        if not acknowledged:
+        reported = run_and_kill(path, recording, rng)
+        if not reported:
             raise SystemExit("it was killed before it did anything")
-        told["importing" if importing else "measuring"] += len(acknowledged)
+        counts["importing" if importing else "measuring"] += len(reported)
         if importing:
-            check(path, known, acknowledged, importing)
+            check(path, known, reported, importing)
             with Session.open(path) as session:
-                whole = len(session.frames) > 0
-            if whole:  # it came to its end before: begin again with none
+                complete = len(session.frames) > 0
+            if complete:  # the import finished before the kill: start again without frames
                 path.unlink()
                 with Session.create(path) as session:
                     session.set_setup(SAMPLE.read_text("utf-8"))
         else:
-            known = check(path, known, acknowledged, importing)
-    print(json.dumps({"kills": kills, "measured": len(known), **told}))
+            known = check(path, known, reported, importing)
+    print(json.dumps({"kills": kills, "measured": len(known), **counts}))
 
 
 if __name__ == "__main__":

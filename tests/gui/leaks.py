@@ -1,4 +1,4 @@
-"""What a test leaves behind: threads, processes, timers that tick on, files that stay open."""
+"""What a test leaves behind: threads, processes, running timers, open files."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from PySide6.QtCore import QThreadPool, QTimer
 from PySide6.QtWidgets import QApplication
 
 GRACE_S = 60.0
-"""What ends by itself, such as a process that was told to, may take so long."""
+"""Time for what ends by itself, such as a terminated process."""
 
 FILES = Path("/proc/self/fd")
 
 
-class Left:
-    """What was there before a test, to be compared with what is there after it.
+class LeakCheck:
+    """Compares threads, processes, timers and open files after a test with those before it.
 
     Parameters
     ----------
     folder
-        Files within it are looked at.
+        Only files within it are checked.
     """
 
     def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -38,15 +38,15 @@ class Left:
         self._timers: list[tuple[weakref.ref[QTimer], str]] = []
         started = QTimer.start
 
-        def start(timer: QTimer, *given: int) -> None:
+        def start(timer: QTimer, *args: int) -> None:
             caller = traceback.extract_stack(limit=2)[0]
             self._timers.append((weakref.ref(timer), f"{caller.filename}:{caller.lineno}"))
-            started(timer, *given)
+            started(timer, *args)
 
         monkeypatch.setattr(QTimer, "start", start)
 
-    def found(self) -> list[str]:
-        """What is left, in words; looked at again until it is gone or the time is up."""
+    def leaks(self) -> list[str]:
+        """Describe what is left; checked again until nothing is, or `GRACE_S` is over."""
         end = time.monotonic() + GRACE_S
         while (left := self._now()) and time.monotonic() < end:
             QApplication.processEvents()
@@ -80,7 +80,7 @@ class Left:
         for descriptor in os.listdir(FILES):
             try:
                 name = os.readlink(FILES / descriptor)
-            except FileNotFoundError:  # the one that lists them
+            except FileNotFoundError:  # the descriptor of the listing itself
                 continue
             if Path(name).is_relative_to(self._folder):
                 names.add(name)

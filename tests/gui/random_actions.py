@@ -1,12 +1,12 @@
-"""Random actions on the real window: by `test_random_actions.py`, or by hand for longer.
+"""Random actions on the real window: run by `test_random_actions.py`, or by hand for longer.
 
-``python -m tests.gui.random_actions SEED [STEPS] [RUNS]`` plays as many actions on every page, and
-prints what each kind did. What goes wrong is told with its seed and the actions before it; a seed
-plays the same actions again, as far as the work behind the window ends in the same order.
+``python -m tests.gui.random_actions SEED [STEPS] [RUNS]`` plays STEPS actions on all pages, and
+prints what each kind did. A fault is reported with its seed and the actions before it; the same
+seed plays the same actions, as long as background tasks end in the same order.
 
-A run goes wrong where anything is raised; where Qt or the log tells of a fault; where a change that
-the session acknowledged, or a number that was typed on the set-up page and taken, is not in the
-file; or where at the end a session or an export is not whole, or something half-written is left.
+A run fails if anything is raised; if Qt or the log reports a fault; if a change that the session
+acknowledged, or a number that the set-up page accepted, is not in the file; or if at the end a
+session or an export is damaged, or a partly written file is left.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ from labapp.log import NAME
 from labapp.session.file.database import SUFFIX
 from labapp.session.session import Session
 from tests.gui.random_hand import BUSY_S, RandomHand, Run, open_window
-from tests.gui.watching import Answers, Files, noted
+from tests.gui.watching import Answers, Files, recorded
 from tests.gui.witness import Witness
 
 STEPS = 300
 
 LAST_S = 60.0
-"""Work that was cancelled ends within this."""
+"""Cancelled tasks end within this time."""
 
 
 class Fault(Exception):
-    """Something went wrong; what, and what led to it."""
+    """A fault, with the actions that led to it."""
 
 
 class Player:
@@ -51,17 +51,17 @@ class Player:
     Parameters
     ----------
     seed
-        Of its actions.
+        Seed of the actions.
     folder
-        For all its files; empty.
+        For all files of the run; empty.
 
     Attributes
     ----------
     counts, seen, changed
-        How often each (page, kind of action) was played, did anything that can be seen, and
-        changed a session.
+        How often each (page, kind of action) was played, had a visible effect, and changed a
+        session.
     longest
-        The action that took longest: seconds, and which.
+        The slowest action: its duration (s) and its description.
     """
 
     def __init__(self, seed: int, folder: Path) -> None:
@@ -73,19 +73,19 @@ class Player:
         self._look: object = None
 
     def play(self, steps: int) -> Run:
-        """Play so many actions, close everything, and check all files.
+        """Play that many actions, close everything, and check all files.
 
         Raises
         ------
         Fault
-            If anything is wrong.
+            If any check fails.
         """
         faults: list[str] = []
         files, witness = Files(self.folder / "files"), Witness()
-        with noted(faults), witness.listening():
+        with recorded(faults), witness.listening():
             run = Run(files, witness, random.Random(self.seed), open_window(files.folder))
             run.faults = faults
-            with Answers(files, lambda: run.random, lambda what: note(run, what)).given():
+            with Answers(files, lambda: run.random, lambda what: note(run, what)).active():
                 run.window.files.open(files.sessions[0])
                 hand = RandomHand(run)
                 for number in range(steps):
@@ -95,8 +95,8 @@ class Player:
                         break
                 self._end(run)
         if faults:
-            told, actions = "\n".join(faults), "\n".join(run.played)
-            raise Fault(f"{told}\n\nseed {self.seed}, {len(run.played)} actions:\n{actions}")
+            messages, actions = "\n".join(faults), "\n".join(run.played)
+            raise Fault(f"{messages}\n\nseed {self.seed}, {len(run.played)} actions:\n{actions}")
         return run
 
     def _act(self, run: Run, hand: RandomHand, number: int) -> None:
@@ -110,14 +110,14 @@ class Player:
             return
         run.rest(BUSY_S if run.random.random() < 0.7 else 0.0)
         self.longest = max(self.longest, (time.perf_counter() - began, run.played[-1]))
-        former, self._look = self._look, look(run)
+        previous, self._look = self._look, look(run)
         self.counts[place] += 1
-        self.seen[place] += self._look != former
+        self.seen[place] += self._look != previous
         self.changed[place] += run.witness.changes != before
         run.check()
 
     def _end(self, run: Run) -> None:
-        """Cancel what is under way, close the window, and check every file."""
+        """Cancel running tasks, close the window, and check every file."""
         try:
             for task in run.window.workspace.tasks.active:
                 task.cancel()
@@ -125,21 +125,21 @@ class Player:
             run.window.close()
             QApplication.processEvents()
             run.check()
-            run.faults += not_whole(run.files)
+            run.faults += file_problems(run.files)
         except Exception:
             run.faults.append(traceback.format_exc())
 
 
 def note(run: Run, what: str) -> None:
-    """Add to what is told of the action under way."""
+    """Add to the description of the current action."""
     if run.played:
         run.played[-1] += f" [{what}]"
 
 
 def look(run: Run) -> object:
-    """What the operator sees."""
+    """What the operator sees, in a form that can be compared."""
     window = run.window
-    image = window.grab().toImage()  # kept: its bits go with it
+    image = window.grab().toImage()  # referenced, because its bits are deleted with it
     return (
         hash(bytes(image.constBits())),
         id(QApplication.focusWidget()),
@@ -150,24 +150,24 @@ def look(run: Run) -> object:
     )
 
 
-def not_whole(files: Files) -> list[str]:
-    """What is wrong with the sessions and exports of a run, and what is half-written, by lines."""
-    wrong = [f"left behind: {path.name}" for path in files.folder.rglob("*.part")]
+def file_problems(files: Files) -> list[str]:
+    """Problems of the sessions and exports of a run, and partly written files, one per line."""
+    lines = [f"left behind: {path.name}" for path in files.folder.rglob("*.part")]
     for path in sorted(files.folder.rglob(f"*{SUFFIX}")):
         if path.is_file() and path != files.garbage:
             with Session.open(path) as session:
-                there = session.missing_recording is None
-                problems = session.problems(recording=there)
-            wrong += [f"verify {path.name}: {problem}" for problem in problems]
+                recording_exists = session.missing_recording is None
+                problems = session.problems(recording=recording_exists)
+            lines += [f"verify {path.name}: {problem}" for problem in problems]
     for manifest in files.folder.rglob(MANIFEST):
-        wrong += [
+        lines += [
             f"export {manifest.parent.name}: {each}" for each in verify_export(manifest.parent)
         ]
-    return wrong
+    return lines
 
 
 def table(players: Sequence[Player]) -> str:
-    """How often each kind of action did anything, page by page, in all runs."""
+    """How often each kind of action had an effect, per page, over all runs."""
     counts, seen, changed = (
         sum((getattr(player, name) for player in players), Counter())
         for name in ("counts", "seen", "changed")
@@ -181,11 +181,11 @@ def table(players: Sequence[Player]) -> str:
 
 
 def main(seed: int, steps: int = STEPS, runs: int = 1) -> int:
-    """Play runs of seeds that follow each other; how many went wrong."""
+    """Play runs with consecutive seeds; return how many failed."""
     warnings.simplefilter("error", RuntimeWarning)
     app = QApplication([NAME])
     app.setQuitOnLastWindowClosed(False)
-    players, wrong = [], 0
+    players, failed = [], 0
     for number in range(seed, seed + runs):
         with tempfile.TemporaryDirectory() as folder:
             player = Player(number, Path(folder))
@@ -194,13 +194,13 @@ def main(seed: int, steps: int = STEPS, runs: int = 1) -> int:
             try:
                 player.play(steps)
             except Fault as fault:
-                wrong, verdict = wrong + 1, f"WRONG\n{fault}"
-            told = f"{player.counts.total()} actions, {player.changed.total()} changed a session"
+                failed, verdict = failed + 1, f"WRONG\n{fault}"
+            summary = f"{player.counts.total()} actions, {player.changed.total()} changed a session"
             took, (longest, action) = time.perf_counter() - began, player.longest
-            print(f"seed {number}: {told}, {took:.0f} s, longest {longest:.1f} s: {action[:90]}")
+            print(f"seed {number}: {summary}, {took:.0f} s, longest {longest:.1f} s: {action[:90]}")
             print(verdict, flush=True)
     print(table(players), flush=True)
-    return wrong
+    return failed
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""One random action on the real window: a key, a click, a drag, words, a file, a step, undo …"""
+"""Random actions on the real window: a key, a click, a drag, text, a file, a step, undo …"""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ PURPOSES = {
     "trends": ("Load table…", "Width", "Height"),
     "export": ("Measures", "PLY", "Export"),
 }
-"""Words of buttons, in the order in which they are pressed."""
+"""Texts of buttons, in the order in which they are pressed."""
 
 TEXTS = (
     *("", " ", "0", "-1", "1", "2", "7", "1e9", "-1e-9", "nan", "inf", "1,5", "3.14", "0.77"),
@@ -80,30 +80,30 @@ TEXTS = (
 SIZES = ((1280, 760), (1366, 768), (1920, 1080), (900, 600), (400, 300))
 
 BUSY_S = 0.4
-"""What an action began may be waited for so long; then the next comes."""
+"""Longest wait for a task that an action started; then the next action follows."""
 
 PATIENCE_S = 3.0
-"""Who means to correct dots waits for them."""
+"""Longest wait for dots before they are corrected."""
 
 
 @dataclass
 class Run:
-    """A run under way.
+    """The state of a run.
 
     Parameters
     ----------
     files
-        What can be chosen.
+        Files that can be chosen.
     witness
-        Knows what each session must hold.
+        Knows what each session must contain.
     random
-        Of the action under way.
+        Random numbers of the current action.
     window
-        The one that is open.
+        The open window.
     played
-        What was done, an action a line.
+        The actions so far, one per line.
     faults
-        What went wrong.
+        Faults so far.
     """
 
     files: Files
@@ -115,25 +115,25 @@ class Run:
 
     @property
     def page(self) -> str:
-        """Key of the page in view."""
+        """Key of the visible page."""
         page = self.window.page
         return "welcome" if page is None else page.key
 
     def check(self) -> None:
-        """Hold that every file is as the acknowledged changes left it."""
+        """Check that every file contains the acknowledged changes."""
         self.faults += self.witness.differences()
 
     def rest(self, most_s: float) -> None:
-        """Let the work behind the window go on, until it is done or the time is over."""
-        until = time.monotonic() + most_s
+        """Let background tasks run until they are done or the time is over."""
+        end = time.monotonic() + most_s
         QApplication.processEvents()
-        while self.window.workspace.tasks.active and time.monotonic() < until:
+        while self.window.workspace.tasks.active and time.monotonic() < end:
             time.sleep(0.005)
             QApplication.processEvents()
 
 
 def open_window(folder: Path) -> MainWindow:
-    """Start as the program does, with what was remembered."""
+    """Open a window with the stored preferences, as the program does."""
     file = folder / "preferences.json"
     preferences, problem = read_preferences(file) if file.exists() else (Preferences(), "")
     assert not problem, problem
@@ -148,17 +148,17 @@ def open_window(folder: Path) -> MainWindow:
 
 
 class RandomHand:
-    """Does one thing or another; each method says what it did.
+    """Performs random actions; each method describes what it did.
 
     Parameters
     ----------
     run
-        Whose window.
+        The run whose window is used.
 
     Attributes
     ----------
     kinds
-        By name: how often, and the method.
+        By name: the relative frequency and the method.
     """
 
     def __init__(self, run: Run) -> None:
@@ -174,19 +174,19 @@ class RandomHand:
         }  # fmt: skip
 
     def act(self, kind: str) -> str:
-        """Do something of a kind."""
+        """Perform an action of this kind."""
         return self.kinds[kind][1]()
 
     # --- keys and words ---------------------------------------------------------------------
 
-    def _press(self, key: Qt.Key, held: Qt.KeyboardModifier = NONE) -> None:
-        if QApplication.activeWindow() is None:  # after a dialog; a desktop gives it back
+    def _press(self, key: Qt.Key, modifiers: Qt.KeyboardModifier = NONE) -> None:
+        if QApplication.activeWindow() is None:  # after a dialog; a desktop would activate it again
             _activate(self._run.window)
-        QTest.keyClick(QApplication.focusWidget() or self._run.window, key, held)
+        QTest.keyClick(QApplication.focusWidget() or self._run.window, key, modifiers)
         QApplication.processEvents()
 
     def _write(self, text: str, widget: QWidget) -> None:
-        """Type on what has the focus, or on a widget; QTest types ASCII alone."""
+        """Type into the widget with the focus, or into `widget`; QTest types ASCII only."""
         for letter in text:
             focused = QApplication.focusWidget() or widget
             if letter.isascii():
@@ -198,20 +198,20 @@ class RandomHand:
     def _key(self) -> str:
         rng = self._run.random
         name = rng.choice(KEYS)
-        held = rng.choices([NONE, SHIFT, CONTROL, ALT], [12, 3, 4, 1])[0]
-        if held == CONTROL and name == "W":
-            held = NONE
+        modifiers = rng.choices([NONE, SHIFT, CONTROL, ALT], [12, 3, 4, 1])[0]
+        if modifiers == CONTROL and name == "W":
+            modifiers = NONE
         times = rng.choice([1, 1, 1, 2, 5])
         for _ in range(times):
-            self._press(getattr(KEY, f"Key_{name}"), held)
-        return f"{held.name} {name} × {times}"
+            self._press(getattr(KEY, f"Key_{name}"), modifiers)
+        return f"{modifiers.name} {name} × {times}"
 
     def _menu(self) -> str:
         actions = self._run.window.menus.actions
         usable = [
             name
-            for name, made in actions.items()
-            if made.isEnabled() and name not in ("quit", "full_screen")
+            for name, action in actions.items()
+            if action.isEnabled() and name not in ("quit", "full_screen")
         ]
         name = self._run.random.choice(usable)
         actions[name].trigger()
@@ -223,11 +223,11 @@ class RandomHand:
         return str(number)
 
     def _undo(self) -> str:
-        held = self._run.random.choice([CONTROL, CONTROL | SHIFT])
+        modifiers = self._run.random.choice([CONTROL, CONTROL | SHIFT])
         times = self._run.random.choice([1, 1, 2, 4])
         for _ in range(times):
-            QTest.keyClick(self._run.window, KEY.Key_Z, held)
-        return f"{'undo' if held == CONTROL else 'redo'} × {times}"
+            QTest.keyClick(self._run.window, KEY.Key_Z, modifiers)
+        return f"{'undo' if modifiers == CONTROL else 'redo'} × {times}"
 
     def _frame(self) -> str:
         names = "previous next first last play next_doubtful previous_corrected".split()
@@ -237,12 +237,12 @@ class RandomHand:
         return action.objectName()
 
     def _measure(self) -> str:
-        held = self._run.random.choice([NONE, SHIFT])
-        QTest.keyClick(self._run.window, KEY.Key_F5, held)
-        return f"{held.name} F5"
+        modifiers = self._run.random.choice([NONE, SHIFT])
+        QTest.keyClick(self._run.window, KEY.Key_F5, modifiers)
+        return f"{modifiers.name} F5"
 
     def _pedal(self) -> str:
-        """Step on a pedal that was learned."""
+        """Press a configured pedal."""
         name = self._run.random.choice(list(CALLS.values()))
         self._run.window.workspace.foot_switches.pressed.emit(name)
         return name
@@ -254,23 +254,23 @@ class RandomHand:
     # --- the mouse --------------------------------------------------------------------------
 
     def _seen(self, *kinds: type[QWidget]) -> list[QWidget]:
-        """Enabled widgets of these kinds that the mouse can meet, in a fixed order."""
-        found = []
+        """Enabled widgets of these types that the mouse can reach, in a fixed order."""
+        reachable = []
         for window in QApplication.topLevelWidgets():
             if not window.isVisible() or isinstance(window, QMenu):
                 continue
             for widget in window.findChildren(QWidget):
                 if isinstance(widget, kinds) and widget.isVisible() and widget.isEnabled():
-                    met = window.childAt(widget.mapTo(window, widget.rect().center()))
-                    if met is not None and (met is widget or widget.isAncestorOf(met)):
-                        found.append(widget)
-        return found
+                    target = window.childAt(widget.mapTo(window, widget.rect().center()))
+                    if target is not None and (target is widget or widget.isAncestorOf(target)):
+                        reachable.append(widget)
+        return reachable
 
     def _place(self, widget: QWidget) -> QPoint:
-        """Somewhere on what is seen of a widget, in its window."""
-        rng, seen = self._run.random, widget.visibleRegion().boundingRect()
-        across, down = (rng.randrange(max(1, size)) for size in (seen.width(), seen.height()))
-        return widget.mapTo(widget.window(), seen.topLeft() + QPoint(across, down))
+        """A random point in the visible part of a widget, in window coordinates."""
+        rng, visible = self._run.random, widget.visibleRegion().boundingRect()
+        across, down = (rng.randrange(max(1, size)) for size in (visible.width(), visible.height()))
+        return widget.mapTo(widget.window(), visible.topLeft() + QPoint(across, down))
 
     def _click(self) -> str:
         rng = self._run.random
@@ -280,56 +280,56 @@ class RandomHand:
         )
         held = rng.choices([NONE, SHIFT, CONTROL], [8, 1, 1])[0]
         double = rng.random() < 0.15
-        place = self._place(widget)
-        told = f"{named(widget)} {button[0].name} {held.name} {place.toTuple()}{' twice' * double}"
+        pos = self._place(widget)
+        text = f"{describe(widget)} {button[0].name} {held.name} {pos.toTuple()}{' twice' * double}"
         _activate(widget)
         act = QTest.mouseDClick if double else QTest.mouseClick
-        act(widget.window().windowHandle(), button[0], held, place)
-        return told
+        act(widget.window().windowHandle(), button[0], held, pos)
+        return text
 
     def _button(self) -> str:
-        found = self._seen(QAbstractButton)
-        return self._push(self._run.random.choice(found)) if found else "none"
+        buttons = self._seen(QAbstractButton)
+        return self._push(self._run.random.choice(buttons)) if buttons else "none"
 
     def _push(self, button: QWidget) -> str:
-        told, window = named(button), button.window()
+        description, window = describe(button), button.window()
         _activate(button)
         hot = QPoint(min(10, button.width() // 2), button.height() // 2)
         QTest.mouseClick(window.windowHandle(), BUTTON.LeftButton, NONE, button.mapTo(window, hot))
-        return told
+        return description
 
     def _drag(self) -> str:
-        """Drag in the largest parts of the page, where pictures, plots and views are."""
+        """Drag in the largest widgets of the page: pictures, plots and views."""
         rng = self._run.random
-        found = sorted(self._seen(QWidget), key=lambda each: each.width() * each.height())[-25:]
-        widget = rng.choice([each for each in found if each.layout() is None] or found)
-        told, handle = named(widget), widget.window().windowHandle()
+        widgets = sorted(self._seen(QWidget), key=lambda each: each.width() * each.height())[-25:]
+        widget = rng.choice([each for each in widgets if each.layout() is None] or widgets)
+        description, handle = describe(widget), widget.window().windowHandle()
         places = [self._place(widget) for _ in range(rng.randint(2, 4))]
         button = rng.choices([BUTTON.LeftButton, BUTTON.MiddleButton], [5, 1])[0]
-        held = rng.choices([NONE, SHIFT], [5, 1])[0]
-        QTest.mousePress(handle, button, held, places[0])
+        modifiers = rng.choices([NONE, SHIFT], [5, 1])[0]
+        QTest.mousePress(handle, button, modifiers, places[0])
         for place in places[1:]:
             QTest.mouseMove(handle, place)
             QApplication.processEvents()
-        QTest.mouseRelease(handle, button, held, places[-1])
-        return f"{told} {[place.toTuple() for place in places]}"
+        QTest.mouseRelease(handle, button, modifiers, places[-1])
+        return f"{description} {[place.toTuple() for place in places]}"
 
     def _wheel(self) -> str:
         widget = self._run.random.choice(self._seen(QWidget))
-        at, way = QPointF(widget.rect().center()), self._run.random.choice([-240, -120, 120, 240])
-        told = named(widget)
+        at, delta = QPointF(widget.rect().center()), self._run.random.choice([-240, -120, 120, 240])
+        description = describe(widget)
         event = QWheelEvent(
-            *(at, QPointF(widget.mapToGlobal(at)), QPoint(), QPoint(0, way)),
+            *(at, QPointF(widget.mapToGlobal(at)), QPoint(), QPoint(0, delta)),
             *(BUTTON.NoButton, self._run.random.choice([NONE, NONE, CONTROL, SHIFT])),
             *(Qt.ScrollPhase.NoScrollPhase, False),
         )
         QApplication.sendEvent(widget, event)
-        return f"{told} {way}"
+        return f"{description} {delta}"
 
     # --- fields, lists, tables --------------------------------------------------------------
 
     def _type(self) -> str:
-        """Write into a field and finish somehow; what the set-up page takes must be kept."""
+        """Type into a field and finish somehow; what the set-up page accepts must be stored."""
         run = self._run
         fields = [each for each in self._seen(NumberField, TextField) if _editor(each).isEnabled()]
         if not fields:
@@ -354,24 +354,24 @@ class RandomHand:
         }
         way = run.random.choices(list(ways), [6, 4, 3, 1, 1, 2])[0]
         page, session, key = run.page, run.window.workspace.session, self._key_of(chosen)
-        told = f"{chosen.label.text()} ← {text[:40]!r}, {way}"
+        summary = f"{chosen.label.text()} ← {text[:40]!r}, {way}"
         ways[way]()
         finished = way not in ("nothing", "another step") or run.page != page
         if key and good and finished and session is not None and not session.read_only:
-            wanted = text if isinstance(chosen, TextField) else float(text)
-            held = run.witness.value(session.path, key)
-            if held != wanted:
+            expected = text if isinstance(chosen, TextField) else float(text)
+            value = run.witness.value(session.path, key)
+            if value != expected:
                 unread = run.window.status_line.unread
                 run.faults.append(
-                    f"{told}: {session.path.name} holds {held!r}, the field {chosen.value()!r} "
+                    f"{summary}: {session.path.name} holds {value!r}, the field {chosen.value()!r} "
                     f"and says {chosen.problem.text()!r}; "
                     f"typed on {typed_on[0]}, at the end on {typed_on[1]}; "
                     f"problems not read: {unread}"
                 )
-        return told
+        return summary
 
     def _text_for(self, chosen: Field) -> tuple[str, bool]:
-        """A text, and whether it is one that the field takes."""
+        """A text, and whether the field accepts it."""
         rng = self._run.random
         if rng.random() < 0.35:
             return rng.choice(TEXTS), False
@@ -383,7 +383,7 @@ class RandomHand:
         return text, chosen.lowest <= float(text) <= chosen.highest
 
     def _key_of(self, chosen: Field) -> str:
-        """Where the session keeps what a field of the set-up page holds; nothing of any other."""
+        """The session's key for a field of the set-up page; "" for other fields."""
         page = self._run.window.page
         if isinstance(page, SetupPage):
             for key, each in (*page.rig_fields.items(), *page.record_fields.items()):
@@ -392,45 +392,45 @@ class RandomHand:
         return ""
 
     def _choose(self) -> str:
-        found = self._seen(QComboBox)
-        if not found:
+        boxes = self._seen(QComboBox)
+        if not boxes:
             return "none"
-        box = self._run.random.choice(found)
+        box = self._run.random.choice(boxes)
         assert isinstance(box, QComboBox)
-        told = named(box)
+        description = describe(box)
         _activate(box)
         box.setFocus(Qt.FocusReason.MouseFocusReason)
         for _ in range(self._run.random.randint(1, 3)):
             self._press(self._run.random.choice([KEY.Key_Down, KEY.Key_Up, KEY.Key_End]))
-        return f"{told} {box.currentText()}"
+        return f"{description} {box.currentText()}"
 
     def _cell(self) -> str:
-        rng, found = self._run.random, self._seen(QTableView)
-        tables = [t for t in found if isinstance(t, QTableView) and t.model().rowCount()]
+        rng, views = self._run.random, self._seen(QTableView)
+        tables = [t for t in views if isinstance(t, QTableView) and t.model().rowCount()]
         if not tables:
             return "none"
         table = rng.choice(tables)
         model, port, window = table.model(), table.viewport(), table.window()
         row, column = rng.randrange(model.rowCount()), rng.randrange(model.columnCount())
         place = port.mapTo(window, table.visualRect(model.index(row, column)).center())
-        told = f"{named(table)} {row}, {column}"
+        description = f"{describe(table)} {row}, {column}"
         _activate(table)
         QTest.mouseClick(window.windowHandle(), BUTTON.LeftButton, NONE, place)
         text = rng.choice([*TEXTS, "4.65", "6.22", "2.75"])[:20]
         self._write(text, table)
         self._press(rng.choice([KEY.Key_Return, KEY.Key_Tab, KEY.Key_Escape]))
-        return f"{told} ← {text!r}"
+        return f"{description} ← {text!r}"
 
     def _purpose(self) -> str:
-        """What the page in view is for, as one who knows it does it."""
+        """Use the visible page for its purpose, as an experienced operator does."""
         page, rng = self._run.window.page, self._run.random
         _activate(self._run.window)
         if isinstance(page, DotsPage):
-            self._run.rest(PATIENCE_S)  # dots are looked for
+            self._run.rest(PATIENCE_S)  # dots are being detected
             page.view.setFocus()
-            (held, key), edit = rng.choice(CHOOSING), rng.choice(EDITING)
+            (modifiers, key), edit = rng.choice(CHOOSING), rng.choice(EDITING)
             for _ in range(rng.choice([1, 1, 3])):
-                self._press(key, held)
+                self._press(key, modifiers)
             self._press(edit[1], edit[0])
             return f"{key.name}, {edit[0].name} {edit[1].name}"
         if isinstance(page, SetupPage):
@@ -447,9 +447,9 @@ class RandomHand:
         QApplication.processEvents()
         done = []
         for words in PURPOSES.get(self._run.page, ()):
-            found = [each for each in self._seen(QAbstractButton) if _words(each) == words]
-            if found and rng.random() < 0.8:
-                done.append(self._push(found[0]))
+            buttons = [each for each in self._seen(QAbstractButton) if _words(each) == words]
+            if buttons and rng.random() < 0.8:
+                done.append(self._push(buttons[0]))
                 self._run.rest(BUSY_S)
         return ", ".join(done)
 
@@ -466,7 +466,7 @@ class RandomHand:
         return ", ".join(path.name for path in paths)
 
     def _reopen(self) -> str:
-        """Close the session and open it again, or another, or make one."""
+        """Close the session, then open it again, open another, or create one."""
         run = self._run
         session = run.window.workspace.session
         path = run.random.choice(run.files.sessions)
@@ -481,7 +481,7 @@ class RandomHand:
         return path.name
 
     def _quit(self) -> str:
-        """Quit, start again, and open what was open."""
+        """Quit, start again, and open the last session."""
         run = self._run
         run.window.close()
         QApplication.processEvents()
@@ -498,18 +498,18 @@ class RandomHand:
         return f"{size}"
 
 
-def named(widget: QWidget) -> str:
-    """A widget in words."""
+def describe(widget: QWidget) -> str:
+    """Describe a widget."""
     words = widget.accessibleName() or widget.objectName() or _words(widget)
     return f"{type(widget).__name__} {words}".strip()
 
 
 def _activate(widget: QWidget) -> None:
-    """Bring its window to the front, as a desktop does at a click."""
+    """Activate the window of a widget, as a desktop does at a click."""
     if not widget.isActiveWindow():
         widget.window().activateWindow()
         QApplication.processEvents()
-    if not widget.isActiveWindow():  # offscreen, a menu that was closed may be left the active one
+    if not widget.isActiveWindow():  # offscreen, a closed menu may remain the active window
         QApplication.setActiveWindow(widget.window())
 
 

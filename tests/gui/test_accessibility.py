@@ -1,4 +1,4 @@
-"""Every page, and the dialogs, by keyboard alone and as a screen reader has them."""
+"""Every page and dialog is usable by keyboard and with a screen reader."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ ROLES: tuple[tuple[type[QWidget], set[QAccessible.Role]], ...] = (
     (Drawn, {Role.Graphic}),
     (QAbstractScrollArea, {Role.Client}),
 )
-"""What a widget may be to a screen reader, the first that it is an instance of."""
+"""Allowed accessible roles by widget type; the first matching type counts."""
 
 CANVASES = {
     "plane": {"Picture of the target"},
@@ -81,36 +81,36 @@ CANVASES = {
     "surface": {"The pool in 3-D", "Reflected dots on the imaging plane", "Height profile"},
     "trends": {"Trends over the recording"},
 }
-"""What is drawn on a page and must be reached."""
+"""Accessible names of the canvases of each page, which the keyboard must reach."""
 
 MOST = 200
-"""No page has so many stops."""
+"""More focus stops than any page has."""
 
 
 @pytest.fixture
 def opened(window: MainWindow, copy_sample: CopySample, qtbot: QtBot) -> MainWindow:
-    """The window, active, with a measured session."""
+    """The active window with a measured session."""
     assert window.files.open(copy_sample("gtaw"))
     qtbot.waitUntil(window.isActiveWindow)
     return window
 
 
 def stops(window: QWidget, key: Qt.Key) -> list[QWidget]:
-    """What a key leads to, from what has the keys now until it is come round."""
-    found: list[QWidget] = []
+    """Widgets that a key moves the focus to, until the cycle is complete."""
+    visited: list[QWidget] = []
     for _ in range(MOST):
         QTest.keyClick(QApplication.focusWidget() or window, key)
-        place = QApplication.focusWidget()
-        assert place is not None, "the keys went to nothing"
-        if place in found:
-            assert place is found[0], f"caught at {spoken(place)}"
-            return found
-        found.append(place)
+        focused = QApplication.focusWidget()
+        assert focused is not None, "the keys went to nothing"
+        if focused in visited:
+            assert focused is visited[0], f"caught at {spoken(focused)}"
+            return visited
+        visited.append(focused)
     raise AssertionError(f"{key} does not come round")
 
 
 def controls(window: QWidget) -> set[QWidget]:
-    """What can be given the keys: enabled, in view, and no part of another control."""
+    """Widgets that can get the focus: enabled, visible, and not part of another control."""
     tab = Qt.FocusPolicy.TabFocus
     return {
         each
@@ -124,19 +124,19 @@ def controls(window: QWidget) -> set[QWidget]:
 
 
 def spoken(widget: QWidget) -> str:
-    """The name that is read out: the widget's own and that of the label before it."""
-    told = QAccessible.queryAccessibleInterface(widget)
+    """The name that a screen reader speaks: the label's and the widget's own."""
+    interface = QAccessible.queryAccessibleInterface(widget)
     labels = [
         label.text(QAccessible.Text.Name)
-        for label, kind in told.relations()
+        for label, kind in interface.relations()
         if kind & QAccessible.RelationFlag.Label
     ]
-    return " ".join([*labels, widget.accessibleName() or told.text(QAccessible.Text.Name)])
+    return " ".join([*labels, widget.accessibleName() or interface.text(QAccessible.Text.Name)])
 
 
 def check_spoken(widget: QWidget) -> None:
-    """A name in words, a role that fits, and what it does."""
-    told = QAccessible.queryAccessibleInterface(widget)
+    """Check that a widget has a name in words, a suitable role and a description."""
+    interface = QAccessible.queryAccessibleInterface(widget)
     name = spoken(widget).strip()
     assert len(name) > 1 or name.isalpha(), f"{widget} has no name"
     assert type(widget).__name__ not in name
@@ -145,15 +145,15 @@ def check_spoken(widget: QWidget) -> None:
         assert widget.accessibleName(), widget.currentText()
     roles = next((roles for kind, roles in ROLES if isinstance(widget, kind)), None)
     assert roles is not None, f"{widget}: what is it to a screen reader?"
-    assert told.role() in roles, f"{name}: {told.role()}"
-    described = told.text(QAccessible.Text.Description)
+    assert interface.role() in roles, f"{name}: {interface.role()}"
+    described = interface.text(QAccessible.Text.Description)
     assert described or isinstance(widget, QTabBar), f"{name} says nothing of what it does"
     if not isinstance(widget, QTabBar | QAbstractScrollArea | Drawn | QAbstractSlider):
         assert widget.toolTip(), f"{name} has no tip"
 
 
 def check_round(window: QWidget) -> list[QWidget]:
-    """Tab and Shift+Tab reach every control and come round; each says what it is."""
+    """Check that Tab and Shift+Tab cycle through all controls, and that each is described."""
     forward = stops(window, Qt.Key.Key_Tab)
     missed = controls(window) - set(forward)
     assert not missed, f"not reached: {sorted(spoken(each) for each in missed)}"
@@ -165,7 +165,7 @@ def check_round(window: QWidget) -> list[QWidget]:
 
 
 @pytest.mark.parametrize("step", [step.key for step in STEPS])
-def test_a_page_by_keyboard(opened: MainWindow, step: str, qtbot: QtBot):
+def test_page_is_keyboard_accessible(opened: MainWindow, step: str, qtbot: QtBot):
     opened.do(f"step_{step}")
     page = opened.page
     assert page is not None
@@ -178,14 +178,14 @@ def test_a_page_by_keyboard(opened: MainWindow, step: str, qtbot: QtBot):
     assert empty or CANVASES.get(step, set()) <= names
     for drawn in page.findChildren(Drawn):
         if drawn.isVisible():
-            told = QAccessible.queryAccessibleInterface(drawn)
-            assert told.role() in (Role.Graphic, Role.Chart)
+            interface = QAccessible.queryAccessibleInterface(drawn)
+            assert interface.role() in (Role.Graphic, Role.Chart)
             assert drawn.accessibleName()
             assert drawn.accessibleDescription()
 
 
 @pytest.mark.parametrize("tab", [0, 1, 2])
-def test_every_part_of_the_set_up(opened: MainWindow, tab: int):
+def test_setup_tabs_are_keyboard_accessible(opened: MainWindow, tab: int):
     opened.show_step("setup")
     tabs = opened.page.tabs  # type: ignore[union-attr]
     bar = tabs.tabBar()
@@ -196,7 +196,7 @@ def test_every_part_of_the_set_up(opened: MainWindow, tab: int):
     check_round(opened)
 
 
-def test_two_schemes_compared(opened: MainWindow, qtbot: QtBot):
+def test_scheme_comparison_is_keyboard_accessible(opened: MainWindow, qtbot: QtBot):
     opened.show_step("surface")
     opened.page.comparing.click()  # type: ignore[union-attr]
     qtbot.waitUntil(lambda: not opened.workspace.tasks.active)
@@ -204,8 +204,8 @@ def test_two_schemes_compared(opened: MainWindow, qtbot: QtBot):
     check_round(opened)
 
 
-def test_a_small_screen_at_150_percent_holds_every_page(opened: MainWindow, qtbot: QtBot):
-    """1366 × 768 px are 911 × 512 of the window's own then."""
+def test_pages_fit_a_small_screen_at_150_percent(opened: MainWindow, qtbot: QtBot):
+    """1366 × 768 px are then 911 × 512 logical pixels."""
     opened.do("log")
     for step in STEPS:
         opened.show_step(step.key)
@@ -226,7 +226,9 @@ def test_a_small_screen_at_150_percent_holds_every_page(opened: MainWindow, qtbo
                 assert button.width() >= button.sizeHint().width() - 1, button.text()
 
 
-def test_the_welcome_page_by_keyboard(window: MainWindow, copy_sample: CopySample, qtbot: QtBot):
+def test_welcome_page_is_keyboard_accessible(
+    window: MainWindow, copy_sample: CopySample, qtbot: QtBot
+):
     window.files.open(copy_sample("thumb_tack"))
     window.do("close")
     qtbot.waitUntil(lambda: window.isActiveWindow() and not window.workspace.tasks.active)
@@ -237,29 +239,29 @@ def test_the_welcome_page_by_keyboard(window: MainWindow, copy_sample: CopySampl
     qtbot.waitUntil(lambda: window.workspace.session is not None)
 
 
-def test_f6_goes_through_the_parts_of_the_window(opened: MainWindow, qtbot: QtBot):
+def test_f6_cycles_through_the_parts_of_the_window(opened: MainWindow, qtbot: QtBot):
     opened.show_step("dots")
     opened.do("log")
     qtbot.waitUntil(lambda: not opened.workspace.tasks.active)
     parts = [opened.step_list, opened.page, opened.side_panel, opened.timeline, opened.log_panel]
 
-    def place() -> int:
+    def focused_part() -> int:
         focus = QApplication.focusWidget()
         return next(k for k, part in enumerate(parts) if part is focus or part.isAncestorOf(focus))
 
     opened.step_list.setFocus()
-    seen = []
-    for key in [Qt.KeyboardModifier.NoModifier] * 5 + [Qt.KeyboardModifier.ShiftModifier] * 5:
-        QTest.keyClick(QApplication.focusWidget(), Qt.Key.Key_F6, key)
-        seen.append(place())
-    assert seen == [1, 2, 3, 4, 0, 4, 3, 2, 1, 0]
+    visited = []
+    for modifier in [Qt.KeyboardModifier.NoModifier] * 5 + [Qt.KeyboardModifier.ShiftModifier] * 5:
+        QTest.keyClick(QApplication.focusWidget(), Qt.Key.Key_F6, modifier)
+        visited.append(focused_part())
+    assert visited == [1, 2, 3, 4, 0, 4, 3, 2, 1, 0]
     opened.say("The recording is gone", True)
     parts.append(opened.status_line)
     QTest.keyClick(opened, Qt.Key.Key_F6, Qt.KeyboardModifier.ShiftModifier)
     assert QApplication.focusWidget() is opened.status_line.dismiss_button
 
 
-def test_f6_comes_back_to_where_the_keys_were(opened: MainWindow):
+def test_f6_returns_to_the_last_focused_widget(opened: MainWindow):
     opened.show_step("trends")
     button = opened.timeline.play_button
     button.setFocus()
@@ -268,20 +270,20 @@ def test_f6_comes_back_to_where_the_keys_were(opened: MainWindow):
     assert QApplication.focusWidget() is button
 
 
-def test_a_step_by_its_key_takes_the_keys_along(opened: MainWindow):
+def test_step_shortcuts_move_the_focus_to_the_page(opened: MainWindow):
     for step in STEPS:
         opened.side_panel.setFocus()
         opened.do(f"step_{step.key}")
         focus = QApplication.focusWidget()
-        seen = opened.stack.currentWidget()
-        assert focus is seen or seen.isAncestorOf(focus)
-        assert seen.accessibleName() == step.title
+        shown = opened.stack.currentWidget()
+        assert focus is shown or shown.isAncestorOf(focus)
+        assert shown.accessibleName() == step.title
     opened.step_list.setFocus()
     QTest.keyClick(opened.step_list, Qt.Key.Key_Up)
     assert QApplication.focusWidget() is opened.step_list
 
 
-def test_a_screen_reader_moves_the_frame(opened: MainWindow):
+def test_screen_reader_changes_the_frame(opened: MainWindow):
     scrubber = opened.timeline.scrubber
     value = QAccessible.queryAccessibleInterface(scrubber).valueInterface()
     assert (value.minimumValue(), value.maximumValue()) == (0, 29)
@@ -292,27 +294,27 @@ def test_a_screen_reader_moves_the_frame(opened: MainWindow):
     assert "Frame 3" in scrubber.accessibleDescription()
 
 
-def test_every_action_has_a_key_or_a_letter_of_its_own(opened: MainWindow):
+def test_every_action_has_a_shortcut_or_unique_mnemonic(opened: MainWindow):
     for action in ACTIONS:
         assert action.key or "&" in action.text, action.name
     menus = [action.menu() for action in opened.menuBar().actions()]
     menus += [menu for menu in opened.findChildren(QMenu) if menu not in menus]
-    check_letters([action.text() for action in opened.menuBar().actions()])
+    check_mnemonics_unique([action.text() for action in opened.menuBar().actions()])
     for menu in menus:
         actions = [each for each in menu.actions() if not each.isSeparator()]
-        check_letters([each.text() for each in actions])
+        check_mnemonics_unique([each.text() for each in actions])
         for each in actions:
             assert each.menu() is not None or each.toolTip(), each.text()
 
 
-def check_letters(texts: list[str]) -> None:
+def check_mnemonics_unique(texts: list[str]) -> None:
     plain = [text.replace("&&", "") for text in texts]
     letters = [text[text.index("&") + 1].lower() for text in plain if "&" in text]
     assert len(set(letters)) == len(letters), texts
 
 
 @pytest.mark.parametrize("kind", ["guide", "keys", "about"])
-def test_the_help_by_keyboard(window: MainWindow, kind: str, qtbot: QtBot):
+def test_help_is_keyboard_accessible(window: MainWindow, kind: str, qtbot: QtBot):
     window.do(kind)
     dialog = next(each for each in window.findChildren(HelpDialog))
     qtbot.waitUntil(dialog.isActiveWindow)
@@ -323,7 +325,7 @@ def test_the_help_by_keyboard(window: MainWindow, kind: str, qtbot: QtBot):
 
 @pytest.mark.usefixtures("little_search")
 @pytest.mark.parametrize("key", TOOLS)
-def test_a_tool_by_keyboard(opened: MainWindow, key: str, qtbot: QtBot):
+def test_tool_windows_are_keyboard_accessible(opened: MainWindow, key: str, qtbot: QtBot):
     opened.do(key)
     tool = opened.findChild(ToolWindow, f"tool-{key}")
     assert tool is not None
@@ -346,14 +348,14 @@ def test_a_tool_by_keyboard(opened: MainWindow, key: str, qtbot: QtBot):
 
 
 def fill_simulator(tool: Any, qtbot: QtBot) -> None:
-    """Its first frame is drawn; something was written."""
+    """Show the first frame and a written recording."""
     qtbot.waitUntil(lambda: tool.preview is not None)
     tool.made = tool.preview.scenario, Path("here")
     tool.show_state()
 
 
 def fill_adviser(tool: Any, qtbot: QtBot) -> None:
-    """It has an advice: that nothing is possible is found soonest."""
+    """Show an advice: the one that nothing is possible takes least time."""
     for key, ends in (("pools.height_mm", (0.5, 0.6)), ("bench.distance_mm", (40.0, 40.0))):
         tool.ranges[key].set_value(ends)
     tool.effort.set_value("quick")
@@ -364,20 +366,20 @@ def fill_adviser(tool: Any, qtbot: QtBot) -> None:
 
 
 def fill_analysis(tool: Any, qtbot: QtBot) -> None:
-    """A part is done."""
+    """Show one finished part."""
     table = Table("error_budget", "Budget", ("source", "predicted_pct"), (("dots", 1.0),))
     tool.show_part(AnalysisPart((table,), {}, (table,)))
 
 
 def fill_dynamics(tool: Any, qtbot: QtBot) -> None:
-    """It has modes, an event and a response."""
+    """Show modes, an event and a response."""
     qtbot.waitUntil(lambda: not tool.working)
     tool.show_found(draw(analysed_step(), lambda: None))
     tool.events.selectRow(0)
 
 
 def fill_study(tool: Any, qtbot: QtBot) -> None:
-    """It has a recording, and results."""
+    """Show a recording and results."""
     recording = StudyRecording("first", Path("first.avi"), Path("setup.toml"))
     status = RecordingStatus(recording, "done", "", 3, 3)
     plan = StudyPlan("study", (recording,), ())
@@ -396,7 +398,7 @@ FILL = {
 }
 
 
-def test_a_label_that_goes_takes_nothing_along_after_a_walk_through_the_parts(opened: MainWindow):
+def test_deleting_a_label_deletes_no_other_widget(opened: MainWindow):
     box, label = QSpinBox(opened), QLabel(opened)
     line = box.lineEdit()
     for _ in range(4):
@@ -407,8 +409,8 @@ def test_a_label_that_goes_takes_nothing_along_after_a_walk_through_the_parts(op
     assert isValid(opened.windowHandle())
 
 
-def test_the_question_whether_to_open_read_only(window: MainWindow, copy_sample: CopySample):
-    path, asked = copy_sample("thumb_tack"), []
+def test_read_only_question_is_keyboard_accessible(window: MainWindow, copy_sample: CopySample):
+    path, reached = copy_sample("thumb_tack"), []
 
     def look() -> None:
         box = QApplication.activeModalWidget()
@@ -417,17 +419,17 @@ def test_the_question_whether_to_open_read_only(window: MainWindow, copy_sample:
             return
         assert isinstance(box, QMessageBox)
         try:
-            asked.extend(check_round(box))
+            reached.extend(check_round(box))
         finally:
             QTest.keyClick(box, Qt.Key.Key_Escape)
 
     QTimer.singleShot(50, look)
     assert not dialogs.ask_read_only(window, path)
-    assert len(asked) == 2
+    assert len(reached) == 2
 
 
-def test_a_walk_finds_what_cannot_be_reached(qtbot: QtBot):
-    """The walk itself, on a window with every fault."""
+def test_check_round_finds_accessibility_faults(qtbot: QtBot):
+    """`check_round` on windows with one fault each."""
 
     class Greedy(QLineEdit):
         def event(self, event):  # type: ignore[no-untyped-def]
@@ -435,7 +437,7 @@ def test_a_walk_finds_what_cannot_be_reached(qtbot: QtBot):
                 return True
             return super().event(event)
 
-    def built(*widgets: QWidget) -> QDialog:
+    def shown(*widgets: QWidget) -> QDialog:
         dialog = QDialog()
         qtbot.addWidget(dialog)
         for widget in widgets:
@@ -448,12 +450,12 @@ def test_a_walk_finds_what_cannot_be_reached(qtbot: QtBot):
         with pytest.raises(AssertionError, match=words):
             check()
 
-    fails(lambda: check_round(built(QLineEdit(), Greedy(), QLineEdit())), "not reached: .'', ''")
-    fails(lambda: check_round(built(QLineEdit())), "has no name")
+    fails(lambda: check_round(shown(QLineEdit(), Greedy(), QLineEdit())), "not reached: .'', ''")
+    fails(lambda: check_round(shown(QLineEdit())), "has no name")
     named = QLineEdit()
     named.setAccessibleName("Title")
-    fails(lambda: check_round(built(named)), "says nothing")
+    fails(lambda: check_round(shown(named)), "says nothing")
     label, combo = QLabel("Way"), QComboBox()
     combo.addItem("fit")
     label.setBuddy(combo)
-    fails(lambda: check_round(built(label, combo)), "fit")
+    fails(lambda: check_round(shown(label, combo)), "fit")

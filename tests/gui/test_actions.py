@@ -14,7 +14,7 @@ from labapp.gui.views import picture, plots, view3d
 from tests.gui.conftest import CopySample
 
 
-def test_every_action_is_whole():
+def test_every_action_is_complete():
     names = [action.name for action in ACTIONS]
     assert len(set(names)) == len(names)
     keys = [QKeySequence(action.key).toString() for action in ACTIONS if action.key]
@@ -27,26 +27,26 @@ def test_every_action_is_whole():
     assert {f"step_{step.key}" for step in STEPS} <= set(names)
 
 
-def test_every_action_has_a_command_and_every_command_an_action(window: MainWindow):
+def test_actions_and_commands_correspond(window: MainWindow):
     assert sorted(commands(window)) == sorted(action.name for action in ACTIONS)
 
 
-def test_what_is_on_is_checked(window: MainWindow):
+def test_active_toggles_are_checked(window: MainWindow):
     def checked() -> set[str]:
-        return {name for name, made in window.menus.actions.items() if made.isChecked()}
+        return {name for name, action in window.menus.actions.items() if action.isChecked()}
 
-    able = {name for name, made in window.menus.actions.items() if made.isCheckable()}
-    assert able == {action.name for action in ACTIONS if action.checkable}
-    first = {"steps", "panel", "timeline", "theme_dark"}
-    assert checked() == first
-    for name in sorted(able - first - {"play"}):  # there is nothing to play
+    checkable = {name for name, action in window.menus.actions.items() if action.isCheckable()}
+    assert checkable == {each.name for each in ACTIONS if each.checkable}
+    initial = {"steps", "panel", "timeline", "theme_dark"}
+    assert checked() == initial
+    for name in sorted(checkable - initial - {"play"}):  # there is nothing to play
         window.do(name)
         assert name in checked()
-    assert checked() >= first - {"theme_dark"}
+    assert checked() >= initial - {"theme_dark"}
     assert len({name for name in checked() if name.startswith("theme_")}) == 1
 
 
-def test_the_letters_of_a_menu_are_its_own():
+def test_menu_mnemonics_are_unique():
     for menu in MENUS:
         texts = [action.text for action in ACTIONS if action.menu == menu]
         letters = [text[text.index("&") + 1].lower() for text in texts if "&" in text]
@@ -55,31 +55,31 @@ def test_the_letters_of_a_menu_are_its_own():
     assert len(set(letters)) == len(letters)
 
 
-def test_every_action_is_in_the_menu_with_its_tip(window: MainWindow):
-    for name, made in window.menus.actions.items():
-        assert made.toolTip(), name
-        assert made.text(), name
-        assert made.parent() is window
-    shown = {action.name for action in ACTIONS if not action.name.startswith("step_")}
+def test_every_menu_action_has_text_and_tooltip(window: MainWindow):
+    for name, action in window.menus.actions.items():
+        assert action.toolTip(), name
+        assert action.text(), name
+        assert action.parent() is window
+    shown = {each.name for each in ACTIONS if not each.name.startswith("step_")}
     assert shown <= set(window.menus.actions)
 
 
-def test_without_a_session_only_what_is_of_use_is_enabled(window: MainWindow):
-    enabled = {name for name, made in window.menus.actions.items() if made.isEnabled()}
+def test_only_usable_actions_are_enabled_without_a_session(window: MainWindow):
+    enabled = {name for name, action in window.menus.actions.items() if action.isEnabled()}
     assert {"open_recording", "new", "open", "sample", "quit", "guide"} <= enabled
     assert not {"undo", "redo", "copy", "close", "measure", "next", "cancel"} & enabled
 
 
-def test_help_names_every_step_and_key(qapp: QApplication):
-    guide, told = TEXTS["guide"](), TEXTS["keys"]()
+def test_help_lists_every_step_and_shortcut(qapp: QApplication):
+    guide, key_list = TEXTS["guide"](), TEXTS["keys"]()
     for step in STEPS:
         assert step.title in guide
     for action in ACTIONS:
         if action.key:
-            assert QKeySequence(action.key).toString() in told
+            assert QKeySequence(action.key).toString() in key_list
 
 
-def test_the_keys_of_the_page_in_view_and_of_drawings_are_told(qtbot: QtBot) -> None:
+def test_help_lists_keys_of_the_visible_page_and_drawings(qtbot: QtBot) -> None:
     page = QWidget()
     qtbot.addWidget(page)
     page.setAccessibleName("Dots")
@@ -87,16 +87,14 @@ def test_the_keys_of_the_page_in_view_and_of_drawings_are_told(qtbot: QtBot) -> 
     action.setShortcut(QKeySequence("Ctrl+Left"))
     action.setToolTip("Shift the row (Ctrl+Left)")
     page.addAction(action)
-    told = keys(page)
-    assert "This page: Dots" in told
-    assert "<b>Row left</b></td><td>Shift the row</td>" in told
+    text = keys(page)
+    assert "This page: Dots" in text
+    assert "<b>Row left</b></td><td>Shift the row</td>" in text
     for words in (picture.KEYS, view3d.KEYS_TOLD, plots.KEYS):
         assert words in keys()
 
 
-def test_the_guide_opens_at_the_page_in_view_with_its_pictures(
-    window: MainWindow, copy_sample: CopySample
-):
+def test_guide_opens_at_the_visible_page_with_pictures(window: MainWindow, copy_sample: CopySample):
     assert window.files.open(copy_sample("gtaw"))
     window.show_step("trends")
     window.do("guide")

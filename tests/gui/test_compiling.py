@@ -1,4 +1,4 @@
-"""What is compiled at the first use is compiled beside the window."""
+"""Code that is compiled at first use is compiled in another process."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from labapp.gui.tasks import Cancelled, Control
 PACKAGE = Path(labapp.__file__).parent
 
 
-def test_every_module_that_compiles_is_listed():
-    found = {
+def test_every_compiled_module_is_listed():
+    modules = {
         ".".join(("labapp", *file.relative_to(PACKAGE).with_suffix("").parts))
         for file in PACKAGE.rglob("*.py")
         if re.search(r"^from labapp\.core\.compiled import .*\bcompiled", file.read_text(), re.M)
     }
-    assert found == set(compiling.COMPILED)
+    assert modules == set(compiling.COMPILED)
 
 
-def test_what_is_not_on_the_disk_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+def test_modules_missing_from_the_cache_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(compiled._config, "CACHE_DIR", str(tmp_path))
     assert compiling.not_compiled() == list(compiling.COMPILED)
     name = compiling.COMPILED[0]
@@ -37,9 +37,7 @@ def test_what_is_not_on_the_disk_is_found(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 @pytest.mark.slow
-def test_the_window_shows_it_and_nothing_is_compiled_here_meanwhile(
-    window: MainWindow, qtbot: QtBot
-):
+def test_window_shows_compiling_and_compiles_nothing_itself(window: MainWindow, qtbot: QtBot):
     first_use = FirstUse(window.workspace.tasks, window)
     first_use.found.emit(["labapp.text"])
     assert "compiling" in window.status_line.title.text()
@@ -49,7 +47,7 @@ def test_the_window_shows_it_and_nothing_is_compiled_here_meanwhile(
 
 
 @pytest.mark.slow
-def test_cancelled_it_ends_its_process():
+def test_cancelling_ends_the_compiling_process():
     control = Control()
     control.cancelled.set()
     with pytest.raises(Cancelled):

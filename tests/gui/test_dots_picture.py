@@ -1,4 +1,4 @@
-"""How dots, rows and the reference are drawn over a frame, held against a kept picture."""
+"""Dots, rows and the reference drawn over a frame, compared with a stored picture."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from labapp.gui.views.picture import PictureView
 from tests.gui.conftest import KEPT, let_draw
 from tests.pictures import RENEW, Away, away, check_picture
 
-KEPT_PICTURE = Path(__file__).parent / "pictures" / "dots.png"
+STORED_PICTURE = Path(__file__).parent / "pictures" / "dots.png"
 
 TOLERANCE = Away(mean=0.5, share=0.001)
 
@@ -29,13 +29,13 @@ IN_DOUBT, BY_HAND, CHOSEN, MOVED = 23, 3, 9, 15
 
 
 def places() -> np.ndarray:
-    """(u, v) of the dots, row by row from the bottom up, shape (24, 2), px."""
+    """Dot positions (u, v), row by row from the bottom up, shape (24, 2), px."""
     row, column = np.divmod(np.arange(ROWS * COLUMNS), COLUMNS)
     return FIRST_PX + STEP_PX * np.column_stack([column, -row - 0.05 * column])
 
 
 def frame(dots_px: np.ndarray) -> np.ndarray:
-    """A dot of light at each place, shape (120, 160)."""
+    """Draw a dot at each position; frame of shape (120, 160)."""
     v, u = np.mgrid[:120, :160]
     grey = np.full(u.shape, 30.0)
     for place in dots_px:
@@ -55,45 +55,45 @@ def correction(dots_px: np.ndarray) -> Correction:
 
 @pytest.fixture
 def view(qapp: QApplication) -> PictureView:
-    made = PictureView("Frame")
-    KEPT.append(made)
-    made.setPalette(palette(dark=True))
-    made.resize(400, 340)
-    made.show()
-    made.show_picture(frame(places()))
+    picture_view = PictureView("Frame")
+    KEPT.append(picture_view)
+    picture_view.setPalette(palette(dark=True))
+    picture_view.resize(400, 340)
+    picture_view.show()
+    picture_view.show_picture(frame(places()))
     let_draw()
-    return made
+    return picture_view
 
 
 def drawn(view: PictureView, overlay: DotsOverlay, marks_px: np.ndarray) -> np.ndarray:
-    """What is seen right of the rows' numbers, whose letters differ by machine."""
+    """The picture right of the row numbers, whose font differs by machine."""
     computed = places() + np.array([2.0, 0.0])
     overlay.show(correction(marks_px), marks_px, np.array([CHOSEN]), computed)
     QApplication.processEvents()
     image = view.grab_picture().convertToFormat(QImage.Format.Format_RGB888)
     lines = np.frombuffer(image.constBits(), np.uint8).reshape(image.height(), -1)
-    seen = lines[:, : 3 * image.width()].reshape(image.height(), image.width(), 3)
-    return seen[:, 80:].copy()
+    pixels = lines[:, : 3 * image.width()].reshape(image.height(), image.width(), 3)
+    return pixels[:, 80:].copy()
 
 
-def test_dots_are_drawn_as_they_were_and_a_dot_3_px_away_is_noticed(
+def test_dots_match_the_stored_picture_within_3_px(
     view: PictureView, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     overlay = DotsOverlay(view)
     picture = drawn(view, overlay, places())
-    check_picture(picture, KEPT_PICTURE, TOLERANCE, tmp_path)
+    check_picture(picture, STORED_PICTURE, TOLERANCE, tmp_path)
     moved = places()
     moved[MOVED] += [3.0, 0.0]
     changed = away(drawn(view, overlay, moved), picture)
     assert changed.share > 2 * TOLERANCE.share
     monkeypatch.delenv(RENEW, raising=False)
     with pytest.raises(pytest.fail.Exception, match=r"dots-difference\.png"):
-        check_picture(drawn(view, overlay, moved), KEPT_PICTURE, TOLERANCE, tmp_path)
+        check_picture(drawn(view, overlay, moved), STORED_PICTURE, TOLERANCE, tmp_path)
     assert (tmp_path / "dots-difference.png").is_file()
 
 
 @pytest.mark.parametrize("what", ["rows", "reference", "marks", "zoom"])
-def test_what_is_missing_or_elsewhere_is_noticed(view: PictureView, what: str):
+def test_missing_or_moved_overlays_change_the_picture(view: PictureView, what: str):
     overlay = DotsOverlay(view)
     picture = drawn(view, overlay, places())
     if what == "rows":

@@ -1,4 +1,4 @@
-"""Fields tell of finished edits only, keep what was right, and say in words what is wrong."""
+"""Fields emit finished edits only, keep the last valid value, and describe invalid input."""
 
 import math
 
@@ -26,11 +26,11 @@ from labapp.gui.widgets.result_table import ResultTable
         (math.nan, None, (NOTHING, "")),
     ],
 )
-def test_a_value_is_rounded_to_its_sigma(value, sigma, texts):
+def test_value_is_rounded_to_its_sigma(value, sigma, texts):
     assert rounded(value, sigma) == texts
 
 
-def test_a_typed_number_is_shown_whole_and_a_computed_one_rounded():
+def test_typed_numbers_are_shown_in_full_and_computed_ones_rounded():
     assert entered(0.77, 2) == "0.77"
     assert entered(38.6, 2) == "38.60"
     assert entered(0.7735, 2) == "0.7735"
@@ -39,14 +39,14 @@ def test_a_typed_number_is_shown_whole_and_a_computed_one_rounded():
     assert plain(-0.001, 2) == "0.00"
 
 
-def test_numbers_are_read_with_point_or_comma_and_either_minus():
+def test_numbers_accept_point_or_comma_and_either_minus():
     assert parsed(" 27,5 ") == parsed("27.5") == 27.5
     assert parsed("−3") == -3
     for text in ("", "x", "1 2", "nan", "inf"):
         assert parsed(text) is None
 
 
-def test_csv_holds_the_numbers_in_full():
+def test_csv_has_the_numbers_in_full_precision():
     rows = [ResultRow("angle", 27.123456, 0.03, "°"), ResultRow('a "b", c', None)]
     lines = as_csv(rows).splitlines()
     assert lines == ["quantity,value,sigma,unit", "angle,27.123456,0.03,°", '"a ""b"", c",,,']
@@ -70,7 +70,7 @@ def retype(qtbot, field, text):
     qtbot.keyClicks(box, text)
 
 
-def test_a_number_is_told_when_it_is_finished(qtbot, number):
+def test_number_is_emitted_when_editing_is_finished(qtbot, number):
     retype(qtbot, number, "30,5")
     assert number.received == []
     qtbot.keyClick(number.editor, Qt.Key.Key_Return)
@@ -80,7 +80,7 @@ def test_a_number_is_told_when_it_is_finished(qtbot, number):
     assert number.received == [30.5]
 
 
-def test_leaving_a_rounded_number_does_not_change_it(qtbot, number):
+def test_leaving_a_rounded_number_keeps_its_value(qtbot, number):
     number.set_value(27.123456789)
     number.editor.setFocus()
     qtbot.keyClick(number.editor, Qt.Key.Key_Return)
@@ -92,7 +92,7 @@ def test_leaving_a_rounded_number_does_not_change_it(qtbot, number):
     ("text", "words"),
     [("abc", "not a number"), ("91", "from 0 to 90 °"), ("", "is needed"), ("1e999", "not a")],
 )
-def test_what_is_wrong_is_said_and_the_former_value_stays(qtbot, number, text, words):
+def test_invalid_number_is_reported_and_the_value_kept(qtbot, number, text, words):
     retype(qtbot, number, text)
     if not text:
         number.editor.clear()
@@ -107,15 +107,15 @@ def test_what_is_wrong_is_said_and_the_former_value_stays(qtbot, number, text, w
     assert number.problem.isHidden()
 
 
-def test_a_refusal_is_said_until_the_field_is_mended(qtbot, number):
+def test_problem_is_shown_until_the_field_is_corrected(qtbot, number):
     retype(qtbot, number, "abc")
     qtbot.keyClick(number.editor, Qt.Key.Key_Return)
-    number.set_value(27.0)  # as a page does when another field was accepted
+    number.set_value(27.0)  # as a page does after another field was accepted
     number.set_problem("")
     number.flush()
     assert "not a number" in number.problem.text()
     assert not number.problem.isHidden()
-    retype(qtbot, number, "27.00")  # what it holds already: accepted, too
+    retype(qtbot, number, "27.00")  # the value that is set already is accepted, too
     qtbot.keyClick(number.editor, Qt.Key.Key_Return)
     assert number.problem.isHidden()
     retype(qtbot, number, "91")
@@ -133,13 +133,13 @@ def test_a_refusal_is_said_until_the_field_is_mended(qtbot, number):
     assert number.problem.isHidden()
 
 
-def test_steps_that_follow_each_other_are_one_edit(qtbot, number):
+def test_consecutive_steps_are_one_edit(qtbot, number):
     number.editor.setFocus()
     for _ in range(3):
         qtbot.keyClick(number.editor, Qt.Key.Key_Up)
     assert number.editor.text() == "30.00"
     assert number.received == []
-    number.set_value(27.0)  # a refresh meanwhile
+    number.set_value(27.0)  # a refresh in between
     qtbot.waitUntil(lambda: number.received == [30.0])
     for _ in range(8):
         qtbot.keyClick(number.editor, Qt.Key.Key_PageUp)
@@ -147,7 +147,7 @@ def test_steps_that_follow_each_other_are_one_edit(qtbot, number):
     assert number.received == [30.0, 90.0]
 
 
-def test_a_refresh_leaves_alone_what_is_being_typed(qtbot, number):
+def test_refresh_keeps_text_being_typed(qtbot, number):
     number.activateWindow()
     qtbot.waitUntil(number.isActiveWindow)
     retype(qtbot, number, "30")
@@ -157,11 +157,11 @@ def test_a_refresh_leaves_alone_what_is_being_typed(qtbot, number):
     assert number.received == [30.0]
 
 
-def test_whole_numbers_and_empty_ones(qtbot):
+def test_integer_and_empty_numbers(qtbot):
     field = NumberField("Rows", lowest=3, highest=99, step=2, decimals=0, optional=True)
     qtbot.addWidget(field)
-    told = []
-    field.edited.connect(told.append)
+    emitted = []
+    field.edited.connect(emitted.append)
     retype(qtbot, field, "19")
     field.flush()
     retype(qtbot, field, "19.5")
@@ -169,8 +169,8 @@ def test_whole_numbers_and_empty_ones(qtbot):
     assert "whole" in field.problem.text()
     field.editor.clear()
     field.flush()
-    assert told == [19, None]
-    assert type(told[0]) is int
+    assert emitted == [19, None]
+    assert type(emitted[0]) is int
 
 
 @pytest.mark.parametrize(
@@ -181,37 +181,35 @@ def test_whole_numbers_and_empty_ones(qtbot):
         (lambda: TextField("Notes", lines=3), "old", "new", "new"),
     ],
 )
-def test_what_is_typed_outlives_a_refresh_while_another_window_is_active(
-    qtbot, field, old, typed, new
-):
-    made = field()
-    qtbot.addWidget(made)  # never shown: it cannot have the focus
-    told = []
-    made.edited.connect(told.append)
-    made.set_value(old)
-    made.editor.selectAll()
-    qtbot.keyClicks(made.editor, typed)
-    made.set_value(old)
-    made.flush()
-    assert told == [new]
+def test_refresh_of_an_inactive_window_keeps_typed_text(qtbot, field, old, typed, new):
+    widget = field()
+    qtbot.addWidget(widget)  # never shown: it cannot have the focus
+    emitted = []
+    widget.edited.connect(emitted.append)
+    widget.set_value(old)
+    widget.editor.selectAll()
+    qtbot.keyClicks(widget.editor, typed)
+    widget.set_value(old)
+    widget.flush()
+    assert emitted == [new]
 
 
 @pytest.mark.parametrize("lines", [1, 3])
-def test_words_are_told_when_they_are_finished(qtbot, lines):
+def test_text_is_emitted_when_editing_is_finished(qtbot, lines):
     field = TextField("Notes", lines=lines)
     qtbot.addWidget(field)
     field.set_value("old")
-    told = []
-    field.edited.connect(told.append)
+    emitted = []
+    field.edited.connect(emitted.append)
     field.editor.selectAll()
     qtbot.keyClicks(field.editor, "steel")
-    assert told == []
+    assert emitted == []
     qtbot.keyClick(field.editor, Qt.Key.Key_Return, Qt.KeyboardModifier.ControlModifier)
     field.flush()
-    assert told == ["steel"]
+    assert emitted == ["steel"]
 
 
-def test_a_long_path_shows_both_ends_until_it_is_edited(qtbot):
+def test_long_path_shows_both_ends_until_edited(qtbot):
     field = PathField("Folder", tooltip="Where to")
     qtbot.addWidget(field)
     field.resize(240, 40)
@@ -221,22 +219,22 @@ def test_a_long_path_shows_both_ends_until_it_is_edited(qtbot):
     line.clearFocus()
     field.set_value("/data/out")
     assert line.shown() == "/data/out"
-    as_ever = line.grab().toImage()
+    short_path_image = line.grab().toImage()
     path = "/data/" + "very long names of days/" * 6 + "pool-17"
     field.set_value(path)
     shown = line.shown()
     assert "…" in shown
     assert shown.startswith("/data/")
     assert shown.endswith("pool-17")
-    assert line.grab().toImage() != as_ever
+    assert line.grab().toImage() != short_path_image
     assert field.value() == path
-    for told in (line.toolTip(), line.accessibleDescription()):
-        assert path in told
-        assert "Where to" in told
-    # Both of these begin and end alike: whoever looks sees the same, at the same place.
-    seen = line.grab().toImage()
+    for text in (line.toolTip(), line.accessibleDescription()):
+        assert path in text
+        assert "Where to" in text
+    # Both paths have the same start and end, so they look the same.
+    image = line.grab().toImage()
     field.set_value(path.replace("days/very", "days/VERY", 5))
-    assert line.grab().toImage() == seen
+    assert line.grab().toImage() == image
     line.setFocus()
     qtbot.waitUntil(line.hasFocus)
     assert line.shown() == field.value()
@@ -251,20 +249,20 @@ def test_a_long_path_shows_both_ends_until_it_is_edited(qtbot):
     assert line.toolTip() == "Where to"
 
 
-def test_a_choice_is_told_by_its_key_and_kept_when_others_are_offered(qtbot):
+def test_choice_is_emitted_as_key_and_kept_with_new_choices(qtbot):
     field = ChoiceField("Scheme", [("fit", "Fit"), ("ers", "Extrapolation")])
     qtbot.addWidget(field)
-    told = []
-    field.edited.connect(told.append)
+    emitted = []
+    field.edited.connect(emitted.append)
     field.set_value("fit")
     qtbot.keyClick(field.editor, Qt.Key.Key_Down)
-    assert told == ["ers"]
+    assert emitted == ["ers"]
     field.set_choices([("irs", "Interpolation"), ("ers", "Extrapolation")])
     assert field.value() == "ers"
-    assert told == ["ers"]
+    assert emitted == ["ers"]
 
 
-def test_a_form_lays_out_label_editor_and_unit(qtbot):
+def test_form_aligns_label_editor_and_unit(qtbot):
     form = FieldForm()
     qtbot.addWidget(form)
     fields = [
@@ -287,7 +285,7 @@ def test_a_form_lays_out_label_editor_and_unit(qtbot):
         assert field.editor.toolTip()
 
 
-def test_a_table_is_copied_as_text_and_as_csv(qtbot):
+def test_table_is_copied_as_text_and_csv(qtbot):
     table = ResultTable("Laser")
     qtbot.addWidget(table)
     table.set_rows([ResultRow("angle", 27.1234, 0.031, "°"), ResultRow("check", "good")])
@@ -304,7 +302,7 @@ def test_a_table_is_copied_as_text_and_as_csv(qtbot):
 
 
 @pytest.mark.parametrize("points", [9, 14])
-def test_no_name_is_cut_in_a_narrow_table(qtbot, points):
+def test_names_are_not_cut_in_a_narrow_table(qtbot, points):
     table = ResultTable("Plane")
     qtbot.addWidget(table)
     font = table.font()

@@ -1,4 +1,4 @@
-"""Foot switches in the window: learned, kept, pressed on any page, pulled out, without rights."""
+"""Foot switches in the window: learning, storing, pressing, unplugging, missing permissions."""
 
 from __future__ import annotations
 
@@ -34,44 +34,44 @@ from tests.media.pedals import INFINITY, KEYBOARD, MOUSE_3D, PCSENSOR, Bench, De
 from tests.waiting import PATIENCE_S
 
 LEFT, MIDDLE, RIGHT = ("0100", "0000"), ("0200", "0000"), ("0400", "0000")
-"""Reports of the Infinity's pedals, down and up."""
+"""HID reports of the Infinity's pedals, pressed and released."""
 
 LEARNED = PedalMap(INFINITY.key, INFINITY.name, False, {0: "trigger", 1: "mark", 2: "next"})
 
 
 @pytest.fixture
 def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
-    """An Infinity and a PCsensor, plugged in; everybody may read them."""
-    made = Bench({INFINITY: Device(), PCSENSOR: Device(KEYBOARD)})
-    monkeypatch.setattr(hid, "find_hid", made.find)
-    monkeypatch.setattr(hid, "open_hid", made.open)
-    monkeypatch.setattr(hid, "may_be_read", lambda info: info not in made.closed)
+    """An Infinity and a PCsensor, both connected and readable."""
+    devices = Bench({INFINITY: Device(), PCSENSOR: Device(KEYBOARD)})
+    monkeypatch.setattr(hid, "find_hid", devices.find)
+    monkeypatch.setattr(hid, "open_hid", devices.open)
+    monkeypatch.setattr(hid, "may_be_read", lambda info: info not in devices.closed)
     monkeypatch.setattr(hid, "RETRY_S", 0.02)
     monkeypatch.setattr(hid, "WAIT_MS", 10)
     monkeypatch.setattr(foot_switches, "DEAF_S", 0.1)
-    return made
+    return devices
 
 
 @pytest.fixture
 def start(qapp: QApplication, tmp_path: Path, state: Path) -> Iterator[Callable[..., MainWindow]]:
-    """Start the app as it is started: with what was remembered."""
-    file, made = tmp_path / "config" / "preferences.json", []
+    """Start the app with the stored preferences."""
+    file, windows = tmp_path / "config" / "preferences.json", []
 
-    def started(*maps: PedalMap) -> MainWindow:
+    def start_app(*maps: PedalMap) -> MainWindow:
         preferences, problem = read_preferences(file)
         assert not problem
         if maps:
             preferences = Preferences(foot_switches=tuple(each.as_dict() for each in maps))
         window = make_window(preferences, file)
-        made.append(window)
+        windows.append(window)
         KEPT.append(window)
         window.resize(1280, 760)
         window.show()
         window.activateWindow()
         return window
 
-    yield started
-    for window in made:
+    yield start_app
+    for window in windows:
         window.close()
 
 
@@ -80,7 +80,7 @@ def panel_of(window: MainWindow) -> FootSwitchPanel:
     return window.page.foot_switch
 
 
-def said_in(window: MainWindow) -> str:
+def log_of(window: MainWindow) -> str:
     return "\n".join(window.log_panel.texts())
 
 
@@ -90,7 +90,7 @@ def connected(window: MainWindow, info: HidInfo = INFINITY) -> Callable[[], bool
 
 
 def learn(window: MainWindow, bench: Bench, info: HidInfo, *reports: str, qtbot: QtBot) -> None:
-    """Press Learn, and step on a pedal when the devices are listened to."""
+    """Press Learn, and press a pedal as soon as the devices are read."""
     readers = len(bench.readers)
     Hand(window).button("Learn a pedal")
     qtbot.waitUntil(lambda: len(bench.readers) == readers + len(bench.devices))
@@ -98,10 +98,10 @@ def learn(window: MainWindow, bench: Bench, info: HidInfo, *reports: str, qtbot:
     qtbot.waitUntil(lambda: window.workspace.foot_switches.learned is not None)
 
 
-# --- learned and kept -----------------------------------------------------------------------------
+# --- learning and storing -------------------------------------------------------------------------
 
 
-def test_a_pedal_is_learned_by_pressing_it_and_kept(
+def test_pedal_is_learned_by_pressing_it_and_stored(
     start, bench: Bench, copy_sample: CopySample, qtbot: QtBot
 ):
     window = start()
@@ -111,7 +111,7 @@ def test_a_pedal_is_learned_by_pressing_it_and_kept(
     assert panel.words.text().startswith("No foot switch is in use")
     learn(window, bench, INFINITY, *MIDDLE, qtbot=qtbot)
     assert panel.learned_words.text() == "VEC Infinity foot pedal: pedal 2 was pressed."
-    assert panel.action.value() == "trigger"  # what none does yet
+    assert panel.action.value() == "trigger"  # no pedal has this action yet
     hand.choose(panel.action, DOES["next"])
     hand.button("Apply")
     assert panel.learned.isHidden()
@@ -122,8 +122,8 @@ def test_a_pedal_is_learned_by_pressing_it_and_kept(
     hand.button("Apply")
     qtbot.waitUntil(connected(window, PCSENSOR))
     assert [field.value() for field in panel.pedals.values()] == ["next", "trigger"]
-    kept = read_preferences(window.preferences.path)[0].foot_switches
-    maps = [PedalMap.from_dict(each) for each in kept]
+    stored = read_preferences(window.preferences.path)[0].foot_switches
+    maps = [PedalMap.from_dict(each) for each in stored]
     assert maps == [
         PedalMap("05f3:00ff:0", "VEC Infinity foot pedal", False, {1: "next"}),
         PedalMap("3553:b001:0", "PCsensor FootSwitch", True, {5: "trigger"}),
@@ -138,7 +138,7 @@ def test_a_pedal_is_learned_by_pressing_it_and_kept(
     qtbot.waitUntil(lambda: again.page.key == "laser")
 
 
-def test_a_press_that_is_learned_does_nothing_else(
+def test_press_while_learning_triggers_no_action(
     start, bench: Bench, copy_sample: CopySample, qtbot: QtBot
 ):
     window = start(LEARNED)
@@ -146,7 +146,7 @@ def test_a_press_that_is_learned_does_nothing_else(
     panel = panel_of(window)
     qtbot.waitUntil(connected(window))
     learn(window, bench, INFINITY, *RIGHT, qtbot=qtbot)
-    assert panel.action.value() == "next"  # what it does already
+    assert panel.action.value() == "next"  # its present action
     qtbot.wait(150)
     assert window.page.key == "capture"
     Hand(window).button("Discard")
@@ -155,7 +155,7 @@ def test_a_press_that_is_learned_does_nothing_else(
     qtbot.waitUntil(lambda: not window.workspace.tasks.active)
 
 
-def test_what_a_pedal_does_is_changed_and_taken_away(start, bench: Bench, copy_sample, qtbot):
+def test_pedal_actions_can_be_changed_and_removed(start, bench: Bench, copy_sample, qtbot):
     window = start(LEARNED)
     window.files.open(copy_sample("thumb_tack"))
     panel, hand = panel_of(window), Hand(window)
@@ -175,7 +175,7 @@ def test_what_a_pedal_does_is_changed_and_taken_away(start, bench: Bench, copy_s
     qtbot.waitUntil(lambda: not window.workspace.tasks.active)
 
 
-def test_waiting_for_a_pedal_can_be_given_up(start, bench: Bench, copy_sample, qtbot: QtBot):
+def test_learning_a_pedal_can_be_cancelled(start, bench: Bench, copy_sample, qtbot: QtBot):
     window = start()
     window.files.open(copy_sample("thumb_tack"))
     panel, hand = panel_of(window), Hand(window)
@@ -185,14 +185,14 @@ def test_waiting_for_a_pedal_can_be_given_up(start, bench: Bench, copy_sample, q
     qtbot.waitUntil(lambda: not window.workspace.tasks.active)
     assert panel.learned_words.isHidden()
     hand.button("Learn a pedal")
-    window.do("close")  # the session, and with it what is under way
+    window.do("close")  # closes the session and cancels its tasks
     assert not window.workspace.foot_switches.learns
 
 
-# --- pressed --------------------------------------------------------------------------------------
+# --- pressing -------------------------------------------------------------------------------------
 
 
-def test_pedals_act_on_the_live_recording_whatever_page_is_in_view(
+def test_pedals_control_the_live_recording_on_any_page(
     start, bench: Bench, tmp_path: Path, qtbot: QtBot, monkeypatch: pytest.MonkeyPatch
 ):
     film = SimulatedDevice("test", lambda k: np.full((24, 32), k % 200, np.uint8), rate_hz=100)
@@ -222,19 +222,19 @@ def test_pedals_act_on_the_live_recording_whatever_page_is_in_view(
     with open_source(take.path) as video:
         levels = [int(frame.image[0, 0]) for frame in video]
     assert set(np.diff(levels) % 200) == {1}
-    # Ctrl+K marks, too: there is nothing to be marked now.
+    # Ctrl+K marks as well, but there is nothing to mark now.
     Hand(window).press(Qt.Key.Key_K, Qt.KeyboardModifier.ControlModifier)
-    assert "Nothing is being recorded" in said_in(window)
+    assert "Nothing is being recorded" in log_of(window)
     view.stop()
     qtbot.waitUntil(lambda: not window.workspace.tasks.active)
     bench.press(INFINITY, *LEFT)
-    qtbot.waitUntil(lambda: "No camera is live: start one in the step" in said_in(window))
+    qtbot.waitUntil(lambda: "No camera is live: start one in the step" in log_of(window))
 
 
-def test_a_question_is_answered_before_the_next_step(
+def test_pedals_wait_while_a_dialog_is_open(
     start, bench: Bench, copy_sample, qtbot, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(foot_switch, "BOUNCE_S", 0.0)  # it is pressed twice, and at once
+    monkeypatch.setattr(foot_switch, "BOUNCE_S", 0.0)  # pressed twice in quick succession
     window = start(LEARNED)
     window.files.open(copy_sample("thumb_tack"))
     panel_of(window)
@@ -242,7 +242,7 @@ def test_a_question_is_answered_before_the_next_step(
     question = QDialog(window)
     question.open()
     bench.press(INFINITY, *RIGHT)
-    qtbot.waitUntil(lambda: "when the question is answered" in said_in(window))
+    qtbot.waitUntil(lambda: "when the question is answered" in log_of(window))
     assert window.page.key == "capture"
     question.close()
     bench.press(INFINITY, *RIGHT)
@@ -250,7 +250,9 @@ def test_a_question_is_answered_before_the_next_step(
     qtbot.waitUntil(lambda: not window.workspace.tasks.active)
 
 
-def test_unplugged_is_said_and_it_comes_back_by_itself(start, bench: Bench, copy_sample, qtbot):
+def test_unplugging_is_reported_and_reconnecting_is_automatic(
+    start, bench: Bench, copy_sample, qtbot
+):
     window = start(LEARNED)
     window.files.open(copy_sample("thumb_tack"))
     panel = panel_of(window)
@@ -266,23 +268,23 @@ def test_unplugged_is_said_and_it_comes_back_by_itself(start, bench: Bench, copy
         window.show_step("capture")
         bench.press(INFINITY, *RIGHT)
         qtbot.waitUntil(lambda: window.page.key == "dots")
-        assert said_in(window).count("connected after") == count
+        assert log_of(window).count("connected after") == count
     qtbot.waitUntil(lambda: not window.workspace.tasks.active)
 
 
-def test_one_that_is_not_plugged_in_at_the_start_is_no_problem(start, bench: Bench, qtbot: QtBot):
+def test_foot_switch_missing_at_start_is_no_problem(start, bench: Bench, qtbot: QtBot):
     bench.devices[INFINITY].plugged = False
     window = start(LEARNED)
-    qtbot.waitUntil(lambda: "VEC Infinity foot pedal: it is not connected" in said_in(window))
+    qtbot.waitUntil(lambda: "VEC Infinity foot pedal: it is not connected" in log_of(window))
     assert window.status_line.unread == []
     bench.devices[INFINITY].plugged = True
     qtbot.waitUntil(connected(window))
 
 
-# --- what is wrong --------------------------------------------------------------------------------
+# --- errors ---------------------------------------------------------------------------------------
 
 
-def test_without_the_right_to_read_it_the_rule_is_told_and_copied(
+def test_missing_permission_offers_the_udev_rule_to_copy(
     start, bench: Bench, copy_sample: CopySample, qtbot: QtBot
 ):
     other = replace(PCSENSOR, path="/dev/hidraw9", vendor=0x1234, product=0xAB, name="Odd pedal")
@@ -291,7 +293,7 @@ def test_without_the_right_to_read_it_the_rule_is_told_and_copied(
     window = start(LEARNED)
     window.files.open(copy_sample("thumb_tack"))
     panel, hand = panel_of(window), Hand(window)
-    # That it may not be read is a problem, and what to do is there without being asked for.
+    # Missing permission is a problem, and the remedy is shown without a request.
     qtbot.waitUntil(lambda: bool(window.status_line.unread))
     qtbot.waitUntil(panel.rights.isVisible)
     assert "▲ No permission to read: VEC Infinity foot pedal." in panel.words.text()
@@ -305,13 +307,13 @@ def test_without_the_right_to_read_it_the_rule_is_told_and_copied(
     hand.choose(panel.closed, "Odd pedal")
     hand.button("Copy the commands")
     assert 'ATTRS{idVendor}=="1234", ATTRS{idProduct}=="00ab"' in QApplication.clipboard().text()
-    bench.closed.clear()  # the rule is installed, and it was plugged in anew
+    bench.closed.clear()  # the rule is installed, and the device was plugged in again
     qtbot.waitUntil(connected(window))
     hand.button("Find devices")
     qtbot.waitUntil(panel.rights.isHidden)
 
 
-def test_where_there_is_no_foot_switch_it_is_said(start, bench: Bench, copy_sample, qtbot: QtBot):
+def test_missing_foot_switch_is_reported(start, bench: Bench, copy_sample, qtbot: QtBot):
     bench.devices.clear()
     window = start()
     window.files.open(copy_sample("thumb_tack"))
@@ -319,13 +321,13 @@ def test_where_there_is_no_foot_switch_it_is_said(start, bench: Bench, copy_samp
     hand.button("Find devices")
     qtbot.waitUntil(lambda: "No known foot switch" in panel.words.text())
     hand.button("Learn a pedal")
-    told = "no foot switch is connected: plug it in"
-    qtbot.waitUntil(lambda: window.status_line.unread == [told])
+    message = "no foot switch is connected: plug it in"
+    qtbot.waitUntil(lambda: window.status_line.unread == [message])
     qtbot.waitUntil(lambda: not window.workspace.tasks.active)
     assert panel.learn_button.text() == "Learn a pedal"
 
 
-def test_without_hidapi_it_is_said(start, copy_sample: CopySample, qtbot: QtBot, monkeypatch):
+def test_missing_hidapi_is_reported(start, copy_sample: CopySample, qtbot: QtBot, monkeypatch):
     def missing() -> None:
         raise hid.HidError(hid.MISSING)
 
@@ -337,33 +339,33 @@ def test_without_hidapi_it_is_said(start, copy_sample: CopySample, qtbot: QtBot,
     qtbot.waitUntil(lambda: "hidapi is needed" in panel.words.text())
 
 
-def test_nothing_is_looked_for_where_none_was_learned(start, copy_sample, monkeypatch, qtbot):
-    looked = []
-    monkeypatch.setattr(hid, "find_hid", lambda: looked.append(1) or [])
+def test_devices_are_not_searched_before_a_pedal_is_learned(start, copy_sample, monkeypatch, qtbot):
+    searches = []
+    monkeypatch.setattr(hid, "find_hid", lambda: searches.append(1) or [])
     threads = {thread.name for thread in threading.enumerate()}
     window = start()
     window.files.open(copy_sample("thumb_tack"))
     panel_of(window)
     qtbot.waitUntil(lambda: not window.workspace.tasks.active)
-    assert not looked
+    assert not searches
     assert not window.workspace.foot_switches._timer.isActive()
     assert {thread.name for thread in threading.enumerate()} <= threads
 
 
-def test_what_was_remembered_and_is_damaged_is_said(start, bench: Bench, qtbot: QtBot):
+def test_damaged_pedal_preferences_are_reported(start, bench: Bench, qtbot: QtBot):
     window = start(LEARNED)
     window.close()
     file = window.preferences.path
-    held = json.loads(file.read_text())
-    assert [each["device"] for each in held["foot_switches"]] == [INFINITY.key]
-    held["foot_switches"].insert(0, {"device": "x", "actions": {"0": "explode"}})
-    file.write_text(json.dumps(held))
+    stored = json.loads(file.read_text())
+    assert [each["device"] for each in stored["foot_switches"]] == [INFINITY.key]
+    stored["foot_switches"].insert(0, {"device": "x", "actions": {"0": "explode"}})
+    file.write_text(json.dumps(stored))
     again = start()
-    assert "A foot switch must be learned again" in said_in(again)
+    assert "A foot switch must be learned again" in log_of(again)
     qtbot.waitUntil(connected(again))
 
 
-def test_a_system_that_is_slow_to_answer_holds_nothing_up(
+def test_slow_device_search_does_not_block_the_window(
     start, bench: Bench, copy_sample: CopySample, qtbot: QtBot, monkeypatch: pytest.MonkeyPatch
 ):
     answer = threading.Event()
@@ -388,10 +390,10 @@ def test_a_system_that_is_slow_to_answer_holds_nothing_up(
     qtbot.waitUntil(lambda: not window.workspace.tasks.active)
 
 
-# --- shown ----------------------------------------------------------------------------------------
+# --- display --------------------------------------------------------------------------------------
 
 
-def test_the_panel_by_keyboard_and_screen_reader(
+def test_panel_is_accessible_by_keyboard_and_screen_reader(
     start, bench: Bench, copy_sample: CopySample, qtbot: QtBot
 ):
     bench.devices[MOUSE_3D] = Device()
@@ -406,9 +408,9 @@ def test_the_panel_by_keyboard_and_screen_reader(
     learn(window, bench, PCSENSOR, "0000050000000000", "0000000000000000", qtbot=qtbot)
     qtbot.waitUntil(lambda: window.isActiveWindow() and not window.workspace.tasks.active)
     reached = check_round(window)
-    wanted = [each.editor for each in panel.pedals.values()]
-    wanted += [panel.action.editor, panel.use_button, panel.copy_button, panel.commands]
-    assert set(wanted) <= set(reached)
+    expected = [each.editor for each in panel.pedals.values()]
+    expected += [panel.action.editor, panel.use_button, panel.copy_button, panel.commands]
+    assert set(expected) <= set(reached)
     window.resize(911, 512)  # 1366 × 768 at 150 %
     let_draw()
     area = window.side_panel.stack.currentWidget()
@@ -428,11 +430,11 @@ def test_the_panel_by_keyboard_and_screen_reader(
         (0xE0, True, "key number 224"),
     ],
 )
-def test_a_pedal_is_called_as_people_call_it(number: int, keyboard: bool, name: str):
+def test_pedal_names(number: int, keyboard: bool, name: str):
     assert pedal_name(number, keyboard) == name
 
 
-def test_another_device_begins_with_what_no_pedal_does_yet(qapp: QApplication):
+def test_proposed_action_is_one_not_yet_used(qapp: QApplication):
     from labapp.gui.tasks import Tasks
     from labapp.media.devices.foot_switch import Learned
 

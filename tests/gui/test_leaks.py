@@ -1,4 +1,4 @@
-"""What is left behind by a test is found."""
+"""The check of what a test leaves behind."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from PySide6.QtCore import QTimer
 
 from labapp.session.session import Session
 from tests.gui import leaks
-from tests.gui.leaks import Left
+from tests.gui.leaks import LeakCheck
 
 
 @contextmanager
@@ -60,12 +60,12 @@ def session(folder: Path) -> Iterator[None]:
         (session, "open file .*left.labsession"),
     ],
 )
-def test_what_is_left_is_found(
+def test_leftovers_are_found(
     leave, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(leaks, "GRACE_S", 0.05)
-    left = Left(tmp_path, monkeypatch)
-    assert left.found() == []
+    check = LeakCheck(tmp_path, monkeypatch)
+    assert check.leaks() == []
     with leave(tmp_path):
-        assert any(re.match(words, found) for found in left.found())
-    assert left.found() == []
+        assert any(re.match(words, leak) for leak in check.leaks())
+    assert check.leaks() == []

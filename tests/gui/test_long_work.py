@@ -1,4 +1,4 @@
-"""Importing and measuring a long recording: watched, cancelled, gone on with, killed."""
+"""Importing and measuring a long recording: progress, cancelling, resuming, killing."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from tests.waiting import PATIENCE_S
 
 FRAMES = 120
 STOPS_AT = 40
-"""Long work waits there until the gate is opened."""
+"""The frame at which the task waits until the gate is opened."""
 
 KILL = Path(__file__).with_name("kill.py")
 
 
 @pytest.fixture
 def recording(tmp_path: Path) -> Path:
-    """Dark frames, each of another grey: measured at once, as they hold no dots."""
+    """Dark frames of different grey levels: measured fast, as they have no dots."""
     path = tmp_path / "dark.npy"
     np.save(path, np.arange(FRAMES, dtype=np.uint8)[:, None, None] + np.zeros((1, 64, 64), "u1"))
     return path
@@ -40,17 +40,17 @@ def recording(tmp_path: Path) -> Path:
 @pytest.fixture
 def session(window: MainWindow, tmp_path: Path) -> Session:
     window.workspace.show(Session.create(tmp_path / "long.labsession"))
-    made = window.workspace.session
-    assert made is not None
-    made.set_setup((SAMPLES / "gtaw" / "setup.toml").read_text("utf-8"))
-    return made
+    current = window.workspace.session
+    assert current is not None
+    current.set_setup((SAMPLES / "gtaw" / "setup.toml").read_text("utf-8"))
+    return current
 
 
 def idle(window: MainWindow, qtbot: QtBot) -> None:
     qtbot.waitUntil(lambda: not window.workspace.tasks.active)
 
 
-def test_an_import_is_watched_cancelled_and_done_again(
+def test_import_shows_progress_and_can_be_cancelled_and_repeated(
     window: MainWindow,
     session: Session,
     recording: Path,
@@ -76,7 +76,7 @@ def test_an_import_is_watched_cancelled_and_done_again(
     qtbot.waitUntil(lambda: line.bar.value() == STOPS_AT)
     assert line.title.text() == "Importing dark.npy"
     assert line.bar.maximum() > FRAMES  # some are read twice
-    page.slider.setValue(7)  # it can be looked at meanwhile
+    page.slider.setValue(7)  # frames can be viewed meanwhile
     qtbot.waitUntil(lambda: page._seen is not None and page._seen[1] == 7)
     line.cancel_button.click()
     gate.set()
@@ -91,7 +91,7 @@ def test_an_import_is_watched_cancelled_and_done_again(
     qtbot.waitUntil(lambda: len(window.timeline.scrubber.kinds) == FRAMES)
 
 
-def test_measuring_is_watched_cancelled_and_gone_on_with(
+def test_measuring_shows_progress_and_resumes_after_a_cancel(
     window: MainWindow,
     session: Session,
     recording: Path,
@@ -101,14 +101,14 @@ def test_measuring_is_watched_cancelled_and_gone_on_with(
     session.import_recording(recording)
     window.workspace.changed.emit()
     gate, read = threading.Event(), list[int]()
-    plainly = session.frame
+    read_frame = session.frame
 
     def slow(number: int) -> Any:
         if threading.current_thread().name == "Measuring":
             read.append(number)
             if number == STOPS_AT:
                 gate.wait(PATIENCE_S)
-        return plainly(number)
+        return read_frame(number)
 
     monkeypatch.setattr(session, "frame", slow)
     window.show_step("trends")
@@ -117,36 +117,36 @@ def test_measuring_is_watched_cancelled_and_gone_on_with(
     qtbot.waitUntil(lambda: line.bar.value() > 0)
     qtbot.waitUntil(lambda: bool((kinds.kinds == FrameStatus.NOT_MEASURABLE).any()))
     assert line.bar.maximum() == FRAMES
-    window.workspace.show_frame(STOPS_AT + 5)  # the window answers meanwhile
+    window.workspace.show_frame(STOPS_AT + 5)  # the window responds meanwhile
     assert window.timeline.scrubber.position == STOPS_AT + 5
     line.cancel_button.click()
     gate.set()
     idle(window, qtbot)
     status = session.overview().status
-    kept = [number for number, word in enumerate(status) if word]
-    assert 0 < len(kept) <= STOPS_AT
-    assert kept == list(range(len(kept)))
-    # What was kept is shown, though nothing follows it.
-    qtbot.waitUntil(lambda: int((kinds.kinds != FrameStatus.NOT_MEASURED).sum()) == len(kept))
+    measured = [number for number, word in enumerate(status) if word]
+    assert 0 < len(measured) <= STOPS_AT
+    assert measured == list(range(len(measured)))
+    # The stored results are shown, though nothing follows them.
+    qtbot.waitUntil(lambda: int((kinds.kinds != FrameStatus.NOT_MEASURED).sum()) == len(measured))
     read.clear()
     window.do("measure")
     idle(window, qtbot)
-    assert read == list(range(len(kept), FRAMES))  # nothing is measured twice
+    assert read == list(range(len(measured), FRAMES))  # nothing is measured twice
     assert set(session.overview().status) == {"no-dots"}
     qtbot.waitUntil(lambda: int((kinds.kinds != FrameStatus.NOT_MEASURED).sum()) == FRAMES)
     assert session.problems() == []
 
 
 @pytest.mark.soak
-def test_killed_at_work_it_loses_no_frame_that_was_done(tmp_path: Path):
-    answer = subprocess.run(
+def test_killed_app_loses_no_finished_frame(tmp_path: Path):
+    process = subprocess.run(
         [sys.executable, KILL, tmp_path, "4", "20261121"],
         capture_output=True,
         text=True,
         check=False,
     )
-    assert answer.returncode == 0, answer.stderr
-    told = json.loads(answer.stdout)
-    assert told["kills"] == 4
-    assert told["importing"] > 0
-    assert told["measured"] >= told["measuring"] > 0
+    assert process.returncode == 0, process.stderr
+    summary = json.loads(process.stdout)
+    assert summary["kills"] == 4
+    assert summary["importing"] > 0
+    assert summary["measured"] >= summary["measuring"] > 0

@@ -1,4 +1,4 @@
-"""A message goes when its cause does, and a failure stands beside the button that was pressed."""
+"""A message disappears with its cause, and a failure is shown beside the pressed button."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.gui.conftest import CopySample, let_draw
 from tests.gui.hand import Hand
 
 BESIDE_PX = 90
-"""A message beside a button is no farther from it."""
+"""Largest distance of a message from its button."""
 
 
 @pytest.fixture
@@ -30,7 +30,7 @@ def opened(window: MainWindow, copy_sample: CopySample, qtbot: QtBot) -> MainWin
 
 
 def stands_beside(label: QLabel, button: QAbstractButton) -> bool:
-    """Whether a message is in view, and close to a button."""
+    """Whether a message is visible and close to a button."""
     let_draw()
     if not (label.isVisible() and button.isVisible()):
         return False
@@ -40,7 +40,7 @@ def stands_beside(label: QLabel, button: QAbstractButton) -> bool:
     return other.adjusted(-BESIDE_PX, -BESIDE_PX, BESIDE_PX, BESIDE_PX).intersects(one)
 
 
-def test_a_full_disk_is_forgotten_when_the_export_goes_well(
+def test_full_disk_message_ends_with_a_successful_export(
     opened: MainWindow, tmp_path: Path, qtbot: QtBot, monkeypatch: pytest.MonkeyPatch
 ):
     opened.show_step("export")
@@ -73,7 +73,7 @@ def test_a_full_disk_is_forgotten_when_the_export_goes_well(
     assert any("No space left" in line for line in opened.log_panel.texts())
 
 
-def test_what_was_wrong_with_one_session_is_not_said_of_the_next(
+def test_problems_of_a_session_end_with_it(
     opened: MainWindow, copy_sample: CopySample, tmp_path: Path, qtbot: QtBot
 ):
     missing = opened.workspace.session.path.parent / "recording.tif"
@@ -84,7 +84,7 @@ def test_what_was_wrong_with_one_session_is_not_said_of_the_next(
     assert "recording is missing" in opened.status_line.message.text()
     opened.files.open(copy_sample("gtaw"))
     assert opened.status_line.unread == []
-    # Where it is found again it is not missed any more.
+    # Once it is found again, the message disappears.
     opened.files.open(path)
     opened.show_step("capture")
     assert "recording is missing" in opened.status_line.message.text()
@@ -93,7 +93,7 @@ def test_what_was_wrong_with_one_session_is_not_said_of_the_next(
     qtbot.waitUntil(lambda: opened.status_line.unread == [])
 
 
-def test_a_click_that_was_asked_for_is_not_awaited_in_another_session(
+def test_pending_click_ends_with_the_session(
     opened: MainWindow, copy_sample: CopySample, qtbot: QtBot
 ):
     opened.show_step("dots")
@@ -108,22 +108,20 @@ def test_a_click_that_was_asked_for_is_not_awaited_in_another_session(
     assert not page.hand.busy
 
 
-def test_an_incomplete_set_up_is_forgotten_when_frames_are_measured(
-    opened: MainWindow, tmp_path: Path
-):
+def test_incomplete_setup_message_ends_after_measuring(opened: MainWindow, tmp_path: Path):
     sample = opened.workspace.session
-    whole, recording = sample.setup_text, sample.path.parent / "recording.tif"
+    complete, recording = sample.setup_text, sample.path.parent / "recording.tif"
     opened.workspace.show(Session.create(tmp_path / "new.labsession"))
     assert opened.workspace.attempt(lambda session: session.import_recording(recording))
     opened.do("measure_frame")
     assert "not complete" in opened.status_line.message.text()
-    assert opened.workspace.attempt(lambda session: session.set_setup(whole))
+    assert opened.workspace.attempt(lambda session: session.set_setup(complete))
     opened.do("measure_frame")
     assert opened.status_line.unread == []
-    opened.files.close()  # it is not what this is about how long measuring takes
+    opened.files.close()  # the duration of measuring does not matter here
 
 
-def test_refused_files_are_told_beside_their_buttons(
+def test_rejected_files_are_reported_beside_their_buttons(
     opened: MainWindow, tmp_path: Path, qtbot: QtBot
 ):
     hand, wrong = Hand(opened), tmp_path / "wrong.toml"
@@ -151,9 +149,7 @@ def test_refused_files_are_told_beside_their_buttons(
     assert stands_beside(page.answer, hand.find("Find O′ and the axes"))
 
 
-def test_what_was_measured_is_said_beside_the_button_of_every_page_that_measures(
-    opened: MainWindow, qtbot: QtBot
-):
+def test_measuring_is_reported_beside_the_button_of_each_page(opened: MainWindow, qtbot: QtBot):
     hand = Hand(opened)
     for key, words in (("surface", "This frame"), ("dots", "Measure this frame")):
         opened.show_step(key)
@@ -164,9 +160,7 @@ def test_what_was_measured_is_said_beside_the_button_of_every_page_that_measures
         assert stands_beside(page.answer, pressed)
 
 
-def test_a_picture_that_was_saved_or_not_is_said_beside_its_button(
-    opened: MainWindow, tmp_path: Path
-):
+def test_saving_a_picture_is_reported_beside_its_button(opened: MainWindow, tmp_path: Path):
     opened.show_step("surface")
     page = opened.page
     page.write_picture(tmp_path / "pool.png")
@@ -177,9 +171,7 @@ def test_a_picture_that_was_saved_or_not_is_said_beside_its_button(
     assert opened.status_line.unread
 
 
-def test_a_problem_of_a_session_ends_with_it_and_one_of_the_start_does_not(
-    window: MainWindow, copy_sample: CopySample
-):
+def test_startup_problems_outlast_the_session(window: MainWindow, copy_sample: CopySample):
     first, second = copy_sample("gtaw"), copy_sample("thumb_tack")
     window.say("Preferences", True)
     assert window.files.open(first)

@@ -1,4 +1,4 @@
-"""A page that is added to the steps is everywhere: list, menu, keys, guide, window, tour."""
+"""An added page appears everywhere: in list, menu, keys, guide, window and tour."""
 
 from __future__ import annotations
 
@@ -75,9 +75,9 @@ print(json.dumps(found))
 
 
 @pytest.mark.slow
-def test_a_page_that_is_added_is_everywhere(tmp_path: Path):
+def test_added_page_appears_everywhere(tmp_path: Path):
     shutil.copytree(SAMPLES / "gtaw", tmp_path / "gtaw")
-    done = subprocess.run(
+    process = subprocess.run(
         [
             *(sys.executable, "-c", PROGRAM),
             *(tmp_path / "preferences.json", tmp_path / "gtaw/gtaw.labsession"),
@@ -87,20 +87,20 @@ def test_a_page_that_is_added_is_everywhere(tmp_path: Path):
         text=True,
         check=False,
     )
-    assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout.splitlines()[-1])
-    assert [tip.partition(":")[0] for tip in found["listed"]][-2:] == ["9 Export", "10 The toy"]
-    assert found["keys"] == ["", True]  # it is the tenth
-    assert found["enabled"]
-    assert found["guide"]
-    assert found["in view"] == ["toy", True, "The toy"]
-    assert found["panel"][:2] == ["The toy", "Play with the toy."]
-    assert found["panel"][2].endswith("30 frames")
-    assert found["tour"] == ["step_toy", "a picture"]
-    assert found["before"] == "export"
+    assert process.returncode == 0, process.stderr
+    report = json.loads(process.stdout.splitlines()[-1])
+    assert [tip.partition(":")[0] for tip in report["listed"]][-2:] == ["9 Export", "10 The toy"]
+    assert report["keys"] == ["", True]  # the tenth step has no digit key
+    assert report["enabled"]
+    assert report["guide"]
+    assert report["in view"] == ["toy", True, "The toy"]
+    assert report["panel"][:2] == ["The toy", "Play with the toy."]
+    assert report["panel"][2].endswith("30 frames")
+    assert report["tour"] == ["step_toy", "a picture"]
+    assert report["before"] == "export"
 
 
-def test_every_step_has_a_key_as_long_as_there_are_digits():
+def test_first_nine_steps_have_digit_shortcuts():
     keys = {action.name: action.key for action in ACTIONS}
     assert [keys[f"step_{step.key}"] for step in STEPS[:9]] == [
         f"Ctrl+{number}" for number, _ in enumerate(STEPS[:9], 1)

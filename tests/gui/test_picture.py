@@ -1,4 +1,4 @@
-"""The picture: places in px, zoom that stays, contrast, points to drag."""
+"""The picture view: pixel coordinates, persistent zoom, contrast, points to drag."""
 
 from __future__ import annotations
 
@@ -37,22 +37,22 @@ def at(view: PictureView, u: float, v: float) -> QPoint:
     return port
 
 
-class Noting(Tool):
+class RecordingTool(Tool):
     def __init__(self) -> None:
-        self.seen: list[tuple[str, float, float]] = []
+        self.events: list[tuple[str, float, float]] = []
 
     def click(self, u: float, v: float, modifiers: Qt.KeyboardModifier) -> None:
-        self.seen.append(("click", u, v))
+        self.events.append(("click", u, v))
 
     def begin(self, u: float, v: float, modifiers: Qt.KeyboardModifier) -> bool:
-        self.seen.append(("begin", u, v))
+        self.events.append(("begin", u, v))
         return True
 
     def drag(self, u: float, v: float) -> None:
-        self.seen.append(("drag", u, v))
+        self.events.append(("drag", u, v))
 
     def end(self, u: float, v: float) -> None:
-        self.seen.append(("end", u, v))
+        self.events.append(("end", u, v))
 
 
 def drag(view: PictureView, start: QPoint, end: QPoint) -> None:
@@ -65,20 +65,20 @@ def drag(view: PictureView, start: QPoint, end: QPoint) -> None:
     let_draw()
 
 
-def test_the_tool_hears_of_clicks_and_drags_in_px_u_right_v_down(view: PictureView) -> None:
-    view.tool = tool = Noting()
+def test_tool_gets_clicks_and_drags_in_px_u_right_v_down(view: PictureView) -> None:
+    view.tool = tool = RecordingTool()
     QTest.mouseClick(view.canvas.viewport(), Qt.MouseButton.LeftButton, pos=at(view, 40, 30))
-    kind, u, v = tool.seen[0]
+    kind, u, v = tool.events[0]
     assert kind == "click"
     assert (u, v) == pytest.approx((40, 30), abs=0.3)
     drag(view, at(view, 20, 20), at(view, 60, 90))
-    assert tool.seen[1][0] == "begin"
-    assert tool.seen[1][1:] == pytest.approx((20, 20), abs=0.3)
-    assert tool.seen[-1][0] == "end"
-    assert tool.seen[-1][1:] == pytest.approx((60, 90), abs=0.3)
+    assert tool.events[1][0] == "begin"
+    assert tool.events[1][1:] == pytest.approx((20, 20), abs=0.3)
+    assert tool.events[-1][0] == "end"
+    assert tool.events[-1][1:] == pytest.approx((60, 90), abs=0.3)
 
 
-def test_pixel_centres_are_whole_numbers() -> None:
+def test_pixel_centres_are_integers() -> None:
     assert level_at(GREY, 12.4, 7.4) == GREY[7, 12]
     assert level_at(GREY, 11.6, 6.6) == GREY[7, 12]
     assert level_at(GREY, -0.4, 119.4) == GREY[119, 0]
@@ -87,33 +87,33 @@ def test_pixel_centres_are_whole_numbers() -> None:
     assert level_at(None, 0, 0) is None
 
 
-def test_the_middle_of_what_is_seen_is_the_middle_of_the_picture(view: PictureView) -> None:
+def test_view_is_centred_on_the_picture(view: PictureView) -> None:
     middle = view.box.viewRect().center()
     assert (middle.x(), middle.y()) == pytest.approx((79.5, 59.5), abs=0.01)
 
 
-def test_zoom_stays_for_the_next_frame_and_is_new_for_another_size(view: PictureView) -> None:
+def test_zoom_is_kept_for_frames_of_the_same_size(view: PictureView) -> None:
     view.zoom(4)
-    seen = view.box.viewRect()
+    visible = view.box.viewRect()
     view.show_picture(GREY[::-1].copy())
-    assert view.box.viewRect() == seen
+    assert view.box.viewRect() == visible
     view.show_picture(GREY[:60])
-    assert view.box.viewRect() != seen
+    assert view.box.viewRect() != visible
 
 
-def test_it_fits_again_in_another_size_until_the_hand_has_zoomed(view: PictureView) -> None:
-    def all_seen() -> bool:
+def test_resizing_fits_the_picture_until_it_is_zoomed(view: PictureView) -> None:
+    def all_visible() -> bool:
         return bool(view.box.viewRect().contains(QRectF(-0.5, -0.5, 160, 120)))
 
-    def as_large_as_can_be() -> bool:
-        seen = view.box.viewRect()
-        return bool(min(seen.width() / 160, seen.height() / 120) < 1.05)
+    def fills_the_view() -> bool:
+        visible = view.box.viewRect()
+        return bool(min(visible.width() / 160, visible.height() / 120) < 1.05)
 
     for size in ((300, 700), (1200, 400), (700, 560)):
         view.resize(*size)
         let_draw()
-        assert all_seen()
-        assert as_large_as_can_be()
+        assert all_visible()
+        assert fills_the_view()
     drag(view, at(view, 80, 60), at(view, 100, 60))
     moved = view.box.viewRect().center()
     view.resize(600, 500)
@@ -123,25 +123,27 @@ def test_it_fits_again_in_another_size_until_the_hand_has_zoomed(view: PictureVi
     view.zoom(4)
     view.resize(700, 560)
     let_draw()
-    assert not all_seen()
+    assert not all_visible()
 
 
 def test_keys_zoom_and_fit(view: PictureView) -> None:
-    whole = view.box.viewRect().width()
+    full_width = view.box.viewRect().width()
     QTest.keyClick(view, Qt.Key.Key_Plus)
-    assert view.box.viewRect().width() == pytest.approx(whole / 1.25)
+    assert view.box.viewRect().width() == pytest.approx(full_width / 1.25)
     QTest.keyClick(view, Qt.Key.Key_Right)
-    assert view.box.viewRect().center().x() == pytest.approx(79.5)  # the window's: next frame
+    assert view.box.viewRect().center().x() == pytest.approx(
+        79.5
+    )  # the window uses this key for the next frame
     QTest.keyClick(view, Qt.Key.Key_Right, Qt.KeyboardModifier.ShiftModifier)
     assert view.box.viewRect().center().x() > 90
     QTest.keyClick(view, Qt.Key.Key_F)
-    assert view.box.viewRect().width() == pytest.approx(whole)
+    assert view.box.viewRect().width() == pytest.approx(full_width)
 
 
-def test_contrast_follows_the_picture_but_does_not_flicker(view: PictureView) -> None:
-    held = auto_levels(GREY)
+def test_contrast_follows_the_picture_without_flicker(view: PictureView) -> None:
+    initial = auto_levels(GREY)
     view.show_picture((GREY * 0.9).astype(np.uint8))
-    assert view._shown_levels() == held
+    assert view._shown_levels() == initial
     dim = GREY.astype(np.uint16) * 200
     view.show_picture(dim)
     assert view._shown_levels() == auto_levels(dim)
@@ -149,20 +151,20 @@ def test_contrast_follows_the_picture_but_does_not_flicker(view: PictureView) ->
     assert view._shown_levels()[1] < auto_levels(dim)[1]
     QTest.keyClick(view, Qt.Key.Key_0)
     assert view._shown_levels() == auto_levels(dim)
-    # Some tiff stacks hold NaN, and a capped lens gives one level alone.
+    # Some TIFF stacks contain NaN, and a covered lens gives a single level.
     assert auto_levels(np.full((9, 9), np.nan)) == (0.0, 1.0)
     black, white = auto_levels(np.full((9, 9), 7))
     assert black == 7 < white
 
 
-def test_a_point_is_dragged_and_nudged(view: PictureView, qtbot: QtBot) -> None:
+def test_points_are_dragged_and_nudged(view: PictureView, qtbot: QtBot) -> None:
     first, second = DragPoint("O′", 40, 40), DragPoint("X axis", 120, 40)
     for point in (first, second):
         view.add_point(point)
     let_draw()
-    with qtbot.waitSignal(second.moved, check_params_cb=lambda u, v: u > 129) as told:
+    with qtbot.waitSignal(second.moved, check_params_cb=lambda u, v: u > 129) as signal:
         drag(view, at(view, 120, 40), at(view, 130, 60))
-    assert told.args == pytest.approx([130, 60], abs=0.5)
+    assert signal.args == pytest.approx([130, 60], abs=0.5)
     u, v = second.place
     QTest.keyClick(view, Qt.Key.Key_Left)
     QTest.keyClick(view, Qt.Key.Key_Down, Qt.KeyboardModifier.ShiftModifier)
@@ -175,16 +177,16 @@ def test_a_point_is_dragged_and_nudged(view: PictureView, qtbot: QtBot) -> None:
     assert first.place == (10, 10)
 
 
-def test_what_is_seen_can_be_copied_overlays_and_all(view: PictureView) -> None:
-    bare = view.grab_picture()
+def test_grabbed_picture_includes_overlays(view: PictureView) -> None:
+    without_overlay = view.grab_picture()
     view.add(pg.ScatterPlotItem([80], [60], size=30, brush="r", pen=None))
     let_draw()
     picture = view.grab_picture()
-    assert picture.size() == bare.size()
+    assert picture.size() == without_overlay.size()
     assert picture.pixelColor(at(view, 80, 60)).red() == 255
 
 
-def test_without_a_picture_it_says_why(view: PictureView) -> None:
+def test_missing_picture_shows_the_reason(view: PictureView) -> None:
     view.show_picture(None, "frame 3 cannot be read")
     assert view.picture is None
     assert view._empty.text() == "frame 3 cannot be read"
@@ -192,20 +194,20 @@ def test_without_a_picture_it_says_why(view: PictureView) -> None:
     assert view._empty.text() == ""
 
 
-def test_the_mouse_reaches_the_picture_as_the_desktop_sends_it(view: PictureView, qtbot: QtBot):
-    seen: list[tuple[float, float]] = []
-    view.pointed.connect(lambda u, v, _: seen.append((u, v)))
-    view.tool = noting = Noting()
-    window, there = view.windowHandle(), view.canvas.mapTo(view, at(view, 80, 60))
-    QTest.mouseMove(window, there - QPoint(20, 20))
-    QTest.mouseMove(window, there)
-    QTest.mouseClick(window, Qt.MouseButton.LeftButton, Qt.KeyboardModifier.NoModifier, there)
-    qtbot.waitUntil(lambda: bool(noting.seen))
-    assert seen  # pyqtgraph passes on so many moves a second, and no more
-    assert noting.seen[0] == ("click", pytest.approx(80, abs=1), pytest.approx(60, abs=1))
+def test_mouse_events_of_the_window_reach_the_picture(view: PictureView, qtbot: QtBot):
+    positions: list[tuple[float, float]] = []
+    view.pointed.connect(lambda u, v, _: positions.append((u, v)))
+    view.tool = tool = RecordingTool()
+    window, place = view.windowHandle(), view.canvas.mapTo(view, at(view, 80, 60))
+    QTest.mouseMove(window, place - QPoint(20, 20))
+    QTest.mouseMove(window, place)
+    QTest.mouseClick(window, Qt.MouseButton.LeftButton, Qt.KeyboardModifier.NoModifier, place)
+    qtbot.waitUntil(lambda: bool(tool.events))
+    assert positions  # pyqtgraph limits the rate of move events
+    assert tool.events[0] == ("click", pytest.approx(80, abs=1), pytest.approx(60, abs=1))
 
 
-def test_the_pointers_place_is_seen_whole_in_a_narrow_view(view: PictureView) -> None:
+def test_pointer_position_fits_into_a_narrow_view(view: PictureView) -> None:
     before = view.minimumSizeHint().width()
     view.resize(300, 300)
     let_draw()
@@ -217,18 +219,18 @@ def test_the_pointers_place_is_seen_whole_in_a_narrow_view(view: PictureView) ->
     assert view.minimumSizeHint().width() == before
 
 
-def test_the_right_button_opens_a_menu_with_the_page_s_actions_for_what_is_there(
+def test_context_menu_has_the_actions_of_the_page(
     view: PictureView, monkeypatch: pytest.MonkeyPatch
 ):
     pointed: list[tuple[float, float]] = []
     monkeypatch.setattr(view.tool, "point_out", lambda u, v: pointed.append((round(u), round(v))))
-    own = QAction("Delete", view)
-    view.menu_actions = [own]
+    action = QAction("Delete", view)
+    view.menu_actions = [action]
     QTest.mouseClick(view.canvas.viewport(), Qt.MouseButton.RightButton, pos=at(view, 40, 30))
     let_draw()
     menu = QApplication.activePopupWidget()
     assert isinstance(menu, QMenu)
-    assert menu.actions()[0] is own
+    assert menu.actions()[0] is action
     assert pointed == [(40, 30)]
     levels = next(each for each in menu.actions() if each.text().startswith("Histogram"))
     levels.trigger()
@@ -240,7 +242,7 @@ def test_the_right_button_opens_a_menu_with_the_page_s_actions_for_what_is_there
     dialog.close()
 
 
-def test_a_profile_has_the_levels_along_its_line_and_none_outside():
+def test_profile_has_the_levels_along_its_line():
     along, levels = profile(GREY, np.array([[10.0, 5.0], [20.0, 5.0]]))
     np.testing.assert_allclose(along, np.arange(11))
     np.testing.assert_allclose(levels, GREY[5, 10:21])

@@ -1,4 +1,4 @@
-"""Words that come from files are shown as they are, never read as HTML."""
+"""Text from files is shown literally, never as HTML."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ SOURCES = sorted(Path(labapp.gui.__file__).parent.rglob("*.py"))
 
 @pytest.fixture
 def evil(copy_sample: CopySample) -> Path:
-    """A measured session that says it wherever a session can."""
+    """A measured session with HTML in every text that a session can contain."""
     name = EVIL.replace("/", "∕")
     folder = copy_sample("gtaw").parent
     folder = folder.rename(folder.with_name(name))
@@ -50,16 +50,16 @@ def evil(copy_sample: CopySample) -> Path:
         basis = session._basis()
         assert basis is not None
         session._results.put(0, replace(doubtful, reconstruction=None, measures=None), basis, None)
-        told = replace(
+        altered = replace(
             recording, path=f"{name}.avi", description=EVIL, warnings=(EVIL,), frame_exact=False
         )
         with session._database.transaction() as connection:
-            connection.execute("UPDATE recording SET content = ?", (pack(told),))
+            connection.execute("UPDATE recording SET content = ?", (pack(altered),))
     return path
 
 
-def is_read(words: str) -> bool:
-    """Whether Qt, left to itself, takes words for HTML with that picture in it."""
+def is_rendered(words: str) -> bool:
+    """Whether Qt by default renders the text as HTML with that picture."""
     return "<img" in words and QtGui.Qt.mightBeRichText(words)
 
 
@@ -73,7 +73,7 @@ def items(model: QAbstractItemModel, parent: QModelIndex) -> Iterator[QModelInde
 
 
 def tips(window: QWidget) -> Iterator[str]:
-    """Every tooltip: of widgets, actions, and what lists and tables hold."""
+    """Every tooltip: of widgets, actions, and the items of lists and tables."""
     for widget in (window, *window.findChildren(QWidget)):
         yield widget.toolTip()
         if isinstance(widget, QAbstractItemView | QComboBox) and widget.model() is not None:
@@ -84,37 +84,37 @@ def tips(window: QWidget) -> Iterator[str]:
 
 
 def check(window: MainWindow) -> int:
-    """No word is read as HTML; returns in how many places it was to be seen."""
+    """Check that no text is rendered as HTML; return how many places show the text."""
     let_draw()
     labels = window.findChildren(QLabel)
     for label in labels:
-        read = label.textFormat() != Qt.TextFormat.PlainText and "<img" in label.text()
-        assert not read, label.text()
-    told = list(tips(window))
-    assert not [tip for tip in told if is_read(tip)]
-    return sum("img" in words for words in (*told, *(label.text() for label in labels)))
+        rendered = label.textFormat() != Qt.TextFormat.PlainText and "<img" in label.text()
+        assert not rendered, label.text()
+    tooltips = list(tips(window))
+    assert not [tip for tip in tooltips if is_rendered(tip)]
+    return sum("img" in words for words in (*tooltips, *(label.text() for label in labels)))
 
 
-def test_what_a_session_says_is_no_html(window: MainWindow, evil: Path, qtbot: QtBot):
+def test_texts_of_a_session_are_not_rendered_as_html(window: MainWindow, evil: Path, qtbot: QtBot):
     assert window.files.open(evil)
     qtbot.waitUntil(lambda: not window.workspace.tasks.active)
-    seen: dict[str, int] = {}
+    counts: dict[str, int] = {}
     for step in window._steps:
         window.show_step(step.key)
         window.workspace.show_frame(0)
         qtbot.waitUntil(lambda: not window.workspace.tasks.active)
-        seen[step.key] = check(window)
+        counts[step.key] = check(window)
     window.say(EVIL, True)
     assert check(window)
     window.do("close")
     qtbot.waitUntil(lambda: not window.workspace.tasks.active)
-    seen["welcome"] = check(window)
+    counts["welcome"] = check(window)
     for key in ("setup", "capture", "welcome"):
-        assert seen[key], f"it was not to be seen on {key}"
+        assert counts[key], f"it was not to be seen on {key}"
 
 
-def test_labels_are_made_by_what_makes_them_plain():
-    """A label of Qt's own guesses whether its words are HTML."""
+def test_labels_are_created_as_plain_text():
+    """A plain `QLabel` guesses whether its text is HTML."""
     for path in SOURCES:
         if path.name != "labels.py":
             calls = [
@@ -124,7 +124,7 @@ def test_labels_are_made_by_what_makes_them_plain():
 
 
 @pytest.mark.parametrize("words", [EVIL, "a < b", "x &lt;b&gt;", "plain", "first\n<b>second</b>"])
-def test_a_tip_shows_its_words_as_they_are(qtbot: QtBot, words: str):
+def test_tooltips_show_their_text_literally(qtbot: QtBot, words: str):
     tip = QLabel(plain_tip(words))  # as QToolTip shows it
     document = QtGui.QTextDocument()
     if QtGui.Qt.mightBeRichText(tip.text()):

@@ -1,4 +1,4 @@
-"""Curves in words and tables, and the plots that show them."""
+"""Curves as text and tables, and the plots that show them."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def current() -> Curve:
     return Curve("Current", "A", x, 75 + np.sin(9 * x))
 
 
-def test_points_in_words() -> None:
+def test_point_text() -> None:
     assert point_text(curve(), 0, TIME) == "Frame 0, 0.0000 s: Height 0.3000 ± 0.0040 mm"
     assert point_text(curve(), 2, TIME).startswith("Frame 4, 0.4000 s, in doubt: ")
     frames = Axis("Frame", "", decimals=0)
@@ -50,7 +50,7 @@ def test_points_in_words() -> None:
     assert point_text(current(), 0, TIME) == "Time 0.0000 s: Current 75.000 A"
 
 
-def test_the_nearest_point_and_the_next_one() -> None:
+def test_nearest_and_next_point() -> None:
     assert nearest(curve(), 0.29) == 1
     assert nearest(curve(), -5) == 0
     assert nearest(curve(), 99) == 9
@@ -65,7 +65,7 @@ def test_the_nearest_point_and_the_next_one() -> None:
     assert next_key([current()], 3, 1) is None
 
 
-def test_a_table_for_a_spreadsheet() -> None:
+def test_table_for_a_spreadsheet() -> None:
     lines = as_table([curve(), curve(3, "Width", 5), current()], TIME).splitlines()
     head = "frame|Time (s)|Height (mm)|Height σ (mm)|Width (mm)|Width σ (mm)|mark".split("|")
     assert lines[0].split("\t") == head
@@ -96,7 +96,7 @@ def at(view: PlotStack, plot: int, x: float, y: float) -> QPoint:
     return port
 
 
-def test_a_click_near_a_point_chooses_its_frame_and_beside_none(view: PlotStack) -> None:
+def test_clicking_near_a_point_selects_its_frame(view: PlotStack) -> None:
     chosen: list[int] = []
     view.chosen.connect(chosen.append)
     port, left = view.canvas.viewport(), Qt.MouseButton.LeftButton
@@ -121,14 +121,14 @@ def test_keys_step_through_the_points(view: PlotStack) -> None:
     assert view.read_out.text() in view.accessibleDescription()
 
 
-def test_the_pointer_is_told_what_is_there(view: PlotStack) -> None:
+def test_readout_describes_the_point_at_the_pointer(view: PlotStack) -> None:
     place = view._plots[0].getViewBox().mapViewToScene(QPointF(0.41, 0.3))
     view.canvas.scene().sigMouseMoved.emit(place)
     assert view.read_out.text().startswith("Frame 4, 0.4000 s, in doubt: Height")
     assert "○ in doubt" in view.legend.text()
 
 
-def test_zoom_stays_when_values_change_and_goes_when_others_are_shown(view: PlotStack) -> None:
+def test_zoom_is_kept_for_new_values_and_reset_for_new_curves(view: PlotStack) -> None:
     QTest.keyClick(view, Qt.Key.Key_Plus)
     zoomed = view._plots[0].viewRange()[0]
     view.show_curves([curve(), curve(name="Width"), current()], TIME)
@@ -139,14 +139,14 @@ def test_zoom_stays_when_values_change_and_goes_when_others_are_shown(view: Plot
     assert view.read_out.text() == " "
 
 
-def test_copies(view: PlotStack) -> None:
+def test_copy_as_table_and_picture(view: PlotStack) -> None:
     view.copy_table()
     assert QGuiApplication.clipboard().text() == as_table(view.curves, TIME)
     view.copy_picture()
     assert not QGuiApplication.clipboard().image().isNull()
 
 
-def test_it_follows_the_palette(view: PlotStack) -> None:
+def test_plots_follow_the_palette(view: PlotStack) -> None:
     for dark in (True, False):
         view.setPalette(palette(dark))
         let_draw()
@@ -154,16 +154,16 @@ def test_it_follows_the_palette(view: PlotStack) -> None:
         assert (corner.lightness() < 128) == dark
 
 
-def test_of_ten_thousand_frames_no_more_points_are_drawn_than_can_be_seen(view: PlotStack) -> None:
+def test_number_of_drawn_points_is_limited(view: PlotStack) -> None:
     many = [curve(10_000, name, 1) for name in ("Width", "Length", "Height", "ARE")]
     view.show_curves(many, TIME)
-    for seen in (100, 1000):
-        view._plots[0].setXRange(0, seen, padding=0)
+    for count in (100, 1000):
+        view._plots[0].setXRange(0, count, padding=0)
         let_draw()
         assert 0 < len(view._plots[0].points.data) <= MOST_POINTS
 
 
-def test_a_frame_without_a_point_is_marked_where_it_is(view: PlotStack) -> None:
+def test_frame_without_a_point_is_marked_at_its_time(view: PlotStack) -> None:
     axis = replace(TIME, span=(-1.0, 9.0))
     view.show_curves([curve()], axis)
     view.set_current(1, 8.5)
@@ -176,8 +176,8 @@ def test_a_frame_without_a_point_is_marked_where_it_is(view: PlotStack) -> None:
     assert plot.current.value() == 1.6
 
 
-def test_nothing_stays_of_plots_that_were_taken_out(view: PlotStack, qtbot: QtBot) -> None:
-    """Shown long ago or from the first, the same curves look the same."""
+def test_removed_plots_leave_no_trace(view: PlotStack, qtbot: QtBot) -> None:
+    """The same curves look the same in a reused and in a new view."""
     six = [curve(name=name) for name in ("Width", "Length", "Height", "Depth", "Area", "ARE")]
     for curves in (six, six[:4]):
         view.show_curves(curves, TIME)

@@ -23,14 +23,14 @@ PEDAL = {"device": "05f3:00ff:0", "name": "A pedal", "keyboard": False, "actions
 SOME = Preferences(("/a b.labsession", "/c.labsession"), "light", "AAA=", "BBB=", "/data", (PEDAL,))
 
 
-def test_what_is_written_is_read_again(tmp_path: Path):
+def test_preferences_round_trip(tmp_path: Path):
     file = tmp_path / "new" / "preferences.json"
     assert write_preferences(file, SOME) == ""
     assert read_preferences(file) == (SOME, "")
     assert [path.name for path in file.parent.iterdir()] == ["preferences.json"]
 
 
-def test_the_first_start_has_the_defaults(tmp_path: Path):
+def test_missing_file_gives_the_defaults(tmp_path: Path):
     assert read_preferences(tmp_path / "none.json") == (Preferences(), "")
 
 
@@ -56,26 +56,26 @@ def test_the_first_start_has_the_defaults(tmp_path: Path):
         b'{"version": 1, "theme": "dark"}' + b" " * 2_000_000,
     ],
 )
-def test_what_cannot_be_used_is_kept_aside_and_said(tmp_path: Path, content: bytes):
+def test_invalid_file_is_renamed_and_reported(tmp_path: Path, content: bytes):
     file = tmp_path / "preferences.json"
     file.write_bytes(content)
-    found, problem = read_preferences(file)
-    assert found == Preferences()
-    aside = file.with_suffix(".kept.json")
-    assert str(aside) in problem
-    assert aside.read_bytes() == content
+    preferences, problem = read_preferences(file)
+    assert preferences == Preferences()
+    renamed = file.with_suffix(".kept.json")
+    assert str(renamed) in problem
+    assert renamed.read_bytes() == content
     assert not file.exists()
 
 
-def test_a_folder_in_its_place_is_said(tmp_path: Path):
+def test_folder_in_place_of_the_file_is_reported(tmp_path: Path):
     (tmp_path / "preferences.json").mkdir()
-    found, problem = read_preferences(tmp_path / "preferences.json")
-    assert found == Preferences()
+    preferences, problem = read_preferences(tmp_path / "preferences.json")
+    assert preferences == Preferences()
     assert "could not be read" in problem
     assert "could not be saved" in write_preferences(tmp_path / "preferences.json", SOME)
 
 
-def test_a_file_that_was_there_stays_whole_when_it_cannot_be_written(tmp_path: Path):
+def test_failed_write_keeps_the_existing_file(tmp_path: Path):
     file = tmp_path / "preferences.json"
     assert write_preferences(file, SOME) == ""
     with mock.patch("os.fsync", side_effect=OSError(28, "No space left on device")):
@@ -84,43 +84,43 @@ def test_a_file_that_was_there_stays_whole_when_it_cannot_be_written(tmp_path: P
     assert read_preferences(file)[0] == SOME
 
 
-def test_the_session_opened_last_comes_first_and_once(tmp_path: Path):
-    held = Preferences()
+def test_last_opened_session_is_listed_first_and_once(tmp_path: Path):
+    preferences = Preferences()
     for number in range(20):
-        held = held.with_recent(tmp_path / f"{number}.labsession")
-    assert len(held.recent) == KEPT_RECENT
-    held = held.with_recent(tmp_path / "15.labsession")
-    assert held.recent[0] == str(tmp_path / "15.labsession")
-    assert len(set(held.recent)) == KEPT_RECENT
-    assert held.last_folder == str(tmp_path)
-    assert held.folder == tmp_path
+        preferences = preferences.with_recent(tmp_path / f"{number}.labsession")
+    assert len(preferences.recent) == KEPT_RECENT
+    preferences = preferences.with_recent(tmp_path / "15.labsession")
+    assert preferences.recent[0] == str(tmp_path / "15.labsession")
+    assert len(set(preferences.recent)) == KEPT_RECENT
+    assert preferences.last_folder == str(tmp_path)
+    assert preferences.folder == tmp_path
     assert (
         str(tmp_path / "15.labsession")
-        not in held.without_recent(tmp_path / "15.labsession").recent
+        not in preferences.without_recent(tmp_path / "15.labsession").recent
     )
 
 
-def test_a_last_folder_that_is_gone_is_not_begun_in(tmp_path: Path):
+def test_missing_last_folder_is_replaced(tmp_path: Path):
     assert replace(SOME, last_folder=str(tmp_path / "gone")).folder.is_dir()
 
 
-def test_windows_change_what_is_remembered_one_after_the_other(tmp_path: Path):
+def test_concurrent_windows_lose_no_preferences(tmp_path: Path):
     file = tmp_path / "preferences.json"
-    known = Preferences(theme="dark")
+    initial = Preferences(theme="dark")
 
     def open_three(window: int) -> None:
         for number in range(3):
             path = tmp_path / f"{window}_{number}.labsession"
-            PreferencesStore(known, file).remember(partial(Preferences.with_recent, path=path))
+            PreferencesStore(initial, file).remember(partial(Preferences.with_recent, path=path))
 
     with ThreadPoolExecutor(4) as windows:
         list(windows.map(open_three, range(4)))
-    found, problem = read_preferences(file)
+    preferences, problem = read_preferences(file)
     assert problem == ""
-    assert (len(set(found.recent)), found.theme) == (12, "dark")
+    assert (len(set(preferences.recent)), preferences.theme) == (12, "dark")
 
 
-def test_what_is_gone_is_written_again(tmp_path: Path):
+def test_missing_file_is_written_again(tmp_path: Path):
     file = tmp_path / "preferences.json"
     store = PreferencesStore(SOME, file)
     store.remember(lambda before: before)
@@ -128,10 +128,10 @@ def test_what_is_gone_is_written_again(tmp_path: Path):
     assert read_preferences(file) == (SOME, "")
 
 
-def test_what_cannot_be_written_holds_and_is_told(tmp_path: Path):
+def test_unwritable_preferences_apply_and_are_reported(tmp_path: Path):
     (tmp_path / "file").touch()
-    store, told = PreferencesStore(SOME, tmp_path / "file" / "preferences.json"), []
-    store.failed.connect(told.append)
+    store, problems = PreferencesStore(SOME, tmp_path / "file" / "preferences.json"), []
+    store.failed.connect(problems.append)
     store.remember(lambda before: replace(before, theme="dark"))
     assert store.current == replace(SOME, theme="dark")
-    assert ["could not be saved" in problem for problem in told] == [True]
+    assert ["could not be saved" in problem for problem in problems] == [True]

@@ -1,4 +1,4 @@
-"""Random actions; `random_actions.py` by hand plays as many as are asked for."""
+"""Short runs of random actions; run `random_actions.py` by hand for longer ones."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.gui.random_actions import Player
 @pytest.mark.parametrize(
     ("seed", "actions"), [(3, 60), pytest.param(8, 600, marks=pytest.mark.soak)]
 )
-def test_nothing_is_raised_and_no_change_is_lost(
+def test_random_actions_raise_nothing_and_lose_no_change(
     qapp: QApplication, tmp_path: Path, state: Path, seed: int, actions: int
 ) -> None:
     player = Player(seed, tmp_path / "run")

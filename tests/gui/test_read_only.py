@@ -1,4 +1,4 @@
-"""A session that is open read-only looks so, on every page, and says why."""
+"""A session that is open read-only is shown as such on every page, with the reason."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.gui.conftest import CopySample
 
 
 def enter_something(field: Field) -> None:
-    """Enter another value, as a hand would."""
+    """Enter another value, as a user does."""
     editor = field.editor
     if isinstance(field, NumberField):
         field._step(1)
@@ -26,12 +26,12 @@ def enter_something(field: Field) -> None:
         editor.editingFinished.emit()
 
 
-def test_what_can_be_entered_is_taken(
+def test_enabled_fields_accept_input(
     window: MainWindow, copy_sample: CopySample, qtbot: QtBot
 ) -> None:
     window.workspace.show(Session.open(copy_sample("gtaw"), read_only=True))
-    said: list[str] = []
-    window.workspace.notified.connect(lambda words, problem: said.append(words))
+    messages: list[str] = []
+    window.workspace.notified.connect(lambda words, problem: messages.append(words))
     entered = 0
     for step in STEPS:
         window.show_step(step.key)
@@ -45,11 +45,11 @@ def test_what_can_be_entered_is_taken(
             if box.isEnabled() and box.isVisible():
                 box.click()
         entered += len(usable)
-        assert [words for words in said if "read-only" in words] == []
-    assert entered > 0  # what only the page knows can be entered, as before
+        assert [words for words in messages if "read-only" in words] == []
+    assert entered > 0  # values that only the page uses can still be entered
 
 
-def test_what_is_locked_says_why_and_is_free_in_the_next_session(
+def test_locked_fields_give_a_reason_and_unlock_with_the_session(
     window: MainWindow, copy_sample: CopySample
 ) -> None:
     path = copy_sample("gtaw")
@@ -68,7 +68,7 @@ def test_what_is_locked_says_why_and_is_free_in_the_next_session(
         assert each.toolTip() == READ_ONLY
     assert not height.editor.isEnabled()
     assert not tick.isEnabled()
-    assert notes.editor.isReadOnly()  # and can be scrolled and copied from
+    assert notes.editor.isReadOnly()  # but can be scrolled and copied
     assert not window.menus.actions["measure"].isEnabled()
     for key in ("laser", "plane", "bench_check"):
         window.show_step(key)

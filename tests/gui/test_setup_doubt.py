@@ -1,4 +1,4 @@
-"""A session whose recording contradicts its set-up: the pages say so."""
+"""Pages warn if the recording of a session contradicts its set-up."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.setups import GTAW, OFF, closely_known
 
 
 @pytest.mark.slow
-def test_pages_say_that_a_set_up_is_doubtful_until_it_is_changed(
+def test_pages_warn_of_a_doubtful_setup_until_it_is_changed(
     window: MainWindow, qtbot: QtBot, tmp_path: Path
 ):
     path = tmp_path / "one.labsession"
@@ -24,17 +24,17 @@ def test_pages_say_that_a_set_up_is_doubtful_until_it_is_changed(
         session.import_recording(GTAW / "recording.avi", "0:8")
         list(session.measure_each())
 
-    def saying(step: str) -> list[str]:
+    def warnings(step: str) -> list[str]:
         window.show_step(step)
-        words = [label.text() for label in window.findChildren(QLabel) if label.isVisible()]
-        return [text for text in words if "doubtful" in text]
+        texts = [label.text() for label in window.findChildren(QLabel) if label.isVisible()]
+        return [text for text in texts if "doubtful" in text]
 
     assert window.files.open(path)
     for step in ("surface", "trends"):
-        qtbot.waitUntil(lambda step=step: bool(saying(step)))
+        qtbot.waitUntil(lambda step=step: bool(warnings(step)))
     assert window.workspace.session is not None
     assert "doubtful" in shown(window.workspace.session).status
     window.workspace.session.set_setup(closely_known({}))
     window.workspace.changed.emit()
-    qtbot.waitUntil(lambda: not saying("trends"))
+    qtbot.waitUntil(lambda: not warnings("trends"))
     assert "doubtful" not in shown(window.workspace.session).status

@@ -1,4 +1,4 @@
-"""What the first window loads, and what it leaves for later."""
+"""Modules that the first window loads, and modules that are loaded later."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ FOR_LATER = {
     *("scipy", "cv2", "av", "pyqtgraph", "matplotlib", "pyvista", "vtkmodules"),
     *("h5py", "tifffile", "pywt", "reportlab", "labapp.core.pipeline", "labapp.session.session"),
 }
-"""Each of them takes from some hundredths to one second to load."""
+"""Modules that each take from some hundredths of a second to one second to load."""
 
 NOT_FOR_A_SURFACE = {"h5py", "tifffile", "pywt", "reportlab"}
 
@@ -81,34 +81,34 @@ print(*threads)
 """
 
 
-def loaded(program: str, *arguments: object) -> set[str]:
-    """Words that a program says, such as the names of the modules that it has loaded."""
-    ran = subprocess.run(
+def words_of(program: str, *arguments: object) -> set[str]:
+    """Words that a program prints, such as the names of the modules it has loaded."""
+    process = subprocess.run(
         [sys.executable, "-c", program, *map(str, arguments)],
         capture_output=True,
         text=True,
         check=True,
         env={**os.environ, "QT_QPA_PLATFORM": "offscreen"},
     )
-    return set(ran.stdout.split())
+    return set(process.stdout.split())
 
 
-def test_the_first_window_loads_nothing_that_only_pages_need(tmp_path: Path):
-    found = loaded(FIRST_WINDOW, tmp_path / "preferences.json")
-    assert "labapp.gui.pages.welcome" in found
-    assert found & FOR_LATER == set()
+def test_first_window_loads_no_module_of_the_pages(tmp_path: Path):
+    modules = words_of(FIRST_WINDOW, tmp_path / "preferences.json")
+    assert "labapp.gui.pages.welcome" in modules
+    assert modules & FOR_LATER == set()
 
 
-def test_a_surface_is_shown_without_what_reads_and_writes_other_files():
-    found = loaded(SURFACE_PAGE)
-    assert "scipy" in found
-    assert found & NOT_FOR_A_SURFACE == set()
+def test_surface_page_loads_no_modules_for_other_files():
+    modules = words_of(SURFACE_PAGE)
+    assert "scipy" in modules
+    assert modules & NOT_FOR_A_SURFACE == set()
 
 
 def test_sigterm_closes_the_window(tmp_path: Path):
-    assert loaded(STOPPED, tmp_path / "preferences.json") == {"0", "False", "True"}
+    assert words_of(STOPPED, tmp_path / "preferences.json") == {"0", "False", "True"}
 
 
-def test_widgets_are_freed_in_the_windows_own_thread_only(tmp_path: Path):
-    """Freed in a thread of work, a widget's end and the window wait for each other."""
-    assert loaded(GARBAGE, tmp_path / "preferences.json") == {"none", "MainThread"}
+def test_widgets_are_deleted_in_the_main_thread_only(tmp_path: Path):
+    """A widget that a worker thread deletes can deadlock with the window."""
+    assert words_of(GARBAGE, tmp_path / "preferences.json") == {"none", "MainThread"}

@@ -1,4 +1,4 @@
-"""What there is to say moves no button: a second click at the same place meets the same button."""
+"""Messages move no button: a second click at the same place hits the same button."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ LEFT, NONE = Qt.MouseButton.LeftButton, Qt.KeyboardModifier.NoModifier
 
 @pytest.fixture
 def opened(window: MainWindow, copy_sample: CopySample, qtbot: QtBot) -> MainWindow:
-    """The window with a session that is measured, high enough for whole panels."""
+    """The window with a measured session, tall enough for complete panels."""
     window.resize(1280, 1000)
     assert window.files.open(copy_sample("thumb_tack"))
     window.activateWindow()
@@ -44,23 +44,23 @@ def opened(window: MainWindow, copy_sample: CopySample, qtbot: QtBot) -> MainWin
 
 
 @contextmanager
-def told_labels() -> Iterator[set[QLabel]]:
-    """The labels that are told something meanwhile."""
-    found: set[QLabel] = set()
+def updated_labels() -> Iterator[set[QLabel]]:
+    """Collect the labels whose text is set meanwhile."""
+    labels: set[QLabel] = set()
     with pytest.MonkeyPatch.context() as patched:
         for kind in (QLabel, Message):
-            own = kind.setText
+            set_text = kind.setText
 
-            def told(label: QLabel, words: str, own=own) -> None:
-                found.add(label)
-                own(label, words)
+            def record(label: QLabel, words: str, set_text=set_text) -> None:
+                labels.add(label)
+                set_text(label, words)
 
-            patched.setattr(kind, "setText", told)
-        yield found
+            patched.setattr(kind, "setText", record)
+        yield labels
 
 
 def places(window: MainWindow) -> dict[QAbstractButton, QPoint]:
-    """Where the buttons in view are, in the window."""
+    """Positions of the visible buttons in the window."""
     return {
         each: each.mapTo(window, QPoint())
         for each in window.findChildren(QAbstractButton)
@@ -68,48 +68,48 @@ def places(window: MainWindow) -> dict[QAbstractButton, QPoint]:
     }
 
 
-def is_of_a_field(label: QLabel) -> bool:
-    """Whether it tells what is wrong with a field: right below it, when the mouse is let go."""
+def is_problem_of_a_field(label: QLabel) -> bool:
+    """Whether it is the problem label of a field, which appears when the mouse is released."""
     parent = label.parentWidget()
     return isinstance(parent, Field) and label is parent.problem
 
 
 @pytest.mark.parametrize("key", PAGES)
-def test_no_message_of_a_page_moves_its_buttons(opened: MainWindow, key: str, qtbot: QtBot):
+def test_messages_do_not_move_the_buttons_of_a_page(opened: MainWindow, key: str, qtbot: QtBot):
     opened.show_step(key)
     page = opened.page
     if key == "setup":
         page.tabs.setCurrentIndex(BENCH_TAB)
     qtbot.waitUntil(lambda: not opened.workspace.tasks.active)
-    with told_labels() as told:
+    with updated_labels() as updated:
         opened.workspace.changed.emit()
         opened.apply_theme()
         qtbot.waitUntil(lambda: not opened.workspace.tasks.active)
-    inside = [each for each in told if page.panel.isAncestorOf(each) or page.isAncestorOf(each)]
-    # That a recording is missing is known when the session is opened, before there is a pointer.
+    inside = [each for each in updated if page.panel.isAncestorOf(each) or page.isAncestorOf(each)]
+    # A missing recording is reported when the session is opened, before a button can be clicked.
     known = {getattr(page, "missing", None)}
-    messages = [each for each in inside if not (is_of_a_field(each) or each in known)]
+    messages = [each for each in inside if not (is_problem_of_a_field(each) or each in known)]
     messages.append(opened.side_panel.state)
     let_draw()
     before = places(opened)
     assert len(before) >= 5
     for label in messages:
-        shown, words = label.isVisibleTo(page.panel), label.text()
-        for said in (LONG, ""):
-            label.setText(said)
-            label.setVisible(bool(said) or isinstance(label, Message))
+        shown, original = label.isVisibleTo(page.panel), label.text()
+        for text in (LONG, ""):
+            label.setText(text)
+            label.setVisible(bool(text) or isinstance(label, Message))
             let_draw()
             after = places(opened)
             moved = {
                 each.text() for each in before if after.get(each, before[each]) != before[each]
             }
-            assert not moved, (label, label.parentWidget(), words, said)
-        label.setText(words)
+            assert not moved, (label, label.parentWidget(), original, text)
+        label.setText(original)
         label.setVisible(shown)
 
 
 def press_at(window: MainWindow, place: QPoint) -> None:
-    """Click where the pointer rests, whatever is there, with time between press and release."""
+    """Click at a place, whatever is there, with some time between press and release."""
     handle = window.windowHandle()
     QTest.mousePress(handle, LEFT, NONE, place)
     let_draw()
@@ -117,9 +117,7 @@ def press_at(window: MainWindow, place: QPoint) -> None:
     let_draw()
 
 
-def test_seven_clicks_tick_the_seven_lines_of_the_safety_list(
-    window: MainWindow, tmp_path, qtbot: QtBot
-):
+def test_each_click_checks_one_line_of_the_safety_list(window: MainWindow, tmp_path, qtbot: QtBot):
     window.resize(1280, 1000)
     window.workspace.show(Session.create(tmp_path / "new.labsession"))
     window.show_step("setup")
@@ -131,10 +129,10 @@ def test_seven_clicks_tick_the_seven_lines_of_the_safety_list(
     area = page.panel
     while not isinstance(area, QScrollArea):
         area = area.parentWidget()
-    seen = area.viewport()
+    viewport = area.viewport()
     ticked = 0
     places = [box.mapTo(window, QPoint(9, box.height() // 2)) for box in page.ticks.values()]
-    bottom = seen.mapTo(window, QPoint(0, seen.height())).y()
+    bottom = viewport.mapTo(window, QPoint(0, viewport.height())).y()
     for place in places:
         if place.y() < bottom:
             press_at(window, place)
@@ -146,7 +144,7 @@ def test_seven_clicks_tick_the_seven_lines_of_the_safety_list(
     assert window.workspace.session.record.safety == ()
 
 
-def test_export_counts_though_the_film_s_speed_is_still_being_typed(
+def test_click_on_export_counts_while_a_field_is_being_edited(
     opened: MainWindow, tmp_path, qtbot: QtBot, monkeypatch: pytest.MonkeyPatch
 ):
     opened.show_step("export")
@@ -170,7 +168,7 @@ def test_export_counts_though_the_film_s_speed_is_still_being_typed(
     assert len(pressed) == 4
 
 
-def test_a_message_that_is_too_long_ends_in_dots_and_its_tip_has_it_all(qtbot: QtBot):
+def test_long_message_is_elided_and_complete_in_its_tooltip(qtbot: QtBot):
     label = Message(2)
     qtbot.addWidget(label)
     label.resize(200, label.sizeHint().height())
@@ -200,22 +198,22 @@ def test_a_message_that_is_too_long_ends_in_dots_and_its_tip_has_it_all(qtbot: Q
         ("export", "Export"),
     ],
 )
-def test_primary_buttons_are_in_view_on_a_small_screen(
+def test_primary_buttons_are_visible_on_a_small_screen(
     opened: MainWindow, qtbot: QtBot, key: str, words: str
 ) -> None:
     opened.resize(1024, 700)
     opened.show_step(key)
     let_draw()
     assert opened.page is not None
-    found = [
+    buttons = [
         each
         for each in opened.page.panel.findChildren(QAbstractButton)
         if each.text().replace("&", "") == words and each.isVisible()
     ]
-    assert [each.visibleRegion().boundingRect() for each in found] == [found[0].rect()]
+    assert [each.visibleRegion().boundingRect() for each in buttons] == [buttons[0].rect()]
 
 
-def test_a_panel_stays_where_it_is_when_a_clicked_button_is_disabled(qtbot: QtBot) -> None:
+def test_panel_does_not_scroll_when_a_clicked_button_is_disabled(qtbot: QtBot) -> None:
     inner = QWidget()
     clicked, beyond = QPushButton("Apply", inner), QPushButton("beyond", inner)
     inner.setMinimumSize(100, 900)

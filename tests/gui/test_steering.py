@@ -1,4 +1,4 @@
-"""A 3-D controller turns the surface: the right way, on the page that is seen, and says so once."""
+"""A 3-D controller turns the surface on the visible page, in the right direction."""
 
 from __future__ import annotations
 
@@ -28,40 +28,40 @@ THREAD = "reader of 3-D controller"
 
 @pytest.fixture
 def view(qtbot: QtBot) -> Iterator[View3d]:
-    made = make_view3d("A hill")
-    KEPT.append(made)
-    made.resize(320, 240)
-    made.show()
-    made.show_scene(hill())
-    made.grab()  # which paints it
-    yield made
-    made.close_view()
-    made.close()
+    view3d = make_view3d("A hill")
+    KEPT.append(view3d)
+    view3d.resize(320, 240)
+    view3d.show()
+    view3d.show_scene(hill())
+    view3d.grab()  # which paints it
+    yield view3d
+    view3d.close_view()
+    view3d.close()
 
 
 def place_px(view: View3d, point_mm: tuple[float, float, float]) -> np.ndarray:
-    """Where a point of the scene is seen, (right, down) of the middle, heights of the view."""
+    """The screen position (right, down) of a scene point from the centre, in view heights."""
     position, focus, up, angle_deg, scale, parallel, _ = view.camera
     ahead = np.subtract(focus, position)
     ahead = ahead / np.linalg.norm(ahead)
     right = np.cross(ahead, up)
     right /= np.linalg.norm(right)
-    way = np.subtract(point_mm, position)
-    tall = scale if parallel else way @ ahead * np.tan(np.radians(angle_deg / 2))
-    return np.array([way @ right, -(way @ np.cross(right, ahead))]) / (2 * tall)
+    offset = np.subtract(point_mm, position)
+    half_height = scale if parallel else offset @ ahead * np.tan(np.radians(angle_deg / 2))
+    return np.array([offset @ right, -(offset @ np.cross(right, ahead))]) / (2 * half_height)
 
 
-def moved_px(view: View3d, held: SixAxes, point_mm: tuple[float, float, float]) -> np.ndarray:
+def moved_px(view: View3d, axes: SixAxes, point_mm: tuple[float, float, float]) -> np.ndarray:
     before = place_px(view, point_mm)
-    steer(view, held, 0.1)
+    steer(view, axes, 0.1)
     return place_px(view, point_mm) - before
 
 
 FRONT, TOP, RIGHT, CENTRE = (0.0, -3.0, 0.0), (0.0, 0.0, 3.0), (3.0, 0.0, 0.0), (0.0, 0.0, 0.1)
-"""Points nearest to the operator, above, at the right, and in the middle, mm."""
+"""Points towards the operator, above, at the right, and in the centre, mm."""
 
 
-def test_what_is_seen_follows_the_hand(view: View3d):
+def test_view_follows_the_controller(view: View3d):
     view.look("front")
     before = place_px(view, CENTRE)
     steer(view, SixAxes(pitch=-0.0001, near=0.01), 1.0)  # within the dead zone
@@ -78,7 +78,7 @@ def test_what_is_seen_follows_the_hand(view: View3d):
     # Tilted towards the operator, the top comes nearer and the front goes down.
     view.look("front")
     assert moved_px(view, SixAxes(pitch=1.0), FRONT)[1] > 0.01
-    # Rolled against the clock, the right side goes up.
+    # Rolled counterclockwise, the right side goes up.
     view.look("front")
     right, down = moved_px(view, SixAxes(roll=1.0), RIGHT)
     assert down < -0.01
@@ -87,7 +87,7 @@ def test_what_is_seen_follows_the_hand(view: View3d):
     assert np.linalg.norm(place_px(view, TOP) - place_px(view, CENTRE)) > 1.05 * before
 
 
-def test_its_first_button_looks_obliquely_again(view: View3d):
+def test_first_button_restores_the_oblique_view(view: View3d):
     view.look("free")
     oblique = view.camera
     for _ in range(20):
@@ -98,7 +98,7 @@ def test_its_first_button_looks_obliquely_again(view: View3d):
         assert now == pytest.approx(then)
 
 
-def test_held_at_rest_nothing_is_drawn_anew(view: View3d):
+def test_controller_at_rest_triggers_no_redraw(view: View3d):
     drawn = []
     view.camera_changed.connect(drawn.append)
     steer(view, SixAxes(right=0.03, yaw=-0.03), 0.033)
@@ -109,14 +109,14 @@ def readers() -> int:
     return sum(thread.name == THREAD for thread in threading.enumerate())
 
 
-def test_it_turns_the_surface_page_while_that_is_in_view(
+def test_controller_turns_the_surface_page_while_visible(
     window: MainWindow, copy_sample: CopySample, qtbot: QtBot, monkeypatch: pytest.MonkeyPatch
 ):
     bench = Bench({MOUSE_3D: Device(AXES)})
     monkeypatch.setattr(hid, "RETRY_S", 0.02)
     monkeypatch.setattr("labapp.media.devices.space_mouse.RETRY_S", 0.02)
-    made = partial(SpaceMouse, find=bench.find, opener=bench.open)
-    monkeypatch.setattr(steering, "SpaceMouse", made)
+    make_controller = partial(SpaceMouse, find=bench.find, opener=bench.open)
+    monkeypatch.setattr(steering, "SpaceMouse", make_controller)
     window.files.open(copy_sample("thumb_tack"))
     window.show_step("surface")
     qtbot.waitUntil(lambda: not window.workspace.tasks.active)
@@ -132,17 +132,17 @@ def test_it_turns_the_surface_page_while_that_is_in_view(
     assert readers() == 0
     window.show_step("surface")
     qtbot.waitUntil(lambda: len(bench.readers) == 2)
-    # Pulled out while it is held it turns nothing; back in, it goes on.
+    # Unplugged while deflected, it turns nothing; plugged in again, it works again.
     bench.press(MOUSE_3D, "01 0000 0000 0000 0000 0000 5e01")
     qtbot.waitUntil(lambda: window.page.steering._held[-1].yaw == 1)
     bench.devices[MOUSE_3D].plugged = False
     qtbot.waitUntil(lambda: window.page.steering._held[-1] == SixAxes())
     bench.devices[MOUSE_3D].plugged = True
     qtbot.waitUntil(lambda: len(bench.readers) == 3)
-    told = "\n".join(window.log_panel.texts())
-    assert told.count("3-D controller: connected\n") <= 1
+    log = "\n".join(window.log_panel.texts())
+    assert log.count("3-D controller: connected\n") <= 1
     assert window.status_line.unread == []
-    # Of two schemes the first is turned, and the others with it.
+    # In the comparison of two schemes, all views are turned together.
     window.page.comparing.click()
     qtbot.waitUntil(lambda: not window.workspace.tasks.active)
     for each in window.page.compare.views:
@@ -159,13 +159,13 @@ def test_it_turns_the_surface_page_while_that_is_in_view(
     assert readers() == 0
 
 
-def test_where_there_is_none_nothing_is_said(
+def test_missing_controller_is_not_reported(
     window: MainWindow, copy_sample: CopySample, qtbot: QtBot, monkeypatch: pytest.MonkeyPatch
 ):
-    looked = []
-    made = partial(SpaceMouse, find=lambda: looked.append(1) or [])
-    monkeypatch.setattr(steering, "SpaceMouse", made)
+    searches = []
+    make_controller = partial(SpaceMouse, find=lambda: searches.append(1) or [])
+    monkeypatch.setattr(steering, "SpaceMouse", make_controller)
     window.files.open(copy_sample("thumb_tack"))
     window.show_step("surface")
-    qtbot.waitUntil(lambda: bool(looked) and not window.workspace.tasks.active)
+    qtbot.waitUntil(lambda: bool(searches) and not window.workspace.tasks.active)
     assert not any("controller" in each for each in window.log_panel.texts())

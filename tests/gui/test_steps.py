@@ -1,4 +1,4 @@
-"""The steps' states, in words that say what to do."""
+"""The states of the steps, and what they say to do."""
 
 from __future__ import annotations
 
@@ -40,38 +40,38 @@ CALIBRATE = "calibrate the picture (step Imaging plane)"
         ),
     ],
 )
-def test_what_is_missing_in_the_setup_is_said_as_what_to_do(text: str, words: str) -> None:
-    with pytest.raises(InputError) as refused:
+def test_missing_setup_values_are_listed_as_instructions(text: str, words: str) -> None:
+    with pytest.raises(InputError) as raised:
         parse_setup(text, "setup")
-    assert setup_to_do(refused.value.problems) == words
+    assert setup_to_do(raised.value.problems) == words
 
 
-def test_a_new_session_has_nothing_entered(tmp_path: Path) -> None:
+def test_states_of_a_new_session(tmp_path: Path) -> None:
     with Session.create(tmp_path / "new.labsession") as session:
-        found = states(session)
-    assert found["setup"].mark is Mark.READY
-    assert found["setup"].why.startswith("Enter the laser")
+        step_states = states(session)
+    assert step_states["setup"].mark is Mark.READY
+    assert step_states["setup"].why.startswith("Enter the laser")
     assert (
-        found["laser"].why
-        == found["plane"].why
+        step_states["laser"].why
+        == step_states["plane"].why
         == ("Not calibrated yet, and no values were entered")
     )
     assert setup_to_do(()) == ""
 
 
-def test_a_pattern_of_lines_gives_its_step_another_name(tmp_path: Path) -> None:
+def test_line_pattern_renames_the_dots_step(tmp_path: Path) -> None:
     (dots,) = (step for step in STEPS if step.key == "dots")
     assert dots.of(None).title == "Dots"
     with Session.create(tmp_path / "new.labsession") as session:
         assert dots.of(session) == dots
         session.update_setup({"pattern": {"kind": "lines"}})
-        named = dots.of(session)
-        assert named.title == "Pattern"
-        assert "lines" in named.hint
+        renamed = dots.of(session)
+        assert renamed.title == "Pattern"
+        assert "lines" in renamed.hint
         assert all(step.of(session) == step for step in STEPS if step is not dots)
 
 
-def test_a_recording_without_any_surface_is_not_done(tmp_path: Path) -> None:
+def test_recording_without_any_surface_needs_attention(tmp_path: Path) -> None:
     dark, setup = tmp_path / "dark.npy", SAMPLES / "gtaw" / "setup.toml"
     np.save(dark, np.zeros((2, 640, 480), np.uint8))
     with Session.create(tmp_path / "new.labsession") as session:
@@ -81,5 +81,7 @@ def test_a_recording_without_any_surface_is_not_done(tmp_path: Path) -> None:
         session.measure([0])
         assert states(session)["surface"].mark is Mark.READY
         session.measure([1])
-        found = states(session)
-    assert {found[key].mark for key in ("dots", "surface", "trends", "export")} == {Mark.ATTENTION}
+        step_states = states(session)
+    assert {step_states[key].mark for key in ("dots", "surface", "trends", "export")} == {
+        Mark.ATTENTION
+    }

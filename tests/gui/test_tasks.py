@@ -10,13 +10,13 @@ from labapp.gui.shell.messages import StatusLine
 from labapp.gui.tasks import Control, Tasks
 
 
-def test_parts_and_the_result_come_in_order_on_the_gui_thread(qtbot: QtBot):
+def test_parts_and_result_arrive_in_order_on_the_gui_thread(qtbot: QtBot):
     tasks = Tasks()
-    came: list[tuple[object, bool]] = []
-    here = threading.current_thread()
+    received: list[tuple[object, bool]] = []
+    gui_thread = threading.current_thread()
 
-    def take(value: object) -> None:
-        came.append((value, threading.current_thread() is here))
+    def receive(value: object) -> None:
+        received.append((value, threading.current_thread() is gui_thread))
 
     def work(control: Control) -> str:
         for number in range(3):
@@ -24,30 +24,30 @@ def test_parts_and_the_result_come_in_order_on_the_gui_thread(qtbot: QtBot):
             control.part(number)
         return "done"
 
-    task = tasks.start("Counting", work, on_done=take, on_part=take)
+    task = tasks.start("Counting", work, on_done=receive, on_part=receive)
     qtbot.waitUntil(lambda: not tasks.active)
-    assert came == [(0, True), (1, True), (2, True), ("done", True)]
+    assert received == [(0, True), (1, True), (2, True), ("done", True)]
     assert (task.done, task.total) == (3, 3)
 
 
-def test_a_failure_is_told_in_words(qtbot: QtBot):
+def test_failures_are_reported(qtbot: QtBot):
     tasks = Tasks()
-    told: list[tuple[str, str]] = []
-    tasks.failed.connect(lambda title, why: told.append((title, why)))
+    failures: list[tuple[str, str]] = []
+    tasks.failed.connect(lambda title, why: failures.append((title, why)))
 
-    def refuse(_: Control) -> None:
+    def reject(_: Control) -> None:
         raise InputError("a.avi", "size", "0 bytes", "a video")
 
-    def break_down(_: Control) -> None:
+    def crash(_: Control) -> None:
         raise KeyError("x")
 
-    tasks.start("Importing", refuse)
+    tasks.start("Importing", reject)
     qtbot.waitUntil(lambda: not tasks.active)
-    tasks.start("Measuring", break_down)
+    tasks.start("Measuring", crash)
     qtbot.waitUntil(lambda: not tasks.active)
-    assert told[0] == ("Importing", "a.avi: size: 0 bytes; expected a video")
-    assert told[1][0] == "Measuring"
-    assert "KeyError" in told[1][1]
+    assert failures[0] == ("Importing", "a.avi: size: 0 bytes; expected a video")
+    assert failures[1][0] == "Measuring"
+    assert "KeyError" in failures[1][1]
 
 
 def endless(control: Control) -> None:
@@ -58,7 +58,7 @@ def endless(control: Control) -> None:
         time.sleep(0.001)
 
 
-def test_cancelling_stops_the_work_and_calls_nothing_back(qtbot: QtBot):
+def test_cancelling_stops_the_task_without_a_callback(qtbot: QtBot):
     tasks = Tasks()
     called: list[object] = []
     line = StatusLine(tasks)
@@ -76,7 +76,7 @@ def test_cancelling_stops_the_work_and_calls_nothing_back(qtbot: QtBot):
     assert not line.bar.isVisibleTo(line)
 
 
-def test_closing_waits_for_the_work(qtbot: QtBot):
+def test_cancel_all_waits_for_the_tasks(qtbot: QtBot):
     tasks = Tasks()
     started = [tasks.start(name, endless) for name in ("Measuring", "Importing")]
     tasks.cancel_all()
@@ -84,7 +84,7 @@ def test_closing_waits_for_the_work(qtbot: QtBot):
     assert tasks.active == []
 
 
-def test_a_problem_stays_until_it_was_read(qtbot: QtBot):
+def test_problem_is_shown_until_it_is_dismissed(qtbot: QtBot):
     line = StatusLine(Tasks())
     qtbot.addWidget(line)
     line.say("30 frames measured", False)
@@ -102,17 +102,17 @@ def test_a_problem_stays_until_it_was_read(qtbot: QtBot):
     assert line.message.text() == "One frame measured"
 
 
-def test_an_error_after_a_cancel_is_told_to_nobody(qapp: object, qtbot: QtBot):
-    tasks, told, begun = Tasks(), [], threading.Event()
-    tasks.failed.connect(lambda *words: told.append(words))
+def test_error_after_a_cancel_is_not_reported(qapp: object, qtbot: QtBot):
+    tasks, failures, started = Tasks(), [], threading.Event()
+    tasks.failed.connect(lambda *words: failures.append(words))
 
     def work(control: Control) -> None:
-        begun.set()
+        started.set()
         control.cancelled.wait()
         raise RuntimeError("the session is closed")
 
     task = tasks.start("Reading", work)
-    begun.wait()
+    started.wait()
     task.cancel()
     qtbot.waitUntil(lambda: not tasks.active)
-    assert told == []
+    assert failures == []

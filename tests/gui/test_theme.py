@@ -1,4 +1,4 @@
-"""From dark to light and back, on every page: what is seen says the same, in the other colours."""
+"""Switching between dark and light changes only the colours, on every page."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ from tests.gui.conftest import CopySample, let_draw
 
 @pytest.fixture
 def opened(window: MainWindow, copy_sample: CopySample) -> MainWindow:
-    """The window, dark, with a measured session."""
+    """The window in the dark theme with a measured session."""
     window.apply_theme()
     assert window.files.open(copy_sample("gtaw"))
     return window
 
 
 def plots(widget: QWidget) -> list[pg.PlotItem]:
-    """All plots that are seen."""
+    """All visible plots."""
     views = [view for view in widget.findChildren(QGraphicsView) if view.isVisible()]
     return [each for view in views for each in view.items() if isinstance(each, pg.PlotItem)]
 
@@ -40,19 +40,19 @@ def axes(plot: pg.PlotItem) -> list[pg.AxisItem]:
     return [plot.getAxis(side) for side in ("left", "bottom") if plot.getAxis(side).isVisible()]
 
 
-def misread(axis: pg.AxisItem) -> list[str]:
-    """Numbers at an axis that are not the place where they stand."""
-    wrong = []
+def wrong_labels(axis: pg.AxisItem) -> list[str]:
+    """Axis labels whose number differs from their position."""
+    errors = []
     size = max(axis.geometry().width(), axis.geometry().height())
     for spacing, values in axis.tickValues(*axis.range, size):
-        told = axis.tickStrings(values, axis.autoSIPrefixScale * axis.scale, spacing)
-        places = zip(told, values, strict=True)
-        wrong += [f"{t} at {v:g}" for t, v in places if abs(float(t) - v) > 0.51 * spacing]
-    return [f"{axis.labelText}: {words}" for words in wrong]
+        labels = axis.tickStrings(values, axis.autoSIPrefixScale * axis.scale, spacing)
+        pairs = zip(labels, values, strict=True)
+        errors += [f"{t} at {v:g}" for t, v in pairs if abs(float(t) - v) > 0.51 * spacing]
+    return [f"{axis.labelText}: {words}" for words in errors]
 
 
-def test_every_axis_keeps_its_unit(opened: MainWindow, qtbot: QtBot) -> None:
-    seen: dict[str, int] = {}
+def test_axes_keep_their_units(opened: MainWindow, qtbot: QtBot) -> None:
+    counts: dict[str, int] = {}
     keys = [step.key for step in STEPS if step.key != "laser"]
     for key in (*keys, "laser"):
         if key == "laser":  # without a calibration there is nothing to draw
@@ -65,13 +65,20 @@ def test_every_axis_keeps_its_unit(opened: MainWindow, qtbot: QtBot) -> None:
             opened.set_theme(theme)
             let_draw()
             drawn = plots(opened)
-            assert [one for plot in drawn for axis in axes(plot) for one in misread(axis)] == []
-        seen[key] = len(drawn)
-    assert {key for key, count in seen.items() if count} >= {"setup", "laser", "surface", "trends"}
-    assert seen["surface"] == 3
+            assert [
+                one for plot in drawn for axis in axes(plot) for one in wrong_labels(axis)
+            ] == []
+        counts[key] = len(drawn)
+    assert {key for key, count in counts.items() if count} >= {
+        "setup",
+        "laser",
+        "surface",
+        "trends",
+    }
+    assert counts["surface"] == 3
 
 
-def test_the_scale_of_heights_keeps_its_numbers(opened: MainWindow, qtbot: QtBot) -> None:
+def test_height_scale_keeps_its_numbers(opened: MainWindow, qtbot: QtBot) -> None:
     opened.show_step("surface")
     views = [view for view in opened.page.findChildren(View3d) if view.isVisible()]
     assert views
@@ -87,15 +94,15 @@ def test_the_scale_of_heights_keeps_its_numbers(opened: MainWindow, qtbot: QtBot
             assert label.replace(" (", "\n(") in overlay.words
 
 
-def shades(image: QImage) -> set[str]:
-    """The colours of a picture's pixels that are wholly of one colour."""
+def colours_of(image: QImage) -> set[str]:
+    """The colours of the opaque pixels of a picture."""
     image = image.convertToFormat(QImage.Format.Format_ARGB32)
     levels = np.frombuffer(image.constBits(), np.uint32).reshape(image.height(), -1)
-    found = np.unique(levels[:, : image.width()]).tolist()
-    return {QColor(level).name() for level in found if level >> 24 == 255}
+    values = np.unique(levels[:, : image.width()]).tolist()
+    return {QColor(level).name() for level in values if level >> 24 == 255}
 
 
-def test_marks_and_words_take_the_colours_of_the_theme(opened: MainWindow) -> None:
+def test_marks_and_texts_use_the_colours_of_the_theme(opened: MainWindow) -> None:
     opened.show_step("trends")
     steps, panel, timeline = opened.step_list, opened.side_panel, opened.timeline
     marks = {opened._states[step.key].mark for step in STEPS}
@@ -106,19 +113,19 @@ def test_marks_and_words_take_the_colours_of_the_theme(opened: MainWindow) -> No
         icons = [steps.item(row).icon().pixmap(54).toImage() for row in range(steps.count())]
         for icon, step in zip(icons, STEPS, strict=True):
             pair = COLOURS[opened._states[step.key].mark]
-            assert pair[dark] in shades(icon)
-            assert pair[not dark] not in shades(icon)
+            assert pair[dark] in colours_of(icon)
+            assert pair[not dark] not in colours_of(icon)
         state = opened._states["trends"]
         colour = panel.state.palette().color(QPalette.ColorRole.WindowText)
         assert colour == QColor(COLOURS[state.mark][dark])
         play = timeline.play_button.icon().pixmap(timeline.play_button.iconSize()).toImage()
-        assert shades(play) == {palette(dark).color(QPalette.ColorRole.ButtonText).name()}
+        assert colours_of(play) == {palette(dark).color(QPalette.ColorRole.ButtonText).name()}
         ticks = [tick for tick in timeline._ticks if tick.light]
         assert any((t.dark if dark else t.light) in timeline.counts.text() for t in ticks)
         assert not any((t.light if dark else t.dark) in timeline.counts.text() for t in ticks)
 
 
-def test_sessions_that_are_gone_stay_legible(tmp_path: Path, window: MainWindow) -> None:
+def test_missing_sessions_stay_legible(tmp_path: Path, window: MainWindow) -> None:
     welcome = window.welcome
     path = tmp_path / "gone.labsession"
     welcome._shown = (path,)
@@ -131,7 +138,7 @@ def test_sessions_that_are_gone_stay_legible(tmp_path: Path, window: MainWindow)
         assert welcome.list.item(0).foreground().color() == pale
 
 
-def test_live_figures_and_alarms_take_the_colours_of_the_theme(qapp: QApplication) -> None:
+def test_live_figures_and_alarms_use_the_colours_of_the_theme(qapp: QApplication) -> None:
     figures, strip = LiveFigures(), AlarmStrip(lambda: None)
     qapp.setPalette(palette(True))
     figures.show_figures([Figure("Width", "6.6", "", "▲ above 6", "alarm")])

@@ -32,28 +32,28 @@ def shown(qtbot: QtBot, kinds: np.ndarray, width: int = 600) -> Timeline:
     return timeline
 
 
-def test_how_frames_stand():
-    seen = overview(
+def test_frame_status():
+    results = overview(
         ["", "ok", "ok", "ok", "no-dots", "", "no-match"],
         [False, False, True, True, False, True, True],
         [False, False, False, True, False, False, False],
     )
-    assert [FrameStatus(kind).name for kind in standings(seen)] == [
+    assert [FrameStatus(kind).name for kind in standings(results)] == [
         "NOT_MEASURED", "MEASURED", "CORRECTED", "DOUBTFUL", "NOT_MEASURABLE", "CORRECTED",
         "NOT_MEASURABLE",
     ]  # fmt: skip
 
 
-def test_a_frame_that_stands_out_is_in_doubt():
+def test_outlying_frame_is_doubtful():
     width = np.full(40, 6.6)
     width[17] = 9.0
     none = np.zeros(40, bool)
     measures = dict.fromkeys(MEASURES, np.full(40, 1.0)) | {"width_mm": width}
-    seen = Overview(np.arange(40), np.arange(40) / 60, ("ok",) * 40, none, none, measures)
-    assert np.flatnonzero(standings(seen) == FrameStatus.DOUBTFUL).tolist() == [17]
+    results = Overview(np.arange(40), np.arange(40) / 60, ("ok",) * 40, none, none, measures)
+    assert np.flatnonzero(standings(results) == FrameStatus.DOUBTFUL).tolist() == [17]
 
 
-def test_the_next_frame_that_is_wanted():
+def test_next_frame():
     frames = np.array([0, 5, 10, 15])
     wanted = np.array([True, False, False, True])
     assert next_frame(frames, wanted, 0) == 15
@@ -62,7 +62,7 @@ def test_the_next_frame_that_is_wanted():
     assert next_frame(frames, wanted, 0, forward=False) is None
 
 
-def test_one_bad_frame_in_ten_thousand_is_seen():
+def test_one_bad_frame_in_ten_thousand_is_visible():
     kinds = np.full(10_000, FrameStatus.MEASURED, np.int64)
     kinds[4321] = FrameStatus.NOT_MEASURABLE
     columns = aggregated(kinds, 700)
@@ -72,7 +72,7 @@ def test_one_bad_frame_in_ten_thousand_is_seen():
 
 
 @pytest.mark.parametrize("count", [1, 7, 599, 600, 601, 10_000])
-def test_every_pixel_goes_to_the_frame_that_it_shows(qtbot: QtBot, count: int):
+def test_pixels_map_to_frames_in_order(qtbot: QtBot, count: int):
     kinds = np.zeros(count, np.int64)
     scrubber = shown(qtbot, kinds).scrubber
     width = scrubber.width()
@@ -82,7 +82,7 @@ def test_every_pixel_goes_to_the_frame_that_it_shows(qtbot: QtBot, count: int):
     assert (np.diff(positions) >= 0).all()
 
 
-def test_kinds_differ_in_shape_not_only_in_colour(qtbot: QtBot):
+def test_frame_kinds_differ_in_shape(qtbot: QtBot):
     shapes = set()
     for kind in range(len(TICKS)):
         timeline = shown(qtbot, np.full(1000, kind, np.int64))
@@ -92,55 +92,55 @@ def test_kinds_differ_in_shape_not_only_in_colour(qtbot: QtBot):
     assert len(shapes) == len(TICKS)
 
 
-def test_clicking_typing_and_keys_go_to_frames(qtbot: QtBot):
+def test_clicks_keys_and_typing_select_frames(qtbot: QtBot):
     timeline = shown(qtbot, np.zeros(100, np.int64))
-    went: list[int] = []
-    timeline.moved.connect(went.append)
+    selected: list[int] = []
+    timeline.moved.connect(selected.append)
     timeline.moved.connect(timeline.set_frame)
     scrubber = timeline.scrubber
     middle = QPoint(int(scrubber.width() * 0.505), 15)
     qtbot.mouseClick(scrubber, Qt.MouseButton.LeftButton, pos=middle)
-    assert went[-1] == 60
+    assert selected[-1] == 60
     qtbot.keyClick(scrubber, Qt.Key.Key_PageUp)
-    assert went[-1] == 50
+    assert selected[-1] == 50
     timeline.step(1)
-    assert went[-1] == 51
+    assert selected[-1] == 51
     timeline.step(10**9)
-    assert went[-1] == 109
+    assert selected[-1] == 109
     timeline.number.setValue(12)
-    assert went[-1] == 12
+    assert selected[-1] == 12
     assert timeline.position_text.text().startswith("3 of 100 · 0.0333 s")
     assert scrubber.accessibleDescription().startswith("Frame 12, 0.0333 s: ")
 
 
-def test_a_number_between_frames_goes_to_the_nearest(qtbot: QtBot):
+def test_number_between_frames_selects_the_nearest(qtbot: QtBot):
     timeline = shown(qtbot, np.zeros(3, np.int64))
     timeline.set_frames(np.array([0, 100, 200]), np.full(3, np.nan), np.zeros(3, np.int64))
     timeline.set_frame(0)
-    with qtbot.waitSignal(timeline.moved) as went:
+    with qtbot.waitSignal(timeline.moved) as signal:
         timeline.number.setValue(90)
-    assert went.args == [100]
+    assert signal.args == [100]
     timeline.set_frame(100)
     timeline.number.setValue(101)
     assert timeline.number.value() == 100
 
 
-def test_playing_shows_every_frame_and_stops_at_the_last(qtbot: QtBot):
+def test_playing_shows_every_frame_and_stops_at_the_end(qtbot: QtBot):
     timeline = shown(qtbot, np.zeros(4, np.int64))
-    went: list[int] = []
-    timeline.moved.connect(went.append)
+    selected: list[int] = []
+    timeline.moved.connect(selected.append)
     timeline.moved.connect(timeline.set_frame)
     timeline.set_playing(True)
     assert timeline.play_button.accessibleName() == "Pause"
     qtbot.waitUntil(lambda: not timeline.playing)
-    assert went == [11, 12, 13]
+    assert selected == [11, 12, 13]
     assert timeline.play_button.accessibleName() == "Play"
     timeline.set_playing(True)
-    assert went[-1] == 10
+    assert selected[-1] == 10
     timeline.set_playing(False)
 
 
-def test_nothing_to_show_takes_no_harm(qtbot: QtBot):
+def test_empty_timeline_is_harmless(qtbot: QtBot):
     timeline = shown(qtbot, np.zeros(3, np.int64))
     timeline.set_frames(np.zeros(0, np.int64), np.zeros(0), np.zeros(0, np.int64))
     timeline.set_frame(0)

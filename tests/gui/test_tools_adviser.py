@@ -1,4 +1,4 @@
-"""The adviser's window: what it asks, that it gives what the command gives, undo, cancel."""
+"""The adviser window: its request, agreement with the command, undo, cancelling."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ SMALL = {
 
 @pytest.fixture
 def adviser(window: MainWindow, copy_sample: CopySample, qtbot: QtBot) -> AdviserWindow:
-    """The adviser's window beside a session, asked for little."""
+    """The adviser window with a session and a small request."""
     assert window.files.open(copy_sample("gtaw"))
     window.do("adviser")
     tool = window.findChild(AdviserWindow)
@@ -50,13 +50,13 @@ def click(button: QPushButton) -> None:
     QTest.mouseClick(button, Qt.MouseButton.LeftButton)
 
 
-def test_the_question_is_the_sessions_pool_and_rig(copy_sample: CopySample):
+def test_request_has_the_pool_and_rig_of_the_session(copy_sample: CopySample):
     with Session.open(copy_sample("gtaw")) as session:
         session.calibrate_laser([4.64, 4.68], [6.26, 6.21], [2.75, 2.78])
         values = advising.question(session)
         expected, limits = parse_request(values, "here")
         known = session.setup.rig.uncertainty
-    # One model: how well the session's set-up is known, correlation and all.
+    # The covariance of the session's set-up, including correlations.
     np.testing.assert_allclose(limits.uncertainty.covariance, known.covariance, rtol=1e-9)
     assert expected.width_mm == pytest.approx((0.9 * 6.7, 1.1 * 6.7))
     assert expected.kind == "convex"
@@ -65,7 +65,7 @@ def test_the_question_is_the_sessions_pool_and_rig(copy_sample: CopySample):
     parse_request(advising.question(None), "here")
 
 
-def test_it_gives_what_the_command_gives_and_undo_takes_it_back(
+def test_advice_equals_that_of_the_command_and_can_be_undone(
     adviser: AdviserWindow, labapp: Run, qtbot: QtBot, tmp_path: Path
 ):
     session = adviser.workspace.session
@@ -88,8 +88,8 @@ def test_it_gives_what_the_command_gives_and_undo_takes_it_back(
     names = sorted(path.name for path in (tmp_path / "command").iterdir())
     assert names == ["advice.csv", "advice.md", "advice.png", "patterns.csv", "setup.toml"]
     for name in names:
-        made = (tmp_path / "window" / name).read_bytes()
-        assert made == (tmp_path / "command" / name).read_bytes(), name
+        content = (tmp_path / "window" / name).read_bytes()
+        assert content == (tmp_path / "command" / name).read_bytes(), name
     click(adviser.use_button)
     laser = session.setup.rig.laser
     assert (laser.projection_angle_deg, laser.distance_mm) == (26.0, 40.0)
@@ -100,7 +100,7 @@ def test_it_gives_what_the_command_gives_and_undo_takes_it_back(
     assert QApplication.clipboard().text().startswith("quantity,unit,way")
 
 
-def test_the_impossible_is_said_in_words(adviser: AdviserWindow, qtbot: QtBot):
+def test_impossible_request_is_explained(adviser: AdviserWindow, qtbot: QtBot):
     adviser.ranges["pools.height_mm"].set_value((0.5, 0.6))
     click(adviser.start_button)
     qtbot.waitUntil(lambda: adviser.advice is not None)
@@ -109,7 +109,7 @@ def test_the_impossible_is_said_in_words(adviser: AdviserWindow, qtbot: QtBot):
     assert not adviser.use_button.isEnabled()
 
 
-def test_a_wrong_question_is_refused_and_nothing_begins(adviser: AdviserWindow):
+def test_invalid_request_is_rejected(adviser: AdviserWindow):
     adviser.ranges["pools.width_mm"].set_value((8.0, 6.0))
     click(adviser.start_button)
     assert not adviser.working
@@ -117,7 +117,7 @@ def test_a_wrong_question_is_refused_and_nothing_begins(adviser: AdviserWindow):
 
 
 @pytest.mark.parametrize("how", ["escape", "close", "app"])
-def test_it_can_be_stopped(adviser: AdviserWindow, window: MainWindow, qtbot: QtBot, how: str):
+def test_adviser_can_be_stopped(adviser: AdviserWindow, window: MainWindow, qtbot: QtBot, how: str):
     adviser.effort.set_value("thorough")
     click(adviser.start_button)
     qtbot.waitUntil(lambda: adviser.bar.maximum() > 0)
@@ -134,7 +134,7 @@ def test_it_can_be_stopped(adviser: AdviserWindow, window: MainWindow, qtbot: Qt
     assert adviser.message.text() == "Stopped"
 
 
-def test_the_set_up_page_leads_to_it(window: MainWindow, copy_sample: CopySample, qtbot: QtBot):
+def test_setup_page_opens_the_adviser(window: MainWindow, copy_sample: CopySample, qtbot: QtBot):
     assert window.files.open(copy_sample("gtaw"))
     window.show_step("setup")
     page = window.page

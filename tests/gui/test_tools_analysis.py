@@ -1,4 +1,4 @@
-"""The window of the error analysis: the command's files, part by part, cancel, copies."""
+"""The error-analysis window: the files of the command, its parts, cancelling, copying."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tests.waiting import PATIENCE_S
 def analysis(
     window: MainWindow, copy_sample: CopySample, qtbot: QtBot, monkeypatch: pytest.MonkeyPatch
 ) -> AnalysisWindow:
-    """The window beside a session; few pools and caps, worked out here."""
+    """The window with a session; few pools and caps, computed in one process."""
     caps = error_analysis.caps_8_3_1()[2::14]
     monkeypatch.setattr(error_analysis, "caps_8_3_1", lambda: caps)
     monkeypatch.setattr("os.cpu_count", lambda: 1)
@@ -50,7 +50,7 @@ def tick(tool: AnalysisWindow, *keys: str) -> None:
         box.setChecked(key in keys)
 
 
-def work_out(tool: AnalysisWindow, qtbot: QtBot) -> None:
+def run_analysis(tool: AnalysisWindow, qtbot: QtBot) -> None:
     tool.start_button.setFocus()
     QTest.keyClick(tool.start_button, Qt.Key.Key_Space)
     assert tool.working
@@ -67,30 +67,30 @@ def check_same(window: Path, command: Path) -> None:
         assert (window / name).read_bytes() == (command / name).read_bytes(), name
 
 
-def test_the_budget_is_that_of_the_sessions_set_up(
+def test_budget_is_computed_for_the_setup_of_the_session(
     analysis: AnalysisWindow, labapp: Run, qtbot: QtBot, tmp_path: Path
 ):
     session = analysis.workspace.session
     assert session is not None
     assert [field.value() for field in analysis.sizes.values()] == [6.7, 7.4, 0.3]
-    work_out(analysis, qtbot)
+    run_analysis(analysis, qtbot)
     analysis.save(tmp_path / "window")
     setup = tmp_path / "setup.toml"
     setup.write_text(session.setup_text, "utf-8")
     size = ("--width", "6.7", "--length", "7.4", "--height", "0.3")
-    code, progress_of, _ = labapp(
+    code, stdout, _ = labapp(
         "analyze", "budget", "--setup", setup, *size, "--out", tmp_path / "command"
     )
     assert code == 0
     check_same(tmp_path / "window", tmp_path / "command")
     assert set(analysis.files) == {"error_budget.csv", "error_budget.md", "error_budget.png"}
-    assert analysis.words.text() in progress_of
-    shown = analysis.table
-    assert shown.horizontalHeaderItem(1).text() == "predicted, %"
-    assert shown.item(shown.rowCount() - 1, 0).text() == "everything"
-    shown.copy_csv()
-    made = (tmp_path / "command" / "error_budget.csv").read_text("utf-8")
-    assert QApplication.clipboard().text() == made
+    assert analysis.words.text() in stdout
+    table = analysis.table
+    assert table.horizontalHeaderItem(1).text() == "predicted, %"
+    assert table.item(table.rowCount() - 1, 0).text() == "everything"
+    table.copy_csv()
+    expected = (tmp_path / "command" / "error_budget.csv").read_text("utf-8")
+    assert QApplication.clipboard().text() == expected
     analysis.save(setup / "below a file")
     assert "expected one that can be written" in analysis.message.text()
     analysis.which.set_value("error_budget.png")
@@ -100,7 +100,7 @@ def test_the_budget_is_that_of_the_sessions_set_up(
     assert QApplication.clipboard().image().width() > 600
 
 
-def test_parts_are_those_of_the_command(
+def test_parts_equal_those_of_the_command(
     analysis: AnalysisWindow, labapp: Run, qtbot: QtBot, tmp_path: Path
 ):
     assert tuple(analysis.parts) == (analysing.BUDGET, *PARTS)
@@ -108,14 +108,14 @@ def test_parts_are_those_of_the_command(
     analysis.scheme.set_value("ers")
     analysis.step.set_value(10)
     analysis.draws.set_value(10)
-    work_out(analysis, qtbot)
+    run_analysis(analysis, qtbot)
     analysis.save(tmp_path / "window")
-    given = ("--part", "CE", "--part", "LE", "--part", "parameters", "--scheme", "ers")
-    given += ("--step", "10", "--draws", "10")
-    assert labapp("analyze", "errors", "--out", tmp_path / "command", *given)[0] == 0
+    options = ("--part", "CE", "--part", "LE", "--part", "parameters", "--scheme", "ers")
+    options += ("--step", "10", "--draws", "10")
+    assert labapp("analyze", "errors", "--out", tmp_path / "command", *options)[0] == 0
     check_same(tmp_path / "window", tmp_path / "command")
-    words = [analysis.which.editor.itemText(n) for n in range(analysis.which.editor.count())]
-    assert words == [
+    names = [analysis.which.editor.itemText(n) for n in range(analysis.which.editor.count())]
+    assert names == [
         "Errors", "ARE", "Errors by cap", "Parameter deviation", "Figure 8-6: CE",
         "Figure 8-7: CE ARE", "Figure 8-8: LE", "Figure 8-9: LE ARE",
         "Parameter deviation convex, picture", "Parameter deviation concave, picture",
@@ -123,7 +123,7 @@ def test_parts_are_those_of_the_command(
 
 
 @pytest.mark.parametrize("how", ["escape", "close", "app"])
-def test_a_cancel_keeps_what_is_finished(
+def test_cancelling_keeps_finished_parts(
     analysis: AnalysisWindow,
     window: MainWindow,
     qtbot: QtBot,
@@ -132,10 +132,10 @@ def test_a_cancel_keeps_what_is_finished(
 ):
     gate, survey = threading.Event(), error_analysis.survey
 
-    def slow(kind: str, *given: Any, **more: Any) -> object:
+    def slow(kind: str, *args: Any, **kwargs: Any) -> object:
         if kind == "LE":
             gate.wait(PATIENCE_S)
-        return survey(kind, *given, **more)
+        return survey(kind, *args, **kwargs)
 
     monkeypatch.setattr(error_analysis, "survey", slow)
     tick(analysis, "CE", "LE")
@@ -156,20 +156,18 @@ def test_a_cancel_keeps_what_is_finished(
     assert analysis.isVisible() == (how == "escape")
 
 
-def test_what_is_ticked_last_takes_the_place_of_what_was_before(
-    analysis: AnalysisWindow, qtbot: QtBot
-):
-    work_out(analysis, qtbot)
+def test_new_parts_replace_the_previous_ones(analysis: AnalysisWindow, qtbot: QtBot):
+    run_analysis(analysis, qtbot)
     tick(analysis)
     assert not analysis.start_button.isEnabled()
     tick(analysis, "CE")
     analysis.scheme.set_value("ers")
-    work_out(analysis, qtbot)
+    run_analysis(analysis, qtbot)
     assert "error_budget" not in analysis.tables
     assert "error_budget.csv" not in analysis.files
 
 
-def test_what_cannot_be_is_refused(analysis: AnalysisWindow, window: MainWindow, tmp_path: Path):
+def test_impossible_input_is_rejected(analysis: AnalysisWindow, window: MainWindow, tmp_path: Path):
     analysis.sizes["height"].set_value(0.001)
     click(analysis.start_button)
     assert not analysis.working
@@ -185,7 +183,7 @@ def test_what_cannot_be_is_refused(analysis: AnalysisWindow, window: MainWindow,
     assert "missing" in analysis.message.text()
 
 
-def test_without_a_set_up_it_begins_with_that_of_the_text(copy_sample: CopySample, tmp_path: Path):
+def test_default_size_without_a_setup(copy_sample: CopySample, tmp_path: Path):
     assert not analysing.has_setup(None)
     assert analysing.expected_mm(None) == (6.0, 7.0, 0.3)
     with Session.create(tmp_path / "new.labsession") as session:

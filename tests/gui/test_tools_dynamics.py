@@ -1,4 +1,4 @@
-"""The window of the pool over time: the command's tables, its events, and what it cannot tell."""
+"""The pool-dynamics window: the tables of the command, events, and missing prerequisites."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ def opened(window: MainWindow, path: Path) -> DynamicsWindow:
 
 @pytest.fixture
 def tool(window: MainWindow, copy_sample: CopySample, qtbot: QtBot) -> DynamicsWindow:
-    """The window beside a session of 30 frames, analysed on opening."""
-    made = opened(window, copy_sample("gtaw"))
-    qtbot.waitUntil(lambda: not made.working)
-    assert made.drawn is not None
-    return made
+    """The window with a session of 30 frames, which is analysed on opening."""
+    dynamics = opened(window, copy_sample("gtaw"))
+    qtbot.waitUntil(lambda: not dynamics.working)
+    assert dynamics.drawn is not None
+    return dynamics
 
 
 @pytest.mark.slow
-def test_its_files_are_the_commands(
+def test_files_equal_those_of_the_command(
     tool: DynamicsWindow, labapp: Run, tmp_path: Path, qtbot: QtBot
 ) -> None:
     tool.save(tmp_path / "window")
@@ -53,7 +53,7 @@ def test_its_files_are_the_commands(
 
 
 @pytest.mark.slow
-def test_what_was_chosen_is_analysed_and_half_a_band_is_refused(
+def test_analysis_uses_the_settings_and_rejects_half_a_band(
     tool: DynamicsWindow, qtbot: QtBot
 ) -> None:
     before = tool.drawn
@@ -74,15 +74,15 @@ def test_what_was_chosen_is_analysed_and_half_a_band_is_refused(
 
 
 @pytest.mark.slow
-def test_events_are_marked_on_the_trends_and_lead_to_their_frame(
+def test_events_are_marked_in_the_trends_and_select_their_frame(
     tool: DynamicsWindow, window: MainWindow, qtbot: QtBot
 ) -> None:
     window.do("step_trends")
     (page,) = window.findChildren(TrendsPage)
-    found = analysed_step()
-    tool.show_found(dynamics_shown.draw(found, lambda: None))
+    analysis = analysed_step()
+    tool.show_found(dynamics_shown.draw(analysis, lambda: None))
     (width,) = [curve for curve in page.plots.curves if curve.name == "Width"]
-    assert width.events.tolist() == [one.time_s for one in found.events["width_mm"]]
+    assert width.events.tolist() == [one.time_s for one in analysis.events["width_mm"]]
     assert width.events[0] == pytest.approx(0.5, abs=0.05)
     row = [tool.events.item(k, 1).text() for k in range(tool.events.rowCount())].index("Width (mm)")
     tool.events.selectRow(row)
@@ -97,7 +97,7 @@ def test_events_are_marked_on_the_trends_and_lead_to_their_frame(
 
 
 @pytest.mark.slow
-def test_a_mode_is_played_until_it_is_stopped(tool: DynamicsWindow, qtbot: QtBot) -> None:
+def test_mode_is_animated_until_stopped(tool: DynamicsWindow, qtbot: QtBot) -> None:
     tool.tabs.setCurrentIndex(1)
     tool.play()
     qtbot.waitUntil(lambda: not tool.working)
@@ -109,7 +109,7 @@ def test_a_mode_is_played_until_it_is_stopped(tool: DynamicsWindow, qtbot: QtBot
     assert not tool._turn.isActive()
 
 
-def test_without_a_frame_rate_nothing_is_analysed(
+def test_missing_frame_rate_prevents_the_analysis(
     window: MainWindow, copy_sample: CopySample
 ) -> None:
     tool = opened(window, copy_sample("concave"))
@@ -118,27 +118,27 @@ def test_without_a_frame_rate_nothing_is_analysed(
     assert not tool.start_button.isEnabled()
 
 
-def test_too_few_frames_are_said_to_be(window: MainWindow, copy_sample: CopySample) -> None:
+def test_too_few_frames_are_reported(window: MainWindow, copy_sample: CopySample) -> None:
     assert window.files.open(copy_sample("gtaw"))
-    seen = window.workspace.overview()
-    assert seen is not None
+    overview = window.workspace.overview()
+    assert overview is not None
     session = window.workspace.session
-    assert dynamics_shown.impossible(session, seen) == ""
-    few = {**seen.measures, "height_mm": np.where(seen.frame < 15, 0.3, np.nan)}
-    object.__setattr__(seen, "measures", few)
-    assert "15 of 30" in dynamics_shown.impossible(session, seen)
+    assert dynamics_shown.impossible(session, overview) == ""
+    few = {**overview.measures, "height_mm": np.where(overview.frame < 15, 0.3, np.nan)}
+    object.__setattr__(overview, "measures", few)
+    assert "15 of 30" in dynamics_shown.impossible(session, overview)
 
 
-def test_the_tables_say_what_was_put_in() -> None:
-    found = analysed_step()
-    rows = {str(row[0]): row for row in dynamics_shown.modes_table(found).rows}
+def test_tables_show_the_simulated_values() -> None:
+    analysis = analysed_step()
+    rows = {str(row[0]): row for row in dynamics_shown.modes_table(analysis).rows}
     assert str(rows["(0, 1)"][2]).startswith("31.0")
     assert str(rows["(1, 1)"][2]).startswith("47.0")
-    response = dynamics_shown.responses_table(found).rows
+    response = dynamics_shown.responses_table(analysis).rows
     assert {row[1] for row in response} == {"Width (mm)"}
     assert len(response) == 4  # the first order does not overshoot
     change = float(str(response[0][3]).partition(" ")[0])
     assert change == pytest.approx(0.5, abs=0.01)
-    table, frames = dynamics_shown.events_table(found)
+    table, frames = dynamics_shown.events_table(analysis)
     assert len(frames) == len(table.rows) >= 2
     assert abs(frames[0] - 100) <= 4

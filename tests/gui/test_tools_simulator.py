@@ -1,4 +1,4 @@
-"""The simulator's window: the first frame, the command's files, cancel, a session of its own."""
+"""The simulator window: first frame, the files of the command, cancelling, opening a session."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.conftest import Run
 
 @pytest.fixture
 def simulator(window: MainWindow, qtbot: QtBot) -> SimulatorWindow:
-    """The simulator's window, its first scenario drawn."""
+    """The simulator window with its first scenario drawn."""
     window.do("simulator")
     tool = window.findChild(SimulatorWindow)
     assert tool is not None
@@ -44,7 +44,7 @@ def click(button: QPushButton) -> None:
     QTest.mouseClick(button, Qt.MouseButton.LeftButton)
 
 
-def test_it_shows_the_first_frame_with_its_true_dots(
+def test_first_frame_is_shown_with_its_true_dots(
     simulator: SimulatorWindow, qtbot: QtBot, labapp: Run, tmp_path: Path
 ):
     path = choose(simulator, "mode_11", qtbot)
@@ -57,9 +57,9 @@ def test_it_shows_the_first_frame_with_its_true_dots(
     ringed = np.column_stack(simulator._rings.getData())
     np.testing.assert_allclose(ringed, true, atol=6e-4)
     assert f"{len(true)} dots" in simulator.picture.accessibleDescription()
-    progress_of = {row.name: row for row in simulator.table.rows}
-    assert progress_of["Dots in the picture"].value == len(true)
-    assert progress_of["Recording lasts"].texts[1:] == ("0.50", "", "s")
+    rows = {row.name: row for row in simulator.table.rows}
+    assert rows["Dots in the picture"].value == len(true)
+    assert rows["Recording lasts"].texts[1:] == ("0.50", "", "s")
     before = simulator.picture.picture
     simulator.seed.set_value(1)
     simulator.seed.edited.emit(1)
@@ -68,7 +68,7 @@ def test_it_shows_the_first_frame_with_its_true_dots(
     assert simulator.seed.value() == 1
 
 
-def test_it_writes_what_the_command_writes_and_opens_it(
+def test_recording_equals_that_of_the_command_and_is_opened(
     simulator: SimulatorWindow, window: MainWindow, labapp: Run, qtbot: QtBot, tmp_path: Path
 ):
     path = choose(simulator, "low_rear", qtbot)
@@ -80,8 +80,8 @@ def test_it_writes_what_the_command_writes_and_opens_it(
     click(simulator.start_button)
     qtbot.waitUntil(lambda: simulator.made is not None)
     assert "3 frames" in simulator.message.text()
-    given = ("--frames", 3, "--seed", 8)
-    assert labapp("simulate", path, "--out", tmp_path / "command", *given)[0] == 0
+    options = ("--frames", 3, "--seed", 8)
+    assert labapp("simulate", path, "--out", tmp_path / "command", *options)[0] == 0
     names = sorted(file.name for file in (tmp_path / "command").iterdir())
     assert names == sorted(file.name for file in out.iterdir())
     for name in names:
@@ -100,12 +100,12 @@ def test_it_writes_what_the_command_writes_and_opens_it(
         assert result.status == "ok"
 
 
-def test_a_stack_gets_its_time_base(simulator: SimulatorWindow, window: MainWindow,
+def test_tiff_stack_has_a_time_base(simulator: SimulatorWindow, window: MainWindow,
                                     qtbot: QtBot, tmp_path: Path):  # fmt: skip
     shipped = next(path for path in shipped_scenarios() if path.stem == "cap")
-    own = tmp_path / "stack.toml"
-    own.write_text(shipped.read_text("utf-8") + 'format = "tif"\n', "utf-8")
-    simulator.take(own)
+    scenario = tmp_path / "stack.toml"
+    scenario.write_text(shipped.read_text("utf-8") + 'format = "tif"\n', "utf-8")
+    simulator.take(scenario)
     qtbot.waitUntil(lambda: simulator.preview is not None)
     simulator.frames.set_value(2)
     simulator.folder.editor.setText(str(tmp_path / "out"))
@@ -118,34 +118,34 @@ def test_a_stack_gets_its_time_base(simulator: SimulatorWindow, window: MainWind
     assert session.frame(1).time_s == pytest.approx(1 / 60)
 
 
-def test_what_is_wrong_is_said_and_nothing_is_written(
+def test_invalid_input_is_reported_and_nothing_written(
     simulator: SimulatorWindow, qtbot: QtBot, tmp_path: Path
 ):
-    own = tmp_path / "own.toml"
-    own.write_text("[pool]\nshape = 'eg'\n", "utf-8")
-    simulator.take(own)
+    scenario = tmp_path / "own.toml"
+    scenario.write_text("[pool]\nshape = 'eg'\n", "utf-8")
+    simulator.take(scenario)
     qtbot.waitUntil(lambda: "pool.shape" in simulator.picture.accessibleDescription())
     assert not simulator.start_button.isEnabled()
     assert simulator.table.rows == ()
     choose(simulator, "cap", qtbot)
-    mine = tmp_path / "folder"
-    mine.mkdir()
-    (mine / "mine.txt").write_text("mine")
-    simulator.folder.editor.setText(str(mine))
+    folder = tmp_path / "folder"
+    folder.mkdir()
+    (folder / "mine.txt").write_text("mine")
+    simulator.folder.editor.setText(str(folder))
     click(simulator.start_button)
     qtbot.waitUntil(lambda: "holds mine.txt" in simulator.message.text())
-    assert [path.name for path in mine.iterdir()] == ["mine.txt"]
+    assert [path.name for path in folder.iterdir()] == ["mine.txt"]
     assert not simulator.open_button.isEnabled()
 
 
-def test_a_process_that_ends_is_said_and_it_can_begin_again(
+def test_dead_process_is_reported_and_a_restart_works(
     simulator: SimulatorWindow, qtbot: QtBot, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ):
-    def killed(*_: object, **__: object) -> None:
+    def crash(*_: object, **__: object) -> None:
         raise BrokenProcessPool
 
     with monkeypatch.context() as patched:
-        patched.setattr("labapp.gui.tools.simulator.simulate", killed)
+        patched.setattr("labapp.gui.tools.simulator.simulate", crash)
         simulator.folder.editor.setText(str(tmp_path / "out"))
         click(simulator.start_button)
         qtbot.waitUntil(lambda: not simulator.working)
@@ -156,7 +156,7 @@ def test_a_process_that_ends_is_said_and_it_can_begin_again(
 
 
 @pytest.mark.parametrize("how", ["escape", "close", "app"])
-def test_it_can_be_stopped_and_leaves_nothing(
+def test_stopped_simulation_leaves_no_files(
     simulator: SimulatorWindow, window: MainWindow, qtbot: QtBot, tmp_path: Path, how: str
 ):
     simulator.frames.set_value(5000)
@@ -177,7 +177,7 @@ def test_it_can_be_stopped_and_leaves_nothing(
     assert simulator.made is None
 
 
-def test_the_scenario_chosen_last_is_shown(simulator: SimulatorWindow, qtbot: QtBot):
+def test_last_chosen_scenario_is_shown(simulator: SimulatorWindow, qtbot: QtBot):
     for path in shipped_scenarios()[:6]:
         simulator.scenario.set_value(str(path))
         simulator.scenario.edited.emit(str(path))
@@ -187,7 +187,7 @@ def test_the_scenario_chosen_last_is_shown(simulator: SimulatorWindow, qtbot: Qt
     assert simulator.preview.scenario.text == path.read_text("utf-8")
 
 
-def test_a_folder_is_proposed_that_is_not_there_yet(tmp_path: Path):
+def test_proposed_folder_does_not_exist_yet(tmp_path: Path):
     assert new_path(tmp_path, "egg", suffix="") == tmp_path / "egg"
     (tmp_path / "egg").mkdir()
     (tmp_path / "egg 2").mkdir()

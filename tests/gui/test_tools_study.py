@@ -1,4 +1,4 @@
-"""The window of studies: made from a folder, run, stopped, looked at, a recording opened."""
+"""The study window: creating from a folder, running, stopping, opening a recording."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def recordings(simulated: Path, tmp_path: Path) -> Path:
-    """Two recordings under different currents, and one that is none."""
+    """Two recordings at different currents, and an invalid one."""
     folder = tmp_path / "runs"
     for current in (80, 100):
         shutil.copytree(simulated, folder / f"I{current}_1")
@@ -72,7 +72,7 @@ def states(tool: StudyWindow) -> dict[str, str]:
     return {one.recording.name: one.state for one in tool.found}
 
 
-def test_a_study_is_made_run_and_a_recording_of_it_opened(
+def test_study_is_created_and_run_and_a_recording_opened(
     window: MainWindow, study: StudyWindow, recordings: Path, qtbot: QtBot
 ):
     assert not study.start_button.isEnabled()
@@ -97,15 +97,15 @@ def test_a_study_is_made_run_and_a_recording_of_it_opened(
         lambda: workspace.session is not None and is_idle(study), timeout=4 * PATIENCE_MS
     )
     assert workspace.session.record.current_a == 100
-    seen = workspace.session.overview()
-    assert list(seen.status) == ["ok"] * 3
+    overview = workspace.session.overview()
+    assert list(overview.status) == ["ok"] * 3
     assert not study.isVisible()
     window.do("study")
     assert study.isVisible()
     assert study.list.selectedItems()
 
 
-def test_a_stopped_run_keeps_what_is_done(study: StudyWindow, recordings: Path, qtbot: QtBot):
+def test_stopped_run_keeps_finished_recordings(study: StudyWindow, recordings: Path, qtbot: QtBot):
     make(study, recordings, qtbot)
     study.workers.set_value(1)
     click(study.start_button)
@@ -134,7 +134,7 @@ def test_means_fit_into_the_window(study: StudyWindow, qtbot: QtBot):
     assert study.means.rowHeight(0) >= 2 * study.means.fontMetrics().height()
 
 
-def test_what_is_no_study_is_refused(study: StudyWindow, recordings: Path, tmp_path: Path):
+def test_invalid_studies_are_rejected(study: StudyWindow, recordings: Path, tmp_path: Path):
     (tmp_path / "wrong.toml").write_text("recordings = 1\n", "utf-8")
     study.show_study(tmp_path / "wrong.toml")
     assert study.study is None

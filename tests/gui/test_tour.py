@@ -1,4 +1,4 @@
-"""The tour under Xvfb: every page and every dialog has a picture that shows something."""
+"""The tour under Xvfb: every page and every dialog has a picture that is not blank."""
 
 from __future__ import annotations
 
@@ -32,16 +32,16 @@ ASKING = ("getOpenFileName", "getSaveFileName", "getExistingDirectory")
 
 def environment(home: Path, platform: str) -> dict[str, str]:
     folders = {"HOME": home, "XDG_CONFIG_HOME": home / "config", "XDG_STATE_HOME": home / "state"}
-    kept = {k: v for k, v in os.environ.items() if k != "VTK_DEFAULT_OPENGL_WINDOW"}
-    return {**kept, "QT_QPA_PLATFORM": platform, **{k: str(v) for k, v in folders.items()}}
+    inherited = {k: v for k, v in os.environ.items() if k != "VTK_DEFAULT_OPENGL_WINDOW"}
+    return {**inherited, "QT_QPA_PLATFORM": platform, **{k: str(v) for k, v in folders.items()}}
 
 
 @pytest.fixture(scope="module")
 def taken(opengl: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str, Path]:
-    """The pictures' folder, what was said, and the home folder of who took the tour."""
+    """The folder of the pictures, the output of the tour, and its home folder."""
     out, home = tmp_path_factory.mktemp("tour"), tmp_path_factory.mktemp("home")
     with screen(*SIZE) as display:
-        done = subprocess.run(
+        process = subprocess.run(
             [*TOUR, "--out", out, "--size", "{}x{}".format(*SIZE)],
             cwd=ROOT,
             env={**environment(home, "xcb"), "DISPLAY": display},
@@ -50,8 +50,8 @@ def taken(opengl: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path,
             timeout=5 * PATIENCE_S,
             check=False,
         )
-    assert done.returncode == 0, f"{done.stdout[-300:]}\n{done.stderr}"
-    return out, done.stdout, home
+    assert process.returncode == 0, f"{process.stdout[-300:]}\n{process.stderr}"
+    return out, process.stdout, home
 
 
 def levels(file: Path) -> np.ndarray:
@@ -59,17 +59,17 @@ def levels(file: Path) -> np.ndarray:
     return cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
 
 
-def named(taken: tuple[Path, str, Path], part: str) -> list[Path]:
+def pictures_of(taken: tuple[Path, str, Path], part: str) -> list[Path]:
     return sorted(taken[0].glob(f"[0-9][0-9]-{part}.png"))
 
 
 @pytest.mark.soak
 @pytest.mark.xvfb
-def test_every_picture_is_there_as_large_as_asked_for_and_shows_something(
+def test_pictures_have_the_requested_size_and_are_not_blank(
     taken: tuple[Path, str, Path],
 ):
-    out, told, _ = taken
-    names = [line.split()[0] for line in told.splitlines() if re.match(r"\d\d-\S+\.png", line)]
+    out, stdout, _ = taken
+    names = [line.split()[0] for line in stdout.splitlines() if re.match(r"\d\d-\S+\.png", line)]
     assert names == sorted(path.name for path in out.iterdir())
     assert [int(name[:2]) for name in names] == list(range(1, len(names) + 1))
     for name in names:
@@ -83,26 +83,26 @@ def test_every_picture_is_there_as_large_as_asked_for_and_shows_something(
 @pytest.mark.xvfb
 def test_no_two_pictures_are_the_same(taken: tuple[Path, str, Path]):
     out, _, _ = taken
-    seen = [path.read_bytes() for path in sorted(out.iterdir())]
-    assert len(set(seen)) == len(seen)
+    contents = [path.read_bytes() for path in sorted(out.iterdir())]
+    assert len(set(contents)) == len(contents)
 
 
 @pytest.mark.soak
 @pytest.mark.xvfb
 @pytest.mark.parametrize("key", ["welcome", *PAGES])
 def test_every_page_has_a_picture(taken: tuple[Path, str, Path], key: str):
-    assert named(taken, key) + named(taken, f"{key}-*")
+    assert pictures_of(taken, key) + pictures_of(taken, f"{key}-*")
 
 
 @pytest.mark.soak
 @pytest.mark.xvfb
 def test_every_menu_has_a_picture(taken: tuple[Path, str, Path]):
     for menu in MENUS:
-        assert named(taken, f"*-menu-{menu.replace('&', '').lower()}"), menu
+        assert pictures_of(taken, f"*-menu-{menu.replace('&', '').lower()}"), menu
 
 
 def asked_titles() -> Iterator[str]:
-    """How the title begins of each dialog that the app opens, read from its source."""
+    """The start of the title of each dialog of the app, read from its source."""
     for path in sorted(GUI.rglob("*.py")):
         tree = ast.parse(path.read_text("utf-8"))
         for function in ast.walk(tree):
@@ -123,12 +123,12 @@ def _titles_in(function: ast.FunctionDef, path: Path) -> Iterator[str]:
         titles = [title for title in titles if title != docstring]
         assert titles, f"{path.name}: {function.name} opens a dialog without a title"
         yield titles[0]
-    made = [
+    created = [
         node.func.id
         for node in ast.walk(function)
         if isinstance(node, ast.Call) and isinstance(node.func, ast.Name)
     ]
-    if "QMessageBox" in made:
+    if "QMessageBox" in created:
         yield from (
             call.args[0].value
             for call in ast.walk(function)
@@ -141,7 +141,7 @@ def _titles_in(function: ast.FunctionDef, path: Path) -> Iterator[str]:
 
 @pytest.mark.soak
 @pytest.mark.xvfb
-def test_every_question_for_a_file_and_every_other_question_has_a_picture(
+def test_every_file_dialog_and_question_has_a_picture(
     taken: tuple[Path, str, Path],
 ):
     lines = [line.partition(".png  ")[2] for line in taken[1].splitlines()]
@@ -154,46 +154,46 @@ def test_every_question_for_a_file_and_every_other_question_has_a_picture(
 @pytest.mark.soak
 @pytest.mark.xvfb
 def test_every_dialog_class_has_a_picture(taken: tuple[Path, str, Path]):
-    """The app's own have pictures: each text of the help, each tool."""
-    own = {
+    """All dialogs of the app have pictures: each help text and each tool."""
+    classes = {
         node.name
         for path in GUI.rglob("*.py")
         for node in ast.walk(ast.parse(path.read_text("utf-8")))
         if isinstance(node, ast.ClassDef)
         and any(isinstance(base, ast.Name) and base.id == "QDialog" for base in node.bases)
     }
-    assert own == {"HelpDialog", "ToolWindow", "PaperDialog", "LevelsDialog"}
+    assert classes == {"HelpDialog", "ToolWindow", "PaperDialog", "LevelsDialog"}
     for kind in (*TITLES, *TOOLS, "save-picture", "levels"):
-        assert named(taken, f"dialog-{kind}")
+        assert pictures_of(taken, f"dialog-{kind}")
 
 
 @pytest.mark.soak
 @pytest.mark.xvfb
-def test_the_3d_views_are_drawn(taken: tuple[Path, str, Path]):
-    """Middle of the canvas, where the surface is: many levels, and not those of another look."""
-    looks = []
+def test_3d_views_are_drawn(taken: tuple[Path, str, Path]):
+    """The centre of the canvas shows the surface: many levels, which differ between the views."""
+    pictures = []
     for name in ("surface", "surface-sigma", "surface-side", "surface-rays", "surface-compare"):
-        (file,) = named(taken, name)
+        (file,) = pictures_of(taken, name)
         part = levels(file)[80:380, 180:600]
         assert part.std() > 12, name
         assert len(np.unique(part)) > 60, name
-        looks.append(part)
-    for one, other in itertools.pairwise(looks):
+        pictures.append(part)
+    for one, other in itertools.pairwise(pictures):
         assert np.abs(one.astype(int) - other).mean() > 1
 
 
 @pytest.mark.soak
 @pytest.mark.xvfb
-def test_nothing_is_left_in_the_home_folder_but_the_log(taken: tuple[Path, str, Path]):
+def test_tour_leaves_only_the_log_in_the_home_folder(taken: tuple[Path, str, Path]):
     home = taken[2]
     left = {path.relative_to(home).parts[:2] for path in home.rglob("*") if path.is_file()}
     assert {parts for parts in left if not parts[0].startswith(".cache")} <= {("state", "labapp")}
 
 
-def refused(home: Path, *arguments: object) -> str:
-    """What the tour says that does not begin, where there is no display."""
+def rejection(home: Path, *arguments: object) -> str:
+    """Run a tour that must be rejected, without a display; return its error message."""
     displays = ("DISPLAY", "WAYLAND_DISPLAY", "QT_QPA_PLATFORM")
-    done = subprocess.run(
+    process = subprocess.run(
         [*TOUR, *map(str, arguments)],
         cwd=ROOT,
         env={k: v for k, v in environment(home, "").items() if k not in displays},
@@ -202,24 +202,24 @@ def refused(home: Path, *arguments: object) -> str:
         timeout=PATIENCE_S,
         check=False,
     )
-    assert done.returncode == 2, done.stderr
-    assert "Traceback" not in done.stderr
-    return done.stderr
+    assert process.returncode == 2, process.stderr
+    assert "Traceback" not in process.stderr
+    return process.stderr
 
 
-def test_without_a_display_it_says_so(tmp_path: Path):
-    assert "display" in refused(tmp_path, "--out", tmp_path / "out")
+def test_missing_display_is_reported(tmp_path: Path):
+    assert "display" in rejection(tmp_path, "--out", tmp_path / "out")
 
 
 @pytest.mark.parametrize("size", ["large", "1366", "1366x", "0x0", "99999x10"])
-def test_a_size_that_is_none_is_refused(tmp_path: Path, size: str):
-    assert "1366x768" in refused(tmp_path, "--out", tmp_path / "out", "--size", size)
+def test_invalid_size_is_rejected(tmp_path: Path, size: str):
+    assert "1366x768" in rejection(tmp_path, "--out", tmp_path / "out", "--size", size)
     assert not (tmp_path / "out").exists()
 
 
-def test_a_folder_that_cannot_be_is_refused(tmp_path: Path):
+def test_invalid_folder_is_rejected(tmp_path: Path):
     (tmp_path / "file").write_text("")
-    assert "folder that can be written" in refused(tmp_path, "--out", tmp_path / "file" / "out")
+    assert "folder that can be written" in rejection(tmp_path, "--out", tmp_path / "file" / "out")
 
 
 BROKEN = """
@@ -241,9 +241,11 @@ sys.exit(main(["--out", sys.argv[1]]))
         pytest.param("laser", "LaserPage", "_show_way", marks=pytest.mark.soak),
     ],
 )
-def test_a_page_that_throws_ends_it_and_is_named(tmp_path: Path, page: str, kind: str, method: str):
+def test_exception_on_a_page_ends_the_tour_and_names_the_page(
+    tmp_path: Path, page: str, kind: str, method: str
+):
     code = BROKEN.format(page=page, kind=kind, method=method)
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", code, tmp_path / "out"],
         cwd=ROOT,
         env=environment(tmp_path / "home", "offscreen"),
@@ -252,6 +254,6 @@ def test_a_page_that_throws_ends_it_and_is_named(tmp_path: Path, page: str, kind
         timeout=PATIENCE_S,
         check=False,
     )
-    assert done.returncode == 1, done.stderr
-    assert f"ended early. {page}: " in done.stderr
-    assert "not today" in done.stderr
+    assert process.returncode == 1, process.stderr
+    assert f"ended early. {page}: " in process.stderr
+    assert "not today" in process.stderr

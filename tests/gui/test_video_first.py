@@ -1,4 +1,4 @@
-"""A video first: its frames at once, then the set-up, then the surface; actions counted."""
+"""Starting from a video: frames first, then set-up and surface; the actions are counted."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ FRAMES = 2
 
 
 class CountingHand(Hand):
-    """A hand that counts its actions: clicks, answers to a dialog, drops."""
+    """A `Hand` that counts its actions: clicks, answers to a dialog, drops."""
 
     def __init__(self, window: MainWindow, qtbot: QtBot) -> None:
         super().__init__(window)
@@ -38,7 +38,7 @@ class CountingHand(Hand):
         self.actions = 0
 
     def press_button(self, words: str) -> None:
-        """Click a button in view."""
+        """Click a visible button."""
         self.actions += 1
         self.button(words)
         self.settle()
@@ -63,9 +63,9 @@ class CountingHand(Hand):
         self.settle()
 
     def settle(self) -> None:
-        """Wait until no work is under way."""
+        """Wait until no task is running."""
         tasks = self.window.workspace.tasks
-        for _ in range(3):  # work may begin other work when it ends
+        for _ in range(3):  # a task may start another one when it ends
             self.qtbot.waitUntil(lambda: not tasks.active)
             let_draw()
 
@@ -79,7 +79,7 @@ def hand(window: MainWindow, qtbot: QtBot) -> CountingHand:
 
 @pytest.fixture
 def bench(tmp_path: Path) -> Path:
-    """A folder with a short recording, a folder of images and an image, and their setup file."""
+    """A folder with a short recording (a folder of images) and its setup file."""
     folder = tmp_path / "bench"
     images = folder / "recording"
     images.mkdir(parents=True)
@@ -91,17 +91,17 @@ def bench(tmp_path: Path) -> Path:
 
 
 def surface_is_shown(window: MainWindow) -> bool:
-    """Whether the surface of the frame in view is on the page in view."""
+    """Whether the visible page is the surface page and shows the current frame."""
     page, session = window.page, window.workspace.session
     assert session is not None
     result = session.result(window.workspace.frame)
     is_ok = result is not None and result.measurement.status == "ok"
-    seen = window.stack.currentWidget()
-    return is_ok and page is not None and page is seen and page.key == "surface"
+    shown = window.stack.currentWidget()
+    return is_ok and page is not None and page is shown and page.key == "surface"
 
 
 @pytest.mark.slow
-def test_four_actions_from_a_video_to_a_surface_and_two_with_the_last_set_up(
+def test_from_video_to_surface_in_four_actions_or_two(
     window: MainWindow, hand: CountingHand, bench: Path
 ):
     hand.choose_file("Open recording…", bench / "recording" / "0.png")
@@ -120,7 +120,7 @@ def test_four_actions_from_a_video_to_a_surface_and_two_with_the_last_set_up(
     assert [path.stem for path in drafts()] == ["recording", "0"]
 
 
-def test_frames_are_seen_before_any_set_up_and_are_a_draft_that_can_be_named(
+def test_frames_are_shown_without_a_setup_as_a_draft(
     window: MainWindow,
     hand: CountingHand,
     bench: Path,
@@ -134,10 +134,12 @@ def test_frames_are_seen_before_any_set_up_and_are_a_draft_that_can_be_named(
     assert len(session.frames) == FRAMES
     assert window.workspace.folder == bench
     assert window.page is not None
-    seen = window.page
-    hand.qtbot.waitUntil(lambda: seen.seen is not None and seen.seen.correction is not None)
+    dots_page = window.page
+    hand.qtbot.waitUntil(
+        lambda: dots_page.seen is not None and dots_page.seen.correction is not None
+    )
     assert "⚠" not in window.page.dots_panel.seen.text()
-    window.workspace.attempt(lambda own: own.set_record(Record(title="Mine")))
+    window.workspace.attempt(lambda s: s.set_record(Record(title="Mine")))
     window.workspace.show_frame(1)
     named = tmp_path / "named.labsession"
     monkeypatch.setattr(dialogs, "ask_new_session", lambda *_: named)
@@ -155,7 +157,7 @@ def test_frames_are_seen_before_any_set_up_and_are_a_draft_that_can_be_named(
     assert not window.menus.actions["name_draft"].isEnabled()
 
 
-def test_a_draft_that_cannot_be_moved_stays_a_draft(
+def test_draft_that_cannot_be_moved_stays_a_draft(
     window: MainWindow,
     hand: CountingHand,
     bench: Path,
@@ -171,7 +173,7 @@ def test_a_draft_that_cannot_be_moved_stays_a_draft(
     assert drafts() == [session.path]
 
 
-def test_drafts_are_listed_and_deleted_only_after_a_question(
+def test_drafts_are_listed_and_deleted_only_on_confirmation(
     window: MainWindow, hand: CountingHand, bench: Path, monkeypatch: pytest.MonkeyPatch
 ):
     hand.drop(bench / "recording")
@@ -192,7 +194,7 @@ def test_drafts_are_listed_and_deleted_only_after_a_question(
     assert window.welcome.list.count() == 0
 
 
-def test_without_a_complete_set_up_among_the_recent_ones_it_says_so_beside_the_button(
+def test_missing_recent_setup_is_reported_beside_the_button(
     window: MainWindow, hand: CountingHand, bench: Path
 ):
     hand.drop(bench / "recording")
@@ -203,7 +205,7 @@ def test_without_a_complete_set_up_among_the_recent_ones_it_says_so_beside_the_b
     assert "complete set-up" in window.page.answer.text()
 
 
-def test_a_set_up_of_another_size_of_frame_is_taken_and_nothing_measured(
+def test_setup_for_another_frame_size_is_used_without_measuring(
     window: MainWindow,
     hand: CountingHand,
     bench: Path,
@@ -228,25 +230,25 @@ def test_a_set_up_of_another_size_of_frame_is_taken_and_nothing_measured(
     assert "400×640 px" in window.page.answer.text()
 
 
-def test_another_session_s_set_up_comes_with_its_calibrations_in_one_step(
+def test_setup_of_another_session_includes_its_calibrations(
     copy_sample: CopySample, tmp_path: Path
 ):
     other = copy_sample("gtaw")
     with Session.open(other) as session:
         session.calibrate_plane(other.parent / "calibration.png", 6.35)
-        text, kept = session.setup_text, session.plane_calibration
-    assert kept is not None
+        text, calibration = session.setup_text, session.plane_calibration
+    assert calibration is not None
     with Session.create(tmp_path / "new.labsession") as session:
         use_setup_of(session, other)
-        assert (session.setup_text, session.plane_calibration) == (text, kept)
-        assert session.picture(kept.picture_sha256).ndim == 2
+        assert (session.setup_text, session.plane_calibration) == (text, calibration)
+        assert session.picture(calibration.picture_sha256).ndim == 2
         session.undo()
         assert (session.setup_text, session.plane_calibration) == ("", None)
     with Session.create(tmp_path / "bare.labsession") as bare, pytest.raises(InputError):
         use_setup_of(bare, tmp_path / "new.labsession")
 
 
-def test_a_session_is_not_moved_onto_another(copy_sample: CopySample, tmp_path: Path):
+def test_session_is_not_moved_onto_another(copy_sample: CopySample, tmp_path: Path):
     path, other = copy_sample("gtaw"), tmp_path / "other.labsession"
     Session.create(other).close()
     with pytest.raises(InputError):
@@ -255,7 +257,7 @@ def test_a_session_is_not_moved_onto_another(copy_sample: CopySample, tmp_path: 
 
 
 @pytest.mark.parametrize("key", ["dots", "surface", "trends", "export", "capture", "plane"])
-def test_a_page_with_nothing_to_show_leads_on(
+def test_empty_page_offers_the_next_action(
     window: MainWindow, hand: CountingHand, tmp_path: Path, key: str
 ):
     window.workspace.show(Session.create(tmp_path / "new.labsession"))
@@ -271,7 +273,7 @@ def test_a_page_with_nothing_to_show_leads_on(
 
 
 @pytest.mark.slow
-def test_a_wrong_row_and_the_default_export_take_two_actions_each(
+def test_row_correction_and_default_export_take_two_actions(
     window: MainWindow, hand: CountingHand, copy_sample: CopySample
 ):
     assert window.files.open(copy_sample("gtaw"))
@@ -288,9 +290,11 @@ def test_a_wrong_row_and_the_default_export_take_two_actions_each(
     hand.click(page.view.canvas, hand.point(page.view, u, v))
     hand.actions += 1
     hand.press_button("Row right")
-    kept = session.correction(window.workspace.frame)
-    assert kept is not None
-    assert kept.lattice.column[kept.lattice.row == row].tolist() == (before + 1).tolist()
+    correction = session.correction(window.workspace.frame)
+    assert correction is not None
+    assert (
+        correction.lattice.column[correction.lattice.row == row].tolist() == (before + 1).tolist()
+    )
     assert hand.actions == 2
     session.undo()
     window.workspace.changed.emit()
@@ -306,7 +310,7 @@ def test_a_wrong_row_and_the_default_export_take_two_actions_each(
     assert hand.actions == 2
 
 
-def test_laser_and_plane_are_calibrated_from_pictures_in_25_actions(
+def test_calibration_from_pictures_takes_at_most_25_actions(
     window: MainWindow, hand: CountingHand, tmp_path: Path
 ):
     lay_out(tmp_path / "files")

@@ -34,29 +34,29 @@ def hill(height_mm: float = 0.3) -> Scene:
 
 @pytest.fixture
 def view(qtbot: QtBot) -> View3d:
-    made = make_view3d("A hill")
-    KEPT.append(made)
-    made.resize(320, 240)
-    made.show()
-    made.show_scene(hill())
-    made.grab()  # which paints it
-    yield made
-    made.close_view()
-    made.close()
+    view3d_widget = make_view3d("A hill")
+    KEPT.append(view3d_widget)
+    view3d_widget.resize(320, 240)
+    view3d_widget.show()
+    view3d_widget.show_scene(hill())
+    view3d_widget.grab()  # which paints it
+    yield view3d_widget
+    view3d_widget.close_view()
+    view3d_widget.close()
 
 
 def colours(view: View3d) -> int:
-    """How many colours are to be seen: a surface has many, words have few."""
+    """Number of visible colours: a surface has many, text has few."""
     image = view.grab().toImage()
     return len({image.pixel(x, y) for x in range(0, 320, 4) for y in range(0, 240, 4)})
 
 
-def test_without_a_display_it_draws_off_screen(view: View3d) -> None:
+def test_view_draws_off_screen_without_a_display(view: View3d) -> None:
     assert isinstance(view, OffscreenView)
     assert colours(view) > 60
 
 
-def test_nothing_is_drawn_before_it_is_shown(qtbot: QtBot) -> None:
+def test_hidden_view_draws_nothing(qtbot: QtBot) -> None:
     hidden = make_view3d()
     KEPT.append(hidden)
     hidden.show_scene(hill())
@@ -64,7 +64,7 @@ def test_nothing_is_drawn_before_it_is_shown(qtbot: QtBot) -> None:
     assert hidden.image() is None
 
 
-def test_the_mouse_turns_moves_and_zooms_it(view: View3d, qtbot: QtBot) -> None:
+def test_mouse_turns_moves_and_zooms_the_view(view: View3d, qtbot: QtBot) -> None:
     def distance() -> float:
         return float(np.linalg.norm(np.subtract(view.camera[0], view.camera[1])))
 
@@ -108,7 +108,7 @@ def drag(
         QApplication.sendEvent(view, event)
 
 
-def test_the_right_button_zooms(view: View3d, qtbot: QtBot) -> None:
+def test_right_button_drag_zooms(view: View3d, qtbot: QtBot) -> None:
     before = view.camera
     right, none = Qt.MouseButton.RightButton, Qt.MouseButton.NoButton
     at, end = QPointF(160, 120), QPointF(160, 60)
@@ -127,7 +127,7 @@ def click(view: View3d, at: QPoint, button: Qt.MouseButton = Qt.MouseButton.Left
     QTest.mouseClick(view, button, pos=at)
 
 
-def test_a_click_reads_a_point_off(view: View3d, qtbot: QtBot) -> None:
+def test_click_reads_a_point(view: View3d, qtbot: QtBot) -> None:
     view.sigma_at = lambda x, y: 0.0021
     view.look("top")
     view.grab()
@@ -137,7 +137,7 @@ def test_a_click_reads_a_point_off(view: View3d, qtbot: QtBot) -> None:
     click(view, QPoint(round(at[0]), round(view.height() - at[1])))
     (x, y, z), words = view.scene.mark_mm[0], view.read_off
     assert (x, y) == (pytest.approx(1.0, abs=0.05), pytest.approx(-0.5, abs=0.05))
-    assert z == pytest.approx(0.3 * (1 - (x**2 + y**2) / 18), abs=0.02)  # of flat triangles
+    assert z == pytest.approx(0.3 * (1 - (x**2 + y**2) / 18), abs=0.02)  # the triangles are flat
     assert words == f"X {x:.3f}, Y {y:.3f}, Z {z:.4f} ± 0.0021 mm".replace("-", "−")
     QTest.keyClick(view, Qt.Key.Key_P)
     assert QApplication.clipboard().text() == words
@@ -150,45 +150,45 @@ def test_a_click_reads_a_point_off(view: View3d, qtbot: QtBot) -> None:
     assert len(view.scene.mark_mm) == 0
 
 
-def test_the_pointer_says_what_it_is_on(view: View3d, qtbot: QtBot) -> None:
-    told: list[str] = []
-    view.pointed.connect(told.append)
+def test_pointer_reports_the_point_below_it(view: View3d, qtbot: QtBot) -> None:
+    texts: list[str] = []
+    view.pointed.connect(texts.append)
     view.look("top")
     view.grab()
-    on = view._drawing.overlay.project(np.zeros((1, 3)))[0]
-    QTest.mouseMove(view, QPoint(round(on[0]), round(view.height() - on[1])))
+    centre = view._drawing.overlay.project(np.zeros((1, 3)))[0]
+    QTest.mouseMove(view, QPoint(round(centre[0]), round(view.height() - centre[1])))
     QTest.mouseMove(view, QPoint(2, 2))
-    assert told[-2].endswith("mm")
-    assert float(told[-2].split("Z ")[1].split()[0]) == pytest.approx(0.3, abs=0.01)
-    assert told[-1] == ""
+    assert texts[-2].endswith("mm")
+    assert float(texts[-2].split("Z ")[1].split()[0]) == pytest.approx(0.3, abs=0.01)
+    assert texts[-1] == ""
 
 
-def test_a_click_with_the_right_button_opens_the_menu(view: View3d, qtbot: QtBot) -> None:
+def test_right_click_opens_the_menu(view: View3d, qtbot: QtBot) -> None:
     click(view, QPoint(160, 120), Qt.MouseButton.RightButton)
     (menu,) = view.findChildren(QMenu)
-    by = {action.text(): action for action in menu.actions() if action.text()}
-    assert {"Copy picture", "Copy point", "Show all", "Top", "Oblique"} <= set(by)
-    assert not by["Copy point"].isEnabled()  # none was read off
-    by["Top"].trigger()
+    actions = {action.text(): action for action in menu.actions() if action.text()}
+    assert {"Copy picture", "Copy point", "Show all", "Top", "Oblique"} <= set(actions)
+    assert not actions["Copy point"].isEnabled()  # no point was read
+    actions["Top"].trigger()
     assert view.camera[5]
     menu.close()
 
 
-def test_f_shows_all_from_the_side_chosen_last(view: View3d) -> None:
+def test_f_restores_the_last_chosen_view(view: View3d) -> None:
     QTest.keyClick(view, Qt.Key.Key_2)
     side = view.camera
     view.turn(20, 10)
     view.zoom(2)
     QTest.keyClick(view, Qt.Key.Key_F)
-    for now, wanted in zip(view.camera, side, strict=True):
-        assert now == pytest.approx(wanted)
+    for now, expected in zip(view.camera, side, strict=True):
+        assert now == pytest.approx(expected)
 
 
 @pytest.mark.parametrize(
     "key",
     [Qt.Key.Key_Left, Qt.Key.Key_Right, Qt.Key.Key_Up, Qt.Key.Key_Down, Qt.Key.Key_Plus],
 )
-def test_keys_turn_and_zoom_it(view: View3d, key: Qt.Key) -> None:
+def test_keys_turn_and_zoom_the_view(view: View3d, key: Qt.Key) -> None:
     before = view.grab().toImage()
     QTest.keyClick(view, key)
     assert view.grab().toImage() != before
@@ -198,18 +198,18 @@ def test_keys_turn_and_zoom_it(view: View3d, key: Qt.Key) -> None:
     ("key", "axis", "sign"),
     [(Qt.Key.Key_1, 2, 1), (Qt.Key.Key_2, 0, 1), (Qt.Key.Key_3, 1, -1)],
 )
-def test_keys_look_from_the_top_the_side_and_the_front(
+def test_keys_select_top_side_and_front_views(
     view: View3d, key: Qt.Key, axis: int, sign: int
 ) -> None:
     QTest.keyClick(view, key)
-    way = np.subtract(view.camera[0], view.camera[1])
-    assert np.argmax(np.abs(way)) == axis
-    assert way[axis] * sign > 0
-    assert np.abs(np.delete(way, axis)).max() < 1e-6 * abs(way[axis])
+    direction = np.subtract(view.camera[0], view.camera[1])
+    assert np.argmax(np.abs(direction)) == axis
+    assert direction[axis] * sign > 0
+    assert np.abs(np.delete(direction, axis)).max() < 1e-6 * abs(direction[axis])
     assert view.camera[5]  # without perspective
 
 
-def test_a_view_looks_from_where_another_does(view: View3d, qtbot: QtBot) -> None:
+def test_camera_of_another_view_can_be_set(view: View3d, qtbot: QtBot) -> None:
     other = make_view3d("Another")
     KEPT.append(other)
     other.set_camera(view.camera)  # before it is drawn
@@ -218,16 +218,16 @@ def test_a_view_looks_from_where_another_does(view: View3d, qtbot: QtBot) -> Non
     other.show_scene(hill())
     other.grab()
     assert other.camera == view.camera
-    told = []
-    other.camera_changed.connect(told.append)
+    changes = []
+    other.camera_changed.connect(changes.append)
     view.turn(30, 10)
     other.set_camera(view.camera)
     assert other.camera == view.camera
-    assert not told  # or two linked views would go round in circles
+    assert not changes  # two linked views would otherwise update each other forever
     other.close_view()
 
 
-def test_another_frame_leaves_the_camera(view: View3d) -> None:
+def test_new_scene_keeps_the_camera(view: View3d) -> None:
     view.turn(30, 10)
     camera, before = view.camera, view.grab().toImage()
     view.show_scene(hill(0.2))
@@ -235,7 +235,7 @@ def test_another_frame_leaves_the_camera(view: View3d) -> None:
     assert view.camera == camera
 
 
-def test_a_view_of_another_size_shows_all_again_unless_it_was_moved(view: View3d) -> None:
+def test_resizing_fits_the_scene_unless_the_view_was_changed(view: View3d) -> None:
     small = view.camera
     view.resize(800, 600)
     view.grab()
@@ -250,7 +250,7 @@ def test_a_view_of_another_size_shows_all_again_unless_it_was_moved(view: View3d
     assert view.camera[3] == pytest.approx(small[3])
 
 
-def test_it_follows_the_window_to_dark(view: View3d) -> None:
+def test_view_follows_the_dark_palette(view: View3d) -> None:
     dark = QPalette()
     dark.setColor(QPalette.ColorRole.Base, QColor("#101418"))
     dark.setColor(QPalette.ColorRole.Text, QColor("#e0e0e0"))
@@ -259,7 +259,7 @@ def test_it_follows_the_window_to_dark(view: View3d) -> None:
     assert QColor(image.pixel(20, 200)).lightness() < 40
 
 
-def test_its_picture_is_what_is_seen(view: View3d) -> None:
+def test_picture_equals_the_displayed_image(view: View3d) -> None:
     image = view.image()
     assert (image.width(), image.height()) == (320, 240)
     picture = view.picture()
@@ -268,7 +268,7 @@ def test_its_picture_is_what_is_seen(view: View3d) -> None:
     assert (at.red(), at.green(), at.blue()) == tuple(picture[120, 160])
 
 
-def test_words_stand_where_there_is_no_scene(view: View3d) -> None:
+def test_text_is_shown_without_a_scene(view: View3d) -> None:
     view.show_scene(None)
     blank = view.grab().toImage()
     view.set_words("Frame 3 is not measured yet.")
@@ -279,7 +279,7 @@ def test_words_stand_where_there_is_no_scene(view: View3d) -> None:
     assert colours(view) > 60
 
 
-def test_words_stand_where_nothing_can_be_drawn(
+def test_text_is_shown_if_drawing_is_impossible(
     qtbot: QtBot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     painted = []
@@ -296,7 +296,7 @@ def test_words_stand_where_nothing_can_be_drawn(
     assert without.camera is None
 
 
-def test_a_closed_view_is_taken_up_again(view: View3d) -> None:
+def test_closed_view_can_be_used_again(view: View3d) -> None:
     view.look("side")
     camera = view.camera
     view.close_view()
@@ -320,11 +320,11 @@ def test_a_closed_view_is_taken_up_again(view: View3d) -> None:
         ("ANGLE (Microsoft Basic Render Driver)", False),
     ],
 )
-def test_only_a_card_draws_in_the_window(renderer: str, card: bool) -> None:
+def test_interactive_view_needs_a_graphics_card(renderer: str, card: bool) -> None:
     assert view3d_kinds.has_card(renderer) is card
 
 
-def test_a_scene_is_drawn_once_however_often_it_changes_and_is_painted(view: View3d) -> None:
+def test_scene_is_rendered_once_per_paint(view: View3d) -> None:
     renders: list[object] = []
     window = view._drawing.plotter.render_window
     window.AddObserver("StartEvent", lambda *_: renders.append(None))
@@ -387,12 +387,12 @@ print("well")
 
 
 @pytest.mark.xvfb
-def test_with_a_display_it_draws_in_the_window() -> None:
-    """The real thing, under Xvfb: a process of its own, since Qt has one platform per process."""
+def test_view_draws_in_the_window_with_a_display() -> None:
+    """The interactive view under Xvfb, in a child process: Qt has one platform per process."""
     environment = {**os.environ, "QT_QPA_PLATFORM": "xcb", "LIBGL_ALWAYS_SOFTWARE": "1"}
     environment.pop("VTK_DEFAULT_OPENGL_WINDOW", None)
     with screen(1000, 800) as display:
-        done = subprocess.run(
+        process = subprocess.run(
             [sys.executable, "-c", REAL],
             cwd=Path(__file__).parents[2],
             env={**environment, "DISPLAY": display},
@@ -401,23 +401,23 @@ def test_with_a_display_it_draws_in_the_window() -> None:
             timeout=PATIENCE_S,
             check=False,
         )
-    assert (done.returncode, done.stdout.strip()[-4:]) == (0, "well"), done.stderr[-3000:]
+    assert (process.returncode, process.stdout.strip()[-4:]) == (0, "well"), process.stderr[-3000:]
 
 
-def test_a_paint_ends_also_where_an_error_keeps_what_was_called(
+def test_painter_ends_although_an_error_keeps_its_frame(
     view: View3d, qtbot: QtBot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Text is drawn by what keeps errors that it caught, and these keep what had called it."""
-    kept: list[Exception] = []
+    """The text renderer stores caught exceptions, whose tracebacks keep the calling frames."""
+    errors: list[Exception] = []
 
     def render(_view: View3d) -> None:
         try:
             raise ValueError
         except ValueError as error:
-            kept.append(error)
+            errors.append(error)
 
     monkeypatch.setattr(OffscreenView, "_render", render)
     view.show_scene(hill(0.2))
-    qtbot.waitUntil(lambda: bool(kept))
-    frame = kept[0].__traceback__.tb_frame.f_back
+    qtbot.waitUntil(lambda: bool(errors))
+    frame = errors[0].__traceback__.tb_frame.f_back
     assert not frame.f_locals["painter"].isActive()

@@ -1,7 +1,7 @@
-"""An experiment from New to the exported files, by mouse and keyboard; the command line agrees.
+"""A complete experiment by mouse and keyboard, from New to the exported files.
 
-Every number is typed, dragged or chosen in the window, and given to the command line as text; what
-both write is compared byte for byte.
+Every number is typed, dragged or chosen in the window, and passed to the command line as text; the
+files of both are compared byte for byte.
 """
 
 from __future__ import annotations
@@ -48,21 +48,21 @@ RIG = {
         "height_mm": "101.6",
     },
 }
-"""As it is typed: the sample's, but for the laser and the camera, which are calibrated."""
+"""The sample's set-up as typed, without the laser and the camera, which are calibrated."""
 
 CROSS = (("4.65", "4.66"), ("6.22", "6.23"), ("2.75", "2.76"))
-"""Two readings each of l₁, l₂, l₃, of a laser 31.48 mm away at 31.14 degrees."""
+"""Two readings each of l₁, l₂, l₃, for a laser at 31.48 mm and 31.14 degrees."""
 
 UNIT_MM = "6.35"
 
 FRAMES = (4, 6, 2)
-"""First, last, every n-th: frames 4 and 6."""
+"""First, last and step: frames 4 and 6."""
 
 CORRECTED = 6
 
 
 def place_of(ray: tuple[int, int]) -> tuple[float, float]:
-    """Where a ray's dot is in the frame to be corrected, (u, v) px, from the sample's truth."""
+    """True position (u, v) of a ray's dot in the corrected frame, px."""
     with (SAMPLE / "dots_truth.csv").open() as file:
         for line in csv.DictReader(file):
             if (int(line["frame"]), int(line["ray_row"]), int(line["ray_column"])) == (
@@ -75,12 +75,12 @@ def place_of(ray: tuple[int, int]) -> tuple[float, float]:
 
 
 MOVED, DELETED = (8, 9), (12, 11)
-"""Rays whose dots are moved, by 1 px to the right and 2 down, and taken out."""
+"""Rays whose dots are moved (1 px to the right and 2 px down) and deleted."""
 
 
 @pytest.fixture
 def hand(window: MainWindow, qtbot: QtBot) -> Hand:
-    """A hand on the window at its first start; dialogs are Qt's own, which keys can work."""
+    """A `Hand` for the window at first start; dialogs are non-native, so that keys work in them."""
     QCoreApplication.setAttribute(Qt.ApplicationAttribute.AA_DontUseNativeDialogs)
     window.activateWindow()
     qtbot.waitUntil(window.isActiveWindow)
@@ -88,10 +88,10 @@ def hand(window: MainWindow, qtbot: QtBot) -> Hand:
 
 
 def page(hand: Hand, kind: type[P]) -> P:
-    """The page in view, which is of that kind."""
-    found = hand.window.page
-    assert isinstance(found, kind), found
-    return found
+    """The visible page, which must be of that type."""
+    current = hand.window.page
+    assert isinstance(current, kind), current
+    return current
 
 
 def settle(hand: Hand, qtbot: QtBot) -> None:
@@ -100,13 +100,13 @@ def settle(hand: Hand, qtbot: QtBot) -> None:
 
 
 def set_up(hand: Hand) -> None:
-    shown = page(hand, SetupPage)
+    setup_page = page(hand, SetupPage)
     for name, text in RECORD.items():
-        hand.enter(shown.record_fields[name], text)
-    hand.tab(shown.tabs, "Bench")
+        hand.enter(setup_page.record_fields[name], text)
+    hand.tab(setup_page.tabs, "Bench")
     for section, values in RIG.items():
         for key, text in values.items():
-            hand.enter(shown.rig_fields[f"{section}.{key}"], text)
+            hand.enter(setup_page.rig_fields[f"{section}.{key}"], text)
 
 
 def calibrate(hand: Hand, qtbot: QtBot) -> None:
@@ -145,7 +145,7 @@ def correct(hand: Hand, qtbot: QtBot) -> None:
     hand.press(Qt.Key.Key_6, CONTROL)
     dots = page(hand, DotsPage)
     hand.click(dots.view)
-    hand.press(Qt.Key.Key_Escape)  # the click may have met a dot, which the arrow would move
+    hand.press(Qt.Key.Key_Escape)  # the click may have selected a dot, which the arrow would move
     hand.press(Qt.Key.Key_Right)
     assert hand.window.workspace.frame == CORRECTED
     qtbot.waitUntil(lambda: dots.looking.frame == CORRECTED and dots.editor.correction is not None)
@@ -154,23 +154,23 @@ def correct(hand: Hand, qtbot: QtBot) -> None:
     for key in (Qt.Key.Key_Right, Qt.Key.Key_Down, Qt.Key.Key_Down):
         hand.press(key, SHIFT)
     settle(hand, qtbot)
-    QTest.qWait(400)  # or the next click would be a double one
+    QTest.qWait(400)  # otherwise the next click would be a double click
     hand.click(port, hand.point(dots.view, *place_of(DELETED)))
     hand.press(Qt.Key.Key_Delete)
     settle(hand, qtbot)
 
 
 def export(hand: Hand, qtbot: QtBot, folder: Path, scheme: str) -> None:
-    shown = page(hand, ExportPage)
-    hand.choose(shown.scheme, scheme)
-    hand.enter(shown.folder, str(folder))
+    export_page = page(hand, ExportPage)
+    hand.choose(export_page.scheme, scheme)
+    hand.enter(export_page.folder, str(folder))
     hand.button("Export")
-    qtbot.waitUntil(lambda: shown.written is not None)
+    qtbot.waitUntil(lambda: export_page.written is not None)
     settle(hand, qtbot)
 
 
 def by_hand(hand: Hand, qtbot: QtBot, recording: Path, folder: Path) -> None:
-    """The whole experiment in the window."""
+    """The complete experiment in the window."""
     hand.answer(folder / "by hand")
     hand.press(Qt.Key.Key_N, CONTROL)
     set_up(hand)
@@ -190,9 +190,9 @@ def by_hand(hand: Hand, qtbot: QtBot, recording: Path, folder: Path) -> None:
 
 
 def by_command(labapp: Run, recording: Path, folder: Path) -> None:
-    """The same on the command line."""
+    """The same experiment on the command line."""
 
-    def done(*arguments: object) -> None:
+    def run(*arguments: object) -> None:
         code, _, err = labapp(*arguments)
         assert code == 0, err
 
@@ -202,44 +202,46 @@ def by_command(labapp: Run, recording: Path, folder: Path) -> None:
         lines += [f"[{section}]", *(f"{key} = {text}" for key, text in values.items())]
     setup.write_text("\n".join(lines))
     readings = [(f"--l{k}", text) for k, texts in enumerate(CROSS, 1) for text in texts]
-    done("calibrate", "laser", *sum(readings, ()), "--setup", setup)
-    done("calibrate", "plane", SAMPLE / "calibration.png", "--unit-mm", UNIT_MM, "--setup", setup)
+    run("calibrate", "laser", *sum(readings, ()), "--setup", setup)
+    run("calibrate", "plane", SAMPLE / "calibration.png", "--unit-mm", UNIT_MM, "--setup", setup)
     record = [(f"--{name.replace('_', '-')}", text) for name, text in RECORD.items()]
-    done("session", "new", session, "--setup", setup, *sum(record, ()))
+    run("session", "new", session, "--setup", setup, *sum(record, ()))
     first, last, every = FRAMES
-    done("session", "import", session, recording, "--frames", f"{first}:{last + 1}:{every}")
-    done("session", "measure", session)
+    run("session", "import", session, recording, "--frames", f"{first}:{last + 1}:{every}")
+    run("session", "measure", session)
     edits = [
         ("--move", "{:.2f},{:.2f}:1,2".format(*place_of(MOVED))),
         ("--delete", "{:.2f},{:.2f}".format(*place_of(DELETED))),
     ]
-    done("session", "correct", session, "--frame", CORRECTED, *sum(edits, ()))
-    done("session", "measure", session, "--scheme", "ers")
+    run("session", "correct", session, "--frame", CORRECTED, *sum(edits, ()))
+    run("session", "measure", session, "--scheme", "ers")
     for scheme in ("ers", "fit"):
         out = ("--out", folder / f"{scheme} by command", "--surfaces", "csv,stl,ply")
-        done("session", "export", session, *out, "--scheme", scheme)
+        run("session", "export", session, *out, "--scheme", scheme)
 
 
 def compare(one: Path, other: Path) -> None:
-    """Every file is the same; so is the manifest, but for the session's name and the times."""
+    """Check that all files are equal, and the manifests except for session name and times."""
     names = sorted(path.name for path in other.iterdir())
     assert sorted(path.name for path in one.iterdir()) == names
     assert {f"surface_{frame:06d}.stl" for frame in (4, 6)} < set(names)
     for name in set(names) - {"manifest.json"}:
         assert (one / name).read_bytes() == (other / name).read_bytes(), name
-    told, expected = (json.loads((where / "manifest.json").read_text()) for where in (one, other))
-    assert told["files"] == expected["files"]
-    told, expected = told["provenance"], expected["provenance"]
-    for each in (told, expected):
+    manifest, expected = (
+        json.loads((where / "manifest.json").read_text()) for where in (one, other)
+    )
+    assert manifest["files"] == expected["files"]
+    manifest, expected = manifest["provenance"], expected["provenance"]
+    for each in (manifest, expected):
         assert each["source"].pop("imported")
     for key in ("record", "source", "settings", "measured_by", "corrected_frames"):
-        assert told[key] == expected[key], key
-    setup, of_command = (tomllib.loads(each["setup"]["toml"]) for each in (told, expected))
+        assert manifest[key] == expected[key], key
+    setup, of_command = (tomllib.loads(each["setup"]["toml"]) for each in (manifest, expected))
     assert setup == of_command
 
 
 @pytest.mark.slow
-def test_a_session_by_hand_gives_the_files_that_the_command_line_gives(
+def test_window_and_command_line_give_the_same_files(
     hand: Hand, labapp: Run, qtbot: QtBot, tmp_path: Path
 ) -> None:
     recording = tmp_path / "recording.avi"

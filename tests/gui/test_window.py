@@ -40,7 +40,7 @@ from tests.gui.conftest import KEPT, CopySample, let_draw
 
 
 class Plain(Page):
-    """A page that counts what the window asks of it."""
+    """A page that counts the calls of the window."""
 
     def __init__(self, workspace: Workspace) -> None:
         super().__init__(workspace)
@@ -81,16 +81,16 @@ class SetUp(Plain):
 def plain(
     qapp: QApplication, tmp_path: Path, state: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[MainWindow]:
-    """A window with pages of the tests' own."""
+    """A window with the test pages above."""
     kinds = (SetUp, Capture, Surface, Broken)
     monkeypatch.setattr(window_module, "PAGES", {kind.key: kind for kind in kinds})
-    made = make_window(Preferences(theme="light"), tmp_path / "preferences.json")
-    KEPT.append(made)
-    made.show()
-    yield made
-    if made.isVisible():
-        made.close()
-    assert not made.workspace.tasks.active
+    main_window = make_window(Preferences(theme="light"), tmp_path / "preferences.json")
+    KEPT.append(main_window)
+    main_window.show()
+    yield main_window
+    if main_window.isVisible():
+        main_window.close()
+    assert not main_window.workspace.tasks.active
 
 
 def plain_page(window: MainWindow) -> Plain:
@@ -106,14 +106,14 @@ def settle(window: MainWindow, qtbot: QtBot) -> None:
     qtbot.waitUntil(lambda: not window.workspace.tasks.active and not window._rest.isActive())
 
 
-def test_the_first_window_welcomes(window: MainWindow):
+def test_first_window_shows_the_welcome_page(window: MainWindow):
     assert window.stack.currentWidget() is window.welcome
     assert window.welcome.nothing.isVisible()
     assert not any(window._docks[name].isVisible() for name in window._docks)
     assert window.windowTitle() == "labapp"
 
 
-def test_opening_shows_the_results_and_closing_the_welcome_page(
+def test_opening_shows_results_and_closing_the_welcome_page(
     plain: MainWindow, copy_sample: CopySample, qtbot: QtBot
 ):
     path = copy_sample("gtaw")
@@ -134,14 +134,14 @@ def test_opening_shows_the_results_and_closing_the_welcome_page(
     qtbot.waitUntil(lambda: "30 frames, all measured" in plain.welcome.list.item(0).text())
 
 
-def test_the_page_in_view_is_refreshed_and_no_other(
+def test_only_the_visible_page_is_refreshed(
     plain: MainWindow, copy_sample: CopySample, qtbot: QtBot
 ):
     plain.files.open(copy_sample("thumb_tack"))
     surface = plain_page(plain)
     plain.show_step("setup")
     settle(plain, qtbot)
-    setup, seen = plain_page(plain), surface.refreshed
+    setup, surface_count = plain_page(plain), surface.refreshed
     assert surface.left == 1
     count = setup.refreshed
     plain.workspace.attempt(lambda s: s.set_record(replace(s.record, title="Another")))
@@ -149,10 +149,10 @@ def test_the_page_in_view_is_refreshed_and_no_other(
     settle(plain, qtbot)
     plain.workspace.show_frame(1)
     assert setup.refreshed == count + 2
-    assert surface.refreshed == seen
+    assert surface.refreshed == surface_count
 
 
-def test_many_changes_in_a_row_are_shown_together_and_the_last_is_seen(
+def test_rapid_changes_are_refreshed_together(
     plain: MainWindow, copy_sample: CopySample, qtbot: QtBot
 ):
     plain.files.open(copy_sample("thumb_tack"))
@@ -167,7 +167,7 @@ def test_many_changes_in_a_row_are_shown_together_and_the_last_is_seen(
     assert plain.menus.actions["undo"].text() == "&Undo experiment record"
 
 
-def test_undo_and_redo_say_what_they_do(plain: MainWindow, copy_sample: CopySample, qtbot: QtBot):
+def test_undo_and_redo_name_the_change(plain: MainWindow, copy_sample: CopySample, qtbot: QtBot):
     plain.files.open(copy_sample("thumb_tack"))
     plain.workspace.attempt(lambda s: s.set_record(replace(s.record, title="Another")))
     settle(plain, qtbot)
@@ -184,7 +184,7 @@ def test_undo_and_redo_say_what_they_do(plain: MainWindow, copy_sample: CopySamp
     assert "Redone: experiment record" in plain.status_line.message.text()
 
 
-def test_keys_go_through_the_frames_and_the_steps(
+def test_keys_move_through_frames_and_steps(
     plain: MainWindow, copy_sample: CopySample, qtbot: QtBot
 ):
     plain.files.open(copy_sample("blocked_rows"))
@@ -211,7 +211,7 @@ def test_keys_go_through_the_frames_and_the_steps(
     assert plain_page(plain).key == "surface"
 
 
-def test_space_plays_and_arrows_in_a_field_stay_there(
+def test_space_plays_and_arrow_keys_in_a_field_keep_the_frame(
     plain: MainWindow, copy_sample: CopySample, qtbot: QtBot
 ):
     plain.files.open(copy_sample("gtaw"))
@@ -228,7 +228,7 @@ def test_space_plays_and_arrows_in_a_field_stay_there(
     assert plain.workspace.frame == frame
 
 
-def test_what_was_said_of_another_session_goes_but_no_problem(
+def test_messages_end_with_the_session_but_problems_stay(
     plain: MainWindow, copy_sample: CopySample
 ):
     plain.files.open(copy_sample("thumb_tack"))
@@ -240,7 +240,7 @@ def test_what_was_said_of_another_session_goes_but_no_problem(
     assert "The disk is full" in plain.status_line.message.text()
 
 
-def test_another_session_shows_the_beginning_of_a_panel(
+def test_new_session_scrolls_panels_to_the_top(
     window: MainWindow, copy_sample: CopySample, qtbot: QtBot
 ):
     window.files.open(copy_sample("gtaw"))
@@ -253,7 +253,7 @@ def test_another_session_shows_the_beginning_of_a_panel(
     assert bar.value() == 0
 
 
-def test_the_same_again_is_one_line_with_how_often(plain: MainWindow):
+def test_repeated_messages_are_counted_on_one_line(plain: MainWindow):
     before = plain.log_panel.count()
     for _ in range(3):
         plain.say("the camera was unplugged", True)
@@ -263,7 +263,7 @@ def test_the_same_again_is_one_line_with_how_often(plain: MainWindow):
     assert "▲ the camera was unplugged (3 times since " in first
     assert back.endswith("  it is back")
     assert again.endswith("  ▲ the camera was unplugged")
-    # On the line it is one problem, and the last.
+    # The status line shows one problem, the last.
     assert plain.status_line.unread == ["the camera was unplugged"]
     plain.say("the disk is full", True)
     plain.say("the camera was unplugged", True)
@@ -271,7 +271,7 @@ def test_the_same_again_is_one_line_with_how_often(plain: MainWindow):
     assert plain.status_line.message.text() == "▲ the camera was unplugged (2 problems)"
 
 
-def test_the_status_line_is_as_high_with_a_problem(plain: MainWindow):
+def test_status_line_keeps_its_height_with_a_problem(plain: MainWindow):
     height = plain.status_line.minimumHeight()
     plain.say("The disk is full:\nnothing\ncan be\nwritten", True)
     assert plain.status_line.dismiss_button.isVisible()
@@ -279,11 +279,11 @@ def test_the_status_line_is_as_high_with_a_problem(plain: MainWindow):
     assert plain.status_line.message.minimumSizeHint().height() <= height
 
 
-def test_no_page_in_view_or_hidden_makes_the_window_grow(
+def test_tall_pages_do_not_enlarge_the_window(
     plain: MainWindow, copy_sample: CopySample, qtbot: QtBot
 ):
     plain.files.open(copy_sample("thumb_tack"))
-    plain.resize(plain.width(), 512)  # what 768 px are at 150 %
+    plain.resize(plain.width(), 512)  # 768 px at 150 %
     for key in ("setup", "surface"):
         plain.show_step(key)
         plain_page(plain).setMinimumHeight(2000)
@@ -294,7 +294,7 @@ def test_no_page_in_view_or_hidden_makes_the_window_grow(
     assert plain.height() == 512
 
 
-def test_a_page_that_fails_is_said_and_the_window_stays(
+def test_failing_page_is_reported_and_the_window_stays_open(
     plain: MainWindow, copy_sample: CopySample, qtbot: QtBot
 ):
     plain.files.open(copy_sample("thumb_tack"))
@@ -310,7 +310,7 @@ def test_a_page_that_fails_is_said_and_the_window_stays(
     assert not plain.log_panel.isVisible()
 
 
-def test_a_session_that_is_in_use_is_offered_read_only(
+def test_session_in_use_is_offered_read_only(
     plain: MainWindow, copy_sample: CopySample, qtbot: QtBot
 ):
     path = copy_sample("thumb_tack")
@@ -333,7 +333,7 @@ def test_a_session_that_is_in_use_is_offered_read_only(
         assert not plain.menus.actions["undo"].isEnabled()
 
 
-def test_what_is_no_session_is_refused_in_words(plain: MainWindow, tmp_path: Path):
+def test_invalid_session_files_are_rejected(plain: MainWindow, tmp_path: Path):
     (tmp_path / "a.labsession").write_bytes(b"nonsense")
     assert not plain.files.open(tmp_path / "a.labsession")
     assert not plain.files.open(tmp_path / "gone.labsession")
@@ -357,7 +357,7 @@ def drop(window: MainWindow, qtbot: QtBot, *paths: Path) -> None:
     let_draw()
 
 
-def test_what_is_dropped_is_opened_or_imported(
+def test_dropped_files_are_opened_or_imported(
     plain: MainWindow,
     copy_sample: CopySample,
     tmp_path: Path,
@@ -384,7 +384,9 @@ def test_what_is_dropped_is_opened_or_imported(
     assert "does not exist" in problems(plain)[1]
 
 
-def test_what_is_no_recording_makes_no_draft(plain: MainWindow, tmp_path: Path, qtbot: QtBot):
+def test_file_that_is_no_recording_creates_no_draft(
+    plain: MainWindow, tmp_path: Path, qtbot: QtBot
+):
     (tmp_path / "notes.txt").write_text("no recording")
     plain.files.take(tmp_path / "notes.txt")
     settle(plain, qtbot)
@@ -393,7 +395,7 @@ def test_what_is_no_recording_makes_no_draft(plain: MainWindow, tmp_path: Path, 
     assert "notes.txt" in plain.welcome.refused.text()
 
 
-def test_a_copy_stands_elsewhere_and_finds_its_recording(
+def test_copied_session_finds_its_recording(
     plain: MainWindow,
     copy_sample: CopySample,
     tmp_path: Path,
@@ -402,24 +404,24 @@ def test_a_copy_stands_elsewhere_and_finds_its_recording(
 ):
     plain.files.open(copy_sample("gtaw"))
     plain.workspace.attempt(lambda s: s.set_record(replace(s.record, title="Mine")))
-    there = tmp_path / "elsewhere" / "copy.labsession"
-    there.parent.mkdir()
-    monkeypatch.setattr(dialogs, "ask_new_session", lambda *_: there)
+    target = tmp_path / "elsewhere" / "copy.labsession"
+    target.parent.mkdir()
+    monkeypatch.setattr(dialogs, "ask_new_session", lambda *_: target)
     plain.do("copy")
     settle(plain, qtbot)
-    assert f"A copy is in {there}" in plain.status_line.message.text()
-    with Session.open(there) as copy:
+    assert f"A copy is in {target}" in plain.status_line.message.text()
+    with Session.open(target) as copy:
         assert copy.record.title == "Mine"
         assert copy.missing_recording is None
         assert copy.frame(3).image.shape == (640, 480)
         assert copy.problems() == []
-    assert sorted(p.name for p in there.parent.iterdir() if "lock" not in p.name) == [there.name]
+    assert sorted(p.name for p in target.parent.iterdir() if "lock" not in p.name) == [target.name]
     plain.do("copy")
     settle(plain, qtbot)
     assert "is there already" in problems(plain)[0]
 
 
-def test_a_copy_must_have_a_name_of_its_own(copy_sample: CopySample, tmp_path: Path):
+def test_copy_needs_a_valid_new_name(copy_sample: CopySample, tmp_path: Path):
     path = copy_sample("thumb_tack")
     for bad in (path, tmp_path / "copy.txt", tmp_path / "no" / "folder.labsession"):
         with pytest.raises(InputError):
@@ -427,7 +429,7 @@ def test_a_copy_must_have_a_name_of_its_own(copy_sample: CopySample, tmp_path: P
     assert not (tmp_path / "no").exists()
 
 
-def test_the_sample_is_copied_once_and_then_the_users_own(tmp_path: Path):
+def test_sample_copy_is_created_once_and_keeps_changes(tmp_path: Path):
     for name in ("gtaw", "concave"):
         path = copied_sample(name, tmp_path / name)
         with Session.open(path) as session:
@@ -440,7 +442,7 @@ def test_the_sample_is_copied_once_and_then_the_users_own(tmp_path: Path):
 
 
 @pytest.mark.parametrize("name", sorted(SAMPLE_TEXTS))
-def test_trying_a_sample_opens_a_copy(
+def test_sample_button_opens_a_copy(
     plain: MainWindow, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
 ):
     monkeypatch.setattr(Preferences, "samples_folder", tmp_path / "documents")
@@ -452,35 +454,36 @@ def test_trying_a_sample_opens_a_copy(
     assert "copy of the sample" in plain.status_line.message.text()
 
 
-def test_what_another_window_opens_is_recent_here_too(
+def test_recent_sessions_are_shared_between_windows(
     window: MainWindow, tmp_path: Path, qtbot: QtBot
 ):
     file = tmp_path / "config" / "preferences.json"
-    own, others = tmp_path / "own.labsession", tmp_path / "other.labsession"
-    for path in (own, others):
+    first, second = tmp_path / "own.labsession", tmp_path / "other.labsession"
+    for path in (first, second):
         Session.create(path).close()
-    window.files.open(own)
+    window.files.open(first)
     window.do("close")
     other = make_window(read_preferences(file)[0], file)
     KEPT.append(other)
     other.show()
     other.activateWindow()
     qtbot.waitUntil(other.isActiveWindow)
-    other.files.open(others)
+    other.files.open(second)
     window.activateWindow()
     qtbot.waitUntil(lambda: window.welcome.list.count() == 2)
     settle(window, qtbot)
-    assert [action.toolTip() for action in window.menus.recent.actions()] == [str(others), str(own)]
+    assert [action.toolTip() for action in window.menus.recent.actions()] == [
+        str(second),
+        str(first),
+    ]
     window.do("theme_light")
     other.close()
     window.close()
-    found = read_preferences(file)[0]
-    assert (found.recent, found.theme) == ((str(others), str(own)), "light")
+    preferences = read_preferences(file)[0]
+    assert (preferences.recent, preferences.theme) == ((str(second), str(first)), "light")
 
 
-def test_the_layout_and_the_theme_are_remembered(
-    plain: MainWindow, copy_sample: CopySample, tmp_path: Path
-):
+def test_layout_and_theme_are_stored(plain: MainWindow, copy_sample: CopySample, tmp_path: Path):
     path = copy_sample("thumb_tack")
     plain.files.open(path)
     plain.resize(798, 555)
@@ -488,22 +491,22 @@ def test_the_layout_and_the_theme_are_remembered(
     plain.do("log")
     plain.do("theme_dark")
     plain.close()
-    found, problem = read_preferences(tmp_path / "preferences.json")
+    preferences, problem = read_preferences(tmp_path / "preferences.json")
     assert problem == ""
-    assert (found.theme, found.recent) == ("dark", (str(path),))
-    again = make_window(found, tmp_path / "preferences.json")
+    assert (preferences.theme, preferences.recent) == ("dark", (str(path),))
+    again = make_window(preferences, tmp_path / "preferences.json")
     KEPT.append(again)
     again.show()
     assert again.size().height() == 555
     again.files.open(path)
     assert not again._docks["steps"].isVisible()
-    assert not again._docks["log"].isVisible()  # what was said then is not said now
+    assert not again._docks["log"].isVisible()  # the earlier messages are not shown again
     again.do("reset_layout")
     assert again._docks["steps"].isVisible()
     again.close()
 
 
-def test_nonsense_for_a_layout_does_no_harm(qapp: QApplication, tmp_path: Path):
+def test_invalid_layout_is_ignored(qapp: QApplication, tmp_path: Path):
     odd = Preferences(("/gone/x.labsession",), "dark", "ä no base64", "AAAAB3NzaC1yc2E=", "/gone")
     window = make_window(odd, tmp_path / "preferences.json")
     KEPT.append(window)
@@ -512,7 +515,7 @@ def test_nonsense_for_a_layout_does_no_harm(qapp: QApplication, tmp_path: Path):
     window.close()
 
 
-def test_closing_stops_the_measuring_and_keeps_what_is_finished(
+def test_closing_stops_measuring_and_keeps_finished_frames(
     plain: MainWindow, copy_sample: CopySample, tmp_path: Path, qtbot: QtBot
 ):
     np.save(tmp_path / "dark.npy", np.zeros((2000, 48, 64), np.uint8))
@@ -535,9 +538,7 @@ def test_closing_stops_the_measuring_and_keeps_what_is_finished(
         assert session.problems() == []
 
 
-def test_a_set_up_that_is_not_complete_is_said_before_measuring(
-    plain: MainWindow, copy_sample: CopySample
-):
+def test_incomplete_setup_is_reported_before_measuring(plain: MainWindow, copy_sample: CopySample):
     plain.files.open(copy_sample("thumb_tack"))
     plain.workspace.attempt(lambda s: s.update_setup({"laser": {"distance_mm": None}}))
     plain.do("measure_frame")
@@ -545,7 +546,7 @@ def test_a_set_up_that_is_not_complete_is_said_before_measuring(
     assert plain.workspace.tasks.active == []
 
 
-def test_a_missing_recording_is_said_at_once(plain: MainWindow, copy_sample: CopySample):
+def test_missing_recording_is_reported_on_opening(plain: MainWindow, copy_sample: CopySample):
     path = copy_sample("gtaw")
     (path.parent / "recording.avi").unlink()
     assert plain.files.open(path)
@@ -572,7 +573,7 @@ def test_copying_a_picture_and_a_table(plain: MainWindow, copy_sample: CopySampl
     assert QApplication.clipboard().pixmap().width() == plain_page(plain).width()
 
 
-def test_where_to_begin(copy_sample: CopySample, tmp_path: Path):
+def test_first_step_and_first_frame(copy_sample: CopySample, tmp_path: Path):
     with Session.create(tmp_path / "new.labsession") as session:
         assert first_step(session) == "setup"
         assert title(session) == "new — labapp"
@@ -586,9 +587,7 @@ def test_where_to_begin(copy_sample: CopySample, tmp_path: Path):
         assert first_frame(session) == 0
 
 
-def test_a_session_opens_where_there_is_something_to_see(
-    plain: MainWindow, copy_sample: CopySample
-):
+def test_session_opens_at_the_first_measured_frame(plain: MainWindow, copy_sample: CopySample):
     plain.files.open(copy_sample("five_lines"))
     session = plain.workspace.session
     assert session.result(0).measurement.status != "ok"
@@ -598,18 +597,18 @@ def test_a_session_opens_where_there_is_something_to_see(
     assert first_step(plain.workspace.session) == "trends"  # one line gives no surface
 
 
-def test_every_step_tells_its_mark_in_words_and_in_a_shape(
+def test_marks_of_steps_differ_in_words_and_shape(
     qapp: QApplication, copy_sample: CopySample, qtbot: QtBot
 ):
-    listed = StepList(STEPS)
-    qtbot.addWidget(listed)
+    step_list = StepList(STEPS)
+    qtbot.addWidget(step_list)
     with Session.open(copy_sample("blocked_rows")) as session:
-        found = states(session)
-        listed.show_states(found)
+        step_states = states(session)
+        step_list.show_states(step_states)
     for row, step in enumerate(STEPS):
-        item = listed.item(row)
-        assert found[step.key].why in item.toolTip()
-        assert found[step.key].mark.value in item.data(Qt.ItemDataRole.AccessibleTextRole)
+        item = step_list.item(row)
+        assert step_states[step.key].why in item.toolTip()
+        assert step_states[step.key].mark.value in item.data(Qt.ItemDataRole.AccessibleTextRole)
     shapes = set()
     for mark in Mark:
         image = mark_icon(mark, False).pixmap(54, 54).toImage()
@@ -618,19 +617,19 @@ def test_every_step_tells_its_mark_in_words_and_in_a_shape(
     assert len(shapes) == len(Mark)
 
 
-def test_looking_at_sessions_changes_none(copy_sample: CopySample, tmp_path: Path):
+def test_preview_of_a_session_does_not_change_it(copy_sample: CopySample, tmp_path: Path):
     path = copy_sample("concave")
     content = path.read_bytes()
-    found = look_at(path)
-    assert found.title == "A concave pool"
-    assert "6 frames, all measured" in found.about
-    assert found.thumbnail is not None
-    assert np.ptp(found.thumbnail) == 255
+    preview = look_at(path)
+    assert preview.title == "A concave pool"
+    assert "6 frames, all measured" in preview.about
+    assert preview.thumbnail is not None
+    assert np.ptp(preview.thumbnail) == 255
     assert path.read_bytes() == content
     shutil.rmtree(path.parent / "recording")
-    without = look_at(path)
-    assert without.there
-    assert without.thumbnail is None
+    without_recording = look_at(path)
+    assert without_recording.there
+    assert without_recording.thumbnail is None
     path.write_bytes(content[:5000])
     assert not look_at(path).there
     assert not look_at(tmp_path / "gone.labsession").there
@@ -639,21 +638,21 @@ def test_looking_at_sessions_changes_none(copy_sample: CopySample, tmp_path: Pat
     assert "no recording yet" in look_at(tmp_path / "new.labsession").about
 
 
-def test_a_fault_goes_to_the_log_and_is_said(plain: MainWindow, qtbot: QtBot):
-    faults = app.ErrorReporter(plain.say, plain)
+def test_uncaught_errors_are_logged_and_reported(plain: MainWindow, qtbot: QtBot):
+    reporter = app.ErrorReporter(plain.say, plain)
     try:
         raise ZeroDivisionError("in a slot")
     except ZeroDivisionError as error:
-        faults.take(type(error), error, error.__traceback__)
+        reporter.take(type(error), error, error.__traceback__)
     assert "ZeroDivisionError: in a slot" in problems(plain)[0]
 
-    def elsewhere() -> None:
+    def fail_in_thread() -> None:
         try:
             raise ValueError("in a thread")
         except ValueError as error:
-            faults.take(type(error), error, error.__traceback__)
+            reporter.take(type(error), error, error.__traceback__)
 
-    thread = threading.Thread(target=elsewhere)
+    thread = threading.Thread(target=fail_in_thread)
     thread.start()
     thread.join()
     qtbot.waitUntil(lambda: len(problems(plain)) == 2)
@@ -663,7 +662,7 @@ def test_a_fault_goes_to_the_log_and_is_said(plain: MainWindow, qtbot: QtBot):
     assert plain.isVisible()
 
 
-def test_without_a_display_or_a_file_it_says_so(
+def test_missing_display_or_file_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, state: Path
 ):
     with pytest.raises(InputError, match="does not exist"):
@@ -674,7 +673,7 @@ def test_without_a_display_or_a_file_it_says_so(
         app.main([])
 
 
-def test_the_app_starts_opens_a_session_and_ends(
+def test_app_starts_opens_a_session_and_ends(
     qapp: QApplication,
     copy_sample: CopySample,
     tmp_path: Path,
@@ -685,7 +684,7 @@ def test_the_app_starts_opens_a_session_and_ends(
     (tmp_path / "config" / "labapp").mkdir(parents=True)
     (tmp_path / "config" / "labapp" / "preferences.json").write_text("{broken")
     path = copy_sample("thumb_tack")
-    seen: dict[str, object] = {}
+    shown: dict[str, object] = {}
 
     before = set(QApplication.topLevelWidgets())
 
@@ -693,18 +692,18 @@ def test_the_app_starts_opens_a_session_and_ends(
         for window in set(QApplication.topLevelWidgets()) - before:
             if isinstance(window, MainWindow):
                 KEPT.append(window)
-                seen["title"] = window.windowTitle()
-                seen["problems"] = problems(window)
+                shown["title"] = window.windowTitle()
+                shown["problems"] = problems(window)
                 window.close()
 
     QTimer.singleShot(500, look)
     assert app.main([str(path)]) == 0
-    assert seen["title"] == "thumb_tack — labapp"
-    assert "preferences file is damaged" in str(seen["problems"])
+    assert shown["title"] == "thumb_tack — labapp"
+    assert "preferences file is damaged" in str(shown["problems"])
 
 
 @pytest.mark.parametrize("way", ["close", "another session", "quit"])
-def test_a_number_that_is_being_typed_is_kept_when_the_session_is_closed(
+def test_number_being_typed_is_stored_on_closing(
     window: MainWindow, copy_sample: CopySample, qtbot: QtBot, way: str
 ):
     path, other = copy_sample("thumb_tack"), copy_sample("blocked_rows")
@@ -727,16 +726,16 @@ def test_a_number_that_is_being_typed_is_kept_when_the_session_is_closed(
         else:
             window.close()
         with Session.open(path, read_only=True) as session:
-            held = session.record.voltage_v, detector_value(session.settings, NUMBERS[0])
-        assert held[key == "dots"] == float(number)
+            stored = session.record.voltage_v, detector_value(session.settings, NUMBERS[0])
+        assert stored[key == "dots"] == float(number)
         if way == "quit":
             return
 
 
-def test_a_page_that_takes_the_place_of_an_empty_one_has_the_focus(
+def test_page_that_replaces_an_empty_one_gets_the_focus(
     window: MainWindow, copy_sample: CopySample, qtbot: QtBot
 ):
-    """Else the next key, such as Space to play, would go to whatever field Qt finds."""
+    """Otherwise the next key, such as Space to play, would go to an arbitrary field."""
     assert window.files.open(copy_sample("thumb_tack"))
     window.activateWindow()
     qtbot.waitUntil(window.isActiveWindow)
@@ -750,13 +749,13 @@ def test_a_page_that_takes_the_place_of_an_empty_one_has_the_focus(
     assert QApplication.focusWidget() is page
 
 
-def test_the_window_fits_1024_px_at_150_percent(window: MainWindow, copy_sample: CopySample):
+def test_window_fits_1024_px_at_150_percent(window: MainWindow, copy_sample: CopySample):
     assert window.files.open(copy_sample("thumb_tack"))
     for key in PAGES:
         window.show_step(key)
-        least = window.minimumSizeHint()
-        assert least.width() <= 1024 / 1.5
-        assert least.height() <= 700 / 1.5
+        minimum = window.minimumSizeHint()
+        assert minimum.width() <= 1024 / 1.5
+        assert minimum.height() <= 700 / 1.5
     window.resize(window.minimumSizeHint())
     let_draw()
     assert window.step_list.item(0).text() == "1"

@@ -1,4 +1,4 @@
-"""None of the old words is left in what the window shows."""
+"""No banned wording is left in the texts of the window."""
 
 from __future__ import annotations
 
@@ -26,22 +26,22 @@ BANNED = {
     r"^Set-up files": "Setup files",
     r"\bput right\b|\bbears\b|\blets go\b|\bhanded over\b": "a plain verb",
 }
-"""Patterns of old words, and what stands in their place."""
+"""Banned patterns, and the wording to use instead."""
 
 
 @pytest.mark.parametrize("pattern", BANNED)
-def test_no_old_word_is_left(pattern: str):
-    found = [(place, words) for place, words in sentences() if re.search(pattern, words)]
+def test_banned_words_are_not_used(pattern: str):
+    matches = [(place, words) for place, words in sentences() if re.search(pattern, words)]
     former = set(FORMER)
-    assert not [each for each in found if each[1] not in former], BANNED[pattern]
+    assert not [each for each in matches if each[1] not in former], BANNED[pattern]
 
 
-def test_the_list_of_sentences_has_those_of_buttons_and_messages():
+def test_sentences_include_buttons_and_messages():
     words = {words for _, words in sentences()}
     assert {"Load set-&up…", "Laser points at nobody's eyes", "Frames are being measured"} <= words
 
 
-def test_ticks_of_items_that_were_renamed_count():
+def test_ticks_of_renamed_items_still_count():
     (old, new), *_ = FORMER.items()
     assert new in dict(SAFETY)
     record = Record(safety=((old, "then"),))

@@ -1,4 +1,4 @@
-"""What is open: measuring that ends because another session is wanted is no fault."""
+"""Measuring that is cancelled because another session is opened is not an error."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from labapp.run import measurers
 from labapp.session.session import Session
 from labapp.simulation import parallel
 from tests.gui.conftest import CopySample
-from tests.gui.watching import Noting
+from tests.gui.watching import FaultHandler
 
 
 class Stuck(Executor):
-    """Never measures anything; what waits for it is let go when it is ended."""
+    """Never measures anything; its futures are cancelled when it is ended."""
 
     def __init__(self) -> None:
         self.begun: list[Future[Any]] = []
@@ -34,26 +34,26 @@ class Stuck(Executor):
             future.cancel()
 
 
-def test_measuring_that_is_left_for_another_session_is_no_fault(
+def test_measuring_cancelled_by_another_session_is_no_fault(
     qapp: QApplication, state: object, copy_sample: CopySample, qtbot: QtBot,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
     faults: list[str] = []
-    stuck, noting, log = Stuck(), Noting(faults), logging.getLogger(NAME)
+    stuck, handler, log = Stuck(), FaultHandler(faults), logging.getLogger(NAME)
     monkeypatch.setattr(measurers, "measuring_pool", lambda _: stuck)
     monkeypatch.setattr(parallel, "end_processes", Stuck.end)
-    log.addHandler(noting)
-    space = Workspace()
-    said: list[str] = []
-    space.notified.connect(lambda words, _: said.append(words))
-    space.show(Session.open(copy_sample("blocked_rows")))
-    space.measure([0, 1, 2])
-    task = space.measuring
+    log.addHandler(handler)
+    workspace = Workspace()
+    messages: list[str] = []
+    workspace.notified.connect(lambda words, _: messages.append(words))
+    workspace.show(Session.open(copy_sample("blocked_rows")))
+    workspace.measure([0, 1, 2])
+    task = workspace.measuring
     assert task is not None
     qtbot.waitUntil(lambda: bool(stuck.begun))
-    space.show(None)
+    workspace.show(None)
     task.thread.join()
-    log.removeHandler(noting)
+    log.removeHandler(handler)
     assert faults == []
-    assert said == []
+    assert messages == []
     assert task.control.cancelled.is_set()

@@ -1,4 +1,4 @@
-"""What random actions need: files to choose, answers where the app asks, ears for faults."""
+"""Helpers for random actions: files to choose, answers to dialogs, a record of faults."""
 
 from __future__ import annotations
 
@@ -25,21 +25,21 @@ from labapp.session.file.database import SUFFIX
 SAMPLES = Path(__file__).parents[2] / "sample_sessions"
 
 HOMES = ("XDG_STATE_HOME", "XDG_CONFIG_HOME", "XDG_DATA_HOME", "XDG_DOCUMENTS_DIR")
-"""Where the app looks for its own; not all of the home, where others keep what is slow to make."""
+"""Folders of the app; not all of the home, which contains the slow-to-build caches of others."""
 
 WITHOUT_DESKTOP = ("This plugin does not support",)
-"""What Qt says on a platform without a desktop."""
+"""Messages of Qt on a platform without a desktop."""
 
 POLL_MS = 30
 
 
 class Files:
-    """Good files and bad ones, in a folder of their own.
+    """Valid and invalid files in a folder.
 
     Parameters
     ----------
     folder
-        Empty, or to be made.
+        Empty, or not yet created.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -50,7 +50,7 @@ class Files:
         self.sessions = [self._sample(name) for name in ("blocked_rows", "concave", "thumb_tack")]
         lost = folder / "lost" / f"lost{SUFFIX}"
         lost.parent.mkdir()
-        self.sessions.append(Path(shutil.copyfile(self.sessions[2], lost)))  # its recording is gone
+        self.sessions.append(Path(shutil.copyfile(self.sessions[2], lost)))  # without recording
         self.garbage = self._file(f"garbage{SUFFIX}", "SQLite format 3\0 and then nothing")
         times = (f"{k / 100},{75 + k % 3},12\n" for k in range(50))
         self.good = [
@@ -75,11 +75,11 @@ class Files:
         return path
 
     def some(self, rng: random.Random) -> Path:
-        """A file to be opened."""
+        """A random file to open."""
         return rng.choice(rng.choices([self.good, self.sessions, self.bad], [5, 3, 2])[0])
 
     def some_new(self, rng: random.Random, proposed: str) -> Path:
-        """A file to be written: mostly one that can be."""
+        """A random file to write: mostly one that can be written."""
         self._made += 1
         suffix = Path(proposed).suffix
         places = [self.folder, self.folder, self.folder / "no folder"]
@@ -87,22 +87,22 @@ class Files:
         return rng.choice(places) / rng.choices(names, [6, 2, 1])[0]
 
     def some_folder(self, rng: random.Random) -> Path:
-        """A folder to be read or written."""
+        """A random folder to read or write."""
         names = ("concave/recording", "home", "none", "out")
         return self.folder / rng.choice(names)
 
 
 class Answers:
-    """Answers where the app asks: for a file, in a menu, in a question.
+    """Answers file dialogs, menus and questions of the app.
 
     Parameters
     ----------
     files
-        What can be chosen.
+        Files that can be chosen.
     rng
-        Gives the source of chance of the action under way.
+        Returns the random numbers of the current action.
     note
-        Told what was chosen.
+        Called with what was chosen.
     """
 
     def __init__(
@@ -111,16 +111,16 @@ class Answers:
         self._files, self._rng, self._note = files, rng, note
 
     @contextmanager
-    def given(self) -> Iterator[None]:
-        """Answer everything from now on; no desktop is opened, the user's folders are others."""
+    def active(self) -> Iterator[None]:
+        """Answer every dialog, open no desktop service, and replace the user's folders."""
 
-        def asked(name: str, answer: Callable[..., object]) -> mock._patch[object]:
+        def patched(name: str, answer: Callable[..., object]) -> mock._patch[object]:
             return mock.patch.object(QFileDialog, name, staticmethod(answer))
 
-        def opened(*_: object, **__: object) -> tuple[str, str]:
+        def open_name(*_: object, **__: object) -> tuple[str, str]:
             return self._chosen(self._files.some(self._rng())), ""
 
-        def saved(
+        def save_name(
             _: object, __: object, proposed: str = "", *___: object, **____: object
         ) -> object:
             return self._chosen(self._files.some_new(self._rng(), proposed)), ""
@@ -129,9 +129,9 @@ class Answers:
         timer.timeout.connect(self._answer)
         timer.start(POLL_MS)
         with (
-            asked("getOpenFileName", opened),
-            asked("getSaveFileName", saved),
-            asked(
+            patched("getOpenFileName", open_name),
+            patched("getSaveFileName", save_name),
+            patched(
                 "getExistingDirectory",
                 lambda *_: self._chosen(self._files.some_folder(self._rng())),
             ),
@@ -144,12 +144,12 @@ class Answers:
         timer.stop()
 
     def _chosen(self, path: Path) -> str:
-        refused = self._rng().random() < 0.1
-        self._note("no file" if refused else str(path.relative_to(self._files.folder)))
-        return "" if refused else str(path)
+        cancelled = self._rng().random() < 0.1
+        self._note("no file" if cancelled else str(path.relative_to(self._files.folder)))
+        return "" if cancelled else str(path)
 
     def _answer(self) -> None:
-        """Answer a menu or a question that waits."""
+        """Answer an open menu or question."""
         popup, dialog, rng = (
             QApplication.activePopupWidget(),
             QApplication.activeModalWidget(),
@@ -176,13 +176,13 @@ class Answers:
                 dialog.close()
 
 
-class Noting(logging.Handler):
-    """Notes what the log tells but refusals, which are no faults.
+class FaultHandler(logging.Handler):
+    """Records all warnings and errors of the log but rejected input, which is no fault.
 
     Parameters
     ----------
     faults
-        Where to.
+        The list to append to.
     """
 
     def __init__(self, faults: list[str]) -> None:
@@ -190,7 +190,7 @@ class Noting(logging.Handler):
         self._faults = faults
 
     def emit(self, record: logging.LogRecord) -> None:
-        """Note it with where it came from."""
+        """Record a message with its traceback."""
         if record.getMessage() != "refused":
             error = record.exc_info[1] if record.exc_info else None
             trace = "" if error is None else "".join(traceback.format_exception(error))
@@ -198,25 +198,25 @@ class Noting(logging.Handler):
 
 
 @contextmanager
-def noted(faults: list[str]) -> Iterator[None]:
-    """Note every uncaught error, every fault in the log, and what Qt warns of."""
+def recorded(faults: list[str]) -> Iterator[None]:
+    """Record every uncaught exception, every fault in the log, and the warnings of Qt."""
 
-    def said(kind: QtMsgType, _: object, message: str) -> None:
+    def on_qt_message(kind: QtMsgType, _: object, message: str) -> None:
         if kind != QtMsgType.QtInfoMsg and not any(words in message for words in WITHOUT_DESKTOP):
             faults.append(f"Qt: {message}")
 
-    def uncaught(*told: object) -> None:
-        faults.append("".join(traceback.format_exception(*told)))  # type: ignore[call-overload]
+    def uncaught(*args: object) -> None:
+        faults.append("".join(traceback.format_exception(*args)))  # type: ignore[call-overload]
 
-    handler, log = Noting(faults), start_log()
+    handler, log = FaultHandler(faults), start_log()
     log.addHandler(handler)
-    former = qInstallMessageHandler(said)
+    previous = qInstallMessageHandler(on_qt_message)
     try:
         with (
             mock.patch.object(sys, "excepthook", uncaught),
-            mock.patch.object(threading, "excepthook", lambda told: uncaught(*told[:3])),
+            mock.patch.object(threading, "excepthook", lambda args: uncaught(*args[:3])),
         ):
             yield
     finally:
-        qInstallMessageHandler(former)
+        qInstallMessageHandler(previous)
         log.removeHandler(handler)

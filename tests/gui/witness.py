@@ -1,6 +1,6 @@
-"""What every session file must hold: kept beside the program, from what it acknowledged.
+"""Expected content of every session file, recorded from the changes that sessions acknowledged.
 
-A change counts from when the session's call returns. The files are read with SQLite alone.
+A change counts as soon as the session's call returns. The files are read with SQLite alone.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ Key = tuple[str, int]
 Values = dict[Key, bytes | None]
 
 
-class Kept:
-    """One session file: its documents, and what undo and redo would bring back.
+class ExpectedContent:
+    """Expected content of a session file: its documents, and the values for undo and redo.
 
     Parameters
     ----------
     path
-        The file as it was first met.
+        The file before its first change.
     """
 
     def __init__(self, path: Path) -> None:
@@ -76,55 +76,57 @@ class Kept:
 
 
 class Witness:
-    """Listens to what sessions acknowledge while it is `listening`.
+    """Records the changes that sessions acknowledge while it is `listening`.
 
     Attributes
     ----------
     changes
-        How many there were.
-    kept
-        By path.
+        Number of changes.
+    expected
+        Expected content by path.
     """
 
     def __init__(self) -> None:
         self.changes = 0
-        self.kept: dict[Path, Kept] = {}
+        self.expected: dict[Path, ExpectedContent] = {}
 
     @contextmanager
     def listening(self) -> Iterator[None]:
-        """Hear every change of every session of this process."""
+        """Record every change of every session in this process."""
         with (
-            self._after(Documents, "change", lambda kept, _, __, values: kept.change(values)),
-            self._after(Documents, "undo", lambda kept, *_: kept.step(back=True)),
-            self._after(Documents, "redo", lambda kept, *_: kept.step(back=False)),
-            self._after(Frames, "import_recording", self._taken),
+            self._after(
+                Documents, "change", lambda expected, _, __, values: expected.change(values)
+            ),
+            self._after(Documents, "undo", lambda expected, *_: expected.step(back=True)),
+            self._after(Documents, "redo", lambda expected, *_: expected.step(back=False)),
+            self._after(Frames, "import_recording", self._imported),
             self._after(Results, "put", self._measured),
         ):
             yield
 
-    def meet(self, path: Path) -> None:
-        """Note what a file holds before it is changed for the first time."""
-        if path not in self.kept:
-            self.kept[path] = Kept(path)
+    def register(self, path: Path) -> None:
+        """Record the content of a file before its first change."""
+        if path not in self.expected:
+            self.expected[path] = ExpectedContent(path)
 
     def differences(self) -> list[str]:
-        """How the files differ from what they must hold, a line each."""
-        found = []
-        for path, kept in self.kept.items():
-            held = _documents(path)
-            for key in sorted(held.keys() | kept.documents.keys()):
-                if held.get(key) != kept.documents.get(key):
-                    found.append(f"{path.name}: {key} is not as it was acknowledged")
+        """Differences between the files and their expected content, one per line."""
+        lines = []
+        for path, expected in self.expected.items():
+            stored = _documents(path)
+            for key in sorted(stored.keys() | expected.documents.keys()):
+                if stored.get(key) != expected.documents.get(key):
+                    lines.append(f"{path.name}: {key} is not as it was acknowledged")
             results = dict(_results(path))
-            for (frame, scheme), statuses in kept.results.items():
+            for (frame, scheme), statuses in expected.results.items():
                 if results.get((frame, scheme)) not in statuses:
-                    found.append(f"{path.name}: the {scheme} result of frame {frame} is lost")
-            if kept.recording is not None and _recording(path) != kept.recording:
-                found.append(f"{path.name}: the recording is not the one that was imported")
-        return found
+                    lines.append(f"{path.name}: the {scheme} result of frame {frame} is lost")
+            if expected.recording is not None and _recording(path) != expected.recording:
+                lines.append(f"{path.name}: the recording is not the one that was imported")
+        return lines
 
     def value(self, path: Path, key: str) -> object:
-        """What a file holds of the setup (``section.key``) or the record (a name)."""
+        """The stored value of a set-up entry (``section.key``) or of a record entry (a name)."""
         section, _, name = key.partition(".")
         blob = _documents(path).get(("setup" if name else "record", -1))
         if blob is None:
@@ -136,26 +138,32 @@ class Witness:
     def _after(self, owner: type, name: str, note: Callable[..., object]) -> Any:
         original = getattr(owner, name)
 
-        def wrapped(this: Any, *given: Any, **named: Any) -> Any:
+        def wrapped(this: Any, *args: Any, **kwargs: Any) -> Any:
             path = this._database.path
-            self.meet(path)
-            answer = original(this, *given, **named)
-            note(self.kept[path], answer, *given)
+            self.register(path)
+            result = original(this, *args, **kwargs)
+            note(self.expected[path], result, *args)
             self.changes += 1
-            return answer
+            return result
 
         return mock.patch.object(owner, name, wrapped)
 
-    def _taken(self, kept: Kept, answer: object, *_: object) -> None:
-        kept.recording = pack(answer)
+    def _imported(self, expected: ExpectedContent, recording: object, *_: object) -> None:
+        expected.recording = pack(recording)
 
     def _measured(
-        self, kept: Kept, _: object, frame: int, measurement: Any, basis: Any, *__: Any
+        self,
+        expected: ExpectedContent,
+        _: object,
+        frame: int,
+        measurement: Any,
+        basis: Any,
+        *__: Any,
     ) -> None:
-        # Undo and redo bring back earlier ones.
+        # Undo and redo restore earlier statuses.
         key = frame, basis.scheme
-        first = {kept.first_results[key]} if key in kept.first_results else set()
-        kept.results.setdefault(key, first).add(measurement.status)
+        first = {expected.first_results[key]} if key in expected.first_results else set()
+        expected.results.setdefault(key, first).add(measurement.status)
 
 
 def _rows(path: Path, sql: str) -> list[tuple[Any, ...]]:

@@ -1,4 +1,4 @@
-"""Every sentence that the window can show, with where it stands: ``python -m tests.gui.words``."""
+"""List every sentence that the window can show: ``python -m tests.gui.words``."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ FOLDER = Path(labapp.gui.__file__).parent
 
 
 def sentences() -> Iterator[tuple[str, str]]:
-    """Where it stands, and its words: all texts of the window but docstrings and names in code."""
+    """Yield (place, text) for all texts of the window but docstrings and names in code."""
     for path in sorted((*FOLDER.rglob("*.py"), Path(checklist.__file__))):
         tree = ast.parse(path.read_text("utf-8"))
         unseen = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}

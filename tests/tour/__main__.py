@@ -1,8 +1,8 @@
-"""Drive the real window through the whole guided way, and save a picture of each page and dialog.
+"""Drive the real window through all steps, and save a picture of each page and dialog.
 
 `python -m tests.tour --out FOLDER` from the checkout; copied beside an installed labapp,
-`python -m tour --out FOLDER`. It needs a display. A page that goes wrong ends it: it is named,
-and the exit code is 1.
+`python -m tour --out FOLDER`. It needs a display. An error on a page ends the tour; the page is
+named, and the exit code is 1.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from labapp.gui.preferences import Preferences
 
 @dataclass(frozen=True)
 class BorrowedPreferences(Preferences):
-    """Preferences of the tour: samples are copied into its own folder, not among the user's.
+    """Preferences of the tour: samples are copied into its own folder, not the user's.
 
     Parameters
     ----------
     tour_folder
-        Where everything goes that the tour makes, besides its pictures.
+        Folder for all files of the tour but its pictures.
     """
 
     tour_folder: str = ""
@@ -44,21 +44,21 @@ class BorrowedPreferences(Preferences):
 def tour(out: Path, size_px: tuple[int, int], theme: str) -> str:
     """Go through the app as an operator does, and write a picture of every page and dialog.
 
-    Nothing of the user's is read or changed.
+    No files of the user are read or changed.
 
     Parameters
     ----------
     out
         Folder for the pictures (PNG); those of an earlier tour are replaced.
     size_px
-        Width and height of the window, px of the screen.
+        Width and height of the window, screen px.
     theme
         ``light`` or ``dark``.
 
     Returns
     -------
     str
-        Where it went wrong and how; empty if it did not.
+        The error, with the page; empty if there was none.
 
     Raises
     ------
@@ -78,7 +78,7 @@ def tour(out: Path, size_px: tuple[int, int], theme: str) -> str:
 
     if not can_draw():
         raise InputError("the tour", "3-D", "nothing can be drawn here", "OpenGL, or Mesa's")
-    app.setAttribute(Qt.ApplicationAttribute.AA_DontUseNativeDialogs)  # they can be driven
+    app.setAttribute(Qt.ApplicationAttribute.AA_DontUseNativeDialogs)  # Qt dialogs can be driven
     with tempfile.TemporaryDirectory(prefix="labapp-tour-") as name:
         folder = Path(name)
         for form in (QSettings.Format.NativeFormat, QSettings.Format.IniFormat):
@@ -87,8 +87,8 @@ def tour(out: Path, size_px: tuple[int, int], theme: str) -> str:
         preferences = BorrowedPreferences(
             theme=theme, last_folder=str(folder / "measurements"), tour_folder=name
         )
-        own = mock.patch.object(drafts, "drafts_folder", return_value=folder / "drafts")
-        with own, open_window(app, preferences, folder / "preferences.json") as window:
+        own_drafts = mock.patch.object(drafts, "drafts_folder", return_value=folder / "drafts")
+        with own_drafts, open_window(app, preferences, folder / "preferences.json") as window:
             try:
                 go_through(Hands(window, out, size_px), folder)
             except TourFailed as failure:
@@ -99,7 +99,7 @@ def tour(out: Path, size_px: tuple[int, int], theme: str) -> str:
 
 
 def _make_room(out: Path) -> None:
-    """Make the folder, and take the pictures of an earlier tour out of it."""
+    """Create the folder, and delete the pictures of an earlier tour."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         for picture in out.glob("[0-9][0-9]-*.png"):
@@ -109,29 +109,29 @@ def _make_room(out: Path) -> None:
 
 
 def _size(text: str) -> tuple[int, int]:
-    found = re.fullmatch(r"([1-9]\d{2,3})x([1-9]\d{2,3})", text)
-    if found is None:
+    match = re.fullmatch(r"([1-9]\d{2,3})x([1-9]\d{2,3})", text)
+    if match is None:
         raise argparse.ArgumentTypeError(f"{text} is not WIDTHxHEIGHT in px, such as 1366x768")
-    return int(found[1]), int(found[2])
+    return int(match[1]), int(match[2])
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Take the tour; returns the exit code."""
+    """Run the tour; return the exit code."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("--out", type=Path, required=True, help="folder for the pictures")
     parser.add_argument("--size", type=_size, default="1366x768", help="of the window, screen px")
     parser.add_argument("--theme", choices=("light", "dark"), default="dark")
     parser.add_argument("--scale", type=float, default=1.0, help="screen pixels to a layout pixel")
-    given = parser.parse_args(arguments)
-    os.environ["QT_SCALE_FACTOR"] = f"{given.scale:g}"
+    options = parser.parse_args(arguments)
+    os.environ["QT_SCALE_FACTOR"] = f"{options.scale:g}"
     try:
-        wrong = tour(given.out.absolute(), given.size, given.theme)
+        error_text = tour(options.out.absolute(), options.size, options.theme)
     except InputError as error:
         parser.error(str(error))
-    if wrong:
-        print(f"the tour ended early. {wrong}", file=sys.stderr)
+    if error_text:
+        print(f"the tour ended early. {error_text}", file=sys.stderr)
         return 1
-    print(f"The pictures are in {given.out}")
+    print(f"The pictures are in {options.out}")
     return 0
 
 

@@ -1,4 +1,4 @@
-"""What the tour has to work with: a folder of files such as an operator would bring along."""
+"""The files of the tour: a folder such as an operator would prepare."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from labapp.simulation.forward import trace
 from labapp.simulation.render import Look, render
 
 CROSS_MM = (4.65, 6.23, 2.75)
-"""l₁, l₂, l₃ that the laser of the sample draws with a fan angle of 10°."""
+"""l₁, l₂, l₃ of the laser of the sample at a fan angle of 10°."""
 
 PX_PER_MM = 30
 CENTRE_PX = (320, 200)
@@ -28,15 +28,15 @@ SCALE_PX = ((120, 440), (420, 440))
 
 
 def lay_out(folder: Path) -> None:
-    """Put the files that the tour opens into a folder.
+    """Write the files that the tour opens into a folder.
 
-    ``measurements`` holds set-up, recording, calibration pictures and a logger's table of a run;
-    ``blocked`` a session with frames that cannot be measured.
+    ``measurements`` has the set-up, recording, calibration pictures and logged table of a run;
+    ``blocked`` has a session with frames that cannot be measured.
 
     Raises
     ------
     InputError
-        If the samples are not there.
+        If the samples are missing.
     """
     measurements = folder / "measurements"
     (measurements / "earlier").mkdir(parents=True)
@@ -52,7 +52,7 @@ def lay_out(folder: Path) -> None:
 
 
 def cross_hair() -> GreyImage:
-    """A picture of the cross hair beside a scale of 10 mm, from above, shape (480, 640)."""
+    """A picture of the cross hair with a 10 mm scale, from above, shape (480, 640)."""
     image = np.full((480, 640), 30, np.uint8)
     u, v = CENTRE_PX
     near, far, across = (round(length * PX_PER_MM) for length in CROSS_MM)
@@ -67,9 +67,9 @@ def cross_hair() -> GreyImage:
 
 
 def plate(setup: Path) -> GreyImage:
-    """What the camera sees of a flat plate in place of the work piece, shape (640, 480)."""
-    given = tomllib.loads(setup.read_text("utf-8"))["image_calibration"]
-    points = {key: tuple(x) if isinstance(x, list) else x for key, x in given.items()}
+    """The camera image of a flat plate in place of the workpiece, shape (640, 480)."""
+    calibration = tomllib.loads(setup.read_text("utf-8"))["image_calibration"]
+    points = {key: tuple(x) if isinstance(x, list) else x for key, x in calibration.items()}
     reflections = trace(FlatMirror(), read_setup(setup).rig)
     rng = np.random.default_rng(5)
     image = render(reflections, CameraView(**points), Look(glow=0.0), rng).image
@@ -77,7 +77,7 @@ def plate(setup: Path) -> GreyImage:
 
 
 def places() -> dict[str, tuple[float, float]]:
-    """(u, v) of the ends of the cross and of the scale in that picture, px, by their names."""
+    """Positions (u, v) of the ends of cross and scale in that picture by name, px."""
     u, v = CENTRE_PX
     near, far, across = (length * PX_PER_MM for length in CROSS_MM)
     return {
@@ -91,7 +91,7 @@ def places() -> dict[str, tuple[float, float]]:
 
 
 def logged() -> str:
-    """What a logger wrote: time, current, voltage; CSV."""
+    """Logged time, current and voltage as CSV text."""
     time_s = np.arange(0.0, 0.5, 0.002)
     rng = np.random.default_rng(4)
     current = 75 + 4 * np.sin(2 * np.pi * 8 * time_s) + rng.normal(0, 0.4, len(time_s))

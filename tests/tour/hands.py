@@ -1,4 +1,4 @@
-"""Hands and eyes of the tour: pressing, typing, waiting until the window rests, taking pictures."""
+"""Operate the window in the tour: press, type, wait until it is idle, and take pictures."""
 
 from __future__ import annotations
 
@@ -46,18 +46,18 @@ from labapp.gui.views.view3d_kinds import InteractiveView
 from labapp.gui.widgets.fields import ChoiceField, Field
 
 LONGEST_MS = 300_000
-"""What takes longer than this has gone wrong."""
+"""Longest wait before the tour fails."""
 
 LOOK_MS = 5
 
 NESTED = 32
-"""Layouts are nested less deep: words that grow have theirs grow by one event, that the next."""
+"""More than the depth of nested layouts: each level grows with an event of its own."""
 
 TITLE_PX = 24
-"""Height of the title that is drawn over a dialog: its frame is the desktop's, not the app's."""
+"""Height of the title that is drawn over a dialog, whose frame belongs to the desktop."""
 
 LEAST_SPREAD = 3.0
-"""A 3-D view whose grey levels deviate by less than this shows nothing."""
+"""A 3-D view with a smaller standard deviation of grey levels is blank."""
 
 NONE, SHIFT, CTRL = (
     Qt.KeyboardModifier.NoModifier,
@@ -71,7 +71,7 @@ P = TypeVar("P", bound=Page)
 
 
 class TourFailed(Exception):
-    """The app did not do what it should: on which page, and what."""
+    """The app failed; names the page and the error."""
 
 
 @dataclass
@@ -85,7 +85,7 @@ class Hands:
     out
         Folder for the pictures.
     size_px
-        Width and height of the pictures, px of the screen.
+        Width and height of the pictures, screen px.
 
     Attributes
     ----------
@@ -103,16 +103,16 @@ class Hands:
     # --- waiting -----------------------------------------------------------------------------
 
     def fail(self, words: str) -> TourFailed:
-        """What to raise when something went wrong on the page in view."""
+        """The exception to raise for an error on the visible page."""
         return TourFailed(f"{self.page}: {words}")
 
     @property
     def page(self) -> str:
-        """Key of the page in view."""
+        """Key of the visible page."""
         return "welcome" if self.window.page is None else self.window.page.key
 
     def wait(self, until: Callable[[], object], what: str) -> None:
-        """Let the window work until something is so."""
+        """Process events until a condition is met."""
         QApplication.processEvents()
         if until():
             return
@@ -126,61 +126,61 @@ class Hands:
             timer.stop()
         if late:
             working = ", ".join(task.title for task in self.window.workspace.tasks.active)
-            under_way = f" ({working} is under way)" if working else ""
-            raise self.fail(f"waited {LONGEST_MS // 1000} s in vain for {what}{under_way}")
+            running = f" ({working} is under way)" if working else ""
+            raise self.fail(f"waited {LONGEST_MS // 1000} s in vain for {what}{running}")
 
     def settle(self) -> None:
-        """Wait until nothing is under way any more, and nothing is due."""
-        self.wait(self._rests, "work to end")
+        """Wait until no task is running and no single-shot timer is active."""
+        self.wait(self._is_idle, "work to end")
 
-    def _rests(self) -> bool:
+    def _is_idle(self) -> bool:
         for _ in range(NESTED):
             QApplication.sendPostedEvents()
         timers = self.window.findChildren(QTimer)
         due = any(timer.isActive() and timer.isSingleShot() for timer in timers)
         return not due and not self.window.workspace.tasks.active
 
-    # --- doing -------------------------------------------------------------------------------
+    # --- actions -----------------------------------------------------------------------------
 
     def begin(self) -> None:
-        """Make the window as large as the pictures."""
+        """Resize the window to the size of the pictures."""
         ratio = self.window.devicePixelRatioF()
-        # At 150 % a screen may end within a pixel of the layout: the rest is cut off.
+        # At 150 % a screen may end within a layout pixel: the rest is cut off.
         self.window.resize(*(math.ceil(side / ratio) for side in self.size_px))
         self.wait(self.window.isVisible, "the window to be seen")
 
     def on(self, kind: type[P]) -> P:
-        """The page in view, which must be of this kind."""
+        """The visible page, which must be of this type."""
         page = self.window.page
         if not isinstance(page, kind):
-            told = "; ".join(self.window.status_line.unread) or "the page does not come"
-            raise TourFailed(f"{kind.key}: {told}")
+            reason = "; ".join(self.window.status_line.unread) or "the page does not come"
+            raise TourFailed(f"{kind.key}: {reason}")
         self.settle()
         return page
 
-    def read(self) -> None:
-        """Take the problem off the status line."""
+    def dismiss(self) -> None:
+        """Dismiss the problem on the status line."""
         self.press("Dismiss")
 
     def do(self, name: str) -> None:
-        """Do an action of the menus."""
+        """Trigger a menu action."""
         action = self.window.menus.actions[name]
         if not action.isEnabled():
             raise self.fail(f"“{action.text()}” is greyed out")
         action.trigger()
 
-    def found(self, kind: type[T], words: str, words_of: Callable[[T], str]) -> T:
-        """The one widget in view that has these words."""
-        there = [
+    def find(self, kind: type[T], words: str, words_of: Callable[[T], str]) -> T:
+        """The only visible widget with this text."""
+        widgets = [
             widget
             for widget in self.window.findChildren(kind)
             if widget.isVisible() and words_of(widget).replace("&", "") == words
         ]
-        if len(there) > 1:  # what leads on from an empty page is in its panel, too
-            there = [each for each in there if not self.window.empty.isAncestorOf(each)]
-        if len(there) != 1:
-            raise self.fail(f"{len(there)} of “{words}” are in view, not one")
-        return self.reveal(there[0])
+        if len(widgets) > 1:  # the button of an empty page is in the side panel, too
+            widgets = [each for each in widgets if not self.window.empty.isAncestorOf(each)]
+        if len(widgets) != 1:
+            raise self.fail(f"{len(widgets)} of “{words}” are in view, not one")
+        return self.reveal(widgets[0])
 
     def reveal(self, widget: T) -> T:
         """Scroll to a widget."""
@@ -193,30 +193,30 @@ class Hands:
         return widget
 
     def press(self, words: str) -> None:
-        """Press the button with these words."""
-        button = self.found(QAbstractButton, words, QAbstractButton.text)
+        """Press the button with this text."""
+        button = self.find(QAbstractButton, words, QAbstractButton.text)
         if not button.isEnabled():
             raise self.fail(f"“{words}” cannot be pressed: {button.toolTip()}")
         QTest.mouseClick(
             button, LEFT, pos=QPoint(min(12, button.width() // 2), button.height() // 2)
         )
 
-    def awake(self) -> None:
-        """Have the keys go to the window."""
+    def activate(self) -> None:
+        """Activate the window, so that it gets key events."""
         if not self.window.isActiveWindow():
             self.window.activateWindow()
             self.wait(self.window.isActiveWindow, "the keys to go to the window")
 
-    def key(self, key: Qt.Key, held: Qt.KeyboardModifier = NONE) -> None:
-        """Press a key in the page in view."""
+    def key(self, key: Qt.Key, modifiers: Qt.KeyboardModifier = NONE) -> None:
+        """Press a key on the visible page."""
         assert self.window.page is not None
-        self.awake()
-        QTest.keyClick(self.window.page.focusProxy() or self.window.page, key, held)
+        self.activate()
+        QTest.keyClick(self.window.page.focusProxy() or self.window.page, key, modifiers)
 
     def enter(self, label: str, text: str) -> None:
         """Type a text into the field with this label."""
-        editor = self.found(Field, label, lambda one: one.label.text()).editor
-        self.awake()
+        editor = self.find(Field, label, lambda one: one.label.text()).editor
+        self.activate()
         editor.setFocus()
         QTest.keyClick(editor, Qt.Key.Key_A, CTRL)
         QTest.keyClicks(editor, text)
@@ -224,14 +224,14 @@ class Hands:
 
     def enter_cell(self, table: QTableWidget, row: int, column: int, text: str) -> None:
         """Type a text into a cell of a table."""
-        self.awake()
+        self.activate()
         table.setFocus()
         table.setCurrentCell(row, column)
         QTest.keyClicks(table, text[0])
 
         def editors() -> list[QLineEdit]:
-            found = table.viewport().findChildren(QLineEdit)
-            return [editor for editor in found if editor.isVisible()]
+            lines = table.viewport().findChildren(QLineEdit)
+            return [editor for editor in lines if editor.isVisible()]
 
         self.wait(editors, "the cell to be opened")
         QTest.keyClicks(editors()[0], text[1:])
@@ -239,8 +239,8 @@ class Hands:
         self.wait(lambda: not editors(), "the cell to be left")
 
     def choose(self, label: str, words: str) -> None:
-        """Choose what begins with these words in the list with this label."""
-        combo = self.found(ChoiceField, label, lambda one: one.label.text()).editor
+        """Choose the entry that starts with `words` in the list with this label."""
+        combo = self.find(ChoiceField, label, lambda one: one.label.text()).editor
         assert isinstance(combo, QComboBox)
         places = [k for k in range(combo.count()) if combo.itemText(k).startswith(words)]
         if len(places) != 1:
@@ -251,13 +251,13 @@ class Hands:
         QTest.keyClick(view, Qt.Key.Key_Return)
 
     def click_row(self, table: QTableWidget, row: int) -> None:
-        """Click a line of a table."""
+        """Click a row of a table."""
         self.reveal(table)
         at = table.visualRect(table.model().index(row, 0)).center()
         QTest.mouseClick(table.viewport(), LEFT, pos=at)
 
     def click(self, view: PictureView, place: tuple[float, float], twice: bool = False) -> None:
-        """Click somewhere in a picture, (u, v) in px; or double click."""
+        """Click or double-click at (u, v) in a picture, px."""
         at, port = _in_view(view, place), view.canvas.viewport()
         QTest.mouseClick(port, LEFT, pos=at)
         if twice:
@@ -265,28 +265,28 @@ class Hands:
             QTest.mouseRelease(port, LEFT, pos=at)
 
     def drag(self, view: PictureView, start: tuple[float, float], end: tuple[float, float]) -> None:
-        """Drag something in a picture from one place to another, (u, v) in px."""
+        """Drag in a picture from one point (u, v) to another, px."""
         port = view.canvas.viewport()
         first, last = _in_view(view, start), _in_view(view, end)
         QTest.mousePress(port, LEFT, pos=first)
         for part in (0.3, 0.6, 1.0):
             QTest.mouseMove(port, first + (last - first) * part)
-            QTest.qWait(LOOK_MS)  # the picture heeds so many moves a second
+            QTest.qWait(LOOK_MS)  # the picture limits the rate of move events
         QTest.mouseRelease(port, LEFT, pos=last)
 
     # --- pictures ----------------------------------------------------------------------------
 
     def picture(self, name: str = "", *, trouble: bool = False, busy: bool = False) -> None:
-        """Take a picture of the window and what is open over it, when it rests.
+        """Take a picture of the idle window and of the dialogs and menus over it.
 
         Parameters
         ----------
         name
-            What is to be seen, after the page's own name; ``dialog-…`` for a dialog.
+            What the picture shows, added to the name of the page; ``dialog-…`` for a dialog.
         trouble
-            Whether a problem is to be told: there must be one; else there must be none.
+            Whether the status line must show a problem; else it must show none.
         busy
-            Whether work is to be seen: the picture is taken while it is under way.
+            Whether to take the picture while a task is running.
         """
         if busy:
             self.wait(lambda: self.window.workspace.tasks.active, "work to begin")
@@ -297,8 +297,8 @@ class Hands:
             raise self.fail("; ".join(unread) or "a problem that should be told is not")
         image = self._seen()
         wide, high = image.width(), image.height()
-        over = (wide - self.size_px[0], high - self.size_px[1])
-        if not all(0 <= px < self.window.devicePixelRatioF() for px in over):
+        excess = (wide - self.size_px[0], high - self.size_px[1])
+        if not all(0 <= px < self.window.devicePixelRatioF() for px in excess):
             raise self.fail(f"the window is {wide}×{high} px large, not as it was asked for")
         image = image.copy(0, 0, *self.size_px)
         self.count += 1
@@ -323,20 +323,20 @@ class Hands:
         return image
 
     def _paint_3d(self, painter: QPainter, view: View3d) -> None:
-        """Paint what is drawn past Qt, after a look whether there is something."""
+        """Paint a 3-D view, which Qt cannot grab; fail if it is blank."""
         if not view.isVisible() or view.scene is None:
             return
-        seen = view.picture()
-        if seen is None or float(np.std(seen.mean(axis=2))) < LEAST_SPREAD:
+        pixels = view.picture()
+        if pixels is None or float(np.std(pixels.mean(axis=2))) < LEAST_SPREAD:
             raise self.fail(f"“{view.accessibleName()}” shows nothing")
         if isinstance(view, InteractiveView):
             image = view.image()
             assert image is not None
-            inner = view.rect().adjusted(1, 1, -1, -1)  # within the frame that shows the focus
+            inner = view.rect().adjusted(1, 1, -1, -1)  # inside the focus frame
             painter.drawImage(QRect(view.mapTo(self.window, inner.topLeft()), inner.size()), image)
 
     def _paint_over(self, painter: QPainter, widget: QWidget) -> None:
-        """Paint a dialog or a menu where it is; a dialog with a title, as a desktop gives it."""
+        """Paint a dialog or a menu at its place; a dialog with a title bar, as on a desktop."""
         is_dialog = isinstance(widget, QDialog)
         top = TITLE_PX if is_dialog else 0
         room = self.window.rect().adjusted(0, top, -widget.width(), -widget.height())
@@ -366,39 +366,41 @@ class Hands:
         self.popup(menu, words.lower(), lambda: QTest.mouseClick(bar, LEFT, pos=at))
 
     def popup(self, menu: QMenu, name: str, show: Callable[[], object]) -> None:
-        """Show a menu, take its picture, and close it; ``show`` may return only when it is."""
+        """Show a menu, take its picture, and close it; ``show`` may block until then."""
 
-        def see(menu: QMenu) -> None:
+        def take_picture(menu: QMenu) -> None:
             self.picture(f"menu-{name}")
             QTest.keyClick(menu, Qt.Key.Key_Escape)
             menu.close()
 
-        self._meet(f"the menu {name}", show, lambda: menu if menu.isVisible() else None, see)
+        self._handle(
+            f"the menu {name}", show, lambda: menu if menu.isVisible() else None, take_picture
+        )
 
-    def asked(
+    def answer_dialog(
         self, name: str, do: Callable[[], object], answer: Callable[[QDialog], object] | None = None
     ) -> None:
-        """Do what opens a dialog that must be answered; take its picture and answer it.
+        """Open a modal dialog, take its picture, and answer it.
 
         Parameters
         ----------
         name
-            Of the picture; empty for none.
+            Name of the picture; empty for no picture.
         do
-            Opens the dialog; may return only when it is closed.
+            Opens the dialog; may block until it is closed.
         answer
-            Answers it; without one it is given up by Escape.
+            Answers the dialog; by default Escape is pressed.
         """
-        began = QElapsedTimer()
-        began.start()
+        timer = QElapsedTimer()
+        timer.start()
 
-        def there() -> QDialog | None:
+        def dialog_if_filled() -> QDialog | None:
             dialog = QApplication.activeModalWidget()
-            if isinstance(dialog, QDialog) and (_is_filled(dialog) or began.hasExpired(LONGEST_MS)):
+            if isinstance(dialog, QDialog) and (_is_filled(dialog) or timer.hasExpired(LONGEST_MS)):
                 return dialog
             return None
 
-        def see(dialog: QDialog) -> None:
+        def handle(dialog: QDialog) -> None:
             if not _is_filled(dialog):
                 raise self.fail(f"“{dialog.windowTitle()}” never shows what it is about")
             if name:
@@ -410,32 +412,32 @@ class Hands:
             if dialog.isVisible():
                 raise self.fail(f"“{dialog.windowTitle()}” stays open")
 
-        self._meet(f"the dialog {name}", do, there, see)
+        self._handle(f"the dialog {name}", do, dialog_if_filled, handle)
 
-    def _meet(
+    def _handle(
         self,
         what: str,
         do: Callable[[], object],
-        there: Callable[[], T | None],
-        see: Callable[[T], None],
+        detect: Callable[[], T | None],
+        handle: Callable[[T], None],
     ) -> None:
-        """Do what opens something over the window; see to that, when it is there, from within."""
+        """Open a dialog or menu, and handle it from within its event loop."""
         ended: list[Exception | None] = []
         look = QTimer()
 
-        def attend() -> None:
-            over = there()
-            if over is None:
+        def check() -> None:
+            widget = detect()
+            if widget is None:
                 return
             look.stop()
             try:
-                see(over)
+                handle(widget)
                 ended.append(None)
             except Exception as error:
                 ended.append(error)
-                over.close()
+                widget.close()
 
-        look.timeout.connect(attend)
+        look.timeout.connect(check)
         look.start(LOOK_MS)
         do()
         self.wait(lambda: ended, what)
@@ -448,8 +450,8 @@ def _in_view(view: PictureView, place: tuple[float, float]) -> QPoint:
     return at
 
 
-def give(path: Path) -> Callable[[QDialog], None]:
-    """Answer a dialog that asks for a file or a folder."""
+def enter_path(path: Path) -> Callable[[QDialog], None]:
+    """Return a function that enters a path into a file dialog."""
 
     def answer(dialog: QDialog) -> None:
         line = dialog.findChild(QLineEdit, "fileNameEdit")
@@ -462,7 +464,7 @@ def give(path: Path) -> Callable[[QDialog], None]:
 
 
 def _is_filled(dialog: QDialog) -> bool:
-    """Whether a dialog shows what it is about: the list of files is read in the background."""
+    """Whether a dialog shows its content: the list of files is read in the background."""
     if not dialog.isVisible():
         return False
     files = dialog.findChild(QListView, "listView")
@@ -472,16 +474,16 @@ def _is_filled(dialog: QDialog) -> bool:
     kinds = QDir.Filter.AllDirs | QDir.Filter.NoDotAndDotDot
     if dialog.fileMode() != QFileDialog.FileMode.Directory:
         kinds |= QDir.Filter.Files
-    there = dialog.directory().entryList(patterns, kinds)
-    return not there or files.model().rowCount(files.rootIndex()) > 0
+    entries = dialog.directory().entryList(patterns, kinds)
+    return not entries or files.model().rowCount(files.rootIndex()) > 0
 
 
 def _over(window: MainWindow) -> list[QWidget]:
-    """Dialogs and menus that are open over the window, the one to be answered last."""
+    """Dialogs and menus that are open over the window; the active one comes last."""
     over = [
         widget
         for widget in QApplication.topLevelWidgets()
         if widget is not window and widget.isVisible() and isinstance(widget, QDialog | QMenu)
     ]
-    uppermost = (QApplication.activeModalWidget(), QApplication.activePopupWidget())
-    return sorted(over, key=lambda widget: widget in uppermost)
+    active = (QApplication.activeModalWidget(), QApplication.activePopupWidget())
+    return sorted(over, key=lambda widget: widget in active)

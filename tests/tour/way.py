@@ -1,4 +1,4 @@
-"""The way of the tour: what an operator does from the first start to the export."""
+"""The steps of the tour: what an operator does from the first start to the export."""
 
 from __future__ import annotations
 
@@ -27,28 +27,28 @@ from labapp.gui.tools.tool import ToolWindow
 from labapp.session.session import Session
 
 from .bench import CROSS_MM, places
-from .hands import CTRL, Hands, give
+from .hands import CTRL, Hands, enter_path
 
 T = TypeVar("T", bound=ToolWindow)
 
 FRAMES = 6
-"""So many are imported: enough to see, soon measured."""
+"""Number of imported frames: enough to see, and quickly measured."""
 
 
 def go_through(hands: Hands, folder: Path) -> None:
-    """Go through the whole app.
+    """Go through the complete app.
 
     Parameters
     ----------
     hands
-        What drives the window.
+        Drives the window.
     folder
-        Of `bench.lay_out`.
+        The folder written by `bench.lay_out`.
 
     Raises
     ------
     TourFailed
-        If a page does not do what it should.
+        If a page does not behave as expected.
     """
     files = folder / "measurements"
     hands.begin()
@@ -75,13 +75,13 @@ def go_through(hands: Hands, folder: Path) -> None:
     _misnumber(hands)
     _blocked(hands, folder / "blocked")
     _moved(hands, folder / "blocked")
-    _troubles(hands, files)
+    _problems(hands, files)
     _help(hands)
 
 
 def _begin_session(hands: Hands, files: Path) -> None:
     new = files / "plate 12.labsession"
-    hands.asked("new", lambda: hands.do("new"), give(new))
+    hands.answer_dialog("new", lambda: hands.do("new"), enter_path(new))
 
 
 def _set_up(hands: Hands, files: Path) -> None:
@@ -96,9 +96,11 @@ def _set_up(hands: Hands, files: Path) -> None:
     hands.picture("safety")
     _tab(hands, page, 2)
     hands.picture("bench-empty")
-    hands.asked("load-setup", lambda: hands.press("Load…"), give(files / "setup.toml"))
+    hands.answer_dialog(
+        "load-setup", lambda: hands.press("Load…"), enter_path(files / "setup.toml")
+    )
     hands.picture("bench")
-    hands.asked("save-setup", lambda: hands.press("Save…"))
+    hands.answer_dialog("save-setup", lambda: hands.press("Save…"))
 
 
 def _tab(hands: Hands, page: SetupPage, number: int) -> None:
@@ -113,7 +115,7 @@ def _laser(hands: Hands, files: Path) -> None:
     hands.picture("before")
     hands.choose("Lengths", "from a picture")
     picture = files / "cross_hair.png"
-    hands.asked("cross-hair", lambda: hands.press("Load picture…"), give(picture))
+    hands.answer_dialog("cross-hair", lambda: hands.press("Load picture…"), enter_path(picture))
     hands.settle()
     for name, place in places().items():
         hands.drag(page.picture_view, page.places()[name], place)
@@ -133,15 +135,15 @@ def _plane(hands: Hands, files: Path) -> None:
     hands.on(PlanePage)
     hands.picture("before")
     none = files / "no_target.png"
-    hands.asked("target", lambda: hands.press("Load picture…"), give(none))
+    hands.answer_dialog("target", lambda: hands.press("Load picture…"), enter_path(none))
     hands.picture("not-found", trouble=True)
-    hands.read()
+    hands.dismiss()
     known = files / "calibration.png"
-    hands.asked("", lambda: hands.press("Load picture…"), give(known))
+    hands.answer_dialog("", lambda: hands.press("Load picture…"), enter_path(known))
     hands.picture("found")
     hands.press("Apply")
     hands.picture("used")
-    hands.asked("print-target", lambda: hands.press("Save for printing…"))
+    hands.answer_dialog("print-target", lambda: hands.press("Save for printing…"))
 
 
 def _bench_check(hands: Hands, files: Path) -> None:
@@ -151,7 +153,7 @@ def _bench_check(hands: Hands, files: Path) -> None:
     hands.press("Predict ± by pictures")
     hands.settle()
     picture = files / "plate.png"
-    hands.asked("mirror", lambda: hands.press("Add picture…"), give(picture))
+    hands.answer_dialog("mirror", lambda: hands.press("Add picture…"), enter_path(picture))
     hands.settle()
     hands.press("Check")
     hands.wait(lambda: page.checked, "the bench to be checked")
@@ -164,20 +166,22 @@ def _bench_check(hands: Hands, files: Path) -> None:
 def _record(hands: Hands, files: Path) -> None:
     hands.do("next_step")
     hands.picture("none")
-    hands.asked("folder", lambda: hands.press("Choose folder…"))
-    hands.asked("file", lambda: hands.press("Choose file…"), give(files / "recording.avi"))
+    hands.answer_dialog("folder", lambda: hands.press("Choose folder…"))
+    hands.answer_dialog(
+        "file", lambda: hands.press("Choose file…"), enter_path(files / "recording.avi")
+    )
     hands.settle()
     hands.enter("Last frame", str(FRAMES - 1))
     hands.picture("chosen")
     hands.press("Import")
     hands.picture("imported")
-    hands.asked("import", lambda: hands.do("import"))
+    hands.answer_dialog("import", lambda: hands.do("import"))
     hands.press("Find devices")
     hands.picture("foot-switch")
 
 
 def _film(hands: Hands) -> None:
-    """Watch the simulated camera and record from it; the session has a recording: it is a file."""
+    """Show the simulated camera and record from it, into a file beside the session."""
     page = hands.on(CapturePage)
     hands.press("Start")
     view = page.live_view
@@ -185,27 +189,27 @@ def _film(hands: Hands) -> None:
     hands.wait(lambda: view.bar.ring.value() == 100, "the seconds before a trigger")
     hands.wait(lambda: view.measured_s, "a live frame to be measured")
     hands.picture("live")
-    _look_on(hands, page)
+    _live_parts(hands, page)
     hands.press("● Record")
     hands.wait(lambda: view.live and view.live.takes[0].frames > 150, "frames to be recorded")
     hands.picture("recording")
-    hands.asked("recording-runs", lambda: hands.do("close"))
+    hands.answer_dialog("recording-runs", lambda: hands.do("close"))
     hands.press("■ End recording")
     hands.press("Stop camera")
     hands.settle()
     hands.picture("second")
-    hands.asked("next-session", lambda: hands.press("New session from this recording…"))
+    hands.answer_dialog("next-session", lambda: hands.press("New session from this recording…"))
 
 
-def _look_on(hands: Hands, page: CapturePage) -> None:
-    """The live pool in 3-D, its trend, a limit that it passes, and who can be told."""
+def _live_parts(hands: Hands, page: CapturePage) -> None:
+    """Show the live pool in 3-D, its trends, an alarm, and the streams to control software."""
     canvas = page.live_view.canvas
     surface, streams = (list(PARTS).index(part) for part in ("surface", "streams"))
     canvas.tabs.setCurrentIndex(surface)
     hands.wait(lambda: canvas.surface.view.scene, "a live surface")
     hands.picture("live-surface")
     canvas.tabs.setCurrentIndex(list(PARTS).index("trends"))
-    canvas.trends.canvas_parts.setCurrentIndex(1)  # seen on a small screen only
+    canvas.trends.canvas_parts.setCurrentIndex(1)  # visible on a small screen only
     hands.enter("Width, max.", "6")
     hands.wait(canvas.alarms.isVisible, "an alarm")
     if canvas.trends.canvas_parts.isVisible():
@@ -216,7 +220,7 @@ def _look_on(hands: Hands, page: CapturePage) -> None:
     hands.press("Acknowledge")
     hands.enter("Width, max.", "9")
     hands.wait(lambda: not canvas.alarms.isVisible(), "the alarm to go")
-    hands.read()
+    hands.dismiss()
     canvas.tabs.setCurrentIndex(streams)
     hands.picture("live-control")
     canvas.tabs.setCurrentIndex(0)
@@ -244,13 +248,13 @@ def _surface(hands: Hands) -> None:
     hands.picture("side")
     hands.press("Oblique")
     hands.enter("Heights ×", "1")
-    show = hands.found(QToolButton, "Show", QToolButton.text)
+    show = hands.find(QToolButton, "Show", QToolButton.text)
     hands.popup(show.menu(), "show", show.showMenu)
     page.parts["rays"].trigger()
     hands.picture("rays")
     page.parts["rays"].trigger()
-    hands.asked("save-picture", lambda: hands.press("Save…"))
-    hands.asked("save-copy", lambda: hands.do("copy"))
+    hands.answer_dialog("save-picture", lambda: hands.press("Save…"))
+    hands.answer_dialog("save-copy", lambda: hands.do("copy"))
 
 
 def _compare(hands: Hands) -> None:
@@ -260,7 +264,7 @@ def _compare(hands: Hands) -> None:
 
 
 def _dots(hands: Hands) -> None:
-    """Look at levels; take a dot out, add it again, and carry that on."""
+    """Show the levels; delete a dot, add it again, and carry the correction on."""
     hands.do("step_dots")
     page = hands.on(DotsPage)
     hands.picture("automatic")
@@ -289,27 +293,27 @@ def _trends(hands: Hands, files: Path) -> None:
     hands.picture("spectrum")
     hands.choose("Spectrum of", "none")
     table = files / "current.csv"
-    hands.asked("signals", lambda: hands.press("Load table…"), give(table))
+    hands.answer_dialog("signals", lambda: hands.press("Load table…"), enter_path(table))
     hands.picture("signals")
     tool = _tool(hands, "dynamics", DynamicsWindow)
     hands.wait(lambda: tool.drawn and not tool.working, "the pool over time to be analysed")
     tool.tabs.setCurrentIndex(1)
     hands.picture("dialog-dynamics")
-    hands.asked("save-dynamics", lambda: hands.press("Save the results…"))
+    hands.answer_dialog("save-dynamics", lambda: hands.press("Save the results…"))
     tool.close()
 
 
 def _export(hands: Hands, files: Path) -> None:
     hands.do("step_export")
     hands.picture("before")
-    hands.asked("where-to", lambda: hands.press("Choose folder…"), give(files))
+    hands.answer_dialog("where-to", lambda: hands.press("Choose folder…"), enter_path(files))
     hands.choose("Frames", "the frame in view")
     hands.press("Export")
     hands.picture("after")
 
 
 def _other_pages(hands: Hands) -> None:
-    """The pages that have no part of the way of their own: a picture each."""
+    """Take a picture of each page that no other function shows."""
     for step in STEPS:
         if step.key not in hands.pages:
             hands.do(f"step_{step.key}")
@@ -325,8 +329,8 @@ def _simulator(hands: Hands) -> None:
     hands.do("step_setup")
     tool = _tool(hands, "simulator", SimulatorWindow)
     hands.wait(lambda: tool.preview, "the first frame of a scenario")
-    hands.asked("scenario", lambda: hands.press("Load scenario…"))
-    hands.asked("simulation-folder", lambda: hands.press("Choose folder…"))
+    hands.answer_dialog("scenario", lambda: hands.press("Load scenario…"))
+    hands.answer_dialog("simulation-folder", lambda: hands.press("Choose folder…"))
     hands.enter("Frames", "2")
     hands.press("Simulate")
     hands.wait(lambda: tool.made, "the simulation to be written")
@@ -335,16 +339,16 @@ def _simulator(hands: Hands) -> None:
 
 
 def _study(hands: Hands) -> None:
-    """A study of the recording that was simulated, made and measured."""
+    """Create and run a study of the simulated recording."""
     hands.do("step_setup")
-    made = hands.window.findChild(SimulatorWindow).made
+    simulated = hands.window.findChild(SimulatorWindow).made
     tool = _tool(hands, "study", StudyWindow)
-    hands.asked("study", lambda: hands.press("Open study…"))
-    hands.asked("study-recordings", lambda: hands.press("Choose folder…"))
-    hands.asked("study-setup", lambda: hands.press("Choose set-up…"))
-    tool.take_folder(made[1])
-    hands.asked("new-study", lambda: hands.press("Make study…"))
-    tool.make(made[1].parent / "study.toml")
+    hands.answer_dialog("study", lambda: hands.press("Open study…"))
+    hands.answer_dialog("study-recordings", lambda: hands.press("Choose folder…"))
+    hands.answer_dialog("study-setup", lambda: hands.press("Choose set-up…"))
+    tool.take_folder(simulated[1])
+    hands.answer_dialog("new-study", lambda: hands.press("Make study…"))
+    tool.make(simulated[1].parent / "study.toml")
     hands.wait(lambda: tool.found and not tool.looks.active, "the study to be read")
     hands.press("Run")
     hands.wait(lambda: tool.summary and not tool.looks.active, "the study to be measured")
@@ -353,15 +357,15 @@ def _study(hands: Hands) -> None:
 
 
 def _adviser(hands: Hands) -> None:
-    """What it asks; a search would take the tour's time."""
+    """Show the request only; a search would take too long."""
     tool = _tool(hands, "adviser", AdviserWindow)
     hands.picture("dialog-adviser")
-    hands.asked("save-advice", tool.choose_folder)
+    hands.answer_dialog("save-advice", tool.choose_folder)
     tool.close()
 
 
 def _analysis(hands: Hands) -> None:
-    """The part that is done soonest."""
+    """Run the fastest part of the analysis."""
     tool = _tool(hands, "analysis", AnalysisWindow)
     for key in ("budget", "measurement"):
         hands.press(tool.parts[key].text())
@@ -369,7 +373,7 @@ def _analysis(hands: Hands) -> None:
     hands.press("Run")
     hands.wait(lambda: tool.files and not tool.working, "the thumb tack to be worked out")
     hands.picture("dialog-analysis")
-    hands.asked("save-results", lambda: hands.press("Save the results…"))
+    hands.answer_dialog("save-results", lambda: hands.press("Save the results…"))
     tool.close()
 
 
@@ -381,7 +385,7 @@ def _tool(hands: Hands, key: str, kind: type[T]) -> T:
 
 
 def _misnumber(hands: Hands) -> None:
-    """Shift a row that was right: the fit takes long and says so, and is left."""
+    """Shift a correct row: the fit takes long, is shown as running, and is left."""
     hands.do("step_dots")
     page = hands.on(DotsPage)
     hands.click_row(page.dots_panel.rows, 3)
@@ -393,9 +397,9 @@ def _misnumber(hands: Hands) -> None:
 
 
 def _blocked(hands: Hands, folder: Path) -> None:
-    """A session with frames that cannot be measured."""
+    """Open a session with frames that cannot be measured."""
     session = folder / "blocked_rows.labsession"
-    hands.asked("open", lambda: hands.do("open"), give(session))
+    hands.answer_dialog("open", lambda: hands.do("open"), enter_path(session))
     hands.settle()
     hands.do("step_dots")
     hands.do("next_doubtful")
@@ -408,23 +412,23 @@ def _blocked(hands: Hands, folder: Path) -> None:
 
 
 def _moved(hands: Hands, folder: Path) -> None:
-    """The recording is not where it was; a session is open elsewhere."""
-    there, elsewhere = folder / "recording.mkv", folder / "elsewhere"
+    """Open a session whose recording was moved, and one that is open elsewhere."""
+    recording, elsewhere = folder / "recording.mkv", folder / "elsewhere"
     elsewhere.mkdir()
-    there.rename(elsewhere / there.name)
+    recording.rename(elsewhere / recording.name)
     session = folder / "blocked_rows.labsession"
     with Session.open(session):
-        hands.asked("read-only", lambda: hands.window.files.open(session), _agree)
+        hands.answer_dialog("read-only", lambda: hands.window.files.open(session), _agree)
     hands.do("step_capture")
     hands.picture("read-only", trouble=True)
-    hands.read()
+    hands.dismiss()
     hands.do("close")
-    QTest.keyClick(hands.window.welcome.list, Qt.Key.Key_Return)  # the last one that was open
+    QTest.keyClick(hands.window.welcome.list, Qt.Key.Key_Return)  # the last open session
     hands.do("step_capture")
     hands.picture("missing", trouble=True)
-    hands.read()
-    found = give(elsewhere / there.name)
-    hands.asked("where-is", lambda: hands.press("Locate…"), found)
+    hands.dismiss()
+    answer = enter_path(elsewhere / recording.name)
+    hands.answer_dialog("where-is", lambda: hands.press("Locate…"), answer)
     hands.picture("found-again")
     hands.do("close")
 
@@ -434,7 +438,7 @@ def _agree(dialog: QDialog) -> None:
     QTest.mouseClick(dialog.defaultButton(), Qt.MouseButton.LeftButton)
 
 
-def _troubles(hands: Hands, files: Path) -> None:
+def _problems(hands: Hands, files: Path) -> None:
     hands.settle()
     hands.window.files.open_path(files / "damaged.labsession")
     hands.picture("problem", trouble=True)

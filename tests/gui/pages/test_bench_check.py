@@ -1,4 +1,4 @@
-"""Bench check: pictures of known mirrors, the check, what is shown of it, used and undone."""
+"""Bench check: pictures of known mirrors, the check, its display, applying and undoing it."""
 
 from __future__ import annotations
 
@@ -45,14 +45,14 @@ from tests.gui.conftest import KEPT
 SETUP = Path(__file__).parents[3] / "sample_sessions" / "gtaw" / "setup.toml"
 
 TRUE_ANGLE_DEG, TRUE_ROTATION_DEG = 31.54, 1.2
-"""Of the bench that the pictures are taken on; the set-up has 31.14 and 0."""
+"""Values of the simulated bench; the set-up has 31.14 and 0."""
 
 
 @pytest.fixture(scope="module")
 def plate() -> GreyImage:
-    """A plate in place of the work piece, on a bench that is not quite as its set-up has it."""
-    given = tomllib.loads(SETUP.read_text("utf-8"))["image_calibration"]
-    view = CameraView(**{k: tuple(x) if isinstance(x, list) else x for k, x in given.items()})
+    """A plate in place of the workpiece, on a bench that deviates slightly from its set-up."""
+    calibration = tomllib.loads(SETUP.read_text("utf-8"))["image_calibration"]
+    view = CameraView(**{k: tuple(x) if isinstance(x, list) else x for k, x in calibration.items()})
     rig = read_setup(SETUP).rig
     laser = replace(rig.laser, projection_angle_deg=TRUE_ANGLE_DEG)
     rig = replace(rig, laser=laser, pattern=replace(rig.pattern, rotation_deg=TRUE_ROTATION_DEG))
@@ -70,7 +70,7 @@ def checked(plate: GreyImage) -> Checked:
 # --- the presenter ------------------------------------------------------------------------------
 
 
-def test_a_picture_shows_the_mirror_that_is_entered() -> None:
+def test_picture_has_the_entered_mirror() -> None:
     one = Chosen("a", np.zeros((2, 2), np.uint8))
     assert one.mirror == Plate(0.0)
     cap = replace(one.of_kind("cap"), height_mm=0.5, diameter_mm=8.0)
@@ -81,7 +81,7 @@ def test_a_picture_shows_the_mirror_that_is_entered() -> None:
     assert not one.problem
 
 
-def test_how_well_a_mirror_is_known_is_entered() -> None:
+def test_uncertainty_of_a_mirror_is_entered() -> None:
     one = Chosen("a", np.zeros((2, 2), np.uint8))
     assert one.usual_height_sigma_mm == Plate.height_sigma_mm
     known = replace(one, height_sigma_mm=0.005, level_sigma_deg=0.03)
@@ -92,11 +92,11 @@ def test_how_well_a_mirror_is_known_is_entered() -> None:
 
 
 @pytest.mark.slow
-def test_how_well_a_mirror_is_known_is_kept(checked: Checked) -> None:
+def test_uncertainty_of_a_mirror_is_stored(checked: Checked) -> None:
     (picture,), (chosen,) = checked.record.pictures, checked.chosen
     assert Chosen.of_kept(picture, chosen.image).mirror == chosen.mirror
     assert chosen.is_of(picture)
-    assert chosen.is_of(replace(picture, pose_sigma=()))  # of a former version
+    assert chosen.is_of(replace(picture, pose_sigma=()))  # of an earlier version
     level = replace(chosen, level_sigma_deg=0.03)
     assert not level.is_of(picture)
     sigma = tuple(zip(level.mirror.parameters, level.mirror.sigma.tolist(), strict=True))
@@ -104,7 +104,7 @@ def test_how_well_a_mirror_is_known_is_kept(checked: Checked) -> None:
 
 
 @pytest.mark.slow
-def test_a_height_that_may_be_wrong_unnoticed_is_said_to_be(checked: Checked) -> None:
+def test_undetectable_height_error_is_reported(checked: Checked) -> None:
     (spot,) = checked.blind
     assert spot.picture == "plate.png"
     assert f"{spot.noticed_mm:.2g} mm" in checked.words
@@ -112,7 +112,7 @@ def test_a_height_that_may_be_wrong_unnoticed_is_said_to_be(checked: Checked) ->
 
 
 @pytest.mark.slow
-def test_the_check_finds_what_is_off_and_what_it_cannot_tell(checked: Checked) -> None:
+def test_check_finds_deviations_and_undetermined_quantities(checked: Checked) -> None:
     assert checked.usable
     record = checked.record
     k = INDEX["pattern.rotation_deg"]
@@ -131,7 +131,7 @@ def test_the_check_finds_what_is_off_and_what_it_cannot_tell(checked: Checked) -
 
 
 @pytest.mark.slow
-def test_the_known_mirror_is_measured_with_the_adjusted_bench(checked: Checked) -> None:
+def test_known_mirror_is_measured_with_the_adjusted_bench(checked: Checked) -> None:
     ((name, known, measured, sigma),) = checked.record.pictures[0].measured
     assert (name, known) == ("height", 0.0)
     assert 0 < sigma < 0.05
@@ -152,14 +152,14 @@ def test_the_known_mirror_is_measured_with_the_adjusted_bench(checked: Checked) 
 
 
 @pytest.mark.slow
-def test_dots_are_drawn_where_they_are_and_arrows_as_enlarged(checked: Checked) -> None:
+def test_overlay_has_dots_in_place_and_enlarged_arrows(checked: Checked) -> None:
     (picture,) = checked.record.pictures
-    shown = presenter.overlay(picture, 640)
-    times = float(shown.words.split("×")[1].split(",")[0])
-    begin, end = shown.arrows_px[::2], shown.arrows_px[1::2]
+    overlay = presenter.overlay(picture, 640)
+    factor = float(overlay.words.split("×")[1].split(",")[0])
+    begin, end = overlay.arrows_px[::2], overlay.arrows_px[1::2]
     np.testing.assert_allclose(begin, picture.dot_px)
-    np.testing.assert_allclose((end - begin) / times, picture.computed_px - picture.dot_px)
-    rows = [text for text, _, _, of_row in shown.numbers if of_row]
+    np.testing.assert_allclose((end - begin) / factor, picture.computed_px - picture.dot_px)
+    rows = [text for text, _, _, of_row in overlay.numbers if of_row]
     assert rows == ["i1", "i5", "i10", "i15", "i19"]
     u, v = picture.dot_px[7]
     i, j = picture.ray[7]
@@ -167,7 +167,7 @@ def test_dots_are_drawn_where_they_are_and_arrows_as_enlarged(checked: Checked) 
     assert presenter.ray_words(picture, -100.0, 0.0) == ""
 
 
-def test_dark_pictures_are_refused_with_the_cause() -> None:
+def test_dark_pictures_are_rejected_with_the_cause() -> None:
     dark = Chosen("dark.png", np.zeros((640, 480), np.uint8))
     text = SETUP.read_text("utf-8")
     with pytest.raises(CannotMeasure, match=r"dark\.png"):
@@ -175,31 +175,31 @@ def test_dark_pictures_are_refused_with_the_cause() -> None:
 
 
 @pytest.mark.slow
-def test_pictures_are_predicted_to_help(tmp_path: Path) -> None:
+def test_predicted_uncertainty_falls_with_more_pictures(tmp_path: Path) -> None:
     with Session.create(tmp_path / "new.labsession") as session:
         record = session.record
-    made = presenter.predicted(read_setup(SETUP), record)
-    values = [float(sigma) for _, sigma in made.rows]
+    prediction = presenter.predicted(read_setup(SETUP), record)
+    values = [float(sigma) for _, sigma in prediction.rows]
     assert len(values) == len(CANDIDATES) + 1
     assert all(value < values[0] for value in values[1:])
 
 
 @pytest.mark.slow
-def test_a_set_of_pictures_without_dots_is_named(
+def test_picture_set_without_dots_is_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The imaging plane ends far below the dots of a plate at 90 mm."""
     sets = {"high": (Plate(90.0),), "level": (Plate(0.0),)}
     monkeypatch.setattr(presenter, "CANDIDATES", sets)
     with Session.create(tmp_path / "new.labsession") as session:
-        made = presenter.predicted(read_setup(SETUP), session.record)
-    sigmas = dict(made.rows)
+        prediction = presenter.predicted(read_setup(SETUP), session.record)
+    sigmas = dict(prediction.rows)
     assert len(sigmas) == 3
     assert sigmas["High"] == presenter.NO_DOTS
     assert float(sigmas["Level"]) > 0
 
 
-def test_a_picture_of_another_size_is_refused(tmp_path: Path) -> None:
+def test_picture_of_another_size_is_rejected(tmp_path: Path) -> None:
     one, other = (Chosen(str(n), np.zeros((n, 48), np.uint8)) for n in (64, 32))
     with Session.create(tmp_path / "new.labsession") as session:
         presenter.check_sizes(session, [one, one])
@@ -214,17 +214,17 @@ def test_a_picture_of_another_size_is_refused(tmp_path: Path) -> None:
 def page(qtbot: QtBot, copy_sample: Callable[[str], Path]) -> Iterator[BenchCheckPage]:
     workspace = Workspace()
     workspace.show(Session.open(copy_sample("gtaw")))
-    made = BenchCheckPage(workspace)
-    KEPT.extend([workspace, made, made.panel])
-    workspace.changed.connect(lambda: made.refresh() if workspace.session else None)
-    made.refresh()
-    made.show()
-    made.panel.show()
+    bench_page = BenchCheckPage(workspace)
+    KEPT.extend([workspace, bench_page, bench_page.panel])
+    workspace.changed.connect(lambda: bench_page.refresh() if workspace.session else None)
+    bench_page.refresh()
+    bench_page.show()
+    bench_page.panel.show()
     qtbot.waitUntil(lambda: not workspace.tasks.active)
-    yield made
+    yield bench_page
     workspace.close()
-    made.hide()
-    made.panel.hide()
+    bench_page.hide()
+    bench_page.panel.hide()
 
 
 def add(qtbot: QtBot, page: BenchCheckPage, folder: Path, *images: GreyImage) -> None:
@@ -235,7 +235,7 @@ def add(qtbot: QtBot, page: BenchCheckPage, folder: Path, *images: GreyImage) ->
         qtbot.waitUntil(lambda: not page.workspace.tasks.active)
 
 
-def test_pictures_are_listed_changed_and_removed(
+def test_pictures_are_listed_edited_and_removed(
     qtbot: QtBot, page: BenchCheckPage, tmp_path: Path
 ) -> None:
     assert not page.check_button.isEnabled()
@@ -256,16 +256,14 @@ def test_pictures_are_listed_changed_and_removed(
     assert not page.diameter.editor.isEnabled()
 
 
-def test_pictures_can_be_dropped_and_nothing_else(
-    qtbot: QtBot, page: BenchCheckPage, tmp_path: Path
-) -> None:
+def test_only_pictures_can_be_dropped(qtbot: QtBot, page: BenchCheckPage, tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "a.png"), np.zeros((64, 48), np.uint8))
     assert page.takes_files([tmp_path / "a.png"])
     qtbot.waitUntil(lambda: len(page.chosen) == 1)
     assert not page.takes_files([tmp_path / "a.labsession"])
 
 
-def test_a_refusal_stands_beside_the_button(
+def test_rejection_is_shown_beside_the_button(
     qtbot: QtBot, page: BenchCheckPage, tmp_path: Path
 ) -> None:
     add(qtbot, page, tmp_path, np.zeros((640, 480), np.uint8))
@@ -277,7 +275,7 @@ def test_a_refusal_stands_beside_the_button(
 
 
 @pytest.mark.slow
-def test_a_bench_is_checked_used_kept_and_undone(
+def test_bench_check_is_applied_stored_and_undone(
     qtbot: QtBot, page: BenchCheckPage, tmp_path: Path, plate: GreyImage
 ) -> None:
     session = page.session
@@ -299,9 +297,9 @@ def test_a_bench_is_checked_used_kept_and_undone(
     assert setup.rig.uncertainty is not None
     assert setup.rig.uncertainty.status == "checked"
     assert states(session)["bench_check"].mark is Mark.DONE
-    kept = session.bench_check
-    assert kept is not None
-    (picture,) = kept.pictures
+    stored = session.bench_check
+    assert stored is not None
+    (picture,) = stored.pictures
     np.testing.assert_array_equal(session.picture(picture.picture_sha256), plate)
     assert session.problems(recording=False) == []
     assert not page.use_button.isEnabled()
@@ -309,11 +307,11 @@ def test_a_bench_is_checked_used_kept_and_undone(
 
     session.update_setup({"laser": {"aim_x_mm": 0.25}})
     assert states(session)["bench_check"].mark is Mark.ATTENTION
-    stated = setup_presenter.shown(session)
-    assert stated.usual_sigmas == setup_presenter.ASSUMED
-    assert stated.status.startswith(SETUP_MARKS["entered"])
-    assert kept.date[:10] in stated.status
-    assert kept.date[:10] in presenter.kept_words(session)
+    setup_view = setup_presenter.shown(session)
+    assert setup_view.usual_sigmas == setup_presenter.ASSUMED
+    assert setup_view.status.startswith(SETUP_MARKS["entered"])
+    assert stored.date[:10] in setup_view.status
+    assert stored.date[:10] in presenter.kept_words(session)
     session.undo()
     assert states(session)["bench_check"].mark is Mark.DONE
     page.workspace.undo()
@@ -325,7 +323,7 @@ def test_a_bench_is_checked_used_kept_and_undone(
 
 
 @pytest.mark.slow
-def test_a_kept_check_is_shown_when_its_session_is_opened(
+def test_stored_check_is_shown_when_its_session_is_opened(
     qtbot: QtBot, page: BenchCheckPage, checked: Checked
 ) -> None:
     workspace, path = page.workspace, page.session.path
@@ -343,35 +341,35 @@ def test_a_kept_check_is_shown_when_its_session_is_opened(
 
 
 @pytest.mark.slow
-def test_a_refused_check_offers_what_is_off_and_no_measured_mirror(
+def test_rejected_check_shows_suspects_and_no_measured_mirror(
     page: BenchCheckPage, checked: Checked
 ) -> None:
-    """What a bench measures that is not to be used would look right."""
+    """Mirrors measured with a rejected bench would look right."""
     page.chosen = list(checked.chosen)
     suspects = (
         Suspect("laser.distance_mm", "laser, distance", 30.0),
         Suspect("imaging_plane.h_mm", "imaging plane, h", 30.0),
     )
-    off = replace(checked.check, status="quantity-off", reason="off", suspects=suspects)
-    page.checked = replace(checked, check=off, setup_text=page.session.setup_text)
+    failed = replace(checked.check, status="quantity-off", reason="off", suspects=suspects)
+    page.checked = replace(checked, check=failed, setup_text=page.session.setup_text)
     page.refresh()
     assert page.suspect.value() == "laser.distance_mm"
     assert page.mirrors.rowCount() == 0
     assert page.quantities.rowCount() > len(INDEX)
     assert not page.use_button.isEnabled()
     assert page.state(states(page.session)["bench_check"]).mark is Mark.ATTENTION
-    off = replace(off, suspects=suspects[1:])
-    page.checked = replace(page.checked, check=off)
+    failed = replace(failed, suspects=suspects[1:])
+    page.checked = replace(page.checked, check=failed)
     page.refresh()
     assert page.suspect.value() == "imaging_plane.h_mm"
-    page.checked = replace(page.checked, check=replace(off, status="size-off"))
+    page.checked = replace(page.checked, check=replace(failed, status="size-off"))
     page.refresh()
     assert page.suspect_part.isHidden()
     page.workspace.close()
     assert page.state(states(None)["bench_check"]) == states(None)["bench_check"]
 
 
-def test_the_table_stands_below_the_picture_where_there_is_no_room_beside_it(
+def test_table_moves_below_the_picture_in_a_narrow_page(
     page: BenchCheckPage,
 ) -> None:
     page.resize(900, 600)
@@ -381,27 +379,27 @@ def test_the_table_stands_below_the_picture_where_there_is_no_room_beside_it(
 
 
 @pytest.mark.slow
-def test_a_quantity_found_from_the_pictures_alone_is_said_to_be(checked: Checked) -> None:
+def test_quantity_found_from_pictures_alone_is_reported(checked: Checked) -> None:
     free = replace(checked, check=replace(checked.check, free=("laser.distance_mm",)))
     assert "distance" not in checked.words
     assert "distance" in free.words
 
 
-def test_every_button_says_what_it_does(page: BenchCheckPage) -> None:
+def test_every_button_has_a_tooltip(page: BenchCheckPage) -> None:
     buttons = page.panel.findChildren(QPushButton)
     assert len(buttons) == 6
     assert all(button.toolTip() for button in buttons)
 
 
 @pytest.mark.slow
-def test_what_was_known_before_holds_again_once_the_bench_is_unchecked(checked: Checked) -> None:
+def test_unchecking_restores_the_previous_uncertainty(checked: Checked) -> None:
     known = {"projection_angle_deg_sigma": 0.3, "angle_distance_correlation": 0.9}
     text = updated_setup(SETUP.read_text("utf-8"), SETUP, {"laser": known})
     check = replace(checked.check, before=parse_setup(text, SETUP).rig)
     after = checked_setup(text, SETUP, check, "2026-01-31T12:00:00+00:00")
     assert parse_setup(after, SETUP).checked.startswith("2026-01-31")
-    back = unchecked_setup(after, SETUP)
-    assert not parse_setup(back, SETUP).checked
-    laser = tomllib.loads(back)["laser"]
+    restored = unchecked_setup(after, SETUP)
+    assert not parse_setup(restored, SETUP).checked
+    laser = tomllib.loads(restored)["laser"]
     assert laser["projection_angle_deg"] == pytest.approx(31.14)
     assert {key: laser[key] for key in known} == known

@@ -1,4 +1,4 @@
-"""What a live camera is set to, and how it is recorded: only what it has, and refusals in words."""
+"""Settings of a live camera and of its recording: available fields and rejected values."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SHAPE = (48, 64)
 
 
 def picture(k: int) -> GreyImage:
-    """Frame k: each pixel tells its place."""
+    """Frame k: the value of each pixel encodes its position."""
     return np.add.outer(2 * np.arange(SHAPE[0]), np.arange(SHAPE[1])).astype(np.uint8)
 
 
@@ -47,10 +47,10 @@ class Industrial(SimulatedCamera):
 
     def apply(self, wanted: CameraSettings) -> CameraSettings:
         check_settings(self.info, self.limits, wanted)
-        held = self._device.settings
+        current = self._device.settings
         if wanted.exposure_us is not None:
-            held = replace(held, exposure_us=10.0 * round(wanted.exposure_us / 10))
-        self._device.settings = replace(held, gain_db=wanted.gain_db or held.gain_db)
+            current = replace(current, exposure_us=10.0 * round(wanted.exposure_us / 10))
+        self._device.settings = replace(current, gain_db=wanted.gain_db or current.gain_db)
         return super().apply(replace(wanted, exposure_us=None, gain_db=None))
 
 
@@ -61,9 +61,9 @@ class Device(SimulatedDevice):
 
 @pytest.fixture
 def device() -> SimulatedDevice:
-    made = Device("test", picture, rate_hz=100)
-    made.settings = replace(made.settings, exposure_us=500.0, gain_db=0.0)
-    return made
+    simulated = Device("test", picture, rate_hz=100)
+    simulated.settings = replace(simulated.settings, exposure_us=500.0, gain_db=0.0)
+    return simulated
 
 
 @pytest.fixture
@@ -90,7 +90,7 @@ def fields(page: CapturePage) -> CameraFields:
     return page.live_view.camera_fields
 
 
-def seen(fields: CameraFields) -> set[str]:
+def visible_fields(fields: CameraFields) -> set[str]:
     return {name for name, field in fields.fields.items() if not field.isHidden()}
 
 
@@ -98,20 +98,20 @@ def problem(field: Field) -> str:
     return "" if field.problem.isHidden() else field.problem.text()
 
 
-def test_only_what_the_camera_has_is_shown(fields: CameraFields):
-    assert seen(fields) == {"exposure_us", "gain_db", "rate_hz", "trigger", "region"}
+def test_only_supported_settings_are_shown(fields: CameraFields):
+    assert visible_fields(fields) == {"exposure_us", "gain_db", "rate_hz", "trigger", "region"}
     assert fields.region.value() == "0, 0, 64, 48"
     assert fields.whole_button.isHidden()
     plain = Limits(rate_hz=Range(1, 100), sensor=(64, 48))
     fields._show(CameraSettings(rate_hz=50.0, region=(0, 0, 64, 48), trigger="free"), plain)
-    assert seen(fields) == {"rate_hz"}
+    assert visible_fields(fields) == {"rate_hz"}
     fixed = Limits(sensor=(64, 48), triggers=("free", "line"))
     fields._show(CameraSettings(), fixed)
-    assert seen(fields) == {"trigger"}
+    assert visible_fields(fields) == {"trigger"}
     assert fields.trigger.editor.count() == 2
 
 
-def test_the_gain_of_usb_video_has_no_unit(fields: CameraFields, monkeypatch: pytest.MonkeyPatch):
+def test_gain_of_usb_video_has_no_unit(fields: CameraFields, monkeypatch: pytest.MonkeyPatch):
     assert fields.fields["gain_db"].unit.text() == "dB"
     camera = fields._feed.camera
     monkeypatch.setattr(camera, "limits", replace(camera.limits, gain_unit=""))
@@ -119,7 +119,7 @@ def test_the_gain_of_usb_video_has_no_unit(fields: CameraFields, monkeypatch: py
     assert fields.fields["gain_db"].unit.text() == ""
 
 
-def test_a_value_that_the_camera_rounds_is_told(page: CapturePage, fields, device, qtbot: QtBot):
+def test_value_rounded_by_the_camera_is_reported(page: CapturePage, fields, device, qtbot: QtBot):
     exposure = fields.fields["exposure_us"]
     Hand(page.window()).enter(exposure, "804")
     qtbot.waitUntil(lambda: device.settings.exposure_us == 800 and not fields.waiting)
@@ -147,7 +147,7 @@ def test_a_value_that_the_camera_rounds_is_told(page: CapturePage, fields, devic
         ("0, 0, 20, 3", "at least 16×16 px"),
     ],
 )
-def test_a_region_that_cannot_be_is_refused_in_words(
+def test_invalid_region_is_rejected(
     page: CapturePage, fields, device, qtbot: QtBot, text: str, words: str
 ):
     Hand(page.window()).enter(fields.region, text or " ")
@@ -157,7 +157,7 @@ def test_a_region_that_cannot_be_is_refused_in_words(
     assert device.settings.region == (0, 0, 64, 48)
 
 
-def test_a_region_is_what_is_seen_and_recorded(page: CapturePage, fields, device, qtbot: QtBot):
+def test_region_applies_to_display_and_recording(page: CapturePage, fields, device, qtbot: QtBot):
     view, hand = page.live_view, Hand(page.window())
     hand.enter(fields.region, "8 4 32 20")
     qtbot.waitUntil(lambda: device.settings.region == (8, 4, 32, 20) and not fields.waiting)
@@ -165,11 +165,11 @@ def test_a_region_is_what_is_seen_and_recorded(page: CapturePage, fields, device
     assert fields.part_words.isVisible()
     qtbot.waitUntil(lambda: np.shape(page.picture_view.picture) == (20, 32))
     assert "with a picture of this very region" in fields.part_words.text()
-    fields.show_camera(view.live.feed, (20, 32))  # it may have been of another place
+    fields.show_camera(view.live.feed, (20, 32))  # it may have had another position
     assert "with a picture of this very region" in fields.part_words.text()
     fields.show_camera(view.live.feed, SHAPE)
     assert "a picture of 64×48 px, and frames have 32×20 px" in fields.part_words.text()
-    # The seconds before the trigger are of the new size, too.
+    # The frames before the trigger have the new size, too.
     view.trigger()
     assert not fields.region.editor.isEnabled()
     assert not fields.whole_button.isEnabled()
@@ -188,7 +188,7 @@ def test_a_region_is_what_is_seen_and_recorded(page: CapturePage, fields, device
     qtbot.waitUntil(lambda: not page.workspace.tasks.active)
 
 
-def test_frames_are_taken_when_they_are_asked_for(page: CapturePage, fields, device, qtbot: QtBot):
+def test_software_trigger_takes_single_frames(page: CapturePage, fields, device, qtbot: QtBot):
     view, hand = page.live_view, Hand(page.window())
     assert fields.shoot_button.isHidden()
     hand.choose(fields.trigger, "by the button Take a frame")
@@ -208,30 +208,30 @@ def test_frames_are_taken_when_they_are_asked_for(page: CapturePage, fields, dev
     assert fields.shoot_button.isHidden()
 
 
-def test_a_region_that_is_typed_is_what_is_shown():
+def test_region_text_round_trip():
     assert region_of("1;2, 300  40") == (1, 2, 300, 40)
     assert region_of(region_text((8, 4, 32, 20))) == (8, 4, 32, 20)
     with pytest.raises(InputError, match="four whole numbers"):
         region_of("1.5, 2, 3, 4")
 
 
-# --- what recording costs -------------------------------------------------------------------------
+# --- cost of recording ----------------------------------------------------------------------------
 
 
-def test_what_raw_and_ffv1_cost_is_told():
+def test_cost_of_raw_and_ffv1_is_shown():
     byte = 640 * 480
     raw, small = Plan(), Plan(codec="ffv1")
     assert cost_text(raw, byte, 200) == "About 61.4 MB a second, 14 % of a core"
-    told = cost_text(small, byte, 200)
-    assert told.startswith("⚠ About 25.8 MB a second, 92 % of a core: little is left")
-    assert told.endswith("Raw takes 14 %")
+    text = cost_text(small, byte, 200)
+    assert text.startswith("⚠ About 25.8 MB a second, 92 % of a core: little is left")
+    assert text.endswith("Raw takes 14 %")
     assert "frames will be lost" in cost_text(small, byte, 500)
     assert cost_text(replace(small, every=4), byte, 200) == (
         "About 6.5 MB a second, 23 % of a core"
     )
 
 
-def test_the_codec_that_is_chosen_is_recorded(page: CapturePage, qtbot: QtBot):
+def test_chosen_codec_is_used(page: CapturePage, qtbot: QtBot):
     view = page.live_view
     qtbot.waitUntil(lambda: "a second" in view.plan_fields.cost.text())
     for words, codec in (("FFV1: small, slow", "ffv1"), ("Raw: large, quick", "raw")):

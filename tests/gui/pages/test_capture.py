@@ -1,4 +1,4 @@
-"""The recording page: what would be imported, importing, what was read, a missing recording."""
+"""The recording page: preview, importing, facts of the recording, a missing recording."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def stack(tmp_path: Path) -> Path:
     return path
 
 
-def test_what_would_be_imported(stack: Path, copy_sample) -> None:
+def test_preview_and_choice_of_frames(stack: Path, copy_sample) -> None:
     preview = Preview(stack)
     assert preview.frames == 12
     assert Choice(2, 9, 3).frames == "2:10:3"
@@ -60,10 +60,10 @@ def test_what_would_be_imported(stack: Path, copy_sample) -> None:
     )
     assert choice_text(preview, Choice(0, 11, 2, 100.0)).endswith("0.120 s at 100 frames/s")
     assert choice_text(preview, Choice(0, 11, 2, 1.0)).endswith("12.000 s at 1 frame/s")
-    seen = preview.look(3, DotSettings())
-    assert seen.image is not None
-    assert seen.image.shape == (40, 50)
-    assert "frame 3 (of 0 to 11)" in seen.title
+    frame_view = preview.look(3, DotSettings())
+    assert frame_view.image is not None
+    assert frame_view.image.shape == (40, 50)
+    assert "frame 3 (of 0 to 11)" in frame_view.title
     preview.close()
     with pytest.raises(InputError):
         Preview(stack.with_name("none.avi"))
@@ -77,29 +77,29 @@ def test_what_would_be_imported(stack: Path, copy_sample) -> None:
         assert refusal(session, Choice(0, 2), False) == ""
 
 
-def test_what_was_read_is_told(copy_sample) -> None:
+def test_recording_facts(copy_sample) -> None:
     with Session.open(copy_sample("gtaw")) as session:
         recording = session.recording
         assert recording is not None
-        told = dict(recording_facts(recording))
-        assert told["Frames"] == "30 in the recording, used: all"
-        assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d", told["Imported"])
-        assert told["Time base"] == "60 frames/s"
-        assert told["Seeking"] == "frame-exact"
-        assert told["SHA-256"] == recording.sha256
-        assert told["Size"] == "3.9 MB"
+        facts = dict(recording_facts(recording))
+        assert facts["Frames"] == "30 in the recording, used: all"
+        assert re.fullmatch(r"\d{4}-\d\d-\d\d \d\d:\d\d", facts["Imported"])
+        assert facts["Time base"] == "60 frames/s"
+        assert facts["Seeking"] == "frame-exact"
+        assert facts["SHA-256"] == recording.sha256
+        assert facts["Size"] == "3.9 MB"
         other = replace(
             recording, selected=(2, 20, 3), rate_is_given=True, frame_exact=False, embedded=True
         )
-        told = dict(recording_facts(other))
-        assert told["Frames"] == "30 in the recording, used: 6, 2 to 19, every 3."
-        assert told["Time base"] == "60 frames/s (entered)"
-        assert told["Seeking"].startswith("not frame-exact")
-        assert told["Kept"] == "in the session itself"
-        seen = look(session, 0)
-        assert seen.exposure is not None
-        assert seen.exposure.verdict == "good"
-        assert len(bars(seen.exposure)) == len(BARS)
+        facts = dict(recording_facts(other))
+        assert facts["Frames"] == "30 in the recording, used: 6, 2 to 19, every 3."
+        assert facts["Time base"] == "60 frames/s (entered)"
+        assert facts["Seeking"].startswith("not frame-exact")
+        assert facts["Kept"] == "in the session itself"
+        frame_view = look(session, 0)
+        assert frame_view.exposure is not None
+        assert frame_view.exposure.verdict == "good"
+        assert len(bars(frame_view.exposure)) == len(BARS)
     assert [name for name, _ in BARS] == ["Exposure", "Saturation", "Contrast"]
     assert format_bytes(999) == "999 bytes"
     assert format_bytes(2_500_000_000) == "2.5 GB"
@@ -107,17 +107,17 @@ def test_what_was_read_is_told(copy_sample) -> None:
     assert [part for part, _ in blank] == [0, 0, 0]
 
 
-def test_a_missing_recording_is_told_and_frames_say_why(copy_sample) -> None:
+def test_missing_recording_is_reported_by_frames(copy_sample) -> None:
     path = copy_sample("gtaw")
     (path.parent / "recording.avi").rename(path.parent / "moved.avi")
     with Session.open(path) as session:
         assert missing_text(session).startswith("recording.avi is missing")
-        seen = look(session, 0)
-        assert seen.image is None
-        assert seen.words == "recording.avi is missing: locate it (step Recording)"
+        frame_view = look(session, 0)
+        assert frame_view.image is None
+        assert frame_view.words == "recording.avi is missing: locate it (step Recording)"
 
 
-def made(workspace: Workspace) -> CapturePage:
+def make_page(workspace: Workspace) -> CapturePage:
     page = CapturePage(workspace)
     KEPT.extend((workspace, page))
     workspace.changed.connect(lambda: page.refresh() if workspace.session else None)
@@ -136,7 +136,7 @@ NOTHING = State(Mark.READY, "No recording yet")
 def page(qtbot: QtBot, tmp_path: Path) -> CapturePage:
     workspace = Workspace()
     workspace.show(Session.create(tmp_path / "new.labsession"))
-    yield made(workspace)
+    yield make_page(workspace)
     workspace.close()
 
 
@@ -145,7 +145,7 @@ def session_of(page: CapturePage) -> Session:
     return page.workspace.session
 
 
-def test_choose_look_and_import(page: CapturePage, stack: Path, qtbot: QtBot) -> None:
+def test_choosing_previewing_and_importing(page: CapturePage, stack: Path, qtbot: QtBot) -> None:
     assert page.picture_view.picture is None
     assert not page.chosen.isVisibleTo(page.panel)
     assert page.state(NOTHING) is NOTHING
@@ -173,42 +173,42 @@ def test_choose_look_and_import(page: CapturePage, stack: Path, qtbot: QtBot) ->
     assert page.state(NOTHING) is NOTHING
 
 
-def test_an_import_that_is_cancelled_leaves_the_session_as_it_was(
+def test_cancelled_import_leaves_the_session_unchanged(
     page: CapturePage, stack: Path, qtbot: QtBot, monkeypatch
 ) -> None:
     page.take(stack)
     qtbot.waitUntil(lambda: page.preview is not None)
-    begun, go_on = threading.Event(), threading.Event()
+    started, resume = threading.Event(), threading.Event()
     progress = page.workspace.tasks.start.__globals__["Control"].progress
 
     def slow(control, done: int, total: int) -> None:
-        begun.set()
-        go_on.wait(PATIENCE_S)
+        started.set()
+        resume.wait(PATIENCE_S)
         progress(control, done, total)
 
     monkeypatch.setattr("labapp.gui.tasks.Control.progress", slow)
     page.import_chosen()
-    qtbot.waitUntil(begun.is_set)
+    qtbot.waitUntil(started.is_set)
     assert page._importing is not None
     page._importing.cancel()
-    go_on.set()
+    resume.set()
     qtbot.waitUntil(lambda: not page.workspace.tasks.active)
     assert session_of(page).recording is None
     assert page.chosen.import_button.isEnabled()
 
 
-def test_what_cannot_be_opened_is_said(page: CapturePage, tmp_path: Path, qtbot: QtBot) -> None:
-    said: list[tuple[str, bool]] = []
-    page.workspace.notified.connect(lambda words, problem: said.append((words, problem)))
+def test_unreadable_recording_is_reported(page: CapturePage, tmp_path: Path, qtbot: QtBot) -> None:
+    messages: list[tuple[str, bool]] = []
+    page.workspace.notified.connect(lambda words, problem: messages.append((words, problem)))
     (tmp_path / "notes.txt").write_text("no video")
     page.take(tmp_path / "notes.txt")
-    qtbot.waitUntil(lambda: bool(said))
-    assert said[0][1]
-    assert "notes.txt" in said[0][0]
+    qtbot.waitUntil(lambda: bool(messages))
+    assert messages[0][1]
+    assert "notes.txt" in messages[0][0]
     assert page.preview is None
 
 
-def test_not_this_one_goes_back(page: CapturePage, stack: Path, qtbot: QtBot) -> None:
+def test_cancelled_choice_restores_the_page(page: CapturePage, stack: Path, qtbot: QtBot) -> None:
     page.take(stack)
     qtbot.waitUntil(lambda: page.picture_view.picture is not None)
     page.cancel_choice()
@@ -217,20 +217,20 @@ def test_not_this_one_goes_back(page: CapturePage, stack: Path, qtbot: QtBot) ->
     assert session_of(page).recording is None
 
 
-def test_a_missing_recording_is_found_again(copy_sample, tmp_path: Path, qtbot: QtBot) -> None:
+def test_missing_recording_can_be_located(copy_sample, tmp_path: Path, qtbot: QtBot) -> None:
     path = copy_sample("gtaw")
     moved = tmp_path / "elsewhere.avi"
     shutil.move(path.parent / "recording.avi", moved)
     workspace = Workspace()
     workspace.show(Session.open(path))
-    page = made(workspace)
-    said: list[tuple[str, bool]] = []
-    workspace.notified.connect(lambda words, problem: said.append((words, problem)))
+    page = make_page(workspace)
+    messages: list[tuple[str, bool]] = []
+    workspace.notified.connect(lambda words, problem: messages.append((words, problem)))
     assert page.find_button.isVisibleTo(page.panel)
     page.relink(path.parent / "calibration.png")
-    qtbot.waitUntil(lambda: len(said) == 1)
-    assert said[0][1]
-    assert "another recording" in said[0][0]
+    qtbot.waitUntil(lambda: len(messages) == 1)
+    assert messages[0][1]
+    assert "another recording" in messages[0][0]
     page.relink(moved)
     qtbot.waitUntil(lambda: page.picture_view.picture is not None)
     assert not page.find_button.isVisibleTo(page.panel)
@@ -238,7 +238,7 @@ def test_a_missing_recording_is_found_again(copy_sample, tmp_path: Path, qtbot: 
     workspace.close()
 
 
-def test_every_button_says_what_it_does(page: CapturePage) -> None:
+def test_every_button_has_a_tooltip(page: CapturePage) -> None:
     for button in page.panel.findChildren(QAbstractButton):
         if button.text():
             assert button.toolTip(), button.text()
@@ -247,7 +247,7 @@ def test_every_button_says_what_it_does(page: CapturePage) -> None:
 # --- a second recording ---------------------------------------------------------------------------
 
 
-def test_a_second_recording_goes_into_a_session_of_its_own(
+def test_second_recording_needs_a_new_session(
     window: MainWindow, copy_sample: CopySample, tmp_path: Path, qtbot: QtBot
 ):
     first = copy_sample("thumb_tack")
@@ -258,7 +258,7 @@ def test_a_second_recording_goes_into_a_session_of_its_own(
     window.activateWindow()
     qtbot.waitUntil(window.isActiveWindow)
     page, hand = window.page, Hand(window)
-    former, setup = window.workspace.session, window.workspace.session.setup_text
+    previous, setup = window.workspace.session, window.workspace.session.setup_text
     assert not page.chosen.isVisible()
     page.take(first.parent / "recording.tif")
     qtbot.waitUntil(lambda: page.preview is not None)
@@ -268,7 +268,7 @@ def test_a_second_recording_goes_into_a_session_of_its_own(
     second = tmp_path / "second.labsession"
     hand.answer(second)
     hand.button("New session from this recording…")
-    qtbot.waitUntil(lambda: window.workspace.session is not former)
+    qtbot.waitUntil(lambda: window.workspace.session is not previous)
     session = window.workspace.session
     assert session.path == second
     qtbot.waitUntil(lambda: session.recording is not None)
@@ -281,29 +281,29 @@ def test_a_second_recording_goes_into_a_session_of_its_own(
     assert hashlib.sha256(first.read_bytes()).hexdigest() == before
 
 
-def test_a_new_session_that_is_given_up_changes_nothing(
+def test_cancelled_new_session_changes_nothing(
     window: MainWindow, copy_sample: CopySample, qtbot: QtBot, monkeypatch: pytest.MonkeyPatch
 ):
     window.files.open(copy_sample("thumb_tack"))
     window.show_step("capture")
-    page, former = window.page, window.workspace.session
-    page.take(former.path.parent / "recording.tif")
+    page, previous = window.page, window.workspace.session
+    page.take(previous.path.parent / "recording.tif")
     qtbot.waitUntil(lambda: page.preview is not None)
     monkeypatch.setattr(dialogs, "ask_new_session", lambda *_: None)
     page.chosen.next_button.click()
-    assert window.workspace.session is former
+    assert window.workspace.session is previous
     assert page.preview is not None
-    # One that is there already is refused in words, and stays.
-    monkeypatch.setattr(dialogs, "ask_new_session", lambda *_: former.path)
+    # An existing session is rejected and stays unchanged.
+    monkeypatch.setattr(dialogs, "ask_new_session", lambda *_: previous.path)
     page.chosen.next_button.click()
-    assert window.workspace.session is former
+    assert window.workspace.session is previous
     assert window.status_line.unread
 
 
 # --- calibrated with another region ---------------------------------------------------------------
 
 
-def test_frames_of_another_size_than_the_calibration_picture_are_told(
+def test_frame_size_other_than_calibrated_is_reported(
     window: MainWindow, copy_sample: CopySample, tmp_path: Path, qtbot: QtBot
 ):
     first = copy_sample("thumb_tack")
@@ -316,20 +316,20 @@ def test_frames_of_another_size_than_the_calibration_picture_are_told(
     session.import_recording(first.parent / "recording.tif")
     window.workspace.changed.emit()
 
-    def told() -> str:
+    def facts() -> str:
         return " ".join(label.text() for label in page.facts_group.findChildren(QLabel))
 
-    qtbot.waitUntil(lambda: "recording.tif" in told())
-    assert "calibrated with" not in told()
+    qtbot.waitUntil(lambda: "recording.tif" in facts())
+    assert "calibrated with" not in facts()
     half = tmp_path / "half.npy"
     np.save(half, np.zeros((2, 240, 460), np.uint8))
     session.import_recording(half)
     window.workspace.changed.emit()
-    qtbot.waitUntil(lambda: "a picture of 460×480 px, and frames have 460×240 px" in told())
-    # A calibration that is not in use tells nothing.
+    qtbot.waitUntil(lambda: "a picture of 460×480 px, and frames have 460×240 px" in facts())
+    # A calibration that is not in use is not compared.
     point = {"image_calibration": {"origin_px": [1.0, 2.0]}}
     window.workspace.attempt(lambda session: session.update_setup(point))
     assert calibrated_px(session) is None
-    qtbot.waitUntil(lambda: "calibrated with" not in told())
+    qtbot.waitUntil(lambda: "calibrated with" not in facts())
     qtbot.waitUntil(lambda: not window.workspace.tasks.active)
     assert other_size(None, (1, 2)) == other_size((1, 2), (1, 2)) == ""

@@ -1,4 +1,4 @@
-"""The dots page: what it shows of a session, and a hand that puts a frame right."""
+"""The dots page: its view of a session, and corrections of a frame by hand."""
 
 from __future__ import annotations
 
@@ -32,35 +32,35 @@ CONTROL, SHIFT = Qt.KeyboardModifier.ControlModifier, Qt.KeyboardModifier.ShiftM
 
 @pytest.fixture
 def page(qtbot: QtBot) -> Iterator[DotsPage]:
-    """The page with its panel beside it, and the signals as the window connects them."""
-    space = Workspace()
-    page = DotsPage(space)
-    space.changed.connect(lambda: page.refresh() if space.session else None)
-    space.frame_changed.connect(lambda _: page.refresh())
-    beside = QWidget()
-    layout = QHBoxLayout(beside)
+    """The page beside its panel, with the signals connected as in the window."""
+    workspace = Workspace()
+    page = DotsPage(workspace)
+    workspace.changed.connect(lambda: page.refresh() if workspace.session else None)
+    workspace.frame_changed.connect(lambda _: page.refresh())
+    container = QWidget()
+    layout = QHBoxLayout(container)
     layout.addWidget(page, 1)
     layout.addWidget(page.panel)
-    KEPT.append(beside)
-    beside.resize(1300, 900)
-    beside.show()
-    beside.activateWindow()
-    qtbot.waitExposed(beside)
+    KEPT.append(container)
+    container.resize(1300, 900)
+    container.show()
+    container.activateWindow()
+    qtbot.waitExposed(container)
     yield page
     page.leave()
-    space.close()
+    workspace.close()
 
 
 @pytest.fixture
 def unfitted(monkeypatch: pytest.MonkeyPatch) -> list[list[int]]:
-    """Frames that would have been measured."""
-    asked: list[list[int]] = []
+    """Record the frames that would have been measured."""
+    requested: list[list[int]] = []
     monkeypatch.setattr(
-        Workspace, "measure", lambda self, frames=None, **_: asked.append(list(frames))
+        Workspace, "measure", lambda self, frames=None, **_: requested.append(list(frames))
     )
-    monkeypatch.setattr(Refit, "_fit", lambda self, frame: asked.append([frame]))
+    monkeypatch.setattr(Refit, "_fit", lambda self, frame: requested.append([frame]))
     monkeypatch.setattr(Processes, "begin", lambda self: None)
-    return asked
+    return requested
 
 
 def show(page: DotsPage, qtbot: QtBot, path: Path, frame: int) -> Session:
@@ -89,15 +89,15 @@ def click(page: DotsPage, place: np.ndarray, *, shift: bool = False) -> None:
 
 
 def double_click(page: DotsPage, place: np.ndarray) -> None:
-    # As a mouse does it; QTest.mouseDClick presses once more in between.
-    port, there, left = page.view.canvas.viewport(), at(page, *place), Qt.MouseButton.LeftButton
+    # As a mouse does; QTest.mouseDClick sends an additional press.
+    port, point, left = page.view.canvas.viewport(), at(page, *place), Qt.MouseButton.LeftButton
     click(page, place)
     again = QMouseEvent(
-        QEvent.Type.MouseButtonDblClick, QPointF(there), QPointF(port.mapToGlobal(there)),
+        QEvent.Type.MouseButtonDblClick, QPointF(point), QPointF(port.mapToGlobal(point)),
         left, left, Qt.KeyboardModifier.NoModifier,
     )  # fmt: skip
     QApplication.sendEvent(port, again)
-    QTest.mouseRelease(port, left, pos=there)
+    QTest.mouseRelease(port, left, pos=point)
 
 
 def drag(page: DotsPage, start: np.ndarray, end: np.ndarray) -> None:
@@ -114,8 +114,11 @@ def key(page: DotsPage, which: Qt.Key, modifier: Qt.KeyboardModifier | None = No
     QTest.keyClick(page.view, which, modifier or Qt.KeyboardModifier.NoModifier)
 
 
-def spoiled(session: Session, frame: int) -> tuple[Correction, np.ndarray, int]:
-    """One row off by a column, two false dots, one dot missed: its place, and the row."""
+def faulty_correction(session: Session, frame: int) -> tuple[Correction, np.ndarray, int]:
+    """A correction with faults, the position of its missed dot and its shifted row.
+
+    The faults are a row shifted by one column, two false dots and a missed dot.
+    """
     result = session.result(frame)
     assert result is not None
     good = start_correction(result.measurement)
@@ -134,12 +137,12 @@ def truth(path: Path, frame: int) -> dict[str, float]:
         return {name: float(value) for name, value in list(csv.DictReader(file))[frame].items()}
 
 
-def test_a_spoiled_frame_is_put_right_in_fifteen_actions(
+def test_frame_with_faults_is_corrected_in_15_actions(
     page: DotsPage, qtbot: QtBot, copy_sample: CopySample
 ) -> None:
     path = copy_sample("gtaw")
     with Session.open(path) as session:
-        bad, missed, row = spoiled(session, 0)
+        bad, missed, row = faulty_correction(session, 0)
         session.correct({0: bad})
         steps = len(session.history)
     session = show(page, qtbot, path, 0)
@@ -151,8 +154,8 @@ def test_a_spoiled_frame_is_put_right_in_fifteen_actions(
         actions += 2
     double_click(page, missed)
     actions += 1
-    own = bad.lattice.row == row
-    click(page, bad.dots.image_px[np.flatnonzero(own)[3]])
+    in_row = bad.lattice.row == row
+    click(page, bad.dots.image_px[np.flatnonzero(in_row)[3]])
     key(page, Qt.Key.Key_Left, CONTROL)
     actions += 2
 
@@ -165,23 +168,23 @@ def test_a_spoiled_frame_is_put_right_in_fifteen_actions(
     assert result.measurement.status == "ok"
     size = result.measurement.measures
     assert size is not None
-    known = truth(path, 0)
-    assert size.height_mm == pytest.approx(known["height_mm"], rel=0.03)
-    assert size.width_mm == pytest.approx(known["width_mm"], rel=0.02)
-    assert size.length_mm == pytest.approx(known["length_mm"], rel=0.02)
+    expected = truth(path, 0)
+    assert size.height_mm == pytest.approx(expected["height_mm"], rel=0.03)
+    assert size.width_mm == pytest.approx(expected["width_mm"], rel=0.02)
+    assert size.length_mm == pytest.approx(expected["length_mm"], rel=0.02)
     assert size.mre_mm < 0.05
-    # What was before the edits and what is now stand beside each other.
+    # The results before and after the edits are shown side by side.
     qtbot.waitUntil(lambda: not page.refit.pending)
     table = {row.name: row.value for row in page.dots_panel.fit.rows}
     assert str(table["Fit"]).endswith("→ ok")
 
 
-def test_a_newer_edit_ends_the_fit_of_the_one_before(
+def test_new_edit_ends_the_previous_fit(
     page: DotsPage, qtbot: QtBot, copy_sample: CopySample
 ) -> None:
-    """One fit at a time, and the last edit wins: the first one's process does not go on."""
+    """One fit runs at a time for the last edit; the process of the previous fit is ended."""
     session = show(page, qtbot, copy_sample("gtaw"), 0)
-    refit, kept = page.refit, list[float]()
+    refit, fitted = page.refit, list[float]()
     qtbot.waitUntil(lambda: refit.processes.ready)
 
     def nudge() -> None:
@@ -192,15 +195,15 @@ def test_a_newer_edit_ends_the_fit_of_the_one_before(
     def note() -> None:
         result = session.result(0)
         if result is not None and result.measurement.correction is not None:
-            kept.append(float(result.measurement.correction.dots.u_px[12]))
+            fitted.append(float(result.measurement.correction.dots.u_px[12]))
 
     page.workspace.changed.connect(note)
-    began = float(page.editor.dots_px[12, 0])
+    initial = float(page.editor.dots_px[12, 0])
     nudge()
     first, pool = refit._task, refit.processes.first
     assert refit.pending
     nudge()
-    nudge()  # the process to take its place is not warm yet: the second's fit goes on until it is
+    nudge()  # the spare process is not ready yet, so the second fit runs until it is
     assert first is not None
     assert first.control.cancelled.is_set()
     assert refit.processes.first is not pool
@@ -209,14 +212,14 @@ def test_a_newer_edit_ends_the_fit_of_the_one_before(
         lambda: not refit.pending and not presenter.needs_fit(presenter.shown(session, 0, None)),
     )
     page.workspace.changed.disconnect(note)
-    assert kept[-1] == pytest.approx(began + 0.6, abs=1e-9)
-    assert began + 0.2 not in kept
+    assert fitted[-1] == pytest.approx(initial + 0.6, abs=1e-9)
+    assert initial + 0.2 not in fitted
 
 
-def test_undo_shows_the_measured_rows_at_once(
+def test_undo_restores_the_measured_rows(
     page: DotsPage, qtbot: QtBot, copy_sample: CopySample, unfitted: list[list[int]]
 ) -> None:
-    """Not what the detector alone finds, which the next edit would make the frame's rows."""
+    """Detected rows would otherwise become the rows of the frame with the next edit."""
     session = show(page, qtbot, copy_sample("gtaw"), 0)
     before = page.editor.correction
     assert before is not None
@@ -227,21 +230,21 @@ def test_undo_shows_the_measured_rows_at_once(
     assert unfitted == [[0]]
     page.workspace.undo()
     assert origin(page) == "measured"
-    seen = page.editor.correction
-    assert seen is not None
-    np.testing.assert_array_equal(seen.lattice.row, before.lattice.row)
-    np.testing.assert_array_equal(seen.lattice.column, before.lattice.column)
+    restored = page.editor.correction
+    assert restored is not None
+    np.testing.assert_array_equal(restored.lattice.row, before.lattice.row)
+    np.testing.assert_array_equal(restored.lattice.column, before.lattice.column)
     page.editor.choose_rows([5])
     assert page.editor.block()
-    kept = session.correction(0)
-    assert kept is not None
-    np.testing.assert_array_equal(kept.sited, before.sited)
+    stored = session.correction(0)
+    assert stored is not None
+    np.testing.assert_array_equal(stored.sited, before.sited)
     page.workspace.undo()
     assert origin(page) == "measured"
     assert unfitted == [[0], [0]]  # after the edits, never after undo
 
 
-def test_what_the_detector_found_is_no_start_while_the_frame_is_measured(
+def test_detected_rows_cannot_be_edited_during_a_fit(
     page: DotsPage,
     qtbot: QtBot,
     copy_sample: CopySample,
@@ -255,7 +258,7 @@ def test_what_the_detector_found_is_no_start_while_the_frame_is_measured(
         session.correct({0: start_correction(result.measurement)})
         assert len(list(session.measure_each([0]))) == 1
     session = show(page, qtbot, path, 0)
-    session.undo()  # what was measured before is not known in a session opened anew
+    session.undo()  # a newly opened session does not know the previous measurement
     page.workspace.changed.emit()
     qtbot.waitUntil(lambda: origin(page) == "found")
     assert unfitted == [[0]]
@@ -267,14 +270,14 @@ def test_what_the_detector_found_is_no_start_while_the_frame_is_measured(
     assert page.editor.block()
 
 
-def test_an_unmeasured_frame_shows_what_is_found_in_it(
+def test_unmeasured_frame_shows_detected_dots(
     page: DotsPage, qtbot: QtBot, copy_sample: CopySample, unfitted: list[list[int]]
 ) -> None:
     path = copy_sample("gtaw")
     session = show(page, qtbot, path, 4)
     assert origin(page) == "measured"
     count = len(page.editor.dots_px)
-    # Other settings: the dots are found anew, in the background, and the fewer are shown.
+    # With other settings, fewer dots are detected in the background and shown.
     page.dots_panel.numbers[1].edited.emit(40.0)
     assert session.settings.dots.band_pass.threshold == 40
     qtbot.waitUntil(lambda: page.editor.correction is not None)
@@ -285,7 +288,7 @@ def test_an_unmeasured_frame_shows_what_is_found_in_it(
     assert unfitted == []
 
 
-def test_buttons_are_of_use_when_what_they_need_is_chosen(
+def test_buttons_are_enabled_by_the_selection(
     page: DotsPage, qtbot: QtBot, copy_sample: CopySample, unfitted: list[list[int]]
 ) -> None:
     session = show(page, qtbot, copy_sample("gtaw"), 0)
@@ -311,11 +314,11 @@ def test_buttons_are_of_use_when_what_they_need_is_chosen(
     key(page, Qt.Key.Key_Escape)
     assert enabled() == always
 
-    # The keys still answer, and say what is lacking.
-    said: list[str] = []
-    page.workspace.notified.connect(lambda words, _: said.append(words))
+    # The keys still work, and report what is missing.
+    messages: list[str] = []
+    page.workspace.notified.connect(lambda words, _: messages.append(words))
     key(page, Qt.Key.Key_Delete)
-    assert len(said) == 1
+    assert len(messages) == 1
     assert session.correction(0) is None
 
     click(page, editor.dots_px[10])
@@ -323,10 +326,10 @@ def test_buttons_are_of_use_when_what_they_need_is_chosen(
     panel.buttons["Delete"].click()
     assert len(editor.selection) == 0
     assert enabled() == always | {"Back to automatic"}
-    assert page.view.hasFocus()  # not another button
+    assert page.view.hasFocus()  # and not another button
 
 
-def test_a_read_only_frame_is_looked_at_and_not_edited(
+def test_read_only_frame_cannot_be_edited(
     page: DotsPage, qtbot: QtBot, copy_sample: CopySample
 ) -> None:
     path = copy_sample("gtaw")
@@ -343,7 +346,7 @@ def test_a_read_only_frame_is_looked_at_and_not_edited(
     assert not page.dots_panel.method.editor.isEnabled()
 
 
-def test_clicks_boxes_drags_and_keys(
+def test_editing_by_clicks_boxes_drags_and_keys(
     page: DotsPage, qtbot: QtBot, copy_sample: CopySample, unfitted: list[list[int]]
 ) -> None:
     session = show(page, qtbot, copy_sample("blocked_rows"), 0)
@@ -360,10 +363,10 @@ def test_clicks_boxes_drags_and_keys(
     assert len(session.history) == steps + 1
     moved = editor.dots_px[11] - start[11]
     assert moved == pytest.approx((6, -4), abs=0.7)
-    kept = session.correction(0)
-    assert kept is not None
-    np.testing.assert_array_equal(kept.dots.image_px, editor.dots_px)
-    assert kept.manual.tolist() == [n == 11 for n in range(len(start))]
+    correction = session.correction(0)
+    assert correction is not None
+    np.testing.assert_array_equal(correction.dots.image_px, editor.dots_px)
+    assert correction.manual.tolist() == [n == 11 for n in range(len(start))]
 
     key(page, Qt.Key.Key_Right)
     key(page, Qt.Key.Key_Up, SHIFT)
@@ -383,26 +386,26 @@ def test_clicks_boxes_drags_and_keys(
     assert unfitted[0] == [0]
 
 
-def test_a_refused_edit_says_why_and_changes_nothing(
+def test_rejected_edit_is_reported_and_changes_nothing(
     page: DotsPage, qtbot: QtBot, copy_sample: CopySample, unfitted: list[list[int]]
 ) -> None:
     session = show(page, qtbot, copy_sample("blocked_rows"), 0)
-    steps, said = len(session.history), []
-    page.workspace.notified.connect(lambda words, problem: said.append((words, problem)))
+    steps, messages = len(session.history), []
+    page.workspace.notified.connect(lambda words, problem: messages.append((words, problem)))
     for which in (Qt.Key.Key_Delete, Qt.Key.Key_M, Qt.Key.Key_S, Qt.Key.Key_B, Qt.Key.Key_N):
         key(page, which)
     lattice = page.editor.correction.lattice if page.editor.correction else None
     assert lattice is not None
     page.editor.choose_rows([4])
-    page.dots_panel.row.edited.emit(5)  # where other dots are
-    assert [problem for _, problem in said] == [True] * 6
-    assert "no dot is selected" in said[0][0]
-    assert "already assigned" in said[-1][0]
+    page.dots_panel.row.edited.emit(5)  # occupied by other dots
+    assert [problem for _, problem in messages] == [True] * 6
+    assert "no dot is selected" in messages[0][0]
+    assert "already assigned" in messages[-1][0]
     assert len(session.history) == steps
     assert unfitted == []
 
 
-def test_rows_are_edited_from_the_list_by_keyboard(
+def test_rows_are_edited_in_the_list_by_keyboard(
     page: DotsPage, qtbot: QtBot, copy_sample: CopySample, unfitted: list[list[int]]
 ) -> None:
     session = show(page, qtbot, copy_sample("blocked_rows"), 0)
@@ -426,9 +429,9 @@ def test_rows_are_edited_from_the_list_by_keyboard(
     QTest.keyClick(rows, Qt.Key.Key_Right, CONTROL)
     after = session.correction(0)
     assert after is not None
-    own = before.lattice.row == top - 1
-    np.testing.assert_array_equal(after.lattice.column[own], before.lattice.column[own] + 1)
-    np.testing.assert_array_equal(after.lattice.column[~own], before.lattice.column[~own])
+    in_row = before.lattice.row == top - 1
+    np.testing.assert_array_equal(after.lattice.column[in_row], before.lattice.column[in_row] + 1)
+    np.testing.assert_array_equal(after.lattice.column[~in_row], before.lattice.column[~in_row])
     assert [change.label for change in session.history][-2:] == [
         f"block row {top - 1}, frame 0",
         f"shift row {top - 1} right, frame 0",
@@ -443,7 +446,7 @@ def test_split_merge_and_reference(
     before = editor.correction
     assert before is not None
     assert before.lattice.reference is None
-    # The README of the sample says where it is on the picture, and which site that is.
+    # The README of the sample states its position in the picture and its site.
     page.pointer = (278.0, 281.0)
     key(page, Qt.Key.Key_R)
     assert editor.correction is not None
@@ -460,7 +463,7 @@ def test_split_merge_and_reference(
     assert editor.correction.lattice.reference == (6, 8)
 
 
-def test_a_button_asks_for_the_click_it_needs(
+def test_reference_button_waits_for_a_click(
     page: DotsPage, qtbot: QtBot, copy_sample: CopySample, unfitted: list[list[int]]
 ) -> None:
     session = show(page, qtbot, copy_sample("blocked_rows"), 3)
@@ -474,25 +477,25 @@ def test_a_button_asks_for_the_click_it_needs(
     assert panel.chosen.text().startswith("Nothing selected")
     button.click()
     click(page, place)
-    kept = session.correction(3)
-    assert kept is not None
-    assert kept.lattice.reference == (6, 8)  # as blocked_rows/README.md has it
+    correction = session.correction(3)
+    assert correction is not None
+    assert correction.lattice.reference == (6, 8)  # as stated in blocked_rows/README.md
     assert panel.chosen.text().startswith("Nothing selected")
     assert "press Reference" not in panel.seen.text()
     assert button.mapTo(page.panel, QPoint()) == left
     assert unfitted == [[3]]
 
 
-def test_a_correction_is_carried_on_and_taken_back(
+def test_correction_is_carried_to_later_frames_and_undone(
     page: DotsPage, qtbot: QtBot, copy_sample: CopySample, unfitted: list[list[int]]
 ) -> None:
     session = show(page, qtbot, copy_sample("blocked_rows"), 2)
-    said: list[str] = []
-    page.workspace.notified.connect(lambda words, problem: said.append(words))
+    messages: list[str] = []
+    page.workspace.notified.connect(lambda words, problem: messages.append(words))
     earlier = session.correction(2)
     key(page, Qt.Key.Key_Return, CONTROL)
-    qtbot.waitUntil(lambda: bool(said))
-    assert "Carried on over 3 frames, up to frame 5" in said[0]
+    qtbot.waitUntil(lambda: bool(messages))
+    assert "Carried on over 3 frames, up to frame 5" in messages[0]
     assert session.corrected_frames().tolist() == [2, 3, 4, 5]
     assert unfitted == [[3, 4, 5]]
     for frame in (3, 4, 5):
@@ -511,7 +514,7 @@ def test_a_correction_is_carried_on_and_taken_back(
     np.testing.assert_array_equal(again.lattice.row, earlier.lattice.row)
 
 
-def test_carrying_on_keeps_what_was_done_when_it_is_cancelled(copy_sample: CopySample) -> None:
+def test_cancelled_carrying_keeps_finished_frames(copy_sample: CopySample) -> None:
     with Session.open(copy_sample("blocked_rows")) as session:
         control = Control()
 
@@ -526,7 +529,7 @@ def test_carrying_on_keeps_what_was_done_when_it_is_cancelled(copy_sample: CopyS
         assert "stopped before frame 5: it was cancelled" in carried.words
 
 
-def test_the_search_for_rows_is_chosen_on_the_page(
+def test_row_search_is_chosen_on_the_page(
     page: DotsPage, qtbot: QtBot, copy_sample: CopySample
 ) -> None:
     session = Session.open(copy_sample("gtaw"))
@@ -541,25 +544,25 @@ def test_the_search_for_rows_is_chosen_on_the_page(
     assert page.dots_panel.row_search.value() == "grow"
 
 
-def test_what_is_shown_without_a_window(copy_sample: CopySample) -> None:
+def test_presenter_of_a_session(copy_sample: CopySample) -> None:
     with Session.open(copy_sample("blocked_rows")) as session:
-        seen = presenter.shown(session, 0, None)
-        assert seen.origin == "measured"
+        shown = presenter.shown(session, 0, None)
+        assert shown.origin == "measured"
         assert presenter.wanted(session, 0) is None
-        assert seen.correction is not None
-        # Computed dots lie on the captured ones: the sample's surface fits.
-        near = np.linalg.norm(
-            seen.computed_px[:, None] - seen.correction.dots.image_px[None], axis=-1
+        assert shown.correction is not None
+        # Computed dots agree with the captured ones, because the surface fits.
+        distances = np.linalg.norm(
+            shown.computed_px[:, None] - shown.correction.dots.image_px[None], axis=-1
         ).min(axis=1)
-        assert len(near) > 90
-        assert near.max() < 1.0
-        assert presenter.sentence(seen).startswith("As measured: 99 dots in 9 rows")
-        lines = presenter.row_lines(seen.correction)
+        assert len(distances) > 90
+        assert distances.max() < 1.0
+        assert presenter.sentence(shown).startswith("As measured: 99 dots in 9 rows")
+        lines = presenter.row_lines(shown.correction)
         assert [line.row for line in lines if line.row] == list(range(9, 0, -1))
         assert sum(line.dots for line in lines) == 99
         assert [line.note for line in lines if line.row == 6] == ["reference 8"]
         assert not presenter.needs_fit(presenter.shown(session, 0, None))
-        session.correct({0: shift_row(seen.correction, 4, 1)})
+        session.correct({0: shift_row(shown.correction, 4, 1)})
         assert presenter.needs_fit(presenter.shown(session, 0, None))
         assert presenter.shown(session, 0, None).origin == "corrected"
         session.correct({0: None})
@@ -567,7 +570,7 @@ def test_what_is_shown_without_a_window(copy_sample: CopySample) -> None:
         assert not presenter.needs_fit(presenter.shown(session, 0, None))
 
 
-def test_figures_before_and_after() -> None:
+def test_comparison_of_figures_before_and_after() -> None:
     before = presenter.Figures("no-match", 0, *[float("nan")] * 4)
     after = presenter.Figures("ok", 94, 0.1234, 0.5, 0.25, 0.006)
     rows = {row.name: row.value for row in presenter.compared(before, after)}
@@ -583,7 +586,7 @@ def test_figures_before_and_after() -> None:
     assert presenter.compared(None, after)[0].value == "ok"
 
 
-def test_frames_that_rush_by_show_their_own_dots(
+def test_fast_frame_changes_show_matching_dots(
     page: DotsPage, qtbot: QtBot, copy_sample: CopySample, unfitted: list[list[int]]
 ) -> None:
     path = copy_sample("gtaw")
@@ -598,13 +601,13 @@ def test_frames_that_rush_by_show_their_own_dots(
         assert page.seen is not None
         np.testing.assert_array_equal(page.view.picture, images[page.seen.frame])
     qtbot.waitUntil(lambda: page.seen is not None and page.seen.frame == numbers[-1])
-    # The session's results are by other settings, so the dots are looked for: once, at the end.
+    # The results have other settings, so dots are detected once, at the end.
     qtbot.waitUntil(lambda: origin(page) == "found")
     assert page.looking.found is not None
     assert page.looking.found.frame == numbers[-1]
 
 
-def test_a_damaged_result_is_told_and_the_dots_are_looked_for(
+def test_damaged_result_is_reported_and_dots_are_detected(
     page: DotsPage,
     qtbot: QtBot,
     copy_sample: CopySample,
@@ -626,7 +629,7 @@ def test_a_damaged_result_is_told_and_the_dots_are_looked_for(
     assert unfitted == [[1]]
 
 
-def test_arrow_keys_go_through_frames_until_a_dot_is_chosen(
+def test_arrow_keys_move_frames_until_a_dot_is_selected(
     window: MainWindow, qtbot: QtBot, copy_sample: CopySample, unfitted: list[list[int]]
 ) -> None:
     window.workspace.show(Session.open(copy_sample("gtaw")))
@@ -650,14 +653,14 @@ def test_arrow_keys_go_through_frames_until_a_dot_is_chosen(
     assert window.workspace.frame == 0
 
 
-def test_rings_grow_with_the_dots_and_the_reference_is_ringed(
+def test_rings_grow_with_the_zoom_and_mark_the_reference(
     page: DotsPage, qtbot: QtBot, copy_sample: CopySample, unfitted: list[list[int]]
 ) -> None:
     show(page, qtbot, copy_sample("gtaw"), 0)
     marks, ring = page.overlay._dots, page.overlay._reference
     size = marks.data["size"].max()
     assert ring.data["size"].tolist() == [2 * size]
-    # Row 6 is dark at column 8: the ring is amid its neighbours there.
+    # Row 6 has no dot at column 8: the ring is between its neighbours.
     assert page.editor.correction is not None
     lattice, place = page.editor.correction.lattice, page.editor.dots_px
     beside = place[(lattice.row == 6) & np.isin(lattice.column, [7, 9])]
@@ -672,7 +675,7 @@ def test_rings_grow_with_the_dots_and_the_reference_is_ringed(
     assert marks.isVisible()
 
 
-def test_edits_that_follow_each_other_at_once_all_stand(
+def test_rapid_edits_are_all_stored(
     window: MainWindow, qtbot: QtBot, copy_sample: CopySample, unfitted: list[list[int]]
 ) -> None:
     window.workspace.show(Session.open(copy_sample("gtaw")))
@@ -689,12 +692,12 @@ def test_edits_that_follow_each_other_at_once_all_stand(
     window.workspace.undo()
     page.editor.choose_rows([5])
     assert page.editor.block()
-    kept = session.correction(0)
-    assert kept is not None
-    assert kept.lattice.blocked_rows == before.lattice.blocked_rows | {2, 4, 5}
+    correction = session.correction(0)
+    assert correction is not None
+    assert correction.lattice.blocked_rows == before.lattice.blocked_rows | {2, 4, 5}
 
 
-def test_a_measured_frame_without_dots_says_so_and_why(
+def test_frame_without_dots_shows_the_reason(
     page: DotsPage, qtbot: QtBot, copy_sample: CopySample, tmp_path: Path
 ) -> None:
     dark, sample = tmp_path / "dark.npy", copy_sample("blocked_rows")

@@ -1,4 +1,4 @@
-"""Which dot, which site: on arrays alone."""
+"""Picking dots and lattice sites, on arrays alone."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from labapp.gui.pages.dots import picking
 
 
 def grid(rows: int = 5, columns: int = 6, missing: tuple[int, int] | None = None) -> Correction:
-    """A grid seen aslant and bowed: rows are 30 px apart, columns 20 px."""
+    """A slanted and curved grid: rows are 30 px apart, columns 20 px."""
     sites = [(k, t) for k in range(1, rows + 1) for t in range(1, columns + 1) if (k, t) != missing]
     k, t = np.array(sites).T
     u = 100 + 20.0 * t + 3 * k
@@ -21,7 +21,7 @@ def grid(rows: int = 5, columns: int = 6, missing: tuple[int, int] | None = None
     return Correction.of(Dots(u, v, one, one, 2 * one, 100 * one, 30 * one), Lattice(k, t))
 
 
-def test_the_nearest_dot_is_meant_if_it_is_near_enough() -> None:
+def test_nearest_dot_within_a_radius() -> None:
     dots = np.array([[10.0, 10.0], [14.0, 10.0]])
     assert picking.nearest(dots, 11.9, 10, 5) == 0
     assert picking.nearest(dots, 12.1, 10, 5) == 1
@@ -29,14 +29,14 @@ def test_the_nearest_dot_is_meant_if_it_is_near_enough() -> None:
     assert picking.nearest(np.zeros((0, 2)), 0, 0, 5) is None
 
 
-def test_a_box_may_be_drawn_from_any_corner() -> None:
+def test_box_can_start_at_any_corner() -> None:
     dots = np.array([[1.0, 1.0], [5.0, 5.0], [9.0, 2.0]])
     assert picking.in_box(dots, (6, 6), (0, 0)).tolist() == [0, 1]
     assert picking.in_box(dots, (5, 6), (9, 2)).tolist() == [1, 2]
     assert picking.in_box(dots, (20, 20), (30, 30)).tolist() == []
 
 
-def test_dots_are_joined_along_rows_over_holes_and_along_columns_to_the_next_row() -> None:
+def test_dots_are_joined_along_rows_and_columns() -> None:
     row = np.array([1, 1, 1, 2, 2, 0, 3])
     column = np.array([1, 2, 4, 1, 4, 2, 2])
     along_rows, along_columns = picking.joints(row, column)
@@ -46,7 +46,7 @@ def test_dots_are_joined_along_rows_over_holes_and_along_columns_to_the_next_row
         assert none.shape == (0, 2)
 
 
-def test_a_row_is_named_at_its_leftmost_dot() -> None:
+def test_row_number_is_at_the_leftmost_dot() -> None:
     correction = grid()
     ends = picking.row_ends(correction.lattice.row, correction.dots.image_px)
     assert [row for row, _ in ends] == [1, 2, 3, 4, 5]
@@ -54,24 +54,26 @@ def test_a_row_is_named_at_its_leftmost_dot() -> None:
 
 
 @pytest.mark.parametrize("site", [(3, 3), (1, 1), (5, 6), (2, 6)])
-def test_the_neighbours_of_a_hole_tell_its_site_and_its_place(site: tuple[int, int]) -> None:
-    whole = grid()
-    own = np.flatnonzero((whole.lattice.row == site[0]) & (whole.lattice.column == site[1]))[0]
-    place = whole.dots.image_px[own]
-    holed = grid(missing=site)
-    found = picking.site_at(holed, *place)
-    assert found is not None
-    assert found[0] == site
-    assert found[1] < 0.25
-    guessed = picking.site_px(holed, site)
-    assert guessed is not None
-    assert np.hypot(*(guessed - place)) < 6
-    lit = picking.site_px(whole, site)
-    assert lit is not None
-    np.testing.assert_array_equal(lit, place)
+def test_neighbours_of_a_missing_dot_give_its_site_and_position(site: tuple[int, int]) -> None:
+    complete = grid()
+    dot = np.flatnonzero((complete.lattice.row == site[0]) & (complete.lattice.column == site[1]))[
+        0
+    ]
+    place = complete.dots.image_px[dot]
+    incomplete = grid(missing=site)
+    nearest = picking.site_at(incomplete, *place)
+    assert nearest is not None
+    assert nearest[0] == site
+    assert nearest[1] < 0.25
+    estimate = picking.site_px(incomplete, site)
+    assert estimate is not None
+    assert np.hypot(*(estimate - place)) < 6
+    existing = picking.site_px(complete, site)
+    assert existing is not None
+    np.testing.assert_array_equal(existing, place)
 
 
-def test_without_rows_there_are_no_sites() -> None:
+def test_dots_without_rows_have_no_sites() -> None:
     dots = grid().dots
     bare = Correction.of(dots, None)
     assert picking.site_at(bare, 150, 200) is None
@@ -96,7 +98,7 @@ def test_dots_are_numbered_by_their_neighbours() -> None:
     assert numbered.manual[lost].all()
 
 
-def test_a_dot_between_sites_is_not_numbered() -> None:
+def test_dot_between_sites_is_not_numbered() -> None:
     correction = grid()
     u = correction.dots.u_px.copy()
     u[8] += 10

@@ -1,4 +1,4 @@
-"""Export: what would be written, why not, and that what is written is the session's export."""
+"""The export page: its plan, obstacles, and agreement with the export of the session."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def gtaw(copy_sample) -> Path:
     return copy_sample("gtaw")
 
 
-def test_the_usual_ticks_are_the_usual_export() -> None:
+def test_default_choice_is_the_default_export() -> None:
     assert ExportRequest().choice() == ExportChoice()
     keys = {item.key for _, items in groups() for item in items}
     everything = ExportRequest(ticked=frozenset(keys)).choice()
@@ -52,9 +52,7 @@ def test_the_usual_ticks_are_the_usual_export() -> None:
 
 
 @pytest.mark.parametrize("suffix", ["png", "jpg", "tif"])
-def test_pictures_of_frames_have_the_format_that_is_chosen(
-    gtaw: Path, tmp_path: Path, suffix: str
-) -> None:
+def test_pictures_of_frames_have_the_chosen_format(gtaw: Path, tmp_path: Path, suffix: str) -> None:
     request = ExportRequest(ticked=frozenset({"pictures:frames"}), picture_format=suffix)
     with Session.open(gtaw) as session:
         assert f"frame_NNNNNN.{suffix} (30 files)" in plan(session, request, 0).files
@@ -67,12 +65,12 @@ def test_pictures_of_frames_have_the_format_that_is_chosen(
     assert picture.size < 1_000_000 or suffix == "tif"
 
 
-def test_an_unknown_format_of_pictures_is_refused() -> None:
+def test_unknown_picture_format_is_rejected() -> None:
     with pytest.raises(InputError, match="picture_format"):
         ExportChoice(picture_format="bmp")
 
 
-def test_what_would_be_written_of_which_frames(gtaw: Path) -> None:
+def test_plan_lists_files_and_frames(gtaw: Path) -> None:
     with Session.open(gtaw) as session:
         every = plan(session, ExportRequest(), 3)
         assert len(every.frames) == 30
@@ -94,12 +92,12 @@ def test_what_would_be_written_of_which_frames(gtaw: Path) -> None:
         assert schemes(session) == (("", "fit (as in the settings)"),)
 
 
-def test_frames_without_a_surface_are_told_and_the_recording_missed(copy_sample) -> None:
+def test_plan_reports_missing_surfaces_and_recording(copy_sample) -> None:
     path = copy_sample("blocked_rows")
     with Session.open(path) as session:
-        made = plan(session, ExportRequest(), 0)
-        assert made.notes[1:] == ("3 frames without a surface: in the tables with the reason.",)
-        assert "surface_NNNNNN.stl (3 files)" in made.files
+        planned = plan(session, ExportRequest(), 0)
+        assert planned.notes[1:] == ("3 frames without a surface: in the tables with the reason.",)
+        assert "surface_NNNNNN.stl (3 files)" in planned.files
     (path.parent / "recording.mkv").unlink()
     with Session.open(path) as session:
         assert plan(session, ExportRequest(), 0).why_not == ""
@@ -107,26 +105,26 @@ def test_frames_without_a_surface_are_told_and_the_recording_missed(copy_sample)
         assert "recording.mkv is missing" in plan(session, pictures, 0).why_not
 
 
-def test_what_no_longer_stands_is_explained_and_can_be_measured(gtaw: Path) -> None:
+def test_plan_explains_outdated_frames_and_lists_them(gtaw: Path) -> None:
     with Session.open(gtaw) as session:
         session.update_setup({"laser": {"distance_mm": 32.0}})
-        made = plan(session, ExportRequest(which="part", first=0, last=4), 0)
-        assert made.why_not == (
+        planned = plan(session, ExportRequest(which="part", first=0, last=4), 0)
+        assert planned.why_not == (
             "5 frames out of date, because the rig or a calibration was changed. "
             "Measure again, or undo the change."
         )
-        assert made.again.tolist() == [0, 1, 2, 3, 4]
+        assert planned.again.tolist() == [0, 1, 2, 3, 4]
         session.undo()
         session.set_settings(replace(session.settings, scheme="ers"))
-        made = plan(session, ExportRequest(which="view"), 7)
-        assert made.again.tolist() == [7]
+        planned = plan(session, ExportRequest(which="view"), 7)
+        assert planned.again.tolist() == [7]
         assert schemes(session) == (("", "ERS (as in the settings)"), ("fit", "fit"))
         other = plan(session, ExportRequest(scheme="fit"), 0)
         assert (len(other.frames), other.why_not) == (30, "")
         assert len(other.again) == 0
 
 
-def test_somebody_s_own_folder_is_not_proposed(gtaw: Path, tmp_path: Path) -> None:
+def test_folder_with_other_files_is_not_proposed(gtaw: Path, tmp_path: Path) -> None:
     with Session.open(gtaw, read_only=True) as session:
         assert proposed_folder(session) == gtaw.parent / "gtaw-results"
         empty = tmp_path / "empty"
@@ -160,7 +158,7 @@ def session_of(page: ExportPage) -> Session:
     return page.workspace.session
 
 
-def test_the_button_writes_what_a_script_would(
+def test_export_button_equals_the_export_of_a_script(
     page: ExportPage, qtbot: QtBot, tmp_path: Path
 ) -> None:
     page.workspace.show_frame(6)
@@ -183,21 +181,25 @@ def test_the_button_writes_what_a_script_would(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("spacing_mm", [0.1, 0.05])
-def test_the_size_is_estimated_within_a_third(
+def test_size_is_estimated_within_a_third(
     page: ExportPage, tmp_path: Path, spacing_mm: float
 ) -> None:
     session = session_of(page)
     keys = {key for _, items in groups() for key in (item.key for item in items)}
     ticked = frozenset(key for key in keys if not key.startswith("pictures") and key != "report")
     request = ExportRequest(ticked=ticked, which="part", last=2, spacing_mm=spacing_mm)
-    made = plan(session, request, 0)
+    planned = plan(session, request, 0)
     frame_px = session.recording.rows * session.recording.columns
-    about = estimated_bytes(request, len(made.frames), made.surfaces, made.area_mm2, frame_px)
-    files = write(session, request, made.frames.tolist(), tmp_path / "out", lambda *_: None).files
-    assert sum(file.size for file in files) == pytest.approx(about, rel=0.33)
+    estimate = estimated_bytes(
+        request, len(planned.frames), planned.surfaces, planned.area_mm2, frame_px
+    )
+    files = write(
+        session, request, planned.frames.tolist(), tmp_path / "out", lambda *_: None
+    ).files
+    assert sum(file.size for file in files) == pytest.approx(estimate, rel=0.33)
 
 
-def test_all_are_selected_or_none(page: ExportPage) -> None:
+def test_select_all_and_none(page: ExportPage) -> None:
     (every,) = [b for b in page.findChildren(QAbstractButton) if b.text() == "Select all"]
     (none,) = [b for b in page.findChildren(QAbstractButton) if b.text() == "Select none"]
     every.click()
@@ -207,20 +209,20 @@ def test_all_are_selected_or_none(page: ExportPage) -> None:
     assert not page.export_button.isEnabled()
 
 
-def test_a_cancelled_export_leaves_nothing(
+def test_cancelled_export_leaves_no_files(
     page: ExportPage, qtbot: QtBot, tmp_path: Path, monkeypatch
 ) -> None:
     folder = tmp_path / "out"
     page.folder.set_value(str(folder))
     original = Session.export
 
-    def cancelled_midway(session: Session, *given, progress, **named):
-        def on(done: int, total: int) -> None:
+    def cancelled_midway(session: Session, *args, progress, **kwargs):
+        def cancel_at_2(done: int, total: int) -> None:
             if done == 2 and page._writing is not None:
                 page._writing.cancel()
             progress(done, total)
 
-        return original(session, *given, progress=on, **named)
+        return original(session, *args, progress=cancel_at_2, **kwargs)
 
     monkeypatch.setattr(Session, "export", cancelled_midway)
     page.export()
@@ -231,22 +233,22 @@ def test_a_cancelled_export_leaves_nothing(
     assert page.export_button.isEnabled()
 
 
-def test_a_folder_of_somebody_s_is_refused_in_words(
+def test_folder_with_other_files_is_rejected(
     page: ExportPage, qtbot: QtBot, tmp_path: Path
 ) -> None:
-    said: list[tuple[str, bool]] = []
-    page.workspace.notified.connect(lambda words, problem: said.append((words, problem)))
+    messages: list[tuple[str, bool]] = []
+    page.workspace.notified.connect(lambda words, problem: messages.append((words, problem)))
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").write_text("mine")
     page.folder.set_value(str(tmp_path / "mine"))
     page.export()
-    qtbot.waitUntil(lambda: bool(said))
-    assert said[0][1]
-    assert "mine" in said[0][0]
+    qtbot.waitUntil(lambda: bool(messages))
+    assert messages[0][1]
+    assert "mine" in messages[0][0]
     assert [path.name for path in (tmp_path / "mine").iterdir()] == ["notes.txt"]
 
 
-def test_the_button_is_greyed_out_with_the_reason(page: ExportPage) -> None:
+def test_export_button_is_disabled_with_the_reason(page: ExportPage) -> None:
     page.workspace.attempt(lambda session: session.update_setup({"laser": {"distance_mm": 32.0}}))
     assert not page.export_button.isEnabled()
     assert "out of date" in page.answer.text()
@@ -261,14 +263,14 @@ def test_the_button_is_greyed_out_with_the_reason(page: ExportPage) -> None:
     assert not page._boxes["solid"].isEnabled()
 
 
-def test_every_control_says_what_it_does(page: ExportPage) -> None:
+def test_every_control_has_a_tooltip(page: ExportPage) -> None:
     for widget in (page, page.panel):
         for button in widget.findChildren(QAbstractButton):
             if button.text():
                 assert button.toolTip(), button.text()
 
 
-def test_a_format_that_is_added_can_be_ticked(gtaw: Path, tmp_path: Path, monkeypatch) -> None:
+def test_added_format_can_be_selected(gtaw: Path, tmp_path: Path, monkeypatch) -> None:
     module = SimpleNamespace(xyz=lambda nodes: b"%d points" % len(nodes))
     monkeypatch.setitem(sys.modules, "labapp.export.toys", module)
     toy = SurfaceFormat(".xyz", "Points", "A toy, mm", "nodes", "toys:xyz")
@@ -279,12 +281,12 @@ def test_a_format_that_is_added_can_be_ticked(gtaw: Path, tmp_path: Path, monkey
     page = ExportPage(workspace)
     KEPT.extend((workspace, page))
     page.refresh()
-    points, whole = page._boxes["surfaces:xyz"], page._boxes["together:toy"]
-    assert (points.text(), points.toolTip(), whole.text()) == ("Points", "A toy, mm", "Toy")
+    points, run = page._boxes["surfaces:xyz"], page._boxes["together:toy"]
+    assert (points.text(), points.toolTip(), run.text()) == ("Points", "A toy, mm", "Toy")
     for box in page._boxes.values():
-        box.setChecked(box in (points, whole))
+        box.setChecked(box in (points, run))
     assert page.files.text().splitlines()[:2] == ["surface_NNNNNN.xyz (30 files)", "toy.bin"]
-    whole.setChecked(False)
+    run.setChecked(False)
     write(session_of(page), page.request, [3], tmp_path / "out", lambda done, total: None)
     assert (tmp_path / "out/surface_000003.xyz").read_bytes().endswith(b" points")
     workspace.close()

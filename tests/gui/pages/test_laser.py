@@ -1,4 +1,4 @@
-"""Laser: readings typed or dragged in a picture, what follows, and what is in use."""
+"""The laser page: readings typed or dragged in a picture, their result, and values in use."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.gui.conftest import KEPT
 CROSS = ((13.676,), (18.561,), (7.874,))
 
 
-def test_cells_become_readings() -> None:
+def test_cells_are_parsed_as_readings() -> None:
     cells = {(0, 0): "13,7", (1, 0): " 13.6", (0, 1): "18.5", (1, 1): "", (0, 2): "x", (1, 2): "-1"}
     readings = presenter.typed(cells, 10.0)
     assert readings.lengths_mm == ((13.7, 13.6), (18.5,), ())
@@ -33,32 +33,32 @@ def test_cells_become_readings() -> None:
     assert presenter.result(readings).why_not.startswith("l₃, reading 1")
 
 
-def test_what_is_missing_is_said() -> None:
+def test_missing_readings_are_reported() -> None:
     result = presenter.result(Readings(((13.7,), (), ())))
     assert result.found is None
     assert result.why_not == "Enter at least one reading of l₂, l₃"
     assert result.rows[0].value == 13.7
 
 
-def test_means_spreads_and_the_laser_are_shown() -> None:
+def test_means_spreads_and_laser_values_are_shown() -> None:
     lengths = ((13.6, 13.8), (18.5, 18.6), (7.87, 7.88))
     result = presenter.result(Readings(lengths))
-    found = calibrate_laser(*lengths)
+    calibration = calibrate_laser(*lengths)
     rows = {row.name: row for row in result.rows}
     assert rows["l₁, 2 readings"].value == pytest.approx(13.7)
     assert rows["l₁, 2 readings"].sigma == pytest.approx(np.std([13.6, 13.8], ddof=1))
-    assert rows["Projection angle"].value == found.angle_deg
-    assert rows["Distance"].sigma == found.distance_sigma_mm
-    assert rows["l₁ computed"].value == found.expected_l1_mm
+    assert rows["Projection angle"].value == calibration.angle_deg
+    assert rows["Distance"].sigma == calibration.distance_sigma_mm
+    assert rows["l₁ computed"].value == calibration.expected_l1_mm
 
 
-def test_lengths_that_contradict_each_other_are_said_in_the_pages_words() -> None:
+def test_contradicting_lengths_are_reported() -> None:
     doubted = presenter.result(Readings(((13.95, 13.95), *(2 * one for one in CROSS[1:]))))
     assert doubted.found is not None
     assert "l₁ = 13.95 differs" in doubted.warnings[0]
-    refused = presenter.result(Readings(((16.0, 16.0), *(2 * one for one in CROSS[1:]))))
-    assert refused.found is None
-    assert "l₁ = 16 contradicts l₂ and l₃" in refused.why_not
+    rejected = presenter.result(Readings(((16.0, 16.0), *(2 * one for one in CROSS[1:]))))
+    assert rejected.found is None
+    assert "l₁ = 16 contradicts l₂ and l₃" in rejected.why_not
 
 
 def cross_places(turn_deg: float, px_per_mm: float = 12.0) -> dict[str, tuple[float, float]]:
@@ -76,12 +76,12 @@ def cross_places(turn_deg: float, px_per_mm: float = 12.0) -> dict[str, tuple[fl
 
 
 @pytest.mark.parametrize("turn_deg", [0.0, 33.0, -120.0])
-def test_a_picture_gives_the_lengths_whichever_way_it_is_turned(turn_deg: float) -> None:
+def test_lengths_from_a_picture_do_not_depend_on_its_rotation(turn_deg: float) -> None:
     lengths = presenter.cross_lengths(cross_places(turn_deg), 25.0)
     assert lengths == pytest.approx([length for (length,) in CROSS])
 
 
-def test_points_that_make_no_cross_are_refused() -> None:
+def test_points_that_form_no_cross_are_rejected() -> None:
     places = cross_places(0.0)
     with pytest.raises(ValueError, match="scale"):
         presenter.cross_lengths(places | {SCALE[0]: places[SCALE[1]]}, 25.0)
@@ -91,7 +91,7 @@ def test_points_that_make_no_cross_are_refused() -> None:
         presenter.cross_lengths(places | {ENDS[3]: places[ENDS[2]]}, 25.0)
 
 
-def test_what_is_used_comes_back_with_its_readings(tmp_path: Path) -> None:
+def test_applied_calibration_is_stored_with_its_readings(tmp_path: Path) -> None:
     with Session.create(tmp_path / "new.labsession") as session:
         assert presenter.kept(session) is None
         assert [row.value for row in presenter.in_use(session)] == [None, None]
@@ -119,13 +119,13 @@ def test_what_is_used_comes_back_with_its_readings(tmp_path: Path) -> None:
 def page(qtbot: QtBot, copy_sample: Callable[[str], Path]) -> Iterator[LaserPage]:
     workspace = Workspace()
     workspace.show(Session.open(copy_sample("gtaw")))
-    made = LaserPage(workspace)
-    KEPT.extend([workspace, made, made.panel])
-    workspace.changed.connect(lambda: made.refresh() if workspace.session else None)
-    made.refresh()
-    made.show()
-    made.panel.show()
-    yield made
+    laser_page = LaserPage(workspace)
+    KEPT.extend([workspace, laser_page, laser_page.panel])
+    workspace.changed.connect(lambda: laser_page.refresh() if workspace.session else None)
+    laser_page.refresh()
+    laser_page.show()
+    laser_page.panel.show()
+    yield laser_page
     workspace.close()
 
 
@@ -151,7 +151,7 @@ def clear(page: LaserPage) -> None:
         item.setText("")
 
 
-def test_typed_readings_are_used_and_undone(qtbot: QtBot, page: LaserPage) -> None:
+def test_typed_readings_are_applied_and_undone(qtbot: QtBot, page: LaserPage) -> None:
     session = page.workspace.session
     assert session is not None
     before = session.setup.rig.laser, page.readings()
@@ -168,26 +168,26 @@ def test_typed_readings_are_used_and_undone(qtbot: QtBot, page: LaserPage) -> No
     assert (session.setup.rig.laser, page.readings()) == before
 
 
-def test_the_table_grows_and_delete_empties(qtbot: QtBot, page: LaserPage) -> None:
+def test_table_grows_and_delete_clears_cells(qtbot: QtBot, page: LaserPage) -> None:
     clear(page)
     rows = page.table.rowCount()
     fill(page, rows - 1, ("1", "2", "3"))
     assert page.table.rowCount() == rows + 1
-    # Said outright: by itself the command follows the modifier keys that were last seen pressed.
-    only_it = QItemSelectionModel.SelectionFlag.ClearAndSelect
-    page.table.setCurrentCell(rows - 1, 0, only_it)
+    # Explicit, because the default command depends on the last modifier keys.
+    select_only = QItemSelectionModel.SelectionFlag.ClearAndSelect
+    page.table.setCurrentCell(rows - 1, 0, select_only)
     qtbot.keyClick(page.table, Qt.Key.Key_Delete)
     assert page.readings().lengths_mm[0] == ()
 
 
-def test_a_refresh_keeps_what_is_being_typed(page: LaserPage) -> None:
+def test_refresh_keeps_typed_readings(page: LaserPage) -> None:
     clear(page)
     fill(page, 0, ("1", "", ""))
     page.refresh()
     assert page.readings().lengths_mm[0] == (1.0,)
 
 
-def test_lengths_from_a_picture_are_a_reading_and_the_picture_is_kept(
+def test_picture_gives_a_reading_and_is_stored(
     qtbot: QtBot, page: LaserPage, tmp_path: Path
 ) -> None:
     session = page.workspace.session
@@ -211,9 +211,9 @@ def test_lengths_from_a_picture_are_a_reading_and_the_picture_is_kept(
     np.testing.assert_array_equal(session.picture(calibration.picture_sha256), image)
 
 
-def test_a_picture_that_cannot_be_read_is_said(qtbot: QtBot, page: LaserPage, tmp_path) -> None:
+def test_unreadable_picture_is_reported(qtbot: QtBot, page: LaserPage, tmp_path) -> None:
     (tmp_path / "bad.png").write_bytes(b"no picture")
-    with qtbot.waitSignal(page.workspace.notified) as said:
+    with qtbot.waitSignal(page.workspace.notified) as signal:
         page.load_picture(tmp_path / "bad.png")
-    assert "bad.png" in said.args[0]
+    assert "bad.png" in signal.args[0]
     assert page.picture_view.picture is None

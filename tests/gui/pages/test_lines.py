@@ -1,4 +1,4 @@
-"""A hand that corrects the lines of a frame on the page of the pattern."""
+"""Correcting the lines of a frame by hand on the pattern page."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ SHIFT, NONE = Qt.KeyboardModifier.ShiftModifier, Qt.KeyboardModifier.NoModifier
 
 
 def arcs() -> np.ndarray:
-    """Three arched lines, 60 px apart, the lowest at v = 400 where it is highest."""
+    """Three arched lines, 60 px apart; the lowest has its apex at v = 400."""
     v, u = np.mgrid[:640, :480].astype(float)
     light = 20 + np.random.default_rng(1).normal(size=v.shape)
     for k in range(3):
-        off = v - (400 - 60 * k) - (u - 240) ** 2 / 900
-        light += 70 * np.exp(-(off**2) / 18) * (abs(u - 240) < 150)
+        distance = v - (400 - 60 * k) - (u - 240) ** 2 / 900
+        light += 70 * np.exp(-(distance**2) / 18) * (abs(u - 240) < 150)
     return np.clip(light, 0, 255).astype(np.uint8)
 
 
@@ -46,26 +46,26 @@ def page(qtbot: QtBot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Itera
         session.import_recording(tmp_path / "frames")
         for _ in session.measure():
             pass
-    space = Workspace()
-    page = DotsPage(space)
-    space.changed.connect(lambda: page.refresh() if space.session else None)
-    beside = QWidget()
-    layout = QHBoxLayout(beside)
+    workspace = Workspace()
+    page = DotsPage(workspace)
+    workspace.changed.connect(lambda: page.refresh() if workspace.session else None)
+    container = QWidget()
+    layout = QHBoxLayout(container)
     layout.addWidget(page, 1)
     layout.addWidget(page.panel)
-    KEPT.append(beside)
-    beside.resize(1300, 900)
-    beside.show()
-    beside.activateWindow()
-    qtbot.waitExposed(beside)
-    space.show(Session.open(tmp_path / "lines.labsession"))
+    KEPT.append(container)
+    container.resize(1300, 900)
+    container.show()
+    container.activateWindow()
+    qtbot.waitExposed(container)
+    workspace.show(Session.open(tmp_path / "lines.labsession"))
     page.refresh()
     qtbot.waitUntil(lambda: len(page.lines_hand.state.lines) == 3)
     let_draw()
     page.view.setFocus()
     yield page
     page.leave()
-    space.close()
+    workspace.close()
 
 
 def click(page: DotsPage, u: float, v: float, modifier: Qt.KeyboardModifier = NONE) -> None:
@@ -84,8 +84,8 @@ def lines(page: DotsPage) -> list[str]:
     return [line.name for line in page.lines_hand.state.lines]
 
 
-def test_cut_join_number_and_delete_are_each_a_step_of_undo(page: DotsPage) -> None:
-    session, space = page.session, page.workspace
+def test_cut_join_number_and_delete_can_each_be_undone(page: DotsPage) -> None:
+    session, workspace = page.session, page.workspace
     assert session.corrected_frames().tolist() == []
     press(page, Qt.Key.Key_C)
     click(page, 240, 340)
@@ -107,12 +107,12 @@ def test_cut_join_number_and_delete_are_each_a_step_of_undo(page: DotsPage) -> N
         *("cut a line", "join two lines", "number a line", "delete lines")
     ]
     for count in (3, 3, 4, 3):
-        space.undo()
+        workspace.undo()
         assert len(lines(page)) == count
     assert session.corrected_frames().tolist() == []
 
 
-def test_what_is_not_chosen_greys_out_what_needs_it(page: DotsPage) -> None:
+def test_buttons_without_their_selection_are_disabled(page: DotsPage) -> None:
     buttons = page.lines_panel.buttons
     assert buttons["Cut"].isEnabled()
     assert not buttons["Join"].isEnabled()
@@ -123,7 +123,7 @@ def test_what_is_not_chosen_greys_out_what_needs_it(page: DotsPage) -> None:
     assert not buttons["Join"].isEnabled()
 
 
-def test_a_corrected_frame_is_measured_as_it_was_corrected(page: DotsPage) -> None:
+def test_corrected_frame_is_measured_with_its_correction(page: DotsPage) -> None:
     session = page.session
     click(page, 240, 280)
     press(page, Qt.Key.Key_Delete)
@@ -140,7 +140,7 @@ def test_a_corrected_frame_is_measured_as_it_was_corrected(page: DotsPage) -> No
     assert session.corrected_frames().tolist() == []
 
 
-def test_no_two_lines_of_a_frame_have_the_same_number(tmp_path: Path) -> None:
+def test_lines_of_a_frame_have_unique_numbers(tmp_path: Path) -> None:
     sample = SAMPLES / "five_lines"
     shutil.copytree(sample, tmp_path / "five_lines")
     with Session.open(tmp_path / "five_lines" / "five_lines.labsession") as session:

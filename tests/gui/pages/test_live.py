@@ -1,4 +1,4 @@
-"""A camera on the recording page: watched, set, recorded from, failing."""
+"""A live camera on the recording page: display, settings, recording, faults."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ SHAPE = (48, 64)
 
 
 def numbered(k: int) -> GreyImage:
-    """Frame k: its number in the first four pixels, over a pattern that is dark and bright."""
+    """Frame k: its number in the first four pixels, over a pattern from dark to bright."""
     image = np.add.outer(np.arange(SHAPE[0]), 2 * np.arange(SHAPE[1])).astype(np.uint8)
     image[0, :4] = np.frombuffer(np.uint32(k).tobytes(), np.uint8)
     return image
@@ -61,23 +61,23 @@ def number_in(image: GreyImage) -> int:
 @pytest.fixture
 def live(tmp_path: Path) -> Iterator[Live]:
     names = iter(range(100))
-    made = Live(
+    camera = Live(
         "test camera",
         lambda: tmp_path / f"run{next(names)}.nut",
         Plan(before_s=0.2),
         CameraSettings(rate_hz=200.0),
         Settings(),
     )
-    yield made
-    made.close()
+    yield camera
+    camera.close()
 
 
-def test_what_is_recorded_is_what_the_camera_gave(live: Live):
+def test_recording_has_the_frames_of_the_camera(live: Live):
     device = SimulatedDevice("test", numbered)
     live.open(device.open)
     assert live.feed is not None
     wait_until(lambda: live.feed.counts.frames > 60)
-    seen = live.feed.counts.frames
+    frames_before = live.feed.counts.frames
     live.trigger()
     assert live.running is live.takes[0]
     live.mark()
@@ -92,7 +92,7 @@ def test_what_is_recorded_is_what_the_camera_gave(live: Live):
     assert len(numbers) == take.frames
     assert numbers == list(range(numbers[0], numbers[0] + len(numbers)))
     # 0.2 s at 200 frames/s are from before the trigger.
-    assert numbers[0] < seen - 20
+    assert numbers[0] < frames_before - 20
     for number, image in zip(numbers, images, strict=True):
         assert np.array_equal(image, numbered(number))
     assert "marked by hand" in take.notes.read_text()
@@ -100,7 +100,7 @@ def test_what_is_recorded_is_what_the_camera_gave(live: Live):
     assert live.ended_takes() == []
 
 
-def test_the_newest_frame_is_given_once_and_judged(live: Live):
+def test_newest_frame_is_returned_once_and_assessed(live: Live):
     gate = threading.Event()
 
     def picture(k: int) -> GreyImage:
@@ -117,15 +117,15 @@ def test_the_newest_frame_is_given_once_and_judged(live: Live):
 
     wait_until(is_last)
     assert live.newest() is None
-    found = []
-    wait_until(lambda: bool(found.append(live.looked()) or found[-1]))
+    results = []
+    wait_until(lambda: bool(results.append(live.looked()) or results[-1]))
     gate.set()
-    assert found[-1].quality.exposure.verdict in ("no dots", "too dark", "good", "dots merge")
+    assert results[-1].quality.exposure.verdict in ("no dots", "too dark", "good", "dots merge")
     assert live.room_byte > 0
     assert "room for" in live.recording_text() or live.rate_hz() is None
 
 
-def test_unplugged_garbage_and_stalled_are_said_and_nothing_recorded_is_lost(live: Live):
+def test_camera_faults_are_reported_and_no_recorded_frame_is_lost(live: Live):
     device = SimulatedDevice("test", numbered, faults=Faults(garbage=0.1, dropped=0.05, seed=3))
     live.open(device.open)
     wait_until(lambda: live.feed.counts.frames > 20)
@@ -133,9 +133,9 @@ def test_unplugged_garbage_and_stalled_are_said_and_nothing_recorded_is_lost(liv
     device.unplug()
     wait_until(lambda: live.feed.state == "lost")
     assert live.state_text().startswith("▲ Not connected")
-    kept = live.takes[0].frames
+    recorded = live.takes[0].frames
     device.plug()
-    wait_until(lambda: live.feed.state == "running" and live.takes[0].frames > kept + 40)
+    wait_until(lambda: live.feed.state == "running" and live.takes[0].frames > recorded + 40)
     assert live.state_text().startswith("● Live")
     live.close()
     counts = live.feed.counts
@@ -143,27 +143,27 @@ def test_unplugged_garbage_and_stalled_are_said_and_nothing_recorded_is_lost(liv
     assert counts.broken > 0
     assert counts.dropped > 0
     assert "lost 1 time" in live.counts_text()
-    words = [str(event) for event in live.events()]
-    assert any("unplugged" in each for each in words)
-    assert any("it is back" in each for each in words)
-    assert any("incomplete" in each for each in words)
+    messages = [str(event) for event in live.events()]
+    assert any("unplugged" in each for each in messages)
+    assert any("it is back" in each for each in messages)
+    assert any("incomplete" in each for each in messages)
     with open_source(live.takes[0].path) as video:
         numbers = [number_in(frame.image) for frame in video]
     assert len(numbers) == live.takes[0].frames
     assert numbers == sorted(set(numbers))
 
 
-def test_one_that_is_closed_while_it_opens_leaves_nothing(live: Live):
-    device, begun, gate = SimulatedDevice("test", numbered), threading.Event(), threading.Event()
+def test_closing_while_opening_leaves_no_camera_open(live: Live):
+    device, started, gate = SimulatedDevice("test", numbered), threading.Event(), threading.Event()
 
     def slow():
-        begun.set()
+        started.set()
         gate.wait(PATIENCE_S)
         return device.open()
 
     opening = threading.Thread(target=live.open, args=(slow,))
     opening.start()
-    begun.wait(PATIENCE_S)
+    started.wait(PATIENCE_S)
     live.close()
     gate.set()
     opening.join()
@@ -173,7 +173,7 @@ def test_one_that_is_closed_while_it_opens_leaves_nothing(live: Live):
     assert live.takes == []
 
 
-def test_another_plan_holds_from_then_on(live: Live):
+def test_new_plan_applies_to_the_next_recording(live: Live):
     live.open(SimulatedDevice("test", numbered).open)
     live.set_plan(Plan(before_s=0, after_s=0.1, every=3))
     assert live.ring() == (0.0, "nothing before the trigger")
@@ -185,7 +185,7 @@ def test_another_plan_holds_from_then_on(live: Live):
     assert 4 <= len(numbers) <= 8
 
 
-def test_a_plan_of_while_it_records_holds_for_the_next_recording(live: Live):
+def test_plan_set_while_recording_applies_to_the_next_one(live: Live):
     live.open(SimulatedDevice("test", numbered).open)
     wait_until(lambda: live.ring()[0] > 0.9)
     live.trigger()
@@ -203,7 +203,7 @@ def test_a_plan_of_while_it_records_holds_for_the_next_recording(live: Live):
     assert steps == [{1}, {3}]
 
 
-def test_what_is_kept_for_before_a_trigger_is_what_is_there(live: Live):
+def test_ring_buffer_is_empty_after_a_trigger(live: Live):
     device = SimulatedDevice("test", numbered)
     live.set_plan(Plan(before_s=0.5, after_s=0.1))
     live.open(device.open)
@@ -213,7 +213,7 @@ def test_what_is_kept_for_before_a_trigger_is_what_is_there(live: Live):
     assert live.ring() == (0.0, "0.0 of 0.5 s")
 
 
-def test_frames_are_measured_where_the_set_up_is_complete(live: Live):
+def test_frames_are_measured_if_the_setup_is_complete(live: Live):
     assert live.watch is None
     assert figures(None)[0] == Figure("Width", "–", "")
     folder = SAMPLES / "gtaw"
@@ -226,13 +226,13 @@ def test_frames_are_measured_where_the_set_up_is_complete(live: Live):
         with_setup.open(device.open)
         watch = with_setup.watch
         assert watch is not None
-        found: list[LiveResult | None] = []
-        wait_until(lambda: bool(found.append(watch.newest()) or found[-1]))
-        # The first is measured by itself, those right after it from the one before.
-        wait_until(lambda: bool(found.append(watch.newest()) or found[-1]))
+        results: list[LiveResult | None] = []
+        wait_until(lambda: bool(results.append(watch.newest()) or results[-1]))
+        # The first frame is measured alone, the next with a prediction from the previous one.
+        wait_until(lambda: bool(results.append(watch.newest()) or results[-1]))
     finally:
         with_setup.close()
-    first, measured = [each for each in found if each is not None]
+    first, measured = [each for each in results if each is not None]
     assert (first.measurement.status, measured.measurement.status) == ("ok", "ok")
     assert (first.track_lost is None, measured.track_lost is None) == (False, True)
     assert measured.quality.reference
@@ -244,32 +244,32 @@ def test_frames_are_measured_where_the_set_up_is_complete(live: Live):
         assert abs(value - float(truth[name])) < max(5 * sigma, 0.02 * value), row
 
 
-def test_the_cameras_to_choose_from():
-    found = [CameraInfo("uvc:0", "Microscope", "USB video")]
-    assert choices(found) == [
+def test_camera_choices():
+    cameras = [CameraInfo("uvc:0", "Microscope", "USB video")]
+    assert choices(cameras) == [
         ("uvc:0", "Microscope (USB video)"),
         (SIMULATED, "Simulated camera"),
     ]
 
 
-def test_the_simulated_camera_films_a_pool_on_the_session_s_bench(tmp_path: Path):
+def test_simulated_camera_shows_a_pool_on_the_bench_of_the_session(tmp_path: Path):
     with Session.create(tmp_path / "a.labsession") as session:
         assert simulated_pool(session) == f"{POOL}{BENCH}"
         setup = (SAMPLES / "gtaw" / "setup.toml").read_text("utf-8")
         session.set_setup(setup)
         assert simulated_pool(session) == f"{POOL}\n{setup}"
-    told: list[tuple[int, int]] = []
-    device = pool_camera(f"{POOL}{BENCH}", lambda *reached: told.append(reached))
-    assert told[-1][0] + 1 == told[-1][1] == len(told)
-    images = [device.picture(k) for k in range(2 * len(told))]
+    progress: list[tuple[int, int]] = []
+    device = pool_camera(f"{POOL}{BENCH}", lambda *args: progress.append(args))
+    assert progress[-1][0] + 1 == progress[-1][1] == len(progress)
+    images = [device.picture(k) for k in range(2 * len(progress))]
     assert images[0].shape == (640, 480)
-    assert np.array_equal(images[0], images[2 * len(told) - 2])
+    assert np.array_equal(images[0], images[2 * len(progress) - 2])
     steps = [np.abs(a.astype(float) - b).mean() for a, b in pairwise(images)]
     assert min(steps) > 0
-    # A camera that is three times as fast sees the pool swing no faster.
+    # With three times the frame rate, the pool oscillates at the same frequency.
     device.settings = replace(device.settings, rate_hz=3 * device.settings.rate_hz)
     faster = [device.picture(k) for k in range(3 * len(images))]
-    for k in (0, 5, 2 * len(told) - 1):
+    for k in (0, 5, 2 * len(progress) - 1):
         assert all(np.array_equal(each, images[k]) for each in faster[3 * k : 3 * k + 3])
 
 
@@ -305,11 +305,11 @@ def start(page: CapturePage, qtbot: QtBot) -> None:
     qtbot.waitUntil(lambda: page.live_view.updates > 2)
 
 
-def said_in(window: MainWindow) -> str:
+def log_of(window: MainWindow) -> str:
     return "\n".join(window.log_panel.texts())
 
 
-def test_start_record_and_import_by_mouse_and_keys(
+def test_start_record_and_import_by_mouse_and_keyboard(
     window: MainWindow, page: CapturePage, qtbot: QtBot
 ):
     hand, view = Hand(window), page.live_view
@@ -339,18 +339,18 @@ def test_start_record_and_import_by_mouse_and_keys(
     assert numbers == list(range(numbers[0], numbers[0] + take.frames))
     assert "marked by hand" in take.notes.read_text()
     assert view.is_live
-    # A second one is kept as a file.
+    # A second recording is stored as a file.
     hand.press(Qt.Key.Key_R, Qt.KeyboardModifier.ControlModifier)
     qtbot.waitUntil(lambda: view.live.running.frames > 5)
     hand.press(Qt.Key.Key_R, Qt.KeyboardModifier.ControlModifier)
-    qtbot.waitUntil(lambda: "Other recordings" in said_in(window))
+    qtbot.waitUntil(lambda: "Other recordings" in log_of(window))
     assert len(session.frames) == take.frames
     hand.button("Stop camera")
     qtbot.waitUntil(lambda: not window.workspace.tasks.active)
     qtbot.waitUntil(lambda: "of the session" in page.title.text())
     assert not view.bar.isVisible()
     assert view.start_button.isVisible()
-    # It goes into a session of its own, with this one's set-up.
+    # It is imported into a new session with the set-up of this one.
     second = session.path.with_name("second.labsession")
     hand.answer(second)
     hand.button("New session from this recording…")
@@ -358,12 +358,12 @@ def test_start_record_and_import_by_mouse_and_keys(
     qtbot.waitUntil(lambda: window.workspace.session.recording is not None)
     assert len(window.workspace.session.frames) > 5
     assert not page.kept.isVisible()
-    with Session.open(session.path) as former:
-        assert len(former.frames) == take.frames
-        assert former.problems() == []
+    with Session.open(session.path) as previous:
+        assert len(previous.frames) == take.frames
+        assert previous.problems() == []
 
 
-def test_large_figures_where_the_set_up_is_complete(
+def test_large_figures_are_shown_if_the_setup_is_complete(
     window: MainWindow, page: CapturePage, qtbot: QtBot, monkeypatch: pytest.MonkeyPatch
 ):
     with open_source(SAMPLES / "gtaw" / "recording.avi") as video:
@@ -371,20 +371,20 @@ def test_large_figures_where_the_set_up_is_complete(
     window.workspace.attempt(
         lambda session: session.set_setup((SAMPLES / "gtaw" / "setup.toml").read_text("utf-8"))
     )
-    film = SimulatedDevice("pool", lambda _: image, rate_hz=4)
-    monkeypatch.setattr(live_view, "pool_camera", lambda *_: film)
+    camera = SimulatedDevice("pool", lambda _: image, rate_hz=4)
+    monkeypatch.setattr(live_view, "pool_camera", lambda *_: camera)
     start(page, qtbot)
     view = page.live_view
     assert view.figures.isVisible()
-    shown = view.figures.findChildren(QLabel)
-    qtbot.waitUntil(lambda: "Height" in [each.text() for each in shown])
-    qtbot.waitUntil(lambda: any("±" in each.text() for each in shown))
-    assert {"Width", "Length", "Height", "mm"} <= {each.text() for each in shown}
+    labels = view.figures.findChildren(QLabel)
+    qtbot.waitUntil(lambda: "Height" in [each.text() for each in labels])
+    qtbot.waitUntil(lambda: any("±" in each.text() for each in labels))
+    assert {"Width", "Length", "Height", "mm"} <= {each.text() for each in labels}
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("wanted", [True, False])
-def test_what_was_recorded_is_measured_afterwards(
+def test_recording_is_measured_afterwards_if_requested(
     window: MainWindow,
     page: CapturePage,
     qtbot: QtBot,
@@ -396,8 +396,8 @@ def test_what_was_recorded_is_measured_afterwards(
     window.workspace.attempt(
         lambda session: session.set_setup((SAMPLES / "gtaw" / "setup.toml").read_text("utf-8"))
     )
-    film = SimulatedDevice("pool", lambda _: image, rate_hz=20)
-    monkeypatch.setattr(live_view, "pool_camera", lambda *_: film)
+    camera = SimulatedDevice("pool", lambda _: image, rate_hz=20)
+    monkeypatch.setattr(live_view, "pool_camera", lambda *_: camera)
     page.live_view.plan_fields.measured.setChecked(wanted)
     start(page, qtbot)
     hand, view, session = Hand(window), page.live_view, window.workspace.session
@@ -411,7 +411,7 @@ def test_what_was_recorded_is_measured_afterwards(
     assert set(session.overview().status) == ({"ok"} if wanted else {""})
 
 
-def test_space_plays_where_no_camera_is_live(window: MainWindow, copy_sample, qtbot: QtBot):
+def test_space_plays_without_a_live_camera(window: MainWindow, copy_sample, qtbot: QtBot):
     window.files.open(copy_sample("gtaw"))
     window.show_step("capture")
     window.page.setFocus()
@@ -421,7 +421,7 @@ def test_space_plays_where_no_camera_is_live(window: MainWindow, copy_sample, qt
     qtbot.waitUntil(lambda: not window.workspace.tasks.active)
 
 
-def test_settings_show_what_was_really_set(page: CapturePage, device, qtbot: QtBot):
+def test_settings_show_the_actual_values(page: CapturePage, device, qtbot: QtBot):
     view = page.live_view
     start(page, qtbot)
     assert view.camera_fields.fields["rate_hz"].value() == 100
@@ -437,24 +437,24 @@ def test_settings_show_what_was_really_set(page: CapturePage, device, qtbot: QtB
     assert view.live.plan.before_s == 0.5
 
 
-def test_faults_are_told_in_words(window: MainWindow, page: CapturePage, device, qtbot: QtBot):
+def test_camera_faults_are_reported(window: MainWindow, page: CapturePage, device, qtbot: QtBot):
     view = page.live_view
     start(page, qtbot)
     view.trigger()
     device.unplug()
     qtbot.waitUntil(lambda: view.bar.state.text().startswith("▲ Not connected"))
-    assert "unplugged. Trying to get it back" in said_in(window)
+    assert "unplugged. Trying to get it back" in log_of(window)
     device.plug()
     qtbot.waitUntil(lambda: view.bar.state.text().startswith("● Live"))
-    assert "it is back after" in said_in(window)
+    assert "it is back after" in log_of(window)
     device.faults = Faults(garbage=1.0)
-    qtbot.waitUntil(lambda: "incomplete, discarded" in said_in(window))
+    qtbot.waitUntil(lambda: "incomplete, discarded" in log_of(window))
     device.faults = Faults()
     updates = view.updates
     qtbot.waitUntil(lambda: view.updates > updates + 2)
 
 
-def test_on_another_page_the_recording_goes_on_and_is_imported_when_it_ends(
+def test_recording_continues_on_another_page_and_is_imported(
     window: MainWindow, page: CapturePage, qtbot: QtBot
 ):
     start(page, qtbot)
@@ -463,7 +463,7 @@ def test_on_another_page_the_recording_goes_on_and_is_imported_when_it_ends(
     window.show_step("setup")
     frames, updates = live.takes[0].frames, page.live_view.updates
     qtbot.waitUntil(lambda: live.takes[0].frames > frames + 20)
-    assert page.live_view.updates == updates  # nobody sees them
+    assert page.live_view.updates == updates  # the page is hidden
     assert window.menus.actions["record"].isEnabled()
     Hand(window).press(Qt.Key.Key_R, Qt.KeyboardModifier.ControlModifier)
     session = window.workspace.session
@@ -495,29 +495,29 @@ def test_closing_the_window_finishes_the_recording(
 
 
 def answer(words: str) -> None:
-    """Press a button of the next question."""
+    """Press a button of the next message box."""
 
     def press() -> None:
         box = QApplication.activeModalWidget()
         if not isinstance(box, QMessageBox):
             QTimer.singleShot(20, press)
             return
-        found = [each for each in box.buttons() if each.text().replace("&", "") == words]
-        assert len(found) == 1, [each.text() for each in box.buttons()]
-        found[0].click()
+        buttons = [each for each in box.buttons() if each.text().replace("&", "") == words]
+        assert len(buttons) == 1, [each.text() for each in box.buttons()]
+        buttons[0].click()
 
     QTimer.singleShot(0, press)
 
 
 def close_by_hand(window: MainWindow) -> None:
-    """As the button in the window's frame does."""
+    """Close the window as the button in its frame does."""
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(QCloseEvent, "spontaneous", lambda _: True)
         window.close()
 
 
 @pytest.mark.parametrize("way", ["the frame", "quit", "close", "another"])
-def test_while_it_records_closing_asks_and_a_no_closes_nothing(
+def test_closing_while_recording_needs_confirmation(
     window: MainWindow, page: CapturePage, qtbot: QtBot, copy_sample, way: str
 ):
     close = {
@@ -545,7 +545,7 @@ def test_while_it_records_closing_asks_and_a_no_closes_nothing(
         assert len(video) == take.frames
 
 
-def test_a_recording_that_is_discarded_is_gone(window: MainWindow, page: CapturePage, qtbot: QtBot):
+def test_discarded_recording_is_deleted(window: MainWindow, page: CapturePage, qtbot: QtBot):
     start(page, qtbot)
     live = page.live_view.live
     page.live_view.trigger()
@@ -557,11 +557,11 @@ def test_a_recording_that_is_discarded_is_gone(window: MainWindow, page: Capture
     assert [path.name for path in folder.glob("new*")] == ["new.labsession"]
 
 
-def test_recordings_made_besides_are_listed_when_the_session_is_opened_again(
+def test_other_recordings_are_listed_on_reopening(
     window: MainWindow, page: CapturePage, qtbot: QtBot
 ):
     path = window.workspace.session.path
-    path.with_name("new-notes.nut").write_bytes(b"")  # not one of the session's
+    path.with_name("new-notes.nut").write_bytes(b"")  # not a recording of the session
     start(page, qtbot)
     live = page.live_view.live
     page.live_view.trigger()
@@ -584,32 +584,32 @@ def test_recordings_made_besides_are_listed_when_the_session_is_opened_again(
     qtbot.waitUntil(lambda: not page.kept.isVisible())
 
 
-def test_a_camera_that_cannot_be_opened_is_told(
+def test_camera_that_cannot_be_opened_is_reported(
     window: MainWindow, page: CapturePage, device, qtbot: QtBot
 ):
     device.unplug()
     page.live_view.start()
-    qtbot.waitUntil(lambda: "is not connected" in said_in(window))
+    qtbot.waitUntil(lambda: "is not connected" in log_of(window))
     assert page.live_view.live is None
     assert page.live_view.start_button.isVisible()
-    assert "fault in the program" not in said_in(window)
+    assert "fault in the program" not in log_of(window)
     device.plug()
     start(page, qtbot)
 
 
-def test_an_opening_that_is_cancelled(
+def test_opening_a_camera_can_be_cancelled(
     window: MainWindow, page: CapturePage, qtbot: QtBot, monkeypatch: pytest.MonkeyPatch
 ):
-    begun, gate = threading.Event(), threading.Event()
+    started, gate = threading.Event(), threading.Event()
 
     def slow(_text: str, progress):
-        begun.set()
+        started.set()
         gate.wait(PATIENCE_S)
         progress(1, 2)
 
     monkeypatch.setattr(live_view, "pool_camera", slow)
     page.live_view.start()
-    qtbot.waitUntil(begun.is_set)
+    qtbot.waitUntil(started.is_set)
     window.status_line.cancel()
     gate.set()
     qtbot.waitUntil(lambda: page.live_view.live is None)
@@ -617,20 +617,22 @@ def test_an_opening_that_is_cancelled(
     assert page.camera is None
 
 
-def test_cameras_are_looked_for(window: MainWindow, page: CapturePage, qtbot: QtBot, monkeypatch):
-    found = [CameraInfo("uvc:0", "Microscope", "USB video")], ["Aravis is not installed"]
-    monkeypatch.setattr(live_view, "find_cameras", lambda: found)
+def test_found_cameras_can_be_chosen(
+    window: MainWindow, page: CapturePage, qtbot: QtBot, monkeypatch
+):
+    result = [CameraInfo("uvc:0", "Microscope", "USB video")], ["Aravis is not installed"]
+    monkeypatch.setattr(live_view, "find_cameras", lambda: result)
     page.live_view.find_button.click()
-    qtbot.waitUntil(lambda: "1 camera found. Aravis is not installed" in said_in(window))
+    qtbot.waitUntil(lambda: "1 camera found. Aravis is not installed" in log_of(window))
     assert page.live_view.camera.value() == SIMULATED
     page.live_view.camera.set_value("uvc:0")
     assert page.live_view.camera.value() == "uvc:0"
 
 
-def test_a_kind_that_is_added_can_be_watched(page: CapturePage, qtbot: QtBot, monkeypatch):
-    still = SimulatedDevice("still", lambda _: np.full(SHAPE, 7, np.uint8))
-    found = [CameraInfo("still:1", "Still picture", "a toy")]
-    kind = CameraKind("still:NUMBER", lambda: found, lambda _: still.open())
+def test_added_camera_kind_can_be_used(page: CapturePage, qtbot: QtBot, monkeypatch):
+    camera = SimulatedDevice("still", lambda _: np.full(SHAPE, 7, np.uint8))
+    cameras = [CameraInfo("still:1", "Still picture", "a toy")]
+    kind = CameraKind("still:NUMBER", lambda: cameras, lambda _: camera.open())
     monkeypatch.setattr("labapp.media.cameras.KINDS", [kind])
     page.live_view.find_button.click()
     qtbot.waitUntil(lambda: "still:1" in dict(page.live_view._choices))
@@ -643,9 +645,7 @@ def test_a_kind_that_is_added_can_be_watched(page: CapturePage, qtbot: QtBot, mo
     qtbot.waitUntil(lambda: not page.workspace.tasks.active)
 
 
-def test_a_file_that_is_chosen_takes_the_place_of_the_camera(
-    page: CapturePage, tmp_path: Path, qtbot: QtBot
-):
+def test_choosing_a_file_stops_the_camera(page: CapturePage, tmp_path: Path, qtbot: QtBot):
     start(page, qtbot)
     path = tmp_path / "stack.npy"
     np.save(path, np.zeros((3, 20, 30), np.uint8))
@@ -655,7 +655,9 @@ def test_a_file_that_is_chosen_takes_the_place_of_the_camera(
     qtbot.waitUntil(lambda: np.shape(page.picture_view.picture) == (20, 30))
 
 
-def test_live_by_keyboard_and_screen_reader(window: MainWindow, page: CapturePage, qtbot: QtBot):
+def test_live_page_is_accessible_by_keyboard_and_screen_reader(
+    window: MainWindow, page: CapturePage, qtbot: QtBot
+):
     start(page, qtbot)
     qtbot.waitUntil(lambda: not window.workspace.tasks.active)
     assert QApplication.focusWidget() is page.live_view.bar.record_button
@@ -668,7 +670,7 @@ def test_live_by_keyboard_and_screen_reader(window: MainWindow, page: CapturePag
         if button.isVisible() and button.text():
             assert button.width() >= button.sizeHint().width() - 1, button.text()
     assert window.page.live_view.bar.record_button.isVisible()
-    # Whatever is to be said of the camera, the window does not grow beyond the screen.
+    # No state of the camera makes the window larger than the screen.
     for words in (*(words for _, words in STATES.values()), *WAITS.values()):
         page.live_view.bar.state.setText(f"▲ {words}, 1000.0 frames/s")
         let_draw()

@@ -1,4 +1,4 @@
-"""A short way through what `tests/benchmarks/live.py` does for long: all faults, nothing lost."""
+"""A short version of `tests/benchmarks/live.py`: all faults occur, and no frame is lost."""
 
 from __future__ import annotations
 
@@ -27,25 +27,25 @@ pytestmark = pytest.mark.soak
 
 ROUNDS = 12
 STALLED = (3, 8)
-"""Rounds in which the disk stalls, too, from before the camera is gone to after it is back."""
+"""Rounds in which the disk stalls as well, from before the unplugging to after it."""
 
 BEHIND, CAUGHT_UP = "writing does not keep up", "writing has caught up"
 
 
 def film(k: int) -> GreyImage:
-    """Frame k: dots that wander."""
+    """Frame k: moving dots."""
     v, u = np.mgrid[:48, :64] + 3 * np.sin([[[k / 7]], [[k / 5]]])
     return (40 + 80 * (np.sin(u) > 0.9) * (np.sin(v) > 0.9)).astype(np.uint8)
 
 
-def test_nothing_recorded_is_lost_and_all_is_said(
+def test_no_frame_is_lost_and_every_fault_is_reported(
     window: MainWindow, tmp_path: Path, qtbot: QtBot, monkeypatch: pytest.MonkeyPatch
 ):
-    goes = threading.Event()
-    goes.set()
+    disk_runs = threading.Event()
+    disk_runs.set()
 
-    def writer(path: Path, *given: object) -> NutWriter:
-        return NutWriter(path, *given, file=Disk(path, goes))
+    def writer(path: Path, *args: object) -> NutWriter:
+        return NutWriter(path, *args, file=Disk(path, disk_runs))
 
     device = FilmedDevice(film, 200, 1_000_000)
     monkeypatch.setattr(live_view, "pool_camera", lambda *_: device)
@@ -56,35 +56,35 @@ def test_nothing_recorded_is_lost_and_all_is_said(
     window.show_step("capture")
     view, truth = window.page.live_view, device.truth
 
-    def told() -> list[str]:
+    def messages() -> list[str]:
         return times_told(window.log_panel.texts())
 
     view.start()
     qtbot.waitUntil(lambda: view.updates > 2)
-    begun_s = time.monotonic()
+    start_s = time.monotonic()
     view.trigger()
     take = view.live.takes[0]
     device.spoil(Faults(garbage=0.05, seed=4804), 0.05)
     for k in range(ROUNDS):
-        seen = truth.frames
-        qtbot.waitUntil(lambda seen=seen: truth.frames > seen + 10)
+        before = truth.frames
+        qtbot.waitUntil(lambda before=before: truth.frames > before + 10)
         if k in STALLED:
-            # A busy computer's disk stalls of itself, too.
-            qtbot.waitUntil(lambda: how_many(told(), BEHIND) == how_many(told(), CAUGHT_UP))
-            stalls = how_many(told(), BEHIND)
-            goes.clear()
-            qtbot.waitUntil(lambda n=stalls: how_many(told(), BEHIND) > n)
+            # The disk of a busy computer can stall by itself, too.
+            qtbot.waitUntil(lambda: how_many(messages(), BEHIND) == how_many(messages(), CAUGHT_UP))
+            stalls = how_many(messages(), BEHIND)
+            disk_runs.clear()
+            qtbot.waitUntil(lambda n=stalls: how_many(messages(), BEHIND) > n)
         device.unplug()
-        qtbot.waitUntil(lambda k=k: how_many(told(), "was unplugged") == k + 1)
+        qtbot.waitUntil(lambda k=k: how_many(messages(), "was unplugged") == k + 1)
         device.plug()
-        qtbot.waitUntil(lambda k=k: how_many(told(), "it is back after") == k + 1)
+        qtbot.waitUntil(lambda k=k: how_many(messages(), "it is back after") == k + 1)
         if k in STALLED:
-            goes.set()
-            qtbot.waitUntil(lambda n=stalls: how_many(told(), CAUGHT_UP) > n)
+            disk_runs.set()
+            qtbot.waitUntil(lambda n=stalls: how_many(messages(), CAUGHT_UP) > n)
     qtbot.waitUntil(lambda: truth.broken > 5)
     device.faults = Faults()
-    qtbot.waitUntil(lambda: how_many(told(), "incomplete, discarded") == truth.broken)
-    ended_s = time.monotonic()
+    qtbot.waitUntil(lambda: how_many(messages(), "incomplete, discarded") == truth.broken)
+    end_s = time.monotonic()
     view.trigger()
     qtbot.waitUntil(take.finished.is_set)
     counts = view.live.feed.counts
@@ -92,12 +92,12 @@ def test_nothing_recorded_is_lost_and_all_is_said(
     qtbot.waitUntil(lambda: not window.workspace.tasks.active)
     assert (counts.broken, counts.lost) == (truth.broken, ROUNDS)
     assert (take.lost, take.trouble) == (0, "")
-    found = compare(take.path, device, begun_s, ended_s)
-    assert found.right, found
-    assert found.frames == take.frames
+    comparison = compare(take.path, device, start_s, end_s)
+    assert comparison.right, comparison
+    assert comparison.frames == take.frames
     with take.notes.open(encoding="utf-8", newline="") as file:
-        noted = [row["what"] for row in csv.DictReader(file)]
+        notes = [row["what"] for row in csv.DictReader(file)]
     for words in ("was unplugged", "it is back after", "incomplete, discarded"):
-        assert how_many(noted, words) == how_many(told(), words), words
+        assert how_many(notes, words) == how_many(messages(), words), words
     for words in (BEHIND, CAUGHT_UP):
-        assert how_many(noted, words) >= len(STALLED), words
+        assert how_many(notes, words) >= len(STALLED), words

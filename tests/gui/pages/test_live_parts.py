@@ -69,16 +69,16 @@ OK = Measurement("ok", "", "fit", measures=MEASURES)
 DARK = Measurement("no-dots", "it is dark", "fit")
 
 
-def live_result(found: Measurement = OK) -> LiveResult:
+def live_result(measurement: Measurement = OK) -> LiveResult:
     return LiveResult(
-        frame=7, time_s=0.7, arrived_s=time.monotonic(), measurement=found, quality=QUALITY
+        frame=7, time_s=0.7, arrived_s=time.monotonic(), measurement=measurement, quality=QUALITY
     )
 
 
-# --- in words -------------------------------------------------------------------------------------
+# --- texts ----------------------------------------------------------------------------------------
 
 
-def test_figures_tell_how_they_stand_and_never_in_order_where_that_is_not_known():
+def test_figures_show_their_verdict_and_unknown_if_not_measured():
     limits = Limits(width_mm=(6.0, 6.6), length_mm=(7.0, 8.0), height_mm=(0.301, None))
     shown = figures(live_result(), limits)
     assert [(f.value, f.sigma, f.verdict, f.look) for f in shown] == [
@@ -97,7 +97,7 @@ def test_figures_tell_how_they_stand_and_never_in_order_where_that_is_not_known(
     assert [figure.verdict for figure in figures(live_result())] == [""] * 3
 
 
-def test_it_is_said_why_a_frame_has_no_figures_and_how_measuring_keeps_up():
+def test_pace_text_explains_missing_figures_and_the_rate():
     assert pace_text(None, Pace(0.0, 0, 0), 60.0, 0.0) == FIRST
     assert (
         pace_text(live_result(), Pace(38.0, 76, 0), 60.0, 0.04)
@@ -110,7 +110,7 @@ def test_it_is_said_why_a_frame_has_no_figures_and_how_measuring_keeps_up():
     assert dark.startswith("▲ Not measured (no-dots): it is dark. ▲ The figures are 5 s old.")
 
 
-def test_live_figures_are_marked_with_the_status_of_the_set_up():
+def test_live_figures_show_the_status_of_the_setup():
     assert live_setup_words(None, "") == live_setup_words(live_result(), "") == ""
     checked = live_result(replace(OK, setup_status="checked"))
     assert live_setup_words(checked, "2026-01-31T12:00:00+00:00").startswith(SETUP_MARKS["checked"])
@@ -119,15 +119,15 @@ def test_live_figures_are_marked_with_the_status_of_the_set_up():
     assert "it moved" in live_setup_words(doubtful, "")
 
 
-def test_alarms_in_words():
+def test_alarm_text():
     alarm = Alarm("width-high", "Width 7.100 mm is above 6.9 mm", 312, 5.2)
-    told = alarms_text([alarm, replace(alarm, holds=False, acknowledged=True)]).split("\n")
-    assert told[0] == f"▲ ALARM: Width 7.100 mm is above 6.9 mm (frame 312, {alarm.at:%H:%M:%S})"
-    assert told[1].startswith("△ over: Width")
-    assert told[1].endswith(", acknowledged")
+    lines = alarms_text([alarm, replace(alarm, holds=False, acknowledged=True)]).split("\n")
+    assert lines[0] == f"▲ ALARM: Width 7.100 mm is above 6.9 mm (frame 312, {alarm.at:%H:%M:%S})"
+    assert lines[1].startswith("△ over: Width")
+    assert lines[1].endswith(", acknowledged")
 
 
-def test_colours_of_the_surface_stay_while_it_fills_the_scale():
+def test_colour_limits_stay_while_the_surface_fills_them():
     limits = steady_limits(None, (0.0, 0.4))
     assert limits == (-0.05, 0.45)
     assert steady_limits(limits, (0.02, 0.38)) == limits
@@ -136,7 +136,7 @@ def test_colours_of_the_surface_stay_while_it_fills_the_scale():
     assert steady_limits(limits, (0.0, 0.2)) == (-0.025, 0.225)
 
 
-def test_trends_have_the_limits_and_mark_what_is_beyond():
+def test_trends_show_limits_and_mark_values_beyond_them():
     values = np.array([[6.7, np.nan, 7.0], [7.5] * 3, [-0.3] * 3])
     trend = Trend(
         ("width", "length", "depth"),
@@ -152,7 +152,7 @@ def test_trends_have_the_limits_and_mark_what_is_beyond():
     assert (width.limits, length.limits, depth.limits) == ((6.0, 6.9), (None, None), (-0.4, None))
     assert width.mark.tolist() == [0, 0, 0, 1]
     assert depth.title == "Depth (mm)"
-    # Nothing is known of the time between frames that came far apart.
+    # The values between frames far apart in time are unknown.
     assert width.key.tolist() == [4, 8, 9, 10]
     assert np.array_equal(length.y, [7.5, 7.5, np.nan, 7.5], equal_nan=True)
 
@@ -166,7 +166,7 @@ def surface() -> Scene:
 
 
 class Prepared:
-    """Measures what the test wants, in milliseconds."""
+    """Returns the measurement set by the test, within milliseconds."""
 
     found, quality = OK, QUALITY
     gate = threading.Event()
@@ -176,15 +176,15 @@ class Prepared:
 
     def measure(self, frame: CameraFrame, drawn: bool) -> LiveResult:
         Prepared.gate.wait(PATIENCE_S)
-        found = Prepared.found
+        measurement = Prepared.found
         return LiveResult(
             frame=frame.number,
             time_s=frame.time_s,
             arrived_s=frame.arrived_s,
-            measurement=found,
-            track_lost=None if found.status == "ok" else found.reason,
+            measurement=measurement,
+            track_lost=None if measurement.status == "ok" else measurement.reason,
             quality=Prepared.quality,
-            scene=surface() if drawn and found.measures is not None else None,
+            scene=surface() if drawn and measurement.measures is not None else None,
         )
 
     def close(self) -> None:
@@ -208,18 +208,18 @@ def page(
     window.show_step("capture")
     window.activateWindow()
     qtbot.waitUntil(window.isActiveWindow)
-    made = window.page
-    assert isinstance(made, CapturePage)
-    made.live_view.plan_fields.measured.setChecked(False)  # what is recorded is noise
-    yield made
-    made.live_view.stop()
+    capture_page = window.page
+    assert isinstance(capture_page, CapturePage)
+    capture_page.live_view.plan_fields.measured.setChecked(False)  # the recorded frames are noise
+    yield capture_page
+    capture_page.live_view.stop()
     qtbot.waitUntil(lambda: not window.workspace.tasks.active)
 
 
 def start(page: CapturePage, qtbot: QtBot) -> None:
     view = page.live_view
     view.measured_s = 0.0
-    qtbot.waitUntil(view.start_button.isEnabled)  # the one before is let go of first
+    qtbot.waitUntil(view.start_button.isEnabled)  # the previous camera is released first
     view.start_button.click()
     qtbot.waitUntil(lambda: view.measured_s > 0)
 
@@ -233,11 +233,11 @@ def figure(page: CapturePage, row: int, column: int) -> QLabel:
     return page.live_view.figures._label(row, column)
 
 
-def said_in(window: MainWindow) -> str:
+def log_of(window: MainWindow) -> str:
     return "\n".join(window.log_panel.texts())
 
 
-def test_without_a_set_up_the_picture_alone_and_why(
+def test_only_the_picture_is_shown_without_a_setup(
     window: MainWindow, page: CapturePage, qtbot: QtBot
 ):
     window.workspace.undo()
@@ -251,24 +251,24 @@ def test_without_a_set_up_the_picture_alone_and_why(
 
 
 @pytest.mark.parametrize("old_s", [-1.0, 60.0])
-def test_the_verdict_is_that_of_a_measured_frame_unless_it_is_old(
+def test_verdict_is_that_of_the_last_measured_frame_unless_old(
     page: CapturePage, qtbot: QtBot, monkeypatch: pytest.MonkeyPatch, old_s: float
 ):
     monkeypatch.setattr(live_view, "OLD_S", old_s)
     hidden = Remark("rows", "doubtful", "The torch hides dots in a row.")
     monkeypatch.setattr(Prepared, "quality", replace(QUALITY, remarks=(hidden,)))
     start(page, qtbot)
-    said: set[str] = set()
+    verdicts: set[str] = set()
 
-    def told_often() -> bool:
-        said.add(page.exposure.verdict.text())
+    def seen_enough() -> bool:
+        verdicts.add(page.exposure.verdict.text())
         return page.live_view.updates > 40 and page.exposure.isVisible()
 
-    qtbot.waitUntil(told_often)
-    assert any("torch" in words for words in said) == (old_s > 0)
+    qtbot.waitUntil(seen_enough)
+    assert any("torch" in words for words in verdicts) == (old_s > 0)
 
 
-def test_a_limit_that_is_passed_is_seen_said_recorded_and_acknowledged(
+def test_alarm_is_shown_logged_recorded_and_acknowledged(
     window: MainWindow, page: CapturePage, qtbot: QtBot
 ):
     hand, view = Hand(window), page.live_view
@@ -286,13 +286,13 @@ def test_a_limit_that_is_passed_is_seen_said_recorded_and_acknowledged(
         colour = figure(page, 0, column).palette().color(QPalette.ColorRole.WindowText)
         assert colour == RED[is_dark(window.palette())]
     assert figure(page, 1, 1).palette().color(QPalette.ColorRole.WindowText) not in RED
-    told = view.canvas.alarms.words.text()
-    assert told.startswith("▲ ALARM: Width 7.100 ± 0.030 mm is above 6.9 mm (frame ")
-    qtbot.waitUntil(lambda: "ALARM: Width 7.100" in said_in(window))
+    text = view.canvas.alarms.words.text()
+    assert text.startswith("▲ ALARM: Width 7.100 ± 0.030 mm is above 6.9 mm (frame ")
+    qtbot.waitUntil(lambda: "ALARM: Width 7.100" in log_of(window))
     assert "ALARM" in " ".join(map(str, window.status_line.unread))
     qtbot.waitUntil(lambda: 1 in view.canvas.trends.plots.curves[0].mark)
     assert view.canvas.trends.plots.curves[0].limits == (None, 6.9)
-    # One that holds when a recording begins stands in its notes; another is noted when it comes.
+    # The notes contain an alarm active at the start of recording and each new alarm.
     view.trigger()
     Prepared.found = replace(OK, measures=replace(MEASURES, width_mm=6.8))
     qtbot.waitUntil(lambda: view.canvas.alarms.words.text().startswith("△ over: Width"))
@@ -321,7 +321,7 @@ def test_a_limit_that_is_passed_is_seen_said_recorded_and_acknowledged(
     ]
 
 
-def test_an_alarm_that_nobody_saw_stays_in_view_when_the_camera_is_stopped(
+def test_unacknowledged_alarm_stays_after_the_camera_is_stopped(
     window: MainWindow, page: CapturePage, qtbot: QtBot
 ):
     hand, view = Hand(window), page.live_view
@@ -332,7 +332,7 @@ def test_an_alarm_that_nobody_saw_stays_in_view_when_the_camera_is_stopped(
     hand.button("Stop camera")
     qtbot.waitUntil(lambda: view.live is None)
     assert view.canvas.alarms.words.text().startswith("△ over: Width")
-    # … and when the next one is started, beside what that one raises.
+    # It also stays when the next camera starts, beside the alarms of that one.
     start(page, qtbot)
     qtbot.waitUntil(lambda: "ALARM" in view.canvas.alarms.words.text())
     assert view.canvas.alarms.words.text().startswith("△ over: Width")
@@ -340,7 +340,7 @@ def test_an_alarm_that_nobody_saw_stays_in_view_when_the_camera_is_stopped(
     assert "over" not in view.canvas.alarms.words.text()
 
 
-def test_limits_that_cannot_be_are_refused_and_others_undone(
+def test_invalid_limits_are_rejected_and_valid_ones_undone(
     window: MainWindow, page: CapturePage, qtbot: QtBot
 ):
     hand, view = Hand(window), page.live_view
@@ -363,49 +363,47 @@ def test_limits_that_cannot_be_are_refused_and_others_undone(
     assert view.live.watch.alarms.limits == Limits()
 
 
-def test_a_frame_that_cannot_be_measured_says_why_where_the_figures_stand(
-    page: CapturePage, qtbot: QtBot
-):
+def test_unmeasured_frame_shows_the_reason_beside_the_figures(page: CapturePage, qtbot: QtBot):
     start(page, qtbot)
     choose(page, "Surface")
-    view, shown = page.live_view, page.live_view.canvas.surface
-    qtbot.waitUntil(lambda: shown.view.scene is not None)
-    former = view.updates
-    qtbot.waitUntil(lambda: view.updates > former + 3)
+    view, surface_view = page.live_view, page.live_view.canvas.surface
+    qtbot.waitUntil(lambda: surface_view.view.scene is not None)
+    updates = view.updates
+    qtbot.waitUntil(lambda: view.updates > updates + 3)
     assert not page.picture_view.isVisible()
     Prepared.found = DARK
     qtbot.waitUntil(lambda: figure(page, 0, 1).text() == "–")
     qtbot.waitUntil(lambda: "Not measured (no-dots): it is dark" in view.figures.words.text())
-    qtbot.waitUntil(lambda: shown.view.scene is None)
-    assert "No surface (no-dots): it is dark" in shown.view.accessibleDescription()
+    qtbot.waitUntil(lambda: surface_view.view.scene is None)
+    assert "No surface (no-dots): it is dark" in surface_view.view.accessibleDescription()
     Prepared.found = OK
-    qtbot.waitUntil(lambda: shown.view.scene is not None)
+    qtbot.waitUntil(lambda: surface_view.view.scene is not None)
     choose(page, "Picture")
     qtbot.waitUntil(page.picture_view.isVisible)
-    assert shown.view.scene is None
+    assert surface_view.view.scene is None
 
 
-def test_what_is_old_does_not_look_as_if_it_were_seen_now(
+def test_outdated_results_are_marked_as_unknown(
     window: MainWindow, page: CapturePage, qtbot: QtBot
 ):
-    view, shown = page.live_view, page.live_view.canvas.surface
+    view, surface_view = page.live_view, page.live_view.canvas.surface
     window.workspace.attempt(lambda session: session.set_limits(Limits(width_mm=(None, 6.9))))
     start(page, qtbot)
     choose(page, "Surface")
-    qtbot.waitUntil(lambda: shown.view.scene is not None)
+    qtbot.waitUntil(lambda: surface_view.view.scene is not None)
     qtbot.waitUntil(lambda: figure(page, 0, 0).text() == "Width\n✓ within limits")
-    Prepared.gate.clear()  # a frame that takes long
+    Prepared.gate.clear()  # measuring the next frame takes long
     try:
         qtbot.waitUntil(lambda: figure(page, 0, 0).text() == "Width\n? not known")
         qtbot.waitUntil(lambda: "The figures are" in view.figures.words.text())
-        qtbot.waitUntil(lambda: shown.view.scene is None)
+        qtbot.waitUntil(lambda: surface_view.view.scene is None)
     finally:
         Prepared.gate.set()
-    qtbot.waitUntil(lambda: shown.view.scene is not None)
+    qtbot.waitUntil(lambda: surface_view.view.scene is not None)
     qtbot.waitUntil(lambda: figure(page, 0, 0).text() == "Width\n✓ within limits")
 
 
-def test_control_software_is_told_while_a_camera_is_watched(
+def test_control_software_receives_results_while_live(
     window: MainWindow, page: CapturePage, qtbot: QtBot, port: int
 ):
     hand, view = Hand(window), page.live_view
@@ -422,20 +420,20 @@ def test_control_software_is_told_while_a_camera_is_watched(
     file = connected.makefile("rb")
     connected.close()
     assert "labapp" in json.loads(file.readline())
-    told = json.loads(file.readline())
-    assert (told["width_mm"], told["alarm"], told["status"]) == (6.7, "", "ok")
+    message = json.loads(file.readline())
+    assert (message["width_mm"], message["alarm"], message["status"]) == (6.7, "", "ok")
     qtbot.waitUntil(lambda: "1 client connected" in streams.words["lines"].text())
-    # Others are let in only where that is ticked, and then it is said what that means.
+    # Other machines may connect only if that is checked; then a warning is shown.
     assert not streams.warning.isVisible()
     streams.anywhere.click()
     assert "Any machine that reaches this one" in streams.warning.text()
     qtbot.waitUntil(lambda: "every address of this machine" in streams.words["lines"].text())
-    for _ in range(7):  # what is wanted at last counts, whatever is under way
+    for _ in range(7):  # the last choice counts, whatever is in progress
         streams.anywhere.click()
     assert not streams.warning.isVisible()
     qtbot.waitUntil(lambda: streams.words["lines"].text().startswith("● 127.0.0.1"))
     file.close()
-    # It ends with the camera, and begins again with it.
+    # The stream ends and starts again with the camera.
     watch = view.live.watch
     hand.button("Stop camera")
     qtbot.waitUntil(lambda: not window.workspace.tasks.active)
@@ -450,14 +448,14 @@ def test_control_software_is_told_while_a_camera_is_watched(
         connect(port)
 
 
-def test_a_penetration_model_stands_beside_the_sizes_and_is_marked(
+def test_penetration_model_is_shown_and_marked_as_a_model(
     page: CapturePage, qtbot: QtBot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     settings = ModelSettings(("width_mm",), "back_width_mm", orders=Orders(0, 1, 0))
     one, half = np.ones(1), LinearMap(np.array([0.5, 0.0]), np.zeros((2, 2)))
-    given = 0 * one, one, 0 * one, 9 * one, 0.0, half, 0.1
+    parameters = 0 * one, one, 0 * one, 9 * one, 0.0, half, 0.1
     path = tmp_path / "bench.json"
-    write_model(path, PenetrationModel("arx", settings, (), *given, rmse_mm=0.12))
+    write_model(path, PenetrationModel("arx", settings, (), *parameters, rmse_mm=0.12))
     monkeypatch.setattr(live_penetration, "ask_file", lambda *_: path)
     view = page.live_view
     start(page, qtbot)
@@ -466,7 +464,7 @@ def test_a_penetration_model_stands_beside_the_sizes_and_is_marked(
     qtbot.waitUntil(lambda: figure(page, 3, 1).text() == "3.350")
     assert figure(page, 3, 0).text() == "Back width\nmodel"
     assert "bench" in view.penetration.words.text()
-    # What cannot be read is said, and changes nothing.
+    # An unreadable file is reported and changes nothing.
     path.write_text("{}")
     view.penetration.choose_button.click()
     qtbot.waitUntil(lambda: "bench.json" in view.penetration.words.text())
@@ -475,20 +473,20 @@ def test_a_penetration_model_stands_beside_the_sizes_and_is_marked(
     qtbot.waitUntil(lambda: not figure(page, 3, 1).isVisible())
 
 
-def test_a_port_that_is_taken_is_said_with_what_to_do(
+def test_occupied_port_is_reported_with_a_remedy(
     window: MainWindow, page: CapturePage, qtbot: QtBot, port: int
 ):
     hand, streams = Hand(window), page.live_view.canvas.streams
     start(page, qtbot)
     choose(page, "Control software")
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        its_port = taken.getsockname()[1]
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        occupied_port = server.getsockname()[1]
         for kind in ("lines", "opcua"):
-            hand.enter(streams.ports[kind], str(its_port))
+            hand.enter(streams.ports[kind], str(occupied_port))
             streams.boxes[kind].click()
             qtbot.waitUntil(lambda kind=kind: not streams.boxes[kind].isChecked())
             assert "Choose another port" in streams.words[kind].text()
-    assert said_in(window).count("Choose another port") == 2
+    assert log_of(window).count("Choose another port") == 2
     streams.boxes["lines"].click()
     qtbot.waitUntil(lambda: streams.words["lines"].text().startswith("● 127.0.0.1"))
     assert page.live_view.live.watch.stream("opcua") is None
@@ -499,7 +497,7 @@ def test_a_port_that_is_taken_is_said_with_what_to_do(
 
 
 @pytest.mark.parametrize("part", ["Picture", "Surface", "Trends and limits", "Control software"])
-def test_every_part_by_keyboard_and_on_a_small_screen(
+def test_every_part_is_accessible_on_a_small_screen(
     window: MainWindow, page: CapturePage, qtbot: QtBot, part: str
 ):
     window.workspace.attempt(lambda session: session.set_limits(Limits(width_mm=(7.0, None))))

@@ -1,4 +1,4 @@
-"""Imaging plane: found or placed by hand, what follows with its ±, and what is in use."""
+"""The imaging-plane page: points found or placed by hand, results with ±, values in use."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ SQUARE = PlaneCalibration(
     sigma_px=(0.1, 0.2, 0.3),
     threshold=14.0,
 )
-"""Six px/mm, axes square, units of 10 mm."""
+"""Scale of 6 px/mm, orthogonal axes, units of 10 mm."""
 
 
-def test_scales_and_angle_carry_the_points_uncertainty() -> None:
+def test_scales_and_angle_have_the_uncertainty_of_the_points() -> None:
     rows = {row.name: row for row in presenter.result(SQUARE).rows}
     along_x, along_z, angle = (
         rows[name] for name in ("Scale along O′X′", "Scale along O′Z′", "Angle")
@@ -55,7 +55,7 @@ def test_scales_and_angle_carry_the_points_uncertainty() -> None:
     assert angle.sigma == pytest.approx(sigma, rel=1e-3)
 
 
-def test_what_cannot_be_used_and_what_is_odd_is_said() -> None:
+def test_unusable_and_implausible_points_are_reported() -> None:
     assert "Load a picture" in presenter.result(None).why_not
     line = replace(SQUARE, z_axis_px=SQUARE.x_axis_px)
     assert "one line" in presenter.result(line).why_not
@@ -65,19 +65,19 @@ def test_what_cannot_be_used_and_what_is_odd_is_said() -> None:
     assert not presenter.result(SQUARE).warnings
 
 
-def askew(perspective: float) -> PlaneCalibration:
-    """Marks of a target whose far end of O′X′ is seen smaller, with a little noise."""
+def with_perspective(perspective: float) -> PlaneCalibration:
+    """Target marks with noise and perspective: the far end of O′X′ appears smaller."""
     units = [(0, 0), *((n, 0) for n in range(1, 11)), *((0, n) for n in range(1, 5))]
     plane = 10.0 * np.array(units, float)
     shrink = 1 + perspective * plane[:, :1]
-    seen = ([50.0, 400.0] + plane * [6.0, -6.0]) / shrink
-    seen += np.random.default_rng(4).normal(0, 0.05, seen.shape)
-    marks = tuple((*row, 1.0) for row in np.column_stack([plane, seen]).tolist())
+    image_px = ([50.0, 400.0] + plane * [6.0, -6.0]) / shrink
+    image_px += np.random.default_rng(4).normal(0, 0.05, image_px.shape)
+    marks = tuple((*row, 1.0) for row in np.column_stack([plane, image_px]).tolist())
     return replace(SQUARE, marks=marks, model="affine")
 
 
-def test_the_model_is_proposed_with_its_reason_and_can_be_overridden() -> None:
-    tilted = askew(1e-3)
+def test_model_is_proposed_with_a_reason_and_can_be_overridden() -> None:
+    tilted = with_perspective(1e-3)
     assert [model for model, _ in presenter.choices(tilted)] == [
         "affine",
         "homography",
@@ -85,8 +85,8 @@ def test_the_model_is_proposed_with_its_reason_and_can_be_overridden() -> None:
     ]
     assert dict(presenter.choices(tilted))["homography"].endswith("(proposed)")
     assert "perspective along X′" in presenter.why(tilted)
-    assert dict(presenter.choices(askew(0.0)))["affine"].endswith("(proposed)")
-    assert "No perspective" in presenter.why(askew(0.0))
+    assert dict(presenter.choices(with_perspective(0.0)))["affine"].endswith("(proposed)")
+    assert "No perspective" in presenter.why(with_perspective(0.0))
     assert presenter.choices(SQUARE) == (("three points", "Three points"),)
     rows = {row.name: row.value for row in presenter.result(tilted).rows}
     assert 0.03 < rows["Homography residual"] < 0.1 < rows["Affine residual"]
@@ -96,28 +96,30 @@ def test_the_model_is_proposed_with_its_reason_and_can_be_overridden() -> None:
     assert (by_hand.model, by_hand.marks) == ("three points", ())
 
 
-def test_the_residual_map_shows_how_far_the_model_is_off() -> None:
-    tilted = askew(1e-3)
-    shown = presenter.residual_map(tilted, 640)
-    assert shown is not None
-    assert shown.share.max() == 1.0
-    arrows = np.hypot(*(shown.end_px - shown.begin_px).T)
+def test_residual_map_shows_the_residuals_of_the_model() -> None:
+    tilted = with_perspective(1e-3)
+    residuals = presenter.residual_map(tilted, 640)
+    assert residuals is not None
+    assert residuals.share.max() == 1.0
+    arrows = np.hypot(*(residuals.end_px - residuals.begin_px).T)
     assert 12 < arrows.max() <= 64
-    times = float(shown.words.split("×")[1].split(",")[0])
+    factor = float(residuals.words.split("×")[1].split(",")[0])
     marks = np.array(tilted.marks)
     places = tilted.image_calibration.to_image(marks[:, :2])
-    np.testing.assert_allclose((shown.end_px - shown.begin_px) / times, places - marks[:, 2:4])
+    np.testing.assert_allclose(
+        (residuals.end_px - residuals.begin_px) / factor, places - marks[:, 2:4]
+    )
     assert presenter.residual_map(SQUARE, 640) is None
 
 
-def test_a_point_placed_by_hand_is_less_certain() -> None:
+def test_point_placed_by_hand_has_a_larger_uncertainty() -> None:
     moved = presenter.moved(SQUARE, 1, (381.0, 401.0))
     assert moved.x_axis_px == (381.0, 401.0)
     assert moved.sigma_px == (0.1, presenter.HAND_SIGMA_PX, 0.3)
     assert moved.origin_px == SQUARE.origin_px
 
 
-def test_another_unit_is_another_scale() -> None:
+def test_unit_changes_the_scale() -> None:
     twice = presenter.with_unit(SQUARE, 20.0)
     assert twice.px_per_mm == pytest.approx((3.0, 3.0))
 
@@ -129,19 +131,19 @@ def test_unit_marks_lie_on_the_axes() -> None:
     np.testing.assert_allclose(marks[[0, 10]], [[110, 400], [50, 340]])
 
 
-def test_points_to_begin_with_are_a_target_in_the_picture() -> None:
-    begun = presenter.first_points((480, 640), 6.35)
-    assert "Drag O′ and O′X′ and O′Z′" in presenter.result(begun).why_not
-    for point, place in enumerate(presenter.places(begun)):
-        begun = presenter.moved(begun, point, place)
-    assert not presenter.result(begun).why_not
-    assert begun.px_per_mm[0] == pytest.approx(begun.px_per_mm[1])
-    line, _ = presenter.axes(begun, 6.35)
+def test_first_points_form_a_target_within_the_picture() -> None:
+    points = presenter.first_points((480, 640), 6.35)
+    assert "Drag O′ and O′X′ and O′Z′" in presenter.result(points).why_not
+    for point, place in enumerate(presenter.places(points)):
+        points = presenter.moved(points, point, place)
+    assert not presenter.result(points).why_not
+    assert points.px_per_mm[0] == pytest.approx(points.px_per_mm[1])
+    line, _ = presenter.axes(points, 6.35)
     assert (line >= 0).all()
     assert (line < [640, 480]).all()
 
 
-def test_what_is_in_use_is_told_whichever_form_it_has(tmp_path: Path) -> None:
+def test_values_in_use_are_shown_for_either_form(tmp_path: Path) -> None:
     with Session.create(tmp_path / "new.labsession") as session:
         assert all(np.isnan(row.value) for row in presenter.in_use(session))
         image = cv2.imread(str(GTAW / "calibration.png"), cv2.IMREAD_UNCHANGED)
@@ -160,7 +162,7 @@ def test_what_is_in_use_is_told_whichever_form_it_has(tmp_path: Path) -> None:
         assert states(session)["plane"].why == "Other values were entered after the calibration"
 
 
-def test_a_picture_without_a_target_is_refused_in_words() -> None:
+def test_picture_without_a_target_is_rejected() -> None:
     with pytest.raises(CannotMeasure, match="no dark marks"):
         presenter.find([np.full((200, 300), 90, np.uint8)], 6.35, None)
 
@@ -172,31 +174,31 @@ def test_a_picture_without_a_target_is_refused_in_words() -> None:
 def page(qtbot: QtBot, copy_sample: Callable[[str], Path]) -> Iterator[PlanePage]:
     workspace = Workspace()
     workspace.show(Session.open(copy_sample("gtaw")))
-    made = PlanePage(workspace)
-    KEPT.extend([workspace, made, made.panel])
-    workspace.changed.connect(lambda: made.refresh() if workspace.session else None)
-    made.refresh()
-    made.show()
-    made.panel.show()
+    plane_page = PlanePage(workspace)
+    KEPT.extend([workspace, plane_page, plane_page.panel])
+    workspace.changed.connect(lambda: plane_page.refresh() if workspace.session else None)
+    plane_page.refresh()
+    plane_page.show()
+    plane_page.panel.show()
     qtbot.waitUntil(lambda: not workspace.tasks.active)
-    yield made
+    yield plane_page
     workspace.close()
-    made.hide()
-    made.panel.hide()
+    plane_page.hide()
+    plane_page.panel.hide()
 
 
-def test_the_target_is_written_for_the_printer(page: PlanePage, tmp_path: Path) -> None:
-    said: list[tuple[str, bool]] = []
-    page.workspace.notified.connect(lambda text, problem: said.append((text, problem)))
+def test_target_is_saved_for_printing(page: PlanePage, tmp_path: Path) -> None:
+    messages: list[tuple[str, bool]] = []
+    page.workspace.notified.connect(lambda text, problem: messages.append((text, problem)))
     page.save_target(tmp_path / "target.svg")
     assert (tmp_path / "target.svg").read_text("utf-8") == target_svg(Target())
-    assert not said[-1][1]
+    assert not messages[-1][1]
     page.save_target(tmp_path / "not there" / "target.svg")
-    assert said[-1][1]
-    assert "can be written" in said[-1][0]
+    assert messages[-1][1]
+    assert "can be written" in messages[-1][0]
 
 
-def test_a_picture_is_loaded_found_used_and_undone(qtbot: QtBot, page: PlanePage) -> None:
+def test_target_is_found_applied_and_undone(qtbot: QtBot, page: PlanePage) -> None:
     session = page.workspace.session
     assert session is not None
     before = session.setup_text
@@ -208,14 +210,14 @@ def test_a_picture_is_loaded_found_used_and_undone(qtbot: QtBot, page: PlanePage
     placed = page.found
     page.use_button.click()
     assert session.setup_text != before
-    kept = session.plane_calibration
-    assert kept is not None
-    assert (kept.found, kept.unit_mm) == (placed, 6.35)
+    stored = session.plane_calibration
+    assert stored is not None
+    assert (stored.found, stored.unit_mm) == (placed, 6.35)
     page.workspace.undo()
     assert session.setup_text == before
 
 
-def test_an_arrow_key_moves_the_chosen_point(qtbot: QtBot, page: PlanePage) -> None:
+def test_arrow_keys_move_the_selected_point(qtbot: QtBot, page: PlanePage) -> None:
     page.load(GTAW / "calibration.png")
     qtbot.waitUntil(lambda: not page.workspace.tasks.active)
     assert page.found is not None
@@ -228,15 +230,15 @@ def test_an_arrow_key_moves_the_chosen_point(qtbot: QtBot, page: PlanePage) -> N
     assert page.result.rows[0].value != scale
 
 
-def test_a_picture_without_a_target_is_said_and_points_can_be_placed(
+def test_points_can_be_placed_if_no_target_is_found(
     qtbot: QtBot, page: PlanePage, tmp_path: Path
 ) -> None:
     cv2.imwrite(str(tmp_path / "bare.png"), np.full((200, 300), 90, np.uint8))
-    said: list[str] = []
-    page.workspace.notified.connect(lambda words, _: said.append(words))
+    messages: list[str] = []
+    page.workspace.notified.connect(lambda words, _: messages.append(words))
     page.load(tmp_path / "bare.png")
-    qtbot.waitUntil(lambda: len(said) == 1)
-    assert "no dark marks" in said[0]
+    qtbot.waitUntil(lambda: len(messages) == 1)
+    assert "no dark marks" in messages[0]
     assert [point.isVisible() for point in page.points] == [True] * 3
     for k, place in enumerate([(30.0, 180.0), (120.0, 181.0), (31.0, 120.0)]):
         assert not page.use_button.isEnabled()
@@ -244,7 +246,7 @@ def test_a_picture_without_a_target_is_said_and_points_can_be_placed(
     assert page.use_button.isEnabled()
 
 
-def test_a_new_unit_is_followed_at_once(qtbot: QtBot, page: PlanePage) -> None:
+def test_new_unit_applies_at_once(qtbot: QtBot, page: PlanePage) -> None:
     page.load(GTAW / "calibration.png")
     qtbot.waitUntil(lambda: not page.workspace.tasks.active)
     scale = page.result.rows[0].value
@@ -255,7 +257,7 @@ def test_a_new_unit_is_followed_at_once(qtbot: QtBot, page: PlanePage) -> None:
     assert page.result.rows[0].value == pytest.approx(scale / 2)
 
 
-def test_the_operator_may_use_another_model(qtbot: QtBot, page: PlanePage) -> None:
+def test_operator_can_choose_another_model(qtbot: QtBot, page: PlanePage) -> None:
     session = page.workspace.session
     assert session is not None
     page.load(GTAW / "calibration.png")
@@ -278,7 +280,7 @@ def test_the_operator_may_use_another_model(qtbot: QtBot, page: PlanePage) -> No
 
 
 @pytest.mark.parametrize("model", ["affine", "homography", "three points"])
-def test_what_is_used_is_what_was_proposed_to_the_last_digit(
+def test_applied_calibration_equals_the_shown_one_exactly(
     qtbot: QtBot, page: PlanePage, model: Model
 ) -> None:
     session = page.workspace.session
@@ -293,29 +295,29 @@ def test_what_is_used_is_what_was_proposed_to_the_last_digit(
     np.testing.assert_array_equal(
         session.setup.calibration.matrix, chosen.image_calibration.matrix, strict=True
     )
-    kept = session.plane_calibration
-    assert kept is not None
-    assert kept.found == chosen
+    stored = session.plane_calibration
+    assert stored is not None
+    assert stored.found == chosen
     used = [row.value for row in presenter.in_use(session)]
     shown = [row.value for row in presenter.result(chosen).rows[:3]]
     assert used == pytest.approx(shown, rel=1e-12)
 
 
-def test_every_button_says_what_it_does(page: PlanePage) -> None:
+def test_every_button_has_a_tooltip(page: PlanePage) -> None:
     buttons = page.panel.findChildren(QPushButton)
     assert len(buttons) == 6
     assert all(button.toolTip() for button in buttons)
 
 
 def board_picture(path: Path) -> Path:
-    """Picture of a board by a lens that distorts by 1 %."""
+    """A picture of a board through a lens with 1 % distortion."""
     view = PosedView.at((40.0, 36.0), 5.0, turned_deg=(1, -2, 1.3), lens=Lens(1000.0, k1=-0.06))
     printed, rng = PrintedBoard(BOARDS["charuco_4_inch"]), np.random.default_rng(1)
     cv2.imwrite(str(path), render_target(printed, view, TargetLook(), rng))
     return path
 
 
-def test_a_board_is_recognised_used_and_taken_back(
+def test_board_is_detected_applied_and_undone(
     page: PlanePage, tmp_path: Path, qtbot: QtBot
 ) -> None:
     session = page.workspace.session
@@ -323,30 +325,30 @@ def test_a_board_is_recognised_used_and_taken_back(
     before = session.setup_text
     page.load(board_picture(tmp_path / "board.png"))
     qtbot.waitUntil(lambda: isinstance(page.found, BoardCalibration), timeout=30_000)
-    found = page.found
-    assert isinstance(found, BoardCalibration)
+    board = page.found
+    assert isinstance(board, BoardCalibration)
     assert page.square.value() == 8.0
     assert page.add_button.isEnabled()
     assert not any(point.isVisible() for point in page.points)
-    rows = {row.name: row for row in presenter.result(found).rows}
+    rows = {row.name: row for row in presenter.result(board).rows}
     assert rows["Distortion"].value == pytest.approx(-0.96, abs=0.1)
-    shown = presenter.residual_map(found, 640)
-    assert shown is not None
-    assert len(shown.share) == len(found.seen[0].index)
+    residuals = presenter.residual_map(board, 640)
+    assert residuals is not None
+    assert len(residuals.share) == len(board.seen[0].index)
     page.use()
-    kept = session.plane_calibration
-    assert kept is not None
-    assert isinstance(kept.found, BoardCalibration)
-    np.testing.assert_array_equal(kept.found.seen[0].image_px, found.seen[0].image_px)
+    stored = session.plane_calibration
+    assert stored is not None
+    assert isinstance(stored.found, BoardCalibration)
+    np.testing.assert_array_equal(stored.found.seen[0].image_px, board.seen[0].image_px)
     assert session.setup is not None
-    assert session.setup.calibration.lens == found.image_calibration.lens
+    assert session.setup.calibration.lens == board.image_calibration.lens
     assert calibrations_in_use(session)[1]
     assert lens_of(session.setup_text) is not None
     session.undo()
     assert session.setup_text == before
 
 
-def test_a_board_is_saved_for_printing(page: PlanePage, tmp_path: Path) -> None:
+def test_board_is_saved_for_printing(page: PlanePage, tmp_path: Path) -> None:
     page.print.set_value("charuco_letter_a4")
     page.save_target(tmp_path / "board.pdf")
     assert (tmp_path / "board.pdf").read_bytes().startswith(b"%PDF")

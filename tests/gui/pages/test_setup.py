@@ -1,4 +1,4 @@
-"""Set-up: what is missing is said at its field, every edit is one step, the drawing follows."""
+"""The set-up page: missing values, one undo step per edit, and a drawing that follows."""
 
 from __future__ import annotations
 
@@ -43,14 +43,16 @@ def empty(tmp_path: Path) -> Iterator[Session]:
         yield session
 
 
-def test_a_new_session_lacks_what_is_needed_and_is_drawn_with_the_dissertation_s_bench(
+def test_new_session_is_incomplete_and_drawn_with_defaults(
     empty: Session,
 ) -> None:
     shown = presenter.shown(empty)
     rules = {
         f"{section}.{key}": rule for section in SECTIONS for key, rule in SECTIONS[section].items()
     }
-    needed = [key for key in KEYS if key in rules and rules[key].required]  # not those of lines
+    needed = [
+        key for key in KEYS if key in rules and rules[key].required
+    ]  # without those of line patterns
     assert shown.missing == set(needed)
     assert shown.problems == {}
     assert set(shown.values.values()) == {None}
@@ -59,13 +61,13 @@ def test_a_new_session_lacks_what_is_needed_and_is_drawn_with_the_dissertation_s
     assert bench.rig is not None
     assert bench.rig.laser.distance_mm == presenter.DEFAULTS["laser.distance_mm"]
     assert bench.words.startswith(presenter.NOT_ENTERED)
-    assert bench.rows == ()  # nothing is counted of a bench that is not the operator's
+    assert bench.rows == ()  # dots are not counted for a bench of default values
     assert presenter.rig(empty) is None
     presenter.put(empty, "laser.projection_angle_deg", 90)
     assert presenter.bench(empty).view is None
 
 
-def test_usual_values_fill_only_what_is_missing(empty: Session) -> None:
+def test_defaults_fill_only_missing_values(empty: Session) -> None:
     presenter.put(empty, "laser.distance_mm", 42.0)
     presenter.put_usual(empty)
     shown = presenter.shown(empty)
@@ -85,21 +87,21 @@ def test_every_quantity_has_a_field_for_its_uncertainty() -> None:
     assert keys == {one.sigma_key for one in QUANTITIES}
 
 
-def test_calibrations_make_a_setup_calibrated_and_edits_undo_that(empty: Session) -> None:
+def test_setup_is_calibrated_until_it_is_edited(empty: Session) -> None:
     empty.set_setup(read_setup(SAMPLES / "gtaw" / "setup.toml").text)
     assert empty.setup.rig.uncertainty.status == "entered"
     cross = [13.66, 13.7, 13.68], [18.52, 18.6, 18.56], [7.86, 7.9, 7.87]
-    found = empty.calibrate_laser(*cross)
+    laser = empty.calibrate_laser(*cross)
     assert empty.setup.rig.uncertainty.status == "entered"
     plane = empty.calibrate_plane(SAMPLES / "gtaw" / "calibration.png", 6.35)
     known = empty.setup.rig.uncertainty
     assert known.status == "calibrated"
     assert "calibrated" in presenter.shown(empty).status
-    assert known.sigma[INDEX["laser.distance_mm"]] == found.distance_sigma_mm
-    assert known.correlation[ANGLE, DISTANCE] == pytest.approx(found.correlation)
+    assert known.sigma[INDEX["laser.distance_mm"]] == laser.distance_sigma_mm
+    assert known.correlation[ANGLE, DISTANCE] == pytest.approx(laser.correlation)
     covariance = known.covariance[np.ix_(POINTS, POINTS)]
     np.testing.assert_allclose(covariance, plane.points_covariance_px2, rtol=1e-6, atol=1e-9)
-    # Another value is not what was calibrated.
+    # A changed value is no longer calibrated.
     presenter.put(empty, "laser.distance_mm", 31.0)
     changed = empty.setup.rig.uncertainty
     assert changed.status == "entered"
@@ -109,13 +111,13 @@ def test_calibrations_make_a_setup_calibrated_and_edits_undo_that(empty: Session
     empty.undo()
     assert empty.setup.rig.uncertainty.status == "calibrated"
     np.testing.assert_array_equal(empty.setup.rig.uncertainty.covariance, known.covariance)
-    # What no calibration found keeps the ± that was entered for it.
+    # Values without a calibration keep their entered ±.
     presenter.put(empty, "imaging_plane.distance_mm_sigma", 0.2)
     presenter.put(empty, "imaging_plane.distance_mm", 51.0)
     assert presenter.shown(empty).sigmas["imaging_plane.distance_mm_sigma"] == 0.2
 
 
-def test_what_cannot_be_is_said_at_its_field(empty: Session) -> None:
+def test_impossible_values_are_reported_at_their_field(empty: Session) -> None:
     empty.set_setup(read_setup(SAMPLES / "gtaw" / "setup.toml").text)
     presenter.put(empty, "laser.projection_angle_deg", 90)
     shown = presenter.shown(empty)
@@ -124,7 +126,7 @@ def test_what_cannot_be_is_said_at_its_field(empty: Session) -> None:
     assert "half the fan" in presenter.shown(empty).problems["laser.projection_angle_deg"]
 
 
-def test_the_bench_counts_what_comes_back(empty: Session) -> None:
+def test_bench_counts_the_reflected_dots(empty: Session) -> None:
     empty.set_setup(read_setup(SAMPLES / "gtaw" / "setup.toml").text)
     usual = presenter.bench(empty)
     assert "Usual pool: 5 × 6 mm, flat" in usual.words
@@ -140,7 +142,7 @@ def test_the_bench_counts_what_comes_back(empty: Session) -> None:
     assert "overhang" in presenter.bench(empty).words
 
 
-def test_a_tick_is_kept_with_its_time(empty: Session) -> None:
+def test_checked_item_is_stored_with_its_time(empty: Session) -> None:
     (first, _), (second, _), *_ = SAFETY
     empty.set_record(tick(empty.record, first, True, "2026-11-21T10:00:00+01:00"))
     empty.set_record(tick(empty.record, second, True, "2026-11-21T10:01:00+01:00"))
@@ -157,13 +159,13 @@ def test_a_tick_is_kept_with_its_time(empty: Session) -> None:
 def page(qtbot: QtBot, copy_sample: Callable[[str], Path]) -> Iterator[SetupPage]:
     workspace = Workspace()
     workspace.show(Session.open(copy_sample("gtaw")))
-    made = SetupPage(workspace)
-    KEPT.extend([workspace, made, made.panel])
-    workspace.changed.connect(lambda: made.refresh() if workspace.session else None)
-    made.refresh()
-    made.show()
-    made.panel.show()
-    yield made
+    setup_page = SetupPage(workspace)
+    KEPT.extend([workspace, setup_page, setup_page.panel])
+    workspace.changed.connect(lambda: setup_page.refresh() if workspace.session else None)
+    setup_page.refresh()
+    setup_page.show()
+    setup_page.panel.show()
+    yield setup_page
     workspace.close()
 
 
@@ -174,9 +176,7 @@ def retype(qtbot: QtBot, field, text: str) -> None:
     qtbot.keyClick(field.editor, Qt.Key.Key_Return)
 
 
-def test_an_edit_changes_the_session_and_the_drawing_and_is_undone(
-    qtbot: QtBot, page: SetupPage
-) -> None:
+def test_edit_changes_session_and_drawing_and_can_be_undone(qtbot: QtBot, page: SetupPage) -> None:
     session = page.workspace.session
     assert session is not None
     field = page.rig_fields["electrode.height_mm"]
@@ -189,7 +189,7 @@ def test_an_edit_changes_the_session_and_the_drawing_and_is_undone(
     assert page.bench.words.text() == words
 
 
-def test_an_uncertainty_is_entered_beside_its_value(qtbot: QtBot, page: SetupPage) -> None:
+def test_uncertainty_is_entered_beside_its_value(qtbot: QtBot, page: SetupPage) -> None:
     session = page.workspace.session
     assert session is not None
     field = page.sigma_fields["laser.distance_mm_sigma"]
@@ -202,7 +202,7 @@ def test_an_uncertainty_is_entered_beside_its_value(qtbot: QtBot, page: SetupPag
     assert session.setup.rig.uncertainty.sigma[DISTANCE] == 0.5
 
 
-def test_the_welding_direction_is_chosen(page: SetupPage) -> None:
+def test_welding_direction_can_be_chosen(page: SetupPage) -> None:
     session = page.workspace.session
     assert session is not None
     page.travel.edited.emit("-y")
@@ -212,7 +212,7 @@ def test_the_welding_direction_is_chosen(page: SetupPage) -> None:
     assert session.setup.rig.travel == "+y"
 
 
-def test_the_grid_of_dots_is_chosen(page: SetupPage) -> None:
+def test_dot_pattern_can_be_chosen(page: SetupPage) -> None:
     session = page.workspace.session
     assert session is not None
     page.kind.edited.emit("hexagonal")
@@ -220,7 +220,7 @@ def test_the_grid_of_dots_is_chosen(page: SetupPage) -> None:
     assert page.kind.value() == "hexagonal"
     page.workspace.undo()
     assert session.setup.rig.pattern.kind == "square"
-    # Measured rays come with a setup file; another grid has none of them.
+    # Measured rays come from a setup file; other patterns have none.
     assert page.pattern.accessibleDescription().startswith("360 rays")
     page.kind.edited.emit("directions")
     assert any("pattern.rays" in words for words in presenter.shown(session).others)
@@ -234,7 +234,7 @@ def test_the_grid_of_dots_is_chosen(page: SetupPage) -> None:
     assert len(session.setup.rig.pattern.measured) == len(GRID)
 
 
-def test_a_refusal_stays_while_other_fields_are_accepted(
+def test_problem_of_a_field_stays_while_others_are_accepted(
     qtbot: QtBot, page: SetupPage, copy_sample: Callable[[str], Path]
 ) -> None:
     session = page.workspace.session
@@ -243,11 +243,11 @@ def test_a_refusal_stays_while_other_fields_are_accepted(
         page.rig_fields[key] for key in ("laser.projection_angle_deg", "electrode.height_mm")
     )
     retype(qtbot, angle, "400")
-    told = angle.problem.text()
-    assert "0 to 90" in told
+    message = angle.problem.text()
+    assert "0 to 90" in message
     retype(qtbot, height, "1,5")
     assert session.setup.rig.electrode.height_mm == 1.5
-    assert (angle.problem.text(), angle.problem.isHidden()) == (told, False)
+    assert (angle.problem.text(), angle.problem.isHidden()) == (message, False)
     retype(qtbot, height, "x")
     retype(qtbot, angle, "30")
     assert angle.problem.isHidden()
@@ -256,7 +256,7 @@ def test_a_refusal_stays_while_other_fields_are_accepted(
     assert height.problem.isHidden()
 
 
-def test_an_emptied_field_is_marked(qtbot: QtBot, page: SetupPage) -> None:
+def test_cleared_field_is_marked(qtbot: QtBot, page: SetupPage) -> None:
     field = page.rig_fields["laser.distance_mm"]
     field.editor.clear()
     field.flush()
@@ -271,7 +271,7 @@ def test_an_emptied_field_is_marked(qtbot: QtBot, page: SetupPage) -> None:
 
 
 @pytest.mark.parametrize("key", list(DRAWN))
-def test_a_dimension_is_entered_in_the_drawing_which_follows(
+def test_dimension_entered_in_the_drawing_updates_it(
     qtbot: QtBot, page: SetupPage, key: str
 ) -> None:
     session = page.workspace.session
@@ -294,30 +294,30 @@ def test_a_dimension_is_entered_in_the_drawing_which_follows(
     assert box.field.value() == value
 
 
-def test_no_field_of_the_drawing_lies_on_another_or_on_the_torch(page: SetupPage) -> None:
+def test_fields_of_the_drawing_do_not_overlap(page: SetupPage) -> None:
     for size in ((560, 400), (900, 640)):
         page.bench.resize(*size)
         let_draw()
         for plot in (page.bench.whole, page.bench.top):
             boxes = [each for each in page.bench.boxes.values() if each.plot is plot]
             assert all(plot.rect().contains(each.geometry()) for each in boxes)
-            lying = [*(each.geometry() for each in boxes), *page.bench.obstacles(plot)]
-            pairs = itertools.combinations(lying, 2)
-            drawn = set(map(id, lying[len(boxes) :]))
+            areas = [*(each.geometry() for each in boxes), *page.bench.obstacles(plot)]
+            pairs = itertools.combinations(areas, 2)
+            obstacles = set(map(id, areas[len(boxes) :]))
             assert not any(
-                a.intersects(b) for a, b in pairs if not (id(a) in drawn and id(b) in drawn)
+                a.intersects(b) for a, b in pairs if not (id(a) in obstacles and id(b) in obstacles)
             )
 
 
-def test_on_a_small_canvas_the_fields_are_below_the_drawing(qtbot: QtBot, page: SetupPage) -> None:
+def test_fields_are_below_the_drawing_on_a_small_canvas(qtbot: QtBot, page: SetupPage) -> None:
     bench = page.bench
     bench.resize(390, 300)
     let_draw()
-    below = max(plot.geometry().bottom() for plot in (bench.whole, bench.top))
+    bottom = max(plot.geometry().bottom() for plot in (bench.whole, bench.top))
     for box in bench.boxes.values():
         place = QRect(box.mapTo(bench, QPoint()), box.size())
         assert bench.rect().contains(place)
-        assert place.top() > below
+        assert place.top() > bottom
     letter = next(
         each
         for each in bench.top.items()
@@ -334,7 +334,7 @@ def test_on_a_small_canvas_the_fields_are_below_the_drawing(qtbot: QtBot, page: 
     assert all(box.parent() is box.plot and box.isVisible() for box in bench.boxes.values())
 
 
-def test_record_and_ticks_by_hand(qtbot: QtBot, page: SetupPage) -> None:
+def test_record_and_checklist_are_edited_by_hand(qtbot: QtBot, page: SetupPage) -> None:
     session = page.workspace.session
     assert session is not None
     retype(qtbot, page.record_fields["operator"], "Ada")
@@ -352,20 +352,20 @@ def test_record_and_ticks_by_hand(qtbot: QtBot, page: SetupPage) -> None:
     assert "0/7" in page.tabs.tabText(1)
 
 
-def test_a_wrong_file_is_refused_in_words(page: SetupPage, tmp_path: Path) -> None:
-    said: list[tuple[str, bool]] = []
-    page.workspace.notified.connect(lambda words, problem: said.append((words, problem)))
+def test_invalid_setup_file_is_rejected(page: SetupPage, tmp_path: Path) -> None:
+    messages: list[tuple[str, bool]] = []
+    page.workspace.notified.connect(lambda words, problem: messages.append((words, problem)))
     bad = tmp_path / "bad.toml"
     bad.write_text("no = [")
     page.load(bad)
-    assert said[-1][1]
-    assert "bad.toml" in said[-1][0]
+    assert messages[-1][1]
+    assert "bad.toml" in messages[-1][0]
     page.save(tmp_path / "good.toml")
-    assert not said[-1][1]
+    assert not messages[-1][1]
     assert page.answer.text().endswith("good.toml")
 
 
-def test_a_setup_file_comes_in_and_goes_out(page: SetupPage, tmp_path: Path) -> None:
+def test_setup_file_is_loaded_and_saved(page: SetupPage, tmp_path: Path) -> None:
     session = page.workspace.session
     assert session is not None
     presenter.put(session, "imaging_plane.pitch_deg", 2.5)
@@ -383,7 +383,7 @@ def test_a_setup_file_comes_in_and_goes_out(page: SetupPage, tmp_path: Path) -> 
     assert "can be written" in page.answer.text()
 
 
-def test_every_control_has_a_name_and_says_what_it_does(page: SetupPage) -> None:
+def test_every_control_has_a_name_and_a_tooltip(page: SetupPage) -> None:
     for field in (*page.rig_fields.values(), *page.record_fields.values()):
         assert field.editor.accessibleName()
         assert field.editor.toolTip()
@@ -391,7 +391,7 @@ def test_every_control_has_a_name_and_says_what_it_does(page: SetupPage) -> None
         assert box.toolTip()
 
 
-def test_a_tab_is_no_higher_than_what_it_holds(page: SetupPage) -> None:
+def test_tabs_are_as_tall_as_their_content(page: SetupPage) -> None:
     heights = []
     for number in range(page.tabs.count()):
         page.tabs.setCurrentIndex(number)
@@ -399,28 +399,28 @@ def test_a_tab_is_no_higher_than_what_it_holds(page: SetupPage) -> None:
     assert max(heights[:2]) < heights[2]
 
 
-def ink(view: PatternView) -> np.ndarray:
-    """Mask of the pixels of the drawing that are not background, shape (height, width)."""
+def drawn_pixels(view: PatternView) -> np.ndarray:
+    """Mask of the foreground pixels of the drawing, shape (height, width)."""
     image = view.grab().toImage().convertToFormat(QImage.Format.Format_Grayscale8)
     grey = np.array(image.bits(), np.uint8).reshape(image.height(), image.bytesPerLine())
     return grey[:, : image.width()] != grey[0, 0]
 
 
-def test_the_pattern_is_drawn_with_its_absent_rays_and_its_rotation(qtbot: QtBot) -> None:
+def test_pattern_drawing_shows_absent_rays_and_rotation(qtbot: QtBot) -> None:
     view = PatternView()
     qtbot.addWidget(view)
     view.resize(132, 132)
     view.show_pattern(DotPattern(5, 5, 1.0), "")
-    dots, holes = label(ink(view))[1], label(~ink(view))[1]
-    assert (dots, holes) == (25, 2)  # the ring of the centre has a hole of its own
+    dots, holes = label(drawn_pixels(view))[1], label(~drawn_pixels(view))[1]
+    assert (dots, holes) == (25, 2)  # the ring at the centre has a hole, too
     view.show_pattern(DotPattern(5, 5, 1.0, absent=frozenset({(3, 3), (1, 5)})), "")
-    assert label(~ink(view))[1] == 3
+    assert label(~drawn_pixels(view))[1] == 3
     view.show_pattern(DotPattern(21, 21, 0.72, kind="hexagonal"), "")
-    assert not ink(view)[:20, :20].any()
+    assert not drawn_pixels(view)[:20, :20].any()
     view.show_pattern(LineRays.of(LinePattern(5, 0.5, 5.0)), "")
-    rows, columns = np.nonzero(ink(view))
-    assert label(ink(view))[1] == 5
+    rows, columns = np.nonzero(drawn_pixels(view))
+    assert label(drawn_pixels(view))[1] == 5
     assert np.ptp(columns) > np.ptp(rows)
     view.show_pattern(LineRays.of(LinePattern(5, 0.5, 5.0, rotation_deg=30.0)), "")
-    rows, columns = np.nonzero(ink(view))
+    rows, columns = np.nonzero(drawn_pixels(view))
     assert rows[columns.argmin()] > rows[columns.argmax()]  # rows rise with X

@@ -37,7 +37,7 @@ from tests.waiting import PATIENCE_S
 
 
 class OneThread(ThreadPoolExecutor):
-    """Measures in place of processes, which take seconds to start."""
+    """Replaces the pool of processes, which takes seconds to start."""
 
     _processes: ClassVar[dict[int, object]] = {}
 
@@ -47,44 +47,44 @@ def page(qapp: QApplication, copy_sample: CopySample) -> SurfacePage:
     """The page beside its panel, as in the window, with the GTAW sample."""
     workspace = Workspace()
     workspace._pool = OneThread(1)
-    made = SurfacePage(workspace)
-    whole, panel = QSplitter(), QScrollArea()
+    surface_page = SurfacePage(workspace)
+    splitter, panel = QSplitter(), QScrollArea()
     panel.setWidgetResizable(True)
-    panel.setWidget(made.panel)
-    for widget in (made, panel):
-        whole.addWidget(widget)
-    whole.resize(1180, 560)
-    whole.setSizes([880, 300])
-    KEPT.append(whole)
-    workspace.changed.connect(lambda: made.refresh() if workspace.session else None)
-    workspace.frame_changed.connect(lambda _: made.refresh())
+    panel.setWidget(surface_page.panel)
+    for widget in (surface_page, panel):
+        splitter.addWidget(widget)
+    splitter.resize(1180, 560)
+    splitter.setSizes([880, 300])
+    KEPT.append(splitter)
+    workspace.changed.connect(lambda: surface_page.refresh() if workspace.session else None)
+    workspace.frame_changed.connect(lambda _: surface_page.refresh())
     workspace.show(Session.open(copy_sample("gtaw")))
-    whole.show()
-    yield made
-    made.leave()
-    whole.close()
+    splitter.show()
+    yield surface_page
+    surface_page.leave()
+    splitter.close()
     workspace.close()
 
 
-def told(page: SurfacePage) -> list[tuple[str, bool]]:
-    said: list[tuple[str, bool]] = []
-    page.workspace.notified.connect(lambda words, bad: said.append((words, bad)))
-    return said
+def record_messages(page: SurfacePage) -> list[tuple[str, bool]]:
+    messages: list[tuple[str, bool]] = []
+    page.workspace.notified.connect(lambda words, bad: messages.append((words, bad)))
+    return messages
 
 
-def test_it_shows_the_frame_in_view(page: SurfacePage, qtbot: QtBot) -> None:
+def test_current_frame_is_shown(page: SurfacePage, qtbot: QtBot) -> None:
     first = page.side.sizes.item(0, 1).text()
     assert page.side.status.text().startswith("✓ Measured.")
     page.workspace.show_frame(7)
     assert page.side.sizes.item(0, 1).text() != first
     assert page.side.provenance.text().startswith("Frame 7 · Fit")
     boundary = page.workspace.session.result(7).measurement.reconstruction.boundary
-    # Charts follow when frames no longer rush by.
+    # Charts are updated after the last of rapid frame changes.
     x = boundary.points_mm[:, 0]
     qtbot.waitUntil(lambda: np.array_equal(page.plan._outline.getData()[0][:-1], x))
 
 
-def test_choosing_a_scheme_is_a_step_that_can_be_undone(page: SurfacePage) -> None:
+def test_choice_of_scheme_can_be_undone(page: SurfacePage) -> None:
     session = page.workspace.session
     page.side.scheme.edited.emit("irs-epa-r")
     assert (session.settings.scheme, session.settings.algorithm) == ("irs", "epa-r")
@@ -98,7 +98,7 @@ def test_choosing_a_scheme_is_a_step_that_can_be_undone(page: SurfacePage) -> No
     assert page.view.scene is not None
 
 
-def test_what_is_stale_can_be_measured_again(page: SurfacePage, qtbot: QtBot) -> None:
+def test_outdated_frame_can_be_measured_again(page: SurfacePage, qtbot: QtBot) -> None:
     assert page.side.again.isHidden()
     page.side.correspondence.edited.emit("S/S")
     assert page.side.status.text().startswith("⟳ These figures are out of date")
@@ -116,7 +116,7 @@ def test_what_is_stale_can_be_measured_again(page: SurfacePage, qtbot: QtBot) ->
     assert page.workspace.session.result(1).stale
 
 
-def test_measuring_can_be_watched_and_cancelled(
+def test_measuring_shows_progress_and_can_be_cancelled(
     page: SurfacePage, qtbot: QtBot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     cancelled = threading.Event()
@@ -140,7 +140,7 @@ def test_measuring_can_be_watched_and_cancelled(
     assert page.side.all.isEnabled()
 
 
-def test_buttons_say_why_they_are_off(page: SurfacePage) -> None:
+def test_disabled_buttons_give_the_reason(page: SurfacePage) -> None:
     page.workspace.attempt(lambda session: session.update_setup({"laser": {"distance_mm": None}}))
     assert not page.side.one.isEnabled()
     assert "The set-up is not complete. Enter distance of the laser" in page.side.one.toolTip()
@@ -148,7 +148,7 @@ def test_buttons_say_why_they_are_off(page: SurfacePage) -> None:
     assert page.side.one.isEnabled()
 
 
-def test_the_section_line_is_dragged(page: SurfacePage) -> None:
+def test_section_line_can_be_dragged(page: SurfacePage) -> None:
     line = page.plan._line
     a, b = line.getHandles()
     line.movePoint(a, QPointF(-3.0, 1.0), coords="parent")
@@ -160,12 +160,12 @@ def test_the_section_line_is_dragged(page: SurfacePage) -> None:
     known = np.isfinite(cut.height_mm)
     np.testing.assert_array_equal(along, cut.along_mm[known])
     np.testing.assert_array_equal(height, cut.height_mm[known])
-    # The ends stay where the hand has put them.
+    # The ends stay where they were dragged to.
     ends = [line.mapToParent(handle.pos()) for handle in line.getHandles()]
     assert [(end.x(), end.y()) for end in ends] == [(-3.0, 1.0), (3.0, 1.0)]
 
 
-def test_the_section_is_typed(page: SurfacePage) -> None:
+def test_section_can_be_typed(page: SurfacePage) -> None:
     page.angle.edited.emit(page.angle.set_value(30.0))
     assert page.options.section == (30.0, 0.0)
     a, b = (page.plan._line.mapToParent(handle.pos()) for handle in page.plan._line.getHandles())
@@ -178,19 +178,19 @@ def test_the_section_is_typed(page: SurfacePage) -> None:
 
 
 def button(page: QWidget, words: str) -> QAbstractButton:
-    (found,) = [each for each in page.findChildren(QAbstractButton) if each.text() == words]
-    return found
+    (match,) = [each for each in page.findChildren(QAbstractButton) if each.text() == words]
+    return match
 
 
-def test_what_the_view_shows_is_ticked(page: SurfacePage) -> None:
+def test_parts_of_the_view_can_be_toggled(page: SurfacePage) -> None:
     assert page.view.scene.rays_mm == {}
     page.parts["rays"].trigger()
     assert len(page.view.scene.rays_mm["reflected"]) == len(page.view.scene.points_mm)
     page.parts["points"].trigger()
     assert len(page.view.scene.points_mm) == 0
-    own = page.view.scene.limits
+    frame_limits = page.view.scene.limits
     page.parts["same_colours"].trigger()
-    assert page.view.scene.limits[1] > own[1]
+    assert page.view.scene.limits[1] > frame_limits[1]
     page.colour.edited.emit("sigma")
     assert page.view.scene.label == "± height (mm)"
     page.high.edited.emit(5.0)
@@ -200,8 +200,8 @@ def test_what_the_view_shows_is_ticked(page: SurfacePage) -> None:
 
 
 @pytest.mark.usefixtures("opengl")
-def test_the_picture_is_copied_and_written(page: SurfacePage, tmp_path: Path) -> None:
-    said = told(page)
+def test_picture_is_copied_and_saved(page: SurfacePage, tmp_path: Path) -> None:
+    messages = record_messages(page)
     page.grab()
     button(page, "Top").click()
     page.copy_picture()
@@ -216,11 +216,11 @@ def test_the_picture_is_copied_and_written(page: SurfacePage, tmp_path: Path) ->
         assert written.width() == round(60 / 25.4 * 150)
         assert written.dotsPerMeterX() == pytest.approx(150 / 0.0254, rel=0.01)
     page.write_picture(tmp_path / "nowhere" / "pool.png")
-    assert [bad for _, bad in said] == [False, False, False, False, True]
+    assert [bad for _, bad in messages] == [False, False, False, False, True]
 
 
 @pytest.mark.usefixtures("opengl")
-def test_a_film_is_seen_as_the_view_is(page: SurfacePage, tmp_path: Path, qtbot: QtBot) -> None:
+def test_film_uses_the_camera_of_the_view(page: SurfacePage, tmp_path: Path, qtbot: QtBot) -> None:
     page.grab()
     page.view.turn(40, 10)
     page.write_film(tmp_path / "pool")
@@ -229,15 +229,17 @@ def test_a_film_is_seen_as_the_view_is(page: SurfacePage, tmp_path: Path, qtbot:
         frames = [frame.to_ndarray(format="rgb24") for frame in film.decode(video=0)]
     assert len(frames) == len(page.session.frames)
     turned = Studio(FILM_PX, page.view.camera).draw(page.view.scene)
-    usual = Studio(FILM_PX, "free").draw(page.view.scene)
+    default_view = Studio(FILM_PX, "free").draw(page.view.scene)
     first = frames[0][..., ::-1].astype(int)
-    ground = [(picture.astype(int) != picture[0, -1]).any(axis=2) for picture in (turned, usual)]
+    foregrounds = [
+        (picture.astype(int) != picture[0, -1]).any(axis=2) for picture in (turned, default_view)
+    ]
     drawn = (np.abs(first - 255) > 60).any(axis=2)
-    agree = [(drawn & one).sum() / (drawn | one).sum() for one in ground]
-    assert agree[0] > agree[1]
+    overlaps = [(drawn & one).sum() / (drawn | one).sum() for one in foregrounds]
+    assert overlaps[0] > overlaps[1]
 
 
-def test_heights_are_drawn_true_or_as_high_as_before(page: SurfacePage) -> None:
+def test_true_scale_toggles_the_exaggeration(page: SurfacePage) -> None:
     page.high.set_value(5.0)
     page.high.edited.emit(5.0)
     page.true_scale.click()
@@ -248,7 +250,7 @@ def test_heights_are_drawn_true_or_as_high_as_before(page: SurfacePage) -> None:
 
 
 @pytest.mark.usefixtures("opengl")
-def test_a_point_read_off_has_the_height_and_its_sigma(page: SurfacePage) -> None:
+def test_point_reading_has_height_and_sigma(page: SurfacePage) -> None:
     page.grab()
     page.view.look("top")
     page.grab()
@@ -264,11 +266,11 @@ def test_a_point_read_off_has_the_height_and_its_sigma(page: SurfacePage) -> Non
 
 
 @pytest.mark.usefixtures("opengl")
-def test_a_key_saves_the_picture(
+def test_shortcut_saves_the_picture(
     page: SurfacePage, qtbot: QtBot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     chosen = str(tmp_path / "pool.png")
-    monkeypatch.setattr(QFileDialog, "getSaveFileName", lambda *given: (chosen, "PNG"))
+    monkeypatch.setattr(QFileDialog, "getSaveFileName", lambda *args: (chosen, "PNG"))
     monkeypatch.setattr(PaperDialog, "exec", lambda _: PaperDialog.DialogCode.Accepted)
     page.activateWindow()
     qtbot.waitUntil(page.isActiveWindow)
@@ -279,11 +281,11 @@ def test_a_key_saves_the_picture(
 
 
 @pytest.mark.usefixtures("opengl")
-def test_two_schemes_stand_side_by_side(page: SurfacePage, qtbot: QtBot) -> None:
+def test_two_schemes_are_shown_side_by_side(page: SurfacePage, qtbot: QtBot) -> None:
     page.comparing.click()
     compare = page.compare
     assert (compare.first.choice.value(), compare.second.choice.value()) == ("fit", "ers")
-    qtbot.waitUntil(lambda: compare.table.rowCount() == 11)  # ers tells its own ARE besides
+    qtbot.waitUntil(lambda: compare.table.rowCount() == 11)  # ERS also gives its own ARE
     page.grab()
     first, second, difference = compare.views
     assert difference.scene.colour_map == DIFFERENCE_MAP
@@ -306,7 +308,7 @@ def test_two_schemes_stand_side_by_side(page: SurfacePage, qtbot: QtBot) -> None
     assert page.view.scene is not None
 
 
-def test_a_narrow_canvas_shows_one_part_at_a_time(page: SurfacePage) -> None:
+def test_narrow_canvas_shows_one_part_at_a_time(page: SurfacePage) -> None:
     page.resize(420, 500)
     assert page.canvas_parts.isVisibleTo(page)
     assert page.view.isVisibleTo(page)
@@ -315,12 +317,12 @@ def test_a_narrow_canvas_shows_one_part_at_a_time(page: SurfacePage) -> None:
     assert not page.view.isVisibleTo(page)
     assert page.plan.isVisibleTo(page)
     page.comparing.click()
-    seen = page.compare
-    assert seen.first.view.isVisibleTo(page)
-    assert not seen.second.view.isVisibleTo(page)
-    seen.parts.setCurrentIndex(3)
-    assert seen.table.isVisibleTo(page)
-    assert not any(view.isVisibleTo(page) for view in seen.views)
+    compare = page.compare
+    assert compare.first.view.isVisibleTo(page)
+    assert not compare.second.view.isVisibleTo(page)
+    compare.parts.setCurrentIndex(3)
+    assert compare.table.isVisibleTo(page)
+    assert not any(view.isVisibleTo(page) for view in compare.views)
     page.comparing.click()
     page.resize(1400, 900)
     assert not page.canvas_parts.isVisibleTo(page)
@@ -328,24 +330,24 @@ def test_a_narrow_canvas_shows_one_part_at_a_time(page: SurfacePage) -> None:
     assert page.dots.isVisibleTo(page)
 
 
-def test_every_control_can_be_named_and_reached(page: SurfacePage) -> None:
+def test_every_control_has_a_name_and_can_be_focused(page: SurfacePage) -> None:
     for each in (*page.findChildren(QAbstractButton), *page.panel.findChildren(QAbstractButton)):
         if each.isVisibleTo(page) or each.isVisibleTo(page.panel):
             if not each.text():
-                continue  # of a spin box or a header
+                continue  # part of a spin box or a header
             assert each.toolTip(), each.text()
-            spoken = QAccessible.queryAccessibleInterface(each)
+            interface = QAccessible.queryAccessibleInterface(each)
             for part in (QAccessible.Text.Name, QAccessible.Text.Description):
-                assert spoken.text(part), each.text()
+                assert interface.text(part), each.text()
             assert each.focusPolicy() & Qt.FocusPolicy.TabFocus, each.text()
 
 
-def test_the_panel_fits_its_place(page: SurfacePage) -> None:
+def test_panel_fits_300_px(page: SurfacePage) -> None:
     page.side.again.show()
     assert page.panel.minimumSizeHint().width() <= 300
 
 
-def test_a_chart_shows_the_values_under_the_pointer_and_is_saved(
+def test_chart_shows_values_at_the_pointer_and_can_be_saved(
     page: SurfacePage, qtbot: QtBot, tmp_path: Path
 ) -> None:
     chart = page.profile
@@ -359,9 +361,9 @@ def test_a_chart_shows_the_values_under_the_pointer_and_is_saved(
         assert write_plot(tmp_path / name, chart, chart.plot, Paper(80, 150))
     assert chart.palette() == dark
     svg = (tmp_path / "chart.svg").read_text("utf-8")
-    wide = re.search(r'<svg width="([\d.]+)mm"', svg)
-    assert wide is not None
-    assert float(wide[1]) == pytest.approx(80, abs=0.3)  # a pixel
+    width = re.search(r'<svg width="([\d.]+)mm"', svg)
+    assert width is not None
+    assert float(width[1]) == pytest.approx(80, abs=0.3)  # within a pixel
     assert "<path" in svg
     assert "<image" not in svg
     assert QImage(str(tmp_path / "chart.png")).width() == Paper(80, 150).width_px

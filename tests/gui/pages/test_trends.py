@@ -1,4 +1,4 @@
-"""Trends: what is shown of a session, and the page that shows it."""
+"""The trends page and its presenter."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def logged(start_s: float = 0.0) -> Signals:
     return Signals("log.csv", time_s, 75 + time_s, np.full(len(time_s), np.nan), start_s)
 
 
-def test_the_course_of_the_sample(gtaw: Path) -> None:
+def test_trends_of_the_sample(gtaw: Path) -> None:
     with Session.open(gtaw) as session:
         shown = show(session, TrendOptions())
     assert [curve.name for curve in shown.curves] == ["Width", "Length", "Height", "ARE"]
@@ -45,7 +45,7 @@ def test_the_course_of_the_sample(gtaw: Path) -> None:
     assert shown.signals_words.startswith("None.")
 
 
-def test_marks_say_how_frames_stand(copy_sample) -> None:
+def test_marks_show_the_status_of_frames(copy_sample) -> None:
     with Session.open(copy_sample("blocked_rows")) as session:
         curve = show(session, TrendOptions()).curves[0]
         assert dict(zip(curve.key.tolist(), curve.mark.tolist(), strict=True))[2] == CORRECTED
@@ -59,7 +59,7 @@ def test_marks_say_how_frames_stand(copy_sample) -> None:
         assert "3 out of date" in shown.words
 
 
-def test_the_spectrum_is_told_or_why_there_is_none(gtaw: Path, copy_sample) -> None:
+def test_spectrum_is_shown_or_its_absence_explained(gtaw: Path, copy_sample) -> None:
     with Session.open(gtaw) as session:
         shown = show(session, TrendOptions(spectrum_of="height_mm"))
         assert len(shown.spectrum[0].x) == 15
@@ -72,7 +72,7 @@ def test_the_spectrum_is_told_or_why_there_is_none(gtaw: Path, copy_sample) -> N
         assert shown.axis.unit == ""  # a folder of pictures has no times
 
 
-def test_current_is_shown_while_the_recording_runs(gtaw: Path, copy_sample) -> None:
+def test_current_is_limited_to_the_time_of_the_recording(gtaw: Path, copy_sample) -> None:
     with Session.open(gtaw) as session:
         session.set_signals(logged())
         current = show(session, TrendOptions()).curves[-1]
@@ -113,7 +113,7 @@ def page(qtbot: QtBot, gtaw: Path) -> TrendsPage:
     workspace.close()
 
 
-def test_keys_on_the_plots_go_to_frames(page: TrendsPage) -> None:
+def test_keys_on_the_plots_select_frames(page: TrendsPage) -> None:
     page.plots.setFocus()
     QTest.keyClick(page.plots, Qt.Key.Key_Right)
     QTest.keyClick(page.plots, Qt.Key.Key_Right)
@@ -121,7 +121,7 @@ def test_keys_on_the_plots_go_to_frames(page: TrendsPage) -> None:
     assert page.plots.read_out.text().startswith("Frame 2, 0.0333 s: Width")
 
 
-def test_ticking_a_measure_shows_it(page: TrendsPage) -> None:
+def test_checked_measures_are_shown(page: TrendsPage) -> None:
     assert len(page.plots.curves) == 4
     QTest.keyClick(page._boxes["volume_mm3"], Qt.Key.Key_Space)
     assert [curve.name for curve in page.plots.curves][-2:] == ["Volume", "ARE"]
@@ -130,7 +130,7 @@ def test_ticking_a_measure_shows_it(page: TrendsPage) -> None:
     assert page.nothing.isVisibleTo(page)
 
 
-def test_the_spectrum_comes_and_goes(page: TrendsPage) -> None:
+def test_spectrum_can_be_shown_and_hidden(page: TrendsPage) -> None:
     page.of.set_value("height_mm")
     page.of.edited.emit("height_mm")
     assert page.spectrum.isVisibleTo(page)
@@ -138,17 +138,17 @@ def test_the_spectrum_comes_and_goes(page: TrendsPage) -> None:
     assert not page.spectrum.isVisibleTo(page)
 
 
-def test_a_table_is_read_kept_moved_and_undone(
+def test_table_is_loaded_stored_shifted_and_undone(
     page: TrendsPage, qtbot: QtBot, tmp_path: Path
 ) -> None:
-    said: list[tuple[str, bool]] = []
-    page.workspace.notified.connect(lambda words, problem: said.append((words, problem)))
+    messages: list[tuple[str, bool]] = []
+    page.workspace.notified.connect(lambda words, problem: messages.append((words, problem)))
     table = tmp_path / "log.csv"
     table.write_text("time_s,current_a\n0,75\n0.2,x\n")
     page.read_signals(table)
-    qtbot.waitUntil(lambda: bool(said))
-    assert "line 3, current_a: x" in said[0][0]
-    assert said[0][1]
+    qtbot.waitUntil(lambda: bool(messages))
+    assert "line 3, current_a: x" in messages[0][0]
+    assert messages[0][1]
     table.write_text("time_s,current_a\n0,75\n0.2,80\n0.4,70\n")
     page.read_signals(table)
     qtbot.waitUntil(lambda: len(page.plots.curves) == 5)
@@ -164,7 +164,7 @@ def test_a_table_is_read_kept_moved_and_undone(
     assert len(page.plots.curves) == 4
 
 
-def test_every_control_has_a_name_and_a_tip(page: TrendsPage) -> None:
+def test_every_control_has_a_tooltip(page: TrendsPage) -> None:
     from PySide6.QtWidgets import QAbstractButton
 
     for button in page.panel.findChildren(QAbstractButton):
@@ -172,7 +172,7 @@ def test_every_control_has_a_name_and_a_tip(page: TrendsPage) -> None:
             assert button.toolTip(), button.text()
 
 
-def test_the_axis_holds_frames_without_a_surface(copy_sample) -> None:
+def test_axis_includes_frames_without_a_surface(copy_sample) -> None:
     with Session.open(copy_sample("blocked_rows")) as session:
         shown = show(session, TrendOptions())
     assert shown.curves[0].x.max() < shown.places[5] == 5.0
