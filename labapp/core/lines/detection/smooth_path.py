@@ -8,6 +8,9 @@ import numpy as np
 
 from labapp.core.values import BoolArray, FloatArray, ReadOnlyArrays
 
+LEAST_SPEED = 1e-3
+"""Least change of the position for a step of 1 px along a path, px."""
+
 
 @dataclass(frozen=True)
 class SmoothPath(ReadOnlyArrays):
@@ -43,7 +46,8 @@ class SmoothPath(ReadOnlyArrays):
     @classmethod
     def _of(cls, fit: tuple[FloatArray, FloatArray, FloatArray], seen: BoolArray) -> SmoothPath:
         place, slope, bend = fit
-        speed = np.linalg.norm(slope, axis=-1)
+        # A path that collapses to a point has no direction; its values must be finite.
+        speed = np.maximum(np.linalg.norm(slope, axis=-1), LEAST_SPEED)
         turn = slope[:, 0] * bend[:, 1] - slope[:, 1] * bend[:, 0]
         return cls(place, slope / speed[:, None], turn / speed**3, seen)
 
