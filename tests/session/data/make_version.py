@@ -1,4 +1,4 @@
-"""A small session with something of everything, as the labapp of its day wrote it.
+"""A small session with every kind of content, as written by labapp of its version.
 
 Run as a program, it writes ``version_N.labsession`` for the present version of the session file:
 once a version, before the version is raised, and never again.
