@@ -46,8 +46,8 @@ def pool() -> Reconstruction:
 
 def dots(count: int) -> Dots:
     """Dots 20 px apart from (10, 20) on."""
-    same = (np.full(count, value) for value in (20.0, 0.1, 0.2, 2.0, 40.0, 9.0))
-    return Dots(10 + 20.0 * np.arange(count), *same)
+    equal = (np.full(count, value) for value in (20.0, 0.1, 0.2, 2.0, 40.0, 9.0))
+    return Dots(10 + 20.0 * np.arange(count), *equal)
 
 
 @pytest.fixture
@@ -98,5 +98,5 @@ def calibration() -> ImageCalibration:
 
 @pytest.fixture
 def writer(calibration: ImageCalibration) -> Callable[[Path], ResultsWriter]:
-    """Open results in a folder."""
+    """Open a writer of results in a folder."""
     return lambda folder: ResultsWriter(folder, calibration, {"source": {"path": "v.avi"}})
