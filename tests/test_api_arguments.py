@@ -41,7 +41,7 @@ def session(tmp_path: Path) -> labapp.Session:
 
 
 @pytest.mark.parametrize(
-    ("field", "arguments"),
+    ("field", "given"),
     [
         ("source", {"source": 5}),
         ("source", {"source": [[1, 2]]}),
@@ -57,9 +57,9 @@ def session(tmp_path: Path) -> labapp.Session:
         ("progress", {"progress": 3}),
     ],
 )
-def test_measure_names_the_argument(field: str, arguments: dict[str, Any]) -> None:
-    source, setup = arguments.pop("source", RECORDING), arguments.pop("setup", SETUP)
-    error = error_of(lambda: labapp.measure(source, setup, **arguments))
+def test_measure_names_the_argument(field: str, given: dict[str, Any]) -> None:
+    source, setup = given.pop("source", RECORDING), given.pop("setup", SETUP)
+    error = error_of(lambda: labapp.measure(source, setup, **given))
     assert error.field == field
     assert "--" not in str(error)  # no option of the command line
 

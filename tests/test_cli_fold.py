@@ -50,7 +50,7 @@ def test_mirroring_twice_restores_the_plane(setup: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("mirror", "option"),
+    ("given", "option"),
     [
         (["--point", "0", "-30", "20", "--normal", "0", "0", "0"], "--normal"),
         (["--point", "nan", "-30", "20", "--normal", "0", "1", "0"], "--point"),
@@ -59,9 +59,9 @@ def test_mirroring_twice_restores_the_plane(setup: Path) -> None:
         ([*MIRROR, "--tilt-sigma", "-1"], "--tilt-sigma"),
     ],
 )
-def test_impossible_mirror_is_rejected(setup: Path, mirror: list[str], option: str) -> None:
+def test_impossible_mirror_is_rejected(setup: Path, given: list[str], option: str) -> None:
     before = setup.read_text("utf-8")
-    result = CliRunner().invoke(app, ["calibrate", "fold", "--setup", str(setup), *mirror, "--use"])
+    result = CliRunner().invoke(app, ["calibrate", "fold", "--setup", str(setup), *given, "--use"])
     assert result.exit_code != 0
     assert option in (result.output + str(result.exception))
     assert setup.read_text("utf-8") == before

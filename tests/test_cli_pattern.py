@@ -48,7 +48,7 @@ def test_rendered_plates_determine_the_rays(setup: Path, tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    "pictures",
+    "given",
     [
         ["a.png", "--height", "0"],
         ["a.png", "b.png", "--height", "0"],
@@ -56,8 +56,8 @@ def test_rendered_plates_determine_the_rays(setup: Path, tmp_path: Path):
         ["a.png", "b.png", "--height", "0", "--height", "nan"],
     ],
 )
-def test_two_different_heights_are_required(setup: Path, pictures: list[str]):
+def test_two_different_heights_are_required(setup: Path, given: list[str]):
     options = ["--setup", str(setup), "--out", str(setup.parent / "rays.csv")]
-    result = CliRunner().invoke(app, ["calibrate", "pattern", *pictures, *options])
+    result = CliRunner().invoke(app, ["calibrate", "pattern", *given, *options])
     assert result.exit_code != 0
     assert not (setup.parent / "rays.csv").exists()

@@ -491,7 +491,7 @@ def test_missing_setup_and_recording_are_reported(labapp: Run, tmp_path: Path) -
 
 
 @pytest.mark.parametrize(
-    ("signal_number", "handler", "expected"),
+    ("signal_number", "handler", "told"),
     [
         (signal.SIGINT, signal.default_int_handler, (130, "")),
         (signal.SIGTERM, signal.SIG_DFL, (143, "labapp: stopped by SIGTERM\n")),
@@ -503,7 +503,7 @@ def test_stopped_measuring_keeps_finished_frames(
     monkeypatch: pytest.MonkeyPatch,
     signal_number: signal.Signals,
     handler: signal.Handlers,
-    expected: tuple[int, str],
+    told: tuple[int, str],
 ) -> None:
     calls: list[object] = []
 
@@ -519,9 +519,9 @@ def test_stopped_measuring_keeps_finished_frames(
         code, stdout, stderr = labapp("session", "measure", file)
     finally:
         signal.signal(signal_number, former)
-    assert (code, stdout) == (expected[0], "")
+    assert (code, stdout) == (told[0], "")
     message = "stopped: 2 of 6 frames are done and kept; the others: labapp session measure"
-    assert stderr == f"{message} {file}\n{expected[1]}"
+    assert stderr == f"{message} {file}\n{told[1]}"
     with open_read_only(file) as session:
         assert session.stale_frames().tolist() == [2, 3, 4, 5]
     with open_read_only(file) as session:

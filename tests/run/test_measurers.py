@@ -194,7 +194,7 @@ def test_session_follows_frames_and_keeps_corrections(
 
 
 @pytest.mark.parametrize(
-    ("frames", "gap", "expected"),
+    ("frames", "gap", "remembered"),
     [
         (range(9), None, [1, 2, 3, 4, 5, 6]),
         (range(9), "unreadable", [1, 2, 1, 1, 2]),
@@ -207,7 +207,7 @@ def test_frames_beside_a_gap_are_not_treated_as_equally_spaced(
     monkeypatch: pytest.MonkeyPatch,
     frames: Sequence[int],
     gap: str | None,
-    expected: list[int],
+    remembered: list[int],
 ) -> None:
     """Number of frames used for each extrapolation; the first three are measured cold."""
     past_counts: list[int] = []
@@ -235,7 +235,7 @@ def test_frames_beside_a_gap_are_not_treated_as_equally_spaced(
         results = list(measurer(frames))
     wrong = [result.frame for result in results if result.measurement.status != "ok"]
     assert wrong == ([5] if gap == "unreadable" else [])
-    assert past_counts == expected
+    assert past_counts == remembered
 
 
 @pytest.mark.slow
