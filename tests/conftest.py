@@ -27,7 +27,7 @@ os.environ.setdefault("NUMBA_CACHE_DIR", platformdirs.user_cache_dir("labapp", a
 
 Run = Callable[..., tuple[int, str, str]]
 
-HEEDING = """
+INTERRUPTIBLE = """
 import signal, sys
 from labapp.cli import main
 
@@ -37,11 +37,11 @@ main(sys.argv[1:])
 """The program for ``python -c``: it reacts to Ctrl-C even if the tests run in the background."""
 
 
-def lacks(words: str) -> None:
+def skip_or_fail(reason: str) -> None:
     """Skip a test that cannot run on this machine, or fail where nothing may be skipped."""
     if os.environ.get("CI") or os.environ.get("LABAPP_SKIP_NOTHING"):
-        pytest.fail(words, pytrace=False)
-    pytest.skip(words)
+        pytest.fail(reason, pytrace=False)
+    pytest.skip(reason)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -97,7 +97,7 @@ def pytest_runtest_teardown() -> None:
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
     if item.get_closest_marker("xvfb") and shutil.which("Xvfb") is None:
-        lacks("Xvfb is not installed")
+        skip_or_fail("Xvfb is not installed")
 
 
 @pytest.fixture(scope="session")
@@ -106,7 +106,7 @@ def opengl() -> None:
     from labapp.export.rendering.drawing import can_draw
 
     if not can_draw():
-        lacks("nothing can be drawn in 3-D here")
+        skip_or_fail("nothing can be drawn in 3-D here")
 
 
 @pytest.fixture

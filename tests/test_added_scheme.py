@@ -160,14 +160,14 @@ def test_sessions_and_pages_offer_an_added_scheme(python: Python, tmp_path: Path
     assert process.returncode == 0, process.stderr
     window = python("-c", IN_THE_WINDOW, file)
     assert window.returncode == 0, window.stderr
-    found = json.loads(window.stdout)
-    assert found.pop("compared").startswith("Toy minus Fit, from the same dots: the heights")
-    assert found.pop("other") == "fit"
-    assert found.pop("provenance").startswith("Frame 0 · Toy · dots found automatically")
-    assert found.pop("export page")[""] == "the toy (as in the settings)"
-    for where, offered in found.items():
+    texts = json.loads(window.stdout)
+    assert texts.pop("compared").startswith("Toy minus Fit, from the same dots: the heights")
+    assert texts.pop("other") == "fit"
+    assert texts.pop("provenance").startswith("Frame 0 · Toy · dots found automatically")
+    assert texts.pop("export page")[""] == "the toy (as in the settings)"
+    for where, offered in texts.items():
         assert "toy" in offered, where
-    assert found["surface page"]["toy"] == "Toy: a quadric by least squares"
+    assert texts["surface page"]["toy"] == "Toy: a quadric by least squares"
     out = tmp_path / "out"
     options = ("--scheme", "toy", "--frames", "0:1", "--out", out)
     process = python("-m", "labapp", "session", "export", file, *options)

@@ -602,8 +602,8 @@ def test_setup_is_calibrated_after_both_calibrations(labapp: Run, tmp_path: Path
     setup = tmp_path / "setup.toml"
     setup.write_bytes(SETUP.read_bytes())
     lengths = "--l1 4.64 --l1 4.68 --l2 6.26 --l2 6.21 --l3 2.75 --l3 2.78".split()
-    known = ["--fan-angle-sigma", 0.05, "--resolution", 0.01, "--setup", setup]
-    assert labapp("calibrate", "laser", *lengths, *known)[0] == 0
+    options = ["--fan-angle-sigma", 0.05, "--resolution", 0.01, "--setup", setup]
+    assert labapp("calibrate", "laser", *lengths, *options)[0] == 0
     assert read_setup(setup).rig.uncertainty.status == "entered"
     picture = SAMPLE / "calibration.png"
     assert labapp("calibrate", "plane", picture, "--unit-mm", 6.35, "--setup", setup)[0] == 0

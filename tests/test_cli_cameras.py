@@ -23,7 +23,7 @@ from labapp.media.cameras import (
 from labapp.media.recording.take_files import Take
 from labapp.session.session import Session
 from labapp.simulated.cameras import simulated_device
-from tests.conftest import HEEDING, Run
+from tests.conftest import INTERRUPTIBLE, Run
 from tests.waiting import wait_until
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -69,7 +69,7 @@ def test_recording_is_imported_into_a_session(tmp_path: Path, labapp: Run) -> No
 def test_stopped_recording_is_complete(tmp_path: Path, signal_number: signal.Signals) -> None:
     out = tmp_path / "run.nut"
     environment = os.environ | {"XDG_STATE_HOME": str(tmp_path)}
-    command = [sys.executable, "-c", HEEDING, "record", CAMERA, "--out", str(out)]
+    command = [sys.executable, "-c", INTERRUPTIBLE, "record", CAMERA, "--out", str(out)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
         wait_until(lambda: out.exists() and out.stat().st_size >= 1_000_000)
         process.send_signal(signal_number)

@@ -20,7 +20,7 @@ from labapp.media import open_source
 from labapp.simulated.simulate import simulate
 from labapp.simulation.pools import Wave
 from labapp.simulation.torch import ConeTorch
-from tests.conftest import HEEDING, Run
+from tests.conftest import INTERRUPTIBLE, Run
 from tests.waiting import PATIENCE_S, wait_until
 
 EXAMPLES = Path(__file__).parents[1] / "resources" / "simulations"
@@ -86,17 +86,17 @@ def test_truth_agrees_with_the_rays_and_with_the_picture(written: Path) -> None:
     """All values are read from the written files."""
     setup = read_setup(written / "setup.toml")
     lines = [row for row in rows(written / "dots_truth.csv") if row["frame"] == "1"]
-    shown = [row for row in lines if row["visible"] == "1"]
-    assert len(shown) == int(rows(written / "truth.csv")[1]["dots"]) > 90
+    visible = [row for row in lines if row["visible"] == "1"]
+    assert len(visible) == int(rows(written / "truth.csv")[1]["dots"]) > 90
     with open_source(written / "recording.avi") as source:
         image = source.frame(1).image.astype(float)
-    px = np.array([[float(row["u_px"]), float(row["v_px"])] for row in shown])
+    px = np.array([[float(row["u_px"]), float(row["v_px"])] for row in visible])
     u, v = np.rint(px).astype(int).T
     around = np.stack([image[v + dv, u + du] for du in (-1, 0, 1) for dv in (-1, 0, 1)])
     assert (around.mean(axis=0) > np.median(image) + 8).mean() > 0.97
     # Each point lies on its ray of the pattern, by the angles of the setup file.
-    point = np.array([[float(row[f"{axis}_mm"]) for axis in "xyz"] for row in shown])
-    ray = np.array([[int(row["ray_row"]), int(row["ray_column"])] for row in shown])
+    point = np.array([[float(row[f"{axis}_mm"]) for axis in "xyz"] for row in visible])
+    ray = np.array([[int(row["ray_row"]), int(row["ray_column"])] for row in visible])
     alpha, beta = np.radians([31.14, 0.77])
     laser = 31.48 * np.array([0, np.cos(alpha), np.sin(alpha)])
     from_laser = point - laser
@@ -129,8 +129,11 @@ def test_another_seed_changes_noise_and_pool_sizes(written: Path, labapp: Run,
     assert code == 0
     assert "1 frame," in stdout
     assert "labapp reconstruct" in stdout
-    with open_source(out / "recording.avi") as one, open_source(written / "recording.avi") as two:
-        assert (one.frame(0).image != two.frame(0).image).mean() > 0.3
+    with (
+        open_source(out / "recording.avi") as other,
+        open_source(written / "recording.avi") as first,
+    ):
+        assert (other.frame(0).image != first.frame(0).image).mean() > 0.3
     assert abs(column(out / "truth.csv", "width_mm")[0] / 6.66 - 1) > 1e-4
 
 
@@ -410,7 +413,7 @@ def test_stopped_simulation_leaves_no_files(
 ) -> None:
     path, out = scenario(tmp_path, frames="500"), tmp_path / "results" / "out"
     process = subprocess.Popen(
-        [sys.executable, "-c", HEEDING, "simulate", path, "--out", out],
+        [sys.executable, "-c", INTERRUPTIBLE, "simulate", path, "--out", out],
         stderr=subprocess.PIPE,
         env={**os.environ, "XDG_STATE_HOME": str(tmp_path / "state")},
         text=True,

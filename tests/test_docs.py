@@ -82,8 +82,8 @@ def test_examples_of_the_python_api_run(
     assert float(height_mm) == pytest.approx(0.22067, rel=0.02)  # the true height
     assert stdout.splitlines()[-1] == "ambiguous-rows"  # after the undo
     for session in ("tack", "blocked"):
-        with Session.open(f"{session}.labsession", read_only=True) as opened:
-            assert opened.problems() == []
+        with Session.open(f"{session}.labsession", read_only=True) as sample:
+            assert sample.problems() == []
 
 
 def test_worked_example_of_the_command_line_prints_its_output(
@@ -164,10 +164,10 @@ def examples(text: str) -> list[list[str]]:
 
 def shown_files(text: str) -> dict[str, str]:
     """Files that a text shows completely, by name."""
-    shown = re.findall(
+    files = re.findall(
         r'^```toml title="(.+?)"\n(.*?)```', (ROOT / text).read_text("utf-8"), re.M | re.S
     )
-    return dict(shown)
+    return dict(files)
 
 
 @pytest.mark.parametrize("text", TEXTS)
@@ -209,8 +209,8 @@ def test_examples_run_in_order(
         if words[:2] == ["session", "measure"]:
             fewer = ["--frames", "0"]
         if fewer and fewer[0] in words:
-            place = words.index(fewer[0])
-            words[place : place + 2] = []
+            index = words.index(fewer[0])
+            words[index : index + 2] = []
         if "--lines" in words:
             words[words.index("--lines") + 1] = "0"  # any free port
         code, _, stderr = labapp(*words, *fewer)

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import lacks
+from tests.conftest import skip_or_fail
 from tests.screen import screen
 from tests.waiting import PATIENCE_S
 
@@ -58,7 +58,7 @@ def test_frozen_window_opens_a_session_and_closes(
     program: Path, bare: Mapping[str, str], tmp_path: Path
 ) -> None:
     if shutil.which("xdotool") is None:
-        lacks("xdotool is not here")
+        skip_or_fail("xdotool is not here")
     session = tmp_path / "gtaw.labsession"
     shutil.copy(ROOT / "sample_sessions" / "gtaw" / session.name, session)
     with screen(1366, 768) as display:

@@ -42,13 +42,13 @@ def test_keys_of_the_index_belong_to_actions():
 
 
 def test_every_picture_is_used_and_small():
-    shown = {
+    used = {
         name
         for page in PAGES
         for name in re.findall(r"\(pictures/(\S+)\)", page.read_text("utf-8"))
     }
     files = list((GUIDE / "pictures").iterdir())
-    assert {path.name for path in files} == shown
+    assert {path.name for path in files} == used
     assert sum(path.stat().st_size for path in files) < 2_500_000
 
 

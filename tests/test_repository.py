@@ -109,14 +109,14 @@ def test_decisions_are_numbered_without_gaps():
 
 def test_no_file_contains_a_path_of_one_machine():
     one_machine = re.compile(r"(?<![\w.])/(?:root|work|farm|tmp|home|Users)/\w")
-    found = []
+    paths = []
     for path in repository_files():
         try:
             text = path.read_text("utf-8")
         except UnicodeDecodeError:
             continue
-        found += [f"{relative(path)}: {m[0]}" for m in one_machine.finditer(text)]
-    assert not found
+        paths += [f"{relative(path)}: {m[0]}" for m in one_machine.finditer(text)]
+    assert not paths
 
 
 def test_sample_sessions_are_small_enough_for_git():
@@ -149,9 +149,9 @@ def test_run_includes_every_folder_of_tests(tmp_path: Path):
     last = "compile_loops env; echo $core_tests $file_tests"
     (tmp_path / "env").mkdir()
     for loop in (ROOT / "labapp").rglob("*.py"):  # none is newer than the compiled files
-        place = tmp_path / loop.relative_to(ROOT)
-        place.parent.mkdir(parents=True, exist_ok=True)
-        place.write_bytes(loop.read_bytes())
+        copy = tmp_path / loop.relative_to(ROOT)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        copy.write_bytes(loop.read_bytes())
     (tmp_path / "env" / "loops-compiled").touch()
     (tmp_path / "run").write_text(f"{functions}\n{last}\n", "utf-8")
     process = subprocess.run(["sh", tmp_path / "run"], capture_output=True, text=True, check=True)

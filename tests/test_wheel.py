@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import lacks
+from tests.conftest import skip_or_fail
 from tests.screen import screen
 from tests.waiting import PATIENCE_S
 
@@ -40,10 +40,12 @@ def run(*command: object, cwd: Path, **variables: str) -> str:
 
 @pytest.fixture(scope="module")
 def uv() -> Path:
-    found = shutil.which("uv", path=f"{ROOT / '.tools' / 'bin'}{os.pathsep}{os.environ['PATH']}")
-    if found is None:
-        lacks("uv is not here")
-    return Path(str(found))
+    executable = shutil.which(
+        "uv", path=f"{ROOT / '.tools' / 'bin'}{os.pathsep}{os.environ['PATH']}"
+    )
+    if executable is None:
+        skip_or_fail("uv is not here")
+    return Path(str(executable))
 
 
 @pytest.fixture(scope="module")

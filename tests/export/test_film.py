@@ -94,16 +94,16 @@ def test_film_times_leave_gaps_for_missing_frames(frames: Frames) -> None:
 
 
 def test_film_has_every_frame_at_its_time(frames: Frames, extent: Extent, tmp_path: Path) -> None:
-    path, done = tmp_path / "film.mp4", list[int]()
+    path, progress = tmp_path / "film.mp4", list[int]()
     times_s = film_times([(result.frame, result.time_s) for result in frames])
-    write_film(path, iter(frames), times_s, extent, InlineExecutor(), done.append)
+    write_film(path, iter(frames), times_s, extent, InlineExecutor(), progress.append)
     starts, durations, pictures = read(path)
     np.testing.assert_allclose(starts, [0, 0.02, 0.1], atol=1e-9)
     np.testing.assert_allclose(durations, [0.02, 0.08, 0.02], atol=1e-9)
     assert [picture.shape for picture in pictures] == [(32, 48, 3)] * 3
     levels = [float(picture.mean()) for picture in pictures]
     np.testing.assert_allclose(levels, [0, 20, 40], atol=3)
-    assert done == [1, 2, 3]
+    assert progress == [1, 2, 3]
     assert [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
 
 
@@ -192,12 +192,12 @@ def test_export_contains_the_film(
     frames: Frames, calibration: ImageCalibration, tmp_path: Path
 ) -> None:
     pytest.importorskip("pyvista")
-    out, done = tmp_path / "out", list[int]()
+    out, progress = tmp_path / "out", list[int]()
     choice = replace(FILM, film_rate_hz=10.0)
-    written = export(out, frames, calibration, {}, choice, progress=done.append)
+    written = export(out, frames, calibration, {}, choice, progress=progress.append)
     assert [file.name for file in written] == ["film.mp4", "measures.csv"]
     assert verify_export(out) == []
-    assert done == [1, 2, 3, 4, 5, 6]
+    assert progress == [1, 2, 3, 4, 5, 6]
     starts, _, pictures = read(out / "film.mp4")
     np.testing.assert_allclose(starts, [0, 0.1, 0.5], atol=1e-9)
     assert {picture.shape for picture in pictures} == {(320, 480, 3)}
@@ -239,12 +239,12 @@ def test_stopped_film_leaves_no_file(
 def test_film_is_started_before_all_frames_are_read(
     frames: Frames, extent: Extent, tmp_path: Path
 ) -> None:
-    taken = 0
+    read_count = 0
 
     def results() -> Iterator[FrameResult]:
-        nonlocal taken
+        nonlocal read_count
         for number in range(40):
-            taken += 1
+            read_count += 1
             yield FrameResult(number, None, frames[0].measurement)
 
     ahead: list[int] = []
@@ -254,7 +254,7 @@ def test_film_is_started_before_all_frames_are_read(
         np.arange(41) / 10,
         extent,
         InlineExecutor(),
-        lambda done: ahead.append(taken - done),
+        lambda done: ahead.append(read_count - done),
     )
     assert max(ahead) <= 4
     assert len(read(tmp_path / "film.mp4")[0]) == 40

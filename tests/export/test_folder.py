@@ -463,8 +463,8 @@ def test_failure_leaves_only_the_earlier_export(
     if earlier:
         run(out, ExportChoice())
     before = contents(out) if earlier else None
-    place = os if name == "fsync" else Path
-    real = print if name == "progress" else getattr(place, name)
+    owner = os if name == "fsync" else Path
+    real = print if name == "progress" else getattr(owner, name)
     finished = False
     for at in range(0, 200, 1 if name == "rename" else 7):
         calls = iter(range(10_000))
@@ -480,7 +480,7 @@ def test_failure_leaves_only_the_earlier_export(
             if name == "progress":
                 run(out, choice, progress=fail)
             else:
-                with mock.patch.object(place, name, fail):
+                with mock.patch.object(owner, name, fail):
                     run(out, choice)
         except expected:
             assert not earlier or contents(out) == before

@@ -68,8 +68,8 @@ def toys(monkeypatch: pytest.MonkeyPatch) -> None:
     for name, content in (("xyz", "nodes"), ("off", "mesh")):
         toy = SurfaceFormat(f".{name}", name.upper(), "A toy, mm", content, f"toys:{name}")
         monkeypatch.setitem(SURFACE_FORMATS, name, toy)
-    whole = RunFormat("frames.json", "JSON", "A toy", "toys:Frames")
-    monkeypatch.setitem(RUN_FORMATS, "json", whole)
+    json_format = RunFormat("frames.json", "JSON", "A toy", "toys:Frames")
+    monkeypatch.setitem(RUN_FORMATS, "json", json_format)
 
 
 def test_added_formats_are_exported(

@@ -242,5 +242,5 @@ def test_vtp_can_be_read_by_vtk(mesh: Mesh) -> None:
 @pytest.mark.parametrize("name", mesh_formats())
 def test_equal_meshes_give_equal_files(name: str) -> None:
     write = SURFACE_FORMATS[name].content
-    again = meshes.open_mesh(reconstruction(cap(HEIGHT_MM)), 0.2)
-    assert write(again) == write(MESHES["surface"])
+    mesh = meshes.open_mesh(reconstruction(cap(HEIGHT_MM)), 0.2)
+    assert write(mesh) == write(MESHES["surface"])

@@ -29,12 +29,12 @@ def test_picture_has_the_given_width_without_empty_margins(
 
 def test_ray_hits_the_first_of_two_surfaces() -> None:
     corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 0, 1], [0, 1, 1]])
-    both = np.array([[0, 1, 2], [3, 5, 4]])
+    triangles = np.array([[0, 1, 2], [3, 5, 4]])
     down = np.array([0.0, 0.0, -1.0])
-    hit = first_hit(corners, both, np.array([0.2, 0.3, 5.0]), down)
+    hit = first_hit(corners, triangles, np.array([0.2, 0.3, 5.0]), down)
     assert hit == pytest.approx([0.2, 0.3, 1.0])
-    hit = first_hit(corners, both, np.array([0.2, 0.3, 0.5]), down)
+    hit = first_hit(corners, triangles, np.array([0.2, 0.3, 0.5]), down)
     assert hit == pytest.approx([0.2, 0.3, 0.0])
-    assert first_hit(corners, both, np.array([0.8, 0.3, 5.0]), down) is None
-    assert first_hit(corners, both, np.array([0.2, 0.3, -1.0]), down) is None
-    assert first_hit(corners, both[:0], np.array([0.2, 0.3, 5.0]), down) is None
+    assert first_hit(corners, triangles, np.array([0.8, 0.3, 5.0]), down) is None
+    assert first_hit(corners, triangles, np.array([0.2, 0.3, -1.0]), down) is None
+    assert first_hit(corners, triangles[:0], np.array([0.2, 0.3, 5.0]), down) is None

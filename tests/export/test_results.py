@@ -121,8 +121,8 @@ def test_content_of_sigma_is_documented_with_the_tables(written: Path) -> None:
     sigmas = [c for name in TABLES for c in TABLES[name] if "_sigma_" in f"_{c.name}_" and c.digits]
     assert len(sigmas) == 10 + 27
     for column in sigmas:  # a total states its content, and a part states its total
-        whole = HEIGHT_SIGMA_OF if column.name == "sigma_mm" else SIGMA_OF
-        assert ("part of" if column.is_part else whole) in column.description
+        expected = HEIGHT_SIGMA_OF if column.name == "sigma_mm" else SIGMA_OF
+        assert ("part of" if column.is_part else expected) in column.description
 
 
 @pytest.mark.parametrize("scheme", ["fit", "ers", "irs"])

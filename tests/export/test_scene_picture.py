@@ -12,7 +12,7 @@ from labapp.export.rendering.drawing import build_scene
 from labapp.export.rendering.scene import Scene
 from tests.pictures import RENEW, Away, away, check_picture
 
-KEPT_PICTURE = Path(__file__).parent / "pictures" / "pool.png"
+REFERENCE = Path(__file__).parent / "pictures" / "pool.png"
 
 TOLERANCE = Away(mean=1.0, share=0.008)
 
@@ -67,10 +67,10 @@ def picture(opengl: None) -> np.ndarray:
 def test_pool_equals_the_stored_picture(
     picture: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    check_picture(picture, KEPT_PICTURE, TOLERANCE, tmp_path)
+    check_picture(picture, REFERENCE, TOLERANCE, tmp_path)
     monkeypatch.delenv(RENEW, raising=False)
     with pytest.raises(pytest.fail.Exception, match=r"pool-difference\.png"):
-        check_picture(drawn(pool(mirrored=True)), KEPT_PICTURE, TOLERANCE, tmp_path)
+        check_picture(drawn(pool(mirrored=True)), REFERENCE, TOLERANCE, tmp_path)
     assert (tmp_path / "pool-difference.png").is_file()
 
 

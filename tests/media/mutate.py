@@ -48,25 +48,25 @@ def survives_damage(path: Path, count: int, head: int, seed: int) -> None:
     """Change bytes (most in the first or last ``head``) or truncate, ``count`` times."""
     rng = np.random.default_rng(seed)
     content = path.read_bytes()
-    places = np.r_[: min(head, len(content)), max(0, len(content) - head) : len(content)]
-    opened = 0
+    ends = np.r_[: min(head, len(content)), max(0, len(content) - head) : len(content)]
+    readable = 0
     with limited_memory():
         for k in range(count):
             damaged = bytearray(content)
             if k % 10 == 9:
                 del damaged[int(rng.integers(1, len(content))) :]
             else:
-                among = places if k % 3 else np.arange(len(content))
-                for place in rng.choice(among, 1 + k % 3):
-                    damaged[place] = int(rng.integers(256)) if k % 2 else 255
+                among = ends if k % 3 else np.arange(len(content))
+                for index in rng.choice(among, 1 + k % 3):
+                    damaged[index] = int(rng.integers(256)) if k % 2 else 255
             path.write_bytes(damaged)
             began = time.process_time()
             try:
-                opened += read_all(path) > 0
+                readable += read_all(path) > 0
             except InputError as error:
                 assert str(path.parent) in str(error)  # noqa: PT017
             # The time of this process only, because the machine may be busy.
             assert time.process_time() - began < 1
             assert path.read_bytes() == damaged
     # If none or all of the files can be read, the test is not meaningful.
-    assert 0 < opened < count
+    assert 0 < readable < count

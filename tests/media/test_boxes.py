@@ -23,9 +23,9 @@ def box(kind: bytes, *content: bytes) -> bytes:
 
 def changed(content: bytes, kind: bytes, offset: int, *values: int) -> bytes:
     """Return the file with other numbers after the type of its first box of a kind."""
-    place = content.index(kind) + 4 + offset
+    start = content.index(kind) + 4 + offset
     new = struct.pack(f">{len(values)}I", *values)
-    return content[:place] + new + content[place + len(new) :]
+    return content[:start] + new + content[start + len(new) :]
 
 
 def many_samples() -> bytes:
@@ -79,8 +79,8 @@ def test_only_tables_of_samples_are_checked(tmp_path: Path) -> None:
     longer = struct.pack(">I4sQ", 1, b"free", 32) + bytes(16)
     path = tmp_path / "v.mp4"
     path.write_bytes(H264.read_bytes() + longer + box(b"mdat", inside))
-    with open_source(path) as source, open_source(H264) as whole:
-        assert len(source) == len(whole)
+    with open_source(path) as source, open_source(H264) as original:
+        assert len(source) == len(original)
     path.write_bytes(
         H264.read_bytes() + box(b"free", struct.pack(">I4sQ3I", 1, b"stsz", 28, 0, 0, MANY))
     )

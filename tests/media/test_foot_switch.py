@@ -95,31 +95,33 @@ def test_constant_bits_of_a_report_count_once() -> None:
 
 
 def test_pedals_trigger_their_actions() -> None:
-    device, done, events = Device(), [], Events()
-    with switch(device, INFINITY, done.append, events.append, trigger=1, mark=0, next=2) as running:
+    device, actions, events = Device(), [], Events()
+    with switch(
+        device, INFINITY, actions.append, events.append, trigger=1, mark=0, next=2
+    ) as running:
         wait_until(lambda: running.connected)
         device.send("0200", "0000", "0100", "0000", "0400", "0000", "0800", "0000")
-        wait_until(lambda: len(done) == 3)
-    assert done == ["trigger", "mark", "next"]
+        wait_until(lambda: len(actions) == 3)
+    assert actions == ["trigger", "mark", "next"]
     assert events.words() == "note: VEC Infinity foot pedal: connected"
 
 
 def test_bouncing_pedal_is_pressed_once(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(foot_switch, "time", SimpleNamespace(monotonic=lambda: 100.0))
-    device, done = Device(), []
-    with switch(device, INFINITY, done.append, lambda _: None, mark=0, next=1):
+    device, actions = Device(), []
+    with switch(device, INFINITY, actions.append, lambda _: None, mark=0, next=1):
         device.send("0100", "0000", "0100", "0000", "0200")
-        wait_until(lambda: "next" in done)
-    assert done == ["mark", "next"]
+        wait_until(lambda: "next" in actions)
+    assert actions == ["mark", "next"]
 
 
 def test_pedal_that_bounces_on_release_is_pressed_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    now_s, done = 100.0, []
+    now_s, actions = 100.0, []
     monkeypatch.setattr(foot_switch, "time", SimpleNamespace(monotonic=lambda: now_s))
     device = Device()
-    with switch(device, INFINITY, done.append, lambda _: None, mark=0, next=1) as running:
+    with switch(device, INFINITY, actions.append, lambda _: None, mark=0, next=1) as running:
         running.stop()  # the test itself sends reports at defined times
         for pause_s, report in (
             (0.0, "0100"),
@@ -131,37 +133,37 @@ def test_pedal_that_bounces_on_release_is_pressed_once(
         ):
             now_s += pause_s
             running.on_report(0, bytes.fromhex(report))
-    assert done == ["mark", "mark", "next"]
+    assert actions == ["mark", "mark", "next"]
 
 
 def test_numbered_keyboard_report_is_decoded() -> None:
-    device, done = Device(NUMBERED), []
-    with switch(device, PCSENSOR, done.append, lambda _: None, trigger=5):
+    device, actions = Device(NUMBERED), []
+    with switch(device, PCSENSOR, actions.append, lambda _: None, trigger=5):
         device.send("010000050000000000", "010000000000000000")
-        wait_until(lambda: done == ["trigger"])
+        wait_until(lambda: actions == ["trigger"])
 
 
 def test_foot_switch_reconnects_and_reports_it() -> None:
-    device, done, events = Device(), [], Events()
-    with switch(device, INFINITY, done.append, events.append, trigger=0) as running:
+    device, actions, events = Device(), [], Events()
+    with switch(device, INFINITY, actions.append, events.append, trigger=0) as running:
         for count in range(1, 6):
             wait_until(lambda: running.connected)
             device.send("0100")  # unplugged while it is pressed
-            wait_until(lambda count=count: len(done) == count)
+            wait_until(lambda count=count: len(actions) == count)
             device.plugged = False
             wait_until(lambda: not running.connected)
             device.plugged = True
-    assert done == ["trigger"] * 5
+    assert actions == ["trigger"] * 5
     assert device.opened >= 5
     assert events.words().count("it was unplugged") == 5
     assert events.words().count("connected after") >= 4
 
 
 def test_failed_action_does_not_stop_the_foot_switch() -> None:
-    device, done, events = Device(), [], Events()
+    device, actions, events = Device(), [], Events()
 
     def do(action: Action) -> None:
-        done.append(action)
+        actions.append(action)
         if action == "trigger":
             raise OSError("no room")  # not an error of the pedal
         raise InputError("run.nut", "recording", "is there already", "another name")
@@ -169,21 +171,21 @@ def test_failed_action_does_not_stop_the_foot_switch() -> None:
     with switch(device, INFINITY, do, events.append, trigger=0, mark=1):
         device.send("0100", "0200", "0000")
         wait_until(lambda: len(events) == 3)
-    assert done == ["trigger", "mark"]
+    assert actions == ["trigger", "mark"]
     assert device.opened == 1
     assert "failed: no room" in events.words()
     assert "failed: run.nut: recording: is there already" in events.words()
 
 
 def test_missing_foot_switch_is_reported_once_and_awaited() -> None:
-    device, done, events = Device(), [], Events()
+    device, actions, events = Device(), [], Events()
     device.plugged = False
-    with switch(device, INFINITY, done.append, events.append, trigger=0) as running:
+    with switch(device, INFINITY, actions.append, events.append, trigger=0) as running:
         wait_until(lambda: len(events) == 1)
         device.plugged = True
         wait_until(lambda: running.connected)
         device.send("0100")
-        wait_until(lambda: done == ["trigger"])
+        wait_until(lambda: actions == ["trigger"])
     assert [event.words.partition(" after")[0] for event in events] == [
         "it is not connected",
         "connected",

@@ -68,8 +68,8 @@ def start(tmp_path: Path) -> Callable[..., Recorder]:
 
     def begin(say: Callable[[Event], None] = lambda _: None, **fields: object) -> Recorder:
         writer = fields.pop("writer", NutWriter)
-        place = partial(recording_path, tmp_path, "run")
-        return Recorder(place, Plan(**fields), 8, RATE_HZ, say, writer)
+        next_path = partial(recording_path, tmp_path, "run")
+        return Recorder(next_path, Plan(**fields), 8, RATE_HZ, say, writer)
 
     return begin
 
@@ -338,8 +338,8 @@ def test_frames_lost_by_a_broken_disk_are_counted(start: Start, marks: int) -> N
 
 def test_missing_folder_is_reported(tmp_path: Path) -> None:
     events = Events()
-    place = partial(recording_path, tmp_path / "away", "run")
-    with Recorder(place, Plan(), 8, RATE_HZ, events.append) as recorder:
+    next_path = partial(recording_path, tmp_path / "away", "run")
+    with Recorder(next_path, Plan(), 8, RATE_HZ, events.append) as recorder:
         take = recorder.trigger()
         recorder.take(frame(0))
         wait_until(lambda: bool(take.trouble))

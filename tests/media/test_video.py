@@ -125,9 +125,9 @@ def test_lossless_recordings_of_ffmpeg_are_read_exactly(
             assert frame.image.dtype == picture.dtype
             np.testing.assert_array_equal(frame.image, picture)
             assert frame.time_s == pytest.approx(frame.index / 60)
-    with VideoSource(path, source.index) as again:
+    with VideoSource(path, source.index) as reopened:
         for index in orders():
-            np.testing.assert_array_equal(again.frame(index).image, pictures[index])
+            np.testing.assert_array_equal(reopened.frame(index).image, pictures[index])
 
 
 @pytest.mark.parametrize(("name", "options", "description"), NEARLY)
@@ -144,9 +144,9 @@ def test_lossy_recordings_of_ffmpeg_are_read_in_order(
         assert number_in(frame.image) == frame.index
         assert np.abs(frame.image.astype(float) - picture).mean() < 3
         assert frame.time_s == pytest.approx(frame.index / 60)
-    with VideoSource(path, source.index) as again:
+    with VideoSource(path, source.index) as reopened:
         for index in orders():
-            np.testing.assert_array_equal(again.frame(index).image, frames[index].image)
+            np.testing.assert_array_equal(reopened.frame(index).image, frames[index].image)
 
 
 def test_limited_luminance_is_expanded_to_the_full_range(tmp_path: Path, encode: Encode) -> None:
@@ -337,12 +337,12 @@ def test_avi_with_an_invalid_index_is_scanned(tmp_path: Path, encode: Encode) ->
     chunk = content.index(b"00dc", content.index(b"movi"))
     second = content.index(b"00dc", chunk + 8)
     entry = index + 8 + 16 * 3  # of the fourth frame
-    frames, again = content.index(b"avih") + 8 + 16, content.index(b"strh") + 8 + 32
+    total_frames, stream_length = content.index(b"avih") + 8 + 16, content.index(b"strh") + 8 + 32
     one_less, size = ((k * (COUNT - 1)).to_bytes(4, "little") for k in (1, 16))
-    fewer = {frames: one_less, again: one_less}
-    more = content[chunk:second] * 3
-    beyond = b"RIFF" + (len(more) + 16).to_bytes(4, "little") + b"AVIXLIST"
-    beyond += (len(more) + 4).to_bytes(4, "little") + b"movi" + more
+    fewer = {total_frames: one_less, stream_length: one_less}
+    extra_frames = content[chunk:second] * 3
+    beyond = b"RIFF" + (len(extra_frames) + 16).to_bytes(4, "little") + b"AVIXLIST"
+    beyond += (len(extra_frames) + 4).to_bytes(4, "little") + b"movi" + extra_frames
     for changes in (
         {len(content): beyond},  # more frames after the index
         fewer,  # fewer frames in the header
@@ -449,7 +449,7 @@ def test_mutated_recordings_are_read_or_rejected(
     path = encode(tmp_path / name, numbered(), *options.split())
     content = path.read_bytes()
     rng = np.random.default_rng(7)
-    opened = 0
+    readable = 0
     for _ in range(25):
         mutated = bytearray(content)
         # Headers are changed as often as the rest of the file.
@@ -458,12 +458,12 @@ def test_mutated_recordings_are_read_or_rejected(
                 mutated[offset] = rng.integers(256)
         path.write_bytes(mutated)
         with contextlib.suppress(InputError), VideoSource(path) as source:
-            opened += 1
+            readable += 1
             for index in (0, len(source) - 1, len(source) // 2):
                 with contextlib.suppress(InputError):
                     assert source.frame(index).image.shape == source.shape
         assert path.read_bytes() == mutated
-    assert opened > 0
+    assert readable > 0
     assert capfd.readouterr() == ("", "")
 
 

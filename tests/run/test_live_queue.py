@@ -41,7 +41,7 @@ def measure(
     The frames whose order is in ``cold`` are measured by themselves, in 1.5 s; so is a frame far
     from the one before, unless 16 were followed until then. Those in ``slow`` take 10 s.
     """
-    done: list[Measured] = []
+    measured: list[Measured] = []
     free_s, followed_count = frames[0] / RATE_HZ, MOST
     busy: tuple[bool, float] | None = None
     for number in frames:
@@ -52,69 +52,73 @@ def measure(
             busy, frame = None, queue.next()
             if frame is None:
                 break
-            done.append(Measured(frame.number, max(free_s, frame.number / RATE_HZ)))
-            far = len(done) > 1 and done[-1].number - done[-2].number > REACH_S * RATE_HZ
-            followed = len(done) not in cold and (not far or followed_count >= MOST // 2)
+            measured.append(Measured(frame.number, max(free_s, frame.number / RATE_HZ)))
+            far = (
+                len(measured) > 1 and measured[-1].number - measured[-2].number > REACH_S * RATE_HZ
+            )
+            followed = len(measured) not in cold and (not far or followed_count >= MOST // 2)
             followed_count = followed_count + 1 if followed else 0
-            duration_s = COLD_S if not followed else 10.0 if len(done) in slow else took_s
-            busy, free_s = (followed, duration_s), done[-1].began_s + duration_s
+            duration_s = COLD_S if not followed else 10.0 if len(measured) in slow else took_s
+            busy, free_s = (followed, duration_s), measured[-1].began_s + duration_s
         queue.put(CameraFrame(number, now_s, now_s, IMAGE))
-    return done
+    return measured
 
 
 @pytest.mark.parametrize("took_s", [0.002, 0.006, 0.011, 0.03])
 def test_steps_are_even_and_as_small_as_possible(took_s: float) -> None:
     queue = FrameQueue()
-    done = measure(queue, range(2000), took_s)
-    settled = [frame.number for frame in done if frame.number > 1000]
+    measured = measure(queue, range(2000), took_s)
+    settled = [frame.number for frame in measured if frame.number > 1000]
     every = int(np.ceil(took_s / SHARE * RATE_HZ - 1e-6))
     assert set(np.diff(settled)) == {every}
     assert queue.every == every
-    assert max(frame.age_s for frame in done if frame.number > 1000) < 0.02
+    assert max(frame.age_s for frame in measured if frame.number > 1000) < 0.02
 
 
 def test_first_steps_cover_an_oscillation() -> None:
-    done = measure(FrameQueue(), range(400), 0.002)
-    steps = np.diff([frame.number for frame in done[2 : 2 * MOST]])
+    measured = measure(FrameQueue(), range(400), 0.002)
+    steps = np.diff([frame.number for frame in measured[2 : 2 * MOST]])
     assert steps.min() >= SWING_S * RATE_HZ
 
 
 def test_frame_measured_alone_is_followed_by_the_next_then_the_newest() -> None:
-    done = measure(FrameQueue(), range(4000), 0.006, cold=frozenset({101}))
-    alone = done[100].number
-    after = [frame.number for frame in done[100 : 101 + MOST]]
+    measured = measure(FrameQueue(), range(4000), 0.006, cold=frozenset({101}))
+    cold_number = measured[100].number
+    after = [frame.number for frame in measured[100 : 101 + MOST]]
     assert np.diff(after).max() <= 4
-    jumped = done[101 + MOST]
-    assert jumped.number > alone + 100
+    jumped = measured[101 + MOST]
+    assert jumped.number > cold_number + 100
     assert jumped.age_s < 0.05
-    assert set(np.diff([frame.number for frame in done if frame.number > jumped.number + 700])) == {
-        2
-    }
+    assert set(
+        np.diff([frame.number for frame in measured if frame.number > jumped.number + 700])
+    ) == {2}
 
 
 @pytest.mark.parametrize("lost", [1, 4, 20])
 def test_results_are_delayed_by_one_search_at_most(lost: int) -> None:
     """Frames after a searched frame have to be searched, too."""
     cold = frozenset(range(101, 102 + lost))
-    done = measure(FrameQueue(), range(10_000), 0.006, cold=cold)
-    assert max(frame.age_s for frame in done) < COLD_S + 0.05
-    assert max(frame.age_s for frame in done[-1000:]) < 0.05
+    measured = measure(FrameQueue(), range(10_000), 0.006, cold=cold)
+    assert max(frame.age_s for frame in measured) < COLD_S + 0.05
+    assert max(frame.age_s for frame in measured[-1000:]) < 0.05
 
 
 def test_slower_measuring_causes_no_long_delay() -> None:
     queue = FrameQueue()
     measure(queue, range(1000), 0.005)
-    done = measure(queue, range(1000, 5000), 0.05)
-    assert max(frame.age_s for frame in done if frame.number > 3000) < 0.1
-    done = measure(queue, range(5000, 9000), 0.005)
-    assert set(np.diff([frame.number for frame in done if frame.number > 8000])) == {2}
+    measured = measure(queue, range(1000, 5000), 0.05)
+    assert max(frame.age_s for frame in measured if frame.number > 3000) < 0.1
+    measured = measure(queue, range(5000, 9000), 0.005)
+    assert set(np.diff([frame.number for frame in measured if frame.number > 8000])) == {2}
 
 
 def test_frames_are_followed_again_after_a_long_delay() -> None:
     queue = FrameQueue()
-    done = measure(queue, range(16000), 0.006, cold=frozenset({200, 201}), slow=frozenset({199}))
-    assert max(frame.age_s for frame in done if frame.number > 9000) < 0.1
-    assert set(np.diff([frame.number for frame in done if frame.number > 12000])) == {2}
+    measured = measure(
+        queue, range(16000), 0.006, cold=frozenset({200, 201}), slow=frozenset({199})
+    )
+    assert max(frame.age_s for frame in measured if frame.number > 9000) < 0.1
+    assert set(np.diff([frame.number for frame in measured if frame.number > 12000])) == {2}
 
 
 def test_steps_do_not_change_if_the_camera_clock_is_set_back() -> None:

@@ -365,9 +365,9 @@ def test_search_only_after_a_long_time_without_followed_frames(setup: Setup, cha
     chain.now_s += 0.9 * SOUGHT_S
     assert measure(live_frame, False) is None
     chain.now_s += 0.2 * SOUGHT_S
-    again = measure(live_frame, False)
-    assert again is not None
-    assert again.track_lost == "it jumped"
+    searched = measure(live_frame, False)
+    assert searched is not None
+    assert searched.track_lost == "it jumped"
     assert chain.skipped == pytest.approx([100 + 0.9 * SOUGHT_S, 100 + 1.8 * SOUGHT_S])
     assert chain.searched == [100.0, chain.now_s]
 

@@ -71,10 +71,10 @@ def test_two_interleaved_sequences_are_independent(
         for k, number in enumerate(order):
             cv2.imwrite(str(tmp_path / name / f"{k}.png"), images[number])
     jobs = [replace(recording, path=tmp_path / name) for name in "ab"]
-    alone = [[result.rows for result in job(range(3))] for job in jobs]
-    in_turn = zip(*(job(range(3)) for job in jobs), strict=True)
-    assert [[result.rows for result in pair] for pair in in_turn] == [
-        list(pair) for pair in zip(*alone, strict=True)
+    separate = [[result.rows for result in job(range(3))] for job in jobs]
+    interleaved = zip(*(job(range(3)) for job in jobs), strict=True)
+    assert [[result.rows for result in pair] for pair in interleaved] == [
+        list(pair) for pair in zip(*separate, strict=True)
     ]
 
 
@@ -83,7 +83,7 @@ def measures_of(result: FrameResult) -> dict[str, float]:
     return asdict(result.measurement.measures)
 
 
-def test_stretches_are_measured_equally_here_and_by_processes(
+def test_stretches_are_measured_equally_with_and_without_processes(
     recording: RecordingMeasurer, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(measurers, "STRETCH", 5)
@@ -96,11 +96,11 @@ def test_stretches_are_measured_equally_here_and_by_processes(
                 replace(recording, with_surfaces=True, pools=pools)(range(FRAMES))
             )
     assert [result.frame for result in results_of[2]] == list(range(FRAMES))
-    for here, there in zip(results_of[0], results_of[2], strict=True):
-        assert here.rows == there.rows
-        assert there.measurement.reconstruction is not None
-        assert here.track_lost == there.track_lost
-        np.testing.assert_equal(measures_of(here), measures_of(there))  # NaN is NaN
+    for local, distributed in zip(results_of[0], results_of[2], strict=True):
+        assert local.rows == distributed.rows
+        assert distributed.measurement.reconstruction is not None
+        assert local.track_lost == distributed.track_lost
+        np.testing.assert_equal(measures_of(local), measures_of(distributed))  # NaN is NaN
     cold = {result.frame for result in results_of[0] if result.track_lost is not None}
     assert cold == {0, 1, 2, 5, 6, 7}  # the first three of each stretch
     with ResultsWriter(tmp_path / "out", recording.setup.calibration, {}) as results:
@@ -188,9 +188,9 @@ def test_session_follows_frames_and_keeps_corrections(
         assert_same(first[1].measures, bare.measures)
         assert (bare.dots, bare.lattice, bare.match, bare.reconstruction) == (None,) * 4
         session.correct({1: start_correction(first[1])}, "as it is")
-        again = dict(session.measure_each([0, 1, 2], warm=True))
-        assert again[1].correction is not None
-        assert again[2].status == "ok"
+        remeasured = dict(session.measure_each([0, 1, 2], warm=True))
+        assert remeasured[1].correction is not None
+        assert remeasured[2].status == "ok"
 
 
 @pytest.mark.parametrize(
@@ -243,11 +243,11 @@ def test_chain_in_another_process_gives_equal_results(recording: RecordingMeasur
     frames = [0, 1, 2, 3, 4, 7, 8]  # with a gap
     with open_source(recording.path) as source, measuring_pool(1) as pool:
         arguments = source.frame, recording.setup, Settings()
-        here, there = (
+        local, remote = (
             list(WarmMeasurer(*arguments, pool=executor)(frames)) for executor in (None, pool)
         )
-    assert [result.frame for result in there] == frames
-    for result, other in zip(here, there, strict=True):
+    assert [result.frame for result in remote] == frames
+    for result, other in zip(local, remote, strict=True):
         assert result.track_lost == other.track_lost
         assert_same(result.measurement.measures, other.measurement.measures)
 

@@ -121,15 +121,15 @@ def apply(session: Session, number: int, seed: int) -> None:
 
 def differences(session: Session, state: dict[str, object]) -> list[str]:
     """Names of the values in which the session differs from a state of the model."""
-    found = []
+    names = []
     if session.record.notes != state["notes"]:
-        found.append("notes")
+        names.append("notes")
     text = session.setup_text
     setup = float(text.split("=")[1]) if text else ""
     if setup != state["setup"]:
-        found.append("setup")
+        names.append("setup")
     if session.settings.scheme != state["scheme"]:
-        found.append("scheme")
+        names.append("scheme")
     assert isinstance(state["corrections"], dict)
     for frame in range(FRAMES):
         stored, number = session.correction(frame), state["corrections"].get(frame)
@@ -139,8 +139,8 @@ def differences(session: Session, state: dict[str, object]) -> list[str]:
             or expected is None
             or np.array_equal(stored.dots.image_px, expected.dots.image_px)
         ):
-            found.append(f"correction {frame}")
-    return found
+            names.append(f"correction {frame}")
+    return names
 
 
 def check(path: Path, acknowledged: int, seed: int) -> tuple[int, list[str]]:

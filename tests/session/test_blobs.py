@@ -169,10 +169,12 @@ def large_surface(kind: str) -> bytes:
 def test_surfaces_of_a_blob_share_the_limit_of_points():
     """Each surface takes seconds and hundreds of megabytes, and many may refer to one array."""
     points = np.random.default_rng(7).uniform(-3, 3, (1500, 3))
-    one = b'{"ThinPlateSurface":{"array":["<f8",[1500,3],0]}}'
-    assert len(unpack(blob_of(b'{"list":[%s]}' % b",".join([one] * 2), points.tobytes()))) == 2
+    thin_plate = b'{"ThinPlateSurface":{"array":["<f8",[1500,3],0]}}'
+    assert (
+        len(unpack(blob_of(b'{"list":[%s]}' % b",".join([thin_plate] * 2), points.tobytes()))) == 2
+    )
     with pytest.raises(Damaged, match="4000 points"):
-        unpack(blob_of(b'{"list":[%s]}' % b",".join([one] * 3), points.tobytes()))
+        unpack(blob_of(b'{"list":[%s]}' % b",".join([thin_plate] * 3), points.tobytes()))
 
 
 @pytest.mark.parametrize(
@@ -208,9 +210,9 @@ def test_value_too_large_to_be_read_is_not_packed():
 
 def test_every_changed_byte_is_detected():
     blob = pack(Boundary(np.zeros(2), np.zeros(4), np.zeros((4, 3))))
-    for place in range(len(blob)):
+    for index in range(len(blob)):
         changed = bytearray(blob)
-        changed[place] ^= 0x10
+        changed[index] ^= 0x10
         with pytest.raises(Damaged):
             unpack(bytes(changed))
     for length in range(len(blob)):

@@ -26,18 +26,18 @@ def plane_in_use(session: Session) -> object:
 
 
 def test_imaging_plane_placed_by_hand_is_used(session: Session):
-    found = session.calibrate_plane(PICTURE, 6.35)
-    u, v = found.origin_px
-    moved = replace(found, origin_px=(u + 1.5, v), marks=(), model="three points")
+    calibration = session.calibrate_plane(PICTURE, 6.35)
+    u, v = calibration.origin_px
+    moved = replace(calibration, origin_px=(u + 1.5, v), marks=(), model="three points")
     image = cv2.imread(str(PICTURE), cv2.IMREAD_UNCHANGED)
     session.use_plane(moved, 6.35, image)
     assert plane_in_use(session) == moved
     assert f"{u + 1.5}" in session.setup_text
-    line = replace(moved, z_axis_px=found.x_axis_px)
+    degenerate = replace(moved, z_axis_px=calibration.x_axis_px)
     with pytest.raises(ValueError, match="one line"):
-        session.use_plane(line, 6.35, image)
+        session.use_plane(degenerate, 6.35, image)
     session.undo()
-    assert plane_in_use(session) == found
+    assert plane_in_use(session) == calibration
 
 
 def test_laser_calibration_stores_its_picture(session: Session):

@@ -177,8 +177,8 @@ def test_mutated_tables_are_read_or_rejected(
 ) -> None:
     content = bytearray(f"frame,{HEAD},blocked\n0,10.5,20,1,1,0\n0,30,20,1,2,0\n".encode())
     for _ in range(data.draw(st.integers(1, 4))):
-        place = data.draw(st.integers(0, len(content) - 1))
-        content[place : place + data.draw(st.integers(0, 3))] = data.draw(st.binary(max_size=3))
+        index = data.draw(st.integers(0, len(content) - 1))
+        content[index : index + data.draw(st.integers(0, 3))] = data.draw(st.binary(max_size=3))
         content = content or bytearray(b"\n")
     path = tmp_path_factory.getbasetemp() / "mutated.csv"
     path.write_bytes(content)

@@ -193,8 +193,8 @@ def test_failed_change_is_rolled_back(path: Path):
     assert kinds(database) == ["one"]
     write(database, "three")
     database.close()
-    with closing(Database.open(path, read_only=True)) as again:
-        assert kinds(again) == ["one", "three"]
+    with closing(Database.open(path, read_only=True)) as reopened:
+        assert kinds(reopened) == ["one", "three"]
 
 
 def copy_during_change(path: Path) -> Path:
@@ -261,12 +261,12 @@ def test_journal_that_names_another_file_is_rejected(
 
 
 @pytest.mark.parametrize("read_only", [True, False])
-@pytest.mark.parametrize("place", ["mine.txt", "/dev/zero"])
+@pytest.mark.parametrize("target", ["mine.txt", "/dev/zero"])
 def test_journal_that_is_a_link_is_rejected(
-    path: Path, tmp_path: Path, place: str, read_only: bool
+    path: Path, tmp_path: Path, target: str, read_only: bool
 ):
     (tmp_path / "mine.txt").write_text("mine")
-    path.with_name(f"{path.name}-journal").symlink_to(place)
+    path.with_name(f"{path.name}-journal").symlink_to(target)
     with pytest.raises(InputError, match="journal: is not a file"):
         Database.open(path, read_only)
     assert (tmp_path / "mine.txt").read_text() == "mine"
@@ -294,8 +294,8 @@ def test_older_version_is_copied_and_migrated(path: Path):
     database.close()
     backup = path.with_name(f"a.version-{VERSION}.labsession")
     assert backup.read_bytes() == before
-    with closing(Database.open(path)) as again:
-        assert kinds(again) == ["ONE"]  # migrated only once
+    with closing(Database.open(path)) as reopened:
+        assert kinds(reopened) == ["ONE"]  # migrated only once
 
 
 def test_link_in_place_of_the_lock_is_rejected(path: Path, tmp_path: Path):

@@ -98,12 +98,12 @@ def test_history_is_saved(database: Database, documents: Documents):
     note(documents, "b")
     documents.undo()
     database.close()
-    again = Database.open(database.path)
-    documents = Documents(again)
+    reopened = Database.open(database.path)
+    documents = Documents(reopened)
     assert documents.get("record") == "a"
     assert documents.redo() is not None
     assert documents.get("record") == "b"
-    again.close()
+    reopened.close()
 
 
 def test_history_is_limited_in_steps(documents: Documents, monkeypatch: pytest.MonkeyPatch):

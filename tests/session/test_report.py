@@ -53,7 +53,7 @@ def setup() -> Setup:
 
 
 @pytest.fixture(scope="module")
-def seen(setup: Setup) -> Measurement:
+def cap_measurement(setup: Setup) -> Measurement:
     """A cap of 6 mm, 0.3 mm high, measured by ERS from exact dots."""
     match = exact_match(trace(spherical_cap(6.0, 0.3), setup.rig), setup.rig)
     reconstruction = ers.reconstruct(match, setup.rig, ers.ErsSettings())
@@ -85,11 +85,11 @@ def session(tmp_path: Path) -> Iterator[Session]:
 
 
 @pytest.fixture
-def keep(session: Session, seen: Measurement) -> Callable[..., None]:
+def store(session: Session, cap_measurement: Measurement) -> Callable[..., None]:
     """Store a measurement of a frame as if it had been made now."""
 
     def put(frame: int, width_mm: float | None = None, **changes: object) -> None:
-        measurement = replace(seen, **changes)
+        measurement = replace(cap_measurement, **changes)
         if width_mm is not None:
             assert measurement.measures is not None
             measurement = replace(
@@ -121,14 +121,14 @@ def frame_lines(session: Session) -> list[FrameLine]:
 
 
 def test_statistics_follow_eq_7_2_and_exclude_stale_frames(
-    session: Session, keep: Callable[..., None]
+    session: Session, store: Callable[..., None]
 ):
     session.update_setup({"laser": {"distance_mm": 31.0}})
-    keep(0, 99.0)
+    store(0, 99.0)
     session.undo()
     for frame, width in ((1, 6.0), (2, 7.0), (3, 9.5)):
-        keep(frame, width)
-    keep(4, status="no-match", reason="9 dots are left over", **NOTHING)
+        store(frame, width)
+    store(4, status="no-match", reason="9 dots are left over", **NOTHING)
     rows = {row[0]: row[1:] for row in data.statistics_cells(frame_lines(session))}
     widths = np.array([6.0, 7.0, 9.5])
     assert rows["width (mm)"] == [
@@ -151,9 +151,9 @@ def test_statistics_follow_eq_7_2_and_exclude_stale_frames(
     ]
 
 
-def test_reasons_that_differ_in_numbers_are_grouped(session: Session, keep: Callable[..., None]):
+def test_reasons_that_differ_in_numbers_are_grouped(session: Session, store: Callable[..., None]):
     for frame in (0, 1, 3):
-        keep(frame, status="no-match", reason=f"{frame + 7} dots, ±0.{frame} px", **NOTHING)
+        store(frame, status="no-match", reason=f"{frame + 7} dots, ±0.{frame} px", **NOTHING)
     assert data.status_cells(frame_lines(session))[1] == [
         "no-match",
         "7 dots, ±0.0 px",
@@ -163,10 +163,12 @@ def test_reasons_that_differ_in_numbers_are_grouped(session: Session, keep: Call
 
 
 def test_correction_makes_its_frame_stale_and_is_listed(
-    session: Session, seen: Measurement, keep: Callable[..., None]
+    session: Session, cap_measurement: Measurement, store: Callable[..., None]
 ):
-    keep(2)
-    moved = correction.move_dots(correction.Correction.of(seen.dots, None), [0, 4], 0.5, 0.0)
+    store(2)
+    moved = correction.move_dots(
+        correction.Correction.of(cap_measurement.dots, None), [0, 4], 0.5, 0.0
+    )
     session.correct({2: correction.block_row(moved, 3)})
     line = frame_lines(session)[2]
     assert (line.stale, line.state, line.counts) == ((CORRECTION_CHANGED,), "stale", False)
@@ -175,17 +177,17 @@ def test_correction_makes_its_frame_stale_and_is_listed(
     count = str(len(moved.dots))
     assert story.tables[0][1:] == [["2", count, "2", "blocked rows 3"]]
     assert [row[2] for row in story.tables[1]][1:] == ["setup", "settings", "correction"]
-    keep(2, correction=session.correction(2))
+    store(2, correction=session.correction(2))
     assert frame_lines(session)[2].state == "corrected by hand"
 
 
 def test_frame_with_two_similar_correspondences_is_doubtful(
-    session: Session, seen: Measurement, keep: Callable[..., None]
+    session: Session, cap_measurement: Measurement, store: Callable[..., None]
 ):
-    assert seen.match is not None
+    assert cap_measurement.match is not None
     for frame, rival in ((0, 0.049), (1, 0.051)):
         trials = (Trial("S/S", 0.01), Trial("I/I", rival))
-        keep(frame, match=replace(seen.match, orientation="S/S", trials=trials))
+        store(frame, match=replace(cap_measurement.match, orientation="S/S", trials=trials))
     assert [line.state for line in frame_lines(session)[:3]] == [
         "doubtful",
         "measured",
@@ -209,12 +211,12 @@ def test_only_the_first_and_last_of_many_frames_are_listed():
     assert len(data.frame_cells(lines[:60])) == 61
 
 
-def test_representative_frame_has_the_median_peak(seen: Measurement):
-    assert seen.measures is not None
+def test_representative_frame_has_the_median_peak(cap_measurement: Measurement):
+    assert cap_measurement.measures is not None
 
     def line(frame: int, **sizes: float) -> FrameLine:
-        assert seen.measures is not None
-        return FrameLine(frame, 0.0, "ok", measures=replace(seen.measures, **sizes))
+        assert cap_measurement.measures is not None
+        return FrameLine(frame, 0.0, "ok", measures=replace(cap_measurement.measures, **sizes))
 
     convex = [line(k, height_mm=h) for k, h in enumerate((0.2, 0.5, 0.31, 0.3))]
     assert data.representative([*convex, FrameLine(9, 0.0, "no-dots")]) is convex[2]
@@ -284,8 +286,11 @@ def sizes(match: Match, rig: Rig) -> np.ndarray:
     return np.array([getattr(size, name) for name in SIZES])
 
 
-def test_budget_equals_measurements_with_changed_values(seen: Measurement, setup: Setup):
-    budget = {contribution.name: contribution for contribution in setup_budget(seen, setup, ERS)}
+def test_budget_equals_measurements_with_changed_values(cap_measurement: Measurement, setup: Setup):
+    budget = {
+        contribution.name: contribution
+        for contribution in setup_budget(cap_measurement, setup, ERS)
+    }
     assert len(budget) == len(QUANTITIES)
     assert all(contribution.assumed for contribution in budget.values() if contribution.sigma > 0.0)
     assert {name for name, contribution in budget.items() if contribution.sigma == 0.0} == {
@@ -293,28 +298,31 @@ def test_budget_equals_measurements_with_changed_values(seen: Measurement, setup
         for name in budget
         if "glass" in name  # there is none
     }
-    assert seen.match is not None
+    assert cap_measurement.match is not None
     farther, nearer = (
         replace(setup.rig, laser=replace(setup.rig.laser, distance_mm=31.48 + step))
         for step in (0.5, -0.5)
     )
-    change = (sizes(seen.match, farther) - sizes(seen.match, nearer)) / 2
+    change = (sizes(cap_measurement.match, farther) - sizes(cap_measurement.match, nearer)) / 2
     distance = budget["laser, distance"]
     assert (distance.sigma, distance.unit) == (0.5, "mm")
     np.testing.assert_allclose(distance.change, change, atol=1e-9)
     assert change[0] > 0.02
 
 
-def test_budget_of_a_calibration_point_equals_a_moved_point(seen: Measurement):
+def test_budget_of_a_calibration_point_equals_a_moved_point(cap_measurement: Measurement):
     setup = parse_setup(SETUP + "origin_px_sigma = 0.2\n", "setup.toml")
-    budget = {contribution.name: contribution for contribution in setup_budget(seen, setup, ERS)}
-    assert seen.match is not None
-    image = setup.calibration.to_image(seen.match.plane_mm)
+    budget = {
+        contribution.name: contribution
+        for contribution in setup_budget(cap_measurement, setup, ERS)
+    }
+    assert cap_measurement.match is not None
+    image = setup.calibration.to_image(cap_measurement.match.plane_mm)
     points = (242.01, 587.93), 34.925, (43.06, 499.99), 15.875
     right, left = (
         sizes(
             replace(
-                seen.match,
+                cap_measurement.match,
                 plane_mm=ImageCalibration.from_three_points((u, 590.0), *points).to_plane(image),
             ),
             setup.rig,
@@ -327,13 +335,13 @@ def test_budget_of_a_calibration_point_equals_a_moved_point(seen: Measurement):
     assert np.abs(origin.change).max() > 1e-4
 
 
-def test_correlated_quantities_are_combined(seen: Measurement, setup: Setup):
+def test_correlated_quantities_are_combined(cap_measurement: Measurement, setup: Setup):
     laser = "angle_distance_correlation = {}\n[pattern]"
     uncorrelated, correlated, anticorrelated = (
         parse_setup(SETUP.replace("[pattern]", laser.format(share)), "setup.toml")
         for share in (0.0, 0.9, -0.9)
     )
-    changes = setup_budget(seen, setup, ERS)
+    changes = setup_budget(cap_measurement, setup, ERS)
     widths = [
         total(np.zeros(6), changes, one.rig)[0]
         for one in (uncorrelated, correlated, anticorrelated)
@@ -344,9 +352,9 @@ def test_correlated_quantities_are_combined(seen: Measurement, setup: Setup):
     assert widths[1] ** 2 + widths[2] ** 2 == pytest.approx(2 * widths[0] ** 2)
 
 
-def test_budget_counts_errors_of_the_frame_once(seen: Measurement, setup: Setup):
-    assert seen.measures is not None
-    measures = replace(seen.measures, width_sigma_mm=0.05, width_sigma_setup_mm=0.04)
+def test_budget_counts_errors_of_the_frame_once(cap_measurement: Measurement, setup: Setup):
+    assert cap_measurement.measures is not None
+    measures = replace(cap_measurement.measures, width_sigma_mm=0.05, width_sigma_setup_mm=0.04)
     line = FrameLine(0, 0.0, "ok", measures=measures)
     changes = np.array([0.04, 0.1, np.nan, 0.0, 0.0, 0.0])
     parts = [
@@ -365,17 +373,17 @@ def test_budget_counts_errors_of_the_frame_once(seen: Measurement, setup: Setup)
 # --- pages ------------------------------------------------------------------------------------
 
 
-def test_report_is_a_reproducible_pdf(session: Session, keep: Callable[..., None], tmp_path: Path):
+def test_report_is_a_reproducible_pdf(session: Session, store: Callable[..., None], tmp_path: Path):
     for frame in range(4):
-        keep(frame, 6.0 + 0.1 * frame)
+        store(frame, 6.0 + 0.1 * frame)
     pdf = report_pdf(session, now=NOW)
     assert page_count(pdf) >= 5
     assert report_pdf(session, now=NOW) == pdf
 
 
-def test_figures_and_tables_are_numbered(session: Session, keep: Callable[..., None]):
-    keep(0)
-    keep(1)
+def test_figures_and_tables_are_numbered(session: Session, store: Callable[..., None]):
+    store(0)
+    store(1)
     story = Story()
     report = ReportData.of(session, None, None)
     add_results(story, report)
@@ -395,10 +403,10 @@ def test_empty_session_has_a_report(tmp_path: Path):
 
 
 def test_missing_surfaces_and_recording_are_reported(
-    session: Session, keep: Callable[..., None], tmp_path: Path
+    session: Session, store: Callable[..., None], tmp_path: Path
 ):
     for frame in range(3):
-        keep(frame, status="no-match", reason="<b> & 3 dots", **NOTHING)
+        store(frame, status="no-match", reason="<b> & 3 dots", **NOTHING)
     (tmp_path / "frames").rename(tmp_path / "elsewhere")
     story = Story()
     report = ReportData.of(session, None, None)
@@ -409,8 +417,8 @@ def test_missing_surfaces_and_recording_are_reported(
     assert page_count(report_pdf(session, now=NOW)) >= 2
 
 
-def test_report_of_selected_frames(session: Session, keep: Callable[..., None]):
-    keep(1)
+def test_report_of_selected_frames(session: Session, store: Callable[..., None]):
+    store(1)
     assert [line.frame for line in data.frame_lines(session, "ers", [4, 1, 1])] == [1, 4]
     assert frame_lines(session)[1].status == "ok"
     assert data.frame_lines(session, "fit", [1])[0].status == ""
@@ -418,8 +426,8 @@ def test_report_of_selected_frames(session: Session, keep: Callable[..., None]):
         report_pdf(session, frames=[6], now=NOW)
 
 
-def test_damaged_result_has_its_own_status(session: Session, keep: Callable[..., None]):
-    keep(0)
+def test_damaged_result_has_its_own_status(session: Session, store: Callable[..., None]):
+    store(0)
     with session._database.transaction() as connection:
         connection.execute("UPDATE detail SET content = x'00'")
     assert frame_lines(session)[0].status == "damaged"

@@ -72,16 +72,16 @@ def test_line_session_is_intact_and_near_the_truth(name: str):
             assert [status == "pulse" for status in overview.status] == on
             assert set(overview.status) == {"followed", "pulse"}
             v, measured = truth(name, "line_v_px"), line_trend(session).values["shift_px"]
-            known = np.isfinite(measured)
-            assert np.corrcoef(measured[known], v[known])[0, 1] > 0.9
+            is_known = np.isfinite(measured)
+            assert np.corrcoef(measured[is_known], v[is_known])[0, 1] > 0.9
             return
         trend = line_trend(session)
         height = trend.values["pool_height_mm"]
-        known = np.isfinite(height)
-        assert known.mean() > 0.6
+        is_known = np.isfinite(height)
+        assert is_known.mean() > 0.6
         error = height / (truth(name, "height_mm") + truth(name, "depth_mm")) - 1
-        assert np.median(np.abs(error[known])) < 0.08
-        assert np.abs(error[known]).max() < 0.25
+        assert np.median(np.abs(error[is_known])) < 0.08
+        assert np.abs(error[is_known]).max() < 0.25
         is_right = [a == b for a, b in zip(trend.states, texts(name, "state"), strict=True)]
         assert np.mean(is_right) > 0.9
 

@@ -70,13 +70,13 @@ def store_changed(session: Session, frame: int, **changes: object) -> None:
 
 @pytest.mark.parametrize("kind", ["device", "pipe", "nul", "folder with a pipe"])
 def test_recording_must_be_a_regular_file(folder: Path, kind: str):
-    place = {"device": "/dev/zero", "pipe": "pipe.avi", "nul": "a\0.avi"}.get(kind, "films")
+    path = {"device": "/dev/zero", "pipe": "pipe.avi", "nul": "a\0.avi"}.get(kind, "films")
     (folder / "films").mkdir()
     for pipe in ("pipe.avi", "films/a.mraw", "films/a.png"):
         os.mkfifo(folder / pipe)
     with Session.open(folder / "run.labsession") as session:
         assert session.recording is not None
-        forged = pack(replace(session.recording, path=place, size=0))
+        forged = pack(replace(session.recording, path=path, size=0))
         with session._database.transaction() as connection:
             connection.execute("UPDATE recording SET content = ?", (forged,))
     script = """

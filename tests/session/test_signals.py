@@ -173,8 +173,8 @@ def test_mutated_binary_files_are_read_or_rejected(tmp_path: Path, monkeypatch, 
     rng = np.random.default_rng(4)
     for _ in range(60):
         bad = bytearray(good)
-        for place in rng.integers(0, min(len(bad), 200), 4):
-            bad[place] = int(rng.integers(256))
+        for index in rng.integers(0, min(len(bad), 200), 4):
+            bad[index] = int(rng.integers(256))
         path.write_bytes(bytes(bad[: rng.integers(1, len(bad) + 1)]))
         with contextlib.suppress(InputError):
             assert len(read_signals(path).time_s) < 1000

@@ -14,7 +14,7 @@ from labapp.simulated.simulate import begin_session, simulate
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Scenario, Path]:
+def simulation(tmp_path_factory: pytest.TempPathFactory) -> tuple[Scenario, Path]:
     """The scenario of a hollow, two frames, and the folder of its simulation."""
     path = next(path for path in shipped_scenarios() if path.stem == "concave")
     folder = tmp_path_factory.mktemp("simulated") / "hollow"
@@ -23,8 +23,10 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Scenario, Path]:
     return scenario, folder
 
 
-def test_session_contains_the_setup_and_the_expected_sizes(made: tuple[Scenario, Path]) -> None:
-    scenario, folder = made
+def test_session_contains_the_setup_and_the_expected_sizes(
+    simulation: tuple[Scenario, Path],
+) -> None:
+    scenario, folder = simulation
     path = folder / "hollow.labsession"
     begin_session(scenario, folder, path)
     with Session.open(path) as session:
@@ -37,8 +39,8 @@ def test_session_contains_the_setup_and_the_expected_sizes(made: tuple[Scenario,
     path.unlink()  # its lock file stays, and does not prevent a replacement
 
 
-def test_exception_in_progress_leaves_no_session(made: tuple[Scenario, Path]) -> None:
-    scenario, folder = made
+def test_exception_in_progress_leaves_no_session(simulation: tuple[Scenario, Path]) -> None:
+    scenario, folder = simulation
     before = {file.name for file in folder.iterdir()}
 
     def stop(done: int, total: int) -> None:
@@ -46,13 +48,13 @@ def test_exception_in_progress_leaves_no_session(made: tuple[Scenario, Path]) ->
 
     with pytest.raises(InterruptedError):
         begin_session(scenario, folder, folder / "other.labsession", stop)
-    left = {file.name for file in folder.iterdir()} - before
-    assert left <= {".other.labsession.lock"}
+    new_files = {file.name for file in folder.iterdir()} - before
+    assert new_files <= {".other.labsession.lock"}
     simulate(scenario, folder, workers=1)  # the folder can still be replaced
 
 
-def test_existing_file_is_not_overwritten(made: tuple[Scenario, Path]) -> None:
-    scenario, folder = made
+def test_existing_file_is_not_overwritten(simulation: tuple[Scenario, Path]) -> None:
+    scenario, folder = simulation
     path = folder / "mine.labsession"
     path.write_text("mine", "utf-8")
     with pytest.raises(InputError, match="file"):
@@ -61,12 +63,12 @@ def test_existing_file_is_not_overwritten(made: tuple[Scenario, Path]) -> None:
 
 
 def test_full_disk_is_reported_and_leaves_no_files(
-    made: tuple[Scenario, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    simulation: tuple[Scenario, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    scenario, _ = made
+    scenario, _ = simulation
     monkeypatch.setattr("labapp.simulation.recording.write_video", full)
     with pytest.raises(InputError, match="No space left on device"):
         simulate(scenario, tmp_path / "out", workers=1)

@@ -27,7 +27,7 @@ from labapp.media.cameras import (
     open_camera,
 )
 from labapp.media.recording.recorder import Plan, Recorder
-from tests.conftest import lacks
+from tests.conftest import skip_or_fail
 from tests.media.cameras.watching import Events
 from tests.waiting import wait_until
 
@@ -46,7 +46,7 @@ def plug() -> Iterator[Plug]:
     try:
         ctypes.CDLL(genicam.LIBRARY)
     except OSError:
-        lacks(f"{genicam.LIBRARY} is not installed")
+        skip_or_fail(f"{genicam.LIBRARY} is not installed")
     running: list[subprocess.Popen[str]] = []
 
     def start(lost: float = 0.0) -> subprocess.Popen[str]:

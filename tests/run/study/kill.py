@@ -22,7 +22,7 @@ import pandas as pd
 import psutil
 
 from labapp import Study
-from tests.conftest import HEEDING
+from tests.conftest import INTERRUPTIBLE
 
 
 def bytes_of(folder: Path) -> dict[str, str]:
@@ -38,7 +38,7 @@ def start(study: Path, out: Path, scheduler: str) -> subprocess.Popen[bytes]:
     arguments = ["study", "run", str(study), "--out", str(out), "--workers", "2"]
     arguments += ["--scheduler", scheduler] if scheduler else []
     return subprocess.Popen(
-        [sys.executable, "-c", HEEDING, *arguments],
+        [sys.executable, "-c", INTERRUPTIBLE, *arguments],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         start_new_session=True,

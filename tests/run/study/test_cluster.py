@@ -69,13 +69,13 @@ def cluster(workers: int, *options: str) -> Iterator[tuple[str, list[subprocess.
 
 
 def test_cluster_and_single_process_give_equal_files(study_file: Path, tmp_path: Path) -> None:
-    here = Study(study_file, tmp_path / "here")
-    expected = [recording.state for recording in here.run(0)]
-    there = Study(study_file, tmp_path / "there")
+    local = Study(study_file, tmp_path / "here")
+    expected = [recording.state for recording in local.run(0)]
+    distributed = Study(study_file, tmp_path / "there")
     with cluster(2) as (address, _):
-        assert [recording.state for recording in there.run(scheduler=address)] == expected
-    assert bytes_of(there.folder) == bytes_of(here.folder)
-    assert len(bytes_of(here.folder)) == 2
+        assert [recording.state for recording in distributed.run(scheduler=address)] == expected
+    assert bytes_of(distributed.folder) == bytes_of(local.folder)
+    assert len(bytes_of(local.folder)) == 2
 
 
 def test_killed_worker_does_not_stop_the_study(study_file: Path, tmp_path: Path) -> None:

@@ -289,12 +289,12 @@ def test_surfaces_are_an_array_over_frames(measured_file: Path, simulated: Path)
     np.testing.assert_allclose(data["z_mm"].max(("x", "y")).values, heights, atol=2e-3)
     setup = read_setup(simulated / "setup.toml")
     with open_source(simulated / "recording.avi") as source:
-        alone, _ = measure(source.frame(5).image, setup.bench, Settings())
-    assert alone.reconstruction is not None
+        measurement, _ = measure(source.frame(5).image, setup.bench, Settings())
+    assert measurement.reconstruction is not None
     z_mm = data["z_mm"].sel(frame=5)
     for x, y in ((0.0, 0.0), (1.0, -1.0)):
         stored = z_mm.sel(x=x, y=y, method="nearest")
-        expected = alone.reconstruction.surface.height(np.array(stored.x), np.array(stored.y))
+        expected = measurement.reconstruction.surface.height(np.array(stored.x), np.array(stored.y))
         assert float(stored) == pytest.approx(float(expected), abs=1e-6)
 
 
