@@ -66,7 +66,7 @@ def measured_images(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Six images, the fourth of them cut off; image k is grey level k."""
+    """Six images, the fourth of them truncated; image k has the grey level k."""
     folder = tmp_path / "images"
     folder.mkdir()
     for k in range(6):

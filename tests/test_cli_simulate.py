@@ -50,7 +50,7 @@ def column(path: Path, name: str) -> np.ndarray:
     return np.array([float(row[name]) for row in rows(path)])
 
 
-# --- what it writes -----------------------------------------------------------------------------
+# --- written files -----------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

@@ -35,7 +35,7 @@ def rows_by_cell(name: str, table: Table) -> str:
 
 
 @given(st.lists(st.tuples(NUMBERS, NUMBERS, NUMBERS), min_size=1, max_size=8))
-def test_numbers_are_formatted_like_by_python(rows: list[tuple[float, ...]]) -> None:
+def test_numbers_are_formatted_as_by_python(rows: list[tuple[float, ...]]) -> None:
     digits = np.array([0, 4, 6])
     text, length = format_fixed(np.array(rows), digits)
     if length >= 0:

@@ -38,8 +38,8 @@ def measure(
 ) -> list[Measured]:
     """Simulate a camera whose frames are measured, each in ``took_s``.
 
-    The frames whose order is in ``cold`` are measured by themselves, in 1.5 s; so is a frame far
-    from the one before, unless 16 were followed until then. Those in ``slow`` take 10 s.
+    The n-th measured frames, n in ``cold``, are measured by themselves, in 1.5 s; so is a frame
+    far from the one before, unless 16 were followed until then. Those in ``slow`` take 10 s.
     """
     measured: list[Measured] = []
     free_s, followed_count = frames[0] / RATE_HZ, MOST

@@ -1,4 +1,4 @@
-"""A session stays intact if the program is killed or the disk is full: `crash.py`, short."""
+"""A session survives a killed program and a full disk: a short run of `crash.py`."""
 
 from __future__ import annotations
 

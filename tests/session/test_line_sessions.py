@@ -66,7 +66,7 @@ def test_lines_are_measured_and_stored(session: Session):
 
 
 @pytest.mark.slow
-def test_lines_are_exported_like_by_the_command(session: Session, tmp_path: Path):
+def test_export_of_lines_equals_the_output_of_the_command(session: Session, tmp_path: Path):
     written = {file_written.name for file_written in session.export(tmp_path / "out")}
     assert written == {"features.csv", "lines.csv", "line_points.csv", "surface_000001.csv"}
     with (tmp_path / "out" / "features.csv").open(newline="", encoding="utf-8") as file:
