@@ -1,4 +1,4 @@
-"""What every test shares."""
+"""Fixtures and hooks of all tests."""
 
 from __future__ import annotations
 
@@ -18,34 +18,34 @@ from xdist.scheduler import LoadScopeScheduling
 
 from labapp import cli, log
 
-# The same examples every time, and no verdict that depends on how busy the machine is.
+# The same examples in every run, and no failure that depends on the load of the machine.
 settings.register_profile("labapp", derandomize=True, deadline=None)
 settings.load_profile("labapp")
 
-# Programs with a home of their own need not compile for themselves what is kept in the user's.
+# Programs with another home folder use the user's cache of compiled functions.
 os.environ.setdefault("NUMBA_CACHE_DIR", platformdirs.user_cache_dir("labapp", appauthor=False))
 
 Run = Callable[..., tuple[int, str, str]]
 
-HEEDING = """
+INTERRUPTIBLE = """
 import signal, sys
 from labapp.cli import main
 
 signal.signal(signal.SIGINT, signal.default_int_handler)  # a job in the background ignores it
 main(sys.argv[1:])
 """
-"""The program for ``python -c``: it heeds Ctrl-C also where tests are run in the background."""
+"""The program for ``python -c``: it reacts to Ctrl-C even if the tests run in the background."""
 
 
-def lacks(words: str) -> None:
-    """Skip a test that cannot be run here; where everything has to be there, fail."""
+def skip_or_fail(reason: str) -> None:
+    """Skip a test that cannot run on this machine, or fail where nothing may be skipped."""
     if os.environ.get("CI") or os.environ.get("LABAPP_SKIP_NOTHING"):
-        pytest.fail(words, pytrace=False)
-    pytest.skip(words)
+        pytest.fail(reason, pytrace=False)
+    pytest.skip(reason)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """What takes long is begun first: at the end a worker would wait for it."""
+    """Start slow tests first; otherwise other workers would wait for them at the end."""
     items.sort(key=lambda item: item.get_closest_marker("slow") is None)
 
 
@@ -72,11 +72,11 @@ SHARING = (
     "test_tour.py",
     "test_wheel.py",
 )
-"""Files of which one worker runs all tests: what these share takes long to make."""
+"""Files whose tests are all run by one worker, because their fixtures take long."""
 
 
 class Scheduling(LoadScopeScheduling):
-    """Give a worker the next test, or all tests of a file that shares."""
+    """Assign single tests to the workers, but all tests of a file in `SHARING` to one."""
 
     def _split_scope(self, nodeid: str) -> str:
         file = nodeid.partition("::")[0]
@@ -84,47 +84,47 @@ class Scheduling(LoadScopeScheduling):
 
 
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Producer) -> Scheduling:
-    """Return the scheduling of the tests in several workers."""
+    """Return the scheduler of the tests for several workers."""
     return Scheduling(config, log)
 
 
 @pytest.hookimpl(trylast=True)
 def pytest_runtest_teardown() -> None:
-    """Let the system have what was freed: glibc keeps some hundred megabytes in pieces."""
+    """Return freed memory to the system; glibc keeps some hundred megabytes in fragments."""
     if sys.platform == "linux":
         ctypes.CDLL("libc.so.6").malloc_trim(0)
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:
     if item.get_closest_marker("xvfb") and shutil.which("Xvfb") is None:
-        lacks("Xvfb is not installed")
+        skip_or_fail("Xvfb is not installed")
 
 
 @pytest.fixture(scope="session")
 def opengl() -> None:
-    """Let only what can draw in 3-D off-screen go on."""
+    """Skip the test if 3-D drawing off-screen is not possible."""
     from labapp.export.rendering.drawing import can_draw
 
     if not can_draw():
-        lacks("nothing can be drawn in 3-D here")
+        skip_or_fail("nothing can be drawn in 3-D here")
 
 
 @pytest.fixture
 def port() -> Iterator[int]:
-    """A free port that nobody takes meanwhile: it is bound, though not listened at."""
-    with socket.socket() as held:
-        held.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        held.bind(("127.0.0.1", 0))
-        yield held.getsockname()[1]
+    """Return a free port, which stays reserved: it is bound, but nothing listens on it."""
+    with socket.socket() as bound:
+        bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        bound.bind(("127.0.0.1", 0))
+        yield bound.getsockname()[1]
 
 
 @pytest.fixture
 def little_search(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The adviser's quick search finds less, in a tenth of the time."""
+    """Reduce the quick search of the adviser to a tenth of its time."""
     from labapp.studies.adviser import search as adviser
 
-    little = adviser.Effort(grid=(1, 1, 2), pools=(2, 2, 3), steps=1, finalists=1, sweep=2)
-    monkeypatch.setattr(adviser, "QUICK", little)
+    reduced = adviser.Effort(grid=(1, 1, 2), pools=(2, 2, 3), steps=1, finalists=1, sweep=2)
+    monkeypatch.setattr(adviser, "QUICK", reduced)
 
 
 @pytest.fixture
@@ -151,10 +151,10 @@ def labapp(capfd: pytest.CaptureFixture[str], state: Path, monkeypatch: pytest.M
         monkeypatch.delenv(name, raising=False)
 
     def start(*arguments: object) -> tuple[int, str, str]:
-        with pytest.raises(SystemExit) as ended:
+        with pytest.raises(SystemExit) as caught:
             cli.main([str(argument) for argument in arguments])
         out, err = capfd.readouterr()
-        assert isinstance(ended.value.code, int)
-        return ended.value.code, out, err
+        assert isinstance(caught.value.code, int)
+        return caught.value.code, out, err
 
     return start

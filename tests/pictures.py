@@ -1,6 +1,6 @@
-"""Pictures that are held against kept ones, with a tolerance.
+"""Comparison of pictures with stored references, within a tolerance.
 
-`RENEW` set in the environment keeps what is drawn now: look at it before it is committed.
+If `RENEW` is set in the environment, the references are replaced: look at them before committing.
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ PixelArray = npt.NDArray[np.integer]
 RENEW = "LABAPP_RENEW_PICTURES"
 
 FAR = 48
-"""A pixel this many levels away in a channel is another one; edges drawn otherwise are nearer."""
+"""Difference of a channel (levels) from which a pixel differs; antialiased edges differ less."""
 
 
 @dataclass(frozen=True)
 class Away:
-    """How far a picture is from another.
+    """Difference between two pictures.
 
     Parameters
     ----------
     mean
         Mean difference of a channel, levels of 255.
     share
-        Pixels that are `FAR` away, as a share of all.
+        Pixels that differ by `FAR` or more, as a share of all.
     """
 
     mean: float
     share: float
 
     def within(self, tolerance: Away) -> bool:
-        """Whether it is nearer than a tolerance in both ways."""
+        """Whether neither value exceeds that of a tolerance."""
         return self.mean <= tolerance.mean and self.share <= tolerance.share
 
 
@@ -48,23 +48,28 @@ def difference(one: PixelArray, other: PixelArray) -> PixelArray:
 
 
 def away(one: PixelArray, other: PixelArray) -> Away:
-    """How far two pictures, each of shape (height, width, 3), R, G, B, are from each other."""
-    apart = difference(one, other)
-    return Away(float(apart.mean()), float((apart.max(axis=2) >= FAR).mean()))
+    """Return the difference of two pictures, each of shape (height, width, 3), R, G, B."""
+    differences = difference(one, other)
+    return Away(float(differences.mean()), float((differences.max(axis=2) >= FAR).mean()))
 
 
-def check_picture(picture: PixelArray, kept: Path, tolerance: Away, out: Path) -> None:
-    """Fail if a picture is not as the kept one; it and the difference are written to ``out``."""
+def check_picture(picture: PixelArray, expected: Path, tolerance: Away, out: Path) -> None:
+    """Fail if a picture differs from its reference; write it and the difference to ``out``."""
     if os.environ.get(RENEW):
-        cv2.imwrite(str(kept), picture[..., ::-1])
-    assert kept.is_file(), f"{kept} is missing"
-    reference = cv2.imread(str(kept), cv2.IMREAD_COLOR_RGB)
-    actual, apart = out / kept.name, out / f"{kept.stem}-difference.png"
+        cv2.imwrite(str(expected), picture[..., ::-1])
+    assert expected.is_file(), f"{expected} is missing"
+    reference = cv2.imread(str(expected), cv2.IMREAD_COLOR_RGB)
+    actual, difference_file = (
+        out / expected.name,
+        out / f"{expected.stem}-difference.png",
+    )
     cv2.imwrite(str(actual), picture[..., ::-1])
     if reference.shape != picture.shape:
-        pytest.fail(f"{actual} is {picture.shape}, {kept} is {reference.shape}")
-    found = away(picture, reference)
-    if not found.within(tolerance):
-        shown = np.clip(2 * difference(picture, reference), 0, 255).astype(np.uint8)
-        cv2.imwrite(str(apart), shown[..., ::-1])
-        pytest.fail(f"{actual} is {found} from {kept}, more than {tolerance}: see {apart}")
+        pytest.fail(f"{actual} is {picture.shape}, {expected} is {reference.shape}")
+    distance = away(picture, reference)
+    if not distance.within(tolerance):
+        magnified = np.clip(2 * difference(picture, reference), 0, 255).astype(np.uint8)
+        cv2.imwrite(str(difference_file), magnified[..., ::-1])
+        pytest.fail(
+            f"{actual} is {distance} from {expected}, more than {tolerance}: see {difference_file}"
+        )

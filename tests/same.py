@@ -1,4 +1,4 @@
-"""What is the same, although NaN equals nothing."""
+"""Comparison of measures in which NaN equals NaN."""
 
 from __future__ import annotations
 

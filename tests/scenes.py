@@ -1,4 +1,4 @@
-"""Scenes of known truth for the tests of matching: exact reflections, seen by a made-up camera."""
+"""Scenes of known truth for the tests of matching: exact reflections in a simulated camera."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from labapp.core.images.dots import Dots
 from labapp.core.values import FloatArray, IntArray
 from labapp.simulation.forward import PoolSurface, Reflections, trace
 
-# The set-up of Fig. 3-17, its plane wide enough for every dot and its torch out of the way.
+# The set-up of Fig. 3-17, with a plane wide enough for every dot and the torch high above.
 OPEN_RIG = Rig(
     Laser(31.14, 31.48),
     DotPattern(),
@@ -20,7 +20,7 @@ OPEN_RIG = Rig(
     ImagingPlane.vertical(50.0, 500.0, -300.0, 1000.0, 1000.0),
 )
 
-# The same as it stood on the bench.
+# The same set-up with the dimensions of the bench.
 BENCH_RIG = Rig(
     Laser(31.14, 31.48), DotPattern(), Electrode(5.0), ImagingPlane.vertical(50.0, 45.0, 3.0)
 )
@@ -32,12 +32,12 @@ FRAME_SHAPE = (640, 480)
 
 @dataclass(frozen=True)
 class SeenDots:
-    """Dots as a perfect detector would find them, and the ray that made each.
+    """Dots as a perfect detector would find them, and the ray of each.
 
     Parameters
     ----------
     dots
-        The dots, in no order.
+        The dots, in random order.
     ray
         Ray (i, j) of each, shape (n, 2); 0 for a dot that no ray made.
     """
@@ -47,10 +47,10 @@ class SeenDots:
 
 
 def gaussian_dots(shape: tuple[int, int], places_px: FloatArray, size_px: float) -> FloatArray:
-    """Sum of round Gaussian dots of peak 1 at (u, v), shape (n, 2), px: each is a product."""
+    """Sum of round Gaussian dots of peak 1 at (u, v), shape (n, 2), px."""
     along, across = (
-        np.exp(-((np.arange(length)[:, None] - at) ** 2) / (2 * size_px**2))
-        for length, at in zip(shape, places_px.T[::-1], strict=True)
+        np.exp(-((np.arange(length)[:, None] - center) ** 2) / (2 * size_px**2))
+        for length, center in zip(shape, places_px.T[::-1], strict=True)
     )
     return np.asarray(along @ across.T)
 
@@ -64,11 +64,11 @@ def see(
     false: int = 0,
     rig: Rig = BENCH_RIG,
 ) -> SeenDots:
-    """Trace a pool and see its dots in the bench's view, some of them missing, some false."""
+    """Return the dots of a pool in the view of the bench, some missing, some false."""
     reflections = trace(pool, rig)
     image, ray = visible_dots(reflections)
-    keep = rng.permutation(len(image))[missing:]
-    image, ray = image[keep] + rng.normal(0.0, sigma_px, (len(keep), 2)), ray[keep]
+    order = rng.permutation(len(image))[missing:]
+    image, ray = image[order] + rng.normal(0.0, sigma_px, (len(order), 2)), ray[order]
     stray = rng.uniform(10.0, np.array(FRAME_SHAPE[::-1]) - 10.0, (false, 2))
     image = np.concatenate([image, stray])
     ray = np.concatenate([ray, np.zeros((false, 2), np.int64)])
@@ -76,7 +76,7 @@ def see(
 
 
 def visible_dots(reflections: Reflections) -> tuple[FloatArray, IntArray]:
-    """Place of each dot in the bench's view, px, and its ray."""
+    """Position of each dot in the view of the bench, px, and its ray."""
     image = BENCH_VIEW.to_image(np.nan_to_num(reflections.plane_mm, nan=-1e3))
     limit = np.array(FRAME_SHAPE[::-1]) - 1
     shown = reflections.visible & ((image > 0) & (image < limit)).all(axis=-1)
@@ -84,7 +84,7 @@ def visible_dots(reflections: Reflections) -> tuple[FloatArray, IntArray]:
 
 
 def as_dots(image_px: FloatArray, sigma_px: float = 0.15) -> Dots:
-    """Dots of one brightness at given places, shape (n, 2), px."""
+    """Dots of equal brightness at given positions, shape (n, 2), px."""
     n = len(image_px)
     sigma = np.full(n, max(sigma_px, 0.02))
     return Dots(

@@ -1,4 +1,4 @@
-"""A screen of its own for a program with windows."""
+"""A virtual display for a program with windows."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ from contextlib import contextmanager
 
 @contextmanager
 def screen(width: int, height: int) -> Iterator[str]:
-    """The name of a virtual display.
+    """Start a virtual display and return its name.
 
-    The server chooses its number itself: ``xvfb-run -a`` looks for one that is free first, and two
-    that look at once find the same.
+    The server chooses its number itself: ``xvfb-run -a`` searches for a free number first, and two
+    searches at the same time find the same number.
     """
     reading, writing = os.pipe()
     server = subprocess.Popen(
@@ -26,8 +26,8 @@ def screen(width: int, height: int) -> Iterator[str]:
     )
     os.close(writing)
     try:
-        with os.fdopen(reading) as told:
-            number = told.readline().strip()
+        with os.fdopen(reading) as pipe:
+            number = pipe.readline().strip()
         assert number, f"Xvfb ended with {server.wait()}"
         yield f":{number}"
     finally:

@@ -1,4 +1,4 @@
-"""Python in a process of its own, for what may hang or fill the memory."""
+"""Python in a separate process, for code that may hang or fill the memory."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ print("peak", int(peak.split()[1]) // 1024)
 
 
 def run_python(script: str, *arguments: object) -> str:
-    """Run a script, which must end in time and without an error; what it printed."""
-    done = subprocess.run(
+    """Run a script, which must end in time and without an error; return its output."""
+    process = subprocess.run(
         [sys.executable, "-c", textwrap.dedent(script), *map(str, arguments)],
         capture_output=True,
         text=True,
@@ -25,11 +25,11 @@ def run_python(script: str, *arguments: object) -> str:
         timeout=PATIENCE_S,
         env={"PYTHONPATH": ":".join(sys.path)},
     )
-    assert (done.returncode, done.stderr) == (0, "")
-    return done.stdout
+    assert (process.returncode, process.stderr) == (0, "")
+    return process.stdout
 
 
 def peak_mb(script: str, *arguments: object) -> int:
-    """Most memory that a script had at one time, MB."""
+    """Peak memory of a script, MB."""
     printed = run_python(textwrap.dedent(script) + SHOW_PEAK, *arguments)
     return int(printed.split()[-1])

@@ -1,4 +1,4 @@
-"""A scheme is a file and an entry of `SCHEMES` (docs/development.md): all offer it then.
+"""A scheme is a file and an entry of `SCHEMES` (docs/development.md); it is offered everywhere.
 
 Python loads the `sitecustomize` below at the start of each process, before labapp.
 """
@@ -105,14 +105,14 @@ Python = Callable[..., subprocess.CompletedProcess[str]]
 
 @pytest.fixture
 def python(tmp_path: Path) -> Python:
-    """Run Python where the toy is in the folder and in the list."""
+    """Run Python with the toy scheme in the folder of schemes and in `SCHEMES`."""
     site = tmp_path / "site"
     site.mkdir()
     (site / "sitecustomize.py").write_text(SITE)
     (site / "toy.py").write_text(TOY)
-    there = [str(site), str(SAMPLE.parents[1]), os.environ.get("PYTHONPATH", "")]
+    paths = [str(site), str(SAMPLE.parents[1]), os.environ.get("PYTHONPATH", "")]
     environment = os.environ | {
-        "PYTHONPATH": os.pathsep.join(filter(None, there)),
+        "PYTHONPATH": os.pathsep.join(filter(None, paths)),
         "QT_QPA_PLATFORM": "offscreen",
         "COLUMNS": "200",
         "XDG_STATE_HOME": str(tmp_path / "state"),
@@ -132,42 +132,44 @@ def python(tmp_path: Path) -> Python:
 
 
 @pytest.mark.slow
-def test_the_command_line_offers_and_runs_it(python: Python, tmp_path: Path) -> None:
+def test_command_line_offers_and_runs_an_added_scheme(python: Python, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    given = (SAMPLE / "recording.avi", "--setup", SAMPLE / "setup.toml", "--frames", "0:1")
-    done = python("-m", "labapp", "reconstruct", *given, "--out", out, "--scheme", "toy")
-    assert done.returncode == 0, done.stderr
+    arguments = (SAMPLE / "recording.avi", "--setup", SAMPLE / "setup.toml", "--frames", "0:1")
+    process = python("-m", "labapp", "reconstruct", *arguments, "--out", out, "--scheme", "toy")
+    assert process.returncode == 0, process.stderr
     with (out / "measures.csv").open(encoding="utf-8", newline="") as file:
         (row,) = csv.DictReader(file)
     assert (row["scheme"], row["status"]) == ("toy", "ok")
     for command in ("reconstruct", "session measure", "session export", "analyze errors"):
-        told = python("-m", "labapp", *command.split(), "--help").stdout
-        (line,) = (line for line in told.splitlines() if "--scheme" in line)
+        help_text = python("-m", "labapp", *command.split(), "--help").stdout
+        (line,) = (line for line in help_text.splitlines() if "--scheme" in line)
         assert "toy" in line, command
-    refused = python("-m", "labapp", "reconstruct", *given, "--out", out, "--scheme", "toys")
-    assert refused.returncode == 2
-    assert "'toy'" in refused.stderr
-    given = ("--algorithm", "epa-r", "--scheme", "toy", "--out", out, *given)
-    assert python("-m", "labapp", "reconstruct", *given).returncode == 2
+    rejected = python("-m", "labapp", "reconstruct", *arguments, "--out", out, "--scheme", "toys")
+    assert rejected.returncode == 2
+    assert "'toy'" in rejected.stderr
+    arguments = ("--algorithm", "epa-r", "--scheme", "toy", "--out", out, *arguments)
+    assert python("-m", "labapp", "reconstruct", *arguments).returncode == 2
 
 
 @pytest.mark.slow
-def test_sessions_and_pages_have_it(python: Python, tmp_path: Path) -> None:
+def test_sessions_and_pages_offer_an_added_scheme(python: Python, tmp_path: Path) -> None:
     file = Path(shutil.copytree(SAMPLE, tmp_path / "gtaw")) / "gtaw.labsession"
-    done = python("-m", "labapp", "session", "measure", file, "--frames", "0:1", "--scheme", "toy")
-    assert done.returncode == 0, done.stderr
-    told = python("-c", IN_THE_WINDOW, file)
-    assert told.returncode == 0, told.stderr
-    found = json.loads(told.stdout)
-    assert found.pop("compared").startswith("Toy minus Fit, from the same dots: the heights")
-    assert found.pop("other") == "fit"
-    assert found.pop("provenance").startswith("Frame 0 · Toy · dots found automatically")
-    assert found.pop("export page")[""] == "the toy (as in the settings)"
-    for where, offered in found.items():
+    process = python(
+        "-m", "labapp", "session", "measure", file, "--frames", "0:1", "--scheme", "toy"
+    )
+    assert process.returncode == 0, process.stderr
+    window = python("-c", IN_THE_WINDOW, file)
+    assert window.returncode == 0, window.stderr
+    texts = json.loads(window.stdout)
+    assert texts.pop("compared").startswith("Toy minus Fit, from the same dots: the heights")
+    assert texts.pop("other") == "fit"
+    assert texts.pop("provenance").startswith("Frame 0 · Toy · dots found automatically")
+    assert texts.pop("export page")[""] == "the toy (as in the settings)"
+    for where, offered in texts.items():
         assert "toy" in offered, where
-    assert found["surface page"]["toy"] == "Toy: a quadric by least squares"
+    assert texts["surface page"]["toy"] == "Toy: a quadric by least squares"
     out = tmp_path / "out"
-    wanted = ("--scheme", "toy", "--frames", "0:1", "--out", out)
-    done = python("-m", "labapp", "session", "export", file, *wanted)
-    assert done.returncode == 0, done.stderr
+    options = ("--scheme", "toy", "--frames", "0:1", "--out", out)
+    process = python("-m", "labapp", "session", "export", file, *options)
+    assert process.returncode == 0, process.stderr
     assert ",ok,toy," in (out / "measures.csv").read_text("utf-8").splitlines()[1]

@@ -36,11 +36,11 @@ def image() -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def results(image: np.ndarray) -> labapp.Results:
-    """Of a frame that can be measured and of one that cannot."""
+    """Results of a frame that can be measured and of one that cannot."""
     return labapp.measure(np.array([image, np.zeros_like(image)]), SETUP)
 
 
-def test_the_public_names_are_those_that_are_there() -> None:
+def test_all_public_names_exist() -> None:
     assert set(labapp.__all__) <= set(dir(labapp))
     for name in labapp.__all__:
         assert getattr(labapp, name) is not None
@@ -49,44 +49,46 @@ def test_the_public_names_are_those_that_are_there() -> None:
 
 
 def documented() -> dict[str, object]:
-    """Names of the API reference, and what they stand for."""
+    """Names of the API reference and their objects."""
     text = (Path(__file__).parents[1] / "docs/reference/api.md").read_text("utf-8")
     return {name: pkgutil.resolve_name(name) for name in re.findall(r"^::: (\S+)", text, re.M)}
 
 
-def test_what_is_exported_is_documented_and_the_reverse() -> None:
+def test_exported_and_documented_names_are_equal() -> None:
     names = {name for name in documented() if name.count(".") == 1}
     assert names == {f"labapp.{name}" for name in labapp.__all__ if name != "__version__"}
 
 
-@pytest.mark.parametrize(("name", "what"), documented().items())
-def test_every_documented_name_says_what_its_parameters_are(name: str, what: object) -> None:
-    silent = []
-    for each, function in public_functions(name, what).items():
+@pytest.mark.parametrize(("name", "documented_object"), documented().items())
+def test_every_documented_name_explains_its_parameters(
+    name: str, documented_object: object
+) -> None:
+    unexplained = []
+    for full_name, function in public_functions(name, documented_object).items():
         doc = inspect.getdoc(function) or ""
         section = doc.partition("Parameters\n----------\n")[2]
         explained = set(re.findall(r"\w+", " ".join(re.findall(r"^\w[\w, ]*$", section, re.M))))
         parameters = set(inspect.signature(function).parameters) - {"self", "cls"}
         if not doc or parameters - explained:
-            silent.append((each, parameters - explained))
-    assert not silent
-    assert inspect.getdoc(what)
+            unexplained.append((full_name, parameters - explained))
+    assert not unexplained
+    assert inspect.getdoc(documented_object)
 
 
-def public_functions(name: str, what: object) -> dict[str, Callable[..., object]]:
-    """A function, or the methods of a class that are labapp's own."""
-    if not inspect.isclass(what):
-        return {name: what} if callable(what) else {}
-    bases = [base for base in what.__mro__ if base.__module__.startswith("labapp.")]
+def public_functions(name: str, documented_object: object) -> dict[str, Callable[..., object]]:
+    """Return a function by its name, or the public methods of a class of labapp."""
+    if not inspect.isclass(documented_object):
+        return {name: documented_object} if callable(documented_object) else {}
+    bases = [base for base in documented_object.__mro__ if base.__module__.startswith("labapp.")]
     return {
-        f"{name}.{key}": getattr(what, key)
+        f"{name}.{key}": getattr(documented_object, key)
         for base in bases
         for key, value in vars(base).items()
         if not key.startswith("_") and isinstance(value, FunctionType | classmethod | staticmethod)
     }
 
 
-def test_a_recording_and_its_images_give_the_same_as_the_command_line(
+def test_recording_and_image_give_the_values_of_the_command_line(
     image: np.ndarray, labapp: Run, tmp_path: Path
 ) -> None:
     import labapp as api
@@ -98,16 +100,18 @@ def test_a_recording_and_its_images_give_the_same_as_the_command_line(
     )  # fmt: skip
     assert code == 0
     (row,) = (out / "measures.csv").read_text("utf-8").splitlines()[1:]
-    seen: list[int] = []
-    by_path = api.measure(RECORDING, SETUP, frames="0", progress=lambda r: seen.append(r.frame))
+    measured_frames: list[int] = []
+    by_path = api.measure(
+        RECORDING, SETUP, frames="0", progress=lambda r: measured_frames.append(r.frame)
+    )
     by_image = api.measure(image, read_setup(SETUP))
-    assert seen == [0]
-    for found in (by_path, by_image):
-        (height,) = found.dataframe()["height_mm"]
+    assert measured_frames == [0]
+    for results in (by_path, by_image):
+        (height,) = results.dataframe()["height_mm"]
         assert f"{height:.6f}" in row.split(",")
 
 
-def test_a_table_has_a_row_a_frame_with_units_and_why_there_is_no_surface(
+def test_table_has_a_row_for_each_frame_with_units_and_status(
     results: labapp.Results,
 ) -> None:
     table = results.dataframe()
@@ -117,46 +121,46 @@ def test_a_table_has_a_row_a_frame_with_units_and_why_there_is_no_surface(
     assert table.attrs["units"]["height_mm"] == "mm"
     assert list(table) == [column.name for column in TABLES["measures"]]
     points = results.dataframe("points")
-    made = results[MEASURED].measurement.reconstruction
-    assert made is not None
-    assert len(points) == len(made.points_mm)
-    assert points["z_mm"].to_numpy() == pytest.approx(made.points_mm[:, 2])
+    reconstruction = results[MEASURED].measurement.reconstruction
+    assert reconstruction is not None
+    assert len(points) == len(reconstruction.points_mm)
+    assert points["z_mm"].to_numpy() == pytest.approx(reconstruction.points_mm[:, 2])
 
 
-def test_surfaces_lie_on_one_grid_and_end_at_the_boundary(results: labapp.Results) -> None:
+def test_surfaces_share_a_grid_and_end_at_the_boundary(results: labapp.Results) -> None:
     grid = results.surfaces(0.2)
-    made = results[MEASURED].measurement.reconstruction
-    assert made is not None
+    reconstruction = results[MEASURED].measurement.reconstruction
+    assert reconstruction is not None
     height = grid["height"]
     assert height.dims == ("frame", "y", "x")
     assert list(grid["frame"]) == [0]  # the other has no surface
     x, y = np.meshgrid(grid["x"], grid["y"])
-    inside = made.boundary.contains(x, y)
+    inside = reconstruction.boundary.contains(x, y)
     assert np.isfinite(height[0].to_numpy()[inside]).all()
     assert np.isnan(height[0].to_numpy()[~inside]).all()
     assert float(height.max()) == pytest.approx(results.dataframe()["height_mm"][0], rel=0.02)
 
 
-def test_frames_may_be_followed_sliced_and_shown(image: np.ndarray) -> None:
-    found = labapp.measure(np.array([image] * 3), SETUP, follow=True)
-    assert [r.measurement.status for r in found] == ["ok"] * 3
-    assert [r.frame for r in found[1:]] == [1, 2]
-    assert "3 frames, 3 measured" in repr(found)
-    axes = found.plot("width_mm")
+def test_results_can_be_followed_sliced_and_plotted(image: np.ndarray) -> None:
+    results = labapp.measure(np.array([image] * 3), SETUP, follow=True)
+    assert [r.measurement.status for r in results] == ["ok"] * 3
+    assert [r.frame for r in results[1:]] == [1, 2]
+    assert "3 frames, 3 measured" in repr(results)
+    axes = results.plot("width_mm")
     (line,) = axes.get_lines()
-    assert line.get_ydata() == pytest.approx(found.dataframe()["width_mm"])
-    axes = found.plot_surface(2)
+    assert line.get_ydata() == pytest.approx(results.dataframe()["width_mm"])
+    axes = results.plot_surface(2)
     assert axes.get_xlabel() == "X (mm)"
-    made = found[2].measurement.reconstruction
-    assert made is not None
+    reconstruction = results[2].measurement.reconstruction
+    assert reconstruction is not None
     color = axes.collections[0].get_facecolor()  # one for each band of heights
     assert len(color) > 10
     bands = axes.collections[0].get_paths()
-    rim = made.boundary.center_mm + 0.998 * (
-        made.boundary.points_mm[:, :2] - made.boundary.center_mm
+    rim = reconstruction.boundary.center_mm + 0.998 * (
+        reconstruction.boundary.points_mm[:, :2] - reconstruction.boundary.center_mm
     )
-    shown = np.any([band.contains_points(rim) for band in bands], axis=0)
-    assert shown.mean() > 0.99  # no steps along the boundary
+    is_filled = np.any([band.contains_points(rim) for band in bands], axis=0)
+    assert is_filled.mean() > 0.99  # no steps along the boundary
 
 
 @pytest.mark.parametrize(
@@ -168,7 +172,7 @@ def test_frames_may_be_followed_sliced_and_shown(image: np.ndarray) -> None:
         ("dots", "dots", None),
     ],
 )
-def test_a_plot_names_size_and_unit_and_has_a_band(
+def test_plot_has_a_label_with_unit_and_a_band(
     results: labapp.Results, size: str, label: str, sigma: str | None
 ) -> None:
     axes = results.plot(size)
@@ -180,28 +184,28 @@ def test_a_plot_names_size_and_unit_and_has_a_band(
     assert spans == ([] if sigma is None else [pytest.approx(2 * table[sigma])])
 
 
-def test_what_is_printed_is_short(results: labapp.Results) -> None:
+def test_representations_are_short(results: labapp.Results) -> None:
     measured, blank = results[MEASURED], results[BLANK]
     assert "no-dots" in repr(blank)
     assert measured.measurement.measures is not None
     height = f"{measured.measurement.measures.height_mm:.3f}"
-    for each in (measured, measured.measurement, measured.measurement.measures):
-        assert height in repr(each)
-    made = measured.measurement.reconstruction
-    assert made is not None
-    parts = (made.boundary, measured.measurement.dots, measured.measurement.match)
-    for each in (measured, blank, measured.measurement, measured.measurement.measures, *parts):
-        assert len(repr(each)) < 400, repr(each)
+    for item in (measured, measured.measurement, measured.measurement.measures):
+        assert height in repr(item)
+    reconstruction = measured.measurement.reconstruction
+    assert reconstruction is not None
+    parts = (reconstruction.boundary, measured.measurement.dots, measured.measurement.match)
+    for item in (measured, blank, measured.measurement, measured.measurement.measures, *parts):
+        assert len(repr(item)) < 400, repr(item)
 
 
-def test_the_results_of_a_session_are_those_that_it_has() -> None:
+def test_results_of_a_session_are_the_stored_ones() -> None:
     with labapp.Session.open(SAMPLE / "gtaw.labsession", read_only=True) as session:
         of_session = labapp.Results.of_session(session)
         assert len(of_session) == len(session.frames)
-        kept = session.result(0)
-        assert kept is not None
-        assert kept.measurement.measures is not None
-        height_mm = kept.measurement.measures.height_mm
+        stored = session.result(0)
+        assert stored is not None
+        assert stored.measurement.measures is not None
+        height_mm = stored.measurement.measures.height_mm
     assert "gtaw.labsession" in repr(session)
     table = of_session.dataframe()
     assert table["height_mm"][0] == height_mm
@@ -209,19 +213,19 @@ def test_the_results_of_a_session_are_those_that_it_has() -> None:
 
 
 def test_other_settings_are_used(image: np.ndarray) -> None:
-    (found,) = labapp.measure(image, SETUP, settings=Settings(scheme="ers"))
-    assert found.measurement.scheme == "ers"
+    (result,) = labapp.measure(image, SETUP, settings=Settings(scheme="ers"))
+    assert result.measurement.scheme == "ers"
 
 
 @pytest.mark.parametrize(
     "wrong", [np.zeros(5), np.zeros((2, 2), complex), np.zeros((0, 4)), np.zeros((1, 2, 3, 4))]
 )
-def test_what_is_no_image_is_refused(wrong: np.ndarray) -> None:
+def test_invalid_image_is_rejected(wrong: np.ndarray) -> None:
     with pytest.raises(labapp.InputError):
         labapp.measure(wrong, SETUP)
 
 
-def test_a_grid_that_is_too_fine_and_a_frame_without_a_surface_are_refused(
+def test_wrong_grid_spacing_and_missing_surface_are_rejected(
     results: labapp.Results,
 ) -> None:
     for spacing_mm in (0.0, -1.0, 1e-7, float("nan")):

@@ -1,4 +1,4 @@
-"""Wrong arguments of the Python API: an `InputError` that names what is wrong and what is right."""
+"""Wrong arguments of the Python API: an `InputError` states what is wrong and what is expected."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ RECORDING, SETUP = next(SAMPLE.glob("recording.*")), SAMPLE / "setup.toml"
 ANY: Any = None
 
 
-def refused(call: Callable[[], object]) -> labapp.InputError:
+def error_of(call: Callable[[], object]) -> labapp.InputError:
     with pytest.raises(labapp.InputError) as caught:
         call()
     return caught.value
@@ -59,13 +59,13 @@ def session(tmp_path: Path) -> labapp.Session:
 )
 def test_measure_names_the_argument(field: str, given: dict[str, Any]) -> None:
     source, setup = given.pop("source", RECORDING), given.pop("setup", SETUP)
-    error = refused(lambda: labapp.measure(source, setup, **given))
+    error = error_of(lambda: labapp.measure(source, setup, **given))
     assert error.field == field
     assert "--" not in str(error)  # no option of the command line
 
 
 @pytest.mark.parametrize(
-    ("call", "right"),
+    ("call", "expected"),
     [
         (lambda r: r.dataframe("dotz"), "dots"),
         (lambda r: r.dataframe(["dots"]), "dots"),
@@ -90,13 +90,13 @@ def test_measure_names_the_argument(field: str, given: dict[str, Any]) -> None:
         (lambda r: r.of_session("x"), "Session"),
     ],
 )
-def test_results_say_what_would_be_right(
-    results: labapp.Results, call: Callable[[Any], object], right: str
+def test_results_state_what_is_expected(
+    results: labapp.Results, call: Callable[[Any], object], expected: str
 ) -> None:
-    assert right in refused(lambda: call(results)).expected
+    assert expected in error_of(lambda: call(results)).expected
 
 
-def test_the_last_surface_counts_from_the_end(results: labapp.Results) -> None:
+def test_negative_index_counts_from_the_last_surface(results: labapp.Results) -> None:
     assert results.plot_surface(-1).get_xlabel() == "X (mm)"
 
 
@@ -137,20 +137,20 @@ def test_the_last_surface_counts_from_the_end(results: labapp.Results) -> None:
         lambda s: s.export("out", scheme="fitt"),
     ],
 )
-def test_a_session_refuses_and_stores_nothing(
+def test_session_rejects_wrong_arguments_and_stores_nothing(
     session: labapp.Session, call: Callable[[Any], object]
 ) -> None:
     with session:
-        refused(lambda: call(session))
+        error_of(lambda: call(session))
         assert session.history == ()
 
 
 @pytest.mark.parametrize("make", [labapp.Session.create, labapp.Session.open, labapp.Study])
-def test_a_path_is_a_path(make: Callable[[Any], object]) -> None:
-    assert refused(lambda: make(5)).field == "path"
+def test_number_is_rejected_as_a_path(make: Callable[[Any], object]) -> None:
+    assert error_of(lambda: make(5)).field == "path"
 
 
-def test_a_script_that_failed_half_way_can_be_run_again(tmp_path: Path) -> None:
+def test_failed_script_can_be_run_again(tmp_path: Path) -> None:
     path, text = tmp_path / "run.labsession", SETUP.read_text("utf-8")
 
     def script(setup: str, *, exist_ok: bool = True) -> list[int]:
@@ -159,20 +159,20 @@ def test_a_script_that_failed_half_way_can_be_run_again(tmp_path: Path) -> None:
             session.import_recording(RECORDING, "0:2")
             return [number for number, _ in session.measure()]
 
-    refused(lambda: script(text.replace("[laser]", "[lazer]")))
+    error_of(lambda: script(text.replace("[laser]", "[lazer]")))
     assert script(text) == [0, 1]
     assert script(text) == []  # nothing is lost, and nothing is measured twice
-    assert refused(lambda: script(text, exist_ok=False)).field == "file"
+    assert error_of(lambda: script(text, exist_ok=False)).field == "file"
     with labapp.Session.open(path) as session:
         assert session.record.title == "run"
         assert len(session.stale_frames()) == 0
     other = tmp_path / "other.labsession"
     other.write_text("notes of a user")
-    refused(lambda: labapp.Session.create(other, exist_ok=True))
+    error_of(lambda: labapp.Session.create(other, exist_ok=True))
     assert other.read_text() == "notes of a user"
 
 
-def test_values_that_no_usual_bench_has_are_a_warning_and_a_doubt(tmp_path: Path) -> None:
+def test_implausible_setup_causes_a_warning_and_a_doubt(tmp_path: Path) -> None:
     text = SETUP.read_text("utf-8")
     low = text.replace("[electrode]\nheight_mm = 5.0", "[electrode]\nheight_mm = 0.5")
     assert low != text
@@ -180,10 +180,10 @@ def test_values_that_no_usual_bench_has_are_a_warning_and_a_doubt(tmp_path: Path
     with open_source(RECORDING) as source:
         image = np.array(source.frame(0).image)
     with pytest.warns(UserWarning, match=r"electrode\.height_mm is 0\.5 mm"):
-        found = labapp.measure(image, wrong)
-    assert found.setup_check is not None
-    assert found.setup_check.is_doubtful
-    assert list(found.dataframe()["setup_status"]) == ["doubtful"]
+        results = labapp.measure(image, wrong)
+    assert results.setup_check is not None
+    assert results.setup_check.is_doubtful
+    assert list(results.dataframe()["setup_status"]) == ["doubtful"]
     with labapp.Session.create(tmp_path / "one.labsession") as session:
         session.set_setup(low)
         assert session.setup_status == "doubtful"

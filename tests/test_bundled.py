@@ -1,4 +1,4 @@
-"""Where the files are that come with labapp: beside the package, or inside it."""
+"""Location of the files shipped with labapp: beside the package or inside it."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from labapp.bundled import bundled
 ROOT = Path(__file__).parents[1]
 
 
-def test_in_a_checkout_they_are_beside_the_package() -> None:
+def test_bundled_files_of_a_checkout_are_beside_the_package() -> None:
     assert bundled("resources/udev") == ROOT / "resources" / "udev"
     assert bundled("sample_sessions") == ROOT / "sample_sessions"
 
 
-def test_in_a_wheel_they_are_inside_the_package(
+def test_bundled_files_of_a_wheel_are_inside_the_package(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     package = tmp_path / "labapp"

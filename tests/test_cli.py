@@ -38,7 +38,7 @@ def table(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def answer(status: str = "no-dots") -> Measurement:
+def failed_measurement(status: str = "no-dots") -> Measurement:
     return Measurement(
         status=status,
         reason="for the test",
@@ -53,12 +53,12 @@ def answer(status: str = "no-dots") -> Measurement:
 
 @pytest.fixture
 def measured_images(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
-    """Replace the measurement by one that only keeps the images it was given."""
+    """Replace the measurement by one that only records its images."""
     images: list[np.ndarray] = []
 
     def measure(image: np.ndarray, *_: object) -> tuple[Measurement, None]:
         images.append(image)
-        return answer(), None
+        return failed_measurement(), None
 
     monkeypatch.setattr(measurers, "measure", measure)
     return images
@@ -66,7 +66,7 @@ def measured_images(monkeypatch: pytest.MonkeyPatch) -> list[np.ndarray]:
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Six images, the fourth of them cut off; image k is grey level k."""
+    """Six images, the fourth of them truncated; image k has the grey level k."""
     folder = tmp_path / "images"
     folder.mkdir()
     for k in range(6):
@@ -97,7 +97,7 @@ def test_frames_are_selected_like_a_slice(text: str, expected: list[int]) -> Non
 
 
 @pytest.mark.parametrize("text", ["a", "1:2:3:4", "::0", "::-1", "6", "4:2", "1.5", "1-3"])
-def test_a_wrong_selection_of_frames_is_refused(text: str) -> None:
+def test_wrong_frame_selection_is_rejected(text: str) -> None:
     with pytest.raises(InputError, match=r"--frames: frames: .*; expected"):
         select_frames(text, 6)
 
@@ -105,64 +105,68 @@ def test_a_wrong_selection_of_frames_is_refused(text: str) -> None:
 # --- reconstruct ------------------------------------------------------------------------------
 
 
-def test_every_frame_has_its_row_and_a_line_if_it_failed(
+def test_each_frame_has_a_row_and_each_failure_a_line(
     labapp: Run, folder: Path, tmp_path: Path, measured_images: list[np.ndarray]
 ) -> None:
     out = tmp_path / "out"
-    code, said, complained = labapp("reconstruct", folder, "--setup", SETUP, "--out", out)
+    code, stdout, stderr = labapp("reconstruct", folder, "--setup", SETUP, "--out", out)
     rows = table(out / "measures.csv")
     assert [row["frame"] for row in rows] == list("012345")
     assert [row["status"] for row in rows] == [*["no-dots"] * 3, "unreadable", *["no-dots"] * 2]
     assert [int(image[0, 0]) for image in measured_images] == [0, 1, 2, 4, 5]
-    lines = complained.splitlines()
+    lines = stderr.splitlines()
     assert len(lines) == 6
     assert lines[0] == "frame 0: no-dots: for the test"
     assert lines[3].startswith("frame 3: unreadable: ")
     assert "3.png: content: cannot be decoded; expected a complete image" in lines[3]
-    assert "6 frames, 0 with a surface (5 no-dots, 1 unreadable)" in said
-    assert str(out) in said
+    assert "6 frames, 0 with a surface (5 no-dots, 1 unreadable)" in stdout
+    assert str(out) in stdout
     assert code == 1  # done, and nothing could be measured
 
 
-def test_options_reach_the_measurement(
+def test_options_are_passed_to_the_measurement(
     labapp: Run, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    seen: list[Settings] = []
+    used_settings: list[Settings] = []
 
-    def measure(*given: Any) -> tuple[Measurement, None]:
-        seen.append(given[2])
-        return answer(), None
+    def measure(*arguments: Any) -> tuple[Measurement, None]:
+        used_settings.append(arguments[2])
+        return failed_measurement(), None
 
     monkeypatch.setattr(measurers, "measure", measure)
     out = tmp_path / "out"
     options = "--scheme irs --algorithm epa-rc --correspondence I/I --frames 0:3:2".split()
     labapp("reconstruct", folder, "--setup", SETUP, "--out", out, *options)
-    assert len(seen) == 2
-    assert (seen[0].scheme, seen[0].algorithm, seen[0].correspondence) == ("irs", "epa-rc", "I/I")
-    told = json.loads((out / "run.json").read_text())
-    assert told["settings"]["algorithm"] == "epa-rc"
-    assert told["frames"] == {"start": 0, "stop": 3, "step": 2}
-    assert told["setup"]["toml"] == SETUP.read_text()
-    assert told["source"]["path"] == str(folder)
+    assert len(used_settings) == 2
+    assert (
+        used_settings[0].scheme,
+        used_settings[0].algorithm,
+        used_settings[0].correspondence,
+    ) == ("irs", "epa-rc", "I/I")
+    summary = json.loads((out / "run.json").read_text())
+    assert summary["settings"]["algorithm"] == "epa-rc"
+    assert summary["frames"] == {"start": 0, "stop": 3, "step": 2}
+    assert summary["setup"]["toml"] == SETUP.read_text()
+    assert summary["source"]["path"] == str(folder)
 
 
-def test_a_truncated_video_is_measured_as_far_as_it_goes(
+def test_readable_frames_of_a_truncated_video_are_measured(
     labapp: Run, tmp_path: Path, measured_images: list[np.ndarray]
 ) -> None:
     video = tmp_path / "v.avi"
     content = (SAMPLE / "recording.avi").read_bytes()
     video.write_bytes(content[: len(content) // 2])
     out = tmp_path / "out"
-    _, _, complained = labapp("reconstruct", video, "--setup", SETUP, "--out", out)
+    _, _, stderr = labapp("reconstruct", video, "--setup", SETUP, "--out", out)
     rows = table(out / "measures.csv")
     assert 10 < len(rows) < 20
     assert float(rows[6]["time_s"]) == pytest.approx(0.1)
-    assert complained.startswith("warning: v.avi ends early: its header says 30 frames")
+    assert stderr.startswith("warning: v.avi ends early: its header says 30 frames")
     assert len(measured_images) == len(rows)
 
 
-def test_any_image_is_measured_or_answered(labapp: Run, tmp_path: Path) -> None:
-    """One pixel, 16 bit, colour, float: by the real measurement."""
+def test_any_image_gets_a_status_and_a_reason(labapp: Run, tmp_path: Path) -> None:
+    """One pixel, 16 bit, colour and float, with the real measurement."""
     noise = np.random.default_rng(0).integers(0, 60, (40, 50, 3))
     images = {
         "one.png": np.array([[7]], np.uint8),
@@ -185,52 +189,50 @@ def test_any_image_is_measured_or_answered(labapp: Run, tmp_path: Path) -> None:
     ("name", "content"),
     [("empty.avi", b""), ("text.avi", b"not a video\n" * 99), ("empty.png", b""), ("x", b"\x00")],
 )
-def test_what_is_no_source_is_refused_in_a_line(
+def test_invalid_source_is_rejected_in_one_line(
     labapp: Run, tmp_path: Path, name: str, content: bytes, state: Path
 ) -> None:
     path = tmp_path / name
     path.write_bytes(content)
-    code, said, complained = labapp("reconstruct", path, "--setup", SETUP, "--out", tmp_path / "o")
+    code, stdout, stderr = labapp("reconstruct", path, "--setup", SETUP, "--out", tmp_path / "o")
     assert code == 2
-    assert said == ""
-    assert complained.startswith(f"labapp: {path}: ")
-    assert complained.count("\n") == 1
-    assert "; expected " in complained
+    assert stdout == ""
+    assert stderr.startswith(f"labapp: {path}: ")
+    assert stderr.count("\n") == 1
+    assert "; expected " in stderr
     assert not (tmp_path / "o").exists()
     (logged,) = state.rglob("labapp.log")
     assert "Traceback" in logged.read_text()
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "message"),
     [
         ("distance_mm = 31.48\n", "", "laser.distance_mm: missing; expected a number above 0"),
         ("distance_mm = 31.48", "distance_mm = -31.48", "laser.distance_mm: -31.48; expected a"),
         ("distance_mm = 31.48", "distance_mm = nan", "laser.distance_mm: nan; expected a number"),
     ],
 )
-def test_a_wrong_setup_is_refused_in_a_line(
-    labapp: Run, folder: Path, tmp_path: Path, old: str, new: str, said: str
+def test_wrong_setup_is_rejected_in_one_line(
+    labapp: Run, folder: Path, tmp_path: Path, old: str, new: str, message: str
 ) -> None:
     setup = tmp_path / "setup.toml"
     setup.write_text(SETUP.read_text().replace(old, new))
-    code, _, complained = labapp("reconstruct", folder, "--setup", setup, "--out", tmp_path / "o")
+    code, _, stderr = labapp("reconstruct", folder, "--setup", setup, "--out", tmp_path / "o")
     assert code == 2
-    assert complained.startswith(f"labapp: {setup}: {said}")
-    assert complained.count("\n") == 1
+    assert stderr.startswith(f"labapp: {setup}: {message}")
+    assert stderr.count("\n") == 1
 
 
-def test_a_folder_that_cannot_be_written_is_refused(
-    labapp: Run, folder: Path, tmp_path: Path
-) -> None:
+def test_unwritable_output_folder_is_rejected(labapp: Run, folder: Path, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     out = tmp_path / "file" / "out"
-    code, _, complained = labapp("reconstruct", folder, "--setup", SETUP, "--out", out)
+    code, _, stderr = labapp("reconstruct", folder, "--setup", SETUP, "--out", out)
     assert code == 2
-    assert f"labapp: {out}: results: Not a directory" in complained
+    assert f"labapp: {out}: results: Not a directory" in stderr
 
 
-def test_a_full_disk_leaves_whole_frames(
+def test_full_disk_leaves_complete_frames(
     labapp: Run,
     folder: Path,
     tmp_path: Path,
@@ -239,18 +241,18 @@ def test_a_full_disk_leaves_whole_frames(
 ) -> None:
     append = results._append
 
-    def fill(file: object, text: str) -> None:
+    def append_until_full(file: object, text: str) -> None:
         if len(measured_images) == 3:
             append(file, text[:10])
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         append(file, text)
 
-    monkeypatch.setattr(results, "_append", fill)
+    monkeypatch.setattr(results, "_append", append_until_full)
     out = tmp_path / "out"
-    code, _, complained = labapp("reconstruct", folder, "--setup", SETUP, "--out", out)
+    code, _, stderr = labapp("reconstruct", folder, "--setup", SETUP, "--out", out)
     assert code == 2
-    assert "results: No space left on device" in complained
-    assert "the 2 previous frames are complete" in complained
+    assert "results: No space left on device" in stderr
+    assert "the 2 previous frames are complete" in stderr
     assert [row["frame"] for row in table(out / "measures.csv")] == ["0", "1"]
     assert json.loads((out / "run.json").read_text())["state"] == "failed"
 
@@ -273,50 +275,52 @@ SLOW = """
 """
 
 
-def test_measures_are_told_while_they_are_made(tmp_path: Path) -> None:
+def test_measures_are_streamed_while_measuring(tmp_path: Path) -> None:
     out = tmp_path / "out"
     arguments = ["reconstruct", SAMPLE / "recording.avi", "--setup", SETUP, "--out", out]
-    started = subprocess.Popen(
+    process = subprocess.Popen(
         [sys.executable, "-m", "labapp", *arguments, "--frames", "0:2", "--lines", "0"],
         stderr=subprocess.PIPE,
         text=True,
     )
-    assert started.stderr is not None
-    port = int(started.stderr.readline().rpartition(":")[2])
-    with connect(port) as connected:
-        told = [json.loads(line) for line in connected.makefile("rb")][1:]
-    _, complained = started.communicate(timeout=PATIENCE_S)
-    assert started.returncode == 0, complained
-    assert [line["frame"] for line in told] == [0, 1]
-    for line, row in zip(told, table(out / "measures.csv"), strict=True):
+    assert process.stderr is not None
+    port = int(process.stderr.readline().rpartition(":")[2])
+    with connect(port) as connection:
+        lines = [json.loads(line) for line in connection.makefile("rb")][1:]
+    _, stderr = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == 0, stderr
+    assert [line["frame"] for line in lines] == [0, 1]
+    for line, row in zip(lines, table(out / "measures.csv"), strict=True):
         assert line["status"] == row["status"] == "ok"
         for name in ("height_mm", "width_mm", "height_sigma_mm", "are_mm"):
             assert line[name] == pytest.approx(float(row[name]), abs=1e-4)
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         (("--lines", "0.0.0.0:0"), "other machines"),
         (("--opcua", "port"), "PORT or HOST:PORT"),
     ],
 )
-def test_a_stream_that_cannot_be_is_refused(
-    labapp: Run, tmp_path: Path, options: tuple[str, str], said: str
+def test_invalid_stream_address_is_rejected(
+    labapp: Run, tmp_path: Path, options: tuple[str, str], message: str
 ) -> None:
     source = ("reconstruct", SAMPLE / "recording.avi", "--setup", SETUP, "--out", tmp_path / "out")
-    code, _, complained = labapp(*source, *options)
+    code, _, stderr = labapp(*source, *options)
     assert code == 2
-    assert said in " ".join(complained.split())
+    assert message in " ".join(stderr.split())
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize(("sent", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_stopped_it_leaves_whole_frames(tmp_path: Path, sent: signal.Signals, code: int) -> None:
+@pytest.mark.parametrize(("signal_number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_stopped_run_leaves_complete_frames(
+    tmp_path: Path, signal_number: signal.Signals, code: int
+) -> None:
     out = tmp_path / "out"
     recording = SAMPLE / "recording.avi"
     arguments = ["reconstruct", recording, "--setup", SETUP, "--out", out]
-    started = subprocess.Popen(
+    process = subprocess.Popen(
         [sys.executable, "-c", textwrap.dedent(SLOW), *map(str, arguments)],
         stderr=subprocess.PIPE,
         text=True,
@@ -324,22 +328,22 @@ def test_stopped_it_leaves_whole_frames(tmp_path: Path, sent: signal.Signals, co
     )
     measures = out / "measures.csv"
     wait_until(lambda: measures.exists() and len(table(measures)) >= 3)
-    started.send_signal(sent)
-    _, complained = started.communicate(timeout=PATIENCE_S)
+    process.send_signal(signal_number)
+    _, stderr = process.communicate(timeout=PATIENCE_S)
     rows = table(measures)
-    assert started.returncode == code
+    assert process.returncode == code
     assert 3 <= len(rows) < 30
-    assert f"stopped: {len(rows)} of 30 frames are done, in {out}" in complained.splitlines()
-    assert ("SIGTERM" in complained) == (sent == signal.SIGTERM)
-    assert "Traceback" not in complained
+    assert f"stopped: {len(rows)} of 30 frames are done, in {out}" in stderr.splitlines()
+    assert ("SIGTERM" in stderr) == (signal_number == signal.SIGTERM)
+    assert "Traceback" not in stderr
     assert len(table(out / "dots.csv")) == 5 * len(rows)
-    told = json.loads((out / "run.json").read_text())
-    assert (told["state"], told["frames_done"]) == ("interrupted", len(rows))
+    summary = json.loads((out / "run.json").read_text())
+    assert (summary["state"], summary["frames_done"]) == ("interrupted", len(rows))
     assert not list(out.glob(".*"))
 
 
-def test_ctrl_c_again_and_again_is_no_more_than_once(tmp_path: Path) -> None:
-    """What the first one set going, the taking back of half a frame, is left to end."""
+def test_repeated_ctrl_c_does_not_interrupt_the_cleanup(tmp_path: Path) -> None:
+    """The first one starts the removal of a half-written frame, which the others do not stop."""
     program = """
         import os, signal, sys
         from labapp import cli
@@ -358,18 +362,18 @@ def test_ctrl_c_again_and_again_is_no_more_than_once(tmp_path: Path) -> None:
     """
     out = tmp_path / "out"
     arguments = ["reconstruct", SAMPLE / "calibration.png", "--setup", SETUP, "--out", out]
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", textwrap.dedent(program), *map(str, arguments)],
         capture_output=True,
         text=True,
         check=False,
         env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
     )
-    assert (done.returncode, done.stdout) == (130, "tidied up\n")
+    assert (process.returncode, process.stdout) == (130, "tidied up\n")
     assert json.loads((out / "run.json").read_text())["state"] == "interrupted"
 
 
-def test_ctrl_c_while_modules_load_is_no_fault(
+def test_ctrl_c_while_modules_load_is_no_internal_error(
     labapp: Run, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A compiled module turns the interrupt into an ImportError."""
@@ -380,59 +384,57 @@ def test_ctrl_c_while_modules_load_is_no_fault(
             time.sleep(1)
         except KeyboardInterrupt:
             raise ImportError("initialization failed") from None
-        return answer()
+        return failed_measurement()
 
     monkeypatch.setattr(measurers, "measure", loading)
     former = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
-        code, _, complained = labapp(
-            "reconstruct", folder, "--setup", SETUP, "--out", tmp_path / "o"
-        )
+        code, _, stderr = labapp("reconstruct", folder, "--setup", SETUP, "--out", tmp_path / "o")
     finally:
         signal.signal(signal.SIGINT, former)
-    assert (code, complained) == (130, "")
+    assert (code, stderr) == (130, "")
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full here")
-def test_output_that_finds_no_space_is_no_fault(tmp_path: Path) -> None:
+def test_full_disk_of_stdout_is_no_internal_error(tmp_path: Path) -> None:
     with Path("/dev/full").open("w") as full:
         arguments = ["detect", SAMPLE / "calibration.png", "--out", tmp_path / "dots.csv"]
-        done = subprocess.run(
+        process = subprocess.run(
             [sys.executable, "-m", "labapp", *arguments],
             stdout=full,
             stderr=subprocess.PIPE,
             text=True,
             check=False,
         )
-    assert done.returncode == 2
-    assert done.stderr.splitlines()[-1].startswith("labapp: output: no space left")
+    assert process.returncode == 2
+    assert process.stderr.splitlines()[-1].startswith("labapp: output: no space left")
 
 
-def test_a_fault_of_ours_is_told_without_a_traceback(
+def test_internal_error_is_reported_without_a_traceback(
     labapp: Run, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken(*_: object) -> Measurement:
         raise ZeroDivisionError("by nothing")
 
     monkeypatch.setattr(measurers, "measure", broken)
-    code, _, complained = labapp("reconstruct", folder, "--setup", SETUP, "--out", tmp_path / "o")
+    code, _, stderr = labapp("reconstruct", folder, "--setup", SETUP, "--out", tmp_path / "o")
     assert code == 3
-    assert "a fault in the program: ZeroDivisionError: by nothing" in complained
-    assert "Traceback" not in complained
+    assert "a fault in the program: ZeroDivisionError: by nothing" in stderr
+    assert "Traceback" not in stderr
     assert "Traceback" in log.log_file().read_text()
 
 
-def test_a_log_that_cannot_be_written_stops_nothing(
+def test_unwritable_log_does_not_stop_a_command(
     labapp: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "file").touch()
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "file"))
-    code, _, complained = labapp("detect", tmp_path / "missing.png", "--out", tmp_path / "d.csv")
+    code, _, stderr = labapp("detect", tmp_path / "missing.png", "--out", tmp_path / "d.csv")
     assert code == 2
-    assert complained.count("\n") == 1
+    assert stderr.count("\n") == 1
 
 
-def test_the_samples_are_copied_and_nothing_is_replaced(labapp: Run, tmp_path: Path) -> None:
+def test_samples_are_copied_without_replacing_anything(labapp: Run, tmp_path: Path) -> None:
     folder = tmp_path / "new"
     assert labapp("samples", folder)[0] == 0
     assert (folder / "sample_sessions/gtaw/recording.avi").stat().st_size > 10_000
@@ -441,22 +443,22 @@ def test_the_samples_are_copied_and_nothing_is_replaced(labapp: Run, tmp_path: P
     assert labapp("samples", folder)[0] == 2
 
 
-def test_the_demo_measures_the_sample_run(
+def test_demo_measures_the_sample_recording(
     labapp: Run,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     measured_images: list[np.ndarray],
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    code, said, complained = labapp("demo")
-    assert code == 1  # the measurement is replaced by one that finds nothing
-    assert len(measured_images) == 30 == complained.count("no-dots")
-    assert f"Results are in {tmp_path / 'demo_results' / 'results'}" in said
+    code, stdout, stderr = labapp("demo")
+    assert code == 1  # the replaced measurement finds nothing
+    assert len(measured_images) == 30 == stderr.count("no-dots")
+    assert f"Results are in {tmp_path / 'demo_results' / 'results'}" in stdout
     assert len(table(tmp_path / "demo_results" / "results" / "measures.csv")) == 30
     assert (tmp_path / "demo_results" / "results" / "report.pdf").stat().st_size > 10_000
-    code, said, _ = labapp("session", "info", tmp_path / "demo_results" / "gtaw.labsession")
+    code, stdout, _ = labapp("session", "info", tmp_path / "demo_results" / "gtaw.labsession")
     assert code == 0
-    assert "30" in said
+    assert "30" in stdout
 
 
 # --- detect, calibrate ------------------------------------------------------------------------
@@ -464,7 +466,7 @@ def test_the_demo_measures_the_sample_run(
 
 def test_detect_writes_its_columns(labapp: Run, tmp_path: Path) -> None:
     out = tmp_path / "deep" / "dots.csv"
-    code, said, _ = labapp("detect", SAMPLE / "recording.avi", "--out", out)
+    code, stdout, _ = labapp("detect", SAMPLE / "recording.avi", "--out", out)
     rows = table(out)
     assert code == 0
     assert ",".join(rows[0]) == (
@@ -472,61 +474,61 @@ def test_detect_writes_its_columns(labapp: Run, tmp_path: Path) -> None:
     )
     truth = [row for row in table(SAMPLE / "dots_truth.csv") if row["frame"] == "0"]
     assert len(rows) == pytest.approx(sum(row["visible"] == "1" for row in truth), abs=5)
-    assert said.startswith(f"{len(rows)} dots, ")
+    assert stdout.startswith(f"{len(rows)} dots, ")
 
 
 @pytest.mark.parametrize("options", [("--detector", "block-threshold"), ("--rows", "rows")])
-def test_detect_by_the_methods_of_the_text(
+def test_detect_with_the_methods_of_the_dissertation(
     labapp: Run, tmp_path: Path, options: tuple[str, str]
 ) -> None:
-    found = {}
-    for name, chosen in (("usual", ()), ("text", options)):
+    tables = {}
+    for name, arguments in (("usual", ()), ("text", options)):
         out = tmp_path / f"{name}.csv"
-        # The text's detector finds dots here of which the default search makes no rows.
-        assert labapp("detect", SAMPLE / "recording.avi", "--out", out, *chosen)[0] in {0, 1}
-        found[name] = table(out)
-    assert found["text"] != found["usual"]
-    assert len(found["text"]) > 40
+        # The default search finds no rows among the dots of the dissertation's detector.
+        assert labapp("detect", SAMPLE / "recording.avi", "--out", out, *arguments)[0] in {0, 1}
+        tables[name] = table(out)
+    assert tables["text"] != tables["usual"]
+    assert len(tables["text"]) > 40
 
 
-def test_detect_refuses_a_size_that_the_detector_has_not(labapp: Run, tmp_path: Path) -> None:
+def test_detect_rejects_a_size_for_a_detector_without_one(labapp: Run, tmp_path: Path) -> None:
     options = ("--size", "2", "--detector", "wavelet")
-    code, _, complained = labapp(
+    code, _, stderr = labapp(
         "detect", SAMPLE / "recording.avi", "--out", tmp_path / "dots.csv", *options
     )
     assert code == 2
-    assert "--size" in complained
+    assert "--size" in stderr
 
 
-def test_detect_does_not_write_over_its_image(labapp: Run, tmp_path: Path) -> None:
+def test_detect_does_not_overwrite_its_image(labapp: Run, tmp_path: Path) -> None:
     image = tmp_path / "frame.png"
     cv2.imwrite(str(image), np.full((40, 40), 90, np.uint8))
     before = image.read_bytes()
-    code, _, complained = labapp("detect", image, "--out", tmp_path / "." / "frame.png")
+    code, _, stderr = labapp("detect", image, "--out", tmp_path / "." / "frame.png")
     assert code == 2
-    assert "--out: the image itself; expected another file" in complained
+    assert "--out: the image itself; expected another file" in stderr
     assert image.read_bytes() == before
 
 
-def test_an_algorithm_without_irs_is_refused(labapp: Run, folder: Path, tmp_path: Path) -> None:
-    code, _, complained = labapp(
+def test_algorithm_without_irs_is_rejected(labapp: Run, folder: Path, tmp_path: Path) -> None:
+    code, _, stderr = labapp(
         "reconstruct", folder, "--setup", SETUP, "--out", tmp_path / "o", "--algorithm", "epa-r"
     )
     assert code == 2
-    assert "--algorithm: algorithm: epa-r; expected --scheme irs" in complained
+    assert "--algorithm: algorithm: epa-r; expected --scheme irs" in stderr
 
 
-def test_detect_on_a_picture_without_dots_says_so(labapp: Run, tmp_path: Path) -> None:
+def test_detect_reports_an_image_without_dots(labapp: Run, tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "flat.png"), np.full((60, 80), 9, np.uint8))
-    code, said, _ = labapp("detect", tmp_path / "flat.png", "--out", tmp_path / "d.csv")
+    code, stdout, _ = labapp("detect", tmp_path / "flat.png", "--out", tmp_path / "d.csv")
     assert code == 1
-    assert said.startswith("0 dots")
+    assert stdout.startswith("0 dots")
     assert table(tmp_path / "d.csv") == []
 
 
 @pytest.fixture
 def two_sizes(tmp_path: Path) -> Path:
-    """A picture of 40 dots of 5 px, each with a spot of 1 px amid it."""
+    """An image of 40 dots of 5 px, each with a spot of 1 px in its centre."""
     v, u = np.mgrid[:240, :380]
     frame = np.random.default_rng(1).normal(20, 1, u.shape)
     for at_v, at_u in np.ndindex(5, 8):
@@ -537,71 +539,71 @@ def two_sizes(tmp_path: Path) -> Path:
     return path
 
 
-def test_detect_takes_the_size_that_is_given(labapp: Run, tmp_path: Path, two_sizes: Path) -> None:
+def test_detect_uses_the_given_size(labapp: Run, tmp_path: Path, two_sizes: Path) -> None:
     peaks = {}
     for size in ("1.2", "5"):
         out = tmp_path / "dots.csv"
-        code, said, complained = labapp("detect", two_sizes, "--size", size, "--out", out)
-        assert (code, complained) == (0, "")
-        assert said.startswith("40 dots, 40 with")
+        code, stdout, stderr = labapp("detect", two_sizes, "--size", size, "--out", out)
+        assert (code, stderr) == (0, "")
+        assert stdout.startswith("40 dots, 40 with")
         peaks[size] = np.median([float(row["snr"]) for row in table(out)])
     assert peaks["1.2"] != pytest.approx(peaks["5"], rel=0.1)
 
 
 @pytest.mark.parametrize("size", ["0", "-2", "0.4", "21", "nan", "inf", "large"])
-def test_detect_refuses_an_impossible_size(
+def test_detect_rejects_an_impossible_size(
     labapp: Run, tmp_path: Path, two_sizes: Path, size: str
 ) -> None:
     out = tmp_path / "dots.csv"
-    code, _, complained = labapp("detect", two_sizes, "--size", size, "--out", out)
+    code, _, stderr = labapp("detect", two_sizes, "--size", size, "--out", out)
     assert code == 2
-    assert "--size" in complained
+    assert "--size" in stderr
     assert not out.exists()
 
 
-def test_detect_that_numbers_no_dot_says_so(labapp: Run, tmp_path: Path) -> None:
+def test_detect_reports_dots_without_rows(labapp: Run, tmp_path: Path) -> None:
     v, u = np.mgrid[:120, :160]
     frame = np.random.default_rng(2).normal(20, 1, u.shape)
     for at in np.random.default_rng(3).uniform(15, 105, (5, 2)):
         frame += 90 * np.exp(-((u - at[0]) ** 2 + (v - at[1]) ** 2) / 8)
     cv2.imwrite(str(tmp_path / "few.png"), np.clip(frame, 0, 255).astype(np.uint8))
-    code, said, complained = labapp("detect", tmp_path / "few.png", "--out", tmp_path / "d.csv")
+    code, stdout, stderr = labapp("detect", tmp_path / "few.png", "--out", tmp_path / "d.csv")
     assert code == 1
-    assert "too-few-dots" in complained
-    assert ", none with a row and a column" in said
+    assert "too-few-dots" in stderr
+    assert ", none with a row and a column" in stdout
     assert len(table(tmp_path / "d.csv")) == 5
 
 
-def test_calibrate_laser_prints_and_writes(labapp: Run, tmp_path: Path) -> None:
-    """A laser 90 mm away at 30° with a 10° fan draws l₂ = 18.561 and l₃ = 7.874 mm."""
+def test_calibrate_laser_prints_and_writes_its_values(labapp: Run, tmp_path: Path) -> None:
+    """A laser 90 mm away at 30° with a 10° fan gives l₂ = 18.561 and l₃ = 7.874 mm."""
     setup = tmp_path / "new.toml"
     lengths = "--l1 13.675 --l1 13.675 --l2 18.561 --l2 18.561 --l3 7.874 --l3 7.874".split()
-    code, said, complained = labapp("calibrate", "laser", *lengths, "--setup", setup)
-    assert code == 0, complained
-    found = [float(number) for number in re.findall(r"([\d.]+) ±", said)]
-    assert found == pytest.approx([30, 90, 45], abs=0.01)
+    code, stdout, stderr = labapp("calibrate", "laser", *lengths, "--setup", setup)
+    assert code == 0, stderr
+    printed = [float(number) for number in re.findall(r"([\d.]+) ±", stdout)]
+    assert printed == pytest.approx([30, 90, 45], abs=0.01)
     written = tomllib.loads(setup.read_text())
     laser = written.pop("laser")
     assert not written
     assert (laser["projection_angle_deg"], laser["distance_mm"]) == pytest.approx(
         (30, 90), abs=0.01
     )
-    told = [float(number) for number in re.findall(r"± ([\d.]+)", said)][:2]
+    printed_sigmas = [float(number) for number in re.findall(r"± ([\d.]+)", stdout)][:2]
     sigmas = [laser["projection_angle_deg_sigma"], laser["distance_mm_sigma"]]
-    assert sigmas == pytest.approx(told, abs=1e-3)
-    shared = laser["angle_distance_correlation"]
-    assert f"correlation      {shared:+.2f}" in said
-    assert f"{setup}: pattern: missing" in complained
+    assert sigmas == pytest.approx(printed_sigmas, abs=1e-3)
+    correlation = laser["angle_distance_correlation"]
+    assert f"correlation      {correlation:+.2f}" in stdout
+    assert f"{setup}: pattern: missing" in stderr
 
 
-def test_a_setup_of_two_calibrations_is_calibrated(labapp: Run, tmp_path: Path) -> None:
+def test_setup_is_calibrated_after_both_calibrations(labapp: Run, tmp_path: Path) -> None:
     from labapp.config.setup import read_setup
 
     setup = tmp_path / "setup.toml"
     setup.write_bytes(SETUP.read_bytes())
     lengths = "--l1 4.64 --l1 4.68 --l2 6.26 --l2 6.21 --l3 2.75 --l3 2.78".split()
-    known = ["--fan-angle-sigma", 0.05, "--resolution", 0.01, "--setup", setup]
-    assert labapp("calibrate", "laser", *lengths, *known)[0] == 0
+    options = ["--fan-angle-sigma", 0.05, "--resolution", 0.01, "--setup", setup]
+    assert labapp("calibrate", "laser", *lengths, *options)[0] == 0
     assert read_setup(setup).rig.uncertainty.status == "entered"
     picture = SAMPLE / "calibration.png"
     assert labapp("calibrate", "plane", picture, "--unit-mm", 6.35, "--setup", setup)[0] == 0
@@ -609,68 +611,66 @@ def test_a_setup_of_two_calibrations_is_calibrated(labapp: Run, tmp_path: Path) 
 
 
 @pytest.mark.parametrize("l1", ["nan", "-1", "3", "x"])
-def test_lengths_that_cannot_be_are_refused(labapp: Run, l1: str) -> None:
-    code, _, complained = labapp(*f"calibrate laser --l1 {l1} --l2 18.561 --l3 7.874".split())
+def test_impossible_lengths_are_rejected(labapp: Run, l1: str) -> None:
+    code, _, stderr = labapp(*f"calibrate laser --l1 {l1} --l2 18.561 --l3 7.874".split())
     assert code == 2
-    assert "Traceback" not in complained
+    assert "Traceback" not in stderr
 
 
-def test_calibrate_plane_puts_its_values_into_a_setup(labapp: Run, tmp_path: Path) -> None:
+def test_calibrate_plane_writes_its_values_to_the_setup(labapp: Run, tmp_path: Path) -> None:
     setup = tmp_path / "setup.toml"
     setup.write_text(SETUP.read_text())
     picture = SAMPLE / "calibration.png"
-    code, said, complained = labapp(
+    code, stdout, stderr = labapp(
         "calibrate", "plane", picture, "--unit-mm", 6.35, "--setup", setup
     )
-    assert (code, complained) == (0, "")
-    assert said.count("±") == 6
-    assert "mm off (95 %)" in said  # the bound far from the marks
-    assert "used       affine, 15 marks. No perspective" in said
-    assert said.count("residual 0.0") == 2
-    assert "6.35 mm between flags" in said
-    assert "scale      5.67" in said
+    assert (code, stderr) == (0, "")
+    assert stdout.count("±") == 6
+    assert "mm off (95 %)" in stdout  # the bound far from the marks
+    assert "used       affine, 15 marks. No perspective" in stdout
+    assert stdout.count("residual 0.0") == 2
+    assert "6.35 mm between flags" in stdout
+    assert "scale      5.67" in stdout
     from labapp.config.setup import read_setup
 
     corners = np.array([[0.0, 0.0], [480, 0], [0, 640], [480, 640]])
-    found = read_setup(setup).calibration.to_plane(corners)
-    np.testing.assert_allclose(found, read_setup(SETUP).calibration.to_plane(corners), atol=0.15)
+    corners_mm = read_setup(setup).calibration.to_plane(corners)
+    np.testing.assert_allclose(
+        corners_mm, read_setup(SETUP).calibration.to_plane(corners), atol=0.15
+    )
     assert setup.read_text().startswith(SETUP.read_text().split("[image_calibration]")[0])
 
 
-def test_calibrate_plane_takes_labapp_s_own_target_and_prints_what_it_writes(
-    labapp: Run, tmp_path: Path
-) -> None:
+def test_calibrate_plane_assumes_the_target_of_labapp(labapp: Run, tmp_path: Path) -> None:
     setup = tmp_path / "setup.toml"
     setup.write_text(SETUP.read_text())
-    code, said, _ = labapp("calibrate", "plane", SAMPLE / "calibration.png", "--setup", setup)
+    code, stdout, _ = labapp("calibrate", "plane", SAMPLE / "calibration.png", "--setup", setup)
     assert code == 0
-    assert "6.35 mm between flags" in said
+    assert "6.35 mm between flags" in stdout
     written = tomllib.loads(setup.read_text())["image_calibration"]
     for name in ("origin_px", "x_axis_px", "z_axis_px"):
-        (line,) = (line for line in said.splitlines() if line.startswith(name))
+        (line,) = (line for line in stdout.splitlines() if line.startswith(name))
         u, v = written[name]
         assert f"{u:.3f}, {v:.3f} ± {written[f'{name}_sigma']:.3f} px" in line
-    assert f"x_axis_mm  {written['x_axis_mm']:.4f} mm" in said
+    assert f"x_axis_mm  {written['x_axis_mm']:.4f} mm" in stdout
 
 
 @pytest.mark.parametrize("unit", ["0", "-1", "nan", "inf"])
-def test_a_unit_that_cannot_be_is_refused(labapp: Run, unit: str) -> None:
-    code, _, complained = labapp(
-        "calibrate", "plane", SAMPLE / "calibration.png", "--unit-mm", unit
-    )
+def test_impossible_unit_is_rejected(labapp: Run, unit: str) -> None:
+    code, _, stderr = labapp("calibrate", "plane", SAMPLE / "calibration.png", "--unit-mm", unit)
     assert code == 2
-    assert "--unit-mm" in complained
+    assert "--unit-mm" in stderr
 
 
-def test_a_picture_without_a_target_is_answered(labapp: Run, tmp_path: Path) -> None:
+def test_picture_without_a_target_is_reported(labapp: Run, tmp_path: Path) -> None:
     cv2.imwrite(str(tmp_path / "flat.png"), np.full((200, 200), 90, np.uint8))
-    code, _, complained = labapp("calibrate", "plane", tmp_path / "flat.png")
+    code, _, stderr = labapp("calibrate", "plane", tmp_path / "flat.png")
     assert code == 1
-    assert "flat.png: no-target: " in complained
+    assert "flat.png: no-target: " in stderr
 
 
 def board_picture(path: Path, name: str) -> Path:
-    """Picture of a board by a lens that distorts by 1 %."""
+    """Write the picture of a board through a lens with a distortion of 1 %."""
     from labapp.core.calibration.boards import BOARDS
     from labapp.simulation.calibration.board import PrintedBoard
     from labapp.simulation.calibration.target import TargetLook, render_target
@@ -683,31 +683,31 @@ def board_picture(path: Path, name: str) -> Path:
     return path
 
 
-def test_a_board_puts_lens_and_plane_into_a_setup(labapp: Run, tmp_path: Path) -> None:
+def test_board_calibrates_lens_and_plane_of_a_setup(labapp: Run, tmp_path: Path) -> None:
     setup = tmp_path / "setup.toml"
     setup.write_text(SETUP.read_text())
     picture = board_picture(tmp_path / "board.png", "charuco_4_inch")
-    code, said, complained = labapp("calibrate", "plane", picture, "--setup", setup)
-    assert (code, complained) == (0, "")
-    assert "charuco_4_inch" in said
+    code, stdout, stderr = labapp("calibrate", "plane", picture, "--setup", setup)
+    assert (code, stderr) == (0, "")
+    assert "charuco_4_inch" in stdout
     from labapp.config.setup import lens_of, read_setup
 
-    found = read_setup(setup)
-    assert found.calibration.lens == lens_of(setup.read_text())
-    assert found.calibration.lens is not None
-    assert found.calibration.lens.distortion[0] < 0
-    assert found.rig.uncertainty is not None
-    assert "camera_lens.distortion_percent" not in found.rig.uncertainty.assumed
+    calibrated = read_setup(setup)
+    assert calibrated.calibration.lens == lens_of(setup.read_text())
+    assert calibrated.calibration.lens is not None
+    assert calibrated.calibration.lens.distortion[0] < 0
+    assert calibrated.rig.uncertainty is not None
+    assert "camera_lens.distortion_percent" not in calibrated.rig.uncertainty.assumed
 
 
 @pytest.mark.parametrize(
     ("board", "field"), [("charuco_letter_a4", "board"), ("charuco:2x2:8", "board")]
 )
-def test_a_wrong_board_is_bad_input(labapp: Run, tmp_path: Path, board: str, field: str) -> None:
+def test_wrong_board_is_rejected(labapp: Run, tmp_path: Path, board: str, field: str) -> None:
     picture = board_picture(tmp_path / "board.png", "charuco_4_inch")
-    code, _, complained = labapp("calibrate", "plane", picture, "--board", board)
+    code, _, stderr = labapp("calibrate", "plane", picture, "--board", board)
     assert code == 2
-    assert f"{field}: " in complained
+    assert f"{field}: " in stderr
 
 
 # --- help -------------------------------------------------------------------------------------
@@ -716,24 +716,24 @@ def test_a_wrong_board_is_bad_input(labapp: Run, tmp_path: Path, board: str, fie
 @pytest.mark.parametrize(
     "command", ["", "reconstruct", "detect", "calibrate laser", "calibrate plane", "demo"]
 )
-def test_help_tells_units(labapp: Run, command: str) -> None:
-    code, said, _ = labapp(*command.split(), "--help")
+def test_help_states_units(labapp: Run, command: str) -> None:
+    code, stdout, _ = labapp(*command.split(), "--help")
     assert code == 0
     if command not in ("demo", ""):
-        assert "mm" in said or "px" in said
+        assert "mm" in stdout or "px" in stdout
 
 
 @pytest.mark.parametrize("command", ["", "session", "analyze", "calibrate"])
-def test_help_lists_commands_with_whole_sentences(labapp: Run, command: str) -> None:
-    _, said, _ = labapp(*command.split(), "--help")
-    listed = said.partition("Commands:")[2]
+def test_help_does_not_truncate_command_summaries(labapp: Run, command: str) -> None:
+    _, stdout, _ = labapp(*command.split(), "--help")
+    listed = stdout.partition("Commands:")[2]
     assert listed
     assert "..." not in listed
 
 
-def test_the_version_is_told(labapp: Run) -> None:
-    code, said, _ = labapp("--version")
-    assert (code, said) == (0, "labapp 1.0.0\n")
+def test_version_is_printed(labapp: Run) -> None:
+    code, stdout, _ = labapp("--version")
+    assert (code, stdout) == (0, "labapp 1.0.0\n")
 
 
 @pytest.mark.parametrize(
@@ -750,8 +750,8 @@ def test_the_version_is_told(labapp: Run) -> None:
         ),
     ],
 )
-def test_nothing_heavy_is_loaded_before_it_is_needed(start: str, heavy: set[str]) -> None:
-    """So that help answers at once, and scripts begin soon."""
+def test_heavy_modules_are_imported_only_when_needed(start: str, heavy: set[str]) -> None:
+    """Help and scripts must start quickly."""
     loaded = subprocess.run(
         [sys.executable, "-c", f"{start}; import sys; print(*sys.modules)"],
         capture_output=True,

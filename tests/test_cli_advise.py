@@ -1,4 +1,4 @@
-"""`labapp advise`: what it tells and writes, and what it refuses."""
+"""`labapp advise`: its output, its files and its errors."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ plane_distance_mm = [60, 65]
 """
 
 
-def question(folder: Path, text: str) -> Path:
+def write_question(folder: Path, text: str) -> Path:
     path = folder / "bench.toml"
     path.write_text(text, "utf-8")
     return path
 
 
-def test_advice_is_told_and_written(labapp: Run, tmp_path: Path) -> None:
+def test_advice_is_printed_and_written(labapp: Run, tmp_path: Path) -> None:
     out = tmp_path / "advice"
-    code, told_out, err = labapp(
-        "advise", question(tmp_path, POOLS + BENCH), "--quick", "--out", out
+    code, stdout, stderr = labapp(
+        "advise", write_question(tmp_path, POOLS + BENCH), "--quick", "--out", out
     )
-    assert code == 0, err
-    assert "laser, projection angle: 26.00 °" in told_out
-    assert "Expected mean height error" in told_out
+    assert code == 0, stderr
+    assert "laser, projection angle: 26.00 °" in stdout
+    assert "Expected mean height error" in stdout
     assert "to spare" in (out / "advice.md").read_text("utf-8")
     with (out / "advice.csv").open(encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
@@ -46,7 +46,7 @@ def test_advice_is_told_and_written(labapp: Run, tmp_path: Path) -> None:
     assert 0 < float(rows[0]["error_mm"]) < 0.02
     assert min(float(rows[0][name]) for name in rows[0] if "margin" in name) >= 0
     assert (out / "advice.png").read_bytes().startswith(b"\x89PNG")
-    # The setup lacks what only the bench can tell, and nothing else.
+    # The setup lacks only the values that have to be measured on the bench.
     setup = out / "setup.toml"
     points = {"origin_px": [0, 480], "x_axis_px": [240, 480], "x_axis_mm": 50.8}
     points |= {"z_axis_px": [0, 240], "z_axis_mm": 50.8}
@@ -56,19 +56,19 @@ def test_advice_is_told_and_written(labapp: Run, tmp_path: Path) -> None:
     assert 60 <= -rig.imaging_plane.origin_mm[1] <= 65
 
 
-def test_options_replace_the_file_and_the_impossible_is_told(labapp: Run, tmp_path: Path) -> None:
+def test_options_override_the_file_and_no_solution_is_reported(labapp: Run, tmp_path: Path) -> None:
     out = tmp_path / "advice"
-    file = question(tmp_path, POOLS + BENCH)
-    code, told_out, err = labapp("advise", file, "--height", "0.5:0.6", "--quick", "--out", out)
-    assert code == 1, err
-    assert "No set-up within these limits" in told_out
-    assert "dots on the plate, above and below" in told_out
+    file = write_question(tmp_path, POOLS + BENCH)
+    code, stdout, stderr = labapp("advise", file, "--height", "0.5:0.6", "--quick", "--out", out)
+    assert code == 1, stderr
+    assert "No set-up within these limits" in stdout
+    assert "dots on the plate, above and below" in stdout
     assert "too little" in (out / "advice.md").read_text("utf-8")
     assert not (out / "setup.toml").exists()
 
 
 @pytest.mark.parametrize(
-    ("text", "options", "told"),
+    ("text", "options", "message"),
     [
         ("", (), "pools"),
         (POOLS + "[bnch]\n", (), "bench, the most similar"),
@@ -81,13 +81,13 @@ def test_options_replace_the_file_and_the_impossible_is_told(labapp: Run, tmp_pa
         ("[pools", (), "syntax"),
     ],
 )
-def test_wrong_questions_are_refused(
-    labapp: Run, tmp_path: Path, text: str, options: tuple[str, ...], told: str
+def test_wrong_questions_are_rejected(
+    labapp: Run, tmp_path: Path, text: str, options: tuple[str, ...], message: str
 ) -> None:
-    code, _, err = labapp(
-        "advise", question(tmp_path, text), *options, "--out", tmp_path / "advice"
+    code, _, stderr = labapp(
+        "advise", write_question(tmp_path, text), *options, "--out", tmp_path / "advice"
     )
     assert code == 2
-    assert told in err
-    assert "Traceback" not in err
+    assert message in stderr
+    assert "Traceback" not in stderr
     assert not (tmp_path / "advice").exists()

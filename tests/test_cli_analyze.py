@@ -1,4 +1,4 @@
-"""`labapp analyze`: what it writes and prints, and what it refuses."""
+"""`labapp analyze`: its files, its output and its errors."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("state")
 
 @pytest.fixture
 def few_caps(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two of the 28 caps, done here."""
+    """Only two of the 28 caps, in this process."""
     caps = error_analysis.caps_8_3_1()[2::14]
     monkeypatch.setattr(error_analysis, "caps_8_3_1", lambda: caps)
     monkeypatch.setattr("os.cpu_count", lambda: 1)
@@ -31,7 +31,7 @@ def table(path: Path) -> list[dict[str, str]]:
 
 
 @pytest.mark.parametrize("kind", ["positioning", "correspondence"])
-def test_tables_alone_are_printed_and_nothing_is_written(
+def test_tables_option_prints_and_writes_no_file(
     labapp: Run, kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "here").mkdir()
@@ -52,26 +52,26 @@ def test_tables_and_pictures_are_written(
     code, out, _ = labapp("analyze", kind, "--out", str(folder))
     assert (code, out) == (0, "")
     assert len(list(folder.glob("*.csv"))) == len(list(folder.glob("*.md"))) == tables
-    drawn = sorted(folder.glob("*.png"))
-    assert len(drawn) == pictures
-    for picture in drawn:
+    images = sorted(folder.glob("*.png"))
+    assert len(images) == pictures
+    for picture in images:
         assert cv2.imread(str(picture)).std() > 5
-    for name in DATA.glob("table_4_*.csv"):
-        made = folder / name.name
-        assert not made.exists() or made.read_bytes() == name.read_bytes()
+    for expected in DATA.glob("table_4_*.csv"):
+        written = folder / expected.name
+        assert not written.exists() or written.read_bytes() == expected.read_bytes()
     former = {path.name: path.read_bytes() for path in folder.iterdir()}
     assert labapp("analyze", kind, "--out", str(folder))[0] == 0
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == former
 
 
-def test_pictures_can_be_drawings(labapp: Run, tmp_path: Path) -> None:
+def test_pictures_can_be_vector_graphics(labapp: Run, tmp_path: Path) -> None:
     assert labapp("analyze", "correspondence", "--out", str(tmp_path), "--format", "svg")[0] == 0
     assert (tmp_path / "figure_4_20_convex.svg").read_text("utf-8").startswith("<?xml")
     assert not list(tmp_path.glob("*.png"))
 
 
 @pytest.mark.usefixtures("few_caps")
-def test_errors_are_written_part_by_part(labapp: Run, tmp_path: Path) -> None:
+def test_selected_parts_of_the_errors_are_written(labapp: Run, tmp_path: Path) -> None:
     arguments = ("--part", "LE", "--part", "CE", "--scheme", "ers", "--step", "10")
     code, out, err = labapp("analyze", "errors", "--out", str(tmp_path), *arguments)
     assert (code, err) == (0, "")
@@ -92,7 +92,7 @@ def test_errors_are_written_part_by_part(labapp: Run, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("few_caps")
-def test_other_parts_have_their_tables(labapp: Run, tmp_path: Path) -> None:
+def test_other_parts_are_written_to_tables(labapp: Run, tmp_path: Path) -> None:
     arguments = ("--part", "measurement", "--part", "parameters", "--scheme", "ers")
     arguments += ("--frames", "1", "--draws", "10")
     assert labapp("analyze", "errors", "--out", str(tmp_path), *arguments)[0] == 0
@@ -108,7 +108,7 @@ def test_other_parts_have_their_tables(labapp: Run, tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("few_caps")
-def test_the_budget_of_a_setup_file(
+def test_budget_of_a_setup_file(
     labapp: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("labapp.studies.setup_budget.POOLS", 2)
@@ -124,7 +124,7 @@ def test_the_budget_of_a_setup_file(
 
 
 @pytest.mark.parametrize(
-    ("arguments", "told"),
+    ("arguments", "message"),
     [
         (("positioning",), "--out: folder: none; expected one for tables and pictures, or"),
         (("errors", "--out", "{}", "--part", "XE"), "--part: part: XE; expected one of CE, LE"),
@@ -139,24 +139,24 @@ def test_the_budget_of_a_setup_file(
         (("positioning", "--out", "{}", "--format", "gif"), "--format"),
     ],
 )
-def test_what_cannot_be_is_refused(
-    labapp: Run, arguments: tuple[str, ...], told: str, tmp_path: Path
+def test_impossible_options_are_rejected(
+    labapp: Run, arguments: tuple[str, ...], message: str, tmp_path: Path
 ) -> None:
     folder = tmp_path / "here"
     folder.mkdir()
     (folder / "file").write_text("mine")
-    code, out, err = labapp("analyze", *(one.format(folder) for one in arguments))
+    code, out, err = labapp("analyze", *(argument.format(folder) for argument in arguments))
     assert (code, out) == (2, "")
-    assert told in " ".join(err.split())
+    assert message in " ".join(err.split())
     assert (folder / "file").read_text() == "mine"
     assert [path.name for path in folder.iterdir()] == ["file"]
 
 
 @pytest.mark.slow
-def test_a_frame_is_compared_by_algorithm(labapp: Run, tmp_path: Path) -> None:
+def test_algorithms_are_compared_on_a_frame(labapp: Run, tmp_path: Path) -> None:
     recording = SETUP.with_name("recording.avi")
-    given = ["analyze", "frame", str(recording), "--setup", str(SETUP), "--frame", "4"]
-    code, _, err = labapp(*given, "--known-object", "7", "0.3", "--out", str(tmp_path))
+    arguments = ["analyze", "frame", str(recording), "--setup", str(SETUP), "--frame", "4"]
+    code, _, err = labapp(*arguments, "--known-object", "7", "0.3", "--out", str(tmp_path))
     assert code == 0, err
     (shape,) = table(tmp_path / "section_7_1_row_shape.csv")
     assert (shape["by_residual"], shape["agree"]) == ("S/S", "yes")
@@ -167,17 +167,17 @@ def test_a_frame_is_compared_by_algorithm(labapp: Run, tmp_path: Path) -> None:
     assert len({row["base_height_mm"] for row in rows}) == 11
 
 
-def test_an_impossible_known_object_is_refused(labapp: Run) -> None:
+def test_impossible_known_object_is_rejected(labapp: Run) -> None:
     recording = SETUP.with_name("recording.avi")
-    given = ["analyze", "frame", str(recording), "--setup", str(SETUP)]
-    code, _, err = labapp(*given, "--known-object", "9", "5", "--tables")
+    arguments = ["analyze", "frame", str(recording), "--setup", str(SETUP)]
+    code, _, err = labapp(*arguments, "--known-object", "9", "5", "--tables")
     assert code == 2
     assert "--known-object" in err
 
 
-def test_a_frame_that_is_not_there_is_refused(labapp: Run) -> None:
+def test_missing_frame_is_rejected(labapp: Run) -> None:
     recording = SETUP.with_name("recording.avi")
-    given = ["analyze", "frame", str(recording), "--setup", str(SETUP), "--frame", "30"]
-    code, _, err = labapp(*given, "--tables")
+    arguments = ["analyze", "frame", str(recording), "--setup", str(SETUP), "--frame", "30"]
+    code, _, err = labapp(*arguments, "--tables")
     assert code == 2
     assert "--frame" in err

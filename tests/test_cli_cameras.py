@@ -23,7 +23,7 @@ from labapp.media.cameras import (
 from labapp.media.recording.take_files import Take
 from labapp.session.session import Session
 from labapp.simulated.cameras import simulated_device
-from tests.conftest import HEEDING, Run
+from tests.conftest import INTERRUPTIBLE, Run
 from tests.waiting import wait_until
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -31,14 +31,14 @@ SAMPLE = ROOT / "sample_sessions/gtaw/recording.avi"
 CAMERA = f"simulated:{SAMPLE}"
 
 
-def test_a_recording_is_made_of_what_the_camera_gives(tmp_path: Path, labapp: Run) -> None:
+def test_recording_contains_the_frames_of_the_camera(tmp_path: Path, labapp: Run) -> None:
     out = tmp_path / "run.nut"
-    code, told, said = labapp("record", CAMERA, "--out", out, "--seconds", 0.5, "--rate", 60)
-    assert (code, said.splitlines()[0]) == (0, "run.nut: recording")
+    code, stdout, stderr = labapp("record", CAMERA, "--out", out, "--seconds", 0.5, "--rate", 60)
+    assert (code, stderr.splitlines()[0]) == (0, "run.nut: recording")
     with open_source(out) as video, open_source(SAMPLE) as sample:
-        assert told == f"{len(video)} frames in {out}\n"
+        assert stdout == f"{len(video)} frames in {out}\n"
         assert 10 < len(video) < 60
-        # The sample is played from its first frame; the recorder is there a little later.
+        # The sample is played from its first frame; the recorder starts a little later.
         first = next(
             k for k in range(20) if np.array_equal(sample.frame(k).image, video.frame(0).image)
         )
@@ -49,14 +49,14 @@ def test_a_recording_is_made_of_what_the_camera_gives(tmp_path: Path, labapp: Ru
         assert next(csv.DictReader(file))["what"].startswith("trigger")
 
 
-def test_it_is_recorded_into_a_session(tmp_path: Path, labapp: Run) -> None:
+def test_recording_is_imported_into_a_session(tmp_path: Path, labapp: Run) -> None:
     Session.create(tmp_path / "a.labsession").close()
-    code, told, _ = labapp(
+    code, stdout, _ = labapp(
         *("record", CAMERA, "--session", tmp_path / "a.labsession", "--seconds", "0.3"),
         *("--every", "2", "--codec", "ffv1", "--region", "0", "0", "64", "48"),
     )
     assert code == 0
-    assert told.endswith(f"Imported into {tmp_path / 'a.labsession'}\n")
+    assert stdout.endswith(f"Imported into {tmp_path / 'a.labsession'}\n")
     with Session.open(tmp_path / "a.labsession", read_only=True) as session:
         recording = session.recording
         assert recording is not None
@@ -65,23 +65,23 @@ def test_it_is_recorded_into_a_session(tmp_path: Path, labapp: Run) -> None:
         assert len(session.frames) == recording.frames > 0
 
 
-@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGTERM])
-def test_stopped_a_recording_is_kept(tmp_path: Path, sent: signal.Signals) -> None:
+@pytest.mark.parametrize("signal_number", [signal.SIGINT, signal.SIGTERM])
+def test_stopped_recording_is_complete(tmp_path: Path, signal_number: signal.Signals) -> None:
     out = tmp_path / "run.nut"
     environment = os.environ | {"XDG_STATE_HOME": str(tmp_path)}
-    command = [sys.executable, "-c", HEEDING, "record", CAMERA, "--out", str(out)]
+    command = [sys.executable, "-c", INTERRUPTIBLE, "record", CAMERA, "--out", str(out)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment) as process:
         wait_until(lambda: out.exists() and out.stat().st_size >= 1_000_000)
-        process.send_signal(sent)
+        process.send_signal(signal_number)
         assert process.stdout is not None
-        told = process.stdout.read()
+        stdout = process.stdout.read()
     assert process.returncode == 0
     with open_source(out) as video:
-        assert told.startswith(f"{len(video)} frames in ")
+        assert stdout.startswith(f"{len(video)} frames in ")
         assert not video.warnings
 
 
-def test_a_session_that_cannot_take_it_is_refused_before_filming(
+def test_unsuitable_session_is_rejected_before_recording(
     tmp_path: Path, labapp: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def film(*_: object) -> Take:
@@ -100,13 +100,13 @@ def test_a_session_that_cannot_take_it_is_refused_before_filming(
             (in_use, "another program"),
             (damaged, "b.labsession"),
         ):
-            code, told, said = labapp("record", CAMERA, "--session", path, "--seconds", "0.1")
-            assert (code, told) == (2, "")
-            assert expected in said
+            code, stdout, stderr = labapp("record", CAMERA, "--session", path, "--seconds", "0.1")
+            assert (code, stdout) == (2, "")
+            assert expected in stderr
     assert not list(tmp_path.rglob("*.nut"))
 
 
-def test_what_cannot_be_is_refused_in_words(tmp_path: Path, labapp: Run) -> None:
+def test_impossible_recordings_are_rejected(tmp_path: Path, labapp: Run) -> None:
     out = tmp_path / "run.nut"
     (tmp_path / "there.nut").write_text("mine")
     for arguments, expected in (
@@ -122,32 +122,32 @@ def test_what_cannot_be_is_refused_in_words(tmp_path: Path, labapp: Run) -> None
         ((CAMERA, "--out", tmp_path / "no" / "a.nut"), "No such file or directory"),
         (("simulated:nothing.avi", "--out", out), "No such file or directory"),
     ):
-        code, told, said = labapp("record", *arguments, "--seconds", "30")
+        code, stdout, stderr = labapp("record", *arguments, "--seconds", "30")
         assert code == 2
-        assert expected in said
-        assert not told or told.startswith("0 frames")
+        assert expected in stderr
+        assert not stdout or stdout.startswith("0 frames")
     assert not list(tmp_path.glob("run*"))
     assert (tmp_path / "there.nut").read_text() == "mine"
 
 
-def test_cameras_are_listed_with_what_can_be_set(
+def test_cameras_are_listed_with_their_settings(
     labapp: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     device = simulated_device(SAMPLE)
-    away = CameraInfo("uvc:3", "Webcam", "USB video")
+    busy = CameraInfo("uvc:3", "Webcam", "USB video")
 
-    def opened(id: str):
-        if id == away.id:
+    def open_camera(id: str):
+        if id == busy.id:
             raise CameraLost("Webcam is used by another program: close that")
         return device.open()
 
     monkeypatch.setattr(
-        "labapp.media.cameras.find_cameras", lambda: ([device.info, away], ["No Aravis"])
+        "labapp.media.cameras.find_cameras", lambda: ([device.info, busy], ["No Aravis"])
     )
-    monkeypatch.setattr("labapp.media.cameras.open_camera", opened)
-    code, told, said = labapp("cameras")
-    assert (code, said) == (0, "No Aravis\n")
-    assert told.splitlines()[:6] == [
+    monkeypatch.setattr("labapp.media.cameras.open_camera", open_camera)
+    code, stdout, stderr = labapp("cameras")
+    assert (code, stderr) == (0, "No Aravis\n")
+    assert stdout.splitlines()[:6] == [
         f"{CAMERA}  simulated recording.avi (simulated)",
         "    picture   480×640 px, 8 bit, any region",
         "    exposure  cannot be set",
@@ -155,28 +155,28 @@ def test_cameras_are_listed_with_what_can_be_set(
         "    rate      0.1 to 10000 frames/s, now 60",
         "    trigger   free, software",
     ]
-    assert "Webcam is used by another program" in told
+    assert "Webcam is used by another program" in stdout
     monkeypatch.setattr("labapp.media.cameras.find_cameras", lambda: ([], []))
-    code, told, said = labapp("cameras")
-    assert (code, said.partition(",")[0]) == (0, "No camera is connected")
-    assert told.startswith("simulated:FILE")
+    code, stdout, stderr = labapp("cameras")
+    assert (code, stderr.partition(",")[0]) == (0, "No camera is connected")
+    assert stdout.startswith("simulated:FILE")
 
 
-def test_a_scenario_is_played_there_and_back(
+def test_scenario_is_played_forwards_and_backwards(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("labapp.simulated.cameras.FRAMES", 3)
-    told: list[tuple[int, int]] = []
+    progress: list[tuple[int, int]] = []
     scenario = ROOT / "resources/simulations/cap.toml"
-    device = simulated_device(scenario, lambda _, done, of: told.append((done, of)))
+    device = simulated_device(scenario, lambda _, done, total: progress.append((done, total)))
     frames = [device.picture(k) for k in range(9)]
-    assert told[-1] == (3, 3)
+    assert progress[-1] == (3, 3)
     for k, same in ((3, 1), (4, 0), (5, 1), (8, 0)):
         assert np.array_equal(frames[k], frames[same])
     assert not np.array_equal(frames[0], frames[1])
 
 
-def test_a_kind_that_is_added_is_listed_and_recorded_from(
+def test_added_camera_kind_is_listed_and_recorded(
     tmp_path: Path, labapp: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     still = SimulatedDevice("still", lambda _: np.full((24, 32), 7, np.uint8))
@@ -193,23 +193,23 @@ def test_a_kind_that_is_added_is_listed_and_recorded_from(
         ),
     ]
     monkeypatch.setattr("labapp.media.cameras.KINDS", kinds)
-    code, told, said = labapp("cameras")
-    assert (code, said) == (0, "No driver of Toys\n")
-    assert told.splitlines()[:2] == [
+    code, stdout, stderr = labapp("cameras")
+    assert (code, stderr) == (0, "No driver of Toys\n")
+    assert stdout.splitlines()[:2] == [
         "still:1  Still picture (a toy)",
         "    picture   32×24 px, 8 bit, any region",
     ]
     out = tmp_path / "a.nut"
-    code, told, _ = labapp("record", "still:1", "--out", out, "--seconds", 0.3)
+    code, stdout, _ = labapp("record", "still:1", "--out", out, "--seconds", 0.3)
     assert code == 0
     with open_source(out) as video:
-        assert told.startswith(f"{len(video)} frame")
+        assert stdout.startswith(f"{len(video)} frame")
         assert (video.frame(0).image == 7).all()
-    code, _, said = labapp("record", "uvc:0", "--out", tmp_path / "b.nut", "--seconds", 0.3)
+    code, _, stderr = labapp("record", "uvc:0", "--out", tmp_path / "b.nut", "--seconds", 0.3)
     assert code == 2
-    assert "expected toy:NUMBER or still:NAME, as labapp cameras lists them" in said
+    assert "expected toy:NUMBER or still:NAME, as labapp cameras lists them" in stderr
 
 
-def test_every_kind_is_in_the_documents() -> None:
+def test_every_camera_kind_is_documented() -> None:
     text = (ROOT / "docs/cameras.md").read_text("utf-8")
     assert all(f"| `{kind.prefix}" in text for kind in KINDS)

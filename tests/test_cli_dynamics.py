@@ -29,8 +29,8 @@ def rows(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def same_step(folder: Path) -> Path:
-    """A logger's table with a step of the current at 0.25 s."""
+def current_step(folder: Path) -> Path:
+    """Write the table of a data logger with a step of the current at 0.25 s."""
     table = folder / "log.csv"
     times = np.arange(-0.2, 0.9, 0.001)
     lines = [f"{t:.3f},{70 + 20 * (t >= 0.25):g}" for t in times]
@@ -38,11 +38,11 @@ def same_step(folder: Path) -> Path:
     return table
 
 
-def test_a_session_gives_tables_and_pictures(labapp: Run, gtaw: Path, tmp_path: Path) -> None:
+def test_tables_and_pictures_of_a_session(labapp: Run, gtaw: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    code, said, _ = labapp("dynamics", gtaw, "--out", out, "--signals", same_step(tmp_path))
+    code, stdout, _ = labapp("dynamics", gtaw, "--out", out, "--signals", current_step(tmp_path))
     assert code == 0
-    assert "current changes at 0.2" in said
+    assert "current changes at 0.2" in stdout
     series = rows(out / "series.csv")
     assert len(series) == 30
     with Session.open(gtaw, read_only=True) as session:
@@ -61,7 +61,7 @@ def test_a_session_gives_tables_and_pictures(labapp: Run, gtaw: Path, tmp_path: 
 
 
 @pytest.mark.slow
-def test_a_folder_of_results_gives_what_its_session_gives(gtaw: Path, tmp_path: Path) -> None:
+def test_result_folder_and_session_have_equal_dynamics(gtaw: Path, tmp_path: Path) -> None:
     from labapp.export.dynamics import dynamics_of
     from labapp.export.result_folder import measured_in
 
@@ -101,34 +101,37 @@ def test_a_folder_of_results_gives_what_its_session_gives(gtaw: Path, tmp_path: 
         ("--film", "(9,9)"),
     ],
 )
-def test_what_is_wrong_is_named(labapp: Run, gtaw: Path, tmp_path: Path, options) -> None:
-    code, _, error = labapp("dynamics", gtaw, "--out", tmp_path / "out", *options)
+def test_wrong_options_are_named(labapp: Run, gtaw: Path, tmp_path: Path, options) -> None:
+    code, _, stderr = labapp("dynamics", gtaw, "--out", tmp_path / "out", *options)
     assert code == 2
-    assert options[1].split(":")[0] in error or options[0] in error or "signals" in error
+    assert options[1].split(":")[0] in stderr or options[0] in stderr or "signals" in stderr
 
 
 def test_frames_without_times_have_no_dynamics(labapp: Run, tmp_path: Path) -> None:
     sample = SAMPLE.parent / "concave" / "concave.labsession"
     shutil.copy(sample, tmp_path)
-    code, _, error = labapp("dynamics", tmp_path / sample.name, "--out", tmp_path / "out")
+    code, _, stderr = labapp("dynamics", tmp_path / sample.name, "--out", tmp_path / "out")
     assert code == 2
-    assert "time" in error
+    assert "time" in stderr
 
 
-def test_signals_are_aligned_by_the_light_of_frames(tmp_path: Path) -> None:
+def test_signals_are_aligned_with_the_brightness_of_frames(tmp_path: Path) -> None:
     from labapp.media import Frame
     from labapp.session.signals import Signals, align_signals
 
     time_s = np.arange(0, 5, 0.001)
     current = np.where((time_s > 1) & (time_s < 1.7), 120.0, 60.0)
     signals = Signals("a.csv", time_s, current, np.full(len(time_s), np.nan))
-    at = np.arange(300) / 100
-    level = np.interp(at + 0.5, time_s, current)
+    frame_time_s = np.arange(300) / 100
+    level = np.interp(frame_time_s + 0.5, time_s, current)
     frames = [
-        Frame(k, t, np.full((4, 4), g)) for k, (t, g) in enumerate(zip(at, level, strict=True))
+        Frame(k, t, np.full((4, 4), g))
+        for k, (t, g) in enumerate(zip(frame_time_s, level, strict=True))
     ]
     aligned, offset = align_signals(signals, frames)
     assert aligned.start_s == pytest.approx(-0.5, abs=0.01)
     assert offset.correlation > 0.9
     with pytest.raises(InputError):
-        align_signals(signals, [Frame(k, t, np.full((4, 4), k % 2)) for k, t in enumerate(at)])
+        align_signals(
+            signals, [Frame(k, t, np.full((4, 4), k % 2)) for k, t in enumerate(frame_time_s)]
+        )

@@ -13,7 +13,7 @@ from labapp.config.setup import read_setup, update_setup
 
 SETUP = Path(__file__).parents[1] / "sample_sessions" / "gtaw" / "setup.toml"
 LEVEL = {"distance_mm": 52.0, "h_mm": 45.0, "pitch_deg": 90.0}
-GIVEN = ["--point", "0", "-30", "20", "--normal", "0", "1", "1"]
+MIRROR = ["--point", "0", "-30", "20", "--normal", "0", "1", "1"]
 
 
 @pytest.fixture
@@ -24,13 +24,13 @@ def setup(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_level_plane_above_a_mirror_stands_upright_in_the_setup(setup: Path) -> None:
+def test_horizontal_plane_above_a_mirror_becomes_vertical(setup: Path) -> None:
     before = read_setup(setup)
-    command = ["calibrate", "fold", "--setup", str(setup), *GIVEN]
+    command = ["calibrate", "fold", "--setup", str(setup), *MIRROR]
     assert CliRunner().invoke(app, command).exit_code == 0
     assert read_setup(setup).text == before.text
-    done = CliRunner().invoke(app, [*command, "--use"])
-    assert done.exit_code == 0, done.output
+    result = CliRunner().invoke(app, [*command, "--use"])
+    assert result.exit_code == 0, result.output
     after = read_setup(setup)
     assert after.rig.imaging_plane.origin_mm[1:] == pytest.approx([-55, 42])
     np.testing.assert_allclose(after.rig.imaging_plane.normal, [0, -1, 0], atol=1e-9)
@@ -38,15 +38,15 @@ def test_a_level_plane_above_a_mirror_stands_upright_in_the_setup(setup: Path) -
     assert "imaging_plane.pitch_deg" not in after.rig.uncertainty.assumed
 
 
-def test_the_image_of_the_image_is_the_plane(setup: Path) -> None:
+def test_mirroring_twice_restores_the_plane(setup: Path) -> None:
     update_setup(setup, {"imaging_plane": {"pitch_deg": 50.0, "yaw_deg": 20.0}})
     before = read_setup(setup).rig.imaging_plane
-    given = ["--setup", str(setup), *GIVEN, "--use"]
+    options = ["--setup", str(setup), *MIRROR, "--use"]
     for _ in range(2):
-        done = CliRunner().invoke(app, ["calibrate", "fold", *given])
-        assert done.exit_code == 0, done.output
-    back = read_setup(setup).rig.imaging_plane
-    np.testing.assert_allclose(back.pose_mm, before.pose_mm, atol=1e-6)
+        result = CliRunner().invoke(app, ["calibrate", "fold", *options])
+        assert result.exit_code == 0, result.output
+    after = read_setup(setup).rig.imaging_plane
+    np.testing.assert_allclose(after.pose_mm, before.pose_mm, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -56,12 +56,12 @@ def test_the_image_of_the_image_is_the_plane(setup: Path) -> None:
         (["--point", "nan", "-30", "20", "--normal", "0", "1", "0"], "--point"),
         (["--point", "0", "60", "0", "--normal", "0", "1", "1"], "--point"),
         (["--point", "0", "-30", "0", "--normal", "0", "1", "0.02"], "--normal"),
-        ([*GIVEN, "--tilt-sigma", "-1"], "--tilt-sigma"),
+        ([*MIRROR, "--tilt-sigma", "-1"], "--tilt-sigma"),
     ],
 )
-def test_an_impossible_mirror_is_refused(setup: Path, given: list[str], option: str) -> None:
+def test_impossible_mirror_is_rejected(setup: Path, given: list[str], option: str) -> None:
     before = setup.read_text("utf-8")
-    done = CliRunner().invoke(app, ["calibrate", "fold", "--setup", str(setup), *given, "--use"])
-    assert done.exit_code != 0
-    assert option in (done.output + str(done.exception))
+    result = CliRunner().invoke(app, ["calibrate", "fold", "--setup", str(setup), *given, "--use"])
+    assert result.exit_code != 0
+    assert option in (result.output + str(result.exception))
     assert setup.read_text("utf-8") == before

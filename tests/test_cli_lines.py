@@ -1,4 +1,4 @@
-"""`labapp lines`, and the setup files it takes."""
+"""`labapp lines` and its setup files."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def rows(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def test_a_setup_of_lines(setup: Path):
+def test_setup_of_a_line_pattern(setup: Path):
     bench = read_line_setup(setup)
     assert bench.line_rig is not None
     pattern = bench.line_rig.pattern
@@ -54,21 +54,21 @@ def test_a_setup_of_lines(setup: Path):
         ("interline_angle_deg = 0.23", "interline_angle_deg = 20", "pattern.interline_angle_deg"),
     ],
 )
-def test_what_a_setup_must_not_say(setup: Path, old: str, new: str, field: str):
+def test_wrong_line_setup_is_rejected(setup: Path, old: str, new: str, field: str):
     setup.write_text(SETUP.replace(old, new, 1), "utf-8")
-    with pytest.raises(InputError) as refused:
+    with pytest.raises(InputError) as caught:
         read_line_setup(setup)
-    assert field in [problem.field for problem in refused.value.problems]
+    assert field in [problem.field for problem in caught.value.problems]
 
 
-def test_a_setup_of_lines_is_none_of_dots(setup: Path):
-    with pytest.raises(InputError) as refused:
+def test_line_setup_is_rejected_as_a_dot_setup(setup: Path):
+    with pytest.raises(InputError) as caught:
         read_setup(setup)
-    assert refused.value.field == "pattern.kind"
+    assert caught.value.field == "pattern.kind"
 
 
 @pytest.mark.slow
-def test_frames_become_tables(labapp: Run, setup: Path, tmp_path: Path):
+def test_frames_are_measured_into_tables(labapp: Run, setup: Path, tmp_path: Path):
     pools = (spherical_cap(6.0, 0.25), None)
     (tmp_path / "frames").mkdir()
     for k, pool in enumerate(pools):
@@ -76,9 +76,9 @@ def test_frames_become_tables(labapp: Run, setup: Path, tmp_path: Path):
                              np.random.default_rng(k)).image  # fmt: skip
         cv2.imwrite(str(tmp_path / "frames" / f"frame_{k}.png"), image)
     out = tmp_path / "out"
-    code, said, _ = labapp("lines", tmp_path / "frames", "--setup", setup, "--out", out)
+    code, stdout, _ = labapp("lines", tmp_path / "frames", "--setup", setup, "--out", out)
     assert code == 0
-    assert "ok 1" in said
+    assert "ok 1" in stdout
     features = rows(out / "features.csv")
     assert [row["status"] for row in features] == ["ok", "no-lines"]
     assert float(features[0]["pool_height_mm"]) == pytest.approx(0.25, rel=0.1)
@@ -94,7 +94,7 @@ def test_frames_become_tables(labapp: Run, setup: Path, tmp_path: Path):
     assert not (out / "surface_000001.csv").exists()
 
 
-def test_without_lines_the_exit_code_says_so(labapp: Run, setup: Path, tmp_path: Path):
+def test_exit_code_without_lines_is_1(labapp: Run, setup: Path, tmp_path: Path):
     noise = 20 + np.random.default_rng(1).normal(size=(640, 480))
     cv2.imwrite(str(tmp_path / "dark.png"), noise.astype(np.uint8))
     arguments = ("lines", tmp_path / "dark.png", "--setup", setup, "--out", tmp_path / "out")
@@ -103,7 +103,7 @@ def test_without_lines_the_exit_code_says_so(labapp: Run, setup: Path, tmp_path:
     assert rows(tmp_path / "out" / "features.csv")[0]["state"] == "no-pool"
 
 
-def test_one_line_is_followed(labapp: Run, setup: Path, tmp_path: Path):
+def test_one_line_is_tracked(labapp: Run, setup: Path, tmp_path: Path):
     (tmp_path / "frames").mkdir()
     v, u = np.mgrid[:120, :160]
     for k in range(4):
@@ -117,19 +117,19 @@ def test_one_line_is_followed(labapp: Run, setup: Path, tmp_path: Path):
     assert np.diff(shift) == pytest.approx([0.5, 0.5, 0.5], abs=0.15)
 
 
-def test_a_current_is_read_for_one_line_only(labapp: Run, setup: Path, tmp_path: Path):
+def test_current_needs_a_tracked_line(labapp: Run, setup: Path, tmp_path: Path):
     (tmp_path / "frames").mkdir()
     for k in range(2):
         cv2.imwrite(str(tmp_path / "frames" / f"{k}.png"), np.full((60, 80), 20, np.uint8))
     (tmp_path / "log.csv").write_text("time_s,current_A\n0,80\n1,300\n", "utf-8")
     (tmp_path / "volts.csv").write_text("time_s,voltage_V\n0,12\n1,13\n", "utf-8")
     source, out = str(tmp_path / "frames"), str(tmp_path / "out")
-    given = ["lines", source, "--setup", str(setup), "--out", out]
-    code, _, err = labapp(*given, "--signals", str(tmp_path / "log.csv"))
+    arguments = ["lines", source, "--setup", str(setup), "--out", out]
+    code, _, stderr = labapp(*arguments, "--signals", str(tmp_path / "log.csv"))
     assert code == 2
-    assert "--signals" in err
-    code, _, err = labapp(*given, "--follow", "--signals", str(tmp_path / "volts.csv"))
+    assert "--signals" in stderr
+    code, _, stderr = labapp(*arguments, "--follow", "--signals", str(tmp_path / "volts.csv"))
     assert code == 2
-    assert "volts.csv" in err
-    code, _, _ = labapp(*given, "--follow", "--signals", str(tmp_path / "log.csv"))
+    assert "volts.csv" in stderr
+    code, _, _ = labapp(*arguments, "--follow", "--signals", str(tmp_path / "log.csv"))
     assert code == 1  # there is no line

@@ -1,4 +1,4 @@
-"""`labapp calibrate pattern`: pictures of a plate in, a table of rays out."""
+"""`labapp calibrate pattern`: pictures of a plate give a table of rays."""
 
 from __future__ import annotations
 
@@ -25,24 +25,26 @@ def setup(tmp_path: Path) -> Path:
 
 
 @pytest.mark.slow
-def test_rendered_plates_give_the_rays(setup: Path, tmp_path: Path):
-    given = ["calibrate", "pattern"]
+def test_rendered_plates_determine_the_rays(setup: Path, tmp_path: Path):
+    arguments = ["calibrate", "pattern"]
     for k, z in enumerate((0.0, 5.0)):
         image = render(
             trace(FlatMirror(z), EXACT.rig), VIEW, Look(), np.random.default_rng(k)
         ).image
         cv2.imwrite(str(tmp_path / f"plate{k}.png"), image)
-        given += [str(tmp_path / f"plate{k}.png"), "--height", str(z)]
+        arguments += [str(tmp_path / f"plate{k}.png"), "--height", str(z)]
     out = tmp_path / "rays.csv"
-    done = CliRunner().invoke(app, [*given, "--setup", str(setup), "--out", str(out), "--use"])
-    assert done.exit_code == 0, done.output
-    found = read_setup(setup).rig.pattern
-    assert found.kind == "directions"
-    assert len(found.measured) > 300
-    assert found.marker == (10, 10)
-    off = found.tangents - EXACT.rig.pattern.tangents
-    i, j = np.array([ray[:2] for ray in found.measured]).T + 9
-    assert np.sqrt(np.mean(off[i, j] ** 2)) < np.tan(np.radians(0.05))
+    result = CliRunner().invoke(
+        app, [*arguments, "--setup", str(setup), "--out", str(out), "--use"]
+    )
+    assert result.exit_code == 0, result.output
+    pattern = read_setup(setup).rig.pattern
+    assert pattern.kind == "directions"
+    assert len(pattern.measured) > 300
+    assert pattern.marker == (10, 10)
+    deviation = pattern.tangents - EXACT.rig.pattern.tangents
+    i, j = np.array([ray[:2] for ray in pattern.measured]).T + 9
+    assert np.sqrt(np.mean(deviation[i, j] ** 2)) < np.tan(np.radians(0.05))
 
 
 @pytest.mark.parametrize(
@@ -54,8 +56,8 @@ def test_rendered_plates_give_the_rays(setup: Path, tmp_path: Path):
         ["a.png", "b.png", "--height", "0", "--height", "nan"],
     ],
 )
-def test_two_heights_are_needed(setup: Path, given: list[str]):
-    where = ["--setup", str(setup), "--out", str(setup.parent / "rays.csv")]
-    done = CliRunner().invoke(app, ["calibrate", "pattern", *given, *where])
-    assert done.exit_code != 0
+def test_two_different_heights_are_required(setup: Path, given: list[str]):
+    options = ["--setup", str(setup), "--out", str(setup.parent / "rays.csv")]
+    result = CliRunner().invoke(app, ["calibrate", "pattern", *given, *options])
+    assert result.exit_code != 0
     assert not (setup.parent / "rays.csv").exists()

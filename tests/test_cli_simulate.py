@@ -1,4 +1,4 @@
-"""`labapp simulate`: what it writes, and what it refuses."""
+"""`labapp simulate`: its files and its errors."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from labapp.media import open_source
 from labapp.simulated.simulate import simulate
 from labapp.simulation.pools import Wave
 from labapp.simulation.torch import ConeTorch
-from tests.conftest import HEEDING, Run
+from tests.conftest import INTERRUPTIBLE, Run
 from tests.waiting import PATIENCE_S, wait_until
 
 EXAMPLES = Path(__file__).parents[1] / "resources" / "simulations"
@@ -29,7 +29,7 @@ BENCH = SCENARIO.partition("[laser]")[2].partition("[look]")[0]
 
 
 def scenario(folder: Path, pool: str = "", more: str = "", **changed: str) -> Path:
-    """A scenario of two small frames, its keys replaced by name, tables added."""
+    """Write a scenario of two small frames, with keys replaced by name and tables added."""
     text = SCENARIO
     if pool:
         text = f"[pool]\n{pool}\n[laser]{BENCH}" + text[text.index("[look]") :]
@@ -50,7 +50,7 @@ def column(path: Path, name: str) -> np.ndarray:
     return np.array([float(row[name]) for row in rows(path)])
 
 
-# --- what it writes -----------------------------------------------------------------------------
+# --- written files -----------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +60,7 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_a_recording_with_its_truth_is_written(written: Path) -> None:
+def test_recording_is_written_with_its_truth(written: Path) -> None:
     names = {path.name for path in written.iterdir()}
     tables = {"truth.csv", "dots_truth.csv"}
     assert names == tables | {"recording.avi", "setup.toml", "calibration.png", "scenario.toml"}
@@ -71,32 +71,32 @@ def test_a_recording_with_its_truth_is_written(written: Path) -> None:
     assert (written / "scenario.toml").read_text("utf-8") == SCENARIO
 
 
-def test_a_scenario_that_comes_with_labapp_goes_by_its_name(
+def test_shipped_scenario_is_found_by_its_name(
     tmp_path: Path, labapp: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    for _ in range(2):  # a folder of that name is no scenario
-        code, _, err = labapp("simulate", "egg", "--out", "egg", "--frames", 1)
-        assert code == 0, err
-    used = (tmp_path / "egg" / "scenario.toml").read_text("utf-8")
-    assert used == (EXAMPLES / "egg.toml").read_text("utf-8")
+    for _ in range(2):  # the folder of that name is not taken for a scenario
+        code, _, stderr = labapp("simulate", "egg", "--out", "egg", "--frames", 1)
+        assert code == 0, stderr
+    text = (tmp_path / "egg" / "scenario.toml").read_text("utf-8")
+    assert text == (EXAMPLES / "egg.toml").read_text("utf-8")
 
 
-def test_the_truth_lies_on_the_pool_and_on_its_dots(written: Path) -> None:
-    """Re-read from the files alone: rays, law of reflection and picture agree."""
+def test_truth_agrees_with_the_rays_and_with_the_picture(written: Path) -> None:
+    """All values are read from the written files."""
     setup = read_setup(written / "setup.toml")
     lines = [row for row in rows(written / "dots_truth.csv") if row["frame"] == "1"]
-    shown = [row for row in lines if row["visible"] == "1"]
-    assert len(shown) == int(rows(written / "truth.csv")[1]["dots"]) > 90
+    visible = [row for row in lines if row["visible"] == "1"]
+    assert len(visible) == int(rows(written / "truth.csv")[1]["dots"]) > 90
     with open_source(written / "recording.avi") as source:
         image = source.frame(1).image.astype(float)
-    px = np.array([[float(row["u_px"]), float(row["v_px"])] for row in shown])
+    px = np.array([[float(row["u_px"]), float(row["v_px"])] for row in visible])
     u, v = np.rint(px).astype(int).T
     around = np.stack([image[v + dv, u + du] for du in (-1, 0, 1) for dv in (-1, 0, 1)])
     assert (around.mean(axis=0) > np.median(image) + 8).mean() > 0.97
     # Each point lies on its ray of the pattern, by the angles of the setup file.
-    point = np.array([[float(row[f"{axis}_mm"]) for axis in "xyz"] for row in shown])
-    ray = np.array([[int(row["ray_row"]), int(row["ray_column"])] for row in shown])
+    point = np.array([[float(row[f"{axis}_mm"]) for axis in "xyz"] for row in visible])
+    ray = np.array([[int(row["ray_row"]), int(row["ray_column"])] for row in visible])
     alpha, beta = np.radians([31.14, 0.77])
     laser = 31.48 * np.array([0, np.cos(alpha), np.sin(alpha)])
     from_laser = point - laser
@@ -111,7 +111,7 @@ def test_the_truth_lies_on_the_pool_and_on_its_dots(written: Path) -> None:
     assert setup.rig.laser.distance_mm == 31.48
 
 
-def test_the_same_seed_gives_the_same_bytes_by_one_process_or_two(
+def test_same_seed_gives_equal_files_for_any_number_of_processes(
     written: Path, tmp_path: Path
 ) -> None:
     for workers in (1, 2):
@@ -120,23 +120,26 @@ def test_the_same_seed_gives_the_same_bytes_by_one_process_or_two(
             assert (tmp_path / "again" / file.name).read_bytes() == file.read_bytes(), file.name
 
 
-def test_another_seed_gives_other_noise_and_other_sizes(written: Path, labapp: Run,
+def test_another_seed_changes_noise_and_pool_sizes(written: Path, labapp: Run,
                                                         tmp_path: Path) -> None:  # fmt: skip
     out = tmp_path / "other"
-    code, told, _ = labapp(
+    code, stdout, _ = labapp(
         "simulate", EXAMPLES / "mode_11.toml", "--out", out, "--frames", 1, "--seed", 7
     )
     assert code == 0
-    assert "1 frame," in told
-    assert "labapp reconstruct" in told
-    with open_source(out / "recording.avi") as one, open_source(written / "recording.avi") as two:
-        assert (one.frame(0).image != two.frame(0).image).mean() > 0.3
+    assert "1 frame," in stdout
+    assert "labapp reconstruct" in stdout
+    with (
+        open_source(out / "recording.avi") as other,
+        open_source(written / "recording.avi") as first,
+    ):
+        assert (other.frame(0).image != first.frame(0).image).mean() > 0.3
     assert abs(column(out / "truth.csv", "width_mm")[0] / 6.66 - 1) > 1e-4
 
 
 @pytest.mark.parametrize(("form", "bits", "kind"), [("tif", 12, "u2"), ("png", 16, "u2"),
                                                     ("png", 8, "u1")])  # fmt: skip
-def test_pictures_of_more_bits_go_into_stacks_and_folders(
+def test_frames_of_more_bits_are_written_to_stacks_and_folders(
     tmp_path: Path, form: str, bits: int, kind: str
 ) -> None:
     path = scenario(tmp_path, hot_pixels=f"2\nbits = {bits}", seed=f'1\nformat = "{form}"')
@@ -149,17 +152,17 @@ def test_pictures_of_more_bits_go_into_stacks_and_folders(
     assert 60 / 255 < image.max() / (2**bits - 1) <= 1
 
 
-def test_a_moving_pool_changes_from_frame_to_frame_and_a_still_one_does_not(tmp_path: Path) -> None:
+def test_only_a_moving_pool_changes_between_frames(tmp_path: Path) -> None:
     still = 'shape = "cap"\ndiameter_mm = 7.0\nheight_mm = 0.3'
     recording = read_scenario(scenario(tmp_path, still), 5).recording
     assert len(set(recording.pools)) == 1
     wave = "\n[[pool.wave]]\nmode = [0, 1]\namplitude_mm = 0.05\nfrequency_hz = 15.0\n"
-    swung = read_scenario(scenario(tmp_path, still, wave), 5).recording
-    heights = [pool.size.height_mm for pool in swung.pools]
+    oscillating = read_scenario(scenario(tmp_path, still, wave), 5).recording
+    heights = [pool.size.height_mm for pool in oscillating.pools]
     np.testing.assert_allclose(heights, [0.35, 0.3, 0.25, 0.3, 0.35], atol=1e-6)
 
 
-def test_a_pool_wanders_by_what_was_asked_for_however_many_frames_there_are(tmp_path: Path) -> None:
+def test_pool_wander_is_independent_of_the_number_of_frames(tmp_path: Path) -> None:
     path = scenario(tmp_path)
     few, many = (read_scenario(path, count).recording.pools for count in (4, 3000))
     widths, lengths, heights = np.array(
@@ -174,7 +177,7 @@ def test_a_pool_wanders_by_what_was_asked_for_however_many_frames_there_are(tmp_
 
 
 @pytest.mark.parametrize("kind", ["cap", "concave"])
-def test_what_is_simulated_can_be_measured_and_every_label_is_right(
+def test_simulated_frame_is_measured_with_correct_labels(
     tmp_path: Path, labapp: Run, kind: str
 ) -> None:
     out, results = tmp_path / "out", tmp_path / "results"
@@ -201,24 +204,24 @@ def test_what_is_simulated_can_be_measured_and_every_label_is_right(
 
 
 @pytest.mark.parametrize("number", [15, 20])
-def test_rings_on_a_pool_do_not_lead_to_rays_a_row_off(number: int) -> None:
-    # All labels were a row off in the one, five of the rim were wrong in the other.
+def test_axisymmetric_waves_do_not_shift_labels_by_a_row(number: int) -> None:
+    # In frame 15, all labels were a row off; in frame 20, five at the edge were wrong.
     scenario = read_scenario(EXAMPLES / "mode_02.toml")
     setup, frame = parse_setup(scenario.setup, "setup"), scenario.recording.frame(number)
-    found = measure(frame.image, setup.bench, Settings())[0]
-    assert found.status in ("ok", "no-match")
-    if found.match is not None:
-        assert found.dots is not None
-        i, j = found.match.ray.T - 1
-        off = found.dots.image_px[found.match.dot] - frame.dot_px[i, j]
+    measurement = measure(frame.image, setup.bench, Settings())[0]
+    assert measurement.status in ("ok", "no-match")
+    if measurement.match is not None:
+        assert measurement.dots is not None
+        i, j = measurement.match.ray.T - 1
+        off = measurement.dots.image_px[measurement.match.dot] - frame.dot_px[i, j]
         assert np.hypot(*off.T).max() < 1.5
 
 
-# --- what a scenario says -----------------------------------------------------------------------
+# --- keys of a scenario -------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.toml")), ids=lambda path: path.stem)
-def test_every_example_can_be_simulated_and_shows_its_dots(path: Path) -> None:
+def test_every_example_can_be_simulated_and_has_visible_dots(path: Path) -> None:
     recording = read_scenario(path, frames=1).recording
     frame = recording.frame(0)
     assert frame.shown.sum() > 60
@@ -226,7 +229,7 @@ def test_every_example_can_be_simulated_and_shows_its_dots(path: Path) -> None:
     assert 0.2 < max(size.height_mm, -size.depth_mm) < 0.8
 
 
-def test_every_key_arrives_where_it_belongs(tmp_path: Path) -> None:
+def test_every_key_of_a_scenario_is_used(tmp_path: Path) -> None:
     pool = """
     shape = "egg"
     width_mm = 6.0
@@ -266,22 +269,22 @@ offset_mm = [0.5, 0.4] }]
     assert recording.exposure_s == 0.0005
 
 
-def test_a_surface_is_looked_for_beside_the_scenario(tmp_path: Path, labapp: Run) -> None:
+def test_surface_file_is_relative_to_the_scenario(tmp_path: Path, labapp: Run) -> None:
     path = scenario(tmp_path, 'shape = "surface"\nfile = "my.csv"\nspacing_mm = 0.2')
-    code, _, err = labapp("simulate", path, "--out", tmp_path / "out")
+    code, _, stderr = labapp("simulate", path, "--out", tmp_path / "out")
     assert code == 2
-    assert f"{tmp_path / 'my.csv'}: file: No such file or directory" in err
+    assert f"{tmp_path / 'my.csv'}: file: No such file or directory" in stderr
     (tmp_path / "my.csv").write_bytes((EXAMPLES / "height_map.csv").read_bytes())
     assert read_scenario(path, 1).recording.pools[0].size.height_mm > 0.25
 
 
-# --- what it refuses ----------------------------------------------------------------------------
+# --- errors -------------------------------------------------------------------------------------
 
 CAP = 'shape = "cap"\ndiameter_mm = 7.0\nheight_mm = 0.3\n'
 
 
 @pytest.mark.parametrize(
-    ("pool", "more", "changed", "words"),
+    ("pool", "more", "changed", "message"),
     [
         ("", "[lock]\nx = 1\n", {}, "lock: unknown key; expected look, the most"),
         ("", "[torches]\n", {}, "torches: unknown key; expected torch, the most"),
@@ -311,28 +314,28 @@ CAP = 'shape = "cap"\ndiameter_mm = 7.0\nheight_mm = 0.3\n'
          'kind = "travelling"', "", {}, "cannot travel"),
     ],
 )  # fmt: skip
-def test_a_wrong_key_is_named_with_what_is_allowed(
-    tmp_path: Path, labapp: Run, pool: str, more: str, changed: dict[str, str], words: str
+def test_wrong_key_is_named_with_the_allowed_values(
+    tmp_path: Path, labapp: Run, pool: str, more: str, changed: dict[str, str], message: str
 ) -> None:
     path = scenario(tmp_path, pool, more, **changed)
-    code, _, err = labapp("simulate", path, "--out", tmp_path / "out")
+    code, _, stderr = labapp("simulate", path, "--out", tmp_path / "out")
     assert code == 2
-    assert words in err
-    assert err.startswith(f"labapp: {path}: ")
+    assert message in stderr
+    assert stderr.startswith(f"labapp: {path}: ")
     assert not (tmp_path / "out").exists()
 
 
-def test_all_that_is_wrong_is_told_together(tmp_path: Path, labapp: Run) -> None:
+def test_all_problems_are_reported_together(tmp_path: Path, labapp: Run) -> None:
     path = scenario(tmp_path, CAP + "widht_mm = 3.0\n", "[lens]\n", distance_mm="0", seed="-1")
-    _, _, err = labapp("simulate", path, "--out", tmp_path / "out")
-    found = [line.split(": ")[-2:][0] for line in err.splitlines()]
-    assert len(found) == 4, err
+    _, _, stderr = labapp("simulate", path, "--out", tmp_path / "out")
+    problems = [line.split(": ")[-2:][0] for line in stderr.splitlines()]
+    assert len(problems) == 4, stderr
     for key in ("laser.distance_mm", "lens", "pool.widht_mm", "recording.seed"):
-        assert key in err
+        assert key in stderr
 
 
 @pytest.mark.parametrize(
-    ("content", "words"),
+    ("content", "message"),
     [
         (b"[pool", "syntax"),
         (b"\xff\xfe", "encoding: not UTF-8"),
@@ -340,85 +343,87 @@ def test_all_that_is_wrong_is_told_together(tmp_path: Path, labapp: Run) -> None
         (b"pool = 3\nrecording = 4\nimage_calibration = 5\n", "pool: 3; expected a table [pool]"),
     ],
 )
-def test_what_is_no_scenario_is_refused(
-    tmp_path: Path, labapp: Run, content: bytes, words: str
+def test_invalid_scenario_file_is_rejected(
+    tmp_path: Path, labapp: Run, content: bytes, message: str
 ) -> None:
     path = tmp_path / "scenario.toml"
     path.write_bytes(content)
-    code, _, err = labapp("simulate", path, "--out", tmp_path / "out")
+    code, _, stderr = labapp("simulate", path, "--out", tmp_path / "out")
     assert code == 2
-    assert words in err
+    assert message in stderr
 
 
-def test_an_unknown_name_is_answered_with_those_that_there_are(labapp: Run, tmp_path: Path) -> None:
+def test_unknown_name_is_rejected_with_the_available_names(labapp: Run, tmp_path: Path) -> None:
     names = {path.stem for path in EXAMPLES.glob("*.toml")}
-    code, _, err = labapp("simulate", "eg", "--out", tmp_path / "out")
+    code, _, stderr = labapp("simulate", "eg", "--out", tmp_path / "out")
     assert code == 2
-    assert "egg (the most similar name)" in err
+    assert "egg (the most similar name)" in stderr
     page = (EXAMPLES.parents[1] / "docs" / "simulation.md").read_text("utf-8")
-    said = " ".join(labapp("simulate", "--help")[1].replace("│", " ").split())
+    help_text = " ".join(labapp("simulate", "--help")[1].replace("│", " ").split())
     for name in names:
-        assert name in err
+        assert name in stderr
         assert f"`{name}`" in page
-        assert name in said
+        assert name in help_text
 
 
-def test_a_missing_scenario_and_a_homography_are_refused(tmp_path: Path, labapp: Run) -> None:
-    code, _, err = labapp("simulate", tmp_path / "no.toml", "--out", tmp_path / "out")
+def test_missing_scenario_and_homography_are_rejected(tmp_path: Path, labapp: Run) -> None:
+    code, _, stderr = labapp("simulate", tmp_path / "no.toml", "--out", tmp_path / "out")
     assert code == 2
-    assert "no.toml: file: No such file or directory" in err
+    assert "no.toml: file: No such file or directory" in stderr
     text = SCENARIO[: SCENARIO.index("origin_px")] + SCENARIO[SCENARIO.index("[look]") :]
     matrix = "homography = [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]\n"
     path = tmp_path / "homography.toml"
     path.write_text(text.replace("[image_calibration]\n", f"[image_calibration]\n{matrix}"))
-    code, _, err = labapp("simulate", path, "--out", tmp_path / "out")
+    code, _, stderr = labapp("simulate", path, "--out", tmp_path / "out")
     assert code == 2
-    assert "image_calibration: a homography; expected the three points" in err
+    assert "image_calibration: a homography; expected the three points" in stderr
 
 
-def test_only_a_former_simulation_is_replaced(tmp_path: Path, labapp: Run) -> None:
+def test_only_an_earlier_simulation_is_replaced(tmp_path: Path, labapp: Run) -> None:
     path, out = scenario(tmp_path), tmp_path / "out"
     out.mkdir()
     (out / "mine.txt").write_text("mine")
-    code, _, err = labapp("simulate", path, "--out", out, "--frames", 1)
+    code, _, stderr = labapp("simulate", path, "--out", out, "--frames", 1)
     assert code == 2
-    assert "holds mine.txt; expected a new folder, an empty one or that of a former" in err
+    assert "holds mine.txt; expected a new folder, an empty one or that of a former" in stderr
     assert [file.name for file in out.iterdir()] == ["mine.txt"]
     (out / "mine.txt").unlink()
     for _ in range(2):
         assert labapp("simulate", path, "--out", out, "--frames", 1)[0] == 0
     (out / "scenario.toml").unlink()
-    code, _, err = labapp("simulate", path, "--out", out, "--frames", 1)
+    code, _, stderr = labapp("simulate", path, "--out", out, "--frames", 1)
     assert code == 2
-    assert "holds no scenario.toml" in err
-    code, _, err = labapp("simulate", path, "--out", path, "--frames", 1)
+    assert "holds no scenario.toml" in stderr
+    code, _, stderr = labapp("simulate", path, "--out", path, "--frames", 1)
     assert code == 2
-    assert "is a file" in err
+    assert "is a file" in stderr
 
 
-def test_a_folder_that_cannot_be_made_is_told(tmp_path: Path, labapp: Run) -> None:
+def test_impossible_output_folder_is_reported(tmp_path: Path, labapp: Run) -> None:
     path = scenario(tmp_path)
-    code, _, err = labapp("simulate", path, "--out", path / "out", "--frames", 1)
+    code, _, stderr = labapp("simulate", path, "--out", path / "out", "--frames", 1)
     assert code == 2
-    assert f"{path / 'out'}: --out: " in err
-    assert "expected a folder that can be written" in err
+    assert f"{path / 'out'}: --out: " in stderr
+    assert "expected a folder that can be written" in stderr
 
 
-@pytest.mark.parametrize(("sent", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_stopped_it_leaves_nothing(tmp_path: Path, sent: signal.Signals, code: int) -> None:
+@pytest.mark.parametrize(("signal_number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_stopped_simulation_leaves_no_files(
+    tmp_path: Path, signal_number: signal.Signals, code: int
+) -> None:
     path, out = scenario(tmp_path, frames="500"), tmp_path / "results" / "out"
-    running = subprocess.Popen(
-        [sys.executable, "-c", HEEDING, "simulate", path, "--out", out],
+    process = subprocess.Popen(
+        [sys.executable, "-c", INTERRUPTIBLE, "simulate", path, "--out", out],
         stderr=subprocess.PIPE,
         env={**os.environ, "XDG_STATE_HOME": str(tmp_path / "state")},
         text=True,
     )
     parts = "results/.out.*/out/recording.avi"
-    wait_until(lambda: running.poll() is not None or any(tmp_path.glob(parts)))
-    assert running.poll() is None
-    running.send_signal(sent)
-    _, err = running.communicate(timeout=PATIENCE_S)
-    assert running.returncode == code
-    assert "nothing is written" in err
-    assert "Traceback" not in err
+    wait_until(lambda: process.poll() is not None or any(tmp_path.glob(parts)))
+    assert process.poll() is None
+    process.send_signal(signal_number)
+    _, stderr = process.communicate(timeout=PATIENCE_S)
+    assert process.returncode == code
+    assert "nothing is written" in stderr
+    assert "Traceback" not in stderr
     assert list((tmp_path / "results").iterdir()) == []

@@ -12,7 +12,7 @@ COMMANDS = ("demo", "session")
 
 
 @pytest.mark.parametrize(
-    ("arguments", "wanted"),
+    ("arguments", "expected"),
     [
         ([], True),
         (["run.labsession"], True),
@@ -27,33 +27,31 @@ COMMANDS = ("demo", "session")
         (["demo", "--out", "x"], False),
     ],
 )
-def test_when_the_app_is_wanted(arguments: list[str], wanted: bool):
-    assert window.asks_for_app(arguments, COMMANDS) == wanted
+def test_arguments_that_open_the_app(arguments: list[str], expected: bool):
+    assert window.asks_for_app(arguments, COMMANDS) == expected
 
 
-def test_a_file_that_is_there_is_opened_whatever_its_name(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_existing_path_is_opened_whatever_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "frames").mkdir()
     assert window.asks_for_app(["frames"], COMMANDS)
 
 
-def test_without_a_display_it_says_what_to_do(labapp: Run):
+def test_missing_display_is_reported_with_a_hint(labapp: Run):
     code, out, err = labapp()
     assert (code, out) == (2, "")
     assert "DISPLAY" in err
     assert "labapp --help" in err
 
 
-def test_a_file_that_is_not_there_is_named(labapp: Run, tmp_path: Path):
+def test_missing_file_is_named(labapp: Run, tmp_path: Path):
     code, _, err = labapp(tmp_path / "gone.labsession")
     assert code == 2
     assert "gone.labsession" in err
     assert "does not exist" in err
 
 
-def test_without_what_windows_need_it_says_what_to_install(
+def test_missing_gui_packages_are_reported_with_the_remedy(
     labapp: Run, monkeypatch: pytest.MonkeyPatch
 ):
     monkeypatch.setitem(sys.modules, "labapp.gui.app", None)
@@ -63,13 +61,13 @@ def test_without_what_windows_need_it_says_what_to_install(
     assert "Traceback" not in err
 
 
-def test_a_word_that_is_no_command_is_none(labapp: Run):
+def test_unknown_command_is_rejected(labapp: Run):
     code, _, err = labapp("reconstrukt")
     assert code == 2
     assert "No such command" in err
 
 
-def test_the_demo_tells_how_to_see_it_where_there_is_no_display(
+def test_demo_prints_the_command_without_a_display(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ):
     for name in ("DISPLAY", "WAYLAND_DISPLAY"):

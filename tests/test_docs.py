@@ -1,4 +1,4 @@
-"""The worked examples of the documents do what they say."""
+"""The examples of the documentation run and give the stated results."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests.conftest import Run
 ROOT = Path(__file__).resolve().parent.parent
 
 
-def test_the_tutorial_leads_to_a_figure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tutorial_writes_its_figure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     mpl.use("Agg")
     text = (ROOT / "docs/tutorial.md").read_text("utf-8")
@@ -35,14 +35,14 @@ def test_the_tutorial_leads_to_a_figure(tmp_path: Path, monkeypatch: pytest.Monk
     assert (tmp_path / "pool.pdf").read_bytes().startswith(b"%PDF")
 
 
-def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     mpl.use("Agg")
     notebook = json.loads((ROOT / "docs/notebooks/measured_and_true.ipynb").read_text("utf-8"))
     names: dict[str, Any] = {}
     for cell in notebook["cells"]:
         if cell["cell_type"] == "code":
-            assert not cell["outputs"]  # results belong to who runs it
+            assert not cell["outputs"]  # the notebook is stored without results
             exec("".join(cell["source"]), names)
     comparison = names["comparison"]
     assert (comparison["median error, %"] < 2).all()
@@ -50,7 +50,7 @@ def test_the_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     assert (tmp_path / "measured_and_true.png").exists()
 
 
-def test_the_commands_of_the_site_are_those_of_the_command_line() -> None:
+def test_site_lists_the_commands_of_the_command_line() -> None:
     spec = importlib.util.spec_from_file_location("site_hooks", ROOT / "docs" / "site_hooks.py")
     assert spec is not None
     assert spec.loader is not None
@@ -61,7 +61,7 @@ def test_the_commands_of_the_site_are_those_of_the_command_line() -> None:
         assert f"`{command}`" in page
 
 
-def test_the_examples_of_the_python_api_run(
+def test_examples_of_the_python_api_run(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for name in ("thumb_tack", "blocked_rows"):
@@ -73,20 +73,20 @@ def test_the_examples_of_the_python_api_run(
     names: dict[str, object] = {}
     for example in examples:
         exec(example, names)
-    told = capsys.readouterr().out
-    height = re.search(r"height ([\d.]+) ± ([\d.]+) mm", told)
+    stdout = capsys.readouterr().out
+    height = re.search(r"height ([\d.]+) ± ([\d.]+) mm", stdout)
     assert height is not None
     assert float(height[1]) == pytest.approx(0.91, rel=0.03)
     assert verify_export("tack_results") == []
-    (height_mm,) = re.findall(r"^ok (0\.\d+)$", told, re.MULTILINE)
+    (height_mm,) = re.findall(r"^ok (0\.\d+)$", stdout, re.MULTILINE)
     assert float(height_mm) == pytest.approx(0.22067, rel=0.02)  # the true height
-    assert told.splitlines()[-1] == "ambiguous-rows"  # back again
+    assert stdout.splitlines()[-1] == "ambiguous-rows"  # after the undo
     for session in ("tack", "blocked"):
-        with Session.open(f"{session}.labsession", read_only=True) as opened:
-            assert opened.problems() == []
+        with Session.open(f"{session}.labsession", read_only=True) as sample:
+            assert sample.problems() == []
 
 
-def test_the_worked_example_of_the_command_line_says_what_it_says(
+def test_worked_example_of_the_command_line_prints_its_output(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, labapp: Run
 ) -> None:
     sample = ROOT / "sample_sessions/blocked_rows"
@@ -97,50 +97,50 @@ def test_the_worked_example_of_the_command_line_says_what_it_says(
     example = text.partition("### A worked example")[2].partition("### correct")[0]
     commands = re.findall(r"^    labapp session (.*)$", example, re.MULTILINE)
     assert [line.split()[0] for line in commands] == "new import measure correct export".split()
-    # The sample is what the first three make, with a set-up found and frame 2 corrected.
+    # The sample is the result of the first three, with a set-up found and frame 2 corrected.
     (tmp_path / "blocked_rows.labsession").rename("run.labsession")
     assert labapp("session", "undo", "run.labsession")[0] == 0
     assert labapp("session", "setup", "run.labsession", "setup.toml")[0] == 0
     assert labapp("session", "measure", "run.labsession", "--frames", "5")[0] == 1
-    code, told, _ = labapp("session", *commands[3].split())
+    code, stdout, _ = labapp("session", *commands[3].split())
     assert code == 0
-    said = example.partition("    Corrected")[1:]
-    expected = re.findall(r"^    (.*)$", "".join(said), re.MULTILINE)[:4]
+    output = example.partition("    Corrected")[1:]
+    expected = re.findall(r"^    (.*)$", "".join(output), re.MULTILINE)[:4]
     assert expected.pop() == "  …"
-    assert not set(expected) - set(told.splitlines())
-    code, told, _ = labapp(
+    assert not set(expected) - set(stdout.splitlines())
+    code, stdout, _ = labapp(
         "session", *commands[4].removesuffix(" --report").split(), "--frames", "5:"
     )
     assert code == 0
     assert verify_export("results") == []
 
 
-def test_the_columns_of_the_tables_are_those_that_are_written() -> None:
-    """In their order; of ``a … b`` the table has all from a to b."""
+def test_documented_columns_are_the_written_ones() -> None:
+    """In their order; ``a … b`` stands for all columns from a to b."""
     text = (ROOT / "docs/results.md").read_text("utf-8")
     for table, columns in TABLES.items():
         names = [column.name for column in columns]
-        found: list[str] = []
+        documented: list[str] = []
         section = text.partition(f"### {table}.csv")[2].partition("\n## ")[0].partition("\n### ")[0]
         for cell in re.findall(r"^\| (`.*?) \|", section, re.MULTILINE):
             first, *others = re.findall(r"`(\w+)`", cell)
             if "…" in cell:
-                found += names[names.index(first) : names.index(others[-1]) + 1]
+                documented += names[names.index(first) : names.index(others[-1]) + 1]
             else:
-                found += [first, *others]
-        assert found == names
+                documented += [first, *others]
+        assert documented == names
 
 
 def test_every_status_is_explained() -> None:
-    given = {word for part in get_args(Status) for word in get_args(part)}
+    used = {word for part in get_args(Status) for word in get_args(part)}
     for path in (ROOT / "labapp").rglob("*.py"):
         pattern = r'(?:CannotMeasure|Measurement|LineFrame|RowsOpen)\(\s*"([a-z-]+)"'
-        given |= set(re.findall(pattern, path.read_text("utf-8")))
-    assert {"too-many-dots", "unreadable", "size-off", "folded-lines"} <= given
+        used |= set(re.findall(pattern, path.read_text("utf-8")))
+    assert {"too-many-dots", "unreadable", "size-off", "folded-lines"} <= used
     explained = set(
         re.findall(r"`([a-z-]+)`", (ROOT / "docs/troubleshooting.md").read_text("utf-8"))
     )
-    assert given - explained == {"noise-like"}  # what is left of a check that is ok
+    assert used - explained == {"noise-like"}  # part of a check that is ok
 
 
 TEXTS = ["README.md", *sorted(str(path.relative_to(ROOT)) for path in ROOT.glob("docs/*.md"))]
@@ -149,31 +149,31 @@ LONG = (
     *(["analyze", part] for part in ("positioning", "correspondence", "errors", "budget")),
     *(["advise"], ["cameras"], ["session", "correct"], ["session", "export"]),
 )
-"""Examples that are not run here: they take minutes, need a camera, or are run above."""
+"""Examples that are not run below: they take minutes, need a camera, or are run above."""
 
 FEWER = {"simulate": "--frames 2", "reconstruct": "--frames 0", "record": "--seconds 0.2"}
-"""What makes examples short."""
+"""Options that shorten examples."""
 
 
 def examples(text: str) -> list[list[str]]:
-    """The commands of a text's examples: their words after ``labapp``."""
+    """Commands of the examples in a text: their arguments after ``labapp``."""
     joined = re.sub(r"\\\n\s*", " ", (ROOT / text).read_text("utf-8"))
     lines = re.findall(r"^    labapp (.*)$", joined, re.MULTILINE)
     return [shlex.split(line, comments=True) for line in lines]
 
 
 def shown_files(text: str) -> dict[str, str]:
-    """Files that a text shows whole, by name."""
-    shown = re.findall(
+    """Files that a text shows completely, by name."""
+    files = re.findall(
         r'^```toml title="(.+?)"\n(.*?)```', (ROOT / text).read_text("utf-8"), re.M | re.S
     )
-    return dict(shown)
+    return dict(files)
 
 
 @pytest.mark.parametrize("text", TEXTS)
-def test_examples_can_be_typed_as_they_are(text: str, tmp_path: Path) -> None:
-    """The options are there, and so is every file: in a checkout, or made by an example before."""
-    made = {"bench.toml", *shown_files(text)}
+def test_options_and_files_of_examples_exist(text: str, tmp_path: Path) -> None:
+    """A file is in the checkout, or an earlier example writes it."""
+    written = {"bench.toml", *shown_files(text)}
     for words in examples(text):
         command: object = typer.main.get_command(cli.app)
         context, rest = None, words
@@ -186,15 +186,15 @@ def test_examples_can_be_typed_as_they_are(text: str, tmp_path: Path) -> None:
         for before, word in zip(["", *words], words, strict=False):
             path = word.removeprefix("simulated:")
             if before in ("--out", "new") or (before == "--setup" and words[0] == "calibrate"):
-                made.add(word)
+                written.add(word)
             elif set(path) & set("*{"):  # a pattern
                 continue
-            elif re.search(r"\.[a-z]+$", path) and path.partition("/")[0] not in made:
+            elif re.search(r"\.[a-z]+$", path) and path.partition("/")[0] not in written:
                 assert (ROOT / path).is_file(), words
 
 
 @pytest.mark.parametrize("text", [text for text in TEXTS if examples(text)])
-def test_examples_run_one_after_the_other(
+def test_examples_run_in_order(
     text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, labapp: Run
 ) -> None:
     for folder in ("sample_sessions", "resources"):
@@ -203,36 +203,36 @@ def test_examples_run_one_after_the_other(
     for name, content in shown_files(text).items():
         Path(name).write_text(content, "utf-8")
     for words in examples(text):
-        if any(words[: len(long)] == long for long in LONG):
+        if any(words[: len(skipped)] == skipped for skipped in LONG):
             continue
         fewer = FEWER.get(words[0], "").split()
         if words[:2] == ["session", "measure"]:
             fewer = ["--frames", "0"]
         if fewer and fewer[0] in words:
-            place = words.index(fewer[0])
-            words[place : place + 2] = []
+            index = words.index(fewer[0])
+            words[index : index + 2] = []
         if "--lines" in words:
-            words[words.index("--lines") + 1] = "0"  # a port that is free
-        code, _, said = labapp(*words, *fewer)
-        assert code == 0, said
+            words[words.index("--lines") + 1] = "0"  # any free port
+        code, _, stderr = labapp(*words, *fewer)
+        assert code == 0, stderr
     if text in (
         "docs/studies.md",
         "docs/penetration.md",
-    ):  # goes on with what its commands have made
+    ):  # the Python examples use the files written by the commands
         for example in re.findall(r"```python\n(.*?)```", (ROOT / text).read_text("utf-8"), re.S):
             exec(example, {})
 
 
-def test_commands_in_the_texts_have_no_gaps_and_options_that_there_are() -> None:
+def test_commands_in_the_texts_are_complete_and_valid() -> None:
     program = typer.main.get_command(cli.app)
     for text in (*TEXTS, *(str(path.relative_to(ROOT)) for path in ROOT.glob("docs/guide/*.md"))):
-        found = re.findall(r"`(?:\./run )?labapp ([^`]*)`", (ROOT / text).read_text("utf-8"))
-        assert not [command for command in found if "…" in command], text
-        for words in (shlex.split(command) for command in found):
+        commands = re.findall(r"`(?:\./run )?labapp ([^`]*)`", (ROOT / text).read_text("utf-8"))
+        assert not [command for command in commands if "…" in command], text
+        for words in (shlex.split(command) for command in commands):
             command: object = program
             while isinstance(command, typer.core.TyperGroup) and words and words[0][0].islower():
                 command = command.commands[words.pop(0)]
             if isinstance(command, typer.core.TyperCommand):
-                known = [name for each in command.params for name in each.opts]
+                options = [name for parameter in command.params for name in parameter.opts]
                 for word in words:
-                    assert word in known or not word.startswith("--"), (text, command.name, word)
+                    assert word in options or not word.startswith("--"), (text, command.name, word)

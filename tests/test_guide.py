@@ -1,4 +1,4 @@
-"""The guide says what the app says, and shows it."""
+"""The guide agrees with the texts of the app and shows its pictures."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_every_step_has_a_page_that_begins_with_its_hint(step: Step):
     assert one_line(hint) == step.hint
 
 
-def test_the_index_says_what_the_app_says_of_itself():
+def test_index_contains_the_introduction_of_the_app():
     pytest.importorskip("PySide6")
     from labapp.gui.shell.help import CLOSING, INTRODUCTION
 
@@ -34,29 +34,29 @@ def test_the_index_says_what_the_app_says_of_itself():
         assert one_line(paragraph) in index
 
 
-def test_the_keys_of_the_index_are_those_of_the_actions():
+def test_keys_of_the_index_belong_to_actions():
     text = (GUIDE / "index.md").read_text("utf-8").partition("## Keys")[2]
     keys = re.findall(r"(?<![\w+])(?:(?:Ctrl|Shift)\+)*(?:F\d+|(?<=\+)[A-Z.](?!\w))", text)
     assert len(keys) >= 15
     assert set(keys) <= {action.key for action in ACTIONS}
 
 
-def test_every_picture_is_shown_and_small():
-    shown = {
+def test_every_picture_is_used_and_small():
+    used = {
         name
         for page in PAGES
         for name in re.findall(r"\(pictures/(\S+)\)", page.read_text("utf-8"))
     }
-    there = list((GUIDE / "pictures").iterdir())
-    assert {path.name for path in there} == shown
-    assert sum(path.stat().st_size for path in there) < 2_500_000
+    files = list((GUIDE / "pictures").iterdir())
+    assert {path.name for path in files} == used
+    assert sum(path.stat().st_size for path in files) < 2_500_000
 
 
-def test_buttons_of_the_guide_that_open_dialogs_are_in_the_window():
+def test_dialog_buttons_of_the_guide_exist_in_the_window():
     pytest.importorskip("PySide6")
     from tests.gui.words import sentences
 
-    there = {words.replace("&", "") for _, words in sentences()}
+    texts = {words.replace("&", "") for _, words in sentences()}
     for page in PAGES:
         named = re.findall(r"(?<!\*)\*([^*]+…)\*(?!\*)", page.read_text("utf-8"))
-        assert {one_line(name) for name in named} <= there, page.name
+        assert {one_line(name) for name in named} <= texts, page.name

@@ -1,4 +1,4 @@
-"""The descriptions of packages fit the program: what they name is there, on each system's terms."""
+"""The package descriptions fit the program: the files that they name exist, for each system."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ ROOT = Path(__file__).resolve().parents[1]
 PACKAGING = ROOT / "packaging"
 
 
-class Made:
-    """Takes the place of PyInstaller's classes; keeps what they were given."""
+class FakeClass:
+    """Replacement for PyInstaller's classes, which records their arguments."""
 
     def __init__(self, *args: Any, **options: Any) -> None:
         self.args, self.options = args, options
@@ -39,8 +39,8 @@ class Made:
         ]
 
 
-def specified(monkeypatch: pytest.MonkeyPatch, platform: str) -> dict[str, Any]:
-    """Run PyInstaller's description as on a system; return its names."""
+def run_specification(monkeypatch: pytest.MonkeyPatch, platform: str) -> dict[str, Any]:
+    """Run PyInstaller's specification as on a given platform; return its names."""
     hooks = ModuleType("PyInstaller.utils.hooks")
     hooks.__dict__.update(
         collect_all=lambda package: ([], [], [package]),
@@ -49,67 +49,65 @@ def specified(monkeypatch: pytest.MonkeyPatch, platform: str) -> dict[str, Any]:
     for name in ("PyInstaller", "PyInstaller.utils"):
         monkeypatch.setitem(sys.modules, name, ModuleType(name))
     monkeypatch.setitem(sys.modules, hooks.__name__, hooks)
-    with monkeypatch.context() as there:
-        there.setattr(sys, "platform", platform)
+    with monkeypatch.context() as patched:
+        patched.setattr(sys, "platform", platform)
         names: dict[str, Any] = {
             "SPECPATH": str(PACKAGING),
-            **dict.fromkeys(("Analysis", "PYZ", "EXE", "COLLECT"), Made),
+            **dict.fromkeys(("Analysis", "PYZ", "EXE", "COLLECT"), FakeClass),
         }
-        bundles: list[Made] = []
-        names["BUNDLE"] = lambda *args, **options: bundles.append(Made(*args, **options))
+        bundles: list[FakeClass] = []
+        names["BUNDLE"] = lambda *args, **options: bundles.append(FakeClass(*args, **options))
         exec(compile((PACKAGING / "labapp.spec").read_text("utf-8"), "labapp.spec", "exec"), names)
     return {**names, "bundles": bundles}
 
 
 @pytest.mark.parametrize("platform", ["linux", "win32", "darwin"])
-def test_the_specification_names_files_that_are_there(
-    platform: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    made = specified(monkeypatch, platform)
-    analysis, program = made["analysis"], made["program"]
+def test_specification_names_existing_files(platform: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    names = run_specification(monkeypatch, platform)
+    analysis, program = names["analysis"], names["program"]
     assert all(Path(script).is_file() for script in analysis.args[0])
     assert all(Path(source).exists() for source, _ in analysis.options["datas"])
-    into = {target for _, target in analysis.options["datas"]}
-    assert into == {"labapp/resources", "labapp/docs/guide", "labapp/sample_sessions"}
+    targets = {target for _, target in analysis.options["datas"]}
+    assert targets == {"labapp/resources", "labapp/docs/guide", "labapp/sample_sessions"}
     assert Path(program.options["icon"]).is_file()
-    kept = {name for name, _, _ in analysis.binaries}
-    assert {"vtkmodules/libvtkCommonCore.so", "pyarrow/libarrow.so.2600"} <= kept
-    assert {"libvtkCommonCore.so", "pyarrow/_fs.abi3.so"} <= kept
-    assert not [name for name in kept if re.search("viskores|Testing|flight", name)]
-    assert ("libstdc++.so.6" in kept) == (platform != "linux")
-    assert len(made["bundles"]) == (platform == "darwin")
-    for bundle in made["bundles"]:
+    binaries = {name for name, _, _ in analysis.binaries}
+    assert {"vtkmodules/libvtkCommonCore.so", "pyarrow/libarrow.so.2600"} <= binaries
+    assert {"libvtkCommonCore.so", "pyarrow/_fs.abi3.so"} <= binaries
+    assert not [name for name in binaries if re.search("viskores|Testing|flight", name)]
+    assert ("libstdc++.so.6" in binaries) == (platform != "linux")
+    assert len(names["bundles"]) == (platform == "darwin")
+    for bundle in names["bundles"]:
         (kind,) = bundle.options["info_plist"]["CFBundleDocumentTypes"]
         assert kind["CFBundleTypeExtensions"] == [SUFFIX[1:]]
 
 
-def test_the_installer_for_windows_packs_what_is_frozen(monkeypatch: pytest.MonkeyPatch) -> None:
-    made = specified(monkeypatch, "win32")
-    frozen, program = made["folder"].options["name"], made["program"].options["name"]
+def test_windows_installer_contains_the_frozen_program(monkeypatch: pytest.MonkeyPatch) -> None:
+    names = run_specification(monkeypatch, "win32")
+    frozen, program = names["folder"].options["name"], names["program"].options["name"]
     text = (PACKAGING / "labapp.iss").read_text("utf-8")
     (source,) = re.findall(r'^Source: "(.+?)"', text, re.M)
     assert source == rf"..\build\frozen\{frozen}\*"
     assert set(re.findall(r"\{app\}\\([\w.]+)", text)) == {f"{program}.exe"}
     assert rf"Software\Classes\{SUFFIX}" in text
     assert f"/DVersion={__version__}" in text
-    for named in re.findall(r"packaging\\([\w.]+)", text):
-        assert (PACKAGING / named).is_file(), named
+    for file in re.findall(r"packaging\\([\w.]+)", text):
+        assert (PACKAGING / file).is_file(), file
     sections = re.findall(r"^\[(\w+)\]", text, re.M)
     assert sections == ["Setup", "Files", "Icons", "Registry"]
     for line in filter(None, map(str.strip, text.splitlines())):
         assert re.match(r"(;|#|\[|\w+=|\w+: )", line), line
 
 
-def test_the_debian_package_installs_files_that_are_there() -> None:
+def test_debian_package_installs_existing_files() -> None:
     text = (PACKAGING / "build.sh").read_text("utf-8")
     for line in re.findall(r"^ +cp ((?:packaging|resources)/.*)$", text, re.M):
         assert (ROOT / shlex.split(line)[0]).is_file(), line
     (depends,) = re.findall(r"^Depends: (.*)$", text, re.M)
-    (wanted,) = re.findall(r"^packages='(.*?)'", (ROOT / "run").read_text("utf-8"), re.M | re.S)
-    assert set(wanted.split()) - {"ca-certificates"} <= set(re.findall(r"[\w.+-]+", depends))
+    (required,) = re.findall(r"^packages='(.*?)'", (ROOT / "run").read_text("utf-8"), re.M | re.S)
+    assert set(required.split()) - {"ca-certificates"} <= set(re.findall(r"[\w.+-]+", depends))
 
 
-def test_sessions_open_in_labapp_on_linux() -> None:
+def test_sessions_are_associated_with_labapp_on_linux() -> None:
     entry = configparser.ConfigParser(interpolation=None)
     entry.read(PACKAGING / "labapp.desktop", "utf-8")
     desktop = entry["Desktop Entry"]

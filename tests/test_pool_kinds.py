@@ -1,4 +1,4 @@
-"""A frame of every kind of pool through the commands: no label is wrong (Show 5, reduced)."""
+"""A frame of every kind of pool, by the command line: no label is wrong (Show 5, reduced)."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ import pytest
 from tests.benchmarks.pool_kinds import OTHERS, judge, scenarios
 from tests.conftest import Run
 
-# A frame takes seconds; all kinds, 30 frames each, are for `tests/benchmarks/pool_kinds.py`.
-# Not `dent_and_wave` and `height_map`, whose first frame is refused: that would hold nothing.
+# A frame takes seconds; `tests/benchmarks/pool_kinds.py` measures all kinds, 30 frames each.
+# The first frames of `dent_and_wave` and `height_map` are refused, so they would test nothing.
 KINDS = sorted(OTHERS.keys() - {"dent_and_wave"} | {"egg", "mode_21", "travelling_21"})
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_no_label_of_any_kind_of_pool_is_wrong(kind: str, labapp: Run, tmp_path: Path) -> None:
+def test_no_label_is_wrong_for_any_kind_of_pool(kind: str, labapp: Run, tmp_path: Path) -> None:
     out, results = tmp_path / "out", tmp_path / "results"
     scenario = scenarios(tmp_path)[kind]
     assert labapp("simulate", scenario, "--out", out, "--frames", 1)[0] == 0

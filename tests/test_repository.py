@@ -1,4 +1,4 @@
-"""What the repository promises as a whole: lock, texts, commands, house rules."""
+"""Rules for the whole repository: lock file, texts, commands, code."""
 
 from __future__ import annotations
 
@@ -41,9 +41,9 @@ def relative(path: Path) -> str:
 
 
 def repository_files() -> Iterator[Path]:
-    """Everything git would keep, told without git: a bare machine may have none."""
+    """Files that git would track, listed without git, which may not be installed."""
     for top in ROOT.iterdir():
-        if top.is_file() and top.name != ".git":  # a work tree has a file of that name
+        if top.is_file() and top.name != ".git":  # a file in a work tree
             yield top
     for folder in REPOSITORY_FOLDERS:
         for path in (ROOT / folder).rglob("*"):
@@ -64,14 +64,14 @@ def test_lock_names_only_the_public_hosts():
     assert local == ["labapp"]
 
 
-def test_the_version_is_the_same_everywhere():
+def test_version_is_the_same_everywhere():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     newest = re.search(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text("utf-8"), re.MULTILINE)
     assert newest is not None
     assert project["version"] == labapp.__version__ == newest[1]
 
 
-def test_the_core_needs_nothing_that_draws():
+def test_core_needs_no_drawing_packages():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
     names = {re.split(r"[<>=\[]", line)[0].lower() for line in project["dependencies"]}
     assert "numpy" in names
@@ -88,7 +88,7 @@ def test_readme_opens_with_the_two_commands():
     assert commands == ["./run demo", "./run test"]
 
 
-def test_links_in_the_texts_lead_somewhere():
+def test_links_in_the_texts_are_not_broken():
     broken = [
         f"{relative(text)}: {target}"
         for text in TEXTS
@@ -107,16 +107,16 @@ def test_decisions_are_numbered_without_gaps():
         assert f"]({name})" in (ROOT / "docs" / "adr" / "index.md").read_text("utf-8")
 
 
-def test_no_path_of_one_machine_is_written_down():
+def test_no_file_contains_a_path_of_one_machine():
     one_machine = re.compile(r"(?<![\w.])/(?:root|work|farm|tmp|home|Users)/\w")
-    found = []
+    paths = []
     for path in repository_files():
         try:
             text = path.read_text("utf-8")
         except UnicodeDecodeError:
             continue
-        found += [f"{relative(path)}: {m[0]}" for m in one_machine.finditer(text)]
-    assert not found
+        paths += [f"{relative(path)}: {m[0]}" for m in one_machine.finditer(text)]
+    assert not paths
 
 
 def test_sample_sessions_are_small_enough_for_git():
@@ -134,7 +134,7 @@ def test_sample_sessions_are_small_enough_for_git():
 
 
 @pytest.mark.parametrize("script", ["run", ".ci/run"])
-def test_scripts_can_be_run(script: str):
+def test_scripts_are_executable(script: str):
     assert os.access(ROOT / script, os.X_OK)
 
 
@@ -143,66 +143,66 @@ def test_continuous_integration_runs_the_same_test():
     assert [line.split("&&")[-1].strip() for line in commands] == ["./run test"]
 
 
-def test_run_takes_every_folder_of_tests(tmp_path: Path):
-    """Also after its functions have been called: one once took a list of folders for its own."""
+def test_run_includes_every_folder_of_tests(tmp_path: Path):
+    """Even after its functions were called: one of them once overwrote the list of folders."""
     functions = (ROOT / "run").read_text("utf-8").split("\ncase ${1:-} in")[0]
     last = "compile_loops env; echo $core_tests $file_tests"
     (tmp_path / "env").mkdir()
-    for loop in (ROOT / "labapp").rglob("*.py"):  # none is newer than what was compiled
-        place = tmp_path / loop.relative_to(ROOT)
-        place.parent.mkdir(parents=True, exist_ok=True)
-        place.write_bytes(loop.read_bytes())
+    for loop in (ROOT / "labapp").rglob("*.py"):  # none is newer than the compiled files
+        copy = tmp_path / loop.relative_to(ROOT)
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        copy.write_bytes(loop.read_bytes())
     (tmp_path / "env" / "loops-compiled").touch()
     (tmp_path / "run").write_text(f"{functions}\n{last}\n", "utf-8")
-    said = subprocess.run(["sh", tmp_path / "run"], capture_output=True, text=True, check=True)
+    process = subprocess.run(["sh", tmp_path / "run"], capture_output=True, text=True, check=True)
     folders = {path.relative_to(ROOT).parts[1] for path in (ROOT / "tests").rglob("*/test_*.py")}
-    assert {*said.stdout.split(), "tests/gui"} == {f"tests/{folder}" for folder in folders}
+    assert {*process.stdout.split(), "tests/gui"} == {f"tests/{folder}" for folder in folders}
 
 
-def test_run_without_a_command_says_what_there_is():
-    answer = subprocess.run([ROOT / "run"], capture_output=True, text=True, check=False)
-    assert answer.returncode == 2
-    assert {"./run demo", "./run test"} <= set(re.findall(r"\./run \w+", answer.stderr))
+def test_run_without_a_command_lists_the_commands():
+    process = subprocess.run([ROOT / "run"], capture_output=True, text=True, check=False)
+    assert process.returncode == 2
+    assert {"./run demo", "./run test"} <= set(re.findall(r"\./run \w+", process.stderr))
 
 
-def test_run_and_pyproject_ask_for_the_same_uv():
-    wanted = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["uv"]
-    assert f"'uv{wanted['required-version']}'" in (ROOT / "run").read_text("utf-8")
+def test_run_and_pyproject_require_the_same_uv():
+    required = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["tool"]["uv"]
+    assert f"'uv{required['required-version']}'" in (ROOT / "run").read_text("utf-8")
 
 
-def test_the_module_is_the_command():
-    answer = subprocess.run(
+def test_module_can_be_run_as_the_command():
+    process = subprocess.run(
         [sys.executable, "-m", "labapp", "--help"], capture_output=True, text=True, check=False
     )
-    assert answer.returncode == 0, answer.stderr
+    assert process.returncode == 0, process.stderr
     for command in ("reconstruct", "detect", "calibrate", "demo"):
-        assert command in answer.stdout
+        assert command in process.stdout
 
 
-# --- house rules ------------------------------------------------------------------------------
+# --- rules of the code -------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("path", MODULES, ids=relative)
-def test_every_module_says_what_it_is(path: Path):
+def test_every_module_has_a_docstring(path: Path):
     assert ast.get_docstring(ast.parse(path.read_text("utf-8")))
 
 
-def test_no_module_is_in_a_circle_of_imports():
-    """Imports for the types alone and within functions are counted, too."""
+def test_no_import_is_circular():
+    """Imports for type checking and within functions are included."""
     files = {".".join(path.relative_to(ROOT).with_suffix("").parts): path for path in MODULES}
     files = {name.removesuffix(".__init__"): path for name, path in files.items()}
-    needs: dict[str, set[str]] = {name: set() for name in files}
+    imports: dict[str, set[str]] = {name: set() for name in files}
     for name, path in files.items():
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):
             if isinstance(node, ast.Import):
-                needs[name] |= {each.name for each in node.names} & set(files)
+                imports[name] |= {alias.name for alias in node.names} & set(files)
             elif isinstance(node, ast.ImportFrom):
                 assert node.module is not None, f"{name}: imports by a relative name"
-                whole = {f"{node.module}.{each.name}" for each in node.names}
-                needs[name] |= {each if each in files else node.module for each in whole}
-                needs[name] &= set(files)
-    assert needs["labapp.gui.app"]
-    TopologicalSorter(needs).prepare()  # names the modules of a circle in its error
+                full_names = {f"{node.module}.{alias.name}" for alias in node.names}
+                imports[name] |= {alias if alias in files else node.module for alias in full_names}
+                imports[name] &= set(files)
+    assert imports["labapp.gui.app"]
+    TopologicalSorter(imports).prepare()  # its error names the modules of a cycle
 
 
 def test_long_files_have_a_reason():
@@ -211,7 +211,7 @@ def test_long_files_have_a_reason():
 
 
 def test_long_functions_have_a_reason():
-    """Sixty lines from the signature to the end, the docstring not counted."""
+    """Long means over 60 lines from the signature to the end, without the docstring."""
     long = set()
     for path in MODULES:
         for node in ast.walk(ast.parse(path.read_text("utf-8"))):

@@ -1,4 +1,4 @@
-"""labapp as on Windows and macOS: what those lack is taken away, and nothing misses it."""
+"""labapp as on Windows and macOS: it works without the functions that those lack."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ ROOT = ELSEWHERE.parents[1]
 
 
 @pytest.mark.parametrize("system", ["win32", "darwin"])
-def test_the_whole_way_can_be_gone_elsewhere(system: str, tmp_path: Path) -> None:
+def test_complete_workflow_on_other_systems(system: str, tmp_path: Path) -> None:
     folders = ("HOME", "XDG_CONFIG_HOME", "XDG_STATE_HOME", "XDG_CACHE_HOME")
-    done = subprocess.run(
+    process = subprocess.run(
         [sys.executable, ELSEWHERE / "way.py", tmp_path / "bench"],
         env={
             **os.environ,
@@ -35,7 +35,7 @@ def test_the_whole_way_can_be_gone_elsewhere(system: str, tmp_path: Path) -> Non
         timeout=5 * PATIENCE_S,
         check=False,
     )
-    assert done.returncode == 0, f"{done.stdout[-500:]}\n{done.stderr[-3000:]}"
-    assert f"{system}: every module is imported" in done.stdout
-    assert f"pages: {' '.join(sorted(PAGES))}" in done.stdout
+    assert process.returncode == 0, f"{process.stdout[-500:]}\n{process.stderr[-3000:]}"
+    assert f"{system}: every module is imported" in process.stdout
+    assert f"pages: {' '.join(sorted(PAGES))}" in process.stdout
     assert verify_export(tmp_path / "bench" / "results") == []

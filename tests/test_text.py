@@ -1,4 +1,4 @@
-"""Words that windows, tables and the report share."""
+"""Texts shared by windows, tables and the report."""
 
 from __future__ import annotations
 
@@ -10,18 +10,18 @@ CHECK = "2026-01-31T12:00:00+00:00"
 
 
 @pytest.mark.parametrize("status", SETUP_WORDS)
-def test_every_status_of_a_set_up_has_words_and_a_mark(status: str):
+def test_every_setup_status_has_words_and_a_mark(status: str):
     words = setup_words(status)
     assert marked_setup_words(status, words) == f"{SETUP_MARKS[status]} {words}"
     assert len(set(SETUP_MARKS.values())) == len(SETUP_WORDS)
 
 
-def test_a_set_up_without_a_status_has_no_words():
+def test_setup_without_a_status_has_no_words():
     assert setup_words("") == setup_words("", was_checked=CHECK) == marked_setup_words("", "") == ""
 
 
 @pytest.mark.parametrize("status", SETUP_WORDS)
-def test_only_one_that_was_changed_after_its_check_is_said_to_be(status: str):
+def test_only_a_setup_changed_after_its_check_is_described_so(status: str):
     changed = setup_words(status, was_checked=CHECK) != setup_words(status)
     assert changed == (status in ("entered", "calibrated"))
     assert (CHECK[:10] in setup_words(status, was_checked=CHECK)) == changed
@@ -46,5 +46,5 @@ def test_only_one_that_was_changed_after_its_check_is_said_to_be(status: str):
         ("more_error_um_per_unit", "more error", "µm per mm or °"),
     ],
 )
-def test_a_unit_is_read_from_the_end_of_a_name(name: str, words: str, unit: str) -> None:
+def test_unit_is_read_from_the_end_of_a_name(name: str, words: str, unit: str) -> None:
     assert split_unit(name) == (words, unit)

@@ -1,4 +1,4 @@
-"""The wheel as a user has it: installed into an empty environment, away from the checkout."""
+"""The wheel as a user installs it: in an empty environment, outside the checkout."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.conftest import lacks
+from tests.conftest import skip_or_fail
 from tests.screen import screen
 from tests.waiting import PATIENCE_S
 
@@ -22,41 +22,43 @@ pytestmark = pytest.mark.slow
 Start = Callable[..., str]
 
 
-def told(*command: object, cwd: Path, **given: str) -> str:
-    """Run a program that knows nothing of this checkout; what it writes."""
-    ours = ("DISPLAY", "WAYLAND_DISPLAY", "QT_QPA_PLATFORM", "PYTHONPATH", "VIRTUAL_ENV")
-    done = subprocess.run(
+def run(*command: object, cwd: Path, **variables: str) -> str:
+    """Run a program that cannot see this checkout; return its output."""
+    removed = ("DISPLAY", "WAYLAND_DISPLAY", "QT_QPA_PLATFORM", "PYTHONPATH", "VIRTUAL_ENV")
+    process = subprocess.run(
         [str(part) for part in command],
         cwd=cwd,
-        env={**{k: v for k, v in os.environ.items() if k not in ours}, **given},
+        env={**{k: v for k, v in os.environ.items() if k not in removed}, **variables},
         capture_output=True,
         text=True,
         timeout=5 * PATIENCE_S,
         check=False,
     )
-    assert done.returncode == 0, f"{done.stdout}\n{done.stderr}"
-    return done.stdout
+    assert process.returncode == 0, f"{process.stdout}\n{process.stderr}"
+    return process.stdout
 
 
 @pytest.fixture(scope="module")
 def uv() -> Path:
-    found = shutil.which("uv", path=f"{ROOT / '.tools' / 'bin'}{os.pathsep}{os.environ['PATH']}")
-    if found is None:
-        lacks("uv is not here")
-    return Path(str(found))
+    executable = shutil.which(
+        "uv", path=f"{ROOT / '.tools' / 'bin'}{os.pathsep}{os.environ['PATH']}"
+    )
+    if executable is None:
+        skip_or_fail("uv is not here")
+    return Path(str(executable))
 
 
 @pytest.fixture(scope="module")
 def away(uv: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with the wheel, and an environment with nothing but what is locked may come into."""
+    """A folder with the wheel, the locked requirements and an empty environment."""
     folder = tmp_path_factory.mktemp("away")
-    told(uv, "build", "--wheel", "--out-dir", folder, ROOT, cwd=folder)
-    told(
+    run(uv, "build", "--wheel", "--out-dir", folder, ROOT, cwd=folder)
+    run(
         *(uv, "export", "--project", ROOT, "--locked", "--no-dev", "--all-extras"),
         *("--no-emit-project", "--no-hashes", "--output-file", folder / "locked.txt"),
         cwd=folder,
     )
-    told(uv, "venv", "--no-project", "--python", sys.executable, folder / "env", cwd=folder)
+    run(uv, "venv", "--no-project", "--python", sys.executable, folder / "env", cwd=folder)
     return folder
 
 
@@ -65,23 +67,23 @@ def own_folders(away: Path) -> dict[str, str]:
 
 
 def install(uv: Path, away: Path, extra: str) -> Start:
-    """Install the wheel with an extra; returns what runs its labapp."""
+    """Install the wheel with an extra; return a function that runs its labapp."""
     (wheel,) = away.glob("*.whl")
-    told(
+    run(
         *(uv, "pip", "install", "--python", away / "env", "--constraint", away / "locked.txt"),
         f"labapp{extra} @ {wheel.as_uri()}",
         cwd=away,
     )
 
-    def start(*arguments: object, **given: str) -> str:
-        return told(
-            away / "env" / "bin" / "labapp", *arguments, cwd=away, **own_folders(away), **given
+    def start(*arguments: object, **variables: str) -> str:
+        return run(
+            away / "env" / "bin" / "labapp", *arguments, cwd=away, **own_folders(away), **variables
         )
 
     return start
 
 
-def test_without_windows_it_measures_and_simulates(uv: Path, away: Path) -> None:
+def test_wheel_without_gui_measures_and_simulates(uv: Path, away: Path) -> None:
     labapp = install(uv, away, "")
     assert "3-D" in labapp("demo", "--frames", "0:2", "--no-window", "--out", "demo")
     assert {"measures.csv", "report.pdf"} <= {p.name for p in (away / "demo" / "results").iterdir()}
@@ -92,17 +94,19 @@ def test_without_windows_it_measures_and_simulates(uv: Path, away: Path) -> None
 
 @pytest.mark.xvfb
 @pytest.mark.usefixtures("opengl")
-def test_with_windows_it_opens_and_goes_through_every_page(uv: Path, away: Path) -> None:
+def test_wheel_with_gui_opens_every_page(uv: Path, away: Path) -> None:
     labapp = install(uv, away, "[gui,study]")
     labapp("demo", "--frames", "0:1", "--no-window", "--out", "demo in 3-D")
     assert list((away / "demo in 3-D").glob("surface_*.png"))
-    shutil.copytree(ROOT / "tests" / "tour", away / "tour")  # away from the checkout's labapp
-    own = {**own_folders(away), "QT_QPA_PLATFORM": "xcb"}
+    shutil.copytree(
+        ROOT / "tests" / "tour", away / "tour"
+    )  # where the labapp of the checkout cannot be imported
+    environment = {**own_folders(away), "QT_QPA_PLATFORM": "xcb"}
     with screen(1366, 768) as display:
-        told(
+        run(
             *(away / "env" / "bin" / "python", "-m", "tour", "--out", "pictures"),
             cwd=away,
             DISPLAY=display,
-            **own,
+            **environment,
         )
     assert len(list((away / "pictures").glob("*.png"))) > 30

@@ -1,4 +1,4 @@
-"""How tests wait: until something is so, never for a time."""
+"""Waiting in tests: for a condition, never for a time."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ import time
 from collections.abc import Callable
 
 PATIENCE_S = 300.0
-"""What does not come within this will not come, however busy the machine is.
+"""Longest wait for an event, s; enough for a busy machine.
 
-It costs nothing where it comes.
+It costs no time if the event occurs.
 """
 
 
-def wait_until(reached: Callable[[], bool]) -> None:
-    """Wait for something that happens in another thread or process; fail when it does not."""
+def wait_until(condition: Callable[[], bool]) -> None:
+    """Wait for a condition set by another thread or process; fail if it does not occur."""
     until_s = time.monotonic() + PATIENCE_S
-    while not reached():
+    while not condition():
         assert time.monotonic() < until_s, "it did not happen"
         time.sleep(0.005)
 

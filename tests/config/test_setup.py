@@ -64,7 +64,7 @@ def change(path: Path, old: str, new: str) -> Path:
     return path
 
 
-def test_a_setup_is_read(path: Path) -> None:
+def test_setup_is_read(path: Path) -> None:
     setup = read_setup(path)
     rig = setup.rig
     assert (rig.laser.projection_angle_deg, rig.laser.distance_mm) == (31.14, 31.48)
@@ -82,24 +82,24 @@ def test_a_setup_is_read(path: Path) -> None:
     assert setup.text == SETUP
 
 
-def test_the_documented_setup_is_one(tmp_path: Path) -> None:
+def test_documented_setup_is_valid(tmp_path: Path) -> None:
     text = (Path(__file__).parents[2] / "docs" / "command-line.md").read_text(encoding="utf-8")
     path = tmp_path / "setup.toml"
     path.write_text(text.split("```toml\n")[1].split("```")[0], encoding="utf-8")
     assert read_setup(path).rig.pattern.absent_rays == {(10, 10)}
 
 
-def test_absent_dots_can_be_named(path: Path) -> None:
+def test_absent_rays_can_be_listed(path: Path) -> None:
     change(path, "rows = 19\n", "rows = 19\nabsent = [[1, 2], [10, 10]]\n")
     assert read_setup(path).rig.pattern.absent_rays == {(1, 2), (10, 10)}
 
 
-def test_a_byte_order_mark_and_crlf_do_no_harm(path: Path) -> None:
+def test_byte_order_mark_and_crlf_are_accepted(path: Path) -> None:
     path.write_bytes(b"\xef\xbb\xbf" + SETUP.replace("\n", "\r\n").encode())
     assert read_setup(path).rig.laser.distance_mm == 31.48
 
 
-def test_a_plane_can_be_tilted(path: Path) -> None:
+def test_plane_can_be_tilted(path: Path) -> None:
     change(path, "h_mm = 3.0\n", "h_mm = 3.0\npitch_deg = 10\nyaw_deg = 20\n")
     plane = read_setup(path).rig.imaging_plane
     pitch, yaw = np.radians([10, 20])
@@ -112,14 +112,14 @@ def test_a_plane_can_be_tilted(path: Path) -> None:
     np.testing.assert_allclose(plane.origin_mm, [-45, -50, 3])
 
 
-def test_a_homography_stands_for_the_three_points(path: Path) -> None:
+def test_homography_replaces_the_three_points(path: Path) -> None:
     path.write_text(HOMOGRAPHY)
-    found = read_setup(path).calibration.to_plane(np.array([100.0, 50.0]))
-    np.testing.assert_allclose(found, [12.0, 100.0])
+    plane_mm = read_setup(path).calibration.to_plane(np.array([100.0, 50.0]))
+    np.testing.assert_allclose(plane_mm, [12.0, 100.0])
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "said"),
+    ("old", "new", "message"),
     [
         ("distance_mm = 31.48", "distance_mm = -31.48", "laser.distance_mm: -31.48; expected a nu"),
         ("distance_mm = 31.48", "distance_mm = nan", "laser.distance_mm: nan; expected a number"),
@@ -169,8 +169,8 @@ def test_a_homography_stands_for_the_three_points(path: Path) -> None:
         ("rows = 19", "rows = 19\nrows = 19", "syntax: "),
     ],
 )
-def test_what_is_wrong_is_named(path: Path, old: str, new: str, said: str) -> None:
-    with pytest.raises(InputError, match=said) as caught:
+def test_wrong_value_is_named(path: Path, old: str, new: str, message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
         read_setup(change(path, old, new))
     assert str(caught.value).startswith(f"{path}: ")
 
@@ -184,19 +184,19 @@ def test_what_is_wrong_is_named(path: Path, old: str, new: str, said: str) -> No
         ("-8.0", "nan"),
     ],
 )
-def test_a_wrong_homography_is_refused(path: Path, old: str, new: str) -> None:
+def test_wrong_homography_is_rejected(path: Path, old: str, new: str) -> None:
     path.write_text(HOMOGRAPHY)
     with pytest.raises(InputError, match=r"image_calibration\.homography: .*3 rows of 3 numbers"):
         read_setup(change(path, old, new))
 
 
-def test_both_forms_of_calibration_at_once_are_refused(path: Path) -> None:
+def test_two_forms_of_calibration_are_rejected(path: Path) -> None:
     path.write_text(HOMOGRAPHY + "z_axis_mm = 31.75\n")
     with pytest.raises(InputError, match=r"image_calibration\.z_axis_mm: unknown key"):
         read_setup(path)
 
 
-def test_everything_wrong_is_reported_at_once(path: Path) -> None:
+def test_all_problems_are_reported_together(path: Path) -> None:
     change(path, "distance_mm = 31.48", "distance_mm = -1")
     change(path, "columns = 19\n", "")
     change(path, "height_mm = 5.0", "height_mm = 5.0\ntip = 1")
@@ -209,7 +209,7 @@ def test_everything_wrong_is_reported_at_once(path: Path) -> None:
     }
 
 
-def test_what_is_no_setup_file_is_refused(tmp_path: Path, path: Path) -> None:
+def test_invalid_setup_file_is_rejected(tmp_path: Path, path: Path) -> None:
     path.write_bytes(b"\xff\xfe[\x00l\x00")
     with pytest.raises(InputError, match="encoding: not UTF-8"):
         read_setup(path)
@@ -223,7 +223,7 @@ def test_what_is_no_setup_file_is_refused(tmp_path: Path, path: Path) -> None:
 
 
 @given(st.text())
-def test_no_text_gets_another_error_than_ours(text: str) -> None:
+def test_any_text_raises_an_input_error(text: str) -> None:
     with mock.patch("labapp.config.setup.read_text", return_value=text), pytest.raises(InputError):
         read_setup("setup.toml")
 
@@ -242,7 +242,9 @@ toml_values = st.recursive(
     ),
     toml_values,
 )
-def test_no_value_gets_another_error_than_ours(section: str, key: str, value: object) -> None:
+def test_any_value_is_accepted_or_raises_an_input_error(
+    section: str, key: str, value: object
+) -> None:
     import tomllib
 
     values = tomllib.loads(SETUP)
@@ -258,28 +260,28 @@ def test_no_value_gets_another_error_than_ours(section: str, key: str, value: ob
     assert np.isfinite(setup.calibration.matrix).all()
 
 
-def test_an_update_keeps_comments_and_everything_else(path: Path) -> None:
+def test_update_preserves_comments_and_other_keys(path: Path) -> None:
     update_setup(path, {"laser": {"projection_angle_deg": 30.5, "distance_mm": 40.0}})
     expected = SETUP.replace("31.14", "30.5").replace("31.48", "40.0")
     assert path.read_text() == expected
     assert read_setup(path).rig.laser.distance_mm == 40.0
 
 
-def test_an_update_can_replace_a_homography(path: Path) -> None:
+def test_update_can_replace_a_homography(path: Path) -> None:
     path.write_text(HOMOGRAPHY)
-    three = {
+    points = {
         "origin_px": [44.0, 590.0],
         "x_axis_px": [440.0, 590.0],
         "x_axis_mm": 69.85,
         "z_axis_px": [44.0, 410.0],
         "z_axis_mm": 31.75,
     }
-    update_setup(path, {"image_calibration": {**three, "homography": None}})
-    found = read_setup(path).calibration.to_plane(np.array([440.0, 410.0]))
-    np.testing.assert_allclose(found, [69.85, 31.75])
+    update_setup(path, {"image_calibration": {**points, "homography": None}})
+    plane_mm = read_setup(path).calibration.to_plane(np.array([440.0, 410.0]))
+    np.testing.assert_allclose(plane_mm, [69.85, 31.75])
 
 
-def test_an_update_makes_what_is_not_there(tmp_path: Path) -> None:
+def test_update_creates_missing_file_and_tables(tmp_path: Path) -> None:
     path = tmp_path / "new.toml"
     update_setup(path, {"laser": {"projection_angle_deg": 30.5, "distance_mm": 40.0}})
     update_setup(path, {"electrode": {"height_mm": 5.0}})
@@ -295,7 +297,7 @@ def test_an_update_makes_what_is_not_there(tmp_path: Path) -> None:
     ]
 
 
-def test_an_update_that_fails_changes_nothing(path: Path) -> None:
+def test_failed_update_changes_nothing(path: Path) -> None:
     values = {"laser": {"distance_mm": 40.0}}
     with (
         mock.patch("pathlib.Path.replace", side_effect=OSError(28, "No space left on device")),
@@ -313,7 +315,7 @@ def test_an_update_that_fails_changes_nothing(path: Path) -> None:
     assert path.read_text() == "laser = 3"
 
 
-def test_an_update_keeps_permissions_and_links(path: Path, tmp_path: Path) -> None:
+def test_update_preserves_permissions_and_links(path: Path, tmp_path: Path) -> None:
     path.chmod(0o640)
     link = tmp_path / "link.toml"
     link.symlink_to(path)
@@ -342,37 +344,37 @@ origin_px_sigma = 0.04""",
 }
 
 
-def test_a_bench_that_is_not_ideal_is_read_with_its_uncertainty(path: Path) -> None:
+def test_nonideal_bench_is_read_with_its_uncertainty(path: Path) -> None:
     for old, new in FULL.items():
         change(path, old, new)
     setup = read_setup(path)
-    rig, known = setup.rig, setup.rig.uncertainty
-    assert known is not None
+    rig, uncertainty = setup.rig, setup.rig.uncertainty
+    assert uncertainty is not None
     assert (rig.laser.azimuth_deg, rig.laser.aim_x_mm, rig.laser.aim_y_mm) == (0.5, 0.0, -0.2)
     assert rig.pattern.rotation_deg == 1.5
     assert rig.imaging_plane.angles_deg == pytest.approx((0, 0, 0.4))
     assert setup.calibration.lens is not None
     assert setup.calibration.lens.focal_px == (1500.0, 1490.0)
-    sigma = dict(zip([one.key for one in QUANTITIES], known.sigma, strict=True))
+    sigma = dict(zip([quantity.key for quantity in QUANTITIES], uncertainty.sigma, strict=True))
     assert sigma["laser.projection_angle_deg"] == pytest.approx(0.25)
     assert sigma["imaging_plane.s_mm"] == pytest.approx(0.05)
     assert sigma["image_calibration.origin_px[u]"] == pytest.approx(0.04)
     assert sigma["image_calibration.origin_px[v]"] == pytest.approx(0.04)
     assert sigma["camera_lens.distortion_percent"] == pytest.approx(0.1)
-    assert known.correlation[ANGLE, DISTANCE] == pytest.approx(0.9)
-    assert "laser.distance_mm" in known.assumed
-    assert not {"imaging_plane.s_mm", "image_calibration.origin_px[v]"} & known.assumed
+    assert uncertainty.correlation[ANGLE, DISTANCE] == pytest.approx(0.9)
+    assert "laser.distance_mm" in uncertainty.assumed
+    assert not {"imaging_plane.s_mm", "image_calibration.origin_px[v]"} & uncertainty.assumed
 
 
-def test_a_setup_of_before_is_the_ideal_bench_with_usual_uncertainties(path: Path) -> None:
+def test_setup_without_uncertainties_has_the_assumed_ones(path: Path) -> None:
     setup = read_setup(path)
-    known = setup.rig.uncertainty
+    uncertainty = setup.rig.uncertainty
     assert setup.rig.laser == Laser(31.14, 31.48)
     assert setup.calibration.lens is None
-    assert known is not None
-    assert known.assumed == {one.key for one in QUANTITIES} - GLASS
-    usual = [0.0 if one.key in GLASS else one.assumed for one in QUANTITIES]
-    np.testing.assert_allclose(known.sigma, usual)
+    assert uncertainty is not None
+    assert uncertainty.assumed == {quantity.key for quantity in QUANTITIES} - GLASS
+    assumed = [0.0 if quantity.key in GLASS else quantity.assumed for quantity in QUANTITIES]
+    np.testing.assert_allclose(uncertainty.sigma, assumed)
 
 
 @pytest.mark.parametrize(
@@ -385,15 +387,15 @@ def test_a_setup_of_before_is_the_ideal_bench_with_usual_uncertainties(path: Pat
         ("[pattern]", "[camera_lens]\nfocal_px = [0.0, 1.0]\n[pattern]", "camera_lens.focal_px"),
     ],
 )
-def test_wrong_uncertainties_and_lenses_are_refused(
+def test_wrong_uncertainties_and_lenses_are_rejected(
     path: Path, old: str, new: str, field: str
 ) -> None:
-    with pytest.raises(InputError) as refused:
+    with pytest.raises(InputError) as caught:
         read_setup(change(path, old, new))
-    assert field in str(refused.value)
+    assert field in str(caught.value)
 
 
-def test_a_lens_may_be_known_by_its_uncertainty_alone(path: Path) -> None:
+def test_lens_may_have_only_an_uncertainty(path: Path) -> None:
     setup = read_setup(
         change(path, "[pattern]", "[camera_lens]\ndistortion_percent_sigma = 0\n[pattern]")
     )
@@ -402,18 +404,20 @@ def test_a_lens_may_be_known_by_its_uncertainty_alone(path: Path) -> None:
     assert setup.rig.uncertainty.sigma[INDEX["camera_lens.distortion_percent"]] == 0.0
 
 
-def test_glass_and_places_on_the_axes_have_uncertainties(path: Path) -> None:
-    given = {
+def test_glass_and_axis_points_have_uncertainties(path: Path) -> None:
+    values = {
         "imaging_plane": {"glass_mm": 3.0, "glass_index_sigma": 0.005},
         "image_calibration": {"x_axis_mm_sigma": 0.02},
     }
-    update_setup(path, given)
-    known = read_setup(path).rig.uncertainty
-    assert known is not None
-    keys = [f"imaging_plane.glass_{one}" for one in ("mm", "index")]
+    update_setup(path, values)
+    uncertainty = read_setup(path).rig.uncertainty
+    assert uncertainty is not None
+    keys = [f"imaging_plane.glass_{suffix}" for suffix in ("mm", "index")]
     keys += [f"image_calibration.{axis}_axis_mm" for axis in "xz"]
-    np.testing.assert_allclose(known.sigma[[INDEX[key] for key in keys]], [0.1, 0.005, 0.02, 0.1])
-    assert known.assumed & set(keys) == {keys[0], keys[3]}
+    np.testing.assert_allclose(
+        uncertainty.sigma[[INDEX[key] for key in keys]], [0.1, 0.005, 0.02, 0.1]
+    )
+    assert uncertainty.assumed & set(keys) == {keys[0], keys[3]}
 
 
 def test_glass_and_welding_direction_are_read(path: Path) -> None:
@@ -438,16 +442,16 @@ def test_glass_and_welding_direction_are_read(path: Path) -> None:
         ("imaging_plane", "glass_index", 0.9, "imaging_plane.glass_index"),
     ],
 )
-def test_wrong_glass_and_directions_are_refused(
+def test_wrong_glass_and_directions_are_rejected(
     path: Path, section: str, key: str, value: object, field: str
 ) -> None:
     update_setup(path, {section: {key: value}})
-    with pytest.raises(InputError) as refused:
+    with pytest.raises(InputError) as caught:
         read_setup(path)
-    assert refused.value.field == field
+    assert caught.value.field == field
 
 
-def test_a_calibrated_value_that_is_changed_loses_its_uncertainty(path: Path) -> None:
+def test_changed_value_loses_its_calibrated_uncertainty(path: Path) -> None:
     calibrated = {
         "projection_angle_deg": 31.0,
         "projection_angle_deg_sigma": 0.2,
@@ -457,42 +461,42 @@ def test_a_calibrated_value_that_is_changed_loses_its_uncertainty(path: Path) ->
         "azimuth_deg_sigma": 0.1,
     }
     update_setup(path, {"laser": calibrated})
-    update_setup(path, {"laser": {"distance_mm": 31.5}})  # the same
+    update_setup(path, {"laser": {"distance_mm": 31.5}})  # the same value
     assert read_setup(path).rig.uncertainty.sigma[DISTANCE] == 0.3
     update_setup(path, {"laser": {"distance_mm": 32.0, "azimuth_deg": 1.0}})
-    known = read_setup(path).rig.uncertainty
-    assert known.sigma[[ANGLE, DISTANCE]].tolist() == [0.2, 0.5]
-    assert known.correlation[ANGLE, DISTANCE] == 0.0
-    assert known.sigma[INDEX["laser.azimuth_deg"]] == 0.1
+    uncertainty = read_setup(path).rig.uncertainty
+    assert uncertainty.sigma[[ANGLE, DISTANCE]].tolist() == [0.2, 0.5]
+    assert uncertainty.correlation[ANGLE, DISTANCE] == 0.0
+    assert uncertainty.sigma[INDEX["laser.azimuth_deg"]] == 0.1
 
 
 COVARIANCE = np.diag([0.01, 0.04, 0.0025, 0.0025, 0.09, 0.09])
 COVARIANCE[0, 2] = COVARIANCE[2, 0] = 0.003
-"""Of the points of a calibration, px²: u of O′ and of the point on O′X′ go together."""
+"""Of the points of a calibration, px²: u of O′ and of the point on O′X′ are correlated."""
 
 
-def test_points_in_the_picture_have_a_whole_covariance(path: Path) -> None:
+def test_calibration_points_have_a_full_covariance(path: Path) -> None:
     sigma = np.sqrt([0.025, 0.0025, 0.09])
     names = ("origin_px", "x_axis_px", "z_axis_px")
-    given = {f"{name}_sigma": float(one) for name, one in zip(names, sigma, strict=True)}
+    sigmas = {f"{name}_sigma": float(value) for name, value in zip(names, sigma, strict=True)}
     points = np.ix_(POINTS, POINTS)
 
-    def known(**keys: object) -> RigUncertainty:
+    def uncertainty_with(**keys: object) -> RigUncertainty:
         update_setup(path, {"image_calibration": keys})
-        found = read_setup(path).rig.uncertainty
-        assert found is not None
-        return found
+        uncertainty = read_setup(path).rig.uncertainty
+        assert uncertainty is not None
+        return uncertainty
 
-    whole = known(**given, points_covariance_px2=COVARIANCE.tolist())
-    np.testing.assert_allclose(whole.covariance[points], COVARIANCE)
-    np.testing.assert_allclose(whole.root @ whole.root.T, whole.covariance, atol=1e-9)
-    wider = known(origin_px_sigma=2 * given["origin_px_sigma"])
+    full = uncertainty_with(**sigmas, points_covariance_px2=COVARIANCE.tolist())
+    np.testing.assert_allclose(full.covariance[points], COVARIANCE)
+    np.testing.assert_allclose(full.root @ full.root.T, full.covariance, atol=1e-9)
+    wider = uncertainty_with(origin_px_sigma=2 * sigmas["origin_px_sigma"])
     np.testing.assert_allclose(wider.covariance[points][:2, :2], 4 * COVARIANCE[:2, :2])
-    np.testing.assert_allclose(wider.correlation, whole.correlation)
-    # Another point is not what was calibrated: nothing is known of its errors and others'.
-    changed = known(origin_px=[45.0, 590.0])
-    alone = np.diag([0.09, 0.09, 0.0025, 0.0025, 0.09, 0.09])
-    np.testing.assert_allclose(changed.covariance[points], alone)
+    np.testing.assert_allclose(wider.correlation, full.correlation)
+    # A changed point was not calibrated: its correlations are unknown.
+    changed = uncertainty_with(origin_px=[45.0, 590.0])
+    uncorrelated = np.diag([0.09, 0.09, 0.0025, 0.0025, 0.09, 0.09])
+    np.testing.assert_allclose(changed.covariance[points], uncorrelated)
 
 
 @pytest.mark.parametrize(
@@ -506,22 +510,22 @@ def test_points_in_the_picture_have_a_whole_covariance(path: Path) -> None:
         ("points_mm", [30.0, 30.0]),
     ],
 )
-def test_wrong_covariances_of_points_are_refused(path: Path, key: str, value: object) -> None:
+def test_wrong_covariances_of_points_are_rejected(path: Path, key: str, value: object) -> None:
     update_setup(path, {"image_calibration": {key: value}})
-    with pytest.raises(InputError) as refused:
+    with pytest.raises(InputError) as caught:
         read_setup(path)
-    assert refused.value.field == f"image_calibration.{key}"
+    assert caught.value.field == f"image_calibration.{key}"
 
 
-def test_points_of_a_homography_lie_where_their_uncertainties_are_of(path: Path) -> None:
+def test_points_of_a_homography_are_those_of_their_uncertainties(path: Path) -> None:
     setup = read_setup(path)
     points = ("origin_px", "x_axis_px", "x_axis_mm", "z_axis_px", "z_axis_mm")
     rows = {"homography": setup.calibration.matrix.tolist()}
     update_setup(path, {"image_calibration": dict.fromkeys(points) | rows})
-    half = read_setup(path).rig
-    assert half.uncertainty is not None
-    assert half.uncertainty.axes.x_mm == half.imaging_plane.width_mm / 2
+    default = read_setup(path).rig
+    assert default.uncertainty is not None
+    assert default.uncertainty.axes.x_mm == default.imaging_plane.width_mm / 2
     update_setup(path, {"image_calibration": {"points_mm": [30.0, 20.0]}})
-    known = read_setup(path).rig.uncertainty
-    assert known is not None
-    assert (known.axes.x_mm, known.axes.z_mm) == (30.0, 20.0)
+    uncertainty = read_setup(path).rig.uncertainty
+    assert uncertainty is not None
+    assert (uncertainty.axes.x_mm, uncertainty.axes.z_mm) == (30.0, 20.0)

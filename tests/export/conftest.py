@@ -45,9 +45,9 @@ def pool() -> Reconstruction:
 
 
 def dots(count: int) -> Dots:
-    """Dots 20 px apart from (10, 20) on."""
-    same = (np.full(count, value) for value in (20.0, 0.1, 0.2, 2.0, 40.0, 9.0))
-    return Dots(10 + 20.0 * np.arange(count), *same)
+    """Dots at intervals of 20 px along u, from (10, 20) px."""
+    equal = (np.full(count, value) for value in (20.0, 0.1, 0.2, 2.0, 40.0, 9.0))
+    return Dots(10 + 20.0 * np.arange(count), *equal)
 
 
 @pytest.fixture
@@ -92,11 +92,11 @@ def unmeasured() -> Measurement:
 
 @pytest.fixture
 def calibration() -> ImageCalibration:
-    """0.5 mm a pixel, O′ at (0, 100)."""
+    """0.5 mm per pixel, O′ at (0, 100) px."""
     return ImageCalibration(np.array([[0.5, 0, 0], [0, -0.5, 50], [0, 0, 1]]))
 
 
 @pytest.fixture
 def writer(calibration: ImageCalibration) -> Callable[[Path], ResultsWriter]:
-    """Open results in a folder."""
+    """Open a writer of results in a folder."""
     return lambda folder: ResultsWriter(folder, calibration, {"source": {"path": "v.avi"}})

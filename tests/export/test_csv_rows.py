@@ -1,4 +1,4 @@
-"""Rows of tables are what Python writes of each cell, to the last digit."""
+"""Rows of tables equal the formatting of each cell by Python, to the last digit."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ NUMBERS = st.one_of(
 )
 
 
-def cell_by_cell(name: str, table: Table) -> str:
+def rows_by_cell(name: str, table: Table) -> str:
     columns = TABLES[name]
     cells = [
         [x if c.digits is None else number(x, c.digits) for x in table[c.name].tolist()]
@@ -35,13 +35,13 @@ def cell_by_cell(name: str, table: Table) -> str:
 
 
 @given(st.lists(st.tuples(NUMBERS, NUMBERS, NUMBERS), min_size=1, max_size=8))
-def test_numbers_are_written_as_python_writes_them(rows: list[tuple[float, ...]]) -> None:
+def test_numbers_are_formatted_as_by_python(rows: list[tuple[float, ...]]) -> None:
     digits = np.array([0, 4, 6])
     text, length = format_fixed(np.array(rows), digits)
     if length >= 0:
-        wanted = [",".join(map(number, row, digits.tolist())) + "\n" for row in rows]
-        assert text[:length].tobytes().decode() == "".join(wanted)
-    else:  # some number is too near to a tie to be rounded here
+        expected = [",".join(map(number, row, digits.tolist())) + "\n" for row in rows]
+        assert text[:length].tobytes().decode() == "".join(expected)
+    else:  # a number is too close to a tie to be rounded here
         assert any(
             math.isfinite(x) and abs(math.modf(abs(x) * 10.0**d)[0] - 0.5) < 1e-4
             for row in rows
@@ -50,7 +50,7 @@ def test_numbers_are_written_as_python_writes_them(rows: list[tuple[float, ...]]
 
 
 @pytest.mark.parametrize("sources", [["auto"] * 3, ["auto", "manual", "auto"], []])
-def test_tables_with_words_are_written_alike(sources: list[str]) -> None:
+def test_tables_with_text_are_formatted_equally(sources: list[str]) -> None:
     rng = np.random.default_rng(2)
     table: Table = {
         column.name: rng.integers(0, 20, len(sources)).astype(float)
@@ -60,32 +60,33 @@ def test_tables_with_words_are_written_alike(sources: list[str]) -> None:
     }
     table["ray_row"][:1] = np.nan
     table["source"] = np.array(sources, object)
-    assert csv_rows("dots", table) == cell_by_cell("dots", table)
+    assert csv_rows("dots", table) == rows_by_cell("dots", table)
 
 
-def test_a_number_of_many_digits_is_written_the_slow_way() -> None:
+def test_number_of_many_digits_is_formatted_by_python() -> None:
     assert format_fixed(np.array([[1e12]]), np.array([6]))[1] == -1
     values = np.array([2e-7, 3e12, 1.5])
     table: Table = {column.name: values for column in TABLES["boundary"]}
-    assert csv_rows("boundary", table) == cell_by_cell("boundary", table)
+    assert csv_rows("boundary", table) == rows_by_cell("boundary", table)
 
 
-def test_parts_of_an_uncertainty_are_written_where_they_are_asked_for() -> None:
+def test_parts_of_an_uncertainty_are_written_on_request() -> None:
     parts = {"": 0.13, "level": 0.04, "setup": 0.12}
     sigmas = {name: value for part, value in parts.items() for name in sigma_names(part)}
     measures = replace(Measures(*[1.0] * 20), **sigmas)
-    found = Measurement("ok", "", "fit", measures=measures)
-    made = FrameResult(0, 0.0, found)
+    measurement = Measurement("ok", "", "fit", measures=measures)
+    result = FrameResult(0, 0.0, measurement)
     rows = [
-        table_rows(made, ImageCalibration(np.eye(3)), parts)["measures"] for parts in (False, True)
+        table_rows(result, ImageCalibration(np.eye(3)), parts)["measures"]
+        for parts in (False, True)
     ]
     heads = [csv_header("measures", parts) for parts in (False, True)]
-    plain, whole = (
+    plain, detailed = (
         next(csv.DictReader((head, row))) for head, row in zip(heads, rows, strict=True)
     )
-    assert plain.items() <= whole.items()
-    more = {name: float(whole[name]) for name in whole.keys() - plain.keys()}
-    assert len(more) == 27
-    for name, value in more.items():
+    assert plain.items() <= detailed.items()
+    additional = {name: float(detailed[name]) for name in detailed.keys() - plain.keys()}
+    assert len(additional) == 27
+    for name, value in additional.items():
         expected = 0.04 if "_level" in name else 0.12 if "_setup" in name else 0.03
         assert value == expected, name

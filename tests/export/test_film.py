@@ -1,4 +1,4 @@
-"""The film: read back by PyAV, it has every frame at its time, and is not blank."""
+"""The film: read with PyAV, it has every frame at its time, and is not blank."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ def frames(measured: Measurement, unmeasured: Measurement) -> Frames:
     assert measured.measures is not None
     sizes = replace(measured.measures, height_mm=0.3, depth_mm=0.0)
     pool = replace(measured, measures=sizes)
-    each = [(3, 0.30, pool), (4, 0.32, unmeasured), (8, 0.40, pool)]
-    return [FrameResult(*one) for one in each]
+    values = [(3, 0.30, pool), (4, 0.32, unmeasured), (8, 0.40, pool)]
+    return [FrameResult(*value) for value in values]
 
 
 @pytest.fixture
@@ -54,8 +54,8 @@ def extent(frames: Frames) -> Extent:
     return extent
 
 
-class Here(Executor):
-    """Draws plain pictures at once: the first is black, each that follows lighter."""
+class InlineExecutor(Executor):
+    """Draws plain pictures immediately: the first is black, each further one lighter."""
 
     def __init__(self) -> None:
         self.scenes: list[Scene] = []
@@ -68,20 +68,20 @@ class Here(Executor):
 
 
 def read(path: Path) -> tuple[list[float], list[float], list[np.ndarray]]:
-    """When frames begin, how long packets last, s, and the pictures."""
+    """Return start times of frames and durations of packets, s, and the pictures."""
     with av.open(str(path)) as container:
         stream = container.streams.video[0]
         assert stream.codec_context.name == "mpeg4"
-        lasts = [float(p.duration * p.time_base) for p in container.demux(stream) if p.size]
+        durations = [float(p.duration * p.time_base) for p in container.demux(stream) if p.size]
     with av.open(str(path)) as container:
-        shown = list(container.decode(video=0))
-    return [f.time for f in shown], lasts, [f.to_ndarray(format="bgr24") for f in shown]
+        decoded = list(container.decode(video=0))
+    return [f.time for f in decoded], durations, [f.to_ndarray(format="bgr24") for f in decoded]
 
 
-# --- when each is shown --------------------------------------------------------------------------
+# --- times of frames -----------------------------------------------------------------------------
 
 
-def test_frames_keep_their_times_and_what_is_left_out_leaves_its_own(frames: Frames) -> None:
+def test_film_times_leave_gaps_for_missing_frames(frames: Frames) -> None:
     numbered = [(result.frame, result.time_s) for result in frames]
     np.testing.assert_allclose(film_times(numbered), [0, 0.02, 0.1, 0.12])
     np.testing.assert_allclose(film_times(numbered, 5.0), [0, 0.2, 1.0, 1.2])
@@ -93,38 +93,36 @@ def test_frames_keep_their_times_and_what_is_left_out_leaves_its_own(frames: Fra
     np.testing.assert_allclose(film_times([(7, 0.7)], 25.0), [0, 0.04])
 
 
-def test_the_film_has_every_frame_at_its_time(
-    frames: Frames, extent: Extent, tmp_path: Path
-) -> None:
-    path, done = tmp_path / "film.mp4", list[int]()
+def test_film_has_every_frame_at_its_time(frames: Frames, extent: Extent, tmp_path: Path) -> None:
+    path, progress = tmp_path / "film.mp4", list[int]()
     times_s = film_times([(result.frame, result.time_s) for result in frames])
-    write_film(path, iter(frames), times_s, extent, Here(), done.append)
-    begins, lasts, pictures = read(path)
-    np.testing.assert_allclose(begins, [0, 0.02, 0.1], atol=1e-9)
-    np.testing.assert_allclose(lasts, [0.02, 0.08, 0.02], atol=1e-9)
+    write_film(path, iter(frames), times_s, extent, InlineExecutor(), progress.append)
+    starts, durations, pictures = read(path)
+    np.testing.assert_allclose(starts, [0, 0.02, 0.1], atol=1e-9)
+    np.testing.assert_allclose(durations, [0.02, 0.08, 0.02], atol=1e-9)
     assert [picture.shape for picture in pictures] == [(32, 48, 3)] * 3
     levels = [float(picture.mean()) for picture in pictures]
     np.testing.assert_allclose(levels, [0, 20, 40], atol=3)
-    assert done == [1, 2, 3]
+    assert progress == [1, 2, 3]
     assert [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
 
 
 @pytest.mark.parametrize("rate_hz", [0.5, 29.97, 500.0, 12_345.0, 60_000.0])
-def test_any_rate_is_kept(tmp_path: Path, rate_hz: float) -> None:
+def test_any_frame_rate_is_preserved(tmp_path: Path, rate_hz: float) -> None:
     pictures = [np.full((16, 16, 3), 9, np.uint8)] * 7
     write_video(tmp_path / "a.mp4", pictures, np.arange(8) / rate_hz)
-    begins, lasts, _ = read(tmp_path / "a.mp4")
-    np.testing.assert_allclose(begins, np.arange(7) / rate_hz, atol=1 / 60_000)
-    assert sum(lasts) == pytest.approx(7 / rate_hz, abs=1 / 60_000)
+    starts, durations, _ = read(tmp_path / "a.mp4")
+    np.testing.assert_allclose(starts, np.arange(7) / rate_hz, atol=1 / 60_000)
+    assert sum(durations) == pytest.approx(7 / rate_hz, abs=1 / 60_000)
 
 
-def test_frames_that_come_too_fast_are_refused(tmp_path: Path) -> None:
+def test_too_high_frame_rate_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="export: film_rate_hz: 200000; expected at most 60000"):
         write_video(tmp_path / "a.mp4", [], np.arange(4) / 200_000)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_link_beside_it_is_not_followed(tmp_path: Path) -> None:
+def test_link_beside_the_film_is_not_followed(tmp_path: Path) -> None:
     (tmp_path / "mine.txt").write_text("mine")
     (tmp_path / ".a.mp4.part").symlink_to("mine.txt")
     write_video(tmp_path / "a.mp4", [np.zeros((16, 16, 3), np.uint8)], np.arange(2.0))
@@ -132,92 +130,92 @@ def test_a_link_beside_it_is_not_followed(tmp_path: Path) -> None:
     assert len(read(tmp_path / "a.mp4")[0]) == 1
 
 
-# --- what is shown -------------------------------------------------------------------------------
+# --- content -------------------------------------------------------------------------------------
 
 
-def test_all_frames_share_room_and_colours(frames: Frames, measured: Measurement) -> None:
+def test_all_frames_share_extent_and_colours(frames: Frames, measured: Measurement) -> None:
     assert measured.reconstruction is not None
     assert measured.measures is not None
     boundary = measured.reconstruction.boundary
-    aside = replace(boundary, points_mm=boundary.points_mm + np.array([2.0, 0.0, 0.0]))
+    shifted = replace(boundary, points_mm=boundary.points_mm + np.array([2.0, 0.0, 0.0]))
     other = replace(
         measured,
-        reconstruction=replace(measured.reconstruction, boundary=aside),
+        reconstruction=replace(measured.reconstruction, boundary=shifted),
         measures=replace(measured.measures, height_mm=0.1, depth_mm=-0.4),
     )
     extent = Extent()
     assert not extent.known
-    shown = [*frames, FrameResult(9, None, other)]
-    for result in shown:
+    results = [*frames, FrameResult(9, None, other)]
+    for result in results:
         extent.add(result.measurement)
     assert extent.limits == (-0.4, 0.3)
     np.testing.assert_allclose(extent.within_mm, [[-3, -3, -0.4], [5, 3, 0.3]])
-    made = [film_scene(result, extent) for result in shown]
-    assert {scene.limits for scene in made} == {(-0.4, 0.3)}
-    for scene in made:
+    scenes = [film_scene(result, extent) for result in results]
+    assert {scene.limits for scene in scenes} == {(-0.4, 0.3)}
+    for scene in scenes:
         np.testing.assert_array_equal(scene.within_mm, extent.within_mm)
-    assert [scene.stamp for scene in made] == [
+    assert [scene.stamp for scene in scenes] == [
         "frame 3, 0.3000 s",
         "frame 4, 0.3200 s",
         "frame 8, 0.4000 s",
         "frame 9",
     ]
-    assert [scene.notice for scene in made] == [
+    assert [scene.notice for scene in scenes] == [
         "",
         'cannot be measured: two references fit, "a" and "b"',
         "",
         "",
     ]
-    assert [len(scene.triangles) > 0 for scene in made] == [True, False, True, True]
+    assert [len(scene.triangles) > 0 for scene in scenes] == [True, False, True, True]
 
 
 @pytest.mark.usefixtures("opengl")
-def test_a_studio_draws_from_the_same_place_each_time(frames: Frames, extent: Extent) -> None:
+def test_studio_keeps_its_viewpoint(frames: Frames, extent: Extent) -> None:
     studio = Studio(SIZE, "free")
-    first, words, again = (
+    first, notice, again = (
         studio.draw(film_scene(replace(frames[k], frame=3, time_s=0.3), extent)) for k in (0, 1, 0)
     )
     studio.plotter.close()
     assert first.shape == (320, 480, 3)
     np.testing.assert_array_equal(first, again)
-    # The surface is gone, words are there; the colour scale, at the right, is the same.
-    blue, green, red = np.moveaxis(words[:, :380].astype(int), 2, 0)
+    # Text replaces the surface; the colour scale, at the right, is the same.
+    blue, green, red = np.moveaxis(notice[:, :380].astype(int), 2, 0)
     assert not ((red > 180) & (green > 150) & (blue < 90)).any()
-    assert (words[60:140, 50:330] < 128).sum() > 500
-    np.testing.assert_array_equal(words[80:, 400:], first[80:, 400:])
+    assert (notice[60:140, 50:330] < 128).sum() > 500
+    np.testing.assert_array_equal(notice[80:, 400:], first[80:, 400:])
 
 
-# --- in an export --------------------------------------------------------------------------------
+# --- export -------------------------------------------------------------------------------------
 
 
-def test_an_export_has_the_film(
+def test_export_contains_the_film(
     frames: Frames, calibration: ImageCalibration, tmp_path: Path
 ) -> None:
     pytest.importorskip("pyvista")
-    out, done = tmp_path / "out", list[int]()
+    out, progress = tmp_path / "out", list[int]()
     choice = replace(FILM, film_rate_hz=10.0)
-    written = export(out, frames, calibration, {}, choice, progress=done.append)
+    written = export(out, frames, calibration, {}, choice, progress=progress.append)
     assert [file.name for file in written] == ["film.mp4", "measures.csv"]
     assert verify_export(out) == []
-    assert done == [1, 2, 3, 4, 5, 6]
-    begins, _, pictures = read(out / "film.mp4")
-    np.testing.assert_allclose(begins, [0, 0.1, 0.5], atol=1e-9)
+    assert progress == [1, 2, 3, 4, 5, 6]
+    starts, _, pictures = read(out / "film.mp4")
+    np.testing.assert_allclose(starts, [0, 0.1, 0.5], atol=1e-9)
     assert {picture.shape for picture in pictures} == {(320, 480, 3)}
-    first, words, last = (picture.astype(int) for picture in pictures)
+    first, notice, last = (picture.astype(int) for picture in pictures)
     assert np.ptp(first) > 200
     # Frames 3 and 8 differ in the stamp only; frame 4 lacks the surface.
     assert np.abs(first - last)[40:].mean() < 1
-    assert np.abs(first - words)[40:].mean() > 5
+    assert np.abs(first - notice)[40:].mean() > 5
 
 
-def test_without_any_surface_there_is_no_film(
+def test_no_film_without_any_surface(
     unmeasured: Measurement, calibration: ImageCalibration, tmp_path: Path
 ) -> None:
     written = export(tmp_path / "out", [FrameResult(0, None, unmeasured)], calibration, {}, FILM)
     assert [file.name for file in written] == ["measures.csv"]
 
 
-# --- what fails on the way -----------------------------------------------------------------------
+# --- failures ------------------------------------------------------------------------------------
 
 
 class Stopped(Exception):
@@ -225,7 +223,7 @@ class Stopped(Exception):
 
 
 @pytest.mark.parametrize("at", [1, 2, 3])
-def test_a_film_that_is_stopped_leaves_nothing(
+def test_stopped_film_leaves_no_file(
     frames: Frames, extent: Extent, tmp_path: Path, at: int
 ) -> None:
     def stop(done: int) -> None:
@@ -234,29 +232,29 @@ def test_a_film_that_is_stopped_leaves_nothing(
 
     times_s = film_times([(result.frame, result.time_s) for result in frames])
     with pytest.raises(Stopped):
-        write_film(tmp_path / "film.mp4", frames, times_s, extent, Here(), stop)
+        write_film(tmp_path / "film.mp4", frames, times_s, extent, InlineExecutor(), stop)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_film_is_begun_before_all_frames_are_read(
+def test_film_is_started_before_all_frames_are_read(
     frames: Frames, extent: Extent, tmp_path: Path
 ) -> None:
-    taken = 0
+    read_count = 0
 
-    def one_by_one() -> Iterator[FrameResult]:
-        nonlocal taken
+    def results() -> Iterator[FrameResult]:
+        nonlocal read_count
         for number in range(40):
-            taken += 1
+            read_count += 1
             yield FrameResult(number, None, frames[0].measurement)
 
     ahead: list[int] = []
     write_film(
         tmp_path / "film.mp4",
-        one_by_one(),
+        results(),
         np.arange(41) / 10,
         extent,
-        Here(),
-        lambda done: ahead.append(taken - done),
+        InlineExecutor(),
+        lambda done: ahead.append(read_count - done),
     )
     assert max(ahead) <= 4
     assert len(read(tmp_path / "film.mp4")[0]) == 40
@@ -280,20 +278,20 @@ FULL_DISK = """
 """
 
 
-def test_a_full_disk_leaves_what_was_there(tmp_path: Path) -> None:
-    """The real thing: the system takes no more."""
-    done = subprocess.run(
+def test_full_disk_leaves_the_earlier_file(tmp_path: Path) -> None:
+    """The limit is set in the operating system."""
+    process = subprocess.run(
         [sys.executable, "-c", textwrap.dedent(FULL_DISK), str(tmp_path / "film.mp4")],
         capture_output=True,
         text=True,
         check=False,
         env={"PYTHONPATH": ":".join(sys.path)},
     )
-    assert (done.returncode, done.stderr) == (0, "")
-    assert done.stdout.splitlines() == ["File too large", "['film.mp4'] b'earlier'"]
+    assert (process.returncode, process.stderr) == (0, "")
+    assert process.stdout.splitlines() == ["File too large", "['film.mp4'] b'earlier'"]
 
 
-def test_the_clock_is_fine_enough_for_a_fraction(tmp_path: Path) -> None:
+def test_time_base_resolves_fractions_of_a_frame(tmp_path: Path) -> None:
     write_video(tmp_path / "a.mp4", [np.zeros((16, 16, 3), np.uint8)], np.array([0, 1 / 30]))
     with av.open(str(tmp_path / "a.mp4")) as container:
         assert container.streams.video[0].time_base == Fraction(1, 60_000)

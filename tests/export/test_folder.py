@@ -42,8 +42,8 @@ Run = Callable[..., tuple[ExportedFile, ...]]
 
 @pytest.fixture
 def frames(measured: Measurement, unmeasured: Measurement) -> list[FrameResult]:
-    each = [(3, 0.5, measured), (4, None, unmeasured), (12, 0.7, measured)]
-    return [FrameResult(*one) for one in each]
+    values = [(3, 0.5, measured), (4, None, unmeasured), (12, 0.7, measured)]
+    return [FrameResult(*value) for value in values]
 
 
 @pytest.fixture
@@ -62,7 +62,7 @@ def alone(folder: Path) -> bool:
     return [path.name for path in folder.parent.iterdir()] == [folder.name]
 
 
-def test_all_that_was_chosen_is_there_and_nothing_else(run: Run, tmp_path: Path) -> None:
+def test_only_the_chosen_files_are_written(run: Run, tmp_path: Path) -> None:
     written = run(tmp_path / "a" / "out")
     expected = {f"{name}.csv" for name in ("measures", "dots", "points", "boundary")}
     expected.add("results.h5")
@@ -70,15 +70,15 @@ def test_all_that_was_chosen_is_there_and_nothing_else(run: Run, tmp_path: Path)
         expected.add(f"surface_{frame}.csv")
         for stem in ("surface", "solid"):
             expected |= {f"{stem}_{frame}{end}" for end in (".stl", "_ascii.stl", ".ply", ".vtp")}
-    there = contents(tmp_path / "a" / "out")
-    assert there.keys() == expected | {"manifest.json"}
+    files = contents(tmp_path / "a" / "out")
+    assert files.keys() == expected | {"manifest.json"}
     assert [file.name for file in written] == sorted(expected)
     assert alone(tmp_path / "a" / "out")
     assert trimesh.load_mesh(tmp_path / "a" / "out" / "solid_000012.ply").is_watertight
     assert not trimesh.load_mesh(tmp_path / "a" / "out" / "surface_000012.ply").is_watertight
 
 
-def test_the_manifest_lists_every_file(run: Run, tmp_path: Path) -> None:
+def test_manifest_lists_every_file(run: Run, tmp_path: Path) -> None:
     out = tmp_path / "out"
     written = run(out)
     manifest = json.loads((out / "manifest.json").read_text(encoding="utf-8"))
@@ -88,34 +88,34 @@ def test_the_manifest_lists_every_file(run: Run, tmp_path: Path) -> None:
     assert manifest["created"]
     assert manifest["sigma_of"] == SIGMA_OF
     assert manifest["files"] == [vars(file) for file in written]
-    there = contents(out)
+    files = contents(out)
     for file in written:
-        assert file.size == len(there[file.name])
-        assert file.sha256 == hashlib.sha256(there[file.name]).hexdigest()
+        assert file.size == len(files[file.name])
+        assert file.sha256 == hashlib.sha256(files[file.name]).hexdigest()
         if file.name.endswith(".csv"):
-            text = there[file.name].decode().splitlines()
+            text = files[file.name].decode().splitlines()
             assert file.rows == len(list(csv.DictReader(text)))
         else:
             assert file.rows is None
     assert verify_export(out) == []
 
 
-def test_tables_and_surfaces_are_the_same_bytes_as_a_runs(
+def test_tables_and_surfaces_equal_those_of_a_run(
     run: Run,
     tmp_path: Path,
     frames: list[FrameResult],
     calibration: ImageCalibration,
 ) -> None:
     with ResultsWriter(tmp_path / "run", calibration, {}) as writer:
-        for each in frames:
-            writer.write(each)
+        for result in frames:
+            writer.write(result)
     run(tmp_path / "out", ExportChoice())
     expected, exported = contents(tmp_path / "run"), contents(tmp_path / "out")
     del expected["run.json"], exported["manifest.json"]
     assert exported == expected
 
 
-def test_hdf5_holds_what_the_tables_hold(run: Run, tmp_path: Path) -> None:
+def test_hdf5_contains_the_content_of_the_tables(run: Run, tmp_path: Path) -> None:
     run(tmp_path / "out")
     with h5py.File(tmp_path / "out" / "results.h5") as file:
         assert list(file["measures/frame"]) == [3, 4, 12]
@@ -126,7 +126,7 @@ def test_hdf5_holds_what_the_tables_hold(run: Run, tmp_path: Path) -> None:
         assert file.attrs["sigma_of"] == SIGMA_OF
 
 
-def test_what_is_not_chosen_is_not_written(run: Run, tmp_path: Path) -> None:
+def test_unselected_files_are_not_written(run: Run, tmp_path: Path) -> None:
     choice = ExportChoice(tables=frozenset({"points"}), surfaces=frozenset())
     run(tmp_path / "out", choice)
     assert contents(tmp_path / "out").keys() == {"points.csv", "manifest.json"}
@@ -134,17 +134,17 @@ def test_what_is_not_chosen_is_not_written(run: Run, tmp_path: Path) -> None:
     assert contents(tmp_path / "out").keys() == {"manifest.json"}
 
 
-def test_the_same_results_give_the_same_bytes(run: Run, tmp_path: Path) -> None:
+def test_equal_results_give_equal_files(run: Run, tmp_path: Path) -> None:
     with mock.patch.object(module, "now", return_value="2026-01-01T00:00:00+00:00"):
         run(tmp_path / "a")
         written = int(time.time())
-        while int(time.time()) == written:  # HDF5 can keep the second in which it was written
+        while int(time.time()) == written:  # HDF5 may store the second in which it was written
             time.sleep(0.05)
         run(tmp_path / "b")
     assert contents(tmp_path / "a") == contents(tmp_path / "b")
 
 
-def test_dots_that_were_put_right_are_manual(
+def test_corrected_dots_are_marked_as_manual(
     run: Run, tmp_path: Path, measured: Measurement
 ) -> None:
     assert measured.dots is not None
@@ -195,19 +195,19 @@ def test_surfaces_are_drawn_in_one_process(run: Run, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("failure", "told"),
+    ("failure", "message"),
     [
         (ModuleNotFoundError("no", name="pyvista"), r"expected pyvista, which is not installed"),
         (BrokenProcessPool("ended"), "a system on which OpenGL can be used"),
     ],
 )
-def test_a_picture_that_cannot_be_drawn_is_told(
-    run: Run, tmp_path: Path, failure: Exception, told: str
+def test_failed_drawing_is_reported(
+    run: Run, tmp_path: Path, failure: Exception, message: str
 ) -> None:
     choice = ExportChoice(pictures=frozenset({"surfaces"}))
     with (
         mock.patch.object(module, "write_surface_picture", side_effect=failure),
-        pytest.raises(InputError, match=told),
+        pytest.raises(InputError, match=message),
     ):
         run(tmp_path / "out", choice)
     assert list(tmp_path.iterdir()) == []
@@ -218,14 +218,14 @@ def test_pictures_of_frames_need_the_recording(run: Run, tmp_path: Path) -> None
         run(tmp_path / "out", ExportChoice(pictures=frozenset({"frames"})))
 
 
-def test_further_files_come_along(run: Run, tmp_path: Path) -> None:
+def test_extra_files_are_included(run: Run, tmp_path: Path) -> None:
     run(tmp_path / "out", extras={"report.pdf": lambda: b"%PDF"})
     assert (tmp_path / "out" / "report.pdf").read_bytes() == b"%PDF"
     assert verify_export(tmp_path / "out") == []
 
 
 @pytest.mark.parametrize("place", ["/proc/nope", "file/out", "mine"])
-def test_a_folder_that_cannot_be_written_is_refused_first(
+def test_unwritable_folder_is_rejected_before_any_work(
     run: Run, tmp_path: Path, place: str
 ) -> None:
     (tmp_path / "file").write_text("")
@@ -239,7 +239,7 @@ def test_a_folder_that_cannot_be_written_is_refused_first(
 
 
 @pytest.mark.parametrize("name", ["../a.pdf", "/a.pdf", "", ".", "a/b", ".part", "measures.csv"])
-def test_further_files_have_names_of_their_own(run: Run, tmp_path: Path, name: str) -> None:
+def test_wrong_names_of_extra_files_are_rejected(run: Run, tmp_path: Path, name: str) -> None:
     with pytest.raises(InputError):
         run(tmp_path / "out", extras={name: bytes})
     assert list(tmp_path.iterdir()) == []
@@ -261,32 +261,32 @@ def test_further_files_have_names_of_their_own(run: Run, tmp_path: Path, name: s
         {"spacing_mm": float("nan")},
     ],
 )
-def test_a_choice_that_there_is_not_is_refused(choice: dict[str, object]) -> None:
+def test_impossible_choice_is_rejected(choice: dict[str, object]) -> None:
     with pytest.raises(InputError, match=r"^export: "):
         ExportChoice(**choice)
 
 
-def test_progress_tells_how_many_are_done(run: Run, tmp_path: Path) -> None:
+def test_progress_counts_finished_frames(run: Run, tmp_path: Path) -> None:
     done: list[int] = []
     run(tmp_path / "out", progress=done.append)
     assert done == [1, 2, 3]
 
 
-# --- what is there already ----------------------------------------------------------------------
+# --- existing files -----------------------------------------------------------------------------
 
 
-def test_an_earlier_export_and_an_empty_folder_are_replaced(run: Run, tmp_path: Path) -> None:
+def test_earlier_export_and_empty_folder_are_replaced(run: Run, tmp_path: Path) -> None:
     out = tmp_path / "out"
     out.mkdir()
     run(out)
-    (out / "points.csv").unlink()  # what is gone cannot be lost
+    (out / "points.csv").unlink()  # a missing file cannot be lost
     run(out, ExportChoice(surfaces=frozenset()))
     assert "surface_000003.stl" not in contents(out)
     assert verify_export(out) == []
     assert alone(out)
 
 
-def test_a_link_to_a_folder_stays_one(run: Run, tmp_path: Path) -> None:
+def test_link_to_a_folder_is_preserved(run: Run, tmp_path: Path) -> None:
     (tmp_path / "real").mkdir()
     (tmp_path / "out").symlink_to("real")
     run(tmp_path / "out")
@@ -327,10 +327,10 @@ def other_manifest(out: Path) -> None:
 
 
 def huge(measured: Measurement, change: str) -> Measurement:
-    """A measurement as a stranger's session may have it; what is built of it has no end."""
-    found = measured.reconstruction
-    assert found is not None
-    boundary, count = found.boundary, len(found.boundary.points_mm)
+    """A measurement of an untrusted session whose surface would be too large."""
+    reconstruction = measured.reconstruction
+    assert reconstruction is not None
+    boundary, count = reconstruction.boundary, len(reconstruction.boundary.points_mm)
     changed = {
         "wide": replace(boundary, points_mm=boundary.points_mm * 1e6),
         "far": replace(boundary, center_mm=boundary.center_mm + 1e9),
@@ -341,11 +341,11 @@ def huge(measured: Measurement, change: str) -> Measurement:
         ),
         "unknown": replace(boundary, points_mm=boundary.points_mm * np.nan),
     }[change]
-    return replace(measured, reconstruction=replace(found, boundary=changed))
+    return replace(measured, reconstruction=replace(reconstruction, boundary=changed))
 
 
 @pytest.mark.parametrize("change", ["wide", "far", "fine", "unknown"])
-def test_a_surface_too_large_to_be_written_is_refused(
+def test_too_large_surface_is_rejected(
     run: Run, tmp_path: Path, measured: Measurement, change: str
 ) -> None:
     frames = [FrameResult(0, None, huge(measured, change))]
@@ -370,9 +370,7 @@ CHANGES = {
 }
 
 
-def test_a_link_in_the_place_of_the_folder_in_the_making_is_not_followed(
-    run: Run, tmp_path: Path
-) -> None:
+def test_links_in_place_of_temporary_folders_are_not_followed(run: Run, tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     mine(tmp_path / "mine")
     for name in (".out.part", ".out.old", ".out.0123456789abcdef.part", ".out.lock"):
@@ -383,7 +381,7 @@ def test_a_link_in_the_place_of_the_folder_in_the_making_is_not_followed(
 
 
 @pytest.mark.parametrize("change", CHANGES, ids=lambda change: change.__name__)
-def test_somebodys_own_files_are_never_deleted(
+def test_other_files_are_never_deleted(
     run: Run, tmp_path: Path, change: Callable[[Path], None]
 ) -> None:
     out = tmp_path / "place" / "out"
@@ -396,23 +394,23 @@ def test_somebodys_own_files_are_never_deleted(
     assert after == before
 
 
-def test_a_file_put_there_meanwhile_is_kept(
+def test_file_added_during_an_export_is_preserved(
     run: Run, tmp_path: Path, frames: list[FrameResult]
 ) -> None:
     out = tmp_path / "out"
     run(out)
 
-    def meanwhile() -> Iterator[tuple[int, float | None, Measurement]]:
+    def add_file_and_measure() -> Iterator[tuple[int, float | None, Measurement]]:
         mine(out)
         yield from frames
 
     with pytest.raises(InputError, match=r"notes\.txt is not in the manifest"):
-        run(out, measured=meanwhile())
+        run(out, measured=add_file_and_measure())
     assert (out / "notes.txt").read_text() == "mine"
     assert alone(out)
 
 
-def test_a_place_that_is_no_folder_is_refused(run: Run, tmp_path: Path) -> None:
+def test_path_that_is_no_folder_is_rejected(run: Run, tmp_path: Path) -> None:
     (tmp_path / "file").write_text("mine")
     for folder in (tmp_path / "file", tmp_path / "file" / "below", Path("/")):
         with pytest.raises(InputError, match="expected"):
@@ -420,7 +418,7 @@ def test_a_place_that_is_no_folder_is_refused(run: Run, tmp_path: Path) -> None:
     assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
 
 
-def test_a_run_of_the_command_line_is_not_replaced(run: Run, written: Path) -> None:
+def test_run_of_the_command_line_is_not_replaced(run: Run, written: Path) -> None:
     with pytest.raises(InputError, match=r"holds boundary\.csv and no manifest\.json"):
         run(written)
 
@@ -432,7 +430,7 @@ def written(tmp_path: Path, calibration: ImageCalibration, measured: Measurement
     return tmp_path / "run"
 
 
-def test_a_second_export_to_the_same_place_waits_its_turn(
+def test_concurrent_export_to_the_same_folder_is_rejected(
     run: Run, tmp_path: Path, frames: list[FrameResult]
 ) -> None:
     def measured() -> Iterator[tuple[int, float | None, Measurement]]:
@@ -444,7 +442,7 @@ def test_a_second_export_to_the_same_place_waits_its_turn(
     assert verify_export(tmp_path / "out") == []
 
 
-# --- what fails on the way ----------------------------------------------------------------------
+# --- failures -----------------------------------------------------------------------------------
 
 
 class Stopped(BaseException):
@@ -457,16 +455,16 @@ FAILURES = [OSError(28, "No space left on device"), KeyboardInterrupt(), Stopped
 @pytest.mark.parametrize("failure", FAILURES, ids=lambda failure: type(failure).__name__)
 @pytest.mark.parametrize("earlier", [True, False], ids=["earlier", "none"])
 @pytest.mark.parametrize("name", ["write_bytes", "rename", "fsync", "progress", "open"])
-def test_a_failure_leaves_nothing_and_the_earlier_export(
+def test_failure_leaves_only_the_earlier_export(
     run: Run, tmp_path: Path, failure: BaseException, earlier: bool, name: str
 ) -> None:
-    """Whichever of the calls of one kind it is that fails."""
+    """Each call of one kind fails in turn."""
     out = tmp_path / "out"
     if earlier:
         run(out, ExportChoice())
     before = contents(out) if earlier else None
-    place = os if name == "fsync" else Path
-    real = print if name == "progress" else getattr(place, name)
+    owner = os if name == "fsync" else Path
+    real = print if name == "progress" else getattr(owner, name)
     finished = False
     for at in range(0, 200, 1 if name == "rename" else 7):
         calls = iter(range(10_000))
@@ -482,7 +480,7 @@ def test_a_failure_leaves_nothing_and_the_earlier_export(
             if name == "progress":
                 run(out, choice, progress=fail)
             else:
-                with mock.patch.object(place, name, fail):
+                with mock.patch.object(owner, name, fail):
                     run(out, choice)
         except expected:
             assert not earlier or contents(out) == before
@@ -496,14 +494,17 @@ def test_a_failure_leaves_nothing_and_the_earlier_export(
     assert "results.h5" in contents(out)
 
 
-def test_what_a_killed_export_left_is_cleared_away(run: Run, tmp_path: Path) -> None:
+def test_remains_of_a_killed_export_are_removed(run: Run, tmp_path: Path) -> None:
     out = tmp_path / "out"
     run(out, ExportChoice())
     before = contents(out)
-    for made in (tmp_path / ".out.0123456789abcdef.part", tmp_path / ".out.fedcba9876543210.part"):
-        made.mkdir()
-        (made / "measures.csv").write_text("half")
-    # Ended between the two steps of putting it in place.
+    for partial in (
+        tmp_path / ".out.0123456789abcdef.part",
+        tmp_path / ".out.fedcba9876543210.part",
+    ):
+        partial.mkdir()
+        (partial / "measures.csv").write_text("half")
+    # The export was killed between the two renames that replace the folder.
     out.rename(tmp_path / ".out.0123456789abcdef.old")
     with pytest.raises(Stopped):
         run(out, progress=mock.Mock(side_effect=Stopped))
@@ -538,26 +539,26 @@ FULL_DISK = """
 
 
 @pytest.mark.parametrize("kind", ["hdf5", "tables"])
-def test_a_full_disk_leaves_the_earlier_export(tmp_path: Path, kind: str) -> None:
-    """The real thing: the system takes no more."""
-    done = subprocess.run(
+def test_full_disk_leaves_the_earlier_export(tmp_path: Path, kind: str) -> None:
+    """The limit is set in the operating system."""
+    process = subprocess.run(
         [sys.executable, "-c", textwrap.dedent(FULL_DISK), str(tmp_path / "out"), kind],
         capture_output=True,
         text=True,
         check=False,
         env={"PYTHONPATH": ":".join(sys.path)},
     )
-    assert (done.returncode, done.stderr) == (0, "")
-    told, state = done.stdout.splitlines()
-    assert "export: File too large" in told
-    assert "expected a writable folder with enough disk space" in told
+    assert (process.returncode, process.stderr) == (0, "")
+    message, state = process.stdout.splitlines()
+    assert "export: File too large" in message
+    assert "expected a writable folder with enough disk space" in message
     assert state == "[] ['out']"
 
 
 # --- verify -------------------------------------------------------------------------------------
 
 
-def test_verify_says_what_differs(run: Run, tmp_path: Path) -> None:
+def test_verify_lists_differences(run: Run, tmp_path: Path) -> None:
     out = tmp_path / "out"
     run(out)
     mine(out)
@@ -591,13 +592,13 @@ def test_verify_says_what_differs(run: Run, tmp_path: Path) -> None:
         '{"program": "labapp", "files": [{"name": "a", "size": null, "sha256": ""}]}',
     ],
 )
-def test_a_manifest_that_is_none_is_told(tmp_path: Path, text: str) -> None:
+def test_invalid_manifest_is_reported(tmp_path: Path, text: str) -> None:
     (tmp_path / "manifest.json").write_text(text)
     with pytest.raises(InputError, match=r"manifest\.json: is not one of labapp"):
         verify_export(tmp_path)
 
 
-def test_a_folder_without_a_manifest_is_told(tmp_path: Path) -> None:
+def test_missing_manifest_is_reported(tmp_path: Path) -> None:
     for folder in (tmp_path, tmp_path / "nowhere"):
         with pytest.raises(InputError, match=r"manifest\.json: does not exist"):
             verify_export(folder)

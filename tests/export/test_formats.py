@@ -1,4 +1,4 @@
-"""The formats of an export: one that is added to the registry is written and offered everywhere."""
+"""The formats of an export: a format added to the registry is written and offered everywhere."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ SAMPLE = ROOT / "sample_sessions/gtaw/gtaw.labsession"
 
 
 def xyz(nodes: FloatArray) -> bytes:
-    """A list of points, as many programs for clouds of points read it."""
+    """A list of points in the usual form of point clouds."""
     return "".join(f"{x:.6f} {y:.6f} {z:.6f}\n" for x, y, z in nodes).encode()
 
 
@@ -44,7 +44,7 @@ def off(mesh: Mesh) -> bytes:
 
 
 class Frames:
-    """Writes the frames' numbers and statuses as JSON."""
+    """Writes numbers and statuses of the frames as JSON."""
 
     def __init__(self, path: Path, about: dict[str, object], spacing_mm: float) -> None:
         self.path, self.about, self.frames = path, about, {}
@@ -61,18 +61,18 @@ class Frames:
 
 @pytest.fixture(autouse=True)
 def toys(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Three formats more: points, triangles, and a file of all frames."""
+    """Add three formats: points, triangles, and one file of all frames."""
     module = ModuleType("labapp.export.toys")
     module.__dict__.update(xyz=xyz, off=off, Frames=Frames)
     monkeypatch.setitem(sys.modules, "labapp.export.toys", module)
-    for name, of in (("xyz", "nodes"), ("off", "mesh")):
-        toy = SurfaceFormat(f".{name}", name.upper(), "A toy, mm", of, f"toys:{name}")
+    for name, content in (("xyz", "nodes"), ("off", "mesh")):
+        toy = SurfaceFormat(f".{name}", name.upper(), "A toy, mm", content, f"toys:{name}")
         monkeypatch.setitem(SURFACE_FORMATS, name, toy)
-    whole = RunFormat("frames.json", "JSON", "A toy", "toys:Frames")
-    monkeypatch.setitem(RUN_FORMATS, "json", whole)
+    json_format = RunFormat("frames.json", "JSON", "A toy", "toys:Frames")
+    monkeypatch.setitem(RUN_FORMATS, "json", json_format)
 
 
-def test_they_are_written_as_the_others_are(
+def test_added_formats_are_exported(
     measured: Measurement, unmeasured: Measurement, calibration: ImageCalibration, tmp_path: Path
 ) -> None:
     choice = ExportChoice(
@@ -95,30 +95,30 @@ def test_they_are_written_as_the_others_are(
         "by": "labapp",
         "frames": {"3": ["ok", True], "4": ["ambiguous-rows", False]},
     }
-    with pytest.raises(InputError) as refused:
+    with pytest.raises(InputError) as caught:
         ExportChoice(surfaces=frozenset({"no-format"}))
-    assert refused.value.expected == f"some of {', '.join(SURFACE_FORMATS)}"
-    with pytest.raises(InputError) as refused:
+    assert caught.value.expected == f"some of {', '.join(SURFACE_FORMATS)}"
+    with pytest.raises(InputError) as caught:
         ExportChoice(surfaces=frozenset({"xyz"}), solid=True)
-    assert refused.value.expected.startswith(f"one of {', '.join(mesh_formats())}")
-    with pytest.raises(InputError) as refused:
+    assert caught.value.expected.startswith(f"one of {', '.join(mesh_formats())}")
+    with pytest.raises(InputError) as caught:
         ExportChoice(together=frozenset({"no-format"}))
-    assert refused.value.expected == f"some of {', '.join(RUN_FORMATS)}"
+    assert caught.value.expected == f"some of {', '.join(RUN_FORMATS)}"
 
 
-def test_the_command_line_offers_and_writes_them(
+def test_command_line_offers_and_writes_added_formats(
     labapp: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "250")
-    code, told, _ = labapp("session", "export", "--help")
+    code, stdout, _ = labapp("session", "export", "--help")
     assert code == 0
-    assert f"Some of {', '.join(SURFACE_FORMATS)}, or none" in told
-    assert f"some of {', '.join(RUN_FORMATS)}, or none" in told
-    code, _, complained = labapp(
+    assert f"Some of {', '.join(SURFACE_FORMATS)}, or none" in stdout
+    assert f"some of {', '.join(RUN_FORMATS)}, or none" in stdout
+    code, _, stderr = labapp(
         *("session", "export", SAMPLE, "--out", tmp_path / "out", "--frames", "4"),
         *("--no-tables", "--surfaces", "xyz", "--together", "json"),
     )
-    assert (code, complained) == (0, "")
+    assert (code, stderr) == (0, "")
     assert sorted(path.name for path in (tmp_path / "out").iterdir()) == [
         *("frames.json", "manifest.json", "surface_000004.xyz")
     ]
@@ -134,7 +134,7 @@ ASC = labapp.SurfaceFormat(".asc", "ASC", "x; y; z, mm", "nodes", asc)
 """
 
 
-def test_a_package_adds_formats_by_an_entry_point(tmp_path: Path) -> None:
+def test_package_adds_formats_by_an_entry_point(tmp_path: Path) -> None:
     site = tmp_path / "site"
     about = site / "toy_format-1.dist-info"
     about.mkdir(parents=True)
@@ -144,7 +144,7 @@ def test_a_package_adds_formats_by_an_entry_point(tmp_path: Path) -> None:
         "[labapp.exports]\nasc = toy_format:ASC\nbroken = toy_format:NOTHING\n"
     )
     out = tmp_path / "out"
-    ended = subprocess.run(
+    process = subprocess.run(
         [
             *(sys.executable, "-m", "labapp", "session", "export", SAMPLE, "--out", out),
             *("--frames", "4", "--no-tables", "--surfaces", "asc,csv"),
@@ -154,15 +154,15 @@ def test_a_package_adds_formats_by_an_entry_point(tmp_path: Path) -> None:
         text=True,
         check=False,
     )
-    assert ended.returncode == 0, ended.stderr
-    assert "broken" in ended.stderr
-    assert "Traceback" not in ended.stderr
+    assert process.returncode == 0, process.stderr
+    assert "broken" in process.stderr
+    assert "Traceback" not in process.stderr
     points = np.loadtxt(out / "surface_000004.asc", delimiter=";")
     table = np.loadtxt(out / "surface_000004.csv", delimiter=",", skiprows=1)
     np.testing.assert_array_equal(points, table)
 
 
-def test_a_script_adds_a_format_under_a_name_and_an_end_of_its_own() -> None:
+def test_added_format_needs_a_new_name_and_suffix() -> None:
     toy = SurfaceFormat(".toy", "Toy", "A toy, mm", "nodes", xyz)
     add_export_format("toy", toy)
     try:
@@ -176,40 +176,40 @@ def test_a_script_adds_a_format_under_a_name_and_an_end_of_its_own() -> None:
             ("new", RunFormat("results.h5", "Toy", "", Frames), "file"),
             ("new", xyz, "type"),
         ):
-            with pytest.raises(InputError) as refused:
+            with pytest.raises(InputError) as caught:
                 add_export_format(name, added)
-            assert refused.value.field == field
+            assert caught.value.field == field
         assert "new" not in SURFACE_FORMATS
     finally:
         del SURFACE_FORMATS["toy"]
 
 
-def test_a_writer_that_returns_no_bytes_is_named() -> None:
+def test_writer_that_returns_no_bytes_is_named() -> None:
     text = SurfaceFormat(".toy", "Toy", "A toy, mm", "nodes", lambda nodes: str(len(nodes)))
-    with pytest.raises(InputError) as refused:
+    with pytest.raises(InputError) as caught:
         text.content(np.zeros((2, 3)))
-    assert (refused.value.source, refused.value.value) == ("export format Toy", "str")
+    assert (caught.value.source, caught.value.value) == ("export format Toy", "str")
 
 
-def test_hdf5_is_one_of_the_formats_of_a_whole_run() -> None:
-    short = ExportChoice(hdf5=True, together=frozenset({"json"}))
-    assert [each.file for each in short.run_formats] == ["results.h5", "frames.json"]
-    assert [each.file for each in ExportChoice(together=frozenset({"hdf5"})).run_formats] == [
-        "results.h5"
-    ]
+def test_hdf5_is_a_format_of_a_whole_run() -> None:
+    combined = ExportChoice(hdf5=True, together=frozenset({"json"}))
+    assert [run_format.file for run_format in combined.run_formats] == ["results.h5", "frames.json"]
+    assert [
+        run_format.file for run_format in ExportChoice(together=frozenset({"hdf5"})).run_formats
+    ] == ["results.h5"]
     assert ExportChoice().run_formats == []
 
 
 @pytest.mark.parametrize("name", [*SURFACE_FORMATS, *RUN_FORMATS])
-def test_every_format_has_a_writer_and_a_place_in_the_documents(name: str) -> None:
-    each = (SURFACE_FORMATS | RUN_FORMATS)[name]
-    assert isinstance(each.writer, str)
-    module, _, function = each.writer.partition(":")
-    made = getattr(__import__(f"labapp.export.{module}", fromlist=[function]), function)
-    if isinstance(each, SurfaceFormat):
-        assert list(inspect.signature(made).parameters) == [each.of]
-        assert (name in mesh_formats()) == (each.of == "mesh")
+def test_every_format_has_a_writer_and_documentation(name: str) -> None:
+    export_format = (SURFACE_FORMATS | RUN_FORMATS)[name]
+    assert isinstance(export_format.writer, str)
+    module, _, function = export_format.writer.partition(":")
+    writer = getattr(__import__(f"labapp.export.{module}", fromlist=[function]), function)
+    if isinstance(export_format, SurfaceFormat):
+        assert list(inspect.signature(writer).parameters) == [export_format.of]
+        assert (name in mesh_formats()) == (export_format.of == "mesh")
     options = (ROOT / "docs/command-line.md").read_text("utf-8").partition("### export")[2]
     assert name in options
-    end = each.end if isinstance(each, SurfaceFormat) else each.file
+    end = export_format.end if isinstance(export_format, SurfaceFormat) else export_format.file
     assert end in (ROOT / "docs/results.md").read_text("utf-8")

@@ -32,9 +32,9 @@ def written(
 ) -> Path:
     path = tmp_path / "results.h5"
     with Hdf5Writer(path, ABOUT, 0.5) as file:
-        for frame, time_s, each in [(12, 1 / 3, measured), (13, None, unmeasured)]:
-            tables = frame_tables(FrameResult(frame, time_s, each), calibration)
-            file.write(frame, tables, each.reconstruction)
+        for frame, time_s, measurement in [(12, 1 / 3, measured), (13, None, unmeasured)]:
+            tables = frame_tables(FrameResult(frame, time_s, measurement), calibration)
+            file.write(frame, tables, measurement.reconstruction)
     return path
 
 
@@ -51,7 +51,7 @@ def test_measures_are_exact_columns_over_the_frames(written: Path, measured: Mea
         assert list(measures["reason"].asstr()) == ["", 'two references fit, "a" and "b"']
 
 
-def test_a_frames_tables_are_exact(
+def test_tables_of_a_frame_are_exact(
     written: Path, measured: Measurement, calibration: ImageCalibration
 ) -> None:
     with h5py.File(written) as file:
@@ -67,17 +67,20 @@ def test_a_frames_tables_are_exact(
     np.testing.assert_array_equal(dots["ray_column"], [11, np.nan, 9])
     np.testing.assert_array_equal(dots["blocked"], [0, np.nan, 1])
     assert dots["source"].tolist() == [b"auto"] * 3
-    found = measured.reconstruction
-    np.testing.assert_array_equal(points["ray_row"], found.ray[:, 0])
-    np.testing.assert_array_equal(points["sigma_mm"], found.sigma_mm)
-    for table, places in ((points, found.points_mm), (boundary, found.boundary.points_mm)):
+    reconstruction = measured.reconstruction
+    np.testing.assert_array_equal(points["ray_row"], reconstruction.ray[:, 0])
+    np.testing.assert_array_equal(points["sigma_mm"], reconstruction.sigma_mm)
+    for table, places in (
+        (points, reconstruction.points_mm),
+        (boundary, reconstruction.boundary.points_mm),
+    ):
         np.testing.assert_array_equal(
             np.column_stack([table[f"{axis}_mm"] for axis in "xyz"]), places
         )
-    np.testing.assert_array_equal(boundary["theta_deg"], found.boundary.theta_deg)
+    np.testing.assert_array_equal(boundary["theta_deg"], reconstruction.boundary.theta_deg)
 
 
-def test_the_surface_is_a_grid_with_nan_outside(written: Path, measured: Measurement) -> None:
+def test_surface_is_a_grid_with_nan_outside(written: Path, measured: Measurement) -> None:
     with h5py.File(written) as file:
         surface = file["frames/000012/surface"]
         x, y, z = (surface[f"{axis}_mm"][()] for axis in "xyz")
@@ -86,21 +89,21 @@ def test_the_surface_is_a_grid_with_nan_outside(written: Path, measured: Measure
         assert axis[0] <= -2.5
         assert axis[-1] >= 2.5
     assert z.shape == (len(y), len(x))
-    found = measured.reconstruction
+    reconstruction = measured.reconstruction
     x, y = np.meshgrid(x, y)
-    inside = found.boundary.contains(x, y)
+    inside = reconstruction.boundary.contains(x, y)
     assert inside.sum() > 90
-    np.testing.assert_array_equal(z, np.where(inside, found.surface.height(x, y), np.nan))
+    np.testing.assert_array_equal(z, np.where(inside, reconstruction.surface.height(x, y), np.nan))
 
 
-def test_what_a_frame_has_not_is_not_there(written: Path) -> None:
+def test_missing_tables_of_a_frame_are_omitted(written: Path) -> None:
     with h5py.File(written) as file:
         assert set(file["frames"]) == {"000012", "000013"}
         assert set(file["frames/000013"]) == {"dots"}
 
 
-def test_every_dataset_says_its_unit_and_what_it_is(written: Path) -> None:
-    seen = []
+def test_every_dataset_has_units_and_descriptions(written: Path) -> None:
+    names = []
 
     def check(name: str, item: object) -> None:
         if not isinstance(item, h5py.Dataset):
@@ -111,26 +114,26 @@ def test_every_dataset_says_its_unit_and_what_it_is(written: Path) -> None:
         )
         assert len(units) == len(about) == len(columns)
         for column, unit, text in zip(columns, units, about, strict=True):
-            named = column.rpartition("_")[2].encode()
-            assert unit == (named if named in b"mm mm2 mm3 px deg s".split() else b"1"), column
+            suffix = column.rpartition("_")[2].encode()
+            assert unit == (suffix if suffix in b"mm mm2 mm3 px deg s".split() else b"1"), column
             assert len(text) > 2
-        seen.append(name)
+        names.append(name)
 
     with h5py.File(written) as file:
         file.visititems(check)
         x_prime = file["frames/000012/dots"].attrs["description"][2]
     assert x_prime == "place on the imaging plane, X′".encode()
-    assert len(seen) == len(TABLES["measures"]) + 4 + 3
+    assert len(names) == len(TABLES["measures"]) + 4 + 3
 
 
-def test_the_root_tells_where_it_comes_from(written: Path) -> None:
+def test_root_contains_the_provenance(written: Path) -> None:
     with h5py.File(written) as file:
         assert file.attrs["program"] == "labapp"
         assert file.attrs["setup"] == ABOUT["setup"]
         assert json.loads(file.attrs["settings"]) == ABOUT["settings"]
 
 
-def test_the_same_results_give_the_same_bytes(
+def test_equal_results_give_equal_files(
     written: Path, tmp_path: Path, measured: Measurement, calibration: ImageCalibration
 ) -> None:
     contents = []
@@ -142,7 +145,7 @@ def test_the_same_results_give_the_same_bytes(
     assert contents[0] == contents[1]
 
 
-def test_a_run_without_frames_has_columns_of_no_length(tmp_path: Path) -> None:
+def test_run_without_frames_has_empty_columns(tmp_path: Path) -> None:
     with Hdf5Writer(tmp_path / "a.h5", {}, 0.5):
         pass
     with h5py.File(tmp_path / "a.h5") as file:
@@ -150,42 +153,42 @@ def test_a_run_without_frames_has_columns_of_no_length(tmp_path: Path) -> None:
         assert not len(file["frames"])
 
 
-def test_text_that_is_no_text_does_not_stop_it(
+def test_invalid_unicode_is_escaped(
     tmp_path: Path, unmeasured: Measurement, calibration: ImageCalibration
 ) -> None:
     odd = b"caf\xe9.avi and\0 more".decode("utf-8", "surrogateescape")
     with Hdf5Writer(tmp_path / "a.h5", {"source": {"path": odd}, "name": odd}, 0.5) as file:
-        each = replace(unmeasured, reason=odd)
-        file.write(0, frame_tables(FrameResult(0, None, each), calibration), None)
+        measurement = replace(unmeasured, reason=odd)
+        file.write(0, frame_tables(FrameResult(0, None, measurement), calibration), None)
     with h5py.File(tmp_path / "a.h5") as file:
         for text in (file["measures/reason"].asstr()[0], file.attrs["name"]):
             assert text == r"caf\udce9.avi and\0 more"
         assert json.loads(file.attrs["source"]) == {"path": odd}
 
 
-class Pulled(io.FileIO):
-    """A disk that takes so many bytes, and then Ctrl-C or an error."""
+class FailingFile(io.FileIO):
+    """A file that accepts a number of bytes, and then raises Ctrl-C or an error."""
 
     room = 20_000
     failure: BaseException = KeyboardInterrupt()
 
     def write(self, content: memoryview) -> int:
-        Pulled.room -= len(content)
-        if Pulled.room < 0:
-            raise Pulled.failure
+        FailingFile.room -= len(content)
+        if FailingFile.room < 0:
+            raise FailingFile.failure
         return super().write(content)
 
 
 @pytest.mark.parametrize("failure", [KeyboardInterrupt(), OSError(28, "full")], ids=["^C", "full"])
 @pytest.mark.parametrize("room", [0, 100, 5_000, 20_000])
-def test_an_error_while_hdf5_writes_comes_out_once_it_has_closed(
+def test_error_while_writing_is_raised_after_closing(
     tmp_path: Path,
     measured: Measurement,
     calibration: ImageCalibration,
     room: int,
     failure: BaseException,
 ) -> None:
-    Pulled.room, Pulled.failure = room, failure
+    FailingFile.room, FailingFile.failure = room, failure
     path = tmp_path / "a.h5"
     tables = frame_tables(FrameResult(0, 0.0, measured), calibration)
 
@@ -194,8 +197,8 @@ def test_an_error_while_hdf5_writes_comes_out_once_it_has_closed(
             for frame in range(20):
                 file.write(frame, tables, measured.reconstruction)
 
-    opened = mock.patch.object(Path, "open", lambda self, *_, **__: Pulled(self, "w+"))
-    with opened, pytest.raises(type(failure)) as raised:
+    patched_open = mock.patch.object(Path, "open", lambda self, *_, **__: FailingFile(self, "w+"))
+    with patched_open, pytest.raises(type(failure)) as raised:
         write_many()
     assert raised.value is failure
 
@@ -224,16 +227,16 @@ FULL_DISK = """
 """
 
 
-def test_a_full_disk_is_an_error_and_not_the_end_of_the_process(tmp_path: Path) -> None:
-    """HDF5 left to itself ends the process with a fault here."""
-    done = subprocess.run(
+def test_full_disk_raises_an_error(tmp_path: Path) -> None:
+    """HDF5 by itself would crash the process."""
+    process = subprocess.run(
         [sys.executable, "-c", textwrap.dedent(FULL_DISK), str(tmp_path / "a.h5")],
         capture_output=True,
         text=True,
         check=False,
         env={"PYTHONPATH": ":".join(sys.path)},
     )
-    assert (done.returncode, done.stderr) == (0, "")
-    frame, message = done.stdout.split(maxsplit=1)
+    assert (process.returncode, process.stderr) == (0, "")
+    frame, message = process.stdout.split(maxsplit=1)
     assert message == "File too large\n"
     assert 2 < int(frame) < 20

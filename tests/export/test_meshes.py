@@ -23,8 +23,10 @@ RADIUS_MM, HEIGHT_MM = 3.5, 0.4
 CENTER_MM = (5.0, -6.0)
 
 
-def of(surface: Surface, center: tuple[float, float] = CENTER_MM, rim_mm: float = 0) -> object:
-    """A reconstruction of a round pool, its boundary at ``rim_mm`` times X."""
+def reconstruction(
+    surface: Surface, center: tuple[float, float] = CENTER_MM, rim_mm: float = 0
+) -> object:
+    """Reconstruction of a round pool, with its boundary at the height ``rim_mm`` times X."""
     boundary = Boundary.polar(np.array(center), np.full(360, RADIUS_MM))
     return Reconstruction(
         scheme="fit",
@@ -46,7 +48,7 @@ DENTED = egg(7.0, 3.5, 3.5, 0.2, CENTER_MM, terms=(Dent(0.6, 0.8),))
 
 @dataclass
 class PartlyKnown:
-    """A pool whose height is not known in places."""
+    """A pool whose height is unknown in some places."""
 
     pool: Pool
     unknown: Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -60,7 +62,7 @@ class PartlyKnown:
 
 @dataclass
 class Tilted:
-    """A cap on a slope."""
+    """A cap on an inclined plane."""
 
     pool: Pool
     slope: float
@@ -72,7 +74,7 @@ class Tilted:
         return self.pool.gradient(x, y) + np.array([self.slope, 0.0])
 
 
-def body(mesh: Mesh) -> trimesh.Trimesh:
+def as_trimesh(mesh: Mesh) -> trimesh.Trimesh:
     return trimesh.Trimesh(mesh.vertices_mm, mesh.triangles, process=False)
 
 
@@ -80,21 +82,21 @@ def cap_volume(height_mm: float) -> float:
     return np.pi * height_mm * (3 * RADIUS_MM**2 + height_mm**2) / 6
 
 
-def test_the_solid_of_a_cap_has_its_volume() -> None:
-    solid = body(meshes.solid_mesh(of(cap(HEIGHT_MM)), 0.1))
+def test_solid_of_a_cap_has_the_correct_volume() -> None:
+    solid = as_trimesh(meshes.solid_mesh(reconstruction(cap(HEIGHT_MM)), 0.1))
     assert solid.is_watertight
     assert solid.is_winding_consistent
     assert solid.volume == pytest.approx(cap_volume(HEIGHT_MM), rel=0.002)
-    # Half the normals point up, those of the flat bottom straight down; none lies in between.
+    # The normals of the top point up, those of the flat bottom straight down; there are no others.
     up = solid.face_normals[:, 2] > 0
     assert solid.vertices[:, 2].min() == pytest.approx(0, abs=1e-12)
     np.testing.assert_allclose(solid.face_normals[~up], [[0, 0, -1]] * 360, atol=1e-9)
     assert len(solid.faces) - 360 == up.sum()
 
 
-def test_the_boundary_need_not_be_level() -> None:
-    tilted = of(Tilted(cap(HEIGHT_MM), 0.05), rim_mm=0.05)
-    solid = body(meshes.solid_mesh(tilted, 0.1))
+def test_boundary_need_not_be_horizontal() -> None:
+    tilted = reconstruction(Tilted(cap(HEIGHT_MM), 0.05), rim_mm=0.05)
+    solid = as_trimesh(meshes.solid_mesh(tilted, 0.1))
     assert solid.is_watertight
     assert solid.volume == pytest.approx(cap_volume(HEIGHT_MM), rel=0.002)
 
@@ -104,11 +106,11 @@ def test_the_boundary_need_not_be_level() -> None:
     [(cap(-HEIGHT_MM), -HEIGHT_MM, -cap_volume(HEIGHT_MM)), (DENTED, DENTED.size.depth_mm, None)],
     ids=["concave", "dented"],
 )
-def test_any_other_pool_is_the_top_of_a_block(
+def test_concave_or_dented_pool_is_the_top_of_a_block(
     pool: Pool, lowest: float, volume: float | None
 ) -> None:
     assert lowest < -0.05
-    solid = body(meshes.solid_mesh(of(pool), 0.1))
+    solid = as_trimesh(meshes.solid_mesh(reconstruction(pool), 0.1))
     assert solid.is_watertight
     assert solid.is_winding_consistent
     bottom = lowest - meshes.BLOCK_MM
@@ -124,8 +126,8 @@ def test_any_other_pool_is_the_top_of_a_block(
         assert solid.volume == pytest.approx(block + volume, rel=0.002)
 
 
-def test_the_open_surface_ends_at_the_boundary_with_its_normals_up() -> None:
-    surface = body(meshes.open_mesh(of(cap(-HEIGHT_MM)), 0.1))
+def test_open_surface_ends_at_the_boundary_with_normals_up() -> None:
+    surface = as_trimesh(meshes.open_mesh(reconstruction(cap(-HEIGHT_MM)), 0.1))
     assert not surface.is_watertight
     assert surface.is_winding_consistent
     assert (surface.face_normals[:, 2] > 0.5).all()
@@ -147,31 +149,34 @@ SLICE_MM2 = RADIUS_MM**2 * np.arccos(EDGE_MM / RADIUS_MM) - EDGE_MM * np.sqrt(
     ],
     ids=["middle", "edge"],
 )
-def test_what_is_not_known_is_left_out_of_the_surface_and_closed_in_the_solid(
+def test_unknown_parts_are_open_in_the_surface_and_closed_in_the_solid(
     unknown: Callable[[np.ndarray, np.ndarray], np.ndarray], area_mm2: float
 ) -> None:
     pool = spherical_cap(2 * RADIUS_MM, HEIGHT_MM)
-    partly = of(PartlyKnown(pool, unknown), center=(0.0, 0.0))
-    surface, solid = body(meshes.open_mesh(partly, 0.05)), body(meshes.solid_mesh(partly, 0.05))
+    partly = reconstruction(PartlyKnown(pool, unknown), center=(0.0, 0.0))
+    surface, solid = (
+        as_trimesh(meshes.open_mesh(partly, 0.05)),
+        as_trimesh(meshes.solid_mesh(partly, 0.05)),
+    )
     assert np.isfinite(surface.vertices).all()
     assert len(np.unique(surface.faces)) == len(surface.vertices)
-    seen_mm2 = np.sum(surface.area_faces * surface.face_normals[:, 2])
-    assert seen_mm2 == pytest.approx(area_mm2, rel=0.01)
+    projected_mm2 = np.sum(surface.area_faces * surface.face_normals[:, 2])
+    assert projected_mm2 == pytest.approx(area_mm2, rel=0.01)
     assert solid.is_watertight
     assert solid.is_winding_consistent
     assert solid.volume == pytest.approx(cap_volume(HEIGHT_MM), rel=0.01)
 
 
 MESHES = {
-    "surface": meshes.open_mesh(of(cap(HEIGHT_MM)), 0.2),
-    "solid": meshes.solid_mesh(of(cap(-HEIGHT_MM)), 0.2),
+    "surface": meshes.open_mesh(reconstruction(cap(HEIGHT_MM)), 0.2),
+    "solid": meshes.solid_mesh(reconstruction(cap(-HEIGHT_MM)), 0.2),
 }
-both = pytest.mark.parametrize("mesh", MESHES.values(), ids=MESHES)
+both_meshes = pytest.mark.parametrize("mesh", MESHES.values(), ids=MESHES)
 
 
-@both
+@both_meshes
 @pytest.mark.parametrize("write", [meshes.stl, meshes.stl_ascii])
-def test_stl_is_read_back_by_other_programs(
+def test_stl_can_be_read_by_other_programs(
     mesh: Mesh, write: Callable[[Mesh], bytes], tmp_path: Path
 ) -> None:
     content = write(mesh)
@@ -186,26 +191,24 @@ def test_stl_is_read_back_by_other_programs(
 
 @pytest.mark.parametrize("write", [meshes.stl, meshes.stl_ascii])
 @pytest.mark.parametrize("height_mm", [HEIGHT_MM, -HEIGHT_MM])
-def test_a_solid_stays_watertight_in_32_bit(
-    write: Callable[[Mesh], bytes], height_mm: float
-) -> None:
-    solid = meshes.solid_mesh(of(cap(height_mm)), meshes.SMALLEST_SPACING_MM)
+def test_solid_stays_watertight_in_32_bit(write: Callable[[Mesh], bytes], height_mm: float) -> None:
+    solid = meshes.solid_mesh(reconstruction(cap(height_mm)), meshes.SMALLEST_SPACING_MM)
     read = trimesh.load_mesh(io.BytesIO(write(solid)), file_type="stl")
     assert read.is_watertight
     assert read.is_winding_consistent
-    assert read.volume == pytest.approx(body(solid).volume, rel=1e-5)
+    assert read.volume == pytest.approx(as_trimesh(solid).volume, rel=1e-5)
 
 
-def test_normals_in_an_stl_are_those_of_its_triangles() -> None:
+def test_normals_of_stl_agree_with_its_triangles() -> None:
     mesh = MESHES["solid"]
     numbers = re.findall(rb"facet normal (\S+) (\S+) (\S+)", meshes.stl_ascii(mesh))
-    np.testing.assert_allclose(np.array(numbers, float), body(mesh).face_normals, atol=1e-6)
+    np.testing.assert_allclose(np.array(numbers, float), as_trimesh(mesh).face_normals, atol=1e-6)
     content = np.frombuffer(meshes.stl(mesh)[84:], meshes.STL_TRIANGLE)
     np.testing.assert_array_equal(content["normal"], np.array(numbers, np.float32))
 
 
-@both
-def test_ply_is_read_back_by_other_programs(mesh: Mesh, tmp_path: Path) -> None:
+@both_meshes
+def test_ply_can_be_read_by_other_programs(mesh: Mesh, tmp_path: Path) -> None:
     content = meshes.ply(mesh)
     read = trimesh.load_mesh(io.BytesIO(content), file_type="ply", process=False)
     np.testing.assert_array_equal(read.vertices, mesh.vertices_mm)
@@ -217,8 +220,8 @@ def test_ply_is_read_back_by_other_programs(mesh: Mesh, tmp_path: Path) -> None:
     np.testing.assert_array_equal(other.point_data["height_mm"], mesh.vertices_mm[:, 2])
 
 
-@both
-def test_vtp_is_read_back_by_vtk(mesh: Mesh) -> None:
+@both_meshes
+def test_vtp_can_be_read_by_vtk(mesh: Mesh) -> None:
     vtk = pytest.importorskip("vtkmodules.vtkIOXML")
     support = pytest.importorskip("vtkmodules.util.numpy_support")
     reader = vtk.vtkXMLPolyDataReader()
@@ -237,7 +240,7 @@ def test_vtp_is_read_back_by_vtk(mesh: Mesh) -> None:
 
 
 @pytest.mark.parametrize("name", mesh_formats())
-def test_the_same_mesh_gives_the_same_bytes(name: str) -> None:
+def test_equal_meshes_give_equal_files(name: str) -> None:
     write = SURFACE_FORMATS[name].content
-    again = meshes.open_mesh(of(cap(HEIGHT_MM)), 0.2)
-    assert write(again) == write(MESHES["surface"])
+    mesh = meshes.open_mesh(reconstruction(cap(HEIGHT_MM)), 0.2)
+    assert write(mesh) == write(MESHES["surface"])

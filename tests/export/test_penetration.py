@@ -1,4 +1,4 @@
-"""Tables of features, files of models, predictions while frames come, ONNX."""
+"""Tables of features, model files, predictions frame by frame, ONNX."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def model(request: pytest.FixtureRequest) -> PenetrationModel:
 # --- tables -------------------------------------------------------------------------------------
 
 
-def test_a_table_comes_back_as_it_was(tmp_path: Path) -> None:
+def test_table_is_read_as_written(tmp_path: Path) -> None:
     written = FeatureTable(FEATURES, TARGET, WELDS)
     written.write(tmp_path / "features.csv")
     read = FeatureTable.read(tmp_path / "features.csv")
@@ -57,14 +57,14 @@ def test_a_table_comes_back_as_it_was(tmp_path: Path) -> None:
     for one, other in zip(read.welds, WELDS, strict=True):
         assert one.name == other.name
         for name in ("time_s", "value", "noise", "level", "target", "target_sigma"):
-            there = getattr(other, name)
-            np.testing.assert_allclose(getattr(one, name), there, rtol=1e-6, equal_nan=True)
+            expected = getattr(other, name)
+            np.testing.assert_allclose(getattr(one, name), expected, rtol=1e-6, equal_nan=True)
 
 
-def test_matlab_reads_the_table(tmp_path: Path) -> None:
+def test_table_can_be_read_as_a_matlab_file(tmp_path: Path) -> None:
     FeatureTable(FEATURES, TARGET, WELDS).write(tmp_path / "features.mat")
     read = loadmat(tmp_path / "features.mat")["features"][0, 0]
-    count = sum(len(one.time_s) for one in WELDS)
+    count = sum(len(weld.time_s) for weld in WELDS)
     assert read["convexity_sigma_noise_mm"].shape == (count, 1)
     assert read["width_mm"][:, 0] == pytest.approx(np.concatenate([w.value[:, 0] for w in WELDS]))
     assert [str(cell[0]) for cell in read["recording"][[0, -1], 0]] == ["weld_01", "weld_04"]
@@ -86,13 +86,13 @@ def test_matlab_reads_the_table(tmp_path: Path) -> None:
         "recording,time_s,width_mm\nweld,0,6,7\n",
     ],
 )
-def test_a_table_that_is_none_is_refused(text: str, tmp_path: Path) -> None:
+def test_invalid_table_is_rejected(text: str, tmp_path: Path) -> None:
     (tmp_path / "features.csv").write_text(text, "utf-8")
     with pytest.raises(InputError):
         FeatureTable.read(tmp_path / "features.csv")
 
 
-def test_what_cannot_be_chosen_or_fitted_is_refused(tmp_path: Path) -> None:
+def test_impossible_choice_fit_or_format_is_rejected(tmp_path: Path) -> None:
     table = FeatureTable(FEATURES, TARGET, WELDS)
     with pytest.raises(InputError):
         table.chosen(("area_mm2",))
@@ -102,7 +102,7 @@ def test_what_cannot_be_chosen_or_fitted_is_refused(tmp_path: Path) -> None:
         table.write(tmp_path / "features.xlsx")
 
 
-def test_the_set_up_is_no_part_of_the_uncertainty_of_features() -> None:
+def test_uncertainty_of_features_excludes_the_setup() -> None:
     columns = {
         name: np.array([value])
         for name, value in {
@@ -120,18 +120,18 @@ def test_the_set_up_is_no_part_of_the_uncertainty_of_features() -> None:
     assert (noise[0], level[0]) == pytest.approx((0.05, 0))
 
 
-# --- files of models ----------------------------------------------------------------------------
+# --- model files --------------------------------------------------------------------------------
 
 
-def test_a_model_from_its_file_predicts_the_same(model: PenetrationModel, tmp_path: Path) -> None:
+def test_stored_model_gives_equal_predictions(model: PenetrationModel, tmp_path: Path) -> None:
     write_model(tmp_path / "model.json", model)
     read = read_model(tmp_path / "model.json")
     assert read.settings == model.settings
     assert (read.kind, read.factor, read.rmse_mm) == (model.kind, 1.2, 0.1)
-    ours, theirs = model.predict(WELDS[3]), read.predict(WELDS[3])
-    np.testing.assert_array_equal(theirs.value, ours.value)
-    np.testing.assert_array_equal(theirs.sigma, ours.sigma)
-    np.testing.assert_array_equal(theirs.is_outside, ours.is_outside)
+    expected, predicted = model.predict(WELDS[3]), read.predict(WELDS[3])
+    np.testing.assert_array_equal(predicted.value, expected.value)
+    np.testing.assert_array_equal(predicted.sigma, expected.sigma)
+    np.testing.assert_array_equal(predicted.is_outside, expected.is_outside)
 
 
 def changed(key: str, value: Any) -> Callable[[dict[str, Any]], object]:
@@ -184,7 +184,7 @@ def changed(key: str, value: Any) -> Callable[[dict[str, Any]], object]:
         changed("static/signal", "much"),
     ],
 )
-def test_a_damaged_model_is_refused(damage: Callable[[Any], object], tmp_path: Path) -> None:
+def test_damaged_model_is_rejected(damage: Callable[[Any], object], tmp_path: Path) -> None:
     path = tmp_path / "model.json"
     write_model(path, fitted("gp"))
     content = json.loads(path.read_text("utf-8"))
@@ -197,13 +197,13 @@ def test_a_damaged_model_is_refused(damage: Callable[[Any], object], tmp_path: P
 @pytest.mark.parametrize(
     "content", [b"", b"[]", b"{}", b"null", b"[" * 100_000, b"\xff\xfe", pickle.dumps([1])]
 )
-def test_what_is_no_model_is_refused(content: bytes, tmp_path: Path) -> None:
+def test_invalid_model_file_is_rejected(content: bytes, tmp_path: Path) -> None:
     (tmp_path / "model.json").write_bytes(content)
     with pytest.raises(InputError):
         read_model(tmp_path / "model.json")
 
 
-def test_a_linear_model_with_wrong_weights_is_refused(tmp_path: Path) -> None:
+def test_linear_model_with_wrong_weights_is_rejected(tmp_path: Path) -> None:
     write_model(tmp_path / "model.json", fitted("arx"))
     content = json.loads((tmp_path / "model.json").read_text("utf-8"))
     content["static"]["weights"] = [1.0]
@@ -216,9 +216,9 @@ def test_a_linear_model_with_wrong_weights_is_refused(tmp_path: Path) -> None:
 
 
 def frames(weld: WeldSeries) -> list[FrameResult]:
-    """Frames that give the features of a weld; NaN: not measured."""
+    """Frames with the features of a weld; NaN: not measured."""
     names = [*Measures.__dataclass_fields__]
-    found = []
+    results = []
     for k, time_s in enumerate(weld.time_s.tolist()):
         width, length, convexity = weld.value[k].tolist()
         sizes: dict[str, Any] = dict.fromkeys(names, np.nan)
@@ -228,43 +228,43 @@ def frames(weld: WeldSeries) -> list[FrameResult]:
             sizes[f"{name}_sigma_level_mm"] = level
         sizes |= {"width_mm": width, "length_mm": length, "convexity_mm": convexity}
         measured = np.isfinite(width)
-        status = Measurement("ok" if measured else "no-dots", "", "fit",
+        measurement = Measurement("ok" if measured else "no-dots", "", "fit",
                              measures=Measures(**sizes) if measured else None)  # fmt: skip
-        found.append(FrameResult(k, time_s, status))
-    return found
+        results.append(FrameResult(k, time_s, measurement))
+    return results
 
 
-def test_frame_by_frame_it_predicts_the_same(model: PenetrationModel) -> None:
+def test_predictions_frame_by_frame_equal_those_of_the_weld(model: PenetrationModel) -> None:
     value = WELDS[3].value.copy()
-    value[100:130], value[300:450] = np.nan, np.nan  # one is short, one longer than is held
+    value[100:130], value[300:450] = np.nan, np.nan  # a short gap, and one that is not bridged
     weld = replace(WELDS[3], value=value)
     predictor = Predictor("bench", model)
-    seen = []
+    shown = []
     for result in frames(weld):
         predictor.add(result)
-        seen.append(predictor.values()["penetration_mm"])
-    every, found = model.predict(weld), predictor.predictions()
-    assert found is not None
-    assert np.isnan(every.value).any()
-    np.testing.assert_allclose(found.time_s, every.time_s)
-    np.testing.assert_allclose(found.value, every.value, rtol=1e-9)
-    np.testing.assert_allclose(found.sigma, every.sigma, rtol=1e-6)
-    # What is shown is the step that ended last, and nothing where nothing is known.
-    assert seen[0] is None
-    assert seen[250] == pytest.approx(every.value[int(250 / 3) - 1])
-    assert seen[440] is None
+        shown.append(predictor.values()["penetration_mm"])
+    expected, predicted = model.predict(weld), predictor.predictions()
+    assert predicted is not None
+    assert np.isnan(expected.value).any()
+    np.testing.assert_allclose(predicted.time_s, expected.time_s)
+    np.testing.assert_allclose(predicted.value, expected.value, rtol=1e-9)
+    np.testing.assert_allclose(predicted.sigma, expected.sigma, rtol=1e-6)
+    # The last complete step is shown, or nothing if there is no prediction.
+    assert shown[0] is None
+    assert shown[250] == pytest.approx(expected.value[int(250 / 3) - 1])
+    assert shown[440] is None
 
 
-def test_a_recording_without_times_is_refused() -> None:
+def test_recording_without_times_is_rejected() -> None:
     predictor = Predictor("bench", fitted("arx"))
     with pytest.raises(InputError):
         predictor.add(FrameResult(0, None, Measurement("no-dots", "", "fit")))
 
 
-def test_predictions_are_marked_as_a_model_s(model: PenetrationModel) -> None:
+def test_predictions_are_marked_with_their_model(model: PenetrationModel) -> None:
     far = replace(WELDS[3], value=WELDS[3].value + 5)
-    found = {"a": model.predict(WELDS[3]), "b": model.predict(far)}
-    head, *rows = prediction_csv("bench", model, found).splitlines()
+    predictions = {"a": model.predict(WELDS[3]), "b": model.predict(far)}
+    head, *rows = prediction_csv("bench", model, predictions).splitlines()
     assert head.split(",")[2:4] == ["model_back_width_mm", "model_back_width_sigma_mm"]
     assert all(row.endswith(",bench") for row in rows)
     assert {row.split(",")[-2] for row in rows if row.startswith("b")} == {"extrapolated"}
@@ -273,7 +273,7 @@ def test_predictions_are_marked_as_a_model_s(model: PenetrationModel) -> None:
 # --- ONNX ---------------------------------------------------------------------------------------
 
 
-def test_onnx_gives_the_same_value(model: PenetrationModel, tmp_path: Path) -> None:
+def test_onnx_gives_equal_values(model: PenetrationModel, tmp_path: Path) -> None:
     import onnx
     from onnx.reference import ReferenceEvaluator
 
@@ -282,10 +282,10 @@ def test_onnx_gives_the_same_value(model: PenetrationModel, tmp_path: Path) -> N
     write_onnx(tmp_path / "model.onnx", model)
     graph = onnx.load(tmp_path / "model.onnx")
     run = ReferenceEvaluator(graph)
-    steps, found = in_steps(WELDS[3], 0.1), model.predict(WELDS[3])
+    steps, predicted = in_steps(WELDS[3], 0.1), model.predict(WELDS[3])
     for last in (60, 111, 199):
         window = steps.value[last + 1 - model.memory : last + 1]
         (value,) = run.run(None, {"features": window})
-        assert value == pytest.approx(found.value[last], rel=1e-9)
-    facts = {one.key: one.value for one in graph.metadata_props}
+        assert value == pytest.approx(predicted.value[last], rel=1e-9)
+    facts = {entry.key: entry.value for entry in graph.metadata_props}
     assert SimpleNamespace(**facts).features == "width_mm length_mm convexity_mm"

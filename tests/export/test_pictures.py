@@ -31,7 +31,7 @@ def summary(measured: Measurement, unmeasured: Measurement) -> Summary:
     return summary
 
 
-def test_dots_are_ringed_by_row_and_grey_in_doubt(measured: Measurement) -> None:
+def test_rings_of_dots_are_coloured_or_grey_if_in_doubt(measured: Measurement) -> None:
     picture = pictures.frame_picture(IMAGE, measured)
     assert picture.shape == (120, 180, 3)
     bright = picture.max(axis=2) > 100
@@ -43,27 +43,27 @@ def test_dots_are_ringed_by_row_and_grey_in_doubt(measured: Measurement) -> None
         assert saturated[left].any() == coloured
 
 
-def test_a_frame_without_dots_is_shown_as_it_is(unmeasured: Measurement) -> None:
+def test_frame_without_dots_is_shown_unchanged(unmeasured: Measurement) -> None:
     blank = Measurement(status="no-dots", reason="", scheme="fit")
     picture = pictures.frame_picture(IMAGE, blank)
     assert len(np.unique(picture.reshape(-1, 3), axis=0)) == 1
     assert (pictures.frame_picture(IMAGE, unmeasured) != picture).any()
 
 
-def test_the_summary_counts_and_averages(summary: Summary) -> None:
+def test_summary_has_counts_and_means(summary: Summary) -> None:
     first, width, *_ = summary.text().splitlines()
     assert first == "3 frames, 2 with a surface (1 ambiguous-rows)"
     assert width == "width    1.2500 ± 1.2500 mm (mean; standard deviation 0.0000 mm)"
     np.testing.assert_array_equal(summary.series("width_mm"), [np.nan, 1.25, 1.25])
 
 
-def test_one_frame_is_told_with_its_uncertainty(measured: Measurement) -> None:
+def test_summary_of_one_frame_has_its_uncertainty(measured: Measurement) -> None:
     summary = Summary()
     summary.add(FrameResult(0, None, measured))
     assert summary.text().splitlines()[1] == "width    1.2500 ± 1.2500 mm"
 
 
-def test_a_size_that_rounds_to_nothing_has_no_sign(measured: Measurement) -> None:
+def test_size_rounded_to_zero_has_no_sign(measured: Measurement) -> None:
     assert measured.measures is not None
     summary = Summary()
     for frame in range(2):
@@ -72,19 +72,19 @@ def test_a_size_that_rounds_to_nothing_has_no_sign(measured: Measurement) -> Non
         assert re.search(r"^depth +0\.0000 ", summary.text(), re.MULTILINE)
 
 
-def test_a_surface_is_drawn(measured: Measurement, tmp_path: Path) -> None:
+def test_surface_is_drawn(measured: Measurement, tmp_path: Path) -> None:
     pytest.importorskip("pyvista")
     assert measured.reconstruction is not None
     assert demo.draw_surface(measured.reconstruction, tmp_path / "surface.png") == ""
     surface = cv2.imread(str(tmp_path / "surface.png"))
-    # viridis: the pool's top is yellow, its rim violet.
+    # viridis: the top of the pool is yellow, the rim violet.
     blue, green, red = np.moveaxis(surface.astype(int), 2, 0)
     assert ((red > 180) & (green > 150) & (blue < 90)).sum() > 2000
     assert ((red < 110) & (green < 80) & (blue > 60)).sum() > 2000
 
 
 @pytest.mark.parametrize(
-    ("problem", "told"),
+    ("problem", "message"),
     [
         (
             ModuleNotFoundError("No module named 'pyvista'", name="pyvista"),
@@ -94,15 +94,15 @@ def test_a_surface_is_drawn(measured: Measurement, tmp_path: Path) -> None:
         (OSError(28, "disk full"), "disk full"),
     ],
 )
-def test_a_picture_that_cannot_be_drawn_stops_nothing(
-    measured: Measurement, tmp_path: Path, problem: Exception, told: str
+def test_failed_drawing_is_reported_without_an_exception(
+    measured: Measurement, tmp_path: Path, problem: Exception, message: str
 ) -> None:
     assert measured.reconstruction is not None
     with mock.patch.object(demo, "write_surface_picture", side_effect=problem):
-        assert demo.draw_surface(measured.reconstruction, tmp_path / "surface.png") == told
+        assert demo.draw_surface(measured.reconstruction, tmp_path / "surface.png") == message
 
 
-def test_the_demo_goes_on_with_its_session(tmp_path: Path) -> None:
+def test_demo_continues_its_session(tmp_path: Path) -> None:
     with demo.open_demo(tmp_path / "demo") as session:
         assert len(session.frames) == 30
         session.set_record(Record(operator="A. Weld"))
@@ -110,7 +110,7 @@ def test_the_demo_goes_on_with_its_session(tmp_path: Path) -> None:
         assert session.record.operator == "A. Weld"
 
 
-def test_a_demo_that_cannot_be_made_leaves_nothing(tmp_path: Path) -> None:
+def test_failed_demo_leaves_no_session(tmp_path: Path) -> None:
     (tmp_path / "demo").touch()
     with pytest.raises(InputError, match="one that can be written"):
         demo.open_demo(tmp_path / "demo")

@@ -57,12 +57,12 @@ def written(out: Path, writer: Writer, measured: Measurement, unmeasured: Measur
 
 
 @pytest.mark.parametrize("name", CONVENTION)
-def test_columns_stand_in_the_order_agreed(written: Path, name: str) -> None:
+def test_columns_have_the_specified_order(written: Path, name: str) -> None:
     header = (written / name).read_text(encoding="utf-8").splitlines()[0]
     assert (header + ",").startswith(CONVENTION[name] + ",")
 
 
-def test_every_frame_has_its_row_in_measures(written: Path) -> None:
+def test_every_frame_has_a_row_of_measures(written: Path) -> None:
     ok, other = table(written / "measures.csv")
     assert (ok["frame"], ok["time_s"]) == ("0", "0.000000")
     assert (ok["status"], ok["scheme"], ok["correspondence"]) == ("ok", "fit", "I/I")
@@ -80,7 +80,7 @@ def test_every_frame_has_its_row_in_measures(written: Path) -> None:
     }
 
 
-def test_every_dot_has_its_row(written: Path) -> None:
+def test_every_dot_has_a_row(written: Path) -> None:
     first, doubtful, last, other = table(written / "dots.csv")
     assert first == {
         "frame": "0",
@@ -101,14 +101,14 @@ def test_every_dot_has_its_row(written: Path) -> None:
     assert other["frame"] == "7"
 
 
-def test_points_carry_residual_and_sigma(written: Path) -> None:
+def test_points_have_residual_and_sigma(written: Path) -> None:
     first, second = table(written / "points.csv")
     assert (first["ray_row"], first["ray_column"], first["z_mm"]) == ("10", "9", "0.300000")
     assert (first["residual_mm"], first["sigma_mm"]) == ("0.500000", "0.002000")
     assert (second["residual_mm"], second["sigma_mm"]) == ("0.010000", "")
 
 
-def test_without_any_sigma_nothing_is_said_to_be_in_it(
+def test_sigma_of_is_empty_without_any_sigma(
     out: Path, writer: Writer, unmeasured: Measurement
 ) -> None:
     with writer(out) as files:
@@ -116,17 +116,17 @@ def test_without_any_sigma_nothing_is_said_to_be_in_it(
     assert json.loads((out / "run.json").read_text("utf-8"))["sigma_of"] == ""
 
 
-def test_what_is_in_sigma_is_said_beside_the_tables(written: Path) -> None:
+def test_content_of_sigma_is_documented_with_the_tables(written: Path) -> None:
     assert json.loads((written / "run.json").read_text("utf-8"))["sigma_of"] == SIGMA_OF
     sigmas = [c for name in TABLES for c in TABLES[name] if "_sigma_" in f"_{c.name}_" and c.digits]
     assert len(sigmas) == 10 + 27
-    for column in sigmas:  # the total says what is in it, a part of which total it is one
-        whole = HEIGHT_SIGMA_OF if column.name == "sigma_mm" else SIGMA_OF
-        assert ("part of" if column.is_part else whole) in column.description
+    for column in sigmas:  # a total states its content, and a part states its total
+        expected = HEIGHT_SIGMA_OF if column.name == "sigma_mm" else SIGMA_OF
+        assert ("part of" if column.is_part else expected) in column.description
 
 
 @pytest.mark.parametrize("scheme", ["fit", "ers", "irs"])
-def test_are_is_reckoned_from_the_points(out: Path, writer: Writer, scheme: str) -> None:
+def test_are_agrees_with_the_points(out: Path, writer: Writer, scheme: str) -> None:
     rig = Rig(
         Laser(31.14, 31.48),
         DotPattern(),
@@ -134,42 +134,42 @@ def test_are_is_reckoned_from_the_points(out: Path, writer: Writer, scheme: str)
         ImagingPlane.vertical(50.0, 1e4, -1e4, 2e4, 2e4),
     )
     rng = np.random.default_rng(5)
-    seen = trace(egg(6.6, 3.0, 4.0, 0.35), rig)
-    match = exact_match(seen, rig, sigma_mm=0.05, rng=rng)
+    reflections = trace(egg(6.6, 3.0, 4.0, 0.35), rig)
+    match = exact_match(reflections, rig, sigma_mm=0.05, rng=rng)
     match = replace(match, dot=np.zeros(len(match.ray), int))
-    made = reconstruct(match, rig, Settings(scheme=scheme))
-    size = measure_surface(made, match, rig)
+    reconstruction = reconstruct(match, rig, Settings(scheme=scheme))
+    size = measure_surface(reconstruction, match, rig)
     with writer(out) as files:
-        found = Measurement("ok", "", scheme, dots(1), None, match, made, size)
-        files.write(FrameResult(0, 0.0, found))
-    told = table(out / "measures.csv")[0]
+        measurement = Measurement("ok", "", scheme, dots(1), None, match, reconstruction, size)
+        files.write(FrameResult(0, 0.0, measurement))
+    measures = table(out / "measures.csv")[0]
     points = [row for row in table(out / "points.csv") if row["residual_mm"]]
     names = ("residual_mm", "residual_x_mm", "residual_z_mm", "error_x_mm", "error_y_mm")
     column = {name: np.array([float(row[name]) for row in points]) for name in names}
     on_plane = np.hypot(column["residual_x_mm"], column["residual_z_mm"])
     np.testing.assert_allclose(on_plane, column["residual_mm"], atol=2e-6)
     error = np.hypot(column["error_x_mm"], column["error_y_mm"])
-    assert error.mean() == pytest.approx(float(told["are_mm"]), abs=2e-6)
-    assert error.max() == pytest.approx(float(told["mre_mm"]), abs=2e-6)
-    # On the work piece errors are a fraction of those on the imaging plane, of the same sign.
+    assert error.mean() == pytest.approx(float(measures["are_mm"]), abs=2e-6)
+    assert error.max() == pytest.approx(float(measures["mre_mm"]), abs=2e-6)
+    # Errors on the work piece are smaller than on the imaging plane, with the same sign.
     assert error.mean() < 0.5 * on_plane.mean()
     assert (column["residual_x_mm"] * column["error_x_mm"] >= 0).all()
     assert {np.sign(value) for value in column["error_y_mm"]} >= {-1.0, 1.0}
-    assert bool(told["own_are_mm"]) == (scheme != "fit")
-    if scheme == "fit":  # captured minus computed: what noise has added to a dot
-        noise = match.plane_mm - exact_match(seen, rig).plane_mm
+    assert bool(measures["own_are_mm"]) == (scheme != "fit")
+    if scheme == "fit":  # captured minus computed: the noise added to a dot
+        noise = match.plane_mm - exact_match(reflections, rig).plane_mm
         assert np.corrcoef(column["residual_x_mm"], noise[:, 0])[0, 1] > 0.5
         assert np.corrcoef(column["residual_z_mm"], noise[:, 1])[0, 1] > 0.5
 
 
-def test_the_boundary_is_written(written: Path) -> None:
+def test_boundary_is_written(written: Path) -> None:
     rows = table(written / "boundary.csv")
     assert len(rows) == 72
     radius = [np.hypot(float(row["x_mm"]), float(row["y_mm"])) for row in rows]
     np.testing.assert_allclose(radius, 3.0, atol=1e-5)
 
 
-def test_surface_nodes_lie_on_the_surface_and_fill_the_boundary(written: Path) -> None:
+def test_nodes_lie_on_the_surface_and_fill_the_boundary(written: Path) -> None:
     assert not (written / "surface_000007.csv").exists()
     rows = table(written / "surface_000000.csv")
     x, y, z = (np.array([float(row[f"{axis}_mm"]) for row in rows]) for axis in "xyz")
@@ -177,7 +177,7 @@ def test_surface_nodes_lie_on_the_surface_and_fill_the_boundary(written: Path) -
     assert len(rows) * results.SPACING_MM**2 == pytest.approx(np.pi * 9, rel=0.02)
 
 
-def test_the_mesh_is_the_surface_with_its_normals_up(written: Path) -> None:
+def test_mesh_is_the_surface_with_normals_up(written: Path) -> None:
     content = (written / "surface_000000.stl").read_bytes()
     count = int.from_bytes(content[80:84], "little")
     assert len(content) == 84 + 50 * count
@@ -191,7 +191,7 @@ def test_the_mesh_is_the_surface_with_its_normals_up(written: Path) -> None:
     np.testing.assert_allclose(
         doubled / np.linalg.norm(doubled, axis=1, keepdims=True), mesh["normal"], atol=1e-2
     )
-    # Every edge belongs to two triangles, but for one closed loop: the boundary.
+    # Every edge belongs to two triangles, except for one closed loop: the boundary.
     vertices, index = np.unique(corner.reshape(-1, 3).round(5), axis=0, return_inverse=True)
     sides = np.sort(index.reshape(-1, 3)[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     pairs, uses = np.unique(sides, axis=0, return_counts=True)
@@ -201,21 +201,21 @@ def test_the_mesh_is_the_surface_with_its_normals_up(written: Path) -> None:
     np.testing.assert_allclose(vertices[np.unique(rim), 2], 0, atol=1e-6)
 
 
-def test_run_json_tells_where_results_come_from(written: Path) -> None:
+def test_run_json_contains_the_provenance(written: Path) -> None:
     run = json.loads((written / "run.json").read_text())
     assert run["program"] == "labapp"
     assert run["source"] == {"path": "v.avi"}
     assert (run["state"], run["frames_done"]) == ("finished", 2)
 
 
-def test_surfaces_can_be_left_out(out: Path, measured: Measurement, calibration: object) -> None:
+def test_surfaces_are_optional(out: Path, measured: Measurement, calibration: object) -> None:
     with ResultsWriter(out, calibration, {}, surfaces=False) as files:
         files.write(FrameResult(0, 0.0, measured))
     assert not list(out.glob("surface_*"))
     assert table(out / "measures.csv")[0]["status"] == "ok"
 
 
-def test_a_former_run_is_replaced_and_nothing_else(
+def test_only_files_of_a_former_run_are_replaced(
     written: Path, writer: Writer, unmeasured: Measurement
 ) -> None:
     (written / "notes.csv").write_text("mine")
@@ -233,7 +233,7 @@ def test_a_former_run_is_replaced_and_nothing_else(
 
 
 @pytest.mark.parametrize("run", [None, "{}", "not json"])
-def test_somebody_elses_file_is_not_replaced(out: Path, writer: Writer, run: str | None) -> None:
+def test_other_files_are_not_replaced(out: Path, writer: Writer, run: str | None) -> None:
     out.mkdir(parents=True)
     (out / "dots.csv").write_text("mine")
     if run is not None:
@@ -246,10 +246,10 @@ def test_somebody_elses_file_is_not_replaced(out: Path, writer: Writer, run: str
 @pytest.mark.parametrize(
     "start", ["=", "+", "-", "@", "\t", "\r", "\n", "'=", "''-", "＝", "＋", "－", "＠"]
 )
-def test_text_is_no_formula_and_numbers_are_numbers(
+def test_text_is_quoted_against_formulas(
     out: Path, writer: Writer, unmeasured: Measurement, start: str
 ) -> None:
-    """A spreadsheet runs what begins so; a recording's name may be in the reason."""
+    """Spreadsheets run text with such a start; a reason may contain the name of a recording."""
     reason = f"{start}HYPERLINK(A1)"
     with writer(out) as files:
         files.write(FrameResult(0, -1.5, replace(unmeasured, reason=reason)))
@@ -259,7 +259,7 @@ def test_text_is_no_formula_and_numbers_are_numbers(
     assert (first["time_s"], second["reason"]) == ("-1.500000", "'quoted' - said")
 
 
-def test_a_link_is_not_followed(out: Path, writer: Writer) -> None:
+def test_link_is_not_followed(out: Path, writer: Writer) -> None:
     out.mkdir(parents=True)
     (out.parent / "mine.json").write_text("mine")
     (out / "run.json").symlink_to("../mine.json")
@@ -272,7 +272,7 @@ def test_a_link_is_not_followed(out: Path, writer: Writer) -> None:
     assert (out.parent / "mine.json").read_text() == "mine"
 
 
-def test_a_folder_that_cannot_be_made_is_refused(tmp_path: Path, writer: Writer) -> None:
+def test_impossible_folder_is_rejected(tmp_path: Path, writer: Writer) -> None:
     (tmp_path / "file").write_text("")
     for folder in (tmp_path / "file", tmp_path / "file" / "below"):
         with pytest.raises(InputError, match="expected a writable folder with enough disk space"):
@@ -288,15 +288,15 @@ FAILURES = [OSError(28, "No space left on device"), KeyboardInterrupt(), Stopped
 
 @pytest.mark.parametrize("failure", FAILURES, ids=lambda failure: type(failure).__name__)
 @pytest.mark.parametrize("at", range(6), ids=lambda at: f"write {at}")
-def test_a_frame_that_fails_leaves_no_trace(
+def test_failed_frame_leaves_no_rows(
     out: Path, writer: Writer, measured: Measurement, failure: BaseException, at: int
 ) -> None:
-    """Whichever of a frame's six files fails, half of it written."""
-    whole, append = results.write_atomically, results._append
+    """Each of the six files of a frame fails in turn, half written."""
+    write, append = results.write_atomically, results._append
     calls = iter(range(100))
 
     def fail_whole(path: Path, content: bytes) -> None:
-        whole(path, content)
+        write(path, content)
         if next(calls) == at:
             raise failure
 
@@ -323,12 +323,12 @@ def test_a_frame_that_fails_leaves_no_trace(
     assert run["state"] == ("interrupted" if expected is KeyboardInterrupt else "failed")
 
 
-def test_a_write_that_takes_a_part_is_carried_on() -> None:
+def test_partial_write_is_continued() -> None:
     file = mock.Mock()
-    taken: list[bytes] = []
-    file.write = lambda content: taken.append(content[:3]) or len(content[:3])
+    written: list[bytes] = []
+    file.write = lambda content: written.append(content[:3]) or len(content[:3])
     results._append(file, "0,1,µm\n")
-    assert b"".join(taken) == "0,1,µm\n".encode()
+    assert b"".join(written) == "0,1,µm\n".encode()
 
 
 FULL_DISK = """
@@ -355,9 +355,9 @@ FULL_DISK = """
 """
 
 
-def test_a_limit_of_the_system_stops_the_run_between_frames(out: Path) -> None:
-    """The real thing: the system takes a part of the last row and refuses the rest."""
-    done = subprocess.run(
+def test_full_disk_stops_the_run_after_a_complete_frame(out: Path) -> None:
+    """The operating system writes a part of the last row and refuses the rest."""
+    process = subprocess.run(
         [sys.executable, "-c", textwrap.dedent(FULL_DISK), str(out)],
         capture_output=True,
         text=True,
@@ -366,7 +366,7 @@ def test_a_limit_of_the_system_stops_the_run_between_frames(out: Path) -> None:
     )
     measures, dots = table(out / "measures.csv"), table(out / "dots.csv")
     assert len(measures) > 5
-    assert f"the {len(measures)} previous frames are complete" in done.stdout
+    assert f"the {len(measures)} previous frames are complete" in process.stdout
     assert len(dots) == 40 * len(measures)
     assert all(None not in row.values() for row in dots)
     assert (out / "dots.csv").read_text().endswith("auto\n")

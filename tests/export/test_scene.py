@@ -38,18 +38,18 @@ def pool(measured: Measurement) -> Reconstruction:
 # --- heights -------------------------------------------------------------------------------------
 
 
-def test_sigma_is_linear_between_the_points_and_the_nearest_outside(pool: Reconstruction) -> None:
+def test_sigma_is_linear_between_points_and_nearest_outside(pool: Reconstruction) -> None:
     sigma = sigma_at(pool, np.array([0.5, -1.25, 2.9, -2.9]), np.array([0.5, 1.0, 0.0, 0.0]))
     np.testing.assert_allclose(sigma, [0.00225, 0.001375, 0.003, 0.001], atol=1e-12)
 
 
-def test_there_is_no_sigma_where_the_scheme_gives_none(pool: Reconstruction) -> None:
+def test_scheme_without_sigma_has_none_in_the_scene(pool: Reconstruction) -> None:
     without = replace(pool, sigma_mm=np.full(25, np.nan))
     assert np.isnan(sigma_at(without, np.zeros(2), np.zeros(2))).all()
     assert scene_of(without, "sigma").label == "height (mm)"
 
 
-def test_surfaces_differ_only_where_both_are(pool: Reconstruction) -> None:
+def test_difference_is_limited_to_the_overlap(pool: Reconstruction) -> None:
     smaller = replace(pool.boundary, points_mm=pool.boundary.points_mm * [0.5, 0.5, 1.0])
     other = replace(pool, surface=FlatSurface(0.1), boundary=smaller)
     difference = difference_at(pool, other, np.array([0.0, 1.0, 2.0]), np.zeros(3))
@@ -57,15 +57,15 @@ def test_surfaces_differ_only_where_both_are(pool: Reconstruction) -> None:
 
 
 @pytest.mark.parametrize("scale", [1, 1e3, 1e6])
-def test_a_huge_surface_is_drawn_with_no_more_nodes(pool: Reconstruction, scale: float) -> None:
-    """It is told in a stranger's session; what is built of it has bounds."""
+def test_number_of_nodes_is_limited_for_huge_surfaces(pool: Reconstruction, scale: float) -> None:
+    """An untrusted session may contain a huge surface."""
     boundary = replace(pool.boundary, points_mm=pool.boundary.points_mm * scale)
     vertices, _ = scenes._mesh(replace(pool, boundary=boundary))
     assert 1000 < len(vertices) < 1_000_000
 
 
 @pytest.mark.parametrize("angle_deg", [0.0, 37.0, 90.0, 180.0, -60.0])
-def test_a_section_ends_at_the_boundary(pool: Reconstruction, angle_deg: float) -> None:
+def test_section_ends_at_the_boundary(pool: Reconstruction, angle_deg: float) -> None:
     cut = profile(pool, angle_deg, 1.5)
     half = np.sqrt(RADIUS_MM**2 - 1.5**2)
     # The boundary is a polygon of 72 corners: its sides are within 0.003 mm of the circle.
@@ -74,21 +74,21 @@ def test_a_section_ends_at_the_boundary(pool: Reconstruction, angle_deg: float) 
     assert known.sum() > 0.98 * len(known)
     radius = np.hypot(*cut.place_mm[known].T)
     np.testing.assert_allclose(cut.height_mm[known], HEIGHT_MM * (1 - radius**2 / 9), atol=1e-12)
-    aside = cut.place_mm @ [-np.sin(np.radians(angle_deg)), np.cos(np.radians(angle_deg))]
-    np.testing.assert_allclose(aside, 1.5)
+    offset_mm = cut.place_mm @ [-np.sin(np.radians(angle_deg)), np.cos(np.radians(angle_deg))]
+    np.testing.assert_allclose(offset_mm, 1.5)
     assert np.isfinite(cut.sigma_mm[known]).all()
 
 
-def test_a_section_that_misses_the_pool_is_empty(pool: Reconstruction) -> None:
+def test_section_outside_the_pool_is_empty(pool: Reconstruction) -> None:
     cut = profile(pool, 0.0, 5.0)
     assert len(cut.edge_mm) == 0
     assert np.isnan(cut.height_mm).all()
 
 
-# --- the scene -----------------------------------------------------------------------------------
+# --- scene ---------------------------------------------------------------------------------------
 
 
-def test_rays_come_from_the_laser_and_go_to_the_computed_dots(pool: Reconstruction) -> None:
+def test_rays_lead_from_the_laser_to_the_computed_dots(pool: Reconstruction) -> None:
     class Matched:
         plane_mm = np.column_stack([np.linspace(20, 70, 25), np.linspace(5, 60, 25)])
 
@@ -103,81 +103,85 @@ def test_rays_come_from_the_laser_and_go_to_the_computed_dots(pool: Reconstructi
         start, end = rays[name][:, 0], rays[name][:, 1]
         np.testing.assert_array_equal(start, pool.points_mm)
         np.testing.assert_allclose(np.linalg.norm(end - start, axis=1), scenes.RAY_MM)
-        off = np.cross(end - start, target - start)
-        np.testing.assert_allclose(off, 0, atol=1e-9)
+        deviation = np.cross(end - start, target - start)
+        np.testing.assert_allclose(deviation, 0, atol=1e-9)
 
 
-def test_a_difference_is_coloured_both_ways_alike(pool: Reconstruction) -> None:
+def test_colours_of_a_difference_are_symmetric(pool: Reconstruction) -> None:
     other = replace(pool, surface=FlatSurface(0.05))
-    made = difference_scene(pool, other)
-    assert made.colour_map == scenes.DIFFERENCE_MAP
-    assert made.limits == pytest.approx((-0.25, 0.25))
-    np.testing.assert_allclose(made.values, made.vertices_mm[:, 2] - 0.05, atol=1e-9)
-    assert made.values.min() == pytest.approx(-0.05, abs=1e-6)
+    scene = difference_scene(pool, other)
+    assert scene.colour_map == scenes.DIFFERENCE_MAP
+    assert scene.limits == pytest.approx((-0.25, 0.25))
+    np.testing.assert_allclose(scene.values, scene.vertices_mm[:, 2] - 0.05, atol=1e-9)
+    assert scene.values.min() == pytest.approx(-0.05, abs=1e-6)
 
 
-def aside(pool: Reconstruction) -> Reconstruction:
-    """The same pool 10 mm farther along X: it does not overlap the first."""
-    way = np.array([10.0, 0.0, 0.0])
-    here = pool.boundary
-    moved = replace(here, center_mm=here.center_mm + way[:2], points_mm=here.points_mm + way)
+def shifted_pool(pool: Reconstruction) -> Reconstruction:
+    """The same pool shifted by 10 mm along X; it does not overlap the first."""
+    shift_mm = np.array([10.0, 0.0, 0.0])
+    boundary = pool.boundary
+    moved = replace(
+        boundary,
+        center_mm=boundary.center_mm + shift_mm[:2],
+        points_mm=boundary.points_mm + shift_mm,
+    )
     return replace(pool, boundary=moved)
 
 
-def test_surfaces_that_do_not_overlap_have_no_difference_to_draw(pool: Reconstruction) -> None:
-    made = difference_scene(pool, aside(pool))
-    assert len(made.vertices_mm) == len(made.triangles) == len(made.values) == 0
+def test_scene_of_surfaces_without_overlap_is_empty(pool: Reconstruction) -> None:
+    scene = difference_scene(pool, shifted_pool(pool))
+    assert len(scene.vertices_mm) == len(scene.triangles) == len(scene.values) == 0
 
 
-def test_what_is_not_known_of_a_surface_is_not_drawn(pool: Reconstruction) -> None:
+def test_unknown_parts_of_a_surface_are_not_drawn(pool: Reconstruction) -> None:
     class Holed(FlatSurface):
         def height(self, x_mm: Any, y_mm: Any) -> Any:
             return np.where(np.hypot(x_mm - 1, y_mm) < 0.5, np.nan, 0.2)
 
-    made = scene_of(replace(pool, surface=Holed()))
-    assert np.isfinite(made.vertices_mm).all()
-    centres = made.vertices_mm[made.triangles].mean(axis=1)
+    scene = scene_of(replace(pool, surface=Holed()))
+    assert np.isfinite(scene.vertices_mm).all()
+    centres = scene.vertices_mm[scene.triangles].mean(axis=1)
     assert np.hypot(centres[:, 0] - 1, centres[:, 1]).min() > 0.35
 
 
-def test_normals_point_up_and_stand_upright_on_the_surface(pool: Reconstruction) -> None:
-    made = scene_of(pool)
-    normals = draws._normals(made.vertices_mm, made.triangles)
-    # The centre's neighbours and the rim see facets of one side only.
-    inner = np.hypot(*made.vertices_mm[:, :2].T) < 2.5
-    x, y = made.vertices_mm[inner, :2].T
+def test_normals_are_perpendicular_to_the_surface_and_point_up(pool: Reconstruction) -> None:
+    scene = scene_of(pool)
+    normals = draws._normals(scene.vertices_mm, scene.triangles)
+    # Nodes at the rim have facets on one side only.
+    inner = np.hypot(*scene.vertices_mm[:, :2].T) < 2.5
+    x, y = scene.vertices_mm[inner, :2].T
     true = np.column_stack([2 * HEIGHT_MM / 9 * x, 2 * HEIGHT_MM / 9 * y, np.ones(len(x))])
     true /= np.linalg.norm(true, axis=1, keepdims=True)
     np.testing.assert_allclose(normals[inner], true, atol=0.01)
 
 
-# --- its picture ---------------------------------------------------------------------------------
+# --- picture -------------------------------------------------------------------------------------
 
 
 @pytest.fixture
 def plotter(opengl: None) -> Any:
     import pyvista
 
-    made: Any = pyvista.Plotter(off_screen=True, window_size=[480, 360])
-    yield made
-    made.close()
+    plotter: Any = pyvista.Plotter(off_screen=True, window_size=[480, 360])
+    yield plotter
+    plotter.close()
 
 
-def seen(plotter: Any) -> np.ndarray:
+def screenshot(plotter: Any) -> np.ndarray:
     plotter.render()
     return np.asarray(plotter.screenshot(return_img=True)).astype(int)
 
 
-def amount(picture: np.ndarray, colour: str) -> int:
-    """How many pixels have about a colour."""
-    wanted = [int(colour[k : k + 2], 16) for k in (1, 3, 5)]
-    return int((np.abs(picture - wanted).max(axis=2) < 40).sum())
+def pixels_of_colour(picture: np.ndarray, colour: str) -> int:
+    """Number of pixels with approximately a given colour."""
+    rgb = [int(colour[k : k + 2], 16) for k in (1, 3, 5)]
+    return int((np.abs(picture - rgb).max(axis=2) < 40).sum())
 
 
-def test_the_summit_is_yellow_and_the_rim_violet(plotter: Any, pool: Reconstruction) -> None:
+def test_peak_is_yellow_and_the_rim_violet(plotter: Any, pool: Reconstruction) -> None:
     draws.build_scene(plotter, scene_of(pool)).look("top")
-    picture = seen(plotter)
-    bar = 400  # the colour scale stands to the right of it
+    picture = screenshot(plotter)
+    bar = 400  # the colour scale is to the right of it
     rows, columns = np.nonzero((picture[:, :bar].max(axis=2) - picture[:, :bar].min(axis=2)) > 60)
     across, down = int(columns.mean()), int(rows.mean())
     red, green, blue = picture[down, across + 6]
@@ -189,72 +193,72 @@ def test_the_summit_is_yellow_and_the_rim_violet(plotter: Any, pool: Reconstruct
     assert blue > 60
 
 
-def test_parts_come_and_go_with_the_scene(plotter: Any, pool: Reconstruction) -> None:
+def test_parts_are_shown_and_hidden_with_the_scene(plotter: Any, pool: Reconstruction) -> None:
     rays = {"incident": np.stack([pool.points_mm, pool.points_mm + np.array([0, 1, 1])], axis=1)}
     line = np.column_stack([np.linspace(-3, 3, 50), np.zeros(50), np.full(50, 0.35)])
     plain = replace(scene_of(pool), points_mm=np.empty((0, 3)))
     full = replace(plain, rays_mm=rays, lines_mm={**plain.lines_mm, "section": line})
     drawing = draws.build_scene(plotter, plain)
-    before = seen(plotter)
+    before = screenshot(plotter)
     drawing.update(full)
-    between = seen(plotter)
+    between = screenshot(plotter)
     drawing.update(plain)
-    after = seen(plotter)
+    after = screenshot(plotter)
     for colour in (draws.COLOURS["incident"], draws.COLOURS["section"]):
-        assert amount(before, colour) < 20
-        assert amount(between, colour) > 100
+        assert pixels_of_colour(before, colour) < 20
+        assert pixels_of_colour(between, colour) > 100
     np.testing.assert_array_equal(after, before)
 
 
-def test_a_frame_takes_the_place_of_another(plotter: Any, pool: Reconstruction) -> None:
-    """The same actors show it, and the picture is the one of a drawing made for it alone."""
+def test_frame_replaces_another(plotter: Any, pool: Reconstruction) -> None:
+    """The actors are reused, and the picture equals that of a new drawing."""
     flat = scene_of(replace(pool, surface=FlatSurface(0.21)), limits=(0.0, 0.3))
     drawing = draws.build_scene(plotter, scene_of(pool, limits=(0.0, 0.3)))
-    first, actors = seen(plotter), list(plotter.renderer.actors)
+    first, actors = screenshot(plotter), list(plotter.renderer.actors)
     drawing.update(flat)
     assert list(plotter.renderer.actors) == actors
-    moved = seen(plotter)
-    assert (moved != first).any(axis=2).mean() > 0.05
+    updated = screenshot(plotter)
+    assert (updated != first).any(axis=2).mean() > 0.05
     plotter.clear()
     draws.build_scene(plotter, flat)
-    np.testing.assert_allclose(seen(plotter), moved, atol=2)
+    np.testing.assert_allclose(screenshot(plotter), updated, atol=2)
 
 
-def test_the_scale_says_what_the_colours_are(plotter: Any, pool: Reconstruction) -> None:
+def test_colour_scale_names_its_quantity(plotter: Any, pool: Reconstruction) -> None:
     drawing = draws.build_scene(plotter, scene_of(pool))
     for label in ("± (mm)", "height (mm)", "± (mm)"):
         drawing.update(replace(scene_of(pool), label=label))
-        seen(plotter)
+        screenshot(plotter)
         assert label.replace(" (", "\n(") in drawing.overlay.words
 
 
-def test_a_surface_that_failed_is_made_another_time(
+def test_drawing_recovers_from_a_failed_update(
     plotter: Any, pool: Reconstruction, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     heights = scene_of(pool)
     drawing = draws.build_scene(plotter, heights)
-    wanted = seen(plotter)
+    expected = screenshot(plotter)
 
-    def refused(*_: Any, **__: Any) -> None:
+    def fail(*_: Any, **__: Any) -> None:
         raise ValueError("refused")
 
     with monkeypatch.context() as patched:
-        patched.setattr(plotter, "add_mesh", refused)
+        patched.setattr(plotter, "add_mesh", fail)
         with pytest.raises(ValueError, match="refused"):
             drawing.update(replace(heights, colour_map=scenes.ERROR_MAP))
     drawing.update(heights)
-    np.testing.assert_allclose(seen(plotter), wanted, atol=2)
+    np.testing.assert_allclose(screenshot(plotter), expected, atol=2)
 
 
-def test_a_surface_may_come_after_a_scene_without_one(plotter: Any, pool: Reconstruction) -> None:
-    """As in a film whose first frame has none, or where two surfaces do not overlap."""
+def test_surface_can_follow_a_scene_without_one(plotter: Any, pool: Reconstruction) -> None:
+    """For instance in a film whose first frame has no surface."""
 
     def coloured() -> np.ndarray:
-        picture = seen(plotter)
-        grey = np.ptp(picture, axis=2, keepdims=True) < 40  # axes and their names
+        picture = screenshot(plotter)
+        grey = np.ptp(picture, axis=2, keepdims=True) < 40  # axes and their labels
         return np.where(grey, 255, picture)
 
-    drawing = draws.build_scene(plotter, difference_scene(pool, aside(pool)))
+    drawing = draws.build_scene(plotter, difference_scene(pool, shifted_pool(pool)))
     assert (coloured()[:, :380] == 255).all()
     for scene in (difference_scene(pool, replace(pool, surface=FlatSurface(0.05))), scene_of(pool)):
         drawing.update(scene)
@@ -268,22 +272,22 @@ def test_a_surface_may_come_after_a_scene_without_one(plotter: Any, pool: Recons
 
 @pytest.mark.parametrize("exaggeration", [1.0, 3.0, 12.0])
 @pytest.mark.parametrize("azimuth_deg", range(0, 360, 45))
-def test_names_and_numbers_are_seen_from_every_side_and_do_not_overlap(
+def test_labels_are_visible_from_every_side_without_overlap(
     plotter: Any, pool: Reconstruction, exaggeration: float, azimuth_deg: float
 ) -> None:
     drawing = draws.build_scene(plotter, replace(scene_of(pool), exaggeration=exaggeration))
     plotter.camera.Azimuth(azimuth_deg + 10)
-    seen(plotter)
+    screenshot(plotter)
     overlay, size = drawing.overlay, np.array(plotter.window_size)
     assert {"X (mm)", "Y, along the weld (mm)"} <= set(overlay.words)
-    assert ("Z (mm)" in overlay.words) == (exaggeration > 1)  # too low to be numbered
+    assert ("Z (mm)" in overlay.words) == (exaggeration > 1)  # too low for numbers
     texts = [text for text in overlay._texts if text.GetVisibility()]
     boxes = []
     for text in texts:
         box = np.zeros(4)
         text.GetBoundingBox(plotter.renderer, box)
-        at = np.array(text.GetPosition())
-        boxes.append(np.stack([at + box[[0, 2]], at + box[[1, 3]]]))
+        position = np.array(text.GetPosition())
+        boxes.append(np.stack([position + box[[0, 2]], position + box[[1, 3]]]))
     assert all((low >= 0).all() and (high <= size).all() for low, high in boxes)
     for k, (low, high) in enumerate(boxes):
         for other in boxes[k + 1 :]:
@@ -305,9 +309,7 @@ def test_ticks_are_round_numbers(low: float, high: float, most: int, wanted: lis
     assert ticks == pytest.approx([float(text.replace("−", "-")) for text in wanted])
 
 
-def test_lines_of_equal_height_are_on_the_surface_at_round_heights(
-    plotter: Any, pool: Reconstruction
-) -> None:
+def test_contours_lie_on_the_surface_at_round_heights(plotter: Any, pool: Reconstruction) -> None:
     drawing = draws.build_scene(plotter, replace(scene_of(pool), contours=True))
     lines, actor = drawing._parts["contours"]
     heights = np.unique(np.round(lines.points[:, 2] / scenes.EXAGGERATION, 6))
@@ -317,7 +319,7 @@ def test_lines_of_equal_height_are_on_the_surface_at_round_heights(
     assert not actor.GetVisibility()
 
 
-def test_the_work_piece_is_drawn_round_the_pool(plotter: Any, pool: Reconstruction) -> None:
+def test_work_piece_is_drawn_around_the_pool(plotter: Any, pool: Reconstruction) -> None:
     drawing = draws.build_scene(plotter, scene_of(pool))
     drawing.look("top")
     plate, actor = drawing._parts["plate"]
@@ -326,75 +328,73 @@ def test_the_work_piece_is_drawn_round_the_pool(plotter: Any, pool: Reconstructi
     box, edge = drawing.overlay.box_mm, scene_of(pool).plate_mm
     x, y = edge[:, 0], edge[:, 1]
     hole = 0.5 * abs(float(x @ np.roll(y, 1) - y @ np.roll(x, 1)))
-    # But for the corners, which are cut between two points of the edge.
+    # The tolerance is for the corners, which are cut off between two points of the edge.
     assert area == pytest.approx(np.prod(np.ptp(box, axis=0)[:2]) - hole, rel=0.02)
 
 
 @pytest.mark.parametrize("colour", ["sigma", "residual"])
-def test_errors_have_one_map_from_zero(pool: Reconstruction, colour: scenes.Colour) -> None:
-    made = scene_of(pool, colour)
-    assert made.colour_map == scenes.ERROR_MAP
-    assert made.limits == (0.0, pytest.approx(made.values.max()))
+def test_errors_have_one_colour_map_from_zero(pool: Reconstruction, colour: scenes.Colour) -> None:
+    scene = scene_of(pool, colour)
+    assert scene.colour_map == scenes.ERROR_MAP
+    assert scene.limits == (0.0, pytest.approx(scene.values.max()))
 
 
-def test_residuals_are_those_of_the_points(pool: Reconstruction) -> None:
+def test_residuals_at_the_points_are_exact(pool: Reconstruction) -> None:
     lengths = np.linalg.norm(pool.residual_mm, axis=1)
-    at = pool.points_mm[np.isfinite(lengths)]
-    found = between_points(pool, lengths, *at[:, :2].T)
-    assert found == pytest.approx(lengths[np.isfinite(lengths)], abs=1e-9)
+    points = pool.points_mm[np.isfinite(lengths)]
+    interpolated = between_points(pool, lengths, *points[:, :2].T)
+    assert interpolated == pytest.approx(lengths[np.isfinite(lengths)], abs=1e-9)
 
 
-def test_axes_stay_while_pools_fill_them(plotter: Any, pool: Reconstruction) -> None:
+def test_steady_axes_change_only_if_necessary(plotter: Any, pool: Reconstruction) -> None:
     def scaled(factor: float) -> scenes.Scene:
-        made = scene_of(pool)
-        return replace(made, vertices_mm=made.vertices_mm * factor)
+        scene = scene_of(pool)
+        return replace(scene, vertices_mm=scene.vertices_mm * factor)
 
     def bounds(drawing: draws.Drawing, factor: float) -> tuple[float, ...]:
         drawing.update(scaled(factor))
         return tuple(drawing.overlay.box_mm.ravel())
 
     steady = draws.build_scene(plotter, scaled(1.0), steady=True)
-    of_all = bounds(steady, 1.0)
-    assert bounds(steady, 0.9) == of_all
+    initial = bounds(steady, 1.0)
+    assert bounds(steady, 0.9) == initial
     larger = bounds(steady, 1.4)
-    assert larger != of_all
-    assert bounds(steady, 1.0) != larger  # too small a pool in them
+    assert larger != initial
+    assert bounds(steady, 1.0) != larger  # the pool is too small for them
     plotter.clear()
-    alone = draws.build_scene(plotter, scaled(1.0))
-    assert bounds(alone, 1.0) == of_all
-    assert bounds(alone, 0.6) != of_all
+    unsteady = draws.build_scene(plotter, scaled(1.0))
+    assert bounds(unsteady, 1.0) == initial
+    assert bounds(unsteady, 0.6) != initial
 
 
-def test_a_dark_window_has_a_dark_scene(plotter: Any, pool: Reconstruction) -> None:
+def test_colours_of_a_dark_window_are_used(plotter: Any, pool: Reconstruction) -> None:
     drawing = draws.build_scene(plotter, scene_of(pool))
-    assert amount(seen(plotter), "#ffffff") > 60_000
+    assert pixels_of_colour(screenshot(plotter), "#ffffff") > 60_000
     drawing.update(replace(scene_of(pool), background="#202020", foreground="#e0e0e0"))
-    picture = seen(plotter)
-    assert amount(picture, "#202020") > 60_000
-    assert 50 < amount(picture, "#e0e0e0") < 10_000
+    picture = screenshot(plotter)
+    assert pixels_of_colour(picture, "#202020") > 60_000
+    assert 50 < pixels_of_colour(picture, "#e0e0e0") < 10_000
 
 
-def test_heights_are_drawn_as_told_and_the_axes_stay_true(
-    plotter: Any, pool: Reconstruction
-) -> None:
+def test_exaggerated_heights_keep_true_axes(plotter: Any, pool: Reconstruction) -> None:
     def extent(exaggeration: float) -> float:
         plotter.clear()
-        drawn = replace(scene_of(pool), exaggeration=exaggeration, electrode=False)
-        drawing = draws.build_scene(plotter, drawn)
+        scene = replace(scene_of(pool), exaggeration=exaggeration, electrode=False)
+        drawing = draws.build_scene(plotter, scene)
         drawing.look("front")
         assert drawing.overlay.box_mm[:, 2] == pytest.approx((0.0, 0.3))
-        top, bottom = np.nonzero(amount_rows(seen(plotter)))[0][[0, -1]]
+        top, bottom = np.nonzero(rows_with_pool(screenshot(plotter)))[0][[0, -1]]
         return float(bottom - top)
 
-    def amount_rows(picture: np.ndarray) -> np.ndarray:
+    def rows_with_pool(picture: np.ndarray) -> np.ndarray:
         saturated = picture[:, :380].max(axis=2) - picture[:, :380].min(axis=2) > 60
         return np.asarray(saturated.sum(axis=1) > 0)
 
-    once, thrice = extent(2.0), extent(6.0)
-    assert thrice == pytest.approx(3 * once, rel=0.2)
+    height_at_2, height_at_6 = extent(2.0), extent(6.0)
+    assert height_at_6 == pytest.approx(3 * height_at_2, rel=0.2)
 
 
-def test_a_picture_is_drawn_at_its_size(plotter: Any, pool: Reconstruction) -> None:
+def test_picture_has_the_given_size(plotter: Any, pool: Reconstruction) -> None:
     picture = Studio((320, 240), "side").draw(scene_of(pool))
     assert picture.shape == (240, 320, 3)
     assert picture.std() > 10

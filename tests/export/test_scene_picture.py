@@ -1,4 +1,4 @@
-"""The pool in 3-D, held against a kept picture."""
+"""The drawing of a pool in 3-D equals a stored picture."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from labapp.export.rendering.drawing import build_scene
 from labapp.export.rendering.scene import Scene
 from tests.pictures import RENEW, Away, away, check_picture
 
-KEPT_PICTURE = Path(__file__).parent / "pictures" / "pool.png"
+REFERENCE = Path(__file__).parent / "pictures" / "pool.png"
 
 TOLERANCE = Away(mean=1.0, share=0.008)
 
@@ -20,8 +20,8 @@ RINGS, SPOKES, RADIUS_MM = 12, 48, 3.0
 
 
 def pool(*, mirrored: bool = False, hollow: bool = False) -> Scene:
-    """A lopsided cap over a circle, its highest place towards +X; points on a cross, boundary."""
-    ring, spoke = (each.ravel() for each in np.mgrid[1 : RINGS + 1, :SPOKES])
+    """An asymmetric cap over a circle, highest towards +X, with points and boundary."""
+    ring, spoke = (index.ravel() for index in np.mgrid[1 : RINGS + 1, :SPOKES])
     radius, angle = RADIUS_MM * ring / RINGS, 2 * np.pi * spoke / SPOKES
     flat = np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
     flat = np.vstack([[0.0, 0.0], flat])
@@ -64,18 +64,20 @@ def picture(opengl: None) -> np.ndarray:
     return drawn(pool())
 
 
-def test_the_pool_is_drawn_as_it_was(
+def test_pool_equals_the_stored_picture(
     picture: np.ndarray, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    check_picture(picture, KEPT_PICTURE, TOLERANCE, tmp_path)
+    check_picture(picture, REFERENCE, TOLERANCE, tmp_path)
     monkeypatch.delenv(RENEW, raising=False)
     with pytest.raises(pytest.fail.Exception, match=r"pool-difference\.png"):
-        check_picture(drawn(pool(mirrored=True)), KEPT_PICTURE, TOLERANCE, tmp_path)
+        check_picture(drawn(pool(mirrored=True)), REFERENCE, TOLERANCE, tmp_path)
     assert (tmp_path / "pool-difference.png").is_file()
 
 
-@pytest.mark.parametrize("what", ["mirrored", "hollow", "colour map", "limits", "points", "height"])
-def test_what_is_drawn_otherwise_is_noticed(picture: np.ndarray, what: str) -> None:
+@pytest.mark.parametrize(
+    "change", ["mirrored", "hollow", "colour map", "limits", "points", "height"]
+)
+def test_changed_drawing_is_detected(picture: np.ndarray, change: str) -> None:
     other = {
         "mirrored": pool(mirrored=True),
         "hollow": pool(hollow=True),
@@ -83,5 +85,5 @@ def test_what_is_drawn_otherwise_is_noticed(picture: np.ndarray, what: str) -> N
         "limits": replace(pool(), limits=(0.0, 0.9)),
         "points": replace(pool(), points_mm=np.empty((0, 3))),
         "height": replace(pool(), exaggeration=pool().exaggeration * 1.5),
-    }[what]
+    }[change]
     assert not away(drawn(other), picture).within(TOLERANCE)

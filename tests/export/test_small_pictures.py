@@ -11,17 +11,17 @@ from labapp.export.rendering.studio import Studio
 
 @pytest.mark.parametrize("size_px", [(367, 226), (285, 170)])
 @pytest.mark.parametrize("view", ["top", "side", "front"])
-def test_names_and_numbers_stay_within_a_small_picture(
+def test_labels_stay_within_a_small_picture(
     measured: Measurement, view: Direction, size_px: tuple[int, int]
 ) -> None:
     pool = measured.reconstruction
     assert pool is not None
     picture = Studio(size_px, view).draw(scene_of(pool)).astype(int)
     ink = np.abs(picture - picture[-1, 0]).max(axis=2) > 40
-    assert not ink[:, -2:].any()  # what ends at the edge is cut there
+    assert not ink[:, -2:].any()  # ink at the edge would be cut off
     assert not ink[-2:].any()
     if view == "top":
-        # Below the drawing, beside what stands along Y: the numbers along X, and the axis's name.
+        # Below the drawing: the numbers along X and the name of the axis.
         lines = np.flatnonzero(ink[:, size_px[0] // 4 : size_px[0] * 2 // 3].any(axis=1))
         bands = np.split(lines, np.flatnonzero(np.diff(lines) > 2) + 1)
         assert [len(band) < 18 for band in bands[-3:]] == [False, True, True]

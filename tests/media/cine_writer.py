@@ -1,4 +1,4 @@
-"""Write Phantom .cine files from the published layout; shares nothing with the reader."""
+"""Write Phantom .cine files from the published layout, independently of the reader."""
 
 from __future__ import annotations
 
@@ -19,31 +19,31 @@ SETUP = (
     "RecordingTimeZone:i CFA:I Bright:i Contrast:i Gamma:i Res21:I AutoExpLevel:I AutoExpSpeed:I "
     "AutoExpRect:16s WBGain:32s Rotate:i WBView:8s RealBPP:I"
 )
-"""The structure's first fields in order, with their types; what follows them is left zero."""
+"""The first fields of the structure in order, with their types; the rest is zero."""
 
 SETUP_LENGTH = 5740
 
 
 def setup(length: int = SETUP_LENGTH, **values: float) -> bytes:
-    """The structure SETUP, cut to ``length`` as older versions of the software end it."""
+    """The structure SETUP, truncated to ``length`` as written by older software."""
     content = b""
     for field in SETUP.split():
         name, code = field.split(":")
-        given = {"Mark": b"ST", "Length": length}.get(name, values.get(name))
+        value = {"Mark": b"ST", "Length": length}.get(name, values.get(name))
         zero: object = b"" if code.endswith("s") else 0
-        content += struct.pack("<" + code, zero if given is None else given)
+        content += struct.pack("<" + code, zero if value is None else value)
     return content.ljust(max(length, len(content)), b"\0")[:length]
 
 
 def pack(levels: np.ndarray, bits: int) -> bytes:
-    """Levels one after the other, highest bit first."""
+    """Pack levels one after the other, most significant bit first."""
     text = "".join(f"{level:0{bits}b}" for level in levels.ravel())
     text += "0" * (-len(text) % 8)
     return int(text, 2).to_bytes(len(text) // 8, "big")
 
 
 def image_bytes(picture: np.ndarray, compression: int, row_step: int) -> bytes:
-    """One picture as it is stored: packed from the top, else from the bottom, blue first."""
+    """One picture as stored: packed from the top, or from the bottom with blue first."""
     if compression:
         return pack(picture, {256: 10, 1024: 12}[compression])
     rows = []
@@ -83,10 +83,10 @@ def write_cine(
         for kind, block in ((1003, exposures), (1002, stamps)):
             head += struct.pack("<I2H", 8 + len(block), kind, 0) + block
     table_at = 44 + len(head)
-    at = table_at + 8 * len(pictures)
+    offset = table_at + 8 * len(pictures)
     places, body = [], b""
     for content in stored:
-        places.append(at + len(body))
+        places.append(offset + len(body))
         body += struct.pack("<I", 8 + len(annotation)) + annotation
         body += struct.pack("<I", len(content)) + content
     file_header = struct.pack(

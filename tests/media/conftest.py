@@ -21,13 +21,13 @@ Encode = Callable[..., Path]
 
 @pytest.fixture(autouse=True)
 def waiting_frames(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Frames wait for a reader that comes late because the machine is busy with other tests."""
+    """Buffer frames longer, because a reader may be late on a busy machine."""
     monkeypatch.setattr(base, "BUFFERED_S", PATIENCE_S)
 
 
 @pytest.fixture
 def pictures() -> Pictures:
-    """A bright blob that moves 4 px a frame over noise: no two frames alike."""
+    """A bright blob that moves 4 px per frame over noise; no two frames are equal."""
     rng = np.random.default_rng(5)
     y, x = np.mgrid[:48, :64]
     return [
@@ -74,8 +74,8 @@ def _encode(
 
 @pytest.fixture(scope="session")
 def encode() -> Encode:
-    """Have ffmpeg write grey pictures at 60 frames a second: (path, pictures, *options) -> path.
+    """Encode grey pictures with ffmpeg at 60 frames a second: (path, pictures, *options) -> path.
 
-    ``levels`` is ffmpeg's name for how they are stored: gray, gray10le, … gray16le.
+    ``levels`` is the name of their format in ffmpeg: gray, gray10le, … gray16le.
     """
     return _encode

@@ -1,4 +1,4 @@
-"""Damage a recording in many ways and hold that only `InputError` comes of it, and soon."""
+"""Damage a recording in many ways: only `InputError` may be raised, and quickly."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from labapp.errors import InputError
 from labapp.media import open_source
 
 MOST_BYTES = 1 << 30
-"""No damaged file of a few kilobytes makes a reader take so much more memory."""
+"""Limit of additional memory to read a damaged file of a few kilobytes."""
 
 
 @contextmanager
-def little_memory() -> Iterator[None]:
-    """Let an allocation of a gigabyte fail."""
+def limited_memory() -> Iterator[None]:
+    """Make an allocation of a gigabyte fail."""
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     with open("/proc/self/statm") as file:
-        taken = int(file.read().split()[0]) * resource.getpagesize()
-    resource.setrlimit(resource.RLIMIT_AS, (taken + MOST_BYTES, hard))
+        used = int(file.read().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (used + MOST_BYTES, hard))
     try:
         yield
     finally:
@@ -32,7 +32,7 @@ def little_memory() -> Iterator[None]:
 
 def read_all(path: Path) -> int:
     """Number of frames that can be read."""
-    whole = 0
+    count = 0
     with open_source(path) as source:
         for index in range(min(len(source), 50)):
             try:
@@ -40,33 +40,33 @@ def read_all(path: Path) -> int:
             except InputError:
                 continue
             assert frame.image.shape == source.shape
-            whole += 1
-    return whole
+            count += 1
+    return count
 
 
 def survives_damage(path: Path, count: int, head: int, seed: int) -> None:
-    """Flip bytes (most of them in the first or last ``head``) and cut, ``count`` times."""
+    """Change bytes (most in the first or last ``head``) or truncate, ``count`` times."""
     rng = np.random.default_rng(seed)
     content = path.read_bytes()
-    places = np.r_[: min(head, len(content)), max(0, len(content) - head) : len(content)]
-    opened = 0
-    with little_memory():
+    ends = np.r_[: min(head, len(content)), max(0, len(content) - head) : len(content)]
+    readable = 0
+    with limited_memory():
         for k in range(count):
             damaged = bytearray(content)
             if k % 10 == 9:
                 del damaged[int(rng.integers(1, len(content))) :]
             else:
-                among = places if k % 3 else np.arange(len(content))
-                for place in rng.choice(among, 1 + k % 3):
-                    damaged[place] = int(rng.integers(256)) if k % 2 else 255
+                among = ends if k % 3 else np.arange(len(content))
+                for index in rng.choice(among, 1 + k % 3):
+                    damaged[index] = int(rng.integers(256)) if k % 2 else 255
             path.write_bytes(damaged)
             began = time.process_time()
             try:
-                opened += read_all(path) > 0
+                readable += read_all(path) > 0
             except InputError as error:
                 assert str(path.parent) in str(error)  # noqa: PT017
-            # What this process took, not what others on the machine did.
+            # The time of this process only, because the machine may be busy.
             assert time.process_time() - began < 1
             assert path.read_bytes() == damaged
-    # Not one that is still read, or all of them, would mean that nothing was tried.
-    assert 0 < opened < count
+    # If none or all of the files can be read, the test is not meaningful.
+    assert 0 < readable < count

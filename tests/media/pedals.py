@@ -1,4 +1,4 @@
-"""Foot switches for tests: their recorded reports, and a device that fails when it is unplugged."""
+"""Foot switches for tests: recorded reports, and a device that fails when it is unplugged."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ INFINITY = HidInfo("/dev/hidraw4", 0x05F3, 0x00FF, 0, (12, 3), "VEC Infinity foo
 PCSENSOR = HidInfo("/dev/hidraw5", 0x3553, 0xB001, 0, (1, 6), "PCsensor FootSwitch")
 MOUSE_3D = HidInfo("/dev/hidraw6", 0x256F, 0xC635, 0, (1, 8), "SpaceMouse Compact")
 
-# A boot keyboard's report descriptor (HID 1.11, appendix B.1).
+# Report descriptor of a boot keyboard (HID 1.11, appendix B.1).
 KEYBOARD = bytes.fromhex(
     "05010906a101050719e029e71500250175019508810295017508810195057501050819012905910295017503"
     "9101950675081500256505071900296581 00c0".replace(" ", "")
 )
-# Of the Infinity: no number (three buttons, padding).
+# Report descriptor of the Infinity: no report number (three buttons, padding).
 THREE = bytes.fromhex("050c0903a101050919012903150025017501950381029501750d8101c0")
-# Of a 3-D controller: its axes in report 1, buttons in 3.
+# Report descriptor of a 3-D controller: axes in report 1, buttons in report 3.
 AXES = bytes.fromhex("05010908a1018501095109308102c0")
 
 
 class Device:
-    """A device that sends what it is given, and fails when it is unplugged."""
+    """A device that sends given reports, and fails when it is unplugged."""
 
     def __init__(self, descriptor: bytes = THREE) -> None:
         self.descriptor = descriptor
@@ -57,7 +57,7 @@ class Device:
 
 
 class Bench:
-    """What is plugged in, several devices; each reader of one gets all its reports.
+    """Several connected devices; each reader of a device gets all its reports.
 
     Parameters
     ----------
@@ -77,10 +77,10 @@ class Bench:
         if info in self.closed:
             raise HidError(f"{info.name} may not be read")
         source = self.devices[info]
-        made = Reader(source)
-        made.open(info)
-        self.readers.append((info, made))
-        return made
+        reader = Reader(source)
+        reader.open(info)
+        self.readers.append((info, reader))
+        return reader
 
     def press(self, info: HidInfo, *reports: str) -> None:
         for other, reader in self.readers:
@@ -89,7 +89,7 @@ class Bench:
 
 
 class Reader(Device):
-    """One who reads a device."""
+    """A reader of a device."""
 
     def __init__(self, source: Device) -> None:
         super().__init__(source.descriptor)

@@ -1,4 +1,4 @@
-"""Write Photron .mraw files and their headers; shares nothing with the reader."""
+"""Write Photron .mraw files and their headers, independently of the reader."""
 
 from __future__ import annotations
 
@@ -55,11 +55,11 @@ def write_photron(
     side: str = "Lower",
     rate: object = 2000,
     step: int = 1,
-    said: Mapping[str, object] | None = None,
+    header_fields: Mapping[str, object] | None = None,
 ) -> Path:
     """Write run.mraw with ``bits`` a level, and its header, which is returned.
 
-    The header says ``said`` in place of what is true.
+    ``header_fields`` replaces the true values of the header.
     """
     rows, columns = pictures[0].shape[:2]
     channels = 3 if pictures[0].ndim == 3 else 1
@@ -81,7 +81,7 @@ def write_photron(
         "depth": depth or bits,
         "side": side,
         "step": step,
-        **(said or {}),
+        **(header_fields or {}),
     }
     header = folder / f"run{suffix}"
     if suffix == ".cih":

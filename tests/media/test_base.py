@@ -6,7 +6,7 @@ from labapp.media.base import format_frame_rate
 
 
 @pytest.mark.parametrize(
-    ("rate_hz", "words"),
+    ("rate_hz", "text"),
     [
         (1.0, "1 frame/s"),
         (60.0, "60 frames/s"),
@@ -18,5 +18,5 @@ from labapp.media.base import format_frame_rate
         (1_234_567.0, "1234567 frames/s"),
     ],
 )
-def test_a_frame_rate_is_told_with_sensible_digits(rate_hz: float, words: str) -> None:
-    assert format_frame_rate(rate_hz) == words
+def test_frame_rate_is_formatted_with_sensible_digits(rate_hz: float, text: str) -> None:
+    assert format_frame_rate(rate_hz) == text

@@ -1,4 +1,4 @@
-"""MP4s that promise more than they hold."""
+"""MP4 files whose headers claim more frames than they contain."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ def box(kind: bytes, *content: bytes) -> bytes:
     return struct.pack(">I", 8 + len(body)) + kind + body
 
 
-def changed(content: bytes, kind: bytes, at: int, *values: int) -> bytes:
-    """A file with other numbers behind the type of its first box of a kind."""
-    place = content.index(kind) + 4 + at
+def changed(content: bytes, kind: bytes, offset: int, *values: int) -> bytes:
+    """Return the file with other numbers after the type of its first box of a kind."""
+    start = content.index(kind) + 4 + offset
     new = struct.pack(f">{len(values)}I", *values)
-    return content[:place] + new + content[place + len(new) :]
+    return content[:start] + new + content[start + len(new) :]
 
 
 def many_samples() -> bytes:
-    """One chunk of frames of a byte each, as long as each other."""
+    """One chunk of equally long frames of one byte each."""
     content = changed(H264.read_bytes(), b"stsz", 4, 1, MANY)
     content = changed(content, b"stts", 4, 1, MANY, 512)
     content = changed(content, b"stsc", 4, 1, 1, MANY, 1)
@@ -51,14 +51,14 @@ def packed() -> bytes:
 
 
 @pytest.mark.parametrize("forge", [many_samples, many_in_a_fragment, many_edits, packed])
-def test_samples_that_cannot_be_in_the_file_are_refused(tmp_path: Path, forge: object) -> None:
+def test_impossible_number_of_samples_is_rejected(tmp_path: Path, forge: object) -> None:
     path = tmp_path / "v.mp4"
     path.write_bytes(forge())
     with pytest.raises(InputError, match=r"samples and edits: .*no more frames"):
         open_source(path)
 
 
-def test_what_would_fill_the_memory_is_refused_at_once(tmp_path: Path) -> None:
+def test_file_that_would_fill_the_memory_is_rejected(tmp_path: Path) -> None:
     path = tmp_path / "v.mp4"
     path.write_bytes(many_samples())
     script = """
@@ -73,14 +73,14 @@ def test_what_would_fill_the_memory_is_refused_at_once(tmp_path: Path) -> None:
     assert peak_mb(script, path) < 300
 
 
-def test_a_long_box_and_frames_are_no_promise(tmp_path: Path) -> None:
-    """Of the frames themselves any bytes are right; a box may have a length of eight bytes."""
+def test_only_tables_of_samples_are_checked(tmp_path: Path) -> None:
+    """Frames may contain any bytes, and a box may have a length of eight bytes."""
     inside = box(b"stsz", bytes(8), b"\xff" * 4)
     longer = struct.pack(">I4sQ", 1, b"free", 32) + bytes(16)
     path = tmp_path / "v.mp4"
     path.write_bytes(H264.read_bytes() + longer + box(b"mdat", inside))
-    with open_source(path) as source, open_source(H264) as whole:
-        assert len(source) == len(whole)
+    with open_source(path) as source, open_source(H264) as original:
+        assert len(source) == len(original)
     path.write_bytes(
         H264.read_bytes() + box(b"free", struct.pack(">I4sQ3I", 1, b"stsz", 28, 0, 0, MANY))
     )
@@ -88,8 +88,8 @@ def test_a_long_box_and_frames_are_no_promise(tmp_path: Path) -> None:
         open_source(path)
 
 
-def test_what_does_not_begin_as_one_is_none(tmp_path: Path) -> None:
-    """FFmpeg would take it for one by what follows, and by its name."""
+def test_file_without_the_start_of_an_mp4_is_rejected(tmp_path: Path) -> None:
+    """FFmpeg would accept it because of the following boxes and its name."""
     path = tmp_path / "v.mp4"
     path.write_bytes(box(b"test") + many_samples())
     with pytest.raises(InputError, match="not a video"):

@@ -29,7 +29,7 @@ def images(path: Path) -> list[np.ndarray]:
     [(GREY_8, 0, 8), (GREY_12, 0, 12), (GREY_12, 1024, 12)],
     ids=["8 bit", "12 of 16 bit", "packed 12 bit"],
 )
-def test_every_frame_is_the_one_written(
+def test_every_frame_equals_the_written_one(
     tmp_path: Path, pictures: list[np.ndarray], compression: int, bits: int
 ) -> None:
     path = write_cine(tmp_path / "run.cine", pictures, compression=compression, RealBPP=bits)
@@ -79,15 +79,15 @@ def test_colour_becomes_luminance(tmp_path: Path, scale: int) -> None:
 def test_ffmpeg_reads_the_same_frames(tmp_path: Path, pixels: str) -> None:
     pictures = {"gray": GREY_8, "gray16le": GREY_12, "bgr24": COLOUR_8}[pixels]
     path = write_cine(tmp_path / "run.cine", pictures, annotation=b"12345678")
-    wanted = f"-f rawvideo -pix_fmt {pixels} -fps_mode passthrough -"
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", path, *wanted.split()]
+    options = f"-f rawvideo -pix_fmt {pixels} -fps_mode passthrough -"
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", "-i", path, *options.split()]
     read = subprocess.run(command, capture_output=True, check=True).stdout
-    theirs = np.frombuffer(read, pictures[0].dtype).reshape(len(pictures), *pictures[0].shape)
+    expected = np.frombuffer(read, pictures[0].dtype).reshape(len(pictures), *pictures[0].shape)
     if pixels == "bgr24":
-        theirs = np.rint(theirs @ [0.114, 0.587, 0.299])
-        np.testing.assert_allclose(images(path), theirs, atol=1)
+        expected = np.rint(expected @ [0.114, 0.587, 0.299])
+        np.testing.assert_allclose(images(path), expected, atol=1)
     else:
-        np.testing.assert_array_equal(images(path), theirs)
+        np.testing.assert_array_equal(images(path), expected)
 
 
 def test_rows_may_be_padded_and_stored_from_the_top(tmp_path: Path) -> None:
@@ -100,7 +100,7 @@ def test_rows_may_be_padded_and_stored_from_the_top(tmp_path: Path) -> None:
     np.testing.assert_array_equal(images(path), [picture[::-1] for picture in pictures])
 
 
-def test_times_are_the_recorded_ones(tmp_path: Path) -> None:
+def test_recorded_times_are_read(tmp_path: Path) -> None:
     times = [1_600_000_000.9995, 1_600_000_001.0005, 1_600_000_001.0016, 1_600_000_001.0025]
     path = write_cine(tmp_path / "run.cine", GREY_8[:4], times=times, FrameRate=997)
     with open_source(path) as source:
@@ -110,14 +110,14 @@ def test_times_are_the_recorded_ones(tmp_path: Path) -> None:
     assert recorded[0] == 0
 
 
-def test_times_that_do_not_grow_give_way_to_the_frame_rate(tmp_path: Path) -> None:
+def test_decreasing_times_are_replaced_by_the_frame_rate(tmp_path: Path) -> None:
     path = write_cine(tmp_path / "run.cine", GREY_8[:3], times=[5.0, 5.2, 5.1], FrameRate=100)
     with open_source(path) as source:
         assert [frame.time_s for frame in source] == [0, 0.01, 0.02]
         assert "time stamps do not increase" in source.warnings[0]
 
 
-def test_a_rate_that_is_not_said_is_that_of_the_times(tmp_path: Path) -> None:
+def test_missing_frame_rate_is_computed_from_the_times(tmp_path: Path) -> None:
     path = write_cine(tmp_path / "run.cine", GREY_8[:3], times=[5.0, 5.25, 5.5], FrameRate=0)
     with open_source(path) as source:
         assert source.frame_rate_hz == pytest.approx(4)
@@ -127,7 +127,7 @@ def test_a_rate_that_is_not_said_is_that_of_the_times(tmp_path: Path) -> None:
         assert source.frame(1).time_s is None
 
 
-def test_old_files_end_their_setup_early(tmp_path: Path) -> None:
+def test_short_setup_of_old_files_is_read(tmp_path: Path) -> None:
     path = write_cine(tmp_path / "run.cine", GREY_8, setup_length=740, FrameRate16=500)
     with open_source(path) as source:
         assert source.frame_rate_hz == 500
@@ -135,7 +135,7 @@ def test_old_files_end_their_setup_early(tmp_path: Path) -> None:
         np.testing.assert_array_equal(source.frame(4).image, GREY_8[4])
 
 
-def test_raw_colour_and_turned_pictures_are_said(tmp_path: Path) -> None:
+def test_raw_colour_and_rotated_pictures_are_reported(tmp_path: Path) -> None:
     path = write_cine(
         tmp_path / "run.cine", GREY_12, file_compression=2, CFA=3, bFlipV=1, RealBPP=12
     )
@@ -146,7 +146,7 @@ def test_raw_colour_and_turned_pictures_are_said(tmp_path: Path) -> None:
     assert "flipped or rotated" in turned
 
 
-def test_a_recording_cut_off_gives_its_whole_frames(tmp_path: Path) -> None:
+def test_truncated_recording_has_its_complete_frames(tmp_path: Path) -> None:
     path = write_cine(tmp_path / "run.cine", GREY_8, times=[1, 2, 3, 4, 5])
     content = path.read_bytes()
     path.write_bytes(content[: -(14 * 24 + 8) - 1])
@@ -162,7 +162,7 @@ def test_a_recording_cut_off_gives_its_whole_frames(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("at", "value", "said"),
+    ("offset", "value", "message"),
     [
         (4, struct.pack("<H", 1), "Compression: JPEG"),
         (4, struct.pack("<H", 9), "Compression: 9"),
@@ -176,16 +176,16 @@ def test_a_recording_cut_off_gives_its_whole_frames(tmp_path: Path) -> None:
         (84 + 140, b"XX", "SETUP: no mark"),
     ],
 )
-def test_what_cannot_be_is_named(tmp_path: Path, at: int, value: bytes, said: str) -> None:
+def test_impossible_field_is_named(tmp_path: Path, offset: int, value: bytes, message: str) -> None:
     path = write_cine(tmp_path / "run.cine", GREY_8)
     content = bytearray(path.read_bytes())
-    content[at : at + len(value)] = value
+    content[offset : offset + len(value)] = value
     path.write_bytes(content)
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=message):
         open_source(path)
 
 
-def test_one_bad_place_leaves_the_other_frames(tmp_path: Path) -> None:
+def test_bad_offset_does_not_affect_the_other_frames(tmp_path: Path) -> None:
     path = write_cine(tmp_path / "run.cine", GREY_8)
     content = bytearray(path.read_bytes())
     table_at = struct.unpack_from("<I", content, 32)[0]
@@ -200,7 +200,7 @@ def test_one_bad_place_leaves_the_other_frames(tmp_path: Path) -> None:
             source.frame(2)
 
 
-def test_another_file_with_that_name_is_refused(tmp_path: Path) -> None:
+def test_other_content_with_the_suffix_is_rejected(tmp_path: Path) -> None:
     path = tmp_path / "run.cine"
     for content in (b"CI", b"x" * 100):
         path.write_bytes(content)
@@ -208,7 +208,7 @@ def test_another_file_with_that_name_is_refused(tmp_path: Path) -> None:
             open_source(path)
 
 
-def test_damaged_files_are_refused_or_read(tmp_path: Path) -> None:
+def test_damaged_files_are_read_or_rejected(tmp_path: Path) -> None:
     plain = write_cine(tmp_path / "run.cine", GREY_8, times=[1, 2, 3, 4, 5])
     survives_damage(plain, 300, 1000, 1)
     packed = write_cine(tmp_path / "packed.cine", GREY_12, compression=1024, RealBPP=12)

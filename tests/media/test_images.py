@@ -31,7 +31,7 @@ def save(path: Path, image: np.ndarray) -> Path:
     ("suffix", "levels"),
     [("png", 1), ("tiff", 1), ("bmp", 1), ("pgm", 1), ("png", 257), ("tiff", 257), ("pgm", 257)],
 )
-def test_grey_levels_are_kept(tmp_path: Path, suffix: str, levels: int) -> None:
+def test_grey_levels_are_preserved(tmp_path: Path, suffix: str, levels: int) -> None:
     image = GREY if levels == 1 else GREY.astype(np.uint16) * levels
     with open_source(save(tmp_path / f"frame.{suffix}", image)) as source:
         assert len(source) == 1
@@ -62,7 +62,7 @@ def test_colour_becomes_luminance_and_alpha_is_dropped(tmp_path: Path, scale: in
     np.testing.assert_allclose(grey, expected * scale, atol=0.6 * scale)
 
 
-def test_floats_stay_floats(tmp_path: Path) -> None:
+def test_floats_are_preserved(tmp_path: Path) -> None:
     image = GREY.astype(np.float32) / 7
     with open_source(save(tmp_path / "frame.tiff", image)) as source:
         np.testing.assert_array_equal(source.frame(0).image, image)
@@ -81,7 +81,7 @@ def test_one_pixel_is_an_image(tmp_path: Path) -> None:
         assert source.frame(0).image[0, 0] == 9
 
 
-def test_nan_is_refused(tmp_path: Path) -> None:
+def test_nan_is_rejected(tmp_path: Path) -> None:
     image = np.ones((3, 3), np.float32)
     image[1, 1] = np.nan
     with pytest.raises(InputError, match=r"frame\.tiff: grey levels: NaN or infinity"):
@@ -98,7 +98,7 @@ def test_each_page_of_a_stack_is_a_frame(tmp_path: Path) -> None:
     assert len(images) == 3
 
 
-def test_a_folder_is_read_in_natural_order(tmp_path: Path) -> None:
+def test_folder_is_read_in_natural_order(tmp_path: Path) -> None:
     for k in (10, 9, 1, 100):
         save(tmp_path / f"frame{k}.png", np.full((4, 4), k, np.uint8))
     (tmp_path / "notes.txt").write_text("not an image")
@@ -113,7 +113,7 @@ def test_digits_sort_as_numbers_beside_letters() -> None:
     assert sorted(names, key=natural_key) == ["2", "10", "a", "A2", "a10", "b1"]
 
 
-def test_one_bad_picture_in_a_folder_leaves_the_others(tmp_path: Path) -> None:
+def test_bad_image_in_a_folder_does_not_affect_the_others(tmp_path: Path) -> None:
     save(tmp_path / "1.png", GREY)
     (tmp_path / "0.png").write_bytes(b"")
     (tmp_path / "2.png").write_bytes((tmp_path / "1.png").read_bytes()[:60])
@@ -136,7 +136,7 @@ def test_there_is_no_frame_beyond_the_last(tmp_path: Path) -> None:
                 source.frame(index)
 
 
-def test_content_tells_what_a_file_is_before_its_name(tmp_path: Path) -> None:
+def test_content_of_a_file_has_priority_over_its_name(tmp_path: Path) -> None:
     saved = tmp_path / "stack.npy"
     np.save(saved, GREY[np.newaxis])
     tiff = save(tmp_path / "frame.tif", GREY)
@@ -149,14 +149,14 @@ def test_content_tells_what_a_file_is_before_its_name(tmp_path: Path) -> None:
             (tmp_path / name).rename(path)
 
 
-def test_a_webp_is_an_image_though_it_begins_like_an_avi(tmp_path: Path) -> None:
+def test_webp_is_not_taken_for_an_avi(tmp_path: Path) -> None:
     path = tmp_path / "frame.webp"
     assert cv2.imwrite(str(path), GREY, [cv2.IMWRITE_WEBP_QUALITY, 101])
     with open_source(path) as source:
         np.testing.assert_array_equal(source.frame(0).image, GREY)
 
 
-def test_the_one_recording_in_a_folder_is_opened(
+def test_only_recording_in_a_folder_is_opened(
     tmp_path: Path, pictures: list[np.ndarray], write_video: WriteVideo
 ) -> None:
     (tmp_path / "notes.txt").write_text("not a recording")
@@ -170,11 +170,11 @@ def test_the_one_recording_in_a_folder_is_opened(
     video.unlink()
     with open_source(tmp_path) as source:
         assert source.name == cine.name
-    # One image beside it may be the calibration picture.
+    # A single image beside it may be the calibration picture.
     save(tmp_path / "1.png", GREY)
     with pytest.raises(InputError, match=r"1\.png, run\.cine; expected one recording in it"):
         open_source(tmp_path)
-    # Images go before recordings: a folder of them often holds the video they came from.
+    # Images have priority: their folder often contains the video from which they come.
     save(tmp_path / "2.png", GREY)
     with open_source(tmp_path) as source:
         assert len(source) == 2
@@ -182,7 +182,7 @@ def test_the_one_recording_in_a_folder_is_opened(
 
 
 @pytest.mark.parametrize("suffix", ["cine", "cihx", "cih", "mraw", "npy", "npz", "tif", "avi"])
-def test_an_unknown_content_is_named_by_what_the_name_promises(tmp_path: Path, suffix: str) -> None:
+def test_error_of_unknown_content_depends_on_the_suffix(tmp_path: Path, suffix: str) -> None:
     path = tmp_path / f"run.{suffix}"
     path.write_text("not a recording\n" * 20)
     with pytest.raises(InputError) as caught:
@@ -193,7 +193,7 @@ def test_an_unknown_content_is_named_by_what_the_name_promises(tmp_path: Path, s
 
 
 @pytest.mark.parametrize("suffix", ["png", "tiff", "bmp", "jpg", "pgm"])
-def test_half_an_image_is_refused(
+def test_truncated_image_is_rejected(
     tmp_path: Path, suffix: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
     path = save(tmp_path / f"frame.{suffix}", GREY)
@@ -205,7 +205,7 @@ def test_half_an_image_is_refused(
 
 
 def png(path: Path, side: int) -> Path:
-    """A black picture, made a row at a time."""
+    """Write a black image row by row."""
 
     def chunk(kind: bytes, content: bytes) -> bytes:
         return (
@@ -233,8 +233,8 @@ def tiff(path: Path, side: int) -> Path:
 
 
 @pytest.mark.parametrize("kind", [b"tEXt", b"IDAT"])
-def test_a_chunk_longer_than_its_picture_is_refused(tmp_path: Path, kind: bytes) -> None:
-    """OpenCV would make room for all that it says to be."""
+def test_chunk_longer_than_its_file_is_rejected(tmp_path: Path, kind: bytes) -> None:
+    """OpenCV would allocate memory for the claimed length."""
     path = tmp_path / "large.png"
     content = cv2.imencode(".png", GREY)[1].tobytes()
     end = content.index(b"IDAT") - 4
@@ -253,7 +253,7 @@ def test_a_chunk_longer_than_its_picture_is_refused(tmp_path: Path, kind: bytes)
 
 
 @pytest.mark.parametrize("write", [png, tiff])
-def test_a_picture_that_would_fill_the_memory_is_refused(
+def test_image_that_would_fill_the_memory_is_rejected(
     tmp_path: Path, write: Callable[[Path, int], Path]
 ) -> None:
     path = write(tmp_path / "large", 20_000)
@@ -273,7 +273,7 @@ def test_a_picture_that_would_fill_the_memory_is_refused(
 
 
 @pytest.mark.parametrize("name", ["pipe", "pipe.png", "pipe.avi", "pipe.mraw", "a\0.png", "folder"])
-def test_what_is_no_regular_file_is_refused(tmp_path: Path, name: str) -> None:
+def test_source_must_be_a_regular_file(tmp_path: Path, name: str) -> None:
     (tmp_path / "folder").mkdir()
     for pipe in ("pipe", "pipe.png", "pipe.avi", "pipe.mraw", "folder/1.png", "folder/2.png"):
         os.mkfifo(tmp_path / pipe)
@@ -288,7 +288,7 @@ def test_what_is_no_regular_file_is_refused(tmp_path: Path, name: str) -> None:
     assert run_python(script).strip()
 
 
-def test_what_is_no_source_is_refused(tmp_path: Path) -> None:
+def test_invalid_source_is_rejected(tmp_path: Path) -> None:
     empty = tmp_path / "empty"
     empty.mkdir()
     (tmp_path / "day" / "run").mkdir(parents=True)
@@ -296,7 +296,7 @@ def test_what_is_no_source_is_refused(tmp_path: Path) -> None:
     nothing.touch()
     text = tmp_path / "text.png"
     text.write_text("not an image\n" * 50)
-    for path, said in [
+    for path, message in [
         (empty, "no image or recording in it; expected a folder of images"),
         (tmp_path / "day", "folders, but no image or recording; .* as a study"),
         (nothing, "0 bytes; expected an image or a video"),
@@ -304,6 +304,6 @@ def test_what_is_no_source_is_refused(tmp_path: Path) -> None:
         (tmp_path / "missing.png", "No such file or directory; expected an image, a folder"),
         (text / "below.png", "Not a directory"),
     ]:
-        with pytest.raises(InputError, match=said) as caught:
+        with pytest.raises(InputError, match=message) as caught:
             open_source(path)
         assert os.fspath(path) in str(caught.value)

@@ -24,7 +24,7 @@ def save(path: Path, array: np.ndarray) -> Path:
 
 @pytest.mark.parametrize("kind", ["u1", "<u2", ">u2"])
 @pytest.mark.parametrize("order", ["C", "F"])
-def test_every_frame_is_the_one_saved(tmp_path: Path, kind: str, order: str) -> None:
+def test_every_frame_equals_the_saved_one(tmp_path: Path, kind: str, order: str) -> None:
     stack = np.array(GREY.astype(kind) * (1 if kind == "u1" else 251), order=order)
     with open_source(save(tmp_path / "run.npy", stack)) as source:
         assert (len(source), source.shape) == (6, (9, 13))
@@ -58,14 +58,14 @@ def test_other_types_become_float32(tmp_path: Path, kind: type) -> None:
         np.testing.assert_array_equal(source.frame(2).image, GREY[2])
 
 
-def test_true_is_white(tmp_path: Path) -> None:
+def test_booleans_become_black_and_white(tmp_path: Path) -> None:
     with open_source(save(tmp_path / "run.npy", GREY > 99)) as source:
         assert source.bit_depth == 8
         np.testing.assert_array_equal(source.frame(1).image, np.where(GREY[1] > 99, 255, 0))
 
 
 @pytest.mark.parametrize("write", [np.savez, np.savez_compressed])
-def test_an_archive_may_give_the_times(tmp_path: Path, write: object) -> None:
+def test_archive_may_contain_times(tmp_path: Path, write: object) -> None:
     path = tmp_path / "run.npz"
     times = np.array([3.0, 3.5, 4.0, 4.5, 5.0, 5.75])
     write(path, frames=GREY, other=COLOUR, time_s=times)
@@ -81,7 +81,7 @@ def test_an_archive_may_give_the_times(tmp_path: Path, write: object) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arrays", "said"),
+    ("arrays", "message"),
     [
         ({"a": GREY, "b": GREY}, "arrays: a, b; expected a .npz with an array"),
         ({}, "arrays: none"),
@@ -94,18 +94,18 @@ def test_an_archive_may_give_the_times(tmp_path: Path, write: object) -> None:
         ({"frames": GREY, "frame_rate_hz": np.array("x")}, "type: .*an array of numbers"),
     ],
 )
-def test_an_archive_that_cannot_be_meant_is_refused(
-    tmp_path: Path, arrays: dict[str, np.ndarray], said: str
+def test_wrong_arrays_of_an_archive_are_rejected(
+    tmp_path: Path, arrays: dict[str, np.ndarray], message: str
 ) -> None:
     path = tmp_path / "run.npz"
     np.savez(path, **arrays)
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=message):
         open_source(path)
 
 
 @pytest.mark.parametrize("write", [np.savez, np.savez_compressed])
-def test_levels_that_do_not_fit_the_checksum_are_refused(tmp_path: Path, write: object) -> None:
-    """Only the sum in the archive's directory is changed: all else is as it was."""
+def test_wrong_checksum_is_rejected(tmp_path: Path, write: object) -> None:
+    """Only the checksum in the directory of the archive is changed."""
     path = tmp_path / "run.npz"
     write(path, frames=GREY)
     content = bytearray(path.read_bytes())
@@ -117,7 +117,7 @@ def test_levels_that_do_not_fit_the_checksum_are_refused(tmp_path: Path, write: 
 
 
 @pytest.mark.parametrize("grow", [1, 2_000_000])
-def test_an_array_with_more_behind_it_is_refused(tmp_path: Path, grow: int) -> None:
+def test_array_with_excess_bytes_is_rejected(tmp_path: Path, grow: int) -> None:
     path = tmp_path / "run.npz"
     array = io.BytesIO()
     np.save(array, GREY)
@@ -127,7 +127,7 @@ def test_an_array_with_more_behind_it_is_refused(tmp_path: Path, grow: int) -> N
         open_source(path)
 
 
-def test_a_compressed_array_that_would_fill_the_memory_is_refused(tmp_path: Path) -> None:
+def test_compressed_array_that_would_fill_the_memory_is_rejected(tmp_path: Path) -> None:
     path = tmp_path / "run.npz"
     header = {"descr": "|u1", "fortran_order": False, "shape": (2000, 1000, 1000)}
     with (
@@ -151,8 +151,8 @@ def test_a_compressed_array_that_would_fill_the_memory_is_refused(tmp_path: Path
 
 
 @pytest.mark.parametrize("packed", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
-def test_what_unpacks_without_bounds_is_refused(tmp_path: Path, packed: int) -> None:
-    """Of a few kilobytes zipfile makes gigabytes, however small it says that the array is."""
+def test_unbounded_compression_methods_are_rejected(tmp_path: Path, packed: int) -> None:
+    """zipfile would unpack a few kilobytes to gigabytes, whatever the stated size of the array."""
     path = tmp_path / "run.npz"
     array = io.BytesIO()
     np.save(array, GREY)
@@ -163,7 +163,7 @@ def test_what_unpacks_without_bounds_is_refused(tmp_path: Path, packed: int) -> 
 
 
 @pytest.mark.parametrize(
-    ("array", "said"),
+    ("array", "message"),
     [
         (np.array([[[{}]]]), "no Python objects"),
         (GREY.astype(complex), "type: '<c16'"),
@@ -175,12 +175,12 @@ def test_what_unpacks_without_bounds_is_refused(tmp_path: Path, packed: int) -> 
         (GREY[:, :0], "shape: "),
     ],
 )
-def test_what_is_no_stack_is_refused(tmp_path: Path, array: np.ndarray, said: str) -> None:
-    with pytest.raises(InputError, match=said):
+def test_invalid_stack_is_rejected(tmp_path: Path, array: np.ndarray, message: str) -> None:
+    with pytest.raises(InputError, match=message):
         open_source(save(tmp_path / "run.npy", array))
 
 
-def test_nan_is_refused_where_it_stands(tmp_path: Path) -> None:
+def test_nan_is_rejected_only_in_its_frame(tmp_path: Path) -> None:
     stack = GREY.astype(np.float32)
     stack[3, 2, 2] = np.nan
     with open_source(save(tmp_path / "run.npy", stack)) as source:
@@ -189,7 +189,7 @@ def test_nan_is_refused_where_it_stands(tmp_path: Path) -> None:
             source.frame(3)
 
 
-def test_a_stack_cut_off_gives_its_whole_frames(tmp_path: Path) -> None:
+def test_truncated_stack_has_its_complete_frames(tmp_path: Path) -> None:
     path = save(tmp_path / "run.npy", GREY)
     content = path.read_bytes()
     path.write_bytes(content[: 128 + 117 * 4 + 50])
@@ -207,7 +207,7 @@ def test_a_stack_cut_off_gives_its_whole_frames(tmp_path: Path) -> None:
         open_source(path)
 
 
-def test_a_huge_shape_is_not_believed(tmp_path: Path) -> None:
+def test_impossible_shape_is_rejected(tmp_path: Path) -> None:
     path = save(tmp_path / "run.npy", GREY)
     content = path.read_bytes()
     path.write_bytes(content.replace(b"(6, 9, 13), }    ", b"(6, 99999, 13), }"))
@@ -215,7 +215,7 @@ def test_a_huge_shape_is_not_believed(tmp_path: Path) -> None:
         open_source(path)
 
 
-def test_damaged_files_are_refused_or_read(tmp_path: Path) -> None:
+def test_damaged_files_are_read_or_rejected(tmp_path: Path) -> None:
     survives_damage(save(tmp_path / "run.npy", GREY), 200, 128, 5)
     for write in (np.savez, np.savez_compressed):
         path = tmp_path / f"{write.__name__}.npz"

@@ -15,18 +15,18 @@ from labapp.media.recording.nut import Codec, NutWriter
 from tests.media.conftest import Encode
 
 LEAST = 100
-"""Bytes at the start of a frame that are no frame yet: headers."""
+"""Bytes of headers at the start of a frame, which are not yet a frame."""
 
 
 def pictures(bits: int, count: int = 12) -> list[GreyImage]:
-    """Noise, which hides nothing: of 48×64 px, all levels."""
+    """Noise of 48×64 px with all levels, in which any loss is visible."""
     rng = np.random.default_rng(bits)
     kind = np.uint8 if bits <= 8 else np.uint16
     return [rng.integers(0, 2**bits, (48, 64)).astype(kind) for _ in range(count)]
 
 
 def write(path: Path, frames: list[GreyImage], bits: int, codec: Codec) -> list[int]:
-    """Write frames 10 ms apart; the file's size after each."""
+    """Write frames at intervals of 10 ms; return the size of the file after each."""
     writer = NutWriter(path, frames[0].shape, bits, 100, codec)
     sizes = []
     for k, image in enumerate(frames):
@@ -38,7 +38,7 @@ def write(path: Path, frames: list[GreyImage], bits: int, codec: Codec) -> list[
 
 @pytest.mark.parametrize("bits", [8, 10, 12, 14, 16])
 @pytest.mark.parametrize("codec", ["ffv1", "raw"])
-def test_nothing_is_lost(tmp_path: Path, codec: Codec, bits: int) -> None:
+def test_frames_and_times_are_preserved(tmp_path: Path, codec: Codec, bits: int) -> None:
     frames = pictures(bits)
     path = tmp_path / "run.nut"
     write(path, frames, bits, codec)
@@ -52,7 +52,7 @@ def test_nothing_is_lost(tmp_path: Path, codec: Codec, bits: int) -> None:
             assert video.frame(k).time_s == pytest.approx(k * 0.01, abs=1e-9)
 
 
-def test_times_are_the_cameras_own_to_the_microsecond(tmp_path: Path) -> None:
+def test_times_of_the_camera_are_preserved_to_the_microsecond(tmp_path: Path) -> None:
     times_s = [0.0, 0.000_2, 0.000_4, 0.000_4, 1.5, 3600.000_007]
     frames = pictures(8, len(times_s))
     writer = NutWriter(tmp_path / "run.nut", (48, 64), 8, 5000)
@@ -60,34 +60,34 @@ def test_times_are_the_cameras_own_to_the_microsecond(tmp_path: Path) -> None:
         writer.write(image, time_s)
     writer.close()
     with open_source(tmp_path / "run.nut") as video:
-        found = [video.frame(k).time_s for k in range(len(video))]
-    times_s[3] = 0.000_401  # not later than the one before: the next that can be told from it
-    assert found == pytest.approx(times_s, abs=5e-7)
+        stored = [video.frame(k).time_s for k in range(len(video))]
+    times_s[3] = 0.000_401  # not later than the one before: increased by one microsecond
+    assert stored == pytest.approx(times_s, abs=5e-7)
 
 
 @pytest.mark.parametrize("codec", ["ffv1", "raw"])
-def test_cut_off_anywhere_it_has_all_frames_before(tmp_path: Path, codec: Codec) -> None:
+def test_truncated_file_has_all_earlier_frames(tmp_path: Path, codec: Codec) -> None:
     frames = pictures(8)
     sizes = write(tmp_path / "run.nut", frames, 8, codec)
     content = (tmp_path / "run.nut").read_bytes()
-    assert all(np.diff(sizes) > 0)  # each is there when it was written
+    assert all(np.diff(sizes) > 0)  # each frame is in the file when it was written
     rng = np.random.default_rng(1)
     cuts = [*sizes, *rng.integers(sizes[0], sizes[-1], 40).tolist()]
     for cut in cuts:
         (tmp_path / "cut.nut").write_bytes(content[:cut])
-        whole = int(np.searchsorted(sizes, cut, "right"))
+        complete = int(np.searchsorted(sizes, cut, "right"))
         with open_source(tmp_path / "cut.nut") as video:
-            assert len(video) == whole
-            for k in range(whole):
+            assert len(video) == complete
+            for k in range(complete):
                 assert np.array_equal(video.frame(k).image, frames[k])
-            cut_off = "cut.nut ends early: its last frame is truncated"
-            assert video.warnings in ((), (cut_off,))
-            # Of some cuts nothing is left that a frame could be told to have begun.
-            assert video.warnings or cut - sizes[whole - 1] < LEAST
+            warning = "cut.nut ends early: its last frame is truncated"
+            assert video.warnings in ((), (warning,))
+            # After some cuts, too little remains to detect the start of a frame.
+            assert video.warnings or cut - sizes[complete - 1] < LEAST
 
 
 @pytest.mark.parametrize("options", [["ffv1", "-level", "1"], ["libx264", "-bf", "2"]])
-def test_what_others_write_as_nut_keeps_its_last_frame(
+def test_last_frame_of_nut_by_other_programs_is_complete(
     tmp_path: Path, encode: Encode, options: list[str]
 ) -> None:
     path = encode(tmp_path / "run.nut", pictures(8), "-c:v", *options)
@@ -112,7 +112,7 @@ for k in range(10**6):
 
 
 @pytest.mark.parametrize("codec", ["ffv1", "raw"])
-def test_a_writer_that_is_killed_leaves_every_frame_it_wrote(tmp_path: Path, codec: Codec) -> None:
+def test_killed_writer_leaves_every_written_frame(tmp_path: Path, codec: Codec) -> None:
     rng = np.random.default_rng(2)
     for attempt in range(4):
         path = tmp_path / f"run{attempt}.nut"
@@ -122,8 +122,8 @@ def test_a_writer_that_is_killed_leaves_every_frame_it_wrote(tmp_path: Path, cod
             process.stdout.readline()
             time.sleep(float(rng.uniform(0, 0.3)))
             process.kill()
-            told = [int(line) for line in process.stdout.read().split("\n")[:-1]]
-        written = max(told, default=0) + 1
+            printed = [int(line) for line in process.stdout.read().split("\n")[:-1]]
+        written = max(printed, default=0) + 1
         with open_source(path) as video:
             assert written <= len(video) <= written + 2
             for k in range(written):
@@ -131,7 +131,7 @@ def test_a_writer_that_is_killed_leaves_every_frame_it_wrote(tmp_path: Path, cod
                 assert np.frombuffer(image[0, :4].tobytes(), np.uint32)[0] == k
 
 
-def test_a_file_that_is_there_is_kept(tmp_path: Path) -> None:
+def test_existing_file_is_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / "run.nut").write_text("mine")
     with pytest.raises(InputError, match="recording: File exists"):
         NutWriter(tmp_path / "run.nut", (48, 64), 8, 100)
@@ -146,7 +146,7 @@ def test_a_file_that_is_there_is_kept(tmp_path: Path) -> None:
         np.full((48, 64), 1024, np.uint16),
     ],
 )
-def test_a_frame_that_would_not_be_kept_whole_is_refused(tmp_path: Path, image: GreyImage) -> None:
+def test_frame_that_does_not_fit_the_format_is_rejected(tmp_path: Path, image: GreyImage) -> None:
     writer = NutWriter(tmp_path / "run.nut", (48, 64), 10, 100)
     with pytest.raises(ValueError, match="a frame of"):
         writer.write(image, 0.0)
@@ -154,7 +154,7 @@ def test_a_frame_that_would_not_be_kept_whole_is_refused(tmp_path: Path, image: 
 
 
 class FullDisk:
-    """A file on a disk with room for so much: it takes what still fits, then nothing."""
+    """A file on a disk with limited space: it accepts what fits, then nothing."""
 
     def __init__(self, path: Path, room: int) -> None:
         self.file, self.room = path.open("xb", buffering=0), room
@@ -170,15 +170,15 @@ class FullDisk:
         self.file.close()
 
 
-def test_a_full_disk_is_told_as_such_and_what_was_written_is_whole(tmp_path: Path) -> None:
+def test_full_disk_is_reported_and_written_frames_are_complete(tmp_path: Path) -> None:
     frames = pictures(8)
     path = tmp_path / "run.nut"
     writer = NutWriter(path, (48, 64), 8, 100, "raw", file=FullDisk(path, 6 * 48 * 64))
     for k, image in enumerate(frames[:5]):
         writer.write(image, k * 0.01)
-    with pytest.raises(OSError, match="No space left") as full:
+    with pytest.raises(OSError, match="No space left") as caught:
         writer.write(frames[5], 0.05)
-    assert full.value.errno == errno.ENOSPC
+    assert caught.value.errno == errno.ENOSPC
     with pytest.raises(OSError, match="end of the video"):
         writer.close()
     with open_source(path) as video:

@@ -1,4 +1,4 @@
-"""The index of a video that a session holds may be anybody's."""
+"""The stored index of a video is not trusted."""
 
 from __future__ import annotations
 
@@ -56,8 +56,8 @@ FORGED: dict[str, dict[str, object]] = {
 
 
 @pytest.mark.parametrize("forged", FORGED.values(), ids=FORGED)
-def test_a_forged_index_is_left_aside(path: Path, forged: dict[str, object]) -> None:
-    """Its checksum and the video's are right."""
+def test_forged_index_is_ignored(path: Path, forged: dict[str, object]) -> None:
+    """Its checksum and that of the video are correct."""
     table, fingerprint = indexed(path)
     index = dataclasses.replace(table, **forged).to_bytes(fingerprint)
     with VideoSource(path, index) as source:
@@ -66,8 +66,8 @@ def test_a_forged_index_is_left_aside(path: Path, forged: dict[str, object]) -> 
 
 
 @pytest.mark.parametrize("outside", [True, False])
-def test_an_index_that_would_fill_the_memory_is_left_aside(path: Path, outside: bool) -> None:
-    """It is packed, and its arrays might be."""
+def test_index_that_would_fill_the_memory_is_ignored(path: Path, outside: bool) -> None:
+    """Either the index or its arrays are highly compressed."""
     table, fingerprint = indexed(path)
     content = zlib.decompress(table.to_bytes(fingerprint)[len(MAGIC) + 4 :])
     others = content[: 4 + int.from_bytes(content[:4], "big")]

@@ -23,7 +23,7 @@ COLOUR_8 = [RNG.integers(0, 256, (12, 16, 3), np.uint8) for _ in range(3)]
     [(GREY_8, 8, 8), (GREY_10, 10, 10), (GREY_12, 12, 12), (GREY_12, 16, 12)],
     ids=["8 bit", "packed 10 bit", "packed 12 bit", "12 of 16 bit"],
 )
-def test_every_frame_is_the_one_written(
+def test_every_frame_equals_the_written_one(
     tmp_path: Path, pictures: list[np.ndarray], bits: int, depth: int, suffix: str
 ) -> None:
     header = write_photron(tmp_path, pictures, bits, depth=depth, suffix=suffix)
@@ -60,7 +60,7 @@ def test_colour_becomes_luminance(tmp_path: Path, bits: int, scale: int) -> None
             np.testing.assert_allclose(frame.image, expected, atol=0.6 * scale)
 
 
-def test_the_partner_that_is_missing_or_one_of_two_is_named(tmp_path: Path) -> None:
+def test_missing_or_ambiguous_partner_is_named(tmp_path: Path) -> None:
     header = write_photron(tmp_path, GREY_8, 8)
     raw = tmp_path / "run.mraw"
     other = write_photron(tmp_path, GREY_8, 8, suffix=".cih")
@@ -81,7 +81,7 @@ def test_the_partner_that_is_missing_or_one_of_two_is_named(tmp_path: Path) -> N
         open_source(header)
 
 
-def test_a_recording_cut_off_gives_its_whole_frames(tmp_path: Path) -> None:
+def test_truncated_recording_has_its_complete_frames(tmp_path: Path) -> None:
     header = write_photron(tmp_path, GREY_12, 12, rate="x")
     raw = tmp_path / "run.mraw"
     content = raw.read_bytes()
@@ -97,13 +97,13 @@ def test_a_recording_cut_off_gives_its_whole_frames(tmp_path: Path) -> None:
         open_source(header)
 
 
-def test_frames_left_out_when_saving_are_said(tmp_path: Path) -> None:
+def test_frames_skipped_when_saving_are_reported(tmp_path: Path) -> None:
     with open_source(write_photron(tmp_path, GREY_8, 8, step=4)) as source:
         assert "not every frame was saved" in source.warnings[0]
 
 
 @pytest.mark.parametrize(
-    ("fields", "said"),
+    ("fields", "message"),
     [
         ({"columns": ""}, "Image Width: missing"),
         ({"columns": 0}, "Image Width: 0; expected a whole number, 1 to"),
@@ -116,28 +116,28 @@ def test_frames_left_out_when_saving_are_said(tmp_path: Path) -> None:
         ({"bits": 10, "columns": 15, "rows": 1}, "Image Width: 15; expected rows of 10 bit levels"),
     ],
 )
-def test_what_the_header_should_say_is_named(
-    tmp_path: Path, fields: dict[str, object], said: str
+def test_wrong_field_of_the_header_is_named(
+    tmp_path: Path, fields: dict[str, object], message: str
 ) -> None:
-    header = write_photron(tmp_path, GREY_8, 8, suffix=".cih", said=fields)
-    with pytest.raises(InputError, match=said):
+    header = write_photron(tmp_path, GREY_8, 8, suffix=".cih", header_fields=fields)
+    with pytest.raises(InputError, match=message):
         open_source(header)
 
 
-def test_a_header_without_its_xml_is_refused(tmp_path: Path) -> None:
+def test_header_without_valid_xml_is_rejected(tmp_path: Path) -> None:
     header = write_photron(tmp_path, GREY_8, 8)
     content = header.read_bytes()
-    for damaged, said in [
+    for damaged, message in [
         (content.replace(b"</cih>", b""), "no <cih> … </cih>"),
         (content.replace(b"<width>", b"<wide>"), "expected well-formed XML"),
         (content.replace(b"width", b"wide"), "imageDataInfo/resolution/width: missing"),
     ]:
         header.write_bytes(damaged)
-        with pytest.raises(InputError, match=said):
+        with pytest.raises(InputError, match=message):
             open_source(header)
 
 
-def test_damaged_headers_are_refused_or_read(tmp_path: Path) -> None:
+def test_damaged_headers_are_read_or_rejected(tmp_path: Path) -> None:
     survives_damage(write_photron(tmp_path, GREY_12, 12), 200, 2000, 3)
     (tmp_path / "run.cihx").unlink()
     survives_damage(write_photron(tmp_path, GREY_12, 12, suffix=".cih"), 200, 2000, 4)

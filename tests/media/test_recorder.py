@@ -21,14 +21,14 @@ from labapp.media.recording.nut import NutWriter
 from labapp.media.recording.recorder import Plan, Recorder, recording_path
 from labapp.media.recording.take_files import Take
 from labapp.session.session import Session
-from tests.media.cameras.watching import Heard, number_in, numbered
+from tests.media.cameras.watching import Events, number_in, numbered
 from tests.waiting import PATIENCE_S, wait_until
 
 RATE_HZ = 100.0
 
 
 class Disk:
-    """A file that can be stalled, and refuse what is beyond its room."""
+    """A file whose writing can be stalled, with limited space."""
 
     def __init__(self, path: Path, room: int = sys.maxsize) -> None:
         self.file, self.room = path.open("xb", buffering=0), room
@@ -52,9 +52,9 @@ def frame(k: int) -> CameraFrame:
 
 
 def numbers(take: Take) -> list[int]:
-    """The numbers of the frames in a recording."""
+    """Return the numbers of the frames in a recording."""
     with open_source(take.path) as video:
-        return [number_in(each.image) for each in video]
+        return [number_in(frame.image) for frame in video]
 
 
 def notes(take: Take) -> list[dict[str, str]]:
@@ -64,12 +64,12 @@ def notes(take: Take) -> list[dict[str, str]]:
 
 @pytest.fixture
 def start(tmp_path: Path) -> Callable[..., Recorder]:
-    """A recorder of a camera of 100 frames/s: (plan's fields …, say, writer)."""
+    """Start a recorder of a camera of 100 frames/s: (fields of the plan …, say, writer)."""
 
-    def begin(say: Callable[[Event], None] = lambda _: None, **given: object) -> Recorder:
-        writer = given.pop("writer", NutWriter)
-        place = partial(recording_path, tmp_path, "run")
-        return Recorder(place, Plan(**given), 8, RATE_HZ, say, writer)
+    def begin(say: Callable[[Event], None] = lambda _: None, **fields: object) -> Recorder:
+        writer = fields.pop("writer", NutWriter)
+        next_path = partial(recording_path, tmp_path, "run")
+        return Recorder(next_path, Plan(**fields), 8, RATE_HZ, say, writer)
 
     return begin
 
@@ -77,13 +77,13 @@ def start(tmp_path: Path) -> Callable[..., Recorder]:
 Start = Callable[..., Recorder]
 
 
-def test_it_records_from_before_the_trigger_to_after_it(start: Start) -> None:
+def test_recording_starts_before_the_trigger_and_ends_after_it(start: Start) -> None:
     with start(before_s=0.1, after_s=0.2) as recorder:
         for k in range(200):
             if k == 100:
                 take = recorder.trigger()
             recorder.take(frame(k))
-    # The newest frame when it was triggered is 99: from 0.1 s before that to 0.2 s after it.
+    # The newest frame at the trigger is 99: from 0.1 s before it to 0.2 s after it.
     assert numbers(take) == list(range(89, 120))
     assert (take.frames, take.lost, take.trouble) == (31, 0, "")
     with open_source(take.path) as video:
@@ -96,7 +96,7 @@ def test_it_records_from_before_the_trigger_to_after_it(start: Start) -> None:
     assert float(row["time_s"]) == pytest.approx(0.1)
 
 
-def test_it_records_until_it_is_stopped_and_every_third_frame(start: Start) -> None:
+def test_every_third_frame_is_recorded_until_stopped(start: Start) -> None:
     with start(every=3) as recorder:
         for k in range(10):
             recorder.take(frame(k))
@@ -113,7 +113,7 @@ def test_it_records_until_it_is_stopped_and_every_third_frame(start: Start) -> N
         assert video.frame_rate_hz == pytest.approx(RATE_HZ / 3, rel=1e-3)
 
 
-def test_one_triggered_while_the_camera_is_away_begins_when_it_is_back(start: Start) -> None:
+def test_recording_triggered_without_camera_starts_when_it_returns(start: Start) -> None:
     with start(after_s=0.2) as recorder:
         for k in range(10):
             recorder.take(frame(k))
@@ -123,7 +123,7 @@ def test_one_triggered_while_the_camera_is_away_begins_when_it_is_back(start: St
     assert numbers(take) == list(range(6000, 6020))
 
 
-def test_recordings_follow_each_other_in_files_of_their_own(start: Start) -> None:
+def test_successive_recordings_have_separate_files(start: Start) -> None:
     with start(before_s=0.05, after_s=0.1) as recorder:
         for k in range(100):
             if k in (20, 60):
@@ -135,7 +135,7 @@ def test_recordings_follow_each_other_in_files_of_their_own(start: Start) -> Non
     assert first.path != second.path
 
 
-def test_marks_and_what_happened_are_kept_beside_it(start: Start) -> None:
+def test_marks_and_events_are_written_beside_the_recording(start: Start) -> None:
     with start() as recorder:
         recorder.note(Event("pedal", "note", "before there is a recording"))
         take = recorder.trigger()
@@ -143,18 +143,18 @@ def test_marks_and_what_happened_are_kept_beside_it(start: Start) -> None:
             recorder.take(frame(k))
             if k == 4:
                 recorder.note(Event("pedal", "note", 'mark, "here"'))
-    found = notes(take)
-    assert [row["what"] for row in found] == [
+    rows = notes(take)
+    assert [row["what"] for row in rows] == [
         "trigger, 0 frames before it",
         'mark, "here"',
         "10 frames recorded",
     ]
-    assert (found[1]["source"], found[1]["kind"]) == ("pedal", "note")
-    assert float(found[1]["time_s"]) == pytest.approx(0.04)
-    assert int(found[1]["frame"]) == 5
+    assert (rows[1]["source"], rows[1]["kind"]) == ("pedal", "note")
+    assert float(rows[1]["time_s"]) == pytest.approx(0.04)
+    assert int(rows[1]["frame"]) == 5
 
 
-def test_a_note_of_a_frame_some_time_ago_tells_that_frame(start: Start) -> None:
+def test_late_note_refers_to_its_frame(start: Start) -> None:
     with start() as recorder:
         take = recorder.trigger()
         for k in range(20):
@@ -164,7 +164,7 @@ def test_a_note_of_a_frame_some_time_ago_tells_that_frame(start: Start) -> None:
     assert (float(late["time_s"]), int(late["frame"])) == (pytest.approx(0.06), 7)
 
 
-def test_a_recorder_that_is_closed_holds_no_frames_and_begins_nothing(start: Start) -> None:
+def test_closed_recorder_frees_frames_and_rejects_triggers(start: Start) -> None:
     with start(before_s=1) as recorder:
         for k in range(50):
             recorder.take(frame(k))
@@ -176,63 +176,61 @@ def test_a_recorder_that_is_closed_holds_no_frames_and_begins_nothing(start: Sta
     assert not recorder.takes
 
 
-def test_a_stalled_disk_loses_nothing_that_memory_has_room_for(
-    start: Start, tmp_path: Path
-) -> None:
+def test_stalled_disk_loses_no_frames_while_memory_suffices(start: Start, tmp_path: Path) -> None:
     disk = Disk(tmp_path / "disk.nut")
     disk.goes.clear()
-    heard = Heard()
+    events = Events()
     writer = partial(NutWriter, file=disk)
-    with start(heard.append, memory_mb=1, writer=writer) as recorder:
+    with start(events.append, memory_mb=1, writer=writer) as recorder:
         take = recorder.trigger()
         for k in range(800):  # of 968 bytes in memory each
             recorder.take(frame(k))
         assert 0.5 < recorder.waiting_mb < 1
-        assert "writing does not keep up" in heard.words()
+        assert "writing does not keep up" in events.words()
         disk.goes.set()
         wait_until(lambda: recorder.waiting_mb == 0)
-        assert "writing has caught up" in heard.words()
+        assert "writing has caught up" in events.words()
     assert (take.frames, take.lost) == (800, 0)
     with open_source(tmp_path / "disk.nut") as video:
-        assert [number_in(each.image) for each in video] == list(range(800))
+        assert [number_in(stored.image) for stored in video] == list(range(800))
 
 
-def test_a_disk_that_takes_nothing_is_said_while_memory_lasts(
+def test_stalled_disk_is_reported(
     start: Start, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(recorder_module, "STALL_S", 0.05)
     disk = Disk(tmp_path / "disk.nut")
-    heard = Heard()
+    events = Events()
     numbers_from = iter(range(1_000_000))
-    with start(heard.append, writer=partial(NutWriter, file=disk)) as recorder:
+    with start(events.append, writer=partial(NutWriter, file=disk)) as recorder:
         take = recorder.trigger()
         for _ in range(2):
             disk.goes.clear()
-            told = len(heard)
+            count = len(events)
 
-            def is_said(told: int = told) -> bool:
+            def is_reported(count: int = count) -> bool:
                 recorder.take(frame(next(numbers_from)))
-                return len(heard) > told
+                return len(events) > count
 
-            wait_until(is_said)
+            wait_until(is_reported)
             disk.goes.set()
-            wait_until(lambda: heard[-1].words == "writing has caught up")
-    said = [event.words for event in heard if event.source == "recording"]
-    stalled, caught_up = said[::2], said[1::2]
+            wait_until(lambda: events[-1].words == "writing has caught up")
+    messages = [event.words for event in events if event.source == "recording"]
+    stalled, caught_up = messages[::2], messages[1::2]
     assert caught_up == ["writing has caught up"] * 2
     for words in stalled:
         assert words.startswith("writing does not keep up, the disk has stalled for 0.")
         assert words.endswith(" 0 MB are queued in memory")
-    assert [row["what"] for row in notes(take)][1:-1] == said
+    assert [row["what"] for row in notes(take)][1:-1] == messages
     assert (take.frames, take.lost) == (next(numbers_from), 0)
 
 
-def test_what_memory_has_no_room_for_is_left_out_and_said(start: Start, tmp_path: Path) -> None:
+def test_frames_beyond_the_memory_are_dropped_and_reported(start: Start, tmp_path: Path) -> None:
     disk = Disk(tmp_path / "disk.nut")
     disk.goes.clear()
-    heard = Heard()
+    events = Events()
     writer = partial(NutWriter, file=disk)
-    with start(heard.append, memory_mb=1, writer=writer) as recorder:
+    with start(events.append, memory_mb=1, writer=writer) as recorder:
         take = recorder.trigger()
         for k in range(1500):
             recorder.take(frame(k))
@@ -242,33 +240,35 @@ def test_what_memory_has_no_room_for_is_left_out_and_said(start: Start, tmp_path
         for k in range(1500, 1600):
             recorder.take(frame(k))
     with open_source(tmp_path / "disk.nut") as video:
-        found = [number_in(each.image) for each in video]
-    assert len(found) + take.lost == 1600
-    assert found == [*range(1500 - take.lost), *range(1500, 1600)]
-    said = [event.words for event in heard if event.kind == "loss"]
-    counted = [int(words.split()[0]) for words in said if "memory is full" in words]
+        recorded = [number_in(stored.image) for stored in video]
+    assert len(recorded) + take.lost == 1600
+    assert recorded == [*range(1500 - take.lost), *range(1500, 1600)]
+    messages = [event.words for event in events if event.kind == "loss"]
+    counted = [int(words.split()[0]) for words in messages if "memory is full" in words]
     assert sum(counted) == take.lost > 0
-    assert f"{take.lost} lost" in said[-1]
+    assert f"{take.lost} lost" in messages[-1]
     assert any("memory is full" in row["what"] for row in notes(take))
 
 
-def test_seconds_before_that_memory_does_not_hold_are_said(start: Start) -> None:
-    heard = Heard()
-    with start(heard.append, before_s=60, memory_mb=1) as recorder:
+def test_pre_trigger_time_beyond_the_memory_is_reported(start: Start) -> None:
+    events = Events()
+    with start(events.append, before_s=60, memory_mb=1) as recorder:
         for k in range(2000):
             recorder.take(frame(k))
             assert recorder.waiting_mb <= 1
         take = recorder.trigger()
     assert numbers(take) == list(range(2000 - take.frames, 2000))
     assert take.frames == 1_000_000 // (24 * 32 + 200)
-    assert heard.words().count("before the trigger are buffered, not 60 s") == 1
+    assert events.words().count("before the trigger are buffered, not 60 s") == 1
 
 
-def test_a_full_disk_is_said_and_what_is_there_is_whole(start: Start, tmp_path: Path) -> None:
+def test_full_disk_is_reported_and_recorded_frames_are_complete(
+    start: Start, tmp_path: Path
+) -> None:
     disk = Disk(tmp_path / "disk.nut", room=20 * 24 * 32)
-    heard = Heard()
+    events = Events()
     writer = partial(NutWriter, file=disk)
-    with start(heard.append, writer=writer) as recorder:
+    with start(events.append, writer=writer) as recorder:
         take = recorder.trigger()
         for k in range(100):
             recorder.take(frame(k))
@@ -278,14 +278,14 @@ def test_a_full_disk_is_said_and_what_is_there_is_whole(start: Start, tmp_path: 
     assert 10 < take.frames < 20
     assert take.frames + take.lost == 100
     with open_source(tmp_path / "disk.nut") as video:
-        assert [number_in(each.image) for each in video] == list(range(take.frames))
-    assert f"written so far and intact: {take.frames} frames" in heard.words()
+        assert [number_in(stored.image) for stored in video] == list(range(take.frames))
+    assert f"written so far and intact: {take.frames} frames" in events.words()
 
 
-def test_frames_that_are_not_as_the_others_are_left_out_and_said(tmp_path: Path) -> None:
-    heard = Heard()
+def test_frames_of_another_format_are_dropped_and_reported(tmp_path: Path) -> None:
+    events = Events()
     wrong = {0: (24, 32), 7: (24, 32), 8: (12, 32)}
-    with Recorder(lambda: tmp_path / "run.nut", Plan(), 12, RATE_HZ, heard.append) as recorder:
+    with Recorder(lambda: tmp_path / "run.nut", Plan(), 12, RATE_HZ, events.append) as recorder:
         take = recorder.trigger()
         for k in range(30):
             levels = 5000 if k in wrong else 100 + k  # of 4095
@@ -293,17 +293,17 @@ def test_frames_that_are_not_as_the_others_are_left_out_and_said(tmp_path: Path)
             recorder.take(CameraFrame(k, k / RATE_HZ, 0.0, image))
     assert (take.frames, take.lost, take.trouble) == (27, 3, "")
     with open_source(take.path) as video:
-        found = [int(each.image[0, 0]) - 100 for each in video]
-        assert found == [k for k in range(30) if k not in wrong]
+        recorded = [int(item.image[0, 0]) - 100 for item in video]
+        assert recorded == [k for k in range(30) if k not in wrong]
         assert [video.frame(k).time_s for k in (0, 5, 6)] == pytest.approx([0, 0.05, 0.08])
-    told = [each.words for each in heard if "discarded: of another size" in each.words]
-    assert sum(int(words.split()[0]) for words in told) == 3
-    assert [row["what"] for row in notes(take) if row["what"] in told] == told
+    messages = [item.words for item in events if "discarded: of another size" in item.words]
+    assert sum(int(words.split()[0]) for words in messages) == 3
+    assert [row["what"] for row in notes(take) if row["what"] in messages] == messages
 
 
-def test_notes_that_cannot_be_written_end_no_video_and_are_said_once(start: Start) -> None:
-    heard = Heard()
-    with start(heard.append) as recorder:
+def test_unwritable_notes_are_reported_once_without_ending_the_video(start: Start) -> None:
+    events = Events()
+    with start(events.append) as recorder:
         take = recorder.trigger()
         take.notes.mkdir()
         for k in range(30):
@@ -311,13 +311,13 @@ def test_notes_that_cannot_be_written_end_no_video_and_are_said_once(start: Star
             recorder.note(Event("pedal", "note", "mark"))
     assert numbers(take) == list(range(30))
     assert (take.frames, take.lost, take.trouble) == (30, 0, "")
-    assert heard.words().count("not all notes can be written beside it: Is a directory") == 1
+    assert events.words().count("not all notes can be written beside it: Is a directory") == 1
     with open_source(take.path) as video:
-        assert not video.warnings  # it was ended as it should be
+        assert not video.warnings  # it was closed properly
 
 
 @pytest.mark.parametrize("marks", [0, 4])
-def test_what_a_broken_disk_loses_is_counted(start: Start, marks: int) -> None:
+def test_frames_lost_by_a_broken_disk_are_counted(start: Start, marks: int) -> None:
     class Breaking(NutWriter):
         def write(self, image: GreyImage, time_s: float) -> None:
             if self.frames == 5:
@@ -336,10 +336,10 @@ def test_what_a_broken_disk_loses_is_counted(start: Start, marks: int) -> None:
     assert notes(take)[-1]["what"] == "5 frames recorded, 45 lost"
 
 
-def test_a_folder_that_is_not_there_is_said(tmp_path: Path) -> None:
-    heard = Heard()
-    place = partial(recording_path, tmp_path / "away", "run")
-    with Recorder(place, Plan(), 8, RATE_HZ, heard.append) as recorder:
+def test_missing_folder_is_reported(tmp_path: Path) -> None:
+    events = Events()
+    next_path = partial(recording_path, tmp_path / "away", "run")
+    with Recorder(next_path, Plan(), 8, RATE_HZ, events.append) as recorder:
         take = recorder.trigger()
         recorder.take(frame(0))
         wait_until(lambda: bool(take.trouble))
@@ -347,7 +347,7 @@ def test_a_folder_that_is_not_there_is_said(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["mine.nut", "mine-notes.csv"])
-def test_a_link_to_nowhere_is_not_followed(tmp_path: Path, name: str) -> None:
+def test_dangling_link_is_not_followed(tmp_path: Path, name: str) -> None:
     (tmp_path / name).symlink_to("elsewhere")
     with (
         Recorder(lambda: tmp_path / "mine.nut", Plan(), 8, RATE_HZ) as recorder,
@@ -357,26 +357,26 @@ def test_a_link_to_nowhere_is_not_followed(tmp_path: Path, name: str) -> None:
     assert not (tmp_path / "elsewhere").exists()
 
 
-def test_notes_follow_no_link_that_is_made_meanwhile(start: Start, tmp_path: Path) -> None:
-    heard = Heard()
-    with start(heard.append) as recorder:
+def test_notes_do_not_follow_a_link_created_meanwhile(start: Start, tmp_path: Path) -> None:
+    events = Events()
+    with start(events.append) as recorder:
         take = recorder.trigger()
         take.notes.symlink_to(tmp_path / "elsewhere")
         for number in range(5):
             recorder.take(frame(number))
     assert take.frames == 5
-    assert heard.words().count("not all notes can be written beside it: File exists") == 1
+    assert events.words().count("not all notes can be written beside it: File exists") == 1
     assert not (tmp_path / "elsewhere").exists()
 
 
 @pytest.mark.parametrize("name", ["mine.nut", "mine-notes.csv"])
-def test_a_file_that_is_there_is_not_written_over(tmp_path: Path, name: str) -> None:
+def test_existing_file_is_not_overwritten(tmp_path: Path, name: str) -> None:
     (tmp_path / name).write_text("mine")
     with Recorder(lambda: tmp_path / "mine.nut", Plan(), 8, RATE_HZ) as recorder:
         with pytest.raises(InputError, match=f"{name}: recording: is there already"):
             recorder.trigger()
         assert recorder.running is None
-    assert [(each.name, each.read_text()) for each in tmp_path.iterdir()] == [(name, "mine")]
+    assert [(file.name, file.read_text()) for file in tmp_path.iterdir()] == [(name, "mine")]
 
 
 @pytest.mark.parametrize(
@@ -390,52 +390,52 @@ def test_a_file_that_is_there_is_not_written_over(tmp_path: Path, name: str) -> 
         ("memory_mb", 0),
     ],
 )
-def test_a_plan_that_cannot_be_is_refused(name: str, value: Any) -> None:
+def test_impossible_plan_is_rejected(name: str, value: Any) -> None:
     with pytest.raises(InputError, match=f"recording: {name}: "):
         Plan(**{name: value})
 
 
-def test_nothing_recorded_is_lost_through_unplugging_garbage_and_a_stalled_disk(
+def test_recording_survives_unplugging_garbage_and_a_stalled_disk(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(feed, "RETRY_S", (0.01,))
     faults = Faults(garbage=0.01, unplug_every=30, unplugged_s=0.03, stall_every=400, seed=9)
     device = SimulatedDevice("test", numbered, rate_hz=1000, faults=faults)
     disk = Disk(tmp_path / "disk.nut")
-    heard = Heard()
-    handed: list[int] = []
+    events = Events()
+    passed_on: list[int] = []
     writer = partial(NutWriter, file=disk)
     with Recorder(
-        lambda: tmp_path / "run.nut", Plan(memory_mb=4), 8, 1000, heard.append, writer
+        lambda: tmp_path / "run.nut", Plan(memory_mb=4), 8, 1000, events.append, writer
     ) as recorder:
         take = recorder.trigger()
 
-        def hand_on(each: CameraFrame) -> None:
-            handed.append(number_in(each.image))
-            recorder.take(each)
+        def pass_on(item: CameraFrame) -> None:
+            passed_on.append(number_in(item.image))
+            recorder.take(item)
 
         def say(event: Event) -> None:
-            heard.append(event)
+            events.append(event)
             recorder.note(event)
 
-        with Feed("camera", device.open, hand_on, say) as running:
+        with Feed("camera", device.open, pass_on, say) as running:
             wait_until(lambda: device.disconnects >= 20)
             disk.goes.clear()
             wait_until(lambda: device.disconnects >= 40)
             disk.goes.set()
             wait_until(lambda: device.disconnects >= 50)
     assert take.lost == 0
-    assert take.frames == len(handed) == running.counts.frames
+    assert take.frames == len(passed_on) == running.counts.frames
     with open_source(tmp_path / "disk.nut") as video:
-        assert [number_in(each.image) for each in video] == handed
-        times_s = [each.time_s for each in video]
+        assert [number_in(item.image) for item in video] == passed_on
+        times_s = [item.time_s for item in video]
     assert (np.diff(np.array(times_s, float)) > 0).all()
-    told = [row["what"] for row in notes(take)]
-    assert sum("was unplugged" in words for words in told) == running.counts.lost >= 45
-    assert sum("is back" in words for words in told) >= 45
+    texts = [row["what"] for row in notes(take)]
+    assert sum("was unplugged" in words for words in texts) == running.counts.lost >= 45
+    assert sum("is back" in words for words in texts) >= 45
 
 
-def test_a_recording_goes_into_a_session_as_it_is(start: Start, tmp_path: Path) -> None:
+def test_recording_can_be_imported_into_a_session(start: Start, tmp_path: Path) -> None:
     with start(before_s=1, codec="ffv1") as recorder:
         for k in range(30):
             recorder.take(frame(k))

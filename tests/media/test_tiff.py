@@ -26,8 +26,8 @@ GREY_16 = RNG.integers(0, 65536, (5, 12, 17), np.uint16)
 COLOUR = RNG.integers(0, 256, (3, 12, 17, 3), np.uint8)
 
 
-def same_frames(path: Path, stack: np.ndarray) -> None:
-    """Hold every frame against the stack, in order and out of it."""
+def assert_same_frames(path: Path, stack: np.ndarray) -> None:
+    """Compare every frame with the stack, in order and in reverse order."""
     with open_source(path) as source:
         assert len(source) == len(stack)
         assert source.shape == stack.shape[1:]
@@ -39,15 +39,15 @@ def same_frames(path: Path, stack: np.ndarray) -> None:
             np.testing.assert_array_equal(frame.image, stack[k])
         with pytest.raises(IndexError):
             source.frame(len(stack))
-        again = source.reopen()
+        reopened = source.reopen()
         source.close()
-        with again:
-            np.testing.assert_array_equal(again.frame(0).image, stack[0])
+        with reopened:
+            np.testing.assert_array_equal(reopened.frame(0).image, stack[0])
 
 
 @pytest.mark.parametrize("stack", [GREY_8, GREY_16], ids=["8 bit", "16 bit"])
 @pytest.mark.parametrize(
-    "how",
+    "options",
     [
         {},
         {"byteorder": ">"},
@@ -64,10 +64,12 @@ def same_frames(path: Path, stack: np.ndarray) -> None:
     ],
     ids=str,
 )
-def test_stacks_of_tifffile(tmp_path: Path, stack: np.ndarray, how: dict[str, object]) -> None:
+def test_stacks_of_tifffile_are_read(
+    tmp_path: Path, stack: np.ndarray, options: dict[str, object]
+) -> None:
     path = tmp_path / "run.tif"
-    tifffile.imwrite(path, stack, photometric="minisblack", **how)
-    same_frames(path, stack)
+    tifffile.imwrite(path, stack, photometric="minisblack", **options)
+    assert_same_frames(path, stack)
     with open_source(path) as source:
         bits = 8 * stack.itemsize
         assert source.bit_depth == bits
@@ -76,18 +78,18 @@ def test_stacks_of_tifffile(tmp_path: Path, stack: np.ndarray, how: dict[str, ob
         assert source.frame(1).time_s is None
 
 
-def test_pages_written_one_by_one(tmp_path: Path) -> None:
+def test_separately_written_pages_are_read(tmp_path: Path) -> None:
     path = tmp_path / "run.tif"
     with tifffile.TiffWriter(path) as writer:
         for page in GREY_16:
             writer.write(page, photometric="minisblack", contiguous=False)
-    same_frames(path, GREY_16)
+    assert_same_frames(path, GREY_16)
 
 
-def test_a_stack_without_pages(tmp_path: Path) -> None:
+def test_stack_without_directories_of_pages_is_read(tmp_path: Path) -> None:
     path = tmp_path / "run.tif"
     tifffile.imwrite(path, GREY_16, imagej=True, truncate=True, metadata={"finterval": 0.002})
-    same_frames(path, GREY_16)
+    assert_same_frames(path, GREY_16)
     with open_source(path) as source:
         assert source.frame_rate_hz == pytest.approx(500)
         assert source.frame(3).time_s == pytest.approx(0.006)
@@ -100,13 +102,13 @@ def test_a_stack_without_pages(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("code", [1, 5, 8, 32773, 32946])
-def test_stacks_of_opencv(tmp_path: Path, code: int) -> None:
+def test_stacks_of_opencv_are_read(tmp_path: Path, code: int) -> None:
     path = tmp_path / "run.tif"
     assert cv2.imwritemulti(str(path), list(GREY_16), [cv2.IMWRITE_TIFF_COMPRESSION, code])
-    same_frames(path, GREY_16)
+    assert_same_frames(path, GREY_16)
 
 
-def test_jpeg_in_tiff(tmp_path: Path) -> None:
+def test_jpeg_compression_is_read(tmp_path: Path) -> None:
     path = tmp_path / "run.tif"
     smooth = np.indices((32, 32)).sum(axis=0).astype(np.uint8) * 4
     assert cv2.imwrite(str(path), smooth, [cv2.IMWRITE_TIFF_COMPRESSION, 7])
@@ -116,28 +118,28 @@ def test_jpeg_in_tiff(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("algorithm", ["raw", "packbits", "lzw", "deflate"])
 @pytest.mark.parametrize("pixels", ["gray", "gray16le"])
-def test_pictures_of_ffmpeg(tmp_path: Path, algorithm: str, pixels: str) -> None:
+def test_images_of_ffmpeg_are_read(tmp_path: Path, algorithm: str, pixels: str) -> None:
     stack = GREY_8 if pixels == "gray" else GREY_16
-    how = f"-v error -f rawvideo -pix_fmt {pixels} -s 17x12 -i - -compression_algo {algorithm}"
-    command = [imageio_ffmpeg.get_ffmpeg_exe(), *how.split(), tmp_path / "run%d.tif"]
+    options = f"-v error -f rawvideo -pix_fmt {pixels} -s 17x12 -i - -compression_algo {algorithm}"
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), *options.split(), tmp_path / "run%d.tif"]
     subprocess.run(command, input=stack.tobytes(), check=True)
-    same_frames(tmp_path, stack)
-    same_frames(tmp_path / "run3.tif", stack[2:3])
+    assert_same_frames(tmp_path, stack)
+    assert_same_frames(tmp_path / "run3.tif", stack[2:3])
 
 
-def test_a_series_of_numbered_pictures(tmp_path: Path) -> None:
-    # What i-SPEED software exports: one 12 bit picture in 16 bit a file.
+def test_series_of_numbered_images_is_read(tmp_path: Path) -> None:
+    # As exported by i-SPEED software: one 12 bit image in 16 bit per file.
     stack = GREY_16 >> 4
     for k, page in enumerate(stack):
         tifffile.imwrite(tmp_path / f"run_{k + 8}.tif", page, photometric="minisblack")
-    same_frames(tmp_path, stack)
+    assert_same_frames(tmp_path, stack)
     with open_source(tmp_path) as source:
         assert source.description == "5 pictures, TIF, 17×12 px, 16 bit grey"
 
 
-def test_a_folder_of_stacks_is_refused_and_of_one_opened(tmp_path: Path) -> None:
+def test_folder_may_contain_only_one_stack(tmp_path: Path) -> None:
     tifffile.imwrite(tmp_path / "a.tif", GREY_8, photometric="minisblack")
-    same_frames(tmp_path, GREY_8)
+    assert_same_frames(tmp_path, GREY_8)
     tifffile.imwrite(tmp_path / "b.tif", GREY_8, photometric="minisblack")
     with pytest.raises(InputError, match=r"a\.tif: pages: 5; expected one picture a file"):
         open_source(tmp_path)
@@ -158,29 +160,29 @@ def test_colour_becomes_luminance(tmp_path: Path, planes: str, scale: int) -> No
             np.testing.assert_allclose(frame.image, expected, atol=0.6 * scale)
 
 
-def test_white_may_be_zero(tmp_path: Path) -> None:
+def test_inverted_levels_are_read(tmp_path: Path) -> None:
     for stack, white in ((GREY_8, 255), (GREY_16, 65535)):
         path = tmp_path / "run.tif"
         tifffile.imwrite(path, stack, photometric="miniswhite")
-        same_frames(path, white - stack)
+        assert_same_frames(path, white - stack)
 
 
 def test_alpha_is_dropped(tmp_path: Path) -> None:
     path = tmp_path / "run.tif"
     image = np.dstack([GREY_8[0], GREY_8[1]])
     tifffile.imwrite(path, image, photometric="minisblack", extrasamples=["unassalpha"])
-    same_frames(path, GREY_8[:1])
+    assert_same_frames(path, GREY_8[:1])
 
 
 def test_floats_and_wide_integers_become_float32(tmp_path: Path) -> None:
     path = tmp_path / "run.tif"
     for kind in (np.float32, np.float64, np.int16, np.uint32):
         tifffile.imwrite(path, GREY_16.astype(kind), photometric="minisblack")
-        same_frames(path, GREY_16.astype(kind).astype(np.float32))
+        assert_same_frames(path, GREY_16.astype(kind).astype(np.float32))
 
 
 def one_page(rows: int, columns: int, bits: int, content: bytes, **other: int) -> bytes:
-    """A TIFF made by hand: one page, one strip, before its directory."""
+    """Contents of a TIFF with one page of one strip, before its directory."""
     tags = {256: columns, 257: rows, 258: bits, 259: 1, 262: 1, 273: 8, 277: 1, 278: rows}
     tags |= {279: len(content)} | {int(tag[1:]): value for tag, value in other.items()}
     content += b"\0" * (len(content) % 2)
@@ -191,27 +193,27 @@ def one_page(rows: int, columns: int, bits: int, content: bytes, **other: int) -
 
 
 @pytest.mark.parametrize("bits", [10, 12, 14])
-def test_packed_levels(tmp_path: Path, bits: int) -> None:
+def test_packed_levels_are_read(tmp_path: Path, bits: int) -> None:
     path = tmp_path / "run.tif"
     levels = GREY_16[0] >> (16 - bits)
     rows = b"".join(pack(row, bits) for row in levels)
     path.write_bytes(one_page(12, 17, bits, rows))
-    same_frames(path, levels[np.newaxis])
+    assert_same_frames(path, levels[np.newaxis])
     with open_source(path) as source:
         assert source.bit_depth == bits
 
 
-def test_one_bit_is_black_or_white(tmp_path: Path) -> None:
+def test_one_bit_becomes_black_or_white(tmp_path: Path) -> None:
     path = tmp_path / "run.tif"
     levels = GREY_8[:1] // 128
     rows = b"".join(pack(row, 1) for row in levels[0])
     path.write_bytes(one_page(12, 17, 1, rows))
-    same_frames(path, levels * 255)
+    assert_same_frames(path, levels * 255)
     path.write_bytes(one_page(12, 17, 1, rows, t262=0))
-    same_frames(path, (1 - levels) * 255)
+    assert_same_frames(path, (1 - levels) * 255)
 
 
-def test_a_palette_is_looked_up(tmp_path: Path) -> None:
+def test_palette_is_applied(tmp_path: Path) -> None:
     path = tmp_path / "run.tif"
     ramp = np.tile(np.arange(256, dtype=np.uint16)[::-1] * 257, (3, 1))
     tifffile.imwrite(path, GREY_8[0], photometric="palette", colormap=ramp)
@@ -220,7 +222,7 @@ def test_a_palette_is_looked_up(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("other", "said"),
+    ("other", "message"),
     [
         ({"t259": 50000}, r"page 0 cannot be decoded \(compression ZSTD\)"),
         ({"t256": 60000}, "8 bits|bytes for"),
@@ -228,20 +230,20 @@ def test_a_palette_is_looked_up(tmp_path: Path) -> None:
         ({"t277": 5}, "samples a pixel: 5|bytes for"),
     ],
 )
-def test_what_cannot_be_is_named(tmp_path: Path, other: dict[str, int], said: str) -> None:
+def test_impossible_tag_is_named(tmp_path: Path, other: dict[str, int], message: str) -> None:
     path = tmp_path / "run.tif"
     path.write_bytes(one_page(12, 17, 8, GREY_8[0].tobytes(), **other))
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=message):
         open_source(path)
 
 
 @pytest.mark.parametrize(
     ("compression", "packer"), [(8, zlib.compressobj), (34925, lzma.LZMACompressor)]
 )
-def test_a_strip_that_would_fill_the_memory_is_refused(
+def test_strip_that_would_fill_the_memory_is_rejected(
     tmp_path: Path, compression: int, packer: Callable[[], Any]
 ) -> None:
-    """The page is small; its one strip unpacks to 600 MB."""
+    """The page is small, but its only strip unpacks to 600 MB."""
     path, zeros, packing = tmp_path / "run.tif", bytes(10**7), packer()
     content = b"".join([packing.compress(zeros) for _ in range(60)]) + packing.flush()
     path.write_bytes(one_page(12, 17, 8, content, t259=compression))
@@ -259,7 +261,7 @@ def test_a_strip_that_would_fill_the_memory_is_refused(
     assert peak_mb(script, path) < 300
 
 
-def test_the_times_of_ome(tmp_path: Path) -> None:
+def test_times_of_ome_are_read(tmp_path: Path) -> None:
     path = tmp_path / "run.ome.tif"
     about = {"axes": "TYX", "TimeIncrement": 4, "TimeIncrementUnit": "ms"}
     tifffile.imwrite(path, GREY_8, ome=True, photometric="minisblack", metadata=about)
@@ -274,7 +276,7 @@ def test_the_times_of_ome(tmp_path: Path) -> None:
         assert source.frame_rate_hz == 2
 
 
-def test_a_page_of_another_size_is_refused_alone(tmp_path: Path) -> None:
+def test_only_a_page_of_another_size_is_rejected(tmp_path: Path) -> None:
     path = tmp_path / "run.tif"
     with tifffile.TiffWriter(path) as writer:
         for page in (GREY_8[0], GREY_8[1][:5], GREY_8[2]):
@@ -285,7 +287,7 @@ def test_a_page_of_another_size_is_refused_alone(tmp_path: Path) -> None:
             source.frame(1)
 
 
-def test_a_chain_of_pages_cut_off_gives_those_that_are_whole(tmp_path: Path) -> None:
+def test_truncated_stack_has_its_complete_pages(tmp_path: Path) -> None:
     path = tmp_path / "run.tif"
     with tifffile.TiffWriter(path) as writer:
         for page in GREY_8:
@@ -299,8 +301,8 @@ def test_a_chain_of_pages_cut_off_gives_those_that_are_whole(tmp_path: Path) -> 
         assert source.warnings == ("run.tif ends early: 3 of its pages are complete",)
 
 
-def test_damaged_files_are_refused_or_read(tmp_path: Path) -> None:
-    for seed, (name, how) in enumerate(
+def test_damaged_files_are_read_or_rejected(tmp_path: Path) -> None:
+    for seed, (name, options) in enumerate(
         [
             ("plain", {}),
             ("pages", {"metadata": None, "rowsperstrip": 4}),
@@ -310,7 +312,7 @@ def test_damaged_files_are_refused_or_read(tmp_path: Path) -> None:
         ]
     ):
         path = tmp_path / f"{name}.tif"
-        tifffile.imwrite(path, GREY_8, photometric="minisblack", **how)
+        tifffile.imwrite(path, GREY_8, photometric="minisblack", **options)
         survives_damage(path, 100, 600, seed)
     path = tmp_path / "lzw.tif"
     assert cv2.imwritemulti(str(path), list(GREY_8), [cv2.IMWRITE_TIFF_COMPRESSION, 5])

@@ -78,7 +78,7 @@ NEARLY = [
 
 
 def pictures_of(bits: int) -> Pictures:
-    """Noise: no two frames alike, every level used."""
+    """Noise with every level; no two frames are equal."""
     rng = np.random.default_rng(bits)
     top = 2**bits
     levels = [rng.integers(0, top, (48, 64), np.uint16) for _ in range(COUNT)]
@@ -111,7 +111,7 @@ def orders() -> list[int]:
 
 
 @pytest.mark.parametrize(("name", "bits", "options", "description"), EXACT)
-def test_ffmpegs_lossless_recordings_come_back_exactly(
+def test_lossless_recordings_of_ffmpeg_are_read_exactly(
     tmp_path: Path, encode: Encode, name: str, bits: int, options: str, description: str
 ) -> None:
     pictures = pictures_of(bits)
@@ -125,13 +125,13 @@ def test_ffmpegs_lossless_recordings_come_back_exactly(
             assert frame.image.dtype == picture.dtype
             np.testing.assert_array_equal(frame.image, picture)
             assert frame.time_s == pytest.approx(frame.index / 60)
-    with VideoSource(path, source.index) as again:
+    with VideoSource(path, source.index) as reopened:
         for index in orders():
-            np.testing.assert_array_equal(again.frame(index).image, pictures[index])
+            np.testing.assert_array_equal(reopened.frame(index).image, pictures[index])
 
 
 @pytest.mark.parametrize(("name", "options", "description"), NEARLY)
-def test_ffmpegs_lossy_recordings_come_back_in_order(
+def test_lossy_recordings_of_ffmpeg_are_read_in_order(
     tmp_path: Path, encode: Encode, name: str, options: str, description: str | None
 ) -> None:
     pictures = numbered()
@@ -144,13 +144,13 @@ def test_ffmpegs_lossy_recordings_come_back_in_order(
         assert number_in(frame.image) == frame.index
         assert np.abs(frame.image.astype(float) - picture).mean() < 3
         assert frame.time_s == pytest.approx(frame.index / 60)
-    with VideoSource(path, source.index) as again:
+    with VideoSource(path, source.index) as reopened:
         for index in orders():
-            np.testing.assert_array_equal(again.frame(index).image, frames[index].image)
+            np.testing.assert_array_equal(reopened.frame(index).image, frames[index].image)
 
 
-def test_limited_luminance_fills_the_range_of_its_bits(tmp_path: Path, encode: Encode) -> None:
-    """Rounding to 219 and back costs a level."""
+def test_limited_luminance_is_expanded_to_the_full_range(tmp_path: Path, encode: Encode) -> None:
+    """Rounding to 219 levels and back causes an error of one level."""
     ramp = [np.tile(np.arange(256, dtype=np.uint8), (48, 1))]
     eight = encode(tmp_path / "8.mkv", ramp, *(FFV1 + " -pix_fmt yuv422p").split())
     with VideoSource(eight) as source:
@@ -161,7 +161,7 @@ def test_limited_luminance_fills_the_range_of_its_bits(tmp_path: Path, encode: E
         assert np.abs(source.frame(0).image / 1023 - ramp[0] / 255).max() < 0.005
 
 
-def test_pictures_are_turned_as_the_recording_says(tmp_path: Path, encode: Encode) -> None:
+def test_rotation_of_a_recording_is_applied(tmp_path: Path, encode: Encode) -> None:
     pictures = numbered()[:3]
     flat = encode(tmp_path / "flat.mp4", pictures, *X264.split())
     turned = tmp_path / "turned.mp4"
@@ -180,23 +180,23 @@ def test_pictures_are_turned_as_the_recording_says(tmp_path: Path, encode: Encod
 @pytest.mark.parametrize(
     ("name", "options"), [("v.mkv", X264), ("v.mp4", X264), ("v.mkv", FFV1), ("v.mp4", MJPG)]
 )
-def test_a_pause_in_a_recording_is_kept(
+def test_pause_in_a_recording_is_preserved(
     tmp_path: Path, encode: Encode, name: str, options: str
 ) -> None:
     """The camera stops for five intervals after frame 5, then runs at half its rate."""
-    place = [k if k <= 5 else 2 * k + 5 for k in range(COUNT)]
+    interval = [k if k <= 5 else 2 * k + 5 for k in range(COUNT)]
     stamps = "setpts='if(lte(N,5),N,2*N+5)/60/TB'"
     path = encode(tmp_path / name, numbered(), *options.split(), "-vf", stamps, "-fps_mode", "vfr")
     with VideoSource(path) as source:
         assert source.warnings == ()
         frames = list(source)
     assert [number_in(frame.image) for frame in frames] == list(range(COUNT))
-    # Matroska keeps whole milliseconds.
-    assert [frame.time_s for frame in frames] == pytest.approx([k / 60 for k in place], abs=6e-4)
+    # Matroska stores times in milliseconds.
+    assert [frame.time_s for frame in frames] == pytest.approx([k / 60 for k in interval], abs=6e-4)
 
 
-def test_frames_that_a_camera_left_out_are_not_missing(tmp_path: Path, encode: Encode) -> None:
-    """After every fifth frame it pauses for three intervals: a varying rate, and no damage."""
+def test_frames_skipped_by_a_camera_are_not_missing(tmp_path: Path, encode: Encode) -> None:
+    """A pause of three intervals after every fifth frame is a variable rate, not damage."""
     stamps = ("-vf", "setpts='(N+floor(N/5)*3)/60/TB'", "-fps_mode", "vfr")
     path = encode(tmp_path / "v.mkv", numbered(), *FFV1.split(), *stamps)
     with VideoSource(path) as source:
@@ -218,23 +218,23 @@ def test_frames_that_a_camera_left_out_are_not_missing(tmp_path: Path, encode: E
         ("v.mov", "-c:v rawvideo -movflags +faststart"),
     ],
 )
-@pytest.mark.parametrize("kept", [0.5, 0.8, 0.99])
-def test_what_is_left_of_a_cut_recording_is_read(
-    tmp_path: Path, encode: Encode, name: str, options: str, kept: float
+@pytest.mark.parametrize("share", [0.5, 0.8, 0.99])
+def test_remaining_frames_of_a_truncated_recording_are_read(
+    tmp_path: Path, encode: Encode, name: str, options: str, share: float
 ) -> None:
     path = encode(tmp_path / name, numbered(), *options.split())
     with VideoSource(path) as source:
-        whole = [frame.image for frame in source]
+        expected = [frame.image for frame in source]
     content = path.read_bytes()
-    path.write_bytes(content[: int(len(content) * kept)])
+    path.write_bytes(content[: int(len(content) * share)])
     with VideoSource(path) as source:
         assert 0 < len(source) <= COUNT
-        got = read_all(source)
-        # H.264 stores a frame before those it is shown after: the last ones left have gaps.
-        for index in range(len(got) - (4 if options.startswith(X264) else 0)):
-            np.testing.assert_array_equal(got[index], whole[index])
-        for index in (len(got) - 1, 0, len(got) // 2):
-            np.testing.assert_array_equal(source.frame(index).image, got[index])
+        images = read_all(source)
+        # H.264 stores some frames before earlier ones, so the last remaining frames have gaps.
+        for index in range(len(images) - (4 if options.startswith(X264) else 0)):
+            np.testing.assert_array_equal(images[index], expected[index])
+        for index in (len(images) - 1, 0, len(images) // 2):
+            np.testing.assert_array_equal(source.frame(index).image, images[index])
 
 
 def read_all(source: VideoSource) -> list[npt.NDArray[Any] | None]:
@@ -251,18 +251,18 @@ def read_all(source: VideoSource) -> list[npt.NDArray[Any] | None]:
     ("name", "options"),
     [("v.avi", FFV1_CRC), ("v.mkv", FFV1_CRC), ("v.avi", "-c:v png"), ("v.mkv", "-c:v png")],
 )
-def test_garbage_in_the_middle_costs_frames_but_changes_none(
+def test_damaged_frames_are_lost_but_never_changed(
     tmp_path: Path, encode: Encode, name: str, options: str
 ) -> None:
-    """These codecs carry checksums: a frame comes back as it was or not at all."""
+    """These codecs have checksums: a frame is either unchanged or unreadable."""
     pictures = pictures_of(8)
     path = encode(tmp_path / name, pictures, *options.split())
     content = path.read_bytes()
     rng = np.random.default_rng(4)
     lost = []
     for _ in range(8):
-        at = int(rng.integers(len(content) // 5, len(content) * 4 // 5))
-        path.write_bytes(content[:at] + rng.bytes(300) + content[at + 300 :])
+        offset = int(rng.integers(len(content) // 5, len(content) * 4 // 5))
+        path.write_bytes(content[:offset] + rng.bytes(300) + content[offset + 300 :])
         with VideoSource(path) as source:
             assert len(source) == COUNT
             images = read_all(source)
@@ -276,10 +276,12 @@ def test_garbage_in_the_middle_costs_frames_but_changes_none(
     assert 0 < max(lost) <= 8
 
 
-def test_frames_after_a_damaged_group_of_pictures_are_whole(tmp_path: Path, encode: Encode) -> None:
+def test_frames_after_a_damaged_group_of_pictures_are_unchanged(
+    tmp_path: Path, encode: Encode
+) -> None:
     path = encode(tmp_path / "v.mp4", numbered(), *X264.split())
     with VideoSource(path) as source:
-        whole = [frame.image for frame in source]
+        expected = [frame.image for frame in source]
     content = bytearray(path.read_bytes())
     with av.open(path) as container:
         places = [packet.pos for packet in container.demux(video=0)]
@@ -290,29 +292,34 @@ def test_frames_after_a_damaged_group_of_pictures_are_whole(tmp_path: Path, enco
         images = read_all(source)
     assert images[15] is None
     for index in (*range(10), *range(30, COUNT)):
-        np.testing.assert_array_equal(images[index], whole[index])
+        np.testing.assert_array_equal(images[index], expected[index])
 
 
 @pytest.mark.parametrize(("name", "options"), [("v.avi", X264), ("v.mkv", FFV1), ("v.mp4", MJPG)])
-def test_with_its_index_a_recording_is_not_read_through_again(
+def test_recording_with_its_index_is_not_scanned_again(
     tmp_path: Path, encode: Encode, name: str, options: str
 ) -> None:
     path = encode(tmp_path / name, numbered(), *options.split())
     with VideoSource(path) as source:
         index = source.index
-        about = (source.shape, source.frame_rate_hz, source.bit_depth, source.description)
-        whole = [frame.image for frame in source]
+        properties = (source.shape, source.frame_rate_hz, source.bit_depth, source.description)
+        expected = [frame.image for frame in source]
     with mock.patch.object(Packets, "read") as read, VideoSource(path, index) as source:
-        assert about == (source.shape, source.frame_rate_hz, source.bit_depth, source.description)
+        assert properties == (
+            source.shape,
+            source.frame_rate_hz,
+            source.bit_depth,
+            source.description,
+        )
         assert (len(source), source.index) == (COUNT, index)
-        np.testing.assert_array_equal(source.frame(33).image, whole[33])
+        np.testing.assert_array_equal(source.frame(33).image, expected[33])
         with source.reopen() as other:
-            np.testing.assert_array_equal(other.frame(12).image, whole[12])
+            np.testing.assert_array_equal(other.frame(12).image, expected[12])
     read.assert_not_called()
 
 
 @pytest.mark.parametrize("options", [X264, FFV1, MJPG])
-def test_an_avi_whose_index_fits_is_not_read_through(
+def test_avi_with_a_valid_index_is_not_scanned(
     tmp_path: Path, encode: Encode, options: str
 ) -> None:
     path = encode(tmp_path / "v.avi", numbered(), *options.split())
@@ -323,52 +330,55 @@ def test_an_avi_whose_index_fits_is_not_read_through(
     read.assert_not_called()
 
 
-def test_an_avi_whose_index_does_not_fit_is_read_through(tmp_path: Path, encode: Encode) -> None:
+def test_avi_with_an_invalid_index_is_scanned(tmp_path: Path, encode: Encode) -> None:
     path = encode(tmp_path / "v.avi", numbered(), *FFV1.split())
     content = path.read_bytes()
     index = content.rindex(b"idx1")
     chunk = content.index(b"00dc", content.index(b"movi"))
     second = content.index(b"00dc", chunk + 8)
     entry = index + 8 + 16 * 3  # of the fourth frame
-    frames, again = content.index(b"avih") + 8 + 16, content.index(b"strh") + 8 + 32
+    total_frames, stream_length = content.index(b"avih") + 8 + 16, content.index(b"strh") + 8 + 32
     one_less, size = ((k * (COUNT - 1)).to_bytes(4, "little") for k in (1, 16))
-    fewer = {frames: one_less, again: one_less}
-    more = content[chunk:second] * 3
-    beyond = b"RIFF" + (len(more) + 16).to_bytes(4, "little") + b"AVIXLIST"
-    beyond += (len(more) + 4).to_bytes(4, "little") + b"movi" + more
+    fewer = {total_frames: one_less, stream_length: one_less}
+    extra_frames = content[chunk:second] * 3
+    beyond = b"RIFF" + (len(extra_frames) + 16).to_bytes(4, "little") + b"AVIXLIST"
+    beyond += (len(extra_frames) + 4).to_bytes(4, "little") + b"movi" + extra_frames
     for changes in (
-        {len(content): beyond},  # others after the index
-        fewer,  # the header speaks of fewer
-        {second: b"01dc"},  # another stream's
-        {second + 4: b"\x07"},  # shorter than the index has it
+        {len(content): beyond},  # more frames after the index
+        fewer,  # fewer frames in the header
+        {second: b"01dc"},  # a packet of another stream
+        {second + 4: b"\x07"},  # shorter than in the index
         {entry + 8: b"\xff\xff\xff\x7f"},  # beyond the file
-        {**fewer, index + 4: size},  # neither it nor the index knows the last
-        {**fewer, index + 4: size + content[index + 8 : entry] + content[entry + 16 :]},  # a fourth
+        {**fewer, index + 4: size},  # the last frame is missing in header and index
+        {
+            **fewer,
+            index + 4: size + content[index + 8 : entry] + content[entry + 16 :],
+        },  # the fourth
     ):
         changed = bytearray(content)
-        for at, put in changes.items():
-            changed[at : at + len(put)] = put
+        for offset, value in changes.items():
+            changed[offset : offset + len(value)] = value
         path.write_bytes(changed)
         with mock.patch.object(Packets, "listed", return_value=None):
-            wanted = index_of(path)
+            expected = index_of(path)
         with mock.patch.object(Packets, "read", side_effect=Packets.read) as read:
-            assert index_of(path) == wanted
+            assert index_of(path) == expected
         read.assert_called_once()
 
 
 def index_of(path: Path) -> bytes | None:
-    """What opening a recording found out; None where it is refused."""
+    """Return the index of a recording, or None if it is rejected."""
     with contextlib.suppress(InputError), VideoSource(path) as source:
         return source.index
     return None
 
 
-def test_an_index_of_a_file_that_cannot_be_read_is_none(tmp_path: Path) -> None:
+def test_index_of_an_unreadable_file_is_none(tmp_path: Path) -> None:
     entry = SimpleNamespace(pos=0, size=1, timestamp=0, is_keyframe=True)
     assert Packets.listed([entry], 0, 1, tmp_path / "gone.avi") is None
 
 
-def test_an_index_that_does_not_fit_is_ignored(tmp_path: Path, encode: Encode) -> None:
+def test_index_of_another_file_is_ignored(tmp_path: Path, encode: Encode) -> None:
     path = encode(tmp_path / "v.avi", numbered(), *FFV1.split())
     with VideoSource(path) as source:
         index = source.index
@@ -376,13 +386,13 @@ def test_an_index_that_does_not_fit_is_ignored(tmp_path: Path, encode: Encode) -
     damaged = bytearray(index)
     damaged[len(index) // 2] ^= 1
     other = encode(tmp_path / "w.avi", numbered()[:20], *FFV1.split())
-    for file, given, count in [
+    for file, stored_index, count in [
         (path, bytes(damaged), COUNT),
         (path, index[:50], COUNT),
         (path, b"", COUNT),
         (other, index, 20),
     ]:
-        with VideoSource(file, given) as source:
+        with VideoSource(file, stored_index) as source:
             assert len(source) == count
             assert number_in(source.frame(count - 1).image) == count - 1
 
@@ -401,17 +411,17 @@ with av.open(path, "w") as container:
     container.mux(stream.encode(frame))
     container.mux(stream.encode(None))
 """
-"""Writes a video of one frame of 42 million pixels: (path, codec, levels); takes 1.5 GB."""
+"""Writes a video of one frame of 42 million pixels: (path, codec, levels); needs 1.5 GB."""
 
 
-def test_a_codec_that_holds_many_large_frames_is_refused(tmp_path: Path) -> None:
-    """What takes one frame of 42 million pixels at a time may be larger."""
-    for codec, refused in (("mpeg4", True), ("ffv1", False)):
+def test_codec_that_buffers_many_large_frames_is_rejected(tmp_path: Path) -> None:
+    """The limit is higher for codecs that decode one frame at a time."""
+    for codec, is_rejected in (("mpeg4", True), ("ffv1", False)):
         path = tmp_path / f"{codec}.avi"
-        levels = "yuv420p" if refused else "gray"
+        levels = "yuv420p" if is_rejected else "gray"
         subprocess.run([sys.executable, "-c", ENCODE_BLACK, path, codec, levels], check=True)
         assert path.stat().st_size < 2e6
-        if refused:
+        if is_rejected:
             with pytest.raises(InputError, match="frame size: 6496×6496 px"):
                 open_source(path)
         else:
@@ -419,7 +429,7 @@ def test_a_codec_that_holds_many_large_frames_is_refused(tmp_path: Path) -> None
                 assert source.shape == (6496, 6496)
 
 
-def test_a_frame_too_large_to_be_true_is_refused(tmp_path: Path, encode: Encode) -> None:
+def test_impossible_frame_size_is_rejected(tmp_path: Path, encode: Encode) -> None:
     path = encode(tmp_path / "v.avi", numbered(), *FFV1.split())
     content = bytearray(path.read_bytes())
     for start in (content.index(b"avih") + 40, content.index(b"strf") + 12):
@@ -432,32 +442,32 @@ def test_a_frame_too_large_to_be_true_is_refused(tmp_path: Path, encode: Encode)
 @pytest.mark.parametrize(
     ("name", "options"), [("v.avi", X264), ("v.mkv", FFV1), ("v.mp4", X264), ("v.avi", MJPG)]
 )
-def test_whatever_the_bytes_a_recording_is_read_or_refused(
+def test_mutated_recordings_are_read_or_rejected(
     tmp_path: Path, encode: Encode, name: str, options: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """Nothing but InputError, and no file is changed."""
+    """Only InputError is raised, and no file is changed."""
     path = encode(tmp_path / name, numbered(), *options.split())
     content = path.read_bytes()
     rng = np.random.default_rng(7)
-    opened = 0
+    readable = 0
     for _ in range(25):
         mutated = bytearray(content)
-        # Headers are hit as often as all the rest.
+        # Headers are changed as often as the rest of the file.
         for span in (600, len(content)):
-            for at in rng.integers(0, span, 3):
-                mutated[at] = rng.integers(256)
+            for offset in rng.integers(0, span, 3):
+                mutated[offset] = rng.integers(256)
         path.write_bytes(mutated)
         with contextlib.suppress(InputError), VideoSource(path) as source:
-            opened += 1
+            readable += 1
             for index in (0, len(source) - 1, len(source) // 2):
                 with contextlib.suppress(InputError):
                     assert source.frame(index).image.shape == source.shape
         assert path.read_bytes() == mutated
-    assert opened > 0
+    assert readable > 0
     assert capfd.readouterr() == ("", "")
 
 
-def test_lists_of_files_and_texts_are_no_videos(tmp_path: Path, encode: Encode) -> None:
+def test_playlists_and_texts_are_rejected(tmp_path: Path, encode: Encode) -> None:
     encode(tmp_path / "v.mkv", numbered(), *FFV1.split())
     playlist = tmp_path / "list.avi"
     playlist.write_text("ffconcat version 1.0\nfile v.mkv\n")
@@ -473,7 +483,7 @@ LOSSY = [("mjpg.avi", "MJPG"), ("mpeg4.mp4", "mp4v")]
 
 
 @pytest.mark.parametrize(("name", "codec"), LOSSLESS)
-def test_lossless_video_comes_back_exactly(
+def test_lossless_video_is_read_exactly(
     tmp_path: Path, pictures: Pictures, write_video: WriteVideo, name: str, codec: str
 ) -> None:
     with open_source(write_video(tmp_path / name, pictures, codec)) as source:
@@ -487,7 +497,7 @@ def test_lossless_video_comes_back_exactly(
 
 
 @pytest.mark.parametrize(("name", "codec"), LOSSY)
-def test_lossy_video_comes_back_nearly(
+def test_lossy_video_is_read_approximately(
     tmp_path: Path, pictures: Pictures, write_video: WriteVideo, name: str, codec: str
 ) -> None:
     smooth = [cv2.GaussianBlur(picture, (0, 0), 3) for picture in pictures]
@@ -498,7 +508,7 @@ def test_lossy_video_comes_back_nearly(
             assert np.abs(frame.image.astype(float) - picture).mean() < 3
 
 
-def test_h264_is_read_and_any_frame_can_be_asked_for() -> None:
+def test_frames_of_h264_are_read_in_any_order() -> None:
     """Long groups of pictures with B-frames; frame k has its blob at u = 10 + 3k."""
     with open_source(H264) as source:
         assert len(source) == 40
@@ -510,8 +520,8 @@ def test_h264_is_read_and_any_frame_can_be_asked_for() -> None:
             np.testing.assert_array_equal(source.frame(index).image, in_order[index])
 
 
-def test_frames_of_a_varying_rate_keep_their_times() -> None:
-    """Frame k is 10·k everywhere; the camera paused, then hurried."""
+def test_times_of_a_variable_frame_rate_are_preserved() -> None:
+    """Frame k is 10·k everywhere; the frame rate varies."""
     time_s = [0, 0.017, 0.033, 0.05, 0.25, 0.26, 0.3, 0.317, 0.333, 0.35, 0.367, 0.383]
     with open_source(VARYING) as source:
         assert source.warnings == ()
@@ -521,8 +531,8 @@ def test_frames_of_a_varying_rate_keep_their_times() -> None:
     assert [frame.time_s for frame in frames] == pytest.approx([time_s[k] for k in expected])
 
 
-def test_sixteen_bits_are_kept() -> None:
-    """Frame k is 1000·k everywhere but for a ramp of 0 … 159 along u."""
+def test_16_bit_levels_are_preserved() -> None:
+    """Frame k is 1000·k plus a ramp of 0 … 159 along u."""
     with open_source(GREY_16) as source:
         for frame in source:
             assert frame.image.dtype == np.uint16
@@ -539,66 +549,66 @@ def test_any_order_gives_the_same_frames(
             np.testing.assert_array_equal(source.frame(index).image, pictures[index])
 
 
-def test_reading_in_order_neither_seeks_nor_opens_again(
+def test_reading_in_order_does_not_seek(
     tmp_path: Path, pictures: Pictures, write_video: WriteVideo
 ) -> None:
     with VideoSource(write_video(tmp_path / "v.avi", pictures, "FFV1")) as source:
-        with mock.patch.object(VideoSource, "_seek") as jump:
+        with mock.patch.object(VideoSource, "_seek") as seek:
             images = [source.frame(index).image for index in (0, 1, 2, 2, 3, 7, 15)]
-        jump.assert_not_called()
+        seek.assert_not_called()
     np.testing.assert_array_equal(images[-1], pictures[15])
 
 
 @pytest.mark.parametrize(("name", "codec"), [*LOSSLESS, LOSSY[0]])
-@pytest.mark.parametrize("kept", [0.4, 0.75, 0.97])
-def test_a_truncated_video_gives_its_whole_frames(
+@pytest.mark.parametrize("share", [0.4, 0.75, 0.97])
+def test_truncated_video_has_its_complete_frames(
     tmp_path: Path,
     pictures: Pictures,
     write_video: WriteVideo,
     name: str,
     codec: str,
-    kept: float,
+    share: float,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
     path = write_video(tmp_path / name, pictures, codec)
     with open_source(path) as source:
-        whole = [frame.image for frame in source]
+        expected = [frame.image for frame in source]
     content = path.read_bytes()
-    path.write_bytes(content[: int(len(content) * kept)])
+    path.write_bytes(content[: int(len(content) * share)])
     with open_source(path) as source:
         images = [frame.image for frame in source]
         assert 0 < len(images) == len(source) < 16
         assert source.warnings == (
             f"{name} ends early: its header says 16 frames, {len(source)} of them complete",
         )
-    # Not a frame too few: one more would need more bytes than there are (AVI's header is 5.6 kB).
-    for image, picture in zip(images, whole, strict=False):
+    # No complete frame is missing: one more would need more bytes (the AVI header has 5.6 kB).
+    for image, picture in zip(images, expected, strict=False):
         np.testing.assert_array_equal(image, picture)
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_frame_that_was_overwritten_does_not_shift_the_others(
+def test_overwritten_frame_does_not_shift_the_others(
     tmp_path: Path, pictures: Pictures, write_video: WriteVideo
 ) -> None:
     path = write_video(tmp_path / "v.avi", pictures, "MJPG")
     with open_source(path) as source:
-        whole = [frame.image for frame in source]
+        expected = [frame.image for frame in source]
     content = path.read_bytes()
     seventh = [match.start() for match in re.finditer(b"\xff\xd8\xff", content)][7]
     path.write_bytes(content[:seventh] + bytes(400) + content[seventh + 400 :])
     with open_source(path) as source:
         assert len(source) == 16
         for index in (*range(7), *range(8, 16), 8, 6):
-            np.testing.assert_array_equal(source.frame(index).image, whole[index])
+            np.testing.assert_array_equal(source.frame(index).image, expected[index])
         with pytest.raises(InputError, match="frame 7: cannot be decoded"):
             source.frame(7)
-        np.testing.assert_array_equal(source.frame(8).image, whole[8])
+        np.testing.assert_array_equal(source.frame(8).image, expected[8])
 
 
 @pytest.mark.parametrize(
     "content", [b"frame 1\nframe 2\n" * 100, bytes(5000), b"RIFF\x00\x00\x00\x00AVI LIST"]
 )
-def test_what_is_no_video_is_refused(
+def test_invalid_video_is_rejected(
     tmp_path: Path, content: bytes, capfd: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "recording_001.avi"
@@ -608,7 +618,7 @@ def test_what_is_no_video_is_refused(
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_video_without_one_whole_frame_is_refused(
+def test_video_without_a_complete_frame_is_rejected(
     tmp_path: Path, pictures: Pictures, write_video: WriteVideo
 ) -> None:
     path = write_video(tmp_path / "v.avi", pictures, "Y800")
@@ -623,7 +633,7 @@ def test_no_file_stays_open(tmp_path: Path, pictures: Pictures, write_video: Wri
     broken = tmp_path / "broken.avi"
     broken.write_bytes(path.read_bytes()[:5800])
 
-    def held() -> int:
+    def open_files() -> int:
         return sum(
             os.readlink(entry).startswith(str(tmp_path))
             for entry in Path("/proc/self/fd").iterdir()
@@ -633,8 +643,8 @@ def test_no_file_stays_open(tmp_path: Path, pictures: Pictures, write_video: Wri
     with open_source(path) as source:
         source.frame(12)
         source.frame(3)
-        assert held() == 1
-    assert held() == 0
+        assert open_files() == 1
+    assert open_files() == 0
     with pytest.raises(InputError):
         open_source(broken)
-    assert held() == 0
+    assert open_files() == 0

@@ -1,4 +1,4 @@
-"""Limits of sizes, and alarms: beyond by more than chance, raised once, shown until seen."""
+"""Limits of sizes and alarms: significant, raised once, shown until acknowledged."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def codes(alarms: list[Alarm] | tuple[Alarm, ...]) -> list[tuple[str, bool]]:
 
 
 @pytest.mark.parametrize(
-    ("value", "sigma", "ends", "told"),
+    ("value", "sigma", "ends", "expected"),
     [
         (6.7, 0.03, (None, None), ""),
         (math.nan, math.nan, (6.0, None), "unknown"),
@@ -44,22 +44,22 @@ def codes(alarms: list[Alarm] | tuple[Alarm, ...]) -> list[tuple[str, bool]]:
         (-0.35, 0.003, (-0.3, -0.2), "low"),
     ],
 )
-def test_how_a_size_stands(value: float, sigma: float, ends: tuple, told: str):
-    assert standing(Size("width", value, sigma), ends) == told
+def test_standing_of_a_size(value: float, sigma: float, ends: tuple, expected: str):
+    assert standing(Size("width", value, sigma), ends) == expected
 
 
-def test_of_a_hollow_pool_the_depth_is_watched():
+def test_depth_of_a_concave_pool_is_monitored():
     hollow = replace(MEASURES, height_mm=0.01, depth_mm=-0.3, depth_sigma_mm=0.004)
     assert sizes_of(hollow)[2] == Size("depth", -0.3, 0.004)
     assert sizes_of(MEASURES)[2] == Size("height", 0.30, 0.003)
     assert all(math.isnan(size.value_mm) for size in sizes_of(None))
-    # A pool that was to rise and is hollow is too low.
+    # A concave pool is below the limits of a convex one.
     alarms = Alarms(Limits(height_mm=(0.2, 0.4)))
     assert codes(alarms.judge(1, 0.1, hollow, "")) == [("height-low", True)]
     assert "Depth -0.300 ± 0.004 mm is below 0.2 mm" in alarms.shown[0].description
 
 
-def test_limits_that_cannot_be_are_refused():
+def test_impossible_limits_are_rejected():
     with pytest.raises(InputError, match="width_mm"):
         Limits(width_mm=(7.0, 6.0))
     with pytest.raises(InputError, match="length_mm"):
@@ -68,12 +68,12 @@ def test_limits_that_cannot_be_are_refused():
         Limits(unmeasured=0)
     assert not Limits().are_set
     assert Limits().words == "none"
-    some = Limits(width_mm=(6, 6.9), length_mm=(None, 8), height_mm=(-0.3, None))
-    assert some.words == "width 6 to 6.9 mm, length to 8 mm, height from -0.3 mm"
+    limits = Limits(width_mm=(6, 6.9), length_mm=(None, 8), height_mm=(-0.3, None))
+    assert limits.words == "width 6 to 6.9 mm, length to 8 mm, height from -0.3 mm"
     assert Limits(height_mm=(None, 1.0)).are_set
 
 
-def test_noise_about_a_limit_is_rarely_an_alarm_and_a_pool_beyond_it_always():
+def test_rate_of_alarms_at_and_beyond_a_limit():
     """A true width at the limit is beyond by 2 σ in one frame of 44 (normal distribution)."""
     rng = np.random.default_rng(5)
     ends = (None, 6.9)
@@ -86,18 +86,18 @@ def test_noise_about_a_limit_is_rarely_an_alarm_and_a_pool_beyond_it_always():
     assert all(standing(Size("width", float(w), 0.03), ends) == "high" for w in outside)
 
 
-def test_an_alarm_is_raised_once_and_stays_until_it_is_over_and_seen():
+def test_alarm_is_raised_once_and_shown_until_acknowledged():
     alarms = Alarms(Limits(width_mm=(None, 6.9)))
     assert alarms.judge(1, 1.0, measured(6.8), "") == []
     assert codes(alarms.judge(2, 2.0, measured(7.0), "")) == [("width-high", True)]
     assert alarms.judge(3, 3.0, measured(7.1), "") == []
-    # Beyond, but by chance perhaps: neither over nor raised again.
+    # Beyond the limit, but not significantly: neither over nor raised again.
     assert alarms.judge(4, 4.0, measured(6.95), "") == []
     assert codes(alarms.judge(5, 5.0, measured(6.8), "")) == [("width-high", False)]
     assert alarms.judge(6, 6.0, measured(6.8), "") == []
     assert codes(alarms.shown) == [("width-high", False)]
     assert (alarms.shown[0].frame, alarms.shown[0].time_s) == (2, 2.0)
-    # Again before it was seen: it is told again.
+    # It occurs again before it was acknowledged: it is reported again.
     assert codes(alarms.judge(7, 7.0, measured(7.0), "")) == [("width-high", True)]
     assert [alarm.frame for alarm in alarms.shown] == [7]
     assert codes(alarms.acknowledge()) == [("width-high", True)]
@@ -108,39 +108,45 @@ def test_an_alarm_is_raised_once_and_stays_until_it_is_over_and_seen():
     assert codes(alarms.judge(9, 9.0, measured(7.0), "")) == [("width-high", True)]
 
 
-def test_a_pool_that_swings_about_a_limit_is_one_alarm():
+def test_pool_oscillating_about_a_limit_is_one_alarm():
     alarms, changed = Alarms(Limits(width_mm=(None, 6.9))), []
     for frame in range(600):
         time_s = frame / 100
-        swing = 0.3 * np.sin(2 * np.pi * 2.7 * time_s) if time_s < 4 else -0.3
-        changed += alarms.judge(frame, time_s, measured(6.9 + swing), "")
+        deviation = 0.3 * np.sin(2 * np.pi * 2.7 * time_s) if time_s < 4 else -0.3
+        changed += alarms.judge(frame, time_s, measured(6.9 + deviation), "")
     assert codes(changed) == [("width-high", True), ("width-high", False)]
     assert changed[0].time_s < 0.1
 
 
-def test_from_too_wide_to_too_narrow():
+def test_pool_changes_from_too_wide_to_too_narrow():
     alarms = Alarms(Limits(width_mm=(6.0, 6.9)))
     alarms.judge(0, 0.0, measured(7.2), "")
     assert codes(alarms.judge(1, 0.5, measured(5.5), "")) == [("width-low", True)]
     assert codes(alarms.judge(2, 1.1, measured(5.5), "")) == [("width-high", False)]
 
 
-def test_frames_in_a_row_that_cannot_be_measured_are_an_alarm():
+def test_consecutive_unmeasured_frames_are_an_alarm():
     alarms = Alarms(Limits(width_mm=(6.0, 6.9), unmeasured=3))
     alarms.judge(0, 0.0, measured(7.0), "")
     for frame in (1, 2):
         assert alarms.judge(frame, float(frame), None, "no dots") == []
-    # One that could not be measured does not bring a size back in order.
+    # An unmeasured frame does not end the alarm of a size.
     assert codes(alarms.shown) == [("width-high", True)]
     assert alarms.judge(3, 3.0, measured(7.0), "") == []
     raised = [alarms.judge(frame, float(frame), None, "no dots") for frame in range(4, 9)]
-    assert [codes(each) for each in raised] == [[], [], [("not-measured", True)], [], []]
+    assert [codes(alarms_of_frame) for alarms_of_frame in raised] == [
+        [],
+        [],
+        [("not-measured", True)],
+        [],
+        [],
+    ]
     assert alarms.shown[1].words == "3 frames in a row could not be measured: no dots"
     over = alarms.judge(9, 9.0, measured(6.5), "")
     assert codes(over) == [("width-high", False), ("not-measured", False)]
 
 
-def test_a_frame_that_misses_a_watched_size_is_not_in_order():
+def test_frame_without_a_monitored_size_counts_as_unmeasured():
     alarms = Alarms(Limits(width_mm=(None, 6.9), unmeasured=2))
     alarms.judge(1, 0.1, measured(7.2), "")
     for k in range(2, 40):
@@ -148,13 +154,13 @@ def test_a_frame_that_misses_a_watched_size_is_not_in_order():
     assert codes(alarms.shown) == [("width-high", True), ("not-measured", True)]
 
 
-def test_without_limits_nothing_is_watched():
+def test_no_alarms_without_limits():
     alarms = Alarms(Limits())
     for frame in range(20):
         assert alarms.judge(frame, 0.0, None, "no dots") == []
 
 
-def test_other_limits_end_the_alarms_of_the_former():
+def test_new_limits_end_the_alarms_of_former_limits():
     alarms = Alarms(Limits(width_mm=(None, 6.9), length_mm=(None, 7.0)))
     alarms.judge(0, 0.0, measured(7.2), "")
     assert [code for code, _ in codes(alarms.shown)] == ["width-high", "length-high"]
@@ -166,33 +172,33 @@ def test_other_limits_end_the_alarms_of_the_former():
     assert alarms.shown == ()
 
 
-def test_alarms_are_told_by_their_codes():
+def test_alarms_are_streamed_by_their_codes():
     alarms = Alarms(Limits(width_mm=(None, 6.9), length_mm=(None, 7.0)))
     alarms.judge(3, 0.0, measured(7.2), "")
     alarms.judge(4, 1.0, measured(6.8), "")
     measured_ok = Measurement("ok", "", "fit", measures=MEASURES)
-    told = stream_values(FrameResult(4, 0.0, measured_ok), alarms.shown)
-    assert told["alarm"] == "length-high"
-    assert told["unacknowledged"] == "width-high length-high"
-    assert told["width_mm"] == MEASURES.width_mm
+    values = stream_values(FrameResult(4, 0.0, measured_ok), alarms.shown)
+    assert values["alarm"] == "length-high"
+    assert values["unacknowledged"] == "width-high length-high"
+    assert values["width_mm"] == MEASURES.width_mm
     alarms.acknowledge()
-    told = stream_values(FrameResult(5, 0.0, Measurement("ok", "", "fit")), alarms.shown)
-    assert (told["alarm"], told["unacknowledged"]) == ("length-high", "")
+    values = stream_values(FrameResult(5, 0.0, Measurement("ok", "", "fit")), alarms.shown)
+    assert (values["alarm"], values["unacknowledged"]) == ("length-high", "")
 
 
-def test_a_session_keeps_its_limits(tmp_path: Path):
-    wanted = Limits(width_mm=(6.0, None), height_mm=(-0.4, -0.2), unmeasured=7)
+def test_session_stores_its_limits(tmp_path: Path):
+    limits = Limits(width_mm=(6.0, None), height_mm=(-0.4, -0.2), unmeasured=7)
     with Session.create(tmp_path / "a.labsession") as session:
         assert session.limits == Limits()
-        session.set_limits(wanted)
+        session.set_limits(limits)
         session.set_limits(Limits())
         session.undo()
     with Session.open(tmp_path / "a.labsession") as session:
-        assert session.limits == wanted
+        assert session.limits == limits
         assert session.problems() == []
 
 
-def test_a_set_up_that_is_doubtful_is_an_alarm_without_limits_too():
+def test_doubtful_setup_is_an_alarm_even_without_limits():
     alarms = Alarms(Limits())
     assert alarms.judge(1, 1.0, measured(6.8), "") == []
     raised = alarms.judge(2, 2.0, measured(6.8), "", "the laser slipped")

@@ -1,4 +1,4 @@
-"""Frames that wait: measured at even steps, as many as can be, and never far behind for long."""
+"""Queue of live frames: even steps, as many frames as possible, no long delays."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ IMAGE = np.zeros((1, 1), np.uint8)
 
 @dataclass(frozen=True)
 class Measured:
-    """A frame that was measured, and when that was begun, s."""
+    """A measured frame, and the time at which its measurement began, s."""
 
     number: int
     began_s: float
@@ -36,13 +36,13 @@ def measure(
     cold: frozenset[int] = frozenset(),
     slow: frozenset[int] = frozenset(),
 ) -> list[Measured]:
-    """Have a camera give frames while they are measured, each in a time.
+    """Simulate a camera whose frames are measured, each in ``took_s``.
 
-    Measured by itself, in 1.5 s, is the how-many-th one as told, and any that is far from the one
-    before where no 16 were followed until then. Slow ones take 10 s.
+    The n-th measured frames, n in ``cold``, are measured by themselves, in 1.5 s; so is a frame
+    far from the one before, unless 16 were followed until then. Those in ``slow`` take 10 s.
     """
-    done: list[Measured] = []
-    free_s, learnt = frames[0] / RATE_HZ, MOST
+    measured: list[Measured] = []
+    free_s, followed_count = frames[0] / RATE_HZ, MOST
     busy: tuple[bool, float] | None = None
     for number in frames:
         now_s = number / RATE_HZ
@@ -52,70 +52,76 @@ def measure(
             busy, frame = None, queue.next()
             if frame is None:
                 break
-            done.append(Measured(frame.number, max(free_s, frame.number / RATE_HZ)))
-            far = len(done) > 1 and done[-1].number - done[-2].number > REACH_S * RATE_HZ
-            followed = len(done) not in cold and (not far or learnt >= MOST // 2)
-            learnt = learnt + 1 if followed else 0
-            own_s = COLD_S if not followed else 10.0 if len(done) in slow else took_s
-            busy, free_s = (followed, own_s), done[-1].began_s + own_s
+            measured.append(Measured(frame.number, max(free_s, frame.number / RATE_HZ)))
+            far = (
+                len(measured) > 1 and measured[-1].number - measured[-2].number > REACH_S * RATE_HZ
+            )
+            followed = len(measured) not in cold and (not far or followed_count >= MOST // 2)
+            followed_count = followed_count + 1 if followed else 0
+            duration_s = COLD_S if not followed else 10.0 if len(measured) in slow else took_s
+            busy, free_s = (followed, duration_s), measured[-1].began_s + duration_s
         queue.put(CameraFrame(number, now_s, now_s, IMAGE))
-    return done
+    return measured
 
 
 @pytest.mark.parametrize("took_s", [0.002, 0.006, 0.011, 0.03])
-def test_steps_are_even_and_as_small_as_measuring_allows(took_s: float) -> None:
+def test_steps_are_even_and_as_small_as_possible(took_s: float) -> None:
     queue = FrameQueue()
-    done = measure(queue, range(2000), took_s)
-    settled = [one.number for one in done if one.number > 1000]
+    measured = measure(queue, range(2000), took_s)
+    settled = [frame.number for frame in measured if frame.number > 1000]
     every = int(np.ceil(took_s / SHARE * RATE_HZ - 1e-6))
     assert set(np.diff(settled)) == {every}
     assert queue.every == every
-    assert max(one.age_s for one in done if one.number > 1000) < 0.02
+    assert max(frame.age_s for frame in measured if frame.number > 1000) < 0.02
 
 
-def test_at_first_steps_are_large_enough_for_a_swing() -> None:
-    done = measure(FrameQueue(), range(400), 0.002)
-    steps = np.diff([one.number for one in done[2 : 2 * MOST]])
+def test_first_steps_cover_an_oscillation() -> None:
+    measured = measure(FrameQueue(), range(400), 0.002)
+    steps = np.diff([frame.number for frame in measured[2 : 2 * MOST]])
     assert steps.min() >= SWING_S * RATE_HZ
 
 
-def test_after_a_frame_measured_by_itself_come_those_right_after_it_and_then_the_newest() -> None:
-    done = measure(FrameQueue(), range(4000), 0.006, cold=frozenset({101}))
-    at = done[100].number
-    after = [one.number for one in done[100 : 101 + MOST]]
+def test_frame_measured_alone_is_followed_by_the_next_then_the_newest() -> None:
+    measured = measure(FrameQueue(), range(4000), 0.006, cold=frozenset({101}))
+    cold_number = measured[100].number
+    after = [frame.number for frame in measured[100 : 101 + MOST]]
     assert np.diff(after).max() <= 4
-    jumped = done[101 + MOST]
-    assert jumped.number > at + 100
+    jumped = measured[101 + MOST]
+    assert jumped.number > cold_number + 100
     assert jumped.age_s < 0.05
-    assert set(np.diff([one.number for one in done if one.number > jumped.number + 700])) == {2}
+    assert set(
+        np.diff([frame.number for frame in measured if frame.number > jumped.number + 700])
+    ) == {2}
 
 
 @pytest.mark.parametrize("lost", [1, 4, 20])
-def test_figures_never_grow_older_than_one_search_makes_them(lost: int) -> None:
-    """Frames that come after one that was searched for have to be searched for, too."""
+def test_results_are_delayed_by_one_search_at_most(lost: int) -> None:
+    """Frames after a searched frame have to be searched, too."""
     cold = frozenset(range(101, 102 + lost))
-    done = measure(FrameQueue(), range(10_000), 0.006, cold=cold)
-    assert max(one.age_s for one in done) < COLD_S + 0.05
-    assert max(one.age_s for one in done[-1000:]) < 0.05
+    measured = measure(FrameQueue(), range(10_000), 0.006, cold=cold)
+    assert max(frame.age_s for frame in measured) < COLD_S + 0.05
+    assert max(frame.age_s for frame in measured[-1000:]) < 0.05
 
 
-def test_where_measuring_becomes_slow_it_is_never_behind_for_long() -> None:
+def test_slower_measuring_causes_no_long_delay() -> None:
     queue = FrameQueue()
     measure(queue, range(1000), 0.005)
-    done = measure(queue, range(1000, 5000), 0.05)
-    assert max(one.age_s for one in done if one.number > 3000) < 0.1
-    done = measure(queue, range(5000, 9000), 0.005)
-    assert set(np.diff([one.number for one in done if one.number > 8000])) == {2}
+    measured = measure(queue, range(1000, 5000), 0.05)
+    assert max(frame.age_s for frame in measured if frame.number > 3000) < 0.1
+    measured = measure(queue, range(5000, 9000), 0.005)
+    assert set(np.diff([frame.number for frame in measured if frame.number > 8000])) == {2}
 
 
-def test_after_a_long_wait_frames_are_followed_again() -> None:
+def test_frames_are_followed_again_after_a_long_delay() -> None:
     queue = FrameQueue()
-    done = measure(queue, range(16000), 0.006, cold=frozenset({200, 201}), slow=frozenset({199}))
-    assert max(one.age_s for one in done if one.number > 9000) < 0.1
-    assert set(np.diff([one.number for one in done if one.number > 12000])) == {2}
+    measured = measure(
+        queue, range(16000), 0.006, cold=frozenset({200, 201}), slow=frozenset({199})
+    )
+    assert max(frame.age_s for frame in measured if frame.number > 9000) < 0.1
+    assert set(np.diff([frame.number for frame in measured if frame.number > 12000])) == {2}
 
 
-def test_a_camera_whose_clock_is_set_back_is_measured_as_before() -> None:
+def test_steps_do_not_change_if_the_camera_clock_is_set_back() -> None:
     queue, numbers = FrameQueue(), []
     for number in range(2000):
         time_s = number / RATE_HZ if number < 500 else 2.5 + 1e-6 * number
@@ -126,7 +132,7 @@ def test_a_camera_whose_clock_is_set_back_is_measured_as_before() -> None:
     assert np.diff(numbers).max() <= 3
 
 
-def test_a_camera_that_counts_from_the_start_again_goes_on() -> None:
+def test_camera_may_restart_its_frame_numbers() -> None:
     queue = FrameQueue()
     measure(queue, range(1000), 0.005)
     queue.put(CameraFrame(0, 9.0, 9.0, IMAGE))

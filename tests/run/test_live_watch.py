@@ -1,4 +1,4 @@
-"""Live frames that are measured: their trend, how measuring keeps up, alarms, who is told."""
+"""Measurement of live frames: trend, rate, alarms, streams."""
 
 from __future__ import annotations
 
@@ -40,18 +40,18 @@ SAMPLE = Path(__file__).parents[2] / "sample_sessions" / "gtaw"
 
 MEASURES = Measures(*[0.0] * 4, 6.7, 7.5, 0.30, -0.01, *[0.0] * 6, *[0.03, 0.04, 0.003] * 2)
 
-Told = list[tuple[Event, float | None]]
+Events = list[tuple[Event, float | None]]
 
 
 class Prepared:
-    """Measures what it is told to: a width for each frame's number, None where it cannot be."""
+    """A measurer with prepared results: a width for each frame number, or None for a failure."""
 
     def __init__(self, *_: object) -> None:
         self.widths: dict[int, float | None] = {}
-        self.asked: list[bool] = []
+        self.drawn: list[bool] = []
 
     def measure(self, frame: CameraFrame, drawn: bool) -> LiveResult:
-        self.asked.append(drawn)
+        self.drawn.append(drawn)
         width = self.widths.get(int(frame.image[0, 0]), 6.7)
         result = LiveResult(
             frame=frame.number,
@@ -63,8 +63,8 @@ class Prepared:
         if width is None:
             return result
         scene: Scene | None = empty_scene(np.zeros((1, 3)), (0, 1), "", "") if drawn else None
-        found = Measurement("ok", "", "fit", measures=replace(MEASURES, width_mm=width))
-        return replace(result, measurement=found, scene=scene)
+        measurement = Measurement("ok", "", "fit", measures=replace(MEASURES, width_mm=width))
+        return replace(result, measurement=measurement, scene=scene)
 
     def close(self) -> None:
         pass
@@ -76,17 +76,17 @@ def setup() -> Setup:
 
 
 @pytest.fixture
-def told() -> Told:
+def events() -> Events:
     return []
 
 
 @pytest.fixture
-def watch(setup: Setup, told: Told, monkeypatch: pytest.MonkeyPatch) -> Iterator[LiveWatch]:
+def watch(setup: Setup, events: Events, monkeypatch: pytest.MonkeyPatch) -> Iterator[LiveWatch]:
     monkeypatch.setattr(live_watch, "LiveMeasuring", Prepared)
     limits = Limits(width_mm=(6.0, 6.9), unmeasured=2)
-    made = LiveWatch("camera", setup, Settings(), 8, limits, lambda *each: told.append(each))
-    yield made
-    made.close()
+    watch = LiveWatch("camera", setup, Settings(), 8, limits, lambda *event: events.append(event))
+    yield watch
+    watch.close()
 
 
 def frame(number: int, image: np.ndarray | None = None) -> CameraFrame:
@@ -101,7 +101,7 @@ def prepare(watch: LiveWatch, widths: dict[int, float | None]) -> Prepared:
     return prepared
 
 
-def test_the_trend_has_every_frame_that_was_tried(watch: LiveWatch):
+def test_trend_contains_every_tried_frame(watch: LiveWatch):
     prepare(watch, {1: 7.2, 2: None})
     limits = watch.alarms.limits
     assert watch.trend.over(60, limits).names == ("width", "length", "height")
@@ -121,20 +121,20 @@ def test_the_trend_has_every_frame_that_was_tried(watch: LiveWatch):
     assert pace.measured_hz == 3 / live_trend.RATE_S
 
 
-def test_the_trend_forgets_what_is_old(watch: LiveWatch, monkeypatch: pytest.MonkeyPatch):
+def test_trend_drops_old_frames(watch: LiveWatch, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(live_trend, "TREND_S", 0.0)
     for number in range(50):
         watch.measure(frame(number))
     assert watch.trend.over(60, Limits()).number.tolist() == [49]
 
 
-def test_alarms_are_said_with_the_time_of_their_frame(watch: LiveWatch, told: Told):
+def test_alarms_are_reported_with_the_time_of_their_frame(watch: LiveWatch, events: Events):
     prepare(watch, {3: 7.2, 4: 7.2, 6: None, 7: None})
     for number in range(9):
         watch.measure(frame(number))
     watch.acknowledge()
     watch.acknowledge()
-    assert [(event.kind, time_s) for event, time_s in told] == [
+    assert [(event.kind, time_s) for event, time_s in events] == [
         ("warning", 13.0),
         ("note", 15.0),
         ("warning", 17.0),
@@ -142,7 +142,7 @@ def test_alarms_are_said_with_the_time_of_their_frame(watch: LiveWatch, told: To
         ("note", None),
         ("note", None),
     ]
-    words = [event.words for event, _ in told]
+    words = [event.words for event, _ in events]
     assert words[0] == "ALARM: Width 7.200 ± 0.030 mm is above 6.9 mm (frame 3)"
     assert words[1].startswith("alarm over: Width 7.200")
     assert words[2] == "ALARM: 2 frames in a row could not be measured: it is dark (frame 7)"
@@ -150,32 +150,32 @@ def test_alarms_are_said_with_the_time_of_their_frame(watch: LiveWatch, told: To
     assert watch.alarms.shown == ()
     for _ in range(2):
         watch.set_limits(Limits(width_mm=(6.0, None)))
-    assert [event.words for event, _ in told[6:]] == ["limits now: width from 6 mm"]
+    assert [event.words for event, _ in events[6:]] == ["limits now: width from 6 mm"]
 
 
-def test_no_figure_for_long_is_an_alarm_until_there_is_one(
-    watch: LiveWatch, told: Told, monkeypatch: pytest.MonkeyPatch
+def test_missing_results_are_an_alarm_until_the_next_result(
+    watch: LiveWatch, events: Events, monkeypatch: pytest.MonkeyPatch
 ):
     watch.measure(frame(3))
     assert watch.next_frame() is None
-    assert told == []
+    assert events == []
     monkeypatch.setattr(live_watch, "SILENT_S", 0.0)
     for _ in range(3):
         watch.next_frame()
-    assert [event.words for event, _ in told] == [
+    assert [event.words for event, _ in events] == [
         "ALARM: No frame has been measured for 0 s (frame 3)"
     ]
     assert [(alarm.code, alarm.holds) for alarm in watch.alarms.shown] == [("silent", True)]
     watch.measure(frame(5))
     assert [(alarm.code, alarm.holds) for alarm in watch.alarms.shown] == [("silent", False)]
-    assert told[-1][0].words.startswith("alarm over: No frame has been measured")
+    assert events[-1][0].words.startswith("alarm over: No frame has been measured")
 
 
-def test_measuring_that_ends_by_itself_is_an_alarm_and_is_told(watch: LiveWatch, told: Told):
+def test_failed_measuring_is_an_alarm_and_is_streamed(watch: LiveWatch, events: Events):
     stream = LineStream()
     watch.set_stream("lines", stream)
-    with connect(stream.port) as heard:
-        lines = heard.makefile(encoding="utf-8")
+    with connect(stream.port) as connection:
+        lines = connection.makefile(encoding="utf-8")
         lines.readline()
 
         def broken(*_: object) -> LiveResult:
@@ -188,18 +188,18 @@ def test_measuring_that_ends_by_itself_is_an_alarm_and_is_told(watch: LiveWatch,
     assert line["status"] == "silent"
     assert line["alarm"] == "silent"
     assert line.get("width_mm") is None
-    assert "Nothing is measured any more: the process was killed" in told[0][0].words
+    assert "Nothing is measured any more: the process was killed" in events[0][0].words
 
 
-def test_alarms_that_other_limits_end_are_said_to_be_over(watch: LiveWatch, told: Told):
+def test_alarms_ended_by_new_limits_are_reported(watch: LiveWatch, events: Events):
     prepare(watch, {1: 7.2})
     watch.measure(frame(1))
     watch.set_limits(Limits(width_mm=(6.0, 7.5)))
-    kinds = [event.words.partition(":")[0] for event, _ in told]
+    kinds = [event.words.partition(":")[0] for event, _ in events]
     assert kinds == ["ALARM", "alarm over", "limits now"]
 
 
-def test_the_trend_judges_as_figures_are_judged(watch: LiveWatch):
+def test_trend_marks_the_values_beyond_the_limits(watch: LiveWatch):
     rng = np.random.default_rng(3)
     widths = {k: float(w) for k, w in enumerate(rng.uniform(5.8, 7.1, 60))}
     prepare(watch, {**widths, 7: None})
@@ -208,34 +208,34 @@ def test_the_trend_judges_as_figures_are_judged(watch: LiveWatch):
     limits = watch.alarms.limits
     trend = watch.trend.over(60, limits)
     sizes = zip(trend.value_mm[0].tolist(), trend.sigma_mm[0].tolist(), strict=True)
-    stands = [standing(Size("width", *each), limits.width_mm) for each in sizes]
-    assert trend.beyond[0].tolist() == [each in ("low", "high") for each in stands]
-    assert {"low", "high", "in order", "unknown"} <= set(stands)
+    standings = [standing(Size("width", *size), limits.width_mm) for size in sizes]
+    assert trend.beyond[0].tolist() == [size in ("low", "high") for size in standings]
+    assert {"low", "high", "in order", "unknown"} <= set(standings)
 
 
-def test_a_surface_is_drawn_when_it_is_asked_for_and_only_once(watch: LiveWatch):
+def test_surface_is_drawn_once_per_request(watch: LiveWatch):
     prepared = prepare(watch, {1: None})
     watch.measure(frame(0))
     watch.ask_for_scene()
-    for number in (1, 2, 3):  # the first of them has none
+    for number in (1, 2, 3):  # the first one has no surface
         watch.measure(frame(number))
-    assert prepared.asked == [False, True, True, False]
+    assert prepared.drawn == [False, True, True, False]
     result = watch.newest()
     assert result is not None
     assert result.frame == 3
     assert watch.newest() is None
-    # The surface that was asked for is there, though another frame was measured since.
+    # The requested surface is available although another frame was measured since.
     assert watch.scene() is not None
     assert watch.scene() is None
 
 
-def test_frames_and_alarms_are_told_to_who_listens(watch: LiveWatch):
+def test_frames_and_alarms_are_streamed(watch: LiveWatch):
     prepare(watch, {1: 7.2, 2: None})
     stream = LineStream()
     watch.set_stream("lines", stream)
     assert watch.stream("lines") is stream
-    with connect(stream.port) as connected:
-        file = connected.makefile("rb")
+    with connect(stream.port) as connection:
+        file = connection.makefile("rb")
         file.readline()
         for number in range(3):
             watch.measure(frame(number))
@@ -255,7 +255,7 @@ def test_frames_and_alarms_are_told_to_who_listens(watch: LiveWatch):
     assert watch.stream("lines") is None
 
 
-def test_a_stream_that_comes_when_all_is_over_is_closed(watch: LiveWatch):
+def test_stream_added_after_the_end_is_closed(watch: LiveWatch):
     watch.close()
     stream = LineStream()
     watch.set_stream("lines", stream)
@@ -263,14 +263,14 @@ def test_a_stream_that_comes_when_all_is_over_is_closed(watch: LiveWatch):
         connect(stream.port)
 
 
-def test_a_pool_beyond_a_limit_and_darkness_raise_alarms(setup: Setup, told: Told):
-    """Of a rendered pool whose width is known, measured in the process that measures."""
+def test_pool_beyond_a_limit_and_darkness_raise_alarms(setup: Setup, events: Events):
+    """A rendered pool of known width is measured in the measuring process."""
     with (SAMPLE / "truth.csv").open() as file:
         width = float(next(csv.DictReader(file))["width_mm"])
     with open_source(SAMPLE / "recording.avi") as video:
         image = video.frame(0).image
     narrow = Limits(width_mm=(None, 0.9 * width), height_mm=(None, 5.0), unmeasured=2)
-    watch = LiveWatch("camera", setup, Settings(), 8, narrow, lambda *each: told.append(each))
+    watch = LiveWatch("camera", setup, Settings(), 8, narrow, lambda *event: events.append(event))
     try:
         watch.ask_for_scene()
         watch.measure(frame(0, image))
@@ -284,25 +284,25 @@ def test_a_pool_beyond_a_limit_and_darkness_raise_alarms(setup: Setup, told: Tol
         assert watch.alarms.shown == ()
         dark = np.random.default_rng(3).integers(0, 4, image.shape).astype(np.uint8)
         began_s = time.monotonic()
-        for number in count(2):  # the first are left out
+        for number in count(2):  # the first dark frames are skipped
             watch.measure(frame(number, dark))
             if watch.alarms.shown:
                 break
             assert time.monotonic() < began_s + PATIENCE_S
         assert [alarm.code for alarm in watch.alarms.shown] == ["not-measured"]
-        assert told[-1][0].words.startswith("ALARM: 2 frames in a row could not be measured: ")
+        assert events[-1][0].words.startswith("ALARM: 2 frames in a row could not be measured: ")
     finally:
         watch.close()
 
 
 @pytest.mark.skipif(not hasattr(os, "nice"), reason="the system knows no niceness")
-def test_what_measures_gives_way_to_nothing(setup: Setup):
-    """Behind other programs its figures would be a minute old; they are looked at now."""
+def test_measuring_process_has_normal_priority(setup: Setup):
+    """With a lower priority, its results could be a minute old on a busy machine."""
     with closing(LiveMeasuring(setup, Settings(), 8)) as measuring:
         assert measuring._pool.submit(os.nice, 0).result() == os.nice(0)
 
 
-def test_a_frame_that_is_left_out_is_none_that_failed(watch: LiveWatch, told: Told):
+def test_skipped_frame_is_not_a_failed_frame(watch: LiveWatch, events: Events):
     prepared = prepare(watch, {})
     watch.measure(frame(1))
     measure = prepared.measure
@@ -313,11 +313,11 @@ def test_a_frame_that_is_left_out_is_none_that_failed(watch: LiveWatch, told: To
     watch.measure(frame(9))
     assert watch.trend.over(60, Limits()).number.tolist() == [1, 9]
     assert watch.trend.pace().failed == 0
-    assert told == []
+    assert events == []
 
 
 class Chain:
-    """Follows frames unless it is lost, and notes when it searches and when frames are judged."""
+    """Follows frames unless it is lost; records the times of searches, skips and judgements."""
 
     def __init__(self) -> None:
         self.now_s, self.is_lost = 100.0, True
@@ -325,15 +325,15 @@ class Chain:
         self.judged: list[float] = []
         self.skipped: list[float] = []
         self.track_lost: str | None = None
-        self.found = Measurement("ok", "", "fit", Dots(*np.ones((7, 2))), measures=MEASURES)
+        self.measurement = Measurement("ok", "", "fit", Dots(*np.ones((7, 2))), measures=MEASURES)
 
     def follow(self, _: np.ndarray) -> Measurement | None:
         self.track_lost = "it jumped" if self.is_lost else None
-        return None if self.is_lost else self.found
+        return None if self.is_lost else self.measurement
 
     def search(self, _: np.ndarray) -> Measurement:
         self.searched.append(self.now_s)
-        return self.found
+        return self.measurement
 
     def skip(self) -> None:
         self.skipped.append(self.now_s)
@@ -351,50 +351,54 @@ def chain(monkeypatch: pytest.MonkeyPatch) -> Chain:
     return chain
 
 
-def test_a_frame_is_searched_for_only_when_none_was_followed_for_long(setup: Setup, chain: Chain):
-    measure, one = LiveChain(setup, Settings(), 8).measure, frame(1)
-    assert measure(one, False) is not None  # the first
+def test_search_only_after_a_long_time_without_followed_frames(setup: Setup, chain: Chain):
+    measure, live_frame = LiveChain(setup, Settings(), 8).measure, frame(1)
+    assert measure(live_frame, False) is not None  # the first
     assert chain.searched == [100.0]
     chain.now_s += 0.9 * SOUGHT_S
-    assert measure(one, False) is None
+    assert measure(live_frame, False) is None
     chain.is_lost = False
-    followed = measure(one, False)
+    followed = measure(live_frame, False)
     assert followed is not None
     assert followed.track_lost is None
     chain.is_lost = True
     chain.now_s += 0.9 * SOUGHT_S
-    assert measure(one, False) is None
+    assert measure(live_frame, False) is None
     chain.now_s += 0.2 * SOUGHT_S
-    again = measure(one, False)
-    assert again is not None
-    assert again.track_lost == "it jumped"
+    searched = measure(live_frame, False)
+    assert searched is not None
+    assert searched.track_lost == "it jumped"
     assert chain.skipped == pytest.approx([100 + 0.9 * SOUGHT_S, 100 + 1.8 * SOUGHT_S])
     assert chain.searched == [100.0, chain.now_s]
 
 
-def test_frames_are_judged_some_times_a_second_while_they_are_followed(setup: Setup, chain: Chain):
-    measure, one = LiveChain(setup, Settings(), 8).measure, frame(7)
-    result = measure(one, False)
+def test_followed_frames_are_judged_at_the_set_rate(setup: Setup, chain: Chain):
+    measure, live_frame = LiveChain(setup, Settings(), 8).measure, frame(7)
+    result = measure(live_frame, False)
     assert result is not None
-    assert (result.frame, result.time_s, result.arrived_s) == (7, one.time_s, one.arrived_s)
+    assert (result.frame, result.time_s, result.arrived_s) == (
+        7,
+        live_frame.time_s,
+        live_frame.arrived_s,
+    )
     assert result.measurement.measures == MEASURES
-    assert result.measurement.dots is None  # what stays in the process
+    assert result.measurement.dots is None  # dots stay in the process
     chain.is_lost = False
-    wanted = [100.0]
+    expected = [100.0]
     for share in (0.6, 1.2, 1.8, 2.3):
         chain.now_s = 100.0 + share * JUDGED_S
-        measure(one, False)
-        wanted += [chain.now_s] if share in (1.2, 2.3) else []
-        assert chain.judged == wanted
+        measure(live_frame, False)
+        expected += [chain.now_s] if share in (1.2, 2.3) else []
+        assert chain.judged == expected
     chain.is_lost, chain.now_s = True, chain.now_s + 1.1 * SOUGHT_S
-    for _ in range(2):  # each that is searched for
-        measure(one, False)
+    for _ in range(2):  # every searched frame is judged
+        measure(live_frame, False)
         chain.now_s += 1.1 * SOUGHT_S
-    assert len(chain.judged) == len(wanted) + 2
+    assert len(chain.judged) == len(expected) + 2
 
 
-def test_a_model_predicts_from_what_is_measured_and_not_while_all_is_silent(watch: LiveWatch):
-    """Half the width, a step a frame: the step that ended is that of the frame before."""
+def test_model_predicts_only_from_measured_frames(watch: LiveWatch):
+    """The model gives half the width of the frame before, one step per frame."""
     settings = ModelSettings(("width_mm",), "back_width_mm", 1.0, Orders(0, 1, 0))
     one, half = np.ones(1), LinearMap(np.array([0.5, 0.0]), np.zeros((2, 2)))
     model = PenetrationModel("arx", settings, (), 0 * one, one, 0 * one, 9 * one, 0.0, half, 0.1)
@@ -408,9 +412,9 @@ def test_a_model_predicts_from_what_is_measured_and_not_while_all_is_silent(watc
         for number in range(12):
             watch.measure(frame(number))
         lines = [json.loads(file.readline()) for _ in range(12)]
-        found = [line["penetration_mm"] for line in lines]
-        assert found[:5] == [None, *map(pytest.approx, (3.35, 3.5, 2.5, 3.35))]
-        assert found[-1] is None
+        predictions = [line["penetration_mm"] for line in lines]
+        assert predictions[:5] == [None, *map(pytest.approx, (3.35, 3.5, 2.5, 3.35))]
+        assert predictions[-1] is None
         assert {line["penetration_model"] for line in lines} == {"bench back_width_mm"}
         assert lines[2]["penetration_sigma_mm"] == pytest.approx(np.hypot(0.1, 0.5 * 0.03))
         watch._raise_silence("nothing came")

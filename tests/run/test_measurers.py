@@ -1,4 +1,4 @@
-"""Frames measured cold, and in stretches: the same wherever that is, whole in their tables."""
+"""Frames measured cold and in stretches: equal results in any process, complete tables."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> RecordingMeasurer:
     return RecordingMeasurer(folder / "made" / "recording.avi", None, setup, Settings())
 
 
-def test_two_sequences_in_turn_keep_apart(
+def test_two_interleaved_sequences_are_independent(
     recording: RecordingMeasurer, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(measurers, "BATCH", 1)
@@ -71,41 +71,45 @@ def test_two_sequences_in_turn_keep_apart(
         for k, number in enumerate(order):
             cv2.imwrite(str(tmp_path / name / f"{k}.png"), images[number])
     jobs = [replace(recording, path=tmp_path / name) for name in "ab"]
-    alone = [[one.rows for one in each(range(3))] for each in jobs]
-    in_turn = zip(*(each(range(3)) for each in jobs), strict=True)
-    assert [[one.rows for one in pair] for pair in in_turn] == [
-        list(pair) for pair in zip(*alone, strict=True)
+    separate = [[result.rows for result in job(range(3))] for job in jobs]
+    interleaved = zip(*(job(range(3)) for job in jobs), strict=True)
+    assert [[result.rows for result in pair] for pair in interleaved] == [
+        list(pair) for pair in zip(*separate, strict=True)
     ]
 
 
-def assemble_measures(told: FrameResult) -> dict[str, float]:
-    assert told.measurement.measures is not None
-    return asdict(told.measurement.measures)
+def measures_of(result: FrameResult) -> dict[str, float]:
+    assert result.measurement.measures is not None
+    return asdict(result.measurement.measures)
 
 
-def test_stretches_are_measured_alike_here_and_by_processes(
+def test_stretches_are_measured_equally_with_and_without_processes(
     recording: RecordingMeasurer, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.setattr(measurers, "STRETCH", 5)
     monkeypatch.setattr(measurers, "BATCH", 2)
-    told: dict[int, list[FrameResult]] = {}
+    results_of: dict[int, list[FrameResult]] = {}
     for workers in (0, 2):
         with stretch_pools(FRAMES, workers) as pools:
             assert len(pools) == workers
-            told[workers] = list(replace(recording, with_surfaces=True, pools=pools)(range(FRAMES)))
-    assert [one.frame for one in told[2]] == list(range(FRAMES))
-    for here, there in zip(told[0], told[2], strict=True):
-        assert here.rows == there.rows
-        assert there.measurement.reconstruction is not None
-        assert here.track_lost == there.track_lost
-        np.testing.assert_equal(assemble_measures(here), assemble_measures(there))  # NaN is NaN
-    cold = {one.frame for one in told[0] if one.track_lost is not None}
+            results_of[workers] = list(
+                replace(recording, with_surfaces=True, pools=pools)(range(FRAMES))
+            )
+    assert [result.frame for result in results_of[2]] == list(range(FRAMES))
+    for local, distributed in zip(results_of[0], results_of[2], strict=True):
+        assert local.rows == distributed.rows
+        assert distributed.measurement.reconstruction is not None
+        assert local.track_lost == distributed.track_lost
+        np.testing.assert_equal(measures_of(local), measures_of(distributed))  # NaN is NaN
+    cold = {result.frame for result in results_of[0] if result.track_lost is not None}
     assert cold == {0, 1, 2, 5, 6, 7}  # the first three of each stretch
     with ResultsWriter(tmp_path / "out", recording.setup.calibration, {}) as results:
-        for one in told[2]:
-            results.write(one)
-    made = sorted(path.name for path in (tmp_path / "out").glob("surface_*"))
-    assert made == [f"surface_{k:06d}.{end}" for k in range(FRAMES) for end in ("csv", "stl")]
+        for result in results_of[2]:
+            results.write(result)
+    surface_files = sorted(path.name for path in (tmp_path / "out").glob("surface_*"))
+    assert surface_files == [
+        f"surface_{k:06d}.{end}" for k in range(FRAMES) for end in ("csv", "stl")
+    ]
     with (tmp_path / "out" / "measures.csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     assert [row["status"] for row in rows] == ["ok"] * FRAMES
@@ -113,31 +117,31 @@ def test_stretches_are_measured_alike_here_and_by_processes(
 
 
 class Slow(Executor):
-    """A pool that has done the first of what it was given when it has so much, and no more."""
+    """A pool that finishes only its first task, when it has a given number of tasks."""
 
     def __init__(self, most: int, done: Any) -> None:
-        self.given: list[Future[Any]] = []
+        self.tasks: list[Future[Any]] = []
         self._most, self._done = most, done
 
     def submit(self, *_: Any, **__: Any) -> Future[Any]:
-        self.given.append(Future())
-        if len(self.given) == self._most:
-            self.given[0].set_result(self._done)
-        return self.given[-1]
+        self.tasks.append(Future())
+        if len(self.tasks) == self._most:
+            self.tasks[0].set_result(self._done)
+        return self.tasks[-1]
 
 
-def test_a_sequence_given_up_takes_back_what_it_had_given_out(
+def test_closed_sequence_cancels_its_tasks(
     recording: RecordingMeasurer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(measurers, "BATCH", 2)
     pool = Slow(5, ["the first"])
-    told = replace(recording, pools=[pool])(range(FRAMES))
-    assert next(told) == "the first"
-    told.close()
-    assert [one.cancelled() for one in pool.given] == [False, True, True, True, True]
+    results = replace(recording, pools=[pool])(range(FRAMES))
+    assert next(results) == "the first"
+    results.close()
+    assert [task.cancelled() for task in pool.tasks] == [False, True, True, True, True]
 
 
-def test_a_frame_that_cannot_be_read_is_told_and_the_others_measured(
+def test_unreadable_frame_is_reported_and_the_others_measured(
     recording: RecordingMeasurer, tmp_path: Path
 ) -> None:
     folder = tmp_path / "frames"
@@ -146,16 +150,16 @@ def test_a_frame_that_cannot_be_read_is_told_and_the_others_measured(
         for n in range(3):
             cv2.imwrite(str(folder / f"frame_{n}.png"), np.asarray(source.frame(n).image))
     (folder / "frame_1.png").write_bytes(b"not a picture")
-    told = list(replace(recording, path=folder)(range(3)))
-    assert [one.measurement.status for one in told] == ["ok", "unreadable", "ok"]
+    results = list(replace(recording, path=folder)(range(3)))
+    assert [result.measurement.status for result in results] == ["ok", "unreadable", "ok"]
 
 
-def test_the_command_follows_frames(recording: RecordingMeasurer, tmp_path: Path) -> None:
+def test_command_follows_frames(recording: RecordingMeasurer, tmp_path: Path) -> None:
     (tmp_path / "setup.toml").write_text(recording.setup.text, "utf-8")
     out = tmp_path / "results"
-    given = ["reconstruct", recording.path, "--setup", tmp_path / "setup.toml", "--out", out]
-    some = ["--frames", "2:6", "--surfaces", "none", "--warm"]
-    result = CliRunner().invoke(app, [*map(str, given), *some])
+    arguments = ["reconstruct", recording.path, "--setup", tmp_path / "setup.toml", "--out", out]
+    options = ["--frames", "2:6", "--surfaces", "none", "--warm"]
+    result = CliRunner().invoke(app, [*map(str, arguments), *options])
     assert result.exit_code == 0, result.output
     assert "4 frames, 4 with a surface" in result.output
     assert json.loads((out / "run.json").read_text("utf-8"))["warm"] is True
@@ -163,30 +167,30 @@ def test_the_command_follows_frames(recording: RecordingMeasurer, tmp_path: Path
         assert [row["frame"] for row in csv.DictReader(file)] == ["2", "3", "4", "5"]
 
 
-def test_the_benchmark_measures_every_frame_and_no_label_wrong(tmp_path: Path) -> None:
-    given = ["benchmark", "--frames", "40", "--workers", "0", "--cache", str(tmp_path)]
-    result = CliRunner().invoke(app, given)
+def test_benchmark_measures_every_frame_without_wrong_labels(tmp_path: Path) -> None:
+    arguments = ["benchmark", "--frames", "40", "--workers", "0", "--cache", str(tmp_path)]
+    result = CliRunner().invoke(app, arguments)
     assert result.exit_code == 0, result.output
     assert "100.00 % of the frames" in result.output
     assert "wrong labels            0;" in result.output
     assert (tmp_path / "oscillating_40.avi").exists()
 
 
-def test_a_session_follows_frames_and_leaves_corrected_ones_as_they_are(
+def test_session_follows_frames_and_keeps_corrections(
     recording: RecordingMeasurer, tmp_path: Path
 ) -> None:
     with Session.create(tmp_path / "one.labsession", Record(title="a pool that swings")) as session:
         session.set_setup(recording.setup.text)
         session.import_recording(recording.path)
         first = dict(session.measure_each([0, 1, 2], warm=True))
-        assert [one.status for one in first.values()] == ["ok"] * 3
-        bare = told_here(recording)[1].measurement
+        assert [measurement.status for measurement in first.values()] == ["ok"] * 3
+        bare = first_results(recording)[1].measurement
         assert_same(first[1].measures, bare.measures)
         assert (bare.dots, bare.lattice, bare.match, bare.reconstruction) == (None,) * 4
         session.correct({1: start_correction(first[1])}, "as it is")
-        again = dict(session.measure_each([0, 1, 2], warm=True))
-        assert again[1].correction is not None
-        assert again[2].status == "ok"
+        remeasured = dict(session.measure_each([0, 1, 2], warm=True))
+        assert remeasured[1].correction is not None
+        assert remeasured[2].status == "ok"
 
 
 @pytest.mark.parametrize(
@@ -198,22 +202,22 @@ def test_a_session_follows_frames_and_leaves_corrected_ones_as_they_are(
         ([0, 1, 2, 3, 4, 6, 7, 8], None, [1, 2, 1, 1, 1]),  # two changes of the step
     ],
 )
-def test_frames_beside_a_gap_are_not_taken_for_equally_spaced(
+def test_frames_beside_a_gap_are_not_treated_as_equally_spaced(
     recording: RecordingMeasurer,
     monkeypatch: pytest.MonkeyPatch,
     frames: Sequence[int],
     gap: str | None,
     remembered: list[int],
 ) -> None:
-    """What a frame is extrapolated from; the first three are measured by themselves."""
-    found: list[int] = []
+    """Number of frames used for each extrapolation; the first three are measured cold."""
+    past_counts: list[int] = []
     predict = following.predictions
 
-    def counted(prior: Prior) -> Iterator[np.ndarray]:
-        found.append(len(prior.past))
+    def count_and_predict(prior: Prior) -> Iterator[np.ndarray]:
+        past_counts.append(len(prior.past))
         return predict(prior)
 
-    monkeypatch.setattr(following, "predictions", counted)
+    monkeypatch.setattr(following, "predictions", count_and_predict)
     with open_source(recording.path) as source:
 
         def read(number: int) -> Frame:
@@ -229,51 +233,53 @@ def test_frames_beside_a_gap_are_not_taken_for_equally_spaced(
 
         measurer = WarmMeasurer(read, recording.setup, Settings(), corrected)
         results = list(measurer(frames))
-    wrong = [one.frame for one in results if one.measurement.status != "ok"]
+    wrong = [result.frame for result in results if result.measurement.status != "ok"]
     assert wrong == ([5] if gap == "unreadable" else [])
-    assert found == remembered
+    assert past_counts == remembered
 
 
 @pytest.mark.slow
-def test_a_chain_in_another_process_gives_the_same(recording: RecordingMeasurer) -> None:
+def test_chain_in_another_process_gives_equal_results(recording: RecordingMeasurer) -> None:
     frames = [0, 1, 2, 3, 4, 7, 8]  # with a gap
     with open_source(recording.path) as source, measuring_pool(1) as pool:
-        given = source.frame, recording.setup, Settings()
-        here, there = (list(WarmMeasurer(*given, pool=each)(frames)) for each in (None, pool))
-    assert [one.frame for one in there] == frames
-    for one, other in zip(here, there, strict=True):
-        assert one.track_lost == other.track_lost
-        assert_same(one.measurement.measures, other.measurement.measures)
+        arguments = source.frame, recording.setup, Settings()
+        local, remote = (
+            list(WarmMeasurer(*arguments, pool=executor)(frames)) for executor in (None, pool)
+        )
+    assert [result.frame for result in remote] == frames
+    for result, other in zip(local, remote, strict=True):
+        assert result.track_lost == other.track_lost
+        assert_same(result.measurement.measures, other.measurement.measures)
 
 
-def told_here(recording: RecordingMeasurer) -> list[FrameResult]:
+def first_results(recording: RecordingMeasurer) -> list[FrameResult]:
     return list(recording(range(3)))
 
 
-# --- each frame by itself -------------------------------------------------------------------------
+# --- cold frames ----------------------------------------------------------------------------------
 
 
 class Later(Executor):
-    """A pool that has done nothing before it is asked for the last frame."""
+    """A pool that runs its tasks, in reverse order, when the last frame is submitted."""
 
     def __init__(self, last: int) -> None:
-        self.begun: list[tuple[Future[Any], Any]] = []
+        self.pending: list[tuple[Future[Any], Any]] = []
         self._last = last
 
-    def submit(self, work: Any, /, *given: Any, **_: Any) -> Future[Any]:
-        self.begun.append((Future(), lambda: work(*given)))
-        if given[0] == self._last:
-            for future, do in reversed(self.begun):
+    def submit(self, work: Any, /, *arguments: Any, **_: Any) -> Future[Any]:
+        self.pending.append((Future(), lambda: work(*arguments)))
+        if arguments[0] == self._last:
+            for future, do in reversed(self.pending):
                 future.set_result(do())
-        return self.begun[-1][0]
+        return self.pending[-1][0]
 
 
 @pytest.fixture
 def plain(monkeypatch: pytest.MonkeyPatch, recording: RecordingMeasurer) -> Any:
-    """A cold measurer whose measurements say no more than grey level and correction of a frame."""
+    """A cold measurer whose measurements contain only grey level and correction of a frame."""
 
-    def measure(image: np.ndarray, *given: Any) -> tuple[Measurement, None]:
-        return Measurement("no-dots", f"{image[0, 0]}, {given[-1]}", given[1].scheme), None
+    def measure(image: np.ndarray, *arguments: Any) -> tuple[Measurement, None]:
+        return Measurement("no-dots", f"{image[0, 0]}, {arguments[-1]}", arguments[1].scheme), None
 
     def read(number: int) -> Frame:
         if number == 3:
@@ -289,40 +295,40 @@ def plain(monkeypatch: pytest.MonkeyPatch, recording: RecordingMeasurer) -> Any:
     return measurer
 
 
-def test_cold_frames_come_in_their_order_wherever_they_are_measured(plain: Any) -> None:
+def test_cold_frames_are_returned_in_order_from_any_process(plain: Any) -> None:
     frames = [5, 1, 3, 4, 0]
     for pool in (None, Later(last=0)):
-        found = list(plain(pool)(frames))
-        assert [each.frame for each in found] == frames
-        assert [each.time_s for each in found] == [0.5, 0.1, None, 0.4, 0.0]
-        assert [each.measurement.status for each in found] == [
+        results = list(plain(pool)(frames))
+        assert [result.frame for result in results] == frames
+        assert [result.time_s for result in results] == [0.5, 0.1, None, 0.4, 0.0]
+        assert [result.measurement.status for result in results] == [
             *("no-dots", "no-dots", "unreadable", "no-dots", "no-dots")
         ]
-        assert found[0].measurement.reason == "5, by hand"
-        assert found[1].measurement.reason == "1, None"
-        assert "cannot be decoded" in found[2].measurement.reason
-        assert {each.track_lost for each in found} == {None}
+        assert results[0].measurement.reason == "5, by hand"
+        assert results[1].measurement.reason == "1, None"
+        assert "cannot be decoded" in results[2].measurement.reason
+        assert {result.track_lost for result in results} == {None}
 
 
-def test_a_pool_is_given_some_frames_ahead_which_are_taken_back_at_the_end(plain: Any) -> None:
+def test_frames_submitted_ahead_are_cancelled_at_the_end(plain: Any) -> None:
     first = FrameResult(4, None, Measurement("no-dots", "", "fit"))
     pool = Slow(AHEAD + 1, first)
     results = plain(pool)(range(4, 100))
     assert next(results) == first
     results.close()
-    assert [one.cancelled() for one in pool.given] == [False, *[True] * AHEAD]
+    assert [task.cancelled() for task in pool.tasks] == [False, *[True] * AHEAD]
 
 
-def test_one_frame_at_a_time_is_measured_here(plain: Any) -> None:
-    asked: list[int] = []
+def test_frames_are_measured_one_at_a_time_without_a_pool(plain: Any) -> None:
+    requested: list[int] = []
 
     def numbers() -> Iterator[int]:
         for number in range(9):
-            asked.append(number)
+            requested.append(number)
             yield number
 
     for result in plain()(numbers()):
-        assert asked[-1] == result.frame
+        assert requested[-1] == result.frame
 
 
 THREADS = """
@@ -346,9 +352,9 @@ THREADS = """
 """
 
 
-def test_matrices_are_multiplied_in_one_thread_from_the_first_frame_on() -> None:
-    """Those of SciPy, too, which nothing may have loaded before."""
-    done = subprocess.run(
+def test_linear_algebra_uses_one_thread_from_the_first_frame() -> None:
+    """This includes the libraries of SciPy, which may not have been imported before."""
+    process = subprocess.run(
         [sys.executable, "-c", textwrap.dedent(THREADS)],
         capture_output=True,
         text=True,
@@ -356,32 +362,32 @@ def test_matrices_are_multiplied_in_one_thread_from_the_first_frame_on() -> None
         cwd=Path(__file__).parents[2],
         env={**os.environ, "PYTHONPATH": ".", "OPENBLAS_NUM_THREADS": "2"},
     )
-    assert (done.returncode, done.stdout) == (0, "{1}\n"), done.stderr
+    assert (process.returncode, process.stdout) == (0, "{1}\n"), process.stderr
 
 
 @pytest.fixture
 def slipping(
     monkeypatch: pytest.MonkeyPatch, recording: RecordingMeasurer
 ) -> Callable[[int], ColdMeasurer]:
-    """A cold measurer of the recording that has the rows of one frame a row off."""
+    """A cold measurer of the recording that shifts the rows of one frame by one."""
     rig = recording.setup.rig
 
-    def measurer(slips: int) -> ColdMeasurer:
+    def measurer(shifted: int) -> ColdMeasurer:
         with open_source(recording.path) as source:
             images = {number: source.frame(number) for number in range(4)}
 
-        def measure(image: np.ndarray, *given: Any) -> tuple[Measurement, None]:
-            found, _ = pipeline.measure(image, *given)
-            if image is not images[slips].image:
-                return found, None
-            assert found.match is not None
+        def measure(image: np.ndarray, *arguments: Any) -> tuple[Measurement, None]:
+            measurement, _ = pipeline.measure(image, *arguments)
+            if image is not images[shifted].image:
+                return measurement, None
+            assert measurement.match is not None
             match = replace(
-                found.match,
-                ray=found.match.ray + np.array([1, 0]),
-                witness=np.roll(found.match.witness, 1, axis=0),
+                measurement.match,
+                ray=measurement.match.ray + np.array([1, 0]),
+                witness=np.roll(measurement.match.witness, 1, axis=0),
             )
-            made = fit.reconstruct(match, rig, FitSettings())
-            return replace(found, match=match, reconstruction=made), None
+            reconstruction = fit.reconstruct(match, rig, FitSettings())
+            return replace(measurement, match=match, reconstruction=reconstruction), None
 
         monkeypatch.setattr(measurers, "measure", measure)
         return ColdMeasurer(images.__getitem__, recording.setup, recording.settings)
@@ -389,30 +395,30 @@ def slipping(
     return measurer
 
 
-@pytest.mark.parametrize("slips", [0, 1, 3])
-def test_a_frame_whose_rows_slipped_is_not_answered(
-    slipping: Callable[[int], ColdMeasurer], slips: int
+@pytest.mark.parametrize("shifted", [0, 1, 3])
+def test_frame_with_shifted_rows_is_refused(
+    slipping: Callable[[int], ColdMeasurer], shifted: int
 ) -> None:
-    told = list(slipping(slips)(range(4)))
-    assert [each.frame for each in told] == list(range(4))
-    expected = ["ambiguous-rows" if k == slips else "ok" for k in range(4)]
-    assert [each.measurement.status for each in told] == expected
+    results = list(slipping(shifted)(range(4)))
+    assert [result.frame for result in results] == list(range(4))
+    expected = ["ambiguous-rows" if k == shifted else "ok" for k in range(4)]
+    assert [result.measurement.status for result in results] == expected
 
 
-def test_two_frames_whose_rows_differ_are_both_not_answered(
+def test_two_frames_whose_rows_differ_are_both_refused(
     slipping: Callable[[int], ColdMeasurer],
 ) -> None:
-    told = list(slipping(1)(range(2)))
-    assert [each.measurement.status for each in told] == ["ambiguous-rows"] * 2
+    results = list(slipping(1)(range(2)))
+    assert [result.measurement.status for result in results] == ["ambiguous-rows"] * 2
 
 
-def test_what_was_measured_is_told_before_measuring_fails(
+def test_results_before_a_failure_are_returned(
     monkeypatch: pytest.MonkeyPatch, recording: RecordingMeasurer
 ) -> None:
-    def measure(image: np.ndarray, *given: Any) -> Any:
+    def measure(image: np.ndarray, *arguments: Any) -> Any:
         if image[0, 0] == 4:
             raise OSError("a process has ended")
-        return pipeline.measure(images[int(image[0, 0])], *given)
+        return pipeline.measure(images[int(image[0, 0])], *arguments)
 
     with open_source(recording.path) as source:
         images = [source.frame(number).image for number in range(4)]
@@ -421,7 +427,7 @@ def test_what_was_measured_is_told_before_measuring_fails(
     def read(number: int) -> Frame:
         return Frame(number, None, np.full((2, 2), number, np.uint8))
 
-    told = []
+    results = []
     with pytest.raises(OSError, match="a process has ended"):
-        told.extend(ColdMeasurer(read, recording.setup, recording.settings)(range(9)))
-    assert [each.frame for each in told] == [0, 1, 2, 3]
+        results.extend(ColdMeasurer(read, recording.setup, recording.settings)(range(9)))
+    assert [result.frame for result in results] == [0, 1, 2, 3]

@@ -1,4 +1,4 @@
-"""A run: every sink gets every result, and whoever stops it stops what measures."""
+"""A run: every sink gets every result, and closing the run closes the measurer."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ from labapp.export.frame_result import FrameResult
 from labapp.run.runner import run
 
 
-class Plain:
-    """Measures nothing, and notes which frames it came to and whether it was closed."""
+class FakeMeasurer:
+    """A measurer that only records the started frames, and whether it was closed."""
 
     def __init__(self) -> None:
-        self.begun: list[int] = []
+        self.started: list[int] = []
         self.is_closed = False
 
     def __call__(self, frames: Iterable[int]) -> Generator[FrameResult]:
         try:
             for number in frames:
-                self.begun.append(number)
+                self.started.append(number)
                 yield FrameResult(number, None, Measurement("no-dots", "it is dark", "fit"))
         finally:
             self.is_closed = True
 
 
 @pytest.fixture
-def measurer() -> Plain:
-    return Plain()
+def measurer() -> FakeMeasurer:
+    return FakeMeasurer()
 
 
-def test_every_sink_has_a_result_before_it_is_given_out(measurer: Plain) -> None:
+def test_every_sink_gets_a_result_before_the_caller(measurer: FakeMeasurer) -> None:
     first: list[FrameResult] = []
     second: list[tuple[FrameResult, bool]] = []
     sinks = [first.append, lambda result: second.append((result, result is first[-1]))]
@@ -44,24 +44,24 @@ def test_every_sink_has_a_result_before_it_is_given_out(measurer: Plain) -> None
     assert measurer.is_closed
 
 
-def test_what_a_sink_raises_ends_the_run(measurer: Plain) -> None:
-    told: list[int] = []
+def test_exception_of_a_sink_ends_the_run(measurer: FakeMeasurer) -> None:
+    frames: list[int] = []
 
-    def full(result: FrameResult) -> None:
+    def fail_at_frame_1(result: FrameResult) -> None:
         if result.frame == 1:
             raise OSError("the disk is full")
 
-    running = run(range(5), measurer, [full, lambda result: told.append(result.frame)])
-    assert next(running).frame == 0
+    results = run(range(5), measurer, [fail_at_frame_1, lambda result: frames.append(result.frame)])
+    assert next(results).frame == 0
     with pytest.raises(OSError, match="full") as raised:
-        next(running)
-    assert (told, measurer.begun, measurer.is_closed) == ([0], [0, 1], True)
+        next(results)
+    assert (frames, measurer.started, measurer.is_closed) == ([0], [0, 1], True)
     assert raised.value.args == ("the disk is full",)
 
 
-def test_a_run_that_is_closed_measures_no_more(measurer: Plain) -> None:
-    told: list[FrameResult] = []
-    running = run(range(5), measurer, [told.append])
-    next(running)
-    running.close()
-    assert (len(told), measurer.begun, measurer.is_closed) == (1, [0], True)
+def test_closed_run_measures_no_further_frames(measurer: FakeMeasurer) -> None:
+    received: list[FrameResult] = []
+    results = run(range(5), measurer, [received.append])
+    next(results)
+    results.close()
+    assert (len(received), measurer.started, measurer.is_closed) == (1, [0], True)

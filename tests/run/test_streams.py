@@ -1,4 +1,4 @@
-"""Measures told while they are made: to who listens, to who does not read, and to nobody else."""
+"""Streams of measures: to clients that read, to clients that do not read, and to no others."""
 
 from __future__ import annotations
 
@@ -42,29 +42,29 @@ def lines() -> Iterator[LineStream]:
     stream.close()
 
 
-def listener(stream: LineStream) -> Any:
-    """A file of lines, the first already read."""
-    connected = connect(stream.port)
-    file = connected.makefile("rb")
-    connected.close()
+def connect_file(stream: LineStream) -> Any:
+    """Connect to a stream; return its lines as a file, with the first one already read."""
+    connection = connect(stream.port)
+    file = connection.makefile("rb")
+    connection.close()
     assert "labapp" in json.loads(file.readline())
     return file
 
 
-def test_a_measurement_is_told_with_the_names_of_the_table(measured: Measurement) -> None:
-    told = stream_values(FrameResult(7, 0.1, measured))
-    assert list(told)[:5] == ["frame", "time_s", "status", "reason", "scheme"]
-    assert list(told)[5:] == [*SIZES, "sigma_of", "setup_status", "setup_doubt"]
-    assert told["sigma_of"] == SIGMA_OF
+def test_streamed_values_have_the_names_of_the_table(measured: Measurement) -> None:
+    values = stream_values(FrameResult(7, 0.1, measured))
+    assert list(values)[:5] == ["frame", "time_s", "status", "reason", "scheme"]
+    assert list(values)[5:] == [*SIZES, "sigma_of", "setup_status", "setup_doubt"]
+    assert values["sigma_of"] == SIGMA_OF
     assert measured.measures is not None
-    assert told["height_mm"] == measured.measures.height_mm
-    without = stream_values(FrameResult(8, None, DARK))
-    assert without["time_s"] is without["height_mm"] is without["height_sigma_mm"] is None
-    assert without["reason"] == "It is dark"
+    assert values["height_mm"] == measured.measures.height_mm
+    unmeasured = stream_values(FrameResult(8, None, DARK))
+    assert unmeasured["time_s"] is unmeasured["height_mm"] is unmeasured["height_sigma_mm"] is None
+    assert unmeasured["reason"] == "It is dark"
 
 
-def test_every_listener_gets_every_line(lines: LineStream) -> None:
-    files = [listener(lines), listener(lines)]
+def test_every_client_gets_every_line(lines: LineStream) -> None:
+    files = [connect_file(lines), connect_file(lines)]
     for frame in range(500):
         lines.publish({"frame": frame, "status": "ok", "height_mm": 0.1 * frame})
     for file in files:
@@ -77,8 +77,8 @@ def test_every_listener_gets_every_line(lines: LineStream) -> None:
         file.close()
 
 
-def test_too_many_listeners_are_refused_and_harm_nobody() -> None:
-    """The measurement opens files while more programs connect than a process may have open."""
+def test_too_many_clients_are_rejected_without_harm() -> None:
+    """The program opens files while more clients connect than a process may have open files."""
     script = """
         import resource, sys
         resource.setrlimit(resource.RLIMIT_NOFILE, (200, 200))
@@ -91,30 +91,30 @@ def test_too_many_listeners_are_refused_and_harm_nobody() -> None:
                 stream.publish({"frame": frame})
         stream.close()
     """
-    measuring = subprocess.Popen(
+    process = subprocess.Popen(
         [sys.executable, "-c", textwrap.dedent(script)],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         env={"PYTHONPATH": ":".join(sys.path)},
     )
-    assert measuring.stdin is not None
-    assert measuring.stdout is not None
+    assert process.stdin is not None
+    assert process.stdout is not None
     with ExitStack() as stack:
-        port = int(measuring.stdout.readline())
+        port = int(process.stdout.readline())
         first = stack.enter_context(connect(port)).makefile("rb")
         assert list(json.loads(first.readline())) == ["labapp"]
-        connected = [stack.enter_context(connect(port)) for _ in range(300)]
-        # The last is answered when all before it were.
-        for each in (connected[0], connected[-1]):
-            assert "labapp" in json.loads(each.makefile("rb").readline())
-        _, told = measuring.communicate(b"go\n", PATIENCE_S)
-        assert (measuring.returncode, told) == (0, b"")
+        connections = [stack.enter_context(connect(port)) for _ in range(300)]
+        # The last one is accepted after all others.
+        for connection in (connections[0], connections[-1]):
+            assert "labapp" in json.loads(connection.makefile("rb").readline())
+        _, stderr = process.communicate(b"go\n", PATIENCE_S)
+        assert (process.returncode, stderr) == (0, b"")
         assert [json.loads(line)["frame"] for line in first] == list(range(100))
-        assert connected[-1].recv(1) == b""
+        assert connections[-1].recv(1) == b""
 
 
-def test_too_many_clients_of_opc_ua_are_refused_and_harm_nobody(port: int) -> None:
+def test_too_many_opc_ua_clients_are_rejected_without_harm(port: int) -> None:
     pytest.importorskip("asyncua")
     script = f"""
         import resource, sys
@@ -129,81 +129,81 @@ def test_too_many_clients_of_opc_ua_are_refused_and_harm_nobody(port: int) -> No
         print(stream.listeners)
         stream.close()
     """
-    measuring = subprocess.Popen(
+    process = subprocess.Popen(
         [sys.executable, "-c", textwrap.dedent(script)],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         env={"PYTHONPATH": ":".join(sys.path)},
     )
-    assert measuring.stdout is not None
+    assert process.stdout is not None
     with ExitStack() as stack:
-        assert measuring.stdout.readline() == b"begun\n"
-        connected = [stack.enter_context(connect(port)) for _ in range(300)]
-        assert connected[-1].recv(1) == b""  # refused, after all before it were answered
-        listeners, complained = measuring.communicate(b"go\n", PATIENCE_S)
-        assert (measuring.returncode, complained) == (0, b"")
-        assert int(listeners) <= 32  # who says nothing for half a minute is let go
+        assert process.stdout.readline() == b"begun\n"
+        connections = [stack.enter_context(connect(port)) for _ in range(300)]
+        assert connections[-1].recv(1) == b""  # rejected, after all others were accepted
+        listeners, stderr = process.communicate(b"go\n", PATIENCE_S)
+        assert (process.returncode, stderr) == (0, b"")
+        assert int(listeners) <= 32  # silent clients are disconnected after half a minute
 
 
-def test_who_does_not_read_is_told_what_it_missed_and_holds_nobody_up(lines: LineStream) -> None:
-    idle, eager = listener(lines), listener(lines)
+def test_client_that_does_not_read_gets_the_number_of_missed_lines(lines: LineStream) -> None:
+    idle, reader = connect_file(lines), connect_file(lines)
     padding = "x" * 10_000
     for frame in range(3000):
         lines.publish({"frame": frame, "reason": padding})
-        assert json.loads(eager.readline())["frame"] == frame
-    seen, missed = [], 0
-    while not seen or seen[-1] < 2999:
-        # Each tells what was missed before it, if there is room again.
-        lines.publish({"frame": 3000 + len(seen), "reason": ""})
-        told = json.loads(idle.readline())
-        seen.append(told["frame"])
-        missed += told.get("missed", 0)
+        assert json.loads(reader.readline())["frame"] == frame
+    frames, missed = [], 0
+    while not frames or frames[-1] < 2999:
+        # Each line states the number missed before it, as soon as there is space again.
+        lines.publish({"frame": 3000 + len(frames), "reason": ""})
+        line = json.loads(idle.readline())
+        frames.append(line["frame"])
+        missed += line.get("missed", 0)
     assert missed > 0
-    assert seen == sorted(seen)
-    assert seen[-1] + 1 == len(seen) + missed
+    assert frames == sorted(frames)
+    assert frames[-1] + 1 == len(frames) + missed
     idle.close()
-    eager.close()
+    reader.close()
 
 
-def test_what_was_missed_is_told_at_the_end_too(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(streams, "PATIENCE_S", PATIENCE_S)  # this listener does read, if late
+def test_number_of_missed_lines_is_sent_at_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(streams, "PATIENCE_S", PATIENCE_S)  # this client reads, but late
     stream = LineStream()
-    idle = listener(stream)
+    idle = connect_file(stream)
     for frame in range(1500):
         stream.publish({"frame": frame, "reason": "x" * 10_000})
-    stream._loop.run(asyncio.sleep(0))  # all were sent, or missed, before any is read
+    stream._loop.run(asyncio.sleep(0))  # all are sent or missed before the first is read
     ending = threading.Thread(target=stream.close)
     ending.start()
-    told = [json.loads(line) for line in idle]
+    lines = [json.loads(line) for line in idle]
     ending.join()
-    assert told[-1]["missed"] + len(told) - 1 == 1500
+    assert lines[-1]["missed"] + len(lines) - 1 == 1500
     idle.close()
 
 
-def test_a_listener_that_says_no_more_is_told_on(lines: LineStream) -> None:
-    with connect(lines.port) as connected:
-        file = connected.makefile("rb")
+def test_client_that_closes_its_sending_side_still_gets_lines(lines: LineStream) -> None:
+    with connect(lines.port) as connection:
+        file = connection.makefile("rb")
         file.readline()
-        connected.shutdown(socket.SHUT_WR)
+        connection.shutdown(socket.SHUT_WR)
         for frame in range(50):
             lines.publish({"frame": frame})
             assert json.loads(file.readline())["frame"] == frame
         file.close()
 
 
-def test_a_listener_that_goes_harms_nobody(lines: LineStream) -> None:
-    gone, stays = listener(lines), listener(lines)
+def test_disconnected_client_does_not_disturb_others(lines: LineStream) -> None:
+    gone, remaining = connect_file(lines), connect_file(lines)
     gone.close()
     for frame in range(200):
         lines.publish({"frame": frame})
-        assert json.loads(stays.readline())["frame"] == frame
-    stays.close()
+        assert json.loads(remaining.readline())["frame"] == frame
+    remaining.close()
 
 
-def test_what_was_told_arrives_when_the_stream_ends() -> None:
+def test_published_lines_arrive_before_the_stream_ends() -> None:
     stream = LineStream()
-    file = listener(stream)
+    file = connect_file(stream)
     for frame in range(100):
         stream.publish({"frame": frame})
     stream.close()
@@ -211,9 +211,9 @@ def test_what_was_told_arrives_when_the_stream_ends() -> None:
     file.close()
 
 
-def test_a_stream_ends_though_a_listener_does_not_read() -> None:
+def test_stream_closes_although_a_client_does_not_read() -> None:
     stream = LineStream()
-    idle = listener(stream)
+    idle = connect_file(stream)
     for frame in range(2000):
         stream.publish({"frame": frame, "reason": "x" * 5000})
     stream.close()
@@ -222,29 +222,29 @@ def test_a_stream_ends_though_a_listener_does_not_read() -> None:
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.0.7", "weld.example"])
 @pytest.mark.parametrize("kind", [LineStream, OpcuaStream])
-def test_other_machines_are_let_in_only_if_that_is_said(kind: Any, host: str) -> None:
+def test_other_machines_are_allowed_only_on_request(kind: Any, host: str) -> None:
     with pytest.raises(InputError, match="other machines"):
         kind(host, 0)
 
 
-def test_a_way_in_for_others_can_be_asked_for() -> None:
+def test_stream_can_be_opened_for_other_machines() -> None:
     open_stream("lines", "0.0.0.0:0", anywhere=True).close()
 
 
-@pytest.mark.parametrize("place", ["", "x", "127.0.0.1:", "127.0.0.1:-1", "65536", "localhost"])
-def test_what_is_no_place_is_refused(place: str) -> None:
+@pytest.mark.parametrize("address", ["", "x", "127.0.0.1:", "127.0.0.1:-1", "65536", "localhost"])
+def test_invalid_address_is_rejected(address: str) -> None:
     with pytest.raises(InputError, match="PORT or HOST:PORT"):
-        open_stream("lines", place, anywhere=False)
+        open_stream("lines", address, anywhere=False)
 
 
-def test_a_port_that_is_taken_is_said(lines: LineStream) -> None:
+def test_used_port_is_reported(lines: LineStream) -> None:
     for kind in (LineStream, OpcuaStream):
         with pytest.raises(InputError, match=f"{lines.port}: Address already in use"):
             kind(port=lines.port)
 
 
 @pytest.mark.parametrize("kind", [LineStream, OpcuaStream])
-def test_a_place_that_is_not_on_this_machine_is_said(kind: Any, port: int) -> None:
+def test_address_of_another_machine_is_reported(kind: Any, port: int) -> None:
     with pytest.raises(InputError, match="an address of this machine"):
         kind("192.0.2.1", port, anywhere=True)
 
@@ -276,35 +276,35 @@ def test_opc_ua_clients_read_the_newest_frame(port: int, measured: Measurement) 
     asyncua = pytest.importorskip("asyncua")
     stream = OpcuaStream(port=port)
     alarm = Alarm("width-high", "Width 7.1 mm is above 6.9 mm", 40, 0.4, acknowledged=True)
-    wanted = stream_values(
+    expected = stream_values(
         FrameResult(41, 0.5, measured), [alarm, replace(alarm, code="height-low")]
     )
-    assert wanted["alarm"] == "width-high height-low"
+    assert expected["alarm"] == "width-high height-low"
 
     async def read() -> dict[str, Any]:
         async with asyncua.Client(stream.address) as client:
             space = await client.get_namespace_index("urn:labapp:measures")
             pool = await client.nodes.objects.get_child(f"{space}:Pool")
-            found: dict[str, Any] = {}
+            values: dict[str, Any] = {}
             for _ in range(1000):
-                found = {
+                values = {
                     name: await (await pool.get_child(f"{space}:{name}")).read_value()
-                    for name in wanted
+                    for name in expected
                 }
-                if found["frame"] == 41:
+                if values["frame"] == 41:
                     assert stream.listeners == 1
                     break
                 await asyncio.sleep(0.02)
-            return found
+            return values
 
     try:
         stream.publish(stream_values(FrameResult(40, None, DARK)))
-        stream.publish(wanted)
-        found = asyncio.run(read())
+        stream.publish(expected)
+        values = asyncio.run(read())
     finally:
         stream.close()
-    for name, value in wanted.items():
+    for name, value in expected.items():
         if value is None:
-            assert math.isnan(found[name])
+            assert math.isnan(values[name])
         else:
-            assert found[name] == value, name
+            assert values[name] == value, name

@@ -1,10 +1,10 @@
-"""Changes to a session, cut off at any moment: run by `test_crash.py`, or by hand for longer.
+"""Changes to a session, interrupted at any moment: run by `test_crash.py`, or by hand for longer.
 
 ``python crash.py kill FOLDER KILLS CHANGES SEED`` forks a child that makes random changes and
-kills it at random moments; ``disk`` lets its disk fill instead. After each the session must open,
-be whole, and hold what the last acknowledged change left: a model of plain values, which knows
-nothing of the session's code, tells what that is. A change that was finished but not acknowledged
-yet may be there as well.
+kills it at random moments; ``disk`` fills its disk instead. After each interruption the session
+must open without problems, in the state after the last acknowledged change. A model of plain
+values, independent of the code of the session, defines this state. A change that was finished but
+not yet acknowledged may be included.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from labapp.session.session import Session
 
 FRAMES = 40
 MOST_CHANGES = 1000
-"""In one round: more than there is time for, or room."""
+"""In one round: more than the time or the disk allows."""
 PLAIN = {"notes": "", "setup": "", "scheme": "fit", "corrections": {}}
 
 
@@ -54,7 +54,7 @@ def step(number: int, seed: int) -> tuple[str, object]:
 
 
 class Model:
-    """What the session must hold, in plain values."""
+    """Expected contents of the session, in plain values."""
 
     def __init__(self) -> None:
         self.state: dict[str, object] = dict(PLAIN)
@@ -78,7 +78,11 @@ class Model:
             assert isinstance(value, dict)
             assert isinstance(before["corrections"], dict)
             merged = {**before["corrections"], **value}
-            value = {frame: of for frame, of in merged.items() if of is not None}
+            value = {
+                frame: number_of_change
+                for frame, number_of_change in merged.items()
+                if number_of_change is not None
+            }
             kind = "corrections"
         after = {**before, kind: value}
         if after != before:
@@ -104,7 +108,10 @@ def apply(session: Session, number: int, seed: int) -> None:
     elif kind in ("correction", "several"):
         assert isinstance(value, dict)
         session.correct(
-            {frame: None if of is None else correction_of(of) for frame, of in value.items()}
+            {
+                frame: None if number_of_change is None else correction_of(number_of_change)
+                for frame, number_of_change in value.items()
+            }
         )
     elif kind == "undo":
         session.undo()
@@ -113,41 +120,41 @@ def apply(session: Session, number: int, seed: int) -> None:
 
 
 def differences(session: Session, state: dict[str, object]) -> list[str]:
-    """How the session differs from a state of the model."""
-    found = []
+    """Names of the values in which the session differs from a state of the model."""
+    names = []
     if session.record.notes != state["notes"]:
-        found.append("notes")
+        names.append("notes")
     text = session.setup_text
     setup = float(text.split("=")[1]) if text else ""
     if setup != state["setup"]:
-        found.append("setup")
+        names.append("setup")
     if session.settings.scheme != state["scheme"]:
-        found.append("scheme")
+        names.append("scheme")
     assert isinstance(state["corrections"], dict)
     for frame in range(FRAMES):
-        held, of = session.correction(frame), state["corrections"].get(frame)
-        expected = None if of is None else correction_of(of)
-        if (held is None) != (expected is None) or not (
-            held is None
+        stored, number = session.correction(frame), state["corrections"].get(frame)
+        expected = None if number is None else correction_of(number)
+        if (stored is None) != (expected is None) or not (
+            stored is None
             or expected is None
-            or np.array_equal(held.dots.image_px, expected.dots.image_px)
+            or np.array_equal(stored.dots.image_px, expected.dots.image_px)
         ):
-            found.append(f"correction {frame}")
-    return found
+            names.append(f"correction {frame}")
+    return names
 
 
 def check(path: Path, acknowledged: int, seed: int) -> tuple[int, list[str]]:
-    """How many changes the session holds, and what is wrong with it."""
-    wrong = []
-    with Session.open(path, read_only=True) as reading:
-        before = differences_from(reading, acknowledged, seed)
+    """Return the number of changes in the session, and its problems."""
+    problems = []
+    with Session.open(path, read_only=True) as session_to_read:
+        before = differences_from(session_to_read, acknowledged, seed)
     with Session.open(path) as session:
-        wrong += session.problems()
-        held, differing = differences_from(session, acknowledged, seed)
-        wrong += differing
-    if before != (held, differing):
-        wrong.append(f"read-only it showed something else: {before}")
-    return held, wrong
+        problems += session.problems()
+        count, differing = differences_from(session, acknowledged, seed)
+        problems += differing
+    if before != (count, differing):
+        problems.append(f"read-only it showed something else: {before}")
+    return count, problems
 
 
 def differences_from(session: Session, acknowledged: int, seed: int) -> tuple[int, list[str]]:
@@ -171,15 +178,15 @@ def make_changes(path: Path, start: int, seed: int, pipe: int) -> None:
 
 
 def last_acknowledged(pipe: int, before: int, most: int = MOST_CHANGES) -> int:
-    """The last change acknowledged, once there are ``most`` or the child is gone."""
+    """Return the last acknowledged change, after ``most`` changes or the end of the child."""
     last = before
     while last < before + most and (part := os.read(pipe, 4)):
         last = int.from_bytes(part, "little")
     return last
 
 
-def killed(path: Path, start: int, seed: int, rng: random.Random) -> int:
-    """Have a child make changes from ``start`` on and kill it; the last it acknowledged."""
+def run_and_kill(path: Path, start: int, seed: int, rng: random.Random) -> int:
+    """Start a child that makes changes from ``start`` on, kill it; return the last acknowledged."""
     reading, writing = os.pipe()
     child = os.fork()
     if child == 0:
@@ -189,7 +196,7 @@ def killed(path: Path, start: int, seed: int, rng: random.Random) -> int:
         finally:
             os._exit(1)
     os.close(writing)
-    # After some changes, and then at any moment of the next: or of opening the session.
+    # After some changes, at a random moment of the next one or of opening the session.
     acknowledged = last_acknowledged(reading, start, rng.randrange(10))
     time.sleep(rng.uniform(0, 0.01))
     os.kill(child, signal.SIGKILL)
@@ -199,8 +206,8 @@ def killed(path: Path, start: int, seed: int, rng: random.Random) -> int:
     return acknowledged
 
 
-def full(path: Path, start: int, seed: int, rng: random.Random) -> int:
-    """Have a child make changes until no file may grow any more; the last it acknowledged."""
+def run_until_disk_is_full(path: Path, start: int, seed: int, rng: random.Random) -> int:
+    """Start a child that makes changes until the disk is full; return the last acknowledged."""
     limit = path.stat().st_size + rng.randrange(400_000)
     reading, writing = os.pipe()
     child = os.fork()
@@ -230,13 +237,13 @@ def main(arguments: list[str]) -> None:
         connection.executemany(
             "INSERT INTO frame (number) VALUES (?)", [(frame,) for frame in range(FRAMES)]
         )
-    interrupt = killed if how == "kill" else full
+    interrupt = run_and_kill if how == "kill" else run_until_disk_is_full
     done, rounds, unacknowledged = 0, 0, 0
     while rounds < times or done < changes:
         acknowledged = interrupt(path, done, seed, rng)
-        done, wrong = check(path, acknowledged, seed)
-        if wrong:
-            raise SystemExit(f"round {rounds}, after change {acknowledged}: {wrong}")
+        done, problems = check(path, acknowledged, seed)
+        if problems:
+            raise SystemExit(f"round {rounds}, after change {acknowledged}: {problems}")
         unacknowledged += done - acknowledged
         rounds += 1
     print(json.dumps({"rounds": rounds, "changes": done, "unacknowledged": unacknowledged}))

@@ -39,7 +39,7 @@ plain = st.recursive(
 
 
 def same(one: object, other: object) -> bool:
-    """Equal to the bit, NaN included."""
+    """Whether two values are equal to the bit, NaN included."""
     if type(one) is not type(other):
         return False
     if isinstance(one, np.ndarray):
@@ -60,23 +60,23 @@ def same(one: object, other: object) -> bool:
 
 
 @given(plain)
-def test_plain_values_come_back(value: object):
+def test_plain_values_are_restored(value: object):
     assert same(unpack(pack(value)), value)
 
 
 @given(hnp.arrays(hnp.scalar_dtypes(), hnp.array_shapes(min_dims=0, min_side=0)))
-def test_arrays_come_back_bit_for_bit_and_read_only(array: np.ndarray):
-    found = unpack(pack(array))
-    assert same(found, array)
-    assert not found.flags.writeable
+def test_arrays_are_restored_exactly_and_read_only(array: np.ndarray):
+    restored = unpack(pack(array))
+    assert same(restored, array)
+    assert not restored.flags.writeable
 
 
 @given(st.binary())
-def test_bytes_come_back(content: bytes):
+def test_bytes_are_restored(content: bytes):
     assert unpack(pack([content, content])) == [content, content]
 
 
-def test_a_rig_comes_back():
+def test_rig_is_restored():
     rig = Rig(
         Laser(31.14, 31.48),
         DotPattern(absent=frozenset({(10, 10), (3, 4)})),
@@ -88,34 +88,34 @@ def test_a_rig_comes_back():
 
 
 @pytest.mark.parametrize("kind", [CloughTocherSurface, ThinPlateSurface])
-def test_surfaces_come_back(kind: type):
+def test_surfaces_are_restored(kind: type):
     rng = np.random.default_rng(5)
     points = np.column_stack([rng.uniform(-3, 3, (60, 2)), rng.uniform(0, 0.3, 60)])
-    surface = kind(points)
+    large_surface = kind(points)
     x, y = rng.uniform(-4, 4, (2, 50))
-    found = unpack(pack(surface))
-    np.testing.assert_array_equal(found.height(x, y), surface.height(x, y))
+    restored = unpack(pack(large_surface))
+    np.testing.assert_array_equal(restored.height(x, y), large_surface.height(x, y))
 
 
-def test_a_spline_surface_comes_back():
+def test_spline_surface_is_restored():
     rng = np.random.default_rng(6)
     basis = SplineBasis.over(np.array([-3.0, -4.0]), np.array([3.0, 4.0]), 0.7)
-    surface = SplineSurface(basis, rng.normal(size=np.prod(basis.shape)))
-    assert same(unpack(pack(surface)), surface)
+    large_surface = SplineSurface(basis, rng.normal(size=np.prod(basis.shape)))
+    assert same(unpack(pack(large_surface)), large_surface)
 
 
-def test_a_measurement_without_a_surface_comes_back(unmeasured: Measurement):
+def test_measurement_without_a_surface_is_restored(unmeasured: Measurement):
     assert same(unpack(pack(unmeasured)), unmeasured)
 
 
-def test_equal_values_have_one_fingerprint_and_others_another():
+def test_fingerprints_are_equal_only_for_equal_values():
     dots = Dots(*np.arange(7.0).reshape(7, 1))
     assert fingerprint(dots) == fingerprint(unpack(pack(dots)))
     assert fingerprint(dots) != fingerprint(dataclasses.replace(dots, peak=dots.peak + 1e-9))
 
 
-def test_what_an_earlier_version_did_not_know_gets_its_default():
-    """A class's field that is not in the blob: as if an earlier labapp had written it."""
+def test_missing_field_of_an_earlier_version_has_its_default():
+    """The blob lacks fields, as if an earlier labapp had written it."""
     tree = b'{"Settings":{"scheme":"ers"}}'
     body = zlib.compress(len(tree).to_bytes(4, "little") + tree)
     blob = HEAD.pack(MAGIC, zlib.crc32(body)) + body
@@ -125,7 +125,7 @@ def test_what_an_earlier_version_did_not_know_gets_its_default():
     assert fingerprint_of(pack(unpack(blob))) == fingerprint(unpack(blob))
 
 
-def test_what_only_a_later_version_knows_is_refused():
+def test_unknown_names_of_a_later_version_are_rejected():
     for tree in (b'{"Settings":{"colour":"red"}}', b'{"NewThing":{}}', b'{"list":1}', b"[1]"):
         body = zlib.compress(len(tree).to_bytes(4, "little") + tree)
         with pytest.raises(Damaged):
@@ -133,17 +133,17 @@ def test_what_only_a_later_version_knows_is_refused():
 
 
 def blob_of(tree: bytes, arrays: bytes = b"") -> bytes:
-    """A blob as somebody might forge it."""
+    """Return a forged blob with a valid checksum."""
     body = zlib.compress(len(tree).to_bytes(4, "little") + tree + arrays, 9)
     return HEAD.pack(MAGIC, zlib.crc32(body)) + body
 
 
-def many_times() -> bytes:
+def repeated_arrays() -> bytes:
     array = b'{"array":["|u1",[60000000],0]}'
     return blob_of(b'{"list":[' + b",".join([array] * 50) + b"]}", bytes(60_000_000))
 
 
-def bytes_many_times() -> bytes:
+def repeated_bytes() -> bytes:
     return blob_of(
         b'{"list":[' + b",".join([b'{"bytes":[0,60000000]}'] * 50) + b"]}", bytes(60_000_000)
     )
@@ -153,35 +153,40 @@ def empty_lists() -> bytes:
     return blob_of(b'{"list":[' + b",".join([b'{"list":[]}'] * 8_000_000) + b"]}")
 
 
-def of_a_long_type() -> bytes:
+def array_of_a_long_type() -> bytes:
     return blob_of(
         b'{"list":[' + b",".join([b'{"array":["|V60000000",[1],0]}'] * 50) + b"]}",
         bytes(60_000_000),
     )
 
 
-def surface(kind: str) -> bytes:
+def large_surface(kind: str) -> bytes:
     points = np.random.default_rng(7).uniform(-3, 3, (12_000, 3))
     tree = b'{"%s":{"array":["<f8",[12000,3],0]}}' % kind.encode()
     return blob_of(tree, points.tobytes())
 
 
-def test_many_surfaces_are_made_from_no_more_points_than_one():
-    """Each of these takes seconds and hundreds of megabytes; a value may name one array often."""
+def test_surfaces_of_a_blob_share_the_limit_of_points():
+    """Each surface takes seconds and hundreds of megabytes, and many may refer to one array."""
     points = np.random.default_rng(7).uniform(-3, 3, (1500, 3))
-    one = b'{"ThinPlateSurface":{"array":["<f8",[1500,3],0]}}'
-    assert len(unpack(blob_of(b'{"list":[%s]}' % b",".join([one] * 2), points.tobytes()))) == 2
+    thin_plate = b'{"ThinPlateSurface":{"array":["<f8",[1500,3],0]}}'
+    assert (
+        len(unpack(blob_of(b'{"list":[%s]}' % b",".join([thin_plate] * 2), points.tobytes()))) == 2
+    )
     with pytest.raises(Damaged, match="4000 points"):
-        unpack(blob_of(b'{"list":[%s]}' % b",".join([one] * 3), points.tobytes()))
+        unpack(blob_of(b'{"list":[%s]}' % b",".join([thin_plate] * 3), points.tobytes()))
 
 
 @pytest.mark.parametrize(
     "forge",
-    [many_times, bytes_many_times, empty_lists, of_a_long_type]
-    + [functools.partial(surface, kind) for kind in ("ThinPlateSurface", "CloughTocherSurface")],
+    [repeated_arrays, repeated_bytes, empty_lists, array_of_a_long_type]
+    + [
+        functools.partial(large_surface, kind)
+        for kind in ("ThinPlateSurface", "CloughTocherSurface")
+    ],
     ids=["arrays", "bytes", "lists", "type", "thin plate", "triangles"],
 )
-def test_what_would_fill_the_memory_is_refused(tmp_path: Path, forge: Callable[[], bytes]):
+def test_blob_that_would_fill_the_memory_is_rejected(tmp_path: Path, forge: Callable[[], bytes]):
     (tmp_path / "blob").write_bytes(forge())
     script = """
         import sys
@@ -196,18 +201,18 @@ def test_what_would_fill_the_memory_is_refused(tmp_path: Path, forge: Callable[[
     assert peak_mb(script, tmp_path / "blob") < 700
 
 
-def test_what_could_not_be_read_again_is_not_packed():
+def test_value_too_large_to_be_read_is_not_packed():
     with pytest.raises(InputError, match="8000000 bytes or less"):
         pack("x" * 9_000_000)
     with pytest.raises(InputError, match="100000000 bytes or less"):
         pack([np.arange(20_000_000.0)])
 
 
-def test_every_changed_byte_is_noticed():
+def test_every_changed_byte_is_detected():
     blob = pack(Boundary(np.zeros(2), np.zeros(4), np.zeros((4, 3))))
-    for place in range(len(blob)):
+    for index in range(len(blob)):
         changed = bytearray(blob)
-        changed[place] ^= 0x10
+        changed[index] ^= 0x10
         with pytest.raises(Damaged):
             unpack(bytes(changed))
     for length in range(len(blob)):
@@ -215,7 +220,7 @@ def test_every_changed_byte_is_noticed():
             unpack(blob[:length])
 
 
-def test_other_classes_are_refused():
+def test_other_classes_are_rejected():
     with pytest.raises(TypeError, match="Path"):
         pack(Path("a"))
     with pytest.raises(TypeError, match="objects"):

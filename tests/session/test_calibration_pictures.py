@@ -1,4 +1,4 @@
-"""Calibrations that keep the picture they were read from."""
+"""Calibrations store the picture from which they were read."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -19,31 +19,31 @@ def session(tmp_path: Path) -> Iterator[Session]:
         yield session
 
 
-def in_use(session: Session) -> object:
-    kept = session.plane_calibration
-    assert kept is not None
-    return kept.found
+def plane_in_use(session: Session) -> object:
+    stored = session.plane_calibration
+    assert stored is not None
+    return stored.found
 
 
-def test_an_imaging_plane_placed_by_hand_is_used(session: Session):
-    found = session.calibrate_plane(PICTURE, 6.35)
-    u, v = found.origin_px
-    moved = replace(found, origin_px=(u + 1.5, v), marks=(), model="three points")
+def test_imaging_plane_placed_by_hand_is_used(session: Session):
+    calibration = session.calibrate_plane(PICTURE, 6.35)
+    u, v = calibration.origin_px
+    moved = replace(calibration, origin_px=(u + 1.5, v), marks=(), model="three points")
     image = cv2.imread(str(PICTURE), cv2.IMREAD_UNCHANGED)
     session.use_plane(moved, 6.35, image)
-    assert in_use(session) == moved
+    assert plane_in_use(session) == moved
     assert f"{u + 1.5}" in session.setup_text
-    line = replace(moved, z_axis_px=found.x_axis_px)
+    degenerate = replace(moved, z_axis_px=calibration.x_axis_px)
     with pytest.raises(ValueError, match="one line"):
-        session.use_plane(line, 6.35, image)
+        session.use_plane(degenerate, 6.35, image)
     session.undo()
-    assert in_use(session) == found
+    assert plane_in_use(session) == calibration
 
 
-def test_a_laser_calibration_keeps_its_picture(session: Session):
+def test_laser_calibration_stores_its_picture(session: Session):
     picture = np.arange(150, dtype=np.uint8).reshape(10, 15)
     session.calibrate_laser([13.676], [18.561], [7.874], picture=picture)
-    kept = session.laser_calibration
-    assert kept is not None
-    assert kept.picture_sha256 is not None
-    np.testing.assert_array_equal(session.picture(kept.picture_sha256), picture)
+    stored = session.laser_calibration
+    assert stored is not None
+    assert stored.picture_sha256 is not None
+    np.testing.assert_array_equal(session.picture(stored.picture_sha256), picture)

@@ -19,7 +19,7 @@ HEAD = "u_px,v_px,reflected_row,reflected_column"
 
 @pytest.fixture
 def before() -> Correction:
-    """Three dots in a row, each with its own uncertainty; the last moved by hand before."""
+    """Three dots in a row, each with another uncertainty; the last was moved by hand."""
     u = np.array([10.12345678, 30.0, 50.0])
     dots = Dots(u, np.full(3, 20.0), *np.array([[0.1, 0.2, 0.3]] * 2), *np.full((3, 3), 2.0))
     lattice = Lattice(np.array([1, 1, 1]), np.array([1, 2, 3]), reference=(1, 9))
@@ -32,38 +32,34 @@ def read(tmp_path: Path, text: str | bytes, before: Correction, frame: int = 0) 
     return read_correction(path, frame, SHAPE, before)
 
 
-def test_an_unchanged_table_changes_nothing_but_the_reference(
-    tmp_path: Path, before: Correction
-) -> None:
-    """Tables round to 0.0001 px; the dot keeps its exact place."""
-    found = read(tmp_path, f"{HEAD}\n10.1235,20,1,1\n30,20,1,2\n50,20,1,3\n", before)
-    np.testing.assert_array_equal(found.dots.u_px, before.dots.u_px)
-    np.testing.assert_array_equal(found.dots.u_sigma_px, before.dots.u_sigma_px)
-    assert found.lattice.column.tolist() == [1, 2, 3]
-    assert found.manual.tolist() == [False, False, True]
-    assert found.lattice.reference is None
+def test_unchanged_table_changes_only_the_reference(tmp_path: Path, before: Correction) -> None:
+    """Tables are rounded to 0.0001 px; dots keep their exact positions."""
+    correction = read(tmp_path, f"{HEAD}\n10.1235,20,1,1\n30,20,1,2\n50,20,1,3\n", before)
+    np.testing.assert_array_equal(correction.dots.u_px, before.dots.u_px)
+    np.testing.assert_array_equal(correction.dots.u_sigma_px, before.dots.u_sigma_px)
+    assert correction.lattice.column.tolist() == [1, 2, 3]
+    assert correction.manual.tolist() == [False, False, True]
+    assert correction.lattice.reference is None
 
 
-def test_what_differs_was_changed_by_hand(tmp_path: Path, before: Correction) -> None:
+def test_changed_dots_are_marked_as_manual(tmp_path: Path, before: Correction) -> None:
     text = f"{HEAD}\n30.5,20,1,2\n10.1235,20,2,1\n80,20.5,,\n"
-    found = read(tmp_path, text, before)
-    assert found.dots.image_px.tolist() == [[30.5, 20], [10.12345678, 20], [80, 20.5]]
-    assert found.dots.u_sigma_px.tolist() == [0.2, 0.1, 2.0]  # by hand: the size of a dot
-    assert found.lattice.row.tolist() == [1, 2, 0]
-    assert found.manual.tolist() == [True, True, True]
+    correction = read(tmp_path, text, before)
+    assert correction.dots.image_px.tolist() == [[30.5, 20], [10.12345678, 20], [80, 20.5]]
+    assert correction.dots.u_sigma_px.tolist() == [0.2, 0.1, 2.0]  # by hand: the size of a dot
+    assert correction.lattice.row.tolist() == [1, 2, 0]
+    assert correction.manual.tolist() == [True, True, True]
 
 
-def test_a_dot_lends_its_uncertainty_to_the_nearest_alone(
-    tmp_path: Path, before: Correction
-) -> None:
-    found = read(tmp_path, f"{HEAD}\n30.6,20,1,2\n30,20,1,3\n", before)
-    assert found.dots.u_sigma_px.tolist() == [2.0, 0.2]
+def test_uncertainty_is_copied_to_the_nearest_dot_only(tmp_path: Path, before: Correction) -> None:
+    correction = read(tmp_path, f"{HEAD}\n30.6,20,1,2\n30,20,1,3\n", before)
+    assert correction.dots.u_sigma_px.tolist() == [2.0, 0.2]
 
 
-def test_a_table_for_a_frame_without_dots(tmp_path: Path) -> None:
-    found = read(tmp_path, f"{HEAD}\n30,20,1,2\n", Correction.of(None, None))
-    assert (len(found.dots), found.manual.tolist()) == (1, [True])
-    assert found.dots.u_sigma_px[0] >= 0.5
+def test_table_for_a_frame_without_dots(tmp_path: Path) -> None:
+    correction = read(tmp_path, f"{HEAD}\n30,20,1,2\n", Correction.of(None, None))
+    assert (len(correction.dots), correction.manual.tolist()) == (1, [True])
+    assert correction.dots.u_sigma_px[0] >= 0.5
 
 
 @pytest.mark.parametrize(
@@ -79,11 +75,11 @@ def test_a_table_for_a_frame_without_dots(tmp_path: Path) -> None:
         f"frame,{HEAD}\n7,1,2,5,5\n0,10.5,20,1,1\n0,30,20,1,2\n7,,,,\n",
     ],
 )
-def test_tables_of_many_programs_are_read(tmp_path: Path, before: Correction, text: str) -> None:
-    found = read(tmp_path, text, before)
-    assert found.dots.image_px.tolist() == [[10.5, 20], [30, 20]]
-    assert found.lattice.row.tolist() == [1, 1]
-    assert found.lattice.column.tolist() == [1, 2]
+def test_tables_of_various_programs_are_read(tmp_path: Path, before: Correction, text: str) -> None:
+    correction = read(tmp_path, text, before)
+    assert correction.dots.image_px.tolist() == [[10.5, 20], [30, 20]]
+    assert correction.lattice.row.tolist() == [1, 1]
+    assert correction.lattice.column.tolist() == [1, 2]
 
 
 def test_blocked_rows_are_marked(tmp_path: Path, before: Correction) -> None:
@@ -92,7 +88,7 @@ def test_blocked_rows_are_marked(tmp_path: Path, before: Correction) -> None:
 
 
 @pytest.mark.parametrize(
-    ("line", "said"),
+    ("line", "message"),
     [
         ("nan,20,1,1", "line 2, u_px: nan; expected a number from -0.5 to 199.5 (px, within"),
         ("inf,20,1,1", "line 2, u_px: inf; expected a number"),
@@ -115,16 +111,16 @@ def test_blocked_rows_are_marked(tmp_path: Path, before: Correction) -> None:
         ),
     ],
 )
-def test_what_is_wrong_is_told_with_line_and_column(
-    tmp_path: Path, before: Correction, line: str, said: str
+def test_wrong_cells_are_reported_with_line_and_column(
+    tmp_path: Path, before: Correction, line: str, message: str
 ) -> None:
-    with pytest.raises(InputError) as refused:
+    with pytest.raises(InputError) as caught:
         read(tmp_path, f"{HEAD}\n{line}\n", before)
-    assert str(refused.value).startswith(f"{tmp_path / 'dots.csv'}: {said}")
+    assert str(caught.value).startswith(f"{tmp_path / 'dots.csv'}: {message}")
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("", "columns: no u_px, no v_px, no reflected_row, no reflected_column; expected a table"),
         ("u_px,v_px\n1,2\n", "columns: no reflected_row, no reflected_column"),
@@ -144,22 +140,22 @@ def test_what_is_wrong_is_told_with_line_and_column(
         (f'{HEAD}\n"' + "1\n" * 100_000, "syntax: field larger than field limit"),
     ],
 )
-def test_what_is_no_table_is_refused(
-    tmp_path: Path, before: Correction, text: str | bytes, said: str
+def test_invalid_table_is_rejected(
+    tmp_path: Path, before: Correction, text: str | bytes, message: str
 ) -> None:
-    with pytest.raises(InputError) as refused:
+    with pytest.raises(InputError) as caught:
         read(tmp_path, text, before)
-    assert str(refused.value).startswith(f"{tmp_path / 'dots.csv'}: {said}")
+    assert str(caught.value).startswith(f"{tmp_path / 'dots.csv'}: {message}")
 
 
-def test_ten_problems_are_told_together(tmp_path: Path, before: Correction) -> None:
+def test_at_most_ten_problems_are_reported(tmp_path: Path, before: Correction) -> None:
     lines = "\n".join(f"{k},nan,{k + 1},0" for k in range(50))
-    with pytest.raises(InputError) as refused:
+    with pytest.raises(InputError) as caught:
         read(tmp_path, f"{HEAD}\n{lines}\n", before)
-    assert len(refused.value.problems) == 10
+    assert len(caught.value.problems) == 10
 
 
-def test_huge_files_are_refused(tmp_path: Path, before: Correction) -> None:
+def test_huge_files_are_rejected(tmp_path: Path, before: Correction) -> None:
     path = tmp_path / "dots.csv"
     with path.open("wb") as file:
         file.truncate(1 << 32)
@@ -170,25 +166,25 @@ def test_huge_files_are_refused(tmp_path: Path, before: Correction) -> None:
         read(tmp_path, f"{HEAD}\n{rows}", before)
 
 
-def test_a_folder_is_no_table(tmp_path: Path, before: Correction) -> None:
+def test_folder_is_rejected(tmp_path: Path, before: Correction) -> None:
     with pytest.raises(InputError, match="file: Is a directory"):
         read_correction(tmp_path, 0, SHAPE, before)
 
 
 @given(st.data())
-def test_mutated_tables_are_read_or_refused(
+def test_mutated_tables_are_read_or_rejected(
     tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
 ) -> None:
     content = bytearray(f"frame,{HEAD},blocked\n0,10.5,20,1,1,0\n0,30,20,1,2,0\n".encode())
     for _ in range(data.draw(st.integers(1, 4))):
-        place = data.draw(st.integers(0, len(content) - 1))
-        content[place : place + data.draw(st.integers(0, 3))] = data.draw(st.binary(max_size=3))
+        index = data.draw(st.integers(0, len(content) - 1))
+        content[index : index + data.draw(st.integers(0, 3))] = data.draw(st.binary(max_size=3))
         content = content or bytearray(b"\n")
     path = tmp_path_factory.getbasetemp() / "mutated.csv"
     path.write_bytes(content)
     try:
-        found = read_correction(path, 0, SHAPE, Correction.of(None, None))
+        correction = read_correction(path, 0, SHAPE, Correction.of(None, None))
     except InputError:
         return
-    assert len(found.dots) >= 1
-    assert np.isfinite(found.dots.image_px).all()
+    assert len(correction.dots) >= 1
+    assert np.isfinite(correction.dots.image_px).all()

@@ -1,4 +1,4 @@
-"""A session survives whatever stops the program: `crash.py` run for a short while."""
+"""A session survives a killed program and a full disk: a short run of `crash.py`."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ PROGRAM = Path(__file__).parent / "crash.py"
         pytest.param("disk", 50, 0, id="disk full, long", marks=pytest.mark.soak),
     ],
 )
-def test_nothing_acknowledged_is_lost(tmp_path: Path, how: str, times: int, changes: int):
-    answer = subprocess.run(
+def test_no_acknowledged_change_is_lost(tmp_path: Path, how: str, times: int, changes: int):
+    process = subprocess.run(
         [sys.executable, PROGRAM, how, tmp_path, str(times), str(changes), "20261121"],
         capture_output=True,
         text=True,
         check=False,
     )
-    assert answer.returncode == 0, answer.stderr
-    told = json.loads(answer.stdout)
-    assert told["rounds"] >= times
-    assert told["changes"] >= max(changes, times)
+    assert process.returncode == 0, process.stderr
+    summary = json.loads(process.stdout)
+    assert summary["rounds"] >= times
+    assert summary["changes"] >= max(changes, times)

@@ -40,19 +40,19 @@ def kinds(database: Database) -> list[str]:
     return [kind for (kind,) in database.rows("SELECT kind FROM document ORDER BY kind")]
 
 
-def test_the_file_says_what_it_is(path: Path):
+def test_file_has_application_id_and_version(path: Path):
     connection = sqlite3.connect(path)
     assert connection.execute("PRAGMA application_id").fetchone() == (APPLICATION_ID,)
     assert connection.execute("PRAGMA user_version").fetchone() == (VERSION,)
     connection.close()
 
 
-def test_a_closed_session_is_one_file(path: Path):
+def test_closed_session_is_one_file(path: Path):
     visible = [entry.name for entry in path.parent.iterdir() if not entry.name.startswith(".")]
     assert visible == [path.name]
 
 
-def test_making_one_over_a_file_is_refused(path: Path):
+def test_create_does_not_overwrite_a_file(path: Path):
     before = path.read_bytes()
     with pytest.raises(InputError, match="is there already"):
         Database.create(path)
@@ -60,7 +60,7 @@ def test_making_one_over_a_file_is_refused(path: Path):
 
 
 @pytest.mark.parametrize("name", ["a.txt", "nowhere/a.labsession"])
-def test_making_one_where_it_cannot_be_is_refused(tmp_path: Path, name: str):
+def test_create_rejects_wrong_name_and_missing_folder(tmp_path: Path, name: str):
     with pytest.raises(InputError, match=r"expected (a name|a folder)"):
         Database.create(tmp_path / name)
     assert not list(tmp_path.rglob("*.part"))
@@ -75,7 +75,7 @@ def test_making_one_where_it_cannot_be_is_refused(tmp_path: Path, name: str):
         (b"SQLite format 3\x00" + bytes(200), "a database of another program"),
     ],
 )
-def test_other_files_are_refused(tmp_path: Path, content: bytes, value: str):
+def test_other_files_are_rejected(tmp_path: Path, content: bytes, value: str):
     path = tmp_path / "a.labsession"
     path.write_bytes(content)
     for read_only in (False, True):
@@ -84,7 +84,7 @@ def test_other_files_are_refused(tmp_path: Path, content: bytes, value: str):
     assert path.read_bytes() == content
 
 
-def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path):
+def test_missing_file_and_folder_are_rejected(tmp_path: Path):
     with pytest.raises(InputError, match="No such file"):
         Database.open(tmp_path / "a.labsession")
     with pytest.raises(InputError, match="folder"):
@@ -92,7 +92,7 @@ def test_a_missing_file_and_a_folder_are_refused(tmp_path: Path):
     assert not list(tmp_path.iterdir())
 
 
-def test_what_is_no_regular_file_is_refused(tmp_path: Path):
+def test_session_must_be_a_regular_file(tmp_path: Path):
     os.mkfifo(tmp_path / "pipe.labsession")
     (tmp_path / "zero.labsession").symlink_to("/dev/zero")
     for name in ("pipe.labsession", "zero.labsession", "a\0b.labsession"):
@@ -108,7 +108,7 @@ def test_what_is_no_regular_file_is_refused(tmp_path: Path):
         assert run_python(script).splitlines() == ["file"] * 2
 
 
-def test_tables_of_another_make_are_refused(path: Path):
+def test_other_tables_are_rejected(path: Path):
     connection = sqlite3.connect(path)
     connection.execute("DROP TABLE detail")
     connection.close()
@@ -116,8 +116,8 @@ def test_tables_of_another_make_are_refused(path: Path):
         Database.open(path)
 
 
-def test_a_trigger_is_refused_whatever_its_name(path: Path):
-    """To LIKE an underscore is any letter, and what is SQLite's own begins with sqlite_."""
+def test_trigger_is_rejected_whatever_its_name(path: Path):
+    """LIKE takes an underscore for any letter; names of SQLite itself begin with sqlite_."""
     connection = sqlite3.connect(path)
     connection.execute(
         "CREATE TRIGGER sqliteXevil AFTER INSERT ON document BEGIN DELETE FROM document; END"
@@ -128,7 +128,7 @@ def test_a_trigger_is_refused_whatever_its_name(path: Path):
             Database.open(path, read_only)
 
 
-def test_a_newer_version_is_refused_and_left_alone(path: Path):
+def test_newer_version_is_rejected_and_not_changed(path: Path):
     connection = sqlite3.connect(path)
     connection.execute(f"PRAGMA user_version = {VERSION + 1}")
     connection.close()
@@ -142,7 +142,7 @@ def test_a_newer_version_is_refused_and_left_alone(path: Path):
 # --- one writer, many readers -----------------------------------------------------------------
 
 
-def test_a_second_writer_is_told_and_may_read(path: Path):
+def test_second_writer_is_rejected_but_can_read(path: Path):
     first = Database.open(path)
     with pytest.raises(SessionInUse, match=r"another program.*read-only"):
         Database.open(path)
@@ -156,19 +156,19 @@ def test_a_second_writer_is_told_and_may_read(path: Path):
     Database.open(path).close()
 
 
-def test_another_process_that_died_does_not_keep_the_session(path: Path):
+def test_lock_of_a_killed_process_is_released(path: Path):
     script = (
         "import os, sys; from labapp.session.file.database import Database; "
         "d = Database.open(sys.argv[1]); print('open', flush=True); os.kill(os.getpid(), 9)"
     )
-    answer = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", script, path], capture_output=True, text=True, check=False
     )
-    assert answer.stdout == "open\n"
+    assert process.stdout == "open\n"
     Database.open(path).close()
 
 
-def test_a_place_where_no_lock_can_be_made_is_told(path: Path):
+def test_impossible_lock_is_reported(path: Path):
     lock = path.with_name(f".{path.name}.lock")
     lock.unlink(missing_ok=True)
     lock.mkdir()
@@ -177,15 +177,15 @@ def test_a_place_where_no_lock_can_be_made_is_told(path: Path):
     Database.open(path, read_only=True).close()
 
 
-# --- changes are whole ------------------------------------------------------------------------
+# --- atomic changes ---------------------------------------------------------------------------
 
 
-def test_a_change_that_fails_leaves_nothing(path: Path):
+def test_failed_change_is_rolled_back(path: Path):
     database = Database.open(path)
 
     def fail() -> None:
         with database.transaction():
-            write(database, "two")  # within it, and so part of it
+            write(database, "two")  # part of the outer transaction
             raise RuntimeError
 
     with pytest.raises(RuntimeError):
@@ -193,12 +193,12 @@ def test_a_change_that_fails_leaves_nothing(path: Path):
     assert kinds(database) == ["one"]
     write(database, "three")
     database.close()
-    with closing(Database.open(path, read_only=True)) as again:
-        assert kinds(again) == ["one", "three"]
+    with closing(Database.open(path, read_only=True)) as reopened:
+        assert kinds(reopened) == ["one", "three"]
 
 
-def cut_off(path: Path) -> Path:
-    """A copy of the session as it is in the middle of a change: half of it in the file."""
+def copy_during_change(path: Path) -> Path:
+    """Copy the session during a change, when half of the change is in the file."""
     database = Database.open(path)
     with database.transaction() as connection:
         connection.execute("PRAGMA cache_size = 1")
@@ -219,15 +219,15 @@ def cut_off(path: Path) -> Path:
     return copy
 
 
-def test_a_change_that_was_cut_off_is_taken_back(path: Path):
-    database = Database.open(cut_off(path))
+def test_interrupted_change_is_rolled_back(path: Path):
+    database = Database.open(copy_during_change(path))
     assert kinds(database) == ["one"]
     assert database.problems() == []
     database.close()
 
 
-def test_reading_one_with_a_change_cut_off_leaves_the_file_alone(path: Path):
-    copy = cut_off(path)
+def test_read_only_access_does_not_roll_back_an_interrupted_change(path: Path):
+    copy = copy_during_change(path)
     before = {entry: entry.read_bytes() for entry in copy.parent.iterdir()}
     database = Database.open(copy, read_only=True)
     assert kinds(database) == ["one"]
@@ -236,7 +236,7 @@ def test_reading_one_with_a_change_cut_off_leaves_the_file_alone(path: Path):
 
 
 def with_super_journal(journal: Path, named: Path) -> None:
-    """End a journal as SQLite does when a change goes over several databases."""
+    """Append to a journal what SQLite writes if a change spans several databases."""
     name = os.fsencode(named)
     with journal.open("ab") as file:
         file.write(b"\xff" * 4 + name)
@@ -246,10 +246,10 @@ def with_super_journal(journal: Path, named: Path) -> None:
 
 @pytest.mark.parametrize("read_only", [True, False])
 @pytest.mark.parametrize("linked", [False, True])
-def test_a_journal_that_names_another_file_is_never_acted_upon(
+def test_journal_that_names_another_file_is_rejected(
     path: Path, tmp_path: Path, read_only: bool, linked: bool
 ):
-    copy, victim = cut_off(path), tmp_path / "mine.txt"
+    copy, victim = copy_during_change(path), tmp_path / "mine.txt"
     victim.write_text("mine")
     with_super_journal(copy.with_name(f"{copy.name}-journal"), victim)
     if linked:
@@ -261,12 +261,12 @@ def test_a_journal_that_names_another_file_is_never_acted_upon(
 
 
 @pytest.mark.parametrize("read_only", [True, False])
-@pytest.mark.parametrize("place", ["mine.txt", "/dev/zero"])
-def test_a_journal_that_is_a_link_is_refused(
-    path: Path, tmp_path: Path, place: str, read_only: bool
+@pytest.mark.parametrize("target", ["mine.txt", "/dev/zero"])
+def test_journal_that_is_a_link_is_rejected(
+    path: Path, tmp_path: Path, target: str, read_only: bool
 ):
     (tmp_path / "mine.txt").write_text("mine")
-    path.with_name(f"{path.name}-journal").symlink_to(place)
+    path.with_name(f"{path.name}-journal").symlink_to(target)
     with pytest.raises(InputError, match="journal: is not a file"):
         Database.open(path, read_only)
     assert (tmp_path / "mine.txt").read_text() == "mine"
@@ -277,7 +277,7 @@ def test_a_journal_that_is_a_link_is_refused(
 
 @pytest.fixture
 def next_version(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The session is there; then comes a labapp whose sessions have one more table."""
+    """Simulate a newer labapp whose sessions have one more table."""
     added = "CREATE TABLE signal (time_s REAL PRIMARY KEY, current_a REAL)"
     monkeypatch.setattr(module, "VERSION", VERSION + 1)
     monkeypatch.setattr(module, "TABLES", (*TABLES, added))
@@ -287,18 +287,18 @@ def next_version(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("next_version")
-def test_an_older_version_is_copied_and_brought_up_to_date(path: Path):
+def test_older_version_is_copied_and_migrated(path: Path):
     before = path.read_bytes()
     database = Database.open(path)
     assert kinds(database) == ["ONE"]
     database.close()
-    kept = path.with_name(f"a.version-{VERSION}.labsession")
-    assert kept.read_bytes() == before
-    with closing(Database.open(path)) as again:
-        assert kinds(again) == ["ONE"]  # and only once
+    backup = path.with_name(f"a.version-{VERSION}.labsession")
+    assert backup.read_bytes() == before
+    with closing(Database.open(path)) as reopened:
+        assert kinds(reopened) == ["ONE"]  # migrated only once
 
 
-def test_a_link_in_the_place_of_the_lock_is_refused(path: Path, tmp_path: Path):
+def test_link_in_place_of_the_lock_is_rejected(path: Path, tmp_path: Path):
     (tmp_path / "mine.txt").write_text("mine")
     path.with_name(f".{path.name}.lock").unlink(missing_ok=True)
     path.with_name(f".{path.name}.lock").symlink_to("mine.txt")
@@ -308,7 +308,7 @@ def test_a_link_in_the_place_of_the_lock_is_refused(path: Path, tmp_path: Path):
 
 
 @pytest.mark.usefixtures("next_version")
-def test_the_copy_of_an_older_version_follows_no_link(path: Path, tmp_path: Path):
+def test_copy_of_an_older_version_follows_no_link(path: Path, tmp_path: Path):
     (tmp_path / "mine.txt").write_text("mine")
     path.with_name(f".a.version-{VERSION}.labsession.part").symlink_to("mine.txt")
     Database.open(path).close()
@@ -316,7 +316,7 @@ def test_the_copy_of_an_older_version_follows_no_link(path: Path, tmp_path: Path
 
 
 @pytest.mark.usefixtures("next_version")
-def test_an_older_version_is_read_without_a_change(path: Path):
+def test_older_version_is_read_without_a_change(path: Path):
     before = path.read_bytes()
     database = Database.open(path, read_only=True)
     assert kinds(database) == ["ONE"]
@@ -326,9 +326,7 @@ def test_an_older_version_is_read_without_a_change(path: Path):
 
 
 @pytest.mark.usefixtures("next_version")
-def test_a_migration_that_fails_leaves_the_file_as_it_was(
-    path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_failed_migration_leaves_the_file_unchanged(path: Path, monkeypatch: pytest.MonkeyPatch):
     steps = (*module.MIGRATIONS[VERSION], "INSERT INTO nowhere VALUES (1)")
     monkeypatch.setitem(module.MIGRATIONS, VERSION, steps)
     before = path.read_bytes()
@@ -339,17 +337,17 @@ def test_a_migration_that_fails_leaves_the_file_as_it_was(
 
 @pytest.mark.usefixtures("next_version")
 @pytest.mark.parametrize("read_only", [False, True])
-def test_an_older_version_with_other_tables_is_refused_unchanged(path: Path, read_only: bool):
+def test_older_version_with_other_tables_is_rejected_unchanged(path: Path, read_only: bool):
     with closing(sqlite3.connect(path)) as connection:
         connection.execute("CREATE TABLE more (text)")
         connection.commit()
     before, files = path.read_bytes(), sorted(path.parent.iterdir())
-    with pytest.raises(InputError) as refused:
+    with pytest.raises(InputError) as caught:
         Database.open(path, read_only)
-    assert (refused.value.field, refused.value.source) == ("tables", str(path))
+    assert (caught.value.field, caught.value.source) == ("tables", str(path))
     assert path.read_bytes() == before
     assert sorted(path.parent.iterdir()) == files
 
 
-def test_every_earlier_version_has_a_step():
+def test_every_earlier_version_has_a_migration():
     assert set(module.MIGRATIONS) == set(range(1, VERSION))

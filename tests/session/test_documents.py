@@ -16,7 +16,7 @@ from labapp.session.file.schema import NO_FRAME
 
 @pytest.fixture(scope="module", autouse=True)
 def plain_values() -> Iterator[None]:
-    """Plain values stand for the documents here."""
+    """Plain values replace the documents in these tests."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(module, "CLASSES", dict.fromkeys(module.CLASSES, object))
         yield
@@ -38,7 +38,7 @@ def note(documents: Documents, text: str | None) -> bool:
     return documents.change(f"note {text}", {("record", NO_FRAME): text})
 
 
-def test_a_document_is_what_was_set_last(documents: Documents):
+def test_document_has_the_value_set_last(documents: Documents):
     assert documents.get("record") is None
     note(documents, "a")
     note(documents, "b")
@@ -47,7 +47,7 @@ def test_a_document_is_what_was_set_last(documents: Documents):
     assert documents.get("record") is None
 
 
-def test_a_document_of_no_frame_is_unpacked_once_per_content(documents: Documents):
+def test_document_without_a_frame_is_unpacked_once_per_content(documents: Documents):
     documents.change("table", {("signals", NO_FRAME): ["long"]})
     first = documents.get("signals")
     note(documents, "a")
@@ -58,13 +58,13 @@ def test_a_document_of_no_frame_is_unpacked_once_per_content(documents: Document
     assert documents.get("signals") == ["long"]
 
 
-def test_a_change_to_what_already_is_is_no_step(documents: Documents):
+def test_change_without_effect_is_no_step(documents: Documents):
     assert note(documents, "a")
     assert not note(documents, "a")
     assert [change.label for change in documents.history()] == ["note a"]
 
 
-def test_undo_and_redo_go_back_and_forth(documents: Documents):
+def test_undo_and_redo_move_through_the_history(documents: Documents):
     assert documents.undo() is None
     for text in "abc":
         note(documents, text)
@@ -82,7 +82,7 @@ def test_undo_and_redo_go_back_and_forth(documents: Documents):
     assert [change.label for change in documents.history()] == ["note a", "note b", "note d"]
 
 
-def test_one_change_of_several_documents_is_one_step(documents: Documents):
+def test_change_of_several_documents_is_one_step(documents: Documents):
     note(documents, "a")
     documents.change(
         "both", {("record", NO_FRAME): "b", ("correction", 3): [1], ("setup", NO_FRAME): "x"}
@@ -93,20 +93,20 @@ def test_one_change_of_several_documents_is_one_step(documents: Documents):
     assert documents.get("setup") is None
 
 
-def test_the_history_is_saved(database: Database, documents: Documents):
+def test_history_is_saved(database: Database, documents: Documents):
     note(documents, "a")
     note(documents, "b")
     documents.undo()
     database.close()
-    again = Database.open(database.path)
-    documents = Documents(again)
+    reopened = Database.open(database.path)
+    documents = Documents(reopened)
     assert documents.get("record") == "a"
     assert documents.redo() is not None
     assert documents.get("record") == "b"
-    again.close()
+    reopened.close()
 
 
-def test_the_history_is_bounded_in_steps(documents: Documents, monkeypatch: pytest.MonkeyPatch):
+def test_history_is_limited_in_steps(documents: Documents, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(module, "MAX_CHANGES", 5)
     for number in range(12):
         note(documents, str(number))
@@ -117,17 +117,17 @@ def test_the_history_is_bounded_in_steps(documents: Documents, monkeypatch: pyte
     assert documents.problems() == []
 
 
-def test_the_history_is_bounded_in_bytes(documents: Documents, monkeypatch: pytest.MonkeyPatch):
+def test_history_is_limited_in_bytes(documents: Documents, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(module, "MAX_HISTORY_BYTES", 2_000)
     for number in range(50):
         note(documents, f"{number} " + "".join(chr(200 + 7 * k * number % 900) for k in range(300)))
-    kept = documents.history()
-    assert 1 <= len(kept) < 5
+    history = documents.history()
+    assert 1 <= len(history) < 5
     documents.undo()
     assert documents.get("record").startswith("48 ")
 
 
-def test_a_change_that_cannot_be_written_is_none(documents: Documents):
+def test_failed_change_changes_nothing(documents: Documents):
     note(documents, "a")
     with pytest.raises(TypeError):
         documents.change("two", {("setup", NO_FRAME): "x", ("record", NO_FRAME): object()})
@@ -135,7 +135,7 @@ def test_a_change_that_cannot_be_written_is_none(documents: Documents):
     assert [change.label for change in documents.history()] == ["note a"]
 
 
-def test_a_damaged_document_is_told(database: Database, documents: Documents):
+def test_damaged_document_is_reported(database: Database, documents: Documents):
     note(documents, "a")
     with database.transaction() as connection:
         connection.execute("UPDATE document SET content = x'4c414231'")
@@ -144,7 +144,7 @@ def test_a_damaged_document_is_told(database: Database, documents: Documents):
     assert any("record is damaged" in problem for problem in documents.problems())
 
 
-def test_a_document_that_the_history_does_not_know_is_told(
+def test_document_that_contradicts_the_history_is_reported(
     database: Database, documents: Documents
 ):
     note(documents, "a")
@@ -163,7 +163,7 @@ def test_a_document_that_the_history_does_not_know_is_told(
         max_size=25,
     )
 )
-def test_any_sequence_is_what_two_stacks_would_give(tmp_path_factory, steps):
+def test_any_sequence_agrees_with_two_stacks(tmp_path_factory, steps):
     folder = tmp_path_factory.mktemp("any")
     database = Database.create(folder / "a.labsession")
     documents = Documents(database)
@@ -183,14 +183,14 @@ def test_any_sequence_is_what_two_stacks_would_give(tmp_path_factory, steps):
                 state = undone.pop()
         else:
             frame, value = step
-            after = {key: held for key, held in state.items() if key != frame}
+            after = {key: stored for key, stored in state.items() if key != frame}
             after |= {} if value is None else {frame: value}
             assert documents.change("set", {("correction", frame): value}) == (after != state)
             if after != state:
                 done.append(state)
                 undone.clear()
                 state = after
-        found = {frame: documents.get("correction", frame) for frame in (NO_FRAME, 1, 2)}
-        assert {frame: value for frame, value in found.items() if value is not None} == state
+        values = {frame: documents.get("correction", frame) for frame in (NO_FRAME, 1, 2)}
+        assert {frame: value for frame, value in values.items() if value is not None} == state
     assert documents.problems() == []
     database.close()

@@ -49,34 +49,37 @@ def blob_of(tree: object) -> bytes:
         (3, Any, True),
     ],
 )
-def test_values_are_held_to_type_hints(value: object, hint: Any, fits: bool):
+def test_values_are_checked_against_type_hints(value: object, hint: Any, fits: bool):
     assert is_a(value, hint) == fits
 
 
-def test_a_measurement_whose_parts_do_not_fit_is_damaged():
-    whole = measurement_of(0)
-    assert whole.match is not None
-    assert whole.reconstruction is not None
+def test_inconsistent_measurement_is_damaged():
+    measurement = measurement_of(0)
+    assert measurement.match is not None
+    assert measurement.reconstruction is not None
     for wrong in (
-        replace(whole, match=replace(whole.match, dot=whole.match.dot + 1)),
-        replace(whole, match=replace(whole.match, ray=whole.match.ray + 90)),
-        replace(whole, match=replace(whole.match, ray=whole.match.ray[:-1])),
-        replace(whole, status=3),  # type: ignore[arg-type]
-        replace(whole, lattice=None, dots=None),
-        replace(whole, reconstruction=replace(whole.reconstruction, sigma_mm=np.zeros((12, 2)))),
+        replace(measurement, match=replace(measurement.match, dot=measurement.match.dot + 1)),
+        replace(measurement, match=replace(measurement.match, ray=measurement.match.ray + 90)),
+        replace(measurement, match=replace(measurement.match, ray=measurement.match.ray[:-1])),
+        replace(measurement, status=3),  # type: ignore[arg-type]
+        replace(measurement, lattice=None, dots=None),
+        replace(
+            measurement,
+            reconstruction=replace(measurement.reconstruction, sigma_mm=np.zeros((12, 2))),
+        ),
     ):
         with pytest.raises(Damaged):
             unpack(pack(wrong))
-    assert unpack(pack(whole)).status == "ok"
+    assert unpack(pack(measurement)).status == "ok"
 
 
 @pytest.mark.parametrize("tree", [{"Record": {"title": 3}}, {"Settings": {}}, "text", None])
-def test_another_value_than_was_asked_for_is_damaged(tree: object):
+def test_value_of_an_unexpected_class_is_damaged(tree: object):
     with pytest.raises(Damaged):
         unpack(blob_of(tree), Record)
 
 
-def test_a_few_bytes_do_not_fill_the_memory():
+def test_highly_compressed_blob_is_rejected():
     packer = zlib.compressobj(1)
     body = b"".join(packer.compress(bytes(1 << 24)) for _ in range(10)) + packer.flush()
     with pytest.raises(Damaged, match="too large"):
@@ -106,7 +109,7 @@ def path(tmp_path: Path) -> Path:
         "DELETE FROM recording",
     ],
 )
-def test_what_stands_beside_a_result_is_vouched_for(path: Path, edit: str):
+def test_edited_columns_of_a_result_are_detected(path: Path, edit: str):
     with Session.open(path, read_only=True) as session:
         assert session.problems() == []
     connection = sqlite3.connect(path, isolation_level=None)
@@ -116,18 +119,18 @@ def test_what_stands_beside_a_result_is_vouched_for(path: Path, edit: str):
         assert len(session.problems()) == 1
 
 
-def test_damaged_inputs_leave_the_overview(path: Path):
+def test_overview_works_with_damaged_inputs(path: Path):
     with Session.open(path) as session, session._database.transaction() as connection:
         connection.execute("UPDATE inputs SET settings = 'text' WHERE id = 1")
     with Session.open(path) as session:
-        seen = session.overview("fit")
-        assert (seen.status[0], bool(seen.stale[0])) == ("ok", True)
+        overview = session.overview("fit")
+        assert (overview.status[0], bool(overview.stale[0])) == ("ok", True)
         assert session.result(1, "ers") is not None
         with pytest.raises(InputError, match="inputs"):
             session.result(0, "fit")
 
 
-def test_damage_in_the_history_stops_undo_with_a_sentence(path: Path):
+def test_undo_reports_a_damaged_history(path: Path):
     with Session.open(path) as session:
         session.set_settings(Settings(scheme="ers"))
         session.set_settings(Settings(scheme="irs"))
@@ -138,13 +141,13 @@ def test_damage_in_the_history_stops_undo_with_a_sentence(path: Path):
         assert session.settings.scheme == "irs"
 
 
-def test_another_kind_of_journal_is_refused_and_nothing_is_left(path: Path):
+def test_other_journal_mode_is_rejected_without_new_files(path: Path):
     content = bytearray(path.read_bytes())
     content[18:20] = b"\x02\x02"
     path.write_bytes(content)
     for read_only in (True, False):
         with pytest.raises(InputError, match="journal"):
             Session.open(path, read_only=read_only)
-    left = {each.name for each in path.parent.iterdir()} - {f".{path.name}.lock"}
-    assert left == {path.name, "stack.npy"}
+    files = {file.name for file in path.parent.iterdir()} - {f".{path.name}.lock"}
+    assert files == {path.name, "stack.npy"}
     assert path.read_bytes() == content

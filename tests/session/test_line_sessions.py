@@ -1,4 +1,4 @@
-"""A session of a line pattern: measured, kept, exported; shown by the pages without Qt."""
+"""A session of a line pattern: measured, stored, exported; shown by the pages without Qt."""
 
 from __future__ import annotations
 
@@ -46,28 +46,28 @@ def measured_session(folder: Path, pools: list[Pool | None]) -> Session:
 
 @pytest.fixture(scope="module")
 def session(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Session]:
-    with measured_session(tmp_path_factory.mktemp("lines"), [None, POOL]) as made:
-        yield made
+    with measured_session(tmp_path_factory.mktemp("lines"), [None, POOL]) as session:
+        yield session
 
 
 @pytest.mark.slow
-def test_lines_are_measured_and_kept(session: Session):
-    kept = session.result(1)
-    assert kept is not None
-    found = kept.measurement.lines
-    assert found is not None
-    assert kept.stale == ()
-    assert (kept.measurement.status, found.features.count) == ("ok", 5)
-    assert found.surface is not None
-    assert found.surface.height_mm == pytest.approx(0.3, rel=0.08)
+def test_lines_are_measured_and_stored(session: Session):
+    stored = session.result(1)
+    assert stored is not None
+    lines = stored.measurement.lines
+    assert lines is not None
+    assert stored.stale == ()
+    assert (stored.measurement.status, lines.features.count) == ("ok", 5)
+    assert lines.surface is not None
+    assert lines.surface.height_mm == pytest.approx(0.3, rel=0.08)
     assert session.overview().status == ("no-lines", "ok")
     assert session.problems() == []
     assert not len(session.stale_frames())
 
 
 @pytest.mark.slow
-def test_lines_are_exported_as_the_command_writes_them(session: Session, tmp_path: Path):
-    written = {one.name for one in session.export(tmp_path / "out")}
+def test_export_of_lines_equals_the_output_of_the_command(session: Session, tmp_path: Path):
+    written = {file_written.name for file_written in session.export(tmp_path / "out")}
     assert written == {"features.csv", "lines.csv", "line_points.csv", "surface_000001.csv"}
     with (tmp_path / "out" / "features.csv").open(newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))
@@ -76,13 +76,13 @@ def test_lines_are_exported_as_the_command_writes_them(session: Session, tmp_pat
 
 
 @pytest.mark.slow
-def test_dots_are_no_correction_of_lines(session: Session):
+def test_dots_are_rejected_as_a_correction_of_lines(session: Session):
     with pytest.raises(InputError):
         session.correct({1: Correction.of(None, None)})
 
 
 @pytest.mark.slow
-def test_a_change_of_the_pattern_makes_lines_stale(session: Session):
+def test_changed_pattern_makes_lines_stale(session: Session):
     session.update_setup({"pattern": {"interline_angle_deg": 0.25}})
     assert session.stale_frames().tolist() == [0, 1]
     session.undo()
@@ -90,7 +90,7 @@ def test_a_change_of_the_pattern_makes_lines_stale(session: Session):
 
 
 @pytest.mark.slow
-def test_the_page_shows_lines_by_their_numbers(session: Session):
+def test_page_shows_lines_by_their_numbers(session: Session):
     shown = show_lines(session, 1)
     assert [line.name for line in shown.lines] == ["1", "2", "3", "4", "5"]
     assert len(shown.listed) == 5
@@ -98,20 +98,20 @@ def test_the_page_shows_lines_by_their_numbers(session: Session):
 
 
 @pytest.mark.slow
-def test_the_surface_ends_at_the_lines(session: Session):
+def test_surface_ends_at_the_outer_lines(session: Session):
     shown = surface_page.shown(session, 1)
     pool = shown.reconstruction
     assert pool is not None
     assert surface_page.shown(session, 0).reconstruction is None
     x, y = pool.points_mm[:, :2].T
     assert np.isfinite(pool.surface.height(0.99 * x, 0.99 * y + 0.01 * y.mean())).mean() > 0.95
-    # The head, beyond the uppermost line, is part of the pool and not of what is shown.
+    # The head beyond the uppermost line belongs to the pool, but is not shown.
     assert np.isfinite(POOL.height(np.zeros(1), np.array([2.5]))).all()
     assert np.isnan(pool.surface.height(np.zeros(1), np.array([2.5]))).all()
     assert [row.name for row in shown.sizes] == ["Height", "Width"]
 
 
-def test_another_kind_of_pattern_takes_the_keys_of_the_former_out(tmp_path: Path):
+def test_change_of_the_pattern_kind_removes_former_keys(tmp_path: Path):
     with Session.create(tmp_path / "kind.labsession") as session:
         session.set_setup(SETUP)
         assert session.has_lines
@@ -128,7 +128,7 @@ def test_another_kind_of_pattern_takes_the_keys_of_the_former_out(tmp_path: Path
         assert (pattern.lines.count, pattern.lines.interline_angle_deg) == (5, 0.23)
 
 
-def test_the_drawing_shows_a_plane_of_light_for_each_line(tmp_path: Path):
+def test_drawing_shows_a_light_plane_for_each_line(tmp_path: Path):
     with Session.create(tmp_path / "bench.labsession") as session:
         session.set_setup(SETUP)
         view = setup_page.bench(session).view
@@ -137,7 +137,7 @@ def test_the_drawing_shows_a_plane_of_light_for_each_line(tmp_path: Path):
 
 
 @pytest.mark.slow
-def test_trends_show_lines_and_no_states_of_few_frames(session: Session):
+def test_trends_of_few_frames_show_lines_without_states(session: Session):
     shown = trends_page.show(session, trends_page.TrendOptions())
     curves = {curve.name: curve for curve in shown.curves}
     assert curves["Lines"].y.tolist() == [0.0, 5.0]
@@ -146,7 +146,7 @@ def test_trends_show_lines_and_no_states_of_few_frames(session: Session):
     assert line_trend(session).states == ()
 
 
-def test_states_in_turn():
+def test_consecutive_equal_states_are_grouped():
     frame, none = np.arange(5), np.zeros(5)
     states: tuple[State, ...] = ("no-pool", "no-pool", "growing", "convex", "convex")
     trend = LineTrend(frame, none > 0, {}, none, states)

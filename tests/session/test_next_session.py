@@ -1,4 +1,4 @@
-"""A session like another, for the next recording: what it takes along, and that the other stays."""
+"""A new session with the bench of another: what is copied, and that the other is unchanged."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def first(tmp_path: Path) -> Path:
         session.set_record(replace(session.record, operator="A. Welder", safety=ticked))
         setup = session.setup_text
         session.calibrate_laser([4.65], [6.23], [2.75], picture=np.eye(30, dtype=np.uint8))
-        session.set_setup(setup)  # that of the sample, which its recording was made with
+        session.set_setup(setup)  # the set-up of the sample, with which the recording was made
         session.set_settings(replace(session.settings, scheme="ers"))
     return path
 
@@ -37,58 +37,58 @@ def digest(path: Path) -> str:
     return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
-def test_it_has_the_bench_and_nothing_that_was_filmed(first: Path, tmp_path: Path) -> None:
+def test_next_session_has_the_bench_without_the_recording(first: Path, tmp_path: Path) -> None:
     with Session.open(first) as session:
         before = digest(first)
         assert len(session.frames)
-        with next_session(session, tmp_path / "second.labsession") as made:
-            assert made.setup_text == session.setup_text
-            assert made.settings == session.settings != Settings()
-            assert made.record == replace(session.record, safety=())
-            assert made.record.operator == "A. Welder"
-            laser = made.laser_calibration
+        with next_session(session, tmp_path / "second.labsession") as second:
+            assert second.setup_text == session.setup_text
+            assert second.settings == session.settings != Settings()
+            assert second.record == replace(session.record, safety=())
+            assert second.record.operator == "A. Welder"
+            laser = second.laser_calibration
             assert laser == session.laser_calibration
             assert laser is not None
             assert laser.picture_sha256 is not None
-            picture = made.picture(laser.picture_sha256)
+            picture = second.picture(laser.picture_sha256)
             assert np.array_equal(picture, np.eye(30, dtype=np.uint8))
-            assert made.plane_calibration == session.plane_calibration
-            assert made.recording is None
-            assert len(made.frames) == 0
-            assert made.corrected_frames().tolist() == []
-            assert made.signals is None
-            assert made.problems() == []
-            assert [change.label for change in made.history] == ["as in thumb_tack"]
+            assert second.plane_calibration == session.plane_calibration
+            assert second.recording is None
+            assert len(second.frames) == 0
+            assert second.corrected_frames().tolist() == []
+            assert second.signals is None
+            assert second.problems() == []
+            assert [change.label for change in second.history] == ["as in thumb_tack"]
         assert digest(first) == before
-        # Another recording goes in, and is measured there.
-        with Session.open(tmp_path / "second.labsession") as again:
-            again.import_recording(first.parent / "recording.tif")
-            again.set_settings(Settings())
-            for _ in again.measure([0]):
+        # Another recording can be imported and measured.
+        with Session.open(tmp_path / "second.labsession") as reopened:
+            reopened.import_recording(first.parent / "recording.tif")
+            reopened.set_settings(Settings())
+            for _ in reopened.measure([0]):
                 pass
-            result = again.result(0)
+            result = reopened.result(0)
             assert result is not None
             assert result.measurement.status == "ok"
 
 
-def test_of_an_empty_session_it_is_empty(tmp_path: Path) -> None:
+def test_next_session_of_an_empty_session_is_empty(tmp_path: Path) -> None:
     with (
         Session.create(tmp_path / "a.labsession") as session,
-        next_session(session, tmp_path / "b.labsession") as made,
+        next_session(session, tmp_path / "b.labsession") as second,
     ):
-        assert made.setup_text == ""
-        assert made.history == ()
+        assert second.setup_text == ""
+        assert second.history == ()
 
 
-def test_nothing_is_written_over_and_nothing_half_made_is_left(
+def test_next_session_overwrites_no_file_and_leaves_no_partial_file(
     first: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with Session.open(first) as session:
-        taken = tmp_path / "taken.labsession"
-        taken.write_text("mine")
+        existing = tmp_path / "taken.labsession"
+        existing.write_text("mine")
         with pytest.raises(InputError, match=r"taken\.labsession"):
-            next_session(session, taken)
-        assert taken.read_text() == "mine"
+            next_session(session, existing)
+        assert existing.read_text() == "mine"
 
         def fail(*_: object) -> None:
             raise InputError(first, "picture", "damaged", "what was kept there")

@@ -42,7 +42,7 @@ NOW = datetime.datetime(2026, 11, 21, 4, 0)
 
 @pytest.fixture(autouse=True)
 def coarse_figures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Most of a report's time goes into pixels."""
+    """Draw with a low resolution, because drawing takes most of the time of a report."""
     for module in (figures, layout):
         monkeypatch.setattr(module, "DPI", 40)
 
@@ -53,24 +53,24 @@ def setup() -> Setup:
 
 
 @pytest.fixture(scope="module")
-def seen(setup: Setup) -> Measurement:
+def cap_measurement(setup: Setup) -> Measurement:
     """A cap of 6 mm, 0.3 mm high, measured by ERS from exact dots."""
     match = exact_match(trace(spherical_cap(6.0, 0.3), setup.rig), setup.rig)
-    found = ers.reconstruct(match, setup.rig, ers.ErsSettings())
+    reconstruction = ers.reconstruct(match, setup.rig, ers.ErsSettings())
     return Measurement(
         status="ok",
         reason="",
         scheme="ers",
         dots=as_dots(setup.calibration.to_image(match.plane_mm)),
         match=match,
-        reconstruction=found,
-        measures=measure_surface(found, match, setup.rig),
+        reconstruction=reconstruction,
+        measures=measure_surface(reconstruction, match, setup.rig),
     )
 
 
 @pytest.fixture
 def session(tmp_path: Path) -> Iterator[Session]:
-    """A session of six frames, nothing measured."""
+    """A session of six frames, none of them measured."""
     folder = tmp_path / "frames"
     folder.mkdir()
     rng = np.random.default_rng(1)
@@ -85,18 +85,20 @@ def session(tmp_path: Path) -> Iterator[Session]:
 
 
 @pytest.fixture
-def keep(session: Session, seen: Measurement) -> Callable[..., None]:
-    """Keep a measurement of a frame as if it had been made now."""
+def store(session: Session, cap_measurement: Measurement) -> Callable[..., None]:
+    """Store a measurement of a frame as if it had been made now."""
 
     def put(frame: int, width_mm: float | None = None, **changes: object) -> None:
-        found = replace(seen, **changes)
+        measurement = replace(cap_measurement, **changes)
         if width_mm is not None:
-            assert found.measures is not None
-            found = replace(found, measures=replace(found.measures, width_mm=width_mm))
+            assert measurement.measures is not None
+            measurement = replace(
+                measurement, measures=replace(measurement.measures, width_mm=width_mm)
+            )
         basis = session._basis()
         assert basis is not None
         session._results.put(
-            frame, found, basis, session._documents.fingerprint("correction", frame)
+            frame, measurement, basis, session._documents.fingerprint("correction", frame)
         )
 
     return put
@@ -105,29 +107,29 @@ def keep(session: Session, seen: Measurement) -> Callable[..., None]:
 NOTHING = {"match": None, "reconstruction": None, "measures": None}
 
 
-def pages(pdf: bytes) -> int:
+def page_count(pdf: bytes) -> int:
     assert pdf.startswith(b"%PDF-")
     assert pdf.rstrip().endswith(b"%%EOF")
     return len(re.findall(rb"/Type\s*/Page\b", pdf))
 
 
-def lines_of(session: Session) -> list[FrameLine]:
+def frame_lines(session: Session) -> list[FrameLine]:
     return data.frame_lines(session, "ers", None)
 
 
-# --- what counts ------------------------------------------------------------------------------
+# --- statistics and tables --------------------------------------------------------------------
 
 
-def test_statistics_are_those_of_eq_7_2_and_leave_out_what_is_stale(
-    session: Session, keep: Callable[..., None]
+def test_statistics_follow_eq_7_2_and_exclude_stale_frames(
+    session: Session, store: Callable[..., None]
 ):
     session.update_setup({"laser": {"distance_mm": 31.0}})
-    keep(0, 99.0)
+    store(0, 99.0)
     session.undo()
     for frame, width in ((1, 6.0), (2, 7.0), (3, 9.5)):
-        keep(frame, width)
-    keep(4, status="no-match", reason="9 dots are left over", **NOTHING)
-    rows = {row[0]: row[1:] for row in data.statistics_cells(lines_of(session))}
+        store(frame, width)
+    store(4, status="no-match", reason="9 dots are left over", **NOTHING)
+    rows = {row[0]: row[1:] for row in data.statistics_cells(frame_lines(session))}
     widths = np.array([6.0, 7.0, 9.5])
     assert rows["width (mm)"] == [
         "3",
@@ -140,7 +142,7 @@ def test_statistics_are_those_of_eq_7_2_and_leave_out_what_is_stale(
         data.UNKNOWN,
     ]
     assert rows["ARE (mm)"][0] == "3"
-    cells = data.status_cells(lines_of(session))[1:]
+    cells = data.status_cells(frame_lines(session))[1:]
     assert cells == [
         ["in the mean", "", "3", "1–3"],
         ["no-match", "9 dots are left over", "1", "4"],
@@ -149,37 +151,44 @@ def test_statistics_are_those_of_eq_7_2_and_leave_out_what_is_stale(
     ]
 
 
-def test_reasons_that_differ_in_numbers_are_one(session: Session, keep: Callable[..., None]):
+def test_reasons_that_differ_in_numbers_are_grouped(session: Session, store: Callable[..., None]):
     for frame in (0, 1, 3):
-        keep(frame, status="no-match", reason=f"{frame + 7} dots, ±0.{frame} px", **NOTHING)
-    assert data.status_cells(lines_of(session))[1] == ["no-match", "7 dots, ±0.0 px", "3", "0–1, 3"]
+        store(frame, status="no-match", reason=f"{frame + 7} dots, ±0.{frame} px", **NOTHING)
+    assert data.status_cells(frame_lines(session))[1] == [
+        "no-match",
+        "7 dots, ±0.0 px",
+        "3",
+        "0–1, 3",
+    ]
 
 
-def test_a_correction_makes_stale_and_is_listed(
-    session: Session, seen: Measurement, keep: Callable[..., None]
+def test_correction_makes_its_frame_stale_and_is_listed(
+    session: Session, cap_measurement: Measurement, store: Callable[..., None]
 ):
-    keep(2)
-    moved = correction.move_dots(correction.Correction.of(seen.dots, None), [0, 4], 0.5, 0.0)
+    store(2)
+    moved = correction.move_dots(
+        correction.Correction.of(cap_measurement.dots, None), [0, 4], 0.5, 0.0
+    )
     session.correct({2: correction.block_row(moved, 3)})
-    line = lines_of(session)[2]
+    line = frame_lines(session)[2]
     assert (line.stale, line.state, line.counts) == ((CORRECTION_CHANGED,), "stale", False)
     story = Story()
     add_corrections(story, ReportData.of(session, None, None))
     count = str(len(moved.dots))
     assert story.tables[0][1:] == [["2", count, "2", "blocked rows 3"]]
     assert [row[2] for row in story.tables[1]][1:] == ["setup", "settings", "correction"]
-    keep(2, correction=session.correction(2))
-    assert lines_of(session)[2].state == "corrected by hand"
+    store(2, correction=session.correction(2))
+    assert frame_lines(session)[2].state == "corrected by hand"
 
 
-def test_a_frame_whose_correspondence_has_a_rival_is_doubtful(
-    session: Session, seen: Measurement, keep: Callable[..., None]
+def test_frame_with_two_similar_correspondences_is_doubtful(
+    session: Session, cap_measurement: Measurement, store: Callable[..., None]
 ):
-    assert seen.match is not None
+    assert cap_measurement.match is not None
     for frame, rival in ((0, 0.049), (1, 0.051)):
         trials = (Trial("S/S", 0.01), Trial("I/I", rival))
-        keep(frame, match=replace(seen.match, orientation="S/S", trials=trials))
-    assert [line.state for line in lines_of(session)[:3]] == [
+        store(frame, match=replace(cap_measurement.match, orientation="S/S", trials=trials))
+    assert [line.state for line in frame_lines(session)[:3]] == [
         "doubtful",
         "measured",
         "not measured",
@@ -194,7 +203,7 @@ def test_rows_that_do_not_allow_a_correspondence_are_counted():
     assert not data.rows_sentence(lines[1:2])
 
 
-def test_of_many_frames_the_first_and_the_last_are_listed():
+def test_only_the_first_and_last_of_many_frames_are_listed():
     lines = [FrameLine(k, k / 50) for k in range(100)]
     cells = data.frame_cells(lines)
     assert [row[0] for row in cells[1:]] == [*map(str, range(20)), "…", *map(str, range(80, 100))]
@@ -202,12 +211,12 @@ def test_of_many_frames_the_first_and_the_last_are_listed():
     assert len(data.frame_cells(lines[:60])) == 61
 
 
-def test_the_frame_that_stands_for_all_has_the_median_peak(seen: Measurement):
-    assert seen.measures is not None
+def test_representative_frame_has_the_median_peak(cap_measurement: Measurement):
+    assert cap_measurement.measures is not None
 
     def line(frame: int, **sizes: float) -> FrameLine:
-        assert seen.measures is not None
-        return FrameLine(frame, 0.0, "ok", measures=replace(seen.measures, **sizes))
+        assert cap_measurement.measures is not None
+        return FrameLine(frame, 0.0, "ok", measures=replace(cap_measurement.measures, **sizes))
 
     convex = [line(k, height_mm=h) for k, h in enumerate((0.2, 0.5, 0.31, 0.3))]
     assert data.representative([*convex, FrameLine(9, 0.0, "no-dots")]) is convex[2]
@@ -226,16 +235,16 @@ def test_the_frame_that_stands_for_all_has_the_median_peak(seen: Measurement):
         (list(range(0, 30, 2)), "0, 2, 4, 6, 8, 10, 12, 14, 16, 18, 20, 22 and 3 more"),
     ],
 )
-def test_frames_are_named_in_short(numbers: list[int], text: str):
+def test_frame_numbers_are_abbreviated(numbers: list[int], text: str):
     assert format_ranges(numbers) == text
 
 
-def test_settings_that_differ_are_told_with_their_defaults():
+def test_changed_settings_are_listed_with_their_defaults():
     assert data.settings_cells(Settings())[1:] == []
     assert data.settings_cells(ERS)[1:] == [["scheme", "ers", "fit"]]
 
 
-def test_the_rig_is_told_with_units(setup: Setup):
+def test_rig_is_listed_with_units(setup: Setup):
     cells = {row[1]: row[2] for row in data.rig_cells(setup)}
     assert cells["projection angle α"] == "31.14 °"
     assert cells["s: O′ at X = −s"] == "45 mm"
@@ -247,7 +256,7 @@ def test_the_rig_is_told_with_units(setup: Setup):
     assert cells["pitch, yaw, roll"].startswith("4 °, -3 °, ")
 
 
-def test_the_rig_has_what_is_not_ideal_of_it(setup: Setup):
+def test_rig_table_lists_nonideal_quantities(setup: Setup):
     values = {
         "laser": {"azimuth_deg": 1.5, "aim_x_mm": 0.25, "aim_y_mm": -0.5},
         "pattern": {"rotation_deg": 0.75},
@@ -277,66 +286,75 @@ def sizes(match: Match, rig: Rig) -> np.ndarray:
     return np.array([getattr(size, name) for name in SIZES])
 
 
-def test_the_budget_is_what_measuring_with_other_values_gives(seen: Measurement, setup: Setup):
-    found = {one.name: one for one in setup_budget(seen, setup, ERS)}
-    assert len(found) == len(QUANTITIES)
-    assert all(one.assumed for one in found.values() if one.sigma > 0.0)
-    assert {name for name, one in found.items() if one.sigma == 0.0} == {
+def test_budget_equals_measurements_with_changed_values(cap_measurement: Measurement, setup: Setup):
+    budget = {
+        contribution.name: contribution
+        for contribution in setup_budget(cap_measurement, setup, ERS)
+    }
+    assert len(budget) == len(QUANTITIES)
+    assert all(contribution.assumed for contribution in budget.values() if contribution.sigma > 0.0)
+    assert {name for name, contribution in budget.items() if contribution.sigma == 0.0} == {
         name
-        for name in found
+        for name in budget
         if "glass" in name  # there is none
     }
-    assert seen.match is not None
+    assert cap_measurement.match is not None
     farther, nearer = (
         replace(setup.rig, laser=replace(setup.rig.laser, distance_mm=31.48 + step))
         for step in (0.5, -0.5)
     )
-    change = (sizes(seen.match, farther) - sizes(seen.match, nearer)) / 2
-    distance = found["laser, distance"]
+    change = (sizes(cap_measurement.match, farther) - sizes(cap_measurement.match, nearer)) / 2
+    distance = budget["laser, distance"]
     assert (distance.sigma, distance.unit) == (0.5, "mm")
     np.testing.assert_allclose(distance.change, change, atol=1e-9)
     assert change[0] > 0.02
 
 
-def test_a_moved_point_of_the_picture_is_another_image_calibration(seen: Measurement):
+def test_budget_of_a_calibration_point_equals_a_moved_point(cap_measurement: Measurement):
     setup = parse_setup(SETUP + "origin_px_sigma = 0.2\n", "setup.toml")
-    found = {one.name: one for one in setup_budget(seen, setup, ERS)}
-    assert seen.match is not None
-    image = setup.calibration.to_image(seen.match.plane_mm)
+    budget = {
+        contribution.name: contribution
+        for contribution in setup_budget(cap_measurement, setup, ERS)
+    }
+    assert cap_measurement.match is not None
+    image = setup.calibration.to_image(cap_measurement.match.plane_mm)
     points = (242.01, 587.93), 34.925, (43.06, 499.99), 15.875
     right, left = (
         sizes(
             replace(
-                seen.match,
+                cap_measurement.match,
                 plane_mm=ImageCalibration.from_three_points((u, 590.0), *points).to_plane(image),
             ),
             setup.rig,
         )
         for u in (44.2, 43.8)
     )
-    origin = found["image calibration, O′, u"]
+    origin = budget["image calibration, O′, u"]
     assert (origin.sigma, origin.assumed) == (0.2, False)
     np.testing.assert_allclose(origin.change, (right - left) / 2, rtol=1e-6, atol=1e-12)
     assert np.abs(origin.change).max() > 1e-4
 
 
-def test_correlated_quantities_count_together(seen: Measurement, setup: Setup):
+def test_correlated_quantities_are_combined(cap_measurement: Measurement, setup: Setup):
     laser = "angle_distance_correlation = {}\n[pattern]"
-    apart, together, against = (
+    uncorrelated, correlated, anticorrelated = (
         parse_setup(SETUP.replace("[pattern]", laser.format(share)), "setup.toml")
         for share in (0.0, 0.9, -0.9)
     )
-    changes = setup_budget(seen, setup, ERS)
-    widths = [total(np.zeros(6), changes, one.rig)[0] for one in (apart, together, against)]
+    changes = setup_budget(cap_measurement, setup, ERS)
+    widths = [
+        total(np.zeros(6), changes, one.rig)[0]
+        for one in (uncorrelated, correlated, anticorrelated)
+    ]
     squares = np.sqrt(np.sum(np.square([one.change[0] for one in changes])))
     assert widths[0] == pytest.approx(squares)
     assert len({round(width, 6) for width in widths}) == 3
     assert widths[1] ** 2 + widths[2] ** 2 == pytest.approx(2 * widths[0] ** 2)
 
 
-def test_the_budget_has_what_is_not_the_setups_once(seen: Measurement, setup: Setup):
-    assert seen.measures is not None
-    measures = replace(seen.measures, width_sigma_mm=0.05, width_sigma_setup_mm=0.04)
+def test_budget_counts_errors_of_the_frame_once(cap_measurement: Measurement, setup: Setup):
+    assert cap_measurement.measures is not None
+    measures = replace(cap_measurement.measures, width_sigma_mm=0.05, width_sigma_setup_mm=0.04)
     line = FrameLine(0, 0.0, "ok", measures=measures)
     changes = np.array([0.04, 0.1, np.nan, 0.0, 0.0, 0.0])
     parts = [
@@ -352,26 +370,24 @@ def test_the_budget_has_what_is_not_the_setups_once(seen: Measurement, setup: Se
     assert cells[-1][2:5] == ["0.0500", "0.1000", "0.0000"]
 
 
-# --- the pages --------------------------------------------------------------------------------
+# --- pages ------------------------------------------------------------------------------------
 
 
-def test_a_report_is_pdf_and_the_same_bytes_for_the_same_session(
-    session: Session, keep: Callable[..., None], tmp_path: Path
-):
+def test_report_is_a_reproducible_pdf(session: Session, store: Callable[..., None], tmp_path: Path):
     for frame in range(4):
-        keep(frame, 6.0 + 0.1 * frame)
-    once = report_pdf(session, now=NOW)
-    assert pages(once) >= 5
-    assert report_pdf(session, now=NOW) == once
+        store(frame, 6.0 + 0.1 * frame)
+    pdf = report_pdf(session, now=NOW)
+    assert page_count(pdf) >= 5
+    assert report_pdf(session, now=NOW) == pdf
 
 
-def test_figures_and_tables_are_counted(session: Session, keep: Callable[..., None]):
-    keep(0)
-    keep(1)
+def test_figures_and_tables_are_numbered(session: Session, store: Callable[..., None]):
+    store(0)
+    store(1)
     story = Story()
-    told = ReportData.of(session, None, None)
-    add_results(story, told)
-    add_example(story, told)
+    report = ReportData.of(session, None, None)
+    add_results(story, report)
+    add_example(story, report)
     numbered = [caption.split(".")[0] for caption in story.captions]
     assert numbered == [
         *("Table 1", "Table 2", "Figure 1", "Figure 2", "Table 3"),
@@ -379,43 +395,43 @@ def test_figures_and_tables_are_counted(session: Session, keep: Callable[..., No
     ]
 
 
-def test_a_session_of_nothing_still_gives_a_report(tmp_path: Path):
+def test_empty_session_has_a_report(tmp_path: Path):
     with Session.create(tmp_path / "new.labsession") as session:
-        assert pages(report_pdf(session, now=NOW)) >= 1
+        assert page_count(report_pdf(session, now=NOW)) >= 1
         session.update_setup({"laser": {"distance_mm": -3.0}})
-        assert pages(report_pdf(session, now=NOW)) >= 1
+        assert page_count(report_pdf(session, now=NOW)) >= 1
 
 
-def test_frames_without_a_surface_and_a_recording_that_is_gone_are_told(
-    session: Session, keep: Callable[..., None], tmp_path: Path
+def test_missing_surfaces_and_recording_are_reported(
+    session: Session, store: Callable[..., None], tmp_path: Path
 ):
     for frame in range(3):
-        keep(frame, status="no-match", reason="<b> & 3 dots", **NOTHING)
+        store(frame, status="no-match", reason="<b> & 3 dots", **NOTHING)
     (tmp_path / "frames").rename(tmp_path / "elsewhere")
     story = Story()
-    told = ReportData.of(session, None, None)
-    add_results(story, told)
-    add_example(story, told)
+    report = ReportData.of(session, None, None)
+    add_results(story, report)
+    add_example(story, report)
     assert story.tables[0][1] == ["no-match", "<b> & 3 dots", "3", "0–2"]
     assert story.captions[-1].endswith("The frame itself cannot be read.")
-    assert pages(report_pdf(session, now=NOW)) >= 2
+    assert page_count(report_pdf(session, now=NOW)) >= 2
 
 
-def test_frames_can_be_chosen_and_must_be_there(session: Session, keep: Callable[..., None]):
-    keep(1)
+def test_report_of_selected_frames(session: Session, store: Callable[..., None]):
+    store(1)
     assert [line.frame for line in data.frame_lines(session, "ers", [4, 1, 1])] == [1, 4]
-    assert lines_of(session)[1].status == "ok"
+    assert frame_lines(session)[1].status == "ok"
     assert data.frame_lines(session, "fit", [1])[0].status == ""
     with pytest.raises(InputError, match=r"frame: 6; expected frames of the session"):
         report_pdf(session, frames=[6], now=NOW)
 
 
-def test_a_damaged_result_is_a_status_of_its_own(session: Session, keep: Callable[..., None]):
-    keep(0)
+def test_damaged_result_has_its_own_status(session: Session, store: Callable[..., None]):
+    store(0)
     with session._database.transaction() as connection:
         connection.execute("UPDATE detail SET content = x'00'")
-    assert lines_of(session)[0].status == "damaged"
-    assert pages(report_pdf(session, now=NOW)) >= 2
+    assert frame_lines(session)[0].status == "damaged"
+    assert page_count(report_pdf(session, now=NOW)) >= 2
 
 
 @pytest.mark.parametrize(
@@ -431,22 +447,22 @@ def test_a_damaged_result_is_a_status_of_its_own(session: Session, keep: Callabl
         "",
     ],
 )
-def test_whatever_was_typed_comes_out(text: str, tmp_path: Path):
+def test_any_text_can_be_reported(text: str, tmp_path: Path):
     story = Story()
     story.title(text or "untitled")
     story.text(text)
     story.listing([("notes", text), (text, "x")])
     story.table(text, [["a", "b"], [text, text]], "lr", (0.5, 0.5))
-    assert pages(story.pdf(text, "footer", text.encode("utf-8", "replace").decode())) >= 1
+    assert page_count(story.pdf(text, "footer", text.encode("utf-8", "replace").decode())) >= 1
 
 
-def test_markup_is_text_and_lines_stay_lines():
+def test_markup_is_escaped_and_line_breaks_are_preserved():
     assert plain("a < b & c\n<i>") == "a &lt; b &amp; c<br/>&lt;i&gt;"
 
 
-def test_a_record_is_reported_by_its_title(tmp_path: Path):
+def test_report_contains_the_title_of_the_record(tmp_path: Path):
     record = Record(title="Bead on plate", operator="A. Weld", safety=(("goggles", "2026"),))
     with Session.create(tmp_path / "x.labsession", record) as session:
-        once = report_pdf(session, now=NOW)
-        assert b"Bead on plate" in once
-        assert report_pdf(session, now=NOW + datetime.timedelta(days=1)) != once
+        pdf = report_pdf(session, now=NOW)
+        assert b"Bead on plate" in pdf
+        assert report_pdf(session, now=NOW + datetime.timedelta(days=1)) != pdf

@@ -1,4 +1,4 @@
-"""The sample sessions: whole, what their recordings give, and read by every later version."""
+"""The sample sessions are intact, close to the truth, and readable by later versions."""
 
 from __future__ import annotations
 
@@ -42,65 +42,65 @@ def name(request: pytest.FixtureRequest) -> str:
 
 
 @pytest.mark.parametrize("name", EXPECTED)
-def test_a_sample_session_is_whole_and_near_the_truth(name: str):
+def test_sample_session_is_intact_and_near_the_truth(name: str):
     path = sample_folder(name) / f"{name}.labsession"
     before = path.read_bytes()
     with Session.open(path, read_only=True) as session:
         assert session.problems() == []
         assert session.record == SAMPLES[name].record
         assert session.plane_calibration is not None
-        seen = session.overview()
-        assert list(seen.status) == EXPECTED[name]
-        assert not seen.stale.any()
+        overview = session.overview()
+        assert list(overview.status) == EXPECTED[name]
+        assert not overview.stale.any()
         extreme = "depth_mm" if name == "concave" else "height_mm"
-        measured = np.array([status == "ok" for status in seen.status])
-        error = seen.measures[extreme][measured] / truth(name, extreme)[measured] - 1
+        measured = np.array([status == "ok" for status in overview.status])
+        error = overview.measures[extreme][measured] / truth(name, extreme)[measured] - 1
         assert np.abs(error).max() < 0.03
         assert session.frame(int(session.frames[-1])).image.any()
     assert path.read_bytes() == before
 
 
 @pytest.mark.parametrize("name", LINES)
-def test_a_session_of_lines_is_whole_and_near_the_truth(name: str):
+def test_line_session_is_intact_and_near_the_truth(name: str):
     with Session.open(sample_folder(name) / f"{name}.labsession", read_only=True) as session:
         assert session.problems() == []
         assert session.record == SAMPLES[name].record
-        seen = session.overview()
-        assert not seen.stale.any()
+        overview = session.overview()
+        assert not overview.stale.any()
         if name == "gmaw":
             on = [state == "on" for state in texts(name, "pulse")]
-            assert [status == "pulse" for status in seen.status] == on
-            assert set(seen.status) == {"followed", "pulse"}
+            assert [status == "pulse" for status in overview.status] == on
+            assert set(overview.status) == {"followed", "pulse"}
             v, measured = truth(name, "line_v_px"), line_trend(session).values["shift_px"]
-            known = np.isfinite(measured)
-            assert np.corrcoef(measured[known], v[known])[0, 1] > 0.9
+            is_known = np.isfinite(measured)
+            assert np.corrcoef(measured[is_known], v[is_known])[0, 1] > 0.9
             return
-        found = line_trend(session)
-        height = found.values["pool_height_mm"]
-        known = np.isfinite(height)
-        assert known.mean() > 0.6
+        trend = line_trend(session)
+        height = trend.values["pool_height_mm"]
+        is_known = np.isfinite(height)
+        assert is_known.mean() > 0.6
         error = height / (truth(name, "height_mm") + truth(name, "depth_mm")) - 1
-        assert np.median(np.abs(error[known])) < 0.08
-        assert np.abs(error[known]).max() < 0.25
-        right = [a == b for a, b in zip(found.states, texts(name, "state"), strict=True)]
-        assert np.mean(right) > 0.9
+        assert np.median(np.abs(error[is_known])) < 0.08
+        assert np.abs(error[is_known]).max() < 0.25
+        is_right = [a == b for a, b in zip(trend.states, texts(name, "state"), strict=True)]
+        assert np.mean(is_right) > 0.9
 
 
-def test_links_beside_the_copy_of_a_sample_are_not_followed(name: str, tmp_path: Path):
+def test_copy_of_a_sample_follows_no_links(name: str, tmp_path: Path):
     folder = tmp_path / "copy"
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine.txt").write_text("mine")
     folder.mkdir()
-    for each in (SAMPLES[name].recording, f"{name}.labsession"):
-        is_folder = (sample_folder(name) / each).is_dir()
-        (folder / f".{each}.part").symlink_to("../mine" if is_folder else "../mine.txt")
+    for file in (SAMPLES[name].recording, f"{name}.labsession"):
+        is_folder = (sample_folder(name) / file).is_dir()
+        (folder / f".{file}.part").symlink_to("../mine" if is_folder else "../mine.txt")
     with Session.open(copy_sample(name, folder)) as session:
         assert session.frame(int(session.frames[0])).image.any()
     assert (tmp_path / "mine.txt").read_text() == "mine"
     assert not list((tmp_path / "mine").iterdir())
 
 
-def test_the_session_with_blocked_rows_holds_a_correction():
+def test_session_with_blocked_rows_contains_a_correction():
     path = sample_folder("blocked_rows") / "blocked_rows.labsession"
     with Session.open(path, read_only=True) as session:
         assert session.corrected_frames().tolist() == [2]
@@ -109,17 +109,17 @@ def test_the_session_with_blocked_rows_holds_a_correction():
         assert correction.lattice.reference == (6, 8)
 
 
-def test_a_sample_that_is_not_there_is_told(tmp_path: Path):
+def test_missing_sample_is_reported(tmp_path: Path):
     with (
         mock.patch.object(samples, "bundled", tmp_path.joinpath),
-        pytest.raises(InputError) as told,
+        pytest.raises(InputError) as caught,
     ):
         sample_folder("gtaw")
-    assert told.value.source == str(tmp_path / "sample_sessions/gtaw")
-    assert told.value.value == "missing"
+    assert caught.value.source == str(tmp_path / "sample_sessions/gtaw")
+    assert caught.value.value == "missing"
 
 
-def test_a_session_that_cannot_be_made_leaves_nothing(tmp_path: Path):
+def test_failed_session_leaves_no_file(tmp_path: Path):
     unreadable = InputError("recording.avi", "content", "damaged", "a video")
     with (
         mock.patch.object(Session, "import_recording", side_effect=unreadable),

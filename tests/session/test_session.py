@@ -34,7 +34,7 @@ SAMPLE = Path(labapp.__file__).parents[1] / "sample_sessions" / "gtaw"
 
 @pytest.fixture(scope="module")
 def measured_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a recording of four frames, two of them measured in a session beside it."""
+    """A folder with a recording and a session of four of its frames, two of them measured."""
     folder = tmp_path_factory.mktemp("session")
     shutil.copy(SAMPLE / "recording.avi", folder)
     with Session.create(folder / "run.labsession", Record(operator="A. Weld")) as session:
@@ -56,8 +56,8 @@ def session(folder: Path) -> Iterator[Session]:
         yield session
 
 
-def pretend(session: Session, frame: int, **changes: object) -> None:
-    """Keep another measurement of a frame, without measuring."""
+def store_changed(session: Session, frame: int, **changes: object) -> None:
+    """Store a changed measurement of a frame, without measuring."""
     result = session.result(frame)
     assert result is not None
     session._results.put(
@@ -69,14 +69,14 @@ def pretend(session: Session, frame: int, **changes: object) -> None:
 
 
 @pytest.mark.parametrize("kind", ["device", "pipe", "nul", "folder with a pipe"])
-def test_a_recording_that_is_no_regular_file_is_refused(folder: Path, kind: str):
-    place = {"device": "/dev/zero", "pipe": "pipe.avi", "nul": "a\0.avi"}.get(kind, "films")
+def test_recording_must_be_a_regular_file(folder: Path, kind: str):
+    path = {"device": "/dev/zero", "pipe": "pipe.avi", "nul": "a\0.avi"}.get(kind, "films")
     (folder / "films").mkdir()
     for pipe in ("pipe.avi", "films/a.mraw", "films/a.png"):
         os.mkfifo(folder / pipe)
     with Session.open(folder / "run.labsession") as session:
         assert session.recording is not None
-        forged = pack(replace(session.recording, path=place, size=0))
+        forged = pack(replace(session.recording, path=path, size=0))
         with session._database.transaction() as connection:
             connection.execute("UPDATE recording SET content = ?", (forged,))
     script = """
@@ -93,11 +93,11 @@ def test_a_recording_that_is_no_regular_file_is_refused(folder: Path, kind: str)
     assert run_python(script, folder / "run.labsession").splitlines() == ["True", "refused"]
 
 
-def test_the_package_offers_it():
+def test_package_exports_the_session():
     assert labapp.Session is Session
 
 
-def test_a_session_holds_everything(session: Session):
+def test_session_contains_record_setup_frames_and_recording(session: Session):
     assert session.record == Record(operator="A. Weld")
     assert same(session.setup.rig, read_setup(SAMPLE / "setup.toml").rig)
     assert session.frames.tolist() == [0, 2, 4, 6]
@@ -111,7 +111,7 @@ def test_a_session_holds_everything(session: Session):
     assert session.problems() == []
 
 
-def test_results_say_what_they_come_from(session: Session):
+def test_results_have_their_provenance(session: Session):
     result = session.result(2)
     assert result is not None
     assert (result.frame, result.scheme, result.version) == (2, "fit", labapp.__version__)
@@ -126,15 +126,15 @@ def test_results_say_what_they_come_from(session: Session):
     assert session.result(4) is None
 
 
-def test_what_is_kept_is_what_was_measured(session: Session):
+def test_stored_measurement_equals_the_measured_one(session: Session):
     ((_, measured),) = session.measure_each([4])
-    kept = session.result(4)
-    assert kept is not None
+    stored = session.result(4)
+    assert stored is not None
     assert measured.reconstruction is not None
-    assert same(kept.measurement, measured)
+    assert same(stored.measurement, measured)
 
 
-def test_frames_are_those_of_the_recording(session: Session):
+def test_frames_are_read_from_the_recording(session: Session):
     video = cv2.VideoCapture(str(SAMPLE / "recording.avi"))
     frames = [video.read()[1][..., 0] for _ in range(7)]
     for number in (6, 0, 4):
@@ -143,10 +143,10 @@ def test_frames_are_those_of_the_recording(session: Session):
         session.frame(1)
 
 
-# --- what no longer stands --------------------------------------------------------------------
+# --- stale results ----------------------------------------------------------------------------
 
 
-def test_a_changed_calibration_makes_results_stale_and_undo_lets_them_stand(session: Session):
+def test_changed_calibration_makes_results_stale_until_undo(session: Session):
     session.update_setup({"laser": {"distance_mm": 30.0}}, "laser moved")
     assert session.stale_frames().tolist() == [0, 2, 4, 6]
     result = session.result(0)
@@ -160,19 +160,19 @@ def test_a_changed_calibration_makes_results_stale_and_undo_lets_them_stand(sess
     assert session.stale_frames().tolist() == [0, 2, 4, 6]
 
 
-def test_a_comment_in_the_setup_makes_nothing_stale(session: Session):
+def test_comment_in_the_setup_makes_nothing_stale(session: Session):
     session.set_setup(session.setup_text + "\n# checked on Monday\n")
     assert session.stale_frames().tolist() == [4, 6]
 
 
-def test_an_incomplete_setup_makes_everything_stale(session: Session):
+def test_incomplete_setup_makes_everything_stale(session: Session):
     session.update_setup({"laser": {"distance_mm": None}})
     assert session.overview().stale.tolist() == [True, True, False, False]
     with pytest.raises(InputError, match=r"laser.distance_mm"):
         next(session.measure_each())
 
 
-def test_a_correction_makes_its_frame_stale(session: Session):
+def test_correction_makes_its_frame_stale(session: Session):
     result = session.result(2)
     assert result is not None
     correction = Correction.of(result.measurement.dots, result.measurement.lattice)
@@ -189,14 +189,18 @@ def test_a_correction_makes_its_frame_stale(session: Session):
     assert session.overview().stale.tolist() == [False, False, False, False]
 
 
-def test_undo_and_redo_bring_back_what_was_measured(session: Session):
-    found = session.result(2)
-    assert found is not None
-    correction = Correction.of(found.measurement.dots, found.measurement.lattice)
+def test_undo_and_redo_restore_measurements(session: Session):
+    automatic = session.result(2)
+    assert automatic is not None
+    correction = Correction.of(automatic.measurement.dots, automatic.measurement.lattice)
     session.correct({2: correction})
     assert len(list(session.measure_each([2]))) == 1
-    by_hand = session.result(2)
-    for step, expected in ((session.undo, found), (session.redo, by_hand), (session.undo, found)):
+    corrected = session.result(2)
+    for step, expected in (
+        (session.undo, automatic),
+        (session.redo, corrected),
+        (session.undo, automatic),
+    ):
         step()
         result = session.result(2)
         assert result is not None
@@ -206,22 +210,22 @@ def test_undo_and_redo_bring_back_what_was_measured(session: Session):
         assert same(result.measurement, expected.measurement)
         assert session.overview().stale.tolist() == [False] * 4
         assert session.problems() == []
-    session.correct({2: correction})  # another way to the same dots and rows
+    session.correct({2: correction})  # the same dots and rows by a new change
     result = session.result(2)
     assert result is not None
     assert result.stale == ()
 
 
-def test_a_fit_that_ends_after_its_edit_was_undone_takes_no_place(session: Session):
-    found = session.result(2)
-    assert found is not None
-    correction = Correction.of(found.measurement.dots, found.measurement.lattice)
+def test_fit_of_an_undone_edit_does_not_replace_the_result(session: Session):
+    automatic = session.result(2)
+    assert automatic is not None
+    correction = Correction.of(automatic.measurement.dots, automatic.measurement.lattice)
     session.correct({2: correction})
-    measuring = session._results.put
-    basis, used = session._basis(), session._documents.fingerprint("correction", 2)
+    put = session._results.put
+    basis, fingerprint = session._basis(), session._documents.fingerprint("correction", 2)
     assert basis is not None
     session.undo()
-    measuring(2, replace(found.measurement, correction=correction), basis, used)
+    put(2, replace(automatic.measurement, correction=correction), basis, fingerprint)
     result = session.result(2)
     assert result is not None
     assert result.measurement.correction is None
@@ -234,13 +238,13 @@ def test_a_fit_that_ends_after_its_edit_was_undone_takes_no_place(session: Sessi
     assert session.problems() == []
 
 
-def test_what_was_measured_with_another_setup_is_not_brought_back(session: Session):
+def test_result_of_another_setup_is_not_restored(session: Session):
     result = session.result(2)
     assert result is not None
     session.correct({2: Correction.of(result.measurement.dots, result.measurement.lattice)})
-    pretend(session, 2)
+    store_changed(session, 2)
     session.update_setup({"electrode": {"height_mm": 5.1}})
-    pretend(session, 2)
+    store_changed(session, 2)
     session.undo()
     session.undo()
     result = session.result(2)
@@ -248,28 +252,28 @@ def test_what_was_measured_with_another_setup_is_not_brought_back(session: Sessi
     assert result.stale == (SETUP_CHANGED, CORRECTION_CHANGED)
 
 
-def test_a_correction_of_a_frame_that_is_not_there_is_refused(session: Session):
+def test_correction_of_a_missing_frame_is_rejected(session: Session):
     with pytest.raises(InputError, match="frame"):
         session.correct({3: None})
 
 
-def test_each_scheme_keeps_its_own_results(session: Session):
+def test_each_scheme_has_separate_results(session: Session):
     session.set_settings(Settings(scheme="ers"))
     assert session.stale_frames().tolist() == [0, 2, 4, 6]
-    one = session.result(0, "fit")
-    assert one is not None
+    result = session.result(0, "fit")
+    assert result is not None
     basis = session._basis()
     assert basis is not None
-    session._results.put(0, replace(one.measurement, scheme="ers"), basis, None)
+    session._results.put(0, replace(result.measurement, scheme="ers"), basis, None)
     assert session.overview().status == ("ok", "", "", "")
     assert session.overview("fit").stale.tolist() == [False] * 4
     assert session.measured_by == {
         ("ers", labapp.__version__): 1,
         ("fit", labapp.__version__): 2,
     }
-    one = session.result(0, "fit")
-    assert one is not None
-    assert one.stale == ()
+    result = session.result(0, "fit")
+    assert result is not None
+    assert result.stale == ()
 
 
 def test_changed_settings_make_results_stale(session: Session):
@@ -280,8 +284,8 @@ def test_changed_settings_make_results_stale(session: Session):
     assert result.stale == (SETTINGS_CHANGED,)
 
 
-def test_a_result_without_a_surface_is_kept_too(session: Session):
-    pretend(
+def test_result_without_a_surface_is_stored(session: Session):
+    store_changed(
         session,
         0,
         status="no-dots",
@@ -297,10 +301,10 @@ def test_a_result_without_a_surface_is_kept_too(session: Session):
     assert session.problems() == []
 
 
-# --- where the recording is -------------------------------------------------------------------
+# --- path of the recording --------------------------------------------------------------------
 
 
-def test_the_folder_may_be_moved(folder: Path):
+def test_folder_can_be_moved(folder: Path):
     moved = folder.rename(folder.with_name("elsewhere"))
     with Session.open(moved / "run.labsession") as session:
         assert session.missing_recording is None
@@ -308,7 +312,7 @@ def test_the_folder_may_be_moved(folder: Path):
         assert session.problems() == []
 
 
-def test_a_recording_beside_the_session_is_found(folder: Path):
+def test_recording_beside_the_session_is_found(folder: Path):
     (folder / "videos").mkdir()
     with Session.create(folder / "other.labsession") as session:
         video = shutil.copy(folder / "recording.avi", folder / "videos")
@@ -318,16 +322,16 @@ def test_a_recording_beside_the_session_is_found(folder: Path):
         assert session.frame(1).index == 1
 
 
-def test_a_recording_that_is_gone_is_asked_for_and_what_was_measured_shows(folder: Path):
+def test_results_remain_without_the_recording(folder: Path):
     (folder / "recording.avi").rename(folder / "moved.avi")
     with Session.open(folder / "run.labsession") as session:
         assert session.missing_recording == folder / "recording.avi"
         result = session.result(0)
         assert result is not None
         assert result.measurement.measures is not None
-        for attempt in (lambda: session.frame(0), lambda: next(session.measure_each())):
+        for call in (lambda: session.frame(0), lambda: next(session.measure_each())):
             with pytest.raises(InputError, match="does not exist"):
-                attempt()
+                call()
         assert session.overview().status == ("ok", "ok", "", "")
         session.relink(folder / "moved.avi")
         assert session.missing_recording is None
@@ -336,7 +340,7 @@ def test_a_recording_that_is_gone_is_asked_for_and_what_was_measured_shows(folde
         assert session.frame(0).image.any()
 
 
-def test_another_recording_in_its_place_is_noticed(folder: Path):
+def test_replaced_recording_is_detected(folder: Path):
     content = bytearray((folder / "recording.avi").read_bytes())
     (folder / "recording.avi").write_bytes(content[:-200_000])
     with Session.open(folder / "run.labsession") as session:
@@ -345,7 +349,7 @@ def test_another_recording_in_its_place_is_noticed(folder: Path):
             session.relink(folder / "recording.avi")
 
 
-def test_frames_that_changed_are_noticed(folder: Path):
+def test_changed_frames_are_detected(folder: Path):
     rng = np.random.default_rng(4)
     frames = rng.integers(0, 255, (3, 20, 30), np.uint8)
     np.save(folder / "stack.npy", frames)
@@ -376,7 +380,7 @@ def test_embedded_frames_need_no_recording(tmp_path: Path, dtype: type):
         assert session.problems() == []
 
 
-def test_another_recording_is_refused_once_frames_are_measured(session: Session, folder: Path):
+def test_other_recording_is_rejected_after_measuring(session: Session, folder: Path):
     np.save(folder / "stack.npy", np.zeros((3, 20, 30), np.uint8))
     with pytest.raises(InputError, match="new session"):
         session.import_recording(folder / "stack.npy")
@@ -387,7 +391,7 @@ def test_another_recording_is_refused_once_frames_are_measured(session: Session,
     assert session.overview().status == ("ok", "", "ok", "", "")
 
 
-def test_an_import_that_is_stopped_leaves_the_session_as_it_was(session: Session, folder: Path):
+def test_stopped_import_leaves_the_session_unchanged(session: Session, folder: Path):
     def stop(done: int, _: int) -> None:
         if done == 2:
             raise KeyboardInterrupt
@@ -400,32 +404,32 @@ def test_an_import_that_is_stopped_leaves_the_session_as_it_was(session: Session
 # --- calibrations -----------------------------------------------------------------------------
 
 
-def test_a_laser_calibration_goes_into_the_rig_and_back(session: Session):
-    found = session.calibrate_laser([13.676], [18.561], [7.874])
-    assert session.setup.rig.laser == found.laser
+def test_laser_calibration_changes_the_rig_until_undo(session: Session):
+    calibration = session.calibrate_laser([13.676], [18.561], [7.874])
+    assert session.setup.rig.laser == calibration.laser
     readings = session.laser_calibration
     assert readings is not None
-    assert (readings.l2_mm, readings.found) == ((18.561,), found)
+    assert (readings.l2_mm, readings.found) == ((18.561,), calibration)
     session.undo()
     assert session.laser_calibration is None
     assert session.setup.rig.laser.distance_mm == pytest.approx(31.48)
 
 
-def test_a_plane_calibration_keeps_its_picture(session: Session):
-    found = session.calibrate_plane(SAMPLE / "calibration.png", 6.35)
-    kept = session.plane_calibration
-    assert kept is not None
-    assert (kept.unit_mm, kept.found) == (6.35, found)
+def test_plane_calibration_stores_its_picture(session: Session):
+    calibration = session.calibrate_plane(SAMPLE / "calibration.png", 6.35)
+    stored = session.plane_calibration
+    assert stored is not None
+    assert (stored.unit_mm, stored.found) == (6.35, calibration)
     picture = cv2.imread(str(SAMPLE / "calibration.png"), cv2.IMREAD_UNCHANGED)
-    np.testing.assert_array_equal(session.picture(kept.picture_sha256), picture)
-    assert same(session.setup.calibration, found.image_calibration)
+    np.testing.assert_array_equal(session.picture(stored.picture_sha256), picture)
+    assert same(session.setup.calibration, calibration.image_calibration)
     session.undo()
     assert session.plane_calibration is None
     with pytest.raises(InputError, match="calibration picture: missing"):
         session.picture("0" * 64)
 
 
-def test_a_picture_without_a_target_changes_nothing(session: Session, tmp_path: Path):
+def test_picture_without_a_target_changes_nothing(session: Session, tmp_path: Path):
     cv2.imwrite(str(tmp_path / "dark.png"), np.zeros((200, 200), np.uint8))
     with pytest.raises(CannotMeasure):
         session.calibrate_plane(tmp_path / "dark.png", 6.35)
@@ -436,7 +440,7 @@ def test_a_picture_without_a_target_changes_nothing(session: Session, tmp_path: 
 # --- damage -----------------------------------------------------------------------------------
 
 
-def test_damage_is_told_and_the_rest_still_shows(session: Session):
+def test_damage_is_reported_and_other_results_remain(session: Session):
     with session._database.transaction() as connection:
         connection.execute("UPDATE detail SET content = substr(content, 1, 900) WHERE result = 1")
         connection.execute("UPDATE result SET height_mm = height_mm + 0.01 WHERE id = 2")
@@ -449,10 +453,10 @@ def test_damage_is_told_and_the_rest_still_shows(session: Session):
     assert "result of frame 2 (fit) differs" in problems[1]
 
 
-# --- out and back -----------------------------------------------------------------------------
+# --- export -----------------------------------------------------------------------------------
 
 
-def test_what_is_exported_is_what_the_command_line_writes(session: Session, tmp_path: Path):
+def test_export_equals_the_output_of_the_command_line(session: Session, tmp_path: Path):
     """Session → CSV and STL: the same bytes as `labapp reconstruct` of the same frames."""
     setup = read_setup(SAMPLE / "setup.toml")
     direct = tmp_path / "direct"
@@ -472,7 +476,7 @@ def test_what_is_exported_is_what_the_command_line_writes(session: Session, tmp_
         assert (tmp_path / "out" / name).read_bytes() == (direct / name).read_bytes(), name
 
 
-def test_hdf5_holds_every_number_of_the_session_exactly(session: Session, tmp_path: Path):
+def test_hdf5_contains_the_exact_values(session: Session, tmp_path: Path):
     session.export(tmp_path / "out", ExportChoice(hdf5=True))
     overview = session.overview()
     with h5py.File(tmp_path / "out" / "results.h5") as file:
@@ -482,14 +486,14 @@ def test_hdf5_holds_every_number_of_the_session_exactly(session: Session, tmp_pa
         assert result is not None
         assert result.measurement.reconstruction is not None
         points = file["frames/000002/points"]
-        found = np.column_stack([points[f"{axis}_mm"] for axis in "xyz"])
-        np.testing.assert_array_equal(found, result.measurement.reconstruction.points_mm)
+        exported = np.column_stack([points[f"{axis}_mm"] for axis in "xyz"])
+        np.testing.assert_array_equal(exported, result.measurement.reconstruction.points_mm)
         assert result.measurement.dots is not None
         dots = file["frames/000002/dots"]
         np.testing.assert_array_equal(dots["u_px"], result.measurement.dots.u_px)
 
 
-def test_what_no_longer_stands_is_not_exported(session: Session, tmp_path: Path):
+def test_stale_results_are_not_exported(session: Session, tmp_path: Path):
     session.update_setup({"laser": {"distance_mm": 30.0}})
     with pytest.raises(InputError, match="2 of 2 frames are out of date: the rig"):
         session.export(tmp_path / "out")
@@ -500,58 +504,58 @@ def test_what_no_longer_stands_is_not_exported(session: Session, tmp_path: Path)
     assert verify_export(tmp_path / "out") == []
 
 
-def test_an_export_needs_something_measured(session: Session, tmp_path: Path):
+def test_export_needs_measured_frames(session: Session, tmp_path: Path):
     with pytest.raises(InputError, match="none by ers"):
         session.export(tmp_path / "out", scheme="ers")
     with pytest.raises(InputError, match="none by fit"):
         session.export(tmp_path / "out", frames=[4])
 
 
-def test_processes_measure_the_same(session: Session):
-    here = [kept for _, kept in session.measure_each([4])]
+def test_worker_processes_give_equal_measurements(session: Session):
+    expected = [measurement for _, measurement in session.measure_each([4])]
     with measuring_pool(1) as pool:
-        there = dict(session.measure_each([4, 6], pool))
-    assert list(there) == [4, 6]
-    assert same(there[4], here[0])
+        measured = dict(session.measure_each([4, 6], pool))
+    assert list(measured) == [4, 6]
+    assert same(measured[4], expected[0])
 
 
-def test_a_corrected_frame_that_processes_measure_stands_until_it_is_corrected_anew(
+def test_frame_corrected_and_measured_by_workers_is_current(
     session: Session,
 ):
-    ((_, found),) = session.measure_each([4])
-    session.correct({4: start_correction(found)})
-    assert stale(session) == [4]
+    ((_, automatic),) = session.measure_each([4])
+    session.correct({4: start_correction(automatic)})
+    assert stale_frames(session) == [4]
     with measuring_pool(1) as pool:
-        ((_, again),) = session.measure_each([4], pool)
-    assert again.correction is not None
-    assert stale(session) == []
+        ((_, corrected),) = session.measure_each([4], pool)
+    assert corrected.correction is not None
+    assert stale_frames(session) == []
     session.undo()
     session.redo()
-    assert stale(session) == []
+    assert stale_frames(session) == []
     session.undo()
-    ((_, meanwhile),) = session.measure_each([4], sinks=[lambda _: session.redo()])
-    assert meanwhile.correction is None
-    assert stale(session) == []
+    ((_, measured),) = session.measure_each([4], sinks=[lambda _: session.redo()])
+    assert measured.correction is None
+    assert stale_frames(session) == []
 
 
-def stale(session: Session) -> list[int]:
-    seen = session.overview()
-    return seen.frame[seen.stale].tolist()
+def stale_frames(session: Session) -> list[int]:
+    overview = session.overview()
+    return overview.frame[overview.stale].tolist()
 
 
-def test_results_go_on_to_sinks_when_they_are_kept(session: Session):
-    told: list[tuple[int, float | None, bool]] = []
+def test_sinks_get_results_after_they_are_stored(session: Session):
+    received: list[tuple[int, float | None, bool]] = []
 
-    def tell(result: FrameResult) -> None:
-        kept = session.result(result.frame)
-        is_kept = kept is not None and same(kept.measurement, result.measurement)
-        told.append((result.frame, result.time_s, is_kept))
+    def receive(result: FrameResult) -> None:
+        stored = session.result(result.frame)
+        is_stored = stored is not None and same(stored.measurement, result.measurement)
+        received.append((result.frame, result.time_s, is_stored))
 
-    assert [frame for frame, _ in session.measure_each([4, 6], sinks=[tell])] == [4, 6]
-    assert told == [(4, session.frame(4).time_s, True), (6, session.frame(6).time_s, True)]
+    assert [frame for frame, _ in session.measure_each([4, 6], sinks=[receive])] == [4, 6]
+    assert received == [(4, session.frame(4).time_s, True), (6, session.frame(6).time_s, True)]
 
 
-def test_measuring_that_is_stopped_keeps_what_was_finished(session: Session):
+def test_stopped_measuring_keeps_finished_frames(session: Session):
     with measuring_pool(1) as pool:
         measuring = session.measure_each([4, 6, 0], pool)
         assert next(measuring)[0] == 4

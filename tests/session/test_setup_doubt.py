@@ -1,4 +1,4 @@
-"""A recording that contradicts its set-up, from the picture to all that results go into."""
+"""A recording that contradicts its set-up: the doubt is stated in all outputs."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ def statuses(path: Path) -> set[str]:
     ],
 )
 @pytest.mark.usefixtures("state")
-def test_a_run_says_whether_its_frames_contradict_the_set_up(
+def test_run_reports_whether_frames_contradict_the_setup(
     labapp: Any, tmp_path: Path, values: Any, status: str, options: tuple[str, ...]
 ):
     setup, out = tmp_path / "setup.toml", tmp_path / "out"
     setup.write_text(closely_known(values), "utf-8")
     source = GTAW / "recording.avi", "--setup", setup, "--out", out, "--frames", FRAMES
-    code, said, _ = labapp("reconstruct", *source, *options)
+    code, stdout, _ = labapp("reconstruct", *source, *options)
     assert code == 0
-    assert ("doubtful" in said) == (status == "doubtful")
+    assert ("doubtful" in stdout) == (status == "doubtful")
     run = json.loads((out / "run.json").read_text("utf-8"))
     assert run["setup_status"] == status
     assert run["setup_check"]["is_doubtful"] == (status == "doubtful")
@@ -49,9 +49,7 @@ def test_a_run_says_whether_its_frames_contradict_the_set_up(
 
 
 @pytest.mark.slow
-def test_a_session_keeps_the_doubt_with_the_set_up_it_is_of(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_session_stores_the_doubt_with_its_setup(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     path = tmp_path / "one.labsession"
     with Session.create(path) as session:
         session.set_setup(closely_known(OFF))
@@ -73,12 +71,12 @@ def test_a_session_keeps_the_doubt_with_the_set_up_it_is_of(
         assert statuses(tmp_path / "out" / "measures.csv") == {"doubtful"}
         manifest = json.loads((tmp_path / "out" / "manifest.json").read_text("utf-8"))
         assert manifest["provenance"]["setup_check"]["reason"] == verdict.reason
-        told: list[str] = []
-        monkeypatch.setattr(layout.Story, "text", lambda _, words, *__: told.append(words))
+        texts: list[str] = []
+        monkeypatch.setattr(layout.Story, "text", lambda _, words, *__: texts.append(words))
         report_pdf(session)
-        assert any(verdict.reason in words for words in told)
+        assert any(verdict.reason in words for words in texts)
 
-        session.set_setup(closely_known({}))  # another set-up is not doubted, nor measured yet
+        session.set_setup(closely_known({}))  # another set-up is not in doubt, and not measured yet
         assert (session.setup_status, session.setup_verdict) == ("calibrated", None)
         result = session.result(0)
         assert result is not None
@@ -88,6 +86,6 @@ def test_a_session_keeps_the_doubt_with_the_set_up_it_is_of(
         session.redo()
         list(session.measure_each())
         assert session.setup_status == "calibrated"
-        found = session.setup_verdict
-        assert found is not None
-        assert not found.is_doubtful
+        new_verdict = session.setup_verdict
+        assert new_verdict is not None
+        assert not new_verdict.is_doubtful

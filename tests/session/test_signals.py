@@ -32,18 +32,18 @@ def table(tmp_path: Path):
         "time_µs,current_ma,voltage_v\n0,75000,11.5\n500000,76500,\n",
     ],
 )
-def test_tables_of_many_loggers_say_the_same(table, text: str) -> None:
-    found = read_signals(table(text))
-    assert found.file == "logger.csv"
-    np.testing.assert_allclose(found.time_s, [0, 0.5])
-    np.testing.assert_allclose(found.current_a, [75, 76.5])
-    np.testing.assert_allclose(found.voltage_v, [11.5, np.nan])
+def test_tables_of_various_loggers_are_read(table, text: str) -> None:
+    signals = read_signals(table(text))
+    assert signals.file == "logger.csv"
+    np.testing.assert_allclose(signals.time_s, [0, 0.5])
+    np.testing.assert_allclose(signals.current_a, [75, 76.5])
+    np.testing.assert_allclose(signals.voltage_v, [11.5, np.nan])
 
 
-def test_one_of_the_two_is_enough(table) -> None:
-    found = read_signals(table("time,current\n0,1\n1,2\n"))
-    assert found.current_a.tolist() == [1, 2]
-    assert np.isnan(found.voltage_v).all()
+def test_table_may_have_only_a_current(table) -> None:
+    signals = read_signals(table("time,current\n0,1\n1,2\n"))
+    assert signals.current_a.tolist() == [1, 2]
+    assert np.isnan(signals.voltage_v).all()
 
 
 @pytest.mark.parametrize(
@@ -66,7 +66,7 @@ def test_one_of_the_two_is_enough(table) -> None:
         ("time,current\n" + "1" * 20000, "line 2", "more than 16384 characters"),
     ],
 )
-def test_what_is_wrong_is_named_with_line_and_column(table, text, field: str, value: str) -> None:
+def test_wrong_cells_are_reported_with_line_and_column(table, text, field: str, value: str) -> None:
     path = table(text)
     with pytest.raises(InputError) as caught:
         read_signals(path)
@@ -74,32 +74,32 @@ def test_what_is_wrong_is_named_with_line_and_column(table, text, field: str, va
     assert str(caught.value.value) == value
 
 
-def test_many_problems_are_told_together_and_not_all(table) -> None:
+def test_at_most_ten_problems_are_reported(table) -> None:
     with pytest.raises(InputError) as caught:
         read_signals(table("time,current\n" + "".join(f"{k},x\n" for k in range(99))))
     assert len(caught.value.problems) == 10
 
 
-def test_no_file_and_too_long_a_file(table, tmp_path: Path, monkeypatch) -> None:
+def test_missing_file_and_too_long_table_are_rejected(table, tmp_path: Path, monkeypatch) -> None:
     with pytest.raises(InputError, match="file"):
         read_signals(tmp_path / "none.csv")
     monkeypatch.setattr("labapp.session.signals.MOST_ROWS", 3)
     with pytest.raises(InputError, match="at most 3"):
         read_signals(table("time,current\n" + "".join(f"{k},1\n" for k in range(9))))
-    assert MOST_ROWS * 8 * 3 < 100_000_000  # as a session can hold them
+    assert MOST_ROWS * 8 * 3 < 100_000_000  # the limit of a session
 
 
-def test_a_session_keeps_them_and_can_undo_that(tmp_path: Path) -> None:
+def test_signals_are_stored_in_a_session_until_undo(tmp_path: Path) -> None:
     signals = Signals("a.csv", np.arange(3.0), np.arange(3.0), np.full(3, np.nan), 0.25)
     path = tmp_path / "a.labsession"
     with Session.create(path) as session:
         assert session.signals is None
         session.set_signals(signals)
     with Session.open(path) as session:
-        found = session.signals
-        assert found is not None
-        assert (found.file, found.start_s) == ("a.csv", 0.25)
-        np.testing.assert_array_equal(found.voltage_v, signals.voltage_v)
+        stored = session.signals
+        assert stored is not None
+        assert (stored.file, stored.start_s) == ("a.csv", 0.25)
+        np.testing.assert_array_equal(stored.voltage_v, signals.voltage_v)
         assert session.problems() == []
         session.undo()
         assert session.signals is None
@@ -121,19 +121,19 @@ def test_tdms_with_an_increment_and_units(tmp_path: Path) -> None:
         ("WFS", np.array([10.0, 20.0, 30.0]), {"unit_string": "mm/s"}),
         ("gas", np.array([1.0]), {}),
     ]
-    found = read_signals(write_tdms(tmp_path / "a.tdms", channels))
-    np.testing.assert_allclose(found.time_s, [0.5, 0.501, 0.502])
-    np.testing.assert_allclose(found.voltage_v, [11, 12, 13])
-    np.testing.assert_allclose(found.current_a, [70, 80, 90])
-    np.testing.assert_allclose(found.wire_m_min, [0.6, 1.2, 1.8])
-    assert list(found.channels) == ["current", "voltage", "wire"]
+    signals = read_signals(write_tdms(tmp_path / "a.tdms", channels))
+    np.testing.assert_allclose(signals.time_s, [0.5, 0.501, 0.502])
+    np.testing.assert_allclose(signals.voltage_v, [11, 12, 13])
+    np.testing.assert_allclose(signals.current_a, [70, 80, 90])
+    np.testing.assert_allclose(signals.wire_m_min, [0.6, 1.2, 1.8])
+    assert list(signals.channels) == ["current", "voltage", "wire"]
 
 
 @pytest.mark.parametrize("name", ["Current", "Current (A)"])
-def test_tdms_whose_unit_is_another_is_refused(tmp_path: Path, name: str) -> None:
-    """A shunt's volts are no amperes; a unit in the name is the one that counts."""
-    given = {"wf_increment": 0.001, "unit_string": "V"}
-    path = write_tdms(tmp_path / "a.tdms", [(name, np.array([1.0, np.inf]), given)])
+def test_tdms_with_a_wrong_unit_is_rejected(tmp_path: Path, name: str) -> None:
+    """The volts of a shunt are not amperes; a unit in the name has priority."""
+    properties = {"wf_increment": 0.001, "unit_string": "V"}
+    path = write_tdms(tmp_path / "a.tdms", [(name, np.array([1.0, np.inf]), properties)])
     if name == "Current":
         with pytest.raises(InputError, match="unit of Current"):
             read_signals(path)
@@ -141,24 +141,24 @@ def test_tdms_whose_unit_is_another_is_refused(tmp_path: Path, name: str) -> Non
         np.testing.assert_array_equal(read_signals(path).current_a, [1, np.nan])
 
 
-def test_wav_is_scaled_and_averaged_to_what_a_session_holds(tmp_path: Path, monkeypatch) -> None:
+def test_wav_is_scaled_and_averaged_to_the_limit_of_rows(tmp_path: Path, monkeypatch) -> None:
     from scipy.io import wavfile
 
     path, samples = tmp_path / "a.wav", np.array([[0, 16384], [16384, 0]] * 8, np.int16)
     wavfile.write(path, 1000, samples)
-    found = read_signals(path, (200.0, 50.0, 1.0))
-    np.testing.assert_allclose(found.time_s, np.arange(16) / 1000)
-    np.testing.assert_allclose(found.current_a[:2], [0, 100])
-    np.testing.assert_allclose(found.voltage_v[:2], [25, 0])
-    assert np.isnan(found.wire_m_min).all()
+    signals = read_signals(path, (200.0, 50.0, 1.0))
+    np.testing.assert_allclose(signals.time_s, np.arange(16) / 1000)
+    np.testing.assert_allclose(signals.current_a[:2], [0, 100])
+    np.testing.assert_allclose(signals.voltage_v[:2], [25, 0])
+    assert np.isnan(signals.wire_m_min).all()
     monkeypatch.setattr("labapp.session.signals.MOST_ROWS", 4)
-    found = read_signals(path, (200.0, 50.0, 1.0))
-    np.testing.assert_allclose(found.current_a, 50)
-    np.testing.assert_allclose(found.time_s, [0.0015, 0.0055, 0.0095, 0.0135])
+    signals = read_signals(path, (200.0, 50.0, 1.0))
+    np.testing.assert_allclose(signals.current_a, 50)
+    np.testing.assert_allclose(signals.time_s, [0.0015, 0.0055, 0.0095, 0.0135])
 
 
 @pytest.mark.parametrize("name", ["a.tdms", "a.wav"])
-def test_bytes_of_a_stranger_are_refused(tmp_path: Path, monkeypatch, name: str) -> None:
+def test_mutated_binary_files_are_read_or_rejected(tmp_path: Path, monkeypatch, name: str) -> None:
     from scipy.io import wavfile
 
     path = tmp_path / name
@@ -173,8 +173,8 @@ def test_bytes_of_a_stranger_are_refused(tmp_path: Path, monkeypatch, name: str)
     rng = np.random.default_rng(4)
     for _ in range(60):
         bad = bytearray(good)
-        for place in rng.integers(0, min(len(bad), 200), 4):
-            bad[place] = int(rng.integers(256))
+        for index in rng.integers(0, min(len(bad), 200), 4):
+            bad[index] = int(rng.integers(256))
         path.write_bytes(bytes(bad[: rng.integers(1, len(bad) + 1)]))
         with contextlib.suppress(InputError):
             assert len(read_signals(path).time_s) < 1000
@@ -184,7 +184,7 @@ def test_bytes_of_a_stranger_are_refused(tmp_path: Path, monkeypatch, name: str)
         read_signals(path)
 
 
-def test_wire_feed_of_a_table(table) -> None:
-    found = read_signals(table("time,WFS [in/min]\n0,100\n1,200\n"))
-    np.testing.assert_allclose(found.wire_m_min, [2.54, 5.08])
-    assert list(found.channels) == ["wire"]
+def test_wire_feed_is_read_from_a_table(table) -> None:
+    signals = read_signals(table("time,WFS [in/min]\n0,100\n1,200\n"))
+    np.testing.assert_allclose(signals.wire_m_min, [2.54, 5.08])
+    assert list(signals.channels) == ["wire"]

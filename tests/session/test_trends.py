@@ -32,39 +32,39 @@ def noisy(count: int = 40) -> np.ndarray:
     return 0.3 + np.random.default_rng(3).normal(0, 0.003, count)
 
 
-def test_spread_is_that_of_the_text() -> None:
+def test_spread_is_defined_as_in_eq_7_4() -> None:
     """Eq. 7-4 divides by n: 15 heights, here 1 … 15."""
-    found = spread(trend(overview(np.arange(1.0, 16.0)), "height_mm"))
-    assert (found.count, found.mean, found.lowest, found.highest) == (15, 8.0, 1.0, 15.0)
-    assert found.deviation == pytest.approx(np.sqrt(224 / 12))
+    result = spread(trend(overview(np.arange(1.0, 16.0)), "height_mm"))
+    assert (result.count, result.mean, result.lowest, result.highest) == (15, 8.0, 1.0, 15.0)
+    assert result.deviation == pytest.approx(np.sqrt(224 / 12))
 
 
-def test_frames_without_a_surface_and_stale_ones_do_not_count() -> None:
+def test_spread_excludes_stale_frames_and_those_without_a_surface() -> None:
     height = noisy()
     height[[3, 7]] = np.nan
-    seen = overview(height)
-    seen = replace(seen, stale=np.arange(40) < 10)
-    course = trend(seen, "height_mm")
+    measured = overview(height)
+    measured = replace(measured, stale=np.arange(40) < 10)
+    course = trend(measured, "height_mm")
     assert course.frame.tolist() == [k for k in range(40) if k not in (3, 7)]
     assert spread(course).mean == pytest.approx(height[10:].mean())
-    assert spread(trend(replace(seen, stale=np.ones(40, bool)), "height_mm")).count == 0
+    assert spread(trend(replace(measured, stale=np.ones(40, bool)), "height_mm")).count == 0
 
 
-def test_sigma_marks_and_axis() -> None:
-    seen = replace(overview(noisy()), corrected=np.arange(40) == 5)
-    course = trend(seen, "height_mm")
+def test_trend_has_sigma_corrections_and_time_axis() -> None:
+    measured = replace(overview(noisy()), corrected=np.arange(40) == 5)
+    course = trend(measured, "height_mm")
     assert course.timed
     assert course.at[6] == pytest.approx(0.1)
-    assert course.corrected.tolist() == seen.corrected.tolist()
+    assert course.corrected.tolist() == measured.corrected.tolist()
     assert (course.sigma == 1).all()
-    assert np.isnan(trend(seen, "are_mm").sigma).all()
+    assert np.isnan(trend(measured, "are_mm").sigma).all()
     untimed = trend(overview(noisy(), np.full(40, np.nan)), "height_mm")
     assert not untimed.timed
     assert untimed.at.tolist() == list(range(40))
 
 
 @pytest.mark.parametrize("odd", [0, 1, 20, 39])
-def test_a_frame_that_stands_out_is_in_doubt(odd: int) -> None:
+def test_outlying_frame_is_doubtful(odd: int) -> None:
     height = noisy()
     height[odd] *= 1.16  # a row shifted by one
     assert np.flatnonzero(doubtful_frames(overview(height))).tolist() == [odd]
@@ -76,43 +76,43 @@ def test_a_frame_that_stands_out_is_in_doubt(odd: int) -> None:
     assert np.flatnonzero(doubtful_frames(overview(noisy(), are_mm=are))).tolist() == [odd]
 
 
-def test_a_pool_that_grows_and_noise_are_not_in_doubt() -> None:
+def test_growing_oscillating_or_noisy_pool_is_not_doubtful() -> None:
     growing = noisy(200) + np.linspace(0, 0.3, 200)
     assert not doubtful_frames(overview(growing)).any()
     assert not doubtful_frames(overview(noisy(2000))).any()
-    swinging = 0.3 + 0.02 * np.sin(np.arange(200))
-    assert not doubtful_frames(overview(swinging)).any()
+    oscillating = 0.3 + 0.02 * np.sin(np.arange(200))
+    assert not doubtful_frames(overview(oscillating)).any()
     assert not doubtful_frames(overview(noisy(FEWEST - 1) * np.array([9, *[1] * 6]))).any()
 
 
-def test_the_spectrum_gives_frequency_and_amplitude_of_an_oscillation() -> None:
+def test_spectrum_gives_frequency_and_amplitude_of_an_oscillation() -> None:
     count = 240
     time_s = np.arange(count) / RATE_HZ
     height = 0.3 + 0.05 * time_s + 0.02 * np.sin(2 * np.pi * 12.5 * time_s)
-    found = spectrum(trend(overview(height), "height_mm"))
-    frequency, amplitude = found.peak
+    result = spectrum(trend(overview(height), "height_mm"))
+    frequency, amplitude = result.peak
     assert frequency == pytest.approx(12.5, abs=0.01)
     assert amplitude == pytest.approx(0.02, rel=0.02)
-    assert found.timed
-    assert found.frequency[-1] == pytest.approx(RATE_HZ / 2)
-    assert found.resolution == pytest.approx(2 * RATE_HZ / count)
+    assert result.timed
+    assert result.frequency[-1] == pytest.approx(RATE_HZ / 2)
+    assert result.resolution == pytest.approx(2 * RATE_HZ / count)
     slow = spectrum(trend(overview(height, np.full(count, np.nan)), "height_mm"))
     assert slow.peak[0] == pytest.approx(12.5 / RATE_HZ)
     assert not slow.timed
 
 
-def test_the_spectrum_takes_the_longest_even_part() -> None:
+def test_spectrum_uses_the_longest_uninterrupted_part() -> None:
     height = noisy(100)
     height[30] = np.nan
-    found = spectrum(trend(overview(height), "height_mm"))
-    assert (found.first, found.last, found.count) == (31, 99, 69)
+    result = spectrum(trend(overview(height), "height_mm"))
+    assert (result.first, result.last, result.count) == (31, 99, 69)
     gap = np.arange(100) / RATE_HZ
     gap[80:] += 0.5
-    found = spectrum(trend(overview(height, gap), "height_mm"))
-    assert (found.first, found.last) == (31, 79)
+    result = spectrum(trend(overview(height, gap), "height_mm"))
+    assert (result.first, result.last) == (31, 79)
 
 
-def test_too_short_a_series_has_no_spectrum() -> None:
+def test_short_series_has_no_spectrum() -> None:
     for count in (0, 1, FEWEST - 1):
         with pytest.raises(ValueError, match="in a row"):
             spectrum(trend(overview(noisy(count)), "height_mm"))

@@ -1,4 +1,4 @@
-"""Sessions that earlier versions wrote: opened, whole, and what they held still there."""
+"""Sessions written by earlier versions can be opened without loss or problems."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from labapp.session.session import Session
 WRITTEN = sorted((Path(__file__).parent / "data").glob("version_*.labsession"))
 
 
-def test_every_version_is_kept():
+def test_a_file_of_every_version_exists():
     assert [path.stem for path in WRITTEN] == [f"version_{n}" for n in range(1, VERSION + 1)]
 
 
 @pytest.mark.parametrize("read_only", [True, False])
 @pytest.mark.parametrize("path", WRITTEN, ids=lambda path: path.stem)
-def test_what_a_version_wrote_is_read(path: Path, tmp_path: Path, read_only: bool):
+def test_files_of_every_version_are_read(path: Path, tmp_path: Path, read_only: bool):
     copy = tmp_path / "old.labsession"
     shutil.copyfile(path, copy)
     with Session.open(copy, read_only=read_only) as session:
@@ -47,11 +47,11 @@ def test_what_a_version_wrote_is_read(path: Path, tmp_path: Path, read_only: boo
             assert result.measurement.measures is not None
             assert result.measurement.measures.height_mm == pytest.approx(0.91, rel=0.1)
             assert result.measurement.reconstruction is not None
-            # It was measured with the defaults of its time: those of version 1 are others now.
+            # It was measured with the former defaults; those of version 1 have changed since.
             former = (SETTINGS_CHANGED,) if path.stem == "version_1" else ()
             assert result.stale == (*former, CORRECTION_CHANGED)
         level = session.overview("fit").measures["height_sigma_level_mm"]
-        assert np.isfinite(level).all() == (path.stem != "version_1")  # which did not keep it
+        assert np.isfinite(level).all() == (path.stem != "version_1")  # which did not store it
         correction = session.correction(0)
         assert correction is not None
         assert correction.lattice.reference is None
@@ -68,8 +68,8 @@ FOUND = PlaneCalibration(
 )
 
 
-def without(blob: bytes, *fields: str) -> bytes:
-    """A plane calibration as it was written when it had no such fields yet."""
+def remove_fields(blob: bytes, *fields: str) -> bytes:
+    """Return a plane calibration as written before it had the given fields."""
     plain = zlib.decompress(blob[HEAD.size :])
     length = int.from_bytes(plain[:4], "little")
     tree = json.loads(plain[4 : 4 + length])
@@ -80,7 +80,7 @@ def without(blob: bytes, *fields: str) -> bytes:
     return HEAD.pack(MAGIC, zlib.crc32(body)) + body
 
 
-def test_a_plane_calibration_from_before_marks_is_read(tmp_path: Path):
+def test_plane_calibration_without_marks_is_read(tmp_path: Path):
     path = tmp_path / "old.labsession"
     shutil.copyfile(WRITTEN[-1], path)
     with Session.open(path) as session:
@@ -88,7 +88,7 @@ def test_a_plane_calibration_from_before_marks_is_read(tmp_path: Path):
     with closing(sqlite3.connect(path)) as database, database:
         where = "kind = 'plane-calibration'"
         (blob,) = database.execute(f"SELECT content FROM document WHERE {where}").fetchone()
-        older = without(blob, "marks", "model")
+        older = remove_fields(blob, "marks", "model")
         content = hashlib.sha256(zlib.decompress(older[HEAD.size :])).hexdigest()
         database.execute(
             f"UPDATE document SET content = ?, sha256 = ? WHERE {where}", (older, content)
@@ -109,21 +109,21 @@ def test_a_plane_calibration_from_before_marks_is_read(tmp_path: Path):
 # --- names --------------------------------------------------------------------------------------
 
 EVER = json.loads((Path(__file__).parent / "data" / "stored_names.json").read_text("utf-8"))
-"""Every value that was ever written, and the names of its fields in files."""
+"""Every class that was ever written, and the names of its fields in files."""
 
 
-def test_every_name_that_was_ever_written_is_read():
+def test_every_name_ever_written_is_read():
     for name, fields in EVER.items():
         if name in SURFACES:
             continue
         stored = STORED[name]
-        ours = {field.name for field in dataclasses.fields(stored.kind)}
+        current = {field.name for field in dataclasses.fields(stored.kind)}
         for field in fields:
-            assert field in stored.retired or stored.renamed.get(field, field) in ours, field
+            assert field in stored.retired or stored.renamed.get(field, field) in current, field
 
 
-def test_every_name_that_is_written_is_kept():
-    # A name that is new here belongs in stored_names.json, from which nothing is ever taken away.
+def test_every_written_name_is_recorded():
+    # Add new names to stored_names.json, and never remove a name from it.
     for name, stored in STORED.items():
         assert set(stored.names()) <= set(EVER[name]), name
     assert SURFACES.keys() <= EVER.keys()
@@ -131,12 +131,12 @@ def test_every_name_that_is_written_is_kept():
 
 @dataclass(frozen=True)
 class Apparatus:
-    """What is kept as an electrode would be called so from today on, its tip, too."""
+    """The class of a stored electrode under a new name, with a renamed field."""
 
     tip_mm: float = 5.0
 
 
-def test_what_is_renamed_is_read_and_written_by_its_old_name(monkeypatch: pytest.MonkeyPatch):
+def test_renamed_class_is_read_and_written_by_its_old_name(monkeypatch: pytest.MonkeyPatch):
     before = pack(Electrode(4.5))
     stored = Stored(Apparatus, renamed={"height_mm": "tip_mm"}, retired=("bent",))
     monkeypatch.setitem(STORED, "Electrode", stored)
@@ -145,7 +145,7 @@ def test_what_is_renamed_is_read_and_written_by_its_old_name(monkeypatch: pytest
     assert pack(Apparatus(4.5)) == before
 
 
-def test_a_field_that_is_retired_is_left_out():
+def test_retired_field_is_ignored():
     text = b'{"Electrode":{"height_mm":4.5,"bent":true}}'
     body = zlib.compress(len(text).to_bytes(4, "little") + text)
     blob = HEAD.pack(MAGIC, zlib.crc32(body)) + body

@@ -1,4 +1,4 @@
-"""Frames of a bench with glass that welds towards −Y, from the scenario to the sizes."""
+"""Frames of a bench with glass that welds towards −Y, from the scenario to the measures."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FRAMES = 5
 
 
 @cache
-def changed() -> str:
+def scenario_text() -> str:
     path = next(path for path in shipped_scenarios() if path.stem == "egg")
     values = tomlkit.parse(path.read_text("utf-8"))
     values["imaging_plane"]["glass_mm"] = 3.0
@@ -34,7 +34,7 @@ def changed() -> str:
 @pytest.fixture(scope="module")
 def scenario(tmp_path_factory: pytest.TempPathFactory) -> Scenario:
     path = tmp_path_factory.mktemp("scenario") / "back.toml"
-    path.write_text(changed(), "utf-8")
+    path.write_text(scenario_text(), "utf-8")
     return read_scenario(path, frames=FRAMES)
 
 
@@ -43,7 +43,7 @@ def setup(scenario: Scenario) -> Setup:
     return parse_setup(scenario.setup, "back.toml")
 
 
-def test_the_scenario_has_its_head_at_minus_y(scenario: Scenario, setup: Setup) -> None:
+def test_scenario_has_its_head_at_minus_y(scenario: Scenario, setup: Setup) -> None:
     assert setup.rig.travel == scenario.recording.rig.travel == "-y"
     assert setup.rig.imaging_plane.glass_mm == 3.0
     foot = scenario.recording.pools[0].footprint
@@ -52,14 +52,14 @@ def test_the_scenario_has_its_head_at_minus_y(scenario: Scenario, setup: Setup) 
     assert scenario.recording.torches == ()
 
 
-def test_what_hides_rays_and_how_it_moves_share_a_table(tmp_path: Path) -> None:
+def test_torch_table_contains_shape_and_travel(tmp_path: Path) -> None:
     path = tmp_path / "torch.toml"
-    values = tomlkit.parse(changed())
+    values = tomlkit.parse(scenario_text())
     values["torch"]["tip_mm"] = [0.0, 0.0, 5.0]
     path.write_text(tomlkit.dumps(values), "utf-8")
-    made = read_scenario(path, frames=1)
-    assert len(made.recording.torches) == 1
-    assert parse_setup(made.setup, path).rig.travel == "-y"
+    scenario = read_scenario(path, frames=1)
+    assert len(scenario.recording.torches) == 1
+    assert parse_setup(scenario.setup, path).rig.travel == "-y"
     values["torch"]["speed"] = 3.0
     path.write_text(tomlkit.dumps(values), "utf-8")
     with pytest.raises(InputError, match="speed"):
@@ -84,11 +84,11 @@ def test_cold_and_followed_frames_have_the_true_sizes(scenario: Scenario, setup:
             continue
         cold, _ = measure(frame.image, Bench(setup.rig, setup.calibration), Settings())
         assert cold.measures is not None
-        off = cold.measures.height_mm - followed.measures.height_mm
-        assert abs(off) < followed.measures.height_sigma_mm
-        # Taken for a bench without glass, it is refused or farther off.
+        difference = cold.measures.height_mm - followed.measures.height_mm
+        assert abs(difference) < followed.measures.height_sigma_mm
+        # With the glass ignored, the frame is refused or has a larger error.
         wrong = replace(setup.rig, imaging_plane=bare)
         without, _ = measure(frame.image, Bench(wrong, setup.calibration), Settings())
         if without.measures is not None:
-            apart = without.measures.height_mm - true.height_mm
-            assert abs(apart) > 3 * abs(cold.measures.height_mm - true.height_mm)
+            error = without.measures.height_mm - true.height_mm
+            assert abs(error) > 3 * abs(cold.measures.height_mm - true.height_mm)

@@ -1,4 +1,4 @@
-"""A simulation as a session: what it holds, and that it is whole or not there."""
+"""A simulation as a session: its contents; it is complete or absent."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from labapp.simulated.simulate import begin_session, simulate
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Scenario, Path]:
-    """A hollow, two frames of it, and the folder of its simulation."""
+def simulation(tmp_path_factory: pytest.TempPathFactory) -> tuple[Scenario, Path]:
+    """The scenario of a hollow, two frames, and the folder of its simulation."""
     path = next(path for path in shipped_scenarios() if path.stem == "concave")
     folder = tmp_path_factory.mktemp("simulated") / "hollow"
     scenario = read_scenario(path, frames=2)
@@ -23,8 +23,10 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Scenario, Path]:
     return scenario, folder
 
 
-def test_a_session_holds_the_set_up_and_what_is_expected(made: tuple[Scenario, Path]) -> None:
-    scenario, folder = made
+def test_session_contains_the_setup_and_the_expected_sizes(
+    simulation: tuple[Scenario, Path],
+) -> None:
+    scenario, folder = simulation
     path = folder / "hollow.labsession"
     begin_session(scenario, folder, path)
     with Session.open(path) as session:
@@ -34,11 +36,11 @@ def test_a_session_holds_the_set_up_and_what_is_expected(made: tuple[Scenario, P
         assert session.frames.tolist() == [0, 1]
         assert session.recording is not None
         assert session.recording.path == "recording.avi"
-    path.unlink()  # nor its lock, which stays, keeps it from being replaced
+    path.unlink()  # its lock file stays, and does not prevent a replacement
 
 
-def test_what_progress_raises_leaves_no_session(made: tuple[Scenario, Path]) -> None:
-    scenario, folder = made
+def test_exception_in_progress_leaves_no_session(simulation: tuple[Scenario, Path]) -> None:
+    scenario, folder = simulation
     before = {file.name for file in folder.iterdir()}
 
     def stop(done: int, total: int) -> None:
@@ -46,13 +48,13 @@ def test_what_progress_raises_leaves_no_session(made: tuple[Scenario, Path]) -> 
 
     with pytest.raises(InterruptedError):
         begin_session(scenario, folder, folder / "other.labsession", stop)
-    left = {file.name for file in folder.iterdir()} - before
-    assert left <= {".other.labsession.lock"}
-    simulate(scenario, folder, workers=1)  # which still may replace what is there
+    new_files = {file.name for file in folder.iterdir()} - before
+    assert new_files <= {".other.labsession.lock"}
+    simulate(scenario, folder, workers=1)  # the folder can still be replaced
 
 
-def test_what_is_there_already_stays(made: tuple[Scenario, Path]) -> None:
-    scenario, folder = made
+def test_existing_file_is_not_overwritten(simulation: tuple[Scenario, Path]) -> None:
+    scenario, folder = simulation
     path = folder / "mine.labsession"
     path.write_text("mine", "utf-8")
     with pytest.raises(InputError, match="file"):
@@ -60,21 +62,21 @@ def test_what_is_there_already_stays(made: tuple[Scenario, Path]) -> None:
     assert path.read_text("utf-8") == "mine"
 
 
-def test_a_full_disk_is_said_and_leaves_nothing(
-    made: tuple[Scenario, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_full_disk_is_reported_and_leaves_no_files(
+    simulation: tuple[Scenario, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(*_: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    scenario, _ = made
+    scenario, _ = simulation
     monkeypatch.setattr("labapp.simulation.recording.write_video", full)
     with pytest.raises(InputError, match="No space left on device"):
         simulate(scenario, tmp_path / "out", workers=1)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_calibrated_bench_can_be_simulated(tmp_path: Path) -> None:
-    """What a calibration says of its points is no property of the camera."""
+def test_calibrated_bench_can_be_simulated(tmp_path: Path) -> None:
+    """The covariance of calibration points does not change the view of the camera."""
     path = next(path for path in shipped_scenarios() if path.stem == "concave")
     covariance = [[0.01 * (row == column) for column in range(6)] for row in range(6)]
     calibrated = f"[image_calibration]\npoints_covariance_px2 = {covariance}\n"

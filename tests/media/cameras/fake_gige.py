@@ -1,7 +1,7 @@
-"""Aravis's own fake GigE Vision camera, until its input ends.
+"""Run the fake GigE Vision camera of Aravis until the standard input ends.
 
-fake_gige.py ADDRESS SERIAL LOST, the last being the part of its packets that do not arrive.
-What arv-fake-gv-camera does, without the GTK that its package brings.
+Usage: fake_gige.py ADDRESS SERIAL LOST, where LOST is the ratio of lost packets.
+It replaces arv-fake-gv-camera, whose package depends on GTK.
 """
 
 from __future__ import annotations
@@ -19,4 +19,4 @@ gobject.g_object_set(
     ctypes.c_void_p(camera), b"gvsp-lost-ratio", ctypes.c_double(float(sys.argv[3])), None
 )
 print("running" if arv.arv_gv_fake_camera_is_running(camera) else "failed", flush=True)
-sys.stdin.read()  # until whoever started it is gone
+sys.stdin.read()  # until the parent process ends

@@ -1,4 +1,4 @@
-"""GenICam cameras, against Aravis's own fake GigE Vision camera on the loopback."""
+"""GenICam cameras, with the fake GigE Vision camera of Aravis on the loopback interface."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ from labapp.media.cameras import (
     open_camera,
 )
 from labapp.media.recording.recorder import Plan, Recorder
-from tests.conftest import lacks
-from tests.media.cameras.watching import Heard
+from tests.conftest import skip_or_fail
+from tests.media.cameras.watching import Events
 from tests.waiting import wait_until
 
 FAKE = Path(__file__).with_name("fake_gige.py")
@@ -39,14 +39,14 @@ Plug = Callable[..., subprocess.Popen[str]]
 
 @pytest.fixture
 def plug() -> Iterator[Plug]:
-    """Let a fake camera run; all that still do are killed at the end.
+    """Start fake cameras, which are killed at the end.
 
-    There is one address for it on a machine: tests in other processes wait.
+    A machine has only one address for it, so tests in other processes wait.
     """
     try:
         ctypes.CDLL(genicam.LIBRARY)
     except OSError:
-        lacks(f"{genicam.LIBRARY} is not installed")
+        skip_or_fail(f"{genicam.LIBRARY} is not installed")
     running: list[subprocess.Popen[str]] = []
 
     def start(lost: float = 0.0) -> subprocess.Popen[str]:
@@ -68,21 +68,21 @@ def plug() -> Iterator[Plug]:
             process.communicate()
 
 
-def test_it_is_discovered_streamed_recorded_killed_and_brought_back(
-    plug: Plug, tmp_path: Path
-) -> None:
+def test_camera_is_found_recorded_killed_and_reconnected(plug: Plug, tmp_path: Path) -> None:
     fake = plug()
-    found, problems = find_cameras()
+    cameras, problems = find_cameras()
     assert not problems
-    assert [(info.name, info.kind) for info in found if info.id == ID] == [
+    assert [(info.name, info.kind) for info in cameras if info.id == ID] == [
         ("Aravis Fake", "GigE Vision")
     ]
-    heard = Heard()
+    events = Events()
     frames: list[CameraFrame] = []
-    wanted = CameraSettings(region=(0, 0, 128, 96), rate_hz=100, exposure_us=2000)
+    settings_to_apply = CameraSettings(region=(0, 0, 128, 96), rate_hz=100, exposure_us=2000)
     with (
-        Recorder(lambda: tmp_path / "run.nut", Plan(), 8, 100, heard.append) as recorder,
-        Feed(ID, lambda: open_camera(ID), recorder.take, heard.append, wanted) as running,
+        Recorder(lambda: tmp_path / "run.nut", Plan(), 8, 100, events.append) as recorder,
+        Feed(
+            ID, lambda: open_camera(ID), recorder.take, events.append, settings_to_apply
+        ) as running,
     ):
         take = recorder.trigger()
         earlier = running.counts.frames
@@ -97,10 +97,10 @@ def test_it_is_discovered_streamed_recorded_killed_and_brought_back(
     assert frames[0].image.shape == (96, 128)
     assert (settings.region, settings.rate_hz) == ((0, 0, 128, 96), 100)
     assert running.counts.lost == 1
-    said = heard.words()
-    assert "does not answer any more. Trying to get it back" in said
-    assert "it is back after" in said
-    # What came before and after is in one recording, with the time that it was away.
+    reported = events.words()
+    assert "does not answer any more. Trying to get it back" in reported
+    assert "it is back after" in reported
+    # The frames before and after are in one recording, with the gap in time.
     assert (take.trouble, take.lost) == ("", 0)
     with open_source(take.path) as video:
         assert len(video) == take.frames >= before - earlier + 50
@@ -112,31 +112,31 @@ def test_it_is_discovered_streamed_recorded_killed_and_brought_back(
     assert steps_s.max() > 1
 
 
-def test_a_frame_with_packets_missing_is_left_out_and_counted(plug: Plug) -> None:
+def test_frame_with_missing_packets_is_discarded_and_counted(plug: Plug) -> None:
     plug(0.03)
-    heard = Heard()
+    events = Events()
     frames: list[CameraFrame] = []
-    wanted = CameraSettings(region=(0, 0, 128, 96), rate_hz=100)
-    with Feed(ID, lambda: open_camera(ID), frames.append, heard.append, wanted) as running:
+    settings = CameraSettings(region=(0, 0, 128, 96), rate_hz=100)
+    with Feed(ID, lambda: open_camera(ID), frames.append, events.append, settings) as running:
         wait_until(lambda: running.counts.broken >= 10 and len(frames) >= 50)
     counts = running.counts
     assert (counts.frames, counts.lost) == (len(frames), 0)
-    # The fake camera's picture is a ramp that begins again at 255, which a missing packet breaks.
+    # The picture of the fake camera is a ramp modulo 255, which a missing packet interrupts.
     for frame in frames:
         for axis in (0, 1):
             assert set(np.unique(np.diff(frame.image.astype(int), axis=axis))) <= {1, -254}
     gaps = int((np.diff([frame.number for frame in frames]) - 1).sum())
     assert gaps <= counts.broken + counts.dropped
-    assert "incomplete, discarded" in heard.words()
+    assert "incomplete, discarded" in events.words()
 
 
-def test_settings_are_read_back_and_refused_in_words(plug: Plug) -> None:
+def test_settings_are_read_back_or_rejected(plug: Plug) -> None:
     plug()
     with open_camera(ID) as camera:
-        found = camera.apply(
+        applied = camera.apply(
             CameraSettings(exposure_us=5000, gain_db=3, rate_hz=50, region=(16, 8, 256, 128))
         )
-        assert found == CameraSettings(
+        assert applied == CameraSettings(
             exposure_us=5000, gain_db=3, rate_hz=50, region=(16, 8, 256, 128), trigger="free"
         )
         with pytest.raises(InputError, match=r"exposure_us: 1; expected from 10 to 1e\+07 \(µs\)"):
@@ -145,12 +145,12 @@ def test_settings_are_read_back_and_refused_in_words(plug: Plug) -> None:
             camera.apply(CameraSettings(region=(2000, 0, 100, 100)))
         with pytest.raises(InputError, match=r"rate_hz: 1000000.0; expected from 0.1 to 1000 "):
             camera.apply(CameraSettings(exposure_us=900, region=(0, 0, 64, 64), rate_hz=1e6))
-        assert camera.settings == found
-        # It has an input Line0 and no other; what it has not it says only when it was put in the
-        # mode that waits for it.
+        assert camera.settings == applied
+        # The camera has only the input Line0; it reports a missing input only in the mode that
+        # waits for it.
         assert camera.limits.triggers == ("free", "software", "line")
         assert camera.apply(CameraSettings(trigger="line")).trigger == "line"
-        assert camera.apply(CameraSettings(trigger="free")) == found
+        assert camera.apply(CameraSettings(trigger="free")) == applied
         camera._line = b"Line1"
         with pytest.raises(CameraError, match="Line1"):
             camera.apply(
@@ -158,13 +158,13 @@ def test_settings_are_read_back_and_refused_in_words(plug: Plug) -> None:
                     exposure_us=900, gain_db=1, rate_hz=20, region=(0, 0, 64, 64), trigger="line"
                 )
             )
-        assert camera.settings == found
+        assert camera.settings == applied
         assert camera.apply(CameraSettings(trigger="software")).trigger == "software"
         with pytest.raises(CameraError, match="used by another program"):
             open_camera(ID)
 
 
-def test_a_frame_is_taken_when_it_is_triggered(plug: Plug) -> None:
+def test_software_trigger_takes_a_frame(plug: Plug) -> None:
     plug()
     with open_camera(ID) as camera:
         camera.apply(CameraSettings(region=(0, 0, 64, 48), rate_hz=100, trigger="software"))
@@ -182,23 +182,25 @@ def test_a_frame_is_taken_when_it_is_triggered(plug: Plug) -> None:
         assert all(camera.read(5.0) for _ in range(3))
 
 
-def test_a_feed_has_frames_taken(plug: Plug) -> None:
+def test_feed_triggers_frames(plug: Plug) -> None:
     plug()
     frames: list[CameraFrame] = []
-    wanted = CameraSettings(region=(0, 0, 64, 48), trigger="software")
-    with Feed(ID, lambda: open_camera(ID), frames.append, settings=wanted) as feed:
+    settings = CameraSettings(region=(0, 0, 64, 48), trigger="software")
+    with Feed(ID, lambda: open_camera(ID), frames.append, settings=settings) as feed:
         for count in range(1, 4):
             feed.trigger()
             wait_until(lambda count=count: len(frames) == count)
         assert feed.counts.dropped == 0
 
 
-def test_a_camera_that_is_not_there_is_said_to_be_away(plug: Plug) -> None:
+def test_missing_camera_is_reported(plug: Plug) -> None:
     with pytest.raises(CameraLost, match="aravis:Nobody-1 is not connected"):
         open_camera("aravis:Nobody-1")
 
 
-def test_without_aravis_it_is_said_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_aravis_is_reported_with_the_package_to_install(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(genicam, "LIBRARY", "libaravis-of-no-system.so.9")
     monkeypatch.setattr(aravis, "aravis", genicam.Aravis)
     _, problems = find_cameras()
@@ -207,8 +209,8 @@ def test_without_aravis_it_is_said_what_to_install(monkeypatch: pytest.MonkeyPat
     ]
 
 
-def test_numbers_go_on_where_sixteen_bits_begin_anew() -> None:
+def test_frame_numbers_continue_after_16_bit_overflow() -> None:
     stream = aravis._Stream(0)
     ids = [65533, 65534, 65535, 1, 2, 4, 65535, 1]
-    found = [stream.number(id) - 65533 for id in ids]
-    assert found == [0, 1, 2, 3, 4, 6, 65537, 65538]
+    numbers = [stream.number(id) - 65533 for id in ids]
+    assert numbers == [0, 1, 2, 3, 4, 6, 65537, 65538]

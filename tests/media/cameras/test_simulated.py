@@ -25,31 +25,31 @@ def read(camera, count: int) -> list[CameraFrame]:
     return frames
 
 
-def test_it_gives_its_pictures_in_order_at_its_rate() -> None:
+def test_frames_come_in_order_at_the_set_rate() -> None:
     device = SimulatedDevice("test", numbered, rate_hz=500)
     with device.open() as camera:
-        begun_s = time.monotonic()
+        start_s = time.monotonic()
         camera.start()
         frames = read(camera, 50)
-        took_s = time.monotonic() - begun_s
+        elapsed_s = time.monotonic() - start_s
     assert [number_in(frame.image) for frame in frames] == list(range(50))
     assert [frame.number for frame in frames] == list(range(50))
     assert np.diff([frame.time_s for frame in frames]) == pytest.approx(1 / 500)
-    assert took_s >= 49 / 500
+    assert elapsed_s >= 49 / 500
 
 
-def test_a_region_is_cut_out_and_said() -> None:
+def test_region_is_applied_and_reported() -> None:
     with SimulatedDevice("test", numbered).open() as camera:
-        found = camera.apply(CameraSettings(region=(2, 3, 20, 16), rate_hz=1000))
-        assert (found.region, found.rate_hz) == ((2, 3, 20, 16), 1000)
-        assert camera.settings == found
+        applied = camera.apply(CameraSettings(region=(2, 3, 20, 16), rate_hz=1000))
+        assert (applied.region, applied.rate_hz) == ((2, 3, 20, 16), 1000)
+        assert camera.settings == applied
         camera.start()
         (frame,) = read(camera, 1)
     assert np.array_equal(frame.image, numbered(0)[3:19, 2:22])
 
 
 @pytest.mark.parametrize(
-    ("wanted", "named"),
+    ("wanted", "message"),
     [
         (CameraSettings(rate_hz=1e6), "rate_hz: 1000000.0; expected from 0.1 to 10000"),
         (CameraSettings(exposure_us=10), "exposure_us: 10; expected nothing"),
@@ -57,18 +57,16 @@ def test_a_region_is_cut_out_and_said() -> None:
         (CameraSettings(trigger="line"), "trigger: line; expected one of free, software"),
     ],
 )
-def test_what_cannot_be_set_is_refused_and_nothing_is_changed(
-    wanted: CameraSettings, named: str
-) -> None:
+def test_rejected_settings_change_nothing(wanted: CameraSettings, message: str) -> None:
     with SimulatedDevice("test", numbered).open() as camera:
         before = camera.settings
-        with pytest.raises(InputError, match="simulated:test") as refused:
+        with pytest.raises(InputError, match="simulated:test") as caught:
             camera.apply(wanted)
-        assert named in str(refused.value)
+        assert message in str(caught.value)
         assert camera.settings == before
 
 
-def test_a_software_trigger_takes_one_frame() -> None:
+def test_software_trigger_takes_one_frame() -> None:
     with SimulatedDevice("test", numbered).open() as camera:
         camera.apply(CameraSettings(trigger="software"))
         camera.start()
@@ -78,7 +76,7 @@ def test_a_software_trigger_takes_one_frame() -> None:
         assert camera.read(0.02) is None
 
 
-def test_it_is_not_set_while_it_runs_nor_read_before() -> None:
+def test_wrong_order_of_start_set_and_read_is_an_error() -> None:
     with SimulatedDevice("test", numbered).open() as camera:
         with pytest.raises(CameraError, match="was not started"):
             camera.read(0.01)
@@ -87,7 +85,7 @@ def test_it_is_not_set_while_it_runs_nor_read_before() -> None:
             camera.apply(CameraSettings(rate_hz=10))
 
 
-def test_a_reader_that_comes_late_finds_all_frames() -> None:
+def test_slow_reader_gets_all_buffered_frames() -> None:
     with SimulatedDevice("test", numbered, rate_hz=1000).open() as camera:
         camera.start()
         read(camera, 1)
@@ -96,7 +94,7 @@ def test_a_reader_that_comes_late_finds_all_frames() -> None:
         assert camera.dropped == 0
 
 
-def test_a_reader_that_comes_too_late_finds_frames_dropped(
+def test_too_slow_reader_loses_frames(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(base, "BUFFERED_S", 0.01)
@@ -109,7 +107,7 @@ def test_a_reader_that_comes_too_late_finds_frames_dropped(
         assert frame.number == 1
 
 
-def test_unplugged_it_is_lost_and_cannot_be_opened_until_it_is_plugged_in() -> None:
+def test_unplugged_camera_can_be_opened_after_plugging_in() -> None:
     device = SimulatedDevice("test", numbered, rate_hz=1000)
     camera = device.open()
     camera.start()
@@ -119,12 +117,12 @@ def test_unplugged_it_is_lost_and_cannot_be_opened_until_it_is_plugged_in() -> N
     with pytest.raises(CameraLost, match="not connected"):
         device.open()
     device.plug()
-    again = device.open()
-    again.start()
-    assert read(again, 2)[0].number == 0
+    reopened = device.open()
+    reopened.start()
+    assert read(reopened, 2)[0].number == 0
 
 
-def test_it_is_lost_though_its_cable_was_put_back_before_anybody_looked() -> None:
+def test_short_disconnection_is_detected() -> None:
     device = SimulatedDevice("test", numbered, rate_hz=1000)
     with device.open() as camera:
         camera.start()
@@ -132,21 +130,21 @@ def test_it_is_lost_though_its_cable_was_put_back_before_anybody_looked() -> Non
         device.plug()
         with pytest.raises(CameraLost, match="unplugged"):
             read(camera, 2)
-        with device.open() as again:
-            again.start()
-            read(again, 2)
+        with device.open() as reopened:
+            reopened.start()
+            read(reopened, 2)
 
 
-def test_faults_come_as_often_as_they_are_asked_for_and_the_same_each_time() -> None:
+def test_faults_have_the_set_rates_and_are_reproducible() -> None:
     def fates(seed: int) -> list[str]:
         faults = Faults(garbage=0.2, dropped=0.1, seed=seed)
         device = SimulatedDevice("test", numbered, faults=faults)
-        found = []
+        results = []
         for _ in range(2000):
             image, fate = device.expose()
-            whole = image.shape == (24, 32) and image.dtype == np.uint8
-            found.append(fate or ("whole" if whole else "garbage"))
-        return found
+            is_complete = image.shape == (24, 32) and image.dtype == np.uint8
+            results.append(fate or ("whole" if is_complete else "garbage"))
+        return results
 
     first = fates(1)
     # Three standard deviations of 2000 draws.
@@ -157,18 +155,18 @@ def test_faults_come_as_often_as_they_are_asked_for_and_the_same_each_time() -> 
     assert fates(2) != first
 
 
-def test_what_is_cut_off_is_told_and_what_is_lost_leaves_a_gap() -> None:
+def test_broken_frames_are_reported_and_lost_frames_leave_gaps() -> None:
     device = SimulatedDevice("test", numbered, rate_hz=1000, faults=Faults(0.3, 0.3, seed=5))
     with device.open() as camera:
         camera.start()
-        numbers, cut = [], 0
+        numbers, broken = [], 0
         while len(numbers) < 20:
             try:
                 frame = camera.read(1.0)
             except BrokenFrame:
-                cut += 1
+                broken += 1
                 continue
             assert frame is not None
             numbers.append(frame.number)
-    assert cut > 0
+    assert broken > 0
     assert np.diff(numbers).max() > 1

@@ -25,7 +25,7 @@ YUYV = cv2.VideoWriter.fourcc(*"YUYV")
 
 
 class Driver:
-    """Stands in for `cv2.VideoCapture` on Video4Linux, as its source has it."""
+    """Replacement for `cv2.VideoCapture` on Video4Linux, with the behaviour of its source."""
 
     def __init__(self, *, grey: bool = True, opens: bool = True, automatic: bool = True) -> None:
         self.values = {
@@ -40,7 +40,7 @@ class Driver:
         self.plugged = self.whole = True
         self.silent = False
 
-    def isOpened(self) -> bool:  # noqa: N802 - OpenCV calls it so
+    def isOpened(self) -> bool:  # noqa: N802 - the name in OpenCV
         return self.opens
 
     def get(self, name: int) -> float:
@@ -52,7 +52,7 @@ class Driver:
         if name == cv2.CAP_PROP_AUTO_EXPOSURE and not self.automatic:
             return False
         if name == cv2.CAP_PROP_FPS:
-            value = min((10, 30, 60), key=lambda own: abs(own - value))
+            value = min((10, 30, 60), key=lambda rate: abs(rate - value))
         self.values[name] = float(value)
         return True
 
@@ -70,37 +70,37 @@ class Driver:
         self.opens = False
 
 
-def opened(driver: Driver, **controls: Range) -> uvc.UvcCamera:
-    known = {uvc.EXPOSURE: controls.get("exposure"), uvc.GAIN: controls.get("gain")}
+def open_uvc(driver: Driver, **controls: Range) -> uvc.UvcCamera:
+    ranges = {uvc.EXPOSURE: controls.get("exposure"), uvc.GAIN: controls.get("gain")}
     return uvc.UvcCamera(
         INFO,
         capture=lambda number: driver if number == 2 else None,
-        query=lambda number, control: known[control],
+        query=lambda number, control: ranges[control],
         present=lambda number: driver.plugged,
     )
 
 
-def test_what_it_can_be_set_to_comes_of_its_driver() -> None:
+def test_limits_come_from_the_driver() -> None:
     driver = Driver()
-    with opened(driver, exposure=Range(3, 2047), gain=Range(0, 100)) as camera:
+    with open_uvc(driver, exposure=Range(3, 2047), gain=Range(0, 100)) as camera:
         assert camera.limits.exposure_us == Range(300, 204700)
         assert camera.limits.gain_db == Range(0, 100)
-        assert camera.limits.gain_unit == ""  # the driver's own steps
+        assert camera.limits.gain_unit == ""  # in steps of the driver
         assert camera.limits.sensor == (640, 480)
         assert driver.values[cv2.CAP_PROP_AUTO_EXPOSURE] == uvc.MANUAL
-        found = camera.apply(CameraSettings(exposure_us=2040, gain_db=7.6, rate_hz=50))
-    # As the driver has it: 20 units of 100 µs, whole gains, the nearest rate.
-    assert (found.exposure_us, found.gain_db, found.rate_hz) == (2000, 8, 60)
-    assert found.region == (0, 0, 640, 480)
+        applied = camera.apply(CameraSettings(exposure_us=2040, gain_db=7.6, rate_hz=50))
+    # The driver uses units of 100 µs, integer gains and the nearest rate.
+    assert (applied.exposure_us, applied.gain_db, applied.rate_hz) == (2000, 8, 60)
+    assert applied.region == (0, 0, 640, 480)
 
 
-def test_one_whose_exposure_is_never_automatic_is_opened_and_set() -> None:
-    with opened(Driver(automatic=False), exposure=Range(3, 2047)) as camera:
+def test_camera_without_automatic_exposure_can_be_set() -> None:
+    with open_uvc(Driver(automatic=False), exposure=Range(3, 2047)) as camera:
         assert camera.apply(CameraSettings(exposure_us=2000)).exposure_us == 2000
 
 
-def test_one_without_controls_says_so() -> None:
-    with opened(Driver()) as camera:
+def test_camera_without_controls_rejects_settings() -> None:
+    with open_uvc(Driver()) as camera:
         assert (camera.limits.exposure_us, camera.limits.gain_db) == (None, None)
         with pytest.raises(InputError, match="exposure_us: 100; expected nothing: A webcam"):
             camera.apply(CameraSettings(exposure_us=100))
@@ -110,8 +110,8 @@ def test_one_without_controls_says_so() -> None:
 
 
 @pytest.mark.parametrize("grey", [True, False])
-def test_frames_are_grey_with_the_drivers_time(grey: bool) -> None:
-    with opened(Driver(grey=grey)) as camera:
+def test_frames_are_grey_with_the_time_of_the_driver(grey: bool) -> None:
+    with open_uvc(Driver(grey=grey)) as camera:
         assert camera.bit_depth == 8
         camera.start()
         frames = [camera.read(0.1) for _ in range(3)]
@@ -124,9 +124,9 @@ def test_frames_are_grey_with_the_drivers_time(grey: bool) -> None:
         assert (frame.image == 7).all()
 
 
-def test_silence_garbage_and_a_pulled_cable_are_told_apart() -> None:
+def test_silence_broken_frames_and_unplugging_are_distinguished() -> None:
     driver = Driver()
-    with opened(driver) as camera:
+    with open_uvc(driver) as camera:
         with pytest.raises(CameraError, match="was not started"):
             camera.read(0.01)
         camera.start()
@@ -140,22 +140,22 @@ def test_silence_garbage_and_a_pulled_cable_are_told_apart() -> None:
             camera.read(0.01)
 
 
-def test_why_it_cannot_be_opened_is_said() -> None:
+def test_reason_why_a_camera_cannot_be_opened() -> None:
     driver = Driver(opens=False)
     driver.plugged = False
     with pytest.raises(CameraLost, match="not connected"):
-        opened(driver)
+        open_uvc(driver)
     with pytest.raises(CameraLost, match="is not connected"):
         open_camera("uvc:77")
 
 
 @pytest.mark.parametrize("id", ["uvc:x", "webcam", "uvc:"])
-def test_an_id_of_no_camera_is_refused(id: str) -> None:
+def test_invalid_id_is_rejected(id: str) -> None:
     with pytest.raises(InputError, match="as labapp cameras lists them"):
         open_camera(id)
 
 
-def test_the_system_lists_a_camera_once(tmp_path: Path) -> None:
+def test_each_camera_is_listed_once(tmp_path: Path) -> None:
     for name, index, title in (
         ("video0", "0", "Webcam"),
         ("video1", "1", "Webcam"),
@@ -165,9 +165,9 @@ def test_the_system_lists_a_camera_once(tmp_path: Path) -> None:
         (tmp_path / name).mkdir()
         (tmp_path / name / "index").write_text(f"{index}\n")
         (tmp_path / name / "name").write_text(f"{title}\n")
-    (tmp_path / "video3").mkdir()  # being unplugged
-    found = uvc.find_uvc(tmp_path)
-    assert [(info.id, info.name) for info in found] == [
+    (tmp_path / "video3").mkdir()  # just being unplugged
+    cameras = uvc.find_uvc(tmp_path)
+    assert [(info.id, info.name) for info in cameras] == [
         ("uvc:0", "Webcam"),
         ("uvc:2", "Another"),
         ("uvc:10", "Microscope"),
@@ -175,7 +175,7 @@ def test_the_system_lists_a_camera_once(tmp_path: Path) -> None:
     assert uvc.find_uvc(tmp_path / "nothing") == []
 
 
-def test_the_drivers_question_is_put_as_the_kernel_has_it() -> None:
+def test_query_of_the_driver_has_the_layout_of_the_kernel() -> None:
     # linux/videodev2.h: VIDIOC_QUERYCTRL is _IOWR('V', 36, struct v4l2_queryctrl), of 17 words.
     assert uvc.QUERY.size == 4 * 17
     number = 3 << 30 | 4 * 17 << 16 | ord("V") << 8 | 36
@@ -183,9 +183,9 @@ def test_the_drivers_question_is_put_as_the_kernel_has_it() -> None:
     assert uvc.query_control(77, uvc.GAIN) is None
 
 
-def test_a_device_that_may_not_be_read_says_which_group_to_join(
+def test_missing_permission_names_the_group_to_join(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("os.access", lambda *_: False)
     with pytest.raises(CameraLost, match="usermod -aG video"):
-        opened(Driver(opens=False))
+        open_uvc(Driver(opens=False))

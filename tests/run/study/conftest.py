@@ -1,4 +1,4 @@
-"""A recording of a pool that swings, and a study of parts of it."""
+"""A recording of an oscillating pool, and a study of parts of it."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def study_file(simulated: Path, tmp_path: Path) -> Path:
-    """A study of two parts of the recording, and of three recordings that are none."""
+    """A study of two parts of the recording, and of three invalid recordings."""
     return write_study(tmp_path, simulated)
 
 

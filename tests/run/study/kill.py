@@ -1,9 +1,9 @@
-"""Kill a study's workers and the program that runs it, at random moments; nothing may be lost.
+"""Kill a study's workers and its program at random moments; no result may be lost.
 
 ``kill.py STUDY KILLS SEED`` runs a study with two processes into a folder beside it; called with a
-scheduler, on Dask's workers. At each of the random moments the program (SIGKILL or Ctrl-C) or one
-of the processes that measure (SIGKILL) is ended. Then it is run to its end, and the files of the
-tasks are held against those of a run that nobody disturbed.
+scheduler, on Dask's workers. At each random moment, the program (SIGKILL or Ctrl-C) or one of the
+measuring processes (SIGKILL) is stopped. Then the study is run to its end, and the files of the
+tasks are compared with those of an undisturbed run.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ import pandas as pd
 import psutil
 
 from labapp import Study
-from tests.conftest import HEEDING
+from tests.conftest import INTERRUPTIBLE
 
 
 def bytes_of(folder: Path) -> dict[str, str]:
-    """Digest of each file that tasks wrote."""
+    """Digest of each file written by the tasks."""
     return {
         path.name: hashlib.sha256(path.read_bytes()).hexdigest()
         for path in sorted((folder / "stretches").glob("*.npz"))
@@ -34,11 +34,11 @@ def bytes_of(folder: Path) -> dict[str, str]:
 
 
 def start(study: Path, out: Path, scheduler: str) -> subprocess.Popen[bytes]:
-    """The command, heeding Ctrl-C."""
-    given = ["study", "run", str(study), "--out", str(out), "--workers", "2"]
-    given += ["--scheduler", scheduler] if scheduler else []
+    """Start the command so that it reacts to Ctrl-C."""
+    arguments = ["study", "run", str(study), "--out", str(out), "--workers", "2"]
+    arguments += ["--scheduler", scheduler] if scheduler else []
     return subprocess.Popen(
-        [sys.executable, "-c", HEEDING, *given],
+        [sys.executable, "-c", INTERRUPTIBLE, *arguments],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         start_new_session=True,
@@ -48,31 +48,31 @@ def start(study: Path, out: Path, scheduler: str) -> subprocess.Popen[bytes]:
 def kill_at_random(
     study: Path, kills: int, seed: int, scheduler: str = "", nannies: Sequence[int] = ()
 ) -> Counter[str]:
-    """Run a study, killed so many times; returns how many of which kind.
+    """Run a study, killed a given number of times; return the number of each kind.
 
     Parameters
     ----------
     scheduler, nannies
-        Address of a Dask scheduler, and the processes whose children are its workers; without, the
-        program's own processes measure.
+        Address of a Dask scheduler, and the processes whose children are its workers; without
+        them, the processes of the program itself measure.
 
     Raises
     ------
     AssertionError
-        If anything was lost, or is there twice.
+        If any result was lost or duplicated.
     """
-    draw = random.Random(seed)
-    alone, out = study.with_name("undisturbed"), study.with_name("disturbed")
-    expected = [one.state for one in Study(study, alone).run(2)]
+    rng = random.Random(seed)
+    undisturbed, disturbed = study.with_name("undisturbed"), study.with_name("disturbed")
+    expected = [recording.state for recording in Study(study, undisturbed).run(2)]
     kinds: Counter[str] = Counter()
-    kept: dict[str, str] = {}
-    program = start(study, out, scheduler)
+    stored: dict[str, str] = {}
+    program = start(study, disturbed, scheduler)
     for _ in range(kills):
-        count, more = len(bytes_of(out)), draw.choice([0, 0, 1, 1, 2])
-        while program.poll() is None and len(bytes_of(out)) < count + more:
+        count, more = len(bytes_of(disturbed)), rng.choice([0, 0, 1, 1, 2])
+        while program.poll() is None and len(bytes_of(disturbed)) < count + more:
             time.sleep(0.02)
-        time.sleep(draw.uniform(0, 2.5))
-        kind = draw.choice(["program", "worker", "worker", "Ctrl-C"])
+        time.sleep(rng.uniform(0, 2.5))
+        kind = rng.choice(["program", "worker", "worker", "Ctrl-C"])
         if program.poll() is None:
             if kind == "program":
                 program.kill()
@@ -85,20 +85,22 @@ def kill_at_random(
                     for child in psutil.Process(parent).children(recursive=True)
                 ]
                 if workers:
-                    workers[draw.randrange(len(workers))].kill()
+                    workers[rng.randrange(len(workers))].kill()
             kinds[kind] += 1
             if kind != "worker":
                 program.wait()
-        now = bytes_of(out)
-        assert kept.items() <= now.items(), "what was done is no longer there"
-        kept = now
+        current = bytes_of(disturbed)
+        assert stored.items() <= current.items(), "what was done is no longer there"
+        stored = current
         if program.poll() is not None:
-            program = start(study, out, scheduler)
+            program = start(study, disturbed, scheduler)
     program.wait()
-    assert [one.state for one in Study(study, out).run(2)] == expected
-    assert bytes_of(out) == bytes_of(alone), "results differ from those of an undisturbed run"
-    Study(study, out).results()
-    rows = pd.read_parquet(out / "measures.parquet", columns=["recording", "frame"])
+    assert [recording.state for recording in Study(study, disturbed).run(2)] == expected
+    assert bytes_of(disturbed) == bytes_of(undisturbed), (
+        "results differ from those of an undisturbed run"
+    )
+    Study(study, disturbed).results()
+    rows = pd.read_parquet(disturbed / "measures.parquet", columns=["recording", "frame"])
     assert not rows.astype(str).duplicated().any(), "rows are there twice"
     return kinds
 

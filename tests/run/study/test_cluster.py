@@ -1,4 +1,4 @@
-"""A study on Dask's workers: the same bytes, and what is said where something is missing."""
+"""A study on Dask's workers: equal files, and errors where something is missing."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from labapp.errors import InputError
 
 pytestmark = [
     pytest.mark.slow,
-    # Sockets that Dask leaves to the garbage collector when it ends.
+    # Dask leaves sockets to the garbage collector when it ends.
     pytest.mark.filterwarnings("default::ResourceWarning"),
     pytest.mark.filterwarnings("default::pytest.PytestUnraisableExceptionWarning"),
     pytest.mark.filterwarnings("default::DeprecationWarning"),
@@ -33,8 +33,8 @@ def bytes_of(folder: Path) -> dict[str, str]:
 
 
 @contextmanager
-def started(*arguments: str) -> Iterator[subprocess.Popen[bytes]]:
-    """A program of Dask that runs meanwhile."""
+def dask_program(*arguments: str) -> Iterator[subprocess.Popen[bytes]]:
+    """Run a program of Dask for the duration of the context."""
     program = subprocess.Popen(
         [sys.executable, "-m", "dask", *arguments],
         stdout=subprocess.DEVNULL,
@@ -49,16 +49,16 @@ def started(*arguments: str) -> Iterator[subprocess.Popen[bytes]]:
 
 @contextmanager
 def cluster(workers: int, *options: str) -> Iterator[tuple[str, list[subprocess.Popen[bytes]]]]:
-    """A scheduler and separate workers, over TCP on this machine."""
-    with closing(socket.socket()) as held:
-        held.bind(("127.0.0.1", 0))
-        port = held.getsockname()[1]
+    """Run a scheduler and separate workers, over TCP on this machine."""
+    with closing(socket.socket()) as bound:
+        bound.bind(("127.0.0.1", 0))
+        port = bound.getsockname()[1]
     address = f"tcp://127.0.0.1:{port}"
     with ExitStack() as stack:
-        here = ["--host", "127.0.0.1", "--port", str(port), "--no-dashboard"]
-        stack.enter_context(started("scheduler", *here))
-        each = ["worker", address, "--nthreads", "1", "--no-dashboard", *options]
-        programs = [stack.enter_context(started(*each)) for _ in range(workers)]
+        options_of_scheduler = ["--host", "127.0.0.1", "--port", str(port), "--no-dashboard"]
+        stack.enter_context(dask_program("scheduler", *options_of_scheduler))
+        command = ["worker", address, "--nthreads", "1", "--no-dashboard", *options]
+        programs = [stack.enter_context(dask_program(*command)) for _ in range(workers)]
         deadline = time.monotonic() + 120
         while time.monotonic() < deadline:
             with closing(socket.socket()) as probe:
@@ -68,35 +68,33 @@ def cluster(workers: int, *options: str) -> Iterator[tuple[str, list[subprocess.
         yield address, programs
 
 
-def test_workers_of_a_cluster_and_this_process_give_the_same_bytes(
-    study_file: Path, tmp_path: Path
-) -> None:
-    here = Study(study_file, tmp_path / "here")
-    expected = [one.state for one in here.run(0)]
-    there = Study(study_file, tmp_path / "there")
+def test_cluster_and_single_process_give_equal_files(study_file: Path, tmp_path: Path) -> None:
+    local = Study(study_file, tmp_path / "here")
+    expected = [recording.state for recording in local.run(0)]
+    distributed = Study(study_file, tmp_path / "there")
     with cluster(2) as (address, _):
-        assert [one.state for one in there.run(scheduler=address)] == expected
-    assert bytes_of(there.folder) == bytes_of(here.folder)
-    assert len(bytes_of(here.folder)) == 2
+        assert [recording.state for recording in distributed.run(scheduler=address)] == expected
+    assert bytes_of(distributed.folder) == bytes_of(local.folder)
+    assert len(bytes_of(local.folder)) == 2
 
 
-def test_a_worker_that_is_killed_costs_its_task_only(study_file: Path, tmp_path: Path) -> None:
+def test_killed_worker_does_not_stop_the_study(study_file: Path, tmp_path: Path) -> None:
     study = Study(study_file, tmp_path / "there")
     killed: list[bool] = []
 
     with cluster(2) as (address, programs):
 
-        def kill(now: object) -> None:
+        def kill(_progress: object) -> None:
             if not killed:
                 killed.append(True)
                 programs[0].kill()
 
-        states = [one.state for one in study.run(scheduler=address, progress=kill)]
+        states = [recording.state for recording in study.run(scheduler=address, progress=kill)]
     assert killed
     assert states == ["done", "done", "failed", "failed", "failed"]
 
 
-def test_a_scheduler_that_is_not_there_is_named(
+def test_unreachable_scheduler_is_reported(
     study_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("labapp.run.study.workers.TIMEOUT_S", 0.5)

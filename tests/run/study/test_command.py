@@ -1,4 +1,4 @@
-"""`labapp study …`: exit codes, and what is said."""
+"""`labapp study …`: exit codes and output."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from labapp.run.study.study import Study
 from tests.conftest import Run
 
 
-def test_a_study_from_its_file_to_its_page(study_file: Path, labapp: Run) -> None:
+def test_study_commands_from_the_file_to_the_page(study_file: Path, labapp: Run) -> None:
     code, out, err = labapp("study", "status", study_file)
     assert code == 1
     assert "3 waiting" not in out
@@ -31,33 +31,35 @@ def test_a_study_from_its_file_to_its_page(study_file: Path, labapp: Run) -> Non
     code, out, _ = labapp("study", "status", study_file)
     assert code == 1
     assert rows["empty"]["problem"] in out
-    # Without what cannot be measured, all is measured.
+    # Without the recordings that fail, everything is measured.
     text = study_file.read_text("utf-8").partition('[[recording]]\nfile = "empty')[0]
     study_file.write_text(text, "utf-8")
     assert labapp("study", "status", study_file)[0] == 0
     assert labapp("study", "results", study_file)[0] == 0
     page = (folder / "summary.html").read_text("utf-8")
     assert "<svg" in page
-    assert not re.findall(r'(?:src|href)="(?!#)|<link|url\((?!#)', page)  # nothing is loaded
+    assert not re.findall(r'(?:src|href)="(?!#)|<link|url\((?!#)', page)  # no external resources
 
 
-def test_bad_input_is_one(study_file: Path, tmp_path: Path, labapp: Run) -> None:
+def test_bad_input_exits_with_2(study_file: Path, tmp_path: Path, labapp: Run) -> None:
     (tmp_path / "wrong.toml").write_text("recording = 3", "utf-8")
     assert labapp("study", "run", tmp_path / "wrong.toml")[0] == 2
     assert labapp("study", "status", tmp_path / "none.toml")[0] == 2
-    assert labapp("study", "run", study_file, "--out", tmp_path)[0] == 2  # a folder with others
-    assert labapp("study", "new", study_file, "a.avi", "--setup", "s.toml")[0] == 2  # is there
+    assert (
+        labapp("study", "run", study_file, "--out", tmp_path)[0] == 2
+    )  # a folder with other files
+    assert labapp("study", "new", study_file, "a.avi", "--setup", "s.toml")[0] == 2  # exists
     assert labapp("study", "new", tmp_path / "a.txt", "a.avi", "--setup", "s.toml")[0] == 2
     assert labapp("study", "run", study_file, "--scheduler", "tcp://127.0.0.1:x")[0] == 2
 
 
-def test_a_run_that_is_stopped_says_what_is_kept(
+def test_stopped_run_prints_its_status(
     study_file: Path, labapp: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def stopped(*_: object, **__: object) -> None:
+    def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(Study, "run", stopped)
+    monkeypatch.setattr(Study, "run", interrupt)
     code, _, err = labapp("study", "run", study_file)
     assert code == 130
     assert "4 waiting" in err

@@ -1,4 +1,4 @@
-"""From a study's results to a model and its predictions; a model beside the measures."""
+"""A penetration model from the results of a study, and its predictions with the measures."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from labapp.simulation.penetration import FEATURES, TARGET, simulate_welds
 from tests.conftest import Run
 
 LAW = 0.4
-"""Back-side width over the pool's width, of the sections here."""
+"""Ratio of back-side width to pool width in these sections."""
 
 
 def rows(path: Path) -> list[dict[str, str]]:
@@ -24,7 +24,9 @@ def rows(path: Path) -> list[dict[str, str]]:
 
 
 @pytest.mark.slow
-def test_from_a_study_to_a_prediction(simulated: Path, tmp_path: Path, labapp: Run) -> None:
+def test_model_of_a_study_predicts_its_sections(
+    simulated: Path, tmp_path: Path, labapp: Run
+) -> None:
     text = f"setup = '{simulated / 'setup.toml'}'\n"
     for k in range(3):
         text += f"[[recording]]\nfile = '{simulated / 'recording.avi'}'\nname = 'weld_{k}'\n"
@@ -47,60 +49,64 @@ def test_from_a_study_to_a_prediction(simulated: Path, tmp_path: Path, labapp: R
         labapp("penetration", "table", study, tmp_path / "sections.csv", "--out", features)[0] == 0
     )
     step = float(tables["weld_0"]["time_s"][1] - tables["weld_0"]["time_s"][0])
-    code, said, _ = labapp(
+    code, stdout, _ = labapp(
         *("penetration", "fit", features, "--out", model, "--model", "arx", "--step", step),
         *("--use", "width_mm", "--orders", 0, 1, 0, "--left-out", tmp_path / "left.csv"),
     )
-    assert code == 0, said
-    assert "9 sections of 3 welds" in said
+    assert code == 0, stdout
+    assert "9 sections of 3 welds" in stdout
     assert len(rows(tmp_path / "left.csv")) == 9
     assert labapp("penetration", "predict", model, study, "--out", out)[0] == 0
     widths = [width for table in tables.values() for width in table["width_mm"]]
-    found = rows(out)
-    assert [float(row["model_back_width_mm"]) for row in found] == pytest.approx(
+    predictions = rows(out)
+    assert [float(row["model_back_width_mm"]) for row in predictions] == pytest.approx(
         [LAW * width for width in widths], abs=1e-3
     )
-    assert {row["model"] for row in found} == {"model"}
-    # The same of a recording by itself, beside its measures.
+    assert {row["model"] for row in predictions} == {"model"}
+    # The model is also applied to a single recording, with its measures.
     folder = tmp_path / "alone"
-    given = simulated / "recording.avi", "--setup", simulated / "setup.toml", "--warm"
-    code, *_ = labapp("reconstruct", *given, "--out", folder, "--model", model, "--frames", "3:6")
+    arguments = simulated / "recording.avi", "--setup", simulated / "setup.toml", "--warm"
+    code, *_ = labapp(
+        "reconstruct", *arguments, "--out", folder, "--model", model, "--frames", "3:6"
+    )
     assert code == 0
-    beside = [float(row["model_back_width_mm"]) for row in rows(folder / "penetration.csv")]
-    assert beside == pytest.approx([LAW * w for w in tables["weld_1"]["width_mm"]], abs=0.01)
+    of_recording = [float(row["model_back_width_mm"]) for row in rows(folder / "penetration.csv")]
+    assert of_recording == pytest.approx([LAW * w for w in tables["weld_1"]["width_mm"]], abs=0.01)
     assert labapp("penetration", "predict", model, folder, "--out", out)[0] == 0
-    again = [float(row["model_back_width_mm"]) for row in rows(out)]
-    assert again == pytest.approx(beside, abs=1e-4)
-    # A later run without a model leaves none of its predictions there.
-    assert labapp("reconstruct", *given, "--out", folder, "--frames", "0")[0] == 0
+    of_folder = [float(row["model_back_width_mm"]) for row in rows(out)]
+    assert of_folder == pytest.approx(of_recording, abs=1e-4)
+    # A later run without a model removes the predictions.
+    assert labapp("reconstruct", *arguments, "--out", folder, "--frames", "0")[0] == 0
     assert not (folder / "penetration.csv").exists()
 
 
 @pytest.mark.slow
-def test_shape_is_there_without_surfaces_in_the_results(
+def test_shape_features_need_no_exported_surfaces(
     simulated: Path, tmp_path: Path, labapp: Run
 ) -> None:
-    welds = [one.series for one in simulate_welds(3, 1)]
+    welds = [weld.series for weld in simulate_welds(3, 1)]
     model = fit_model(welds, "arx", ModelSettings(FEATURES, TARGET))
     write_model(tmp_path / "model.json", replace(model, rmse_mm=0.1))
-    for more in ([], ["--warm"]):
-        out = tmp_path / f"results{len(more)}"
+    for options in ([], ["--warm"]):
+        out = tmp_path / f"results{len(options)}"
         code, *_ = labapp(
             *("reconstruct", simulated / "recording.avi", "--setup", simulated / "setup.toml"),
             *("--out", out, "--surfaces", "none", "--frames", ":3"),
-            *("--model", tmp_path / "model.json", *more),
+            *("--model", tmp_path / "model.json", *options),
         )
         assert code == 0
         assert not list(out.glob("surface*"))
         assert all(row["model_back_width_mm"] for row in rows(out / "penetration.csv"))
 
 
-def test_what_the_commands_cannot_do(tmp_path: Path, labapp: Run) -> None:
+def test_impossible_commands_are_rejected(tmp_path: Path, labapp: Run) -> None:
     table, out = tmp_path / "welds.csv", tmp_path / "model.json"
     assert labapp("penetration", "simulate", "--out", table, "--welds", 3)[0] == 0
     for wrong in (["--orders", 3, 1, 0], ["--orders", 1, 0, 0], ["--use", "brightness"]):
-        code, _, said = labapp("penetration", "fit", table, "--out", out, "--model", "arx", *wrong)
-        assert code == 2, said
+        code, _, stderr = labapp(
+            "penetration", "fit", table, "--out", out, "--model", "arx", *wrong
+        )
+        assert code == 2, stderr
     assert not out.exists()
     out.write_text("{}")
     assert labapp("penetration", "predict", out, table, "--out", tmp_path / "p.csv")[0] == 2

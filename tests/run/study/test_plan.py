@@ -13,17 +13,17 @@ from labapp.run.study.plan import MOST_RECORDINGS, read_study, write_study
 SAMPLES = Path(__file__).parents[3] / "sample_sessions"
 
 
-def written(folder: Path, text: str, name: str = "study.toml") -> Path:
+def write(folder: Path, text: str, name: str = "study.toml") -> Path:
     path = folder / name
     path.write_text(text, "utf-8")
     return path
 
 
 def fields(error: pytest.ExceptionInfo[InputError]) -> set[str]:
-    return {one.field for one in error.value.problems}
+    return {problem.field for problem in error.value.problems}
 
 
-def test_a_recording_has_the_defaults_at_the_top_and_its_own_keys(tmp_path: Path) -> None:
+def test_recording_combines_defaults_and_its_own_keys(tmp_path: Path) -> None:
     text = """
 title = "Two"
 setup = "bench.toml"
@@ -40,23 +40,31 @@ scheme = "irs"
 algorithm = "epa-r"
 warm = false
 """
-    plan = read_study(written(tmp_path, text))
-    one, two = plan.recordings
+    plan = read_study(write(tmp_path, text))
+    first, second = plan.recordings
     assert (plan.title, plan.conditions) == ("Two", ("current_a", "gas"))
-    assert (one.name, one.path, one.setup) == ("a", tmp_path / "a.avi", tmp_path / "bench.toml")
-    assert (one.frames, one.settings.scheme, one.warm) == (":", "ers", True)
-    assert one.conditions == {"current_a": 100, "gas": "Ar"}
-    assert (two.name, two.path, two.setup) == (
+    assert (first.name, first.path, first.setup) == (
+        "a",
+        tmp_path / "a.avi",
+        tmp_path / "bench.toml",
+    )
+    assert (first.frames, first.settings.scheme, first.warm) == (":", "ers", True)
+    assert first.conditions == {"current_a": 100, "gas": "Ar"}
+    assert (second.name, second.path, second.setup) == (
         "second",
         Path("/data/b.avi"),
         tmp_path / "sub/other.toml",
     )
-    assert (two.frames, two.settings.scheme, two.settings.algorithm) == ("2:8", "irs", "epa-r")
-    assert not two.warm
+    assert (second.frames, second.settings.scheme, second.settings.algorithm) == (
+        "2:8",
+        "irs",
+        "epa-r",
+    )
+    assert not second.warm
 
 
 @pytest.mark.parametrize("separator", [",", ";"])
-def test_a_table_has_a_recording_a_row_and_conditions_in_its_other_columns(
+def test_table_has_a_recording_per_row_and_columns_of_conditions(
     tmp_path: Path, separator: str
 ) -> None:
     decimal = "1,5" if separator == ";" else "1.5"
@@ -66,30 +74,34 @@ def test_a_table_has_a_recording_a_row_and_conditions_in_its_other_columns(
         ["b.avi", "s.toml", "false", "", "He"],
     ]
     text = "\n".join(separator.join(row) for row in rows)
-    plan = read_study(written(tmp_path, text, "study.csv"))
-    one, two = plan.recordings
-    assert one.conditions == {"speed": 1.5, "gas": "Ar"}
-    assert two.conditions == {"gas": "He"}
-    assert [one.warm, two.warm] == [True, False]
+    plan = read_study(write(tmp_path, text, "study.csv"))
+    first, second = plan.recordings
+    assert first.conditions == {"speed": 1.5, "gas": "Ar"}
+    assert second.conditions == {"gas": "He"}
+    assert [first.warm, second.warm] == [True, False]
 
 
-def test_a_pattern_stands_for_files_and_tells_their_conditions(tmp_path: Path) -> None:
+def test_pattern_matches_files_and_their_conditions(tmp_path: Path) -> None:
     for name in ("I100_Ar_1", "I100_Ar_2", "I80.5_He_1"):
         (tmp_path / "runs" / name).mkdir(parents=True)
         (tmp_path / "runs" / name / "recording.avi").touch()
     text = 'setup = "s.toml"\n[[recording]]\nfile = "runs/I{current_a}_{gas}_*/recording.avi"\n'
-    plan = read_study(written(tmp_path, text))
-    assert [one.name for one in plan.recordings] == ["I100_Ar_1", "I100_Ar_2", "I80.5_He_1"]
-    assert [one.conditions["current_a"] for one in plan.recordings] == [100, 100, 80.5]
-    assert [one.conditions["gas"] for one in plan.recordings] == ["Ar", "Ar", "He"]
+    plan = read_study(write(tmp_path, text))
+    assert [recording.name for recording in plan.recordings] == [
+        "I100_Ar_1",
+        "I100_Ar_2",
+        "I80.5_He_1",
+    ]
+    assert [recording.conditions["current_a"] for recording in plan.recordings] == [100, 100, 80.5]
+    assert [recording.conditions["gas"] for recording in plan.recordings] == ["Ar", "Ar", "He"]
 
 
-def test_a_file_whose_name_looks_like_a_pattern_is_itself(tmp_path: Path) -> None:
+def test_existing_file_named_like_a_pattern_is_used(tmp_path: Path) -> None:
     (tmp_path / "odd*{name}.avi").touch()
     text = 'setup = "s.toml"\n[[recording]]\nfile = "odd*{name}.avi"\n'
-    (one,) = read_study(written(tmp_path, text)).recordings
-    assert one.path == tmp_path / "odd*{name}.avi"
-    assert not one.conditions
+    (recording,) = read_study(write(tmp_path, text)).recordings
+    assert recording.path == tmp_path / "odd*{name}.avi"
+    assert not recording.conditions
 
 
 @pytest.mark.parametrize(
@@ -130,26 +142,26 @@ def test_a_file_whose_name_looks_like_a_pattern_is_itself(tmp_path: Path) -> Non
         (f'setup = "s"\n[[recording]]\nfile = "{"a" * 300}*.avi"', "recording[1].file"),
     ],
 )
-def test_what_is_wrong_is_named(tmp_path: Path, text: str, field: str) -> None:
+def test_wrong_key_is_named(tmp_path: Path, text: str, field: str) -> None:
     with pytest.raises(InputError) as error:
-        read_study(written(tmp_path, text))
+        read_study(write(tmp_path, text))
     assert field in fields(error)
 
 
 @pytest.mark.parametrize("text", ["", "setup\ns", "file,file\n", "file\na,b\n", "file,\0\n"])
-def test_a_table_that_is_none_is_refused(tmp_path: Path, text: str) -> None:
+def test_invalid_table_is_rejected(tmp_path: Path, text: str) -> None:
     with pytest.raises(InputError):
-        read_study(written(tmp_path, text, "study.csv"))
+        read_study(write(tmp_path, text, "study.csv"))
 
 
-def test_the_number_of_recordings_is_bounded(tmp_path: Path) -> None:
+def test_number_of_recordings_is_limited(tmp_path: Path) -> None:
     rows = "".join(f"{k}.avi,s\n" for k in range(MOST_RECORDINGS + 1))
     with pytest.raises(InputError):
-        read_study(written(tmp_path, f"file,setup\n{rows}", "study.csv"))
+        read_study(write(tmp_path, f"file,setup\n{rows}", "study.csv"))
 
 
 @pytest.mark.parametrize("name", ["new.toml", "new.csv"])
-def test_a_new_file_says_what_it_was_made_from(
+def test_new_study_file_contains_its_recordings(
     tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for file in ("I80_a.avi", "I90_b.avi", "=odd.avi"):
@@ -162,13 +174,17 @@ def test_a_new_file_says_what_it_was_made_from(
     assert not (tmp_path / "sub" / name).exists()
     plan = write_study(tmp_path / "sub" / name, ["I{current_a}_*.avi", "=odd.avi"], "bench.toml")
     assert plan == read_study(tmp_path / "sub" / name)
-    assert [one.path.resolve() for one in plan.recordings] == [
+    assert [recording.path.resolve() for recording in plan.recordings] == [
         tmp_path / "I80_a.avi",
         tmp_path / "I90_b.avi",
         tmp_path / "=odd.avi",
     ]
-    assert {one.setup.resolve() for one in plan.recordings} == {tmp_path / "bench.toml"}
-    assert [one.conditions.get("current_a") for one in plan.recordings] == [80, 90, None]
+    assert {recording.setup.resolve() for recording in plan.recordings} == {tmp_path / "bench.toml"}
+    assert [recording.conditions.get("current_a") for recording in plan.recordings] == [
+        80,
+        90,
+        None,
+    ]
     with pytest.raises(InputError):
         write_study(tmp_path / "sub" / name, ["=odd.avi"], "bench.toml")
     plan = write_study(tmp_path / "sub" / name, ["=odd.avi"], "bench.toml", replace=True)

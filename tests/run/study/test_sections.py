@@ -1,4 +1,4 @@
-"""Sections brought to the frames of a study's recordings."""
+"""Assignment of sections to the frames of a study's recordings."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def plan(**conditions: Condition) -> StudyPlan:
 
 
 def measured(count: int = 50, rate_hz: float = 10.0) -> Table:
-    """A recording whose width is its frame's number; every tenth frame has no surface."""
+    """A recording whose width equals the frame number; every tenth frame has no surface."""
     table: Table = {column.name: np.full(count, 1.0) for column in COLUMNS}
     table["frame"] = np.arange(count)
     table["time_s"] = np.arange(count) / rate_hz
@@ -43,12 +43,12 @@ def sections(folder: Path, text: str) -> Path:
     return path
 
 
-def test_positions_become_times_by_speed_and_start(tmp_path: Path) -> None:
+def test_positions_are_converted_to_times_by_speed_and_start(tmp_path: Path) -> None:
     text = HEAD + "first,20,10,5,2.5,0.1\nfirst,12,10,5,1.5,0.1\nsecond,20,15,2,3.5,\n"
-    found, unused = study_features(plan(), TABLES, sections(tmp_path, text))
-    assert found.target == "back_width_mm"
+    features, unused = study_features(plan(), TABLES, sections(tmp_path, text))
+    assert features.target == "back_width_mm"
     assert unused == 0
-    first, second = found.welds
+    first, second = features.welds
     cut = np.isfinite(first.target)
     assert first.time_s[cut] == pytest.approx([0.4, 2.0])
     assert first.target[cut] == pytest.approx([1.5, 2.5])
@@ -58,10 +58,10 @@ def test_positions_become_times_by_speed_and_start(tmp_path: Path) -> None:
     assert np.isnan(second.target_sigma[cut]).all()
 
 
-def test_speed_and_start_may_be_conditions_and_columns_come_first(tmp_path: Path) -> None:
+def test_columns_of_speed_and_start_override_conditions(tmp_path: Path) -> None:
     text = "recording,position_mm,start_mm,back_width_mm\nfirst,20,,1\nfirst,20,10,2\n"
-    where = sections(tmp_path, text)
-    (first,) = study_features(plan(start_mm=5.0, travel_mm_s=5.0), TABLES, where)[0].welds
+    path = sections(tmp_path, text)
+    (first,) = study_features(plan(start_mm=5.0, travel_mm_s=5.0), TABLES, path)[0].welds
     cut = np.isfinite(first.target)
     assert first.time_s[cut] == pytest.approx([2.0, 3.0])
     assert first.target[cut] == pytest.approx([2, 1])
@@ -75,18 +75,18 @@ def test_sections_at_one_frame_are_averaged(tmp_path: Path) -> None:
     assert first.target_sigma[cut] == pytest.approx([0.25])
 
 
-def test_a_section_goes_to_the_nearest_frame_with_a_surface_or_is_left_out(tmp_path: Path) -> None:
+def test_section_is_assigned_to_the_nearest_measured_frame(tmp_path: Path) -> None:
     text = "recording,time_s,back_width_mm\nfirst,0.91,1\nfirst,7,2\nfirst,-1,3\n"
-    found, unused = study_features(plan(), TABLES, sections(tmp_path, text))
-    (first,) = found.welds
+    features, unused = study_features(plan(), TABLES, sections(tmp_path, text))
+    (first,) = features.welds
     assert first.time_s[np.isfinite(first.target)] == pytest.approx([1.0])
     assert unused == 2
 
 
-def test_without_sections_there_are_the_features_of_all() -> None:
-    found, _ = study_features(plan(), TABLES, None)
-    assert found.target == ""
-    assert [len(one.time_s) for one in found.welds] == [45, 45]
+def test_without_sections_all_frames_have_features() -> None:
+    features, _ = study_features(plan(), TABLES, None)
+    assert features.target == ""
+    assert [len(weld.time_s) for weld in features.welds] == [45, 45]
 
 
 @pytest.mark.parametrize(
@@ -108,11 +108,11 @@ def test_without_sections_there_are_the_features_of_all() -> None:
         "recording,time_s,back_width_mm\nfirst,1,wide\n",
     ],
 )
-def test_wrong_sections_are_refused(text: str, tmp_path: Path) -> None:
+def test_wrong_sections_are_rejected(text: str, tmp_path: Path) -> None:
     with pytest.raises(InputError):
         study_features(plan(), TABLES, sections(tmp_path, text))
 
 
-def test_a_study_without_results_is_refused(tmp_path: Path) -> None:
+def test_study_without_results_is_rejected(tmp_path: Path) -> None:
     with pytest.raises(InputError):
         study_features(plan(), {}, None)

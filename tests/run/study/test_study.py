@@ -1,4 +1,4 @@
-"""A study: run, interrupted, run again; what is not measured says why; the same for any workers."""
+"""A study: run, interrupted, run again; reasons of failures; equal results for any workers."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ STATES = ["done", "done", "failed", "failed", "failed"]
 
 @pytest.fixture(autouse=True)
 def _short(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Stretches of three frames: a recording has some."""
+    """Use stretches of three frames, so that a recording has several."""
     monkeypatch.setattr(measurers, "STRETCH", 3)
 
 
@@ -47,13 +47,13 @@ def measured_once(simulated: Path, tmp_path_factory: pytest.TempPathFactory) -> 
 
 @pytest.fixture
 def measured_file(measured_once: Path, tmp_path: Path) -> Path:
-    """A copy of `study_file` and of what was measured."""
+    """A copy of `study_file` and of its results."""
     shutil.copytree(measured_once, tmp_path, dirs_exist_ok=True)
     return tmp_path / "study.toml"
 
 
 def bytes_of(folder: Path) -> dict[str, str]:
-    """Digest of each file that tasks wrote."""
+    """Digest of each file written by the tasks."""
     return {
         path.name: hashlib.sha256(path.read_bytes()).hexdigest()
         for path in sorted((folder / "stretches").glob("*.npz"))
@@ -65,17 +65,20 @@ def rows_of(folder: Path) -> pd.DataFrame:
     return table.sort_values(["recording", "frame"], ignore_index=True)
 
 
-def test_what_can_be_measured_is_and_the_others_say_why(study_file: Path) -> None:
+def test_valid_recordings_are_measured_and_failures_explained(study_file: Path) -> None:
     study = Study(study_file)
-    assert {one.state for one in study.status()} == {"waiting", "failed"}  # one is missing
+    assert {status.state for status in study.status()} == {
+        "waiting",
+        "failed",
+    }  # one file is missing
     notes: list[str] = []
-    found = study.run(0, note=notes.append)
-    assert [one.state for one in found] == STATES
-    assert [(one.frames, one.frames_done) for one in found[:2]] == [(5, 5), (4, 4)]
-    assert all(one.problem for one in found[2:])
-    assert not any(one.problem for one in found[:2])
+    statuses = study.run(0, note=notes.append)
+    assert [status.state for status in statuses] == STATES
+    assert [(status.frames, status.frames_done) for status in statuses[:2]] == [(5, 5), (4, 4)]
+    assert all(status.problem for status in statuses[2:])
+    assert not any(status.problem for status in statuses[:2])
     assert [note.partition(":")[0] for note in notes] == ["empty", "corrupt", "missing"]
-    assert [one.state for one in Study(study_file).status()] == STATES
+    assert [status.state for status in Study(study_file).status()] == STATES
     summary = study.results()
     rows = rows_of(study.folder)
     assert rows["frame"].tolist() == [0, 1, 2, 3, 4, 5, 6, 7, 8]
@@ -88,16 +91,16 @@ def test_what_can_be_measured_is_and_the_others_say_why(study_file: Path) -> Non
     ]
 
 
-def test_figures_are_those_of_reconstruct(
+def test_values_equal_those_of_reconstruct(
     measured_file: Path, simulated: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     study = Study(measured_file)
     study.results()
     monkeypatch.undo()
     monkeypatch.setattr(measurers, "STRETCH", 3)
-    given = ["reconstruct", simulated / "recording.avi", "--setup", simulated / "setup.toml"]
+    arguments = ["reconstruct", simulated / "recording.avi", "--setup", simulated / "setup.toml"]
     options = ["--out", tmp_path / "out", "--frames", ":5", "--surfaces", "none", "--warm"]
-    assert CliRunner().invoke(app, [*map(str, given), *map(str, options)]).exit_code == 0
+    assert CliRunner().invoke(app, [*map(str, arguments), *map(str, options)]).exit_code == 0
     with (tmp_path / "out" / "measures.csv").open(encoding="utf-8", newline="") as file:
         expected = list(csv.DictReader(file))
     rows = rows_of(study.folder)
@@ -107,41 +110,41 @@ def test_figures_are_those_of_reconstruct(
     assert rows["setup_status"].tolist() == [row["setup_status"] for row in expected]
 
 
-def test_nothing_that_is_done_is_done_again(
+def test_finished_tasks_are_not_repeated(
     measured_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     study = Study(measured_file)
     before = bytes_of(study.folder)
     assert len(before) == 4
     measured: list[object] = []
-    monkeypatch.setattr(stretches, "_measured", lambda *given: measured.append(given))
+    monkeypatch.setattr(stretches, "_measured", lambda *arguments: measured.append(arguments))
     study.run(0)
     assert not measured
     assert bytes_of(study.folder) == before
 
 
-def test_another_setup_other_settings_and_another_recording_are_measured_anew(
+def test_changed_setup_settings_or_frames_are_measured_again(
     measured_file: Path, simulated: Path, tmp_path: Path
 ) -> None:
     text = measured_file.read_text("utf-8")
     changed = text.replace('name = "first"', 'name = "first"\nscheme = "ers"')
     measured_file.write_text(changed, "utf-8")
-    assert [one.state for one in Study(measured_file).status()[:2]] == ["waiting", "done"]
+    assert [status.state for status in Study(measured_file).status()[:2]] == ["waiting", "done"]
     setup = (simulated / "setup.toml").read_text("utf-8")
     (tmp_path / "other.toml").write_text(setup + "# other\n", "utf-8")
     changed = text.replace('name = "second"', 'name = "second"\nsetup = "other.toml"')
     measured_file.write_text(changed, "utf-8")
-    assert [one.state for one in Study(measured_file).status()[:2]] == ["done", "waiting"]
+    assert [status.state for status in Study(measured_file).status()[:2]] == ["done", "waiting"]
     measured_file.write_text(text.replace('frames = ":5"', 'frames = ":6"'), "utf-8")
     first = Study(measured_file).status()[0]
     assert (first.state, first.frames_done) == ("part", 3)
 
 
-def test_conditions_change_without_measuring(measured_file: Path) -> None:
+def test_conditions_can_change_without_measuring(measured_file: Path) -> None:
     text = measured_file.read_text("utf-8").replace('gas = "Ar"', 'gas = "He", speed = 2')
     measured_file.write_text(text, "utf-8")
     study = Study(measured_file)
-    assert [one.state for one in study.status()] == STATES
+    assert [status.state for status in study.status()] == STATES
     study.results()
     rows = rows_of(study.folder)
     assert set(rows["gas"]) == {"He"}
@@ -149,21 +152,21 @@ def test_conditions_change_without_measuring(measured_file: Path) -> None:
 
 
 @pytest.mark.slow
-def test_processes_and_this_one_give_the_same_bytes(measured_file: Path, tmp_path: Path) -> None:
-    made = {0: bytes_of(Study(measured_file).folder)}
+def test_files_are_equal_for_any_number_of_processes(measured_file: Path, tmp_path: Path) -> None:
+    digests = {0: bytes_of(Study(measured_file).folder)}
     for count in (1, 2):
         study = Study(measured_file, tmp_path / f"out_{count}")
-        assert [one.state for one in study.run(count)] == STATES
-        made[count] = bytes_of(study.folder)
-    assert made[0] == made[1] == made[2]
-    assert len(made[0]) == 4
+        assert [status.state for status in study.run(count)] == STATES
+        digests[count] = bytes_of(study.folder)
+    assert digests[0] == digests[1] == digests[2]
+    assert len(digests[0]) == 4
 
 
-def test_a_run_that_is_stopped_goes_on_where_it_was(study_file: Path) -> None:
+def test_stopped_run_continues_where_it_stopped(study_file: Path) -> None:
     study = Study(study_file)
 
-    def stop(now: study_module.Progress) -> None:
-        if now.frames_done >= 3:
+    def stop(progress: study_module.Progress) -> None:
+        if progress.frames_done >= 3:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -171,27 +174,27 @@ def test_a_run_that_is_stopped_goes_on_where_it_was(study_file: Path) -> None:
     before = bytes_of(study.folder)
     assert len(before) == 1
     assert study.status()[0].state == "part"
-    study.results()  # of what there is
+    study.results()  # of the finished part
     assert len(rows_of(study.folder)) == 3
     study.run(0)
-    assert [one.state for one in study.status()] == STATES
+    assert [status.state for status in study.status()] == STATES
     assert before.items() <= bytes_of(study.folder).items()
 
 
-def test_a_full_disk_stops_a_run_and_loses_nothing(
+def test_full_disk_stops_a_run_without_loss(
     study_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     study = Study(study_file)
     write = stretches.write_atomically
     written: list[Path] = []
 
-    def full(path: Path, content: bytes) -> None:
+    def write_until_full(path: Path, content: bytes) -> None:
         written.append(path)
         if len(written) == 3:
             raise OSError(errno.ENOSPC, "no space left")
         write(path, content)
 
-    monkeypatch.setattr(stretches, "write_atomically", full)
+    monkeypatch.setattr(stretches, "write_atomically", write_until_full)
     with pytest.raises(InputError) as error:
         study.run(0)
     assert "no space left" in str(error.value)
@@ -199,10 +202,10 @@ def test_a_full_disk_stops_a_run_and_loses_nothing(
     monkeypatch.setattr(measurers, "STRETCH", 3)
     assert not list(study.folder.glob("*/.*.part"))
     assert len(bytes_of(study.folder)) == 1
-    assert [one.state for one in study.run(0)] == STATES
+    assert [status.state for status in study.run(0)] == STATES
 
 
-def test_a_damaged_file_is_measured_again(measured_file: Path) -> None:
+def test_damaged_file_is_measured_again(measured_file: Path) -> None:
     study = Study(measured_file)
     before = bytes_of(study.folder)
     damaged = sorted((study.folder / "stretches").glob("*.npz"))
@@ -211,20 +214,20 @@ def test_a_damaged_file_is_measured_again(measured_file: Path) -> None:
     ):
         path.write_bytes(content)
     damaged[3].write_bytes(damaged[3].read_bytes().replace(b"ok", b"no"))
-    states = [one.status.state for one in study.results().recordings]
+    states = [recording.status.state for recording in study.results().recordings]
     assert "done" not in states
     study.run(0)
-    assert [one.status.state for one in study.results().recordings] == STATES
+    assert [recording.status.state for recording in study.results().recordings] == STATES
     assert bytes_of(study.folder) == before
 
 
-def test_a_recording_that_was_changed_is_looked_at_again(
+def test_changed_recording_is_checked_again(
     measured_file: Path, simulated: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "missing.avi").write_bytes((simulated / "recording.avi").read_bytes())
     assert Study(measured_file).status()[4].problem
-    found = Study(measured_file).run(0)[4]
-    assert (found.state, found.problem, found.frames) == ("done", "", 9)
+    status = Study(measured_file).run(0)[4]
+    assert (status.state, status.problem, status.frames) == ("done", "", 9)
 
 
 def test_only_one_run_at_a_time(study_file: Path) -> None:
@@ -233,7 +236,7 @@ def test_only_one_run_at_a_time(study_file: Path) -> None:
         study.run(0)
 
 
-def test_a_folder_of_others_is_left_alone(study_file: Path, tmp_path: Path) -> None:
+def test_folder_with_other_files_is_rejected(study_file: Path, tmp_path: Path) -> None:
     (tmp_path / "theirs").mkdir()
     (tmp_path / "theirs" / "thesis.txt").touch()
     with pytest.raises(InputError):
@@ -243,17 +246,17 @@ def test_a_folder_of_others_is_left_alone(study_file: Path, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("key", ["setup", "frames"])
-def test_a_recording_with_a_wrong_key_does_not_stop_the_others(study_file: Path, key: str) -> None:
+def test_wrong_key_of_a_recording_does_not_stop_the_others(study_file: Path, key: str) -> None:
     text = study_file.read_text("utf-8")
     wrong = {"setup": 'setup = "none.toml"', "frames": 'frames = "70:"'}[key]
     changed = text.replace('frames = ":5"', wrong)
     study_file.write_text(changed, "utf-8")
-    found = Study(study_file).run(0)
-    assert [one.state for one in found] == ["failed", *STATES[1:]]
-    assert key in found[0].problem
+    statuses = Study(study_file).run(0)
+    assert [status.state for status in statuses] == ["failed", *STATES[1:]]
+    assert key in statuses[0].problem
 
 
-def test_the_dataset_opens_lazily_and_says_its_units(measured_file: Path) -> None:
+def test_dataset_opens_lazily_and_has_units(measured_file: Path) -> None:
     study = Study(measured_file)
     study.results()
     scanned = pl.scan_parquet(study.folder / "measures.parquet" / "*.parquet")
@@ -264,7 +267,7 @@ def test_the_dataset_opens_lazily_and_says_its_units(measured_file: Path) -> Non
 
     schema = parquet.read_schema(study.folder / "measures.parquet" / "first.parquet")
     assert schema.field("height_sigma_mm").metadata[b"units"] == b"mm"
-    # A recording that is no longer in the study is no longer in its results.
+    # A recording removed from the study is removed from its results.
     text = measured_file.read_text("utf-8").replace('name = "second"', 'name = "other"')
     measured_file.write_text(text, "utf-8")
     Study(measured_file).results()
@@ -274,7 +277,7 @@ def test_the_dataset_opens_lazily_and_says_its_units(measured_file: Path) -> Non
 def test_surfaces_are_an_array_over_frames(measured_file: Path, simulated: Path) -> None:
     study = Study(measured_file)
     study.results(surfaces=True)
-    assert not (study.folder / "surfaces.zarr").exists()  # none were kept
+    assert not (study.folder / "surfaces.zarr").exists()  # none were stored
     study.run(0, surfaces=True)
     study.results(surfaces=True)
     data = xr.open_zarr(study.folder / "surfaces.zarr", group="second", consolidated=False)
@@ -286,47 +289,47 @@ def test_surfaces_are_an_array_over_frames(measured_file: Path, simulated: Path)
     np.testing.assert_allclose(data["z_mm"].max(("x", "y")).values, heights, atol=2e-3)
     setup = read_setup(simulated / "setup.toml")
     with open_source(simulated / "recording.avi") as source:
-        alone, _ = measure(source.frame(5).image, setup.bench, Settings())
-    assert alone.reconstruction is not None
+        measurement, _ = measure(source.frame(5).image, setup.bench, Settings())
+    assert measurement.reconstruction is not None
     z_mm = data["z_mm"].sel(frame=5)
     for x, y in ((0.0, 0.0), (1.0, -1.0)):
-        there = z_mm.sel(x=x, y=y, method="nearest")
-        own = alone.reconstruction.surface.height(np.array(there.x), np.array(there.y))
-        assert float(there) == pytest.approx(float(own), abs=1e-6)
+        stored = z_mm.sel(x=x, y=y, method="nearest")
+        expected = measurement.reconstruction.surface.height(np.array(stored.x), np.array(stored.y))
+        assert float(stored) == pytest.approx(float(expected), abs=1e-6)
 
 
-def test_tasks_that_raise_are_tried_again_and_then_reported(
+def test_failing_tasks_are_retried_and_then_reported(
     study_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    tried: list[object] = []
-    whole = stretches._measured
+    attempts: list[object] = []
+    measured = stretches._measured
 
     def flaky(stretch: stretches.Stretch, measurer: object) -> bytes:
-        tried.append(stretch.frames)
-        if stretch.frames == range(3) and len(tried) < workers.ATTEMPTS:
+        attempts.append(stretch.frames)
+        if stretch.frames == range(3) and len(attempts) < workers.ATTEMPTS:
             raise RuntimeError("a hiccup")
         if stretch.frames == range(8, 9):
             raise RuntimeError("always")
-        return whole(stretch, measurer)
+        return measured(stretch, measurer)
 
     monkeypatch.setattr(stretches, "_measured", flaky)
-    found = Study(study_file).run(0)
-    assert [one.state for one in found] == ["done", "failed", *STATES[2:]]
-    assert "always" in found[1].problem
-    assert tried.count(range(8, 9)) == workers.ATTEMPTS
+    statuses = Study(study_file).run(0)
+    assert [status.state for status in statuses] == ["done", "failed", *STATES[2:]]
+    assert "always" in statuses[1].problem
+    assert attempts.count(range(8, 9)) == workers.ATTEMPTS
     monkeypatch.undo()
     monkeypatch.setattr(measurers, "STRETCH", 3)
-    assert [one.state for one in Study(study_file).run(0)] == STATES
+    assert [status.state for status in Study(study_file).run(0)] == STATES
 
 
-def test_temporary_files_that_a_killed_run_left_are_deleted(
+def test_temporary_files_of_a_killed_run_are_deleted(
     measured_file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     study = Study(measured_file)
-    left = files.beside(study.folder / "stretches" / "x.npz")
-    left.touch()
+    temporary = files.beside(study.folder / "stretches" / "x.npz")
+    temporary.touch()
     study.run(0)
-    assert left.exists()  # it may be being written
+    assert temporary.exists()  # another run may be writing it
     monkeypatch.setattr(study_module, "OLD_S", -1.0)
     study.run(0)
-    assert not left.exists()
+    assert not temporary.exists()

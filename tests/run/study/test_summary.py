@@ -1,4 +1,4 @@
-"""Means over recordings and their ±, outliers, and the page."""
+"""Means over recordings with their ±, outliers, and the summary page."""
 
 from __future__ import annotations
 
@@ -30,33 +30,33 @@ NOISE, LEVEL, SETUP = 0.03, 0.02, 0.1
 
 def table(seed: int, frames: int = 50, offset: float = 0.0) -> Table:
     """Frames whose sizes scatter by their noise about 6 mm."""
-    draw = np.random.default_rng(seed)
-    made: Table = {
+    rng = np.random.default_rng(seed)
+    table: Table = {
         "frame": np.arange(frames),
         "status": np.array(["ok"] * frames),
         "center_x_mm": np.zeros(frames),
         "center_y_mm": np.zeros(frames),
     }
     for size in SIZES:
-        made[size] = 6 + offset + NOISE * draw.standard_normal(frames)
+        table[size] = 6 + offset + NOISE * rng.standard_normal(frames)
         for part, value in (("noise", NOISE), ("level", LEVEL), ("setup", SETUP)):
-            made[sigma_name(size, part)] = np.full(frames, value)
-        made[sigma_name(size)] = np.full(frames, np.hypot(np.hypot(NOISE, LEVEL), SETUP))
-    return made
+            table[sigma_name(size, part)] = np.full(frames, value)
+        table[sigma_name(size)] = np.full(frames, np.hypot(np.hypot(NOISE, LEVEL), SETUP))
+    return table
 
 
 def status(name: str, **conditions: float | str) -> RecordingStatus:
-    one = StudyRecording(name, Path(name), Path("s.toml"), conditions=conditions)
-    return RecordingStatus(one, "done", "", 50, 50)
+    recording = StudyRecording(name, Path(name), Path("s.toml"), conditions=conditions)
+    return RecordingStatus(recording, "done", "", 50, 50)
 
 
-def summary(name: str, made: Table, **conditions: float | str) -> RecordingSummary:
+def summary(name: str, frames: Table, **conditions: float | str) -> RecordingSummary:
     return RecordingSummary(
-        status(name, **conditions), {"ok": 50}, "entered", "", recording_means(made)
+        status(name, **conditions), {"ok": 50}, "entered", "", recording_means(frames)
     )
 
 
-def test_noise_averages_out_over_recordings_and_the_set_up_does_not() -> None:
+def test_only_noise_averages_out_over_recordings() -> None:
     several = [summary(f"r{k}", table(k), current=80.0) for k in range(5)]
     (group,) = group_recordings(["current"], several)
     mean = group.means["width_mm"]
@@ -68,7 +68,7 @@ def test_noise_averages_out_over_recordings_and_the_set_up_does_not() -> None:
     assert mean.count == 5
 
 
-def test_groups_are_the_recordings_with_the_same_conditions() -> None:
+def test_recordings_are_grouped_by_equal_conditions() -> None:
     several = [
         summary("a", table(1), current=80.0, gas="Ar"),
         summary("b", table(2), current=100.0),
@@ -80,28 +80,28 @@ def test_groups_are_the_recordings_with_the_same_conditions() -> None:
     assert groups[1].conditions == {"current": 100.0}
 
 
-def test_a_frame_far_from_its_recording_is_named() -> None:
-    made = table(5)
-    assert not outlying_frames(status("a"), made)
-    made["width_mm"][7] += 12 * NOISE
-    made["status"][9] = "no-dots"
-    made["height_mm"][9] = np.nan
-    (one,) = outlying_frames(status("a"), made)
-    assert (one.frame, one.measure, one.recording) == (7, "width_mm", "a")
-    made[sigma_name("width_mm", "noise")][7] = 12 * NOISE  # which its ± covers
-    assert not outlying_frames(status("a"), made)
+def test_outlying_frame_is_named() -> None:
+    frames = table(5)
+    assert not outlying_frames(status("a"), frames)
+    frames["width_mm"][7] += 12 * NOISE
+    frames["status"][9] = "no-dots"
+    frames["height_mm"][9] = np.nan
+    (outlier,) = outlying_frames(status("a"), frames)
+    assert (outlier.frame, outlier.measure, outlier.recording) == (7, "width_mm", "a")
+    frames[sigma_name("width_mm", "noise")][7] = 12 * NOISE  # within its ±
+    assert not outlying_frames(status("a"), frames)
 
 
-def test_a_recording_far_from_those_like_it_is_named() -> None:
+def test_outlying_recording_is_named() -> None:
     several = [summary(f"r{k}", table(k)) for k in range(6)]
     assert not outlying_recordings(group_recordings([], several), several)
     several[3] = summary("r3", table(3, offset=0.2))
-    found = outlying_recordings(group_recordings([], several), several)
-    assert {one.recording for one in found} == {"r3"}
-    assert {one.frame for one in found} == {None}
+    outliers = outlying_recordings(group_recordings([], several), several)
+    assert {outlier.recording for outlier in outliers} == {"r3"}
+    assert {outlier.frame for outlier in outliers} == {None}
 
 
-def test_the_page_shows_text_as_text() -> None:
+def test_text_of_the_page_is_escaped() -> None:
     evil = "<script>alert(1)</script>"
     one = summary("a", table(1), gas=evil)
     two = summary("b", table(2), gas="Ar")
@@ -111,17 +111,17 @@ def test_the_page_shows_text_as_text() -> None:
     assert "&lt;script&gt;" in page
 
 
-def test_a_size_that_is_0_everywhere_has_no_plot() -> None:
+def test_size_that_is_0_everywhere_has_no_plot() -> None:
     tables = [table(k) for k in range(2)]
     pages = []
     for depth_mm in (0.1, 0.0):
-        for one in tables:
-            one["depth_mm"] = np.full(len(one["frame"]), depth_mm)
-        both = [summary(f"r{k}", one, current=80.0 + k) for k, one in enumerate(tables)]
-        found = StudySummary(
-            "t", ("current",), tuple(both), group_recordings(["current"], both), ()
+        for frames in tables:
+            frames["depth_mm"] = np.full(len(frames["frame"]), depth_mm)
+        summaries = [summary(f"r{k}", frames, current=80.0 + k) for k, frames in enumerate(tables)]
+        study = StudySummary(
+            "t", ("current",), tuple(summaries), group_recordings(["current"], summaries), ()
         )
-        pages.append(summary_page(found, "today"))
+        pages.append(summary_page(study, "today"))
     assert ["0 everywhere" in page for page in pages] == [False, True]
 
 
@@ -133,14 +133,12 @@ def test_a_size_that_is_0_everywhere_has_no_plot() -> None:
         (6.1234, np.nan, "6.123"),
     ],
 )
-def test_values_have_the_digits_that_their_uncertainty_has(
-    value: float, sigma: float, expected: str
-) -> None:
+def test_values_are_rounded_to_their_uncertainty(value: float, sigma: float, expected: str) -> None:
     assert rounded(value, sigma) == expected
 
 
 @pytest.mark.slow
-def test_a_known_dependence_comes_out(tmp_path: Path) -> None:
+def test_known_dependence_is_recovered(tmp_path: Path) -> None:
     widths = {80: 5.6, 100: 6.2, 120: 6.8}
     for current, width in widths.items():
         text = SCENARIO.format(frames=2).replace("width_mm = 6.66", f"width_mm = {width}")
@@ -153,8 +151,8 @@ def test_a_known_dependence_comes_out(tmp_path: Path) -> None:
     )
     study = Study(path)
     study.run(0)
-    found = [group.means["width_mm"] for group in study.results().groups]
-    for mean, width in zip(found, widths.values(), strict=True):
+    means = [group.means["width_mm"] for group in study.results().groups]
+    for mean, width in zip(means, widths.values(), strict=True):
         assert abs(mean.mean - width) < 2.5 * mean.sigma
-    slope = np.polyfit(list(widths), [mean.mean for mean in found], 1)[0]
+    slope = np.polyfit(list(widths), [mean.mean for mean in means], 1)[0]
     assert slope == pytest.approx(0.03, rel=0.15)

@@ -1,4 +1,4 @@
-"""A small session with something of everything, as the labapp of its day wrote it.
+"""A small session with every kind of content, as written by labapp of its version.
 
 Run as a program, it writes ``version_N.labsession`` for the present version of the session file:
 once a version, before the version is raised, and never again.
@@ -26,8 +26,8 @@ def main() -> None:
     path = Path(__file__).with_name(f"version_{VERSION}.labsession")
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        one = tifffile.imread(SAMPLE / "recording.tif", key=0)
-        tifffile.imwrite(folder / "one.tif", (one * (255 / one.max())).astype("uint8"))
+        frame = tifffile.imread(SAMPLE / "recording.tif", key=0)
+        tifffile.imwrite(folder / "one.tif", (frame * (255 / frame.max())).astype("uint8"))
         with Session.create(folder / path.name, Record(operator="A. Weld", notes="µ")) as session:
             session.set_setup((SAMPLE / "setup.toml").read_text("utf-8"))
             session.calibrate_laser([13.676], [18.561], [7.874])
