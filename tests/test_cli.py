@@ -635,6 +635,14 @@ def test_calibrate_plane_puts_its_values_into_a_setup(labapp: Run, tmp_path: Pat
     found = read_setup(setup).calibration.to_plane(corners)
     np.testing.assert_allclose(found, read_setup(SETUP).calibration.to_plane(corners), atol=0.15)
     assert setup.read_text().startswith(SETUP.read_text().split("[image_calibration]")[0])
+    other = tmp_path / "other.png"
+    cv2.imwrite(str(other), np.zeros((240, 320), np.uint8))
+    code, _, complained = labapp(
+        "reconstruct", other, "--setup", setup, "--out", tmp_path / "results"
+    )
+    assert code == 2
+    assert "320×240" in complained
+    assert "480×640" in complained
 
 
 def test_calibrate_plane_takes_labapp_s_own_target_and_prints_what_it_writes(
