@@ -639,6 +639,14 @@ def test_calibrate_plane_writes_its_values_to_the_setup(labapp: Run, tmp_path: P
         corners_mm, read_setup(SETUP).calibration.to_plane(corners), atol=0.15
     )
     assert setup.read_text().startswith(SETUP.read_text().split("[image_calibration]")[0])
+    other = tmp_path / "other.png"
+    cv2.imwrite(str(other), np.zeros((240, 320), np.uint8))
+    code, _, complained = labapp(
+        "reconstruct", other, "--setup", setup, "--out", tmp_path / "results"
+    )
+    assert code == 2
+    assert "320×240" in complained
+    assert "480×640" in complained
 
 
 def test_calibrate_plane_assumes_the_target_of_labapp(labapp: Run, tmp_path: Path) -> None:

@@ -220,7 +220,7 @@ def _view(path: Path, calibration: dict[str, Any], camera: dict[str, Any]) -> Ca
     points: dict[str, Any] = {
         key: tuple(value) if isinstance(value, list) else value
         for key, value in calibration.items()
-        if not key.endswith(ENDINGS)
+        if not key.endswith(ENDINGS) and key != "frame_px"
     }
     try:
         return CameraView(**points, **size, lens=Lens(**bent) if bent else None)

@@ -23,7 +23,14 @@ from labapp.config.bench_check import (
 )
 from labapp.config.ray_file import with_rays
 from labapp.config.setup_keys import OPTIONAL, SECTIONS, rules_for
-from labapp.config.toml_keys import check_keys, parse_toml, read_text, shown, unknown_key
+from labapp.config.toml_keys import (
+    are_numbers,
+    check_keys,
+    parse_toml,
+    read_text,
+    shown,
+    unknown_key,
+)
 from labapp.core.bench_check.check import BenchCheck
 from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.coordinates import ImageCalibration, Lens
@@ -38,6 +45,7 @@ from labapp.core.geometry.uncertainty import (
     RigUncertainty,
     covariance_of,
 )
+from labapp.core.values import FloatArray
 from labapp.errors import InputError, os_errors_as_input
 from labapp.files import write_atomically
 
@@ -71,6 +79,29 @@ class Setup:
     def warnings(self) -> tuple[str, ...]:
         """Values that are unusual for a bench, one clause each (`implausible_values`)."""
         return implausible_values(self.rig)
+
+    def require_size(self, shape: tuple[int, ...], name: str) -> None:
+        """Raise `InputError` if frames have another size than the calibration picture.
+
+        Parameters
+        ----------
+        shape
+            (rows, columns) of the frames.
+        name
+            Name of a frame, for the error.
+        """
+        calibrated = self._frame_px
+        height, width = shape
+        if calibrated not in (None, (width, height)):
+            wanted = "{}×{} px, the size of the calibration picture (frame_px in the set-up): "
+            advice = "calibrate the imaging plane with a picture of the same size as the frames"
+            raise InputError(
+                name, "size", f"{width}×{height} px", wanted.format(*calibrated) + advice
+            )
+
+    @functools.cached_property
+    def _frame_px(self) -> tuple[int, int] | None:
+        return frame_px_of(self.text)
 
     @property
     def line_rig(self) -> LineRig | None:
@@ -195,7 +226,7 @@ def updated_setup(
 _CALIBRATED_KEYS = frozenset(key.partition("[")[0] for key in CALIBRATED)
 _SHARED = {
     "laser": ("angle_distance_correlation",),
-    "image_calibration": ("points_covariance_px2",),
+    "image_calibration": ("points_covariance_px2", "frame_px"),
 }
 
 
@@ -213,6 +244,26 @@ def lens_of(text: str) -> Lens | None:
     if check_keys(Path(), "camera_lens", lens, SECTIONS["camera_lens"]):
         return None
     return Lens(**{name: tuple(value) for name, value in lens.items()})
+
+
+def three_points(text: str) -> FloatArray | None:
+    """(u, v) of O′ and the points on the axes in the text of a setup, shape (3, 2), px.
+
+    The text may be incomplete; None if it does not have all three.
+    """
+    keys = _section(text, "image_calibration")
+    points = [keys.get(name) for name in ("origin_px", "x_axis_px", "z_axis_px")]
+    return np.array(points, float) if all(are_numbers(point, 2) for point in points) else None
+
+
+def frame_px_of(text: str) -> tuple[int, int] | None:
+    """(width, height) of the calibration picture in the text of a setup, which may be incomplete.
+
+    None if it is unknown.
+    """
+    size = _section(text, "image_calibration").get("frame_px")
+    rule = SECTIONS["image_calibration"]["frame_px"]
+    return (size[0], size[1]) if rule.accepts(size) and isinstance(size, list) else None
 
 
 def _section(text: str, name: str) -> dict[str, Any]:
@@ -267,7 +318,12 @@ def _keeping_sigmas(
 ) -> dict[str, dict[str, object]]:
     """Values to set, with the uncertainties in the file, which apply again without the check."""
     return {
-        section: {k: v for k, v in now.get(section, {}).items() if k.endswith(ENDINGS)} | dict(keys)
+        section: {
+            key: value
+            for key, value in now.get(section, {}).items()
+            if key.endswith(ENDINGS) or key == "frame_px"
+        }
+        | dict(keys)
         for section, keys in values.items()
     }
 
@@ -469,6 +525,7 @@ def _calibration(values: dict[str, Any]) -> ImageCalibration:
     half = np.array([plane["width_mm"], plane["height_mm"]]) / 2
     lens = Lens(**{key: tuple(pair) for key, pair in lens_keys.items()}) if lens_keys else None
     keys = _without_sigmas(values["image_calibration"])
+    keys.pop("frame_px", None)
     if "homography" in keys:
         made = ImageCalibration(np.array(keys["homography"], float), lens)
     else:

@@ -101,6 +101,11 @@ def _is_points_covariance(value: object) -> bool:
 
 _OF_PICTURE = {
     **_sigmas("image_calibration"),
+    "frame_px": Rule(
+        "[width, height] of the calibration picture, two whole numbers above 0 (px)",
+        lambda value: are_numbers(value, 2) and all(type(n) is int and n > 0 for n in value),
+        required=False,
+    ),
     "points_covariance_px2": Rule(
         "a covariance matrix, 6 x 6 (px²): u and v of O′, of the point on O′X′, of that on O′Z′",
         _is_points_covariance,

@@ -15,8 +15,14 @@ from labapp.media.cameras import CameraFrame
 
 MOST = 32
 """Length of the queue. After a frame that was measured without tracking, the queued frames are
-measured in order, however old, as the newest would be too far from it. If one of these also has to
-be measured without tracking, the newest frame is next, so that the delay does not grow."""
+measured in order, although they are old, as the newest would be too far from it. If one of these
+also has to be measured without tracking, or if together they take longer than `CATCH_UP_S`, the
+newest frame is next, so that the delay does not grow."""
+
+CATCH_UP_S = 2.0
+"""Longest time spent on frames in order, and largest delay of other queued frames, s. The frames
+in order usually take 0.2 s; without enough processor time they would take minutes. A shorter limit
+would leave too few tracked frames to recover the track from after the jump to the newest."""
 
 SWING_S = 0.0125
 """Smallest step until ``2 * MOST`` frames in a row were tracked, s: these then cover a full
@@ -41,17 +47,25 @@ class FrameQueue:
         self._last: CameraFrame | None = None
         self._interval_s = self._took_s = 0.0
         """Running means of the frame interval and of the measuring time."""
-        self._given_s = 0.0
-        """Arrival of the frame being measured."""
+        self._given: CameraFrame | None = None
+        """Frame being measured."""
         self._in_order = self._followed = 0
         """Number of queued frames to be measured in order, and of frames tracked in a row."""
         self._is_behind = self._is_old = False
         """Whether the queue overflowed, and whether the frame being measured is one in order."""
+        self._catching_up_s = 0.0
+        """Measuring time of the frames in order so far."""
+        self._skipped = 0
 
     @property
     def every(self) -> int:
         """Step between measured frames."""
         return self._every
+
+    @property
+    def skipped(self) -> int:
+        """Number of frames passed over for a newer one, in addition to those between steps."""
+        return self._skipped
 
     def put(self, frame: CameraFrame) -> None:
         """Queue a frame of the camera if it is due."""
@@ -75,29 +89,36 @@ class FrameQueue:
             if not self._waiting:
                 self._in_order, self._is_behind = 0, False
                 return None
+            assert self._last is not None
             self._is_old = self._in_order > 0
-            if self._is_old or not self._is_behind:
+            delay_s = self._last.arrived_s - self._waiting[0].arrived_s
+            if self._is_old or not (self._is_behind or delay_s > CATCH_UP_S):
                 self._in_order = max(self._in_order - 1, 0)
                 frame = self._waiting.popleft()
             else:
+                frame = self._last
                 self._is_behind = False
-                frame = self._waiting.pop()
+                self._due = frame.number + self._every
                 self._waiting.clear()
-            self._given_s = frame.arrived_s
+            given, self._given = self._given, frame
+            if given is not None:
+                self._skipped += max(frame.number - given.number - self._every, 0)
             return frame
 
     def done(self, followed: bool, took_s: float) -> None:
         """Report whether the frame was tracked, and how long it took, s."""
         with self._turn:
+            self._catching_up_s = self._catching_up_s + took_s if self._is_old else 0.0
             if not followed:
                 self._followed = 0
-                far = self._waiting and self._waiting[0].arrived_s - self._given_s > FAR_S
-                if far or self._is_old:
+                if self._is_old or self._is_far():
                     # The queued frames cannot be tracked from this one, or are older still.
                     self._waiting.clear()
                     self._every, self._due, self._took_s = self._steps(SWING_S), 0, 0.0
                 self._in_order = len(self._waiting)
                 return
+            if self._catching_up_s > CATCH_UP_S:
+                self._in_order = 0
             self._followed += 1
             self._took_s = _mean(self._took_s, min(took_s, FAR_S))
             least_s = self._took_s / SHARE
@@ -107,6 +128,13 @@ class FrameQueue:
             grown_s = EASE * self._interval_s * (self._every - 1)
             if wanted > self._every or (wanted < self._every and least_s < grown_s):
                 self._every = wanted
+
+    def _is_far(self) -> bool:
+        """Whether the next queued frame is too far from the one that was measured."""
+        given = self._given
+        if given is None or not self._waiting:
+            return False
+        return self._waiting[0].arrived_s - given.arrived_s > FAR_S
 
     def _steps(self, least_s: float) -> int:
         """Return the step, in frames, that is at least ``least_s`` or `FAR_S`."""

@@ -55,7 +55,8 @@ class LiveWatch:
         """Alarms; sizes of the last frames, and rate of measuring."""
         self._name, self._scheme, self._on_event = name, settings.scheme, on_event
         self._measuring = LiveMeasuring(setup, settings, bit_depth)
-        self._queue = FrameQueue()
+        self.queue = FrameQueue()
+        """Frames to be measured."""
         self._newest: deque[LiveResult] = deque(maxlen=1)
         self._scene: deque[Scene] = deque(maxlen=1)
         self._turn = threading.Lock()
@@ -69,7 +70,7 @@ class LiveWatch:
 
     def take(self, frame: CameraFrame) -> None:
         """Queue a frame of the camera; never blocks."""
-        self._queue.put(frame)
+        self.queue.put(frame)
 
     def close(self) -> None:
         """End the measuring, and the streams. May be called twice."""
@@ -84,7 +85,7 @@ class LiveWatch:
 
     def next_frame(self) -> CameraFrame | None:
         """Return the next frame to be measured; None if there is none (`FrameQueue`)."""
-        frame = self._queue.next()
+        frame = self.queue.next()
         if frame is None:
             self._check_silence()
         return frame
@@ -105,7 +106,7 @@ class LiveWatch:
                 self._raise_silence(f"Nothing is measured any more: {error}")
             raise
         is_followed = result is not None and result.track_lost is None
-        self._queue.done(is_followed, time.monotonic() - began_s)
+        self.queue.done(is_followed, time.monotonic() - began_s)
         if result is not None:
             for sink in self._sinks:
                 sink(result)

@@ -93,7 +93,7 @@ class ColdMeasurer:
 
     def _submit(self, number: int) -> Future[FrameResult]:
         """Read a frame in this process, and measure it in the pool, or at once if there is none."""
-        frame = _read(self.read, number, self.settings)
+        frame = _read(self.read, number, self.setup, self.settings)
         if isinstance(frame, FrameResult):
             return _here(lambda: frame)
         submit = _here if self.pool is None else self.pool.submit
@@ -152,12 +152,20 @@ def _here(work: Callable[..., T], *given: Any) -> Future[T]:
     return future
 
 
-def _read(read: Read, number: int, settings: Settings) -> Frame | FrameResult:
-    """Return the frame, or its result if it cannot be read."""
+def _read(read: Read, number: int, setup: Setup, settings: Settings) -> Frame | FrameResult:
+    """Return the frame, or its result if it cannot be read.
+
+    Raises
+    ------
+    InputError
+        If its size is not that of the picture with which the set-up was calibrated.
+    """
     try:
-        return read(number)
+        frame = read(number)
     except InputError as error:
         return FrameResult(number, None, Measurement("unreadable", str(error), settings.scheme))
+    setup.require_size(frame.image.shape, f"frame {number}")
+    return frame
 
 
 def _cold(
@@ -228,7 +236,9 @@ class LineFollower:
 
         tracker, numbers = LineTracker(), iter(frames)
         while chosen := list(islice(numbers, FOLLOWED_AT_ONCE)):
-            begun = [(number, _read(self.read, number, self.settings)) for number in chosen]
+            begun = [
+                (number, _read(self.read, number, self.setup, self.settings)) for number in chosen
+            ]
             seen = [frame for _, frame in begun if isinstance(frame, Frame)]
             time_s = np.array([np.nan if one.time_s is None else one.time_s for one in seen])
             step = float(np.median(np.diff(time_s))) if len(seen) > 1 else 0.0
@@ -288,7 +298,7 @@ class WarmMeasurer:
             if step is not None and before != step:
                 warm.skip()
             last, step = number, before
-            frame = _read(self.read, number, self.settings)
+            frame = _read(self.read, number, self.setup, self.settings)
             if isinstance(frame, FrameResult):
                 warm.skip()
                 yield frame

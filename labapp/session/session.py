@@ -324,9 +324,11 @@ class Session(SessionContents):
 
         _ = found.image_calibration  # raises ValueError
         readings = PlanePicture(unit_mm, found, self._pictures.add(name, image))
+        keys, (height, width) = found.setup_keys, image.shape
+        keys["image_calibration"]["frame_px"] = [width, height]
         values: dict[Key, Any] = {
             ("plane-calibration", NO_FRAME): readings,
-            ("setup", NO_FRAME): self._updated_setup(found.setup_keys),
+            ("setup", NO_FRAME): self._updated_setup(keys),
         }
         self._documents.change("imaging-plane calibration", values)
 

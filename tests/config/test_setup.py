@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from labapp.config.setup import read_setup, update_setup
+from labapp.config.setup import frame_px_of, read_setup, update_setup
 from labapp.core.geometry.rig import Laser
 from labapp.core.geometry.uncertainty import (
     ANGLE,
@@ -529,3 +529,25 @@ def test_points_of_a_homography_are_those_of_their_uncertainties(path: Path) -> 
     uncertainty = read_setup(path).rig.uncertainty
     assert uncertainty is not None
     assert (uncertainty.axes.x_mm, uncertainty.axes.z_mm) == (30.0, 20.0)
+
+
+def test_changed_points_discard_the_size_of_the_calibration_picture(
+    path: Path,
+) -> None:
+    update_setup(path, {"image_calibration": {"frame_px": [640, 480]}})
+    setup = read_setup(path)
+    setup.require_size((480, 640), "frame 0")
+    with pytest.raises(InputError) as refused:
+        setup.require_size((240, 320), "frame 0")
+    assert "320×240" in str(refused.value)
+    assert "640×480" in str(refused.value)
+    update_setup(path, {"image_calibration": {"origin_px": [45.0, 590.0]}})
+    assert frame_px_of(path.read_text()) is None
+    read_setup(path).require_size((240, 320), "frame 0")
+
+
+@pytest.mark.parametrize("size", [[640], [640, 0], [640.5, 480], "640×480", True])
+def test_wrong_size_of_the_calibration_picture_is_rejected(path: Path, size: object) -> None:
+    update_setup(path, {"image_calibration": {"frame_px": size}})
+    with pytest.raises(InputError, match="frame_px"):
+        read_setup(path)

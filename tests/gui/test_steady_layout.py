@@ -19,6 +19,7 @@ from PySide6.QtWidgets import (
 from pytestqt.qtbot import QtBot
 
 from labapp.gui.pages import PAGES
+from labapp.gui.pages.dots import DotsPage
 from labapp.gui.pages.setup.view import BENCH_TAB, SAFETY_TAB
 from labapp.gui.shell.window import MainWindow
 from labapp.gui.widgets.fields import Field
@@ -211,6 +212,32 @@ def test_primary_buttons_are_visible_on_a_small_screen(
         if each.text().replace("&", "") == words and each.isVisible()
     ]
     assert [each.visibleRegion().boundingRect() for each in buttons] == [buttons[0].rect()]
+
+
+def test_selected_dot_scrolls_its_buttons_into_view(opened: MainWindow, qtbot: QtBot) -> None:
+    """As on a screen of 1024 × 700 px at 150 %; a choice in the panel leaves it where it is."""
+    opened.resize(683, 467)
+    opened.show_step("dots")
+    page = opened.page
+    assert isinstance(page, DotsPage)
+    qtbot.waitUntil(lambda: len(page.editor.dots_px) > 1)
+    panel = page.dots_panel
+
+    def in_view() -> list[bool]:
+        let_draw()
+        return [
+            each.visibleRegion().boundingRect() == each.rect()
+            for each in map(panel.buttons.get, ("Delete", "In doubt", "Blocked"))
+        ]
+
+    assert not all(in_view())
+    panel.rows.setFocus()
+    panel.rows.selectRow(0)
+    assert page.editor.selection.size
+    assert not all(in_view())
+    page.setFocus()
+    QTest.keyClick(page.view, Qt.Key.Key_Period)
+    assert all(in_view())
 
 
 def test_panel_does_not_scroll_when_a_clicked_button_is_disabled(qtbot: QtBot) -> None:

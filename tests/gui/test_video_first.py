@@ -11,6 +11,7 @@ from PySide6.QtCore import QMimeData, QPointF, Qt, QUrl
 from PySide6.QtGui import QDropEvent
 from pytestqt.qtbot import QtBot
 
+from labapp.config.setup import update_setup
 from labapp.errors import InputError
 from labapp.gui import dialogs
 from labapp.gui.drafts import drafts, is_draft
@@ -228,6 +229,35 @@ def test_setup_for_another_frame_size_is_used_without_measuring(
     assert session.result(0) is None
     assert window.page is not None
     assert "400×640 px" in window.page.answer.text()
+
+
+@pytest.mark.parametrize("calibrated", [None, [480, 640]])
+def test_setup_file_for_another_frame_size_causes_a_warning(
+    window: MainWindow,
+    hand: CountingHand,
+    bench: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    calibrated: list[int] | None,
+):
+    """Without the size in the file, by its points, which would lie outside the frames."""
+    if calibrated is not None:
+        update_setup(bench / "setup.toml", {"image_calibration": {"frame_px": calibrated}})
+    small = bench / "small.png"
+    cv2.imwrite(str(small), cv2.imread(str(bench / "recording" / "0.png"))[:320, :240])
+    hand.drop(small)
+    monkeypatch.setattr(dialogs, "ask_setup", lambda *_: bench / "setup.toml")
+    window.do("load_setup")
+    hand.settle()
+    session, page = window.workspace.session, window.page
+    assert session is not None
+    assert page is not None
+    assert session.setup_problems == ()
+    assert session.result(0) is None
+    assert "240×320 px" in page.answer.text()
+    assert ("480×640 px" in page.answer.text()) == (calibrated is not None)
+    if calibrated is not None:
+        with pytest.raises(InputError, match="480×640"):
+            session.measure([0])
 
 
 def test_setup_of_another_session_includes_its_calibrations(

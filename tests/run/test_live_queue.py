@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from labapp.media.cameras import CameraFrame
-from labapp.run.live_queue import MOST, SHARE, SWING_S, FrameQueue
+from labapp.run.live_queue import CATCH_UP_S, MOST, SHARE, SWING_S, FrameQueue
 
 RATE_HZ = 200.0
 IMAGE = np.zeros((1, 1), np.uint8)
@@ -110,6 +110,22 @@ def test_slower_measuring_causes_no_long_delay() -> None:
     assert max(frame.age_s for frame in measured if frame.number > 3000) < 0.1
     measured = measure(queue, range(5000, 9000), 0.005)
     assert set(np.diff([frame.number for frame in measured if frame.number > 8000])) == {2}
+
+
+@pytest.mark.parametrize("took_s", [0.12, 0.4, 2.3])
+def test_old_frames_are_skipped_and_counted_without_processor_time(took_s: float) -> None:
+    """Frames after one that was measured without tracking would be 32 times ``took_s`` old."""
+    queue = FrameQueue()
+    done = measure(queue, range(20_000), took_s, cold=frozenset({1}))
+    assert max(one.age_s for one in done) < max(COLD_S, took_s) + CATCH_UP_S + took_s
+    passed = done[-1].number - done[0].number + 1 - len(done)
+    assert 0 < queue.skipped <= passed
+
+
+def test_no_frame_is_skipped_at_a_constant_step() -> None:
+    queue = FrameQueue()
+    measure(queue, range(1000), 0.002)
+    assert queue.skipped == 0
 
 
 def test_frames_are_followed_again_after_a_long_delay() -> None:

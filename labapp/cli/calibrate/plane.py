@@ -52,7 +52,7 @@ def calibrate_plane(
     """Calibrate the imaging plane, and with a board the lens, from pictures (§5.1)."""
     from labapp.core.calibration.plane_calibration import PlaneCalibration
 
-    found = _calibrated(images, unit_mm, board, setup)
+    found, (height, width) = _calibrated(images, unit_mm, board, setup)
     if isinstance(found, PlaneCalibration):
         _show_target(found, unit_mm)
     elif square_mm is not None:
@@ -66,13 +66,21 @@ def calibrate_plane(
     )
     for line in found.fit_lines():
         typer.echo(line)
-    write_values(setup, found.setup_keys)
+    keys = found.setup_keys
+    keys["image_calibration"]["frame_px"] = [width, height]
+    write_values(setup, keys)
 
 
 def _calibrated(
     images: Sequence[Path], unit_mm: float, board: str | None, setup: Path | None
-) -> Calibration:
-    """Calibrate from pictures; for pictures of the target, with the lens in the setup file."""
+) -> tuple[Calibration, tuple[int, ...]]:
+    """Calibrate from pictures, for those of the target with the lens in the setup file.
+
+    Returns
+    -------
+    tuple
+        The calibration, and (rows, columns) of the first picture.
+    """
     from labapp.config.setup import lens_of
     from labapp.core.calibration.boards import A_BOARD, parse_board
     from labapp.core.calibration.imaging_plane import calibrate_imaging_plane
@@ -88,7 +96,7 @@ def _calibrated(
     lens = lens_of(setup.read_text("utf-8")) if setup is not None and setup.is_file() else None
     settings = PlaneCalibrationSettings(unit_mm=unit_mm)
     try:
-        return calibrate_imaging_plane(pictures, settings, named, lens)
+        return calibrate_imaging_plane(pictures, settings, named, lens), pictures[0].shape
     except CannotMeasure as answer:
         if answer.status != "no-target":
             shown = "a picture in which the board is seen, flat and sharp"

@@ -11,6 +11,7 @@ from typing import Any
 from PySide6.QtCore import QObject, Signal
 from PySide6.QtWidgets import QWidget
 
+from labapp.config.setup import frame_px_of, three_points
 from labapp.errors import InputError
 from labapp.gui.shell.steps import calibrations_in_use
 from labapp.gui.widgets.buttons import button
@@ -18,6 +19,7 @@ from labapp.gui.widgets.fields import ChoiceField, Field, FieldForm, NumberField
 from labapp.gui.widgets.labels import selectable_label, show_words
 from labapp.gui.widgets.layouts import hbox
 from labapp.media.cameras import CameraError, CameraSettings, Feed, Limits, Region
+from labapp.session.record import Recording
 from labapp.session.session import Session
 
 NUMBERS = {
@@ -234,7 +236,12 @@ def setting_text(value: object) -> str:
 
 
 def calibrated_px(session: Session) -> tuple[int, int] | None:
-    """(rows, columns) of the picture used to calibrate the imaging plane; None if unknown."""
+    """(rows, columns) of the picture used to calibrate the imaging plane; None if unknown.
+
+    Sessions of earlier versions have it in the stored picture only.
+    """
+    if size := frame_px_of(session.setup_text):
+        return size[1], size[0]
     kept = session.plane_calibration
     if kept is None or not calibrations_in_use(session)[1]:
         return None
@@ -243,6 +250,20 @@ def calibrated_px(session: Session) -> tuple[int, int] | None:
     except InputError:
         return None
     return rows, columns
+
+
+def size_warning(session: Session, recording: Recording) -> str:
+    """Warning if a set-up does not match the size of the frames, else ""."""
+    shape, calibrated = (recording.rows, recording.columns), calibrated_px(session)
+    points = three_points(session.setup_text)
+    if calibrated is None and points is not None and (points > shape[::-1]).any():
+        u, v = points.max(axis=0)
+        return (
+            f"The set-up's image calibration has points up to ({u:.0f}, {v:.0f}) px, and frames "
+            f"have {recording.columns}×{recording.rows} px: was it made with larger pictures? "
+            "Calibrate with a picture of the same size"
+        )
+    return other_size(calibrated, shape)
 
 
 def other_size(calibrated: tuple[int, int] | None, shape: tuple[int, int]) -> str:

@@ -20,7 +20,7 @@ from labapp.run.alarms import Alarm
 from labapp.run.limits import Limits, Size, Standing, sizes_of, standing
 from labapp.run.live_measuring import LiveResult
 from labapp.run.live_trend import Pace
-from labapp.text import marked_setup_words, setup_words
+from labapp.text import marked_setup_words, pluralize, setup_words
 
 DECIMALS = 3
 """Number of decimals of live figures in mm."""
@@ -103,8 +103,16 @@ def standing_text(stands: Standing, limits: Limits, name: str) -> str:
     }[stands]
 
 
-def pace_text(result: LiveResult | None, pace: Pace, came_hz: float | None, age_s: float) -> str:
-    """Text of the rate of measurement, and the reason if there is no figure."""
+def pace_text(
+    result: LiveResult | None, pace: Pace, came_hz: float | None, age_s: float, skipped: int
+) -> str:
+    """Text of the rate of measurement, and the reason if there is no figure.
+
+    Parameters
+    ----------
+    skipped
+        Number of frames that were not measured because a newer one was waiting.
+    """
     if result is None:
         return FIRST
     parts = []
@@ -119,6 +127,8 @@ def pace_text(result: LiveResult | None, pace: Pace, came_hz: float | None, age_
     parts.append(f"{pace.measured_hz:.1f}{came} frames/s measured")
     if age_s <= OLD_S:
         parts[-1] += f"; {age_s:.2f} s old"
+    if skipped:
+        parts[-1] += f"; {pluralize(skipped, 'frame')} skipped to keep up"
     return " ".join(parts)
 
 

@@ -386,9 +386,11 @@ class LiveView(QObject):
         self.bar.show_status(live)
         self.counts.setText(live.counts_text())
         if live.watch is not None:
-            pace, came_hz = live.watch.trend.pace(), live.rate_hz()
+            pace, skipped = live.watch.trend.pace(), live.watch.queue.skipped
             self._show_figures(live.watch)
-            self.figures.words.setText(pace_text(self._result, pace, came_hz, self._age_s))
+            self.figures.words.setText(
+                pace_text(self._result, pace, live.rate_hz(), self._age_s, skipped)
+            )
             checked = "" if live.setup is None else live.setup.checked
             self.figures.setup_words.setText(live_setup_words(self._result, checked))
             self.canvas.show_status(live.watch)

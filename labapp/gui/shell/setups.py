@@ -81,7 +81,7 @@ class Setups(QObject):
 
     def _use(self, take: Callable[[Session], None], name: str) -> None:
         """Use a set-up, and measure with it unless it was calibrated for another frame size."""
-        from labapp.gui.live.camera_fields import calibrated_px, other_size
+        from labapp.gui.live.camera_fields import size_warning
 
         workspace = self.workspace
         if not workspace.attempt(take, CAUSE, self.answered.emit):
@@ -94,7 +94,7 @@ class Setups(QObject):
         recording = session.recording
         if recording is None or session.missing_recording is not None:
             return
-        if unlike := other_size(calibrated_px(session), (recording.rows, recording.columns)):
+        if unlike := size_warning(session, recording):
             workspace.say_wrong(CAUSE, unlike)
             self.answered.emit(f"{PROBLEM} {unlike}")
             return

@@ -73,7 +73,7 @@ def setup_to_do(problems: Iterable[InputError]) -> str:
     for problem in problems:
         part, _, key = problem.field.partition(".")
         if part == "image_calibration":
-            calibrate = ["calibrate the picture (step Imaging plane)"]
+            calibrate = ["calibrate the picture (step 3)"]
         elif part not in PARTS:
             wrong.append(f"take out {problem.field}: {problem.expected}")
         elif problem.value == "missing":

@@ -102,7 +102,7 @@ class DynamicsWindow(ToolWindow):
         self.tabs = QTabWidget()
         for words, parts in (
             ("Spectrum", (self.peak_words, (self.spectrum, 1))),
-            ("Modes", ((self.modes, 3), (self.shape, 4), hbox(self.play_button, 1))),
+            ("Modes", ((self.modes, 4), (self.shape, 7), hbox(self.play_button, 1))),
             (
                 "Events",
                 (self.event_words, (self.series, 3), (self.events, 2), hbox(self.frame_button, 1)),

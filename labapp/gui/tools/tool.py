@@ -25,7 +25,7 @@ from labapp.simulation.parallel import Progress, low_priority
 if TYPE_CHECKING:
     from labapp.gui.shell.files import Files
 
-SIZE_PX = (1120, 700)
+SIZE_PX = (1120, 760)
 PART_OF_SCREEN = 0.9
 FORM_PX = 336
 """Width of the form: a name and two numbers."""

@@ -79,6 +79,16 @@ def scrolled(widget: QWidget, name: str = "") -> QScrollArea:
     return area
 
 
+def reveal(*widgets: QWidget) -> None:
+    """Scroll the area around widgets until they are in view, the first one in any case."""
+    area = widgets[0].parentWidget()
+    while area is not None and not isinstance(area, QScrollArea):
+        area = area.parentWidget()
+    if area is not None:
+        for widget in reversed(widgets):
+            area.ensureWidgetVisible(widget, 0, 0)
+
+
 class Group(QWidget):
     """Parts under a heading; ``column`` is its layout."""
 

@@ -98,16 +98,17 @@ def test_figures_show_their_verdict_and_unknown_if_not_measured():
 
 
 def test_pace_text_explains_missing_figures_and_the_rate():
-    assert pace_text(None, Pace(0.0, 0, 0), 60.0, 0.0) == FIRST
+    assert pace_text(None, Pace(0.0, 0, 0), 60.0, 0.0, 0) == FIRST
     assert (
-        pace_text(live_result(), Pace(38.0, 76, 0), 60.0, 0.04)
+        pace_text(live_result(), Pace(38.0, 76, 0), 60.0, 0.04, 0)
         == "38.0 of 60.0 frames/s measured; 0.04 s old"
     )
-    assert pace_text(live_result(), Pace(38.0, 76, 2), None, 0.0).startswith(
+    assert pace_text(live_result(), Pace(38.0, 76, 2), None, 0.0, 0).startswith(
         "◆ 2 of the last 76 frames could not be measured. 38.0 frames/s measured"
     )
-    dark = pace_text(live_result(DARK), Pace(0.0, 3, 3), 60.0, 5.2)
+    dark = pace_text(live_result(DARK), Pace(0.0, 3, 3), 60.0, 5.2, 1)
     assert dark.startswith("▲ Not measured (no-dots): it is dark. ▲ The figures are 5 s old.")
+    assert dark.endswith("1 frame skipped to keep up")
 
 
 def test_live_figures_show_the_status_of_the_setup():

@@ -10,7 +10,7 @@ from PySide6.QtGui import QKeyEvent
 from PySide6.QtWidgets import QGridLayout, QSlider
 
 from labapp.gui.dialogs import ask_file, ask_folder, ask_recording
-from labapp.gui.live.camera_fields import calibrated_px, other_size
+from labapp.gui.live.camera_fields import size_warning
 from labapp.gui.live.view import LiveView
 from labapp.gui.pages.capture.foot_switch import FootSwitchPanel
 from labapp.gui.pages.capture.import_choice import ImportChoice
@@ -195,7 +195,7 @@ class CapturePage(Page):
         for row, (name, words) in enumerate(rows):
             self.facts.addWidget(plain_label(f"{name}:"), row, 0)
             self.facts.addWidget(selectable_label(words), row, 1)
-        unlike = other_size(calibrated_px(session), (recording.rows, recording.columns))
+        unlike = size_warning(session, recording)
         warnings = (*recording.warnings, *[unlike] * bool(unlike))
         for row, sentence in enumerate(warnings, len(rows)):
             self.facts.addWidget(selectable_label(f"⚠ {sentence}"), row, 0, 1, 2)

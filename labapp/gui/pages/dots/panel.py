@@ -34,7 +34,7 @@ from labapp.gui.widgets.labels import (
     plain_label,
     plain_tip,
 )
-from labapp.gui.widgets.layouts import Group, vbox
+from labapp.gui.widgets.layouts import Group, reveal, vbox
 from labapp.gui.widgets.result_table import ResultTable
 from labapp.gui.widgets.tables import ReadTable
 
@@ -84,12 +84,13 @@ class DotsPanel(QWidget):
         self.rows.addActions(edits)
         vbox(
             *(self.seen, heading("Correct"), self.chosen, self._sites()),
-            self._buttons(edits),
-            *(heading("Following frames"), form, self._buttons(frames), self.carried),
+            button_grid(edits, self.buttons),
+            *(heading("Following frames"), form, button_grid(frames, self.buttons), self.carried),
             *(heading("Fit"), self.fit, heading("Rows"), self.rows),
             *(heading("Detector"), self._detector(), 1),
             of=self,
         )
+        self.edit_buttons = [self.buttons[action.text()] for action in edits]
 
     def show_frame(
         self, seen: str, why: str, fit: Sequence[ResultRow], rows: Sequence[RowLine] | None
@@ -106,6 +107,10 @@ class DotsPanel(QWidget):
         self.rows.choose(rows)
         self.row.set_value(site[0] or None)
         self.column.set_value(site[1] or None)
+
+    def reveal_edits(self) -> None:
+        """Scroll to the buttons of the edits, which may be out of view on a small screen."""
+        reveal(*self.edit_buttons)
 
     def show_unmet_needs(self, unmet_need: Mapping[str, str]) -> bool:
         """Disable the buttons of edits with unmet needs, given by the buttons' texts.
@@ -201,9 +206,6 @@ class DotsPanel(QWidget):
             form.add(field)
             self.numbers.append(field)
         return form
-
-    def _buttons(self, actions: Sequence[QAction]) -> QGridLayout:
-        return button_grid(actions, self.buttons)
 
 
 def button_grid(actions: Sequence[QAction], buttons: dict[str, QToolButton]) -> QGridLayout:

@@ -222,7 +222,10 @@ class DotsPage(Page):
             site = editor.rows[0], 0
         chosen = presenter.chosen_words(editor.correction, editor.selection.tolist())
         words = self.hand.asked or chosen
+        is_new = words != self.dots_panel.chosen.text()
         self.dots_panel.show_chosen(words, editor.rows, site)
+        if is_new and editor.selection.size and self.view.hasFocus():
+            self.dots_panel.reveal_edits()  # not if the pointer is in the panel
         self._show_unmet_needs()
 
     def _show_unmet_needs(self) -> None:

@@ -265,7 +265,11 @@ def in_use(session: Session) -> tuple[ResultRow, ...]:
     values, sigmas = [np.nan] * 3, [None] * 3
     kept = session.plane_calibration if calibrations_in_use(session)[1] else None
     keys = tomllib.loads(session.setup_text).get("image_calibration", {})
-    keys = {name: value for name, value in keys.items() if not name.endswith(ENDINGS)}
+    keys = {
+        name: value
+        for name, value in keys.items()
+        if not name.endswith(ENDINGS) and name != "frame_px"
+    }
     lens = lens_of(session.setup_text)
     try:
         calibration = (

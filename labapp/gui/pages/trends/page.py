@@ -228,7 +228,7 @@ class TrendsPage(Page):
         choices = [("", "none"), *((q.key, q.label) for q in QUANTITIES)]
         self.of = ChoiceField("Spectrum of", choices, tooltip="Shows oscillations of a measure")
         self.of.edited.connect(lambda key: self._set_options(spectrum_of=key))
-        self.spectrum_words = Message(2)
+        self.spectrum_words = Message(3)
         of = hbox(self.of.label, (self.of, 1))
         more = button(
             "Pool over time…",
