@@ -513,7 +513,7 @@ def test_an_algorithm_without_irs_is_refused(labapp: Run, folder: Path, tmp_path
         "reconstruct", folder, "--setup", SETUP, "--out", tmp_path / "o", "--algorithm", "epa-r"
     )
     assert code == 2
-    assert "--algorithm: algorithm: epa-r; expected --scheme irs" in complained
+    assert "--algorithm: algorithm: epa-r; expected scheme irs" in complained
 
 
 def test_detect_on_a_picture_without_dots_says_so(labapp: Run, tmp_path: Path) -> None:

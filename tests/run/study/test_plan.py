@@ -101,6 +101,14 @@ def test_a_file_whose_name_looks_like_a_pattern_is_itself(tmp_path: Path) -> Non
         ('setup = "s"\n[[recording]]\n', "recording[1].file"),
         ('[[recording]]\nfile = "a.avi"', "recording[1].setup"),
         ('setup = "s"\n[[recording]]\nfile = "a"\nscheme = "magic"', "recording[1].scheme"),
+        (
+            'setup = "s"\nscheme = "fit"\n[[recording]]\nfile = "a"\nalgorithm = "epa-r"',
+            "recording[1].algorithm",
+        ),
+        (
+            'setup = "s"\nalgorithm = "epa-r"\n[[recording]]\nfile = "a"',
+            "recording[1].algorithm",
+        ),
         ('setup = "s"\n[[recording]]\nfile = "a"\nname = "../a"', "recording[1].name"),
         ('setup = "s"\n[[recording]]\nfile = "a"\nname = ".a"', "recording[1].name"),
         ('setup = "s"\n[[recording]]\nfile = "a"\nname = "a/b"', "recording[1].name"),
