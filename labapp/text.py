@@ -68,6 +68,33 @@ def pluralize(count: int, noun: str) -> str:
 BYTES = ("bytes", "kB", "MB", "GB", "TB")
 
 
+def fixed(value: float, decimals: int) -> str:
+    """A number with the given decimals (negative: rounded to tens, …), never a negative zero."""
+    return f"{round(value, decimals):z.{max(decimals, 0)}f}"
+
+
+def rounded(value: float, sigma: float, decimals: int = 3) -> tuple[str, str]:
+    """Text of a value and of its σ: σ to two significant digits, the value to the same place.
+
+    Parameters
+    ----------
+    sigma
+        NaN if unknown.
+    decimals
+        Decimals of the value if σ is unknown or 0; the text of σ is empty then.
+    """
+    if not (math.isfinite(sigma) and sigma > 0):
+        return fixed(value, decimals), ""
+    # Rounding may carry: 0.0996 to two digits is 0.10.
+    place = 1 - math.floor(math.log10(float(f"{sigma:.1e}")))
+    return fixed(value, place), fixed(sigma, place)
+
+
+def with_sigma(value: float, sigma: float) -> str:
+    """A value and its σ in one text: "5.003 ± 0.010", see `rounded`."""
+    return " ± ".join(filter(None, rounded(value, sigma)))
+
+
 def format_bytes(size: float) -> str:
     """Return a file size with a decimal unit: "512 bytes", "1.5 MB"."""
     value, unit = float(size), 0

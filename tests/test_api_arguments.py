@@ -53,6 +53,7 @@ def session(tmp_path: Path) -> labapp.Session:
         ("frames", {"frames": "50:60"}),
         ("settings", {"settings": "irs"}),
         ("settings.scheme", {"settings": Settings(scheme="fitt")}),
+        ("settings.algorithm", {"settings": Settings(algorithm="epa-r")}),
         ("settings.correspondence", {"settings": Settings(correspondence="S" + "S")}),  # type: ignore[arg-type]
         ("progress", {"progress": 3}),
     ],
@@ -120,6 +121,7 @@ def test_negative_index_counts_from_the_last_surface(results: labapp.Results) ->
         lambda s: s.set_record("x"),
         lambda s: s.set_settings("x"),
         lambda s: s.set_settings(Settings(scheme="fitt")),
+        lambda s: s.set_settings(Settings(algorithm="epa-r")),
         lambda s: s.set_signals("x"),
         lambda s: s.set_limits("x"),
         lambda s: s.correct(3),

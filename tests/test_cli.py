@@ -515,7 +515,7 @@ def test_algorithm_without_irs_is_rejected(labapp: Run, folder: Path, tmp_path: 
         "reconstruct", folder, "--setup", SETUP, "--out", tmp_path / "o", "--algorithm", "epa-r"
     )
     assert code == 2
-    assert "--algorithm: algorithm: epa-r; expected --scheme irs" in stderr
+    assert "--algorithm: algorithm: epa-r; expected scheme irs" in stderr
 
 
 def test_detect_reports_an_image_without_dots(labapp: Run, tmp_path: Path) -> None:

@@ -431,7 +431,7 @@ def test_run_without_a_surface_exits_with_1(labapp: Run, file: Path) -> None:
         ("--frames 7", "--frames: frames: 7; expected some of the frames 0 to 5"),
         ("--frames x", "--frames: frames: x; expected A:B:STEP"),
         ("--frames 1 --all", "--all: frames: and --frames 1; expected one of the two"),
-        ("--algorithm epa-r", "--algorithm: algorithm: epa-r; expected --scheme irs"),
+        ("--algorithm epa-r", "--algorithm: algorithm: epa-r; expected scheme irs"),
         ("--scheme best", "--scheme"),
     ],
 )

@@ -204,7 +204,6 @@ def _series_of(source: Path, features: tuple[str, ...]) -> tuple[WeldSeries, ...
     from labapp.export.dynamics import measured_of
     from labapp.export.features import FeatureTable, measured_series
     from labapp.export.result_folder import measured_in
-    from labapp.run.study.sections import study_features
     from labapp.run.study.study import Study
     from labapp.session.session import Session
 
@@ -216,8 +215,7 @@ def _series_of(source: Path, features: tuple[str, ...]) -> tuple[WeldSeries, ...
             return (measured_series(source.stem, measured, features),)
     if source.suffix.lower() == ".csv" and _is_table(source):
         return FeatureTable.read(source).chosen(features).welds
-    study = Study(source)
-    return study_features(study.plan, study.tables(), None)[0].chosen(features).welds
+    return Study(source).features().chosen(features).welds
 
 
 def _is_table(source: Path) -> bool:

@@ -35,8 +35,6 @@ from labapp.cli.shared import (
     warned,
     with_methods,
 )
-from labapp.core.schemes import SCHEMES
-from labapp.errors import InputError
 from labapp.files import as_bytes, write_file
 
 if TYPE_CHECKING:
@@ -103,11 +101,11 @@ def reconstruct(
 
     A frame that cannot be measured has a row in measures.csv with its status.
     """
+    from labapp.config.settings import check_algorithm
     from labapp.core.pipeline import Settings
 
-    if algorithm != "opa" and not SCHEMES[scheme].algorithms:
-        raise InputError("--algorithm", "algorithm", algorithm, "--scheme irs, which alone has it")
     settings = Settings(scheme=scheme, algorithm=algorithm, correspondence=correspondence)
+    check_algorithm(settings, "--algorithm")
     settings = with_methods(settings, detector, rows)
     places = {"lines": lines, "opcua": opcua}
     with ExitStack() as at_end:

@@ -15,7 +15,7 @@ from labapp.cli.shared import (
     progress_bar,
 )
 from labapp.system import quoted
-from labapp.text import pluralize
+from labapp.text import pluralize, with_sigma
 
 if TYPE_CHECKING:
     from labapp.run.study.status import Progress
@@ -152,7 +152,6 @@ def results(
 def _finish(study: Study, surfaces: bool) -> None:
     """Write the results, print the means, and exit with 1 unless all is measured."""
     summary = study.results(surfaces=surfaces)
-    from labapp.run.study.page import rounded
     from labapp.run.study.plan import named_condition
     from labapp.run.study.status import count_states
 
@@ -163,8 +162,9 @@ def _finish(study: Study, surfaces: bool) -> None:
     for group in summary.groups[:SHOWN]:
         at = ", ".join(named_condition(name, v) for name, v in group.conditions.items())
         means = (
-            f"{size} {rounded(group.means[f'{size}_mm'].mean, group.means[f'{size}_mm'].sigma)} mm"
+            f"{size} {with_sigma(mean.mean, mean.sigma)} mm"
             for size in ("width", "length", "height")
+            for mean in [group.means[f"{size}_mm"]]
         )
         count = pluralize(len(group.recordings), "recording")
         typer.echo(f"{at or 'all'} ({count}): {', '.join(means)}")

@@ -1,14 +1,15 @@
-"""Check of the settings of a measurement that come from a script."""
+"""Checks of the settings of a measurement that a user names."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import get_args, get_type_hints
 
 from labapp.core.images.find_dots import DotSettings
 from labapp.core.pipeline import Settings
 from labapp.core.rows.find_lattice import LatticeSettings
 from labapp.core.schemes import SCHEMES
-from labapp.errors import require, unknown_name
+from labapp.errors import InputError, require, unknown_name
 
 
 def check_settings(settings: Settings, source: str) -> None:
@@ -31,6 +32,26 @@ def check_settings(settings: Settings, source: str) -> None:
     for field, value, known in named:
         if value not in known:
             raise unknown_name(source, f"settings.{field}", value, known)
+
+
+def check_algorithm(settings: Settings, source: str | Path, field: str = "algorithm") -> None:
+    """Check that the scheme has the algorithm; the default is allowed for every scheme.
+
+    Parameters
+    ----------
+    settings
+        Settings with known names.
+    source, field
+        Where the algorithm is named.
+
+    Raises
+    ------
+    InputError
+        If the scheme has no algorithms, and would ignore the one named.
+    """
+    if settings.algorithm != Settings.algorithm and not SCHEMES[settings.scheme].algorithms:
+        expected = f"scheme irs, which alone has it, instead of {settings.scheme}"
+        raise InputError(source, field, settings.algorithm, expected)
 
 
 def _choices(owner: type, field: str) -> tuple[str, ...]:

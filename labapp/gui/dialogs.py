@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Literal
 
-from PySide6.QtCore import Qt
+from PySide6.QtCore import QMimeData, Qt
 from PySide6.QtWidgets import QFileDialog, QMessageBox, QWidget
 
 from labapp.session.file.database import SUFFIX
@@ -23,6 +23,11 @@ def recordings() -> str:
 
     suffixes = sorted(RECORDING_SUFFIXES | IMAGE_SUFFIXES | TIFF_SUFFIXES)
     return f"Recordings ({' '.join(f'*{suffix}' for suffix in suffixes)})"
+
+
+def dropped_paths(data: QMimeData) -> list[Path]:
+    """Return the files and folders of this machine among what is dropped on a window."""
+    return [Path(url.toLocalFile()) for url in data.urls() if url.isLocalFile()]
 
 
 def ask_file(parent: QWidget, title: str, folder: Path, kinds: str = "") -> Path | None:

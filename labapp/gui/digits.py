@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from labapp.text import csv_text
+from labapp import text
 
 MINUS = "−"
 """Minus sign, as wide as a plus; a hyphen reads as a dash."""
@@ -57,11 +57,8 @@ def rounded(value: float | None, sigma: float | None, decimals: int = 3) -> tupl
     """
     if value is None or not math.isfinite(value):
         return NOTHING, ""
-    if sigma is None or not (math.isfinite(sigma) and sigma > 0):
-        return plain(value, decimals), ""
-    # Rounding may carry: 0.0996 to two digits is 0.10.
-    place = 1 - math.floor(math.log10(float(f"{sigma:.1e}")))
-    return plain(value, place), plain(sigma, place)
+    number, spread = text.rounded(value, math.nan if sigma is None else sigma, decimals)
+    return number.replace("-", MINUS), spread
 
 
 def with_sigma(value: float | None, sigma: float | None) -> str:
@@ -71,8 +68,7 @@ def with_sigma(value: float | None, sigma: float | None) -> str:
 
 def plain(value: float, decimals: int) -> str:
     """A number with the given decimals (negative: rounded to tens, …), never a negative zero."""
-    text = f"{round(value, decimals):.{max(decimals, 0)}f}"
-    return text.lstrip("-") if float(text) == 0 else text.replace("-", MINUS)
+    return text.fixed(value, decimals).replace("-", MINUS)
 
 
 def entered(value: float, decimals: int) -> str:
@@ -82,10 +78,10 @@ def entered(value: float, decimals: int) -> str:
     return plain(value, more if decimals < more <= decimals + EXTRA_DECIMALS else decimals)
 
 
-def parsed(text: str) -> float | None:
+def parsed(entry: str) -> float | None:
     """The entered number, with a decimal point or comma; None if it is not a finite number."""
     try:
-        value = float(text.strip().replace(MINUS, "-").replace(",", "."))
+        value = float(entry.strip().replace(MINUS, "-").replace(",", "."))
     except ValueError:
         return None
     return value if math.isfinite(value) else None
@@ -99,7 +95,7 @@ def as_text(rows: Iterable[ResultRow]) -> str:
 def as_csv(rows: Iterable[ResultRow]) -> str:
     """Result rows as comma-separated values at full precision, for a program."""
     cells = ((row.name, row.value, row.sigma, row.unit) for row in rows)
-    return csv_text([("quantity", "value", "sigma", "unit"), *cells])
+    return text.csv_text([("quantity", "value", "sigma", "unit"), *cells])
 
 
 def round_factor(most: float) -> float:

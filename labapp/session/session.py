@@ -372,11 +372,13 @@ class Session(SessionContents):
         Raises
         ------
         InputError
-            If a name in them is unknown.
+            If a name in them is unknown, or an algorithm is chosen that the scheme does not have.
         """
-        from labapp.config.settings import check_settings
+        from labapp.config.settings import check_algorithm, check_settings
 
         check_settings(settings, "set_settings")
+        if settings.algorithm != self.settings.algorithm:  # the former one may remain
+            check_algorithm(settings, "set_settings", "settings.algorithm")
         self._documents.change(label, {("settings", NO_FRAME): settings})
 
     def correct(self, corrections: Mapping[int, ByHand | None], label: str = "correction") -> None:

@@ -157,8 +157,8 @@ class Watched:
     def __init__(self, *programs: int) -> None:
         self._programs = programs
         self._used: dict[int, float] = {}
-        self.memory: list[tuple[float, int, int]] = []
-        """(time, s; processes; the largest one's resident memory, bytes)."""
+        self.memory: list[tuple[int, int]] = []
+        """Resident memory of the first program and of the largest other process, bytes."""
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._watch)
 
@@ -172,28 +172,31 @@ class Watched:
 
     def _watch(self) -> None:
         while not self._ended.wait(0.3):
-            sizes = []
+            own, others = 0, [0]
             for program in self._programs:
                 try:
                     root = psutil.Process(program)
                     for one in (root, *root.children(recursive=True)):
                         times = one.cpu_times()
                         self._used[one.pid] = times.user + times.system
-                        sizes.append(one.memory_info().rss)
+                        if one.pid == self._programs[0]:
+                            own = one.memory_info().rss
+                        else:
+                            others.append(one.memory_info().rss)
                 except psutil.Error:
                     continue
-            if sizes:
-                self.memory.append((time.monotonic(), len(sizes), max(sizes)))
+            self.memory.append((own, max(others)))
 
     @property
     def processor_s(self) -> float:
         """Processor time of all of them together, s."""
         return sum(self._used.values())
 
-    def thirds_mb(self) -> list[float]:
-        """Largest resident memory of a process in each third of the time, MB."""
-        sizes = np.array([size for *_, size in self.memory]) / 1e6
-        return [round(float(part.max()), 0) for part in np.array_split(sizes, 3)]
+    def memory_text(self) -> str:
+        """Largest memory of the first program, and of a worker in each third of the time, MB."""
+        program, worker = np.array(self.memory).T / 1e6
+        thirds = [round(float(part.max())) for part in np.array_split(worker, 3)]
+        return f"workers at most {thirds} MB in each third of the time, program {program.max():.0f}"
 
 
 def timed(command: list[str], *others: int) -> str:
@@ -205,8 +208,7 @@ def timed(command: list[str], *others: int) -> str:
     wall_s = time.perf_counter() - begun
     load = os.getloadavg()[0]
     return (
-        f"{wall_s:.1f} s wall, {seen.processor_s:.1f} s, largest process in each third of the time "
-        f"{seen.thirds_mb()} MB, load {load:.1f}"
+        f"{wall_s:.1f} s wall, {seen.processor_s:.1f} s, {seen.memory_text()} MB, load {load:.1f}"
     )
 
 

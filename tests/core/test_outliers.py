@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -260,3 +261,17 @@ def test_only_the_newest_fits_of_a_frame_are_kept(monkeypatch: pytest.MonkeyPatc
     again = fitted(8)
     assert again is not first
     assert again.points_mm == pytest.approx(first.points_mm, abs=1e-9)
+
+
+def test_a_fit_that_is_kept_takes_little_more_than_its_factor() -> None:
+    observed, labels = scene()
+    fitted = [try_fit(observed, np.where(labels == dot, UNLABELLED, labels)) for dot in range(30)]
+    tracemalloc.start()
+    before, _ = tracemalloc.get_traced_memory()
+    more = [try_fit(observed, np.where(labels == dot, UNLABELLED, labels)) for dot in range(30, 60)]
+    after, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert all(pool is not None for pool in fitted)
+    factors = sum(pool.factor.nbytes for pool in more if pool is not None)
+    assert factors > 1e6
+    assert after - before < 1.5 * factors

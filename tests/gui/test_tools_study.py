@@ -6,14 +6,16 @@ import shutil
 from pathlib import Path
 
 import pytest
-from PySide6.QtCore import Qt
+from PySide6.QtCore import QMimeData, QPoint, QPointF, Qt, QUrl
+from PySide6.QtGui import QDragEnterEvent, QDropEvent
 from PySide6.QtTest import QTest
-from PySide6.QtWidgets import QPushButton
+from PySide6.QtWidgets import QApplication, QPushButton
 from pytestqt.qtbot import QtBot
 
 from labapp.config.scenario import read_scenario
 from labapp.gui.shell.window import MainWindow
 from labapp.gui.tools.study import StudyWindow
+from labapp.run.study.plan import write_study
 from labapp.simulated.benchmark import SCENARIO
 from labapp.simulated.simulate import simulate
 from labapp.studies.tables import Table
@@ -54,6 +56,18 @@ def study(window: MainWindow, qtbot: QtBot) -> StudyWindow:
 
 def click(button: QPushButton) -> None:
     QTest.mouseClick(button, Qt.MouseButton.LeftButton)
+
+
+def drop(tool: StudyWindow, *paths: Path) -> None:
+    """Drop files on the window, as the desktop does."""
+    data = QMimeData()
+    data.setUrls([QUrl.fromLocalFile(str(path)) for path in paths])
+    button, none = Qt.MouseButton.LeftButton, Qt.KeyboardModifier.NoModifier
+    copied = Qt.DropAction.CopyAction, data, button, none
+    entered = QDragEnterEvent(QPoint(9, 9), *copied)
+    QApplication.sendEvent(tool, entered)
+    assert entered.isAccepted()
+    QApplication.sendEvent(tool, QDropEvent(QPointF(9, 9), *copied))
 
 
 def is_idle(tool: StudyWindow) -> bool:
@@ -103,6 +117,24 @@ def test_study_is_created_and_run_and_a_recording_opened(
     window.do("study")
     assert study.isVisible()
     assert study.list.selectedItems()
+
+
+def test_dropped_files_are_opened_or_filled_in(
+    study: StudyWindow, recordings: Path, tmp_path: Path, qtbot: QtBot
+):
+    recording = recordings / "I80_1" / "recording.avi"
+    setup = shutil.copy(recordings / "I80_1" / "setup.toml", tmp_path / "bench.toml")
+    drop(study, recording, setup)
+    assert [study.recordings.value(), study.setup.value()] == [str(recording), str(setup)]
+    assert study.matches.text().startswith("1 recording")
+    drop(study, recordings)
+    assert study.recordings.value() == str(recordings / "*" / "recording.avi")
+    assert study.study is None
+    file = tmp_path / "study.toml"
+    write_study(file, [str(recordings / "*" / "recording.avi")], setup)
+    drop(study, file)
+    qtbot.waitUntil(lambda: len(study.found) == 3 and is_idle(study), timeout=PATIENCE_MS)
+    assert study.study.path == file
 
 
 def test_stopped_run_keeps_finished_recordings(study: StudyWindow, recordings: Path, qtbot: QtBot):

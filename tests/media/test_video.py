@@ -1,10 +1,12 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import re
 import subprocess
 import sys
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -648,3 +650,15 @@ def test_no_file_stays_open(tmp_path: Path, pictures: Pictures, write_video: Wri
     with pytest.raises(InputError):
         open_source(broken)
     assert open_files() == 0
+
+
+def test_closed_video_is_freed_without_the_garbage_collector() -> None:
+    gc.disable()
+    try:
+        with open_source(VARYING) as source:
+            source.frame(3)
+        closed = weakref.ref(source)
+        del source
+        assert closed() is None
+    finally:
+        gc.enable()

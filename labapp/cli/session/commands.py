@@ -39,7 +39,7 @@ from labapp.cli.shared import (
     warned,
     with_methods,
 )
-from labapp.core.schemes import SCHEMES, scheme_words
+from labapp.core.schemes import scheme_words
 from labapp.errors import InputError
 from labapp.export.formats import RUN_FORMATS, SURFACE_FORMATS
 from labapp.text import now, pluralize
@@ -283,11 +283,12 @@ def _set(
     rows: RowsName | None,
 ) -> None:
     """Store options as the session's settings, as one change of its history."""
+    from labapp.config.settings import check_algorithm
+
     settings: Settings = replace(session.settings, **options)  # type: ignore[arg-type]
     settings = with_methods(settings, detector, rows)
-    if "algorithm" in options and not SCHEMES[settings.scheme].algorithms:
-        wanted = "--scheme irs, which alone has it"
-        raise InputError("--algorithm", "algorithm", settings.algorithm, wanted)
+    if "algorithm" in options:
+        check_algorithm(settings, "--algorithm")
     if settings != session.settings:
         methods = (("detector", detector), ("rows", rows))
         named = options | {name: value for name, value in methods if value is not None}

@@ -37,9 +37,9 @@ RESOLVED_SIZES = 2.2
 equal Gaussians have a single peak up to 2, and pixels and noise blur them further."""
 
 KEPT_BYTES, COUNTED_EVERY = 100_000_000, 32
-"""Approximate limit for the factors of the cached fits of a frame, bytes; splines and stiffness
-take twice as much. That is over a thousand fits of a usual pool. The size is checked once in so
-many fits."""
+"""Approximate limit for the factors of the cached fits of a frame, bytes, beside which the rest of
+a fit is small. That is over a thousand fits of a usual pool. The size is checked once in so many
+fits."""
 
 EDGE_MM, EDGE_PX = 0.5, 4.0
 """A dot nearer to the edge of the plane or of the frame may be cut off and does not count as in

@@ -201,7 +201,7 @@ def normal_equations(
     dots = rig.imaging_plane.to_universal(plane_mm)
     near = laser, plane, points_mm, dots
     weights = ray_kernels.slope_weights(*near, plane_covariance_mm2, settings.floor_mm)
-    stiffness = basis.stiffness(CORRELATED_MM2 / settings.jerk**2)
+    stiffness = CORRELATED_MM2 / settings.jerk**2 * basis.roughness
     return NormalEquations(basis, stiffness, laser, plane, dots, weights)
 
 

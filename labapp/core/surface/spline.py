@@ -89,6 +89,16 @@ def _products(count: int) -> FloatArray:
     return products
 
 
+@lru_cache(maxsize=16)
+def _roughness(x_count: int, y_count: int, *step_mm: float) -> FloatArray:
+    """`SplineBasis.roughness`; not kept by the basis, of which a hard frame has hundreds."""
+    from labapp.core.surface.kernels import solver_kernels
+
+    band = solver_kernels.roughness(_products(x_count), _products(y_count), np.array(step_mm))
+    band.flags.writeable = False
+    return np.asarray(band)
+
+
 @dataclass(frozen=True)
 class SplineBasis(ReadOnlyArrays):
     """Tensor product of uniform cubic B-splines over a rectangle.
@@ -181,26 +191,13 @@ class SplineBasis(ReadOnlyArrays):
         x, y = np.asarray(x_mm), np.asarray(y_mm)
         return np.asarray((x >= x_low) & (x <= x_high) & (y >= y_low) & (y <= y_high))
 
-    @cached_property
+    @property
     def roughness(self) -> FloatArray:
-        """Matrix P of ∫∫ z_xxx² + 3 z_xxy² + 3 z_xyy² + z_yyy² = cᵀPc.
+        """Matrix P of ∫∫ z_xxx² + 3 z_xxy² + 3 z_xyy² + z_yyy² = cᵀPc, read-only.
 
         Lower band, shape (width + 1, splines), in LAPACK's storage.
         """
-        from labapp.core.surface.kernels import solver_kernels
-
-        nx, ny = self.shape
-        return solver_kernels.roughness(_products(nx), _products(ny), self.step_mm)
-
-    def stiffness(self, weight: float) -> FloatArray:
-        """`roughness` times a weight, cached."""
-        if weight not in self._stiffness:
-            self._stiffness[weight] = weight * self.roughness
-        return self._stiffness[weight]
-
-    @cached_property
-    def _stiffness(self) -> dict[float, FloatArray]:
-        return {}
+        return _roughness(*self.shape, *self.step_mm.tolist())
 
 
 @dataclass(frozen=True)

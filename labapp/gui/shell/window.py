@@ -21,6 +21,7 @@ from PySide6.QtWidgets import (
 )
 
 from labapp.core.values import IntArray
+from labapp.gui.dialogs import dropped_paths
 from labapp.gui.drafts import drafts, is_draft
 from labapp.gui.pages import PAGES
 from labapp.gui.pages.page import Page
@@ -463,12 +464,12 @@ class MainWindow(QMainWindow):
 
     def dragEnterEvent(self, event: QDragEnterEvent) -> None:
         """Accept files."""
-        if any(url.isLocalFile() for url in event.mimeData().urls()):
+        if dropped_paths(event.mimeData()):
             event.acceptProposedAction()
 
     def dropEvent(self, event: QDropEvent) -> None:
         """Pass dropped files to the page in view, or open them."""
-        paths = [Path(url.toLocalFile()) for url in event.mimeData().urls() if url.isLocalFile()]
+        paths = dropped_paths(event.mimeData())
         event.acceptProposedAction()
         if self.page is None or not self.page.takes_files(paths):
             self.files.open_dropped(paths)

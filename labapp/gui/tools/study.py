@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
 from PySide6.QtCore import QUrl
-from PySide6.QtGui import QCloseEvent, QDesktopServices
+from PySide6.QtGui import QCloseEvent, QDesktopServices, QDragEnterEvent, QDropEvent
 from PySide6.QtWidgets import QAbstractItemView, QCheckBox, QHeaderView, QTabWidget, QWidget
 
-from labapp.gui.dialogs import ask_file, ask_folder, ask_save
+from labapp.gui.dialogs import SETUP_FILES, ask_file, ask_folder, ask_save, dropped_paths
 from labapp.gui.tasks import Control, Tasks
 from labapp.gui.tools import studying
 from labapp.gui.tools.tool import ToolWindow, progress_of
@@ -44,7 +44,8 @@ LOOK_S = 1.0
 
 NONE_YET = (
     "A study is a file that names recordings, each with its set-up and the conditions it was made "
-    "under. Open one, or choose a folder with recordings and press Make study."
+    "under. Open one, or choose a folder with recordings and press Make study. Files and folders "
+    "can be dropped on this window, too."
 )
 
 
@@ -67,6 +68,7 @@ class StudyWindow(ToolWindow):
         self.looks.failed.connect(lambda _, why: self.say(why, True))
         self.looks.changed.connect(self._show)
         self.tasks.changed.connect(self._look_at_end)
+        self.setAcceptDrops(True)
         self._make_form()
         self._make_results()
         self.page_button = self.add_button(
@@ -168,6 +170,25 @@ class StudyWindow(ToolWindow):
         if folder := ask_folder(self, "Recordings in", self._sessions.preferences.current.folder):
             self.take_folder(folder)
 
+    def dragEnterEvent(self, event: QDragEnterEvent) -> None:
+        """Accept files."""
+        if dropped_paths(event.mimeData()):
+            event.acceptProposedAction()
+
+    def dropEvent(self, event: QDropEvent) -> None:
+        """Open a dropped study, or fill in dropped recordings and their set-up."""
+        event.acceptProposedAction()
+        for path in dropped_paths(event.mimeData()):
+            if path.is_dir():
+                self.take_folder(path)
+            elif path.suffix.lower() not in (".toml", ".csv"):
+                self.recordings.set_value(str(path))
+                self._show_matches()
+            elif studying.is_setup(path):
+                self.setup.set_value(str(path))
+            else:
+                self.show_study(path)
+
     def take_folder(self, folder: Path) -> None:
         """Propose the recordings in a folder, and a setup file beside one of them."""
         pattern = self._try(lambda: folder_pattern(folder))
@@ -185,7 +206,7 @@ class StudyWindow(ToolWindow):
     def choose_setup(self) -> None:
         """Ask for a setup file."""
         folder = self._sessions.preferences.current.folder
-        if path := ask_file(self, "Choose a set-up", folder, "Setup files (*.toml)"):
+        if path := ask_file(self, "Choose a set-up", folder, SETUP_FILES):
             self.setup.set_value(str(path))
 
     def choose_new(self) -> None:

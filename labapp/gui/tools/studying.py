@@ -7,9 +7,10 @@ from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 
+from labapp.config.setup import read_setup
 from labapp.core.surface.measures import SIZES
 from labapp.errors import InputError
-from labapp.run.study.page import rounded
+from labapp.gui.digits import with_sigma
 from labapp.run.study.plan import StudyPlan, StudyRecording, matching_recordings, shown_condition
 from labapp.run.study.status import STATE_WORDS, RecordingStatus, State
 from labapp.run.study.summary import StudySummary
@@ -46,7 +47,7 @@ def means_table(summary: StudySummary) -> Table:
             *(shown_condition(one.conditions.get(name)) for name in summary.conditions),
             str(len(one.recordings)),
             str(one.frames),
-            *(rounded(one.means[size].mean, one.means[size].sigma) for size in SIZES),
+            *(with_sigma(one.means[size].mean, one.means[size].sigma) for size in SIZES),
         )
         for one in summary.groups
     )
@@ -90,6 +91,15 @@ def matches_text(pattern: str) -> str:
     )
 
 
+def is_setup(path: Path) -> bool:
+    """Whether a file is a setup file, which a study file resembles by its name."""
+    try:
+        read_setup(path, lines=True)
+    except InputError:
+        return False
+    return True
+
+
 def session_path(folder: Path, recording: StudyRecording) -> Path:
     """Path of the session of a study's recording, in the folder of the results."""
     return folder / "sessions" / f"{recording.name}{SUFFIX}"
@@ -111,8 +121,6 @@ def begin_session(folder: Path, recording: StudyRecording, progress: Progress) -
     InputError
         If the recording or its setup file cannot be read, or the session cannot be written.
     """
-    from labapp.config.setup import read_setup
-
     path = session_path(folder, recording)
     if path.exists():
         return path

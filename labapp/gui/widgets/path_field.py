@@ -31,6 +31,10 @@ class PathField(TextField):
 class PathLine(QLineEdit):
     """A line that omits the middle of a text that is too long while it does not have the focus."""
 
+    def __init__(self) -> None:
+        super().__init__()
+        self.setAcceptDrops(False)  # a dropped file is for the window; a line takes its URL as text
+
     def shown(self) -> str:
         """The text as painted."""
         if self.hasFocus():

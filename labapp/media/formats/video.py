@@ -146,6 +146,7 @@ class VideoSource(FrameSource):
     def close(self) -> None:
         """Close the file. May be called twice."""
         self._container.close()
+        self._decoded = iter(())  # generators that would keep this source and its decoder in memory
 
     def reopen(self) -> Self:
         """Open the same video again; see `FrameSource.reopen`."""

@@ -15,7 +15,7 @@ from labapp.run.study.plan import Condition, named_condition, shown_condition
 from labapp.run.study.status import STATE_WORDS, count_states
 from labapp.run.study.summary import GroupSummary, Mean, StudySummary
 from labapp.studies.plotting import INCHES, STYLE, as_bytes, new_figure
-from labapp.text import SIGMA_OF, axis_label, column_heading
+from labapp.text import SIGMA_OF, axis_label, column_heading, with_sigma
 
 MOST_SHOWN = 60
 """Most outliers that are listed; all are in outliers.csv."""
@@ -229,16 +229,8 @@ def _table(head: Iterable[str], rows: Iterable[Sequence[str]]) -> str:
     return f'<div class="scroll"><table><tr>{names}</tr>\n{body}</table></div>'
 
 
-def rounded(value: float, sigma: float) -> str:
-    """Format value and ±, with two significant digits of ±."""
-    if not math.isfinite(sigma) or sigma <= 0:
-        return f"{value:z.4g}"
-    decimals = min(max(1 - math.floor(math.log10(sigma)), 0), 6)
-    return f"{value:z.{decimals}f} ± {sigma:.{decimals}f}"
-
-
 def _mean_cells(means: Mapping[str, Mean]) -> list[str]:
-    return [_n(rounded(means[s].mean, means[s].sigma)) if s in means else _n("") for s in SIZES]
+    return [_n(with_sigma(means[s].mean, means[s].sigma)) if s in means else _n("") for s in SIZES]
 
 
 def _groups(summary: StudySummary) -> str:

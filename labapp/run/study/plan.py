@@ -31,6 +31,7 @@ from typing import Any
 import tomlkit
 
 from labapp.config.csv_tables import bounded_lines, open_table, parse_number
+from labapp.config.settings import check_algorithm
 from labapp.config.setup import read_setup
 from labapp.config.toml_keys import Rule, check_keys, is_number, parse_toml, shown, unknown_key
 from labapp.core.pipeline import Settings
@@ -190,8 +191,7 @@ def read_study(path: str | os.PathLike[str]) -> StudyPlan:
         raise InputError.gather(problems[:10])
     names = _names(path, found)
     recordings = tuple(
-        _recording(path, name, keys, file, varied)
-        for name, (_, keys, file, varied) in zip(names, found, strict=True)
+        _recording(path, name, *each) for name, each in zip(names, found, strict=True)
     )
     conditions = dict.fromkeys(name for one in recordings for name in one.conditions)
     if len(conditions) > MOST_CONDITIONS:
@@ -301,15 +301,22 @@ def _toml(value: Condition) -> str:
 
 
 def _recording(
-    path: Path, name: str, keys: Mapping[str, Any], file: Path, varied: Mapping[str, Condition]
+    path: Path,
+    name: str,
+    where: str,
+    keys: Mapping[str, Any],
+    file: Path,
+    varied: Mapping[str, Condition],
 ) -> StudyRecording:
     chosen = {key: keys[key] for key in ("scheme", "algorithm", "correspondence") if key in keys}
+    settings = Settings(**chosen)
+    check_algorithm(settings, path, f"{where}.algorithm")
     return StudyRecording(
         name,
         file,
         path.parent.absolute() / keys["setup"],
         keys.get("frames", ":"),
-        Settings(**chosen),
+        settings,
         keys.get("warm", True),
         {**keys.get("conditions", {}), **varied},
     )

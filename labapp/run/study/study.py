@@ -212,6 +212,12 @@ class Study:
         )
         return Tasks(recording, setup, found, frames, stretches)
 
+    def _known_tasks(self, recording: StudyRecording) -> Tasks | None:
+        """Return `tasks`; None also if the recording cannot be measured, which its status says."""
+        with suppress(InputError):
+            return self.tasks(recording)
+        return None
+
     def _problem_file(self, recording: StudyRecording) -> Path:
         return self.folder / "problems" / f"{recording.name}.txt"
 
@@ -257,15 +263,10 @@ class Study:
         """
         from labapp.run.study.results import assembled
 
-        found = {}
         with self._alone():
-            for one in self.plan.recordings:
-                with suppress(InputError):  # reported by the status
-                    tasks = self.tasks(one)
-                    table = None if tasks is None else assembled(tasks)[0]
-                    if table is not None:
-                        found[one.name] = table
-        return found
+            known = {one.name: self._known_tasks(one) for one in self.plan.recordings}
+            found = {name: assembled(tasks)[0] for name, tasks in known.items() if tasks}
+        return {name: table for name, table in found.items() if table is not None}
 
     def features(self, sections: Path | None = None) -> FeatureTable:
         """Return features of all frames, and penetration from sections (`FeatureTable.fit`).
@@ -312,12 +313,7 @@ class Study:
         from labapp.run.study.results import write_results
 
         with self._alone():
-            parts = []
-            for status in self.status():
-                with suppress(InputError):  # reported by the status
-                    parts.append((status, self.tasks(status.recording)))
-                    continue
-                parts.append((status, None))
+            parts = [(one, self._known_tasks(one.recording)) for one in self.status()]
             return write_results(self.folder, self.plan, parts, surfaces)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import socket
 import subprocess
 import sys
@@ -15,6 +14,7 @@ import pytest
 
 from labapp import Study
 from labapp.errors import InputError
+from tests.run.study.kill import bytes_of
 
 pytestmark = [
     pytest.mark.slow,
@@ -23,13 +23,6 @@ pytestmark = [
     pytest.mark.filterwarnings("default::pytest.PytestUnraisableExceptionWarning"),
     pytest.mark.filterwarnings("default::DeprecationWarning"),
 ]
-
-
-def bytes_of(folder: Path) -> dict[str, str]:
-    return {
-        path.name: hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted((folder / "stretches").glob("*.npz"))
-    }
 
 
 @contextmanager

@@ -113,6 +113,14 @@ def test_existing_file_named_like_a_pattern_is_used(tmp_path: Path) -> None:
         ('setup = "s"\n[[recording]]\n', "recording[1].file"),
         ('[[recording]]\nfile = "a.avi"', "recording[1].setup"),
         ('setup = "s"\n[[recording]]\nfile = "a"\nscheme = "magic"', "recording[1].scheme"),
+        (
+            'setup = "s"\nscheme = "fit"\n[[recording]]\nfile = "a"\nalgorithm = "epa-r"',
+            "recording[1].algorithm",
+        ),
+        (
+            'setup = "s"\nalgorithm = "epa-r"\n[[recording]]\nfile = "a"',
+            "recording[1].algorithm",
+        ),
         ('setup = "s"\n[[recording]]\nfile = "a"\nname = "../a"', "recording[1].name"),
         ('setup = "s"\n[[recording]]\nfile = "a"\nname = ".a"', "recording[1].name"),
         ('setup = "s"\n[[recording]]\nfile = "a"\nname = "a/b"', "recording[1].name"),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import errno
-import hashlib
 import shutil
 from pathlib import Path
 
@@ -25,6 +24,7 @@ from labapp.run import measurers
 from labapp.run.study import stretches, workers
 from labapp.run.study import study as study_module
 from tests.run.study.conftest import write_study
+from tests.run.study.kill import bytes_of
 
 STATES = ["done", "done", "failed", "failed", "failed"]
 
@@ -50,14 +50,6 @@ def measured_file(measured_once: Path, tmp_path: Path) -> Path:
     """A copy of `study_file` and of its results."""
     shutil.copytree(measured_once, tmp_path, dirs_exist_ok=True)
     return tmp_path / "study.toml"
-
-
-def bytes_of(folder: Path) -> dict[str, str]:
-    """Digest of each file written by the tasks."""
-    return {
-        path.name: hashlib.sha256(path.read_bytes()).hexdigest()
-        for path in sorted((folder / "stretches").glob("*.npz"))
-    }
 
 
 def rows_of(folder: Path) -> pd.DataFrame:

@@ -11,7 +11,7 @@ from labapp import Study
 from labapp.config.scenario import read_scenario
 from labapp.core.surface.measures import SIZES, sigma_name
 from labapp.export.tables import Table
-from labapp.run.study.page import rounded, summary_page
+from labapp.run.study.page import summary_page
 from labapp.run.study.plan import StudyRecording
 from labapp.run.study.status import RecordingStatus
 from labapp.run.study.summary import (
@@ -24,6 +24,7 @@ from labapp.run.study.summary import (
 )
 from labapp.simulated.benchmark import SCENARIO
 from labapp.simulated.simulate import simulate
+from labapp.text import with_sigma
 
 NOISE, LEVEL, SETUP = 0.03, 0.02, 0.1
 
@@ -131,10 +132,12 @@ def test_size_that_is_0_everywhere_has_no_plot() -> None:
         (6.1234, 0.123, "6.12 ± 0.12"),
         (0.28123, 0.0083, "0.2812 ± 0.0083"),
         (6.1234, np.nan, "6.123"),
+        (-0.012345, 0.0, "-0.012"),
+        (-0.0001, np.nan, "0.000"),
     ],
 )
 def test_values_are_rounded_to_their_uncertainty(value: float, sigma: float, expected: str) -> None:
-    assert rounded(value, sigma) == expected
+    assert with_sigma(value, sigma) == expected
 
 
 @pytest.mark.slow
