@@ -128,14 +128,21 @@ def measure(
 
 @dataclass(frozen=True, repr=False)
 class Results(Sequence[FrameResult]):
-    """Results of frames, in order: a sequence of `FrameResult`."""
+    """Results of frames, in order: a sequence of `FrameResult`.
+
+    Parameters
+    ----------
+    results
+        Result of each frame.
+    calibration
+        Pixel ↔ imaging plane.
+    setup_check
+        Check of the set-up by the residuals of all frames; None: not checked.
+    """
 
     results: tuple[FrameResult, ...]
-    """Result of each frame."""
     calibration: ImageCalibration
-    """Pixel ↔ imaging plane."""
     setup_check: SetupVerdict | None = None
-    """Check of the set-up by the residuals of all frames; None: not checked."""
 
     @classmethod
     def of_session(cls, session: Session) -> Results:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import inspect
 import pkgutil
 import re
@@ -73,6 +74,19 @@ def test_every_documented_name_explains_its_parameters(
             unexplained.append((full_name, parameters - explained))
     assert not unexplained
     assert inspect.getdoc(documented_object)
+
+
+def test_the_fields_of_documented_classes_are_in_their_docstrings() -> None:
+    """``help`` shows docstrings only."""
+    for name, what in documented().items():
+        if not dataclasses.is_dataclass(what):
+            continue
+        section = (inspect.getdoc(what) or "").partition("Parameters\n----------\n")[2]
+        explained = " ".join(re.findall(r"^\w[\w, …]*$", section, re.MULTILINE))
+        fields = [field.name for field in dataclasses.fields(what) if field.init]
+        for first, last in re.findall(r"(\w+) … (\w+)", explained):
+            explained += " " + " ".join(fields[fields.index(first) : fields.index(last) + 1])
+        assert not set(fields) - set(re.findall(r"\w+", explained)), name
 
 
 def public_functions(name: str, documented_object: object) -> dict[str, Callable[..., object]]:

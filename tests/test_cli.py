@@ -17,8 +17,11 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+import typer.core
+from typer.main import get_command
 
 from labapp import log
+from labapp.cli import app
 from labapp.core.pipeline import Measurement, Settings
 from labapp.errors import InputError
 from labapp.export import results
@@ -737,6 +740,22 @@ def test_help_does_not_truncate_command_summaries(labapp: Run, command: str) -> 
     listed = stdout.partition("Commands:")[2]
     assert listed
     assert "..." not in listed
+
+
+def test_help_names_arguments_and_kinds_of_values() -> None:
+    commands, count = [("labapp", get_command(app))], 0
+    for name, one in commands:
+        context = one.context_class(one, info_name=name)
+        commands += [(f"{name} {sub}", of) for sub, of in getattr(one, "commands", {}).items()]
+        for parameter in one.params:
+            first, about = parameter.get_help_record(context)
+            assert about, (name, first)
+            assert not re.search(r"[<>{}]|list\[| range", first), (name, first)
+            if isinstance(parameter, typer.core.TyperArgument):
+                (piece,) = parameter.get_usage_pieces(context)
+                assert re.fullmatch(r"\[?[A-Z]+(\.toml)?(\.\.\.)?\]?", piece), (name, piece)
+            count += 1
+    assert count > 150
 
 
 def test_version_is_printed(labapp: Run) -> None:

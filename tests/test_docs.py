@@ -26,6 +26,7 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 def test_tutorial_writes_its_figure(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.copytree(ROOT / "sample_sessions/gtaw", tmp_path / "sample_sessions/gtaw")
     monkeypatch.chdir(tmp_path)
     mpl.use("Agg")
     text = (ROOT / "docs/tutorial.md").read_text("utf-8")
@@ -36,6 +37,7 @@ def test_tutorial_writes_its_figure(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 def test_notebook_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    shutil.copytree(ROOT / "sample_sessions/gtaw", tmp_path / "sample_sessions/gtaw")
     monkeypatch.chdir(tmp_path)
     mpl.use("Agg")
     notebook = json.loads((ROOT / "docs/notebooks/measured_and_true.ipynb").read_text("utf-8"))

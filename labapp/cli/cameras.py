@@ -90,10 +90,10 @@ def record(
         float | None, typer.Option(callback=finite, help="Exposure time (µs).")
     ] = None,
     gain: Annotated[float | None, typer.Option(callback=finite, help="Amplification (dB).")] = None,
-    rate: Annotated[float | None, typer.Option(callback=finite, help="Frames a second.")] = None,
+    rate: Annotated[float | None, typer.Option(callback=finite, help="Frame rate (Hz).")] = None,
     region: Annotated[
         tuple[int, int, int, int] | None,
-        typer.Option(metavar="U V WIDTH HEIGHT", help="Part of the picture (px)."),
+        typer.Option(metavar="U V WIDTH HEIGHT", help="Part of the sensor to read out (px)."),
     ] = None,
     trigger: Annotated[
         Literal["free", "line"] | None,
@@ -101,6 +101,8 @@ def record(
     ] = None,
 ) -> None:
     """Record losslessly from a camera: docs/cameras.md.
+
+    Exposure time, gain, frame rate and region are those of the camera where no option sets them.
 
     Events are reported on stderr, and written beside the recording as FILE-notes.csv.
 

@@ -25,13 +25,25 @@ def dynamics(
     out: Annotated[Path, typer.Option(help="Folder for tables and pictures; made if missing.")],
     *,
     of: Annotated[
-        str, typer.Option(help="Series for the spectra: width_mm, height_mm, convexity_mm …")
+        str,
+        typer.Option(
+            metavar="SERIES", help="Series for the spectra: width_mm, height_mm, convexity_mm …"
+        ),
     ] = "height_mm",
     band: Annotated[
-        str | None, typer.Option(metavar="LOW:HIGH", help="Frequencies to look at (Hz).")
+        str | None,
+        typer.Option(
+            metavar="LOW:HIGH",
+            help="Frequencies to look at (Hz). Default: from two periods in the recording to half "
+            "the frame rate.",
+        ),
     ] = None,
     segment: Annotated[
-        float | None, typer.Option(min=1e-6, help="Duration of a segment of the spectrogram (s).")
+        float | None,
+        typer.Option(
+            min=1e-6,
+            help="Duration of a segment of the spectrogram (s). Default: an eighth of the series.",
+        ),
     ] = None,
     signals: Annotated[
         Path | None,
@@ -43,7 +55,10 @@ def dynamics(
     ] = (1.0, 1.0, 1.0),
     start: Annotated[
         float | None,
-        typer.Option(callback=finite, help="Time of the signals' start in the recording (s)."),
+        typer.Option(
+            callback=finite,
+            help="Time of the signals' start in the recording (s). Default: 0, or the session's.",
+        ),
     ] = None,
     align: Annotated[
         Path | None,

@@ -77,8 +77,53 @@ SigmaParts = Annotated[
 ]
 
 
+KINDS_OF_VALUE = {
+    "int": "INTEGER",
+    "float": "NUMBER",
+    "str": "TEXT",
+    "path": "PATH",
+    "Path": "PATH",
+}
+
+
+class Argument(typer.core.TyperArgument):
+    """Argument that the help names in capitals, without its type."""
+
+    @property
+    def display_name_raw(self) -> str:
+        """The name in usage, help and errors."""
+        return self.metavar or (self.name or "").upper()
+
+    def display_type_rich(self, ctx: Any) -> str:
+        """Return no type: the help's text describes it."""
+        return ""
+
+    def get_usage_pieces(self, ctx: Any) -> list[str]:
+        """Return the argument as usage lines have it: ``NAME``, ``[NAME]`` or ``NAME...``."""
+        name = self.display_name_raw
+        name += "..." * (self.nargs != 1)
+        return [name if self.required else f"[{name}]"]
+
+
+class Option(typer.core.TyperOption):
+    """Option whose kind of value is in capitals, such as NUMBER, or a list of choices."""
+
+    def display_type(self, ctx: Any) -> str:
+        """Return the kind of value of an option without ``metavar``."""
+        kind = super().display_type(ctx).strip("<>").removesuffix(" range")
+        kind = kind.removeprefix("list[").removesuffix("]")
+        return KINDS_OF_VALUE.get(kind, kind)
+
+
 class Commands(typer.core.TyperGroup):
     """Command group whose help lists the complete first sentence of each command."""
+
+    def __init__(self, **attributes: Any) -> None:
+        super().__init__(**attributes)
+        for command in self.commands.values():
+            for one in command.params:  # Typer has no setting for the class of a parameter
+                is_option = isinstance(one, typer.core.TyperOption)
+                one.__class__ = Option if is_option else Argument
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write the list of names and sentences."""

@@ -67,6 +67,36 @@ OWN_FOLDER = "a new or empty folder, or an unchanged earlier export (it is repla
 class ExportChoice:
     """Contents of an export.
 
+    Parameters
+    ----------
+    tables
+        Tables as CSV: some of ``measures``, ``dots``, ``points``, ``boundary``.
+    surfaces
+        Formats of each surface: some of ``csv``, ``stl``, ``stl-ascii``, ``ply``, ``vtp``, and
+        those added by `add_export_format`.
+    solid
+        Whether to add each surface as a watertight solid, in the mesh formats of `surfaces`.
+    hdf5
+        Short for ``hdf5`` in `together`.
+    pictures
+        Some of ``frames`` (dots over each frame), ``surfaces`` (each in 3-D), ``trends`` and
+        ``film`` (all surfaces in the same view and on the same colour scale).
+    spacing_mm
+        Distance between the surfaces' nodes, mm.
+    view
+        View of surfaces in pictures and the film: ``free`` (oblique), ``top``, ``side`` or
+        ``front``.
+    size_px
+        Width and height of these, even, px.
+    film_rate_hz
+        Frame rate of the film, Hz; None: that of the recording (`film.film_times`).
+    together
+        Formats with everything in one file: ``hdf5``, and those added by `add_export_format`.
+    picture_format
+        Format of pictures of frames: ``png``, ``jpg`` or ``tif``.
+    sigma_parts
+        Whether `measures.csv` also has the parts of standard uncertainties.
+
     Raises
     ------
     InputError
@@ -74,33 +104,17 @@ class ExportChoice:
     """
 
     tables: frozenset[str] = frozenset(TABLES)
-    """Tables as CSV: some of ``measures``, ``dots``, ``points``, ``boundary``."""
     surfaces: frozenset[str] = frozenset(SURFACES)
-    """Formats of each surface: some of `SURFACE_FORMATS`."""
     solid: bool = False
-    """Whether to add each surface as a watertight solid, in the mesh formats of `surfaces`."""
     hdf5: bool = False
-    """Short for ``hdf5`` in `together`."""
     pictures: frozenset[str] = frozenset()
-    """Some of ``frames`` (dots over each frame), ``surfaces`` (each in 3-D), ``trends`` and
-    ``film`` (all surfaces in the same view and on the same colour scale).
-    """
     spacing_mm: float = SPACING_MM
-    """Distance between the surfaces' nodes, mm."""
     view: Direction = "free"
-    """View of surfaces in pictures and the film: ``free`` (oblique), ``top``, ``side`` or
-    ``front``.
-    """
     size_px: tuple[int, int] = PICTURE_PX
-    """Width and height of these, even, px."""
     film_rate_hz: float | None = None
-    """Frame rate of the film, Hz; None: that of the recording (`film.film_times`)."""
     together: frozenset[str] = frozenset()
-    """Formats with everything in one file: some of `RUN_FORMATS`."""
     picture_format: str = "png"
-    """Format of pictures of frames: ``png``, ``jpg`` or ``tif``."""
     sigma_parts: bool = False
-    """Whether `measures.csv` also has the parts of standard uncertainties."""
 
     def __post_init__(self) -> None:
         allowed: dict[str, Collection[str]] = {

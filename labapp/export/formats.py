@@ -26,21 +26,27 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SurfaceFormat:
-    """A format with one file per frame that has a surface."""
+    """A format with one file per frame that has a surface.
+
+    Parameters
+    ----------
+    end
+        End of its file names, after ``surface_NNNNNN``.
+    title, tip
+        Name and description on the Export page.
+    of
+        Data: ``mesh`` for triangles (`meshes.Mesh`), which can also be a watertight solid;
+        ``nodes`` for the points of a grid within the boundary, shape (n, 3), mm.
+    writer
+        Function that returns the file's content, bytes, for the mesh or nodes; also as
+        ``module:function`` in this package.
+    """
 
     end: str
-    """End of its file names, after ``surface_NNNNNN``."""
     title: str
     tip: str
-    """Name and description on the Export page."""
     of: Literal["mesh", "nodes"]
-    """Data: ``mesh`` for triangles (`meshes.Mesh`), which can also be a watertight solid; ``nodes``
-    for the points of a grid within the boundary, shape (n, 3), mm.
-    """
     writer: str | Callable[[Any], bytes]
-    """Function that returns the file's content for the mesh or nodes; also as ``module:function``
-    in this package.
-    """
 
     def content(self, shape: object) -> bytes:
         """Return the content of a file.
@@ -84,16 +90,23 @@ class RunWriter(Protocol):
 
 @dataclass(frozen=True)
 class RunFormat:
-    """A format with one file for all frames."""
+    """A format with one file for all frames.
+
+    Parameters
+    ----------
+    file
+        Name of the file in the export's folder.
+    title, tip
+        Name and description on the Export page.
+    writer
+        Class of a `RunWriter`, whose arguments are the file's path, its provenance, and the
+        distance between the surfaces' nodes in mm; also as ``module:Class`` in this package.
+    """
 
     file: str
     title: str
     tip: str
-    """Name and description on the Export page."""
     writer: str | Callable[[Path, Mapping[str, object], float], AbstractContextManager[RunWriter]]
-    """Class of a `RunWriter`, whose arguments are the file's path, its provenance, and the distance
-    between the surfaces' nodes in mm; also as ``module:Class`` in this package.
-    """
 
     def open(
         self, path: str | os.PathLike[str], about: Mapping[str, object], spacing_mm: float

@@ -11,22 +11,33 @@ from labapp.core.recording.residual_check import Residuals
 
 @dataclass(frozen=True, repr=False)
 class FrameResult:
-    """The result of one frame."""
+    """The result of one frame.
+
+    Parameters
+    ----------
+    frame
+        Its number.
+    time_s
+        Its time, s; None if the recording has none.
+    measurement
+        Status, reason, measures, and what they were computed from.
+    track_lost
+        Why it was not tracked from the previous frame; None if it was, or tracking was off.
+    rows
+        Its rows of each table as CSV text (`tables.table_rows`); None: not computed yet.
+    residuals
+        Its residuals, if these were removed from the measurement.
+    setup_doubt
+        Why the set-up is doubtful according to the frames so far; empty if it is not.
+    """
 
     frame: int
-    """Its number."""
     time_s: float | None
-    """Its time, s; None if the recording has none."""
     measurement: Measurement
-    """Status, reason, measures, and what they were computed from."""
     track_lost: str | None = None
-    """Why it was not tracked from the previous frame; None if it was, or tracking was off."""
     rows: Mapping[str, str] | None = None
-    """Its rows of each table as CSV text (`tables.table_rows`); None: not computed yet."""
     residuals: Residuals | None = None
-    """Its residuals, if these were removed from the measurement."""
     setup_doubt: str = ""
-    """Why the set-up is doubtful according to the frames so far; empty if it is not."""
 
     def __repr__(self) -> str:
         time = "" if self.time_s is None else f" at {self.time_s:.6g} s"

@@ -40,12 +40,18 @@ PLY_FACE = np.dtype([("count", "u1"), ("corner", "<i4", 3)])
 
 @dataclass(frozen=True, repr=False)
 class Mesh(ReadOnlyArrays):
-    """Triangles; n vertices, k triangles."""
+    """Triangles; n vertices, k triangles.
+
+    Parameters
+    ----------
+    vertices_mm
+        UCS, shape (n, 3), mm.
+    triangles
+        Indices of their corners, shape (k, 3).
+    """
 
     vertices_mm: FloatArray
-    """UCS, shape (n, 3), mm."""
     triangles: IntArray
-    """Indices of their corners, shape (k, 3)."""
 
 
 def refuse_too_large(reconstruction: Reconstruction, spacing_mm: float) -> None:

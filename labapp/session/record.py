@@ -12,7 +12,25 @@ from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
 
 @dataclass(frozen=True)
 class Record:
-    """The experiment record, entered by the operator; unknown values are empty or None."""
+    """The experiment record, entered by the operator; unknown values are empty or None.
+
+    Parameters
+    ----------
+    title, operator
+        Of the experiment.
+    material, thickness_mm
+        Of the work piece; thickness in mm.
+    current_a, voltage_v, travel_speed_mm_s
+        Welding current, A; arc voltage, V; travel speed, mm/s.
+    gas, gas_flow_l_min
+        Shielding gas, and its flow, l/min.
+    expected_width_mm, expected_length_mm, expected_height_mm
+        Expected size of the pool, mm; the height is negative for a concave pool.
+    notes
+        Further notes.
+    safety
+        Ticked items of the checklists of Appendix II (`checklist`): (item, ISO 8601) pairs.
+    """
 
     title: str = ""
     operator: str = ""
@@ -26,10 +44,8 @@ class Record:
     expected_width_mm: float | None = None
     expected_length_mm: float | None = None
     expected_height_mm: float | None = None
-    """Expected size of the pool; the height is negative for a concave pool."""
     notes: str = ""
     safety: tuple[tuple[str, str], ...] = ()
-    """Ticked items of the checklists of Appendix II (`checklist`): (item, ISO 8601) pairs."""
 
 
 @dataclass(frozen=True)

@@ -23,23 +23,23 @@ if TYPE_CHECKING:
 def calibrate_bench(
     *,
     setup: Annotated[Path, typer.Option(help="Setup file (TOML).")],
-    pictures: Annotated[
-        list[Path] | None, typer.Argument(metavar="PICTURE...", help="Pictures of mirrors.")
-    ] = None,
+    pictures: Annotated[list[Path] | None, typer.Argument(help="Pictures of mirrors.")] = None,
     mirror: Annotated[
         list[str] | None,
         typer.Option(
+            metavar="MIRROR",
             help="The mirror of each picture, in the same order: plate:HEIGHT, "
             "cap:DIAMETER:HEIGHT, ball:DIAMETER:TOP (mm, above the work piece); a standard "
             "uncertainty may follow, as in 2+-0.01; plate:HEIGHT:LEVEL gives the ± of its level "
-            "(degrees). Repeat for more pictures."
+            "(degrees). Repeat for more pictures.",
         ),
     ] = None,
     free: Annotated[
         list[str] | None,
         typer.Option(
             metavar="KEY",
-            help="Quantity to adjust without its prior, such as laser.distance_mm or picture.u.",
+            help="Quantity to adjust without its prior, such as laser.distance_mm or picture.u; "
+            "repeat for more.",
         ),
     ] = None,
     predict: Annotated[

@@ -22,9 +22,7 @@ HIGHEST_MM = 1000.0
 def calibrate_pattern(
     *,
     setup: Annotated[Path, typer.Option(help="Setup file (TOML).")],
-    pictures: Annotated[
-        list[Path], typer.Argument(metavar="PICTURE...", help="Pictures of a flat mirror.")
-    ],
+    pictures: Annotated[list[Path], typer.Argument(help="Pictures of a flat mirror.")],
     height: Annotated[
         list[float],
         typer.Option(

@@ -37,14 +37,18 @@ def calibrate_plane(
     board: Annotated[
         str | None,
         typer.Option(
+            metavar="BOARD",
             help="The board: a name (charuco_4_inch, …) or KIND:COLUMNSxROWS:SQUARE_MM. Default: "
-            "boards printed by labapp are recognised."
+            "boards printed by labapp are recognised.",
         ),
     ] = None,
     square_mm: Annotated[
         float | None,
         typer.Option(
-            min=0.1, max=1000, help="Edge of the board's squares as measured on the print (mm)."
+            min=0.1,
+            max=1000,
+            help="Edge of the board's squares as measured on the print (mm). "
+            "Default: that of the board.",
         ),
     ] = None,
     setup: SetupToChange = None,

@@ -56,7 +56,9 @@ app = typer.Typer(
 )
 
 File = Annotated[Path, typer.Argument(metavar="FILE", help="The session (.labsession).")]
-Frames = Annotated[str | None, typer.Option(metavar=FRAMES_METAVAR, help=FRAMES_HELP)]
+Frames = Annotated[
+    str | None, typer.Option(metavar=FRAMES_METAVAR, help=f"{FRAMES_HELP} Default: all.")
+]
 
 WhoseResults = Annotated[
     ResultsName | None,
@@ -337,7 +339,7 @@ def export(
     size: Size = "1280x720",
     film_rate: FilmRate = None,
     picture_format: Annotated[
-        str, typer.Option(help="Format of pictures of frames: png, jpg or tif.")
+        str, typer.Option(metavar="FORMAT", help="Format of pictures of frames: png, jpg or tif.")
     ] = "png",
     report: Annotated[bool, typer.Option("--report", help="A PDF report.")] = False,
 ) -> None:

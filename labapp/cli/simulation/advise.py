@@ -23,7 +23,7 @@ def advise(
     ],
     question: Annotated[
         Path | None,
-        typer.Argument(metavar="[FILE.toml]", help="Pools and bench (TOML): docs/adviser.md."),
+        typer.Argument(metavar="FILE.toml", help="Pools and bench (TOML): docs/adviser.md."),
     ] = None,
     width: Annotated[
         str | None, typer.Option(metavar="A:B", help="Width of the pools (X), from A to B (mm).")
@@ -36,7 +36,9 @@ def advise(
     ] = None,
     convex: Annotated[
         bool | None,
-        typer.Option("--convex/--concave", help="Pools above or below the work piece."),
+        typer.Option(
+            "--convex/--concave", help="Pools above or below the work piece. Default: above."
+        ),
     ] = None,
     angle: Annotated[
         str | None, typer.Option(metavar="A:B", help="Range of the laser's angle (degrees).")

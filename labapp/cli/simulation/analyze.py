@@ -92,13 +92,17 @@ def errors(
     part: Annotated[
         list[str] | None,
         typer.Option(
+            metavar="PART",
             help=f"Part to compute: {', '.join(PARTS)}; repeat for more. CE, LE, ME are "
-            "configuration, system limitation and methodology error. Default: all."
+            "configuration, system limitation and methodology error. Default: all.",
         ),
     ] = None,
     scheme: Annotated[
         list[str] | None,
-        typer.Option(help=f"{', '.join(SCHEMES)}; repeat for more. Default: all."),
+        typer.Option(
+            metavar="SCHEME",
+            help=f"Scheme to use: {', '.join(SCHEMES)}; repeat for more. Default: all.",
+        ),
     ] = None,
     step: Annotated[
         float,
