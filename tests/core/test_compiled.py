@@ -57,7 +57,7 @@ print(moments(rng.normal(size=(5, 301)), rng.random((5, 301))).tobytes().hex())
 
 @pytest.mark.slow
 def test_cached_code_computes_the_same_as_freshly_compiled_code(tmp_path):
-    """Without `inner`, numba would call different copies of ``_moments`` in the two processes."""
+    """By default numba would call different copies of ``_moments`` in the two processes."""
     (tmp_path / "loops.py").write_text(LOOPS, "utf-8")
     cache = tmp_path / "cache"
     environment = os.environ | {"NUMBA_CACHE_DIR": str(cache), "PYTHONPATH": str(tmp_path)}
