@@ -8,19 +8,19 @@ import pytest
 
 from labapp.config.setup import parse_setup
 from tests.benchmarks import clutter_recordings, rendered
-from tests.benchmarks.clutter import draw, set_up_off
-from tests.benchmarks.dips import Answer, answer
+from tests.benchmarks.clutter import draw, with_setup_errors
+from tests.benchmarks.dips import PoolResult, measure_pool
 
 
-def answered(kind: str, seed: int) -> Answer:
+def result_of(kind: str, seed: int) -> PoolResult:
     rig, seen, pool = draw(kind, seed, 0.05, 12)
-    return answer(pool, seen, rig)
+    return measure_pool(pool, seen, rig)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "seed"), [("cap", 100), ("ellipse", 101), ("egg", 100)])
 def test_isolated_false_and_missing_dots_are_tolerated(kind: str, seed: int) -> None:
-    got = answered(kind, seed)
+    got = result_of(kind, seed)
     assert (got.status, got.wrong) == ("ok", 0)
     assert got.right >= 0.9 * got.shown
 
@@ -28,21 +28,21 @@ def test_isolated_false_and_missing_dots_are_tolerated(kind: str, seed: int) -> 
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "seed"), [("egg", 110), ("lowrear", 110)])
 def test_false_dot_beyond_the_last_row_gets_no_ray(kind: str, seed: int) -> None:
-    got = answered(kind, seed)
+    got = result_of(kind, seed)
     assert (got.status, got.wrong) == ("ok", 0)
 
 
-def answered_with_setup_off(kind: str, seed: int, *, is_exact: bool = False) -> Answer:
-    """As `answered`, with random setup errors: laser 0.2° and 0.3 mm, plane 0.3 mm."""
+def result_with_setup_errors(kind: str, seed: int, *, is_exact: bool = False) -> PoolResult:
+    """As `result_of`, with random setup errors: laser 0.2° and 0.3 mm, plane 0.3 mm."""
     rig, seen, pool = draw(kind, seed, 0.1, 10)
-    off = set_up_off(rig, seed, 1.0)
-    return answer(pool, seen, replace(off, uncertainty=None) if is_exact else off)
+    off = with_setup_errors(rig, seed, 1.0)
+    return measure_pool(pool, seen, replace(off, uncertainty=None) if is_exact else off)
 
 
 @pytest.mark.slow
 def test_isolated_clutter_with_wrong_setup_is_rejected() -> None:
     """With a looser rule all labels were wrong, with 13 dots and 6 rays left over."""
-    got = answered_with_setup_off("rippled", 7020, is_exact=True)
+    got = result_with_setup_errors("rippled", 7020, is_exact=True)
     assert got.status in {"no-match", "ambiguous-rows", "no-reference"}
 
 
@@ -50,14 +50,14 @@ def test_isolated_clutter_with_wrong_setup_is_rejected() -> None:
 @pytest.mark.parametrize(("kind", "seed"), [("lowrear", 9084), ("dented", 9132), ("concave", 9192)])
 def test_slight_preference_of_knots_for_rows_does_not_decide(kind: str, seed: int) -> None:
     """They preferred rows with every label wrong, by 18, 20 and 15 units of χ²."""
-    assert answered_with_setup_off(kind, seed, is_exact=True).wrong == 0
+    assert result_with_setup_errors(kind, seed, is_exact=True).wrong == 0
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "seed"), [("dented", 9087), ("egg", 9100), ("lowrear", 9100)])
 def test_holes_ambiguous_within_setup_uncertainty_are_rejected(kind: str, seed: int) -> None:
     """With the setup assumed exact, every label was a row or a column off."""
-    assert answered_with_setup_off(kind, seed).status == "ambiguous-rows"
+    assert result_with_setup_errors(kind, seed).status == "ambiguous-rows"
 
 
 @pytest.mark.slow
@@ -82,7 +82,7 @@ def test_pool_jump_by_one_ray_spacing_gives_no_wrong_rows() -> None:
 def test_setup_without_uncertainties_uses_assumed_ones() -> None:
     """An ambiguous frame is therefore rejected as well."""
     rig, seen, pool = draw("dented", 9087, 0.1, 10)
-    off = set_up_off(rig, 9087, 1.0)
+    off = with_setup_errors(rig, 9087, 1.0)
     s_mm, distance_mm, h_mm = -off.imaging_plane.origin_mm * [1, 1, -1]
     text = f"""\
 [laser]
@@ -107,7 +107,7 @@ x_axis_mm = 69.85
 z_axis_px = [40.5, 410.0]
 z_axis_mm = 31.75
 """
-    assert answer(pool, seen, parse_setup(text, "setup.toml").rig).status == "ambiguous-rows"
+    assert measure_pool(pool, seen, parse_setup(text, "setup.toml").rig).status == "ambiguous-rows"
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ from labapp.core.schemes import fit
 from labapp.core.schemes.fit import FitSettings
 from labapp.core.surface.measures import measure_surface
 from labapp.core.values import CannotMeasure, IntArray
-from tests.benchmarks.dips import answer, draw, matched
+from tests.benchmarks.dips import draw, matched, measure_pool
 from tests.scenes import BENCH_RIG, BENCH_VIEW, FRAME_SHAPE, SeenDots
 
 SHIFTED = 37
@@ -49,7 +49,7 @@ NO_ROWS = (7005, 7016)
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [SHIFTED, 2, *CROSSED, *NO_ROWS, ROW_LEFT_OVER])
 def test_pool_with_a_dip_gets_the_right_rows(seed: int) -> None:
-    got = answer(*draw(seed))
+    got = measure_pool(*draw(seed))
     assert (got.status, got.wrong) == ("ok", 0)
     assert got.right >= 0.95 * got.shown
     assert abs(got.height) < 0.03
@@ -58,7 +58,7 @@ def test_pool_with_a_dip_gets_the_right_rows(seed: int) -> None:
 @pytest.mark.slow
 def test_row_beyond_shifted_labels_is_searched(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(decision, "ROW", 1000)  # or the labels without it would be rejected
-    got = answer(*draw(ROW_LEFT_OVER))
+    got = measure_pool(*draw(ROW_LEFT_OVER))
     assert (got.status, got.wrong, got.right) == ("ok", 0, got.shown)
 
 
@@ -77,14 +77,14 @@ def test_labels_that_miss_a_row_of_dots_are_rejected() -> None:
 @pytest.mark.parametrize("seed", [60031, 60151])
 def test_rows_crossing_in_a_narrow_dip_are_matched(seed: int) -> None:
     """Finer knots are needed: stiff ones led back to three swapped labels, and no match."""
-    got = answer(*draw(seed))
+    got = measure_pool(*draw(seed))
     assert (got.status, got.wrong) == ("ok", 0)
     assert got.right >= 0.9 * got.shown
 
 
 def test_caps_do_not_replace_a_better_match() -> None:
     """When caps were always tried as well, this pool had five wrong labels at its rim."""
-    got = answer(*draw(7306))
+    got = measure_pool(*draw(7306))
     assert (got.status, got.wrong) == ("ok", 0)
 
 
@@ -95,13 +95,13 @@ def test_caps_do_not_replace_a_better_match() -> None:
 )
 def test_missing_and_false_dots_give_no_wrong_rows(seed: int, missing: int, false: int) -> None:
     """Once these were matched a row off, two rows off, and with a row skipped."""
-    assert answer(*draw(seed, missing, false)).wrong == 0
+    assert measure_pool(*draw(seed, missing, false)).wrong == 0
 
 
 @pytest.mark.slow
 def test_boundary_alone_does_not_reject_rows() -> None:
     """Without a bound on its likelihood, the right rows lost to others."""
-    got = answer(*draw(9007, missing=6, false=3))
+    got = measure_pool(*draw(9007, missing=6, false=3))
     assert (got.status, got.wrong) == ("ok", 0)
 
 
@@ -114,7 +114,7 @@ def test_many_isolated_rays_without_a_dot_are_tolerated(
     seed: int, missing: int, false: int
 ) -> None:
     """As are dots without a ray. Outlying labels at the rim are removed (9070: three)."""
-    got = answer(*draw(seed, missing, false))
+    got = measure_pool(*draw(seed, missing, false))
     assert (got.status, got.wrong) == ("ok", 0)
     assert got.right >= 0.94 * got.shown
 
@@ -123,7 +123,7 @@ def test_many_isolated_rays_without_a_dot_are_tolerated(
 @pytest.mark.parametrize("seed", [52009, 52023, 52030, 52031, 52072])
 def test_dip_with_missing_dots_beside_it_is_matched(seed: int) -> None:
     """Rows and quadric fail, and the cap that explains most dots has wrong rays."""
-    got = answer(*draw(seed, missing=6, false=3))
+    got = measure_pool(*draw(seed, missing=6, false=3))
     assert (got.status, got.wrong) == ("ok", 0)
     assert got.right >= 0.9 * got.shown
 
@@ -132,20 +132,20 @@ def test_dip_with_missing_dots_beside_it_is_matched(seed: int) -> None:
 @pytest.mark.parametrize("seed", [52014, 52094, 61008])
 def test_smoother_surface_identifies_the_marker_of_two_holes(seed: int) -> None:
     """Missing dots make a second hole; the rows it implies fit too, but need a rougher surface."""
-    got = answer(*draw(seed, missing=6, false=3))
+    got = measure_pool(*draw(seed, missing=6, false=3))
     assert (got.status, got.wrong) == ("ok", 0)
     assert got.right >= 0.9 * got.shown
 
 
 def test_false_dot_near_a_predicted_dot_at_the_rim_gets_no_ray() -> None:
     """It is 0.5 mm from the predicted dot of a ray that did not come back."""
-    got = answer(*draw(71011, missing=6, false=3))
+    got = measure_pool(*draw(71011, missing=6, false=3))
     assert (got.status, got.wrong) == ("ok", 0)
     assert got.right >= 0.95 * got.shown
 
 
 def test_three_missing_dots_at_a_corner_are_no_row() -> None:
-    got = answer(*draw(52040, missing=6, false=3))
+    got = measure_pool(*draw(52040, missing=6, false=3))
     assert (got.status, got.wrong) == ("ok", 0)
 
 

@@ -1,4 +1,4 @@
-"""Chapter 8 by simulation: CE, LE, ME, the thumb tack and wrong setups, against published values."""
+"""Chapter 8 by simulation: CE, LE, ME, thumb tack and wrong setups, against published values."""
 
 from __future__ import annotations
 
