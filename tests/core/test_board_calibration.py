@@ -34,12 +34,12 @@ def lens(percent: float, **terms: float) -> Lens | None:
 
 @cache
 def shot(
-    board, percent=0.0, turned_deg=(1.0, -2.0, 1.3), center=None, seed=1, px_per_mm=5.0, axis=None
+    board, percent=0.0, turned=(1.0, -2.0, 1.3), center=None, seed=1, px_per_mm=5.0, axis=None
 ):
     """Return a view of a board, and its picture."""
     middle = board.corners_mm.mean(axis=0) if center is None else center
     view = PosedView.at(
-        tuple(middle), px_per_mm, turned_deg=turned_deg, lens=lens(percent), axis_px=axis
+        tuple(middle), px_per_mm, turned_deg=turned, lens=lens(percent), axis_px=axis
     )
     look = TargetLook()
     return view, render_target(PrintedBoard(board), view, look, np.random.default_rng(seed))
