@@ -65,9 +65,9 @@ class WindowWatcher:
                 if self._usable:
                     self._look_for_surface(window)
                 elif handle is not None and handle.isExposed():
-                    self._tell_usable(window)
+                    self._report_usable(window)
 
-    def _tell_usable(self, window: Any) -> None:
+    def _report_usable(self, window: Any) -> None:
         from PySide6.QtCore import QTimer
 
         self._usable = True

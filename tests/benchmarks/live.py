@@ -237,7 +237,7 @@ class Run:
         self.window.resize(1366, 768)
         self.window.show()
         self.log: Any = self.window.log_panel
-        self.log.model().rowsInserted.connect(self._hear)
+        self.log.model().rowsInserted.connect(self._record_messages)
         self.window.workspace.show(Session.open(folder / "run" / "gtaw.labsession"))
         self.window.show_step("capture")
         self.page: Any = self.window.page
@@ -264,7 +264,7 @@ class Run:
         counted = MeasureCounts.counted(LiveMeasuring.measure, lambda k: self.device.is_noise[k])
         LiveMeasuring.measure = counted
 
-    def _hear(self, _: object, first: int, last: int) -> None:
+    def _record_messages(self, _: object, first: int, last: int) -> None:
         self.notified += [self.log.item(row).text() for row in range(first, last + 1)]
 
     def _stall(self) -> None:
@@ -317,7 +317,7 @@ class Run:
         ended.set()
         sampling.join()
         if left := (len(self.samples) - 1) % 60:
-            self.tell_minute(self.samples[-left - 1 :])
+            self.print_minute(self.samples[-left - 1 :])
         take: Take = self.live.takes[-1]
         self.device.faults = Faults()
         run_for(1.5)  # frequent events are reported once a second
@@ -332,7 +332,7 @@ class Run:
         while not ended.wait(max(0.0, self.samples[-1].at_s + 1 - time.monotonic())):
             self._sample()
             if len(self.samples) % 60 == 1:
-                self.tell_minute(self.samples[-61:])
+                self.print_minute(self.samples[-61:])
 
     def _sample(self) -> None:
         truth, take = self.device.truth, self.live.takes[-1]
@@ -362,7 +362,7 @@ class Run:
 
     # --- output -------------------------------------------------------------------------------
 
-    def tell_minute(self, samples: Sequence[Sample]) -> None:
+    def print_minute(self, samples: Sequence[Sample]) -> None:
         """Print a row of the table for the samples of a minute."""
         if len(self.samples) <= 61:
             print(

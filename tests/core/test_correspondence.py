@@ -74,7 +74,7 @@ SCENES: list[tuple[Callable[..., Pool], Rig]] = [
 
 
 @dataclass(frozen=True)
-class Answer:
+class SceneResult:
     """Result of matching for one scene, and the truth."""
 
     pool: Pool
@@ -108,41 +108,41 @@ def matched(
 
 
 @cache
-def computed() -> list[Answer]:
+def computed() -> list[SceneResult]:
     results = []
     for seed, (kind, rig) in enumerate(SCENES):
         rng = np.random.default_rng(seed)
         pool = kind(rng, rng.uniform(4.8, 6.0), tuple(rng.uniform(-0.3, 0.3, 2)))
         missing, false = int(rng.integers(0, 4)), int(rng.integers(0, 5))
         seen = see(pool, rng, missing=missing, false=false, rig=rig)
-        results.append(Answer(pool, rig, trace(pool, rig), seen, *matched(seen.dots, rig)))
+        results.append(SceneResult(pool, rig, trace(pool, rig), seen, *matched(seen.dots, rig)))
     return results
 
 
 @pytest.fixture
-def answers() -> list[Answer]:
+def scene_results() -> list[SceneResult]:
     """Results computed once per process, and only for slow tests."""
     return computed()
 
 
-def answered(answers: list[Answer]) -> list[tuple[Answer, Match]]:
-    return [(answer, answer.match) for answer in answers if answer.match is not None]
+def with_match(scene_results: list[SceneResult]) -> list[tuple[SceneResult, Match]]:
+    return [(scene, scene.match) for scene in scene_results if scene.match is not None]
 
 
 @pytest.mark.slow
-def test_no_dot_gets_a_wrong_ray(answers: list[Answer]) -> None:
-    assert len(answers) >= 24
-    assert sum(int(answer.wrong.sum()) for answer, _ in answered(answers)) == 0
+def test_no_dot_gets_a_wrong_ray(scene_results: list[SceneResult]) -> None:
+    assert len(scene_results) >= 24
+    assert sum(int(scene.wrong.sum()) for scene, _ in with_match(scene_results)) == 0
 
 
 @pytest.mark.slow
-def test_most_scenes_and_most_of_their_dots_are_matched(answers: list[Answer]) -> None:
-    assert len(answered(answers)) >= len(answers) - 2
-    true_dots = sum(int((answer.seen.ray[:, 0] > 0).sum()) for answer, _ in answered(answers))
-    assert sum(len(match.dot) for _, match in answered(answers)) >= 0.95 * true_dots
-    for answer in answers:
-        assert (answer.match is None) != (answer.status == "ok")
-        assert answer.status != "no reason"
+def test_most_scenes_and_most_of_their_dots_are_matched(scene_results: list[SceneResult]) -> None:
+    assert len(with_match(scene_results)) >= len(scene_results) - 2
+    true_dots = sum(int((scene.seen.ray[:, 0] > 0).sum()) for scene, _ in with_match(scene_results))
+    assert sum(len(match.dot) for _, match in with_match(scene_results)) >= 0.95 * true_dots
+    for scene in scene_results:
+        assert (scene.match is None) != (scene.status == "ok")
+        assert scene.status != "no reason"
 
 
 @pytest.mark.slow
@@ -162,10 +162,10 @@ def test_row_that_growth_does_not_reach_is_seeded(monkeypatch: pytest.MonkeyPatc
 
 
 @pytest.mark.slow
-def test_orientation_is_right_with_a_large_margin(answers: list[Answer]) -> None:
+def test_orientation_is_right_with_a_large_margin(scene_results: list[SceneResult]) -> None:
     orientations: set[Orientation] = set()
-    for answer, match in answered(answers):
-        assert match.orientation == seen_orientation(answer.reflections)
+    for scene, match in with_match(scene_results):
+        assert match.orientation == seen_orientation(scene.reflections)
         assert match.margin >= 5
         assert match.trials[0].orientation == match.orientation
         assert {trial.orientation for trial in match.trials} == set(ORIENTATIONS)
@@ -176,14 +176,14 @@ def test_orientation_is_right_with_a_large_margin(answers: list[Answer]) -> None
 
 
 @pytest.mark.slow
-def test_match_is_consistent(answers: list[Answer]) -> None:
-    for answer, match in answered(answers):
+def test_match_is_consistent(scene_results: list[SceneResult]) -> None:
+    for scene, match in with_match(scene_results):
         assert len(np.unique(match.dot)) == len(match.dot)
         assert len(np.unique(match.ray, axis=0)) == len(match.ray)
         labelled = np.zeros(match.witness.shape, bool)
         labelled[tuple(match.ray.T - 1)] = True
         np.testing.assert_array_equal(match.witness > 0, labelled)
-        plane_mm = BENCH_VIEW.to_plane(answer.seen.dots.image_px[match.dot])
+        plane_mm = BENCH_VIEW.to_plane(scene.seen.dots.image_px[match.dot])
         np.testing.assert_allclose(match.plane_mm, plane_mm)
         assert (np.linalg.eigvalsh(match.plane_covariance_mm2) > 0).all()
         # Reflected numbers start at 1; the orientation gives their direction.
@@ -193,30 +193,30 @@ def test_match_is_consistent(answers: list[Answer]) -> None:
 
 
 @pytest.mark.slow
-def test_rays_marked_as_dark_have_no_dot(answers: list[Answer]) -> None:
+def test_rays_marked_as_dark_have_no_dot(scene_results: list[SceneResult]) -> None:
     # Rays hidden by the torch or missing the plane are not dark. Dots which the test removed at
     # the rim do not count: matching cannot know that they existed.
     dark_count = came_back = 0
-    for answer, match in answered(answers):
+    for scene, match in with_match(scene_results):
         dark = match.witness < 0
         dark_count += int(dark.sum())
-        taken_out = answer.reflections.visible.copy()
-        taken_out[tuple(answer.seen.ray[answer.seen.ray[:, 0] > 0].T - 1)] = False
-        came_back += int((dark & answer.reflections.hit & ~taken_out).sum())
-        assert not (dark & answer.reflections.absent).any()
+        taken_out = scene.reflections.visible.copy()
+        taken_out[tuple(scene.seen.ray[scene.seen.ray[:, 0] > 0].T - 1)] = False
+        came_back += int((dark & scene.reflections.hit & ~taken_out).sum())
+        assert not (dark & scene.reflections.absent).any()
         assert dark.any()
-    assert dark_count >= 40 * len(answered(answers))
+    assert dark_count >= 40 * len(with_match(scene_results))
     assert came_back <= 0.005 * dark_count
 
 
 @pytest.mark.slow
-def test_only_dots_with_a_ray_are_indexed(answers: list[Answer]) -> None:
-    for answer, match in answered(answers):
-        lattice = lattice_of_match(match, answer.rig, len(answer.seen.dots))
-        expected = np.zeros((len(answer.seen.dots), 2), int)
+def test_only_dots_with_a_ray_are_indexed(scene_results: list[SceneResult]) -> None:
+    for scene, match in with_match(scene_results):
+        lattice = lattice_of_match(match, scene.rig, len(scene.seen.dots))
+        expected = np.zeros((len(scene.seen.dots), 2), int)
         expected[match.dot] = match.reflected
         np.testing.assert_array_equal(np.stack([lattice.row, lattice.column], axis=-1), expected)
-        center = np.array(answer.rig.pattern.reference)
+        center = np.array(scene.rig.pattern.reference)
         offset = match.reflected[0] - match.ray[0] * ways(match.orientation)
         assert lattice.reference == tuple(center * ways(match.orientation) + offset)
 

@@ -25,10 +25,10 @@ def frame(sample: str, recording: str, number: int) -> GreyImage:
 
 def judged(image: GreyImage, sample: str | None = "gtaw") -> Quality:
     """Judge a frame with a sample's setup, or without one."""
-    return judge_quality(image, looked_at(image, sample), 8, RAYS)
+    return judge_quality(image, observed(image, sample), 8, RAYS)
 
 
-def looked_at(image: GreyImage, sample: str | None) -> Measurement:
+def observed(image: GreyImage, sample: str | None) -> Measurement:
     setup = None if sample is None else read_setup(SAMPLES / sample / "setup.toml")
     return look(image, Settings(), None if setup is None else setup.bench)
 
@@ -46,7 +46,7 @@ def good() -> GreyImage:
 
 @pytest.fixture(scope="module")
 def measured(good: GreyImage) -> Measurement:
-    return looked_at(good, "gtaw")
+    return observed(good, "gtaw")
 
 
 @pytest.mark.slow
