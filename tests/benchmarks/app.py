@@ -168,11 +168,11 @@ def shown_by(window: MainWindow) -> Callable[[], bool]:
 
 def rate(step: Callable[[int], None], seconds: float = SCRUB_S) -> float:
     step(0)
-    began, done = time.perf_counter(), 0
-    while time.perf_counter() - began < seconds:
+    start_s, done = time.perf_counter(), 0
+    while time.perf_counter() - start_s < seconds:
         done += 1
         step(done)
-    return done / (time.perf_counter() - began)
+    return done / (time.perf_counter() - start_s)
 
 
 def scrub(window: MainWindow, session: Session) -> None:
@@ -267,7 +267,7 @@ def import_recording(window: MainWindow, recording: Path, frames: int) -> None:
     run_until(lambda: page.preview is not None)
     run_until(lambda: not tasks.active)
     for how, part in (("cancelled", 0.3), ("to its end", 2.0)):
-        began = time.perf_counter()
+        start_s = time.perf_counter()
         with StallMeter() as meter:
             page.import_chosen()
             task = page._importing
@@ -279,8 +279,8 @@ def import_recording(window: MainWindow, recording: Path, frames: int) -> None:
                 if task.total and task.done > part * task.total:
                     task.cancel()
             run_until(lambda: not tasks.active)
-        took = time.perf_counter() - began
-        print_longest(f"importing, {how}", meter, f"{took / frames * 1000:.1f} ms a frame")
+        took_s = time.perf_counter() - start_s
+        print_longest(f"importing, {how}", meter, f"{took_s / frames * 1000:.1f} ms a frame")
         imported = 0 if window.workspace.session is None else len(window.workspace.session.frames)
         print(f"      {task.done} of {task.total} done; the session holds {imported} frames")
 
@@ -314,7 +314,7 @@ def measure(window: MainWindow, session: Session) -> None:
     keys = list(PAGES)
     share = len(dark) // len(keys)
     worst = StallMeter()
-    began = time.perf_counter()
+    start_s = time.perf_counter()
     for place, key in enumerate(keys):
         window.show_step(key)
         run_for(0.5)
@@ -325,11 +325,11 @@ def measure(window: MainWindow, session: Session) -> None:
             if done < share:
                 print(f"      cancelled after {done} of {share}")
                 measure_while_browsing(window, part[done:], share)
-        took = time.perf_counter() - began_part
-        print_longest(f"measuring, {key}", meter, f"{share / took:.0f} results/s")
+        took_s = time.perf_counter() - began_part
+        print_longest(f"measuring, {key}", meter, f"{share / took_s:.0f} results/s")
         worst.stalls += meter.stalls
-    took = time.perf_counter() - began
-    print_longest(f"measuring {len(keys) * share}", worst, f"{took:.0f} s")
+    took_s = time.perf_counter() - start_s
+    print_longest(f"measuring {len(keys) * share}", worst, f"{took_s:.0f} s")
     statuses = session.overview().status
     wrong = [k for k in dark[: len(keys) * share] if statuses[k] == "ok"]
     print(f"      results that were not replaced: {len(wrong)}; problems: {session.problems()}")

@@ -49,8 +49,8 @@ def _egg(rng: np.random.Generator, width: float, center: tuple[float, float], *t
 
 
 def dented(rng: np.random.Generator, width: float, center: tuple[float, float]) -> Pool:
-    away = tuple(rng.uniform(-1.0, 1.0, 2))
-    return _egg(rng, width, center, Dent(rng.uniform(0.01, 0.06), rng.uniform(0.6, 1.6), away))
+    offset = tuple(rng.uniform(-1.0, 1.0, 2))
+    return _egg(rng, width, center, Dent(rng.uniform(0.01, 0.06), rng.uniform(0.6, 1.6), offset))
 
 
 def lowrear(rng: np.random.Generator, width: float, center: tuple[float, float]) -> Pool:

@@ -121,11 +121,11 @@ def outcome(result: Measurement, seen: SeenDots) -> str:
 
 
 def outcomes(
-    kind: str, seed: int, count: int, clutter: Clutter, off: float
+    kind: str, seed: int, count: int, clutter: Clutter, setup_errors: float
 ) -> tuple[list[str], list[str]]:
     """Return the outcomes of a recording's frames measured singly, and together."""
     rig, scenes = draw(kind, seed, count, clutter)
-    entered = with_setup_errors(rig, seed, off)
+    entered = with_setup_errors(rig, seed, setup_errors)
     alone = [measured(each, entered) for each in scenes]
     judged = together(alone, entered)
     return (

@@ -72,8 +72,8 @@ def detectors(size_px: float) -> Iterator[tuple[str, Callable[[Image], FloatArra
         chosen.filterByCircularity = chosen.filterByConvexity = chosen.filterByInertia = False
         chosen.minThreshold, chosen.maxThreshold, chosen.thresholdStep = 25.0, 200.0, 5.0
         chosen.minDistBetweenBlobs = 3.0 * size_px
-        found = opencv.SimpleBlobDetector_create(chosen).detect(image)
-        return np.array([point.pt for point in found]).reshape(-1, 2)
+        keypoints = opencv.SimpleBlobDetector_create(chosen).detect(image)
+        return np.array([point.pt for point in keypoints]).reshape(-1, 2)
 
     def make_trackpy(trackpy: Any) -> Callable[[Image], FloatArray]:
         diameter = 2 * round(2 * size_px) + 1

@@ -249,14 +249,14 @@ def compare(path: Path, device: FilmedDevice, begun_s: float, ended_s: float) ->
 
 def times_told(lines: Sequence[str]) -> list[str]:
     """Return the messages; a message repeated in succession appears as often."""
-    told = []
+    messages = []
     for each in lines:
-        found = re.search(r" \((\d+) times since [\d:]+\)$", each)
-        told += [each] * (int(found[1]) if found else 1)
-    return told
+        repeats = re.search(r" \((\d+) times since [\d:]+\)$", each)
+        messages += [each] * (int(repeats[1]) if repeats else 1)
+    return messages
 
 
-def how_many(told: Sequence[str], words: str) -> int:
+def how_many(messages: Sequence[str], words: str) -> int:
     """Return how often the words occur, or the number of frames they state."""
-    found = [re.search(rf"(\d+) frames? {words}|{words}", message) for message in told]
-    return sum(int(message[1] or 1) for message in found if message)
+    matches = [re.search(rf"(\d+) frames? {words}|{words}", message) for message in messages]
+    return sum(int(message[1] or 1) for message in matches if message)

@@ -181,8 +181,8 @@ def gmaw(frames: int, seed: int, pictures: Path | None) -> None:
     film = track_line((one.image for one in run), look.frame_rate_hz)
     rate = frames / (time.perf_counter() - begin)
     truth = np.array([one.on for one in run])
-    off, followed, errors = np.flatnonzero(~truth), 0, []
-    for k in off:
+    off_frames, followed, errors = np.flatnonzero(~truth), 0, []
+    for k in off_frames:
         line = film.lines[k]
         if line is None:
             continue
@@ -191,7 +191,7 @@ def gmaw(frames: int, seed: int, pictures: Path | None) -> None:
         error = float(np.sqrt(np.mean((line.v_px - np.interp(line.u_px, u, v))[inside] ** 2)))
         errors.append(error)
         followed += error < 1.5
-        if pictures and k in off[:: max(len(off) // 8, 1)]:
+        if pictures and k in off_frames[:: max(len(off_frames) // 8, 1)]:
             enlarged = cv2.cvtColor(cv2.resize(run[k].image, None, fx=3, fy=3), cv2.COLOR_GRAY2BGR)
             for point in zip(line.u_px, line.v_px, strict=True):
                 place = np.rint(3 * np.array(point) + 1).astype(int).tolist()
@@ -200,7 +200,7 @@ def gmaw(frames: int, seed: int, pictures: Path | None) -> None:
     print(
         f"on/off right in {np.mean(film.pulses.on == truth):.2%} of {frames} frames, pulses at"
         f" {film.pulses.frequency_hz:.2f} Hz (true {look.pulse_hz:g});"
-        f" line followed in {followed / len(off):.1%} of {len(off)} off-frames,"
+        f" line followed in {followed / len(off_frames):.1%} of {len(off_frames)} off-frames,"
         f" median error {np.median(errors):.2f} px; oscillation {film.frequency_hz:.2f} Hz"
         f" (true {hertz:.2f}); {rate:.0f} frames/s"
     )

@@ -174,8 +174,8 @@ class PaintCounter(QObject):
 
 def children() -> list[int]:
     """Return the ids of the child processes."""
-    found = [each.read_text() for each in Path("/proc/self/task").glob("*/children")]
-    return [int(word) for words in found for word in words.split()]
+    texts = [each.read_text() for each in Path("/proc/self/task").glob("*/children")]
+    return [int(word) for words in texts for word in words.split()]
 
 
 def resident_mb(process: int) -> float:
@@ -197,14 +197,14 @@ def busy_s(process: int) -> float:
 def busy_threads() -> dict[str, float]:
     """Return the processor time of this process's threads by name, s."""
     names = {each.native_id: each.name for each in threading.enumerate()}
-    found: dict[str, float] = {}
+    times_s: dict[str, float] = {}
     for each in Path("/proc/self/task").iterdir():
         name = names.get(int(each.name), "others")
         with contextlib.suppress(OSError):  # it has ended
             words = (each / "stat").read_text().rpartition(")")[2].split()
             ticks = int(words[11]) + int(words[12])
-            found[name] = found.get(name, 0.0) + ticks / os.sysconf("SC_CLK_TCK")
-    return found
+            times_s[name] = times_s.get(name, 0.0) + ticks / os.sysconf("SC_CLK_TCK")
+    return times_s
 
 
 # --- the run ----------------------------------------------------------------------------------
@@ -316,8 +316,8 @@ class Run:
         }
         ended.set()
         sampling.join()
-        if left := (len(self.samples) - 1) % 60:
-            self.print_minute(self.samples[-left - 1 :])
+        if remaining := (len(self.samples) - 1) % 60:
+            self.print_minute(self.samples[-remaining - 1 :])
         take: Take = self.live.takes[-1]
         self.device.faults = Faults()
         run_for(1.5)  # frequent events are reported once a second
@@ -463,11 +463,11 @@ class Run:
             }
             # The disk of a busy computer may also stall by itself.
             least = {"MB are queued in memory": self.stalls, "writing has caught up": self.stalls}
-            found = {words: how_many(reported, words) for words in (*expected, *least)}
-            right = all(found[each] == count for each, count in expected.items())
-            right &= all(found[each] >= count for each, count in least.items())
+            counts = {words: how_many(reported, words) for words in (*expected, *least)}
+            right = all(counts[each] == count for each, count in expected.items())
+            right &= all(counts[each] >= count for each, count in least.items())
             words = ", ".join(
-                f"“{each}” {found[each]} of {n}" for each, n in (expected | least).items()
+                f"“{each}” {counts[each]} of {n}" for each, n in (expected | least).items()
             )
             line(right, f"{where}: {words}")
 

@@ -72,17 +72,17 @@ def measured(name: str, kind: str, seed: int) -> Outcome:
     axes = (view.origin_px, view.x_axis_px, view.x_axis_mm, view.z_axis_px, view.z_axis_mm)
     calibration = ImageCalibration.from_three_points(*axes)
     bench = Bench(as_entered(rig, calibration), calibration)
-    result, apart = (
+    result, is_clear = (
         measure(frame.image, bench, Settings())[0],
         resolvable(frame.dot_px[frame.shown], look),
     )
     if result.match is None or result.measures is None or result.dots is None:
-        return Outcome(result.status, apart, shown=int(frame.shown.sum()))
+        return Outcome(result.status, is_clear, shown=int(frame.shown.sum()))
     true_px = np.where(frame.shown[..., None], frame.dot_px, np.nan)[tuple(result.match.ray.T - 1)]
     distance = np.linalg.norm(result.dots.image_px[result.match.dot] - true_px, axis=-1)
     wrong = int((~(distance < ON_ITS_DOT_PX)).sum())
     right, shown = len(distance) - wrong, int(frame.shown.sum())
-    return Outcome("ok", apart, wrong, right, shown, height_error(pool, result.measures))
+    return Outcome("ok", is_clear, wrong, right, shown, height_error(pool, result.measures))
 
 
 def surveyed(name: str, pools: int, first: int) -> bool:

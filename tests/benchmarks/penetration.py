@@ -90,16 +90,16 @@ def fresh_cover(model: PenetrationModel, welds: Sequence[SimulatedWeld]) -> tupl
     )
 
 
-def false_transitions(left: LeftOut) -> int:
+def false_transitions(left_out: LeftOut) -> int:
     """Return the number of predicted transitions without a true one within 0.5 s."""
     count = 0
-    for name in dict.fromkeys(left.weld):
-        in_weld = np.array([each == name for each in left.weld])
-        known, found = (
-            find_transitions(left.time_s[in_weld], value[in_weld], FULL_MM)
-            for value in (left.measured, left.predicted)
+    for name in dict.fromkeys(left_out.weld):
+        in_weld = np.array([each == name for each in left_out.weld])
+        known, predicted = (
+            find_transitions(left_out.time_s[in_weld], value[in_weld], FULL_MM)
+            for value in (left_out.measured, left_out.predicted)
         )
-        count += sum(not len(known) or np.abs(known - at).min() > 0.5 for at in found)
+        count += sum(not len(known) or np.abs(known - time_s).min() > 0.5 for time_s in predicted)
     return count
 
 
@@ -108,21 +108,21 @@ def examine(seed: int, kind: Kind, count: int, fresh: int) -> tuple[FloatArray, 
     welds = simulate_welds(count, seed)
     series: list[WeldSeries] = [one.series for one in welds]
     settings = ModelSettings(FEATURES, TARGET, STEP_S, full_mm=FULL_MM)
-    model, left = validated_model(series, kind, settings)
-    known, found = left.transitions()
-    near = np.abs(known - found) <= NEAR_S
-    spread = np.hypot(left.sigma, left.measured_sigma)
-    bead = left.measured > 0
-    inside = np.abs(left.predicted - left.measured) <= SURE_95 * spread
+    model, left_out = validated_model(series, kind, settings)
+    known, predicted = left_out.transitions()
+    near = np.abs(known - predicted) <= NEAR_S
+    spread = np.hypot(left_out.sigma, left_out.measured_sigma)
+    bead = left_out.measured > 0
+    inside = np.abs(left_out.predicted - left_out.measured) <= SURE_95 * spread
     error, cover = fresh_cover(model, simulate_welds(fresh, 10_000 + seed))
     cells = [
-        *(f"{seed}", kind, f"{len(left.measured)}", f"{left.rmse_mm:.4f}"),
+        *(f"{seed}", kind, f"{len(left_out.measured)}", f"{left_out.rmse_mm:.4f}"),
         *(f"{noise_mm(welds):.4f}", f"{informed_mm(welds):.4f}"),
-        *(f"{left.bias_mm:+.4f}", f"{left.cover:.1%}"),
+        *(f"{left_out.bias_mm:+.4f}", f"{left_out.cover:.1%}"),
         *(f"{inside[bead].mean():.1%}", f"{error:.4f}", f"{cover:.1%}"),
-        *(f"{near.sum()}/{len(near)}", f"{false_transitions(left)}", f"{model.factor:.2f}"),
+        *(f"{near.sum()}/{len(near)}", f"{false_transitions(left_out)}", f"{model.factor:.2f}"),
     ]
-    return np.stack([known, found]), cells
+    return np.stack([known, predicted]), cells
 
 
 def main() -> None:
@@ -141,10 +141,10 @@ def main() -> None:
             times, cells = examine(seed, cast(Kind, kind), chosen.welds, chosen.fresh)
             all_times.append(times)
             print("".join(f"{cell:>12}" for cell in cells), flush=True)
-        known, found = np.hstack(all_times)
-        near = np.abs(known - found) <= NEAR_S
+        known, predicted = np.hstack(all_times)
+        near = np.abs(known - predicted) <= NEAR_S
         print(f"{kind}: {near.sum()} of {len(near)} transitions within {NEAR_S} s "
-              f"({near.mean():.1%}), median {np.nanmedian(found - known):+.3f} s")  # fmt: skip
+              f"({near.mean():.1%}), median {np.nanmedian(predicted - known):+.3f} s")  # fmt: skip
 
 
 if __name__ == "__main__":

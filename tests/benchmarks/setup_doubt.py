@@ -170,8 +170,8 @@ def smallest(
     def is_doubted(size: float) -> bool:
         moved = []
         for k, sample in enumerate(samples):
-            by = np.nan_to_num(pattern[tuple(sample.ray.T - 1)])
-            residual = sample.residual_mm - size * share(k) * by
+            effect = np.nan_to_num(pattern[tuple(sample.ray.T - 1)])
+            residual = sample.residual_mm - size * share(k) * effect
             moved.append(replace(sample, residual_mm=residual))
         return judge_setup(rig, {"ok": len(samples)}, moved).is_doubtful
 

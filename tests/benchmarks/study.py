@@ -376,7 +376,7 @@ def _truth(folder: Path, name: str) -> dict[str, float]:
 def _slope(summary: StudySummary, truth: Mapping[str, Mapping[str, float]], size: str) -> str:
     """Return the slope against current by least squares: simulated, of these pools, measured."""
     by_name = {one.status.recording.name: one for one in summary.recordings}
-    found = []
+    lines = []
     for gas in GASES:
         groups = [one for one in summary.groups if one.conditions["gas"] == gas]
         names = [name for one in groups for name in one.recordings]
@@ -393,11 +393,11 @@ def _slope(summary: StudySummary, truth: Mapping[str, Mapping[str, float]], size
             slopes.append(fit[1])
             errors.append(np.sqrt(scatter * np.linalg.inv(basis.T @ basis)[1, 1]))
         simulated = (law_mm(125, gas)[size] - law_mm(80, gas)[size]) / 45
-        found.append(
+        lines.append(
             f"{gas} measured {slopes[1]:.6f} ± {errors[1]:.6f} mm/A, true of these pools "
             f"{slopes[0]:.6f}, put in {simulated:.6f}"
         )
-    return "; ".join(found)
+    return "; ".join(lines)
 
 
 # --- a long recording ---------------------------------------------------------------------------

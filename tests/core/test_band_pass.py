@@ -27,9 +27,9 @@ def draw(positions: FloatArray, size: float, peak: float) -> FloatArray:
     return peak * gaussian_dots(SHAPE, positions, size)
 
 
-def offsets(found: FloatArray, true: FloatArray) -> FloatArray:
+def offsets(detected: FloatArray, true: FloatArray) -> FloatArray:
     """Return the vectors from each true position to the nearest detected one, shape (n, 2)."""
-    difference = found[None] - true[:, None]
+    difference = detected[None] - true[:, None]
     nearest = np.argmin(np.linalg.norm(difference, axis=-1), axis=1)
     return difference[np.arange(len(true)), nearest]
 
@@ -198,9 +198,9 @@ def test_compression_ripples_are_neither_peaks_nor_spikes() -> None:
     encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 40])[1]
     frame = np.asarray(cv2.imdecode(encoded, cv2.IMREAD_GRAYSCALE))
     assert np.median(np.abs(np.diff(frame.astype(int)))) == 0
-    tuning, seen = _tuned(frame, BandPassSettings())
-    assert len(seen.peaks(tuning)[0]) <= 1.5 * len(grid())
-    assert np.mean(seen.picture != frame) < 0.001
+    tuning, view = _tuned(frame, BandPassSettings())
+    assert len(view.peaks(tuning)[0]) <= 1.5 * len(grid())
+    assert np.mean(view.picture != frame) < 0.001
     dots = band_pass_dots(frame, BandPassSettings())
     assert len(dots) == len(grid())
     assert np.abs(offsets(dots.image_px, grid())).max() < 0.5

@@ -72,14 +72,17 @@ def system(gross_mm: float = 0.0) -> System:
 
 def test_jacobian_agrees_with_central_differences() -> None:
     equations = system()
-    at = np.random.default_rng(1).normal(0, 0.5, equations.size)
-    at[-4:] *= 0.02  # rays still hit the cap
+    parameters = np.random.default_rng(1).normal(0, 0.5, equations.size)
+    parameters[-4:] *= 0.02  # rays still hit the cap
     steps = 1e-3 * np.eye(equations.size)
     central = np.array(
-        [(equations.residuals(at + s) - equations.residuals(at - s)) / 2e-3 for s in steps]
+        [
+            (equations.residuals(parameters + s) - equations.residuals(parameters - s)) / 2e-3
+            for s in steps
+        ]
     ).T
     scale = np.abs(central).max(axis=0)
-    np.testing.assert_allclose(equations.jacobian(at) / scale, central / scale, atol=5e-5)
+    np.testing.assert_allclose(equations.jacobian(parameters) / scale, central / scale, atol=5e-5)
     assert (scale[np.flatnonzero(equations.factor.any(axis=0))] > 0.1).all()
 
 

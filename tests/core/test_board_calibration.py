@@ -176,9 +176,9 @@ def test_glare_hides_corners_but_does_not_move_them():
     image = image.copy()
     cv2.circle(image, (300, 400), 60, 255, -1)
     calibration = calibrate_board([image])
-    seen = calibration.seen[0]
-    assert 40 < len(seen.index) < 105
-    assert np.abs(seen.image_px - view.to_image(seen.plane_mm)).max() < 0.4
+    corners = calibration.seen[0]
+    assert 40 < len(corners.index) < 105
+    assert np.abs(corners.image_px - view.to_image(corners.plane_mm)).max() < 0.4
 
 
 def mirrored():

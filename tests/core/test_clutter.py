@@ -35,8 +35,8 @@ def test_false_dot_beyond_the_last_row_gets_no_ray(kind: str, seed: int) -> None
 def result_with_setup_errors(kind: str, seed: int, *, is_exact: bool = False) -> PoolResult:
     """As `result_of`, with random setup errors: laser 0.2° and 0.3 mm, plane 0.3 mm."""
     rig, seen, pool = draw(kind, seed, 0.1, 10)
-    off = with_setup_errors(rig, seed, 1.0)
-    return measure_pool(pool, seen, replace(off, uncertainty=None) if is_exact else off)
+    wrong_rig = with_setup_errors(rig, seed, 1.0)
+    return measure_pool(pool, seen, replace(wrong_rig, uncertainty=None) if is_exact else wrong_rig)
 
 
 @pytest.mark.slow
@@ -82,12 +82,12 @@ def test_pool_jump_by_one_ray_spacing_gives_no_wrong_rows() -> None:
 def test_setup_without_uncertainties_uses_assumed_ones() -> None:
     """An ambiguous frame is therefore rejected as well."""
     rig, seen, pool = draw("dented", 9087, 0.1, 10)
-    off = with_setup_errors(rig, 9087, 1.0)
-    s_mm, distance_mm, h_mm = -off.imaging_plane.origin_mm * [1, 1, -1]
+    wrong_rig = with_setup_errors(rig, 9087, 1.0)
+    s_mm, distance_mm, h_mm = -wrong_rig.imaging_plane.origin_mm * [1, 1, -1]
     text = f"""\
 [laser]
-projection_angle_deg = {off.laser.projection_angle_deg}
-distance_mm = {off.laser.distance_mm}
+projection_angle_deg = {wrong_rig.laser.projection_angle_deg}
+distance_mm = {wrong_rig.laser.distance_mm}
 [pattern]
 rows = 19
 columns = 19

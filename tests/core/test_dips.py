@@ -167,10 +167,10 @@ def test_true_rows_cost_less_than_rows_with_a_dot_on_the_marker() -> None:
 def test_marker_not_amid_labelled_rays_is_unknown() -> None:
     observed, labels = observation_of(draw(SHIFTED)[1])
     assert BENCH_RIG.pattern.marker is not None
-    apart = labels.copy()
-    apart[: BENCH_RIG.pattern.marker[0]] = UNLABELLED
-    apart[:, : BENCH_RIG.pattern.marker[1]] = UNLABELLED
-    assert evaluated(observed, apart).marker == "unknown"
+    partial_labels = labels.copy()
+    partial_labels[: BENCH_RIG.pattern.marker[0]] = UNLABELLED
+    partial_labels[:, : BENCH_RIG.pattern.marker[1]] = UNLABELLED
+    assert evaluated(observed, partial_labels).marker == "unknown"
 
 
 OUT_OF_VIEW = 41110

@@ -37,8 +37,8 @@ def test_spectrum_with_missing_frames_has_the_same_density():
     rng = np.random.default_rng(6)
     time = np.arange(4000) / 1000
     value = rng.normal(0, 1, 4000) + np.cos(2 * np.pi * 100 * time)
-    kept = rng.random(4000) > 0.1
-    spectrum = spectrogram(time[kept], value[kept], 0.25)
+    present = rng.random(4000) > 0.1
+    spectrum = spectrogram(time[present], value[present], 0.25)
     mean = spectrum.mean()
     assert spectrum.method == "Lomb-Scargle"
     assert mean.frequency_hz[np.argmax(mean.density)] == pytest.approx(100, abs=4)
@@ -49,9 +49,9 @@ def test_spectrum_with_missing_frames_has_the_same_density():
 def test_peak_of_a_chirp_is_tracked():
     rng = np.random.default_rng(8)
     time = np.arange(4000) / 1000
-    kept = rng.random(4000) > 0.05
+    present = rng.random(4000) > 0.05
     value = np.cos(2 * np.pi * (60 * time + 5 * time**2)) + rng.normal(0, 0.3, 4000)
-    peak = track_peak(time[kept], value[kept], 0.25)
+    peak = track_peak(time[present], value[present], 0.25)
     truth = 60 + 10 * peak.time_s  # the phase's derivative
     error = peak.frequency_hz - truth
     assert np.abs(error).max() < 0.5

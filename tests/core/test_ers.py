@@ -34,9 +34,9 @@ def match_of(pool, rig=RIG, **noise):
     return exact_match(trace(pool, rig), rig, **noise)
 
 
-def without(match, gone):
+def without(match, removed):
     """Return the match without the dots of a mask."""
-    remaining = ~np.asarray(gone)
+    remaining = ~np.asarray(removed)
     return replace(
         match,
         dot=match.dot[remaining],
@@ -244,8 +244,8 @@ def test_isolated_row_of_a_single_dot_is_reconstructed():
     match = match_of(spherical_cap(7.0, 0.4))
     i, j = match.ray.T
     first = i == i.min()
-    gone = (first & (j != j[first].min())) | (i == i.min() + 1)
-    reconstruction = ers.reconstruct(without(match, gone), RIG, CIRCLE)
+    removed = (first & (j != j[first].min())) | (i == i.min() + 1)
+    reconstruction = ers.reconstruct(without(match, removed), RIG, CIRCLE)
     single = reconstruction.ray[:, 0] == i.min()
     assert single.sum() == 1
     # Reached across a missing row by a step between columns: inaccurate, but near the surface.

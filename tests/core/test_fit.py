@@ -268,10 +268,10 @@ def test_sizes_have_uncertainties_where_last_rows_are_hidden() -> None:
 
 def test_setup_part_is_that_of_the_nearest_sizes_within_10_percent() -> None:
     sizes = np.array([6.0, 7.0, 0.3, -0.01, 30.0, 5.0])
-    parts = tuple(fit.SetupPart(np.full(6, by), by * sizes) for by in (1.0, 1.08, 1.3))
+    parts = tuple(fit.SetupPart(np.full(6, factor), factor * sizes) for factor in (1.0, 1.08, 1.3))
     assert fit.nearest_part((), sizes) is None
-    for by, expected in ((1.0, 1.0), (1.05, 1.08), (1.25, 1.3)):
-        part = fit.nearest_part(parts, by * sizes)
+    for factor, expected in ((1.0, 1.0), (1.05, 1.08), (1.25, 1.3)):
+        part = fit.nearest_part(parts, factor * sizes)
         assert part is not None
         assert part.sigma[0] == expected
     assert fit.nearest_part(parts, 0.85 * sizes) is None

@@ -31,9 +31,9 @@ def match_of(pool, **noise):
     return exact_match(trace(pool, RIG), RIG, **noise)
 
 
-def without(match, gone):
+def without(match, removed):
     """Return the match without the dots of a mask."""
-    remaining = ~np.asarray(gone)
+    remaining = ~np.asarray(removed)
     return replace(
         match,
         dot=match.dot[remaining],

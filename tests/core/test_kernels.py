@@ -200,11 +200,13 @@ def test_normal_equations_are_those_of_least_squares() -> None:
     points = np.column_stack([rng.uniform(BASIS.low_mm, BASIS.high_mm, (60, 2)), np.zeros(60)])
     root = rng.normal(size=(60, 2, 2))
     weights = root @ np.swapaxes(root, 1, 2)
-    by = np.stack([BASIS.matrix(*points[:, :2].T, 1, 0), BASIS.matrix(*points[:, :2].T, 0, 1)], 1)
+    slope_matrix = np.stack(
+        [BASIS.matrix(*points[:, :2].T, 1, 0), BASIS.matrix(*points[:, :2].T, 0, 1)], 1
+    )
     band = 0.1 * BASIS.roughness
     rough = sum(np.diag(line[: COUNT - k], -k) for k, line in enumerate(band))
     rough += np.tril(rough, -1).T
-    normal = np.einsum("nap,nab,nbq->pq", by, weights, by) + rough
+    normal = np.einsum("nap,nab,nbq->pq", slope_matrix, weights, slope_matrix) + rough
     factor = normal_factor(BASIS, band, points, weights)
     lower = sum(np.diag(line[: COUNT - k], -k) for k, line in enumerate(factor))
     difference = lower @ lower.T - normal
@@ -225,7 +227,7 @@ def test_normal_equations_are_those_of_least_squares() -> None:
         solver_kernels.gradient_rhs(
             BASIS.grid, surface().coefficients, points, weights, LASER, PLANE.pose_mm, dots_mm
         ),
-        np.einsum("nap,nab,nb->p", by, weights, residual),
+        np.einsum("nap,nab,nb->p", slope_matrix, weights, residual),
         atol=1e-9,
     )
 
@@ -314,11 +316,11 @@ def test_on_plane_agrees_with_the_calibration() -> None:
     image, sigma = random().uniform(0, 480, (30, 2)), random().uniform(0.05, 0.4, (30, 2))
     plane, covariance, scale = dot_kernels.on_plane(calibration.matrix, image, sigma)
     np.testing.assert_allclose(plane, calibration.to_plane(image))
-    by = calibration.jacobian(image)
+    jacobian = calibration.jacobian(image)
     np.testing.assert_allclose(
-        covariance, np.einsum("nij,nj,nkj->nik", by, sigma**2, by), atol=1e-15
+        covariance, np.einsum("nij,nj,nkj->nik", jacobian, sigma**2, jacobian), atol=1e-15
     )
-    np.testing.assert_allclose(scale, np.sqrt(np.abs(np.linalg.det(by))))
+    np.testing.assert_allclose(scale, np.sqrt(np.abs(np.linalg.det(jacobian))))
 
 
 def test_two_nearest_agree_with_kd_tree() -> None:
@@ -352,11 +354,11 @@ def test_peaks_are_the_local_maxima() -> None:
     band, disc = band_of(picture()[1]), dot_size.peak_disc(1.9)
     highest = cv2.dilate(band, disc.astype(np.uint8))
     for floor in (np.full((1, 1), 3.0, "f4"), np.full(band.shape, 3.0, "f4")):
-        found = dot_kernels.peaks(band, floor, disc)
-        np.testing.assert_array_equal(found[::-1], np.nonzero((band >= highest) & (band > 3.0)))
+        peaks = dot_kernels.peaks(band, floor, disc)
+        np.testing.assert_array_equal(peaks[::-1], np.nonzero((band >= highest) & (band > 3.0)))
     noise = random().normal(0, 1, (90, 700)).astype(np.float32)  # more peaks than room at first
-    found = dot_kernels.peaks(noise, np.full((1, 1), -9.0, "f4"), np.ones((3, 3), bool))
-    assert found.shape[1] == (noise >= cv2.dilate(noise, np.ones((3, 3)))).sum() > 256
+    peaks = dot_kernels.peaks(noise, np.full((1, 1), -9.0, "f4"), np.ones((3, 3), bool))
+    assert peaks.shape[1] == (noise >= cv2.dilate(noise, np.ones((3, 3)))).sum() > 256
 
 
 def test_close_pixels_are_merged() -> None:
@@ -372,9 +374,9 @@ def test_ridges_are_recognised_at_any_angle_and_at_the_edge() -> None:
         for times, long in ((2.0, False), (6.0, True)):
             band = np.exp(-(across**2 + (along / times) ** 2) / 18).astype(np.float32)
             assert dot_kernels.ridges(band, np.array([40]), np.array([30]), 10.0) == [long]
-    for at, times, long in ((0, 6.0, True), (79, 6.0, True), (0, 1.0, False)):
-        band = np.exp(-((u - at) ** 2 + ((v - 30) / times) ** 2) / 18).astype(np.float32)
-        assert dot_kernels.ridges(band, np.array([at]), np.array([30]), 10.0) == [long]
+    for column, times, long in ((0, 6.0, True), (79, 6.0, True), (0, 1.0, False)):
+        band = np.exp(-((u - column) ** 2 + ((v - 30) / times) ** 2) / 18).astype(np.float32)
+        assert dot_kernels.ridges(band, np.array([column]), np.array([30]), 10.0) == [long]
 
 
 def centroids_by_hand(
@@ -445,8 +447,8 @@ def test_residual_light_is_the_same_for_bytes_and_floats() -> None:
 def test_dots_are_subtracted_from_a_blurred_picture() -> None:
     dots, light, rest = fitted_picture()
     blurred = light_of(dots, light.shape, 7.0)
-    left = dot_fit_kernels.without_dots((blurred + rest).astype(np.float32), 1.0, 7.0, dots)
-    np.testing.assert_allclose(left, rest, atol=0.02)
+    remainder = dot_fit_kernels.without_dots((blurred + rest).astype(np.float32), 1.0, 7.0, dots)
+    np.testing.assert_allclose(remainder, rest, atol=0.02)
 
 
 def test_residual_light_excludes_dots_and_background() -> None:
@@ -465,15 +467,15 @@ def test_residual_light_excludes_dots_and_background() -> None:
         p, q = (u - u_px)[near], (v - v_px)[near]
         square = p**2 + q**2
         window = np.exp(-square / (2 * width[k] ** 2))
-        left, profile = window * (rest - 12.0)[near], np.exp(-square / (2 * size**2))
-        expected = left @ np.stack([0 * p + 1, p, q, profile, profile * square], -1)
+        remainder, profile = window * (rest - 12.0)[near], np.exp(-square / (2 * size**2))
+        expected = remainder @ np.stack([0 * p + 1, p, q, profile, profile * square], -1)
         np.testing.assert_allclose(sums[k, :5], expected, rtol=1e-3, atol=0.15)
         spread = 1 / (1 / width[k] ** 2 + 1 / size**2)
         third = square - 4 * spread
         fifth = square**2 - 12 * spread * square + 24 * spread**2
         mode = np.stack([each for by in (1.0, third, fifth) for each in (by * p, by * q)])
         large = np.sqrt(np.square(mode) @ window**2)
-        np.testing.assert_allclose(modes[:, k, 0] / large, mode @ left / large, atol=0.1)
+        np.testing.assert_allclose(modes[:, k, 0] / large, mode @ remainder / large, atol=0.1)
         light_part = np.square(mode) @ (window * light[near]) ** 2
         np.testing.assert_allclose(modes[:, k, 2], light_part, rtol=0.03)
         if 8 < u_px < 70 and 8 < v_px < 54:  # the window is in the picture
@@ -498,9 +500,9 @@ def test_enlarged_peaks_are_those_of_the_full_picture() -> None:
     error = high - highest[v, u]
     assert np.abs(error[within[v, u]]).max() < 0.02 * image.max()
     expected = (blurred >= highest) & (blurred > 13.0)
-    found = np.zeros(image.shape, bool)
-    found[v, u] = True
-    near = cv2.dilate(found.astype(np.uint8), np.ones((3, 3))) > 0
+    is_peak = np.zeros(image.shape, bool)
+    is_peak[v, u] = True
+    near = cv2.dilate(is_peak.astype(np.uint8), np.ones((3, 3))) > 0
     assert near[inner][expected[inner]].all()
 
 
@@ -563,11 +565,11 @@ def test_spikes_are_isolated_hot_pixels() -> None:
     hot = {(75, 49): 500.0, (0, 40): 90.0, (100, 88): 70.0, (101, 88): 70.0, (101, 89): 70.0}
     for (u, v), height in hot.items():
         image[v, u] += height
-    found, (times, beside) = dot_kernels.spikes(image, 6.0, 1.9, 1.5, 5)
-    assert set(zip(*found.tolist(), strict=True)) == set(hot)
+    spikes, (times, beside) = dot_kernels.spikes(image, 6.0, 1.9, 1.5, 5)
+    assert set(zip(*spikes.tolist(), strict=True)) == set(hot)
     assert (times > 1.5).all()
     clean = picture()[1] + 20
-    for u, v, fit in zip(*found, beside, strict=True):
+    for u, v, fit in zip(*spikes, beside, strict=True):
         assert fit == pytest.approx(clean[v, u], abs=0.35 * max(float(clean[v, u]) - 20, 15))
 
 

@@ -134,14 +134,14 @@ def test_line_is_tracked_through_pulses_spatter_and_glare():
     film = track_line((one.image for one in run), 1500.0)
     truth = np.array([one.on for one in run])
     assert np.mean(film.pulses.on == truth) >= 0.99
-    off = np.flatnonzero(~truth)
+    off_frames = np.flatnonzero(~truth)
     errors = []
-    for k in off:
+    for k in off_frames:
         line = film.lines[k]
         if line is not None:
             u, v = run[k].line_px[np.argsort(run[k].line_px[:, 0])].T
             errors.append(np.abs(line.v_px - np.interp(line.u_px, u, v))[3:-3].max())
-    assert len(errors) >= 0.95 * len(off)
+    assert len(errors) >= 0.95 * len(off_frames)
     assert np.median(errors) < 0.6
     assert film.frequency_hz == pytest.approx(36.0, abs=1.0)
 

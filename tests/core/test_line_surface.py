@@ -40,14 +40,14 @@ def exact_data(frame: LineFrame, sigma_mm: float = 0.01) -> tuple[LineData, np.n
     lines = sorted(frame.lines, key=lambda one: -float(np.mean(one.image_px[:, 1])))
     places = [VIEW.to_plane(one.image_px) for one in lines]
     tangents = [np.gradient(place, axis=0) for place in places]
-    some = slice(3, -3, 8)
-    along = np.concatenate([each[some] for each in tangents])
+    samples = slice(3, -3, 8)
+    along = np.concatenate([each[samples] for each in tangents])
     along /= np.linalg.norm(along, axis=-1, keepdims=True)
-    count = [len(place[some]) for place in places]
+    count = [len(place[samples]) for place in places]
     line = np.repeat(np.arange(len(lines)), count)
     data = LineData(
         line,
-        np.concatenate([place[some] for place in places]),
+        np.concatenate([place[samples] for place in places]),
         np.stack([-along[:, 1], along[:, 0]], axis=-1),
         np.full(len(line), sigma_mm),
         np.repeat(np.arange(len(lines)), 2),

@@ -39,9 +39,9 @@ def pinhole(
         @ np.array([[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]])
     )
     from_middle = np.array([[1, 0, -44.0], [0, 1, -44.0], [0, 0, 0]])
-    at = turned @ from_middle + distance_mm * np.diag([0, 0, 1])
+    pose = turned @ from_middle + distance_mm * np.diag([0, 0, 1])
     focal = 4.6 * distance_mm
-    return np.array([[focal, 0, 240.0], [0, -focal, 320.0], [0, 0, 1]]) @ at
+    return np.array([[focal, 0, 240.0], [0, -focal, 320.0], [0, 0, 1]]) @ pose
 
 
 def projected(matrix: FloatArray, points: FloatArray) -> FloatArray:

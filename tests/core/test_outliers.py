@@ -185,7 +185,7 @@ def test_labels_fail_by_likelihoods_of_rivals_and_false_dots() -> None:
     rim_neighbours, rim_sigma2, rim_times = 4, 4.0, 2.0
     limits = np.array([1e-4, 0.02, 0.998, 1.4, 1e-3, 1.386, false, gate, margin])
     limits = np.append(limits, [rim_neighbours, rim_sigma2, rim_times])
-    found = match_kernels.failing_labels(
+    failing = match_kernels.failing_labels(
         labels,
         (places, dot_covariance),
         (predicted, predicted_covariance),
@@ -226,7 +226,7 @@ def test_labels_fail_by_likelihoods_of_rivals_and_false_dots() -> None:
     worst[lit] = np.where(fails, square, 0.0)
     expected = (worst > 0.0) & (worst >= maximum_filter(worst, 3, mode="constant"))
     assert 0 < expected.sum() < fails.sum() < count
-    np.testing.assert_array_equal(found, expected)
+    np.testing.assert_array_equal(failing, expected)
 
 
 def covariances(rng: np.random.Generator, count: int) -> FloatArray:

@@ -217,9 +217,9 @@ def test_unexplained_weld_to_weld_scatter_widens_the_interval() -> None:
         replace(one, target=one.target + rng.normal(0, 0.3), target_sigma=0 * one.target)
         for one in linear_welds(12, 6)
     ]
-    model, left = validated_model(welds, "arx", ModelSettings(("width_mm",), TARGET))
-    assert left.sigma == pytest.approx(left.rmse_mm, rel=0.15)
-    assert model.rmse_mm == left.rmse_mm
+    model, left_out = validated_model(welds, "arx", ModelSettings(("width_mm",), TARGET))
+    assert left_out.sigma == pytest.approx(left_out.rmse_mm, rel=0.15)
+    assert model.rmse_mm == left_out.rmse_mm
 
 
 @pytest.mark.slow
@@ -227,18 +227,18 @@ def test_unexplained_weld_to_weld_scatter_widens_the_interval() -> None:
 def test_welds_left_out_are_predicted_within_their_intervals(kind: str, most: float) -> None:
     welds = [one.series for one in simulate_welds(10, 12)]
     settings = ModelSettings(FEATURES, TARGET, full_mm=FULL_MM)
-    _, left = validated_model(welds, kind, settings)  # type: ignore[arg-type]
-    bead = left.measured > 0
+    _, left_out = validated_model(welds, kind, settings)  # type: ignore[arg-type]
+    bead = left_out.measured > 0
     noise = np.sqrt(np.mean(np.where(bead, SCAN_SIGMA_MM**2 + SCATTER_MM**2, 0.0)))
-    assert noise < left.rmse_mm < most * noise
-    assert abs(left.bias_mm) < 0.03
-    assert 0.92 < left.cover < 0.98
-    spread = np.hypot(left.sigma, left.measured_sigma)[bead]
-    assert np.mean(np.abs(left.predicted - left.measured)[bead] < SURE_95 * spread) > 0.9
-    known, found = left.transitions()
+    assert noise < left_out.rmse_mm < most * noise
+    assert abs(left_out.bias_mm) < 0.03
+    assert 0.92 < left_out.cover < 0.98
+    spread = np.hypot(left_out.sigma, left_out.measured_sigma)[bead]
+    assert np.mean(np.abs(left_out.predicted - left_out.measured)[bead] < SURE_95 * spread) > 0.9
+    known, predicted = left_out.transitions()
     assert len(known) > 10
     # Of 17 transitions; tests/benchmarks/penetration.py requires 90 % of 166.
-    assert np.mean(np.abs(known - found) <= 0.2) >= 0.8
+    assert np.mean(np.abs(known - predicted) <= 0.2) >= 0.8
 
 
 # --- transitions --------------------------------------------------------------------------------

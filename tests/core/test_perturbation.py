@@ -76,10 +76,10 @@ def test_dots_follow_the_image_calibration(lens: Lens | None, percent: float):
     before = replace(AXES.calibration, lens=lens).with_distortion(percent, np.array([50.8, 50.8]))
     axes = replace(AXES, calibration=before)
     rig = replace(RIG, uncertainty=RigUncertainty(axes, *covariance_of({})))
-    by = {key: 30.0 for key in INDEX if key.endswith("px[u]")}
-    by |= {"image_calibration.origin_px[v]": -2.0, "camera_lens.distortion_percent": 0.5}
+    offsets = {key: 30.0 for key in INDEX if key.endswith("px[u]")}
+    offsets |= {"image_calibration.origin_px[v]": -2.0, "camera_lens.distortion_percent": 0.5}
     vector = np.zeros(len(QUANTITIES))
-    vector[[INDEX[key] for key in by]] = list(by.values())
+    vector[[INDEX[key] for key in offsets]] = list(offsets.values())
     moved = moved_dots(DOTS, rig, axes, vector)
     again = moved_bench(rig, vector)[1].to_plane(before.to_image(DOTS))
     np.testing.assert_allclose(moved, again, atol=1e-6)
@@ -87,11 +87,11 @@ def test_dots_follow_the_image_calibration(lens: Lens | None, percent: float):
 
 
 def test_dots_scale_with_the_axis_points():
-    by = offset(image_calibration_x_axis_mm=0.6985, image_calibration_z_axis_mm=-0.3175)
-    np.testing.assert_allclose(moved_dots(DOTS, RIG, AXES, by), DOTS * [1.01, 0.99], rtol=1e-9)
+    offsets = offset(image_calibration_x_axis_mm=0.6985, image_calibration_z_axis_mm=-0.3175)
+    np.testing.assert_allclose(moved_dots(DOTS, RIG, AXES, offsets), DOTS * [1.01, 0.99], rtol=1e-9)
     rig = replace(RIG, uncertainty=RigUncertainty(AXES, *covariance_of({})))
-    changed = quantity_values(moved_bench(rig, by)[0]) - quantity_values(rig)
-    np.testing.assert_allclose(changed, by, atol=1e-9)
+    changed = quantity_values(moved_bench(rig, offsets)[0]) - quantity_values(rig)
+    np.testing.assert_allclose(changed, offsets, atol=1e-9)
 
 
 def test_glass_index_is_uncertain_only_with_glass():
@@ -111,9 +111,9 @@ def test_covariance_of_first_quantities_has_the_others_exact():
 
 
 def test_distortion_moves_the_corner_but_not_the_centre():
-    by = offset(camera_lens_distortion_percent=1.0)
+    offsets = offset(camera_lens_distortion_percent=1.0)
     corner, center = np.array([101.6, 101.6]), np.array([50.8, 50.8])
-    moved = moved_dots(np.array([corner, center]), RIG, AXES, by)
+    moved = moved_dots(np.array([corner, center]), RIG, AXES, offsets)
     np.testing.assert_allclose(moved, [corner + 0.01 * center, center])
 
 

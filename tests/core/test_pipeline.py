@@ -67,8 +67,8 @@ def test_sizes_of_the_sample_run_are_accurate(measurements: dict[int, Measuremen
         assert size.area_mm2 == pytest.approx(true["area_mm2"], rel=0.04)
         assert size.volume_mm3 == pytest.approx(true["volume_mm3"], rel=0.08)
         for name in ("height", "width", "length"):
-            off = getattr(size, f"{name}_mm") - true[f"{name}_mm"]
-            assert abs(off) < 3.5 * getattr(size, f"{name}_sigma_mm")
+            error = getattr(size, f"{name}_mm") - true[f"{name}_mm"]
+            assert abs(error) < 3.5 * getattr(size, f"{name}_sigma_mm")
 
 
 def test_no_dot_of_the_sample_run_has_a_wrong_ray(measurements: dict[int, Measurement]) -> None:

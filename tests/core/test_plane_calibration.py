@@ -199,11 +199,11 @@ def test_uncertainty_of_points_is_propagated_to_scales_and_angle() -> None:
 
 
 def test_another_unit_also_scales_the_marks() -> None:
-    found = calibrate_plane(Scene().render())
-    half = found.with_scale(0.5)
-    assert half.px_per_mm == pytest.approx([2 * scale for scale in found.px_per_mm])
-    assert half.points_px == pytest.approx(found.points_px)
-    assert half.model == found.model
+    calibration = calibrate_plane(Scene().render())
+    scaled = calibration.with_scale(0.5)
+    assert scaled.px_per_mm == pytest.approx([2 * scale for scale in calibration.px_per_mm])
+    assert scaled.points_px == pytest.approx(calibration.points_px)
+    assert scaled.model == calibration.model
 
 
 @pytest.mark.parametrize(
@@ -248,14 +248,16 @@ def test_partly_covered_bar_is_never_measured_wrong() -> None:
     along = scene.axes[0] / scene.unit_px
     for begin in (3.0, 7.0, 8.5, 9.4, 9.7):
         image = scene.render().astype(float)
-        near, far = (np.round(scene.truth[0] + along * scene.unit_px * at) for at in (begin, 11))
+        near, far = (
+            np.round(scene.truth[0] + along * scene.unit_px * units) for units in (begin, 11)
+        )
         ends = (tuple(int(c) for c in near), tuple(int(c) for c in far))
         cv2.line(image, *ends, float(np.median(image)), 24)
         try:
-            found = calibrate_plane(image)
+            calibration = calibrate_plane(image)
         except CannotMeasure:
             continue
-        assert np.hypot(*(points(found) - scene.truth).T).max() < 3.0
+        assert np.hypot(*(points(calibration) - scene.truth).T).max() < 3.0
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -79,10 +79,10 @@ def test_search_of_a_part_finds_the_dots_of_the_full_search(
     for halved in (0.0, np.inf):
         monkeypatch.setattr("labapp.core.images.band_pass.HALVED_PX", halved)
         results += [quick_dots(each, tuning, BandPassSettings()) for each in (first, image)]
-    for part, whole in zip(results[:2], results[2:], strict=True):
-        assert len(part) == len(whole)
-        assert (np.abs(part.image_px - whole.image_px) < 0.01 * whole.u_sigma_px[:, None]).all()
-        np.testing.assert_allclose(part.size_px, whole.size_px, rtol=1e-2)
+    for part, full in zip(results[:2], results[2:], strict=True):
+        assert len(part) == len(full)
+        assert (np.abs(part.image_px - full.image_px) < 0.01 * full.u_sigma_px[:, None]).all()
+        np.testing.assert_allclose(part.size_px, full.size_px, rtol=1e-2)
     assert np.linalg.norm(results[1].image_px - faint, axis=-1).min() < 1.0
 
 

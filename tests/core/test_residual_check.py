@@ -185,19 +185,19 @@ def test_too_few_frames_give_no_verdict():
 
 @pytest.mark.parametrize(("lost", "doubtful"), [(19, True), (10, False)])
 def test_many_unmatched_frames_are_doubted(lost, doubtful):
-    none = Measurement("no-match", "", "fit")
-    some = next(iter(frames(BENCH_RIG, count=1)))
-    assert verdict_of([none] * lost + [some] * (20 - lost)).is_doubtful == doubtful
+    unmatched = Measurement("no-match", "", "fit")
+    good = next(iter(frames(BENCH_RIG, count=1)))
+    assert verdict_of([unmatched] * lost + [good] * (20 - lost)).is_doubtful == doubtful
 
 
 @pytest.mark.parametrize("status", ["no-reference", "ambiguous-rows", "no-rows"])
 def test_frames_without_a_reference_are_not_doubted(status):
     """They also occur with the right setup, for instance if the pool is beside the absent ray."""
-    some = next(iter(frames(BENCH_RIG, count=1)))
+    good = next(iter(frames(BENCH_RIG, count=1)))
     assert not verdict_of([Measurement(status, "", "fit")] * 30).is_doubtful
-    assert not verdict_of([Measurement(status, "", "fit")] * 29 + [some]).is_doubtful
-    none = [Measurement("no-match", "", "fit")] * 12
-    assert verdict_of([Measurement(status, "", "fit")] * 30 + none).is_doubtful
+    assert not verdict_of([Measurement(status, "", "fit")] * 29 + [good]).is_doubtful
+    unmatched = [Measurement("no-match", "", "fit")] * 12
+    assert verdict_of([Measurement(status, "", "fit")] * 30 + unmatched).is_doubtful
 
 
 def test_dark_frames_are_not_doubted():

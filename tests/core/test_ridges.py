@@ -41,8 +41,8 @@ def drawn(
 
 
 def test_ridge_points_are_on_a_slanted_line():
-    at = np.linspace(0, 1, 4000)[:, None]
-    frame = drawn((np.array([30.3, 60.7]) + at * np.array([190.0, 61.0]), 60.0), noise=0.2)
+    share = np.linspace(0, 1, 4000)[:, None]
+    frame = drawn((np.array([30.3, 60.7]) + share * np.array([190.0, 61.0]), 60.0), noise=0.2)
     ridges = find_ridges(frame)
     main = slice(*ridges.starts[:2]) if len(ridges) == 1 else slice(None)
     points = ridges.image_px[main]
@@ -84,8 +84,8 @@ def test_ends_are_where_the_light_ends():
 
 
 def test_line_that_leaves_the_picture_is_cut():
-    at = np.linspace(0, 1, 4000)[:, None]
-    frame = drawn((np.array([40.0, 90.0]) + at * np.array([218.0, 20.0]), 60.0))
+    share = np.linspace(0, 1, 4000)[:, None]
+    frame = drawn((np.array([40.0, 90.0]) + share * np.array([218.0, 20.0]), 60.0))
     (line,) = find_lines(frame)
     assert line.cut.tolist() == [False, True]
 

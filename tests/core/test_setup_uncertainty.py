@@ -135,9 +135,9 @@ def test_height_is_covered_with_a_plane_from_a_noisy_picture() -> None:
         setup = parse_setup(text, "setup.toml")
         match = exact_match(trace(pool, setup.rig), setup.rig)
         match = replace(match, plane_mm=setup.calibration.to_plane(seen_px))
-        made = fit.reconstruct(match, setup.rig, SETTINGS)
-        size = measure_surface(made, match, setup.rig)
-        return np.array([size.height_mm, made.size_sigma_setup[2]])
+        reconstruction = fit.reconstruct(match, setup.rig, SETTINGS)
+        size = measure_surface(reconstruction, match, setup.rig)
+        return np.array([size.height_mm, reconstruction.size_sigma_setup[2]])
 
     text = updated_setup(SETUP.text, "setup.toml", exact)
     truth = {
@@ -150,7 +150,9 @@ def test_height_is_covered_with_a_plane_from_a_noisy_picture() -> None:
         noise = np.random.default_rng([18, n]).normal(0.0, 2.5, clean.shape)
         calibration = calibrate_plane(np.clip(np.rint(clean + noise), 0, 255).astype(np.uint8))
         calibrated = calibration.setup_keys["image_calibration"] | axes
-        made, sigma = height(updated_setup(text, "setup.toml", {"image_calibration": calibrated}))
-        errors.append((made - true) / sigma)
+        height_mm, sigma = height(
+            updated_setup(text, "setup.toml", {"image_calibration": calibrated})
+        )
+        errors.append((height_mm - true) / sigma)
     covered = np.mean(np.abs(errors) < 1.96)
     assert 0.92 <= covered <= 0.98

@@ -120,12 +120,12 @@ def test_stiffer_surface_follows_a_ripple_less() -> None:
     xy = places(150)
     slopes = np.stack([np.cos(2 * xy[:, 0]), np.zeros(len(xy))], axis=-1) * 0.1
     weights = np.tile(1e4 * np.eye(2), (len(xy), 1, 1))
-    left = [
+    residuals = [
         np.std(slopes - fit_slopes(BASIS, xy, slopes, weights, s).surface.gradient(*xy.T))
         for s in (1e-2, 1e3, 1e6)
     ]
-    assert left[0] < 0.7 * left[2]
-    assert left == sorted(left)
+    assert residuals[0] < 0.7 * residuals[2]
+    assert residuals == sorted(residuals)
 
 
 def test_covariance_is_the_spread_of_repeated_fits() -> None:

@@ -83,9 +83,11 @@ def test_surfaces_interpolate_their_points(surface):
 def test_surfaces_reproduce_a_plane(surface):
     xy = scattered()
     plane = surface(np.column_stack([xy, 0.3 + xy @ [0.2, -0.1]]))
-    at = 0.5 * scattered(seed=4)
-    np.testing.assert_allclose(plane.height(*at.T), 0.3 + at @ [0.2, -0.1], atol=1e-6)
-    np.testing.assert_allclose(plane.gradient(*at.T), np.tile([0.2, -0.1], (len(at), 1)), atol=1e-5)
+    points = 0.5 * scattered(seed=4)
+    np.testing.assert_allclose(plane.height(*points.T), 0.3 + points @ [0.2, -0.1], atol=1e-6)
+    np.testing.assert_allclose(
+        plane.gradient(*points.T), np.tile([0.2, -0.1], (len(points), 1)), atol=1e-5
+    )
     np.testing.assert_allclose(plane.point_gradient[:, 0], 0.2, atol=1e-5)
 
 

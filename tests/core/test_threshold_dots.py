@@ -116,8 +116,8 @@ def test_threshold_adapts_to_each_block() -> None:
     frame[17:24, 17:24] = 60
     frame[57:64, 57:64] = 190
     dots = block_threshold_dots(frame)
-    found = dots.image_px[np.lexsort(dots.image_px.T)]
-    assert found == pytest.approx(np.array([[20.0, 20.0], [60.0, 60.0]]))
+    positions = dots.image_px[np.lexsort(dots.image_px.T)]
+    assert positions == pytest.approx(np.array([[20.0, 20.0], [60.0, 60.0]]))
 
 
 def test_delta_is_the_least_excess_over_the_block_level() -> None:
@@ -133,8 +133,8 @@ def test_small_regions_are_deleted_and_split_dots_joined() -> None:
     frame[80:90, 80:90] = 60
     frame[100:103, 30:33] = 60  # survives the median, is smaller than S_a/6
     dots = block_threshold_dots(frame)
-    found = dots.image_px[np.argsort(dots.v_px)]
-    assert found == pytest.approx(np.array([[29.5, 24.5], [84.5, 84.5]]), abs=1e-6)
+    positions = dots.image_px[np.argsort(dots.v_px)]
+    assert positions == pytest.approx(np.array([[29.5, 24.5], [84.5, 84.5]]), abs=1e-6)
 
 
 def test_full_dilation_merges_close_dots() -> None:

@@ -112,8 +112,8 @@ def test_absent_rays_are_never_visible_and_have_no_witness():
 def test_torch_blocks_a_flat_mirror_as_in_eq_4_14_and_4_15():
     """L1 and L2 of Eq. 4-14 and 4-15."""
     reflections = trace(mirror(), rig_with(angle=35, distance=30, electrode=2.0))
-    height, away = 30 * np.sin(np.radians(35)), 30 * np.cos(np.radians(35))
-    l1, l2 = 2 * away / (height - 2), 2 * away / (height + 2)
+    height, horizontal = 30 * np.sin(np.radians(35)), 30 * np.cos(np.radians(35))
+    l1, l2 = 2 * horizontal / (height - 2), 2 * horizontal / (height + 2)
     y = reflections.point_mm[..., 1]
     np.testing.assert_array_equal(reflections.incident_blocked, y < -l1)
     np.testing.assert_array_equal(reflections.reflected_blocked, y > l2)
@@ -133,8 +133,8 @@ def test_tables_4_1_and_4_2(name, sign):
         rig = rig_with(angle=float(angle), distance=30.0, electrode=5.0)
         reflections = trace(spherical_cap(2 * radius, sign * depth), rig)
         assert not reflections.incident_blocked.any()
-        found = "rb" if (reflections.lit & reflections.reflected_blocked).any() else "nb"
-        assert (angle, column, found) == (angle, column, expected)
+        blocking = "rb" if (reflections.lit & reflections.reflected_blocked).any() else "nb"
+        assert (angle, column, blocking) == (angle, column, expected)
 
 
 @pytest.mark.parametrize(
@@ -212,12 +212,12 @@ def test_rays_obey_the_law_of_reflection_on_a_disturbed_pool():
     )
 
 
-def second_reflections(pool, seen, steps=20000):
+def second_reflections(pool, reflections, steps=20000):
     """Return the rays whose reflection goes below the surface, found in tiny steps."""
-    found = np.zeros(seen.hit.shape, bool)
-    for ray in np.argwhere(seen.hit):
+    found = np.zeros(reflections.hit.shape, bool)
+    for ray in np.argwhere(reflections.hit):
         t = np.linspace(0, 12, steps)[1:, None]
-        path = seen.point_mm[tuple(ray)] + t * seen.reflected[tuple(ray)]
+        path = reflections.point_mm[tuple(ray)] + t * reflections.reflected[tuple(ray)]
         found[tuple(ray)] = (pool.height(path[:, 0], path[:, 1]) > path[:, 2] + 1e-6).any()
     return found
 

@@ -76,8 +76,10 @@ def test_gradient_is_the_derivative_up_to_the_boundary(pool, seed):
 def test_gradient_is_continuous_up_to_the_boundary(pool):
     rim = pool.boundary_mm(90)[:, :2]
     center = np.array(pool.footprint.center_mm)
-    at, near = (pool.gradient(*(center + f * (rim - center)).T) for f in (1 - 1e-11, 1 - 1e-6))
-    np.testing.assert_allclose(at, near, atol=2e-5)
+    at_boundary, near = (
+        pool.gradient(*(center + f * (rim - center)).T) for f in (1 - 1e-11, 1 - 1e-6)
+    )
+    np.testing.assert_allclose(at_boundary, near, atol=2e-5)
 
 
 @settings(max_examples=40, deadline=None)
@@ -155,13 +157,15 @@ def test_dent_lowers_the_centre_but_not_the_boundary():
 
 
 def test_oscillation_is_periodic():
-    start, half, whole = (
+    start, half_period, full_period = (
         egg(7, 3, 4, 0.3, terms=(Oscillation(0.03, 40.0, t / 40.0),)) for t in (0.0, 0.5, 1.0)
     )
     x, y = np.random.default_rng(2).uniform(-2, 2, (2, 40))
     still = egg(7, 3, 4, 0.3).height(x, y)
-    np.testing.assert_allclose(whole.height(x, y), start.height(x, y), atol=1e-12)
-    np.testing.assert_allclose(half.height(x, y) - still, still - start.height(x, y), atol=1e-12)
+    np.testing.assert_allclose(full_period.height(x, y), start.height(x, y), atol=1e-12)
+    np.testing.assert_allclose(
+        half_period.height(x, y) - still, still - start.height(x, y), atol=1e-12
+    )
     assert np.abs(start.height(x, y) - still).max() > 0.005
 
 

@@ -28,10 +28,10 @@ def rig_with(angle=30.0, distance=30.0, electrode=5.0, plane=50.0, h=3.0, size=1
 
 def test_flat_pool_agrees_with_eq_4_14_to_4_16():
     rig = rig_with(angle=35.0, electrode=2.0, h=3.0)
-    _, away, height = rig.laser.position_mm
+    _, horizontal, height = rig.laser.position_mm
     limits = clearance(rig)
-    assert limits.l1_mm == pytest.approx(2 * away / (height - 2))
-    assert limits.l2_mm == pytest.approx(2 * away / (height + 2))
+    assert limits.l1_mm == pytest.approx(2 * horizontal / (height - 2))
+    assert limits.l2_mm == pytest.approx(2 * horizontal / (height + 2))
     assert limits.least_plane_mm == pytest.approx(limits.l2_mm * (3 - 2) / 2)
     assert limits.most_plane_mm == pytest.approx(limits.l2_mm * (104.6 - 2) / 2)
     assert clearance(rig_with(electrode=20.0)).l1_mm == np.inf

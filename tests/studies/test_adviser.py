@@ -90,8 +90,8 @@ def test_margins_are_those_of_a_flat_mirror() -> None:
     place = laser.place(50.0)
     margins = laser.margins(place)
     # The rays to the rim's ends, y = ±3, seen from the diode at (y, z) = 40·(cos 30°, sin 30°).
-    away, high = 40 * np.cos(np.pi / 6), 20.0
-    far, near = high / (away + 3), high / (away - 3)
+    horizontal, height = 40 * np.cos(np.pi / 6), 20.0
+    far, near = height / (horizontal + 3), height / (horizontal - 3)
     lowest, highest = far * (50 - 3), near * (50 + 3)
     # The pool's slope, at most 0.0133, deflects rays by twice that: at most 1.5 mm on the plane.
     assert margins["torch"] == pytest.approx(5 - near * 3, abs=0.15)

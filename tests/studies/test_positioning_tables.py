@@ -34,10 +34,10 @@ def test_all_dots_are_on_the_plane_at_30_and_50_mm_only() -> None:
 def test_l1_l2_and_d1_agree_with_the_equations() -> None:
     table = made.clearance_table()
     rows = {tuple(row[:2]): dict(zip(table.columns, row, strict=True)) for row in table.rows}
-    height, away = 30 * np.sin(np.radians(30)), 30 * np.cos(np.radians(30))
+    height, horizontal = 30 * np.sin(np.radians(30)), 30 * np.cos(np.radians(30))
     flat = rows[30, "flat"]
-    assert flat["l1_mm"] == pytest.approx(5 * away / (height - 5))  # Eq. 4-14
-    assert flat["l2_mm"] == pytest.approx(5 * away / (height + 5))  # Eq. 4-15
+    assert flat["l1_mm"] == pytest.approx(5 * horizontal / (height - 5))  # Eq. 4-14
+    assert flat["l2_mm"] == pytest.approx(5 * horizontal / (height + 5))  # Eq. 4-15
     l2 = flat["l2_mm"]
     assert flat["d1_most_mm"] == pytest.approx((101.6 * l2 - 5 * l2) / 5)  # Eq. 4-16
     for depth in ("r/10", "r/5"):
@@ -46,7 +46,7 @@ def test_l1_l2_and_d1_agree_with_the_equations() -> None:
         assert convex["l2_mm"] < l2 < concave["l2_mm"]
         # Eq. 4-17: the slope at the edge of an arc of sagitta d over the half chord r.
         beta = 2 * np.arctan(0.1 if depth == "r/10" else 0.2)
-        c = np.arctan2(height, away - convex["l2_mm"])
+        c = np.arctan2(height, horizontal - convex["l2_mm"])
         assert 5 / np.tan(2 * beta + c) == pytest.approx(convex["l2_mm"], rel=1e-9)
         assert np.degrees(beta) == pytest.approx(convex["head_slope_deg"])
 
