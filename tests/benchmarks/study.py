@@ -504,7 +504,6 @@ def kills(folder: Path, count: int, seed: int) -> None:
 
 def main() -> None:
     """Run the chosen parts."""
-
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("parts", nargs="*", metavar="PART")

@@ -290,7 +290,6 @@ def test_any_sequence_of_edits_keeps_the_correction_consistent(
 
 def picture(positions: FloatArray, peak: float) -> FloatArray:
     """Return an image of round dots of σ = 2 px on a noisy background."""
-
     v, u = np.mgrid[:220, :340]
     image: FloatArray = np.random.default_rng(3).normal(20.0, 1.5, u.shape)
     for x, y in positions:

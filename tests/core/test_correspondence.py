@@ -490,7 +490,6 @@ def test_wrongly_shifted_row_is_rejected_and_named(pool: Pool, columns: int) -> 
             corrected(shift_row(good, row, columns))
         assert refusal.value.status == "no-match"
     # A single dot that is one column off is tolerated, and increases the residual.
-
     edge = int(np.argmax(good.lattice.column))
     column = int(good.lattice.column[edge]) + 1
     assert corrected(assign(good, [edge], column=column)).trials[0].residual_mm > 1.3 * right

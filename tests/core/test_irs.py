@@ -115,7 +115,6 @@ def test_base_point_is_the_lower_left_dot():
     assert lowest[by_number]
     assert match.plane_mm[by_number, 0] == match.plane_mm[lowest, 0].min()
     # Without numbers the positions on the imaging plane give the same dot.
-
     unnumbered = replace(match, reflected=np.zeros_like(match.reflected))
     assert irs.lower_left(unnumbered) == by_number
     # On an inverse pool it is the ray nearest the head.

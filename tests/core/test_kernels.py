@@ -288,7 +288,7 @@ def test_behind_torch_agrees_with_reflected_rays() -> None:
     points = landing + random().normal(0.0, 0.2, landing.shape)
     slopes = random().normal(0.0, 0.1, (len(rays), 2))
     reflected = reflect(rays, surface_normal(slopes))
-    # Where y is 0, beside the torch, the incident or reflected ray is highest.
+    # Beside the torch a ray is highest at y = 0, before or after its reflection.
     towards = np.where((points[:, 1] < 0)[:, None], -rays, reflected)
     height = points[:, 2] - points[:, 1] * towards[:, 2] / towards[:, 1]
     hidden = height > 2.4 - 0.3
@@ -560,7 +560,7 @@ def test_connected_pixels_agree_with_opencv() -> None:
     assert seeds.sum() < connected.sum() < len(u)
 
 
-def test_spikes_are_isolated_hot_pixels() -> None:
+def test_spikes_are_hot_pixels_but_not_dots() -> None:
     image = picture()[1] + 20
     hot = {(75, 49): 500.0, (0, 40): 90.0, (100, 88): 70.0, (101, 88): 70.0, (101, 89): 70.0}
     for (u, v), height in hot.items():

@@ -72,7 +72,6 @@ def test_every_quantity_moves_the_named_value():
 @pytest.mark.parametrize("lens", [None, LENS])
 def test_dots_follow_the_image_calibration(lens: Lens | None, percent: float):
     """A dot is fixed in the picture; the moved bench's calibration maps it elsewhere."""
-
     before = replace(AXES.calibration, lens=lens).with_distortion(percent, np.array([50.8, 50.8]))
     axes = replace(AXES, calibration=before)
     rig = replace(RIG, uncertainty=RigUncertainty(axes, *covariance_of({})))

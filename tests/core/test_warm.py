@@ -240,7 +240,6 @@ def test_pool_that_moves_by_a_row_gives_no_wrong_rays(way: int) -> None:
 
 def test_another_pool_with_as_many_rays_starts_a_new_track() -> None:
     """The splines differ, so that cached results of the first pool cannot be used."""
-
     follower = WarmChain(BENCH, Settings())
     for number, pool in enumerate(
         [

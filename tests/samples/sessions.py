@@ -25,7 +25,6 @@ def correct_frame_2(session: Session) -> None:
 
 def main(names: Sequence[str]) -> None:
     """Make the named sessions, or all; existing ones are replaced."""
-
     for name in names or SAMPLES:
         path = sample_folder(name) / f"{name}.labsession"
         path.unlink(missing_ok=True)
