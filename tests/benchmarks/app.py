@@ -1,12 +1,13 @@
-"""How quick the app is for its operator: start, opening, scrubbing, 3-D, and the longest stalls.
+"""Speed of the app: start, opening, scrubbing, 3-D updates, and the longest GUI stalls.
 
 Run as ``xvfb-run -a -s "-screen 0 1920x1080x24" python tests/benchmarks/app.py [frames] [part …]``
-with the parts ``start``, ``scrub``, ``import`` and ``measure``; without any, all of them. Each
-figure is told beside something plain that was timed in the same run, and with the load of the
-machine, as machines differ and are busy.
+with the parts ``start``, ``scrub``, ``import`` and ``measure``; by default all of them. Each figure
+is printed with a simple reference timed in the same run, and with the load of the machine, as
+machines differ and are busy.
 
-Frames are those of the GTAW sample, then dark ones: a fit takes seconds, a dark frame none, so that
-results come as fast as they ever can. Every frame holds one of the sample's results before.
+Frames are those of the GTAW sample, followed by dark ones: a fit takes seconds, a dark frame almost
+no time, so that results arrive at the highest possible rate. Before measuring, every frame has one
+of the sample's results.
 """
 
 from __future__ import annotations
@@ -43,16 +44,16 @@ from labapp.session.session import Session
 STARTS = 5
 SCRUB_S = 4.0
 MOST_MS = 50.0
-"""No call may keep the GUI thread longer."""
+"""No call may block the GUI thread for longer."""
 
 BRIGHT = 300
-"""So many frames of the recording show dots."""
+"""Number of frames of the recording that show dots."""
 
 CHILD = Path(__file__).with_name("app_start.py")
 PARTS = ("start", "scrub", "import", "measure")
 
 
-def told(name: str, value: str, beside: str, bar: str) -> None:
+def print_figure(name: str, value: str, beside: str, bar: str) -> None:
     print(f"{name:<34}{value:>14}   {beside:<44}{bar:<22} load {os.getloadavg()[0]:.1f}")
     sys.stdout.flush()
 
@@ -61,15 +62,15 @@ def told(name: str, value: str, beside: str, bar: str) -> None:
 
 
 def started(*arguments: object) -> dict[str, float]:
-    """Seconds from a program's beginning to what it tells of."""
-    began = time.monotonic()
-    answer = subprocess.run(
-        [sys.executable, CHILD, str(began), *map(str, arguments)],
+    """Return the seconds from the start of a program to the events that it prints."""
+    started_s = time.monotonic()
+    process = subprocess.run(
+        [sys.executable, CHILD, str(started_s), *map(str, arguments)],
         capture_output=True,
         text=True,
         check=True,
     )
-    pairs = [line.split() for line in answer.stdout.splitlines()]
+    pairs = [line.split() for line in process.stdout.splitlines()]
     return {name: float(value) for name, value in pairs}
 
 
@@ -93,9 +94,9 @@ def start(folder: Path) -> None:
         ("start with the sample, to 3-D", "file", "drawn", "wanted ≤ 4.0 s"),
         ("open the sample later, to 3-D", "later", "drawn", "wanted ≤ 1.5 s"),
     ):
-        took, busy = median(kind, event), median(kind, f"{event}_cpu")
-        beside = f"{busy:.2f} s of processor; {took / bare:.1f} × a bare Qt window"
-        told(name, f"{took:.2f} s", beside, bar)
+        took_s, cpu_s = median(kind, event), median(kind, f"{event}_cpu")
+        beside = f"{cpu_s:.2f} s of processor; {took_s / bare:.1f} × a bare Qt window"
+        print_figure(name, f"{took_s:.2f} s", beside, bar)
 
 
 # --- the session ------------------------------------------------------------------------------
@@ -121,14 +122,14 @@ def make_recording(path: Path, frames: int) -> None:
 def fill(session: Session) -> None:
     """Give every frame one of the sample's results."""
     with Session.open(SAMPLE / "gtaw.labsession", read_only=True) as sample:
-        kept = [sample.result(int(k)) for k in sample.frames]
+        results = [sample.result(int(k)) for k in sample.frames]
         session.set_setup(sample.setup_text)
         session.set_settings(sample.settings)
     basis = session._basis()
     assert basis is not None
     with session._database.transaction():
         for number in session.frames.tolist():
-            result = kept[number % len(kept)]
+            result = results[number % len(results)]
             assert result is not None
             session._results.put(number, result.measurement, basis, None)
 
@@ -146,14 +147,14 @@ def new_window(folder: Path) -> MainWindow:
 
 
 def is_drawn(view: Any) -> bool:
-    """Whether a 3-D view has drawn its scene, as far as that is its own work."""
+    """Return whether a 3-D view has drawn its scene."""
     if isinstance(view, OffscreenView):
         return view._picture is not None
     return not view._late.isActive()
 
 
 def shown_by(window: MainWindow) -> Callable[[], bool]:
-    """Whether the page in view shows the frame in view, drawn."""
+    """Return a condition: the current page has drawn the current frame."""
     page: Any = window.page
     space = window.workspace
     if page.key == "dots":
@@ -167,17 +168,17 @@ def shown_by(window: MainWindow) -> Callable[[], bool]:
 
 def rate(step: Callable[[int], None], seconds: float = SCRUB_S) -> float:
     step(0)
-    began, done = time.perf_counter(), 0
-    while time.perf_counter() - began < seconds:
+    start_s, done = time.perf_counter(), 0
+    while time.perf_counter() - start_s < seconds:
         done += 1
         step(done)
-    return done / (time.perf_counter() - began)
+    return done / (time.perf_counter() - start_s)
 
 
 def scrub(window: MainWindow, session: Session) -> None:
     numbers = np.random.default_rng(1).integers(0, BRIGHT, 10_000).tolist()
-    decoded = rate(lambda k: session.frame(numbers[k]) and None)
-    print(f"{len(session.frames)} frames; decoding alone: {decoded:.0f} frames/s")
+    decoding_rate = rate(lambda k: session.frame(numbers[k]) and None)
+    print(f"{len(session.frames)} frames; decoding alone: {decoding_rate:.0f} frames/s")
     for key in ("capture", "dots", "surface", "trends"):
         window.show_step(key)
         run_until(shown_by(window))
@@ -186,22 +187,22 @@ def scrub(window: MainWindow, session: Session) -> None:
         def step(k: int) -> None:
             window.timeline.scrubber.go_to(numbers[k])
             run_until(shown_by(window))
-            QApplication.processEvents()  # which draws what was updated
+            QApplication.processEvents()  # draws the updates
 
-        busy = time.process_time()
+        cpu_s = time.process_time()
         with StallMeter() as meter:
-            reached = rate(step)
-        busy = (time.process_time() - busy) / (reached * SCRUB_S) * 1000
-        beside = f"{reached / decoded:.2f} of decoding; {busy:.0f} ms of processor each"
-        told(f"scrubbing, {key}", f"{reached:.1f} /s", beside, "wanted ≥ 30 /s")
-        tell_stalls(meter, 1)
+            frame_rate = rate(step)
+        cpu_s = (time.process_time() - cpu_s) / (frame_rate * SCRUB_S) * 1000
+        beside = f"{frame_rate / decoding_rate:.2f} of decoding; {cpu_s:.0f} ms of processor each"
+        print_figure(f"scrubbing, {key}", f"{frame_rate:.1f} /s", beside, "wanted ≥ 30 /s")
+        print_stalls(meter, 1)
     window.show_step("surface")
     run_until(shown_by(window))
     draw(window)
 
 
 def draw(window: MainWindow) -> None:
-    """Another surface in the 3-D view, which has to be built and drawn."""
+    """Time how often another surface can be built and drawn in the 3-D view."""
     page: Any = window.page
     scenes = []
     for number in range(10):
@@ -209,92 +210,92 @@ def draw(window: MainWindow) -> None:
         run_until(shown_by(window))
         scenes.append(page.view.scene)
     plotter = page.view._drawing.plotter
-    bare = rate(lambda _: plotter.render() and None)
+    render_rate = rate(lambda _: plotter.render() and None)
 
     def step(k: int) -> None:
         page.view.show_scene(scenes[k % len(scenes)])
         run_until(lambda: is_drawn(page.view))
         QApplication.processEvents()
 
-    reached = rate(step)
+    update_rate = rate(step)
     size = plotter.window_size
-    beside = f"{reached / bare:.2f} of bare renders, {size[0]}×{size[1]} px"
-    told("3-D updates", f"{reached:.1f} /s", beside, "wanted ≥ 20 /s")
+    beside = f"{update_rate / render_rate:.2f} of bare renders, {size[0]}×{size[1]} px"
+    print_figure("3-D updates", f"{update_rate:.1f} /s", beside, "wanted ≥ 20 /s")
 
 
 # --- long work --------------------------------------------------------------------------------
 
 
-def tell_stalls(meter: StallMeter, count: int) -> None:
+def print_stalls(meter: StallMeter, count: int) -> None:
     for stall in meter.longest[:count]:
         print(f"      {stall.wall_ms:6.1f} ms ({stall.cpu_ms:.0f} of processor)  {stall.calls}")
     sys.stdout.flush()
 
 
-def tell_longest(name: str, meter: StallMeter, beside: str) -> None:
+def print_longest(name: str, meter: StallMeter, beside: str) -> None:
     longest = meter.longest
-    most = longest[0].wall_ms if longest else 0.0
+    wall_ms = longest[0].wall_ms if longest else 0.0
     over = sum(stall.wall_ms > MOST_MS for stall in longest)
-    busy = max((stall.cpu_ms for stall in longest), default=0.0)
-    beside = f"of processor {busy:.0f} ms; {over} over {MOST_MS:g}; {beside}"
-    told(name, f"{most:.0f} ms", beside, f"wanted ≤ {MOST_MS:g} ms")
-    tell_stalls(meter, 4)
+    cpu_ms = max((stall.cpu_ms for stall in longest), default=0.0)
+    beside = f"of processor {cpu_ms:.0f} ms; {over} over {MOST_MS:g}; {beside}"
+    print_figure(name, f"{wall_ms:.0f} ms", beside, f"wanted ≤ {MOST_MS:g} ms")
+    print_stalls(meter, 4)
 
 
 def idle(folder: Path) -> None:
-    """What a window that does nothing comes to, beside a process that is busy as one measures."""
-    busy = subprocess.Popen([sys.executable, "-c", "while True: pass"])
-    bare = QMainWindow()
-    bare.setCentralWidget(QLabel("nothing"))
-    bare.show()
+    """Measure the stalls of an idle window while another process is busy, as a reference."""
+    busy_process = subprocess.Popen([sys.executable, "-c", "while True: pass"])
+    window = QMainWindow()
+    window.setCentralWidget(QLabel("nothing"))
+    window.show()
     try:
         with StallMeter() as meter:
             run_for(5)
     finally:
-        busy.kill()
-        busy.wait()
-        bare.close()
-    tell_longest("a bare window, another busy", meter, "5 s")
+        busy_process.kill()
+        busy_process.wait()
+        window.close()
+    print_longest("a bare window, another busy", meter, "5 s")
 
 
-def take_in(window: MainWindow, recording: Path, frames: int) -> None:
-    """Import by the recording page: watch, cancel, begin again, and look at it meanwhile."""
+def import_recording(window: MainWindow, recording: Path, frames: int) -> None:
+    """Import on the recording page while browsing frames: cancel, then import to the end."""
     window.show_step("capture")
     page: Any = window.page
     tasks = window.workspace.tasks
     page.take(recording)
     run_until(lambda: page.preview is not None)
     run_until(lambda: not tasks.active)
-    for words, part in (("cancelled", 0.3), ("to its end", 2.0)):
-        began = time.perf_counter()
+    for how, part in (("cancelled", 0.3), ("to its end", 2.0)):
+        start_s = time.perf_counter()
         with StallMeter() as meter:
             page.import_chosen()
             task = page._importing
-            looked = 0
+            steps = 0
             while task in tasks.active:
                 run_for(0.05)
-                looked += 1
-                page.slider.setValue((looked * 37) % frames)
+                steps += 1
+                page.slider.setValue((steps * 37) % frames)
                 if task.total and task.done > part * task.total:
                     task.cancel()
             run_until(lambda: not tasks.active)
-        took = time.perf_counter() - began
-        tell_longest(f"importing, {words}", meter, f"{took / frames * 1000:.1f} ms a frame")
-        held = 0 if window.workspace.session is None else len(window.workspace.session.frames)
-        print(f"      {task.done} of {task.total} done; the session holds {held} frames")
+        took_s = time.perf_counter() - start_s
+        print_longest(f"importing, {how}", meter, f"{took_s / frames * 1000:.1f} ms a frame")
+        imported = 0 if window.workspace.session is None else len(window.workspace.session.frames)
+        print(f"      {task.done} of {task.total} done; the session holds {imported} frames")
 
 
-def watch(window: MainWindow, part: Sequence[int], most: int) -> int:
-    """Measure frames, at most so many, while others are looked at; how many were kept."""
+def measure_while_browsing(window: MainWindow, part: Sequence[int], most: int) -> int:
+    """Measure at most ``most`` frames while browsing others; return the number done."""
     space = window.workspace
     space.measure(part)
     task = space.measuring
     assert task is not None
-    looked = 0
+    steps = 0
     while task in space.tasks.active:
         run_for(0.1)
-        looked += 1
-        space.show_frame(looked % BRIGHT)
+        steps += 1
+        space.show_frame(steps % BRIGHT)
         if task.done > most:
             task.cancel()
     run_until(lambda: not space.tasks.active)
@@ -302,33 +303,33 @@ def watch(window: MainWindow, part: Sequence[int], most: int) -> int:
 
 
 def measure(window: MainWindow, session: Session) -> None:
-    """Measure on every page, while frames are stepped through; cancel, and go on to the end."""
+    """Measure on every page while browsing frames; cancel once, then continue to the end."""
     space = window.workspace
     dark = session.frames[BRIGHT:].tolist()
     for key in PAGES:
         window.show_step(key)
         run_for(1.0)
-    space.measure(dark[:200])  # the processes are there, and what is made once
+    space.measure(dark[:200])  # starts the processes and fills caches
     run_until(lambda: not space.tasks.active, 120)
     keys = list(PAGES)
     share = len(dark) // len(keys)
     worst = StallMeter()
-    began = time.perf_counter()
+    start_s = time.perf_counter()
     for place, key in enumerate(keys):
         window.show_step(key)
         run_for(0.5)
         began_part = time.perf_counter()
         part = dark[place * share : (place + 1) * share]
         with StallMeter() as meter:
-            kept = watch(window, part, share // 2 if place == 0 else share)
-            if kept < share:
-                print(f"      cancelled after {kept} of {share}")
-                watch(window, part[kept:], share)
-        took = time.perf_counter() - began_part
-        tell_longest(f"measuring, {key}", meter, f"{share / took:.0f} results/s")
+            done = measure_while_browsing(window, part, share // 2 if place == 0 else share)
+            if done < share:
+                print(f"      cancelled after {done} of {share}")
+                measure_while_browsing(window, part[done:], share)
+        took_s = time.perf_counter() - began_part
+        print_longest(f"measuring, {key}", meter, f"{share / took_s:.0f} results/s")
         worst.stalls += meter.stalls
-    took = time.perf_counter() - began
-    tell_longest(f"measuring {len(keys) * share}", worst, f"{took:.0f} s")
+    took_s = time.perf_counter() - start_s
+    print_longest(f"measuring {len(keys) * share}", worst, f"{took_s:.0f} s")
     statuses = session.overview().status
     wrong = [k for k in dark[: len(keys) * share] if statuses[k] == "ok"]
     print(f"      results that were not replaced: {len(wrong)}; problems: {session.problems()}")
@@ -356,7 +357,7 @@ def main(arguments: Sequence[str]) -> None:
         session = window.workspace.session
         assert session is not None
         if "import" in parts:
-            take_in(window, recording, frames)
+            import_recording(window, recording, frames)
         else:
             session.import_recording(recording)
         fill(session)

@@ -1,4 +1,4 @@
-"""The app in a process of its own for `app.py`: tells when it can be used, and when 3-D is drawn.
+"""The app in its own process, for `app.py`: prints when it is usable, and when 3-D is drawn.
 
 ``app_start.py BEGAN bare|app|file|later [SESSION]``, BEGAN by `time.monotonic`, s.
 """
@@ -14,15 +14,15 @@ POLL_MS = 2
 LATER_MS = 3000
 
 
-def tell(name: str, since: float, busy: float = 0.0) -> None:
-    """Tell how long it took, and how much of the processor; s."""
+def print_time(name: str, since: float, cpu_start: float = 0.0) -> None:
+    """Print the elapsed time and the processor time, s."""
     print(name, time.monotonic() - since)
-    print(f"{name}_cpu", time.process_time() - busy)
+    print(f"{name}_cpu", time.process_time() - cpu_start)
     sys.stdout.flush()
 
 
 def bare(began: float) -> None:
-    """A window of Qt's and nothing in it."""
+    """Show an empty Qt window."""
     from PySide6.QtCore import QTimer
     from PySide6.QtWidgets import QApplication, QMainWindow
 
@@ -35,7 +35,7 @@ def bare(began: float) -> None:
         handle = window.windowHandle()
         if handle is not None and handle.isExposed():
             timer.stop()
-            QTimer.singleShot(0, lambda: (tell("usable", began), app.quit()))
+            QTimer.singleShot(0, lambda: (print_time("usable", began), app.quit()))
 
     timer = QTimer()
     timer.timeout.connect(look)
@@ -43,8 +43,8 @@ def bare(began: float) -> None:
     app.exec()
 
 
-class Onlooker:
-    """Looks at the app's window every other millisecond."""
+class WindowWatcher:
+    """Checks the app's window every 2 ms."""
 
     def __init__(self, app: Any, began: float, kind: str, session: Path | None) -> None:
         from PySide6.QtCore import QTimer
@@ -65,13 +65,13 @@ class Onlooker:
                 if self._usable:
                     self._look_for_surface(window)
                 elif handle is not None and handle.isExposed():
-                    self._tell_usable(window)
+                    self._report_usable(window)
 
-    def _tell_usable(self, window: Any) -> None:
+    def _report_usable(self, window: Any) -> None:
         from PySide6.QtCore import QTimer
 
         self._usable = True
-        tell("usable", *self._since)
+        print_time("usable", *self._since)
         if self._kind == "app":
             window.close()
         elif self._kind == "later":
@@ -85,21 +85,21 @@ class Onlooker:
         drawing = getattr(getattr(window.page, "view", None), "_drawing", None)
         if drawing and drawing.plotter.renderer.GetLastRenderTimeInSeconds() > 0:
             self._timer.stop()
-            tell("drawn", *self._since)
+            print_time("drawn", *self._since)
             window.close()
 
 
 def start(began: float, kind: str, session: Path | None) -> None:
-    """The command, with an onlooker."""
+    """Run the command with a watcher."""
     from labapp import cli
     from labapp.gui import app as gui_app
 
-    make = gui_app.start_app
-    lookers = []
+    start_original = gui_app.start_app
+    watchers = []
 
     def start_app() -> Any:
-        app = make()
-        lookers.append(Onlooker(app, began, kind, session))
+        app = start_original()
+        watchers.append(WindowWatcher(app, began, kind, session))
         return app
 
     gui_app.start_app = start_app

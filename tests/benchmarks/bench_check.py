@@ -1,11 +1,11 @@
-"""How well bench checks do on simulated benches: coverage of the height's ±, and its errors.
+"""Bench checks on simulated benches: coverage of the height's ±, and errors of the height.
 
 Run as ``python -m tests.benchmarks.bench_check [--benches N] [--full M] [--seed S]``. Benches are
-drawn about one set-up, with all quantities off that have a ±, those of a glass on the plane too.
-Pools of two kinds are measured on each before and after the check, and with the true set-up, whose
-errors are those of noise and level alone. Of the first M benches dots are matched as in the app; of
-the others each dot's ray is given, which is some ten times as quick. Each set of pictures is taken
-with plates that lie level to each of `LEVELS_DEG`, on the same benches with the same draws.
+drawn around one setup, with errors in all quantities that have a ±, including those of the glass.
+Pools of two kinds are measured on each before and after the check, and with the true setup, where
+only noise and level contribute errors. For the first M benches dots are matched as in the app; for
+the others each dot's ray is given, which is about ten times as fast. Each set of pictures is taken
+with plates levelled to each of `LEVELS_DEG`, on the same benches with the same draws.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from labapp.simulation.pools import Pool, egg, spherical_cap
 
 PX_PER_MM, SIGMA_PX, SHAPE = 4.7, 0.12, (640, 480)
 MIDDLE = np.array([SHAPE[1] - 1, SHAPE[0] - 1]) / 2
-# The camera looks at the plane's middle.
+# The camera is aimed at the plane's middle.
 VIEW = CameraView.rolled(
     (float(MIDDLE[0] - 50.8 * PX_PER_MM), float(MIDDLE[1] + 50.8 * PX_PER_MM)), PX_PER_MM
 )
@@ -66,12 +66,12 @@ PICTURES: dict[str, tuple[Plate | Cap, ...]] = {
     "plate and cap": (Plate(0.0), Cap(9.75, 0.91)),
 }
 LEVELS_DEG = (0.1, 0.02, 0.0)
-"""Standard deviations of how level plates lie, and what the check takes them for: what is assumed
-where nothing is entered, a ground plate on a surface plate, and exactly level."""
+"""Standard deviations of the plates' tilt, also assumed by the check: the default, a ground plate
+on a surface plate, and exactly level."""
 
 
 def levelled(mirror: Plate | Cap, level_deg: float) -> Plate | Cap:
-    """A mirror; if it is a plate, level to so much."""
+    """Return the mirror; a plate gets the given tilt uncertainty."""
     return replace(mirror, tilt_sigma_deg=level_deg) if isinstance(mirror, Plate) else mirror
 
 
@@ -83,7 +83,7 @@ CANDIDATES: dict[str, tuple[Mirror, ...]] = {
 
 
 def surface_like(mirror: Mirror, rng: np.random.Generator) -> PoolSurface:
-    """A mirror as it truly is: off by its uncertainties."""
+    """Return a true surface of a mirror, with errors drawn from its uncertainties."""
     if isinstance(mirror, Plate):
         rise = np.tan(np.radians(rng.normal(0, mirror.tilt_sigma_deg, 2)))
         height = mirror.height_mm + rng.normal(0, mirror.height_sigma_mm)
@@ -95,65 +95,67 @@ def surface_like(mirror: Mirror, rng: np.random.Generator) -> PoolSurface:
     return spherical_cap(float(diameter), float(height), (float(x), float(y)))
 
 
-def seen(
+def seen_dots(
     surface: PoolSurface, bench: SimulatedBench, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Places of dots in the picture, px, and their rays, counted from 0."""
-    made = trace(surface, bench.rig)
-    place = bench.view.to_image(made.plane_mm)
-    shown = made.visible & ((place > 3) & (place < [SHAPE[1] - 4, SHAPE[0] - 4])).all(axis=-1)
-    return place[shown] + rng.normal(0, SIGMA_PX, (int(shown.sum()), 2)), np.argwhere(shown)
+    """Return positions of dots in the picture, px, and their rays, counted from 0."""
+    reflections = trace(surface, bench.rig)
+    image_px = bench.view.to_image(reflections.plane_mm)
+    shown = reflections.visible & ((image_px > 3) & (image_px < [SHAPE[1] - 4, SHAPE[0] - 4])).all(
+        axis=-1
+    )
+    return image_px[shown] + rng.normal(0, SIGMA_PX, (int(shown.sum()), 2)), np.argwhere(shown)
 
 
-def dots_at(place: FloatArray) -> Dots:
-    """Dots at places in the picture."""
-    n = len(place)
-    same = np.full(n, SIGMA_PX)
+def dots_at(image_px: FloatArray) -> Dots:
+    """Return dots at positions in the picture."""
+    n = len(image_px)
+    sigma_px = np.full(n, SIGMA_PX)
     shape = np.full(n, 2.0), np.full(n, 50.0), np.full(n, 20.0)
-    return Dots(place[:, 0], place[:, 1], same, same, *shape)
+    return Dots(image_px[:, 0], image_px[:, 1], sigma_px, sigma_px, *shape)
 
 
-def sighting(mirror: Mirror, place: FloatArray, ray: FloatArray) -> Sighting:
-    """What a perfect matching would give."""
-    covariance = np.tile((SIGMA_PX / PX_PER_MM) ** 2 * np.eye(2), (len(place), 1, 1))
-    return Sighting(mirror, ray, CALIBRATION.to_plane(place), covariance)
+def sighting(mirror: Mirror, image_px: FloatArray, ray: FloatArray) -> Sighting:
+    """Return the sighting from a perfect match."""
+    covariance = np.tile((SIGMA_PX / PX_PER_MM) ** 2 * np.eye(2), (len(image_px), 1, 1))
+    return Sighting(mirror, ray, CALIBRATION.to_plane(image_px), covariance)
 
 
 ToPlane = Callable[[FloatArray], FloatArray]
-"""From places in the picture, px, to the imaging plane, mm."""
+"""From positions in the picture, px, to the imaging plane, mm."""
 
 
 def measured(
     pool: Pool, bench: SimulatedBench, rig: Rig, to_plane: ToPlane, seed: list[int]
 ) -> tuple[float, float]:
-    """A pool's height by a set-up, and its ±, mm; NaN without a surface."""
+    """Return a pool's height with a setup, and its ±, mm; NaN without a surface."""
     rng = np.random.default_rng(seed)
-    place, ray = seen(pool, bench, rng)
+    image_px, ray = seen_dots(pool, bench, rng)
     match = exact_match(trace(pool, bench.rig), rig)
     keep = (match.ray[:, None] == ray + 1).all(-1).any(1)
-    covariance = np.tile((SIGMA_PX / PX_PER_MM) ** 2 * np.eye(2), (len(place), 1, 1))
+    covariance = np.tile((SIGMA_PX / PX_PER_MM) ** 2 * np.eye(2), (len(image_px), 1, 1))
     match = replace(
         match, dot=match.dot[: keep.sum()], ray=ray + 1, reflected=match.reflected[keep],
-        plane_mm=to_plane(place), plane_covariance_mm2=covariance,
+        plane_mm=to_plane(image_px), plane_covariance_mm2=covariance,
     )  # fmt: skip
     try:
-        made = measure_surface(reconstruct(match, rig, Settings()), match, rig)
+        measures = measure_surface(reconstruct(match, rig, Settings()), match, rig)
     except CannotMeasure:
         return np.nan, np.nan
-    return made.height_mm, made.height_sigma_mm
+    return measures.height_mm, measures.height_sigma_mm
 
 
 def main() -> None:
     """Run the study and print its tables."""
-    ask = argparse.ArgumentParser()
-    ask.add_argument("--benches", type=int, default=200)
-    ask.add_argument("--full", type=int, default=10)
-    ask.add_argument("--seed", type=int, default=18)
-    given = ask.parse_args()
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--benches", type=int, default=200)
+    parser.add_argument("--full", type=int, default=10)
+    parser.add_argument("--seed", type=int, default=18)
+    chosen = parser.parse_args()
     errors: dict[str, list[tuple[float, ...]]] = defaultdict(list)
     statuses: dict[str, dict[str, int]] = defaultdict(lambda: defaultdict(int))
-    for n in range(given.benches):
-        rng = np.random.default_rng([given.seed, n])
+    for n in range(chosen.benches):
+        rng = np.random.default_rng([chosen.seed, n])
         bench = draw_bench(BEHIND_GLASS, VIEW, ERRORS, rng)
         width, height = float(rng.uniform(5.5, 7.5)), float(rng.uniform(0.15, 0.35))
         pool = spherical_cap(width, height) if n % 2 else egg(width, width / 2, 0.6 * width, height)
@@ -161,7 +163,7 @@ def main() -> None:
             one.name: (one.total_sigma_mm, one.setup_sigma_mm)
             for one in forecast(BEHIND_GLASS, CANDIDATES, Cap(width, height))
         }
-        seed = [given.seed, n, 1]
+        seed = [chosen.seed, n, 1]
         exact = replace(BEHIND_GLASS, uncertainty=None)
         predicted["true"] = height_sigma(exact, Cap(width, height)).total_sigma_mm, 0.0
         results: dict[str, tuple[Rig, ToPlane]] = {
@@ -169,33 +171,35 @@ def main() -> None:
             "as it is": (BEHIND_GLASS, CALIBRATION.to_plane),
         }
         for k, (name, mirrors) in enumerate(CANDIDATES.items()):
-            own = np.random.default_rng([given.seed, n, 2, k % len(PICTURES)])
-            shots = [(m, *seen(surface_like(m, own), bench, own)) for m in mirrors]
-            if n < given.full:
-                pictures = [Picture(m.name, m, dots_at(place), SHAPE) for m, place, _ in shots]
+            rng_pictures = np.random.default_rng([chosen.seed, n, 2, k % len(PICTURES)])
+            sightings = [
+                (m, *seen_dots(surface_like(m, rng_pictures), bench, rng_pictures)) for m in mirrors
+            ]
+            if n < chosen.full:
+                pictures = [Picture(m.name, m, dots_at(place), SHAPE) for m, place, _ in sightings]
                 try:
                     check = check_bench(pictures, BEHIND_GLASS, CALIBRATION)
-                except CannotMeasure as why:
-                    statuses[name][why.status] += 1
+                except CannotMeasure as error:
+                    statuses[name][error.status] += 1
                     continue
                 statuses[name][check.status] += 1
                 results[name] = check.rig, check.calibration.to_plane
             else:
-                made = adjust(BEHIND_GLASS, [sighting(*one) for one in shots])
-                rig, calibration = adjusted_bench(BEHIND_GLASS, made, checked=True)
+                adjustment = adjust(BEHIND_GLASS, [sighting(*one) for one in sightings])
+                rig, calibration = adjusted_bench(BEHIND_GLASS, adjustment, checked=True)
                 results[name] = rig, calibration.to_plane
         by_truth = np.nan
         for name, (rig, to_plane) in results.items():
-            found, sigma = measured(pool, bench, rig, to_plane, seed)
-            by_truth = found if name == "true" else by_truth
-            row = found - height, sigma, *predicted[name], found - by_truth, height
+            height_mm, sigma = measured(pool, bench, rig, to_plane, seed)
+            by_truth = height_mm if name == "true" else by_truth
+            row = height_mm - height, sigma, *predicted[name], height_mm - by_truth, height
             errors[name].append(row)
-        if n % 10 == 9 or n == given.benches - 1:
+        if n % 10 == 9 or n == chosen.benches - 1:
             report(errors, statuses)
 
 
 def report(errors: dict[str, list[tuple[float, ...]]], statuses: dict[str, dict[str, int]]) -> None:
-    """Print what has come out so far."""
+    """Print the results so far."""
     print(
         f"{'':23} {'n':>4} lost covered     error         ± predicted  | by the set-up, predicted "
         "| error's fall  (RMS, % of the height)"

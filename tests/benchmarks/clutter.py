@@ -1,12 +1,12 @@
-"""Pools of every kind on benches set up otherwise, dots missing and false ones among them.
+"""Pools of every kind on various benches, with missing and false dots.
 
 Run as ``python tests/benchmarks/clutter.py [--pools N] [--seed S] [--missing SHARE] [--false N]
-[--off TIMES] [KIND …]``. Every pool is drawn from its own seed, as are its bench, the noise of the
-detector, which dots are missing, up to a share, how many are false, and by how much the set-up is
-off: so many times 0.2° and 0.3 mm of the laser and 0.3 mm of the imaging plane, one standard
-deviation. The set-up has the uncertainties that a setup file without any has. A line for each pool
-that was not answered, or answered wrongly; then, for every kind, how many were answered and the
-error of their height. Fails where a label is wrong.
+[--off TIMES] [KIND …]``. Each pool is drawn from its own seed, together with its bench, the noise
+of the detector, the missing dots (up to a share), the number of false ones, and the setup errors:
+TIMES 0.2° and 0.3 mm of the laser and 0.3 mm of the imaging plane (standard deviations). The setup
+has the default uncertainties of a setup file. Prints a line for each pool that was rejected or has
+wrong labels; then, for every kind, how many were measured and the error of their height. Fails if
+any label is wrong.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.rig import ImagingPlane, Laser, Rig
 from labapp.core.geometry.uncertainty import AxisPoints, RigUncertainty, covariance_of
 from labapp.simulation.pools import Dent, LowRear, Pool, Wave, egg, ellipsoidal_cap, spherical_cap
-from tests.benchmarks.dips import Answer, answer, report
+from tests.benchmarks.dips import PoolResult, measure_pool, report
 from tests.scenes import BENCH_RIG, BENCH_VIEW, SeenDots, see
 
 MODES = ((1, 1), (2, 1), (0, 2), (3, 1))
@@ -49,8 +49,8 @@ def _egg(rng: np.random.Generator, width: float, center: tuple[float, float], *t
 
 
 def dented(rng: np.random.Generator, width: float, center: tuple[float, float]) -> Pool:
-    away = tuple(rng.uniform(-1.0, 1.0, 2))
-    return _egg(rng, width, center, Dent(rng.uniform(0.01, 0.06), rng.uniform(0.6, 1.6), away))
+    offset = tuple(rng.uniform(-1.0, 1.0, 2))
+    return _egg(rng, width, center, Dent(rng.uniform(0.01, 0.06), rng.uniform(0.6, 1.6), offset))
 
 
 def lowrear(rng: np.random.Generator, width: float, center: tuple[float, float]) -> Pool:
@@ -75,7 +75,7 @@ KINDS: dict[str, Draw] = {
 
 
 def draw_pool(kind: str, rng: np.random.Generator) -> tuple[Rig, Pool]:
-    """A pool of a kind, and the bench it is seen on."""
+    """Return a bench, and a pool of a kind."""
     rig = replace(
         BENCH_RIG,
         laser=Laser(rng.uniform(28.0, 33.0), rng.uniform(29.0, 35.5)),
@@ -85,36 +85,43 @@ def draw_pool(kind: str, rng: np.random.Generator) -> tuple[Rig, Pool]:
 
 
 def draw(kind: str, seed: int, missing: float, false: int) -> tuple[Rig, SeenDots, Pool]:
-    """A pool of a kind, the bench it is seen on, and its dots."""
+    """Return a bench, the dots of a pool of a kind, and the pool."""
     rng = np.random.default_rng([seed, list(KINDS).index(kind)])
     rig, pool = draw_pool(kind, rng)
-    sigma_px, many = rng.uniform(0.05, 0.3), len(see(pool, np.random.default_rng(0), rig=rig).ray)
-    lost = round(many * rng.uniform(0.0, missing))
-    strays = int(rng.integers(0, false + 1))
-    return rig, see(pool, rng, sigma_px=sigma_px, missing=lost, false=strays, rig=rig), pool
+    sigma_px, dot_count = (
+        rng.uniform(0.05, 0.3),
+        len(see(pool, np.random.default_rng(0), rig=rig).ray),
+    )
+    missing_count = round(dot_count * rng.uniform(0.0, missing))
+    false_count = int(rng.integers(0, false + 1))
+    return (
+        rig,
+        see(pool, rng, sigma_px=sigma_px, missing=missing_count, false=false_count, rig=rig),
+        pool,
+    )
 
 
-def set_up_off(rig: Rig, seed: int, times: float) -> Rig:
-    """The rig as it is thought to be, off by chance; with the uncertainties that are assumed."""
+def with_setup_errors(rig: Rig, seed: int, times: float) -> Rig:
+    """Return the rig with random setup errors, and the default uncertainties."""
     rng = np.random.default_rng([seed, 78])
     angle, distance = times * rng.normal(0.0, [0.2, 0.3])
     laser, plane = rig.laser, rig.imaging_plane
-    off = replace(
+    wrong = replace(
         rig,
         laser=Laser(laser.projection_angle_deg + angle, laser.distance_mm + distance),
         imaging_plane=replace(plane, origin_mm=plane.origin_mm + times * rng.normal(0, 0.3, 3)),
     )
-    return as_entered(off, BENCH_VIEW)
+    return as_entered(wrong, BENCH_VIEW)
 
 
 def as_entered(rig: Rig, calibration: ImageCalibration) -> Rig:
-    """The rig with the uncertainties that a setup file without any has."""
+    """Return the rig with the default uncertainties of a setup file."""
     axes = AxisPoints(calibration, 60.0, 60.0)
     return replace(rig, uncertainty=RigUncertainty(axes, *covariance_of({})))
 
 
 def main() -> int:
-    """How many labels were wrong."""
+    """Print the results; return the number of wrong labels."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("kinds", nargs="*", default=list(KINDS))
     parser.add_argument("--pools", type=int, default=50)
@@ -125,13 +132,13 @@ def main() -> int:
     chosen = parser.parse_args()
     wrong = 0
     for kind in chosen.kinds:
-        answers: list[Answer] = []
+        results: list[PoolResult] = []
         for seed in range(chosen.seed, chosen.seed + chosen.pools):
             rig, seen, pool = draw(kind, seed, chosen.missing, chosen.false)
-            answers.append(answer(pool, seen, set_up_off(rig, seed, chosen.off)))
-            if answers[-1].status != "ok" or answers[-1].wrong:
-                print(f"{kind} {seed}: {answers[-1]}", flush=True)
-        wrong += report(kind, answers)
+            results.append(measure_pool(pool, seen, with_setup_errors(rig, seed, chosen.off)))
+            if results[-1].status != "ok" or results[-1].wrong:
+                print(f"{kind} {seed}: {results[-1]}", flush=True)
+        wrong += report(kind, results)
     return wrong
 
 

@@ -1,11 +1,11 @@
 """Short recordings of the pools of ``clutter.py``: frames of one bench decide the rows together.
 
 Run as ``python -m tests.benchmarks.clutter_recordings [--seeds N] [--seed S] [--frames N]
-[--missing SHARE] [--false N] [--off TIMES] [--beside SHARE] [--jump FRAME] [KIND …]``. The set-up
-is off by the same in all frames of a recording. The pool swings, and its size and place wander from
-frame to frame; in a share of the frames a dot beside the marker is missing besides, and from one
-frame on the pool may lie a ray's spacing further on. A line for each recording: what its frames
-gave by themselves, and together. Fails where rows are wrong.
+[--missing SHARE] [--false N] [--off TIMES] [--beside SHARE] [--jump FRAME] [KIND …]``. The setup
+errors are the same in all frames of a recording. The pool oscillates, and its size and position
+vary between frames; in a share of the frames a dot beside the marker is missing as well, and from
+one frame on the pool may be moved by the spacing of the rays. Prints a line for each recording: the
+results of single frames, and of all together. Fails if rows are wrong.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from labapp.core.schemes import fit
 from labapp.core.surface.measures import measure_surface
 from labapp.core.values import CannotMeasure
 from labapp.simulation.pools import Wave
-from tests.benchmarks.clutter import KINDS, draw_pool, set_up_off
+from tests.benchmarks.clutter import KINDS, draw_pool, with_setup_errors
 from tests.benchmarks.dips import matched
 from tests.scenes import SeenDots, see
 
@@ -37,13 +37,13 @@ BESIDE = ((1, 0), (-1, 0), (0, 1), (0, -1), (2, 0), (-2, 0))
 """Rays beside the marker whose dot may be missing."""
 
 WRONG_ROWS = 0.2
-"""Rows are wrong where a larger share of the labels is."""
+"""Rows count as wrong if a larger share of the labels is wrong."""
 
 
 @dataclass(frozen=True)
 class Clutter:
-    """What is wrong with the frames: most missing, a share, and false; how often one beside the
-    marker is missing; from which frame on the pool lies elsewhere.
+    """Defects of the frames: the largest share of missing dots, and number of false ones; how often
+    a dot beside the marker is missing; the frame from which on the pool is moved.
     """
 
     missing: float = 0.1
@@ -53,11 +53,11 @@ class Clutter:
 
 
 def draw(kind: str, seed: int, count: int, clutter: Clutter) -> tuple[Rig, list[SeenDots]]:
-    """The bench of a recording, and the dots of its frames."""
+    """Return the bench of a recording, and the dots of its frames."""
     rng = np.random.default_rng([seed, list(KINDS).index(kind), 5])
     rig, pool = draw_pool(kind, rng)
     swing = rng.uniform(0.002, 0.01), 30.0, rng.uniform(0.0, 360.0)
-    sigma_px, seen = rng.uniform(0.05, 0.3), []
+    sigma_px, scenes = rng.uniform(0.05, 0.3), []
     for k in range(count):
         width, length, height = rng.normal(1.0, [0.01, 0.01, 0.02])
         foot, center = pool.footprint, np.add(pool.footprint.center_mm, rng.normal(0.0, 0.03, 2))
@@ -71,71 +71,71 @@ def draw(kind: str, seed: int, count: int, clutter: Clutter) -> tuple[Rig, list[
             center_mm=(float(center[0]), float(center[1])),
         )
         wave = Wave((1, 1), swing[0], frequency_hz=swing[1], turned_deg=swing[2], time_s=k / 200)
-        now = replace(
+        current = replace(
             pool, footprint=foot, peak_mm=pool.peak_mm * height, terms=(*pool.terms, wave)
         )
-        many = len(see(now, np.random.default_rng(0), rig=rig).ray)
-        missing = round(many * rng.uniform(0.0, clutter.missing))
+        dot_count = len(see(current, np.random.default_rng(0), rig=rig).ray)
+        missing = round(dot_count * rng.uniform(0.0, clutter.missing))
         false = int(rng.integers(0, clutter.false + 1))
-        dots = see(now, rng, sigma_px=sigma_px, missing=missing, false=false, rig=rig)
+        dots = see(current, rng, sigma_px=sigma_px, missing=missing, false=false, rig=rig)
         if rng.uniform() < clutter.beside:
             dots = _without(dots, np.add(rig.pattern.marker, BESIDE[rng.integers(len(BESIDE))]))
-        seen.append(dots)
-    return rig, seen
+        scenes.append(dots)
+    return rig, scenes
 
 
 def _without(seen: SeenDots, ray: np.ndarray) -> SeenDots:
-    """What is seen without the dot of a ray."""
-    kept = (seen.ray != ray).any(axis=-1)
-    dots = {name: values[kept] for name, values in vars(seen.dots).items()}
-    return SeenDots(replace(seen.dots, **dots), seen.ray[kept])
+    """Return the scene without the dot of a ray."""
+    others = (seen.ray != ray).any(axis=-1)
+    dots = {name: values[others] for name, values in vars(seen.dots).items()}
+    return SeenDots(replace(seen.dots, **dots), seen.ray[others])
 
 
 def measured(seen: SeenDots, rig: Rig) -> Measurement:
-    """What a frame gives by itself."""
+    """Return the measurement of a single frame."""
     try:
         match = matched(seen, rig)
-        made = fit.reconstruct(match, rig, Settings().fit)
-    except RowsOpen as why:
-        own = why.status, why.reason, "fit", seen.dots
-        return OpenMeasurement(*own, candidates=why.candidates)
-    except CannotMeasure as why:
-        return Measurement(why.status, why.reason, "fit", seen.dots)
-    size = measure_surface(made, match, rig)
-    return Measurement("ok", "", "fit", seen.dots, None, match, made, size)
+        reconstruction = fit.reconstruct(match, rig, Settings().fit)
+    except RowsOpen as error:
+        common = error.status, error.reason, "fit", seen.dots
+        return OpenMeasurement(*common, candidates=error.candidates)
+    except CannotMeasure as error:
+        return Measurement(error.status, error.reason, "fit", seen.dots)
+    size = measure_surface(reconstruction, match, rig)
+    return Measurement("ok", "", "fit", seen.dots, None, match, reconstruction, size)
 
 
 def together(frames: Sequence[Measurement], rig: Rig) -> list[Measurement]:
-    """What the frames of a recording give together."""
+    """Return the measurements of all frames of a recording, judged together."""
     vote = RowVote(rig, Settings())
     ballots = [vote.add(each) for each in frames]
     return [vote.judged(ballot) for ballot in ballots]
 
 
-def outcome(found: Measurement, seen: SeenDots) -> str:
-    """The status, or ``wrong-rows``."""
-    if found.status != "ok" or found.match is None:
-        return found.status
-    wrong = (seen.ray[found.match.dot] != found.match.ray).any(axis=-1)
+def outcome(result: Measurement, seen: SeenDots) -> str:
+    """Return the status, or ``wrong-rows``."""
+    if result.status != "ok" or result.match is None:
+        return result.status
+    wrong = (seen.ray[result.match.dot] != result.match.ray).any(axis=-1)
     return "wrong-rows" if wrong.mean() > WRONG_ROWS else "ok"
 
 
 def outcomes(
-    kind: str, seed: int, count: int, clutter: Clutter, off: float
+    kind: str, seed: int, count: int, clutter: Clutter, setup_errors: float
 ) -> tuple[list[str], list[str]]:
-    """What the frames of a recording gave by themselves, and together."""
-    rig, seen = draw(kind, seed, count, clutter)
-    entered = set_up_off(rig, seed, off)
-    alone = [measured(each, entered) for each in seen]
-    said = together(alone, entered)
+    """Return the outcomes of a recording's frames measured singly, and together."""
+    rig, scenes = draw(kind, seed, count, clutter)
+    entered = with_setup_errors(rig, seed, setup_errors)
+    alone = [measured(each, entered) for each in scenes]
+    judged = together(alone, entered)
     return (
-        [outcome(*each) for each in zip(alone, seen, strict=True)],
-        [outcome(*each) for each in zip(said, seen, strict=True)],
+        [outcome(*each) for each in zip(alone, scenes, strict=True)],
+        [outcome(*each) for each in zip(judged, scenes, strict=True)],
     )
 
 
 def main() -> int:
-    """How many frames have wrong rows."""
+    """Print the results; return the number of frames with wrong rows."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("kinds", nargs="*", default=list(KINDS))
     parser.add_argument("--seeds", type=int, default=2)
@@ -152,10 +152,10 @@ def main() -> int:
     all_together: Counter[str] = Counter()
     for seed in range(chosen.seed, chosen.seed + chosen.seeds):
         for kind in chosen.kinds:
-            alone, said = outcomes(kind, seed, chosen.frames, clutter, chosen.off)
+            alone, judged = outcomes(kind, seed, chosen.frames, clutter, chosen.off)
             by_themselves.update(alone)
-            all_together.update(said)
-            print(kind, seed, dict(Counter(alone)), "together", dict(Counter(said)), flush=True)
+            all_together.update(judged)
+            print(kind, seed, dict(Counter(alone)), "together", dict(Counter(judged)), flush=True)
     print(f"alone {dict(by_themselves)}, together {dict(all_together)}")
     return all_together["wrong-rows"]
 

@@ -1,8 +1,8 @@
-"""Detectors of dots side by side: labapp's, trackpy's, OpenCV's and scikit-image's.
+"""Comparison of dot detectors: labapp, trackpy, OpenCV and scikit-image.
 
 Run as ``python tests/benchmarks/detectors.py [--frames N] [--cache FOLDER]``. The frames are those
-of `labapp benchmark`. trackpy and scikit-image are in the dependency group ``benchmark``; one that
-is not installed is named.
+of `labapp benchmark`. trackpy and scikit-image are in the dependency group ``benchmark``; if one is
+not installed, that is printed.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ class Detected:
     time
         Processor time per frame.
     recall, precision
-        Share of the visible dots that it found; share of its finds that are dots.
+        Share of the visible dots that it found; share of its detections that are dots.
     error_px
-        Root mean square distance of found dots from their true places, px.
+        Root mean square distance of detected dots from their true positions, px.
     """
 
     name: str
@@ -55,13 +55,14 @@ class Detected:
 
 
 def detectors(size_px: float) -> Iterator[tuple[str, Callable[[Image], FloatArray] | str]]:
-    """Yield name and function of each detector; of one that is missing, how to install it.
+    """Yield name and function of each detector, or for a missing one how to install it.
 
-    Others' parameters follow their guides, for Gaussian dots of the given standard deviation.
+    Parameters of other packages follow their documentation, for Gaussian dots of the given
+    standard deviation.
     """
     settings = Settings().dots.band_pass
 
-    opencv: Any = cv2  # its hints leave this detector out
+    opencv: Any = cv2  # its type hints lack this detector
 
     def blobs(image: Image) -> FloatArray:
         chosen = opencv.SimpleBlobDetector_Params()
@@ -71,16 +72,16 @@ def detectors(size_px: float) -> Iterator[tuple[str, Callable[[Image], FloatArra
         chosen.filterByCircularity = chosen.filterByConvexity = chosen.filterByInertia = False
         chosen.minThreshold, chosen.maxThreshold, chosen.thresholdStep = 25.0, 200.0, 5.0
         chosen.minDistBetweenBlobs = 3.0 * size_px
-        found = opencv.SimpleBlobDetector_create(chosen).detect(image)
-        return np.array([point.pt for point in found]).reshape(-1, 2)
+        keypoints = opencv.SimpleBlobDetector_create(chosen).detect(image)
+        return np.array([point.pt for point in keypoints]).reshape(-1, 2)
 
-    def located(trackpy: Any) -> Callable[[Image], FloatArray]:
+    def make_trackpy(trackpy: Any) -> Callable[[Image], FloatArray]:
         diameter = 2 * round(2 * size_px) + 1
         return lambda image: np.asarray(
             trackpy.locate(image, diameter, minmass=20 * size_px**2)[["x", "y"]]
         )
 
-    def dogs(feature: Any) -> Callable[[Image], FloatArray]:
+    def make_dog(feature: Any) -> Callable[[Image], FloatArray]:
         return lambda image: feature.blob_dog(
             np.asarray(image, float) / 255.0,
             min_sigma=0.7 * size_px,
@@ -90,18 +91,18 @@ def detectors(size_px: float) -> Iterator[tuple[str, Callable[[Image], FloatArra
 
     yield "labapp, whole search", lambda image: band_pass_dots(image, settings).image_px
     yield "OpenCV SimpleBlobDetector", blobs
-    for name, module, package, made in (
-        ("trackpy locate", "trackpy", "trackpy", located),
-        ("scikit-image blob_dog", "skimage.feature", "scikit-image", dogs),
+    for name, module, package, create in (
+        ("trackpy locate", "trackpy", "trackpy", make_trackpy),
+        ("scikit-image blob_dog", "skimage.feature", "scikit-image", make_dog),
     ):
         try:
-            yield name, made(importlib.import_module(module))
+            yield name, create(importlib.import_module(module))
         except ImportError:
             yield name, f"not installed: pip install {package}"
 
 
 def compare_detectors(video: Video, count: int) -> list[Detected | tuple[str, str]]:
-    """Scores of every detector on ``count`` frames over the video; see `detectors`."""
+    """Return the scores of every detector on ``count`` frames of the video; see `detectors`."""
     frames = np.linspace(0, len(video.dots) - 1, count).astype(int).tolist()
     with open_source(video.path) as source:
         images = [source.frame(number).image for number in frames]
@@ -113,13 +114,13 @@ def compare_detectors(video: Video, count: int) -> list[Detected | tuple[str, st
         return dots.image_px
 
     true = [video.dots[number][0] for number in frames]
-    made: list[Detected | tuple[str, str]] = [_detected("labapp, warm", quick, images, true)]
+    scores: list[Detected | tuple[str, str]] = [_detected("labapp, warm", quick, images, true)]
     for name, detector in detectors(tuning.size_px):
         if isinstance(detector, str):
-            made.append((name, detector))
+            scores.append((name, detector))
         else:
-            made.append(_detected(name, detector, images, true))
-    return made
+            scores.append(_detected(name, detector, images, true))
+    return scores
 
 
 def _detected(
@@ -128,22 +129,22 @@ def _detected(
     images: list[Image],
     true: list[FloatArray],
 ) -> Detected:
-    times, hits, found_count, off = [], 0, 0, []
+    times, hits, found_count, errors = [], 0, 0, []
     detector(images[0])
-    for image, places in zip(images, true, strict=True):
-        begun = time.process_time()
+    for image, true_px in zip(images, true, strict=True):
+        start_s = time.process_time()
         found = detector(image)
-        times.append(time.process_time() - begun)
+        times.append(time.process_time() - start_s)
         found_count += len(found)
         if len(found) == 0:
             continue
-        distance, nearest = cKDTree(found).query(places)
-        _, own = cKDTree(places).query(found)
-        pairs = (own[nearest] == np.arange(len(places))) & (distance <= TRUE_PX)
+        distance, nearest = cKDTree(found).query(true_px)
+        _, nearest_found = cKDTree(true_px).query(found)
+        pairs = (nearest_found[nearest] == np.arange(len(true_px))) & (distance <= TRUE_PX)
         hits += int(pairs.sum())
-        off += distance[pairs].tolist()
+        errors += distance[pairs].tolist()
     shown = sum(map(len, true))
-    error = float(np.sqrt(np.mean(np.square(off)))) if off else float("nan")
+    error = float(np.sqrt(np.mean(np.square(errors)))) if errors else float("nan")
     return Detected(name, Spread.of(times), hits / shown, hits / max(found_count, 1), error)
 
 

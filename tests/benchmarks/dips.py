@@ -1,12 +1,12 @@
-"""Pools with a dip under the torch, whose rays are to be told: no label wrong, how many answered.
+"""Pools with a dip under the torch: wrong labels, and the number of pools measured.
 
-Run as ``python tests/benchmarks/dips.py [--pools N] [--seed S] [--missing N] [--false N]``. Every
-pool is drawn from its own seed, traced and seen by a perfect detector with 0.06 px of noise. A line
-for each pool that was not answered, or answered wrongly; then how many were answered and the error
-of their height. Fails where a label is wrong.
+Run as ``python tests/benchmarks/dips.py [--pools N] [--seed S] [--missing N] [--false N]``. Each
+pool is drawn from its own seed, traced and detected perfectly with 0.06 px of noise. Prints a line
+for each pool that was rejected or has wrong labels; then how many were measured and the error of
+their height. Fails if any label is wrong.
 
-A dip moves the dots under the torch as a shift by one row would move them: the hardest case there
-is for telling rows, as the absent centre ray lies there, too.
+A dip moves the dots under the torch like a shift by one row: the hardest case for identifying rows,
+as the absent centre ray is there as well.
 """
 
 from __future__ import annotations
@@ -35,22 +35,22 @@ NOISE_PX = 0.06
 
 
 def draw(seed: int, missing: int = 0, false: int = 0) -> tuple[Pool, SeenDots]:
-    """A pool with a dip 10–60 µm deep, σ 0.6–1.6 mm, within 1.5 mm of the torch; and its dots."""
+    """Return a pool with a dip 10–60 µm deep, σ 0.6–1.6 mm, near the torch, and its dots."""
     rng = np.random.default_rng(seed)
     width, center = rng.uniform(4.8, 6.6), rng.uniform(-0.4, 0.4, 2)
     head, tail = width * rng.uniform(0.42, 0.52), width * rng.uniform(0.5, 0.66)
-    away, angle = 1.5 * np.sqrt(rng.uniform()), rng.uniform(0.0, 2 * np.pi)
-    place = away * np.array([np.cos(angle), np.sin(angle)])
-    dent = Dent(rng.uniform(0.01, 0.06), rng.uniform(0.6, 1.6), tuple(place - center))
+    distance, angle = 1.5 * np.sqrt(rng.uniform()), rng.uniform(0.0, 2 * np.pi)
+    position = distance * np.array([np.cos(angle), np.sin(angle)])
+    dent = Dent(rng.uniform(0.01, 0.06), rng.uniform(0.6, 1.6), tuple(position - center))
     pool = egg(width, head, tail, width * rng.uniform(0.04, 0.06), tuple(center), (dent,))
     return pool, see(pool, rng, sigma_px=NOISE_PX, missing=missing, false=false)
 
 
 @dataclass(frozen=True)
-class Answer:
-    """What came of one pool: the status, wrong and right labels, dots shown, error of the height.
+class PoolResult:
+    """Result for one pool: status, wrong and right labels, dots shown, error of the height.
 
-    The error is a share of the true height; NaN where the pool was not answered.
+    The error is a share of the true height; NaN if the pool was rejected.
     """
 
     status: str
@@ -60,26 +60,26 @@ class Answer:
     height: float = float("nan")
 
 
-def answer(pool: Pool, seen: SeenDots, rig: Rig = BENCH_RIG) -> Answer:
-    """Match the dots, fit the surface, and hold both against the truth."""
+def measure_pool(pool: Pool, seen: SeenDots, rig: Rig = BENCH_RIG) -> PoolResult:
+    """Match the dots, fit the surface, and compare both with the truth."""
     shown = int((seen.ray[:, 0] > 0).sum())
     try:
         match = matched(seen, rig)
         size = measure_surface(fit.reconstruct(match, rig, FitSettings()), match, rig)
-    except CannotMeasure as reason:
-        return Answer(reason.status, shown=shown)
+    except CannotMeasure as error:
+        return PoolResult(error.status, shown=shown)
     wrong = int((seen.ray[match.dot] != match.ray).any(axis=-1).sum())
-    return Answer("ok", wrong, len(match.dot) - wrong, shown, height_error(pool, size))
+    return PoolResult("ok", wrong, len(match.dot) - wrong, shown, height_error(pool, size))
 
 
 def height_error(pool: Pool, size: Measures) -> float:
-    """Error of a pool's height, or of its depth where that is more, as a share of it."""
+    """Return the relative error of a pool's height, or of its depth if that is larger."""
     name = "height_mm" if pool.size.height_mm > -pool.size.depth_mm else "depth_mm"
     return float(getattr(size, name) / getattr(pool.size, name) - 1)
 
 
 def matched(seen: SeenDots, rig: Rig = BENCH_RIG) -> Match:
-    """Tell the rays of seen dots."""
+    """Return the match of seen dots."""
     try:
         lattice = grow_lattice(seen.dots, GrowSettings())
     except CannotMeasure:
@@ -87,35 +87,35 @@ def matched(seen: SeenDots, rig: Rig = BENCH_RIG) -> Match:
     return match_rays(seen.dots, lattice, Bench(rig, BENCH_VIEW), FRAME_SHAPE, MatchSettings())[0]
 
 
-def report(kind: str, answers: list[Answer]) -> int:
-    """Say how the pools of a kind were answered; returns how many labels were wrong."""
-    good = [one for one in answers if one.status == "ok"]
-    off = 100 * np.abs([one.height for one in good] or [np.nan])
-    wrong, right = sum(one.wrong for one in good), sum(one.right for one in good)
+def report(kind: str, results: list[PoolResult]) -> int:
+    """Print the results for the pools of a kind; return the number of wrong labels."""
+    measured = [one for one in results if one.status == "ok"]
+    error_pct = 100 * np.abs([one.height for one in measured] or [np.nan])
+    wrong, right = sum(one.wrong for one in measured), sum(one.right for one in measured)
     print(
-        f"{kind}: {len(good)} of {len(answers)} answered, {wrong} labels wrong, "
-        f"{right / max(sum(one.shown for one in good), 1):.3f} labelled, height off by "
-        f"{np.median(off):.2f} % in the median, {off.max():.2f} % at worst",
+        f"{kind}: {len(measured)} of {len(results)} answered, {wrong} labels wrong, "
+        f"{right / max(sum(one.shown for one in measured), 1):.3f} labelled, height off by "
+        f"{np.median(error_pct):.2f} % in the median, {error_pct.max():.2f} % at worst",
         flush=True,
     )
     return wrong
 
 
 def main() -> int:
-    """How many labels were wrong."""
+    """Print the results; return the number of wrong labels."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--pools", type=int, default=400)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--missing", type=int, default=0)
     parser.add_argument("--false", type=int, default=0)
     chosen = parser.parse_args()
-    answers = []
+    results = []
     for seed in range(chosen.seed, chosen.seed + chosen.pools):
-        answers.append(answer(*draw(seed, chosen.missing, chosen.false)))
-        if answers[-1].status != "ok" or answers[-1].wrong:
-            print(f"{seed}: {answers[-1]}", flush=True)
-    wrong = report("dips", answers)
-    print(dict(Counter(one.status for one in answers)))
+        results.append(measure_pool(*draw(seed, chosen.missing, chosen.false)))
+        if results[-1].status != "ok" or results[-1].wrong:
+            print(f"{seed}: {results[-1]}", flush=True)
+    wrong = report("dips", results)
+    print(dict(Counter(one.status for one in results)))
     return wrong
 
 

@@ -1,7 +1,7 @@
-"""How long a change of what is drawn takes to be seen: the timeline, curves, dots that are dragged.
+"""Time to draw a change: the timeline, curves, and dragged dots.
 
-Run as ``QT_QPA_PLATFORM=offscreen python tests/benchmarks/drawing.py``. Each is told beside a plain
-label of the same size, drawn in the same run.
+Run as ``QT_QPA_PLATFORM=offscreen python tests/benchmarks/drawing.py``. Each is compared with a
+plain label of the same size, drawn in the same run.
 """
 
 from __future__ import annotations
@@ -27,40 +27,40 @@ from labapp.gui.widgets.timeline import Timeline
 FRAMES = 10_000
 TIMES = 30
 KEPT: list[QWidget] = []
-"""Windows with pyqtgraph live to the end of the process: some crash when they are destroyed."""
+"""Windows with pyqtgraph are kept until the process ends: some crash when they are destroyed."""
 
 
 def median_ms(widget: QWidget, change: Callable[[int], object]) -> float:
-    """Median time of a change and the picture after it, ms."""
+    """Return the median time of a change and of drawing it, ms."""
     KEPT.append(widget)
     widget.show()
     widget.grab()
-    took = []
+    times_ms = []
     for step in range(TIMES):
-        began = time.perf_counter()
+        start_s = time.perf_counter()
         change(step)
         widget.grab()
-        took.append(1000 * (time.perf_counter() - began))
-    return statistics.median(took)
+        times_ms.append(1000 * (time.perf_counter() - start_s))
+    return statistics.median(times_ms)
 
 
 def timeline() -> tuple[QWidget, Callable[[int], object]]:
-    """Every frame stands otherwise than before."""
-    made, kinds = Timeline(TICKS), np.arange(FRAMES) % 5
-    made.resize(1900, 80)
+    """Return a timeline and a change of every frame's state."""
+    widget, kinds = Timeline(TICKS), np.arange(FRAMES) % 5
+    widget.resize(1900, 80)
 
     def change(step: int) -> None:
-        made.set_frames(np.arange(FRAMES), np.zeros(FRAMES), np.roll(kinds, step))
-        made.set_frame(step * 300)
+        widget.set_frames(np.arange(FRAMES), np.zeros(FRAMES), np.roll(kinds, step))
+        widget.set_frame(step * 300)
 
-    return made, change
+    return widget, change
 
 
 def curves() -> tuple[QWidget, Callable[[int], object]]:
-    """Four curves are panned together."""
-    made, at_s = PlotStack("Trends"), np.arange(FRAMES) / 10
-    made.resize(800, 600)
-    many = [
+    """Return a plot and a change which pans four curves together."""
+    widget, at_s = PlotStack("Trends"), np.arange(FRAMES) / 10
+    widget.resize(800, 600)
+    four_curves = [
         Curve(
             *(name, "mm", at_s, np.sin(at_s)),
             key=np.arange(FRAMES),
@@ -69,22 +69,22 @@ def curves() -> tuple[QWidget, Callable[[int], object]]:
         )
         for name in ("Width", "Length", "Height", "ARE")
     ]
-    made.show_curves(many, Axis("Time", "s"))
-    return made, lambda step: made._plots[0].setXRange(step, 100 + step * 25, padding=0)
+    widget.show_curves(four_curves, Axis("Time", "s"))
+    return widget, lambda step: widget._plots[0].setXRange(step, 100 + step * 25, padding=0)
 
 
 def dots() -> tuple[QWidget, Callable[[int], object]]:
-    """Four hundred dots follow the hand; 60 Hz is wanted."""
-    made = PictureView("Frame")
-    made.resize(700, 560)
-    made.show_picture(np.zeros((480, 480), np.uint8))
+    """Return a picture of 400 dots and a change which drags some; 60 Hz is required."""
+    widget = PictureView("Frame")
+    widget.resize(700, 560)
+    widget.show_picture(np.zeros((480, 480), np.uint8))
     row, column = (number.ravel() for number in np.mgrid[1:21, 1:21])
     one = np.ones(len(row))
     lattice = Lattice(row, column, (10, 10), (), frozenset({3, 4}))
     correction = Correction.of(
         Dots(20.0 * column, 450 - 20.0 * row, one, one, one, one, one), lattice
     )
-    overlay, chosen = DotsOverlay(made), np.arange(80, 140)
+    overlay, chosen = DotsOverlay(widget), np.arange(80, 140)
     before = correction.dots.image_px
 
     def change(step: int) -> None:
@@ -92,7 +92,7 @@ def dots() -> tuple[QWidget, Callable[[int], object]]:
         after[chosen] += step, -step
         overlay.show(correction, after, chosen, np.empty((0, 2)))
 
-    return made, change
+    return widget, change
 
 
 def main() -> None:
@@ -105,9 +105,11 @@ def main() -> None:
         widget, change = make()
         label = QLabel("0")
         label.resize(widget.size())
-        took = median_ms(widget, change)
-        plain = median_ms(label, lambda step, label=label: label.setText(str(step)))
-        print(f"{words:<32}{took:8.2f} ms   {took / plain:6.1f} × a label of this size")
+        change_ms = median_ms(widget, change)
+        label_ms = median_ms(label, lambda step, label=label: label.setText(str(step)))
+        print(
+            f"{words:<32}{change_ms:8.2f} ms   {change_ms / label_ms:6.1f} × a label of this size"
+        )
     app.quit()
 
 

@@ -1,13 +1,13 @@
-"""Modes, chirps and step responses of simulated series against their truth.
+"""Modes, chirps and step responses of simulated series, compared with the truth.
 
 Run as ``python -m tests.benchmarks.dynamics [PART …] [--count N] [--seed S]``. Every case
 draws its own pool, frequencies, phases and damping.
 
 modes
-    Two modes at once over 1 s, noise 0.6 µm in each shape, 5 % of the frames lost, at 200 and 1000
-    frames/s: median and largest error of frequency, amplitude and damping, share within the bars
-    (0.1 Hz, 5 %, 10 %) and within 1.96 of their own σ. Then
-    the same without noise: what the method leaves.
+    Two simultaneous modes over 1 s, noise 0.6 µm in each shape, 5 % of the frames lost, at 200 and
+    1000 frames/s: median and largest error of frequency, amplitude and damping, share within the
+    limits (0.1 Hz, 5 %, 10 %) and within 1.96 σ. Then the same without noise: the error of the
+    method.
 chirp
     A linear chirp of 4 s: error of the tracked peak, share within 1.96 σ.
 step
@@ -31,7 +31,7 @@ SURE = 1.96
 
 
 def report(name: str, error: Sequence[float], sigma: Sequence[float], bar: float = np.inf) -> None:
-    """A line about the errors of one quantity; one that was not found is NaN and counts as off."""
+    """Print the errors of one quantity; NaN (not found) counts as outside the limits."""
     off, spread = np.abs(error), np.asarray(sigma)
     print(
         f"  {name:<24} median {np.nanmedian(off):.4g}, largest {np.nanmax(off):.4g}, within "
@@ -42,7 +42,7 @@ def report(name: str, error: Sequence[float], sigma: Sequence[float], bar: float
 
 
 def modes(count: int, seed: int, rate_hz: float, noise_mm: float) -> None:
-    """Two modes of a random ellipse at once."""
+    """Print the errors of two simultaneous modes of a random ellipse."""
     rng = np.random.default_rng(seed)
     errors: dict[str, list[tuple[float, float]]] = {}
     for _ in range(count):
@@ -63,9 +63,9 @@ def modes(count: int, seed: int, rate_hz: float, noise_mm: float) -> None:
             for k, f in zip(chosen, hertz, strict=True)
         ]
         series = series_of(pool_with(foot, *waves), rate_hz, rng=rng, noise_mm=noise_mm, lost=0.05)
-        found = bessel_modes(series)
+        results = bessel_modes(series)
         for k, wave in zip(chosen, waves, strict=True):
-            figures = found[k].figures
+            figures = results[k].figures
             size = wave.amplitude_mm * np.exp(-wave.damping_per_s * series.time_s[0])
             for name, true, unit in (
                 ("frequency_hz", wave.frequency_hz, 1.0),
@@ -80,7 +80,7 @@ def modes(count: int, seed: int, rate_hz: float, noise_mm: float) -> None:
 
 
 def chirps(count: int, seed: int) -> None:
-    """Chirps from a low to a high frequency, and back."""
+    """Print the errors of tracked chirps between two random frequencies."""
     rng = np.random.default_rng(seed)
     errors, sigmas = [], []
     for _ in range(count):
@@ -97,7 +97,7 @@ def chirps(count: int, seed: int) -> None:
 
 
 def steps(count: int, seed: int, order: int) -> None:
-    """Responses of first or second order to a step."""
+    """Print the errors of step responses of first or second order."""
     rng = np.random.default_rng(seed)
     errors: dict[str, list[tuple[float, float]]] = {}
     chosen = 0
@@ -119,10 +119,14 @@ def steps(count: int, seed: int, order: int) -> None:
         crossed = [fine[np.argmax(course >= share)] for share in (0.1, 0.9)]
         truth |= {"change": change, "delay_s": delay, "rise_time_s": crossed[1] - crossed[0]}
         noise = rng.normal(0, 0.04 * abs(change), len(time))
-        found = step_response(time, 6 + change * np.interp(late, fine, course) + noise, at)
-        chosen += found is not None and found.order == order
+        response = step_response(time, 6 + change * np.interp(late, fine, course) + noise, at)
+        chosen += response is not None and response.order == order
         for name, true in truth.items():
-            value = (np.nan, np.nan) if found is None else (found.value[name], found.sigma[name])
+            value = (
+                (np.nan, np.nan)
+                if response is None
+                else (response.value[name], response.sigma[name])
+            )
             errors.setdefault(name, []).append((value[0] - true, value[1]))
     print(f"step of order {order}: order found in {chosen} of {count}")
     for name, pairs in errors.items():
@@ -135,16 +139,16 @@ def main() -> None:
     parser.add_argument("parts", nargs="*", default=["modes", "chirp", "step"])
     parser.add_argument("--count", type=int, default=40)
     parser.add_argument("--seed", type=int, default=1)
-    given = parser.parse_args()
-    if "modes" in given.parts:
+    chosen = parser.parse_args()
+    if "modes" in chosen.parts:
         for rate_hz in (200, 1000):
             for noise_mm in (6e-4, 0.0):
-                modes(given.count, given.seed, rate_hz, noise_mm)
-    if "chirp" in given.parts:
-        chirps(given.count, given.seed)
-    if "step" in given.parts:
+                modes(chosen.count, chosen.seed, rate_hz, noise_mm)
+    if "chirp" in chosen.parts:
+        chirps(chosen.count, chosen.seed)
+    if "step" in chosen.parts:
         for order in (1, 2):
-            steps(given.count, given.seed, order)
+            steps(chosen.count, chosen.seed, order)
 
 
 if __name__ == "__main__":

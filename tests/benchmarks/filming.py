@@ -1,6 +1,6 @@
-"""A camera, a disk and their faults, of which everything is known: what the live window is held to.
+"""A camera, a disk and their faults as known truth for the tests of the live window.
 
-`compare` holds a recording against what the camera gave, frame by frame.
+`compare` compares a recording with the frames that the camera delivered.
 """
 
 from __future__ import annotations
@@ -25,44 +25,44 @@ from labapp.media.cameras import (
 from labapp.media.cameras.simulated import SimulatedCamera
 
 BITS = 32
-"""A frame's number is in the lowest bits of so many pixels of its first row: nobody sees it."""
+"""A frame's number is in the lowest bits of as many pixels of its first row, invisibly."""
 
 NOISES = 4
 
 SOON_S = 0.5
-"""Frames that arrive within so long of the trigger, or of the end, may be recorded or not."""
+"""Frames that arrive within this time of the trigger, or of the end, may be recorded or not."""
 
 
 def numbered(image: GreyImage, number: int) -> GreyImage:
-    """A copy of a picture with a number in it."""
-    told = image.copy()
+    """Return a copy of a picture with a number in it."""
+    copy = image.copy()
     bits = number >> np.arange(BITS) & 1
-    told[0, :BITS] = told[0, :BITS] & ~np.array(1, told.dtype) | bits.astype(told.dtype)
-    return told
+    copy[0, :BITS] = copy[0, :BITS] & ~np.array(1, copy.dtype) | bits.astype(copy.dtype)
+    return copy
 
 
 def number_in(image: GreyImage) -> int:
-    """The number that `numbered` wrote."""
+    """Return the number written by `numbered`."""
     return int(((image[0, :BITS].astype(np.int64) & 1) << np.arange(BITS)).sum())
 
 
 class Truth:
-    """What a camera gave to whoever reads it.
+    """The frames that a camera delivered to its reader.
 
     Attributes
     ----------
     frames
-        How many that were whole.
+        Number of complete frames.
     numbers, time_s, arrived_s, connection
-        Of each: its number in the film, the camera's clock, when it was read, and how often the
-        camera was opened by then.
+        Of each: its number in the film, the camera's clock, the time of reading, and how often the
+        camera had been opened by then.
     broken, lost
-        How many were not whole, and how often the camera told that it is gone.
+        Number of incomplete frames, and how often the camera reported its loss.
     """
 
     def __init__(self, most: int) -> None:
         self.frames = self.broken = self.lost = self.opened = 0
-        # Of ones: it is all there from the beginning, and memory that grows is somebody else's.
+        # Ones, so that the memory is allocated at once: later growth is not caused here.
         self.numbers = np.ones(most, np.int64)
         self.time_s, self.arrived_s = np.ones(most), np.ones(most)
         self.connection = np.ones(most, np.int64)
@@ -76,16 +76,16 @@ class Truth:
 
 
 class FilmedDevice(SimulatedDevice):
-    """A simulated camera whose frames have numbers and are kept account of.
+    """A simulated camera with numbered frames and a record of them.
 
     Parameters
     ----------
     film
-        Frame k before it has its number.
+        Frame k without its number.
     rate_hz
-        Frames a second at first.
+        Initial frame rate.
     most
-        It is not read more often.
+        Largest number of frames.
     """
 
     def __init__(self, film: Callable[[int], GreyImage], rate_hz: float, most: int) -> None:
@@ -96,7 +96,7 @@ class FilmedDevice(SimulatedDevice):
         super().__init__("pool", self._numbered, rate_hz=rate_hz)
 
     def spoil(self, faults: Faults, noise: float) -> None:
-        """Let things go wrong from now on; part of the frames be whole, but nothing but noise."""
+        """Start the faults; a share of the frames contains only noise."""
         random = np.random.default_rng([faults.seed, 7])
         shape = self._film(0).shape
         self._noises = [random.integers(0, 256, shape, np.uint8) for _ in range(NOISES)]
@@ -109,7 +109,7 @@ class FilmedDevice(SimulatedDevice):
         return numbered(self._noises[k % NOISES] if noisy else self._film(k), k)
 
     def open(self) -> SimulatedCamera:
-        super().open()  # is it there?
+        super().open()  # raises if it is absent
         self.truth.opened += 1
         return _FilmedCamera(self, self.truth)
 
@@ -152,13 +152,13 @@ class Disk:
 
 
 def moments(seconds: float, count: int, random: np.random.Generator) -> list[float]:
-    """So many moments within some seconds, one in each equal part, none at its end."""
+    """Return random times, one in each of ``count`` equal parts, none at the end of a part."""
     step_s = seconds / count
-    return [step_s * (k + each) for k, each in enumerate(random.uniform(0.05, 0.6, count))]
+    return [step_s * (k + fraction) for k, fraction in enumerate(random.uniform(0.05, 0.6, count))]
 
 
 class Agenda:
-    """What is done at its time, by a thread of its own; used in a ``with``."""
+    """Actions at given times, executed by a thread; a context manager."""
 
     def __init__(self, what: Sequence[tuple[float, Callable[[], object]]]) -> None:
         self._what = sorted(what, key=lambda each: each[0])
@@ -183,21 +183,21 @@ class Agenda:
 
 @dataclass(frozen=True)
 class Compared:
-    """What a recording has of what a camera gave.
+    """Comparison of a recording with the frames delivered by a camera.
 
     Parameters
     ----------
     frames
-        In the file.
+        Number of frames in the file.
     missing
-        That were given between trigger and end, and are not in it.
+        Frames delivered between trigger and end which are not in it.
     strange
-        That were never given, are there twice or in another order.
+        Frames never delivered, duplicated or in the wrong order.
     wrong
-        With another content.
+        Frames with wrong content.
     off_us
-        By how much the time from a frame to the next is another than the camera's clock tells, at
-        most, µs; over a time without the camera only that it does not go back.
+        Largest deviation of a frame interval from the camera's clock, µs; across a disconnection
+        only decreasing times count.
     """
 
     frames: int
@@ -208,12 +208,12 @@ class Compared:
 
     @property
     def right(self) -> bool:
-        """Whether it has all of it, once, and right: its times are kept to the microsecond."""
+        """Whether all frames are there, once and correct; times are stored in microseconds."""
         return not (self.missing or self.strange or self.wrong) and self.off_us <= 2
 
 
 def compare(path: Path, device: FilmedDevice, begun_s: float, ended_s: float) -> Compared:
-    """Hold a recording against what the camera gave from its trigger to its end.
+    """Compare a recording with the frames delivered from its trigger to its end.
 
     Parameters
     ----------
@@ -223,9 +223,9 @@ def compare(path: Path, device: FilmedDevice, begun_s: float, ended_s: float) ->
         `time.monotonic` of its trigger and of its end.
     """
     truth = device.truth
-    given = truth.numbers[: truth.frames]
-    place = np.full(device.taken + 1, -1)
-    place[given] = np.arange(truth.frames)
+    given_numbers = truth.numbers[: truth.frames]
+    index_of = np.full(device.taken + 1, -1)
+    index_of[given_numbers] = np.arange(truth.frames)
     numbers, times, wrong = [], [], 0
     with open_source(path) as video:
         for frame in video:
@@ -234,29 +234,29 @@ def compare(path: Path, device: FilmedDevice, begun_s: float, ended_s: float) ->
             wrong += not (known and np.array_equal(frame.image, device.picture(number)))
             numbers.append(number if known else -1)
             times.append(frame.time_s or 0.0)
-    places = np.array([place[number] if number >= 0 else -1 for number in numbers])
+    places = np.array([index_of[number] if number >= 0 else -1 for number in numbers])
     arrived_s = truth.arrived_s[: truth.frames]
-    due = (arrived_s > begun_s + SOON_S) & (arrived_s < ended_s - SOON_S)
-    due[places[places >= 0].min(initial=len(due)) : places.max(initial=-1)] = True
-    missing = np.setdiff1d(np.nonzero(due)[0], places)
+    expected = (arrived_s > begun_s + SOON_S) & (arrived_s < ended_s - SOON_S)
+    expected[places[places >= 0].min(initial=len(expected)) : places.max(initial=-1)] = True
+    missing = np.setdiff1d(np.nonzero(expected)[0], places)
     strange = int((places < 0).sum() + (np.diff(places) <= 0).sum())
     steps_s, clock_s = np.diff(times), np.diff(truth.time_s[places])
     same = np.diff(truth.connection[places]) == 0
-    off_s = np.where(same, np.abs(steps_s - clock_s), np.where(steps_s > 0, 0.0, np.inf))
-    most_us = 1e6 * off_s.max() if len(off_s) else 0.0
+    error_s = np.where(same, np.abs(steps_s - clock_s), np.where(steps_s > 0, 0.0, np.inf))
+    most_us = 1e6 * error_s.max() if len(error_s) else 0.0
     return Compared(len(numbers), len(missing), strange, int(wrong), float(most_us))
 
 
 def times_told(lines: Sequence[str]) -> list[str]:
-    """The messages, those that were said several times in a row as often."""
-    told = []
+    """Return the messages; a message repeated in succession appears as often."""
+    messages = []
     for each in lines:
-        found = re.search(r" \((\d+) times since [\d:]+\)$", each)
-        told += [each] * (int(found[1]) if found else 1)
-    return told
+        repeats = re.search(r" \((\d+) times since [\d:]+\)$", each)
+        messages += [each] * (int(repeats[1]) if repeats else 1)
+    return messages
 
 
-def how_many(told: Sequence[str], words: str) -> int:
-    """How often it is said, or of how many frames."""
-    found = [re.search(rf"(\d+) frames? {words}|{words}", each) for each in told]
-    return sum(int(each[1] or 1) for each in found if each)
+def how_many(messages: Sequence[str], words: str) -> int:
+    """Return how often the words occur, or the number of frames they state."""
+    matches = [re.search(rf"(\d+) frames? {words}|{words}", message) for message in messages]
+    return sum(int(message[1] or 1) for message in matches if message)

@@ -1,9 +1,8 @@
-"""A session of many frames: what opening it, saving a correction and its memory come to.
+"""A session of many frames: time to open it and to save a correction, and memory.
 
-Run as ``python tests/benchmarks/large_session.py [frames]``: it makes a recording (640×480, MJPG)
-and a session of it in a temporary folder. Every frame holds the result of one that was measured.
-Each figure is told beside something plain that was timed in the same run, as machines differ and
-are busy.
+Run as ``python tests/benchmarks/large_session.py [frames]``: makes a recording (640×480, MJPG) and
+a session of it in a temporary folder. Every frame has the result of a single measured one. Each
+figure is printed with a simple reference timed in the same run, as machines differ and are busy.
 """
 
 from __future__ import annotations
@@ -33,12 +32,12 @@ SAVED = 100
 
 
 def median_ms(work: Callable[[int], object], times: int) -> float:
-    taken = []
+    times_s = []
     for number in range(times):
-        began = time.perf_counter()
+        start_s = time.perf_counter()
         work(number)
-        taken.append(time.perf_counter() - began)
-    return float(np.median(taken)) * 1000
+        times_s.append(time.perf_counter() - start_s)
+    return float(np.median(times_s)) * 1000
 
 
 def make_recording(path: Path, frames: int) -> None:
@@ -52,7 +51,7 @@ def make_recording(path: Path, frames: int) -> None:
 
 
 def write_recording(path: Path, pictures: Iterable[np.ndarray]) -> None:
-    """Pictures of one size, at least one, as MJPG, 500 frames a second."""
+    """Write pictures of one size, at least one, as MJPG at 500 frames/s."""
     following = iter(pictures)
     first = next(following)
     command = (
@@ -77,46 +76,50 @@ def make_session(folder: Path, frames: int) -> Path:
         setup = one.setup_text
     with Session.create(path) as session:
         session.set_setup(setup)
-        began = time.perf_counter()
+        start_s = time.perf_counter()
         session.import_recording(recording)
-        print(f"import            {(time.perf_counter() - began) / frames * 1000:8.2f} ms a frame")
+        print(
+            f"import            {(time.perf_counter() - start_s) / frames * 1000:8.2f} ms a frame"
+        )
         basis = session._basis()
         assert basis is not None
-        began = time.perf_counter()
+        start_s = time.perf_counter()
         with session._database.transaction():
             for number in range(frames):
                 session._results.put(number, measurement, basis, None)
-        print(f"keep a result     {(time.perf_counter() - began) / frames * 1000:8.2f} ms a frame")
+        print(
+            f"keep a result     {(time.perf_counter() - start_s) / frames * 1000:8.2f} ms a frame"
+        )
     print(f"session file      {path.stat().st_size / 1e6:8.1f} MB, {frames} frames with results")
     return path
 
 
-def saved_plainly(folder: Path, content: bytes) -> float:
-    """The same bytes into a table of SQLite's, with the same care: ms."""
+def plain_insert_ms(folder: Path, content: bytes) -> float:
+    """Return the time to insert the same bytes into a plain SQLite table, equally durable, ms."""
     connection = sqlite3.connect(folder / "plain.db", isolation_level=None)
     connection.execute("PRAGMA synchronous = EXTRA")
     connection.execute("CREATE TABLE t (number INTEGER PRIMARY KEY, content BLOB)")
-    taken = median_ms(
+    median = median_ms(
         lambda number: connection.execute("INSERT INTO t VALUES (?, ?)", (number, content)), SAVED
     )
     connection.close()
-    return taken
+    return median
 
 
 def look(path: Path, folder: Path) -> None:
-    """Open, scrub and correct, in a process of its own so that its memory can be told."""
-    began = time.perf_counter()
+    """Open, scrub and correct, in a separate process so that its memory can be measured."""
+    start_s = time.perf_counter()
     session = Session.open(path)
     overview = session.overview()
     session.frame(0)
-    opened = time.perf_counter() - began
+    opened = time.perf_counter() - start_s
     result = session.result(0)
     assert result is not None
     with path.open("rb") as file:
-        began = time.perf_counter()
+        start_s = time.perf_counter()
         while file.read(1 << 20):
             pass
-        read = time.perf_counter() - began
+        read = time.perf_counter() - start_s
     print(f"open, first frame {opened * 1000:8.0f} ms   {opened / read:6.2f} × reading the file")
     frames = np.random.default_rng(1).integers(0, len(overview.frame), SAVED)
     scrub = median_ms(lambda k: session.frame(int(frames[k])), SAVED)
@@ -132,7 +135,7 @@ def look(path: Path, folder: Path) -> None:
     ]
     save = median_ms(lambda k: session.correct({int(frames[k]): moved[k]}), SAVED)
     undo = median_ms(lambda _: session.undo(), SAVED)
-    plain = saved_plainly(folder, os.urandom(8000))
+    plain = plain_insert_ms(folder, os.urandom(8000))
     print(
         f"save a correction {save:8.2f} ms   {save / plain:6.2f} × a bare insert ({plain:.2f} ms)"
     )

@@ -1,13 +1,13 @@
-"""The live camera for long: filmed, measured and recorded in the window, with and without faults.
+"""Long runs of the live camera: filming, measuring and recording, with and without faults.
 
 Run as ``xvfb-run -a -s "-screen 0 1366x768x24" python tests/benchmarks/live.py [MINUTES]
 [FRAMES_A_SECOND] [plain] [faults] [FOLDER]``: 1 minute, 200 frames/s, both, a temporary folder. A
 minute of 480×640 px at 200 frames/s takes 3.7 GB there.
 
-The simulated camera films a pool, each frame with its number in it. What it gave, and when, is kept
-where it is read, and is the truth: of the window's and the recording's counts, of what the window
-says, and of the file, every frame of which is compared. Each figure is told with the load of the
-machine.
+The simulated camera films a pool, with the number of each frame in it. The frames delivered, and
+their times, are recorded when they are read, and are the truth for the counts of the window and of
+the recording, for the window's messages, and for the file, every frame of which is compared. Each
+figure is printed with the load of the machine.
 """
 
 from __future__ import annotations
@@ -60,41 +60,42 @@ from labapp.session.samples import sample_folder
 from labapp.session.session import Session
 
 LEAST_UPDATES = 20.0
-"""Of the window, a second, in every minute."""
+"""Least updates of the window per second, in every minute."""
 
 FLAT = 1.03
-"""What memory the last third of the time takes is flat, of that of the third before."""
+"""Largest ratio of the memory in the last third of the time to that in the second third."""
 
 STALL_S, STALLS = 5.0, 3
-"""The disk takes nothing for so long, so many times."""
+"""Duration and number of stalls of the disk."""
 
 DISCONNECTS, GARBAGE, NOISE, SEED = 50, 0.0075, 0.0025, 4803
-"""Garbage arrives cut off, of another size or type; noise is a whole frame, but of nothing."""
+"""Garbage is truncated or of another size or type; noise is a complete frame without dots."""
 
 PARTS = ("plain", "faults")
 
 
 class Sample(NamedTuple):
-    """What is counted at one time; frames are since the beginning.
+    """Counts at one time; frames are counted from the beginning.
 
     Parameters
     ----------
     at_s
         `time.monotonic`.
     made, given, taken, written, lost
-        By the camera, to its reader, by the window's feed, to the file; lost by the recorder.
+        Frames made by the camera, given to its reader, taken by the window's feed, written to the
+        file, and lost by the recorder.
     waiting_mb
-        What waits for the disk, or for a trigger.
+        Size of the frames waiting for the disk, or for a trigger.
     measured, good, cold
-        Frames measured, those of them that have a surface, and those measured by themselves.
+        Frames measured, those with a surface, and those measured without following.
     age_s
-        Of the frame that the newest figures are of.
+        Age of the frame of the newest figures.
     updates, longest_s
-        Frames painted; the longest time between two since the sample before.
+        Frames painted; the longest time between two since the previous sample.
     window_mb, measuring_mb
-        Resident memory, of the window's process and of those it began.
+        Resident memory of the window's process, and of its child processes.
     busy_s
-        Time of the processor, of all processes.
+        Processor time of all processes.
     """
 
     at_s: float
@@ -115,22 +116,22 @@ class Sample(NamedTuple):
     busy_s: float
 
 
-class Measured:
-    """Keeps account of what is measured."""
+class MeasureCounts:
+    """Counts the measured frames."""
 
     frames = good = cold = newest = 0
     noise: ClassVar[list[tuple[int, str]]] = []
-    """Numbers of the frames of noise that were measured, and what that gave."""
+    """Numbers of the measured frames of noise, and their statuses."""
 
     @classmethod
     def counted(
         cls, measure: Callable[..., Any], is_noise: Callable[[int], bool]
     ) -> Callable[..., Any]:
-        """The same, counted."""
+        """Return the function with counting."""
 
         def counting(measuring: LiveMeasuring, frame: CameraFrame, *given: Any) -> Any:
             result = measure(measuring, frame, *given)
-            if result is None:  # it was left out
+            if result is None:  # the frame was skipped
                 return result
             status = result.measurement.status
             cls.frames += 1
@@ -144,7 +145,7 @@ class Measured:
         return counting
 
 
-class Painted(QObject):
+class PaintCounter(QObject):
     """Counts how often a picture is painted with another frame."""
 
     def __init__(self, view: Any, viewport: QObject) -> None:
@@ -162,19 +163,19 @@ class Painted(QObject):
         return False
 
     def longest_s(self) -> float:
-        """The longest time between two since it was asked last."""
+        """Return the longest time between two updates since the last call."""
         longest_s = max(self._longest_s, time.monotonic() - self._last_s)
         self._longest_s = 0.0
         return longest_s
 
 
-# --- what processes take ----------------------------------------------------------------------
+# --- resources of processes -------------------------------------------------------------------
 
 
 def children() -> list[int]:
-    """Processes that this one began."""
-    found = [each.read_text() for each in Path("/proc/self/task").glob("*/children")]
-    return [int(word) for words in found for word in words.split()]
+    """Return the ids of the child processes."""
+    texts = [each.read_text() for each in Path("/proc/self/task").glob("*/children")]
+    return [int(word) for words in texts for word in words.split()]
 
 
 def resident_mb(process: int) -> float:
@@ -194,16 +195,16 @@ def busy_s(process: int) -> float:
 
 
 def busy_threads() -> dict[str, float]:
-    """Time of the processor of each of this process's threads, s, by their names."""
+    """Return the processor time of this process's threads by name, s."""
     names = {each.native_id: each.name for each in threading.enumerate()}
-    found: dict[str, float] = {}
+    times_s: dict[str, float] = {}
     for each in Path("/proc/self/task").iterdir():
         name = names.get(int(each.name), "others")
         with contextlib.suppress(OSError):  # it has ended
             words = (each / "stat").read_text().rpartition(")")[2].split()
             ticks = int(words[11]) + int(words[12])
-            found[name] = found.get(name, 0.0) + ticks / os.sysconf("SC_CLK_TCK")
-    return found
+            times_s[name] = times_s.get(name, 0.0) + ticks / os.sysconf("SC_CLK_TCK")
+    return times_s
 
 
 # --- the run ----------------------------------------------------------------------------------
@@ -215,11 +216,11 @@ class Run:
     Parameters
     ----------
     folder
-        Where it records to.
+        Folder of the recordings.
     seconds, rate_hz
-        How long, and how fast it films.
+        Duration, and frame rate.
     faulty
-        Whether everything goes wrong that can.
+        Whether all faults occur.
     """
 
     def __init__(self, folder: Path, seconds: float, rate_hz: float, faulty: bool) -> None:
@@ -236,20 +237,20 @@ class Run:
         self.window.resize(1366, 768)
         self.window.show()
         self.log: Any = self.window.log_panel
-        self.log.model().rowsInserted.connect(self._hear)
+        self.log.model().rowsInserted.connect(self._record_messages)
         self.window.workspace.show(Session.open(folder / "run" / "gtaw.labsession"))
         self.window.show_step("capture")
         self.page: Any = self.window.page
         self.view = self.page.live_view
-        self.painted = Painted(self.view, self.page.picture_view.canvas.viewport())
+        self.painted = PaintCounter(self.view, self.page.picture_view.canvas.viewport())
 
     def _put_camera_in(self) -> None:
-        """Have the window film with a camera, and record on a disk, that are known."""
+        """Replace the window's camera and disk by those of `filming`."""
         pool_camera = live_view.pool_camera
         most = round((self.seconds + 600) * self.rate_hz)
 
         def filmed(text: str, progress: Any) -> FilmedDevice:
-            # As many pictures as it films in the same time: the pool swings as ever.
+            # As many pictures as in the same time, so that the oscillation is unchanged.
             rate = f"frames = {round(self.rate_hz / 5)}\nframe_rate_hz = {self.rate_hz:.1f}"
             text = re.sub(r"frames = \d+\nframe_rate_hz = [\d.]+", rate, text)
             self.device = FilmedDevice(pool_camera(text, progress).picture, self.rate_hz, most)
@@ -260,10 +261,10 @@ class Run:
 
         live_view.pool_camera = filmed
         live_module.Recorder = partial(Recorder, writer=writer)
-        counted = Measured.counted(LiveMeasuring.measure, lambda k: self.device.is_noise[k])
+        counted = MeasureCounts.counted(LiveMeasuring.measure, lambda k: self.device.is_noise[k])
         LiveMeasuring.measure = counted
 
-    def _hear(self, _: object, first: int, last: int) -> None:
+    def _record_messages(self, _: object, first: int, last: int) -> None:
         self.notified += [self.log.item(row).text() for row in range(first, last + 1)]
 
     def _stall(self) -> None:
@@ -273,7 +274,7 @@ class Run:
         self.stalls += 1
 
     def _agenda(self) -> Agenda:
-        """Disconnects and stalls of the disk at moments that follow from the seed."""
+        """Return disconnects and stalls of the disk at times given by the seed."""
         if not self.faulty:
             return Agenda([])
         random = np.random.default_rng(SEED)
@@ -283,7 +284,7 @@ class Run:
             for at_s in moments(self.seconds, DISCONNECTS, random)
         ]
         count = min(STALLS, int(self.seconds / (4 * STALL_S)))
-        # Each in a thread of its own: the cable is pulled while the disk stalls, too.
+        # Each in its own thread, so that a disconnect can occur during a stall.
         stalls = [
             (at_s, threading.Thread(target=self._stall, daemon=True).start)
             for at_s in (moments(self.seconds, count, random) if count else [])
@@ -295,7 +296,7 @@ class Run:
         self.view.start()
         run_until(lambda: self.view.updates > 2, 120)
         self.live = self.view.live
-        run_until(lambda: Measured.good > 1, 120)
+        run_until(lambda: MeasureCounts.good > 1, 120)
         run_for(2.0)
         self.painted.updates = 0
         self.view.trigger()
@@ -315,11 +316,11 @@ class Run:
         }
         ended.set()
         sampling.join()
-        if left := (len(self.samples) - 1) % 60:
-            self.tell_minute(self.samples[-left - 1 :])
+        if remaining := (len(self.samples) - 1) % 60:
+            self.print_minute(self.samples[-remaining - 1 :])
         take: Take = self.live.takes[-1]
         self.device.faults = Faults()
-        run_for(1.5)  # what happens often is told once a second
+        run_for(1.5)  # frequent events are reported once a second
         self.ended_s = time.monotonic()
         self.view.trigger()
         self.view.stop()
@@ -331,12 +332,12 @@ class Run:
         while not ended.wait(max(0.0, self.samples[-1].at_s + 1 - time.monotonic())):
             self._sample()
             if len(self.samples) % 60 == 1:
-                self.tell_minute(self.samples[-61:])
+                self.print_minute(self.samples[-61:])
 
     def _sample(self) -> None:
         truth, take = self.device.truth, self.live.takes[-1]
         given, now_s = truth.frames, time.monotonic()
-        place = int(np.searchsorted(truth.numbers[:given], Measured.newest))
+        place = int(np.searchsorted(truth.numbers[:given], MeasureCounts.newest))
         mine, others = os.getpid(), children()
         self.samples.append(
             Sample(
@@ -347,9 +348,9 @@ class Run:
                 take.frames,
                 take.lost,
                 self.live._recorders[-1].waiting_mb,
-                Measured.frames,
-                Measured.good,
-                Measured.cold,
+                MeasureCounts.frames,
+                MeasureCounts.good,
+                MeasureCounts.cold,
                 now_s - truth.arrived_s[min(place, given - 1)],
                 self.painted.updates,
                 self.painted.longest_s(),
@@ -359,10 +360,10 @@ class Run:
             )
         )
 
-    # --- what is told -------------------------------------------------------------------------
+    # --- output -------------------------------------------------------------------------------
 
-    def tell_minute(self, samples: Sequence[Sample]) -> None:
-        """A row of the table, of the samples of a minute."""
+    def print_minute(self, samples: Sequence[Sample]) -> None:
+        """Print a row of the table for the samples of a minute."""
         if len(self.samples) <= 61:
             print(
                 "  min   made  given  taken written lost waiting  measured  by itself,without"
@@ -389,7 +390,7 @@ class Run:
         )
 
     def rates(self, samples: Sequence[Sample], over: int = 1) -> list[float]:
-        """Updates a second that frames came, over so many samples each."""
+        """Return updates per second while frames arrived, over ``over`` samples each."""
         pairs = zip(samples[::over], samples[over::over], strict=False)
         return [
             (b.updates - a.updates) * self.rate_hz / (b.made - a.made)
@@ -398,11 +399,11 @@ class Run:
         ]
 
     def judge(self, take: Take) -> bool:
-        """Hold all that was counted and said against what is true; a line a bar."""
+        """Compare all counts and messages with the truth; print a line per requirement."""
         truth, counts, all_right = self.device.truth, self.live.feed.counts, []
         shares = sorted(self.shares.items(), key=lambda each: -each[1])
-        told = ", ".join(f"{name} {share:.2f}" for name, share in shares if share > 0.005)
-        print(f"    of a core: {told}")
+        share_text = ", ".join(f"{name} {share:.2f}" for name, share in shares if share > 0.005)
+        print(f"    of a core: {share_text}")
 
         def line(right: bool, words: str) -> None:
             all_right.append(right)
@@ -432,8 +433,11 @@ class Run:
         measured = self.samples[-1].measured - self.samples[0].measured
         rate = measured / (self.samples[-1].at_s - self.samples[0].at_s)
         line(measured > 0, f"{measured} measured, {rate:.1f} a second")
-        fooled = [k for k, status in Measured.noise if status == "ok"]
-        line(not fooled, f"{len(Measured.noise)} of noise, surfaces given to them: {len(fooled)}")
+        fooled = [k for k, status in MeasureCounts.noise if status == "ok"]
+        line(
+            not fooled,
+            f"{len(MeasureCounts.noise)} of noise, surfaces given to them: {len(fooled)}",
+        )
         self._judge_words(take, line)
         return all(all_right)
 
@@ -447,37 +451,37 @@ class Run:
             line(end <= FLAT * mid, f"{words} {most:.0f}")
 
     def _judge_words(self, take: Take, line: Any) -> None:
-        """Every fault is in the window's messages and beside the recording."""
+        """Check that every fault is in the window's messages and in the recording's notes."""
         truth = self.device.truth
         with take.notes.open(encoding="utf-8", newline="") as file:
             noted = [row["what"] for row in csv.DictReader(file)]
-        for where, told in (("messages", times_told(self.log.texts())), ("notes", noted)):
-            wanted = {
+        for where, reported in (("messages", times_told(self.log.texts())), ("notes", noted)):
+            expected = {
                 "was unplugged": truth.lost,
                 "it is back after": truth.lost,
                 "incomplete, discarded": truth.broken,
             }
-            # The disk of a busy computer stalls of itself, too.
+            # The disk of a busy computer may also stall by itself.
             least = {"MB are queued in memory": self.stalls, "writing has caught up": self.stalls}
-            found = {words: how_many(told, words) for words in (*wanted, *least)}
-            right = all(found[each] == count for each, count in wanted.items())
-            right &= all(found[each] >= count for each, count in least.items())
+            counts = {words: how_many(reported, words) for words in (*expected, *least)}
+            right = all(counts[each] == count for each, count in expected.items())
+            right &= all(counts[each] >= count for each, count in least.items())
             words = ", ".join(
-                f"“{each}” {found[each]} of {n}" for each, n in (wanted | least).items()
+                f"“{each}” {counts[each]} of {n}" for each, n in (expected | least).items()
             )
             line(right, f"{where}: {words}")
 
 
 def run(folder: Path, seconds: float, rate_hz: float, part: str) -> bool:
-    """One part, in a process of its own."""
+    """Run one part, in its own process."""
     for variable in ("XDG_STATE_HOME", "XDG_CONFIG_HOME", "XDG_DOCUMENTS_DIR"):
         os.environ[variable] = str(folder / "home")
     app = QApplication(["labapp"])
     print(f"{part}: {seconds / 60:g} min, {rate_hz:g} frames/s, load {os.getloadavg()[0]:.1f}")
-    made = Run(folder, seconds, rate_hz, part == "faults")
-    right = made.judge(made.do())
-    made.window.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose, False)
-    made.window.close()
+    live_run = Run(folder, seconds, rate_hz, part == "faults")
+    right = live_run.judge(live_run.do())
+    live_run.window.setAttribute(Qt.WidgetAttribute.WA_DeleteOnClose, False)
+    live_run.window.close()
     app.processEvents()
     return right
 

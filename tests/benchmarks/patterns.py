@@ -1,12 +1,12 @@
-"""Patterns of every kind on pools of several kinds: wrong labels, answers, and error with density.
+"""Patterns of every kind on pools of several kinds: wrong labels, and error against density.
 
 Run as ``python tests/benchmarks/patterns.py [--pools N] [--seed S] [PATTERN …]``. The fan of each
 is about that of 19 × 19 rays at 0.77°. Pools and benches are those of ``clutter.py``, frames have
-the twin's usual look. A frame is resolvable where 95 % of its dots have their next one at least
-three of their standard deviations away. A line for each frame that has a wrong label, and for each
-resolvable one that was not answered; a line for every pattern; then the error CE-D of the fit on
-the caps of §8.3.1 with exact reflections, against the rays on the pool. Fails where a label is
-wrong, or less than nine in ten resolvable frames were answered.
+the default look of the simulation. A frame is resolvable if 95 % of its dots have their nearest
+neighbour at least three dot sizes (σ) away. Prints a line for each frame with a wrong label, and
+for each resolvable one that was rejected; a line for every pattern; then the error CE-D of the fit
+on the caps of §8.3.1 with exact reflections, against the number of rays on the pool. Fails if any
+label is wrong, or less than 90 % of the resolvable frames were measured.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ LEAST_ANSWERED = 0.9
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a frame; see `rendered.Answer`."""
+    """Result for a frame; see `dips.PoolResult`."""
 
     status: str
     resolvable: bool
@@ -57,10 +57,10 @@ class Outcome:
 
 
 def resolvable(dot_px: np.ndarray, look: Look) -> bool:
-    """Whether 95 % of the dots, shape (n, 2), lie apart."""
+    """Whether 95 % of the dots, shape (n, 2), can be resolved."""
     sigma_px = np.hypot(look.dot_floor_mm * PX_PER_MM, look.blur_px)
-    apart = scipy.spatial.cKDTree(dot_px).query(dot_px, k=2)[0][:, 1]
-    return bool(np.quantile(apart, 0.05) >= 3.0 * sigma_px)
+    distance = scipy.spatial.cKDTree(dot_px).query(dot_px, k=2)[0][:, 1]
+    return bool(np.quantile(distance, 0.05) >= 3.0 * sigma_px)
 
 
 def measured(name: str, kind: str, seed: int) -> Outcome:
@@ -72,37 +72,39 @@ def measured(name: str, kind: str, seed: int) -> Outcome:
     axes = (view.origin_px, view.x_axis_px, view.x_axis_mm, view.z_axis_px, view.z_axis_mm)
     calibration = ImageCalibration.from_three_points(*axes)
     bench = Bench(as_entered(rig, calibration), calibration)
-    found, apart = (
+    result, is_clear = (
         measure(frame.image, bench, Settings())[0],
         resolvable(frame.dot_px[frame.shown], look),
     )
-    if found.match is None or found.measures is None or found.dots is None:
-        return Outcome(found.status, apart, shown=int(frame.shown.sum()))
-    own = np.where(frame.shown[..., None], frame.dot_px, np.nan)[tuple(found.match.ray.T - 1)]
-    off = np.linalg.norm(found.dots.image_px[found.match.dot] - own, axis=-1)
-    wrong = int((~(off < ON_ITS_DOT_PX)).sum())
-    right, shown = len(off) - wrong, int(frame.shown.sum())
-    return Outcome("ok", apart, wrong, right, shown, height_error(pool, found.measures))
+    if result.match is None or result.measures is None or result.dots is None:
+        return Outcome(result.status, is_clear, shown=int(frame.shown.sum()))
+    true_px = np.where(frame.shown[..., None], frame.dot_px, np.nan)[tuple(result.match.ray.T - 1)]
+    distance = np.linalg.norm(result.dots.image_px[result.match.dot] - true_px, axis=-1)
+    wrong = int((~(distance < ON_ITS_DOT_PX)).sum())
+    right, shown = len(distance) - wrong, int(frame.shown.sum())
+    return Outcome("ok", is_clear, wrong, right, shown, height_error(pool, result.measures))
 
 
 def surveyed(name: str, pools: int, first: int) -> bool:
-    """Whether a pattern has no wrong label and enough answers; says what it has."""
+    """Print a pattern's results; return whether no label is wrong and enough were measured."""
     outcomes = []
     for kind in KINDS:
         for seed in range(first, first + pools):
-            one = measured(name, kind, seed)
-            outcomes.append(one)
-            if one.wrong or (one.resolvable and one.status != "ok"):
-                print(f"{name} {kind} {seed}: {one}", flush=True)
-    apart = [one for one in outcomes if one.resolvable]
-    answered = [one for one in outcomes if one.status == "ok"]
-    share = sum(one.status == "ok" for one in apart) / max(len(apart), 1)
-    wrong = sum(one.wrong for one in outcomes)
-    heights = np.abs([one.height for one in answered])
-    labelled = sum(one.right for one in answered) / max(sum(one.shown for one in answered), 1)
-    others = Counter(one.status for one in outcomes if not one.resolvable)
+            outcome = measured(name, kind, seed)
+            outcomes.append(outcome)
+            if outcome.wrong or (outcome.resolvable and outcome.status != "ok"):
+                print(f"{name} {kind} {seed}: {outcome}", flush=True)
+    clear = [outcome for outcome in outcomes if outcome.resolvable]
+    answered = [outcome for outcome in outcomes if outcome.status == "ok"]
+    share = sum(outcome.status == "ok" for outcome in clear) / max(len(clear), 1)
+    wrong = sum(outcome.wrong for outcome in outcomes)
+    heights = np.abs([outcome.height for outcome in answered])
+    labelled = sum(outcome.right for outcome in answered) / max(
+        sum(outcome.shown for outcome in answered), 1
+    )
+    others = Counter(outcome.status for outcome in outcomes if not outcome.resolvable)
     print(
-        f"{name}: {len(apart)} of {len(outcomes)} resolvable, {100 * share:.1f} % answered; "
+        f"{name}: {len(clear)} of {len(outcomes)} resolvable, {100 * share:.1f} % answered; "
         f"{wrong} wrong labels, {labelled:.4f} labelled; height "
         f"{100 * np.median(heights):.2f} % median, {100 * heights.max():.2f} % worst; "
         f"not resolvable: {dict(others)}",
@@ -112,13 +114,13 @@ def surveyed(name: str, pools: int, first: int) -> bool:
 
 
 def density_line(name: str) -> str:
-    """Error of the depth on the caps of §8.3.1, and how many rays come back."""
+    """Return a line with the depth error on the caps of §8.3.1, and the number of rays."""
     rig, errors, rays = replace(OPEN_BENCH, pattern=PATTERNS[name]), [], []
     for cap in aside(caps_8_3_1(), 1):
-        seen = trace_once(cap, rig)
-        match = exact_match(seen, rig)
+        reflections = trace_once(cap, rig)
+        match = exact_match(reflections, rig)
         rays.append(len(match.ray))
-        errors.append(errors_of(match, seen, rig, cap, "fit")[0])
+        errors.append(errors_of(match, reflections, rig, cap, "fit")[0])
     lost = int(np.isnan(errors).sum())
     return (
         f"{name:14} {np.median(rays):5.0f} rays  CE-D {100 * np.nanmean(errors):.2f} % mean, "
@@ -127,16 +129,16 @@ def density_line(name: str) -> str:
 
 
 def main() -> int:
-    """0 if every pattern holds."""
+    """Return 0 if every pattern passes."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("patterns", nargs="*", default=list(PATTERNS))
     parser.add_argument("--pools", type=int, default=30, help="of each kind")
     parser.add_argument("--seed", type=int, default=0)
     chosen = parser.parse_args()
-    held = [surveyed(name, chosen.pools, chosen.seed) for name in chosen.patterns]
+    passed = [surveyed(name, chosen.pools, chosen.seed) for name in chosen.patterns]
     for name in chosen.patterns:
         print(density_line(name), flush=True)
-    return 0 if all(held) else 1
+    return 0 if all(passed) else 1
 
 
 if __name__ == "__main__":

@@ -3,18 +3,18 @@
 Run as ``python -m tests.benchmarks.penetration [--seeds N] [--welds N] [--fresh N] [KIND …]``.
 
 For each seed the welds are simulated, each is predicted by a model of the others (leave one weld
-out), and fresh welds, which no model has seen, by the model of all. A line a seed and kind:
+out), and fresh welds, unknown to any model, by the model of all. Prints a line per seed and kind:
 
 error
-    Root mean square of predicted less scanned, mm.
+    Root mean square of predicted minus scanned, mm.
 noise
-    The same of the law itself, given the true pool: scan and scatter of the back side.
+    The same for the true law with the true pool: scan and scatter of the back side.
 informed
-    That of a prediction that knows the law and every ±, from the pool as it was measured.
+    The same for a prediction that knows the law and every ±, from the measured pool.
 cover
-    Share of sections in the 95 % interval; of welds left out, of the bead alone, of fresh welds.
+    Share of sections in the 95 % interval: of welds left out, of the bead only, of fresh welds.
 found
-    Transitions from partial to full within 0.2 s, and those that are predicted where there is none.
+    Transitions from partial to full within 0.2 s, and false transitions.
 """
 
 from __future__ import annotations
@@ -52,77 +52,77 @@ STEP_S, NEAR_S = 0.1, 0.2
 
 
 def noise_mm(welds: Sequence[SimulatedWeld]) -> float:
-    """Scan and scatter: what is left between scans and the true law of the true pool."""
-    square = []
+    """Return the RMS of scan error and scatter, relative to the true law of the true pool, mm."""
+    squares = []
     for one in welds:
-        there = np.isfinite(one.series.target)
-        scan = one.series.target[there] - one.back_width_mm[there]
-        square.append(scan**2 + SCATTER_MM**2 * (one.back_width_mm[there] > 0))
-    return float(np.sqrt(np.mean(np.concatenate(square))))
+        known = np.isfinite(one.series.target)
+        scan = one.series.target[known] - one.back_width_mm[known]
+        squares.append(scan**2 + SCATTER_MM**2 * (one.back_width_mm[known] > 0))
+    return float(np.sqrt(np.mean(np.concatenate(squares))))
 
 
 def informed_mm(welds: Sequence[SimulatedWeld]) -> float:
-    """Error of the likeliest drive of the step and those before it, taken through the true law."""
+    """Return the error of the most likely drive of each step, taken through the true law, mm."""
     drive = np.linspace(0.7, 1.5, 801)
     errors = []
     for one in welds:
         steps = in_steps(one.series, STEP_S)
         variance = steps.noise**2 + steps.level**2
-        away = steps.value[:, None, :] - pool_features(drive)
-        likeliest = drive[np.argmin((away**2 / variance[:, None, :]).sum(axis=2), axis=1)]
-        found = first_order_lag(back_width_mm(likeliest), BACK_S, 1 / STEP_S)
-        errors.append((found - steps.target)[np.isfinite(steps.target)])
+        residual = steps.value[:, None, :] - pool_features(drive)
+        likeliest = drive[np.argmin((residual**2 / variance[:, None, :]).sum(axis=2), axis=1)]
+        predicted = first_order_lag(back_width_mm(likeliest), BACK_S, 1 / STEP_S)
+        errors.append((predicted - steps.target)[np.isfinite(steps.target)])
     return float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
 
 
 def fresh_cover(model: PenetrationModel, welds: Sequence[SimulatedWeld]) -> tuple[float, float]:
-    """Error and cover of welds that the model has not seen."""
+    """Return error and cover of welds unknown to the model."""
     errors, inside = [], []
     for one in welds:
-        found, steps = model.predict(one.series), in_steps(one.series, STEP_S)
-        there = np.isfinite(steps.target)
-        error = (found.value - steps.target)[there]
+        prediction, steps = model.predict(one.series), in_steps(one.series, STEP_S)
+        known = np.isfinite(steps.target)
+        error = (prediction.value - steps.target)[known]
         errors.append(error)
-        spread = np.hypot(found.sigma, steps.target_sigma)[there]
+        spread = np.hypot(prediction.sigma, steps.target_sigma)[known]
         inside.append(np.abs(error) <= SURE_95 * spread)
     return float(np.sqrt(np.mean(np.concatenate(errors) ** 2))), float(
         np.mean(np.concatenate(inside))
     )
 
 
-def false_transitions(left: LeftOut) -> int:
-    """Predicted transitions without one of the sections within half a second."""
+def false_transitions(left_out: LeftOut) -> int:
+    """Return the number of predicted transitions without a true one within 0.5 s."""
     count = 0
-    for name in dict.fromkeys(left.weld):
-        of = np.array([each == name for each in left.weld])
-        known, found = (
-            find_transitions(left.time_s[of], value[of], FULL_MM)
-            for value in (left.measured, left.predicted)
+    for name in dict.fromkeys(left_out.weld):
+        in_weld = np.array([each == name for each in left_out.weld])
+        known, predicted = (
+            find_transitions(left_out.time_s[in_weld], value[in_weld], FULL_MM)
+            for value in (left_out.measured, left_out.predicted)
         )
-        count += sum(not len(known) or np.abs(known - at).min() > 0.5 for at in found)
+        count += sum(not len(known) or np.abs(known - time_s).min() > 0.5 for time_s in predicted)
     return count
 
 
 def examine(seed: int, kind: Kind, count: int, fresh: int) -> tuple[FloatArray, list[str]]:
-    """Known and found transitions of a seed, and the cells of its line."""
+    """Return known and predicted transitions for a seed, and the cells of its line."""
     welds = simulate_welds(count, seed)
     series: list[WeldSeries] = [one.series for one in welds]
     settings = ModelSettings(FEATURES, TARGET, STEP_S, full_mm=FULL_MM)
-    model, left = validated_model(series, kind, settings)
-    known, found = left.transitions()
-    near = np.abs(known - found) <= NEAR_S
-    spread = np.hypot(left.sigma, left.measured_sigma)
-    bead = left.measured > 0
-    inside = np.abs(left.predicted - left.measured) <= SURE_95 * spread
+    model, left_out = validated_model(series, kind, settings)
+    known, predicted = left_out.transitions()
+    near = np.abs(known - predicted) <= NEAR_S
+    spread = np.hypot(left_out.sigma, left_out.measured_sigma)
+    bead = left_out.measured > 0
+    inside = np.abs(left_out.predicted - left_out.measured) <= SURE_95 * spread
     error, cover = fresh_cover(model, simulate_welds(fresh, 10_000 + seed))
     cells = [
-        *(f"{seed}", kind, f"{len(left.measured)}", f"{left.rmse_mm:.4f}"),
+        *(f"{seed}", kind, f"{len(left_out.measured)}", f"{left_out.rmse_mm:.4f}"),
         *(f"{noise_mm(welds):.4f}", f"{informed_mm(welds):.4f}"),
-        *(f"{left.bias_mm:+.4f}", f"{left.cover:.1%}"),
+        *(f"{left_out.bias_mm:+.4f}", f"{left_out.cover:.1%}"),
         *(f"{inside[bead].mean():.1%}", f"{error:.4f}", f"{cover:.1%}"),
-        *(f"{near.sum()}/{len(near)}", f"{false_transitions(left)}", f"{model.factor:.2f}"),
+        *(f"{near.sum()}/{len(near)}", f"{false_transitions(left_out)}", f"{model.factor:.2f}"),
     ]
-    return np.stack([known, found]), cells
+    return np.stack([known, predicted]), cells
 
 
 def main() -> None:
@@ -131,20 +131,20 @@ def main() -> None:
     parser.add_argument("kinds", nargs="*", default=["arx", "gp"])
     for name, default in (("seeds", 5), ("welds", 20), ("fresh", 20)):
         parser.add_argument(f"--{name}", type=int, default=default)
-    given = parser.parse_args()
+    chosen = parser.parse_args()
     head = "seed kind sections error noise informed bias cover bead fresh fresh-cover found false "
     head += "factor"
     print("".join(f"{cell:>12}" for cell in head.split()))
-    for kind in given.kinds:
-        every = []
-        for seed in range(1, given.seeds + 1):
-            times, cells = examine(seed, cast(Kind, kind), given.welds, given.fresh)
-            every.append(times)
+    for kind in chosen.kinds:
+        all_times = []
+        for seed in range(1, chosen.seeds + 1):
+            times, cells = examine(seed, cast(Kind, kind), chosen.welds, chosen.fresh)
+            all_times.append(times)
             print("".join(f"{cell:>12}" for cell in cells), flush=True)
-        known, found = np.hstack(every)
-        near = np.abs(known - found) <= NEAR_S
+        known, predicted = np.hstack(all_times)
+        near = np.abs(known - predicted) <= NEAR_S
         print(f"{kind}: {near.sum()} of {len(near)} transitions within {NEAR_S} s "
-              f"({near.mean():.1%}), median {np.nanmedian(found - known):+.3f} s")  # fmt: skip
+              f"({near.mean():.1%}), median {np.nanmedian(predicted - known):+.3f} s")  # fmt: skip
 
 
 if __name__ == "__main__":

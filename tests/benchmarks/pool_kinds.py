@@ -1,9 +1,9 @@
-"""Frames of every kind of pool through `labapp reconstruct`, held against what they were made of.
+"""Frames of every kind of pool through `labapp reconstruct`, compared with their truth.
 
-Run as ``python tests/benchmarks/pool_kinds.py [--warm] [--frames N] [--seed S] [KIND …]``. A line
-a kind: frames, those that were answered, why others were not, wrong labels (each is told), the
-share of the shown dots that has its ray, the error of the height. Fails where a label is wrong.
-With ``--warm`` frames come at 200 a second, and each is measured from the one before.
+Run as ``python tests/benchmarks/pool_kinds.py [--warm] [--frames N] [--seed S] [KIND …]``. Prints a
+line per kind: frames, those measured, statuses of the others, wrong labels (each is listed), the
+share of the shown dots with their ray, the error of the height. Fails if any label is wrong. With
+``--warm`` the frame rate is 200 Hz, and each frame is followed from the previous one.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from labapp.simulation.pools import egg
 EXAMPLES = Path(__file__).parents[2] / "resources" / "simulations"
 
 TRUE_PX = 3.0
-"""A dot that is farther from its ray's true one has a wrong label; so has one nearer to another."""
+"""A dot farther from its ray's true one, or nearer to another, has a wrong label."""
 
 EGG = """shape = "egg"
 width_mm = 6.66
@@ -51,23 +51,23 @@ OTHERS = {
     "mesh": 'shape = "surface"\nfile = "mesh.ply"',
     "outline": 'shape = "surface"\nfile = "outline.npy"\nspacing_mm = 0.25\noutline_mm = {outline}',
 }
-"""[pool] of the kinds that no example has."""
+"""[pool] sections of the kinds without an example."""
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What was made of frames of known pools.
+    """Results for frames of known pools.
 
     Parameters
     ----------
     statuses
-        How many frames ended how.
+        Number of frames by status.
     wrong
         Each wrong label: the frame and the ray.
     labelled, shown
-        Dots with their own ray, and all that show, of the frames answered.
+        Dots with their true ray, and all shown dots, of the frames measured.
     height
-        Error of each frame's height (of a hollow: depth), as a share of it.
+        Relative error of each frame's height (depth of a concave pool).
     """
 
     statuses: Counter[str]
@@ -91,56 +91,56 @@ HEADER = "frames answered wrong labelled height %: median  worst  not answered"
 
 
 def rows(path: Path) -> list[dict[str, str]]:
-    """The lines of a table."""
+    """Return the rows of a table."""
     with path.open(encoding="utf-8") as file:
         return list(csv.DictReader(file))
 
 
 def judge(simulated: Path, results: Path) -> Verdict:
-    """Hold the tables that `reconstruct` wrote against those that `simulate` did."""
+    """Compare the tables written by `reconstruct` with those of `simulate`."""
     truth, dots = rows(simulated / "dots_truth.csv"), rows(results / "dots.csv")
     verdict = Verdict(Counter(), [], 0, 0, [])
     height, labelled, shown_dots = [], 0, 0
-    for size, got in zip(
+    for size, measured in zip(
         rows(simulated / "truth.csv"), rows(results / "measures.csv"), strict=True
     ):
         number = size["frame"]
-        verdict.statuses[got["status"]] += 1
+        verdict.statuses[measured["status"]] += 1
         shown = [row for row in truth if row["frame"] == number and row["visible"] == "1"]
-        place = np.array([[float(row["u_px"]), float(row["v_px"])] for row in shown])
+        true_px = np.array([[float(row["u_px"]), float(row["v_px"])] for row in shown])
         rays = [(row["ray_row"], row["ray_column"]) for row in shown]
         for dot in dots:
             if dot["frame"] != number or not dot["ray_row"]:
                 continue
-            apart = np.hypot(*(place - [float(dot["u_px"]), float(dot["v_px"])]).T)
-            nearest, ray = int(apart.argmin()), (dot["ray_row"], dot["ray_column"])
-            if rays[nearest] == ray and apart[nearest] <= TRUE_PX:
+            distance = np.hypot(*(true_px - [float(dot["u_px"]), float(dot["v_px"])]).T)
+            nearest, ray = int(distance.argmin()), (dot["ray_row"], dot["ray_column"])
+            if rays[nearest] == ray and distance[nearest] <= TRUE_PX:
                 labelled += 1
             else:
                 verdict.wrong.append(f"frame {number}: ray ({ray[0]}, {ray[1]})")
-        if got["status"] == "ok":
+        if measured["status"] == "ok":
             shown_dots += len(shown)
             high, deep = float(size["height_mm"]), float(size["depth_mm"])
             name, true = ("height_mm", high) if high >= -deep else ("depth_mm", deep)
-            height.append(float(got[name]) / true - 1)
+            height.append(float(measured[name]) / true - 1)
     return Verdict(verdict.statuses, verdict.wrong, labelled, shown_dots, height)
 
 
 def scenarios(folder: Path) -> dict[str, Path]:
-    """Scenario of every kind; those that no example has are written into ``folder``."""
-    found = {path.stem: path for path in sorted(EXAMPLES.glob("*.toml"))}
-    bench = "\n[laser]" + found["egg"].read_text("utf-8").partition("[laser]")[2]
+    """Return the scenario of every kind; those without an example are written to ``folder``."""
+    paths = {path.stem: path for path in sorted(EXAMPLES.glob("*.toml"))}
+    bench = "\n[laser]" + paths["egg"].read_text("utf-8").partition("[laser]")[2]
     outline = write_surfaces(folder)
     for number, (kind, pool) in enumerate(OTHERS.items()):
         path = folder / f"{kind}.toml"
         text = bench.replace("seed = 5003", f"seed = {5200 + number}")
         path.write_text(f"[pool]\n{pool.replace('{outline}', str(outline))}\n{text}", "utf-8")
-        found[kind] = path
-    return found
+        paths[kind] = path
+    return paths
 
 
 def quickened(scenario: Path, folder: Path) -> Path:
-    """The same scenario at 200 frames/s, with what it reads, in a folder."""
+    """Copy a scenario with its files to a folder, at 200 frames/s."""
     text, path = scenario.read_text("utf-8"), folder / f"{scenario.stem}-quick.toml"
     shutil.copy(EXAMPLES / "height_map.csv", folder)
     path.write_text(re.sub(r"frame_rate_hz = [\d.]+", "frame_rate_hz = 200.0", text), "utf-8")
@@ -148,7 +148,7 @@ def quickened(scenario: Path, folder: Path) -> Path:
 
 
 def write_surfaces(folder: Path) -> list[list[float]]:
-    """Write the mesh and the height map; returns the outline that belongs to the map."""
+    """Write the mesh and the height map; return the outline of the map."""
     pool = egg(6.6, 3.0, 4.2, 0.29, (0.0, -0.6))
     rim, rings = pool.boundary_mm(72)[:, :2], np.linspace(0.04, 1 - 1e-9, 25)
     xy = np.array([0.0, -0.6]) + rings[:, None, None] * (rim - [0.0, -0.6])
@@ -168,7 +168,7 @@ def write_surfaces(folder: Path) -> list[list[float]]:
     body = [" ".join(f"{value:.7f}" for value in place) for place in places]
     body += [f"3 {a} {b} {c}" for a, b, c in corners]
     (folder / "mesh.ply").write_text(head + "\n".join(body) + "\n", "ascii")
-    # A paraboloid over an ellipse that is turned; its heights go on below the work piece.
+    # A paraboloid over a rotated ellipse; its heights continue below the work piece.
     turn = np.radians(25)
     y, x = 0.25 * (np.mgrid[:45, :45] - 22)
     along, across = y * np.cos(turn) + x * np.sin(turn), x * np.cos(turn) - y * np.sin(turn)
@@ -181,15 +181,15 @@ def write_surfaces(folder: Path) -> list[list[float]]:
 
 
 def run(*arguments: object) -> None:
-    """Run the command; 1 says that no frame was answered."""
+    """Run the command; exit code 1 means that no frame was measured."""
     command = [sys.executable, "-m", "labapp", *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    if done.returncode not in (0, 1):
-        raise SystemExit(done.stderr)
+    process = subprocess.run(command, capture_output=True, text=True, check=False)
+    if process.returncode not in (0, 1):
+        raise SystemExit(process.stderr)
 
 
 def main() -> int:
-    """How many labels were wrong."""
+    """Print the results; return the number of wrong labels."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("kinds", nargs="*", metavar="KIND")
     parser.add_argument("--frames", type=int, default=30)
@@ -199,14 +199,14 @@ def main() -> int:
     wrong = 0
     with tempfile.TemporaryDirectory() as work:
         folder = Path(work)
-        known = scenarios(folder)
+        paths = scenarios(folder)
         print(f"{'':18} {HEADER}")
-        for kind in chosen.kinds or known:
+        for kind in chosen.kinds or paths:
             out, results = folder / kind, folder / f"{kind}_results"
             seed = () if chosen.seed is None else ("--seed", chosen.seed)
             if chosen.warm:
-                known[kind] = quickened(known[kind], folder)
-            run("simulate", known[kind], "--out", out, "--frames", chosen.frames, *seed)
+                paths[kind] = quickened(paths[kind], folder)
+            run("simulate", paths[kind], "--out", out, "--frames", chosen.frames, *seed)
             run(
                 *("reconstruct", out / "recording.avi", "--setup", out / "setup.toml"),
                 *("--out", results, "--surfaces", "none", *["--warm"] * chosen.warm),

@@ -1,7 +1,7 @@
-"""How fast frames are recorded, and whether a camera at 200 frames/s is recorded without loss.
+"""Speed of recording, and whether a camera at 200 frames/s is recorded without loss.
 
 record_camera.py [SECONDS] [FRAMES_A_SECOND] [FOLDER]: 10 s, 200 frames/s, a temporary folder. The
-plain thing beside it is writing the same bytes to the same disk, in the same run.
+reference is writing the same bytes to the same disk, in the same run.
 """
 
 from __future__ import annotations
@@ -24,40 +24,44 @@ WRITTEN = 400
 
 
 def frames() -> list[GreyImage]:
-    """Frames of the sample run, 480×640 px."""
+    """Return frames of the sample run, 480×640 px."""
     with open_source(sample_folder("gtaw") / "recording.avi") as source:
         return [source.frame(k).image for k in range(12)]
 
 
 def encode(folder: Path, images: list[GreyImage], codec: Codec, threads: int) -> None:
-    """Time the writer by itself, beside plain writing."""
+    """Time the writer alone, and plain writing."""
     path = folder / "speed.nut"
     writer = NutWriter(path, images[0].shape, 8, 200, codec, threads)
-    began_s, used_s = time.perf_counter(), time.process_time()
+    start_s, cpu_s = time.perf_counter(), time.process_time()
     for k in range(WRITTEN):
         writer.write(images[k % len(images)], k / 200)
     writer.close()
-    took_s, used_s = time.perf_counter() - began_s, time.process_time() - used_s
+    wall_s, cpu_s = time.perf_counter() - start_s, time.process_time() - cpu_s
     size = path.stat().st_size / WRITTEN
     path.unlink()
-    began_s = time.perf_counter()
+    start_s = time.perf_counter()
     with path.open("xb", buffering=0) as file:
         for k in range(WRITTEN):
             file.write(images[k % len(images)].tobytes())
-    plain_s = time.perf_counter() - began_s
+    plain_s = time.perf_counter() - start_s
     path.unlink()
     print(
-        f"{codec} on {threads}: {WRITTEN / took_s:.0f} frames/s, "
-        f"{1e3 * used_s / WRITTEN:.2f} ms of a core and {size / 1e3:.0f} kB a frame; "
+        f"{codec} on {threads}: {WRITTEN / wall_s:.0f} frames/s, "
+        f"{1e3 * cpu_s / WRITTEN:.2f} ms of a core and {size / 1e3:.0f} kB a frame; "
         f"plain writing {WRITTEN / plain_s:.0f} frames/s"
     )
 
 
 def film(
-    folder: Path, images: list[GreyImage], codec: Codec, faults: Faults, of: list[float]
+    folder: Path,
+    images: list[GreyImage],
+    codec: Codec,
+    faults: Faults,
+    duration_and_rate: list[float],
 ) -> None:
-    """Record a simulated camera, and tell what was lost and how much memory it took."""
-    seconds, rate_hz = of
+    """Record a simulated camera, and print lost frames and memory."""
+    seconds, rate_hz = duration_and_rate
     device = SimulatedDevice("camera", lambda k: images[k % len(images)], faults=faults)
     path = folder / "film.nut"
     events: list[str] = []
@@ -66,8 +70,8 @@ def film(
     ) as recorder:
         take = recorder.trigger()
         waiting, memory = [], []
-        wanted = CameraSettings(rate_hz=rate_hz)
-        with Feed("camera", device.open, recorder.take, recorder.note, wanted) as feed:
+        settings = CameraSettings(rate_hz=rate_hz)
+        with Feed("camera", device.open, recorder.take, recorder.note, settings) as feed:
             until_s = time.monotonic() + seconds
             while time.monotonic() < until_s:
                 time.sleep(0.2)
@@ -75,14 +79,14 @@ def film(
                 memory.append(int(Path("/proc/self/statm").read_text().split()[1]) * 4096 / 1e6)
     counts = feed.counts
     with open_source(path) as video:
-        whole = len(video) == take.frames == counts.frames
+        is_complete = len(video) == take.frames == counts.frames
         steps_s = np.diff([frame.time_s or 0.0 for frame in video])
     path.unlink()
     take.notes.unlink()
     third = len(memory) // 3
     print(
         f"{codec} at {rate_hz:g} frames/s for {seconds:g} s: {counts}, lost by the recorder "
-        f"{take.lost}, all in the file: {whole}, longest gap {1e3 * steps_s.max():.0f} ms, "
+        f"{take.lost}, all in the file: {is_complete}, longest gap {1e3 * steps_s.max():.0f} ms, "
         f"waiting at most {max(waiting):.1f} MB, memory {np.median(memory[:third]):.0f} MB in the "
         f"first third, {np.median(memory[-third:]):.0f} MB in the last"
     )
@@ -91,11 +95,11 @@ def film(
 
 
 def main() -> None:
-    """Measure and tell."""
-    given = sys.argv[1:]
-    seconds, rate_hz = (float(given[k]) if len(given) > k else (10, 200)[k] for k in (0, 1))
+    """Measure and print."""
+    arguments = sys.argv[1:]
+    seconds, rate_hz = (float(arguments[k]) if len(arguments) > k else (10, 200)[k] for k in (0, 1))
     images = frames()
-    with tempfile.TemporaryDirectory(dir=given[2] if len(given) > 2 else None) as name:
+    with tempfile.TemporaryDirectory(dir=arguments[2] if len(arguments) > 2 else None) as name:
         folder = Path(name)
         for codec, threads in (("raw", 1), ("ffv1", 1), ("ffv1", 2)):
             encode(folder, images, codec, threads)

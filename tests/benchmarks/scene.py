@@ -1,7 +1,7 @@
-"""How often the 3-D scene can show another frame, drawn by the processor alone.
+"""Update rate of the 3-D scene with software rendering.
 
-Run as ``python tests/benchmarks/scene.py``. Prints updates a second, made from a new surface to the
-picture, and renders a second of the same scene when nothing changes.
+Run as ``python tests/benchmarks/scene.py``. Prints updates per second, from a new surface to the
+picture, and renders per second of the unchanged scene.
 """
 
 from __future__ import annotations
@@ -26,36 +26,38 @@ from labapp.export.rendering.scene import scene_of
 SIZE = (900, 600)
 SECONDS = 3.0
 LEAST_PER_S = 20.0
-"""What the operator's windows ask for."""
+"""Required by the app's windows."""
 
 
 def pools(count: int) -> list[Reconstruction]:
-    """Pools that swell and sink, of the form that ``fit`` gives: a spline and 100 points."""
+    """Return growing and shrinking pools as from ``fit``: a spline and 100 points."""
     basis = SplineBasis(np.linspace(-6.0, 6.0, 25), np.linspace(-6.0, 6.0, 25))
     x, y = (grid.ravel() for grid in np.meshgrid(np.linspace(-2, 2, 10), np.linspace(-2, 2, 10)))
     a, b = (grid.ravel() for grid in np.meshgrid(np.linspace(-6, 6, 60), np.linspace(-6, 6, 60)))
     matrix = basis.matrix(a, b)
-    made = []
+    reconstructions = []
     for k in range(count):
         height, radius = 0.3 + 0.05 * np.sin(k), 3.3 + 0.1 * np.cos(k)
-        bowl = height * (1 - (a**2 + b**2) / radius**2)
-        surface = SplineSurface(basis, np.linalg.lstsq(matrix, bowl, rcond=None)[0])
+        height_mm = height * (1 - (a**2 + b**2) / radius**2)
+        surface = SplineSurface(basis, np.linalg.lstsq(matrix, height_mm, rcond=None)[0])
         points = np.column_stack([x, y, surface.height(x, y)])
         boundary = Boundary.polar(np.zeros(2), np.full(360, radius))
         residual, sigma = np.zeros((100, 2)), np.full(100, 0.002)
         ray = np.ones((100, 2), np.int64)
-        made.append(Reconstruction("fit", surface, boundary, ray, points, residual, sigma))
-    return made
+        reconstructions.append(
+            Reconstruction("fit", surface, boundary, ray, points, residual, sigma)
+        )
+    return reconstructions
 
 
 def rate(work: Callable[[int], None]) -> float:
-    """How often work can be done in a second."""
+    """Return how often work can be done per second."""
     work(0)
-    began, done = time.perf_counter(), 0
-    while time.perf_counter() - began < SECONDS:
+    start_s, done = time.perf_counter(), 0
+    while time.perf_counter() - start_s < SECONDS:
         work(done)
         done += 1
-    return done / (time.perf_counter() - began)
+    return done / (time.perf_counter() - start_s)
 
 
 def main() -> None:

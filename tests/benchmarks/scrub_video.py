@@ -1,4 +1,4 @@
-"""How long a frame takes to show while the operator drags through a 640×480 recording.
+"""Time to read a frame while the operator scrubs through a 640×480 recording.
 
 Run as ``python tests/benchmarks/scrub_video.py [frames]``. Recordings are made by ffmpeg.
 """
@@ -25,11 +25,11 @@ FORMATS = {
     "ffv1.avi": (["-c:v", "ffv1", "-pix_fmt", "gray"], 120.0),
     "h264.mp4": (["-c:v", "libx264", "-pix_fmt", "yuv420p", "-preset", "veryfast"], None),
 }
-"""What ffmpeg is told for each recording, and the most a frame may take, ms."""
+"""Options of ffmpeg for each recording, and the longest time for a frame, ms."""
 
 
 def write(folder: Path, frames: int) -> None:
-    """Write one recording a format: a matrix of dots that drifts over noise."""
+    """Write one recording per format: a matrix of dots that drifts over noise."""
     rng = np.random.default_rng(0)
     v, u = np.mgrid[:ROWS, :COLUMNS]
     noise = rng.normal(25, 6, (ROWS + 64, COLUMNS + 64))
@@ -59,14 +59,14 @@ def write(folder: Path, frames: int) -> None:
 
 
 def milliseconds(work: Callable[[], object]) -> float:
-    """Time ``work`` takes, ms."""
+    """Return the time of ``work``, ms."""
     start = time.perf_counter()
     work()
     return 1000 * (time.perf_counter() - start)
 
 
 def measure(path: Path, bar_ms: float | None) -> None:
-    """Print what it takes to open, to play and to scrub a recording."""
+    """Print the times to open, play and scrub a recording."""
     source = VideoSource(path)
     index = source.index
     source.close()

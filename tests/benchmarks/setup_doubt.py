@@ -1,12 +1,11 @@
-"""What recordings can tell of their set-up: false alarms, and the size that can be seen.
+"""The check of the setup by recordings: false alarms, and the smallest detectable errors.
 
 Run as ``python tests/benchmarks/setup_doubt.py [--recordings N] [--frames M] [--sizes K]``. Dots of
-pools of seven kinds that swing, grow and wander are simulated, on benches that are exactly as set
-up, on such as are off by the assumed uncertainties, and on the latter once they are checked against
-a plate and a cap. Before that the size of each quantity is searched
-for at which a recording of K frames is in doubt: what that size leaves in the residuals, by its
-linear response, is added to those of a right bench; a bench that is truly off by twice of it is
-simulated, too.
+seven kinds of oscillating, growing and drifting pools are simulated on exact benches, on benches
+with errors of the assumed uncertainties, and on the latter after a check with a plate and a cap.
+Before that, the smallest error of each quantity is searched at which a recording of K frames is in
+doubt: its linear response is added to the residuals of an exact bench. A bench with twice that
+error is simulated as well.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ from tests.benchmarks.bench_check import (
     PX_PER_MM,
     SHAPE,
     VIEW,
-    seen,
+    seen_dots,
     sighting,
     surface_like,
 )
@@ -60,7 +59,7 @@ ASSUMED = RigUncertainty(
 
 
 def grown(pool: Pool, by: float, aside: FloatArray) -> Pool:
-    """A pool that has grown by a share, higher by half more, and wandered."""
+    """Return a pool grown by a share (its height by 1.5 times that) and moved aside."""
     foot = pool.footprint
     sizes = {name: getattr(foot, name) * (1 + by) for name in ("width_mm", "head_mm", "tail_mm")}
     x, y = np.add(foot.center_mm, aside).tolist()
@@ -76,48 +75,48 @@ def recorded(
     sigma_px: float,
     rng: np.random.Generator,
 ) -> tuple[Counter[str], list[Residuals]]:
-    """Statuses and residuals of pools' frames, their dots labelled without a fault."""
+    """Return statuses and residuals of frames of pools with perfectly labelled dots."""
     statuses: Counter[str] = Counter()
-    found: list[Residuals] = []
+    residuals: list[Residuals] = []
     near: SplineSurface | None = None
     exact, known = replace(rig, uncertainty=None), rig.uncertainty
     assert known is not None
     for pool in pools:
-        made_dots = trace(pool, true)
-        place = to_image(made_dots.plane_mm)
-        inside = ((place > 3) & (place < np.array(SHAPE[::-1]) - 4)).all(axis=-1)
-        shown = made_dots.visible & inside & (rng.random(inside.shape) > MISSING)
+        reflections = trace(pool, true)
+        image_px = to_image(reflections.plane_mm)
+        inside = ((image_px > 3) & (image_px < np.array(SHAPE[::-1]) - 4)).all(axis=-1)
+        shown = reflections.visible & inside & (rng.random(inside.shape) > MISSING)
         ray, noise = np.argwhere(shown) + 1, rng.normal(0, sigma_px, (int(shown.sum()), 2))
-        dots = known.axes.calibration.to_plane(place[shown] + noise)
+        dots = known.axes.calibration.to_plane(image_px[shown] + noise)
         covariance = np.broadcast_to((sigma_px / PX_PER_MM) ** 2 * np.eye(2), (len(ray), 2, 2))
-        witness = np.where(shown, 1, np.where(made_dots.lit | made_dots.absent, 0, -1))
-        given = ray, dots, covariance, witness, exact, FitSettings(), near, MISSING
+        witness = np.where(shown, 1, np.where(reflections.lit | reflections.absent, 0, -1))
+        arguments = ray, dots, covariance, witness, exact, FitSettings(), near, MISSING
         try:
-            made = fit_pool(*given)
-        except CannotMeasure as why:
-            statuses[why.status] += 1
+            pool_fit = fit_pool(*arguments)
+        except CannotMeasure as error:
+            statuses[error.status] += 1
             near = None
             continue
         statuses["ok"] += 1
-        near = made.surface
-        found.append(Residuals(ray, made.residual_mm, made.surface))
-    return statuses, found
+        near = pool_fit.surface
+        residuals.append(Residuals(ray, pool_fit.residual_mm, pool_fit.surface))
+    return statuses, residuals
 
 
 def checked(rig: Rig, bench: SimulatedBench, rng: np.random.Generator) -> Rig:
-    """The set-up once it is checked against a plate and a cap, without the torch."""
-    free, sightings = replace(rig, electrode=Electrode(500.0)), []
-    bench = replace(bench, rig=replace(bench.rig, electrode=free.electrode))
+    """Return the setup after a check with a plate and a cap, without the torch."""
+    without_torch, sightings = replace(rig, electrode=Electrode(500.0)), []
+    bench = replace(bench, rig=replace(bench.rig, electrode=without_torch.electrode))
     for mirror in MIRRORS:
-        sightings.append(sighting(mirror, *seen(surface_like(mirror, rng), bench, rng)))
-    adjusted, _ = adjusted_bench(free, adjust(free, sightings), checked=True)
+        sightings.append(sighting(mirror, *seen_dots(surface_like(mirror, rng), bench, rng)))
+    adjusted, _ = adjusted_bench(without_torch, adjust(without_torch, sightings), checked=True)
     return replace(adjusted, electrode=rig.electrode)
 
 
 def false_alarms(
     recordings: int, frames: int, errors: BenchErrors | None, *, is_checked: bool = False
 ) -> None:
-    """Judge recordings of benches that are right, or off by no more than is known."""
+    """Judge recordings of benches that are exact, or whose errors are within their uncertainty."""
     doubted = judged = 0
     for n in range(recordings):
         rng = np.random.default_rng([SEED, n])
@@ -125,7 +124,7 @@ def false_alarms(
         rig = replace(rig, uncertainty=ASSUMED)
         swing = Oscillation(rng.uniform(0, 0.015), rng.uniform(10, 40))
         pool, growth = replace(pool, terms=(*pool.terms, swing)), rng.uniform(-0.05, 0.1)
-        way, sigma_px = rng.uniform(-0.2, 0.2, 2), rng.uniform(0.1, 0.3)
+        drift, sigma_px = rng.uniform(-0.2, 0.2, 2), rng.uniform(0.1, 0.3)
         bench = SimulatedBench(rig, VIEW)
         if errors is not None:
             bench = draw_bench(rig, VIEW, errors, rng)
@@ -133,7 +132,7 @@ def false_alarms(
             rig = checked(rig, bench, rng)
         share = np.linspace(0, 1, frames)
         pools = [
-            grown(pool.after(k / RATE_HZ), growth * s, way * s)
+            grown(pool.after(k / RATE_HZ), growth * s, drift * s)
             for k, s in enumerate(share.tolist())
         ]
         verdict = judge_setup(
@@ -151,7 +150,7 @@ _KEPT: dict[tuple[object, ...], Responses] = {}
 
 
 def kept_responses(rig: Rig, surfaces: Sequence[SplineSurface], ray: IntArray) -> Responses:
-    """`dot_responses`, worked out once for the same surfaces, whatever the ± of the rig."""
+    """Return cached `dot_responses`, which do not depend on the ± of the rig."""
     key = (*map(id, surfaces), ray.tobytes())
     if key not in _KEPT:
         _KEPT[key] = dot_responses(rig, surfaces, ray)
@@ -161,7 +160,7 @@ def kept_responses(rig: Rig, surfaces: Sequence[SplineSurface], ray: IntArray) -
 def smallest(
     rig: Rig, samples: Sequence[Residuals], one: Direction, share: Callable[[int], float]
 ) -> float:
-    """Smallest size of a quantity that brings samples into doubt, in its unit; inf: none."""
+    """Return the smallest error of a quantity that causes doubt, in its unit; inf if none."""
     middle = samples[len(samples) // 2]
     ray = middle.ray
     known, (response,) = kept_responses(rig, [middle.surface], ray)
@@ -171,8 +170,8 @@ def smallest(
     def is_doubted(size: float) -> bool:
         moved = []
         for k, sample in enumerate(samples):
-            by = np.nan_to_num(pattern[tuple(sample.ray.T - 1)])
-            residual = sample.residual_mm - size * share(k) * by
+            effect = np.nan_to_num(pattern[tuple(sample.ray.T - 1)])
+            residual = sample.residual_mm - size * share(k) * effect
             moved.append(replace(sample, residual_mm=residual))
         return judge_setup(rig, {"ok": len(samples)}, moved).is_doubtful
 
@@ -186,27 +185,27 @@ def smallest(
 
 
 def simulated(rig: Rig, one: Direction, size: float, pools: Sequence[Pool]) -> str:
-    """What a recording says on a bench that is truly off: not by its linear response."""
+    """Return the verdict on a recording simulated with the error, without linearization."""
     exact, offset = replace(rig, uncertainty=None), size * one.vector
     try:
         true = moved_rig(exact, offset)
         camera = moved_calibration(ASSUMED.axes, rig.imaging_plane, offset)
         rng = np.random.default_rng([SEED, 1])
         verdict = judge_setup(rig, *recorded(pools, rig, true, camera.to_image, 0.16, rng))
-    except ValueError as why:
-        return f"impossible: {why}"
+    except ValueError as error:
+        return f"impossible: {error}"
     if not verdict.is_doubtful:
         return "no doubt"
-    alike = [suspect for suspect in verdict.suspects if not suspect.is_drift]
-    own = [suspect for suspect in alike if suspect.name == one.name]
-    if not own:
-        return f"doubt, not named among {len(alike)}: {verdict.reason}"
-    place = alike.index(own[0]) + 1
-    return f"doubt, named {place} of {len(alike)}, off {own[0].off:.3g} ± {own[0].sigma:.2g}"
+    constant = [suspect for suspect in verdict.suspects if not suspect.is_drift]
+    named = [suspect for suspect in constant if suspect.name == one.name]
+    if not named:
+        return f"doubt, not named among {len(constant)}: {verdict.reason}"
+    rank = constant.index(named[0]) + 1
+    return f"doubt, named {rank} of {len(constant)}, off {named[0].off:.3g} ± {named[0].sigma:.2g}"
 
 
 def sizes(frames: int) -> None:
-    """Print the size that can be seen of each quantity, and what twice of it does in earnest."""
+    """Print the smallest detectable error of each quantity, and the verdict at twice that."""
     rng = np.random.default_rng([SEED, frames])
     rig = replace(BENCH_RIG, uncertainty=ASSUMED)
     pools = [
@@ -217,42 +216,49 @@ def sizes(frames: int) -> None:
     samples = samples[:: -(-len(samples) // MOST)] if frames > MOST else samples
     sightings = [expected_sighting(mirror, rig) for mirror in MIRRORS]
     system = System.of(rig, [one for one in sightings if one], None)
-    after = replace(ASSUMED, covariance=system.adjustment(np.zeros(system.size), 1.0).covariance)
+    checked_uncertainty = replace(
+        ASSUMED, covariance=system.adjustment(np.zeros(system.size), 1.0).covariance
+    )
     _, (response,) = kept_responses(rig, [samples[0].surface], samples[0].ray)
     last = len(samples) - 1
     print(f"{len(samples)} frames kept of {frames}, {len(samples[0].ray)} dots")
     print(f"{'':42} {'unit':4} µm a unit  entered  checked    moves  checked × 2, {TRIED} frames")
     for one in directions(rig):
-        left = 1e3 * float(np.sqrt(np.mean((response.by_quantity @ one.vector) ** 2)))
+        effect_um = 1e3 * float(np.sqrt(np.mean((response.by_quantity @ one.vector) ** 2)))
         with mock.patch.object(residual_check, "dot_responses", kept_responses):
-            found = [
+            smallest_sizes = [
                 smallest(replace(rig, uncertainty=known), samples, one, lambda _: 1.0)
-                for known in (ASSUMED, after)
+                for known in (ASSUMED, checked_uncertainty)
             ]
             moves = np.nan
             if not one.key.startswith(FIXED):
                 moves = smallest(rig, samples, one, lambda k: k / last)
-        said = ""
-        if np.isfinite(found[1]):
-            said = simulated(replace(rig, uncertainty=after), one, 2 * found[1], pools[:TRIED])
-        figures = " ".join(f"{each:8.3g}" for each in (left, *found, moves))
-        print(f"{one.name:42} {one.unit:4} {figures}  {said}", flush=True)
+        outcome = ""
+        if np.isfinite(smallest_sizes[1]):
+            outcome = simulated(
+                replace(rig, uncertainty=checked_uncertainty),
+                one,
+                2 * smallest_sizes[1],
+                pools[:TRIED],
+            )
+        figures = " ".join(f"{each:8.3g}" for each in (effect_um, *smallest_sizes, moves))
+        print(f"{one.name:42} {one.unit:4} {figures}  {outcome}", flush=True)
 
 
 def main() -> None:
     """Run the study and print its figures."""
-    ask = argparse.ArgumentParser()
-    ask.add_argument("--recordings", type=int, default=150)
-    ask.add_argument("--frames", type=int, default=16)
-    ask.add_argument("--sizes", type=int, default=100)
-    given = ask.parse_args()
-    sizes(given.sizes)
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--recordings", type=int, default=150)
+    parser.add_argument("--frames", type=int, default=16)
+    parser.add_argument("--sizes", type=int, default=100)
+    chosen = parser.parse_args()
+    sizes(chosen.sizes)
     print("benches as set up:")
-    false_alarms(given.recordings, given.frames, None)
+    false_alarms(chosen.recordings, chosen.frames, None)
     print("benches off by the assumed uncertainties:")
-    false_alarms(given.recordings, given.frames, BenchErrors())
+    false_alarms(chosen.recordings, chosen.frames, BenchErrors())
     print("the same, once they are checked:")
-    false_alarms(given.recordings, given.frames, BenchErrors(), is_checked=True)
+    false_alarms(chosen.recordings, chosen.frames, BenchErrors(), is_checked=True)
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
-"""How fast frames are measured: followed and cold ones, their dots, and a video from file to CSV.
+"""Speed of measuring: followed and cold frames, their dots, and a video from file to CSV.
 
 Run as ``python -m tests.benchmarks.speed [--frames N] [--cache FOLDER] [--cases FOLDER …]``. The
 video is that of `labapp benchmark`. A folder of cases has a folder each with ``frame.png`` and
-``setup.toml``; each frame is measured by itself, after one that is not counted. Times are those of
-the processor, on one core, unless something else is named. Each ratio is of one run: where other
-programs share the cores, it tells more than the times do. The profile has what a followed frame
-costs by module, with the profiler's own time in it, and how often what costs most is called.
+``setup.toml``; each frame is measured independently, after one that is not counted. Times are
+processor times on one core, unless stated otherwise. Each ratio is from one run: where other
+programs share the cores, ratios are more reliable than times. The profile contains the time of a
+followed frame by module, including the profiler's overhead, and calls of the costliest functions.
 """
 
 from __future__ import annotations
@@ -37,8 +37,7 @@ from labapp.simulated.benchmark import Video, make_video, run_video, time_frames
 from tests.benchmarks.detectors import detectors
 
 FOLLOWED, BEFORE, SEARCHED = 200, 20, 10
-"""Frames that are followed under the profiler, frames before them, and frames whose dots are
-sought."""
+"""Frames followed under the profiler, frames before them, and frames whose dots are searched."""
 
 COUNTED = {
     "rounds of the fit": "step",
@@ -46,36 +45,36 @@ COUNTED = {
     "searches for the level": "find_level",
     "covariances of dots": "covariance_of_dots",
 }
-"""What is counted, and the function that does it."""
+"""Counted operations, and their functions."""
 
 
-def seconds(work: Callable[..., object], *given: object) -> float:
-    """Processor time of some work, s."""
-    began = time.process_time()
-    work(*given)
-    return time.process_time() - began
+def seconds(work: Callable[..., object], *arguments: object) -> float:
+    """Return the processor time of a call, s."""
+    start_s = time.process_time()
+    work(*arguments)
+    return time.process_time() - start_s
 
 
-def print_ratio(name: str, ratio: float, wanted: str) -> None:
-    """A line for a ratio, and what it is to be."""
-    print(f"{name:42}{ratio:8.2f}   wanted {wanted}")
+def print_ratio(name: str, ratio: float, required: str) -> None:
+    """Print a ratio and its requirement."""
+    print(f"{name:42}{ratio:8.2f}   wanted {required}")
 
 
 def compare_dots(images: list[Image]) -> None:
-    """Dots of frames without a prior beside OpenCV's SimpleBlobDetector."""
+    """Compare the detector without a prior with OpenCV's SimpleBlobDetector."""
     size_px = DetectorTuning.of(images[0], Settings().dots.band_pass).size_px
-    (_, own), (_, blobs) = islice(detectors(size_px), 2)
-    assert not isinstance(own, str)
+    (_, labapp_detector), (_, blobs) = islice(detectors(size_px), 2)
+    assert not isinstance(labapp_detector, str)
     assert not isinstance(blobs, str)
-    own(images[0])
-    times = np.array([[seconds(find, one) for one in images] for find in (own, blobs)])
-    ours, others = 1e3 * np.median(times, axis=1)
-    print(f"dots of a cold frame {ours:.1f} ms, SimpleBlobDetector {others:.1f} ms")
-    print_ratio("cold dots / SimpleBlobDetector", ours / others, "<= 1")
+    labapp_detector(images[0])
+    times = np.array([[seconds(find, one) for one in images] for find in (labapp_detector, blobs)])
+    labapp_ms, opencv_ms = 1e3 * np.median(times, axis=1)
+    print(f"dots of a cold frame {labapp_ms:.1f} ms, SimpleBlobDetector {opencv_ms:.1f} ms")
+    print_ratio("cold dots / SimpleBlobDetector", labapp_ms / opencv_ms, "<= 1")
 
 
 def time_cases(folder: Path) -> None:
-    """Cold frames of a folder of cases: median and worst, ms."""
+    """Print median and largest time of cold frames of a folder of cases, ms."""
     cases = []
     for case in sorted(path.parent for path in folder.glob("*/frame.png")):
         with open_source(case / "frame.png") as source:
@@ -88,7 +87,7 @@ def time_cases(folder: Path) -> None:
 
 
 def profile_followed(video: Video) -> None:
-    """What a followed frame costs by module, from reading it to the text of its rows."""
+    """Print the time of a followed frame by module, from reading it to the text of its rows."""
     chain, profile = WarmChain(video.setup.bench, Settings()), cProfile.Profile(time.process_time)
     with open_source(video.path) as source:
 
@@ -103,8 +102,8 @@ def profile_followed(video: Video) -> None:
             profile.runcall(follow, number)
     shares: Counter[str] = Counter()
     calls: Counter[str] = Counter()
-    every = pstats.Stats(profile).stats  # type: ignore[attr-defined]  # not in typeshed
-    for (path, _, name), (_, count, own_s, _, _) in every.items():
+    statistics = pstats.Stats(profile).stats  # type: ignore[attr-defined]  # not in typeshed
+    for (path, _, name), (_, count, own_s, _, _) in statistics.items():
         module = path.rpartition("/labapp/")[2] if "/labapp/" in path else "NumPy, OpenCV, Python"
         shares[module] += own_s
         calls[name] += 0 if module.endswith("kernels.py") else count
@@ -112,7 +111,7 @@ def profile_followed(video: Video) -> None:
     for module, own_s in shares.most_common(14):
         print(f"  {module:40}{1e3 * own_s / FOLLOWED:8.2f}")
     print(f"{'calls a followed frame':42}")
-    print(f"  {'of all functions':40}{sum(one[1] for one in every.values()) / FOLLOWED:8.0f}")
+    print(f"  {'of all functions':40}{sum(one[1] for one in statistics.values()) / FOLLOWED:8.0f}")
     for name, function in COUNTED.items():
         print(f"  {name:40}{calls[function] / FOLLOWED:8.1f}")
 

@@ -1,4 +1,4 @@
-"""How long a GUI thread does not come back to its event loop, and what it was at meanwhile."""
+"""Stalls of the GUI thread: time away from the event loop, and the functions executed."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from PySide6.QtCore import QEventLoop, QObject, Qt, QTimer
 BEAT_MS = 1
 SAMPLE_S = 0.004
 LONG_MS = 12.0
-"""Shorter ones are not looked into."""
+"""Shorter stalls are ignored."""
 
 
 @dataclass(frozen=True)
 class Stall:
-    """Time between two beats of a timer of the GUI thread: what it did in it came in one go.
+    """Uninterrupted time between two beats of a timer of the GUI thread.
 
     Parameters
     ----------
     wall_ms, cpu_ms
-        By the clock, and of the processor: the difference was spent waiting for a lock, the disk,
-        or other programs.
+        Wall time and processor time: the difference was spent waiting for a lock, the disk, or
+        other programs.
     calls
-        Where the thread was, of labapp's functions, the innermost last.
+        labapp's functions on the thread's stack, the innermost last.
     """
 
     wall_ms: float
@@ -38,14 +38,14 @@ class Stall:
 
 @dataclass
 class StallMeter:
-    """Beats in the GUI thread while it is used in a ``with``; another thread looks on.
+    """Context manager with a timer in the GUI thread, watched by another thread.
 
     Attributes
     ----------
     stalls
         The long ones, in order.
     beats
-        How many beats there were.
+        Number of beats.
     """
 
     stalls: list[Stall] = field(default_factory=list)
@@ -93,9 +93,9 @@ class StallMeter:
 
 
 def calls_of(frame: FrameType | None) -> str:
-    """labapp's functions on a stack, the innermost last, and the library's it is in.
+    """Return labapp's functions on a stack, the innermost last, and the current library function.
 
-    Quick, and without a hold of the frames: a painter that lives on is an error of Qt's.
+    Quick, and without references to frames: a painter kept alive is an error in Qt.
     """
     names: list[str] = []
     while frame is not None and len(names) < 6:

@@ -1,29 +1,29 @@
-"""Studies at scale: the same bytes from any workers, what it costs, the law that was simulated.
+"""Studies at scale: identical bytes from any workers, overhead, and the simulated law.
 
 Run as ``python -m tests.benchmarks.study FOLDER [PART …] [--frames N] [--simulated N]
 [--long N] [--kills N] [--seed S]``.
-Parts, in this order; without any, all but ``long``:
+Parts, in this order; by default all but ``long``:
 
 make
-    Simulates 40 recordings (4 currents, 2 gases, 5 of each) of 480x640 px into the folder, and puts
-    an empty, a corrupt and a missing one among them. ``--simulated`` frames of each are simulated,
-    and repeated forwards and backwards up to ``--frames``.
+    Simulates 40 recordings (4 currents, 2 gases, 5 of each) of 480x640 px in the folder, and adds
+    an empty, a corrupt and a missing one. ``--simulated`` frames of each are simulated, and
+    repeated forwards and backwards up to ``--frames``.
 workers
-    Measures them by 1 and 2 processes, by a Dask cluster of 4 workers in one program, and by 2
-    separate workers over TCP.
+    Measures them with 1 and 2 processes, with a Dask cluster of 4 workers in one program, and with
+    2 separate workers over TCP.
 speedup
-    What a second process brings.
+    Speed-up by a second process.
 overhead
-    What a study costs beside measuring.
+    Time of a study in addition to measuring.
 law
-    The summary against the truth.
+    The summary compared with the truth.
 kills
-    Kills workers and programs at random moments.
+    Kills workers and programs at random times.
 long
-    Measures a video of 100,000 frames (``--long``, 31 GB); interrupted, it goes on when called
+    Measures a video of 100,000 frames (``--long``, 31 GB); if interrupted, it continues when called
     again.
 
-Times are the processor's, which other programs hardly change, unless they are called wall.
+Times are processor times, which other programs hardly affect, unless they are called wall.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ if __name__ == "__main__":
 
 
 def law_mm(current_a: float, gas: str) -> dict[str, float]:
-    """Mean sizes of the simulated pools under a condition."""
+    """Return the mean sizes of the simulated pools under a condition."""
     width = 6.0 + 0.014 * (current_a - 80)
     return {"width_mm": width, "height_mm": 0.24 + 0.0012 * (current_a - 80) + 0.04 * (gas == "He")}
 
@@ -91,7 +91,7 @@ def law_mm(current_a: float, gas: str) -> dict[str, float]:
 def make_recording(
     folder: Path, seed: int, frames: int, current_a: int, gas: str, repeat: int
 ) -> None:
-    """Simulate one recording, unless it is there."""
+    """Simulate one recording, unless it exists."""
     out = folder / f"I{current_a}_{gas}_{repeat}"
     if (out / "recording.avi").exists():
         return
@@ -111,12 +111,12 @@ def make_recording(
 
 
 def there_and_back(simulated: int) -> list[int]:
-    """Order in which frames are repeated: forwards and backwards, without a jump."""
+    """Return the order of repeated frames: forwards and backwards, without a jump."""
     return [*range(simulated), *range(simulated - 2, 0, -1)]
 
 
 def write_repeated(recording: Path, out: Path, frames: int) -> None:
-    """Repeat a short recording as a long one of raw frames: reading them costs next to nothing."""
+    """Repeat a short recording as a long one of raw frames, which are very fast to read."""
     with open_source(recording) as source:
         each = [source.frame(k).image for k in range(len(source))]  # in order: far faster
         images = [each[k] for k in there_and_back(len(each))]
@@ -136,9 +136,9 @@ def make(folder: Path, frames: int, simulated: int, seed: int) -> None:
         for job in [pool.submit(make_recording, folder, seed, simulated, *name) for name in names]:
             job.result()
     for current, gas, repeat in names:
-        of = folder / f"I{current}_{gas}_{repeat}"
-        if not (of / STUDIED).exists():
-            write_repeated(of / "recording.avi", of / STUDIED, frames)
+        recording = folder / f"I{current}_{gas}_{repeat}"
+        if not (recording / STUDIED).exists():
+            write_repeated(recording / "recording.avi", recording / STUDIED, frames)
     (folder / "empty.avi").touch()
     (folder / "corrupt.avi").write_bytes(random.Random(1).randbytes(100_000))
     setup = f"I{CURRENTS_A[0]}_{GASES[0]}_1/setup.toml"
@@ -148,11 +148,11 @@ def make(folder: Path, frames: int, simulated: int, seed: int) -> None:
     (folder / "study.toml").write_text(text, "utf-8")
 
 
-# --- the same from any workers ------------------------------------------------------------------
+# --- identical results from any workers ---------------------------------------------------------
 
 
-class Watched:
-    """Processor time, and memory over time, of processes and their children."""
+class ProcessWatcher:
+    """Records processor time and memory of processes and their children."""
 
     def __init__(self, *programs: int) -> None:
         self._programs = programs
@@ -162,7 +162,7 @@ class Watched:
         self._ended = threading.Event()
         self._thread = threading.Thread(target=self._watch)
 
-    def __enter__(self) -> Watched:
+    def __enter__(self) -> ProcessWatcher:
         self._thread.start()
         return self
 
@@ -189,31 +189,39 @@ class Watched:
 
     @property
     def processor_s(self) -> float:
-        """Processor time of all of them together, s."""
+        """Total processor time, s."""
         return sum(self._used.values())
 
+<<<<<<< HEAD
     def memory_text(self) -> str:
         """Largest memory of the first program, and of a worker in each third of the time, MB."""
         program, worker = np.array(self.memory).T / 1e6
         thirds = [round(float(part.max())) for part in np.array_split(worker, 3)]
         return f"workers at most {thirds} MB in each third of the time, program {program.max():.0f}"
+=======
+    def thirds_mb(self) -> list[float]:
+        """Return the largest resident memory of a process in each third of the time, MB."""
+        sizes = np.array([size for *_, size in self.memory]) / 1e6
+        return [round(float(part.max()), 0) for part in np.array_split(sizes, 3)]
+>>>>>>> words1
 
 
 def timed(command: list[str], *others: int) -> str:
-    """Run a program; what it took, together with other processes that work for it."""
-    begun = time.perf_counter()
+    """Run a program; return the time and memory used by it and by its worker processes."""
+    start_s = time.perf_counter()
     program = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-    with Watched(program.pid, *others) as seen:
+    with ProcessWatcher(program.pid, *others) as used:
         program.wait()
-    wall_s = time.perf_counter() - begun
+    wall_s = time.perf_counter() - start_s
     load = os.getloadavg()[0]
     return (
         f"{wall_s:.1f} s wall, {seen.processor_s:.1f} s, {seen.memory_text()} MB, load {load:.1f}"
+        f"{used.thirds_mb()} MB, load {load:.1f}"
     )
 
 
 def workers(folder: Path) -> None:
-    """Measure the study by processes and by Dask's workers, and compare the files."""
+    """Measure the study with processes and with Dask workers, and compare the files."""
     study = folder / "study.toml"
     command = [sys.executable, "-m", "labapp", "study", "run", str(study), "--out"]
     ways: dict[str, Callable[[Path], str]] = {
@@ -225,14 +233,14 @@ def workers(folder: Path) -> None:
         "2 workers over TCP": lambda out: _over_tcp([*command, str(out)]),
     }
     first: dict[str, str] = {}
-    for name, way in ways.items():
+    for name, measure_to in ways.items():
         out = folder / f"by {name}"
         shutil.rmtree(out, ignore_errors=True)
-        words = way(out)
-        made = bytes_of(out)
-        first = first or made
-        same = "the same bytes" if made == first else "OTHER BYTES"
-        print(f"{name}: {words}; {len(made)} tasks, {same}", flush=True)
+        words = measure_to(out)
+        hashes = bytes_of(out)
+        first = first or hashes
+        same = "the same bytes" if hashes == first else "OTHER BYTES"
+        print(f"{name}: {words}; {len(hashes)} tasks, {same}", flush=True)
         states = [one.state for one in Study(study, out).status()]
         problems = [one.problem for one in Study(study, out).status() if one.problem]
         print(f"  {states.count('done')} done, {states.count('failed')} failed: {problems}")
@@ -243,13 +251,13 @@ def _over_tcp(command: list[str]) -> str:
         return timed([*command, "--scheduler", address], *(one.pid for one in programs))
 
 
-# --- what a second process brings ---------------------------------------------------------------
+# --- speed-up -----------------------------------------------------------------------------------
 
 
 def speedup(folder: Path, rounds: int = 3) -> None:
-    """Measure 4 recordings by 1 and by 2 processes, and by two programs at once that share nothing.
+    """Measure 4 recordings with 1 and 2 processes, and with two simultaneous independent programs.
 
-    The last is what the machine allows two processes at that moment.
+    The last is the speed-up that the machine allows at that time.
     """
     names = [f"I{current}_{GASES[0]}_1" for current in CURRENTS_A]
     studies = {"all": names, "half 1": names[:2], "half 2": names[2:]}
@@ -259,8 +267,8 @@ def speedup(folder: Path, rounds: int = 3) -> None:
         (folder / f"{study}.toml").write_text(text, "utf-8")
 
     def run(*ways: tuple[str, int]) -> tuple[float, float]:
-        """Wall and processor time of programs at once, each a study and its processes."""
-        begun, before = time.perf_counter(), os.times()
+        """Return wall and processor time of simultaneous programs: (study, processes) each."""
+        start_s, before = time.perf_counter(), os.times()
         programs = []
         for study, count in ways:
             out = folder / f"speed-up {study}"
@@ -277,31 +285,33 @@ def speedup(folder: Path, rounds: int = 3) -> None:
             programs.append(subprocess.Popen(command, stdout=subprocess.DEVNULL))
         assert [each.wait() for each in programs] == [0] * len(programs)
         after = os.times()
-        used = after.children_user + after.children_system
-        return time.perf_counter() - begun, used - before.children_user - before.children_system
+        cpu_s = after.children_user + after.children_system
+        return time.perf_counter() - start_s, cpu_s - before.children_user - before.children_system
 
-    found = []
+    ratios = []
     for _ in range(rounds):
-        one, two, apart = run(("all", 1)), run(("all", 2)), run(("half 1", 1), ("half 2", 1))
-        found.append((one[0] / two[0], one[0] / apart[0], two[1] / one[1], apart[1] / one[1]))
+        one, two, separate = run(("all", 1)), run(("all", 2)), run(("half 1", 1), ("half 2", 1))
+        ratios.append(
+            (one[0] / two[0], one[0] / separate[0], two[1] / one[1], separate[1] / one[1])
+        )
         print(
-            f"wall: 1 process {one[0]:.1f} s, 2 processes {two[0]:.1f} s (x {found[-1][0]:.2f}), "
-            f"two programs {apart[0]:.1f} s (x {found[-1][1]:.2f}); processor: {one[1]:.1f}, "
-            f"{two[1]:.1f}, {apart[1]:.1f} s; load {os.getloadavg()[0]:.1f}",
+            f"wall: 1 process {one[0]:.1f} s, 2 processes {two[0]:.1f} s (x {ratios[-1][0]:.2f}), "
+            f"two programs {separate[0]:.1f} s (x {ratios[-1][1]:.2f}); processor: {one[1]:.1f}, "
+            f"{two[1]:.1f}, {separate[1]:.1f} s; load {os.getloadavg()[0]:.1f}",
             flush=True,
         )
-    wall, ceiling, used, used_apart = np.median(found, axis=0)
+    wall, ceiling, used, used_apart = np.median(ratios, axis=0)
     print(
         f"medians: speed-up {wall:.2f} (two programs {ceiling:.2f}); processor time of 2 processes "
         f"over that of 1: {used:.3f} (two programs {used_apart:.3f})"
     )
 
 
-# --- what it costs ------------------------------------------------------------------------------
+# --- overhead -----------------------------------------------------------------------------------
 
 
 def overhead(folder: Path) -> None:
-    """Tell what a study of 8 recordings takes beyond measuring their frames, in one process."""
+    """Print the time of a study of 8 recordings beyond measuring their frames, in one process."""
     part = folder / "eight.toml"
     names = [f"I{current}_{gas}_1" for current in CURRENTS_A for gas in GASES]
     text = f'setup = "{names[0]}/setup.toml"\n'
@@ -314,31 +324,31 @@ def overhead(folder: Path) -> None:
             for result in WarmMeasurer(source.frame, setup, Settings())(range(len(source))):
                 frame_tables(result, setup.calibration)
 
-    measure(names[0])  # modules are loaded and compiled now
+    measure(names[0])  # loads and compiles modules
     plain_s, study_s, results_s = [], [], []
     for k in range(3):
-        begun = time.process_time()
+        start_s = time.process_time()
         for name in names:
             measure(name)
-        plain_s.append(time.process_time() - begun)
+        plain_s.append(time.process_time() - start_s)
         out = folder / f"overhead {k}"
         shutil.rmtree(out, ignore_errors=True)
-        study, begun = Study(part, out), time.process_time()
+        study, start_s = Study(part, out), time.process_time()
         study.run(0)
-        study_s.append(time.process_time() - begun)
-        begun = time.process_time()
+        study_s.append(time.process_time() - start_s)
+        start_s = time.process_time()
         study.results()
-        results_s.append(time.process_time() - begun)
-    beside = [(a - b) / len(names) for a, b in zip(study_s, plain_s, strict=True)]
+        results_s.append(time.process_time() - start_s)
+    overhead_s = [(a - b) / len(names) for a, b in zip(study_s, plain_s, strict=True)]
     print(f"8 recordings, three times: measured {plain_s}, as a study {study_s} s")
-    print(f"overhead of a recording {beside} s; results of 8, with their plots: {results_s} s")
+    print(f"overhead of a recording {overhead_s} s; results of 8, with their plots: {results_s} s")
 
 
 # --- the law ------------------------------------------------------------------------------------
 
 
 def law(folder: Path) -> None:
-    """Hold each recording's mean and each condition's against the truth, and fit the law."""
+    """Compare the means of recordings and conditions with the truth, and fit the law."""
     summary = Study(folder / "study.toml", folder / "by 2 processes").results()
     truth = {one.status.recording.name: _truth(folder, one.status.recording.name)
              for one in summary.recordings if one.means}  # fmt: skip
@@ -369,14 +379,14 @@ def _truth(folder: Path, name: str) -> dict[str, float]:
     with open_source(folder / name / STUDIED) as source:
         frames = len(source)
     order = there_and_back(len(rows))
-    seen = [rows[order[k % len(order)]] for k in range(frames)]
-    return {key: float(np.mean([float(row[key]) for row in seen])) for key in seen[0]}
+    repeated = [rows[order[k % len(order)]] for k in range(frames)]
+    return {key: float(np.mean([float(row[key]) for row in repeated])) for key in repeated[0]}
 
 
 def _slope(summary: StudySummary, truth: Mapping[str, Mapping[str, float]], size: str) -> str:
-    """Slope against the current by least squares: simulated, true in these pools, measured."""
+    """Return the slope against current by least squares: simulated, of these pools, measured."""
     by_name = {one.status.recording.name: one for one in summary.recordings}
-    found = []
+    lines = []
     for gas in GASES:
         groups = [one for one in summary.groups if one.conditions["gas"] == gas]
         names = [name for one in groups for name in one.recordings]
@@ -392,46 +402,46 @@ def _slope(summary: StudySummary, truth: Mapping[str, Mapping[str, float]], size
             scatter = residual[0] / (len(names) - 2)
             slopes.append(fit[1])
             errors.append(np.sqrt(scatter * np.linalg.inv(basis.T @ basis)[1, 1]))
-        put_in = (law_mm(125, gas)[size] - law_mm(80, gas)[size]) / 45
-        found.append(
+        simulated = (law_mm(125, gas)[size] - law_mm(80, gas)[size]) / 45
+        lines.append(
             f"{gas} measured {slopes[1]:.6f} ± {errors[1]:.6f} mm/A, true of these pools "
-            f"{slopes[0]:.6f}, put in {put_in:.6f}"
+            f"{slopes[0]:.6f}, put in {simulated:.6f}"
         )
-    return "; ".join(found)
+    return "; ".join(lines)
 
 
 # --- a long recording ---------------------------------------------------------------------------
 
 
 class Reference:
-    """Times a constant operation between frames, against which their time is judged."""
+    """Times a constant operation between frames, as a reference for their time."""
 
     EVERY = 20
 
     def __init__(self) -> None:
         self._values = np.random.default_rng(4).random(200_000)
         self.took_s: list[float] = []
-        """Processor time of each."""
+        """Processor time of each operation."""
 
     def opened(self, path: Path, index: bytes | None = None) -> FrameSource:
-        """Open a recording that times the operation every so many frames."""
+        """Open a recording that times the operation after every `EVERY` frames."""
         source = open_source(path, index)
         read = source.frame
 
         def frame(number: int) -> Frame:
             if number % self.EVERY == 0:
-                begun = time.process_time()
+                start_s = time.process_time()
                 np.sort(self._values)
-                self.took_s.append(time.process_time() - begun)
+                self.took_s.append(time.process_time() - start_s)
             return read(number)
 
         return cast(FrameSource, mock.Mock(wraps=source, spec=source, frame=frame))
 
 
 def long(folder: Path, frames: int) -> None:
-    """Measure a long recording in this process; time and memory of each stretch.
+    """Measure a long recording in this process; print time and memory of each stretch.
 
-    Interrupted, it goes on when it is called again.
+    If interrupted, it continues when it is called again.
     """
     recording = f"I{CURRENTS_A[0]}_{GASES[0]}_1"
     if not (folder / "long.nut").exists():
@@ -472,16 +482,16 @@ def long(folder: Path, frames: int) -> None:
 
 
 def open_lazily(folder: Path) -> None:
-    """Read few values of a Parquet dataset; what that takes."""
-    before, begun = psutil.Process().memory_info().rss, time.process_time()
+    """Print time and memory for reading few values of a Parquet dataset."""
+    before, start_s = psutil.Process().memory_info().rss, time.process_time()
     rows = dataset.dataset(folder, format="parquet")
     last = compute.field("frame") >= rows.count_rows() - 100
-    some = rows.to_table(["frame", "height_mm"], filter=last)
+    few = rows.to_table(["frame", "height_mm"], filter=last)
     more_mb = (psutil.Process().memory_info().rss - before) / 1e6
     size_mb = sum(each.stat().st_size for each in folder.glob("*.parquet")) / 1e6
     print(
-        f"Parquet, {size_mb:.1f} MB, {rows.count_rows()} rows: {len(some)} rows of two columns in "
-        f"{time.process_time() - begun:.3f} s, {more_mb:.1f} MB"
+        f"Parquet, {size_mb:.1f} MB, {rows.count_rows()} rows: {len(few)} rows of two columns in "
+        f"{time.process_time() - start_s:.3f} s, {more_mb:.1f} MB"
     )
 
 
@@ -492,7 +502,7 @@ def kills(folder: Path, count: int, seed: int) -> None:
     """Kill local processes and their program, then Dask's workers and their client."""
     for name in ("undisturbed", "disturbed"):
         shutil.rmtree(folder / name, ignore_errors=True)
-    if (folder / "by 2 processes").exists():  # that is the run that nobody disturbed
+    if (folder / "by 2 processes").exists():  # the undisturbed run
         shutil.copytree(folder / "by 2 processes", folder / "undisturbed")
     study = folder / "study.toml"
     print("local:", kill_at_random(study, count // 2, seed), flush=True)
@@ -503,7 +513,7 @@ def kills(folder: Path, count: int, seed: int) -> None:
 
 
 def main() -> None:
-    """Do the parts that are wanted."""
+    """Run the chosen parts."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("folder", type=Path)
     parser.add_argument("parts", nargs="*", metavar="PART")
@@ -512,19 +522,19 @@ def main() -> None:
     parser.add_argument("--long", type=int, default=100_000)
     parser.add_argument("--kills", type=int, default=20)
     parser.add_argument("--seed", type=int, default=1)
-    given = parser.parse_args()
-    folder = given.folder.absolute()
-    do: dict[str, Callable[[], None]] = {
-        "make": lambda: make(folder, given.frames, given.simulated, given.seed),
+    chosen = parser.parse_args()
+    folder = chosen.folder.absolute()
+    parts: dict[str, Callable[[], None]] = {
+        "make": lambda: make(folder, chosen.frames, chosen.simulated, chosen.seed),
         "workers": lambda: workers(folder),
         "speedup": lambda: speedup(folder),
         "overhead": lambda: overhead(folder),
         "law": lambda: law(folder),
-        "long": lambda: long(folder, given.long),
-        "kills": lambda: kills(folder, given.kills, given.seed),
+        "long": lambda: long(folder, chosen.long),
+        "kills": lambda: kills(folder, chosen.kills, chosen.seed),
     }
-    for part in given.parts or PARTS:
-        do[part]()
+    for part in chosen.parts or PARTS:
+        parts[part]()
 
 
 if __name__ == "__main__":

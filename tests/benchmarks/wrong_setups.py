@@ -1,10 +1,10 @@
-"""Seven wrong set-ups, before and after a check against known mirrors.
+"""Seven wrong setups, before and after a check with known mirrors.
 
 Run as ``python -m tests.benchmarks.wrong_setups [--seeds N] [--pictures N] [NAME …]``. The bench
-stands as the set-up of `bench_check` has it but for one thing. Pools are measured on it with the
-set-up as entered, with the adjusted one and with the true one, whose errors are those of noise and
-level alone: the mean difference of the last two is what the check has left of the set-up's. Where
-the check names quantities, the likeliest is freed and the check repeated, as an operator would.
+differs from the setup of `bench_check` in one quantity. Pools are measured on it with the setup as
+entered, with the adjusted one and with the true one, where only noise and level contribute errors:
+the mean difference of the last two is the setup error that remains after the check. Where the check
+names quantities, the most likely is freed and the check repeated, as an operator would.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from tests.benchmarks.bench_check import (
     ToPlane,
     dots_at,
     measured,
-    seen,
+    seen_dots,
     surface_like,
 )
 
@@ -40,7 +40,7 @@ MIRRORS = (Plate(), Cap(9.75, 0.91), Plate(2.0))
 
 
 def _laser(**off: float) -> SimulatedBench:
-    """The bench whose laser is off by so much."""
+    """Return a bench with the given errors of the laser."""
     laser = replace(RIG.laser, **{key: getattr(RIG.laser, key) + by for key, by in off.items()})
     return SimulatedBench(replace(RIG, laser=laser, uncertainty=None), VIEW)
 
@@ -76,69 +76,74 @@ WRONG: Mapping[str, Callable[[], SimulatedBench]] = {
     "plane pitch 5 deg": lambda: _pitched(5.0),
     "laser aim 0.5 mm, Y": lambda: _laser(aim_y_mm=0.5),
 }
-"""How the bench truly stands; the set-up is `RIG` and `CALIBRATION` in all."""
+"""The true benches; the setup is always `RIG` and `CALIBRATION`."""
 
 
 def errors(bench: SimulatedBench, rig: Rig, to_plane: ToPlane, seed: int) -> FloatArray:
-    """Error of each pool's height, and its ±, in % of the height, shape (pools, 2)."""
-    found = [measured(one, bench, rig, to_plane, [seed, 1]) for one in POOLS]
+    """Return the error of each pool's height, and its ±, in % of the height, shape (pools, 2)."""
+    heights = [measured(one, bench, rig, to_plane, [seed, 1]) for one in POOLS]
     true = np.array([one.peak_mm for one in POOLS])
-    return 100 * (np.array(found) - np.outer(true, [1.0, 0.0])) / true[:, None]
+    return 100 * (np.array(heights) - np.outer(true, [1.0, 0.0])) / true[:, None]
 
 
-def summary(made: FloatArray) -> str:
-    """Mean of the errors, the largest, and the ± of one."""
-    made = made[np.isfinite(made[:, 0])]
-    if not len(made):
+def summary(rows: FloatArray) -> str:
+    """Return the text of the mean error, the largest, and the mean ±."""
+    rows = rows[np.isfinite(rows[:, 0])]
+    if not len(rows):
         return f"{'no surface':>19}"
-    (mean, sigma), worst = made.mean(axis=0), max(made[:, 0].tolist(), key=abs)
+    (mean, sigma), worst = rows.mean(axis=0), max(rows[:, 0].tolist(), key=abs)
     return f"{mean:+6.2f} {worst:+6.1f} ± {sigma:4.1f}"
 
 
 def checked(
     bench: SimulatedBench, mirrors: Sequence[Mirror], seed: int
 ) -> tuple[BenchCheck | None, str]:
-    """The check that the operator ends with, if any, and what was named on the way."""
+    """Return the final check, if any, and the quantities named before."""
     rng = np.random.default_rng([18, seed])
     pictures = [
-        Picture(m.name, m, dots_at(seen(surface_like(m, rng), bench, rng)[0]), SHAPE)
+        Picture(m.name, m, dots_at(seen_dots(surface_like(m, rng), bench, rng)[0]), SHAPE)
         for m in mirrors
     ]
     try:
         check = check_bench(pictures, RIG, CALIBRATION)
         named = [one.key for one in check.suspects]
-        said = f"{check.status} {' or '.join(named)}".strip()
+        verdict = f"{check.status} {' or '.join(named)}".strip()
         if check.status == "quantity-off":
             check = check_bench(pictures, RIG, CALIBRATION, named[:1])
-            said += f"; freed {named[0]}: {check.status}"
-    except CannotMeasure as why:
-        return None, why.status
-    return check, said
+            verdict += f"; freed {named[0]}: {check.status}"
+    except CannotMeasure as error:
+        return None, error.status
+    return check, verdict
 
 
 def main() -> None:
-    """Run it and print a line for each set-up and seed."""
-    ask = argparse.ArgumentParser()
-    ask.add_argument("--seeds", type=int, default=2)
-    ask.add_argument("--pictures", type=int, default=len(MIRRORS))
-    ask.add_argument("names", nargs="*", default=list(WRONG))
-    given = ask.parse_args()
-    mirrors = MIRRORS[: given.pictures]
+    """Print a line for each setup and seed."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--seeds", type=int, default=2)
+    parser.add_argument("--pictures", type=int, default=len(MIRRORS))
+    parser.add_argument("names", nargs="*", default=list(WRONG))
+    chosen = parser.parse_args()
+    mirrors = MIRRORS[: chosen.pictures]
     print(f"{len(POOLS)} pools, height %: mean and largest error, ± of one; mirrors:")
     print(", ".join(one.name for one in mirrors))
     columns = "".join(f"{name:21}" for name in ("entered", "checked", "true"))
     print(f"{'wrong in the set-up':23} seed {columns}set-up  check")
-    for name in given.names:
-        for seed in range(given.seeds):
+    for name in chosen.names:
+        for seed in range(chosen.seeds):
             bench = WRONG[name]()
             check, said = checked(bench, mirrors, seed)
             before = summary(errors(bench, RIG, CALIBRATION.to_plane, seed))
             true = errors(bench, bench.rig, bench.view.to_plane, seed)
-            after, left = f"{'refused':>19}", np.nan
+            after, remainder = f"{'refused':>19}", np.nan
             if check is not None:
-                found = errors(bench, check.rig, check.calibration.to_plane, seed)
-                after, left = summary(found), float(np.nanmean(found[:, 0] - true[:, 0]))
-            line = f"{name:23} {seed:4} {before}  {after}  {summary(true)}  {left:+6.2f}  {said}"
+                checked_errors = errors(bench, check.rig, check.calibration.to_plane, seed)
+                after, remainder = (
+                    summary(checked_errors),
+                    float(np.nanmean(checked_errors[:, 0] - true[:, 0])),
+                )
+            line = (
+                f"{name:23} {seed:4} {before}  {after}  {summary(true)}  {remainder:+6.2f}  {said}"
+            )
             print(line, flush=True)
 
 

@@ -1,4 +1,4 @@
-"""Surfaces of swinging pools whose modes are known, as series: truth for the tests of dynamics."""
+"""Series of oscillating pool surfaces with known modes: ground truth for the dynamics tests."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ ROUGH = [(0, 1), (1, 1), (2, 1), (0, 2), (3, 1), (1, 2)]
 
 
 def boundary_of(pool):
-    """Boundary of a pool of the twin."""
+    """Return the boundary of a simulated pool."""
     points = pool.boundary_mm(360)
     center = (points[:, :2].min(axis=0) + points[:, :2].max(axis=0)) / 2
     theta = np.degrees(np.arctan2(*(points[:, :2] - center).T[::-1]))
@@ -23,7 +23,7 @@ def boundary_of(pool):
 
 
 def series_of(pool, rate_hz, seconds=1.0, rng=None, noise_mm=0.0, lost=0.0):
-    """Surfaces of a pool that swings, with noise in shape and level, and frames lost at random."""
+    """Sample an oscillating pool, with noise in shape and level, and randomly lost frames."""
     outline = boundary_of(pool)
     frames = [k for k in range(int(rate_hz * seconds)) if rng is None or rng.random() >= lost]
     series = SurfaceSeries.of((k, k / rate_hz, pool.after(k / rate_hz), outline) for k in frames)
@@ -35,7 +35,7 @@ def series_of(pool, rate_hz, seconds=1.0, rng=None, noise_mm=0.0, lost=0.0):
 
 
 def analysed_step():
-    """Analysis of two modes at once, whose width grows after a step of the current at 0.5 s."""
+    """Analyse a pool with two modes whose width grows after a current step at 0.5 s."""
     foot, rng = Footprint(6.6, 3.7, 3.7), np.random.default_rng(1)
     waves = Wave((0, 1), 0.02, 31.0), Wave((1, 1), 0.01, 47.0)
     surfaces = series_of(pool_with(foot, *waves), 200)
@@ -48,5 +48,5 @@ def analysed_step():
 
 
 def pool_with(foot, *waves):
-    """A convex pool with waves on it."""
+    """Return a convex pool with waves on it."""
     return Pool(foot, 0.29, waves)

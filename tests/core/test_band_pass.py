@@ -1,4 +1,4 @@
-"""The default detector: found, placed as well as the noise allows, and honest about it."""
+"""The default detector: completeness, position error and stated uncertainty."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ SHAPE = (240, 320)
 
 
 def grid(spacing: float = 24.0) -> FloatArray:
-    """Places off the pixel centres by all sorts of fractions, shape (n, 2)."""
+    """Return positions at varying subpixel offsets, shape (n, 2)."""
     u, v = np.meshgrid(
         np.arange(30.0, 300.0, spacing + 0.37), np.arange(30.0, 220.0, spacing - 0.21)
     )
     return np.stack([u.ravel(), v.ravel()], axis=-1)
 
 
-def draw(places: FloatArray, size: float, peak: float) -> FloatArray:
-    return peak * gaussian_dots(SHAPE, places, size)
+def draw(positions: FloatArray, size: float, peak: float) -> FloatArray:
+    return peak * gaussian_dots(SHAPE, positions, size)
 
 
-def offsets(found: FloatArray, true: FloatArray) -> FloatArray:
-    """From each true place to the nearest found one, shape (n, 2)."""
-    difference = found[None] - true[:, None]
+def offsets(detected: FloatArray, true: FloatArray) -> FloatArray:
+    """Return the vectors from each true position to the nearest detected one, shape (n, 2)."""
+    difference = detected[None] - true[:, None]
     nearest = np.argmin(np.linalg.norm(difference, axis=-1), axis=1)
     return difference[np.arange(len(true)), nearest]
 
@@ -47,7 +47,7 @@ def test_dots_of_any_size_are_found_and_measured(size: float) -> None:
 
 @pytest.mark.parametrize("snr", [6.0, 12.0, 25.0])
 @pytest.mark.slow
-def test_places_are_as_good_as_white_noise_allows_and_said_to_be(snr: float) -> None:
+def test_position_error_is_at_white_noise_limit_and_matches_sigma(snr: float) -> None:
     rng = np.random.default_rng(2)
     settings = BandPassSettings(speckle_px=0.0)
     errors, sigmas = [], []
@@ -56,13 +56,13 @@ def test_places_are_as_good_as_white_noise_allows_and_said_to_be(snr: float) -> 
         dots = band_pass_dots(frame, settings)
         errors.append(offsets(dots.image_px, grid()))
         sigmas.append(np.median(dots.u_sigma_px))
-    rms = float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
-    assert rms < 1.25 * 0.80 / snr  # the white-noise limit
-    assert np.mean(sigmas) == pytest.approx(rms, rel=0.25)
+    rms_px = float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
+    assert rms_px < 1.25 * 0.80 / snr  # the white-noise limit
+    assert np.mean(sigmas) == pytest.approx(rms_px, rel=0.25)
 
 
 @pytest.mark.slow
-def test_noise_alone_is_not_a_dot() -> None:
+def test_noise_adds_no_dots() -> None:
     rng = np.random.default_rng(3)
     false = 0
     for _ in range(10):
@@ -85,28 +85,28 @@ def test_hot_pixels_and_a_glow_are_not_dots() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("size", [2.5, 5.5])
 @pytest.mark.parametrize("grain", [0.0, 0.3])
-def test_lobes_and_grains_of_a_dot_are_not_dots(size: float, grain: float) -> None:
+def test_lobes_and_speckle_of_a_dot_are_not_separate_dots(size: float, grain: float) -> None:
     rng = np.random.default_rng(8)
     places = grid(5.0 * size)
-    round_it = np.linspace(0.0, 2 * np.pi, 5)[:4] + 0.3
-    lobes = np.stack([np.cos(round_it), np.sin(round_it)], axis=-1) * 1.15 * size
+    angle = np.linspace(0.0, 2 * np.pi, 5)[:4] + 0.3
+    lobes = np.stack([np.cos(angle), np.sin(angle)], axis=-1) * 1.15 * size
     frame = 0.7 * draw(places, 0.45 * size, 130.0)
     for lobe in lobes:
         frame += draw(places + lobe, 0.45 * size, 130.0)
     speckle = cv2.GaussianBlur(rng.normal(size=SHAPE), (0, 0), 0.8)
     frame = np.maximum(frame * (1 + grain * speckle / speckle.std()), 0.0)
     dots = band_pass_dots(frame + rng.normal(20.0, 1.5, SHAPE), BandPassSettings())
-    assert np.abs(offsets(places, dots.image_px)).max() < size  # none is false
-    away = np.abs(offsets(dots.image_px, places)).max(axis=1)
-    assert np.mean(away < size) > 0.98
-    assert np.median(away) < 0.2 * size
+    assert np.abs(offsets(places, dots.image_px)).max() < size  # no false dots
+    distance = np.abs(offsets(dots.image_px, places)).max(axis=1)
+    assert np.mean(distance < size) > 0.98
+    assert np.median(distance) < 0.2 * size
     assert len(dots) <= len(places)
 
 
 @pytest.mark.parametrize("wide", [1, 2])
 @pytest.mark.parametrize("side", ["left", "right", "top", "bottom", "amid"])
 @pytest.mark.slow
-def test_a_bright_line_of_pixels_is_not_dots(side: str, wide: int) -> None:
+def test_bright_line_of_pixels_is_not_detected_as_dots(side: str, wide: int) -> None:
     rng = np.random.default_rng(7)
     frame = draw(grid(), 1.6, 60.0) + rng.normal(10.0, 3.0, SHAPE)
     line = {
@@ -124,7 +124,7 @@ def test_a_bright_line_of_pixels_is_not_dots(side: str, wide: int) -> None:
 
 @pytest.mark.parametrize("height", [60.0, 150.0, 230.0])
 @pytest.mark.parametrize("size", [1.4, 2.4])
-def test_a_hot_pixel_on_a_dot_does_not_delete_it(size: float, height: float) -> None:
+def test_hot_pixel_on_a_dot_does_not_remove_it(size: float, height: float) -> None:
     rng = np.random.default_rng(12)
     frame = draw(grid(), size, 50.0) + rng.normal(15.0, 1.5, SHAPE)
     for u, v in grid()[::3]:
@@ -136,7 +136,7 @@ def test_a_hot_pixel_on_a_dot_does_not_delete_it(size: float, height: float) -> 
     assert np.abs(offsets(dots.image_px, grid())).max() < 0.6
 
 
-def test_dots_close_together_do_not_pull_at_each_other() -> None:
+def test_close_dots_do_not_bias_each_other() -> None:
     places = np.array(
         [[100.0, 100.0], [110.4, 100.3], [120.7, 100.9], [160.0, 140.0], [60.0, 60.0]]
     )
@@ -146,20 +146,20 @@ def test_dots_close_together_do_not_pull_at_each_other() -> None:
     assert np.abs(offsets(dots.image_px, places)).max() < 0.15
 
 
-def test_a_faint_dot_beside_a_bright_one_does_not_end_on_that() -> None:
-    """Its window moved on from where it had come, 7 px in all."""
+def test_faint_dot_does_not_drift_onto_bright_neighbour() -> None:
+    """The fit window once moved repeatedly, 7 px in total."""
     bright, faint = np.array([120.0, 120.0]), np.array([128.0, 117.6])
     others = np.array([[60.0, 60.0], [250.0, 60.0], [60.0, 180.0], [250.0, 180.0], [200.0, 120.0]])
     frame = draw(np.vstack([others, bright]), 2.6, 60.0) + draw(faint[None], 2.6, 26.0)
     frame += np.random.default_rng(5).normal(30.0, 0.5, SHAPE)
     dots = band_pass_dots(frame, BandPassSettings())
     assert len(dots) == 7
-    away = np.linalg.norm(dots.image_px - bright, axis=-1)
-    assert np.sum(away < np.linalg.norm(bright - faint) / 2) == 1
+    distance = np.linalg.norm(dots.image_px - bright, axis=-1)
+    assert np.sum(distance < np.linalg.norm(bright - faint) / 2) == 1
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16, np.float32])
-def test_the_type_of_the_frame_does_not_matter(dtype: type) -> None:
+def test_dtype_of_the_frame_does_not_matter(dtype: type) -> None:
     frame = draw(grid(), 2.0, 60.0) + np.random.default_rng(6).normal(40.0, 2.0, SHAPE)
     scale = 200.0 if dtype is np.uint16 else 1.0
     dots = band_pass_dots((frame * scale).astype(dtype), BandPassSettings())
@@ -167,7 +167,7 @@ def test_the_type_of_the_frame_does_not_matter(dtype: type) -> None:
     assert np.median(dots.snr) == pytest.approx(30.0, rel=0.2)
 
 
-def test_a_dot_with_a_flat_top_is_one_dot() -> None:
+def test_saturated_dot_is_detected_once() -> None:
     places = np.array([[100.5, 100.0], [150.0, 120.5], [60.0, 180.0], [220.0, 60.0]])
     frame = np.minimum(draw(places, 2.5, 400.0), 255.0)
     dots = band_pass_dots(frame, BandPassSettings())
@@ -176,14 +176,14 @@ def test_a_dot_with_a_flat_top_is_one_dot() -> None:
 
 
 @pytest.mark.parametrize("frame", [np.zeros((1, 1)), np.zeros((5, 400)), np.full((200, 200), 7.0)])
-def test_nothing_to_be_seen_is_said(frame: FloatArray) -> None:
-    with pytest.raises(CannotMeasure) as answer:
+def test_frame_without_dots_raises_no_dots(frame: FloatArray) -> None:
+    with pytest.raises(CannotMeasure) as error:
         band_pass_dots(frame, BandPassSettings())
-    assert answer.value.status == "no-dots"
+    assert error.value.status == "no-dots"
 
 
-def test_noise_beside_a_blank_part_has_no_more_blobs_than_are_looked_at() -> None:
-    """The noise of most of the frame is nothing, and every grain of the rest is over it."""
+def test_number_of_blobs_is_limited_beside_a_blank_area() -> None:
+    """Most of the frame has no noise, so every noise peak in the rest exceeds the threshold."""
     frame = np.full((640, 480), 20.0, np.float32)
     frame[:300] += np.random.default_rng(2).normal(0.0, 3.0, (300, 480)).astype(np.float32)
     bands = dict(dot_size._bands(frame))
@@ -191,16 +191,16 @@ def test_noise_beside_a_blank_part_has_no_more_blobs_than_are_looked_at() -> Non
     assert max(counts) == dot_size.MOST_BLOBS
 
 
-def test_ripples_of_a_compressed_picture_are_neither_peaks_nor_spikes() -> None:
-    """Compression leaves flat areas without noise, beside which every ripple would stand out."""
+def test_compression_ripples_are_neither_peaks_nor_spikes() -> None:
+    """Compression leaves flat areas without noise, in which every ripple would stand out."""
     noise = np.random.default_rng(3).normal(20.0, 1.5, SHAPE)
     image = np.clip(np.rint(draw(grid(), 2.0, 40.0) + noise), 0, 255).astype(np.uint8)
-    coded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 40])[1]
-    frame = np.asarray(cv2.imdecode(coded, cv2.IMREAD_GRAYSCALE))
+    encoded = cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, 40])[1]
+    frame = np.asarray(cv2.imdecode(encoded, cv2.IMREAD_GRAYSCALE))
     assert np.median(np.abs(np.diff(frame.astype(int)))) == 0
-    tuning, seen = _tuned(frame, BandPassSettings())
-    assert len(seen.peaks(tuning)[0]) <= 1.5 * len(grid())
-    assert np.mean(seen.picture != frame) < 0.001
+    tuning, view = _tuned(frame, BandPassSettings())
+    assert len(view.peaks(tuning)[0]) <= 1.5 * len(grid())
+    assert np.mean(view.picture != frame) < 0.001
     dots = band_pass_dots(frame, BandPassSettings())
     assert len(dots) == len(grid())
     assert np.abs(offsets(dots.image_px, grid())).max() < 0.5

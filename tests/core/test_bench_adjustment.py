@@ -1,4 +1,4 @@
-"""Derivatives and minimum of the bench check's adjustment, held against other methods."""
+"""Derivatives and minimum of the bench check's adjustment, compared with other methods."""
 
 from __future__ import annotations
 
@@ -50,13 +50,13 @@ def sightings_of(
     rng: np.random.Generator,
     gross_mm: float = 0.0,
 ) -> list[Sighting]:
-    """Mirrors' dots, noisy, each with its ray; some off by a gross error."""
+    """Return the mirrors' noisy dots, each with its ray; some have a gross error."""
     sightings = []
     for mirror, surface in mirrors:
-        made = trace(surface, bench.rig)
-        ray = np.argwhere(made.visible)
-        place = bench.view.to_image(made.plane_mm[made.visible])
-        dots = CALIBRATION.to_plane(place + rng.normal(0, 0.12, place.shape))
+        reflections = trace(surface, bench.rig)
+        ray = np.argwhere(reflections.visible)
+        image_px = bench.view.to_image(reflections.plane_mm[reflections.visible])
+        dots = CALIBRATION.to_plane(image_px + rng.normal(0, 0.12, image_px.shape))
         dots[::17] += gross_mm
         covariance = np.tile(0.026**2 * np.eye(2), (len(ray), 1, 1))
         sightings.append(Sighting(mirror, ray, dots, covariance))
@@ -64,49 +64,54 @@ def sightings_of(
 
 
 def system(gross_mm: float = 0.0) -> System:
-    """Equations of a bench that is off, some of its dots by a gross error."""
+    """Return the equations of a misaligned bench; some of its dots have a gross error."""
     rng = np.random.default_rng(18)
     bench = draw_bench(RIG, VIEW, BenchErrors(), rng)
     return System.of(RIG, sightings_of(MIRRORS, bench, rng, gross_mm), None)
 
 
-def test_derivatives_are_those_by_central_differences() -> None:
-    of = system()
-    at = np.random.default_rng(1).normal(0, 0.5, of.size)
-    at[-4:] *= 0.02  # the cap stays where rays meet it
-    steps = 1e-3 * np.eye(of.size)
-    central = np.array([(of.residuals(at + s) - of.residuals(at - s)) / 2e-3 for s in steps]).T
+def test_jacobian_agrees_with_central_differences() -> None:
+    equations = system()
+    parameters = np.random.default_rng(1).normal(0, 0.5, equations.size)
+    parameters[-4:] *= 0.02  # rays still hit the cap
+    steps = 1e-3 * np.eye(equations.size)
+    central = np.array(
+        [
+            (equations.residuals(parameters + s) - equations.residuals(parameters - s)) / 2e-3
+            for s in steps
+        ]
+    ).T
     scale = np.abs(central).max(axis=0)
-    np.testing.assert_allclose(of.jacobian(at) / scale, central / scale, atol=5e-5)
-    assert (scale[np.flatnonzero(of.factor.any(axis=0))] > 0.1).all()
+    np.testing.assert_allclose(equations.jacobian(parameters) / scale, central / scale, atol=5e-5)
+    assert (scale[np.flatnonzero(equations.factor.any(axis=0))] > 0.1).all()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("gross_mm", [0.0, 0.5])
-def test_another_method_finds_no_lower_cost(gross_mm: float) -> None:
-    of = system(gross_mm)
+def test_scipy_finds_no_lower_cost(gross_mm: float) -> None:
+    equations = system(gross_mm)
 
     def roots(x: FloatArray) -> FloatArray:
         """Square roots of the terms of the cost, with the residuals' signs."""
-        residual = of.residuals(x)
+        residual = equations.residuals(x)
         loss = 2 * ROBUST**2 * (np.sqrt(1 + residual**2 / ROBUST**2) - 1)
         return np.append(np.copysign(np.sqrt(loss), residual), x)
 
-    made = of.minimised(of.start(), 1.0, 40)
-    found = scipy.optimize.least_squares(roots, made, max_nfev=10)
-    assert roots(made) @ roots(made) == pytest.approx(2 * found.cost, abs=0.01)
-    np.testing.assert_allclose(made, found.x, atol=0.05)
+    minimum = equations.minimised(equations.start(), 1.0, 40)
+    reference = scipy.optimize.least_squares(roots, minimum, max_nfev=10)
+    assert roots(minimum) @ roots(minimum) == pytest.approx(2 * reference.cost, abs=0.01)
+    np.testing.assert_allclose(minimum, reference.x, atol=0.05)
 
 
-def test_a_plate_turned_between_two_pictures_cancels_its_wedge() -> None:
-    """The reversal method; by one picture the wedge is taken for a tilt of the bench."""
+def test_turning_the_plate_between_pictures_cancels_its_wedge() -> None:
+    """Reversal method: with a single picture the wedge is attributed to a tilt of the bench."""
     bench, wedge = SimulatedBench(replace(RIG, uncertainty=None), VIEW), np.tan(np.radians(0.15))
     once, turned = ((Plate(), FlatMirror(0.0, 0.0, sign * wedge)) for sign in (1, -1))
     tilts = [INDEX["laser.projection_angle_deg"], INDEX["imaging_plane.pitch_deg"]]
-    found = []
+    tilt_offsets = []
     for pictures in ([once], [once, turned]):
         mirrors = [*pictures, MIRRORS[1]]
-        made = adjust(RIG, sightings_of(mirrors, bench, np.random.default_rng(5)))
-        found.append(np.abs(made.offset[tilts]).max())
-    assert found[0] > 0.1
-    assert found[1] < 0.3 * found[0]
+        adjustment = adjust(RIG, sightings_of(mirrors, bench, np.random.default_rng(5)))
+        tilt_offsets.append(np.abs(adjustment.offset[tilts]).max())
+    assert tilt_offsets[0] > 0.1
+    assert tilt_offsets[1] < 0.3 * tilt_offsets[0]

@@ -1,4 +1,4 @@
-"""The bench check: a simulated bench that is off is found from pictures of known mirrors."""
+"""The bench check: the errors of a simulated bench are found from pictures of known mirrors."""
 
 from __future__ import annotations
 
@@ -75,12 +75,12 @@ def picture(
     missing: float = 0.0,
     false: int = 0,
 ) -> tuple[Picture, np.ndarray]:
-    """A mirror's picture, and the ray of each of its dots, counted from 0, −1 for a false one."""
-    made = trace(surface, bench.rig)
-    place = bench.view.to_image(made.plane_mm)
-    shown = made.visible & ((place > 3) & (place < [476, 636])).all(axis=-1)
+    """Return a mirror's picture, and the ray of each dot, counted from 0 (−1 for false dots)."""
+    reflections = trace(surface, bench.rig)
+    image_px = bench.view.to_image(reflections.plane_mm)
+    shown = reflections.visible & ((image_px > 3) & (image_px < [476, 636])).all(axis=-1)
     shown &= rng.random(shown.shape) >= missing
-    dots = place[shown] + rng.normal(0, 0.12, (int(shown.sum()), 2))
+    dots = image_px[shown] + rng.normal(0, 0.12, (int(shown.sum()), 2))
     dots = np.vstack([dots, rng.uniform(10, [470, 630], (false, 2))])
     ray = np.vstack([np.argwhere(shown), np.full((false, 2), -1)])
     order = rng.permutation(len(dots))
@@ -88,7 +88,7 @@ def picture(
 
 
 def check_of(bench: SimulatedBench, free: tuple[str, ...] = ()) -> BenchCheck:
-    """A check with a plate and a thumb tack."""
+    """Return the check of a bench with a plate and a thumb tack."""
     rng = np.random.default_rng(9)
     tack = Cap(9.75, 0.91), spherical_cap(9.75, 0.91, (0.2, -0.1))
     pairs = [(Plate(), FlatMirror(0.01, 0.001, -0.001)), tack]
@@ -106,7 +106,7 @@ def check_of(bench: SimulatedBench, free: tuple[str, ...] = ()) -> BenchCheck:
     ],
     ids=["plate", "cap", "ball"],
 )
-def test_mirrors_send_rays_where_the_simulation_has_them(mirror: Mirror, surface: PoolSurface):
+def test_landing_points_agree_with_the_simulation(mirror: Mirror, surface: PoolSurface):
     true = trace(surface, EXACT.rig)
     plane, hit = landing_points(mirror, mirror.pose, RIG)
     assert true.hit.sum() > 50
@@ -116,7 +116,7 @@ def test_mirrors_send_rays_where_the_simulation_has_them(mirror: Mirror, surface
 
 
 @pytest.mark.parametrize("top_mm", [0.9, 10.0])
-def test_a_ball_is_expected_where_the_beam_axis_meets_its_top(top_mm: float):
+def test_ball_is_placed_where_the_beam_axis_meets_its_top(top_mm: float):
     laser = replace(RIG.laser, azimuth_deg=5.0, aim_x_mm=0.5)
     rig = replace(RIG, laser=laser)
     ball = placed(Ball(10.0, top_mm), rig)
@@ -127,70 +127,70 @@ def test_a_ball_is_expected_where_the_beam_axis_meets_its_top(top_mm: float):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_rays_of_a_plate_are_found_on_a_bench_that_is_off(seed: int):
+def test_plate_rays_are_labelled_on_a_misaligned_bench(seed: int):
     rng = np.random.default_rng([5, seed])
     bench = draw_bench(RIG, VIEW, BenchErrors(), rng)
-    made, ray = picture(Plate(), FlatMirror(), bench, rng, missing=0.05, false=8)
-    labels = label_picture(made, RIG, CALIBRATION).labels
-    at = np.argwhere(labels >= 0)
-    found = ray[labels[tuple(at.T)]]
-    assert len(at) > 0.97 * (ray[:, 0] >= 0).sum()
-    wrong = (found != at).any(axis=-1) & (found[:, 0] >= 0)
+    plate, ray = picture(Plate(), FlatMirror(), bench, rng, missing=0.05, false=8)
+    labels = label_picture(plate, RIG, CALIBRATION).labels
+    labelled = np.argwhere(labels >= 0)
+    true_ray = ray[labels[tuple(labelled.T)]]
+    assert len(labelled) > 0.97 * (ray[:, 0] >= 0).sum()
+    wrong = (true_ray != labelled).any(axis=-1) & (true_ray[:, 0] >= 0)
     assert not wrong.any()
 
 
-def test_without_the_hole_of_the_absent_ray_there_is_no_answer():
+def test_labelling_fails_without_the_reference_hole():
     rng = np.random.default_rng(1)
-    made, ray = picture(Cap(9.75, 0.91), spherical_cap(9.75, 0.91), EXACT, rng)
-    high = ray[:, 0] > 10  # rows above the hole alone
-    dots = as_dots(made.dots.image_px[high], 0.12)
-    with pytest.raises(CannotMeasure) as why:
-        label_picture(replace(made, dots=dots), RIG, CALIBRATION)
-    assert why.value.status in ("no-reference", "ambiguous-rows", "no-match")
+    full, ray = picture(Cap(9.75, 0.91), spherical_cap(9.75, 0.91), EXACT, rng)
+    above_hole = ray[:, 0] > 10  # only rows above the hole
+    dots = as_dots(full.dots.image_px[above_hole], 0.12)
+    with pytest.raises(CannotMeasure) as error:
+        label_picture(replace(full, dots=dots), RIG, CALIBRATION)
+    assert error.value.status in ("no-reference", "ambiguous-rows", "no-match")
 
 
 @pytest.mark.slow
-def test_errors_of_the_adjusted_bench_have_the_covariance_told():
-    """The offsets' errors over 12 benches: their χ² is what its degrees of freedom are."""
-    square = []
+def test_errors_of_the_adjusted_bench_match_the_covariance():
+    """Over 12 benches, the mean χ² of the offsets' errors equals the degrees of freedom."""
+    chi_square = []
     errors = BenchErrors(distortion=0.0, point_px=0.0)
-    told = RIG.uncertainty
-    assert told is not None
-    keys = [k for key, k in INDEX.items() if key.startswith(("image_cal", "camera"))]
-    covariance = told.covariance.copy()
-    covariance[keys] = 0.0
-    covariance[:, keys] = 0.0
-    rig = replace(RIG, uncertainty=replace(told, covariance=covariance))
+    uncertainty = RIG.uncertainty
+    assert uncertainty is not None
+    calibration_keys = [k for key, k in INDEX.items() if key.startswith(("image_cal", "camera"))]
+    covariance = uncertainty.covariance.copy()
+    covariance[calibration_keys] = 0.0
+    covariance[:, calibration_keys] = 0.0
+    rig = replace(RIG, uncertainty=replace(uncertainty, covariance=covariance))
     for seed in range(12):
         rng = np.random.default_rng([8, seed])
         bench = draw_bench(rig, VIEW, errors, rng)
-        made, ray = picture(Plate(tilt_sigma_deg=1e-3), FlatMirror(), bench, rng)
-        observed = Observation.of(made.dots, Bench(rig, CALIBRATION), SHAPE)
+        plate, ray = picture(Plate(tilt_sigma_deg=1e-3), FlatMirror(), bench, rng)
+        observed = Observation.of(plate.dots, Bench(rig, CALIBRATION), SHAPE)
         labels = np.full((19, 19), -1)
         labels[tuple(ray.T)] = np.arange(len(ray))
-        found = adjust(rig, [sighting_of(observed, made.mirror, labels)])
-        off = found.offset - true_offset(bench.rig)
-        square.append(off @ np.linalg.pinv(found.covariance, rcond=1e-10) @ off)
-    assert 9.0 < np.mean(square) < 17.0  # 13 quantities
+        adjustment = adjust(rig, [sighting_of(observed, plate.mirror, labels)])
+        error = adjustment.offset - true_offsets(bench.rig)
+        chi_square.append(error @ np.linalg.pinv(adjustment.covariance, rcond=1e-10) @ error)
+    assert 9.0 < np.mean(chi_square) < 17.0  # 13 quantities
 
 
-def true_offset(true: Rig) -> np.ndarray:
-    """By how much a bench is off from the set-up, but for its picture."""
-    made = np.zeros(len(QUANTITIES))
+def true_offsets(true: Rig) -> np.ndarray:
+    """Return the true offsets of a bench from the setup, without those of its picture."""
+    offsets = np.zeros(len(QUANTITIES))
     for part in ("laser", "pattern"):
         for key, k in INDEX.items():
             section, _, name = key.partition(".")
             if section == part:
-                made[k] = getattr(getattr(true, part), name) - getattr(getattr(RIG, part), name)
+                offsets[k] = getattr(getattr(true, part), name) - getattr(getattr(RIG, part), name)
     first = INDEX["imaging_plane.distance_mm"]
-    plane, was = true.imaging_plane, RIG.imaging_plane
-    made[first : first + 3] = (plane.origin_mm - was.origin_mm)[[1, 0, 2]] * [-1, -1, 1]
-    made[first + 3 : first + 6] = np.subtract(plane.angles_deg, was.angles_deg)
-    return made
+    plane, nominal = true.imaging_plane, RIG.imaging_plane
+    offsets[first : first + 3] = (plane.origin_mm - nominal.origin_mm)[[1, 0, 2]] * [-1, -1, 1]
+    offsets[first + 3 : first + 6] = np.subtract(plane.angles_deg, nominal.angles_deg)
+    return offsets
 
 
 @pytest.mark.slow
-def test_a_check_is_kept_in_the_setup_file_until_something_is_changed():
+def test_check_in_setup_file_is_valid_until_a_value_changes():
     bench = draw_bench(RIG, VIEW, BenchErrors(), np.random.default_rng(2))
     check = check_of(bench)
     assert check.status == "ok"
@@ -200,10 +200,10 @@ def test_a_check_is_kept_in_the_setup_file_until_something_is_changed():
     assert section["free"] == []
     assert section["mirrors"] == ["plate:0+-0.02", "cap:9.75+-0.02:0.91+-0.005"]
     checked = parse_setup(text, "setup.toml")
-    known = checked.rig.uncertainty
-    assert known is not None
-    assert known.status == "checked"
-    np.testing.assert_allclose(known.covariance, check.adjustment.covariance, atol=1e-8)
+    uncertainty = checked.rig.uncertainty
+    assert uncertainty is not None
+    assert uncertainty.status == "checked"
+    np.testing.assert_allclose(uncertainty.covariance, check.adjustment.covariance, atol=1e-8)
     places = np.array([[100.0, 120.0], [400.0, 300.0]])
     np.testing.assert_allclose(
         checked.calibration.to_plane(places), check.calibration.to_plane(places), atol=1e-9
@@ -218,44 +218,44 @@ def test_a_check_is_kept_in_the_setup_file_until_something_is_changed():
         assert again is not None
         assert again.status == "entered"
         assert changed_since_check(tomllib.loads(changed))
-    back = parse_setup(unchecked_setup(text, "setup.toml"), "setup.toml")
-    assert back.rig.laser == RIG.laser
-    assert back.calibration.lens is None
+    unchecked = parse_setup(unchecked_setup(text, "setup.toml"), "setup.toml")
+    assert unchecked.rig.laser == RIG.laser
+    assert unchecked.calibration.lens is None
 
 
 @pytest.mark.slow
-def test_the_set_up_that_is_written_is_the_adjusted_one():
-    """With a lens in it, too, and its picture shifted: nothing else was adjusted to the dots."""
+def test_written_setup_is_the_adjusted_one():
+    """The setup has a lens, and the picture is shifted; residuals are those of the adjustment."""
     middle = SHAPE[1] / 2, SHAPE[0] / 2
     keys = {"focal_px": [FOCAL_PX] * 2, "center_px": list(middle), "distortion": [-0.5, 0, 0, 0, 0]}
     written = "".join(f"{key} = {value}\n" for key, value in keys.items())
     text = TEXT + "[camera_lens]\n" + written
     lens_px = Lens((FOCAL_PX, FOCAL_PX), middle, (-0.5, 0.0, 0.0, 0.0, 0.0))
     setup, rng = parse_setup(text, "setup.toml"), np.random.default_rng(3)
-    made = trace(FlatMirror(), EXACT.rig)
+    reflections = trace(FlatMirror(), EXACT.rig)
     matrix = np.linalg.inv(np.array([[1, 0, 12], [0, 1, -7], [0, 0, 1]]) @ CALIBRATION.from_plane)
     ideal = ImageCalibration(matrix, lens_px)
-    place = ideal.to_image(made.plane_mm[made.visible])
-    dots = as_dots(place + rng.normal(0, 0.12, place.shape), 0.12)
-    shot = Picture("plate", Plate(), dots, SHAPE)
-    check = check_bench([shot], setup.rig, setup.calibration, ["picture.u", "picture.v"])
+    image_px = ideal.to_image(reflections.plane_mm[reflections.visible])
+    dots = as_dots(image_px + rng.normal(0, 0.12, image_px.shape), 0.12)
+    plate = Picture("plate", Plate(), dots, SHAPE)
+    check = check_bench([plate], setup.rig, setup.calibration, ["picture.u", "picture.v"])
     assert check.status == "ok"
     read = parse_setup(checked_setup(text, "setup.toml", check, "2026-11-24T12:00:00+00:00"), "")
-    (one,) = check.pictures
-    computed, _ = landing_points(Plate(), one.pose, read.rig, tuple(one.ray.T - 1))
-    again = read.calibration.to_plane(dots.image_px[one.dot]) - computed
-    np.testing.assert_allclose(again, one.residual_mm, atol=1e-4)
+    (result,) = check.pictures
+    computed, _ = landing_points(Plate(), result.pose, read.rig, tuple(result.ray.T - 1))
+    residual = read.calibration.to_plane(dots.image_px[result.dot]) - computed
+    np.testing.assert_allclose(residual, result.residual_mm, atol=1e-4)
 
 
 @pytest.mark.slow
-def test_a_quantity_far_off_is_named_and_put_right_when_let_go_of():
+def test_quantity_far_off_is_named_and_corrected_when_free():
     laser = replace(RIG.laser, distance_mm=RIG.laser.distance_mm / 0.8)
     check = check_of(SimulatedBench(replace(EXACT.rig, laser=laser), VIEW))
     assert check.status == "quantity-off"
     assert [one.key for one in check.suspects] == ["laser.distance_mm"]
-    known = check.rig.uncertainty
-    assert known is not None
-    assert known.status != "checked"
+    uncertainty = check.rig.uncertainty
+    assert uncertainty is not None
+    assert uncertainty.status != "checked"
     again = check_of(SimulatedBench(replace(EXACT.rig, laser=laser), VIEW), ("laser.distance_mm",))
     assert again.status == "ok"
     assert again.rig.laser.distance_mm == pytest.approx(laser.distance_mm, abs=0.5)
@@ -263,7 +263,7 @@ def test_a_quantity_far_off_is_named_and_put_right_when_let_go_of():
 
 @pytest.mark.slow
 @pytest.mark.parametrize("truth", [0.91, 1.0])
-def test_a_mirror_that_measures_otherwise_than_it_is_known_is_no_check(truth: float):
+def test_check_fails_where_a_mirror_contradicts_its_known_size(truth: float):
     rng = np.random.default_rng(9)
     pairs = [(Plate(), FlatMirror()), (Cap(9.75, 0.91), spherical_cap(9.75, truth, (0.2, -0.1)))]
     check = check_bench([picture(*each, EXACT, rng)[0] for each in pairs], RIG, CALIBRATION)
@@ -271,15 +271,15 @@ def test_a_mirror_that_measures_otherwise_than_it_is_known_is_no_check(truth: fl
     assert check.status == ("ok" if truth == 0.91 else "size-off")
     assert radius.is_contradicted == (truth != 0.91)
     assert height.independent_mm == pytest.approx(truth, abs=3 * height.independent_sigma_mm)
-    known = check.rig.uncertainty
-    assert known is not None
-    assert (known.status == "checked") == (truth == 0.91)
+    uncertainty = check.rig.uncertainty
+    assert uncertainty is not None
+    assert (uncertainty.status == "checked") == (truth == 0.91)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("absent", [[9, 10], [10, 11]])
-def test_rays_a_row_off_are_named(absent: list[int]):
-    """The bench adjusts itself to them, by half a degree here and half a millimetre there."""
+def test_labels_a_row_off_are_reported(absent: list[int]):
+    """The adjustment absorbs them, with changes of about half a degree and half a millimetre."""
     angle = "inter_beam_angle_deg = 0.77\n"
     setup = parse_setup(TEXT.replace(angle, f"{angle}absent = [{absent}]\n"), "setup.toml")
     rng = np.random.default_rng(0)
@@ -290,13 +290,15 @@ def test_rays_a_row_off_are_named(absent: list[int]):
 
 
 class BowedPattern(DotPattern):
-    """Another lens: its rows and columns are bowed, by 4 % at the edges."""
+    """A different lens, whose rows and columns are bowed by 4 % at the edges."""
 
     @property
     def tangents(self) -> np.ndarray:
         """Tangents of the rays to the beam axis."""
-        made = super().tangents
-        return made * (1 + 0.04 * (made**2).sum(axis=-1, keepdims=True) / np.abs(made).max() ** 2)
+        ideal = super().tangents
+        return ideal * (
+            1 + 0.04 * (ideal**2).sum(axis=-1, keepdims=True) / np.abs(ideal).max() ** 2
+        )
 
 
 @pytest.mark.slow
@@ -308,7 +310,7 @@ class BowedPattern(DotPattern):
     ],
     ids=["plate", "lens"],
 )
-def test_what_the_model_lacks_is_named(plate: FlatMirror, pattern: DotPattern, verdict: str):
+def test_model_errors_are_named(plate: FlatMirror, pattern: DotPattern, verdict: str):
     rng = np.random.default_rng(4)
     bench = replace(EXACT, rig=replace(EXACT.rig, pattern=pattern))
     pictures = [
@@ -317,15 +319,15 @@ def test_what_the_model_lacks_is_named(plate: FlatMirror, pattern: DotPattern, v
     ]
     check = check_bench(pictures, RIG, CALIBRATION)
     assert check.status == check.verdict == verdict
-    known = check.rig.uncertainty
-    assert known is not None
-    assert known.status != "checked"
+    uncertainty = check.rig.uncertainty
+    assert uncertainty is not None
+    assert uncertainty.status != "checked"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("bend_per_mm", [(0.00044, 0.0), (0.00044, -0.00044)])
-def test_a_plate_0_05_mm_from_flat_is_named(bend_per_mm: tuple[float, float]):
-    """Over 30 mm. It pulls the thumb tack's height along, which may be named first."""
+def test_plate_0_05_mm_from_flat_is_reported(bend_per_mm: tuple[float, float]):
+    """Over 30 mm. It also biases the thumb tack's height, which may be named first."""
     rng = np.random.default_rng(4)
     tack = Cap(9.75, 0.91), spherical_cap(9.75, 0.91, (0.2, -0.1))
     pairs = [(Plate(), FlatMirror(bend_per_mm=bend_per_mm)), tack]
@@ -336,7 +338,7 @@ def test_a_plate_0_05_mm_from_flat_is_named(bend_per_mm: tuple[float, float]):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("height_mm", [1.5, 2.3])
-def test_a_wrong_height_of_a_plate_is_named(height_mm: float):
+def test_wrong_plate_height_is_reported(height_mm: float):
     rng = np.random.default_rng(4)
     pairs = [(Plate(), FlatMirror()), (Plate(2.0), FlatMirror(height_mm))]
     check = check_bench([picture(*each, EXACT, rng)[0] for each in pairs], RIG, CALIBRATION)
@@ -347,7 +349,7 @@ def test_a_wrong_height_of_a_plate_is_named(height_mm: float):
 
 
 @pytest.mark.slow
-def test_a_plate_that_is_bent_much_is_no_check():
+def test_check_fails_with_a_strongly_bent_plate():
     rng = np.random.default_rng(4)
     bent = FlatMirror(bend_per_mm=(0.004, -0.003))
     pictures = [
@@ -360,7 +362,7 @@ def test_a_plate_that_is_bent_much_is_no_check():
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["ball", "sunk ball", "thumb tack"])
 @pytest.mark.parametrize("seed", range(2))
-def test_a_mirror_alone_in_the_usual_look_measures_itself(kind: str, seed: int):
+def test_single_mirror_in_a_rendered_picture_is_measured(kind: str, seed: int):
     rng = np.random.default_rng([33, seed])
     bench = draw_bench(RIG, VIEW, BenchErrors(), rng)
     x, y = rng.uniform(-0.6, 0.6, 2)
@@ -382,23 +384,23 @@ def test_a_mirror_alone_in_the_usual_look_measures_itself(kind: str, seed: int):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("level_deg", [0.1, 0.0])
-def test_noise_of_the_dots_is_not_taken_for_a_wrong_scale(level_deg: float):
-    """On a plane of smaller scale residuals are smaller, which once counted for it."""
+def test_dot_noise_is_not_mistaken_for_a_wrong_scale(level_deg: float):
+    """Residuals shrink with the plane's scale, which once favoured smaller scales."""
     plate = Plate(tilt_sigma_deg=level_deg)
     rng = np.random.default_rng(0)
-    made = trace(FlatMirror(), EXACT.rig)
-    place = VIEW.to_image(made.plane_mm)[made.visible]
-    dots = as_dots(place + rng.normal(0, 0.2, place.shape), 0.2)
+    reflections = trace(FlatMirror(), EXACT.rig)
+    image_px = VIEW.to_image(reflections.plane_mm)[reflections.visible]
+    dots = as_dots(image_px + rng.normal(0, 0.2, image_px.shape), 0.2)
     check = check_bench([Picture("plate", plate, dots, SHAPE)], RIG, CALIBRATION)
     assert (check.status, check.suspects) == ("ok", ())
 
 
-def test_pictures_are_forecast_to_help():
-    found = {one.name: one.setup_sigma_mm for one in forecast(RIG)}
-    before, plate = found["as it is"], found["plate at 0 mm"]
-    assert 0.03 < before / 0.3 < 0.1
-    assert plate < 0.7 * before
-    assert found["plate at 0 mm, thumb tack"] < 0.6 * plate
+def test_forecast_uncertainty_falls_with_each_picture():
+    sigma_mm = {one.name: one.setup_sigma_mm for one in forecast(RIG)}
+    initial, plate = sigma_mm["as it is"], sigma_mm["plate at 0 mm"]
+    assert 0.03 < initial / 0.3 < 0.1
+    assert plate < 0.7 * initial
+    assert sigma_mm["plate at 0 mm, thumb tack"] < 0.6 * plate
 
 
 @pytest.mark.parametrize(
@@ -413,7 +415,7 @@ def test_pictures_are_forecast_to_help():
         ("ball:10", Ball(10.0)),
     ],
 )
-def test_mirrors_are_read(text: str, mirror: Mirror):
+def test_mirror_text_round_trip(text: str, mirror: Mirror):
     assert parse_mirror(text) == mirror
     written = parse_mirror(mirror_text(mirror))
     np.testing.assert_allclose(written.pose, mirror.pose)
@@ -438,30 +440,32 @@ def test_mirrors_are_read(text: str, mirror: Mirror):
         "plate:0:20",
     ],
 )
-def test_impossible_mirrors_are_refused(text: str):
+def test_impossible_mirrors_are_rejected(text: str):
     with pytest.raises(InputError):
         parse_mirror(text)
 
 
 @pytest.mark.slow
-def test_heights_whose_error_one_plate_cannot_notice_are_named():
-    """A plate half a millimetre too high is taken for a bench that is off; two plates are not."""
+def test_blind_spot_of_a_single_plate_is_reported():
+    """A plate 0.5 mm too high is mistaken for a misaligned bench; with two plates it is not."""
     rng = np.random.default_rng(4)
-    right, high = (picture(Plate(), FlatMirror(z), EXACT, rng)[0] for z in (0.0, 0.5))
+    correct, too_high = (picture(Plate(), FlatMirror(z), EXACT, rng)[0] for z in (0.0, 0.5))
     second = picture(Plate(2.0), FlatMirror(2.0), EXACT, rng)[0]
-    misled = check_bench([high], RIG, CALIBRATION)
-    assert misled.status == "ok"
+    biased = check_bench([too_high], RIG, CALIBRATION)
+    assert biased.status == "ok"
     pool = spherical_cap(6.7, 0.3)
-    match = exact_match(trace(pool, EXACT.rig), misled.rig)
-    seen = misled.calibration.to_plane(EXACT.view.to_image(match.plane_mm))
-    match = replace(match, plane_mm=seen)
-    found = measure_surface(fit.reconstruct(match, misled.rig, FitSettings()), match, misled.rig)
-    error = abs(found.height_mm - pool.peak_mm)
-    assert error > found.height_sigma_mm
-    (of_misled,), (of_right,) = map(blind_spots, (misled, check_bench([right], RIG, CALIBRATION)))
-    assert of_misled.picture == of_right.picture == right.name
-    assert 0.5 < of_misled.noticed_mm < 2.0
-    assert error < of_right.pool_mm < 3 * error
-    assert check_bench([high, second], RIG, CALIBRATION).status == "size-off"
-    assert blind_spots(replace(misled, status="size-off")) == ()
-    assert blind_spots(check_bench([right, second], RIG, CALIBRATION)) == ()
+    match = exact_match(trace(pool, EXACT.rig), biased.rig)
+    plane_mm = biased.calibration.to_plane(EXACT.view.to_image(match.plane_mm))
+    match = replace(match, plane_mm=plane_mm)
+    measures = measure_surface(fit.reconstruct(match, biased.rig, FitSettings()), match, biased.rig)
+    error = abs(measures.height_mm - pool.peak_mm)
+    assert error > measures.height_sigma_mm
+    (of_biased,), (of_correct,) = map(
+        blind_spots, (biased, check_bench([correct], RIG, CALIBRATION))
+    )
+    assert of_biased.picture == of_correct.picture == correct.name
+    assert 0.5 < of_biased.noticed_mm < 2.0
+    assert error < of_correct.pool_mm < 3 * error
+    assert check_bench([too_high, second], RIG, CALIBRATION).status == "size-off"
+    assert blind_spots(replace(biased, status="size-off")) == ()
+    assert blind_spots(check_bench([correct, second], RIG, CALIBRATION)) == ()

@@ -1,4 +1,4 @@
-"""Camera and imaging plane from pictures of boards, rendered by the twin's own lens and camera."""
+"""Calibration of camera and imaging plane from pictures of boards, rendered with a known lens."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ CORNER = np.hypot(WIDTH - 1, HEIGHT - 1) / 2 / FOCAL_PX
 
 
 def lens(percent: float, **terms: float) -> Lens | None:
-    """A lens with so much distortion in the picture's corner."""
+    """Return a lens with the given distortion in the picture's corner, None for 0 %."""
     return Lens(FOCAL_PX, k1=percent / 100 / CORNER**2, **terms) if percent else None
 
 
@@ -36,7 +36,7 @@ def lens(percent: float, **terms: float) -> Lens | None:
 def shot(
     board, percent=0.0, turned=(1.0, -2.0, 1.3), center=None, seed=1, px_per_mm=5.0, axis=None
 ):
-    """A view of a board, and its picture."""
+    """Return a view of a board, and its picture."""
     middle = board.corners_mm.mean(axis=0) if center is None else center
     view = PosedView.at(
         tuple(middle), px_per_mm, turned_deg=turned, lens=lens(percent), axis_px=axis
@@ -47,80 +47,80 @@ def shot(
 
 @cache
 def calibrated(board, percent=-1.0):
-    """The board's view of the usual pose, and what it is calibrated to."""
+    """Return the default view of a board, and the calibration from its picture."""
     view, image = shot(board, percent)
     return view, calibrate_board([image])
 
 
-def off_mm(found: BoardCalibration, view: PosedView) -> np.ndarray:
-    """How far places all over the picture are from where they are on the plane, mm."""
+def off_mm(calibration: BoardCalibration, view: PosedView) -> np.ndarray:
+    """Return the calibration's errors on the plane, at points all over the picture, mm."""
     u, v = np.linspace(5, WIDTH - 6, 9), np.linspace(5, HEIGHT - 6, 9)
-    seen = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
-    return np.hypot(*(found.image_calibration.to_plane(seen) - view.to_plane(seen)).T)
+    image_px = np.stack(np.meshgrid(u, v), axis=-1).reshape(-1, 2)
+    return np.hypot(*(calibration.image_calibration.to_plane(image_px) - view.to_plane(image_px)).T)
 
 
 @pytest.mark.parametrize("board", [CHARUCO, CHESS], ids=lambda board: board.kind)
 @pytest.mark.parametrize("percent", [-1.0, 0.5, 0.0])
-def test_lens_and_plane_are_found(board, percent):
-    view, found = calibrated(board, percent)
-    value, sigma = found.distortion_percent
-    assert found.board == board
+def test_lens_and_plane_are_calibrated(board, percent):
+    view, calibration = calibrated(board, percent)
+    value, sigma = calibration.distortion_percent
+    assert calibration.board == board
     assert abs(value - percent) < 3 * sigma < 0.15
-    assert found.fit.rms_px < 0.1
-    assert off_mm(found, view).max() < 0.05
-    assert (found.image_calibration.lens is None) == (percent == 0.0)
+    assert calibration.fit.rms_px < 0.1
+    assert off_mm(calibration, view).max() < 0.05
+    assert (calibration.image_calibration.lens is None) == (percent == 0.0)
 
 
-def test_corners_are_as_noisy_as_is_said():
-    view, found = calibrated(CHARUCO)
-    true = view.to_image(found.seen[0].plane_mm)
-    off = found.seen[0].image_px - true
-    assert np.sqrt(np.mean(off**2)) == pytest.approx(found.fit.sigma_px, rel=0.2)
-    assert np.sqrt(np.mean(off**2)) < 0.07
+def test_corner_noise_matches_its_sigma():
+    view, calibration = calibrated(CHARUCO)
+    true = view.to_image(calibration.seen[0].plane_mm)
+    error = calibration.seen[0].image_px - true
+    assert np.sqrt(np.mean(error**2)) == pytest.approx(calibration.fit.sigma_px, rel=0.2)
+    assert np.sqrt(np.mean(error**2)) < 0.07
 
 
-def test_lens_off_the_middle_is_tangential():
+def test_decentred_lens_gets_tangential_terms():
     view, image = shot(CHARUCO, -1.0, axis=(215.0, 345.0), seed=2)
-    found = calibrate_board([image])
-    assert {"k1", "p1", "p2"} <= set(found.fit.terms)
-    assert off_mm(found, view).max() < 0.06
+    calibration = calibrate_board([image])
+    assert {"k1", "p1", "p2"} <= set(calibration.fit.terms)
+    assert off_mm(calibration, view).max() < 0.06
 
 
-def test_pull_of_the_distortion_is_normal():
+def test_distortion_error_over_sigma_is_standard_normal():
     rng = np.random.default_rng(5)
     pulls = []
     for _ in range(60):
         view = PosedView.at(
             (40.0, 36.0), 5.0, turned_deg=tuple(rng.normal(0, 2, 3)), lens=lens(-0.8)
         )
-        seen = view.to_image(CHARUCO.corners_mm) + rng.normal(0, 0.05, (110, 2))
-        fit = fit_terms([PlaneView(CHARUCO.corners_mm, seen)], SIZE, ("k1",))
+        image_px = view.to_image(CHARUCO.corners_mm) + rng.normal(0, 0.05, (110, 2))
+        fit = fit_terms([PlaneView(CHARUCO.corners_mm, image_px)], SIZE, ("k1",))
         value, sigma = fit.distortion_percent()
         pulls.append((value + 0.8) / sigma)
     assert 0.75 < np.std(pulls) < 1.3
     assert abs(np.mean(pulls)) < 0.45
 
 
-def test_no_lens_is_taken_from_noise():
+def test_no_lens_is_fitted_to_noise():
     rng = np.random.default_rng(6)
     view = PosedView.at((40.0, 36.0), 5.0, turned_deg=(2.0, -1.0, 1.0))
-    straight = view.to_image(CHARUCO.corners_mm)
-    taken = [
+    image_px = view.to_image(CHARUCO.corners_mm)
+    lenses = [
         fit_lens(
-            [PlaneView(CHARUCO.corners_mm, straight + rng.normal(0, 0.05, (110, 2)))], SIZE
+            [PlaneView(CHARUCO.corners_mm, image_px + rng.normal(0, 0.05, (110, 2)))], SIZE
         ).lens
         for _ in range(100)
     ]
-    assert sum(one is not None for one in taken) <= 1
+    assert sum(one is not None for one in lenses) <= 1
 
 
-def test_covariance_is_that_of_repeated_noise():
+def test_covariance_matches_spread_over_repeated_noise():
     rng = np.random.default_rng(7)
     view = PosedView.at((40.0, 36.0), 5.0, turned_deg=(2.0, -1.0, 1.0), lens=lens(-1.0))
-    straight, places = view.to_image(CHARUCO.corners_mm), np.array([[0.0, 0.0], [80.0, 0.0]])
+    image_px, places = view.to_image(CHARUCO.corners_mm), np.array([[0.0, 0.0], [80.0, 0.0]])
     fits = [
         fit_terms(
-            [PlaneView(CHARUCO.corners_mm, straight + rng.normal(0, 0.05, (110, 2)))], SIZE, ("k1",)
+            [PlaneView(CHARUCO.corners_mm, image_px + rng.normal(0, 0.05, (110, 2)))], SIZE, ("k1",)
         )
         for _ in range(80)
     ]
@@ -129,54 +129,56 @@ def test_covariance_is_that_of_repeated_noise():
     np.testing.assert_allclose(spread, sigma, rtol=0.3)
 
 
-def test_further_pictures_tell_more_and_agree_with_opencv():
+def test_more_pictures_reduce_uncertainty_and_agree_with_opencv():
     view, first = shot(CHARUCO, -1.0)
     poses = [((15, 0, 0), (40, 20)), ((0, -15, 3), (30, 60)), ((-10, 12, -4), (50, 50))]
     more = [shot(CHARUCO, -1.0, turned, center, k)[1] for k, (turned, center) in enumerate(poses)]
-    one, all_ = calibrated(CHARUCO)[1], calibrate_board([first, *more])
-    assert all_.distortion_percent[1] < 0.8 * one.distortion_percent[1]
-    assert off_mm(all_, view).max() < 0.04
-    on_board = [np.column_stack([s.plane_mm, np.zeros(len(s.index))]) for s in all_.seen]
+    single, several = calibrated(CHARUCO)[1], calibrate_board([first, *more])
+    assert several.distortion_percent[1] < 0.8 * single.distortion_percent[1]
+    assert off_mm(several, view).max() < 0.04
+    on_board = [np.column_stack([s.plane_mm, np.zeros(len(s.index))]) for s in several.seen]
     camera = np.array([[1500.0, 0, 239.5], [0, 1500.0, 319.5], [0, 0, 1]])
     flags = cv2.CALIB_USE_INTRINSIC_GUESS | cv2.CALIB_FIX_K2 | cv2.CALIB_FIX_K3
     flags |= cv2.CALIB_ZERO_TANGENT_DIST | cv2.CALIB_FIX_ASPECT_RATIO
-    rms, camera, bent, *_ = cv2.calibrateCamera(
-        [one.astype(np.float32) for one in on_board],
-        [s.image_px.astype(np.float32) for s in all_.seen],
+    rms, camera, distortion, *_ = cv2.calibrateCamera(
+        [single.astype(np.float32) for single in on_board],
+        [s.image_px.astype(np.float32) for s in several.seen],
         SIZE,
         camera,
         np.zeros(5),
         flags=flags,
     )
     corner = CORNER * FOCAL_PX / camera[0, 0]
-    assert 100 * bent.ravel()[0] * corner**2 == pytest.approx(all_.distortion_percent[0], abs=0.08)
-    assert rms == pytest.approx(np.sqrt(2) * all_.fit.rms_px, rel=0.1)
+    assert 100 * distortion.ravel()[0] * corner**2 == pytest.approx(
+        several.distortion_percent[0], abs=0.08
+    )
+    assert rms == pytest.approx(np.sqrt(2) * several.fit.rms_px, rel=0.1)
 
 
 @pytest.mark.parametrize("board", [CHARUCO, CHESS], ids=lambda board: board.kind)
-def test_board_may_be_turned_a_little(board):
+def test_slightly_turned_board_is_calibrated(board):
     view, image = shot(board, -1.0, turned=(0.0, 0.0, 5.0))
     assert off_mm(calibrate_board([image]), view).max() < 0.05
 
 
-def test_charuco_may_be_seen_in_part():
+def test_partly_visible_charuco_is_calibrated():
     view, image = shot(CHARUCO, -1.0, center=(75.0, 70.0))
-    found = calibrate_board([image])
-    true = view.to_image(found.seen[0].plane_mm)
-    assert 40 < len(found.seen[0].index) < 90
-    assert np.abs(found.seen[0].image_px - true).max() < 0.4
-    assert found.covered < 0.3
-    assert any("larger board" in words for words in found.undetermined())
+    calibration = calibrate_board([image])
+    true = view.to_image(calibration.seen[0].plane_mm)
+    assert 40 < len(calibration.seen[0].index) < 90
+    assert np.abs(calibration.seen[0].image_px - true).max() < 0.4
+    assert calibration.covered < 0.3
+    assert any("larger board" in words for words in calibration.undetermined())
 
 
-def test_glare_hides_corners_and_moves_none():
+def test_glare_hides_corners_but_does_not_move_them():
     view, image = shot(CHARUCO, -1.0)
     image = image.copy()
     cv2.circle(image, (300, 400), 60, 255, -1)
-    found = calibrate_board([image])
-    seen = found.seen[0]
-    assert 40 < len(seen.index) < 105
-    assert np.abs(seen.image_px - view.to_image(seen.plane_mm)).max() < 0.4
+    calibration = calibrate_board([image])
+    corners = calibration.seen[0]
+    assert 40 < len(corners.index) < 105
+    assert np.abs(corners.image_px - view.to_image(corners.plane_mm)).max() < 0.4
 
 
 def mirrored():
@@ -201,13 +203,13 @@ def glaring_chessboard():
         (lambda: shot(CHARUCO, center=(400.0, 40.0))[1], CHARUCO, "no-board"),
     ],
 )
-def test_what_is_no_board_is_refused(image, board, status):
-    with pytest.raises(CannotMeasure) as refused:
+def test_picture_without_the_expected_board_is_rejected(image, board, status):
+    with pytest.raises(CannotMeasure) as error:
         calibrate_board([image()], board)
-    assert refused.value.status in (status, "wrong-board")
+    assert error.value.status in (status, "wrong-board")
 
 
-def test_bent_board_is_refused():
+def test_bent_board_is_rejected():
     _, image = shot(CHARUCO)
     v, u = np.mgrid[:HEIGHT, :WIDTH].astype(np.float32)
     bent = cv2.remap(image, u, v + 8 * np.sin(u / 30), cv2.INTER_LINEAR)
@@ -215,7 +217,7 @@ def test_bent_board_is_refused():
         calibrate_board([bent])
 
 
-def test_what_the_picture_shows_is_recognised():
+def test_content_of_the_picture_is_recognised():
     rng = np.random.default_rng(2)
     target = Target()
     view = PosedView.at((40.0, 40.0), 5.5)
@@ -224,9 +226,9 @@ def test_what_the_picture_shows_is_recognised():
     assert isinstance(calibrate_imaging_plane([picture], settings), PlaneCalibration)
     for board in (CHARUCO, CHESS, BOARDS["charuco_letter_a4"]):
         scale = 5.0 if board.square_mm == 8.0 else 2.6
-        found = calibrate_imaging_plane([shot(board, px_per_mm=scale)[1]], settings)
-        assert isinstance(found, BoardCalibration)
-        assert found.board == board
+        calibration = calibrate_imaging_plane([shot(board, px_per_mm=scale)[1]], settings)
+        assert isinstance(calibration, BoardCalibration)
+        assert calibration.board == board
 
 
 def test_known_lens_straightens_the_target():
@@ -248,10 +250,10 @@ def test_setup_keys_are_those_of_a_setup_file():
 
 
 def test_square_scales_the_plane():
-    _, found = calibrated(CHARUCO, 0.0)
-    larger = found.with_square(8.4)
-    assert larger.px_per_mm[0] == pytest.approx(found.px_per_mm[0] * 8.0 / 8.4)
-    assert larger.distortion_percent == pytest.approx(found.distortion_percent)
+    _, calibration = calibrated(CHARUCO, 0.0)
+    larger = calibration.with_square(8.4)
+    assert larger.px_per_mm[0] == pytest.approx(calibration.px_per_mm[0] * 8.0 / 8.4)
+    assert larger.distortion_percent == pytest.approx(calibration.distortion_percent)
 
 
 @pytest.mark.parametrize(
@@ -259,6 +261,6 @@ def test_square_scales_the_plane():
     ["", "charuco", "charuco:3x9:8", "charuco:9x9:0", "charuco:60x60:8", "chessboard:9x9:8",
      "charuco:9x9:8:NONE:0", "other:9x8:8", "charuco:9x9:8:4X4_50:40"],
 )  # fmt: skip
-def test_impossible_boards_are_refused(text):
+def test_impossible_boards_are_rejected(text):
     with pytest.raises(ValueError, match=r"."):
         parse_board(text)

@@ -1,4 +1,4 @@
-"""Boundary models on z = 0 from the rows' ends."""
+"""Boundary models on z = 0, from the ends of the rows."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def match_of(pool):
 
 
 def edges_of(radius_at, rows, center=(0.0, 0.0)):
-    """Edge points where rows y = const cross a polar curve r(θ), θ counter-clockwise from +X."""
+    """Return edge points where rows y = const cross a polar curve r(θ), θ from +X to +Y."""
     theta = np.radians(np.arange(0.0, 360.0, 0.01))
     radius = radius_at(theta)
     x, y = center[0] + radius * np.cos(theta), center[1] + radius * np.sin(theta)
@@ -53,7 +53,7 @@ def radius_of(boundary):
     return np.linalg.norm(boundary.points_mm[:, :2] - boundary.center_mm, axis=-1)
 
 
-def test_edge_points_lie_midway_between_the_last_lit_ray_and_its_outer_neighbour():
+def test_edge_points_are_midway_between_last_lit_ray_and_next():
     match = match_of(spherical_cap(6.5, 0.4))
     edges = edge_points(match, RIG)
     landing = intersect_level(RIG.laser.position_mm, ray_directions(RIG.laser, RIG.pattern))[
@@ -68,20 +68,20 @@ def test_edge_points_lie_midway_between_the_last_lit_ray_and_its_outer_neighbour
     np.testing.assert_allclose(edges.left_mm[k], expected)
 
 
-def test_a_pool_wider_than_the_pattern_ends_half_a_step_beyond_it():
+def test_pool_wider_than_the_pattern_ends_half_a_step_beyond_it():
     match = match_of(spherical_cap(14.0, 0.4))
     edges = edge_points(match, RIG)
     landing = intersect_level(RIG.laser.position_mm, ray_directions(RIG.laser, RIG.pattern))[
         ..., :2
     ]
-    whole = [i for i in range(19) if (match.ray[:, 0] == i + 1).sum() == 19]
-    assert whole
-    step = landing[whole[0], 18] - landing[whole[0], 17]
-    k = list(np.unique(match.ray[:, 0])).index(whole[0] + 1)
-    np.testing.assert_allclose(edges.right_mm[k], landing[whole[0], 18] + step / 2, atol=0.01)
+    full_rows = [i for i in range(19) if (match.ray[:, 0] == i + 1).sum() == 19]
+    assert full_rows
+    step = landing[full_rows[0], 18] - landing[full_rows[0], 17]
+    k = list(np.unique(match.ray[:, 0])).index(full_rows[0] + 1)
+    np.testing.assert_allclose(edges.right_mm[k], landing[full_rows[0], 18] + step / 2, atol=0.01)
 
 
-def test_rows_that_end_at_a_ray_which_cannot_testify_are_left_out():
+def test_rows_whose_end_ray_has_unknown_witness_are_skipped():
     match = match_of(spherical_cap(6.5, 0.4))
     row = 11
     last = match.ray[match.ray[:, 0] == row, 1].max()
@@ -91,13 +91,13 @@ def test_rows_that_end_at_a_ray_which_cannot_testify_are_left_out():
     remaining = edge_points(replace(match, witness=witness), RIG).left_mm[:, 1]
     assert len(remaining) == len(y) - 1
     assert set(np.round(remaining, 9)) < set(np.round(y, 9))
-    # But not when nothing would be left.
-    nothing = edge_points(replace(match, witness=np.zeros_like(witness)), RIG)
-    assert len(nothing.left_mm) == len(y)
+    # They are used if no others are left.
+    unknown = edge_points(replace(match, witness=np.zeros_like(witness)), RIG)
+    assert len(unknown.left_mm) == len(y)
 
 
 @given(st.floats(2.0, 5.0), st.tuples(st.floats(-0.5, 0.5), st.floats(-0.5, 0.5)), st.booleans())
-def test_both_models_give_a_circle_back(radius, center, by_pieces):
+def test_both_models_reproduce_a_circle(radius, center, by_pieces):
     rows = center[1] + np.array([-0.8, -0.6, -0.4, -0.2, 0.0, 0.2, 0.4, 0.6, 0.8]) * radius
     edges = edges_of(lambda theta: np.full(theta.shape, radius), rows, center)
     boundary = piecewise(edges) if by_pieces else circle(edges)
@@ -106,7 +106,7 @@ def test_both_models_give_a_circle_back(radius, center, by_pieces):
     assert (boundary.points_mm[:, 2] == 0).all()
 
 
-def test_the_points_go_round_once_counter_clockwise():
+def test_points_go_round_once_counter_clockwise():
     boundary = boundary_on_work_piece(match_of(egg(6.5, 2.8, 4.2, 0.4)), RIG, "piecewise")
     assert len(boundary.theta_deg) == len(boundary.points_mm) == 360
     assert boundary.theta_deg[0] == -180
@@ -116,8 +116,8 @@ def test_the_points_go_round_once_counter_clockwise():
     np.testing.assert_allclose((angle - boundary.theta_deg + 180) % 360 - 180, 0, atol=1e-9)
 
 
-def test_the_piecewise_model_follows_an_egg_and_has_no_steps():
-    # The head at +Y is blunt, the rear at −Y is long; the piece ends are the hard part.
+def test_piecewise_model_follows_an_egg_without_steps():
+    # The head at +Y is blunt, the rear at −Y is long; the ends of the pieces are difficult.
     def radius_at(theta):
         return 3.3 - 0.5 * np.sin(theta) + 0.1 * np.cos(2 * theta)
 
@@ -125,11 +125,11 @@ def test_the_piecewise_model_follows_an_egg_and_has_no_steps():
     boundary = piecewise(edges_of(radius_at, rows))
     offset = boundary.points_mm[:, :2]
     theta = np.arctan2(offset[:, 1], offset[:, 0])
-    # About the middle of the longest row, so compare as curves, not radius by radius.
+    # The boundary's centre is the middle of the longest row: compare curves, not radii.
     error = np.abs(np.linalg.norm(offset, axis=-1) - radius_at(theta))
     between = (offset[:, 1] > rows[0]) & (offset[:, 1] < rows[-1])
     assert error[between].max() < 0.06
-    assert error.max() < 0.15  # the rear and the front beyond the last rows are extrapolated
+    assert error.max() < 0.15  # rear and head beyond the last rows are extrapolated
     step = np.abs(np.diff(radius_of(boundary), append=radius_of(boundary)[0]))
     assert step.max() < 0.06
 
@@ -142,21 +142,21 @@ def test_head_and_rear_are_not_mixed_up():
 
 
 @pytest.mark.parametrize("rows", [2, 3, 4])
-def test_few_rows_get_a_model_of_lower_order(rows):
+def test_few_rows_use_a_model_of_lower_order(rows):
     edges = edges_of(lambda theta: np.full(theta.shape, 3.0), np.linspace(-1.2, 1.2, rows))
     assert radius_of(piecewise(edges)).max() < 4.5
     assert radius_of(piecewise(edges)).min() > 2.0
 
 
-def test_one_row_has_no_boundary():
+def test_single_row_raises_no_boundary():
     match = match_of(spherical_cap(6.5, 0.4))
     one = match.ray[:, 0] == 10
     with pytest.raises(CannotMeasure, match="no-boundary"):
         boundary_on_work_piece(replace(match, ray=match.ray[one]), RIG, "circle")
 
 
-def test_a_model_that_runs_away_is_refused():
-    # Rows that get ever wider towards a rear that is not seen.
+def test_diverging_model_is_rejected():
+    # Rows get ever wider towards a rear that is not visible.
     angle = np.radians([0.0, -10.0, -20.0, -30.0, -40.0, -45.0])
     radius = np.array([1.0, 1.02, 1.15, 1.5, 2.2, 2.8])
     right = np.column_stack([radius * np.cos(angle), radius * np.sin(angle)])
@@ -165,14 +165,14 @@ def test_a_model_that_runs_away_is_refused():
 
 
 @given(st.floats(-5.0, 5.0), st.floats(-5.0, 5.0))
-def test_inside_is_inside(x, y):
+def test_contains_is_true_inside_only(x, y):
     boundary = Boundary.polar(np.array([0.5, -0.3]), np.full(360, 3.0))
     distance = np.hypot(x - 0.5, y + 0.3)
     if abs(distance - 3.0) > 0.001:
         assert bool(boundary.contains(x, y)) == (distance < 3.0)
 
 
-def test_other_heights_leave_x_and_y_alone():
+def test_at_height_does_not_change_x_and_y():
     boundary = Boundary.polar(np.zeros(2), np.full(180, 3.0))
     raised = boundary.at_height(np.linspace(0, 1, 180))
     np.testing.assert_array_equal(raised.points_mm[:, :2], boundary.points_mm[:, :2])

@@ -1,4 +1,4 @@
-"""What is compiled here and what was compiled before compute the same, to the bit."""
+"""Freshly compiled and cached code give bitwise identical results."""
 
 import os
 import subprocess
@@ -56,23 +56,23 @@ print(moments(rng.normal(size=(5, 301)), rng.random((5, 301))).tobytes().hex())
 
 
 @pytest.mark.slow
-def test_a_process_that_compiles_computes_what_one_that_loads_does(tmp_path):
-    """By itself numba calls another copy of ``_moments`` in the one than in the other."""
+def test_cached_code_computes_the_same_as_freshly_compiled_code(tmp_path):
+    """By default numba would call different copies of ``_moments`` in the two processes."""
     (tmp_path / "loops.py").write_text(LOOPS, "utf-8")
     cache = tmp_path / "cache"
-    set_so = os.environ | {"NUMBA_CACHE_DIR": str(cache), "PYTHONPATH": str(tmp_path)}
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(cache), "PYTHONPATH": str(tmp_path)}
     command = [sys.executable, "-c", USE]
-    printed, kept = [], []
+    outputs, cached = [], []
     for _ in range(2):
-        done = subprocess.run(command, capture_output=True, text=True, check=True, env=set_so)
-        printed.append(done.stdout)
-        kept.append({path.name: path.stat().st_mtime_ns for path in cache.rglob("*.nbc")})
-    assert kept[0]
-    assert kept[0] == kept[1], "the second one is to load what the first one compiled"
-    assert printed[0] == printed[1]
+        done = subprocess.run(command, capture_output=True, text=True, check=True, env=environment)
+        outputs.append(done.stdout)
+        cached.append({path.name: path.stat().st_mtime_ns for path in cache.rglob("*.nbc")})
+    assert cached[0]
+    assert cached[0] == cached[1], "the second one is to load what the first one compiled"
+    assert outputs[0] == outputs[1]
 
 
-def test_what_is_kept_depends_on_what_was_compiled_and_by_what(tmp_path, monkeypatch):
+def test_cache_key_depends_on_imported_sources_and_numba_version(tmp_path, monkeypatch):
     package = tmp_path / "package"
     (package / "far").mkdir(parents=True)
     files = {
@@ -83,12 +83,12 @@ def test_what_is_kept_depends_on_what_was_compiled_and_by_what(tmp_path, monkeyp
     }
     for name, source in files.items():
         (package / name).write_text(source, "utf-8")
-    own = ("package.own_kernels", package / "own_kernels.py")
-    found = [compiled._digest(*own)]
+    module = ("package.own_kernels", package / "own_kernels.py")
+    digests = [compiled._digest(*module)]
     for name, source in files.items():
         (package / name).write_text(source + "MORE = 2\n", "utf-8")
-        found.append(compiled._digest(*own))
-    assert len(set(found)) == 4, "all but the one that is not imported"
-    assert found[-1] == found[-2]
+        digests.append(compiled._digest(*module))
+    assert len(set(digests)) == 4, "all but the one that is not imported"
+    assert digests[-1] == digests[-2]
     monkeypatch.setattr("numba.__version__", "0.0")
-    assert compiled._digest(*own) not in found, "another numba discards what this one kept"
+    assert compiled._digest(*module) not in digests, "another numba discards what this one kept"

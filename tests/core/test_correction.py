@@ -1,4 +1,4 @@
-"""Corrections by hand: every edit, what no edit may break, and dots placed on a real frame."""
+"""Manual corrections: every edit, the invariants of all edits, and dots added to an image."""
 
 from __future__ import annotations
 
@@ -33,23 +33,23 @@ ROWS, COLUMNS = 4, 5
 HOLE = (3, 3)
 
 
-def place_of(site: IntArray) -> FloatArray:
-    """Where the dots of sites (k, t) are, shape (n, 2), px."""
-    return np.stack([40.0 + 20.0 * site[:, 1], 200.0 - 30.0 * site[:, 0]], axis=-1)
+def place_of(sites: IntArray) -> FloatArray:
+    """Return the positions of the dots of sites (k, t), shape (n, 2), px."""
+    return np.stack([40.0 + 20.0 * sites[:, 1], 200.0 - 30.0 * sites[:, 0]], axis=-1)
 
 
 def grid() -> Correction:
-    """A full grid but for one hole, dot by dot from the lower left, and one dot in doubt."""
+    """Return a grid with one hole, numbered from the lower left, and one dot in doubt."""
     k, t = np.mgrid[1 : ROWS + 1, 1 : COLUMNS + 1]
-    site = np.stack([k.ravel(), t.ravel()], axis=-1)
-    site = site[(site != HOLE).any(axis=-1)]
-    dots = as_dots(np.vstack([place_of(site), [300.0, 20.0]]))
-    row, column = np.append(site[:, 0], 0), np.append(site[:, 1], 0)
+    sites = np.stack([k.ravel(), t.ravel()], axis=-1)
+    sites = sites[(sites != HOLE).any(axis=-1)]
+    dots = as_dots(np.vstack([place_of(sites), [300.0, 20.0]]))
+    row, column = np.append(sites[:, 0], 0), np.append(sites[:, 1], 0)
     return Correction.of(dots, Lattice(row, column, None, (HOLE,)))
 
 
 def dot_at(correction: Correction, row: int, column: int) -> int:
-    """Which dot has a site."""
+    """Return the index of the dot at a site."""
     lattice = correction.lattice
     (dot,) = np.flatnonzero((lattice.row == row) & (lattice.column == column))
     return int(dot)
@@ -62,7 +62,7 @@ def sites(correction: Correction) -> IntArray:
 LAST = ROWS * COLUMNS - 1  # the dot in doubt
 
 
-def test_deleted_dots_are_gone_and_the_others_as_they_were() -> None:
+def test_delete_dots_leaves_the_others_unchanged() -> None:
     before = grid()
     after = delete_dots(before, [3, 0, 3])
     keep = np.delete(np.arange(LAST + 1), [0, 3])
@@ -72,13 +72,13 @@ def test_deleted_dots_are_gone_and_the_others_as_they_were() -> None:
     assert len(before.dots) == LAST + 1
 
 
-def test_a_deleted_dot_leaves_a_hole_that_may_be_the_reference() -> None:
+def test_deleted_dot_leaves_a_candidate_for_the_reference() -> None:
     before = grid()
     after = delete_dots(before, [dot_at(before, 2, 2)])
     assert set(after.lattice.candidates) == {HOLE, (2, 2)}
 
 
-def test_moved_dots_are_where_they_were_put_and_as_uncertain_as_a_hand() -> None:
+def test_moved_dots_get_the_uncertainty_of_manual_placement() -> None:
     before = grid()
     after = move_dots(before, [2, 4], 0.5, -1.25)
     step = after.dots.image_px - before.dots.image_px
@@ -90,19 +90,19 @@ def test_moved_dots_are_where_they_were_put_and_as_uncertain_as_a_hand() -> None
     np.testing.assert_array_equal(sites(after), sites(before))
 
 
-def test_a_dot_is_given_a_row_then_a_column() -> None:
-    half = assign(grid(), [LAST], row=3)
-    assert sites(half)[LAST].tolist() == [3, 0]
-    assert not half.sited[LAST]
-    whole = assign(half, [LAST], column=3)
-    assert sites(whole)[LAST].tolist() == list(HOLE)
-    assert whole.sited[LAST]
-    assert np.flatnonzero(whole.manual).tolist() == [LAST]
-    # The other dot is too far from the hole to fill it, but has its site.
-    assert whole.lattice.candidates == ()
+def test_row_and_column_can_be_assigned_one_after_the_other() -> None:
+    with_row = assign(grid(), [LAST], row=3)
+    assert sites(with_row)[LAST].tolist() == [3, 0]
+    assert not with_row.sited[LAST]
+    with_site = assign(with_row, [LAST], column=3)
+    assert sites(with_site)[LAST].tolist() == list(HOLE)
+    assert with_site.sited[LAST]
+    assert np.flatnonzero(with_site.manual).tolist() == [LAST]
+    # The dot is too far from the hole to fill it, but has its site.
+    assert with_site.lattice.candidates == ()
 
 
-def test_a_site_is_refused_where_another_dot_has_it() -> None:
+def test_assigning_an_occupied_site_is_rejected() -> None:
     before = grid()
     owner = dot_at(before, 2, 2)
     u, v = before.dots.image_px[owner]
@@ -112,22 +112,22 @@ def test_a_site_is_refused_where_another_dot_has_it() -> None:
         assign(before, [0, LAST], row=9, column=9)
 
 
-def test_cleared_dots_are_in_doubt() -> None:
+def test_cleared_dots_have_no_site() -> None:
     after = clear_rows(grid(), [0, 1])
     assert sites(after)[:3].tolist() == [[0, 0], [0, 0], [1, 3]]
 
 
-def test_a_row_is_shifted_with_the_reference_in_it() -> None:
+def test_shifting_a_row_shifts_the_reference_in_it() -> None:
     before = set_reference(grid(), HOLE)
     after = shift_row(before, 3, 2)
-    own = before.lattice.row == 3
-    np.testing.assert_array_equal(after.lattice.column - before.lattice.column, 2 * own)
+    in_row = before.lattice.row == 3
+    np.testing.assert_array_equal(after.lattice.column - before.lattice.column, 2 * in_row)
     assert after.lattice.reference == (3, 5)
-    np.testing.assert_array_equal(after.manual, own)
+    np.testing.assert_array_equal(after.manual, in_row)
     assert shift_row(before, 2, 1).lattice.reference == HOLE
 
 
-def test_a_shift_below_the_first_column_counts_all_anew() -> None:
+def test_shift_below_the_first_column_renumbers_all_columns() -> None:
     before = set_reference(grid(), HOLE)
     after = shift_row(before, 1, -2)
     step = after.lattice.column - before.lattice.column
@@ -136,7 +136,7 @@ def test_a_shift_below_the_first_column_counts_all_anew() -> None:
     assert after.lattice.reference == (3, 5)
 
 
-def test_a_row_below_the_lowest_counts_all_anew() -> None:
+def test_row_below_the_lowest_renumbers_all_rows() -> None:
     before = block_row(set_reference(grid(), HOLE), 4)
     after = assign(before, [LAST], row=0, column=2)
     assert sites(after)[LAST].tolist() == [1, 2]
@@ -146,7 +146,7 @@ def test_a_row_below_the_lowest_counts_all_anew() -> None:
 
 
 @pytest.mark.parametrize("above", [True, False])
-def test_a_split_row_is_two_and_merged_again_is_one(above: bool) -> None:
+def test_split_and_merge_are_inverse(above: bool) -> None:
     before = block_row(set_reference(grid(), HOLE), 3)
     after = split_row(before, 3, 3, above=above)
     row, column = before.lattice.row, before.lattice.column
@@ -163,12 +163,12 @@ def test_a_split_row_is_two_and_merged_again_is_one(above: bool) -> None:
         assert again.lattice.blocked_rows == {3}
 
 
-def test_rows_that_share_columns_are_not_merged() -> None:
+def test_merging_rows_with_common_columns_is_rejected() -> None:
     with pytest.raises(ValueError, match="row 1, column 1 is already assigned to dot 0"):
         merge_rows(grid(), 2, 1)
 
 
-def test_rows_are_marked_as_blocked_and_not() -> None:
+def test_rows_are_blocked_and_unblocked() -> None:
     blocked = block_row(block_row(grid(), 2), 4)
     assert blocked.lattice.blocked_rows == {2, 4}
     assert block_row(blocked, 2, blocked=False).lattice.blocked_rows == {4}
@@ -208,14 +208,12 @@ REFUSED: list[tuple[Callable[[Correction], Correction], str]] = [
 
 
 @pytest.mark.parametrize(("edit", "message"), REFUSED, ids=[message for _, message in REFUSED])
-def test_a_wrong_edit_is_refused_with_a_sentence(
-    edit: Callable[[Correction], Correction], message: str
-) -> None:
+def test_wrong_edits_are_rejected(edit: Callable[[Correction], Correction], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         edit(grid())
 
 
-def test_a_correction_that_makes_no_sense_is_none() -> None:
+def test_inconsistent_corrections_are_rejected() -> None:
     good = grid()
     n = len(good.dots)
     with pytest.raises(ValueError, match="is already assigned to dot 0"):
@@ -226,10 +224,10 @@ def test_a_correction_that_makes_no_sense_is_none() -> None:
         replace(good, manual=good.manual[1:])
 
 
-def test_dots_that_a_search_put_on_one_site_are_in_doubt() -> None:
+def test_second_dot_found_on_a_site_loses_it() -> None:
     dots = as_dots(place_of(np.array([[1, 1], [1, 2], [1, 3]])))
-    found = Correction.of(dots, Lattice(np.array([1, 1, 1]), np.array([1, 2, 2])))
-    assert sites(found).tolist() == [[1, 1], [0, 0], [0, 0]]
+    correction = Correction.of(dots, Lattice(np.array([1, 1, 1]), np.array([1, 2, 2])))
+    assert sites(correction).tolist() == [[1, 1], [0, 0], [0, 0]]
     assert len(Correction.of(None, None).dots) == 0
 
 
@@ -259,7 +257,9 @@ def edited(correction: Correction, kind: int, numbers: list[int]) -> Correction:
 
 @given(EDITS)
 @pytest.mark.slow
-def test_whatever_is_edited_a_correction_stays_whole(edits: list[tuple[int, list[int]]]) -> None:
+def test_any_sequence_of_edits_keeps_the_correction_consistent(
+    edits: list[tuple[int, list[int]]],
+) -> None:
     correction = grid()
     for kind, numbers in edits:
         before = (len(correction.dots), correction.manual.sum(), sites(correction).copy())
@@ -270,8 +270,8 @@ def test_whatever_is_edited_a_correction_stays_whole(edits: list[tuple[int, list
             continue
         assert len(after.dots) == before[0] + {0: 1, 1: -1}.get(kind, 0)
         lattice, sited = after.lattice, after.sited
-        own = sites(after)[sited]
-        assert len(np.unique(own, axis=0)) == len(own)
+        assigned = sites(after)[sited]
+        assert len(np.unique(assigned, axis=0)) == len(assigned)
         assert sites(after).min() >= 0
         if kind == 1:
             assert after.manual.sum() <= before[1]
@@ -279,7 +279,7 @@ def test_whatever_is_edited_a_correction_stays_whole(edits: list[tuple[int, list
             assert (after.manual[: before[0]] >= correction.manual).all()
         assert lattice.reference is None or min(lattice.reference) >= 1
         assert all(k >= 1 for k in lattice.blocked_rows)
-        assert not {*lattice.candidates} & {tuple(site) for site in own.tolist()} or (
+        assert not {*lattice.candidates} & {tuple(site) for site in assigned.tolist()} or (
             lattice.reference is not None
         )
         arrays = [getattr(after.dots, field.name) for field in fields(Dots)]
@@ -288,31 +288,31 @@ def test_whatever_is_edited_a_correction_stays_whole(edits: list[tuple[int, list
         correction = after
 
 
-def picture(places: FloatArray, peak: float) -> FloatArray:
-    """Round dots of σ = 2 px on a noisy ground."""
+def picture(positions: FloatArray, peak: float) -> FloatArray:
+    """Return an image of round dots of σ = 2 px on a noisy background."""
     v, u = np.mgrid[:220, :340]
     image: FloatArray = np.random.default_rng(3).normal(20.0, 1.5, u.shape)
-    for x, y in places:
+    for x, y in positions:
         image += peak * np.exp(-((u - x) ** 2 + (v - y) ** 2) / 8.0)
     return image
 
 
 @pytest.mark.parametrize("peak", [8.0, 40.0])
-def test_an_added_dot_snaps_to_the_peak_under_the_pointer(peak: float) -> None:
+def test_added_dot_snaps_to_the_peak_under_the_pointer(peak: float) -> None:
     before = grid()
     true = np.array([150.3, 151.7])
     image = picture(np.vstack([before.dots.image_px, true]), peak)
     after = add_dot(before, image, true[0] + 1.8, true[1] - 2.1)
     assert len(after.dots) == LAST + 2
-    off = after.dots.image_px[-1] - true
-    assert np.linalg.norm(off) < (0.3 if peak > 20 else 0.6)
+    error = after.dots.image_px[-1] - true
+    assert np.linalg.norm(error) < (0.3 if peak > 20 else 0.6)
     assert 0.05 < after.dots.u_sigma_px[-1] < 0.5
     assert np.flatnonzero(after.manual).tolist() == [LAST + 1]
     assert sites(after)[-1].tolist() == [0, 0]
     np.testing.assert_array_equal(after.dots.image_px[:-1], before.dots.image_px)
 
 
-def test_a_dot_beside_another_does_not_snap_to_that() -> None:
+def test_dot_added_beside_another_does_not_snap_to_it() -> None:
     before = grid()
     true = before.dots.image_px[LAST] + [9.0, 3.0]
     image = picture(np.vstack([before.dots.image_px, true]), 40.0)
@@ -321,7 +321,7 @@ def test_a_dot_beside_another_does_not_snap_to_that() -> None:
 
 
 @pytest.mark.parametrize("image", [picture(np.zeros((0, 2)), 0.0), np.zeros((220, 340), np.uint8)])
-def test_a_dot_where_there_is_no_peak_is_where_it_was_put_and_says_so(image: FloatArray) -> None:
+def test_dot_added_without_a_peak_stays_and_is_uncertain(image: FloatArray) -> None:
     after = add_dot(grid(), image, 152.25, 151.5)
     assert after.dots.image_px[-1].tolist() == [152.25, 151.5]
     assert min(after.dots.u_sigma_px[-1], after.dots.v_sigma_px[-1]) >= 1.0
@@ -329,7 +329,7 @@ def test_a_dot_where_there_is_no_peak_is_where_it_was_put_and_says_so(image: Flo
 
 
 @pytest.mark.parametrize("true", [(335.0, 5.0), (3.5, 216.0)])
-def test_a_dot_can_be_added_to_none_near_the_rim(true: tuple[float, float]) -> None:
+def test_dot_near_the_frame_edge_can_be_added_first(true: tuple[float, float]) -> None:
     image = picture(np.array([true]), 40.0)
     after = add_dot(Correction.of(None, None), image, true[0] + 1.0, true[1] - 1.0)
     assert np.linalg.norm(after.dots.image_px[0] - true) < 0.5

@@ -1,4 +1,4 @@
-"""Which ray made which dot: right or silent, on scenes of known truth."""
+"""Correspondence of dots and rays on simulated scenes: correct, or rejected."""
 
 from __future__ import annotations
 
@@ -74,8 +74,8 @@ SCENES: list[tuple[Callable[..., Pool], Rig]] = [
 
 
 @dataclass(frozen=True)
-class Answer:
-    """What matching said of one scene, and the truth."""
+class SceneResult:
+    """Result of matching for one scene, and the truth."""
 
     pool: Pool
     rig: Rig
@@ -86,7 +86,7 @@ class Answer:
 
     @property
     def wrong(self) -> BoolArray:
-        """Pairs with another ray than the dot's own, shape (n,)."""
+        """Whether each pair has another ray than the dot's true one, shape (n,)."""
         assert self.match is not None
         return np.asarray((self.seen.ray[self.match.dot] != self.match.ray).any(axis=-1))
 
@@ -94,60 +94,60 @@ class Answer:
 def matched(
     dots: Dots, rig: Rig = BENCH_RIG, settings: MatchSettings | None = None
 ) -> tuple[Match | None, str]:
-    """The match, and its status."""
+    """Return the match, and its status."""
     try:
         lattice = grow_lattice(dots, GrowSettings())
     except CannotMeasure:
         lattice = None
     try:
-        given = Bench(rig, BENCH_VIEW), FRAME_SHAPE, settings or MatchSettings()
-        match, _ = match_rays(dots, lattice, *given)
-    except CannotMeasure as answer:
-        return None, answer.status if answer.reason else "no reason"
+        context = Bench(rig, BENCH_VIEW), FRAME_SHAPE, settings or MatchSettings()
+        match, _ = match_rays(dots, lattice, *context)
+    except CannotMeasure as error:
+        return None, error.status if error.reason else "no reason"
     return match, "ok"
 
 
 @cache
-def computed() -> list[Answer]:
-    made = []
+def computed() -> list[SceneResult]:
+    results = []
     for seed, (kind, rig) in enumerate(SCENES):
         rng = np.random.default_rng(seed)
         pool = kind(rng, rng.uniform(4.8, 6.0), tuple(rng.uniform(-0.3, 0.3, 2)))
         missing, false = int(rng.integers(0, 4)), int(rng.integers(0, 5))
         seen = see(pool, rng, missing=missing, false=false, rig=rig)
-        made.append(Answer(pool, rig, trace(pool, rig), seen, *matched(seen.dots, rig)))
-    return made
+        results.append(SceneResult(pool, rig, trace(pool, rig), seen, *matched(seen.dots, rig)))
+    return results
 
 
 @pytest.fixture
-def answers() -> list[Answer]:
-    """Computed once a process: tests that are slow are run apart from the others."""
+def scene_results() -> list[SceneResult]:
+    """Results computed once per process, and only for slow tests."""
     return computed()
 
 
-def answered(answers: list[Answer]) -> list[tuple[Answer, Match]]:
-    return [(answer, answer.match) for answer in answers if answer.match is not None]
+def with_match(scene_results: list[SceneResult]) -> list[tuple[SceneResult, Match]]:
+    return [(scene, scene.match) for scene in scene_results if scene.match is not None]
 
 
 @pytest.mark.slow
-def test_no_dot_is_ever_given_a_wrong_ray(answers: list[Answer]) -> None:
-    assert len(answers) >= 24
-    assert sum(int(answer.wrong.sum()) for answer, _ in answered(answers)) == 0
+def test_no_dot_gets_a_wrong_ray(scene_results: list[SceneResult]) -> None:
+    assert len(scene_results) >= 24
+    assert sum(int(scene.wrong.sum()) for scene, _ in with_match(scene_results)) == 0
 
 
 @pytest.mark.slow
-def test_most_scenes_are_answered_and_most_of_their_dots(answers: list[Answer]) -> None:
-    assert len(answered(answers)) >= len(answers) - 2
-    own = sum(int((answer.seen.ray[:, 0] > 0).sum()) for answer, _ in answered(answers))
-    assert sum(len(match.dot) for _, match in answered(answers)) >= 0.95 * own
-    for answer in answers:
-        assert (answer.match is None) != (answer.status == "ok")
-        assert answer.status != "no reason"
+def test_most_scenes_and_most_of_their_dots_are_matched(scene_results: list[SceneResult]) -> None:
+    assert len(with_match(scene_results)) >= len(scene_results) - 2
+    true_dots = sum(int((scene.seen.ray[:, 0] > 0).sum()) for scene, _ in with_match(scene_results))
+    assert sum(len(match.dot) for _, match in with_match(scene_results)) >= 0.95 * true_dots
+    for scene in scene_results:
+        assert (scene.match is None) != (scene.status == "ok")
+        assert scene.status != "no reason"
 
 
 @pytest.mark.slow
-def test_a_row_that_growth_does_not_reach_is_begun(monkeypatch: pytest.MonkeyPatch) -> None:
-    # A wave bends the pool so that no ray alone comes into question for the dots of an end row.
+def test_row_that_growth_does_not_reach_is_seeded(monkeypatch: pytest.MonkeyPatch) -> None:
+    # A wave bends the pool so that each dot of an end row could belong to several rays.
     rng = np.random.default_rng(7)
     wave = Wave((2, 1), 0.015, 60.0, rng.uniform(0, 1 / 60), travelling=True)
     seen = see(egg(6.66, 3.0, 4.4, 0.29, (0.0, -0.6), (wave,)), rng)
@@ -155,68 +155,68 @@ def test_a_row_that_growth_does_not_reach_is_begun(monkeypatch: pytest.MonkeyPat
     assert match is not None
     np.testing.assert_array_equal(seen.ray[match.dot], match.ray)
     assert len(match.dot) == len(seen.dots)
-    for way in ("with_rows_beyond", "with_repaired"):  # either finds them, and so do caps
+    for way in ("with_rows_beyond", "with_repaired"):  # each of the two finds them, and so do caps
         monkeypatch.setattr(correspondence, way, lambda _scene, found: found)
     monkeypatch.setattr(correspondence, "_by_caps", lambda _scene: [])
     assert matched(seen.dots) == (None, "no-match")
 
 
 @pytest.mark.slow
-def test_the_orientation_is_right_and_far_ahead(answers: list[Answer]) -> None:
-    seen: set[Orientation] = set()
-    for answer, match in answered(answers):
-        assert match.orientation == seen_orientation(answer.reflections)
+def test_orientation_is_right_with_a_large_margin(scene_results: list[SceneResult]) -> None:
+    orientations: set[Orientation] = set()
+    for scene, match in with_match(scene_results):
+        assert match.orientation == seen_orientation(scene.reflections)
         assert match.margin >= 5
         assert match.trials[0].orientation == match.orientation
         assert {trial.orientation for trial in match.trials} == set(ORIENTATIONS)
         residuals = [trial.residual_mm for trial in match.trials]
         assert residuals == sorted(residuals)
-        seen.add(match.orientation)
-    assert seen == {"S/S", "I/I"}
+        orientations.add(match.orientation)
+    assert orientations == {"S/S", "I/I"}
 
 
 @pytest.mark.slow
-def test_a_match_is_whole(answers: list[Answer]) -> None:
-    for answer, match in answered(answers):
+def test_match_is_consistent(scene_results: list[SceneResult]) -> None:
+    for scene, match in with_match(scene_results):
         assert len(np.unique(match.dot)) == len(match.dot)
         assert len(np.unique(match.ray, axis=0)) == len(match.ray)
-        lit = np.zeros(match.witness.shape, bool)
-        lit[tuple(match.ray.T - 1)] = True
-        np.testing.assert_array_equal(match.witness > 0, lit)
-        place = BENCH_VIEW.to_plane(answer.seen.dots.image_px[match.dot])
-        np.testing.assert_allclose(match.plane_mm, place)
+        labelled = np.zeros(match.witness.shape, bool)
+        labelled[tuple(match.ray.T - 1)] = True
+        np.testing.assert_array_equal(match.witness > 0, labelled)
+        plane_mm = BENCH_VIEW.to_plane(scene.seen.dots.image_px[match.dot])
+        np.testing.assert_allclose(match.plane_mm, plane_mm)
         assert (np.linalg.eigvalsh(match.plane_covariance_mm2) > 0).all()
-        # Reflected numbers run as the orientation says, from 1.
+        # Reflected numbers start at 1; the orientation gives their direction.
         assert match.reflected.min(axis=0).tolist() == [1, 1]
         offset = match.reflected - match.ray * ways(match.orientation)
         assert (offset == offset[0]).all()
 
 
 @pytest.mark.slow
-def test_rays_that_are_said_to_have_stayed_away_did(answers: list[Answer]) -> None:
-    # Neither those that the torch hides nor those that miss the plane. A dot that the test took
-    # out at the rim cannot be known to have been there.
-    dark = came_back = 0
-    for answer, match in answered(answers):
-        away = match.witness < 0
-        dark += int(away.sum())
-        taken_out = answer.reflections.visible.copy()
-        taken_out[tuple(answer.seen.ray[answer.seen.ray[:, 0] > 0].T - 1)] = False
-        came_back += int((away & answer.reflections.hit & ~taken_out).sum())
-        assert not (away & answer.reflections.absent).any()
-        assert away.any()
-    assert dark >= 40 * len(answered(answers))
-    assert came_back <= 0.005 * dark
+def test_rays_marked_as_dark_have_no_dot(scene_results: list[SceneResult]) -> None:
+    # Rays hidden by the torch or missing the plane are not dark. Dots which the test removed at
+    # the rim do not count: matching cannot know that they existed.
+    dark_count = came_back = 0
+    for scene, match in with_match(scene_results):
+        dark = match.witness < 0
+        dark_count += int(dark.sum())
+        taken_out = scene.reflections.visible.copy()
+        taken_out[tuple(scene.seen.ray[scene.seen.ray[:, 0] > 0].T - 1)] = False
+        came_back += int((dark & scene.reflections.hit & ~taken_out).sum())
+        assert not (dark & scene.reflections.absent).any()
+        assert dark.any()
+    assert dark_count >= 40 * len(with_match(scene_results))
+    assert came_back <= 0.005 * dark_count
 
 
 @pytest.mark.slow
-def test_indexed_dots_are_those_with_a_ray(answers: list[Answer]) -> None:
-    for answer, match in answered(answers):
-        lattice = lattice_of_match(match, answer.rig, len(answer.seen.dots))
-        expected = np.zeros((len(answer.seen.dots), 2), int)
+def test_only_dots_with_a_ray_are_indexed(scene_results: list[SceneResult]) -> None:
+    for scene, match in with_match(scene_results):
+        lattice = lattice_of_match(match, scene.rig, len(scene.seen.dots))
+        expected = np.zeros((len(scene.seen.dots), 2), int)
         expected[match.dot] = match.reflected
         np.testing.assert_array_equal(np.stack([lattice.row, lattice.column], axis=-1), expected)
-        center = np.array(answer.rig.pattern.reference)
+        center = np.array(scene.rig.pattern.reference)
         offset = match.reflected[0] - match.ray[0] * ways(match.orientation)
         assert lattice.reference == tuple(center * ways(match.orientation) + offset)
 
@@ -226,7 +226,7 @@ CONCAVE = spherical_cap(6.0, -0.6)
 
 
 def exact(pool: Pool, with_reference: bool = False) -> SeenDots:
-    """Dots with next to no noise; the absent centre dot lit on request, its ray 0."""
+    """Return dots with little noise; the absent centre dot is lit on request, with ray 0."""
     reflections = trace(pool, BENCH_RIG)
     image, ray = visible_dots(reflections)
     if with_reference:
@@ -239,8 +239,8 @@ def exact(pool: Pool, with_reference: bool = False) -> SeenDots:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("pool", [CONVEX, CONCAVE])
-def test_where_the_centre_is_lit_no_ray_is_wrong(pool: Pool) -> None:
-    # It may pass for a false dot where the rim tells the rows; it never gets a ray itself.
+def test_no_ray_is_wrong_where_the_centre_is_lit(pool: Pool) -> None:
+    # Where the rim identifies the rows it may count as a false dot; it never gets a ray itself.
     seen = exact(pool, with_reference=True)
     match, status = matched(seen.dots)
     if match is None:
@@ -252,20 +252,20 @@ def test_where_the_centre_is_lit_no_ray_is_wrong(pool: Pool) -> None:
 @pytest.mark.parametrize("pool", [CONVEX, CONCAVE])
 @pytest.mark.parametrize("hole", [(11, 10), (9, 10)])
 @pytest.mark.slow
-def test_a_second_hole_beside_the_true_one_never_misleads(
+def test_second_hole_beside_the_reference_gives_no_wrong_rays(
     pool: Pool, hole: tuple[int, int]
 ) -> None:
     seen = exact(pool)
-    kept = np.flatnonzero((seen.ray != hole).any(axis=-1))
-    assert len(kept) == len(seen.ray) - 1
-    match, status = matched(as_dots(seen.dots.image_px[kept]))
+    others = np.flatnonzero((seen.ray != hole).any(axis=-1))
+    assert len(others) == len(seen.ray) - 1
+    match, status = matched(as_dots(seen.dots.image_px[others]))
     if match is None:
         assert status == "ambiguous-rows"
     else:
-        np.testing.assert_array_equal(match.ray, seen.ray[kept][match.dot])
+        np.testing.assert_array_equal(match.ray, seen.ray[others][match.dot])
 
 
-def test_a_pool_too_shallow_to_be_told_which_way_round_is_not_answered() -> None:
+def test_pool_too_shallow_for_its_orientation_is_rejected() -> None:
     seen = see(egg(6.2, 2.8, 3.6, 0.002), np.random.default_rng(0), sigma_px=0.3)
     match, status = matched(seen.dots)
     assert match is None
@@ -273,15 +273,15 @@ def test_a_pool_too_shallow_to_be_told_which_way_round_is_not_answered() -> None
 
 
 @pytest.mark.parametrize("peak_mm", [0.005, -0.008])
-def test_which_way_round_a_shallow_pool_is_the_boundary_tells(peak_mm: float) -> None:
+def test_boundary_decides_the_orientation_of_a_shallow_pool(peak_mm: float) -> None:
     seen = see(egg(6.2, 2.8, 3.6, peak_mm), np.random.default_rng(0), sigma_px=0.3)
     match, _ = matched(seen.dots)
     assert match is not None
     np.testing.assert_array_equal(seen.ray[match.dot], match.ray)
 
 
-def off(rng: np.random.Generator) -> Rig:
-    """The bench as a set-up has it that is off by 0.2° and 0.3 mm, standard deviations."""
+def wrong_setup(rng: np.random.Generator) -> Rig:
+    """Return the bench with setup errors of 0.2° and 0.3 mm (standard deviations)."""
     laser, plane = BENCH_RIG.laser, BENCH_RIG.imaging_plane
     angle, distance = rng.normal(0.0, [0.2, 0.3])
     return replace(
@@ -299,13 +299,13 @@ def hollow(rng: np.random.Generator, width: float, center: tuple[float, float]) 
     return egg(width, 0.47 * width, 0.6 * width, -rng.choice([0.004, 0.008, 0.015, 0.03]), center)
 
 
-def seen_off(kind: Callable[..., Pool], seed: int) -> tuple[SeenDots, Match | None]:
-    """The dots of a pool, and what is made of them with a set-up that is a little off."""
+def with_wrong_setup(kind: Callable[..., Pool], seed: int) -> tuple[SeenDots, Match | None]:
+    """Return the dots of a pool, and their match with a slightly wrong setup."""
     rng = np.random.default_rng([seed, 77])
     pool = kind(rng, rng.uniform(4.8, 6.6), tuple(rng.uniform(-0.3, 0.3, 2)))
     missing, false = int(rng.integers(0, 5)), int(rng.integers(0, 4))
     seen = see(pool, rng, sigma_px=0.1, missing=missing, false=false)
-    return seen, matched(seen.dots, off(rng))[0]
+    return seen, matched(seen.dots, wrong_setup(rng))[0]
 
 
 @pytest.mark.slow
@@ -313,25 +313,23 @@ def seen_off(kind: Callable[..., Pool], seed: int) -> tuple[SeenDots, Match | No
     ("kind", "seed"),
     [(ellipse, 22), *((shallow, n) for n in (5, 9, 11, 16, 18)), (hollow, 9), (hollow, 18)],
 )
-def test_a_set_up_that_is_a_little_off_leads_to_no_wrong_rays(
-    kind: Callable[..., Pool], seed: int
-) -> None:
-    """Answered with nearly all rays wrong, the shallow pools the other way round."""
-    seen, match = seen_off(kind, seed)
+def test_slightly_wrong_setup_gives_no_wrong_rays(kind: Callable[..., Pool], seed: int) -> None:
+    """Once nearly all rays were wrong, and shallow pools had the opposite orientation."""
+    seen, match = with_wrong_setup(kind, seed)
     if match is not None:
         assert (seen.ray[match.dot] == match.ray).all(axis=-1).mean() > 0.95
 
 
 @pytest.mark.parametrize(("kind", "seed"), [(cap, 20), (ellipse, 24), (dented, 20)])
-def test_a_set_up_that_is_a_little_off_keeps_the_answer(
+def test_slightly_wrong_setup_does_not_prevent_a_match(
     kind: Callable[..., Pool], seed: int
 ) -> None:
-    seen, match = seen_off(kind, seed)
+    seen, match = with_wrong_setup(kind, seed)
     assert match is not None
     np.testing.assert_array_equal(seen.ray[match.dot], match.ray)
 
 
-def test_a_pattern_without_an_absent_ray_has_no_reference() -> None:
+def test_pattern_without_an_absent_ray_has_no_reference() -> None:
     rig = replace(BENCH_RIG, pattern=DotPattern(19, 19, 0.77, absent=frozenset()))
     seen = see(CONVEX, np.random.default_rng(0), rig=rig)
     assert matched(seen.dots, rig) == (None, "no-reference")
@@ -339,18 +337,14 @@ def test_a_pattern_without_an_absent_ray_has_no_reference() -> None:
 
 @pytest.mark.parametrize(("pool", "forced"), [(CONVEX, "I/I"), (CONVEX, "S/I"), (CONCAVE, "S/S")])
 @pytest.mark.slow
-def test_a_forced_correspondence_that_is_wrong_has_no_answer(
-    pool: Pool, forced: Orientation
-) -> None:
+def test_wrong_forced_correspondence_is_rejected(pool: Pool, forced: Orientation) -> None:
     match, status = matched(exact(pool).dots, settings=MatchSettings(correspondence=forced))
     assert match is None
     assert status != "ok"
 
 
 @pytest.mark.parametrize(("pool", "forced"), [(CONVEX, "S/S"), (CONCAVE, "I/I")])
-def test_a_forced_correspondence_that_is_right_changes_nothing(
-    pool: Pool, forced: Orientation
-) -> None:
+def test_right_forced_correspondence_changes_nothing(pool: Pool, forced: Orientation) -> None:
     seen = exact(pool)
     match, _ = matched(seen.dots, settings=MatchSettings(correspondence=forced))
     assert match is not None
@@ -360,12 +354,12 @@ def test_a_forced_correspondence_that_is_right_changes_nothing(
 
 
 def corrected(correction: Correction, settings: MatchSettings | None = None) -> Match:
-    given = Bench(BENCH_RIG, BENCH_VIEW), FRAME_SHAPE, settings or MatchSettings()
-    return match_corrected(correction.dots, correction.lattice, *given)[0]
+    context = Bench(BENCH_RIG, BENCH_VIEW), FRAME_SHAPE, settings or MatchSettings()
+    return match_corrected(correction.dots, correction.lattice, *context)[0]
 
 
 def by_hand(seen: SeenDots, orientation: Orientation = "S/S") -> tuple[Correction, Site]:
-    """Every dot in its row and column as an operator would give them, and the reference's site."""
+    """Return the true rows and columns as a manual correction, and the reference's site."""
     real = seen.ray[:, 0] > 0
     number = seen.ray * ways(orientation)
     step = 1 - number[real].min(axis=0)
@@ -375,12 +369,12 @@ def by_hand(seen: SeenDots, orientation: Orientation = "S/S") -> tuple[Correctio
 
 
 def grown(seen: SeenDots) -> tuple[Correction, Site]:
-    """The rows that a search finds (S/S), and the reference's site in them."""
-    found = replace(grow_lattice(seen.dots, GrowSettings()), reference=None)
-    site = np.stack([found.row, found.column], axis=-1)
-    offset = (site - seen.ray)[(found.row > 0) & (seen.ray[:, 0] > 0)]
+    """Return the rows found by the search (S/S), and the reference's site in them."""
+    lattice = replace(grow_lattice(seen.dots, GrowSettings()), reference=None)
+    site = np.stack([lattice.row, lattice.column], axis=-1)
+    offset = (site - seen.ray)[(lattice.row > 0) & (seen.ray[:, 0] > 0)]
     k, t = (np.median(offset, axis=0) + 10).astype(int).tolist()
-    return Correction.of(seen.dots, found), (k, t)
+    return Correction.of(seen.dots, lattice), (k, t)
 
 
 def without(seen: SeenDots, *rays: tuple[int, int]) -> SeenDots:
@@ -401,7 +395,7 @@ BEHIND_THE_TORCH = [(i, j) for i in (10, 11, 12) for j in (9, 10, 11)]
         (spherical_cap(5.5, 0.27), BEHIND_THE_TORCH, "no-match"),
     ],
 )
-def test_a_reference_that_cannot_be_told_is_set_by_hand(
+def test_undetermined_reference_can_be_set_manually(
     pool: Pool, hidden: list[tuple[int, int]], refusal: str
 ) -> None:
     seen = without(exact(pool), *hidden)
@@ -415,7 +409,7 @@ def test_a_reference_that_cannot_be_told_is_set_by_hand(
 
 
 @pytest.mark.slow
-def test_a_dot_that_hides_the_reference_is_deleted_by_hand() -> None:
+def test_dot_that_hides_the_reference_can_be_deleted() -> None:
     seen = exact(NARROW, with_reference=True)
     assert matched(seen.dots) == (None, "no-reference")
     correction, reference = grown(seen)
@@ -428,7 +422,7 @@ def test_a_dot_that_hides_the_reference_is_deleted_by_hand() -> None:
 
 
 @pytest.mark.parametrize(("pool", "orientation"), [(CONVEX, "S/S"), (CONCAVE, "I/I")])
-def test_rows_given_by_hand_are_binding_and_keep_their_numbers(
+def test_manual_rows_are_binding_and_keep_their_numbers(
     pool: Pool, orientation: Orientation
 ) -> None:
     seen = without(exact(pool), *BEHIND_THE_TORCH)
@@ -451,7 +445,7 @@ def test_rows_given_by_hand_are_binding_and_keep_their_numbers(
 
 
 @pytest.mark.slow
-def test_dots_left_in_doubt_get_rays_that_no_given_number_contradicts() -> None:
+def test_dots_in_doubt_get_rays_consistent_with_assigned_numbers() -> None:
     seen = see(CONVEX, np.random.default_rng(3), sigma_px=0.1, false=2)
     correction, reference = by_hand(seen)
     doubt = np.arange(0, len(seen.ray) - 2, 3)
@@ -459,7 +453,7 @@ def test_dots_left_in_doubt_get_rays_that_no_given_number_contradicts() -> None:
     match = corrected(correction)
     np.testing.assert_array_equal(match.ray, seen.ray[match.dot])
     assert len(match.dot) == len(seen.ray) - 2
-    # A row that the surface does not agree to leaves the dot without a ray.
+    # A row that contradicts the surface leaves the dot without a ray.
     one = int(doubt[4])
     true = int(by_hand(seen)[0].lattice.row[one])
     assert one in corrected(assign(correction, [one], row=true)).dot
@@ -476,7 +470,7 @@ def test_rows_without_a_reference_are_matched_as_a_block() -> None:
     assert lattice_of_corrected(match, BENCH_RIG, correction.lattice).reference == reference
 
 
-def test_without_any_rows_the_optics_decide() -> None:
+def test_dots_without_rows_are_matched_by_optics() -> None:
     seen = exact(CONVEX)
     match = corrected(Correction.of(seen.dots, None))
     np.testing.assert_array_equal(match.ray, seen.ray[match.dot])
@@ -486,7 +480,7 @@ def test_without_any_rows_the_optics_decide() -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("pool", [CONVEX, CONCAVE])
 @pytest.mark.parametrize("columns", [1, -1])
-def test_a_row_that_was_shifted_by_mistake_is_refused_and_named(pool: Pool, columns: int) -> None:
+def test_wrongly_shifted_row_is_rejected_and_named(pool: Pool, columns: int) -> None:
     seen = exact(pool)
     correction, reference = by_hand(seen, "S/S" if pool is CONVEX else "I/I")
     good = set_reference(correction, reference)
@@ -495,14 +489,14 @@ def test_a_row_that_was_shifted_by_mistake_is_refused_and_named(pool: Pool, colu
         with pytest.raises(CannotMeasure, match=f"does not fit: .* most in row {row}") as refusal:
             corrected(shift_row(good, row, columns))
         assert refusal.value.status == "no-match"
-    # A single dot that is one off is put up with, and shows.
+    # A single dot that is one column off is tolerated, and increases the residual.
     edge = int(np.argmax(good.lattice.column))
     column = int(good.lattice.column[edge]) + 1
     assert corrected(assign(good, [edge], column=column)).trials[0].residual_mm > 1.3 * right
 
 
-def test_blocked_rows_do_not_testify() -> None:
-    # The torch hides what its rig does not say: the boundary must not be drawn within.
+def test_dark_rays_of_blocked_rows_are_ignored() -> None:
+    # The torch hides more than the rig predicts: the boundary must not exclude those rays.
     behind = {(i, j) for i in (6, 7) for j in range(12, 20)}
     seen = without(exact(CONVEX), *behind)
     correction, reference = by_hand(seen)
@@ -520,7 +514,7 @@ def test_blocked_rows_do_not_testify() -> None:
     )
 
 
-def test_too_few_rows_or_an_orientation_that_is_wrong_have_no_answer() -> None:
+def test_too_few_rows_or_wrong_orientation_is_rejected() -> None:
     seen = exact(CONVEX)
     correction, reference = by_hand(seen)
     good = set_reference(correction, reference)
@@ -532,7 +526,7 @@ def test_too_few_rows_or_an_orientation_that_is_wrong_have_no_answer() -> None:
         corrected(Correction.of(None, None))
 
 
-def test_a_few_rows_round_the_reference_are_enough() -> None:
+def test_a_few_rows_around_the_reference_suffice() -> None:
     seen = exact(CONVEX)
     correction, reference = by_hand(seen)
     far = np.flatnonzero(np.abs(seen.ray - 10).max(axis=-1) > 1)
@@ -558,7 +552,7 @@ def test_scattered_dots_have_no_rays() -> None:
         8,
     ],
 )
-def test_a_handful_of_dots_is_answered_with_a_reason(count: int) -> None:
+def test_handful_of_dots_is_rejected(count: int) -> None:
     seen = exact(CONVEX)
     match, status = matched(as_dots(seen.dots.image_px[:count]))
     assert match is None

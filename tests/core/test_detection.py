@@ -1,4 +1,4 @@
-"""Each detector and each search is the one that the settings name."""
+"""The settings select the detector of dots and the search for rows."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SHAPE = (400, 420)
 
 
 def places() -> FloatArray:
-    """A square grid with its middle missing, shape (n, 2), px."""
+    """Return a square grid without its middle, shape (n, 2), px."""
     u, v = np.meshgrid(np.arange(60.0, 380.0, 40.0), np.arange(60.0, 360.0, 44.0))
     grid = np.stack([u.ravel(), v.ravel()], axis=-1)
     return np.delete(grid, len(grid) // 2, axis=0)
@@ -36,12 +36,12 @@ def test_every_detector_finds_the_dots(frame: FloatArray, method: str) -> None:
     true = places()
     distance = np.linalg.norm(dots.image_px[None] - true[:, None], axis=-1)
     assert distance.min(axis=1).max() < 1.0
-    # Noise that the wavelet brings out is in the text's chain too.
+    # The wavelet also enhances noise, as in the dissertation.
     if method != "wavelet":
         assert len(dots) == len(true)
 
 
-def test_the_detector_is_the_one_that_is_named(frame: FloatArray) -> None:
+def test_find_dots_uses_the_named_detector(frame: FloatArray) -> None:
     settings = DotSettings()
     by_name = {
         "band-pass": band_pass_dots(frame, settings.band_pass),
@@ -51,7 +51,7 @@ def test_the_detector_is_the_one_that_is_named(frame: FloatArray) -> None:
     for name, dots in by_name.items():
         chosen = find_dots(frame, DotSettings(method=name))
         np.testing.assert_array_equal(chosen.image_px, dots.image_px)
-    # … and they differ, so that a wrong one would show.
+    # They differ, so that the wrong one would be noticed.
     first = [np.sort(dots.u_px)[:20] for dots in by_name.values()]
     assert not np.array_equal(first[0], first[1])
     assert not np.array_equal(first[0], first[2])
@@ -60,7 +60,7 @@ def test_the_detector_is_the_one_that_is_named(frame: FloatArray) -> None:
 
 
 @pytest.mark.parametrize(("method", "share"), [("grow", 1.0), ("masks", 0.9)])
-def test_a_search_indexes_the_dots(method: str, share: float) -> None:
+def test_search_indexes_the_dots(method: str, share: float) -> None:
     dots = as_dots(places())
     lattice = find_lattice(dots, SHAPE, LatticeSettings(method=method))
     u, v = dots.image_px.T
@@ -71,7 +71,7 @@ def test_a_search_indexes_the_dots(method: str, share: float) -> None:
     np.testing.assert_array_equal(lattice.column[indexed], t[indexed])
 
 
-def test_the_search_is_the_one_that_is_named() -> None:
+def test_find_lattice_uses_the_named_search() -> None:
     dots = as_dots(places() + np.random.default_rng(1).normal(0.0, 2.0, places().shape))
     settings = LatticeSettings()
     by_name = {
@@ -95,19 +95,19 @@ def test_the_search_is_the_one_that_is_named() -> None:
     ],
 )
 @pytest.mark.parametrize("shape", [(1, 1), (3, 200), (120, 160)])
-def test_a_blank_frame_has_no_dots(method: str, shape: tuple[int, int]) -> None:
-    with pytest.raises(CannotMeasure) as answer:
+def test_blank_frame_raises_no_dots(method: str, shape: tuple[int, int]) -> None:
+    with pytest.raises(CannotMeasure) as error:
         find_dots(np.full(shape, 9, np.uint8), DotSettings(method=method))
-    assert answer.value.status == "no-dots"
-    assert answer.value.reason
+    assert error.value.status == "no-dots"
+    assert error.value.reason
 
 
 @pytest.mark.parametrize("method", ["grow", "rows", "masks"])
-def test_a_single_dot_is_no_row(method: str) -> None:
-    with pytest.raises(CannotMeasure) as answer:
+def test_single_dot_raises_no_rows(method: str) -> None:
+    with pytest.raises(CannotMeasure) as error:
         find_lattice(
             as_dots(places()[:1]),
             SHAPE,
             LatticeSettings(method=method),
         )
-    assert answer.value.status in {"too-few-dots", "no-rows"}
+    assert error.value.status in {"too-few-dots", "no-rows"}

@@ -1,4 +1,4 @@
-"""Places of dots by the joint fit: as good as said, of large dots that overlap, too."""
+"""Dot positions by the joint fit: errors match their uncertainty, also for overlapping dots."""
 
 from __future__ import annotations
 
@@ -18,37 +18,39 @@ from tests.core.test_bench_check import EXACT, VIEW
 PLATE, TACK, POOL = FlatMirror(), spherical_cap(9.75, 0.91), spherical_cap(6.5, 0.3)
 
 
-def seen(surface: PoolSurface, look: Look, seed: int) -> tuple[Dots, FloatArray, FloatArray]:
-    """Dots of a picture, and their places and errors, shapes (n, 2), px."""
+def detected_dots(
+    surface: PoolSurface, look: Look, seed: int
+) -> tuple[Dots, FloatArray, FloatArray]:
+    """Return the dots of a picture, their true positions and errors, shapes (n, 2), px."""
     frame = render(trace(surface, EXACT.rig), VIEW, look, np.random.default_rng([7, seed]))
     true = frame.dot_px[frame.shown]
     dots = crowded_dots(frame.image, BandPassSettings())
-    away, own = cKDTree(true).query(dots.image_px)
+    distance, nearest = cKDTree(true).query(dots.image_px)
     assert len(dots) > 0.97 * len(true)
-    assert (away < 1.5).all()
-    return dots, true[own], dots.image_px - true[own]
+    assert (distance < 1.5).all()
+    return dots, true[nearest], dots.image_px - true[nearest]
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("surface", [PLATE, TACK, POOL], ids=["plate", "tack", "pool"])
 @pytest.mark.parametrize("speckle", [0.0, 0.35, 0.5])
-def test_places_are_as_uncertain_as_said(surface: PoolSurface, speckle: float) -> None:
-    """Mean χ² of a coordinate over three pictures."""
-    square = []
+def test_position_errors_match_their_uncertainty(surface: PoolSurface, speckle: float) -> None:
+    """The mean χ² per coordinate over three pictures is near 1."""
+    chi_square = []
     for seed in range(3):
-        dots, _, error = seen(surface, Look(speckle=speckle), seed)
-        square.append((error / np.stack([dots.u_sigma_px, dots.v_sigma_px], 1)) ** 2)
-    assert 0.6 < np.concatenate(square).mean() < 1.4
+        dots, _, error = detected_dots(surface, Look(speckle=speckle), seed)
+        chi_square.append((error / np.stack([dots.u_sigma_px, dots.v_sigma_px], 1)) ** 2)
+    assert 0.6 < np.concatenate(chi_square).mean() < 1.4
 
 
 @pytest.mark.slow
-def test_dots_that_overlap_are_not_drawn_to_each_other() -> None:
-    """Standard deviation 1.5 px, 5.7 px apart: neighbours once moved them by 0.4 px."""
+def test_overlapping_dots_do_not_attract_each_other() -> None:
+    """Dot size 1.5 px (σ), 5.7 px apart: neighbours once moved them by 0.4 px."""
     rms, scale = [], []
     for seed in range(4):
-        _, place, error = seen(PLATE, Look(glow=0.0), seed)
-        out = place - place.mean(axis=0)
+        _, true, error = detected_dots(PLATE, Look(glow=0.0), seed)
+        radius = true - true.mean(axis=0)
         rms.append(np.sqrt(np.mean(error**2)))
-        scale.append((error * out).sum() / (out**2).sum())
+        scale.append((error * radius).sum() / (radius**2).sum())
     assert max(rms) < 0.2
     assert abs(np.mean(scale)) < 2.5e-4  # its own standard deviation is 0.6e-4

@@ -13,11 +13,11 @@ ELLIPSE = Footprint(6.6, 3.7, 3.7, (0.0, -0.5))
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_a_mode_on_an_ellipse_is_found_exactly_and_alone(mode):
+def test_single_mode_on_an_ellipse_is_recovered_exactly(mode):
     turned = 20.0 if mode[0] else 0.0
     wave = Wave(mode, 0.02, 40.0, phase_deg=30.0, turned_deg=turned, damping_per_s=3.0)
-    found = bessel_modes(series_of(pool_with(ELLIPSE, wave), 200))
-    one = found[MODES.index(mode)]
+    modes = bessel_modes(series_of(pool_with(ELLIPSE, wave), 200))
+    one = modes[MODES.index(mode)]
     assert one.share == pytest.approx(1, abs=1e-6)
     value = {name: figure[0] for name, figure in one.figures.items()}
     assert value["frequency_hz"] == pytest.approx(40, abs=1e-6)
@@ -29,18 +29,18 @@ def test_a_mode_on_an_ellipse_is_found_exactly_and_alone(mode):
         assert value["turning"] == pytest.approx(0, abs=1e-5)
 
 
-def test_a_travelling_mode_turns():
+def test_travelling_mode_turns():
     wave = Wave((2, 1), 0.02, 40.0, travelling=True)
     figures = bessel_modes(series_of(pool_with(ELLIPSE, wave), 200))[2].figures
     assert figures["turning"][0] == pytest.approx(1, abs=1e-5)
 
 
-def test_the_area_is_that_of_the_outline():
+def test_area_is_that_of_the_outline():
     series = series_of(pool_with(ELLIPSE), 200, seconds=0.1)
     assert series.area_mm2.sum() == pytest.approx(math.pi * 3.3 * 3.7, rel=0.01)
 
 
-def test_pod_finds_the_two_shapes_that_the_pool_swings_in():
+def test_pod_finds_the_two_mode_shapes():
     waves = Wave((0, 1), 0.03, 40.0), Wave((1, 1), 0.01, 63.0)
     first, second, third, _ = pod_modes(series_of(pool_with(ELLIPSE, *waves), 500))
     # ∫J_0²(j_01 ρ) ρ dρ = J_1²(j_01)/2, ∫J_1²(j_11 ρ) ρ dρ = J_2²(j_11)/2, twice of cos² and sin².
@@ -54,7 +54,7 @@ def test_pod_finds_the_two_shapes_that_the_pool_swings_in():
 
 
 def two_modes(rng):
-    """Two damped modes at once, with phases at random; their truth by name."""
+    """Return the amplitudes of two simultaneous damped modes with random phases, and the pool."""
     amplitude, phase = (0.02, 0.012), rng.uniform(0, 360, 2)
     return amplitude, pool_with(
         ELLIPSE,
@@ -69,17 +69,17 @@ def test_two_modes_at_once_with_noise_and_lost_frames(rate_hz):
     rng = np.random.default_rng(7)
     amplitude, pool = two_modes(rng)
     series = series_of(pool, rate_hz, rng=rng, noise_mm=6e-4, lost=0.05)
-    found = bessel_modes(series)
-    for one, hertz, size, gamma in zip(found, (37.3, 61.8), amplitude, (3.0, 4.0), strict=False):
+    modes = bessel_modes(series)
+    for one, hertz, size, gamma in zip(modes, (37.3, 61.8), amplitude, (3.0, 4.0), strict=False):
         figures = one.figures
         at_first = size * math.exp(-gamma * series.time_s[0])
         assert figures["frequency_hz"][0] == pytest.approx(hertz, abs=0.1)
         assert figures["amplitude_mm"][0] == pytest.approx(at_first, rel=0.05)
         assert figures["damping_per_s"][0] == pytest.approx(gamma, rel=0.1)
-    assert not found[3].oscillations
+    assert not modes[3].oscillations
 
 
-def test_no_mode_leaks_into_another_and_lost_frames_do_no_harm():
+def test_modes_are_separated_despite_lost_frames():
     amplitude, pool = two_modes(np.random.default_rng(7))
     series = series_of(pool, 200, rng=np.random.default_rng(8), lost=0.05)
     for one, size, gamma in zip(bessel_modes(series), amplitude, (3.0, 4.0), strict=False):
@@ -87,19 +87,19 @@ def test_no_mode_leaks_into_another_and_lost_frames_do_no_harm():
         assert one.figures["amplitude_mm"][0] == pytest.approx(at_first, rel=1e-6)
 
 
-def test_an_amplitude_scatters_no_more_than_noise_makes_it():
-    """Its standard deviation is the Cramér-Rao bound, for white noise known to be so."""
+def test_amplitude_scatter_reaches_the_cramer_rao_bound():
+    """For white noise."""
     rng, time, noise = np.random.default_rng(5), np.arange(200) / 200, 0.05
     wave = np.exp((2j * np.pi * 61.8 - 4) * time)
-    found = [
+    amplitudes = [
         abs(fit_oscillations(time, wave.real + noise * rng.normal(size=200), 1)[0].amplitude[0])
         for _ in range(60)
     ]
-    # Of amplitude, phase, frequency and decay, all at once; the trend costs next to nothing.
+    # Joint fit of amplitude, phase, frequency and decay; the trend adds almost nothing.
     turned = np.column_stack([wave, 1j * wave, 1j * time * wave, time * wave]).real
     bound = noise * np.sqrt(np.linalg.inv(turned.T @ turned)[0, 0])
-    assert np.std(found) == pytest.approx(bound, rel=0.3)  # 9 % standard deviation of 60
-    assert np.mean(found) == pytest.approx(1, abs=4 * bound / np.sqrt(60))
+    assert np.std(amplitudes) == pytest.approx(bound, rel=0.3)  # 9 % standard deviation of 60
+    assert np.mean(amplitudes) == pytest.approx(1, abs=4 * bound / np.sqrt(60))
 
 
 @pytest.mark.slow
@@ -111,12 +111,12 @@ def test_standard_uncertainties_cover_the_truth():
         value = 20 * np.exp(-3 * time) * np.cos(2 * np.pi * 37.3 * time + phase)
         value += 8 * np.exp(-2 * time) * np.cos(2 * np.pi * 61 * time) + 5 * time
         value += rng.normal(0, 2, len(time))
-        one = fit_oscillations(time, value, 2)[0]
-        size, sigma = one.quantities(np.abs)
+        oscillation = fit_oscillations(time, value, 2)[0]
+        size, sigma = oscillation.quantities(np.abs)
         scores.append(
             [
-                (one.frequency_hz - 37.3) / one.frequency_sigma_hz,
-                (one.damping_per_s - 3) / one.damping_sigma_per_s,
+                (oscillation.frequency_hz - 37.3) / oscillation.frequency_sigma_hz,
+                (oscillation.damping_per_s - 3) / oscillation.damping_sigma_per_s,
                 (size[0] - 20 * np.exp(-3 * time[0])) / sigma[0],
             ]
         )

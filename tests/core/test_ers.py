@@ -1,4 +1,4 @@
-"""Extrapolation scheme: its steps, and odd sets of dots; its accuracy is `test_error_analysis`."""
+"""Extrapolation scheme: its steps, and incomplete dots. `test_error_analysis` tests accuracy."""
 
 from __future__ import annotations
 
@@ -34,21 +34,21 @@ def match_of(pool, rig=RIG, **noise):
     return exact_match(trace(pool, rig), rig, **noise)
 
 
-def without(match, gone):
-    """The match without some of its dots, given as a mask."""
-    kept = ~np.asarray(gone)
+def without(match, removed):
+    """Return the match without the dots of a mask."""
+    remaining = ~np.asarray(removed)
     return replace(
         match,
-        dot=match.dot[kept],
-        ray=match.ray[kept],
-        reflected=match.reflected[kept],
-        plane_mm=match.plane_mm[kept],
-        plane_covariance_mm2=match.plane_covariance_mm2[kept],
+        dot=match.dot[remaining],
+        ray=match.ray[remaining],
+        reflected=match.reflected[remaining],
+        plane_mm=match.plane_mm[remaining],
+        plane_covariance_mm2=match.plane_covariance_mm2[remaining],
     )
 
 
-def test_the_thumb_tack_of_8_2():
-    # The text has 9.12 % of height and 1.49 % of diameter. Dots that miss the plane are lost.
+def test_thumb_tack_of_8_2():
+    # The dissertation has errors of 9.12 % (height) and 1.49 % (diameter), with dots off the plane.
     rig = Rig(
         Laser(30.56, 46.4),
         DotPattern(),
@@ -62,7 +62,7 @@ def test_the_thumb_tack_of_8_2():
     assert measures.length_mm == pytest.approx(9.75, rel=0.015)
 
 
-def test_a_denser_pattern_leaves_less_error():
+def test_denser_pattern_halves_the_error():
     # §8.3.3: 39 × 39 rays half as far apart.
     dense = replace(RIG, pattern=DotPattern(39, 39, 0.385))
     errors = []
@@ -70,7 +70,7 @@ def test_a_denser_pattern_leaves_less_error():
         caps = [spherical_cap(b, b / r) for b in (5.5, 6.5) for r in (20, -10)]
         each = []
         for cap in caps:
-            # As the text does, also where a ray would meet a deep hollow again.
+            # As in the dissertation, a second reflection in a deep hollow is ignored.
             match = exact_match(trace_once(cap, rig), rig)
             measures = measure_surface(ers.reconstruct(match, rig, CIRCLE), match, rig)
             depth = measures.height_mm if cap.peak_mm > 0 else -measures.depth_mm
@@ -79,58 +79,60 @@ def test_a_denser_pattern_leaves_less_error():
     assert errors[1] < errors[0] / 2
 
 
-def test_the_base_point_is_the_leftmost_of_the_row_nearest_the_head():
+def test_base_point_is_leftmost_of_the_row_nearest_the_head():
     rays = np.array([[3, 5], [9, 8], [9, 6], [9, 7], [4, 1]])
     assert ers.head_left(rays) == 2
     match = match_of(spherical_cap(6.0, 0.4))
-    made = ers.reconstruct(match, RIG, CIRCLE)
+    reconstruction = ers.reconstruct(match, RIG, CIRCLE)
     base = ers.head_left(match.ray)
-    assert made.points_mm[base, 2] == pytest.approx(0.0, abs=1e-9)
+    assert reconstruction.points_mm[base, 2] == pytest.approx(0.0, abs=1e-9)
     head = match.ray[:, 0] == match.ray[:, 0].max()
-    assert made.points_mm[base, 0] == made.points_mm[head, 0].min()
+    assert reconstruction.points_mm[base, 0] == reconstruction.points_mm[head, 0].min()
 
 
-def test_reflection_points_lie_on_their_rays_and_their_own_are_is_that_of_step_4():
+def test_points_are_on_their_rays_and_own_are_is_that_of_step_4():
     match = match_of(egg(6.6, 3.0, 4.0, 0.35))
-    made = ers.reconstruct(match, RIG)
-    np.testing.assert_array_equal(made.ray, match.ray)
+    reconstruction = ers.reconstruct(match, RIG)
+    np.testing.assert_array_equal(reconstruction.ray, match.ray)
     rays = reflected_rays(match, RIG)
     direction = rays.direction[: rays.measured]
-    offset = made.points_mm - RIG.laser.position_mm
+    offset = reconstruction.points_mm - RIG.laser.position_mm
     np.testing.assert_allclose(
         offset / np.linalg.norm(offset, axis=1)[:, None], direction, atol=1e-12
     )
-    # Step 4 by the long way: rays ∩ surface, reflected there, met with the plane. The centre's
-    # stand-in is not in the reconstruction, hence no exact equality.
-    surface = ThinPlateSurface(made.points_mm)
+    # Step 4 computed independently: rays ∩ surface, reflected, intersected with the plane. The
+    # interpolated centre is not in the reconstruction, hence no exact equality.
+    surface = ThinPlateSurface(reconstruction.points_mm)
     points = intersect(surface, RIG.laser.position_mm, direction)
-    np.testing.assert_allclose(points, made.points_mm, atol=1e-6)
+    np.testing.assert_allclose(points, reconstruction.points_mm, atol=1e-6)
     gradient = surface.gradient(points[:, 0], points[:, 1])
     computed = intersect_imaging_plane(
         points, reflect(direction, surface_normal(gradient)), RIG.imaging_plane
     )
-    own = np.hypot(*((computed - match.plane_mm) * reflection_scale(match, RIG)).T).mean()
-    assert made.own_are_mm == pytest.approx(own, rel=0.05)
+    expected = np.hypot(*((computed - match.plane_mm) * reflection_scale(match, RIG)).T).mean()
+    assert reconstruction.own_are_mm == pytest.approx(expected, rel=0.05)
 
 
-def test_the_boundary_lies_on_the_extrapolated_surface():
+def test_boundary_is_on_the_extrapolated_surface():
     match = match_of(spherical_cap(6.5, 0.4))
-    made = ers.reconstruct(match, RIG, CIRCLE)
-    x, y, z = made.boundary.points_mm.T
+    reconstruction = ers.reconstruct(match, RIG, CIRCLE)
+    x, y, z = reconstruction.boundary.points_mm.T
     assert np.ptp(z) > 0
-    np.testing.assert_allclose(z, ThinPlateSurface(made.points_mm).height(x, y), atol=0.02)
-    inner = made.boundary.center_mm[:, None] + 0.99 * (
-        np.stack([x, y]) - made.boundary.center_mm[:, None]
+    np.testing.assert_allclose(
+        z, ThinPlateSurface(reconstruction.points_mm).height(x, y), atol=0.02
     )
-    assert np.isfinite(made.surface.height(*inner)).all()
-    assert made.scheme == "ers"
-    assert np.isnan(made.sigma_mm).all()
+    inner = reconstruction.boundary.center_mm[:, None] + 0.99 * (
+        np.stack([x, y]) - reconstruction.boundary.center_mm[:, None]
+    )
+    assert np.isfinite(reconstruction.surface.height(*inner)).all()
+    assert reconstruction.scheme == "ers"
+    assert np.isnan(reconstruction.sigma_mm).all()
 
 
 @pytest.mark.slow
 @given(st.floats(-0.1, 0.1), st.floats(-0.1, 0.1), st.floats(-0.3, 0.3))
-def test_a_tilted_mirror_is_followed_exactly(slope_x, slope_y, level):
-    # Constant slopes: the mean of two is exact, and so is every step, whatever the path.
+def test_tilted_mirror_is_reconstructed_exactly(slope_x, slope_y, level):
+    # With constant slopes the mean of two is exact, and so is every step on any path.
     rays = reflected_rays(match_of(spherical_cap(6.0, 0.3)), RIG)
     normal = np.array([-slope_x, -slope_y, 1.0])
     laser = RIG.laser.position_mm
@@ -140,7 +142,7 @@ def test_a_tilted_mirror_is_followed_exactly(slope_x, slope_y, level):
     np.testing.assert_allclose(paths.follow(normals, exact), exact, rtol=1e-9)
 
 
-def test_the_slope_field_is_that_of_the_pool_at_the_true_points():
+def test_slopes_at_the_true_points_are_those_of_the_pool():
     pool = spherical_cap(6.0, 0.3)
     match = match_of(pool)
     rays = reflected_rays(match, RIG)
@@ -148,20 +150,20 @@ def test_the_slope_field_is_that_of_the_pool_at_the_true_points():
     true = trace(pool, RIG).point_mm[i, j]
     normals = rays.normals(np.linalg.norm(true - RIG.laser.position_mm, axis=1))
     expected = surface_normal(pool.gradient(true[:, 0], true[:, 1]))
-    # The last one is the centre's stand-in.
+    # The last one is the interpolated centre.
     np.testing.assert_allclose(normals[:-1], expected[:-1], atol=1e-7)
     np.testing.assert_allclose(normals[-1], expected[-1], atol=0.01)
 
 
-def test_the_mean_slope_carries_the_sign_of_the_base_point():
-    # Eq. 6-1: from slope +0.1 to −0.3 the mean is −0.1, and the step is taken with +0.1.
+def test_mean_slope_has_the_sign_of_the_base_point():
+    # Eq. 6-1: from slope +0.1 to −0.3 the mean is −0.1, and the step uses +0.1.
     rays = reflected_rays(match_of(spherical_cap(6.0, 0.3)), RIG)
     row = np.flatnonzero(rays.ray[:, 0] == 9)[:2]
     direction = rays.direction[row]
     level = rays.distance_at(0.0)[row]
     normals = np.array([[-0.1, 0.0, 1.0], [0.3, 0.0, 1.0]])
     span = np.diff(direction[:, 0] * level)[0]
-    # Going the other way the base point's slope is −0.3, and the step rises again.
+    # In the opposite direction the base point's slope is −0.3, and the step rises again.
     for parent, reached in (([-1, 0], 1), ([1, -1], 0)):
         distance = Paths.along(np.array(parent), direction).follow(normals, level)
         z = RIG.laser.position_mm[2] + distance * direction[:, 2]
@@ -169,8 +171,8 @@ def test_the_mean_slope_carries_the_sign_of_the_base_point():
 
 
 @pytest.mark.parametrize("nothing", [1e-17, -1e-17, 0.0, 1e-9, -1e-9])
-def test_a_slope_of_nothing_has_no_sign(nothing):
-    # A base point on the summit: the mean goes down with its neighbour, whatever rounding says.
+def test_zero_slope_has_no_sign(nothing):
+    # A base point on the summit: the mean has the neighbour's sign, whatever the rounding error.
     rays = reflected_rays(match_of(spherical_cap(6.0, 0.3)), RIG)
     row = np.flatnonzero(rays.ray[:, 0] == 9)[:2]
     direction, level = rays.direction[row], rays.distance_at(0.0)[row]
@@ -180,7 +182,7 @@ def test_a_slope_of_nothing_has_no_sign(nothing):
     assert z[1] == pytest.approx(-0.025 * np.diff(direction[:, 0] * level)[0], rel=0.1)
 
 
-def test_caps_that_hardly_move_are_measured_alike():
+def test_tiny_shifts_of_a_cap_hardly_change_its_height():
     for diameter in (5.0, 6.5, 8.0):
         depth = []
         for aside in (0.0, 1e-9, -1e-9):
@@ -189,7 +191,7 @@ def test_caps_that_hardly_move_are_measured_alike():
         assert np.ptp(depth) < 1e-4
 
 
-def test_the_centre_reference_is_stood_in_for_between_its_neighbours():
+def test_absent_centre_is_interpolated_from_its_neighbours():
     match = match_of(spherical_cap(6.0, 0.3))
     rays = reflected_rays(match, RIG)
     assert len(rays.ray) == rays.measured + 1 == len(match.ray) + 1
@@ -202,7 +204,7 @@ def test_the_centre_reference_is_stood_in_for_between_its_neighbours():
     assert len(reflected_rays(match, everywhere).ray) == len(match.ray)
 
 
-def test_rows_are_joined_in_the_middle_column_or_the_nearest_shared_one():
+def test_rows_are_joined_at_the_shared_column_nearest_the_middle():
     rays = np.array([[5, j] for j in (2, 3, 4, 5, 6)] + [[6, j] for j in (5, 6)] + [[8, 9]])
     parent = parents_from(rays, base=0)
     assert parent[0] == -1
@@ -214,21 +216,21 @@ def test_rows_are_joined_in_the_middle_column_or_the_nearest_shared_one():
 
 @pytest.mark.slow
 @given(st.integers(0, 10_000), st.sampled_from([0.1, 0.3, 0.6, 0.9]))
-def test_odd_sets_of_dots_are_measured_or_refused(seed, share):
+def test_random_subsets_of_dots_are_measured_or_rejected(seed, share):
     rng = np.random.default_rng(seed)
     match = match_of(egg(6.6, 3.0, 4.0, rng.choice([-0.5, 0.4])), sigma_mm=0.1, rng=rng)
     match = without(match, rng.random(len(match.ray)) > share)
     for boundary in ("circle", "piecewise"):
         try:
-            made = ers.reconstruct(match, RIG, ers.ErsSettings(boundary=boundary))
+            reconstruction = ers.reconstruct(match, RIG, ers.ErsSettings(boundary=boundary))
         except CannotMeasure as error:
             assert error.status in {"too-few-dots", "no-surface", "no-boundary"}  # noqa: PT017 - or an answer
         else:
-            assert np.isfinite(made.points_mm).all()
-            assert np.isfinite(measure_surface(made, match, RIG).volume_mm3)
+            assert np.isfinite(reconstruction.points_mm).all()
+            assert np.isfinite(measure_surface(reconstruction, match, RIG).volume_mm3)
 
 
-def test_too_few_dots_are_refused():
+def test_too_few_dots_are_rejected():
     match = match_of(spherical_cap(6.0, 0.3))
     with pytest.raises(CannotMeasure, match="too-few-dots"):
         ers.reconstruct(without(match, np.arange(len(match.ray)) >= 8), RIG)
@@ -238,21 +240,21 @@ def test_too_few_dots_are_refused():
         ers.reconstruct(without(match, np.ones(len(match.ray), bool)), RIG)
 
 
-def test_a_row_of_one_dot_and_a_row_on_its_own_take_part():
+def test_isolated_row_of_a_single_dot_is_reconstructed():
     match = match_of(spherical_cap(7.0, 0.4))
     i, j = match.ray.T
     first = i == i.min()
-    gone = (first & (j != j[first].min())) | (i == i.min() + 1)
-    made = ers.reconstruct(without(match, gone), RIG, CIRCLE)
-    single = made.ray[:, 0] == i.min()
+    removed = (first & (j != j[first].min())) | (i == i.min() + 1)
+    reconstruction = ers.reconstruct(without(match, removed), RIG, CIRCLE)
+    single = reconstruction.ray[:, 0] == i.min()
     assert single.sum() == 1
-    # Reached over a missing row by a step across columns: rough, but near the surface.
-    x, y, z = made.points_mm[single][0]
+    # Reached across a missing row by a step between columns: inaccurate, but near the surface.
+    x, y, z = reconstruction.points_mm[single][0]
     true = spherical_cap(7.0, 0.4).height(x, y)
     assert z == pytest.approx(float(true), abs=0.15)
 
 
-def test_pools_off_the_axis_either_way_are_centred_either_way():
+def test_off_axis_pools_get_symmetric_centres():
     centers = []
     for x in (-0.2, 0.2):
         match = match_of(spherical_cap(6.5, 0.4, (x, 0.0)))

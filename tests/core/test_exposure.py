@@ -18,7 +18,7 @@ def picture(
     noise: float = 2.0,
     full: int = 255,
 ) -> np.ndarray:
-    """8 × 8 dots 14 px apart, as a camera of the given full scale would record them."""
+    """Return a frame of 8 × 8 dots 14 px apart, from a camera of the given full scale."""
     v, u = np.mgrid[0:150, 0:150].astype(float)
     centre = 26 + SPACING_PX * np.arange(8)
     light = np.full(u.shape, float(background))
@@ -37,13 +37,13 @@ def judged(image: np.ndarray, bit_depth: int | None = 8) -> Exposure:
     return judge_exposure(image, dots, bit_depth)
 
 
-def test_a_well_exposed_frame_is_good() -> None:
-    found = judged(picture(150))
-    assert found.verdict == "good"
-    assert found.clipped == 0
-    assert found.level == pytest.approx(170 / 255, abs=0.05)
-    assert found.contrast == pytest.approx(150 / 170, abs=0.1)
-    assert found.snr > 20
+def test_well_exposed_frame_is_good() -> None:
+    exposure = judged(picture(150))
+    assert exposure.verdict == "good"
+    assert exposure.clipped == 0
+    assert exposure.level == pytest.approx(170 / 255, abs=0.05)
+    assert exposure.contrast == pytest.approx(150 / 170, abs=0.1)
+    assert exposure.snr > 20
 
 
 @pytest.mark.parametrize(
@@ -59,15 +59,15 @@ def test_a_well_exposed_frame_is_good() -> None:
         (picture(0, background=400, noise=80), "saturated"),
     ],
 )
-def test_what_is_wrong_is_named(image: np.ndarray, verdict: str) -> None:
-    found = judged(image)
-    assert found.verdict == verdict
-    assert found.advice == ADVICE[found.verdict]
-    assert 0 <= found.level <= 1
-    assert 0 <= found.clipped <= 1
+def test_exposure_problem_is_named(image: np.ndarray, verdict: str) -> None:
+    exposure = judged(image)
+    assert exposure.verdict == verdict
+    assert exposure.advice == ADVICE[exposure.verdict]
+    assert 0 <= exposure.level <= 1
+    assert 0 <= exposure.clipped <= 1
 
 
-def test_twelve_bits_in_a_file_of_sixteen_are_seen_to_be_clipped() -> None:
+def test_clipping_of_12_bits_in_a_16_bit_file_is_detected() -> None:
     image = picture(9000, background=300, noise=20, full=4095)
     assert judged(image, bit_depth=16).verdict == "saturated"
     assert judged(picture(2500, background=300, noise=20, full=4095), 16).verdict == "good"
@@ -79,18 +79,20 @@ def test_float_levels_have_no_full_scale() -> None:
     assert judged(image, None).verdict == "good"
 
 
-def test_dots_begin_to_be_lost_about_where_it_says_that_they_merge() -> None:
+def test_dots_are_lost_where_the_verdict_is_dots_merge() -> None:
     sharp = picture(150, noise=1.0)
-    lost = {}
+    fewest_dots = {}
     for blur in (1.0, 2.0, 3.0, 4.0, 5.0, 6.0):
         blurred = cv2.GaussianBlur(sharp, (0, 0), blur)
         verdict = judged(blurred).verdict
-        lost[verdict] = min(lost.get(verdict, 64), len(find_dots(blurred, DotSettings())))
-    assert lost["good"] >= 62
-    assert "dots merge" in lost
+        fewest_dots[verdict] = min(
+            fewest_dots.get(verdict, 64), len(find_dots(blurred, DotSettings()))
+        )
+    assert fewest_dots["good"] >= 62
+    assert "dots merge" in fewest_dots
 
 
-def test_one_dot_and_a_tiny_frame_are_judged_too() -> None:
+def test_single_dot_and_tiny_frame_are_judged() -> None:
     one = picture(0, noise=1.0)
     one[70:75, 70:75] += 100
     assert judged(one).verdict in {"good", "saturated"}

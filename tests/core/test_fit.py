@@ -1,4 +1,4 @@
-"""The fit on exact reflections, on noisy ones, and what it says of its own uncertainty."""
+"""The fit on exact and noisy reflections, and its stated uncertainty."""
 
 from __future__ import annotations
 
@@ -60,36 +60,38 @@ def inside(pool: Pool) -> FloatArray:
 
 
 @pytest.mark.parametrize(("width_mm", "depth_mm"), [(6.1, -0.72), (5.5, -0.6)])
-def test_head_and_rear_of_a_pool_may_miss_the_plane(width_mm: float, depth_mm: float) -> None:
-    # However dense the pattern: only the middle third of the pool is seen.
+def test_pool_is_measured_where_head_and_rear_miss_the_plane(
+    width_mm: float, depth_mm: float
+) -> None:
+    # Even with a dense pattern only the middle third of the pool is visible.
     rig = replace(BENCH, pattern=DotPattern(37, 37, 0.385))
     pool = spherical_cap(width_mm, depth_mm)
     match = exact_match(trace(pool, rig), rig)
-    made = fit.reconstruct(match, rig, FitSettings())
-    sizes = measure_surface(made, match, rig)
-    assert np.ptp(made.points_mm[:, 1]) < 0.75 * width_mm
+    reconstruction = fit.reconstruct(match, rig, FitSettings())
+    sizes = measure_surface(reconstruction, match, rig)
+    assert np.ptp(reconstruction.points_mm[:, 1]) < 0.75 * width_mm
     assert sizes.depth_mm == pytest.approx(depth_mm, rel=0.02)
     assert sizes.length_mm == pytest.approx(width_mm, rel=0.02)
 
 
 @pytest.mark.slow
-def test_the_28_caps_of_8_3_1() -> None:
+def test_28_caps_of_8_3_1() -> None:
     depth, width, length, ratio = [], [], [], []
     for cap in caps_8_3_1():
-        made, match = fitted(cap)
-        measures = measure_surface(made, match, OPEN_RIG)
+        reconstruction, match = fitted(cap)
+        measures = measure_surface(reconstruction, match, OPEN_RIG)
         depth.append(abs(extreme(cap, measures) / abs(cap.peak_mm) - 1))
         width.append(abs(measures.width_mm / cap.footprint.width_mm - 1))
         length.append(abs(measures.length_mm / cap.footprint.width_mm - 1))
-        text = ers.reconstruct(match, OPEN_RIG, ers.ErsSettings(boundary="circle"))
-        error = reflection_errors(text, match, OPEN_RIG).are_mm
+        ers_result = ers.reconstruct(match, OPEN_RIG, ers.ErsSettings(boundary="circle"))
+        error = reflection_errors(ers_result, match, OPEN_RIG).are_mm
         ratio.append(error / measures.are_mm)
     assert len(depth) == 28
     assert np.mean(depth) <= 0.01
     assert np.max(depth) <= 0.04
     assert np.max(width) <= 0.02
     assert np.max(length) <= 0.02
-    # The bar is five; exact dots leave next to nothing, on every single cap (least found: 600).
+    # The requirement is 5; with exact dots the least ratio of any cap was 600.
     assert np.min(ratio) >= 100
 
 
@@ -103,13 +105,13 @@ def test_the_28_caps_of_8_3_1() -> None:
         (Oscillation(0.15, 30.0, 0.004), 0.0015),
     ],
 )
-def test_a_dent_and_an_oscillation_are_followed(term: Term, rms_mm: float) -> None:
+def test_dent_and_oscillation_are_reconstructed(term: Term, rms_mm: float) -> None:
     pool = egg(6.6, 3.2, 4.2, 0.3, terms=(term,))
-    made, match = fitted(pool)
+    reconstruction, match = fitted(pool)
     xy = inside(pool)
-    error = made.unbounded.height(*xy.T) - pool.height(*xy.T)
+    error = reconstruction.unbounded.height(*xy.T) - pool.height(*xy.T)
     assert np.sqrt(np.mean(error**2)) < rms_mm
-    measures = measure_surface(made, match, OPEN_RIG)
+    measures = measure_surface(reconstruction, match, OPEN_RIG)
     assert measures.height_mm == pytest.approx(pool.size.height_mm, abs=0.01)
     assert measures.width_mm == pytest.approx(pool.size.width_mm, rel=0.02)
     assert measures.length_mm == pytest.approx(pool.size.length_mm, rel=0.02)
@@ -117,33 +119,33 @@ def test_a_dent_and_an_oscillation_are_followed(term: Term, rms_mm: float) -> No
 
 def test_points_residuals_and_boundary_belong_to_the_surface() -> None:
     pool = ellipsoidal_cap(6.4, 7.4, 0.35, (0.3, -0.2))
-    made, match = fitted(pool)
-    assert made.scheme == "fit"
-    np.testing.assert_array_equal(made.ray, match.ray)
-    x, y, z = made.points_mm.T
-    np.testing.assert_allclose(z, made.unbounded.height(x, y), atol=1e-6)
+    reconstruction, match = fitted(pool)
+    assert reconstruction.scheme == "fit"
+    np.testing.assert_array_equal(reconstruction.ray, match.ray)
+    x, y, z = reconstruction.points_mm.T
+    np.testing.assert_allclose(z, reconstruction.unbounded.height(x, y), atol=1e-6)
     true = trace(pool, OPEN_RIG).point_mm[tuple(match.ray.T - 1)]
-    np.testing.assert_allclose(made.points_mm, true, atol=0.02)
-    assert np.linalg.norm(made.residual_mm, axis=-1).max() < 0.02
-    outline = made.boundary.points_mm
+    np.testing.assert_allclose(reconstruction.points_mm, true, atol=0.02)
+    assert np.linalg.norm(reconstruction.residual_mm, axis=-1).max() < 0.02
+    outline = reconstruction.boundary.points_mm
     np.testing.assert_allclose(outline[:, 2], 0.0, atol=1e-12)
-    np.testing.assert_allclose(made.surface.height(*outline[:, :2].T), 0.0, atol=1e-6)
-    assert made.boundary.contains(x, y).mean() > 0.97
-    # Beyond the boundary there is no surface, though its splines go on.
-    beyond = outline[:, :2] + 1e-3 * (outline[:, :2] - made.boundary.center_mm)
-    assert np.isfinite(made.unbounded.height(*beyond.T)).all()
-    assert np.isnan(made.surface.height(*beyond.T)).all()
-    assert np.isnan(made.surface.gradient(*beyond.T)).all()
+    np.testing.assert_allclose(reconstruction.surface.height(*outline[:, :2].T), 0.0, atol=1e-6)
+    assert reconstruction.boundary.contains(x, y).mean() > 0.97
+    # Beyond the boundary there is no surface, though its splines continue.
+    beyond = outline[:, :2] + 1e-3 * (outline[:, :2] - reconstruction.boundary.center_mm)
+    assert np.isfinite(reconstruction.unbounded.height(*beyond.T)).all()
+    assert np.isnan(reconstruction.surface.height(*beyond.T)).all()
+    assert np.isnan(reconstruction.surface.gradient(*beyond.T)).all()
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seen", [spherical_cap(6.0, 0.35), egg(6.6, 3.2, 4.2, 0.3)])
-def test_the_uncertainty_of_sizes_is_their_spread_over_surfaces_as_likely(seen: Pool) -> None:
-    # Surfaces drawn from the covariance of the fit, each measured as a whole.
+def test_size_uncertainty_is_the_spread_over_the_posterior(seen: Pool) -> None:
+    # Surfaces drawn from the covariance of the fit, each measured.
     rng = np.random.default_rng(0)
-    pool_seen = trace(seen, OPEN_RIG)
-    match = exact_match(pool_seen, OPEN_RIG, sigma_mm=NOISE_MM, rng=rng)
-    made = fit.reconstruct(match, OPEN_RIG, FitSettings())
+    reflections = trace(seen, OPEN_RIG)
+    match = exact_match(reflections, OPEN_RIG, sigma_mm=NOISE_MM, rng=rng)
+    reconstruction = fit.reconstruct(match, OPEN_RIG, FitSettings())
     dots = match.plane_mm, match.plane_covariance_mm2
     pool = fit_pool(match.ray, *dots, match.witness, OPEN_RIG, FitSettings())
     sizes = []
@@ -152,16 +154,16 @@ def test_the_uncertainty_of_sizes_is_their_spread_over_surfaces_as_likely(seen: 
         change = dtbtrs(pool.factor, half, uplo="L", trans="T")[0]
         change += rng.normal(0.0, pool.level.sigma_mm) - pool.mean_splines @ change
         surface = SplineSurface(pool.surface.basis, pool.surface.coefficients + change)
-        center = made.boundary.center_mm
+        center = reconstruction.boundary.center_mm
         boundary, _ = trace_boundary(surface.basis, surface.coefficients, pool.level, center)
         sizes.append(np.append(surface_sizes(surface, boundary)[0], shape_of(surface, boundary)))
-    np.testing.assert_allclose(np.std(sizes, axis=0)[:3], made.size_sigma[:3], rtol=0.2)
-    np.testing.assert_allclose(np.std(sizes, axis=0)[4:], made.size_sigma[4:], rtol=0.2)
-    assert np.isnan(made.size_sigma[3])  # the lowest point is on the rim
+    np.testing.assert_allclose(np.std(sizes, axis=0)[:3], reconstruction.size_sigma[:3], rtol=0.2)
+    np.testing.assert_allclose(np.std(sizes, axis=0)[4:], reconstruction.size_sigma[4:], rtol=0.2)
+    assert np.isnan(reconstruction.size_sigma[3])  # the lowest point is on the rim
 
 
 def random_pool(rng: np.random.Generator, kind: int) -> Pool:
-    """Caps, ellipses, eggs and concave caps by turns, off the origin by up to half a millimetre."""
+    """Return a cap, ellipse, egg or concave cap, up to 0.5 mm off the origin in X and Y."""
     width = rng.uniform(4.5, 8.0)
     peak = width * rng.uniform(0.03, 0.1)
     center = (rng.uniform(-0.5, 0.5), rng.uniform(-0.5, 0.5))
@@ -182,7 +184,7 @@ def area(pool: Pool) -> float:
 
 
 def volume(pool: Pool) -> float:
-    """By the midpoint rule on a fine grid, mm³."""
+    """Return the volume by the midpoint rule on a fine grid, mm³."""
     center, reach = pool.footprint.center_mm, 6.0
     axis = (np.arange(240) + 0.5) / 240 * 2 * reach - reach
     z = pool.height(*np.meshgrid(center[0] + axis, center[1] + axis))
@@ -190,22 +192,22 @@ def volume(pool: Pool) -> float:
 
 
 @pytest.mark.slow
-def test_uncertainties_are_honest() -> None:
-    # 240 such pools: 97.5 % of heights within ±1.96 σ; RMS of error/σ 0.75 … 0.80 for width,
-    # length, height and area.
+def test_uncertainties_cover_the_errors() -> None:
+    # With 240 pools, 97.5 % of heights were within ±1.96 σ, and the RMS of error/σ was 0.75 to
+    # 0.80 for width, length, height and area.
     rng = np.random.default_rng(0)
-    within, surprise = [], []
+    within, normalized_errors = [], []
     for k in range(40):
         pool = random_pool(rng, k % 4)
-        made, match = fitted(pool, NOISE_MM, rng)
-        error = made.points_mm[:, 2] - pool.height(*made.points_mm[:, :2].T)
+        reconstruction, match = fitted(pool, NOISE_MM, rng)
+        error = reconstruction.points_mm[:, 2] - pool.height(*reconstruction.points_mm[:, :2].T)
         known = np.isfinite(error)
         assert known.mean() > 0.9
-        within.append(np.abs(error[known]) < 1.96 * made.sigma_mm[known])
-        measures, true = measure_surface(made, match, OPEN_RIG), pool.size
+        within.append(np.abs(error[known]) < 1.96 * reconstruction.sigma_mm[known])
+        measures, true = measure_surface(reconstruction, match, OPEN_RIG), pool.size
         convex = pool.peak_mm > 0
         sigma = measures.height_sigma_mm if convex else measures.depth_sigma_mm
-        surprise.append(
+        normalized_errors.append(
             [
                 (measures.width_mm - true.width_mm) / measures.width_sigma_mm,
                 (measures.length_mm - true.length_mm) / measures.length_sigma_mm,
@@ -215,7 +217,7 @@ def test_uncertainties_are_honest() -> None:
             ]
         )
     assert 0.87 < np.mean(np.concatenate(within)) < 0.995
-    rms = np.sqrt(np.mean(np.square(surprise), axis=0))
+    rms = np.sqrt(np.mean(np.square(normalized_errors), axis=0))
     assert rms.min() > 0.5
     assert rms.max() < 1.6
 
@@ -230,7 +232,7 @@ def test_uncertainty_grows_with_the_noise() -> None:
     assert sigma[2] > 1.25 * sigma[0]
 
 
-def test_the_same_dots_give_the_same_surface() -> None:
+def test_fit_is_reproducible() -> None:
     one, other = (
         fitted(egg(6.6, 3.0, 4.0, 0.3), NOISE_MM, np.random.default_rng(4))[0] for _ in range(2)
     )
@@ -238,9 +240,9 @@ def test_the_same_dots_give_the_same_surface() -> None:
     np.testing.assert_array_equal(one.boundary.points_mm, other.boundary.points_mm)
 
 
-def test_every_size_has_its_uncertainty_where_the_pool_ends_near_what_is_fitted() -> None:
-    # The torch hides the last two rows: the fitted rectangle reaches just beyond the pool's end,
-    # which one σ away lies outside it.
+def test_sizes_have_uncertainties_where_last_rows_are_hidden() -> None:
+    # The torch hides the last two rows: the fitted rectangle ends just beyond the pool's end,
+    # which would be outside if it were one σ farther out.
     rng = np.random.default_rng(1)
     pool = egg(7.16, 3.78, 4.62, 0.131)
     match = exact_match(trace(pool, OPEN_RIG), OPEN_RIG, sigma_mm=0.12, rng=rng)
@@ -256,23 +258,23 @@ def test_every_size_has_its_uncertainty_where_the_pool_ends_near_what_is_fitted(
         plane_covariance_mm2=match.plane_covariance_mm2[~hidden],
         witness=witness,
     )
-    made = fit.reconstruct(match, OPEN_RIG, FitSettings())
-    size = measure_surface(made, match, OPEN_RIG)
+    reconstruction = fit.reconstruct(match, OPEN_RIG, FitSettings())
+    size = measure_surface(reconstruction, match, OPEN_RIG)
     sigmas = {name: value for name, value in vars(size).items() if "_sigma_" in name}
-    # The lowest point is on the boundary.
+    # The depth has none: the lowest point is on the boundary.
     assert all(np.isfinite(sigmas[name]) for name in sigmas if not name.startswith("depth"))
     assert 0 < size.volume_sigma_mm3 < 0.2 * size.volume_mm3
 
 
-def test_the_set_up_s_part_is_that_of_the_nearest_sizes_within_a_tenth() -> None:
+def test_setup_part_is_that_of_the_nearest_sizes_within_10_percent() -> None:
     sizes = np.array([6.0, 7.0, 0.3, -0.01, 30.0, 5.0])
-    parts = tuple(fit.SetupPart(np.full(6, by), by * sizes) for by in (1.0, 1.08, 1.3))
+    parts = tuple(fit.SetupPart(np.full(6, factor), factor * sizes) for factor in (1.0, 1.08, 1.3))
     assert fit.nearest_part((), sizes) is None
-    for by, wanted in ((1.0, 1.0), (1.05, 1.08), (1.25, 1.3)):
-        part = fit.nearest_part(parts, by * sizes)
+    for factor, expected in ((1.0, 1.0), (1.05, 1.08), (1.25, 1.3)):
+        part = fit.nearest_part(parts, factor * sizes)
         assert part is not None
-        assert part.sigma[0] == wanted
+        assert part.sigma[0] == expected
     assert fit.nearest_part(parts, 0.85 * sizes) is None
-    depth = np.eye(6)[3]  # its change is one of the height's
+    depth = np.eye(6)[3]  # depth is compared on the scale of the height
     assert fit.nearest_part(parts[:1], sizes - 0.02 * depth) is parts[0]
     assert fit.nearest_part(parts[:1], sizes - 0.04 * depth) is None

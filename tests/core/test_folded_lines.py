@@ -1,4 +1,4 @@
-"""Lines that a hollow pool folds or gathers to spots, and short ends of lines."""
+"""Lines that a concave pool folds or focuses to spots, and short ends of lines."""
 
 from __future__ import annotations
 
@@ -39,22 +39,22 @@ def test_each_line_is_found_once(tmp_path, number: int, sign: int):
     center = rng.uniform(-0.2, 0.2), rng.uniform(-0.2, 0.2)
     pool = egg(width, head, length - head, sign * rng.uniform(0.1, 0.4), center)
     true = render_lines(pool, rig, VIEW, LineLook(gaps=2), rng)
-    seen = number_lines(find_lines(true.image), 5)
+    numbered = number_lines(find_lines(true.image), 5)
     nearest = []
-    for one in seen.lines:
-        away = {
+    for one in numbered.lines:
+        distance = {
             line.number: np.median(
                 np.linalg.norm(one.image_px[:, None] - line.image_px, axis=-1).min(axis=1)
             )
             for line in true.lines
         }
-        best = min(away, key=lambda k: away[k])
-        assert away[best] < 4.0
+        best = min(distance, key=lambda k: distance[k])
+        assert distance[best] < 4.0
         nearest.append(best)
     assert nearest == ([1, 2, 3, 4, 5] if sign > 0 else [5, 4, 3, 2, 1])
 
 
-def test_a_frame_of_very_many_ridges(monkeypatch):
+def test_ridges_of_a_very_noisy_frame(monkeypatch):
     monkeypatch.setattr(ridges_module, "SEED", 1.0)
     monkeypatch.setattr(ridges_module, "FLOOR", 0.5)
     noise = np.random.default_rng(1).normal(100, 30, (900, 900)).astype(np.float32)
@@ -63,7 +63,7 @@ def test_a_frame_of_very_many_ridges(monkeypatch):
     assert len(ridges.height) == len(ridges.image_px)
 
 
-def test_places_beyond_what_one_call_takes():
+def test_sampling_more_points_than_one_call_accepts():
     rng = np.random.default_rng(2)
     picture = rng.normal(size=(40, 50)).astype(np.float32)
     u, v = rng.integers(0, 50, 40000), rng.integers(0, 40, 40000)

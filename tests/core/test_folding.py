@@ -22,30 +22,32 @@ from labapp.studies.image_error import BENCH, VIEW, axes_of, rendered
 
 POOL = egg(6.0, 2.7, 3.4, 0.3)
 
-# The mirror leans over the bench at 45° and turns the light up to a level sheet of paper.
+# The mirror is inclined at 45° and reflects the light up to a level sheet of paper.
 MIRROR = FoldingMirror(np.array([0.0, -30.0, 20.0]), np.array([0.0, 2.0, 2.0]))
 LEVEL = ImagingPlane.of_angles(np.array([-50.8, -52.0, 45.0]), (90.0, 0.0, 0.0))
 
 
 def folded_paths(rig: Rig, plane: ImagingPlane, mirror: FoldingMirror) -> FloatArray:
-    """Where rays from the pool land on a plane by way of a mirror, (X′, Z′), (rows, columns, 2)."""
-    seen = trace(POOL, rig)
+    """Return the dots (X′, Z′) of rays reflected to a plane by a mirror, (rows, columns, 2)."""
+    reflections = trace(POOL, rig)
     unit = mirror.normal / np.linalg.norm(mirror.normal)
-    start, way = seen.point_mm, seen.reflected
-    t = ((mirror.point_mm - start) @ unit) / (way @ unit)
-    face = start + np.where(t > 0, t, np.nan)[..., None] * way
-    after = way - 2 * (way @ unit)[..., None] * unit
+    start, direction = reflections.point_mm, reflections.reflected
+    t = ((mirror.point_mm - start) @ unit) / (direction @ unit)
+    on_mirror = start + np.where(t > 0, t, np.nan)[..., None] * direction
+    folded = direction - 2 * (direction @ unit)[..., None] * unit
     normal = np.cross(plane.x_axis, plane.z_axis)
-    u = ((plane.origin_mm - face) @ normal) / (after @ normal)
-    place = face + np.where(u > 0, u, np.nan)[..., None] * after - plane.origin_mm
+    u = ((plane.origin_mm - on_mirror) @ normal) / (folded @ normal)
+    place = on_mirror + np.where(u > 0, u, np.nan)[..., None] * folded - plane.origin_mm
     return np.where(
-        seen.hit[..., None], np.stack([place @ plane.x_axis, place @ plane.z_axis], -1), np.nan
+        reflections.hit[..., None],
+        np.stack([place @ plane.x_axis, place @ plane.z_axis], -1),
+        np.nan,
     )
 
 
 @pytest.mark.parametrize("normal", [(0.0, 1.0, 0.3), (-0.4, -1.0, -0.2), (0.5, 0.5, 0.0)])
 @pytest.mark.parametrize("angles", [(0.0, 0.0, 0.0), (12.0, -9.0, 170.0)])
-def test_a_pool_is_measured_by_way_of_a_mirror(
+def test_pool_is_measured_via_a_mirror(
     normal: tuple[float, float, float], angles: tuple[float, float, float]
 ) -> None:
     mirror = FoldingMirror(np.array([0.0, -25.0, 15.0]), np.array(normal))
@@ -57,19 +59,19 @@ def test_a_pool_is_measured_by_way_of_a_mirror(
     true = folded_paths(rig, paper, mirror)[tuple(match.ray.T - 1)]
     assert len(match.ray) > 60
     np.testing.assert_allclose(match.plane_mm, true, atol=1e-9)
-    made = fit.reconstruct(match, rig, FitSettings())
-    sizes = measure_surface(made, match, rig)
+    reconstruction = fit.reconstruct(match, rig, FitSettings())
+    sizes = measure_surface(reconstruction, match, rig)
     assert sizes.height_mm == pytest.approx(POOL.size.height_mm, rel=0.02)
     assert sizes.width_mm == pytest.approx(6.0, rel=0.02)
 
 
-def test_by_45_degrees_a_level_plane_becomes_an_upright_one() -> None:
+def test_mirror_at_45_degrees_turns_a_level_plane_upright() -> None:
     image = MIRROR.image_of(LEVEL)
     np.testing.assert_allclose(pose_of(image), [55, 50.8, 42, 0, 0, 0], atol=1e-9)
 
 
 @pytest.mark.parametrize("angles", [(0.0, 0.0, 0.0), (30.0, -20.0, 170.0), (-50.0, 120.0, -95.0)])
-def test_a_pose_is_what_its_angles_make(angles: tuple[float, float, float]) -> None:
+def test_pose_has_the_angles_of_its_plane(angles: tuple[float, float, float]) -> None:
     plane = ImagingPlane.of_angles(np.array([-4.0, -30.0, 5.0]), angles)
     np.testing.assert_allclose(pose_of(plane), [30, 4, 5, *angles], atol=1e-9)
     again = plane_of(pose_of(MIRROR.image_of(MIRROR.image_of(plane))), plane)
@@ -77,22 +79,22 @@ def test_a_pose_is_what_its_angles_make(angles: tuple[float, float, float]) -> N
 
 
 @pytest.mark.parametrize("angles", [(90.0, 0.0, 0.0), (90.0, 40.0, 0.0), (-90.0, 10.0, 30.0)])
-def test_a_level_plane_has_angles(angles: tuple[float, float, float]) -> None:
+def test_level_plane_has_angles(angles: tuple[float, float, float]) -> None:
     plane = ImagingPlane.of_angles(np.zeros(3), angles)
     again = ImagingPlane.of_angles(np.zeros(3), plane.angles_deg)
     np.testing.assert_allclose(again.pose_mm[:4], plane.pose_mm[:4], atol=1e-9)
 
 
-def test_what_is_not_known_of_the_mirror_doubles_in_the_image() -> None:
-    nothing, known = np.zeros(6), np.zeros(3)
-    np.testing.assert_allclose(image_sigma(LEVEL, MIRROR, nothing, known), 0)
-    tilted = image_sigma(LEVEL, MIRROR, nothing, np.array([0.0, 0.5, 0.5]))
+def test_mirror_uncertainty_doubles_in_the_image() -> None:
+    zero, known = np.zeros(6), np.zeros(3)
+    np.testing.assert_allclose(image_sigma(LEVEL, MIRROR, zero, known), 0)
+    tilted = image_sigma(LEVEL, MIRROR, zero, np.array([0.0, 0.5, 0.5]))
     assert tilted[3] == pytest.approx(1.0, rel=0.01)  # pitch
-    shifted = image_sigma(LEVEL, MIRROR, nothing, np.array([0.5, 0.0, 0.0]))
+    shifted = image_sigma(LEVEL, MIRROR, zero, np.array([0.5, 0.0, 0.0]))
     np.testing.assert_allclose(np.linalg.norm(shifted[:3]), 1.0, rtol=1e-3)
-    own = image_sigma(LEVEL, MIRROR, np.array([0.1, 0.2, 0.3, 0, 0, 0]), known)
-    # Up and along change places in a mirror at 45°.
-    np.testing.assert_allclose(own[:3], [0.3, 0.2, 0.1], rtol=1e-3)
+    from_plane = image_sigma(LEVEL, MIRROR, np.array([0.1, 0.2, 0.3, 0, 0, 0]), known)
+    # A mirror at 45° exchanges the vertical and the longitudinal direction.
+    np.testing.assert_allclose(from_plane[:3], [0.3, 0.2, 0.1], rtol=1e-3)
 
 
 @pytest.mark.slow
@@ -100,25 +102,25 @@ def test_what_is_not_known_of_the_mirror_doubles_in_the_image() -> None:
 def test_frames_on_a_plane_tilted_by_30_degrees(pitch_deg: float) -> None:
     upright = BENCH.imaging_plane
     tilted = ImagingPlane.of_angles(upright.origin_mm, (pitch_deg, 0.0, 0.0))
-    middle = upright.to_universal(np.array([50.8, 45.0])) - tilted.to_universal(
+    shift = upright.to_universal(np.array([50.8, 45.0])) - tilted.to_universal(
         np.array([50.8, 45.0])
     )
-    tilted = replace(tilted, origin_mm=tilted.origin_mm + middle)
+    tilted = replace(tilted, origin_mm=tilted.origin_mm + shift)
     rig = replace(BENCH, imaging_plane=tilted)
     frame = rendered(POOL, rig, 0)
-    found = measure(frame.image, Bench(rig, axes_of(VIEW).calibration), Settings())[0]
-    assert found.status == "ok", found.reason
-    assert found.match is not None
-    assert found.measures is not None
-    own = frame.dot_px[tuple(found.match.ray.T - 1)]
-    assert found.dots is not None
-    assert np.linalg.norm(found.dots.image_px[found.match.dot] - own, axis=-1).max() < 2
-    assert found.measures.height_mm == pytest.approx(POOL.size.height_mm, rel=0.03)
-    assert found.measures.width_mm == pytest.approx(6.0, rel=0.03)
+    result = measure(frame.image, Bench(rig, axes_of(VIEW).calibration), Settings())[0]
+    assert result.status == "ok", result.reason
+    assert result.match is not None
+    assert result.measures is not None
+    true_px = frame.dot_px[tuple(result.match.ray.T - 1)]
+    assert result.dots is not None
+    assert np.linalg.norm(result.dots.image_px[result.match.dot] - true_px, axis=-1).max() < 2
+    assert result.measures.height_mm == pytest.approx(POOL.size.height_mm, rel=0.03)
+    assert result.measures.width_mm == pytest.approx(6.0, rel=0.03)
 
 
 @pytest.mark.slow
-def test_the_camera_may_see_the_other_side_of_the_paper() -> None:
+def test_camera_may_view_the_back_of_the_paper() -> None:
     frame = rendered(POOL, BENCH, 0)
     last = frame.image.shape[1] - 1
     points = [(last - u, v) for u, v in (VIEW.origin_px, VIEW.x_axis_px, VIEW.z_axis_px)]
@@ -126,7 +128,7 @@ def test_the_camera_may_see_the_other_side_of_the_paper() -> None:
         points[0], points[1], VIEW.x_axis_mm, points[2], VIEW.z_axis_mm
     )
     mirrored = np.ascontiguousarray(frame.image[:, ::-1])
-    found = measure(mirrored, Bench(BENCH, calibration), Settings())[0]
-    assert found.status == "ok", found.reason
-    assert found.measures is not None
-    assert found.measures.height_mm == pytest.approx(POOL.size.height_mm, rel=0.03)
+    result = measure(mirrored, Bench(BENCH, calibration), Settings())[0]
+    assert result.status == "ok", result.reason
+    assert result.measures is not None
+    assert result.measures.height_mm == pytest.approx(POOL.size.height_mm, rel=0.03)

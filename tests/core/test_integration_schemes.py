@@ -26,45 +26,45 @@ def match_of(pool):
 def test_zonal_heights_of_a_quadric_are_exact():
     # Between two points of a quadric the height changes by the mean of their slopes.
     rays = reflected_rays(match_of(POOLS[0]), OPEN_BENCH)
-    x, y = place = rays.points(rays.distance_at(0.0))[:, :2].T
+    x, y = xy = rays.points(rays.distance_at(0.0))[:, :2].T
     height = 0.03 * x - 0.05 * x**2 + 0.02 * x * y - 0.03 * y**2
     gradient = np.stack([0.03 - 0.1 * x + 0.02 * y, 0.02 * x - 0.06 * y], axis=-1)
-    found = zonal.heights(rays, place.T, gradient)
-    np.testing.assert_allclose(found - found.mean(), height - height.mean(), atol=1e-9)
+    heights = zonal.heights(rays, xy.T, gradient)
+    np.testing.assert_allclose(heights - heights.mean(), height - height.mean(), atol=1e-9)
 
 
 @pytest.mark.parametrize("order", [3, 4, 6])
 def test_modal_heights_of_a_polynomial_are_exact(order: int):
     rng = np.random.default_rng(2)
-    x, y = place = rng.uniform(-3, 3, (2, 80))
+    x, y = xy = rng.uniform(-3, 3, (2, 80))
     height = 0.01 * x**3 - 0.02 * x * y**2 + 0.1 * y
     gradient = np.stack([0.03 * x**2 - 0.02 * y**2, -0.04 * x * y + 0.1], axis=-1)
-    found = modal.heights(place.T, gradient, order)
-    np.testing.assert_allclose(found - found.mean(), height - height.mean(), atol=1e-9)
+    heights = modal.heights(xy.T, gradient, order)
+    np.testing.assert_allclose(heights - heights.mean(), height - height.mean(), atol=1e-9)
 
 
 def test_modal_order_is_lower_with_few_points():
-    # Nine points bear six polynomials: those of order 2. A cubic is not among them.
-    place = np.stack(np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]), axis=-1).reshape(-1, 2)
-    gradient = np.stack([3 * place[:, 0] ** 2, 0 * place[:, 1]], axis=-1)
-    found = modal.heights(place, gradient, 6)
-    assert np.abs(found - found.mean() - place[:, 0] ** 3).max() > 0.1
+    # Nine points allow six polynomials, those up to order 2. A cubic is not among them.
+    xy = np.stack(np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]), axis=-1).reshape(-1, 2)
+    gradient = np.stack([3 * xy[:, 0] ** 2, 0 * xy[:, 1]], axis=-1)
+    heights = modal.heights(xy, gradient, 6)
+    assert np.abs(heights - heights.mean() - xy[:, 0] ** 3).max() > 0.1
 
 
 @pytest.mark.parametrize("pool", POOLS, ids=["cap", "egg"])
 @pytest.mark.parametrize("scheme", ["zonal", "modal"])
 def test_surfaces_are_near_the_true_ones(scheme: str, pool):
     match = match_of(pool)
-    made = reconstruct(match, OPEN_BENCH, Settings(scheme=scheme))
-    assert made.scheme == scheme
-    measures = measure_surface(made, match, OPEN_BENCH)
+    reconstruction = reconstruct(match, OPEN_BENCH, Settings(scheme=scheme))
+    assert reconstruction.scheme == scheme
+    measures = measure_surface(reconstruction, match, OPEN_BENCH)
     assert measures.height_mm == pytest.approx(pool.size.height_mm, rel=0.04)
-    true = pool.height(*made.points_mm[:, :2].T)
-    assert np.abs(made.points_mm[:, 2] - true).max() < 0.03
+    true = pool.height(*reconstruction.points_mm[:, :2].T)
+    assert np.abs(reconstruction.points_mm[:, 2] - true).max() < 0.03
 
 
 @pytest.mark.parametrize("scheme", ["zonal", "modal"])
-def test_few_dots_are_refused(scheme: str):
+def test_few_dots_are_rejected(scheme: str):
     match = match_of(POOLS[0])
     few = replace(
         match,
@@ -82,7 +82,7 @@ def test_few_dots_are_refused(scheme: str):
     ],
     ids=["zonal", "modal"],
 )
-def test_the_circle_is_a_boundary_of_both(settings: Settings):
+def test_both_schemes_accept_a_circular_boundary(settings: Settings):
     boundary = reconstruct(match_of(POOLS[1]), OPEN_BENCH, settings).boundary
     radius = np.linalg.norm(boundary.points_mm[:, :2] - boundary.center_mm, axis=-1)
     np.testing.assert_allclose(radius, radius[0], atol=1e-9)

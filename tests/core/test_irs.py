@@ -1,4 +1,4 @@
-"""Interpolation scheme: base points, its four algorithms, and odd sets of dots."""
+"""Interpolation scheme: base points, its four algorithms, and incomplete sets of dots."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ def match_of(pool, **noise):
     return exact_match(trace(pool, RIG), RIG, **noise)
 
 
-def without(match, gone):
-    """The match without some of its dots, given as a mask."""
-    kept = ~np.asarray(gone)
+def without(match, removed):
+    """Return the match without the dots of a mask."""
+    remaining = ~np.asarray(removed)
     return replace(
         match,
-        dot=match.dot[kept],
-        ray=match.ray[kept],
-        reflected=match.reflected[kept],
-        plane_mm=match.plane_mm[kept],
-        plane_covariance_mm2=match.plane_covariance_mm2[kept],
+        dot=match.dot[remaining],
+        ray=match.ray[remaining],
+        reflected=match.reflected[remaining],
+        plane_mm=match.plane_mm[remaining],
+        plane_covariance_mm2=match.plane_covariance_mm2[remaining],
     )
 
 
@@ -60,20 +60,20 @@ def test_depths_of_the_caps(algorithm, median):
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_the_boundary_lies_on_the_work_piece(algorithm):
+def test_boundary_is_on_the_work_piece(algorithm):
     match = match_of(egg(6.6, 3.0, 4.0, 0.35))
-    made = irs.reconstruct(match, RIG, irs.IrsSettings(algorithm=algorithm))
-    assert (made.boundary.points_mm[:, 2] == 0).all()
-    assert made.scheme == "irs"
-    assert made.points_mm.shape == (len(match.ray), 3)
+    reconstruction = irs.reconstruct(match, RIG, irs.IrsSettings(algorithm=algorithm))
+    assert (reconstruction.boundary.points_mm[:, 2] == 0).all()
+    assert reconstruction.scheme == "irs"
+    assert reconstruction.points_mm.shape == (len(match.ray), 3)
 
 
 def test_edge_points_start_on_the_work_piece():
     match = match_of(spherical_cap(6.0, 0.3))
-    # After one loop both ends of a row are the mean of 0 and what the other end gives.
-    made = irs.reconstruct(match, RIG, irs.IrsSettings(algorithm="epa-r", loops=1))
+    # After one loop each end of a row is the mean of 0 and the value from the other end.
+    reconstruction = irs.reconstruct(match, RIG, irs.IrsSettings(algorithm="epa-r", loops=1))
     for i in np.unique(match.ray[:, 0]):
-        row = made.points_mm[match.ray[:, 0] == i]
+        row = reconstruction.points_mm[match.ray[:, 0] == i]
         row = row[np.argsort(row[:, 0])]
         assert row[[0, -1], 2].sum() == pytest.approx(0.0, abs=0.03)
         assert row[len(row) // 2, 2] > 0
@@ -81,21 +81,21 @@ def test_edge_points_start_on_the_work_piece():
 
 def test_rows_and_columns_together_are_the_mean_of_both():
     match = match_of(spherical_cap(6.0, 0.3))
-    by = {
+    points = {
         name: irs.reconstruct(match, RIG, irs.IrsSettings(algorithm=name, loops=1)).points_mm
         for name in ("epa-r", "epa-c", "epa-rc")
     }
-    np.testing.assert_allclose(by["epa-rc"], (by["epa-r"] + by["epa-c"]) / 2, atol=1e-9)
+    np.testing.assert_allclose(points["epa-rc"], (points["epa-r"] + points["epa-c"]) / 2, atol=1e-9)
 
 
 @pytest.mark.parametrize("height", [-0.3, 0.0, 0.2])
-def test_the_base_point_stays_at_the_height_that_is_tried(height):
+def test_base_point_stays_at_the_trial_height(height):
     match = match_of(spherical_cap(6.0, 0.3))
-    made = irs.reconstruct(match, RIG, irs.IrsSettings(base_heights_mm=(height,)))
-    assert made.points_mm[irs.lower_left(match), 2] == pytest.approx(height)
+    reconstruction = irs.reconstruct(match, RIG, irs.IrsSettings(base_heights_mm=(height,)))
+    assert reconstruction.points_mm[irs.lower_left(match), 2] == pytest.approx(height)
 
 
-def test_of_all_heights_the_least_are_unless_they_explain_the_dots_equally_well():
+def test_base_height_has_least_are_or_is_zero_within_the_margin():
     match = match_of(spherical_cap(6.0, -0.3))
     heights = (-0.5, -0.2, 0.0, 0.3)
 
@@ -108,13 +108,13 @@ def test_of_all_heights_the_least_are_unless_they_explain_the_dots_equally_well(
     assert are(*heights, margin=10.0) == each[0.0]
 
 
-def test_the_base_point_is_the_lower_left_dot():
+def test_base_point_is_the_lower_left_dot():
     match = match_of(spherical_cap(6.0, 0.3))
     lowest = match.reflected[:, 0] == 1
     by_number = irs.lower_left(match)
     assert lowest[by_number]
     assert match.plane_mm[by_number, 0] == match.plane_mm[lowest, 0].min()
-    # Without numbers the imaging plane tells the same.
+    # Without numbers the positions on the imaging plane give the same dot.
     unnumbered = replace(match, reflected=np.zeros_like(match.reflected))
     assert irs.lower_left(unnumbered) == by_number
     # On an inverse pool it is the ray nearest the head.
@@ -123,7 +123,7 @@ def test_the_base_point_is_the_lower_left_dot():
     assert inverse.ray[irs.lower_left(inverse), 0] == inverse.ray[:, 0].max()
 
 
-def test_more_loops_never_leave_a_larger_are():
+def test_more_loops_never_increase_the_are():
     match = match_of(egg(6.6, 3.0, 4.0, 0.35))
     are = [
         irs.reconstruct(match, RIG, irs.IrsSettings(algorithm="epa-rc", loops=loops)).own_are_mm
@@ -136,21 +136,21 @@ def test_more_loops_never_leave_a_larger_are():
 @examples(max_examples=25)
 @given(st.integers(0, 10_000), st.sampled_from([0.1, 0.3, 0.6, 0.9]), st.sampled_from(ALGORITHMS))
 @pytest.mark.slow
-def test_odd_sets_of_dots_are_measured_or_refused(seed, share, algorithm):
+def test_random_subsets_of_dots_are_measured_or_rejected(seed, share, algorithm):
     rng = np.random.default_rng(seed)
     match = match_of(egg(6.6, 3.0, 4.0, rng.choice([-0.5, 0.4])), sigma_mm=0.1, rng=rng)
     match = without(match, rng.random(len(match.ray)) > share)
     settings = irs.IrsSettings(algorithm=algorithm, loops=10, base_heights_mm=(0.0, 0.2))
     try:
-        made = irs.reconstruct(match, RIG, settings)
+        reconstruction = irs.reconstruct(match, RIG, settings)
     except CannotMeasure as error:
         assert error.status in {"too-few-dots", "no-surface", "no-boundary"}  # noqa: PT017 - or an answer
     else:
-        assert np.isfinite(made.points_mm).all()
-        assert np.isfinite(measure_surface(made, match, RIG).volume_mm3)
+        assert np.isfinite(reconstruction.points_mm).all()
+        assert np.isfinite(measure_surface(reconstruction, match, RIG).volume_mm3)
 
 
-def test_too_few_dots_are_refused():
+def test_too_few_dots_are_rejected():
     match = match_of(spherical_cap(6.0, 0.3))
     for algorithm in ALGORITHMS:
         with pytest.raises(CannotMeasure, match="too-few-dots"):

@@ -1,4 +1,4 @@
-"""The compiled loops give what NumPy, SciPy and OpenCV give, written down in another way."""
+"""The compiled loops agree with independent NumPy, SciPy and OpenCV implementations."""
 
 from __future__ import annotations
 
@@ -57,36 +57,36 @@ def random() -> np.random.Generator:
 
 
 def surface() -> SplineSurface:
-    """A dome with bumps, 0.3 mm high."""
+    """Return a bumpy dome, 0.3 mm high."""
     x, y = np.random.default_rng(3).uniform(BASIS.low_mm, BASIS.high_mm, (4 * COUNT, 2)).T
     z = 0.3 - 0.02 * (x**2 + 0.8 * y**2) + 0.01 * np.sin(2 * x) * np.cos(y)
     return SplineSurface(BASIS, np.linalg.lstsq(BASIS.matrix(x, y), z, rcond=None)[0])
 
 
 def landings() -> tuple[FloatArray, FloatArray]:
-    """Rays, and where they land on z = 0, shapes (n, 3)."""
+    """Return rays, and their intersections with z = 0, shapes (n, 3)."""
     rays = ray_directions(RIG.laser, RIG.pattern).reshape(-1, 3)
     return rays, intersect_level(LASER, rays)
 
 
-def test_splines_and_surfaces_are_those_of_the_basis() -> None:
-    # Some places lie beyond the rectangle, whose edge they are held to.
-    place = random().uniform(BASIS.low_mm - 0.5, BASIS.high_mm + 0.5, (200, 2))
-    held = np.clip(place, BASIS.low_mm, BASIS.high_mm)
-    splines, values = spline_kernels.splines_at(BASIS.grid, place)
-    for of, (dx, dy) in zip(values, ((0, 0), (1, 0), (0, 1)), strict=True):
-        matrix = np.zeros((len(place), COUNT))
-        np.put_along_axis(matrix, splines, of, axis=1)
-        np.testing.assert_allclose(matrix, BASIS.matrix(*held.T, dx, dy), atol=1e-12)
-    made = spline_kernels.surface_at(BASIS.grid, surface().coefficients, place)
-    height, gradient = surface().height_and_gradient(*held.T)
-    np.testing.assert_allclose(made, [height, *gradient.T], atol=1e-12)
-    share = random().normal(size=len(place))
-    summed = spline_kernels.gradient_of_sum(BASIS.grid, COUNT, place, share)
-    np.testing.assert_allclose(summed, share @ BASIS.matrix(*held.T), atol=1e-12)
+def test_splines_and_surfaces_agree_with_the_basis() -> None:
+    # Points outside the rectangle are moved to its edge.
+    xy = random().uniform(BASIS.low_mm - 0.5, BASIS.high_mm + 0.5, (200, 2))
+    inside = np.clip(xy, BASIS.low_mm, BASIS.high_mm)
+    splines, values = spline_kernels.splines_at(BASIS.grid, xy)
+    for value, (dx, dy) in zip(values, ((0, 0), (1, 0), (0, 1)), strict=True):
+        matrix = np.zeros((len(xy), COUNT))
+        np.put_along_axis(matrix, splines, value, axis=1)
+        np.testing.assert_allclose(matrix, BASIS.matrix(*inside.T, dx, dy), atol=1e-12)
+    computed = spline_kernels.surface_at(BASIS.grid, surface().coefficients, xy)
+    height, gradient = surface().height_and_gradient(*inside.T)
+    np.testing.assert_allclose(computed, [height, *gradient.T], atol=1e-12)
+    share = random().normal(size=len(xy))
+    summed = spline_kernels.gradient_of_sum(BASIS.grid, COUNT, xy, share)
+    np.testing.assert_allclose(summed, share @ BASIS.matrix(*inside.T), atol=1e-12)
 
 
-def test_rays_meet_the_surface_and_their_dots_lie_where_the_optics_put_them() -> None:
+def test_intersection_and_reflection_agree_with_optics() -> None:
     rays, landing = landings()
     points, slopes, plane = ray_kernels.intersect_and_reflect(
         BASIS.grid, surface().coefficients, rays, landing, 6, PLANE.pose_mm
@@ -97,17 +97,19 @@ def test_rays_meet_the_surface_and_their_dots_lie_where_the_optics_put_them() ->
     height, gradient = surface().height_and_gradient(*points[known, :2].T)
     np.testing.assert_allclose(points[known, 2], height, atol=1e-9)
     np.testing.assert_allclose(slopes[known], gradient, atol=1e-6)  # before the last step
-    way = reflect(rays[known], surface_normal(slopes[known]))
+    direction = reflect(rays[known], surface_normal(slopes[known]))
     np.testing.assert_allclose(
-        plane[known], intersect_imaging_plane(points[known], way, PLANE), atol=1e-9
+        plane[known], intersect_imaging_plane(points[known], direction, PLANE), atol=1e-9
     )
-    own = rays[known], landing[known]
-    moved, most = solver_kernels.newton_along_rays(BASIS.grid, surface().coefficients, *own, 6)
+    known_rays = rays[known], landing[known]
+    moved, most = solver_kernels.newton_along_rays(
+        BASIS.grid, surface().coefficients, *known_rays, 6
+    )
     np.testing.assert_allclose(moved, points[known], atol=1e-12)
     assert most == np.abs(moved - landing[known]).max()
 
 
-def test_a_ray_that_runs_away_from_the_plane_has_no_dot() -> None:
+def test_ray_reflected_away_from_the_plane_has_no_dot() -> None:
     rays, landing = landings()
     steep = SplineSurface(BASIS, surface().coefficients + 8.0 * BASIS_Y)
     plane = ray_kernels.intersect_and_reflect(
@@ -120,7 +122,7 @@ BASIS_Y = np.tile((BASIS.y_knots[:-4] + BASIS.y_knots[4:]) / 2, BASIS.shape[0]) 
 
 
 def slopes_of_dots(points: FloatArray, plane_mm: FloatArray) -> FloatArray:
-    """∂(slopes at points)/∂(dots X′, Z′), shape (n, 2, 2), mm⁻¹, from how they change."""
+    """Return ∂(slopes at points)/∂(dots X′, Z′) by differences, shape (n, 2, 2), mm⁻¹."""
     dots = PLANE.to_universal(plane_mm)
     step = 1e-4
     ahead, behind = (
@@ -133,36 +135,40 @@ def slopes_of_dots(points: FloatArray, plane_mm: FloatArray) -> FloatArray:
     return (np.stack(ahead, axis=-1) - np.stack(behind, axis=-1)) / (2 * step)
 
 
-def test_slopes_weigh_as_the_covariance_of_their_dots_has_it() -> None:
+def test_slope_weights_invert_the_propagated_covariance() -> None:
     rng, (_, landing) = random(), landings()
-    seen = rng.uniform([10.0, 10.0], [80.0, 60.0], (len(landing), 2))
+    plane_mm = rng.uniform([10.0, 10.0], [80.0, 60.0], (len(landing), 2))
     half = rng.normal(0.0, 0.05, (len(landing), 2, 2))
     covariance, floor = half @ half.swapaxes(1, 2), 0.02
-    made = ray_kernels.slope_weights(
-        LASER, PLANE.pose_mm, landing, PLANE.to_universal(seen), covariance, floor
+    weights = ray_kernels.slope_weights(
+        LASER, PLANE.pose_mm, landing, PLANE.to_universal(plane_mm), covariance, floor
     )
-    jacobian = slopes_of_dots(landing, seen)
+    jacobian = slopes_of_dots(landing, plane_mm)
     spread = jacobian @ (covariance + floor**2 * np.eye(2)) @ jacobian.swapaxes(1, 2)
-    np.testing.assert_allclose(made @ spread, np.broadcast_to(np.eye(2), spread.shape), atol=5e-3)
+    np.testing.assert_allclose(
+        weights @ spread, np.broadcast_to(np.eye(2), spread.shape), atol=5e-3
+    )
 
 
-def test_dots_are_uncertain_by_what_the_coefficients_are() -> None:
+def test_dot_covariance_is_propagated_from_the_coefficients() -> None:
     rng = random()
     points = np.column_stack([rng.uniform(BASIS.low_mm, BASIS.high_mm, (60, 2)), np.zeros(60)])
     weights = np.tile(np.diag([4e4, 1e4]), (60, 1, 1))
     factor = normal_factor(BASIS, 10.0 * BASIS.roughness, points, weights)
     lower = sum(np.diag(line[: COUNT - k], -k) for k, line in enumerate(factor))
-    at, seen = points[:7], rng.uniform([10.0, 10.0], [80.0, 60.0], (7, 2))
-    made = solver_kernels.covariance_of_dots(
-        BASIS.grid, factor, LASER, PLANE.pose_mm, at, PLANE.to_universal(seen)
+    dot_points, plane_mm = points[:7], rng.uniform([10.0, 10.0], [80.0, 60.0], (7, 2))
+    covariance = solver_kernels.covariance_of_dots(
+        BASIS.grid, factor, LASER, PLANE.pose_mm, dot_points, PLANE.to_universal(plane_mm)
     )
-    slopes = np.stack([BASIS.matrix(*at[:, :2].T, 1, 0), BASIS.matrix(*at[:, :2].T, 0, 1)], axis=1)
-    parts = np.linalg.inv(slopes_of_dots(at, seen)) @ slopes
+    slopes = np.stack(
+        [BASIS.matrix(*dot_points[:, :2].T, 1, 0), BASIS.matrix(*dot_points[:, :2].T, 0, 1)], axis=1
+    )
+    parts = np.linalg.inv(slopes_of_dots(dot_points, plane_mm)) @ slopes
     expected = parts @ np.linalg.inv(lower @ lower.T) @ parts.swapaxes(1, 2)
-    np.testing.assert_allclose(made, expected, rtol=1e-4)
+    np.testing.assert_allclose(covariance, expected, rtol=1e-4)
 
 
-def test_surprises_are_those_of_the_normal_distribution() -> None:
+def test_pair_deviances_are_those_of_normal_distributions() -> None:
     rng = random()
     places, predicted = rng.normal(0.0, 1.0, (9, 2)), rng.normal(0.0, 1.0, (5, 2))
     half = rng.normal(0.0, 0.5, (9, 2, 2)), rng.normal(0.0, 0.5, (5, 2, 2))
@@ -174,12 +180,12 @@ def test_surprises_are_those_of_the_normal_distribution() -> None:
             np.testing.assert_allclose(
                 deviance[n, m], -2 * law.logpdf(places[n]) - 2 * np.log(2 * np.pi), rtol=1e-9
             )
-            whole = -2 * law.logpdf(places[n]) + 2 * law.logpdf(predicted[m])
-            np.testing.assert_allclose(distance[n, m], whole, rtol=1e-9)
+            excess = -2 * law.logpdf(places[n]) + 2 * law.logpdf(predicted[m])
+            np.testing.assert_allclose(distance[n, m], excess, rtol=1e-9)
 
 
-def test_the_two_least_are_those_of_the_sorted_values() -> None:
-    values = random().integers(0, 40, (9, 7)).astype(float)  # some are there twice
+def test_two_least_agrees_with_sorting() -> None:
+    values = random().integers(0, 40, (9, 7)).astype(float)  # with duplicates
     column, next_in_row, row, next_in_column = match_kernels.two_least(values)
     np.testing.assert_array_equal(column, values.argmin(axis=1))
     np.testing.assert_array_equal(row, values.argmin(axis=0))
@@ -189,75 +195,77 @@ def test_the_two_least_are_those_of_the_sorted_values() -> None:
     assert np.isinf(match_kernels.two_least(values[:, :1])[1]).all()
 
 
-def test_the_normal_equations_are_those_of_least_squares() -> None:
+def test_normal_equations_are_those_of_least_squares() -> None:
     rng = random()
     points = np.column_stack([rng.uniform(BASIS.low_mm, BASIS.high_mm, (60, 2)), np.zeros(60)])
     root = rng.normal(size=(60, 2, 2))
     weights = root @ np.swapaxes(root, 1, 2)
-    by = np.stack([BASIS.matrix(*points[:, :2].T, 1, 0), BASIS.matrix(*points[:, :2].T, 0, 1)], 1)
+    slope_matrix = np.stack(
+        [BASIS.matrix(*points[:, :2].T, 1, 0), BASIS.matrix(*points[:, :2].T, 0, 1)], 1
+    )
     band = 0.1 * BASIS.roughness
     rough = sum(np.diag(line[: COUNT - k], -k) for k, line in enumerate(band))
     rough += np.tril(rough, -1).T
-    normal = np.einsum("nap,nab,nbq->pq", by, weights, by) + rough
+    normal = np.einsum("nap,nab,nbq->pq", slope_matrix, weights, slope_matrix) + rough
     factor = normal_factor(BASIS, band, points, weights)
     lower = sum(np.diag(line[: COUNT - k], -k) for k, line in enumerate(factor))
-    held = lower @ lower.T - normal
-    middle = np.unravel_index(np.argmax(held), held.shape)
-    assert middle[0] == middle[1]
-    assert held[middle] == pytest.approx(np.trace(normal) / COUNT)
-    held[middle] = 0.0
-    np.testing.assert_allclose(held, 0.0, atol=1e-9 * normal.max())
+    difference = lower @ lower.T - normal
+    diagonal = np.unravel_index(np.argmax(difference), difference.shape)
+    assert diagonal[0] == diagonal[1]
+    assert difference[diagonal] == pytest.approx(np.trace(normal) / COUNT)
+    difference[diagonal] = 0.0
+    np.testing.assert_allclose(difference, 0.0, atol=1e-9 * normal.max())
     right = rng.normal(size=(2, COUNT))
     solved = np.linalg.solve(lower @ lower.T, right.T).T
     np.testing.assert_allclose(solver_kernels.solve(factor, right), solved, rtol=1e-6)
     indefinite = solver_kernels.normal_factor(BASIS.grid, -1e3 * BASIS.roughness, points, weights)
     assert not indefinite[1]
     dots_mm = PLANE.to_universal(rng.uniform([10.0, 10.0], [80.0, 60.0], (60, 2)))
-    asked = bisecting_gradient(points - LASER, dots_mm - points)
-    off = asked - surface().gradient(*points[:, :2].T)
+    required = bisecting_gradient(points - LASER, dots_mm - points)
+    residual = required - surface().gradient(*points[:, :2].T)
     np.testing.assert_allclose(
         solver_kernels.gradient_rhs(
             BASIS.grid, surface().coefficients, points, weights, LASER, PLANE.pose_mm, dots_mm
         ),
-        np.einsum("nap,nab,nb->p", by, weights, off),
+        np.einsum("nap,nab,nb->p", slope_matrix, weights, residual),
         atol=1e-9,
     )
 
 
-def test_a_step_solves_the_normal_equations_and_keeps_the_mean_height() -> None:
+def test_fit_step_solves_normal_equations_and_keeps_mean_height() -> None:
     rng = random()
     points = np.column_stack([rng.uniform(BASIS.low_mm, BASIS.high_mm, (60, 2)), np.zeros(60)])
     weights = np.tile(np.diag([4e4, 1e4]), (60, 1, 1))
     dots_mm = PLANE.to_universal(rng.uniform([10.0, 10.0], [80.0, 60.0], (60, 2)))
-    own, rough = surface().coefficients, rng.normal(0.0, 0.1, COUNT)
+    coefficients, rough = surface().coefficients, rng.normal(0.0, 0.1, COUNT)
     band = 10.0 * BASIS.roughness
     factor = normal_factor(BASIS, band, points, weights)
     half = sum(np.diag(line[: COUNT - k], -k) for k, line in enumerate(band))
     right = solver_kernels.gradient_rhs(
-        BASIS.grid, own, points, weights, LASER, PLANE.pose_mm, dots_mm
+        BASIS.grid, coefficients, points, weights, LASER, PLANE.pose_mm, dots_mm
     )
     right -= (half + np.tril(half, -1).T) @ rough
     change = solver_kernels.solve(factor, right[None])[0]
     change -= (BASIS.matrix(*points[:, :2].T) @ change).mean()
     bench = LASER, PLANE.pose_mm
-    made = solver_kernels.fit_step(
-        BASIS.grid, (band, factor), own, rough, points, weights, bench, dots_mm
+    stepped = solver_kernels.fit_step(
+        BASIS.grid, (band, factor), coefficients, rough, points, weights, bench, dots_mm
     )
-    np.testing.assert_allclose(made, own + change, atol=1e-9 * np.abs(change).max())
+    np.testing.assert_allclose(stepped, coefficients + change, atol=1e-9 * np.abs(change).max())
 
 
-def test_rays_are_between_others_that_are_lit_on_either_side() -> None:
+def test_between_needs_lit_rays_on_both_sides() -> None:
     lit = random().uniform(size=(9, 11)) < 0.2
-    wanted = np.zeros_like(lit)
+    expected = np.zeros_like(lit)
     for i, j in np.ndindex(lit.shape):
         row, column = lit[i], lit[:, j]
-        wanted[i, j] = (row[:j].any() and row[j + 1 :].any()) or (
+        expected[i, j] = (row[:j].any() and row[j + 1 :].any()) or (
             column[:i].any() and column[i + 1 :].any()
         )
-    np.testing.assert_array_equal(match_kernels.between(lit), wanted)
+    np.testing.assert_array_equal(match_kernels.between(lit), expected)
 
 
-def test_rays_are_amid_others_in_their_row_or_column() -> None:
+def test_amid_agrees_with_numpy() -> None:
     lit = random().uniform(size=(9, 7)) < 0.2
     lit[4] = False
     expected = np.zeros_like(lit)
@@ -268,74 +276,74 @@ def test_rays_are_amid_others_in_their_row_or_column() -> None:
     np.testing.assert_array_equal(match_kernels.amid(lit), expected)
 
 
-def test_a_guessed_level_has_the_outer_points_at_0() -> None:
+def test_guessed_level_puts_the_outer_points_at_0() -> None:
     height, outer = random().normal(1.0, 0.3, 12), np.arange(12) % 3 == 0
     guessed = level_kernels.guess_level(height, outer)
     expected = -height[outer].mean(), height.std(), height[~outer].mean()
     np.testing.assert_allclose(guessed, expected)
 
 
-def test_rays_are_hidden_by_the_torch_as_when_they_are_reflected_one_by_one() -> None:
+def test_behind_torch_agrees_with_reflected_rays() -> None:
     rays, landing = landings()
     points = landing + random().normal(0.0, 0.2, landing.shape)
     slopes = random().normal(0.0, 0.1, (len(rays), 2))
-    way = reflect(rays, surface_normal(slopes))
-    # On its way to or from the laser's side a ray is highest beside the torch where y is 0.
-    towards = np.where((points[:, 1] < 0)[:, None], -rays, way)
+    reflected = reflect(rays, surface_normal(slopes))
+    # Beside the torch a ray is highest at y = 0, before or after its reflection.
+    towards = np.where((points[:, 1] < 0)[:, None], -rays, reflected)
     height = points[:, 2] - points[:, 1] * towards[:, 2] / towards[:, 1]
     hidden = height > 2.4 - 0.3
     assert 10 < hidden.sum() < len(rays) - 10
     np.testing.assert_array_equal(ray_kernels.behind_torch(points, rays, slopes, 2.4), hidden)
 
 
-def test_frames_follow_on_each_other_by_the_least_squares_recurrence() -> None:
+def test_recurrence_is_ridge_least_squares() -> None:
     slopes, rays, order = random().normal(0.0, 1.0, (30, 40, 2)), np.arange(0, 40, 3), 4
-    own = slopes[:, rays].reshape(30, -1)
-    own = own - own.mean(axis=0)
-    before = np.stack([own[order - 1 - k : 29 - k].ravel() for k in range(order)], axis=-1)
-    held = np.sqrt(RIDGE * np.sum(before**2)) * np.eye(order)
-    known = np.concatenate([own[order:].ravel(), np.zeros(order)])
+    series = slopes[:, rays].reshape(30, -1)
+    series = series - series.mean(axis=0)
+    before = np.stack([series[order - 1 - k : 29 - k].ravel() for k in range(order)], axis=-1)
+    ridge = np.sqrt(RIDGE * np.sum(before**2)) * np.eye(order)
+    right_side = np.concatenate([series[order:].ravel(), np.zeros(order)])
     np.testing.assert_allclose(
         recurrence(slopes, rays, order),
-        np.linalg.lstsq(np.concatenate([before, held]), known, rcond=None)[0],
+        np.linalg.lstsq(np.concatenate([before, ridge]), right_side, rcond=None)[0],
     )
 
 
-def test_dots_are_put_on_the_plane_as_the_calibration_has_it() -> None:
+def test_on_plane_agrees_with_the_calibration() -> None:
     calibration = ImageCalibration(
         np.array([[0.17, 0.01, -8.0], [0.004, -0.18, 95.0], [1e-4, -2e-4, 1.0]])
     )
     image, sigma = random().uniform(0, 480, (30, 2)), random().uniform(0.05, 0.4, (30, 2))
     plane, covariance, scale = dot_kernels.on_plane(calibration.matrix, image, sigma)
     np.testing.assert_allclose(plane, calibration.to_plane(image))
-    by = calibration.jacobian(image)
+    jacobian = calibration.jacobian(image)
     np.testing.assert_allclose(
-        covariance, np.einsum("nij,nj,nkj->nik", by, sigma**2, by), atol=1e-15
+        covariance, np.einsum("nij,nj,nkj->nik", jacobian, sigma**2, jacobian), atol=1e-15
     )
-    np.testing.assert_allclose(scale, np.sqrt(np.abs(np.linalg.det(by))))
+    np.testing.assert_allclose(scale, np.sqrt(np.abs(np.linalg.det(jacobian))))
 
 
-def test_the_two_nearest_are_those_of_a_tree() -> None:
+def test_two_nearest_agree_with_kd_tree() -> None:
     places, among = random().uniform(0, 10, (2, 40, 2))
     distance, number = dot_kernels.two_nearest(places, among)
-    wanted = cKDTree(among).query(places, k=2)
-    np.testing.assert_allclose(distance, wanted[0])
-    np.testing.assert_array_equal(number, wanted[1])
+    expected = cKDTree(among).query(places, k=2)
+    np.testing.assert_allclose(distance, expected[0])
+    np.testing.assert_array_equal(number, expected[1])
     distance, number = dot_kernels.two_nearest(places, among[:1])
     assert np.isinf(distance[:, 1]).all()
     assert (number == [0, 1]).all()
 
 
 def picture() -> tuple[FloatArray, dots.Grey]:
-    """Dots, some at the very edge, in noise; their places (u, v)."""
+    """Return the positions (u, v) of dots, some at the edge, and a noisy image of them."""
     rng = random()
-    place = np.stack(np.meshgrid(np.arange(1.0, 150, 18), np.arange(1.0, 110, 16)), -1)
-    place = place.reshape(-1, 2) + rng.uniform(-1, 1, (place.size // 2, 2))
+    positions = np.stack(np.meshgrid(np.arange(1.0, 150, 18), np.arange(1.0, 110, 16)), -1)
+    positions = positions.reshape(-1, 2) + rng.uniform(-1, 1, (positions.size // 2, 2))
     v, u = np.mgrid[:110, :150]
     image = rng.normal(0, 1.0, u.shape)
-    for at in place:
-        image += 50 * np.exp(-((u - at[0]) ** 2 + (v - at[1]) ** 2) / (2 * 1.9**2))
-    return place, image.astype(np.float32)
+    for position in positions:
+        image += 50 * np.exp(-((u - position[0]) ** 2 + (v - position[1]) ** 2) / (2 * 1.9**2))
+    return positions, image.astype(np.float32)
 
 
 def band_of(image: dots.Grey) -> dots.Grey:
@@ -346,19 +354,19 @@ def test_peaks_are_the_local_maxima() -> None:
     band, disc = band_of(picture()[1]), dot_size.peak_disc(1.9)
     highest = cv2.dilate(band, disc.astype(np.uint8))
     for floor in (np.full((1, 1), 3.0, "f4"), np.full(band.shape, 3.0, "f4")):
-        found = dot_kernels.peaks(band, floor, disc)
-        np.testing.assert_array_equal(found[::-1], np.nonzero((band >= highest) & (band > 3.0)))
+        peaks = dot_kernels.peaks(band, floor, disc)
+        np.testing.assert_array_equal(peaks[::-1], np.nonzero((band >= highest) & (band > 3.0)))
     noise = random().normal(0, 1, (90, 700)).astype(np.float32)  # more peaks than room at first
-    found = dot_kernels.peaks(noise, np.full((1, 1), -9.0, "f4"), np.ones((3, 3), bool))
-    assert found.shape[1] == (noise >= cv2.dilate(noise, np.ones((3, 3)))).sum() > 256
+    peaks = dot_kernels.peaks(noise, np.full((1, 1), -9.0, "f4"), np.ones((3, 3), bool))
+    assert peaks.shape[1] == (noise >= cv2.dilate(noise, np.ones((3, 3)))).sum() > 256
 
 
-def test_pixels_that_share_a_peak_are_one() -> None:
+def test_close_pixels_are_merged() -> None:
     u, v = np.array([5, 6, 30, 5, 31, 60]), np.array([5, 5, 9, 7, 11, 9])
     np.testing.assert_array_equal(dot_kernels.first_of_each(u, v, 2.0), [0, 2, 4, 5])
 
 
-def test_ridges_are_long_at_any_angle_and_at_the_edge() -> None:
+def test_ridges_are_recognised_at_any_angle_and_at_the_edge() -> None:
     v, u = np.mgrid[:60, :80].astype(float)
     for angle in np.linspace(0, np.pi, 9):
         along = (u - 40) * np.cos(angle) + (v - 30) * np.sin(angle)
@@ -366,17 +374,17 @@ def test_ridges_are_long_at_any_angle_and_at_the_edge() -> None:
         for times, long in ((2.0, False), (6.0, True)):
             band = np.exp(-(across**2 + (along / times) ** 2) / 18).astype(np.float32)
             assert dot_kernels.ridges(band, np.array([40]), np.array([30]), 10.0) == [long]
-    for at, times, long in ((0, 6.0, True), (79, 6.0, True), (0, 1.0, False)):
-        band = np.exp(-((u - at) ** 2 + ((v - 30) / times) ** 2) / 18).astype(np.float32)
-        assert dot_kernels.ridges(band, np.array([at]), np.array([30]), 10.0) == [long]
+    for column, times, long in ((0, 6.0, True), (79, 6.0, True), (0, 1.0, False)):
+        band = np.exp(-((u - column) ** 2 + ((v - 30) / times) ** 2) / 18).astype(np.float32)
+        assert dot_kernels.ridges(band, np.array([column]), np.array([30]), 10.0) == [long]
 
 
 def centroids_by_hand(
     light: FloatArray, u: int, v: int, margin: int, width: float
 ) -> tuple[float, float, float]:
-    """A window moved on to the light until it stays, in NumPy: column, row, second moment."""
-    wide = np.pad(np.maximum(light, 0.0), margin)
-    patch = wide[v : v + 2 * margin + 1, u : u + 2 * margin + 1].astype(float)
+    """Return column, row and second moment of light in a window moved iteratively (NumPy)."""
+    padded = np.pad(np.maximum(light, 0.0), margin)
+    patch = padded[v : v + 2 * margin + 1, u : u + 2 * margin + 1].astype(float)
     y, x = np.mgrid[-margin : margin + 1, -margin : margin + 1]
     at_u = at_v = 0.0
     for _ in range(4):
@@ -390,88 +398,91 @@ def centroids_by_hand(
 
 
 @pytest.mark.parametrize("sigma", [0.0, 1.1])
-def test_centroids_are_those_of_the_blurred_picture_over_what_is_around_it(sigma: float) -> None:
-    place, image = picture()
-    u, v = np.rint(place).astype(np.int64).T
+def test_centroids_are_those_of_the_blurred_picture(sigma: float) -> None:
+    positions, image = picture()
+    u, v = np.rint(positions).astype(np.int64).T
     width = random().uniform(1.0, 2.2, len(u))
     around = dot_size.blur(image, 4.0) if sigma else np.zeros_like(image)
     taps = dot_size.kernel(sigma)
     light = cv2.sepFilter2D(image, -1, taps, taps, borderType=cv2.BORDER_REFLECT) - around
     offset, moment = centroid_kernels.centroids(image, around, taps, u, v, 6, width, 2.0)
     for k in range(len(u)):
-        wanted = centroids_by_hand(light, u[k], v[k], 6, width[k])
-        np.testing.assert_allclose([*offset[:, k], moment[k]], wanted, atol=1e-5)
+        expected = centroids_by_hand(light, u[k], v[k], 6, width[k])
+        np.testing.assert_allclose([*offset[:, k], moment[k]], expected, atol=1e-5)
 
 
 def fitted_picture() -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Crowded dots, shape (n, 4), and some light over those and a slope, near edges, too."""
+    """Return crowded dots, shape (n, 4), some near edges, their light, and a noisy background."""
     rng = random()
-    place = np.stack(np.meshgrid(np.arange(4.0, 76.0, 8.0), np.arange(6.0, 58.0, 9.0)), -1)
-    place = place.reshape(-1, 2) + rng.uniform(-1.5, 1.5, (54, 2))
-    dots = np.column_stack([place, rng.uniform(20, 60, 54), rng.uniform(1.2, 2.2, 54)])
+    positions = np.stack(np.meshgrid(np.arange(4.0, 76.0, 8.0), np.arange(6.0, 58.0, 9.0)), -1)
+    positions = positions.reshape(-1, 2) + rng.uniform(-1.5, 1.5, (54, 2))
+    dots = np.column_stack([positions, rng.uniform(20, 60, 54), rng.uniform(1.2, 2.2, 54)])
     v, u = np.mgrid[:64, :80]
     return dots, light_of(dots, (64, 80)), 12.0 + 0.1 * u - 0.05 * v + rng.normal(0, 2, (64, 80))
 
 
 def light_of(dots: FloatArray, shape: tuple[int, int], blur: float = 0.0) -> FloatArray:
-    """Light of round dots, blurred, in a picture whose edges are mirrors if it is blurred."""
+    """Return the light of round dots; when blurred, the picture is mirrored at its edges."""
     v, u = np.mgrid[: shape[0], : shape[1]]
-    made = np.zeros(shape)
+    light = np.zeros(shape)
     for u_px, v_px, peak, size in dots:
-        wide = size**2 + blur**2
+        variance = size**2 + blur**2
         for at_u in (u_px, -1 - u_px, 2 * shape[1] - 1 - u_px) if blur else (u_px,):
             for at_v in (v_px, -1 - v_px, 2 * shape[0] - 1 - v_px) if blur else (v_px,):
                 square = (u - at_u) ** 2 + (v - at_v) ** 2
-                made += peak * size**2 / wide * np.exp(-square / (2 * wide))
-    return made
+                light += peak * size**2 / variance * np.exp(-square / (2 * variance))
+    return light
 
 
-def test_residual_light_of_bytes_is_that_of_numbers() -> None:
+def test_residual_light_is_the_same_for_bytes_and_floats() -> None:
     dots, light, rest = fitted_picture()
-    coarse, level = np.rint(light + rest).astype(np.uint8), np.full(light.shape, 12.0, np.float32)
+    as_bytes, level = np.rint(light + rest).astype(np.uint8), np.full(light.shape, 12.0, np.float32)
     number, begin = dot_fit_kernels.neighbours(dots[:, 0], dots[:, 1], 25.0)
-    given = level, 7.0, dots, 1.3 * dots[:, 3], number, begin, 6
-    for made in (dot_fit_kernels.residual_sums, dot_fit_kernels.residual_modes):
-        one, other = made(coarse, *given), made(coarse.astype(np.float32), *given)
+    arguments = level, 7.0, dots, 1.3 * dots[:, 3], number, begin, 6
+    for kernel in (dot_fit_kernels.residual_sums, dot_fit_kernels.residual_modes):
+        one, other = kernel(as_bytes, *arguments), kernel(as_bytes.astype(np.float32), *arguments)
         np.testing.assert_allclose(one, other, rtol=1e-3, atol=1e-3)
 
 
-def test_dots_are_taken_off_a_blurred_picture() -> None:
+def test_dots_are_subtracted_from_a_blurred_picture() -> None:
     dots, light, rest = fitted_picture()
     blurred = light_of(dots, light.shape, 7.0)
-    left = dot_fit_kernels.without_dots((blurred + rest).astype(np.float32), 1.0, 7.0, dots)
-    np.testing.assert_allclose(left, rest, atol=0.02)
+    remainder = dot_fit_kernels.without_dots((blurred + rest).astype(np.float32), 1.0, 7.0, dots)
+    np.testing.assert_allclose(remainder, rest, atol=0.02)
 
 
-def test_residual_light_is_what_dots_and_surroundings_leave() -> None:
+def test_residual_light_excludes_dots_and_background() -> None:
     dots, light, rest = fitted_picture()
     level = np.full(light.shape, 12.0, np.float32)
     width, margin = 1.3 * dots[:, 3], 6
     number, begin = dot_fit_kernels.neighbours(dots[:, 0], dots[:, 1], 25.0)
-    given = (light + rest).astype(np.float32), level, 7.0, dots, width, number, begin, margin
-    sums, modes = dot_fit_kernels.residual_sums(*given), dot_fit_kernels.residual_modes(*given)
+    arguments = (light + rest).astype(np.float32), level, 7.0, dots, width, number, begin, margin
+    sums, modes = (
+        dot_fit_kernels.residual_sums(*arguments),
+        dot_fit_kernels.residual_modes(*arguments),
+    )
     v, u = np.mgrid[:64, :80]
     for k, (u_px, v_px, _, size) in enumerate(dots):
         near = (np.abs(u - round(u_px)) <= margin) & (np.abs(v - round(v_px)) <= margin)
         p, q = (u - u_px)[near], (v - v_px)[near]
         square = p**2 + q**2
         window = np.exp(-square / (2 * width[k] ** 2))
-        left, profile = window * (rest - 12.0)[near], np.exp(-square / (2 * size**2))
-        made = left @ np.stack([0 * p + 1, p, q, profile, profile * square], -1)
-        np.testing.assert_allclose(sums[k, :5], made, rtol=1e-3, atol=0.15)
+        remainder, profile = window * (rest - 12.0)[near], np.exp(-square / (2 * size**2))
+        expected = remainder @ np.stack([0 * p + 1, p, q, profile, profile * square], -1)
+        np.testing.assert_allclose(sums[k, :5], expected, rtol=1e-3, atol=0.15)
         spread = 1 / (1 / width[k] ** 2 + 1 / size**2)
         third = square - 4 * spread
         fifth = square**2 - 12 * spread * square + 24 * spread**2
         mode = np.stack([each for by in (1.0, third, fifth) for each in (by * p, by * q)])
         large = np.sqrt(np.square(mode) @ window**2)
-        np.testing.assert_allclose(modes[:, k, 0] / large, mode @ left / large, atol=0.1)
-        seen = np.square(mode) @ (window * light[near]) ** 2
-        np.testing.assert_allclose(modes[:, k, 2], seen, rtol=0.03)
+        np.testing.assert_allclose(modes[:, k, 0] / large, mode @ remainder / large, atol=0.1)
+        light_part = np.square(mode) @ (window * light[near]) ** 2
+        np.testing.assert_allclose(modes[:, k, 2], light_part, rtol=0.03)
         if 8 < u_px < 70 and 8 < v_px < 54:  # the window is in the picture
             np.testing.assert_allclose(modes[:, k, 1], np.square(mode) @ window**2, rtol=1e-3)
 
 
-def test_an_enlarged_band_is_that_of_the_whole_picture_where_it_is_over_a_floor() -> None:
+def test_enlarged_peaks_are_those_of_the_full_picture() -> None:
     v, u = np.mgrid[:120, :160]
     image = np.zeros((120, 160))
     for u_px, v_px in random().uniform(0.0, 120.0, (30, 2)):
@@ -479,158 +490,163 @@ def test_an_enlarged_band_is_that_of_the_whole_picture_where_it_is_over_a_floor(
     band = dot_kernels.halved(image.astype(np.float32))
     low, floor = np.full(band.shape, 10.0, "f4"), np.full(image.shape, 12.0, "f4")
     (u, v), high = dot_kernels.enlarged_peaks(band, low, floor, np.ones((5, 5), bool))
-    blurred = cv2.blur(image, (3, 3)) * 0.375 + image * 0.625  # as far as a pixel's area blurs
+    blurred = cv2.blur(image, (3, 3)) * 0.375 + image * 0.625  # the blur of the pixel area
     highest = cv2.dilate(blurred, np.ones((5, 5)))
     inner = np.s_[8:-8, 8:-8]
     assert (high > 12.0).all()
     assert (np.diff(v) >= 0).all()
     within = np.zeros(image.shape, bool)
     within[inner] = True
-    off = high - highest[v, u]
-    assert np.abs(off[within[v, u]]).max() < 0.02 * image.max()
-    wanted = (blurred >= highest) & (blurred > 13.0)
-    found = np.zeros(image.shape, bool)
-    found[v, u] = True
-    near = cv2.dilate(found.astype(np.uint8), np.ones((3, 3))) > 0
-    assert near[inner][wanted[inner]].all()
+    error = high - highest[v, u]
+    assert np.abs(error[within[v, u]]).max() < 0.02 * image.max()
+    expected = (blurred >= highest) & (blurred > 13.0)
+    is_peak = np.zeros(image.shape, bool)
+    is_peak[v, u] = True
+    near = cv2.dilate(is_peak.astype(np.uint8), np.ones((3, 3))) > 0
+    assert near[inner][expected[inner]].all()
 
 
-def test_a_halved_picture_has_the_means_of_four_pixels() -> None:
+def test_halved_picture_has_means_of_four_pixels() -> None:
     image = random().integers(0, 256, (40, 60)).astype(np.uint8)
-    wanted = image.reshape(20, 2, 30, 2).mean(axis=(1, 3))
-    np.testing.assert_array_equal(dot_kernels.halved(image), wanted)
-    np.testing.assert_array_equal(dot_kernels.halved(image.astype(np.float32)), wanted)
+    expected = image.reshape(20, 2, 30, 2).mean(axis=(1, 3))
+    np.testing.assert_array_equal(dot_kernels.halved(image), expected)
+    np.testing.assert_array_equal(dot_kernels.halved(image.astype(np.float32)), expected)
 
 
-def test_the_next_of_places_is_the_nearest_but_itself() -> None:
+def test_next_apart_is_the_distance_to_the_nearest_other() -> None:
     places = random().uniform(0, 10, (50, 2))
-    wanted = np.sort(np.linalg.norm(places[:, None] - places, axis=-1), axis=1)[:, 1]
-    np.testing.assert_allclose(dot_kernels.next_apart(places), wanted)
+    expected = np.sort(np.linalg.norm(places[:, None] - places, axis=-1), axis=1)[:, 1]
+    np.testing.assert_allclose(dot_kernels.next_apart(places), expected)
     np.testing.assert_array_equal(dot_kernels.next_apart(places[:1]), [np.inf])
     assert dot_kernels.next_apart(places[:0]).shape == (0,)
 
 
-def test_places_in_view_have_all_their_corners_on_the_plane_and_in_the_image() -> None:
+def test_within_view_needs_all_corners_on_plane_and_image() -> None:
     rng = random()
     places, margin = rng.uniform(-5, 25, (200, 2)), rng.uniform(0, 3, (200, 2))
     to_image = np.array([[10.0, 1.0, 5.0], [-1.0, 9.0, 20.0], [1e-3, 2e-3, 1.0]])
     plane, image = np.array([[0.5, 1.0], [19.0, 18.0]]), np.array([[4.0, 4.0], [170.0, 150.0]])
-    wanted = np.ones(200, bool)
-    for way in ([1, 1], [1, -1], [-1, 1], [-1, -1]):
-        corner = places + way * margin
+    expected = np.ones(200, bool)
+    for direction in ([1, 1], [1, -1], [-1, 1], [-1, -1]):
+        corner = places + direction * margin
         u, v, w = to_image @ np.column_stack([corner, np.ones(200)]).T
         pixel = np.stack([u / w, v / w], axis=1)
-        wanted &= ((corner > plane[0]) & (corner < plane[1])).all(axis=1)
-        wanted &= ((pixel > image[0]) & (pixel < image[1])).all(axis=1)
-    made = match_kernels.within_view(places, margin, to_image, plane, image)
-    np.testing.assert_array_equal(made, wanted)
-    assert 10 < made.sum() < 190
+        expected &= ((corner > plane[0]) & (corner < plane[1])).all(axis=1)
+        expected &= ((pixel > image[0]) & (pixel < image[1])).all(axis=1)
+    computed = match_kernels.within_view(places, margin, to_image, plane, image)
+    np.testing.assert_array_equal(computed, expected)
+    assert 10 < computed.sum() < 190
 
 
-def test_noise_is_that_of_each_tile() -> None:
+def test_tile_noise_is_that_of_each_tile() -> None:
     rng = random()
     image = 50 + np.concatenate(
         [rng.normal(0, 1.0, (200, 240)), rng.normal(0, 3.0, (200, 240))], axis=1
     )
-    made = 1.4826 * size_kernels.tile_noise(image.astype(np.float32), 2, 4)
-    np.testing.assert_allclose(made, [[1, 1, 3, 3]] * 2, rtol=0.08)
+    sigma = 1.4826 * size_kernels.tile_noise(image.astype(np.float32), 2, 4)
+    np.testing.assert_allclose(sigma, [[1, 1, 3, 3]] * 2, rtol=0.08)
     ramp = np.add.outer(np.arange(40.0), 3 * np.arange(50.0)).astype(np.float32)
     np.testing.assert_allclose(size_kernels.tile_noise(ramp, 2, 2), 0.0, atol=1e-4)
     assert size_kernels.tile_noise(ramp[:8, :8].copy(), 1, 1).shape == (1, 1)
 
 
-def test_pixels_that_hang_together_are_those_of_one_spot() -> None:
+def test_connected_pixels_agree_with_opencv() -> None:
     spots = (random().uniform(size=(40, 50)) < 0.2).astype(np.uint8)
     v, u = np.nonzero(spots)
-    begun = random().uniform(size=len(u)) < 0.1
+    seeds = random().uniform(size=len(u)) < 0.1
     spot = np.asarray(cv2.connectedComponents(spots)[1])[v, u]
-    made = dot_kernels.connected_pixels(u, v, begun)
-    np.testing.assert_array_equal(made, np.isin(spot, spot[begun]))
-    assert begun.sum() < made.sum() < len(u)
+    connected = dot_kernels.connected_pixels(u, v, seeds)
+    np.testing.assert_array_equal(connected, np.isin(spot, spot[seeds]))
+    assert seeds.sum() < connected.sum() < len(u)
 
 
-def test_spikes_are_pixels_that_no_dot_has() -> None:
+def test_spikes_are_hot_pixels_but_not_dots() -> None:
     image = picture()[1] + 20
     hot = {(75, 49): 500.0, (0, 40): 90.0, (100, 88): 70.0, (101, 88): 70.0, (101, 89): 70.0}
     for (u, v), height in hot.items():
         image[v, u] += height
-    found, (times, beside) = dot_kernels.spikes(image, 6.0, 1.9, 1.5, 5)
-    assert set(zip(*found.tolist(), strict=True)) == set(hot)
+    spikes, (times, beside) = dot_kernels.spikes(image, 6.0, 1.9, 1.5, 5)
+    assert set(zip(*spikes.tolist(), strict=True)) == set(hot)
     assert (times > 1.5).all()
     clean = picture()[1] + 20
-    for u, v, fit in zip(*found, beside, strict=True):
+    for u, v, fit in zip(*spikes, beside, strict=True):
         assert fit == pytest.approx(clean[v, u], abs=0.35 * max(float(clean[v, u]) - 20, 15))
 
 
-def test_answers_are_the_largest_about_the_same_place_in_smaller_pictures() -> None:
+def test_answers_are_local_maxima_of_smaller_pictures() -> None:
     image = random().normal(0, 1, (60, 80)).astype(np.float32)
     for step in (1, 2, 4):
         small = cv2.resize(image, (80 // step, 60 // step), interpolation=cv2.INTER_AREA)
         u, v = np.array([0, 33, 79]), np.array([0, 21, 59])
-        most = cv2.dilate(small, np.ones((3, 3)))
-        x, y = (np.rint((at + 0.5) / step - 0.5).astype(int) for at in (u, v))
-        np.testing.assert_array_equal(size_kernels.answers(small, u, v, float(step)), most[y, x])
+        highest = cv2.dilate(small, np.ones((3, 3)))
+        x, y = (np.rint((pixel + 0.5) / step - 0.5).astype(int) for pixel in (u, v))
+        np.testing.assert_array_equal(size_kernels.answers(small, u, v, float(step)), highest[y, x])
 
 
-def test_parts_have_a_whole_near_them() -> None:
-    places, wholes = np.array([[0.0, 0], [3, 0], [9, 0], [0, 4]]), np.array([[1.0, 0], [9, 3]])
-    made = size_kernels.parts(
-        places, np.array([1.0, 2, 1, 1]), wholes, np.array([1.0, 0.5]), 3, 0.6
+def test_parts_are_near_a_larger_dot() -> None:
+    places, larger = np.array([[0.0, 0], [3, 0], [9, 0], [0, 4]]), np.array([[1.0, 0], [9, 3]])
+    is_part = size_kernels.parts(
+        places, np.array([1.0, 2, 1, 1]), larger, np.array([1.0, 0.5]), 3, 0.6
     )
-    np.testing.assert_array_equal(made, [True, False, False, False])
+    np.testing.assert_array_equal(is_part, [True, False, False, False])
 
 
-def test_the_finer_band_is_that_of_the_whole_picture() -> None:
-    place, image = picture()
-    u, v = np.rint(place).astype(np.int64).T
+def test_finest_band_is_that_of_the_full_picture() -> None:
+    positions, image = picture()
+    u, v = np.rint(positions).astype(np.int64).T
     narrow, wide = np.zeros((2, 3, 13), np.float32)
     for filters, sigma, taps in ((narrow, 0.8, 7), (wide, 1.3, 11)):
-        own = cv2.getGaussianKernel(taps, sigma, cv2.CV_32F).ravel()
+        kernel = cv2.getGaussianKernel(taps, sigma, cv2.CV_32F).ravel()
         for k in range(3):
             start = (11 - taps) // 2 + k
-            filters[k, start : start + taps] = own
+            filters[k, start : start + taps] = kernel
     fine = cv2.GaussianBlur(image, (7, 7), 0.8, borderType=cv2.BORDER_REFLECT)
     fine -= cv2.GaussianBlur(image, (11, 11), 1.3, borderType=cv2.BORDER_REFLECT)
-    most = np.pad(fine, 1, "symmetric")  # beyond the edge the filters see the mirrored picture
-    most = np.array([most[y : y + 3, x : x + 3].max() for x, y in zip(u, v, strict=True)])
-    np.testing.assert_allclose(centroid_kernels.finest(image, u, v, narrow, wide), most, atol=1e-4)
+    highest = np.pad(fine, 1, "symmetric")  # the filters mirror the picture at the edge
+    highest = np.array([highest[y : y + 3, x : x + 3].max() for x, y in zip(u, v, strict=True)])
+    np.testing.assert_allclose(
+        centroid_kernels.finest(image, u, v, narrow, wide), highest, atol=1e-4
+    )
 
 
-def test_bytes_are_read_as_they_are() -> None:
-    place, image = picture()
-    u, v = np.rint(place).astype(np.int64).T
-    coarse, around = np.clip(image + 20, 0, 255).astype(np.uint8), np.full(image.shape, 20.0, "f4")
+def test_kernels_give_the_same_for_bytes_and_floats() -> None:
+    positions, image = picture()
+    u, v = np.rint(positions).astype(np.int64).T
+    as_bytes, around = (
+        np.clip(image + 20, 0, 255).astype(np.uint8),
+        np.full(image.shape, 20.0, "f4"),
+    )
     taps, width = cv2.getGaussianKernel(9, 1.1, cv2.CV_32F).ravel(), np.full(len(u), 2.0)
     narrow, wide = np.float32(random().uniform(0, 1, (2, 3, 13)))
-    for made in (
+    for kernel in (
         lambda own: centroid_kernels.centroids(own, around, taps, u, v, 6, width, 2.0),
         lambda own: centroid_kernels.finest(own, u, v, narrow, wide),
         lambda own: dot_kernels.spikes(own, 3.0, 1.9, 1.2, 5),
         lambda own: size_kernels.tile_noise(own, 2, 3),
     ):
-        for one, other in zip(made(coarse), made(coarse.astype(np.float32)), strict=True):
+        for one, other in zip(kernel(as_bytes), kernel(as_bytes.astype(np.float32)), strict=True):
             np.testing.assert_array_equal(one, other)
 
 
 @pytest.mark.parametrize("rows", [1, 3])
-def test_pictures_lower_than_the_filters_are_mirrored_again_and_again(rows: int) -> None:
+def test_pictures_smaller_than_the_filters_are_mirrored_repeatedly(rows: int) -> None:
     image = random().uniform(0, 90, (rows, 40)).astype(np.float32)
-    own = np.float32(cv2.getGaussianKernel(31, 4.0).ravel())
-    filters = np.stack([np.pad(own, (k, 2 - k)) for k in range(3)])
+    kernel = np.float32(cv2.getGaussianKernel(31, 4.0).ravel())
+    filters = np.stack([np.pad(kernel, (k, 2 - k)) for k in range(3)])
     blurred = np.pad(image, 16, "symmetric")
-    blurred = cv2.sepFilter2D(blurred, -1, own, own)[15 : 17 + rows, 15:57]
+    blurred = cv2.sepFilter2D(blurred, -1, kernel, kernel)[15 : 17 + rows, 15:57]
     u, v = np.array([0, 20, 39]), np.array([0, rows - 1, 0])
-    most = [blurred[y : y + 3, x : x + 3].max() for x, y in zip(u, v, strict=True)]
-    made = centroid_kernels.finest(image, u, v, filters, np.zeros_like(filters))
-    np.testing.assert_allclose(made, most, rtol=1e-5)
+    expected = [blurred[y : y + 3, x : x + 3].max() for x, y in zip(u, v, strict=True)]
+    computed = centroid_kernels.finest(image, u, v, filters, np.zeros_like(filters))
+    np.testing.assert_allclose(computed, expected, rtol=1e-5)
 
 
-def test_what_is_not_a_number_is_not_settled() -> None:
+def test_nan_coefficients_give_nan() -> None:
     rays, landing = landings()
-    nothing = np.full(COUNT, np.nan)
-    assert np.isnan(solver_kernels.newton_along_rays(BASIS.grid, nothing, rays, landing, 1)[1])
+    nan = np.full(COUNT, np.nan)
+    assert np.isnan(solver_kernels.newton_along_rays(BASIS.grid, nan, rays, landing, 1)[1])
     assert np.isnan(
-        ray_kernels.intersect_and_reflect(BASIS.grid, nothing, rays, landing, 1, PLANE.pose_mm)[2]
+        ray_kernels.intersect_and_reflect(BASIS.grid, nan, rays, landing, 1, PLANE.pose_mm)[2]
     ).all()
 
 
@@ -640,65 +656,65 @@ def test_division_by_zero_is_as_in_numpy() -> None:
 
 
 @pytest.mark.parametrize("drop_mm", [0.0, 0.06])
-def test_the_rim_is_where_the_surface_comes_down_to_it(drop_mm: float) -> None:
+def test_boundary_is_where_the_surface_meets_the_level(drop_mm: float) -> None:
     theta = np.linspace(-np.pi, np.pi, 48, endpoint=False)
-    way = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
+    directions = np.stack([np.cos(theta), np.sin(theta)], axis=-1)
     center, rear = np.array([0.1, -0.4]), Rear(drop_mm, -1.0, -4.5)
     radius, boundary_slope, over = outline_kernels.newton_to_boundary(
-        BASIS.grid, surface().coefficients, np.array([drop_mm, -1.0, -4.5]), center, way,
+        BASIS.grid, surface().coefficients, np.array([drop_mm, -1.0, -4.5]), center, directions,
         np.full(48, 3.0), np.full(48, 0.3), 1e-10,
     )  # fmt: skip
-    place = center + radius[:, None] * way
-    height, gradient = surface().height_and_gradient(*place.T)
-    inside = BASIS.contains(*place.T)
+    boundary = center + radius[:, None] * directions
+    height, gradient = surface().height_and_gradient(*boundary.T)
+    inside = BASIS.contains(*boundary.T)
     assert inside.sum() > 40
-    np.testing.assert_allclose((height - rear.height(place[:, 1]))[inside], 0.0, atol=1e-9)
+    np.testing.assert_allclose((height - rear.height(boundary[:, 1]))[inside], 0.0, atol=1e-9)
     np.testing.assert_allclose(over[inside], 0.0, atol=1e-9)
-    below = np.maximum(-1.0 - place[:, 1], 0.0)
+    below = np.maximum(-1.0 - boundary[:, 1], 0.0)
     gradient[:, 1] -= 2 * drop_mm * below / 3.5**2
     np.testing.assert_allclose(boundary_slope[inside], gradient[inside], atol=1e-6)
 
 
-def test_rays_meet_quadrics() -> None:
+def test_rays_are_reflected_off_quadrics() -> None:
     rays = ray_directions(RIG.laser, RIG.pattern)[7:12, 7:12].reshape(-1, 3)
     center = np.array([0.2, -0.3])
     quadrics = np.array([[0.02, -0.03, -0.05, 0.01, -0.04], [0.0, 0.01, 0.03, 0.0, 0.02]])
     points, plane = quadric_kernels.reflect_off_quadrics(
         center, quadrics, rays, LASER, PLANE.pose_mm
     )
-    for (g_x, g_y, k_x, k_xy, k_y), met, seen in zip(quadrics, points, plane, strict=True):
-        x, y = (met[:, :2] - center).T
+    for (g_x, g_y, k_x, k_xy, k_y), point, dot in zip(quadrics, points, plane, strict=True):
+        x, y = (point[:, :2] - center).T
         z = g_x * x + g_y * y + (k_x * x**2 + 2 * k_xy * x * y + k_y * y**2) / 2
-        np.testing.assert_allclose(met[:, 2], z, atol=1e-5)
-        np.testing.assert_allclose(np.cross(met - LASER, rays), 0.0, atol=1e-9)
+        np.testing.assert_allclose(point[:, 2], z, atol=1e-5)
+        np.testing.assert_allclose(np.cross(point - LASER, rays), 0.0, atol=1e-9)
         slope = np.stack([g_x + k_x * x + k_xy * y, g_y + k_xy * x + k_y * y], axis=-1)
-        way = reflect(rays, surface_normal(slope))
-        np.testing.assert_allclose(seen, intersect_imaging_plane(met, way, PLANE), atol=1e-9)
+        reflected = reflect(rays, surface_normal(slope))
+        np.testing.assert_allclose(dot, intersect_imaging_plane(point, reflected, PLANE), atol=1e-9)
 
 
-def test_a_predicted_dot_hits_within_its_share_of_the_way_to_the_next() -> None:
+def test_predicted_dots_match_within_a_share_of_the_spacing() -> None:
     j, i = np.meshgrid(np.arange(4.0), np.arange(3.0))
     pattern = np.stack([2.0 * j, 3.0 * i], axis=-1)
     pattern[2, 3] = np.nan
     absent = np.zeros((3, 4), bool)
     absent[1, 1] = True
     places = np.array([[0.9, 0.0], [2.0, 3.0], [6.0, 1.1], [4.0, 5.0]])
-    hit, dot, off = (
+    hit, dot, offset = (
         part[0] for part in quadric_kernels.match_predicted_dots(pattern[None], places, absent, 0.5)
     )
-    np.testing.assert_allclose(off[0, 0], 0.9)  # of half the 2 mm to the next in its row
+    np.testing.assert_allclose(offset[0, 0], 0.9)  # relative to half the spacing of 2 mm
     assert hit[0, 0]
-    assert not hit[1, 1]  # nobody makes that dot
-    assert off[1, 1] == 0.0
+    assert not hit[1, 1]  # the ray is absent
+    assert offset[1, 1] == 0.0
     assert not hit[0, 3]  # 1.1 of 1 mm
     assert dot[0, 3] == 2
     assert not hit[2, 3]
-    assert np.isinf(off[2, 3])
+    assert np.isinf(offset[2, 3])
     assert np.argwhere(hit).tolist() == [[0, 0]]
 
 
 @pytest.mark.parametrize("lit", [range(9), [0, 1, 2, 3, 8], [3, 4, 5], [0, 4, 8, 5]])
-def test_quadrics_are_fitted_by_least_squares_of_slopes(lit: list[int]) -> None:
+def test_quadrics_are_fitted_to_dots(lit: list[int]) -> None:
     rays, center = ray_directions(RIG.laser, RIG.pattern)[7:12, 7:12], np.array([0.1, -0.2])
     true = np.array([[0.02, -0.03, -0.05, 0.01, -0.04]])
     near, absent = true + 0.003 * random().normal(size=(1, 5)), np.zeros((5, 5), bool)
@@ -712,79 +728,81 @@ def test_quadrics_are_fitted_by_least_squares_of_slopes(lit: list[int]) -> None:
     pattern = quadric_kernels.reflect_off_quadrics(center, fitted, rays.reshape(-1, 3), *bench)[1][
         0
     ]
-    off = np.linalg.norm(places[:, None] - pattern, axis=-1).min(axis=1)
-    assert off.max() < 0.02
+    distance = np.linalg.norm(places[:, None] - pattern, axis=-1).min(axis=1)
+    assert distance.max() < 0.02
     if len(lit) > 4:
         np.testing.assert_allclose(fitted, true, atol=2e-4)
 
 
 @pytest.mark.parametrize("missing", [0.0, 0.004, 0.3])
 @pytest.mark.parametrize("witnesses", [1, 90, 2 * level_kernels.FACTORS + 7])
-def test_doubts_are_logarithms_of_what_was_seen(witnesses: int, missing: float) -> None:
-    # Some lie so far off that an exponential alone would be infinite, one never changes its mind.
+def test_level_likelihood_agrees_with_numpy(witnesses: int, missing: float) -> None:
+    # Some heights are so far off that a plain exponential would overflow; one has no slope.
     over = random().normal(0.0, 0.1, (3, witnesses))
     side = random().choice([-1.0, 1.0], witnesses) / random().uniform(0.01, 0.04, witnesses)
     side[0] = 0.0
     levels, blurs = np.linspace(-0.05, 0.07, 31), np.array([0.005, 0.04, 0.25])
     dark = random().uniform(size=witnesses) < 0.4
-    made = level_kernels.level_negative_log_likelihood(
+    computed = level_kernels.level_negative_log_likelihood(
         over, side, dark, missing, levels[0], levels[1] - levels[0], 31, blurs
     )
-    right = side * (over[:, None, None] + levels[:, None]) / blurs[:, None, None]
-    against = np.logaddexp(0.0, -right)
-    if missing:  # a dark ray is outside, or inside and its dot is missing
-        against -= np.where(dark, np.logaddexp(0.0, np.log(missing) - right), 0.0)
-    rtol = 1e-9 if missing else 1e-11  # of two sums that nearly cancel each other
-    np.testing.assert_allclose(made, against.sum(axis=-1), rtol=rtol, atol=1e-9 * bool(missing))
+    argument = side * (over[:, None, None] + levels[:, None]) / blurs[:, None, None]
+    expected = np.logaddexp(0.0, -argument)
+    if missing:  # a dark ray is outside, or inside with its dot missing
+        expected -= np.where(dark, np.logaddexp(0.0, np.log(missing) - argument), 0.0)
+    rtol = 1e-9 if missing else 1e-11  # the two sums nearly cancel
+    np.testing.assert_allclose(
+        computed, expected.sum(axis=-1), rtol=rtol, atol=1e-9 * bool(missing)
+    )
 
 
 @pytest.mark.parametrize("depth", [0, 1])
-def test_levels_are_weighed_by_what_speaks_against_them(depth: int) -> None:
+def test_level_posterior_agrees_with_numpy(depth: int) -> None:
     nats = random().uniform(0.0, 4.0, (3, 4, 21))
-    nats[depth] -= 3.0  # there the rear is as deep as that, or it does not sink
+    nats[depth] -= 3.0  # selects a sunken rear, or one that is not
     blur_cost, drops, levels = np.linspace(0, 1, 4), np.array([0.0, 0.05, 0.1]), 0.3 + np.arange(21)
     against = nats + blur_cost[:, None]
     against[1:] += 1.5
-    share = np.exp(-against).sum(axis=1)
-    share /= share.sum()
+    posterior = np.exp(-against).sum(axis=1)
+    posterior /= posterior.sum()
     part = slice(1, None) if depth else slice(0, 1)
-    chosen = share[part] / share[part].sum()
+    chosen = posterior[part] / posterior[part].sum()
     mean = chosen.sum(axis=0) @ levels
-    wanted = (
+    expected = (
         chosen.sum(axis=1) @ drops[part],
         mean,
-        np.sqrt(share.sum(axis=0) @ (levels - mean) ** 2),
-        share[:, [0, -1]].sum(),
+        np.sqrt(posterior.sum(axis=0) @ (levels - mean) ** 2),
+        posterior[:, [0, -1]].sum(),
     )
-    made = level_kernels.level_posterior(nats, blur_cost, 1.5, drops, 0.3, 1.0)
-    np.testing.assert_allclose(made, wanted)
+    computed = level_kernels.level_posterior(nats, blur_cost, 1.5, drops, 0.3, 1.0)
+    np.testing.assert_allclose(computed, expected)
 
 
-def test_the_likelihood_of_what_is_unknown_is_unknown() -> None:
+def test_likelihood_of_nan_heights_is_nan() -> None:
     over = np.array([[0.1, np.nan], [0.1, 0.2]])
     lit = np.zeros(2, bool)
-    made = level_kernels.level_negative_log_likelihood(
+    computed = level_kernels.level_negative_log_likelihood(
         over, np.ones(2), lit, 0.0, 0.0, 0.1, 3, np.ones(2)
     )
-    assert np.isnan(made[0]).all()
-    assert np.isfinite(made[1]).all()
+    assert np.isnan(computed[0]).all()
+    assert np.isfinite(computed[1]).all()
 
 
 @pytest.mark.slow
-def test_what_cannot_be_kept_on_disk_is_compiled_all_the_same(tmp_path: Path) -> None:
+def test_functions_are_compiled_without_a_usable_cache_folder(tmp_path: Path) -> None:
     script = "from labapp.core.compiled import compiled\nfrom numba import types\n" + (
         "made = compiled(types.int64)(eval('lambda x: x + 1'))\nprint(made(1))\n"
     )
     (tmp_path / "file").touch()
-    told = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", script], capture_output=True, text=True, check=False,
         cwd=Path(__file__).parents[2],
         env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "file")},
     )  # fmt: skip
-    assert (told.returncode, told.stdout) == (0, "2\n"), told.stderr
+    assert (process.returncode, process.stdout) == (0, "2\n"), process.stderr
 
 
-def test_the_first_use_is_announced_once(tmp_path: Path) -> None:
+def test_first_compilation_is_announced_once(tmp_path: Path) -> None:
     source = """from numba import types
 from labapp.core.compiled import compiled
 @compiled(types.float64)
@@ -792,9 +810,9 @@ def twice(x): return 2.0 * x
 """
     for name in ("loops", "more_loops"):
         (tmp_path / f"{name}.py").write_text(source, "utf-8")
-    said = []
+    messages = []
     for _ in range(2):
-        done = subprocess.run(
+        process = subprocess.run(
             [sys.executable, "-c", "import loops, more_loops"],
             capture_output=True, text=True, check=True, cwd=tmp_path,
             env={
@@ -802,19 +820,19 @@ def twice(x): return 2.0 * x
                 "PYTHONPATH": str(Path(__file__).parents[2]),
             },
         )  # fmt: skip
-        said.append(done.stderr.splitlines())
-    assert [len(lines) for lines in said] == [1, 0]
+        messages.append(process.stderr.splitlines())
+    assert [len(lines) for lines in messages] == [1, 0]
 
 
 @pytest.mark.parametrize("height_mm", [0.3, -0.5])
-def test_caps_are_scored_by_the_places_that_lie_where_they_have_dots(height_mm: float) -> None:
+def test_caps_are_scored_by_the_dots_near_their_predictions(height_mm: float) -> None:
     rng = np.random.default_rng(7)
     rays = ray_directions(RIG.laser, RIG.pattern).reshape(-1, 3)
     absent = np.zeros(len(rays), bool)
     absent[len(rays) // 2] = True
     middle, axes = np.array([0.2, -0.3]), np.array([2.6, 3.1])
     cap = np.array([*middle, *axes, height_mm])
-    # The same by NumPy and a tree: the quadric's top is at 0, so the bench is moved down.
+    # NumPy and a k-d tree: the quadric's top is at 0, so the bench is moved down.
     down = np.array([0.0, 0.0, height_mm])
     plane = np.vstack([PLANE.pose_mm[:1] - down, PLANE.pose_mm[1:]])
     quadric = np.array(
@@ -824,27 +842,27 @@ def test_caps_are_scored_by_the_places_that_lie_where_they_have_dots(height_mm: 
         part[0]
         for part in quadric_kernels.reflect_off_quadrics(middle, quadric, rays, LASER - down, plane)
     )
-    there = (((points[:, :2] - middle) / axes) ** 2).sum(axis=1) < 1
-    there &= np.isfinite(dots).all(axis=1)
-    own = np.flatnonzero(there & ~absent)
-    shown = rng.permutation(own)[: len(own) // 2]
+    inside = (((points[:, :2] - middle) / axes) ** 2).sum(axis=1) < 1
+    inside &= np.isfinite(dots).all(axis=1)
+    predicted = np.flatnonzero(inside & ~absent)
+    shown = rng.permutation(predicted)[: len(predicted) // 2]
     places = np.vstack([dots[shown] + rng.normal(0.0, 0.1, (len(shown), 2)), dots[absent]])
-    spacing = cKDTree(dots[own]).query(dots[own], k=2)[0][:, 1]
-    away, dot = cKDTree(places).query(dots[own])
-    mutual = cKDTree(dots[own]).query(places)[1][dot] == np.arange(len(own))
-    near = mutual & (away < 0.45 * spacing)
-    wanted = np.sum(1 - away[near] / spacing[near]) - 0.5 * np.sum(~near) - 5.0
+    spacing = cKDTree(dots[predicted]).query(dots[predicted], k=2)[0][:, 1]
+    distance, dot = cKDTree(places).query(dots[predicted])
+    mutual = cKDTree(dots[predicted]).query(places)[1][dot] == np.arange(len(predicted))
+    near = mutual & (distance < 0.45 * spacing)
+    expected = np.sum(1 - distance[near] / spacing[near]) - 0.5 * np.sum(~near) - 5.0
     labels = np.full(len(rays), -1)
-    labels[own[near]] = dot[near]
+    labels[predicted[near]] = dot[near]
 
     settings = np.array([10, 0.45, 0.5, 0.3, 5.0])
     far = cap + np.array([9.0, 0.0, 0.0, 0.0, 0.0])
     caps = np.array([cap, far])
-    score, made = quadric_kernels.score_caps(
+    score, labelled = quadric_kernels.score_caps(
         caps, rays, LASER, PLANE.pose_mm, places, absent, settings
     )
-    assert len(own) > 30
-    assert 0 < near.sum() < len(own)
-    np.testing.assert_allclose(score, [wanted, -np.inf], rtol=1e-9)
-    np.testing.assert_array_equal(made[0], labels)
-    assert (made[1] == -1).all()
+    assert len(predicted) > 30
+    assert 0 < near.sum() < len(predicted)
+    np.testing.assert_allclose(score, [expected, -np.inf], rtol=1e-9)
+    np.testing.assert_array_equal(labelled[0], labels)
+    assert (labelled[1] == -1).all()

@@ -1,4 +1,4 @@
-"""Appendix I: the laser found again from the cross-hair it draws."""
+"""Appendix I: calibration of the laser from the cross-hair it draws."""
 
 from __future__ import annotations
 
@@ -25,16 +25,16 @@ def cross_hair(angle_deg: float, distance_mm: float, fan_deg: float = 10.0) -> n
     return np.array(ends)
 
 
-def test_the_example_of_the_conventions() -> None:
+def test_example_of_the_conventions() -> None:
     l1, l2, l3 = cross_hair(30.0, 90.0)
     assert (l3, l2) == pytest.approx((7.874, 18.561), abs=5e-4)
-    found = calibrate_laser(2 * [l1], 2 * [18.561], 2 * [7.874])
-    assert found.angle_deg == pytest.approx(30.0, abs=2e-3)
-    assert found.distance_mm == pytest.approx(90.0, abs=2e-3)
-    assert found.height_mm == pytest.approx(45.0, abs=4e-3)
-    assert found.horizontal_mm == pytest.approx(90.0 * np.cos(np.pi / 6), abs=4e-3)
-    assert found.warnings == ()
-    assert found.laser.projection_angle_deg == found.angle_deg
+    calibration = calibrate_laser(2 * [l1], 2 * [18.561], 2 * [7.874])
+    assert calibration.angle_deg == pytest.approx(30.0, abs=2e-3)
+    assert calibration.distance_mm == pytest.approx(90.0, abs=2e-3)
+    assert calibration.height_mm == pytest.approx(45.0, abs=4e-3)
+    assert calibration.horizontal_mm == pytest.approx(90.0 * np.cos(np.pi / 6), abs=4e-3)
+    assert calibration.warnings == ()
+    assert calibration.laser.projection_angle_deg == calibration.angle_deg
 
 
 @given(
@@ -42,20 +42,20 @@ def test_the_example_of_the_conventions() -> None:
     distance=st.floats(20.0, 300.0),
     fan=st.floats(4.0, 20.0),
 )
-def test_any_laser_is_found_again(angle: float, distance: float, fan: float) -> None:
+def test_calibration_recovers_any_laser(angle: float, distance: float, fan: float) -> None:
     l1, l2, l3 = cross_hair(angle, distance, fan)
-    found = calibrate_laser(2 * [l1], 2 * [l2], 2 * [l3], fan)
-    assert found.angle_deg == pytest.approx(angle, abs=1e-6)
-    assert found.distance_mm == pytest.approx(distance, rel=1e-9)
-    assert found.expected_l1_mm == pytest.approx(l1, rel=1e-9)
-    assert found.warnings == ()
+    calibration = calibrate_laser(2 * [l1], 2 * [l2], 2 * [l3], fan)
+    assert calibration.angle_deg == pytest.approx(angle, abs=1e-6)
+    assert calibration.distance_mm == pytest.approx(distance, rel=1e-9)
+    assert calibration.expected_l1_mm == pytest.approx(l1, rel=1e-9)
+    assert calibration.warnings == ()
 
 
-def test_a_square_beam_has_three_equal_lengths() -> None:
+def test_perpendicular_beam_has_three_equal_lengths() -> None:
     assert cross_hair(90.0, 60.0) == pytest.approx(60.0 * np.tan(np.radians(5.0)))
-    found = calibrate_laser(5.0, 5.0, 5.0)
-    assert found.angle_deg == pytest.approx(90.0)
-    assert found.distance_mm == pytest.approx(5.0 / np.tan(np.radians(5.0)))
+    calibration = calibrate_laser(5.0, 5.0, 5.0)
+    assert calibration.angle_deg == pytest.approx(90.0)
+    assert calibration.distance_mm == pytest.approx(5.0 / np.tan(np.radians(5.0)))
 
 
 @pytest.mark.parametrize("count", [3, 5, 10])
@@ -67,70 +67,74 @@ def test_intervals_cover_the_laser_with_few_readings(
     rng = np.random.default_rng(7)
     settings = LaserCalibrationSettings(resolution_mm=0.01, fan_angle_sigma_deg=fan_sigma)
     truth = np.array([31.14, 31.48, 31.48 * np.sin(np.radians(31.14))])
-    covered, apart = [], []
+    covered, errors = [], []
     for _ in range(1500):
         drawn = cross_hair(31.14, 31.48, 10.0 + fan_sigma * rng.normal())
         readings = np.round(drawn[:, None] + rng.normal(0.0, 0.1, (3, count)), 2)
-        found = calibrate_laser(*readings, settings=settings)
-        values = np.array([found.angle_deg, found.distance_mm, found.height_mm])
-        sigma = [found.angle_sigma_deg, found.distance_sigma_mm, found.height_sigma_mm]
+        calibration = calibrate_laser(*readings, settings=settings)
+        values = np.array([calibration.angle_deg, calibration.distance_mm, calibration.height_mm])
+        sigma = [
+            calibration.angle_sigma_deg,
+            calibration.distance_sigma_mm,
+            calibration.height_sigma_mm,
+        ]
         covered.append(np.abs(values - truth) < 1.96 * np.array(sigma))
-        apart.append(values - truth)
+        errors.append(values - truth)
     share = np.mean(covered, axis=0)
     assert (share > 0.93).all(), share
     assert (share < 0.97).all(), share
     if not fan_sigma:
-        seen = np.corrcoef(np.array(apart)[:, :2].T)[0, 1]
-        assert seen > 0.85
+        correlation = np.corrcoef(np.array(errors)[:, :2].T)[0, 1]
+        assert correlation > 0.85
         exact = calibrate_laser(*cross_hair(31.14, 31.48), settings=settings)
-        assert exact.correlation == pytest.approx(seen, abs=0.02)
+        assert exact.correlation == pytest.approx(correlation, abs=0.02)
 
 
-def test_few_readings_count_with_students_factor() -> None:
-    truth, off = cross_hair(31.14, 31.48), np.array([-0.1, 0.0, 0.1])
+def test_few_readings_use_students_factor() -> None:
+    truth, deviations = cross_hair(31.14, 31.48), np.array([-0.1, 0.0, 0.1])
     settings = LaserCalibrationSettings(resolution_mm=1e-6, fan_angle_sigma_deg=0.0)
-    found = calibrate_laser(*(truth[:, None] + off), settings=settings)
-    # Only l3 is in the distance: t of two degrees of freedom, 4.303, over 1.96.
+    calibration = calibrate_laser(*(truth[:, None] + deviations), settings=settings)
+    # The distance depends only on l3: t for two degrees of freedom, 4.303, over 1.96.
     expected = 0.1 / np.sqrt(3) / np.tan(np.radians(5.0)) * 4.3027 / 1.95996
-    assert found.distance_sigma_mm == pytest.approx(expected, rel=1e-4)
+    assert calibration.distance_sigma_mm == pytest.approx(expected, rel=1e-4)
 
 
-def test_equal_readings_are_known_to_the_resolution() -> None:
+def test_equal_readings_are_uncertain_by_the_resolution() -> None:
     readings = np.tile(cross_hair(31.14, 31.48)[:, None], 50)
     settings = LaserCalibrationSettings(resolution_mm=0.05, fan_angle_sigma_deg=0.0)
-    found = calibrate_laser(*readings, settings=settings)
+    calibration = calibrate_laser(*readings, settings=settings)
     least = 0.05 / np.sqrt(12) / np.tan(np.radians(5.0))
-    assert found.distance_sigma_mm == pytest.approx(least, rel=0.03)
+    assert calibration.distance_sigma_mm == pytest.approx(least, rel=0.03)
 
 
-def test_the_setup_gets_all_that_is_known() -> None:
-    found = calibrate_laser(*cross_hair(31.14, 31.48))
-    assert found.setup_keys == {
-        "projection_angle_deg": found.angle_deg,
-        "projection_angle_deg_sigma": found.angle_sigma_deg,
-        "distance_mm": found.distance_mm,
-        "distance_mm_sigma": found.distance_sigma_mm,
-        "angle_distance_correlation": found.correlation,
+def test_setup_keys_contain_values_sigmas_and_correlation() -> None:
+    calibration = calibrate_laser(*cross_hair(31.14, 31.48))
+    assert calibration.setup_keys == {
+        "projection_angle_deg": calibration.angle_deg,
+        "projection_angle_deg_sigma": calibration.angle_sigma_deg,
+        "distance_mm": calibration.distance_mm,
+        "distance_mm_sigma": calibration.distance_sigma_mm,
+        "angle_distance_correlation": calibration.correlation,
     }
 
 
-def test_the_resolution_counts_for_a_single_reading() -> None:
+def test_resolution_contributes_for_a_single_reading() -> None:
     lengths = cross_hair(31.0, 60.0)
     coarse = calibrate_laser(*lengths, settings=LaserCalibrationSettings(1.0, 0.1, 0.0))
     expected = 1.0 / np.sqrt(12.0) / np.tan(np.radians(5.0))
     assert coarse.distance_sigma_mm == pytest.approx(expected)
 
 
-def test_the_fan_angle_counts() -> None:
+def test_fan_angle_uncertainty_contributes() -> None:
     settings = LaserCalibrationSettings(1e-9, 1e-9, 0.1)
     lengths = cross_hair(31.0, 60.0)
-    found = calibrate_laser(*lengths, settings=settings)
+    calibration = calibrate_laser(*lengths, settings=settings)
     wider = calibrate_laser(*lengths, fan_angle_deg=10.01)
     narrower = calibrate_laser(*lengths, fan_angle_deg=9.99)
     slope = abs(wider.distance_mm - narrower.distance_mm) / 0.02
-    assert found.distance_sigma_mm == pytest.approx(0.1 * slope, rel=1e-3)
+    assert calibration.distance_sigma_mm == pytest.approx(0.1 * slope, rel=1e-3)
     slope = abs(wider.angle_deg - narrower.angle_deg) / 0.02
-    assert found.angle_sigma_deg == pytest.approx(0.1 * slope, rel=1e-3)
+    assert calibration.angle_sigma_deg == pytest.approx(0.1 * slope, rel=1e-3)
 
 
 @pytest.mark.parametrize(
@@ -145,21 +149,23 @@ def test_the_fan_angle_counts() -> None:
         (13.675, 18.561, 7.874, 0.0, "fan_angle_deg = 0"),
     ],
 )
-def test_contradictions_are_named(l1: float, l2: float, l3: float, fan: float, words: str) -> None:
+def test_contradictory_readings_are_rejected(
+    l1: float, l2: float, l3: float, fan: float, words: str
+) -> None:
     with pytest.raises(ValueError, match=words):
         calibrate_laser(l1, l2, l3, fan)
 
 
-def test_a_mild_disagreement_is_a_warning() -> None:
+def test_mild_disagreement_is_a_warning() -> None:
     l1, l2, l3 = cross_hair(31.0, 60.0)
     settings = LaserCalibrationSettings(fan_angle_sigma_deg=0.0)
-    often = ([length - 0.01, length, length + 0.01] for length in (l1 + 0.25, l2, l3))
-    (warning,) = calibrate_laser(*often, settings=settings).warnings
+    readings = ([length - 0.01, length, length + 0.01] for length in (l1 + 0.25, l2, l3))
+    (warning,) = calibrate_laser(*readings, settings=settings).warnings
     assert "l1_mm" in warning
     assert f"{l1:.4g}" in warning
 
 
-def test_a_nearly_square_beam_is_measured_with_a_warning() -> None:
-    found = calibrate_laser(5.0, 5.0, 5.03)
-    assert found.angle_deg == pytest.approx(90.0)
-    assert "l3_mm" in found.warnings[0]
+def test_nearly_perpendicular_beam_gives_a_warning() -> None:
+    calibration = calibrate_laser(5.0, 5.0, 5.03)
+    assert calibration.angle_deg == pytest.approx(90.0)
+    assert "l3_mm" in calibration.warnings[0]

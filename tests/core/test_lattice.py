@@ -1,4 +1,4 @@
-"""The default search for rows and columns: right or silent."""
+"""The default search for rows and columns: indices are correct, or the frame is rejected."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ ROWS, COLUMNS = 9, 14
 
 
 def sites() -> IntArray:
-    """(k, t) of a full grid, counted from 1, rows from the bottom up, shape (n, 2)."""
+    """Return (k, t) of a full grid, counted from 1, rows from the bottom up, shape (n, 2)."""
     k, t = np.mgrid[1 : ROWS + 1, 1 : COLUMNS + 1]
     return np.stack([k.ravel(), t.ravel()], axis=-1)
 
 
 def bowed(site: IntArray, bow: float = 0.0, fan: float = 0.0, roll_deg: float = 0.0) -> FloatArray:
-    """Places (u, v) of sites: rows arched by ``bow``, columns spread upwards by ``fan``."""
+    """Return positions (u, v): rows arched by ``bow``, columns spread upwards by ``fan``."""
     k, t = site.T - np.array([[5.0], [7.5]])
     x = 22.0 * t * (1 + fan * k)
     y = 34.0 * k - bow * t**2
@@ -33,7 +33,7 @@ def bowed(site: IntArray, bow: float = 0.0, fan: float = 0.0, roll_deg: float = 
 
 
 def wrong(lattice: Lattice, true: IntArray) -> int:
-    """How many indexed dots are off the others, by what step and turn suits most of them."""
+    """Return the number of wrong indices, up to the shift and turn that suit most dots."""
     indexed = lattice.row > 0
     site = np.stack([lattice.row, lattice.column], axis=-1)[indexed]
     agreeing = 0
@@ -47,9 +47,7 @@ def wrong(lattice: Lattice, true: IntArray) -> int:
     ("bow", "fan", "roll_deg"),
     [(0, 0, 0), (1.2, 0, 0), (0, 0.06, 0), (1.2, 0.06, 3), (-1.0, 0.04, -3), (0, 0, 20)],
 )
-def test_a_whole_grid_is_indexed_from_the_lower_left(
-    bow: float, fan: float, roll_deg: float
-) -> None:
+def test_full_grid_is_indexed_from_the_lower_left(bow: float, fan: float, roll_deg: float) -> None:
     order = np.random.default_rng(0).permutation(ROWS * COLUMNS)
     site = sites()[order]
     lattice = grow_lattice(as_dots(bowed(site, bow, fan, roll_deg)), GrowSettings())
@@ -57,14 +55,14 @@ def test_a_whole_grid_is_indexed_from_the_lower_left(
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_tiles_with_gaps_between_them_are_one_grid(seed: int) -> None:
-    """As an infrared projector has them: rows staggered and bowed, steps a quarter longer there."""
+def test_tiles_with_gaps_are_joined_to_one_grid(seed: int) -> None:
+    """As from an infrared projector: rows staggered and bowed, gaps a quarter step wide."""
     rng = np.random.default_rng(seed)
     row, column = np.mgrid[0:24, 0:24].reshape(2, -1)
     u = 20.0 * (column + 0.25 * (column // 8) + row % 2 / 2)
     v = 14.5 * (row + 0.25 * (row // 8)) + 6e-4 * (u - 250) ** 2
-    place = np.stack([u, v], axis=-1) + rng.normal(0, 0.2, (len(u), 2))
-    lattice = grow_lattice(as_dots(place), GrowSettings())
+    positions = np.stack([u, v], axis=-1) + rng.normal(0, 0.2, (len(u), 2))
+    lattice = grow_lattice(as_dots(positions), GrowSettings())
     indexed = lattice.row > 0
     assert indexed.mean() > 0.95
     # In whole steps along two sides of the triangles that staggered dots make.
@@ -75,12 +73,12 @@ def test_tiles_with_gaps_between_them_are_one_grid(seed: int) -> None:
     np.testing.assert_array_equal(true @ steps, site)
 
 
-def test_grids_that_contradict_each_other_are_not_joined() -> None:
+def test_contradictory_grids_are_not_joined() -> None:
     left, right = (np.arange(64).reshape(8, 8) + first for first in (0, 100))
     right[:, :2] = left[:, -2:]
-    whole = merge_grids([left, right.T])
-    assert whole.shape == (8, 14)
-    np.testing.assert_array_equal(whole[:, 6:], right)
+    merged = merge_grids([left, right.T])
+    assert merged.shape == (8, 14)
+    np.testing.assert_array_equal(merged[:, 6:], right)
     right[4:, 0] = left[3:7, -2]  # slipped by a row
     np.testing.assert_array_equal(merge_grids([left, right.T]), left)
 
@@ -89,40 +87,40 @@ def test_grids_that_contradict_each_other_are_not_joined() -> None:
 def test_missing_and_false_dots_never_cause_a_wrong_index(seed: int) -> None:
     rng = np.random.default_rng(seed)
     site = sites()[rng.permutation(ROWS * COLUMNS)[rng.integers(0, 18) :]]
-    place = bowed(site, rng.uniform(-1, 1.3), rng.uniform(-0.05, 0.07), rng.uniform(-3, 3))
-    place = place + rng.normal(0.0, 0.6, place.shape)
+    positions = bowed(site, rng.uniform(-1, 1.3), rng.uniform(-0.05, 0.07), rng.uniform(-3, 3))
+    positions = positions + rng.normal(0.0, 0.6, positions.shape)
     false = rng.uniform(0.0, 480.0, (int(rng.integers(0, 7)), 2))
-    lattice = grow_lattice(as_dots(np.concatenate([place, false])), GrowSettings())
-    own = Lattice(lattice.row[: len(site)], lattice.column[: len(site)])
-    assert wrong(own, site) == 0
-    # Up to a seventh of the dots are gone; one with no whole cell beside it is left in doubt.
-    assert np.mean(own.row > 0) > 0.8
+    lattice = grow_lattice(as_dots(np.concatenate([positions, false])), GrowSettings())
+    true_part = Lattice(lattice.row[: len(site)], lattice.column[: len(site)])
+    assert wrong(true_part, site) == 0
+    # Up to a seventh of the dots are missing; a dot without a complete cell remains in doubt.
+    assert np.mean(true_part.row > 0) > 0.8
 
 
 @pytest.mark.parametrize("seed", range(0, ROWS * COLUMNS, 25))
 @pytest.mark.parametrize("reach", [3, 20])
-def test_a_grid_grows_from_any_dot_as_far_as_there_are_sites(seed: int, reach: int) -> None:
+def test_grid_grows_from_any_dot_within_reach(seed: int, reach: int) -> None:
     u, v = bowed(sites(), 1.2, 0.06, 3.0).T
     order = np.argsort(u)
     plane, site = (u - 1j * v)[order], sites()[order]
     across = 2 * (reach + BORDER) + 1
     dot_at = np.full((across, across), -1)
-    at = {(k, t): dot for dot, (k, t) in enumerate(site.tolist())}
+    dot_of = {(k, t): dot for dot, (k, t) in enumerate(site.tolist())}
     k, t = site[seed]
-    # Steps as its neighbours have them, from the side where it has one.
+    # Steps to its neighbours, from the side where it has one.
     right, up = (t + 1 if t < COLUMNS else t - 1), (k + 1 if k < ROWS else k - 1)
-    first = (plane[at[k, right]] - plane[seed]) * (right - t)
-    second = (plane[at[up, t]] - plane[seed]) * (up - k)
+    first = (plane[dot_of[k, right]] - plane[seed]) * (right - t)
+    second = (plane[dot_of[up, t]] - plane[seed]) * (up - k)
     row, column, dot, part = grow(plane, dot_at, seed, first, second, 0.36, 1.8).T
     grown = np.stack([row, column], axis=-1) - across // 2
-    off = site - site[seed]
-    assert set(dot.tolist()) == set(np.nonzero(np.abs(off).max(axis=1) <= reach)[0].tolist())
-    np.testing.assert_array_equal(grown, off[dot])
-    assert len(set(part.tolist())) == 1  # all hangs together
+    offset = site - site[seed]
+    assert set(dot.tolist()) == set(np.nonzero(np.abs(offset).max(axis=1) <= reach)[0].tolist())
+    np.testing.assert_array_equal(grown, offset[dot])
+    assert len(set(part.tolist())) == 1  # all are connected
     assert (dot_at == -1).all()
 
 
-def test_of_what_does_not_hang_together_nothing_is_joined() -> None:
+def test_unconnected_dots_are_not_joined() -> None:
     # Five dots in a cross have no cell.
     plane = np.array([-20.0, -20.0j, 0.0, 20.0j, 20.0])
     dot_at = np.full((21, 21), -1)
@@ -131,28 +129,28 @@ def test_of_what_does_not_hang_together_nothing_is_joined() -> None:
     np.testing.assert_array_equal(grown[:, 2], grown[:, 3])
 
 
-def test_dots_in_one_place_do_no_harm() -> None:
+def test_coincident_dots_cause_no_wrong_index() -> None:
     site = np.concatenate([sites(), sites()[::9]])
     lattice = grow_lattice(as_dots(bowed(site, 1.0, 0.04)), GrowSettings())
     assert wrong(lattice, site) == 0
-    assert np.mean(lattice.row > 0) > 0.5  # all of them are in doubt
+    assert np.mean(lattice.row > 0) > 0.5  # coincident dots are in doubt
 
 
-def test_the_absent_centre_stands_out() -> None:
+def test_absent_centre_is_the_reference() -> None:
     site = np.array([s for s in sites() if tuple(s) != (5, 7)])
     lattice = grow_lattice(as_dots(bowed(site, 1.0, 0.04)), GrowSettings())
     assert lattice.reference == (5, 7)
     assert lattice.candidates == ((5, 7),)
 
 
-def test_of_two_holes_none_is_chosen() -> None:
+def test_no_reference_is_chosen_among_two_holes() -> None:
     site = np.array([s for s in sites() if tuple(s) not in {(5, 7), (3, 9)}])
     lattice = grow_lattice(as_dots(bowed(site, 1.0)), GrowSettings())
     assert lattice.reference is None
     assert set(lattice.candidates) == {(5, 7), (3, 9)}
 
 
-def test_a_row_behind_the_torch_is_marked() -> None:
+def test_rows_behind_the_torch_are_blocked() -> None:
     hidden = {(8, t) for t in range(6, 10)} | {(9, t) for t in range(6, 10)}
     site = np.array([s for s in sites() if tuple(s) not in hidden])
     lattice = grow_lattice(as_dots(bowed(site, 0.8)), GrowSettings())
@@ -160,7 +158,7 @@ def test_a_row_behind_the_torch_is_marked() -> None:
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_dots_of_real_pools_are_indexed_right_or_not_at_all(seed: int) -> None:
+def test_dots_of_pools_are_indexed_correctly_or_rejected(seed: int) -> None:
     rng = np.random.default_rng(seed)
     width, peak = rng.uniform(5.5, 7.5), rng.uniform(0.2, 0.4)
     pool = [
@@ -174,18 +172,18 @@ def test_dots_of_real_pools_are_indexed_right_or_not_at_all(seed: int) -> None:
         lattice = grow_lattice(seen.dots, GrowSettings())
     except CannotMeasure:
         return
-    own = seen.ray[:, 0] > 0
-    assert wrong(Lattice(lattice.row[own], lattice.column[own]), seen.ray[own]) == 0
+    has_ray = seen.ray[:, 0] > 0
+    assert wrong(Lattice(lattice.row[has_ray], lattice.column[has_ray]), seen.ray[has_ray]) == 0
 
 
-def test_scattered_dots_are_no_grid() -> None:
+def test_scattered_dots_raise_no_rows() -> None:
     scattered = np.random.default_rng(1).uniform(0.0, 480.0, (60, 2))
-    with pytest.raises(CannotMeasure) as answer:
+    with pytest.raises(CannotMeasure) as error:
         grow_lattice(as_dots(scattered), GrowSettings())
-    assert answer.value.status == "no-rows"
+    assert error.value.status == "no-rows"
 
 
-def test_a_handful_of_dots_is_no_grid() -> None:
-    with pytest.raises(CannotMeasure) as answer:
+def test_handful_of_dots_raises_too_few_dots() -> None:
+    with pytest.raises(CannotMeasure) as error:
         grow_lattice(as_dots(bowed(sites()[:5])), GrowSettings())
-    assert answer.value.status == "too-few-dots"
+    assert error.value.status == "too-few-dots"

@@ -1,4 +1,4 @@
-"""Lines corrected by hand: what each edit makes of them, and what is then measured."""
+"""Manual correction of lines: the edits, and the measurement after them."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ from tests.benchmarks.lines import CALIBRATION, RIG, VIEW
 
 
 def straight(v_px: float, u_px: tuple[int, int] = (100, 300)) -> LightLine:
-    """A line along u."""
+    """Return a line along u."""
     u = np.arange(*u_px, dtype=float)
-    place = np.stack([u, np.full_like(u, v_px)], axis=-1)
+    image_px = np.stack([u, np.full_like(u, v_px)], axis=-1)
     return LightLine(
-        image_px=place,
+        image_px=image_px,
         tangent=np.tile([1.0, 0.0], (len(u), 1)),
         sigma_px=np.full(len(u), 0.1),
         curvature=np.zeros(len(u)),
-        ends_px=place[[0, -1]],
+        ends_px=image_px[[0, -1]],
         cut=np.zeros(2, bool),
         width_px=3.0,
         light=100.0,
@@ -41,7 +41,7 @@ def straight(v_px: float, u_px: tuple[int, int] = (100, 300)) -> LightLine:
 
 
 def five() -> LineCorrection:
-    """Five lines, 40 px apart, from the lowest up."""
+    """Return five lines, 40 px apart, from the lowest up."""
     lines = tuple(straight(500.0 - 40.0 * k) for k in range(5))
     return LineCorrection.of(LinesSeen(lines, True, True, 2))
 
@@ -50,7 +50,7 @@ def same(one: LightLine, other: LightLine) -> bool:
     return bool(np.array_equal(one.image_px, other.image_px) and (one.cut == other.cut).all())
 
 
-def test_a_line_that_is_cut_and_joined_is_what_it_was():
+def test_cut_and_join_are_inverse():
     cut = cut_line(five(), 2, 80)
     assert len(cut.seen.lines) == 6
     left, right = sorted(cut.seen.lines[2:4], key=lambda one: one.ends_px[0, 0])
@@ -61,7 +61,7 @@ def test_a_line_that_is_cut_and_joined_is_what_it_was():
     assert same(joined.seen.lines[2], five().seen.lines[2])
 
 
-def test_pieces_are_joined_at_their_nearest_ends_whichever_way_they_run():
+def test_pieces_are_joined_at_their_nearest_ends():
     one, other = straight(420.0, (100, 180)), straight(420.0, (220, 300))
     turned = LineCorrection.of(LinesSeen((other, one), False, False, 0))
     joined = join_lines(turned, 0, 1).seen.lines[0]
@@ -71,12 +71,12 @@ def test_pieces_are_joined_at_their_nearest_ends_whichever_way_they_run():
     assert joined.ends_px[:, 0].tolist() == [100.0, 299.0]
 
 
-def test_a_line_is_not_cut_at_its_end():
+def test_cutting_a_line_at_its_end_is_rejected():
     with pytest.raises(ValueError, match="end"):
         cut_line(five(), 0, 3)
 
 
-def test_what_is_deleted_at_the_edge_leaves_no_fringe_beside_the_next():
+def test_deleting_the_edge_line_clears_its_fringe():
     assert delete_line(five(), 2).seen.fringe_below
     changed = delete_line(five(), 0).seen
     assert (changed.fringe_below, changed.fringe_above) == (False, True)
@@ -84,7 +84,7 @@ def test_what_is_deleted_at_the_edge_leaves_no_fringe_beside_the_next():
     assert [one.image_px[0, 1] for one in changed.lines] == [460.0, 420.0, 380.0, 340.0]
 
 
-def test_numbers_that_no_pattern_has_are_refused():
+def test_impossible_line_numbers_are_rejected():
     with pytest.raises(ValueError, match="1 to 5"):
         number_line(five(), 0, 6, 5)
     two = number_line(number_line(five(), 0, 2, 5), 1, 3, 5)
@@ -92,9 +92,9 @@ def test_numbers_that_no_pattern_has_are_refused():
         join_lines(two, 0, 1)
 
 
-def test_the_line_at_a_place():
-    line, point, away = nearest_line(five().seen.lines, 150.0, 463.0)
-    assert (line, point, away) == (1, 50, 3.0)
+def test_nearest_line():
+    line, point, distance = nearest_line(five().seen.lines, 150.0, 463.0)
+    assert (line, point, distance) == (1, 50, 3.0)
 
 
 @pytest.fixture(scope="module")
@@ -116,9 +116,7 @@ def measured(picture: np.ndarray, correction: LineCorrection):
 
 
 @pytest.mark.slow
-def test_two_pieces_of_one_number_give_the_surface_of_the_line(
-    picture: np.ndarray, found: LineCorrection
-):
+def test_two_pieces_of_a_line_give_the_same_surface(picture: np.ndarray, found: LineCorrection):
     whole = measured(picture, found).surface
     cut = cut_line(found, 2, len(found.seen.lines[2].image_px) // 2)
     assert measured(picture, cut).status == "line-numbers"  # six lines of five
@@ -133,9 +131,7 @@ def test_two_pieces_of_one_number_give_the_surface_of_the_line(
 
 
 @pytest.mark.slow
-def test_numbers_by_hand_go_before_those_that_fringes_settle(
-    picture: np.ndarray, found: LineCorrection
-):
+def test_manual_numbers_override_those_from_fringes(picture: np.ndarray, found: LineCorrection):
     three = delete_line(delete_line(found, 4), 3)
     three = number_line(number_line(three, 0, 1, 5), 1, 2, 5)
     surface = measured(picture, three).surface

@@ -1,4 +1,4 @@
-"""States of a run from its series, pulses from brightness, oscillation from a followed line."""
+"""States of a run from its series, pulses from brightness, oscillation from a tracked line."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from labapp.simulation.lines.runs import PHASES, GmawLook, gmaw_run
 
 
 def run_series(seed: int, noise: float = 0.004) -> tuple[LineSeries, list[str]]:
-    """A run like that of Fig. 3-11: what its frames would show, with gaps, and its states."""
+    """Simulate the measured series of a run like Fig. 3-11, with gaps, and its true states."""
     rng = np.random.default_rng(seed)
     ends = (15, 55, 110, 150, 200)
     truth = [PHASES[int(np.searchsorted(ends, k, side="right"))] for k in range(200)]
-    at = np.arange(200.0)
-    width = np.interp(at, ends[:4], [2.2, 6.2, 6.2, 4.4])
-    bend = np.interp(at, ends[:4], [-0.06, -0.06, -0.06, 0.08])
+    frame = np.arange(200.0)
+    width = np.interp(frame, ends[:4], [2.2, 6.2, 6.2, 4.4])
+    bend = np.interp(frame, ends[:4], [-0.06, -0.06, -0.06, 0.08])
     count = np.where(width > 5, 5, np.where(width > 3, 4, 3))
-    lit = at >= ends[0]
+    lit = frame >= ends[0]
     width = np.where(lit, width + 0.05 * rng.normal(size=200), np.nan)
     bend = np.where(lit, bend + noise * rng.normal(size=200), np.nan)
     unknown = rng.random(200) < 0.15
@@ -35,10 +35,10 @@ def run_series(seed: int, noise: float = 0.004) -> tuple[LineSeries, list[str]]:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_change_begins_where_a_steady_value_ceases_to_be_known(seed: int):
+def test_change_starts_where_a_steady_value_becomes_unknown(seed: int):
     series, _ = run_series(seed)
     turn = series.turn.copy()
-    part = (np.arange(110, 150) - 109.5) / 40  # it speeds up, so that a straight ramp begins late
+    part = (np.arange(110, 150) - 109.5) / 40  # accelerating, so that a straight ramp starts late
     low, high = np.nanmedian(turn[60:105]), np.nanmedian(turn[155:])
     turn[110:150] = low + (high - low) * part * (0.7 + 0.3 * part)
     turn[110:129] = np.nan  # a caustic as soon as the pool flattens
@@ -55,11 +55,11 @@ def test_states_of_a_run(seed: int):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_a_pool_grows_from_its_first_lines_though_they_are_too_few(seed: int):
+def test_pool_grows_from_its_first_lines_though_too_few(seed: int):
     series, truth = run_series(seed)
     width, turn = series.width_mm.copy(), series.turn.copy()
     width[15:26], turn[15:26] = np.nan, np.nan
-    width[26:34] = width[34]  # the growth is seen later than within 15 frames of the first lines
+    width[26:34] = width[34]  # the growth is visible only 15 frames after the first lines
     states = line_states(replace(series, width_mm=width, turn=turn))
     assert set(states[15:50]) == {"growing"} == set(truth[15:50])
 
@@ -71,6 +71,7 @@ def test_a_steady_pool_neither_grows_nor_flattens():
     assert set(line_states(series)) == {"concave"}
 
 
+<<<<<<< HEAD
 def test_convex_pool_that_bulges_further_is_not_flattening():
     rng = np.random.default_rng(5)
     turn = np.interp(np.arange(120), [60, 80], [0.2, 0.5]) + 0.01 * rng.normal(size=120)
@@ -79,6 +80,9 @@ def test_convex_pool_that_bulges_further_is_not_flattening():
 
 
 def test_frames_without_a_surface_keep_the_state_before_them():
+=======
+def test_frames_without_a_surface_keep_the_previous_state():
+>>>>>>> words1
     turn = np.concatenate([np.full(100, -0.3), np.full(40, np.nan)])
     width = np.where(np.isfinite(turn), 6.0, np.nan)
     assert set(line_states(LineSeries(np.full(140, 5), width, turn))) == {"concave"}
@@ -106,8 +110,8 @@ def test_steady_light_has_no_pulses():
     assert np.isnan(pulses.frequency_hz)
 
 
-def test_the_period_settles_frames_in_between():
-    """Half as bright as a pulse: the place in the period says which it is."""
+def test_period_decides_frames_of_medium_brightness():
+    """At half the brightness of a pulse, the phase decides."""
     phase = (np.arange(1500) / 1500 * 120.0) % 1.0
     on = phase < 0.4
     light = np.where(on, 100.0, 10.0)
@@ -120,15 +124,15 @@ def test_the_period_settles_frames_in_between():
 def test_frequency_through_missing_frames():
     rng = np.random.default_rng(7)
     time_s = np.arange(3000) / 1500
-    kept = (time_s * 120) % 1.0 > 0.4
+    known = (time_s * 120) % 1.0 > 0.4
     values = np.sin(2 * np.pi * 37.3 * time_s) + 2 * time_s + 0.5 * rng.normal(size=3000)
-    frequency, share = oscillation_frequency(time_s[kept], values[kept])
+    frequency, share = oscillation_frequency(time_s[known], values[known])
     assert frequency == pytest.approx(37.3, abs=0.1)
     assert share > 0.5
 
 
 @pytest.mark.slow
-def test_a_line_is_followed_through_pulses_spatter_and_glare():
+def test_line_is_tracked_through_pulses_spatter_and_glare():
     rig = LineRig(
         Laser(70.0, 60.0, aim_y_mm=-2.4),
         LinePattern(1, 0.23, 4.0),
@@ -141,14 +145,14 @@ def test_a_line_is_followed_through_pulses_spatter_and_glare():
     film = track_line((one.image for one in run), 1500.0)
     truth = np.array([one.on for one in run])
     assert np.mean(film.pulses.on == truth) >= 0.99
-    off = np.flatnonzero(~truth)
+    off_frames = np.flatnonzero(~truth)
     errors = []
-    for k in off:
+    for k in off_frames:
         line = film.lines[k]
         if line is not None:
             u, v = run[k].line_px[np.argsort(run[k].line_px[:, 0])].T
             errors.append(np.abs(line.v_px - np.interp(line.u_px, u, v))[3:-3].max())
-    assert len(errors) >= 0.95 * len(off)
+    assert len(errors) >= 0.95 * len(off_frames)
     assert np.median(errors) < 0.6
     assert film.frequency_hz == pytest.approx(36.0, abs=1.0)
 
@@ -173,18 +177,18 @@ def test_a_tracked_line_ends_where_its_light_ends():
         assert abs(line.u_px[-1] - 220) < 9
 
 
-def test_pulses_are_told_by_the_current_where_the_light_does_not_tell_them():
+def test_current_identifies_pulses_where_light_does_not():
     rng = np.random.default_rng(12)
     on = np.arange(600) * 120 / 1500 % 1.0 < 0.4
-    dim = 20 + 0.3 * on + rng.normal(size=600)  # a filter that lets next to nothing through
+    dim = 20 + 0.3 * on + rng.normal(size=600)  # a very dense filter
     assert not classify_pulses(dim, 1500.0).on.any()
     current = np.where(on, 300.0, 80.0) + 10 * rng.normal(size=600)
-    current[200:260] = np.nan  # the logger paused: the period tells
+    current[200:260] = np.nan  # the logger paused: the period decides
     pulses = classify_pulses(dim, 1500.0, current)
     assert np.mean(pulses.on == on) > 0.99
     assert pulses.frequency_hz == pytest.approx(120.0, abs=0.5)
     light = np.where(on, 190.0, 22.0) * np.exp(0.08 * rng.normal(size=600))
-    light[::50] = 100.0  # spatter or glare, which the current tells from a pulse
+    light[::50] = 100.0  # spatter or glare, which the current distinguishes from a pulse
     assert (classify_pulses(light, None, current).on == on)[::50].mean() > 0.8
     steady = np.full(600, 150.0)
     assert np.array_equal(

@@ -1,4 +1,4 @@
-"""The surface under lines, against the twin; its equations, against differences."""
+"""The surface from lines, compared with the simulation; its Jacobian, with differences."""
 
 from __future__ import annotations
 
@@ -36,18 +36,18 @@ def rendered(pool: Pool | None, seed: int = 1, look: LineLook | None = None) -> 
 
 
 def exact_data(frame: LineFrame, sigma_mm: float = 0.01) -> tuple[LineData, np.ndarray]:
-    """What a perfect detector would give, and the numbers of the lines from the lowest up."""
+    """Return the data of a perfect detector, and the line numbers from the lowest up."""
     lines = sorted(frame.lines, key=lambda one: -float(np.mean(one.image_px[:, 1])))
     places = [VIEW.to_plane(one.image_px) for one in lines]
     tangents = [np.gradient(place, axis=0) for place in places]
-    some = slice(3, -3, 8)
-    along = np.concatenate([each[some] for each in tangents])
+    samples = slice(3, -3, 8)
+    along = np.concatenate([each[samples] for each in tangents])
     along /= np.linalg.norm(along, axis=-1, keepdims=True)
-    count = [len(place[some]) for place in places]
+    count = [len(place[samples]) for place in places]
     line = np.repeat(np.arange(len(lines)), count)
     data = LineData(
         line,
-        np.concatenate([place[some] for place in places]),
+        np.concatenate([place[samples] for place in places]),
         np.stack([-along[:, 1], along[:, 0]], axis=-1),
         np.full(len(line), sigma_mm),
         np.repeat(np.arange(len(lines)), 2),
@@ -66,7 +66,7 @@ def test_rays_of_a_line_are_in_one_plane():
 
 
 @pytest.mark.parametrize("peak_mm", [0.25, -0.3])
-def test_equations_have_the_derivatives_of_their_residuals(peak_mm: float):
+def test_jacobian_agrees_with_central_differences(peak_mm: float):
     data, numbers = exact_data(rendered(spherical_cap(6.0, peak_mm)))
     basis = SplineBasis.over(np.array([-4.0, -3.0]), np.array([4.0, 3.0]), 1.5)
     model = LineModel(RIG, basis, numbers)
@@ -76,16 +76,17 @@ def test_equations_have_the_derivatives_of_their_residuals(peak_mm: float):
     linear = model.residuals(coefficients, data)
     rng, step = np.random.default_rng(2), 1e-6
     for _ in range(3):
-        way = rng.normal(size=basis.count)
+        direction = rng.normal(size=basis.count)
         ahead, behind = (
-            model.residuals(coefficients + sign * step * way, data).residual for sign in (1, -1)
+            model.residuals(coefficients + sign * step * direction, data).residual
+            for sign in (1, -1)
         )
         slope = -(ahead - behind) / (2 * step)  # a residual falls as its prediction rises
-        predicted = linear.jacobian @ way
-        off = np.abs(slope - predicted) / np.abs(predicted).max()
-        # Terms of the residual's own size are left out of the Jacobian.
-        assert np.median(off) < 0.01
-        assert np.quantile(off, 0.9) < 0.1
+        predicted = linear.jacobian @ direction
+        error = np.abs(slope - predicted) / np.abs(predicted).max()
+        # The Jacobian omits terms of the order of the residual.
+        assert np.median(error) < 0.01
+        assert np.quantile(error, 0.9) < 0.1
 
 
 @pytest.mark.slow
@@ -102,7 +103,7 @@ def test_exact_lines_give_the_surface_and_its_uncertainty(peak_mm: float):
     assert fitted.margin > 50
 
 
-def test_one_line_alone_is_no_surface():
+def test_single_line_raises_too_few_lines():
     data, numbers = exact_data(rendered(spherical_cap(6.0, 0.25)))
     on, ends = data.line == 2, data.end_line == 2
     alone = replace(
@@ -115,37 +116,37 @@ def test_one_line_alone_is_no_surface():
         end_mm=data.end_mm[ends],
         end_sigma_mm=data.end_sigma_mm[ends],
     )
-    with pytest.raises(CannotMeasure) as answer:
+    with pytest.raises(CannotMeasure) as error:
         fit_lines(alone, [numbers[2:3]], RIG)
-    assert answer.value.status == "too-few-lines"
+    assert error.value.status == "too-few-lines"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("peak_mm", "numbers"), [(0.25, [1, 2, 3, 4, 5]), (-0.3, [5, 4, 3, 2, 1])])
 def test_frames_give_height_numbers_and_features(peak_mm: float, numbers: list[int]):
     frame = rendered(spherical_cap(6.0, peak_mm), look=LineLook(gaps=1))
-    found = measure_lines(frame.image, RIG, CALIBRATION)
-    assert found.status == "ok"
-    assert found.surface is not None
-    assert found.surface.numbers.tolist() == numbers
-    assert found.surface.height_mm == pytest.approx(peak_mm, rel=0.08)
-    assert found.surface.height_sigma_mm < 0.1 * abs(peak_mm)
-    assert found.features.count == 5
-    assert found.features.curvature_per_mm > 0
-    assert abs(found.features.asymmetry) < 0.1
+    result = measure_lines(frame.image, RIG, CALIBRATION)
+    assert result.status == "ok"
+    assert result.surface is not None
+    assert result.surface.numbers.tolist() == numbers
+    assert result.surface.height_mm == pytest.approx(peak_mm, rel=0.08)
+    assert result.surface.height_sigma_mm < 0.1 * abs(peak_mm)
+    assert result.features.count == 5
+    assert result.features.curvature_per_mm > 0
+    assert abs(result.features.asymmetry) < 0.1
     plane = VIEW.to_plane(np.concatenate([one.image_px for one in frame.lines]))
-    assert found.features.width_mm == pytest.approx(np.ptp(plane[:, 0]), rel=0.1)
+    assert result.features.width_mm == pytest.approx(np.ptp(plane[:, 0]), rel=0.1)
 
 
 @pytest.mark.slow
-def test_a_caustic_is_no_surface():
-    """A hollow of this depth gathers each line to a point: nothing must be read from it."""
+def test_caustic_is_rejected():
+    """A pool of this depth focuses each line to a point and must not be measured."""
     frame = rendered(spherical_cap(6.0, -0.138))
-    found = measure_lines(frame.image, RIG, CALIBRATION)
-    assert found.status != "ok"
+    result = measure_lines(frame.image, RIG, CALIBRATION)
+    assert result.status != "ok"
 
 
 def test_solid_metal_shows_no_line():
-    found = measure_lines(rendered(None).image, RIG, CALIBRATION)
-    assert found.status == "no-lines"
-    assert found.features.count == 0
+    result = measure_lines(rendered(None).image, RIG, CALIBRATION)
+    assert result.status == "no-lines"
+    assert result.features.count == 0

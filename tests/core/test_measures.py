@@ -1,4 +1,4 @@
-"""Reflection errors, and the sizes of pools that are known."""
+"""Reflection errors, and sizes of known pools."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ RIG = Rig(
 
 
 def truth(pool: Pool, residual=None):
-    """What a scheme without fault would return for a pool, and its match."""
+    """Return the reconstruction by a perfect scheme, and its match."""
     match = exact_match(trace(pool, RIG), RIG)
     count = len(match.ray)
     points = trace(pool, RIG).point_mm[match.ray[:, 0] - 1, match.ray[:, 1] - 1]
@@ -60,7 +60,7 @@ def truth(pool: Pool, residual=None):
     st.sampled_from([-0.1, -0.05, 0.05, 0.1]),
     st.tuples(st.floats(-0.4, 0.4), st.floats(-0.4, 0.4)),
 )
-def test_a_spherical_cap_has_the_size_of_the_formulas(diameter, share, center):
+def test_spherical_cap_has_analytical_sizes(diameter, share, center):
     height = diameter * share
     reconstruction, match = truth(spherical_cap(diameter, height, center))
     measures = measure_surface(reconstruction, match, RIG)
@@ -75,7 +75,7 @@ def test_a_spherical_cap_has_the_size_of_the_formulas(diameter, share, center):
     assert (measures.peak_x_mm, measures.peak_y_mm) == pytest.approx(center, abs=1e-4)
 
 
-def test_an_egg_off_the_origin_is_measured():
+def test_off_centre_egg_is_measured():
     pool = egg(6.6, 2.8, 4.6, 0.29, (0.2, -0.4))
     reconstruction, match = truth(pool)
     measures, size = measure_surface(reconstruction, match, RIG), pool.size
@@ -88,17 +88,17 @@ def test_an_egg_off_the_origin_is_measured():
     assert measures.area_mm2 == pytest.approx(len(x) * 0.02**2, rel=1e-3)
 
 
-def test_the_uncertainties_of_sizes_are_those_of_the_reconstruction():
+def test_size_uncertainties_are_those_of_the_reconstruction():
     reconstruction, match = truth(spherical_cap(6.0, 0.4))
     assert np.isnan(measure_surface(reconstruction, match, RIG).height_sigma_mm)
     sigma = np.array([0.06, 0.05, 0.04, 0.03, 0.2, 0.1])
     measures = measure_surface(replace(reconstruction, size_sigma=sigma), match, RIG)
     names = ("width_sigma_mm", "length_sigma_mm", "height_sigma_mm", "depth_sigma_mm")
-    told = [getattr(measures, name) for name in (*names, "area_sigma_mm2", "volume_sigma_mm3")]
-    np.testing.assert_array_equal(told, sigma)
+    stated = [getattr(measures, name) for name in (*names, "area_sigma_mm2", "volume_sigma_mm3")]
+    np.testing.assert_array_equal(stated, sigma)
 
 
-def test_reflection_errors_are_eq_6_3_to_6_8():
+def test_reflection_errors_agree_with_eq_6_3_to_6_8():
     reconstruction, match = truth(
         spherical_cap(6.0, 0.3),
         residual=lambda n: np.random.default_rng(1).normal(0.0, 1.0, (n, 2)),
@@ -121,7 +121,7 @@ def test_reflection_errors_are_eq_6_3_to_6_8():
     assert errors.mre_mm == pytest.approx(np.max(each))
 
 
-def test_inner_errors_leave_out_first_and_last_row_and_both_ends_of_each():
+def test_inner_errors_exclude_edge_rows_and_row_ends():
     reconstruction, match = truth(spherical_cap(6.0, 0.3))
     inner = []
     for i, j in match.ray:
@@ -138,7 +138,7 @@ def test_inner_errors_leave_out_first_and_last_row_and_both_ends_of_each():
     assert errors.mre_mm == pytest.approx(scale)
 
 
-def test_two_rows_have_no_inside():
+def test_two_rows_have_no_inner_errors():
     reconstruction, match = truth(spherical_cap(6.0, 0.3))
     two = (match.ray[:, 0] == 10) | (match.ray[:, 0] == 11)
     match = replace(match, ray=match.ray[two], plane_mm=match.plane_mm[two])
@@ -150,7 +150,7 @@ def test_two_rows_have_no_inside():
     assert errors.are_mm == 0
 
 
-def test_the_grid_is_the_nodes_inside():
+def test_grid_nodes_are_inside_the_boundary():
     reconstruction, _ = truth(spherical_cap(6.0, 0.3, (0.1, 0.2)))
     x, y, z = grid_nodes(reconstruction, 0.25)
     np.testing.assert_allclose(x / 0.25, np.round(x / 0.25), atol=1e-9)
@@ -159,7 +159,7 @@ def test_the_grid_is_the_nodes_inside():
     np.testing.assert_allclose(z, reconstruction.surface.height(x, y))
 
 
-def test_the_mesh_ends_at_the_boundary_and_looks_up():
+def test_mesh_ends_at_the_boundary_and_faces_up():
     reconstruction, match = truth(egg(6.6, 2.8, 4.6, 0.29))
     vertices, triangles = surface_mesh(reconstruction, 0.3)
     a, b, c = (vertices[triangles[:, k]] for k in range(3))
@@ -167,7 +167,7 @@ def test_the_mesh_ends_at_the_boundary_and_looks_up():
     assert (normal[:, 2] > 0).all()
     measures = measure_surface(reconstruction, match, RIG)
     assert normal[:, 2].sum() / 2 == pytest.approx(measures.area_mm2)
-    # A sheet: every edge has two triangles but those of the boundary, which are its points.
+    # Every edge has two triangles, except boundary edges, whose vertices are boundary points.
     edges = np.sort(np.vstack([triangles[:, [k, (k + 1) % 3]] for k in range(3)]), axis=1)
     pairs, count = np.unique(edges, axis=0, return_counts=True)
     assert set(count) == {1, 2}
@@ -177,33 +177,35 @@ def test_the_mesh_ends_at_the_boundary_and_looks_up():
 
 
 @pytest.mark.parametrize("scheme", [irs, ers])
-def test_residuals_and_are_of_the_text_s_schemes_are_those_of_the_surface_they_give(scheme):
+def test_residuals_of_irs_and_ers_are_those_of_their_surfaces(scheme):
     match = exact_match(trace(egg(6.6, 3.0, 4.0, 0.2), RIG), RIG)
-    made = scheme.reconstruct(match, RIG)
-    told = measure_surface(made, match, RIG)
-    # Down each ray to the surface in steps of 1 µm, not by the way that the program takes.
+    reconstruction = scheme.reconstruct(match, RIG)
+    measures = measure_surface(reconstruction, match, RIG)
+    # Independent of the program: search along each ray in vertical steps of 1 µm.
     laser = RIG.laser.position_mm
     distance = np.arange(-0.2, 1.2, 0.001)
     dots = []
     for i, j in match.ray:
         ray = ray_directions(RIG.laser, RIG.pattern)[i - 1, j - 1]
-        way = laser + ((distance[::-1] - laser[2]) / ray[2])[:, None] * ray
-        over = way[:, 2] - made.surface.height(way[:, 0], way[:, 1])
-        met = np.flatnonzero((over[:-1] > 0) & (over[1:] <= 0))
-        if len(met) == 0 or not made.boundary.contains(*way[met[0], :2]):
+        points = laser + ((distance[::-1] - laser[2]) / ray[2])[:, None] * ray
+        above = points[:, 2] - reconstruction.surface.height(points[:, 0], points[:, 1])
+        crossings = np.flatnonzero((above[:-1] > 0) & (above[1:] <= 0))
+        if len(crossings) == 0 or not reconstruction.boundary.contains(*points[crossings[0], :2]):
             dots.append([np.nan, np.nan])
             continue
-        k = met[0]
-        at = way[k] + over[k] / (over[k] - over[k + 1]) * (way[k + 1] - way[k])
-        normal = surface_normal(made.surface.gradient(at[0], at[1]))
-        dots.append(intersect_imaging_plane(at, reflect(ray, normal), RIG.imaging_plane))
+        k = crossings[0]
+        point = points[k] + above[k] / (above[k] - above[k + 1]) * (points[k + 1] - points[k])
+        normal = surface_normal(reconstruction.surface.gradient(point[0], point[1]))
+        dots.append(intersect_imaging_plane(point, reflect(ray, normal), RIG.imaging_plane))
     residual = np.array(dots) - match.plane_mm
     error = np.hypot(*(residual * reflection_scale(match, RIG)).T)
     known = np.isfinite(error)
     assert known.mean() > 0.9
-    np.testing.assert_array_equal(known, np.isfinite(made.residual_mm).all(axis=1))
-    np.testing.assert_allclose(np.median(made.residual_mm[known] / residual[known]), 1, rtol=1e-3)
-    assert told.are_mm == pytest.approx(error[known].mean(), rel=0.02)
-    assert told.mre_mm == pytest.approx(error[known].max(), rel=0.02)
-    assert told.own_are_mm < told.are_mm
-    assert (told.scale_x, told.scale_z) == tuple(reflection_scale(match, RIG))
+    np.testing.assert_array_equal(known, np.isfinite(reconstruction.residual_mm).all(axis=1))
+    np.testing.assert_allclose(
+        np.median(reconstruction.residual_mm[known] / residual[known]), 1, rtol=1e-3
+    )
+    assert measures.are_mm == pytest.approx(error[known].mean(), rel=0.02)
+    assert measures.mre_mm == pytest.approx(error[known].max(), rel=0.02)
+    assert measures.own_are_mm < measures.are_mm
+    assert (measures.scale_x, measures.scale_z) == tuple(reflection_scale(match, RIG))

@@ -1,4 +1,4 @@
-"""The dots of a frame, and the fits to them that are kept."""
+"""The dots of a frame, and the cached fits to them."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from tests.core.test_dips import observation_of
 from tests.scenes import see
 
 
-def test_a_frame_whose_fits_fail_leaves_memory_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Hundreds of megabytes waited for the garbage collector where many frames were refused."""
+def test_frame_with_failed_fits_is_freed_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Hundreds of megabytes once waited for garbage collection where many frames failed."""
 
     def fails(*_: object) -> None:
         raise CannotMeasure("no-surface", "it diverges")
@@ -26,10 +26,10 @@ def test_a_frame_whose_fits_fail_leaves_memory_at_once(monkeypatch: pytest.Monke
     observed, labels = observation_of(see(egg(5.8, 2.6, 3.2, 0.28), np.random.default_rng(1)))
     assert try_fit(observed, labels) is None
     assert try_fit(observed, labels) is None
-    left = weakref.ref(observed)
+    reference = weakref.ref(observed)
     gc.disable()
     try:
         del observed
-        assert left() is None
+        assert reference() is None
     finally:
         gc.enable()

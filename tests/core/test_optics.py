@@ -1,4 +1,4 @@
-"""The reflection law, the rays of the pattern and where they meet planes."""
+"""The reflection law, the rays of the pattern, and their intersections with planes."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ sideways = st.floats(-30.0, 30.0)
 
 
 def falling(elevation_deg: float, side_deg: float) -> np.ndarray:
-    """Direction of a ray that comes down from +Y."""
+    """Return the direction of a ray falling from +Y."""
     down, side = np.radians([elevation_deg, side_deg])
     return np.array([np.cos(down) * np.sin(side), -np.cos(down) * np.cos(side), -np.sin(down)])
 
 
 @given(elevations, sideways, slopes)
-def test_reflecting_twice_gives_the_ray_back(elevation, side, gradient):
+def test_reflecting_twice_is_the_identity(elevation, side, gradient):
     ray, normal = falling(elevation, side), surface_normal(gradient)
-    there = reflect(ray, normal)
-    assert np.linalg.norm(there) == pytest.approx(1.0)
-    assert there @ normal == pytest.approx(-(ray @ normal))
-    np.testing.assert_allclose(reflect(there, normal), ray, atol=1e-12)
+    reflected = reflect(ray, normal)
+    assert np.linalg.norm(reflected) == pytest.approx(1.0)
+    assert reflected @ normal == pytest.approx(-(ray @ normal))
+    np.testing.assert_allclose(reflect(reflected, normal), ray, atol=1e-12)
 
 
 @given(elevations, sideways, slopes)
-def test_the_bisecting_gradient_is_that_of_the_mirror(elevation, side, gradient):
+def test_bisecting_gradient_is_that_of_the_mirror(elevation, side, gradient):
     ray, normal = falling(elevation, side), surface_normal(gradient)
     if ray @ normal > -0.05:  # the ray does not meet the upper side of the mirror
         return
@@ -46,12 +46,12 @@ def test_the_bisecting_gradient_is_that_of_the_mirror(elevation, side, gradient)
     np.testing.assert_allclose(bisecting_gradient(ray, reflected), gradient, atol=1e-9)
 
 
-def test_a_flat_mirror_reverses_z_only():
+def test_flat_mirror_reverses_only_z():
     ray = falling(30.0, 10.0)
     np.testing.assert_allclose(reflect(ray, np.array([0.0, 0.0, 1.0])), ray * [1, 1, -1])
 
 
-def test_the_beam_axis_goes_through_the_origin_and_neighbours_are_the_angle_apart():
+def test_beam_axis_meets_the_origin_and_rays_are_beta_apart():
     laser = Laser(31.14, 31.48)
     direction = ray_directions(laser, DotPattern())
     np.testing.assert_allclose(np.linalg.norm(direction, axis=-1), 1.0)
@@ -68,7 +68,7 @@ def test_rows_grow_towards_the_head_and_columns_with_x():
     assert (np.diff(landing[..., 0], axis=1) > 0).all()
 
 
-def test_a_ray_off_a_flat_mirror_meets_the_plane_where_the_geometry_says():
+def test_reflected_ray_meets_the_plane_at_the_expected_dot():
     # From (0, 0, 0) at 30° elevation towards −Y: after 50 mm it is 50·tan 30° high.
     plane = ImagingPlane.vertical(50.0, s_mm=45.0, h_mm=3.0)
     direction = np.array([0.0, -np.cos(np.radians(30)), np.sin(np.radians(30))])
@@ -76,13 +76,13 @@ def test_a_ray_off_a_flat_mirror_meets_the_plane_where_the_geometry_says():
     np.testing.assert_allclose(dot, [45.0, 50 * np.tan(np.radians(30)) - 3.0])
 
 
-def test_a_ray_that_runs_away_from_the_plane_or_along_it_never_meets_it():
+def test_ray_away_from_or_along_the_plane_never_meets_it():
     plane = ImagingPlane.vertical(50.0, s_mm=45.0, h_mm=3.0)
     for direction in ([0.0, 1.0, 1.0], [1.0, 0.0, 1.0]):
         assert np.isnan(intersect_imaging_plane(np.zeros(3), np.array(direction), plane)).all()
 
 
 @given(st.floats(-2.0, 2.0), elevations, sideways)
-def test_a_ray_meets_a_level_at_that_level(level, elevation, side):
+def test_intersection_with_a_level_is_at_that_level(level, elevation, side):
     point = intersect_level(np.array([1.0, 20.0, 30.0]), falling(elevation, side), level)
     assert point[2] == pytest.approx(level)

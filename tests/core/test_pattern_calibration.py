@@ -1,4 +1,4 @@
-"""Rays measured one by one on flat mirrors, of a lens that the simulation stretches."""
+"""Rays measured individually on flat mirrors, with a simulated lens that stretches the pattern."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def stretching_lens(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def calibrated(true: Rig) -> PatternCalibration:
-    """What pictures of plates on a true bench give with the set-up `RIG`."""
+    """Calibrate from pictures of plates on a true bench, with the setup `RIG`."""
     rng = np.random.default_rng(4)
     bench = SimulatedBench(replace(true, uncertainty=None), VIEW)
     plates = [picture(Plate(z), FlatMirror(z), bench, rng)[0] for z in HEIGHTS_MM]
@@ -35,19 +35,19 @@ def calibrated(true: Rig) -> PatternCalibration:
 
 
 @pytest.mark.slow
-def test_rays_are_found_within_their_uncertainty():
+def test_rays_are_measured_within_their_uncertainty():
     true = DotPattern(kind="bent", rotation_deg=0.4)
-    found = calibrated(replace(RIG, pattern=true))
-    assert len(found.ray) > 330
-    off = found.tangents - true.tangents[tuple(found.ray.T - 1)]
-    pulls = off / found.sigma
+    calibration = calibrated(replace(RIG, pattern=true))
+    assert len(calibration.ray) > 330
+    error = calibration.tangents - true.tangents[tuple(calibration.ray.T - 1)]
+    pulls = error / calibration.sigma
     assert 0.85 < np.sqrt(np.mean(pulls**2)) < 1.15
-    assert 0.8 < found.disagreement < 1.2
-    assert found.off_deg > 5 * np.degrees(np.sqrt(np.mean(off**2)))
+    assert 0.8 < calibration.disagreement < 1.2
+    assert calibration.off_deg > 5 * np.degrees(np.sqrt(np.mean(error**2)))
 
 
 @pytest.mark.slow
-def test_two_heights_contradict_a_mirror_that_is_elsewhere():
+def test_two_heights_reveal_a_mirror_at_a_wrong_height():
     rng = np.random.default_rng(4)
     bench = SimulatedBench(replace(RIG, uncertainty=None), VIEW)
     true_mm = {0.0: 0.0, 6.0: 6.1}
@@ -55,9 +55,9 @@ def test_two_heights_contradict_a_mirror_that_is_elsewhere():
     assert calibrate_pattern(plates, Bench(RIG, CALIBRATION)).disagreement > 2
 
 
-def test_pictures_without_the_hole_are_refused():
+def test_pictures_without_the_reference_hole_are_rejected():
     bench = SimulatedBench(replace(RIG, uncertainty=None), VIEW)
-    whole = replace(bench, rig=replace(bench.rig, pattern=DotPattern(absent=frozenset())))
-    made = picture(Plate(), FlatMirror(), whole, np.random.default_rng(1))[0]
+    without_hole = replace(bench, rig=replace(bench.rig, pattern=DotPattern(absent=frozenset())))
+    plate = picture(Plate(), FlatMirror(), without_hole, np.random.default_rng(1))[0]
     with pytest.raises(CannotMeasure):
-        calibrate_pattern([made, made], Bench(RIG, CALIBRATION))
+        calibrate_pattern([plate, plate], Bench(RIG, CALIBRATION))

@@ -1,4 +1,4 @@
-"""Kinds of dot pattern: what each must keep to, and that one more is read, simulated, measured."""
+"""Kinds of dot pattern: their requirements; an added one is read, simulated and measured."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ SETUP = Path(__file__).parents[2] / "sample_sessions" / "gtaw" / "setup.toml"
 
 
 def stretched(rows: int, columns: int, step: float) -> np.ndarray:
-    """Rows nearer to each other than columns, and each a little aside of the one above it."""
+    """Return a pattern with rows closer than columns, each slightly shifted from the one above."""
     tangents = square(rows, columns, step)
     tangents[..., 1] *= 0.9
     tangents[..., 0] += 0.2 * tangents[..., 1]
@@ -44,23 +44,23 @@ def one_kind_more(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("kind", [*PATTERNS, "stretched"])
-def test_a_kind_is_rows_and_columns_about_the_axis(kind: str) -> None:
+def test_pattern_kind_has_rows_and_columns_around_the_axis(kind: str) -> None:
     step = np.radians(0.77)
     tangents = PATTERNS[kind].tangents(19, 17, step)
     assert tangents.shape == (19, 17, 2)
     np.testing.assert_allclose(tangents[9, 8], 0, atol=1e-15)
     assert (np.diff(tangents[..., 0], axis=1) > 0).all()
     assert (np.diff(tangents[..., 1], axis=0) < 0).all()
-    # The boundary asks for the rays that would come next, all round.
+    # The boundary needs the rays that would come next on all sides.
     np.testing.assert_allclose(
         PATTERNS[kind].tangents(21, 19, step)[1:-1, 1:-1], tangents, atol=1e-15
     )
-    # What a setup file may hold is reckoned from the angle: no neighbours are farther apart.
+    # Limits of setup values are derived from the angle: no neighbours are farther apart.
     assert np.abs(np.diff(tangents[9, :, 0])).min() <= np.tan(step) * (1 + 1e-9)
     assert np.abs(np.diff(tangents[:, 8, 1])).min() <= np.tan(step) * (1 + 1e-9)
 
 
-def test_a_setup_file_names_the_kind() -> None:
+def test_setup_file_names_the_kind() -> None:
     text = SETUP.read_text("utf-8")
     usual = parse_setup(text, SETUP)
     assert usual.rig.pattern.kind == "square"
@@ -73,7 +73,7 @@ def test_a_setup_file_names_the_kind() -> None:
         parse_setup(updated_setup(text, SETUP, {"pattern": {"kind": "rings"}}), SETUP)
 
 
-def test_the_twin_and_the_measurement_have_the_same_rays() -> None:
+def test_simulation_and_measurement_have_the_same_rays() -> None:
     rig = replace(BENCH, pattern=DotPattern(kind="stretched"))
     assert not np.allclose(
         ray_directions(rig.laser, rig.pattern), ray_directions(rig.laser, DotPattern())
@@ -86,45 +86,45 @@ def test_the_twin_and_the_measurement_have_the_same_rays() -> None:
 
 
 @pytest.mark.slow
-def test_a_frame_of_another_kind_is_measured() -> None:
+def test_frame_of_an_added_kind_is_measured() -> None:
     rig = replace(BENCH, pattern=DotPattern(kind="stretched"))
     frame = rendered(spherical_cap(6.0, 0.3), rig, 0)
-    found = measure(frame.image, Bench(rig, axes_of(VIEW).calibration), Settings())[0]
-    assert found.status == "ok", found.reason
-    assert found.match is not None
-    assert found.measures is not None
-    assert len(found.match.ray) > 0.9 * frame.shown.sum()
-    true_px = frame.dot_px[tuple(found.match.ray.T - 1)]
-    assert found.dots is not None
-    assert np.abs(found.dots.image_px[found.match.dot] - true_px).max() < 3
-    assert found.measures.height_mm == pytest.approx(0.3, abs=0.01)
+    result = measure(frame.image, Bench(rig, axes_of(VIEW).calibration), Settings())[0]
+    assert result.status == "ok", result.reason
+    assert result.match is not None
+    assert result.measures is not None
+    assert len(result.match.ray) > 0.9 * frame.shown.sum()
+    true_px = frame.dot_px[tuple(result.match.ray.T - 1)]
+    assert result.dots is not None
+    assert np.abs(result.dots.image_px[result.match.dot] - true_px).max() < 3
+    assert result.measures.height_mm == pytest.approx(0.3, abs=0.01)
 
 
-def test_a_hexagonal_pattern_is_a_hexagon_of_rays_with_six_neighbours() -> None:
+def test_hexagonal_pattern_is_a_hexagon_of_rays() -> None:
     pattern = DotPattern(21, 21, 0.7, kind="hexagonal")
-    there = [
+    present = [
         ray for ray in np.ndindex(21, 21) if (ray[0] + 1, ray[1] + 1) not in pattern.absent_rays
     ]
-    assert len(there) == 331 - 1
+    assert len(present) == 331 - 1
     assert pattern.marker == (11, 11)
     tangents = pattern.tangents
-    places = np.array([tangents[ray] for ray in there])
-    apart = np.sort(np.linalg.norm(places - tangents[12, 12], axis=-1))[1:8]
-    np.testing.assert_allclose(apart[:6], np.tan(np.radians(0.7)), rtol=0.02)
-    assert apart[6] > 1.5 * apart[5]
+    places = np.array([tangents[ray] for ray in present])
+    distances = np.sort(np.linalg.norm(places - tangents[12, 12], axis=-1))[1:8]
+    np.testing.assert_allclose(distances[:6], np.tan(np.radians(0.7)), rtol=0.02)
+    assert distances[6] > 1.5 * distances[5]
     corners = [tangents[10, 0], tangents[10, 20], tangents[0, 5], tangents[20, 15]]
     np.testing.assert_allclose(np.linalg.norm(corners, axis=-1), np.tan(np.radians(7.0)), rtol=0.02)
 
 
 def bent(rows: int, columns: int, step: float) -> np.ndarray:
-    """A square pattern of a lens that stretches its fan towards the rim, by 3 % at the corners."""
+    """Return a square pattern stretched towards the rim, by 3 % at the corners."""
     tangents = square(rows, columns, step)
     share = np.sum(tangents**2, axis=-1, keepdims=True) / np.sum(tangents[0, 0] ** 2)
     return np.asarray(tangents * (1 + 0.03 * share))
 
 
 def ray_table(rig: Rig, universal: bool) -> str:
-    """Table of the rays that a rig has, in the UCS or about the beam axis."""
+    """Return a table of a rig's rays, in the UCS or relative to the beam axis."""
     directions = ray_directions(rig.laser, rig.pattern)
     if not universal:
         axis, aside, up = rig.laser.axes
@@ -138,7 +138,7 @@ def ray_table(rig: Rig, universal: bool) -> str:
 
 
 @pytest.mark.parametrize("universal", [True, False])
-def test_measured_rays_come_from_a_table_beside_the_setup_file(
+def test_measured_rays_are_read_from_a_table(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, universal: bool
 ) -> None:
     monkeypatch.setitem(PATTERNS, "bent", PatternKind("bent", bent))
@@ -147,27 +147,27 @@ def test_measured_rays_come_from_a_table_beside_the_setup_file(
     update_setup(path, {"pattern": {"kind": "bent", "rotation_deg": 1.5}})
     true = read_setup(path).rig
     (tmp_path / "rays.csv").write_text(ray_table(true, universal), "utf-8")
-    whole = {"rows": None, "columns": None, "inter_beam_angle_deg": None}
-    update_setup(path, {"pattern": {"kind": "directions", "file": "rays.csv", **whole}})
-    if not universal:  # a table about the beam axis holds what rotation the lens has
+    removed = {"rows": None, "columns": None, "inter_beam_angle_deg": None}
+    update_setup(path, {"pattern": {"kind": "directions", "file": "rays.csv", **removed}})
+    if not universal:  # a table relative to the beam axis includes the rotation
         update_setup(path, {"pattern": {"rotation_deg": None}})
     setup = read_setup(path)
     pattern = setup.rig.pattern
     assert (pattern.rows, pattern.columns) == (19, 19)
     assert pattern.absent_rays == true.pattern.absent_rays
     assert pattern.marker == true.pattern.marker
-    there = np.ones((19, 19), bool)
-    there[tuple(np.array(sorted(true.pattern.absent_rays)).T - 1)] = False
+    present = np.ones((19, 19), bool)
+    present[tuple(np.array(sorted(true.pattern.absent_rays)).T - 1)] = False
     np.testing.assert_allclose(
-        ray_directions(setup.rig.laser, pattern)[there],
-        ray_directions(true.laser, true.pattern)[there],
+        ray_directions(setup.rig.laser, pattern)[present],
+        ray_directions(true.laser, true.pattern)[present],
         atol=1e-8,
     )
-    # The absent ray and those beyond the rim are where their neighbours say.
+    # The absent ray and those beyond the rim are extrapolated from their neighbours.
     wider = replace(pattern, rows=21, columns=21), replace(true.pattern, rows=21, columns=21)
     rays = [ray_directions(true.laser, one) for one in wider]
     assert np.abs(rays[0] - rays[1]).max() < 0.15 * np.radians(pattern.inter_beam_angle_deg)
-    # Its text holds the rays: a session needs no table.
+    # The text contains the rays: a session needs no table.
     (tmp_path / "rays.csv").unlink()
     assert parse_setup(setup.text, "elsewhere").rig.pattern == pattern
     again = updated_setup(setup.text, path, {"pattern": pattern_values(pattern)})
@@ -182,7 +182,7 @@ def test_measured_rays_come_from_a_table_beside_the_setup_file(
     ],
     ids=["inline", "dotted"],
 )
-def test_the_pattern_may_be_written_in_any_way_of_toml(tmp_path: Path, head: str) -> None:
+def test_pattern_may_be_an_inline_table_or_dotted_keys(tmp_path: Path, head: str) -> None:
     text = SETUP.read_text("utf-8")
     rig = parse_setup(text, SETUP).rig
     others = {
@@ -215,7 +215,7 @@ def test_the_pattern_may_be_written_in_any_way_of_toml(tmp_path: Path, head: str
         ({"file": None}, None, "pattern.rays"),
     ],
 )
-def test_what_is_no_table_of_rays_is_refused(
+def test_invalid_table_of_rays_is_rejected(
     tmp_path: Path, keys: dict[str, object], table: str | None, field: str
 ) -> None:
     path = tmp_path / "setup.toml"
@@ -224,9 +224,9 @@ def test_what_is_no_table_of_rays_is_refused(
     (tmp_path / "rays.csv").write_text(ray_table(rig, True) if table is None else table, "utf-8")
     pattern = {"kind": "directions", "file": "rays.csv"} | keys
     path.write_text(updated_setup(text, path, {"pattern": pattern}), "utf-8")
-    with pytest.raises(InputError) as refused:
+    with pytest.raises(InputError) as error:
         read_setup(path)
-    assert refused.value.field == field
+    assert error.value.field == field
 
 
 @pytest.mark.slow
@@ -244,19 +244,19 @@ def test_frames_of_other_patterns_are_measured(
     rig = replace(BENCH, pattern=true)
     frame = rendered(spherical_cap(6.0, 0.3), rig, 3)
     bench = Bench(replace(rig, pattern=known), axes_of(VIEW).calibration)
-    found = measure(frame.image, bench, Settings())[0]
-    assert found.status == "ok", found.reason
-    assert found.match is not None
-    assert found.measures is not None
-    assert found.dots is not None
-    assert len(found.match.ray) > 0.9 * frame.shown.sum()
-    true_px = frame.dot_px[tuple(found.match.ray.T - 1)]
-    assert np.abs(found.dots.image_px[found.match.dot] - true_px).max() < 2.5
-    assert found.measures.height_mm == pytest.approx(0.3, abs=0.01)
+    result = measure(frame.image, bench, Settings())[0]
+    assert result.status == "ok", result.reason
+    assert result.match is not None
+    assert result.measures is not None
+    assert result.dots is not None
+    assert len(result.match.ray) > 0.9 * frame.shown.sum()
+    true_px = frame.dot_px[tuple(result.match.ray.T - 1)]
+    assert np.abs(result.dots.image_px[result.match.dot] - true_px).max() < 2.5
+    assert result.measures.height_mm == pytest.approx(0.3, abs=0.01)
 
 
 def measured_pattern(pattern: DotPattern) -> DotPattern:
-    """The rays of a pattern as if they were measured one by one."""
+    """Return the pattern as if its rays were measured individually."""
     steps = pattern.tangents / np.tan(np.radians(pattern.inter_beam_angle_deg))
     i, j = pattern.reference
     rays = (ray for ray in np.ndindex(steps.shape[:2]))

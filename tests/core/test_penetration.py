@@ -1,4 +1,4 @@
-"""Penetration models against laws that are known, and against scikit-learn."""
+"""Penetration models compared with known laws and with scikit-learn."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def weld(
     rate_hz: float = 10.0,
     name: str = "weld",
 ) -> WeldSeries:
-    """A weld of one feature."""
+    """Return a weld with one feature."""
     count = len(value)
     noise, level = (np.full((count, 1), part) for part in sigma)
     time_s = (np.arange(count) + 0.5) / rate_hz
@@ -59,9 +59,9 @@ def pulses(rng: np.random.Generator, count: int) -> FloatArray:
 # --- steps --------------------------------------------------------------------------------------
 
 
-def test_a_step_has_the_mean_of_its_frames_and_less_noise() -> None:
-    made = weld(np.arange(8.0), np.array([1, 3, *[np.nan] * 6]), (0.2, 0.3), rate_hz=40.0)
-    steps = in_steps(made, STEP_S)
+def test_step_has_the_mean_of_its_frames_and_less_noise() -> None:
+    series = weld(np.arange(8.0), np.array([1, 3, *[np.nan] * 6]), (0.2, 0.3), rate_hz=40.0)
+    steps = in_steps(series, STEP_S)
     assert steps.time_s == pytest.approx([0.05, 0.15])
     assert steps.value[:, 0] == pytest.approx([1.5, 5.5])
     assert steps.noise[:, 0] == pytest.approx([0.1, 0.1])
@@ -71,7 +71,7 @@ def test_a_step_has_the_mean_of_its_frames_and_less_noise() -> None:
     assert np.isnan(steps.target[1])
 
 
-def test_features_are_held_for_a_while_and_not_longer() -> None:
+def test_missing_features_are_held_for_a_limited_time() -> None:
     value = np.arange(20.0)
     value[4:16] = np.nan
     steps = in_steps(weld(value), STEP_S)
@@ -80,14 +80,14 @@ def test_features_are_held_for_a_while_and_not_longer() -> None:
     assert steps.value[16:, 0] == pytest.approx([16, 17, 18, 19])
 
 
-def test_steps_of_steps_are_the_same() -> None:
+def test_in_steps_is_idempotent() -> None:
     once = in_steps(simulate_welds(1, 3)[0].series, STEP_S)
     twice = in_steps(once, STEP_S)
     for name in ("time_s", "value", "noise", "level", "target", "target_sigma"):
         np.testing.assert_allclose(getattr(twice, name), getattr(once, name), equal_nan=True)
 
 
-def test_a_weld_without_frames_or_without_end_is_refused() -> None:
+def test_weld_without_frames_or_too_long_is_rejected() -> None:
     with pytest.raises(ValueError, match="no frame"):
         in_steps(weld(np.full(5, np.nan)), STEP_S)
     with pytest.raises(ValueError, match="steps"):
@@ -97,21 +97,21 @@ def test_a_weld_without_frames_or_without_end_is_refused() -> None:
 # --- dynamics -----------------------------------------------------------------------------------
 
 
-def test_the_filter_is_a_first_order_lag_that_begins_at_rest() -> None:
+def test_filter_is_a_first_order_lag_from_rest() -> None:
     value = np.repeat([2.0, 5.0], 60)
-    found, _, _ = regressors(weld(value), impulse_response([0.4], STEP_S), Orders())
+    filtered, _, _ = regressors(weld(value), impulse_response([0.4], STEP_S), Orders())
     expected = first_order_lag(value, 0.4, 1 / STEP_S)
-    assert found[:, 0] == pytest.approx(expected, abs=2e-3)
+    assert filtered[:, 0] == pytest.approx(expected, abs=2e-3)
 
 
 def test_lags_and_delay_shift_the_features() -> None:
     value = np.arange(30.0)
-    found, _, _ = regressors(weld(value), impulse_response([], STEP_S), Orders(0, 3, 2))
-    assert found[10] == pytest.approx([8, 7, 6])
-    assert found[0] == pytest.approx([0, 0, 0])
+    filtered, _, _ = regressors(weld(value), impulse_response([], STEP_S), Orders(0, 3, 2))
+    assert filtered[10] == pytest.approx([8, 7, 6])
+    assert filtered[0] == pytest.approx([0, 0, 0])
 
 
-def test_the_filter_averages_noise_out_and_the_level_not() -> None:
+def test_filter_averages_noise_but_not_the_level() -> None:
     steps = weld(np.ones(200), sigma=(0.5, 0.2))
     _, noise, level = regressors(steps, impulse_response([0.4], STEP_S), Orders())
     pole = np.exp(-STEP_S / 0.4)
@@ -119,36 +119,36 @@ def test_the_filter_averages_noise_out_and_the_level_not() -> None:
     assert level[-1, 0] == pytest.approx(0.2)
 
 
-def test_after_a_gap_the_filter_begins_anew() -> None:
+def test_filter_restarts_after_a_gap() -> None:
     value = np.concatenate([np.full(20, 1.0), np.full(20, np.nan), np.full(20, 7.0)])
     steps = in_steps(weld(value), STEP_S)
-    found, _, _ = regressors(steps, impulse_response([1.0], STEP_S), Orders())
-    assert found[40:, 0] == pytest.approx(7.0)
-    assert np.isnan(found[30, 0])
+    filtered, _, _ = regressors(steps, impulse_response([1.0], STEP_S), Orders())
+    assert filtered[40:, 0] == pytest.approx(7.0)
+    assert np.isnan(filtered[30, 0])
 
 
 # --- models -------------------------------------------------------------------------------------
 
 
 def linear_welds(count: int, seed: int) -> list[WeldSeries]:
-    """Penetration of 2 + 0.7·u after a lag of 0.5 s, without noise."""
+    """Return welds with penetration 2 + 0.7·u after a lag of 0.5 s, without noise."""
     rng = np.random.default_rng(seed)
-    made = []
+    welds = []
     for k in range(count):
         value = pulses(rng, 200)
         target = 2 + 0.7 * first_order_lag(value, 0.5, 1 / STEP_S)
-        made.append(weld(value, target, name=f"weld_{k}"))
-    return made
+        welds.append(weld(value, target, name=f"weld_{k}"))
+    return welds
 
 
-def test_arx_finds_the_law_that_was_put_in() -> None:
+def test_arx_recovers_the_simulated_law() -> None:
     welds = linear_welds(4, 1)
     model = fit_model(welds[:3], "arx", ModelSettings(("width_mm",), TARGET))
     assert model.time_constants_s == pytest.approx((0.5,), rel=0.03)
     assert model.predict(welds[3]).value == pytest.approx(welds[3].target, abs=0.01)
 
 
-def test_arx_of_few_sections_finds_it_too() -> None:
+def test_arx_recovers_the_law_from_few_sections() -> None:
     welds = [
         replace(one, target=np.where(np.arange(200) % 17 == 0, one.target, np.nan))
         for one in linear_welds(5, 2)
@@ -157,7 +157,7 @@ def test_arx_of_few_sections_finds_it_too() -> None:
     assert model.time_constants_s == pytest.approx((0.5,), rel=0.1)
 
 
-def test_the_gaussian_process_is_that_of_scikit_learn() -> None:
+def test_gaussian_process_agrees_with_scikit_learn() -> None:
     from sklearn.gaussian_process import GaussianProcessRegressor
     from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 
@@ -165,11 +165,11 @@ def test_the_gaussian_process_is_that_of_scikit_learn() -> None:
     x, y, variance = rng.normal(size=(40, 2)), rng.normal(size=40), rng.uniform(0.1, 0.3, 40)
     lengths, places = np.array([0.8, 2.5]), rng.normal(size=(9, 2))
     kernel = ConstantKernel(1.7) * RBF(lengths)
-    theirs = GaussianProcessRegressor(kernel, alpha=variance, optimizer=None).fit(x, y)
-    mean, sigma = theirs.predict(places, return_std=True)
+    reference = GaussianProcessRegressor(kernel, alpha=variance, optimizer=None).fit(x, y)
+    mean, sigma = reference.predict(places, return_std=True)
     ours = GaussianMap(x, y, variance, lengths, 1.7)
-    found, found_variance, gradient = ours.evaluate(places)
-    assert found == pytest.approx(mean)
+    mean_found, found_variance, gradient = ours.evaluate(places)
+    assert mean_found == pytest.approx(mean)
     assert np.sqrt(found_variance) == pytest.approx(sigma)
     for axis in range(2):
         aside = 1e-5 * np.eye(2)[axis]
@@ -178,7 +178,7 @@ def test_the_gaussian_process_is_that_of_scikit_learn() -> None:
 
 
 @pytest.mark.parametrize("kind", ["arx", "gp"])
-def test_the_uncertainty_of_features_enters(kind: str) -> None:
+def test_feature_uncertainty_is_propagated(kind: str) -> None:
     welds = linear_welds(3, 4)
     model = fit_model(welds, kind, ModelSettings(("width_mm",), TARGET))  # type: ignore[arg-type]
     middle = np.full(60, 2.0)
@@ -186,7 +186,7 @@ def test_the_uncertainty_of_features_enters(kind: str) -> None:
     assert uncertain**2 - exact**2 == pytest.approx((0.7 * 0.3) ** 2, rel=0.1)
 
 
-def test_features_beyond_those_of_the_fit_are_marked() -> None:
+def test_features_outside_the_training_range_are_flagged() -> None:
     model = fit_model(linear_welds(3, 4), "arx", ModelSettings(("width_mm",), TARGET))
     assert not model.predict(weld(np.full(30, 2.0))).is_outside.any()
     assert model.predict(weld(np.full(30, 4.0))).is_outside.all()
@@ -194,13 +194,13 @@ def test_features_beyond_those_of_the_fit_are_marked() -> None:
 
 def test_penetration_is_never_negative() -> None:
     model = fit_model(linear_welds(3, 4), "arx", ModelSettings(("width_mm",), TARGET))
-    found = model.predict(weld(np.full(30, -9.0)))
-    assert (found.value == 0).all()
-    assert (found.low_95 == 0).all()
-    assert (found.high_95 > 0).all()
+    prediction = model.predict(weld(np.full(30, -9.0)))
+    assert (prediction.value == 0).all()
+    assert (prediction.low_95 == 0).all()
+    assert (prediction.high_95 > 0).all()
 
 
-def test_too_few_welds_or_sections_are_refused() -> None:
+def test_too_few_welds_or_sections_are_rejected() -> None:
     settings = ModelSettings(("width_mm",), TARGET)
     with pytest.raises(ValueError, match="welds"):
         validated_model(linear_welds(2, 1), "arx", settings)
@@ -217,9 +217,9 @@ def test_unexplained_weld_to_weld_scatter_widens_the_interval() -> None:
         replace(one, target=one.target + rng.normal(0, 0.3), target_sigma=0 * one.target)
         for one in linear_welds(12, 6)
     ]
-    model, left = validated_model(welds, "arx", ModelSettings(("width_mm",), TARGET))
-    assert left.sigma == pytest.approx(left.rmse_mm, rel=0.15)
-    assert model.rmse_mm == left.rmse_mm
+    model, left_out = validated_model(welds, "arx", ModelSettings(("width_mm",), TARGET))
+    assert left_out.sigma == pytest.approx(left_out.rmse_mm, rel=0.15)
+    assert model.rmse_mm == left_out.rmse_mm
 
 
 @pytest.mark.slow
@@ -227,27 +227,27 @@ def test_unexplained_weld_to_weld_scatter_widens_the_interval() -> None:
 def test_welds_left_out_are_predicted_within_their_intervals(kind: str, most: float) -> None:
     welds = [one.series for one in simulate_welds(10, 12)]
     settings = ModelSettings(FEATURES, TARGET, full_mm=FULL_MM)
-    _, left = validated_model(welds, kind, settings)  # type: ignore[arg-type]
-    bead = left.measured > 0
+    _, left_out = validated_model(welds, kind, settings)  # type: ignore[arg-type]
+    bead = left_out.measured > 0
     noise = np.sqrt(np.mean(np.where(bead, SCAN_SIGMA_MM**2 + SCATTER_MM**2, 0.0)))
-    assert noise < left.rmse_mm < most * noise
-    assert abs(left.bias_mm) < 0.03
-    assert 0.92 < left.cover < 0.98
-    spread = np.hypot(left.sigma, left.measured_sigma)[bead]
-    assert np.mean(np.abs(left.predicted - left.measured)[bead] < SURE_95 * spread) > 0.9
-    known, found = left.transitions()
+    assert noise < left_out.rmse_mm < most * noise
+    assert abs(left_out.bias_mm) < 0.03
+    assert 0.92 < left_out.cover < 0.98
+    spread = np.hypot(left_out.sigma, left_out.measured_sigma)[bead]
+    assert np.mean(np.abs(left_out.predicted - left_out.measured)[bead] < SURE_95 * spread) > 0.9
+    known, predicted = left_out.transitions()
     assert len(known) > 10
-    # Of 17; 90 % is what tests/benchmarks/penetration.py holds against 166.
-    assert np.mean(np.abs(known - found) <= 0.2) >= 0.8
+    # Of 17 transitions; tests/benchmarks/penetration.py requires 90 % of 166.
+    assert np.mean(np.abs(known - predicted) <= 0.2) >= 0.8
 
 
 # --- transitions --------------------------------------------------------------------------------
 
 
-def test_a_transition_is_where_the_limit_is_crossed_for_good() -> None:
+def test_transition_is_where_the_limit_is_crossed_permanently() -> None:
     time_s = np.arange(0, 4, 0.1)
     value = np.where(time_s < 1.95, 0.2, 0.8)
-    value[5] = 0.9  # a flicker is none
+    value[5] = 0.9  # a flicker is no transition
     value[30] = 0.1
     assert find_transitions(time_s, value, 0.5) == pytest.approx([1.95])
     assert find_transitions(time_s, value, 0.35) == pytest.approx([1.925])

@@ -1,4 +1,4 @@
-"""A bench that is a little off: what moves with which quantity."""
+"""Perturbed benches: the effect of each quantity."""
 
 from __future__ import annotations
 
@@ -33,14 +33,14 @@ DOTS = np.random.default_rng(5).uniform(5.0, 95.0, (30, 2))
 
 
 def offset(**by: float) -> np.ndarray:
-    made = np.zeros(len(QUANTITIES))
+    vector = np.zeros(len(QUANTITIES))
     for name, value in by.items():
         (key,) = [key for key in INDEX if key.replace(".", "_") == name]
-        made[INDEX[key]] = value
-    return made
+        vector[INDEX[key]] = value
+    return vector
 
 
-def test_every_quantity_of_the_bench_moves_what_it_names():
+def test_every_quantity_moves_the_named_value():
     rig = moved_rig(
         RIG,
         offset(
@@ -71,54 +71,54 @@ def test_every_quantity_of_the_bench_moves_what_it_names():
 @pytest.mark.parametrize("percent", [0.0, 0.8])
 @pytest.mark.parametrize("lens", [None, LENS])
 def test_dots_follow_the_image_calibration(lens: Lens | None, percent: float):
-    """A dot stays in the picture; the calibration of the moved bench has it elsewhere."""
+    """A dot is fixed in the picture; the moved bench's calibration maps it elsewhere."""
     before = replace(AXES.calibration, lens=lens).with_distortion(percent, np.array([50.8, 50.8]))
     axes = replace(AXES, calibration=before)
     rig = replace(RIG, uncertainty=RigUncertainty(axes, *covariance_of({})))
-    by = {key: 30.0 for key in INDEX if key.endswith("px[u]")}
-    by |= {"image_calibration.origin_px[v]": -2.0, "camera_lens.distortion_percent": 0.5}
+    offsets = {key: 30.0 for key in INDEX if key.endswith("px[u]")}
+    offsets |= {"image_calibration.origin_px[v]": -2.0, "camera_lens.distortion_percent": 0.5}
     vector = np.zeros(len(QUANTITIES))
-    vector[[INDEX[key] for key in by]] = list(by.values())
+    vector[[INDEX[key] for key in offsets]] = list(offsets.values())
     moved = moved_dots(DOTS, rig, axes, vector)
     again = moved_bench(rig, vector)[1].to_plane(before.to_image(DOTS))
     np.testing.assert_allclose(moved, again, atol=1e-6)
     assert np.abs(moved - DOTS).max() > 0.3
 
 
-def test_dots_lie_farther_out_where_the_axis_points_do():
-    by = offset(image_calibration_x_axis_mm=0.6985, image_calibration_z_axis_mm=-0.3175)
-    np.testing.assert_allclose(moved_dots(DOTS, RIG, AXES, by), DOTS * [1.01, 0.99], rtol=1e-9)
+def test_dots_scale_with_the_axis_points():
+    offsets = offset(image_calibration_x_axis_mm=0.6985, image_calibration_z_axis_mm=-0.3175)
+    np.testing.assert_allclose(moved_dots(DOTS, RIG, AXES, offsets), DOTS * [1.01, 0.99], rtol=1e-9)
     rig = replace(RIG, uncertainty=RigUncertainty(AXES, *covariance_of({})))
-    changed = quantity_values(moved_bench(rig, by)[0]) - quantity_values(rig)
-    np.testing.assert_allclose(changed, by, atol=1e-9)
+    changed = quantity_values(moved_bench(rig, offsets)[0]) - quantity_values(rig)
+    np.testing.assert_allclose(changed, offsets, atol=1e-9)
 
 
-def test_a_glass_is_uncertain_where_there_is_one():
-    given = {"imaging_plane.glass_mm_sigma": 0.3}
-    at = [INDEX["imaging_plane.glass_mm"], INDEX["imaging_plane.glass_index"]]
+def test_glass_index_is_uncertain_only_with_glass():
+    sigmas = {"imaging_plane.glass_mm_sigma": 0.3}
+    indices = [INDEX["imaging_plane.glass_mm"], INDEX["imaging_plane.glass_index"]]
     for has_glass, sigma in ((False, (0.3, 0.0)), (True, (0.3, 0.02))):
-        covariance, assumed = covariance_of(given, has_glass=has_glass)
-        np.testing.assert_allclose(np.sqrt(np.diag(covariance)[at]), sigma)
+        covariance, assumed = covariance_of(sigmas, has_glass=has_glass)
+        np.testing.assert_allclose(np.sqrt(np.diag(covariance)[indices]), sigma)
         assert ("imaging_plane.glass_index" in assumed) == has_glass
 
 
-def test_a_covariance_of_the_first_quantities_has_the_others_exact():
+def test_covariance_of_first_quantities_has_the_others_exact():
     before = RigUncertainty(AXES, covariance_of({})[0][:FIRST, :FIRST])
     assert before.covariance.shape == (len(QUANTITIES), len(QUANTITIES))
     assert not before.sigma[FIRST:].any()
     assert before.sigma[:FIRST].all()
 
 
-def test_distortion_moves_the_corner_by_its_share_and_the_centre_not_at_all():
-    by = offset(camera_lens_distortion_percent=1.0)
+def test_distortion_moves_the_corner_but_not_the_centre():
+    offsets = offset(camera_lens_distortion_percent=1.0)
     corner, center = np.array([101.6, 101.6]), np.array([50.8, 50.8])
-    moved = moved_dots(np.array([corner, center]), RIG, AXES, by)
+    moved = moved_dots(np.array([corner, center]), RIG, AXES, offsets)
     np.testing.assert_allclose(moved, [corner + 0.01 * center, center])
 
 
 def test_angle_and_distance_of_the_laser_may_be_correlated():
-    told = {"laser.projection_angle_deg_sigma": 0.2, "laser.distance_mm_sigma": 0.4}
-    covariance, assumed = covariance_of(told, 0.5)
+    sigmas = {"laser.projection_angle_deg_sigma": 0.2, "laser.distance_mm_sigma": 0.4}
+    covariance, assumed = covariance_of(sigmas, 0.5)
     assert covariance[0, 1] == covariance[1, 0] == pytest.approx(0.04)
     assert np.count_nonzero(covariance - np.diag(np.diag(covariance))) == 2
     assert len(assumed) == len(QUANTITIES) - 4  # these two, and no glass

@@ -1,4 +1,4 @@
-"""The whole measurement on the sample run, by every scheme, and on frames that show nothing."""
+"""The complete measurement of the sample run, by every scheme, and of frames without dots."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def measurements(images: dict[int, npt.NDArray[np.generic]]) -> dict[int, Measur
 
 
 @pytest.mark.slow
-def test_the_sample_run_is_measured_true(measurements: dict[int, Measurement]) -> None:
+def test_sizes_of_the_sample_run_are_accurate(measurements: dict[int, Measurement]) -> None:
     truth = {int(row["frame"]): row for row in table("truth.csv")}
     for index, result in measurements.items():
         assert (result.status, result.reason) == ("ok", "")
@@ -67,44 +67,48 @@ def test_the_sample_run_is_measured_true(measurements: dict[int, Measurement]) -
         assert size.area_mm2 == pytest.approx(true["area_mm2"], rel=0.04)
         assert size.volume_mm3 == pytest.approx(true["volume_mm3"], rel=0.08)
         for name in ("height", "width", "length"):
-            off = getattr(size, f"{name}_mm") - true[f"{name}_mm"]
-            assert abs(off) < 3.5 * getattr(size, f"{name}_sigma_mm")
+            error = getattr(size, f"{name}_mm") - true[f"{name}_mm"]
+            assert abs(error) < 3.5 * getattr(size, f"{name}_sigma_mm")
 
 
 def test_no_dot_of_the_sample_run_has_a_wrong_ray(measurements: dict[int, Measurement]) -> None:
     rows = [row for row in table("dots_truth.csv") if row["visible"]]
     labelled = shown = 0
     for index, result in measurements.items():
-        mine = [row for row in rows if int(row["frame"]) == index]
-        place = np.array([[row["u_px"], row["v_px"]] for row in mine])
-        ray = np.array([[row["ray_row"], row["ray_column"]] for row in mine], int)
+        in_frame = [row for row in rows if int(row["frame"]) == index]
+        true_px = np.array([[row["u_px"], row["v_px"]] for row in in_frame])
+        ray = np.array([[row["ray_row"], row["ray_column"]] for row in in_frame], int)
         assert result.match is not None
         assert result.dots is not None
-        found = result.dots.image_px[result.match.dot]
-        distance = np.linalg.norm(found[:, None] - place, axis=-1)
+        labelled_px = result.dots.image_px[result.match.dot]
+        distance = np.linalg.norm(labelled_px[:, None] - true_px, axis=-1)
         nearest = np.argmin(distance, axis=1)
         assert distance.min(axis=1).max() < 2.0
         np.testing.assert_array_equal(result.match.ray, ray[nearest])
-        labelled, shown = labelled + len(found), shown + len(mine)
+        labelled, shown = labelled + len(labelled_px), shown + len(in_frame)
     assert labelled >= 0.97 * shown
 
 
-def test_reflection_points_lie_where_they_were(measurements: dict[int, Measurement]) -> None:
+def test_reflection_points_are_within_their_uncertainty(
+    measurements: dict[int, Measurement],
+) -> None:
     truth = {
         (int(row["frame"]), int(row["ray_row"]), int(row["ray_column"])): row["z_mm"]
         for row in table("dots_truth.csv")
     }
-    surprise = []
+    normalized_errors = []
     for index, result in measurements.items():
-        made = result.reconstruction
-        assert made is not None
-        true = np.array([truth[index, i, j] for i, j in made.ray.tolist()])
-        surprise.append((made.points_mm[:, 2] - true) / made.sigma_mm)
-    within = np.abs(np.concatenate(surprise)) < 1.96
+        reconstruction = result.reconstruction
+        assert reconstruction is not None
+        true = np.array([truth[index, i, j] for i, j in reconstruction.ray.tolist()])
+        normalized_errors.append((reconstruction.points_mm[:, 2] - true) / reconstruction.sigma_mm)
+    within = np.abs(np.concatenate(normalized_errors)) < 1.96
     assert within.mean() > 0.85
 
 
-def test_every_step_is_handed_on(measurements: dict[int, Measurement]) -> None:
+def test_measurement_contains_the_result_of_every_step(
+    measurements: dict[int, Measurement],
+) -> None:
     result = measurements[FRAMES[0]]
     assert result.dots is not None
     assert result.lattice is not None
@@ -124,19 +128,21 @@ def test_every_step_is_handed_on(measurements: dict[int, Measurement]) -> None:
     ],
     ids=["ers", "opa", "epa-r", "epa-c", "epa-rc"],
 )
-def test_every_scheme_answers(measurements: dict[int, Measurement], settings: Settings) -> None:
+def test_every_scheme_reconstructs_the_pool(
+    measurements: dict[int, Measurement], settings: Settings
+) -> None:
     match = measurements[FRAMES[1]].match
     true = table("truth.csv")[FRAMES[1]]
     assert match is not None
-    made = reconstruct(match, SETUP.rig, settings)
-    assert made.scheme == settings.scheme
-    width, length = np.ptp(made.boundary.points_mm[:, :2], axis=0)
+    reconstruction = reconstruct(match, SETUP.rig, settings)
+    assert reconstruction.scheme == settings.scheme
+    width, length = np.ptp(reconstruction.boundary.points_mm[:, :2], axis=0)
     assert width == pytest.approx(true["width_mm"], rel=0.15)
     assert length == pytest.approx(true["length_mm"], rel=0.15)
-    assert np.nanmax(made.points_mm[:, 2]) == pytest.approx(true["height_mm"], rel=0.5)
+    assert np.nanmax(reconstruction.points_mm[:, 2]) == pytest.approx(true["height_mm"], rel=0.5)
 
 
-def test_the_algorithms_of_irs_are_different_ones(
+def test_irs_algorithms_give_different_heights(
     measurements: dict[int, Measurement],
 ) -> None:
     match = measurements[FRAMES[1]].match
@@ -149,7 +155,7 @@ def test_the_algorithms_of_irs_are_different_ones(
         assert all(np.abs(one - other).max() > 1e-6 for other in heights[k + 1 :])
 
 
-def test_the_scheme_is_the_one_that_is_asked_for(
+def test_measure_uses_the_scheme_of_the_settings(
     images: dict[int, npt.NDArray[np.generic]], measurements: dict[int, Measurement]
 ) -> None:
     result = measure(images[FRAMES[1]], SETUP.bench, Settings(scheme="ers"))[0]
@@ -158,49 +164,49 @@ def test_the_scheme_is_the_one_that_is_asked_for(
     assert result.reconstruction is not None
     assert result.reconstruction.scheme == "ers"
     assert result.measures is not None
-    ours, other = measurements[FRAMES[1]], result
-    assert ours.measures is not None
-    assert ours.measures.are_mm < other.measures.are_mm
-    # Up to the reconstruction nothing depends on the scheme, and nothing at all on chance.
-    assert ours.match is not None
+    default, other = measurements[FRAMES[1]], result
+    assert default.measures is not None
+    assert default.measures.are_mm < other.measures.are_mm
+    # Up to the reconstruction nothing depends on the scheme; all results are reproducible.
+    assert default.match is not None
     assert other.match is not None
     for name in ("dot", "ray", "plane_mm", "witness"):
-        np.testing.assert_array_equal(getattr(ours.match, name), getattr(other.match, name))
-    assert ours.match.trials == other.match.trials
+        np.testing.assert_array_equal(getattr(default.match, name), getattr(other.match, name))
+    assert default.match.trials == other.match.trials
     again = reconstruct(other.match, SETUP.rig, Settings())
-    assert_alike(measure_surface(again, other.match, SETUP.rig), ours.measures)
+    assert_alike(measure_surface(again, other.match, SETUP.rig), default.measures)
 
 
-def test_a_correction_that_changes_nothing_changes_no_figure(
+def test_unchanged_correction_changes_no_figure(
     images: dict[int, npt.NDArray[np.generic]], measurements: dict[int, Measurement]
 ) -> None:
-    found = measurements[FRAMES[2]]
-    assert found.lattice is not None
-    correction = start_correction(found)
-    assert correction.lattice.reference == found.lattice.reference
-    dark = np.zeros_like(images[FRAMES[2]])  # of the image only the shape counts
-    again = measure(dark, SETUP.bench, Settings(), correction=correction)[0]
-    assert_alike(again.measures, found.measures)
+    original = measurements[FRAMES[2]]
+    assert original.lattice is not None
+    correction = start_correction(original)
+    assert correction.lattice.reference == original.lattice.reference
+    blank = np.zeros_like(images[FRAMES[2]])  # only the image's shape matters
+    again = measure(blank, SETUP.bench, Settings(), correction=correction)[0]
+    assert_alike(again.measures, original.measures)
     assert again.correction is correction
     assert start_correction(again) is correction
     assert again.lattice is not None
-    np.testing.assert_array_equal(again.lattice.row, found.lattice.row)
+    np.testing.assert_array_equal(again.lattice.row, original.lattice.row)
     assert again.match is not None
-    assert found.match is not None
-    np.testing.assert_array_equal(again.match.witness, found.match.witness)
+    assert original.match is not None
+    np.testing.assert_array_equal(again.match.witness, original.match.witness)
 
 
-def test_a_false_dot_is_deleted_and_a_missing_one_added_by_hand(
+def test_false_dot_is_deleted_and_missing_one_added_manually(
     images: dict[int, npt.NDArray[np.generic]], measurements: dict[int, Measurement]
 ) -> None:
     index = FRAMES[0]
-    found = measurements[index]
-    assert found.match is not None
-    assert found.dots is not None
-    start = start_correction(found)
-    # A dot in the middle, of all rays, is missed by the detector and a false one seen instead.
-    one = int(found.match.dot[len(found.match.dot) // 2])
-    ray = found.match.ray[len(found.match.dot) // 2].tolist()
+    original = measurements[index]
+    assert original.match is not None
+    assert original.dots is not None
+    start = start_correction(original)
+    # The detector misses a dot in the middle and finds a false one instead.
+    one = int(original.match.dot[len(original.match.dot) // 2])
+    ray = original.match.ray[len(original.match.dot) // 2].tolist()
     (true,) = (
         (row["u_px"], row["v_px"])
         for row in table("dots_truth.csv")
@@ -218,20 +224,20 @@ def test_a_false_dot_is_deleted_and_a_missing_one_added_by_hand(
     result = measure(images[index], SETUP.bench, Settings(), correction=better)[0]
     assert result.status == "ok"
     assert result.match is not None
-    assert len(result.match.dot) == len(found.match.dot)
+    assert len(result.match.dot) == len(original.match.dot)
     assert result.match.ray[result.match.dot == last].tolist() == [ray]
     assert result.measures is not None
-    assert found.measures is not None
-    assert result.measures.height_mm == pytest.approx(found.measures.height_mm, rel=0.002)
+    assert original.measures is not None
+    assert result.measures.height_mm == pytest.approx(original.measures.height_mm, rel=0.002)
 
 
-def test_a_frame_that_was_refused_is_measured_with_its_reference_set() -> None:
-    # The torch hides what is round the reference.
+def test_setting_the_reference_makes_a_frame_measurable() -> None:
+    # The torch hides the dots around the reference.
     pool = spherical_cap(5.5, 0.27)
-    seen = see(pool, np.random.default_rng(2), sigma_px=0.1)
-    hidden = (np.abs(seen.ray - [11, 10]) <= 1).all(axis=-1)
-    dots = Dots(*(getattr(seen.dots, field.name)[~hidden] for field in fields(Dots)))
-    ray = seen.ray[~hidden]
+    scene = see(pool, np.random.default_rng(2), sigma_px=0.1)
+    hidden = (np.abs(scene.ray - [11, 10]) <= 1).all(axis=-1)
+    dots = Dots(*(getattr(scene.dots, field.name)[~hidden] for field in fields(Dots)))
+    ray = scene.ray[~hidden]
     lattice = grow_lattice(dots, GrowSettings())
     offset = (np.stack([lattice.row, lattice.column], axis=-1) - ray)[lattice.row > 0]
     assert (offset == offset[0]).all()
@@ -250,22 +256,22 @@ def test_a_frame_that_was_refused_is_measured_with_its_reference_set() -> None:
     assert result.measures.width_mm == pytest.approx(5.5, rel=0.02)
 
 
-def test_a_hole_that_no_ray_confirmed_is_no_reference() -> None:
+def test_unconfirmed_hole_is_not_kept_as_reference() -> None:
     dots = as_dots(np.mgrid[:4, :4].reshape(2, -1).T * 20.0)
     lattice = Lattice(np.arange(16) // 4 + 1, np.arange(16) % 4 + 1, (9, 9), ((9, 9),))
-    refused = Measurement("no-match", "…", "fit", dots, lattice)
-    assert start_correction(refused).lattice.reference is None
+    rejected = Measurement("no-match", "…", "fit", dots, lattice)
+    assert start_correction(rejected).lattice.reference is None
     assert len(start_correction(Measurement("no-dots", "…", "fit")).dots) == 0
 
 
-def test_a_correction_without_dots_has_a_status() -> None:
-    nothing = Correction.of(None, None)
-    result = measure(np.zeros((640, 480)), SETUP.bench, Settings(), correction=nothing)[0]
+def test_correction_without_dots_has_a_status() -> None:
+    empty = Correction.of(None, None)
+    result = measure(np.zeros((640, 480)), SETUP.bench, Settings(), correction=empty)[0]
     assert result.status == "too-few-dots"
     assert result.lattice is not None
 
 
-def test_a_frame_is_left_as_it_was(images: dict[int, npt.NDArray[np.generic]]) -> None:
+def test_measure_does_not_modify_the_frame(images: dict[int, npt.NDArray[np.generic]]) -> None:
     image = images[FRAMES[0]][:400].astype(np.float32)
     image.flags.writeable = False
     before = image.copy()
@@ -290,7 +296,7 @@ def noise(seed: int) -> FloatArray:
     ],
     ids=["black", "white", "1x1", "one line", "noise", "8-bit noise"],
 )
-def test_a_frame_that_shows_nothing_has_a_status_and_a_reason(
+def test_frame_without_dots_has_a_status_and_a_reason(
     image: npt.NDArray[np.generic], scheme: str
 ) -> None:
     result = measure(image, SETUP.bench, Settings(scheme=scheme))[0]
@@ -303,7 +309,7 @@ def test_a_frame_that_shows_nothing_has_a_status_and_a_reason(
 
 
 @pytest.mark.parametrize("method", ["block-threshold", "wavelet"])
-def test_the_text_s_detectors_say_that_a_blank_frame_has_no_dots(method: str) -> None:
+def test_other_detectors_report_no_dots_in_a_blank_frame(method: str) -> None:
     settings = Settings(dots=DotSettings(method=method))
     result = measure(np.zeros((640, 480), np.uint8), SETUP.bench, settings)[0]
     assert result.status == "no-dots"
@@ -313,7 +319,7 @@ def test_the_text_s_detectors_say_that_a_blank_frame_has_no_dots(method: str) ->
     "count",
     [1, 2, 3],
 )
-def test_a_frame_of_one_or_a_few_dots_is_answered(count: int) -> None:
+def test_frame_with_few_dots_has_status_too_few_dots(count: int) -> None:
     v, u = np.mgrid[:640, :480]
     frame = np.random.default_rng(0).normal(20.0, 1.0, u.shape)
     for k in range(count):
@@ -324,11 +330,11 @@ def test_a_frame_of_one_or_a_few_dots_is_answered(count: int) -> None:
 
 
 @pytest.mark.slow
-def test_a_step_that_cannot_be_done_keeps_those_before_it(
+def test_failed_step_keeps_the_results_of_earlier_steps(
     images: dict[int, npt.NDArray[np.generic]],
 ) -> None:
     half = images[FRAMES[0]].copy()
-    half[: half.shape[0] * 7 // 10] = np.median(half)  # only the lowest dots are left
+    half[: half.shape[0] * 7 // 10] = np.median(half)  # only the lowest dots remain
     result = measure(half, SETUP.bench, Settings())[0]
     assert result.status != "ok"
     assert result.reason
@@ -337,7 +343,7 @@ def test_a_step_that_cannot_be_done_keeps_those_before_it(
     assert result.measures is None
 
 
-def test_a_scheme_that_finds_no_surface_says_so(measurements: dict[int, Measurement]) -> None:
+def test_scheme_raises_too_few_dots(measurements: dict[int, Measurement]) -> None:
     match = measurements[FRAMES[0]].match
     assert match is not None
     few = replace(

@@ -1,4 +1,4 @@
-"""§5.1: O′ and both axes found in calibration pictures whose truth is known, or refused."""
+"""§5.1: O′ and both axes in calibration pictures of known truth; wrong pictures are rejected."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from labapp.core.values import CannotMeasure
 
 @dataclass(frozen=True)
 class Scene:
-    """A target in a picture, drawn from distances to its edges; nothing of the package in it."""
+    """A picture of a target, drawn independently of the package from distances to its edges."""
 
     roll_deg: float = 3.0
     unit_px: float = 34.0
@@ -66,7 +66,7 @@ class Scene:
             outside.append(np.hypot(x, z) - dot)
         if self.has_x:
             outside.append(box(*self.x_units, -bar, bar))
-            # Flags on one side only: they would pull a plain centroid.
+            # Flags on one side only: they would bias a plain centroid.
             outside += [box(n - 0.03, n + 0.03, 0, bar + flag_out) for n in range(2, 10)]
         if self.has_z:
             outside.append(box(-bar, bar, *self.z_units))
@@ -83,8 +83,8 @@ class Scene:
         return np.clip(np.round(grey), 0, 255).astype(np.uint8)
 
 
-def points(found: PlaneCalibration) -> np.ndarray:
-    return np.array([found.origin_px, found.x_axis_px, found.z_axis_px])
+def points(calibration: PlaneCalibration) -> np.ndarray:
+    return np.array([calibration.origin_px, calibration.x_axis_px, calibration.z_axis_px])
 
 
 def random_scene(seed: int) -> Scene:
@@ -105,28 +105,28 @@ def random_scene(seed: int) -> Scene:
     )
 
 
-def test_the_points_of_eq_5_6_in_a_dim_picture() -> None:
+def test_points_of_eq_5_6_in_a_dim_picture() -> None:
     scene = Scene()
-    found = calibrate_plane(scene.render())
-    assert np.abs(points(found) - scene.truth).max() < 0.3
-    assert found.x_axis_mm == pytest.approx(34.925)
-    assert found.z_axis_mm == pytest.approx(15.875)
-    assert found.px_per_mm == pytest.approx((34 / 6.35, 34 / 6.35), rel=5e-3)
-    assert found.angle_deg == pytest.approx(90.0, abs=0.3)
-    assert 12 < found.threshold < 32
-    assert (len(found.marks), found.model) == (15, "affine")
-    plane = found.image_calibration.to_plane(scene.truth)
+    calibration = calibrate_plane(scene.render())
+    assert np.abs(points(calibration) - scene.truth).max() < 0.3
+    assert calibration.x_axis_mm == pytest.approx(34.925)
+    assert calibration.z_axis_mm == pytest.approx(15.875)
+    assert calibration.px_per_mm == pytest.approx((34 / 6.35, 34 / 6.35), rel=5e-3)
+    assert calibration.angle_deg == pytest.approx(90.0, abs=0.3)
+    assert 12 < calibration.threshold < 32
+    assert (len(calibration.marks), calibration.model) == (15, "affine")
+    plane = calibration.image_calibration.to_plane(scene.truth)
     assert plane == pytest.approx(np.array([[0, 0], [34.925, 0], [0, 15.875]]), abs=0.075)
 
 
 @pytest.mark.slow
-def test_random_pictures_are_right_to_half_a_pixel() -> None:
+def test_random_pictures_are_calibrated_within_half_a_pixel() -> None:
     errors, ratios = [], []
     for seed in range(15):
         scene = random_scene(seed)
-        found = calibrate_plane(scene.render())
-        errors.append(points(found) - scene.truth)
-        ratios.append(errors[-1] / np.array(found.sigma_px)[:, None])
+        calibration = calibrate_plane(scene.render())
+        errors.append(points(calibration) - scene.truth)
+        ratios.append(errors[-1] / np.array(calibration.sigma_px)[:, None])
     assert np.hypot(*np.moveaxis(errors, -1, 0)).max() < 0.5
     assert 0.2 < np.sqrt(np.mean(np.square(ratios))) < 1.3
 
@@ -144,24 +144,24 @@ def test_any_kind_of_picture_gives_the_same_points(kind: str) -> None:
     assert points(calibrate_plane(image)) == pytest.approx(points(calibrate_plane(grey)), abs=0.02)
 
 
-def test_the_unit_is_the_one_that_was_measured() -> None:
-    found = calibrate_plane(Scene().render(), PlaneCalibrationSettings(unit_mm=6.35))
-    assert found.x_axis_mm == pytest.approx(5.5 * 6.35)
-    assert found.px_per_mm[0] == pytest.approx(34 / 6.35, rel=5e-3)
+def test_unit_of_the_settings_scales_the_axes() -> None:
+    calibration = calibrate_plane(Scene().render(), PlaneCalibrationSettings(unit_mm=6.35))
+    assert calibration.x_axis_mm == pytest.approx(5.5 * 6.35)
+    assert calibration.px_per_mm[0] == pytest.approx(34 / 6.35, rel=5e-3)
 
 
-def test_the_fixed_threshold_and_whole_pixels_of_the_text() -> None:
+def test_fixed_threshold_and_integer_pixels_of_5_1() -> None:
     scene = Scene(vignetting=0.0, slope=0.0)
     settings = PlaneCalibrationSettings(threshold=23.0, subpixel=False)
-    found = calibrate_plane(scene.render(), settings)
-    assert found.threshold == 23.0
-    assert np.array_equal(points(found), np.floor(points(found)))
-    assert np.abs(points(found) + 0.5 - scene.truth).max() < 1.5
-    assert min(found.sigma_px) >= 1 / np.sqrt(12)
-    assert (found.marks, found.model) == ((), "three points")
+    calibration = calibrate_plane(scene.render(), settings)
+    assert calibration.threshold == 23.0
+    assert np.array_equal(points(calibration), np.floor(points(calibration)))
+    assert np.abs(points(calibration) + 0.5 - scene.truth).max() < 1.5
+    assert min(calibration.sigma_px) >= 1 / np.sqrt(12)
+    assert (calibration.marks, calibration.model) == ((), "three points")
 
 
-def test_a_flag_that_is_hidden_is_no_mark() -> None:
+def test_hidden_flag_is_not_a_mark() -> None:
     scene = Scene(noise=0.5)
     image = scene.render().astype(float)
     along_x, along_z = scene.axes
@@ -169,25 +169,25 @@ def test_a_flag_that_is_hidden_is_no_mark() -> None:
         ends = [scene.truth[0] + 6 * along_x + at * along_z for at in (begin, end)]
         places = [tuple(round(c) for c in place) for place in ends]
         cv2.line(image, *places, float(np.median(image)), 5)
-    found = calibrate_plane(image)
-    assert len(found.marks) == 14
-    assert 6 * 6.35 not in [mark[0] for mark in found.marks]
-    assert np.abs(points(found) - scene.truth).max() < 0.3
+    calibration = calibrate_plane(image)
+    assert len(calibration.marks) == 14
+    assert 6 * 6.35 not in [mark[0] for mark in calibration.marks]
+    assert np.abs(points(calibration) - scene.truth).max() < 0.3
 
 
 @pytest.mark.slow
-def test_the_marks_make_the_points_more_certain() -> None:
+def test_marks_reduce_the_error_of_the_points() -> None:
     scenes = [random_scene(seed) for seed in range(20, 32)]
     errors, sigma = [], []
     for scene in scenes:
-        found = calibrate_plane(scene.render())
-        errors.append(found.points_px - scene.truth)
-        sigma.append(np.sqrt(np.diag(found.points_covariance_px2)).reshape(3, 2))
+        calibration = calibrate_plane(scene.render())
+        errors.append(calibration.points_px - scene.truth)
+        sigma.append(np.sqrt(np.diag(calibration.points_covariance_px2)).reshape(3, 2))
     assert np.sqrt(np.mean(np.square(errors))) < 0.12
     assert 0.4 < np.sqrt(np.mean(np.square(np.array(errors) / sigma))) < 2.0
 
 
-def test_scales_and_angle_carry_the_points_uncertainty() -> None:
+def test_uncertainty_of_points_is_propagated_to_scales_and_angle() -> None:
     square = PlaneCalibration(
         (50.0, 400.0), (380.0, 400.0), 55.0, (50.0, 250.0), 25.0, (0.1, 0.2, 0.3), 14.0
     )
@@ -198,12 +198,12 @@ def test_scales_and_angle_carry_the_points_uncertainty() -> None:
     np.testing.assert_allclose(square.scales_and_angle_sigma, expected, rtol=1e-3)
 
 
-def test_another_unit_scales_the_marks_too() -> None:
-    found = calibrate_plane(Scene().render())
-    half = found.with_scale(0.5)
-    assert half.px_per_mm == pytest.approx([2 * scale for scale in found.px_per_mm])
-    assert half.points_px == pytest.approx(found.points_px)
-    assert half.model == found.model
+def test_another_unit_also_scales_the_marks() -> None:
+    calibration = calibrate_plane(Scene().render())
+    scaled = calibration.with_scale(0.5)
+    assert scaled.px_per_mm == pytest.approx([2 * scale for scale in calibration.px_per_mm])
+    assert scaled.points_px == pytest.approx(calibration.points_px)
+    assert scaled.model == calibration.model
 
 
 @pytest.mark.parametrize(
@@ -223,9 +223,7 @@ def test_another_unit_scales_the_marks_too() -> None:
     ],
 )
 @pytest.mark.slow
-def test_what_is_not_the_target_is_refused_with_the_reason(
-    change: dict[str, object], words: str
-) -> None:
+def test_picture_of_a_wrong_target_is_rejected(change: dict[str, object], words: str) -> None:
     scene = replace(Scene(), **change)
     with pytest.raises(CannotMeasure, match=words) as caught:
         calibrate_plane(scene.render(), PlaneCalibrationSettings(angle_tolerance_deg=15.0))
@@ -233,7 +231,7 @@ def test_what_is_not_the_target_is_refused_with_the_reason(
 
 
 @pytest.mark.parametrize("turn", ["mirrored", "upside down", "on its side"])
-def test_a_turned_picture_is_refused(turn: str) -> None:
+def test_turned_picture_is_rejected(turn: str) -> None:
     image = Scene().render()
     turned = {
         "mirrored": image[:, ::-1],
@@ -245,29 +243,31 @@ def test_a_turned_picture_is_refused(turn: str) -> None:
 
 
 @pytest.mark.slow
-def test_a_bar_partly_covered_is_never_measured_wrong() -> None:
+def test_partly_covered_bar_is_never_measured_wrong() -> None:
     scene = Scene(noise=0.5)
     along = scene.axes[0] / scene.unit_px
     for begin in (3.0, 7.0, 8.5, 9.4, 9.7):
         image = scene.render().astype(float)
-        near, far = (np.round(scene.truth[0] + along * scene.unit_px * at) for at in (begin, 11))
+        near, far = (
+            np.round(scene.truth[0] + along * scene.unit_px * units) for units in (begin, 11)
+        )
         ends = (tuple(int(c) for c in near), tuple(int(c) for c in far))
         cv2.line(image, *ends, float(np.median(image)), 24)
         try:
-            found = calibrate_plane(image)
+            calibration = calibrate_plane(image)
         except CannotMeasure:
             continue
-        assert np.hypot(*(points(found) - scene.truth).T).max() < 3.0
+        assert np.hypot(*(points(calibration) - scene.truth).T).max() < 3.0
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_noise_alone_is_no_target(seed: int) -> None:
+def test_noise_is_rejected(seed: int) -> None:
     noise = np.random.default_rng(seed).integers(0, 255, (640, 480)).astype(np.uint8)
     with pytest.raises(CannotMeasure, match="no-target"):
         calibrate_plane(noise)
 
 
-def test_what_is_no_picture_is_refused() -> None:
+def test_invalid_pictures_are_rejected() -> None:
     with pytest.raises(ValueError, match="a picture has shape"):
         calibrate_plane(np.zeros((4, 5, 6, 7)))
     with pytest.raises(ValueError, match="finite"):
@@ -278,7 +278,7 @@ def test_what_is_no_picture_is_refused() -> None:
         calibrate_plane(np.full((200, 200), 90, np.uint8))
 
 
-def test_thinning_leaves_a_line_of_one_pixel_along_the_middle() -> None:
+def test_thinning_gives_a_centre_line_one_pixel_wide() -> None:
     mask = np.zeros((15, 60), bool)
     mask[4:11, 5:55] = True
     line = thinned(mask)
@@ -290,6 +290,6 @@ def test_thinning_leaves_a_line_of_one_pixel_along_the_middle() -> None:
     assert u.mean() == pytest.approx(29.5, abs=1.0)
 
 
-def test_thinning_never_wipes_an_object_out() -> None:
+def test_thinning_never_removes_an_object() -> None:
     assert thinned(np.ones((2, 2), bool)).any()
     assert thinned(np.ones((1, 1), bool)).sum() == 1

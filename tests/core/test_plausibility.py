@@ -1,4 +1,4 @@
-"""Set-ups with a slip of the unit, and benches that are unusual and right."""
+"""Setups with wrong units, and benches that are unusual but correct."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ SETUP = (Path(__file__).parents[2] / "sample_sessions" / "gtaw" / "setup.toml").
 KNOWN = RigUncertainty(AxisPoints(BENCH_VIEW, 69.85, 31.75), *covariance_of({}))
 
 
-def of(rig: Rig) -> tuple[str, ...]:
+def warnings_of(rig: Rig) -> tuple[str, ...]:
     return implausible_values(replace(rig, uncertainty=KNOWN))
 
 
 def slipped(section: str, key: str, change: Callable[[float], float]) -> tuple[str, ...]:
-    """What is unusual of the sample's bench with one value changed."""
+    """Return the warnings for the sample's bench with one value changed."""
     values = tomlkit.parse(SETUP)
     value = values[section][key]  # type: ignore[index]
     values[section][key] = change(float(value))  # type: ignore[index, arg-type]
@@ -48,24 +48,24 @@ TEN, TENTH, INCHES = (lambda v: 10 * v), (lambda v: v / 10), (lambda v: v / 25.4
         ("image_calibration", "z_axis_mm"),
     ],
 )
-def test_a_length_in_another_unit_is_named(
+def test_length_in_another_unit_is_reported(
     section: str, key: str, change: Callable[[float], float]
 ) -> None:
     assert parse_setup(SETUP, "setup.toml").warnings == ()
-    found = slipped(section, key, change)
-    assert any(each.startswith(f"{section}.{key} is ") for each in found)
+    warnings = slipped(section, key, change)
+    assert any(each.startswith(f"{section}.{key} is ") for each in warnings)
 
 
 @pytest.mark.parametrize("times", [0.1, 0.5, 2.0])
-def test_half_the_fan_and_twice_the_fan_are_named(times: float) -> None:
-    (found,) = slipped("pattern", "inter_beam_angle_deg", lambda v: times * v)
-    assert found.startswith("pattern.inter_beam_angle_deg")
+def test_half_and_twice_the_fan_are_reported(times: float) -> None:
+    (warning,) = slipped("pattern", "inter_beam_angle_deg", lambda v: times * v)
+    assert warning.startswith("pattern.inter_beam_angle_deg")
 
 
 @pytest.mark.parametrize(("key", "value"), [("s_mm", 450.0), ("h_mm", -200.0), ("s_mm", -60.0)])
-def test_a_beam_that_would_miss_the_imaging_plane_is_named(key: str, value: float) -> None:
-    (found,) = slipped("imaging_plane", key, lambda _: value)
-    assert key in found
+def test_beam_that_misses_the_imaging_plane_is_reported(key: str, value: float) -> None:
+    (warning,) = slipped("imaging_plane", key, lambda _: value)
+    assert key in warning
 
 
 @pytest.mark.parametrize(
@@ -80,17 +80,19 @@ def test_a_beam_that_would_miss_the_imaging_plane_is_named(key: str, value: floa
         replace(BENCH_RIG, imaging_plane=ImagingPlane.vertical(150.0, 50.8, 20.0)),
     ],
 )
-def test_benches_of_the_text_and_of_the_adviser_are_usual(rig: Rig) -> None:
-    assert of(rig) == ()
+def test_benches_of_dissertation_and_adviser_are_plausible(rig: Rig) -> None:
+    assert warnings_of(rig) == ()
 
 
-def test_a_bench_that_was_checked_may_be_unusual() -> None:
+def test_checked_bench_may_be_unusual() -> None:
     far = replace(BENCH_RIG, laser=Laser(31.14, 200.0))
-    assert len(of(far)) == 1
+    assert len(warnings_of(far)) == 1
     assert implausible_values(replace(far, uncertainty=replace(KNOWN, checked=True))) == ()
     assert implausible_values(replace(far, uncertainty=None)) == ()
 
 
-def test_a_plane_that_no_reflection_reaches_is_named() -> None:
+def test_plane_that_no_reflection_reaches_is_reported() -> None:
     behind = ImagingPlane(np.array([-45.0, 50.0, 3.0]))
-    assert any("never reaches" in each for each in of(replace(BENCH_RIG, imaging_plane=behind)))
+    assert any(
+        "never reaches" in each for each in warnings_of(replace(BENCH_RIG, imaging_plane=behind))
+    )

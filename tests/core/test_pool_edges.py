@@ -28,7 +28,7 @@ def bench(tmp_path):
 
 
 def true_edges(rig, pool) -> dict[tuple[int, int], np.ndarray]:
-    """Where the middle of each line crosses the boundary at z = 0, by line and side."""
+    """Return where the middle of each line crosses the boundary at z = 0, by line and side."""
     fan = np.linspace(-rig.pattern.half_fan, rig.pattern.half_fan, 4001)
     number = np.arange(1.0, rig.pattern.count + 1)[:, None]
     ray = line_directions(rig.laser, rig.pattern, number, fan)
@@ -44,32 +44,32 @@ def true_edges(rig, pool) -> dict[tuple[int, int], np.ndarray]:
 def test_lines_on_stainless_steel_end_at_the_pool(bench):
     rig, rng = bench.line_rig, np.random.default_rng(3)
     image = render_lines(HOLLOW, rig, VIEW, LineLook(metal=0.4), rng).image
-    found = measure_lines(image, rig, bench.calibration)
-    edges, true = found.edges, true_edges(rig, HOLLOW)
+    result = measure_lines(image, rig, bench.calibration)
+    edges, true = result.edges, true_edges(rig, HOLLOW)
     assert edges is not None
     ends = zip(edges.line.tolist(), edges.side.tolist(), edges.point_mm, strict=True)
-    off = [np.linalg.norm(place - true[line, side]) for line, side, place in ends]
-    assert len(off) == 10
-    assert np.median(off) < 0.12
-    assert max(off) < 0.3
-    # What the metal reflects is none of the pattern's lines: its pieces are short.
-    assert len(found.seen.lines) in (4, 5)
-    assert all(one.length_px > 40 for one in found.seen.lines)
+    error = [np.linalg.norm(place - true[line, side]) for line, side, place in ends]
+    assert len(error) == 10
+    assert np.median(error) < 0.12
+    assert max(error) < 0.3
+    # Short pieces reflected by the metal are not lines of the pattern.
+    assert len(result.seen.lines) in (4, 5)
+    assert all(one.length_px > 40 for one in result.seen.lines)
 
 
-def test_mild_steel_shows_no_edges(bench):
+def test_mild_steel_gives_no_edges(bench):
     image = render_lines(HOLLOW, bench.line_rig, VIEW, LineLook(), np.random.default_rng(3)).image
     assert pool_edges(image, bench.line_rig, bench.calibration) is None
 
 
-def test_lines_of_a_convex_pool_that_cross_are_no_edges(bench):
+def test_crossing_lines_of_a_convex_pool_give_no_edges(bench):
     pool = egg(6.6, 3.0, 3.4, 0.2)
     rng = np.random.default_rng(0)
     image = render_lines(pool, bench.line_rig, VIEW, LineLook(metal=0.4), rng).image
     assert pool_edges(image, bench.line_rig, bench.calibration) is None
 
 
-def test_too_few_lines_show_no_smooth_boundary(bench):
+def test_too_few_lines_give_no_edges(bench):
     rig = replace(bench.line_rig, pattern=replace(bench.line_rig.pattern, count=3))
     look, rng = LineLook(metal=0.4), np.random.default_rng(3)
     image = render_lines(HOLLOW, rig, VIEW, look, rng).image

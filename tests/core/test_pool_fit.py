@@ -1,4 +1,4 @@
-"""The engine of the fit: the level from who came back, any plane, and answers to bad dots."""
+"""The fit: the level from lit and dark rays, tilted planes, and bad dots."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ STATUSES = {"no-surface", "open-boundary", "too-few-dots"}
 
 
 def dome(sign: int = 1) -> SplineSurface:
-    """A paraboloid whose height is 0 at `RADIUS`, moved up by 0.5: that shift must be undone."""
+    """Return a paraboloid with height 0 at `RADIUS`, raised by 0.5: the level must undo this."""
     basis = SplineBasis.over(np.array([-5.0, -5.0]), np.array([5.0, 5.0]), 1.0)
     x, y = (a.ravel() for a in np.meshgrid(*[np.linspace(-5, 5, 40)] * 2))
     z = sign * 0.05 * (RADIUS**2 - x**2 - y**2) + 0.5
@@ -36,7 +36,7 @@ def dome(sign: int = 1) -> SplineSurface:
 
 
 def rays_landing(spacing: float, seed: int = 0) -> tuple[FloatArray, IntArray]:
-    """Landing points of a square grid laid anyhow, and +1 for those inside the circle."""
+    """Return landing points of a randomly shifted grid, and +1 for those inside the circle."""
     axis = np.arange(-4.5, 4.5, spacing)
     shift = np.random.default_rng(seed).uniform(-0.5, 0.5, 2) * spacing
     landing = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2) + shift
@@ -67,7 +67,7 @@ def match() -> Match:
 
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.parametrize("seed", range(4))
-def test_the_contour_lies_between_lit_and_dark_rays(sign: int, seed: int) -> None:
+def test_contour_is_between_lit_and_dark_rays(sign: int, seed: int) -> None:
     landing, witness = rays_landing(0.45, seed)
     level = level_of(landing, witness, 0.45, sign)
     assert level.sign == sign
@@ -79,7 +79,7 @@ def test_the_contour_lies_between_lit_and_dark_rays(sign: int, seed: int) -> Non
     assert level.disagreement < 0.15
 
 
-def test_more_witnesses_know_the_level_better() -> None:
+def test_more_witnesses_reduce_the_level_uncertainty() -> None:
     sigmas, errors = [], []
     for spacing in (1.0, 0.5, 0.25):
         levels = [level_of(*rays_landing(spacing, seed), spacing) for seed in range(8)]
@@ -87,37 +87,37 @@ def test_more_witnesses_know_the_level_better() -> None:
         errors.append(np.sqrt(np.mean([(level.shift_mm + 0.5) ** 2 for level in levels])))
     assert sigmas[0] > 1.8 * sigmas[1] > 1.8**2 * sigmas[2]
     assert errors[0] > errors[2]
-    # What is said of the level is neither boast nor excuse.
+    # The stated uncertainty of the level is neither too small nor too large.
     assert 0.3 < np.sqrt(np.mean(np.square(np.divide(errors, sigmas)))) < 2.0
 
 
 @pytest.mark.parametrize("lies", ["dark inside", "lit outside"])
-def test_one_false_witness_moves_the_level_little(lies: str) -> None:
+def test_single_false_witness_hardly_moves_the_level(lies: str) -> None:
     landing, witness = rays_landing(0.45)
-    honest = level_of(landing, witness, 0.45)
+    original = level_of(landing, witness, 0.45)
     radius = np.linalg.norm(landing, axis=-1)
-    liar = np.argmin(np.abs(radius - (RADIUS - 0.9 if lies == "dark inside" else RADIUS + 0.9)))
+    flipped = np.argmin(np.abs(radius - (RADIUS - 0.9 if lies == "dark inside" else RADIUS + 0.9)))
     witness = witness.copy()
-    witness[liar] *= -1
+    witness[flipped] *= -1
     level = level_of(landing, witness, 0.45)
     assert level.sign == 1
     # A ray's spacing is 0.3 × 0.45 mm of height at the contour.
-    assert abs(level.shift_mm - honest.shift_mm) < 0.15 * 0.3 * 0.45
-    assert level.sigma_mm > honest.sigma_mm
-    assert level.disagreement > honest.disagreement
+    assert abs(level.shift_mm - original.shift_mm) < 0.15 * 0.3 * 0.45
+    assert level.sigma_mm > original.sigma_mm
+    assert level.disagreement > original.disagreement
 
 
-def test_a_boundary_that_the_surface_contradicts_is_known_less_well() -> None:
-    # Of a concave pool: a convex one that seems long may have a rear that sinks.
+def test_boundary_contradicting_the_surface_is_less_certain() -> None:
+    # A concave pool is used, as a convex one that seems too long may have a low rear.
     landing, witness = rays_landing(0.45)
-    honest = level_of(landing, witness, 0.45, -1)
+    original = level_of(landing, witness, 0.45, -1)
     squeezed = np.where(np.linalg.norm(landing * [1.15, 0.87], axis=-1) < RADIUS, 1, -1)
     level = level_of(landing, squeezed, 0.45, -1)
-    assert level.sigma_mm > 2 * honest.sigma_mm
+    assert level.sigma_mm > 2 * original.sigma_mm
     assert abs(level.shift_mm + 0.5) < 3 * level.sigma_mm
 
 
-def test_rays_meet_the_surface_and_give_back_the_dots(match: Match) -> None:
+def test_fitted_surface_reflects_the_rays_to_the_residuals(match: Match) -> None:
     pool = fitted(match)
     offset = pool.points_mm - OPEN_RIG.laser.position_mm
     rays = offset / np.linalg.norm(offset, axis=-1, keepdims=True)
@@ -130,9 +130,9 @@ def test_rays_meet_the_surface_and_give_back_the_dots(match: Match) -> None:
     np.testing.assert_allclose(pool.residual_mm, dots - match.plane_mm, atol=1e-6)
 
 
-def test_a_surface_that_is_near_leads_to_the_same_one_in_fewer_rounds(match: Match) -> None:
+def test_nearby_start_converges_in_fewer_rounds(match: Match) -> None:
     pool, other = fitted(match), fitted(match, plane_mm=match.plane_mm + 0.3)
-    hasty = replace(FitSettings(), rounds=2)
+    settings = replace(FitSettings(), rounds=2)
     from_it, from_flat = (
         fit_pool(
             match.ray,
@@ -140,17 +140,17 @@ def test_a_surface_that_is_near_leads_to_the_same_one_in_fewer_rounds(match: Mat
             match.plane_covariance_mm2,
             match.witness,
             OPEN_RIG,
-            hasty,
+            settings,
             near,
         )
         for near in (other.surface, None)
     )
-    off = [np.abs(one.points_mm - pool.points_mm).max() for one in (from_it, from_flat)]
-    assert off[0] < 0.002
-    assert off[0] < off[1] / 10
+    error = [np.abs(one.points_mm - pool.points_mm).max() for one in (from_it, from_flat)]
+    assert error[0] < 0.002
+    assert error[0] < error[1] / 10
 
 
-def test_the_surface_does_not_depend_on_the_order_of_the_dots(match: Match) -> None:
+def test_surface_is_independent_of_the_order_of_dots(match: Match) -> None:
     order = np.random.default_rng(0).permutation(len(match.ray))
     one = fitted(match)
     other = fitted(
@@ -162,7 +162,7 @@ def test_the_surface_does_not_depend_on_the_order_of_the_dots(match: Match) -> N
     np.testing.assert_allclose(other.points_mm, one.points_mm[order], atol=1e-7)
 
 
-def test_a_dot_that_is_known_less_well_pulls_less(match: Match) -> None:
+def test_less_certain_dot_has_less_influence(match: Match) -> None:
     plane = match.plane_mm.copy()
     plane[40] += [0.8, -0.8]
     covariance = match.plane_covariance_mm2.copy()
@@ -171,14 +171,14 @@ def test_a_dot_that_is_known_less_well_pulls_less(match: Match) -> None:
     doubted = fitted(match, plane_mm=plane, plane_covariance_mm2=covariance)
     true = fitted(match)
 
-    def off(pool: FittedPool) -> float:
+    def max_error(pool: FittedPool) -> float:
         return float(np.abs(pool.points_mm[:, 2] - true.points_mm[:, 2]).max())
 
-    assert off(doubted) < 0.1 * off(trusted)
+    assert max_error(doubted) < 0.1 * max_error(trusted)
 
 
 def tilted_plane(roll_deg: float, lean_deg: float) -> ImagingPlane:
-    """Lean the plane back about X′ and turn it in itself, wide enough for every dot."""
+    """Return a plane tilted back about X′ and rolled, large enough for every dot."""
     roll, lean = np.radians([roll_deg, lean_deg])
     x = np.array([1.0, 0.0, 0.0])
     z = np.array([0.0, -np.sin(lean), np.cos(lean)])
@@ -188,64 +188,66 @@ def tilted_plane(roll_deg: float, lean_deg: float) -> ImagingPlane:
 
 
 @pytest.mark.parametrize(("roll_deg", "lean_deg"), [(0, 25), (12, -10), (180, 0), (90, 15)])
-def test_the_pose_of_the_plane_does_not_matter(
+def test_surface_is_independent_of_the_plane_pose(
     match: Match, roll_deg: float, lean_deg: float
 ) -> None:
     rig = replace(OPEN_RIG, imaging_plane=tilted_plane(roll_deg, lean_deg))
     tilted = exact_match(trace(POOL, rig), rig)
     np.testing.assert_array_equal(tilted.ray, match.ray)
     upright = fit.reconstruct(match, OPEN_RIG, FitSettings())
-    made = fit.reconstruct(tilted, rig, FitSettings())
-    # Weights differ with the pose: exact dots leave no room for them to matter.
-    np.testing.assert_allclose(made.points_mm, upright.points_mm, atol=1e-3)
-    np.testing.assert_allclose(made.boundary.points_mm, upright.boundary.points_mm, atol=0.005)
-
-
-def refused(match: Match) -> str:
-    """Status of the fit's answer."""
-    with pytest.raises(CannotMeasure) as answer:
-        fit.reconstruct(match, OPEN_RIG, FitSettings())
-    assert answer.value.reason
-    return answer.value.status
-
-
-def part(match: Match, kept: FloatArray | IntArray) -> Match:
-    """The match with some of its dots only."""
-    return replace(
-        match,
-        dot=match.dot[kept],
-        ray=match.ray[kept],
-        reflected=match.reflected[kept],
-        plane_mm=match.plane_mm[kept],
-        plane_covariance_mm2=match.plane_covariance_mm2[kept],
+    from_tilted = fit.reconstruct(tilted, rig, FitSettings())
+    # Weights differ with the pose, but have no influence with exact dots.
+    np.testing.assert_allclose(from_tilted.points_mm, upright.points_mm, atol=1e-3)
+    np.testing.assert_allclose(
+        from_tilted.boundary.points_mm, upright.boundary.points_mm, atol=0.005
     )
 
 
-def test_where_no_ray_stayed_away_the_boundary_is_open(match: Match) -> None:
-    assert refused(replace(match, witness=np.maximum(match.witness, 0))) == "open-boundary"
+def rejected_status(match: Match) -> str:
+    """Return the status with which the fit rejects a match."""
+    with pytest.raises(CannotMeasure) as error:
+        fit.reconstruct(match, OPEN_RIG, FitSettings())
+    assert error.value.reason
+    return error.value.status
 
 
-def test_where_the_tail_is_not_seen_the_boundary_is_open(match: Match) -> None:
+def part(match: Match, selected: FloatArray | IntArray) -> Match:
+    """Return the match with only some of its dots."""
+    return replace(
+        match,
+        dot=match.dot[selected],
+        ray=match.ray[selected],
+        reflected=match.reflected[selected],
+        plane_mm=match.plane_mm[selected],
+        plane_covariance_mm2=match.plane_covariance_mm2[selected],
+    )
+
+
+def test_boundary_is_open_without_dark_rays(match: Match) -> None:
+    assert rejected_status(replace(match, witness=np.maximum(match.witness, 0))) == "open-boundary"
+
+
+def test_boundary_is_open_where_the_rear_is_not_visible(match: Match) -> None:
     witness = match.witness.copy()
     witness[:9] = 0
     head = part(match, np.flatnonzero(match.ray[:, 0] > 9))
-    assert refused(replace(head, witness=witness)) == "open-boundary"
+    assert rejected_status(replace(head, witness=witness)) == "open-boundary"
 
 
 @pytest.mark.parametrize("count", [0, 1, 5])
-def test_too_few_dots_are_refused(match: Match, count: int) -> None:
-    assert refused(part(match, np.arange(count))) == "too-few-dots"
+def test_too_few_dots_are_rejected(match: Match, count: int) -> None:
+    assert rejected_status(part(match, np.arange(count))) == "too-few-dots"
 
 
-def test_a_corner_of_the_pool_is_not_taken_for_the_pool(match: Match) -> None:
+def test_corner_of_the_pool_is_rejected(match: Match) -> None:
     corner = part(match, np.flatnonzero((match.ray[:, 1] > 10) & (match.ray[:, 0] > 8)))
     assert len(corner.ray) > fit.LEAST_DOTS
-    assert refused(corner) == "open-boundary"
+    assert rejected_status(corner) == "open-boundary"
 
 
 @examples(max_examples=16)
 @given(st.integers(0, 10_000), st.sampled_from([1.0, 8.0, 40.0, 400.0]))
-def test_garbage_is_answered_with_a_surface_or_a_reason(seed: int, noise_mm: float) -> None:
+def test_garbage_gives_a_surface_or_a_reason(seed: int, noise_mm: float) -> None:
     rng = np.random.default_rng(seed)
     pool: Pool = spherical_cap(6.0, float(rng.choice([0.4, -0.5])))
     good = exact_match(trace(pool, OPEN_RIG), OPEN_RIG)
@@ -255,24 +257,24 @@ def test_garbage_is_answered_with_a_surface_or_a_reason(seed: int, noise_mm: flo
         witness=np.where(rng.random(good.witness.shape) < 0.1, -good.witness, good.witness),
     )
     try:
-        made = fit.reconstruct(garbage, OPEN_RIG, FitSettings())
-    except CannotMeasure as answer:
-        assert answer.status in STATUSES  # noqa: PT017 - or a surface
-        assert answer.reason  # noqa: PT017 - or a surface
+        reconstruction = fit.reconstruct(garbage, OPEN_RIG, FitSettings())
+    except CannotMeasure as error:
+        assert error.status in STATUSES  # noqa: PT017 - or a surface
+        assert error.reason  # noqa: PT017 - or a surface
     else:
-        assert np.isfinite(made.points_mm).all()
-        assert np.isfinite(made.boundary.points_mm).all()
-        assert (made.sigma_mm > 0).all()
+        assert np.isfinite(reconstruction.points_mm).all()
+        assert np.isfinite(reconstruction.boundary.points_mm).all()
+        assert (reconstruction.sigma_mm > 0).all()
         assert noise_mm < 40.0
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_dots_with_the_wrong_rays_make_no_surface(match: Match, seed: int) -> None:
+def test_dots_with_wrong_rays_are_rejected(match: Match, seed: int) -> None:
     shuffled = np.random.default_rng(seed).permutation(len(match.ray))
-    assert refused(replace(match, plane_mm=match.plane_mm[shuffled])) in STATUSES
+    assert rejected_status(replace(match, plane_mm=match.plane_mm[shuffled])) in STATUSES
 
 
-def test_a_single_row_of_rays_that_came_back_has_a_level() -> None:
+def test_single_row_of_lit_rays_has_a_level() -> None:
     height, slope = np.array([0.1, 0.2, 0.1, -0.1, -0.1]), np.full((5, 2), 0.1)
     y, witness = np.array([1.0, 1.0, 1.0, 2.0, 0.0]), np.array([1, 1, 1, -1, -1])
     level = find_level(height, slope, y, witness, np.array([0.4, 0.8]))
@@ -280,8 +282,8 @@ def test_a_single_row_of_rays_that_came_back_has_a_level() -> None:
     assert level.rear.drop_mm == 0.0
 
 
-def test_rays_of_a_laser_ten_times_too_far_away_light_no_pool() -> None:
-    """Their splines would take gigabytes."""
+def test_laser_ten_times_too_far_away_is_rejected() -> None:
+    """The splines would take gigabytes."""
     match = exact_match(trace(POOL, OPEN_RIG), OPEN_RIG)
     far = replace(OPEN_RIG.laser, distance_mm=10 * OPEN_RIG.laser.distance_mm)
     dots = match.ray, match.plane_mm, match.plane_covariance_mm2, match.witness

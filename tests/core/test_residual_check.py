@@ -1,4 +1,4 @@
-"""What the residuals of recordings say of the set-up: right ones, and such that are off."""
+"""The check of the setup by the residuals of recordings, with right and wrong setups."""
 
 from __future__ import annotations
 
@@ -37,28 +37,32 @@ CENTER_MM = np.array([50.8, 50.8])
 
 
 def bent(plane_mm, by_percent, center_mm):
-    """Dots seen through a lens whose distortion has a centre."""
-    out = plane_mm - center_mm
-    square = np.sum(out**2, axis=-1, keepdims=True) / np.sum(CENTER_MM**2)
-    return plane_mm + by_percent / 100.0 * square * out
+    """Return dots seen through a lens with distortion around a centre."""
+    offset = plane_mm - center_mm
+    relative = np.sum(offset**2, axis=-1, keepdims=True) / np.sum(CENTER_MM**2)
+    return plane_mm + by_percent / 100.0 * relative * offset
 
 
 def frames(truth, count=8, seed=0, noise_mm=0.02, growth=0.0, lens=lambda plane_mm: plane_mm):
-    """Frames of a pool that swings, seen on a bench, and fitted on what it is taken for."""
+    """Yield frames of an oscillating pool on a true bench, fitted with the assumed one."""
     rng = np.random.default_rng(seed)
     for n in range(count):
-        by = 1.0 + growth * n / count
+        scale = 1.0 + growth * n / count
         swing = Oscillation(0.012, 22.0, n / 60.0)
-        pool = egg(6.6 * by, 3.0 * by, 4.2 * by, 0.29 * by, (0.0, -0.6), (swing,))
-        seen = trace(pool, truth)
-        ray = np.argwhere(seen.visible) + 1
-        dots = lens(seen.plane_mm[seen.visible]) + rng.normal(0, noise_mm, (len(ray), 2))
-        witness = np.where(seen.visible, 1, np.where(seen.lit | seen.absent, 0, -1))
+        pool = egg(6.6 * scale, 3.0 * scale, 4.2 * scale, 0.29 * scale, (0.0, -0.6), (swing,))
+        reflections = trace(pool, truth)
+        ray = np.argwhere(reflections.visible) + 1
+        dots = lens(reflections.plane_mm[reflections.visible]) + rng.normal(
+            0, noise_mm, (len(ray), 2)
+        )
+        witness = np.where(
+            reflections.visible, 1, np.where(reflections.lit | reflections.absent, 0, -1)
+        )
         covariance = np.broadcast_to(noise_mm**2 * np.eye(2), (len(ray), 2, 2))
         index = np.arange(len(ray))
         match = Match("S/S", index, ray, np.zeros_like(ray), dots, covariance, witness)
-        made = fit.reconstruct(match, EXACT, FitSettings())
-        yield Measurement("ok", "", "fit", match=match, reconstruction=made)
+        reconstruction = fit.reconstruct(match, EXACT, FitSettings())
+        yield Measurement("ok", "", "fit", match=match, reconstruction=reconstruction)
 
 
 def verdict_of(measured, rig=RIG):
@@ -69,20 +73,20 @@ def verdict_of(measured, rig=RIG):
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_right_set_up_is_not_doubted(seed):
+def test_right_setup_is_not_doubted(seed):
     assert not verdict_of(frames(BENCH_RIG, seed=seed)).is_doubtful
 
 
 def test_rolled_plane_is_doubted_and_named():
     plane = BENCH_RIG.imaging_plane
     rolled = ImagingPlane.of_angles(plane.origin_mm, (0, 0, 3.5), plane.width_mm, plane.height_mm)
-    found = verdict_of(frames(replace(BENCH_RIG, imaging_plane=rolled)))
-    assert found.is_doubtful
-    roll = next(one for one in found.suspects if "roll" in one.name)
+    verdict = verdict_of(frames(replace(BENCH_RIG, imaging_plane=rolled)))
+    assert verdict.is_doubtful
+    roll = next(one for one in verdict.suspects if "roll" in one.name)
     assert roll.off == pytest.approx(3.5, abs=0.8)
 
 
-def test_error_that_is_not_off_by_more_than_known_is_not_doubted():
+def test_error_within_its_uncertainty_is_not_doubted():
     plane = BENCH_RIG.imaging_plane
     rolled = ImagingPlane.of_angles(plane.origin_mm, (0, 0, 0.4), plane.width_mm, plane.height_mm)
     assert not verdict_of(frames(replace(BENCH_RIG, imaging_plane=rolled))).is_doubtful
@@ -90,7 +94,7 @@ def test_error_that_is_not_off_by_more_than_known_is_not_doubted():
 
 @pytest.fixture(scope="module")
 def checked():
-    """The bench as it is known after a check with a plate and a thumb tack."""
+    """Return the bench with its uncertainty after a check with a plate and a thumb tack."""
     sightings = [expected_sighting(mirror, RIG) for mirror in (Plate(0.0), Cap(9.75, 0.91))]
     system = System.of(RIG, sightings, None)
     covariance = system.adjustment(np.zeros(system.size), 1.0).covariance
@@ -118,85 +122,85 @@ WRONG = {
     "picture.v": 2.5,
     "picture.scale": 0.1,
 }
-"""How far quantities are off that are found on a checked bench, twice what the table of
-`docs/method.md` has or a little more, in their units."""
+"""Errors of quantities that are found on a checked bench, in their units: at least twice those in
+the table of `docs/method.md`."""
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("key", WRONG)
-def test_every_quantity_that_is_off_is_named_on_a_checked_bench(key, checked):
-    one = next(one for one in directions(RIG) if one.key == key)
-    offset = WRONG[key] * one.vector
+def test_each_wrong_quantity_is_named_on_a_checked_bench(key, checked):
+    direction = next(direction for direction in directions(RIG) if direction.key == key)
+    offset = WRONG[key] * direction.vector
     camera = moved_calibration(KNOWN.axes, RIG.imaging_plane, offset)
 
     def seen(plane_mm):
         return BENCH_VIEW.to_plane(camera.to_image(plane_mm))
 
-    found = verdict_of(frames(moved_rig(BENCH_RIG, offset), lens=seen), checked)
-    assert found.is_doubtful
-    own = next(suspect for suspect in found.suspects if suspect.name == one.name)
-    assert not own.is_drift
-    assert abs(own.off - WRONG[key]) < 4 * own.sigma
+    verdict = verdict_of(frames(moved_rig(BENCH_RIG, offset), lens=seen), checked)
+    assert verdict.is_doubtful
+    named = next(suspect for suspect in verdict.suspects if suspect.name == direction.name)
+    assert not named.is_drift
+    assert abs(named.off - WRONG[key]) < 4 * named.sigma
 
 
 @pytest.mark.parametrize("pitch_deg", [10.0, -8.0])
 def test_pitch_far_off_is_named_alone(checked, pitch_deg):
-    """It leaves little for its assumed ±, and enough for a gross error."""
+    """An error within its assumed ± leaves small residuals; a gross one is found."""
     plane = BENCH_RIG.imaging_plane
     size = plane.width_mm, plane.height_mm
     pitched = ImagingPlane.of_angles(plane.origin_mm, (pitch_deg, 0.0, 0.0), *size)
-    found = verdict_of(frames(replace(BENCH_RIG, imaging_plane=pitched)), checked)
-    assert found.is_doubtful
-    assert [one.name for one in found.suspects if not one.is_drift] == ["imaging plane, pitch"]
+    verdict = verdict_of(frames(replace(BENCH_RIG, imaging_plane=pitched)), checked)
+    assert verdict.is_doubtful
+    assert [one.name for one in verdict.suspects if not one.is_drift] == ["imaging plane, pitch"]
 
 
-def test_reason_names_all_quantities_that_residuals_cannot_tell_apart(checked):
+def test_reason_names_all_indistinguishable_quantities(checked):
     higher = moved_rig(BENCH_RIG, 0.5 * np.eye(len(QUANTITIES))[INDEX["imaging_plane.h_mm"]])
-    found = verdict_of(frames(higher), checked)
-    assert len(found.suspects) > 4
-    assert all(one.name in found.reason for one in found.suspects)
+    verdict = verdict_of(frames(higher), checked)
+    assert len(verdict.suspects) > 4
+    assert all(one.name in verdict.reason for one in verdict.suspects)
 
 
-def test_lens_that_looks_beside_the_plane_s_middle_is_no_doubt():
-    """A checked bench knows how much its picture is distorted, and not about which centre."""
+def test_off_centre_lens_distortion_is_not_doubted():
+    """A checked bench knows the amount of distortion, but not its centre."""
     calibration = BENCH_VIEW.with_distortion(1.0, CENTER_MM)
     sigma = {one.sigma_key: 0.02 * one.assumed for one in QUANTITIES}
     known = RigUncertainty(AxisPoints(calibration, 69.85, 31.75), *covariance_of(sigma))
 
     def left(plane_mm):
-        """What is left of the distortion, the check has moved the image calibration's points."""
-        off = bent(plane_mm, 1.0, CENTER_MM) - bent(plane_mm, 1.0, CENTER_MM - [22.0, 5.0])
+        """Return dots with the distortion that remains after the check adjusted the calibration."""
+        remainder = bent(plane_mm, 1.0, CENTER_MM) - bent(plane_mm, 1.0, CENTER_MM - [22.0, 5.0])
         ones = np.column_stack([plane_mm, np.ones(len(plane_mm))])
-        return plane_mm + off - ones @ np.linalg.lstsq(ones, off, rcond=None)[0]
+        return plane_mm + remainder - ones @ np.linalg.lstsq(ones, remainder, rcond=None)[0]
 
-    found = verdict_of(frames(BENCH_RIG, lens=left), replace(BENCH_RIG, uncertainty=known))
-    assert not found.is_doubtful
+    verdict = verdict_of(frames(BENCH_RIG, lens=left), replace(BENCH_RIG, uncertainty=known))
+    assert not verdict.is_doubtful
 
 
-def test_few_frames_say_nothing():
-    found = verdict_of(frames(BENCH_RIG, count=3))
-    assert not found.is_doubtful
-    assert "too few" in found.reason
+def test_too_few_frames_give_no_verdict():
+    verdict = verdict_of(frames(BENCH_RIG, count=3))
+    assert not verdict.is_doubtful
+    assert "too few" in verdict.reason
 
 
 @pytest.mark.parametrize(("lost", "doubtful"), [(19, True), (10, False)])
-def test_frames_that_match_nothing_are_a_doubt(lost, doubtful):
-    none = Measurement("no-match", "", "fit")
-    some = next(iter(frames(BENCH_RIG, count=1)))
-    assert verdict_of([none] * lost + [some] * (20 - lost)).is_doubtful == doubtful
+def test_many_unmatched_frames_are_doubted(lost, doubtful):
+    unmatched = Measurement("no-match", "", "fit")
+    good = next(iter(frames(BENCH_RIG, count=1)))
+    assert verdict_of([unmatched] * lost + [good] * (20 - lost)).is_doubtful == doubtful
 
 
 @pytest.mark.parametrize("status", ["no-reference", "ambiguous-rows", "no-rows"])
-def test_frames_that_lack_the_absent_dot_are_no_doubt(status):
-    """The right set-up gives these, too: the pool lies beside the absent ray, say."""
-    some = next(iter(frames(BENCH_RIG, count=1)))
+def test_frames_without_a_reference_are_not_doubted(status):
+    """They also occur with the right setup, for instance if the pool is beside the absent ray."""
+    good = next(iter(frames(BENCH_RIG, count=1)))
     assert not verdict_of([Measurement(status, "", "fit")] * 30).is_doubtful
-    assert not verdict_of([Measurement(status, "", "fit")] * 29 + [some]).is_doubtful
-    none = [Measurement("no-match", "", "fit")] * 12
-    assert verdict_of([Measurement(status, "", "fit")] * 30 + none).is_doubtful
+    assert not verdict_of([Measurement(status, "", "fit")] * 29 + [good]).is_doubtful
+    unmatched = [Measurement("no-match", "", "fit")] * 12
+    assert verdict_of([Measurement(status, "", "fit")] * 30 + unmatched).is_doubtful
 
 
-def test_dark_frames_are_no_doubt_of_the_set_up():
+def test_dark_frames_are_not_doubted():
     assert not verdict_of([Measurement("no-dots", "", "fit")] * 30).is_doubtful
 
 
@@ -207,16 +211,16 @@ def test_long_recordings_are_thinned_evenly():
     assert MOST / 2 <= len(record._samples) <= MOST
 
 
-def test_laser_that_slips_is_doubted_as_a_drift():
+def test_slipped_laser_is_doubted_as_a_drift():
     slipped = replace(BENCH_RIG, laser=replace(BENCH_RIG.laser, azimuth_deg=0.15))
-    found = verdict_of([*frames(BENCH_RIG), *frames(slipped, seed=1)])
-    assert found.is_doubtful
-    assert found.suspects[0].is_drift
-    azimuth = next(one for one in found.suspects if "azimuth" in one.name)
+    verdict = verdict_of([*frames(BENCH_RIG), *frames(slipped, seed=1)])
+    assert verdict.is_doubtful
+    assert verdict.suspects[0].is_drift
+    azimuth = next(one for one in verdict.suspects if "azimuth" in one.name)
     assert azimuth.off == pytest.approx(0.15, abs=0.04)
 
 
-def test_what_is_sent_has_the_doubt_once_it_is_known():
+def test_setup_status_becomes_doubtful_once_known():
     slipped = replace(BENCH_RIG, laser=replace(BENCH_RIG.laser, azimuth_deg=0.15))
     record = ResidualRecord(RIG)
     entered = [replace(one, setup_status="entered") for one in frames(BENCH_RIG)]
@@ -227,5 +231,5 @@ def test_what_is_sent_has_the_doubt_once_it_is_known():
     assert record.doubt
 
 
-def test_pool_that_grows_is_no_drift():
+def test_growing_pool_is_no_drift():
     assert not verdict_of(frames(BENCH_RIG, count=12, growth=0.07)).is_doubtful

@@ -1,4 +1,4 @@
-"""Ridges and lines: found to a fraction of a pixel, joined, ended; the truth is drawn."""
+"""Ridges and lines in drawn frames: subpixel position, gaps, ends and numbers."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SHAPE = (200, 260)
 
 
 def arc(center: tuple[float, float], radius: float, half: float) -> FloatArray:
-    """Points of an arch about its top, from left to right, shape (n, 2), px."""
+    """Return points of an arch, from left to right, shape (n, 2), px."""
     angle = np.linspace(-half, half, 4000)
     return np.stack(
         [center[0] + radius * np.sin(angle), center[1] - radius * np.cos(angle)], axis=-1
@@ -25,7 +25,7 @@ def arc(center: tuple[float, float], radius: float, half: float) -> FloatArray:
 def drawn(
     *lines: tuple[FloatArray, float], width: float = 2.0, noise: float = 1.0, seed: int = 0
 ) -> FloatArray:
-    """A frame of lines with their peaks, grey levels."""
+    """Return a frame of lines with the given peaks, grey levels."""
     light = np.zeros(SHAPE)
     for points, peak in lines:
         length = np.linalg.norm(np.diff(points, axis=0), axis=-1).sum()
@@ -40,21 +40,21 @@ def drawn(
     return light + 20.0 + noise * np.random.default_rng(seed).normal(size=SHAPE)
 
 
-def test_ridge_points_lie_on_a_slanted_line():
-    at = np.linspace(0, 1, 4000)[:, None]
-    frame = drawn((np.array([30.3, 60.7]) + at * np.array([190.0, 61.0]), 60.0), noise=0.2)
+def test_ridge_points_are_on_a_slanted_line():
+    share = np.linspace(0, 1, 4000)[:, None]
+    frame = drawn((np.array([30.3, 60.7]) + share * np.array([190.0, 61.0]), 60.0), noise=0.2)
     ridges = find_ridges(frame)
     main = slice(*ridges.starts[:2]) if len(ridges) == 1 else slice(None)
     points = ridges.image_px[main]
     inner = (points[:, 0] > 45) & (points[:, 0] < 205)
     across = np.array([-61.0, 190.0]) / np.hypot(61.0, 190.0)
-    off = (points[inner] - [30.3, 60.7]) @ across
+    error = (points[inner] - [30.3, 60.7]) @ across
     assert inner.sum() > 140
-    assert np.sqrt(np.mean(off**2)) < 0.05
+    assert np.sqrt(np.mean(error**2)) < 0.05
 
 
-def test_a_bent_line_is_found_where_it_is():
-    """Smoothing draws the ridge of a bent line inwards by more than its noise."""
+def test_bent_line_is_not_biased_inwards():
+    """Smoothing moves the ridge of a bent line inwards by more than its noise."""
     path = arc((130.4, 140.2), 45.0, 1.2)
     frame = drawn((path, 60.0), width=2.5, noise=0.5)
     line = max(find_lines(frame), key=lambda one: one.light * one.length_px)
@@ -65,15 +65,15 @@ def test_a_bent_line_is_found_where_it_is():
     assert line.width_px == pytest.approx(2.5, rel=0.15)
 
 
-def test_a_sharp_turn_is_not_cut_off():
-    """A line of a hollow pool near its focus: straight legs, and 10 px radius between them."""
+def test_sharp_turn_is_followed():
+    """A line of a concave pool near its focus: straight legs joined with a radius of 10 px."""
     across = np.linspace(-40.0, 40.0, 4000)
     path = np.stack([130.4 + across, 50.3 + 1.5 * np.hypot(across, 15.0)], axis=-1)
     line = max(find_lines(drawn((path, 60.0), noise=0.5)), key=lambda one: one.length_px)
-    away = np.linalg.norm(line.image_px[:, None] - path, axis=-1).min(axis=-1)
+    distance = np.linalg.norm(line.image_px[:, None] - path, axis=-1).min(axis=-1)
     turn = np.abs(line.image_px[:, 0] - 130.4) < 12.0
     assert turn.sum() > 20
-    assert np.sqrt(np.mean(away[turn] ** 2)) < 0.17
+    assert np.sqrt(np.mean(distance[turn] ** 2)) < 0.17
 
 
 def test_ends_are_where_the_light_ends():
@@ -83,9 +83,9 @@ def test_ends_are_where_the_light_ends():
     assert not line.cut.any()
 
 
-def test_a_line_that_leaves_the_picture_is_cut():
-    at = np.linspace(0, 1, 4000)[:, None]
-    frame = drawn((np.array([40.0, 90.0]) + at * np.array([218.0, 20.0]), 60.0))
+def test_line_that_leaves_the_picture_is_cut():
+    share = np.linspace(0, 1, 4000)[:, None]
+    frame = drawn((np.array([40.0, 90.0]) + share * np.array([218.0, 20.0]), 60.0))
     (line,) = find_lines(frame)
     assert line.cut.tolist() == [False, True]
 
@@ -100,22 +100,22 @@ def test_gaps_are_bridged_and_reported():
 
 
 def five(*bright: float, spacing: float = 22.0) -> list[tuple[FloatArray, float]]:
-    """Arches one above the other, from the lowest up, each with its peak."""
+    """Return arches above one another, from the lowest up, each with its peak."""
     return [(arc((130.0, 240.0 - spacing * k), 90.0, 0.7), peak) for k, peak in enumerate(bright)]
 
 
-def test_fringes_are_left_out_and_settle_the_numbers():
+def test_fringes_are_excluded_and_determine_the_numbers():
     frame = drawn(*five(9.0, 50.0, 55.0, 60.0, 10.0))
-    seen = number_lines(find_lines(frame), 3)
-    assert len(seen.lines) == 3
-    assert seen.fringe_below
-    assert seen.fringe_above
-    assert seen.left_out == 2
-    assert list(seen.first_numbers(3, same_order=True)) == [1]
-    assert list(seen.first_numbers(3, same_order=False)) == [3]
+    numbered = number_lines(find_lines(frame), 3)
+    assert len(numbered.lines) == 3
+    assert numbered.fringe_below
+    assert numbered.fringe_above
+    assert numbered.left_out == 2
+    assert list(numbered.first_numbers(3, same_order=True)) == [1]
+    assert list(numbered.first_numbers(3, same_order=False)) == [3]
 
 
-def test_missing_lines_leave_the_numbers_open_unless_a_fringe_is_seen():
+def test_missing_lines_make_numbers_ambiguous_without_a_fringe():
     alone = number_lines(find_lines(drawn(*five(50.0, 55.0, 60.0))), 5)
     assert list(alone.first_numbers(5, same_order=True)) == [1, 2, 3]
     assert list(alone.first_numbers(5, same_order=False)) == [3, 4, 5]
@@ -126,7 +126,7 @@ def test_missing_lines_leave_the_numbers_open_unless_a_fringe_is_seen():
     assert list(below.first_numbers(5, same_order=False)) == [5]
 
 
-def test_an_empty_frame_has_no_line():
+def test_empty_frame_has_no_line():
     frame = 20.0 + np.random.default_rng(1).normal(size=SHAPE)
-    seen = number_lines(find_lines(frame), 5)
-    assert seen.lines == ()
+    numbered = number_lines(find_lines(frame), 5)
+    assert numbered.lines == ()

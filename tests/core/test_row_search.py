@@ -1,4 +1,4 @@
-"""Rows and columns by the text's two searches, on patterns that are known."""
+"""Rows and columns by the dissertation's two searches, on known patterns."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def pattern(
     row_step: float = 55.0,
     seed: int = 0,
 ) -> tuple[Dots, np.ndarray]:
-    """Convex arcs, one above the other, in shuffled order; and (k, t) of each dot, from 1."""
+    """Return dots on convex arcs in shuffled order, and (k, t) of each, counted from 1."""
     rng = np.random.default_rng(seed)
     site = np.array(
         [
@@ -59,7 +59,7 @@ both = pytest.mark.parametrize("search", [by_search, by_masks])
 
 @both
 @pytest.mark.parametrize("seed", range(3))
-def test_every_dot_of_a_convex_pattern_is_placed(search: Search, seed: int) -> None:
+def test_every_dot_of_a_convex_pattern_is_indexed(search: Search, seed: int) -> None:
     dots, site = pattern(seed=seed)
     lattice = search(dots)
     assert np.array_equal(np.stack([lattice.row, lattice.column], -1), site)
@@ -82,12 +82,12 @@ def test_two_absent_middle_dots_mark_a_blocked_row(search: Search) -> None:
     lattice = search(dots)
     assert lattice.blocked_rows == {2}
     assert lattice.reference == (4, 6)
-    placed = lattice.row > 0
-    assert placed.sum() > 0.9 * len(dots)
-    assert np.array_equal(np.stack([lattice.row, lattice.column], -1)[placed], site[placed])
+    indexed = lattice.row > 0
+    assert indexed.sum() > 0.9 * len(dots)
+    assert np.array_equal(np.stack([lattice.row, lattice.column], -1)[indexed], site[indexed])
 
 
-def test_of_two_rows_the_one_without_its_centre_has_the_reference() -> None:
+def test_row_without_its_centre_dot_has_the_reference() -> None:
     """§5.2.2: "If two or more rows are available …"."""
     dots, _ = pattern(missing=((4, 6), (2, 7)))
     lattice = search_rows(dots)
@@ -96,7 +96,7 @@ def test_of_two_rows_the_one_without_its_centre_has_the_reference() -> None:
 
 
 @both
-def test_two_possible_references_are_not_decided(search: Search) -> None:
+def test_no_reference_is_chosen_among_two_candidates(search: Search) -> None:
     dots, _ = pattern(missing=((4, 6), (2, 6)))
     lattice = search(dots)
     assert lattice.reference is None
@@ -104,7 +104,7 @@ def test_two_possible_references_are_not_decided(search: Search) -> None:
 
 
 @both
-def test_no_reference_where_no_dot_is_missing(search: Search) -> None:
+def test_no_reference_is_found_where_no_dot_is_missing(search: Search) -> None:
     dots, site = pattern(missing=())
     lattice = search(dots)
     assert lattice.reference is None
@@ -113,7 +113,7 @@ def test_no_reference_where_no_dot_is_missing(search: Search) -> None:
 
 
 @both
-def test_a_lone_false_dot_gets_no_row(search: Search) -> None:
+def test_isolated_false_dot_gets_no_row(search: Search) -> None:
     dots, site = pattern()
     lattice = search(dots_at(np.vstack([dots.image_px, [[450.0, 60.0]]])))
     assert lattice.row[-1] == lattice.column[-1] == 0
@@ -122,17 +122,17 @@ def test_a_lone_false_dot_gets_no_row(search: Search) -> None:
 
 @both
 @pytest.mark.parametrize("bow", [0.0, 1.0, 2.0, 2.5])
-def test_what_is_placed_in_a_bowed_pattern_is_right(search: Search, bow: float) -> None:
+def test_indices_in_a_bowed_pattern_are_right(search: Search, bow: float) -> None:
     dots, site = pattern(bow=bow)
     lattice = search(dots)
-    placed = lattice.row > 0
-    assert placed.mean() > 0.2
-    shift = np.stack([lattice.row, lattice.column], -1)[placed] - site[placed]
+    indexed = lattice.row > 0
+    assert indexed.mean() > 0.2
+    shift = np.stack([lattice.row, lattice.column], -1)[indexed] - site[indexed]
     assert (shift == shift[0]).all()
 
 
-def test_a_row_ends_where_it_would_be_too_steep() -> None:
-    """The dot at the right is the nearest one, but more than 60° up: it begins a row itself."""
+def test_row_ends_where_it_would_be_too_steep() -> None:
+    """The next dot at the right is the nearest, but more than 60° up: it starts a new row."""
     places = np.array([[100.0, 300], [120, 300], [140, 300], [150, 270], [170, 270], [190, 270]])
     lattice = search_rows(dots_at(places))
     first = lattice.row[:3]
@@ -140,7 +140,7 @@ def test_a_row_ends_where_it_would_be_too_steep() -> None:
     assert first[0] not in lattice.row[3:]
 
 
-def test_rows_whose_masks_run_together_are_in_doubt() -> None:
+def test_rows_whose_masks_merge_are_rejected() -> None:
     dots, _ = pattern(row_step=8.0)
     with pytest.raises(CannotMeasure, match="no-rows"):
         mask_rows(dots, SHAPE)
@@ -148,14 +148,14 @@ def test_rows_whose_masks_run_together_are_in_doubt() -> None:
 
 @both
 @pytest.mark.parametrize("count", [0, 1])
-def test_too_few_dots_are_named(search: Search, count: int) -> None:
+def test_too_few_dots_are_rejected(search: Search, count: int) -> None:
     with pytest.raises(CannotMeasure) as caught:
         search(dots_at(np.full((count, 2), 50.0)))
     assert caught.value.status == "too-few-dots"
 
 
 @both
-def test_dots_one_above_the_other_form_no_rows(search: Search) -> None:
+def test_vertically_aligned_dots_form_no_rows(search: Search) -> None:
     with pytest.raises(CannotMeasure) as caught:
         search(dots_at(np.array([[50.0, 50], [50, 100], [50, 150]])))
     assert caught.value.status == "no-rows"

@@ -1,4 +1,4 @@
-"""Convex and concave rows on the caps of Tables 4-4 and 4-5, and what they allow (§7.1)."""
+"""Convex and concave rows of the caps of Tables 4-4 and 4-5, and what they allow (§7.1)."""
 
 from __future__ import annotations
 
@@ -18,36 +18,36 @@ from labapp.studies.correspondence_table import (
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
-def test_the_rule_allows_what_tables_4_4_and_4_5_have(sign: int) -> None:
+def test_row_shapes_allow_the_orientations_of_tables_4_4_and_4_5(sign: int) -> None:
     shapes = []
     for part in DEPTHS:
         for radius in RADII_MM:
-            seen = cap_reflections(radius, sign / part)
-            orientation = correspondence_letters(seen).rstrip("*")
+            reflections = cap_reflections(radius, sign / part)
+            orientation = correspondence_letters(reflections).rstrip("*")
             if orientation == "D/D":
                 continue
-            row, column = np.nonzero(seen.lit)
-            found = row_shapes(seen.plane_mm[row, column], row + 1)
-            assert found.allows(orientation) is True, (part, radius)
-            shapes.append(found.shape)
-    # From shallow to deep the picture of a concave surface turns from concave to convex.
+            row, column = np.nonzero(reflections.lit)
+            result = row_shapes(reflections.plane_mm[row, column], row + 1)
+            assert result.allows(orientation) is True, (part, radius)
+            shapes.append(result.shape)
+    # With increasing depth the rows of a concave surface turn from concave to convex.
     assert shapes == (["convex"] * 16 if sign > 0 else ["concave"] * 8 + ["convex"] * 8)
 
 
 @pytest.mark.parametrize(("width_mm", "height_mm"), [(6.0, 0.3), (6.0, -0.3), (6.0, -0.03)])
-def test_a_match_with_noise(width_mm: float, height_mm: float) -> None:
+def test_row_shape_of_a_noisy_match(width_mm: float, height_mm: float) -> None:
     rng = np.random.default_rng(3)
-    seen = trace(spherical_cap(width_mm, height_mm), OPEN_BENCH)
-    match = exact_match(seen, OPEN_BENCH, sigma_mm=0.03, rng=rng)
-    found = match_row_shapes(match)
-    assert found.allows(match.orientation)
-    assert found.shape == ("concave" if height_mm == -0.03 else "convex")
+    reflections = trace(spherical_cap(width_mm, height_mm), OPEN_BENCH)
+    match = exact_match(reflections, OPEN_BENCH, sigma_mm=0.03, rng=rng)
+    shapes = match_row_shapes(match)
+    assert shapes.allows(match.orientation)
+    assert shapes.shape == ("concave" if height_mm == -0.03 else "convex")
 
 
-def test_without_rows_nothing_is_said() -> None:
-    nothing = row_shapes(np.zeros((0, 2)), np.zeros(0, int))
-    assert nothing == RowShapes(0, 0)
-    assert nothing.shape is None
-    assert nothing.allows("S/S") is None
+def test_without_rows_the_shape_is_unknown() -> None:
+    empty = row_shapes(np.zeros((0, 2)), np.zeros(0, int))
+    assert empty == RowShapes(0, 0)
+    assert empty.shape is None
+    assert empty.allows("S/S") is None
     three = row_shapes(np.array([[0.0, 0], [1, 1], [2, 0]]), np.array([1, 1, 1]))
     assert three == RowShapes(0, 0)

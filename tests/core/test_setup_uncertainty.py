@@ -1,4 +1,4 @@
-"""How sizes change with the bench: the linear response against fits on benches that are off."""
+"""Sensitivity of sizes to the bench: linear response compared with fits on perturbed benches."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.pools import egg
 
 SIZED = [0, 1, 2, 4, 5]
-"""All sizes of a convex pool but its depth."""
+"""All sizes of a convex pool except its depth."""
 
 SETUP = read_setup(Path(__file__).parents[2] / "sample_sessions" / "gtaw" / "setup.toml")
 RIG, SETTINGS = SETUP.rig, FitSettings()
@@ -43,7 +43,7 @@ def changes(pool: FittedPool | None = None) -> FloatArray:
 
 
 def sizes_on(offset: FloatArray) -> FloatArray:
-    """Sizes that the same dots give on a bench that is off."""
+    """Return the sizes from the same dots on a perturbed bench."""
     assert RIG.uncertainty is not None
     dots = moved_dots(MATCH.plane_mm, RIG, RIG.uncertainty.axes, offset)
     rig, match = moved_rig(RIG, offset), replace(MATCH, plane_mm=dots)
@@ -64,20 +64,20 @@ def sizes_on(offset: FloatArray) -> FloatArray:
         "camera_lens.distortion_percent",
     ],
 )
-def test_changes_are_those_of_fits_on_benches_that_are_off(key: str) -> None:
+def test_changes_agree_with_fits_on_perturbed_benches(key: str) -> None:
     assert RIG.uncertainty is not None
     offset = np.zeros(len(RIG.uncertainty.sigma))
     offset[INDEX[key]] = RIG.uncertainty.sigma[INDEX[key]]
-    wanted = (sizes_on(offset) - sizes_on(-offset)) / 2
-    every = changes()
-    total = np.sqrt(np.sum(every**2, axis=1))
-    off = np.abs(every[:, INDEX[key]] - wanted)
-    # A level that is looked for from scratch may answer such a step in another way.
-    assert (off[SIZED] <= 0.35 * total[SIZED]).all()
+    expected = (sizes_on(offset) - sizes_on(-offset)) / 2
+    computed = changes()
+    total = np.sqrt(np.sum(computed**2, axis=1))
+    error = np.abs(computed[:, INDEX[key]] - expected)
+    # A level estimated from scratch may respond differently to such a step.
+    assert (error[SIZED] <= 0.35 * total[SIZED]).all()
 
 
-def test_changes_do_not_depend_on_the_factor_that_a_followed_fit_was_solved_with() -> None:
-    """Its points have moved since by as much as a factor is reused for."""
+def test_changes_do_not_depend_on_a_reused_factor() -> None:
+    """Here the points have moved by the largest distance for which a factor is reused."""
     pool = fit.solve(MATCH, RIG, SETTINGS)
     moved = pool.points_mm + REUSE_MM * np.sin(np.arange(pool.points_mm.size)).reshape(-1, 3)
     dots = MATCH.plane_mm, MATCH.plane_covariance_mm2
@@ -89,15 +89,15 @@ def test_changes_do_not_depend_on_the_factor_that_a_followed_fit_was_solved_with
     assert outdated == pytest.approx(total, rel=1e-6)
 
 
-def test_a_bench_that_is_known_exactly_changes_nothing() -> None:
+def test_exact_bench_has_no_changes() -> None:
     rig, pool = replace(RIG, uncertainty=None), fit.solve(MATCH, RIG, SETTINGS)
     gradient = np.ones((6, len(pool.surface.coefficients)))
     assert setup_changes(MATCH, rig, SETTINGS, pool, gradient).shape == (6, 0)
 
 
 @pytest.mark.parametrize("key", ["laser.azimuth_deg", "pattern.rotation_deg", "imaging_plane.s_mm"])
-def test_residuals_change_as_those_of_fits_on_benches_that_are_off(key: str) -> None:
-    """These quantities leave most of what no surface absorbs."""
+def test_residual_changes_agree_with_fits_on_perturbed_benches(key: str) -> None:
+    """These quantities leave the largest residuals, which no surface absorbs."""
     assert RIG.uncertainty is not None
     offset = 0.1 * RIG.uncertainty.root[:, INDEX[key]]
     dots = MATCH.plane_mm, MATCH.plane_covariance_mm2
@@ -105,19 +105,19 @@ def test_residuals_change_as_those_of_fits_on_benches_that_are_off(key: str) -> 
     change = residual_changes(MATCH.ray, *dots, RIG, SETTINGS, pool)[..., INDEX[key]]
     more, less = (
         fit.solve(
-            replace(MATCH, plane_mm=moved_dots(dots[0], RIG, RIG.uncertainty.axes, off)),
-            moved_rig(RIG, off),
+            replace(MATCH, plane_mm=moved_dots(dots[0], RIG, RIG.uncertainty.axes, vector)),
+            moved_rig(RIG, vector),
             SETTINGS,
         )
-        for off in (offset, -offset)
+        for vector in (offset, -offset)
     )
-    wanted = (more.residual_mm - less.residual_mm) / 0.2
-    assert np.linalg.norm(change - wanted) <= 0.1 * np.linalg.norm(wanted)
+    expected = (more.residual_mm - less.residual_mm) / 0.2
+    assert np.linalg.norm(change - expected) <= 0.1 * np.linalg.norm(expected)
 
 
 @pytest.mark.slow
-def test_the_height_is_covered_with_a_plane_that_a_noisy_picture_calibrated() -> None:
-    """Nothing else is uncertain: the ± is that of the calibration's whole covariance."""
+def test_height_is_covered_with_a_plane_from_a_noisy_picture() -> None:
+    """Nothing else is uncertain: the ± follows from the calibration's full covariance."""
     view, pool, draws = CameraView.rolled(roll_deg=1.5), egg(6.6, 3.0, 3.9, 0.33), 50
     sections = {one.sigma_key.partition(".")[::2]: 0.0 for one in QUANTITIES}
     exact: dict[str, dict[str, object]] = {}
@@ -131,13 +131,13 @@ def test_the_height_is_covered_with_a_plane_that_a_noisy_picture_calibrated() ->
     seen_px = view.to_image(MATCH.plane_mm)
 
     def height(text: str) -> FloatArray:
-        """The height by a set-up, and the set-up's part of its ±."""
+        """Return the height with a setup, and the setup's part of its ±."""
         setup = parse_setup(text, "setup.toml")
         match = exact_match(trace(pool, setup.rig), setup.rig)
         match = replace(match, plane_mm=setup.calibration.to_plane(seen_px))
-        made = fit.reconstruct(match, setup.rig, SETTINGS)
-        size = measure_surface(made, match, setup.rig)
-        return np.array([size.height_mm, made.size_sigma_setup[2]])
+        reconstruction = fit.reconstruct(match, setup.rig, SETTINGS)
+        size = measure_surface(reconstruction, match, setup.rig)
+        return np.array([size.height_mm, reconstruction.size_sigma_setup[2]])
 
     text = updated_setup(SETUP.text, "setup.toml", exact)
     truth = {
@@ -148,9 +148,11 @@ def test_the_height_is_covered_with_a_plane_that_a_noisy_picture_calibrated() ->
     errors = []
     for n in range(draws):
         noise = np.random.default_rng([18, n]).normal(0.0, 2.5, clean.shape)
-        found = calibrate_plane(np.clip(np.rint(clean + noise), 0, 255).astype(np.uint8))
-        calibrated = found.setup_keys["image_calibration"] | axes
-        made, sigma = height(updated_setup(text, "setup.toml", {"image_calibration": calibrated}))
-        errors.append((made - true) / sigma)
+        calibration = calibrate_plane(np.clip(np.rint(clean + noise), 0, 255).astype(np.uint8))
+        calibrated = calibration.setup_keys["image_calibration"] | axes
+        height_mm, sigma = height(
+            updated_setup(text, "setup.toml", {"image_calibration": calibrated})
+        )
+        errors.append((height_mm - true) / sigma)
     covered = np.mean(np.abs(errors) < 1.96)
     assert 0.92 <= covered <= 0.98

@@ -1,4 +1,4 @@
-"""Sizes of a followed surface, and how they change with it, against `measures.surface_sizes`."""
+"""Sizes of a followed surface and their derivatives, compared with `measures.surface_sizes`."""
 
 from __future__ import annotations
 
@@ -19,50 +19,50 @@ DEPTH = measures.SIZES.index("depth_mm")
 
 
 def coefficients(dent_mm: float) -> FloatArray:
-    """Splines of a dome, 0.3 mm high, lower in the middle by a dent."""
+    """Return the splines of a dome, 0.3 mm high, with a dent in the middle."""
     x, y = np.random.default_rng(3).uniform(BASIS.low_mm, BASIS.high_mm, (2000, 2)).T
     z = 0.3 - 0.03 * ((x - 0.2) ** 2 + 0.8 * y**2) + 0.01 * np.sin(2 * x) * np.cos(y)
     z -= dent_mm * np.exp(-2.0 * ((x - 0.2) ** 2 + y**2))
     return np.asarray(np.linalg.lstsq(BASIS.matrix(x, y), z, rcond=None)[0])
 
 
-def measured(made: FloatArray, level: Level) -> tuple[Sizes, Boundary]:
+def measured(splines: FloatArray, level: Level) -> tuple[Sizes, Boundary]:
     circle = Boundary.polar(CENTER, np.full(360, 3.0))
     for _ in range(4):
-        circle, boundary_slope = retrace_boundary(BASIS, made, level, CENTER, circle)
-    return sizes_and_gradients(BASIS, made, level, circle, boundary_slope), circle
+        circle, boundary_slope = retrace_boundary(BASIS, splines, level, CENTER, circle)
+    return sizes_and_gradients(BASIS, splines, level, circle, boundary_slope), circle
 
 
 @pytest.mark.parametrize(("sign", "drop_mm"), [(1, 0.0), (1, 0.05), (-1, 0.0)])
 @pytest.mark.parametrize("dent_mm", [0.0, 0.2])
-def test_sizes_are_those_of_many_samples(sign: int, drop_mm: float, dent_mm: float) -> None:
-    made = sign * coefficients(dent_mm)
+def test_sizes_agree_with_dense_sampling(sign: int, drop_mm: float, dent_mm: float) -> None:
+    splines = sign * coefficients(dent_mm)
     level = Level(0.0, 0.001, sign, Rear(drop_mm, -1.0, -3.2), 0.0)
-    sizes, boundary = measured(made, level)
-    wanted, peak = measures.surface_sizes(SplineSurface(BASIS, made), boundary)
-    assert (np.abs(sizes.size - wanted) < [1e-9, 1e-9, 1e-5, 1e-5, 1e-9, 2e-4]).all()
+    sizes, boundary = measured(splines, level)
+    expected, peak = measures.surface_sizes(SplineSurface(BASIS, splines), boundary)
+    assert (np.abs(sizes.size - expected) < [1e-9, 1e-9, 1e-5, 1e-5, 1e-9, 2e-4]).all()
     np.testing.assert_allclose(sizes.peak_mm, peak, atol=1e-3)
     assert sizes.holds
 
 
-def test_a_surface_that_comes_down_on_the_way_to_its_boundary_does_not_hold() -> None:
+def test_surface_below_its_level_inside_the_boundary_is_invalid() -> None:
     x, y = np.random.default_rng(3).uniform(BASIS.low_mm, BASIS.high_mm, (2000, 2)).T
-    away = np.hypot(x - CENTER[0], y - CENTER[1])
-    ridge = np.exp(-(((away - 2.4) / 0.5) ** 2)) + 0.3 * np.exp(-((away / 0.8) ** 2)) - 0.05
-    made = np.linalg.lstsq(BASIS.matrix(x, y), 0.2 * ridge, rcond=None)[0]
-    assert not measured(made, Level(0.0, 0.001, 1, Rear(), 0.0))[0].holds
+    distance = np.hypot(x - CENTER[0], y - CENTER[1])
+    ridge = np.exp(-(((distance - 2.4) / 0.5) ** 2)) + 0.3 * np.exp(-((distance / 0.8) ** 2)) - 0.05
+    splines = np.linalg.lstsq(BASIS.matrix(x, y), 0.2 * ridge, rcond=None)[0]
+    assert not measured(splines, Level(0.0, 0.001, 1, Rear(), 0.0))[0].holds
 
 
 @pytest.mark.parametrize("drop_mm", [0.0, 0.05])
-def test_derivatives_are_those_of_small_changes(drop_mm: float) -> None:
-    made, step = coefficients(0.0), 1e-5
+def test_derivatives_agree_with_differences(drop_mm: float) -> None:
+    splines, step = coefficients(0.0), 1e-5
     level = Level(0.0, 0.001, 1, Rear(drop_mm, -1.0, -3.2), 0.0)
-    sizes, _ = measured(made, level)
-    # The deepest is the rear of the rim, which is given.
+    sizes, _ = measured(splines, level)
+    # The deepest point is at the rear of the rim, which is given.
     assert np.isnan(sizes.gradient[DEPTH]).all()
-    for spline in np.random.default_rng(5).choice(len(made), 25, replace=False):
-        change = np.zeros_like(made)
+    for spline in np.random.default_rng(5).choice(len(splines), 25, replace=False):
+        change = np.zeros_like(splines)
         change[spline] = step
-        more, less = (measured(made + way * change, level)[0].size for way in (1, -1))
-        off = sizes.gradient[:, spline] - (more - less) / (2 * step)
-        assert np.abs(np.delete(off, DEPTH)).max() < 2e-3
+        more, less = (measured(splines + sign * change, level)[0].size for sign in (1, -1))
+        error = sizes.gradient[:, spline] - (more - less) / (2 * step)
+        assert np.abs(np.delete(error, DEPTH)).max() < 2e-3

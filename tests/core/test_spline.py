@@ -1,4 +1,4 @@
-"""The spline basis, what it holds without a penalty, and the fit of slopes."""
+"""The spline basis, its roughness penalty, and the fit of slopes."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ BASIS = SplineBasis.over(LOW, HIGH, 1.3)
 
 
 def places(count: int, seed: int = 0) -> FloatArray:
-    """Points within the rectangle, shape (count, 2)."""
+    """Return points within the rectangle, shape (count, 2)."""
     return np.random.default_rng(seed).uniform(LOW, HIGH, (count, 2))
 
 
 def quadric(terms: FloatArray, xy: FloatArray) -> FloatArray:
-    """z = a x + b y + c x² + d xy + e y², shape of the points."""
+    """Return z = a x + b y + c x² + d xy + e y², in the shape of the points."""
     x, y = xy.T
     return np.stack([x, y, x**2, x * y, y**2], axis=-1) @ terms
 
@@ -33,11 +33,11 @@ def quadric_slopes(terms: FloatArray, xy: FloatArray) -> FloatArray:
 
 
 def through(values: FloatArray, xy: FloatArray) -> FloatArray:
-    """Coefficients of the splines that take values at points."""
+    """Return the coefficients of the splines that take the given values at points."""
     return np.linalg.lstsq(BASIS.matrix(*xy.T), values, rcond=None)[0]
 
 
-def test_the_splines_cover_the_rectangle_with_knots_no_wider_than_asked() -> None:
+def test_splines_cover_the_rectangle_within_the_knot_spacing() -> None:
     np.testing.assert_allclose(BASIS.low_mm, LOW)
     np.testing.assert_allclose(BASIS.high_mm, HIGH)
     assert np.diff(BASIS.x_knots).max() <= 1.3
@@ -53,7 +53,7 @@ def test_splines_add_up_to_one_and_none_is_negative() -> None:
 
 
 @pytest.mark.parametrize(("dx", "dy"), [(1, 0), (0, 1), (2, 0), (1, 1)])
-def test_derivatives_are_those_of_the_splines(dx: int, dy: int) -> None:
+def test_derivatives_agree_with_central_differences(dx: int, dy: int) -> None:
     x, y = places(40).T * 0.9
     h = 1e-5
     if dx:
@@ -64,20 +64,20 @@ def test_derivatives_are_those_of_the_splines(dx: int, dy: int) -> None:
 
 
 def roughness() -> FloatArray:
-    """The whole symmetric matrix of the band."""
+    """Return the full symmetric matrix of the band."""
     lower = sum(np.diag(line[: len(line) - k], -k) for k, line in enumerate(BASIS.roughness))
     return np.asarray(lower + np.tril(lower, -1).T)
 
 
 @given(st.tuples(*[st.floats(-2.0, 2.0)] * 5))
-def test_quadrics_are_not_rough(terms: tuple[float, ...]) -> None:
+def test_quadrics_have_no_roughness(terms: tuple[float, ...]) -> None:
     xy = places(300)
     coefficients = through(quadric(np.array(terms), xy), xy)
     assert coefficients @ roughness() @ coefficients == pytest.approx(0.0, abs=1e-9)
 
 
-def test_the_roughness_of_a_cubic_is_its_integral() -> None:
-    # Cubics lie in the basis; x³, x²y, xy² and y³ have third derivatives 6, 2, 2 and 6.
+def test_roughness_of_a_cubic_is_its_integral() -> None:
+    # Cubics are in the basis; x³, x²y, xy² and y³ have third derivatives 6, 2, 2 and 6.
     xy = places(400)
     x, y = xy.T
     area = np.prod(HIGH - LOW)
@@ -89,7 +89,7 @@ def test_the_roughness_of_a_cubic_is_its_integral() -> None:
     assert np.linalg.eigvalsh(roughness()).min() > -1e-9
 
 
-def test_a_surface_is_nan_outside_and_rises_as_a_whole() -> None:
+def test_surface_is_nan_outside_and_can_be_raised() -> None:
     xy = places(200)
     surface = SplineSurface(BASIS, through(quadric(np.array([0.1, 0, 0.2, 0, 0.3]), xy), xy))
     outside = np.array([[LOW[0] - 0.01, 0.0], [0.0, HIGH[1] + 0.01]])
@@ -104,7 +104,7 @@ def test_a_surface_is_nan_outside_and_rises_as_a_whole() -> None:
 
 
 @pytest.mark.parametrize("stiffness", [1e-2, 1.0, 1e3])
-def test_slopes_of_a_quadric_give_it_back_even_where_none_were_given(stiffness: float) -> None:
+def test_fit_of_quadric_slopes_extrapolates_the_quadric(stiffness: float) -> None:
     terms = np.array([0.05, -0.1, 0.06, 0.02, -0.04])
     xy = places(60) * 0.6
     weights = np.tile(np.diag([4e4, 1e4]), (len(xy), 1, 1))
@@ -116,34 +116,34 @@ def test_slopes_of_a_quadric_give_it_back_even_where_none_were_given(stiffness: 
     assert fitted.surface.height(*xy.T).mean() == pytest.approx(0.0, abs=1e-9)
 
 
-def test_a_stiffer_surface_follows_a_ripple_less() -> None:
+def test_stiffer_surface_follows_a_ripple_less() -> None:
     xy = places(150)
     slopes = np.stack([np.cos(2 * xy[:, 0]), np.zeros(len(xy))], axis=-1) * 0.1
     weights = np.tile(1e4 * np.eye(2), (len(xy), 1, 1))
-    left = [
+    residuals = [
         np.std(slopes - fit_slopes(BASIS, xy, slopes, weights, s).surface.gradient(*xy.T))
         for s in (1e-2, 1e3, 1e6)
     ]
-    assert left[0] < 0.7 * left[2]
-    assert left == sorted(left)
+    assert residuals[0] < 0.7 * residuals[2]
+    assert residuals == sorted(residuals)
 
 
-def test_the_covariance_is_the_spread_of_repeated_fits() -> None:
+def test_covariance_is_the_spread_of_repeated_fits() -> None:
     rng = np.random.default_rng(2)
     xy = places(120)
     truth = quadric_slopes(np.array([0.0, 0.0, 0.05, 0.01, 0.03]), xy)
     spread = np.array([[0.01, 0.0], [0.006, 0.02]])
     weights = np.tile(np.linalg.inv(spread @ spread.T), (len(xy), 1, 1))
-    at = places(12, seed=3) * 0.8
-    # Hardly stiff: the penalty is what is expected of the surface, which the noise knows not of.
+    points = places(12, seed=3) * 0.8
+    # Low stiffness: the penalty is a prior on the surface, which does not affect the noise.
     heights = []
     for _ in range(300):
         slopes = truth + rng.normal(size=truth.shape) @ spread.T
         fitted = fit_slopes(BASIS, xy, slopes, weights, 1e-3)
-        heights.append(fitted.surface.height(*at.T))
-    matrix = BASIS.matrix(*at.T)
-    told = fitted.sigma_of(matrix)
-    found = np.std(heights, axis=0)
-    np.testing.assert_allclose(found / told, 1.0, atol=0.2)
+        heights.append(fitted.surface.height(*points.T))
+    matrix = BASIS.matrix(*points.T)
+    stated = fitted.sigma_of(matrix)
+    observed = np.std(heights, axis=0)
+    np.testing.assert_allclose(observed / stated, 1.0, atol=0.2)
     level = BASIS.matrix(*xy.T).mean(axis=0)
     assert fitted.sigma_of(level[None])[0] == pytest.approx(0.0, abs=1e-6)

@@ -1,4 +1,4 @@
-"""Where rays meet surfaces, and the two surfaces through scattered points."""
+"""Intersections of rays and surfaces, and the two surfaces through scattered points."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ RAYS = ray_directions(LASER, DotPattern()).reshape(-1, 3)
 
 
 def scattered(seed: int = 3, count: int = 80) -> np.ndarray:
-    """(x, y) of points over a square of 6 mm."""
+    """Return (x, y) of random points in a square of 6 mm."""
     return np.random.default_rng(seed).uniform(-3.0, 3.0, (count, 2))
 
 
 @given(st.floats(-1.5, 1.5))
-def test_rays_meet_a_level_where_the_formula_says(level):
+def test_intersection_with_a_level_agrees_with_the_formula(level):
     points = intersect(FlatSurface(level), LASER.position_mm, RAYS)
     np.testing.assert_allclose(points, intersect_level(LASER.position_mm, RAYS, level), atol=1e-8)
 
 
 @given(st.floats(5.0, 8.0), st.floats(-0.12, 0.12))
-def test_rays_meet_a_sphere_where_the_formula_says(diameter, share):
+def test_intersection_with_a_sphere_agrees_with_the_formula(diameter, share):
     if abs(share) < 0.01:
         return
     peak = diameter * share
@@ -50,7 +50,7 @@ def test_rays_meet_a_sphere_where_the_formula_says(diameter, share):
     assert np.isnan(points[outside | (b * b < c)]).all()
 
 
-def test_a_ray_that_starts_outside_the_domain_is_found_inside_it():
+def test_ray_landing_outside_the_domain_is_intersected_inside():
     # It lands outside the hull on z = 0, but meets the raised surface within it.
     x, y = np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0])
     plateau = CloughTocherSurface(np.column_stack([x.ravel(), y.ravel(), np.full(9, 0.8)]))
@@ -63,7 +63,7 @@ def test_a_ray_that_starts_outside_the_domain_is_found_inside_it():
     )
 
 
-def test_rays_that_miss_or_rise_give_nan():
+def test_rays_that_miss_or_rise_give_nan_points():
     upward = np.array([[0.0, -1.0, 0.2], [0.0, -1.0, 0.0]])
     assert np.isnan(intersect(FlatSurface(), LASER.position_mm, upward)).all()
     assert np.isnan(intersect(FlatSurface(-5.0), LASER.position_mm, RAYS[:3])).all()
@@ -73,24 +73,26 @@ def test_rays_that_miss_or_rise_give_nan():
 
 
 @pytest.mark.parametrize("surface", [CloughTocherSurface, ThinPlateSurface])
-def test_both_surfaces_pass_through_their_points(surface):
+def test_surfaces_interpolate_their_points(surface):
     xy = scattered()
     z = np.sin(xy[:, 0]) * np.cos(xy[:, 1])
     np.testing.assert_allclose(surface(np.column_stack([xy, z])).height(*xy.T), z, atol=1e-9)
 
 
 @pytest.mark.parametrize("surface", [CloughTocherSurface, ThinPlateSurface])
-def test_a_plane_stays_a_plane(surface):
+def test_surfaces_reproduce_a_plane(surface):
     xy = scattered()
     plane = surface(np.column_stack([xy, 0.3 + xy @ [0.2, -0.1]]))
-    at = 0.5 * scattered(seed=4)
-    np.testing.assert_allclose(plane.height(*at.T), 0.3 + at @ [0.2, -0.1], atol=1e-6)
-    np.testing.assert_allclose(plane.gradient(*at.T), np.tile([0.2, -0.1], (len(at), 1)), atol=1e-5)
+    points = 0.5 * scattered(seed=4)
+    np.testing.assert_allclose(plane.height(*points.T), 0.3 + points @ [0.2, -0.1], atol=1e-6)
+    np.testing.assert_allclose(
+        plane.gradient(*points.T), np.tile([0.2, -0.1], (len(points), 1)), atol=1e-5
+    )
     np.testing.assert_allclose(plane.point_gradient[:, 0], 0.2, atol=1e-5)
 
 
 @pytest.mark.parametrize("surface", [CloughTocherSurface, ThinPlateSurface])
-def test_the_gradient_is_the_difference_quotient(surface):
+def test_gradient_agrees_with_central_differences(surface):
     xy = scattered()
     curved = surface(np.column_stack([xy, 0.05 * (xy**2).sum(axis=1)]))
     x, y = (0.5 * scattered(seed=5)).T
@@ -109,7 +111,7 @@ def test_the_gradient_is_the_difference_quotient(surface):
     assert curved.gradient(x[:4].reshape(2, 2), y[:4].reshape(2, 2)).shape == (2, 2, 2)
 
 
-def test_one_surface_ends_at_the_hull_and_the_other_goes_on():
+def test_only_the_thin_plate_surface_extrapolates():
     xy = scattered()
     points = np.column_stack([xy, 0.05 * (xy**2).sum(axis=1)])
     assert np.isnan(CloughTocherSurface(points).height(np.array(5.0), np.array(0.0)))
@@ -118,19 +120,19 @@ def test_one_surface_ends_at_the_hull_and_the_other_goes_on():
 
 
 @pytest.mark.parametrize("surface", [CloughTocherSurface, ThinPlateSurface])
-def test_points_on_a_line_make_no_surface(surface):
+def test_collinear_points_raise_no_surface(surface):
     line = np.column_stack([np.arange(9.0), np.arange(9.0), np.zeros(9)])
     with pytest.raises(CannotMeasure, match="no-surface"):
         surface(line)
 
 
-def test_points_beside_the_boundary_make_no_cliff():
+def test_points_at_the_boundary_do_not_cause_a_cliff():
     boundary = Boundary.polar(np.zeros(2), np.full(360, 3.0))
     xy = np.array([[0.0, 0.0], [1.0, 0.5], [-1.0, 1.0], [0.5, -1.5], [2.99, 0.0], [3.2, 0.5]])
     z = np.array([0.3, 0.3, 0.3, 0.2, 5.0, 5.0])
-    whole = whole_surface(np.column_stack([xy, z]), boundary)
+    surface = whole_surface(np.column_stack([xy, z]), boundary)
     x, y = np.meshgrid(np.linspace(-2.9, 2.9, 60), np.linspace(-2.9, 2.9, 60))
-    assert np.nanmax(whole.height(x, y)) < 0.5
-    np.testing.assert_allclose(whole.height(*xy[:4].T), z[:4], atol=1e-9)
+    assert np.nanmax(surface.height(x, y)) < 0.5
+    np.testing.assert_allclose(surface.height(*xy[:4].T), z[:4], atol=1e-9)
     with pytest.raises(CannotMeasure, match="no-surface"):
         whole_surface(np.column_stack([xy, z])[4:], boundary)

@@ -1,4 +1,4 @@
-"""The covariance of the bench's quantities: drawn from, and combined."""
+"""The covariance of the bench's quantities: drawing offsets, and combining changes."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ AXES = AxisPoints(
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.92, -1.0])
-def test_offsets_that_are_drawn_have_the_covariance(correlation):
-    told = {"imaging_plane.s_mm_sigma": 0.0, "laser.distance_mm_sigma": 0.2}
-    known = RigUncertainty(AXES, *covariance_of(told, correlation))
+def test_root_of_the_covariance_draws_correlated_offsets(correlation):
+    sigmas = {"imaging_plane.s_mm_sigma": 0.0, "laser.distance_mm_sigma": 0.2}
+    known = RigUncertainty(AXES, *covariance_of(sigmas, correlation))
     root = known.root
     np.testing.assert_allclose(root @ root.T, known.covariance, atol=1e-9)
     drawn = np.random.default_rng(5).normal(size=(4000, len(QUANTITIES))) @ root.T
-    seen = np.corrcoef(drawn[:, [ANGLE, DISTANCE]].T)[0, 1]
-    assert seen == pytest.approx(correlation, abs=0.05)
+    observed = np.corrcoef(drawn[:, [ANGLE, DISTANCE]].T)[0, 1]
+    assert observed == pytest.approx(correlation, abs=0.05)
 
 
 def test_changes_are_combined_with_their_correlation():

@@ -1,4 +1,4 @@
-"""Frames measured one from the other: as the cold chain has them, and never a wrong ray."""
+"""Frames followed from the previous one agree with independent ones and have no wrong ray."""
 
 from __future__ import annotations
 
@@ -35,20 +35,20 @@ TRUE_PX = 2.5
 
 @cache
 def frames() -> tuple[RecordedFrame, ...]:
-    """A pool that swings: dots at its rim move by up to two columns from frame to frame."""
+    """Return frames of an oscillating pool: dots at its rim move by up to 2 columns per frame."""
     pool = egg(6.66, 3.0, 4.4, 0.29, (0.0, -0.6), terms=(Wave((0, 1), 0.03, WAVE_HZ),))
     pools = tuple(pool.after(n / RATE_HZ) for n in range(FRAMES))
     look = Look(hot_pixels=2, missing=0.01)
-    made = Recording(
+    recording = Recording(
         file="recording.avi", rig=RIG, view=VIEW, look=look, pools=pools, seed=61,
         frame_rate_hz=RATE_HZ,
     )  # fmt: skip
-    return tuple(made.frame(n) for n in range(FRAMES))
+    return tuple(recording.frame(n) for n in range(FRAMES))
 
 
 @dataclass(frozen=True)
 class Run:
-    """A chain after `WARMED` frames, and what it said of each."""
+    """A chain after `WARMED` frames, and its results."""
 
     chain: WarmChain
     measurements: tuple[Measurement, ...]
@@ -70,33 +70,33 @@ def chain() -> WarmChain:
 
 
 def wrong_rays(result: Measurement, frame: RecordedFrame, shift_px: float = 0.0) -> int:
-    """How many dots have a ray whose true dot is not there."""
+    """Return the number of dots which are not at the true dot of their ray."""
     if result.match is None or result.dots is None:
         return 0
     true = frame.dot_px + np.array([shift_px, 0.0])
     i, j = result.match.ray.T - 1
-    off = np.linalg.norm(result.dots.image_px[result.match.dot] - true[i, j], axis=-1)
-    return int(np.sum(~(off < TRUE_PX)))
+    error = np.linalg.norm(result.dots.image_px[result.match.dot] - true[i, j], axis=-1)
+    return int(np.sum(~(error < TRUE_PX)))
 
 
-def with_dots(image: FloatArray, places: FloatArray, peak: float = 50.0) -> FloatArray:
+def with_dots(image: FloatArray, positions: FloatArray, peak: float = 50.0) -> FloatArray:
     v, u = np.mgrid[: image.shape[0], : image.shape[1]]
     light = image.astype(float)
-    for at in places:
-        light += peak * np.exp(-((u - at[0]) ** 2 + (v - at[1]) ** 2) / (2 * 1.8**2))
+    for position in positions:
+        light += peak * np.exp(-((u - position[0]) ** 2 + (v - position[1]) ** 2) / (2 * 1.8**2))
     return np.clip(light, 0, 255).astype(np.uint8)
 
 
-def without_dots(image: FloatArray, places: FloatArray) -> FloatArray:
+def without_dots(image: FloatArray, positions: FloatArray) -> FloatArray:
     dark = image.copy()
     rng = np.random.default_rng(7)
-    for u, v in np.rint(places).astype(int):
+    for u, v in np.rint(positions).astype(int):
         patch = dark[v - 6 : v + 7, u - 6 : u + 7]
         patch[:] = np.clip(rng.normal(np.quantile(patch, 0.2), 1.5, patch.shape), 0, 255)
     return dark
 
 
-def test_every_frame_after_the_first_is_followed() -> None:
+def test_all_frames_after_the_first_are_followed() -> None:
     run = warmed()
     assert run.track_lost[0] is not None
     assert [reason for reason in run.track_lost[1:] if reason] == []
@@ -107,19 +107,19 @@ def test_every_frame_after_the_first_is_followed() -> None:
         assert len(result.match.ray) >= 0.97 * frame.shown.sum()
 
 
-def test_sizes_are_true_within_what_they_are_said_to_be_uncertain_by() -> None:
+def test_sizes_are_within_their_uncertainty() -> None:
     for name in ("width", "length", "height"):
-        surprise = []
+        normalized_errors = []
         for result, frame in zip(warmed().measurements, frames(), strict=False):
             assert result.measures is not None
-            off = getattr(result.measures, f"{name}_mm") - getattr(frame.pool.size, f"{name}_mm")
-            surprise.append(off / getattr(result.measures, f"{name}_sigma_mm"))
-        assert np.abs(surprise).max() < 4.0
-        assert 0.2 < np.sqrt(np.mean(np.square(surprise))) < 2.0
+            error = getattr(result.measures, f"{name}_mm") - getattr(frame.pool.size, f"{name}_mm")
+            normalized_errors.append(error / getattr(result.measures, f"{name}_sigma_mm"))
+        assert np.abs(normalized_errors).max() < 4.0
+        assert 0.2 < np.sqrt(np.mean(np.square(normalized_errors))) < 2.0
 
 
 @pytest.mark.parametrize("number", [2, 9])
-def test_a_followed_frame_is_what_the_cold_chain_makes_of_it(number: int) -> None:
+def test_followed_frame_agrees_with_an_independent_measurement(number: int) -> None:
     warm = warmed().measurements[number]
     cold = measure(frames()[number].image, BENCH, Settings())[0]
     assert cold.match is not None
@@ -127,46 +127,54 @@ def test_a_followed_frame_is_what_the_cold_chain_makes_of_it(number: int) -> Non
     assert cold.measures is not None
     assert warm.measures is not None
     assert warm.match.orientation == cold.match.orientation
-    own = {tuple(ray): k for k, ray in enumerate(warm.match.ray.tolist())}
-    both = [(own[r], k) for k, r in enumerate(map(tuple, cold.match.ray.tolist())) if r in own]
+    warm_index = {tuple(ray): k for k, ray in enumerate(warm.match.ray.tolist())}
+    both = [
+        (warm_index[r], k)
+        for k, r in enumerate(map(tuple, cold.match.ray.tolist()))
+        if r in warm_index
+    ]
     assert len(both) >= 0.97 * len(cold.match.ray)
     assert warm.reconstruction is not None
     assert cold.reconstruction is not None
-    mine, its = np.array(both).T
-    off = warm.reconstruction.points_mm[mine, 2] - cold.reconstruction.points_mm[its, 2]
-    # Their splines need not have the same knots: where dots end these count for a few µm.
-    surprise = off / cold.reconstruction.sigma_mm[its]
-    assert np.sqrt(np.mean(surprise**2)) < 1.0
-    assert np.abs(surprise).max() < 2.0
+    in_warm, in_cold = np.array(both).T
+    difference = (
+        warm.reconstruction.points_mm[in_warm, 2] - cold.reconstruction.points_mm[in_cold, 2]
+    )
+    # The knots may differ, which matters by a few µm at the rim.
+    normalized = difference / cold.reconstruction.sigma_mm[in_cold]
+    assert np.sqrt(np.mean(normalized**2)) < 1.0
+    assert np.abs(normalized).max() < 2.0
     np.testing.assert_allclose(
-        warm.reconstruction.sigma_mm[mine], cold.reconstruction.sigma_mm[its], rtol=0.4
+        warm.reconstruction.sigma_mm[in_warm], cold.reconstruction.sigma_mm[in_cold], rtol=0.4
     )
     for name in ("width_mm", "length_mm", "height_mm", "area_mm2", "volume_mm3"):
         sigma = name.replace("_mm", "_sigma_mm")
-        a, b = warm.measures, cold.measures
-        assert abs(getattr(a, name) - getattr(b, name)) < getattr(b, sigma)
-        assert getattr(a, sigma) == pytest.approx(getattr(b, sigma), rel=0.4)
-    # Centroids over more of each dot leave less of the speckle in it.
+        warm_sizes, cold_sizes = warm.measures, cold.measures
+        assert abs(getattr(warm_sizes, name) - getattr(cold_sizes, name)) < getattr(
+            cold_sizes, sigma
+        )
+        assert getattr(warm_sizes, sigma) == pytest.approx(getattr(cold_sizes, sigma), rel=0.4)
+    # Centroids over more of each dot are less affected by speckle.
     assert 0.6 < warm.measures.are_mm / cold.measures.are_mm < 1.1
     assert warm.lattice is not None
     assert cold.lattice is not None
     assert warm.lattice.reference is not None
-    row = warm.lattice.row[warm.match.dot[mine]] - cold.lattice.row[cold.match.dot[its]]
+    row = warm.lattice.row[warm.match.dot[in_warm]] - cold.lattice.row[cold.match.dot[in_cold]]
     assert (row == row[0]).all()
 
 
-def test_the_same_frames_give_the_same_answers() -> None:
+def test_following_is_reproducible() -> None:
     one, other = chain(), chain()
     for frame in frames()[WARMED:]:
         first, second = one.measure(frame.image), other.measure(frame.image)
         assert_same(first.measures, second.measures)
 
 
-def test_missing_and_false_dots_are_told_apart_from_the_others() -> None:
+def test_missing_and_false_dots_get_no_ray() -> None:
     frame, follower = frames()[WARMED], chain()
-    gone = frame.dot_px[[9, 9, 11], [5, 13, 8]]
-    image = without_dots(frame.image, gone)
-    image = with_dots(image, gone[:1] + np.array([6.0, 14.0]))
+    missing = frame.dot_px[[9, 9, 11], [5, 13, 8]]
+    image = without_dots(frame.image, missing)
+    image = with_dots(image, missing[:1] + np.array([6.0, 14.0]))
     result = follower.measure(image)
     assert follower.track_lost is None
     assert wrong_rays(result, frame) == 0
@@ -177,7 +185,7 @@ def test_missing_and_false_dots_are_told_apart_from_the_others() -> None:
 
 
 @pytest.mark.parametrize("beside", [(5.0, 0.0), (0.0, 5.0)])
-def test_a_dot_that_a_false_one_runs_into_has_no_ray_in_either_chain(
+def test_dot_merged_with_a_false_one_gets_no_ray(
     beside: tuple[float, float],
 ) -> None:
     frame, follower = frames()[WARMED], chain()
@@ -193,7 +201,7 @@ def test_a_dot_that_a_false_one_runs_into_has_no_ray_in_either_chain(
 
 
 @pytest.mark.slow
-def test_a_dot_where_the_absent_one_should_be_dark_breaks_the_track() -> None:
+def test_dot_at_the_absent_ray_breaks_the_track() -> None:
     frame, follower = frames()[WARMED], chain()
     hole = frame.dot_px[9, 8:11:2].mean(axis=0)
     result = follower.measure(with_dots(frame.image, hole[None]))
@@ -203,7 +211,7 @@ def test_a_dot_where_the_absent_one_should_be_dark_breaks_the_track() -> None:
 
 
 @pytest.mark.slow
-def test_a_shift_of_everything_by_a_column_is_not_taken_for_the_next_column() -> None:
+def test_shift_by_a_column_gives_no_wrong_rays() -> None:
     frame, follower = frames()[WARMED], chain()
     step = round(float(np.nanmedian(np.diff(frame.dot_px[9, 5:14, 0]))))
     result = follower.measure(np.roll(frame.image, step, axis=1))
@@ -213,37 +221,37 @@ def test_a_shift_of_everything_by_a_column_is_not_taken_for_the_next_column() ->
 
 @pytest.mark.parametrize("way", [-1, 1])
 @pytest.mark.slow
-def test_a_pool_that_goes_on_by_a_row_is_not_followed_to_the_wrong_rays(way: int) -> None:
-    """The dot that would tell, where the absent one was, is missing."""
+def test_pool_that_moves_by_a_row_gives_no_wrong_rays(way: int) -> None:
+    """The dot that would reveal it, at the former absent ray, is missing."""
     prior = chain()._prior
     assert prior is not None
     step = way * BENCH.rays.spacing_mm[1]
     for k, share in enumerate(np.linspace(0.6, 1.4, 17).tolist()):
         pool = egg(6.66, 3.0, 4.4, 0.29, (0.0, -0.6 + share * step))
-        made = Recording(
+        recording = Recording(
             file="recording.avi", rig=RIG, view=VIEW, look=Look(), pools=(pool,), seed=8000 + k,
             frame_rate_hz=RATE_HZ,
         )  # fmt: skip
-        frame = made.frame(0)
+        frame = recording.frame(0)
         image = without_dots(frame.image, frame.dot_px[[9 + way], [9]])
         result, _ = measure(image, BENCH, Settings(), prior)
         assert wrong_rays(result, frame) == 0
 
 
-def test_a_pool_elsewhere_with_as_many_rays_begins_a_track_of_its_own() -> None:
-    """Their splines are others: what was remembered of the former pool is of no use."""
+def test_another_pool_with_as_many_rays_starts_a_new_track() -> None:
+    """The splines differ, so that cached results of the first pool cannot be used."""
     follower = WarmChain(BENCH, Settings())
-    for number, at in enumerate(
+    for number, pool in enumerate(
         [
             (5.57, 3.04, 3.73, 0.27, (-0.66, -0.39)),
             *[(6.17, 2.56, 3.21, 0.27, (1.06, -0.12))] * 2,
         ]
     ):
-        made = Recording(
-            file="recording.avi", rig=RIG, view=VIEW, look=Look(), pools=(egg(*at),),
+        recording = Recording(
+            file="recording.avi", rig=RIG, view=VIEW, look=Look(), pools=(egg(*pool),),
             seed=10 + number, frame_rate_hz=RATE_HZ,
         )  # fmt: skip
-        frame = made.frame(0)
+        frame = recording.frame(0)
         result = follower.measure(frame.image)
         assert result.status == "ok"
         assert wrong_rays(result, frame) == 0
@@ -252,32 +260,32 @@ def test_a_pool_elsewhere_with_as_many_rays_begins_a_track_of_its_own() -> None:
     assert follower.track_lost is None
 
 
-def test_a_pool_that_jumps_is_measured_anew() -> None:
+def test_pool_that_jumps_is_measured_again() -> None:
     other = egg(5.6, 2.6, 3.4, 0.2, (0.3, -0.2))
-    made = Recording(
+    recording = Recording(
         file="recording.avi", rig=RIG, view=VIEW, look=Look(), pools=(other,), seed=62,
         frame_rate_hz=RATE_HZ,
     )  # fmt: skip
-    frame, follower = made.frame(0), chain()
+    frame, follower = recording.frame(0), chain()
     result = follower.measure(frame.image)
     assert wrong_rays(result, frame) == 0
     if result.measures is not None:
-        off = result.measures.height_mm - frame.pool.size.height_mm
-        assert abs(off) < 4 * result.measures.height_sigma_mm
+        error = result.measures.height_mm - frame.pool.size.height_mm
+        assert abs(error) < 4 * result.measures.height_sigma_mm
 
 
-def test_a_frame_that_is_not_followed_is_left_out_and_the_next_one_is_followed() -> None:
+def test_following_resumes_after_a_lost_frame() -> None:
     follower = chain()
     dark = np.full_like(frames()[0].image, 20)
     assert follower.follow(dark) is None
     assert follower.track_lost is not None
-    found = follower.follow(frames()[WARMED].image)
-    assert found is not None
+    result = follower.follow(frames()[WARMED].image)
+    assert result is not None
     assert follower.track_lost is None
-    assert wrong_rays(found, frames()[WARMED]) == 0
+    assert wrong_rays(result, frames()[WARMED]) == 0
 
 
-def test_the_track_goes_on_after_a_frame_without_dots() -> None:
+def test_track_continues_after_a_frame_without_dots() -> None:
     follower = chain()
     dark = np.full_like(frames()[0].image, 18)
     assert follower.measure(dark).status == "no-dots"
@@ -289,7 +297,7 @@ def test_the_track_goes_on_after_a_frame_without_dots() -> None:
 
 
 @pytest.mark.slow
-def test_another_scheme_is_measured_by_the_cold_chain() -> None:
+def test_another_scheme_is_never_followed() -> None:
     follower = WarmChain(BENCH, Settings(scheme="ers"))
     for frame in frames()[:2]:
         result = follower.measure(frame.image)
@@ -298,22 +306,22 @@ def test_another_scheme_is_measured_by_the_cold_chain() -> None:
 
 
 @pytest.mark.slow
-def test_the_part_of_the_set_up_follows_a_pool_that_grows():
+def test_setup_part_of_sigma_is_updated_as_a_pool_grows():
     axes = AxisPoints(CALIBRATION, VIEW.x_axis_mm, VIEW.z_axis_mm)
     covariance, assumed = covariance_of({})
     rig = replace(RIG, uncertainty=RigUncertainty(axes, covariance, assumed))
     pools = tuple(egg(6.4, 2.9, 3.9, height, (0.0, -0.4)) for height in np.linspace(0.18, 0.34, 20))
-    made = Recording(
+    recording = Recording(
         file="recording.avi", rig=rig, view=VIEW, look=Look(), pools=pools, seed=5,
         frame_rate_hz=RATE_HZ,
     )  # fmt: skip
     chain, bench = WarmChain(Bench(rig, CALIBRATION), Settings()), Bench(rig, CALIBRATION)
     last = None
     for n in range(len(pools)):
-        last = chain.measure(made.frame(n).image)
+        last = chain.measure(recording.frame(n).image)
     assert last is not None
     assert chain.track_lost is None
-    cold = measure(made.frame(len(pools) - 1).image, bench, Settings())[0]
+    cold = measure(recording.frame(len(pools) - 1).image, bench, Settings())[0]
     assert last.measures is not None
     assert cold.measures is not None
     for name in ("height_sigma_setup_mm", "volume_sigma_setup_mm3"):

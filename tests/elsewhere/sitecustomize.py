@@ -1,8 +1,8 @@
-"""Let labapp run as on another system: what is not there is taken away from its modules.
+"""Run labapp as on another system: features missing there are hidden from its modules.
 
-Python loads this at its start where this folder is on PYTHONPATH, in processes that are started
-too. LABAPP_ELSEWHERE is "win32" or "darwin". Only modules of labapp see the other system: libraries
-know the one that they are installed on. For "win32" files behave as they do there, for all.
+Python loads this at startup if this folder is on PYTHONPATH, also in child processes.
+LABAPP_ELSEWHERE is "win32" or "darwin". Only modules of labapp see the other system, as libraries
+are those of the installed one. For "win32" files behave as on Windows, for all modules.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ POSIX_ONLY = {
 
 
 class Elsewhere(ModuleType):
-    """A module of Python as it is on the other system; what is set, is set in the true one."""
+    """A Python module as on the other system; attributes are set in the true module."""
 
     def __init__(self, true: ModuleType, lacking: set[str], other: dict[str, Any]) -> None:
         super().__init__(true.__name__)
@@ -64,30 +64,30 @@ class Elsewhere(ModuleType):
         setattr(object.__getattribute__(self, "__dict__")["_true"], name, value)
 
 
-def take_away() -> None:
-    """Show labapp's modules the other system from now on."""
-    lacking = {
+def hide_missing() -> None:
+    """Make labapp's modules see the other system from now on."""
+    missing = {
         name: LINUX_ONLY.get(name, set())
         | (POSIX_ONLY.get(name, set()) if SYSTEM == "win32" else set())
         for name in {*LINUX_ONLY, *POSIX_ONLY}
     }
-    absent = lacking.pop("modules")
-    other: dict[str, dict[str, Any]] = {
+    absent = missing.pop("modules")
+    replaced: dict[str, dict[str, Any]] = {
         "sys": {"platform": SYSTEM},
         "os": {"environ": {k: v for k, v in os.environ.items() if k not in NO_DISPLAY}},
     }
     if SYSTEM == "win32":
-        other["os"]["name"] = "nt"
+        replaced["os"]["name"] = "nt"
     import signal
     import socket
     import time
 
     true = {module.__name__: module for module in (os, sys, signal, socket, time)}
     views = {
-        name: Elsewhere(module, lacking.get(name, set()), other.get(name, {}))
+        name: Elsewhere(module, missing.get(name, set()), replaced.get(name, {}))
         for name, module in true.items()
     }
-    former = builtins.__import__
+    original_import = builtins.__import__
 
     def imported(
         name: str, globals: Any = None, locals: Any = None, fromlist: Any = (), level: int = 0
@@ -97,7 +97,7 @@ def take_away() -> None:
                 raise ModuleNotFoundError(f"No module named {name!r} on {SYSTEM}", name=name)
             if name in views:
                 return views[name]
-        return former(name, globals, locals, fromlist, level)
+        return original_import(name, globals, locals, fromlist, level)
 
     builtins.__import__ = imported
 
@@ -107,25 +107,25 @@ def take_away() -> None:
 TRUE = {name: getattr(os, name) for name in ("open", "fsync", "rename", "replace", "unlink")}
 
 
-def _refused(path: Any, why: str) -> PermissionError:
+def _permission_error(path: Any, why: str) -> PermissionError:
     return PermissionError(13, f"refused on Windows, as {why}", os.fsdecode(path))
 
 
 def _refuse_if_open(*paths: Any) -> None:
-    """Refuse a change of name where this process has one of some paths open, or what is below."""
+    """Raise an error if this process has one of the paths, or a file below it, open."""
     names = [os.path.abspath(os.fsdecode(path)) for path in paths]
     for handle in os.listdir("/proc/self/fd"):
         try:
-            found = os.readlink(f"/proc/self/fd/{handle}")
-        except OSError:  # the list's own
+            target = os.readlink(f"/proc/self/fd/{handle}")
+        except OSError:  # the handle of the listing
             continue
-        if any(found == name or found.startswith(f"{name}/") for name in names):
-            raise _refused(found, "it is open")
+        if any(target == name or target.startswith(f"{name}/") for name in names):
+            raise _permission_error(target, "it is open")
 
 
 def _open(path: Any, flags: int, *more: Any, **options: Any) -> int:
     if not isinstance(path, int) and os.path.isdir(path):
-        raise _refused(path, "it is a folder")
+        raise _permission_error(path, "it is a folder")
     return int(TRUE["open"](path, flags, *more, **options))
 
 
@@ -145,20 +145,20 @@ def _rename(source: Any, target: Any) -> None:
 
 def _replace(source: Any, target: Any) -> None:
     if os.path.isdir(target):
-        raise _refused(target, "it is a folder")
+        raise _permission_error(target, "it is a folder")
     _refuse_if_open(source, target)
     TRUE["replace"](source, target)
 
 
 def _unlink(path: Any) -> None:
-    # filelock knows the true system and removes its open lock, as it may there and not on Windows.
+    # filelock sees the true system and removes its open lock, which Windows would not allow.
     if sys._getframe(1).f_globals.get("__name__", "").partition(".")[0] != "filelock":
         _refuse_if_open(path)
     TRUE["unlink"](path)
 
 
-def be_windows_about_files() -> None:
-    """Refuse what Windows refuses."""
+def behave_like_windows_with_files() -> None:
+    """Reject operations on files which Windows rejects."""
     import shutil
     import tempfile
 
@@ -176,9 +176,9 @@ def be_windows_about_files() -> None:
 
 
 if SYSTEM:
-    take_away()
-    # What is not told its encoding is read in another one there.
+    hide_missing()
+    # Without an encoding, text is read in a different one there.
     warnings.filterwarnings("ignore", category=EncodingWarning)
     warnings.filterwarnings("error", category=EncodingWarning, module=r"labapp(\.|$)")
     if SYSTEM == "win32":
-        be_windows_about_files()
+        behave_like_windows_with_files()

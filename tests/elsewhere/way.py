@@ -1,9 +1,9 @@
-"""The whole way in one process: every module, a session to its export, every page and tool.
+"""The complete workflow in one process: every module, a session up to export, every page and tool.
 
     python way.py FOLDER
 
-It ends with a traceback where something goes wrong. `sitecustomize` beside it, on PYTHONPATH, lets
-it go as on another system.
+It ends with a traceback if something fails. With `sitecustomize` (in this folder) on PYTHONPATH it
+runs as on another system.
 """
 
 from __future__ import annotations
@@ -34,24 +34,24 @@ def import_all() -> None:
 
 
 def run(*arguments: object) -> None:
-    """Call a command, which has to end well."""
+    """Call a command, which must exit with code 0."""
     with pytest.raises(SystemExit) as ended:
         main([str(argument) for argument in arguments])
     assert ended.value.code == 0, arguments
 
 
 def measure(folder: Path) -> Path:
-    """Simulate, record, measure and export by commands; returns the session."""
+    """Simulate, record, measure and export by commands; return the session."""
     from labapp.export.rendering.drawing import can_draw
 
-    made, session = folder / "egg", folder / "egg.labsession"
-    setup, recording = made / "setup.toml", made / "recording.avi"
+    simulated, session = folder / "egg", folder / "egg.labsession"
+    setup, recording = simulated / "setup.toml", simulated / "recording.avi"
     export = ("session", "export", session, "--out", folder / "results")
     pictures = "frames,trends,surfaces,film" if can_draw() else "frames,trends"
     run("cameras")
-    for frames in (1, FRAMES):  # the later takes the earlier one's place
+    for frames in (1, FRAMES):  # the second replaces the first
         egg = bundled("resources/simulations/egg.toml")
-        run("simulate", egg, "--out", made, "--frames", frames)
+        run("simulate", egg, "--out", simulated, "--frames", frames)
     run("session", "new", folder / "recorded.labsession", "--setup", setup)
     record = ("record", f"simulated:{recording}", "--seconds", "0.1")
     run(*record, "--session", folder / "recorded.labsession")
@@ -66,7 +66,7 @@ def measure(folder: Path) -> Path:
 
 
 def show(session: Path, folder: Path) -> tuple[str, ...]:
-    """Show every page and tool of the app; returns the pages."""
+    """Show every page and tool of the app; return the pages."""
     from labapp.gui.app import open_window, start_app
     from labapp.gui.pages import PAGES
     from labapp.gui.preferences import Preferences, read_preferences
@@ -93,7 +93,7 @@ def show(session: Path, folder: Path) -> tuple[str, ...]:
         until("foot switches", lambda: window.workspace.foot_switches.found is not None)
         window.do("measure")
         until("measured", lambda: not window.workspace.tasks.active)
-        for key in TOOLS:  # some begin to calculate for minutes
+        for key in TOOLS:  # some start calculations of minutes
             until(key, show_tool(key, window.files, window).isVisible)
         problems = [text for text in window.log_panel.texts() if "▲" in text]
         assert not problems, problems
@@ -102,8 +102,8 @@ def show(session: Path, folder: Path) -> tuple[str, ...]:
     return tuple(window.pages)
 
 
-def go() -> None:
-    """Go the whole way, and tell of it."""
+def run_all() -> None:
+    """Run the complete workflow, and print its steps."""
     from labapp import system
 
     folder = Path(sys.argv[1])
@@ -113,8 +113,8 @@ def go() -> None:
     session = measure(folder)
     print("pages:", *sorted(show(session, folder)))
     sys.stdout.flush()
-    os._exit(0)  # as tests of windows do: VTK can crash while all is taken down
+    os._exit(0)  # as in the window tests: VTK can crash at shutdown
 
 
 if __name__ == "__main__":
-    go()
+    run_all()

@@ -1,4 +1,4 @@
-"""What must hold of a damaged file, whatever the damage: `Broken` says what does not."""
+"""Requirements that hold for any damaged file; `Broken` is raised where one does not."""
 
 from __future__ import annotations
 
@@ -44,36 +44,36 @@ from tests.fuzz.originals import (
 )
 
 SCHEMES = ("fit", "ers")
-UNTOLD = "differs, and problems() is silent"
+UNREPORTED = "differs, and problems() is silent"
 
 
 class Broken(AssertionError):
-    """The contract does not hold."""
+    """A requirement does not hold."""
 
 
 @dataclasses.dataclass
 class Tally:
-    """What was tried, and how often the file was still good for something."""
+    """Number of calls that succeeded or were rejected with a damaged file."""
 
     used: int = 0
     refused: int = 0
 
     def attempt(self, call: Callable[[], Any]) -> Any:
-        """The result of a call that may refuse with a sentence; None if it did."""
+        """Return the result of a call, or None if it raised an `InputError` with a message."""
         try:
-            found = call()
+            result = call()
         except InputError as error:
             self.refused += 1
             if not str(error).strip() or not error.expected:
                 raise Broken(f"an error that says nothing: {error!r}") from error
             return None
         self.used += 1
-        return found
+        return result
 
 
 @contextlib.contextmanager
 def unchanged(folder: Path) -> Iterator[None]:
-    """Hold that no file in a folder changes, comes or goes."""
+    """Check that no file in a folder is changed, added or removed."""
     before = _contents(folder)
     yield
     after = _contents(folder)
@@ -95,13 +95,13 @@ def _contents(folder: Path) -> dict[str, bytes]:
 
 
 def facts(session: Session) -> dict[tuple[Any, ...], Any]:
-    """Everything a session shows that is a value, by what it is; what it refuses is left out."""
-    found: dict[tuple[Any, ...], Any] = {}
+    """Return every value that a session shows, by its kind; rejected ones are omitted."""
+    shown: dict[tuple[Any, ...], Any] = {}
 
     def note(key: tuple[Any, ...], call: Callable[[], Any]) -> Any:
         with contextlib.suppress(InputError):
-            found[key] = call()
-        return found.get(key)
+            shown[key] = call()
+        return shown.get(key)
 
     for name in (
         *("record", "setup_text", "settings"),
@@ -118,23 +118,23 @@ def facts(session: Session) -> dict[tuple[Any, ...], Any]:
                 lambda frame=frame, scheme=scheme: session.result(frame, scheme),
             )
             if result is not None:
-                found["result", frame, scheme] = (
+                shown["result", frame, scheme] = (
                     fingerprint(result.measurement.measures),
                     result.measurement.status,
                     fingerprint(result.measurement),
                     *(result.setup, fingerprint(result.settings), result.version, result.stale),
                 )
     for scheme in SCHEMES:
-        seen = note(("overview", scheme), lambda scheme=scheme: session.overview(scheme))
-        if seen is None:
+        overview = note(("overview", scheme), lambda scheme=scheme: session.overview(scheme))
+        if overview is None:
             continue
-        del found["overview", scheme]
-        for k, frame in enumerate(seen.frame.tolist()):
-            sizes = {name: float(values[k]) for name, values in seen.measures.items()}
-            found["measures", frame, scheme] = repr(sizes)
-            found["glance", frame, scheme] = (seen.status[k], bool(seen.stale[k]))
-            found["time", frame] = repr(float(seen.time_s[k]))
-    return found
+        del shown["overview", scheme]
+        for k, frame in enumerate(overview.frame.tolist()):
+            sizes = {name: float(values[k]) for name, values in overview.measures.items()}
+            shown["measures", frame, scheme] = repr(sizes)
+            shown["glance", frame, scheme] = (overview.status[k], bool(overview.stale[k]))
+            shown["time", frame] = repr(float(overview.time_s[k]))
+    return shown
 
 
 def _numbers(session: Session) -> list[int]:
@@ -149,9 +149,9 @@ UNMEASURED = repr(dict.fromkeys(MEASURES, float("nan")))
 NOTHING = {fingerprint(None), fingerprint(""), fingerprint(Record()), fingerprint(Settings())}
 
 
-def untold(before: dict[Any, Any], after: dict[Any, Any], *, forged: bool) -> list[str]:
-    """Values that differ from the whole file's; what is gone does not count."""
-    found = []
+def unreported(before: dict[Any, Any], after: dict[Any, Any], *, forged: bool) -> list[str]:
+    """Return values that differ from those of the undamaged file; missing ones do not count."""
+    differences = []
     for key, value in after.items():
         known = before.get(key)
         kind = key[0]
@@ -165,8 +165,8 @@ def untold(before: dict[Any, Any], after: dict[Any, Any], *, forged: bool) -> li
             continue
         if forged and kind in ("glance", "frame"):
             continue
-        found.append(f"{key}: {_difference(value, known)}")
-    return found
+        differences.append(f"{key}: {_difference(value, known)}")
+    return differences
 
 
 def _difference(value: Any, known: Any) -> str:
@@ -177,7 +177,7 @@ def _difference(value: Any, known: Any) -> str:
 
 
 def look(session: Session, tally: Tally) -> None:
-    """Everything a window shows of a session."""
+    """Read everything a window shows of a session."""
     attempt = tally.attempt
     for name in (
         *("record", "setup_text", "setup", "settings", "laser_calibration", "plane_calibration"),
@@ -213,7 +213,7 @@ def _show(frame: int, measurement: Measurement, calibration: Any) -> None:
 
 
 def change(session: Session, tally: Tally, rng: random.Random) -> None:
-    """What an operator might do with it."""
+    """Do what an operator might do with a session."""
     attempt = tally.attempt
     correction = Correction(dots_of(2), lattice_of(), np.ones(12, bool))
     steps: list[Callable[[], Any]] = [
@@ -236,11 +236,11 @@ def change(session: Session, tally: Tally, rng: random.Random) -> None:
 
 
 def try_session(folder: Path, known: dict[Any, Any], rng: random.Random) -> Tally:
-    """Damage the session in a folder, open it both ways and use it."""
+    """Damage the session in a folder, open it read-only and writable, and use it."""
     tally = Tally()
     (path,) = folder.glob("*.labsession")
-    how = damage_session(path, rng)
-    forged = how == "blob"
+    damage = damage_session(path, rng)
+    forged = damage == "blob"
     with unchanged(folder):
         session = tally.attempt(lambda: Session.open(path, read_only=True))
         if session is not None:
@@ -248,8 +248,8 @@ def try_session(folder: Path, known: dict[Any, Any], rng: random.Random) -> Tall
                 look(session, tally)
                 problems = tally.attempt(session.problems)
                 if problems == []:
-                    _hold_untold(known, facts(session), forged=forged)
-                _refuses(session)
+                    _check_unreported(known, facts(session), forged=forged)
+                _check_read_only(session)
     with contextlib.ExitStack() as stack:
         journal = Path(f"{path}-journal").exists()
         before = _contents(folder)
@@ -262,24 +262,24 @@ def try_session(folder: Path, known: dict[Any, Any], rng: random.Random) -> Tall
         problems = tally.attempt(session.problems)
         change(session, tally, rng)
         if problems == [] and tally.attempt(session.problems) == []:
-            # What it calls stale follows from the changes; the numbers and the frames stand.
+            # Results may have become stale by the changes; numbers and frames must not differ.
             after = {
                 k: v for k, v in facts(session).items() if k[0] in ("measures", "frame", "time")
             }
             after.pop(("measures", 4, "fit"), None)  # measured in `change`
-            _hold_untold(known, after, forged=forged)
-    strange = [name for name in _contents(folder) if name not in before]
-    if [name for name in strange if not name.endswith("-journal")]:
-        raise Broken(f"left beside it: {strange}")
+            _check_unreported(known, after, forged=forged)
+    extra = [name for name in _contents(folder) if name not in before]
+    if [name for name in extra if not name.endswith("-journal")]:
+        raise Broken(f"left beside it: {extra}")
     return tally
 
 
-def _hold_untold(known: dict[Any, Any], now: dict[Any, Any], *, forged: bool) -> None:
-    if differing := untold(known, now, forged=forged):
-        raise Broken(f"{UNTOLD}: {'; '.join(differing[:3])}")
+def _check_unreported(known: dict[Any, Any], now: dict[Any, Any], *, forged: bool) -> None:
+    if differing := unreported(known, now, forged=forged):
+        raise Broken(f"{UNREPORTED}: {'; '.join(differing[:3])}")
 
 
-def _refuses(session: Session) -> None:
+def _check_read_only(session: Session) -> None:
     try:
         session.set_record(Record(notes="never"))
     except InputError:
@@ -287,7 +287,7 @@ def _refuses(session: Session) -> None:
     raise Broken("a read-only session was changed")
 
 
-# --- the others -------------------------------------------------------------------------------
+# --- other files ------------------------------------------------------------------------------
 
 
 def try_setup(folder: Path, path: Path, rng: random.Random) -> Tally:
@@ -319,7 +319,7 @@ def try_recording(folder: Path, path: Path, rng: random.Random) -> Tally:
         files = sorted((path if path.is_dir() else path.parent).iterdir())
         target = rng.choice(files)
     target.write_bytes(damaged_bytes(target.read_bytes(), rng, rng.choice([64, 300, 2000])))
-    # In a folder of its own, so that what lies beside the recording is not the session's.
+    # In a separate folder, so that files beside the recording do not belong to the session.
     session_path = folder / "new.labsession"
     with unchanged(path if path.is_dir() else path.parent):
         source = tally.attempt(lambda: open_source(path))
@@ -331,15 +331,15 @@ def try_recording(folder: Path, path: Path, rng: random.Random) -> Tally:
                         raise Broken(f"frame {k} is {frame.image.shape}, not {source.shape}")
         with Session.create(session_path) as session:
             embed = rng.random() < 0.5
-            found = tally.attempt(lambda: session.import_recording(path, embed=embed))
-            if found is None:
+            entry = tally.attempt(lambda: session.import_recording(path, embed=embed))
+            if entry is None:
                 if session.recording is not None or len(session.frames):
                     raise Broken("it was not imported, and is there")
             else:
                 for k in session.frames[:5].tolist():
                     tally.attempt(lambda k=k: session.frame(k))
                 session.overview()
-        if found is not None:
+        if entry is not None:
             with Session.open(session_path, read_only=True) as session:
                 for k in session.frames[:3].tolist():
                     tally.attempt(lambda k=k: session.frame(k))
@@ -351,8 +351,8 @@ def try_table(folder: Path, path: Path, rng: random.Random) -> Tally:
     path.write_bytes(damaged_text(path.read_bytes(), rng))
     before = Correction(dots_of(1), lattice_of(), np.zeros(12, bool))
     with unchanged(folder):
-        found = tally.attempt(lambda: read_correction(path, 1, SHAPE, before))
-        if found is not None and not np.isfinite(found.dots.image_px).all():
+        correction = tally.attempt(lambda: read_correction(path, 1, SHAPE, before))
+        if correction is not None and not np.isfinite(correction.dots.image_px).all():
             raise Broken("a dot is nowhere")
     return tally
 
@@ -365,9 +365,9 @@ def try_manifest(folder: Path, path: Path, rng: random.Random) -> Tally:
         other = rng.choice(sorted(path.parent.iterdir()))
         other.write_bytes(damaged_bytes(other.read_bytes(), rng))
     with unchanged(folder):
-        found = tally.attempt(lambda: verify_export(path.parent))
-        if found is not None and not all(isinstance(each, str) for each in found):
-            raise Broken(f"what is no sentence: {found}")
+        problems = tally.attempt(lambda: verify_export(path.parent))
+        if problems is not None and not all(isinstance(each, str) for each in problems):
+            raise Broken(f"what is no sentence: {problems}")
     return tally
 
 
@@ -375,7 +375,7 @@ def try_manifest(folder: Path, path: Path, rng: random.Random) -> Tally:
 
 
 def try_command_line(folder: Path, path: Path, originals: Originals, rng: random.Random) -> Tally:
-    """The commands a user would try on a damaged file."""
+    """Run the commands a user would try on a damaged file."""
     tally = Tally()
     if path.suffix == ".labsession":
         damage_session(path, rng)
@@ -393,9 +393,9 @@ def try_command_line(folder: Path, path: Path, originals: Originals, rng: random
     for command in commands:
         read_only = command[1] != "measure"
         with unchanged(path.parent) if read_only else contextlib.nullcontext():
-            code, told = _run([str(part) for part in command])
-        if code not in (0, 1, 2) or "Traceback" in told or "a fault in the program" in told:
-            raise Broken(f"labapp {' '.join(map(str, command))}: exit code {code}: {told}")
+            code, stderr = _run([str(part) for part in command])
+        if code not in (0, 1, 2) or "Traceback" in stderr or "a fault in the program" in stderr:
+            raise Broken(f"labapp {' '.join(map(str, command))}: exit code {code}: {stderr}")
         tally.used += code == 0
         tally.refused += code != 0
     return tally
@@ -426,7 +426,7 @@ KINDS = (
 def try_case(
     kind: str, originals: Originals, folder: Path, known: Any, rng: random.Random
 ) -> Tally:
-    """Damage one file of a kind in an empty folder, and hold the contract of its kind."""
+    """Damage one file of a kind in an empty folder, and check the requirements of its kind."""
     groups = {
         "session": originals.sessions,
         "setup": originals.setups,

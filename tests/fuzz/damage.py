@@ -1,6 +1,6 @@
-"""Ways to damage a file: bytes that say nothing of its format, and lies told in its own language.
+"""Ways to damage a file: in its bytes, regardless of the format, and with wrong but valid content.
 
-Every function takes the generator that decides, so that a seed tells all of it.
+Every function takes a random generator, so that the damage is reproducible from a seed.
 """
 
 from __future__ import annotations
@@ -27,21 +27,23 @@ PAGE = 4096
 
 
 def damaged_bytes(content: bytes, rng: random.Random, head: int = 100) -> bytes:
-    """Some bytes changed, most of them near the start or the end; or a stretch of them."""
+    """Change some bytes, mostly near the start or the end, or a range of bytes."""
     data = bytearray(content)
-    how = rng.choice([_flip] * 6 + [_cut, _zeroed, _doubled, _moved, _grown])
-    how(data, rng, head)
+    damage = rng.choice([_flip] * 6 + [_cut, _zeroed, _doubled, _moved, _grown])
+    damage(data, rng, head)
     return bytes(data)
 
 
 def _flip(data: bytearray, rng: random.Random, head: int) -> None:
     for _ in range(rng.choice([1, 1, 2, 4, 16, 100])):
         where = rng.choice(["head", "anywhere", "anywhere", "tail"])
-        most = min(head, len(data))
-        place = rng.randrange(len(data)) if where == "anywhere" else rng.randrange(most)
-        place = len(data) - 1 - place if where == "tail" else place
-        odd = rng.choice(ODD_BYTES)
-        data[place] = rng.choice([odd, rng.randrange(256), data[place] ^ 1 << rng.randrange(8)])
+        end = min(head, len(data))
+        position = rng.randrange(len(data)) if where == "anywhere" else rng.randrange(end)
+        position = len(data) - 1 - position if where == "tail" else position
+        odd_byte = rng.choice(ODD_BYTES)
+        data[position] = rng.choice(
+            [odd_byte, rng.randrange(256), data[position] ^ 1 << rng.randrange(8)]
+        )
 
 
 def _cut(data: bytearray, rng: random.Random, head: int) -> None:
@@ -54,18 +56,18 @@ def _stretch(data: bytearray, rng: random.Random) -> slice:
 
 
 def _zeroed(data: bytearray, rng: random.Random, _: int) -> None:
-    where = _stretch(data, rng)
-    data[where] = bytes([rng.choice([0, 255])]) * len(data[where])
+    part = _stretch(data, rng)
+    data[part] = bytes([rng.choice([0, 255])]) * len(data[part])
 
 
 def _doubled(data: bytearray, rng: random.Random, _: int) -> None:
-    where = _stretch(data, rng)
-    data[where] = data[where] * 2
+    part = _stretch(data, rng)
+    data[part] = data[part] * 2
 
 
 def _moved(data: bytearray, rng: random.Random, _: int) -> None:
-    where, there = _stretch(data, rng), rng.randrange(len(data))
-    data[there : there + len(data[where])] = data[where]
+    part, target = _stretch(data, rng), rng.randrange(len(data))
+    data[target : target + len(data[part])] = data[part]
 
 
 def _grown(data: bytearray, rng: random.Random, _: int) -> None:
@@ -73,27 +75,29 @@ def _grown(data: bytearray, rng: random.Random, _: int) -> None:
 
 
 def damaged_pages(content: bytes, rng: random.Random) -> bytes:
-    """A database whose header, pages' headers or whole pages are not what they were."""
+    """Change a database's header, page headers or complete pages."""
     data = bytearray(content)
     count = len(data) // PAGE
     one, other = rng.randrange(count), rng.randrange(count)
-    where, there = (slice(k * PAGE, (k + 1) * PAGE) for k in (one, other))
-    how = rng.choice(["header", "header", "page", "page", "page", "swap", "double", "zero", "less"])
-    if how == "header":
+    page, other_page = (slice(k * PAGE, (k + 1) * PAGE) for k in (one, other))
+    damage = rng.choice(
+        ["header", "header", "page", "page", "page", "swap", "double", "zero", "less"]
+    )
+    if damage == "header":
         for _ in range(rng.choice([1, 1, 2, 5])):
             data[rng.randrange(16, 100)] = rng.choice([*ODD_BYTES, rng.randrange(256)])
-    elif how == "page":
+    elif damage == "page":
         start = one * PAGE + (100 if one == 0 else 0)
         for _ in range(rng.choice([1, 1, 2, 5])):
             data[start + rng.choice([rng.randrange(12), rng.randrange(64)])] = rng.randrange(256)
-    elif how == "swap":
-        data[where], data[there] = data[there], data[where]
-    elif how == "double":
-        data[where] = data[there]
-    elif how == "zero":
-        data[where] = bytes(PAGE)
+    elif damage == "swap":
+        data[page], data[other_page] = data[other_page], data[page]
+    elif damage == "double":
+        data[page] = data[other_page]
+    elif damage == "zero":
+        data[page] = bytes(PAGE)
     else:
-        del data[where]
+        del data[page]
     return bytes(data)
 
 
@@ -101,38 +105,38 @@ def damaged_pages(content: bytes, rng: random.Random) -> bytes:
 
 
 def damage_session(path: Path, rng: random.Random) -> str:
-    """Damage a session in place; returns how."""
-    how = rng.choice(
+    """Damage a session in place; return the kind of damage."""
+    damage = rng.choice(
         ["bytes"] * 3 + ["pages"] * 4 + ["journal"] * 2 + ["tables"] * 5 + ["blob"] * 6
     )
-    if how == "bytes":
+    if damage == "bytes":
         path.write_bytes(damaged_bytes(path.read_bytes(), rng))
-    elif how == "pages":
+    elif damage == "pages":
         path.write_bytes(damaged_pages(path.read_bytes(), rng))
-    elif how == "journal":
+    elif damage == "journal":
         _damage_journal(path, rng)
-    elif how == "tables":
+    elif damage == "tables":
         for _ in range(rng.choice([1, 1, 2, 4])):
             _change_table(path, rng)
     else:
         _change_blob(path, rng)
-    return how
+    return damage
 
 
 def _damage_journal(path: Path, rng: random.Random) -> None:
-    whole = path.read_bytes()
+    original = path.read_bytes()
     hot_journal(path)
     journal = Path(f"{path}-journal")
-    how = rng.choice(["journal", "both", "foreign", "noise", "empty", "whole"])
-    if how in ("journal", "both"):
+    damage = rng.choice(["journal", "both", "foreign", "noise", "empty", "whole"])
+    if damage in ("journal", "both"):
         journal.write_bytes(damaged_bytes(journal.read_bytes(), rng, 600))
-    if how == "both":
+    if damage == "both":
         path.write_bytes(damaged_bytes(path.read_bytes(), rng))
-    elif how == "foreign":
-        path.write_bytes(damaged_bytes(whole, rng))
-    elif how == "noise":
+    elif damage == "foreign":
+        path.write_bytes(damaged_bytes(original, rng))
+    elif damage == "noise":
         journal.write_bytes(rng.randbytes(3000))
-    elif how == "empty":
+    elif damage == "empty":
         journal.write_bytes(b"")
 
 
@@ -160,36 +164,36 @@ def _change_table(path: Path, rng: random.Random) -> None:
     try:
         _change_one_table(connection, rng)
     except sqlite3.Error:
-        pass  # refused: this one stays as it is
+        pass  # rejected by SQLite: the table is unchanged
     finally:
         connection.close()
 
 
 def _change_one_table(connection: sqlite3.Connection, rng: random.Random) -> None:
-    found = connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall()
-    names = [name for (name,) in found]
+    rows = connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall()
+    names = [name for (name,) in rows]
     names = [name for name in names if not name.startswith("sqlite_")] or ["document"]
     weights = [4 if name in ("result", "frame", "document") else 1 for name in names]
     (table,) = rng.choices(names, weights)
     columns = [row[1] for row in connection.execute(f"PRAGMA table_info({table})")] or ["id"]
     column, other = rng.choice(columns[: rng.choice([8, 99])]), rng.choice(columns)
-    one = (
+    condition = (
         f"rowid IN (SELECT rowid FROM {table} ORDER BY random() LIMIT {rng.choice([1, 1, 1, 99])})"
     )
-    one = one.replace("random()", f"rowid * {rng.randrange(1, 99)} % 101")
-    odd, step = rng.choice(ODD_VALUES), rng.choice([1, 0.01])
+    condition = condition.replace("random()", f"rowid * {rng.randrange(1, 99)} % 101")
+    odd_value, step = rng.choice(ODD_VALUES), rng.choice([1, 0.01])
     row = rng.choices(ODD_VALUES, k=len(columns))
-    triggered = f"BEGIN UPDATE {table} SET {column} = {odd}; END"
+    triggered = f"BEGIN UPDATE {table} SET {column} = {odd_value}; END"
     statements = [
-        *[f"UPDATE OR REPLACE {table} SET {column} = {odd} WHERE {one}"] * 6,
-        *[f"UPDATE OR REPLACE {table} SET {column} = {column} + {step} WHERE {one}"] * 2,
-        f"UPDATE OR REPLACE {table} SET {column} = {other} WHERE {one}",
+        *[f"UPDATE OR REPLACE {table} SET {column} = {odd_value} WHERE {condition}"] * 6,
+        *[f"UPDATE OR REPLACE {table} SET {column} = {column} + {step} WHERE {condition}"] * 2,
+        f"UPDATE OR REPLACE {table} SET {column} = {other} WHERE {condition}",
         f"UPDATE OR REPLACE {table} SET {column} = (SELECT {column} FROM {table} LIMIT 1 OFFSET 1) "
-        f"WHERE {one}",
-        *[f"DELETE FROM {table} WHERE {one}"] * 2,
+        f"WHERE {condition}",
+        *[f"DELETE FROM {table} WHERE {condition}"] * 2,
         f"DELETE FROM {table}",
         f"DROP TABLE {table}",
-        f"INSERT OR REPLACE INTO {table} ({column}) VALUES ({odd})",
+        f"INSERT OR REPLACE INTO {table} ({column}) VALUES ({odd_value})",
         f"INSERT OR REPLACE INTO {table} VALUES ({', '.join(row)})",
         f"ALTER TABLE {table} RENAME COLUMN {column} TO more",
         f"ALTER TABLE {table} ADD COLUMN more TEXT DEFAULT 'x'",
@@ -205,7 +209,7 @@ def _change_one_table(connection: sqlite3.Connection, rng: random.Random) -> Non
     connection.executescript(rng.choice(statements))
 
 
-# --- a blob: its checksum is right, what it says is not -----------------------------------------
+# --- a blob with a right checksum and wrong content ---------------------------------------------
 
 BLOBS = (
     ("document", "content"), ("document", "content"), ("change_part", "before"),
@@ -228,11 +232,11 @@ ODD_TREES: tuple[Any, ...] = (
 def _change_blob(path: Path, rng: random.Random) -> None:
     connection = _connected(path)
     table, column = rng.choice(BLOBS)
-    found = connection.execute(
+    rows = connection.execute(
         f"SELECT rowid, {column} FROM {table} WHERE {column} IS NOT NULL"
     ).fetchall()
-    if found:
-        rowid, content = rng.choice(found)
+    if rows:
+        rowid, content = rng.choice(rows)
         if content.startswith(MAGIC):
             changed = _repacked(content, rng)
         else:
@@ -240,7 +244,7 @@ def _change_blob(path: Path, rng: random.Random) -> None:
         same = f"{column} = (SELECT {column} FROM {table} WHERE rowid = ?)"
         connection.execute("PRAGMA foreign_keys = OFF")
         if table == "document" or rng.random() < 0.5:
-            # The history says the same.
+            # The history is changed alike.
             connection.execute(
                 f"UPDATE change_part SET after = ? WHERE after IS "
                 f"(SELECT {column} FROM {table} WHERE rowid = ?)",
@@ -252,7 +256,7 @@ def _change_blob(path: Path, rng: random.Random) -> None:
 
 @functools.cache
 def _bomb() -> bytes:
-    """A few megabytes that become four gigabytes."""
+    """Return a few megabytes that decompress to four gigabytes."""
     packer = zlib.compressobj(1)
     chunk, count = 1 << 24, 256
     head = packer.compress(b"") + packer.flush(zlib.Z_FULL_FLUSH)
@@ -265,29 +269,29 @@ def _repacked(content: bytes, rng: random.Random) -> bytes:
     plain = zlib.decompress(content[HEAD.size :])
     length = int.from_bytes(plain[:4], "little")
     tree, arrays = json.loads(plain[4 : 4 + length]), plain[4 + length :]
-    how = rng.choice(["tree"] * 8 + ["arrays", "deep", "bomb", "text", "plain", "length"])
-    if how == "tree":
+    damage = rng.choice(["tree"] * 8 + ["arrays", "deep", "bomb", "text", "plain", "length"])
+    if damage == "tree":
         for _ in range(rng.choice([1, 1, 3])):
             tree = _changed_tree(tree, rng)
         text = json.dumps(tree)
-    elif how == "deep":
+    elif damage == "deep":
         text = '{"list":[' * 100_000 + "]}" * 100_000
-    elif how == "text":
+    elif damage == "text":
         text = damaged_bytes(json.dumps(tree).encode(), rng).decode("latin-1")
     else:
         text = json.dumps(tree)
-    if how == "arrays" and arrays:
+    if damage == "arrays" and arrays:
         arrays = damaged_bytes(arrays, rng)
-    stated = len(text.encode()) if how != "length" else rng.choice([0, 3, 2**32 - 1])
+    stated = len(text.encode()) if damage != "length" else rng.choice([0, 3, 2**32 - 1])
     body = struct.pack("<I", stated) + text.encode() + arrays
-    if how == "plain":
+    if damage == "plain":
         body = damaged_bytes(body, rng)
-    packed = _bomb() if how == "bomb" else zlib.compress(body, 1)
+    packed = _bomb() if damage == "bomb" else zlib.compress(body, 1)
     return HEAD.pack(MAGIC, zlib.crc32(packed)) + packed
 
 
 def _changed_tree(tree: Any, rng: random.Random) -> Any:
-    """The tree with one place changed: another value, a key gone, renamed or put elsewhere."""
+    """Return the tree with one change: another value, a key removed, renamed or moved."""
     places: list[Callable[[Any], None]] = []
 
     def walk(node: Any) -> None:
@@ -327,29 +331,29 @@ WORD = re.compile(r"[^\s,;=:\[\]]+|[,;=:\[\]]")
 
 
 def damaged_text(content: bytes, rng: random.Random) -> bytes:
-    """Tokens, lines or bytes that are not what they were."""
-    how = rng.choice(
+    """Change tokens, lines or bytes."""
+    damage = rng.choice(
         ["bytes", "word", "word", "word", "word", "line", "line", "deep", "long", "utf"]
     )
-    if how == "bytes":
+    if damage == "bytes":
         return damaged_bytes(content, rng)
-    if how == "utf":
+    if damage == "utf":
         return content.decode().encode(rng.choice(["utf-16", "utf-32", "utf-8-sig", "utf-16-le"]))
-    if how == "deep":
+    if damage == "deep":
         depth = rng.choice([50, 5000, 100_000])
-        opened = rng.choice(["[", "{a = ", '{"a":', "a."])
-        return content + f"\nmore = {opened * depth}".encode()
-    if how == "long":
-        place = rng.randrange(len(content))
+        brackets = rng.choice(["[", "{a = ", '{"a":', "a."])
+        return content + f"\nmore = {brackets * depth}".encode()
+    if damage == "long":
+        position = rng.randrange(len(content))
         return (
-            content[:place]
+            content[:position]
             + rng.choice([b"9", b"x", b",", b"[]\n", b" "]) * 200_000
-            + content[place:]
+            + content[position:]
         )
     lines = content.decode().split("\n")
     for _ in range(rng.choice([1, 1, 2, 5])):
         k = rng.randrange(len(lines))
-        if how == "line":
+        if damage == "line":
             rng.choice(
                 [
                     lambda k=k: lines.pop(k) if len(lines) > 1 else None,
@@ -359,7 +363,7 @@ def damaged_text(content: bytes, rng: random.Random) -> bytes:
                 ]
             )()
             continue
-        words = [(found.start(), found.end()) for found in WORD.finditer(lines[k])]
+        words = [(match.start(), match.end()) for match in WORD.finditer(lines[k])]
         start, end = rng.choice(words or [(0, 0)])
         new = rng.choice([*ODD_WORDS, *(lines[k][a:b] for a, b in words * 5)])
         lines[k] = lines[k][:start] + new + lines[k][end:]

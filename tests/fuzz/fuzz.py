@@ -1,8 +1,8 @@
-"""Damage sessions, setups, recordings and tables: nothing worse than a sentence may come of it.
+"""Damage sessions, setups, recordings and tables: at worst, an error message may result.
 
 ``python tests/fuzz/fuzz.py COUNT SEED [FIRST]`` tries files FIRST … FIRST + COUNT − 1 of a seed's
-sequence; each can be tried again by itself (COUNT 1). A file that takes more than 10 s, or more
-than 3 GB, is a failure, as is one that ends the process.
+sequence; each can be repeated alone (COUNT 1). A file that takes more than 10 s or 3 GB, or ends
+the process, is a failure.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ from tests.fuzz.contract import KINDS, facts, try_case
 from tests.fuzz.originals import Originals, make_originals
 
 MOST_S = 10
-"""Of processor time, so that other programs do not count …"""
+"""Limit of processor time, which is independent of other programs."""
 
 MOST_WAITING_S = 60
-"""… and by the clock, so that waiting for ever does."""
+"""Limit of wall time, which detects endless waiting."""
 
 MOST_BYTES = 3 << 30
 
 
 @dataclass
 class Outcome:
-    """What came of the files."""
+    """Results of the files."""
 
     files: Counter[str] = field(default_factory=Counter)
     refused: Counter[str] = field(default_factory=Counter)
@@ -53,7 +53,7 @@ def kind_of(seed: int, number: int) -> str:
 
 
 def _work(originals: Originals, numbers: range, seed: int, folder: Path, pipe: int) -> None:
-    """Try files one after the other; tells of each what came of it, in a line."""
+    """Try files one after the other; write a line with the result of each to a pipe."""
     resource.setrlimit(resource.RLIMIT_AS, (MOST_BYTES, MOST_BYTES))
     os.environ["XDG_STATE_HOME"] = str(folder / "state")
     known = {}
@@ -63,27 +63,27 @@ def _work(originals: Originals, numbers: range, seed: int, folder: Path, pipe: i
             known[path] = facts(session)
     for number in numbers:
         rng = random.Random(f"{seed} {number}")
-        place = folder / "case"
-        shutil.rmtree(place, ignore_errors=True)
-        place.mkdir()
-        began = time.process_time()
+        case_folder = folder / "case"
+        shutil.rmtree(case_folder, ignore_errors=True)
+        case_folder.mkdir()
+        start_s = time.process_time()
         signal.setitimer(signal.ITIMER_PROF, MOST_S)  # its signal ends the process
         signal.alarm(MOST_WAITING_S)
-        told = ""
+        failure = ""
         used = refused = 0
         try:
-            tally = try_case(kind_of(seed, number), originals, place, known, rng)
+            tally = try_case(kind_of(seed, number), originals, case_folder, known, rng)
             used, refused = tally.used, tally.refused
         except Exception:
-            told = traceback.format_exc()
+            failure = traceback.format_exc()
         signal.setitimer(signal.ITIMER_PROF, 0)
         signal.alarm(0)
-        took = time.process_time() - began
-        os.write(pipe, json.dumps([number, took, used, refused, told]).encode() + b"\n")
+        took_s = time.process_time() - start_s
+        os.write(pipe, json.dumps([number, took_s, used, refused, failure]).encode() + b"\n")
 
 
 def fuzz(count: int, seed: int, folder: Path, first: int = 0) -> Outcome:
-    """Try ``count`` files in child processes; a child that ends is told of and replaced."""
+    """Try ``count`` files in child processes; a child that ends is reported and replaced."""
     outcome = Outcome()
     (folder / "originals").mkdir()
     originals = make_originals(folder / "originals")
@@ -105,10 +105,10 @@ def fuzz(count: int, seed: int, folder: Path, first: int = 0) -> Outcome:
             for line in lines:
                 number = _note(outcome, line, seed) + 1
         _, status = os.waitpid(child, 0)
-        if ended := os.waitstatus_to_exitcode(status):
+        if code := os.waitstatus_to_exitcode(status):
             kind = kind_of(seed, number)
-            why = signal.Signals(-ended).name if ended < 0 else ended
-            outcome.failures.append(f"seed {seed}, file {number} ({kind}): ended by {why}")
+            reason = signal.Signals(-code).name if code < 0 else code
+            outcome.failures.append(f"seed {seed}, file {number} ({kind}): ended by {reason}")
             outcome.files[kind] += 1
             number += 1
     return outcome
@@ -116,15 +116,15 @@ def fuzz(count: int, seed: int, folder: Path, first: int = 0) -> Outcome:
 
 def _note(outcome: Outcome, line: str, seed: int) -> int:
     number: int
-    number, took, used, refused, told = json.loads(line)
+    number, took_s, used, refused, failure = json.loads(line)
     kind = kind_of(seed, number)
     outcome.files[kind] += 1
     outcome.used[kind] += used
     outcome.refused[kind] += refused
-    outcome.slowest = max(outcome.slowest, (took, number, kind))
-    if told:
+    outcome.slowest = max(outcome.slowest, (took_s, number, kind))
+    if failure:
         where = f"seed {seed}, file {number} ({kind})"
-        outcome.failures.append(f"{where}:\n{told}")
+        outcome.failures.append(f"{where}:\n{failure}")
     return number
 
 
@@ -137,8 +137,8 @@ def main(arguments: list[str]) -> None:
     print(f"{'files':>14} {'calls done':>11} {'refused':>8}")
     for kind, files in sorted(outcome.files.items()):
         print(f"{files:5} {kind:<14} {outcome.used[kind]:5} {outcome.refused[kind]:8}")
-    took, number, kind = outcome.slowest
-    print(f"slowest: file {number} ({kind}), {took:.2f} s")
+    took_s, number, kind = outcome.slowest
+    print(f"slowest: file {number} ({kind}), {took_s:.2f} s")
     raise SystemExit(f"{len(outcome.failures)} failures" if outcome.failures else 0)
 
 

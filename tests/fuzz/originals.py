@@ -1,4 +1,4 @@
-"""The whole files that are to be damaged: made small, so that damage meets what matters."""
+"""The undamaged files: small, so that damage affects relevant parts."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ SHAPE = (48, 64)
 
 @dataclass(frozen=True)
 class Originals:
-    """The files by kind; each lies in a folder of its own with what belongs to it."""
+    """The files by kind; each is in its own folder with the files that belong to it."""
 
     sessions: tuple[Path, ...]
     setups: tuple[Path, ...]
@@ -86,7 +86,7 @@ def lattice_of(count: int = 12) -> Lattice:
 
 
 def measurement_of(frame: int, scheme: str = "fit") -> Measurement:
-    """What a frame might have given: every field there is filled, the numbers are the frame's."""
+    """Return a plausible measurement with all fields; its numbers depend on the frame."""
     rng = np.random.default_rng([frame, len(scheme)])
     n = 12
     theta = np.arange(-180.0, 180.0, 30.0)
@@ -126,7 +126,7 @@ def measurement_of(frame: int, scheme: str = "fit") -> Measurement:
 
 
 def keep(session: Session, frame: int, measurement: Measurement, scheme: str) -> None:
-    """Keep a result without measuring."""
+    """Store a result without measuring."""
     basis = Basis(session.setup, replace(session.settings, scheme=scheme))  # type: ignore[arg-type]
     session._results.put(
         frame, measurement, basis, session._documents.fingerprint("correction", frame)
@@ -177,21 +177,21 @@ def _new_session(folder: Path) -> Path:
 
 
 def hot_journal(path: Path) -> None:
-    """Leave beside a session the journal of a change that was cut off, and half of the change."""
-    away = path.with_name("away.labsession")
-    journal = Path(f"{away}-journal")
-    away.write_bytes(path.read_bytes())
-    connection = sqlite3.connect(away, isolation_level=None)
+    """Leave the journal of an interrupted change beside a session, with half of the change."""
+    copy = path.with_name("away.labsession")
+    journal = Path(f"{copy}-journal")
+    copy.write_bytes(path.read_bytes())
+    connection = sqlite3.connect(copy, isolation_level=None)
     connection.execute("PRAGMA cache_size = 1")  # written before it is finished
     connection.execute("BEGIN IMMEDIATE")
     connection.execute("UPDATE change SET label = label || 'xxxxxxxxxxxxxxxx'")
     connection.execute("UPDATE document SET content = zeroblob(3000)")
-    content, left = away.read_bytes(), journal.read_bytes()
+    content, journal_content = copy.read_bytes(), journal.read_bytes()
     connection.execute("ROLLBACK")
     connection.close()
-    away.unlink()
+    copy.unlink()
     path.write_bytes(content)
-    Path(f"{path}-journal").write_bytes(left)
+    Path(f"{path}-journal").write_bytes(journal_content)
 
 
 def _setups(folder: Path) -> tuple[Path, ...]:
@@ -208,36 +208,36 @@ def _setups(folder: Path) -> tuple[Path, ...]:
 
 
 def _recordings(folder: Path) -> tuple[Path, ...]:
-    """One of each format, each in its own folder; what is imported, not what lies beside it."""
+    """Return the imported file of a recording of each format, each in its own folder."""
 
-    def place(name: str) -> Path:
+    def new_folder(name: str) -> Path:
         (folder / name).mkdir()
         return folder / name
 
     eight, sixteen = pictures(12), pictures(6, np.uint16)
-    made = [
-        _encoded(place("avi-ffv1") / "run.avi", eight, "-c:v ffv1 -g 4"),
-        _encoded(place("mkv-ffv1") / "run.mkv", eight, "-c:v ffv1 -slicecrc 1"),
-        _encoded(place("avi-mjpg") / "run.avi", eight, "-c:v mjpeg -q:v 3 -pix_fmt yuvj420p"),
-        _encoded(place("mp4-h264") / "run.mp4", eight, "-c:v libx264 -g 5 -pix_fmt yuv420p"),
-        _encoded(place("mkv-h264") / "run.mkv", eight, "-c:v libx264 -g 5 -pix_fmt yuv420p"),
-        place("tiff") / "run.tif",
-        place("tiff-zlib") / "run.tiff",
-        write_cine(place("cine") / "run.cine", eight, times=[k / 1000 for k in range(12)]),
-        write_cine(place("cine-packed") / "run.cine", sixteen, compression=256, RealBPP=10),
-        write_photron(place("photron"), sixteen, 12),
-        write_photron(place("photron-cih"), eight, 8, suffix=".cih"),
-        place("npy") / "run.npy",
-        place("npz") / "run.npz",
-        place("images"),
+    paths = [
+        _encoded(new_folder("avi-ffv1") / "run.avi", eight, "-c:v ffv1 -g 4"),
+        _encoded(new_folder("mkv-ffv1") / "run.mkv", eight, "-c:v ffv1 -slicecrc 1"),
+        _encoded(new_folder("avi-mjpg") / "run.avi", eight, "-c:v mjpeg -q:v 3 -pix_fmt yuvj420p"),
+        _encoded(new_folder("mp4-h264") / "run.mp4", eight, "-c:v libx264 -g 5 -pix_fmt yuv420p"),
+        _encoded(new_folder("mkv-h264") / "run.mkv", eight, "-c:v libx264 -g 5 -pix_fmt yuv420p"),
+        new_folder("tiff") / "run.tif",
+        new_folder("tiff-zlib") / "run.tiff",
+        write_cine(new_folder("cine") / "run.cine", eight, times=[k / 1000 for k in range(12)]),
+        write_cine(new_folder("cine-packed") / "run.cine", sixteen, compression=256, RealBPP=10),
+        write_photron(new_folder("photron"), sixteen, 12),
+        write_photron(new_folder("photron-cih"), eight, 8, suffix=".cih"),
+        new_folder("npy") / "run.npy",
+        new_folder("npz") / "run.npz",
+        new_folder("images"),
     ]
-    tifffile.imwrite(made[5], np.stack(sixteen), photometric="minisblack")
-    tifffile.imwrite(made[6], np.stack(eight), photometric="minisblack", compression="zlib")
-    np.save(made[11], np.stack(sixteen))
-    np.savez_compressed(made[12], frames=np.stack(eight))
+    tifffile.imwrite(paths[5], np.stack(sixteen), photometric="minisblack")
+    tifffile.imwrite(paths[6], np.stack(eight), photometric="minisblack", compression="zlib")
+    np.save(paths[11], np.stack(sixteen))
+    np.savez_compressed(paths[12], frames=np.stack(eight))
     for k, picture in enumerate(eight[:4]):
-        cv2.imwrite(str(made[13] / f"frame{k}.png"), picture)
-    return tuple(made)
+        cv2.imwrite(str(paths[13] / f"frame{k}.png"), picture)
+    return tuple(paths)
 
 
 def _encoded(path: Path, frames: list[np.ndarray], options: str) -> Path:
@@ -259,8 +259,8 @@ def _tables(folder: Path) -> tuple[Path, ...]:
         writer.writerow(names)
         for k in range(len(dots)):
             blocked = int(lattice.row[k] == 3)
-            place = [f"{dots.u_px[k]:.4f}", f"{dots.v_px[k]:.4f}"]
-            writer.writerow([1, *place, lattice.row[k], lattice.column[k], blocked, "auto"])
+            position = [f"{dots.u_px[k]:.4f}", f"{dots.v_px[k]:.4f}"]
+            writer.writerow([1, *position, lattice.row[k], lattice.column[k], blocked, "auto"])
         path = folder / f"{name}.csv"
         path.write_text(text.getvalue(), "utf-8")
         paths.append(path)

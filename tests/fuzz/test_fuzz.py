@@ -13,15 +13,13 @@ from tests.fuzz.fuzz import fuzz
 @pytest.mark.parametrize(
     ("count", "seed"), [(200, 7), pytest.param(5000, 8, marks=pytest.mark.soak)]
 )
-def test_damaged_files_are_refused_with_a_sentence_or_still_good(
-    tmp_path: Path, count: int, seed: int
-):
-    # In a new process: one that ran other tests may hold nearly as much as a child is allowed.
+def test_damaged_files_are_rejected_or_still_usable(tmp_path: Path, count: int, seed: int):
+    # In a new process, as the memory of one that ran other tests may be close to the limit.
     with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as new:
         outcome = new.submit(fuzz, count, seed, tmp_path).result()
     assert outcome.failures == []
     assert sum(outcome.files.values()) == count
-    # Nothing refused, or everything, would mean that nothing was tried.
+    # If nothing or everything was rejected, nothing was really tested.
     for kind in set(KINDS):
         assert outcome.refused[kind] > 0, kind
     assert all(outcome.used[kind] > 0 for kind in ("session", "setup", "recording", "manifest"))

@@ -1,4 +1,4 @@
-"""The sample recordings: ``python -m tests.samples DIR`` writes them all anew.
+"""The sample recordings: ``python -m tests.samples DIR`` writes them all.
 
-Each is simulated from exact rays on known pools, the same every time, with its truth beside it.
+Each is simulated reproducibly from exact rays on known pools and stored with its truth.
 """

@@ -13,7 +13,7 @@ from tests.samples.runs import samples
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Write each sample into a folder of its own."""
+    """Write each sample to its own folder."""
     every = {sample.name: sample for sample in (*samples(), *line_samples())}
     parser = argparse.ArgumentParser(prog="python -m tests.samples", description=__doc__)
     parser.add_argument("folder", type=Path, help="where the folders of the samples go")

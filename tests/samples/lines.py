@@ -20,27 +20,27 @@ from labapp.simulation.render import Picture
 from labapp.text import csv_text
 
 Rendered = tuple[list[Picture], list[list[str]]]
-"""Frames, and their rows of the truth."""
+"""Frames, and their rows in the truth table."""
 
 
 @dataclass(frozen=True)
 class LineSample:
-    """A recording of a line pattern that is kept as a sample, with its truth and a README."""
+    """A sample recording of a line pattern, with its truth and a README."""
 
     name: str
     file: str
     """The recording's name: ``.avi`` or ``.tif``."""
     frame_rate_hz: float
     about: str
-    """The README."""
+    """Text of the README."""
     rig: LineRig
     view: CameraView
     columns: tuple[str, ...]
-    """Of the truth."""
+    """Columns of the truth table."""
     render: Callable[[LineRig, CameraView], Rendered]
 
     def setup(self) -> str:
-        """Write the setup file's text."""
+        """Return the text of the setup file."""
         rig, view = self.rig, self.view
         x, y, z = map(float, rig.imaging_plane.origin_mm)
         return f"""\
@@ -98,7 +98,7 @@ z_axis_mm = {view.z_axis_mm}
 
 @functools.cache
 def line_samples() -> tuple[LineSample, ...]:
-    """Build every sample recording of lines."""
+    """Return every sample recording of lines."""
     return FIVE, GMAW
 
 

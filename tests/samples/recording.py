@@ -1,4 +1,4 @@
-"""A sample: a simulated recording with its set-up and a README, in a folder of its own."""
+"""A sample: a simulated recording with its setup and a README, in its own folder."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ X′ bar at {TARGET.x_middle_mm:g} mm (5.5 units), of the Z′ bar at {TARGET.z_
 | `dots_truth.csv` | each lit ray in each frame: where its dot is, whether it shows, where it met \
 the pool |
 """
-"""What the files of every sample are; `file` and `codec` are the recording's."""
+"""The files of every sample; `file` and `codec` are those of the recording."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sample(Recording):
-    """A recording that is kept as a sample.
+    """A recording that is stored as a sample.
 
     Parameters
     ----------
     name
-        Of its folder.
+        Name of the folder.
     codec
-        What to call the form that the recording is kept in.
+        Description of the recording's file format.
     about
-        The README, with ``{files}`` where the table of files goes.
+        Text of the README; ``{files}`` is replaced by the table of files.
     """
 
     name: str
@@ -45,7 +45,7 @@ class Sample(Recording):
     dot_columns: ClassVar[tuple[str, ...]] = DOT_COLUMNS[:9]
 
     def setup(self) -> str:
-        """Write the setup file's text."""
+        """Return the text of the setup file."""
         rig, view = self.rig, self.view
         x, y, z = map(float, rig.imaging_plane.origin_mm)
         return f"""\
@@ -78,7 +78,7 @@ z_axis_mm = {view.z_axis_mm}
 """
 
     def readme(self) -> str:
-        """Write the README's text."""
+        """Return the text of the README."""
         name = self.file if Path(self.file).suffix else f"{self.file}/"
         files = FILES.format(
             file=name, codec=self.codec, width=self.view.width_px, height=self.view.height_px

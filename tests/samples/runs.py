@@ -1,4 +1,4 @@
-"""What the sample recordings show: pools, benches, cameras, and what to expect of each."""
+"""The sample recordings: pools, benches, cameras, and the README of each."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ RUN_HZ = 60.0
 TACK_DIAMETER_MM, TACK_HEIGHT_MM = 9.75, 0.91
 
 BENT_MM = (0.2, -1.2)
-"""By how much the electrode of the blocked rows is bent, along X and along Y."""
+"""Lateral offset of the bent electrode's tip in the sample of blocked rows, along X and Y."""
 
 TIP_MM = (5.0, 5.0, 1.2, 1.15, 1.1, 1.05)
-"""Height of its tip in each frame, one a second."""
+"""Height of its tip in each frame, at one frame per second."""
 
 SWING_HZ = 22.0
 
@@ -41,13 +41,13 @@ BENCH = Rig(
 
 @functools.cache
 def samples() -> tuple[Sample, ...]:
-    """Build every sample recording."""
+    """Return every sample recording."""
     return gtaw(), thumb_tack(), blocked_rows(), concave()
 
 
 @functools.cache
 def gtaw() -> Sample:
-    """Build the run of §7.3: 75 A, 3 mm/s, and a pool that fluctuates as that section reports."""
+    """Return the run of §7.3: 75 A, 3 mm/s, and a pool that fluctuates as reported there."""
     return Sample(
         name="gtaw",
         file="recording.avi",
@@ -82,7 +82,7 @@ The pool is convex and egg-shaped, its head nearer to the torch than its tail. W
 
 @functools.cache
 def thumb_tack() -> Sample:
-    """Build the thumb tack of §8.2, which stands still."""
+    """Return the thumb tack of §8.2, which does not move."""
     count = 3
     return Sample(
         name="thumb_tack",
@@ -123,7 +123,7 @@ height.
 
 @functools.cache
 def blocked_rows() -> Sample:
-    """Build a run in which a bent electrode comes down until it hides the reference."""
+    """Return a run in which a bent electrode is lowered until it hides the reference."""
     seed = 20053
     count = len(TIP_MM)
     return Sample(
@@ -143,7 +143,7 @@ def blocked_rows() -> Sample:
 
 @functools.cache
 def concave() -> Sample:
-    """Build a run with a concave pool, whose dots are turned round both ways."""
+    """Return a run with a concave pool, whose dots are inverted in rows and columns."""
     seed = 20044
     return Sample(
         name="concave",
@@ -210,7 +210,7 @@ With the reference and the rows given, height comes within 2 % in every frame.
 def _view(
     origin_px: tuple[float, float], px_per_mm: float, roll_deg: float, width: int, height: int
 ) -> CameraView:
-    """View of a turned camera, with the axes' points in the middles of the target's bars."""
+    """Return the view of a rolled camera, with axis points in the middle of the target's bars."""
     rolled = CameraView.rolled(
         origin_px, px_per_mm, roll_deg, TARGET.x_middle_mm, TARGET.z_middle_mm
     )
@@ -227,7 +227,7 @@ def _view(
 
 
 def _gtaw_pools(count: int) -> tuple[Pool, ...]:
-    """Pool of every frame: all its measures wander, smoothly, by what §7.3 reports."""
+    """Return the pool of every frame: its sizes vary smoothly, by the amounts of §7.3."""
     rng = np.random.default_rng(20070)
     width, length, height, ahead, aside = (_wander(rng, count) for _ in range(5))
     pools = []
@@ -237,7 +237,9 @@ def _gtaw_pools(count: int) -> tuple[Pool, ...]:
         aim = HEIGHT_MM + HEIGHT_SIGMA_MM * height[n]
         swing = Oscillation(0.012, SWING_HZ, n / RUN_HZ)
         peak = aim
-        for _ in range(4):  # the swinging lifts the highest point a little; take that off again
+        for _ in range(
+            4
+        ):  # compensate for the oscillation, which raises the highest point slightly
             pool = egg(
                 width_mm=WIDTH_MM + WIDTH_SIGMA_MM * width[n],
                 head_mm=head,
@@ -252,7 +254,7 @@ def _gtaw_pools(count: int) -> tuple[Pool, ...]:
 
 
 def _swinging(seed: int, count: int, foot: Footprint, peak_mm: float) -> tuple[Pool, ...]:
-    """Pool of every frame of a short run: it swings, and its size wanders by 1 or 2 %."""
+    """Return the pools of a short run: they oscillate, and their size varies by 1 or 2 %."""
     rng = np.random.default_rng(seed)
     width, length, peak = (_wander(rng, count) for _ in range(3))
     return tuple(
@@ -269,6 +271,6 @@ def _swinging(seed: int, count: int, foot: Footprint, peak_mm: float) -> tuple[P
 
 
 def _wander(rng: np.random.Generator, count: int) -> FloatArray:
-    """Smooth random course of one value a frame, mean 0 and standard deviation 1."""
+    """Return a smooth random series of mean 0 and standard deviation 1, a value per frame."""
     course = gaussian_filter1d(rng.normal(size=count), 1.5, mode="wrap")
     return np.asarray((course - course.mean()) / course.std())

@@ -1,4 +1,4 @@
-"""The sample sessions: ``python -m tests.samples.sessions [NAME …]`` makes them anew."""
+"""The sample sessions: ``python -m tests.samples.sessions [NAME …]`` makes them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from labapp.session.session import Session
 
 
 def correct_frame_2(session: Session) -> None:
-    """Set the reference and the blocked rows of frame 2; the frames after it stay as they are."""
+    """Set the reference and the blocked rows of frame 2; later frames are not changed."""
     result = session.result(2)
     assert result is not None
     correction = set_reference(start_correction(result.measurement), (6, 8))
@@ -24,7 +24,7 @@ def correct_frame_2(session: Session) -> None:
 
 
 def main(names: Sequence[str]) -> None:
-    """Make the sessions named, or all; existing ones are replaced."""
+    """Make the named sessions, or all; existing ones are replaced."""
     for name in names or SAMPLES:
         path = sample_folder(name) / f"{name}.labsession"
         path.unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""Boards for the printer, and that what is drawn is what is printed."""
+"""Printable boards: the drawings agree with the simulated board."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ every_board = pytest.mark.parametrize("board", BOARDS.values(), ids=BOARDS)
 
 
 @every_board
-def test_rectangles_are_what_is_inked(board):
+def test_rectangles_are_the_inked_areas(board):
     printed = PrintedBoard(board)
     rectangles = printed.rectangles_mm()
     rng = np.random.default_rng(4)
-    places = rng.uniform(-20, 200, (4000, 2))
+    points = rng.uniform(-20, 200, (4000, 2))
     low, high = rectangles[:, :2], rectangles[:, 2:]
-    within = ((places[:, None] > low) & (places[:, None] < high)).all(axis=-1).any(axis=-1)
-    np.testing.assert_array_equal(printed.inked(places), within)
+    within = ((points[:, None] > low) & (points[:, None] < high)).all(axis=-1).any(axis=-1)
+    np.testing.assert_array_equal(printed.inked(points), within)
 
 
 @every_board
@@ -40,14 +40,14 @@ def test_svg_has_the_board_at_true_size(board):
     ]
     assert len(squares) == -(-board.columns * board.rows // 2)
     x, z = PrintedBoard(board).origin_mm
-    # The square to the lower left of O′: black where columns and rows are both even, or both odd.
+    # The square to the lower left of O′ is black if columns and rows are both even, or both odd.
     lower_left = (board.square_mm, x - board.square_mm, height - z)
     upper_left = (board.square_mm, x - board.square_mm, height - z - board.square_mm)
     assert any(np.allclose(one, lower_left) or np.allclose(one, upper_left) for one in squares)
 
 
 @every_board
-def test_committed_boards_are_these(board):
+def test_committed_boards_are_up_to_date(board):
     assert (TARGETS / f"{board.name}.svg").read_text("utf-8") == board_svg(board)
     pdf, width = (TARGETS / f"{board.name}.pdf").read_bytes(), PrintedBoard(board).plate_mm[0]
     assert f"/MediaBox [ 0 0 {width * 72 / 25.4:.6g}"[:20].encode() in pdf

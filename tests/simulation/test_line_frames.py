@@ -1,4 +1,4 @@
-"""The twin of lines keeps to the law of reflection, and its light to where the rays land."""
+"""Simulated lines obey the law of reflection, and their light is where the rays land."""
 
 from __future__ import annotations
 
@@ -20,28 +20,28 @@ RIG = LineRig(
 VIEW = CameraView((1.0, 318.0), (226.0, 318.0), 60.0, (1.0, 93.0), 60.0, 240, 320)
 
 
-def test_the_middle_ray_of_a_flat_pool_lands_where_it_must():
-    """At the elevation it came with: Z = 53.6·tan 27°, under X = 0."""
+def test_middle_ray_of_a_flat_pool_lands_at_its_elevation():
+    """It keeps its elevation: Z = 53.6·tan 27° at X = 0."""
     frame = render_lines(spherical_cap(6.0, 1e-6), RIG, VIEW, LineLook(), np.random.default_rng(0))
     middle = next(one for one in frame.lines if one.number == 2)
     k = int(np.argmin(np.abs(middle.fan)))
     place = VIEW.to_image(np.array([32.0, 53.6 * np.tan(np.radians(27.0)) + 5.0]))
     assert np.abs(middle.image_px[k] - place).max() < 0.01
-    # i grows towards the head, and upwards on a flat mirror.
+    # i grows towards the head, which is upwards in the image of a flat mirror.
     heights = [-float(np.mean(one.image_px[:, 1])) for one in frame.lines]
     assert heights == sorted(heights)
 
 
-def test_light_lies_on_the_true_lines():
+def test_light_is_on_the_true_lines():
     look = LineLook(fringes=(), beam_fraction=0.0)
     frame = render_lines(spherical_cap(6.0, 0.2), RIG, VIEW, look, np.random.default_rng(0))
-    every = np.concatenate([one.image_px for one in frame.lines])
+    line_px = np.concatenate([one.image_px for one in frame.lines])
     v, u = np.nonzero(frame.light_px > 0.02 * frame.light_px.max())
-    away = np.linalg.norm(np.stack([u, v], axis=-1)[:, None] - every, axis=-1).min(axis=1)
-    assert away.max() < 4 * 0.25 * 3.75 + 1.0
+    distance = np.linalg.norm(np.stack([u, v], axis=-1)[:, None] - line_px, axis=-1).min(axis=1)
+    assert distance.max() < 4 * 0.25 * 3.75 + 1.0
 
 
-def test_nothing_shows_without_a_pool():
+def test_frame_without_a_pool_is_dark():
     frame = render_lines(None, RIG, VIEW, LineLook(), np.random.default_rng(0))
     assert frame.lines == ()
     assert not frame.light_px.any()
@@ -58,7 +58,7 @@ def test_gaps_interrupt_lines_and_fringes_add_light():
     assert 1.05 * bare < light(LineLook(fringes=(0.18, 0.08))) < 1.4 * bare
 
 
-def test_a_run_goes_through_its_phases_in_order():
+def test_run_has_its_phases_in_order():
     run = penetration_run(80, np.random.default_rng(1))
     states = [one.state for one in run]
     assert [s for k, s in enumerate(states) if k == 0 or states[k - 1] != s] == list(PHASES)

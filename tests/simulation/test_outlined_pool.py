@@ -16,7 +16,7 @@ from labapp.simulation.surface_files import read_pool
 
 RIG = Rig(Laser(31.14, 31.48), DotPattern(), Electrode(5.0), ImagingPlane.vertical(50.0, 45.0, 3.0))
 EGG = egg(6.6, 3.0, 4.4, 0.3, (0.1, -0.6), (Dent(0.05, 0.8),))
-"""What the files hold, known exactly."""
+"""The exact surface in the files."""
 
 
 def square(half):
@@ -33,7 +33,7 @@ def grid_of(pool, spacing=0.1):
 
 
 def inner(pool, count=200, reach=0.95):
-    """Points inside the pool."""
+    """Return points inside the pool."""
     rng = np.random.default_rng(5)
     rim = pool.boundary_mm()[rng.integers(0, len(pool.boundary_mm()), count), :2]
     middle = rim.mean(axis=0)
@@ -61,7 +61,7 @@ def test_gradient_of_any_function_is_its_derivative():
     np.testing.assert_allclose(pool.gradient(x, y), exact, atol=1e-10)
 
 
-def test_a_pool_ends_at_its_outline():
+def test_pool_ends_at_its_outline():
     pool = OutlinedPool(saddle, square(3))
     x, y = np.random.default_rng(2).uniform(-4, 4, (2, 400))
     inside = np.maximum(abs(x), abs(y)) < 3
@@ -75,21 +75,21 @@ def test_a_pool_ends_at_its_outline():
 
 
 @pytest.mark.slow
-def test_the_same_pool_by_function_reflects_the_same():
-    whole = Dent(0.05, 0.8)
-    assert whole in EGG.terms
+def test_pool_as_a_function_gives_the_same_reflections():
+    dent = Dent(0.05, 0.8)
+    assert dent in EGG.terms
     rim = EGG.boundary_mm(7200)[:, :2]
-    # The function itself knows no boundary: beyond it, the height is that of the nearest rim.
+    # The function has no boundary: beyond the outline it returns 0.
     pool = OutlinedPool(lambda x, y: np.nan_to_num(EGG.height(x, y)), rim, EGG.gradient)
-    seen, exact = trace(pool, RIG), trace(EGG, RIG)
-    assert (seen.hit != exact.hit).sum() <= 1
-    both = seen.visible & exact.visible
+    reflections, exact = trace(pool, RIG), trace(EGG, RIG)
+    assert (reflections.hit != exact.hit).sum() <= 1
+    both = reflections.visible & exact.visible
     assert both.sum() > 80
-    np.testing.assert_allclose(seen.plane_mm[both], exact.plane_mm[both], atol=1e-6)
+    np.testing.assert_allclose(reflections.plane_mm[both], exact.plane_mm[both], atol=1e-6)
 
 
 @pytest.mark.parametrize("outline", [square(3)[:2], np.array([[0, 0], [1, 1], [2, 2]])])
-def test_an_outline_without_area_is_refused(outline):
+def test_outline_without_area_is_rejected(outline):
     with pytest.raises(ValueError, match="area"):
         OutlinedPool(saddle, outline)
 
@@ -97,7 +97,7 @@ def test_an_outline_without_area_is_refused(outline):
 # --- height maps ----------------------------------------------------------------------------------
 
 
-def test_a_height_map_is_the_surface_it_was_taken_from():
+def test_height_map_reproduces_its_surface():
     pool = pool_from_heights(*grid_of(EGG), EGG.boundary_mm(360)[:, :2])
     assert_is_the_egg(pool, 1e-4, 2e-3, 1e-3)
     rim = pool.boundary_mm()
@@ -118,17 +118,17 @@ def test_gradient_of_a_height_map_is_the_derivative_of_its_height():
     np.testing.assert_allclose(pool.gradient(x, y), numeric, atol=1e-8)
 
 
-def test_dots_of_a_height_map_are_those_of_the_surface():
-    seen, exact = trace(pool_from_heights(*grid_of(EGG)), RIG), trace(EGG, RIG)
-    both = seen.visible & exact.visible
-    assert (seen.visible ^ exact.visible).sum() <= 4
-    apart = np.linalg.norm(seen.plane_mm - exact.plane_mm, axis=-1)[both]
-    assert np.median(apart) < 0.01
+def test_height_map_gives_the_dots_of_its_surface():
+    reflections, exact = trace(pool_from_heights(*grid_of(EGG)), RIG), trace(EGG, RIG)
+    both = reflections.visible & exact.visible
+    assert (reflections.visible ^ exact.visible).sum() <= 4
+    distance = np.linalg.norm(reflections.plane_mm - exact.plane_mm, axis=-1)[both]
+    assert np.median(distance) < 0.01
 
 
-def test_a_height_map_can_go_to_another_process():
+def test_height_map_can_be_pickled():
     pool = pool_from_heights(*grid_of(EGG))
-    pool.size  # noqa: B018 - what was found already goes with it
+    pool.size  # noqa: B018 - the cached value is pickled too
     again = pickle.loads(pickle.dumps(pool))
     x, y = inner(EGG)
     np.testing.assert_array_equal(again.height(x, y), pool.height(x, y))
@@ -141,8 +141,8 @@ def write(path):
         path.write_text("\n".join(rows) + "\n")
     elif path.name == "nodes.csv":
         u, v = np.meshgrid(x, y)
-        some = np.isfinite(z)
-        np.savetxt(path, np.stack([u[some], v[some], z[some]], -1), "%.6f", ",",
+        known = np.isfinite(z)
+        np.savetxt(path, np.stack([u[known], v[known], z[known]], -1), "%.6f", ",",
                    header="x_mm,y_mm,z_mm", comments="")  # fmt: skip
     elif path.suffix == ".npy":
         np.save(path, z)
@@ -151,11 +151,13 @@ def write(path):
 
 
 @pytest.mark.parametrize("name", ["table.csv", "nodes.csv", "map.npy", "map.npz"])
-def test_height_maps_are_read_from_every_kind_of_file(tmp_path, name):
+def test_height_maps_are_read_from_every_file_format(tmp_path, name):
     write(tmp_path / name)
-    bare = name in ("table.csv", "map.npy")
+    is_bare = name in ("table.csv", "map.npy")
     # The grid's middle is at (0, -1).
-    pool = read_pool(tmp_path / name, 0.1 if bare else None, (0.0, -1.0) if bare else (0.0, 0.0))
+    pool = read_pool(
+        tmp_path / name, 0.1 if is_bare else None, (0.0, -1.0) if is_bare else (0.0, 0.0)
+    )
     assert_is_the_egg(pool)
 
 
@@ -163,20 +165,20 @@ def test_height_maps_are_read_from_every_kind_of_file(tmp_path, name):
 
 
 def triangles(rings=40, sectors=90):
-    """The egg as rings of triangles."""
+    """Return the egg as rings of triangles."""
     rim = EGG.boundary_mm(sectors)[:, :2]
     middle = np.array(EGG.footprint.center_mm)
-    places = [middle[None]]
-    places += [middle + (n / rings) * (1 - 1e-9) * (rim - middle) for n in range(1, rings + 1)]
-    xy = np.concatenate(places)
+    points = [middle[None]]
+    points += [middle + (n / rings) * (1 - 1e-9) * (rim - middle) for n in range(1, rings + 1)]
+    xy = np.concatenate(points)
     vertices = np.column_stack([xy, EGG.height(*xy.T)])
     next_ = np.roll(np.arange(sectors), -1)
     faces = [np.column_stack([np.zeros(sectors, int), 1 + np.arange(sectors), 1 + next_])]
     for ring in range(rings - 1):
         a, b = 1 + ring * sectors, 1 + (ring + 1) * sectors
-        at = np.arange(sectors)
-        faces += [np.column_stack([a + at, b + at, b + next_])]
-        faces += [np.column_stack([a + at, b + next_, a + next_])]
+        sector = np.arange(sectors)
+        faces += [np.column_stack([a + sector, b + sector, b + next_])]
+        faces += [np.column_stack([a + sector, b + next_, a + next_])]
     return vertices, np.concatenate(faces)
 
 
@@ -206,7 +208,7 @@ def test_meshes_of_other_programs_are_read(tmp_path, name, kind):
     assert_is_the_egg(read_pool(tmp_path / name), size_mm=0.02)
 
 
-def test_the_top_of_a_body_is_the_pool(tmp_path):
+def test_top_of_a_closed_body_is_the_pool(tmp_path):
     vertices, faces = triangles()
     sectors = 90
     rim = len(vertices) - sectors + np.arange(sectors)
@@ -221,7 +223,7 @@ def test_the_top_of_a_body_is_the_pool(tmp_path):
     assert_is_the_egg(read_pool(tmp_path / "body.stl"), size_mm=0.02)
 
 
-# --- what is no surface -------------------------------------------------------------------------
+# --- invalid files ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -245,15 +247,15 @@ def test_the_top_of_a_body_is_the_pool(tmp_path):
         ),
     ],
 )
-def test_what_is_no_surface_is_refused_with_what_would_be(tmp_path, name, content, words):
+def test_invalid_surface_files_are_rejected(tmp_path, name, content, words):
     path = tmp_path / name
     path.write_bytes(content)
-    with pytest.raises(InputError, match=words) as refused:
+    with pytest.raises(InputError, match=words) as error:
         read_pool(path)
-    assert refused.value.source == str(path)
+    assert error.value.source == str(path)
 
 
-def test_a_missing_file_and_a_wrong_unit_are_refused(tmp_path):
+def test_missing_file_and_wrong_unit_are_rejected(tmp_path):
     with pytest.raises(InputError, match=r"No such file"):
         read_pool(tmp_path / "a.csv", 0.1)
     x, y, z = grid_of(EGG)

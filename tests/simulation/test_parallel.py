@@ -1,4 +1,4 @@
-"""Processes that work for another one: they give way, and end with it, or when they are told to."""
+"""Worker processes: low priority, sharing, and their end with their parent or on an exception."""
 
 from __future__ import annotations
 
@@ -40,11 +40,11 @@ if __name__ == "__main__":
 """
 
 
-def test_they_give_way_to_a_window_and_use_one_thread() -> None:
-    own = os.nice(0)
+def test_workers_have_low_priority_and_one_thread() -> None:
+    niceness = os.nice(0)
     with low_priority():
-        assert in_parallel(os.nice, [0, 0, 0], workers=2) == [min(own + NICE, 19)] * 3
-    assert in_parallel(os.nice, [0, 0], workers=2) == [own] * 2
+        assert in_parallel(os.nice, [0, 0, 0], workers=2) == [min(niceness + NICE, 19)] * 3
+    assert in_parallel(os.nice, [0, 0], workers=2) == [niceness] * 2
     assert in_parallel(os.getenv, ["OMP_NUM_THREADS"] * 2, workers=2) == ["1", "1"]
 
 
@@ -53,7 +53,7 @@ def process(_: int) -> int:
     return os.getpid()
 
 
-def test_processes_are_shared_and_end() -> None:
+def test_shared_processes_are_reused_and_end() -> None:
     with shared_processes(2):
         first, second = (set(in_parallel(process, range(20), workers=2)) for _ in range(2))
         assert len(first | second) <= 2
@@ -62,7 +62,7 @@ def test_processes_are_shared_and_end() -> None:
     assert first.isdisjoint(in_parallel(process, range(20), workers=2))
 
 
-def test_what_progress_raises_ends_shared_ones() -> None:
+def test_exception_in_progress_ends_shared_processes() -> None:
     def stop(_what: str, done: int, _total: int) -> None:
         if multiprocessing.active_children():
             raise InterruptedError(done)
@@ -72,7 +72,7 @@ def test_what_progress_raises_ends_shared_ones() -> None:
     assert not multiprocessing.active_children()
 
 
-def test_what_progress_raises_ends_them() -> None:
+def test_exception_in_progress_ends_processes() -> None:
     def stop(_what: str, done: int, _total: int) -> None:
         if multiprocessing.active_children():
             raise InterruptedError(done)
@@ -82,7 +82,7 @@ def test_what_progress_raises_ends_them() -> None:
     assert not multiprocessing.active_children()
 
 
-def test_they_end_when_who_they_work_for_is_killed(tmp_path: Path) -> None:
+def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
     program = tmp_path / "busy.py"
     program.write_text(BUSY, "utf-8")
     with subprocess.Popen([sys.executable, program], stdout=subprocess.PIPE) as running:
@@ -90,23 +90,23 @@ def test_they_end_when_who_they_work_for_is_killed(tmp_path: Path) -> None:
         while len(workers := spawned(running.pid)) < 2:
             assert running.stdout.readline()
         running.send_signal(signal.SIGKILL)
-    wait_until(lambda: not any(is_there(pid) for pid in workers))
+    wait_until(lambda: not any(is_running(pid) for pid in workers))
 
 
 def stat(pid: int) -> list[str]:
-    """State, parent … of a process, as Linux tells; empty if it is gone."""
+    """Return state, parent … of a process from Linux's ``/proc``; empty if it has ended."""
     try:
         return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     except (FileNotFoundError, ProcessLookupError):
         return []
 
 
-def is_there(pid: int) -> bool:
+def is_running(pid: int) -> bool:
     return stat(pid)[:1] not in ([], ["Z"])
 
 
 def spawned(parent: int) -> list[int]:
-    """Those that a process has spawned to work for it, and that have begun."""
+    """Return the ids of started workers which a process has spawned."""
     pids = [int(path.name) for path in Path("/proc").iterdir() if path.name.isdigit()]
     return [
         pid
@@ -114,13 +114,13 @@ def spawned(parent: int) -> list[int]:
         if stat(pid)[1:2] == [str(parent)]
         and b"spawn_main" in Path(f"/proc/{pid}/cmdline").read_bytes()
         and Path(f"/proc/{pid}/task").is_dir()
-        and len(list(Path(f"/proc/{pid}/task").iterdir())) > 1  # one of them follows the parent
+        and len(list(Path(f"/proc/{pid}/task").iterdir())) > 1  # one thread watches the parent
     ]
 
 
 @pytest.mark.slow
-def test_one_that_is_ended_while_it_tells_much_holds_nobody_up(tmp_path: Path) -> None:
-    """What is told is larger than what a pipe holds: each is ended half through one."""
+def test_ending_a_worker_that_sends_much_data_does_not_block(tmp_path: Path) -> None:
+    """Results are larger than a pipe's buffer: each worker is ended while it sends one."""
     program = tmp_path / "ended.py"
     program.write_text(ENDED, "utf-8")
     subprocess.run([sys.executable, program], timeout=PATIENCE_S, check=True)

@@ -53,7 +53,7 @@ pools = st.builds(
 
 @settings(max_examples=60, deadline=None)
 @given(pools, st.integers(0, 2**32 - 1))
-def test_gradient_is_the_derivative_of_the_height_up_to_the_boundary(pool, seed):
+def test_gradient_is_the_derivative_up_to_the_boundary(pool, seed):
     rng = np.random.default_rng(seed)
     rim = pool.boundary_mm(60)[:, :2]
     center = np.array(pool.footprint.center_mm)
@@ -66,9 +66,9 @@ def test_gradient_is_the_derivative_of_the_height_up_to_the_boundary(pool, seed)
         ],
         axis=-1,
     ) / (2 * step)
-    seen = np.isfinite(numeric)
-    assert seen.sum() > 60
-    np.testing.assert_allclose(pool.gradient(x, y)[seen], numeric[seen], atol=2e-7)
+    known = np.isfinite(numeric)
+    assert known.sum() > 60
+    np.testing.assert_allclose(pool.gradient(x, y)[known], numeric[known], atol=2e-7)
 
 
 @settings(max_examples=40, deadline=None)
@@ -76,13 +76,15 @@ def test_gradient_is_the_derivative_of_the_height_up_to_the_boundary(pool, seed)
 def test_gradient_is_continuous_up_to_the_boundary(pool):
     rim = pool.boundary_mm(90)[:, :2]
     center = np.array(pool.footprint.center_mm)
-    at, near = (pool.gradient(*(center + f * (rim - center)).T) for f in (1 - 1e-11, 1 - 1e-6))
-    np.testing.assert_allclose(at, near, atol=2e-5)
+    at_boundary, near = (
+        pool.gradient(*(center + f * (rim - center)).T) for f in (1 - 1e-11, 1 - 1e-6)
+    )
+    np.testing.assert_allclose(at_boundary, near, atol=2e-5)
 
 
 @settings(max_examples=40, deadline=None)
 @given(pools)
-def test_boundary_is_on_the_work_piece_but_for_a_low_rear(pool):
+def test_boundary_is_on_the_work_piece_except_for_a_low_rear(pool):
     rim = pool.boundary_mm(360)
     drop = sum(term.drop_mm for term in pool.terms if isinstance(term, LowRear))
     ahead = rim[:, 1] >= pool.footprint.center_mm[1]
@@ -92,7 +94,7 @@ def test_boundary_is_on_the_work_piece_but_for_a_low_rear(pool):
 
 @settings(max_examples=40, deadline=None)
 @given(pools)
-def test_size_is_the_extent_of_the_boundary_and_of_the_heights(pool):
+def test_size_is_the_extent_of_boundary_and_heights(pool):
     rim = pool.boundary_mm(7200)
     size = pool.size
     assert np.ptp(rim[:, 0]) == pytest.approx(size.width_mm, rel=1e-6)
@@ -119,12 +121,12 @@ def test_spherical_cap_is_part_of_a_sphere(peak):
 def test_ellipsoidal_cap_is_part_of_an_ellipsoid():
     pool = ellipsoidal_cap(6.0, 9.0, 0.4)
     x, y = np.random.default_rng(1).uniform(-2, 2, (2, 50))
-    # Squeezing Y to the width must give the sphere of that width.
+    # Scaling Y to the width gives the sphere of that width.
     sphere = spherical_cap(6.0, 0.4)
     np.testing.assert_allclose(pool.height(x, 1.5 * y), sphere.height(x, y), rtol=1e-12)
 
 
-def test_egg_has_its_head_its_tail_and_one_smooth_outline():
+def test_egg_has_head_and_tail_and_a_smooth_outline():
     pool = egg(6.0, 2.5, 4.5, 0.3, (0.0, 1.0))
     on_axis = np.zeros(4)
     y = np.array([1.0 + 2.5, 1.0 - 4.5, 1.0 + 2.5, 1.0 - 4.5])
@@ -138,7 +140,7 @@ def test_egg_has_its_head_its_tail_and_one_smooth_outline():
     assert ahead == pytest.approx(behind, rel=2e-3)
 
 
-def test_outside_there_is_no_pool():
+def test_height_outside_the_pool_is_nan():
     pool = egg(6.0, 2.5, 4.5, 0.3)
     far = np.array([0.0, 0.0, 3.1, 100.0]), np.array([2.6, -4.6, 0.0, 100.0])
     assert not pool.inside(*far).any()
@@ -146,7 +148,7 @@ def test_outside_there_is_no_pool():
     assert np.isnan(pool.gradient(*far)).all()
 
 
-def test_dent_makes_a_hollow_under_the_torch_and_leaves_the_boundary():
+def test_dent_lowers_the_centre_but_not_the_boundary():
     plain, dented = egg(7, 3, 4, 0.3), egg(7, 3, 4, 0.3, terms=(Dent(0.1, 0.7),))
     zero = np.zeros(1)
     assert dented.height(zero, zero) == pytest.approx(plain.height(zero, zero) - 0.1)
@@ -154,19 +156,21 @@ def test_dent_makes_a_hollow_under_the_torch_and_leaves_the_boundary():
     assert np.hypot(*dented.size.peak_mm) > 0.5
 
 
-def test_oscillation_comes_back_after_a_period():
-    start, half, whole = (
+def test_oscillation_is_periodic():
+    start, half_period, full_period = (
         egg(7, 3, 4, 0.3, terms=(Oscillation(0.03, 40.0, t / 40.0),)) for t in (0.0, 0.5, 1.0)
     )
     x, y = np.random.default_rng(2).uniform(-2, 2, (2, 40))
     still = egg(7, 3, 4, 0.3).height(x, y)
-    np.testing.assert_allclose(whole.height(x, y), start.height(x, y), atol=1e-12)
-    np.testing.assert_allclose(half.height(x, y) - still, still - start.height(x, y), atol=1e-12)
+    np.testing.assert_allclose(full_period.height(x, y), start.height(x, y), atol=1e-12)
+    np.testing.assert_allclose(
+        half_period.height(x, y) - still, still - start.height(x, y), atol=1e-12
+    )
     assert np.abs(start.height(x, y) - still).max() > 0.005
 
 
 def flat(*waves, width=7.0):
-    """A round pool that is flat but for its waves: what they add alone."""
+    """Return a round pool which is flat except for its waves."""
     return Pool(Footprint(width, width / 2, width / 2, (0.2, -0.3)), 0.0, waves, fullness=0.5)
 
 
@@ -178,9 +182,9 @@ def polar(radius, angle, width=7.0):
 def test_waves_are_the_modes_of_a_membrane(mode):
     m, n = mode
     radius, angle = np.random.default_rng(3).uniform([[0], [-3]], [[0.999], [3]], (2, 100))
-    own = jv(m, jn_zeros(m, n)[-1] * radius) * np.cos(m * (angle - np.radians(25)))
-    seen = flat(Wave(mode, 0.02, turned_deg=25.0)).height(*polar(radius, angle))
-    ratio = seen[np.abs(own) > 1e-3] / own[np.abs(own) > 1e-3]
+    mode_shape = jv(m, jn_zeros(m, n)[-1] * radius) * np.cos(m * (angle - np.radians(25)))
+    height = flat(Wave(mode, 0.02, turned_deg=25.0)).height(*polar(radius, angle))
+    ratio = height[np.abs(mode_shape) > 1e-3] / mode_shape[np.abs(mode_shape) > 1e-3]
     np.testing.assert_allclose(ratio, ratio[0], rtol=1e-9)
     size = flat(Wave(mode, 0.02)).size
     assert max(size.height_mm, -size.depth_mm) == pytest.approx(0.02, rel=1e-6)
@@ -188,7 +192,7 @@ def test_waves_are_the_modes_of_a_membrane(mode):
 
 @pytest.mark.parametrize("mode", MODES)
 def test_waves_obey_the_wave_equation(mode):
-    """∇²z = (1/c²)·∂²z/∂t², with one c over the whole pool, which the mode's zero gives."""
+    """∇²z = (1/c²)·∂²z/∂t², with c constant over the pool and given by the mode's zero."""
     step, hertz = 1e-3, 30.0
     wave = Wave(mode, 0.02, hertz, travelling=mode[0] > 0, phase_deg=40.0)
     x, y = polar(*np.random.default_rng(4).uniform([[0], [-3]], [[0.95], [3]], (2, 60)))
@@ -206,7 +210,7 @@ def test_waves_obey_the_wave_equation(mode):
     np.testing.assert_allclose(laplacian, faster / speed**2, atol=2e-6)
 
 
-def test_a_travelling_wave_turns_and_a_standing_one_does_not():
+def test_travelling_wave_turns_and_standing_wave_does_not():
     angle = np.linspace(-3, 3, 50)
     quarter = 1 / 4 / 30.0
     for mode in ((1, 1), (2, 1)):
@@ -222,7 +226,7 @@ def test_a_travelling_wave_turns_and_a_standing_one_does_not():
         assert np.abs(standing.height(*turned)).max() > 0.01
 
 
-def test_what_stands_still_is_the_same_pool_later():
+def test_pool_without_oscillation_is_unchanged_later():
     still = egg(7, 3, 4, 0.3, terms=(Dent(0.1, 0.7), LowRear(0.1)))
     assert still.after(0.1) is still
     moved = egg(7, 3, 4, 0.3, terms=(Dent(0.1, 0.7), Oscillation(0.03, 40.0))).after(0.005)
@@ -233,12 +237,12 @@ def test_what_stands_still_is_the_same_pool_later():
     ("mode", "travelling", "words"),
     [((-1, 1), False, "m ≥ 0"), ((1, 0), False, "n ≥ 1"), ((0, 2), True, "cannot travel")],
 )
-def test_waves_that_cannot_be_are_refused(mode, travelling, words):
+def test_impossible_waves_are_rejected(mode, travelling, words):
     with pytest.raises(ValueError, match=words):
         Wave(mode, 0.1, travelling=travelling)
 
 
-def test_caps_of_8_3_1_are_28_of_the_sizes_the_text_names():
+def test_28_caps_of_8_3_1_have_the_stated_sizes():
     caps = caps_8_3_1()
     ratio = [cap.footprint.width_mm / cap.peak_mm for cap in caps]
     assert len(caps) == 28
@@ -255,6 +259,6 @@ def test_caps_of_8_3_1_are_28_of_the_sizes_the_text_names():
         (6.0, 3.0, 0.3, 1.0, "fullness"),
     ],
 )
-def test_impossible_pools_are_refused(width, head, peak, fullness, words):
+def test_impossible_pools_are_rejected(width, head, peak, fullness, words):
     with pytest.raises(ValueError, match=words):
         Pool(Footprint(width, head, 3.0), peak, fullness=fullness)

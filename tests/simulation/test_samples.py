@@ -32,8 +32,8 @@ every_sample = pytest.mark.parametrize("sample", samples(), ids=lambda sample: s
 
 
 def rows(name, file="truth.csv"):
-    with (FOLDER / name / file).open(encoding="utf-8") as kept:
-        return list(csv.DictReader(kept))
+    with (FOLDER / name / file).open(encoding="utf-8") as stream:
+        return list(csv.DictReader(stream))
 
 
 def column(name, key):
@@ -51,35 +51,35 @@ def measured(sample, index, correction=None):
     return measure(image, setup.bench, Settings(), correction=correction)[0]
 
 
-def same_picture(made, kept):
-    """Equal, but for a rounding that another processor or library may do otherwise."""
-    apart = np.abs(made.astype(int) - kept.astype(int))
-    return apart.max() <= 1 and (apart > 0).mean() < 1e-3
+def same_picture(computed, committed):
+    """Whether pictures are equal, except for rounding on another processor or library."""
+    difference = np.abs(computed.astype(int) - committed.astype(int))
+    return difference.max() <= 1 and (difference > 0).mean() < 1e-3
 
 
-# --- what is kept is what the program makes ---------------------------------------------------
+# --- the committed files are those the program makes ------------------------------------------
 
 
 @every_sample
 @pytest.mark.slow
-def test_recording_is_what_the_program_makes(sample):
+def test_recording_is_reproduced_by_the_program(sample):
     with open_source(FOLDER / sample.name / sample.file) as source:
         assert len(source) == len(sample.pools)
         assert source.frame_rate_hz == sample.frame_rate_hz
         assert source.shape == (sample.view.height_px, sample.view.width_px)
         for index in (1, len(source) - 1):
-            kept, made = source.frame(index).image, sample.frame(index).image
-            assert kept.dtype == made.dtype
-            assert same_picture(made, kept)
-            assert not same_picture(made, source.frame(0).image)
+            committed, computed = source.frame(index).image, sample.frame(index).image
+            assert committed.dtype == computed.dtype
+            assert same_picture(computed, committed)
+            assert not same_picture(computed, source.frame(0).image)
 
 
 @every_sample
 @pytest.mark.slow
-def test_pictures_and_texts_are_what_the_program_makes(sample):
+def test_pictures_and_texts_are_reproduced_by_the_program(sample):
     folder = FOLDER / sample.name
-    kept = cv2.imread(str(folder / "calibration.png"), cv2.IMREAD_UNCHANGED)
-    assert same_picture(sample.calibration_picture(), kept)
+    committed = cv2.imread(str(folder / "calibration.png"), cv2.IMREAD_UNCHANGED)
+    assert same_picture(sample.calibration_picture(), committed)
     assert (folder / "setup.toml").read_text(encoding="utf-8") == sample.setup()
     assert (folder / "README.md").read_text(encoding="utf-8") == sample.readme()
 
@@ -125,21 +125,21 @@ def test_dots_truth_agrees_with_the_picture(sample):
     dots = np.array([[float(row["u_px"]), float(row["v_px"])] for row in truth])
     light = image[tuple(np.rint(dots[shown][:, ::-1]).astype(int).T)]
     assert shown.sum() > 60
-    # Not by their surroundings: the concave pool's dots lie close.
+    # Relative to the whole frame, as the concave pool's dots are close together.
     assert np.mean(light > np.median(image) + 8) == 1.0
     assert ("10", "10") not in {(row["ray_row"], row["ray_column"]) for row in truth}
 
 
 @every_sample
 @pytest.mark.slow
-def test_writing_loses_nothing(sample, tmp_path):
+def test_written_recording_is_lossless_and_complete(sample, tmp_path):
     short = replace(sample, pools=sample.pools[:2], exposures=min(sample.exposures, 2))
     short.write(tmp_path)
-    # The session beside them is made of what is written here, by another program; whoever opens
-    # it leaves its lock there.
-    kept = {path.name for path in (FOLDER / sample.name).iterdir() if path.name[0] != "."}
+    # The session beside them is made from these files by another program; opening it leaves a
+    # hidden lock file there.
+    committed = {path.name for path in (FOLDER / sample.name).iterdir() if path.name[0] != "."}
     written = {path.name for path in tmp_path.iterdir()}
-    assert written == kept - {f"{sample.name}.labsession"}
+    assert written == committed - {f"{sample.name}.labsession"}
     with open_source(tmp_path / sample.file) as source:
         assert len(source) == 2
         for frame in source:
@@ -151,12 +151,12 @@ def test_command_writes_a_folder_for_each(tmp_path):
     main([str(tmp_path / "all"), "--only", "concave", "--target", str(target)])
     assert [path.name for path in (tmp_path / "all").iterdir()] == ["concave"]
     assert target.read_text(encoding="utf-8").startswith("<svg")
-    kept = {path.name for path in FOLDER.iterdir() if path.is_dir()}
-    assert kept == {sample.name for sample in (*samples(), *line_samples())}
+    committed = {path.name for path in FOLDER.iterdir() if path.is_dir()}
+    assert committed == {sample.name for sample in (*samples(), *line_samples())}
 
 
 @every_sample
-def test_setup_file_says_what_was_rendered(sample):
+def test_setup_file_describes_the_rendered_bench(sample):
     setup = read_setup(FOLDER / sample.name / "setup.toml")
     assert setup.rig.laser == sample.rig.laser
     assert setup.rig.pattern == sample.rig.pattern
@@ -174,17 +174,17 @@ def test_setup_file_says_what_was_rendered(sample):
 # --- the GTAW run -----------------------------------------------------------------------------
 
 
-def test_pool_fluctuates_as_7_3_reports():
+def test_pool_fluctuates_as_in_7_3():
     for key, mean, sigma in (
         ("width_mm", 6.66, 0.15),
         ("length_mm", 7.45, 0.46),
         ("height_mm", 0.294, 0.019),
     ):
-        course = column("gtaw", key)
-        assert course.mean() == pytest.approx(mean, abs=1e-3)
-        assert course.std() == pytest.approx(sigma, abs=1e-3)
-        # Smooth: a frame is far more like the next than like any other.
-        assert np.abs(np.diff(course)).mean() < 0.6 * sigma
+        values = column("gtaw", key)
+        assert values.mean() == pytest.approx(mean, abs=1e-3)
+        assert values.std() == pytest.approx(sigma, abs=1e-3)
+        # Smooth: consecutive frames differ little.
+        assert np.abs(np.diff(values)).mean() < 0.6 * sigma
 
 
 def test_head_is_nearer_to_the_torch_than_the_tail():
@@ -202,7 +202,7 @@ def test_torch_hides_nothing_and_the_plane_catches_all():
 # --- the thumb tack ---------------------------------------------------------------------------
 
 
-def test_thumb_tack_is_that_of_8_2_and_stands_still():
+def test_thumb_tack_is_that_of_8_2_and_does_not_move():
     diameter, height = 9.75, 0.91
     for row in rows("thumb_tack"):
         assert float(row["width_mm"]) == float(row["length_mm"]) == diameter
@@ -225,7 +225,7 @@ def test_thumb_tack_is_measured():
 # --- rows blocked by the torch ----------------------------------------------------------------
 
 
-def test_torch_hides_what_it_stands_in_the_way_of():
+def test_torch_hides_the_rays_it_intersects():
     torch = ConeTorch((1.0, 2.0, 3.0), tip_radius_mm=0.3, radius_mm=1.0, half_angle_deg=45.0)
     below = np.array([[1.0, 2.0, 0.0], [1.29, 2.0, 0.0], [1.9, 2.0, 0.0], [2.1, 2.0, 0.0]])
     up = np.tile([0.0, 0.0, 1.0], (4, 1))
@@ -233,7 +233,7 @@ def test_torch_hides_what_it_stands_in_the_way_of():
     assert reflected.tolist() == [True, True, True, False]
     assert not incident.any()
     assert torch.hides(below, -up, up)[0].tolist() == [True, True, True, False]
-    # Level rays, past the flat end and under it.
+    # Horizontal rays, past the flat end and below it.
     beside = np.array([[-4.0, 2.0, 3.1], [-4.0, 2.0, 2.9], [-4.0, 2.45, 3.1], [-4.0, 2.45, 3.3]])
     along = np.tile([1.0, 0.0, 0.0], (4, 1))
     assert torch.hides(beside, along, along)[1].tolist() == [True, False, False, True]
@@ -249,13 +249,13 @@ def test_lowered_torch_hides_the_references_neighbourhood():
             assert not hidden.any()
         else:
             assert beside.any()
-            # The middle of rows, never a whole one but the front's and the rear's ends.
+            # The middle of rows; complete rows only at the ends of head and rear.
             assert 10 <= hidden.sum() <= 20
             assert (reflections.visible.sum(axis=1)[5:12] >= 6).all()
 
 
 def advised(index):
-    """Reference, place on the picture and blocked rows that the README has for a frame."""
+    """Return status, reference, its position and blocked rows of a frame from the README."""
     text = (FOLDER / "blocked_rows" / "README.md").read_text(encoding="utf-8")
     cells = re.search(rf"^\| {index} \|(.*)\|$", text, re.MULTILINE)[1].split("|")
     status, reference, place, blocked = cells
@@ -263,7 +263,7 @@ def advised(index):
     return status.strip(" `"), tuple(numbers[0]), numbers[1], numbers[2]
 
 
-def test_torch_out_of_the_way_is_no_matter():
+def test_frame_with_raised_torch_is_measured():
     result = measured(blocked_rows(), 1)
     assert result.status == advised(1)[0] == "ok"
     assert result.lattice.reference == advised(1)[1]
@@ -273,7 +273,7 @@ def test_torch_out_of_the_way_is_no_matter():
 
 @pytest.mark.parametrize("index", [2, 4, 5])
 @pytest.mark.slow
-def test_a_blocked_frame_is_measured_with_its_reference_given(index):
+def test_blocked_frame_is_measured_with_a_given_reference(index):
     sample, frame = blocked_rows(), blocked_rows().frame(index)
     result = measured(sample, index)
     status, reference, _, blocked = advised(index)
@@ -290,7 +290,7 @@ def test_a_blocked_frame_is_measured_with_its_reference_given(index):
 
 @pytest.mark.parametrize("mark", [True, False])
 @pytest.mark.slow
-def test_a_frame_with_more_hidden_is_refused_and_put_right_by_hand(mark):
+def test_frame_with_more_hidden_dots_is_measured_after_correction(mark):
     index, bench = 5, read_setup(FOLDER / "blocked_rows" / "setup.toml").bench
     sample = replace(blocked_rows(), torches=(ConeTorch((*BENT_MM, 0.8)),) * 6)
     frame = sample.frame(index)
@@ -301,18 +301,18 @@ def test_a_frame_with_more_hidden_is_refused_and_put_right_by_hand(mark):
     correction = set_reference(start_correction(result), reference)
     for row in blocked if mark else ():
         correction = block_row(correction, row)
-    again = measure(frame.image, bench, Settings(), correction=correction)[0]
-    assert again.status == "ok"
+    corrected = measure(frame.image, bench, Settings(), correction=correction)[0]
+    assert corrected.status == "ok"
     tolerance = 0.03 if mark else 0.05
-    assert again.measures.height_mm == pytest.approx(frame.pool.size.height_mm, rel=tolerance)
-    true = frame.reflections.plane_mm[tuple(again.match.ray.T - 1)]
-    np.testing.assert_allclose(again.match.plane_mm, true, atol=0.3)
+    assert corrected.measures.height_mm == pytest.approx(frame.pool.size.height_mm, rel=tolerance)
+    true = frame.reflections.plane_mm[tuple(corrected.match.ray.T - 1)]
+    np.testing.assert_allclose(corrected.match.plane_mm, true, atol=0.3)
 
 
 # --- the concave pool -------------------------------------------------------------------------
 
 
-def test_concave_pool_is_measured_the_right_way_round():
+def test_concave_pool_is_measured_with_its_orientation():
     sample = concave()
     result = measured(sample, 3)
     assert result.status == "ok"

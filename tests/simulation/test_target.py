@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[2]
 
 
 def objects(image):
-    """§5.1.2 in three lines: threshold, median 7 × 7, labels; largest first."""
+    """Return areas and centres as in §5.1.2: threshold, median 7 × 7, labels; largest first."""
     binary = cv2.medianBlur((image < 22).astype(np.uint8), 7)
     _, _, stats, centers = cv2.connectedComponentsWithStats(binary)
     order = np.argsort(stats[1:, cv2.CC_STAT_AREA])[::-1] + 1
@@ -23,7 +23,7 @@ def objects(image):
 
 @pytest.mark.parametrize("roll_deg", [-2.0, 0.0, 1.5])
 @pytest.mark.slow
-def test_picture_holds_three_objects_where_the_view_says(roll_deg):
+def test_picture_has_three_objects_at_their_true_positions(roll_deg):
     target, view = Target(), CameraView.rolled(roll_deg=roll_deg)
     look = TargetLook(vignetting=0.0, slope=0.0)
     areas, centers = objects(render_target(target, view, look, np.random.default_rng(1)))
@@ -32,7 +32,7 @@ def test_picture_holds_three_objects_where_the_view_says(roll_deg):
     np.testing.assert_allclose(centers, view.to_image(marks), atol=0.4)
 
 
-def test_picture_is_dim_and_of_low_contrast():
+def test_picture_is_dim_and_has_low_contrast():
     image = render_target(Target(), CameraView.rolled(), TargetLook(), np.random.default_rng(1))
     assert image.shape == (640, 480)
     assert image.mean() < 40
@@ -44,14 +44,14 @@ def test_picture_is_dim_and_of_low_contrast():
     assert 5 < np.median(image[~marks]) - np.median(image[marks]) < 30
 
 
-def test_middles_of_the_bars_are_those_of_eq_5_6():
+def test_bar_centres_agree_with_eq_5_6():
     target = Target(unit_mm=2.0)
     assert (target.x_middle_mm, target.z_middle_mm) == (11.0, 5.0)
     x_bar, *_ = target.rectangles_mm()
     assert (x_bar[0] + x_bar[2]) / 2 == pytest.approx(11.0)
 
 
-def test_marks_stay_on_the_plate():
+def test_marks_are_on_the_plate():
     target = Target()
     reach = target.plate_mm - target.margin_mm
     box = target.rectangles_mm()
@@ -79,6 +79,6 @@ def test_printable_target_is_true_to_size():
     assert len(drawn) == len(target.rectangles_mm()) == 2 + 8 + 2
 
 
-def test_committed_target_is_the_one_the_program_draws():
+def test_committed_target_is_up_to_date():
     committed = ROOT / "resources" / "targets" / "imaging_plane_4_inch.svg"
     assert committed.read_text(encoding="utf-8") == target_svg(Target())

@@ -1,4 +1,4 @@
-"""The adviser: what it keeps, what it promises, and what it says when nothing is possible."""
+"""The adviser: its constraints, predicted errors, and advice when nothing is possible."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from labapp.studies.adviser.search import Advice, Effort, Sweep, advise, constra
 from labapp.studies.parameter_deviation import NOMINAL
 
 EXPECTED = ExpectedPools((6.0, 7.0), (6.5, 8.0), (0.12, 0.2))
-# A roughly calibrated bench: what its plane's distance is worth shows on few pools.
+# A roughly calibrated bench: few pools suffice to show the effect of the plane's distance.
 LIMITS = BenchLimits(
     angle_deg=(28.0, 32.0),
     distance_mm=(26.0, 32.0),
@@ -43,7 +43,7 @@ def checked(advice: Advice) -> Check:
 
 
 @pytest.mark.parametrize("even", [True, False])
-def test_pools_are_drawn_within_the_ranges_and_again_the_same(even: bool) -> None:
+def test_pools_are_within_the_ranges_and_reproducible(even: bool) -> None:
     sample = EXPECTED.sample(40, 3, even)
     for pool in sample.pools:
         foot = pool.footprint
@@ -62,7 +62,7 @@ def test_pools_are_drawn_within_the_ranges_and_again_the_same(even: bool) -> Non
     assert sample.deviate.std() == pytest.approx(1, abs=0.1)
 
 
-def test_concave_pools_lie_below() -> None:
+def test_concave_pools_have_negative_peaks() -> None:
     concave = replace(EXPECTED, kind="concave")
     assert all(pool.peak_mm < 0 for pool in concave.sample(4, 0).pools)
     assert len(concave.corners(shifted=True)) == 32
@@ -72,80 +72,80 @@ def test_concave_pools_lie_below() -> None:
 @pytest.mark.parametrize(
     ("width", "height", "word"), [((7, 6), (0.1, 0.2), "width"), ((5, 6), (0.1, 2.6), "overhang")]
 )
-def test_impossible_pools_are_refused(
+def test_impossible_pools_are_rejected(
     width: tuple[float, float], height: tuple[float, float], word: str
 ) -> None:
     with pytest.raises(ValueError, match=word):
         ExpectedPools(width, (6, 7), height)
 
 
-# --- what a set-up keeps ------------------------------------------------------------------------
+# --- the margins --------------------------------------------------------------------------------
 
 
 def test_margins_are_those_of_a_flat_mirror() -> None:
-    """On a nearly flat pool rays go on at their own elevation: plane geometry gives the margins."""
+    """On a nearly flat pool rays keep their elevation: plane geometry gives the margins."""
     flat = ExpectedPools((6.0, 6.0), (6.0, 6.0), (0.01, 0.01), shift_mm=0.0)
     limits = BenchLimits(spacing_px=0.0)
     laser = LaserPlace(flat, limits, 30.0, 40.0)
     place = laser.place(50.0)
     margins = laser.margins(place)
     # The rays to the rim's ends, y = ±3, seen from the diode at (y, z) = 40·(cos 30°, sin 30°).
-    away, high = 40 * np.cos(np.pi / 6), 20.0
-    far, near = high / (away + 3), high / (away - 3)
+    horizontal, height = 40 * np.cos(np.pi / 6), 20.0
+    far, near = height / (horizontal + 3), height / (horizontal - 3)
     lowest, highest = far * (50 - 3), near * (50 + 3)
-    # The pool's own slope, 0.0133 at most, turns rays by twice that: 1.5 mm up there at most.
+    # The pool's slope, at most 0.0133, deflects rays by twice that: at most 1.5 mm on the plane.
     assert margins["torch"] == pytest.approx(5 - near * 3, abs=0.15)
     assert place.h_mm == pytest.approx(max((lowest + highest - 101.6) / 2, 0), abs=0.5)
     assert margins["up"] == pytest.approx(lowest - 1, abs=2)
     assert margins["across"] == pytest.approx(50.8 - 3 * (40 + 50) / 40 - 1, abs=3.0)
 
 
-def test_kept_margins_hold_for_pools_in_between() -> None:
+def test_positive_margins_hold_for_intermediate_pools() -> None:
     laser = LaserPlace(EXPECTED, LIMITS, 28.0, 30.0)
     place = laser.place(70.0)
     assert min(laser.margins(place).values()) >= 0
     for pool in EXPECTED.sample(16, 9).pools:
-        seen = trace(pool, LIMITS.rig(place))
-        assert not (seen.lit & ~seen.visible).any()
+        reflections = trace(pool, LIMITS.rig(place))
+        assert not (reflections.lit & ~reflections.visible).any()
 
 
-def test_broken_margins_are_seen_by_tracing() -> None:
+def test_negative_margins_are_confirmed_by_tracing() -> None:
     steep = ExpectedPools((5.0, 5.0), (5.5, 5.5), (0.5, 0.5), shift_mm=0.0)
     laser = LaserPlace(steep, LIMITS, 31.0, 35.0)
     place = laser.place(50.0)
     margins = laser.margins(place)
-    seen = trace(steep.corners(shifted=False)[0], LIMITS.rig(place))
+    reflections = trace(steep.corners(shifted=False)[0], LIMITS.rig(place))
     assert margins["torch"] < 0
-    assert (seen.lit & seen.blocked).any()
+    assert (reflections.lit & reflections.blocked).any()
     assert margins["up"] < 0
-    assert (seen.lit & ~seen.on_plane).any()
+    assert (reflections.lit & ~reflections.on_plane).any()
 
 
 # --- the errors ---------------------------------------------------------------------------------
 
 
-def test_an_exact_bench_is_better_than_an_uncertain_one() -> None:
+def test_exact_bench_is_better_than_an_uncertain_one() -> None:
     place = LaserPlace(EXPECTED, LIMITS, 28.0, 30.0).place(70.0)
-    known = {key: 0.0 if key.startswith("image") else 10 * NOMINAL[key] for key in NOMINAL}
-    rough = replace(LIMITS, sigma=known)
+    sigma = {key: 0.0 if key.startswith("image") else 10 * NOMINAL[key] for key in NOMINAL}
+    rough = replace(LIMITS, sigma=sigma)
     trial = Trial(rough, place, EXPECTED.sample(4, 1), 0, 4)
     exact = replace(trial, calibrated=False)
     assert simulated_errors(trial)[:, 0].mean() > 2 * simulated_errors(exact)[:, 0].mean()
     assert predicted_errors(trial).mean() > 2 * predicted_errors(exact).mean()
 
 
-def test_a_pool_without_dots_has_no_height() -> None:
+def test_pool_without_dots_has_an_infinite_error() -> None:
     sample = EXPECTED.sample(1, 1)
     small = replace(sample, pools=(spherical_cap(0.5, 0.02),))
     place = Place(26.0, 40.0, 70.0, 50.8, 0.0)
     assert np.isinf(simulated_errors(Trial(LIMITS, place, small, 0, 1))[0, 0])
 
 
-# --- the advice (Show 4, reduced) ---------------------------------------------------------------
+# --- the advice ---------------------------------------------------------------------------------
 
 
 @pytest.mark.slow
-def test_advice_is_possible_within_the_limits_and_the_same_again(advice: Advice) -> None:
+def test_advice_is_within_the_limits_and_reproducible(advice: Advice) -> None:
     assert advice.possible
     best = advice.best.place
     for value, (low, high) in (
@@ -161,9 +161,9 @@ def test_advice_is_possible_within_the_limits_and_the_same_again(advice: Advice)
 
 
 @pytest.mark.slow
-def test_fresh_pools_are_whole_and_as_well_measured_as_promised(checked: Check) -> None:
+def test_other_pools_are_visible_and_measured_as_predicted(checked: Check) -> None:
     assert not checked.chosen[..., 1:].any()
-    # So few have a mean that swings by a fifth, so twice Show 4's 20 % and some.
+    # The mean of so few scatters by a fifth: a little more than twice 20 % is allowed.
     assert abs(checked.off_prediction) < 0.5
     assert checked.error_mm < checked.text_error_mm
     assert len(checked.places)
@@ -172,25 +172,25 @@ def test_fresh_pools_are_whole_and_as_well_measured_as_promised(checked: Check) 
     assert "6 fresh pools at 4 places each: 0 rays hidden, 0 off the plane" in check_text(checked)
 
 
-def test_what_the_texts_set_up_does_not_keep_is_said(checked: Check) -> None:
-    # There the dots of a hollow cross: exact ones are told apart, those of a frame are not.
+def test_broken_constraints_of_the_dissertations_setup_are_listed(checked: Check) -> None:
+    # There the dots of a concave pool cross: exact ones can be separated, those of a frame cannot.
     hollow = ExpectedPools((5.0, 5.5), (5.5, 6.0), (0.25, 0.3), kind="concave")
     other = replace(checked, advice=replace(checked.advice, expected=hollow, limits=BenchLimits()))
     assert [words.split(":")[0] for words in other.text_breaks] == ["neighbouring dots apart"]
     assert other.text_breaks[0] in check_text(other)
 
 
-def test_sweeps_tell_where_a_set_up_breaks(advice: Advice) -> None:
+def test_sweeps_show_where_a_setup_breaks(advice: Advice) -> None:
     names = {sweep.name: sweep for sweep in advice.sweeps}
     assert list(names) == ["projection_angle_deg", "distance_mm", "plane_mm", "s_mm", "h_mm"]
     for name, sweep in names.items():
-        own = int(np.flatnonzero(sweep.value == getattr(advice.best.place, name))[0])
-        assert sweep.error_mm[own] == pytest.approx(advice.error_mm)
-        assert sweep.breaks(own) == ()
+        index = int(np.flatnonzero(sweep.value == getattr(advice.best.place, name))[0])
+        assert sweep.error_mm[index] == pytest.approx(advice.error_mm)
+        assert sweep.breaks(index) == ()
     assert "across" in names["s_mm"].breaks(0)
 
 
-def test_cost_of_a_mm_is_the_slope_of_its_curve(advice: Advice) -> None:
+def test_cost_per_mm_is_the_slope_of_its_curve(advice: Advice) -> None:
     best = replace(advice.best, place=Place(30.0, 30.0, 60.0, 50.0, 0.0))
     value, error = np.array([40.0, 50.0, 60.0, 70.0]), np.array([5.0, 4.0, 3.0, 2.5]) / 1000
     fine, bad = dict(advice.best.margins), {**advice.best.margins, "spacing": -1.0}
@@ -204,16 +204,16 @@ def test_cost_of_a_mm_is_the_slope_of_its_curve(advice: Advice) -> None:
     assert (more["kept_to"], more["broken_at"]) == (70, None)
 
 
-def test_where_nothing_is_possible_it_says_what_stands_in_the_way() -> None:
+def test_impossible_advice_names_the_broken_constraint() -> None:
     steep = ExpectedPools((5.0, 5.5), (5.5, 6.0), (0.4, 0.5))
-    found = advise(steep, LIMITS, LITTLE, workers=1)
-    assert not found.possible
-    assert np.isnan(found.error_mm)
-    assert found.best.margins["up"] < 0
+    advice = advise(steep, LIMITS, LITTLE, workers=1)
+    assert not advice.possible
+    assert np.isnan(advice.error_mm)
+    assert advice.best.margins["up"] < 0
     assert constraint_text("up", -2.0) == ("dots on the plate, above and below: 2 mm too little")
 
 
-def test_what_progress_raises_ends_the_search() -> None:
+def test_exception_in_progress_ends_the_search() -> None:
     class StopNow(Exception):
         pass
 

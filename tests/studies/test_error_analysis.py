@@ -1,4 +1,4 @@
-"""Chapter 8 by simulation: CE, LE, ME, the thumb tack, and what moves a bench; against the text."""
+"""Chapter 8 by simulation: CE, LE, ME, thumb tack and wrong setups, against published values."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ from labapp.studies.setup_budget import SetupBudget, budget_table, similar_pool
 
 @pytest.fixture(scope="module")
 def ce() -> ErrorSurvey:
-    """Two schemes on the 28 caps of §8.3.1, each at one of its centres."""
+    """Survey two schemes on the 28 caps of §8.3.1, each at one of its centres."""
     return survey("CE", ("ers", "fit"), caps=aside(caps_8_3_1(), 1), workers=1)
 
 
 @pytest.mark.slow
-def test_ers_errs_as_the_text_has_it(ce: ErrorSurvey) -> None:
-    # Fig. 8-6: CE-D 8.0 % on the mean, 26.9 % at worst; CE-B up to 2.51 %.
+def test_errors_of_ers_are_those_of_the_dissertation(ce: ErrorSurvey) -> None:
+    # Fig. 8-6: CE-D has a mean of 8.0 % and a maximum of 26.9 %; CE-B is at most 2.51 %.
     assert len(ce.caps) == 28
     depth, boundary = ce.of("ers", "depth"), ce.of("ers", "boundary")
     assert 0.04 < depth.mean() < 0.09
@@ -43,53 +43,53 @@ def test_ers_errs_as_the_text_has_it(ce: ErrorSurvey) -> None:
 
 
 @pytest.mark.parametrize("surface", ["convex", "concave"])
-def test_fit_is_below_ers(ce: ErrorSurvey, surface: str) -> None:
+def test_errors_of_fit_are_below_those_of_ers(ce: ErrorSurvey, surface: str) -> None:
     for error in ("depth", "boundary"):
         ers, fitted = ce.of("ers", error, surface), ce.of("fit", error, surface)
         assert fitted.mean() < ers.mean()
-        # On one hollow no ray lands between −0.1 and +2 % of its diameter: there fit's boundary
-        # is 1.5 % off, where ERS, with one radius for all, is at most 1.3 % off.
+        # On one concave cap no ray lands between −0.1 and +2 % of its diameter: there the boundary
+        # of fit is 1.5 % off; ERS, with a single radius, is at most 1.3 % off.
         assert fitted.max() < (0.016 if (error, surface) == ("boundary", "concave") else ers.max())
     assert ce.of("fit", "depth", surface).mean() < 0.01
     assert ce.of("fit", "depth", surface).max() < 0.036
 
 
 @pytest.mark.slow
-def test_the_best_place_of_the_laser_leaves_ers_less_than_one_percent() -> None:
-    # Fig. 8-8: 0.6 % at most. The deep hollows are the worst of the 28. The fewer the places of the
-    # laser (here 10/3° and 10/3 mm apart), the larger their least error.
-    found = survey("LE", ["ers"], 10 / 3, caps=caps_8_3_1()[21:], workers=1)
-    assert found.lost[0] == 0
-    assert found.of("ers", "depth").max() < 0.01
+def test_best_laser_position_gives_ers_errors_below_1_percent() -> None:
+    # Fig. 8-8: 0.6 % at most. The deep concave caps are the worst of the 28. The fewer the laser
+    # positions (here 10/3° and 10/3 mm apart), the larger their least error.
+    result = survey("LE", ["ers"], 10 / 3, caps=caps_8_3_1()[21:], workers=1)
+    assert result.lost[0] == 0
+    assert result.of("ers", "depth").max() < 0.01
 
 
 @pytest.mark.slow
-def test_a_denser_pattern_leaves_less() -> None:
-    # §8.3.3, with the laser at nine places.
+def test_denser_pattern_gives_smaller_errors() -> None:
+    # §8.3.3, with nine laser positions.
     caps = caps_8_3_1()[1::5]
     le, me = (survey(kind, ["ers"], 5.0, caps, workers=1) for kind in ("LE", "ME"))
     assert me.of("ers", "depth").mean() < le.of("ers", "depth").mean()
     assert me.of("ers", "actual_are_mm").mean() < le.of("ers", "actual_are_mm").mean()
 
 
-def test_tables_tell_mean_and_worst_beside_the_text(ce: ErrorSurvey) -> None:
-    made = error_table([ce])
-    row = dict(zip(made.columns, made.rows[2], strict=True))
+def test_table_compares_mean_and_worst_with_the_dissertation(ce: ErrorSurvey) -> None:
+    table = error_table([ce])
+    row = dict(zip(table.columns, table.rows[2], strict=True))
     assert (row["error"], row["surface"]) == ("CE-D", "all")
     assert row["ers_mean_pct"] == pytest.approx(100 * ce.of("ers", "depth").mean())
     assert row["text_worst_pct"] == pytest.approx(26.9)
-    assert "| 26.9" in made.markdown()
+    assert "| 26.9" in table.markdown()
 
 
-def test_places_of_the_laser_span_the_range_of_8_3_2() -> None:
+def test_laser_positions_span_the_range_of_8_3_2() -> None:
     places = [(one.projection_angle_deg, one.distance_mm) for one in error_analysis.laser_places(2)]
     assert len(places) == len(set(places)) == 36
     assert (min(places), max(places)) == ((25.0, 25.0), (35.0, 35.0))
 
 
 @pytest.mark.slow
-def test_the_thumb_tack_of_8_2() -> None:
-    # The text: height 9.12 % with ERS, diameter 1.49 %; exact reflections leave fit 0.5 %.
+def test_thumb_tack_of_8_2() -> None:
+    # §8.2: height 9.12 % with ERS, diameter 1.49 %. With exact reflections, fit has 0.5 %.
     frames = image_error.frame_errors([TACK], TACK_RIG, 2, schemes=("ers", "fit"), workers=1)[0]
     assert (trace(TACK, TACK_RIG).lit & ~trace(TACK, TACK_RIG).on_plane).any()
     for frame in frames:
@@ -102,11 +102,11 @@ def test_the_thumb_tack_of_8_2() -> None:
         assert np.median(frame.off_px) < 0.5
 
 
-# --- what moves a bench -----------------------------------------------------------------------
+# --- wrong setups -----------------------------------------------------------------------------
 
 
-def test_a_bench_that_is_off_is_told_by_its_dots() -> None:
-    """Dots of the true bench, taken for another's: moved back, they are the true ones."""
+def test_moved_bench_is_consistent_with_its_dots() -> None:
+    """Dots seen on a moved bench are those that the moved calibration gives."""
     known = exactly_seen(spherical_cap(6.0, 0.3), BENCH)
     offset = np.zeros(len(QUANTITIES))
     moved = {
@@ -135,25 +135,25 @@ def test_a_bench_that_is_off_is_told_by_its_dots() -> None:
 
 
 def doubtful(known: RigUncertainty) -> RigUncertainty:
-    """Twice as uncertain."""
+    """Return the uncertainty, doubled."""
     return replace(known, covariance=4 * known.covariance)
 
 
 @pytest.mark.slow
-def test_parts_add_up_to_what_the_draws_scatter_by() -> None:
-    # JCGM 101, 8: a bench that is well known acts linearly.
+def test_contributions_add_up_to_the_scatter_of_the_draws() -> None:
+    # JCGM 101, 8: the response is linear if the uncertainties are small.
     known = exactly_seen(spherical_cap(6.0, 0.3), BENCH)
-    found = parameter_deviation.parameter_deviation(known, "ers", draws=150, workers=1)
-    assert found.contribution.shape == (len(QUANTITIES), 2)
-    assert ((found.contribution == 0).all(axis=1) == (found.uncertainty.sigma == 0)).all()
-    np.testing.assert_allclose(found.linear, found.standard, rtol=0.3)
-    low, high = found.interval[0]
-    within = (found.draws[:, 0] >= low) & (found.draws[:, 0] <= high)
+    deviation = parameter_deviation.parameter_deviation(known, "ers", draws=150, workers=1)
+    assert deviation.contribution.shape == (len(QUANTITIES), 2)
+    assert ((deviation.contribution == 0).all(axis=1) == (deviation.uncertainty.sigma == 0)).all()
+    np.testing.assert_allclose(deviation.linear, deviation.standard, rtol=0.3)
+    low, high = deviation.interval[0]
+    within = (deviation.draws[:, 0] >= low) & (deviation.draws[:, 0] <= high)
     assert low < 0 < high
     assert within.mean() == pytest.approx(0.95, abs=0.01)
     doubled = replace(known, uncertainty=doubtful(known.uncertainty))
     twice = parameter_deviation.parameter_deviation(doubled, "ers", draws=2, workers=1)
-    np.testing.assert_allclose(twice.contribution[1], 2 * found.contribution[1], rtol=0.1)
+    np.testing.assert_allclose(twice.contribution[1], 2 * deviation.contribution[1], rtol=0.1)
 
 
 # --- prediction -------------------------------------------------------------------------------
@@ -161,9 +161,9 @@ def test_parts_add_up_to_what_the_draws_scatter_by() -> None:
 
 @pytest.mark.parametrize("sign", [1, -1])
 @pytest.mark.slow
-def test_the_predicted_error_is_what_the_fit_makes(sign: int) -> None:
+def test_predicted_error_agrees_with_the_fit(sign: int) -> None:
     rng = np.random.default_rng(3)
-    predicted, made = [], []
+    predicted, errors = [], []
     for _ in range(16):
         width = rng.uniform(5.0, 7.5)
         pool = egg(
@@ -175,20 +175,20 @@ def test_the_predicted_error_is_what_the_fit_makes(sign: int) -> None:
         )
         match = exact_match(trace(pool, BENCH), BENCH, sigma_mm=DOT_SIGMA_MM, rng=rng)
         size = measure_surface(fit.reconstruct(match, BENCH, FitSettings()), match, BENCH)
-        found = size.height_mm if sign > 0 else -size.depth_mm
-        made.append(found - abs(pool.peak_mm))
+        measured = size.height_mm if sign > 0 else -size.depth_mm
+        errors.append(measured - abs(pool.peak_mm))
         predicted.append(predict_error(pool, BENCH).random_mm)
-    ratio = np.sqrt(np.mean(np.square(predicted)) / np.mean(np.square(made)))
+    ratio = np.sqrt(np.mean(np.square(predicted)) / np.mean(np.square(errors)))
     assert 0.7 < ratio < 1.45
 
 
-def test_a_prediction_counts_what_is_lost() -> None:
+def test_prediction_counts_lost_dots() -> None:
     pool = spherical_cap(6.0, 0.6)
     low = replace(BENCH, electrode=Electrode(1.5))
-    seen = trace(pool, low)
-    found = predict_error(pool, low)
-    assert found.blocked == (seen.lit & seen.blocked).sum() > 0
-    assert found.dots == seen.visible.sum()
+    reflections = trace(pool, low)
+    prediction = predict_error(pool, low)
+    assert prediction.blocked == (reflections.lit & reflections.blocked).sum() > 0
+    assert prediction.dots == reflections.visible.sum()
     far = replace(BENCH, imaging_plane=ImagingPlane.vertical(150.0, 50.8, 0.0))
     assert predict_error(pool, far).off_plane > 0
     nothing = predict_error(pool, replace(BENCH, imaging_plane=ImagingPlane.vertical(50, 0, 500.0)))
@@ -196,7 +196,7 @@ def test_a_prediction_counts_what_is_lost() -> None:
     assert nothing.total_mm == np.inf
 
 
-def test_a_calibration_known_worse_makes_the_prediction_worse() -> None:
+def test_predicted_error_grows_with_calibration_uncertainty() -> None:
     pool = spherical_cap(6.0, 0.3)
     known = nominal(axes_of(VIEW))
     once = predict_error(pool, BENCH, uncertainty=known)
@@ -207,20 +207,20 @@ def test_a_calibration_known_worse_makes_the_prediction_worse() -> None:
     assert ((once.parameters_mm == 0) == (known.sigma == 0)).all()
 
 
-def test_the_prediction_of_the_setups_part_is_what_the_fit_propagates() -> None:
-    """All quantities of the one model, and their correlation: predicted without, found by fits."""
+def test_predicted_setup_part_agrees_with_the_fit() -> None:
+    """All quantities of the model, with their correlation."""
     pool = spherical_cap(6.0, 0.3)
     known = RigUncertainty(axes_of(VIEW), *covariance_of({}, 0.9))
     rig = replace(BENCH, uncertainty=known)
     match = exact_match(trace(pool, BENCH), BENCH, sigma_mm=0.02, rng=np.random.default_rng(2))
-    made = fit.reconstruct(match, rig, FitSettings())
+    reconstruction = fit.reconstruct(match, rig, FitSettings())
     predicted = predict_error(pool, BENCH, uncertainty=known)
-    assert predicted.setup_mm == pytest.approx(made.size_sigma_setup[2], rel=0.25)
+    assert predicted.setup_mm == pytest.approx(reconstruction.size_sigma_setup[2], rel=0.25)
     alone = replace(known, covariance=np.diag(np.diag(known.covariance)))
     assert predict_error(pool, BENCH, uncertainty=alone).setup_mm != predicted.setup_mm
 
 
-def test_a_budget_table_adds_up_in_squares() -> None:
+def test_budget_table_adds_up_in_squares() -> None:
     rng = np.random.default_rng(0)
     pool = spherical_cap(6.0, 0.3)
     pools = [similar_pool(pool, rng) for _ in range(3)]
@@ -228,17 +228,17 @@ def test_a_budget_table_adds_up_in_squares() -> None:
     known = nominal(axes_of(VIEW))
     predicted = tuple(predict_error(one, BENCH, uncertainty=known) for one in pools)
     random = np.array([0.003, np.nan, -0.004])
-    made = budget_table(
+    table = budget_table(
         SetupBudget(pool, known, predicted, random, np.full((2, len(QUANTITIES)), 0.01))
     )
-    rows = {row[0]: row[1:] for row in made.rows}
+    rows = {row[0]: row[1:] for row in table.rows}
     assert rows["these together"][1] == pytest.approx(100 * np.sqrt(12.5e-6))
     assert rows["everything"][1] == pytest.approx(100 * np.sqrt(12.5e-6 + 1.1e-3))
     uncertain = [QUANTITIES[k].name for k in np.flatnonzero(known.sigma)]
     assert len(uncertain) == 11
     parts = [rows[name][0] for name in uncertain] + [rows["these together"][0]]
     assert rows["everything"][0] == pytest.approx(np.linalg.norm(parts))
-    assert "1 without a surface" in made.caption
+    assert "1 without a surface" in table.caption
 
 
 # --- on all cores -----------------------------------------------------------------------------
@@ -246,9 +246,9 @@ def test_a_budget_table_adds_up_in_squares() -> None:
 
 @pytest.mark.parametrize("workers", [1, 2])
 def test_results_keep_the_order_of_the_tasks(workers: int) -> None:
-    told: list[tuple[str, int, int]] = []
-    found = in_parallel(abs, range(-9, 1), "all", lambda *what: told.append(what), workers)
-    assert found == list(range(9, -1, -1))
-    assert told[0] == ("all", 0, 10)
-    assert told[-1] == ("all", 10, 10)
+    progress: list[tuple[str, int, int]] = []
+    results = in_parallel(abs, range(-9, 1), "all", lambda *what: progress.append(what), workers)
+    assert results == list(range(9, -1, -1))
+    assert progress[0] == ("all", 0, 10)
+    assert progress[-1] == ("all", 10, 10)
     assert in_parallel(abs, [], workers=workers) == []

@@ -15,7 +15,7 @@ from labapp.studies.frame_comparison import comparison_tables, shape_table, with
 MATCH = exact_match(trace(egg(6.0, 2.7, 3.4, 0.3), OPEN_BENCH), OPEN_BENCH)
 
 
-def test_rays_are_mirrored_about_the_marker() -> None:
+def test_rays_are_mirrored_around_the_marker() -> None:
     assert MATCH.orientation == "S/S"
     turned = with_orientation(MATCH, OPEN_BENCH, "I/I")
     assert turned.orientation == "I/I"
@@ -32,13 +32,13 @@ def test_rows_of_a_convex_pool_agree_with_its_correspondence() -> None:
     assert named["rows"] == "convex"
     assert named["by_residual"] == "S/S"
     assert named["agree"] == "yes"
-    # The same dots with rows that allow another: they are told to differ.
+    # The same dots with an orientation that their rows do not allow.
     (row,) = shape_table(replace(MATCH, orientation="S/I")).rows
     assert row[-1] == "no"
 
 
 @pytest.mark.slow
-def test_the_true_correspondence_has_the_least_error_with_every_algorithm() -> None:
+def test_true_correspondence_has_the_least_error() -> None:
     edge, one = comparison_tables(MATCH, OPEN_BENCH)
     assert len(edge.rows) == 9
     assert len(one.rows) == 3 * 11
@@ -48,7 +48,7 @@ def test_the_true_correspondence_has_the_least_error_with_every_algorithm() -> N
     for height in {row[1] for row in one.rows}:
         errors = {row[0]: row[2] for row in one.rows if row[1] == height}
         assert min(errors, key=lambda way: errors[way] or np.inf) == "S/S"
-    # Points inside are better than those at the edges (Fig. 6-16).
-    own = np.array([row[2:] for row in one.rows if row[0] == "S/S"], float)
-    assert (own[:, 2] < own[:, 0]).all()
-    assert (own[:, 3] <= own[:, 1]).all()
+    # Inner points have smaller errors than those at the edges (Fig. 6-16).
+    true_errors = np.array([row[2:] for row in one.rows if row[0] == "S/S"], float)
+    assert (true_errors[:, 2] < true_errors[:, 0]).all()
+    assert (true_errors[:, 3] <= true_errors[:, 1]).all()

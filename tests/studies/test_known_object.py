@@ -1,4 +1,4 @@
-"""The measurement error of a user's own known object (§8.2)."""
+"""The measurement error of a known object of the user (§8.2)."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ def test_errors_are_relative_to_the_entered_size() -> None:
 
 
 @pytest.mark.slow
-def test_a_rendered_tack_is_measured_as_in_section_8_2() -> None:
+def test_rendered_tack_is_measured_as_in_section_8_2() -> None:
     frame = rendered(TACK, TACK_RIG, 0)
-    found = measure(frame.image, Bench(TACK_RIG, axes_of(VIEW).calibration), Settings())[0]
-    assert found.match is not None
-    rows = named_rows(known_object_table(found.match, TACK_RIG, TACK))
+    result = measure(frame.image, Bench(TACK_RIG, axes_of(VIEW).calibration), Settings())[0]
+    assert result.match is not None
+    rows = named_rows(known_object_table(result.match, TACK_RIG, TACK))
     assert rows["fit"]["height_error_pct"] < 2
     assert rows["ers"]["height_error_pct"] < 15
 
 
 @pytest.mark.parametrize(("diameter", "height"), [(0.0, 0.1), (40, 1), (9, 0), (9, 3), (9, -3)])
-def test_an_impossible_object_is_refused(diameter: float, height: float) -> None:
+def test_impossible_object_is_rejected(diameter: float, height: float) -> None:
     with pytest.raises(InputError):
         known_cap(diameter, height)
