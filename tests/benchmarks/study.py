@@ -192,18 +192,11 @@ class ProcessWatcher:
         """Total processor time, s."""
         return sum(self._used.values())
 
-<<<<<<< HEAD
     def memory_text(self) -> str:
         """Largest memory of the first program, and of a worker in each third of the time, MB."""
         program, worker = np.array(self.memory).T / 1e6
         thirds = [round(float(part.max())) for part in np.array_split(worker, 3)]
         return f"workers at most {thirds} MB in each third of the time, program {program.max():.0f}"
-=======
-    def thirds_mb(self) -> list[float]:
-        """Return the largest resident memory of a process in each third of the time, MB."""
-        sizes = np.array([size for *_, size in self.memory]) / 1e6
-        return [round(float(part.max()), 0) for part in np.array_split(sizes, 3)]
->>>>>>> words1
 
 
 def timed(command: list[str], *others: int) -> str:
@@ -215,8 +208,7 @@ def timed(command: list[str], *others: int) -> str:
     wall_s = time.perf_counter() - start_s
     load = os.getloadavg()[0]
     return (
-        f"{wall_s:.1f} s wall, {seen.processor_s:.1f} s, {seen.memory_text()} MB, load {load:.1f}"
-        f"{used.thirds_mb()} MB, load {load:.1f}"
+        f"{wall_s:.1f} s wall, {used.processor_s:.1f} s, {used.memory_text()} MB, load {load:.1f}"
     )
 
 

@@ -71,7 +71,6 @@ def test_a_steady_pool_neither_grows_nor_flattens():
     assert set(line_states(series)) == {"concave"}
 
 
-<<<<<<< HEAD
 def test_convex_pool_that_bulges_further_is_not_flattening():
     rng = np.random.default_rng(5)
     turn = np.interp(np.arange(120), [60, 80], [0.2, 0.5]) + 0.01 * rng.normal(size=120)
@@ -79,10 +78,7 @@ def test_convex_pool_that_bulges_further_is_not_flattening():
     assert set(line_states(series)) == {"convex"}
 
 
-def test_frames_without_a_surface_keep_the_state_before_them():
-=======
 def test_frames_without_a_surface_keep_the_previous_state():
->>>>>>> words1
     turn = np.concatenate([np.full(100, -0.3), np.full(40, np.nan)])
     width = np.where(np.isfinite(turn), 6.0, np.nan)
     assert set(line_states(LineSeries(np.full(140, 5), width, turn))) == {"concave"}
