@@ -229,10 +229,8 @@ def test_choosing_a_dot_brings_the_buttons_that_correct_it_into_view(
 
     def in_view() -> list[bool]:
         let_draw()
-        return [
-            each.visibleRegion().boundingRect() == each.rect()
-            for each in map(panel.buttons.get, ("Delete", "In doubt", "Blocked"))
-        ]
+        buttons = [panel.buttons[words] for words in ("Delete", "In doubt", "Blocked")]
+        return [each.visibleRegion().boundingRect() == each.rect() for each in buttons]
 
     assert not all(in_view())
     panel.rows.setFocus()
