@@ -92,7 +92,7 @@ class Setup:
         """
         calibrated = self._frame_px
         height, width = shape
-        if calibrated not in (None, (width, height)):
+        if calibrated is not None and calibrated != (width, height):
             wanted = "{}×{} px, the size of the calibration picture (frame_px in the set-up): "
             advice = "calibrate the imaging plane with a picture of the same size as the frames"
             raise InputError(

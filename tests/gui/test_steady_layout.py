@@ -225,10 +225,8 @@ def test_selected_dot_scrolls_its_buttons_into_view(opened: MainWindow, qtbot: Q
 
     def in_view() -> list[bool]:
         let_draw()
-        return [
-            each.visibleRegion().boundingRect() == each.rect()
-            for each in map(panel.buttons.get, ("Delete", "In doubt", "Blocked"))
-        ]
+        buttons = [panel.buttons[words] for words in ("Delete", "In doubt", "Blocked")]
+        return [each.visibleRegion().boundingRect() == each.rect() for each in buttons]
 
     assert not all(in_view())
     panel.rows.setFocus()

@@ -103,6 +103,8 @@ class VideoSource(FrameSource):
         If it has no complete frame.
     """
 
+    _decoded: Iterator[tuple[int, VideoFrame]]
+    """Frames from here on, with their numbers."""
     _shown: tuple[int, VideoFrame] | None
     """Last frame read, with its number."""
     _ahead: tuple[int, VideoFrame] | None
