@@ -701,7 +701,8 @@ def test_board_calibrates_lens_and_plane_of_a_setup(labapp: Run, tmp_path: Path)
     code, stdout, stderr = labapp("calibrate", "plane", picture, "--setup", setup)
     assert (code, stderr) == (0, "")
     assert "charuco_4_inch" in stdout
-    from labapp.config.setup import lens_of, read_setup
+    from labapp.config.setup import read_setup
+    from labapp.config.setup_text import lens_of
 
     calibrated = read_setup(setup)
     assert calibrated.calibration.lens == lens_of(setup.read_text())

@@ -17,6 +17,22 @@ if TYPE_CHECKING:
     from labapp.core.dynamics.analysis import Dynamics, DynamicsSettings
     from labapp.session.signals import Signals
 
+Segment = Annotated[
+    float | None,
+    typer.Option(
+        min=1e-6,
+        help="Duration of a segment of the spectrogram (s). Default: an eighth of the series.",
+    ),
+]
+
+Start = Annotated[
+    float | None,
+    typer.Option(
+        callback=finite,
+        help="Time of the signals' start in the recording (s). Default: 0, or the session's.",
+    ),
+]
+
 
 def dynamics(
     source: Annotated[
@@ -38,13 +54,7 @@ def dynamics(
             "the frame rate.",
         ),
     ] = None,
-    segment: Annotated[
-        float | None,
-        typer.Option(
-            min=1e-6,
-            help="Duration of a segment of the spectrogram (s). Default: an eighth of the series.",
-        ),
-    ] = None,
+    segment: Segment = None,
     signals: Annotated[
         Path | None,
         typer.Option(help="Current, voltage, wire feed: CSV, TDMS or WAV; else the session's."),
@@ -53,13 +63,7 @@ def dynamics(
         tuple[float, float, float],
         typer.Option(metavar="A V M/MIN", help="Full scale of a WAV's channels."),
     ] = (1.0, 1.0, 1.0),
-    start: Annotated[
-        float | None,
-        typer.Option(
-            callback=finite,
-            help="Time of the signals' start in the recording (s). Default: 0, or the session's.",
-        ),
-    ] = None,
+    start: Start = None,
     align: Annotated[
         Path | None,
         typer.Option(

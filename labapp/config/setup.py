@@ -23,8 +23,8 @@ from labapp.config.bench_check import (
 )
 from labapp.config.ray_file import with_rays
 from labapp.config.setup_keys import OPTIONAL, SECTIONS, rules_for
+from labapp.config.setup_text import frame_px_of
 from labapp.config.toml_keys import (
-    are_numbers,
     check_keys,
     parse_toml,
     read_text,
@@ -45,7 +45,6 @@ from labapp.core.geometry.uncertainty import (
     RigUncertainty,
     covariance_of,
 )
-from labapp.core.values import FloatArray
 from labapp.errors import InputError, os_errors_as_input
 from labapp.files import write_atomically
 
@@ -228,51 +227,6 @@ _SHARED = {
     "laser": ("angle_distance_correlation",),
     "image_calibration": ("points_covariance_px2", "frame_px"),
 }
-
-
-def pattern_kind(text: str) -> str:
-    """Kind of pattern in the text of a setup, which may be incomplete."""
-    kind = _section(text, "pattern").get("kind")
-    return kind if isinstance(kind, str) else DotPattern.kind
-
-
-def lens_of(text: str) -> Lens | None:
-    """Lens in the text of a setup, which may be incomplete; None if there is none."""
-    keys = _section(text, "camera_lens")
-    names = ("focal_px", "center_px", "distortion")
-    lens: dict[str, Any] = {name: keys.get(name) for name in names}
-    if check_keys(Path(), "camera_lens", lens, SECTIONS["camera_lens"]):
-        return None
-    return Lens(**{name: tuple(value) for name, value in lens.items()})
-
-
-def three_points(text: str) -> FloatArray | None:
-    """(u, v) of O′ and the points on the axes in the text of a setup, shape (3, 2), px.
-
-    The text may be incomplete; None if it does not have all three.
-    """
-    keys = _section(text, "image_calibration")
-    points = [keys.get(name) for name in ("origin_px", "x_axis_px", "z_axis_px")]
-    return np.array(points, float) if all(are_numbers(point, 2) for point in points) else None
-
-
-def frame_px_of(text: str) -> tuple[int, int] | None:
-    """(width, height) of the calibration picture in the text of a setup, which may be incomplete.
-
-    None if it is unknown.
-    """
-    size = _section(text, "image_calibration").get("frame_px")
-    rule = SECTIONS["image_calibration"]["frame_px"]
-    return (size[0], size[1]) if rule.accepts(size) and isinstance(size, list) else None
-
-
-def _section(text: str, name: str) -> dict[str, Any]:
-    """A section of the text of a setup; empty if it is missing or the text is not TOML."""
-    try:
-        section = _parsed(text, "").unwrap().get(name)
-    except InputError:
-        return {}
-    return section if isinstance(section, dict) else {}
 
 
 def checked_setup(text: str, path: str | os.PathLike[str], check: BenchCheck, date: str) -> str:

@@ -72,20 +72,17 @@ class ExportChoice:
     tables
         Tables as CSV: some of ``measures``, ``dots``, ``points``, ``boundary``.
     surfaces
-        Formats of each surface: some of ``csv``, ``stl``, ``stl-ascii``, ``ply``, ``vtp``, and
-        those added by `add_export_format`.
+        Formats of each surface: ``csv``, ``stl``, ``stl-ascii``, ``ply``, ``vtp``, or added ones.
     solid
         Whether to add each surface as a watertight solid, in the mesh formats of `surfaces`.
     hdf5
         Short for ``hdf5`` in `together`.
     pictures
-        Some of ``frames`` (dots over each frame), ``surfaces`` (each in 3-D), ``trends`` and
-        ``film`` (all surfaces in the same view and on the same colour scale).
+        Some of ``frames`` (dots over each frame), ``surfaces`` (each in 3-D), ``trends``, ``film``.
     spacing_mm
         Distance between the surfaces' nodes, mm.
     view
-        View of surfaces in pictures and the film: ``free`` (oblique), ``top``, ``side`` or
-        ``front``.
+        View in pictures and the film: ``free`` (oblique), ``top``, ``side`` or ``front``.
     size_px
         Width and height of these, even, px.
     film_rate_hz

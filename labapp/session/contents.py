@@ -114,7 +114,7 @@ class SessionContents:
     @property
     def has_lines(self) -> bool:
         """Whether the pattern consists of lines rather than dots."""
-        from labapp.config.setup import pattern_kind
+        from labapp.config.setup_text import pattern_kind
 
         return pattern_kind(self.setup_text) == "lines"
 

@@ -243,7 +243,7 @@ class Session(SessionContents):
         InputError
             If the picture cannot be read.
         """
-        from labapp.config.setup import lens_of
+        from labapp.config.setup_text import lens_of
         from labapp.core.calibration.plane_calibration import (
             PlaneCalibrationSettings,
             calibrate_plane,

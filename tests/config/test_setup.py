@@ -9,7 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from labapp.config.setup import frame_px_of, read_setup, update_setup
+from labapp.config.setup import read_setup, update_setup
+from labapp.config.setup_text import frame_px_of
 from labapp.core.geometry.rig import Laser
 from labapp.core.geometry.uncertainty import (
     ANGLE,

@@ -85,7 +85,7 @@ def _calibrated(
     tuple
         The calibration, and (rows, columns) of the first picture.
     """
-    from labapp.config.setup import lens_of
+    from labapp.config.setup_text import lens_of
     from labapp.core.calibration.boards import A_BOARD, parse_board
     from labapp.core.calibration.imaging_plane import calibrate_imaging_plane
     from labapp.core.calibration.plane_calibration import PlaneCalibrationSettings

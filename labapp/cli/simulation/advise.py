@@ -36,9 +36,7 @@ def advise(
     ] = None,
     convex: Annotated[
         bool | None,
-        typer.Option(
-            "--convex/--concave", help="Pools above or below the work piece. Default: above."
-        ),
+        typer.Option("--convex/--concave", help="Kind of the pools. Default: convex."),
     ] = None,
     angle: Annotated[
         str | None, typer.Option(metavar="A:B", help="Range of the laser's angle (degrees).")

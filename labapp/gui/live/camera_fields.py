@@ -11,7 +11,7 @@ from typing import Any
 from PySide6.QtCore import QObject, Signal
 from PySide6.QtWidgets import QWidget
 
-from labapp.config.setup import frame_px_of, three_points
+from labapp.config.setup_text import frame_px_of, three_points
 from labapp.errors import InputError
 from labapp.gui.shell.steps import calibrations_in_use
 from labapp.gui.widgets.buttons import button

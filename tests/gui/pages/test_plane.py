@@ -13,7 +13,7 @@ from PySide6.QtCore import Qt
 from PySide6.QtWidgets import QPushButton
 from pytestqt.qtbot import QtBot
 
-from labapp.config.setup import lens_of
+from labapp.config.setup_text import lens_of
 from labapp.core.calibration.board_calibration import BoardCalibration
 from labapp.core.calibration.boards import BOARDS
 from labapp.core.calibration.mark_fit import Model

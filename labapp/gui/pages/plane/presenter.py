@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from labapp.config.setup import lens_of
+from labapp.config.setup_text import lens_of
 from labapp.core.calibration.board_calibration import BoardCalibration
 from labapp.core.calibration.imaging_plane import Calibration, calibrate_imaging_plane
 from labapp.core.calibration.mark_fit import Model, root_mean_square

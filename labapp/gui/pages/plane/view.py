@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pyqtgraph as pg
 
-from labapp.config.setup import lens_of
+from labapp.config.setup_text import lens_of
 from labapp.core.calibration.board_calibration import BoardCalibration
 from labapp.core.calibration.boards import BOARDS
 from labapp.core.calibration.imaging_plane import Calibration

@@ -1,0 +1,54 @@
+"""Values in the text of a setup that may be incomplete, as while it is being entered."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from labapp.config.setup_keys import SECTIONS
+from labapp.config.toml_keys import are_numbers, check_keys
+from labapp.core.geometry.coordinates import Lens
+from labapp.core.geometry.rig import DotPattern
+from labapp.core.values import FloatArray
+
+
+def pattern_kind(text: str) -> str:
+    """Kind of the pattern."""
+    kind = _section(text, "pattern").get("kind")
+    return kind if isinstance(kind, str) else DotPattern.kind
+
+
+def lens_of(text: str) -> Lens | None:
+    """Lens of the camera; None if there is none."""
+    keys = _section(text, "camera_lens")
+    names = ("focal_px", "center_px", "distortion")
+    lens: dict[str, Any] = {name: keys.get(name) for name in names}
+    if check_keys(Path(), "camera_lens", lens, SECTIONS["camera_lens"]):
+        return None
+    return Lens(**{name: tuple(value) for name, value in lens.items()})
+
+
+def three_points(text: str) -> FloatArray | None:
+    """(u, v) of O′ and the points on the axes, shape (3, 2), px; None without all three."""
+    keys = _section(text, "image_calibration")
+    points = [keys.get(name) for name in ("origin_px", "x_axis_px", "z_axis_px")]
+    return np.array(points, float) if all(are_numbers(point, 2) for point in points) else None
+
+
+def frame_px_of(text: str) -> tuple[int, int] | None:
+    """(width, height) of the calibration picture, px; None if it is unknown."""
+    size = _section(text, "image_calibration").get("frame_px")
+    rule = SECTIONS["image_calibration"]["frame_px"]
+    return (size[0], size[1]) if rule.accepts(size) and isinstance(size, list) else None
+
+
+def _section(text: str, name: str) -> dict[str, Any]:
+    """A section of the text of a setup; empty if it is missing or the text is not TOML."""
+    try:
+        section = tomllib.loads(text).get(name)
+    except tomllib.TOMLDecodeError:
+        return {}
+    return section if isinstance(section, dict) else {}
