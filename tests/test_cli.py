@@ -316,6 +316,33 @@ def test_invalid_stream_address_is_rejected(
     assert not (tmp_path / "out").exists()
 
 
+LOSES_AN_INTERRUPT = """
+import ctypes, signal, sys, time
+from labapp import cli
+
+def lose(*_):
+    ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(int(sys.argv[1])))()
+    time.sleep(1000)
+
+signal.signal(signal.SIGINT, signal.default_int_handler)
+cli.asks_for_app = lose
+cli.main([])
+"""
+
+
+@pytest.mark.parametrize(("sent", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_in_a_callback_of_the_compiler_stops_the_program(
+    sent: signal.Signals, code: int
+) -> None:
+    """An exception in a callback from C is ignored by Python."""
+    done = subprocess.run(
+        [sys.executable, "-c", LOSES_AN_INTERRUPT, str(int(sent))],
+        capture_output=True, text=True, check=False, timeout=PATIENCE_S,
+    )  # fmt: skip
+    assert done.returncode == code
+    assert "Traceback" not in done.stderr
+
+
 @pytest.mark.parametrize(("signal_number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_stopped_run_leaves_complete_frames(
     tmp_path: Path, signal_number: signal.Signals, code: int

@@ -8,9 +8,11 @@ and Ctrl-C during an import is handled like any other.
 
 from __future__ import annotations
 
+import _thread
 import errno
 import signal
 import sys
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -129,6 +131,17 @@ def _stoppable() -> Iterator[list[tuple[float, int]]]:
             stops.append((now, number))
             raise KeyboardInterrupt
 
+    usual_hook = sys.unraisablehook
+
+    def interrupt_again(lost: sys.UnraisableHookArgs) -> None:
+        """Send a signal again whose exception was lost in a callback, as of the compiler."""
+        if not (stops and issubclass(lost.exc_type, KeyboardInterrupt)):
+            usual_hook(lost)
+            return
+        again = threading.Timer(0.1, _thread.interrupt_main, [stops.pop()[1]])
+        again.daemon = True
+        again.start()
+
     handled = {  # not a signal that is ignored, such as Ctrl-C in a background job
         number: usual
         for number, usual in (
@@ -139,6 +152,7 @@ def _stoppable() -> Iterator[list[tuple[float, int]]]:
     }
     for number in handled:
         signal.signal(number, interrupt)
+    sys.unraisablehook = interrupt_again
     try:
         yield stops
     except SystemExit as ended:
@@ -147,6 +161,7 @@ def _stoppable() -> Iterator[list[tuple[float, int]]]:
         typer.echo("labapp: stopped by SIGTERM", err=True)
         sys.exit(TERMINATED)
     finally:
+        sys.unraisablehook = usual_hook
         received = {number for _, number in stops}
         for number, usual in handled.items():
             signal.signal(number, signal.SIG_IGN if number in received else usual)
