@@ -331,9 +331,7 @@ cli.main([])
 
 
 @pytest.mark.parametrize(("sent", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_a_signal_in_a_callback_of_the_compiler_stops_the_program(
-    sent: signal.Signals, code: int
-) -> None:
+def test_signal_in_a_compiler_callback_stops_the_program(sent: signal.Signals, code: int) -> None:
     """An exception in a callback from C is ignored by Python."""
     done = subprocess.run(
         [sys.executable, "-c", LOSES_AN_INTERRUPT, str(int(sent))],
