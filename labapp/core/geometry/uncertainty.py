@@ -152,11 +152,12 @@ class RigUncertainty(ReadOnlyArrays):
 
     @property
     def sigma_by_key(self) -> dict[str, float]:
-        """Standard uncertainty by `Quantity.sigma_key`; for a point the larger of u and v."""
-        found: dict[str, float] = {}
-        for one, sigma in zip(QUANTITIES, self.sigma.tolist(), strict=True):
-            found[one.sigma_key] = max(sigma, found.get(one.sigma_key, 0.0))
-        return found
+        """Standard uncertainty by `Quantity.sigma_key`; for a point the rms of u and v."""
+        keys = [one.sigma_key for one in QUANTITIES]
+        variance = dict.fromkeys(keys, 0.0)
+        for key, sigma in zip(keys, self.sigma.tolist(), strict=True):
+            variance[key] += sigma**2 / keys.count(key)
+        return {key: float(np.sqrt(value)) for key, value in variance.items()}
 
     @property
     def status(self) -> str:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 
+from labapp.config.bench_check import semidefinite
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.geometry.uncertainty import AxisPoints, RigUncertainty, covariance_of
@@ -79,6 +80,8 @@ class BenchLimits:
     """Standard uncertainties of the bench's quantities, by `Quantity.sigma_key`."""
     angle_distance_correlation: float = 0.0
     """Correlation of the laser's projection angle and distance."""
+    points_covariance_px2: Sequence[Sequence[float]] | None = None
+    """Covariance of the points of the image calibration (`covariance_of`), 6 × 6, px²."""
 
     @property
     def dot_sigma_mm(self) -> float:
@@ -99,9 +102,10 @@ class BenchLimits:
     @property
     def uncertainty(self) -> RigUncertainty:
         """Uncertainty of the bench, independent of the positions of laser and plane."""
-        return RigUncertainty(
-            self.axes, *covariance_of(self.sigma, self.angle_distance_correlation)
-        )
+        of_points = self.points_covariance_px2
+        known = None if of_points is None else semidefinite(np.array(of_points, float))
+        covariance = covariance_of(self.sigma, self.angle_distance_correlation, known)
+        return RigUncertainty(self.axes, *covariance)
 
     def rig(self, place: Place) -> Rig:
         """The bench with laser and plane at a position."""

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from labapp.config.setup import dot_pattern
 from labapp.config.setup_keys import SECTIONS
 from labapp.config.toml_keys import (
@@ -18,7 +20,7 @@ from labapp.config.toml_keys import (
     unknown_key,
     within,
 )
-from labapp.core.geometry.uncertainty import ANGLE, DISTANCE, QUANTITIES, RigUncertainty
+from labapp.core.geometry.uncertainty import ANGLE, DISTANCE, POINTS, QUANTITIES, RigUncertainty
 from labapp.errors import InputError
 from labapp.studies.adviser.bench_limits import BenchLimits
 from labapp.studies.adviser.expected_pools import ExpectedPools
@@ -37,12 +39,17 @@ CALIBRATION = {
 LARGEST_SIGMA = 10.0
 
 
-def calibration_values(known: RigUncertainty) -> dict[str, float]:
+def calibration_values(known: RigUncertainty) -> dict[str, Any]:
     """Uncertainty of a bench as the keys of ``[calibration]``: key → value."""
     sigma = known.sigma_by_key
-    values = {name: min(sigma[key], LARGEST_SIGMA) for name, key in CALIBRATION.items()}
-    shared = float(known.correlation[ANGLE, DISTANCE])
-    return {**values, "angle_distance_correlation": shared}
+    values: dict[str, Any] = {
+        name: min(sigma[key], LARGEST_SIGMA) for name, key in CALIBRATION.items()
+    }
+    values["angle_distance_correlation"] = float(known.correlation[ANGLE, DISTANCE])
+    of_points = known.covariance[np.ix_(POINTS, POINTS)]
+    if np.diag(of_points).min() > 0.0:
+        values["points_covariance_px2"] = of_points.tolist()
+    return values
 
 
 def _range(low: float, high: float, unit: str, required: bool = False) -> Rule:
@@ -85,6 +92,7 @@ TABLES: dict[str, dict[str, Rule]] = {
     "calibration": {
         **{name: within(0, LARGEST_SIGMA, "standard uncertainty") for name in CALIBRATION},
         "angle_distance_correlation": within(-1, 1, "correlation"),
+        "points_covariance_px2": SECTIONS["image_calibration"]["points_covariance_px2"],
     },
 }
 """All tables and keys; only the pools are required."""
@@ -165,6 +173,7 @@ def _limits(tables: dict[str, dict[str, Any]]) -> BenchLimits:
         pattern=dot_pattern(tables["pattern"]),
         sigma=sigma,
         angle_distance_correlation=calibration.get("angle_distance_correlation", 0.0),
+        points_covariance_px2=calibration.get("points_covariance_px2"),
         **tables["camera"],
     )
 
