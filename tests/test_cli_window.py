@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import re
 import sys
+from importlib.abc import MetaPathFinder
 from pathlib import Path
 
 import pytest
@@ -9,6 +11,8 @@ from labapp.cli import window
 from tests.conftest import Run
 
 COMMANDS = ("demo", "session")
+
+ROOT = Path(__file__).resolve().parent.parent
 
 
 @pytest.mark.parametrize(
@@ -59,6 +63,26 @@ def test_missing_gui_packages_are_reported_with_the_remedy(
     assert code == 2
     assert "pip install 'labapp[gui]'" in err
     assert "Traceback" not in err
+
+
+def test_missing_system_libraries_are_named(labapp: Run, monkeypatch: pytest.MonkeyPatch):
+    class WithoutLibrary(MetaPathFinder):
+        def find_spec(self, name: str, *_: object) -> None:
+            if name == "labapp.gui.app":
+                raise ImportError("libEGL.so.1: cannot open shared object file")
+
+    monkeypatch.delitem(sys.modules, "labapp.gui.app", raising=False)
+    monkeypatch.setattr(sys, "meta_path", [WithoutLibrary(), *sys.meta_path])
+    code, _, err = labapp()
+    assert code == 2
+    assert "libEGL.so.1" in err
+    assert "apt install libegl1" in err
+
+
+def test_system_libraries_are_those_that_run_installs():
+    packages = re.search(r"packages='([^']*)'", (ROOT / "run").read_text("utf-8"))
+    assert packages is not None
+    assert {*window.LIBRARIES.split(), "ca-certificates"} == {*packages[1].split()}
 
 
 def test_unknown_command_is_rejected(labapp: Run):

@@ -12,6 +12,12 @@ import typer
 from labapp.errors import InputError
 from labapp.system import has_display, own_command, quoted
 
+LIBRARIES = (
+    "libegl1 libgl1 libglib2.0-0 libxkbcommon0 libfontconfig1 libdbus-1-3 libxcb-cursor0 "
+    "libxcb-icccm4 libxcb-keysyms1 libxcb-shape0 libxkbcommon-x11-0 libxcursor1"
+)
+"""Packages of Debian and Ubuntu with the libraries that Qt and VTK need."""
+
 
 def asks_for_app(arguments: Sequence[str], commands: Collection[str]) -> bool:
     """Whether to open the app: without arguments, or with one that is a file, not a command."""
@@ -29,12 +35,16 @@ def open_app(arguments: Sequence[str]) -> int:
     Raises
     ------
     InputError
-        If there is no such file, no display, or the packages of the app are not installed.
+        If there is no such file, no display, or packages of the app or system libraries are not
+        installed.
     """
     try:
         from labapp.gui.app import main
+    except ModuleNotFoundError as error:
+        expected = "the packages of the app: pip install 'labapp[gui]'. Without it: labapp --help"
+        raise InputError("the app", error.name or "package", error, expected) from error
     except ImportError as error:
-        expected = "what windows need: pip install 'labapp[gui]'. Without it: labapp --help"
+        expected = f"system libraries; on Debian and Ubuntu: sudo apt install {LIBRARIES}"
         raise InputError("the app", error.name or "library", error, expected) from error
     return main(arguments)
 
