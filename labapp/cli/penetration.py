@@ -101,7 +101,7 @@ def fit(
     ] = 0.1,
     full: Annotated[
         float | None,
-        typer.Option(min=1e-3, max=1000, help="Full penetration (mm). Default: not evaluated."),
+        typer.Option(min=1e-3, max=1000, help="Threshold of full penetration (mm). Default: none."),
     ] = None,
     left_out: Annotated[
         Path | None, typer.Option(help="CSV file for the cross-validation predictions.")

@@ -9,6 +9,7 @@ from scipy.ndimage import gaussian_filter
 from labapp.core.lines.detection.find_lines import find_lines
 from labapp.core.lines.detection.numbering import number_lines
 from labapp.core.lines.detection.ridges import find_ridges
+from labapp.core.lines.detection.smooth_path import SmoothPath
 from labapp.core.values import FloatArray
 
 SHAPE = (200, 260)
@@ -130,3 +131,10 @@ def test_empty_frame_has_no_line():
     frame = 20.0 + np.random.default_rng(1).normal(size=SHAPE)
     numbered = number_lines(find_lines(frame), 5)
     assert numbered.lines == ()
+
+
+def test_path_through_coinciding_points_is_finite():
+    """As of a short piece of a line that a pool focuses to a spot."""
+    path = SmoothPath.through(np.full((8, 2), 5.0), 3.0)
+    assert np.isfinite(path.tangent).all()
+    assert np.isfinite(path.curvature).all()
