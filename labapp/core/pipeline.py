@@ -227,7 +227,7 @@ def measure(
             on_step("dots")
             observed = Observation.of(dots, bench, frame_shape)
             followed = follow(prior, observed, settings.fit, match_settings)
-            match, known = followed.match, prior.known(followed.lit)
+            match, known = followed.match, prior.known()
             lattice = lattice_of_match(match, rig, len(dots))
         else:
             dots, tuning = _dots_and_tuning(image, settings.dots)

@@ -42,7 +42,13 @@ from labapp.core.surface.kernels import (
     spline_kernels,
 )
 from labapp.core.surface.level import Rear
-from labapp.core.surface.solver import normal_factor
+from labapp.core.surface.solver import (
+    height_sigma,
+    inverse_of,
+    mean_splines,
+    normal_factor,
+    propagate_sigma,
+)
 from labapp.core.surface.spline import SplineBasis, SplineSurface
 from labapp.core.values import FloatArray
 
@@ -157,8 +163,9 @@ def test_dot_covariance_is_propagated_from_the_coefficients() -> None:
     factor = normal_factor(BASIS, 10.0 * BASIS.roughness, points, weights)
     lower = sum(np.diag(line[: COUNT - k], -k) for k, line in enumerate(factor))
     dot_points, plane_mm = points[:7], rng.uniform([10.0, 10.0], [80.0, 60.0], (7, 2))
+    inverse = solver_kernels.inverse_band(factor)
     covariance = solver_kernels.covariance_of_dots(
-        BASIS.grid, factor, LASER, PLANE.pose_mm, dot_points, PLANE.to_universal(plane_mm)
+        BASIS.grid, inverse, LASER, PLANE.pose_mm, dot_points, PLANE.to_universal(plane_mm)
     )
     slopes = np.stack(
         [BASIS.matrix(*dot_points[:, :2].T, 1, 0), BASIS.matrix(*dot_points[:, :2].T, 0, 1)], axis=1
@@ -166,6 +173,18 @@ def test_dot_covariance_is_propagated_from_the_coefficients() -> None:
     parts = np.linalg.inv(slopes_of_dots(dot_points, plane_mm)) @ slopes
     expected = parts @ np.linalg.inv(lower @ lower.T) @ parts.swapaxes(1, 2)
     np.testing.assert_allclose(covariance, expected, rtol=1e-4)
+
+
+def test_height_sigma_is_propagated_from_the_coefficients() -> None:
+    points = random().uniform(BASIS.low_mm, BASIS.high_mm, (60, 2))
+    weights = np.tile(np.diag([4e4, 1e4]), (60, 1, 1))
+    factor = normal_factor(BASIS, 10.0 * BASIS.roughness, points, weights)
+    places = random().uniform(BASIS.low_mm, BASIS.high_mm, (7, 2))
+    mean = mean_splines(BASIS, points)
+    np.testing.assert_allclose(mean, BASIS.matrix(*points.T).mean(axis=0), atol=1e-15)
+    sigma = height_sigma(BASIS, factor, inverse_of(factor), mean, places)
+    expected = propagate_sigma(factor, BASIS.matrix(*places.T), mean, 0.0)
+    np.testing.assert_allclose(sigma, expected, rtol=1e-6)
 
 
 def test_pair_deviances_are_those_of_normal_distributions() -> None:
@@ -743,10 +762,12 @@ def test_level_likelihood_agrees_with_numpy(witnesses: int, missing: float) -> N
     side[0] = 0.0
     levels, blurs = np.linspace(-0.05, 0.07, 31), np.array([0.005, 0.04, 0.25])
     dark = random().uniform(size=witnesses) < 0.4
+    spread = np.where(random().uniform(size=witnesses) < 0.5, 0.0, 0.03)
     computed = level_kernels.level_negative_log_likelihood(
-        over, side, dark, missing, levels[0], levels[1] - levels[0], 31, blurs
+        over, side, dark, spread, missing, (levels[0], levels[1] - levels[0], 31), blurs
     )
-    argument = side * (over[:, None, None] + levels[:, None]) / blurs[:, None, None]
+    width = np.sqrt(blurs[:, None, None] ** 2 + spread)
+    argument = side * (over[:, None, None] + levels[:, None]) / width
     expected = np.logaddexp(0.0, -argument)
     if missing:  # a dark ray is outside, or inside with its dot missing
         expected -= np.where(dark, np.logaddexp(0.0, np.log(missing) - argument), 0.0)
@@ -782,7 +803,7 @@ def test_likelihood_of_nan_heights_is_nan() -> None:
     over = np.array([[0.1, np.nan], [0.1, 0.2]])
     lit = np.zeros(2, bool)
     computed = level_kernels.level_negative_log_likelihood(
-        over, np.ones(2), lit, 0.0, 0.0, 0.1, 3, np.ones(2)
+        over, np.ones(2), lit, np.zeros(2), 0.0, (0.0, 0.1, 3), np.ones(2)
     )
     assert np.isnan(computed[0]).all()
     assert np.isfinite(computed[1]).all()

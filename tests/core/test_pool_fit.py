@@ -45,7 +45,8 @@ def rays_landing(spacing: float, seed: int = 0) -> tuple[FloatArray, IntArray]:
 
 def level_of(landing: FloatArray, witness: IntArray, spacing: float, sign: int = 1) -> Level:
     height, slope = dome(sign).height_and_gradient(*landing.T)
-    return find_level(height, slope, landing[:, 1], witness, np.array([spacing, spacing]))
+    seen = np.stack([height, 0 * height]), slope, landing[:, 1], witness
+    return find_level(*seen, np.array([spacing, spacing]))
 
 
 def fitted(match: Match, **changes: object) -> FittedPool:
@@ -277,7 +278,8 @@ def test_dots_with_wrong_rays_are_rejected(match: Match, seed: int) -> None:
 def test_single_row_of_lit_rays_has_a_level() -> None:
     height, slope = np.array([0.1, 0.2, 0.1, -0.1, -0.1]), np.full((5, 2), 0.1)
     y, witness = np.array([1.0, 1.0, 1.0, 2.0, 0.0]), np.array([1, 1, 1, -1, -1])
-    level = find_level(height, slope, y, witness, np.array([0.4, 0.8]))
+    exact = np.stack([height, 0 * height])
+    level = find_level(exact, slope, y, witness, np.array([0.4, 0.8]))
     assert np.isfinite([level.shift_mm, level.sigma_mm]).all()
     assert level.rear.drop_mm == 0.0
 
@@ -291,3 +293,21 @@ def test_laser_ten_times_too_far_away_is_rejected() -> None:
         fit_pool(*dots, replace(OPEN_RIG, laser=far), FitSettings())
     assert caught.value.status == "no-surface"
     assert " mm" in caught.value.reason
+
+
+def test_uncertain_heights_count_less_for_the_level() -> None:
+    """Some rays land where the surface is off by a quarter of the rise, with a known σ."""
+    exact, weighed = [], []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        landing, witness = rays_landing(0.5, seed)
+        height, slope = dome().height_and_gradient(*landing.T)
+        sigma = np.where(landing[:, 0] > 1.5, 0.04, 1e-4)
+        height += sigma * rng.normal(size=len(height))
+        seen = slope, landing[:, 1], witness, np.array([0.5, 0.5])
+        for levels, known in (exact, 0 * sigma), (weighed, sigma):
+            level = find_level(np.stack([height, known]), *seen, rear=(1, 0.0))
+            levels.append([level.shift_mm + 0.5, level.sigma_mm])
+    (off, _), (off_weighed, stated_weighed) = np.transpose(exact), np.transpose(weighed)
+    assert np.sqrt(np.mean(off_weighed**2)) < 0.7 * np.sqrt(np.mean(off**2))
+    assert np.sqrt(np.mean((off_weighed / stated_weighed) ** 2)) < 1.2

@@ -39,8 +39,9 @@ def test_level_of_a_mirrored_pool_is_mirrored():
     rim = -0.08 * np.maximum(-y / 4.5, 0) ** 2
     witness = np.where(height + rng.normal(0, 1e-3, len(x)) > rim, 1, -1)
     spacing = np.array([0.4, 0.8])
-    forward = find_level(height, slope, y, witness, spacing)
-    backward = find_level(height, slope * [1, -1], -y, witness, spacing, (-1, None))
+    exact = np.stack([height, 0 * height])
+    forward = find_level(exact, slope, y, witness, spacing)
+    backward = find_level(exact, slope * [1, -1], -y, witness, spacing, (-1, None))
     assert forward.rear.drop_mm > 0.03
     assert backward.shift_mm == pytest.approx(forward.shift_mm)
     assert backward.rear.drop_mm == pytest.approx(forward.rear.drop_mm)

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import stdtrit
+from scipy.special import chdtrc, stdtrit
 
 from labapp.core.values import ComplexArray, FloatArray, ReadOnlyArrays
 
@@ -222,11 +222,9 @@ def _refine(
 
 def _stands_out(without: _Fit, with_it: _Fit, step: float) -> bool:
     """Whether the last component is significant, given the number of frequencies tried."""
-    from scipy.stats import chi2
-
     last, channels = len(with_it.rates) - 1, with_it.value.shape[1]
     gain = np.sum(without.residual**2 - with_it.residual**2, axis=0)
-    chance = chi2.sf(np.sum(gain / with_it.noise(last, step)), 2 * channels + 2)
+    chance = chdtrc(2 * channels + 2, np.sum(gain / with_it.noise(last, step)))
     return bool(chance * 2 * len(without.time) < FALSE_ALARM)
 
 

@@ -71,6 +71,7 @@ from labapp.core.matching.ray_classes import certain_witness
 from labapp.core.matching.repair import with_repaired, with_rows_beyond
 from labapp.core.rows.lattice import Lattice, Site, empty_sites
 from labapp.core.surface.pool_fit import FitSettings
+from labapp.core.surface.solver import inverse_of
 from labapp.core.surface.spline import SplineSurface
 from labapp.core.values import CannotMeasure, FloatArray, IntArray
 
@@ -302,11 +303,12 @@ def match_of_hypothesis(
     at = np.argwhere(best.labels != UNLABELLED)
     dot = best.labels[at[:, 0], at[:, 1]]
     trials.sort(key=lambda trial: trial.residual_mm)
-    paths, surface, factor = paths_of(observed, best.pool), best.pool.surface, best.pool.factor
+    paths, surface = paths_of(observed, best.pool), best.pool.surface
+    inverse = inverse_of(best.pool.factor)
 
     def covariance_of(rays: IntArray) -> FloatArray:
         at = paths.points_mm[rays], paths.plane_mm[rays]
-        return covariance_of_dots(observed.rig, surface.basis, factor, *at)
+        return covariance_of_dots(observed.rig, surface.basis, inverse, *at)
 
     witness, missed = (
         certain_witness(observed, best.witness, paths, covariance_of),

@@ -34,6 +34,7 @@ from labapp.core.matching.outliers import MOST_LEFT_OUT, FittedLabels, unsupport
 from labapp.core.matching.prediction import covariance_of_dots
 from labapp.core.matching.ray_classes import RayClasses
 from labapp.core.surface.pool_fit import FitSettings
+from labapp.core.surface.solver import inverse_of
 from labapp.core.values import CannotMeasure, IntArray, median
 
 MISFIT_MM, MISFIT_TIMES = 0.15, 3.0
@@ -291,7 +292,7 @@ def fitted_labels(observed: Observation, best: Hypothesis, fit: FitSettings) -> 
     classes = RayClasses(best.witness, missed, best.stray_dots)
     rays = np.union1d(np.flatnonzero(best.labels != UNLABELLED), missed)
     rays = rays[np.isfinite(paths.plane_mm[rays, 0])]
-    at = best.pool.factor, paths.points_mm[rays], paths.plane_mm[rays]
+    at = inverse_of(best.pool.factor), paths.points_mm[rays], paths.plane_mm[rays]
     covariance = np.full((best.labels.size, 2, 2), np.nan)
     covariance[rays] = covariance_of_dots(observed.rig, basis, *at)
     how = fit.floor_mm, best.pool.unsettled_mm

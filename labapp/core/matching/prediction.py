@@ -11,6 +11,7 @@ from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.rig import Rig
 from labapp.core.matching.observation import Observation
 from labapp.core.surface.pool_fit import FittedPool
+from labapp.core.surface.solver import inverse_of
 from labapp.core.surface.spline import SplineBasis
 from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
 
@@ -112,12 +113,12 @@ class Prediction:
 
     def covariance_mm2(self, pool: FittedPool, rig: Rig) -> FloatArray:
         """Covariance of the dots due to that of the surface, shape (m, 2, 2), mm²."""
-        basis = pool.surface.basis
-        return covariance_of_dots(rig, basis, pool.factor, self.points_mm, self.plane_mm)
+        basis, inverse = pool.surface.basis, inverse_of(pool.factor)
+        return covariance_of_dots(rig, basis, inverse, self.points_mm, self.plane_mm)
 
 
 def covariance_of_dots(
-    rig: Rig, basis: SplineBasis, factor: FloatArray, points_mm: FloatArray, plane_mm: FloatArray
+    rig: Rig, basis: SplineBasis, inverse: FloatArray, points_mm: FloatArray, plane_mm: FloatArray
 ) -> FloatArray:
     """Covariance of computed dots due to that of the surface, shape (n, 2, 2), mm².
 
@@ -125,9 +126,8 @@ def covariance_of_dots(
     ----------
     rig
         The bench.
-    basis, factor
-        The surface's splines, and the Cholesky factor of their normal matrix
-        (`solver.normal_factor`).
+    basis, inverse
+        The surface's splines, and the covariance of their coefficients (`solver.inverse_of`).
     points_mm, plane_mm
         Reflection points, shape (n, 3), and the dots computed for them, IPCS, shape (n, 2), mm.
     """
@@ -135,7 +135,7 @@ def covariance_of_dots(
 
     laser, plane = rig.laser.position_mm, rig.imaging_plane.pose_mm
     dots_mm = rig.imaging_plane.to_universal(plane_mm)
-    return solver_kernels.covariance_of_dots(basis.grid, factor, laser, plane, points_mm, dots_mm)
+    return solver_kernels.covariance_of_dots(basis.grid, inverse, laser, plane, points_mm, dots_mm)
 
 
 def predict(observed: Observation, pool: FittedPool, where: BoolArray) -> Prediction:

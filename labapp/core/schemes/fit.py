@@ -67,15 +67,11 @@ class Known:
     ----------
     boundary
         Its boundary.
-    free_sigma_mm
-        Uncertainty of the height of the n reflection points without the part of the level, shape
-        (n,), mm; None: it must be computed.
     by_setup
         The set-up's part of the uncertainty, as computed earlier for some sizes.
     """
 
     boundary: Boundary
-    free_sigma_mm: FloatArray | None
     by_setup: tuple[SetupPart, ...]
 
 
@@ -144,9 +140,6 @@ def complete(
         by_setup = former.sigma
     else:
         by_setup = setup_sigma(setup_changes(match, rig, settings, pool, gradient))
-    free_sigma = None if known is None else known.free_sigma_mm
-    if free_sigma is None:
-        free_sigma = pool.free_sigma_of(basis.matrix(*points[:, :2].T))
     reconstruction = Reconstruction(
         scheme="fit",
         surface=pool.surface,
@@ -154,7 +147,7 @@ def complete(
         ray=match.ray,
         points_mm=points,
         residual_mm=pool.residual_mm,
-        sigma_mm=np.hypot(free_sigma, level.sigma_mm),
+        sigma_mm=np.hypot(pool.height_sigma_mm(points), level.sigma_mm),
         size_sigma=np.hypot(pool.sigma_of(gradient), by_setup),
         size_sigma_level=np.abs(gradient.sum(axis=1)) * level.sigma_mm,
         size_sigma_setup=by_setup,

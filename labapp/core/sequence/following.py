@@ -11,7 +11,7 @@ As in `correspondence`, a dot whose ray is ambiguous gets none.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -217,10 +217,9 @@ class _Fit:
 
     def covariance_of(self, paths: RayPaths, rays: IntArray) -> FloatArray:
         """Covariance of the dots of m rays due to that of the surface, shape (m, 2, 2), mm²."""
-        factor = self.rounds.equations.factor
-        assert factor is not None
         at = paths.points_mm[rays], paths.plane_mm[rays]
-        return covariance_of_dots(self.observed.rig, self.prior.basis, factor, *at)
+        inverse = self.rounds.equations.inverse
+        return covariance_of_dots(self.observed.rig, self.prior.basis, inverse, *at)
 
     def covariance_around(self) -> FloatArray:
         """Covariance of the dots of lit rays and their neighbours, else NaN, shape (R, 2, 2)."""
@@ -377,6 +376,8 @@ def _with_level(prior: Prior, fit: _Fit, covariance: FloatArray) -> tuple[RayCla
     witnesses = Witnesses.of(
         observed.bench.rays, observed.rig.head_sign, witness, prior.basis, missing
     )
+    sigma = fit.rounds.height_sigma_mm(witnesses.landing_mm)
+    witnesses = replace(witnesses, height_sigma_mm=sigma)
     near = Level(0.0, prior.open_mm, prior.level.sign, prior.level.rear, 0.0)
     how = fit.settings.rounds, SETTLED_MM, near, prior.drop_is_free, RAISED_MM
     level = rounds_with_level(fit.rounds, witnesses, *how)

@@ -33,9 +33,9 @@ RIDGE = 1e-4
 MOST_ROUNDS, SETTLED_MM = 8, 3e-4
 """Maximum number of rounds of a fit that starts from a close surface, and its convergence limit."""
 
-POINTS_EVERY, SETUP_EVERY, SINKS_EVERY = 8, 128, 16
-"""Intervals in frames after which the uncertainty of the reflection points, the part of the set-up
-in the uncertainty of the sizes, and the drop of the rear are recomputed."""
+SETUP_EVERY, SINKS_EVERY = 128, 16
+"""Intervals in frames after which the part of the set-up in the uncertainty of the sizes, and the
+drop of the rear, are recomputed."""
 
 
 @dataclass(frozen=True)
@@ -81,9 +81,6 @@ class Prior:
         of those surfaces at the reflection points, shape (frames, R, 2).
     open_mm
         Uncertainty of the level when the drop of the rear was last fitted with it, mm.
-    free_sigma_mm
-        Uncertainty of the height of each ray's reflection point without the part of the level, as
-        last computed, shape (R,), mm; NaN if it never was. It changes slowly.
     by_setup
         Parts of the set-up in the uncertainty of sizes, each with the sizes for which it was
         computed: the sizes of a pool that oscillates recur.
@@ -104,7 +101,6 @@ class Prior:
     past: FloatArray
     slopes: FloatArray
     open_mm: float
-    free_sigma_mm: FloatArray
     by_setup: tuple[SetupPart, ...]
     unseen: int = 0
     count: int = 0
@@ -134,7 +130,6 @@ class Prior:
             past=coefficients[None],
             slopes=paths.slopes[None],
             open_mm=level.sigma_mm,
-            free_sigma_mm=np.full(len(paths.slopes), np.nan),
             by_setup=(SetupPart(made.size_sigma_setup, measures.sizes),),
         )
 
@@ -144,8 +139,6 @@ class Prior:
         if nearest_part(by_setup, sizes) is None:  # it was computed for these sizes
             by_setup = *by_setup, SetupPart(made.size_sigma_setup, sizes)
         paths, lit, pool = followed.paths, followed.lit, followed.pool
-        free = self.free_sigma_mm.copy()
-        free[lit.ravel()] = np.sqrt(np.maximum(made.sigma_mm**2 - pool.level.sigma_mm**2, 0.0))
         return replace(
             self,
             paths=paths,
@@ -155,7 +148,6 @@ class Prior:
             past=np.vstack([self.past[1 - MEMORY :], paths.coefficients]),
             slopes=np.concatenate([self.slopes[1 - MEMORY :], paths.slopes[None]]),
             open_mm=pool.level.sigma_mm if self.drop_is_free else self.open_mm,
-            free_sigma_mm=free,
             by_setup=by_setup,
             unseen=0 if followed.datum_is_seen else self.unseen + 1,
             count=self.count + 1,
@@ -171,15 +163,9 @@ class Prior:
         """Whether the part of the set-up is recomputed in the next frame, whatever its sizes."""
         return self.count % SETUP_EVERY == SETUP_EVERY - 1
 
-    def known(self, lit: BoolArray) -> Known:
-        """Quantities known for the next frame, given its lit rays, shape (rows, columns).
-
-        Slowly changing quantities are recomputed at intervals.
-        """
-        free = self.free_sigma_mm[lit.ravel()]
-        is_known = self.count % POINTS_EVERY != 0 and bool(np.isfinite(free).all())
-        by_setup = () if self.setup_is_due else self.by_setup
-        return Known(self.boundary, free if is_known else None, by_setup)
+    def known(self) -> Known:
+        """Quantities known for the next frame; slowly changing ones are recomputed at intervals."""
+        return Known(self.boundary, () if self.setup_is_due else self.by_setup)
 
     def after_gap(self) -> Prior:
         """Build the prior after a frame that was not measured: only the last surface is kept."""

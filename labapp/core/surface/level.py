@@ -116,6 +116,9 @@ class Witnesses(ReadOnlyArrays):
         +1 where the pool's head lies towards +Y, −1 for the reverse (`Rig.head_sign`).
     missing
         Probability that a ray that came back has no dot (`Match.missing`).
+    height_sigma_mm
+        Standard uncertainty of the surface's height there, apart from its level, shape (m,), mm.
+        None: it is taken as exact.
     """
 
     landing_mm: FloatArray
@@ -123,6 +126,7 @@ class Witnesses(ReadOnlyArrays):
     spacing_mm: FloatArray
     head_sign: int
     missing: float = 0.0
+    height_sigma_mm: FloatArray | None = None
 
     @classmethod
     def of(
@@ -149,8 +153,10 @@ class Witnesses(ReadOnlyArrays):
         from labapp.core.surface.kernels import spline_kernels
 
         there = spline_kernels.surface_at(basis.grid, coefficients, self.landing_mm)
-        seen = there[1:].T, self.landing_mm[:, 1], self.sign, self.spacing_mm
-        return find_level(there[0], *seen, (self.head_sign, drop_mm), about, self.missing)
+        sigma = self.height_sigma_mm
+        height = np.stack([there[0], np.zeros(len(there[0])) if sigma is None else sigma])
+        seen = height, there[1:].T, self.landing_mm[:, 1], self.sign, self.spacing_mm
+        return find_level(*seen, (self.head_sign, drop_mm), about, self.missing)
 
     def negative_log_evidence(
         self, basis: SplineBasis, coefficients: FloatArray, level: Level
@@ -182,12 +188,13 @@ def find_level(
     A ray that lands a distance d inside the boundary came back with probability
     1/(1 + exp(−d/s)), and then has a dot unless that is missing. The posterior of level, blur s and
     drop of the rear is evaluated on a grid, which gives mean and standard deviation of the level.
+    An uncertain height widens s for that ray.
 
     Parameters
     ----------
     height, slope
-        Heights, up to the level, and gradients of the surface at the landing points of m witnesses
-        on z = 0, shapes (m,), mm, and (m, 2).
+        Heights, up to the level, and their standard uncertainty, shape (2, m), mm, and gradients of
+        the surface, shape (m, 2), at the landing points of m witnesses on z = 0.
     y
         Y of the landing points, shape (m,), mm.
     witness

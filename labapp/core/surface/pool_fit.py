@@ -24,7 +24,14 @@ import numpy as np
 from labapp.core.geometry.optics import ProjectedRays, project_rays
 from labapp.core.geometry.rig import Rig
 from labapp.core.surface.level import Level, Rear, Witnesses, guess_level
-from labapp.core.surface.solver import NormalEquations, Rounds, propagate_sigma
+from labapp.core.surface.solver import (
+    NormalEquations,
+    Rounds,
+    height_sigma,
+    inverse_of,
+    mean_splines,
+    propagate_sigma,
+)
 from labapp.core.surface.spline import SplineBasis, SplineSurface
 from labapp.core.values import (
     BoolArray,
@@ -99,6 +106,8 @@ class FittedPool(ReadOnlyArrays):
         Computed minus captured dot on the imaging plane (X′, Z′), shape (n, 2), mm.
     unsettled_mm
         Largest displacement of a reflection point in the last round, mm.
+    inverse
+        Inverse of the normal matrix (`solver.inverse_of`), if it has been computed.
     """
 
     surface: SplineSurface
@@ -107,6 +116,7 @@ class FittedPool(ReadOnlyArrays):
     points_mm: FloatArray
     residual_mm: FloatArray
     unsettled_mm: float
+    inverse: FloatArray | None = None
 
     @property
     def residual_rms_mm(self) -> float:
@@ -116,19 +126,17 @@ class FittedPool(ReadOnlyArrays):
     @cached_property
     def mean_splines(self) -> FloatArray:
         """Mean value of each spline over the reflection points, shape (splines,)."""
-        from labapp.core.surface.kernels import spline_kernels
-
-        share = np.full(len(self.points_mm), 1 / len(self.points_mm))
-        grid, count = self.surface.basis.grid, self.factor.shape[1]
-        return spline_kernels.gradient_of_sum(grid, count, self.points_mm, share)
+        return mean_splines(self.surface.basis, self.points_mm)
 
     def sigma_of(self, gradients: FloatArray) -> FloatArray:
         """Standard uncertainty of quantities, shape (m,), from their derivatives, shape (m, p)."""
         return propagate_sigma(self.factor, gradients, self.mean_splines, self.level.sigma_mm)
 
-    def free_sigma_of(self, gradients: FloatArray) -> FloatArray:
-        """Standard uncertainty of quantities without the part of the level."""
-        return propagate_sigma(self.factor, gradients, self.mean_splines, 0.0)
+    def height_sigma_mm(self, places_mm: FloatArray) -> FloatArray:
+        """Standard uncertainty of the height at m places, apart from the level, shape (m,), mm."""
+        inverse = inverse_of(self.factor) if self.inverse is None else self.inverse
+        at = self.factor, inverse, self.mean_splines, places_mm
+        return height_sigma(self.surface.basis, *at)
 
 
 def fit_pool(
@@ -139,7 +147,7 @@ def fit_pool(
     rig: Rig,
     settings: FitSettings,
     initial: SplineSurface | None = None,
-    missing: float = 0.0,
+    missing: float | None = None,
 ) -> FittedPool:
     """Fit the surface that reflects each ray to its dot.
 
@@ -155,7 +163,9 @@ def fit_pool(
     initial
         A surface to start from: fewer rounds are needed if it is close. None: z = 0.
     missing
-        Probability that a ray that came back has no dot, for the level (`Match.missing`).
+        Probability that a ray that came back has no dot (`Match.missing`). None: the level is
+        estimated faster, as if every dot had been found and the slopes determined the surface
+        exactly.
 
     Raises
     ------
@@ -176,10 +186,14 @@ def fit_pool(
         near = initial.basis.grid, initial.coefficients, rays.directions[at], points
         points, _ = solver_kernels.newton_along_rays(*near, NEWTON_STEPS)
     rounds = Rounds(equations, rays.directions[at], np.zeros(basis.count), points, np.inf)
-    witnesses = Witnesses.of(rays, rig.head_sign, witness, basis, missing)
+    witnesses = Witnesses.of(rays, rig.head_sign, witness, basis, missing or 0.0)
     outer = None if (witnesses.sign < 0).any() else _outer(rays.landing_mm[at][:, :2])
     until = settings.rounds, settings.settled_mm
     level = rounds_with_level(rounds, witnesses, *until, outer=outer)
+    if missing is not None and outer is None:
+        sigma = rounds.height_sigma_mm(witnesses.landing_mm)
+        witnesses = replace(witnesses, height_sigma_mm=sigma)
+        level = rounds_with_level(rounds, witnesses, *until, near=level)
     return fitted_pool(rounds, level, rig, plane_mm)
 
 
@@ -292,9 +306,10 @@ def fitted_pool(rounds: Rounds, level: Level, rig: Rig, plane_mm: FloatArray) ->
     residual = computed - plane_mm
     if not np.isfinite(residual).all():
         raise CannotMeasure("no-surface", "the fitted surface sends rays away from the plane")
-    assert rounds.equations.factor is not None
-    surface = SplineSurface(basis, rounds.coefficients)
-    return FittedPool(surface, rounds.equations.factor, level, points, residual, rounds.moved_mm)
+    equations, surface = rounds.equations, SplineSurface(basis, rounds.coefficients)
+    assert equations.factor is not None
+    fitted = surface, equations.factor, level, points, residual, rounds.moved_mm
+    return FittedPool(*fitted, equations.known_inverse)
 
 
 def basis_around(places_mm: FloatArray, rays: ProjectedRays, knot_mm: float) -> SplineBasis:

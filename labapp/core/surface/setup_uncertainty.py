@@ -74,10 +74,11 @@ def setup_changes(
     x, y = own.landing_mm[..., 0], own.landing_mm[..., 1]
     seen = (match.witness != 0) & basis.contains(x, y)
     landing, sign = own.landing_mm[seen], match.witness[seen]
+    sigma, limits = pool.height_sigma_mm(landing), (rig.head_sign, match.missing)
     for k, by, (bench, _) in zip(off, change.T, benches, strict=True):
         aside = (project_rays(bench.laser, bench.pattern).landing_mm[seen] - landing) / SHARE
         more, less = (
-            Witnesses(landing + way * aside, sign, own.spacing_mm, rig.head_sign, match.missing)
+            Witnesses(landing + way * aside, sign, own.spacing_mm, *limits, sigma)
             .level(basis, pool.surface.coefficients + way * by, pool.level.rear.drop_mm, about)
             .shift_mm
             for way in (1.0, -1.0)

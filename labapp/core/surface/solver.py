@@ -55,6 +55,20 @@ class NormalEquations:
     weights: FloatArray
     factor: FloatArray | None = None
     reuse_mm: float = REUSE_MM
+    _inverse: tuple[FloatArray, FloatArray] | None = None
+
+    @property
+    def known_inverse(self) -> FloatArray | None:
+        """Covariance of the coefficients (`inverse_of`), if computed with the current factor."""
+        return self._inverse[1] if self._inverse and self._inverse[0] is self.factor else None
+
+    @property
+    def inverse(self) -> FloatArray:
+        """Covariance of the coefficients (`inverse_of`)."""
+        assert self.factor is not None
+        if (known := self.known_inverse) is None:
+            self._inverse = self.factor, (known := inverse_of(self.factor))
+        return known
 
     def step(
         self,
@@ -127,6 +141,13 @@ class Rounds:
     coefficients: FloatArray
     points_mm: FloatArray
     moved_mm: float = 0.0
+
+    def height_sigma_mm(self, places_mm: FloatArray) -> FloatArray:
+        """Standard uncertainty of the height at m places (`height_sigma`), shape (m,), mm."""
+        equations = self.equations
+        assert equations.factor is not None
+        mean = mean_splines(equations.basis, self.points_mm)
+        return height_sigma(equations.basis, equations.factor, equations.inverse, mean, places_mm)
 
     def run(
         self,
@@ -201,6 +222,49 @@ def normal_factor(
     if not has_one:
         raise CannotMeasure("no-surface", NO_SURFACE)
     return lower
+
+
+def inverse_of(factor: FloatArray) -> FloatArray:
+    """Covariance of the p spline coefficients, shape (p, p), mm²: entries within the factor's band.
+
+    ``factor`` is the Cholesky factor of the normal matrix (`normal_factor`).
+    """
+    from labapp.core.surface.kernels import solver_kernels
+
+    return solver_kernels.inverse_band(factor)
+
+
+def mean_splines(basis: SplineBasis, points_mm: FloatArray) -> FloatArray:
+    """Mean value of each spline over n points, shape (n, ≥ 2), mm; shape (p,)."""
+    from labapp.core.surface.kernels import spline_kernels
+
+    share = np.full(len(points_mm), 1 / len(points_mm))
+    return spline_kernels.gradient_of_sum(basis.grid, basis.count, points_mm, share)
+
+
+def height_sigma(
+    basis: SplineBasis,
+    factor: FloatArray,
+    inverse: FloatArray,
+    mean_splines: FloatArray,
+    places_mm: FloatArray,
+) -> FloatArray:
+    """Standard uncertainty of the surface's height at places, apart from its level, shape (m,), mm.
+
+    Parameters
+    ----------
+    basis, factor, inverse
+        The splines, the Cholesky factor of the normal matrix, and its inverse (`inverse_of`).
+    mean_splines
+        See `propagate_sigma`.
+    places_mm
+        The places, shape (m, ≥ 2), mm.
+    """
+    from labapp.core.surface.kernels import solver_kernels
+
+    covariance = solver_kernels.solve(factor, mean_splines[None])[0]
+    of_mean = np.append(covariance, covariance @ mean_splines)
+    return np.sqrt(solver_kernels.height_variances(basis.grid, inverse, of_mean, places_mm))
 
 
 def propagate_sigma(

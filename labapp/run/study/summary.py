@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import scipy.stats
+from scipy.special import stdtrit
 
 from labapp.core.sequence.mean import (
     level_sigma_of_mean,
@@ -219,7 +219,7 @@ def outlying_recordings(
         count = len(members) - 1
         if len(members) < FEWEST_RECORDINGS:
             continue
-        limit = scipy.stats.t.ppf((1 + SURE) / 2, count - 1)
+        limit = stdtrit(count - 1, (1 + SURE) / 2)
         for size in SIZES:
             values = np.array([one.means[size].mean for one in members])
             for place, one in enumerate(members):

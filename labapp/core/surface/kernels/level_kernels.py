@@ -12,6 +12,7 @@ from labapp.core.values import BoolArray, FloatArray, IntArray
 _f, _i = types.float64, types.int64
 _f1, _f2, _f3 = (types.Array(_f, n, "A", readonly=True) for n in (1, 2, 3))
 _i1 = types.Array(_i, 1, "A", readonly=True)
+_levels = types.Tuple((_f, _f, _i))  # type: ignore[no-untyped-call]
 
 EPS = 1e-12
 """A factor of 1 plus less than this is replaced by 1: a thousand of them do not change the
@@ -85,22 +86,21 @@ def _accumulate(
             _multiply(factors, at, way, np.exp(-away), shrinks)
 
 
-@_compiled(_f2, _f1, types.Array(types.boolean, 1, "A", readonly=True), _f, _f, _f, _i, _f1)
+@_compiled(_f2, _f1, types.Array(types.boolean, 1, "A", readonly=True), _f1, _f, _levels, _f1)
 def level_negative_log_likelihood(
     over: FloatArray,
     side: FloatArray,
     dark: BoolArray,
+    spread: FloatArray,
     missing: float,
-    first: float,
-    step: float,
-    count: int,
+    levels: tuple[float, float, int],
     blurs: FloatArray,
 ) -> FloatArray:
     """−log likelihood of lit and dark witnesses at levels.
 
-    With x = side · (over + level) / blur, a lit ray has P = 1/(1 + exp(−x)), up to a factor common
-    to all levels. A dark ray, whose side has the opposite sign, either lands outside, or lands
-    inside and its dot is missing: P = (1 + m · exp(−x))/(1 + exp(−x)).
+    With x = side · (over + level) / √(blur² + spread), a lit ray has P = 1/(1 + exp(−x)), up to a
+    factor common to all levels. A dark ray, whose side has the opposite sign, either lands outside,
+    or lands inside and its dot is missing: P = (1 + m · exp(−x))/(1 + exp(−x)).
 
     Parameters
     ----------
@@ -111,10 +111,13 @@ def level_negative_log_likelihood(
         +1 or −1 of each witness, lit or dark, over its rise (`find_level`), shape (n,), mm⁻¹.
     dark
         Which witnesses are dark, shape (n,).
+    spread
+        Widens the blur where the height is uncertain (`spread_of`), in squared spacings of the
+        rays, shape (n,).
     missing
         m, the share of the dots that are missing, from 0.
-    first, step, count
-        The levels: the first, mm, the step to the next, above 0, and how many.
+    levels
+        The first, mm, the step to the next, above 0, and how many.
     blurs
         In spacings of the rays, shape (b,).
 
@@ -123,6 +126,7 @@ def level_negative_log_likelihood(
     FloatArray
         Nats, shape (d, b, count).
     """
+    first, step, count = levels
     made = np.empty((len(over), len(blurs), count))
     factors, starts, slopes = np.empty(count), np.empty(count + 1), np.empty(count + 1)
     for d in range(len(over)):
@@ -135,7 +139,7 @@ def level_negative_log_likelihood(
                 shift = -np.log(missing) if part else 0.0
                 for n in range(len(side)):
                     if dark[n] or not part:
-                        sharp = side[n] / blurs[b]
+                        sharp = side[n] / np.sqrt(blurs[b] * blurs[b] + spread[n])
                         start, slope = sharp * (over[d, n] + first) + shift, sharp * step
                         _accumulate(factors, starts, slopes, start, slope)
                     if n % FACTORS == FACTORS - 1 or n == len(side) - 1:
@@ -217,7 +221,7 @@ def rises_of(slope: FloatArray, spacing: FloatArray) -> tuple[FloatArray, float]
     return np.maximum(rises, usual / 4.0), usual
 
 
-@_compiled(_f1, _f2, _f1, _i1, _f1, _i, _f1)
+@_compiled(_f2, _f2, _f1, _i1, _f1, _i, _f1)
 def scan_levels(
     height: FloatArray,
     slope: FloatArray,
@@ -232,21 +236,30 @@ def scan_levels(
     The first five arguments are those of `level.find_level`.
     """
     rises, _ = rises_of(slope, spacing)
-    over, first = np.empty((1, len(height))), -height.max()
-    over[0] = height
+    over, first, exact = height[:1].copy(), -height[0].max(), np.zeros(height.shape[1])
     least, shift, sign = np.inf, 0.0, 1
-    step = (height.max() - height.min()) / (count - 1)
+    levels = first, (height[0].max() - height[0].min()) / (count - 1), count
     for way in (1, -1):
         nats = level_negative_log_likelihood(
-            over, way * witness / rises, witness < 0, 0.0, first, step, count, blur
+            over, way * witness / rises, witness < 0, exact, 0.0, levels, blur
         )[0, 0]
         at = np.argmin(nats)
         if nats[at] < least:
-            least, shift, sign = nats[at], first + at * step, way
+            least, shift, sign = nats[at], first + at * levels[1], way
     return shift, sign
 
 
-@_compiled(_f1, _f2, _f1, _i1, _f1, _f1, _f1, _f2)
+@_inner
+def spread_of(sigma: float, rise: float) -> float:
+    """Square by which the uncertainty of a height widens the blur, in squared spacings.
+
+    The mean of a logistic function over a normal distribution is close to a logistic function of
+    the larger width √(s² + π σ²/8) (Spiegelhalter and Lauritzen 1990, Networks 20, 579–605).
+    """
+    return np.pi / 8.0 * (sigma / rise) ** 2
+
+
+@_compiled(_f2, _f2, _f1, _i1, _f1, _f1, _f1, _f2)
 def search_level(
     height: FloatArray,
     slope: FloatArray,
@@ -288,22 +301,24 @@ def search_level(
             low, high = min(low, head_sign * y[n]), max(high, head_sign * y[n])
     start = (low + high) / 2.0
     end = min(low, start - 1e-6)  # a single row has no rear
-    near = np.flatnonzero(np.abs(height + shift) < NEAR_RISES * rises)
-    side, dark = np.empty(len(near)), np.empty(len(near), np.bool_)
+    near = np.flatnonzero(np.abs(height[0] + shift) < NEAR_RISES * rises)
+    side, dark, spread = np.empty(len(near)), np.empty(len(near), np.bool_), np.empty(len(near))
     is_seen = False
     for m in range(len(near)):
         at = near[m]
         side[m], dark[m] = sign * witness[at] / rises[at], witness[at] < 0
+        spread[m] = spread_of(height[1, at], rises[at])
         is_seen |= dark[m] and head_sign * y[at] < end
     drops = drops if is_seen else drops[:1]
     over = np.empty((len(drops), len(near)))
     for m in range(len(near)):
         share = max((start - head_sign * y[near[m]]) / (start - end), 0.0)
         for d in range(len(drops)):
-            over[d, m] = height[near[m]] + drops[d] * share * share
+            over[d, m] = height[0, near[m]] + drops[d] * share * share
     count = int(np.rint(STEPS_A_REACH * reach)) + 1
     first, step = shift - reach * usual, 2.0 * reach * usual / (count - 1)
-    nats = level_negative_log_likelihood(over, side, dark, missing, first, step, count, blurs[0])
+    levels = first, step, count
+    nats = level_negative_log_likelihood(over, side, dark, spread, missing, levels, blurs[0])
     drop, mean, sigma, at_ends = level_posterior(nats, blurs[1], sunk, drops, first, step)
     rear = head_sign * start, head_sign * end
     return np.array([mean, sigma, drop, *rear, at_ends, nats.min(), usual]), len(near)
@@ -323,7 +338,8 @@ def negative_log_evidence(
     """−log probability of the witnesses, marginalised over levels near 0 and blurs, nats.
 
     ``rear`` is the height of the boundary at the m landing points, shape (m,), mm. ``blurs`` is
-    that of `search_level`, the others are those of `level.find_level`. A constant is omitted.
+    that of `search_level`, ``height`` is taken as exact, shape (m,), mm, and the others are those
+    of `level.find_level`. A constant is omitted.
     """
     rises, usual = rises_of(slope, spacing)
     near = np.flatnonzero(np.abs(height) < NEAR_RISES * rises)
@@ -333,10 +349,9 @@ def negative_log_evidence(
         at = near[m]
         over[0, m] = height[at] - rear[at]
         side[m], dark[m] = sign * witness[at] / rises[at], witness[at] < 0
-    grid = -usual, usual / STEPS_A_REACH, 2 * STEPS_A_REACH + 1
-    nats = level_negative_log_likelihood(
-        over, side, dark, missing, grid[0], grid[1], grid[2], blurs[0]
-    )
+    exact = np.zeros(len(near))
+    levels = -usual, usual / STEPS_A_REACH, 2 * STEPS_A_REACH + 1
+    nats = level_negative_log_likelihood(over, side, dark, exact, missing, levels, blurs[0])
     least, total = np.inf, 0.0
     for b in range(blurs.shape[1]):
         least = min(least, nats[0, b].min() + blurs[1, b])

@@ -181,17 +181,18 @@ def solve(lower: FloatArray, right: FloatArray) -> FloatArray:
     return made
 
 
-@_inner
-def _inverse_band(columns: FloatArray, start: int) -> FloatArray:
-    """Band of the inverse of LLᵀ from row ``start`` on, both triangles, shape (p, p).
+@_compiled(_lower)
+def inverse_band(lower: FloatArray) -> FloatArray:
+    """Band of the inverse of LLᵀ, both triangles, shape (p, p).
 
-    Entries farther from the diagonal than the band of L, and rows before ``start``, are not set.
-    Takahashi's recurrence (Erisman and Tinney 1975, On computing certain elements of the inverse
-    of a sparse matrix), from the last row to the first.
+    L is the factor of the normal matrix, shape (width + 1, p). Entries farther from the diagonal
+    than its band are not set. Takahashi's recurrence (Erisman and Tinney 1975, On computing certain
+    elements of the inverse of a sparse matrix), from the last row to the first.
     """
+    columns = lower.T
     width, count = columns.shape[1] - 1, len(columns)
     inverse, column = np.empty((count, count)), np.empty(width)
-    for j in range(count - 1, start - 1, -1):
+    for j in range(count - 1, -1, -1):
         after = min(width, count - 1 - j)
         column[:] = 0.0
         for k in range(0, after - 3, 4):  # four at a time: the column is read and written once
@@ -212,10 +213,44 @@ def _inverse_band(columns: FloatArray, start: int) -> FloatArray:
     return inverse
 
 
-@_compiled(_f2, _lower, _f1, _f2, _f2, _f2)
+@_compiled(_f2, _f2, _f1, _f2)
+def height_variances(
+    grid: FloatArray, inverse: FloatArray, of_mean: FloatArray, points: FloatArray
+) -> FloatArray:
+    """Variance of the height at points less the mean height, shape (m,), mm².
+
+    Parameters
+    ----------
+    grid
+        The splines.
+    inverse
+        Covariance of the p coefficients (`inverse_band`), shape (p, p), mm².
+    of_mean
+        Covariance of each coefficient with the mean height, and the variance of that, shape
+        (p + 1,), mm².
+    points
+        Shape (m, ≥ 2), mm.
+    """
+    out, work, many = np.empty(len(points)), np.empty((4, 4)), int(grid[1, 3]) + 3
+    for k in range(len(points)):
+        first = cubic_splines(grid[0], points[k, 0], work[0], work[1]) * many
+        first += cubic_splines(grid[1], points[k, 1], work[2], work[3])
+        variance = of_mean[-1]
+        for a in range(4):
+            for b in range(4):
+                spline, along = first + a * many + b, 0.0
+                for c in range(4):
+                    for d in range(4):
+                        along += work[0, c] * work[2, d] * inverse[spline, first + c * many + d]
+                variance += work[0, a] * work[2, b] * (along - 2.0 * of_mean[spline])
+        out[k] = max(variance, 0.0)
+    return out
+
+
+@_compiled(_f2, _f2, _f1, _f2, _f2, _f2)
 def covariance_of_dots(
     grid: FloatArray,
-    lower: FloatArray,
+    inverse: FloatArray,
     laser: FloatArray,
     plane: FloatArray,
     points: FloatArray,
@@ -223,8 +258,8 @@ def covariance_of_dots(
 ) -> FloatArray:
     """Covariance of the dots that a fitted surface makes of rays, shape (n, 2, 2), mm².
 
-    With L the factor of the normal matrix, shape (width + 1, p), and R what each coefficient moves
-    either coordinate of a dot by, Rᵀ (LLᵀ)⁻¹ R. Points and dots are in the UCS, shape (n, 3), mm.
+    ``inverse`` is the covariance of the p coefficients (`inverse_band`), whose band contains all
+    splines of a cell. Points and dots are in the UCS, shape (n, 3), mm.
     """
     pairs, work, many = len(points), np.empty((4, 4)), int(grid[1, 3]) + 3
     first = np.empty(pairs, np.int64)
@@ -232,10 +267,6 @@ def covariance_of_dots(
         first_x = cubic_splines(grid[0], points[k, 0], work[0], work[1])
         first[k] = first_x * many + cubic_splines(grid[1], points[k, 1], work[2], work[3])
     out = np.zeros((pairs, 2, 2))
-    if pairs == 0:
-        return out
-    # The splines of a cell are all within the band.
-    inverse = _inverse_band(lower.T, first.min())
     by_u, by_v = np.empty(16), np.empty(16)
     for k in range(pairs):
         (xu, xv), (yu, yv) = slope_jacobian(laser, plane, points[k], dots[k])
