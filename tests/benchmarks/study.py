@@ -40,6 +40,7 @@ import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
+from typing import Any
 from unittest import mock
 
 import numpy as np
@@ -51,7 +52,7 @@ from labapp.config.scenario import read_scenario
 from labapp.config.setup import read_setup
 from labapp.core.pipeline import Settings
 from labapp.export.tables import frame_tables
-from labapp.media import Frame, FrameSource, open_source
+from labapp.media import Frame, open_source
 from labapp.media.recording.nut import NutWriter
 from labapp.run.measurers import WarmMeasurer
 from labapp.run.study import stretches
@@ -414,10 +415,8 @@ class Reference:
         self.took_s: list[float] = []
         """Processor time of each operation."""
 
-    def opened(self, path: Path, index: bytes | None = None) -> FrameSource:
-        """Open a recording that times the operation after every `EVERY` frames."""
-        source = open_source(path, index)
-        read = source.frame
+    def measurer(self, read: Callable[[int], Frame], *others: Any) -> WarmMeasurer:
+        """Return a measurer that times the operation before every `EVERY` frames."""
 
         def frame(number: int) -> Frame:
             if number % self.EVERY == 0:
@@ -426,8 +425,7 @@ class Reference:
                 self.took_s.append(time.process_time() - start_s)
             return read(number)
 
-        source.frame = frame  # type: ignore[method-assign]
-        return source
+        return WarmMeasurer(frame, *others)
 
 
 def long(folder: Path, frames: int) -> None:
@@ -459,7 +457,7 @@ def long(folder: Path, frames: int) -> None:
         )
 
     with (
-        mock.patch.object(stretches, "open_source", reference.opened),
+        mock.patch.object(stretches, "WarmMeasurer", reference.measurer),
         mock.patch.object(study_module, "measure_stretch", measure),
     ):
         study = Study(folder / "long.toml", out)
