@@ -17,9 +17,9 @@ from labapp.bundled import bundled
 from labapp.config.scenario_keys import RECORDINGS, SHAPES, TABLES, TERMS, pool_rules
 from labapp.config.setup import parse_setup
 from labapp.config.setup_keys import SECTIONS
+from labapp.config.setup_text import points_of
 from labapp.config.toml_keys import check_keys, parse_toml, read_text, unknown_key
 from labapp.core.geometry.rig import Rig
-from labapp.core.geometry.uncertainty import ENDINGS
 from labapp.core.values import FloatArray
 from labapp.errors import InputError, unknown_name
 from labapp.simulation.camera import CameraView, Lens
@@ -219,8 +219,7 @@ def _view(path: Path, calibration: dict[str, Any], camera: dict[str, Any]) -> Ca
         raise InputError(path, "camera.focal_px", "missing", expected)
     points: dict[str, Any] = {
         key: tuple(value) if isinstance(value, list) else value
-        for key, value in calibration.items()
-        if not key.endswith(ENDINGS) and key != "frame_px"
+        for key, value in points_of(calibration).items()
     }
     try:
         return CameraView(**points, **size, lens=Lens(**bent) if bent else None)

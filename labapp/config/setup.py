@@ -23,7 +23,7 @@ from labapp.config.bench_check import (
 )
 from labapp.config.ray_file import with_rays
 from labapp.config.setup_keys import OPTIONAL, SECTIONS, rules_for
-from labapp.config.setup_text import frame_px_of
+from labapp.config.setup_text import frame_px_of, image_calibration_of
 from labapp.config.toml_keys import (
     check_keys,
     parse_toml,
@@ -478,10 +478,4 @@ def _calibration(values: dict[str, Any]) -> ImageCalibration:
     percent = lens_keys.pop("distortion_percent", 0.0)
     half = np.array([plane["width_mm"], plane["height_mm"]]) / 2
     lens = Lens(**{key: tuple(pair) for key, pair in lens_keys.items()}) if lens_keys else None
-    keys = _without_sigmas(values["image_calibration"])
-    keys.pop("frame_px", None)
-    if "homography" in keys:
-        made = ImageCalibration(np.array(keys["homography"], float), lens)
-    else:
-        made = ImageCalibration.from_three_points(**keys, lens=lens)
-    return made.with_distortion(percent, half)
+    return image_calibration_of(values["image_calibration"], lens).with_distortion(percent, half)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,8 +11,9 @@ import numpy as np
 
 from labapp.config.setup_keys import SECTIONS
 from labapp.config.toml_keys import are_numbers, check_keys
-from labapp.core.geometry.coordinates import Lens
+from labapp.core.geometry.coordinates import ImageCalibration, Lens
 from labapp.core.geometry.rig import DotPattern
+from labapp.core.geometry.uncertainty import ENDINGS
 from labapp.core.values import FloatArray
 
 
@@ -36,6 +38,25 @@ def three_points(text: str) -> FloatArray | None:
     keys = _section(text, "image_calibration")
     points = [keys.get(name) for name in ("origin_px", "x_axis_px", "z_axis_px")]
     return np.array(points, float) if all(are_numbers(point, 2) for point in points) else None
+
+
+def points_of(keys: Mapping[str, Any]) -> dict[str, Any]:
+    """Keys of an image calibration without uncertainties and the size of its picture."""
+    return {k: v for k, v in keys.items() if not k.endswith(ENDINGS) and k != "frame_px"}
+
+
+def image_calibration_of(keys: Mapping[str, Any], lens: Lens | None) -> ImageCalibration:
+    """Image calibration of a section of a setup.
+
+    Raises
+    ------
+    KeyError, TypeError, ValueError
+        If a key is missing or unknown, or the points do not determine a calibration.
+    """
+    points = points_of(keys)
+    if "homography" in points:
+        return ImageCalibration(np.array(points["homography"], float), lens)
+    return ImageCalibration.from_three_points(**points, lens=lens)
 
 
 def frame_px_of(text: str) -> tuple[int, int] | None:

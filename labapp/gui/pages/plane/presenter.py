@@ -8,13 +8,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from labapp.config.setup_text import lens_of
+from labapp.config.setup_text import image_calibration_of, lens_of
 from labapp.core.calibration.board_calibration import BoardCalibration
 from labapp.core.calibration.imaging_plane import Calibration, calibrate_imaging_plane
 from labapp.core.calibration.mark_fit import Model, root_mean_square
 from labapp.core.calibration.plane_calibration import PlaneCalibration, PlaneCalibrationSettings
-from labapp.core.geometry.coordinates import ImageCalibration, Lens
-from labapp.core.geometry.uncertainty import ENDINGS
+from labapp.core.geometry.coordinates import Lens
 from labapp.core.values import FloatArray
 from labapp.gui.digits import ResultRow, round_factor
 from labapp.gui.shell.steps import calibrations_in_use
@@ -265,18 +264,8 @@ def in_use(session: Session) -> tuple[ResultRow, ...]:
     values, sigmas = [np.nan] * 3, [None] * 3
     kept = session.plane_calibration if calibrations_in_use(session)[1] else None
     keys = tomllib.loads(session.setup_text).get("image_calibration", {})
-    keys = {
-        name: value
-        for name, value in keys.items()
-        if not name.endswith(ENDINGS) and name != "frame_px"
-    }
-    lens = lens_of(session.setup_text)
     try:
-        calibration = (
-            ImageCalibration(np.array(keys["homography"], float), lens)
-            if "homography" in keys
-            else ImageCalibration.from_three_points(**keys, lens=lens)
-        )
+        calibration = image_calibration_of(keys, lens_of(session.setup_text))
     except (TypeError, ValueError, KeyError):
         pass  # it is missing or wrong; the set-up page shows the reason
     else:
