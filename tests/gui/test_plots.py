@@ -8,12 +8,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from PySide6.QtCore import QPoint, QPointF, Qt
-from PySide6.QtGui import QGuiApplication
+from PySide6.QtGui import QFontMetricsF, QGuiApplication
 from PySide6.QtTest import QTest
 from pytestqt.qtbot import QtBot
 
 from labapp.gui.curves import Axis, Curve, Mark, as_table, nearest, next_key, point_text
 from labapp.gui.theme import palette
+from labapp.gui.views.axes import PlainAxis
 from labapp.gui.views.plots import MOST_POINTS, PlotStack
 from tests.gui.conftest import KEPT, let_draw
 
@@ -191,3 +192,15 @@ def test_removed_plots_leave_no_trace(view: PlotStack, qtbot: QtBot) -> None:
     let_draw()
     assert view.grab().toImage() == fresh.grab().toImage()
     fresh.hide()
+
+
+@pytest.mark.parametrize("low_high", [(6.0, 6.9), (0.25, 0.34), (0.0018, 0.0036), (0.0, 1.0)])
+@pytest.mark.parametrize("length_px", [40.0, 60.0, 300.0])
+def test_numbers_of_a_short_axis_do_not_overlap(
+    qapp: object, low_high: tuple[float, float], length_px: float
+) -> None:
+    low, high = low_high
+    spacing, _ = PlainAxis("left").tickSpacing(low, high, length_px)[0]
+    line_px = QFontMetricsF(QGuiApplication.font()).height()
+    assert spacing / (high - low) * length_px >= line_px
+    assert spacing <= high - low

@@ -77,6 +77,8 @@ class DynamicsWindow(ToolWindow):
         ]  # fmt: skip
         for field in self.band:
             self.form.add(field)
+        for field in (self.segment, *self.band):
+            field.set_placeholder("automatic")
 
     def _make_results(self) -> None:
         self.words = wrapping_label()

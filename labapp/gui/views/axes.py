@@ -7,7 +7,7 @@ from typing import Any
 
 import pyqtgraph as pg
 from PySide6.QtCore import Qt
-from PySide6.QtGui import QColor
+from PySide6.QtGui import QColor, QFontMetricsF, QGuiApplication
 from PySide6.QtWidgets import QLayout, QWidget
 
 from labapp.core.values import FloatArray
@@ -17,11 +17,22 @@ from labapp.gui.widgets.layouts import hbox, vbox
 
 
 class PlainAxis(pg.AxisItem):  # type: ignore[misc]
-    """An axis that never scales its numbers.
+    """An axis that never scales its numbers, and leaves some out where they would overlap.
 
     pyqtgraph scales them by the visible range whenever a label is set, even if scaling is switched
-    off: the numbers of an axis in mm would be in µm, but its label would still say mm.
+    off: the numbers of an axis in mm would be in µm, but its label would still say mm. Along a
+    short vertical axis it draws four numbers whatever their height.
     """
+
+    def tickSpacing(self, low: float, high: float, length_px: float) -> list[tuple[float, float]]:
+        """Spacings of ticks, widest first, and their offsets: as wide as a line of text."""
+        levels: list[tuple[float, float]] = super().tickSpacing(low, high, length_px)
+        line_px = QFontMetricsF(QGuiApplication.font()).height()
+        spacing, least = levels[0][0], line_px * (high - low) / length_px
+        if self.orientation not in {"left", "right"} or spacing >= least:
+            return levels
+        wider = [spacing * times for times in (2, 5, 10) if spacing * times >= least]
+        return [(wider[0], 0.0), *levels] if wider else levels
 
     def updateAutoSIPrefix(self) -> None:
         """Keep the numbers unscaled."""
