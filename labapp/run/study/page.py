@@ -26,6 +26,9 @@ MOST_ROWS = 6
 COLOURS = "#0072b2 #d55e00 #009e73 #cc79a7 #56b4e9 #e69f00 #333333 #999999".split()
 """Colours that can be distinguished with poor colour vision (Okabe and Ito)."""
 
+APART = 0.02
+"""Distance between symbols of different colours, as a share of the range of the axis."""
+
 PANEL_INCHES = (2.0, 1.8)
 
 CSS = """
@@ -89,7 +92,11 @@ def _problems(summary: StudySummary) -> list[str]:
 
 def _plots_note(summary: StudySummary) -> str:
     varying = varying_conditions(summary)
-    colours = " Colours distinguish the other conditions." if len(varying) > 1 else ""
+    colours = (
+        " Colours distinguish the other conditions and are drawn slightly apart."
+        if len(varying) > 1
+        else ""
+    )
     return (
         "<p class=note>Large symbols: mean of the recordings under one condition, with its "
         f"standard uncertainty ({SIGMA_OF}). Small symbols: mean of each recording.{colours} "
@@ -149,6 +156,8 @@ def _draw_row(
     places, ticks = _places(summary.groups, condition)
     kinds = _kinds(summary.groups, others)
     colours = dict(zip(dict.fromkeys(kinds), COLOURS, strict=False))
+    step = APART * (max(places, default=0.0) - min(places, default=0.0) or 1.0)
+    apart = {kind: step * (k - (len(colours) - 1) / 2) for k, kind in enumerate(colours)}
     for axis, size in zip(axes, SIZES, strict=True):
         if all(group.means[size].mean == 0 for group in summary.groups):
             axis.set_axis_off()
@@ -156,7 +165,7 @@ def _draw_row(
             continue
         for group, place, kind in zip(summary.groups, places, kinds, strict=True):
             each = [by_name[name].means[size].mean for name in group.recordings]
-            _draw(axis, place, group.means[size], each, colours[kind])
+            _draw(axis, place + apart[kind], group.means[size], each, colours[kind])
         axis.grid(True, color="0.9", linewidth=0.5)
         axis.set_axisbelow(True)
         if ticks is not None:
