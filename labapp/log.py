@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import faulthandler
 import logging
 import logging.handlers
+from contextlib import suppress
 from pathlib import Path
 
 import platformdirs
@@ -15,6 +17,11 @@ MAX_BYTES, KEPT = 1_000_000, 3
 def log_file() -> Path:
     """Return the path of the log file."""
     return Path(platformdirs.user_log_dir(NAME, appauthor=False)) / "labapp.log"
+
+
+def crash_file() -> Path:
+    """Return the path of the file with reports of crashes."""
+    return log_file().with_name("crash.log")
 
 
 def start_log() -> logging.Logger:
@@ -29,6 +36,15 @@ def start_log() -> logging.Logger:
     if logging.lastResort is not None:  # notices of `core.compiled` also go to stderr
         logger.getChild("notices").addHandler(logging.lastResort)
     return logger
+
+
+def report_crashes() -> None:
+    """Write what each thread was doing to `crash_file` if a library crashes the program."""
+    if faulthandler.is_enabled():
+        return
+    with suppress(OSError, RuntimeError):  # as in `_handler`
+        crash_file().parent.mkdir(parents=True, exist_ok=True)
+        faulthandler.enable(crash_file().open("a", encoding="utf-8"))  # kept open by the handler
 
 
 def _handler() -> logging.Handler:

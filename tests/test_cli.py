@@ -453,6 +453,19 @@ def test_internal_error_is_reported_without_a_traceback(
     assert "Traceback" in log.log_file().read_text()
 
 
+def test_crash_of_a_library_is_reported_beside_the_log(state: Path) -> None:
+    script = "import faulthandler\nfrom labapp.log import crash_file, report_crashes\n"
+    script += "print(crash_file(), flush=True)\nreport_crashes()\nfaulthandler._sigsegv()\n"
+    without = {key: value for key, value in os.environ.items() if key != "PYTHONFAULTHANDLER"}
+    done = subprocess.run(
+        [sys.executable, "-c", script], env=without, capture_output=True, text=True, check=False
+    )
+    report = Path(done.stdout.strip())
+    assert done.returncode != 0
+    assert report.is_relative_to(state)
+    assert "Current thread" in report.read_text("utf-8")
+
+
 def test_unwritable_log_does_not_stop_a_command(
     labapp: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -32,7 +32,7 @@ from PySide6.QtWidgets import QApplication
 from labapp.bundled import bundled
 from labapp.errors import InputError
 from labapp.gui import compiling
-from labapp.log import NAME, start_log
+from labapp.log import NAME, report_crashes, start_log
 from labapp.system import has_display
 from labapp.version import VERSION
 
@@ -71,6 +71,7 @@ def main(arguments: Sequence[str]) -> int:
     path = Path(arguments[0]).absolute() if arguments else None
     if path is not None and not path.exists():
         raise InputError(path, "file", "does not exist", "a session, or a recording to import")
+    report_crashes()
     app = start_app()
 
     from labapp.gui.preferences import preferences_file, read_preferences
