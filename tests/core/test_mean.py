@@ -82,9 +82,9 @@ def test_correlation_in_a_long_recording_is_sampled(still: bool) -> None:
 
 @pytest.mark.slow
 def test_mean_uncertainty_of_an_oscillating_pool() -> None:
-    """The mean height's error over its σ, in three recordings."""
+    """The mean height's error over its σ, in six recordings."""
     errors, if_independent = [], []
-    for seed in (1, 2, 3):
+    for seed in range(1, 7):
         rng = np.random.default_rng([seed, 5])
         width = rng.uniform(4.8, 6.6)
         wave = Wave((1, 1), 0.015, frequency_hz=30.0, turned_deg=rng.uniform(0.0, 360.0))
@@ -102,4 +102,4 @@ def test_mean_uncertainty_of_an_oscillating_pool() -> None:
         errors.append(np.mean(height_errors) / sigma_of_mean("height_mm", series))
         if_independent.append(np.mean(height_errors) / independent_sigma)
     assert np.abs(errors).max() < 3.0
-    assert np.sqrt(np.mean(np.square(if_independent))) > 1.5
+    assert np.abs(if_independent).max() > 3.0  # the same criterion rejects independent levels

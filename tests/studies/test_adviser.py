@@ -36,7 +36,7 @@ def advice() -> Advice:
 
 @pytest.fixture(scope="module")
 def checked(advice: Advice) -> Check:
-    return check(advice, pools=6, places=4, grid=(2, 1, 1), workers=1)
+    return check(advice, pools=24, places=1, grid=(2, 1, 1), workers=1)
 
 
 # --- the pools ----------------------------------------------------------------------------------
@@ -165,12 +165,12 @@ def test_other_pools_are_visible_and_measured_as_predicted(checked: Check) -> No
     assert not checked.chosen[..., 1:].any()
     # The mean of so few scatters by a fifth: a little more than twice 20 % is allowed.
     assert abs(checked.off_prediction) < 0.5
-    # So little effort finds a bench about as good as the dissertation's; both means scatter.
-    assert checked.error_mm < 1.5 * checked.text_error_mm
+    # So little effort finds a bench as good as the dissertation's; each mean scatters by a tenth.
+    assert checked.error_mm < 1.3 * checked.text_error_mm
     assert len(checked.places)
     assert checked.errors.min() > 0.6 * checked.error_mm
-    assert checked.rematch.shape == (2, 6, 4)
-    assert "6 fresh pools at 4 places each: 0 rays hidden, 0 off the plane" in check_text(checked)
+    assert checked.rematch.shape == (2, 24, 1)
+    assert "24 fresh pools at 1 places each: 0 rays hidden, 0 off the plane" in check_text(checked)
 
 
 def test_broken_constraints_of_the_dissertations_setup_are_listed(checked: Check) -> None:

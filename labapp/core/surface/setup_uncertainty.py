@@ -20,7 +20,7 @@ from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match
 from labapp.core.surface.level import Witnesses
 from labapp.core.surface.pool_fit import FitSettings, FittedPool, normal_equations
-from labapp.core.surface.solver import normal_factor
+from labapp.core.surface.solver import NormalEquations, height_sigma, normal_factor
 from labapp.core.values import FloatArray, IntArray
 
 ROUNDS = 3
@@ -68,13 +68,16 @@ def setup_changes(
     off = np.flatnonzero(known.root.any(axis=0)).tolist()
     dots = match.plane_mm, match.plane_covariance_mm2
     benches = [bench_off(rig, SHARE * known.root[:, k], match.plane_mm) for k in off]
-    change = _response(match.ray, *dots, rig, settings, pool, benches) / SHARE
+    equations = _factorised(*dots, rig, settings, pool)
+    change = _response(match.ray, equations, pool, benches) / SHARE
     basis, about = pool.surface.basis, (0.0, pool.level.sign, REACH)
     own = project_rays(rig.laser, rig.pattern)
     x, y = own.landing_mm[..., 0], own.landing_mm[..., 1]
     seen = (match.witness != 0) & basis.contains(x, y)
     landing, sign = own.landing_mm[seen], match.witness[seen]
-    sigma, limits = pool.height_sigma_mm(landing), (rig.head_sign, match.missing)
+    assert equations.factor is not None
+    solved = equations.factor, equations.inverse, pool.mean_splines
+    sigma, limits = height_sigma(basis, *solved, landing), (rig.head_sign, match.missing)
     for k, by, (bench, _) in zip(off, change.T, benches, strict=True):
         aside = (project_rays(bench.laser, bench.pattern).landing_mm[seen] - landing) / SHARE
         more, less = (
@@ -111,7 +114,8 @@ def residual_changes(
     root, at, surface = rig.uncertainty.root, tuple(ray.T - 1), pool.surface
     off = np.flatnonzero(root.any(axis=0)).tolist()
     benches = [bench_off(rig, SHARE * root[:, k], plane_mm) for k in off]
-    change = _response(ray, plane_mm, plane_covariance_mm2, rig, settings, pool, benches)
+    equations = _factorised(plane_mm, plane_covariance_mm2, rig, settings, pool)
+    change = _response(ray, equations, pool, benches)
     changes = np.zeros((*plane_mm.shape, len(root)))
     for k, by, (bench, dots_mm) in zip(off, change.T, benches, strict=True):
         rays, plane = project_rays(bench.laser, bench.pattern), bench.imaging_plane.pose_mm
@@ -122,23 +126,30 @@ def residual_changes(
     return changes
 
 
-def _response(
-    ray: IntArray,
+def _factorised(
     plane_mm: FloatArray,
     plane_covariance_mm2: FloatArray,
     rig: Rig,
     settings: FitSettings,
     pool: FittedPool,
-    benches: Sequence[Perturbed],
+) -> NormalEquations:
+    """Normal equations with a factor for the final reflection points (see `SHARE`)."""
+    basis, points = pool.surface.basis, pool.points_mm
+    own = normal_equations(basis, rig, points, plane_mm, plane_covariance_mm2, settings)
+    own.factor = normal_factor(basis, own.stiffness, points, own.weights)
+    return own
+
+
+def _response(
+    ray: IntArray, own: NormalEquations, pool: FittedPool, benches: Sequence[Perturbed]
 ) -> FloatArray:
     """Changes of a fit's p coefficients for q slightly perturbed benches, shape (p, q), mm."""
     from labapp.core.surface.kernels import solver_kernels, spline_kernels
 
     points, surface = pool.points_mm, pool.surface
     grid, coefficients, at = surface.basis.grid, surface.coefficients, tuple(ray.T - 1)
-    dots = plane_mm, plane_covariance_mm2
-    own = normal_equations(surface.basis, rig, points, *dots, settings)
-    factor = normal_factor(surface.basis, own.stiffness, points, own.weights)
+    factor = own.factor
+    assert factor is not None
 
     def right_side(
         points_mm: FloatArray, laser_mm: FloatArray, plane: FloatArray, dots_mm: FloatArray
