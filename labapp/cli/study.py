@@ -82,9 +82,8 @@ def run(
     An interrupted study can be continued by running it again. A recording that cannot be measured
     does not stop the others. Exit code 1: not everything is measured.
     """
-    from labapp.run.study.results import require_extra
     from labapp.run.study.status import count_states
-    from labapp.run.study.study import Study
+    from labapp.run.study.study import Study, require_extra
 
     opened = Study(study, out)
     require_extra()

@@ -455,17 +455,17 @@ def stretch_pools(frames: int, workers: int | None = None) -> Iterator[list[Exec
         for _ in range(min(os.cpu_count() or 1 if workers is None else workers, stretches)):
             pools.append(pool := measuring_pool(1))
             at_end.callback(pool.shutdown, cancel_futures=True)
-            pool.submit(_load)
+            pool.submit(load_all)
         yield pools
 
 
 def await_loaded(pools: Sequence[Executor]) -> None:
     """Wait until `stretch_pools` have loaded their modules."""
-    for loaded in [pool.submit(_load) for pool in pools]:
+    for loaded in [pool.submit(load_all) for pool in pools]:
         loaded.result()
 
 
-def _load() -> None:
+def load_all() -> None:
     """Import all modules for measuring in this process."""
     import labapp.core.matching.match_kernels
     import labapp.core.rows.lattice_kernels

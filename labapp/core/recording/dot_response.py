@@ -88,7 +88,10 @@ def dot_responses(
     known, responses
         Which rays meet all surfaces and the plane, shape (n,); the responses of these m.
     """
-    changes = [(_by_spline(rig, one, ray), *_by_bench(rig, one, ray)) for one in surfaces]
+    by_bench = _by_bench(rig, surfaces, ray)
+    changes = [
+        (_by_spline(rig, one, ray), *by) for one, by in zip(surfaces, by_bench, strict=True)
+    ]
     known = np.isfinite(np.concatenate(sum(changes, ()), axis=-1)).all(axis=(1, 2))
     return np.asarray(known), [_response(*(by[known] for by in one)) for one in changes]
 
@@ -108,8 +111,10 @@ def _without(absorbed: FloatArray, moved: FloatArray) -> FloatArray:
     return np.asarray(moved - absorbed @ (absorbed.T @ moved))
 
 
-def _by_bench(rig: Rig, surface: SplineSurface, ray: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Derivatives of the dots by each quantity, shape (n, 2, q), and by the lens's centre."""
+def _by_bench(
+    rig: Rig, surfaces: Sequence[SplineSurface], ray: IntArray
+) -> list[tuple[FloatArray, FloatArray]]:
+    """Derivatives of each surface's dots by each quantity, (n, 2, q), and by the lens's centre."""
     from labapp.core.surface.kernels import ray_kernels
 
     assert rig.uncertainty is not None
@@ -117,9 +122,12 @@ def _by_bench(rig: Rig, surface: SplineSurface, ray: IntArray) -> tuple[FloatArr
 
     def computed(bench: Rig) -> FloatArray:
         rays = project_rays(bench.laser, bench.pattern)
-        near = rays.directions[at], rays.landing_mm[at]
-        met = surface.basis.grid, surface.coefficients, *near, NEWTON_STEPS
-        return ray_kernels.intersect_and_reflect(*met, bench.imaging_plane.pose_mm)[2]
+        near = rays.directions[at], rays.landing_mm[at], NEWTON_STEPS, bench.imaging_plane.pose_mm
+        met = (
+            ray_kernels.intersect_and_reflect(one.basis.grid, one.coefficients, *near)
+            for one in surfaces
+        )
+        return np.stack([dots for _, _, dots in met])
 
     dots, changes = computed(rig), []
     for k, one in enumerate(QUANTITIES):
@@ -129,7 +137,11 @@ def _by_bench(rig: Rig, surface: SplineSurface, ray: IntArray) -> tuple[FloatArr
             for offset in (way * step * np.eye(len(QUANTITIES))[k] for way in (1.0, -1.0))
         )
         changes.append((more - less) / (2.0 * step))
-    return np.stack(changes, axis=-1), _by_lens_center(dots, rig.imaging_plane)
+    by_quantity = np.stack(changes, axis=-1)
+    return [
+        (by, _by_lens_center(one, rig.imaging_plane))
+        for by, one in zip(by_quantity, dots, strict=True)
+    ]
 
 
 def _by_lens_center(plane_mm: FloatArray, plane: ImagingPlane) -> FloatArray:

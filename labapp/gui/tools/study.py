@@ -25,9 +25,8 @@ from labapp.gui.widgets.tables import CellTable, FittingTable
 from labapp.run.measurers import measuring_pool
 from labapp.run.study.page import condition_picture, varying_conditions
 from labapp.run.study.plan import StudyRecording, folder_pattern, write_study
-from labapp.run.study.results import require_extra
 from labapp.run.study.status import Progress, RecordingStatus, count_states
-from labapp.run.study.study import Study
+from labapp.run.study.study import Study, require_extra
 from labapp.run.study.summary import StudySummary
 from labapp.simulation.parallel import end_processes, wait_for
 from labapp.text import column_heading

@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from threadpoolctl import threadpool_limits
 
 from labapp.core.pipeline import Measurement
 from labapp.core.recording.residual_check import (
@@ -31,7 +32,7 @@ from labapp.core.recording.residual_check import (
     judged_status,
 )
 from labapp.core.surface.measures import SIZES, sigma_name
-from labapp.errors import InputError, os_errors_as_input
+from labapp.errors import os_errors_as_input
 from labapp.export.meshes import SPACING_MM
 from labapp.export.tables import MM_DIGITS, Table, number
 from labapp.files import as_bytes, atomic_file, write_file
@@ -55,22 +56,6 @@ CHUNK = 64
 """Frames per chunk of surfaces."""
 
 
-def require_extra() -> None:
-    """Check that the packages that write results are installed.
-
-    Raises
-    ------
-    InputError
-        If one is not installed.
-    """
-    for name in ("pyarrow", "zarr"):
-        try:
-            __import__(name)
-        except ImportError as error:
-            expected = "this package: pip install 'labapp[study]'"
-            raise InputError("study", name, "is not installed", expected) from error
-
-
 def write_results(
     folder: Path,
     plan: StudyPlan,
@@ -84,11 +69,11 @@ def write_results(
     parts
         Status and tasks of each recording.
     """
-    require_extra()
     recordings: list[RecordingSummary] = []
     outliers: list[Outlier] = []
     numbers = [name for name in plan.conditions if _is_number(plan, name)]
-    with os_errors_as_input(folder, "results", ROOM):
+    # More threads are slower for the small matrices of the set-up's check.
+    with os_errors_as_input(folder, "results", ROOM), threadpool_limits(1, "blas"):
         dataset = folder / "measures.parquet"
         dataset.mkdir(exist_ok=True)
         for known, tasks in parts:

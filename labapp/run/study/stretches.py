@@ -43,7 +43,7 @@ from labapp.run.study.plan import COLUMNS
 from labapp.system import sync_folder
 from labapp.version import VERSION
 
-FORMAT = 2
+FORMAT = 3
 """Format of the files; increased when a new program cannot use old ones."""
 
 KEPT_RESIDUALS = 2 * MOST
@@ -263,19 +263,31 @@ def _measured(stretch: Stretch, measurer: Measurer) -> bytes:
     for column in COLUMNS:
         values = np.concatenate([row[column.name] for row in rows])
         arrays[f"measures/{column.name}"] = values.astype(str) if values.dtype == object else values
-    for frame, one in residuals:
-        arrays |= {
-            f"residuals/{frame}/ray": one.ray,
-            f"residuals/{frame}/residual_mm": one.residual_mm,
-            f"residuals/{frame}/x_knots": one.surface.basis.x_knots,
-            f"residuals/{frame}/y_knots": one.surface.basis.y_knots,
-            f"residuals/{frame}/coefficients": one.surface.coefficients,
-        }
+    arrays |= _residual_arrays(residuals)
     for frame, z_mm, low in surfaces:
         arrays |= {f"surfaces/{frame}/z_mm": z_mm, f"surfaces/{frame}/low": np.array(low)}
     content = io.BytesIO()
     np.savez_compressed(content, allow_pickle=False, **arrays)
     return content.getvalue()
+
+
+def _residual_arrays(residuals: Sequence[tuple[int, Residuals]]) -> dict[str, npt.NDArray[Any]]:
+    """Return residuals as arrays of all frames, which are read much faster than one per frame.
+
+    Each has beside it the number of its rows in each frame.
+    """
+    arrays = {"residuals/frame": np.array([frame for frame, _ in residuals], int)}
+    parts = {
+        "ray": [one.ray for _, one in residuals],
+        "residual_mm": [one.residual_mm for _, one in residuals],
+        "x_knots": [one.surface.basis.x_knots for _, one in residuals],
+        "y_knots": [one.surface.basis.y_knots for _, one in residuals],
+        "coefficients": [one.surface.coefficients for _, one in residuals],
+    }
+    for name, each in parts.items():
+        arrays[f"residuals/{name}"] = np.concatenate(each) if each else np.empty(0)
+        arrays[f"residuals/{name}/rows"] = np.array([len(one) for one in each], int)
+    return arrays
 
 
 def _grid(surface: Reconstruction) -> tuple[FloatArray, tuple[int, int]]:
@@ -332,18 +344,25 @@ class StretchFile:
 
     def residuals(self) -> dict[int, Residuals]:
         """Return the residuals of the frames that have any."""
+        frames = self._array("residuals/frame").tolist()
+        names = ("ray", "residual_mm", "x_knots", "y_knots", "coefficients")
         found = {}
-        for frame in self._numbers("residuals/", "/ray"):
-            of = f"residuals/{frame}/"
-            basis = SplineBasis(self._array(f"{of}x_knots"), self._array(f"{of}y_knots"))
-            surface = SplineSurface(basis, self._array(f"{of}coefficients"))
-            ray, residual = self._array(f"{of}ray"), self._array(f"{of}residual_mm")
+        for frame, ray, residual, x, y, coefficients in zip(
+            frames, *map(self._by_frame, names), strict=True
+        ):
+            surface = SplineSurface(SplineBasis(x, y), coefficients)
             found[frame] = Residuals(ray, residual, surface)
         return found
 
+    def _by_frame(self, name: str) -> list[npt.NDArray[Any]]:
+        """Return the part of each frame of an array of `_residual_arrays`."""
+        ends = np.cumsum(self._array(f"residuals/{name}/rows"))
+        return np.split(self._array(f"residuals/{name}"), ends)[:-1]
+
     def surfaces(self) -> Sequence[int]:
         """Return the frames that have a surface."""
-        return self._numbers("surfaces/", "/z_mm")
+        names = [name for name in self._arrays.files if name.endswith("/z_mm")]
+        return [int(name.split("/")[1]) for name in names]
 
     def low(self, frame: int) -> tuple[int, int]:
         """Return the indices (row, column) of the first node of a frame's surface."""
@@ -353,10 +372,6 @@ class StretchFile:
     def surface(self, frame: int) -> FloatArray:
         """Return the heights of a frame's surface, shape (rows, columns), mm."""
         return np.asarray(self._array(f"surfaces/{frame}/z_mm"))
-
-    def _numbers(self, begin: str, end: str) -> list[int]:
-        names = [name for name in self._arrays.files if name.startswith(begin)]
-        return [int(name[len(begin) : -len(end)]) for name in names if name.endswith(end)]
 
     def __enter__(self) -> StretchFile:
         return self

@@ -6,6 +6,7 @@ import json
 import time
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
+from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -36,6 +37,20 @@ MARKER = "study.json"
 OWN_FOLDER = "a new or empty folder, or one with results of a study"
 OLD_S = 3600.0
 """Age at which a temporary file must be from a killed process, s."""
+
+
+def require_extra() -> None:
+    """Check that the packages that write results are installed.
+
+    Raises
+    ------
+    InputError
+        If one is not installed.
+    """
+    for name in ("pyarrow", "zarr"):
+        if find_spec(name) is None:
+            expected = "this package: pip install 'labapp[study]'"
+            raise InputError("study", name, "is not installed", expected)
 
 
 class Study:
@@ -115,8 +130,10 @@ class Study:
             scheduler is lost. Finished frames are stored.
         """
         with self._alone():
-            hired = local_workers(workers) if scheduler is None else dask_workers(scheduler)
+            left = sum(one.state != "done" for one in self.status(surfaces=surfaces))
+            hired = local_workers(workers, left) if scheduler is None else dask_workers(scheduler)
             with hired as team:
+                import labapp.run.study.results  # noqa: F401 - while the processes start
                 for sentence in (team.dashboard and f"Dashboard: {team.dashboard}", team.warning):
                     if sentence:
                         note(sentence)
@@ -310,6 +327,7 @@ class Study:
         InputError
             If it cannot be written, or a package of the extra ``study`` is missing.
         """
+        require_extra()
         from labapp.run.study.results import write_results
 
         with self._alone():

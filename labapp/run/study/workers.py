@@ -24,7 +24,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from labapp.errors import InputError
-from labapp.run.measurers import measuring_pool
+from labapp.run.measurers import load_all, measuring_pool
 from labapp.simulation.parallel import POLL_S, end_processes
 from labapp.system import interrupts_blocked
 
@@ -125,18 +125,33 @@ def _error_of(future: Future[None]) -> Exception | None:
 class _Processes(Executor):
     """Processes with a pool each: if one dies, tasks of the others go on."""
 
-    def __init__(self, count: int) -> None:
+    def __init__(self, count: int, tasks: int) -> None:
         self._lock = threading.Lock()
-        self._idle: list[ProcessPoolExecutor | None] = [None] * count
         self._pools: set[ProcessPoolExecutor] = set()
+        soon = min(count, tasks)
+        self._idle: list[ProcessPoolExecutor | None] = [None] * (count - soon)
+        self._idle += [self._start() for _ in range(soon)]
+
+    def _start(self) -> ProcessPoolExecutor:
+        """Start a process, which loads its modules in the background."""
+        pool = measuring_pool(1)
+        self._pools.add(pool)
+        with interrupts_blocked():
+            pool.submit(load_all)
+        return pool
 
     def submit(self, work: Callable[..., Any], /, *given: Any, **named: Any) -> Future[Any]:
         """Start a task in an idle process; there must be one."""
         with self._lock:
-            pool = self._idle.pop() or measuring_pool(1)
-            self._pools.add(pool)
+            pool = self._idle.pop() or self._start()
         with interrupts_blocked():
-            future = pool.submit(work, *given, **named)
+            try:
+                future = pool.submit(work, *given, **named)
+            except BrokenExecutor:  # it died while idle
+                with self._lock:
+                    self._pools.discard(pool)
+                    pool = self._start()
+                future = pool.submit(work, *given, **named)
         future.add_done_callback(lambda done: self._free(pool, done))
         return future
 
@@ -169,16 +184,18 @@ class _Here(Executor):
 
 
 @contextmanager
-def local_workers(count: int | None) -> Iterator[Workers]:
+def local_workers(count: int | None, tasks: int) -> Iterator[Workers]:
     """Start processes of this machine.
 
     Parameters
     ----------
     count
         Number of processes; None: one per core; 0: tasks run in this process.
+    tasks
+        Number of tasks to expect: not more processes start at once, but when they are needed.
     """
     count = (os.cpu_count() or 1) if count is None else count
-    executor = _Processes(count) if count else _Here()
+    executor = _Processes(count, tasks) if count else _Here()
     try:
         yield Workers(executor, lambda: max(count, 1))
     finally:

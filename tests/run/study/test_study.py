@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import csv
 import errno
+import os
 import shutil
+from concurrent.futures import BrokenExecutor
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +20,7 @@ from labapp import Study, files
 from labapp.cli import app
 from labapp.config.setup import read_setup
 from labapp.core.pipeline import Settings, measure
+from labapp.core.recording.residual_check import Residuals
 from labapp.errors import InputError
 from labapp.media import open_source
 from labapp.run import measurers
@@ -141,6 +144,41 @@ def test_conditions_can_change_without_measuring(measured_file: Path) -> None:
     rows = rows_of(study.folder)
     assert set(rows["gas"]) == {"He"}
     assert set(rows["speed"]) == {2.0}
+
+
+def test_residuals_of_frames_are_kept_in_full(measured_file: Path, simulated: Path) -> None:
+    study = Study(measured_file)
+    first, rig = study.plan.recordings[0], read_setup(simulated / "setup.toml").rig
+    tasks = study.tasks(first)
+    assert tasks is not None
+    kept = {}
+    for stretch in tasks.stretches:
+        assert stretch.done is not None
+        with stretches.StretchFile(stretch, stretch.done) as read:
+            kept |= read.residuals()
+    assert list(kept) == [0, 1, 2, 3, 4]
+    with open_source(first.path) as source:
+        found, _ = measure(source.frame(3).image, rig, first.settings)
+    residuals = Residuals.of(found)
+    assert residuals is not None
+    assert np.array_equal(kept[3].ray, residuals.ray)
+    assert np.array_equal(kept[3].residual_mm, residuals.residual_mm)
+    assert np.array_equal(kept[3].surface.coefficients, residuals.surface.coefficients)
+    assert np.array_equal(kept[3].surface.basis.x_knots, residuals.surface.basis.x_knots)
+    assert np.array_equal(kept[3].surface.basis.y_knots, residuals.surface.basis.y_knots)
+
+
+def test_process_that_died_while_idle_is_replaced() -> None:
+    with workers.local_workers(1, tasks=1) as team:
+        assert isinstance(team.executor, workers._Processes)
+        (pool,) = team.executor._idle
+        assert pool is not None
+        (process,) = pool._processes.values()
+        process.kill()
+        with pytest.raises(BrokenExecutor):
+            while True:
+                pool.submit(os.getpid).result()
+        assert team.executor.submit(max, 1, 2).result() == 2
 
 
 @pytest.mark.slow
