@@ -32,13 +32,13 @@ ROOT = Path(__file__).resolve().parent.parent
     ],
 )
 def test_arguments_that_open_the_app(arguments: list[str], expected: bool):
-    assert window.asks_for_app(arguments, COMMANDS) == expected
+    assert window.asks_for_app(arguments, lambda: COMMANDS) == expected
 
 
 def test_existing_path_is_opened_whatever_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "frames").mkdir()
-    assert window.asks_for_app(["frames"], COMMANDS)
+    assert window.asks_for_app(["frames"], lambda: COMMANDS)
 
 
 def test_missing_display_is_reported_with_a_hint(labapp: Run):

@@ -83,7 +83,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     with _stoppable() as stops:
         try:
             given = sys.argv[1:] if arguments is None else arguments
-            if asks_for_app(given, _commands()):
+            if asks_for_app(given, _commands):
                 sys.exit(open_app(given))
             app(args=arguments)
         except InputError as error:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import subprocess
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
 import typer
@@ -19,14 +19,19 @@ LIBRARIES = (
 """Packages of Debian and Ubuntu with the libraries that Qt and VTK need."""
 
 
-def asks_for_app(arguments: Sequence[str], commands: Collection[str]) -> bool:
-    """Whether to open the app: without arguments, or with one that is a file, not a command."""
+def asks_for_app(arguments: Sequence[str], commands: Callable[[], Collection[str]]) -> bool:
+    """Whether to open the app: without arguments, or with one that is a file, not a command.
+
+    The commands are called only if they matter: making them takes a tenth of a second.
+    """
     if not arguments:
         return True
     (first, *others) = arguments
-    if others or first.startswith("-") or first in commands:
+    if others or first.startswith("-"):
         return False
-    return bool(Path(first).suffix) or os.sep in first or Path(first).exists()
+    if Path(first).suffix or os.sep in first:
+        return True
+    return Path(first).exists() and first not in commands()
 
 
 def open_app(arguments: Sequence[str]) -> int:

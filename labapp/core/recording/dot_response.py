@@ -89,9 +89,7 @@ def dot_responses(
         Which rays meet all surfaces and the plane, shape (n,); the responses of these m.
     """
     by_bench = _by_bench(rig, surfaces, ray)
-    changes = [
-        (_by_spline(rig, one, ray), *by) for one, by in zip(surfaces, by_bench, strict=True)
-    ]
+    changes = [(_by_spline(rig, one, ray), *by) for one, by in zip(surfaces, by_bench, strict=True)]
     known = np.isfinite(np.concatenate(sum(changes, ()), axis=-1)).all(axis=(1, 2))
     return np.asarray(known), [_response(*(by[known] for by in one)) for one in changes]
 

@@ -53,24 +53,30 @@ class Label(NamedTuple):
     plain: bool = True
     """Whether it has no background."""
 
-    def corners(self, point_px: float) -> FloatArray:
-        """Return the lower left and upper right corner, shape (2, 2), px, for wide letters."""
+    def edges(self, point_px: float) -> tuple[float, float, float, float]:
+        """Return the left, lower, right and upper edge, px, for wide letters."""
         lines = self.words.split("\n")
-        extent = np.array([max(map(len, lines)) * LETTER, len(lines) * LINE])
-        extent = (extent[::-1] if self.upright else extent) * self.size_pt * point_px
-        low = self.at_px - extent * (0.5 - 0.5 * self.side)
-        return np.stack([low, low + extent])
+        wide, tall = max(map(len, lines)) * LETTER, len(lines) * LINE
+        if self.upright:
+            wide, tall = tall, wide
+        wide, tall = wide * self.size_pt * point_px, tall * self.size_pt * point_px
+        (x, y), (across, up) = self.at_px, self.side
+        left, low = x - wide * (0.5 - 0.5 * across), y - tall * (0.5 - 0.5 * up)
+        return left, low, left + wide, low + tall
 
     def within(self, size_px: FloatArray, point_px: float) -> Label:
         """Return the label, moved into the picture."""
-        low, high = self.corners(point_px)
-        moved = np.clip(low, 2, np.maximum(size_px - (high - low) - 2, 2))
-        return self._replace(at_px=self.at_px + moved - low)
+        left, low, right, high = self.edges(point_px)
+        wide, tall = size_px
+        x = max(2.0, min(left, wide - (right - left) - 2)) - left
+        y = max(2.0, min(low, tall - (high - low) - 2)) - low
+        return self._replace(at_px=self.at_px + np.array([x, y]))
 
     @property
-    def side(self) -> FloatArray:
-        """Side of the anchor, −1, 0 or 1 to the right and up, shape (2,)."""
-        return np.sign(self.way) * (np.abs(self.way) > SLANT)
+    def side(self) -> tuple[int, int]:
+        """Side of the anchor, −1, 0 or 1 to the right and up."""
+        x, y = self.way
+        return (x > SLANT) - (x < -SLANT), (y > SLANT) - (y < -SLANT)
 
 
 def round_step(span: float, most: int) -> float:
@@ -105,6 +111,10 @@ class Overlay:
         self._plotter = plotter
         self._colour = pyvista.Color(colour).float_rgb
         self._texts: list[Any] = []
+        self._written: list[Label | None] = []
+        """Labels of the texts; None: hidden."""
+        self._axes: list[Label] = []
+        self._axes_made_for: object = None
         self._bar: Any = None
         self._bar_made_for: object = None
         self._bar_left = np.inf
@@ -131,25 +141,27 @@ class Overlay:
         return float(self._plotter.render_window.GetDPI()) / USUAL_DPI
 
     def place(self) -> None:
-        """Place all labels for the present camera."""
+        """Place all labels for the present camera; this is called before every rendering."""
         size = np.array(self._plotter.renderer.GetSize(), float)
         if size.min() < 1:
             return
-        scale = self._scale(size)
-        beside = size - [max(size[0] - self._bar_left, 0.0), 0.0]
-        axes = [*self._axis(0), *self._axis(1), *self._upwards()]
-        labels = [*self._apart(axes, beside), *scale, *self._captions(size)]
+        others = [*self._scale(size), *self._captions(size)]
         if self.mark is not None:
             at, words = self.mark
             place = self.project(at[None] * self.stretch)[0]
             at_px = place + GAP_PT * self.point_px
-            labels.append(Label(words, at_px, (1, 1), TITLE_PT, plain=False))
+            others.append(Label(words, at_px, (1, 1), TITLE_PT, plain=False))
+        beside = size - [max(size[0] - self._bar_left, 0.0), 0.0]
+        self._label_axes(beside)
+        labels = [*self._axes, *(label.within(size, self.point_px) for label in others)]
         while len(self._texts) < len(labels):
             self._texts.append(self._new_text())
-        for text in self._texts[len(labels) :]:
-            text.SetVisibility(False)
-        for text, label in zip(self._texts, labels, strict=False):
-            self._write(text, label.within(size, self.point_px))
+            self._written.append(None)
+        for k, text in enumerate(self._texts):
+            label = labels[k] if k < len(labels) else None
+            if label is not self._written[k]:
+                self._write(text, label)
+                self._written[k] = label
 
     def project(self, points_mm: FloatArray) -> FloatArray:
         """Project drawn points, shape (n, 3), to px from the picture's lower left, shape (n, 2)."""
@@ -159,15 +171,26 @@ class Overlay:
         """Omit numbers that would overlap other labels."""
         labels = [label.within(size, self.point_px) for label in labels]
         names = [label for label in labels if label.size_pt == TITLE_PT]
-        kept, taken = names, [name.corners(self.point_px) for name in names]
+        kept, taken = names, [name.edges(self.point_px) for name in names]
         for label in (one for one in labels if one.size_pt != TITLE_PT):
-            low, high = label.corners(self.point_px)
-            if not any((low < box[1]).all() and (box[0] < high).all() for box in taken):
+            left, low, right, high = edges = label.edges(self.point_px)
+            if not any(
+                left < other[2] and other[0] < right and low < other[3] and other[1] < high
+                for other in taken
+            ):
                 kept.append(label)
-                taken.append(np.stack([low, high]))
+                taken.append(edges)
         return kept
 
     # --- the axes ----------------------------------------------------------------------------
+
+    def _label_axes(self, beside: FloatArray) -> None:
+        """Label the axes, unless nothing has changed: this takes as long as the rendering."""
+        arrays = view_matrix(self._plotter.renderer), beside, self.box_mm, self.stretch
+        made_for = *(array.tobytes() for array in arrays), self.point_px
+        if made_for != self._axes_made_for:
+            labels = [*self._axis(0), *self._axis(1), *self._upwards()]
+            self._axes, self._axes_made_for = self._apart(labels, beside), made_for
 
     def _axis(self, axis: int) -> list[Label]:
         """Label the edge of the floor that faces the viewer."""
@@ -285,16 +308,18 @@ class Overlay:
         self._plotter.renderer.AddViewProp(text)
         return text
 
-    def _write(self, text: Any, label: Label) -> None:
+    def _write(self, text: Any, label: Label | None) -> None:
+        text.SetVisibility(label is not None)
+        if label is None:
+            return
         style = text.GetTextProperty()
         style.SetFontSize(label.size_pt)
         style.SetOrientation(90.0 if label.upright else 0.0)
         style.SetBackgroundOpacity(0.0 if label.plain else 0.75)
-        across, up = label.side.astype(int).tolist()
+        across, up = label.side
         style.SetJustification(1 - (up if label.upright else across))
         style.SetVerticalJustification(1 + (across if label.upright else -up))
         text.SetInput(label.words)
-        text.SetVisibility(True)
         text.SetPosition(*label.at_px.tolist())
 
 

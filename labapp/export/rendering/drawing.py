@@ -80,6 +80,8 @@ class Drawing:
         self.plotter = plotter
         self._steady = steady
         self.plotter.theme.allow_empty_mesh = True  # a frame may have no surface
+        # The work piece is the only transparent part but for lines: sorting pixels is not needed.
+        self.plotter.renderer.SetUseOIT(False)
         self._box, self._step_mm = np.zeros((2, 3)), 1.0
         self._stretch = np.ones(3)
         self.overlay = Overlay(plotter, "black")

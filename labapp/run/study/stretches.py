@@ -277,7 +277,7 @@ def _residual_arrays(residuals: Sequence[tuple[int, Residuals]]) -> dict[str, np
     Each has beside it the number of its rows in each frame.
     """
     arrays = {"residuals/frame": np.array([frame for frame, _ in residuals], int)}
-    parts = {
+    parts: dict[str, list[npt.NDArray[Any]]] = {
         "ray": [one.ray for _, one in residuals],
         "residual_mm": [one.residual_mm for _, one in residuals],
         "x_knots": [one.surface.basis.x_knots for _, one in residuals],

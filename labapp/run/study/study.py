@@ -134,6 +134,7 @@ class Study:
             hired = local_workers(workers, left) if scheduler is None else dask_workers(scheduler)
             with hired as team:
                 import labapp.run.study.results  # noqa: F401 - while the processes start
+
                 for sentence in (team.dashboard and f"Dashboard: {team.dashboard}", team.warning):
                     if sentence:
                         note(sentence)

@@ -48,7 +48,7 @@ class Basis:
 
     def fingerprints(self) -> tuple[str, str]:
         """Return the SHA-256 of the set-up's values, without comments, and of the settings."""
-        return _setup_fingerprint(self.setup.text), fingerprint(self.settings)
+        return _setup_fingerprint(self.setup.text), _settings_fingerprint(self.settings)
 
 
 @dataclass(frozen=True)
@@ -71,6 +71,17 @@ class Result:
     """Reasons why it is stale, one clause each; empty if it is not."""
     doubt: str = ""
     """Why the set-up of the measurement is doubtful; empty if it is not."""
+
+    @property
+    def parsed_setup(self) -> Setup:
+        """Set-up of the measurement.
+
+        Raises
+        ------
+        InputError
+            If its text is damaged.
+        """
+        return _parsed(self.setup)
 
 
 @dataclass(frozen=True)
@@ -391,14 +402,24 @@ def _residuals(content: bytes, columns: tuple[object, ...]) -> Residuals | None:
 
 @functools.lru_cache(maxsize=64)
 def _read_inputs(setup: bytes, settings: bytes) -> Basis:
-    return Basis(parse_setup(unpack(setup, str), "setup", lines=True), unpack(settings, Settings))
+    return Basis(_parsed(unpack(setup, str)), unpack(settings, Settings))
+
+
+@functools.lru_cache(maxsize=64)
+def _parsed(setup: str) -> Setup:
+    return parse_setup(setup, "setup", lines=True)
 
 
 @functools.lru_cache(maxsize=64)
 def _setup_fingerprint(text: str) -> str:
     """Return the SHA-256 of a set-up's values, without comments."""
-    setup = parse_setup(text, "setup", lines=True)
+    setup = _parsed(text)
     return fingerprint((setup.rig, setup.calibration))
+
+
+@functools.lru_cache(maxsize=64)
+def _settings_fingerprint(settings: Settings) -> str:
+    return fingerprint(settings)
 
 
 def _differences(now: Basis | None, then: Basis) -> tuple[str, ...]:

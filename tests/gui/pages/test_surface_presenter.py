@@ -117,7 +117,7 @@ def test_scheme_names_round_trip(session: Session, name: str) -> None:
 
 def test_scene_follows_its_options(session: Session) -> None:
     result = session.result(3)
-    rig = presenter.rig_of(result)
+    rig = result.parsed_setup.rig
     reconstruction = result.measurement.reconstruction
     cut = profile(reconstruction)
 

@@ -148,7 +148,7 @@ def test_conditions_can_change_without_measuring(measured_file: Path) -> None:
 
 def test_residuals_of_frames_are_kept_in_full(measured_file: Path, simulated: Path) -> None:
     study = Study(measured_file)
-    first, rig = study.plan.recordings[0], read_setup(simulated / "setup.toml").rig
+    first, bench = study.plan.recordings[0], read_setup(simulated / "setup.toml").bench
     tasks = study.tasks(first)
     assert tasks is not None
     kept = {}
@@ -158,14 +158,14 @@ def test_residuals_of_frames_are_kept_in_full(measured_file: Path, simulated: Pa
             kept |= read.residuals()
     assert list(kept) == [0, 1, 2, 3, 4]
     with open_source(first.path) as source:
-        found, _ = measure(source.frame(3).image, rig, first.settings)
+        found, _ = measure(source.frame(1).image, bench, first.settings)
     residuals = Residuals.of(found)
     assert residuals is not None
-    assert np.array_equal(kept[3].ray, residuals.ray)
-    assert np.array_equal(kept[3].residual_mm, residuals.residual_mm)
-    assert np.array_equal(kept[3].surface.coefficients, residuals.surface.coefficients)
-    assert np.array_equal(kept[3].surface.basis.x_knots, residuals.surface.basis.x_knots)
-    assert np.array_equal(kept[3].surface.basis.y_knots, residuals.surface.basis.y_knots)
+    assert np.array_equal(kept[1].ray, residuals.ray)
+    assert np.array_equal(kept[1].residual_mm, residuals.residual_mm)
+    assert np.array_equal(kept[1].surface.coefficients, residuals.surface.coefficients)
+    assert np.array_equal(kept[1].surface.basis.x_knots, residuals.surface.basis.x_knots)
+    assert np.array_equal(kept[1].surface.basis.y_knots, residuals.surface.basis.y_knots)
 
 
 def test_process_that_died_while_idle_is_replaced() -> None:
@@ -175,9 +175,13 @@ def test_process_that_died_while_idle_is_replaced() -> None:
         assert pool is not None
         (process,) = pool._processes.values()
         process.kill()
-        with pytest.raises(BrokenExecutor):
+
+        def use_until_broken() -> None:
             while True:
                 pool.submit(os.getpid).result()
+
+        with pytest.raises(BrokenExecutor):
+            use_until_broken()
         assert team.executor.submit(max, 1, 2).result() == 2
 
 

@@ -9,7 +9,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from labapp.config.setup import parse_setup
 from labapp.core.images.dots import Dots, Image
 from labapp.core.images.find_dots import DotSettings, find_dots
 from labapp.core.pipeline import Measurement, Settings, start_correction
@@ -171,7 +170,7 @@ def computed_px(result: Result | None) -> FloatArray:
     point, pair = np.array(points, int).reshape(-1, 2).T
     plane = match.plane_mm[pair] + surface.residual_mm[point]
     met = np.isfinite(plane).all(axis=1)
-    return parse_setup(result.setup, "setup", lines=True).calibration.to_image(plane[met])
+    return result.parsed_setup.calibration.to_image(plane[met])
 
 
 def needs_fit(seen: DotsState) -> bool:

@@ -16,7 +16,6 @@ from labapp.gui.pages.surface.presenter import (
     SCHEMES,
     SIZES,
     Options,
-    rig_of,
     scene,
     with_scheme,
 )
@@ -66,7 +65,7 @@ def compared(
             words.append(f"No surface ({answer.status}): {answer.reason}.")
     first, second = found
     base = session.result(frame)
-    rig = session.setup.rig if base is None else rig_of(base)
+    rig = session.setup.rig if base is None else base.parsed_setup.rig
     measures = [each.measures for each in (first, second) if each and each.measures]
     limits = None
     if measures:
@@ -120,7 +119,7 @@ def by_scheme(session: Session, frame: int, scheme: str) -> Measurement:
     base = session.result(frame)
     if base is None or base.measurement.match is None:
         raise CannotMeasure("no-match", f"frame {frame} has no matched dots: measure it first")
-    match, rig = base.measurement.match, rig_of(base)
+    match, rig = base.measurement.match, base.parsed_setup.rig
     chosen = with_scheme(base.settings, scheme)
     reconstruction = reconstruct(match, rig, chosen)
     return replace(

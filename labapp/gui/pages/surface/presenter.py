@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import functools
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
-from labapp.config.setup import parse_setup
 from labapp.core.geometry.rig import Rig
 from labapp.core.lines.frame import LineFrame
 from labapp.core.lines.region import between_lines
@@ -201,8 +199,9 @@ def _setup_words(result: Result) -> str:
     status = result.measurement.setup_status
     if result.stale or result.measurement.status != "ok" or not status:
         return ""
-    checked = parse_setup(result.setup, "setup", lines=True).checked
-    return marked_setup_words(status, setup_words(status, checked, result.doubt))
+    return marked_setup_words(
+        status, setup_words(status, result.parsed_setup.checked, result.doubt)
+    )
 
 
 def provenance(result: Result) -> str:
@@ -283,16 +282,6 @@ def verdict(match: Match | None) -> str:
     times = match.margin
     factor = f"{times:.0f}" if times >= 10 else f"{times:.1f}"
     return f"{match.orientation}: the next best is {factor} times as far off."
-
-
-def rig_of(result: Result) -> Rig:
-    """The rig with which a result was measured."""
-    return _rig(result.setup)
-
-
-@functools.lru_cache(maxsize=8)
-def _rig(setup: str) -> Rig:
-    return parse_setup(setup, "setup", lines=True).rig
 
 
 def height_limits(seen: Overview) -> tuple[float, float] | None:

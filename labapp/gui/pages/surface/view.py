@@ -44,7 +44,6 @@ from labapp.gui.pages.surface.presenter import (
     SurfaceState,
     height_limits,
     reflected_dots,
-    rig_of,
     scene,
     shown,
 )
@@ -360,7 +359,7 @@ class SurfacePage(Page):
         if result is not None and seen is not None:
             measurement = result.measurement
             limits = height_limits(seen) if self.options.same_colours else None
-            drawn = scene(measurement, rig_of(result), self.options, limits, cut)
+            drawn = scene(measurement, result.parsed_setup.rig, self.options, limits, cut)
             dots = reflected_dots(measurement)
         self.view.set_words(self.surface_state.words)
         self.view.sigma_at = None if reconstruction is None else partial(_sigma, reconstruction)
