@@ -46,7 +46,7 @@ WITHOUT = "labapp --help lists the commands"
 BAD_INPUT = 2
 
 LOAD_AFTER_MS = 300
-"""Delay, ms, before modules needed later are loaded; the window is shown first."""
+"""Delay, ms, before modules needed later are loaded; the window and a session are shown first."""
 
 NEEDED_LATER = (
     "labapp.session.frames",
@@ -78,17 +78,25 @@ def main(arguments: Sequence[str]) -> int:
 
     file = preferences_file()
     preferences, problem = read_preferences(file)
-    with open_window(app, preferences, file) as window:
+    with open_window(app, preferences, file, path) as window:
         if problem:
             window.say(problem, True)
-        if path is not None:
-            QTimer.singleShot(0, window, lambda: window.files.open_path(path))
         return app.exec()
 
 
 @contextlib.contextmanager
-def open_window(app: QApplication, preferences: Preferences, file: Path) -> Iterator[MainWindow]:
-    """Show the window; restore signals, error reporting and garbage collection afterwards."""
+def open_window(
+    app: QApplication, preferences: Preferences, file: Path, path: Path | None = None
+) -> Iterator[MainWindow]:
+    """Show the window; restore signals, error reporting and garbage collection afterwards.
+
+    Parameters
+    ----------
+    file
+        File of the preferences.
+    path
+        Session or recording to open.
+    """
     from labapp.gui.shell.commands import make_window
 
     window = make_window(preferences, file)
@@ -109,7 +117,13 @@ def open_window(app: QApplication, preferences: Preferences, file: Path) -> Iter
     loading = threading.Thread(target=target, name="loading", daemon=True)
     load = QTimer(window, singleShot=True)
     load.timeout.connect(loading.start)
-    load.start(LOAD_AFTER_MS)
+
+    def begin() -> None:
+        if path is not None:
+            window.files.open_path(path)
+        load.start(LOAD_AFTER_MS)
+
+    QTimer.singleShot(0, window, begin)
     try:
         yield window
     finally:
