@@ -54,10 +54,11 @@ OPEN_WAITS = 20
 FOLLOWED_AT_ONCE = 400
 """Frames whose pulses are classified together: some tens of periods."""
 
-STRETCH = 1000
-"""Frames of a stretch. A frame measured without tracking takes as long as 200 tracked ones."""
+STRETCH = 500
+"""Frames of a stretch. A frame measured without tracking takes as long as ten to twenty tracked
+ones."""
 
-BY_THEMSELVES = frozenset({0, 1, 2, 500})
+BY_THEMSELVES = frozenset({0, 1, 2})
 """Frames of a stretch that are measured without tracking, to vote independently on its rows."""
 
 BATCH = 20
