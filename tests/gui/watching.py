@@ -17,7 +17,7 @@ from unittest import mock
 from PySide6.QtCore import Qt, QTimer, QtMsgType, qInstallMessageHandler
 from PySide6.QtGui import QDesktopServices
 from PySide6.QtTest import QTest
-from PySide6.QtWidgets import QAbstractButton, QApplication, QFileDialog, QMenu
+from PySide6.QtWidgets import QAbstractButton, QApplication, QFileDialog, QMenu, QWidget
 
 from labapp.log import start_log
 from labapp.session.file.database import SUFFIX
@@ -161,9 +161,9 @@ class Answers:
                 action = rng.choice(usable)
                 self._note(action.text())
                 popup.setActiveAction(action)
-                QTest.keyClick(popup, Qt.Key.Key_Return)
+                _soon(popup, lambda: QTest.keyClick(popup, Qt.Key.Key_Return))
             else:
-                QTest.keyClick(popup, Qt.Key.Key_Escape)
+                _soon(popup, lambda: QTest.keyClick(popup, Qt.Key.Key_Escape))
         elif popup is not None:
             popup.close()
         elif dialog is not None:
@@ -171,9 +171,14 @@ class Answers:
             if buttons:
                 button = rng.choice(buttons)
                 self._note(button.text())
-                button.click()
+                _soon(button, button.click)
             else:
                 dialog.close()
+
+
+def _soon(widget: QWidget, answer: Callable[[], object]) -> None:
+    """Answer after this call: a dialog that opens waits for its own answer in the meantime."""
+    QTimer.singleShot(0, widget, answer)
 
 
 class FaultHandler(logging.Handler):
