@@ -105,6 +105,7 @@ def no_windows(nothing_left: None) -> Iterator[None]:
     QCoreApplication.sendPostedEvents(None, QEvent.Type.DeferredDelete)
     KEPT.clear()
     gc.collect()
+    gc.unfreeze()  # Hypothesis searches all objects for those that refer to its random numbers
 
 
 @pytest.fixture
