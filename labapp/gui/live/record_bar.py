@@ -15,8 +15,8 @@ from labapp.gui.widgets.layouts import hbox, vbox
 
 BEGIN, END = "● Record", "■ End recording"
 
-BUTTON_PX, RING_BAR_PX = 44, 130
-"""Minimum height of the buttons, which are pressed with gloves; width of the memory bar."""
+BUTTON_PX, RING_BAR_PX = 44, 96
+"""Minimum size of the buttons, which are pressed with gloves; width of the memory bar."""
 
 
 class RecordBar(QWidget):
@@ -47,9 +47,10 @@ class RecordBar(QWidget):
         stop_button = button(
             "Stop camera", "Release the camera; a recording is finished first", stop
         )
-        buttons = ((self.record_button, 3), (self.mark_button, 1), (stop_button, 2))
+        buttons = ((self.record_button, 3), (self.mark_button, 2), (stop_button, 2))
         for each, _ in buttons:
             each.setMinimumHeight(BUTTON_PX)
+        self.mark_button.setMinimumWidth(BUTTON_PX)  # leaves room for the others at 150 %
         font = self.record_button.font()
         font.setBold(True)
         self.record_button.setFont(font)

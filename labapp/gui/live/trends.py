@@ -34,6 +34,9 @@ MARKS = PLAIN, Mark("▪", "beyond its limit")
 LOW_PX = 460
 """On a lower canvas there is no space for both plots and fields."""
 
+LEAST_PX = 48
+"""Least height of the plots, which scroll: on a small screen an alarm takes their room."""
+
 ROOM_PX = 40
 """Space that must be left for all fields to be side by side."""
 
@@ -74,6 +77,7 @@ class LiveTrends(QWidget):
         super().__init__()
         self._workspace = workspace
         self.plots = PlotStack("Trends of the live pool")
+        self.plots.area.setMinimumHeight(LEAST_PX)
         self.last = NumberField(
             "Shown, the last",
             "s",

@@ -675,3 +675,15 @@ def test_live_page_is_accessible_by_keyboard_and_screen_reader(
         page.live_view.bar.state.setText(f"▲ {words}, 1000.0 frames/s")
         let_draw()
         assert (window.width(), window.height()) == (911, 512), words
+
+
+def test_record_buttons_do_not_overlap_on_a_small_screen(
+    window: MainWindow, page: CapturePage, qtbot: QtBot
+):
+    start(page, qtbot)
+    window.resize(683, 467)  # 1024 × 700 at 150 %
+    let_draw()
+    buttons = sorted(page.live_view.bar.findChildren(QAbstractButton), key=lambda each: each.x())
+    assert len(buttons) == 3
+    for left, right in pairwise(buttons):
+        assert left.geometry().right() < right.x()
