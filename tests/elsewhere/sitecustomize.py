@@ -104,6 +104,9 @@ def hide_missing() -> None:
 
 # --- files, as on Windows -----------------------------------------------------------------------
 
+LOCK_PROBE = ".filelock-probe-"
+"""Files with which filelock tries the locks of Unix: on Windows it has other code, without them."""
+
 TRUE = {name: getattr(os, name) for name in ("open", "fsync", "rename", "replace", "unlink")}
 
 
@@ -118,6 +121,8 @@ def _refuse_if_open(*paths: Any) -> None:
         try:
             target = os.readlink(f"/proc/self/fd/{handle}")
         except OSError:  # the handle of the listing
+            continue
+        if os.path.basename(target).startswith(LOCK_PROBE):
             continue
         if any(target == name or target.startswith(f"{name}/") for name in names):
             raise _permission_error(target, "it is open")
