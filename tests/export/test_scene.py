@@ -224,6 +224,26 @@ def test_frame_replaces_another(plotter: Any, pool: Reconstruction) -> None:
     np.testing.assert_allclose(screenshot(plotter), updated, atol=2)
 
 
+def test_axis_labels_follow_a_scene_under_the_same_camera(
+    plotter: Any, pool: Reconstruction
+) -> None:
+    """The picture equals that of a new drawing, although unchanged labels are kept."""
+    first = scene_of(pool)
+    high = replace(first, exaggeration=2 * first.exaggeration)
+    wide = replace(first, within_mm=np.array([[-9.0, -9.0, 0.0], [9.0, 9.0, 0.5]]))
+    for other in (high, wide):
+        plotter.clear()
+        drawing = draws.build_scene(plotter, first)
+        screenshot(plotter)
+        camera, depths = drawing.camera, plotter.camera.clipping_range
+        drawing.update(other)
+        updated = screenshot(plotter)
+        plotter.clear()
+        draws.build_scene(plotter, other).camera = camera
+        plotter.camera.clipping_range = depths
+        np.testing.assert_allclose(screenshot(plotter), updated, atol=2)
+
+
 def test_colour_scale_names_its_quantity(plotter: Any, pool: Reconstruction) -> None:
     drawing = draws.build_scene(plotter, scene_of(pool))
     for label in ("± (mm)", "height (mm)", "± (mm)"):

@@ -148,6 +148,7 @@ class _Processes(Executor):
             try:
                 future = pool.submit(work, *given, **named)
             except BrokenExecutor:  # it died while idle
+                pool.shutdown(wait=False)
                 with self._lock:
                     self._pools.discard(pool)
                     pool = self._start()
