@@ -53,7 +53,7 @@ def robust_sigma(residuals: npt.ArrayLike) -> float:
 
     The median size of normal deviates is their standard deviation over 1.4826.
     """
-    return 1.4826 * float(np.median(np.abs(residuals)))
+    return 1.4826 * median(np.abs(residuals).ravel())
 
 
 def median(values: FloatArray) -> float:
