@@ -7,9 +7,15 @@ from dataclasses import replace
 import pytest
 
 from labapp.config.setup import parse_setup
+from labapp.core.geometry.bench import Bench
+from labapp.core.matching import decision
+from labapp.core.matching.hypothesis import evaluate
+from labapp.core.matching.observation import Observation
 from tests.benchmarks import clutter_recordings, rendered
 from tests.benchmarks.clutter import draw, with_setup_errors
 from tests.benchmarks.dips import PoolResult, measure_pool
+from tests.core.test_dips import true_labels
+from tests.scenes import BENCH_VIEW, FRAME_SHAPE
 
 
 def result_of(kind: str, seed: int) -> PoolResult:
@@ -58,6 +64,17 @@ def test_slight_preference_of_knots_for_rows_does_not_decide(kind: str, seed: in
 def test_holes_ambiguous_within_setup_uncertainty_are_rejected(kind: str, seed: int) -> None:
     """With the setup assumed exact, every label was a row or a column off."""
     assert result_with_setup_errors(kind, seed).status == "ambiguous-rows"
+
+
+@pytest.mark.parametrize(("kind", "seed"), [("cap", 5000), ("egg", 5001), ("concave", 5005)])
+def test_setup_is_doubted_only_if_another_one_fits_better(kind: str, seed: int) -> None:
+    rig, seen, _ = draw(kind, seed, 0.0, 0)
+    for times, is_doubted in ((0.0, False), (1.0, True)):
+        bench = Bench(with_setup_errors(rig, seed, times), BENCH_VIEW)
+        observed = Observation.of(seen.dots, bench, FRAME_SHAPE)
+        true = evaluate(observed, true_labels(seen))
+        assert true is not None
+        assert bool(decision._doubt_of_setup(observed, true)) == is_doubted
 
 
 @pytest.mark.slow

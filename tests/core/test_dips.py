@@ -24,6 +24,10 @@ SHIFTED = 37
 ROW_LEFT_OVER = 60361
 """A pool once matched without its last row, whose rays counted as dark: 22 % too low."""
 
+UNEXPLAINED_DOT = 16
+"""A pool once matched with every ray a row off: two dots without a ray merge on that surface, and
+did not count as stray."""
+
 COLUMN_SKIPPED = 60352
 """A pool that was once not measured: a hypothesis from a cap had skipped a column."""
 
@@ -33,10 +37,15 @@ CROSSED = (7004, 7008, 7148)
 
 def observation_of(seen: SeenDots) -> tuple[Observation, IntArray]:
     """Return the observation, and the true labels."""
+    bench = Bench(BENCH_RIG, BENCH_VIEW)
+    return Observation.of(seen.dots, bench, FRAME_SHAPE), true_labels(seen)
+
+
+def true_labels(seen: SeenDots) -> IntArray:
     labels = np.full((BENCH_RIG.pattern.rows, BENCH_RIG.pattern.columns), UNLABELLED, np.int64)
     dot = np.flatnonzero(seen.ray[:, 0] > 0)
     labels[seen.ray[dot, 0] - 1, seen.ray[dot, 1] - 1] = dot
-    return Observation.of(seen.dots, Bench(BENCH_RIG, BENCH_VIEW), FRAME_SHAPE), labels
+    return labels
 
 
 def evaluated(observed: Observation, labels: IntArray) -> Hypothesis:
@@ -50,7 +59,10 @@ NO_ROWS = (7005, 7016)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [SHIFTED, 2, *CROSSED, *NO_ROWS, ROW_LEFT_OVER, COLUMN_SKIPPED])
+@pytest.mark.parametrize(
+    "seed",
+    [SHIFTED, UNEXPLAINED_DOT, 2, *CROSSED, *NO_ROWS, ROW_LEFT_OVER, COLUMN_SKIPPED],
+)
 def test_pool_with_a_dip_gets_the_right_rows(seed: int) -> None:
     got = measure_pool(*draw(seed))
     assert (got.status, got.wrong) == ("ok", 0)

@@ -11,7 +11,7 @@ import numpy as np
 import scipy
 
 from labapp.core.match import ORIENTATIONS, Orientation
-from labapp.core.matching.free_setup import FreeHypothesis, holes_left_open
+from labapp.core.matching.free_setup import FreeHypothesis, holes_left_open, with_setup_free
 from labapp.core.matching.hypothesis import (
     FINE_KNOTS,
     KNOT_ERROR_MM,
@@ -29,7 +29,13 @@ from labapp.core.matching.hypothesis import (
     without_doubtful_outermost,
     without_false_ends,
 )
-from labapp.core.matching.observation import QUICK, UNLABELLED, Observation, try_fit
+from labapp.core.matching.observation import (
+    QUICK,
+    UNLABELLED,
+    Observation,
+    count_labels,
+    try_fit,
+)
 from labapp.core.matching.outliers import MOST_LEFT_OUT, FittedLabels, unsupported
 from labapp.core.matching.prediction import covariance_of_dots
 from labapp.core.matching.ray_classes import RayClasses
@@ -69,6 +75,11 @@ shifted labels of 160 pools with a dip, those that came close had less than 2.5 
 FAR_COST = 30.0
 """Labels that cost more than the best by this with rough fits, and by `CLOSE_COST` in addition if
 the marker is included, do not come close to it with converged fits."""
+
+SETUP_GAIN = 80.0
+"""If another set-up within the uncertainty lowers the cost of a rejected hypothesis by more, the
+set-up is in doubt. With the true one, cluttered frames gained less than 40; with errors of one
+standard uncertainty, most gained hundreds."""
 
 NOTHING_EXPLAINS = "no surface explains the reflected dots"
 """Reason for ``no-match`` if most of the dots have no ray."""
@@ -338,7 +349,8 @@ def _refuse_unexplained(observed: Observation, best: Hypothesis, settings: Match
         raise CannotMeasure(
             "no-match",
             f"the best surface leaves {_counted(best.stray_count, 'dot')} without a ray and "
-            f"{_counted(best.missed_count, 'ray')} without a dot among {best.label_count} pairs",
+            f"{_counted(best.missed_count, 'ray')} without a dot among {best.label_count} pairs"
+            f"{_doubt_of_setup(observed, best)}",
         )
     if best.pool.level.rays and best.pool.level.disagreement > CONTRADICTED_BITS:
         raise CannotMeasure(
@@ -346,6 +358,15 @@ def _refuse_unexplained(observed: Observation, best: Hypothesis, settings: Match
             "no boundary of the best surface separates the rays that came back from those that "
             "did not: is the set-up correct?",
         )
+
+
+def _doubt_of_setup(observed: Observation, best: Hypothesis) -> str:
+    """Return the end of the reason for a rejection that another set-up would avoid, or nothing."""
+    freed = with_setup_free(observed, best, USUAL_KNOTS)
+    if freed.cost > best.cost - SETUP_GAIN:
+        return ""
+    explained = f"{count_labels(freed.labels)} of {len(observed.plane_mm)} dots would have a ray"
+    return f"; with another set-up within its uncertainty {explained}: is the set-up correct?"
 
 
 def _stands_against(
@@ -380,11 +401,13 @@ def _stands_against(
 
 
 def _beyond_doubt(observed: Observation, best: Hypothesis, margin: float) -> bool:
-    """Whether nothing is left unexplained, so that no shifted labels can come close.
+    """Whether every dot has a ray and no ray is missed, so that no shifted labels can come close.
 
-    Any shift places a dot at the marker's absent ray, and a ray without a dot in the hole.
+    Any shift places a dot at the marker's absent ray, and a ray without a dot in the hole. A dot
+    that is neither labelled nor stray may be the one at the absent ray.
     """
-    if best.stray_count or best.missed_count or best.marker != "dark":
+    every_dot = best.label_count == len(observed.plane_mm)
+    if not every_dot or best.missed_count or best.marker != "dark":
         return False
     fine = evaluate(observed, best.labels, FINE_KNOTS, initial=best.pool)
     return fine is not None and fine.misfit + margin < STRAY_COST + MISSED_COST

@@ -83,12 +83,12 @@ def holes_left_open(
     steps = [] if observed.rig.uncertainty is None else _steps_to_other_holes(observed, best)
     if not steps:
         return []
-    own = _with_setup_free(observed, best, fit)
+    own = with_setup_free(observed, best, fit)
     rivals = []
     for step in steps:
         shifted = evaluate(observed, shifted_by(observed, best.labels, step))
         if shifted is not None:
-            rival = _with_setup_free(observed, shifted, fit, own.given_cost + margin)
+            rival = with_setup_free(observed, shifted, fit, own.given_cost + margin)
             if rival.cost < own.cost + margin:
                 rivals.append(replace(rival, step=step))
     return [own, *rivals] if rivals else []
@@ -102,7 +102,7 @@ def _steps_to_other_holes(observed: Observation, best: Hypothesis) -> list[tuple
     return [step for step in STEPS if holes[marker[0] + 1 - step[0], marker[1] + 1 - step[1]]]
 
 
-def _with_setup_free(
+def with_setup_free(
     observed: Observation, hypothesis: Hypothesis, fit: FitSettings, most: float = np.inf
 ) -> FreeHypothesis:
     """Evaluate labels with the set-up with which they are likeliest.
