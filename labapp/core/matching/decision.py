@@ -29,13 +29,7 @@ from labapp.core.matching.hypothesis import (
     without_doubtful_outermost,
     without_false_ends,
 )
-from labapp.core.matching.observation import (
-    QUICK,
-    UNLABELLED,
-    Observation,
-    count_labels,
-    try_fit,
-)
+from labapp.core.matching.observation import QUICK, UNLABELLED, Observation, try_fit
 from labapp.core.matching.outliers import MOST_LEFT_OUT, FittedLabels, unsupported
 from labapp.core.matching.prediction import covariance_of_dots
 from labapp.core.matching.ray_classes import RayClasses
@@ -77,8 +71,8 @@ FAR_COST = 30.0
 the marker is included, do not come close to it with converged fits."""
 
 SETUP_GAIN = 80.0
-"""If another set-up within the uncertainty lowers the cost of a rejected hypothesis by more, the
-set-up is in doubt. With the true one, cluttered frames gained less than 40; with errors of one
+"""If another set-up (`with_setup_free`) lowers the cost of a rejected hypothesis by more, the given
+one is in doubt. With the true one, cluttered frames gained less than 40; with errors of one
 standard uncertainty, most gained hundreds."""
 
 NOTHING_EXPLAINS = "no surface explains the reflected dots"
@@ -365,8 +359,9 @@ def _doubt_of_setup(observed: Observation, best: Hypothesis) -> str:
     freed = with_setup_free(observed, best, USUAL_KNOTS)
     if freed.cost > best.cost - SETUP_GAIN:
         return ""
-    explained = f"{count_labels(freed.labels)} of {len(observed.plane_mm)} dots would have a ray"
-    return f"; with another set-up within its uncertainty {explained}: is the set-up correct?"
+    count = np.sum(freed.labels != UNLABELLED)
+    explained = f"{count} of {len(observed.plane_mm)} dots would have a ray"
+    return f"; with a slightly different set-up {explained}: is the set-up correct?"
 
 
 def _stands_against(
