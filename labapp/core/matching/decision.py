@@ -361,7 +361,7 @@ def _doubt_of_setup(observed: Observation, best: Hypothesis) -> str:
         return ""
     count = np.sum(freed.labels != UNLABELLED)
     explained = f"{count} of {len(observed.plane_mm)} dots would have a ray"
-    return f"; with a slightly different set-up {explained}: is the set-up correct?"
+    return f"; with another set-up {explained}: is the set-up correct?"
 
 
 def _stands_against(
