@@ -77,7 +77,7 @@ def measure(
     settings
         Settings of the measurement; None: the defaults of `labapp.core.pipeline.Settings`.
     follow
-        Whether to start from the previous frame's result, which is about twenty times faster.
+        Whether to start from the previous frame's result, which is more than ten times as fast.
     progress
         Called with the result of each frame.
 
@@ -101,8 +101,8 @@ def measure(
     require(setup, (*PATH, Setup), "measure", "setup", "a setup file's path or a Setup")
     if isinstance(setup, str) and "\n" in setup:
         raise InputError("measure", "setup", "text of several lines", "a setup file's path")
-    bench = setup if isinstance(setup, Setup) else read_setup(setup)
-    for unusual in bench.warnings:
+    loaded = setup if isinstance(setup, Setup) else read_setup(setup)
+    for unusual in loaded.warnings:
         warnings.warn(f"set-up: {unusual}", stacklevel=2)
     chosen = Settings() if settings is None else settings
     check_settings(chosen, "measure")
@@ -115,15 +115,15 @@ def measure(
         else:
             recording = at_end.enter_context(open_source(source))
             count, read = len(recording), recording.frame
-        measurer = (WarmMeasurer if follow else ColdMeasurer)(read, bench, chosen)
-        record = ResidualRecord(bench.rig)
+        measurer = (WarmMeasurer if follow else ColdMeasurer)(read, loaded, chosen)
+        record = ResidualRecord(loaded.rig)
         sinks = [] if progress is None else [progress]
         selected = select_frames(frames, count, "measure")
         found = list(run(selected, with_setup_check(measurer, record), sinks))
     verdict = record.verdict()
-    status = judged_status(bench.rig, verdict)  # of all frames together
+    status = judged_status(loaded.rig, verdict)  # of all frames together
     judged = (replace(r, measurement=replace(r.measurement, setup_status=status)) for r in found)
-    return Results(tuple(judged), bench.calibration, verdict)
+    return Results(tuple(judged), loaded.calibration, verdict)
 
 
 @dataclass(frozen=True, repr=False)

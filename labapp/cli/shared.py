@@ -58,7 +58,7 @@ Warm = Annotated[
     bool,
     typer.Option(
         "--warm",
-        help="Start each frame from the previous frame's result: about ten times as fast, for "
+        help="Start each frame from the previous frame's result: more than ten times as fast, for "
         "recordings with a high frame rate.",
     ),
 ]

@@ -1,10 +1,11 @@
 """Measure a frame: the steps of the measurement in order.
 
-1. `find_dots`: the reflected dots of the frame (§5.2.1).
+1. `tuned_dots`, or `find_dots` for another detector: the reflected dots of the frame (§5.2.1).
 2. `find_lattice`: their rows and columns in the picture, as far as they can be determined (§5.2.2).
 3. `match_rays`: which ray made which dot (§4.2.2); then rows and columns are those of the rays.
-4. `reconstruct`: the pool's surface and boundary, by the selected scheme (ch. 6, 7).
-5. `measure_surface`: its size and the reflection errors (Eq. 6-3 … 6-8).
+4. `fit.solve`, or `reconstruct` for another scheme: the pool's surface (ch. 6, 7).
+5. `fit.complete`, or `measure_surface` for another scheme: its boundary with fit, its size and the
+   reflection errors (Eq. 6-3 … 6-8).
 
 If the operator corrected the frame, the corrected dots and rows replace the results of steps 1
 and 2. With a prior from the previous frame, dots are matched to the predicted dots (`follow`),
@@ -46,7 +47,7 @@ if TYPE_CHECKING:  # the module compiles: it is loaded where a frame is measured
     from labapp.core.sequence.prior import Prior
 
 OnStep = Callable[[str], None]
-"""Called with the name of each completed step."""
+"""Called with the name of a completed step, see `measure`."""
 
 ByHand = Correction | LineCorrection
 """The operator's correction of a frame: dots and rows, or the lines of a line pattern."""
@@ -197,7 +198,8 @@ def measure(
         The operator's dots and rows, or lines, which are used instead of automatic detection; of
         the image only the shape is then used. Ignored if it is for the other kind of pattern.
     on_step
-        Called with the name of each completed step: dots, match, measures.
+        Called when a step of an uncorrected frame is completed, with its name: ``dots``; with fit
+        also ``surface``, when rays and surface are known, and ``measures``.
 
     Returns
     -------
@@ -242,7 +244,7 @@ def measure(
         if settings.scheme != "fit":
             return _by_scheme(result, match, rig, settings), None
         pool = followed.pool if followed else fit.solve(match, rig, settings.fit, initial)
-        on_step("match")
+        on_step("surface")
         reconstruction, sizes = fit.complete(match, pool, rig, settings.fit, known)
     except CannotMeasure as why:
         return _refused(result, why), None
@@ -252,7 +254,7 @@ def measure(
         return result, prior.followed_by(followed, reconstruction, sizes)
     from labapp.core.sequence.prior import Prior
 
-    if tuning is None or rig.pattern.marker is None:
+    if tuning is None:
         return result, None
     return result, Prior.of(bench, tuning, match, pool, reconstruction, sizes)
 

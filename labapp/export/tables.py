@@ -143,7 +143,7 @@ TABLES: dict[str, tuple[Column, ...]] = {
 
 _NAMES = {name: [column.name for column in columns] for name, columns in TABLES.items()}
 _MEASURED = {field.name for field in fields(Measures)}
-SIZES = [c.name for c in TABLES["measures"] if c.name in _MEASURED and not c.is_part]
+MEASURE_COLUMNS = [c.name for c in TABLES["measures"] if c.name in _MEASURED and not c.is_part]
 
 
 @cache
@@ -187,7 +187,7 @@ def _measures(time_s: float | None, measurement: Measurement) -> list[npt.NDArra
         "" if match is None else match.orientation,
         0 if measurement.dots is None else len(measurement.dots),
         math.nan if lattice is None else float(len(np.unique(lattice.row[lattice.row > 0]))),
-        *(getattr(measurement.measures, name, math.nan) for name in SIZES),
+        *(getattr(measurement.measures, name, math.nan) for name in MEASURE_COLUMNS),
         sigma_of(measurement),
         measurement.reason,
         measurement.setup_status,

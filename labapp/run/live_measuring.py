@@ -105,7 +105,7 @@ class LiveChain:
             frame=frame.number,
             time_s=frame.time_s,
             arrived_s=frame.arrived_s,
-            measurement=without_surface(self._record.judged(found)),
+            measurement=without_surface(self._record.add_and_judge(found)),
             setup_doubt=self._record.doubt,
             track_lost=self._chain.track_lost,
             quality=self._quality(frame, found),

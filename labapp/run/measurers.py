@@ -1,7 +1,7 @@
 """Measurers of the frames of a run (`runner.Measurer`).
 
-`ColdMeasurer` measures each frame independently, in this process or in a pool of processes.
-`WarmMeasurer` tracks each frame from the previous one, in this process. `RecordingMeasurer` tracks
+`ColdMeasurer` measures each frame without a prior; neighbouring frames then vote on its rows.
+`WarmMeasurer` tracks each frame from the previous one. `RecordingMeasurer` tracks
 stretches of a recording in several processes, which also compute the rows of the tables.
 
 Stretches have the same length, however many processes there are, and each begins with a frame
@@ -76,7 +76,7 @@ Corrected = Callable[[int], ByHand | None]
 
 @dataclass(frozen=True)
 class ColdMeasurer:
-    """Measures each frame independently of the others."""
+    """Measures each frame without a prior; its neighbours vote on its rows (`_agreeing`)."""
 
     read: Read
     """Reads frames; one that cannot be read gets the status ``unreadable``."""
@@ -96,8 +96,8 @@ class ColdMeasurer:
         """Read a frame in this process, and measure it in the pool, or at once if there is none."""
         frame = _read(self.read, number, self.setup, self.settings)
         if isinstance(frame, FrameResult):
-            return _here(lambda: frame)
-        submit = _here if self.pool is None else self.pool.submit
+            return _finished(lambda: frame)
+        submit = _finished if self.pool is None else self.pool.submit
         return submit(_cold, number, frame, self.setup, self.settings, self.corrected(number))
 
 
@@ -146,7 +146,7 @@ def _agreeing(
             yield judged()
 
 
-def _here(work: Callable[..., T], *given: Any) -> Future[T]:
+def _finished(work: Callable[..., T], *given: Any) -> Future[T]:
     """Call a function at once, with the interface of a pool."""
     future: Future[T] = Future()
     future.set_result(work(*given))
@@ -337,28 +337,28 @@ class _ChainElsewhere:
         return found
 
 
-_chain: WarmChain | None = None
+_worker_chain: WarmChain | None = None
 """The chain of this process, for `_ChainElsewhere`."""
 
 
 def _begin_chain(setup: Setup, settings: Settings) -> None:
-    global _chain  # noqa: PLW0603 - one chain at a time
+    global _worker_chain  # noqa: PLW0603 - one chain at a time
     from labapp.core.recording.chain import WarmChain
 
     cv2.setNumThreads(1)
-    _chain = WarmChain(setup.bench, settings)
+    _worker_chain = WarmChain(setup.bench, settings)
 
 
 def _skip_in_chain() -> None:
-    assert _chain is not None
-    _chain.skip()
+    assert _worker_chain is not None
+    _worker_chain.skip()
 
 
 def _measure_in_chain(image: GreyImage) -> tuple[Measurement, str | None]:
-    assert _chain is not None
+    assert _worker_chain is not None
     with _one_thread():
-        found = _chain.measure(image)
-    return found, _chain.track_lost
+        found = _worker_chain.measure(image)
+    return found, _worker_chain.track_lost
 
 
 @dataclass(frozen=True)

@@ -57,7 +57,7 @@ def with_setup_check(measurer: Measurer, record: ResidualRecord) -> Measurer:
     def measure(frames: Iterable[int]) -> Generator[FrameResult]:
         with closing(measurer(frames)) as results:
             for result in results:
-                measurement = record.judged(result.measurement, result.residuals)
+                measurement = record.add_and_judge(result.measurement, result.residuals)
                 yield replace(result, measurement=measurement, setup_doubt=record.doubt)
 
     return measure

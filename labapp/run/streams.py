@@ -20,7 +20,7 @@ from typing import Any, Protocol
 
 from labapp.errors import InputError
 from labapp.export.frame_result import FrameResult
-from labapp.export.tables import SIZES, sigma_of
+from labapp.export.tables import MEASURE_COLUMNS, sigma_of
 from labapp.log import NAME
 from labapp.run.alarms import Alarm
 from labapp.version import VERSION
@@ -72,7 +72,7 @@ def stream_values(result: FrameResult, alarms: Iterable[Alarm] | None = None) ->
         "status": measurement.status,
         "reason": measurement.reason,
         "scheme": measurement.scheme,
-        **{name: number(name) for name in SIZES},
+        **{name: number(name) for name in MEASURE_COLUMNS},
         "sigma_of": sigma_of(measurement),
         "setup_status": measurement.setup_status,
         "setup_doubt": result.setup_doubt,
@@ -268,7 +268,7 @@ class OpcuaStream:
         space = await server.register_namespace(NAMESPACE)
         pool = await server.nodes.objects.add_object(space, "Pool")
         words = dict.fromkeys((*WORDS, *ALARMS, PENETRATION[2]), "")
-        sizes = dict.fromkeys((*SIZES, *PENETRATION[:2]), math.nan)
+        sizes = dict.fromkeys((*MEASURE_COLUMNS, *PENETRATION[:2]), math.nan)
         for name, empty in {"frame": -1, "time_s": math.nan, **words, **sizes}.items():
             self._variables[name] = await pool.add_variable(space, name, empty)
         await server.start()

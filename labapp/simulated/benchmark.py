@@ -64,7 +64,7 @@ seed = 6001
 TRUE_PX = 3.0
 """Maximum distance between a detected dot and the true dot that it matches."""
 
-STEPS = ("dots", "match", "measures")
+STEPS = ("dots", "surface", "measures")
 
 
 @dataclass(frozen=True)

@@ -225,9 +225,9 @@ def test_setup_status_becomes_doubtful_once_known():
     record = ResidualRecord(RIG)
     entered = [replace(one, setup_status="entered") for one in frames(BENCH_RIG)]
     later = [replace(one, setup_status="entered") for one in frames(slipped, count=16, seed=1)]
-    assert {record.judged(one).setup_status for one in entered} == {"entered"}
+    assert {record.add_and_judge(one).setup_status for one in entered} == {"entered"}
     assert record.doubt == ""
-    assert [record.judged(one).setup_status for one in later][-1] == "doubtful"
+    assert [record.add_and_judge(one).setup_status for one in later][-1] == "doubtful"
     assert record.doubt
 
 

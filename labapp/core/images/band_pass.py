@@ -135,8 +135,8 @@ def tuned_dots(frame: Image, settings: BandPassSettings) -> tuple[Dots, Detector
     picture = as_picture(np.asarray(frame))
     if picture.ndim != 2 or min(picture.shape) < 8 or not float(np.ptp(picture)) > 0:
         raise CannotMeasure("no-dots", "the frame is blank or too small to hold a dot")
-    tuning = _tuned(picture, settings)[0]
-    return quick_dots(frame, tuning, settings), tuning
+    tuning, seen = _tuned(picture, settings)
+    return _found(tuning, seen, settings), tuning
 
 
 def quick_dots(frame: Image, tuning: DetectorTuning, settings: BandPassSettings) -> Dots:

@@ -72,8 +72,6 @@ class FittedDots(ReadOnlyArrays):
         Its standard uncertainty.
     size_px
         Standard deviation of the dot's light.
-    speckle_px2
-        Strength of the speckle in the frame: its squared contrast times the area of a grain.
     """
 
     u_px: FloatArray
@@ -81,7 +79,6 @@ class FittedDots(ReadOnlyArrays):
     u_sigma_px: FloatArray
     v_sigma_px: FloatArray
     size_px: FloatArray
-    speckle_px2: float
 
 
 def fit_dots(
@@ -138,7 +135,6 @@ def fit_dots(
         u_sigma_px=np.where(astray, median_size, sigma[0]),
         v_sigma_px=np.where(astray, median_size, sigma[1]),
         size_px=dots[:, 3].copy(),
-        speckle_px2=speckle,
     )
 
 

@@ -42,7 +42,7 @@ from labapp.core.matching.decision import (
     any_explains,
     decide,
     explains,
-    nearly_explains,
+    explains_half,
     supported,
 )
 from labapp.core.matching.free_setup import FreeHypothesis
@@ -126,7 +126,7 @@ def match_rays(
         if any_explains(observed, found):
             break
     # If no hypothesis explains most dots, caps are tried at once.
-    hopeless = bool(found) and not any(nearly_explains(observed, each) for each in found)
+    hopeless = bool(found) and not any(explains_half(observed, each) for each in found)
     try:
         decided = None if hopeless else _decide_among(observed, found, lattice, settings)
     except CannotMeasure:

@@ -140,7 +140,7 @@ def explains(observed: Observation, hypothesis: Hypothesis) -> bool:
     return hypothesis.stray_count <= few and missed and hypothesis.marker != "lit"
 
 
-def nearly_explains(observed: Observation, hypothesis: Hypothesis) -> bool:
+def explains_half(observed: Observation, hypothesis: Hypothesis) -> bool:
     """Whether most dots have a ray; the rest may be a row, or a dip."""
     return hypothesis.stray_count <= MOST_STRAY * len(observed.plane_mm)
 
@@ -172,7 +172,7 @@ def decide(
         a dot in the only hole, or a part of the rows is ambiguous.
     """
     best, found, neighbours, fit = _cheapest(observed, found, settings.margin)
-    cheapest = best  # compared with the others before doubtful labels are removed, as from none
+    cheapest = best  # rivals keep their doubtful labels: they are compared with this one
     if fit is FINE_KNOTS:
         cheapest = evaluate_twice(observed, best.labels, fit, best.pool) or best
     best = without_doubtful_outermost(observed, without_false_ends(observed, best, fit), fit)
@@ -189,7 +189,7 @@ def decide(
         if other != orientation
     )
     for other in [*found, *neighbours, *_rivals(observed, best, others, fit)]:
-        if _stands_against(observed, cheapest, other, fit, settings):
+        if _clearly_cheaper(observed, cheapest, other, fit, settings):
             continue
         differing, shared = _differing(best, other)
         if len(differing) <= MOST_DIFFERING * shared:
@@ -337,7 +337,7 @@ def _refuse_unexplained(observed: Observation, best: Hypothesis, settings: Match
         and (best.stray_count <= settings.most_strays(best) or _strays_lie_apart(observed, best))
         and best.stray_count + best.missed_count <= MOST_SCATTERED * best.label_count
     )
-    if not nearly_explains(observed, best):
+    if not explains_half(observed, best):
         raise CannotMeasure("no-match", NOTHING_EXPLAINS)
     if not scattered and settings.leaves_much(best):
         raise CannotMeasure(
@@ -364,7 +364,7 @@ def _doubt_of_setup(observed: Observation, best: Hypothesis) -> str:
     return f"; with another set-up {explained}: is the set-up correct?"
 
 
-def _stands_against(
+def _clearly_cheaper(
     observed: Observation,
     best: Hypothesis,
     other: Hypothesis,

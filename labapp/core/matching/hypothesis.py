@@ -96,9 +96,9 @@ class Hypothesis:
         The surface.
     witness
         See `Match.witness`.
-    missed_rays, missed_mm
+    missed_rays
         Rows and columns of the rays between lit rays that have no dot, counted from 0, shape
-        (m, 2); their predicted dots, IPCS, shape (m, 2), mm.
+        (m, 2).
     stray_dots
         Indices of the dots that have no ray, shape (s,).
     marker
@@ -114,7 +114,6 @@ class Hypothesis:
     pool: FittedPool
     witness: IntArray
     missed_rays: IntArray
-    missed_mm: FloatArray
     stray_dots: IntArray
     marker: Marker | None
     misfit_without_marker: float
@@ -219,8 +218,7 @@ def evaluate(
     misfit = cost + _boundary_cost(pool.level)
     rough = _roughness_cost(pool, settings)
     missed = np.stack(np.divmod(classes.missed, labels.shape[1]), axis=-1)
-    missed_mm = paths.plane_mm[classes.missed]
-    left = classes.witness, missed, missed_mm, classes.stray, marker
+    left = classes.witness, missed, classes.stray, marker
     return Hypothesis(labels, pool, *left, misfit, rough)
 
 

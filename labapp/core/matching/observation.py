@@ -45,9 +45,9 @@ EDGE_MM, EDGE_PX = 0.5, 4.0
 """A dot nearer to the edge of the plane or of the frame may be cut off and does not count as in
 view: about the radius of a dot."""
 
-# Surfaces fitted during labelling are stiffer than the final one, so that a wrong label has a large
-# residual instead of bending the surface. A stiff surface extrapolates a shallow pool farther; a
-# steep pool needs a soft one.
+# During labelling dots have a larger floor of their uncertainty than in the final fit, so that the
+# smoothness counts more and a wrong label has a large residual instead of bending the surface. The
+# stiffer surface extrapolates a shallow pool farther; a steep pool needs the softer one.
 STIFF = FitSettings(rounds=5, jerk=0.05, floor_mm=0.03, settled_mm=2e-3)
 SOFT = replace(STIFF, jerk=0.12)
 QUICK = replace(SOFT, knot_mm=1.5, rounds=3)

@@ -88,15 +88,19 @@ class FittedLabels:
 def unsupported(observed: Observation, fitted: FittedLabels) -> IntArray:
     """Return the labelled dots that are not explained by their ray.
 
-    Each is held against the surface fitted to all the others: its ray must be likelier by
-    `RIVAL_MARGIN` to have made it than a false dot to lie there, than its ray to have made another
-    dot that has no ray, and than another ray amid the others, that has no dot, to have made it. A
-    ray that lands outside the boundary of the others is unlikely to have come back at all. Dots
-    much wider than those around them are two in one, also less wide ones where a ray
-    without a dot would make its own beside them. With few neighbours, at the rim, a label must
-    be nearer to its prediction than elsewhere, and one without any may as well be the next ray's:
-    nothing beside it fixes its place in the row. Where all are farther off than what is known
-    of dots and surface explains, these are as much more uncertain.
+    Each label is compared with the surface fitted to all the others. It is kept if it is likelier
+    by `RIVAL_MARGIN` than each of these explanations:
+
+    * the dot is false;
+    * its ray made another dot, which has no ray;
+    * another ray between the others, which has no dot, made it.
+
+    A ray that lands outside the boundary of the others is unlikely to be reflected. A dot much
+    wider than those around it is two merged dots; one that is less wide is, if a ray without a dot
+    would have its dot beside it. With few neighbours, at the rim, a label must be nearer to its
+    prediction than elsewhere. One without neighbours may be that of the next ray, since nothing
+    determines its place in the row. If all labels are farther from their predictions than the
+    uncertainty of dots and surface explains, that uncertainty is increased accordingly.
 
     A false dot shifts the predictions of its neighbours. Of adjacent labels that fail, only the one
     with the largest distance in σ is returned, as the others may pass after its removal.

@@ -101,16 +101,6 @@ class Prediction:
     plane_mm: FloatArray
     spacing_mm: FloatArray
 
-    def part(self, which: BoolArray) -> Prediction:
-        """Return the prediction of the rays selected by a mask of shape (m,)."""
-        return Prediction(
-            self.at[which],
-            self.points_mm[which],
-            self.slopes[which],
-            self.plane_mm[which],
-            self.spacing_mm[which],
-        )
-
     def covariance_mm2(self, pool: FittedPool, rig: Rig) -> FloatArray:
         """Covariance of the dots due to that of the surface, shape (m, 2, 2), mm²."""
         basis, inverse = pool.surface.basis, inverse_of(pool.factor)
@@ -125,7 +115,7 @@ def covariance_of_dots(
     Parameters
     ----------
     rig
-        The bench.
+        The rig.
     basis, inverse
         The surface's splines, and the covariance of their coefficients (`solver.inverse_of`).
     points_mm, plane_mm

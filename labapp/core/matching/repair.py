@@ -29,6 +29,9 @@ LEAST_ROW, MOST_BEYOND = 3, 0.6
 """One or two dots beyond the last row may be false; three that one surface explains are not. If
 more than this share of all dots is stray, the cause is not a row that growth did not reach."""
 
+MOST_PAIRS = 8
+"""Number of pairs of a stray dot and a ray beyond the labelled ones that are tried."""
+
 LEAST_BETWEEN = 2
 """Two dots midway between those of two rows belong to a row that was omitted."""
 
@@ -137,10 +140,10 @@ def with_rows_beyond(observed: Observation, found: list[Hypothesis]) -> list[Hyp
     return found
 
 
-def _rows_begun(observed: Observation, hypothesis: Hypothesis, most: int = 8) -> list[Hypothesis]:
+def _rows_begun(observed: Observation, hypothesis: Hypothesis) -> list[Hypothesis]:
     """Assign a stray dot to each candidate ray beyond the labelled ones, and grow the labels.
 
-    The ``most`` likeliest pairs are tried, except those that an earlier one has led to. As a
+    The `MOST_PAIRS` likeliest pairs are tried, except those that an earlier one has led to. As a
     surface can fit any single dot, the labels must grow by at least `LEAST_ROW` dots.
     """
     labels = hypothesis.labels
@@ -151,7 +154,7 @@ def _rows_begun(observed: Observation, hypothesis: Hypothesis, most: int = 8) ->
     if len(stray) == 0 or len(rays.at) == 0:
         return found
     distance, deviance = pair_deviances(observed, hypothesis.pool, rays, stray)
-    for pair in np.argsort(deviance, axis=None)[:most]:
+    for pair in np.argsort(deviance, axis=None)[:MOST_PAIRS]:
         dot, ray = (int(k) for k in np.unravel_index(pair, deviance.shape))
         at = tuple(rays.at[ray])
         vague = deviance[dot, ray] > false_dot_deviance()

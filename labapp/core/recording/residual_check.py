@@ -211,7 +211,9 @@ class ResidualRecord:
             self._samples = self._samples[::2]
             self._every *= 2
 
-    def judged(self, measurement: Measurement, residuals: Residuals | None = None) -> Measurement:
+    def add_and_judge(
+        self, measurement: Measurement, residuals: Residuals | None = None
+    ) -> Measurement:
         """Add the next frame, and return its measurement with the current status of the set-up.
 
         The newest frames are weighted as much as all earlier ones, so that a movement is detected

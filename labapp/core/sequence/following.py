@@ -121,14 +121,14 @@ def follow(
     rays, dots = fit.rays, fit.labels.ravel()[fit.rays]
     _check_explained(classes, limits, len(observed.plane_mm), len(rays))
     pool = fitted_pool(fit.rounds, level, observed.rig, observed.plane_mm[dots])
-    if not pool.residual_rms_mm < WORSE * prior.residual_mm:
+    if not pool.residual_rms_mm < WORSE * prior.cold_residual_mm:
         raise TrackLost("the surface no longer explains the dots")
     paths = fit.paths()
-    is_seen = _datum_is_seen(observed, paths, off)
+    is_seen = _reference_is_seen(observed, paths, off)
     if not is_seen and prior.unseen >= HELD:
         raise TrackLost("the dots beside the absent one have been missing for too long")
-    orientation = prior.match.orientation
-    others = (trial for trial in prior.match.trials if trial.orientation != orientation)
+    orientation = prior.cold_match.orientation
+    others = (trial for trial in prior.cold_match.trials if trial.orientation != orientation)
     trials = (Trial(orientation, pool.residual_rms_mm), *others)
     at = np.stack(np.divmod(rays, fit.labels.shape[1]), axis=-1)
     missed = len(classes.missed)
@@ -378,7 +378,7 @@ def _with_level(prior: Prior, fit: _Fit, covariance: FloatArray) -> tuple[RayCla
     )
     sigma = fit.rounds.height_sigma_mm(witnesses.landing_mm)
     witnesses = replace(witnesses, height_sigma_mm=sigma)
-    near = Level(0.0, prior.open_mm, prior.level.sign, prior.level.rear, 0.0)
+    near = Level(0.0, prior.level_sigma_mm, prior.level.sign, prior.level.rear, 0.0)
     how = fit.settings.rounds, SETTLED_MM, near, prior.drop_is_free, RAISED_MM
     level = rounds_with_level(fit.rounds, witnesses, *how)
     fit.check_settled()
@@ -393,7 +393,7 @@ def _check_explained(classes: RayClasses, limits: MatchSettings, dots: int, rays
         raise TrackLost(f"{missed} rays between the others have no dot")
 
 
-def _datum_is_seen(observed: Observation, paths: RayPaths, off: float) -> bool:
+def _reference_is_seen(observed: Observation, paths: RayPaths, off: float) -> bool:
     """Whether all four neighbours of the absent ray are lit.
 
     A dot that the fit rejects (`_unsupported`) still counts as light here.

@@ -33,7 +33,7 @@ RIDGE = 1e-4
 MOST_ROUNDS, SETTLED_MM = 8, 3e-4
 """Maximum number of rounds of a fit that starts from a close surface, and its convergence limit."""
 
-SETUP_EVERY, SINKS_EVERY = 128, 16
+SETUP_EVERY, DROP_EVERY = 128, 16
 """Intervals in frames after which the part of the set-up in the uncertainty of the sizes, and the
 drop of the rear, are recomputed."""
 
@@ -48,7 +48,7 @@ class Followed:
         The pairs, the surface fitted to them, and the paths of all rays.
     lit
         Rays that have a dot, shape (rows, columns).
-    datum_is_seen
+    reference_is_seen
         Whether the absent ray is dark and all its four neighbours are lit.
     """
 
@@ -56,21 +56,20 @@ class Followed:
     pool: FittedPool
     paths: RayPaths
     lit: BoolArray
-    datum_is_seen: bool
+    reference_is_seen: bool
 
 
 @dataclass(frozen=True)
 class Prior:
-    """State passed from one frame to the next.
+    """Information of a measured frame for the next one.
 
     Parameters
     ----------
     tuning
         Size of dots and noise.
-    match
-        Match of the frame that was matched without a prior.
-    residual_mm
-        Root mean square residual of that frame, mm.
+    cold_match, cold_residual_mm
+        Match of the last frame that was measured without a prior, and its root mean square
+        residual, mm.
     basis
         The splines.
     paths, lit, boundary, level
@@ -79,20 +78,20 @@ class Prior:
     past, slopes
         Spline coefficients of the last frames, newest last, shape (frames, p), mm, and the slopes
         of those surfaces at the reflection points, shape (frames, R, 2).
-    open_mm
+    level_sigma_mm
         Uncertainty of the level when the drop of the rear was last fitted with it, mm.
     by_setup
         Parts of the set-up in the uncertainty of sizes, each with the sizes for which it was
         computed: the sizes of a pool that oscillates recur.
     unseen
-        Number of frames since `Followed.datum_is_seen` was last true.
+        Number of frames since `Followed.reference_is_seen` was last true.
     count
         Number of followed frames.
     """
 
     tuning: DetectorTuning
-    match: Match
-    residual_mm: float
+    cold_match: Match
+    cold_residual_mm: float
     basis: SplineBasis
     paths: RayPaths
     lit: BoolArray
@@ -100,7 +99,7 @@ class Prior:
     level: Level
     past: FloatArray
     slopes: FloatArray
-    open_mm: float
+    level_sigma_mm: float
     by_setup: tuple[SetupPart, ...]
     unseen: int = 0
     count: int = 0
@@ -120,8 +119,8 @@ class Prior:
         paths, level = RayPaths.of(bench, basis, coefficients), replace(pool.level, shift_mm=0.0)
         return cls(
             tuning=tuning,
-            match=match,
-            residual_mm=pool.residual_rms_mm,
+            cold_match=match,
+            cold_residual_mm=pool.residual_rms_mm,
             basis=basis,
             paths=paths,
             lit=match.witness > 0,
@@ -129,7 +128,7 @@ class Prior:
             level=level,
             past=coefficients[None],
             slopes=paths.slopes[None],
-            open_mm=level.sigma_mm,
+            level_sigma_mm=level.sigma_mm,
             by_setup=(SetupPart(made.size_sigma_setup, measures.sizes),),
         )
 
@@ -147,16 +146,16 @@ class Prior:
             level=pool.level,
             past=np.vstack([self.past[1 - MEMORY :], paths.coefficients]),
             slopes=np.concatenate([self.slopes[1 - MEMORY :], paths.slopes[None]]),
-            open_mm=pool.level.sigma_mm if self.drop_is_free else self.open_mm,
+            level_sigma_mm=pool.level.sigma_mm if self.drop_is_free else self.level_sigma_mm,
             by_setup=by_setup,
-            unseen=0 if followed.datum_is_seen else self.unseen + 1,
+            unseen=0 if followed.reference_is_seen else self.unseen + 1,
             count=self.count + 1,
         )
 
     @property
     def drop_is_free(self) -> bool:
         """Whether the drop of the rear is fitted with the level in the next frame."""
-        return self.count % SINKS_EVERY == SINKS_EVERY - 1
+        return self.count % DROP_EVERY == DROP_EVERY - 1
 
     @property
     def setup_is_due(self) -> bool:
@@ -190,7 +189,7 @@ class Prior:
 
     def _in_splines(self, former: Prior, bench: Bench, settings: FitSettings) -> RayPaths | None:
         """Refit the surface in the splines of a former prior; None if it does not converge."""
-        match, basis = self.match, former.basis
+        match, basis = self.cold_match, former.basis
         at = tuple(match.ray.T - 1)
         ray = np.ravel_multi_index(at, self.lit.shape)
         points = self.paths.points_mm[ray]

@@ -23,10 +23,9 @@ MOST_AT_ENDS, MOST_AT_FAR_ENDS = 1e-6, 0.02
 narrow grid (reach below 1), the second for a wide one."""
 
 # Blurs: width of the step from inside to outside, in dot spacings, from a sharp boundary to one
-# that half of the neighbouring rays contradict.
-_BLURS = np.geomspace(1 / 200, 1 / 4, 9)
-_WIDEST_BLUR = _BLURS[-1:]
-_BLURS = np.array([_BLURS, 1.2 * np.log(_BLURS)])  # −log of the prior, nats: sharp is likelier
+# that half of the neighbouring rays contradict; and −log of their prior, nats: sharp is likelier.
+_BLUR_WIDTHS = np.geomspace(1 / 200, 1 / 4, 9)
+_BLURS = np.array([_BLUR_WIDTHS, 1.2 * np.log(_BLUR_WIDTHS)])
 
 # Drops: depths of the rear, mm. One rear in five lies below the work piece; its depths are equally
 # likely.
@@ -215,10 +214,8 @@ def find_level(
 
     head_sign, drop_mm = rear
     seen = height, slope, y, witness, spacing_mm
-    shift, sign, reach = about or (
-        *level_kernels.scan_levels(*seen, SCAN_LEVELS, _WIDEST_BLUR),
-        1.0,
-    )
+    scanned = height, slope, witness, spacing_mm, SCAN_LEVELS, _BLUR_WIDTHS[-1:]
+    shift, sign, reach = about or (*level_kernels.scan_levels(*scanned), 1.0)
     # Only pools above the work piece have been observed to sink at the rear.
     some = _DROPS_MM if drop_mm is None and sign > 0 else np.array([drop_mm or 0.0])
     search = np.array([head_sign, shift, sign, reach, missing, _SUNK_COST])

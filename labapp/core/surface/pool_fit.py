@@ -107,7 +107,7 @@ class FittedPool(ReadOnlyArrays):
     unsettled_mm
         Largest displacement of a reflection point in the last round, mm.
     inverse
-        Inverse of the normal matrix (`solver.inverse_of`), if it has been computed.
+        Covariance of the coefficients within the band (`solver.inverse_of`), if computed.
     """
 
     surface: SplineSurface

@@ -225,7 +225,9 @@ def normal_factor(
 
 
 def inverse_of(factor: FloatArray) -> FloatArray:
-    """Covariance of the p spline coefficients, shape (p, p), mm²: entries within the factor's band.
+    """Covariance of the p spline coefficients, shape (p, p), mm²; undefined outside the band.
+
+    Only entries within the band of the factor are computed; the others have arbitrary values.
 
     ``factor`` is the Cholesky factor of the normal matrix (`normal_factor`).
     """

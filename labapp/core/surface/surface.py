@@ -32,7 +32,7 @@ class Surface(Protocol):
 
 
 class FlatSurface:
-    """Horizontal plane z = level: the initial estimate of both schemes (step 0)."""
+    """Horizontal plane z = level: a kind of surface that session files may contain."""
 
     def __init__(self, level_mm: float = 0.0) -> None:
         self.level_mm = level_mm

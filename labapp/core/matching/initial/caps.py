@@ -44,17 +44,20 @@ and the number of caps that are examined further. A cap with 29 of 30 rays corre
 dots than one with 21 of 33: the smoothness of the surface through their dots distinguishes them."""
 
 
-def search_caps(observed: Observation, most: int = 24) -> list[IntArray]:
+MOST_RETURNED = 24
+"""Number of labels that `search_caps` returns: growing labels takes most of the time."""
+
+
+def search_caps(observed: Observation) -> list[IntArray]:
     """Find the caps whose predicted dots match the observed dots best.
 
-    The best of them are sorted by the cost of a surface fitted to their dots.
+    The best `MOST_CAPS` are sorted by the cost of a surface fitted to their dots; the first
+    `MOST_RETURNED` are returned, all different.
 
     Parameters
     ----------
     observed
         The dots and the rig.
-    most
-        Maximum number of label arrays to return; all are different.
 
     Returns
     -------
@@ -64,7 +67,7 @@ def search_caps(observed: Observation, most: int = 24) -> list[IntArray]:
     from labapp.core.matching.initial import quadric_kernels
 
     rig = observed.rig
-    bench = (
+    seen = (
         rig.laser.position_mm,
         rig.imaging_plane.pose_mm,
         observed.plane_mm,
@@ -72,7 +75,7 @@ def search_caps(observed: Observation, most: int = 24) -> list[IntArray]:
     )
     settings = np.array([LEAST_RAYS, GATE, DARK_PENALTY, LIT_GATE, LIT_MARKER_PENALTY])
     score, found = quadric_kernels.score_caps(
-        _caps(observed), observed.rays.reshape(-1, 3), *bench, settings
+        _caps(observed), observed.rays.reshape(-1, 3), *seen, settings
     )
     best = np.full((MOST_CAPS, found.shape[1]), UNLABELLED, np.int64)
     count = 0
@@ -86,7 +89,7 @@ def search_caps(observed: Observation, most: int = 24) -> list[IntArray]:
     shape = observed.absent.shape
     matched = [one for k in range(count) if (one := _matched(observed, best[k].reshape(shape)))]
     matched.sort(key=lambda one: one[0])
-    return list({labels.tobytes(): labels for _, labels in matched}.values())[:most]
+    return list({labels.tobytes(): labels for _, labels in matched}.values())[:MOST_RETURNED]
 
 
 def _matched(observed: Observation, labels: IntArray) -> tuple[float, IntArray] | None:

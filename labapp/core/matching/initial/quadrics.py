@@ -50,9 +50,12 @@ SILENT_COST, NEARNESS_GAIN = 3.0, 4.0
 """Penalty in the score for each ray next to the reference that should have a dot and has none, and
 gain for dots exactly at their predictions; a ray with a dot counts 1."""
 
+MOST_QUADRICS = 8
+"""Number of quadrics whose labels are grown."""
+
 
 @dataclass(frozen=True)
-class QuadricGuess:
+class QuadricLabels:
     """Labels that follow from a quadric.
 
     Parameters
@@ -68,27 +71,27 @@ class QuadricGuess:
     score: float
 
 
-def search_quadrics(observed: Observation, most: int = 8) -> list[QuadricGuess]:
-    """Find the quadrics that best explain the dots around a hole, best first.
+def search_quadrics(observed: Observation) -> list[QuadricLabels]:
+    """Find the `MOST_QUADRICS` that best explain the dots around a hole, best first.
+
+    Their labels are all different.
 
     Parameters
     ----------
     observed
         The dots and the rig.
-    most
-        Maximum number of guesses to return; all labels are different.
     """
     marker = observed.rig.pattern.marker
     if marker is None or min(marker) < 2 or np.any(np.array(marker) >= observed.rays.shape[:2]):
         return []  # without rays on all sides a hole cannot be recognised
     window = _Window(observed, marker)
-    found: dict[bytes, QuadricGuess] = {}
+    found: dict[bytes, QuadricLabels] = {}
     quadrics = [_quadrics(window, *hole) for hole in _holes(observed, window.tree)]
     for guess in window.scored(window.fitted(np.concatenate([np.empty((0, 5)), *quadrics]))):
         key = guess.labels.tobytes()
         if key not in found or found[key].score < guess.score:
             found[key] = guess
-    return sorted(found.values(), key=lambda guess: -guess.score)[:most]
+    return sorted(found.values(), key=lambda guess: -guess.score)[:MOST_QUADRICS]
 
 
 def _holes(
@@ -195,7 +198,7 @@ class _Window:
         bench = self.rays, laser, plane, places, self.absent
         return quadric_kernels.fit_quadrics(center, quadrics, *bench, LOOSE_GATE)
 
-    def scored(self, quadrics: FloatArray) -> Iterator[QuadricGuess]:
+    def scored(self, quadrics: FloatArray) -> Iterator[QuadricLabels]:
         """Yield a scored guess for each quadric that explains the dots around the hole."""
         patterns = self.intersect(quadrics, self.rays.reshape(-1, 3))[1]
         patterns = patterns.reshape(-1, *self.rays.shape[:2], 2)
@@ -209,7 +212,7 @@ class _Window:
         for k, count in zip(explains, silent.sum(axis=(1, 2)).tolist(), strict=True):
             yield self._guess(hit[k], dot[k], off[k], count)
 
-    def _guess(self, hit: BoolArray, dot: IntArray, off: FloatArray, silent: int) -> QuadricGuess:
+    def _guess(self, hit: BoolArray, dot: IntArray, off: FloatArray, silent: int) -> QuadricLabels:
         matched = np.where(hit, dot, UNLABELLED)
         chosen, count = np.unique(matched[hit], return_counts=True)
         matched[np.isin(matched, chosen[count > 1])] = UNLABELLED
@@ -221,4 +224,4 @@ class _Window:
         labels = np.full(self.observed.rays.shape[:2], UNLABELLED, np.int64)
         labels[self.part] = near
         score = np.sum(matched != UNLABELLED) - SILENT_COST * silent + NEARNESS_GAIN * nearness
-        return QuadricGuess(labels, float(score))
+        return QuadricLabels(labels, float(score))

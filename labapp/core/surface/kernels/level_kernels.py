@@ -221,11 +221,10 @@ def rises_of(slope: FloatArray, spacing: FloatArray) -> tuple[FloatArray, float]
     return np.maximum(rises, usual / 4.0), usual
 
 
-@_compiled(_f2, _f2, _f1, _i1, _f1, _i, _f1)
+@_compiled(_f2, _f2, _i1, _f1, _i, _f1)
 def scan_levels(
     height: FloatArray,
     slope: FloatArray,
-    y: FloatArray,
     witness: IntArray,
     spacing: FloatArray,
     count: int,
@@ -233,7 +232,7 @@ def scan_levels(
 ) -> tuple[float, int]:
     """Shift, mm, and sign with the largest likelihood, among ``count`` shifts and with one blur.
 
-    The first five arguments are those of `level.find_level`.
+    The first four arguments are those of `level.find_level`.
     """
     rises, _ = rises_of(slope, spacing)
     over, first, exact = height[:1].copy(), -height[0].max(), np.zeros(height.shape[1])

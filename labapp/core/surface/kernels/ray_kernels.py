@@ -25,12 +25,8 @@ _f, _i = types.float64, types.int64
 _f1, _f2, _f3, _f4 = (types.Array(_f, n, "A", readonly=True) for n in (1, 2, 3, 4))
 
 LONGEST_STEP_MM, LEAST_DESCENT = 0.5, 0.05
-"""A Newton step along a ray is no longer, and a ray comes no slower nearer to the surface, mm a mm:
-where one grazes the surface a step would throw it off the pool."""
-
-LONGEST_STEP_MM, LEAST_DESCENT = 0.5, 0.05
-"""A Newton step along a ray is no longer, and a ray comes no slower nearer to the surface, mm a mm:
-where one grazes the surface a step would throw it off the pool."""
+"""Longest Newton step along a ray, mm, and the least descent towards the surface that is assumed
+per mm of the ray: a step along a grazing ray would otherwise leave the pool."""
 
 TIP_MARGIN_MM = 0.3
 """A ray that passes less than this below the electrode's tip may be hidden."""

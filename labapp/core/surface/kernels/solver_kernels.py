@@ -36,7 +36,7 @@ _lower = types.Array(_f, 2, "F", readonly=True)
 _bands, _bench = types.UniTuple(_lower, 2), types.Tuple((_f1, _f2))  # type: ignore[no-untyped-call]
 
 ON_SURFACE_MM = 1e-9
-"""After a step as short no other is taken: the next would be far below rounding."""
+"""Newton's method stops after a shorter step: the next would be far below rounding."""
 
 AT_ONCE = 8
 """Columns of a matrix that are factorized at once."""
@@ -95,8 +95,9 @@ def _accumulate_normal_matrix(
 def _factorize(columns: FloatArray, count: int, width: int) -> bool:
     """Replace the lower band of a matrix by its Cholesky factor; whether it has one.
 
-    Columns are one a row, and there is room of `AT_ONCE` beyond the last and below the band. So
-    many columns at once are taken from those after them, each of which is read and written once.
+    Each row of the array holds one column of the band, padded by `AT_ONCE`; so many more rows
+    follow the last. `AT_ONCE` columns are eliminated together, so that each column after them is
+    read and written once.
     """
     for j in range(0, count, AT_ONCE):
         for a in range(min(AT_ONCE, count - j)):
