@@ -17,6 +17,7 @@ import typer.main
 
 from labapp import cli
 from labapp.core.bench_check.check import Status
+from labapp.core.schemes import SCHEMES
 from labapp.export.folder import verify_export
 from labapp.export.tables import TABLES
 from labapp.session.session import Session
@@ -143,6 +144,15 @@ def test_every_status_is_explained() -> None:
         re.findall(r"`([a-z-]+)`", (ROOT / "docs/troubleshooting.md").read_text("utf-8"))
     )
     assert used - explained == {"noise-like"}  # part of a check that is ok
+
+
+@pytest.mark.parametrize("scheme", SCHEMES)
+def test_scheme_is_documented(scheme: str) -> None:
+    options = (ROOT / "docs/command-line.md").read_text("utf-8").split("| `--scheme` |")[1:]
+    assert len(options) == 2
+    assert all(f"`{scheme}`" in row.partition("\n")[0] for row in options)
+    results = (ROOT / "docs/results.md").read_text("utf-8").partition("| `scheme` |")[2]
+    assert f"`{scheme}`" in results.partition("\n")[0]
 
 
 TEXTS = ["README.md", *sorted(str(path.relative_to(ROOT)) for path in ROOT.glob("docs/*.md"))]

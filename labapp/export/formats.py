@@ -40,6 +40,8 @@ class SurfaceFormat:
     writer
         Function that returns the file's content, bytes, for the mesh or nodes; also as
         ``module:function`` in this package.
+    bytes_each
+        Approximate size of a triangle or node in the file, bytes, for the size of an export.
     """
 
     end: str
@@ -47,6 +49,7 @@ class SurfaceFormat:
     tip: str
     of: Literal["mesh", "nodes"]
     writer: str | Callable[[Any], bytes]
+    bytes_each: float = 50.0
 
     def content(self, shape: object) -> bytes:
         """Return the content of a file.
@@ -101,12 +104,16 @@ class RunFormat:
     writer
         Class of a `RunWriter`, whose arguments are the file's path, its provenance, and the
         distance between the surfaces' nodes in mm; also as ``module:Class`` in this package.
+    frame_bytes, node_bytes
+        Approximate size in the file of the tables of a frame, and of a node of its surface, bytes.
     """
 
     file: str
     title: str
     tip: str
     writer: str | Callable[[Path, Mapping[str, object], float], AbstractContextManager[RunWriter]]
+    frame_bytes: float = 80_000.0
+    node_bytes: float = 6.5
 
     def open(
         self, path: str | os.PathLike[str], about: Mapping[str, object], spacing_mm: float
@@ -130,18 +137,21 @@ class RunFormat:
 
 SURFACE_FORMATS: dict[str, SurfaceFormat] = {
     "csv": SurfaceFormat(
-        ".csv", "CSV", "x, y, z of a grid within the boundary, mm", "nodes", "tables:nodes_csv"
+        ".csv", "CSV", "x, y, z of a grid within the boundary, mm", "nodes", "tables:nodes_csv", 28
     ),
-    "stl": SurfaceFormat(".stl", "STL", "Triangles, binary, mm", "mesh", "meshes:stl"),
+    "stl": SurfaceFormat(".stl", "STL", "Triangles, binary, mm", "mesh", "meshes:stl", 50),
     "stl-ascii": SurfaceFormat(
         "_ascii.stl",
         "STL as text",
         "Triangles as text, for old programs, mm",
         "mesh",
         "meshes:stl_ascii",
+        247,
     ),
-    "ply": SurfaceFormat(".ply", "PLY", "Triangles for mesh programs, mm", "mesh", "meshes:ply"),
-    "vtp": SurfaceFormat(".vtp", "VTP", "Triangles for ParaView, mm", "mesh", "meshes:vtp"),
+    "ply": SurfaceFormat(
+        ".ply", "PLY", "Triangles for mesh programs, mm", "mesh", "meshes:ply", 29
+    ),
+    "vtp": SurfaceFormat(".vtp", "VTP", "Triangles for ParaView, mm", "mesh", "meshes:vtp", 64),
 }
 """Formats by their names in ``--surfaces``."""
 

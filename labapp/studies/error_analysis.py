@@ -14,13 +14,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from labapp.core.geometry.rig import DotPattern, Laser, Rig
 from labapp.core.match import Match
 from labapp.core.pipeline import Settings, reconstruct
-from labapp.core.schemes import ers, irs, modal, zonal
 from labapp.core.surface.measures import Measures, measure_surface
 from labapp.core.values import CannotMeasure, FloatArray, ReadOnlyArrays
 from labapp.simulation.forward import PoolSurface, Reflections, exact_match, trace
@@ -60,13 +60,12 @@ TEXT = {
 
 def circle_settings(scheme: str) -> Settings:
     """Settings with the circle as boundary model (§8.2.1); fit uses its own boundary."""
-    return Settings(
-        scheme=scheme,
-        ers=ers.ErsSettings(boundary="circle"),
-        irs=irs.IrsSettings(boundary="circle"),
-        zonal=zonal.ZonalSettings(boundary="circle"),
-        modal=modal.ModalSettings(boundary="circle"),
-    )
+    settings = Settings(scheme=scheme)
+    own: Any = getattr(settings, scheme, None)
+    if not hasattr(own, "boundary"):
+        return settings
+    with_circle: dict[str, Any] = {scheme: replace(own, boundary="circle")}
+    return replace(settings, **with_circle)
 
 
 def trace_once(pool: PoolSurface, rig: Rig) -> Reflections:

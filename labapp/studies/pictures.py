@@ -167,7 +167,7 @@ def _over_caps(survey: ErrorSurvey, rows: Sequence[tuple[str, str, float]]) -> F
                         plot.errorbar(
                             diameter,
                             mean,
-                            np.array([mean - least, largest - mean]),
+                            np.maximum([mean - least, largest - mean], 0.0),  # rounding
                             fmt=style,
                             elinewidth=0.5,
                             marker=STYLE_OF[scheme][1],

@@ -60,6 +60,14 @@ def test_pattern_kind_has_rows_and_columns_around_the_axis(kind: str) -> None:
     assert np.abs(np.diff(tangents[:, 8, 1])).min() <= np.tan(step) * (1 + 1e-9)
 
 
+@pytest.mark.parametrize("kind", PATTERNS)
+def test_kind_is_documented(kind: str) -> None:
+    table = (
+        (SETUP.parents[2] / "docs/command-line.md").read_text("utf-8").partition("`[pattern]`")[2]
+    )
+    assert f'`"{kind}"`' in table
+
+
 def test_setup_file_names_the_kind() -> None:
     text = SETUP.read_text("utf-8")
     usual = parse_setup(text, SETUP)

@@ -6,6 +6,7 @@ import pytest
 
 from labapp.core.geometry.bench import Bench
 from labapp.core.pipeline import Settings, measure
+from labapp.core.schemes import SCHEMES
 from labapp.errors import InputError
 from labapp.simulation.forward import exact_match, trace
 from labapp.studies.image_error import TACK, TACK_RIG, VIEW, axes_of, rendered
@@ -19,7 +20,7 @@ def named_rows(table) -> dict[str, dict[str, object]]:
 def test_errors_are_relative_to_the_entered_size() -> None:
     match = exact_match(trace(TACK, TACK_RIG), TACK_RIG)
     right = named_rows(known_object_table(match, TACK_RIG, known_cap(9.75, 0.91)))
-    assert set(right) == {"fit", "ers", "irs", "zonal", "modal"}
+    assert set(right) == set(SCHEMES)
     assert right["fit"]["height_error_pct"] < 1
     assert right["fit"]["diameter_error_pct"] < 1
     assert right["ers"]["diameter_error_pct"] < 3

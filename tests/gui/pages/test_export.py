@@ -6,6 +6,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Literal
 
 import cv2
 import pytest
@@ -44,8 +45,8 @@ def test_default_choice_is_the_default_export() -> None:
     keys = {item.key for _, items in groups() for item in items}
     everything = ExportRequest(ticked=frozenset(keys)).choice()
     assert everything.solid
-    assert [each.file for each in everything.run_formats] == ["results.h5"]
-    assert len(everything.surfaces) == 5
+    assert everything.run_formats == list(RUN_FORMATS.values())
+    assert set(everything.surfaces) == set(SURFACE_FORMATS)
     assert everything.pictures == {"frames", "surfaces", "trends", "film"}
     assert keys > USUAL
     assert not ExportRequest(ticked=frozenset({"solid", "surfaces:csv"})).choice().solid
@@ -268,6 +269,22 @@ def test_every_control_has_a_tooltip(page: ExportPage) -> None:
         for button in widget.findChildren(QAbstractButton):
             if button.text():
                 assert button.toolTip(), button.text()
+
+
+@pytest.mark.parametrize("of", ["nodes", "mesh"])
+def test_size_of_an_added_format_is_included(monkeypatch, of: Literal["nodes", "mesh"]) -> None:
+    toy = SurfaceFormat(".xyz", "Points", "A toy, mm", of, lambda nodes: b"", bytes_each=10.0)
+    run = RunFormat("toy.bin", "Toy", "A toy", "toys:Toy", frame_bytes=5e6, node_bytes=0.0)
+    monkeypatch.setitem(SURFACE_FORMATS, "xyz", toy)
+    monkeypatch.setitem(RUN_FORMATS, "toy", run)
+
+    def size(*ticked: str) -> float:
+        return estimated_bytes(ExportRequest(ticked=frozenset(ticked)), 2, 1, 30.0, 300_000)
+
+    smallest = 30.0 / ExportRequest().spacing_mm ** 2 * 10.0
+    assert size("surfaces:xyz") - size() >= smallest
+    assert size("together:toy") - size() == pytest.approx(1e7)
+    assert size("together:toy", "together:hdf5") > 1e7 + 2 * 80_000.0
 
 
 def test_added_format_can_be_selected(gtaw: Path, tmp_path: Path, monkeypatch) -> None:

@@ -2,16 +2,11 @@
 
 from __future__ import annotations
 
+from labapp.export.formats import SURFACE_FORMATS
 from labapp.gui.pages.export.presenter import ExportRequest
 
 ROWS = {"measures": 400.0, "dots": 5_500.0, "points": 7_000.0, "boundary": 14_000.0}
 """Bytes per frame in each table."""
-
-NODE = {"csv": 28.0}
-"""Bytes per node of a surface stored as a grid of points."""
-
-TRIANGLE = {"stl": 50.0, "stl-ascii": 247.0, "ply": 29.0, "vtp": 64.0}
-"""Bytes per triangle of each mesh format."""
 
 EDGE_TRIANGLES = 22_000
 """Triangles along the boundary for any grid; inside there are two per node."""
@@ -22,7 +17,7 @@ PIXEL = {"png": 1.5, "jpg": 0.3, "tif": 3.0}
 SURFACE_PIXEL, FILM_PIXEL = 0.16, 0.03
 """Bytes per pixel of a picture of a surface, and of a frame of a film."""
 
-TREND_PICTURE, REPORT, HDF5_FRAME, HDF5_NODE = 80_000.0, 2_000_000.0, 80_000.0, 6.5
+TREND_PICTURE, REPORT = 80_000.0, 2_000_000.0
 
 
 def estimated_bytes(
@@ -43,11 +38,13 @@ def estimated_bytes(
     triangles = 2 * nodes + EDGE_TRIANGLES
     choice = request.choice()
     a_frame = sum(ROWS[name] for name in choice.tables)
-    meshes = sum(TRIANGLE.get(name, 0.0) for name in choice.surfaces) * triangles
-    a_surface = meshes * (1 + choice.solid) + nodes * sum(NODE.get(n, 0) for n in choice.surfaces)
-    if choice.together:
-        a_frame += HDF5_FRAME
-        a_surface += HDF5_NODE * nodes
+    surface_formats = [SURFACE_FORMATS[name] for name in choice.surfaces]
+    a_node = sum(each.bytes_each for each in surface_formats if each.of == "nodes")
+    a_triangle = sum(each.bytes_each for each in surface_formats if each.of == "mesh")
+    a_surface = a_node * nodes + a_triangle * triangles * (1 + choice.solid)
+    for each in choice.run_formats:
+        a_frame += each.frame_bytes
+        a_surface += each.node_bytes * nodes
     view_px = request.size_px[0] * request.size_px[1]
     if "frames" in choice.pictures:
         a_frame += PIXEL[request.picture_format] * frame_px
