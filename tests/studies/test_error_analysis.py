@@ -20,6 +20,7 @@ from labapp.studies.adviser.predicted_error import DOT_SIGMA_MM, predict_error
 from labapp.studies.error_analysis import ErrorSurvey, aside, error_table, survey
 from labapp.studies.image_error import BENCH, TACK, TACK_RIG, VIEW, axes_of, exactly_seen
 from labapp.studies.parameter_deviation import move, nominal
+from labapp.studies.pictures import error_picture
 from labapp.studies.setup_budget import SetupBudget, budget_table, similar_pool
 
 
@@ -252,3 +253,11 @@ def test_results_keep_the_order_of_the_tasks(workers: int) -> None:
     assert progress[0] == ("all", 0, 10)
     assert progress[-1] == ("all", 10, 10)
     assert in_parallel(abs, [], workers=workers) == []
+
+
+def test_equal_errors_are_drawn() -> None:
+    """The mean of three equal numbers can exceed them by rounding."""
+    caps, error = (spherical_cap(4.0, 0.2),) * 3, 0.637
+    assert np.mean([100.0 * error] * 3) > 100.0 * error
+    same = ErrorSurvey("CE", caps, ("fit",), np.full((3, 1, 4), error), np.zeros(1))
+    assert len(error_picture(same).axes) == 4
