@@ -308,7 +308,7 @@ def pattern_values(pattern: DotPattern) -> dict[str, object]:
     if pattern.rotation_deg:
         values["rotation_deg"] = pattern.rotation_deg
     if pattern.measured:
-        i, j = pattern.reference
+        i, j = pattern.center_ray
         values["rays"] = [[i + row, j + column, *to] for row, column, *to in pattern.measured]
     return values if pattern.kind == DotPattern.kind else values | {"kind": pattern.kind}
 
@@ -318,7 +318,7 @@ def dot_pattern(keys: Mapping[str, Any]) -> DotPattern:
     given = _without_sigmas(keys)
     absent, rays = given.pop("absent", None), given.pop("rays", [])
     pattern = DotPattern(**given)
-    i, j = pattern.reference
+    i, j = pattern.center_ray
     return replace(
         pattern,
         absent=None if absent is None else frozenset((i, j) for i, j in absent),

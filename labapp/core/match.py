@@ -84,7 +84,7 @@ class Match(ReadOnlyArrays):
     missing: float = 0.0
 
     @property
-    def margin(self) -> float:
+    def residual_ratio(self) -> float:
         """Residual of the best other orientation divided by that of the selected one."""
         others = [t.residual_mm for t in self.trials if t.orientation != self.orientation]
         own = [t.residual_mm for t in self.trials if t.orientation == self.orientation]

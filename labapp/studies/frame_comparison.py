@@ -30,7 +30,7 @@ def with_orientation(match: Match, rig: Rig, orientation: Orientation) -> Match:
 
     No ray is a witness then, because it is unknown which of the other rays were reflected.
     """
-    center = np.array(rig.pattern.marker or rig.pattern.reference)
+    center = np.array(rig.pattern.marker or rig.pattern.center_ray)
     ray = center + (match.ray - center) * ways(match.orientation) * ways(orientation)
     there = ((ray >= 1) & (ray <= (rig.pattern.rows, rig.pattern.columns))).all(axis=-1)
     return replace(

@@ -166,7 +166,7 @@ def test_orientation_is_right_with_a_large_margin(scene_results: list[SceneResul
     orientations: set[Orientation] = set()
     for scene, match in with_match(scene_results):
         assert match.orientation == seen_orientation(scene.reflections)
-        assert match.margin >= 5
+        assert match.residual_ratio >= 5
         assert match.trials[0].orientation == match.orientation
         assert {trial.orientation for trial in match.trials} == set(ORIENTATIONS)
         residuals = [trial.residual_mm for trial in match.trials]
@@ -216,7 +216,7 @@ def test_only_dots_with_a_ray_are_indexed(scene_results: list[SceneResult]) -> N
         expected = np.zeros((len(scene.seen.dots), 2), int)
         expected[match.dot] = match.reflected
         np.testing.assert_array_equal(np.stack([lattice.row, lattice.column], axis=-1), expected)
-        center = np.array(scene.rig.pattern.reference)
+        center = np.array(scene.rig.pattern.center_ray)
         offset = match.reflected[0] - match.ray[0] * ways(match.orientation)
         assert lattice.reference == tuple(center * ways(match.orientation) + offset)
 
@@ -230,7 +230,7 @@ def exact(pool: Pool, with_reference: bool = False) -> SeenDots:
     reflections = trace(pool, BENCH_RIG)
     image, ray = visible_dots(reflections)
     if with_reference:
-        center = tuple(n - 1 for n in BENCH_RIG.pattern.reference)
+        center = tuple(n - 1 for n in BENCH_RIG.pattern.center_ray)
         image = np.vstack([image, BENCH_VIEW.to_image(reflections.plane_mm[center])])
         ray = np.vstack([ray, [0, 0]])
     noise = np.random.default_rng(0).normal(0.0, 0.1, image.shape)
@@ -405,7 +405,7 @@ def test_undetermined_reference_can_be_set_manually(
     np.testing.assert_array_equal(match.ray, seen.ray[match.dot])
     assert len(match.dot) == len(seen.ray)
     assert match.orientation == "S/S"
-    assert match.margin > 5
+    assert match.residual_ratio > 5
 
 
 @pytest.mark.slow

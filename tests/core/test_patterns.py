@@ -266,7 +266,7 @@ def test_frames_of_other_patterns_are_measured(
 def measured_pattern(pattern: DotPattern) -> DotPattern:
     """Return the pattern as if its rays were measured individually."""
     steps = pattern.tangents / np.tan(np.radians(pattern.inter_beam_angle_deg))
-    i, j = pattern.reference
+    i, j = pattern.center_ray
     rays = (ray for ray in np.ndindex(steps.shape[:2]))
     measured = tuple(
         (a + 1 - i, b + 1 - j, *steps[a, b].tolist())

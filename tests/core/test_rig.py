@@ -23,10 +23,10 @@ def test_laser_position_has_its_distance_and_elevation(angle, distance):
 
 def test_absent_ray_is_the_centre_unless_others_are_named():
     assert DotPattern().absent_rays == {(10, 10)}
-    assert DotPattern(39, 39, 0.385).reference == (20, 20)
+    assert DotPattern(39, 39, 0.385).center_ray == (20, 20)
     named = DotPattern(absent=frozenset({(3, 4)}))
     assert named.absent_rays == {(3, 4)}
-    assert named.reference == (10, 10)
+    assert named.center_ray == (10, 10)
 
 
 @given(angles, angles, angles, st.tuples(lengths, lengths), st.tuples(lengths, lengths, lengths))

@@ -204,7 +204,7 @@ def _by_places(observed: Observation, picture: Picture) -> list[IntArray]:
         for place in product(x, y)
     ]
     made.sort(key=lambda labels: -int((labels != UNLABELLED).sum()))
-    i, j = rig.pattern.marker or rig.pattern.reference
+    i, j = rig.pattern.marker or rig.pattern.center_ray
     found: dict[bytes, IntArray] = {}
     for labels in made[: 4 * MOST_STARTS]:
         holes = (labels == UNLABELLED) & (_lit_neighbours(labels) >= SURROUNDED)
@@ -283,7 +283,7 @@ def _grown(
         labels = relabelled(observed, mirror, made.offset, made.poses[0])
         if (labels == before).all():
             break
-    i, j = observed.rig.pattern.marker or observed.rig.pattern.reference
+    i, j = observed.rig.pattern.marker or observed.rig.pattern.center_ray
     in_hole = labels[i - 1, j - 1] != UNLABELLED
     if in_hole or _lit_neighbours(labels)[i - 1, j - 1] < SURROUNDED:
         return None

@@ -95,18 +95,18 @@ class DotPattern:
 
     def __post_init__(self) -> None:
         if self.absent is None:
-            absent = frozenset[tuple[int, int]]() if self.measured else {self.reference}
+            absent = frozenset[tuple[int, int]]() if self.measured else {self.center_ray}
             object.__setattr__(self, "absent", frozenset(absent))
 
     @property
-    def reference(self) -> tuple[int, int]:
-        """The centre reference ray ``(i, j)``, counted from 1."""
+    def center_ray(self) -> tuple[int, int]:
+        """The ray ``(i, j)`` at the centre, counted from 1; usually absent."""
         return (self.rows + 1) // 2, (self.columns + 1) // 2
 
     @cached_property
     def marker(self) -> tuple[int, int] | None:
         """The absent ray whose hole identifies the rows: the nearest to the centre, or None."""
-        center = np.array(self.reference)
+        center = np.array(self.center_ray)
         return min(
             sorted(self.absent_rays - self._outside),
             key=lambda ray: float(np.linalg.norm(np.array(ray) - center)),
@@ -139,7 +139,7 @@ class DotPattern:
         """Measured rays; for other kinds all rays within the outline."""
         if self.kind != MEASURED:
             return self._within
-        i, j = self.reference
+        i, j = self.center_ray
         return frozenset((i + row, j + column) for row, column, *_ in self.measured)
 
     @cached_property

@@ -141,7 +141,7 @@ def _bound(
 ) -> _Bound | None:
     """Label dots by their sites, and the others by the surface; None if no surface fits them."""
     pattern, way, rows = observed.rig.pattern, ways(orientation), _whole_sites(given)
-    marker = pattern.marker or pattern.reference
+    marker = pattern.marker or pattern.center_ray
     hidden = (marker[0] + (k - reference[0]) * int(way[0]) for k in given.blocked_rows)
     observed = replace(observed, hidden_rows=frozenset(hidden))
     shape = (pattern.rows, pattern.columns)
@@ -176,7 +176,7 @@ def _found_reference(match: Match, rows: Lattice, rig: Rig) -> Site:
     """Site of the reference in the operator's rows, from the rays of a match."""
     pattern = rig.pattern
     site = np.stack([rows.row, rows.column], axis=-1)[match.dot]
-    away = (match.ray - (pattern.marker or pattern.reference)) * ways(match.orientation)
+    away = (match.ray - (pattern.marker or pattern.center_ray)) * ways(match.orientation)
     kinds, count = np.unique((site - away)[site[:, 0] > 0], axis=0, return_counts=True)
     if len(kinds) == 0 or count.max() < AGREED * count.sum():
         raise CannotMeasure(

@@ -186,7 +186,7 @@ def lattice_of_match(match: Match, rig: Rig, count: int) -> Lattice:
 
     They include dots that the image alone leaves in doubt, and exclude dots without a ray.
     """
-    way, marker = ways(match.orientation), rig.pattern.marker or rig.pattern.reference
+    way, marker = ways(match.orientation), rig.pattern.marker or rig.pattern.center_ray
     k, t = np.array(marker) * way + (match.reflected - match.ray * way)[0]
     row, column = np.zeros((2, count), np.int64)
     row[match.dot], column[match.dot] = match.reflected.T
@@ -345,7 +345,7 @@ def match_of_pairs(
         Reflected row and column (k, t) of the marker. None: rows and columns begin at 1.
     """
     pattern = observed.rig.pattern
-    numbers = (at + 1 - (pattern.marker or pattern.reference)) * ways(orientation)
+    numbers = (at + 1 - (pattern.marker or pattern.center_ray)) * ways(orientation)
     least = numbers.min(axis=0)
     numbers += 1 - least if reference is None else np.maximum(reference, 1 - least)
     return Match(

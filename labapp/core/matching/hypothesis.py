@@ -430,7 +430,7 @@ def reoriented_labels(
 ) -> IntArray:
     """Label the same dots with another orientation: rays are mirrored about the marker."""
     at = np.argwhere(labels != UNLABELLED)
-    center = np.array(observed.rig.pattern.marker or observed.rig.pattern.reference)
+    center = np.array(observed.rig.pattern.marker or observed.rig.pattern.center_ray)
     ray = center + (at + 1 - center) * ways(before) * ways(after)
     return _labels_of_pairs(ray, labels[at[:, 0], at[:, 1]], labels.shape)
 

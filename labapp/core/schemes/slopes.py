@@ -129,7 +129,7 @@ def reflected_rays(match: Match, rig: Rig) -> ReflectedRays:
             f"at least {FEWEST_DOTS} in {FEWEST_ROWS} are needed",
         )
     ray, plane = match.ray, match.plane_mm
-    i, j = rig.pattern.reference
+    i, j = rig.pattern.center_ray
     beside = (ray[:, 0] == i) & (np.abs(ray[:, 1] - j) == 1)
     centre = (ray == (i, j)).all(axis=1)
     if (i, j) in rig.pattern.absent_rays and beside.sum() == 2 and not centre.any():

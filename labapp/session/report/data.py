@@ -201,7 +201,7 @@ def rows_sentence(lines: Iterable[FrameLine]) -> str:
 
 def is_doubtful(measurement: Measurement) -> bool:
     """Whether another correspondence explains the dots nearly as well."""
-    return measurement.match is not None and measurement.match.margin < DOUBTFUL_MARGIN
+    return measurement.match is not None and measurement.match.residual_ratio < DOUBTFUL_MARGIN
 
 
 def representative(lines: Iterable[FrameLine]) -> FrameLine | None:

@@ -65,7 +65,9 @@ def test_tried_correspondences_are_listed(session: Session) -> None:
     match = frame_view.result.measurement.match
     assert [row.name for row in frame_view.trials] == ["S/S ✓", "S/I", "I/I"]
     assert [row.value for row in frame_view.trials] == [trial.residual_mm for trial in match.trials]
-    assert frame_view.verdict == f"S/S: the next best is {match.margin:.0f} times as far off."
+    assert (
+        frame_view.verdict == f"S/S: the next best is {match.residual_ratio:.0f} times as far off."
+    )
     one = replace(match, trials=match.trials[:1])
     assert presenter.verdict(one) == "S/S: no other correspondence gives a surface."
     none = replace(match.trials[1], residual_mm=np.inf)

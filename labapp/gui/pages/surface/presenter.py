@@ -277,9 +277,9 @@ def verdict(match: Match | None) -> str:
     """Text of how much better the chosen correspondence is than the next."""
     if match is None:
         return ""
-    if not np.isfinite(match.margin):
+    if not np.isfinite(match.residual_ratio):
         return f"{match.orientation}: no other correspondence gives a surface."
-    times = match.margin
+    times = match.residual_ratio
     factor = f"{times:.0f}" if times >= 10 else f"{times:.1f}"
     return f"{match.orientation}: the next best is {factor} times as far off."
 
