@@ -346,7 +346,7 @@ def _refuse_unexplained(observed: Observation, best: Hypothesis, settings: Match
             f"{_counted(best.missed_count, 'ray')} without a dot among {best.label_count} pairs"
             f"{_doubt_of_setup(observed, best)}",
         )
-    if best.pool.level.rays and best.pool.level.disagreement > CONTRADICTED_BITS:
+    if best.pool.level.ray_count and best.pool.level.disagreement > CONTRADICTED_BITS:
         raise CannotMeasure(
             "no-match",
             "no boundary of the best surface separates the rays that came back from those that "

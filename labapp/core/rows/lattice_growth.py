@@ -67,14 +67,14 @@ def grow_lattice(dots: Dots, settings: GrowSettings) -> Lattice:
         raise CannotMeasure(
             "too-few-dots", f"only {len(dots)} dots found; a grid needs {settings.least}"
         )
-    plane = dots.u_px - 1j * dots.v_px
-    order = np.argsort(plane.real)
-    rank, in_order = np.argsort(order), plane[order]
+    dots_px = dots.u_px - 1j * dots.v_px
+    order = np.argsort(dots_px.real)
+    rank, in_order = np.argsort(order), dots_px[order]
     across = 2 * (min(len(dots), MOST_STEPS) + BORDER) + 1
     dot_at = np.full((across, across), -1)
     tried = np.zeros(len(dots), np.bool_)
     grids: list[IntArray] = []
-    for seed, first, second in _seeds(plane):
+    for seed, first, second in _seeds(dots_px):
         if tried[seed]:
             continue
         k, t, dot = _largest_part(
@@ -83,12 +83,12 @@ def grow_lattice(dots: Dots, settings: GrowSettings) -> Lattice:
         dot = order[dot]
         tried[dot] = True
         if len(dot) >= settings.least:
-            grown = _upright(_reduced(_grid_of(k, t, dot), plane), plane)
-            grids.append(_without_slips(grown, plane))
+            grown = _upright(_reduced(_grid_of(k, t, dot), dots_px), dots_px)
+            grids.append(_without_slips(grown, dots_px))
     grid = max(grids, key=_count, default=np.empty((0, 0), np.int64))
     if len(grids) > 1 and _count(grid) < settings.share * len(dots):
-        whole = _upright(_reduced(merge_grids(grids), plane), plane)
-        grid = max(grid, _without_slips(whole, plane), key=_count)
+        whole = _upright(_reduced(merge_grids(grids), dots_px), dots_px)
+        grid = max(grid, _without_slips(whole, dots_px), key=_count)
     if _count(grid) < max(settings.least, settings.share * len(dots)):
         raise CannotMeasure("no-rows", "the dots do not form rows and columns")
     grid = _grid_of(*_sites(grid))
@@ -156,20 +156,20 @@ def _centered(sites: IntArray) -> FloatArray:
     return np.asarray(sites - sites.mean(axis=0))
 
 
-def _seeds(plane: ComplexArray) -> list[tuple[int, complex, complex]]:
+def _seeds(dots_px: ComplexArray) -> list[tuple[int, complex, complex]]:
     """Find dots midway between two neighbours, the most regular first.
 
     Returns triples of the dot, the step to one of these neighbours, and a step in another
     direction: to a neighbour of another such pair if there is one, or else to the nearest dot well
     off the first line (the distance of rows may be ten times that of the dots within them).
     """
-    points = np.stack([plane.real, plane.imag], axis=-1)
+    points = np.stack([dots_px.real, dots_px.imag], axis=-1)
     near = scipy.spatial.cKDTree(points).query(points, k=min(41, len(points)))[1][:, 1:]
-    offset = plane[near] - plane[:, None]
+    offset = dots_px[near] - dots_px[:, None]
     length = np.abs(offset)
     a, b = np.triu_indices(min(10, near.shape[1]), 1)
     step = (offset[:, b] - offset[:, a]) / 2
-    dots = np.arange(len(plane))
+    dots = np.arange(len(dots_px))
     with np.errstate(divide="ignore", invalid="ignore"):  # two dots in one place
         error = np.abs(offset[:, a] + offset[:, b]) / np.minimum(length[:, a], length[:, b])
         size = np.where(error < 0.5, length[:, a] + length[:, b], np.inf)
@@ -181,7 +181,7 @@ def _seeds(plane: ComplexArray) -> list[tuple[int, complex, complex]]:
     last = np.where(off_line.any(axis=1), np.finfo(float).max, np.inf)
     size_across = np.column_stack([crossing, last])
     across = np.column_stack([step, offset[dots, off_line.argmax(axis=1)]])
-    doubt = np.column_stack([error, np.full(len(plane), 0.5)])
+    doubt = np.column_stack([error, np.full(len(dots_px), 0.5)])
     found = np.isfinite(size_across)
     ends = np.where(found, size_across, -np.inf).argmax(axis=1)
     both = np.column_stack([size_across.argmin(axis=1), ends])
@@ -226,17 +226,17 @@ def _grid_of(k: IntArray, t: IntArray, dot: IntArray) -> IntArray:
     return grid
 
 
-def _places(grid: IntArray, plane: ComplexArray) -> ComplexArray:
+def _places(grid: IntArray, dots_px: ComplexArray) -> ComplexArray:
     """Position of each site's dot, px; NaN if there is none."""
-    return np.where(grid >= 0, plane[grid], complex(np.nan, np.nan))
+    return np.where(grid >= 0, dots_px[grid], complex(np.nan, np.nan))
 
 
-def _reduced(grid: IntArray, plane: ComplexArray) -> IntArray:
+def _reduced(grid: IntArray, dots_px: ComplexArray) -> IntArray:
     """Renumber a grid by its two shortest steps, since a grid grown at a hole may be diagonal.
 
     Lagrange's reduction of the lattice, with inner products summed over the cells.
     """
-    place = _places(grid, plane)
+    place = _places(grid, dots_px)
     a, b = place[:-1, 1:] - place[:-1, :-1], place[1:, :-1] - place[:-1, :-1]
     with np.errstate(divide="ignore", invalid="ignore"):  # two dots in one place
         along, across = np.nansum(np.abs(a) / np.abs(b)), np.nansum(np.abs(b) / np.abs(a))
@@ -260,9 +260,9 @@ def _reduced(grid: IntArray, plane: ComplexArray) -> IntArray:
     return _grid_of(row[0] * k + row[1] * t, column[0] * k + column[1] * t, dot)
 
 
-def _upright(grid: IntArray, plane: ComplexArray) -> IntArray:
+def _upright(grid: IntArray, dots_px: ComplexArray) -> IntArray:
     """Orient the grid so that columns count from left to right and rows from the bottom up."""
-    place = _places(grid, plane)
+    place = _places(grid, dots_px)
     along, across = np.diff(place, axis=1), np.diff(place, axis=0)
     level = [
         np.nansum(np.abs(steps.real)) / max(np.nansum(np.abs(steps)), 1e-9)
@@ -277,14 +277,14 @@ def _upright(grid: IntArray, plane: ComplexArray) -> IntArray:
     return grid
 
 
-def _without_slips(grid: IntArray, plane: ComplexArray) -> IntArray:
+def _without_slips(grid: IntArray, dots_px: ComplexArray) -> IntArray:
     """Keep the largest block of adjacent rows without misalignment.
 
     A row may be joined to the next with an offset of one column, or from alternating dots of two
     rows. Its columns then slant by a whole step more than those of other rows; those of curved or
     fanned rows do not.
     """
-    place = _places(grid, plane)
+    place = _places(grid, dots_px)
     with np.errstate(divide="ignore", invalid="ignore"):  # two dots in one place
         lean = (np.diff(place, axis=0) / _steps_along(place[:-1])).real
     slant = np.full(len(grid), np.nan)

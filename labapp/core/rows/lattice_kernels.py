@@ -36,26 +36,26 @@ Claim = tuple[float, int, int, int]
 """Cost of a site's dot, from its distance to predictions; the site's row and column; the dot."""
 
 _f, _i, _c = types.float64, types.int64, types.complex128
-_plane = types.Array(_c, 1, "C", readonly=True)
+_dots = types.Array(_c, 1, "C", readonly=True)
 _sites = types.Array(_i, 2, "C")
 
 
 @inner
-def _nearest(plane: ComplexArray, place: complex, within: float) -> tuple[int, float, float]:
+def _nearest(dots_px: ComplexArray, place: complex, within: float) -> tuple[int, float, float]:
     """The dot nearest to a place, its distance and that of the second nearest, within a radius.
 
     Without a dot, its index is −1 and the distance infinite.
     """
-    start, end = 0, len(plane)
+    start, end = 0, len(dots_px)
     while start < end:
         middle = (start + end) // 2
-        if plane[middle].real < place.real - within:
+        if dots_px[middle].real < place.real - within:
             start = middle + 1
         else:
             end = middle
     nearest, least, second = -1, np.inf, np.inf
-    for dot in range(start, len(plane)):
-        off = plane[dot] - place
+    for dot in range(start, len(dots_px)):
+        off = dots_px[dot] - place
         if not off.real <= within:
             break
         square = off.real * off.real + off.imag * off.imag
@@ -75,7 +75,7 @@ def _clamped(ratio: complex) -> complex:
 
 @inner
 def _predictions(
-    plane: ComplexArray, dot_at: IntArray, k: int, t: int, gate: float
+    dots_px: ComplexArray, dot_at: IntArray, k: int, t: int, gate: float
 ) -> tuple[ComplexArray, FloatArray]:
     """Predict the position of a site's dot, shape (p,), with local steps and tolerances, (p, 2).
 
@@ -91,25 +91,27 @@ def _predictions(
         one, two = dot_at[k + dk, t + dt], dot_at[k + 2 * dk, t + 2 * dt]
         if one < 0 or two < 0:
             continue
-        step = plane[one] - plane[two]
+        step = dots_px[one] - dots_px[two]
         for ek, et in ((dk, dt), (dt, dk), (-dt, -dk)):  # the same row, and the adjacent ones
             near, next_one = dot_at[k + ek, t + et], dot_at[k + dk + ek, t + dt + et]
             far = dot_at[k + 2 * dk + ek, t + 2 * dt + et]
             if near >= 0 and next_one >= 0 and far >= 0:
-                ratio = (plane[near] - plane[next_one]) / (plane[next_one] - plane[far])
-                places[count] = plane[one] + step * _clamped(ratio)
+                ratio = (dots_px[near] - dots_px[next_one]) / (dots_px[next_one] - dots_px[far])
+                places[count] = dots_px[one] + step * _clamped(ratio)
                 sizes[count, 0], sizes[count, 1] = abs(step), gate * abs(step)
                 count += 1
             elif near == one:
-                places[count] = plane[one] + step
+                places[count] = dots_px[one] + step
                 sizes[count, 0], sizes[count, 1] = abs(step), LOOSER * gate * abs(step)
                 count += 1
     for dt in (1, -1):
         for dk in (1, -1):
             one, other, corner = dot_at[k, t + dt], dot_at[k + dk, t], dot_at[k + dk, t + dt]
             if one >= 0 and other >= 0 and corner >= 0:
-                shorter = min(abs(plane[other] - plane[corner]), abs(plane[one] - plane[corner]))
-                places[count] = plane[one] + plane[other] - plane[corner]
+                shorter = min(
+                    abs(dots_px[other] - dots_px[corner]), abs(dots_px[one] - dots_px[corner])
+                )
+                places[count] = dots_px[one] + dots_px[other] - dots_px[corner]
                 sizes[count, 0], sizes[count, 1] = shorter, LOOSER * gate * shorter
                 count += 1
     return places[:count], sizes[:count]
@@ -117,7 +119,7 @@ def _predictions(
 
 @inner
 def _claim(
-    plane: ComplexArray,
+    dots_px: ComplexArray,
     dot_at: IntArray,
     taken: BoolArray,
     k: int,
@@ -129,11 +131,11 @@ def _claim(
 
     At least half of the predictions must match a dot, and all of these the same one.
     """
-    places, sizes = _predictions(plane, dot_at, k, t, gate)
+    places, sizes = _predictions(dots_px, dot_at, k, t, gate)
     chosen, fitting, error = -1, 0, 0.0
     for p in range(len(places)):
         step, reach = sizes[p, 0], sizes[p, 1]
-        dot, distance, second = _nearest(plane, places[p], max(doubt, 1.0) * reach)
+        dot, distance, second = _nearest(dots_px, places[p], max(doubt, 1.0) * reach)
         if dot < 0 or distance >= reach:
             continue
         if second < doubt * distance or (chosen >= 0 and dot != chosen):
@@ -146,12 +148,12 @@ def _claim(
 
 @inner
 def _seed_claims(
-    plane: ComplexArray, middle: int, seed: int, first: complex, second: complex
+    dots_px: ComplexArray, middle: int, seed: int, first: complex, second: complex
 ) -> list[Claim]:
     """Claims of the seed and its neighbours, which precede all others in this order."""
     queue = [(-5.0, middle, middle, seed)]
     for dk, dt, step in ((0, 1, first), (0, -1, -first), (1, 0, second), (-1, 0, -second)):
-        dot, distance, _ = _nearest(plane, plane[seed] + step, SEED_GATE * abs(step))
+        dot, distance, _ = _nearest(dots_px, dots_px[seed] + step, SEED_GATE * abs(step))
         if dot >= 0 and distance < SEED_GATE * abs(step):
             queue.append((len(queue) - 5.0, middle + dk, middle + dt, dot))
     return queue
@@ -167,14 +169,14 @@ def _root(parent: IntArray, dot: int) -> int:
 
 
 @inner
-def _connected_parts(plane: ComplexArray, dot_at: IntArray, placed: list[Claim]) -> IntArray:
+def _connected_parts(dots_px: ComplexArray, dot_at: IntArray, placed: list[Claim]) -> IntArray:
     """Parents in a union-find forest of dots that are connected by valid cells (`MOST_OPEN`)."""
-    parent = np.arange(len(plane))
+    parent = np.arange(len(dots_px))
     for _, k, t, dot in placed:
         right, up, across = dot_at[k, t + 1], dot_at[k + 1, t], dot_at[k + 1, t + 1]
         if right < 0 or up < 0 or across < 0:
             continue
-        a, b, c, d = plane[dot], plane[right], plane[up], plane[across]
+        a, b, c, d = dots_px[dot], dots_px[right], dots_px[up], dots_px[across]
         sides = min(max(abs(b - a), abs(d - c)), max(abs(c - a), abs(d - b)))
         if abs(a - b - c + d) < MOST_OPEN * sides:
             for corner in (right, up, across):
@@ -182,9 +184,9 @@ def _connected_parts(plane: ComplexArray, dot_at: IntArray, placed: list[Claim])
     return parent
 
 
-@compiled(_plane, _sites, _i, _c, _c, _f, _f)
+@compiled(_dots, _sites, _i, _c, _c, _f, _f)
 def grow(
-    plane: ComplexArray,
+    dots_px: ComplexArray,
     dot_at: IntArray,
     seed: int,
     first: complex,
@@ -196,8 +198,8 @@ def grow(
 
     Parameters
     ----------
-    plane
-        The dots, shape (n,).
+    dots_px
+        The dots, u − iv, shape (n,), px, sorted by u.
     dot_at
         Scratch array of −1, shape (m, m), which is restored. The grid grows from its middle, but
         not into the outermost BORDER sites.
@@ -212,15 +214,15 @@ def grow(
         Row and column in ``dot_at``, dot, and representative dot of the connected part
         (`_connected_parts`) of each site, shape (s, 4).
     """
-    taken, middle, end = np.zeros(len(plane), np.bool_), len(dot_at) // 2, len(dot_at) - BORDER
-    queue, placed = _seed_claims(plane, middle, seed, first, second), [(0.0, 0, 0, 0)][:0]
+    taken, middle, end = np.zeros(len(dots_px), np.bool_), len(dot_at) // 2, len(dot_at) - BORDER
+    queue, placed = _seed_claims(dots_px, middle, seed, first, second), [(0.0, 0, 0, 0)][:0]
     while queue:
         claim = heapq.heappop(queue)
         badness, k, t, dot = claim
         if dot_at[k, t] >= 0 or taken[dot]:
             continue
         if badness >= 0.0:  # the neighbourhood may have changed since
-            again = _claim(plane, dot_at, taken, k, t, gate, doubt)
+            again = _claim(dots_px, dot_at, taken, k, t, gate, doubt)
             if again != claim:
                 if again[3] >= 0:
                     heapq.heappush(queue, again)
@@ -231,10 +233,10 @@ def grow(
             for near_t in range(t - 2, t + 3):
                 inside = BORDER <= near_k < end and BORDER <= near_t < end
                 if inside and dot_at[near_k, near_t] < 0:
-                    near = _claim(plane, dot_at, taken, near_k, near_t, gate, doubt)
+                    near = _claim(dots_px, dot_at, taken, near_k, near_t, gate, doubt)
                     if near[3] >= 0:
                         heapq.heappush(queue, near)
-    parent = _connected_parts(plane, dot_at, placed)
+    parent = _connected_parts(dots_px, dot_at, placed)
     sites = np.empty((len(placed), 4), np.int64)
     for at, (_, k, t, dot) in enumerate(placed):
         sites[at, 0], sites[at, 1], sites[at, 2], sites[at, 3] = k, t, dot, _root(parent, dot)

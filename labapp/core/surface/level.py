@@ -81,7 +81,7 @@ class Level:
     negative_log_likelihood
         −log likelihood of the lit and dark rays near the boundary: 0 if every lit one lands inside
         and every dark one outside, or if no ray is known to be dark.
-    rays, rise_mm
+    ray_count, rise_mm
         Number of these rays; typical change of the height there from one ray to the next, mm.
     """
 
@@ -90,13 +90,15 @@ class Level:
     sign: int
     rear: Rear
     negative_log_likelihood: float
-    rays: int = 0
+    ray_count: int = 0
     rise_mm: float = 0.0
 
     @property
     def disagreement(self) -> float:
         """Mean surprise of the rays near the boundary, bits; infinite if there are none."""
-        return self.negative_log_likelihood / np.log(2) / self.rays if self.rays else np.inf
+        return (
+            self.negative_log_likelihood / np.log(2) / self.ray_count if self.ray_count else np.inf
+        )
 
 
 @dataclass(frozen=True)
