@@ -171,13 +171,13 @@ def decide(
         ``no-match``, ``no-reference`` or ``ambiguous-orientation``; ``ambiguous-rows`` if there is
         a dot in the only hole, or a part of the rows is ambiguous.
     """
-    best, found, neighbours, fit = _cheapest(observed, found, settings.margin)
+    best, found, neighbours, knots = _cheapest(observed, found, settings.margin)
     cheapest = best  # rivals keep their doubtful labels: they are compared with this one
-    if fit is FINE_KNOTS:
-        cheapest = evaluate_twice(observed, best.labels, fit, best.pool) or best
-    best = without_doubtful_outermost(observed, without_false_ends(observed, best, fit), fit)
-    if fit is FINE_KNOTS:
-        best = evaluate_twice(observed, best.labels, fit, best.pool) or best
+    if knots == FINE_KNOTS:
+        cheapest = evaluate_twice(observed, best.labels, knots, best.pool) or best
+    best = without_doubtful_outermost(observed, without_false_ends(observed, best, knots), knots)
+    if knots == FINE_KNOTS:
+        best = evaluate_twice(observed, best.labels, knots, best.pool) or best
     _refuse_unexplained(observed, best, settings)
     orientation = best.orientation(observed)
     _refuse_marker(observed, best, found)
@@ -188,8 +188,8 @@ def decide(
         for other in settings.orientations
         if other != orientation
     )
-    for other in [*found, *neighbours, *_rivals(observed, best, others, fit)]:
-        if _clearly_cheaper(observed, cheapest, other, fit, settings):
+    for other in [*found, *neighbours, *_rivals(observed, best, others, knots)]:
+        if _clearly_cheaper(observed, cheapest, other, knots, settings):
             continue
         differing, shared = _differing(best, other)
         if len(differing) <= MOST_DIFFERING * shared:
@@ -201,9 +201,9 @@ def decide(
             )
         else:
             rivals.append(other)
-    best = _without(observed, best, doubtful, fit)
-    best = supported(observed, best, fit)
-    open_holes = holes_left_open(observed, best, fit, settings.margin)
+    best = _without(observed, best, doubtful, knots)
+    best = supported(observed, best, knots)
+    open_holes = holes_left_open(observed, best, knots, settings.margin)
     return best, _with_rivals(open_holes, best, cheapest, rivals)
 
 
@@ -259,38 +259,38 @@ def _step(one: Hypothesis, other: Hypothesis) -> tuple[int, int]:
     return int(row), int(column)
 
 
-def supported(observed: Observation, best: Hypothesis, fit: FitSettings) -> Hypothesis:
+def supported(observed: Observation, best: Hypothesis, knots: FitSettings) -> Hypothesis:
     """Remove the labels that the surface through the other dots does not support."""
     for _ in range(MOST_LEFT_OUT):
-        settled = _settled(observed, best, fit)
-        wrong = unsupported(observed, fitted_labels(observed, settled, fit))
+        settled = _settled(observed, best, knots)
+        wrong = unsupported(observed, fitted_labels(observed, settled, knots))
         if len(wrong) == 0:
             break
-        best = _without(observed, best, wrong, fit)
+        best = _without(observed, best, wrong, knots)
     return best
 
 
 def _without(
-    observed: Observation, best: Hypothesis, dots: IntArray | list[int], fit: FitSettings
+    observed: Observation, best: Hypothesis, dots: IntArray | list[int], knots: FitSettings
 ) -> Hypothesis:
     """Remove the labels of some dots; the witness of their rays becomes unknown."""
     certain = np.where(np.isin(best.labels, dots), UNLABELLED, best.labels)
     if (certain == best.labels).all():
         return best
     witness = np.where(certain == best.labels, best.witness, 0)
-    return replace(evaluate(observed, certain, fit, initial=best.pool) or best, witness=witness)
+    return replace(evaluate(observed, certain, knots, initial=best.pool) or best, witness=witness)
 
 
-def _settled(observed: Observation, best: Hypothesis, fit: FitSettings) -> Hypothesis:
+def _settled(observed: Observation, best: Hypothesis, knots: FitSettings) -> Hypothesis:
     """Continue the fit of a hypothesis until it has converged as for a reconstruction."""
-    fit = replace(fit, settled_mm=FitSettings().settled_mm)
+    converged = replace(knots, settled_mm=FitSettings().settled_mm)
     try:
-        return replace(best, pool=observed.fit(best.labels, best.witness, fit, best.pool))
+        return replace(best, pool=observed.fit(best.labels, best.witness, converged, best.pool))
     except CannotMeasure:
         return best
 
 
-def fitted_labels(observed: Observation, best: Hypothesis, fit: FitSettings) -> FittedLabels:
+def fitted_labels(observed: Observation, best: Hypothesis, knots: FitSettings) -> FittedLabels:
     """Labels and surface of a hypothesis, as the input of `unsupported`."""
     basis, paths = best.pool.surface.basis, paths_of(observed, best.pool)
     missed = np.ravel_multi_index(tuple(best.missed_rays.T), best.labels.shape)
@@ -300,32 +300,32 @@ def fitted_labels(observed: Observation, best: Hypothesis, fit: FitSettings) -> 
     at = inverse_of(best.pool.factor), paths.points_mm[rays], paths.plane_mm[rays]
     covariance = np.full((best.labels.size, 2, 2), np.nan)
     covariance[rays] = covariance_of_dots(observed.rig, basis, *at)
-    how = fit.floor_mm, best.pool.unsettled_mm
+    how = knots.floor_mm, best.pool.unsettled_mm
     return FittedLabels(best.labels, basis, best.pool.level, paths, covariance, classes, *how)
 
 
 def _cheapest(
     observed: Observation, found: list[Hypothesis], margin: float
 ) -> tuple[Hypothesis, list[Hypothesis], list[Hypothesis], FitSettings]:
-    """The cheapest hypothesis, all found, its neighbours by a row or two, and the fit settings."""
+    """The cheapest hypothesis, all found, its neighbours by a row or two, and the knots used."""
     best = min(found, key=lambda hypothesis: hypothesis.cost)
-    fit = USUAL_KNOTS
+    knots = USUAL_KNOTS
     neighbours: list[Hypothesis] = []
     if best.stray_count or best.missed_count:
-        neighbours = _rivals(observed, best, shifted_labels(observed, best.labels), fit)
+        neighbours = _rivals(observed, best, shifted_labels(observed, best.labels), knots)
     # Residuals of a dip that these knots cannot follow may decide between rivals this close.
     near = any(rival.cost < best.cost + CLOSE_COST for rival in neighbours)
     if near or best.residual_mm > KNOT_ERROR_MM:
-        fit, neighbours = FINE_KNOTS, []
+        knots, neighbours = FINE_KNOTS, []
         found = [
-            h for each in found if (h := evaluate_twice(observed, each.labels, fit, each.pool))
+            h for each in found if (h := evaluate_twice(observed, each.labels, knots, each.pool))
         ]
         best = min(found, key=lambda hypothesis: hypothesis.cost, default=best)
     if not neighbours and not _beyond_doubt(observed, best, margin):
-        best, neighbours = _with_neighbours(observed, best, fit)
-    if fit is FINE_KNOTS:  # labels are removed by comparing costs of these knots alone
-        best = evaluate(observed, best.labels, fit, initial=best.pool) or best
-    return best, found, neighbours, fit
+        best, neighbours = _with_neighbours(observed, best, knots)
+    if knots == FINE_KNOTS:  # labels are removed by comparing costs of these knots alone
+        best = evaluate(observed, best.labels, knots, initial=best.pool) or best
+    return best, found, neighbours, knots
 
 
 def _refuse_unexplained(observed: Observation, best: Hypothesis, settings: MatchSettings) -> None:
@@ -368,7 +368,7 @@ def _clearly_cheaper(
     observed: Observation,
     best: Hypothesis,
     other: Hypothesis,
-    fit: FitSettings,
+    knots: FitSettings,
     settings: MatchSettings,
 ) -> bool:
     """Whether the best hypothesis costs less than another by the margin.
@@ -384,7 +384,7 @@ def _clearly_cheaper(
     margin = (2 if many_false else 1) * settings.margin
     if other.cost >= best.cost + margin:
         return True
-    if fit is not FINE_KNOTS:
+    if knots != FINE_KNOTS:
         return False
     ahead = []
     for each in (FINE_KNOTS, USUAL_KNOTS):
@@ -409,18 +409,18 @@ def _beyond_doubt(observed: Observation, best: Hypothesis, margin: float) -> boo
 
 
 def _with_neighbours(
-    observed: Observation, best: Hypothesis, fit: FitSettings
+    observed: Observation, best: Hypothesis, knots: FitSettings
 ) -> tuple[Hypothesis, list[Hypothesis]]:
     """The cheapest hypothesis that shifts by a row or two lead to, and its neighbours.
 
     Shifted labels that come close are grown first, as they may lack dots at their ends.
     """
     while True:  # each round is cheaper than the previous one
-        neighbours = _rivals(observed, best, shifted_labels(observed, best.labels), fit)
+        neighbours = _rivals(observed, best, shifted_labels(observed, best.labels), knots)
         near = [each.labels for each in neighbours if each.cost < best.cost + CLOSE_COST]
-        grown = [h for labels in near if (h := grow_and_evaluate(observed, labels, fit))]
+        grown = [h for labels in near if (h := grow_and_evaluate(observed, labels, knots))]
         grown = [
-            h for each in grown if (h := evaluate_twice(observed, each.labels, fit, each.pool))
+            h for each in grown if (h := evaluate_twice(observed, each.labels, knots, each.pool))
         ]
         better = min(grown, key=lambda h: h.cost, default=best)
         if better.cost >= best.cost:
@@ -429,7 +429,7 @@ def _with_neighbours(
 
 
 def _rivals(
-    observed: Observation, best: Hypothesis, labelled: Iterable[IntArray], fit: FitSettings
+    observed: Observation, best: Hypothesis, labelled: Iterable[IntArray], knots: FitSettings
 ) -> list[Hypothesis]:
     """Evaluate other labels as rivals of a hypothesis, except those that cannot come close to it.
 
@@ -441,7 +441,7 @@ def _rivals(
     rough = try_fit(observed, best.labels, initial=best.pool)
     far_mm = np.inf if quick is None else QUICK_MISFIT_TIMES * quick.residual_rms_mm
     costs = (
-        None if rough is None or fit is FINE_KNOTS else rough_costs(observed, best.labels, rough)
+        None if rough is None or knots == FINE_KNOTS else rough_costs(observed, best.labels, rough)
     )
     rivals = []
     for labels in labelled:
@@ -455,7 +455,7 @@ def _rivals(
             unlit, cost = rough_costs(observed, labels, pool)
             if unlit > costs[0] + FAR_COST and cost > costs[1] + FAR_COST + CLOSE_COST:
                 continue
-        hypothesis = evaluate_twice(observed, labels, fit, pool)
+        hypothesis = evaluate_twice(observed, labels, knots, pool)
         rivals += [] if hypothesis is None else [hypothesis]
     return rivals
 

@@ -223,15 +223,15 @@ def evaluate(
 
 
 def evaluate_twice(
-    observed: Observation, labels: IntArray, fit: FitSettings, initial: FittedPool
+    observed: Observation, labels: IntArray, knots: FitSettings, initial: FittedPool
 ) -> Hypothesis | None:
     """Evaluate labels; with fine knots the cost is the mean of those with fine and usual knots.
 
     The usual knots do not follow a dip; fine ones allow the rough surface that wrong labels need.
     A marker that is lit with the usual knots counts as lit.
     """
-    hypothesis = evaluate(observed, labels, fit, initial=initial)
-    if hypothesis is None or fit is not FINE_KNOTS:
+    hypothesis = evaluate(observed, labels, knots, initial=initial)
+    if hypothesis is None or knots != FINE_KNOTS:
         return hypothesis
     usual = evaluate(observed, labels, USUAL_KNOTS, initial=initial)
     if usual is None:
