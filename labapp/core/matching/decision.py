@@ -300,8 +300,16 @@ def fitted_labels(observed: Observation, best: Hypothesis, knots: FitSettings) -
     at = inverse_of(best.pool.factor), paths.points_mm[rays], paths.plane_mm[rays]
     covariance = np.full((best.labels.size, 2, 2), np.nan)
     covariance[rays] = covariance_of_dots(observed.rig, basis, *at)
-    how = knots.floor_mm, best.pool.unsettled_mm
-    return FittedLabels(best.labels, basis, best.pool.level, paths, covariance, classes, *how)
+    return FittedLabels(
+        labels=best.labels,
+        basis=basis,
+        level=best.pool.level,
+        paths=paths,
+        covariance_mm2=covariance,
+        classes=classes,
+        floor_mm=knots.floor_mm,
+        unsettled_mm=best.pool.unsettled_mm,
+    )
 
 
 def _cheapest(

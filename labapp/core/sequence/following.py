@@ -379,8 +379,15 @@ def _with_level(prior: Prior, fit: _Fit, covariance: FloatArray) -> tuple[RayCla
     sigma = fit.rounds.height_sigma_mm(witnesses.landing_mm)
     witnesses = replace(witnesses, height_sigma_mm=sigma)
     near = Level(0.0, prior.level_sigma_mm, prior.level.sign, prior.level.rear, 0.0)
-    how = fit.settings.rounds, SETTLED_MM, near, prior.drop_is_free, RAISED_MM
-    level = rounds_with_level(fit.rounds, witnesses, *how)
+    level = rounds_with_level(
+        fit.rounds,
+        witnesses,
+        most=fit.settings.rounds,
+        until_mm=SETTLED_MM,
+        near=near,
+        drop_is_free=prior.drop_is_free,
+        raised_mm=RAISED_MM,
+    )
     fit.check_settled()
     return RayClasses(witness, found.missed, found.stray), level
 
