@@ -67,7 +67,7 @@ def setup_changes(
     changes = np.zeros((len(gradient), len(known.root)))
     off = np.flatnonzero(known.root.any(axis=0)).tolist()
     dots = match.plane_mm, match.plane_covariance_mm2
-    benches = [bench_off(rig, SHARE * known.root[:, k], match.plane_mm) for k in off]
+    benches = [perturbed(rig, SHARE * known.root[:, k], match.plane_mm) for k in off]
     equations = _factorised(*dots, rig, settings, pool)
     change = _response(match.ray, equations, pool, benches) / SHARE
     basis, about = pool.surface.basis, (0.0, pool.level.sign, REACH)
@@ -78,8 +78,8 @@ def setup_changes(
     assert equations.factor is not None
     solved = equations.factor, equations.inverse, pool.mean_splines
     sigma, limits = height_sigma(basis, *solved, landing), (rig.head_sign, match.missing)
-    for k, by, (bench, _) in zip(off, change.T, benches, strict=True):
-        aside = (project_rays(bench.laser, bench.pattern).landing_mm[seen] - landing) / SHARE
+    for k, by, (moved, _) in zip(off, change.T, benches, strict=True):
+        aside = (project_rays(moved.laser, moved.pattern).landing_mm[seen] - landing) / SHARE
         more, less = (
             Witnesses(landing + way * aside, sign, own.spacing_mm, *limits, sigma)
             .level(basis, pool.surface.coefficients + way * by, pool.level.rear.drop_mm, about)
@@ -113,12 +113,12 @@ def residual_changes(
     assert rig.uncertainty is not None
     root, at, surface = rig.uncertainty.root, tuple(ray.T - 1), pool.surface
     off = np.flatnonzero(root.any(axis=0)).tolist()
-    benches = [bench_off(rig, SHARE * root[:, k], plane_mm) for k in off]
+    benches = [perturbed(rig, SHARE * root[:, k], plane_mm) for k in off]
     equations = _factorised(plane_mm, plane_covariance_mm2, rig, settings, pool)
     change = _response(ray, equations, pool, benches)
     changes = np.zeros((*plane_mm.shape, len(root)))
-    for k, by, (bench, dots_mm) in zip(off, change.T, benches, strict=True):
-        rays, plane = project_rays(bench.laser, bench.pattern), bench.imaging_plane.pose_mm
+    for k, by, (moved, dots_mm) in zip(off, change.T, benches, strict=True):
+        rays, plane = project_rays(moved.laser, moved.pattern), moved.imaging_plane.pose_mm
         met = rays.directions[at], rays.landing_mm[at], NEWTON_STEPS, plane
         coefficients = surface.coefficients + by
         computed = ray_kernels.intersect_and_reflect(surface.basis.grid, coefficients, *met)[2]
@@ -160,9 +160,9 @@ def _response(
 
     base = right_side(points, own.laser_mm, own.plane, own.dots_mm)
     changes = np.zeros((len(benches), len(coefficients)))
-    for k, (bench, dots_mm) in enumerate(benches):
-        laser_mm, plane = bench.laser.position_mm, bench.imaging_plane
-        rays = project_rays(bench.laser, bench.pattern).directions[at]
+    for k, (moved, dots_mm) in enumerate(benches):
+        laser_mm, plane = moved.laser.position_mm, moved.imaging_plane
+        rays = project_rays(moved.laser, moved.pattern).directions[at]
         start = intersect_level(laser_mm, rays, points[:, 2:])
         there, _ = solver_kernels.newton_along_rays(grid, coefficients, rays, start, 2)
         seen = laser_mm, plane.pose_mm, plane.to_universal(dots_mm)
@@ -177,7 +177,7 @@ def _response(
     return changes.T
 
 
-def bench_off(rig: Rig, offset: FloatArray, plane_mm: FloatArray) -> Perturbed:
+def perturbed(rig: Rig, offset: FloatArray, plane_mm: FloatArray) -> Perturbed:
     """Perturb the quantities of a rig by an offset, shape (q,), and the dots on its plane, mm."""
     assert rig.uncertainty is not None
     dots = moved_dots(plane_mm, rig, rig.uncertainty.axes, offset)
