@@ -65,7 +65,7 @@ class FreeHypothesis:
 
 
 def holes_left_open(
-    observed: Observation, best: Hypothesis, fit: FitSettings, margin: float
+    observed: Observation, best: Hypothesis, knots: FitSettings, margin: float
 ) -> list[FreeHypothesis]:
     """Hypotheses for each hole that may be the marker's, with a free set-up.
 
@@ -79,7 +79,7 @@ def holes_left_open(
         The dots, and the bench with its uncertainty.
     best
         The best hypothesis.
-    fit
+    knots
         Fit settings of the evaluation (`evaluate_twice`).
     margin
         Largest difference in cost, in units of χ²; see `HOLES_SHARE`.
@@ -92,12 +92,12 @@ def holes_left_open(
     steps = [] if observed.rig.uncertainty is None else _steps_to_other_holes(observed, best)
     if not steps:
         return []
-    own = with_setup_free(observed, best, fit)
+    own = with_setup_free(observed, best, knots)
     rivals = []
     for step in steps:
         shifted = evaluate(observed, shifted_by(observed, best.labels, step))
         if shifted is not None:
-            rival = with_setup_free(observed, shifted, fit, own.given_cost + HOLES_SHARE * margin)
+            rival = with_setup_free(observed, shifted, knots, own.given_cost + HOLES_SHARE * margin)
             if rival.cost < own.cost + HOLES_SHARE * margin:
                 rivals.append(replace(rival, step=step))
     return [own, *rivals] if rivals else []
@@ -112,7 +112,7 @@ def _steps_to_other_holes(observed: Observation, best: Hypothesis) -> list[tuple
 
 
 def with_setup_free(
-    observed: Observation, hypothesis: Hypothesis, fit: FitSettings, most: float = np.inf
+    observed: Observation, hypothesis: Hypothesis, knots: FitSettings, most: float = np.inf
 ) -> FreeHypothesis:
     """Evaluate labels with the set-up with which they are likeliest.
 
@@ -143,11 +143,11 @@ def with_setup_free(
         if settled is None or step @ step < SMALL_STEP:
             break
         pool = settled
-    found, setup_cost = evaluate_twice(moved, labels, fit, pool), float(deviation @ deviation)
+    found, setup_cost = evaluate_twice(moved, labels, knots, pool), float(deviation @ deviation)
     if found is None or found.cost + setup_cost >= most:
         return FreeHypothesis(labels)
     more = grow_and_evaluate(moved, labels)
-    grown = more and evaluate_twice(moved, more.labels, fit, more.pool)
+    grown = more and evaluate_twice(moved, more.labels, knots, more.pool)
     least = grown if grown and grown.cost < found.cost else found
     return FreeHypothesis(
         least.labels, given_cost=found.cost + setup_cost, cost=least.cost + setup_cost
