@@ -12,7 +12,9 @@ import pytest
 
 import labapp
 from labapp.config.setup import parse_setup
+from labapp.core.matching.decision import MatchSettings
 from labapp.core.pipeline import Settings
+from labapp.core.schemes.irs import IrsSettings
 from labapp.media import open_source
 from labapp.session.record import Record
 
@@ -55,6 +57,11 @@ def session(tmp_path: Path) -> labapp.Session:
         ("settings.scheme", {"settings": Settings(scheme="fitt")}),
         ("settings.algorithm", {"settings": Settings(algorithm="epa-r")}),
         ("settings.correspondence", {"settings": Settings(correspondence="S" + "S")}),  # type: ignore[arg-type]
+        (
+            "settings.match.correspondence",
+            {"settings": Settings(match=MatchSettings(correspondence="I/I"))},
+        ),
+        ("settings.irs.algorithm", {"settings": Settings(irs=IrsSettings(algorithm="epa-c"))}),
         ("progress", {"progress": 3}),
     ],
 )

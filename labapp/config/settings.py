@@ -6,9 +6,11 @@ from pathlib import Path
 from typing import get_args, get_type_hints
 
 from labapp.core.images.find_dots import DotSettings
+from labapp.core.matching.decision import MatchSettings
 from labapp.core.pipeline import Settings
 from labapp.core.rows.find_lattice import LatticeSettings
 from labapp.core.schemes import SCHEMES
+from labapp.core.schemes.irs import IrsSettings
 from labapp.errors import InputError, require, unknown_name
 
 
@@ -18,8 +20,9 @@ def check_settings(settings: Settings, source: str) -> None:
     Raises
     ------
     InputError
-        If they are not `Settings`, or name a scheme, an algorithm, a correspondence or a method
-        that does not exist.
+        If they are not `Settings`, name a scheme, an algorithm, a correspondence or a method that
+        does not exist, or set ``match.correspondence`` or ``irs.algorithm``, which those of
+        `Settings` override.
     """
     require(settings, Settings, source, "settings", "labapp.core.pipeline.Settings")
     named = (
@@ -32,6 +35,14 @@ def check_settings(settings: Settings, source: str) -> None:
     for field, value, known in named:
         if value not in known:
             raise unknown_name(source, f"settings.{field}", value, known)
+    overridden = (
+        ("match", "correspondence", settings.match.correspondence, MatchSettings.correspondence),
+        ("irs", "algorithm", settings.irs.algorithm, IrsSettings.algorithm),
+    )
+    for part, field, value, default in overridden:
+        if value not in (default, getattr(settings, field)):
+            expected = f"settings.{field}, which overrides it"
+            raise InputError(source, f"settings.{part}.{field}", repr(value), expected)
 
 
 def check_algorithm(settings: Settings, source: str | Path, field: str = "algorithm") -> None:
