@@ -66,14 +66,6 @@ def test_holes_ambiguous_within_setup_uncertainty_are_rejected(kind: str, seed: 
     assert result_with_setup_errors(kind, seed).status == "ambiguous-rows"
 
 
-@pytest.mark.slow
-def test_hole_that_needs_another_setup_by_two_sigma_is_compared() -> None:
-    """After one step towards that set-up its cost was 25 too high: all labels were a row off."""
-    rig, seen, pool = draw("rippled", 6516, 0.05, 12)
-    got = measure_pool(pool, seen, with_setup_errors(rig, 6516, 2.0))
-    assert got.status == "ambiguous-rows"
-
-
 @pytest.mark.parametrize(("kind", "seed"), [("cap", 5000), ("egg", 5001), ("concave", 5005)])
 def test_setup_is_doubted_only_if_another_one_fits_better(kind: str, seed: int) -> None:
     rig, seen, _ = draw(kind, seed, 0.0, 0)

@@ -32,15 +32,6 @@ from labapp.core.surface.pool_fit import FitSettings
 from labapp.core.surface.setup_uncertainty import perturbed, residual_changes
 from labapp.core.values import IntArray
 
-MOST_STEPS, SMALL_STEP = 4, 1.0
-"""Maximum number of Gauss–Newton steps to the likeliest set-up, and the squared length below which
-a step is the last, σ². After one step the cost may be 25 too large if a set-up is wrong by two σ,
-and 200 for a rival shifted by two rows."""
-
-HOLES_SHARE = 0.5
-"""Share of the margin below which two holes with a free set-up cannot be distinguished. In 420
-frames with set-ups wrong by one or two σ, wrong rows led by less than 6, half of the cost 14."""
-
 
 @dataclass(frozen=True)
 class FreeHypothesis:
@@ -82,7 +73,7 @@ def holes_left_open(
     knots
         Fit settings of the evaluation (`evaluate_twice`).
     margin
-        Largest difference in cost, in units of χ²; see `HOLES_SHARE`.
+        Largest difference in cost, in units of χ².
 
     Returns
     -------
@@ -97,8 +88,8 @@ def holes_left_open(
     for step in steps:
         shifted = evaluate(observed, shifted_by(observed, best.labels, step))
         if shifted is not None:
-            rival = with_setup_free(observed, shifted, knots, own.given_cost + HOLES_SHARE * margin)
-            if rival.cost < own.cost + HOLES_SHARE * margin:
+            rival = with_setup_free(observed, shifted, knots, own.given_cost + margin)
+            if rival.cost < own.cost + margin:
                 rivals.append(replace(rival, step=step))
     return [own, *rivals] if rivals else []
 
@@ -116,9 +107,9 @@ def with_setup_free(
 ) -> FreeHypothesis:
     """Evaluate labels with the set-up with which they are likeliest.
 
-    That set-up is found by Gauss–Newton steps, which minimise the sum of the squared residuals and
-    squared deviations of the set-up, both in σ, while the surface is refitted. Costs are infinite
-    without a surface, and if the cost of the given labels is not below ``most``.
+    That set-up is found by one Gauss–Newton step, which minimises the sum of the squared residuals
+    and squared deviations of the set-up, both in σ, while the surface is refitted. Costs are
+    infinite without a surface, and if the cost of the given labels is not below ``most``.
     """
     labels, known = hypothesis.labels, observed.rig.uncertainty
     pool = try_fit(observed, labels, USUAL_KNOTS, hypothesis.pool)
@@ -126,23 +117,15 @@ def with_setup_free(
         return FreeHypothesis(labels)
     at = np.argwhere(labels != UNLABELLED)
     dot = labels[tuple(at.T)]
+    pairs = at + 1, observed.plane_mm[dot], observed.covariance_mm2[dot]
     sigma = np.repeat(np.sqrt(variance_mm2(observed, dot)), 2)
-    moved, deviation = observed, np.zeros(len(known.root))
-    for _ in range(MOST_STEPS):
-        pairs = at + 1, moved.plane_mm[dot], moved.covariance_mm2[dot]
-        change = residual_changes(*pairs, moved.rig, USUAL_KNOTS, pool).reshape(len(sigma), -1)
-        finite = np.isfinite(change).all(axis=1)  # a ray at the rim may leave the splines
-        jacobian = change[finite] / sigma[finite, None]
-        left = (pool.residual_mm.ravel() / sigma)[finite]
-        stacked = np.vstack([jacobian, np.eye(len(deviation))])
-        step = np.linalg.lstsq(stacked, -np.concatenate([left, deviation]))[0]
-        deviation = deviation + step
-        rig, plane_mm = perturbed(observed.rig, known.root @ deviation, observed.plane_mm)
-        moved = replace(observed, bench=Bench(rig, observed.bench.calibration), plane_mm=plane_mm)
-        settled = try_fit(moved, labels, USUAL_KNOTS, pool)
-        if settled is None or step @ step < SMALL_STEP:
-            break
-        pool = settled
+    change = residual_changes(*pairs, observed.rig, USUAL_KNOTS, pool).reshape(len(sigma), -1)
+    finite = np.isfinite(change).all(axis=1)  # a ray at the rim may leave the splines
+    jacobian = change[finite] / sigma[finite, None]
+    rhs = -jacobian.T @ (pool.residual_mm.ravel() / sigma)[finite]
+    deviation = np.linalg.solve(jacobian.T @ jacobian + np.eye(len(rhs)), rhs)
+    rig, plane_mm = perturbed(observed.rig, known.root @ deviation, observed.plane_mm)
+    moved = replace(observed, bench=Bench(rig, observed.bench.calibration), plane_mm=plane_mm)
     found, setup_cost = evaluate_twice(moved, labels, knots, pool), float(deviation @ deviation)
     if found is None or found.cost + setup_cost >= most:
         return FreeHypothesis(labels)
