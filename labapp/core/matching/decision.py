@@ -30,9 +30,9 @@ from labapp.core.matching.hypothesis import (
     without_false_ends,
 )
 from labapp.core.matching.observation import QUICK, UNLABELLED, Observation, try_fit
-from labapp.core.matching.outliers import MOST_LEFT_OUT, FittedLabels, unsupported
 from labapp.core.matching.prediction import covariance_of_dots
 from labapp.core.matching.ray_classes import RayClasses
+from labapp.core.matching.unsupported_labels import MOST_LEFT_OUT, FittedLabels, unsupported
 from labapp.core.surface.pool_fit import FitSettings
 from labapp.core.surface.solver import inverse_of
 from labapp.core.values import CannotMeasure, IntArray, median

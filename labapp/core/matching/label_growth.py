@@ -109,7 +109,7 @@ def _settled(observed: Observation, labels: IntArray, settings: FitSettings) -> 
         if state in before:
             break
         before.append(state)
-    labels = _without_outliers(observed, labels, settings)
+    labels = _without_far_labels(observed, labels, settings)
     return labels if count_labels(labels) >= LEAST_LABELS else None
 
 
@@ -134,7 +134,7 @@ def matched_labels(observed: Observation, pool: FittedPool, labels: IntArray) ->
     return matched
 
 
-def _without_outliers(observed: Observation, labels: IntArray, settings: FitSettings) -> IntArray:
+def _without_far_labels(observed: Observation, labels: IntArray, settings: FitSettings) -> IntArray:
     """Remove labels whose residual from the surface through all of them is an outlier."""
     if len(observed.plane_mm) < 2:
         return labels

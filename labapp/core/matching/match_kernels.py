@@ -257,7 +257,7 @@ def failing_labels(
     stray: IntArray,
     limits: FloatArray,
 ) -> BoolArray:
-    """Mask of labels that are not explained by their ray, the worst of adjacent ones (`outliers`).
+    """Mask of labels that their ray does not explain, the worst of adjacent ones (`unsupported`).
 
     Parameters
     ----------

@@ -20,9 +20,9 @@ from labapp.core.match import Trial, missing_share
 from labapp.core.matching.correspondence import match_of_pairs
 from labapp.core.matching.decision import MatchSettings
 from labapp.core.matching.observation import UNLABELLED, Observation, amid, count_labels, widened
-from labapp.core.matching.outliers import MOST_LEFT_OUT, FittedLabels, unsupported
 from labapp.core.matching.prediction import RayPaths, covariance_of_dots, sure_pairs
 from labapp.core.matching.ray_classes import RayClasses, certain_witness, classify_rays
+from labapp.core.matching.unsupported_labels import MOST_LEFT_OUT, FittedLabels, unsupported
 from labapp.core.schemes.fit import LEAST_DOTS, UNSETTLED_MM
 from labapp.core.sequence.prior import MOST_ROUNDS, SETTLED_MM, Followed, Prior, predictions
 from labapp.core.surface.level import Level, Witnesses
@@ -360,7 +360,7 @@ def _apart_mm(one: FloatArray, other: FloatArray) -> FloatArray:
 
 
 def _unsupported(fit: _Fit, covariance: FloatArray, classes: RayClasses, level: Level) -> IntArray:
-    """Labelled dots that the surface does not support (`outliers.unsupported`)."""
+    """Labelled dots that the surface does not support (`unsupported_labels.unsupported`)."""
     seen = fit.paths(), covariance, classes, fit.settings.floor_mm, fit.rounds.moved_mm
     return unsupported(fit.observed, FittedLabels(fit.labels, fit.prior.basis, level, *seen))
 

@@ -13,8 +13,8 @@ from labapp.core.matching import match_kernels, observation
 from labapp.core.matching.decision import fitted_labels
 from labapp.core.matching.hypothesis import USUAL_KNOTS, evaluate
 from labapp.core.matching.observation import UNLABELLED, Observation, try_fit
-from labapp.core.matching.outliers import unsupported
 from labapp.core.matching.prediction import sure_pairs
+from labapp.core.matching.unsupported_labels import unsupported
 from labapp.core.surface.level import Witnesses
 from labapp.core.surface.pool_fit import FittedPool
 from labapp.core.values import FloatArray, IntArray
