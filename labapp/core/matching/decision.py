@@ -86,7 +86,7 @@ ROW, ROW_SPACINGS = 5, 2.2
 """So many stray dots, each within `ROW_SPACINGS` spacings of the next, are a row: beyond the last
 labelled one, where rows fan out, dots are farther apart than the others."""
 
-MOST_SCATTERED, MOST_MISSED_APART = 0.38, 0.12
+MOST_SCATTERED, MOST_MISSED_APART = 0.3, 0.12
 """Largest share of stray dots and missed rays together, relative to the labelled dots, that is
 accepted if they are isolated: false dots and random failures are isolated, whereas the dots of a
 row that was omitted or skipped are not. With at most the second share of missed rays no other
