@@ -20,7 +20,7 @@ import pytest
 from labapp.core.pipeline import Measurement
 from labapp.errors import InputError
 from labapp.export.frame_result import FrameResult
-from labapp.export.tables import SIZES
+from labapp.export.tables import MEASURE_COLUMNS
 from labapp.run import streams
 from labapp.run.alarms import Alarm
 from labapp.run.streams import LineStream, OpcuaStream, open_stream, stream_values
@@ -54,7 +54,7 @@ def connect_file(stream: LineStream) -> Any:
 def test_streamed_values_have_the_names_of_the_table(measured: Measurement) -> None:
     values = stream_values(FrameResult(7, 0.1, measured))
     assert list(values)[:5] == ["frame", "time_s", "status", "reason", "scheme"]
-    assert list(values)[5:] == [*SIZES, "sigma_of", "setup_status", "setup_doubt"]
+    assert list(values)[5:] == [*MEASURE_COLUMNS, "sigma_of", "setup_status", "setup_doubt"]
     assert values["sigma_of"] == SIGMA_OF
     assert measured.measures is not None
     assert values["height_mm"] == measured.measures.height_mm
