@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 import numpy as np
 import numpy.typing as npt
 
-from labapp.config.settings import check_algorithm, check_settings
+from labapp.config.settings import check_algorithm, check_overridden, check_settings
 from labapp.config.setup import Setup, read_setup
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.pipeline import Measurement, Settings
@@ -106,6 +106,7 @@ def measure(
         warnings.warn(f"set-up: {unusual}", stacklevel=2)
     chosen = Settings() if settings is None else settings
     check_settings(chosen, "measure")
+    check_overridden(chosen, "measure")
     check_algorithm(chosen, "measure", "settings.algorithm")
     if not (progress is None or callable(progress)):
         raise InputError("measure", "progress", repr(progress), "a function of a FrameResult")

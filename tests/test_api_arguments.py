@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -129,6 +130,7 @@ def test_negative_index_counts_from_the_last_surface(results: labapp.Results) ->
         lambda s: s.set_settings("x"),
         lambda s: s.set_settings(Settings(scheme="fitt")),
         lambda s: s.set_settings(Settings(algorithm="epa-r")),
+        lambda s: s.set_settings(Settings(irs=IrsSettings(algorithm="epa-c"))),
         lambda s: s.set_signals("x"),
         lambda s: s.set_limits("x"),
         lambda s: s.correct(3),
@@ -152,6 +154,14 @@ def test_session_rejects_wrong_arguments_and_stores_nothing(
     with session:
         error_of(lambda: call(session))
         assert session.history == ()
+
+
+def test_overridden_choice_of_a_session_blocks_no_other_change(session: labapp.Session) -> None:
+    with session:
+        same = Settings(scheme="irs", algorithm="epa-c", irs=IrsSettings(algorithm="epa-c"))
+        session.set_settings(same)
+        session.set_settings(replace(same, algorithm="opa"))
+        assert session.settings.algorithm == "opa"
 
 
 @pytest.mark.parametrize("make", [labapp.Session.create, labapp.Session.open, labapp.Study])

@@ -20,9 +20,8 @@ def check_settings(settings: Settings, source: str) -> None:
     Raises
     ------
     InputError
-        If they are not `Settings`, name a scheme, an algorithm, a correspondence or a method that
-        does not exist, or set ``match.correspondence`` or ``irs.algorithm``, which those of
-        `Settings` override.
+        If they are not `Settings`, or name a scheme, an algorithm, a correspondence or a method
+        that does not exist.
     """
     require(settings, Settings, source, "settings", "labapp.core.pipeline.Settings")
     named = (
@@ -35,6 +34,17 @@ def check_settings(settings: Settings, source: str) -> None:
     for field, value, known in named:
         if value not in known:
             raise unknown_name(source, f"settings.{field}", value, known)
+
+
+def check_overridden(settings: Settings, source: str) -> None:
+    """Check that no part of the settings contains a choice that `Settings` overrides.
+
+    Raises
+    ------
+    InputError
+        If ``match.correspondence`` or ``irs.algorithm`` differs from that of `Settings`, and from
+        its default.
+    """
     overridden = (
         ("match", "correspondence", settings.match.correspondence, MatchSettings.correspondence),
         ("irs", "algorithm", settings.irs.algorithm, IrsSettings.algorithm),

@@ -372,11 +372,14 @@ class Session(SessionContents):
         Raises
         ------
         InputError
-            If a name in them is unknown, or an algorithm is chosen that the scheme does not have.
+            If a name in them is unknown, an algorithm is chosen that the scheme does not have, or a
+            choice in ``match`` or ``irs`` that `Settings` overrides.
         """
-        from labapp.config.settings import check_algorithm, check_settings
+        from labapp.config.settings import check_algorithm, check_overridden, check_settings
 
         check_settings(settings, "set_settings")
+        if (settings.match, settings.irs) != (self.settings.match, self.settings.irs):
+            check_overridden(settings, "set_settings")
         if settings.algorithm != self.settings.algorithm:  # the former one may remain
             check_algorithm(settings, "set_settings", "settings.algorithm")
         self._documents.change(label, {("settings", NO_FRAME): settings})

@@ -47,6 +47,8 @@ def test_default_choice_is_the_default_export() -> None:
     assert everything.solid
     assert everything.run_formats == list(RUN_FORMATS.values())
     assert set(everything.surfaces) == set(SURFACE_FORMATS)
+    assert {"csv", "stl", "stl-ascii", "ply", "vtp"} <= set(everything.surfaces)
+    assert "results.h5" in [each.file for each in everything.run_formats]
     assert everything.pictures == {"frames", "surfaces", "trends", "film"}
     assert keys > USUAL
     assert not ExportRequest(ticked=frozenset({"solid", "surfaces:csv"})).choice().solid

@@ -43,7 +43,6 @@ ALIKE, MOST_CAPS = 0.9, 150
 and the number of caps that are examined further. A cap with 29 of 30 rays correct may match fewer
 dots than one with 21 of 33: the smoothness of the surface through their dots distinguishes them."""
 
-
 MOST_RETURNED = 24
 """Number of labels that `search_caps` returns: growing labels takes most of the time."""
 

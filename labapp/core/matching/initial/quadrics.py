@@ -87,11 +87,11 @@ def search_quadrics(observed: Observation) -> list[QuadricLabels]:
     window = _Window(observed, marker)
     found: dict[bytes, QuadricLabels] = {}
     quadrics = [_quadrics(window, *hole) for hole in _holes(observed, window.tree)]
-    for guess in window.scored(window.fitted(np.concatenate([np.empty((0, 5)), *quadrics]))):
-        key = guess.labels.tobytes()
-        if key not in found or found[key].score < guess.score:
-            found[key] = guess
-    return sorted(found.values(), key=lambda guess: -guess.score)[:MOST_QUADRICS]
+    for one in window.scored(window.fitted(np.concatenate([np.empty((0, 5)), *quadrics]))):
+        key = one.labels.tobytes()
+        if key not in found or found[key].score < one.score:
+            found[key] = one
+    return sorted(found.values(), key=lambda one: -one.score)[:MOST_QUADRICS]
 
 
 def _holes(
@@ -199,7 +199,7 @@ class _Window:
         return quadric_kernels.fit_quadrics(center, quadrics, *bench, LOOSE_GATE)
 
     def scored(self, quadrics: FloatArray) -> Iterator[QuadricLabels]:
-        """Yield a scored guess for each quadric that explains the dots around the hole."""
+        """Yield the labels of each quadric that explains the dots around the hole."""
         patterns = self.intersect(quadrics, self.rays.reshape(-1, 3))[1]
         patterns = patterns.reshape(-1, *self.rays.shape[:2], 2)
         hit, dot, off = self.hits(patterns, TIGHT_GATE, self.absent)
@@ -210,9 +210,9 @@ class _Window:
         # quadric.
         silent = seen & ~self.absent[self.core] & ~hit[core][explains]
         for k, count in zip(explains, silent.sum(axis=(1, 2)).tolist(), strict=True):
-            yield self._guess(hit[k], dot[k], off[k], count)
+            yield self._labels(hit[k], dot[k], off[k], count)
 
-    def _guess(self, hit: BoolArray, dot: IntArray, off: FloatArray, silent: int) -> QuadricLabels:
+    def _labels(self, hit: BoolArray, dot: IntArray, off: FloatArray, silent: int) -> QuadricLabels:
         matched = np.where(hit, dot, UNLABELLED)
         chosen, count = np.unique(matched[hit], return_counts=True)
         matched[np.isin(matched, chosen[count > 1])] = UNLABELLED
