@@ -13,7 +13,7 @@ import pytest
 
 import labapp
 from labapp.config.setup import parse_setup
-from labapp.core.matching.decision import MatchSettings
+from labapp.core.matching.match_settings import MatchSettings
 from labapp.core.pipeline import Settings
 from labapp.core.schemes.irs import IrsSettings
 from labapp.media import open_source

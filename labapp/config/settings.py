@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import get_args, get_type_hints
 
 from labapp.core.images.find_dots import DotSettings
-from labapp.core.matching.decision import MatchSettings
+from labapp.core.matching.match_settings import MatchSettings
 from labapp.core.pipeline import Settings
 from labapp.core.rows.find_lattice import LatticeSettings
 from labapp.core.schemes import SCHEMES

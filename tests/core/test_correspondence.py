@@ -16,7 +16,7 @@ from labapp.core.match import ORIENTATIONS, Match, Orientation, ways
 from labapp.core.matching import correspondence
 from labapp.core.matching.corrected_rows import lattice_of_corrected, match_corrected
 from labapp.core.matching.correspondence import lattice_of_match, match_rays
-from labapp.core.matching.decision import MatchSettings
+from labapp.core.matching.match_settings import MatchSettings
 from labapp.core.rows.correction import (
     Correction,
     assign,

@@ -73,14 +73,16 @@ def directions(rig: Rig) -> tuple[Direction, ...]:
 
 def moved_rig(rig: Rig, offset: FloatArray) -> Rig:
     """Rig with an offset added to its quantities, shape (q,)."""
-    laser = {name: getattr(rig.laser, name) + offset[k] for name, k in _LASER}
-    pattern = {name: getattr(rig.pattern, name) + offset[k] for name, k in _PATTERN}
-    return replace(
-        rig,
-        laser=replace(rig.laser, **laser),
-        pattern=replace(rig.pattern, **pattern),
-        imaging_plane=moved_plane(rig.imaging_plane, offset),
-    )
+    if not offset[~OF_PICTURE].any():
+        return rig
+    laser, pattern = rig.laser, rig.pattern
+    if any(offset[k] for _, k in _LASER):
+        laser = replace(laser, **{name: getattr(laser, name) + offset[k] for name, k in _LASER})
+    if any(offset[k] for _, k in _PATTERN):
+        moved = {name: getattr(pattern, name) + offset[k] for name, k in _PATTERN}
+        pattern = replace(pattern, **moved)
+    plane = moved_plane(rig.imaging_plane, offset)
+    return replace(rig, laser=laser, pattern=pattern, imaging_plane=plane)
 
 
 def moved_plane(plane: ImagingPlane, offset: FloatArray) -> ImagingPlane:
@@ -105,6 +107,8 @@ def aimed_as(laser: Laser, rig: Rig) -> Rig:
     The pool's dimensions do not change, and the surface stays within the domain of its spline.
     """
     aside = np.array([rig.laser.aim_x_mm - laser.aim_x_mm, rig.laser.aim_y_mm - laser.aim_y_mm, 0])
+    if not aside.any():
+        return rig
     back = replace(rig.laser, aim_x_mm=laser.aim_x_mm, aim_y_mm=laser.aim_y_mm)
     plane = replace(rig.imaging_plane, origin_mm=rig.imaging_plane.origin_mm - aside)
     return replace(rig, laser=back, imaging_plane=plane)

@@ -36,13 +36,8 @@ from labapp.core.match import (
 from labapp.core.matching.decision import (
     MISFIT_MM,
     MISFIT_TIMES,
-    NOTHING_EXPLAINS,
     QUICK_MISFIT_TIMES,
-    MatchSettings,
-    any_explains,
     decide,
-    explains,
-    explains_half,
     supported,
 )
 from labapp.core.matching.free_setup import FreeHypothesis
@@ -58,6 +53,7 @@ from labapp.core.matching.hypothesis import (
 )
 from labapp.core.matching.initial.caps import search_caps
 from labapp.core.matching.initial.quadrics import search_quadrics
+from labapp.core.matching.match_settings import MatchSettings
 from labapp.core.matching.observation import (
     LEAST_LABELS,
     QUICK,
@@ -69,6 +65,14 @@ from labapp.core.matching.observation import (
 from labapp.core.matching.prediction import covariance_of_dots
 from labapp.core.matching.ray_classes import certain_witness
 from labapp.core.matching.repair import with_repaired, with_rows_beyond
+from labapp.core.matching.unexplained import (
+    MOST_SCATTERED,
+    MOST_SCATTERED_AT_LAST,
+    NOTHING_EXPLAINS,
+    any_explains,
+    explains,
+    explains_half,
+)
 from labapp.core.rows.lattice import Lattice, Site, empty_sites
 from labapp.core.surface.pool_fit import FitSettings
 from labapp.core.surface.solver import inverse_of
@@ -134,7 +138,8 @@ def match_rays(
             raise
         decided = None
     if decided is None or (decided[1] and not any_explains(observed, found)):
-        decided = _decide_among(observed, found + _by_caps(observed), lattice, settings)
+        found = found + _by_caps(observed)
+        decided = _decide_among(observed, found, lattice, settings, MOST_SCATTERED_AT_LAST)
     best, open_holes = decided
     match = match_of_hypothesis(observed, best, best.orientation(observed))
     if open_holes:
@@ -161,9 +166,13 @@ def _candidates(
 
 
 def _decide_among(
-    observed: Observation, found: list[Hypothesis], lattice: Lattice | None, settings: MatchSettings
+    observed: Observation,
+    found: list[Hypothesis],
+    lattice: Lattice | None,
+    settings: MatchSettings,
+    most_scattered: float = MOST_SCATTERED,
 ) -> tuple[Hypothesis, list[FreeHypothesis]]:
-    """Add rows beyond the labelled ones, and choose a hypothesis; errors as in `match_rays`."""
+    """Add rows beyond the labelled ones, and `decide`; errors as in `match_rays`."""
     found = with_rows_beyond(observed, found)
     # Labels may have grown into an orientation that the settings exclude.
     allowed = settings.orientations
@@ -172,13 +181,15 @@ def _decide_among(
         if lattice is not None and not lattice.candidates:
             raise CannotMeasure("no-reference", "no hole in the rows can be the absent dot")
         raise CannotMeasure("no-match", NOTHING_EXPLAINS)
-    best, open_holes = decide(observed, found, settings)
+    best, open_holes = decide(observed, found, settings, most_scattered)
     lit = best.labels != UNLABELLED
     if any(np.mean(each.labels[lit] == best.labels[lit]) > 0.5 for each in found):
         return best, open_holes
     # Shifted labels were chosen, which may lack a row on one side.
     wider = with_rows_beyond(observed, [best])[1:]
-    return decide(observed, found + wider, settings) if wider else (best, open_holes)
+    if not wider:
+        return best, open_holes
+    return decide(observed, found + wider, settings, most_scattered)
 
 
 def lattice_of_match(match: Match, rig: Rig, count: int) -> Lattice:

@@ -3,15 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import replace
 
-import cv2
 import numpy as np
-import scipy
 
-from labapp.core.match import ORIENTATIONS, Orientation
-from labapp.core.matching.free_setup import FreeHypothesis, holes_left_open, with_setup_free
+from labapp.core.matching.free_setup import FreeHypothesis, holes_left_open
 from labapp.core.matching.hypothesis import (
     FINE_KNOTS,
     KNOT_ERROR_MM,
@@ -29,34 +25,23 @@ from labapp.core.matching.hypothesis import (
     without_doubtful_outermost,
     without_false_ends,
 )
+from labapp.core.matching.match_settings import MatchSettings
 from labapp.core.matching.observation import QUICK, UNLABELLED, Observation, try_fit
 from labapp.core.matching.prediction import covariance_of_dots
 from labapp.core.matching.ray_classes import RayClasses
+from labapp.core.matching.unexplained import MOST_SCATTERED, any_explains, refuse_unexplained
 from labapp.core.matching.unsupported_labels import MOST_LEFT_OUT, FittedLabels, unsupported
 from labapp.core.surface.pool_fit import FitSettings
 from labapp.core.surface.solver import inverse_of
-from labapp.core.values import CannotMeasure, IntArray, median
+from labapp.core.values import CannotMeasure, IntArray
 
 MISFIT_MM, MISFIT_TIMES = 0.15, 3.0
 """Labels whose residuals exceed both the first, mm, and this multiple of the best residuals are
 discarded: residuals with wrong rays are usually ten times those with the correct ones."""
 
-FEW_LEFT = 0.05
-"""A hypothesis explains a frame if at most this share of the dots is stray, and as few rays are
-missed: no other is searched for."""
-
-MOST_STRAY = 0.5
-"""If a larger share of the dots is stray, a hypothesis is not repaired; another one is searched
-for.
-"""
-
 MOST_DIFFERING = 0.2
 """If hypotheses of nearly equal cost assign different rays to a larger share of the dots, the frame
 is ambiguous."""
-
-CONTRADICTED_BITS = 0.5
-"""Mean surprise of the rays near the boundary, bits, above which the surface is rejected: less than
-0.3 even if the set-up is slightly wrong, more than 1 if the labels are wrong for that reason."""
 
 CLOSE_COST = 40.0
 """A rival whose cost is within this of the lowest is examined further, in units of χ²: a dip under
@@ -70,88 +55,12 @@ FAR_COST = 30.0
 """Labels that cost more than the best by this with rough fits, and by `CLOSE_COST` in addition if
 the marker is included, do not come close to it with converged fits."""
 
-SETUP_GAIN = 80.0
-"""If another set-up (`with_setup_free`) lowers the cost of a rejected hypothesis by more, the given
-one is in doubt. With the true one, cluttered frames gained less than 40; with errors of one
-standard uncertainty, most gained hundreds."""
-
-NOTHING_EXPLAINS = "no surface explains the reflected dots"
-"""Reason for ``no-match`` if most of the dots have no ray."""
-
-PAIR, BESIDE_SPACINGS = 2, 1.5
-"""Up to this number of adjacent missed rays, or of adjacent stray dots, is not taken for a row.
-Dots are adjacent within `BESIDE_SPACINGS` spacings."""
-
-ROW, ROW_SPACINGS = 5, 2.2
-"""So many stray dots, each within `ROW_SPACINGS` spacings of the next, are a row: beyond the last
-labelled one, where rows fan out, dots are farther apart than the others."""
-
-MOST_SCATTERED, MOST_MISSED_APART = 0.3, 0.12
-"""Largest share of stray dots and missed rays together, relative to the labelled dots, that is
-accepted if they are isolated: false dots and random failures are isolated, whereas the dots of a
-row that was omitted or skipped are not. With at most the second share of missed rays no other
-hypothesis is searched for."""
-
-
-@dataclass(frozen=True)
-class MatchSettings:
-    """Settings for the choice of the correspondence.
-
-    Parameters
-    ----------
-    correspondence
-        ``auto`` tries every orientation; otherwise the one to use. `pipeline.measure` sets it from
-        `Settings.correspondence`.
-    margin
-        Two hypotheses whose costs differ by less, in units of χ², cannot be distinguished.
-    stray, missed
-        How many stray dots and missed rays are accepted: a number, and a share of the dots
-        (`most_strays`, `leaves_much`) that is added to it.
-    """
-
-    correspondence: Literal["auto", "S/S", "S/I", "I/I"] = "auto"
-    margin: float = 14.0
-    stray: tuple[int, float] = (4, 0.02)
-    missed: tuple[int, float] = (2, 0.06)
-
-    @property
-    def orientations(self) -> tuple[Orientation, ...]:
-        """Orientations to try."""
-        return ORIENTATIONS if self.correspondence == "auto" else (self.correspondence,)
-
-    def most_strays(self, hypothesis: Hypothesis) -> float:
-        """Return how many stray dots are accepted, wherever they lie."""
-        return self.stray[0] + self.stray[1] * (hypothesis.label_count + hypothesis.stray_count)
-
-    def leaves_much(self, hypothesis: Hypothesis) -> bool:
-        """Whether more dots or rays are unexplained than are accepted wherever they lie."""
-        most_missed = self.missed[0] + self.missed[1] * hypothesis.label_count
-        return (
-            hypothesis.stray_count > self.most_strays(hypothesis)
-            or hypothesis.missed_count > most_missed
-        )
-
-
-def explains(observed: Observation, hypothesis: Hypothesis) -> bool:
-    """Whether there are few stray dots, few and isolated missed rays, and no dot at the marker."""
-    few = max(2, FEW_LEFT * len(observed.plane_mm))
-    most = MOST_MISSED_APART * hypothesis.label_count if _missed_lie_apart(hypothesis) else 0.0
-    missed = hypothesis.missed_count <= max(few, most)
-    return hypothesis.stray_count <= few and missed and hypothesis.marker != "lit"
-
-
-def explains_half(observed: Observation, hypothesis: Hypothesis) -> bool:
-    """Whether most dots have a ray; the rest may be a row, or a dip."""
-    return hypothesis.stray_count <= MOST_STRAY * len(observed.plane_mm)
-
-
-def any_explains(observed: Observation, found: list[Hypothesis]) -> bool:
-    """Whether one of several hypotheses `explains` the frame."""
-    return any(explains(observed, hypothesis) for hypothesis in found)
-
 
 def decide(
-    observed: Observation, found: list[Hypothesis], settings: MatchSettings
+    observed: Observation,
+    found: list[Hypothesis],
+    settings: MatchSettings,
+    most_scattered: float = MOST_SCATTERED,
 ) -> tuple[Hypothesis, list[FreeHypothesis]]:
     """Choose the cheapest hypothesis if no other is close and it leaves little unexplained.
 
@@ -178,7 +87,7 @@ def decide(
     best = without_doubtful_outermost(observed, without_false_ends(observed, best, knots), knots)
     if knots == FINE_KNOTS:
         best = evaluate_twice(observed, best.labels, knots, best.pool) or best
-    _refuse_unexplained(observed, best, settings)
+    refuse_unexplained(observed, best, settings, most_scattered)
     orientation = best.orientation(observed)
     _refuse_marker(observed, best, found)
     doubtful: list[int] = []
@@ -336,42 +245,6 @@ def _cheapest(
     return best, found, neighbours, knots
 
 
-def _refuse_unexplained(observed: Observation, best: Hypothesis, settings: MatchSettings) -> None:
-    """Raise ``no-match`` if too much is left unexplained, or what is left may be a row."""
-    # Adjacent missed rays are a hole or a row: stray dots may then be their dots.
-    scattered = (
-        best.marker == "dark"
-        and _missed_lie_apart(best)
-        and (best.stray_count <= settings.most_strays(best) or _strays_lie_apart(observed, best))
-        and best.stray_count + best.missed_count <= MOST_SCATTERED * best.label_count
-    )
-    if not explains_half(observed, best):
-        raise CannotMeasure("no-match", NOTHING_EXPLAINS)
-    if not scattered and settings.leaves_much(best):
-        raise CannotMeasure(
-            "no-match",
-            f"the best surface leaves {_counted(best.stray_count, 'dot')} without a ray and "
-            f"{_counted(best.missed_count, 'ray')} without a dot among {best.label_count} pairs"
-            f"{_doubt_of_setup(observed, best)}",
-        )
-    if best.pool.level.ray_count and best.pool.level.disagreement > CONTRADICTED_BITS:
-        raise CannotMeasure(
-            "no-match",
-            "no boundary of the best surface separates the rays that came back from those that "
-            "did not: is the set-up correct?",
-        )
-
-
-def _doubt_of_setup(observed: Observation, best: Hypothesis) -> str:
-    """Return the end of the reason for a rejection that another set-up would avoid, or nothing."""
-    freed = with_setup_free(observed, best, USUAL_KNOTS)
-    if freed.cost > best.cost - SETUP_GAIN:
-        return ""
-    count = np.sum(freed.labels != UNLABELLED)
-    explained = f"{count} of {len(observed.plane_mm)} dots would have a ray"
-    return f"; with another set-up {explained}: is the set-up correct?"
-
-
 def _clearly_cheaper(
     observed: Observation,
     best: Hypothesis,
@@ -412,8 +285,11 @@ def _beyond_doubt(observed: Observation, best: Hypothesis, margin: float) -> boo
     every_dot = best.label_count == len(observed.plane_mm)
     if not every_dot or best.missed_count or best.marker != "dark":
         return False
+    most = STRAY_COST + MISSED_COST - margin
+    if best.misfit < most:
+        return True
     fine = evaluate(observed, best.labels, FINE_KNOTS, initial=best.pool)
-    return fine is not None and fine.misfit + margin < STRAY_COST + MISSED_COST
+    return fine is not None and fine.misfit < most
 
 
 def _with_neighbours(
@@ -468,32 +344,8 @@ def _rivals(
     return rivals
 
 
-def _missed_lie_apart(hypothesis: Hypothesis) -> bool:
-    """Whether at most `PAIR` missed rays are connected, or one more around a corner."""
-    seen = np.zeros(hypothesis.labels.shape, np.uint8)
-    seen[tuple(hypothesis.missed_rays.T)] = 1
-    found = cv2.connectedComponentsWithStats(seen, connectivity=4)[2][1:]
-    count, sides = found[:, cv2.CC_STAT_AREA], found[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]]
-    return bool((count <= PAIR + (sides == PAIR).all(axis=1)).all())
-
-
-def _strays_lie_apart(observed: Observation, hypothesis: Hypothesis) -> bool:
-    """Whether at most `PAIR` stray dots are adjacent, and fewer than `ROW` lie in a chain."""
-    dots = observed.plane_mm[hypothesis.labels[hypothesis.labels != UNLABELLED]]
-    spacing = median(scipy.spatial.cKDTree(dots).query(dots, k=2)[0][:, 1])
-    stray_dots = observed.plane_mm[hypothesis.stray_dots]
-    apart = scipy.spatial.distance.cdist(stray_dots, stray_dots)
-    beside = (apart <= BESIDE_SPACINGS * spacing).sum(axis=0)
-    chain = scipy.sparse.csgraph.connected_components(apart <= ROW_SPACINGS * spacing)[1]
-    return bool((beside <= PAIR).all() and (np.bincount(chain) < ROW).all())
-
-
 def _differing(one: Hypothesis, other: Hypothesis) -> tuple[list[int], int]:
     """Dots with different rays in two hypotheses, and the number of dots with a ray in both."""
     rays = [{int(dot): at for at, dot in np.ndenumerate(h.labels)} for h in (one, other)]
     shared = rays[0].keys() & rays[1].keys() - {UNLABELLED}
     return [dot for dot in shared if rays[0][dot] != rays[1][dot]], len(shared)
-
-
-def _counted(count: int, thing: str) -> str:
-    return f"{count} {thing}{'s' * (count != 1)}"

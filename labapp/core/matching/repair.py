@@ -7,7 +7,6 @@ from collections.abc import Iterator
 import numpy as np
 import scipy
 
-from labapp.core.matching.decision import explains
 from labapp.core.matching.hypothesis import FINE_KNOTS, Hypothesis, grow_and_evaluate
 from labapp.core.matching.observation import UNLABELLED, Observation, widened, within_rings
 from labapp.core.matching.prediction import (
@@ -16,6 +15,7 @@ from labapp.core.matching.prediction import (
     pair_deviances,
     predict,
 )
+from labapp.core.matching.unexplained import explains
 from labapp.core.values import BoolArray, IntArray
 
 DISCARDED_RINGS = 2

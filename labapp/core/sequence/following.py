@@ -18,7 +18,7 @@ import numpy as np
 from labapp.core.images import dot_kernels
 from labapp.core.match import Trial, missing_share
 from labapp.core.matching.correspondence import match_of_pairs
-from labapp.core.matching.decision import MatchSettings
+from labapp.core.matching.match_settings import MatchSettings
 from labapp.core.matching.observation import UNLABELLED, Observation, amid, count_labels, widened
 from labapp.core.matching.prediction import RayPaths, covariance_of_dots, sure_pairs
 from labapp.core.matching.ray_classes import RayClasses, certain_witness, classify_rays

@@ -10,18 +10,18 @@ the bench perturbed by plus and minus one standard uncertainty, and half the dif
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from labapp.core.geometry.optics import intersect_level, project_rays
+from labapp.core.geometry.optics import ProjectedRays, project_rays
 from labapp.core.geometry.perturbation import aimed_as, moved_dots, moved_rig
 from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match
 from labapp.core.surface.level import Witnesses
 from labapp.core.surface.pool_fit import FitSettings, FittedPool, normal_equations
 from labapp.core.surface.solver import NormalEquations, height_sigma, normal_factor
-from labapp.core.values import FloatArray, IntArray
+from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
 
 ROUNDS = 3
 """Rounds in which the reflection points follow the surface: the remaining error is 0.1 %."""
@@ -33,9 +33,6 @@ reason the factor of the fit is not used, which followed frames reuse while poin
 
 NEWTON_STEPS = 8
 """Newton steps from the landing point of a ray on the work piece to the surface."""
-
-Perturbed = tuple[Rig, FloatArray]
-"""A rig, and the dots on its imaging plane, shape (n, 2), mm."""
 
 REACH = 0.6
 """Reach of the search for the level (`find_level`) around that of the unperturbed surface."""
@@ -65,9 +62,8 @@ def setup_changes(
     if known is None:
         return np.zeros((len(gradient), 0))
     changes = np.zeros((len(gradient), len(known.root)))
-    off = np.flatnonzero(known.root.any(axis=0)).tolist()
+    benches = _Perturbed.of(rig, match.plane_mm)
     dots = match.plane_mm, match.plane_covariance_mm2
-    benches = [perturbed(rig, SHARE * known.root[:, k], match.plane_mm) for k in off]
     equations = _factorised(*dots, rig, settings, pool)
     change = _response(match.ray, equations, pool, benches) / SHARE
     basis, about = pool.surface.basis, (0.0, pool.level.sign, REACH)
@@ -78,8 +74,8 @@ def setup_changes(
     assert equations.factor is not None
     solved = equations.factor, equations.inverse, pool.mean_splines
     sigma, limits = height_sigma(basis, *solved, landing), (rig.head_sign, match.missing)
-    for k, by, (moved, _) in zip(off, change.T, benches, strict=True):
-        aside = (project_rays(moved.laser, moved.pattern).landing_mm[seen] - landing) / SHARE
+    for k, by, rays in zip(benches.columns, change, benches.rays, strict=True):
+        aside = (rays.landing_mm[seen] - landing) / SHARE
         more, less = (
             Witnesses(landing + way * aside, sign, own.spacing_mm, *limits, sigma)
             .level(basis, pool.surface.coefficients + way * by, pool.level.rear.drop_mm, about)
@@ -111,19 +107,62 @@ def residual_changes(
     from labapp.core.surface.kernels import ray_kernels
 
     assert rig.uncertainty is not None
-    root, at, surface = rig.uncertainty.root, tuple(ray.T - 1), pool.surface
-    off = np.flatnonzero(root.any(axis=0)).tolist()
-    benches = [perturbed(rig, SHARE * root[:, k], plane_mm) for k in off]
+    at, surface = tuple(ray.T - 1), pool.surface
+    benches = _Perturbed.of(rig, plane_mm)
     equations = _factorised(plane_mm, plane_covariance_mm2, rig, settings, pool)
     change = _response(ray, equations, pool, benches)
-    changes = np.zeros((*plane_mm.shape, len(root)))
-    for k, by, (moved, dots_mm) in zip(off, change.T, benches, strict=True):
-        rays, plane = project_rays(moved.laser, moved.pattern), moved.imaging_plane.pose_mm
+    changes = np.zeros((*plane_mm.shape, len(rig.uncertainty.root)))
+    for number, k in enumerate(benches.columns):
+        rays, plane = benches.rays[number], benches.planes[number]
         met = rays.directions[at], rays.landing_mm[at], NEWTON_STEPS, plane
-        coefficients = surface.coefficients + by
+        coefficients = surface.coefficients + change[number]
         computed = ray_kernels.intersect_and_reflect(surface.basis.grid, coefficients, *met)[2]
-        changes[..., k] = (computed - dots_mm - pool.residual_mm) / SHARE
+        off = computed - benches.plane_mm[number] - pool.residual_mm
+        changes[..., k] = off / SHARE
     return changes
+
+
+@dataclass(frozen=True)
+class _Perturbed(ReadOnlyArrays):
+    """The bench perturbed by `SHARE` of each of q columns of the root of its covariance.
+
+    Parameters
+    ----------
+    columns
+        The columns that are not 0, shape (q,).
+    lasers, planes
+        Positions of the laser, shape (q, 3), mm, and imaging planes (`ImagingPlane.pose_mm`), shape
+        (q, 5, 3).
+    rays
+        The rays of each bench.
+    plane_mm, dots_mm
+        The dots on the imaging plane, shape (q, n, 2), and in the UCS, shape (q, n, 3), mm.
+    """
+
+    columns: IntArray
+    lasers: FloatArray
+    planes: FloatArray
+    rays: tuple[ProjectedRays, ...]
+    plane_mm: FloatArray
+    dots_mm: FloatArray
+
+    @classmethod
+    def of(cls, rig: Rig, plane_mm: FloatArray) -> _Perturbed:
+        """Perturb a rig with an uncertainty and the dots on its plane, shape (n, 2), mm."""
+        assert rig.uncertainty is not None
+        root = SHARE * rig.uncertainty.root
+        columns = np.flatnonzero(root.any(axis=0))
+        benches = [perturbed(rig, root[:, k], plane_mm) for k in columns]
+        rigs, count = [moved for moved, _ in benches], len(columns)
+        dots_mm = [moved.imaging_plane.to_universal(dots) for moved, dots in benches]
+        return cls(
+            columns,
+            np.reshape([moved.laser.position_mm for moved in rigs], (count, 3)),
+            np.reshape([moved.imaging_plane.pose_mm for moved in rigs], (count, 5, 3)),
+            tuple(project_rays(moved.laser, moved.pattern) for moved in rigs),
+            np.reshape([dots for _, dots in benches], (count, len(plane_mm), 2)),
+            np.reshape(dots_mm, (count, len(plane_mm), 3)),
+        )
 
 
 def _factorised(
@@ -141,44 +180,31 @@ def _factorised(
 
 
 def _response(
-    ray: IntArray, own: NormalEquations, pool: FittedPool, benches: Sequence[Perturbed]
+    ray: IntArray, own: NormalEquations, pool: FittedPool, benches: _Perturbed
 ) -> FloatArray:
-    """Changes of a fit's p coefficients for q slightly perturbed benches, shape (p, q), mm."""
-    from labapp.core.surface.kernels import solver_kernels, spline_kernels
+    """Changes of a fit's p coefficients for q slightly perturbed benches, shape (q, p), mm."""
+    from labapp.core.surface.kernels import setup_kernels
 
-    points, surface = pool.points_mm, pool.surface
-    grid, coefficients, at = surface.basis.grid, surface.coefficients, tuple(ray.T - 1)
-    factor = own.factor
+    surface, at, factor = pool.surface, tuple(ray.T - 1), own.factor
     assert factor is not None
-
-    def right_side(
-        points_mm: FloatArray, laser_mm: FloatArray, plane: FloatArray, dots_mm: FloatArray
-    ) -> FloatArray:
-        """Right-hand side of the equations for the given surface, shape (p,)."""
-        at = grid, coefficients, points_mm, own.weights
-        return solver_kernels.gradient_rhs(*at, laser_mm, plane, dots_mm)
-
-    base = right_side(points, own.laser_mm, own.plane, own.dots_mm)
-    changes = np.zeros((len(benches), len(coefficients)))
-    for k, (moved, dots_mm) in enumerate(benches):
-        laser_mm, plane = moved.laser.position_mm, moved.imaging_plane
-        rays = project_rays(moved.laser, moved.pattern).directions[at]
-        start = intersect_level(laser_mm, rays, points[:, 2:])
-        there, _ = solver_kernels.newton_along_rays(grid, coefficients, rays, start, 2)
-        seen = laser_mm, plane.pose_mm, plane.to_universal(dots_mm)
-        _, *slopes = spline_kernels.surface_at(grid, coefficients, there)
-        rises = rays / (rays[:, 2] - np.vecdot(np.transpose(slopes), rays[:, :2]))[:, None]
-        for _ in range(ROUNDS):
-            raised = spline_kernels.surface_at(grid, changes[k], there)[0][:, None]
-            change = right_side(there + raised * rises, *seen) - base
-            changes[k] = solver_kernels.solve(factor, change[None])[0]
-            # Slopes do not determine the level.
-            changes[k] -= spline_kernels.surface_at(grid, changes[k], there)[0].mean()
-    return changes.T
+    rays = np.reshape([each.directions[at] for each in benches.rays], benches.dots_mm.shape)
+    return setup_kernels.coefficient_changes(
+        surface.basis.grid,
+        surface.coefficients,
+        factor,
+        pool.points_mm,
+        own.weights,
+        (own.laser_mm, own.plane, own.dots_mm),
+        (benches.lasers, benches.planes, rays, benches.dots_mm),
+        ROUNDS,
+    )
 
 
-def perturbed(rig: Rig, offset: FloatArray, plane_mm: FloatArray) -> Perturbed:
-    """Perturb the quantities of a rig by an offset, shape (q,), and the dots on its plane, mm."""
+def perturbed(rig: Rig, offset: FloatArray, plane_mm: FloatArray) -> tuple[Rig, FloatArray]:
+    """Perturb the quantities of a rig by an offset, shape (q,), and the dots on its plane, mm.
+
+    Dots have shape (n, 2).
+    """
     assert rig.uncertainty is not None
     dots = moved_dots(plane_mm, rig, rig.uncertainty.axes, offset)
     return aimed_as(rig.laser, moved_rig(rig, offset)), dots

@@ -30,7 +30,7 @@ from labapp.core.lines.frame import LineFeatures, LineFrame
 from labapp.core.lines.metal import PoolEdges
 from labapp.core.lines.track import TrackedLine
 from labapp.core.match import Match, Trial
-from labapp.core.matching.decision import MatchSettings
+from labapp.core.matching.match_settings import MatchSettings
 from labapp.core.pipeline import Measurement, Settings
 from labapp.core.recording.residual_check import SetupVerdict, Suspect
 from labapp.core.rows import find_lattice, lattice, lattice_growth, row_search

@@ -27,8 +27,8 @@ STEPS_A_REACH = 120
 NEAR_RISES = 3.0
 """Witnesses whose rays land farther than this from the boundary, in spacings, are ignored."""
 
-FACTORS = 1000
-"""Number of factors of at most 2 whose product does not overflow."""
+FACTORS = 500
+"""Twice so many factors of at most 2 have a product that does not overflow."""
 
 
 @_inner
@@ -60,16 +60,12 @@ def _multiply(factors: FloatArray, k: int, way: int, factor: float, shrinks: flo
 
 @_inner
 def _accumulate(
-    factors: FloatArray,
-    starts: FloatArray,
-    slopes: FloatArray,
-    start: float,
-    slope: float,
+    factors: FloatArray, lines: FloatArray, start: float, slope: float, sign: float
 ) -> None:
-    """Add log(1 + exp(−(start + k · slope))) to every level k.
+    """Add log(1 + exp(−(start + k · slope))) to every level k, with a sign.
 
     Along the levels the exponential is a geometric progression. Where its exponent is positive it
-    is taken out of the logarithm, into ``starts`` and ``slopes``.
+    is taken out of the logarithm, into the sums of starts and of slopes, ``lines``.
     """
     count = len(factors)
     if min(start, start + (count - 1) * slope) > FARTHEST:
@@ -77,13 +73,37 @@ def _accumulate(
     turn = -start / slope if slope != 0.0 else np.inf * start
     turn = int(min(max(np.ceil(turn), 0.0), count)) if not np.isnan(turn) else 0
     begins, ends = (0, turn) if slope > 0.0 else (turn, count)
-    starts[begins], slopes[begins] = starts[begins] - start, slopes[begins] - slope
-    starts[ends], slopes[ends] = starts[ends] + start, slopes[ends] + slope
+    for at, way in ((begins, -sign), (ends, sign)):
+        lines[0, at] += way * start
+        lines[1, at] += way * slope
     shrinks = np.exp(-abs(slope))
     for at, way in ((turn, 1), (turn - 1, -1)):
         away = abs(start + at * slope)
         if 0 <= at < count and away < FARTHEST:
             _multiply(factors, at, way, np.exp(-away), shrinks)
+
+
+@_inner
+def _add_witnesses(
+    sums: tuple[FloatArray, FloatArray, FloatArray],
+    rays: IntArray,
+    over: FloatArray,
+    sharp: FloatArray,
+    dark: BoolArray,
+    missing: float,
+    levels: tuple[float, float, int],
+) -> None:
+    """Add the terms of some rays to the sums of `level_negative_log_likelihood`."""
+    (nats, factors, lines), (first, step, _) = sums, levels
+    for m in range(len(rays)):
+        n = rays[m]
+        start, slope = sharp[n] * (over[n] + first), sharp[n] * step
+        _accumulate(factors[0], lines, start, slope, 1.0)
+        if dark[n] and missing > 0.0:
+            _accumulate(factors[1], lines, start - np.log(missing), slope, -1.0)
+        if m % FACTORS == FACTORS - 1:
+            nats += np.log(factors[0] / factors[1])
+            factors[:] = 1.0
 
 
 @_compiled(_f2, _f1, types.Array(types.boolean, 1, "A", readonly=True), _f1, _f, _levels, _f1)
@@ -126,30 +146,24 @@ def level_negative_log_likelihood(
     FloatArray
         Nats, shape (d, b, count).
     """
-    first, step, count = levels
-    made = np.empty((len(over), len(blurs), count))
-    factors, starts, slopes = np.empty(count), np.empty(count + 1), np.empty(count + 1)
-    for d in range(len(over)):
-        for b in range(len(blurs)):
-            total = made[d, b]
-            total[:] = 0.0
-            for part in range(2 if missing > 0.0 else 1):
-                factors[:], starts[:], slopes[:] = 1.0, 0.0, 0.0
-                sign = 1.0 - 2.0 * part
-                shift = -np.log(missing) if part else 0.0
-                for n in range(len(side)):
-                    if dark[n] or not part:
-                        sharp = side[n] / np.sqrt(blurs[b] * blurs[b] + spread[n])
-                        start, slope = sharp * (over[d, n] + first) + shift, sharp * step
-                        _accumulate(factors, starts, slopes, start, slope)
-                    if n % FACTORS == FACTORS - 1 or n == len(side) - 1:
-                        total += sign * np.log(factors)
-                        factors[:] = 1.0
-                start, slope = 0.0, 0.0
-                for k in range(count):
-                    start, slope = start + starts[k], slope + slopes[k]
-                    total[k] += sign * (start + k * slope)
+    made, count = np.empty((len(over), len(blurs), levels[2])), levels[2]
+    is_same = np.ones(len(side), np.bool_)
+    for d in range(1, len(over)):
+        is_same &= over[d] == over[0]
+    # Rays at the head lie as high whatever the drop: their terms are added once.
+    same, others = np.flatnonzero(is_same), np.flatnonzero(~is_same)
+    for b in range(len(blurs)):
+        sharp = side / np.sqrt(blurs[b] * blurs[b] + spread)
+        common = np.zeros(count), np.ones((2, count)), np.zeros((2, count + 1))
+        _add_witnesses(common, same, over[0], sharp, dark, missing, levels)
+        for d in range(len(over)):
+            total, factors, lines = made[d, b], common[1].copy(), common[2].copy()
+            total[:] = common[0]
+            _add_witnesses((total, factors, lines), others, over[d], sharp, dark, missing, levels)
+            start, slope = 0.0, 0.0
             for k in range(count):
+                start, slope = start + lines[0, k], slope + lines[1, k]
+                total[k] += np.log(factors[0, k] / factors[1, k]) + start + k * slope
                 total[k] = max(total[k], 0.0)  # rounded
     return made
 
@@ -193,7 +207,8 @@ def level_posterior(
         for b in range(blurs):
             for k in range(count):
                 against = nats[d, b, k] + blur_cost[b] + (sunk if d else 0.0)
-                share[d, k] += np.exp(least - against)
+                if against < least + FARTHEST:
+                    share[d, k] += np.exp(least - against)
     share /= share.sum()
     start, end = (1, depths) if share[0].sum() < 0.5 else (0, 1)
     chosen, drop, mean, spread = share[start:end].sum(), 0.0, 0.0, 0.0

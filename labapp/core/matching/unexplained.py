@@ -1,0 +1,132 @@
+"""Dots and rays that a hypothesis leaves unexplained: whether it is accepted in spite of them."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import scipy
+
+from labapp.core.matching.free_setup import with_setup_free
+from labapp.core.matching.hypothesis import USUAL_KNOTS, Hypothesis
+from labapp.core.matching.match_settings import MatchSettings
+from labapp.core.matching.observation import UNLABELLED, Observation
+from labapp.core.values import CannotMeasure, median
+
+FEW_LEFT = 0.05
+"""A hypothesis explains a frame if at most this share of the dots is stray, and as few rays are
+missed: no other is searched for."""
+
+MOST_STRAY = 0.5
+"""If a larger share of the dots is stray, a hypothesis is not repaired; another one is searched
+for.
+"""
+
+CONTRADICTED_BITS = 0.5
+"""Mean surprise of the rays near the boundary, bits, above which the surface is rejected: less than
+0.3 even if the set-up is slightly wrong, more than 1 if the labels are wrong for that reason."""
+
+SETUP_GAIN = 80.0
+"""If another set-up (`with_setup_free`) lowers the cost of a rejected hypothesis by more, the given
+one is in doubt. With the true one, cluttered frames gained less than 40; with errors of one
+standard uncertainty, most gained hundreds."""
+
+NOTHING_EXPLAINS = "no surface explains the reflected dots"
+"""Reason for ``no-match`` if most of the dots have no ray."""
+
+PAIR, BESIDE_SPACINGS = 2, 1.5
+"""Up to this number of adjacent missed rays, or of adjacent stray dots, is not taken for a row.
+Dots are adjacent within `BESIDE_SPACINGS` spacings."""
+
+ROW, ROW_SPACINGS = 5, 2.2
+"""So many stray dots, each within `ROW_SPACINGS` spacings of the next, are a row: beyond the last
+labelled one, where rows fan out, dots are farther apart than the others."""
+
+MOST_SCATTERED, MOST_SCATTERED_AT_LAST, MOST_MISSED_APART = 0.3, 0.38, 0.12
+"""Largest share of stray dots and missed rays together, relative to the labelled dots, that is
+accepted if they are isolated: false dots and random failures are isolated, whereas the dots of a
+row that was omitted or skipped are not. The second applies when every kind of initial labels has
+been tried. With at most the third share of missed rays no other hypothesis is searched for."""
+
+
+def explains(observed: Observation, hypothesis: Hypothesis) -> bool:
+    """Whether there are few stray dots, few and isolated missed rays, and no dot at the marker."""
+    few = max(2, FEW_LEFT * len(observed.plane_mm))
+    most = MOST_MISSED_APART * hypothesis.label_count if _missed_lie_apart(hypothesis) else 0.0
+    missed = hypothesis.missed_count <= max(few, most)
+    return hypothesis.stray_count <= few and missed and hypothesis.marker != "lit"
+
+
+def explains_half(observed: Observation, hypothesis: Hypothesis) -> bool:
+    """Whether most dots have a ray; the rest may be a row, or a dip."""
+    return hypothesis.stray_count <= MOST_STRAY * len(observed.plane_mm)
+
+
+def any_explains(observed: Observation, found: list[Hypothesis]) -> bool:
+    """Whether one of several hypotheses `explains` the frame."""
+    return any(explains(observed, hypothesis) for hypothesis in found)
+
+
+def refuse_unexplained(
+    observed: Observation, best: Hypothesis, settings: MatchSettings, most_scattered: float
+) -> None:
+    """Raise ``no-match`` if too much is left unexplained, or what is left may be a row.
+
+    ``most_scattered`` is the largest accepted share of isolated strays and missed rays, such as
+    `MOST_SCATTERED`.
+    """
+    # Adjacent missed rays are a hole or a row: stray dots may then be their dots.
+    scattered = (
+        best.marker == "dark"
+        and _missed_lie_apart(best)
+        and (best.stray_count <= settings.most_strays(best) or _strays_lie_apart(observed, best))
+        and best.stray_count + best.missed_count <= most_scattered * best.label_count
+    )
+    if not explains_half(observed, best):
+        raise CannotMeasure("no-match", NOTHING_EXPLAINS)
+    if not scattered and settings.leaves_much(best):
+        raise CannotMeasure(
+            "no-match",
+            f"the best surface leaves {_counted(best.stray_count, 'dot')} without a ray and "
+            f"{_counted(best.missed_count, 'ray')} without a dot among {best.label_count} pairs"
+            f"{_doubt_of_setup(observed, best)}",
+        )
+    if best.pool.level.ray_count and best.pool.level.disagreement > CONTRADICTED_BITS:
+        raise CannotMeasure(
+            "no-match",
+            "no boundary of the best surface separates the rays that came back from those that "
+            "did not: is the set-up correct?",
+        )
+
+
+def _doubt_of_setup(observed: Observation, best: Hypothesis) -> str:
+    """Return the end of the reason for a rejection that another set-up would avoid, or nothing."""
+    freed = with_setup_free(observed, best, USUAL_KNOTS)
+    if freed.cost > best.cost - SETUP_GAIN:
+        return ""
+    count = np.sum(freed.labels != UNLABELLED)
+    explained = f"{count} of {len(observed.plane_mm)} dots would have a ray"
+    return f"; with another set-up {explained}: is the set-up correct?"
+
+
+def _missed_lie_apart(hypothesis: Hypothesis) -> bool:
+    """Whether at most `PAIR` missed rays are connected, or one more around a corner."""
+    seen = np.zeros(hypothesis.labels.shape, np.uint8)
+    seen[tuple(hypothesis.missed_rays.T)] = 1
+    found = cv2.connectedComponentsWithStats(seen, connectivity=4)[2][1:]
+    count, sides = found[:, cv2.CC_STAT_AREA], found[:, [cv2.CC_STAT_WIDTH, cv2.CC_STAT_HEIGHT]]
+    return bool((count <= PAIR + (sides == PAIR).all(axis=1)).all())
+
+
+def _strays_lie_apart(observed: Observation, hypothesis: Hypothesis) -> bool:
+    """Whether at most `PAIR` stray dots are adjacent, and fewer than `ROW` lie in a chain."""
+    dots = observed.plane_mm[hypothesis.labels[hypothesis.labels != UNLABELLED]]
+    spacing = median(scipy.spatial.cKDTree(dots).query(dots, k=2)[0][:, 1])
+    stray_dots = observed.plane_mm[hypothesis.stray_dots]
+    apart = scipy.spatial.distance.cdist(stray_dots, stray_dots)
+    beside = (apart <= BESIDE_SPACINGS * spacing).sum(axis=0)
+    chain = scipy.sparse.csgraph.connected_components(apart <= ROW_SPACINGS * spacing)[1]
+    return bool((beside <= PAIR).all() and (np.bincount(chain) < ROW).all())
+
+
+def _counted(count: int, thing: str) -> str:
+    return f"{count} {thing}{'s' * (count != 1)}"
