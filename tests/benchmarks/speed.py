@@ -40,12 +40,11 @@ FOLLOWED, BEFORE, SEARCHED = 200, 20, 10
 """Frames followed under the profiler, frames before them, and frames whose dots are searched."""
 
 COUNTED = {
-    "rounds of the fit": "step",
-    "factorisations": "normal_factor",
-    "searches for the level": "find_level",
+    "fits of several rounds": "run_rounds",
+    "inverses of the normal matrix": "inverse_band",
     "covariances of dots": "covariance_of_dots",
 }
-"""Counted operations, and their functions."""
+"""Counted operations, and their compiled functions."""
 
 
 def seconds(work: Callable[..., object], *arguments: object) -> float:
@@ -106,7 +105,7 @@ def profile_followed(video: Video) -> None:
     for (path, _, name), (_, count, own_s, _, _) in statistics.items():
         module = path.rpartition("/labapp/")[2] if "/labapp/" in path else "NumPy, OpenCV, Python"
         shares[module] += own_s
-        calls[name] += 0 if module.endswith("kernels.py") else count
+        calls[name] += count if module.endswith("kernels.py") else 0
     print(f"\n{'profile of a followed frame':42}{'ms':>8}")
     for module, own_s in shares.most_common(14):
         print(f"  {module:40}{1e3 * own_s / FOLLOWED:8.2f}")

@@ -8,7 +8,7 @@ import pytest
 
 from labapp.config.setup import parse_setup
 from labapp.core.geometry.bench import Bench
-from labapp.core.matching import decision
+from labapp.core.matching import unexplained
 from labapp.core.matching.hypothesis import evaluate
 from labapp.core.matching.observation import Observation
 from tests.benchmarks import clutter_recordings, rendered
@@ -74,7 +74,7 @@ def test_setup_is_doubted_only_if_another_one_fits_better(kind: str, seed: int) 
         observed = Observation.of(seen.dots, bench, FRAME_SHAPE)
         true = evaluate(observed, true_labels(seen))
         assert true is not None
-        assert bool(decision._doubt_of_setup(observed, true)) == is_doubted
+        assert bool(unexplained._doubt_of_setup(observed, true)) == is_doubted
 
 
 @pytest.mark.slow

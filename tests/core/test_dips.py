@@ -8,8 +8,10 @@ import numpy as np
 import pytest
 
 from labapp.core.geometry.bench import Bench
-from labapp.core.matching import decision
+from labapp.core.matching import unexplained
+from labapp.core.matching.decision import decide
 from labapp.core.matching.hypothesis import Hypothesis, evaluate, shifted_labels
+from labapp.core.matching.match_settings import MatchSettings
 from labapp.core.matching.observation import UNLABELLED, Observation
 from labapp.core.schemes import fit
 from labapp.core.schemes.fit import FitSettings
@@ -72,7 +74,7 @@ def test_pool_with_a_dip_gets_the_right_rows(seed: int) -> None:
 
 @pytest.mark.slow
 def test_row_beyond_shifted_labels_is_searched(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(decision, "ROW", 1000)  # or the labels without it would be rejected
+    monkeypatch.setattr(unexplained, "ROW", 1000)  # or the labels without it would be rejected
     got = measure_pool(*draw(ROW_LEFT_OVER))
     assert (got.status, got.wrong, got.right) == ("ok", 0, got.shown)
 
@@ -84,7 +86,7 @@ def test_labels_that_miss_a_row_of_dots_are_rejected() -> None:
     lacking = evaluated(observed, labels)
     assert (lacking.stray_count, lacking.missed_count, lacking.marker) == (9, 0, "dark")
     with pytest.raises(CannotMeasure) as error:
-        decision.decide(observed, [lacking], decision.MatchSettings())
+        decide(observed, [lacking], MatchSettings())
     assert error.value.status == "no-match"
 
 

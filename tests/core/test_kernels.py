@@ -758,6 +758,7 @@ def test_quadrics_are_fitted_to_dots(lit: list[int]) -> None:
 def test_level_likelihood_agrees_with_numpy(witnesses: int, missing: float) -> None:
     # Some heights are so far off that a plain exponential would overflow; one has no slope.
     over = random().normal(0.0, 0.1, (3, witnesses))
+    over[:, ::3] = over[0, ::3]  # at the head the drop of the rear changes nothing
     side = random().choice([-1.0, 1.0], witnesses) / random().uniform(0.01, 0.04, witnesses)
     side[0] = 0.0
     levels, blurs = np.linspace(-0.05, 0.07, 31), np.array([0.005, 0.04, 0.25])

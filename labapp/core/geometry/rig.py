@@ -53,11 +53,13 @@ class Laser:
             ]
         )
 
-    @property
+    @cached_property
     def position_mm(self) -> FloatArray:
-        """Position of the diode, shape (3,), mm."""
+        """Position of the diode, shape (3,), mm, read-only."""
         aim = np.array([self.aim_x_mm, self.aim_y_mm, 0.0])
-        return np.asarray(aim - self.distance_mm * self.axes[0])
+        position = np.asarray(aim - self.distance_mm * self.axes[0])
+        position.flags.writeable = False
+        return position
 
 
 def _rays(rows: int, columns: int) -> list[tuple[int, int]]:

@@ -245,7 +245,7 @@ def try_fit(
 
 def count_labels(labels: IntArray) -> int:
     """Number of rays with a dot."""
-    return int(np.sum(labels != UNLABELLED))
+    return int(np.count_nonzero(labels != UNLABELLED))
 
 
 def amid(lit: BoolArray) -> BoolArray:

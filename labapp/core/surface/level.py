@@ -13,25 +13,7 @@ import numpy as np
 
 from labapp.core.geometry.optics import ProjectedRays
 from labapp.core.surface.spline import SplineBasis
-from labapp.core.values import BoolArray, FloatArray, IntArray, ReadOnlyArrays
-
-SCAN_LEVELS = 300
-"""Number of levels that are tried if no estimate is given."""
-
-MOST_AT_ENDS, MOST_AT_FAR_ENDS = 1e-6, 0.02
-"""A wider grid is searched if the probability at the ends of the grid exceeds this: the first for a
-narrow grid (reach below 1), the second for a wide one."""
-
-# Blurs: width of the step from inside to outside, in dot spacings, from a sharp boundary to one
-# that half of the neighbouring rays contradict; and −log of their prior, nats: sharp is likelier.
-_BLUR_WIDTHS = np.geomspace(1 / 200, 1 / 4, 9)
-_BLURS = np.array([_BLUR_WIDTHS, 1.2 * np.log(_BLUR_WIDTHS)])
-
-# Drops: depths of the rear, mm. One rear in five lies below the work piece; its depths are equally
-# likely.
-_DROPS_MM = np.concatenate([[0.0], np.linspace(0.01, 0.15, 10)])
-_SHARE_SUNK = 0.2
-_SUNK_COST = -float(np.log(_SHARE_SUNK / (1 - _SHARE_SUNK) / (len(_DROPS_MM) - 1)))  # nats
+from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
 
 
 @dataclass(frozen=True)
@@ -93,6 +75,20 @@ class Level:
     ray_count: int = 0
     rise_mm: float = 0.0
 
+    @classmethod
+    def of(cls, values: FloatArray) -> Level:
+        """Build a level from the result of `level_kernels.find_level`, shape (9,)."""
+        shift, sigma, sign, drop, start, end, least, rays, rise = values.tolist()
+        return cls(shift, sigma, int(sign), Rear(drop, start, end), least, int(rays), rise)
+
+    @property
+    def as_array(self) -> FloatArray:
+        """Values as an array for compiled functions (`of`), shape (9,)."""
+        own, rear = (self.shift_mm, self.sigma_mm, self.sign), self.rear
+        depth = rear.drop_mm, rear.start_mm, rear.end_mm
+        seen = self.negative_log_likelihood, self.ray_count, self.rise_mm
+        return np.array([*own, *depth, *seen], float)
+
     @property
     def disagreement(self) -> float:
         """Mean surprise of the rays near the boundary, bits; infinite if there are none."""
@@ -140,7 +136,9 @@ class Witnesses(ReadOnlyArrays):
     ) -> Witnesses:
         """Select those of `Match.witness`, shape (rows, columns), within the spline domain."""
         landing = rays.landing_mm
-        known = (witness != 0) & basis.contains(landing[..., 0], landing[..., 1])
+        known = witness != 0
+        if known.any():
+            known &= basis.contains(landing[..., 0], landing[..., 1])
         return cls(landing[known], witness[known], rays.spacing_mm, head_sign, missing)
 
     def level(
@@ -171,7 +169,9 @@ class Witnesses(ReadOnlyArrays):
         there = spline_kernels.surface_at(basis.grid, coefficients, self.landing_mm)
         seen = there[0], there[1:].T, self.sign, self.spacing_mm
         rear = level.rear.height(self.landing_mm[:, 1])
-        return level_kernels.negative_log_evidence(*seen, rear, level.sign, self.missing, _BLURS)
+        return level_kernels.negative_log_evidence(
+            *seen, rear, level.sign, self.missing, level_kernels.BLURS
+        )
 
 
 def find_level(
@@ -215,31 +215,7 @@ def find_level(
     from labapp.core.surface.kernels import level_kernels
 
     head_sign, drop_mm = rear
+    depth = np.array([head_sign, np.nan if drop_mm is None else drop_mm])
+    around = np.array([0.0, 1.0, np.nan] if about is None else about, float)
     seen = height, slope, y, witness, spacing_mm
-    scanned = height, slope, witness, spacing_mm, SCAN_LEVELS, _BLUR_WIDTHS[-1:]
-    shift, sign, reach = about or (*level_kernels.scan_levels(*scanned), 1.0)
-    # Only pools above the work piece have been observed to sink at the rear.
-    some = _DROPS_MM if drop_mm is None and sign > 0 else np.array([drop_mm or 0.0])
-    search = np.array([head_sign, shift, sign, reach, missing, _SUNK_COST])
-    found, rays = level_kernels.search_level(*seen, search, some, _BLURS)
-    mean, sigma, drop, start, end, at_ends, least, usual = found.tolist()
-    if about is not None and at_ends > (MOST_AT_ENDS if reach < 1.0 else MOST_AT_FAR_ENDS):
-        about = (shift, sign, 1.0) if reach < 1.0 else None
-        return find_level(*seen, rear, about, missing)
-    return Level(mean, sigma, sign, Rear(drop, start, end), least, rays, usual)
-
-
-def guess_level(height: FloatArray, outer: BoolArray) -> Level:
-    """Guess the level if no ray is dark: the mean height of the outer points is set to 0.
-
-    Parameters
-    ----------
-    height
-        Heights of the surface at reflection points, up to the level, shape (n,), mm.
-    outer
-        Mask of the points far from their centre, shape (n,).
-    """
-    from labapp.core.surface.kernels import level_kernels
-
-    shift, sigma, inner = level_kernels.guess_level(height, outer)
-    return Level(shift, sigma, 1 if inner + shift > 0 else -1, Rear(), 0.0)
+    return Level.of(level_kernels.find_level(*seen, depth, around, missing))

@@ -23,8 +23,9 @@ import numpy as np
 
 from labapp.core.geometry.optics import ProjectedRays, project_rays
 from labapp.core.geometry.rig import Rig
-from labapp.core.surface.level import Level, Rear, Witnesses, guess_level
+from labapp.core.surface.level import Level, Rear, Witnesses
 from labapp.core.surface.solver import (
+    LevelSearch,
     NormalEquations,
     Rounds,
     height_sigma,
@@ -54,10 +55,6 @@ number, and there are many hypotheses."""
 
 CORRELATED_MM2 = 1.0
 """Area over which a pool's third derivatives are correlated, mm²."""
-
-FIRST_REACH, LEVEL_REACH = 0.4, 0.3
-"""Reach of the search for the level (`find_level`) around that of a given surface, and around that
-of the previous round."""
 
 NEWTON_STEPS = 4
 """Steps from a reflection point to that on the surface of the next round."""
@@ -118,10 +115,10 @@ class FittedPool(ReadOnlyArrays):
     unsettled_mm: float
     inverse: FloatArray | None = None
 
-    @property
+    @cached_property
     def residual_rms_mm(self) -> float:
         """Root mean square distance of computed from captured dots, mm."""
-        return float(np.sqrt(np.mean(np.sum(self.residual_mm**2, axis=-1))))
+        return float(np.sqrt(np.sum(self.residual_mm**2) / len(self.residual_mm)))
 
     @cached_property
     def mean_splines(self) -> FloatArray:
@@ -255,39 +252,27 @@ def rounds_with_level(
     CannotMeasure
         ``no-surface`` if no surface fits the slopes.
     """
-    from labapp.core.surface.kernels import spline_kernels
-
-    basis, level = rounds.equations.basis, near or Level(0.0, np.inf, 1, Rear(), 0.0)
-
-    def shift(count: int) -> float:
-        nonlocal level
-        if count and abs(level.shift_mm) < raised_mm:
-            return 0.0
-        if outer is not None:
-            height = spline_kernels.surface_at(basis.grid, rounds.coefficients, rounds.points_mm)[0]
-            level = guess_level(height, outer)
-            return level.shift_mm
-        # The drop is fixed in the second half of the rounds, as the iteration may oscillate.
-        is_held = not drop_is_free or 2 * count > most
-        reach = LEVEL_REACH if count else FIRST_REACH
-        found = witnesses.level(
-            basis,
-            rounds.coefficients,
-            level.rear.drop_mm if is_held else None,
-            (0.0, level.sign, reach) if count or near else None,
-        )
-        sigma = max(found.sigma_mm, level.sigma_mm) if is_held else found.sigma_mm
-        level = replace(found, sigma_mm=sigma)
-        return found.shift_mm
-
-    rounds.run(most, until_mm, NEWTON_STEPS if near is None else 1, shift=shift)
-    return level
+    level = near or Level(0.0, np.inf, 1, Rear(), 0.0)
+    sigma = witnesses.height_sigma_mm
+    search = LevelSearch(
+        (
+            np.empty(0, bool) if outer is None else outer,
+            witnesses.landing_mm,
+            witnesses.sign,
+            np.zeros(len(witnesses.sign)) if sigma is None else sigma,
+            witnesses.spacing_mm,
+        ),
+        level.as_array,
+        (witnesses.head_sign, witnesses.missing, drop_is_free, near is not None, raised_mm),
+    )
+    return Level.of(rounds.run(most, until_mm, NEWTON_STEPS if near is None else 1, by=search))
 
 
 def _outer(places_mm: FloatArray) -> BoolArray:
     """Mask of the places, shape (n, 2), farther from their centre than the median distance."""
-    from_middle = np.linalg.norm(places_mm - places_mm.mean(axis=0), axis=-1)
-    return np.asarray(from_middle > median(from_middle))
+    offset = places_mm - places_mm.sum(axis=0) / len(places_mm)
+    square = np.vecdot(offset, offset)
+    return np.asarray(square > median(square))
 
 
 def fitted_pool(rounds: Rounds, level: Level, rig: Rig, plane_mm: FloatArray) -> FittedPool:

@@ -8,13 +8,12 @@ whatever factor is used.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from labapp.core.surface.spline import SplineBasis, SplineSurface
-from labapp.core.values import CannotMeasure, FloatArray
+from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray
 
 REUSE_MM = 5e-3
 """By default a factor is reused if no reflection point has moved by more, which is small compared
@@ -22,6 +21,31 @@ with the cells of the splines."""
 
 
 NO_SURFACE = "no surface has the slopes that the dots require"
+
+
+@dataclass(frozen=True)
+class LevelSearch:
+    """How the level is determined in each round, for compiled functions.
+
+    Parameters
+    ----------
+    witnesses, level
+        See `round_kernels.run_rounds`.
+    limits
+        The last five of its limits.
+    """
+
+    witnesses: tuple[BoolArray, FloatArray, IntArray, FloatArray, FloatArray]
+    level: FloatArray
+    limits: tuple[float, float, bool, bool, float]
+
+
+NO_SEARCH = LevelSearch(
+    (np.empty(0, bool), np.empty((0, 3)), np.empty(0, np.int64), np.empty(0), np.ones(2)),
+    np.zeros(9),
+    (1.0, 0.0, False, False, 0.0),
+)
+"""The mean height of the reflection points stays."""
 
 
 @dataclass
@@ -70,50 +94,6 @@ class NormalEquations:
             self._inverse = self.factor, (known := inverse_of(self.factor))
         return known
 
-    def step(
-        self,
-        coefficients: FloatArray,
-        points_mm: FloatArray,
-        moved_mm: float,
-        smooth_about: FloatArray | float = 0.0,
-    ) -> FloatArray:
-        """Coefficients after one step of the fit, shape (p,), mm: one linear least-squares problem.
-
-        The reflection points and their mean height are fixed. The slopes there become those that
-        reflect the rays to their dots, as far as the roughness penalty allows.
-
-        Parameters
-        ----------
-        coefficients
-            The current surface, shape (p,), mm.
-        points_mm
-            The reflection points on it, shape (n, 3), mm.
-        moved_mm
-            Largest displacement of these in the last round, mm.
-        smooth_about
-            Coefficients of a surface; the roughness of the difference from it is penalised. 0: that
-            of the surface itself.
-
-        Raises
-        ------
-        CannotMeasure
-            ``no-surface`` if the slopes do not determine the surface.
-        """
-        from labapp.core.surface.kernels import solver_kernels
-
-        if self.factor is None or not moved_mm <= self.reuse_mm:
-            self.factor = normal_factor(self.basis, self.stiffness, points_mm, self.weights)
-        return solver_kernels.fit_step(
-            self.basis.grid,
-            (self.stiffness, self.factor),
-            coefficients,
-            coefficients - smooth_about,
-            points_mm,
-            self.weights,
-            (self.laser_mm, self.plane),
-            self.dots_mm,
-        )
-
 
 @dataclass
 class Rounds:
@@ -154,10 +134,14 @@ class Rounds:
         most: int,
         until_mm: float,
         newton_steps: int = 1,
-        smooth_about: FloatArray | float = 0.0,
-        shift: Callable[[int], float] = lambda _: 0.0,
-    ) -> None:
+        smooth_about: FloatArray | None = None,
+        by: LevelSearch = NO_SEARCH,
+    ) -> FloatArray:
         """Run rounds until no reflection point moves by ``until_mm``.
+
+        In each the slopes at the reflection points become those that reflect the rays to their
+        dots, as far as the roughness penalty allows: a linear least-squares problem, in which the
+        points and their mean height are fixed. Then the surface is shifted to its level.
 
         Parameters
         ----------
@@ -168,30 +152,44 @@ class Rounds:
         newton_steps
             Newton steps from a reflection point to the surface of the next round.
         smooth_about
-            See `NormalEquations.step`.
-        shift
-            Function of the number of the round, counted from 0, that returns the shift to add to
-            the surface's height, mm.
+            Coefficients of a surface, shape (p,), mm: the roughness of the difference from it is
+            penalised. None: that of the surface itself.
+        by
+            Search for the level. By default the mean height of the points stays.
+
+        Returns
+        -------
+        FloatArray
+            The final level (`level_kernels.find_level`), shape (9,).
 
         Raises
         ------
         CannotMeasure
             ``no-surface`` if the slopes do not determine the surface.
         """
-        from labapp.core.surface.kernels import solver_kernels
+        from labapp.core.surface.kernels import round_kernels
 
-        grid = self.equations.basis.grid
-        for count in range(most):
-            at = self.coefficients, self.points_mm, self.moved_mm
-            self.coefficients = self.equations.step(*at, smooth_about)
-            self.coefficients += shift(count)  # the splines add up to 1
-            self.points_mm, self.moved_mm = solver_kernels.newton_along_rays(
-                grid, self.coefficients, self.rays, self.points_mm, newton_steps
+        own = self.equations
+        bench = own.laser_mm, own.plane, own.dots_mm
+        smooth = np.zeros_like(self.coefficients) if smooth_about is None else smooth_about
+        known = (own.stiffness, np.nan) if own.factor is None else (own.factor, self.moved_mm)
+        limits = np.array([most, until_mm, newton_steps, own.reuse_mm, known[1], *by.limits])
+        self.coefficients, self.points_mm, factor, level, (moved, is_new) = (
+            round_kernels.run_rounds(
+                own.basis.grid,
+                (own.stiffness, self.rays, own.weights, *bench),
+                (self.coefficients, smooth, self.points_mm, known[0]),
+                by.witnesses,
+                by.level,
+                limits,
             )
-            if np.isnan(self.moved_mm):
-                raise CannotMeasure("no-surface", NO_SURFACE)
-            if self.moved_mm < until_mm:
-                break
+        )
+        if is_new:
+            own.factor = factor
+        self.moved_mm = float(moved)
+        if np.isnan(moved):
+            raise CannotMeasure("no-surface", NO_SURFACE)
+        return level
 
 
 def normal_factor(

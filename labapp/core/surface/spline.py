@@ -149,15 +149,15 @@ class SplineBasis(ReadOnlyArrays):
     @cached_property
     def step_mm(self) -> FloatArray:
         """Distance between knots along x and along y, shape (2,), mm."""
-        return np.array(
-            [np.ptp(knots) / (len(knots) - 1) for knots in (self.x_knots, self.y_knots)]
-        )
+        x, y = self.x_knots, self.y_knots
+        return np.array([(x[-1] - x[0]) / (len(x) - 1), (y[-1] - y[0]) / (len(y) - 1)])
 
     @cached_property
     def grid(self) -> FloatArray:
         """Low and high end, step, mm, and number of cells along x and along y, shape (2, 4)."""
-        cells = np.array(self.shape) - DEGREE
-        return np.column_stack([self.low_mm, self.high_mm, self.step_mm, cells])
+        nx, ny = self.shape
+        ends = self.low_mm, self.high_mm, self.step_mm, np.array([nx - DEGREE, ny - DEGREE], float)
+        return np.array(ends).T
 
     def cells(self, x_mm: FloatArray, y_mm: FloatArray) -> Cells:
         """Find the cells of points, each shape (n,); the outermost extend beyond the rectangle."""

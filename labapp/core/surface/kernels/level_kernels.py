@@ -31,6 +31,25 @@ FACTORS = 500
 """Twice so many factors of at most 2 have a product that does not overflow."""
 
 
+SCAN_LEVELS = 300
+"""Number of levels that are tried if no estimate is given."""
+
+MOST_AT_ENDS, MOST_AT_FAR_ENDS = 1e-6, 0.02
+"""A wider grid is searched if the probability at the ends of the grid exceeds this: the first for a
+narrow grid (reach below 1), the second for a wide one."""
+
+# Blurs: width of the step from inside to outside, in dot spacings, from a sharp boundary to one
+# that half of the neighbouring rays contradict; and −log of their prior, nats: sharp is likelier.
+BLUR_WIDTHS = np.geomspace(1 / 200, 1 / 4, 9)
+BLURS = np.array([BLUR_WIDTHS, 1.2 * np.log(BLUR_WIDTHS)])
+
+# Drops: depths of the rear, mm. One rear in five lies below the work piece; its depths are equally
+# likely.
+DROPS_MM = np.concatenate([[0.0], np.linspace(0.01, 0.15, 10)])
+SHARE_SUNK = 0.2
+SUNK_COST = -float(np.log(SHARE_SUNK / (1 - SHARE_SUNK) / (len(DROPS_MM) - 1)))  # nats
+
+
 @_inner
 def _multiply(factors: FloatArray, k: int, way: int, factor: float, shrinks: float) -> None:
     """Multiply entries from k on in one direction by 1 + factor, as the factor decays to `EPS`.
@@ -336,6 +355,48 @@ def search_level(
     drop, mean, sigma, at_ends = level_posterior(nats, blurs[1], sunk, drops, first, step)
     rear = head_sign * start, head_sign * end
     return np.array([mean, sigma, drop, *rear, at_ends, nats.min(), usual]), len(near)
+
+
+@_compiled(_f2, _f2, _f1, _i1, _f1, _f1, _f1, _f)
+def find_level(
+    height: FloatArray,
+    slope: FloatArray,
+    y: FloatArray,
+    witness: IntArray,
+    spacing: FloatArray,
+    rear: FloatArray,
+    about: FloatArray,
+    missing: float,
+) -> FloatArray:
+    """Find the level of a surface.
+
+    The arguments are those of `level.find_level`, with NaN for a drop to be found, and for the
+    reach if all levels are tried.
+
+    Returns
+    -------
+    FloatArray
+        Shift, mm, its standard uncertainty, mm, and sign; drop, start and end of the rear, mm;
+        least −log likelihood, number of rays, and usual rise, mm (`level.Level`), shape (9,).
+    """
+    (head_sign, drop), (shift, sign, reach) = rear, about
+    while True:
+        is_tried = np.isnan(reach)
+        if is_tried:
+            scanned, side = scan_levels(
+                height, slope, witness, spacing, SCAN_LEVELS, BLUR_WIDTHS[-1:]
+            )
+            shift, sign, reach = scanned, float(side), 1.0
+        # Only pools above the work piece have been observed to sink at the rear.
+        drops = np.array([0.0 if np.isnan(drop) else drop])
+        if np.isnan(drop) and sign > 0.0:
+            drops = DROPS_MM.copy()
+        search = np.array([head_sign, shift, sign, reach, missing, SUNK_COST])
+        found, rays = search_level(height, slope, y, witness, spacing, search, drops, BLURS)
+        mean, sigma, sunk, start, end, at_ends, least, usual = found
+        if is_tried or not at_ends > (MOST_AT_ENDS if reach < 1.0 else MOST_AT_FAR_ENDS):
+            return np.array([mean, sigma, sign, sunk, start, end, least, float(rays), usual])
+        reach = 1.0 if reach < 1.0 else np.nan
 
 
 @_compiled(_f1, _f2, _i1, _f1, _f1, _f, _f, _f2)
