@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from labapp.core.match import missing_share
-from labapp.core.matching.observation import UNLABELLED, Observation
+from labapp.core.matching.observation import UNLABELLED, Observation, neighbours_of
 from labapp.core.matching.prediction import (
     FALSE_DOTS_PER_MM2,
     GATE_SIGMA2,
@@ -153,8 +153,7 @@ def unsupported(observed: Observation, fitted: FittedLabels) -> IntArray:
 
 def isolated(lit: BoolArray) -> BoolArray:
     """Labelled rays without a labelled one beside them, also diagonally, shape (rows, columns)."""
-    blocks = np.lib.stride_tricks.sliding_window_view(np.pad(lit, 1), (3, 3))
-    return np.asarray(lit & (blocks.sum(axis=(2, 3)) == 1))
+    return np.asarray(lit & (neighbours_of(lit) == 0))
 
 
 def _wide(observed: Observation, fitted: FittedLabels) -> BoolArray:

@@ -46,17 +46,20 @@ class SetupPart(ReadOnlyArrays):
     sigma: FloatArray
     sizes: FloatArray
 
-    def change_to(self, sizes: FloatArray) -> float:
-        """Largest relative change of a size, shape (6,); height and depth have a common scale."""
-        scale = np.abs(self.sizes)
-        scale[2:4] = scale[2:4].max()
-        return float(np.max(np.abs(sizes - self.sizes) / scale))
-
 
 def nearest_part(parts: tuple[SetupPart, ...], sizes: FloatArray) -> SetupPart | None:
-    """The part with the nearest sizes, shape (6,); None if all differ by more than `CHANGED`."""
-    nearest = min(parts, key=lambda part: part.change_to(sizes), default=None)
-    return nearest if nearest and nearest.change_to(sizes) <= CHANGED else None
+    """The part with the nearest sizes, shape (6,); None if all differ by more than `CHANGED`.
+
+    Compared is the largest relative change of a size; height and depth have a common scale.
+    """
+    if not parts:
+        return None
+    known = np.array([part.sizes for part in parts])
+    scale = np.abs(known)
+    scale[:, 2:4] = scale[:, 2:4].max(axis=1, keepdims=True)
+    change = (np.abs(sizes - known) / scale).max(axis=1)
+    nearest = int(np.argmin(change))
+    return parts[nearest] if change[nearest] <= CHANGED else None
 
 
 @dataclass(frozen=True)
