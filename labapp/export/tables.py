@@ -162,13 +162,19 @@ def frame_tables(result: FrameResult, calibration: ImageCalibration) -> dict[str
     calibration
         Pixel ↔ imaging plane, for the dots' positions on the plane.
     """
+    cells = [np.array([cell], object if isinstance(cell, str) else None) for cell in _cells(result)]
+    measures = dict(zip(_NAMES["measures"], cells, strict=True))
+    return _tables_of_places(result, calibration) | {"measures": measures}
+
+
+def _tables_of_places(result: FrameResult, calibration: ImageCalibration) -> dict[str, Table]:
+    """Return the tables of a frame that have a row for each dot or point."""
     measurement = result.measurement
     reconstruction = measurement.reconstruction
     columns = {
         "dots": _dots(measurement, calibration),
         "points": [] if reconstruction is None else _points(reconstruction, measurement.measures),
         "boundary": [] if reconstruction is None else _boundary(reconstruction),
-        "measures": _measures(result.time_s, measurement),
     }
     tables = {}
     for name, values in columns.items():
@@ -178,10 +184,13 @@ def frame_tables(result: FrameResult, calibration: ImageCalibration) -> dict[str
     return tables
 
 
-def _measures(time_s: float | None, measurement: Measurement) -> list[npt.NDArray[Any]]:
+def _cells(result: FrameResult) -> list[Any]:
+    """Return the cells of a frame's row of `measures`: numbers and text."""
+    measurement = result.measurement
     lattice, match = measurement.lattice, measurement.match
-    row: list[object] = [
-        math.nan if time_s is None else time_s,
+    return [
+        result.frame,
+        math.nan if result.time_s is None else result.time_s,
         measurement.status,
         measurement.scheme,
         "" if match is None else match.orientation,
@@ -193,7 +202,6 @@ def _measures(time_s: float | None, measurement: Measurement) -> list[npt.NDArra
         measurement.setup_status,
         *_sigma_parts(measurement.measures),
     ]
-    return [np.array([cell], object if isinstance(cell, str) else None) for cell in row]
 
 
 def sigma_of(measurement: Measurement) -> str:
@@ -260,8 +268,14 @@ def table_rows(
     result: FrameResult, calibration: ImageCalibration, sigma_parts: bool = False
 ) -> dict[str, str]:
     """Return a frame's rows of every table as CSV text (`frame_tables`)."""
-    tables = frame_tables(result, calibration)
-    return {name: csv_rows(name, table, sigma_parts) for name, table in tables.items()}
+    tables = _tables_of_places(result, calibration)
+    rows = {name: csv_rows(name, table, sigma_parts) for name, table in tables.items()}
+    row = [
+        cell if column.digits is None else number(cell, column.digits)
+        for cell, column in zip(_cells(result), TABLES["measures"], strict=True)
+        if sigma_parts or not column.is_part
+    ]
+    return rows | {"measures": csv_text([row])}
 
 
 def csv_header(name: str, sigma_parts: bool = False) -> str:

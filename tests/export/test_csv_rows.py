@@ -16,7 +16,15 @@ from labapp.core.pipeline import Measurement
 from labapp.core.surface.measures import Measures, sigma_names
 from labapp.export.fixed_point import format_fixed
 from labapp.export.frame_result import FrameResult
-from labapp.export.tables import TABLES, Table, csv_header, csv_rows, number, table_rows
+from labapp.export.tables import (
+    TABLES,
+    Table,
+    csv_header,
+    csv_rows,
+    frame_tables,
+    number,
+    table_rows,
+)
 
 NUMBERS = st.one_of(
     st.floats(-1e7, 1e7),
@@ -90,3 +98,16 @@ def test_parts_of_an_uncertainty_are_written_on_request() -> None:
     for name, value in additional.items():
         expected = 0.04 if "_level" in name else 0.12 if "_setup" in name else 0.03
         assert value == expected, name
+
+
+@pytest.mark.parametrize("time_s", [None, 0.04])
+@pytest.mark.parametrize("parts", [False, True])
+def test_rows_of_a_frame_are_those_of_its_tables(time_s: float | None, parts: bool) -> None:
+    measured = Measurement("ok", "", "fit", measures=Measures(*np.linspace(-3.0, 1e4, 20)))
+    refused = Measurement("no-match", 'no "surface", none', "irs")
+    for measurement in (measured, refused):
+        result, calibration = FrameResult(7, time_s, measurement), ImageCalibration(np.eye(3))
+        tables = frame_tables(result, calibration)
+        expected = {name: csv_rows(name, table, parts) for name, table in tables.items()}
+        assert table_rows(result, calibration, parts) == expected
+        assert list(expected) == list(TABLES)
