@@ -106,8 +106,16 @@ def solve(
         )
     if not (match.witness < 0).any():
         raise CannotMeasure("open-boundary", "no visible ray is missing: the boundary is not seen")
-    dots = match.ray, match.plane_mm, match.plane_covariance_mm2, match.witness
-    pool = fit_pool(*dots, rig, settings, initial, match.missing)
+    pool = fit_pool(
+        ray=match.ray,
+        plane_mm=match.plane_mm,
+        plane_covariance_mm2=match.plane_covariance_mm2,
+        witness=match.witness,
+        rig=rig,
+        settings=settings,
+        initial=initial,
+        missing=match.missing,
+    )
     if pool.unsettled_mm > UNSETTLED_MM:
         raise CannotMeasure("no-surface", "the surface does not settle")
     return pool
@@ -126,11 +134,10 @@ def complete(
     basis, coefficients, level = pool.surface.basis, pool.surface.coefficients, pool.level
     points = pool.points_mm
     center = (points[:, :2].min(axis=0) + points[:, :2].max(axis=0)) / 2
-    at = basis, coefficients, level, center
     if known is None:
-        boundary, slope = trace_boundary(*at)
+        boundary, slope = trace_boundary(basis, coefficients, level, center)
     else:
-        boundary, slope = retrace_boundary(*at, known.boundary)
+        boundary, slope = retrace_boundary(basis, coefficients, level, center, known.boundary)
     sizes = sizes_and_gradients(basis, coefficients, level, boundary, slope)
     if known is not None and not sizes.holds:
         raise CannotMeasure(

@@ -84,10 +84,18 @@ class Level:
     @property
     def as_array(self) -> FloatArray:
         """Values as an array for compiled functions (`of`), shape (9,)."""
-        own, rear = (self.shift_mm, self.sigma_mm, self.sign), self.rear
-        depth = rear.drop_mm, rear.start_mm, rear.end_mm
-        seen = self.negative_log_likelihood, self.ray_count, self.rise_mm
-        return np.array([*own, *depth, *seen], float)
+        values = [
+            self.shift_mm,
+            self.sigma_mm,
+            self.sign,
+            self.rear.drop_mm,
+            self.rear.start_mm,
+            self.rear.end_mm,
+            self.negative_log_likelihood,
+            self.ray_count,
+            self.rise_mm,
+        ]
+        return np.array(values, float)
 
     @property
     def disagreement(self) -> float:
@@ -153,9 +161,16 @@ class Witnesses(ReadOnlyArrays):
 
         there = spline_kernels.surface_at(basis.grid, coefficients, self.landing_mm)
         sigma = self.height_sigma_mm
-        height = np.stack([there[0], np.zeros(len(there[0])) if sigma is None else sigma])
-        seen = height, there[1:].T, self.landing_mm[:, 1], self.sign, self.spacing_mm
-        return find_level(*seen, (self.head_sign, drop_mm), about, self.missing)
+        return find_level(
+            height=np.stack([there[0], np.zeros(len(there[0])) if sigma is None else sigma]),
+            slope=there[1:].T,
+            y=self.landing_mm[:, 1],
+            witness=self.sign,
+            spacing_mm=self.spacing_mm,
+            rear=(self.head_sign, drop_mm),
+            about=about,
+            missing=self.missing,
+        )
 
     def negative_log_evidence(
         self, basis: SplineBasis, coefficients: FloatArray, level: Level
@@ -167,10 +182,15 @@ class Witnesses(ReadOnlyArrays):
         from labapp.core.surface.kernels import level_kernels, spline_kernels
 
         there = spline_kernels.surface_at(basis.grid, coefficients, self.landing_mm)
-        seen = there[0], there[1:].T, self.sign, self.spacing_mm
-        rear = level.rear.height(self.landing_mm[:, 1])
         return level_kernels.negative_log_evidence(
-            *seen, rear, level.sign, self.missing, level_kernels.BLURS
+            there[0],
+            there[1:].T,
+            self.sign,
+            self.spacing_mm,
+            level.rear.height(self.landing_mm[:, 1]),
+            level.sign,
+            self.missing,
+            level_kernels.BLURS,
         )
 
 
@@ -217,5 +237,5 @@ def find_level(
     head_sign, drop_mm = rear
     depth = np.array([head_sign, np.nan if drop_mm is None else drop_mm])
     around = np.array([0.0, 1.0, np.nan] if about is None else about, float)
-    seen = height, slope, y, witness, spacing_mm
-    return Level.of(level_kernels.find_level(*seen, depth, around, missing))
+    found = level_kernels.find_level(height, slope, y, witness, spacing_mm, depth, around, missing)
+    return Level.of(found)

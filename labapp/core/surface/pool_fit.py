@@ -132,8 +132,7 @@ class FittedPool(ReadOnlyArrays):
     def height_sigma_mm(self, places_mm: FloatArray) -> FloatArray:
         """Standard uncertainty of the height at m places, apart from the level, shape (m,), mm."""
         inverse = inverse_of(self.factor) if self.inverse is None else self.inverse
-        at = self.factor, inverse, self.mean_splines, places_mm
-        return height_sigma(self.surface.basis, *at)
+        return height_sigma(self.surface.basis, self.factor, inverse, self.mean_splines, places_mm)
 
 
 def fit_pool(
@@ -180,17 +179,18 @@ def fit_pool(
     equations = normal_equations(basis, rig, points, plane_mm, plane_covariance_mm2, settings)
     equations.reuse_mm = settings.floor_mm / 50
     if initial is not None:
-        near = initial.basis.grid, initial.coefficients, rays.directions[at], points
-        points, _ = solver_kernels.newton_along_rays(*near, NEWTON_STEPS)
+        points, _ = solver_kernels.newton_along_rays(
+            initial.basis.grid, initial.coefficients, rays.directions[at], points, NEWTON_STEPS
+        )
     rounds = Rounds(equations, rays.directions[at], np.zeros(basis.count), points, np.inf)
     witnesses = Witnesses.of(rays, rig.head_sign, witness, basis, missing or 0.0)
     outer = None if (witnesses.sign < 0).any() else _outer(rays.landing_mm[at][:, :2])
-    until = settings.rounds, settings.settled_mm
-    level = rounds_with_level(rounds, witnesses, *until, outer=outer)
+    most, until_mm = settings.rounds, settings.settled_mm
+    level = rounds_with_level(rounds, witnesses, most, until_mm, outer=outer)
     if missing is not None and outer is None:
         sigma = rounds.height_sigma_mm(witnesses.landing_mm)
         witnesses = replace(witnesses, height_sigma_mm=sigma)
-        level = rounds_with_level(rounds, witnesses, *until, near=level)
+        level = rounds_with_level(rounds, witnesses, most, until_mm, near=level)
     return fitted_pool(rounds, level, rig, plane_mm)
 
 
@@ -210,8 +210,9 @@ def normal_equations(
 
     laser, plane = rig.laser.position_mm, rig.imaging_plane.pose_mm
     dots = rig.imaging_plane.to_universal(plane_mm)
-    near = laser, plane, points_mm, dots
-    weights = ray_kernels.slope_weights(*near, plane_covariance_mm2, settings.floor_mm)
+    weights = ray_kernels.slope_weights(
+        laser, plane, points_mm, dots, plane_covariance_mm2, settings.floor_mm
+    )
     stiffness = CORRELATED_MM2 / settings.jerk**2 * basis.roughness
     return NormalEquations(basis, stiffness, laser, plane, dots, weights)
 
@@ -286,15 +287,22 @@ def fitted_pool(rounds: Rounds, level: Level, rig: Rig, plane_mm: FloatArray) ->
     from labapp.core.surface.kernels import ray_kernels
 
     basis, plane = rounds.equations.basis, rig.imaging_plane.pose_mm
-    at = basis.grid, rounds.coefficients, rounds.rays, rounds.points_mm
-    points, _, computed = ray_kernels.intersect_and_reflect(*at, 1, plane)
+    points, _, computed = ray_kernels.intersect_and_reflect(
+        basis.grid, rounds.coefficients, rounds.rays, rounds.points_mm, 1, plane
+    )
     residual = computed - plane_mm
     if not np.isfinite(residual).all():
         raise CannotMeasure("no-surface", "the fitted surface sends rays away from the plane")
-    equations, surface = rounds.equations, SplineSurface(basis, rounds.coefficients)
-    assert equations.factor is not None
-    fitted = surface, equations.factor, level, points, residual, rounds.moved_mm
-    return FittedPool(*fitted, equations.known_inverse)
+    assert rounds.equations.factor is not None
+    return FittedPool(
+        surface=SplineSurface(basis, rounds.coefficients),
+        factor=rounds.equations.factor,
+        level=level,
+        points_mm=points,
+        residual_mm=residual,
+        unsettled_mm=rounds.moved_mm,
+        inverse=rounds.equations.known_inverse,
+    )
 
 
 def basis_around(places_mm: FloatArray, rays: ProjectedRays, knot_mm: float) -> SplineBasis:

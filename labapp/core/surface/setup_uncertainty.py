@@ -10,7 +10,7 @@ the bench perturbed by plus and minus one standard uncertainty, and half the dif
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -63,21 +63,26 @@ def setup_changes(
         return np.zeros((len(gradient), 0))
     changes = np.zeros((len(gradient), len(known.root)))
     benches = _Perturbed.of(rig, match.plane_mm)
-    dots = match.plane_mm, match.plane_covariance_mm2
-    equations = _factorised(*dots, rig, settings, pool)
+    equations = _factorised(match.plane_mm, match.plane_covariance_mm2, rig, settings, pool)
     change = _response(match.ray, equations, pool, benches) / SHARE
     basis, about = pool.surface.basis, (0.0, pool.level.sign, REACH)
     own = project_rays(rig.laser, rig.pattern)
     x, y = own.landing_mm[..., 0], own.landing_mm[..., 1]
     seen = (match.witness != 0) & basis.contains(x, y)
-    landing, sign = own.landing_mm[seen], match.witness[seen]
+    landing, mean = own.landing_mm[seen], pool.mean_splines
     assert equations.factor is not None
-    solved = equations.factor, equations.inverse, pool.mean_splines
-    sigma, limits = height_sigma(basis, *solved, landing), (rig.head_sign, match.missing)
+    witnesses = Witnesses(
+        landing_mm=landing,
+        sign=match.witness[seen],
+        spacing_mm=own.spacing_mm,
+        head_sign=rig.head_sign,
+        missing=match.missing,
+        height_sigma_mm=height_sigma(basis, equations.factor, equations.inverse, mean, landing),
+    )
     for k, by, rays in zip(benches.columns, change, benches.rays, strict=True):
         aside = (rays.landing_mm[seen] - landing) / SHARE
         more, less = (
-            Witnesses(landing + way * aside, sign, own.spacing_mm, *limits, sigma)
+            replace(witnesses, landing_mm=landing + way * aside)
             .level(basis, pool.surface.coefficients + way * by, pool.level.rear.drop_mm, about)
             .shift_mm
             for way in (1.0, -1.0)
@@ -114,9 +119,11 @@ def residual_changes(
     changes = np.zeros((*plane_mm.shape, len(rig.uncertainty.root)))
     for number, k in enumerate(benches.columns):
         rays, plane = benches.rays[number], benches.planes[number]
-        met = rays.directions[at], rays.landing_mm[at], NEWTON_STEPS, plane
+        directions, landing = rays.directions[at], rays.landing_mm[at]
         coefficients = surface.coefficients + change[number]
-        computed = ray_kernels.intersect_and_reflect(surface.basis.grid, coefficients, *met)[2]
+        _, _, computed = ray_kernels.intersect_and_reflect(
+            surface.basis.grid, coefficients, directions, landing, NEWTON_STEPS, plane
+        )
         off = computed - benches.plane_mm[number] - pool.residual_mm
         changes[..., k] = off / SHARE
     return changes

@@ -57,8 +57,9 @@ def shape_and_gradients(
     samples, outline = _Samples.of(_Evaluated(basis, coefficients), boundary), boundary.points_mm
     spokes = samples.middle_mm, samples.reach_mm, samples.place_mm, samples.height_mm
     rim = samples.length_mm, samples.inward, samples.rim_mm, samples.rise
-    at = basis.grid, coefficients, outline, boundary_slope
-    return samples.shape, shape_kernels.shape_gradients(*at, spokes, rim, samples.shape)
+    return samples.shape, shape_kernels.shape_gradients(
+        basis.grid, coefficients, outline, boundary_slope, spokes, rim, samples.shape
+    )
 
 
 @dataclass(frozen=True)

@@ -170,14 +170,13 @@ class Rounds:
         from labapp.core.surface.kernels import round_kernels
 
         own = self.equations
-        bench = own.laser_mm, own.plane, own.dots_mm
         smooth = np.zeros_like(self.coefficients) if smooth_about is None else smooth_about
         known = (own.stiffness, np.nan) if own.factor is None else (own.factor, self.moved_mm)
         limits = np.array([most, until_mm, newton_steps, own.reuse_mm, known[1], *by.limits])
         self.coefficients, self.points_mm, factor, level, (moved, is_new) = (
             round_kernels.run_rounds(
                 own.basis.grid,
-                (own.stiffness, self.rays, own.weights, *bench),
+                (own.stiffness, self.rays, own.weights, own.laser_mm, own.plane, own.dots_mm),
                 (self.coefficients, smooth, self.points_mm, known[0]),
                 by.witnesses,
                 by.level,
