@@ -318,13 +318,12 @@ def match_of_hypothesis(
     inverse = inverse_of(best.pool.factor)
 
     def covariance_of(rays: IntArray) -> FloatArray:
-        at = paths.points_mm[rays], paths.plane_mm[rays]
-        return covariance_of_dots(observed.rig, surface.basis, inverse, *at)
+        return covariance_of_dots(
+            observed.rig, surface.basis, inverse, paths.points_mm[rays], paths.plane_mm[rays]
+        )
 
-    witness, missed = (
-        certain_witness(observed, best.witness, paths, covariance_of),
-        best.missed_count,
-    )
+    witness = certain_witness(observed, best.witness, paths, covariance_of)
+    missed = best.missed_count
     return match_of_pairs(observed, at, dot, orientation, witness, missed, trials, reference)
 
 

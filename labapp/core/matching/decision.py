@@ -206,9 +206,11 @@ def fitted_labels(observed: Observation, best: Hypothesis, knots: FitSettings) -
     classes = RayClasses(best.witness, missed, best.stray_dots)
     rays = np.union1d(np.flatnonzero(best.labels != UNLABELLED), missed)
     rays = rays[np.isfinite(paths.plane_mm[rays, 0])]
-    at = inverse_of(best.pool.factor), paths.points_mm[rays], paths.plane_mm[rays]
+    inverse = inverse_of(best.pool.factor)
     covariance = np.full((best.labels.size, 2, 2), np.nan)
-    covariance[rays] = covariance_of_dots(observed.rig, basis, *at)
+    covariance[rays] = covariance_of_dots(
+        observed.rig, basis, inverse, paths.points_mm[rays], paths.plane_mm[rays]
+    )
     return FittedLabels(
         labels=best.labels,
         basis=basis,

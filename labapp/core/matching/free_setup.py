@@ -117,9 +117,15 @@ def with_setup_free(
         return FreeHypothesis(labels)
     at = np.argwhere(labels != UNLABELLED)
     dot = labels[tuple(at.T)]
-    pairs = at + 1, observed.plane_mm[dot], observed.covariance_mm2[dot]
     sigma = np.repeat(np.sqrt(variance_mm2(observed, dot)), 2)
-    change = residual_changes(*pairs, observed.rig, USUAL_KNOTS, pool).reshape(len(sigma), -1)
+    change = residual_changes(
+        ray=at + 1,
+        plane_mm=observed.plane_mm[dot],
+        plane_covariance_mm2=observed.covariance_mm2[dot],
+        rig=observed.rig,
+        settings=USUAL_KNOTS,
+        pool=pool,
+    ).reshape(len(sigma), -1)
     finite = np.isfinite(change).all(axis=1)  # a ray at the rim may leave the splines
     jacobian = change[finite] / sigma[finite, None]
     rhs = -jacobian.T @ (pool.residual_mm.ravel() / sigma)[finite]

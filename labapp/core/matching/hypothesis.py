@@ -215,11 +215,16 @@ def evaluate(
         return None
     paths = paths_of(observed, pool)
     classes, marker, cost = _misfit(observed, labels, pool, paths)
-    misfit = cost + _boundary_cost(pool.level)
-    rough = _roughness_cost(pool, settings)
-    missed = np.stack(np.divmod(classes.missed, labels.shape[1]), axis=-1)
-    left = classes.witness, missed, classes.stray, marker
-    return Hypothesis(labels, pool, *left, misfit, rough)
+    return Hypothesis(
+        labels=labels,
+        pool=pool,
+        witness=classes.witness,
+        missed_rays=np.stack(np.divmod(classes.missed, labels.shape[1]), axis=-1),
+        stray_dots=classes.stray,
+        marker=marker,
+        misfit_without_marker=cost + _boundary_cost(pool.level),
+        roughness=_roughness_cost(pool, settings),
+    )
 
 
 def evaluate_twice(

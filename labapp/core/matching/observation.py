@@ -169,10 +169,16 @@ class Observation(ReadOnlyArrays):
         if key not in self._fitted:
             at = np.argwhere(labels != UNLABELLED)
             dot = labels[tuple(at.T)]
-            dots = self.plane_mm[dot], self.covariance_mm2[dot]
-            surface = None if initial is None else initial.surface
             try:
-                pool = fit_pool(at + 1, *dots, witness, self.rig, settings, surface)
+                pool = fit_pool(
+                    ray=at + 1,
+                    plane_mm=self.plane_mm[dot],
+                    plane_covariance_mm2=self.covariance_mm2[dot],
+                    witness=witness,
+                    rig=self.rig,
+                    settings=settings,
+                    initial=None if initial is None else initial.surface,
+                )
                 if len(self._fitted) % COUNTED_EVERY == 0:
                     self._forget_oldest()
                 self._fitted[key] = pool
@@ -207,9 +213,10 @@ class Observation(ReadOnlyArrays):
         """
         from labapp.core.matching import match_kernels
 
-        margin = np.full(plane_mm.shape, margin_mm)
-        at, view = (plane_mm.reshape(-1, 2), margin.reshape(-1, 2)), self._view
-        visible = match_kernels.within_view(*at, self.bench.calibration.from_plane, *view)
+        places, to_image = plane_mm.reshape(-1, 2), self.bench.calibration.from_plane
+        margin = np.full(plane_mm.shape, margin_mm).reshape(-1, 2)
+        on_plane, in_image = self._view
+        visible = match_kernels.within_view(places, margin, to_image, on_plane, in_image)
         return visible.reshape(plane_mm.shape[:-1])
 
     @cached_property

@@ -75,8 +75,10 @@ class RayPaths(ReadOnlyArrays):
 
         start = bench.rays.landing_mm.reshape(-1, 3) if near_mm is None else near_mm
         rays, plane = bench.rays.directions.reshape(-1, 3), bench.rig.imaging_plane.pose_mm
-        met = ray_kernels.intersect_and_reflect(basis.grid, coefficients, rays, start, steps, plane)
-        return cls(coefficients, *met)
+        points, slopes, dots = ray_kernels.intersect_and_reflect(
+            basis.grid, coefficients, rays, start, steps, plane
+        )
+        return cls(coefficients, points, slopes, dots)
 
 
 @dataclass(frozen=True)
@@ -171,9 +173,9 @@ def sure_pairs(
     """
     from labapp.core.matching import match_kernels
 
-    spread = _enlarged(covariance_mm2)
-    seen = observed.plane_mm[dots], observed.covariance_mm2[dots]
-    distance, deviance = match_kernels.pair_deviances(*seen, plane_mm, spread)
+    distance, deviance = match_kernels.pair_deviances(
+        observed.plane_mm[dots], observed.covariance_mm2[dots], plane_mm, _enlarged(covariance_mm2)
+    )
     ray, next_ray, best_dot, next_dot = match_kernels.two_least(deviance)
     own = np.arange(len(ray))
     rival = np.minimum(np.minimum(next_ray, next_dot[ray]), false_dot_deviance())
@@ -198,8 +200,9 @@ def pair_deviances(
     from labapp.core.matching import match_kernels
 
     spread = _enlarged(predicted.covariance_mm2(pool, observed.rig))
-    seen = observed.plane_mm[dots], observed.covariance_mm2[dots]
-    return match_kernels.pair_deviances(*seen, predicted.plane_mm, spread)
+    return match_kernels.pair_deviances(
+        observed.plane_mm[dots], observed.covariance_mm2[dots], predicted.plane_mm, spread
+    )
 
 
 def _enlarged(covariance_mm2: FloatArray) -> FloatArray:

@@ -194,10 +194,10 @@ def _inside(observed: Observation, fitted: FittedLabels, missing: float) -> Floa
         for sign in (1, -1):
             witness = known.witness.copy()
             witness[tuple(at[k])] = sign
-            rays = observed.bench.rays, observed.rig.head_sign, witness, fitted.basis, missing
-            nats.append(
-                Witnesses.of(*rays).negative_log_evidence(fitted.basis, coefficients, level)
+            witnesses = Witnesses.of(
+                observed.bench.rays, observed.rig.head_sign, witness, fitted.basis, missing
             )
+            nats.append(witnesses.negative_log_evidence(fitted.basis, coefficients, level))
         odds[k] = np.exp(min(nats[1] - nats[0], 0.0))
     inside[tuple(at.T)] = odds / (1 + odds)
     return np.asarray(inside[lit])

@@ -177,8 +177,14 @@ class _Fit:
         if len(rays) < LEAST_DOTS:
             raise TrackLost("too few dots have a ray")
         dots, landing = labels.ravel()[rays], observed.landing_mm.reshape(-1, 3)[rays]
-        seen = observed.plane_mm[dots], observed.covariance_mm2[dots]
-        equations = normal_equations(prior.basis, observed.rig, landing, *seen, settings)
+        equations = normal_equations(
+            basis=prior.basis,
+            rig=observed.rig,
+            points_mm=landing,
+            plane_mm=observed.plane_mm[dots],
+            plane_covariance_mm2=observed.covariance_mm2[dots],
+            settings=settings,
+        )
         directions = observed.rays.reshape(-1, 3)[rays]
         rounds = Rounds(equations, directions, near.coefficients, near.points_mm[rays])
         return cls(prior, observed, settings, labels, rays, near, rounds)
@@ -217,9 +223,13 @@ class _Fit:
 
     def covariance_of(self, paths: RayPaths, rays: IntArray) -> FloatArray:
         """Covariance of the dots of m rays due to that of the surface, shape (m, 2, 2), mm²."""
-        at = paths.points_mm[rays], paths.plane_mm[rays]
-        inverse = self.rounds.equations.inverse
-        return covariance_of_dots(self.observed.rig, self.prior.basis, inverse, *at)
+        return covariance_of_dots(
+            rig=self.observed.rig,
+            basis=self.prior.basis,
+            inverse=self.rounds.equations.inverse,
+            points_mm=paths.points_mm[rays],
+            plane_mm=paths.plane_mm[rays],
+        )
 
     def covariance_around(self) -> FloatArray:
         """Covariance of the dots of lit rays and their neighbours, else NaN, shape (R, 2, 2)."""
@@ -361,8 +371,17 @@ def _apart_mm(one: FloatArray, other: FloatArray) -> FloatArray:
 
 def _unsupported(fit: _Fit, covariance: FloatArray, classes: RayClasses, level: Level) -> IntArray:
     """Labelled dots that the surface does not support (`unsupported_labels.unsupported`)."""
-    seen = fit.paths(), covariance, classes, fit.settings.floor_mm, fit.rounds.moved_mm
-    return unsupported(fit.observed, FittedLabels(fit.labels, fit.prior.basis, level, *seen))
+    fitted = FittedLabels(
+        labels=fit.labels,
+        basis=fit.prior.basis,
+        level=level,
+        paths=fit.paths(),
+        covariance_mm2=covariance,
+        classes=classes,
+        floor_mm=fit.settings.floor_mm,
+        unsettled_mm=fit.rounds.moved_mm,
+    )
+    return unsupported(fit.observed, fitted)
 
 
 def _with_level(prior: Prior, fit: _Fit, covariance: FloatArray) -> tuple[RayClasses, Level]:

@@ -193,8 +193,9 @@ class Prior:
         at = tuple(match.ray.T - 1)
         ray = np.ravel_multi_index(at, self.lit.shape)
         points = self.paths.points_mm[ray]
-        dots = match.plane_mm, match.plane_covariance_mm2
-        equations = normal_equations(basis, bench.rig, points, *dots, settings)
+        equations = normal_equations(
+            basis, bench.rig, points, match.plane_mm, match.plane_covariance_mm2, settings
+        )
         fit = Rounds(equations, bench.rays.directions[at], former.past[-1], points)
         try:
             fit.run(MOST_ROUNDS, SETTLED_MM)

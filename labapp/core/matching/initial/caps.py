@@ -65,16 +65,15 @@ def search_caps(observed: Observation) -> list[IntArray]:
     """
     from labapp.core.matching.initial import quadric_kernels
 
-    rig = observed.rig
-    seen = (
-        rig.laser.position_mm,
-        rig.imaging_plane.pose_mm,
-        observed.plane_mm,
-        observed.absent.ravel(),
-    )
     settings = np.array([LEAST_RAYS, GATE, DARK_PENALTY, LIT_GATE, LIT_MARKER_PENALTY])
     score, found = quadric_kernels.score_caps(
-        _caps(observed), observed.rays.reshape(-1, 3), *seen, settings
+        _caps(observed),
+        observed.rays.reshape(-1, 3),
+        observed.rig.laser.position_mm,
+        observed.rig.imaging_plane.pose_mm,
+        observed.plane_mm,
+        observed.absent.ravel(),
+        settings,
     )
     best = np.full((MOST_CAPS, found.shape[1]), UNLABELLED, np.int64)
     count = 0

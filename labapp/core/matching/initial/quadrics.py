@@ -86,7 +86,8 @@ def search_quadrics(observed: Observation) -> list[QuadricLabels]:
         return []  # without rays on all sides a hole cannot be recognised
     window = _Window(observed, marker)
     found: dict[bytes, QuadricLabels] = {}
-    quadrics = [_quadrics(window, *hole) for hole in _holes(observed, window.tree)]
+    holes = _holes(observed, window.tree)
+    quadrics = [_quadrics(window, hole, half_width) for hole, half_width in holes]
     for one in window.scored(window.fitted(np.concatenate([np.empty((0, 5)), *quadrics]))):
         key = one.labels.tobytes()
         if key not in found or found[key].score < one.score:
@@ -194,9 +195,10 @@ class _Window:
         from labapp.core.matching.initial import quadric_kernels
 
         laser, places = self.observed.rig.laser.position_mm, self.observed.plane_mm
-        center, plane = self.landing_mm[:2], self.plane
-        bench = self.rays, laser, plane, places, self.absent
-        return quadric_kernels.fit_quadrics(center, quadrics, *bench, LOOSE_GATE)
+        center = self.landing_mm[:2]
+        return quadric_kernels.fit_quadrics(
+            center, quadrics, self.rays, laser, self.plane, places, self.absent, LOOSE_GATE
+        )
 
     def scored(self, quadrics: FloatArray) -> Iterator[QuadricLabels]:
         """Yield the labels of each quadric that explains the dots around the hole."""
