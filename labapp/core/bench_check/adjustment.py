@@ -287,12 +287,13 @@ class System:
         rig = moved_rig(self.rig, offset)
         made = np.zeros((2 * sum(len(s.ray) for s in self.sightings), self.size))
         for k, (pose, part) in enumerate(zip(poses, self.parts[1:], strict=True)):
-            rows, dots = self._rows(k), self.observed(k, offset)
+            rows, (plane_mm, whitening) = self._rows(k), self.observed(k, offset)
             made[rows, self.parts[0]] = self.by_quantities(k, offset, pose, used) @ self.factor
             computed = partial(self.computed, k, rig)
-            still = _standardised(*dots, computed(pose))
+            still = _standardised(plane_mm, whitening, computed(pose))
             for p, step in zip(range(part.start, part.stop), STEP * np.eye(len(pose)), strict=True):
-                made[rows, p] = (_standardised(*dots, computed(pose + step)) - still) / STEP
+                changed = _standardised(plane_mm, whitening, computed(pose + step))
+                made[rows, p] = (changed - still) / STEP
         return made
 
     def by_quantities(
@@ -303,11 +304,12 @@ class System:
         Quantities of the picture change the observed dots, all others the computed ones; those of
         the imaging plane do so without a change of the reflected rays.
         """
-        dots, (one, at) = self.observed(k, offset), (self.sightings[k], self.pose(k, pose))
+        plane_mm, whitening = self.observed(k, offset)
+        one, at = self.sightings[k], self.pose(k, pose)
         rig = moved_rig(self.rig, offset)
         point, direction, _ = reflected_rays(one.mirror, at, rig, tuple(one.ray.T))
         landed = intersect_imaging_plane(point, direction, rig.imaging_plane)
-        still = _standardised(*dots, landed)
+        still = _standardised(plane_mm, whitening, landed)
         made = np.zeros((len(still), len(QUANTITIES)))
         for q in np.flatnonzero(used):
             moved = offset.copy()
@@ -316,10 +318,12 @@ class System:
                 changed = _standardised(*self.observed(k, moved), landed)
             elif OF_PLANE[q]:
                 plane = moved_plane(self.rig.imaging_plane, moved)
-                changed = _standardised(*dots, intersect_imaging_plane(point, direction, plane))
+                changed = _standardised(
+                    plane_mm, whitening, intersect_imaging_plane(point, direction, plane)
+                )
             else:
                 moved_computed = self.computed(k, moved_rig(self.rig, moved), pose)
-                changed = _standardised(*dots, moved_computed)
+                changed = _standardised(plane_mm, whitening, moved_computed)
             made[:, q] = (changed - still) / step
         return made
 

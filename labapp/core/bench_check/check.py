@@ -294,12 +294,13 @@ def _first_label(
     The alternatives are needed because a mirror of another kind or size than given, or a quantity
     that is far off, misleads the subsequent adjustments.
     """
-    for bench in benches[:-1]:
+    for rig, calibration in benches[:-1]:
         try:
-            return label_picture(picture, *bench, free_directions), bench[0]
+            return label_picture(picture, rig, calibration, free_directions), rig
         except CannotMeasure:
             continue
-    return label_picture(picture, *benches[-1], free_directions), benches[-1][0]
+    rig, calibration = benches[-1]
+    return label_picture(picture, rig, calibration, free_directions), rig
 
 
 def _wide(rig: Rig) -> Rig:

@@ -94,8 +94,19 @@ def measure_sizes(
         independent = _without_size(rig, sightings, released, made, k)
         sizes = []
         for name, size in _sizes(mirror).items():
-            found = (_propagated(size, *pose) for pose in (known, by_new, independent))
-            sizes.append(MeasuredSize(name, *(value for pair in found for value in pair)))
+            known_mm, known_sigma = _propagated(size, *known)
+            measured_mm, sigma = _propagated(size, *by_new)
+            independent_mm, independent_sigma = _propagated(size, *independent)
+            one = MeasuredSize(
+                name=name,
+                known_mm=known_mm,
+                known_sigma_mm=known_sigma,
+                measured_mm=measured_mm,
+                sigma_mm=sigma,
+                independent_mm=independent_mm,
+                independent_sigma_mm=independent_sigma,
+            )
+            sizes.append(one)
         every.append(tuple(sizes))
     return tuple(every)
 

@@ -84,7 +84,9 @@ def _adjusted(
     near: Adjustment | None = None,
 ) -> Adjustment:
     """Adjust to labels, roughly or from a similar adjustment; the absent ray may have a dot."""
-    sightings = [sighting_of(*one, with_absent=True) for one in seen]
+    sightings = [
+        sighting_of(observed, mirror, labels, with_absent=True) for observed, mirror, labels in seen
+    ]
     system = System.of(rig, sightings, released)
     start, steps = (system.start(), FEW_STEPS) if near is None else (near.unknown, STEPS)
     return system.adjustment(system.minimised(start, scale, steps), scale)

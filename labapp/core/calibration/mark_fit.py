@@ -273,8 +273,17 @@ def _chosen(affine: MarkFit, fits: list[MarkFit], axis_mm: float) -> MarkFits:
         reason = f"No perspective is seen: noise alone gains as much in {chance:.0%} of pictures"
     else:
         reason = f"There is perspective, but the marks determine it too poorly: {here}"
-    whole, corner, errors = fits[2], FIELD * axis_mm, (affine_error, error)
-    return MarkFits(affine, homography, whole, corner, chance, *errors, best, reason)
+    return MarkFits(
+        affine=affine,
+        homography=homography,
+        whole=fits[2],
+        corner_mm=FIELD * axis_mm,
+        chance=chance,
+        affine_error_mm=affine_error,
+        homography_error_mm=error,
+        best=best,
+        reason=reason,
+    )
 
 
 def _chance(smaller: MarkFit, larger: MarkFit) -> float:

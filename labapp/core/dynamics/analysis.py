@@ -141,15 +141,14 @@ def analyse(
         within = (at >= time[0]) & (at <= time[-1]) & np.isfinite(value)
         found = find_events(at[within], value[within], lags=(1,))
         steps[name] = tuple(_sharpened(one, at[within], value[within]) for one in found)
-    chosen = time, series[settings.of], settings.segment_s
     return Dynamics(
         surfaces,
         series,
         settings,
         modes,
         pod_modes(surfaces, scale_sigma=scale_sigma, band_hz=settings.band_hz),
-        spectrogram(*chosen),
-        track_peak(*chosen, settings.band_hz),
+        spectrogram(time, series[settings.of], settings.segment_s),
+        track_peak(time, series[settings.of], settings.segment_s, settings.band_hz),
         events | steps,
         _responses(time, series, steps),
     )

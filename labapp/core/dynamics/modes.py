@@ -229,10 +229,15 @@ def pod_modes(
         shape = vectors[:, -k] / root
         largest = shape[np.argmax(np.abs(shape))]
         course: FloatArray = (moving @ vectors[:, -k:][:, :1]) * largest
-        swings = fit_oscillations(series.time_s, course, band_hz=band_hz)
-        share = float(energy[-k] / max(energy.sum(), 1e-30))
-        one = np.atleast_2d(shape / largest), course, share, swings
-        found.append(ModeCourse(f"POD {k}", *one, scale_sigma=scale_sigma))
+        one = ModeCourse(
+            name=f"POD {k}",
+            shape=np.atleast_2d(shape / largest),
+            coefficient_mm=course,
+            share=float(energy[-k] / max(energy.sum(), 1e-30)),
+            oscillations=fit_oscillations(series.time_s, course, band_hz=band_hz),
+            scale_sigma=scale_sigma,
+        )
+        found.append(one)
     return tuple(found)
 
 

@@ -224,9 +224,17 @@ def fit_model(
         static, scatter = fit_linear(standard)
     else:
         static, scatter = fit_gaussian(standard, like.static if like else None)
-    ends = rows.x.min(axis=0), rows.x.max(axis=0)
     return PenetrationModel(
-        kind, settings, constants, center, scale, *ends, mean, static, float(np.sqrt(scatter))
+        kind=kind,
+        settings=settings,
+        time_constants_s=constants,
+        center=center,
+        scale=scale,
+        low=rows.x.min(axis=0),
+        high=rows.x.max(axis=0),
+        mean_mm=mean,
+        static=static,
+        scatter_mm=float(np.sqrt(scatter)),
     )
 
 

@@ -160,7 +160,8 @@ def track_peak(
             at = length * step / 2
             size = float(abs(one.amplitude[0]) * np.exp(-one.damping_per_s * at))
             column[:] = one.frequency_hz, one.frequency_sigma_hz, size
-    return PeakTrack(begins + length * step / 2, *found)
+    frequency, sigma, amplitude = found
+    return PeakTrack(begins + length * step / 2, frequency, sigma, amplitude)
 
 
 def _step_and_length(time_s: FloatArray, segment_s: float | None) -> tuple[float, int]:

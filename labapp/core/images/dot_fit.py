@@ -115,11 +115,11 @@ def fit_dots(
         width = np.clip(WINDOW_SHARE * next_px, CLOSE_WINDOW * median_size, WINDOW * median_size)
         margin = int(np.ceil(2.2 * width.max())) + 1
         rest = kernels.without_dots(around[0], by, blur, dots)
-        where = picture, rest, blur, dots, width, number, begin, margin
         if last == ROUNDS or move < SETTLED_PX:
             break
-        move = _improve(dots, kernels.residual_sums(*where), width)
-    modes = kernels.residual_modes(*where)
+        sums = kernels.residual_sums(picture, rest, blur, dots, width, number, begin, margin)
+        move = _improve(dots, sums, width)
+    modes = kernels.residual_modes(picture, rest, blur, dots, width, number, begin, margin)
     free = _free_share(dots, number, begin)
     speckle = _speckle(modes, dots, noise, free)
     variance = noise**2 * modes[:2, :, 1] + speckle * modes[:2, :, 2]

@@ -162,8 +162,14 @@ class LineModel:
         rises = (direction[:, 2] / descent)[:, None] * value
         ends = slice(count, None)
         residual[ends], local[ends] = _end_equations(
-            *(data, np.abs(fan[ends]) >= curves.fan[-1] - 1e-6, point[ends, 2], off[ends]),
-            *(rate[ends], rise[ends], rises[ends], change[ends]),
+            data=data,
+            at_fan=np.abs(fan[ends]) >= curves.fan[-1] - 1e-6,
+            height=point[ends, 2],
+            off=off[ends],
+            rate=rate[ends],
+            rise=rise[ends],
+            rises=rises[ends],
+            change=change[ends],
         )
         jacobian = np.zeros((len(line), self.basis.count))
         np.put_along_axis(jacobian, cells.splines, local, axis=1)

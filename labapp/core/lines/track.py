@@ -225,7 +225,8 @@ def track_line(
     if not seen:
         return LineFilm(pulses, kept, float("nan"), 0.0)
     time_s, shift = np.array(seen).T
-    return LineFilm(pulses, kept, *oscillation_frequency(time_s, shift))
+    frequency_hz, strength = oscillation_frequency(time_s, shift)
+    return LineFilm(pulses, kept, frequency_hz, strength)
 
 
 def oscillation_frequency(time_s: FloatArray, values: FloatArray) -> tuple[float, float]:

@@ -58,8 +58,9 @@ class WarmChain:
         if self._prior is None:
             self.track_lost = "no earlier frame was measured"
             return None
-        given = self.bench, self.settings, self._prior
-        measurement, prior = measure(image, *given, on_step=self._on_step)
+        measurement, prior = measure(
+            image, self.bench, self.settings, self._prior, on_step=self._on_step
+        )
         if prior is None:
             self.track_lost = measurement.reason
             return None

@@ -101,8 +101,11 @@ def _response(
     rows = by_spline.reshape(count, -1)
     square, basis = np.linalg.eigh(rows @ rows.T)
     absorbed = basis[:, square > CLOSED * np.max(square, initial=0.0)]
-    moved = (_without(absorbed, by.reshape(count, -1)) for by in (by_quantity, by_lens_center))
-    return DotResponse(absorbed, *moved)
+    return DotResponse(
+        absorbed=absorbed,
+        by_quantity=_without(absorbed, by_quantity.reshape(count, -1)),
+        by_lens_center=_without(absorbed, by_lens_center.reshape(count, -1)),
+    )
 
 
 def _without(absorbed: FloatArray, moved: FloatArray) -> FloatArray:
@@ -120,9 +123,12 @@ def _by_bench(
 
     def computed(bench: Rig) -> FloatArray:
         rays = project_rays(bench.laser, bench.pattern)
-        near = rays.directions[at], rays.landing_mm[at], NEWTON_STEPS, bench.imaging_plane.pose_mm
+        directions, landing = rays.directions[at], rays.landing_mm[at]
+        plane = bench.imaging_plane.pose_mm
         met = (
-            ray_kernels.intersect_and_reflect(one.basis.grid, one.coefficients, *near)
+            ray_kernels.intersect_and_reflect(
+                one.basis.grid, one.coefficients, directions, landing, NEWTON_STEPS, plane
+            )
             for one in surfaces
         )
         return np.stack([dots for _, _, dots in met])
@@ -156,9 +162,10 @@ def _by_spline(rig: Rig, surface: SplineSurface, ray: IntArray) -> FloatArray:
     from labapp.core.surface.kernels import solver_kernels
 
     rays, at = project_rays(rig.laser, rig.pattern), tuple(ray.T - 1)
-    grid, direction = surface.basis.grid, rays.directions[at]
-    near = grid, surface.coefficients, direction, rays.landing_mm[at]
-    point, _ = solver_kernels.newton_along_rays(*near, NEWTON_STEPS)
+    direction = rays.directions[at]
+    point, _ = solver_kernels.newton_along_rays(
+        surface.basis.grid, surface.coefficients, direction, rays.landing_mm[at], NEWTON_STEPS
+    )
     x, y = point[:, 0], point[:, 1]
     slope = surface.gradient(x, y)
 

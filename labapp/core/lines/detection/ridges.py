@@ -97,9 +97,8 @@ def find_ridges(frame: Image, scale_px: float = SCALE_PX) -> Ridges:
     def filtered(along_u: FloatArray, along_v: FloatArray) -> Grey:
         return np.asarray(cv2.sepFilter2D(picture, cv2.CV_32F, along_u, along_v))
 
-    smooth, uu, vv, uv = (
-        filtered(*pair) for pair in ((bell, bell), (bend, bell), (bell, bend), (slope, slope))
-    )
+    smooth, uu = filtered(bell, bell), filtered(bend, bell)
+    vv, uv = filtered(bell, bend), filtered(slope, slope)
     noise = robust_sigma(uu[::3, ::3] - np.median(uu[::3, ::3])) + 1e-9
     # Smaller eigenvalue of the Hessian: the strongest curvature of a maximum.
     half, root = (uu + vv) / 2, np.sqrt(((uu - vv) / 2) ** 2 + uv * uv)
