@@ -92,6 +92,17 @@ class Match(ReadOnlyArrays):
 
 
 @dataclass(frozen=True)
+class MatchedDots:
+    """What the fit of a surface needs of a `Match`, whose fields have the same names."""
+
+    ray: IntArray
+    plane_mm: FloatArray
+    plane_covariance_mm2: FloatArray
+    witness: IntArray
+    missing: float = 0.0
+
+
+@dataclass(frozen=True)
 class Candidate:
     """One possible match of a frame whose rows are ambiguous: the marker in one of several holes.
 

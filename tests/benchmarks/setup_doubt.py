@@ -30,6 +30,7 @@ from labapp.core.geometry.perturbation import (
 )
 from labapp.core.geometry.rig import Electrode, Rig
 from labapp.core.geometry.uncertainty import AxisPoints, RigUncertainty, covariance_of
+from labapp.core.match import MatchedDots
 from labapp.core.recording import residual_check
 from labapp.core.recording.dot_response import DotResponse, dot_responses
 from labapp.core.recording.residual_check import FIXED, MOST, Residuals, judge_setup
@@ -90,9 +91,9 @@ def recorded(
         dots = known.axes.calibration.to_plane(image_px[shown] + noise)
         covariance = np.broadcast_to((sigma_px / PX_PER_MM) ** 2 * np.eye(2), (len(ray), 2, 2))
         witness = np.where(shown, 1, np.where(reflections.lit | reflections.absent, 0, -1))
-        arguments = ray, dots, covariance, witness, exact, FitSettings(), near, MISSING
+        match = MatchedDots(ray, dots, covariance, witness, MISSING)
         try:
-            pool_fit = fit_pool(*arguments)
+            pool_fit = fit_pool(match, exact, FitSettings(), near, by_uncertain_heights=True)
         except CannotMeasure as error:
             statuses[error.status] += 1
             near = None

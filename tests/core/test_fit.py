@@ -146,8 +146,7 @@ def test_size_uncertainty_is_the_spread_over_the_posterior(seen: Pool) -> None:
     reflections = trace(seen, OPEN_RIG)
     match = exact_match(reflections, OPEN_RIG, sigma_mm=NOISE_MM, rng=rng)
     reconstruction = fit.reconstruct(match, OPEN_RIG, FitSettings())
-    dots = match.plane_mm, match.plane_covariance_mm2
-    pool = fit_pool(match.ray, *dots, match.witness, OPEN_RIG, FitSettings())
+    pool = fit_pool(match, OPEN_RIG, FitSettings())
     sizes = []
     for _ in range(300):
         half = rng.normal(size=pool.surface.basis.count)

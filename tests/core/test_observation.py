@@ -19,7 +19,7 @@ from tests.scenes import see
 def test_frame_with_failed_fits_is_freed_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     """Hundreds of megabytes once waited for garbage collection where many frames failed."""
 
-    def fails(**_: object) -> None:
+    def fails(*_: object) -> None:
         raise CannotMeasure("no-surface", "it diverges")
 
     monkeypatch.setattr(observation, "fit_pool", fails)

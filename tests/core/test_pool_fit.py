@@ -50,15 +50,7 @@ def level_of(landing: FloatArray, witness: IntArray, spacing: float, sign: int =
 
 
 def fitted(match: Match, **changes: object) -> FittedPool:
-    match = replace(match, **changes)
-    return fit_pool(
-        match.ray,
-        match.plane_mm,
-        match.plane_covariance_mm2,
-        match.witness,
-        OPEN_RIG,
-        FitSettings(),
-    )
+    return fit_pool(replace(match, **changes), OPEN_RIG, FitSettings())
 
 
 @pytest.fixture(scope="module")
@@ -135,16 +127,7 @@ def test_nearby_start_converges_in_fewer_rounds(match: Match) -> None:
     pool, other = fitted(match), fitted(match, plane_mm=match.plane_mm + 0.3)
     settings = replace(FitSettings(), rounds=2)
     from_it, from_flat = (
-        fit_pool(
-            match.ray,
-            match.plane_mm,
-            match.plane_covariance_mm2,
-            match.witness,
-            OPEN_RIG,
-            settings,
-            near,
-        )
-        for near in (other.surface, None)
+        fit_pool(match, OPEN_RIG, settings, near) for near in (other.surface, None)
     )
     error = [np.abs(one.points_mm - pool.points_mm).max() for one in (from_it, from_flat)]
     assert error[0] < 0.002
@@ -288,9 +271,8 @@ def test_laser_ten_times_too_far_away_is_rejected() -> None:
     """The splines would take gigabytes."""
     match = exact_match(trace(POOL, OPEN_RIG), OPEN_RIG)
     far = replace(OPEN_RIG.laser, distance_mm=10 * OPEN_RIG.laser.distance_mm)
-    dots = match.ray, match.plane_mm, match.plane_covariance_mm2, match.witness
     with pytest.raises(CannotMeasure) as caught:
-        fit_pool(*dots, replace(OPEN_RIG, laser=far), FitSettings())
+        fit_pool(match, replace(OPEN_RIG, laser=far), FitSettings())
     assert caught.value.status == "no-surface"
     assert " mm" in caught.value.reason
 

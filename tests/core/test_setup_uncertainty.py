@@ -103,7 +103,7 @@ def test_residual_changes_agree_with_fits_on_perturbed_benches(key: str) -> None
     offset = 0.1 * RIG.uncertainty.root[:, INDEX[key]]
     dots = MATCH.plane_mm, MATCH.plane_covariance_mm2
     pool = fit.solve(MATCH, RIG, SETTINGS)
-    change = residual_changes(MATCH.ray, *dots, RIG, SETTINGS, pool)[..., INDEX[key]]
+    change = residual_changes(MATCH, RIG, SETTINGS, pool)[..., INDEX[key]]
     more, less = (
         fit.solve(
             replace(MATCH, plane_mm=moved_dots(dots[0], RIG, RIG.uncertainty.axes, vector)),

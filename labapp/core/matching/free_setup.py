@@ -17,6 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from labapp.core.geometry.bench import Bench
+from labapp.core.match import MatchedDots
 from labapp.core.matching.hypothesis import (
     STEPS,
     USUAL_KNOTS,
@@ -118,14 +119,10 @@ def with_setup_free(
     at = np.argwhere(labels != UNLABELLED)
     dot = labels[tuple(at.T)]
     sigma = np.repeat(np.sqrt(variance_mm2(observed, dot)), 2)
-    change = residual_changes(
-        ray=at + 1,
-        plane_mm=observed.plane_mm[dot],
-        plane_covariance_mm2=observed.covariance_mm2[dot],
-        rig=observed.rig,
-        settings=USUAL_KNOTS,
-        pool=pool,
-    ).reshape(len(sigma), -1)
+    matched = MatchedDots(
+        at + 1, observed.plane_mm[dot], observed.covariance_mm2[dot], hypothesis.witness
+    )
+    change = residual_changes(matched, observed.rig, USUAL_KNOTS, pool).reshape(len(sigma), -1)
     finite = np.isfinite(change).all(axis=1)  # a ray at the rim may leave the splines
     jacobian = change[finite] / sigma[finite, None]
     rhs = -jacobian.T @ (pool.residual_mm.ravel() / sigma)[finite]

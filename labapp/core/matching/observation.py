@@ -15,6 +15,7 @@ import numpy as np
 from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.rig import Rig
 from labapp.core.images.dots import Dots
+from labapp.core.match import MatchedDots
 from labapp.core.surface.pool_fit import FitSettings, FittedPool, fit_pool
 from labapp.core.values import (
     BoolArray,
@@ -169,16 +170,10 @@ class Observation(ReadOnlyArrays):
         if key not in self._fitted:
             at = np.argwhere(labels != UNLABELLED)
             dot = labels[tuple(at.T)]
+            matched = MatchedDots(at + 1, self.plane_mm[dot], self.covariance_mm2[dot], witness)
+            near = None if initial is None else initial.surface
             try:
-                pool = fit_pool(
-                    ray=at + 1,
-                    plane_mm=self.plane_mm[dot],
-                    plane_covariance_mm2=self.covariance_mm2[dot],
-                    witness=witness,
-                    rig=self.rig,
-                    settings=settings,
-                    initial=None if initial is None else initial.surface,
-                )
+                pool = fit_pool(matched, self.rig, settings, near)
                 if len(self._fitted) % COUNTED_EVERY == 0:
                     self._forget_oldest()
                 self._fitted[key] = pool

@@ -106,16 +106,7 @@ def solve(
         )
     if not (match.witness < 0).any():
         raise CannotMeasure("open-boundary", "no visible ray is missing: the boundary is not seen")
-    pool = fit_pool(
-        ray=match.ray,
-        plane_mm=match.plane_mm,
-        plane_covariance_mm2=match.plane_covariance_mm2,
-        witness=match.witness,
-        rig=rig,
-        settings=settings,
-        initial=initial,
-        missing=match.missing,
-    )
+    pool = fit_pool(match, rig, settings, initial, by_uncertain_heights=True)
     if pool.unsettled_mm > UNSETTLED_MM:
         raise CannotMeasure("no-surface", "the surface does not settle")
     return pool

@@ -23,6 +23,7 @@ import numpy as np
 
 from labapp.core.geometry.optics import ProjectedRays, project_rays
 from labapp.core.geometry.rig import Rig
+from labapp.core.match import Match, MatchedDots
 from labapp.core.surface.level import Level, Rear, Witnesses
 from labapp.core.surface.solver import (
     LevelSearch,
@@ -38,7 +39,6 @@ from labapp.core.values import (
     BoolArray,
     CannotMeasure,
     FloatArray,
-    IntArray,
     ReadOnlyArrays,
     median,
 )
@@ -136,32 +136,27 @@ class FittedPool(ReadOnlyArrays):
 
 
 def fit_pool(
-    ray: IntArray,
-    plane_mm: FloatArray,
-    plane_covariance_mm2: FloatArray,
-    witness: IntArray,
+    match: Match | MatchedDots,
     rig: Rig,
     settings: FitSettings,
     initial: SplineSurface | None = None,
-    missing: float | None = None,
+    *,
+    by_uncertain_heights: bool = False,
 ) -> FittedPool:
     """Fit the surface that reflects each ray to its dot.
 
     Parameters
     ----------
-    ray, plane_mm, plane_covariance_mm2, witness
-        Data of n matched pairs, see `Match`. Without a dark ray in ``witness`` the level is
-        guessed.
+    match
+        The n matched pairs. Without a dark ray in its ``witness`` the level is guessed.
     rig
         The rig.
     settings
         See `FitSettings`.
     initial
         A surface to start from: fewer rounds are needed if it is close. None: z = 0.
-    missing
-        Probability that a ray that came back has no dot (`Match.missing`). None: the level is
-        estimated faster, as if every dot had been found and the slopes determined the surface
-        exactly.
+    by_uncertain_heights
+        Whether rays count less for the level where the surface is uncertain, which takes longer.
 
     Raises
     ------
@@ -170,28 +165,30 @@ def fit_pool(
     """
     from labapp.core.surface.kernels import solver_kernels
 
-    rays, at = project_rays(rig.laser, rig.pattern), tuple(ray.T - 1)
+    rays, at = project_rays(rig.laser, rig.pattern), tuple(match.ray.T - 1)
     points = rays.landing_mm[at]
     basis = basis_around(points[:, :2], rays, settings.knot_mm)
     if basis.count > MOST_SPLINES:
         width, length = basis.high_mm - basis.low_mm
         raise CannotMeasure("no-surface", f"lit rays spread over {width:.0f} × {length:.0f} mm")
-    equations = normal_equations(basis, rig, points, plane_mm, plane_covariance_mm2, settings)
+    equations = normal_equations(
+        basis, rig, points, match.plane_mm, match.plane_covariance_mm2, settings
+    )
     equations.reuse_mm = settings.floor_mm / 50
     if initial is not None:
         points, _ = solver_kernels.newton_along_rays(
             initial.basis.grid, initial.coefficients, rays.directions[at], points, NEWTON_STEPS
         )
     rounds = Rounds(equations, rays.directions[at], np.zeros(basis.count), points, np.inf)
-    witnesses = Witnesses.of(rays, rig.head_sign, witness, basis, missing or 0.0)
+    witnesses = Witnesses.of(rays, rig.head_sign, match.witness, basis, match.missing)
     outer = None if (witnesses.sign < 0).any() else _outer(rays.landing_mm[at][:, :2])
     most, until_mm = settings.rounds, settings.settled_mm
     level = rounds_with_level(rounds, witnesses, most, until_mm, outer=outer)
-    if missing is not None and outer is None:
+    if by_uncertain_heights and outer is None:
         sigma = rounds.height_sigma_mm(witnesses.landing_mm)
         witnesses = replace(witnesses, height_sigma_mm=sigma)
         level = rounds_with_level(rounds, witnesses, most, until_mm, near=level)
-    return fitted_pool(rounds, level, rig, plane_mm)
+    return fitted_pool(rounds, level, rig, match.plane_mm)
 
 
 def normal_equations(

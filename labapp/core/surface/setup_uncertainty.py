@@ -17,7 +17,7 @@ import numpy as np
 from labapp.core.geometry.optics import ProjectedRays, project_rays
 from labapp.core.geometry.perturbation import aimed_as, moved_dots, moved_rig
 from labapp.core.geometry.rig import Rig
-from labapp.core.match import Match
+from labapp.core.match import Match, MatchedDots
 from labapp.core.surface.level import Witnesses
 from labapp.core.surface.pool_fit import FitSettings, FittedPool, normal_equations
 from labapp.core.surface.solver import NormalEquations, height_sigma, normal_factor
@@ -63,7 +63,7 @@ def setup_changes(
         return np.zeros((len(gradient), 0))
     changes = np.zeros((len(gradient), len(known.root)))
     benches = _Perturbed.of(rig, match.plane_mm)
-    equations = _factorised(match.plane_mm, match.plane_covariance_mm2, rig, settings, pool)
+    equations = _factorised(match, rig, settings, pool)
     change = _response(match.ray, equations, pool, benches) / SHARE
     basis, about = pool.surface.basis, (0.0, pool.level.sign, REACH)
     own = project_rays(rig.laser, rig.pattern)
@@ -92,17 +92,12 @@ def setup_changes(
 
 
 def residual_changes(
-    ray: IntArray,
-    plane_mm: FloatArray,
-    plane_covariance_mm2: FloatArray,
-    rig: Rig,
-    settings: FitSettings,
-    pool: FittedPool,
+    match: Match | MatchedDots, rig: Rig, settings: FitSettings, pool: FittedPool
 ) -> FloatArray:
     """Changes of a fit's residuals due to each independent error component of the bench.
 
-    The surface is refitted. Rays, dots and covariance are those of n pairs, see `Match`; the rig
-    must have an uncertainty.
+    The surface is refitted to the n matched pairs; the rig must have an uncertainty. Parameters are
+    those of `setup_changes`.
 
     Returns
     -------
@@ -112,11 +107,11 @@ def residual_changes(
     from labapp.core.surface.kernels import ray_kernels
 
     assert rig.uncertainty is not None
-    at, surface = tuple(ray.T - 1), pool.surface
-    benches = _Perturbed.of(rig, plane_mm)
-    equations = _factorised(plane_mm, plane_covariance_mm2, rig, settings, pool)
-    change = _response(ray, equations, pool, benches)
-    changes = np.zeros((*plane_mm.shape, len(rig.uncertainty.root)))
+    at, surface = tuple(match.ray.T - 1), pool.surface
+    benches = _Perturbed.of(rig, match.plane_mm)
+    equations = _factorised(match, rig, settings, pool)
+    change = _response(match.ray, equations, pool, benches)
+    changes = np.zeros((*match.plane_mm.shape, len(rig.uncertainty.root)))
     for number, k in enumerate(benches.columns):
         rays, plane = benches.rays[number], benches.planes[number]
         directions, landing = rays.directions[at], rays.landing_mm[at]
@@ -173,15 +168,11 @@ class _Perturbed(ReadOnlyArrays):
 
 
 def _factorised(
-    plane_mm: FloatArray,
-    plane_covariance_mm2: FloatArray,
-    rig: Rig,
-    settings: FitSettings,
-    pool: FittedPool,
+    match: Match | MatchedDots, rig: Rig, settings: FitSettings, pool: FittedPool
 ) -> NormalEquations:
     """Normal equations with a factor for the final reflection points (see `SHARE`)."""
     basis, points = pool.surface.basis, pool.points_mm
-    own = normal_equations(basis, rig, points, plane_mm, plane_covariance_mm2, settings)
+    own = normal_equations(basis, rig, points, match.plane_mm, match.plane_covariance_mm2, settings)
     own.factor = normal_factor(basis, own.stiffness, points, own.weights)
     return own
 
