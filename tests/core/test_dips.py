@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from labapp.core.geometry.bench import Bench
-from labapp.core.matching import unexplained
+from labapp.core.matching import decision, unexplained
 from labapp.core.matching.decision import decide
 from labapp.core.matching.hypothesis import Hypothesis, evaluate, shifted_labels
 from labapp.core.matching.match_settings import MatchSettings
@@ -17,8 +17,9 @@ from labapp.core.schemes import fit
 from labapp.core.schemes.fit import FitSettings
 from labapp.core.surface.measures import measure_surface
 from labapp.core.values import CannotMeasure, IntArray
+from labapp.simulation.pools import egg
 from tests.benchmarks.dips import draw, matched, measure_pool
-from tests.scenes import BENCH_RIG, BENCH_VIEW, FRAME_SHAPE, SeenDots
+from tests.scenes import BENCH_RIG, BENCH_VIEW, FRAME_SHAPE, SeenDots, see
 
 SHIFTED = 37
 """A pool that was once matched with every ray a row off."""
@@ -164,6 +165,19 @@ def test_false_dot_near_a_predicted_dot_at_the_rim_gets_no_ray() -> None:
 def test_three_missing_dots_at_a_corner_are_no_row() -> None:
     got = measure_pool(*draw(52040, missing=6, false=3))
     assert (got.status, got.wrong) == ("ok", 0)
+
+
+def test_rows_are_beyond_doubt_only_if_the_surface_fits_the_dots() -> None:
+    seen = see(egg(5.8, 2.6, 3.2, 0.28), np.random.default_rng(1))
+    observed, labels = observation_of(seen)
+    fits, margin = evaluated(observed, labels), MatchSettings().margin
+    assert (fits.label_count, fits.missed_count) == (len(observed.plane_mm), 0)
+    assert decision._beyond_doubt(observed, fits, margin)
+    noise_mm = np.random.default_rng(2).normal(0.0, 0.15, observed.plane_mm.shape)
+    moved = replace(observed, plane_mm=observed.plane_mm + noise_mm)
+    doubtful = evaluated(moved, labels)
+    assert (doubtful.missed_count, doubtful.marker) == (0, "dark")
+    assert not decision._beyond_doubt(moved, doubtful, margin)
 
 
 def test_wrong_rows_need_a_rougher_surface() -> None:
