@@ -9,6 +9,7 @@ from labapp.core.surface import measures
 from labapp.core.surface.boundary import Boundary
 from labapp.core.surface.boundary_trace import retrace_boundary
 from labapp.core.surface.level import Level, Rear
+from labapp.core.surface.shape import shape_and_gradients
 from labapp.core.surface.sizes import Sizes, sizes_and_gradients
 from labapp.core.surface.spline import SplineBasis, SplineSurface
 from labapp.core.values import FloatArray
@@ -66,3 +67,29 @@ def test_derivatives_agree_with_differences(drop_mm: float) -> None:
         more, less = (measured(splines + sign * change, level)[0].size for sign in (1, -1))
         error = sizes.gradient[:, spline] - (more - less) / (2 * step)
         assert np.abs(np.delete(error, DEPTH)).max() < 2e-3
+
+
+@pytest.mark.parametrize(
+    ("sign", "drop_mm", "most"), [(1, 0.0, 0.02), (1, 0.05, 0.1), (-1, 0.0, 0.02)]
+)
+@pytest.mark.parametrize("dent_mm", [0.0, 0.2])
+def test_shape_follows_its_derivatives(
+    sign: int, drop_mm: float, most: float, dent_mm: float
+) -> None:
+    """The kink of the boundary where a low rear begins is neglected."""
+    level = Level(0.0, 0.001, sign, Rear(drop_mm, -1.0, -3.2), 0.0)
+
+    def shape(splines: FloatArray) -> tuple[FloatArray, FloatArray]:
+        boundary = Boundary.polar(CENTER, np.full(360, 3.0))
+        for _ in range(4):
+            boundary, slope = retrace_boundary(BASIS, splines, level, CENTER, boundary)
+        return shape_and_gradients(BASIS, splines, boundary, slope)
+
+    splines, rng = sign * coefficients(dent_mm), np.random.default_rng(8)
+    gradient = shape(splines)[1]
+    assert gradient.shape == (3, BASIS.count)
+    for _ in range(4):
+        change = 1e-5 * rng.normal(size=BASIS.count)
+        moved = (shape(splines + change)[0] - shape(splines - change)[0]) / 2
+        usual = 1e-5 * np.linalg.norm(gradient, axis=1)
+        assert (np.abs(moved - gradient @ change) < most * usual).all()
