@@ -258,6 +258,18 @@ def test_dots_with_wrong_rays_are_rejected(match: Match, seed: int) -> None:
     assert rejected_status(replace(match, plane_mm=match.plane_mm[shuffled])) in STATUSES
 
 
+@pytest.mark.parametrize("off_mm", [0.02, -0.08, 0.3])
+def test_level_is_found_wherever_the_search_begins(off_mm: float) -> None:
+    landing, witness = rays_landing(0.45)
+    height, slope = dome().height_and_gradient(*landing.T)
+    seen = np.stack([height, 0 * height]), slope, landing[:, 1], witness
+    known = find_level(*seen, np.array([0.45, 0.45]))
+    about = known.shift_mm + off_mm, known.sign, 0.3
+    found = find_level(*seen, np.array([0.45, 0.45]), about=about)
+    assert found.shift_mm == pytest.approx(known.shift_mm, abs=0.2 * known.sigma_mm)
+    assert found.sigma_mm == pytest.approx(known.sigma_mm, rel=0.2)
+
+
 def test_single_row_of_lit_rays_has_a_level() -> None:
     height, slope = np.array([0.1, 0.2, 0.1, -0.1, -0.1]), np.full((5, 2), 0.1)
     y, witness = np.array([1.0, 1.0, 1.0, 2.0, 0.0]), np.array([1, 1, 1, -1, -1])

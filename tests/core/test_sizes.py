@@ -70,7 +70,7 @@ def test_derivatives_agree_with_differences(drop_mm: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("sign", "drop_mm", "most"), [(1, 0.0, 0.02), (1, 0.05, 0.1), (-1, 0.0, 0.02)]
+    ("sign", "drop_mm", "most"), [(1, 0.0, 0.01), (1, 0.05, 0.1), (-1, 0.0, 0.01)]
 )
 @pytest.mark.parametrize("dent_mm", [0.0, 0.2])
 def test_shape_follows_its_derivatives(
@@ -88,7 +88,7 @@ def test_shape_follows_its_derivatives(
     splines, rng = sign * coefficients(dent_mm), np.random.default_rng(8)
     gradient = shape(splines)[1]
     assert gradient.shape == (3, BASIS.count)
-    for _ in range(4):
+    for _ in range(8):
         change = 1e-5 * rng.normal(size=BASIS.count)
         moved = (shape(splines + change)[0] - shape(splines - change)[0]) / 2
         usual = 1e-5 * np.linalg.norm(gradient, axis=1)
