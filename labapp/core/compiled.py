@@ -163,7 +163,7 @@ def _announce() -> None:
     # Once per process, however many files it compiles.
     logging.getLogger(NOTICES).warning(
         "First use of this version: labapp is being compiled for this computer's processor. "
-        "This takes one to two minutes and is done once."
+        "This takes two to four minutes and is done once."
     )
 
 

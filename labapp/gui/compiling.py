@@ -9,7 +9,7 @@ from pathlib import Path
 
 from labapp.gui.tasks import Control
 
-TITLE = "First use: compiling for this computer, one to two minutes"
+TITLE = "First use: compiling for this computer, two to four minutes"
 
 POLL_S = 0.2
 
