@@ -199,10 +199,7 @@ def _response(
 
 
 def perturbed(rig: Rig, offset: FloatArray, plane_mm: FloatArray) -> tuple[Rig, FloatArray]:
-    """Perturb the quantities of a rig by an offset, shape (q,), and the dots on its plane, mm.
-
-    Dots have shape (n, 2).
-    """
+    """Perturb the quantities of a rig by an offset, (q,), and the dots on its plane, (n, 2), mm."""
     assert rig.uncertainty is not None
     dots = moved_dots(plane_mm, rig, rig.uncertainty.axes, offset)
     return aimed_as(rig.laser, moved_rig(rig, offset)), dots

@@ -30,7 +30,6 @@ NEAR_RISES = 3.0
 FACTORS = 500
 """Twice so many factors of at most 2 have a product that does not overflow."""
 
-
 SCAN_LEVELS = 300
 """Number of levels that are tried if no estimate is given."""
 
