@@ -14,12 +14,13 @@ from labapp.core.geometry.optics import intersect_imaging_plane, reflect, surfac
 from labapp.core.geometry.rig import ImagingPlane
 from labapp.core.match import Match
 from labapp.core.schemes import fit
-from labapp.core.surface.level import Level, find_level
+from labapp.core.surface.level import Level
 from labapp.core.surface.pool_fit import FitSettings, FittedPool, fit_pool
 from labapp.core.surface.spline import SplineBasis, SplineSurface
 from labapp.core.values import CannotMeasure, FloatArray, IntArray
 from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.pools import Pool, egg, spherical_cap
+from tests.levels import find_level
 from tests.scenes import OPEN_RIG
 
 RADIUS = 3.0

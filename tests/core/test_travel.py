@@ -11,10 +11,10 @@ from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser,
 from labapp.core.pipeline import Settings, reconstruct
 from labapp.core.schemes import ers
 from labapp.core.surface.boundary import EdgePoints, piecewise
-from labapp.core.surface.level import find_level
 from labapp.core.surface.measures import measure_surface
 from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.pools import Footprint, LowRear, Pool, egg
+from tests.levels import find_level
 
 RIG = Rig(Laser(31.14, 31.48), DotPattern(), Electrode(5.0), ImagingPlane.vertical(50, 45, 3))
 BACK = replace(RIG, travel="-y")

@@ -176,8 +176,8 @@ def _inside(observed: Observation, fitted: FittedLabels, missing: float) -> Floa
     """Probability that each of the n labelled rays landed inside the boundary, shape (n,).
 
     It is 1 for rays between other lit rays and at most 1/2 for the others. If such a ray seems to
-    land outside, the probability is that of the model of `level.find_level`, marginalised over the
-    levels and blurs that the other rays allow.
+    land outside, the probability is that of the model of `level_kernels.find_level`, marginalised
+    over the levels and blurs that the other rays allow.
     """
     from labapp.core.matching import match_kernels
     from labapp.core.surface.kernels import spline_kernels

@@ -149,29 +149,6 @@ class Witnesses(ReadOnlyArrays):
             known &= basis.contains(landing[..., 0], landing[..., 1])
         return cls(landing[known], witness[known], rays.spacing_mm, head_sign, missing)
 
-    def level(
-        self,
-        basis: SplineBasis,
-        coefficients: FloatArray,
-        drop_mm: float | None = None,
-        about: tuple[float, int, float] | None = None,
-    ) -> Level:
-        """Find the level of a spline surface (`find_level`)."""
-        from labapp.core.surface.kernels import spline_kernels
-
-        there = spline_kernels.surface_at(basis.grid, coefficients, self.landing_mm)
-        sigma = self.height_sigma_mm
-        return find_level(
-            height=np.stack([there[0], np.zeros(len(there[0])) if sigma is None else sigma]),
-            slope=there[1:].T,
-            y=self.landing_mm[:, 1],
-            witness=self.sign,
-            spacing_mm=self.spacing_mm,
-            rear=(self.head_sign, drop_mm),
-            about=about,
-            missing=self.missing,
-        )
-
     def negative_log_evidence(
         self, basis: SplineBasis, coefficients: FloatArray, level: Level
     ) -> float:
@@ -192,50 +169,3 @@ class Witnesses(ReadOnlyArrays):
             self.missing,
             level_kernels.BLURS,
         )
-
-
-def find_level(
-    height: FloatArray,
-    slope: FloatArray,
-    y: FloatArray,
-    witness: IntArray,
-    spacing_mm: FloatArray,
-    rear: tuple[int, float | None] = (1, None),
-    about: tuple[float, int, float] | None = None,
-    missing: float = 0.0,
-) -> Level:
-    """Find the level at which lit rays land inside the boundary and dark ones outside.
-
-    A ray that lands a distance d inside the boundary came back with probability
-    1/(1 + exp(−d/s)), and then has a dot unless that is missing. The posterior of level, blur s and
-    drop of the rear is evaluated on a grid, which gives mean and standard deviation of the level.
-    An uncertain height widens s for that ray.
-
-    Parameters
-    ----------
-    height, slope
-        Heights, up to the level, and their standard uncertainty, shape (2, m), mm, and gradients of
-        the surface, shape (m, 2), at the landing points of m witnesses on z = 0.
-    y
-        Y of the landing points, shape (m,), mm.
-    witness
-        +1 lit, −1 dark, shape (m,).
-    spacing_mm
-        Distance between neighbouring landing points along X and along Y, shape (2,), mm.
-    rear
-        +1 where the head lies towards +Y and the rear towards −Y, −1 for the reverse
-        (`Rig.head_sign`); and the depth of the rear, mm, or None to find it along with the level.
-    about
-        Initial estimate of the level: its shift, mm, its sign, and the reach of the search in
-        rises, the typical change of the height from one ray to the next. If the ends of the grid
-        are likely, a wider one is searched. None: all levels are tried.
-    missing
-        Probability that a ray that came back has no dot (`Match.missing`).
-    """
-    from labapp.core.surface.kernels import level_kernels
-
-    head_sign, drop_mm = rear
-    depth = np.array([head_sign, np.nan if drop_mm is None else drop_mm])
-    around = np.array([0.0, 1.0, np.nan] if about is None else about, float)
-    found = level_kernels.find_level(height, slope, y, witness, spacing_mm, depth, around, missing)
-    return Level.of(found)

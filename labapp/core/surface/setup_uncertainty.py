@@ -10,7 +10,7 @@ the bench perturbed by plus and minus one standard uncertainty, and half the dif
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -18,7 +18,6 @@ from labapp.core.geometry.optics import ProjectedRays, project_rays
 from labapp.core.geometry.perturbation import aimed_as, moved_dots, moved_rig
 from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match, MatchedDots
-from labapp.core.surface.level import Witnesses
 from labapp.core.surface.pool_fit import FitSettings, FittedPool, normal_equations
 from labapp.core.surface.solver import NormalEquations, height_sigma, normal_factor
 from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
@@ -58,6 +57,8 @@ def setup_changes(
         Shape (m, q), in the units of the sizes, one column per column of `RigUncertainty.root`; q
         is 0 if the rig is known exactly.
     """
+    from labapp.core.surface.kernels import setup_kernels
+
     known = rig.uncertainty
     if known is None:
         return np.zeros((len(gradient), 0))
@@ -65,29 +66,21 @@ def setup_changes(
     benches = _Perturbed.of(rig, match.plane_mm)
     equations = _factorised(match, rig, settings, pool)
     change = _response(match.ray, equations, pool, benches) / SHARE
-    basis, about = pool.surface.basis, (0.0, pool.level.sign, REACH)
-    own = project_rays(rig.laser, rig.pattern)
-    x, y = own.landing_mm[..., 0], own.landing_mm[..., 1]
-    seen = (match.witness != 0) & basis.contains(x, y)
+    basis, level, own = pool.surface.basis, pool.level, project_rays(rig.laser, rig.pattern)
+    seen = (match.witness != 0) & basis.contains(own.landing_mm[..., 0], own.landing_mm[..., 1])
     landing, mean = own.landing_mm[seen], pool.mean_splines
     assert equations.factor is not None
-    witnesses = Witnesses(
-        landing_mm=landing,
-        sign=match.witness[seen],
-        spacing_mm=own.spacing_mm,
-        head_sign=rig.head_sign,
-        missing=match.missing,
-        height_sigma_mm=height_sigma(basis, equations.factor, equations.inverse, mean, landing),
+    sigma = height_sigma(basis, equations.factor, equations.inverse, mean, landing)
+    raised = setup_kernels.level_changes(
+        basis.grid,
+        pool.surface.coefficients,
+        change,
+        (landing, match.witness[seen], sigma, own.spacing_mm),
+        np.reshape([rays.landing_mm[seen] - landing for rays in benches.rays], (-1, *landing.shape))
+        / SHARE,
+        np.array([rig.head_sign, level.rear.drop_mm, level.sign, REACH, match.missing]),
     )
-    for k, by, rays in zip(benches.columns, change, benches.rays, strict=True):
-        aside = (rays.landing_mm[seen] - landing) / SHARE
-        more, less = (
-            replace(witnesses, landing_mm=landing + way * aside)
-            .level(basis, pool.surface.coefficients + way * by, pool.level.rear.drop_mm, about)
-            .shift_mm
-            for way in (1.0, -1.0)
-        )
-        changes[:, k] = gradient @ (by + (more - less) / 2)
+    changes[:, benches.columns] = gradient @ (change + raised[:, None]).T
     return changes
 
 

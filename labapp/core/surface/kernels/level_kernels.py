@@ -30,8 +30,9 @@ NEAR_RISES = 3.0
 FACTORS = 500
 """Twice so many factors of at most 2 have a product that does not overflow."""
 
-SCAN_LEVELS = 300
-"""Number of levels that are tried if no estimate is given."""
+SCAN_LEVELS, SCANNED_REACH = 300, 0.6
+"""Number of levels that are tried if no estimate is given, and reach of the search around the best
+of them."""
 
 MOST_AT_ENDS, MOST_AT_FAR_ENDS = 1e-6, 0.02
 """A wider grid is searched if the probability at the ends of the grid exceeds this: the first for a
@@ -124,7 +125,19 @@ def _add_witnesses(
             factors[:] = 1.0
 
 
-@_compiled(_f2, _f1, types.Array(types.boolean, 1, "A", readonly=True), _f1, _f, _levels, _f1)
+@_inner
+def _total(sums: tuple[FloatArray, FloatArray, FloatArray]) -> FloatArray:
+    """Nats of each level from the sums of `_add_witnesses`."""
+    nats, factors, lines = sums
+    total, start, slope = np.empty(len(nats)), 0.0, 0.0
+    for k in range(len(nats)):
+        start, slope = start + lines[0, k], slope + lines[1, k]
+        added = np.log(factors[0, k] / factors[1, k]) + start + k * slope
+        total[k] = max(nats[k] + added, 0.0)  # rounded
+    return total
+
+
+@_compiled(_f2, _f1, types.Array(types.boolean, 1, "A", readonly=True), _f1, _f, _levels, _f2)
 def level_negative_log_likelihood(
     over: FloatArray,
     side: FloatArray,
@@ -157,32 +170,31 @@ def level_negative_log_likelihood(
     levels
         The first, mm, the step to the next, above 0, and how many.
     blurs
-        In spacings of the rays, shape (b,).
+        In ascending order, in spacings of the rays, and −log of their priors, shape (2, b).
 
     Returns
     -------
     FloatArray
-        Nats, shape (d, b, count).
+        Nats, shape (d, b, count); infinite for blurs that are negligible at all levels.
     """
-    made, count = np.empty((len(over), len(blurs), levels[2])), levels[2]
+    made, count = np.full((len(over), blurs.shape[1], levels[2]), np.inf), levels[2]
     is_same = np.ones(len(side), np.bool_)
     for d in range(1, len(over)):
         is_same &= over[d] == over[0]
     # Rays at the head lie as high whatever the drop: their terms are added once.
     same, others = np.flatnonzero(is_same), np.flatnonzero(~is_same)
-    for b in range(len(blurs)):
-        sharp = side / np.sqrt(blurs[b] * blurs[b] + spread)
+    least = np.inf
+    for b in range(blurs.shape[1] - 1, -1, -1):
+        sharp = side / np.sqrt(blurs[0, b] * blurs[0, b] + spread)
         common = np.zeros(count), np.ones((2, count)), np.zeros((2, count + 1))
         _add_witnesses(common, same, over[0], sharp, dark, missing, levels)
+        if len(over) > 1 and _total(common).min() + blurs[1, b] > least + FARTHEST:
+            continue  # the other rays can only add to it
         for d in range(len(over)):
-            total, factors, lines = made[d, b], common[1].copy(), common[2].copy()
-            total[:] = common[0]
-            _add_witnesses((total, factors, lines), others, over[d], sharp, dark, missing, levels)
-            start, slope = 0.0, 0.0
-            for k in range(count):
-                start, slope = start + lines[0, k], slope + lines[1, k]
-                total[k] += np.log(factors[0, k] / factors[1, k]) + start + k * slope
-                total[k] = max(total[k], 0.0)  # rounded
+            sums = common[0].copy(), common[1].copy(), common[2].copy()
+            _add_witnesses(sums, others, over[d], sharp, dark, missing, levels)
+            made[d, b] = _total(sums)
+            least = min(least, made[d, b].min() + blurs[1, b])
     return made
 
 
@@ -254,7 +266,7 @@ def rises_of(slope: FloatArray, spacing: FloatArray) -> tuple[FloatArray, float]
     return np.maximum(rises, usual / 4.0), usual
 
 
-@_compiled(_f2, _f2, _i1, _f1, _i, _f1)
+@_compiled(_f2, _f2, _i1, _f1, _i, _f2)
 def scan_levels(
     height: FloatArray,
     slope: FloatArray,
@@ -265,7 +277,7 @@ def scan_levels(
 ) -> tuple[float, int]:
     """Shift, mm, and sign with the largest likelihood, among ``count`` shifts and with one blur.
 
-    The first four arguments are those of `level.find_level`.
+    The first four arguments are those of `find_level`.
     """
     rises, _ = rises_of(slope, spacing)
     over, first, exact = height[:1].copy(), -height[0].max(), np.zeros(height.shape[1])
@@ -307,7 +319,7 @@ def search_level(
     Parameters
     ----------
     height, slope, y, witness, spacing
-        See `level.find_level`.
+        See `find_level`.
     search
         Sign of the head's side, the level in the middle, mm, its sign, how far levels reach from
         there, in rises, the probability that a dot is missing, and −log of the prior of every drop
@@ -350,7 +362,7 @@ def search_level(
     count = int(np.rint(STEPS_A_REACH * reach)) + 1
     first, step = shift - reach * usual, 2.0 * reach * usual / (count - 1)
     levels = first, step, count
-    nats = level_negative_log_likelihood(over, side, dark, spread, missing, levels, blurs[0])
+    nats = level_negative_log_likelihood(over, side, dark, spread, missing, levels, blurs)
     drop, mean, sigma, at_ends = level_posterior(nats, blurs[1], sunk, drops, first, step)
     rear = head_sign * start, head_sign * end
     return np.array([mean, sigma, drop, *rear, at_ends, nats.min(), usual]), len(near)
@@ -367,10 +379,33 @@ def find_level(
     about: FloatArray,
     missing: float,
 ) -> FloatArray:
-    """Find the level of a surface.
+    """Find the level at which lit rays land inside the boundary and dark ones outside.
 
-    The arguments are those of `level.find_level`, with NaN for a drop to be found, and for the
-    reach if all levels are tried.
+    A ray that lands a distance d inside the boundary came back with probability
+    1/(1 + exp(−d/s)), and then has a dot unless that is missing. The posterior of level, blur s and
+    drop of the rear is evaluated on a grid, which gives mean and standard deviation of the level.
+    An uncertain height widens s for that ray.
+
+    Parameters
+    ----------
+    height, slope
+        Heights, up to the level, and their standard uncertainty, shape (2, m), mm, and gradients of
+        the surface, shape (m, 2), at the landing points of m witnesses on z = 0.
+    y
+        Y of the landing points, shape (m,), mm.
+    witness
+        +1 lit, −1 dark, shape (m,).
+    spacing
+        Distance between neighbouring landing points along X and along Y, shape (2,), mm.
+    rear
+        +1 where the head lies towards +Y and the rear towards −Y, −1 for the reverse
+        (`Rig.head_sign`); and the depth of the rear, mm, or NaN to find it along with the level.
+    about
+        Initial estimate of the level: its shift, mm, its sign, and the reach of the search in
+        rises, the typical change of the height from one ray to the next. If the ends of the grid
+        are likely, a wider one is searched. A reach of NaN: all levels are tried.
+    missing
+        Probability that a ray that came back has no dot (`Match.missing`).
 
     Returns
     -------
@@ -379,13 +414,11 @@ def find_level(
         least −log likelihood, number of rays, and usual rise, mm (`level.Level`), shape (9,).
     """
     (head_sign, drop), (shift, sign, reach) = rear, about
+    is_tried = False
     while True:
-        is_tried = np.isnan(reach)
-        if is_tried:
-            scanned, side = scan_levels(
-                height, slope, witness, spacing, SCAN_LEVELS, BLUR_WIDTHS[-1:]
-            )
-            shift, sign, reach = scanned, float(side), 1.0
+        if np.isnan(reach):
+            scanned, side = scan_levels(height, slope, witness, spacing, SCAN_LEVELS, BLURS[:, -1:])
+            shift, sign, reach, is_tried = scanned, float(side), SCANNED_REACH, True
         # Only pools above the work piece have been observed to sink at the rear.
         drops = np.array([0.0 if np.isnan(drop) else drop])
         if np.isnan(drop) and sign > 0.0:
@@ -393,9 +426,10 @@ def find_level(
         search = np.array([head_sign, shift, sign, reach, missing, SUNK_COST])
         found, rays = search_level(height, slope, y, witness, spacing, search, drops, BLURS)
         mean, sigma, sunk, start, end, at_ends, least, usual = found
-        if is_tried or not at_ends > (MOST_AT_ENDS if reach < 1.0 else MOST_AT_FAR_ENDS):
+        is_wide = reach >= 1.0
+        if (is_tried and is_wide) or not at_ends > (MOST_AT_FAR_ENDS if is_wide else MOST_AT_ENDS):
             return np.array([mean, sigma, sign, sunk, start, end, least, float(rays), usual])
-        reach = 1.0 if reach < 1.0 else np.nan
+        reach = np.nan if is_wide else 1.0
 
 
 @_compiled(_f1, _f2, _i1, _f1, _f1, _f, _f, _f2)
@@ -413,7 +447,7 @@ def negative_log_evidence(
 
     ``rear`` is the height of the boundary at the m landing points, shape (m,), mm. ``blurs`` is
     that of `search_level`, ``height`` is taken as exact, shape (m,), mm, and the others are those
-    of `level.find_level`. A constant is omitted.
+    of `find_level`. A constant is omitted.
     """
     rises, usual = rises_of(slope, spacing)
     near = np.flatnonzero(np.abs(height) < NEAR_RISES * rises)
@@ -425,7 +459,7 @@ def negative_log_evidence(
         side[m], dark[m] = sign * witness[at] / rises[at], witness[at] < 0
     exact = np.zeros(len(near))
     levels = -usual, usual / STEPS_A_REACH, 2 * STEPS_A_REACH + 1
-    nats = level_negative_log_likelihood(over, side, dark, exact, missing, levels, blurs[0])
+    nats = level_negative_log_likelihood(over, side, dark, exact, missing, levels, blurs)
     least, total = np.inf, 0.0
     for b in range(blurs.shape[1]):
         least = min(least, nats[0, b].min() + blurs[1, b])

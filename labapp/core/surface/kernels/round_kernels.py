@@ -24,9 +24,9 @@ _fit = types.Tuple((_lower, _f2, _f3, _f1, _f2, _f2))  # type: ignore[no-untyped
 _state = types.Tuple((_f1, _f1, _f2, _lower))  # type: ignore[no-untyped-call]
 _witnesses = types.Tuple((_b1, _f2, _i1, _f1, _f1))  # type: ignore[no-untyped-call]
 
-FIRST_REACH, LEVEL_REACH = 0.4, 0.3
-"""Reach of the search for the level (`find_level`) around that of a given surface, and around that
-of the previous round."""
+FIRST_REACH, LEVEL_REACH, REACH_SIGMAS = 0.4, 0.3, 6.0
+"""Least reach of the search for the level (`find_level`) around that of a given surface, and around
+that of the previous round; and the reach in σ of the level, if that is larger."""
 
 
 @_inner
@@ -52,6 +52,8 @@ def _level_of_round(
     height = np.empty((2, len(sign)))
     height[0], height[1] = there[0], sigma
     reach = LEVEL_REACH if count else FIRST_REACH
+    if level[8] > 0.0:
+        reach = min(max(reach, REACH_SIGMAS * level[1] / level[8]), 1.0)
     about = np.array([0.0, level[2], reach if count or is_near != 0.0 else np.nan])
     rear = np.array([head_sign, level[3] if is_held else np.nan])
     seen = height, there[1:].T, landing[:, 1], sign, spacing

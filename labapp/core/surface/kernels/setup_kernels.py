@@ -1,4 +1,4 @@
-"""Response of a fitted surface to a slightly perturbed bench, compiled (docs/adr/0018).
+"""Response of a fitted surface and of its level to a perturbed bench, compiled (docs/adr/0018).
 
 Arguments mean the same as in `solver_kernels`.
 """
@@ -9,15 +9,18 @@ import numpy as np
 from numba import types
 
 from labapp.core.compiled import compiled as _compiled
+from labapp.core.surface.kernels.level_kernels import find_level
 from labapp.core.surface.kernels.solver_kernels import gradient_rhs, newton_along_rays, solve
 from labapp.core.surface.kernels.spline_kernels import surface_at
-from labapp.core.values import FloatArray
+from labapp.core.values import FloatArray, IntArray
 
 _f, _i = types.float64, types.int64
 _f1, _f2, _f3 = (types.Array(_f, n, "A", readonly=True) for n in (1, 2, 3))
 _lower = types.Array(_f, 2, "F", readonly=True)
 _own = types.Tuple((_f1, _f2, _f2))  # type: ignore[no-untyped-call]
 _moved = types.Tuple((_f2, _f3, _f3, _f3))  # type: ignore[no-untyped-call]
+_i1 = types.Array(_i, 1, "A", readonly=True)
+_witnesses = types.Tuple((_f2, _i1, _f1, _f1))  # type: ignore[no-untyped-call]
 
 
 @_compiled(_f2, _f1, _lower, _f2, _f3, _own, _moved, _i)
@@ -70,3 +73,52 @@ def coefficient_changes(
             # Slopes do not determine the level.
             changes[k] = change - surface_at(grid, change, there)[0].mean()
     return changes
+
+
+@_compiled(_f2, _f1, _f2, _witnesses, _f3, _f1)
+def level_changes(
+    grid: FloatArray,
+    coefficients: FloatArray,
+    changes: FloatArray,
+    witnesses: tuple[FloatArray, IntArray, FloatArray, FloatArray],
+    aside: FloatArray,
+    search: FloatArray,
+) -> FloatArray:
+    """Changes of the level for q perturbed benches, shape (q,), mm.
+
+    The level responds in steps: half the difference between the bench perturbed one way and the
+    other is used.
+
+    Parameters
+    ----------
+    grid, coefficients
+        The surface.
+    changes
+        Changes of its coefficients (`coefficient_changes`), shape (q, p), mm.
+    witnesses
+        Landing points, shape (m, 3), signs, shape (m,), and uncertainty of the height there, shape
+        (m,), of the witnesses, and the spacing of the rays, shape (2,) (`level.Witnesses`).
+    aside
+        Displacements of the landing points on each bench, shape (q, m, 3), mm.
+    search
+        Side of the head, drop of the rear, sign of the pool, reach of the search in rises, and
+        share of missing dots.
+    """
+    landing, sign, sigma, spacing = witnesses
+    head_sign, drop, side, reach, missing = search
+    rear, about = np.array([head_sign, drop]), np.array([0.0, side, reach])
+    height, levels = np.empty((2, len(sign))), np.empty(len(changes))
+    height[1] = sigma
+    for k in range(len(changes)):
+        shifts = np.empty(2)
+        for n in range(2):
+            way = 1.0 - 2.0 * n
+            places = landing + way * aside[k]
+            there = surface_at(grid, coefficients + way * changes[k], places)
+            height[0] = there[0]
+            found = find_level(
+                height, there[1:].T, places[:, 1], sign, spacing, rear, about, missing
+            )
+            shifts[n] = found[0]
+        levels[k] = (shifts[0] - shifts[1]) / 2.0
+    return levels
