@@ -9,6 +9,7 @@ import numpy as np
 from labapp.core.geometry.coordinates import ImageCalibration
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.images.dots import Dots
+from labapp.core.matching.observation import UNLABELLED
 from labapp.core.values import FloatArray, IntArray
 from labapp.simulation.forward import PoolSurface, Reflections, trace
 
@@ -73,6 +74,14 @@ def see(
     image = np.concatenate([image, stray])
     ray = np.concatenate([ray, np.zeros((false, 2), np.int64)])
     return SeenDots(as_dots(image, sigma_px), ray)
+
+
+def true_labels(seen: SeenDots) -> IntArray:
+    """Return the index of each ray's dot, or `UNLABELLED`, shape (rows, columns)."""
+    labels = np.full((BENCH_RIG.pattern.rows, BENCH_RIG.pattern.columns), UNLABELLED, np.int64)
+    dot = np.flatnonzero(seen.ray[:, 0] > 0)
+    labels[seen.ray[dot, 0] - 1, seen.ray[dot, 1] - 1] = dot
+    return labels
 
 
 def visible_dots(reflections: Reflections) -> tuple[FloatArray, IntArray]:

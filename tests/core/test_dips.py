@@ -19,7 +19,7 @@ from labapp.core.surface.measures import measure_surface
 from labapp.core.values import CannotMeasure, IntArray
 from labapp.simulation.pools import egg
 from tests.benchmarks.dips import draw, matched, measure_pool
-from tests.scenes import BENCH_RIG, BENCH_VIEW, FRAME_SHAPE, SeenDots, see
+from tests.scenes import BENCH_RIG, BENCH_VIEW, FRAME_SHAPE, SeenDots, see, true_labels
 
 SHIFTED = 37
 """A pool that was once matched with every ray a row off."""
@@ -42,13 +42,6 @@ def observation_of(seen: SeenDots) -> tuple[Observation, IntArray]:
     """Return the observation, and the true labels."""
     bench = Bench(BENCH_RIG, BENCH_VIEW)
     return Observation.of(seen.dots, bench, FRAME_SHAPE), true_labels(seen)
-
-
-def true_labels(seen: SeenDots) -> IntArray:
-    labels = np.full((BENCH_RIG.pattern.rows, BENCH_RIG.pattern.columns), UNLABELLED, np.int64)
-    dot = np.flatnonzero(seen.ray[:, 0] > 0)
-    labels[seen.ray[dot, 0] - 1, seen.ray[dot, 1] - 1] = dot
-    return labels
 
 
 def evaluated(observed: Observation, labels: IntArray) -> Hypothesis:

@@ -203,15 +203,32 @@ def test_pair_deviances_are_those_of_normal_distributions() -> None:
             np.testing.assert_allclose(distance[n, m], excess, rtol=1e-9)
 
 
-def test_two_least_agrees_with_sorting() -> None:
-    values = random().integers(0, 40, (9, 7)).astype(float)  # with duplicates
-    column, next_in_row, row, next_in_column = match_kernels.two_least(values)
-    np.testing.assert_array_equal(column, values.argmin(axis=1))
-    np.testing.assert_array_equal(row, values.argmin(axis=0))
-    np.testing.assert_array_equal(next_in_row, np.sort(values, axis=1)[:, 1])
-    np.testing.assert_array_equal(next_in_column, np.sort(values, axis=0)[1])
-    assert np.isinf(match_kernels.two_least(values[:1])[3]).all()
-    assert np.isinf(match_kernels.two_least(values[:, :1])[1]).all()
+@pytest.mark.parametrize("scale", [0.3, 1.0, 4.0])
+def test_sure_pairs_are_likelier_than_all_rivals(scale: float) -> None:
+    """Likelihoods of all pairs are compared, without any limit of the distance."""
+    rng, count = random(), 0
+    inflation, error, gate, margin, false = limits = np.array([2.0, 4e-3, 9.0, 2.0, 8.0])
+    for _ in range(40):
+        predicted = scale * rng.uniform(0.0, 3.0, (8, 2))
+        shown = np.concatenate([predicted[:6], scale * rng.uniform(0.0, 3.0, (3, 2))])
+        places = rng.permutation(shown) + rng.normal(0.0, 0.1, (9, 2))
+        half = rng.normal(0.0, 0.1, (9, 2, 2)), rng.normal(0.0, 0.1, (8, 2, 2))
+        covariance, uncertain = (one @ one.swapaxes(1, 2) for one in half)
+        spread = inflation * uncertain + error * np.eye(2)
+        distance, deviance = match_kernels.pair_deviances(places, covariance, predicted, spread)
+        expected = []
+        for n, m in np.ndindex(deviance.shape):
+            rivals = [*np.delete(deviance[n], m), *np.delete(deviance[:, m], n), false]
+            if distance[n, m] < gate and deviance[n, m] + margin < min(rivals):
+                expected.append((n, m))
+        place, prediction = match_kernels.sure_pairs(
+            places, covariance, predicted, uncertain, limits
+        )
+        assert list(zip(place.tolist(), prediction.tolist(), strict=True)) == expected
+        count += len(expected)
+    assert count > 20
+    empty = match_kernels.sure_pairs(places[:0], covariance[:0], predicted, uncertain, limits)
+    assert [len(each) for each in empty] == [0, 0]
 
 
 def test_normal_equations_are_those_of_least_squares() -> None:
@@ -765,17 +782,41 @@ def test_level_likelihood_agrees_with_numpy(witnesses: int, missing: float) -> N
     dark = random().uniform(size=witnesses) < 0.4
     spread = np.where(random().uniform(size=witnesses) < 0.5, 0.0, 0.03)
     computed = level_kernels.level_negative_log_likelihood(
-        over, side, dark, spread, missing, (levels[0], levels[1] - levels[0], 31), blurs
-    )
+        over, side, dark, spread, missing, (levels[0], levels[1] - levels[0], 31),
+        np.stack([blurs, np.zeros(3)]),
+    )  # fmt: skip
     width = np.sqrt(blurs[:, None, None] ** 2 + spread)
     argument = side * (over[:, None, None] + levels[:, None]) / width
     expected = np.logaddexp(0.0, -argument)
     if missing:  # a dark ray is outside, or inside with its dot missing
         expected -= np.where(dark, np.logaddexp(0.0, np.log(missing) - argument), 0.0)
+    expected = expected.sum(axis=-1)
+    omitted = np.isinf(computed)
+    assert (omitted == omitted.all(axis=(0, 2))[:, None]).all()  # blurs, at all levels
+    assert not omitted.all()
+    assert (expected[omitted] > expected.min() + level_kernels.FARTHEST).all()
     rtol = 1e-9 if missing else 1e-11  # the two sums nearly cancel
-    np.testing.assert_allclose(
-        computed, expected.sum(axis=-1), rtol=rtol, atol=1e-9 * bool(missing)
-    )
+    computed, expected = computed[~omitted], expected[~omitted]
+    np.testing.assert_allclose(computed, expected, rtol=rtol, atol=1e-9 * bool(missing))
+
+
+@pytest.mark.parametrize("beyond", [-1.0, 1.0])
+def test_blurs_are_omitted_only_if_negligible(beyond: float) -> None:
+    """A ray at the head contradicts the sharp blur at all levels; the prior may outweigh that."""
+    over = np.array([[-0.2, 0.1, 0.2], [-0.2, 0.1, 0.1]])
+    side, levels, blurs = np.full(3, 20.0), -0.05 + 0.01 * np.arange(11), np.array([0.005, 0.25])
+    argument = side * (over[:, None, None] + levels[:, None]) / blurs[:, None, None]
+    nats = np.logaddexp(0.0, -argument)  # drops, blurs, levels, rays
+    sharp, wide = nats[0, 0, :, :2].sum(axis=-1).min(), nats[:, 1].sum(axis=-1).min()
+    prior = sharp - wide - level_kernels.FARTHEST - beyond
+    computed = level_kernels.level_negative_log_likelihood(
+        over, side, np.zeros(3, bool), np.zeros(3), 0.0, (-0.05, 0.01, 11),
+        np.array([blurs, [0.0, prior]]),
+    )  # fmt: skip
+    assert np.isinf(computed[:, 0]).all() == (beyond > 0)
+    np.testing.assert_allclose(computed[:, 1], nats[:, 1].sum(axis=-1))
+    if beyond < 0:
+        np.testing.assert_allclose(computed[:, 0], nats[:, 0].sum(axis=-1))
 
 
 @pytest.mark.parametrize("depth", [0, 1])
@@ -804,7 +845,7 @@ def test_likelihood_of_nan_heights_is_nan() -> None:
     over = np.array([[0.1, np.nan], [0.1, 0.2]])
     lit = np.zeros(2, bool)
     computed = level_kernels.level_negative_log_likelihood(
-        over, np.ones(2), lit, np.zeros(2), 0.0, (0.0, 0.1, 3), np.ones(2)
+        over, np.ones(2), lit, np.zeros(2), 0.0, (0.0, 0.1, 3), np.ones((2, 2))
     )
     assert np.isnan(computed[0]).all()
     assert np.isfinite(computed[1]).all()

@@ -6,11 +6,15 @@ import numpy as np
 from numba import types
 
 from labapp.core.compiled import compiled, inner
+from labapp.core.images.dot_kernels import next_apart, two_nearest
+from labapp.core.surface.kernels.ray_kernels import behind_torch
 from labapp.core.values import BoolArray, FloatArray, IntArray
 
 _f1, _f2, _f3 = (types.Array(types.float64, n, "A", readonly=True) for n in (1, 2, 3))
 _uncertain = types.Tuple((_f2, _f3))  # type: ignore[no-untyped-call]
 _i1, _i2 = (types.Array(types.int64, n, "A", readonly=True) for n in (1, 2))
+_mask = types.Array(types.boolean, 2, "A", readonly=True)
+_paths = _view = types.UniTuple(_f2, 3)  # type: ignore[no-untyped-call]
 
 
 @compiled(_f2, _f3, _f2, _f3)
@@ -101,7 +105,7 @@ def within_view(
     return visible
 
 
-@compiled(types.Array(types.boolean, 2, "A", readonly=True))
+@compiled(_mask)
 def amid(lit: BoolArray) -> BoolArray:
     """Mask of rays that are lit or between lit ones in a row or column, shape (rows, columns)."""
     rows, columns = lit.shape
@@ -117,7 +121,7 @@ def amid(lit: BoolArray) -> BoolArray:
     return mask
 
 
-@compiled(types.Array(types.boolean, 2, "A", readonly=True))
+@compiled(_mask)
 def between(lit: BoolArray) -> BoolArray:
     """Mask of rays with lit ones on both sides in their row or column, shape (rows, columns)."""
     rows, columns = lit.shape
@@ -133,28 +137,137 @@ def between(lit: BoolArray) -> BoolArray:
     return mask
 
 
-@compiled(_f2)
-def two_least(values: FloatArray) -> tuple[IntArray, FloatArray, IntArray, FloatArray]:
-    """Index of the smallest value of each row and the second smallest value; the same per column.
+@compiled(_f2, _f3, _f2, _f3, _f1)
+def sure_pairs(
+    places: FloatArray,
+    covariance: FloatArray,
+    predicted: FloatArray,
+    uncertain: FloatArray,
+    limits: FloatArray,
+) -> tuple[IntArray, IntArray]:
+    """Find the unambiguous pairs of n places and m predictions (`prediction.sure_pairs`).
 
-    Values have shape (n, m), m > 0. The second smallest value is infinite if there is none.
+    Parameters
+    ----------
+    places, covariance, predicted
+        See `pair_deviances`.
+    uncertain
+        Covariance of the predictions due to that of the surface, shape (m, 2, 2).
+    limits
+        Factor applied to it, and variance of the model added to it; largest squared distance of a
+        pair; margin over rivals; and the deviance of a false place.
+
+    Returns
+    -------
+    place, prediction
+        Indices of each pair, in the order of the places.
     """
-    rows, columns = values.shape
-    column, next_in_row = np.zeros(rows, np.int64), np.full(rows, np.inf)
-    row, next_in_column = np.zeros(columns, np.int64), np.full(columns, np.inf)
-    in_row, in_column = np.full(rows, np.inf), np.full(columns, np.inf)
-    for n in range(rows):
-        for m in range(columns):
-            value = values[n, m]
-            if value < in_row[n]:
-                in_row[n], next_in_row[n], column[n] = value, in_row[n], m
-            elif value < next_in_row[n]:
-                next_in_row[n] = value
-            if value < in_column[m]:
-                in_column[m], next_in_column[m], row[m] = value, in_column[m], n
-            elif value < next_in_column[m]:
-                next_in_column[m] = value
-    return column, next_in_row, row, next_in_column
+    inflation, error, gate, margin, false = limits
+    count = len(places), len(predicted)
+    # Of each place and of each prediction the least deviance and the next one.
+    by_place, by_prediction = np.full((2, count[0]), np.inf), np.full((2, count[1]), np.inf)
+    prediction, near = np.full(count[0], -1), np.zeros(count[0], np.bool_)
+    # The variances of a pair are at least ``error``: beyond this distance it exceeds ``false``.
+    farthest = false - 2.0 * np.log(error)
+    for n in range(count[0]):
+        for m in range(count[1]):
+            x, y = places[n, 0] - predicted[m, 0], places[n, 1] - predicted[m, 1]
+            xx = covariance[n, 0, 0] + inflation * uncertain[m, 0, 0] + error
+            xy = covariance[n, 0, 1] + inflation * uncertain[m, 0, 1]
+            yy = covariance[n, 1, 1] + inflation * uncertain[m, 1, 1] + error
+            area = xx * yy - xy * xy
+            distance = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / area
+            if not distance < farthest:
+                continue
+            deviance = distance + np.log(area)
+            if deviance < by_place[0, n]:
+                by_place[1, n], by_place[0, n] = by_place[0, n], deviance
+                prediction[n], near[n] = m, distance < gate
+            elif deviance < by_place[1, n]:
+                by_place[1, n] = deviance
+            if deviance < by_prediction[0, m]:
+                by_prediction[1, m], by_prediction[0, m] = by_prediction[0, m], deviance
+            elif deviance < by_prediction[1, m]:
+                by_prediction[1, m] = deviance
+    for n in range(count[0]):
+        m = prediction[n]
+        if m >= 0:
+            # If another place is likelier for m, the second one there is this place or likelier.
+            rival = min(by_place[1, n], by_prediction[1, m], false)
+            if not near[n] or not by_place[0, n] + margin < rival:
+                prediction[n] = -1
+    sure = np.flatnonzero(prediction >= 0)
+    return sure, prediction[sure]
+
+
+@compiled(_i2, _mask, _paths, _f2, _f2, _view, _f1)
+def classify_rays(
+    labels: IntArray,
+    without_dot: BoolArray,
+    paths: tuple[FloatArray, FloatArray, FloatArray],
+    rays: FloatArray,
+    dots: FloatArray,
+    view: tuple[FloatArray, FloatArray, FloatArray],
+    limits: FloatArray,
+) -> tuple[IntArray, IntArray, IntArray]:
+    """Classify all R rays for a surface fitted to labels (`ray_classes.classify_rays`).
+
+    Parameters
+    ----------
+    labels
+        Index of each ray's dot, negative if it has none, shape (rows, columns).
+    without_dot
+        Mask of the rays that are known to have no dot, shape (rows, columns).
+    paths
+        Reflection points of the rays, row by row, shape (R, 3), slopes of the surface there, shape
+        (R, 2), and computed dots, shape (R, 2); NaN if unknown.
+    rays, dots
+        Directions of the rays, shape (R, 3), and observed dots, shape (d, 2), mm.
+    view
+        Homography and limits of the view, the last three arguments of `within_view`.
+    limits
+        Height of the tip of the electrode, mm, and distance below which dots merge, mm.
+
+    Returns
+    -------
+    witness, missed, stray
+        See `ray_classes.RayClasses`; shape (R,).
+    """
+    (points, slopes, plane), (tip, resolution) = paths, limits
+    is_lit = labels >= 0
+    lit, between, dark = is_lit.ravel(), amid(is_lit).ravel(), without_dot.ravel()
+    known = np.flatnonzero(np.isfinite(plane[:, 0]))
+    shown = plane[known]
+    blocked = behind_torch(points[known], rays[known], slopes[known], tip)
+    seen = within_view(shown, np.zeros_like(shown), view[0], view[1], view[2]) & ~blocked
+
+    among = np.flatnonzero(between[known] & ~dark[known])
+    merged = next_apart(shown[among]) < resolution
+    is_missed = seen[among] & ~merged & ~lit[known[among]]
+    missed = known[among[is_missed]]
+    unlabelled = np.ones(len(dots), np.bool_)
+    for label in labels.ravel():
+        if label >= 0:
+            unlabelled[label] = False
+    stray = np.flatnonzero(unlabelled)
+    candidates = dots[stray]
+    if len(stray) and merged.any():
+        apart = two_nearest(candidates, shown[among[merged]])[0][:, 0] > resolution
+        stray = stray[apart]
+
+    spacing = next_apart(shown)
+    witness = np.zeros(len(plane), np.int64)
+    # A stray dot near a prediction may be the dot of a ray that seems dark.
+    away = np.full(len(known), np.inf)
+    if len(candidates):
+        away = two_nearest(shown, candidates)[0][:, 0]
+    for k in range(len(known)):
+        ray = known[k]
+        is_open = between[ray] or dark[ray] or away[k] < spacing[k]
+        if seen[k] and spacing[k] >= resolution and not is_open:
+            witness[ray] = -1
+    witness[lit] = 1
+    return witness, missed, stray
 
 
 @compiled(_f2)

@@ -208,20 +208,23 @@ class Observation(ReadOnlyArrays):
         """
         from labapp.core.matching import match_kernels
 
-        places, to_image = plane_mm.reshape(-1, 2), self.bench.calibration.from_plane
+        places = plane_mm.reshape(-1, 2)
         margin = np.full(plane_mm.shape, margin_mm).reshape(-1, 2)
-        on_plane, in_image = self._view
-        visible = match_kernels.within_view(places, margin, to_image, on_plane, in_image)
+        visible = match_kernels.within_view(places, margin, *self.view)
         return visible.reshape(plane_mm.shape[:-1])
 
     @cached_property
-    def _view(self) -> tuple[FloatArray, FloatArray]:
-        """Limits (low, high) of the view on the plane, mm, and in the image, px, shapes (2, 2)."""
+    def view(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """The homography from the plane to the image, shape (3, 3), and the limits of the view.
+
+        The limits (low, high) are those on the plane, mm, and in the image, px, shapes (2, 2).
+        """
         plane = self.rig.imaging_plane
         low = np.minimum(self.plane_mm.min(axis=0), 0.0) + EDGE_MM
         high = np.maximum(self.plane_mm.max(axis=0), [plane.width_mm, plane.height_mm]) - EDGE_MM
         first, last = self.bench.frame_px(self.frame_shape)
-        return np.array([low, high]), np.array([first + EDGE_PX, last - EDGE_PX])
+        in_image = np.array([first + EDGE_PX, last - EDGE_PX])
+        return self.bench.calibration.from_plane, np.array([low, high]), in_image
 
 
 def try_fit(

@@ -173,15 +173,15 @@ def sure_pairs(
     """
     from labapp.core.matching import match_kernels
 
-    distance, deviance = match_kernels.pair_deviances(
-        observed.plane_mm[dots], observed.covariance_mm2[dots], plane_mm, _enlarged(covariance_mm2)
+    variances = SIGMA_INFLATION**2, MODEL_ERROR_MM**2
+    dot, ray = match_kernels.sure_pairs(
+        observed.plane_mm[dots],
+        observed.covariance_mm2[dots],
+        plane_mm,
+        covariance_mm2,
+        np.array([*variances, GATE_SIGMA2, RIVAL_MARGIN, false_dot_deviance()]),
     )
-    ray, next_ray, best_dot, next_dot = match_kernels.two_least(deviance)
-    own = np.arange(len(ray))
-    rival = np.minimum(np.minimum(next_ray, next_dot[ray]), false_dot_deviance())
-    sure = (best_dot[ray] == own) & (distance[own, ray] < GATE_SIGMA2)
-    sure &= deviance[own, ray] + RIVAL_MARGIN < rival
-    return dots[sure], ray[sure]
+    return dots[dot], ray
 
 
 def pair_deviances(

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from labapp.core.matching.observation import UNLABELLED, Observation, amid, widened
+from labapp.core.matching.observation import Observation, widened
 from labapp.core.matching.prediction import RayPaths, lines_out_of_view
 from labapp.core.values import FloatArray, IntArray
 
@@ -36,39 +36,18 @@ def classify_rays(observed: Observation, labels: IntArray, paths: RayPaths) -> R
 
     Where the surface predicts that dots merge, neither a dot nor a ray counts as unexplained.
     """
-    from labapp.core.images import dot_kernels
-    from labapp.core.surface.kernels import ray_kernels
+    from labapp.core.matching import match_kernels
 
-    lit, plane = labels != UNLABELLED, paths.plane_mm
-    known = np.flatnonzero(np.isfinite(plane[:, 0]))
-    tip = observed.rig.electrode.height_mm
-    rays = observed.rays.reshape(-1, 3)[known]
-    blocked = ray_kernels.behind_torch(paths.points_mm[known], rays, paths.slopes[known], tip)
-    in_view = observed.in_view(plane[known]) & ~blocked
-
-    without_dot = observed.absent | observed.hidden
-    between = amid(lit)
-    is_among = (between & ~without_dot).ravel()[known]
-    among = known[is_among]
-    merged = dot_kernels.next_apart(plane[among]) < observed.resolution_mm
-    missed = among[in_view[is_among] & ~merged & ~lit.ravel()[among]]
-    is_stray = np.ones(len(observed.plane_mm), bool)
-    is_stray[labels[lit]] = False
-    stray = unlabelled = np.flatnonzero(is_stray)
-    if merged.any() and len(stray):
-        off = dot_kernels.two_nearest(observed.plane_mm[stray], plane[among[merged]])[0][:, 0]
-        stray = stray[off > observed.resolution_mm]
-
-    spacing = dot_kernels.next_apart(plane[known])
-    witness = np.zeros(lit.size, np.int64)
-    witness[known[in_view & (spacing >= observed.resolution_mm)]] = -1
-    witness[(between | without_dot).ravel()] = 0
-    if len(unlabelled):
-        # A stray dot near a prediction may be the dot of a ray that seems dark.
-        off = dot_kernels.two_nearest(plane[known], observed.plane_mm[unlabelled])[0][:, 0]
-        witness[known[off < spacing]] = 0
-    witness[lit.ravel()] = 1
-    return RayClasses(witness.reshape(lit.shape), missed, stray)
+    witness, missed, stray = match_kernels.classify_rays(
+        labels,
+        observed.absent | observed.hidden,
+        (paths.points_mm, paths.slopes, paths.plane_mm),
+        observed.rays.reshape(-1, 3),
+        observed.plane_mm,
+        observed.view,
+        np.array([observed.rig.electrode.height_mm, observed.resolution_mm]),
+    )
+    return RayClasses(witness.reshape(labels.shape), missed, stray)
 
 
 def certain_witness(

@@ -1,0 +1,116 @@
+"""Classes of rays: returned, dark or unknown; rays and dots that a surface leaves unexplained."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from labapp.core.geometry.bench import Bench
+from labapp.core.geometry.rig import Rig
+from labapp.core.matching.hypothesis import USUAL_KNOTS, paths_of
+from labapp.core.matching.observation import UNLABELLED, Observation, try_fit, widened
+from labapp.core.matching.ray_classes import RayClasses, classify_rays
+from labapp.core.values import BoolArray, IntArray
+from labapp.simulation.pools import egg
+from tests.scenes import BENCH_RIG, BENCH_VIEW, FRAME_SHAPE, see, true_labels
+
+POOL = egg(5.4, 2.6, 3.0, 0.27)
+SEEN = see(POOL, np.random.default_rng(3), sigma_px=0.05)
+
+
+def observed_on(rig: Rig) -> tuple[Observation, IntArray]:
+    """Return the dots of the pool on a rig, and their true labels."""
+    return Observation.of(SEEN.dots, Bench(rig, BENCH_VIEW), FRAME_SHAPE), true_labels(SEEN)
+
+
+def classes(observed: Observation, labels: IntArray) -> RayClasses:
+    """Return the classes of rays for the surface fitted to the true labels."""
+    pool = try_fit(observed, true_labels(SEEN), USUAL_KNOTS)
+    assert pool is not None
+    return classify_rays(observed, labels, paths_of(observed, pool))
+
+
+def inner(lit: BoolArray) -> BoolArray:
+    """Mask of lit rays that have lit rays all round, and are not beside the marker."""
+    return ~widened(~lit, 1)
+
+
+@pytest.fixture(scope="module")
+def frame() -> tuple[Observation, IntArray]:
+    return observed_on(BENCH_RIG)
+
+
+def test_true_labels_leave_nothing_unexplained(frame: tuple[Observation, IntArray]) -> None:
+    observed, labels = frame
+    found, lit = classes(observed, labels), labels != UNLABELLED
+    assert (len(found.missed), len(found.stray)) == (0, 0)
+    assert (found.witness[lit] == 1).all()
+    assert not (found.witness[~lit] > 0).any()
+    assert (found.witness[observed.absent] == 0).all()
+    # Rays that land well outside the pool have no dot, but some of them cross the view.
+    assert (found.witness < 0).sum() > 20
+
+
+def test_missing_dot_is_a_missed_ray(frame: tuple[Observation, IntArray]) -> None:
+    observed, labels = frame
+    ray = np.argwhere(inner(labels != UNLABELLED))[0]
+    dot = labels[tuple(ray)]
+    keep = np.arange(len(observed.plane_mm)) != dot
+    fewer = replace(
+        observed,
+        plane_mm=observed.plane_mm[keep],
+        covariance_mm2=observed.covariance_mm2[keep],
+        size_mm=observed.size_mm[keep],
+    )
+    others = np.where(labels > dot, labels - 1, np.where(labels == dot, UNLABELLED, labels))
+    pool = try_fit(fewer, others, USUAL_KNOTS)
+    assert pool is not None
+    found = classify_rays(fewer, others, paths_of(fewer, pool))
+    assert found.missed.tolist() == [np.ravel_multi_index(tuple(ray), labels.shape)]
+    assert len(found.stray) == 0
+    assert found.witness[tuple(ray)] == 0
+
+
+def test_dot_without_label_is_stray_and_its_ray_not_dark(
+    frame: tuple[Observation, IntArray],
+) -> None:
+    observed, labels = frame
+    lit = labels != UNLABELLED
+    at_rim = np.argwhere(lit & ~inner(lit) & (np.cumsum(lit, axis=0) == 1))[0]
+    for ray in np.argwhere(inner(lit))[0], at_rim:
+        fewer = labels.copy()
+        fewer[tuple(ray)] = UNLABELLED
+        found = classes(observed, fewer)
+        assert found.stray.tolist() == [labels[tuple(ray)]]
+        assert found.witness[tuple(ray)] == 0
+
+
+def test_merged_dots_are_neither_missed_nor_stray(frame: tuple[Observation, IntArray]) -> None:
+    observed, labels = frame
+    ray = tuple(np.argwhere(inner(labels != UNLABELLED))[0])
+    fewer = labels.copy()
+    fewer[ray] = UNLABELLED
+    blurred = replace(observed, size_mm=np.full(len(observed.size_mm), 50.0))
+    found = classes(blurred, fewer)
+    assert (len(found.missed), len(found.stray)) == (0, 0)
+    assert not (found.witness < 0).any()
+
+
+def test_rays_behind_the_torch_are_not_dark() -> None:
+    seen = classes(*observed_on(BENCH_RIG)).witness
+    low = replace(BENCH_RIG.electrode, height_mm=-50.0)
+    behind = classes(*observed_on(replace(BENCH_RIG, electrode=low))).witness
+    assert (seen < 0).any()
+    assert not (behind < 0).any()
+    assert ((behind > 0) == (seen > 0)).all()
+
+
+def test_rays_out_of_view_are_not_dark(frame: tuple[Observation, IntArray]) -> None:
+    observed, labels = frame
+    width, height = observed.plane_mm.max(axis=0)
+    narrow = replace(observed.rig.imaging_plane, width_mm=width, height_mm=height)
+    cropped, _ = observed_on(replace(BENCH_RIG, imaging_plane=narrow))
+    wide, tight = classes(observed, labels).witness, classes(cropped, labels).witness
+    assert (tight < 0).sum() < (wide < 0).sum()
