@@ -229,22 +229,22 @@ def _cheapest(
     """The cheapest hypothesis, all found, its neighbours by a row or two, and the knots used."""
     best = min(found, key=lambda hypothesis: hypothesis.cost)
     knots = USUAL_KNOTS
-    neighbours: list[Hypothesis] = []
+    neighbours: list[Hypothesis] | None = None
     if best.stray_count or best.missed_count:
         neighbours = _rivals(observed, best, shifted_labels(observed, best.labels), knots)
     # Residuals of a dip that these knots cannot follow may decide between rivals this close.
-    near = any(rival.cost < best.cost + CLOSE_COST for rival in neighbours)
+    near = any(rival.cost < best.cost + CLOSE_COST for rival in neighbours or ())
     if near or best.residual_mm > KNOT_ERROR_MM:
-        knots, neighbours = FINE_KNOTS, []
+        knots, neighbours = FINE_KNOTS, None
         found = [
             h for each in found if (h := evaluate_twice(observed, each.labels, knots, each.pool))
         ]
         best = min(found, key=lambda hypothesis: hypothesis.cost, default=best)
-    if not neighbours and not _beyond_doubt(observed, best, margin):
+    if neighbours is None and not _beyond_doubt(observed, best, margin):
         best, neighbours = _with_neighbours(observed, best, knots)
     if knots == FINE_KNOTS:  # labels are removed by comparing costs of these knots alone
         best = evaluate(observed, best.labels, knots, initial=best.pool) or best
-    return best, found, neighbours, knots
+    return best, found, neighbours or [], knots
 
 
 def _clearly_cheaper(

@@ -75,9 +75,14 @@ def grow_labels(
         stages = [replace(SOFT, knot_mm=knot_mm)]
     else:
         stages = [_STIFF_WIDE, _SOFT_WIDE, _STIFF_WIDE] if few else [STIFF, SOFT, STIFF]
+    settled: dict[tuple[bytes, FitSettings], IntArray | None] = {}
     for attempt in range(2):
         for settings in stages:
-            grown = _settled(observed, labels, settings)
+            key = labels.tobytes(), settings
+            if key not in settled:
+                settled[key] = _settled(observed, labels, settings)
+            if (grown := settled[key]) is not None:
+                settled[grown.tobytes(), settings] = grown  # they would not change
             if grown is not None and (best is None or count_labels(grown) > count_labels(best)):
                 best = grown
             labels = labels if best is None else best
