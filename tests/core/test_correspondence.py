@@ -155,8 +155,9 @@ def test_row_that_growth_does_not_reach_is_seeded(monkeypatch: pytest.MonkeyPatc
     assert match is not None
     np.testing.assert_array_equal(seen.ray[match.dot], match.ray)
     assert len(match.dot) == len(seen.dots)
-    for way in ("with_rows_beyond", "with_repaired"):  # each of the two finds them, and so do caps
-        monkeypatch.setattr(correspondence, way, lambda _scene, found: found)
+    # Each of the two finds them, and so do caps.
+    monkeypatch.setattr(correspondence, "with_rows_beyond", lambda _scene, found: found)
+    monkeypatch.setattr(correspondence, "with_repaired", lambda _scene, found, new: found + new)
     monkeypatch.setattr(correspondence, "_by_caps", lambda _scene: [])
     assert matched(seen.dots) == (None, "no-match")
 

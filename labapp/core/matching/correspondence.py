@@ -70,8 +70,8 @@ from labapp.core.matching.unexplained import (
     MOST_SCATTERED_AT_LAST,
     NOTHING_EXPLAINS,
     any_explains,
-    explains,
     explains_half,
+    suffices,
 )
 from labapp.core.rows.lattice import Lattice, Site, empty_sites
 from labapp.core.surface.pool_fit import FitSettings
@@ -126,8 +126,9 @@ def match_rays(
     orientations = settings.orientations
     found: list[Hypothesis] = []
     for first_labels in (_by_grid, _by_empty_sites, _by_quadrics):
-        found = with_repaired(observed, found + first_labels(observed, lattice, orientations))
-        if any_explains(observed, found):
+        new = first_labels(observed, lattice, orientations)
+        found = with_repaired(observed, found, new)
+        if any(suffices(observed, each) for each in found):
             break
     # If no hypothesis explains most dots, caps are tried at once.
     hopeless = bool(found) and not any(explains_half(observed, each) for each in found)
@@ -271,11 +272,11 @@ def _by_caps(observed: Observation) -> list[Hypothesis]:
         hypothesis = grow_and_evaluate(observed, labels)
         if hypothesis is not None:
             found.append(hypothesis)
-            if explains(observed, hypothesis):
-                return with_repaired(observed, found)
+            if suffices(observed, hypothesis):
+                return with_repaired(observed, [], found)
     for start in sorted(found, key=lambda hypothesis: hypothesis.misfit)[:MOST_REPAIRED]:
-        found += with_repaired(observed, [start])[1:]
-        if any_explains(observed, found):
+        found += with_repaired(observed, [], [start])[1:]
+        if any(suffices(observed, each) for each in found):
             break
     return found
 
@@ -294,7 +295,7 @@ def _by_quadrics(
             labels = extended_over_grid(hypothesis, lattice, hypothesis.orientation(observed))
             wider = None if labels is None else grow_and_evaluate(observed, labels)
             found += [wider] if wider is not None else []
-        if explains(observed, hypothesis):
+        if suffices(observed, hypothesis):
             break
     return found
 

@@ -15,7 +15,7 @@ from labapp.core.matching.prediction import (
     pair_deviances,
     predict,
 )
-from labapp.core.matching.unexplained import explains
+from labapp.core.matching.unexplained import explains, suffices
 from labapp.core.values import BoolArray, IntArray
 
 DISCARDED_RINGS = 2
@@ -36,26 +36,35 @@ LEAST_BETWEEN = 2
 """Two dots midway between those of two rows belong to a row that was omitted."""
 
 
-def with_repaired(observed: Observation, found: list[Hypothesis]) -> list[Hypothesis]:
-    """Add the repaired versions of the cheapest hypothesis, as long as each is cheaper.
+def with_repaired(
+    observed: Observation, found: list[Hypothesis], new: list[Hypothesis]
+) -> list[Hypothesis]:
+    """Add new hypotheses, and repaired versions of the cheapest of all as long as each is cheaper.
+
+    If none of the new ones is the cheapest, nothing is repaired: the cheapest was repaired before.
 
     Labels around unexplained rays and dots are discarded, gaps of skipped rows are closed, omitted
     rows are inserted, and a dip is followed with finer knots.
 
     Labels that still need repair bend the surface, so its roughness is not included in the
-    comparison yet.
+    comparison yet. If only isolated dots are left over, which are probably false, nothing is
+    repaired.
 
     Where rows cross in a dip, growth may swap them; the swapped labels then bend the surface and
     support each other. The surface through the surrounding labels is more reliable, and follows
     the dip with finer knots.
     """
+    found = found + new
     best = min(found, key=lambda hypothesis: hypothesis.misfit, default=None)
-    while best is not None:
+    if not any(best is each for each in new):
+        return found
+    while best is not None and (best.missed_count or not suffices(observed, best)):
         labels = np.where(_about_unexplained(observed, best), UNLABELLED, best.labels)
         tried = [*_closed_up(best), *_opened_up(observed, best)]
         finer = [] if explains(observed, best) else [best.labels]
         if (labels != best.labels).any():
-            tried, finer = [labels, *tried], [labels, *finer]
+            # Dots of swapped rows usually leave missed rays, too; false dots leave none.
+            tried, finer = [labels, *tried], [labels, *finer] if best.missed_count else finer
         grown = [grow_and_evaluate(observed, labels) for labels in tried]
         knot_mm = FINE_KNOTS.knot_mm
         grown += [grow_and_evaluate(observed, labels, knot_mm=knot_mm) for labels in finer]

@@ -7,14 +7,14 @@ import numpy as np
 import scipy
 
 from labapp.core.matching.free_setup import with_setup_free
-from labapp.core.matching.hypothesis import USUAL_KNOTS, Hypothesis
+from labapp.core.matching.hypothesis import KNOT_ERROR_MM, USUAL_KNOTS, Hypothesis
 from labapp.core.matching.match_settings import MatchSettings
 from labapp.core.matching.observation import UNLABELLED, Observation
 from labapp.core.values import CannotMeasure, median
 
 FEW_LEFT = 0.05
 """A hypothesis explains a frame if at most this share of the dots is stray, and as few rays are
-missed: no other is searched for."""
+missed."""
 
 MOST_STRAY = 0.5
 """If a larger share of the dots is stray, a hypothesis is not repaired; another one is searched
@@ -41,11 +41,15 @@ ROW, ROW_SPACINGS = 5, 2.2
 """So many stray dots, each within `ROW_SPACINGS` spacings of the next, are a row: beyond the last
 labelled one, where rows fan out, dots are farther apart than the others."""
 
-MOST_SCATTERED, MOST_SCATTERED_AT_LAST, MOST_MISSED_APART = 0.3, 0.38, 0.12
+FEW_SCATTERED, MOST_SCATTERED, MOST_SCATTERED_AT_LAST = 0.2, 0.3, 0.38
 """Largest share of stray dots and missed rays together, relative to the labelled dots, that is
 accepted if they are isolated: false dots and random failures are isolated, whereas the dots of a
-row that was omitted or skipped are not. The second applies when every kind of initial labels has
-been tried. With at most the third share of missed rays no other hypothesis is searched for."""
+row that was omitted or skipped are not. The third applies when every kind of initial labels has
+been tried. With at most the first share no other kind is tried (`suffices`)."""
+
+MOST_MISSED_APART = 0.12
+"""Largest share of isolated missed rays, relative to the labelled dots, with which a hypothesis
+explains a frame."""
 
 
 def explains(observed: Observation, hypothesis: Hypothesis) -> bool:
@@ -54,6 +58,18 @@ def explains(observed: Observation, hypothesis: Hypothesis) -> bool:
     most = MOST_MISSED_APART * hypothesis.label_count if _missed_lie_apart(hypothesis) else 0.0
     missed = hypothesis.missed_count <= max(few, most)
     return hypothesis.stray_count <= few and missed and hypothesis.marker != "lit"
+
+
+def suffices(observed: Observation, hypothesis: Hypothesis) -> bool:
+    """Whether a hypothesis `explains` the frame, perhaps but for a few isolated dots and rays.
+
+    Other kinds of initial labels are then not tried.
+    """
+    return explains(observed, hypothesis) or (
+        hypothesis.residual_mm < KNOT_ERROR_MM
+        and _leaves_isolated(hypothesis, FEW_SCATTERED)
+        and _strays_lie_apart(observed, hypothesis)
+    )
 
 
 def explains_half(observed: Observation, hypothesis: Hypothesis) -> bool:
@@ -74,12 +90,9 @@ def refuse_unexplained(
     ``most_scattered`` is the largest accepted share of isolated strays and missed rays, such as
     `MOST_SCATTERED`.
     """
-    # Adjacent missed rays are a hole or a row: stray dots may then be their dots.
-    scattered = (
-        best.marker == "dark"
-        and _missed_lie_apart(best)
-        and (best.stray_count <= settings.most_strays(best) or _strays_lie_apart(observed, best))
-        and best.stray_count + best.missed_count <= most_scattered * best.label_count
+    few = best.stray_count <= settings.most_strays(best)
+    scattered = _leaves_isolated(best, most_scattered) and (
+        few or _strays_lie_apart(observed, best)
     )
     if not explains_half(observed, best):
         raise CannotMeasure("no-match", NOTHING_EXPLAINS)
@@ -106,6 +119,16 @@ def _doubt_of_setup(observed: Observation, best: Hypothesis) -> str:
     count = np.sum(freed.labels != UNLABELLED)
     explained = f"{count} of {len(observed.plane_mm)} dots would have a ray"
     return f"; with another set-up {explained}: is the set-up correct?"
+
+
+def _leaves_isolated(hypothesis: Hypothesis, most: float) -> bool:
+    """Whether little is left unexplained, a share of the labels at most, and missed rays lie apart.
+
+    Adjacent missed rays are a hole or a row: stray dots may then be their dots.
+    """
+    left = hypothesis.stray_count + hypothesis.missed_count
+    few = left <= most * hypothesis.label_count
+    return few and hypothesis.marker == "dark" and _missed_lie_apart(hypothesis)
 
 
 def _missed_lie_apart(hypothesis: Hypothesis) -> bool:

@@ -86,19 +86,18 @@ def search_quadrics(observed: Observation) -> list[QuadricLabels]:
         return []  # without rays on all sides a hole cannot be recognised
     window = _Window(observed, marker)
     found: dict[bytes, QuadricLabels] = {}
-    holes = _holes(observed, window.tree)
-    quadrics = [_quadrics(window, hole, half_width) for hole, half_width in holes]
-    for one in window.scored(window.fitted(np.concatenate([np.empty((0, 5)), *quadrics]))):
+    for one in window.scored(window.fitted(_quadrics(window, *_holes(observed, window.tree)))):
         key = one.labels.tobytes()
         if key not in found or found[key].score < one.score:
             found[key] = one
     return sorted(found.values(), key=lambda one: -one.score)[:MOST_QUADRICS]
 
 
-def _holes(
-    observed: Observation, tree: scipy.spatial.cKDTree
-) -> Iterator[tuple[FloatArray, float]]:
-    """Yield empty places between two dots, IPCS, and half the distance of these along X′, mm."""
+def _holes(observed: Observation, tree: scipy.spatial.cKDTree) -> tuple[FloatArray, FloatArray]:
+    """Empty places between two dots, IPCS, and half the distance of these along X′, mm.
+
+    Shapes (h, 2) and (h,).
+    """
     dots = observed.plane_mm
     near = tree.query(dots, k=min(10, len(dots)))[1][:, 1:]
     one, other = dots[np.repeat(np.arange(len(dots)), near.shape[1])], dots[near.ravel()]
@@ -111,33 +110,37 @@ def _holes(
     one, other, step, length = one[regular], other[regular], step[regular], length[regular]
     lifts = length[:, None, None] * _LIFTS[:, None] * [0.0, 1.0]
     holes = ((one + other) / 2)[:, None] + lifts
-    for k, lift in np.argwhere(tree.query(holes)[0] > LEAST_GAP * length[:, None]):
-        yield holes[k, lift], step[k, 0] / 2
+    pair, lift = np.nonzero(tree.query(holes)[0] > LEAST_GAP * length[:, None])
+    return holes[pair, lift], step[pair, 0] / 2
 
 
-def _quadrics(window: _Window, hole: FloatArray, half_width: float) -> FloatArray:
-    """Quadrics that reflect the reference into the hole and roughly explain the dots around it.
+def _quadrics(window: _Window, holes: FloatArray, half_widths: FloatArray) -> FloatArray:
+    """Quadrics that reflect the reference into a hole and roughly explain the dots around it.
 
     z = g·x + ½(κ_x x² + 2κ_xy xy + κ_y y²), x and y relative to where the reference would land on
     the work piece: (g_x, g_y, κ_x, κ_xy, κ_y) of each, shape (m, 5), curvatures in mm⁻¹. All
     longitudinal curvatures are tried, and both signs of the transverse curvature that reproduces
-    the neighbouring dots.
+    the neighbouring dots. Parameters are those that `_holes` returns.
     """
-    observed = window.observed
+    observed, landing, middle = window.observed, window.landing_mm, window.middle
     laser, plane = observed.rig.laser.position_mm, observed.rig.imaging_plane
-    landing = window.landing_mm
-    slope = bisecting_gradient(landing - laser, direction_to_dots(landing, hole, plane))
-    middle = window.middle
-    beside = window.rays[middle[0], middle[1] + 1][None]
+    slope = bisecting_gradient(landing - laser, direction_to_dots(landing, holes, plane))
     # The dot beside the hole moves almost linearly with κ_x: two trials give both solutions.
-    trial = np.array([[*slope, -0.02, 0.0, -0.02], [*slope, 0.02, 0.0, 0.02]])
-    moved = window.intersect(trial, beside)[1][:, 0, 0] - hole[0]
-    across = (np.array([1, -1]) * half_width - moved.mean()) / ((moved[1] - moved[0]) / 0.04)
-    across = across[(np.abs(across) > _FLATTEST) & (np.abs(across) < _STEEPEST)]
-    quadrics = np.zeros((len(across) * len(_RATIOS), 5))
-    quadrics[:, :2] = slope
-    quadrics[:, 2] = np.repeat(across, len(_RATIOS))
-    quadrics[:, 4] = np.outer(across, _RATIOS).ravel()
+    trials = np.zeros((len(holes), 2, 5))
+    trials[..., :2] = slope[:, None]
+    trials[..., 2] = trials[..., 4] = -0.02, 0.02
+    beside = window.rays[middle[0], middle[1] + 1][None]
+    moved = window.intersect(trials.reshape(-1, 5), beside)[1][:, 0, 0].reshape(-1, 2)
+    moved -= holes[:, :1]
+    per_curvature = (moved[:, 1:] - moved[:, :1]) / 0.04
+    across = half_widths[:, None] * [1, -1] - moved.mean(axis=1, keepdims=True)
+    across /= per_curvature
+    hole, side = np.nonzero((np.abs(across) > _FLATTEST) & (np.abs(across) < _STEEPEST))
+    curvature = np.repeat(across[hole, side], len(_RATIOS))
+    quadrics = np.zeros((len(curvature), 5))
+    quadrics[:, :2] = np.repeat(slope[hole], len(_RATIOS), axis=0)
+    quadrics[:, 2] = curvature
+    quadrics[:, 4] = curvature * np.tile(_RATIOS, len(hole))
     rays = window.rays[window.near]
     patterns = window.intersect(quadrics, rays.reshape(-1, 3))[1].reshape(-1, *rays.shape[:2], 2)
     hit = window.hits(patterns, LOOSE_GATE, window.absent[window.near])[0]

@@ -1,0 +1,126 @@
+"""Dots and rays that a hypothesis leaves unexplained, and the search that they end or prolong."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from labapp.core.geometry.bench import Bench
+from labapp.core.matching import correspondence, repair
+from labapp.core.matching.hypothesis import Hypothesis, evaluate
+from labapp.core.matching.match_settings import MatchSettings
+from labapp.core.matching.observation import UNLABELLED, Observation
+from labapp.core.matching.repair import with_repaired
+from labapp.core.matching.unexplained import explains, suffices
+from labapp.core.rows.lattice_growth import GrowSettings, grow_lattice
+from labapp.core.values import IntArray
+from labapp.simulation.pools import egg
+from tests.scenes import BENCH_RIG, BENCH_VIEW, FRAME_SHAPE, SeenDots, see, true_labels
+
+BENCH = Bench(BENCH_RIG, BENCH_VIEW)
+POOL = egg(5.4, 2.6, 3.0, 0.27)
+
+
+def seen_with(false: int, missing: int = 0, sigma_px: float = 0.05) -> SeenDots:
+    rng = np.random.default_rng(6)
+    return see(POOL, rng, sigma_px=sigma_px, missing=missing, false=false)
+
+
+def hypothesis(seen: SeenDots, labels: IntArray | None = None) -> tuple[Observation, Hypothesis]:
+    """Return the observation, and the hypothesis of labels, by default of the true ones."""
+    observed = Observation.of(seen.dots, BENCH, FRAME_SHAPE)
+    found = evaluate(observed, true_labels(seen) if labels is None else labels)
+    assert found is not None
+    return observed, found
+
+
+def test_isolated_false_dots_leave_a_hypothesis_that_suffices() -> None:
+    observed, found = hypothesis(seen_with(false=10))
+    assert (found.stray_count, found.missed_count) == (10, 0)
+    assert not explains(observed, found)
+    assert suffices(observed, found)
+
+
+@pytest.mark.parametrize("kept", ["all but a row", "half"])
+def test_dots_without_a_ray_that_are_adjacent_do_not_suffice(kept: str) -> None:
+    labels = true_labels(seen_with(false=0))
+    rows = np.flatnonzero((labels != UNLABELLED).any(axis=1))
+    labels[rows[-1] if kept == "all but a row" else rows[len(rows) // 2 + 2 :]] = UNLABELLED
+    observed, found = hypothesis(seen_with(false=0), labels)
+    assert not suffices(observed, found)
+
+
+def test_many_isolated_dots_do_not_suffice() -> None:
+    observed, found = hypothesis(seen_with(false=30))
+    assert not suffices(observed, found)
+
+
+def test_dots_far_from_their_predictions_do_not_suffice() -> None:
+    observed, found = hypothesis(seen_with(false=10, sigma_px=0.7))
+    assert found.stray_count == 10
+    assert not suffices(observed, found)
+
+
+def searched_with(seen: SeenDots, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """Match a frame; return the kinds of initial labels that were tried."""
+    tried: list[str] = []
+
+    def noted(name: str) -> None:
+        search = getattr(correspondence, name)
+
+        def run(*given: object) -> list[Hypothesis]:
+            tried.append(name)
+            made: list[Hypothesis] = search(*given)
+            return made
+
+        monkeypatch.setattr(correspondence, name, run)
+
+    for name in ("_by_grid", "_by_empty_sites", "_by_quadrics", "_by_caps"):
+        noted(name)
+    lattice = grow_lattice(seen.dots, GrowSettings())
+    match, _ = correspondence.match_rays(seen.dots, lattice, BENCH, FRAME_SHAPE, MatchSettings())
+    assert (seen.ray[match.dot] == match.ray).all()
+    return tried
+
+
+def test_isolated_false_dots_do_not_prolong_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert searched_with(seen_with(false=10), monkeypatch) == ["_by_grid"]
+
+
+def test_a_cluttered_frame_is_searched_in_other_ways(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert len(searched_with(seen_with(false=24), monkeypatch)) > 1
+
+
+@pytest.fixture
+def grown(monkeypatch: pytest.MonkeyPatch) -> list[IntArray]:
+    """Labels that were grown during a test."""
+    labels: list[IntArray] = []
+    grow = repair.grow_and_evaluate
+
+    def run(observed: Observation, own: IntArray, **given: float) -> Hypothesis | None:
+        labels.append(own)
+        return grow(observed, own, **given)
+
+    monkeypatch.setattr(repair, "grow_and_evaluate", run)
+    return labels
+
+
+def test_only_a_new_cheapest_hypothesis_is_repaired(grown: list[IntArray]) -> None:
+    seen = seen_with(false=0, missing=3)
+    labels = true_labels(seen)
+    lit = np.argwhere(labels != UNLABELLED)
+    labels[tuple(lit[len(lit) // 3])] = UNLABELLED
+    observed, lacking = hypothesis(seen, labels)
+    _, whole = hypothesis(seen)
+    assert whole.missed_count > 0
+    assert with_repaired(observed, [whole], [lacking]) == [whole, lacking]
+    assert not grown
+    repaired = with_repaired(observed, [], [lacking])
+    assert grown
+    assert repaired[-1].label_count == whole.label_count
+
+
+def test_nothing_is_repaired_if_only_isolated_dots_are_left(grown: list[IntArray]) -> None:
+    observed, found = hypothesis(seen_with(false=10))
+    assert with_repaired(observed, [], [found]) == [found]
+    assert not grown
