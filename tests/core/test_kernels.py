@@ -811,7 +811,7 @@ def test_blurs_are_omitted_only_if_negligible(beyond: float) -> None:
     prior = sharp - wide - level_kernels.FARTHEST - beyond
     computed = level_kernels.level_negative_log_likelihood(
         over, side, np.zeros(3, bool), np.zeros(3), 0.0, (-0.05, 0.01, 11),
-        np.array([blurs, [0.0, prior]]),
+        np.array([blurs, [3.0, prior + 3.0]]),
     )  # fmt: skip
     assert np.isinf(computed[:, 0]).all() == (beyond > 0)
     np.testing.assert_allclose(computed[:, 1], nats[:, 1].sum(axis=-1))
