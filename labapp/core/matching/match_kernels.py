@@ -17,6 +17,13 @@ _mask = types.Array(types.boolean, 2, "A", readonly=True)
 _paths = _view = types.UniTuple(_f2, 3)  # type: ignore[no-untyped-call]
 
 
+@inner
+def _distance(x: float, y: float, xx: float, xy: float, yy: float) -> tuple[float, float]:
+    """Squared Mahalanobis length of a vector, and the determinant of its covariance."""
+    area = xx * yy - xy * xy
+    return (yy * x * x - 2.0 * xy * x * y + xx * y * y) / area, area
+
+
 @compiled(_f2, _f3, _f2, _f3)
 def pair_deviances(
     places: FloatArray, covariance: FloatArray, predicted: FloatArray, uncertain: FloatArray
@@ -38,9 +45,7 @@ def pair_deviances(
             xx = covariance[n, 0, 0] + uncertain[m, 0, 0]
             xy = covariance[n, 0, 1] + uncertain[m, 0, 1]
             yy = covariance[n, 1, 1] + uncertain[m, 1, 1]
-            area = xx * yy - xy * xy
-            distance[n, m] = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / area
-            deviance[n, m] = area
+            distance[n, m], deviance[n, m] = _distance(x, y, xx, xy, yy)
     deviance[:] = distance + np.log(deviance)
     return distance, deviance
 
@@ -175,8 +180,7 @@ def sure_pairs(
             xx = covariance[n, 0, 0] + inflation * uncertain[m, 0, 0] + error
             xy = covariance[n, 0, 1] + inflation * uncertain[m, 0, 1]
             yy = covariance[n, 1, 1] + inflation * uncertain[m, 1, 1] + error
-            area = xx * yy - xy * xy
-            distance = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / area
+            distance, area = _distance(x, y, xx, xy, yy)
             if not distance < farthest:
                 continue
             deviance = distance + np.log(area)
@@ -231,7 +235,7 @@ def classify_rays(
     Returns
     -------
     witness, missed, stray
-        See `ray_classes.RayClasses`; shape (R,).
+        See `ray_classes.RayClasses`; the witness has shape (R,).
     """
     (points, slopes, plane), (tip, resolution) = paths, limits
     is_lit = labels >= 0
@@ -308,8 +312,7 @@ def _deviances(
     for n in range(len(off)):
         x, y, xy = off[n, 0], off[n, 1], excess * covariance[n, 0, 1]
         xx, yy = excess * covariance[n, 0, 0], excess * covariance[n, 1, 1]
-        area = xx * yy - xy * xy
-        distance[n] = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / area
+        distance[n], area = _distance(x, y, xx, xy, yy)
         deviance[n] = distance[n] + np.log(area)
     return distance, deviance
 
@@ -333,8 +336,8 @@ def _least_deviance(
         xx = excess * (covariance[0, 0] + of_others[m, 0, 0])
         xy = excess * (covariance[0, 1] + of_others[m, 0, 1])
         yy = excess * (covariance[1, 1] + of_others[m, 1, 1])
-        area = xx * yy - xy * xy
-        deviance = (yy * x * x - 2.0 * xy * x * y + xx * y * y) / area + np.log(area)
+        distance, area = _distance(x, y, xx, xy, yy)
+        deviance = distance + np.log(area)
         least = deviance if deviance < least else least
     return least
 
