@@ -11,8 +11,8 @@ from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.rig import Rig
 from labapp.core.matching.hypothesis import USUAL_KNOTS, paths_of
 from labapp.core.matching.observation import UNLABELLED, Observation, try_fit, widened
-from labapp.core.matching.ray_classes import RayClasses, classify_rays
-from labapp.core.values import BoolArray, IntArray
+from labapp.core.matching.ray_classes import RayClasses, certain_witness, classify_rays
+from labapp.core.values import BoolArray, FloatArray, IntArray
 from labapp.simulation.pools import egg
 from tests.scenes import BENCH_RIG, BENCH_VIEW, FRAME_SHAPE, see, true_labels
 
@@ -114,3 +114,35 @@ def test_rays_out_of_view_are_not_dark(frame: tuple[Observation, IntArray]) -> N
     cropped, _ = observed_on(replace(BENCH_RIG, imaging_plane=narrow))
     wide, tight = classes(observed, labels).witness, classes(cropped, labels).witness
     assert (tight < 0).sum() < (wide < 0).sum()
+
+
+def test_false_dot_beside_the_plane_does_not_widen_the_view(
+    frame: tuple[Observation, IntArray],
+) -> None:
+    observed, labels = frame
+    pool = try_fit(observed, labels, USUAL_KNOTS)
+    assert pool is not None
+    paths = paths_of(observed, pool)
+    witness = classify_rays(observed, labels, paths).witness
+    dark = np.flatnonzero((witness < 0) & widened(witness > 0, 1))
+    right = paths.plane_mm[dark, 0].max()
+    narrow = replace(observed.rig.imaging_plane, width_mm=observed.plane_mm[:, 0].max() + 1.0)
+    assert right > narrow.width_mm
+    cropped, _ = observed_on(replace(BENCH_RIG, imaging_plane=narrow))
+    with_false = replace(
+        cropped,
+        plane_mm=np.vstack([cropped.plane_mm, [right + 2.0, 50.0]]),
+        covariance_mm2=np.concatenate([cropped.covariance_mm2, cropped.covariance_mm2[-1:]]),
+        size_mm=np.append(cropped.size_mm, cropped.size_mm[-1:]),
+    )
+    found, without = (classify_rays(one, labels, paths).witness for one in (with_false, cropped))
+    assert (found.flat[dark] < 0).sum() > (without.flat[dark] < 0).sum()
+
+    def exact(rays: IntArray) -> FloatArray:
+        return np.zeros((len(rays), 2, 2))
+
+    certain, expected = (certain_witness(one, found, paths, exact) for one in (with_false, cropped))
+    np.testing.assert_array_equal(certain, expected)
+    beside = paths.plane_mm[dark, 0] > narrow.width_mm
+    assert (certain.flat[dark[beside]] == 0).all()
+    assert (certain.flat[dark[~beside]] < 0).any()

@@ -198,30 +198,44 @@ class Observation(ReadOnlyArrays):
     def _fitted(self) -> dict[tuple[bytes, bytes, FitSettings], FittedPool | tuple[str, str]]:
         return {}
 
-    def in_view(self, plane_mm: FloatArray, margin_mm: FloatArray | float = 0.0) -> BoolArray:
+    def in_view(
+        self,
+        plane_mm: FloatArray,
+        margin_mm: FloatArray | float = 0.0,
+        view: tuple[FloatArray, FloatArray, FloatArray] | None = None,
+    ) -> BoolArray:
         """Whether dots at places on the plane, shape (…, 2), mm, would be visible.
 
-        They must be on the plane and in the frame, farther from the edge than `EDGE_MM` and
-        `EDGE_PX`, even if displaced by a margin, of their shape, mm, along either axis. The plane
-        extends over its nominal size and over all observed dots, as O′ need not be exactly its
-        corner.
+        They must be in the view even if displaced by a margin, of their shape, mm, along either
+        axis. The view is that of `view_with`. None: that of all observed dots.
         """
         from labapp.core.matching import match_kernels
 
         places = plane_mm.reshape(-1, 2)
         margin = np.full(plane_mm.shape, margin_mm).reshape(-1, 2)
-        visible = match_kernels.within_view(places, margin, *self.view)
+        visible = match_kernels.within_view(places, margin, *(view or self.view))
         return visible.reshape(plane_mm.shape[:-1])
 
     @cached_property
     def view(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """The homography from the plane to the image, shape (3, 3), and the limits of the view.
+        """The view with all observed dots (`view_with`)."""
+        return self.view_with(self.plane_mm)
 
-        The limits (low, high) are those on the plane, mm, and in the image, px, shapes (2, 2).
+    def view_with(self, dots_mm: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Limits of the view, given dots on the plane, shape (n, 2), n > 0, mm.
+
+        The plane extends over its nominal size and over these dots, as O′ need not be exactly its
+        corner.
+
+        Returns
+        -------
+        from_plane, on_plane_mm, in_image_px
+            The homography from the plane to the image, shape (3, 3); the limits (low, high) of
+            visible dots, `EDGE_MM` and `EDGE_PX` inside the edges, shapes (2, 2).
         """
         plane = self.rig.imaging_plane
-        low = np.minimum(self.plane_mm.min(axis=0), 0.0) + EDGE_MM
-        high = np.maximum(self.plane_mm.max(axis=0), [plane.width_mm, plane.height_mm]) - EDGE_MM
+        low = np.minimum(dots_mm.min(axis=0), 0.0) + EDGE_MM
+        high = np.maximum(dots_mm.max(axis=0), [plane.width_mm, plane.height_mm]) - EDGE_MM
         first, last = self.bench.frame_px(self.frame_shape)
         in_image = np.array([first + EDGE_PX, last - EDGE_PX])
         return self.bench.calibration.from_plane, np.array([low, high]), in_image

@@ -217,6 +217,7 @@ def false_dot_deviance(per_mm2: float = FALSE_DOTS_PER_MM2) -> float:
 
 def lines_out_of_view(
     observed: Observation,
+    view: tuple[FloatArray, FloatArray, FloatArray],
     at: IntArray,
     plane_mm: FloatArray,
     covariance_of: Callable[[BoolArray], FloatArray],
@@ -225,19 +226,19 @@ def lines_out_of_view(
 
     Parameters
     ----------
-    observed
-        The dots and the rig.
+    observed, view
+        The frame's dots, and the limits of the view (`Observation.view_with`).
     at, plane_mm
         Dark rays next to lit ones and their predicted dots, as in `Prediction`, shapes (m, 2), mm.
     covariance_of
         Function of a mask over these rays, shape (m,), that returns the covariance of their dots,
         shape (…, 2, 2), mm².
     """
-    unsure = ~observed.in_view(plane_mm, NEAR_EDGE_MM)
+    unsure = ~observed.in_view(plane_mm, NEAR_EDGE_MM, view)
     lines = _lines_of(at[unsure], observed.absent.shape)
     if lines.any():
-        variance = covariance_of(unsure)[:, [0, 1], [0, 1]]
-        unsure[unsure] = ~observed.in_view(plane_mm[unsure], OUT_OF_VIEW_SIGMA * np.sqrt(variance))
+        margin = OUT_OF_VIEW_SIGMA * np.sqrt(covariance_of(unsure)[:, [0, 1], [0, 1]])
+        unsure[unsure] = ~observed.in_view(plane_mm[unsure], margin, view)
         lines = _lines_of(at[unsure], observed.absent.shape)
     return lines
 

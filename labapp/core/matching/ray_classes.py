@@ -56,10 +56,11 @@ def certain_witness(
     paths: RayPaths,
     covariance_of: Callable[[IntArray], FloatArray],
 ) -> IntArray:
-    """Return the witness with dark rows set to unknown if they may have left the view.
+    """Return the witness with dark rays set to unknown if their dots may be out of view.
 
     Beyond the last visible row the fit extrapolates smoothly, whereas the pool gets steeper towards
-    its edge: the dots of the next row may lie farther out than predicted.
+    its edge: the dots of the next row may lie farther out than predicted. And only labelled dots
+    prove that dots are visible outside the nominal plane: others may come from elsewhere.
 
     Parameters
     ----------
@@ -71,8 +72,13 @@ def certain_witness(
         Function of the flat indices of rays, shape (m,), that returns the covariance of their
         dots, shape (m, 2, 2), mm².
     """
-    rim = np.flatnonzero((witness < 0) & widened(witness > 0, 1))
+    lit, dark = witness > 0, np.flatnonzero(witness < 0)
+    view = observed.view_with(paths.plane_mm[lit.ravel()])
+    certain = witness.copy()
+    certain.flat[dark[~observed.in_view(paths.plane_mm[dark], view=view)]] = 0
+    rim = np.flatnonzero((certain < 0) & widened(lit, 1))
     at = np.stack(np.divmod(rim, witness.shape[1]), axis=-1)
-    plane_mm = paths.plane_mm[rim]
-    lost = lines_out_of_view(observed, at, plane_mm, lambda which: covariance_of(rim[which]))
-    return np.where(lost, 0, witness)
+    lost = lines_out_of_view(
+        observed, view, at, paths.plane_mm[rim], lambda which: covariance_of(rim[which])
+    )
+    return np.where(lost, 0, certain)
