@@ -183,7 +183,7 @@ def test_height_sigma_is_propagated_from_the_coefficients() -> None:
     mean = mean_splines(BASIS, points)
     np.testing.assert_allclose(mean, BASIS.matrix(*points.T).mean(axis=0), atol=1e-15)
     sigma = height_sigma(BASIS, factor, inverse_of(factor), mean, places)
-    expected = propagate_sigma(factor, BASIS.matrix(*places.T), mean, 0.0)
+    expected = propagate_sigma(factor, BASIS.matrix(*places.T), mean)
     np.testing.assert_allclose(sigma, expected, rtol=1e-6)
 
 
@@ -831,10 +831,14 @@ def test_level_posterior_agrees_with_numpy(depth: int) -> None:
     part = slice(1, None) if depth else slice(0, 1)
     chosen = posterior[part] / posterior[part].sum()
     mean = chosen.sum(axis=0) @ levels
+    drop = chosen.sum(axis=1) @ drops[part]
+    higher, deeper = levels - mean, drops - drop
     expected = (
-        chosen.sum(axis=1) @ drops[part],
         mean,
-        np.sqrt(posterior.sum(axis=0) @ (levels - mean) ** 2),
+        np.sqrt(posterior.sum(axis=0) @ higher**2),
+        drop,
+        np.sqrt(posterior.sum(axis=1) @ deeper**2),
+        deeper @ posterior @ higher,
         posterior[:, [0, -1]].sum(),
     )
     computed = level_kernels.level_posterior(nats, blur_cost, 1.5, drops, 0.3, 1.0)

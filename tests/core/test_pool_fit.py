@@ -14,12 +14,13 @@ from labapp.core.geometry.optics import intersect_imaging_plane, reflect, surfac
 from labapp.core.geometry.rig import ImagingPlane
 from labapp.core.match import Match
 from labapp.core.schemes import fit
-from labapp.core.surface.level import Level
+from labapp.core.surface.level import Level, Rear
+from labapp.core.surface.measures import WITH_SIGMA
 from labapp.core.surface.pool_fit import FitSettings, FittedPool, fit_pool
 from labapp.core.surface.spline import SplineBasis, SplineSurface
 from labapp.core.values import CannotMeasure, FloatArray, IntArray
 from labapp.simulation.forward import exact_match, trace
-from labapp.simulation.pools import Pool, egg, spherical_cap
+from labapp.simulation.pools import LowRear, Pool, egg, spherical_cap
 from tests.levels import find_level
 from tests.scenes import OPEN_RIG
 
@@ -278,6 +279,34 @@ def test_single_row_of_lit_rays_has_a_level() -> None:
     level = find_level(exact, slope, y, witness, np.array([0.4, 0.8]))
     assert np.isfinite([level.shift_mm, level.sigma_mm]).all()
     assert level.rear.drop_mm == 0.0
+
+
+def test_rear_sinks_although_no_dark_ray_is_seen_there() -> None:
+    """The lit rays at the rear land outside the boundary that the head determines."""
+    for drop_mm in 0.0, 0.1:
+        pool = egg(6.6, 3.0, 3.9, 0.33, terms=(LowRear(drop_mm),))
+        match = exact_match(trace(pool, OPEN_RIG), OPEN_RIG)
+        witness = match.witness.copy()
+        witness[(witness < 0) & (np.arange(1, 20)[:, None] < match.ray[:, 0].min() + 2)] = 0
+        match = replace(match, witness=witness)
+        fitted = fit.solve(match, OPEN_RIG, FitSettings())
+        made, found = fit.complete(match, fitted, OPEN_RIG, FitSettings())
+        assert (fitted.level.rear.drop_mm > 0.03) == (drop_mm > 0)
+        assert abs(found.length_mm - pool.size.length_mm) < 2.5 * found.length_sigma_mm
+        given = replace(fitted.level, drop_sigma_mm=0.0, drop_covariance_mm2=0.0)
+        certain, _ = fit.complete(match, replace(fitted, level=given), OPEN_RIG, FitSettings())
+        less = certain.size_sigma_level < made.size_sigma_level
+        assert less[WITH_SIGMA.index("length_mm")]
+        assert not less[WITH_SIGMA.index("height_mm")]
+
+
+def test_uncertainty_of_shift_and_drop_agrees_with_samples() -> None:
+    level = Level(0.0, 0.02, 1, Rear(), 0.0, drop_sigma_mm=0.03, drop_covariance_mm2=-3e-4)
+    covariance = [[0.02**2, -3e-4], [-3e-4, 0.03**2]]
+    samples = np.random.default_rng(4).multivariate_normal([0.0, 0.0], covariance, 100_000)
+    by_shift, by_drop = np.array([1.0, 2.0, 0.0]), np.array([0.0, 1.0, -3.0])
+    expected = np.std(samples @ [by_shift, by_drop], axis=0)
+    np.testing.assert_allclose(level.sigma_of(by_shift, by_drop), expected, rtol=0.02)
 
 
 def test_laser_ten_times_too_far_away_is_rejected() -> None:

@@ -39,7 +39,7 @@ def changes(pool: FittedPool | None = None) -> FloatArray:
     center = (points[:, :2].min(axis=0) + points[:, :2].max(axis=0)) / 2
     boundary, slope = trace_boundary(basis, coefficients, pool.level, center)
     gradient = sizes_and_gradients(basis, coefficients, pool.level, boundary, slope).gradient
-    return setup_changes(MATCH, RIG, SETTINGS, pool, gradient)
+    return setup_changes(MATCH, RIG, SETTINGS, pool, gradient[:, :-1])
 
 
 def sizes_on(offset: FloatArray) -> FloatArray:

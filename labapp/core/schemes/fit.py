@@ -134,8 +134,9 @@ def complete(
         raise CannotMeasure(
             "open-boundary", "the surface comes down to the work piece within its boundary"
         )
-    shape, by_shape = shape_and_gradients(basis, coefficients, boundary, slope)
-    gradient = np.concatenate([sizes.gradient, by_shape])
+    shape, by_shape = shape_and_gradients(basis, coefficients, level.rear, boundary, slope)
+    gradient, by_drop = np.split(np.concatenate([sizes.gradient, by_shape]), [-1], axis=1)
+    by_level = level.sigma_of(gradient.sum(axis=1), by_drop[:, 0])
     former = None if known is None else nearest_part(known.by_setup, sizes.size)
     if former is not None:
         by_setup = former.sigma
@@ -149,8 +150,8 @@ def complete(
         points_mm=points,
         residual_mm=pool.residual_mm,
         sigma_mm=np.hypot(pool.height_sigma_mm(points), level.sigma_mm),
-        size_sigma=np.hypot(pool.sigma_of(gradient), by_setup),
-        size_sigma_level=np.abs(gradient.sum(axis=1)) * level.sigma_mm,
+        size_sigma=np.sqrt(pool.sigma_of(gradient) ** 2 + by_level**2 + by_setup**2),
+        size_sigma_level=by_level,
         size_sigma_setup=by_setup,
     )
     errors = measures.reflection_errors(reconstruction, match, rig)

@@ -397,7 +397,7 @@ def _with_level(prior: Prior, fit: _Fit, covariance: FloatArray) -> tuple[RayCla
     )
     sigma = fit.rounds.height_sigma_mm(witnesses.landing_mm)
     witnesses = replace(witnesses, height_sigma_mm=sigma)
-    near = Level(0.0, prior.level_sigma_mm, prior.level.sign, prior.level.rear, 0.0)
+    near = replace(prior.level, shift_mm=0.0, sigma_mm=prior.level_sigma_mm)
     level = rounds_with_level(
         fit.rounds,
         witnesses,

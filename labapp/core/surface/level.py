@@ -65,6 +65,8 @@ class Level:
         and every dark one outside, or if no ray is known to be dark.
     ray_count, rise_mm
         Number of these rays; typical change of the height there from one ray to the next, mm.
+    drop_sigma_mm, drop_covariance_mm2
+        Standard uncertainty of the rear's drop, mm, and its covariance with the shift, mm².
     """
 
     shift_mm: float
@@ -74,16 +76,18 @@ class Level:
     negative_log_likelihood: float
     ray_count: int = 0
     rise_mm: float = 0.0
+    drop_sigma_mm: float = 0.0
+    drop_covariance_mm2: float = 0.0
 
     @classmethod
     def of(cls, values: FloatArray) -> Level:
-        """Build a level from the result of `level_kernels.find_level`, shape (9,)."""
-        shift, sigma, sign, drop, start, end, least, rays, rise = values.tolist()
-        return cls(shift, sigma, int(sign), Rear(drop, start, end), least, int(rays), rise)
+        """Build a level from the result of `level_kernels.find_level`, shape (11,)."""
+        shift, sigma, sign, drop, start, end, least, rays, *others = values.tolist()
+        return cls(shift, sigma, int(sign), Rear(drop, start, end), least, int(rays), *others)
 
     @property
     def as_array(self) -> FloatArray:
-        """Values as an array for compiled functions (`of`), shape (9,)."""
+        """Values as an array for compiled functions (`of`), shape (11,)."""
         values = [
             self.shift_mm,
             self.sigma_mm,
@@ -94,8 +98,19 @@ class Level:
             self.negative_log_likelihood,
             self.ray_count,
             self.rise_mm,
+            self.drop_sigma_mm,
+            self.drop_covariance_mm2,
         ]
         return np.array(values, float)
+
+    def sigma_of(self, by_shift: FloatArray, by_drop: FloatArray) -> FloatArray:
+        """Standard uncertainty of quantities due to that of the level, shape (m,).
+
+        Parameters are their derivatives by the shift and by the rear's drop, shape (m,).
+        """
+        both = 2 * self.drop_covariance_mm2 * by_shift * by_drop
+        variance = (self.sigma_mm * by_shift) ** 2 + both + (self.drop_sigma_mm * by_drop) ** 2
+        return np.sqrt(np.maximum(variance, 0.0))
 
     @property
     def disagreement(self) -> float:

@@ -126,8 +126,8 @@ class FittedPool(ReadOnlyArrays):
         return mean_splines(self.surface.basis, self.points_mm)
 
     def sigma_of(self, gradients: FloatArray) -> FloatArray:
-        """Standard uncertainty of quantities, shape (m,), from their derivatives, shape (m, p)."""
-        return propagate_sigma(self.factor, gradients, self.mean_splines, self.level.sigma_mm)
+        """Standard uncertainty of quantities apart from the level (`propagate_sigma`)."""
+        return propagate_sigma(self.factor, gradients, self.mean_splines)
 
     def height_sigma_mm(self, places_mm: FloatArray) -> FloatArray:
         """Standard uncertainty of the height at m places, apart from the level, shape (m,), mm."""

@@ -13,6 +13,7 @@ from functools import cached_property
 import numpy as np
 
 from labapp.core.surface.boundary import Boundary
+from labapp.core.surface.level import Rear
 from labapp.core.surface.spline import SplineBasis
 from labapp.core.surface.surface import Surface
 from labapp.core.values import FloatArray
@@ -39,18 +40,23 @@ def shape_of(surface: Surface, boundary: Boundary) -> FloatArray:
 
 
 def shape_and_gradients(
-    basis: SplineBasis, coefficients: FloatArray, boundary: Boundary, boundary_slope: FloatArray
+    basis: SplineBasis,
+    coefficients: FloatArray,
+    rear: Rear,
+    boundary: Boundary,
+    boundary_slope: FloatArray,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return `shape_of` a spline surface, shape (3,), and its derivatives, shape (3, p).
+    """Return `shape_of` a spline surface, shape (3,), and its derivatives, shape (3, p + 1).
 
-    Derivatives are by the spline coefficients; the boundary moves with the surface.
+    Derivatives are by the spline coefficients and by the drop of the rear; the boundary moves with
+    the surface.
 
     Parameters
     ----------
     basis, coefficients
         The surface: splines and their coefficients, shape (p,), mm.
-    boundary, boundary_slope
-        See `trace_boundary`.
+    rear, boundary, boundary_slope
+        The rear of the level, and the boundary traced with it (`trace_boundary`).
     """
     from labapp.core.surface.kernels import shape_kernels
 
@@ -58,7 +64,14 @@ def shape_and_gradients(
     spokes = samples.middle_mm, samples.reach_mm, samples.place_mm, samples.height_mm
     rim = samples.length_mm, samples.inward, samples.rim_mm, samples.rise
     return samples.shape, shape_kernels.shape_gradients(
-        basis.grid, coefficients, outline, boundary_slope, spokes, rim, samples.shape
+        basis.grid,
+        coefficients,
+        outline,
+        boundary_slope,
+        rear.as_array,
+        spokes,
+        rim,
+        samples.shape,
     )
 
 

@@ -32,9 +32,9 @@ class Sizes:
     peak_mm
         (x, y) where the surface is farthest from the work piece, shape (2,).
     gradient
-        Derivatives by the spline coefficients, shape (6, p). NaN for the depth of a pool above the
-        work piece if the lowest point is on the boundary, whose rear is assumed to be a parabola
-        and not measured.
+        Derivatives by the p spline coefficients and the drop of the rear, shape (6, p + 1). NaN for
+        the depth of a pool above the work piece if the lowest point is on the boundary, whose rear
+        is assumed to be a parabola and not measured.
     holds
         Whether the surface is on one side of the boundary's height between centre and boundary.
     """
@@ -68,21 +68,20 @@ def sizes_and_gradients(
     samples, over, share = outline_kernels.spokes(
         grid, coefficients, outline, center, FRACTION, WEIGHT, level.rear.as_array, STRIDE
     )
-    extremes, changes = [], np.zeros((2, len(coefficients)))
+    count, rear = len(coefficients), level.rear.as_array
+    extremes, changes = [], np.zeros((2, count + 1))
     for sign, change in zip((1.0, -1.0), changes, strict=True):
         within, extreme = (places[np.argmax(sign * places[:, 2])] for places in (samples, outline))
         # An extreme on the boundary is not refined; one within it may lie between samples.
         if sign * within[2] >= sign * extreme[2]:
             extreme = measures.refined(height, boundary, within, sign)
-            change[:] = spline_kernels.gradient_of_sum(
-                grid, len(change), extreme[None, :2], np.ones(1)
-            )
+            change[:-1] = spline_kernels.gradient_of_sum(grid, count, extreme[None, :2], np.ones(1))
         elif level.sign > 0:
             change[:] = np.nan
         extremes.append(extreme)
     high, low = extremes
     by_boundary = outline_kernels.size_gradients(
-        grid, len(coefficients), samples, share, outline, boundary_slope, center
+        grid, count, samples, share, outline, boundary_slope, center, rear
     )
     width, length = np.ptp(outline[:, :2], axis=0)
     area, volume = share.sum(), share @ samples[:, 2]

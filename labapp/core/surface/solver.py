@@ -160,7 +160,7 @@ class Rounds:
         Returns
         -------
         FloatArray
-            The final level (`level_kernels.find_level`), shape (9,).
+            The final level (`level_kernels.find_level`), shape (11,).
 
         Raises
         ------
@@ -267,9 +267,9 @@ def height_sigma(
 
 
 def propagate_sigma(
-    factor: FloatArray, gradients: FloatArray, mean_splines: FloatArray, level_sigma_mm: float
+    factor: FloatArray, gradients: FloatArray, mean_splines: FloatArray
 ) -> FloatArray:
-    """Standard uncertainty of quantities, shape (m,), from their derivatives, shape (m, p).
+    """Standard uncertainty of quantities apart from that of the level, shape (m,).
 
     The covariance of the coefficients is the inverse of the normal matrix; the level is known
     independently of them.
@@ -279,20 +279,15 @@ def propagate_sigma(
     factor
         Cholesky factor of the normal matrix (`normal_factor`).
     gradients
-        Derivatives by the spline coefficients.
+        Derivatives by the spline coefficients, shape (m, p).
     mean_splines
         Mean value of each spline over the reflection points, shape (p,): slopes determine the
         surface up to its mean there.
-    level_sigma_mm
-        Standard uncertainty of the level, mm.
     """
     from labapp.core.surface.kernels import solver_kernels
 
-    by_level = gradients.sum(axis=1)
-    free = gradients - by_level[:, None] * mean_splines
-    return np.asarray(
-        np.sqrt(solver_kernels.variances(factor, free) + (level_sigma_mm * by_level) ** 2)
-    )
+    free = gradients - gradients.sum(axis=1)[:, None] * mean_splines
+    return np.asarray(np.sqrt(solver_kernels.variances(factor, free)))
 
 
 @dataclass(frozen=True)
@@ -316,7 +311,7 @@ class SlopeFit:
 
     def sigma_of(self, gradients: FloatArray) -> FloatArray:
         """Standard uncertainty of quantities that do not depend on the level, shape (m,)."""
-        return propagate_sigma(self.factor, gradients, self.mean_splines, 0.0)
+        return propagate_sigma(self.factor, gradients, self.mean_splines)
 
 
 def fit_slopes(

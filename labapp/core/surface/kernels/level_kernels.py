@@ -206,7 +206,7 @@ def level_posterior(
     drops: FloatArray,
     first: float,
     step: float,
-) -> tuple[float, float, float, float]:
+) -> tuple[float, float, float, float, float, float]:
     """Posterior of the level and of the rear's drop, marginalised over blurs.
 
     Parameters
@@ -222,9 +222,10 @@ def level_posterior(
 
     Returns
     -------
-    drop, mean, sigma, at_ends
-        Expected drop and level, given that there is a drop or none, whichever is likelier; standard
-        deviation of the level over both, mm; probability of the first and last levels together.
+    mean, sigma, drop, drop_sigma, covariance, at_ends
+        Expected level and drop, given that there is a drop or none, whichever is likelier, and
+        their standard deviations over both, mm; their covariance, mm²; probability of the first and
+        last levels together.
     """
     depths, blurs, count = nats.shape
     least = np.inf
@@ -241,15 +242,21 @@ def level_posterior(
                     share[d, k] += np.exp(least - against)
     share /= share.sum()
     start, end = (1, depths) if share[0].sum() < 0.5 else (0, 1)
-    chosen, drop, mean, spread = share[start:end].sum(), 0.0, 0.0, 0.0
+    chosen, drop, mean = share[start:end].sum(), 0.0, 0.0
     for d in range(start, end):
         for k in range(count):
             drop += share[d, k] / chosen * drops[d]
             mean += share[d, k] / chosen * (first + k * step)
+    spread, drop_spread, covariance = 0.0, 0.0, 0.0
     for d in range(depths):
+        deeper = drops[d] - drop
         for k in range(count):
-            spread += share[d, k] * (first + k * step - mean) ** 2
-    return drop, mean, np.sqrt(spread), share[:, 0].sum() + share[:, -1].sum()
+            higher = first + k * step - mean
+            spread += share[d, k] * higher**2
+            drop_spread += share[d, k] * deeper**2
+            covariance += share[d, k] * higher * deeper
+    at_ends = share[:, 0].sum() + share[:, -1].sum()
+    return mean, np.sqrt(spread), drop, np.sqrt(drop_spread), covariance, at_ends
 
 
 @_inner
@@ -313,7 +320,7 @@ def search_level(
     search: FloatArray,
     drops: FloatArray,
     blurs: FloatArray,
-) -> tuple[FloatArray, int]:
+) -> tuple[FloatArray, float]:
     """Evaluate the posterior of levels, blurs and drops of the rear on a grid.
 
     Parameters
@@ -325,17 +332,14 @@ def search_level(
         there, in rises, the probability that a dot is missing, and −log of the prior of every drop
         but the first, nats.
     drops
-        Drops of the rear, mm. Of several only the first counts where no dark ray near the boundary
-        is at the rear.
+        Drops of the rear, mm.
     blurs
         Blurs, in spacings of the rays, and −log of their priors, shape (2, b).
 
     Returns
     -------
-    found, rays
-        Mean and standard deviation of the level, drop, start and end of the rear (`level.Rear`),
-        mm, probability at the ends of the grid, least −log likelihood, and the usual rise, mm; and
-        how many witnesses count.
+    found, at_ends
+        The level (`find_level`), shape (11,), and its probability at the ends of the grid.
     """
     head_sign, shift, sign, reach, missing, sunk = search
     rises, usual = rises_of(slope, spacing)
@@ -347,13 +351,10 @@ def search_level(
     end = min(low, start - 1e-6)  # a single row has no rear
     near = np.flatnonzero(np.abs(height[0] + shift) < NEAR_RISES * rises)
     side, dark, spread = np.empty(len(near)), np.empty(len(near), np.bool_), np.empty(len(near))
-    is_seen = False
     for m in range(len(near)):
         at = near[m]
         side[m], dark[m] = sign * witness[at] / rises[at], witness[at] < 0
         spread[m] = spread_of(height[1, at], rises[at])
-        is_seen |= dark[m] and head_sign * y[at] < end
-    drops = drops if is_seen else drops[:1]
     over = np.empty((len(drops), len(near)))
     for m in range(len(near)):
         share = max((start - head_sign * y[near[m]]) / (start - end), 0.0)
@@ -363,9 +364,12 @@ def search_level(
     first, step = shift - reach * usual, 2.0 * reach * usual / (count - 1)
     levels = first, step, count
     nats = level_negative_log_likelihood(over, side, dark, spread, missing, levels, blurs)
-    drop, mean, sigma, at_ends = level_posterior(nats, blurs[1], sunk, drops, first, step)
-    rear = head_sign * start, head_sign * end
-    return np.array([mean, sigma, drop, *rear, at_ends, nats.min(), usual]), len(near)
+    mean, sigma, drop, drop_sigma, covariance, at_ends = level_posterior(
+        nats, blurs[1], sunk, drops, first, step
+    )
+    level, rear = (mean, sigma, sign), (drop, head_sign * start, head_sign * end)
+    seen = nats.min(), float(len(near)), usual
+    return np.array([*level, *rear, *seen, drop_sigma, covariance]), at_ends
 
 
 @_compiled(_f2, _f2, _f1, _i1, _f1, _f1, _f1, _f)
@@ -411,7 +415,8 @@ def find_level(
     -------
     FloatArray
         Shift, mm, its standard uncertainty, mm, and sign; drop, start and end of the rear, mm;
-        least −log likelihood, number of rays, and usual rise, mm (`level.Level`), shape (9,).
+        least −log likelihood, number of rays, and usual rise, mm; standard uncertainty of the drop,
+        mm, and its covariance with the shift, mm² (`level.Level`), shape (11,).
     """
     (head_sign, drop), (shift, sign, reach) = rear, about
     is_tried = False
@@ -424,11 +429,10 @@ def find_level(
         if np.isnan(drop) and sign > 0.0:
             drops = DROPS_MM.copy()
         search = np.array([head_sign, shift, sign, reach, missing, SUNK_COST])
-        found, rays = search_level(height, slope, y, witness, spacing, search, drops, BLURS)
-        mean, sigma, sunk, start, end, at_ends, least, usual = found
+        found, at_ends = search_level(height, slope, y, witness, spacing, search, drops, BLURS)
         is_wide = reach >= 1.0
         if (is_tried and is_wide) or not at_ends > (MOST_AT_FAR_ENDS if is_wide else MOST_AT_ENDS):
-            return np.array([mean, sigma, sign, sunk, start, end, least, float(rays), usual])
+            return found
         reach = np.nan if is_wide else 1.0
 
 

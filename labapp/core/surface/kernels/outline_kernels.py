@@ -14,7 +14,11 @@ import numpy as np
 from numba import types
 
 from labapp.core.compiled import compiled as _compiled
-from labapp.core.surface.kernels.spline_kernels import accumulate_splines, height_and_slopes
+from labapp.core.surface.kernels.spline_kernels import (
+    accumulate_at_boundary,
+    accumulate_splines,
+    height_and_slopes,
+)
 from labapp.core.values import FloatArray
 
 _f, _i = types.float64, types.int64
@@ -130,7 +134,7 @@ def spokes(
     return samples, over, share
 
 
-@_compiled(_f2, _i, _f2, _f1, _f2, _f2, _f1)
+@_compiled(_f2, _i, _f2, _f1, _f2, _f2, _f1, _f1)
 def size_gradients(
     grid: FloatArray,
     count: int,
@@ -139,13 +143,15 @@ def size_gradients(
     outline: FloatArray,
     boundary_slope: FloatArray,
     center: FloatArray,
+    rear: FloatArray,
 ) -> FloatArray:
-    """Derivatives of width, length, area and volume by so many coefficients, shape (4, p).
+    """Derivatives of width, length, area and volume, shape (4, p + 1).
 
-    Samples and what they count in the volume are those of `spokes`; ``boundary_slope`` is the
-    gradient of the surface's height over the boundary's at each boundary point, shape (m, 2).
+    They are by p = ``count`` coefficients and by the drop of the rear (`Rear.as_array`). Samples
+    and what they count in the volume are those of `spokes`; ``boundary_slope`` is the gradient of
+    the surface's height over the boundary's at each boundary point, shape (m, 2).
     """
-    out, work = np.zeros((4, count)), np.empty((4, 4))
+    out, work = np.zeros((4, count + 1)), np.empty((4, 4))
     for axis in range(2):
         low, high = 0, 0
         for k in range(len(outline)):
@@ -153,19 +159,21 @@ def size_gradients(
             high = k if outline[k, axis] > outline[high, axis] else high
         for end, sign in ((high, -1.0), (low, 1.0)):
             moved = sign / boundary_slope[end, axis]
-            accumulate_splines(grid, outline[end, 0], outline[end, 1], moved, work, out[axis])
+            x, y = outline[end, 0], outline[end, 1]
+            accumulate_at_boundary(grid, rear, x, y, moved, work, out[axis])
     for k in range(len(outline)):
-        x, y = outline[k, 0] - center[0], outline[k, 1] - center[1]
+        x, y, z = outline[k]
+        off_x, off_y = x - center[0], y - center[1]
         # Where the surface rises by dz the boundary moves by −dz over its slope outwards.
         moved = (
             -2.0
             * np.pi
             / len(outline)
-            * (x * x + y * y)
-            / (boundary_slope[k, 0] * x + boundary_slope[k, 1] * y)
+            * (off_x * off_x + off_y * off_y)
+            / (boundary_slope[k, 0] * off_x + boundary_slope[k, 1] * off_y)
         )
-        accumulate_splines(grid, outline[k, 0], outline[k, 1], moved, work, out[2])
-        accumulate_splines(grid, outline[k, 0], outline[k, 1], moved * outline[k, 2], work, out[3])
+        accumulate_at_boundary(grid, rear, x, y, moved, work, out[2])
+        accumulate_at_boundary(grid, rear, x, y, moved * z, work, out[3])
     for k in range(len(samples)):
         accumulate_splines(grid, samples[k, 0], samples[k, 1], share[k], work, out[3])
     return out

@@ -45,7 +45,7 @@ def _level_of_round(
     if len(outer):
         shift, level_sigma, inner = guess_level(surface_at(grid, coefficients, points)[0], outer)
         side = 1.0 if inner + shift > 0.0 else -1.0
-        return np.array([shift, level_sigma, side, 0.0, 0.0, -1.0, 0.0, 0.0, 0.0])
+        return np.array([shift, level_sigma, side, 0.0, 0.0, -1.0, *np.zeros(5)])
     # The drop is fixed in the second half of the rounds, as the iteration may oscillate.
     is_held = drop_is_free == 0.0 or 2 * count > most
     there = surface_at(grid, coefficients, landing)
@@ -59,7 +59,7 @@ def _level_of_round(
     seen = height, there[1:].T, landing[:, 1], sign, spacing
     found = find_level(*seen, rear, about, missing)
     if is_held:
-        found[1] = max(found[1], level[1])
+        found[1], found[9:] = max(found[1], level[1]), level[9:]
     return found
 
 
@@ -90,7 +90,7 @@ def run_rounds(
         the witnesses, and the spacing of the rays, shape (2,) (`level.Witnesses`). With neither an
         outer point nor a witness the surface is not shifted.
     level
-        Level before (`level_kernels.find_level`), shape (9,).
+        Level before (`level_kernels.find_level`), shape (11,).
     limits
         Maximum number of rounds; displacement, mm, of the reflection points below which they end;
         Newton steps of a round; displacement up to which the factor is reused; the displacement in

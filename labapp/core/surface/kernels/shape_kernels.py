@@ -12,7 +12,11 @@ from numba import types
 
 from labapp.core.compiled import compiled as _compiled
 from labapp.core.compiled import inner as _inner
-from labapp.core.surface.kernels.spline_kernels import accumulate_splines, height_and_slopes
+from labapp.core.surface.kernels.spline_kernels import (
+    accumulate_at_boundary,
+    accumulate_splines,
+    height_and_slopes,
+)
 from labapp.core.values import FloatArray, IntArray
 
 _f = types.float64
@@ -114,6 +118,7 @@ def _convexity(
     coefficients: FloatArray,
     outline: FloatArray,
     boundary_slope: FloatArray,
+    rear: FloatArray,
     spokes: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
     convexity: float,
     out: FloatArray,
@@ -138,7 +143,7 @@ def _convexity(
         outwards = WAY[e, 1] * (height - convexity) / length
         aside -= outwards * slope_x / slope_y
         x, y = middle[0] + reach[e] * WAY[e, 0], middle[1] + reach[e] * WAY[e, 1]
-        accumulate_splines(grid, x, y, -outwards / slope_y, work, out)
+        accumulate_at_boundary(grid, rear, x, y, -outwards / slope_y, work, out)
     return aside
 
 
@@ -147,6 +152,7 @@ def _asymmetry(
     grid: FloatArray,
     outline: FloatArray,
     boundary_slope: FloatArray,
+    rear: FloatArray,
     spokes: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
     rim: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
     asymmetry: float,
@@ -177,7 +183,7 @@ def _asymmetry(
         a, b = boundary_slope[k]
         outwards = (inward[k, 0] * a + inward[k, 1] * b) / (a * a + b * b) * abs(z) * length[k]
         share = (np.sign(x - middle[0]) - asymmetry) * outwards / total
-        accumulate_splines(grid, x, y, share, work, out)
+        accumulate_at_boundary(grid, rear, x, y, share, work, out)
     return -2 * across / total
 
 
@@ -187,6 +193,7 @@ def _wetting(
     coefficients: FloatArray,
     outline: FloatArray,
     boundary_slope: FloatArray,
+    rear: FloatArray,
     rim: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
     wetting_deg: float,
     out: FloatArray,
@@ -217,45 +224,49 @@ def _wetting(
             grown = (pull[k - 1, axis] - pull[(k + 1) % count, axis]) / 2
             moved = -boundary_slope[k, axis] / (a * a + b * b)
             by_move += (RIM * turned * bend[axis] + grown) * moved
-        accumulate_splines(grid, outline[k, 0], outline[k, 1], by_move, work, out)
+        accumulate_at_boundary(grid, rear, outline[k, 0], outline[k, 1], by_move, work, out)
     return 0.0
 
 
-@_compiled(_f2, _f1, _f2, _f2, _spokes, _rims, _f1)
+@_compiled(_f2, _f1, _f2, _f2, _f1, _spokes, _rims, _f1)
 def shape_gradients(
     grid: FloatArray,
     coefficients: FloatArray,
     outline: FloatArray,
     boundary_slope: FloatArray,
+    rear: FloatArray,
     spokes: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
     rim: tuple[FloatArray, FloatArray, FloatArray, FloatArray],
     shape: FloatArray,
 ) -> FloatArray:
-    """Derivatives of the shape parameters by the p spline coefficients, shape (3, p).
+    """Derivatives of the shape parameters by the p spline coefficients and the drop of the rear.
 
-    The boundary moves with the surface.
+    The boundary moves with the surface. They have shape (3, p + 1).
 
     Parameters
     ----------
     grid, coefficients, outline, boundary_slope
         See the module.
+    rear
+        `Rear.as_array`.
     spokes, rim
         Results of `sample_places`, with the heights of the surface on the spokes, shape (s, r), and
         its slopes inwards at the rim, shape (m,).
     shape
         The parameters, shape (3,).
     """
-    out = np.zeros((3, len(coefficients)))
+    out = np.zeros((3, len(coefficients) + 1))
     low, high = np.argmin(outline[:, 0]), np.argmax(outline[:, 0])
+    edge = outline, boundary_slope, rear
     by_middle = (
-        _convexity(grid, coefficients, outline, boundary_slope, spokes, shape[0], out[0]),
-        _asymmetry(grid, outline, boundary_slope, spokes, rim, shape[1], out[1]),
-        _wetting(grid, coefficients, outline, boundary_slope, rim, shape[2], out[2]),
+        _convexity(grid, coefficients, *edge, spokes, shape[0], out[0]),
+        _asymmetry(grid, *edge, spokes, rim, shape[1], out[1]),
+        _wetting(grid, coefficients, *edge, rim, shape[2], out[2]),
     )
     work = np.empty((4, 4))
     for parameter in range(3):
         for end in (low, high):  # the middle moves by half the displacement of each side
             share = -0.5 * by_middle[parameter] / boundary_slope[end, 0]
             x, y = outline[end, 0], outline[end, 1]
-            accumulate_splines(grid, x, y, share, work, out[parameter])
+            accumulate_at_boundary(grid, rear, x, y, share, work, out[parameter])
     return out

@@ -108,6 +108,26 @@ def accumulate_splines(
             out[(first_x + a) * many + first_y + b] += share * work[0, a] * work[2, b]
 
 
+@_inner
+def accumulate_at_boundary(
+    grid: FloatArray,
+    rear: FloatArray,
+    x: float,
+    y: float,
+    share: float,
+    work: FloatArray,
+    out: FloatArray,
+) -> None:
+    """`accumulate_splines` at a boundary point, and for the drop of the rear.
+
+    Where the boundary lies lower by dz it moves as if the surface were higher by dz. The derivative
+    by the drop (`Rear.height`) is the last value of ``out``.
+    """
+    accumulate_splines(grid, x, y, share, work, out)
+    part = max((rear[1] - y) / (rear[1] - rear[2]), 0.0)
+    out[-1] += share * part * part
+
+
 @_compiled(_f2, _i, _f2, _f1)
 def gradient_of_sum(
     grid: FloatArray, count: int, place: FloatArray, share: FloatArray
