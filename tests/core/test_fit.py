@@ -147,14 +147,18 @@ def test_size_uncertainty_is_the_spread_over_the_posterior(seen: Pool) -> None:
     match = exact_match(reflections, OPEN_RIG, sigma_mm=NOISE_MM, rng=rng)
     reconstruction = fit.reconstruct(match, OPEN_RIG, FitSettings())
     pool = fit_pool(match, OPEN_RIG, FitSettings())
-    sizes = []
+    level, sizes = pool.level, []
+    both = level.drop_covariance_mm2
+    covariance = [[level.sigma_mm**2, both], [both, level.drop_sigma_mm**2]]
     for _ in range(300):
         half = rng.normal(size=pool.surface.basis.count)
         change = dtbtrs(pool.factor, half, uplo="L", trans="T")[0]
-        change += rng.normal(0.0, pool.level.sigma_mm) - pool.mean_splines @ change
+        shift, deeper = rng.multivariate_normal([0.0, 0.0], covariance)
+        change += shift - pool.mean_splines @ change
         surface = SplineSurface(pool.surface.basis, pool.surface.coefficients + change)
         center = reconstruction.boundary.center_mm
-        boundary, _ = trace_boundary(surface.basis, surface.coefficients, pool.level, center)
+        moved = replace(level, rear=replace(level.rear, drop_mm=level.rear.drop_mm + deeper))
+        boundary, _ = trace_boundary(surface.basis, surface.coefficients, moved, center)
         sizes.append(np.append(surface_sizes(surface, boundary)[0], shape_of(surface, boundary)))
     np.testing.assert_allclose(np.std(sizes, axis=0)[:3], reconstruction.size_sigma[:3], rtol=0.2)
     np.testing.assert_allclose(np.std(sizes, axis=0)[4:], reconstruction.size_sigma[4:], rtol=0.2)
