@@ -10,10 +10,16 @@ import pytest
 from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.rig import Rig
 from labapp.core.matching.hypothesis import USUAL_KNOTS, paths_of
-from labapp.core.matching.observation import UNLABELLED, Observation, try_fit, widened
+from labapp.core.matching.observation import (
+    RESOLVED_SIZES,
+    UNLABELLED,
+    Observation,
+    try_fit,
+    widened,
+)
 from labapp.core.matching.ray_classes import RayClasses, certain_witness, classify_rays
 from labapp.core.values import BoolArray, FloatArray, IntArray
-from labapp.simulation.pools import egg
+from labapp.simulation.pools import egg, spherical_cap
 from tests.scenes import BENCH_RIG, BENCH_VIEW, FRAME_SHAPE, see, true_labels
 
 POOL = egg(5.4, 2.6, 3.0, 0.27)
@@ -146,3 +152,25 @@ def test_false_dot_beside_the_plane_does_not_widen_the_view(
     beside = paths.plane_mm[dark, 0] > narrow.width_mm
     assert (certain.flat[dark[beside]] == 0).all()
     assert (certain.flat[dark[~beside]] < 0).any()
+
+
+def test_merged_dots_of_a_row_beyond_the_labels_are_not_stray() -> None:
+    """A concave pool focuses its last row, of which no dot may be resolved."""
+    seen = see(spherical_cap(5.4, -0.45), np.random.default_rng(3), sigma_px=0.05)
+    observed = Observation.of(seen.dots, Bench(BENCH_RIG, BENCH_VIEW), FRAME_SHAPE)
+    sharp, merging = (
+        replace(observed, size_mm=np.full(len(seen.ray), size_mm))
+        for size_mm in (0.1, 1.2 / RESOLVED_SIZES)
+    )
+    true = true_labels(seen)
+    last = np.flatnonzero((true != UNLABELLED).any(axis=1))[-1]
+    labels, dots = true.copy(), true[last][true[last] != UNLABELLED]
+    labels[last] = UNLABELLED
+    pool = try_fit(observed, labels, USUAL_KNOTS)
+    assert pool is not None
+    paths = paths_of(observed, pool)
+    assert classify_rays(sharp, labels, paths).stray.tolist() == sorted(dots.tolist())
+    assert len(classify_rays(merging, labels, paths).stray) == 0
+    # Two rows are left over: the dots of the second one may come from elsewhere.
+    labels[last - 1] = UNLABELLED
+    assert set(classify_rays(merging, labels, paths).stray) >= set(dots.tolist())

@@ -110,6 +110,17 @@ def within_view(
     return visible
 
 
+@inner
+def beside(mask: BoolArray) -> BoolArray:
+    """Mask with its neighbours in rows, columns and diagonals, shape (rows, columns)."""
+    rows, columns = mask.shape
+    wider = np.zeros((rows, columns), np.bool_)
+    for i in range(rows):
+        for j in range(columns):
+            wider[i, j] = mask[max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2].any()
+    return wider
+
+
 @compiled(_mask)
 def amid(lit: BoolArray) -> BoolArray:
     """Mask of rays that are lit or between lit ones in a row or column, shape (rows, columns)."""
@@ -255,8 +266,10 @@ def classify_rays(
             unlabelled[label] = False
     stray = np.flatnonzero(unlabelled)
     candidates = dots[stray]
-    if len(stray) and merged.any():
-        apart = two_nearest(candidates, shown[among[merged]])[0][:, 0] > resolution
+    around = np.flatnonzero(beside(amid(is_lit)).ravel()[known] & ~dark[known])
+    around = around[next_apart(shown[around]) < resolution]
+    if len(stray) and len(around):
+        apart = two_nearest(candidates, shown[around])[0][:, 0] > resolution
         stray = stray[apart]
 
     spacing = next_apart(shown)

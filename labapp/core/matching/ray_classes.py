@@ -34,7 +34,8 @@ class RayClasses:
 def classify_rays(observed: Observation, labels: IntArray, paths: RayPaths) -> RayClasses:
     """Classify every ray, for labels of shape (rows, columns) and a surface fitted to them.
 
-    Where the surface predicts that dots merge, neither a dot nor a ray counts as unexplained.
+    Where the surface predicts that dots merge, neither a dot nor a ray counts as unexplained. This
+    includes the dots of rays next to labelled ones: a concave pool focuses its last rows.
     """
     from labapp.core.matching import match_kernels
 
