@@ -10,13 +10,26 @@ from hypothesis import given
 from hypothesis import settings as examples
 from hypothesis import strategies as st
 
-from labapp.core.geometry.optics import intersect_imaging_plane, reflect, surface_normal
+from labapp.core.geometry.optics import (
+    intersect_imaging_plane,
+    project_rays,
+    reflect,
+    surface_normal,
+)
 from labapp.core.geometry.rig import ImagingPlane
 from labapp.core.match import Match
 from labapp.core.schemes import fit
-from labapp.core.surface.level import Level, Rear
+from labapp.core.surface.level import Level, Rear, Witnesses
 from labapp.core.surface.measures import WITH_SIGMA
-from labapp.core.surface.pool_fit import FitSettings, FittedPool, fit_pool
+from labapp.core.surface.pool_fit import (
+    FitSettings,
+    FittedPool,
+    basis_around,
+    fit_pool,
+    normal_equations,
+    rounds_with_level,
+)
+from labapp.core.surface.solver import Rounds
 from labapp.core.surface.spline import SplineBasis, SplineSurface
 from labapp.core.values import CannotMeasure, FloatArray, IntArray
 from labapp.simulation.forward import exact_match, trace
@@ -298,6 +311,33 @@ def test_rear_sinks_although_no_dark_ray_is_seen_there() -> None:
         less = certain.size_sigma_level < made.size_sigma_level
         assert less[WITH_SIGMA.index("length_mm")]
         assert not less[WITH_SIGMA.index("height_mm")]
+
+
+def test_held_drop_keeps_its_uncertainty(match: Match) -> None:
+    rays, at, settings = (
+        project_rays(OPEN_RIG.laser, OPEN_RIG.pattern),
+        match.ray.T - 1,
+        FitSettings(),
+    )
+    points = rays.landing_mm[tuple(at)]
+    basis = basis_around(points[:, :2], rays, settings.knot_mm)
+    seen = match.plane_mm, match.plane_covariance_mm2
+    equations = normal_equations(basis, OPEN_RIG, points, *seen, settings)
+    witnesses = Witnesses.of(rays, 1, match.witness, basis, 0.0)
+    held = replace(
+        fitted(match).level, sigma_mm=0.02, drop_sigma_mm=0.03, drop_covariance_mm2=-3e-4
+    )
+    found = {}
+    for is_free in True, False:
+        rounds = Rounds(
+            equations, rays.directions[tuple(at)], np.zeros(basis.count), points, np.inf
+        )
+        found[is_free] = rounds_with_level(
+            rounds, witnesses, 3, 0.0, near=held, drop_is_free=is_free
+        )
+    assert (found[False].drop_sigma_mm, found[False].drop_covariance_mm2) == (0.03, -3e-4)
+    assert found[False].sigma_mm == 0.02
+    assert found[True].drop_sigma_mm < 0.02
 
 
 def test_uncertainty_of_shift_and_drop_agrees_with_samples() -> None:
