@@ -17,7 +17,7 @@ from labapp.core.pipeline import Measurement, Settings, measure
 from labapp.core.recording.chain import WarmChain
 from labapp.core.values import FloatArray
 from labapp.simulation.camera import CameraView
-from labapp.simulation.pools import Wave, egg
+from labapp.simulation.pools import LowRear, Wave, egg
 from labapp.simulation.recording import RecordedFrame, Recording
 from labapp.simulation.render import Look
 from tests.same import assert_same
@@ -116,6 +116,20 @@ def test_sizes_are_within_their_uncertainty() -> None:
             normalized_errors.append(error / getattr(result.measures, f"{name}_sigma_mm"))
         assert np.abs(normalized_errors).max() < 4.0
         assert 0.2 < np.sqrt(np.mean(np.square(normalized_errors))) < 2.0
+
+
+def test_uncertain_depth_of_the_rear_counts_in_followed_frames() -> None:
+    pools = (egg(6.0, 2.8, 3.6, 0.28, terms=(LowRear(0.07),)),) * 2
+    recording = Recording(
+        file="recording.avi", rig=RIG, view=VIEW, look=Look(), pools=pools, seed=62
+    )
+    first, prior = measure(recording.frame(0).image, BENCH, Settings())
+    followed, _ = measure(recording.frame(1).image, BENCH, Settings(), prior)
+    assert first.measures is not None
+    assert followed.measures is not None
+    sigma = first.measures.length_sigma_level_mm
+    assert sigma > 1.5 * first.measures.width_sigma_level_mm
+    assert followed.measures.length_sigma_level_mm == pytest.approx(sigma, rel=0.3)
 
 
 @pytest.mark.parametrize("number", [2, 9])
