@@ -149,6 +149,11 @@ def test_false_dot_beside_the_plane_does_not_widen_the_view(
 
     certain, expected = (certain_witness(one, found, paths, exact) for one in (with_false, cropped))
     np.testing.assert_array_equal(certain, expected)
+    # A labelled ray at the rim may leave the splines.
+    plane = paths.plane_mm.copy()
+    plane[np.flatnonzero(found > 0)[0]] = np.nan
+    beyond = certain_witness(with_false, found, replace(paths, plane_mm=plane), exact)
+    np.testing.assert_array_equal(beyond, certain)
     # Rows and columns whose predictions are uncertain by 2 mm may have left the view as well.
     rough, expected = (
         certain_witness(one, found, paths, lambda rays: exact(rays) + 4 * np.eye(2))

@@ -74,7 +74,8 @@ def certain_witness(
         dots, shape (m, 2, 2), mm².
     """
     lit, dark = witness > 0, np.flatnonzero(witness < 0)
-    view = observed.view_with(paths.plane_mm[lit.ravel()])
+    labelled = paths.plane_mm[lit.ravel()]
+    view = observed.view_with(labelled[np.isfinite(labelled[:, 0])])
     certain = witness.copy()
     certain.flat[dark[~observed.in_view(paths.plane_mm[dark], view=view)]] = 0
     rim = np.flatnonzero((certain < 0) & widened(lit, 1))
