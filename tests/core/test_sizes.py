@@ -87,6 +87,7 @@ def test_shape_follows_its_derivatives(
 
     splines, rng = sign * coefficients(dent_mm), np.random.default_rng(8)
     gradient = shape(splines)[1][:, :-1]
+    assert gradient.shape == (3, BASIS.count)
     for _ in range(8):
         change = 1e-5 * rng.normal(size=BASIS.count)
         moved = (shape(splines + change)[0] - shape(splines - change)[0]) / 2

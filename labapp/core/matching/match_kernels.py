@@ -111,8 +111,8 @@ def within_view(
 
 
 @inner
-def beside(mask: BoolArray) -> BoolArray:
-    """Mask with its neighbours in rows, columns and diagonals, shape (rows, columns)."""
+def widened(mask: BoolArray) -> BoolArray:
+    """`observation.widened` by one ring, shape (rows, columns)."""
     rows, columns = mask.shape
     wider = np.zeros((rows, columns), np.bool_)
     for i in range(rows):
@@ -266,7 +266,7 @@ def classify_rays(
             unlabelled[label] = False
     stray = np.flatnonzero(unlabelled)
     candidates = dots[stray]
-    around = np.flatnonzero(beside(amid(is_lit)).ravel()[known] & ~dark[known])
+    around = np.flatnonzero(widened(amid(is_lit)).ravel()[known] & ~dark[known])
     around = around[next_apart(shown[around]) < resolution]
     if len(stray) and len(around):
         apart = two_nearest(candidates, shown[around])[0][:, 0] > resolution

@@ -65,10 +65,10 @@ def sizes_and_gradients(
         z = spline_kernels.surface_at(grid, coefficients, place_mm)[0]
         return np.asarray(z.reshape(np.shape(x_mm)))
 
-    samples, over, share = outline_kernels.spokes(
-        grid, coefficients, outline, center, FRACTION, WEIGHT, level.rear.as_array, STRIDE
-    )
     count, rear = len(coefficients), level.rear.as_array
+    samples, over, share = outline_kernels.spokes(
+        grid, coefficients, outline, center, FRACTION, WEIGHT, rear, STRIDE
+    )
     extremes, changes = [], np.zeros((2, count + 1))
     for sign, change in zip((1.0, -1.0), changes, strict=True):
         within, extreme = (places[np.argmax(sign * places[:, 2])] for places in (samples, outline))
