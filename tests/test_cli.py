@@ -705,6 +705,41 @@ def test_calibrate_plane_assumes_the_target_of_labapp(labapp: Run, tmp_path: Pat
     assert f"x_axis_mm  {written['x_axis_mm']:.4f} mm" in stdout
 
 
+def test_calibrate_plane_uses_the_lens_of_a_setup_with_a_byte_order_mark(
+    labapp: Run, tmp_path: Path
+) -> None:
+    lens = "[camera_lens]\nfocal_px = [900, 900]\ncenter_px = [240, 320]\n"
+    lens += "distortion = [-0.3, 0, 0, 0, 0]\n"
+    found = []
+    for start, more in (("", ""), ("", lens), ("\ufeff", lens)):
+        setup = tmp_path / "setup.toml"
+        setup.write_text(f"{start}{SETUP.read_text('utf-8')}{more}", "utf-8")
+        code, stdout, stderr = labapp(
+            "calibrate", "plane", SAMPLE / "calibration.png", "--setup", setup
+        )
+        assert code == 0, stderr
+        found.append(stdout)
+    without_lens, with_lens, with_mark = found
+    assert with_mark == with_lens != without_lens
+
+
+@pytest.mark.parametrize(
+    ("start", "problem"),
+    [
+        ("# 30° to the work piece\n".encode("latin-1"), "encoding: not UTF-8"),
+        (b"a = " + 5000 * b"9" + b"\n", "syntax: "),
+    ],
+)
+def test_calibrate_plane_rejects_a_setup_that_is_not_text_or_not_toml(
+    labapp: Run, tmp_path: Path, start: bytes, problem: str
+) -> None:
+    setup = tmp_path / "setup.toml"
+    setup.write_bytes(start + SETUP.read_bytes())
+    code, _, stderr = labapp("calibrate", "plane", SAMPLE / "calibration.png", "--setup", setup)
+    assert code == 2
+    assert problem in stderr
+
+
 @pytest.mark.parametrize("unit", ["0", "-1", "nan", "inf"])
 def test_impossible_unit_is_rejected(labapp: Run, unit: str) -> None:
     code, _, stderr = labapp("calibrate", "plane", SAMPLE / "calibration.png", "--unit-mm", unit)

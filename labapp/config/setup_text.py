@@ -70,6 +70,6 @@ def _section(text: str, name: str) -> dict[str, Any]:
     """A section of the text of a setup; empty if it is missing or the text is not TOML."""
     try:
         section = tomllib.loads(text).get(name)
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):  # ValueError: too many digits, too
         return {}
     return section if isinstance(section, dict) else {}

@@ -85,7 +85,9 @@ def _calibrated(
     tuple
         The calibration, and (rows, columns) of the first picture.
     """
+    from labapp.config.setup import A_SETUP
     from labapp.config.setup_text import lens_of
+    from labapp.config.toml_keys import read_text
     from labapp.core.calibration.boards import A_BOARD, parse_board
     from labapp.core.calibration.imaging_plane import calibrate_imaging_plane
     from labapp.core.calibration.plane_calibration import PlaneCalibrationSettings
@@ -97,7 +99,9 @@ def _calibrated(
         named = None if board is None else parse_board(board)
     except ValueError as error:
         raise InputError("--board", "board", f"{board} ({error})", A_BOARD) from error
-    lens = lens_of(setup.read_text("utf-8")) if setup is not None and setup.is_file() else None
+    lens = None
+    if setup is not None and setup.is_file():
+        lens = lens_of(read_text(setup, A_SETUP))
     settings = PlaneCalibrationSettings(unit_mm=unit_mm)
     try:
         return calibrate_imaging_plane(pictures, settings, named, lens), pictures[0].shape
