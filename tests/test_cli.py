@@ -485,6 +485,13 @@ def test_samples_are_copied_without_replacing_anything(labapp: Run, tmp_path: Pa
     assert labapp("samples", folder)[0] == 2
 
 
+def test_samples_reject_a_folder_that_cannot_be_written(labapp: Run, tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    code, _, stderr = labapp("samples", tmp_path / "file" / "new")
+    assert code == 2
+    assert "expected one that can be written" in stderr
+
+
 def test_demo_measures_the_sample_recording(
     labapp: Run,
     tmp_path: Path,

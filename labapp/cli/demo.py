@@ -15,7 +15,7 @@ from labapp.cli.shared import (
     measure_frames,
 )
 from labapp.cli.window import show_in_app
-from labapp.errors import InputError
+from labapp.errors import InputError, os_errors_as_input
 
 
 def samples(
@@ -33,7 +33,8 @@ def samples(
         if (folder / name).exists():
             raise InputError(folder, "folder", f"it has {name}", "a folder without it")
     for name in ("sample_sessions", "resources"):
-        shutil.copytree(bundled(name), folder / name, ignore=shutil.ignore_patterns(".*"))
+        with os_errors_as_input(folder, "folder", "one that can be written"):
+            shutil.copytree(bundled(name), folder / name, ignore=shutil.ignore_patterns(".*"))
     typer.echo(f"sample_sessions and resources are in {folder}")
 
 
