@@ -11,6 +11,7 @@ from PySide6.QtTest import QTest
 from PySide6.QtWidgets import QApplication, QPushButton
 from pytestqt.qtbot import QtBot
 
+from labapp.core.geometry.rig import ImagingPlane, Laser
 from labapp.gui.pages.setup import SetupPage
 from labapp.gui.shell.window import MainWindow
 from labapp.gui.tools import advising
@@ -70,6 +71,11 @@ def test_advice_equals_that_of_the_command_and_can_be_undone(
 ):
     session = adviser.workspace.session
     assert session is not None
+    turned = {
+        "laser": {"azimuth_deg": 2.0, "aim_x_mm": 0.4, "aim_y_mm": -0.3},
+        "imaging_plane": {"pitch_deg": 1.0, "yaw_deg": -2.0, "roll_deg": 3.0},
+    }
+    session.update_setup(turned, "turned")
     before = session.setup_text
     click(adviser.start_button)
     assert not adviser.start_button.isEnabled()
@@ -91,8 +97,13 @@ def test_advice_equals_that_of_the_command_and_can_be_undone(
         content = (tmp_path / "window" / name).read_bytes()
         assert content == (tmp_path / "command" / name).read_bytes(), name
     click(adviser.use_button)
-    laser = session.setup.rig.laser
-    assert (laser.projection_angle_deg, laser.distance_mm) == (26.0, 40.0)
+    found, place = session.setup.rig, adviser.advice.best.place
+    assert found.laser == Laser(26.0, 40.0)
+    position = (round(value, 2) for value in (place.plane_mm, place.s_mm, place.h_mm))
+    advised = ImagingPlane.vertical(*position, *adviser.advice.limits.plate_mm)
+    for name in ("origin_mm", "normal", "x_axis", "z_axis"):
+        ours, theirs = (getattr(plane, name) for plane in (found.imaging_plane, advised))
+        np.testing.assert_allclose(ours, theirs, atol=1e-12, err_msg=name)
     assert session.setup_text != before
     adviser.workspace.undo()
     assert session.setup_text == before

@@ -113,7 +113,11 @@ def kept_rows(advice: Advice) -> tuple[ResultRow, ...]:
 
 
 def use(session: Session, advice: Advice) -> None:
-    """Use the recommended set-up, with a vertical plane, in a session; one step of undo."""
+    """Use the recommended set-up in a session; one step of undo.
+
+    The advice is for a beam in the YOZ plane aimed at the origin, and a vertical, level plane.
+    """
     values = advised_setup(advice)
-    values["imaging_plane"] |= {"pitch_deg": None, "yaw_deg": None}
+    values["laser"] |= dict.fromkeys(("azimuth_deg", "aim_x_mm", "aim_y_mm"))
+    values["imaging_plane"] |= dict.fromkeys(("pitch_deg", "yaw_deg", "roll_deg"))
     session.update_setup(values, "advised set-up")
