@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -20,6 +21,7 @@ from labapp.media import open_source
 from labapp.simulated.simulate import simulate
 from labapp.simulation.pools import Wave
 from labapp.simulation.torch import ConeTorch
+from labapp.system import IS_WINDOWS
 from tests.conftest import INTERRUPTIBLE, Run
 from tests.waiting import PATIENCE_S, wait_until
 
@@ -80,6 +82,16 @@ def test_shipped_scenario_is_found_by_its_name(
         assert code == 0, stderr
     text = (tmp_path / "egg" / "scenario.toml").read_text("utf-8")
     assert text == (EXAMPLES / "egg.toml").read_text("utf-8")
+
+
+@pytest.mark.skipif(IS_WINDOWS, reason="quoting as of a POSIX shell")
+def test_next_command_is_quoted_for_the_shell(tmp_path: Path, labapp: Run) -> None:
+    out = tmp_path / "my run"
+    code, stdout, stderr = labapp("simulate", "egg", "--out", out, "--frames", 1)
+    assert code == 0, stderr
+    words = shlex.split(stdout.splitlines()[-1])
+    names = [str(out / name) for name in ("recording.avi", "setup.toml")]
+    assert words == ["labapp", "reconstruct", names[0], "--setup", names[1], "--out", "results"]
 
 
 def test_truth_agrees_with_the_rays_and_with_the_picture(written: Path) -> None:

@@ -9,6 +9,7 @@ import typer
 
 from labapp.bundled import bundled
 from labapp.cli.shared import progress_shown
+from labapp.system import quoted
 from labapp.text import pluralize
 
 SHIPPED = sorted(path.stem for path in bundled("resources/simulations").glob("*.toml"))
@@ -49,4 +50,5 @@ def simulate(
         write(read, out, progress=progress)
     name = read.recording.file
     typer.echo(f"{pluralize(count, 'frame')}, setup, calibration picture and truth are in {out}")
-    typer.echo(f"  labapp reconstruct {out / name} --setup {out / 'setup.toml'} --out results")
+    recording, setup = (quoted(str(out / file)) for file in (name, "setup.toml"))
+    typer.echo(f"  labapp reconstruct {recording} --setup {setup} --out results")
