@@ -13,9 +13,9 @@ from labapp.config.line_setup import read_line_setup
 from labapp.config.setup import read_setup
 from labapp.errors import InputError
 from labapp.simulation.camera import CameraView
-from labapp.simulation.lines.frames import LineLook, render_lines
 from labapp.simulation.pools import spherical_cap
 from tests.conftest import Run
+from tests.line_truth.frames import LineLook, render_lines
 from tests.setups import FIVE_LINES as SETUP
 
 VIEW = CameraView((2.0, 638.0), (452.0, 638.0), 60.0, (2.0, 188.0), 60.0)

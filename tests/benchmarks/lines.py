@@ -1,8 +1,8 @@
 """Simulated line patterns: five lines (§3.2.1), penetration runs (Fig. 3-14), GMAW (§3.3).
 
-python tests/benchmarks/lines.py five [--pools N] [--seed S] [--pictures FOLDER]
-python tests/benchmarks/lines.py runs [--frames N] [--seed S]
-python tests/benchmarks/lines.py gmaw [--frames N] [--seed S]
+python -m tests.benchmarks.lines five [--pools N] [--seed S] [--pictures FOLDER]
+python -m tests.benchmarks.lines runs [--frames N] [--seed S]
+python -m tests.benchmarks.lines gmaw [--frames N] [--seed S]
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ from labapp.core.lines.frame import LineFrame, measure_lines
 from labapp.core.lines.states import LineSeries, line_changes, line_states
 from labapp.core.lines.track import track_line
 from labapp.simulation.camera import CameraView
-from labapp.simulation.lines.frames import LineFrame as TrueFrame
-from labapp.simulation.lines.frames import LineLook, render_lines
-from labapp.simulation.lines.runs import GmawLook, gmaw_run, penetration_run
 from labapp.simulation.pools import Pool, egg
+from tests.line_truth.frames import LineFrame as TrueFrame
+from tests.line_truth.frames import LineLook, render_lines
+from tests.line_truth.runs import GmawLook, gmaw_run, penetration_run
 
 RIG = LineRig(
     Laser(27.0, 90.0),

@@ -11,8 +11,8 @@ from labapp.core.lines.detection.find_lines import find_lines
 from labapp.core.lines.detection.numbering import number_lines
 from labapp.core.lines.detection.ridges import find_ridges, sampled
 from labapp.simulation.camera import CameraView
-from labapp.simulation.lines.frames import LineLook, render_lines
 from labapp.simulation.pools import egg
+from tests.line_truth.frames import LineLook, render_lines
 from tests.setups import FIVE_LINES
 
 VIEW = CameraView((2.0, 638.0), (452.0, 638.0), 60.0, (2.0, 188.0), 60.0)

@@ -17,9 +17,9 @@ from labapp.core.lines.correction import (
 from labapp.core.lines.detection.find_lines import LightLine, find_lines
 from labapp.core.lines.detection.numbering import LinesSeen, number_lines
 from labapp.core.lines.frame import measure_lines
-from labapp.simulation.lines.frames import LineLook, render_lines
 from labapp.simulation.pools import egg
 from tests.benchmarks.lines import CALIBRATION, RIG, VIEW
+from tests.line_truth.frames import LineLook, render_lines
 
 
 def straight(v_px: float, u_px: tuple[int, int] = (100, 300)) -> LightLine:

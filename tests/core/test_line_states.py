@@ -13,7 +13,7 @@ from labapp.core.lines.pulses import classify_pulses
 from labapp.core.lines.states import LineSeries, line_changes, line_states
 from labapp.core.lines.track import oscillation_frequency, track_line
 from labapp.simulation.camera import CameraView
-from labapp.simulation.lines.runs import PHASES, GmawLook, gmaw_run
+from tests.line_truth.runs import PHASES, GmawLook, gmaw_run
 
 
 def run_series(seed: int, noise: float = 0.004) -> tuple[LineSeries, list[str]]:

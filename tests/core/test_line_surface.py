@@ -16,8 +16,8 @@ from labapp.core.lines.model import LineData, LineModel
 from labapp.core.surface.spline import SplineBasis
 from labapp.core.values import CannotMeasure
 from labapp.simulation.camera import CameraView
-from labapp.simulation.lines.frames import LineFrame, LineLook, render_lines
 from labapp.simulation.pools import Pool, spherical_cap
+from tests.line_truth.frames import LineFrame, LineLook, render_lines
 
 RIG = LineRig(
     Laser(27.0, 90.0),

@@ -13,8 +13,8 @@ from labapp.core.geometry.optics import intersect_level
 from labapp.core.lines.frame import measure_lines
 from labapp.core.lines.metal import pool_edges
 from labapp.simulation.camera import CameraView
-from labapp.simulation.lines.frames import LineLook, render_lines
 from labapp.simulation.pools import egg
+from tests.line_truth.frames import LineLook, render_lines
 from tests.setups import FIVE_LINES
 
 VIEW = CameraView((2.0, 638.0), (452.0, 638.0), 60.0, (2.0, 188.0), 60.0)

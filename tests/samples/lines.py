@@ -13,11 +13,11 @@ import tifffile
 from labapp.core.geometry.line_pattern import LinePattern, LineRig
 from labapp.core.geometry.rig import Electrode, ImagingPlane, Laser
 from labapp.simulation.camera import CameraView
-from labapp.simulation.lines.frames import LineLook, render_lines
-from labapp.simulation.lines.runs import gmaw_run, penetration_run
 from labapp.simulation.recording import write_video
 from labapp.simulation.render import Picture
 from labapp.text import csv_text
+from tests.line_truth.frames import LineLook, render_lines
+from tests.line_truth.runs import gmaw_run, penetration_run
 
 Rendered = tuple[list[Picture], list[list[str]]]
 """Frames, and their rows in the truth table."""

@@ -21,8 +21,8 @@ from labapp.gui.pages.surface import presenter as surface_page
 from labapp.gui.pages.trends import presenter as trends_page
 from labapp.session.results.line_trends import LineTrend, line_trend
 from labapp.session.session import Session
-from labapp.simulation.lines.frames import LineLook, render_lines
 from labapp.simulation.pools import Pool, egg
+from tests.line_truth.frames import LineLook, render_lines
 from tests.test_cli_lines import SETUP, VIEW
 
 POOL = egg(6.0, 2.8, 3.2, 0.3)

@@ -7,9 +7,9 @@ import numpy as np
 from labapp.core.geometry.line_pattern import LinePattern, LineRig
 from labapp.core.geometry.rig import Electrode, ImagingPlane, Laser
 from labapp.simulation.camera import CameraView
-from labapp.simulation.lines.frames import LineLook, render_lines
-from labapp.simulation.lines.runs import PHASES, penetration_run
 from labapp.simulation.pools import spherical_cap
+from tests.line_truth.frames import LineLook, render_lines
+from tests.line_truth.runs import PHASES, penetration_run
 
 RIG = LineRig(
     Laser(27.0, 90.0),

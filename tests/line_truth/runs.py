@@ -12,9 +12,9 @@ from scipy.ndimage import gaussian_filter
 from labapp.core.geometry.line_pattern import LineRig
 from labapp.core.values import FloatArray, ReadOnlyArrays
 from labapp.simulation.camera import CameraView
-from labapp.simulation.lines.frames import LineLook, render_lines
 from labapp.simulation.pools import Pool, Wave, egg
 from labapp.simulation.render import Picture, expose, speckle_field
+from tests.line_truth.frames import LineLook, render_lines
 
 PHASES_A_PERIOD = 72
 

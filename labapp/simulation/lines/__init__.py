@@ -1,1 +1,0 @@
-"""Frames and recordings of line patterns (§3.2, §3.3)."""
