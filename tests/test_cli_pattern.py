@@ -11,10 +11,10 @@ from typer.testing import CliRunner
 
 from labapp.cli import app
 from labapp.config.setup import read_setup
-from labapp.simulation.calibration.mirrors import FlatMirror
 from labapp.simulation.forward import trace
 from labapp.simulation.render import Look, render
 from tests.core.test_bench_check import EXACT, TEXT, VIEW
+from tests.mirrors import FlatMirror
 
 
 @pytest.fixture

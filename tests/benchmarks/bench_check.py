@@ -29,11 +29,11 @@ from labapp.core.images.dots import Dots
 from labapp.core.pipeline import Settings, reconstruct
 from labapp.core.surface.measures import measure_surface
 from labapp.core.values import CannotMeasure, FloatArray
-from labapp.simulation.benches import BenchErrors, SimulatedBench, draw_bench
-from labapp.simulation.calibration.mirrors import FlatMirror
 from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import PoolSurface, exact_match, trace
 from labapp.simulation.pools import Pool, egg, spherical_cap
+from tests.mirrors import FlatMirror
+from tests.simulated_benches import BenchErrors, SimulatedBench, draw_bench
 
 PX_PER_MM, SIGMA_PX, SHAPE = 4.7, 0.12, (640, 480)
 MIDDLE = np.array([SHAPE[1] - 1, SHAPE[0] - 1]) / 2

@@ -1,6 +1,6 @@
 """The check of the setup by recordings: false alarms, and the smallest detectable errors.
 
-Run as ``python tests/benchmarks/setup_doubt.py [--recordings N] [--frames M] [--sizes K]``. Dots of
+Run as ``python -m tests.benchmarks.setup_doubt [--recordings N] [--frames M] [--sizes K]``. Dots of
 seven kinds of oscillating, growing and drifting pools are simulated on exact benches, on benches
 with errors of the assumed uncertainties, and on the latter after a check with a plate and a cap.
 Before that, the smallest error of each quantity is searched at which a recording of K frames is in
@@ -37,7 +37,6 @@ from labapp.core.recording.residual_check import FIXED, MOST, Residuals, judge_s
 from labapp.core.surface.pool_fit import FitSettings, fit_pool
 from labapp.core.surface.spline import SplineSurface
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray
-from labapp.simulation.benches import BenchErrors, SimulatedBench, draw_bench
 from labapp.simulation.forward import trace
 from labapp.simulation.pools import Oscillation, Pool, egg
 from tests.benchmarks.bench_check import (
@@ -51,6 +50,7 @@ from tests.benchmarks.bench_check import (
 )
 from tests.benchmarks.clutter import KINDS, draw_pool
 from tests.scenes import BENCH_RIG
+from tests.simulated_benches import BenchErrors, SimulatedBench, draw_bench
 
 RATE_HZ, MISSING, SEED, TRIED = 60.0, 0.02, 18, 16
 MIRRORS = (Plate(0.0), Cap(9.75, 0.91))

@@ -20,7 +20,6 @@ from labapp.core.bench_check.labelling import Picture
 from labapp.core.bench_check.mirrors import Cap, Mirror, Plate
 from labapp.core.geometry.rig import ImagingPlane, Rig
 from labapp.core.values import CannotMeasure, FloatArray
-from labapp.simulation.benches import SimulatedBench
 from labapp.simulation.camera import CameraView
 from labapp.simulation.pools import spherical_cap
 from tests.benchmarks.bench_check import (
@@ -34,6 +33,7 @@ from tests.benchmarks.bench_check import (
     seen_dots,
     surface_like,
 )
+from tests.simulated_benches import SimulatedBench
 
 POOLS = tuple(spherical_cap(*size) for size in ((6.7, 0.3), (6.2, 0.2), (7.1, 0.3), (6.5, 0.25)))
 MIRRORS = (Plate(), Cap(9.75, 0.91), Plate(2.0))

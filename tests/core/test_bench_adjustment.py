@@ -20,11 +20,11 @@ from labapp.core.geometry.uncertainty import (
     covariance_of,
 )
 from labapp.core.values import FloatArray
-from labapp.simulation.benches import BenchErrors, SimulatedBench, draw_bench
-from labapp.simulation.calibration.mirrors import FlatMirror
 from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import PoolSurface, trace
 from labapp.simulation.pools import spherical_cap
+from tests.mirrors import FlatMirror
+from tests.simulated_benches import BenchErrors, SimulatedBench, draw_bench
 
 VIEW = CameraView.rolled((0.74, 558.26), 4.7)
 CALIBRATION = ImageCalibration.from_three_points(

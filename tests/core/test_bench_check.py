@@ -28,13 +28,13 @@ from labapp.core.surface.measures import measure_surface
 from labapp.core.surface.pool_fit import FitSettings
 from labapp.core.values import CannotMeasure
 from labapp.errors import InputError
-from labapp.simulation.benches import FOCAL_PX, BenchErrors, SimulatedBench, draw_bench
-from labapp.simulation.calibration.mirrors import BallMirror, FlatMirror
 from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import PoolSurface, exact_match, trace
 from labapp.simulation.pools import spherical_cap
 from labapp.simulation.render import Look, render
+from tests.mirrors import BallMirror, FlatMirror
 from tests.scenes import as_dots
+from tests.simulated_benches import FOCAL_PX, BenchErrors, SimulatedBench, draw_bench
 
 SHAPE = (640, 480)
 VIEW = CameraView.rolled((0.74, 558.26), 4.7)

@@ -9,11 +9,11 @@ from scipy.spatial import cKDTree
 from labapp.core.images.band_pass import crowded_dots
 from labapp.core.images.dots import BandPassSettings, Dots
 from labapp.core.values import FloatArray
-from labapp.simulation.calibration.mirrors import FlatMirror
 from labapp.simulation.forward import PoolSurface, trace
 from labapp.simulation.pools import spherical_cap
 from labapp.simulation.render import Look, render
 from tests.core.test_bench_check import EXACT, VIEW
+from tests.mirrors import FlatMirror
 
 PLATE, TACK, POOL = FlatMirror(), spherical_cap(9.75, 0.91), spherical_cap(6.5, 0.3)
 

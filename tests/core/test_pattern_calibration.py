@@ -13,10 +13,10 @@ from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.patterns import PATTERNS, PatternKind
 from labapp.core.geometry.rig import DotPattern, Rig
 from labapp.core.values import CannotMeasure
-from labapp.simulation.benches import SimulatedBench
-from labapp.simulation.calibration.mirrors import FlatMirror
 from tests.core.test_bench_check import CALIBRATION, RIG, VIEW, picture
 from tests.core.test_patterns import bent
+from tests.mirrors import FlatMirror
+from tests.simulated_benches import SimulatedBench
 
 HEIGHTS_MM = 0.0, 6.0
 

@@ -13,9 +13,9 @@ from labapp.config.setup import read_setup
 from labapp.media import GreyImage
 from labapp.session.copies import copy_sample
 from labapp.session.samples import sample_folder
-from labapp.simulation.calibration.mirrors import FlatMirror
 from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import trace
+from labapp.simulation.outlined_pool import OutlinedPool
 from labapp.simulation.render import Look, render
 
 CROSS_MM = (4.65, 6.23, 2.75)
@@ -70,7 +70,9 @@ def plate(setup: Path) -> GreyImage:
     """The camera image of a flat plate in place of the workpiece, shape (640, 480)."""
     calibration = tomllib.loads(setup.read_text("utf-8"))["image_calibration"]
     points = {key: tuple(x) if isinstance(x, list) else x for key, x in calibration.items()}
-    reflections = trace(FlatMirror(), read_setup(setup).rig)
+    corners_mm = 30.0 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    mirror = OutlinedPool(lambda x, y: np.zeros_like(x), corners_mm)
+    reflections = trace(mirror, read_setup(setup).rig)
     rng = np.random.default_rng(5)
     image = render(reflections, CameraView(**points), Look(glow=0.0), rng).image
     return np.asarray(image, np.uint8)

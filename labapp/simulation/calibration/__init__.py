@@ -1,1 +1,1 @@
-"""Pictures of targets, boards and known mirrors."""
+"""Pictures of targets and boards."""

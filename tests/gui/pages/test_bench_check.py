@@ -35,12 +35,12 @@ from labapp.gui.shell.steps import Mark, states
 from labapp.gui.workspace import Workspace
 from labapp.media import GreyImage
 from labapp.session.session import Session
-from labapp.simulation.calibration.mirrors import FlatMirror
 from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import trace
 from labapp.simulation.render import Look, render
 from labapp.text import SETUP_MARKS
 from tests.gui.conftest import KEPT
+from tests.mirrors import FlatMirror
 
 SETUP = Path(__file__).parents[3] / "sample_sessions" / "gtaw" / "setup.toml"
 
