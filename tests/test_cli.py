@@ -764,14 +764,15 @@ def test_picture_without_a_target_is_reported(labapp: Run, tmp_path: Path) -> No
 def board_picture(path: Path, name: str) -> Path:
     """Write the picture of a board through a lens with a distortion of 1 %."""
     from labapp.core.calibration.boards import BOARDS
-    from labapp.simulation.calibration.board import PrintedBoard
     from labapp.simulation.calibration.target import TargetLook, render_target
-    from labapp.simulation.camera import Lens, PosedView
+    from labapp.simulation.camera import Lens
+    from tests.inked_board import InkedBoard
+    from tests.posed_view import PosedView
 
     lens = Lens(1000.0, k1=-0.06)
     view = PosedView.at((40.0, 36.0), 5.0, turned_deg=(1.0, -2.0, 1.3), lens=lens)
     rng = np.random.default_rng(1)
-    cv2.imwrite(str(path), render_target(PrintedBoard(BOARDS[name]), view, TargetLook(), rng))
+    cv2.imwrite(str(path), render_target(InkedBoard(BOARDS[name]), view, TargetLook(), rng))
     return path
 
 

@@ -15,9 +15,10 @@ from labapp.core.calibration.imaging_plane import calibrate_imaging_plane
 from labapp.core.calibration.lens_fit import PlaneView, fit_lens, fit_terms
 from labapp.core.calibration.plane_calibration import PlaneCalibration, PlaneCalibrationSettings
 from labapp.core.values import CannotMeasure
-from labapp.simulation.calibration.board import PrintedBoard
 from labapp.simulation.calibration.target import Target, TargetLook, render_target
-from labapp.simulation.camera import Lens, PosedView
+from labapp.simulation.camera import Lens
+from tests.inked_board import InkedBoard
+from tests.posed_view import PosedView
 
 pytestmark = pytest.mark.slow
 
@@ -42,7 +43,7 @@ def shot(
         tuple(middle), px_per_mm, turned_deg=turned, lens=lens(percent), axis_px=axis
     )
     look = TargetLook()
-    return view, render_target(PrintedBoard(board), view, look, np.random.default_rng(seed))
+    return view, render_target(InkedBoard(board), view, look, np.random.default_rng(seed))
 
 
 @cache

@@ -10,6 +10,7 @@ import pytest
 
 from labapp.core.calibration.boards import BOARDS
 from labapp.simulation.calibration.board import PrintedBoard, board_pdf, board_svg
+from tests.inked_board import InkedBoard
 
 TARGETS = Path(__file__).parents[2] / "resources" / "targets"
 SVG = "{http://www.w3.org/2000/svg}"
@@ -19,7 +20,7 @@ every_board = pytest.mark.parametrize("board", BOARDS.values(), ids=BOARDS)
 
 @every_board
 def test_rectangles_are_the_inked_areas(board):
-    printed = PrintedBoard(board)
+    printed = InkedBoard(board)
     rectangles = printed.rectangles_mm()
     rng = np.random.default_rng(4)
     points = rng.uniform(-20, 200, (4000, 2))

@@ -8,13 +8,12 @@ puts their midpoints at (5.5, 0) and (0, 2.5), the points of Eq. 5-6.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from labapp.core.values import BoolArray, FloatArray
-from labapp.simulation.camera import CameraView, PosedView
+from labapp.simulation.camera import CameraView
 from labapp.simulation.render import GreyImage
 
 FINE = 4
@@ -22,14 +21,6 @@ FINE = 4
 
 STRIP_ROWS = 4
 """Rows of pixels that are rendered at a time: few enough to stay in the processor's cache."""
-
-
-class Print(Protocol):
-    """A print on the imaging plane or on a board in its place."""
-
-    def inked(self, plane_mm: FloatArray) -> BoolArray:
-        """Whether points (X′, Z′), shape (…, 2), mm, are black, shape (…)."""
-        ...
 
 
 @dataclass(frozen=True)
@@ -103,7 +94,7 @@ class TargetLook:
 
 
 def render_target(
-    target: Print, view: CameraView | PosedView, look: TargetLook, rng: np.random.Generator
+    target: Target, view: CameraView, look: TargetLook, rng: np.random.Generator
 ) -> GreyImage:
     """Render the calibration picture, shape (height, width), grey levels."""
     shape = (view.height_px, view.width_px)
@@ -121,7 +112,7 @@ def render_target(
     return np.asarray(np.clip(np.rint(seen), 0, 255).astype(np.uint8))
 
 
-def _share_of_ink(target: Print, view: CameraView | PosedView, rows: range) -> FloatArray:
+def _share_of_ink(target: Target, view: CameraView, rows: range) -> FloatArray:
     """Return the black share of each pixel of some rows, shape (rows, width)."""
     columns = range(view.width_px)
     u, v = (

@@ -23,10 +23,12 @@ from labapp.gui.pages.plane import PlanePage, presenter
 from labapp.gui.shell.steps import calibrations_in_use, states
 from labapp.gui.workspace import Workspace
 from labapp.session.session import Session
-from labapp.simulation.calibration.board import PrintedBoard, board_svg
+from labapp.simulation.calibration.board import board_svg
 from labapp.simulation.calibration.target import Target, TargetLook, render_target, target_svg
-from labapp.simulation.camera import Lens, PosedView
+from labapp.simulation.camera import Lens
 from tests.gui.conftest import KEPT
+from tests.inked_board import InkedBoard
+from tests.posed_view import PosedView
 
 GTAW = Path(__file__).parents[3] / "sample_sessions" / "gtaw"
 
@@ -312,7 +314,7 @@ def test_every_button_has_a_tooltip(page: PlanePage) -> None:
 def board_picture(path: Path) -> Path:
     """A picture of a board through a lens with 1 % distortion."""
     view = PosedView.at((40.0, 36.0), 5.0, turned_deg=(1, -2, 1.3), lens=Lens(1000.0, k1=-0.06))
-    printed, rng = PrintedBoard(BOARDS["charuco_4_inch"]), np.random.default_rng(1)
+    printed, rng = InkedBoard(BOARDS["charuco_4_inch"]), np.random.default_rng(1)
     cv2.imwrite(str(path), render_target(printed, view, TargetLook(), rng))
     return path
 
