@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.polynomial import Chebyshev
@@ -106,6 +106,15 @@ class Term(Protocol):
         ...
 
 
+@runtime_checkable
+class MovingTerm(Term, Protocol):
+    """A disturbance that changes with time."""
+
+    def after(self, seconds: float) -> Term:
+        """The same disturbance ``seconds`` later."""
+        ...
+
+
 @dataclass(frozen=True)
 class Dent:
     """A Gaussian dip, as under the torch; multiplied by 1 − ρ² to keep the boundary at z = 0."""
@@ -154,36 +163,6 @@ class LowRear:
             np.zeros_like(place.q),
             -3 * self.towards * self.drop_mm * np.maximum(self.towards * place.q, 0) ** 2,
         )
-
-
-@dataclass(frozen=True)
-class Oscillation:
-    """An oscillation of the pool along and across, zero at the boundary.
-
-    ``amplitude · (1 − ρ²)² · (cos(ωt)·q + ½·sin(ωt)·p)`` has no net volume on an even pool.
-    """
-
-    amplitude_mm: float
-    """Amplitude of the mode."""
-    frequency_hz: float
-    time_s: float = 0.0
-    """ω/2π, and the time t."""
-
-    def _weights(self) -> tuple[float, float]:
-        phase = 2 * np.pi * self.frequency_hz * self.time_s
-        return self.amplitude_mm * np.cos(phase), self.amplitude_mm * np.sin(phase) / 2
-
-    def height(self, place: Place) -> FloatArray:
-        """Height that it adds, mm."""
-        along, across = self._weights()
-        return (1 - place.rho2) ** 2 * (along * place.q + across * place.p)
-
-    def gradient(self, place: Place) -> FloatArray:
-        """Gradient that it adds, shape (…, 2)."""
-        along, across = self._weights()
-        damp = 1 - place.rho2
-        slope = -4 * damp * (along * place.q + across * place.p)
-        return place.gradient(slope * place.p + damp**2 * across, slope * place.q + damp**2 * along)
 
 
 @dataclass(frozen=True)
@@ -270,6 +249,10 @@ class Wave:
             (outward * place.p + around).real, (outward * place.q + 1j * around).real
         )
 
+    def after(self, seconds: float) -> Wave:
+        """The same wave ``seconds`` later."""
+        return replace(self, time_s=self.time_s + seconds)
+
 
 @dataclass(frozen=True)
 class Pool:
@@ -353,13 +336,10 @@ class Pool:
 
     def after(self, seconds: float) -> Pool:
         """The same pool ``seconds`` later; itself if nothing on it oscillates."""
-        if not any(isinstance(term, Oscillation | Wave) for term in self.terms):
+        if not any(isinstance(term, MovingTerm) for term in self.terms):
             return self
         terms = tuple(
-            replace(term, time_s=term.time_s + seconds)
-            if isinstance(term, Oscillation | Wave)
-            else term
-            for term in self.terms
+            term.after(seconds) if isinstance(term, MovingTerm) else term for term in self.terms
         )
         return replace(self, terms=terms)
 

@@ -38,7 +38,7 @@ from labapp.core.surface.pool_fit import FitSettings, fit_pool
 from labapp.core.surface.spline import SplineSurface
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray
 from labapp.simulation.forward import trace
-from labapp.simulation.pools import Oscillation, Pool, egg
+from labapp.simulation.pools import Pool, egg
 from tests.benchmarks.bench_check import (
     CALIBRATION,
     PX_PER_MM,
@@ -49,6 +49,7 @@ from tests.benchmarks.bench_check import (
     surface_like,
 )
 from tests.benchmarks.clutter import KINDS, draw_pool
+from tests.oscillation import Oscillation
 from tests.scenes import BENCH_RIG
 from tests.simulated_benches import BenchErrors, SimulatedBench, draw_bench
 

@@ -21,7 +21,6 @@ from labapp.core.values import FloatArray
 from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.pools import (
     Dent,
-    Oscillation,
     Pool,
     Term,
     caps_8_3_1,
@@ -30,6 +29,7 @@ from labapp.simulation.pools import (
     spherical_cap,
 )
 from labapp.studies.image_error import BENCH
+from tests.oscillation import Oscillation
 from tests.scenes import OPEN_RIG
 
 NOISE_MM = 0.053

@@ -25,7 +25,8 @@ from labapp.core.recording.residual_check import MOST, ResidualRecord
 from labapp.core.schemes import fit
 from labapp.core.surface.pool_fit import FitSettings
 from labapp.simulation.forward import trace
-from labapp.simulation.pools import Oscillation, egg
+from labapp.simulation.pools import egg
+from tests.oscillation import Oscillation
 from tests.scenes import BENCH_RIG, BENCH_VIEW
 
 KNOWN = RigUncertainty(AxisPoints(BENCH_VIEW, 69.85, 31.75), *covariance_of({}))

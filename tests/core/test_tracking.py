@@ -13,7 +13,8 @@ from labapp.core.rows.correction import Correction, block_row, clear_rows
 from labapp.core.rows.lattice import Lattice
 from labapp.core.rows.tracking import carry_on
 from labapp.core.values import BoolArray, IntArray
-from labapp.simulation.pools import Oscillation, egg
+from labapp.simulation.pools import egg
+from tests.oscillation import Oscillation
 from tests.scenes import SeenDots, as_dots, see
 
 FRAMES = 12

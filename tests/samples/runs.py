@@ -10,10 +10,11 @@ from scipy.ndimage import gaussian_filter1d
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.values import FloatArray
 from labapp.simulation.camera import CameraView
-from labapp.simulation.pools import Footprint, Oscillation, Pool, egg, spherical_cap
+from labapp.simulation.pools import Footprint, Pool, egg, spherical_cap
 from labapp.simulation.recording import TARGET
 from labapp.simulation.render import Look
 from labapp.simulation.torch import ConeTorch
+from tests.oscillation import Oscillation
 from tests.samples.recording import Sample
 
 WIDTH_MM, WIDTH_SIGMA_MM = 6.66, 0.15

@@ -10,7 +10,6 @@ from labapp.simulation.pools import (
     Dent,
     Footprint,
     LowRear,
-    Oscillation,
     Pool,
     Wave,
     caps_8_3_1,
@@ -18,6 +17,7 @@ from labapp.simulation.pools import (
     ellipsoidal_cap,
     spherical_cap,
 )
+from tests.oscillation import Oscillation
 
 MODES = ((0, 1), (1, 1), (2, 1), (0, 2))
 
