@@ -13,6 +13,7 @@ from pathlib import Path
 import av
 import cv2
 import numpy as np
+import tomlkit
 from threadpoolctl import ThreadpoolController
 
 from labapp.config.scenario import read_scenario
@@ -27,39 +28,11 @@ from labapp.media import open_source
 from labapp.run.measurers import RecordingMeasurer, await_loaded, stretch_pools
 from labapp.run.runner import run
 from labapp.simulated.simulate import simulate
-from labapp.simulated.simulated_pool import BENCH
+from labapp.simulated.simulated_pool import oscillating_pool
 from labapp.simulation.parallel import Progress
 
 RATE_HZ, WAVE_HZ = 200.0, 37.3
 COLD = 3  # frames measured without a prior
-
-SCENARIO = f"""# An oscillating pool in front of a fast camera.
-
-[pool]
-shape = "egg"
-width_mm = 6.66
-head_mm = 3.0
-tail_mm = 4.4
-height_mm = 0.29
-center_mm = [0.0, -0.6]
-wander_percent = 2.0
-
-[[pool.wave]]
-mode = [0, 1]
-amplitude_mm = 0.03
-frequency_hz = {WAVE_HZ}
-
-{BENCH}
-[look]
-hot_pixels = 2
-missing = 0.01
-
-[recording]
-frames = {{frames}}
-frame_rate_hz = {RATE_HZ}
-exposure_ms = 0.0
-seed = 6001
-"""
 
 TRUE_PX = 3.0
 """Maximum distance between a detected dot and the true dot that it matches."""
@@ -80,6 +53,12 @@ class Video:
     """Visible true dots of each frame: position, shape (n, 2), px; ray (i, j), shape (n, 2)."""
 
 
+def scenario_text(frames: int) -> str:
+    """Scenario of an oscillating pool in front of a fast camera."""
+    fast = {"frame_rate_hz": RATE_HZ, "exposure_ms": 0.0}
+    return tomlkit.dumps(oscillating_pool(WAVE_HZ, 2.0, frames=frames, seed=6001, **fast))
+
+
 def make_video(
     cache: Path,
     frames: int,
@@ -95,7 +74,7 @@ def make_video(
     """
     folder = cache / f"oscillating_{frames}"
     path = cache / f"oscillating_{frames}.avi"
-    text = SCENARIO.format(frames=frames)
+    text = scenario_text(frames)
     scenario = folder / "scenario.toml"
     if not (path.exists() and scenario.exists() and scenario.read_text("utf-8") == text):
         cache.mkdir(parents=True, exist_ok=True)

@@ -5,78 +5,58 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
+import tomlkit
+
+from labapp.bundled import bundled
 from labapp.config.scenario import read_scenario
+from labapp.config.setup_keys import SECTIONS
 from labapp.errors import InputError
 from labapp.media import GreyImage
 from labapp.media.cameras import SimulatedDevice, there_and_back
 from labapp.session.session import Session
 
-POOL = """\
-# An oscillating pool
 
-[pool]
-shape = "egg"
-width_mm = 6.66
-head_mm = 3.0
-tail_mm = 4.4
-height_mm = 0.29
-center_mm = [0.0, -0.6]
-wander_percent = 0.3
+def oscillating_pool(
+    frequency_hz: float, wander_percent: float, **recording: float
+) -> tomlkit.TOMLDocument:
+    """Scenario of an egg-shaped pool on the usual bench that swings up and down.
 
-[[pool.wave]]
-mode = [0, 1]
-amplitude_mm = 0.03
-frequency_hz = 2.727
-kind = "standing"
+    Parameters
+    ----------
+    frequency_hz
+        Frequency of the pool's wave.
+    wander_percent
+        Fluctuation of its sizes.
+    recording
+        Keys of ``[recording]``.
+    """
+    path = bundled("resources/simulations/mode_01.toml")
+    scenario = tomlkit.parse(path.read_text("utf-8"))
+    pool: Any = scenario["pool"]
+    pool["wander_percent"] = wander_percent
+    pool["wave"][0]["frequency_hz"] = frequency_hz
+    table: Any = scenario["recording"]
+    table.update(recording)
+    return scenario
 
-[look]
-hot_pixels = 2
-missing = 0.01
 
-[recording]
-frames = 12
-frame_rate_hz = 60.0
-exposure_ms = 0.5
-seed = 4801
-"""
-
-BENCH = """
-[laser]
-projection_angle_deg = 31.14
-distance_mm = 31.48
-
-[pattern]
-rows = 19
-columns = 19
-inter_beam_angle_deg = 0.77
-
-[electrode]
-height_mm = 5.0
-
-[imaging_plane]
-distance_mm = 50.0
-s_mm = 45.0
-h_mm = 3.0
-width_mm = 101.6
-height_mm = 101.6
-
-[image_calibration]
-origin_px = [44.0, 590.0]
-x_axis_px = [242.02, 590.0]
-x_axis_mm = 34.925
-z_axis_px = [44.0, 499.99]
-z_axis_mm = 15.875
-"""
-"""Bench if the session's set-up is incomplete or its camera cannot be simulated."""
+def camera_pool() -> tomlkit.TOMLDocument:
+    """Scenario of the simulated camera on the usual bench."""
+    return oscillating_pool(2.727, 0.3, frames=12, seed=4801)
 
 
 def simulated_pool(session: Session) -> str:
-    """Text of a scenario of a pool on the session's bench, or on the default bench without one."""
+    """Text of a scenario of a pool on the session's bench, or on the usual bench without one."""
+    scenario = camera_pool()
     try:
-        return f"{POOL}\n{session.setup.text}"
+        setup = session.setup.text
     except InputError:
-        return f"{POOL}{BENCH}"
+        return tomlkit.dumps(scenario)
+    for section in SECTIONS:
+        scenario.pop(section, None)
+    return f"{tomlkit.dumps(scenario)}\n{setup}"
 
 
 def pool_camera(text: str, progress: Callable[[int, int], None]) -> SimulatedDevice:
@@ -87,7 +67,7 @@ def pool_camera(text: str, progress: Callable[[int, int], None]) -> SimulatedDev
     Parameters
     ----------
     text
-        Text from `simulated_pool`; the default bench replaces one that cannot be simulated.
+        Text from `simulated_pool`; the usual bench replaces one that cannot be simulated.
     progress
         Called with the number of frames rendered and in total; an exception ends the rendering.
     """
@@ -97,7 +77,7 @@ def pool_camera(text: str, progress: Callable[[int, int], None]) -> SimulatedDev
         try:
             recording = read_scenario(path).recording
         except InputError:  # a homography
-            path.write_text(f"{POOL}{BENCH}", encoding="utf-8")
+            path.write_text(tomlkit.dumps(camera_pool()), encoding="utf-8")
             recording = read_scenario(path).recording
     images: list[GreyImage] = []
     for number in range(len(recording.pools)):

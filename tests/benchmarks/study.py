@@ -58,7 +58,7 @@ from labapp.run.measurers import WarmMeasurer
 from labapp.run.study import stretches
 from labapp.run.study import study as study_module
 from labapp.run.study.summary import StudySummary
-from labapp.simulated.benchmark import SCENARIO
+from labapp.simulated.benchmark import scenario_text
 from labapp.simulated.simulate import simulate
 from tests.run.study.kill import bytes_of, kill_at_random
 from tests.run.study.test_cluster import cluster
@@ -96,7 +96,7 @@ def make_recording(
     if (out / "recording.avi").exists():
         return
     law = law_mm(current_a, gas)
-    text = SCENARIO.format(frames=frames)
+    text = scenario_text(frames)
     for old, new in (
         ("width_mm = 6.66", f"width_mm = {law['width_mm']}"),
         ("height_mm = 0.29", f"height_mm = {law['height_mm']}"),

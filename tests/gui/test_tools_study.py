@@ -16,7 +16,7 @@ from labapp.config.scenario import read_scenario
 from labapp.gui.shell.window import MainWindow
 from labapp.gui.tools.study import StudyWindow
 from labapp.run.study.plan import write_study
-from labapp.simulated.benchmark import SCENARIO
+from labapp.simulated.benchmark import scenario_text
 from labapp.simulated.simulate import simulate
 from labapp.studies.tables import Table
 from tests.waiting import PATIENCE_S
@@ -29,7 +29,7 @@ PATIENCE_MS = round(1000 * PATIENCE_S)
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("simulated")
-    (folder / "scenario.toml").write_text(SCENARIO.format(frames=3), "utf-8")
+    (folder / "scenario.toml").write_text(scenario_text(3), "utf-8")
     simulate(read_scenario(folder / "scenario.toml"), folder / "made", workers=1)
     return folder / "made"
 

@@ -44,7 +44,7 @@ from labapp.run.measurers import (
 )
 from labapp.session.record import Record
 from labapp.session.session import Session
-from labapp.simulated.benchmark import SCENARIO
+from labapp.simulated.benchmark import scenario_text
 from labapp.simulated.simulate import simulate
 from tests.same import assert_same
 
@@ -54,7 +54,7 @@ FRAMES = 9
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> RecordingMeasurer:
     folder = tmp_path_factory.mktemp("sequence")
-    (folder / "scenario.toml").write_text(SCENARIO.format(frames=FRAMES), "utf-8")
+    (folder / "scenario.toml").write_text(scenario_text(FRAMES), "utf-8")
     simulate(read_scenario(folder / "scenario.toml"), folder / "made", workers=1)
     setup = read_setup(folder / "made" / "setup.toml")
     return RecordingMeasurer(folder / "made" / "recording.avi", None, setup, Settings())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import threading
+import tomllib
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
@@ -11,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import tomlkit
 from PySide6.QtCore import Qt, QTimer
 from PySide6.QtGui import QCloseEvent
 from PySide6.QtTest import QTest
@@ -35,7 +37,7 @@ from labapp.media.cameras import (
 from labapp.media.recording.recorder import Plan
 from labapp.run.live_measuring import LiveResult
 from labapp.session.session import Session
-from labapp.simulated.simulated_pool import BENCH, POOL, pool_camera, simulated_pool
+from labapp.simulated.simulated_pool import camera_pool, pool_camera, simulated_pool
 from tests.gui.conftest import SAMPLES, let_draw
 from tests.gui.hand import Hand
 from tests.gui.test_accessibility import check_round
@@ -254,12 +256,17 @@ def test_camera_choices():
 
 def test_simulated_camera_shows_a_pool_on_the_bench_of_the_session(tmp_path: Path):
     with Session.create(tmp_path / "a.labsession") as session:
-        assert simulated_pool(session) == f"{POOL}{BENCH}"
+        usual = camera_pool()
+        assert tomllib.loads(simulated_pool(session)) == usual.unwrap()
         setup = (SAMPLES / "gtaw" / "setup.toml").read_text("utf-8")
         session.set_setup(setup)
-        assert simulated_pool(session) == f"{POOL}\n{setup}"
+        text = simulated_pool(session)
+        assert text.endswith(f"\n{setup}")
+        own = ("pool", "look", "recording")
+        pool = tomllib.loads(text.removesuffix(f"\n{setup}"))
+        assert pool == {name: usual[name].unwrap() for name in own}
     progress: list[tuple[int, int]] = []
-    device = pool_camera(f"{POOL}{BENCH}", lambda *args: progress.append(args))
+    device = pool_camera(tomlkit.dumps(usual), lambda *args: progress.append(args))
     assert progress[-1][0] + 1 == progress[-1][1] == len(progress)
     images = [device.picture(k) for k in range(2 * len(progress))]
     assert images[0].shape == (640, 480)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from labapp.config.scenario import read_scenario
-from labapp.simulated.benchmark import SCENARIO
+from labapp.simulated.benchmark import scenario_text
 from labapp.simulated.simulate import simulate
 
 FRAMES = 9
@@ -20,7 +20,7 @@ Write = Callable[..., Path]
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Folder of a simulated recording and its set-up."""
     folder = tmp_path_factory.mktemp("simulated")
-    (folder / "scenario.toml").write_text(SCENARIO.format(frames=FRAMES), "utf-8")
+    (folder / "scenario.toml").write_text(scenario_text(FRAMES), "utf-8")
     simulate(read_scenario(folder / "scenario.toml"), folder / "made", workers=1)
     return folder / "made"
 

@@ -22,7 +22,7 @@ from labapp.run.study.summary import (
     outlying_recordings,
     recording_means,
 )
-from labapp.simulated.benchmark import SCENARIO
+from labapp.simulated.benchmark import scenario_text
 from labapp.simulated.simulate import simulate
 from labapp.text import with_sigma
 
@@ -144,7 +144,7 @@ def test_values_are_rounded_to_their_uncertainty(value: float, sigma: float, exp
 def test_known_dependence_is_recovered(tmp_path: Path) -> None:
     widths = {80: 5.6, 100: 6.2, 120: 6.8}
     for current, width in widths.items():
-        text = SCENARIO.format(frames=2).replace("width_mm = 6.66", f"width_mm = {width}")
+        text = scenario_text(2).replace("width_mm = 6.66", f"width_mm = {width}")
         text = text.replace("wander_percent = 2.0", "wander_percent = 0.0")
         (tmp_path / "scenario.toml").write_text(text, "utf-8")
         simulate(read_scenario(tmp_path / "scenario.toml"), tmp_path / f"I{current}", workers=1)
