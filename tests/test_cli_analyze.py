@@ -111,8 +111,8 @@ def test_other_parts_are_written_to_tables(labapp: Run, tmp_path: Path) -> None:
 def test_budget_of_a_setup_file(
     labapp: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("labapp.studies.setup_budget.POOLS", 2)
-    monkeypatch.setattr("labapp.studies.setup_budget.MOVED_POOLS", 1)
+    monkeypatch.setattr("labapp.studies.predicted_budget.POOLS", 2)
+    monkeypatch.setattr("labapp.studies.predicted_budget.MOVED_POOLS", 1)
     arguments = ("--setup", str(SETUP), "--width", "6.5", "--length", "7.5", "--height", "0.3")
     code, out, _ = labapp("analyze", "budget", *arguments, "--out", str(tmp_path))
     assert code == 0

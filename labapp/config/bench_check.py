@@ -108,7 +108,7 @@ RULES = {
 """Rules for the keys of the section."""
 
 
-def contradictions(path: Path, values: Mapping[str, Any]) -> list[InputError]:
+def section_contradictions(path: Path, values: Mapping[str, Any]) -> list[InputError]:
     """Problems of keys of the section that are each valid but contradict each other."""
     section = values.get(SECTION)
     if section is None:

@@ -36,7 +36,7 @@ NORM_OFF = 0.01
 """Maximum deviation of the length of a unit vector from 1."""
 
 
-def with_rays(text: str, path: Path, values: Mapping[str, Any]) -> str:
+def text_with_rays(text: str, path: Path, values: Mapping[str, Any]) -> str:
     """Text of a setup file in which the named table is replaced by its rays.
 
     Parameters

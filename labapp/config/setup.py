@@ -16,12 +16,12 @@ from tomlkit.items import Table
 from labapp.config.bench_check import (
     check_values,
     checked_covariance,
-    contradictions,
     same_setup,
+    section_contradictions,
     semidefinite,
     unchecked_values,
 )
-from labapp.config.ray_file import with_rays
+from labapp.config.ray_file import text_with_rays
 from labapp.config.setup_keys import OPTIONAL, SECTIONS, rules_for
 from labapp.config.setup_text import frame_px_of, image_calibration_of
 from labapp.config.toml_keys import (
@@ -130,7 +130,7 @@ def read_setup_text(path: str | os.PathLike[str]) -> str:
     """
     path = Path(path)
     text = read_text(path, A_SETUP)
-    return with_rays(text, path, parse_toml(text, path, A_SETUP))
+    return text_with_rays(text, path, parse_toml(text, path, A_SETUP))
 
 
 @functools.lru_cache(maxsize=64)
@@ -160,7 +160,7 @@ def parse_setup(text: str, path: str | os.PathLike[str], lines: bool = False) ->
         ),
     ]
     # Values are compared with each other only if each is valid.
-    problems = problems or [*_contradictions(path, values), *contradictions(path, values)]
+    problems = problems or [*_contradictions(path, values), *section_contradictions(path, values)]
     if problems:
         raise InputError.gather(problems)
     calibration = _calibration(values)

@@ -60,7 +60,7 @@ class Look:
 
 
 @dataclass(frozen=True)
-class Frame(ReadOnlyArrays):
+class RenderedFrame(ReadOnlyArrays):
     """A rendered frame and its dots."""
 
     image: Picture
@@ -88,7 +88,7 @@ def render(
     look: Look,
     rng: np.random.Generator,
     brightness: FloatArray | None = None,
-) -> Frame:
+) -> RenderedFrame:
     """Render one frame.
 
     Parameters
@@ -123,7 +123,7 @@ def render(
     dots = _draw(shape, *(np.concatenate(part) for part in (centers, spreads, peaks)))
     light = gaussian_filter(dots * speckle_field(shape, look.speckle, rng), look.blur_px)
     image = expose(light + arc_glow(shape, look), look, rng)
-    return Frame(image, _middle(places, drawn), np.asarray(drawn.mean(axis=0) >= 1 / 2))
+    return RenderedFrame(image, _middle(places, drawn), np.asarray(drawn.mean(axis=0) >= 1 / 2))
 
 
 def _middle(places: FloatArray, drawn: BoolArray) -> FloatArray:

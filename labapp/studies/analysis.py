@@ -16,10 +16,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from labapp.config.setup import Setup
+    from labapp.core.geometry.rig import Rig
     from labapp.simulation.parallel import Progress
     from labapp.simulation.pools import Pool
     from labapp.studies.error_analysis import ErrorSurvey
-    from labapp.studies.setup_budget import Bench
     from labapp.studies.tables import Table
 
 PARTS = ("CE", "LE", "ME", "measurement", "images", "parameters")
@@ -188,9 +188,9 @@ def analyze_budget(
     import numpy as np
 
     from labapp.studies.pictures import bars_picture
-    from labapp.studies.setup_budget import budget_table, setup_budget
+    from labapp.studies.predicted_budget import budget_table, predicted_budget
 
-    table = budget_table(setup_budget(_bench(setup), pool, progress))
+    table = budget_table(predicted_budget(_rig(setup), pool, progress))
     names, *columns = zip(*table.rows, strict=True)
     predicted, simulated = (np.array(column, float) for column in columns)  # None becomes NaN
     values = {"predicted": predicted, "simulated": simulated}
@@ -199,14 +199,14 @@ def analyze_budget(
     return AnalysisPart((table,), _drawn(drawn, "png"), (table,))
 
 
-def _bench(setup: Setup | None) -> Bench:
+def _rig(setup: Setup | None) -> Rig:
+    """The rig of a set-up with uncertainty, or else that of chapter 8."""
     from labapp.studies.image_error import BENCH, VIEW, axes_of
     from labapp.studies.parameter_deviation import nominal
-    from labapp.studies.setup_budget import Bench
 
     if setup is None or setup.rig.uncertainty is None:
-        return Bench(BENCH, nominal(axes_of(VIEW)))
-    return Bench(replace(setup.rig, uncertainty=None), setup.rig.uncertainty)
+        return replace(BENCH, uncertainty=nominal(axes_of(VIEW)))
+    return setup.rig
 
 
 def expected_pool(width: float, length: float, height: float) -> Pool:

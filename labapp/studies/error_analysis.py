@@ -36,7 +36,7 @@ ERRORS = ("depth", "boundary", "are_mm", "actual_are_mm")
 ANGLES_DEG, DISTANCES_MM = (25.0, 35.0), (25.0, 35.0)
 """Ranges of the laser's positions in §8.3.2."""
 
-ASIDE_MM = 0.1
+OFF_CENTRE_MM = 0.1
 """Maximum distance of the caps' centres from the origin in X and Y: a fifth of the dot spacing."""
 
 CENTERS = {"CE": 5, "LE": 1, "ME": 1}
@@ -144,7 +144,7 @@ def survey(
     caps
         The surfaces. None: the 28 of §8.3.1, each at its `CENTERS`.
     """
-    caps, schemes = tuple(caps or aside(caps_8_3_1(), CENTERS[kind])), tuple(schemes)
+    caps, schemes = tuple(caps or off_centre(caps_8_3_1(), CENTERS[kind])), tuple(schemes)
     pattern = DENSE if kind == "ME" else DotPattern()
     lasers = [OPEN_BENCH.laser] if kind == "CE" else laser_places(step)
     rigs = [replace(OPEN_BENCH, laser=laser, pattern=pattern) for laser in lasers]
@@ -156,10 +156,10 @@ def survey(
     return ErrorSurvey(kind, caps, schemes, np.where(np.isinf(least), np.nan, least), lost)
 
 
-def aside(caps: Sequence[Pool], centers: int) -> tuple[Pool, ...]:
-    """Each cap at a number of centres near the origin (`ASIDE_MM`), the same at each call."""
+def off_centre(caps: Sequence[Pool], centers: int) -> tuple[Pool, ...]:
+    """Each cap at a number of centres near the origin (`OFF_CENTRE_MM`), the same at each call."""
     rng = np.random.default_rng(83)
-    at = rng.uniform(-ASIDE_MM, ASIDE_MM, (len(caps), centers, 2)).tolist()
+    at = rng.uniform(-OFF_CENTRE_MM, OFF_CENTRE_MM, (len(caps), centers, 2)).tolist()
     return tuple(
         replace(cap, footprint=replace(cap.footprint, center_mm=tuple(center)))
         for cap, own in zip(caps, at, strict=True)

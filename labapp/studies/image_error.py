@@ -23,7 +23,7 @@ from labapp.simulation.camera import CameraView
 from labapp.simulation.forward import exact_match
 from labapp.simulation.parallel import Progress, in_parallel
 from labapp.simulation.pools import Pool, spherical_cap
-from labapp.simulation.render import Frame, Look, render
+from labapp.simulation.render import Look, RenderedFrame, render
 from labapp.studies import SCHEMES
 from labapp.studies.error_analysis import (
     circle_settings,
@@ -124,7 +124,7 @@ def frame_errors(
     return [found[n * frames : (n + 1) * frames] for n in range(len(caps))]
 
 
-def rendered(cap: Pool, rig: Rig, number: int) -> Frame:
+def rendered(cap: Pool, rig: Rig, number: int) -> RenderedFrame:
     """Render one of the frames of a known surface; it is the same at each call."""
     seed = [round(1000 * cap.footprint.width_mm), round(1000 * abs(cap.peak_mm)), number]
     return render(trace_once(cap, rig), VIEW, LOOK, np.random.default_rng(seed))
@@ -154,7 +154,7 @@ def _sizes(known: KnownPool, scheme: str) -> FloatArray:
     return np.array([*relative_errors(measures, known.cap), computed_are(measures)])
 
 
-def _off(seen: Measurement, frame: Frame) -> tuple[FloatArray, int]:
+def _off(seen: Measurement, frame: RenderedFrame) -> tuple[FloatArray, int]:
     """Distance of the matched dots from the truth, px, and number of visible dots without a ray."""
     if seen.match is None or seen.dots is None:
         return np.zeros(0), int(frame.shown.sum())

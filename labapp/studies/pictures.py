@@ -16,7 +16,7 @@ from labapp.core.schemes import SCHEMES
 from labapp.core.values import FloatArray
 from labapp.simulation.forward import Reflections
 from labapp.simulation.positioning import Fate, SideView, side_view
-from labapp.simulation.render import Frame
+from labapp.simulation.render import RenderedFrame
 from labapp.studies.error_analysis import ErrorSurvey
 from labapp.studies.plotting import INCHES, STYLE, new_figure, row_colour
 from labapp.studies.positioning_tables import Coverage
@@ -213,7 +213,7 @@ def bars_picture(names: Sequence[str], values: dict[str, FloatArray], label: str
         return figure
 
 
-def frame_picture(frame: Frame) -> Figure:
+def frame_picture(frame: RenderedFrame) -> Figure:
     """A rendered frame as a negative, with rings at the true positions of its dots."""
     with rc_context(STYLE):
         figure = new_figure(INCHES / 2, INCHES / 2 * frame.image.shape[0] / frame.image.shape[1])

@@ -27,7 +27,7 @@ from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.pools import caps_8_3_1
 from labapp.simulation.render import Look, render
 from labapp.studies.correspondence_table import OPEN_BENCH
-from labapp.studies.error_analysis import aside, errors_of, trace_once
+from labapp.studies.error_analysis import errors_of, off_centre, trace_once
 from tests.benchmarks.clutter import as_entered, draw_pool
 from tests.benchmarks.dips import height_error
 from tests.benchmarks.rendered import ON_ITS_DOT_PX, PX_PER_MM, draw_view
@@ -116,7 +116,7 @@ def surveyed(name: str, pools: int, first: int) -> bool:
 def density_line(name: str) -> str:
     """Return a line with the depth error on the caps of §8.3.1, and the number of rays."""
     rig, errors, rays = replace(OPEN_BENCH, pattern=PATTERNS[name]), [], []
-    for cap in aside(caps_8_3_1(), 1):
+    for cap in off_centre(caps_8_3_1(), 1):
         reflections = trace_once(cap, rig)
         match = exact_match(reflections, rig)
         rays.append(len(match.ray))

@@ -16,7 +16,7 @@ from labapp.gui.shell.window import MainWindow
 from labapp.gui.tools import analysing
 from labapp.gui.tools.analysis import AnalysisWindow
 from labapp.session.session import Session
-from labapp.studies import error_analysis, setup_budget
+from labapp.studies import error_analysis, predicted_budget
 from labapp.studies.analysis import PARTS
 from tests.conftest import Run
 from tests.gui.conftest import CopySample
@@ -31,8 +31,8 @@ def analysis(
     caps = error_analysis.caps_8_3_1()[2::14]
     monkeypatch.setattr(error_analysis, "caps_8_3_1", lambda: caps)
     monkeypatch.setattr("os.cpu_count", lambda: 1)
-    monkeypatch.setattr(setup_budget, "POOLS", 2)
-    monkeypatch.setattr(setup_budget, "MOVED_POOLS", 1)
+    monkeypatch.setattr(predicted_budget, "POOLS", 2)
+    monkeypatch.setattr(predicted_budget, "MOVED_POOLS", 1)
     assert window.files.open(copy_sample("gtaw"))
     window.do("analysis")
     tool = window.findChild(AnalysisWindow)

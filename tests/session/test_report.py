@@ -31,7 +31,7 @@ from labapp.session.results.measured import CORRECTION_CHANGED, SETUP_CHANGED
 from labapp.session.session import Session
 from labapp.simulation.forward import exact_match, trace
 from labapp.simulation.pools import spherical_cap
-from labapp.studies.error_budget import Contribution, setup_budget, total
+from labapp.studies.measured_budget import Contribution, measured_budget, total
 from tests.scenes import FRAME_SHAPE, as_dots
 
 SAMPLE = Path(labapp.__file__).parents[1] / "sample_sessions" / "gtaw"
@@ -289,7 +289,7 @@ def sizes(match: Match, rig: Rig) -> np.ndarray:
 def test_budget_equals_measurements_with_changed_values(cap_measurement: Measurement, setup: Setup):
     budget = {
         contribution.name: contribution
-        for contribution in setup_budget(cap_measurement, setup, ERS)
+        for contribution in measured_budget(cap_measurement, setup, ERS)
     }
     assert len(budget) == len(QUANTITIES)
     assert all(contribution.assumed for contribution in budget.values() if contribution.sigma > 0.0)
@@ -314,7 +314,7 @@ def test_budget_of_a_calibration_point_equals_a_moved_point(cap_measurement: Mea
     setup = parse_setup(SETUP + "origin_px_sigma = 0.2\n", "setup.toml")
     budget = {
         contribution.name: contribution
-        for contribution in setup_budget(cap_measurement, setup, ERS)
+        for contribution in measured_budget(cap_measurement, setup, ERS)
     }
     assert cap_measurement.match is not None
     image = setup.calibration.to_image(cap_measurement.match.plane_mm)
@@ -341,7 +341,7 @@ def test_correlated_quantities_are_combined(cap_measurement: Measurement, setup:
         parse_setup(SETUP.replace("[pattern]", laser.format(share)), "setup.toml")
         for share in (0.0, 0.9, -0.9)
     )
-    changes = setup_budget(cap_measurement, setup, ERS)
+    changes = measured_budget(cap_measurement, setup, ERS)
     widths = [
         total(np.zeros(6), changes, one.rig)[0]
         for one in (uncorrelated, correlated, anticorrelated)

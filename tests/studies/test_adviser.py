@@ -87,7 +87,7 @@ def test_margins_are_those_of_a_flat_mirror() -> None:
     flat = ExpectedPools((6.0, 6.0), (6.0, 6.0), (0.01, 0.01), shift_mm=0.0)
     limits = BenchLimits(spacing_px=0.0)
     laser = LaserPlace(flat, limits, 30.0, 40.0)
-    place = laser.place(50.0)
+    place = laser.best_plate(50.0)
     margins = laser.margins(place)
     # The rays to the rim's ends, y = ±3, seen from the diode at (y, z) = 40·(cos 30°, sin 30°).
     horizontal, height = 40 * np.cos(np.pi / 6), 20.0
@@ -102,7 +102,7 @@ def test_margins_are_those_of_a_flat_mirror() -> None:
 
 def test_positive_margins_hold_for_intermediate_pools() -> None:
     laser = LaserPlace(EXPECTED, LIMITS, 28.0, 30.0)
-    place = laser.place(70.0)
+    place = laser.best_plate(70.0)
     assert min(laser.margins(place).values()) >= 0
     for pool in EXPECTED.sample(16, 9).pools:
         reflections = trace(pool, LIMITS.rig(place))
@@ -112,7 +112,7 @@ def test_positive_margins_hold_for_intermediate_pools() -> None:
 def test_negative_margins_are_confirmed_by_tracing() -> None:
     steep = ExpectedPools((5.0, 5.0), (5.5, 5.5), (0.5, 0.5), shift_mm=0.0)
     laser = LaserPlace(steep, LIMITS, 31.0, 35.0)
-    place = laser.place(50.0)
+    place = laser.best_plate(50.0)
     margins = laser.margins(place)
     reflections = trace(steep.corners(shifted=False)[0], LIMITS.rig(place))
     assert margins["torch"] < 0
@@ -125,7 +125,7 @@ def test_negative_margins_are_confirmed_by_tracing() -> None:
 
 
 def test_exact_bench_is_better_than_an_uncertain_one() -> None:
-    place = LaserPlace(EXPECTED, LIMITS, 28.0, 30.0).place(70.0)
+    place = LaserPlace(EXPECTED, LIMITS, 28.0, 30.0).best_plate(70.0)
     sigma = {key: 0.0 if key.startswith("image") else 10 * NOMINAL[key] for key in NOMINAL}
     rough = replace(LIMITS, sigma=sigma)
     trial = Trial(rough, place, EXPECTED.sample(4, 1), 0, 4)

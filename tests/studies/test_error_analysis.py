@@ -17,17 +17,17 @@ from labapp.simulation.parallel import in_parallel
 from labapp.simulation.pools import caps_8_3_1, egg, spherical_cap
 from labapp.studies import error_analysis, image_error, parameter_deviation
 from labapp.studies.adviser.predicted_error import DOT_SIGMA_MM, predict_error
-from labapp.studies.error_analysis import ErrorSurvey, aside, error_table, survey
+from labapp.studies.error_analysis import ErrorSurvey, error_table, off_centre, survey
 from labapp.studies.image_error import BENCH, TACK, TACK_RIG, VIEW, axes_of, exactly_seen
 from labapp.studies.parameter_deviation import move, nominal
 from labapp.studies.pictures import error_picture
-from labapp.studies.setup_budget import SetupBudget, budget_table, similar_pool
+from labapp.studies.predicted_budget import SetupBudget, budget_table, similar_pool
 
 
 @pytest.fixture(scope="module")
 def ce() -> ErrorSurvey:
     """Survey two schemes on the 28 caps of §8.3.1, each at one of its centres."""
-    return survey("CE", ("ers", "fit"), caps=aside(caps_8_3_1(), 1), workers=1)
+    return survey("CE", ("ers", "fit"), caps=off_centre(caps_8_3_1(), 1), workers=1)
 
 
 @pytest.mark.slow

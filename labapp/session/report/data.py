@@ -23,7 +23,7 @@ from labapp.export.summary import format_ranges
 from labapp.session.contents import SessionContents
 from labapp.session.report.layout import Cells
 from labapp.session.results.measured import scheme_name
-from labapp.studies.error_budget import Contribution, total
+from labapp.studies.measured_budget import Contribution, total
 from labapp.text import pluralize
 
 DOUBTFUL_MARGIN = 5.0

@@ -15,7 +15,7 @@ from labapp.errors import InputError
 from labapp.session.report import data, figures
 from labapp.session.report.data import FrameLine, ReportData
 from labapp.session.report.layout import Story
-from labapp.studies.error_budget import setup_budget
+from labapp.studies.measured_budget import measured_budget
 from labapp.text import SIGMA_OF
 
 LATEST_CHANGES = 40
@@ -172,7 +172,7 @@ def add_budget(story: Story, report: ReportData) -> None:
     result = session.result(line.frame, report.scheme)
     assert result is not None
     setup = parse_setup(result.setup, session.path)
-    contributions = setup_budget(result.measurement, setup, result.settings)
+    contributions = measured_budget(result.measurement, setup, result.settings)
     story.table(
         f"Effect of each ± (one σ) on the sizes. Set-up: frame {line.frame}, measured again with "
         "the quantity changed by its ± in either direction, for the same correspondence. *: no ± "

@@ -176,7 +176,7 @@ class LaserPlace:
         inside = np.abs(incident[:, 0]) <= across * forward
         return np.asarray(inside & (np.abs(incident @ up) <= along * forward))
 
-    def place(self, plane_mm: float) -> Place:
+    def best_plate(self, plane_mm: float) -> Place:
         """Place the plate such that the dots are farthest from its edges, within s and h."""
         x, z = _dots(self.points, self.away, plane_mm).T
         across, up = self.limits.plate_mm

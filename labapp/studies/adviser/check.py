@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import product
 
 import numpy as np
 
@@ -12,8 +11,8 @@ from labapp.core.values import FloatArray, ReadOnlyArrays
 from labapp.simulation.parallel import Progress, in_parallel
 from labapp.studies.adviser.bench_limits import LaserPlace, Place
 from labapp.studies.adviser.expected_pools import Sample
-from labapp.studies.adviser.height_error import blocks, simulated_errors
-from labapp.studies.adviser.search import Advice, constraint_text
+from labapp.studies.adviser.height_error import simulated_errors, trials_in_blocks
+from labapp.studies.adviser.search import Advice, constraint_text, grid_of
 
 TEXT_PLACE = Place(31.14, 31.48, 50.0, 50.8, 0.0)
 """The set-up of §8.3.1, on the 4″ plane."""
@@ -94,14 +93,15 @@ def check(
         Numbers of angles, distances and plane distances, evenly over the bench's limits.
     """
     expected, limits = advice.expected, advice.limits
-    rivals = _possible(advice, grid)
+    compared = grid_of(expected, limits, grid, workers=1)
+    rivals = [one.place for one in compared if one.possible]
     fresh, more = (
         expected.sample(pools, seed, even=False, places=places)
         for seed in (FRESH_SEED, FRESH_SEED + 1)
     )
 
     def measured(some: Sequence[Place], sample: Sample, what: str) -> FloatArray:
-        tasks = blocks(limits, some, sample, BLOCK)
+        tasks = trials_in_blocks(limits, some, sample, BLOCK)
         found = np.concatenate(in_parallel(simulated_errors, tasks, what, progress, workers))
         return np.asarray(found.reshape(len(some), pools, places, -1))
 
@@ -113,21 +113,6 @@ def check(
         rival = rivals[int(errors.argmin())]
         once_more = measured([advice.best.place, rival], more, "the best two once more")
     return Check(advice, own[0], own[1], tuple(rivals), errors, once_more[..., 0])
-
-
-def _possible(advice: Advice, grid: tuple[int, int, int]) -> list[Place]:
-    limits = advice.limits
-    ranges = (limits.angle_deg, limits.distance_mm, limits.plane_mm)
-    angles, distances, planes = (
-        np.unique(np.linspace(*span, count)).tolist()
-        for span, count in zip(ranges, grid, strict=True)
-    )
-    found = []
-    for angle, distance in product(angles, distances):
-        laser = LaserPlace(advice.expected, limits, angle, distance)
-        places = [laser.place(plane) for plane in planes]
-        found += [one for one in places if min(laser.margins(one).values()) >= 0]
-    return found
 
 
 def check_text(found: Check) -> str:

@@ -28,9 +28,9 @@ class Trial:
     limits: BenchLimits
     place: Place
     sample: Sample
-    first: int
-    last: int
-    """Pools ``first`` to before ``last`` of a sample."""
+    start: int
+    stop: int
+    """Pools ``start`` to before ``stop`` of a sample."""
     calibrated: bool = True
     """Whether the calibration has the sample's errors."""
 
@@ -48,7 +48,7 @@ def simulated_errors(trial: Trial) -> FloatArray:
     rig, known = limits.rig(trial.place), limits.uncertainty
     root = known.root
     rows = []
-    for number in range(trial.first, trial.last):
+    for number in range(trial.start, trial.stop):
         pool = sample.pools[number]
         seen = trace(pool, rig)
         counts = (int((seen.lit & seen.blocked).sum()), int((seen.lit & ~seen.on_plane).sum()))
@@ -79,12 +79,12 @@ def predicted_errors(trial: Trial) -> FloatArray:
             dot_sigma_mm=limits.dot_sigma_mm,
             uncertainty=limits.uncertainty if trial.calibrated else None,
         )
-        for pool in trial.sample.pools[trial.first : trial.last]
+        for pool in trial.sample.pools[trial.start : trial.stop]
     ]
     return np.array([MEAN_OF_SIGMA * one.total_mm for one in found])
 
 
-def blocks(
+def trials_in_blocks(
     limits: BenchLimits,
     places: Sequence[Place],
     sample: Sample,
@@ -94,7 +94,7 @@ def blocks(
     """Trials of every set-up with all pools of a sample, ``size`` pools each, set-up by set-up."""
     count = len(sample.pools)
     return [
-        Trial(limits, place, sample, first, min(first + size, count), calibrated)
+        Trial(limits, place, sample, start, min(start + size, count), calibrated)
         for place in places
-        for first in range(0, count, size)
+        for start in range(0, count, size)
     ]

@@ -28,9 +28,9 @@ from labapp.studies.adviser.bench_limits import (
 from labapp.studies.adviser.expected_pools import ExpectedPools, Range, Sample
 from labapp.studies.adviser.height_error import (
     Trial,
-    blocks,
     predicted_errors,
     simulated_errors,
+    trials_in_blocks,
 )
 
 MOVED: dict[str, str] = {
@@ -196,22 +196,14 @@ class _Search:
         )
 
     def grid(self) -> tuple[Candidate, ...]:
-        ranges = (self.limits.angle_deg, self.limits.distance_mm, self.limits.plane_mm)
-        angles, distances, planes = (
-            np.unique(np.linspace(*span, count))
-            for span, count in zip(ranges, self.effort.grid, strict=True)
-        )
-        tasks = [
-            (self.expected, self.limits, float(angle), float(distance), planes)
-            for angle, distance in product(angles, distances)
-        ]
-        found = in_parallel(_at_planes, tasks, "which are possible", self.progress, self.workers)
-        return tuple(one for some in found for one in some)
+        return grid_of(self.expected, self.limits, self.effort.grid, self.progress, self.workers)
 
     def scored(self, candidates: Sequence[Candidate], stage: int) -> list[Candidate]:
         """Predict the candidates' errors on the pools of a stage."""
         sample = self.samples[stage]
-        tasks = blocks(self.limits, [one.place for one in candidates], sample, len(sample.pools))
+        tasks = trials_in_blocks(
+            self.limits, [one.place for one in candidates], sample, len(sample.pools)
+        )
         what = ("predicted errors", "the best")[stage]
         found = in_parallel(predicted_errors, tasks, what, self.progress, self.workers)
         return [
@@ -226,12 +218,12 @@ class _Search:
             (self.expected, self.limits, one, self.samples[1], self.effort.steps)
             for one in best[:2]
         ]
-        found = in_parallel(_way_on, tasks, "local search", self.progress, self.workers)
+        found = in_parallel(_refined_locally, tasks, "local search", self.progress, self.workers)
         return list({one.place: one for one in [*found, *best]}.values())
 
     def nearest(self, start: Candidate) -> Candidate:
         """The set-up with the least violation, starting from the grid's."""
-        return _way_on((self.expected, self.limits, start, None, 3 * self.effort.steps))
+        return _refined_locally((self.expected, self.limits, start, None, 3 * self.effort.steps))
 
     def decided(self, finalists: list[Candidate]) -> tuple[Candidate, float, float, float]:
         """Simulate the finalists; returns the best, its mean error, the σ of it, its random part.
@@ -241,7 +233,7 @@ class _Search:
         finalists are compared by the mean of both on a logarithmic scale.
         """
         sample, count = self.samples[2], len(finalists)
-        tasks = blocks(self.limits, [one.place for one in finalists], sample, 8)
+        tasks = trials_in_blocks(self.limits, [one.place for one in finalists], sample, 8)
         tell = (self.progress, self.workers)
         found = in_parallel(simulated_errors, tasks, "measuring pools", *tell)
         errors = np.concatenate(found)[:, 0].reshape(count, -1)
@@ -256,7 +248,7 @@ class _Search:
         both = np.where(kept, np.sqrt(simulated * factor * predicted), np.inf)
         best = int(both.argmin())
         sigma = errors[best].std(ddof=1) / np.sqrt(errors.shape[1])
-        exact = blocks(self.limits, [finalists[best].place], sample, 8, calibrated=False)
+        exact = trials_in_blocks(self.limits, [finalists[best].place], sample, 8, calibrated=False)
         random = np.concatenate(in_parallel(simulated_errors, exact, "exact calibration", *tell))
         return finalists[best], float(both[best]), float(sigma), float(random[:, 0].mean())
 
@@ -269,16 +261,44 @@ class _Search:
         return tuple(replace(one, error_mm=scale * one.error_mm) for one in found)
 
 
+def grid_of(
+    expected: ExpectedPools,
+    limits: BenchLimits,
+    counts: tuple[int, int, int],
+    progress: Progress | None = None,
+    workers: int | None = None,
+) -> tuple[Candidate, ...]:
+    """Set-ups evenly over the limits, one laser position after the other.
+
+    Parameters
+    ----------
+    counts
+        Numbers of angles, distances and plane distances.
+    progress, workers
+        See `in_parallel`.
+    """
+    ranges = (limits.angle_deg, limits.distance_mm, limits.plane_mm)
+    angles, distances, planes = (
+        np.unique(np.linspace(*span, count)) for span, count in zip(ranges, counts, strict=True)
+    )
+    tasks = [
+        (expected, limits, float(angle), float(distance), planes)
+        for angle, distance in product(angles, distances)
+    ]
+    found = in_parallel(_at_planes, tasks, "which are possible", progress, workers)
+    return tuple(one for some in found for one in some)
+
+
 def _at_planes(
     task: tuple[ExpectedPools, BenchLimits, float, float, FloatArray],
 ) -> list[Candidate]:
     expected, limits, angle, distance, planes = task
     laser = LaserPlace(expected, limits, angle, distance)
-    places = [laser.place(float(plane)) for plane in planes]
+    places = [laser.best_plate(float(plane)) for plane in planes]
     return [Candidate(place, laser.margins(place)) for place in places]
 
 
-def _way_on(
+def _refined_locally(
     task: tuple[ExpectedPools, BenchLimits, Candidate, Sample | None, int],
 ) -> Candidate:
     """Minimise the predicted error or, without a sample, the violation (Nelder–Mead)."""
@@ -291,7 +311,7 @@ def _way_on(
         nonlocal best
         at = ranges[:, 0] + np.clip(share, 0, 1) * span
         laser = LaserPlace(expected, limits, float(at[0]), float(at[1]))
-        place = laser.place(float(at[2]))
+        place = laser.best_plate(float(at[2]))
         one = Candidate(place, laser.margins(place))
         if sample is None:
             best = min(best, one, key=lambda each: broken(each.margins))

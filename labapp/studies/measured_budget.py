@@ -30,7 +30,7 @@ class Contribution(ReadOnlyArrays):
     """
 
 
-def setup_budget(
+def measured_budget(
     measurement: Measurement, setup: Setup, settings: Settings
 ) -> tuple[Contribution, ...]:
     """Reconstruct a measured frame with each quantity of the set-up changed by its ± either way.

@@ -32,17 +32,6 @@ SHIFT_MM, STRETCH = 0.3, 0.05
 
 
 @dataclass(frozen=True)
-class Bench:
-    """A set-up and its uncertainty."""
-
-    rig: Rig
-    uncertainty: RigUncertainty
-    """The set-up and its uncertainty."""
-    dot_sigma_mm: float = DOT_SIGMA_MM
-    """Standard uncertainty of a dot's position on the plane."""
-
-
-@dataclass(frozen=True)
 class SetupBudget(ReadOnlyArrays):
     """Budget of the height for m pools of a kind."""
 
@@ -61,18 +50,20 @@ class SetupBudget(ReadOnlyArrays):
     """
 
 
-def setup_budget(
-    bench: Bench, pool: Pool, progress: Progress | None = None, workers: int | None = None
+def predicted_budget(
+    rig: Rig, pool: Pool, progress: Progress | None = None, workers: int | None = None
 ) -> SetupBudget:
-    """Predict and simulate the error budget of a set-up for a kind of pool."""
+    """Predict and simulate the error budget of a rig with uncertainty for a kind of pool."""
+    known, exact = rig.uncertainty, replace(rig, uncertainty=None)
+    assert known is not None
     rng = np.random.default_rng(831)
     pools = [similar_pool(pool, rng) for _ in range(POOLS)]
-    tasks = [(bench, one, k) for k, one in enumerate(pools)]
+    tasks = [(exact, known, one, k) for k, one in enumerate(pools)]
     found = in_parallel(_simulated, tasks, "budget", progress, workers)
     moved = np.array([changes for _, _, changes in found[:MOVED_POOLS]])
     return SetupBudget(
         pool=pool,
-        uncertainty=bench.uncertainty,
+        uncertainty=known,
         predicted=tuple(predicted for predicted, _, _ in found),
         random=np.array([error for _, error, _ in found]),
         parameters=moved,
@@ -94,13 +85,13 @@ def similar_pool(pool: Pool, rng: np.random.Generator) -> Pool:
     return replace(pool, footprint=moved, peak_mm=scale * pool.peak_mm)
 
 
-def _simulated(task: tuple[Bench, Pool, int]) -> tuple[PredictedError, float, FloatArray]:
-    bench, pool, number = task
-    rig, rng = bench.rig, np.random.default_rng([831, number])
-    predicted = predict_error(
-        pool, rig, dot_sigma_mm=bench.dot_sigma_mm, uncertainty=bench.uncertainty
-    )
-    match = exact_match(trace(pool, rig), rig, sigma_mm=bench.dot_sigma_mm, rng=rng)
+def _simulated(
+    task: tuple[Rig, RigUncertainty, Pool, int],
+) -> tuple[PredictedError, float, FloatArray]:
+    rig, uncertainty, pool, number = task
+    rng = np.random.default_rng([831, number])
+    predicted = predict_error(pool, rig, dot_sigma_mm=DOT_SIGMA_MM, uncertainty=uncertainty)
+    match = exact_match(trace(pool, rig), rig, sigma_mm=DOT_SIGMA_MM, rng=rng)
     changes = np.full(len(QUANTITIES), np.nan)
     try:
         made = reconstruct(match, rig, Settings())
@@ -108,10 +99,10 @@ def _simulated(task: tuple[Bench, Pool, int]) -> tuple[PredictedError, float, Fl
     except CannotMeasure:
         return predicted, float("nan"), changes
     if number < MOVED_POOLS:
-        known = KnownPool(pool, match, rig, bench.uncertainty)
+        known = KnownPool(pool, match, rig, uncertainty)
         changes[:] = 0.0
-        for k in np.flatnonzero(bench.uncertainty.sigma):
-            step = np.diag(bench.uncertainty.sigma)[k]
+        for k in np.flatnonzero(uncertainty.sigma):
+            step = np.diag(uncertainty.sigma)[k]
             both = [moved_errors((known, way * step, "fit"))[0] for way in (1, -1)]
             changes[k] = (both[0] - both[1]) / 2
     return predicted, error, changes
