@@ -87,7 +87,7 @@ def test_unsuitable_session_is_rejected_before_recording(
     def film(*_: object) -> Take:
         pytest.fail("it was filmed")
 
-    monkeypatch.setattr("labapp.simulated.cameras.record", film)
+    monkeypatch.setattr("labapp.cli.cameras._film", film)
     measured = shutil.copytree(SAMPLE.parent, tmp_path / "run") / "gtaw.labsession"
     in_use = tmp_path / "a.labsession"
     damaged = tmp_path / "b.labsession"

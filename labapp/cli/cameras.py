@@ -16,7 +16,7 @@ from labapp.errors import InputError
 from labapp.text import pluralize
 
 if TYPE_CHECKING:
-    from labapp.media.cameras import Camera, CameraSettings, Feed, Range
+    from labapp.media.cameras import Camera, CameraFrame, CameraSettings, Range
     from labapp.media.events import Event
     from labapp.media.recording.recorder import Plan
     from labapp.media.recording.take_files import Take
@@ -136,32 +136,47 @@ def _film(
     seconds: float | None,
 ) -> Take:
     """Record for some seconds, or until Ctrl-C or SIGTERM; events are reported on stderr."""
-    from labapp.media.cameras import CameraError
+    from labapp.media.cameras import CameraError, Feed
+    from labapp.media.events import logged
+    from labapp.media.recording.recorder import Recorder
     from labapp.simulated.cameras import camera_opener
-    from labapp.simulated.cameras import record as film
+
+    recorders: list[Recorder] = []
+
+    def deliver(frame: CameraFrame) -> None:
+        for recorder in recorders:
+            recorder.take(frame)
 
     with progress_bar() as bar:
         task = bar.add_task(camera, total=None)
+        log = logged(lambda event: note(bar.console, str(event)))
 
-        def wait(feed: Feed, take: Take) -> None:
-            until_s = time.monotonic() + (math.inf if seconds is None else seconds)
-            try:
-                while feed.state != "ended" and not take.trouble and time.monotonic() < until_s:
-                    time.sleep(POLL_S)
-                    bar.update(task, completed=take.frames)
-            except KeyboardInterrupt:
-                note(bar.console, "stopped: the recording ends here")
+        def say(event: Event) -> None:
+            log(event)
+            for recorder in recorders:
+                recorder.note(event)
 
         try:
-            opened = camera_opener(
+            opener = camera_opener(
                 camera, lambda _, done, of: bar.update(task, completed=done, total=of)
             )
             bar.update(task, completed=0, total=None)
-
-            def say(event: Event) -> None:
-                note(bar.console, str(event))
-
-            return film(camera, opened, place, plan, settings, wait, say)
+            with (
+                Feed(camera, opener, deliver, say, settings) as feed,
+                Recorder(place, plan, feed.bit_depth, feed.settings.rate_hz, log) as recorder,
+            ):
+                take = recorder.trigger()
+                recorders.append(recorder)
+                until_s = time.monotonic() + (math.inf if seconds is None else seconds)
+                try:
+                    while feed.state != "ended" and not take.trouble and time.monotonic() < until_s:
+                        time.sleep(POLL_S)
+                        bar.update(task, completed=take.frames)
+                except KeyboardInterrupt:
+                    note(bar.console, "stopped: the recording ends here")
+                finally:
+                    recorders.clear()
+            return take
         except CameraError as error:
             expected = "a camera that answers: labapp cameras lists them"
             raise InputError(camera, "camera", error, expected) from error

@@ -1,4 +1,4 @@
-"""Opening of cameras by id, including simulated ones, and recording from one."""
+"""Opening of cameras by id, including simulated ones."""
 
 from __future__ import annotations
 
@@ -14,17 +14,11 @@ from labapp.errors import InputError
 from labapp.media import GreyImage, open_source
 from labapp.media.cameras import (
     Camera,
-    CameraFrame,
-    CameraSettings,
     Faults,
-    Feed,
     SimulatedDevice,
     open_camera,
     there_and_back,
 )
-from labapp.media.events import Event, OnEvent, ignore_event, logged
-from labapp.media.recording.recorder import Plan, Recorder
-from labapp.media.recording.take_files import Take
 from labapp.simulated.simulate import simulate
 from labapp.simulation.parallel import Progress
 
@@ -97,59 +91,3 @@ def _recorded(path: Path) -> tuple[list[GreyImage], int, float | None]:
             if len(images) * frame.image.nbytes > MOST_BYTE:
                 break
         return images, source.bit_depth, source.frame_rate_hz
-
-
-def record(
-    id: str,
-    opener: Callable[[], Camera],
-    new_path: Callable[[], Path],
-    plan: Plan,
-    settings: CameraSettings,
-    wait: Callable[[Feed, Take], None],
-    on_event: OnEvent = ignore_event,
-) -> Take:
-    """Record from a camera immediately.
-
-    Parameters
-    ----------
-    id, opener
-        The camera's id, and its `camera_opener`.
-    new_path
-        Returns the path of the recording.
-    plan, settings
-        Plan of the recording, and the camera's settings.
-    wait
-        Function that returns at the end of the recording; the recording is also completed if it
-        raises.
-    on_event
-        Called with every event; the notes contain it, too.
-
-    Raises
-    ------
-    InputError, CameraError
-        If the camera cannot be opened or set, or the file exists.
-    """
-    recorders: list[Recorder] = []
-
-    def deliver(frame: CameraFrame) -> None:
-        for recorder in recorders:
-            recorder.take(frame)
-
-    log = logged(on_event)
-
-    def note(event: Event) -> None:
-        log(event)
-        for recorder in recorders:
-            recorder.note(event)
-
-    with (
-        Feed(id, opener, deliver, note, settings) as feed,
-        Recorder(new_path, plan, feed.bit_depth, feed.settings.rate_hz, log) as recorder,
-    ):
-        take = recorder.trigger()
-        recorders.append(recorder)
-        try:
-            wait(feed, take)
-        finally:
-            recorders.clear()
-    return take
