@@ -147,10 +147,6 @@ class Packets:
         names = ("place", "pts", "dts", "key", "shown")
         return dataclasses.replace(self, **{name: getattr(self, name)[:-1] for name in names})
 
-    def with_keys(self, key: BoolArray) -> Self:
-        """Return the packets with other key frames."""
-        return dataclasses.replace(self, key=key)
-
     def stamps_differ(self) -> bool:
         """Whether every packet has a unique presentation time stamp."""
         return _differ(self.pts)
@@ -264,10 +260,6 @@ class PacketTable(ReadOnlyArrays):
             return []
         stamps = self.seek[np.count_nonzero(self.key[:packet])].tolist()
         return [stamp for stamp in dict.fromkeys(stamps) if stamp != UNKNOWN]
-
-    def without_seeking(self) -> Self:
-        """Return the index with seeking disabled."""
-        return dataclasses.replace(self, seekable=False)
 
     def to_bytes(self, fingerprint: tuple[int, int]) -> bytes:
         """Serialise for the file with this fingerprint."""

@@ -13,9 +13,11 @@ import numpy as np
 import numpy.typing as npt
 
 from labapp.core.values import FloatArray
-from labapp.errors import InputError
+from labapp.errors import InputError, os_errors_as_input
 from labapp.media.base import Frame, FrameSource, GreyImage, check_index, format_frame_rate
 from labapp.pixels import MOST_PIXELS
+
+READABLE = "a file that may be read"
 
 Read = TypeVar("Read")
 
@@ -175,10 +177,8 @@ def file_size(path: Path) -> int:
     InputError
         If it is not regular, or does not exist.
     """
-    try:
+    with os_errors_as_input(path, "file", READABLE):
         return regular_size(path)
-    except OSError as error:
-        raise _unreadable(path, error) from error
 
 
 def read_bytes(path: Path, offset: int, size: int) -> bytes:
@@ -189,12 +189,9 @@ def read_bytes(path: Path, offset: int, size: int) -> bytes:
     InputError
         If the file cannot be opened or is too short.
     """
-    try:
-        with path.open("rb") as file:
-            file.seek(offset)
-            content = file.read(size)
-    except OSError as error:
-        raise _unreadable(path, error) from error
+    with os_errors_as_input(path, "file", READABLE), path.open("rb") as file:
+        file.seek(offset)
+        content = file.read(size)
     if len(content) != size:
         raise InputError(
             path, "size", f"{offset + len(content)} bytes", f"at least {offset + size} bytes"
@@ -231,7 +228,3 @@ def unpack_bits(packed: bytes, bits: int) -> npt.NDArray[np.uint16]:
     for column in each.T:
         levels = levels << 1 | column
     return levels
-
-
-def _unreadable(path: Path, error: OSError) -> InputError:
-    return InputError(path, "file", error.strerror, "a file that may be read")

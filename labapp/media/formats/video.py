@@ -162,7 +162,7 @@ class VideoSource(FrameSource):
     def decode_from_start(self) -> None:
         """Disable seeking; `index` and `warnings` are updated."""
         self._open()
-        table = self._table.without_seeking()
+        table = dataclasses.replace(self._table, seekable=False)
         self._use(table, table.to_bytes(self._fingerprint))
 
     def frame(self, index: int) -> Frame:
@@ -298,10 +298,12 @@ class VideoSource(FrameSource):
         elif codec.reorder:
             timing = dataclasses.replace(timing, stamped=False)
             key, number = self._decode_through(packets)
-            packets = packets.with_keys(key & packets.key if indexed or not is_avi else key)
+            packets = dataclasses.replace(
+                packets, key=key & packets.key if indexed or not is_avi else key
+            )
         elif is_avi and not indexed and not codec.intra_only:
             key, _ = self._decode_through(packets)
-            packets = packets.with_keys(key)
+            packets = dataclasses.replace(packets, key=key)
         if not (number >= 0).any():
             raise InputError(self._path, "frames", "no complete one", A_VIDEO)
         table = PacketTable.build(packets, number, timing, self.name)
