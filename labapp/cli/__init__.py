@@ -72,6 +72,12 @@ app.command()(advise.advise)
 app.command()(cameras.cameras)
 app.command()(cameras.record)
 app.command()(benchmark.benchmark)
+app.command()(reconstruct.reconstruct)
+app.command()(detect.detect)
+app.command()(lines.lines)
+app.command()(dynamics.dynamics)
+app.command()(demo.samples)
+app.command()(demo.demo)
 
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
@@ -183,11 +189,3 @@ def program(
     ] = False,
 ) -> None:
     """Define the options of the program itself."""
-
-
-app.command()(reconstruct.reconstruct)
-app.command()(detect.detect)
-app.command()(lines.lines)
-app.command()(dynamics.dynamics)
-app.command()(demo.samples)
-app.command()(demo.demo)

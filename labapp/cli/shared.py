@@ -52,7 +52,10 @@ RECORDING_HELP = (
     "A video, an image, a folder of images, a TIFF or NumPy stack, a Phantom .cine, "
     "a Photron .mraw or its header."
 )
-FRAMES_HELP = "Frames A up to but not including B, from 0, every STEP-th; parts may be omitted."
+FRAMES_HELP = (
+    "Frames A up to but not including B, from 0, every STEP-th; parts may be omitted. "
+    "A alone: that frame."
+)
 
 Warm = Annotated[
     bool,
