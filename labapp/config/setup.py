@@ -64,7 +64,7 @@ class Setup:
     """Conversion between pixels and imaging plane."""
     text: str
     """The file as read, for the record."""
-    checked: str = ""
+    check_date: str = ""
     """Date of the check against a known mirror, ISO 8601; empty if the bench was not checked or has
     changed since.
     """

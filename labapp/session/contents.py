@@ -326,7 +326,7 @@ class SessionContents:
         from labapp.text import setup_words
 
         status, verdict, check = self.setup_status, self.setup_verdict, self.bench_check
-        checked = self.setup.checked if status else ""
+        checked = self.setup.check_date if status else ""
         was_checked = check.date if check is not None and not checked else ""
         return setup_words(status, checked, verdict.reason if verdict else "", was_checked)
 

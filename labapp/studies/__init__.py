@@ -2,5 +2,5 @@
 
 from labapp.core import schemes
 
-SCHEMES = tuple(reversed(schemes.SCHEMES))
+SCHEME_NAMES = tuple(reversed(schemes.SCHEMES))
 """Names of the schemes in the studies: all of them, the default one last."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 from labapp.errors import InputError
-from labapp.studies import SCHEMES
+from labapp.studies import SCHEME_NAMES
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -35,7 +35,7 @@ class AnalysisOptions:
 
     parts: tuple[str, ...] = PARTS
     """Some of `PARTS`."""
-    schemes: tuple[str, ...] = SCHEMES
+    schemes: tuple[str, ...] = SCHEME_NAMES
     step: float = 2.0
     """Step between places of the laser, degrees and mm (LE, ME)."""
     frames: int = 3

@@ -26,7 +26,7 @@ from labapp.core.values import CannotMeasure, FloatArray, ReadOnlyArrays
 from labapp.simulation.forward import PoolSurface, Reflections, exact_match, trace
 from labapp.simulation.parallel import Progress, in_parallel
 from labapp.simulation.pools import Pool, caps_8_3_1
-from labapp.studies import SCHEMES
+from labapp.studies import SCHEME_NAMES
 from labapp.studies.correspondence_table import OPEN_BENCH
 from labapp.studies.tables import Cell, Table
 
@@ -126,7 +126,7 @@ class ErrorSurvey(ReadOnlyArrays):
 
 def survey(
     kind: str,
-    schemes: Sequence[str] = SCHEMES,
+    schemes: Sequence[str] = SCHEME_NAMES,
     step: float = 2.0,
     caps: Sequence[Pool] | None = None,
     progress: Progress | None = None,

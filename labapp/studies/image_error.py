@@ -24,7 +24,7 @@ from labapp.simulation.forward import exact_match
 from labapp.simulation.parallel import Progress, in_parallel
 from labapp.simulation.pools import Pool, spherical_cap
 from labapp.simulation.render import Look, RenderedFrame, render
-from labapp.studies import SCHEMES
+from labapp.studies import SCHEME_NAMES
 from labapp.studies.error_analysis import (
     circle_settings,
     computed_are,
@@ -108,7 +108,7 @@ def frame_errors(
     rig: Rig,
     frames: int,
     *,
-    schemes: Sequence[str] = SCHEMES,
+    schemes: Sequence[str] = SCHEME_NAMES,
     progress: Progress | None = None,
     workers: int | None = None,
 ) -> list[list[FrameErrors]]:
@@ -164,7 +164,7 @@ def _off(seen: Measurement, frame: RenderedFrame) -> tuple[FloatArray, int]:
     return off, int(frame.shown.sum()) - int((off <= WRONG_PX).sum())
 
 
-def thumb_tack_table(frames: Sequence[FrameErrors], schemes: Sequence[str] = SCHEMES) -> Table:
+def thumb_tack_table(frames: Sequence[FrameErrors], schemes: Sequence[str] = SCHEME_NAMES) -> Table:
     """Measurement error of §8.2: exact reflections, rendered frames, and values of the text."""
     rows = []
     for k, scheme in enumerate(schemes):
@@ -197,7 +197,7 @@ def thumb_tack_table(frames: Sequence[FrameErrors], schemes: Sequence[str] = SCH
 def image_error_table(
     caps: Sequence[Pool],
     found: Sequence[Sequence[FrameErrors]],
-    schemes: Sequence[str] = SCHEMES,
+    schemes: Sequence[str] = SCHEME_NAMES,
 ) -> Table:
     """Image processing error: difference between rendered frames and exact reflections; dots."""
     rows = []

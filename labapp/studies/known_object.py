@@ -12,7 +12,7 @@ from labapp.core.surface.measures import measure_surface
 from labapp.core.values import CannotMeasure
 from labapp.errors import InputError
 from labapp.simulation.pools import Pool, spherical_cap
-from labapp.studies import SCHEMES
+from labapp.studies import SCHEME_NAMES
 from labapp.studies.error_analysis import circle_settings, computed_are, relative_errors
 from labapp.studies.tables import Cell, Table
 
@@ -52,7 +52,7 @@ def known_object_table(match: Match, rig: Rig, cap: Pool) -> Table:
     """
     rows: list[tuple[Cell, ...]] = []
     diameter_mm, height_mm = cap.footprint.width_mm, cap.peak_mm
-    for scheme in SCHEMES:
+    for scheme in SCHEME_NAMES:
         try:
             made = reconstruct(match, rig, circle_settings(scheme))
         except CannotMeasure as why:

@@ -116,7 +116,7 @@ def test_check_of_some_quantities_is_ignored(count: int) -> None:
     text = with_check(quantities=checked, correlation=np.eye(count).tolist())
     setup = parse_setup(text, PATH)
     assert status(text) == "entered"
-    assert not setup.checked
+    assert not setup.check_date
 
 
 def test_check_before_the_latest_quantities_is_valid() -> None:
@@ -156,7 +156,7 @@ def test_check_can_be_reverted() -> None:
     for text in (SETUP, HOMOGRAPHY):
         checked = checked_text(text)
         assert status(checked) == "checked"
-        assert parse_setup(checked, PATH).checked == DATE
+        assert parse_setup(checked, PATH).check_date == DATE
         reverted = parse_setup(unchecked_setup(checked, PATH), PATH)
         original = parse_setup(text, PATH)
         assert reverted.rig.laser == original.rig.laser

@@ -80,7 +80,7 @@ def _facts(session: Session) -> dict[str, Any]:
         else {
             "date": check.date,
             "mirrors": [one.kind for one in check.pictures],
-            "in_use": not session.setup_problems and bool(session.setup.checked),
+            "in_use": not session.setup_problems and bool(session.setup.check_date),
         },
         "settings": _differences(session.settings, Settings()),
         "scheme": scheme_name(session.settings),

@@ -18,7 +18,7 @@ from labapp.cli.shared import (
 )
 from labapp.errors import InputError
 from labapp.files import write_file
-from labapp.studies import SCHEMES
+from labapp.studies import SCHEME_NAMES
 from labapp.studies.analysis import (
     PARTS,
     AnalysisOptions,
@@ -101,7 +101,7 @@ def errors(
         list[str] | None,
         typer.Option(
             metavar="SCHEME",
-            help=f"Scheme to use: {', '.join(SCHEMES)}; repeat for more. Default: all.",
+            help=f"Scheme to use: {', '.join(SCHEME_NAMES)}; repeat for more. Default: all.",
         ),
     ] = None,
     step: Annotated[
@@ -124,7 +124,7 @@ def errors(
     """
     options = AnalysisOptions(
         _chosen("part", part, PARTS),
-        _chosen("scheme", scheme, SCHEMES),
+        _chosen("scheme", scheme, SCHEME_NAMES),
         step,
         frames,
         draws,

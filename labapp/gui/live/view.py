@@ -391,7 +391,7 @@ class LiveView(QObject):
             self.figures.words.setText(
                 pace_text(self._result, pace, live.rate_hz(), self._age_s, skipped)
             )
-            checked = "" if live.setup is None else live.setup.checked
+            checked = "" if live.setup is None else live.setup.check_date
             self.figures.setup_words.setText(live_setup_words(self._result, checked))
             self.canvas.show_status(live.watch)
         picture = self._picture.picture

@@ -161,7 +161,7 @@ class Facts:
     @property
     def checked(self) -> str:
         """Date of the bench check, see `Setup`."""
-        return "" if self.problems else self.session.setup.checked
+        return "" if self.problems else self.session.setup.check_date
 
     @property
     def to_do(self) -> str:

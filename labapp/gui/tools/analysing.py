@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 
 from labapp.session.session import Session
-from labapp.studies import SCHEMES
+from labapp.studies import SCHEME_NAMES
 
 BUDGET = "budget"
 
@@ -32,7 +32,7 @@ PARTS = (
 )
 """Parts that can be computed: key, text and explanation."""
 
-SCHEME_CHOICES = (("", "all of them"), *((scheme, scheme) for scheme in SCHEMES))
+SCHEME_CHOICES = (("", "all of them"), *((scheme, scheme) for scheme in SCHEME_NAMES))
 
 OPENED, USUAL = "opened", "usual"
 SETUPS = ((OPENED, "of the session"), (USUAL, "of §8.3.1, 4″ plane"))

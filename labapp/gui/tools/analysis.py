@@ -15,7 +15,7 @@ from labapp.gui.widgets.fields import ChoiceField, FieldForm, NumberField
 from labapp.gui.widgets.labels import wrapping_label
 from labapp.gui.widgets.sheet import Sheet
 from labapp.gui.widgets.tables import CellTable
-from labapp.studies import SCHEMES
+from labapp.studies import SCHEME_NAMES
 from labapp.studies.analysis import (
     AnalysisOptions,
     AnalysisPart,
@@ -159,7 +159,7 @@ class AnalysisWindow(ToolWindow):
         scheme = self.scheme.value()
         options = AnalysisOptions(
             parts=tuple(key for key in ticked if key != BUDGET),
-            schemes=tuple(one for one in SCHEMES if scheme in ("", one)),
+            schemes=tuple(one for one in SCHEME_NAMES if scheme in ("", one)),
             step=float(self.step.value() or 0),
             frames=int(self.frames.value() or 0),
             draws=int(self.draws.value() or 0),

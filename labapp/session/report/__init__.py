@@ -247,7 +247,7 @@ def _laser(story: Story, report: ReportData) -> None:
 
 
 def _changed(what: str, setup: Setup) -> str:
-    by = "adjusted by the bench check" if setup.checked else "changed"
+    by = "adjusted by the bench check" if setup.check_date else "changed"
     return f"{what} was {by} after this calibration: other values are in use."
 
 
@@ -334,7 +334,7 @@ def _bench_check(story: Story, report: ReportData) -> None:
         "llrrr",
         (0.3, 0.22, 0.16, 0.18, 0.14),
     )
-    if report.setup is not None and not report.setup.checked:
+    if report.setup is not None and not report.setup.check_date:
         story.text("The set-up was changed after this check: it is not checked.")
 
 

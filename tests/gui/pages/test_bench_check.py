@@ -397,9 +397,9 @@ def test_unchecking_restores_the_previous_uncertainty(checked: Checked) -> None:
     text = updated_setup(SETUP.read_text("utf-8"), SETUP, {"laser": known})
     check = replace(checked.check, before=parse_setup(text, SETUP).rig)
     after = checked_setup(text, SETUP, check, "2026-01-31T12:00:00+00:00")
-    assert parse_setup(after, SETUP).checked.startswith("2026-01-31")
+    assert parse_setup(after, SETUP).check_date.startswith("2026-01-31")
     restored = unchecked_setup(after, SETUP)
-    assert not parse_setup(restored, SETUP).checked
+    assert not parse_setup(restored, SETUP).check_date
     laser = tomllib.loads(restored)["laser"]
     assert laser["projection_angle_deg"] == pytest.approx(31.14)
     assert {key: laser[key] for key in known} == known

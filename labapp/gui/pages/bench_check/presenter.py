@@ -240,7 +240,7 @@ def kept_words(session: Session) -> str:
     if found is None:
         return ""
     day = found.date[:10]
-    if session.setup_problems or not session.setup.checked:
+    if session.setup_problems or not session.setup.check_date:
         return (
             f"▲ The set-up was changed after this check of {day} and is no longer checked. Check "
             "again, or undo the change."
@@ -381,7 +381,7 @@ def ray_words(picture: MirrorPicture, u: float, v: float) -> str:
     return f"Ray ({i}, {j}): residual {um:.0f} µm"
 
 
-def expected_pool(record: Record) -> Cap:
+def expected_cap(record: Record) -> Cap:
     """The expected pool of the record, or a usual one."""
     width, height = record.expected_width_mm, record.expected_height_mm
     return Cap(width, height) if width and height and height > 0 else EXPECTED
@@ -405,7 +405,7 @@ def predicted(setup: Setup, record: Record) -> Predicted:
     CannotMeasure
         If that pool cannot be measured with this set-up.
     """
-    pool = expected_pool(record)
+    pool = expected_cap(record)
     try:
         made = forecast(setup.rig, CANDIDATES, pool)
     except CannotMeasure as answer:

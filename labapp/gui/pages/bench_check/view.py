@@ -199,7 +199,7 @@ class BenchCheckPage(Page):
         """Adjust the set-up to the pictures."""
         session, chosen = self.session, tuple(self.chosen)
         text, path, settings = session.setup_text, session.path, session.settings.dots
-        pool = presenter.expected_pool(session.record)
+        pool = presenter.expected_cap(session.record)
 
         def work(control: Control) -> Checked:
             presenter.check_sizes(session, chosen)

@@ -200,7 +200,7 @@ def _setup_words(result: Result) -> str:
     if result.stale or result.measurement.status != "ok" or not status:
         return ""
     return marked_setup_words(
-        status, setup_words(status, result.parsed_setup.checked, result.doubt)
+        status, setup_words(status, result.parsed_setup.check_date, result.doubt)
     )
 
 
