@@ -54,7 +54,7 @@ def test_true_labels_leave_nothing_unexplained(frame: tuple[Observation, IntArra
     assert (len(found.missed), len(found.stray)) == (0, 0)
     assert (found.witness[lit] == 1).all()
     assert not (found.witness[~lit] > 0).any()
-    assert (found.witness[observed.absent] == 0).all()
+    assert (found.witness[observed.rays.absent] == 0).all()
     # Rays that land well outside the pool have no dot, but some of them cross the view.
     assert (found.witness < 0).sum() > 20
 

@@ -146,7 +146,7 @@ def _bound(
     observed = replace(observed, hidden_rows=frozenset(hidden))
     shape = (pattern.rows, pattern.columns)
     labels = labels_from_lattice(rows, reference, marker, orientation, shape)
-    labels = np.where(observed.absent, UNLABELLED, labels)
+    labels = np.where(observed.rays.absent, UNLABELLED, labels)
     lit = labels != UNLABELLED
     if lit.sum() < (rows.row > 0).sum():  # a site beyond the pattern, or where no ray is
         return None
@@ -200,7 +200,7 @@ def _check_bound(bound: _Bound, rows: Lattice, settings: MatchSettings) -> None:
             f"are far from any surface's prediction, most in row {_most(rows.row[wrong])}",
         )
     stray = bound.hypothesis.stray_count
-    if stray > settings.stray[0] + settings.stray[1] * len(observed.plane_mm):
+    if stray > settings.most_strays(len(observed.plane_mm)):
         reason = f"the correction leaves {stray} of {len(observed.plane_mm)} dots without a ray"
         if len(bound.contested):
             row = _most(rows.row[bound.contested])

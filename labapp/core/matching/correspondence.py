@@ -73,7 +73,7 @@ from labapp.core.matching.unexplained import (
     explains_half,
     suffices,
 )
-from labapp.core.rows.lattice import Lattice, Site, empty_sites
+from labapp.core.rows.lattice import Lattice, Site, empty_sites, lattice_of_sites
 from labapp.core.surface.pool_fit import FitSettings
 from labapp.core.surface.solver import inverse_of
 from labapp.core.surface.spline import SplineSurface
@@ -110,11 +110,12 @@ def match_rays(
     ------
     CannotMeasure
         ``too-few-dots`` if there are fewer than `LEAST_LABELS`; ``no-reference`` if the pattern has
-        no absent ray or no hole can be the absent dot, ``ambiguous-rows`` if several can;
-        ``ambiguous-orientation``; ``no-match`` if no surface explains the dots.
+        no absent ray or no hole can be the absent dot; ``ambiguous-rows`` if a dot lies in the only
+        hole, or a part of the rows can be shifted; ``ambiguous-orientation``; ``no-match`` if no
+        surface explains the dots.
     RowsOpen
-        ``ambiguous-rows`` if several can, perhaps with a set-up that is wrong within its
-        uncertainty. Other frames of the recording may decide between them.
+        ``ambiguous-rows`` if several holes can be the absent dot, perhaps with a set-up that is
+        wrong within its uncertainty. Other frames of the recording may decide between them.
     """
     if len(dots) < LEAST_LABELS:
         raise CannotMeasure(
@@ -200,14 +201,9 @@ def lattice_of_match(match: Match, rig: Rig, count: int) -> Lattice:
     """
     way, marker = ways(match.orientation), rig.pattern.marker or rig.pattern.center_ray
     k, t = np.array(marker) * way + (match.reflected - match.ray * way)[0]
-    row, column = np.zeros((2, count), np.int64)
-    row[match.dot], column[match.dot] = match.reflected.T
-    # Rows that lack two or more neighbouring dots between others are blocked.
-    sites = match.reflected[np.lexsort(match.reflected.T[::-1])]
-    step = np.diff(sites, axis=0)
-    blocked = np.unique(sites[1:, 0][(step[:, 0] == 0) & (step[:, 1] > 2)])
-    site = (int(k), int(t))
-    return Lattice(row, column, site, (site,), frozenset(blocked.tolist()))
+    pairs = np.column_stack([match.reflected, match.dot]).tolist()
+    dot_at = {(row, column): dot for row, column, dot in pairs}
+    return lattice_of_sites(dot_at, count, (int(k), int(t)))
 
 
 def _by_grid(
@@ -301,11 +297,14 @@ def _by_quadrics(
 
 
 def match_of_hypothesis(
-    observed: Observation, best: Hypothesis, orientation: Orientation, reference: Site | None = None
+    observed: Observation,
+    best: Hypothesis,
+    orientation: Orientation,
+    marker_site: Site | None = None,
 ) -> Match:
     """Build the match of a hypothesis with its orientation, and try the other orientations.
 
-    Reflected rows and columns count from 1, or so that the reference has the given site (k, t).
+    Reflected rows and columns count from 1, or so that the marker has the given site (k, t).
     """
     trials = [Trial(orientation, best.residual_mm)]
     for other in ORIENTATIONS:
@@ -325,7 +324,7 @@ def match_of_hypothesis(
 
     witness = certain_witness(observed, best.witness, paths, covariance_of)
     missed = best.missed_count
-    return match_of_pairs(observed, at, dot, orientation, witness, missed, trials, reference)
+    return match_of_pairs(observed, at, dot, orientation, witness, missed, trials, marker_site)
 
 
 def match_of_pairs(
@@ -336,7 +335,7 @@ def match_of_pairs(
     witness: IntArray,
     missed: int,
     trials: Iterable[Trial],
-    reference: Site | None = None,
+    marker_site: Site | None = None,
 ) -> Match:
     """Build the match of n pairs of ray and dot.
 
@@ -352,13 +351,13 @@ def match_of_pairs(
         See `Match`.
     missed
         Number of rays between lit rays that have no dot.
-    reference
+    marker_site
         Reflected row and column (k, t) of the marker. None: rows and columns begin at 1.
     """
     pattern = observed.rig.pattern
     numbers = (at + 1 - (pattern.marker or pattern.center_ray)) * ways(orientation)
     least = numbers.min(axis=0)
-    numbers += 1 - least if reference is None else np.maximum(reference, 1 - least)
+    numbers += 1 - least if marker_site is None else np.maximum(marker_site, 1 - least)
     return Match(
         orientation=orientation,
         dot=dot,

@@ -171,8 +171,8 @@ def _step(one: Hypothesis, other: Hypothesis) -> tuple[int, int]:
 def supported(observed: Observation, best: Hypothesis, knots: FitSettings) -> Hypothesis:
     """Remove the labels that the surface through the other dots does not support."""
     for _ in range(MOST_LEFT_OUT):
-        settled = _settled(observed, best, knots)
-        wrong = unsupported(observed, fitted_labels(observed, settled, knots))
+        converged = _converged(observed, best, knots)
+        wrong = unsupported(observed, fitted_labels(observed, converged, knots))
         if len(wrong) == 0:
             break
         best = _without(observed, best, wrong, knots)
@@ -190,11 +190,11 @@ def _without(
     return replace(evaluate(observed, certain, knots, initial=best.pool) or best, witness=witness)
 
 
-def _settled(observed: Observation, best: Hypothesis, knots: FitSettings) -> Hypothesis:
+def _converged(observed: Observation, best: Hypothesis, knots: FitSettings) -> Hypothesis:
     """Continue the fit of a hypothesis until it has converged as for a reconstruction."""
-    converged = replace(knots, settled_mm=FitSettings().settled_mm)
+    settings = replace(knots, settled_mm=FitSettings().settled_mm)
     try:
-        return replace(best, pool=observed.fit(best.labels, best.witness, converged, best.pool))
+        return replace(best, pool=observed.fit(best.labels, best.witness, settings, best.pool))
     except CannotMeasure:
         return best
 
@@ -263,7 +263,7 @@ def _clearly_cheaper(
     if other.cost_without_marker < best.cost_without_marker:
         return False
     # With a wrong set-up and many false dots, wrong rows led by more than one margin.
-    many_false = best.stray_count > settings.most_strays(best)
+    many_false = best.stray_count > settings.most_strays(best.label_count + best.stray_count)
     margin = (2 if many_false else 1) * settings.margin
     if other.cost >= best.cost + margin:
         return True

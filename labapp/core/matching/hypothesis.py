@@ -187,11 +187,11 @@ def grow_and_evaluate(
 def _outside(observed: Observation, hypothesis: Hypothesis) -> IntArray:
     """Labelled rays that land well outside the boundary of the fit."""
     at = np.argwhere(hypothesis.labels != UNLABELLED)
-    x, y = observed.landing_mm[at[:, 0], at[:, 1], :2].T
+    x, y = observed.rays.landing_mm[at[:, 0], at[:, 1], :2].T
     height, slope = hypothesis.pool.surface.height_and_gradient(x, y)
     level = hypothesis.pool.level
     inward = level.sign * (height - level.rear.height(y))
-    far = inward < -BEYOND_SPACINGS * np.linalg.norm(slope * observed.spacing_mm, axis=-1)
+    far = inward < -BEYOND_SPACINGS * np.linalg.norm(slope * observed.rays.spacing_mm, axis=-1)
     return np.asarray(at[far])
 
 
@@ -356,7 +356,7 @@ def without_doubtful_outermost(
     deviance = pair_deviances(observed, pool, rays, hypothesis.labels[tuple(rays.at.T)])[
         1
     ].diagonal()
-    false_per_mm2 = max(FALSE_DOTS_PER_MM2, (hypothesis.stray_count + 1) / observed.view_mm2)
+    false_per_mm2 = max(FALSE_DOTS_PER_MM2, (hypothesis.stray_count + 1) / observed.frame_area_mm2)
     certain = deviance + RIVAL_MARGIN + FALSE_MARGIN < false_dot_deviance(false_per_mm2)
     kept = strong.copy()
     at = tuple(rays.at[certain].T)
@@ -426,7 +426,7 @@ def shifted_by(observed: Observation, labels: IntArray, step: tuple[int, ...]) -
     """Shift labels by rows and columns."""
     at = np.argwhere(labels != UNLABELLED)
     shifted = _labels_of_pairs(at + 1 + step, labels[tuple(at.T)], labels.shape)
-    shifted[observed.absent] = UNLABELLED
+    shifted[observed.rays.absent] = UNLABELLED
     return shifted
 
 

@@ -158,7 +158,7 @@ def _rows_begun(observed: Observation, hypothesis: Hypothesis) -> list[Hypothesi
     labels = hypothesis.labels
     found: list[Hypothesis] = []
     stray = np.setdiff1d(np.arange(len(observed.plane_mm)), labels)
-    beyond = within_rings(labels, 2) & (labels == UNLABELLED) & ~observed.absent
+    beyond = within_rings(labels, 2) & (labels == UNLABELLED) & ~observed.rays.absent
     rays = predict(observed, hypothesis.pool, beyond)
     if len(stray) == 0 or len(rays.at) == 0:
         return found

@@ -90,7 +90,7 @@ def refuse_unexplained(
     ``most_scattered`` is the largest accepted share of isolated strays and missed rays, such as
     `MOST_SCATTERED`.
     """
-    few = best.stray_count <= settings.most_strays(best)
+    few = best.stray_count <= settings.most_strays(best.label_count + best.stray_count)
     scattered = _leaves_isolated(best, most_scattered) and (
         few or _strays_lie_apart(observed, best)
     )
