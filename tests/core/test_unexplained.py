@@ -75,7 +75,7 @@ def searched_with(seen: SeenDots, monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
         monkeypatch.setattr(correspondence, name, run)
 
-    for name in ("_by_grid", "_by_empty_sites", "_by_quadrics", "_by_caps"):
+    for name in ("_by_lattice", "_by_empty_sites", "_by_quadrics", "_by_caps"):
         noted(name)
     lattice = grow_lattice(seen.dots, GrowSettings())
     match, _ = correspondence.match_rays(seen.dots, lattice, BENCH, FRAME_SHAPE, MatchSettings())
@@ -84,7 +84,7 @@ def searched_with(seen: SeenDots, monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 def test_isolated_false_dots_do_not_prolong_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert searched_with(seen_with(false=10), monkeypatch) == ["_by_grid"]
+    assert searched_with(seen_with(false=10), monkeypatch) == ["_by_lattice"]
 
 
 def test_a_cluttered_frame_is_searched_in_other_ways(monkeypatch: pytest.MonkeyPatch) -> None:

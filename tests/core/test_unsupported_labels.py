@@ -11,7 +11,7 @@ from scipy.ndimage import convolve, maximum_filter
 
 from labapp.core.matching import match_kernels, observation
 from labapp.core.matching.decision import fitted_labels
-from labapp.core.matching.hypothesis import USUAL_KNOTS, evaluate
+from labapp.core.matching.hypothesis import USUAL_FIT, evaluate
 from labapp.core.matching.observation import UNLABELLED, Observation, try_fit
 from labapp.core.matching.prediction import sure_pairs
 from labapp.core.matching.unsupported_labels import unsupported
@@ -23,7 +23,7 @@ from tests.core.test_dips import observation_of
 from tests.scenes import BENCH_RIG, see
 
 POOL = egg(5.8, 2.6, 3.2, 0.28)
-FIT = replace(USUAL_KNOTS, settled_mm=1e-4)
+FIT = replace(USUAL_FIT, settled_mm=1e-4)
 
 
 def scene(seed: int = 1) -> tuple[Observation, IntArray]:

@@ -17,7 +17,7 @@ from labapp.core.images.dots import Dots
 from labapp.core.match import Match, Orientation, ways
 from labapp.core.matching.correspondence import lattice_of_match, match_of_hypothesis, match_rays
 from labapp.core.matching.hypothesis import (
-    WIDE_KNOTS,
+    WIDE_FIT,
     Hypothesis,
     evaluate,
     grow_and_evaluate,
@@ -150,7 +150,7 @@ def _bound(
     lit = labels != UNLABELLED
     if lit.sum() < (rows.row > 0).sum():  # a site beyond the pattern, or where no ray is
         return None
-    hypothesis = evaluate(observed, labels, WIDE_KNOTS)
+    hypothesis = evaluate(observed, labels, WIDE_FIT)
     if hypothesis is None:
         return None
     wider = grow_and_evaluate(observed, labels)
@@ -166,7 +166,7 @@ def _bound(
         more = ~against.any(axis=-1)
         labels = labels.copy()
         labels[ray[more, 0] - 1, ray[more, 1] - 1] = dot[more]
-        further = evaluate(observed, labels, WIDE_KNOTS)
+        further = evaluate(observed, labels, WIDE_FIT)
         if further is not None and further.cost < hypothesis.cost:
             hypothesis = further
     return _Bound(observed, orientation, hypothesis, contested)

@@ -2,13 +2,13 @@
 
 `match_rays` has three steps:
 
-1. Initial labels. The absent centre dot gives the rays of a complete grid, for each orientation.
-   Where rows bend too much for a grid to grow, labels come from models of the surface instead:
+1. Initial labels. The absent centre dot gives the rays of a complete lattice, for each orientation.
+   Where rows bend too much for a lattice to grow, labels come from models of the surface instead:
    quadrics that explain the dots around a hole (`initial.quadrics`), or caps as large as the pool
    (`initial.caps`).
 2. Labels are grown (`label_growth`) and evaluated (`hypothesis`): fit the surface to the labelled
    dots, predict the dot of every ray, label the dots with an unambiguous ray, and fit again until
-   nothing changes. This labels the dots that the grid left in doubt and removes wrong labels.
+   nothing changes. This labels the dots that the lattice left in doubt and removes wrong labels.
    Swapped, skipped and omitted rows are repaired (`repair`).
 3. The cheapest hypothesis is accepted if no other is close (`decision`).
 """
@@ -42,10 +42,10 @@ from labapp.core.matching.decision import (
 )
 from labapp.core.matching.free_setup import FreeHypothesis
 from labapp.core.matching.hypothesis import (
-    USUAL_KNOTS,
+    USUAL_FIT,
     Hypothesis,
     evaluate,
-    extended_over_grid,
+    extended_over_lattice,
     grow_and_evaluate,
     labels_from_lattice,
     paths_of,
@@ -80,7 +80,7 @@ from labapp.core.surface.spline import SplineSurface
 from labapp.core.values import CannotMeasure, FloatArray, IntArray
 
 MOST_SITES = 8
-"""Maximum number of best-fitting sites of the marker in the grid that are grown to a hypothesis."""
+"""Maximum number of best-fitting sites of the marker in the lattice that become hypotheses."""
 
 MOST_REPAIRED = 4
 """Maximum number of hypotheses from caps that are repaired if none explains the frame."""
@@ -126,7 +126,7 @@ def match_rays(
     observed = Observation.of(dots, bench, frame_shape)
     orientations = settings.orientations
     found: list[Hypothesis] = []
-    for first_labels in (_by_grid, _by_empty_sites, _by_quadrics):
+    for first_labels in (_by_lattice, _by_empty_sites, _by_quadrics):
         new = first_labels(observed, lattice, orientations)
         found = with_repaired(observed, found, new)
         if any(suffices(observed, each) for each in found):
@@ -162,7 +162,7 @@ def _candidates(
     for each in open_holes[1:]:
         rival, match = evaluate(observed, each.labels), None
         if rival is not None:
-            rival = supported(observed, rival, USUAL_KNOTS)
+            rival = supported(observed, rival, USUAL_FIT)
             match = match_of_hypothesis(observed, rival, own.orientation)
         yield Candidate(match, each.step, each.cost - least.cost)
 
@@ -206,17 +206,17 @@ def lattice_of_match(match: Match, rig: Rig, count: int) -> Lattice:
     return lattice_of_sites(dot_at, count, (int(k), int(t)))
 
 
-def _by_grid(
+def _by_lattice(
     observed: Observation, lattice: Lattice | None, orientations: tuple[Orientation, ...]
 ) -> list[Hypothesis]:
-    """Hypotheses from the grid with the marker at each candidate site, in each orientation."""
+    """Hypotheses from the lattice with the marker at each candidate site, in each orientation."""
     return [] if lattice is None else _by_sites(observed, lattice, lattice.candidates, orientations)
 
 
 def _by_empty_sites(
     observed: Observation, lattice: Lattice | None, orientations: tuple[Orientation, ...]
 ) -> list[Hypothesis]:
-    """Hypotheses from the grid with the marker at each empty site in it or next to it.
+    """Hypotheses from the lattice with the marker at each empty site in it or next to it.
 
     Because of false or missing dots, or the torch, the marker may have fewer than three lit
     neighbours.
@@ -232,7 +232,7 @@ def _by_sites(
     sites: Iterable[Site],
     orientations: tuple[Orientation, ...],
 ) -> list[Hypothesis]:
-    """Hypotheses from the grid with the marker at given sites, in each orientation.
+    """Hypotheses from the lattice with the marker at given sites, in each orientation.
 
     Only the best-fitting ones are grown. They are selected first by a quick fit, then by the fit
     with which labels grow.
@@ -280,7 +280,7 @@ def _by_caps(observed: Observation) -> list[Hypothesis]:
 def _by_quadrics(
     observed: Observation, lattice: Lattice | None, orientations: tuple[Orientation, ...]
 ) -> list[Hypothesis]:
-    """Hypotheses from the quadrics that explain the dots around a hole, extended by the grid."""
+    """Hypotheses from the quadrics that explain the dots around a hole, extended by the lattice."""
     found = []
     for guess in search_quadrics(observed):
         hypothesis = grow_and_evaluate(observed, guess.labels)
@@ -288,7 +288,7 @@ def _by_quadrics(
             continue
         found.append(hypothesis)
         if lattice is not None:
-            labels = extended_over_grid(hypothesis, lattice, hypothesis.orientation(observed))
+            labels = extended_over_lattice(hypothesis, lattice, hypothesis.orientation(observed))
             wider = None if labels is None else grow_and_evaluate(observed, labels)
             found += [wider] if wider is not None else []
         if suffices(observed, hypothesis):
@@ -306,7 +306,7 @@ def match_of_hypothesis(
 
     Reflected rows and columns count from 1, or so that the marker has the given site (k, t).
     """
-    trials = [Trial(orientation, best.residual_mm)]
+    trials = [Trial(orientation, best.residual_rms_mm)]
     for other in ORIENTATIONS:
         if other != orientation:
             pool = try_fit(observed, reoriented_labels(observed, best.labels, orientation, other))

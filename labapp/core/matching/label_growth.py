@@ -30,7 +30,7 @@ FEW_UNLABELLED = 0.06
 """Share of the dots that may be false or hidden. If more remain unlabelled, growth is retried."""
 
 FEW_LABELS = 25
-"""A complete grid labels more dots than this; a quadric around a hole labels fewer."""
+"""A complete lattice labels more dots than this; a quadric around a hole labels fewer."""
 
 # Only knots as fine as those of the final fit follow a dent; with few labels, wider knots
 # extrapolate farther.

@@ -164,13 +164,21 @@ def sure_pairs(
     """
     from labapp.core.matching import match_kernels
 
-    variances = SIGMA_INFLATION**2, MODEL_ERROR_MM**2
+    limits = np.array(
+        [
+            SIGMA_INFLATION**2,  # inflation
+            MODEL_ERROR_MM**2,  # error
+            GATE_SIGMA2,  # gate
+            RIVAL_MARGIN,  # margin
+            false_dot_deviance(),  # false
+        ]
+    )
     dot, ray = match_kernels.sure_pairs(
         observed.plane_mm[dots],
         observed.covariance_mm2[dots],
         plane_mm,
         covariance_mm2,
-        np.array([*variances, GATE_SIGMA2, RIVAL_MARGIN, false_dot_deviance()]),
+        limits,
     )
     return dots[dot], ray
 

@@ -96,8 +96,8 @@ def unsupported(observed: Observation, fitted: FittedLabels) -> IntArray:
     * another ray between the others, which has no dot, made it.
 
     A ray that lands outside the boundary of the others is unlikely to be reflected. A dot much
-    wider than those around it is two merged dots; one that is less wide is, if a ray without a dot
-    would have its dot beside it. With few neighbours, at the rim, a label must be nearer to its
+    wider than those around it is two merged dots; a less wide one counts as merged if a ray without
+    a dot is predicted beside it. With few neighbours, at the rim, a label must be nearer to its
     prediction than elsewhere. One without neighbours may be that of the next ray, since nothing
     determines its place in the row. If all labels are farther from their predictions than the
     uncertainty of dots and surface explains, that uncertainty is increased accordingly.
@@ -125,18 +125,18 @@ def unsupported(observed: Observation, fitted: FittedLabels) -> IntArray:
     false_per_mm2 = max(FALSE_DOTS_PER_MM2, (len(stray) + 1) / observed.frame_area_mm2)
     limits = np.array(
         [
-            fitted.floor_mm**2,
-            LEVER * fitted.unsettled_mm,
-            MOST_LEVERAGE,
-            SIGMA_INFLATION**2,
-            MODEL_ERROR_MM**2,
-            MEDIAN_CHI2,
-            false_dot_deviance(false_per_mm2),
-            GATE_SIGMA2,
-            RIVAL_MARGIN,
-            RIM_NEIGHBOURS,
-            RIM_SIGMA2,
-            RIM_TIMES,
+            fitted.floor_mm**2,  # floor
+            LEVER * fitted.unsettled_mm,  # unsettled
+            MOST_LEVERAGE,  # leverage
+            SIGMA_INFLATION**2,  # inflation
+            MODEL_ERROR_MM**2,  # error
+            MEDIAN_CHI2,  # median
+            false_dot_deviance(false_per_mm2),  # false
+            GATE_SIGMA2,  # gate
+            RIVAL_MARGIN,  # margin
+            RIM_NEIGHBOURS,  # rim_neighbours
+            RIM_SIGMA2,  # rim_sigma2
+            RIM_TIMES,  # rim_times
         ]
     )
     fails = match_kernels.failing_labels(

@@ -314,11 +314,15 @@ def judge_setup(
 
 def _lens_center_sigma(rig: Rig) -> float:
     """Standard uncertainty of the centre of the distortion times the distortion, mm·percent."""
-    known, plane = rig.uncertainty, rig.imaging_plane
-    assert known is not None
-    sigma = float(known.sigma[INDEX["camera_lens.distortion_percent"]])
+    uncertainty, plane = rig.uncertainty, rig.imaging_plane
+    assert uncertainty is not None
+    sigma = float(uncertainty.sigma[INDEX["camera_lens.distortion_percent"]])
     reach = min(plane.width_mm, plane.height_mm) / 2
-    return LENS_CENTER * reach * float(np.hypot(known.axes.calibration.distortion_percent, sigma))
+    return (
+        LENS_CENTER
+        * reach
+        * float(np.hypot(uncertainty.axes.calibration.distortion_percent, sigma))
+    )
 
 
 def _by_ray(samples: Sequence[Residuals], shape: tuple[int, int]) -> tuple[IntArray, FloatArray]:

@@ -31,12 +31,13 @@ GATE = 0.45
 LEAST_RAYS = 10
 """Minimum number of rays that meet a cap."""
 
-LIT_MARKER_PENALTY, DARK_PENALTY = 5.0, 0.5
-"""Penalties for a dot at the marker's absent ray, and for a ray without a dot. Each ray with a dot
-adds about 1 to the score."""
+LIT_ABSENT_PENALTY, DARK_PENALTY = 5.0, 0.5
+"""Penalty for dots at absent rays, times the share of these that have one, and for a ray without a
+dot. Each ray with a dot adds about 1 to the score."""
 
 LIT_GATE = 0.3
-"""The marker is lit if a dot lies within this fraction of the median spacing of predictions."""
+"""An absent ray counts as lit if a dot lies within this fraction of the median spacing of
+predictions."""
 
 ALIKE, MOST_CAPS = 0.9, 150
 """Two caps are the same hypothesis if this share of the rays with a dot in both have the same dot;
@@ -65,7 +66,7 @@ def search_caps(observed: Observation) -> list[IntArray]:
     """
     from labapp.core.matching.initial import quadric_kernels
 
-    settings = np.array([LEAST_RAYS, GATE, DARK_PENALTY, LIT_GATE, LIT_MARKER_PENALTY])
+    settings = np.array([LEAST_RAYS, GATE, DARK_PENALTY, LIT_GATE, LIT_ABSENT_PENALTY])
     score, found = quadric_kernels.score_caps(
         _caps(observed),
         observed.rays.directions.reshape(-1, 3),

@@ -1,8 +1,9 @@
 """Initial labels from a local model of the pool: quadrics that explain the dots around a hole.
 
-Where rows bend so much that no grid can be grown in the image, the surface can still be found from
-the few dots around the hole: near its centre a pool is a quadric. The hole determines its slope,
-the two dots beside the hole the transverse curvature; several longitudinal curvatures are tried.
+Where rows bend so much that no lattice can be grown in the image, the surface can still be found
+from the few dots around the hole: near its centre a pool is a quadric. The hole determines its
+slope, the two dots beside the hole the transverse curvature; several longitudinal curvatures are
+tried.
 Quadrics whose predictions lie near the dots around the hole are fitted to these and then compared
 with more dots.
 """
