@@ -134,8 +134,8 @@ def _agreeing(
         try:
             for result in measured:
                 found = result.measurement
-                followed = warm and result.track_lost is None and found.correction is None
-                waiting.append((result, vote.add(found, followed)))
+                tracked = warm and result.track_lost is None and found.correction is None
+                waiting.append((result, vote.add(found, tracked)))
                 while waiting and is_due():
                     yield judged()
         except (Exception, KeyboardInterrupt):
@@ -470,5 +470,5 @@ def load_all() -> None:
     """Import all modules for measuring in this process."""
     import labapp.core.matching.match_kernels
     import labapp.core.rows.lattice_kernels
-    import labapp.core.sequence.following
+    import labapp.core.sequence.tracking
     import labapp.export.fixed_point  # noqa: F401

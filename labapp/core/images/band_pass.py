@@ -263,10 +263,10 @@ class _BandPassed:
         self._pass()
 
     def _pass(self) -> None:
-        from labapp.core.images import dot_kernels
+        from labapp.core.images import band_pass_kernels
 
         size, lost = self.size / self.step, (1 - self.step**-2) / 12
-        seen = dot_kernels.halved(self.picture) if self.step == 2 else self.picture
+        seen = band_pass_kernels.halved(self.picture) if self.step == 2 else self.picture
         blur(seen, float(np.sqrt((0.8 * size) ** 2 - lost)), self._narrow)
         widen(self._narrow, self._wide, (1.6**2 - 0.8**2) * size**2)
         cv2.subtract(self._narrow, self._wide, dst=self.band)
@@ -277,7 +277,7 @@ class _BandPassed:
         Peaks as sharp as hot pixels or as elongated as lines of them are suspect. Their pixels
         are repaired, since a dot of usual brightness may lie beneath them.
         """
-        from labapp.core.images import dot_kernels
+        from labapp.core.images import band_pass_kernels
 
         u, v, bright = self._over(tuning)
         good = self._dot_like(u, v, bright)
@@ -290,30 +290,30 @@ class _BandPassed:
             self.picture = repaired
             self._pass()
             u, v, bright = self._over(tuning)
-            near = dot_kernels.two_nearest(pairs(u, v), pairs(*suspects))[0][:, 0]
+            near = band_pass_kernels.two_nearest(pairs(u, v), pairs(*suspects))[0][:, 0]
             good = self._dot_like(u, v, bright)
             good &= (near > 2.0 * self.size) | (bright >= REMAINS_SHARE * typical_brightness)
         return u[good], v[good], bright[good]
 
     def _over(self, tuning: DetectorTuning) -> Peaks:
         """Return the peaks above the threshold."""
-        from labapp.core.images import dot_kernels
+        from labapp.core.images import band_pass_kernels
 
         band, floor, disc = self.band, tuning.floor, peak_disc(self.size)
         if self.step == 2:
-            (u, v), bright = dot_kernels.enlarged_peaks(band, tuning.coarse, floor, disc)
+            (u, v), bright = band_pass_kernels.enlarged_peaks(band, tuning.coarse, floor, disc)
             return u, v, bright
-        u, v = dot_kernels.peaks(band, floor, disc)
+        u, v = band_pass_kernels.peaks(band, floor, disc)
         return u, v, band[v, u].astype(float)
 
     def _dot_like(self, u: IntArray, v: IntArray, bright: FloatArray) -> BoolArray:
         """Whether peaks are round and do not respond more strongly to a much finer band."""
-        from labapp.core.images import centroid_kernels, dot_kernels
+        from labapp.core.images import band_pass_kernels, centroid_kernels
 
         scale = max(0.4, self.size / 3.0)
         narrow, wide = (_nine(sigma * scale, 1.6 * scale) for sigma in (0.8, 1.6))
         sharp = centroid_kernels.finest(self.picture, u, v, narrow, wide) >= HOT_RATIO * bright
-        ridges = dot_kernels.ridges(self.band, u // self.step, v // self.step, SLENDER)
+        ridges = band_pass_kernels.ridges(self.band, u // self.step, v // self.step, SLENDER)
         return np.asarray(~sharp & ~ridges)
 
     def light(
@@ -388,14 +388,14 @@ def _found(tuning: DetectorTuning, seen: _BandPassed, settings: BandPassSettings
 
 def _kept(tuning: DetectorTuning, seen: _BandPassed, settings: BandPassSettings) -> Peaks:
     """Return the peaks that are bright enough, without duplicates."""
-    from labapp.core.images import dot_kernels
+    from labapp.core.images import band_pass_kernels
 
     u, v, bright = seen.peaks(tuning)
     if len(u) == 0:
         raise CannotMeasure("no-dots", "no dot is brighter than the frame's noise")
     keep = np.flatnonzero(bright >= settings.contrast * typical(bright))
     # A dot with a flat top has several peaks.
-    keep = keep[dot_kernels.first_of_each(u[keep], v[keep], max(1.5, seen.size))]
+    keep = keep[band_pass_kernels.first_of_each(u[keep], v[keep], max(1.5, seen.size))]
     return u[keep], v[keep], bright[keep]
 
 
@@ -429,10 +429,10 @@ def margin_of(reach: float) -> int:
 
 def _described(seen: _BandPassed, peaks: Peaks, noise: Grey, speckle_px: float) -> Dots:
     """Compute position, uncertainty, size, height and signal-to-noise ratio of each peak."""
-    from labapp.core.images import dot_kernels
+    from labapp.core.images import band_pass_kernels
 
     (u, v, bright), size = peaks, seen.size
-    width = window_widths(dot_kernels.next_apart(pairs(u, v)), CENTROID_WIDENING * size)
+    width = window_widths(band_pass_kernels.next_apart(pairs(u, v)), CENTROID_WIDENING * size)
     (u_px, v_px), moment = seen.light(u, v, width, CENTROID_WIDENING * size)
     moment = np.clip(moment / 2, 1e-3, 0.95 * width**2)
     spread = (1 / (1 / moment - 1 / width**2) - (0.5 * size) ** 2) / WIDTH_KEPT**2

@@ -91,21 +91,21 @@ def without_spikes(
     These are certain spikes, spikes near one of the ``suspects`` pixels (columns and rows), and
     spikes connected to either. A picture without spikes is returned unchanged.
     """
-    from labapp.core.images import dot_kernels
+    from labapp.core.images import band_pass_kernels
 
     least = 1e-3 * float(cv2.minMaxLoc(picture)[1])
     over = SPIKE * max(float(noise[::8, ::8].min()), least)
     reach = max(2, round(2.5 * size))
-    (u, v), (times, beside) = dot_kernels.spikes(picture, over, size, DOUBTED, reach)
+    (u, v), (times, beside) = band_pass_kernels.spikes(picture, over, size, DOUBTED, reach)
     sharp = picture[v, u] - beside > SPIKE * noise[v, u]
     u, v, times, beside = u[sharp], v[sharp], times[sharp], beside[sharp]
     begun = times > CERTAIN
     if suspects is not None:
-        away = dot_kernels.two_nearest(pairs(u, v), pairs(*suspects))[0][:, 0]
+        away = band_pass_kernels.two_nearest(pairs(u, v), pairs(*suspects))[0][:, 0]
         begun |= away <= 1.5 * size + 1.0
     if not begun.any():
         return picture
-    hot = dot_kernels.connected_pixels(u, v, begun)
+    hot = band_pass_kernels.connected_pixels(u, v, begun)
     result = picture.copy()
     result[v[hot], u[hot]] = np.rint(beside[hot]) if picture.dtype == np.uint8 else beside[hot]
     return result
@@ -190,15 +190,15 @@ class _Blobs:
 
 
 def _blobs(bands: dict[int, tuple[int, Grey]], scale: int, noise: float) -> _Blobs:
-    from labapp.core.images import dot_kernels, size_kernels
+    from labapp.core.images import band_pass_kernels, size_kernels
 
     step, band = bands[scale]
     white = noise / noise_gain(SCALES_PX[scale])
     every = -(-8 // step)
     floor = OVER_NOISE * band_noise(band[::every, ::every], white) + 1e-6
     disc = peak_disc(SCALES_PX[scale] / step).astype(bool)
-    x, y = dot_kernels.peaks(band, np.full((1, 1), floor, np.float32), disc)
-    good = ~dot_kernels.ridges(band, x, y, SLENDER)
+    x, y = band_pass_kernels.peaks(band, np.full((1, 1), floor, np.float32), disc)
+    good = ~band_pass_kernels.ridges(band, x, y, SLENDER)
     x, y = x[good], y[good]
     if len(x) > MOST_BLOBS:
         most = np.argpartition(-band[y, x], MOST_BLOBS)[:MOST_BLOBS]

@@ -15,7 +15,6 @@ from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.rig import Rig
 from labapp.core.images.dots import Dots
 from labapp.core.match import Match, Orientation, ways
-from labapp.core.matching.correspondence import lattice_of_match, match_of_hypothesis, match_rays
 from labapp.core.matching.hypothesis import (
     WIDE_FIT,
     Hypothesis,
@@ -23,6 +22,7 @@ from labapp.core.matching.hypothesis import (
     grow_and_evaluate,
     labels_from_lattice,
 )
+from labapp.core.matching.match_rays import lattice_of_match, match_of_hypothesis, match_rays
 from labapp.core.matching.match_settings import MatchSettings
 from labapp.core.matching.observation import LEAST_LABELS, UNLABELLED, Observation
 from labapp.core.rows.lattice import Lattice, Site

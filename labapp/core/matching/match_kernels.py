@@ -6,7 +6,7 @@ import numpy as np
 from numba import types
 
 from labapp.core.compiled import compiled, inner
-from labapp.core.images.dot_kernels import next_apart, two_nearest
+from labapp.core.images.band_pass_kernels import next_apart, two_nearest
 from labapp.core.surface.kernels.ray_kernels import behind_torch
 from labapp.core.values import BoolArray, FloatArray, IntArray
 

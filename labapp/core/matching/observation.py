@@ -88,11 +88,13 @@ class Observation(ReadOnlyArrays):
     @classmethod
     def of(cls, dots: Dots, bench: Bench, frame_shape: tuple[int, int]) -> Observation:
         """Map the dots of a frame, of shape (height, width), px, to the imaging plane."""
-        from labapp.core.images import dot_kernels
+        from labapp.core.images import band_pass_kernels
 
         sigma = np.stack([dots.u_sigma_px, dots.v_sigma_px], axis=-1)
         image_px = bench.calibration.ideal_px(dots.image_px)
-        plane, covariance, scale = dot_kernels.on_plane(bench.calibration.matrix, image_px, sigma)
+        plane, covariance, scale = band_pass_kernels.on_plane(
+            bench.calibration.matrix, image_px, sigma
+        )
         return cls(plane, covariance, dots.size_px * scale, bench, frame_shape)
 
     @cached_property

@@ -123,7 +123,7 @@ def covariance_of_dots(
 
 def predict(observed: Observation, pool: FittedPool, where: BoolArray) -> Prediction:
     """Predict the dots of those rays in a mask, shape (rows, columns), that reach the plane."""
-    from labapp.core.images import dot_kernels
+    from labapp.core.images import band_pass_kernels
     from labapp.core.surface.kernels import ray_kernels
 
     at = np.argwhere(where)
@@ -138,7 +138,7 @@ def predict(observed: Observation, pool: FittedPool, where: BoolArray) -> Predic
     )
     finite = np.isfinite(plane[:, 0])
     at, points, slopes, plane = at[finite], points[finite], slopes[finite], plane[finite]
-    return Prediction(at, points, slopes, plane, dot_kernels.next_apart(plane))
+    return Prediction(at, points, slopes, plane, band_pass_kernels.next_apart(plane))
 
 
 def sure_pairs(

@@ -87,7 +87,7 @@ class RowVote:
         self._votes: Counter[tuple[int, int]] = Counter()
         """Number of frames by the shift of their rays from the first frame, in rows and columns."""
         self._at = (0, 0)
-        """Shift of the frames that are currently followed."""
+        """Shift of the frames that are currently tracked."""
         self._usual: Placed | None = None
         """The last frame that agrees with the majority."""
         self._before: Placed | None = None
@@ -99,18 +99,18 @@ class RowVote:
         self._lost: dict[tuple[int, int], dict[tuple[int, int], float]] = {}
         """Margins that these lack compared with unambiguous frames, by shift and rival's step."""
 
-    def add(self, measured: Measurement, followed: bool = False) -> Ballot:
+    def add(self, measured: Measurement, tracked: bool = False) -> Ballot:
         """Count the next frame.
 
-        A followed frame has the rows of the previous one, and no vote of its own. A frame that was
-        corrected by hand has a vote, but later frames are not followed from it.
+        A tracked frame has the rows of the previous one, and no vote of its own. A frame that was
+        corrected by hand has a vote, but later frames are not tracked from it.
         """
         surface, at = measured.reconstruction, self._at
         if surface is None:
             ballot = Ballot(measured)
             self._undecided += [ballot] if ballot.is_open else []
             return ballot
-        if not followed:
+        if not tracked:
             if self._usual is not None:
                 usual, (row, column) = self._usual
                 slip = self._slip(measured, usual)

@@ -6,7 +6,7 @@ keep their rays; dots next to them get theirs from the surface fitted to the tra
 result is accepted only if the absent ray is dark between lit ones, and if no more is left
 unexplained than would be accepted without a prior.
 
-As in `correspondence`, a dot whose ray is ambiguous gets none.
+As in `match_rays`, a dot whose ray is ambiguous gets none.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from labapp.core.images import dot_kernels
+from labapp.core.images import band_pass_kernels
 from labapp.core.match import Trial, missing_share
-from labapp.core.matching.correspondence import match_of_pairs
+from labapp.core.matching.match_rays import match_of_pairs
 from labapp.core.matching.match_settings import MatchSettings
 from labapp.core.matching.observation import UNLABELLED, Observation, amid, count_labels, widened
 from labapp.core.matching.prediction import RayPaths, covariance_of_dots, sure_pairs
 from labapp.core.matching.ray_classes import RayClasses, certain_witness, classify_rays
 from labapp.core.matching.unsupported_labels import MOST_LEFT_OUT, FittedLabels, unsupported
 from labapp.core.schemes.fit import LEAST_DOTS, UNSETTLED_MM
-from labapp.core.sequence.prior import MOST_ROUNDS, SETTLED_MM, Followed, Prior, predictions
+from labapp.core.sequence.prior import MOST_ROUNDS, SETTLED_MM, Prior, Tracked, predictions
 from labapp.core.surface.level import Level, Witnesses
 from labapp.core.surface.pool_fit import (
     FitSettings,
@@ -85,9 +85,9 @@ class TrackLost(CannotMeasure):
         super().__init__("track-lost", reason)
 
 
-def follow(
+def track(
     prior: Prior, observed: Observation, settings: FitSettings, limits: MatchSettings
-) -> Followed:
+) -> Tracked:
     """Find the ray of every dot, and the surface, by prediction from the previous frames.
 
     Raises
@@ -133,7 +133,7 @@ def follow(
     at = np.stack(np.divmod(rays, fit.labels.shape[1]), axis=-1)
     missed = len(classes.missed)
     match = match_of_pairs(observed, at, dots, orientation, classes.witness, missed, trials)
-    return Followed(match, pool, paths, fit.labels != UNLABELLED, is_seen)
+    return Tracked(match, pool, paths, fit.labels != UNLABELLED, is_seen)
 
 
 @dataclass
@@ -258,7 +258,7 @@ def _found_again(
     tracked, looked_for = (lit | amid(lit)) & ~observed.rays.absent, widened(lit, 2)
     for coefficients in predictions(prior):
         paths = RayPaths.of(observed.bench, prior.basis, coefficients, last, 1)
-        labels, off = _tracked(observed, paths, tracked, looked_for)
+        labels, off = _labels_near_predictions(observed, paths, tracked, looked_for)
         if len(off) >= FOUND * count and (half := median(off)) < STEADY:
             return paths, labels, half
     found = 0
@@ -285,7 +285,9 @@ def _grown(
     looked_for, start = widened(prior.lit, 2), paths.coefficients
     labels = np.full(ring.shape, UNLABELLED)
     for reach in range(FIRST_RING, int(ring[prior.lit].max()) + 2):
-        labels, _ = _tracked(observed, paths, prior.lit & (ring <= reach), looked_for)
+        labels, _ = _labels_near_predictions(
+            observed, paths, prior.lit & (ring <= reach), looked_for
+        )
         if count_labels(labels) < LEAST_DOTS:
             break
         fit = _Fit.of(prior, observed, settings, labels, paths)
@@ -294,7 +296,7 @@ def _grown(
     return paths, labels
 
 
-def _tracked(
+def _labels_near_predictions(
     observed: Observation, paths: RayPaths, lit: BoolArray, looked_for: BoolArray
 ) -> tuple[IntArray, FloatArray]:
     """Label the dots that are close to exactly one prediction.
@@ -318,9 +320,9 @@ def _tracked(
     if len(near) < 2 or len(observed.plane_mm) < 2:
         return labels, np.empty(0)
     plane = paths.plane_mm[near]
-    step = dot_kernels.next_apart(plane)
-    off, ray = dot_kernels.two_nearest(observed.plane_mm, plane)
-    other, dot = dot_kernels.two_nearest(plane, observed.plane_mm)
+    step = band_pass_kernels.next_apart(plane)
+    off, ray = band_pass_kernels.two_nearest(observed.plane_mm, plane)
+    other, dot = band_pass_kernels.two_nearest(plane, observed.plane_mm)
     own, off_own = ray[:, 0], off[:, 0]
     gate = GATE * step[own]
     sure = (off_own < gate) & (step[own] > observed.resolution_mm) & lit.ravel()[near[own]]
@@ -339,7 +341,7 @@ def _extended_labels(fit: _Fit) -> IntArray:
     known = np.isfinite(paths.plane_mm[:, 0])
     looked_for = np.flatnonzero(widened(lit, 2).ravel() & known)
     next_mm = np.full(len(known), np.inf)
-    next_mm[looked_for] = dot_kernels.next_apart(paths.plane_mm[looked_for])
+    next_mm[looked_for] = band_pass_kernels.next_apart(paths.plane_mm[looked_for])
     labels, rays = fit.labels.copy().ravel(), fit.lit_rays
     off = np.linalg.norm(paths.plane_mm[rays] - observed.plane_mm[labels[rays]], axis=-1)
     labels[rays[off > np.maximum(6.0 * median(off), ASTRAY * next_mm[rays])]] = UNLABELLED
