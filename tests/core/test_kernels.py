@@ -27,8 +27,8 @@ from labapp.core.images import (
     band_pass_kernels,
     centroid_kernels,
     dot_fit_kernels,
-    dot_size,
     dots,
+    filters,
     size_kernels,
 )
 from labapp.core.matching import match_kernels
@@ -383,11 +383,11 @@ def picture() -> tuple[FloatArray, dots.Grey]:
 
 
 def band_of(image: dots.Grey) -> dots.Grey:
-    return dot_size.blur(image, 1.5) - dot_size.blur(image, 3.0)
+    return filters.blur(image, 1.5) - filters.blur(image, 3.0)
 
 
 def test_peaks_are_the_local_maxima() -> None:
-    band, disc = band_of(picture()[1]), dot_size.peak_disc(1.9)
+    band, disc = band_of(picture()[1]), filters.peak_disc(1.9)
     highest = cv2.dilate(band, disc.astype(np.uint8))
     for floor in (np.full((1, 1), 3.0, "f4"), np.full(band.shape, 3.0, "f4")):
         peaks = band_pass_kernels.peaks(band, floor, disc)
@@ -438,8 +438,8 @@ def test_centroids_are_those_of_the_blurred_picture(sigma: float) -> None:
     positions, image = picture()
     u, v = np.rint(positions).astype(np.int64).T
     width = random().uniform(1.0, 2.2, len(u))
-    around = dot_size.blur(image, 4.0) if sigma else np.zeros_like(image)
-    taps = dot_size.kernel(sigma)
+    around = filters.blur(image, 4.0) if sigma else np.zeros_like(image)
+    taps = filters.kernel(sigma)
     light = cv2.sepFilter2D(image, -1, taps, taps, borderType=cv2.BORDER_REFLECT) - around
     offset, moment = centroid_kernels.centroids(image, around, taps, u, v, 6, width, 2.0)
     for k in range(len(u)):
@@ -518,14 +518,14 @@ def test_residual_light_excludes_dots_and_background() -> None:
             np.testing.assert_allclose(modes[:, k, 1], np.square(mode) @ window**2, rtol=1e-3)
 
 
-def test_enlarged_peaks_are_those_of_the_full_picture() -> None:
+def test_upsampled_peaks_are_those_of_the_full_picture() -> None:
     v, u = np.mgrid[:120, :160]
     image = np.zeros((120, 160))
     for u_px, v_px in random().uniform(0.0, 120.0, (30, 2)):
         image += 40.0 * np.exp(-((u - u_px) ** 2 + (v - v_px) ** 2) / (2 * 3.2**2))
     band = band_pass_kernels.halved(image.astype(np.float32))
     low, floor = np.full(band.shape, 10.0, "f4"), np.full(image.shape, 12.0, "f4")
-    (u, v), high = band_pass_kernels.enlarged_peaks(band, low, floor, np.ones((5, 5), bool))
+    (u, v), high = band_pass_kernels.upsampled_peaks(band, low, floor, np.ones((5, 5), bool))
     blurred = cv2.blur(image, (3, 3)) * 0.375 + image * 0.625  # the blur of the pixel area
     highest = cv2.dilate(blurred, np.ones((5, 5)))
     inner = np.s_[8:-8, 8:-8]
@@ -616,7 +616,9 @@ def test_answers_are_local_maxima_of_smaller_pictures() -> None:
         u, v = np.array([0, 33, 79]), np.array([0, 21, 59])
         highest = cv2.dilate(small, np.ones((3, 3)))
         x, y = (np.rint((pixel + 0.5) / step - 0.5).astype(int) for pixel in (u, v))
-        np.testing.assert_array_equal(size_kernels.answers(small, u, v, float(step)), highest[y, x])
+        np.testing.assert_array_equal(
+            size_kernels.responses(small, u, v, float(step)), highest[y, x]
+        )
 
 
 def test_parts_are_near_a_larger_dot() -> None:
@@ -631,17 +633,17 @@ def test_finest_band_is_that_of_the_full_picture() -> None:
     positions, image = picture()
     u, v = np.rint(positions).astype(np.int64).T
     narrow, wide = np.zeros((2, 3, 13), np.float32)
-    for filters, sigma, taps in ((narrow, 0.8, 7), (wide, 1.3, 11)):
+    for weights, sigma, taps in ((narrow, 0.8, 7), (wide, 1.3, 11)):
         kernel = cv2.getGaussianKernel(taps, sigma, cv2.CV_32F).ravel()
         for k in range(3):
             start = (11 - taps) // 2 + k
-            filters[k, start : start + taps] = kernel
+            weights[k, start : start + taps] = kernel
     fine = cv2.GaussianBlur(image, (7, 7), 0.8, borderType=cv2.BORDER_REFLECT)
     fine -= cv2.GaussianBlur(image, (11, 11), 1.3, borderType=cv2.BORDER_REFLECT)
     highest = np.pad(fine, 1, "symmetric")  # the filters mirror the picture at the edge
     highest = np.array([highest[y : y + 3, x : x + 3].max() for x, y in zip(u, v, strict=True)])
     np.testing.assert_allclose(
-        centroid_kernels.finest(image, u, v, narrow, wide), highest, atol=1e-4
+        centroid_kernels.largest_fine_response(image, u, v, narrow, wide), highest, atol=1e-4
     )
 
 
@@ -656,7 +658,7 @@ def test_kernels_give_the_same_for_bytes_and_floats() -> None:
     narrow, wide = np.float32(random().uniform(0, 1, (2, 3, 13)))
     for kernel in (
         lambda own: centroid_kernels.centroids(own, around, taps, u, v, 6, width, 2.0),
-        lambda own: centroid_kernels.finest(own, u, v, narrow, wide),
+        lambda own: centroid_kernels.largest_fine_response(own, u, v, narrow, wide),
         lambda own: band_pass_kernels.spikes(own, 3.0, 1.9, 1.2, 5),
         lambda own: size_kernels.tile_noise(own, 2, 3),
     ):
@@ -668,12 +670,12 @@ def test_kernels_give_the_same_for_bytes_and_floats() -> None:
 def test_pictures_smaller_than_the_filters_are_mirrored_repeatedly(rows: int) -> None:
     image = random().uniform(0, 90, (rows, 40)).astype(np.float32)
     kernel = np.float32(cv2.getGaussianKernel(31, 4.0).ravel())
-    filters = np.stack([np.pad(kernel, (k, 2 - k)) for k in range(3)])
+    three = np.stack([np.pad(kernel, (k, 2 - k)) for k in range(3)])
     blurred = np.pad(image, 16, "symmetric")
     blurred = cv2.sepFilter2D(blurred, -1, kernel, kernel)[15 : 17 + rows, 15:57]
     u, v = np.array([0, 20, 39]), np.array([0, rows - 1, 0])
     expected = [blurred[y : y + 3, x : x + 3].max() for x, y in zip(u, v, strict=True)]
-    computed = centroid_kernels.finest(image, u, v, filters, np.zeros_like(filters))
+    computed = centroid_kernels.largest_fine_response(image, u, v, three, np.zeros_like(three))
     np.testing.assert_allclose(computed, expected, rtol=1e-5)
 
 
