@@ -4,8 +4,8 @@
 2. `find_lattice`: their rows and columns in the picture, as far as they can be determined (§5.2.2).
 3. `match_rays`: which ray made which dot (§4.2.2); then rows and columns are those of the rays.
 4. `fit.solve`, or `reconstruct` for another scheme: the pool's surface (ch. 6, 7).
-5. `fit.complete`, or `measure_surface` for another scheme: its boundary with fit, its size and the
-   reflection errors (Eq. 6-3 … 6-8).
+5. `fit.complete`, or `measure_surface` for another scheme: its size and reflection errors
+   (Eq. 6-3 … 6-8); with fit also its boundary.
 
 If the operator corrected the frame, the corrected dots and rows replace the results of steps 1
 and 2. With a prior from the previous frame, dots are matched to the predicted dots (`track`),
@@ -246,25 +246,25 @@ def measure(
             return _by_scheme(result, match, rig, settings), None
         pool = tracked.pool if tracked else fit.solve(match, rig, settings.fit, initial)
         on_step("surface")
-        reconstruction, sizes = fit.complete(match, pool, rig, settings.fit, known)
+        reconstruction, measured = fit.complete(match, pool, rig, settings.fit, known)
     except CannotMeasure as why:
         return _refused(result, why), None
     on_step("measures")
-    result = replace(result, reconstruction=reconstruction, measures=sizes)
+    result = replace(result, reconstruction=reconstruction, measures=measured)
     if prior is not None and tracked is not None:
-        return result, prior.after(tracked, reconstruction, sizes)
+        return result, prior.after(tracked, reconstruction, measured)
     from labapp.core.sequence.prior import Prior
 
     if tuning is None:
         return result, None
-    return result, Prior.of(bench, tuning, match, pool, reconstruction, sizes)
+    return result, Prior.of(bench, tuning, match, pool, reconstruction, measured)
 
 
 def _by_scheme(result: Measurement, match: Match, rig: Rig, settings: Settings) -> Measurement:
-    """Add the surface of a scheme that needs only the match."""
+    """Add surface and measures from the match alone; also for fit, when other frames decided it."""
     made = reconstruct(match, rig, settings)
-    size = measures.measure_surface(made, match, rig)
-    return replace(result, reconstruction=made, measures=size)
+    measured = measures.measure_surface(made, match, rig)
+    return replace(result, reconstruction=made, measures=measured)
 
 
 def _with_lines(result: Measurement, image: Image, rig: LineRig, bench: Bench) -> Measurement:
@@ -325,7 +325,10 @@ def reconstruct(match: Match, rig: Rig, settings: Settings) -> Reconstruction:
 
 
 def _refused(result: Measurement, why: CannotMeasure) -> Measurement:
-    """Measurement of a frame without a surface; rows given by the operator stay refused."""
+    """Measurement of a frame without a surface.
+
+    An `OpenMeasurement` if other frames may decide its rows and the operator has not set them.
+    """
     result = replace(result, status=why.status, reason=why.reason)
     if isinstance(why, RowsOpen) and result.correction is None:
         return OpenMeasurement(**vars(result), candidates=why.candidates)

@@ -30,6 +30,10 @@ FALSE_DOTS_PER_MM2 = 5e-4
 """Expected density of false dots on the imaging plane: a few per frame. Where a prediction is
 uncertain, a dot is as likely to be false as to belong to the ray."""
 
+NEWTON_STEPS = 4
+"""Newton steps from the landing points to the surface: rays near labelled ones land close to where
+they meet it. `RayPaths.of` takes more, as it includes rays far outside."""
+
 
 @dataclass(frozen=True)
 class RayPaths(ReadOnlyArrays):
@@ -133,7 +137,7 @@ def predict(observed: Observation, pool: FittedPool, where: BoolArray) -> Predic
         surface.coefficients,
         observed.rays.directions[index],
         observed.rays.landing_mm[index],
-        4,
+        NEWTON_STEPS,
         pose,
     )
     finite = np.isfinite(plane[:, 0])
