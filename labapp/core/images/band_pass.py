@@ -69,8 +69,8 @@ WIDEST_WINDOW, LEAST_WINDOW_PX = 1.1, 0.75
 """Largest width of a window, over the reach of its centre; and the least, px."""
 
 LEAST_MOMENT_PX2, MOST_MOMENT = 1e-3, 0.95
-"""Least variance of the light in a window, and the largest, as a share of the window's: that of
-uniform light is the same as the window's, and gives no size."""
+"""Least variance of the light in a window, and the largest, as a share of the window's. Uniform
+light has that of the window, which gives no size."""
 
 SIGMA_TIMES_SNR = 0.8
 """Standard uncertainty of a centroid due to the camera's noise, px, times the signal-to-noise

@@ -43,8 +43,8 @@ LEAST_CROSSING, LEAST_OFF_LINE = 0.4, 0.6
 and otherwise."""
 
 NEARLY_SHORTEST = 1.05
-"""Steps are not reduced further if a reduction would shorten them by less than this factor allows:
-two steps of equal length would be exchanged again and again."""
+"""Two steps are the shortest if twice their inner product is at most this multiple of the lesser
+square: with a factor of 1, equally short ones could alternate."""
 
 
 @dataclass(frozen=True)
