@@ -110,13 +110,13 @@ def reconstruct(
     places = {"lines": lines, "opcua": opcua}
     with ExitStack() as at_end:
         predictor = at_end.enter_context(_predicting(model, out)) if model is not None else None
-        streams = _stream_sinks(at_end, places, anywhere, predictor)
+        more_sinks = _stream_sinks(at_end, places, anywhere, predictor)
         summary = _measure_recording(
             *(source, setup, out, settings, frames),
             surfaces=surfaces == "all",
             sigma_parts=sigma_parts,
             warm=warm,
-            streams=streams,
+            more_sinks=more_sinks,
         )
     if not summary.statuses["ok"]:
         raise typer.Exit(NOTHING_MEASURED)
@@ -172,11 +172,11 @@ def _measure_recording(
     surfaces: bool,
     sigma_parts: bool,
     warm: bool,
-    streams: Sequence[Sink],
+    more_sinks: Sequence[Sink],
 ) -> Summary:
     """Measure, with progress and failures on stderr and the summary on stdout.
 
-    Parameters are the command's options (`reconstruct`) and the sinks of the streams.
+    Parameters are the command's options (`reconstruct`) and the sinks of predictor and streams.
     """
     from labapp.config.setup import read_setup
     from labapp.core.recording.residual_check import ResidualRecord, judged_status
@@ -204,7 +204,7 @@ def _measure_recording(
                         *(source_path, source.index, setup, settings, surfaces, sigma_parts),
                         processes,
                     )
-                sinks = [results.write, summary.add, *streams, shown]
+                sinks = [results.write, summary.add, *more_sinks, shown]
                 for _ in run(selected, with_setup_check(measurer, record), sinks):
                     pass
                 summary.verdict = record.verdict()

@@ -62,17 +62,17 @@ def compiled(*signature: types.Type) -> Callable[[F], F]:
     A function is recompiled when its file changes, or a kernel module that the file imports at its
     top, whose compiled functions it may call.
     """
-    return lambda function: _kept(function, signature)
+    return lambda function: _compile_cached(function, signature)
 
 
 def compiled_for(*signatures: tuple[types.Type, ...]) -> Callable[[F], F]:
     """Compile as `compiled` does for several signatures."""
-    return lambda function: _kept(function, list(signatures))
+    return lambda function: _compile_cached(function, list(signatures))
 
 
 def inner(function: F) -> F:
     """Compile a function that is called only by compiled functions."""
-    return _kept(function)
+    return _compile_cached(function)
 
 
 class BySource(_CacheLocator):
@@ -180,7 +180,8 @@ def _one_at_a_time(function: Any) -> AbstractContextManager[object]:
     return nullcontext() if place is None else FileLock(Path(place.get_cache_path()) / "lock")
 
 
-def _kept(function: F, *signature: Any) -> F:
+def _compile_cached(function: F, *signature: Any) -> F:
+    """Compile a function, or load its machine code from the cache."""
     MAY_COMPILE.wait()
     # A numba version without this setting uses its default cache.
     usual = getattr(_config, "CACHE_LOCATOR_CLASSES", "")

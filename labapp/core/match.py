@@ -24,7 +24,7 @@ def ways(orientation: Orientation) -> IntArray:
 def missing_share(missed: int, pairs: int) -> float:
     """Estimate the share of missing dots from the numbers of missed rays and of pairs.
 
-    The posterior mean, with a prior of 0.05 missing dots: never 0.
+    The posterior mean with a prior worth one dot, 0.05 of it missing: never 0.
     """
     return (missed + 0.05) / (pairs + missed + 1)
 

@@ -4,11 +4,11 @@
 2. `find_lattice`: their rows and columns in the picture, as far as they can be determined (§5.2.2).
 3. `match_rays`: which ray made which dot (§4.2.2); then rows and columns are those of the rays.
 4. `fit.solve`, or `reconstruct` for another scheme: the pool's surface (ch. 6, 7).
-5. `fit.complete`, or `measure_surface` for another scheme: its boundary with fit, its size and the
-   reflection errors (Eq. 6-3 … 6-8).
+5. `fit.complete`, or `measure_surface` for another scheme: its size and reflection errors
+   (Eq. 6-3 … 6-8); with fit also its boundary.
 
 If the operator corrected the frame, the corrected dots and rows replace the results of steps 1
-and 2. With a prior from the previous frame, dots are matched to the predicted dots (`follow`),
+and 2. With a prior from the previous frame, dots are matched to the predicted dots (`track`),
 which needs no rows; the other steps are the same.
 
 A line pattern is measured differently (`measure_lines`): its points do not identify their rays.
@@ -30,7 +30,7 @@ from labapp.core.lines.correction import LineCorrection
 from labapp.core.lines.frame import LineFrame, measure_lines
 from labapp.core.match import Candidate, Match, RowsOpen
 from labapp.core.matching.corrected_rows import lattice_of_corrected, match_corrected
-from labapp.core.matching.correspondence import lattice_of_match, match_rays
+from labapp.core.matching.match_rays import lattice_of_match, match_rays
 from labapp.core.matching.match_settings import MatchSettings
 from labapp.core.matching.observation import Observation
 from labapp.core.matching.unexplained import NOTHING_EXPLAINS
@@ -206,7 +206,7 @@ def measure(
     -------
     measurement, prior
         The results, and the prior for the next frame; None if there is no surface that can be
-        followed.
+        tracked.
     """
     result = Measurement(
         "ok", "", settings.scheme, correction=correction, setup_status=setup_status(bench.rig)
@@ -215,7 +215,7 @@ def measure(
         return _with_lines(result, image, lines_rig, bench), None
     rig, match_settings = bench.rig, replace(settings.match, correspondence=settings.correspondence)
     frame_shape, known = (image.shape[0], image.shape[1]), None
-    followed, tuning, initial = None, None, None
+    tracked, tuning, initial = None, None, None
     try:
         if isinstance(correction, Correction):
             dots, lattice = correction.dots, correction.lattice
@@ -223,14 +223,14 @@ def measure(
             match, initial = match_corrected(dots, lattice, bench, frame_shape, match_settings)
             lattice = lattice_of_corrected(match, rig, lattice)
         elif prior is not None:
-            from labapp.core.sequence.following import follow
+            from labapp.core.sequence.tracking import track
 
             dots = quick_dots(_as_before(image, prior), prior.tuning, settings.dots.band_pass)
             result = replace(result, dots=dots)
             on_step("dots")
             observed = Observation.of(dots, bench, frame_shape)
-            followed = follow(prior, observed, settings.fit, match_settings)
-            match, known = followed.match, prior.known()
+            tracked = track(prior, observed, settings.fit, match_settings)
+            match, known = tracked.match, prior.known()
             lattice = lattice_of_match(match, rig, len(dots))
         else:
             dots, tuning = _dots_and_tuning(image, settings.dots)
@@ -244,27 +244,27 @@ def measure(
         result = replace(result, match=match, lattice=lattice)
         if settings.scheme != "fit":
             return _by_scheme(result, match, rig, settings), None
-        pool = followed.pool if followed else fit.solve(match, rig, settings.fit, initial)
+        pool = tracked.pool if tracked else fit.solve(match, rig, settings.fit, initial)
         on_step("surface")
-        reconstruction, sizes = fit.complete(match, pool, rig, settings.fit, known)
+        reconstruction, measured = fit.complete(match, pool, rig, settings.fit, known)
     except CannotMeasure as why:
         return _refused(result, why), None
     on_step("measures")
-    result = replace(result, reconstruction=reconstruction, measures=sizes)
-    if prior is not None and followed is not None:
-        return result, prior.followed_by(followed, reconstruction, sizes)
+    result = replace(result, reconstruction=reconstruction, measures=measured)
+    if prior is not None and tracked is not None:
+        return result, prior.after(tracked, reconstruction, measured)
     from labapp.core.sequence.prior import Prior
 
     if tuning is None:
         return result, None
-    return result, Prior.of(bench, tuning, match, pool, reconstruction, sizes)
+    return result, Prior.of(bench, tuning, match, pool, reconstruction, measured)
 
 
 def _by_scheme(result: Measurement, match: Match, rig: Rig, settings: Settings) -> Measurement:
-    """Add the surface of a scheme that needs only the match."""
+    """Add surface and measures from the match alone; also for fit, when other frames decided it."""
     made = reconstruct(match, rig, settings)
-    size = measures.measure_surface(made, match, rig)
-    return replace(result, reconstruction=made, measures=size)
+    measured = measures.measure_surface(made, match, rig)
+    return replace(result, reconstruction=made, measures=measured)
 
 
 def _with_lines(result: Measurement, image: Image, rig: LineRig, bench: Bench) -> Measurement:
@@ -277,7 +277,7 @@ def _with_lines(result: Measurement, image: Image, rig: LineRig, bench: Bench) -
 def _as_before(image: Image, prior: Prior) -> Image:
     """Check that the image has the size of the previous frame."""
     if image.shape != prior.tuning.noise.shape:
-        from labapp.core.sequence.following import TrackLost
+        from labapp.core.sequence.tracking import TrackLost
 
         raise TrackLost("the frame differs in size from the previous frame")
     return image
@@ -325,7 +325,10 @@ def reconstruct(match: Match, rig: Rig, settings: Settings) -> Reconstruction:
 
 
 def _refused(result: Measurement, why: CannotMeasure) -> Measurement:
-    """Measurement of a frame without a surface; rows given by the operator stay refused."""
+    """Measurement of a frame without a surface.
+
+    An `OpenMeasurement` if other frames may decide its rows and the operator has not set them.
+    """
     result = replace(result, status=why.status, reason=why.reason)
     if isinstance(why, RowsOpen) and result.correction is None:
         return OpenMeasurement(**vars(result), candidates=why.candidates)

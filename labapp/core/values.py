@@ -64,3 +64,8 @@ def median(values: FloatArray) -> float:
     low, high, last = (count - 1) // 2, count // 2, count - 1
     ordered = np.partition(values, (low, high, last))  # NaN comes last
     return float("nan" if np.isnan(ordered[last]) else (ordered[low] + ordered[high]) / 2)
+
+
+def rms(values: FloatArray) -> float:
+    """Root mean square of the values of an array, of any shape."""
+    return float(np.sqrt(np.mean(values**2)))

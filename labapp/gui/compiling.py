@@ -14,7 +14,10 @@ TITLE = "First use: compiling for this computer, two to four minutes"
 POLL_S = 0.2
 
 COMPILED = (
-    *(f"labapp.core.images.{name}_kernels" for name in ("centroid", "dot", "dot_fit", "size")),
+    *(
+        f"labapp.core.images.{name}_kernels"
+        for name in ("centroid", "band_pass", "dot_fit", "size")
+    ),
     "labapp.core.rows.lattice_kernels",
     *(
         f"labapp.core.surface.kernels.{name}_kernels"

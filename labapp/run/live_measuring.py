@@ -92,7 +92,7 @@ class LiveChain:
 
     def measure(self, frame: CameraFrame, drawn: bool) -> LiveResult | None:
         """Measure the next frame, or skip it: see `LiveMeasuring.measure`."""
-        found = self._chain.follow(frame.image)
+        found = self._chain.track(frame.image)
         if found is None:
             if time.monotonic() < self._measured_s + SOUGHT_S:
                 self._chain.skip()

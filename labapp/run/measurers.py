@@ -4,8 +4,8 @@
 `WarmMeasurer` tracks each frame from the previous one. `RecordingMeasurer` tracks
 stretches of a recording in several processes, which also compute the rows of the tables.
 
-Stretches have the same length, however many processes there are, and each begins with a frame
-measured without tracking, so that results do not depend on the machine.
+Stretches have the same length, however many processes there are, and each begins with three
+frames measured without tracking (`BY_THEMSELVES`), so that results do not depend on the machine.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ Corrected = Callable[[int], ByHand | None]
 
 @dataclass(frozen=True)
 class ColdMeasurer:
-    """Measures each frame without a prior; its neighbours vote on its rows (`_agreeing`)."""
+    """Measures each frame without a prior; its neighbours vote on its rows (`_with_rows_voted`)."""
 
     read: Read
     """Reads frames; one that cannot be read gets the status ``unreadable``."""
@@ -90,7 +90,7 @@ class ColdMeasurer:
     def __call__(self, frames: Iterable[int]) -> Generator[FrameResult]:
         """Measure frames; see `runner.Measurer`."""
         measured = _results_in_order(map(self._submit, frames), AHEAD)
-        return _agreeing(measured, self.setup, self.settings)
+        return _with_rows_voted(measured, self.setup, self.settings)
 
     def _submit(self, number: int) -> Future[FrameResult]:
         """Read a frame in this process, and measure it in the pool, or at once if there is none."""
@@ -101,7 +101,7 @@ class ColdMeasurer:
         return submit(_cold, number, frame, self.setup, self.settings, self.corrected(number))
 
 
-def _agreeing(
+def _with_rows_voted(
     measured: Generator[FrameResult], setup: Setup, settings: Settings, warm: bool = False
 ) -> Generator[FrameResult]:
     """Yield results in order, with rows decided by a vote among neighbouring frames (`RowVote`).
@@ -134,8 +134,8 @@ def _agreeing(
         try:
             for result in measured:
                 found = result.measurement
-                followed = warm and result.track_lost is None and found.correction is None
-                waiting.append((result, vote.add(found, followed)))
+                tracked = warm and result.track_lost is None and found.correction is None
+                waiting.append((result, vote.add(found, tracked)))
                 while waiting and is_due():
                     yield judged()
         except (Exception, KeyboardInterrupt):
@@ -287,7 +287,7 @@ class WarmMeasurer:
         rest = iter(frames)
         for first in rest:
             stretch = self._stretch(chain([first], islice(rest, STRETCH - 1)))
-            yield from _agreeing(stretch, self.setup, self.settings, warm=True)
+            yield from _with_rows_voted(stretch, self.setup, self.settings, warm=True)
 
     def _stretch(self, frames: Iterable[int]) -> Generator[FrameResult]:
         last: int | None = None
@@ -420,23 +420,23 @@ class RecordingMeasurer:
             yield from batch
 
 
-_stretch: Generator[FrameResult] | None = None
+_running_stretch: Generator[FrameResult] | None = None
 """The stretch of this process."""
 
 
 def _first_batch(measurer: RecordingMeasurer, frames: Sequence[int]) -> list[FrameResult]:
     """Begin a stretch in this process, and end the previous one."""
-    global _stretch  # noqa: PLW0603 - one stretch at a time
-    if _stretch is not None:
-        _stretch.close()
+    global _running_stretch  # noqa: PLW0603 - one stretch at a time
+    if _running_stretch is not None:
+        _running_stretch.close()
     cv2.setNumThreads(1)
-    _stretch = measurer(frames)
+    _running_stretch = measurer(frames)
     return _next_batch()
 
 
 def _next_batch() -> list[FrameResult]:
-    assert _stretch is not None
-    return list(islice(_stretch, BATCH))
+    assert _running_stretch is not None
+    return list(islice(_running_stretch, BATCH))
 
 
 @contextmanager
@@ -470,5 +470,5 @@ def load_all() -> None:
     """Import all modules for measuring in this process."""
     import labapp.core.matching.match_kernels
     import labapp.core.rows.lattice_kernels
-    import labapp.core.sequence.following
+    import labapp.core.sequence.tracking
     import labapp.export.fixed_point  # noqa: F401

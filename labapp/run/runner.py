@@ -63,33 +63,33 @@ def with_setup_check(measurer: Measurer, record: ResidualRecord) -> Measurer:
     return measure
 
 
-def select_frames(text: str, count: int, source: str = "--frames") -> range:
+def select_frames(text: str, count: int, option: str = "--frames") -> range:
     """Return the frames that ``A:B:STEP`` selects, as a Python slice does; ``A`` is one frame.
 
     Parameters
     ----------
     text, count
         The selection, and the number of frames.
-    source
-        Source of the text, for the error.
+    option
+        Name of the option or input, for the error.
 
     Raises
     ------
     InputError
         If the text is not of that form, or selects no frame.
     """
-    require(text, str, source, "frames", f'text such as "0:100:5": {SOME_FRAMES}')
+    require(text, str, option, "frames", f'text such as "0:100:5": {SOME_FRAMES}')
     try:
         first, *others = (int(part) if part.strip() else None for part in text.split(":"))
         if first is not None and not others:
             others = [first + 1 or None]
         selected = range(count)[slice(first, *others)]
     except (TypeError, ValueError) as error:  # TypeError: empty, or four numbers
-        raise InputError(source, "frames", text, SOME_FRAMES) from error
+        raise InputError(option, "frames", text, SOME_FRAMES) from error
     if selected.step < 0:
-        raise InputError(source, "frames", text, SOME_FRAMES)
+        raise InputError(option, "frames", text, SOME_FRAMES)
     if not selected:
-        raise InputError(source, "frames", text, f"some of the frames 0 to {count - 1}")
+        raise InputError(option, "frames", text, f"some of the frames 0 to {count - 1}")
     return selected
 
 

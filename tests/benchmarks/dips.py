@@ -21,7 +21,7 @@ import numpy as np
 from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.rig import Rig
 from labapp.core.match import Match
-from labapp.core.matching.correspondence import match_rays
+from labapp.core.matching.match_rays import match_rays
 from labapp.core.matching.match_settings import MatchSettings
 from labapp.core.rows.lattice_growth import GrowSettings, grow_lattice
 from labapp.core.schemes import fit

@@ -13,9 +13,9 @@ from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.rig import DotPattern, Laser, Rig
 from labapp.core.images.dots import Dots
 from labapp.core.match import ORIENTATIONS, Match, Orientation, ways
-from labapp.core.matching import correspondence
+from labapp.core.matching import match_rays as match_rays_module
 from labapp.core.matching.corrected_rows import lattice_of_corrected, match_corrected
-from labapp.core.matching.correspondence import lattice_of_match, match_rays
+from labapp.core.matching.match_rays import lattice_of_match, match_rays
 from labapp.core.matching.match_settings import MatchSettings
 from labapp.core.rows.correction import (
     Correction,
@@ -156,9 +156,9 @@ def test_row_that_growth_does_not_reach_is_seeded(monkeypatch: pytest.MonkeyPatc
     np.testing.assert_array_equal(seen.ray[match.dot], match.ray)
     assert len(match.dot) == len(seen.dots)
     # Each of the two finds them, and so do caps.
-    monkeypatch.setattr(correspondence, "with_rows_beyond", lambda _scene, found: found)
-    monkeypatch.setattr(correspondence, "with_repaired", lambda _scene, found, new: found + new)
-    monkeypatch.setattr(correspondence, "_by_caps", lambda _scene: [])
+    monkeypatch.setattr(match_rays_module, "with_rows_beyond", lambda _scene, found: found)
+    monkeypatch.setattr(match_rays_module, "with_repaired", lambda _scene, found, new: found + new)
+    monkeypatch.setattr(match_rays_module, "_by_caps", lambda _scene: [])
     assert matched(seen.dots) == (None, "no-match")
 
 

@@ -78,7 +78,7 @@ def test_labels_that_miss_a_row_of_dots_are_rejected() -> None:
     rows = np.flatnonzero((labels != UNLABELLED).any(axis=1))
     labels[rows[-1]] = UNLABELLED
     lacking = evaluated(observed, labels)
-    assert (lacking.stray_count, lacking.missed_count, lacking.marker) == (9, 0, "dark")
+    assert (lacking.stray_count, lacking.missed_count, lacking.marker) == (9, 0, "empty")
     with pytest.raises(CannotMeasure) as error:
         decide(observed, [lacking], MatchSettings())
     assert error.value.status == "no-match"
@@ -169,7 +169,7 @@ def test_rows_are_beyond_doubt_only_if_the_surface_fits_the_dots() -> None:
     noise_mm = np.random.default_rng(2).normal(0.0, 0.15, observed.plane_mm.shape)
     moved = replace(observed, plane_mm=observed.plane_mm + noise_mm)
     doubtful = evaluated(moved, labels)
-    assert (doubtful.missed_count, doubtful.marker) == (0, "dark")
+    assert (doubtful.missed_count, doubtful.marker) == (0, "empty")
     assert not decision._beyond_doubt(moved, doubtful, margin)
 
 
@@ -183,7 +183,7 @@ def test_true_rows_cost_less_than_rows_with_a_dot_on_the_marker() -> None:
     observed, labels = observation_of(draw(SHIFTED)[1])
     true = evaluated(observed, labels)
     shifted = [evaluated(observed, other) for other in shifted_labels(observed, labels)]
-    assert (true.marker, true.stray_count, true.missed_count) == ("dark", 0, 0)
+    assert (true.marker, true.stray_count, true.missed_count) == ("empty", 0, 0)
     assert {other.marker for other in shifted} == {"lit"}
     assert true.cost < min(other.cost for other in shifted) - 50
 

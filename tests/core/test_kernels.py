@@ -24,11 +24,11 @@ from labapp.core.geometry.optics import (
 )
 from labapp.core.geometry.rig import DotPattern, Electrode, ImagingPlane, Laser, Rig
 from labapp.core.images import (
+    band_pass_kernels,
     centroid_kernels,
     dot_fit_kernels,
-    dot_kernels,
-    dot_size,
     dots,
+    filters,
     size_kernels,
 )
 from labapp.core.matching import match_kernels
@@ -350,7 +350,7 @@ def test_on_plane_agrees_with_the_calibration() -> None:
         np.array([[0.17, 0.01, -8.0], [0.004, -0.18, 95.0], [1e-4, -2e-4, 1.0]])
     )
     image, sigma = random().uniform(0, 480, (30, 2)), random().uniform(0.05, 0.4, (30, 2))
-    plane, covariance, scale = dot_kernels.on_plane(calibration.matrix, image, sigma)
+    plane, covariance, scale = band_pass_kernels.on_plane(calibration.matrix, image, sigma)
     np.testing.assert_allclose(plane, calibration.to_plane(image))
     jacobian = calibration.jacobian(image)
     np.testing.assert_allclose(
@@ -361,11 +361,11 @@ def test_on_plane_agrees_with_the_calibration() -> None:
 
 def test_two_nearest_agree_with_kd_tree() -> None:
     places, among = random().uniform(0, 10, (2, 40, 2))
-    distance, number = dot_kernels.two_nearest(places, among)
+    distance, number = band_pass_kernels.two_nearest(places, among)
     expected = cKDTree(among).query(places, k=2)
     np.testing.assert_allclose(distance, expected[0])
     np.testing.assert_array_equal(number, expected[1])
-    distance, number = dot_kernels.two_nearest(places, among[:1])
+    distance, number = band_pass_kernels.two_nearest(places, among[:1])
     assert np.isinf(distance[:, 1]).all()
     assert (number == [0, 1]).all()
 
@@ -383,23 +383,23 @@ def picture() -> tuple[FloatArray, dots.Grey]:
 
 
 def band_of(image: dots.Grey) -> dots.Grey:
-    return dot_size.blur(image, 1.5) - dot_size.blur(image, 3.0)
+    return filters.blur(image, 1.5) - filters.blur(image, 3.0)
 
 
 def test_peaks_are_the_local_maxima() -> None:
-    band, disc = band_of(picture()[1]), dot_size.peak_disc(1.9)
+    band, disc = band_of(picture()[1]), filters.peak_disc(1.9)
     highest = cv2.dilate(band, disc.astype(np.uint8))
     for floor in (np.full((1, 1), 3.0, "f4"), np.full(band.shape, 3.0, "f4")):
-        peaks = dot_kernels.peaks(band, floor, disc)
+        peaks = band_pass_kernels.peaks(band, floor, disc)
         np.testing.assert_array_equal(peaks[::-1], np.nonzero((band >= highest) & (band > 3.0)))
     noise = random().normal(0, 1, (90, 700)).astype(np.float32)  # more peaks than room at first
-    peaks = dot_kernels.peaks(noise, np.full((1, 1), -9.0, "f4"), np.ones((3, 3), bool))
+    peaks = band_pass_kernels.peaks(noise, np.full((1, 1), -9.0, "f4"), np.ones((3, 3), bool))
     assert peaks.shape[1] == (noise >= cv2.dilate(noise, np.ones((3, 3)))).sum() > 256
 
 
 def test_close_pixels_are_merged() -> None:
     u, v = np.array([5, 6, 30, 5, 31, 60]), np.array([5, 5, 9, 7, 11, 9])
-    np.testing.assert_array_equal(dot_kernels.first_of_each(u, v, 2.0), [0, 2, 4, 5])
+    np.testing.assert_array_equal(band_pass_kernels.first_of_each(u, v, 2.0), [0, 2, 4, 5])
 
 
 def test_ridges_are_recognised_at_any_angle_and_at_the_edge() -> None:
@@ -409,10 +409,10 @@ def test_ridges_are_recognised_at_any_angle_and_at_the_edge() -> None:
         across = (v - 30) * np.cos(angle) - (u - 40) * np.sin(angle)
         for times, long in ((2.0, False), (6.0, True)):
             band = np.exp(-(across**2 + (along / times) ** 2) / 18).astype(np.float32)
-            assert dot_kernels.ridges(band, np.array([40]), np.array([30]), 10.0) == [long]
+            assert band_pass_kernels.ridges(band, np.array([40]), np.array([30]), 10.0) == [long]
     for column, times, long in ((0, 6.0, True), (79, 6.0, True), (0, 1.0, False)):
         band = np.exp(-((u - column) ** 2 + ((v - 30) / times) ** 2) / 18).astype(np.float32)
-        assert dot_kernels.ridges(band, np.array([column]), np.array([30]), 10.0) == [long]
+        assert band_pass_kernels.ridges(band, np.array([column]), np.array([30]), 10.0) == [long]
 
 
 def centroids_by_hand(
@@ -438,8 +438,8 @@ def test_centroids_are_those_of_the_blurred_picture(sigma: float) -> None:
     positions, image = picture()
     u, v = np.rint(positions).astype(np.int64).T
     width = random().uniform(1.0, 2.2, len(u))
-    around = dot_size.blur(image, 4.0) if sigma else np.zeros_like(image)
-    taps = dot_size.kernel(sigma)
+    around = filters.blur(image, 4.0) if sigma else np.zeros_like(image)
+    taps = filters.kernel(sigma)
     light = cv2.sepFilter2D(image, -1, taps, taps, borderType=cv2.BORDER_REFLECT) - around
     offset, moment = centroid_kernels.centroids(image, around, taps, u, v, 6, width, 2.0)
     for k in range(len(u)):
@@ -518,14 +518,14 @@ def test_residual_light_excludes_dots_and_background() -> None:
             np.testing.assert_allclose(modes[:, k, 1], np.square(mode) @ window**2, rtol=1e-3)
 
 
-def test_enlarged_peaks_are_those_of_the_full_picture() -> None:
+def test_upsampled_peaks_are_those_of_the_full_picture() -> None:
     v, u = np.mgrid[:120, :160]
     image = np.zeros((120, 160))
     for u_px, v_px in random().uniform(0.0, 120.0, (30, 2)):
         image += 40.0 * np.exp(-((u - u_px) ** 2 + (v - v_px) ** 2) / (2 * 3.2**2))
-    band = dot_kernels.halved(image.astype(np.float32))
+    band = band_pass_kernels.halved(image.astype(np.float32))
     low, floor = np.full(band.shape, 10.0, "f4"), np.full(image.shape, 12.0, "f4")
-    (u, v), high = dot_kernels.enlarged_peaks(band, low, floor, np.ones((5, 5), bool))
+    (u, v), high = band_pass_kernels.upsampled_peaks(band, low, floor, np.ones((5, 5), bool))
     blurred = cv2.blur(image, (3, 3)) * 0.375 + image * 0.625  # the blur of the pixel area
     highest = cv2.dilate(blurred, np.ones((5, 5)))
     inner = np.s_[8:-8, 8:-8]
@@ -545,16 +545,16 @@ def test_enlarged_peaks_are_those_of_the_full_picture() -> None:
 def test_halved_picture_has_means_of_four_pixels() -> None:
     image = random().integers(0, 256, (40, 60)).astype(np.uint8)
     expected = image.reshape(20, 2, 30, 2).mean(axis=(1, 3))
-    np.testing.assert_array_equal(dot_kernels.halved(image), expected)
-    np.testing.assert_array_equal(dot_kernels.halved(image.astype(np.float32)), expected)
+    np.testing.assert_array_equal(band_pass_kernels.halved(image), expected)
+    np.testing.assert_array_equal(band_pass_kernels.halved(image.astype(np.float32)), expected)
 
 
 def test_next_apart_is_the_distance_to_the_nearest_other() -> None:
     places = random().uniform(0, 10, (50, 2))
     expected = np.sort(np.linalg.norm(places[:, None] - places, axis=-1), axis=1)[:, 1]
-    np.testing.assert_allclose(dot_kernels.next_apart(places), expected)
-    np.testing.assert_array_equal(dot_kernels.next_apart(places[:1]), [np.inf])
-    assert dot_kernels.next_apart(places[:0]).shape == (0,)
+    np.testing.assert_allclose(band_pass_kernels.next_apart(places), expected)
+    np.testing.assert_array_equal(band_pass_kernels.next_apart(places[:1]), [np.inf])
+    assert band_pass_kernels.next_apart(places[:0]).shape == (0,)
 
 
 def test_within_view_needs_all_corners_on_plane_and_image() -> None:
@@ -591,7 +591,7 @@ def test_connected_pixels_agree_with_opencv() -> None:
     v, u = np.nonzero(spots)
     seeds = random().uniform(size=len(u)) < 0.1
     spot = np.asarray(cv2.connectedComponents(spots)[1])[v, u]
-    connected = dot_kernels.connected_pixels(u, v, seeds)
+    connected = band_pass_kernels.connected_pixels(u, v, seeds)
     np.testing.assert_array_equal(connected, np.isin(spot, spot[seeds]))
     assert seeds.sum() < connected.sum() < len(u)
 
@@ -601,7 +601,7 @@ def test_spikes_are_hot_pixels_but_not_dots() -> None:
     hot = {(75, 49): 500.0, (0, 40): 90.0, (100, 88): 70.0, (101, 88): 70.0, (101, 89): 70.0}
     for (u, v), height in hot.items():
         image[v, u] += height
-    spikes, (times, beside) = dot_kernels.spikes(image, 6.0, 1.9, 1.5, 5)
+    spikes, (times, beside) = band_pass_kernels.spikes(image, 6.0, 1.9, 1.5, 5)
     assert set(zip(*spikes.tolist(), strict=True)) == set(hot)
     assert (times > 1.5).all()
     clean = picture()[1] + 20
@@ -616,7 +616,9 @@ def test_answers_are_local_maxima_of_smaller_pictures() -> None:
         u, v = np.array([0, 33, 79]), np.array([0, 21, 59])
         highest = cv2.dilate(small, np.ones((3, 3)))
         x, y = (np.rint((pixel + 0.5) / step - 0.5).astype(int) for pixel in (u, v))
-        np.testing.assert_array_equal(size_kernels.answers(small, u, v, float(step)), highest[y, x])
+        np.testing.assert_array_equal(
+            size_kernels.responses(small, u, v, float(step)), highest[y, x]
+        )
 
 
 def test_parts_are_near_a_larger_dot() -> None:
@@ -631,17 +633,17 @@ def test_finest_band_is_that_of_the_full_picture() -> None:
     positions, image = picture()
     u, v = np.rint(positions).astype(np.int64).T
     narrow, wide = np.zeros((2, 3, 13), np.float32)
-    for filters, sigma, taps in ((narrow, 0.8, 7), (wide, 1.3, 11)):
+    for weights, sigma, taps in ((narrow, 0.8, 7), (wide, 1.3, 11)):
         kernel = cv2.getGaussianKernel(taps, sigma, cv2.CV_32F).ravel()
         for k in range(3):
             start = (11 - taps) // 2 + k
-            filters[k, start : start + taps] = kernel
+            weights[k, start : start + taps] = kernel
     fine = cv2.GaussianBlur(image, (7, 7), 0.8, borderType=cv2.BORDER_REFLECT)
     fine -= cv2.GaussianBlur(image, (11, 11), 1.3, borderType=cv2.BORDER_REFLECT)
     highest = np.pad(fine, 1, "symmetric")  # the filters mirror the picture at the edge
     highest = np.array([highest[y : y + 3, x : x + 3].max() for x, y in zip(u, v, strict=True)])
     np.testing.assert_allclose(
-        centroid_kernels.finest(image, u, v, narrow, wide), highest, atol=1e-4
+        centroid_kernels.largest_fine_response(image, u, v, narrow, wide), highest, atol=1e-4
     )
 
 
@@ -656,8 +658,8 @@ def test_kernels_give_the_same_for_bytes_and_floats() -> None:
     narrow, wide = np.float32(random().uniform(0, 1, (2, 3, 13)))
     for kernel in (
         lambda own: centroid_kernels.centroids(own, around, taps, u, v, 6, width, 2.0),
-        lambda own: centroid_kernels.finest(own, u, v, narrow, wide),
-        lambda own: dot_kernels.spikes(own, 3.0, 1.9, 1.2, 5),
+        lambda own: centroid_kernels.largest_fine_response(own, u, v, narrow, wide),
+        lambda own: band_pass_kernels.spikes(own, 3.0, 1.9, 1.2, 5),
         lambda own: size_kernels.tile_noise(own, 2, 3),
     ):
         for one, other in zip(kernel(as_bytes), kernel(as_bytes.astype(np.float32)), strict=True):
@@ -668,12 +670,12 @@ def test_kernels_give_the_same_for_bytes_and_floats() -> None:
 def test_pictures_smaller_than_the_filters_are_mirrored_repeatedly(rows: int) -> None:
     image = random().uniform(0, 90, (rows, 40)).astype(np.float32)
     kernel = np.float32(cv2.getGaussianKernel(31, 4.0).ravel())
-    filters = np.stack([np.pad(kernel, (k, 2 - k)) for k in range(3)])
+    three = np.stack([np.pad(kernel, (k, 2 - k)) for k in range(3)])
     blurred = np.pad(image, 16, "symmetric")
     blurred = cv2.sepFilter2D(blurred, -1, kernel, kernel)[15 : 17 + rows, 15:57]
     u, v = np.array([0, 20, 39]), np.array([0, rows - 1, 0])
     expected = [blurred[y : y + 3, x : x + 3].max() for x, y in zip(u, v, strict=True)]
-    computed = centroid_kernels.finest(image, u, v, filters, np.zeros_like(filters))
+    computed = centroid_kernels.largest_fine_response(image, u, v, three, np.zeros_like(three))
     np.testing.assert_allclose(computed, expected, rtol=1e-5)
 
 
@@ -688,7 +690,7 @@ def test_nan_coefficients_give_nan() -> None:
 
 def test_division_by_zero_is_as_in_numpy() -> None:
     matrix, place = np.zeros((3, 3)), np.ones((1, 2))
-    assert not np.isfinite(dot_kernels.on_plane(matrix, place, place)[0]).any()
+    assert not np.isfinite(band_pass_kernels.on_plane(matrix, place, place)[0]).any()
 
 
 @pytest.mark.parametrize("drop_mm", [0.0, 0.06])

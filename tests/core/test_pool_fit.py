@@ -84,7 +84,7 @@ def test_contour_is_between_lit_and_dark_rays(sign: int, seed: int) -> None:
     assert height[witness > 0].min() > -level.sigma_mm
     assert height[witness < 0].max() < level.sigma_mm
     assert abs(level.shift_mm + 0.5) < 4 * level.sigma_mm
-    assert level.disagreement < 0.15
+    assert level.disagreement_bits < 0.15
 
 
 def test_more_witnesses_reduce_the_level_uncertainty() -> None:
@@ -112,7 +112,7 @@ def test_single_false_witness_hardly_moves_the_level(lies: str) -> None:
     # A ray's spacing is 0.3 × 0.45 mm of height at the contour.
     assert abs(level.shift_mm - original.shift_mm) < 0.15 * 0.3 * 0.45
     assert level.sigma_mm > original.sigma_mm
-    assert level.disagreement > original.disagreement
+    assert level.disagreement_bits > original.disagreement_bits
 
 
 def test_boundary_contradicting_the_surface_is_less_certain() -> None:

@@ -9,7 +9,7 @@ import pytest
 
 from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.rig import Rig
-from labapp.core.matching.hypothesis import USUAL_KNOTS, paths_of
+from labapp.core.matching.hypothesis import USUAL_FIT, paths_of
 from labapp.core.matching.observation import (
     RESOLVED_SIZES,
     UNLABELLED,
@@ -33,7 +33,7 @@ def observed_on(rig: Rig) -> tuple[Observation, IntArray]:
 
 def classes(observed: Observation, labels: IntArray) -> RayClasses:
     """Return the classes of rays for the surface fitted to the true labels."""
-    pool = try_fit(observed, true_labels(SEEN), USUAL_KNOTS)
+    pool = try_fit(observed, true_labels(SEEN), USUAL_FIT)
     assert pool is not None
     return classify_rays(observed, labels, paths_of(observed, pool))
 
@@ -54,7 +54,7 @@ def test_true_labels_leave_nothing_unexplained(frame: tuple[Observation, IntArra
     assert (len(found.missed), len(found.stray)) == (0, 0)
     assert (found.witness[lit] == 1).all()
     assert not (found.witness[~lit] > 0).any()
-    assert (found.witness[observed.absent] == 0).all()
+    assert (found.witness[observed.rays.absent] == 0).all()
     # Rays that land well outside the pool have no dot, but some of them cross the view.
     assert (found.witness < 0).sum() > 20
 
@@ -71,7 +71,7 @@ def test_missing_dot_is_a_missed_ray(frame: tuple[Observation, IntArray]) -> Non
         size_mm=observed.size_mm[keep],
     )
     others = np.where(labels > dot, labels - 1, np.where(labels == dot, UNLABELLED, labels))
-    pool = try_fit(fewer, others, USUAL_KNOTS)
+    pool = try_fit(fewer, others, USUAL_FIT)
     assert pool is not None
     found = classify_rays(fewer, others, paths_of(fewer, pool))
     assert found.missed.tolist() == [np.ravel_multi_index(tuple(ray), labels.shape)]
@@ -126,7 +126,7 @@ def test_false_dot_beside_the_plane_does_not_widen_the_view(
     frame: tuple[Observation, IntArray],
 ) -> None:
     observed, labels = frame
-    pool = try_fit(observed, labels, USUAL_KNOTS)
+    pool = try_fit(observed, labels, USUAL_FIT)
     assert pool is not None
     paths = paths_of(observed, pool)
     witness = classify_rays(observed, labels, paths).witness
@@ -178,7 +178,7 @@ def test_merged_dots_of_a_row_beyond_the_labels_are_not_stray() -> None:
     last = np.flatnonzero((true != UNLABELLED).any(axis=1))[-1]
     labels, dots = true.copy(), true[last][true[last] != UNLABELLED]
     labels[last] = UNLABELLED
-    pool = try_fit(observed, labels, USUAL_KNOTS)
+    pool = try_fit(observed, labels, USUAL_FIT)
     assert pool is not None
     paths = paths_of(observed, pool)
     assert classify_rays(sharp, labels, paths).stray.tolist() == sorted(dots.tolist())

@@ -9,7 +9,12 @@ import pytest
 
 from labapp.core.images.dots import Dots
 from labapp.core.rows.lattice import Lattice
-from labapp.core.rows.row_search import mask_rows, search_rows
+from labapp.core.rows.row_search import (
+    MaskRowsSettings,
+    RowSearchSettings,
+    mask_rows,
+    search_rows,
+)
 from labapp.core.values import CannotMeasure
 
 SHAPE = (640, 480)
@@ -47,11 +52,11 @@ def pattern(
 
 
 def by_search(dots: Dots) -> Lattice:
-    return search_rows(dots)
+    return search_rows(dots, RowSearchSettings())
 
 
 def by_masks(dots: Dots) -> Lattice:
-    return mask_rows(dots, SHAPE)
+    return mask_rows(dots, SHAPE, MaskRowsSettings())
 
 
 both = pytest.mark.parametrize("search", [by_search, by_masks])
@@ -90,7 +95,7 @@ def test_two_absent_middle_dots_mark_a_blocked_row(search: Search) -> None:
 def test_row_without_its_centre_dot_has_the_reference() -> None:
     """§5.2.2: "If two or more rows are available …"."""
     dots, _ = pattern(missing=((4, 6), (2, 7)))
-    lattice = search_rows(dots)
+    lattice = search_rows(dots, RowSearchSettings())
     assert lattice.reference == (4, 6)
     assert lattice.candidates == ((4, 6), (2, 7))
 
@@ -134,7 +139,7 @@ def test_indices_in_a_bowed_pattern_are_right(search: Search, bow: float) -> Non
 def test_row_ends_where_it_would_be_too_steep() -> None:
     """The next dot at the right is the nearest, but more than 60° up: it starts a new row."""
     places = np.array([[100.0, 300], [120, 300], [140, 300], [150, 270], [170, 270], [190, 270]])
-    lattice = search_rows(dots_at(places))
+    lattice = search_rows(dots_at(places), RowSearchSettings())
     first = lattice.row[:3]
     assert len(set(first)) == 1
     assert first[0] not in lattice.row[3:]
@@ -143,7 +148,7 @@ def test_row_ends_where_it_would_be_too_steep() -> None:
 def test_rows_whose_masks_merge_are_rejected() -> None:
     dots, _ = pattern(row_step=8.0)
     with pytest.raises(CannotMeasure, match="no-rows"):
-        mask_rows(dots, SHAPE)
+        mask_rows(dots, SHAPE, MaskRowsSettings())
 
 
 @both

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from labapp.core.geometry.bench import Bench
-from labapp.core.matching import correspondence, repair
+from labapp.core.matching import match_rays, repair
 from labapp.core.matching.hypothesis import Hypothesis, evaluate
 from labapp.core.matching.match_settings import MatchSettings
 from labapp.core.matching.observation import UNLABELLED, Observation
@@ -66,25 +66,25 @@ def searched_with(seen: SeenDots, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     tried: list[str] = []
 
     def noted(name: str) -> None:
-        search = getattr(correspondence, name)
+        search = getattr(match_rays, name)
 
         def run(*given: object) -> list[Hypothesis]:
             tried.append(name)
             made: list[Hypothesis] = search(*given)
             return made
 
-        monkeypatch.setattr(correspondence, name, run)
+        monkeypatch.setattr(match_rays, name, run)
 
-    for name in ("_by_grid", "_by_empty_sites", "_by_quadrics", "_by_caps"):
+    for name in ("_by_lattice", "_by_empty_sites", "_by_quadrics", "_by_caps"):
         noted(name)
     lattice = grow_lattice(seen.dots, GrowSettings())
-    match, _ = correspondence.match_rays(seen.dots, lattice, BENCH, FRAME_SHAPE, MatchSettings())
+    match, _ = match_rays.match_rays(seen.dots, lattice, BENCH, FRAME_SHAPE, MatchSettings())
     assert (seen.ray[match.dot] == match.ray).all()
     return tried
 
 
 def test_isolated_false_dots_do_not_prolong_the_search(monkeypatch: pytest.MonkeyPatch) -> None:
-    assert searched_with(seen_with(false=10), monkeypatch) == ["_by_grid"]
+    assert searched_with(seen_with(false=10), monkeypatch) == ["_by_lattice"]
 
 
 def test_a_cluttered_frame_is_searched_in_other_ways(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -11,7 +11,7 @@ from scipy.ndimage import convolve, maximum_filter
 
 from labapp.core.matching import match_kernels, observation
 from labapp.core.matching.decision import fitted_labels
-from labapp.core.matching.hypothesis import USUAL_KNOTS, evaluate
+from labapp.core.matching.hypothesis import USUAL_FIT, evaluate
 from labapp.core.matching.observation import UNLABELLED, Observation, try_fit
 from labapp.core.matching.prediction import sure_pairs
 from labapp.core.matching.unsupported_labels import unsupported
@@ -23,7 +23,7 @@ from tests.core.test_dips import observation_of
 from tests.scenes import BENCH_RIG, see
 
 POOL = egg(5.8, 2.6, 3.2, 0.28)
-FIT = replace(USUAL_KNOTS, settled_mm=1e-4)
+FIT = replace(USUAL_FIT, settled_mm=1e-4)
 
 
 def scene(seed: int = 1) -> tuple[Observation, IntArray]:
@@ -107,7 +107,7 @@ def test_false_dot_of_a_ray_outside_the_boundary_gets_no_ray() -> None:
     fitted = fitted_labels(observed, hypothesis, FIT)
     # Among the dark rays next to lit ones, that which lands farthest outside the boundary.
     candidates = [tuple(k) for k in np.argwhere((hypothesis.witness < 0) & _beside(labels))]
-    landing = observed.landing_mm[tuple(np.array(candidates).T)]
+    landing = observed.rays.landing_mm[tuple(np.array(candidates).T)]
     height, _ = hypothesis.pool.surface.height_and_gradient(*landing[:, :2].T)
     ray = candidates[int(np.argmin(height))]
     predicted = fitted.paths.plane_mm.reshape(*labels.shape, 2)[ray]
@@ -240,16 +240,16 @@ def test_reflection_far_outside_the_boundary_is_unlikely() -> None:
     hypothesis = evaluate(observed, labels, FIT)
     assert hypothesis is not None
     surface, pool = hypothesis.pool.surface, hypothesis.pool
-    x, y = observed.landing_mm[..., 0], observed.landing_mm[..., 1]
+    x, y = observed.rays.landing_mm[..., 0], observed.rays.landing_mm[..., 1]
     height, slope = surface.height_and_gradient(x.ravel(), y.ravel())
-    rise = np.linalg.norm(slope * observed.spacing_mm, axis=-1).reshape(labels.shape)
+    rise = np.linalg.norm(slope * observed.rays.spacing_mm, axis=-1).reshape(labels.shape)
     inward = height.reshape(labels.shape) / rise
     dark = np.argwhere((hypothesis.witness < 0) & (inward < -0.5) & (inward > -2.0))
 
     def evidence(sign: int) -> float:
         witness = hypothesis.witness.copy()
         witness[tuple(dark[0])] = sign
-        rays = observed.bench.rays, BENCH_RIG.head_sign, witness, surface.basis, 0.01
+        rays = observed.rays, BENCH_RIG.head_sign, witness, surface.basis, 0.01
         level = pool.level
         return Witnesses.of(*rays).negative_log_evidence(surface.basis, surface.coefficients, level)
 

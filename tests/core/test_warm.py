@@ -291,9 +291,9 @@ def test_pool_that_jumps_is_measured_again() -> None:
 def test_following_resumes_after_a_lost_frame() -> None:
     follower = chain()
     dark = np.full_like(frames()[0].image, 20)
-    assert follower.follow(dark) is None
+    assert follower.track(dark) is None
     assert follower.track_lost is not None
-    result = follower.follow(frames()[WARMED].image)
+    result = follower.track(frames()[WARMED].image)
     assert result is not None
     assert follower.track_lost is None
     assert wrong_rays(result, frames()[WARMED]) == 0

@@ -327,7 +327,7 @@ class Chain:
         self.track_lost: str | None = None
         self.measurement = Measurement("ok", "", "fit", Dots(*np.ones((7, 2))), measures=MEASURES)
 
-    def follow(self, _: np.ndarray) -> Measurement | None:
+    def track(self, _: np.ndarray) -> Measurement | None:
         self.track_lost = "it jumped" if self.is_lost else None
         return None if self.is_lost else self.measurement
 

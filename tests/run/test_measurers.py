@@ -26,7 +26,7 @@ from labapp.core import pipeline
 from labapp.core.pipeline import Measurement, Settings, measure, start_correction
 from labapp.core.rows.correction import Correction
 from labapp.core.schemes import fit
-from labapp.core.sequence import following
+from labapp.core.sequence import tracking
 from labapp.core.sequence.prior import Prior
 from labapp.core.surface.pool_fit import FitSettings
 from labapp.errors import InputError
@@ -211,13 +211,13 @@ def test_frames_beside_a_gap_are_not_treated_as_equally_spaced(
 ) -> None:
     """Number of frames used for each extrapolation; the first three are measured cold."""
     past_counts: list[int] = []
-    predict = following.predictions
+    predict = tracking.predictions
 
     def count_and_predict(prior: Prior) -> Iterator[np.ndarray]:
         past_counts.append(len(prior.past))
         return predict(prior)
 
-    monkeypatch.setattr(following, "predictions", count_and_predict)
+    monkeypatch.setattr(tracking, "predictions", count_and_predict)
     with open_source(recording.path) as source:
 
         def read(number: int) -> Frame:

@@ -279,7 +279,7 @@ def _dot_at(correction: Correction, u_px: float, v_px: float) -> int:
 def _carried_on(session: Session, frame: int, correction: Correction) -> dict[int, Correction]:
     """Apply a correction to the frames after it while it fits, and report where it ends."""
     from labapp.core.images.find_dots import find_dots
-    from labapp.core.rows.tracking import carry_on
+    from labapp.core.rows.carry_on import carry_on
     from labapp.core.values import CannotMeasure
 
     carried: dict[int, Correction] = {}

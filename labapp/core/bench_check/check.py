@@ -257,7 +257,9 @@ def _adjusted(
             relabelled(o, p.mirror, made.offset, pose)
             for o, p, pose in zip(observed, pictures, made.poses, strict=True)
         ]
-        again = [np.where(o.absent, UNLABELLED, a) for o, a in zip(observed, again, strict=True)]
+        again = [
+            np.where(o.rays.absent, UNLABELLED, a) for o, a in zip(observed, again, strict=True)
+        ]
         used = labels
         if all((new == old).all() for new, old in zip(again, used, strict=True)):
             break

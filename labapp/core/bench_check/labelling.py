@@ -195,7 +195,9 @@ def _by_places(observed: Observation, picture: Picture) -> list[IntArray]:
     mirror, rig = picture.mirror, observed.rig
     if "x_mm" not in mirror.parameters:
         return []
-    passed = intersect_level(rig.laser.position_mm, observed.rays, mirror.pose[2])[..., :2]
+    passed = intersect_level(rig.laser.position_mm, observed.rays.directions, mirror.pose[2])[
+        ..., :2
+    ]
     low, high = passed.min(axis=(0, 1)), passed.max(axis=(0, 1))
     x, y = (np.arange(*ends, GRID_MM) for ends in zip(low, high, strict=True))
     still = np.zeros(len(QUANTITIES))
@@ -233,7 +235,7 @@ def sighting_of(
     observed: Observation, mirror: Mirror, labels: IntArray, *, with_absent: bool = False
 ) -> Sighting:
     """Return the ray–dot pairs of labels; optionally with dots of rays that should be absent."""
-    at = np.argwhere((labels != UNLABELLED) & (with_absent | ~observed.absent))
+    at = np.argwhere((labels != UNLABELLED) & (with_absent | ~observed.rays.absent))
     dot = labels[tuple(at.T)]
     return Sighting(mirror, at, observed.plane_mm[dot], observed.covariance_mm2[dot])
 
@@ -288,7 +290,7 @@ def _grown(
     if in_hole or _lit_neighbours(labels)[i - 1, j - 1] < SURROUNDED:
         return None
     cost = made.cost + _penalty(labels, observed) + _coarse(made)
-    return Labelled(np.where(observed.absent, UNLABELLED, labels), made, cost)
+    return Labelled(np.where(observed.rays.absent, UNLABELLED, labels), made, cost)
 
 
 def _coarse(made: Adjustment) -> float:
@@ -305,8 +307,8 @@ def _different(found: list[Labelled]) -> list[Labelled]:
 def _penalty(labels: IntArray, observed: Observation) -> float:
     """Cost of dots without a ray, and of surrounded rays without a dot."""
     lit = labels != UNLABELLED
-    missed = int((~lit & ~observed.absent & (_lit_neighbours(labels) >= SURROUNDED)).sum())
-    on_hole = int((lit & observed.absent).sum())
+    missed = int((~lit & ~observed.rays.absent & (_lit_neighbours(labels) >= SURROUNDED)).sum())
+    on_hole = int((lit & observed.rays.absent).sum())
     stray = len(observed.plane_mm) - int(lit.sum()) + on_hole
     return STRAY * stray + MISSED * missed
 

@@ -14,22 +14,27 @@ import cv2
 import numpy as np
 import scipy
 
-from labapp.core.images.dot_fit import fit_dots
+from labapp.core.images.dot_fit import WINDOW_SHARE, fit_dots
 from labapp.core.images.dot_size import (
     SLENDER,
     as_picture,
     band_noise,
-    blur,
     estimate_size,
-    kernel,
     local_noise,
+)
+from labapp.core.images.dots import BandPassSettings, Dots, Grey, Image, Picture
+from labapp.core.images.filters import (
+    LEAST_NOISE,
+    NARROW,
+    WIDE,
+    blur,
+    kernel,
     noise_gain,
     pairs,
     peak_disc,
     scratch,
     without_spikes,
 )
-from labapp.core.images.dots import BandPassSettings, Dots, Grey, Image, Picture
 from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray, ReadOnlyArrays
 
 Peaks = tuple[IntArray, IntArray, FloatArray]
@@ -57,6 +62,20 @@ CENTROID_WIDENING = 1.4
 """Width of the window for centroids over that for detection. A wider window averages over more
 speckle grains, which then move the centroid less."""
 
+LIGHT_BLUR = 0.5
+"""Blur of the light before centroids are computed, in dot sizes."""
+
+WIDEST_WINDOW, LEAST_WINDOW_PX = 1.1, 0.75
+"""Largest width of a window, over the reach of its centre; and the least, px."""
+
+LEAST_MOMENT_PX2, MOST_MOMENT = 1e-3, 0.95
+"""Least variance of the light in a window, and the largest, as a share of the window's. Uniform
+light has that of the window, which gives no size."""
+
+SIGMA_TIMES_SNR = 0.8
+"""Standard uncertainty of a centroid due to the camera's noise, px, times the signal-to-noise
+ratio."""
+
 MOST_SURROUNDINGS = 0.3
 """If the dots' windows cover a larger share of the picture, all of it is blurred at once."""
 
@@ -64,18 +83,18 @@ HALVED_PX, NEARLY = 1.5, 0.75
 """Dots of at least this size are searched for at half resolution, where a peak above the threshold
 has a pixel above this fraction of it."""
 
-PEAK_GAIN = 1 / 1.64 - 1 / 3.56
-"""Peak height of a Gaussian dot of the band's size after the band-pass, over its height before:
-1/(1 + 0.8²) − 1/(1 + 1.6²)."""
+PEAK_GAIN = 1 / (1 + NARROW**2) - 1 / (1 + WIDE**2)
+"""Peak height of a Gaussian dot of the band's size after the band-pass, over its height before."""
 
 WIDTH_KEPT = 0.8
 """Width of a Gaussian dot after its background is subtracted, over its width before."""
 
 AROUND_SIZES = 4.2
-"""Standard deviation of the blur that gives the background in the joint fit, in dot sizes."""
+"""Standard deviation of the blur that gives the background of the dots, in dot sizes."""
 
 AROUND_PX2 = 3.0
-"""Least variance of that blur, px² of the downsampled picture, so that its samples resolve it."""
+"""Least variance of that blur in the joint fit, px² of the downsampled picture, so that its samples
+resolve it."""
 
 LEAST_SIGMA_PX = 0.02
 """Added in quadrature to the position uncertainty of jointly fitted dots, px."""
@@ -216,7 +235,7 @@ def dot_at(
     if not (away <= 2.0 * size).any():
         at = round(v_px), round(u_px)
         peak = max(float(seen.band[at[0] // seen.step, at[1] // seen.step]), 0.0) / PEAK_GAIN
-        snr = peak / max(float(tuning.noise[at]), 1e-3 * peak, 1e-9)
+        snr = peak / max(float(tuning.noise[at]), LEAST_NOISE * peak, 1e-9)
         unsure = max(size, 1.0)
         return Dots(*(np.array([x]) for x in (u_px, v_px, unsure, unsure, size, peak, snr)))
     k = int(np.argmin(away))
@@ -240,11 +259,11 @@ def _tuned(picture: Picture, settings: BandPassSettings) -> tuple[DetectorTuning
     noise = local_noise(picture)
     size = settings.size_px or estimate_size(picture, noise)
     seen = _BandPassed(without_spikes(picture, noise, size), size)
-    white = float(np.median(noise[::8, ::8])) / noise_gain(size)
+    white = float(np.median(noise[::8, ::8])) * noise_gain(size)
     every = 4 // seen.step
     grain = band_noise(seen.band[::every, ::every], white) / max(white, 1e-9)
-    least = 1e-3 * max(map(abs, cv2.minMaxLoc(seen.band)[:2])) + 1e-6
-    floor = noise * np.float32(settings.threshold * grain / noise_gain(size))
+    least = LEAST_NOISE * max(map(abs, cv2.minMaxLoc(seen.band)[:2])) + 1e-6
+    floor = noise * np.float32(settings.threshold * grain * noise_gain(size))
     np.maximum(floor, np.float32(settings.threshold * least), out=floor)
     return DetectorTuning(size, noise, floor), seen
 
@@ -263,12 +282,12 @@ class _BandPassed:
         self._pass()
 
     def _pass(self) -> None:
-        from labapp.core.images import dot_kernels
+        from labapp.core.images import band_pass_kernels
 
         size, lost = self.size / self.step, (1 - self.step**-2) / 12
-        seen = dot_kernels.halved(self.picture) if self.step == 2 else self.picture
-        blur(seen, float(np.sqrt((0.8 * size) ** 2 - lost)), self._narrow)
-        widen(self._narrow, self._wide, (1.6**2 - 0.8**2) * size**2)
+        seen = band_pass_kernels.halved(self.picture) if self.step == 2 else self.picture
+        blur(seen, float(np.sqrt((NARROW * size) ** 2 - lost)), self._narrow)
+        widen(self._narrow, self._wide, (WIDE**2 - NARROW**2) * size**2)
         cv2.subtract(self._narrow, self._wide, dst=self.band)
 
     def peaks(self, tuning: DetectorTuning) -> Peaks:
@@ -277,7 +296,7 @@ class _BandPassed:
         Peaks as sharp as hot pixels or as elongated as lines of them are suspect. Their pixels
         are repaired, since a dot of usual brightness may lie beneath them.
         """
-        from labapp.core.images import dot_kernels
+        from labapp.core.images import band_pass_kernels
 
         u, v, bright = self._over(tuning)
         good = self._dot_like(u, v, bright)
@@ -290,47 +309,51 @@ class _BandPassed:
             self.picture = repaired
             self._pass()
             u, v, bright = self._over(tuning)
-            near = dot_kernels.two_nearest(pairs(u, v), pairs(*suspects))[0][:, 0]
+            near = band_pass_kernels.two_nearest(pairs(u, v), pairs(*suspects))[0][:, 0]
             good = self._dot_like(u, v, bright)
             good &= (near > 2.0 * self.size) | (bright >= REMAINS_SHARE * typical_brightness)
         return u[good], v[good], bright[good]
 
     def _over(self, tuning: DetectorTuning) -> Peaks:
         """Return the peaks above the threshold."""
-        from labapp.core.images import dot_kernels
+        from labapp.core.images import band_pass_kernels
 
         band, floor, disc = self.band, tuning.floor, peak_disc(self.size)
         if self.step == 2:
-            (u, v), bright = dot_kernels.enlarged_peaks(band, tuning.coarse, floor, disc)
+            (u, v), bright = band_pass_kernels.upsampled_peaks(band, tuning.coarse, floor, disc)
             return u, v, bright
-        u, v = dot_kernels.peaks(band, floor, disc)
+        u, v = band_pass_kernels.peaks(band, floor, disc)
         return u, v, band[v, u].astype(float)
 
     def _dot_like(self, u: IntArray, v: IntArray, bright: FloatArray) -> BoolArray:
         """Whether peaks are round and do not respond more strongly to a much finer band."""
-        from labapp.core.images import centroid_kernels, dot_kernels
+        from labapp.core.images import band_pass_kernels, centroid_kernels
 
         scale = max(0.4, self.size / 3.0)
-        narrow, wide = (_nine(sigma * scale, 1.6 * scale) for sigma in (0.8, 1.6))
-        sharp = centroid_kernels.finest(self.picture, u, v, narrow, wide) >= HOT_RATIO * bright
-        ridges = dot_kernels.ridges(self.band, u // self.step, v // self.step, SLENDER)
+        narrow, wide = (_shifted_gaussians(sigma * scale, WIDE * scale) for sigma in (NARROW, WIDE))
+        fine = centroid_kernels.largest_fine_response(self.picture, u, v, narrow, wide)
+        sharp = fine >= HOT_RATIO * bright
+        ridges = band_pass_kernels.ridges(self.band, u // self.step, v // self.step, SLENDER)
         return np.asarray(~sharp & ~ridges)
 
     def light(
         self, u: IntArray, v: IntArray, width: FloatArray, reach: float
     ) -> tuple[FloatArray, FloatArray]:
-        """Return centroids (u, v) and second moments of the background-subtracted light.
+        """Return centroids and second moments of the background-subtracted light.
+
+        Centroids (u, v) have shape (2, n), px; moments, the sum of the second central moments along
+        u and v, shape (n,), px².
 
         Windows are moved a few times only; otherwise they would drift to a brighter neighbour.
         """
         from labapp.core.images import centroid_kernels
 
-        variance = ((3.0 * CENTROID_WIDENING) ** 2 - 0.8**2) * (self.size / self.step) ** 2
+        variance = (AROUND_SIZES**2 - NARROW**2) * (self.size / self.step) ** 2
         around = smaller_blurred(self._narrow, variance)
-        margin, taps, picture = margin_of(reach), kernel(0.5 * self.size), self.picture
+        margin, taps, picture = margin_of(reach), kernel(LIGHT_BLUR * self.size), self.picture
         if len(u) * (2 * margin + 1) ** 2 > MOST_SURROUNDINGS * picture.size:
             into = scratch("picture", picture.shape)
-            picture, taps = blur(picture, 0.5 * self.size, into), kernel(0.0)
+            picture, taps = blur(picture, LIGHT_BLUR * self.size, into), kernel(0.0)
         (x, y), moment = centroid_kernels.centroids(
             picture, around, taps, u, v, margin, width, reach
         )
@@ -339,7 +362,7 @@ class _BandPassed:
     def around(self) -> tuple[Grey, float]:
         """Return the downsampled, blurred picture and the blur's standard deviation, px."""
         image, (height, width), scale = self._narrow, self._narrow.shape, 1
-        variance = (AROUND_SIZES**2 - 0.8**2) * (self.size / self.step) ** 2
+        variance = (AROUND_SIZES**2 - NARROW**2) * (self.size / self.step) ** 2
         while (
             variance / (2 * scale) ** 2 > AROUND_PX2
             and height % (2 * scale) == width % (2 * scale) == 0
@@ -388,14 +411,14 @@ def _found(tuning: DetectorTuning, seen: _BandPassed, settings: BandPassSettings
 
 def _kept(tuning: DetectorTuning, seen: _BandPassed, settings: BandPassSettings) -> Peaks:
     """Return the peaks that are bright enough, without duplicates."""
-    from labapp.core.images import dot_kernels
+    from labapp.core.images import band_pass_kernels
 
     u, v, bright = seen.peaks(tuning)
     if len(u) == 0:
         raise CannotMeasure("no-dots", "no dot is brighter than the frame's noise")
     keep = np.flatnonzero(bright >= settings.contrast * typical(bright))
     # A dot with a flat top has several peaks.
-    keep = keep[dot_kernels.first_of_each(u[keep], v[keep], max(1.5, seen.size))]
+    keep = keep[band_pass_kernels.first_of_each(u[keep], v[keep], max(1.5, seen.size))]
     return u[keep], v[keep], bright[keep]
 
 
@@ -405,13 +428,16 @@ def _top_to_bottom(dots: Dots) -> Dots:
 
 
 @lru_cache(maxsize=8)
-def _nine(sigma: float, widest: float) -> Grey:
-    """Gaussian weights centred on a pixel and its two neighbours, padded to the widest kernel."""
+def _shifted_gaussians(sigma: float, widest: float) -> Grey:
+    """Gaussian weights centred on a pixel and its two neighbours, shape (3, side).
+
+    They are padded to the length of the widest kernel and by a pixel on either side.
+    """
     weights, side = kernel(sigma), len(kernel(widest))
     line = np.pad(weights, (side - len(weights)) // 2)
-    nine = np.stack([np.pad(line, (k, 2 - k)) for k in range(3)])
-    nine.flags.writeable = False
-    return np.asarray(nine)
+    shifted = np.stack([np.pad(line, (k, 2 - k)) for k in range(3)])
+    shifted.flags.writeable = False
+    return np.asarray(shifted)
 
 
 def window_widths(next_px: FloatArray, reach: float) -> FloatArray:
@@ -419,26 +445,30 @@ def window_widths(next_px: FloatArray, reach: float) -> FloatArray:
 
     A window that ends half-way to the nearest dot excludes its light.
     """
-    return np.minimum(1.1 * reach, np.maximum(0.275 * next_px, 0.75))
+    return np.minimum(WIDEST_WINDOW * reach, np.maximum(WINDOW_SHARE * next_px, LEAST_WINDOW_PX))
 
 
 def margin_of(reach: float) -> int:
-    """Half side of the square about a peak in which light is integrated, px."""
-    return int(np.ceil(2.2 * reach)) + 1
+    """Half side of the square about a peak in which light is integrated, px.
+
+    It is twice the width of the widest window.
+    """
+    return int(np.ceil(2 * WIDEST_WINDOW * reach)) + 1
 
 
 def _described(seen: _BandPassed, peaks: Peaks, noise: Grey, speckle_px: float) -> Dots:
     """Compute position, uncertainty, size, height and signal-to-noise ratio of each peak."""
-    from labapp.core.images import dot_kernels
+    from labapp.core.images import band_pass_kernels
 
     (u, v, bright), size = peaks, seen.size
-    width = window_widths(dot_kernels.next_apart(pairs(u, v)), CENTROID_WIDENING * size)
+    width = window_widths(band_pass_kernels.next_apart(pairs(u, v)), CENTROID_WIDENING * size)
     (u_px, v_px), moment = seen.light(u, v, width, CENTROID_WIDENING * size)
-    moment = np.clip(moment / 2, 1e-3, 0.95 * width**2)
-    spread = (1 / (1 / moment - 1 / width**2) - (0.5 * size) ** 2) / WIDTH_KEPT**2
+    moment = np.clip(moment / 2, LEAST_MOMENT_PX2, MOST_MOMENT * width**2)
+    # Undo window, blur and background.
+    spread = (1 / (1 / moment - 1 / width**2) - (LIGHT_BLUR * size) ** 2) / WIDTH_KEPT**2
     peak = bright / PEAK_GAIN
-    snr = peak / np.maximum(noise[v, u], 1e-3 * np.max(peak))
-    sigma = np.hypot(0.8 / snr, speckle_px)
+    snr = peak / np.maximum(noise[v, u], LEAST_NOISE * np.max(peak))
+    sigma = np.hypot(SIGMA_TIMES_SNR / snr, speckle_px)
     return Dots(
         u_px=u_px,
         v_px=v_px,
@@ -454,7 +484,7 @@ def _fitted(seen: _BandPassed, peaks: Peaks, noise: Grey) -> Dots:
     """Compute the same for overlapping dots by a joint fit (`fit_dots`)."""
     (u, v, bright), size = peaks, seen.size
     peak = bright / PEAK_GAIN
-    dot_noise = np.maximum(noise[v, u], 1e-3 * np.max(peak)).astype(np.float64)
+    dot_noise = np.maximum(noise[v, u], LEAST_NOISE * np.max(peak)).astype(np.float64)
     start = np.stack([u, v, peak, np.full(len(u), size)], axis=1).astype(np.float64)
     fitted = fit_dots(seen.picture, seen.around(), start, dot_noise)
     return Dots(

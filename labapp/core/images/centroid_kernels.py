@@ -31,7 +31,7 @@ def _mirrored(at: int, count: int) -> int:
 
 
 @_inner
-def _fold(line: Grey, taps: Grey, step: int, count: int, out: Grey) -> None:
+def _convolve(line: Grey, taps: Grey, step: int, count: int, out: Grey) -> None:
     """Convolve a line with a symmetric filter whose taps are ``step`` elements apart.
 
     The first ``count`` results are written to ``out``.
@@ -66,8 +66,8 @@ def _blurred(image: Picture, taps: Grey, u: int, v: int, lines: Grey, patch: Gre
             at_y = _mirrored(v + y - reach, image.shape[0])
             for x in range(wide):
                 row[x] = image[at_y, _mirrored(u + x - reach, image.shape[1])]
-    _fold(lines[0], taps, 1, wide * wide - 2 * rim, lines[1])
-    _fold(lines[1], taps, wide, wide * side, lines[0])
+    _convolve(lines[0], taps, 1, wide * wide - 2 * rim, lines[1])
+    _convolve(lines[1], taps, wide, wide * side, lines[0])
     for y in range(side):
         row, own = patch[y], lines[0, y * wide :]
         for x in range(side):
@@ -90,11 +90,11 @@ def _subtract_background(
 
     Negative differences and pixels outside the picture are set to 0.
     """
-    (side, even), zero = patch.shape, np.float32(0.0)
+    (side, padded), zero = patch.shape, np.float32(0.0)
     top, _ = _interpolation(v, by, around.shape[0])
     last, _ = _interpolation(v + side - 1, by, around.shape[0])
     last = min(last + 1, around.shape[0] - 1)
-    for x in range(even):
+    for x in range(padded):
         column, on = _interpolation(u + x, by, around.shape[1])
         after = min(column + 1, around.shape[1] - 1)
         for row in range(top, last + 1):
@@ -108,7 +108,7 @@ def _subtract_background(
         row, part = _interpolation(v + y, by, around.shape[0])
         low, high = across[row - top], across[min(row + 1, last) - top]
         share = np.float32(part)
-        for x in range(even):
+        for x in range(padded):
             light = patch[y, x] - (low[x] + share * (high[x] - low[x]))
             patch[y, x] = light if light > zero else zero
         patch[y, :first_x] = zero
@@ -139,10 +139,10 @@ def gaussian_samples(first: int, center: float, width: float, values: Grey) -> N
 def _centroid(patch: Grey, place: FloatArray, width: float, reach: float, lines: Grey) -> float:
     """Set a place, shape (2,), relative to the patch's middle, to the centroid; return the moment.
 
-    The light is weighted by a Gaussian window that follows the centroid; the moment is the second
-    central one. ``lines`` is scratch memory for four rows.
+    The light is weighted by a Gaussian window that follows the centroid; the moment is the sum of
+    the second central moments along u and v, px². ``lines`` is scratch memory for four rows.
     """
-    (side, even), moment = patch.shape, 0.0
+    (side, padded), moment = patch.shape, 0.0
     along_u, along_v, pull_u, pull_v = lines[0], lines[1], lines[2], lines[3]
     pull_u[side:] = 0.0
     for _ in range(4):
@@ -151,7 +151,7 @@ def _centroid(patch: Grey, place: FloatArray, width: float, reach: float, lines:
         along_u[:] = 0.0
         for y in range(side):
             row = np.float32(0.0)
-            for x in range(even):
+            for x in range(padded):
                 weighed = patch[y, x] * pull_u[x]
                 row += weighed
                 along_u[x] += pull_v[y] * weighed
@@ -188,17 +188,18 @@ def centroids(
     """Compute centroids and second moments of the light about pixels (`band_pass._described`).
 
     The light is the image, blurred by a symmetric filter, minus the background ``around``, which
-    may be downsampled. Centroids are offsets from the pixels, shape (2, n).
+    may be downsampled. Centroids are offsets from the pixels, shape (2, n), px; a moment is the sum
+    of the second central moments along u and v, shape (n,), px².
     """
     count, side, rim = len(u), 2 * margin + 1, len(taps) // 2
-    even = (side + 7) // 8 * 8  # padded for vector instructions
+    padded = (side + 7) // 8 * 8  # for vector instructions
     by, single = image.shape[1] / around.shape[1], np.float32
-    offset, moment, patch = np.zeros((2, count)), np.empty(count), np.zeros((side, even), single)
+    offset, moment, patch = np.zeros((2, count)), np.empty(count), np.zeros((side, padded), single)
     squares, across = (
         np.zeros((2, (side + 2 * rim) ** 2), single),
-        np.empty((side + 2, even), single),
+        np.empty((side + 2, padded), single),
     )
-    lines = np.empty((4, even), single)
+    lines = np.empty((4, padded), single)
     for k in range(count):
         _blurred(image, taps, u[k], v[k], squares, patch)
         _subtract_background(patch, around, by, u[k] - margin, v[k] - margin, image.shape, across)
@@ -207,8 +208,13 @@ def centroids(
 
 
 @_compiled_for(*((own, _ints, _ints, _grey, _grey) for own in (_grey, _byte)))
-def finest(image: Picture, u: IntArray, v: IntArray, narrow: Grey, wide: Grey) -> FloatArray:
-    """Largest difference of two filters in the 3 × 3 pixels about each (`band_pass._nine`)."""
+def largest_fine_response(
+    image: Picture, u: IntArray, v: IntArray, narrow: Grey, wide: Grey
+) -> FloatArray:
+    """Largest difference of two filters in the 3 × 3 pixels about each.
+
+    The filters, shape (3, side), are those of `band_pass._shifted_gaussians`.
+    """
     side, result = narrow.shape[1], np.empty(len(u))
     column, across = np.empty(side, np.float32), np.empty((6, side), np.float32)
     filters = np.concatenate((narrow, wide))

@@ -102,7 +102,7 @@ def fit_dots(
         Standard deviation of the camera's noise at each dot, shape (n,), grey levels.
     """
     from labapp.core.images import dot_fit_kernels as kernels
-    from labapp.core.images.dot_kernels import next_apart
+    from labapp.core.images.band_pass_kernels import next_apart
 
     dots, median_size = np.array(start, np.float64), float(np.median(start[:, 3]))
     by, blur = picture.shape[1] / around[0].shape[1], around[1]

@@ -1,31 +1,31 @@
-"""Estimates from a frame before its dots are detected: noise, spikes, and dot size."""
+"""Estimates from a frame before its dots are detected: noise and dot size."""
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import lru_cache
 
 import cv2
 import numpy as np
 
 from labapp.core.images.dots import Grey, Image, Picture
-from labapp.core.values import BoolArray, FloatArray, IntArray, robust_sigma
+from labapp.core.images.filters import (
+    NARROW,
+    blur,
+    noise_gain,
+    pairs,
+    peak_disc,
+    scratch,
+    without_spikes,
+)
+from labapp.core.values import BoolArray, FloatArray, robust_sigma
 
 TILE_PX = 40
 """Noise is estimated in tiles of about this side."""
 
 LEAST_BYTE_NOISE = 0.5
-"""Least noise of a picture of bytes, grey levels. Video compression leaves flat areas, in which no
-noise is seen; in the ripples around them thousands of peaks and spikes would stand out of none."""
-
-SPIKE = 6.0
-"""A spike exceeds the light that a dot could have by at least this many noise σ."""
-
-DOUBTED, CERTAIN = 1.5, 6.0
-"""Least ratio of a spike's fall of light to that of a dot: next to a certain spike or a suspect
-peak, and elsewhere. The latter is large since speckle makes dots much sharper than Gaussians."""
+"""Least noise of a picture of bytes, grey levels. Compression leaves flat areas without visible
+noise; measured against none, ripples would count as thousands of peaks."""
 
 SLENDER = 10.0
 """A peak with a larger ratio of principal curvatures is part of a ridge, not a dot."""
@@ -51,10 +51,8 @@ WHOLE = 0.6
 """Smaller blobs within a blob are its parts if it has at least this share of their response."""
 
 BEST = 0.884
-"""Scale of the band with the largest response to a Gaussian dot, over the dot's size."""
-
-KEPT_BYTES = 2**23
-"""Larger scratch pictures are not kept for the next frame."""
+"""Scale of the band with the largest response to a Gaussian dot, over the dot's size: about
+1/√(NARROW · WIDE)."""
 
 
 def as_picture(frame: Image) -> Picture:
@@ -81,39 +79,6 @@ def local_noise(picture: Picture) -> Grey:
     if picture.dtype == np.uint8:
         sigma = np.maximum(sigma, np.float32(LEAST_BYTE_NOISE))
     return np.asarray(cv2.resize(sigma, (width, height)), np.float32)
-
-
-def without_spikes(
-    picture: Picture, noise: Grey, size: float, suspects: tuple[IntArray, IntArray] | None = None
-) -> Picture:
-    """Replace pixels that are too bright for dots of a size, px, by their surroundings.
-
-    These are certain spikes, spikes near one of the ``suspects`` pixels (columns and rows), and
-    spikes connected to either. A picture without spikes is returned unchanged.
-    """
-    from labapp.core.images import dot_kernels
-
-    least = 1e-3 * float(cv2.minMaxLoc(picture)[1])
-    over = SPIKE * max(float(noise[::8, ::8].min()), least)
-    reach = max(2, round(2.5 * size))
-    (u, v), (times, beside) = dot_kernels.spikes(picture, over, size, DOUBTED, reach)
-    sharp = picture[v, u] - beside > SPIKE * noise[v, u]
-    u, v, times, beside = u[sharp], v[sharp], times[sharp], beside[sharp]
-    begun = times > CERTAIN
-    if suspects is not None:
-        away = dot_kernels.two_nearest(pairs(u, v), pairs(*suspects))[0][:, 0]
-        begun |= away <= 1.5 * size + 1.0
-    if not begun.any():
-        return picture
-    hot = dot_kernels.connected_pixels(u, v, begun)
-    result = picture.copy()
-    result[v[hot], u[hot]] = np.rint(beside[hot]) if picture.dtype == np.uint8 else beside[hot]
-    return result
-
-
-def pairs(u: IntArray, v: IntArray) -> FloatArray:
-    """Places (u, v) of pixels, shape (n, 2)."""
-    return np.stack([u, v], axis=1).astype(float)
 
 
 def estimate_size(picture: Picture, noise: Grey) -> float:
@@ -190,26 +155,28 @@ class _Blobs:
 
 
 def _blobs(bands: dict[int, tuple[int, Grey]], scale: int, noise: float) -> _Blobs:
-    from labapp.core.images import dot_kernels, size_kernels
+    from labapp.core.images import band_pass_kernels, size_kernels
 
     step, band = bands[scale]
-    white = noise / noise_gain(SCALES_PX[scale])
+    white = noise * noise_gain(SCALES_PX[scale])
     every = -(-8 // step)
     floor = OVER_NOISE * band_noise(band[::every, ::every], white) + 1e-6
     disc = peak_disc(SCALES_PX[scale] / step).astype(bool)
-    x, y = dot_kernels.peaks(band, np.full((1, 1), floor, np.float32), disc)
-    good = ~dot_kernels.ridges(band, x, y, SLENDER)
+    x, y = band_pass_kernels.peaks(band, np.full((1, 1), floor, np.float32), disc)
+    good = ~band_pass_kernels.ridges(band, x, y, SLENDER)
     x, y = x[good], y[good]
     if len(x) > MOST_BLOBS:
         most = np.argpartition(-band[y, x], MOST_BLOBS)[:MOST_BLOBS]
         x, y = x[most], y[most]
     place = (pairs(x, y) + 0.5) * step - 0.5
     u, v = np.rint(place.T).astype(np.int64)
-    answer = {k: size_kernels.answers(other, u, v, float(by)) for k, (by, other) in bands.items()}
-    answer[scale] = band[y, x].astype(np.float64)
-    less = answer.get(scale - 1, np.full(len(place), -np.inf))
-    largest = np.stack(list(answer.values())).max(axis=0)
-    return _Blobs(scale, place, less, answer[scale], answer[scale + 1], largest)
+    response = {
+        k: size_kernels.responses(other, u, v, float(by)) for k, (by, other) in bands.items()
+    }
+    response[scale] = band[y, x].astype(np.float64)
+    less = response.get(scale - 1, np.full(len(place), -np.inf))
+    largest = np.stack(list(response.values())).max(axis=0)
+    return _Blobs(scale, place, less, response[scale], response[scale + 1], largest)
 
 
 def _bands(picture: Picture, finest: int = 0) -> Iterator[tuple[int, tuple[int, Grey]]]:
@@ -226,7 +193,7 @@ def _bands(picture: Picture, finest: int = 0) -> Iterator[tuple[int, tuple[int, 
         blurred = [
             blur(
                 picture,
-                float(np.sqrt((0.8 * SCALES_PX[0] * 2 ** (k / 2) / step) ** 2 - lost)),
+                float(np.sqrt((NARROW * SCALES_PX[0] * 2 ** (k / 2) / step) ** 2 - lost)),
                 scratch(f"blurred {step} {k}", picture.shape),
             )
             for k in range(scale, scale + count + 2)
@@ -246,13 +213,6 @@ def _smaller(picture: Picture, step: int) -> Picture:
     return as_picture(cv2.resize(picture, size, interpolation=cv2.INTER_AREA))
 
 
-def noise_gain(size: float) -> float:
-    """Ratio of white noise before the band-pass to that after it, for the given dot size."""
-    a, b = (0.8 * size) ** 2, (1.6 * size) ** 2
-    power = 1 / (4 * np.pi) * (1 / a + 1 / b - 4 / (a + b))
-    return float(1 / np.sqrt(power))
-
-
 def band_noise(band: Grey, white: float) -> float:
     """Estimate the noise of a band-passed picture; ``white`` is what white noise would give.
 
@@ -261,46 +221,3 @@ def band_noise(band: Grey, white: float) -> float:
     """
     excess = robust_sigma(band) / max(white, 1e-9)
     return white * min(max(1.0, excess), 3.0)
-
-
-_local = threading.local()
-
-
-def scratch(name: str, shape: tuple[int, int]) -> Grey:
-    """Return this thread's scratch picture of the given name, shape (height, width).
-
-    It is reused for frames of the same size, since allocation would take as long as the filters.
-    """
-    buffers: dict[str, Grey] = _local.__dict__
-    count = shape[0] * shape[1]
-    if name not in buffers or buffers[name].size < count:
-        buffers.pop(name, None)
-        buffer = np.empty(count, np.float32)
-        if buffer.nbytes > KEPT_BYTES:
-            return buffer.reshape(shape)
-        buffers[name] = buffer
-    return buffers[name][:count].reshape(shape)
-
-
-def blur(picture: Picture, sigma: float, into: Grey | None = None) -> Grey:
-    """Blur by a Gaussian of the given standard deviation, px, without an intermediate copy."""
-    taps = kernel(sigma)
-    edge = cv2.BORDER_REFLECT
-    return np.asarray(
-        cv2.sepFilter2D(picture, cv2.CV_32F, taps, taps, dst=into, borderType=edge), np.float32
-    )
-
-
-@lru_cache(maxsize=64)
-def kernel(sigma: float) -> Grey:
-    """One-dimensional Gaussian kernel; cached, as the dot size is constant in a recording."""
-    taps = cv2.getGaussianKernel(round(8 * sigma + 1) | 1, sigma, cv2.CV_32F)
-    line = np.asarray(taps, np.float32).ravel()
-    line.flags.writeable = False
-    return line
-
-
-def peak_disc(size: float) -> BoolArray:
-    """Neighbourhood in which a peak must be the maximum: a disc mask, shape (side, side)."""
-    reach = 2 * max(1, round(1.2 * size)) + 1
-    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (reach, reach)), bool)

@@ -47,7 +47,7 @@ def tile_noise(image: Picture, rows: int, columns: int) -> Grey:
 
 
 @_compiled(_grey, _ints, _ints, _f)
-def answers(band: Grey, u: IntArray, v: IntArray, step: float) -> FloatArray:
+def responses(band: Grey, u: IntArray, v: IntArray, step: float) -> FloatArray:
     """Largest of 3 × 3 values of a ``step`` times smaller picture about each full-size pixel."""
     height, width = band.shape
     result = np.empty(len(u))

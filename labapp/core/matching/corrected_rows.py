@@ -15,14 +15,14 @@ from labapp.core.geometry.bench import Bench
 from labapp.core.geometry.rig import Rig
 from labapp.core.images.dots import Dots
 from labapp.core.match import Match, Orientation, ways
-from labapp.core.matching.correspondence import lattice_of_match, match_of_hypothesis, match_rays
 from labapp.core.matching.hypothesis import (
-    WIDE_KNOTS,
+    WIDE_FIT,
     Hypothesis,
     evaluate,
     grow_and_evaluate,
     labels_from_lattice,
 )
+from labapp.core.matching.match_rays import lattice_of_match, match_of_hypothesis, match_rays
 from labapp.core.matching.match_settings import MatchSettings
 from labapp.core.matching.observation import LEAST_LABELS, UNLABELLED, Observation
 from labapp.core.rows.lattice import Lattice, Site
@@ -146,11 +146,11 @@ def _bound(
     observed = replace(observed, hidden_rows=frozenset(hidden))
     shape = (pattern.rows, pattern.columns)
     labels = labels_from_lattice(rows, reference, marker, orientation, shape)
-    labels = np.where(observed.absent, UNLABELLED, labels)
+    labels = np.where(observed.rays.absent, UNLABELLED, labels)
     lit = labels != UNLABELLED
     if lit.sum() < (rows.row > 0).sum():  # a site beyond the pattern, or where no ray is
         return None
-    hypothesis = evaluate(observed, labels, WIDE_KNOTS)
+    hypothesis = evaluate(observed, labels, WIDE_FIT)
     if hypothesis is None:
         return None
     wider = grow_and_evaluate(observed, labels)
@@ -166,7 +166,7 @@ def _bound(
         more = ~against.any(axis=-1)
         labels = labels.copy()
         labels[ray[more, 0] - 1, ray[more, 1] - 1] = dot[more]
-        further = evaluate(observed, labels, WIDE_KNOTS)
+        further = evaluate(observed, labels, WIDE_FIT)
         if further is not None and further.cost < hypothesis.cost:
             hypothesis = further
     return _Bound(observed, orientation, hypothesis, contested)
@@ -200,7 +200,7 @@ def _check_bound(bound: _Bound, rows: Lattice, settings: MatchSettings) -> None:
             f"are far from any surface's prediction, most in row {_most(rows.row[wrong])}",
         )
     stray = bound.hypothesis.stray_count
-    if stray > settings.stray[0] + settings.stray[1] * len(observed.plane_mm):
+    if stray > settings.most_strays(len(observed.plane_mm)):
         reason = f"the correction leaves {stray} of {len(observed.plane_mm)} dots without a ray"
         if len(bound.contested):
             row = _most(rows.row[bound.contested])

@@ -9,14 +9,14 @@ import numpy as np
 
 from labapp.core.matching.free_setup import FreeHypothesis, holes_left_open
 from labapp.core.matching.hypothesis import (
-    FINE_KNOTS,
+    FINE_FIT,
     KNOT_ERROR_MM,
     MISSED_COST,
     STRAY_COST,
-    USUAL_KNOTS,
+    USUAL_FIT,
     Hypothesis,
     evaluate,
-    evaluate_twice,
+    evaluate_averaged,
     grow_and_evaluate,
     paths_of,
     reoriented_labels,
@@ -80,13 +80,15 @@ def decide(
         ``no-match``, ``no-reference`` or ``ambiguous-orientation``; ``ambiguous-rows`` if there is
         a dot in the only hole, or a part of the rows is ambiguous.
     """
-    best, found, neighbours, knots = _cheapest(observed, found, settings.margin)
+    best, found, neighbours, fit_settings = _cheapest(observed, found, settings.margin)
     cheapest = best  # rivals keep their doubtful labels: they are compared with this one
-    if knots == FINE_KNOTS:
-        cheapest = evaluate_twice(observed, best.labels, knots, best.pool) or best
-    best = without_doubtful_outermost(observed, without_false_ends(observed, best, knots), knots)
-    if knots == FINE_KNOTS:
-        best = evaluate_twice(observed, best.labels, knots, best.pool) or best
+    if fit_settings == FINE_FIT:
+        cheapest = evaluate_averaged(observed, best.labels, fit_settings, best.pool) or best
+    best = without_doubtful_outermost(
+        observed, without_false_ends(observed, best, fit_settings), fit_settings
+    )
+    if fit_settings == FINE_FIT:
+        best = evaluate_averaged(observed, best.labels, fit_settings, best.pool) or best
     refuse_unexplained(observed, best, settings, most_scattered)
     orientation = best.orientation(observed)
     _refuse_marker(observed, best, found)
@@ -97,8 +99,8 @@ def decide(
         for other in settings.orientations
         if other != orientation
     )
-    for other in [*found, *neighbours, *_rivals(observed, best, others, knots)]:
-        if _clearly_cheaper(observed, cheapest, other, knots, settings):
+    for other in [*found, *neighbours, *_rivals(observed, best, others, fit_settings)]:
+        if _clearly_cheaper(observed, cheapest, other, fit_settings, settings):
             continue
         differing, shared = _differing(best, other)
         if len(differing) <= MOST_DIFFERING * shared:
@@ -110,16 +112,16 @@ def decide(
             )
         else:
             rivals.append(other)
-    best = _without(observed, best, doubtful, knots)
-    best = supported(observed, best, knots)
-    open_holes = holes_left_open(observed, best, knots, settings.margin)
+    best = _without(observed, best, doubtful, fit_settings)
+    best = supported(observed, best, fit_settings)
+    open_holes = holes_left_open(observed, best, fit_settings, settings.margin)
     return best, _with_rivals(open_holes, best, cheapest, rivals)
 
 
 def _refuse_marker(observed: Observation, best: Hypothesis, found: list[Hypothesis]) -> None:
-    """Raise ``no-reference`` or ``ambiguous-rows`` unless the marker is dark between lit rays."""
+    """Raise ``no-reference`` or ``ambiguous-rows`` unless the marker is empty between lit rays."""
     if best.marker == "lit":
-        others_explain = any_explains(observed, [h for h in found if h.marker == "dark"])
+        others_explain = any_explains(observed, [h for h in found if h.marker == "empty"])
         raise CannotMeasure(
             "ambiguous-rows" if others_explain else "no-reference",
             "the best rows have a dot where the absent centre dot would be",
@@ -168,38 +170,42 @@ def _step(one: Hypothesis, other: Hypothesis) -> tuple[int, int]:
     return int(row), int(column)
 
 
-def supported(observed: Observation, best: Hypothesis, knots: FitSettings) -> Hypothesis:
+def supported(observed: Observation, best: Hypothesis, fit_settings: FitSettings) -> Hypothesis:
     """Remove the labels that the surface through the other dots does not support."""
     for _ in range(MOST_LEFT_OUT):
-        settled = _settled(observed, best, knots)
-        wrong = unsupported(observed, fitted_labels(observed, settled, knots))
+        converged = _converged(observed, best, fit_settings)
+        wrong = unsupported(observed, fitted_labels(observed, converged, fit_settings))
         if len(wrong) == 0:
             break
-        best = _without(observed, best, wrong, knots)
+        best = _without(observed, best, wrong, fit_settings)
     return best
 
 
 def _without(
-    observed: Observation, best: Hypothesis, dots: IntArray | list[int], knots: FitSettings
+    observed: Observation, best: Hypothesis, dots: IntArray | list[int], fit_settings: FitSettings
 ) -> Hypothesis:
     """Remove the labels of some dots; the witness of their rays becomes unknown."""
     certain = np.where(np.isin(best.labels, dots), UNLABELLED, best.labels)
     if (certain == best.labels).all():
         return best
     witness = np.where(certain == best.labels, best.witness, 0)
-    return replace(evaluate(observed, certain, knots, initial=best.pool) or best, witness=witness)
+    return replace(
+        evaluate(observed, certain, fit_settings, initial=best.pool) or best, witness=witness
+    )
 
 
-def _settled(observed: Observation, best: Hypothesis, knots: FitSettings) -> Hypothesis:
+def _converged(observed: Observation, best: Hypothesis, fit_settings: FitSettings) -> Hypothesis:
     """Continue the fit of a hypothesis until it has converged as for a reconstruction."""
-    converged = replace(knots, settled_mm=FitSettings().settled_mm)
+    until_settled = replace(fit_settings, settled_mm=FitSettings().settled_mm)
     try:
-        return replace(best, pool=observed.fit(best.labels, best.witness, converged, best.pool))
+        return replace(best, pool=observed.fit(best.labels, best.witness, until_settled, best.pool))
     except CannotMeasure:
         return best
 
 
-def fitted_labels(observed: Observation, best: Hypothesis, knots: FitSettings) -> FittedLabels:
+def fitted_labels(
+    observed: Observation, best: Hypothesis, fit_settings: FitSettings
+) -> FittedLabels:
     """Labels and surface of a hypothesis, as the input of `unsupported`."""
     basis, paths = best.pool.surface.basis, paths_of(observed, best.pool)
     missed = np.ravel_multi_index(tuple(best.missed_rays.T), best.labels.shape)
@@ -218,7 +224,7 @@ def fitted_labels(observed: Observation, best: Hypothesis, knots: FitSettings) -
         paths=paths,
         covariance_mm2=covariance,
         classes=classes,
-        floor_mm=knots.floor_mm,
+        floor_mm=fit_settings.floor_mm,
         unsettled_mm=best.pool.unsettled_mm,
     )
 
@@ -226,32 +232,34 @@ def fitted_labels(observed: Observation, best: Hypothesis, knots: FitSettings) -
 def _cheapest(
     observed: Observation, found: list[Hypothesis], margin: float
 ) -> tuple[Hypothesis, list[Hypothesis], list[Hypothesis], FitSettings]:
-    """The cheapest hypothesis, all found, its neighbours by a row or two, and the knots used."""
+    """The cheapest hypothesis, all found, its neighbours by a row or two, and the settings used."""
     best = min(found, key=lambda hypothesis: hypothesis.cost)
-    knots = USUAL_KNOTS
+    fit_settings = USUAL_FIT
     neighbours: list[Hypothesis] | None = None
     if best.stray_count or best.missed_count:
-        neighbours = _rivals(observed, best, shifted_labels(observed, best.labels), knots)
-    # Residuals of a dip that these knots cannot follow may decide between rivals this close.
+        neighbours = _rivals(observed, best, shifted_labels(observed, best.labels), fit_settings)
+    # Residuals of a dip that this fit cannot follow may decide between rivals this close.
     near = any(rival.cost < best.cost + CLOSE_COST for rival in neighbours or ())
-    if near or best.residual_mm > KNOT_ERROR_MM:
-        knots, neighbours = FINE_KNOTS, None
+    if near or best.residual_rms_mm > KNOT_ERROR_MM:
+        fit_settings, neighbours = FINE_FIT, None
         found = [
-            h for each in found if (h := evaluate_twice(observed, each.labels, knots, each.pool))
+            h
+            for each in found
+            if (h := evaluate_averaged(observed, each.labels, fit_settings, each.pool))
         ]
         best = min(found, key=lambda hypothesis: hypothesis.cost, default=best)
     if neighbours is None and not _beyond_doubt(observed, best, margin):
-        best, neighbours = _with_neighbours(observed, best, knots)
-    if knots == FINE_KNOTS:  # labels are removed by comparing costs of these knots alone
-        best = evaluate(observed, best.labels, knots, initial=best.pool) or best
-    return best, found, neighbours or [], knots
+        best, neighbours = _with_neighbours(observed, best, fit_settings)
+    if fit_settings == FINE_FIT:  # labels are removed by comparing costs of this fit alone
+        best = evaluate(observed, best.labels, fit_settings, initial=best.pool) or best
+    return best, found, neighbours or [], fit_settings
 
 
 def _clearly_cheaper(
     observed: Observation,
     best: Hypothesis,
     other: Hypothesis,
-    knots: FitSettings,
+    fit_settings: FitSettings,
     settings: MatchSettings,
 ) -> bool:
     """Whether the best hypothesis costs less than another by the margin.
@@ -263,14 +271,14 @@ def _clearly_cheaper(
     if other.cost_without_marker < best.cost_without_marker:
         return False
     # With a wrong set-up and many false dots, wrong rows led by more than one margin.
-    many_false = best.stray_count > settings.most_strays(best)
+    many_false = best.stray_count > settings.most_strays(best.label_count + best.stray_count)
     margin = (2 if many_false else 1) * settings.margin
     if other.cost >= best.cost + margin:
         return True
-    if knots != FINE_KNOTS:
+    if fit_settings != FINE_FIT:
         return False
     ahead = []
-    for each in (FINE_KNOTS, USUAL_KNOTS):
+    for each in (FINE_FIT, USUAL_FIT):
         own, rival = (evaluate(observed, h.labels, each, initial=h.pool) for h in (best, other))
         if own is None or rival is None:
             return False
@@ -285,28 +293,30 @@ def _beyond_doubt(observed: Observation, best: Hypothesis, margin: float) -> boo
     that is neither labelled nor stray may be the one at the absent ray.
     """
     every_dot = best.label_count == len(observed.plane_mm)
-    if not every_dot or best.missed_count or best.marker != "dark":
+    if not every_dot or best.missed_count or best.marker != "empty":
         return False
     most = STRAY_COST + MISSED_COST - margin
     if best.misfit < most:
         return True
-    fine = evaluate(observed, best.labels, FINE_KNOTS, initial=best.pool)
+    fine = evaluate(observed, best.labels, FINE_FIT, initial=best.pool)
     return fine is not None and fine.misfit < most
 
 
 def _with_neighbours(
-    observed: Observation, best: Hypothesis, knots: FitSettings
+    observed: Observation, best: Hypothesis, fit_settings: FitSettings
 ) -> tuple[Hypothesis, list[Hypothesis]]:
     """The cheapest hypothesis that shifts by a row or two lead to, and its neighbours.
 
     Shifted labels that come close are grown first, as they may lack dots at their ends.
     """
     while True:  # each round is cheaper than the previous one
-        neighbours = _rivals(observed, best, shifted_labels(observed, best.labels), knots)
+        neighbours = _rivals(observed, best, shifted_labels(observed, best.labels), fit_settings)
         near = [each.labels for each in neighbours if each.cost < best.cost + CLOSE_COST]
-        grown = [h for labels in near if (h := grow_and_evaluate(observed, labels, knots))]
+        grown = [h for labels in near if (h := grow_and_evaluate(observed, labels, fit_settings))]
         grown = [
-            h for each in grown if (h := evaluate_twice(observed, each.labels, knots, each.pool))
+            h
+            for each in grown
+            if (h := evaluate_averaged(observed, each.labels, fit_settings, each.pool))
         ]
         better = min(grown, key=lambda h: h.cost, default=best)
         if better.cost >= best.cost:
@@ -315,19 +325,21 @@ def _with_neighbours(
 
 
 def _rivals(
-    observed: Observation, best: Hypothesis, labelled: Iterable[IntArray], knots: FitSettings
+    observed: Observation, best: Hypothesis, labelled: Iterable[IntArray], fit_settings: FitSettings
 ) -> list[Hypothesis]:
     """Evaluate other labels as rivals of a hypothesis, except those that cannot come close to it.
 
     Their residuals must be comparable. With the usual knots, their cost with a rough fit must be
     comparable too. (Fine knots are used for a dip, which the rough fit does not follow.)
     """
-    most_mm = max(MISFIT_MM, MISFIT_TIMES * best.residual_mm)
+    most_mm = max(MISFIT_MM, MISFIT_TIMES * best.residual_rms_mm)
     quick = try_fit(observed, best.labels, QUICK, best.pool)
     rough = try_fit(observed, best.labels, initial=best.pool)
     far_mm = np.inf if quick is None else QUICK_MISFIT_TIMES * quick.residual_rms_mm
     costs = (
-        None if rough is None or knots == FINE_KNOTS else rough_costs(observed, best.labels, rough)
+        None
+        if rough is None or fit_settings == FINE_FIT
+        else rough_costs(observed, best.labels, rough)
     )
     rivals = []
     for labels in labelled:
@@ -341,7 +353,7 @@ def _rivals(
             unlit, cost = rough_costs(observed, labels, pool)
             if unlit > costs[0] + FAR_COST and cost > costs[1] + FAR_COST + CLOSE_COST:
                 continue
-        hypothesis = evaluate_twice(observed, labels, knots, pool)
+        hypothesis = evaluate_averaged(observed, labels, fit_settings, pool)
         rivals += [] if hypothesis is None else [hypothesis]
     return rivals
 

@@ -19,11 +19,11 @@ import numpy as np
 from labapp.core.geometry.bench import Bench
 from labapp.core.match import MatchedDots
 from labapp.core.matching.hypothesis import (
-    STEPS,
-    USUAL_KNOTS,
+    SHIFTS,
+    USUAL_FIT,
     Hypothesis,
     evaluate,
-    evaluate_twice,
+    evaluate_averaged,
     grow_and_evaluate,
     shifted_by,
     variance_mm2,
@@ -36,7 +36,7 @@ from labapp.core.values import IntArray
 
 @dataclass(frozen=True)
 class FreeHypothesis:
-    """Labels with the set-up with which they are likeliest, given its uncertainty.
+    """Labels, and their cost with the set-up that makes them likeliest, given its uncertainty.
 
     Parameters
     ----------
@@ -57,7 +57,7 @@ class FreeHypothesis:
 
 
 def holes_left_open(
-    observed: Observation, best: Hypothesis, knots: FitSettings, margin: float
+    observed: Observation, best: Hypothesis, fit_settings: FitSettings, margin: float
 ) -> list[FreeHypothesis]:
     """Hypotheses for each hole that may be the marker's, with a free set-up.
 
@@ -71,8 +71,8 @@ def holes_left_open(
         The dots, and the bench with its uncertainty.
     best
         The best hypothesis.
-    knots
-        Fit settings of the evaluation (`evaluate_twice`).
+    fit_settings
+        Fit settings of the evaluation (`evaluate_averaged`).
     margin
         Largest difference in cost, in units of χ².
 
@@ -84,12 +84,12 @@ def holes_left_open(
     steps = [] if observed.rig.uncertainty is None else _steps_to_other_holes(observed, best)
     if not steps:
         return []
-    own = with_setup_free(observed, best, knots)
+    own = with_setup_free(observed, best, fit_settings)
     rivals = []
     for step in steps:
         shifted = evaluate(observed, shifted_by(observed, best.labels, step))
         if shifted is not None:
-            rival = with_setup_free(observed, shifted, knots, own.given_cost + margin)
+            rival = with_setup_free(observed, shifted, fit_settings, own.given_cost + margin)
             if rival.cost < own.cost + margin:
                 rivals.append(replace(rival, step=step))
     return [own, *rivals] if rivals else []
@@ -100,11 +100,11 @@ def _steps_to_other_holes(observed: Observation, best: Hypothesis) -> list[tuple
     marker = observed.rig.pattern.marker
     assert marker is not None
     holes = np.pad(best.labels == UNLABELLED, 2)  # beyond the pattern is no hole
-    return [step for step in STEPS if holes[marker[0] + 1 - step[0], marker[1] + 1 - step[1]]]
+    return [step for step in SHIFTS if holes[marker[0] + 1 - step[0], marker[1] + 1 - step[1]]]
 
 
 def with_setup_free(
-    observed: Observation, hypothesis: Hypothesis, knots: FitSettings, most: float = np.inf
+    observed: Observation, hypothesis: Hypothesis, fit_settings: FitSettings, most: float = np.inf
 ) -> FreeHypothesis:
     """Evaluate labels with the set-up with which they are likeliest.
 
@@ -112,9 +112,9 @@ def with_setup_free(
     and squared deviations of the set-up, both in σ, while the surface is refitted. Costs are
     infinite without a surface, and if the cost of the given labels is not below ``most``.
     """
-    labels, known = hypothesis.labels, observed.rig.uncertainty
-    pool = try_fit(observed, labels, USUAL_KNOTS, hypothesis.pool)
-    if pool is None or known is None:
+    labels, uncertainty = hypothesis.labels, observed.rig.uncertainty
+    pool = try_fit(observed, labels, USUAL_FIT, hypothesis.pool)
+    if pool is None or uncertainty is None:
         return FreeHypothesis(labels)
     at = np.argwhere(labels != UNLABELLED)
     dot = labels[tuple(at.T)]
@@ -122,18 +122,21 @@ def with_setup_free(
     matched = MatchedDots(
         at + 1, observed.plane_mm[dot], observed.covariance_mm2[dot], hypothesis.witness
     )
-    change = residual_changes(matched, observed.rig, USUAL_KNOTS, pool).reshape(len(sigma), -1)
+    change = residual_changes(matched, observed.rig, USUAL_FIT, pool).reshape(len(sigma), -1)
     finite = np.isfinite(change).all(axis=1)  # a ray at the rim may leave the splines
     jacobian = change[finite] / sigma[finite, None]
     rhs = -jacobian.T @ (pool.residual_mm.ravel() / sigma)[finite]
     deviation = np.linalg.solve(jacobian.T @ jacobian + np.eye(len(rhs)), rhs)
-    rig, plane_mm = perturbed(observed.rig, known.root @ deviation, observed.plane_mm)
+    rig, plane_mm = perturbed(observed.rig, uncertainty.root @ deviation, observed.plane_mm)
     moved = replace(observed, bench=Bench(rig, observed.bench.calibration), plane_mm=plane_mm)
-    found, setup_cost = evaluate_twice(moved, labels, knots, pool), float(deviation @ deviation)
+    found, setup_cost = (
+        evaluate_averaged(moved, labels, fit_settings, pool),
+        float(deviation @ deviation),
+    )
     if found is None or found.cost + setup_cost >= most:
         return FreeHypothesis(labels)
     more = grow_and_evaluate(moved, labels)
-    grown = more and evaluate_twice(moved, more.labels, knots, more.pool)
+    grown = more and evaluate_averaged(moved, more.labels, fit_settings, more.pool)
     least = grown if grown and grown.cost < found.cost else found
     return FreeHypothesis(
         least.labels, given_cost=found.cost + setup_cost, cost=least.cost + setup_cost

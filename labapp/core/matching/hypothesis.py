@@ -41,8 +41,8 @@ from labapp.core.values import BoolArray, CannotMeasure, FloatArray, IntArray
 KNOT_ERROR_MM = 0.045
 """Standard error of dots, mm, because the knots of the correct surface cannot follow a dent."""
 
-USUAL_KNOTS = FitSettings(settled_mm=1e-3)
-FINE_KNOTS, WIDE_KNOTS = replace(USUAL_KNOTS, knot_mm=0.5), replace(USUAL_KNOTS, knot_mm=1.0)
+USUAL_FIT = FitSettings(settled_mm=1e-3)
+FINE_FIT, WIDE_FIT = replace(USUAL_FIT, knot_mm=0.5), replace(USUAL_FIT, knot_mm=1.0)
 """Fit settings for the evaluation of a hypothesis. Their knots are those of the final fit; fine
 enough for a narrow dip under the torch, whose residuals would mask what is unexplained; or wide
 enough that a row which the operator has shifted stands out."""
@@ -63,9 +63,9 @@ the boundary, in units of χ²."""
 ROUGHNESS_FREEDOM = 100.0
 """Degrees of freedom with which the expected size of a surface's third derivatives is known."""
 
-Marker = Literal["dark", "lit", "unknown"]
-"""State of the place of the marker's absent dot: ``lit``, there is a dot; ``dark``, there is none,
-between labelled rays; ``unknown``, there is none, but none need be visible there either."""
+Marker = Literal["empty", "lit", "unknown"]
+"""State of the place of the marker's absent dot: ``lit``, there is a dot; ``empty``, there is
+none, between labelled rays; ``unknown``, there is none, but none need be visible there either."""
 
 WEAK_NEIGHBOURS, FALSE_MARGIN = 3, 2 * np.log(10)
 """A label with at most this number of labelled neighbours is weak: it depends on the dots on one
@@ -76,12 +76,12 @@ MARKER_SPACINGS = 1 / 3
 """The marker is lit if a dot is nearer than this fraction of the distance to the nearest
 prediction."""
 
-STEPS = tuple((i, j) for i, j in product(range(-2, 3), repeat=2) if 0 < abs(i) + abs(j) < 3)
+SHIFTS = tuple((i, j) for i, j in product(range(-2, 3), repeat=2) if 0 < abs(i) + abs(j) < 3)
 """Rows and columns by which labels are shifted."""
 
 AGREED = 0.8
-"""Minimum share of the dots of a hypothesis in the grid that must have the same offset of rays from
-sites."""
+"""Minimum share of the dots of a hypothesis in the lattice that must have the same offset of rays
+from sites."""
 
 
 @dataclass(frozen=True)
@@ -150,7 +150,7 @@ class Hypothesis:
         return count_labels(self.labels)
 
     @property
-    def residual_mm(self) -> float:
+    def residual_rms_mm(self) -> float:
         """Root mean square distance of computed from captured dots, mm."""
         return self.pool.residual_rms_mm
 
@@ -167,12 +167,12 @@ class Hypothesis:
 def grow_and_evaluate(
     observed: Observation,
     labels: IntArray,
-    settings: FitSettings = USUAL_KNOTS,
+    fit_settings: FitSettings = USUAL_FIT,
     knot_mm: float | None = None,
 ) -> Hypothesis | None:
     """Grow labels (`grow_labels`) and evaluate the result; None if no surface fits it."""
     grown = grow_labels(observed, labels, knot_mm)
-    hypothesis = None if grown is None else evaluate(observed, grown, settings)
+    hypothesis = None if grown is None else evaluate(observed, grown, fit_settings)
     if hypothesis is None:
         return None
     outside = _outside(observed, hypothesis)
@@ -181,24 +181,24 @@ def grow_and_evaluate(
         return hypothesis
     labels = hypothesis.labels.copy()
     labels[outside[:, 0], outside[:, 1]] = UNLABELLED
-    return evaluate(observed, labels, settings)
+    return evaluate(observed, labels, fit_settings)
 
 
 def _outside(observed: Observation, hypothesis: Hypothesis) -> IntArray:
     """Labelled rays that land well outside the boundary of the fit."""
     at = np.argwhere(hypothesis.labels != UNLABELLED)
-    x, y = observed.landing_mm[at[:, 0], at[:, 1], :2].T
+    x, y = observed.rays.landing_mm[at[:, 0], at[:, 1], :2].T
     height, slope = hypothesis.pool.surface.height_and_gradient(x, y)
     level = hypothesis.pool.level
     inward = level.sign * (height - level.rear.height(y))
-    far = inward < -BEYOND_SPACINGS * np.linalg.norm(slope * observed.spacing_mm, axis=-1)
+    far = inward < -BEYOND_SPACINGS * np.linalg.norm(slope * observed.rays.spacing_mm, axis=-1)
     return np.asarray(at[far])
 
 
 def evaluate(
     observed: Observation,
     labels: IntArray,
-    settings: FitSettings = USUAL_KNOTS,
+    fit_settings: FitSettings = USUAL_FIT,
     initial: FittedPool | None = None,
 ) -> Hypothesis | None:
     """Fit the surface to given labels and compute their cost; None if no surface fits them.
@@ -210,7 +210,7 @@ def evaluate(
         return None
     witness = classify_rays(observed, labels, paths_of(observed, pool)).witness
     try:
-        pool = observed.fit(labels, witness, settings, pool)
+        pool = observed.fit(labels, witness, fit_settings, pool)
     except CannotMeasure:
         return None
     paths = paths_of(observed, pool)
@@ -223,22 +223,22 @@ def evaluate(
         stray_dots=classes.stray,
         marker=marker,
         misfit_without_marker=cost + _boundary_cost(pool.level),
-        roughness=_roughness_cost(pool, settings),
+        roughness=_roughness_cost(pool, fit_settings),
     )
 
 
-def evaluate_twice(
-    observed: Observation, labels: IntArray, knots: FitSettings, initial: FittedPool
+def evaluate_averaged(
+    observed: Observation, labels: IntArray, fit_settings: FitSettings, initial: FittedPool
 ) -> Hypothesis | None:
     """Evaluate labels; with fine knots the cost is the mean of those with fine and usual knots.
 
     The usual knots do not follow a dip; fine ones allow the rough surface that wrong labels need.
     A marker that is lit with the usual knots counts as lit.
     """
-    hypothesis = evaluate(observed, labels, knots, initial=initial)
-    if hypothesis is None or knots != FINE_KNOTS:
+    hypothesis = evaluate(observed, labels, fit_settings, initial=initial)
+    if hypothesis is None or fit_settings != FINE_FIT:
         return hypothesis
-    usual = evaluate(observed, labels, USUAL_KNOTS, initial=initial)
+    usual = evaluate(observed, labels, USUAL_FIT, initial=initial)
     if usual is None:
         return None
     marker = "lit" if usual.marker == "lit" else hypothesis.marker
@@ -290,12 +290,12 @@ def _boundary_cost(level: Level) -> float:
     return min(2 * share * level.negative_log_likelihood, MOST_BOUNDARY_COST)
 
 
-def _roughness_cost(pool: FittedPool, settings: FitSettings) -> float:
+def _roughness_cost(pool: FittedPool, fit_settings: FitSettings) -> float:
     """−2 log probability of a surface's third derivatives, whose expected size is uncertain.
 
     Wrong labels nearly always need a rougher surface than correct ones.
     """
-    ratio = CORRELATED_MM2 / settings.jerk**2 * pool.surface.roughness() / ROUGHNESS_FREEDOM
+    ratio = CORRELATED_MM2 / fit_settings.jerk**2 * pool.surface.roughness() / ROUGHNESS_FREEDOM
     return ROUGHNESS_FREEDOM * float(np.log1p(ratio))
 
 
@@ -314,13 +314,13 @@ def _marker_state(observed: Observation, lit: BoolArray, pool: FittedPool) -> Ma
     place, spacing = predicted.plane_mm[is_marker][0], predicted.spacing_mm[is_marker][0]
     if np.linalg.norm(observed.plane_mm - place, axis=-1).min() < spacing * MARKER_SPACINGS:
         return "lit"
-    return "dark" if amid(lit)[at] else "unknown"
+    return "empty" if amid(lit)[at] else "unknown"
 
 
 def without_false_ends(
-    observed: Observation, hypothesis: Hypothesis, settings: FitSettings = USUAL_KNOTS
+    observed: Observation, hypothesis: Hypothesis, fit_settings: FitSettings = USUAL_FIT
 ) -> Hypothesis:
-    """Remove labels because of which alone a dark ray lies between lit ones, if that costs less.
+    """Remove a label that is the only one on its side of a missed ray, if that costs less.
 
     Beyond the last row a false dot may lie where the dot of a ray is predicted.
     """
@@ -329,15 +329,15 @@ def without_false_ends(
     for at in {at for ray in hypothesis.missed_rays.tolist() for at in _alone_around(lit, ray)}:
         labels = hypothesis.labels.copy()
         labels[at] = UNLABELLED
-        fewer.append(evaluate(observed, labels, settings, initial=hypothesis.pool))
+        fewer.append(evaluate(observed, labels, fit_settings, initial=hypothesis.pool))
     best = min((h for h in fewer if h), key=lambda h: h.cost, default=hypothesis)
     if best.cost >= hypothesis.cost:
         return hypothesis
-    return without_false_ends(observed, best, settings)
+    return without_false_ends(observed, best, fit_settings)
 
 
 def without_doubtful_outermost(
-    observed: Observation, hypothesis: Hypothesis, settings: FitSettings = USUAL_KNOTS
+    observed: Observation, hypothesis: Hypothesis, fit_settings: FitSettings = USUAL_FIT
 ) -> Hypothesis:
     """Remove outermost labels that a false dot explains as well as their ray does.
 
@@ -349,25 +349,25 @@ def without_doubtful_outermost(
     if not weak.any():
         return hypothesis
     strong = np.where(weak, UNLABELLED, hypothesis.labels)
-    pool = try_fit(observed, strong, settings, hypothesis.pool)
+    pool = try_fit(observed, strong, fit_settings, hypothesis.pool)
     if pool is None:
         return hypothesis
     rays = predict(observed, pool, weak)
     deviance = pair_deviances(observed, pool, rays, hypothesis.labels[tuple(rays.at.T)])[
         1
     ].diagonal()
-    false_per_mm2 = max(FALSE_DOTS_PER_MM2, (hypothesis.stray_count + 1) / observed.view_mm2)
+    false_per_mm2 = max(FALSE_DOTS_PER_MM2, (hypothesis.stray_count + 1) / observed.frame_area_mm2)
     certain = deviance + RIVAL_MARGIN + FALSE_MARGIN < false_dot_deviance(false_per_mm2)
     kept = strong.copy()
     at = tuple(rays.at[certain].T)
     kept[at] = hypothesis.labels[at]
     if (kept == hypothesis.labels).all():
         return hypothesis
-    return evaluate(observed, kept, settings, initial=hypothesis.pool) or hypothesis
+    return evaluate(observed, kept, fit_settings, initial=hypothesis.pool) or hypothesis
 
 
 def _alone_around(lit: BoolArray, ray: list[int]) -> list[tuple[int, int]]:
-    """Lit rays, counted from 0, because of which alone a dark ray lies between lit ones."""
+    """Lit rays, counted from 0, that are the only ones on their side of a missed ray."""
     i, j = ray
     across = [np.flatnonzero(lit[i, :j]), np.flatnonzero(lit[i, j + 1 :]) + j + 1]
     along = [np.flatnonzero(lit[:i, j]), np.flatnonzero(lit[i + 1 :, j]) + i + 1]
@@ -381,7 +381,7 @@ def _alone_around(lit: BoolArray, ray: list[int]) -> list[tuple[int, int]]:
 def labels_from_lattice(
     lattice: Lattice, hole: Site, ray: Site, orientation: Orientation, shape: tuple[int, int]
 ) -> IntArray:
-    """Label a complete grid, given the site (k, t) of the hole and its absent ray (i, j).
+    """Label a complete lattice, given the site (k, t) of the hole and its absent ray (i, j).
 
     Labels have the pattern's shape (rows, columns); dots at sites beyond it get no ray.
     """
@@ -390,10 +390,10 @@ def labels_from_lattice(
     return _labels_of_pairs(np.array(ray) + (site - hole) * ways(orientation), dot, shape)
 
 
-def extended_over_grid(
+def extended_over_lattice(
     hypothesis: Hypothesis, lattice: Lattice, orientation: Orientation
 ) -> IntArray | None:
-    """Extend the labels of a hypothesis over the grid; None if the two disagree."""
+    """Extend the labels of a hypothesis over the lattice; None if the two disagree."""
     labels = hypothesis.labels
     at = np.argwhere(labels != UNLABELLED)
     dot = labels[at[:, 0], at[:, 1]]
@@ -405,11 +405,11 @@ def extended_over_grid(
     kinds, count = np.unique(offset, axis=0, return_counts=True)
     if count.max() < AGREED * len(offset):
         return None
-    on_grid = np.nonzero(site[:, 0] > 0)[0]
-    ray = site[on_grid] * ways(orientation) + kinds[np.argmax(count)]
-    grid = _labels_of_pairs(ray, on_grid, labels.shape)
-    others = np.where(np.isin(labels, on_grid), UNLABELLED, labels)
-    return np.where(grid != UNLABELLED, grid, others)
+    on_lattice = np.nonzero(site[:, 0] > 0)[0]
+    ray = site[on_lattice] * ways(orientation) + kinds[np.argmax(count)]
+    sited = _labels_of_pairs(ray, on_lattice, labels.shape)
+    others = np.where(np.isin(labels, on_lattice), UNLABELLED, labels)
+    return np.where(sited != UNLABELLED, sited, others)
 
 
 def shifted_labels(observed: Observation, labels: IntArray) -> Iterator[IntArray]:
@@ -418,7 +418,7 @@ def shifted_labels(observed: Observation, labels: IntArray) -> Iterator[IntArray
     A shift changes the surface slightly and hardly affects the residuals. It is what a single frame
     determines least well.
     """
-    for step in STEPS:
+    for step in SHIFTS:
         yield shifted_by(observed, labels, step)
 
 
@@ -426,7 +426,7 @@ def shifted_by(observed: Observation, labels: IntArray, step: tuple[int, ...]) -
     """Shift labels by rows and columns."""
     at = np.argwhere(labels != UNLABELLED)
     shifted = _labels_of_pairs(at + 1 + step, labels[tuple(at.T)], labels.shape)
-    shifted[observed.absent] = UNLABELLED
+    shifted[observed.rays.absent] = UNLABELLED
     return shifted
 
 

@@ -30,7 +30,7 @@ FEW_UNLABELLED = 0.06
 """Share of the dots that may be false or hidden. If more remain unlabelled, growth is retried."""
 
 FEW_LABELS = 25
-"""A complete grid labels more dots than this; a quadric around a hole labels fewer."""
+"""A complete lattice labels more dots than this; a quadric around a hole labels fewer."""
 
 # Only knots as fine as those of the final fit follow a dent; with few labels, wider knots
 # extrapolate farther.
@@ -80,7 +80,7 @@ def grow_labels(
         for settings in stages:
             key = labels.tobytes(), settings
             if key not in settled:
-                settled[key] = _settled(observed, labels, settings)
+                settled[key] = _grown_until_stable(observed, labels, settings)
             if (grown := settled[key]) is not None:
                 settled[grown.tobytes(), settings] = grown  # they would not change
             if grown is not None and (best is None or count_labels(grown) > count_labels(best)):
@@ -101,7 +101,9 @@ def _without_outermost(labels: IntArray) -> IntArray:
     return np.where(neighbours_of(labels != UNLABELLED) >= LEAST_NEIGHBOURS, labels, UNLABELLED)
 
 
-def _settled(observed: Observation, labels: IntArray, settings: FitSettings) -> IntArray | None:
+def _grown_until_stable(
+    observed: Observation, labels: IntArray, settings: FitSettings
+) -> IntArray | None:
     """Predict and match until the labels no longer change, or repeat an earlier state."""
     before: list[bytes] = []
     pool: FittedPool | None = None
@@ -132,7 +134,7 @@ def matched_labels(observed: Observation, pool: FittedPool, labels: IntArray) ->
     dots, covariance = np.arange(len(observed.plane_mm)), far.covariance_mm2(pool, observed.rig)
     dot, ray = sure_pairs(observed, dots, far.plane_mm, covariance)
     at = far.at[ray]
-    taken = within_rings(labels, 1)[at[:, 0], at[:, 1]] & ~observed.absent[at[:, 0], at[:, 1]]
+    taken = within_rings(labels, 1)[at[:, 0], at[:, 1]] & ~observed.rays.absent[at[:, 0], at[:, 1]]
     # The positions of dots that merge are not those of either ray.
     taken &= far.spacing_mm[ray] > observed.resolution_mm
     matched[at[taken, 0], at[taken, 1]] = dot[taken]

@@ -6,7 +6,7 @@ import numpy as np
 from numba import types
 
 from labapp.core.compiled import compiled, inner
-from labapp.core.images.dot_kernels import next_apart, two_nearest
+from labapp.core.images.band_pass_kernels import next_apart, two_nearest
 from labapp.core.surface.kernels.ray_kernels import behind_torch
 from labapp.core.values import BoolArray, FloatArray, IntArray
 
@@ -178,7 +178,13 @@ def sure_pairs(
     place, prediction
         Indices of each pair, in the order of the places.
     """
-    inflation, error, gate, margin, false = limits
+    (
+        inflation,
+        error,
+        gate,
+        margin,
+        false,
+    ) = limits
     count = len(places), len(predicted)
     # Of each place and of each prediction the least deviance and the next one.
     by_place, by_prediction = np.full((2, count[0]), np.inf), np.full((2, count[1]), np.inf)
@@ -207,7 +213,7 @@ def sure_pairs(
     for n in range(count[0]):
         m = prediction[n]
         if m >= 0:
-            # If another place is likelier for m, the second one there is this place or likelier.
+            # If m has a likelier place, by_prediction[1, m] is at most this deviance, which fails.
             rival = min(by_place[1, n], by_prediction[1, m], false)
             if not near[n] or not by_place[0, n] + margin < rival:
                 prediction[n] = -1
@@ -250,13 +256,13 @@ def classify_rays(
     """
     (points, slopes, plane), (tip, resolution) = paths, limits
     is_lit = labels >= 0
-    lit, between, dark = is_lit.ravel(), amid(is_lit).ravel(), without_dot.ravel()
+    lit, amid_lit, dotless = is_lit.ravel(), amid(is_lit).ravel(), without_dot.ravel()
     known = np.flatnonzero(np.isfinite(plane[:, 0]))
     shown = plane[known]
     blocked = behind_torch(points[known], rays[known], slopes[known], tip)
     seen = within_view(shown, np.zeros_like(shown), view[0], view[1], view[2]) & ~blocked
 
-    among = np.flatnonzero(between[known] & ~dark[known])
+    among = np.flatnonzero(amid_lit[known] & ~dotless[known])
     merged = next_apart(shown[among]) < resolution
     is_missed = seen[among] & ~merged & ~lit[known[among]]
     missed = known[among[is_missed]]
@@ -266,7 +272,7 @@ def classify_rays(
             unlabelled[label] = False
     stray = np.flatnonzero(unlabelled)
     candidates = dots[stray]
-    around = np.flatnonzero(widened(amid(is_lit)).ravel()[known] & ~dark[known])
+    around = np.flatnonzero(widened(amid(is_lit)).ravel()[known] & ~dotless[known])
     around = around[next_apart(shown[around]) < resolution]
     if len(stray) and len(around):
         apart = two_nearest(candidates, shown[around])[0][:, 0] > resolution
@@ -280,8 +286,8 @@ def classify_rays(
         away = two_nearest(shown, candidates)[0][:, 0]
     for k in range(len(known)):
         ray = known[k]
-        is_open = between[ray] or dark[ray] or away[k] < spacing[k]
-        if seen[k] and spacing[k] >= resolution and not is_open:
+        may_be_lit = amid_lit[ray] or dotless[ray] or away[k] < spacing[k]
+        if seen[k] and spacing[k] >= resolution and not may_be_lit:
             witness[ray] = -1
     witness[lit] = 1
     return witness, missed, stray
@@ -413,8 +419,20 @@ def failing_labels(
     BoolArray
         Shape (rows, columns).
     """
-    floor, unsettled, leverage, inflation, error, median, false, gate, margin = limits[:9]
-    rim_neighbours, rim_sigma2, rim_times = limits[9:]
+    (
+        floor,
+        unsettled,
+        leverage,
+        inflation,
+        error,
+        median,
+        false,
+        gate,
+        margin,
+        rim_neighbours,
+        rim_sigma2,
+        rim_times,
+    ) = limits
     (places, seen), (predicted, drawn) = dots, surface
     rays = np.flatnonzero(labels.ravel() >= 0)
     number = labels.ravel()[rays]
@@ -433,6 +451,7 @@ def failing_labels(
         i, j = rays[n] // labels.shape[1], rays[n] % labels.shape[1]
         beside = labels[max(i - 1, 0) : i + 2, max(j - 1, 0) : j + 2]
         at_rim = np.sum(beside >= 0) - 1 <= rim_neighbours
+        # If the dot is false, the ray shows none: odds of ``shows``.
         by_ray = deviance[n] + 2.0 * np.log(1.0 - shows[n]) - 2.0 * np.log(max(shows[n], 1e-300))
         rival = min(
             _least_deviance(own[n] + off[n], spread[n], places[stray], seen[stray], excess),

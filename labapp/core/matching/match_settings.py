@@ -22,7 +22,7 @@ class MatchSettings:
         Two hypotheses whose costs differ by less, in units of χ², cannot be distinguished.
     stray, missed
         How many stray dots and missed rays are accepted: a number, and a share of the dots
-        (`most_strays`, `leaves_much`) that is added to it.
+        (`most_strays`, `most_missed`) that is added to it.
     """
 
     correspondence: Literal["auto", "S/S", "S/I", "I/I"] = "auto"
@@ -35,14 +35,17 @@ class MatchSettings:
         """Orientations to try."""
         return ORIENTATIONS if self.correspondence == "auto" else (self.correspondence,)
 
-    def most_strays(self, hypothesis: Hypothesis) -> float:
-        """Return how many stray dots are accepted, wherever they lie."""
-        return self.stray[0] + self.stray[1] * (hypothesis.label_count + hypothesis.stray_count)
+    def most_strays(self, dots: int) -> float:
+        """Return how many of a number of dots are accepted as stray, wherever they lie."""
+        return self.stray[0] + self.stray[1] * dots
+
+    def most_missed(self, labels: int) -> float:
+        """Return how many missed rays are accepted for a number of labels, wherever they lie."""
+        return self.missed[0] + self.missed[1] * labels
 
     def leaves_much(self, hypothesis: Hypothesis) -> bool:
         """Whether more dots or rays are unexplained than are accepted wherever they lie."""
-        most_missed = self.missed[0] + self.missed[1] * hypothesis.label_count
-        return (
-            hypothesis.stray_count > self.most_strays(hypothesis)
-            or hypothesis.missed_count > most_missed
-        )
+        labels, strays = hypothesis.label_count, hypothesis.stray_count
+        return strays > self.most_strays(
+            labels + strays
+        ) or hypothesis.missed_count > self.most_missed(labels)

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from labapp.core.geometry.bench import Bench
+from labapp.core.geometry.optics import ProjectedRays
 from labapp.core.geometry.rig import Rig
 from labapp.core.images.dots import Dots
 from labapp.core.match import MatchedDots
@@ -46,11 +47,13 @@ EDGE_MM, EDGE_PX = 0.5, 4.0
 """A dot nearer to the edge of the plane or of the frame may be cut off and does not count as in
 view: about the radius of a dot."""
 
-# During labelling dots have a larger floor of their uncertainty than in the final fit, so that the
-# smoothness counts more and a wrong label has a large residual instead of bending the surface. The
-# stiffer surface extrapolates a shallow pool farther; a steep pool needs the softer one.
 STIFF = FitSettings(rounds=5, jerk=0.05, floor_mm=0.03, settled_mm=2e-3)
 SOFT = replace(STIFF, jerk=0.12)
+"""Fit settings for labelling. Dots have a larger floor of their uncertainty than in the final fit,
+so that the smoothness counts more and a wrong label has a large residual instead of bending the
+surface. The stiffer surface extrapolates a shallow pool farther; a steep pool needs the softer one.
+"""
+
 QUICK = replace(SOFT, knot_mm=1.5, rounds=3)
 """Fit settings for ranking many sets of labels: the correct one is near the top of the ranking."""
 
@@ -85,11 +88,13 @@ class Observation(ReadOnlyArrays):
     @classmethod
     def of(cls, dots: Dots, bench: Bench, frame_shape: tuple[int, int]) -> Observation:
         """Map the dots of a frame, of shape (height, width), px, to the imaging plane."""
-        from labapp.core.images import dot_kernels
+        from labapp.core.images import band_pass_kernels
 
         sigma = np.stack([dots.u_sigma_px, dots.v_sigma_px], axis=-1)
         image_px = bench.calibration.ideal_px(dots.image_px)
-        plane, covariance, scale = dot_kernels.on_plane(bench.calibration.matrix, image_px, sigma)
+        plane, covariance, scale = band_pass_kernels.on_plane(
+            bench.calibration.matrix, image_px, sigma
+        )
         return cls(plane, covariance, dots.size_px * scale, bench, frame_shape)
 
     @cached_property
@@ -103,37 +108,22 @@ class Observation(ReadOnlyArrays):
         return self.bench.rig
 
     @property
-    def rays(self) -> FloatArray:
-        """Directions of the rays, shape (rows, columns, 3)."""
-        return self.bench.rays.directions
-
-    @property
-    def landing_mm(self) -> FloatArray:
-        """Where the rays would land on z = 0, shape (rows, columns, 3), mm."""
-        return self.bench.rays.landing_mm
-
-    @property
-    def spacing_mm(self) -> FloatArray:
-        """Distance between neighbouring landing points along X and along Y, shape (2,), mm."""
-        return self.bench.rays.spacing_mm
+    def rays(self) -> ProjectedRays:
+        """The rays of the pattern."""
+        return self.bench.rays
 
     @cached_property
-    def view_mm2(self) -> float:
+    def frame_area_mm2(self) -> float:
         """Area of the imaging plane that the frame shows, mm²."""
         height, width = self.frame_shape
         corners = np.array([[0, 0], [width, 0], [width, height], [0, height]], float)
         seen = self.bench.calibration.to_plane(corners).astype(np.float32)
         return float(cv2.contourArea(seen))
 
-    @property
-    def absent(self) -> BoolArray:
-        """Rays that the lens does not make, shape (rows, columns)."""
-        return self.bench.rays.absent
-
     @cached_property
     def hidden(self) -> BoolArray:
         """Rays of `hidden_rows`, shape (rows, columns)."""
-        mask = np.zeros(self.rays.shape[:2], bool)
+        mask = np.zeros(self.rays.absent.shape, bool)
         mask[[i - 1 for i in self.hidden_rows if 1 <= i <= len(mask)]] = True
         mask.flags.writeable = False
         return mask

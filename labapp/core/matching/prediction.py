@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,13 +30,9 @@ FALSE_DOTS_PER_MM2 = 5e-4
 """Expected density of false dots on the imaging plane: a few per frame. Where a prediction is
 uncertain, a dot is as likely to be false as to belong to the ray."""
 
-OUT_OF_VIEW_SIGMA, LEAST_LINE = 2.5, 3
-"""A row of rays next to the last lit row may have left the view if at least `LEAST_LINE` of its
-dots are predicted in view by less than `OUT_OF_VIEW_SIGMA` σ. Its rays then are not known to be
-dark."""
-
-NEAR_EDGE_MM = 8.0
-"""The uncertainty of predictions is computed only within this distance of the edge of the view."""
+NEWTON_STEPS = 4
+"""Newton steps from the landing points to the surface: rays near labelled ones land close to where
+they meet it. `RayPaths.of` takes more, as it includes rays far outside."""
 
 
 @dataclass(frozen=True)
@@ -132,7 +127,7 @@ def covariance_of_dots(
 
 def predict(observed: Observation, pool: FittedPool, where: BoolArray) -> Prediction:
     """Predict the dots of those rays in a mask, shape (rows, columns), that reach the plane."""
-    from labapp.core.images import dot_kernels
+    from labapp.core.images import band_pass_kernels
     from labapp.core.surface.kernels import ray_kernels
 
     at = np.argwhere(where)
@@ -140,14 +135,14 @@ def predict(observed: Observation, pool: FittedPool, where: BoolArray) -> Predic
     points, slopes, plane = ray_kernels.intersect_and_reflect(
         surface.basis.grid,
         surface.coefficients,
-        observed.rays[index],
-        observed.landing_mm[index],
-        4,
+        observed.rays.directions[index],
+        observed.rays.landing_mm[index],
+        NEWTON_STEPS,
         pose,
     )
     finite = np.isfinite(plane[:, 0])
     at, points, slopes, plane = at[finite], points[finite], slopes[finite], plane[finite]
-    return Prediction(at, points, slopes, plane, dot_kernels.next_apart(plane))
+    return Prediction(at, points, slopes, plane, band_pass_kernels.next_apart(plane))
 
 
 def sure_pairs(
@@ -173,13 +168,21 @@ def sure_pairs(
     """
     from labapp.core.matching import match_kernels
 
-    variances = SIGMA_INFLATION**2, MODEL_ERROR_MM**2
+    limits = np.array(
+        [
+            SIGMA_INFLATION**2,  # inflation
+            MODEL_ERROR_MM**2,  # error
+            GATE_SIGMA2,  # gate
+            RIVAL_MARGIN,  # margin
+            false_dot_deviance(),  # false
+        ]
+    )
     dot, ray = match_kernels.sure_pairs(
         observed.plane_mm[dots],
         observed.covariance_mm2[dots],
         plane_mm,
         covariance_mm2,
-        np.array([*variances, GATE_SIGMA2, RIVAL_MARGIN, false_dot_deviance()]),
+        limits,
     )
     return dots[dot], ray
 
@@ -213,39 +216,3 @@ def _enlarged(covariance_mm2: FloatArray) -> FloatArray:
 def false_dot_deviance(per_mm2: float = FALSE_DOTS_PER_MM2) -> float:
     """Deviance of a false dot for a density of false dots, comparable with `pair_deviances`."""
     return -2 * float(np.log(2 * np.pi * per_mm2))
-
-
-def lines_out_of_view(
-    observed: Observation,
-    view: tuple[FloatArray, FloatArray, FloatArray],
-    at: IntArray,
-    plane_mm: FloatArray,
-    covariance_of: Callable[[BoolArray], FloatArray],
-) -> BoolArray:
-    """Mask of rays in rows or columns that may have left the view, shape (rows, columns).
-
-    Parameters
-    ----------
-    observed, view
-        The frame's dots, and the limits of the view (`Observation.view_with`).
-    at, plane_mm
-        Dark rays next to lit ones and their predicted dots, as in `Prediction`, shapes (m, 2), mm.
-    covariance_of
-        Function of a mask over these rays, shape (m,), that returns the covariance of their dots,
-        shape (…, 2, 2), mm².
-    """
-    unsure = ~observed.in_view(plane_mm, NEAR_EDGE_MM, view)
-    lines = _lines_of(at[unsure], observed.absent.shape)
-    if lines.any():
-        margin = OUT_OF_VIEW_SIGMA * np.sqrt(covariance_of(unsure)[:, [0, 1], [0, 1]])
-        unsure[unsure] = ~observed.in_view(plane_mm[unsure], margin, view)
-        lines = _lines_of(at[unsure], observed.absent.shape)
-    return lines
-
-
-def _lines_of(at: IntArray, shape: tuple[int, ...]) -> BoolArray:
-    """Mask of the rays, shape (m, 2), whose row or column holds `LEAST_LINE` or more of them."""
-    mask = np.zeros(shape, bool)
-    mask[tuple(at.T)] = True
-    rows, columns = mask.sum(axis=1, keepdims=True), mask.sum(axis=0, keepdims=True)
-    return np.asarray(mask & ((rows >= LEAST_LINE) | (columns >= LEAST_LINE)))

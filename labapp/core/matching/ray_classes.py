@@ -8,8 +8,16 @@ from dataclasses import dataclass
 import numpy as np
 
 from labapp.core.matching.observation import Observation, widened
-from labapp.core.matching.prediction import RayPaths, lines_out_of_view
-from labapp.core.values import FloatArray, IntArray
+from labapp.core.matching.prediction import RayPaths
+from labapp.core.values import BoolArray, FloatArray, IntArray
+
+OUT_OF_VIEW_SIGMA, LEAST_LINE = 2.5, 3
+"""A row of rays next to the last lit row may have left the view if at least `LEAST_LINE` of its
+dots are predicted in view by less than `OUT_OF_VIEW_SIGMA` σ. Its rays then are not known to be
+dark."""
+
+NEAR_EDGE_MM = 8.0
+"""The uncertainty of predictions is computed only within this distance of the edge of the view."""
 
 
 @dataclass(frozen=True)
@@ -41,9 +49,9 @@ def classify_rays(observed: Observation, labels: IntArray, paths: RayPaths) -> R
 
     witness, missed, stray = match_kernels.classify_rays(
         labels,
-        observed.absent | observed.hidden,
+        observed.rays.absent | observed.hidden,
         (paths.points_mm, paths.slopes, paths.plane_mm),
-        observed.rays.reshape(-1, 3),
+        observed.rays.directions.reshape(-1, 3),
         observed.plane_mm,
         observed.view,
         np.array([observed.rig.electrode.height_mm, observed.resolution_mm]),
@@ -79,8 +87,16 @@ def certain_witness(
     certain = witness.copy()
     certain.flat[dark[~observed.in_view(paths.plane_mm[dark], view=view)]] = 0
     rim = np.flatnonzero((certain < 0) & widened(lit, 1))
-    at = np.stack(np.divmod(rim, witness.shape[1]), axis=-1)
-    lost = lines_out_of_view(
-        observed, view, at, paths.plane_mm[rim], lambda which: covariance_of(rim[which])
-    )
-    return np.where(lost, 0, certain)
+    near = rim[~observed.in_view(paths.plane_mm[rim], NEAR_EDGE_MM, view)]
+    if _in_lines(near, witness.shape).any():
+        margin = OUT_OF_VIEW_SIGMA * np.sqrt(covariance_of(near)[:, [0, 1], [0, 1]])
+        near = near[~observed.in_view(paths.plane_mm[near], margin, view)]
+    return np.where(_in_lines(near, witness.shape), 0, certain)
+
+
+def _in_lines(rays: IntArray, shape: tuple[int, ...]) -> BoolArray:
+    """Mask of the rays, flat indices, whose row or column holds `LEAST_LINE` or more of them."""
+    mask = np.zeros(shape, bool)
+    mask.flat[rays] = True
+    rows, columns = mask.sum(axis=1, keepdims=True), mask.sum(axis=0, keepdims=True)
+    return np.asarray(mask & ((rows >= LEAST_LINE) | (columns >= LEAST_LINE)))

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import scipy
 
-from labapp.core.matching.hypothesis import FINE_KNOTS, Hypothesis, grow_and_evaluate
+from labapp.core.matching.hypothesis import FINE_FIT, Hypothesis, grow_and_evaluate
 from labapp.core.matching.observation import UNLABELLED, Observation, widened, within_rings
 from labapp.core.matching.prediction import (
     GATE_SIGMA2,
@@ -66,7 +66,7 @@ def with_repaired(
             # Dots of swapped rows usually leave missed rays, too; false dots leave none.
             tried, finer = [labels, *tried], [labels, *finer] if best.missed_count else finer
         grown = [grow_and_evaluate(observed, labels) for labels in tried]
-        knot_mm = FINE_KNOTS.knot_mm
+        knot_mm = FINE_FIT.knot_mm
         grown += [grow_and_evaluate(observed, labels, knot_mm=knot_mm) for labels in finer]
         repaired = [hypothesis for hypothesis in grown if hypothesis is not None]
         cheapest = min(repaired, key=lambda hypothesis: hypothesis.misfit, default=best)
@@ -135,8 +135,8 @@ def with_rows_beyond(observed: Observation, found: list[Hypothesis]) -> list[Hyp
     hypothesis like the others: a row assigned to the wrong rays is penalised for the rays that it
     skips, or costs nearly as much as another hypothesis.
     """
-    # The cheapest of all, and the cheapest with a dark marker, which may lack only a row.
-    groups = (found, [hypothesis for hypothesis in found if hypothesis.marker == "dark"])
+    # The cheapest of all, and the cheapest with an empty marker, which may lack only a row.
+    groups = (found, [hypothesis for hypothesis in found if hypothesis.marker == "empty"])
     starts = [min(group, key=lambda hypothesis: hypothesis.misfit) for group in groups if group]
     for start in starts[:1] + [start for start in starts[1:] if start is not starts[0]]:
         best: Hypothesis | None = start
@@ -158,7 +158,7 @@ def _rows_begun(observed: Observation, hypothesis: Hypothesis) -> list[Hypothesi
     labels = hypothesis.labels
     found: list[Hypothesis] = []
     stray = np.setdiff1d(np.arange(len(observed.plane_mm)), labels)
-    beyond = within_rings(labels, 2) & (labels == UNLABELLED) & ~observed.absent
+    beyond = within_rings(labels, 2) & (labels == UNLABELLED) & ~observed.rays.absent
     rays = predict(observed, hypothesis.pool, beyond)
     if len(stray) == 0 or len(rays.at) == 0:
         return found

@@ -7,7 +7,7 @@ import numpy as np
 import scipy
 
 from labapp.core.matching.free_setup import with_setup_free
-from labapp.core.matching.hypothesis import KNOT_ERROR_MM, USUAL_KNOTS, Hypothesis
+from labapp.core.matching.hypothesis import KNOT_ERROR_MM, USUAL_FIT, Hypothesis
 from labapp.core.matching.match_settings import MatchSettings
 from labapp.core.matching.observation import UNLABELLED, Observation
 from labapp.core.values import CannotMeasure, median
@@ -22,8 +22,9 @@ for.
 """
 
 CONTRADICTED_BITS = 0.5
-"""Mean surprise of the rays near the boundary, bits, above which the surface is rejected: less than
-0.3 even if the set-up is slightly wrong, more than 1 if the labels are wrong for that reason."""
+"""Mean −log₂ likelihood of the rays near the boundary above which the surface is rejected: less
+than 0.3 even if the set-up is slightly wrong, more than 1 if the labels are wrong for that reason.
+"""
 
 SETUP_GAIN = 80.0
 """If another set-up (`with_setup_free`) lowers the cost of a rejected hypothesis by more, the given
@@ -66,7 +67,7 @@ def suffices(observed: Observation, hypothesis: Hypothesis) -> bool:
     Other kinds of initial labels are then not tried.
     """
     return explains(observed, hypothesis) or (
-        hypothesis.residual_mm < KNOT_ERROR_MM
+        hypothesis.residual_rms_mm < KNOT_ERROR_MM
         and _leaves_isolated(hypothesis, FEW_SCATTERED)
         and _strays_lie_apart(observed, hypothesis)
     )
@@ -90,7 +91,7 @@ def refuse_unexplained(
     ``most_scattered`` is the largest accepted share of isolated strays and missed rays, such as
     `MOST_SCATTERED`.
     """
-    few = best.stray_count <= settings.most_strays(best)
+    few = best.stray_count <= settings.most_strays(best.label_count + best.stray_count)
     scattered = _leaves_isolated(best, most_scattered) and (
         few or _strays_lie_apart(observed, best)
     )
@@ -103,7 +104,7 @@ def refuse_unexplained(
             f"{_counted(best.missed_count, 'ray')} without a dot among {best.label_count} pairs"
             f"{_doubt_of_setup(observed, best)}",
         )
-    if best.pool.level.ray_count and best.pool.level.disagreement > CONTRADICTED_BITS:
+    if best.pool.level.ray_count and best.pool.level.disagreement_bits > CONTRADICTED_BITS:
         raise CannotMeasure(
             "no-match",
             "no boundary of the best surface separates the rays that came back from those that "
@@ -113,7 +114,7 @@ def refuse_unexplained(
 
 def _doubt_of_setup(observed: Observation, best: Hypothesis) -> str:
     """Return the end of the reason for a rejection that another set-up would avoid, or nothing."""
-    freed = with_setup_free(observed, best, USUAL_KNOTS)
+    freed = with_setup_free(observed, best, USUAL_FIT)
     if freed.cost > best.cost - SETUP_GAIN:
         return ""
     count = np.sum(freed.labels != UNLABELLED)
@@ -128,7 +129,7 @@ def _leaves_isolated(hypothesis: Hypothesis, most: float) -> bool:
     """
     left = hypothesis.stray_count + hypothesis.missed_count
     few = left <= most * hypothesis.label_count
-    return few and hypothesis.marker == "dark" and _missed_lie_apart(hypothesis)
+    return few and hypothesis.marker == "empty" and _missed_lie_apart(hypothesis)
 
 
 def _missed_lie_apart(hypothesis: Hypothesis) -> bool:

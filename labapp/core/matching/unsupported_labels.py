@@ -96,8 +96,8 @@ def unsupported(observed: Observation, fitted: FittedLabels) -> IntArray:
     * another ray between the others, which has no dot, made it.
 
     A ray that lands outside the boundary of the others is unlikely to be reflected. A dot much
-    wider than those around it is two merged dots; one that is less wide is, if a ray without a dot
-    would have its dot beside it. With few neighbours, at the rim, a label must be nearer to its
+    wider than those around it is two merged dots; a less wide one counts as merged if a ray without
+    a dot is predicted beside it. With few neighbours, at the rim, a label must be nearer to its
     prediction than elsewhere. One without neighbours may be that of the next ray, since nothing
     determines its place in the row. If all labels are farther from their predictions than the
     uncertainty of dots and surface explains, that uncertainty is increased accordingly.
@@ -122,21 +122,21 @@ def unsupported(observed: Observation, fitted: FittedLabels) -> IntArray:
     labels, classes = fitted.labels, fitted.classes
     lit, stray = labels != UNLABELLED, classes.stray
     share = missing_share(len(classes.missed), int(lit.sum()))
-    false_per_mm2 = max(FALSE_DOTS_PER_MM2, (len(stray) + 1) / observed.view_mm2)
+    false_per_mm2 = max(FALSE_DOTS_PER_MM2, (len(stray) + 1) / observed.frame_area_mm2)
     limits = np.array(
         [
-            fitted.floor_mm**2,
-            LEVER * fitted.unsettled_mm,
-            MOST_LEVERAGE,
-            SIGMA_INFLATION**2,
-            MODEL_ERROR_MM**2,
-            MEDIAN_CHI2,
-            false_dot_deviance(false_per_mm2),
-            GATE_SIGMA2,
-            RIVAL_MARGIN,
-            RIM_NEIGHBOURS,
-            RIM_SIGMA2,
-            RIM_TIMES,
+            fitted.floor_mm**2,  # floor
+            LEVER * fitted.unsettled_mm,  # unsettled
+            MOST_LEVERAGE,  # leverage
+            SIGMA_INFLATION**2,  # inflation
+            MODEL_ERROR_MM**2,  # error
+            MEDIAN_CHI2,  # median
+            false_dot_deviance(false_per_mm2),  # false
+            GATE_SIGMA2,  # gate
+            RIVAL_MARGIN,  # margin
+            RIM_NEIGHBOURS,  # rim_neighbours
+            RIM_SIGMA2,  # rim_sigma2
+            RIM_TIMES,  # rim_times
         ]
     )
     fails = match_kernels.failing_labels(
@@ -161,7 +161,7 @@ def _wide(observed: Observation, fitted: FittedLabels) -> BoolArray:
     from labapp.core.matching import match_kernels
 
     lit, plane_mm = fitted.labels != UNLABELLED, fitted.paths.plane_mm
-    dark_mm = plane_mm[np.flatnonzero(~lit & ~observed.absent)]
+    dark_mm = plane_mm[np.flatnonzero(~lit & ~observed.rays.absent)]
     size = np.full(lit.shape, np.nan)
     size[lit] = observed.size_mm[fitted.labels[lit]]
     times = size / match_kernels.medians_around(size)
@@ -185,7 +185,7 @@ def _inside(observed: Observation, fitted: FittedLabels, missing: float) -> Floa
     lit, known, level = fitted.labels != UNLABELLED, fitted.classes, fitted.level
     inside = np.ones(lit.shape)
     at = np.argwhere(lit & ~match_kernels.between(lit))
-    landing, coefficients = observed.landing_mm[tuple(at.T)], fitted.paths.coefficients
+    landing, coefficients = observed.rays.landing_mm[tuple(at.T)], fitted.paths.coefficients
     height = spline_kernels.surface_at(fitted.basis.grid, coefficients, landing)[0]
     outside = level.sign * (height - level.rear.height(landing[:, 1])) < 0.0
     odds = np.ones(len(at))  # the surface may go up there for the dot alone
@@ -195,7 +195,7 @@ def _inside(observed: Observation, fitted: FittedLabels, missing: float) -> Floa
             witness = known.witness.copy()
             witness[tuple(at[k])] = sign
             witnesses = Witnesses.of(
-                observed.bench.rays, observed.rig.head_sign, witness, fitted.basis, missing
+                observed.rays, observed.rig.head_sign, witness, fitted.basis, missing
             )
             nats.append(witnesses.negative_log_evidence(fitted.basis, coefficients, level))
         odds[k] = np.exp(min(nats[1] - nats[0], 0.0))

@@ -11,8 +11,8 @@ from dataclasses import replace
 from labapp.core.geometry.bench import Bench
 from labapp.core.images.dots import Image
 from labapp.core.pipeline import Measurement, Settings, measure
-from labapp.core.sequence.following import HELD
 from labapp.core.sequence.prior import Prior
+from labapp.core.sequence.tracking import HELD
 
 
 class WarmChain:
@@ -23,14 +23,14 @@ class WarmChain:
     bench
         The bench.
     settings
-        Settings of the measurement. Only the fit to band-passed dots, the default, can be followed.
+        Settings of the measurement. Only the fit to band-passed dots, the default, can be tracked.
     on_step
-        See `pipeline.measure`; called for followed frames.
+        See `pipeline.measure`; called for tracked frames.
 
     Attributes
     ----------
     track_lost
-        Why the last frame was measured without a prior; None if it was followed.
+        Why the last frame was measured without a prior; None if it was tracked.
     """
 
     def __init__(
@@ -50,10 +50,10 @@ class WarmChain:
         if self._prior is not None:
             self._prior, self._after_gap = self._prior.after_gap(), True
 
-    def follow(self, image: Image) -> Measurement | None:
+    def track(self, image: Image) -> Measurement | None:
         """Measure the next frame with the prior; None if the track is lost.
 
-        No search is started, and a later frame may be followed again.
+        No search is started, and a later frame may be tracked again.
         """
         if self._prior is None:
             self.track_lost = "no earlier frame was measured"
@@ -70,10 +70,10 @@ class WarmChain:
 
     def measure(self, image: Image) -> Measurement:
         """Measure the next frame with the prior, or else without one (`search`)."""
-        return self.follow(image) or self.search(image)
+        return self.track(image) or self.search(image)
 
     def search(self, image: Image) -> Measurement:
-        """Measure the next frame as if it were the first; later frames may be followed from it."""
+        """Measure the next frame as if it were the first; later frames may be tracked from it."""
         self.track_lost = self.track_lost or "it was measured by itself"
         measurement, prior = measure(image, self.bench, self.settings)
         former = self._prior

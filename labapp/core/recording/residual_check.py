@@ -28,7 +28,7 @@ from labapp.core.geometry.uncertainty import INDEX, QUANTITIES
 from labapp.core.pipeline import Measurement, setup_status
 from labapp.core.recording.dot_response import dot_responses
 from labapp.core.surface.spline import SplineSurface
-from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays
+from labapp.core.values import FloatArray, IntArray, ReadOnlyArrays, rms
 
 MOST = 64
 """Maximum number of frames whose residuals are kept, evenly spaced over the recording."""
@@ -299,10 +299,10 @@ def judge_setup(
     centers = _lens_center_sigma(rig) * np.array([one.by_lens_center for one in responses])
     freedom, root = responses[PARTS // 2].freedom, rig.uncertainty.root
     pattern, uncertain = patterns.mean(axis=0), np.concatenate([patterns @ root, centers], axis=-1)
-    bent = NONLINEAR * _rms(left)
-    mean = _Left(left.mean(axis=0), pattern, uncertain.mean(axis=0), freedom, bent)
+    bent = NONLINEAR * rms(left)
+    mean = _Unabsorbed(left.mean(axis=0), pattern, uncertain.mean(axis=0), freedom, bent)
     # With a wrong set-up, the unabsorbed residuals also change if the pool changes.
-    drift = _Left(left[-1] - left[0], pattern, uncertain[-1] - uncertain[0], freedom, bent)
+    drift = _Unabsorbed(left[-1] - left[0], pattern, uncertain[-1] - uncertain[0], freedom, bent)
     every = directions(rig)
     moved = drift.suspects([one for one in every if not one.key.startswith(FIXED)], is_drift=True)
     off = mean.suspects(every, is_drift=False)
@@ -314,11 +314,15 @@ def judge_setup(
 
 def _lens_center_sigma(rig: Rig) -> float:
     """Standard uncertainty of the centre of the distortion times the distortion, mm·percent."""
-    known, plane = rig.uncertainty, rig.imaging_plane
-    assert known is not None
-    sigma = float(known.sigma[INDEX["camera_lens.distortion_percent"]])
+    uncertainty, plane = rig.uncertainty, rig.imaging_plane
+    assert uncertainty is not None
+    sigma = float(uncertainty.sigma[INDEX["camera_lens.distortion_percent"]])
     reach = min(plane.width_mm, plane.height_mm) / 2
-    return LENS_CENTER * reach * float(np.hypot(known.axes.calibration.distortion_percent, sigma))
+    return (
+        LENS_CENTER
+        * reach
+        * float(np.hypot(uncertainty.axes.calibration.distortion_percent, sigma))
+    )
 
 
 def _by_ray(samples: Sequence[Residuals], shape: tuple[int, int]) -> tuple[IntArray, FloatArray]:
@@ -336,7 +340,7 @@ def _by_ray(samples: Sequence[Residuals], shape: tuple[int, int]) -> tuple[IntAr
 
 
 @dataclass(frozen=True)
-class _Left(ReadOnlyArrays):
+class _Unabsorbed(ReadOnlyArrays):
     """Unabsorbed residuals of m rays, X′ and Z′ interleaved.
 
     Parameters
@@ -374,7 +378,7 @@ class _Left(ReadOnlyArrays):
                 continue
             # Residuals of a set-up with an error δ have the sign of a response to −δ.
             off, sigma = -float(left @ weighted) / information, information**-0.5
-            drop, size = (off / sigma) ** 2, _rms(pattern)
+            drop, size = (off / sigma) ** 2, rms(pattern)
             is_visible = usual * size >= VISIBLE_MM
             seen = max(seen, drop) if is_visible else seen
             if is_visible or abs(off) <= IMPLAUSIBLE * usual:
@@ -410,7 +414,3 @@ def _reason(suspects: Sequence[Suspect], frames: int) -> str:
     others = "; ".join(f"{one.name}, by {one.off:+.2g} {one.unit}".rstrip() for one in alike[1:])
     one_of = f"the likeliest cause is one of these {len(alike)}, which residuals cannot distinguish"
     return f"{found}; {one_of}: {off}; {others}"
-
-
-def _rms(values: FloatArray) -> float:
-    return float(np.sqrt(np.mean(values**2)))

@@ -24,7 +24,7 @@ from labapp.core.match import Candidate, Match
 from labapp.core.pipeline import Measurement, OpenMeasurement, Settings
 from labapp.core.schemes import fit
 from labapp.core.surface.reconstruction import Reconstruction
-from labapp.core.values import CannotMeasure, FloatArray, IntArray
+from labapp.core.values import CannotMeasure, FloatArray, IntArray, rms
 
 ALIKE = 0.15
 """Surfaces that differ by less than this share of their rms height have the same rows."""
@@ -87,7 +87,7 @@ class RowVote:
         self._votes: Counter[tuple[int, int]] = Counter()
         """Number of frames by the shift of their rays from the first frame, in rows and columns."""
         self._at = (0, 0)
-        """Shift of the frames that are currently followed."""
+        """Shift of the frames that are currently tracked."""
         self._usual: Placed | None = None
         """The last frame that agrees with the majority."""
         self._before: Placed | None = None
@@ -99,18 +99,18 @@ class RowVote:
         self._lost: dict[tuple[int, int], dict[tuple[int, int], float]] = {}
         """Margins that these lack compared with unambiguous frames, by shift and rival's step."""
 
-    def add(self, measured: Measurement, followed: bool = False) -> Ballot:
+    def add(self, measured: Measurement, tracked: bool = False) -> Ballot:
         """Count the next frame.
 
-        A followed frame has the rows of the previous one, and no vote of its own. A frame that was
-        corrected by hand has a vote, but later frames are not followed from it.
+        A tracked frame has the rows of the previous one, and no vote of its own. A frame that was
+        corrected by hand has a vote, but later frames are not tracked from it.
         """
         surface, at = measured.reconstruction, self._at
         if surface is None:
             ballot = Ballot(measured)
             self._undecided += [ballot] if ballot.is_open else []
             return ballot
-        if not followed:
+        if not tracked:
             if self._usual is not None:
                 usual, (row, column) = self._usual
                 slip = self._slip(measured, usual)
@@ -189,9 +189,9 @@ class RowVote:
         found: set[int | None] = set()
         for one in beside:
             usual = self._heights(one)
-            off = [np.inf if own is None else _rms(own - usual) for own in made]
+            off = [np.inf if own is None else rms(own - usual) for own in made]
             nearest, next_one = np.argsort(off)[:2].tolist()
-            is_alike = off[nearest] < min(ALIKE * _rms(usual), off[next_one] / NEARER)
+            is_alike = off[nearest] < min(ALIKE * rms(usual), off[next_one] / NEARER)
             found.add(nearest if is_alike else None)
         return found.pop() if len(found) == 1 else None
 
@@ -209,8 +209,8 @@ class RowVote:
         assert measured.match is not None
         assert measured.reconstruction is not None
         heights = self._heights(usual)
-        slip, off = np.zeros(2, np.int64), _rms(self._heights(measured.reconstruction) - heights)
-        if off < ALIKE * _rms(heights):
+        slip, off = np.zeros(2, np.int64), rms(self._heights(measured.reconstruction) - heights)
+        if off < ALIKE * rms(heights):
             return slip
         nearest = off / NEARER
         for by in SLIPS:
@@ -218,7 +218,7 @@ class RowVote:
                 moved = fit.reconstruct(_moved(measured.match, by), self._rig, self._settings.fit)
             except CannotMeasure:
                 continue
-            off = _rms(self._heights(moved) - heights)
+            off = rms(self._heights(moved) - heights)
             if off < nearest:
                 nearest, slip = off, -by
         return slip
@@ -246,7 +246,3 @@ def _moved(match: Match, by: IntArray) -> Match:
         plane_covariance_mm2=match.plane_covariance_mm2[on],
         witness=witness,
     )
-
-
-def _rms(values: FloatArray) -> float:
-    return float(np.sqrt(np.mean(values**2)))

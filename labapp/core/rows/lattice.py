@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import scipy
@@ -30,9 +31,10 @@ class Lattice(ReadOnlyArrays):
         Reflected row k (from the bottom up) and column t (from left to right) of each dot, both
         counted from 1, shape (n,) for n dots; 0 for dots in doubt, which have none.
     reference
-        Site (k, t) of the absent centre dot; None if it is ambiguous or unknown.
+        Site (k, t) of the marker's hole: the reference's, unless the centre ray exists. None if it
+        is ambiguous or unknown.
     candidates
-        All sites (k, t) that could be the absent centre dot, the likeliest first.
+        All sites (k, t) that could be the marker's hole, the likeliest first.
     blocked_rows
         Rows k with dots hidden by the torch.
     """
@@ -45,34 +47,34 @@ class Lattice(ReadOnlyArrays):
 
 
 def lattice_of_sites(
-    grid: dict[Site, int],
+    dot_at: dict[Site, int],
     count: int,
     reference: Site | None = None,
     candidates: tuple[Site, ...] = (),
 ) -> Lattice:
     """Build the lattice of ``count`` dots from a mapping of sites (k, t), from 1, to dots."""
     row, column = np.zeros(count, np.int64), np.zeros(count, np.int64)
-    for (k, t), dot in grid.items():
-        row[dot], column[dot] = k, t
+    dots = list(dot_at.values())
+    row[dots], column[dots] = np.array(list(dot_at), np.int64).reshape(-1, 2).T
     candidates = candidates or ((reference,) if reference else ())
-    return Lattice(row, column, reference, candidates, _blocked_rows(grid))
+    return Lattice(row, column, reference, candidates, _blocked_rows(dot_at))
 
 
-def find_holes(grid: dict[Site, int], dots: Dots) -> list[tuple[Site, int]]:
+def find_holes(dot_at: dict[Site, int], dots: Dots) -> list[tuple[Site, int]]:
     """Find empty sites with dots on the left and right, and on 3 or 4 sides in all.
 
-    ``grid`` maps sites (k, t) to dots. Returns sites and numbers of sides, 4 before 3.
+    ``dot_at`` maps sites (k, t) to dots. Returns sites and numbers of sides, 4 before 3.
     """
-    if not grid:
+    if not dot_at:
         return []
     points = dots.image_px
     tree = scipy.spatial.cKDTree(points)
     holes = []
-    for k, t in {(k + dk, t + dt) for k, t in grid for dk, dt in _NEXT} - grid.keys():
-        lit = [(k + dk, t + dt) in grid for dk, dt in _NEXT]
+    for k, t in {(k + dk, t + dt) for k, t in dot_at for dk, dt in _NEXT} - dot_at.keys():
+        lit = [(k + dk, t + dt) in dot_at for dk, dt in _NEXT]
         if not (lit[0] and lit[1]) or sum(lit) < 3:
             continue
-        left, right = points[grid[k, t - 1]], points[grid[k, t + 1]]
+        left, right = points[dot_at[k, t - 1]], points[dot_at[k, t + 1]]
         nearest = tree.query((left + right) / 2)[0]
         if nearest > HOLE_DISTANCE * np.linalg.norm(right - left):
             holes.append(((k, t), sum(lit)))
@@ -86,9 +88,11 @@ def empty_sites(lattice: Lattice) -> list[Site]:
     return sorted({(k + dk, t + dt) for k, t in taken for dk, dt in _NEXT} - taken)
 
 
-def _blocked_rows(grid: dict[Site, int]) -> frozenset[int]:
+def _blocked_rows(dot_at: dict[Site, int]) -> frozenset[int]:
     """Rows that lack two or more adjacent dots between others: hidden by the torch."""
     rows: dict[int, list[int]] = {}
-    for k, t in grid:
+    for k, t in dot_at:
         rows.setdefault(k, []).append(t)
-    return frozenset(k for k, ts in rows.items() if len(ts) > 1 and np.diff(np.sort(ts)).max() > 2)
+    return frozenset(
+        k for k, ts in rows.items() if any(t - before > 2 for before, t in pairwise(sorted(ts)))
+    )

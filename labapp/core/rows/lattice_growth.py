@@ -30,6 +30,22 @@ MOST_SLIP, MOST_SLANT = 0.55, 0.7
 """A row is misaligned by a column if the slant of its columns differs from that of other rows by at
 least the first, or is at least the second, in steps along the row: both slightly over a half."""
 
+NEAREST, NEAR = 10, 40
+"""Numbers of nearest dots among which a dot's opposite neighbours, and a dot off their line, are
+searched for."""
+
+MOST_UNEVEN = 0.5
+"""Two neighbours are opposite if the sum of the steps to them is shorter than this fraction of the
+shorter step. A step without an opposite one counts as this uneven."""
+
+LEAST_CROSSING, LEAST_OFF_LINE = 0.4, 0.6
+"""Least sine of the angle between the two steps of a seed: if the second one has an opposite step,
+and otherwise."""
+
+NEARLY_SHORTEST = 1.05
+"""Two steps are the shortest if twice their inner product is at most this multiple of the lesser
+square: with a factor of 1, equally short ones could alternate."""
+
 
 @dataclass(frozen=True)
 class GrowSettings:
@@ -91,7 +107,7 @@ def grow_lattice(dots: Dots, settings: GrowSettings) -> Lattice:
         grid = max(grid, _without_slips(whole, dots_px), key=_count)
     if _count(grid) < max(settings.least, settings.share * len(dots)):
         raise CannotMeasure("no-rows", "the dots do not form rows and columns")
-    grid = _grid_of(*_sites(grid))
+    grid = _grid_of(*_sites(grid))  # without empty margins
     sites = {(k + 1, t + 1): dot for k, t, dot in np.stack(_sites(grid), axis=-1).tolist()}
     holes = find_holes(sites, dots)
     certain = [site for site, sides in holes if sides == 4]
@@ -164,24 +180,24 @@ def _seeds(dots_px: ComplexArray) -> list[tuple[int, complex, complex]]:
     off the first line (the distance of rows may be ten times that of the dots within them).
     """
     points = np.stack([dots_px.real, dots_px.imag], axis=-1)
-    near = scipy.spatial.cKDTree(points).query(points, k=min(41, len(points)))[1][:, 1:]
+    near = scipy.spatial.cKDTree(points).query(points, k=min(NEAR + 1, len(points)))[1][:, 1:]
     offset = dots_px[near] - dots_px[:, None]
     length = np.abs(offset)
-    a, b = np.triu_indices(min(10, near.shape[1]), 1)
+    a, b = np.triu_indices(min(NEAREST, near.shape[1]), 1)
     step = (offset[:, b] - offset[:, a]) / 2
     dots = np.arange(len(dots_px))
     with np.errstate(divide="ignore", invalid="ignore"):  # two dots in one place
         error = np.abs(offset[:, a] + offset[:, b]) / np.minimum(length[:, a], length[:, b])
-        size = np.where(error < 0.5, length[:, a] + length[:, b], np.inf)
+        size = np.where(error < MOST_UNEVEN, length[:, a] + length[:, b], np.inf)
         shortest = dots, size.argmin(axis=1)
         first = step[shortest]
-        crossing = np.where(_sine_between(first, step) > 0.4, size, np.inf)
-        off_line = _sine_between(first, offset) > 0.6
+        crossing = np.where(_sine_between(first, step) > LEAST_CROSSING, size, np.inf)
+        off_line = _sine_between(first, offset) > LEAST_OFF_LINE
     # A dot off the line without an opposite one is the last choice.
     last = np.where(off_line.any(axis=1), np.finfo(float).max, np.inf)
     size_across = np.column_stack([crossing, last])
     across = np.column_stack([step, offset[dots, off_line.argmax(axis=1)]])
-    doubt = np.column_stack([error, np.full(len(dots_px), 0.5)])
+    doubt = np.column_stack([error, np.full(len(dots_px), MOST_UNEVEN)])
     found = np.isfinite(size_across)
     ends = np.where(found, size_across, -np.inf).argmax(axis=1)
     both = np.column_stack([size_across.argmin(axis=1), ends])
@@ -243,7 +259,7 @@ def _reduced(grid: IntArray, dots_px: ComplexArray) -> IntArray:
         mixed = np.nansum((a * b.conj()).real / (np.abs(a) * np.abs(b)))
     row, column = (1, 0), (0, 1)  # coefficients of the old k and t in the new k and in the new t
     for _ in range(8):
-        if 2 * abs(mixed) <= 1.05 * min(along, across):
+        if 2 * abs(mixed) <= NEARLY_SHORTEST * min(along, across):
             break
         if along <= across:  # subtract a multiple of the step along rows from that across them
             m = round(mixed / along)

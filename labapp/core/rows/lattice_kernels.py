@@ -143,6 +143,7 @@ def _claim(
         chosen, fitting, error = dot, fitting + 1, error + distance / step
     if chosen < 0 or taken[chosen] or 2 * fitting < len(places):
         return np.inf, k, t, -1
+    # The mean distance in steps; the more predictions agree, the earlier.
     return error / fitting / fitting, k, t, chosen
 
 
@@ -215,7 +216,8 @@ def grow(
         (`_connected_parts`) of each site, shape (s, 4).
     """
     taken, middle, end = np.zeros(len(dots_px), np.bool_), len(dot_at) // 2, len(dot_at) - BORDER
-    queue, placed = _seed_claims(dots_px, middle, seed, first, second), [(0.0, 0, 0, 0)][:0]
+    queue = _seed_claims(dots_px, middle, seed, first, second)
+    placed = [(0.0, 0, 0, 0)][:0]  # an empty list, typed for numba
     while queue:
         claim = heapq.heappop(queue)
         badness, k, t, dot = claim

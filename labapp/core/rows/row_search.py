@@ -92,7 +92,7 @@ class MaskRowsSettings:
     least_dots: int = 2
 
 
-def search_rows(dots: Dots, settings: RowSearchSettings | None = None) -> Lattice:
+def search_rows(dots: Dots, settings: RowSearchSettings) -> Lattice:
     """Find rows by nearest neighbours, columns by column angles (§5.2.2, Fig. 5-13 … 5-19).
 
     Raises
@@ -100,7 +100,6 @@ def search_rows(dots: Dots, settings: RowSearchSettings | None = None) -> Lattic
     CannotMeasure
         ``too-few-dots`` without two dots, ``no-rows`` if no two dots form a row.
     """
-    settings = settings or RowSearchSettings()
     place = _places(dots)
     rows = [row for row in _neighbour_rows(place, settings) if len(row) >= settings.least_dots]
     if not rows:
@@ -137,9 +136,7 @@ def search_rows(dots: Dots, settings: RowSearchSettings | None = None) -> Lattic
     return _lattice(len(dots), rows, columns, reference, candidates, blocked)
 
 
-def mask_rows(
-    dots: Dots, frame_shape: tuple[int, int], settings: MaskRowsSettings | None = None
-) -> Lattice:
+def mask_rows(dots: Dots, frame_shape: tuple[int, int], settings: MaskRowsSettings) -> Lattice:
     """Find rows by dilated masks, columns from a vertical line (§5.3, Fig. 5-25 … 5-28).
 
     Parameters
@@ -149,14 +146,13 @@ def mask_rows(
     frame_shape
         (rows, columns) of that frame, px.
     settings
-        None for the defaults.
+        See `MaskRowsSettings`.
 
     Raises
     ------
     CannotMeasure
         ``too-few-dots`` without two dots, ``no-rows`` if no two dots form a row.
     """
-    settings = settings or MaskRowsSettings()
     place = _places(dots)
     distance = np.asarray(scipy.spatial.cKDTree(place).query(place, k=2)[0])[:, 1]
     spacing = max(float(np.median(distance)), 1.0)

@@ -39,7 +39,7 @@ drop of the rear, are recomputed."""
 
 
 @dataclass(frozen=True)
-class Followed:
+class Tracked:
     """A frame matched and fitted from its prior.
 
     Parameters
@@ -84,9 +84,9 @@ class Prior:
         Parts of the set-up in the uncertainty of sizes, each with the sizes for which it was
         computed: the sizes of a pool that oscillates recur.
     unseen
-        Number of frames since `Followed.reference_is_seen` was last true.
+        Number of frames since `Tracked.reference_is_seen` was last true.
     count
-        Number of followed frames.
+        Number of tracked frames.
     """
 
     tuning: DetectorTuning
@@ -132,12 +132,12 @@ class Prior:
             by_setup=(SetupPart(made.size_sigma_setup, measures.sizes),),
         )
 
-    def followed_by(self, followed: Followed, made: Reconstruction, measures: Measures) -> Prior:
-        """Build the prior from a frame that was followed with this one."""
+    def after(self, tracked: Tracked, made: Reconstruction, measures: Measures) -> Prior:
+        """Build the prior for the frame after one that was tracked with this one."""
         by_setup, sizes = () if self.setup_is_due else self.by_setup, measures.sizes
         if nearest_part(by_setup, sizes) is None:  # it was computed for these sizes
             by_setup = *by_setup, SetupPart(made.size_sigma_setup, sizes)
-        paths, lit, pool = followed.paths, followed.lit, followed.pool
+        paths, lit, pool = tracked.paths, tracked.lit, tracked.pool
         return replace(
             self,
             paths=paths,
@@ -148,7 +148,7 @@ class Prior:
             slopes=np.concatenate([self.slopes[1 - MEMORY :], paths.slopes[None]]),
             level_sigma_mm=pool.level.sigma_mm if self.drop_is_free else self.level_sigma_mm,
             by_setup=by_setup,
-            unseen=0 if followed.reference_is_seen else self.unseen + 1,
+            unseen=0 if tracked.reference_is_seen else self.unseen + 1,
             count=self.count + 1,
         )
 

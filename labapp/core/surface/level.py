@@ -113,8 +113,8 @@ class Level:
         return np.sqrt(np.maximum(variance, 0.0))
 
     @property
-    def disagreement(self) -> float:
-        """Mean surprise of the rays near the boundary, bits; infinite if there are none."""
+    def disagreement_bits(self) -> float:
+        """Mean −log₂ likelihood of the rays near the boundary; infinite if there are none."""
         return (
             self.negative_log_likelihood / np.log(2) / self.ray_count if self.ray_count else np.inf
         )

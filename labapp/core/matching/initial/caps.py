@@ -31,12 +31,13 @@ GATE = 0.45
 LEAST_RAYS = 10
 """Minimum number of rays that meet a cap."""
 
-LIT_MARKER_PENALTY, DARK_PENALTY = 5.0, 0.5
-"""Penalties for a dot at the marker's absent ray, and for a ray without a dot. Each ray with a dot
-adds about 1 to the score."""
+LIT_ABSENT_PENALTY, DARK_PENALTY = 5.0, 0.5
+"""Penalty for dots at absent rays, times the share of these that have one, and for a ray without a
+dot. Each ray with a dot adds about 1 to the score."""
 
 LIT_GATE = 0.3
-"""The marker is lit if a dot lies within this fraction of the median spacing of predictions."""
+"""An absent ray counts as lit if a dot lies within this fraction of the median spacing of
+predictions."""
 
 ALIKE, MOST_CAPS = 0.9, 150
 """Two caps are the same hypothesis if this share of the rays with a dot in both have the same dot;
@@ -65,14 +66,14 @@ def search_caps(observed: Observation) -> list[IntArray]:
     """
     from labapp.core.matching.initial import quadric_kernels
 
-    settings = np.array([LEAST_RAYS, GATE, DARK_PENALTY, LIT_GATE, LIT_MARKER_PENALTY])
+    settings = np.array([LEAST_RAYS, GATE, DARK_PENALTY, LIT_GATE, LIT_ABSENT_PENALTY])
     score, found = quadric_kernels.score_caps(
         _caps(observed),
-        observed.rays.reshape(-1, 3),
+        observed.rays.directions.reshape(-1, 3),
         observed.rig.laser.position_mm,
         observed.rig.imaging_plane.pose_mm,
         observed.plane_mm,
-        observed.absent.ravel(),
+        observed.rays.absent.ravel(),
         settings,
     )
     best = np.full((MOST_CAPS, found.shape[1]), UNLABELLED, np.int64)
@@ -84,7 +85,7 @@ def search_caps(observed: Observation) -> list[IntArray]:
             best[count], count = found[k], count + 1
             if count == MOST_CAPS:
                 break
-    shape = observed.absent.shape
+    shape = observed.rays.absent.shape
     matched = [one for k in range(count) if (one := _matched(observed, best[k].reshape(shape)))]
     matched.sort(key=lambda one: one[0])
     return list({labels.tobytes(): labels for _, labels in matched}.values())[:MOST_RETURNED]
@@ -102,7 +103,7 @@ def _matched(observed: Observation, labels: IntArray) -> tuple[float, IntArray] 
 
 def _caps(observed: Observation) -> FloatArray:
     """Caps to try, with the area given by the number of dots (`quadric_kernels.score_caps`)."""
-    area = len(observed.plane_mm) * observed.spacing_mm.prod()
+    area = len(observed.plane_mm) * observed.rays.spacing_mm.prod()
     caps = []
     for aspect, height, x, y in product(_ASPECTS, _HEIGHTS, _ASIDE, _ALONG):
         across, along = np.sqrt(area / np.pi * np.array([1 / aspect, aspect]))

@@ -1,8 +1,9 @@
 """Initial labels from a local model of the pool: quadrics that explain the dots around a hole.
 
-Where rows bend so much that no grid can be grown in the image, the surface can still be found from
-the few dots around the hole: near its centre a pool is a quadric. The hole determines its slope,
-the two dots beside the hole the transverse curvature; several longitudinal curvatures are tried.
+Where rows bend so much that no lattice can be grown in the image, the surface can still be found
+from the few dots around the hole: near its centre a pool is a quadric. The hole determines its
+slope, the two dots beside the hole the transverse curvature; several longitudinal curvatures are
+tried.
 Quadrics whose predictions lie near the dots around the hole are fitted to these and then compared
 with more dots.
 """
@@ -82,7 +83,7 @@ def search_quadrics(observed: Observation) -> list[QuadricLabels]:
         The dots and the rig.
     """
     marker = observed.rig.pattern.marker
-    if marker is None or min(marker) < 2 or np.any(np.array(marker) >= observed.rays.shape[:2]):
+    if marker is None or min(marker) < 2 or np.any(np.array(marker) >= observed.rays.absent.shape):
         return []  # without rays on all sides a hole cannot be recognised
     window = _Window(observed, marker)
     found: dict[bytes, QuadricLabels] = {}
@@ -153,7 +154,7 @@ class _Window:
 
     def __init__(self, observed: Observation, marker: tuple[int, int]) -> None:
         i, j = (n - 1 for n in marker)
-        rows, columns = observed.rays.shape[:2]
+        rows, columns = observed.rays.absent.shape
         reach = min(WINDOW_REACH, i, j, rows - 1 - i, columns - 1 - j)
         self.observed = observed
         self.tree, self.plane = (
@@ -161,9 +162,9 @@ class _Window:
             observed.rig.imaging_plane.pose_mm,
         )
         self.part = slice(i - reach, i + reach + 1), slice(j - reach, j + reach + 1)
-        self.rays = observed.rays[self.part]
-        self.landing_mm = observed.landing_mm[i, j]
-        self.absent = observed.absent[self.part]
+        self.rays = observed.rays.directions[self.part]
+        self.landing_mm = observed.rays.landing_mm[i, j]
+        self.absent = observed.rays.absent[self.part]
         self.middle = (reach, reach)
         self.core = slice(reach - 1, reach + 2), slice(reach - 1, reach + 2)
         rim = max(reach - 2, 0)  # the core, and the ring around it if there is one
@@ -226,7 +227,7 @@ class _Window:
         core = (self.core[0], slice(self.core[1].start - 1, self.core[1].stop + 1))
         near = np.full(matched.shape, UNLABELLED)
         near[core] = matched[core]
-        labels = np.full(self.observed.rays.shape[:2], UNLABELLED, np.int64)
+        labels = np.full(self.observed.rays.absent.shape, UNLABELLED, np.int64)
         labels[self.part] = near
         score = np.sum(matched != UNLABELLED) - SILENT_COST * silent + NEARNESS_GAIN * nearness
         return QuadricLabels(labels, float(score))

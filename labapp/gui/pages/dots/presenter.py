@@ -12,10 +12,10 @@ import numpy as np
 from labapp.core.images.dots import Dots, Image
 from labapp.core.images.find_dots import DotSettings, find_dots
 from labapp.core.pipeline import Measurement, Settings, start_correction
+from labapp.core.rows.carry_on import carry_on
 from labapp.core.rows.correction import Correction
 from labapp.core.rows.find_lattice import LatticeSettings, find_lattice
 from labapp.core.rows.lattice import Lattice
-from labapp.core.rows.tracking import carry_on
 from labapp.core.values import CannotMeasure, FloatArray, IntArray
 from labapp.errors import InputError
 from labapp.gui.digits import ResultRow, plain

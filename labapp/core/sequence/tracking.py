@@ -6,7 +6,7 @@ keep their rays; dots next to them get theirs from the surface fitted to the tra
 result is accepted only if the absent ray is dark between lit ones, and if no more is left
 unexplained than would be accepted without a prior.
 
-As in `correspondence`, a dot whose ray is ambiguous gets none.
+As in `match_rays`, a dot whose ray is ambiguous gets none.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from labapp.core.images import dot_kernels
+from labapp.core.images import band_pass_kernels
 from labapp.core.match import Trial, missing_share
-from labapp.core.matching.correspondence import match_of_pairs
+from labapp.core.matching.match_rays import match_of_pairs
 from labapp.core.matching.match_settings import MatchSettings
 from labapp.core.matching.observation import UNLABELLED, Observation, amid, count_labels, widened
 from labapp.core.matching.prediction import RayPaths, covariance_of_dots, sure_pairs
 from labapp.core.matching.ray_classes import RayClasses, certain_witness, classify_rays
 from labapp.core.matching.unsupported_labels import MOST_LEFT_OUT, FittedLabels, unsupported
 from labapp.core.schemes.fit import LEAST_DOTS, UNSETTLED_MM
-from labapp.core.sequence.prior import MOST_ROUNDS, SETTLED_MM, Followed, Prior, predictions
+from labapp.core.sequence.prior import MOST_ROUNDS, SETTLED_MM, Prior, Tracked, predictions
 from labapp.core.surface.level import Level, Witnesses
 from labapp.core.surface.pool_fit import (
     FitSettings,
@@ -85,9 +85,9 @@ class TrackLost(CannotMeasure):
         super().__init__("track-lost", reason)
 
 
-def follow(
+def track(
     prior: Prior, observed: Observation, settings: FitSettings, limits: MatchSettings
-) -> Followed:
+) -> Tracked:
     """Find the ray of every dot, and the surface, by prediction from the previous frames.
 
     Raises
@@ -101,7 +101,7 @@ def follow(
     fit = _Fit.of(prior, observed, settings, labels, paths)
     fit.run(ROUGHLY_MM)
     for _ in range(WIDENINGS):
-        before, labels = labels, _widened(fit)
+        before, labels = labels, _extended_labels(fit)
         if np.array_equal(labels, before):
             break
         fit = fit.with_labels(labels)
@@ -118,7 +118,7 @@ def follow(
         fit = fit.without_dots(wrong)
     else:
         raise TrackLost("too many dots do not fit one surface")
-    rays, dots = fit.rays, fit.labels.ravel()[fit.rays]
+    rays, dots = fit.lit_rays, fit.labels.ravel()[fit.lit_rays]
     _check_explained(classes, limits, len(observed.plane_mm), len(rays))
     pool = fitted_pool(fit.rounds, level, observed.rig, observed.plane_mm[dots])
     if not pool.residual_rms_mm < WORSE * prior.cold_residual_mm:
@@ -133,7 +133,7 @@ def follow(
     at = np.stack(np.divmod(rays, fit.labels.shape[1]), axis=-1)
     missed = len(classes.missed)
     match = match_of_pairs(observed, at, dots, orientation, classes.witness, missed, trials)
-    return Followed(match, pool, paths, fit.labels != UNLABELLED, is_seen)
+    return Tracked(match, pool, paths, fit.labels != UNLABELLED, is_seen)
 
 
 @dataclass
@@ -146,7 +146,7 @@ class _Fit:
         The prior, the frame's dots, and the settings of the fit.
     labels
         Index of each ray's dot or `UNLABELLED`, shape (rows, columns).
-    rays
+    lit_rays
         Flat indices of the n rays that have a dot, shape (n,).
     near
         Paths of all rays for the initial surface.
@@ -158,7 +158,7 @@ class _Fit:
     observed: Observation
     settings: FitSettings
     labels: IntArray
-    rays: IntArray
+    lit_rays: IntArray
     near: RayPaths
     rounds: Rounds
     _paths: tuple[FloatArray, RayPaths] | None = None
@@ -176,7 +176,7 @@ class _Fit:
         rays = np.flatnonzero(labels != UNLABELLED)
         if len(rays) < LEAST_DOTS:
             raise TrackLost("too few dots have a ray")
-        dots, landing = labels.ravel()[rays], observed.landing_mm.reshape(-1, 3)[rays]
+        dots, landing = labels.ravel()[rays], observed.rays.landing_mm.reshape(-1, 3)[rays]
         equations = normal_equations(
             basis=prior.basis,
             rig=observed.rig,
@@ -185,7 +185,7 @@ class _Fit:
             plane_covariance_mm2=observed.covariance_mm2[dots],
             settings=settings,
         )
-        directions = observed.rays.reshape(-1, 3)[rays]
+        directions = observed.rays.directions.reshape(-1, 3)[rays]
         rounds = Rounds(equations, directions, near.coefficients, near.points_mm[rays])
         return cls(prior, observed, settings, labels, rays, near, rounds)
 
@@ -216,7 +216,7 @@ class _Fit:
         coefficients = self.rounds.coefficients
         if self._paths is None or self._paths[0] is not coefficients:
             points = self.near.points_mm.copy()
-            points[self.rays] = self.rounds.points_mm
+            points[self.lit_rays] = self.rounds.points_mm
             bench, basis = self.observed.bench, self.prior.basis
             self._paths = coefficients, RayPaths.of(bench, basis, coefficients, points, 1)
         return self._paths[1]
@@ -255,10 +255,10 @@ def _found_again(
     """
     lit, count, last = prior.lit, int(prior.lit.sum()), prior.paths.points_mm
     # Rays between lit ones, whose dots may have been missed, are predicted reliably too.
-    tracked, looked_for = (lit | amid(lit)) & ~observed.absent, widened(lit, 2)
+    tracked, looked_for = (lit | amid(lit)) & ~observed.rays.absent, widened(lit, 2)
     for coefficients in predictions(prior):
         paths = RayPaths.of(observed.bench, prior.basis, coefficients, last, 1)
-        labels, off = _tracked(observed, paths, tracked, looked_for)
+        labels, off = _labels_near_predictions(observed, paths, tracked, looked_for)
         if len(off) >= FOUND * count and (half := median(off)) < STEADY:
             return paths, labels, half
     found = 0
@@ -285,7 +285,9 @@ def _grown(
     looked_for, start = widened(prior.lit, 2), paths.coefficients
     labels = np.full(ring.shape, UNLABELLED)
     for reach in range(FIRST_RING, int(ring[prior.lit].max()) + 2):
-        labels, _ = _tracked(observed, paths, prior.lit & (ring <= reach), looked_for)
+        labels, _ = _labels_near_predictions(
+            observed, paths, prior.lit & (ring <= reach), looked_for
+        )
         if count_labels(labels) < LEAST_DOTS:
             break
         fit = _Fit.of(prior, observed, settings, labels, paths)
@@ -294,7 +296,7 @@ def _grown(
     return paths, labels
 
 
-def _tracked(
+def _labels_near_predictions(
     observed: Observation, paths: RayPaths, lit: BoolArray, looked_for: BoolArray
 ) -> tuple[IntArray, FloatArray]:
     """Label the dots that are close to exactly one prediction.
@@ -318,9 +320,9 @@ def _tracked(
     if len(near) < 2 or len(observed.plane_mm) < 2:
         return labels, np.empty(0)
     plane = paths.plane_mm[near]
-    step = dot_kernels.next_apart(plane)
-    off, ray = dot_kernels.two_nearest(observed.plane_mm, plane)
-    other, dot = dot_kernels.two_nearest(plane, observed.plane_mm)
+    step = band_pass_kernels.next_apart(plane)
+    off, ray = band_pass_kernels.two_nearest(observed.plane_mm, plane)
+    other, dot = band_pass_kernels.two_nearest(plane, observed.plane_mm)
     own, off_own = ray[:, 0], off[:, 0]
     gate = GATE * step[own]
     sure = (off_own < gate) & (step[own] > observed.resolution_mm) & lit.ravel()[near[own]]
@@ -330,7 +332,7 @@ def _tracked(
     return labels, off_own[sure] / step[own[sure]]
 
 
-def _widened(fit: _Fit) -> IntArray:
+def _extended_labels(fit: _Fit) -> IntArray:
     """Remove labels with large residuals, and add unambiguous ones next to the remaining labels.
 
     New labels are determined by `sure_pairs`, as without a prior (`label_growth`).
@@ -339,14 +341,14 @@ def _widened(fit: _Fit) -> IntArray:
     known = np.isfinite(paths.plane_mm[:, 0])
     looked_for = np.flatnonzero(widened(lit, 2).ravel() & known)
     next_mm = np.full(len(known), np.inf)
-    next_mm[looked_for] = dot_kernels.next_apart(paths.plane_mm[looked_for])
-    labels, rays = fit.labels.copy().ravel(), fit.rays
+    next_mm[looked_for] = band_pass_kernels.next_apart(paths.plane_mm[looked_for])
+    labels, rays = fit.labels.copy().ravel(), fit.lit_rays
     off = np.linalg.norm(paths.plane_mm[rays] - observed.plane_mm[labels[rays]], axis=-1)
     labels[rays[off > np.maximum(6.0 * median(off), ASTRAY * next_mm[rays])]] = UNLABELLED
     is_free = np.ones(len(observed.plane_mm), bool)
     is_free[labels[labels != UNLABELLED]] = False
     free = np.flatnonzero(is_free)
-    beside = widened(lit, 1) & ~lit & ~observed.absent
+    beside = widened(lit, 1) & ~lit & ~observed.rays.absent
     if len(free) and beside.any():
         apart = _apart_mm(paths.plane_mm[looked_for], observed.plane_mm[free])
         near = looked_for[np.unique(np.argsort(apart, axis=0)[:RIVALS])]
@@ -391,10 +393,8 @@ def _with_level(prior: Prior, fit: _Fit, covariance: FloatArray) -> tuple[RayCla
     witness = certain_witness(observed, found.witness, paths, lambda some: covariance[some])
     if not (witness < 0).any():
         raise TrackLost("no visible ray is missing: the boundary is not seen")
-    missing = missing_share(len(found.missed), len(fit.rays))
-    witnesses = Witnesses.of(
-        observed.bench.rays, observed.rig.head_sign, witness, prior.basis, missing
-    )
+    missing = missing_share(len(found.missed), len(fit.lit_rays))
+    witnesses = Witnesses.of(observed.rays, observed.rig.head_sign, witness, prior.basis, missing)
     sigma = fit.rounds.height_sigma_mm(witnesses.landing_mm)
     witnesses = replace(witnesses, height_sigma_mm=sigma)
     near = replace(prior.level, shift_mm=0.0, sigma_mm=prior.level_sigma_mm)
@@ -413,9 +413,9 @@ def _with_level(prior: Prior, fit: _Fit, covariance: FloatArray) -> tuple[RayCla
 
 def _check_explained(classes: RayClasses, limits: MatchSettings, dots: int, rays: int) -> None:
     stray, missed = len(classes.stray), len(classes.missed)
-    if stray > limits.stray[0] + limits.stray[1] * dots:
+    if stray > limits.most_strays(dots):
         raise TrackLost(f"{stray} dots have no ray")
-    if missed > limits.missed[0] + limits.missed[1] * rays:
+    if missed > limits.most_missed(rays):
         raise TrackLost(f"{missed} rays between the others have no dot")
 
 

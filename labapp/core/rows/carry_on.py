@@ -114,13 +114,13 @@ def _likeliest_motion(
     share = np.linspace(-REACH, REACH, 7)
     near = [median_step @ np.array([t, k]) for k in share for t in share]
     first = max(near, key=lambda shift: _count(before + shift, after, steps, sited))
-    motion = _followed(before, after, steps, first)
+    motion = _refined_motion(before, after, steps, first)
     found = _found(motion(before), after, steps)
     count = int(np.sum(found[sited] != LOST))
     for cell in np.array([(1, 0), (-1, 0), (0, 1), (0, -1), (1, 1), (-1, -1), (1, -1), (-1, 1)]):
         # The shift by a row or column differs from dot to dot.
         start = motion(before) + steps @ cell
-        further = _followed(before, after, steps, start - before)
+        further = _refined_motion(before, after, steps, start - before)
         other = _found(further(before), after, steps)
         if np.mean(other[sited] == found[sited]) > 0.5:
             continue
@@ -129,7 +129,7 @@ def _likeliest_motion(
     return motion
 
 
-def _followed(
+def _refined_motion(
     before: FloatArray, after: FloatArray, steps: FloatArray, shift: FloatArray
 ) -> Motion:
     """Refine a motion from a shift, shape (2,) or (n, 2), by polynomials fitted to matched dots."""

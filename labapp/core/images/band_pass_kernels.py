@@ -1,4 +1,4 @@
-"""Inner loops over the dots of a frame, compiled for the processor (docs/adr/0018).
+"""Inner loops of the band-pass and over the dots of a frame, compiled (docs/adr/0018).
 
 Arrays may be read-only; pictures must be contiguous, other arrays need not be.
 """
@@ -165,28 +165,28 @@ def ridges(band: Grey, u: IntArray, v: IntArray, slender: float) -> BoolArray:
 
 
 @_inner
-def _lit_pixels(band: Grey, low: Grey) -> IntArray:
+def _pixels_over(band: Grey, low: Grey) -> IntArray:
     """Rows and columns, shape (n, 2), of the pixels that exceed ``low``, row by row."""
     height, width = band.shape
-    lit, count = np.empty((width, 2), np.int64), 0
+    over, count = np.empty((width, 2), np.int64), 0
     for v in range(height):
-        own, dark = band[v], low[v]
-        if len(lit) < count + width:
+        own, floor = band[v], low[v]
+        if len(over) < count + width:
             more = np.empty((2 * (count + width), 2), np.int64)
-            more[:count] = lit[:count]
-            lit = more
+            more[:count] = over[:count]
+            over = more
         for first in range(0, width, BLOCK):
             last = min(first + BLOCK, width)
-            if not _any_over(own[first:last], dark[first:last]):
+            if not _any_over(own[first:last], floor[first:last]):
                 continue
             for u in range(first, last):
-                lit[count, 0], lit[count, 1] = v, u
-                count += own[u] > dark[u]
-    return lit[:count]
+                over[count, 0], over[count, 1] = v, u
+                count += own[u] > floor[u]
+    return over[:count]
 
 
 @_inner
-def _enlarged(band: Grey, v: int, u: int, taps: Grey, patch: Grey, four: Grey) -> None:
+def _upsampled(band: Grey, v: int, u: int, taps: Grey, patch: Grey, four: Grey) -> None:
     """Upsample one pixel of a band twofold; its four values are written to ``four``, row by row.
 
     The interpolation is by polynomials through six pixels; ``taps`` are their weights a quarter of
@@ -231,7 +231,7 @@ def _is_upsampled_peak(fours: Grey, number: IntArray, disc: BoolArray, v: int, u
 
 
 @_compiled(_grey, _grey, _grey, _mask)
-def enlarged_peaks(
+def upsampled_peaks(
     band: Grey, low: Grey, floor: Grey, disc: BoolArray
 ) -> tuple[IntArray, FloatArray]:
     """Find peaks of a band that is upsampled twofold where it exceeds ``low`` (`peaks`).
@@ -251,19 +251,19 @@ def enlarged_peaks(
     places, heights
         Columns and rows, shape (2, n), and the upsampled band there, shape (n,).
     """
-    lit = _lit_pixels(band, low)
+    over = _pixels_over(band, low)
     number = np.full(band.shape, -1, np.int64)
-    fours, patch = np.empty((len(lit), 4), np.float32), np.empty((7, 7), np.float32)
+    fours, patch = np.empty((len(over), 4), np.float32), np.empty((7, 7), np.float32)
     # Lagrange's polynomials through six pixels.
     taps = np.array([77, -693, 6930, 2310, -495, 63], np.float32) / np.float32(8192)
-    for k in range(len(lit)):
-        number[lit[k, 0], lit[k, 1]] = k
-        _enlarged(band, lit[k, 0], lit[k, 1], taps, patch, fours[k])
-    found, high, count = np.empty((2, 4 * len(lit)), np.int64), np.empty(4 * len(lit)), 0
-    for k in range(len(lit)):
+    for k in range(len(over)):
+        number[over[k, 0], over[k, 1]] = k
+        _upsampled(band, over[k, 0], over[k, 1], taps, patch, fours[k])
+    found, high, count = np.empty((2, 4 * len(over)), np.int64), np.empty(4 * len(over)), 0
+    for k in range(len(over)):
         most = fours[k].max()  # the other three cannot be peaks
         for m in range(4):
-            v, u = 2 * lit[k, 0] + m // 2, 2 * lit[k, 1] + m % 2
+            v, u = 2 * over[k, 0] + m // 2, 2 * over[k, 1] + m % 2
             if fours[k, m] < most or not _is_upsampled_peak(fours, number, disc, v, u):
                 continue
             if most > floor[v, u]:

@@ -2,13 +2,13 @@
 
 `match_rays` has three steps:
 
-1. Initial labels. The absent centre dot gives the rays of a complete grid, for each orientation.
-   Where rows bend too much for a grid to grow, labels come from models of the surface instead:
+1. Initial labels. The absent centre dot gives the rays of a complete lattice, for each orientation.
+   Where rows bend too much for a lattice to grow, labels come from models of the surface instead:
    quadrics that explain the dots around a hole (`initial.quadrics`), or caps as large as the pool
    (`initial.caps`).
 2. Labels are grown (`label_growth`) and evaluated (`hypothesis`): fit the surface to the labelled
    dots, predict the dot of every ray, label the dots with an unambiguous ray, and fit again until
-   nothing changes. This labels the dots that the grid left in doubt and removes wrong labels.
+   nothing changes. This labels the dots that the lattice left in doubt and removes wrong labels.
    Swapped, skipped and omitted rows are repaired (`repair`).
 3. The cheapest hypothesis is accepted if no other is close (`decision`).
 """
@@ -42,10 +42,10 @@ from labapp.core.matching.decision import (
 )
 from labapp.core.matching.free_setup import FreeHypothesis
 from labapp.core.matching.hypothesis import (
-    USUAL_KNOTS,
+    USUAL_FIT,
     Hypothesis,
     evaluate,
-    extended_over_grid,
+    extended_over_lattice,
     grow_and_evaluate,
     labels_from_lattice,
     paths_of,
@@ -73,14 +73,14 @@ from labapp.core.matching.unexplained import (
     explains_half,
     suffices,
 )
-from labapp.core.rows.lattice import Lattice, Site, empty_sites
+from labapp.core.rows.lattice import Lattice, Site, empty_sites, lattice_of_sites
 from labapp.core.surface.pool_fit import FitSettings
 from labapp.core.surface.solver import inverse_of
 from labapp.core.surface.spline import SplineSurface
 from labapp.core.values import CannotMeasure, FloatArray, IntArray
 
 MOST_SITES = 8
-"""Maximum number of best-fitting sites of the marker in the grid that are grown to a hypothesis."""
+"""Maximum number of best-fitting sites of the marker in the lattice that become hypotheses."""
 
 MOST_REPAIRED = 4
 """Maximum number of hypotheses from caps that are repaired if none explains the frame."""
@@ -110,11 +110,12 @@ def match_rays(
     ------
     CannotMeasure
         ``too-few-dots`` if there are fewer than `LEAST_LABELS`; ``no-reference`` if the pattern has
-        no absent ray or no hole can be the absent dot, ``ambiguous-rows`` if several can;
-        ``ambiguous-orientation``; ``no-match`` if no surface explains the dots.
+        no absent ray or no hole can be the absent dot; ``ambiguous-rows`` if a dot lies in the only
+        hole, or a part of the rows can be shifted; ``ambiguous-orientation``; ``no-match`` if no
+        surface explains the dots.
     RowsOpen
-        ``ambiguous-rows`` if several can, perhaps with a set-up that is wrong within its
-        uncertainty. Other frames of the recording may decide between them.
+        ``ambiguous-rows`` if several holes can be the absent dot, perhaps with a set-up that is
+        wrong within its uncertainty. Other frames of the recording may decide between them.
     """
     if len(dots) < LEAST_LABELS:
         raise CannotMeasure(
@@ -125,7 +126,7 @@ def match_rays(
     observed = Observation.of(dots, bench, frame_shape)
     orientations = settings.orientations
     found: list[Hypothesis] = []
-    for first_labels in (_by_grid, _by_empty_sites, _by_quadrics):
+    for first_labels in (_by_lattice, _by_empty_sites, _by_quadrics):
         new = first_labels(observed, lattice, orientations)
         found = with_repaired(observed, found, new)
         if any(suffices(observed, each) for each in found):
@@ -161,7 +162,7 @@ def _candidates(
     for each in open_holes[1:]:
         rival, match = evaluate(observed, each.labels), None
         if rival is not None:
-            rival = supported(observed, rival, USUAL_KNOTS)
+            rival = supported(observed, rival, USUAL_FIT)
             match = match_of_hypothesis(observed, rival, own.orientation)
         yield Candidate(match, each.step, each.cost - least.cost)
 
@@ -200,27 +201,22 @@ def lattice_of_match(match: Match, rig: Rig, count: int) -> Lattice:
     """
     way, marker = ways(match.orientation), rig.pattern.marker or rig.pattern.center_ray
     k, t = np.array(marker) * way + (match.reflected - match.ray * way)[0]
-    row, column = np.zeros((2, count), np.int64)
-    row[match.dot], column[match.dot] = match.reflected.T
-    # Rows that lack two or more neighbouring dots between others are blocked.
-    sites = match.reflected[np.lexsort(match.reflected.T[::-1])]
-    step = np.diff(sites, axis=0)
-    blocked = np.unique(sites[1:, 0][(step[:, 0] == 0) & (step[:, 1] > 2)])
-    site = (int(k), int(t))
-    return Lattice(row, column, site, (site,), frozenset(blocked.tolist()))
+    pairs = np.column_stack([match.reflected, match.dot]).tolist()
+    dot_at = {(row, column): dot for row, column, dot in pairs}
+    return lattice_of_sites(dot_at, count, (int(k), int(t)))
 
 
-def _by_grid(
+def _by_lattice(
     observed: Observation, lattice: Lattice | None, orientations: tuple[Orientation, ...]
 ) -> list[Hypothesis]:
-    """Hypotheses from the grid with the marker at each candidate site, in each orientation."""
+    """Hypotheses from the lattice with the marker at each candidate site, in each orientation."""
     return [] if lattice is None else _by_sites(observed, lattice, lattice.candidates, orientations)
 
 
 def _by_empty_sites(
     observed: Observation, lattice: Lattice | None, orientations: tuple[Orientation, ...]
 ) -> list[Hypothesis]:
-    """Hypotheses from the grid with the marker at each empty site in it or next to it.
+    """Hypotheses from the lattice with the marker at each empty site in it or next to it.
 
     Because of false or missing dots, or the torch, the marker may have fewer than three lit
     neighbours.
@@ -236,7 +232,7 @@ def _by_sites(
     sites: Iterable[Site],
     orientations: tuple[Orientation, ...],
 ) -> list[Hypothesis]:
-    """Hypotheses from the grid with the marker at given sites, in each orientation.
+    """Hypotheses from the lattice with the marker at given sites, in each orientation.
 
     Only the best-fitting ones are grown. They are selected first by a quick fit, then by the fit
     with which labels grow.
@@ -284,7 +280,7 @@ def _by_caps(observed: Observation) -> list[Hypothesis]:
 def _by_quadrics(
     observed: Observation, lattice: Lattice | None, orientations: tuple[Orientation, ...]
 ) -> list[Hypothesis]:
-    """Hypotheses from the quadrics that explain the dots around a hole, extended by the grid."""
+    """Hypotheses from the quadrics that explain the dots around a hole, extended by the lattice."""
     found = []
     for guess in search_quadrics(observed):
         hypothesis = grow_and_evaluate(observed, guess.labels)
@@ -292,7 +288,7 @@ def _by_quadrics(
             continue
         found.append(hypothesis)
         if lattice is not None:
-            labels = extended_over_grid(hypothesis, lattice, hypothesis.orientation(observed))
+            labels = extended_over_lattice(hypothesis, lattice, hypothesis.orientation(observed))
             wider = None if labels is None else grow_and_evaluate(observed, labels)
             found += [wider] if wider is not None else []
         if suffices(observed, hypothesis):
@@ -301,13 +297,16 @@ def _by_quadrics(
 
 
 def match_of_hypothesis(
-    observed: Observation, best: Hypothesis, orientation: Orientation, reference: Site | None = None
+    observed: Observation,
+    best: Hypothesis,
+    orientation: Orientation,
+    marker_site: Site | None = None,
 ) -> Match:
     """Build the match of a hypothesis with its orientation, and try the other orientations.
 
-    Reflected rows and columns count from 1, or so that the reference has the given site (k, t).
+    Reflected rows and columns count from 1, or so that the marker has the given site (k, t).
     """
-    trials = [Trial(orientation, best.residual_mm)]
+    trials = [Trial(orientation, best.residual_rms_mm)]
     for other in ORIENTATIONS:
         if other != orientation:
             pool = try_fit(observed, reoriented_labels(observed, best.labels, orientation, other))
@@ -325,7 +324,7 @@ def match_of_hypothesis(
 
     witness = certain_witness(observed, best.witness, paths, covariance_of)
     missed = best.missed_count
-    return match_of_pairs(observed, at, dot, orientation, witness, missed, trials, reference)
+    return match_of_pairs(observed, at, dot, orientation, witness, missed, trials, marker_site)
 
 
 def match_of_pairs(
@@ -336,7 +335,7 @@ def match_of_pairs(
     witness: IntArray,
     missed: int,
     trials: Iterable[Trial],
-    reference: Site | None = None,
+    marker_site: Site | None = None,
 ) -> Match:
     """Build the match of n pairs of ray and dot.
 
@@ -352,13 +351,13 @@ def match_of_pairs(
         See `Match`.
     missed
         Number of rays between lit rays that have no dot.
-    reference
+    marker_site
         Reflected row and column (k, t) of the marker. None: rows and columns begin at 1.
     """
     pattern = observed.rig.pattern
     numbers = (at + 1 - (pattern.marker or pattern.center_ray)) * ways(orientation)
     least = numbers.min(axis=0)
-    numbers += 1 - least if reference is None else np.maximum(reference, 1 - least)
+    numbers += 1 - least if marker_site is None else np.maximum(marker_site, 1 - least)
     return Match(
         orientation=orientation,
         dot=dot,

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from labapp.core.images.dots import Dots
+from labapp.core.rows.carry_on import carry_on
 from labapp.core.rows.correction import Correction, block_row, clear_rows
 from labapp.core.rows.lattice import Lattice
-from labapp.core.rows.tracking import carry_on
 from labapp.core.values import BoolArray, IntArray
 from labapp.simulation.pools import egg
 from tests.oscillation import Oscillation
