@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +10,7 @@ import pytest
 
 from labapp.core.geometry.line_pattern import LinePattern, LineRig
 from labapp.core.geometry.rig import Electrode, ImagingPlane, Laser
-from labapp.core.lines.pulses import classify_pulses
+from labapp.core.lines.pulses import classify_pulses, pulse_frequency
 from labapp.core.lines.states import LineSeries, line_changes, line_states
 from labapp.core.lines.track import oscillation_frequency, track_line
 from labapp.simulation.camera import CameraView
@@ -106,6 +107,11 @@ def test_steady_light_has_no_pulses():
     assert np.isnan(pulses.frequency_hz)
 
 
+@pytest.mark.parametrize("on", [False, True])
+def test_frames_that_are_all_alike_have_no_frequency_of_pulses(on):
+    assert np.isnan(pulse_frequency(np.full(100, on), 1500.0))
+
+
 def test_period_decides_frames_of_medium_brightness():
     """At half the brightness of a pulse, the phase decides."""
     phase = (np.arange(1500) / 1500 * 120.0) % 1.0
@@ -125,6 +131,16 @@ def test_frequency_through_missing_frames():
     frequency, share = oscillation_frequency(time_s[known], values[known])
     assert frequency == pytest.approx(37.3, abs=0.1)
     assert share > 0.5
+
+
+def test_frequency_of_a_long_recording_needs_little_memory():
+    time_s = np.arange(3000) / 1500
+    tracemalloc.start()
+    frequency, _ = oscillation_frequency(time_s, np.sin(2 * np.pi * 37.3 * time_s))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert frequency == pytest.approx(37.3, abs=0.01)
+    assert peak < 50e6
 
 
 @pytest.mark.slow

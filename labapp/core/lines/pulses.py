@@ -123,7 +123,7 @@ def _log_odds(light: FloatArray, on: BoolArray) -> FloatArray:
 
 
 def pulse_frequency(on: BoolArray, frame_rate_hz: float) -> float:
-    """Frequency of the pulses, Hz; NaN if they are not periodic.
+    """Frequency of the pulses, Hz; NaN if they are not periodic, or all frames are alike.
 
     Parameters
     ----------
@@ -133,7 +133,7 @@ def pulse_frequency(on: BoolArray, frame_rate_hz: float) -> float:
         Frame rate, Hz.
     """
     count = len(on)
-    if count < 16:
+    if count < 16 or on.all() or not on.any():
         return float("nan")
     wave = (on - on.mean()) * np.hanning(count)
     power = np.abs(np.fft.rfft(wave, 8 * count)) ** 2

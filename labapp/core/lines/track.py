@@ -45,6 +45,10 @@ LEAST_CONTRAST = 1.5
 LOWEST_HZ, HIGHEST_HZ = 5.0, 100.0
 """Range of the frequencies of a line's oscillation."""
 
+TERMS_AT_ONCE = 1 << 18
+"""Number of sines, one for each frame and frequency, that are computed at once. SciPy keeps about
+12 arrays of this size; those of all frequencies of a long recording would not fit in memory."""
+
 
 @dataclass(frozen=True)
 class TrackedLine(ReadOnlyArrays):
@@ -248,11 +252,19 @@ def oscillation_frequency(time_s: FloatArray, values: FloatArray) -> tuple[float
     kept = np.abs(swing) < limit
     step = 1.0 / (OVERSAMPLE * max(float(np.ptp(time_s)), 1e-9))
     rates = np.arange(LOWEST_HZ, HIGHEST_HZ, step)
-    power = scipy.signal.lombscargle(
-        time_s[kept], swing[kept], 2 * np.pi * rates, normalize=True, floating_mean=True
-    )
+    at_once = max(TERMS_AT_ONCE // int(kept.sum()), 1)
+    parts = (rates[first : first + at_once] for first in range(0, len(rates), at_once))
+    power = np.concatenate([_variance_share(time_s[kept], swing[kept], part) for part in parts])
     best = int(np.argmax(power))
     if 0 < best < len(power) - 1:
         before, top, after = power[best - 1 : best + 2]
         rates[best] += step * (before - after) / (2 * (before - 2 * top + after))
     return float(rates[best]), float(power[best])
+
+
+def _variance_share(time_s: FloatArray, swing: FloatArray, rates_hz: FloatArray) -> FloatArray:
+    """Share of the variance of n values that an oscillation at each of f frequencies has, (f,)."""
+    power = scipy.signal.lombscargle(
+        time_s, swing, 2 * np.pi * rates_hz, normalize=True, floating_mean=True
+    )
+    return np.atleast_1d(power)
