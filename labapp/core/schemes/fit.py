@@ -106,7 +106,7 @@ def solve(
         )
     if not (match.witness < 0).any():
         raise CannotMeasure("open-boundary", "no visible ray is missing: the boundary is not seen")
-    pool = fit_pool(match, rig, settings, initial, by_uncertain_heights=True)
+    pool = fit_pool(match, rig, settings, initial, weigh_by_height_sigma=True)
     if pool.unsettled_mm > UNSETTLED_MM:
         raise CannotMeasure("no-surface", "the surface does not settle")
     return pool
