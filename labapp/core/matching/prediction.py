@@ -89,8 +89,8 @@ class Prediction:
     ----------
     at
         Rows and columns of the rays in the pattern's arrays, counted from 0, shape (m, 2).
-    points_mm, slopes
-        Reflection points, shape (m, 3), mm, and the surface's slopes there, shape (m, 2).
+    points_mm
+        Reflection points, shape (m, 3), mm.
     plane_mm
         Dots, IPCS, shape (m, 2), mm.
     spacing_mm
@@ -99,7 +99,6 @@ class Prediction:
 
     at: IntArray
     points_mm: FloatArray
-    slopes: FloatArray
     plane_mm: FloatArray
     spacing_mm: FloatArray
 
@@ -137,7 +136,7 @@ def predict(observed: Observation, pool: FittedPool, where: BoolArray) -> Predic
 
     at = np.argwhere(where)
     index, surface, pose = tuple(at.T), pool.surface, observed.rig.imaging_plane.pose_mm
-    points, slopes, plane = ray_kernels.intersect_and_reflect(
+    points, _, plane = ray_kernels.intersect_and_reflect(
         surface.basis.grid,
         surface.coefficients,
         observed.rays[index],
@@ -146,8 +145,8 @@ def predict(observed: Observation, pool: FittedPool, where: BoolArray) -> Predic
         pose,
     )
     finite = np.isfinite(plane[:, 0])
-    at, points, slopes, plane = at[finite], points[finite], slopes[finite], plane[finite]
-    return Prediction(at, points, slopes, plane, dot_kernels.next_apart(plane))
+    at, points, plane = at[finite], points[finite], plane[finite]
+    return Prediction(at, points, plane, dot_kernels.next_apart(plane))
 
 
 def sure_pairs(
