@@ -23,7 +23,8 @@ from labapp.core.matching.observation import UNLABELLED, Observation, amid, coun
 from labapp.core.matching.prediction import RayPaths, covariance_of_dots, sure_pairs
 from labapp.core.matching.ray_classes import RayClasses, certain_witness, classify_rays
 from labapp.core.matching.unsupported_labels import MOST_LEFT_OUT, FittedLabels, unsupported
-from labapp.core.schemes.fit import LEAST_DOTS, UNSETTLED_MM
+from labapp.core.schemes import LEAST_DOTS
+from labapp.core.schemes.fit import UNSETTLED_MM
 from labapp.core.sequence.prior import MOST_ROUNDS, SETTLED_MM, Followed, Prior, predictions
 from labapp.core.surface.level import Level, LevelSearch, Witnesses
 from labapp.core.surface.pool_fit import (
